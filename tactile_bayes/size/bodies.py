@@ -29,7 +29,7 @@ import numpy as np
 from tactile_bayes.declarations import Meta, Record, replace
 from tactile_bayes.errors import BadDataError, UsageError, check_number, meant
 from tactile_bayes.geometry import FloatArray, Matrix, Vector
-from tactile_bayes.size.draws import Supposition
+from tactile_bayes.size.draws import ShapeDraws, Supposition
 from tactile_bayes.size.eq6 import Eq6Law, Power, Powers, eq6_coefficients, eq6_log_size, eq6_terms
 from tactile_bayes.size.fat import WEIGHTS, FatDepth
 from tactile_bayes.size.process import Residual
@@ -171,6 +171,13 @@ class BodyCalibration(BodyLaw, eq=False, kw_only=True):
             return self
         what = f"amplitude {amplitude:.3g} with sigma {sigma_mm:.3g} mm over {self.fat_mm:.3g} mm of fat"
         return self._at_any_depth(f"{what} {UNLIKE}").for_another_kind()
+
+    def for_maps(self, maps: Sequence[ShapeDraws]) -> BodyCalibration:
+        """The calibration at the depth of fat that the maps of a mass tell, if all of them go with that depth."""
+        found = self.at_fat([one.profile for one in maps])
+        for one in maps:
+            found = found.fitting(*one.middle)
+        return found
 
     def for_another_kind(self) -> BodyCalibration:
         """This calibration with room for a body unlike any of the table's: intervals without it held 38 of 48."""

@@ -10,7 +10,7 @@ common to all maps of a mass and does not average out.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import assert_never
+from functools import cached_property
 
 import numpy as np
 
@@ -50,22 +50,15 @@ IRREGULAR_SD = 0.15
 
 
 class SizePriors(Record):
-    """Assumptions about a mass's size besides the calibration.
-
-    Parameters
-    ----------
-    between_maps
-        Spread between the maps at hand; None takes what the calibration's exams show.
-    another_exam
-        Spread that exams of one mass may have beyond simulated ones: the second interval's. None leaves that out.
-    known
-        Properties of the body that somebody knows, by the names of `HiddenTerms`.
-    """
+    """Assumptions about a mass's size besides the calibration."""
 
     between_maps: BetweenMaps | None = None
+    """Spread between the maps at hand; None takes what the calibration's exams show."""
     another_exam: BetweenMaps | None = field(default_factory=BetweenMaps)
+    """Spread that exams of one mass may have beyond simulated ones: the second interval's. None leaves that out."""
     shape: ShapePrior = field(default_factory=ShapePrior)
     known: Mapping[str, float] = field(default_factory=dict)
+    """Properties of the body that somebody knows, by the names of `HiddenTerms`."""
 
     @property
     def learned_between_maps(self) -> BetweenMaps | None:
@@ -91,44 +84,16 @@ def draw_sizes(
     oblique: tuple[float, float] | None = None,
     irregular: bool = False,
 ) -> SizePosterior:
-    """Draw sizes from the joint draws of one map.
+    """Draw sizes from the (chain, draw) joint draws of one map, whose labels and rest are as `ShapeDraws` has them.
 
-    Parameters
-    ----------
-    amplitude, sigma_x_mm, sigma_y_mm, angle_rad : (chain, draw) arrays
-        Of Eq 7.
-    priors
-        Spread between maps, shape of the lump, known properties of the body. Eq 6 uses the spread, for the interval
-        of another exam, and nothing else.
-    replicates : (chain * draw,) array
-        As `ParameterDraws.replicates`.
-    oblique, irregular
-        As `MapPosterior`'s; Eq 6 does not use them.
+    Eq 6 by axes uses of the priors the spread, for the interval of another exam, and nothing else.
     """
-    match calibration:
-        case BodyCalibration():
-            one = ShapeDraws.of(
-                amplitude,
-                sigma_x_mm,
-                sigma_y_mm,
-                angle_rad,
-                labels=replicates,
-                oblique=oblique,
-                irregular=irregular,
-            )
-            return pooled_size([one], calibration=calibration, priors=priors, rng=rng).reshaped(amplitude.shape)
-        case SizeCalibration():
-            return push_sizes(
-                amplitude,
-                sigma_x_mm,
-                sigma_y_mm,
-                angle_rad,
-                calibration=calibration,
-                rng=rng,
-                replicates=replicates,
-                another_exam=priors.another_exam or priors.between_maps,
-            )
-    assert_never(calibration)
+    drawn = amplitude, sigma_x_mm, sigma_y_mm, angle_rad
+    if isinstance(calibration, SizeCalibration):
+        another = priors.another_exam or priors.between_maps
+        return push_sizes(*drawn, calibration=calibration, rng=rng, replicates=replicates, another_exam=another)
+    one = ShapeDraws.of(*drawn, labels=replicates, oblique=oblique, irregular=irregular)
+    return pooled_size([one], calibration=calibration, priors=priors, rng=rng).reshaped(amplitude.shape)
 
 
 def log_sizes(calibration: BodyCalibration, maps: Sequence[ShapeDraws]) -> list[FloatArray]:
@@ -136,9 +101,47 @@ def log_sizes(calibration: BodyCalibration, maps: Sequence[ShapeDraws]) -> list[
     return [calibration.corrected_log_size(one.log_amplitude, one.log_width) for one in maps]
 
 
-def map_terms(calibration: BodyCalibration, maps: Sequence[ShapeDraws]) -> FloatArray:
-    """(k, n, t) terms of each map's draws."""
-    return np.stack([calibration.terms(one.log_amplitude, one.log_width) for one in maps])
+class Weighted(Record, eq=False):
+    """Maps of a mass averaged for each of n spreads between them: (n,) values, (n, t) terms, and (k, n) weights."""
+
+    weight: FloatArray
+    mean: FloatArray
+    variance: FloatArray
+    """By the spread between maps."""
+    terms: FloatArray
+    log_amplitude: FloatArray
+    log_width: FloatArray
+
+
+class MassMaps(Record, eq=False):
+    """Draws of the k maps of a mass: (k, n) log sizes, (k,) means and variances of each, (k, n, t) terms."""
+
+    maps: Sequence[ShapeDraws]
+    by_map: FloatArray
+    centre: FloatArray
+    noise: FloatArray
+    terms: FloatArray
+
+    @classmethod
+    def of(cls, maps: Sequence[ShapeDraws], calibration: BodyCalibration) -> MassMaps:
+        """By a calibration."""
+        by_map = np.stack(log_sizes(calibration, maps))
+        terms = np.stack([calibration.terms(one.log_amplitude, one.log_width) for one in maps])
+        return cls(maps, by_map, np.nanmean(by_map, axis=1), np.nanvar(by_map, axis=1), terms)
+
+    def weighted(self, tau: FloatArray) -> Weighted:
+        """Average the maps with the weights that (n,) spreads between them give."""
+        weight = 1.0 / (self.noise[:, None] + tau**2 + 1e-12)
+        weight /= weight.sum(axis=0)
+        log_a, p = (np.stack([getattr(one, name) for one in self.maps]) for name in ("log_amplitude", "log_width"))
+        return Weighted(
+            weight,
+            np.sum(weight * self.by_map, axis=0),
+            np.sum(weight**2, axis=0) * tau**2,
+            np.einsum("kn,knt->nt", weight, self.terms),
+            np.sum(weight * log_a, axis=0),
+            np.sum(weight * p, axis=0),
+        )
 
 
 def lump_shape(
@@ -206,141 +209,93 @@ def pooled_size(
     calibration = calibration.at_fat([one.profile for one in maps])
     used, replicates = matched_draws(maps, number, rng)
     log_size = log_sizes(calibration, maps)
-    by_map = np.stack(log_size if used is maps else log_sizes(calibration, used))
     centre, noise = (np.array([of(one) for one in log_size]) for of in (np.nanmean, np.nanvar))
+    drawn = replace(MassMaps.of(used, calibration), centre=centre, noise=noise)
     oval, shown = lump_shape(calibration, maps, log_size, priors.shape)
-    points = paired_points(by_map.mean(axis=0), replicates, DIMENSIONS, rng)
-    terms = map_terms(calibration, used)
-    half = oval.at(points[:, 3:])
+    points = paired_points(drawn.by_map.mean(axis=0), replicates, DIMENSIONS, rng)
     figures = {
         "oval_probability": oval.probability,
         "oval_half_log_ratio": oval.magnitude,
         "shown_share": shown,
         "irregular_outline": float(2 * sum(one.irregular for one in maps) >= len(maps)),
     }
-    form_sd = IRREGULAR_SD * figures["irregular_outline"]
-    of_body = None
-    if len(used) == 1:
-        only = used[0]
-        score = normal_quantile(points[:, _SCORE])
-        of_body = (
-            calibration.body_sd(only.log_amplitude, only.log_width, score),
-            calibration.coefficient_variance(terms[0]),
-        )
-    pool = _Pool(
-        used, by_map, terms, centre, noise, points, half, replicates, calibration, priors.known, form_sd, of_body
-    )
-    between = priors.between_maps or calibration.between_exams
-    another = priors.another_exam
-    size = pool.size(between, figures)
-    log_a, log_width = (
-        float(np.mean([np.nanmean(getattr(m, n)) for m in used])) for n in ("log_amplitude", "log_width")
-    )
+    pool = _Pool(drawn, points, oval.at(points[:, 3:]), replicates, calibration, priors.known, figures)
+    size = pool.size(priors.between_maps or calibration.between_exams)
+    middle = [float(np.mean([np.nanmean(getattr(m, n)) for m in used])) for n in ("log_amplitude", "log_width")]
     variance = float(np.nanvar(np.log(size.max_size_mm)))
     return replace(
         size,
         outliers=outlying_maps(centre, noise, priors.spread_of_others),
-        another_exam=None if another is None else pool.size(another, figures),
-        supposing=suppositions(calibration, priors.known, (log_a, log_width), variance=variance),
+        another_exam=None if priors.another_exam is None else pool.size(priors.another_exam),
+        supposing=suppositions(calibration, priors.known, (middle[0], middle[1]), variance=variance),
     )
 
 
-class _Pool(Record, eq=False):
-    """Draws of the k maps of a mass, before a spread between maps is added.
+class _Pool(Record, eq=False, dict=True):
+    """Draws of the maps of a mass before a spread between maps is added, with (n, `DIMENSIONS`) points.
 
-    Parameters
-    ----------
-    by_map : (k, n) array
-        ln d by each map.
-    terms : (k, n, t) array
-        The calibration's terms.
-    centre, noise : (k,) arrays
-        Its mean and variance.
-    points : (n, `DIMENSIONS`) array
-    half : (n, 2) array
-        Half log axis ratio of the lump, in two components.
-    form_sd
-        SD of ln d because the lump's outline is irregular.
-    of_body
-        SD(B) and the coefficients' variance of the only map, which no spread between maps moves; None of several.
+    `half` is (n, 2): half the log axis ratio of the lump, in two components.
     """
 
-    maps: Sequence[ShapeDraws]
-    by_map: FloatArray
-    terms: FloatArray
-    centre: FloatArray
-    noise: FloatArray
+    drawn: MassMaps
     points: FloatArray
     half: FloatArray
     replicates: Labels
     calibration: BodyCalibration
     known: Mapping[str, float]
-    form_sd: float
-    of_body: tuple[FloatArray, FloatArray] | None
+    figures: Mapping[str, float]
 
-    def size(self, between: BetweenMaps, figures: Mapping[str, float]) -> SizePosterior:
+    def size(self, between: BetweenMaps) -> SizePosterior:
         """Sizes under a prior of the spread between maps."""
-        tau = between.at(self.points[:, 1], self.centre, self.noise)
-        weight = 1.0 / (self.noise[:, None] + tau**2 + 1e-12)
-        weight /= weight.sum(axis=0)
-        z, score = normal_quantile(self.points[:, [0, _SCORE]].T)
-        known, variances = self._left_open(tau=tau, weight=weight, score=score)
-        map_part = np.sum(weight * self.by_map, axis=0)
+        tau = between.at(self.points[:, 1], self.drawn.centre, self.drawn.noise)
+        maps = self.drawn.weighted(tau)
+        known, variances = self._left_open(maps)
         longer = np.hypot(self.half[:, 0], self.half[:, 1])
-        mean = map_part + known + longer
+        mean = maps.mean + known + longer
         sd = np.sqrt(sum(variances.values()) + (OVAL_SD * longer) ** 2)
-        log_largest, log_smallest = self._evened(mean, sd, z, longer)
+        log_largest, log_smallest = self._evened(mean, sd, longer)
         wide = self.half[:, 0] >= 0
-        share = {"map": float(np.nanvar(map_part)), **{name: float(np.nanmean(v)) for name, v in variances.items()}}
-        weights = {f"weight_{i + 1}": float(w) for i, w in enumerate(weight.mean(axis=1))} if len(weight) > 1 else {}
+        share = {"map": float(np.nanvar(maps.mean)), **{name: float(np.nanmean(v)) for name, v in variances.items()}}
+        weights = {f"weight_{i + 1}": float(one.mean()) for i, one in enumerate(maps.weight)}
         return SizePosterior(
             np.exp(np.where(wide, log_largest, log_smallest)),
             np.exp(np.where(wide, log_smallest, log_largest)),
             shares(share | {"shape": float(np.var(longer) + OVAL_SD**2 * np.mean(longer**2))}),
             int((~np.isfinite(mean)).sum()),
             self.replicates,
-            {"between_map_sd": float(np.sqrt(np.mean(tau**2))), **figures, **weights},
-        )
-
-    def _left_open(
-        self, *, tau: FloatArray, weight: FloatArray, score: FloatArray
-    ) -> tuple[FloatArray, dict[str, FloatArray]]:
-        """Distribution of ln d given each draw of the maps: its mean, and its variances by source.
-
-        Parameters
-        ----------
-        tau : (n,) array
-        weight : (k, n) array
-            Of the maps, for each tau.
-        score : (n,) array
-            Normal scores of the uncertain spread of B.
-        """
-        log_a, log_width = (np.stack([getattr(m, name) for m in self.maps]) for name in ("log_amplitude", "log_width"))
-        middle_a, middle_width = np.sum(weight * log_a, axis=0), np.sum(weight * log_width, axis=0)
-        if self.of_body is None:
-            terms = np.einsum("kn,knt->nt", weight, self.terms)
-            body_sd = self.calibration.body_sd(middle_a, middle_width, score)
-            error = self.calibration.coefficient_variance(terms)
-        else:
-            body_sd, error = self.of_body
-        # what is known of a body explains the spread of the population's bodies, and nothing of other kinds
-        other_sd, site = self.calibration.other_sd, self.calibration.site
-        own_sd = self.calibration.own_sd(body_sd)
-        left = known_body(self.calibration, self.known, middle_a, middle_width, own_sd)
-        return (
-            left.expected,
             {
-                "between_maps": np.sum(weight**2, axis=0) * tau**2,
-                "calibration": error,
-                "body": left.variance + other_sd**2 + self.form_sd**2,
-                **({} if site is None else {"site": site.variance(middle_width)}),
+                "between_map_sd": float(np.sqrt(np.mean(tau**2))),
+                **self.figures,
+                **(weights if len(weights) > 1 else {}),
             },
         )
 
-    def _evened(
-        self, mean: FloatArray, sd: FloatArray, z: FloatArray, longer: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
+    @cached_property
+    def _of_one(self) -> tuple[FloatArray, FloatArray]:
+        """SD(B) and the coefficients' variance of the only map, which no spread between maps moves."""
+        return self._errors(self.drawn.weighted(np.zeros(len(self.points))))
+
+    def _errors(self, maps: Weighted) -> tuple[FloatArray, FloatArray]:
+        body_sd = self.calibration.body_sd(maps.log_amplitude, maps.log_width, normal_quantile(self.points[:, _SCORE]))
+        return body_sd, self.calibration.coefficient_variance(maps.terms)
+
+    def _left_open(self, maps: Weighted) -> tuple[FloatArray, dict[str, FloatArray]]:
+        """(n,) mean of what the maps leave open of ln d, and its variances by source."""
+        body_sd, error = self._of_one if len(maps.weight) == 1 else self._errors(maps)
+        # what is known of a body explains the spread of the population's bodies, and nothing of other kinds
+        own_sd, site = self.calibration.own_sd(body_sd), self.calibration.site
+        left = known_body(self.calibration, self.known, maps.log_amplitude, maps.log_width, own_sd)
+        form_sd = IRREGULAR_SD * self.figures["irregular_outline"]
+        return left.expected, {
+            "between_maps": maps.variance,
+            "calibration": error,
+            "body": left.variance + self.calibration.other_sd**2 + form_sd**2,
+            **({} if site is None else {"site": site.variance(maps.log_width)}),
+        }
+
+    def _evened(self, mean: FloatArray, sd: FloatArray, longer: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Logs of both sizes, smoothed separately for round and oval draws, so that a round lump's sizes stay equal."""
+        z = normal_quantile(self.points[:, 0])
         largest = evened(mean + sd * z, mean, sd, 2 * self.replicates + (longer > 0))
         smallest, o = largest.copy(), longer > 0
         shorter = 2.0 * longer[o]
@@ -349,42 +304,28 @@ class _Pool(Record, eq=False):
 
 
 class PooledEstimate(Record, eq=False):
-    """Result of pooling the maps of one mass.
-
-    Parameters
-    ----------
-    status, reason
-        As of `Estimate`; also ``maps_disagree``, where the maps are not of one size, or not of one mass.
-    size
-        None without an estimate.
-    centres
-        ln d by each map alone, by its place in the list; maps without a lump are missing.
-    outlying
-        Places of the maps that lie apart from the rest.
-    outside
-        How maps lie outside the calibration's table, in words.
-    calibration
-        The one used: for the depth of fat that the maps tell, where they do.
-    fat_apart_mm
-        Least and largest depth of fat by single maps, where they can hardly be of one body; None otherwise.
-    one_size, one_size_apart
-        Probability that maps of one mass come out as far apart in size or farther, by the spread that `one_size`
-        supposes and, where a second interval is told, by the paper's maps; None without several maps.
-    one_place
-        Likewise for the places of their masses in the patient; None without landmarks.
-    """
+    """Result of pooling the maps of one mass."""
 
     status: str
     reason: str
+    """As of `Estimate`; also ``maps_disagree``, where the maps are not of one size, or not of one mass."""
     size: SizePosterior | None = None
     centres: Mapping[int, float] = field(default_factory=dict)
+    """ln d by each map alone, by its place in the list; maps without a lump are missing."""
     outlying: tuple[int, ...] = ()
+    """Places of the maps that lie apart from the rest."""
     outside: tuple[str, ...] = ()
+    """How maps lie outside the calibration's table, in words."""
     calibration: BodyCalibration | None = None
+    """The one used: for the depth of fat that the maps tell, where they do."""
     fat_apart_mm: tuple[float, float] | None = None
+    """Least and largest depth of fat by single maps, where they can hardly be of one body; None otherwise."""
     one_size: float | None = None
     one_size_apart: float | None = None
+    """Probability that maps of one mass come out as far apart in size or farther, by the spread that `spread_tested`
+    gives and, where a second interval is told, by the paper's maps; None without several maps."""
     one_place: float | None = None
+    """Likewise for the places of their masses in the patient; None without landmarks."""
 
 
 def pool_maps(
@@ -405,13 +346,9 @@ def pool_maps(
     # one order whatever the caller's, so that the order leaves no trace in the draws
     in_order = sorted(((shape, i) for i, shape in enumerate(shapes) if shape is not None), key=lambda one: one[0].order)
     used, found = [shape for shape, _ in in_order], [i for _, i in in_order]
-    profiles = [one.profile for one in used]
-    fat_apart_mm = None if calibration.depth is None else calibration.depth.apart(profiles)
-    at_depth = calibration.at_fat(profiles)
-    middles = [one.middle for one in used]
-    for middle in middles:  # one map that does not go with the depth is enough: it is the same body
-        at_depth = at_depth.fitting(*middle)
-    named = sorted(zip(found, middles, strict=True))
+    depth, at_depth = calibration.depth, calibration.for_maps(used)
+    fat_apart_mm = None if depth is None else depth.apart([one.profile for one in used])
+    named = sorted(zip(found, [one.middle for one in used], strict=True))
     far = [f"map {i + 1}: {text}" for i, middle in named for text in at_depth.too_far(*middle)]
     if far:
         return PooledEstimate("no_estimate", extrapolated(far).reason)

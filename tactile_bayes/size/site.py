@@ -77,14 +77,9 @@ def _percent(share: float) -> str:
     return f"{100 * share:.1f}" if share < 0.0995 else f"{100 * share:.0f}"
 
 
-def for_shape(calibration: BodyCalibration, shape: ShapeDraws) -> BodyCalibration:
-    """The calibration at a single map's depth of fat."""
-    return calibration.at_fat([shape.profile]).fitting(*shape.middle)
-
-
 def log_size_alone(calibration: BodyCalibration, shape: ShapeDraws) -> tuple[float, float]:
     """Mean and variance of ln d by a map alone, without what no map shows."""
-    (log_size,) = log_sizes(for_shape(calibration, shape), [shape])
+    (log_size,) = log_sizes(calibration.for_maps([shape]), [shape])
     return float(np.nanmean(log_size)), float(np.nanvar(log_size))
 
 
@@ -96,4 +91,4 @@ def size_alone(
     It has the draws of the map one by one, as `estimate_map` gives them, paired with other random points.
     """
     used: Sequence[ShapeDraws] = [shape]
-    return pooled_size(used, calibration=for_shape(calibration, shape), priors=priors, rng=rng)
+    return pooled_size(used, calibration=calibration.for_maps([shape]), priors=priors, rng=rng)

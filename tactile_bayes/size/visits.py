@@ -31,7 +31,7 @@ from tactile_bayes.inference.points import evened, normal_cdf, normal_quantile, 
 from tactile_bayes.presets import REGISTRATION_MM
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.draws import ShapeDraws, matched_draws
-from tactile_bayes.size.pooling import POOLED_DRAWS, SizePriors, log_sizes, lump_shape, map_terms
+from tactile_bayes.size.pooling import POOLED_DRAWS, MassMaps, SizePriors, Weighted, log_sizes, lump_shape
 from tactile_bayes.size.spread import BetweenMaps, above_chi_square
 
 MOST_VISITS: Final = 10
@@ -46,14 +46,9 @@ VOLUME: Final = 3.0
 
 
 class Place(Record, eq=False):
-    """Place of a mass at one visit.
+    """Place of a mass at one visit: x and y in the patient's frame, and the covariance of the maps' centres.
 
-    Parameters
-    ----------
-    centre_mm : (2,) array
-        x and y in the patient's frame.
-    covariance_mm2 : (2, 2) array
-        Of the maps' centres; what posture and landmarks add between visits is no part of it.
+    What posture and landmarks add between visits is no part of it.
     """
 
     centre_mm: FloatArray
@@ -70,21 +65,14 @@ class Place(Record, eq=False):
 
 
 class Apart(Record):
-    """How far apart the masses of two visits lie.
-
-    Parameters
-    ----------
-    shift_mm
-        From the earlier visit's place to the later one's.
-    sd_mm
-        Of the distance of one mass between visits, in the direction of the shift.
-    probability
-        That one mass comes out as far apart or farther.
-    """
+    """How far apart the masses of two visits lie."""
 
     shift_mm: tuple[float, float]
+    """From the earlier visit's place to the later one's."""
     sd_mm: float
+    """Of the distance of one mass between visits, in the direction of the shift."""
     probability: float
+    """That one mass comes out as far apart or farther."""
 
     @property
     def distance_mm(self) -> float:
@@ -103,13 +91,7 @@ class Apart(Record):
 
 
 def apart(earlier: Place, later: Place, *, registration_mm: float = REGISTRATION_MM) -> Apart:
-    """Compare the places of two visits.
-
-    Parameters
-    ----------
-    registration_mm
-        s, the SD each way of one mass's place between two visits.
-    """
+    """Compare the places of two visits; `registration_mm` is s, the SD each way of one mass's place between two."""
     shift = later.centre_mm - earlier.centre_mm
     spread = earlier.covariance_mm2 + later.covariance_mm2 + registration_mm**2 * np.eye(2)
     length = float(np.hypot(*shift))
@@ -119,13 +101,7 @@ def apart(earlier: Place, later: Place, *, registration_mm: float = REGISTRATION
 
 
 def contradictions(visits: Sequence[Sequence[Mapping[str, str]]]) -> list[str]:
-    """What the scans of all visits contradict each other in, in words; empty where they do not.
-
-    Parameters
-    ----------
-    visits
-        Of each visit what its scans say of the exam, see `files.provenance.EXAM_FACTS`.
-    """
+    """What the scans of all visits contradict each other in, in words, by what each says of the exam."""
     found = []
     for key, plural in CODES.items():
         said: dict[str, int] = {}
@@ -142,17 +118,7 @@ def contradictions(visits: Sequence[Sequence[Mapping[str, str]]]) -> list[str]:
 def one_place_probability(places: Sequence[Place], *, registration_mm: float = REGISTRATION_MM) -> float:
     r"""Probability that the places of one mass come out as far apart or farther.
 
-    Parameters
-    ----------
-    places
-        Of the maps, by landmarks.
-    registration_mm
-        SD each way of the distance of one mass between two exams, by posture and landmarks.
-
-    Notes
-    -----
-    As `one_size_probability` in the plane, with :math:`S_i = C_i + s^2 I / 2`: for two places it is
-    `same_mass.apart`'s probability.
+    As `one_size_probability` in the plane, with :math:`S_i = C_i + s^2 I / 2`: for two places it is that of `apart`.
     """
     if len(places) < 2:
         return 1.0
@@ -164,18 +130,21 @@ def one_place_probability(places: Sequence[Place], *, registration_mm: float = R
 
 
 class SharedBody(Record):
-    """Law of the correlation of B between visits of one body.
+    r"""Law of the correlation of B between visits of one body.
 
-    Parameters
-    ----------
-    redrawn
-        f, the share of the variance of B that differs between visits of an unchanged lump, 0 to 1.
-    length
-        Lambda: a change in ln d after which the rest of the correlation has fallen to exp(-1/2).
+    B is a function of properties that stay (stiffness, moduli) and of some that change as a lump grows (seat, depth
+    over size). At visits v and w, B over its SD has the correlation
+
+    .. math:: \rho_{vw} = (1 - f)\, \exp\Big(-\tfrac12 (g_v - g_w)^2 / \lambda^2\Big)
+
+    where g is the log size by the maps. f is the share of B's variance that another posture draws anew though the lump
+    is the same; the rest of a change in B grows with the square of the growth, as of any smooth function.
     """
 
     redrawn: float
+    """f, 0 to 1."""
     length: float
+    """Lambda."""
 
     def __post_init__(self) -> None:
         if not (0.0 <= self.redrawn <= 1.0 and self.length > 0.0):
@@ -200,22 +169,15 @@ STRANGERS: Final = SharedBody(1.0, 1.0)
 
 
 class Change(Record, eq=False):
-    """Change of a mass between two visits.
-
-    Parameters
-    ----------
-    log_ratio : (n,) array
-        Draws of ln of the later size over the earlier one.
-    mean, sd : (n,) arrays
-        Of the normal that each draw comes from.
-    replicates : (n,) array
-        Label of the independent replicate of each draw.
-    """
+    """Change of a mass between two visits."""
 
     log_ratio: FloatArray
+    """(n,) draws of ln of the later size over the earlier one."""
     mean: FloatArray
     sd: FloatArray
+    """(n,) of the normal that each draw comes from."""
     replicates: Labels
+    """(n,) label of the independent replicate of each draw."""
 
     def probability_above(self, share: float) -> float:
         """Probability that the size grew by more than this share of it (0.2: by more than 20 %)."""
@@ -245,32 +207,20 @@ class Change(Record, eq=False):
 
 
 class JointSizes(Record, eq=False):
-    """Joint posterior of the sizes of one mass at v visits.
-
-    Parameters
-    ----------
-    log_size : (v, n) array
-        Draws of ln of the largest size in mm.
-    mean : (v, n) array
-        Means of the normals that the draws come from.
-    covariance : (n, v, v) array
-        Their covariances.
-    replicates : (n,) array
-    between_map_sd
-        Spread between exams of a visit, root mean square.
-    correlation : (v, v) array
-        Of B between the visits.
-    calibrations
-        Of each visit: at the depth of fat that its maps tell.
-    """
+    """Joint posterior of the sizes of one mass at v visits."""
 
     log_size: FloatArray
+    """(v, n) draws of ln of the largest size in mm."""
     mean: FloatArray
     covariance: FloatArray
+    """(v, n) and (n, v, v) of the normals that the draws come from."""
     replicates: Labels
     between_map_sd: float
+    """Spread between exams of a visit, root mean square."""
     correlation: FloatArray
+    """(v, v) of B between the visits."""
     calibrations: tuple[BodyCalibration, ...]
+    """Of each visit: at the depth of fat that its maps tell."""
 
     def change(self, earlier: int, later: int) -> Change:
         """Change from one visit to another."""
@@ -326,10 +276,8 @@ def joint_sizes(
     between = between or priors.between_maps or calibration.between_exams
     flat = [one for maps in visits for one in maps]
     used, replicates = matched_draws(flat, number, rng)
-    parts, start = [], 0
-    for maps, at in zip(visits, fitted, strict=True):
-        parts.append(_Visit.of(used[start : start + len(maps)], at))
-        start += len(maps)
+    ends = np.cumsum([len(maps) for maps in visits])
+    parts = [MassMaps.of(used[end - len(maps) : end], at) for maps, end, at in zip(visits, ends, fitted, strict=True)]
     middle = np.mean([one.by_map.mean(axis=0) for one in parts], axis=0)
     points = paired_points(middle, replicates, DIMENSIONS, rng)
     tau = _shared_tau(between, parts, points[:, 0])
@@ -354,52 +302,9 @@ def visit_calibrations(visits: Sequence[Sequence[ShapeDraws]], calibration: Body
     count as a change of size. Where a visit tells none, none is used: what the maps hide would be something else with
     it than without.
     """
-    fitted = []
-    for maps in visits:
-        at_depth = calibration.at_fat([one.profile for one in maps])
-        for one in maps:
-            at_depth = at_depth.fitting(*one.middle)
-        fitted.append(at_depth)
+    fitted = [calibration.for_maps(maps) for maps in visits]
     without = [one for one in fitted if one.fat_mm is None]
     return [without[0]] * len(fitted) if without else fitted
-
-
-class _Weighted(Record, eq=False):
-    """Maps of a visit averaged for each tau: (n,) mean and variance between exams, (n, k) terms, ln a and p."""
-
-    mean: FloatArray
-    exam_variance: FloatArray
-    terms: FloatArray
-    log_amplitude: FloatArray
-    log_width: FloatArray
-
-
-class _Visit(Record, eq=False):
-    """Draws of the k maps of a visit: (k, n) log sizes, (k,) centres and variances, (k, n, t) terms."""
-
-    maps: Sequence[ShapeDraws]
-    by_map: FloatArray
-    centre: FloatArray
-    noise: FloatArray
-    terms: FloatArray
-
-    @classmethod
-    def of(cls, maps: Sequence[ShapeDraws], calibration: BodyCalibration) -> _Visit:
-        by_map, terms = np.stack(log_sizes(calibration, maps)), map_terms(calibration, maps)
-        return cls(maps, by_map, np.nanmean(by_map, axis=1), np.nanvar(by_map, axis=1), terms)
-
-    def weighted(self, tau: FloatArray) -> _Weighted:
-        """Average the maps with the weights that (n,) spreads between exams give them."""
-        weight = 1.0 / (self.noise[:, None] + tau**2 + 1e-12)
-        weight /= weight.sum(axis=0)
-        log_a, p = (np.stack([getattr(one, name) for one in self.maps]) for name in ("log_amplitude", "log_width"))
-        return _Weighted(
-            np.sum(weight * self.by_map, axis=0),
-            np.sum(weight**2, axis=0) * tau**2,
-            np.einsum("kn,knt->nt", weight, self.terms),
-            np.sum(weight * log_a, axis=0),
-            np.sum(weight * p, axis=0),
-        )
 
 
 def _check(visits: Sequence[Sequence[ShapeDraws]]) -> None:
@@ -409,7 +314,7 @@ def _check(visits: Sequence[Sequence[ShapeDraws]]) -> None:
         raise UsageError("a visit has no map with a lump; leave it out")
 
 
-def _shared_tau(between: BetweenMaps, parts: Sequence[_Visit], points: FloatArray) -> FloatArray:
+def _shared_tau(between: BetweenMaps, parts: Sequence[MassMaps], points: FloatArray) -> FloatArray:
     """(n,) draws of the spread between exams of a visit, which the maps of all visits tell together."""
     prior = between.density(np.zeros(1), np.zeros(1))
     density = prior.copy()
@@ -420,7 +325,7 @@ def _shared_tau(between: BetweenMaps, parts: Sequence[_Visit], points: FloatArra
 
 
 def _covariance(
-    parts: Sequence[_Weighted], fitted: Sequence[BodyCalibration], correlation: FloatArray, score: FloatArray
+    parts: Sequence[Weighted], fitted: Sequence[BodyCalibration], correlation: FloatArray, score: FloatArray
 ) -> FloatArray:
     """(n, v, v) covariance of ln d at the visits given each draw of the maps."""
     site = fitted[0].site
@@ -430,13 +335,11 @@ def _covariance(
     terms = np.stack([one.terms for one in parts], axis=1)
     found = bodies[:, :, None] * correlation * bodies[:, None, :]
     found = found + (terms @ fitted[0].coefficient_covariance) @ np.swapaxes(terms, 1, 2)
-    exams = np.stack([one.exam_variance for one in parts], axis=1)
+    exams = np.stack([one.variance for one in parts], axis=1)
     found[:, range(len(parts)), range(len(parts))] += exams
     if site is not None:
-        about = np.stack(
-            [np.stack([np.ones_like(p), p - site.centre], axis=-1) for p in (one.log_width for one in parts)]
-        )
-        about = np.swapaxes(about, 0, 1)
+        widths = np.stack([one.log_width for one in parts], axis=1) - site.centre
+        about = np.stack([np.ones_like(widths), widths], axis=-1)
         found = found + (about @ site.covariance) @ np.swapaxes(about, 1, 2)
     return np.asarray(found)
 
@@ -453,32 +356,18 @@ def _drawn(mean: FloatArray, covariance: FloatArray, z: FloatArray, replicates: 
 
 
 class Trend(Record):
-    """Straight line of ln d over time.
-
-    Parameters
-    ----------
-    per_day, sd
-        Slope of ln d and its posterior SD.
-    departure
-        Probability that sizes on a straight line come out as far from one or farther; None for two visits, which are
-        always on one.
-    """
+    """Straight line of ln d over time: its slope and the slope's posterior SD."""
 
     per_day: float
     sd: float
     departure: float | None
+    """Probability that sizes on a straight line come out as far from one or farther; None for two visits."""
 
 
 def straight_line(log_size: FloatArray, covariance: FloatArray, days: Sequence[float]) -> Trend:
     """Fit ln d of several visits by generalised least squares, with flat priors of level and slope.
 
-    Parameters
-    ----------
-    log_size : (v,) array
-    covariance : (v, v) array
-        With what the visits share, so that it cancels in the slope.
-    days
-        Times of the visits.
+    The covariance holds what the visits share, so that it cancels in the slope.
     """
     columns = np.stack([np.ones(len(days)), np.array(days) - np.mean(days)], axis=1)
     weighted = np.linalg.solve(covariance, columns)
@@ -496,26 +385,16 @@ def doubling_days(rate_per_day: float) -> float | None:
 
 
 class Compared(Record, eq=False):
-    """Whether visits are of one mass, and its sizes.
-
-    Parameters
-    ----------
-    status
-        ``"compared"``, ``"not_one_mass"`` or ``"no_estimate"``.
-    reason, advice
-        Why there is no comparison, and what would help; empty where there is one.
-    apart
-        How far the mass of each later visit lies from the first's; None where landmarks do not show it.
-    findings
-        What speaks against the comparison.
-    joint, another
-        Sizes with the calibration's or the site's spread between exams, and with the paper's.
-    """
+    """Whether visits are of one mass, and its sizes: status compared, not_one_mass or no_estimate."""
 
     status: str
     reason: str = ""
     advice: str = ""
+    """Why there is no comparison, and what would help; empty where there is one."""
     apart: tuple[Apart | None, ...] = ()
+    """How far the mass of each later visit lies from the first's; None where landmarks do not show it."""
     findings: tuple[Finding, ...] = ()
+    """What speaks against the comparison."""
     joint: JointSizes | None = None
     another: JointSizes | None = None
+    """Sizes with the calibration's or the site's spread between exams, and with the paper's."""

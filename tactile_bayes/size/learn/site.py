@@ -242,10 +242,8 @@ def _phantom(calibration: BodyCalibration, maps: Sequence[PhantomMap]) -> _Phant
     """What the calibration leaves of a phantom, or why it takes no part."""
     if not all(np.isfinite(one.shape.log_amplitude).any() for one in maps):
         return "a map does not rise above its background"
-    centre, used = calibration.centre.log_width, calibration.at_fat([one.shape.profile for one in maps])
-    for one in maps:
-        used = used.fitting(*one.shape.middle)
     shapes = [one.shape for one in maps]
+    centre, used = calibration.centre.log_width, calibration.for_maps(shapes)
     for one in maps:
         note = used.fat_note  # beyond the depth's range it is sized without the depth, as any map is
         if outside := [text for text in used.outside(*one.shape.middle) if not (note and text.startswith(note))]:
