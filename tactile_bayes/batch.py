@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
+import signal
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -127,7 +129,6 @@ def _work(line: Connection) -> None:
 def prepare_worker() -> None:
     """Set up a worker process: ignore Ctrl-C, and end when the parent process does, even if that was killed."""
     import multiprocessing
-    import signal
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
@@ -230,8 +231,6 @@ def cluster_executor(address: str, *, timeout_s: float = 10.0) -> Iterator[Execu
 
 def _silence(library: str) -> None:
     """Stop a library's log on stderr; the outcomes repeat what matters of it in one line."""
-    import logging
-
     for name in list(logging.root.manager.loggerDict):
         if name == library or name.startswith(f"{library}."):
             logging.getLogger(name).setLevel(logging.CRITICAL + 1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import math
 import numbers
 from collections.abc import Collection
@@ -83,8 +84,6 @@ def number_words(least: float | None, most: float | None, *, whole: bool = False
 
 def meant(name: str, known: Collection[str]) -> str:
     """The way out for a name that is not known: the one that was probably meant, else all of them."""
-    import difflib
-
     lower = {one.lower(): one for one in known}
     near = difflib.get_close_matches(name.lower(), lower, n=1)
     return f"did you mean {lower[near[0]]}?" if near else f"known are {', '.join(known)}"

@@ -15,15 +15,30 @@ from tactile_bayes.api.arguments import door, plain, sequence_of
 from tactile_bayes.api.estimates import SizeEstimate, estimated, of_one_mass, settings_of
 from tactile_bayes.api.estimating import Answer, size_priors
 from tactile_bayes.api.maps import Map, PathLike, path_of
-from tactile_bayes.api.pooled import common_calibration
+from tactile_bayes.api.pooled import common_calibration, place_of
 from tactile_bayes.api.repeatability import check_repeatability, repeatability_digest, repeatability_setting
 from tactile_bayes.api.settings import GROWN_BY, Comparing, Settings, refuse_checkpoint, times_of
 from tactile_bayes.api.sized import Draws
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import EXIT_DONE, EXIT_NO_ESTIMATE, UsageError
+from tactile_bayes.files.provenance import Provenance, hash_inputs, repeated_scans, scans_of
 from tactile_bayes.findings import Finding, Verdict, by_weight, finding_lines, verdict
 from tactile_bayes.presets import REGISTRATION_MM, RESEARCH_USE
 from tactile_bayes.records import dataclass
+from tactile_bayes.report.compare import compare_document, compare_summary, compare_text
+from tactile_bayes.report.compare_figure import DrawnMap, draw_comparison
+from tactile_bayes.report.pooled import disagreement, fat_apart
+from tactile_bayes.size.pooling import MOST_INVALID, log_sizes
+from tactile_bayes.size.spread import LEAST_PROBABILITY, one_size_of
+from tactile_bayes.size.visits import (
+    Compared,
+    Place,
+    apart,
+    contradictions,
+    joint_sizes,
+    one_place_probability,
+    visit_calibrations,
+)
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -81,9 +96,6 @@ def compare_answers(
         When there are fewer than two visits, two maps are of one scan, days do not fit, or the calibration cannot pool
         maps.
     """
-    from tactile_bayes.files.provenance import Provenance, hash_inputs
-    from tactile_bayes.report.compare import compare_document
-
     if len(visits) < 2 or not all(visits):
         raise UsageError("a comparison needs two visits of a map or more each: `compare VISIT1.nc --with VISIT2.nc`")
     comparing.check_visits(len(visits))
@@ -113,7 +125,6 @@ def compare_answers(
 
 def drawn_maps(maps: Sequence[Sequence[TactileMap]], visits: Sequence[Sequence[Answer]]) -> list[list[DrawnMap]]:
     """The maps of each visit with the places of their lumps, for the figure."""
-    from tactile_bayes.report.compare_figure import DrawnMap
 
     def place(answer: Answer) -> tuple[float, float] | None:
         centre = None if answer.document is None or answer.shape is None else answer.document["centre_mm"]
@@ -128,8 +139,6 @@ def drawn_maps(maps: Sequence[Sequence[TactileMap]], visits: Sequence[Sequence[A
 def _compared(
     visits: Sequence[Sequence[Answer]], calibration: BodyCalibration, settings: Settings, comparing: Comparing
 ) -> Compared:
-    from tactile_bayes.size.visits import Compared, contradictions
-
     found = [[answer for answer in maps if answer.shape is not None] for maps in visits]
     missing = [
         f"a lump was found on {len(some)} of {len(maps)} maps of visit {number}"
@@ -152,10 +161,6 @@ def _by_place(
     visits: Sequence[Sequence[Answer]], comparing: Comparing
 ) -> tuple[Compared | None, tuple[Apart | None, ...], list[Finding]]:
     """Refusal where the places do not show one mass, the distances from the first visit, and what else speaks of it."""
-    from tactile_bayes.api.pooled import place_of
-    from tactile_bayes.size.spread import LEAST_PROBABILITY
-    from tactile_bayes.size.visits import Compared, Place, apart, one_place_probability
-
     of_maps = [[place for answer in maps if (place := place_of(answer.document)) is not None] for maps in visits]
     places = [Place.mean_of(one) for one in of_maps]
     found = tuple(
@@ -192,11 +197,6 @@ def _sized(
     doubts: Sequence[Finding],
 ) -> Compared:
     """Sizes of visits that are of one mass, or why there are none."""
-    import numpy as np
-
-    from tactile_bayes.size.pooling import MOST_INVALID
-    from tactile_bayes.size.visits import Compared, joint_sizes, visit_calibrations
-
     # one order whatever the caller's, so that the order of a visit's maps leaves no trace
     shapes: list[list[ShapeDraws]] = [
         sorted((answer.shape for answer in maps if answer.shape is not None), key=lambda one: one.order)
@@ -244,10 +244,6 @@ def _sizes_apart(
     shapes: Sequence[Sequence[ShapeDraws]], fitted: Sequence[BodyCalibration], priors: SizePriors
 ) -> list[Finding]:
     """Cautions where the maps of one visit are not of one size."""
-    from tactile_bayes.report.pooled import disagreement
-    from tactile_bayes.size.pooling import log_sizes
-    from tactile_bayes.size.spread import LEAST_PROBABILITY, one_size_of
-
     found = []
     for number, (maps, at) in enumerate(zip(shapes, fitted, strict=True), start=1):
         chance = one_size_of(log_sizes(at, maps), priors.between_maps)
@@ -258,8 +254,6 @@ def _sizes_apart(
 
 def _fat_apart(shapes: Sequence[Sequence[ShapeDraws]], calibration: BodyCalibration) -> list[Finding]:
     """Caution where the maps differ too much in the depth of fat to be of one breast."""
-    from tactile_bayes.report.pooled import fat_apart
-
     fat = calibration.depth
     depths = None if fat is None else fat.apart([one.profile for maps in shapes for one in maps])
     return [] if depths is None else [fat_apart(depths)]
@@ -278,15 +272,11 @@ def _of_visits(visits: Sequence[Sequence[Answer]]) -> list[Finding]:
 
 def _refuse_repeated(visits: Sequence[Sequence[Answer]], names: Sequence[str]) -> None:
     """Refuse two maps of one scan: they are no two exams, and less apart than those would be."""
-    from tactile_bayes.files.provenance import repeated_scans
-
     for index, earlier in repeated_scans([_scans([one]) for one in chain.from_iterable(visits)]).items():
         raise UsageError(f"{names[index]} and {names[earlier]} are of one scan; give one map of each scan")
 
 
 def _scans(answers: Sequence[Answer]) -> list[Mapping[str, str]]:
-    from tactile_bayes.files.provenance import scans_of
-
     return [scan for one in answers if one.document is not None for scan in scans_of(one.document["provenance"])]
 
 
@@ -389,22 +379,16 @@ class Comparison:
     @property
     def text(self) -> str:
         """What ``compare`` prints."""
-        from tactile_bayes.report.compare import compare_summary
-
         return compare_summary(self.document)
 
     @property
     def full_text(self) -> str:
         """What ``compare -v`` prints."""
-        from tactile_bayes.report.compare import compare_text
-
         return compare_text(self.document)
 
     @door
     def plot(self, path: PathLike | None = None, *, force: bool = False) -> Figure:
         """Draw the visits' maps, their difference and the change; with a path also write it."""
-        from tactile_bayes.report.compare_figure import draw_comparison
-
         maps = [[one.outcome.tactile_map for one in visit] for visit in self.visits]
         drawn = drawn_maps(maps, [[one.answer for one in visit] for visit in self.visits])
         return draw_comparison(self.outcome.compared, self.document, drawn, path_of(path), force=force)

@@ -15,13 +15,18 @@ from tactile_bayes.api.arguments import check_keywords, door, in_keywords, plain
 from tactile_bayes.api.estimating import Answer, Outcome, answer_of, estimate_one
 from tactile_bayes.api.exam_report import EstimatedMap, ExamFiles, Given, make_exam, read_exam
 from tactile_bayes.api.maps import Map, PathLike, map_of, output_path, path_of
+from tactile_bayes.api.pooled import elsewhere, pool_answers
 from tactile_bayes.api.settings import Settings, refuse_checkpoint
 from tactile_bayes.api.sized import Draws, MassEstimate, Sized
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import UsageError
+from tactile_bayes.files.repeatability_json import read_repeatability
 from tactile_bayes.findings import Finding, findings_in
+from tactile_bayes.report.estimate_document import patient_mm
+from tactile_bayes.report.estimate_figures import draw_fit, draw_map, draw_size
 from tactile_bayes.report.exam_page import PageFiles
 from tactile_bayes.report.exam_words import Exam, headline
+from tactile_bayes.report.figure_file import named_exam
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -136,8 +141,6 @@ class SizeEstimate(SizedExam):
     @property
     def masses(self) -> tuple[MassEstimate, ...]:
         """All masses of the map, the surest first; this estimate is of the one that is `reported`."""
-        from tactile_bayes.report.estimate_document import patient_mm
-
         found, tactile_map = self.outcome.estimate, self.outcome.tactile_map
         return tuple(
             MassEstimate(
@@ -179,8 +182,6 @@ class SizeEstimate(SizedExam):
         path
             Also write it there, as PNG, PDF or SVG.
         """
-        from tactile_bayes.report.estimate_figures import draw_size
-
         size = self.outcome.estimate.size
         if size is None:
             return self.plot_map(path, force=force)
@@ -196,8 +197,6 @@ class SizeEstimate(SizedExam):
     @door
     def plot_map(self, path: PathLike | None = None, *, force: bool = False) -> Figure:
         """Draw the map with the lump's ellipse and size, or with the places looked at."""
-        from tactile_bayes.report.estimate_figures import draw_map
-
         return draw_map(self.outcome.tactile_map, self.outcome.estimate, path_of(path), name=self._titled, force=force)
 
     @door
@@ -209,8 +208,6 @@ class SizeEstimate(SizedExam):
         path
             Also write it there, as PNG, PDF or SVG.
         """
-        from tactile_bayes.report.estimate_figures import draw_fit
-
         if self.status != "estimate":
             return self.plot_map(path, force=force)
         return draw_fit(self.outcome.tactile_map, self.outcome.estimate, path_of(path), name=self._titled, force=force)
@@ -218,8 +215,6 @@ class SizeEstimate(SizedExam):
     @property
     def _titled(self) -> str:
         """Name for the titles of figures, with the subject's code and the scan's digest."""
-        from tactile_bayes.report.figure_file import named_exam
-
         return named_exam(self.name, self.outcome.provenance.scans)
 
     @door
@@ -284,8 +279,6 @@ class PooledSize(SizedExam):
         UsageError
             Without a size.
         """
-        from tactile_bayes.report.estimate_figures import draw_size
-
         size = self._size
         if size is None:
             raise UsageError(f"there is no size to draw: {self.why}")
@@ -334,8 +327,6 @@ def _properties(given: Any) -> tuple[tuple[str, float], ...]:
 
 
 def _repeatability(given: Any) -> Repeatability | None:
-    from tactile_bayes.files.repeatability_json import read_repeatability
-
     if given is None or hasattr(given, "between_maps"):
         return cast("Repeatability | None", given)
     return read_repeatability(path_of(given))
@@ -411,8 +402,6 @@ def pool(maps: Iterable[Any], **settings: Any) -> PooledSize:
     BadDataError
         As of `estimate`, and when the maps were normalised in several ways.
     """
-    from tactile_bayes.api.pooled import pool_answers
-
     used = settings_of(settings)
     refuse_checkpoint(used)
     found = estimated(_several(maps), settings)
@@ -437,8 +426,6 @@ def of_one_mass(found: Sequence[SizeEstimate]) -> tuple[SizeEstimate, ...]:
 
     Estimates of a place that somebody gave stay as they are.
     """
-    from tactile_bayes.api.pooled import elsewhere
-
     same = list(found)
     for i, place in elsewhere([one.answer.document for one in found]).items():
         outcome = same[i].outcome

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -159,8 +160,6 @@ def estimate_one(
     NotConvergedError
         When the method asked for does not converge.
     """
-    import math
-
     import numpy as np
 
     from tactile_bayes.files.provenance import Provenance, hash_inputs
@@ -417,8 +416,6 @@ def answer_of(outcome: Outcome) -> Answer:
 
 def pooling_shape(tactile_map: TactileMap, estimate: Estimate) -> ShapeDraws | None:
     """Draws that pooling needs of a map, with the direction of its axes if landmarks define it."""
-    import math
-
     from tactile_bayes.size.draws import ShapeDraws
     from tactile_bayes.size.fat import head_profile
 

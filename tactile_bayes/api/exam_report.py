@@ -13,7 +13,13 @@ from tactile_bayes.api.pooled import check_one_mass, elsewhere, pool_answers
 from tactile_bayes.api.settings import Settings, refuse_checkpoint
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, UsageError
-from tactile_bayes.files.atomic import given_twice
+from tactile_bayes.files.atomic import given_twice, sha256
+from tactile_bayes.files.documents import load_json
+from tactile_bayes.files.estimate_json import check_estimate
+from tactile_bayes.files.map_nc import read_map_and_scans
+from tactile_bayes.files.posterior_nc import is_posterior, read_estimate
+from tactile_bayes.files.provenance import scans_of
+from tactile_bayes.files.reading import HDF5_MAGIC, open_input
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.records import dataclass
 from tactile_bayes.report.exam_words import Exam, exam_map
@@ -99,9 +105,6 @@ def _is_json(path: Path) -> bool:
 
 
 def _is_posterior(path: Path) -> bool:
-    from tactile_bayes.files.posterior_nc import is_posterior
-    from tactile_bayes.files.reading import HDF5_MAGIC, open_input
-
     with open_input(path) as file:
         netcdf = file.read(len(HDF5_MAGIC)) == HDF5_MAGIC
     return netcdf and is_posterior(path)
@@ -164,8 +167,6 @@ def _document(answer: Answer) -> dict[str, Any]:
 
 
 def _estimated(path: Path, settings: Settings, notice: Notice | None) -> EstimatedMap:
-    from tactile_bayes.files.map_nc import read_map_and_scans
-
     tactile_map, scans = read_map_and_scans(path)
     told = None if notice is None else lambda line: notice(f"{path}: {line}")
     try:
@@ -177,10 +178,6 @@ def _estimated(path: Path, settings: Settings, notice: Notice | None) -> Estimat
 
 def _from_estimate(source: Path, path: Path | None, given: Given) -> Exam:
     """Exam of an estimate, and of its map where that is given: the estimate must name it by its digest."""
-    from tactile_bayes.files.atomic import sha256
-    from tactile_bayes.files.map_nc import read_map_and_scans
-    from tactile_bayes.files.provenance import scans_of
-
     document = _read_estimate(source)
     scans: Scans = scans_of(document["provenance"])
     tactile_map = None
@@ -195,10 +192,6 @@ def _from_estimate(source: Path, path: Path | None, given: Given) -> Exam:
 
 def _read_estimate(source: Path) -> dict[str, Any]:
     """An estimate's JSON object, from its JSON or its posterior's file."""
-    from tactile_bayes.files.documents import load_json
-    from tactile_bayes.files.estimate_json import check_estimate
-    from tactile_bayes.files.posterior_nc import read_estimate
-
     if not _is_json(source):
         return read_estimate(source)
     document: Any = load_json(source, way_out="give what `estimate --json` printed for one map")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, overload
@@ -14,9 +14,16 @@ import numpy as np
 
 from tactile_bayes.api.arguments import check_keywords, door, plain
 from tactile_bayes.errors import UsageError, check_number
-from tactile_bayes.files.atomic import Format, check_suffix
+from tactile_bayes.files.atomic import Format, check_suffix, sha256
+from tactile_bayes.files.map_nc import read_map_and_scans, write_map
+from tactile_bayes.files.provenance import Provenance, repeated_scans, scan_facts
+from tactile_bayes.files.scene_toml import read_scene
 from tactile_bayes.findings import finding_lines
+from tactile_bayes.mapping import build_map as build
+from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.report.map_figure import map_figure
+from tactile_bayes.scan import Scan
 
 if TYPE_CHECKING:
     import pandas
@@ -97,8 +104,6 @@ def map_provenance(paths: Sequence[Path], scans: Sequence[Scan], settings: Mappi
     settings
         By the names of the command's options.
     """
-    from tactile_bayes.files.provenance import Provenance
-
     facts = exam_facts(paths, scans)
     inputs = {f"scan_{number}": fact["sha256"] for number, fact in enumerate(facts, start=1)}
     return Provenance("map", settings, inputs, scans=facts)
@@ -106,9 +111,6 @@ def map_provenance(paths: Sequence[Path], scans: Sequence[Scan], settings: Mappi
 
 def exam_facts(paths: Sequence[Path], scans: Sequence[Scan]) -> list[dict[str, str]]:
     """Digests of each scan and what it says of its exam, for `Provenance.scans`."""
-    from tactile_bayes.files.atomic import sha256
-    from tactile_bayes.files.provenance import scan_facts
-
     return [
         scan_facts(scan.session, frames=scan.frames.sha256, file=sha256(path))
         for path, scan in zip(paths, scans, strict=True)
@@ -177,8 +179,6 @@ class Map:
     @door
     def plot(self, path: PathLike | None = None, *, force: bool = False) -> Figure:
         """Draw the map beside its coverage; with a path also write it as PNG, PDF or SVG."""
-        from tactile_bayes.report.map_figure import map_figure
-
         return map_figure(self.tactile_map, path_of(path), force=force)
 
     @door
@@ -190,8 +190,6 @@ class Map:
         UsageError
             When the file exists and `force` is false.
         """
-        from tactile_bayes.files.map_nc import write_map
-
         write_map(output_path(path, "netCDF"), self.tactile_map, provenance=_provenance(self), force=force)
 
     def __repr__(self) -> str:
@@ -228,8 +226,6 @@ def read_map(path: PathLike) -> Map:
     BadDataError
         When the file is no map, or is damaged.
     """
-    from tactile_bayes.files.map_nc import read_map_and_scans
-
     source = required_path(path, "path")
     tactile_map, scans = read_map_and_scans(source)
     return Map(tactile_map, source, scans=scans)
@@ -253,9 +249,6 @@ def build_map(scans: Any, **options: Any) -> Map:
     UsageError
         When an option cannot be so, or a recording is given twice.
     """
-    from tactile_bayes.files.provenance import repeated_scans, scan_facts
-    from tactile_bayes.mapping import build_map as build
-
     check_keywords("build_map", options, set(inspect.signature(build).parameters) - {"scans"})
     given = [scans] if isinstance(scans, str | Path) or not isinstance(scans, Sequence) else list(scans)
     loaded: list[Scan] = []
@@ -277,8 +270,6 @@ def build_map(scans: Any, **options: Any) -> Map:
 
 
 def _scan_of(given: Any) -> Scan:
-    from tactile_bayes.scan import Scan
-
     scan = getattr(given, "scan", given)
     if not isinstance(scan, Scan):
         kind = type(given).__name__
@@ -306,7 +297,6 @@ def simulate(
     SimulatedScan
         `scan`, and `truth` as plain data.
     """
-    from tactile_bayes.files.scene_toml import read_scene
     from tactile_bayes.forward.simulate import simulate as run
 
     read = read_scene(required_path(scene, "scene"))
@@ -333,8 +323,6 @@ def map_of(given: Any) -> Map:
     UsageError
         When it is none of them.
     """
-    from tactile_bayes.mapping.map import TactileMap
-
     if isinstance(given, Map):
         return given
     if isinstance(given, str | Path):
@@ -348,8 +336,4 @@ def map_of(given: Any) -> Map:
 
 
 def _provenance(made: Map) -> Provenance:
-    from dataclasses import asdict
-
-    from tactile_bayes.files.provenance import Provenance
-
     return Provenance("map", {"called_from": "Python", **asdict(made.tactile_map.recipe)}, scans=made.scans)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
+from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,9 +15,18 @@ from tactile_bayes.api.repeatability import check_repeatability, repeatability_d
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, UsageError
+from tactile_bayes.files.provenance import Provenance, hash_inputs, scans_of
+from tactile_bayes.files.shipped import default_for, size_calibration_path
+from tactile_bayes.files.size_json import read_size_calibration
+from tactile_bayes.posterior.estimate import way_to_head
 from tactile_bayes.presets import MATCH_MM
 from tactile_bayes.records import dataclass
+from tactile_bayes.report.pooled import pooled_document
+from tactile_bayes.size.bodies import BodyCalibration
+from tactile_bayes.size.pooling import DISAGREE, PooledEstimate, pool_maps
+from tactile_bayes.size.spread import LEAST_PROBABILITY
 from tactile_bayes.size.visits import Place as PatientPlace
+from tactile_bayes.size.visits import one_place_probability
 
 if TYPE_CHECKING:
     from tactile_bayes.files.provenance import Provenance
@@ -178,13 +188,6 @@ def pool_answers(
     UsageError
         When the calibration cannot pool maps.
     """
-    import numpy as np
-
-    from tactile_bayes.files.provenance import Provenance, hash_inputs, scans_of
-    from tactile_bayes.report.pooled import pooled_document
-    from tactile_bayes.size.pooling import DISAGREE, pool_maps
-    from tactile_bayes.size.visits import one_place_probability
-
     documents = [answer.document for answer in answers if answer.document is not None]
     scans = [scan for document in documents for scan in scans_of(document["provenance"])]
     check_one_mass(scans)
@@ -226,8 +229,6 @@ def pool_answers(
 
 def _too_far(answers: Sequence[Answer]) -> PooledEstimate | None:
     """Reason for no size where a map is too far outside the calibration's range; else None."""
-    from tactile_bayes.size.pooling import PooledEstimate
-
     for i, answer in enumerate(answers):
         if answer.document is not None and answer.document["reason_code"] == "extrapolated":
             return PooledEstimate("no_estimate", f"map {i + 1}: {answer.document['reason']}")
@@ -236,8 +237,6 @@ def _too_far(answers: Sequence[Answer]) -> PooledEstimate | None:
 
 def _none_can_show(documents: Sequence[Mapping[str, Any]]) -> PooledEstimate | None:
     """Reason for no size where the cells of all maps are too large to show a lump; else None."""
-    from tactile_bayes.size.pooling import PooledEstimate
-
     if any(one["reason_code"] != "coarse" for one in documents):
         return None
     return PooledEstimate("no_estimate", "the maps cannot show whether there is a lump: their cells are too large")
@@ -245,13 +244,6 @@ def _none_can_show(documents: Sequence[Mapping[str, Any]]) -> PooledEstimate | N
 
 def _apart(places: Sequence[Place], chance: float | None) -> PooledEstimate | None:
     """Reason for no size where landmarks show that the maps are of several masses; else None."""
-    from itertools import combinations
-
-    import numpy as np
-
-    from tactile_bayes.size.pooling import DISAGREE, PooledEstimate
-    from tactile_bayes.size.spread import LEAST_PROBABILITY
-
     if chance is None or chance >= LEAST_PROBABILITY:
         return None
     most = max(float(np.hypot(*(a.centre_mm - b.centre_mm))) for a, b in combinations(places, 2))
@@ -282,8 +274,6 @@ def check_one_mass(scans: Sequence[Mapping[str, str]]) -> None:
 
 def _shipped_for(answers: Sequence[Answer]) -> str:
     """Shipped calibration for maps that are all normalised alike."""
-    from tactile_bayes.files.shipped import default_for
-
     ways = sorted({answer.normalise for answer in answers})
     if len(ways) > 1:
         raise BadDataError(
@@ -295,10 +285,6 @@ def _shipped_for(answers: Sequence[Answer]) -> str:
 
 def _calibration(answers: Sequence[Answer], settings: Settings) -> tuple[Path | None, BodyCalibration]:
     """The calibration that pools, and its file if it is in one."""
-    from tactile_bayes.files.shipped import size_calibration_path
-    from tactile_bayes.files.size_json import read_size_calibration
-    from tactile_bayes.size.bodies import BodyCalibration
-
     path, calibration = None, settings.calibration
     if calibration is None or isinstance(calibration, str):
         path = size_calibration_path(calibration or _shipped_for(answers))
@@ -315,8 +301,6 @@ def _calibration(answers: Sequence[Answer], settings: Settings) -> tuple[Path | 
 
 def _check_heads(answers: Sequence[Answer], calibration: BodyCalibration, names: Sequence[str]) -> None:
     """Refuse a map that was made with another head than the calibration's."""
-    from tactile_bayes.posterior.estimate import way_to_head
-
     for answer, name in zip(answers, names, strict=True):
         differs = calibration.recipe.head_differences(answer.head)
         if differs:

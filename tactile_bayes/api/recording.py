@@ -8,6 +8,7 @@ import click
 
 from tactile_bayes.api.arguments import check_keywords, door
 from tactile_bayes.api.maps import PathLike, path_of
+from tactile_bayes.commands.record import Request, command, make_recording
 from tactile_bayes.errors import DeviceError, UsageError, check_number
 
 if TYPE_CHECKING:
@@ -47,8 +48,6 @@ def record(output: PathLike, *, head: str, duration_s: float, **options: Any) ->
     UsageError
         When options contradict each other, or the file exists and `force` is false.
     """
-    from tactile_bayes.commands.record import Request, command, make_recording
-
     words = ["-o", str(path_of(output)), "--head", head]
     context = command.make_context("record", words)
     defaults = context.params

@@ -7,8 +7,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from tactile_bayes.declarations import replace
+from tactile_bayes.declarations import replace, to_plain
 from tactile_bayes.errors import BadDataError, UsageError
+from tactile_bayes.files.atomic import sha256
 from tactile_bayes.files.campaign_names import DONE, ESTIMATE, EXAMS, SHAPE, exam_name, mass_name
 from tactile_bayes.records import dataclass
 
@@ -137,7 +138,6 @@ def learn_from_exams(
     UsageError
         When the calibration's file is not found, or it is not learned over bodies.
     """
-    from tactile_bayes.declarations import to_plain
     from tactile_bayes.files.provenance import Provenance
     from tactile_bayes.files.repeatability_json import repeatability_document
     from tactile_bayes.size.learn.site import FEWEST_MASSES, PRIOR_LOG_SD, PRIOR_MEDIAN, learn_repeatability
@@ -203,7 +203,6 @@ def _repeats(exams: Sequence[ExamFolder]) -> tuple[list[list[_Repeat]], list[str
 
 def _read(exam: ExamFolder) -> _Repeat | None:
     """What an exam's estimate says of it; None where it has no size."""
-    from tactile_bayes.files.atomic import sha256
     from tactile_bayes.files.documents import check_document, load_json
     from tactile_bayes.files.provenance import recordings, scans_of
 
@@ -244,7 +243,6 @@ def _calibration_named(repeats: Sequence[_Repeat]) -> tuple[str, str]:
 
 def _calibration(name: str, digest: str, given: str | None) -> BodyCalibration:
     """The calibration with this digest: the one given, or that of the name, or a shipped one."""
-    from tactile_bayes.files.atomic import sha256
     from tactile_bayes.files.shipped import SHIPPED, size_calibration_path
     from tactile_bayes.files.size_json import read_size_calibration
     from tactile_bayes.size.bodies import BodyCalibration

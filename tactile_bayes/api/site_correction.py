@@ -9,9 +9,23 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from tactile_bayes.api.estimating import estimate_file, pooling_shape
+from tactile_bayes.api.settings import Settings
+from tactile_bayes.api.size_calibration import table_recipe
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, UsageError
-from tactile_bayes.presets import LEAST_HARD_RATIO
+from tactile_bayes.files.documents import load_json
+from tactile_bayes.files.provenance import Provenance, hash_inputs
+from tactile_bayes.files.reading import open_input
+from tactile_bayes.files.shipped import SHIPPED, size_calibration_path
+from tactile_bayes.files.size_json import read_size_calibration, write_size_calibration
+from tactile_bayes.files.tables import read_table
+from tactile_bayes.forward.body import parse_seat
+from tactile_bayes.presets import HEAD_PROFILE, LEAST_HARD_RATIO
+from tactile_bayes.size.bodies import BodyCalibration
+from tactile_bayes.size.draws import ShapeDraws
 
 if TYPE_CHECKING:
     from tactile_bayes.api.estimating import Progress
@@ -47,9 +61,6 @@ class Corrected:
 
     def write(self, path: Path, *, force: bool = False) -> None:
         """Write the file that `estimate --size-calibration` takes."""
-        from tactile_bayes.files.provenance import Provenance, hash_inputs
-        from tactile_bayes.files.size_json import write_size_calibration
-
         assert self.calibration.site is not None
         provenance = Provenance("calibrate size", self.settings, hash_inputs(**self.inputs), seed=self.seed)
         write_size_calibration(path, self.calibration, base=self.base, provenance=provenance, force=force)
@@ -86,10 +97,6 @@ def correct_size(
     UsageError
         When the calibration cannot be corrected, or options do not go with the table.
     """
-    from tactile_bayes.files.documents import load_json
-    from tactile_bayes.files.shipped import SHIPPED, size_calibration_path
-    from tactile_bayes.files.size_json import read_size_calibration
-    from tactile_bayes.size.bodies import BodyCalibration
     from tactile_bayes.size.learn.site import correct_calibration
 
     path = size_calibration_path(base)
@@ -121,8 +128,6 @@ def correct_size(
 def _header(source: Path | Sheet) -> list[str]:
     """The names in a table's first line."""
     if isinstance(source, Path):
-        from tactile_bayes.files.reading import open_input
-
         with open_input(source) as file:
             first = file.readline(4096).decode("utf-8-sig", errors="replace")
     else:
@@ -139,11 +144,6 @@ def _refuse(declared: Mapping[str, Any]) -> None:
 
 def _from_bumps(source: Path | Sheet, calibration: BodyCalibration, declared: Mapping[str, Any]) -> _Phantoms:
     """The phantoms of a table of amplitudes and widths."""
-    import numpy as np
-
-    from tactile_bayes.files.tables import read_table
-    from tactile_bayes.presets import HEAD_PROFILE
-    from tactile_bayes.size.draws import ShapeDraws
     from tactile_bayes.size.learn.site import PhantomMap
 
     rows = read_table(source, "size_table.table.json")
@@ -170,9 +170,6 @@ def _from_bumps(source: Path | Sheet, calibration: BodyCalibration, declared: Ma
 
 def _from_maps(source: Path | Sheet, base: str, *, seed: int, progress: Progress | None) -> _Phantoms:
     """The phantoms of a table of map files, each estimated by the calibration's recipe."""
-    from tactile_bayes.api.estimating import estimate_file, pooling_shape
-    from tactile_bayes.api.settings import Settings
-    from tactile_bayes.files.tables import read_table
     from tactile_bayes.size.learn.site import PhantomMap
 
     rows = read_table(source, "phantom_maps.table.json")
@@ -213,8 +210,6 @@ def _names(rows: Table, otherwise: list[str]) -> list[str]:
 
 def _known(rows: Table, i: int) -> dict[str, float]:
     """The properties of a row's phantom, by the names of `HiddenTerms`."""
-    from tactile_bayes.forward.body import parse_seat
-
     row = {name: values[i] for name, values in rows.columns.items()}
     found: dict[str, float] = {}
     if row["depth_ratio"] is not None:
@@ -239,8 +234,6 @@ def _too_soft(rows: Table, i: int) -> str | None:
 
 def _check_recipe(rows: Table, calibration: BodyCalibration, declared: Mapping[str, Any]) -> None:
     """Refuse a table of maps that were made or fitted otherwise than the calibration's."""
-    from tactile_bayes.api.size_calibration import table_recipe
-
     recipe, ours = table_recipe(rows, declared), calibration.recipe
     differs = ours.differences(
         normalise=recipe.normalise,

@@ -7,8 +7,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, cast
 
-from tactile_bayes.errors import BadDataError
+import numpy as np
+
+from tactile_bayes.declarations import replace
+from tactile_bayes.errors import BadDataError, NotConvergedError, UsageError
+from tactile_bayes.files.reading import open_input
 from tactile_bayes.presets import FIT_RADIUS_MM, LEAST_HARD_RATIO, Background, Noise
+from tactile_bayes.scan import HeadShape
+from tactile_bayes.size.terms import Recipe
 
 if TYPE_CHECKING:
     from tactile_bayes.api.estimating import Progress
@@ -76,9 +82,6 @@ def learn_eq6(
     NotConvergedError
         When the sampler does not converge.
     """
-    import numpy as np
-
-    from tactile_bayes.declarations import replace
     from tactile_bayes.size.learn.eq6 import learn_size_calibration, learn_two_stage, other_fit
 
     recipe = table_recipe(rows, declared)
@@ -143,9 +146,7 @@ def learn_population(
     NotConvergedError
         When the posterior has no mode.
     """
-    from tactile_bayes.declarations import replace
     from tactile_bayes.size.learn import bodies as learning
-    from tactile_bayes.size.terms import Recipe
     from tactile_bayes.studies.population import measuring_options, population_table, table_bodies, table_head
 
     fit = measuring_options().fit
@@ -180,8 +181,6 @@ def learn_population(
 def is_population(source: Path | Sheet) -> bool:
     """Whether a table is one of `population`: exams of bodies, by its header."""
     if isinstance(source, Path):
-        from tactile_bayes.files.reading import open_input
-
         with open_input(source) as file:
             header = file.readline(4096).decode("utf-8-sig", errors="replace")
     else:
@@ -204,9 +203,6 @@ def table_recipe(table: Table, declared: Mapping[str, Any]) -> Recipe:
     UsageError
         When a level is to be fixed on maps that have none.
     """
-    from tactile_bayes.errors import UsageError
-    from tactile_bayes.size.terms import Recipe
-
     said = {name: _alike(table, name) for name in (*declared, "flat_field")}
     for name, value in declared.items():
         if None not in (value, said[name]) and value != said[name]:
@@ -232,8 +228,6 @@ def table_recipe(table: Table, declared: Mapping[str, Any]) -> Recipe:
 
 def _named_head(table: Table) -> HeadShape | None:
     """Head that a table of lumps names; None where it does not."""
-    from tactile_bayes.scan import HeadShape
-
     names = ("head_rows", "head_columns", "head_pitch_mm")
     values = [_alike(table, name) for name in names]
     if values == [None, None, None]:
@@ -265,7 +259,6 @@ def _contradiction(table: Table, name: str, said: object, declared: object) -> B
 
 def _left_out(lumps: SizeTable, fit: EqSixFit, *, least_stiffness_ratio: float) -> tuple[LeftOutErrors | None, str]:
     """Cross-validated errors, or the reason why Eq 6 has none."""
-    from tactile_bayes.errors import NotConvergedError
     from tactile_bayes.size.learn.cross_validation import left_out_of_study
     from tactile_bayes.size.learn.eq6 import axis_in_two_stages
 
@@ -302,9 +295,6 @@ def rows_of_one_way(rows: Table, normalise: str | None) -> tuple[Normalise, dict
 
 def size_table(table: Table, *, least_stiffness_ratio: float = 0.0) -> SizeTable:
     """Columns of a table as arrays, with Delta sigma where depths are given; without softer lumps."""
-    import numpy as np
-
-    from tactile_bayes.errors import BadDataError
     from tactile_bayes.size.learn.eq6 import SizeTable, width_changes
 
     # only lumps marked as detectable: fits to the others describe a trough
@@ -340,8 +330,6 @@ def size_table(table: Table, *, least_stiffness_ratio: float = 0.0) -> SizeTable
 
 def _study_cases(columns: dict[str, list[Any]]) -> StudyCases | None:
     """Study case of each row; None where a row lacks the lump's stiffness."""
-    import numpy as np
-
     from tactile_bayes.size.learn.eq6 import StudyCases
 
     if None in columns["stiffness_ratio"]:

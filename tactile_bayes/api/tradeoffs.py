@@ -7,9 +7,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tactile_bayes.api.estimating import Answer, answer_of, estimate_file, estimate_inputs
+from tactile_bayes.api.pooled import of_one_mass, pool_answers
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, UsageError
+from tactile_bayes.files.map_nc import read_map
 
 if TYPE_CHECKING:
     from tactile_bayes.mapping.map import TactileMap
@@ -30,7 +32,6 @@ def tradeoff_of_map(path: Path, settings: Settings, work: Work) -> tuple[Tactile
     UsageError
         When the settings name a checkpoint: the runs are many.
     """
-    from tactile_bayes.files.map_nc import read_map
     from tactile_bayes.studies.estimate_tradeoff import measure
 
     _refuse_checkpoint(settings)
@@ -52,7 +53,6 @@ def pooled_rows(paths: Sequence[Path], settings: Settings, *, clock: Clock) -> t
     UsageError
         When the calibration cannot pool maps.
     """
-    from tactile_bayes.api.pooled import of_one_mass, pool_answers
     from tactile_bayes.studies.estimate_tradeoff import PooledRow
 
     def at_place(i: int, place: tuple[float, float]) -> Answer:

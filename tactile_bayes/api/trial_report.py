@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from tactile_bayes.errors import check_choice, check_number
+from tactile_bayes.presets import INTERVAL, RESEARCH_USE
 from tactile_bayes.records import dataclass
 
 if TYPE_CHECKING:
@@ -50,7 +52,6 @@ class TrialOutcome:
 
 def intervals_of(settings: TrialSettings) -> Intervals:
     """Intervals of a report: probability and method."""
-    from tactile_bayes.presets import INTERVAL
     from tactile_bayes.trial.figures import Intervals
 
     return Intervals(INTERVAL, method=settings.intervals, resamples=settings.resamples, seed=settings.seed)
@@ -66,7 +67,6 @@ def analyse(
     protocol, title
         File and title of the pre-specified analysis, where there is one.
     """
-    from tactile_bayes.presets import RESEARCH_USE
     from tactile_bayes.report.trial import as_document, checks_document
     from tactile_bayes.trial.planning import check_all
     from tactile_bayes.trial.summary import summarise
@@ -98,7 +98,6 @@ def _next_mass(inputs: TrialInputs, settings: TrialSettings) -> NextMass:
     import numpy as np
 
     from tactile_bayes.api.trial_sampler import draw
-    from tactile_bayes.presets import INTERVAL
     from tactile_bayes.trial.next_mass import next_mass
 
     return next_mass(
@@ -112,10 +111,7 @@ def _next_mass(inputs: TrialInputs, settings: TrialSettings) -> NextMass:
 
 
 def _provenance(inputs: TrialInputs, settings: TrialSettings, protocol: Path | None) -> dict[str, Any]:
-    from dataclasses import asdict
-
     from tactile_bayes.files.provenance import Provenance, hash_inputs
-    from tactile_bayes.presets import INTERVAL
 
     files = inputs.files | ({} if protocol is None else {"protocol": protocol})
     kept = {name: value for name, value in asdict(settings).items() if name != "seed"}

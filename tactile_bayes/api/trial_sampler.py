@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tactile_bayes.errors import NotConvergedError
+from tactile_bayes.inference.importance import importance, importance_options
+from tactile_bayes.inference.modes import mode_and_covariance
 
 if TYPE_CHECKING:
     from tactile_bayes.geometry import FloatArray
@@ -35,8 +37,6 @@ def draw(
         When MCMC, too, does not reach its criteria.
     """
     from tactile_bayes.inference.ensemble import ensemble
-    from tactile_bayes.inference.importance import importance, importance_options
-    from tactile_bayes.inference.modes import mode_and_covariance
 
     try:
         mode, about, _ = mode_and_covariance(log_density, centre, scale=np.sqrt(np.diag(covariance)))

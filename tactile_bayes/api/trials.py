@@ -10,8 +10,20 @@ from typing import TYPE_CHECKING, Any, cast
 
 from tactile_bayes.api.arguments import check_keywords, door, plain
 from tactile_bayes.api.maps import PathLike, output_path, path_of, required_path
+from tactile_bayes.api.repeatability import exams_in, learn_from_exams
+from tactile_bayes.api.site_correction import correct_size
+from tactile_bayes.api.size_calibration import FORMS, is_population, learn_eq6, learn_population
+from tactile_bayes.api.trial_report import TrialSettings, analyse
 from tactile_bayes.errors import UsageError, check_choice, check_number
+from tactile_bayes.files.column_map import read_mapping, read_wide, read_wide_excision
+from tactile_bayes.files.estimate_json import fill_from_posteriors
+from tactile_bayes.files.provenance import Provenance, hash_inputs
+from tactile_bayes.files.size_json import write_size_calibration
+from tactile_bayes.files.tables import Sheet, check_references, read_table
 from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.report.trial import trial_text
+from tactile_bayes.trial.readings import readings_from_columns
+from tactile_bayes.trial.visits import at_excision
 
 if TYPE_CHECKING:
     import pandas
@@ -55,12 +67,6 @@ def load_trial(
     tidy_trial
         Whether the trial is tidy whatever the mapping holds.
     """
-    from tactile_bayes.files.column_map import read_mapping, read_wide
-    from tactile_bayes.files.estimate_json import fill_from_posteriors
-    from tactile_bayes.files.tables import Sheet, check_references, read_table
-    from tactile_bayes.trial.readings import readings_from_columns
-    from tactile_bayes.trial.visits import at_excision
-
     sizes = read_excision(excision, columns)
     if columns is None or tidy_trial or isinstance(trial, Sheet) or "reading" not in read_mapping(columns):
         table = read_table(trial, "trial.table.json")
@@ -85,9 +91,6 @@ def load_trial(
 
 def read_excision(excision: Path | Sheet, columns: Path | None) -> Table:
     """Sizes after excision: from a wide table where the mapping has ``[excision]``, otherwise from a tidy one."""
-    from tactile_bayes.files.column_map import read_mapping, read_wide_excision
-    from tactile_bayes.files.tables import read_table
-
     if columns is None or not isinstance(excision, Path) or "excision" not in read_mapping(columns):
         return read_table(excision, "excision.table.json")
     return read_wide_excision(excision, columns)
@@ -116,8 +119,6 @@ class TrialResult:
     @property
     def text(self) -> str:
         """What ``validate --methods`` prints."""
-        from tactile_bayes.report.trial import trial_text
-
         more = [] if self.outcome.next_mass is None else self.outcome.next_mass.lines()
         return trial_text(self.outcome.report, methods=True, checks=self.outcome.checks, more=more)
 
@@ -170,8 +171,6 @@ def validate(
     BadDataError
         Naming the table, the line (1 is the header), the column, the value and the way out.
     """
-    from tactile_bayes.api.trial_report import TrialSettings, analyse
-
     check_keywords("validate", settings, [one.name for one in fields(TrialSettings)])
     used = TrialSettings(**{name: plain(value) for name, value in settings.items()})
     inputs = load_trial(_table(trial, "trial"), _table(excision, "excision"), path_of(columns))
@@ -227,12 +226,6 @@ def calibrate_size(
     UsageError
         When a keyword's value cannot be one, or goes with another form.
     """
-    from tactile_bayes.api.site_correction import correct_size
-    from tactile_bayes.api.size_calibration import FORMS, is_population, learn_eq6, learn_population
-    from tactile_bayes.files.provenance import Provenance, hash_inputs
-    from tactile_bayes.files.size_json import write_size_calibration
-    from tactile_bayes.files.tables import read_table
-
     check_choice("form", form, FORMS)
     check_choice("fit", fit, ("joint", "two-stage"))
     check_number("seed", seed, 0, whole=True)
@@ -296,8 +289,6 @@ def calibrate_repeatability(
     UsageError
         When the calibration's file is not found.
     """
-    from tactile_bayes.api.repeatability import exams_in, learn_from_exams
-
     target = None if path is None else output_path(path, "JSON")
     given = None if size_calibration is None else str(size_calibration)
     learned = learn_from_exams(exams_in(required_path(folder, "folder")), size_calibration=given)
@@ -308,8 +299,6 @@ def calibrate_repeatability(
 
 def _table(given: PathLike | pandas.DataFrame, name: str) -> Path | Sheet:
     """Return a path as it is, and a DataFrame as CSV text."""
-    from tactile_bayes.files.tables import Sheet
-
     if hasattr(given, "to_csv"):
         return Sheet(Path(f"{name} (DataFrame)"), given.to_csv(index=False))
     return required_path(given, name)

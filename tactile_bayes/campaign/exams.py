@@ -10,8 +10,10 @@ from pathlib import Path
 from typing import Any, Final
 
 from tactile_bayes.errors import BadDataError, UsageError
+from tactile_bayes.files.atomic import sha256
 from tactile_bayes.files.campaign_names import JOURNAL
 from tactile_bayes.files.manifest_csv import natural
+from tactile_bayes.files.map_nc import read_map_and_scans
 from tactile_bayes.files.remote import check_address, fetched, files_below, is_address
 from tactile_bayes.records import dataclass
 
@@ -70,8 +72,6 @@ def _of_scan(path: Path) -> Said:
 
 
 def _of_map(path: Path) -> Said:
-    from tactile_bayes.files.map_nc import read_map_and_scans
-
     _, scans = read_map_and_scans(path)
     return Said(_facts(scans), frozenset(one["sha256"] for one in scans if "sha256" in one))
 
@@ -183,8 +183,6 @@ class FolderFiles:
                 yield name, original
 
     def _digest(self, name: str) -> str:
-        from tactile_bayes.files.atomic import sha256
-
         if name not in self._digests:
             self._digests[name] = sha256(self.paths[name])
         return self._digests[name]

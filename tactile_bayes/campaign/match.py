@@ -10,12 +10,15 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from tactile_bayes.api.estimating import estimate_file
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.campaign_names import COMPARED, GROWTH
 from tactile_bayes.files.documents import load_json, load_schema
 from tactile_bayes.files.manifest_csv import Exam, natural, table_text
+from tactile_bayes.files.map_nc import read_map
 from tactile_bayes.findings import Finding, finding_lines
+from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.records import dataclass
 from tactile_bayes.report.compare import Growth, of_document
 from tactile_bayes.trial.visits import day_of, in_order
@@ -102,8 +105,6 @@ def matched_outcome(
     BadDataError
         When several masses of the map may be the one, or its place lies off the map.
     """
-    from tactile_bayes.api.estimating import estimate_file
-
     outcome = estimate_file(path, settings)
     tactile_map, masses = outcome.tactile_map, outcome.estimate.masses
     wanted = places_on(tactile_map, places)
@@ -134,8 +135,6 @@ def _within(outcome: Outcome, place: tuple[float, float], most_mm: float) -> boo
 
 def _not_there(outcome: Outcome, mass: str, place: tuple[float, float], most_mm: float) -> Outcome:
     """The outcome without its estimate, which is of a lump elsewhere."""
-    from tactile_bayes.posterior.result import Estimate
-
     found = outcome.estimate
     reason = f"no lump found within {most_mm:g} mm of mass {mass}'s place, ({place[0]:.1f}, {place[1]:.1f}) mm"
     masses = tuple(replace(one, reported=False) for one in found.masses)
@@ -152,8 +151,6 @@ def _not_there(outcome: Outcome, mass: str, place: tuple[float, float], most_mm:
 
 def places_on(tactile_map: TactileMap, places: Sequence[NamedPlace]) -> dict[str, tuple[float, float]]:
     """Where masses lie on a map, by their code: through the landmarks, or as they are where a scan has none."""
-    from tactile_bayes.files.map_nc import read_map
-
     found = {}
     for one in places:
         there = read_map(one.path).patient_from_plane
@@ -179,8 +176,6 @@ def nearest(wanted: Mapping[str, tuple[float, float]], place: tuple[float, float
 
 def in_own_axes(tactile_map: TactileMap, places: Sequence[NamedPlace]) -> bool:
     """Whether places are compared in the maps' own axes."""
-    from tactile_bayes.files.map_nc import read_map
-
     return any(one.patient_from_plane is None for one in (tactile_map, *(read_map(place.path) for place in places)))
 
 

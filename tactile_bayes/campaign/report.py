@@ -8,11 +8,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from tactile_bayes import __version__
+from tactile_bayes.api.trial_report import TrialSettings, analyse
+from tactile_bayes.api.trials import load_trial, read_excision
 from tactile_bayes.campaign.match import growth_rows, growth_text
 from tactile_bayes.campaign.run import Campaign
 from tactile_bayes.campaign.tables import Row, exam_rows, write_tables
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, UsageError
+from tactile_bayes.files.atomic import write_text
 from tactile_bayes.files.campaign_names import (
     DONE,
     ESTIMATE,
@@ -29,9 +32,15 @@ from tactile_bayes.files.campaign_names import (
     THUMBNAIL,
     TRIAL,
 )
+from tactile_bayes.files.documents import check_document, dump_json, read_protocol
+from tactile_bayes.files.reading import IMAGE_BYTES, read_bytes
+from tactile_bayes.files.remote import put
 from tactile_bayes.records import dataclass
+from tactile_bayes.report.campaign_html import campaign_html, worst
 from tactile_bayes.report.compare import Growth, growth_line
 from tactile_bayes.report.quantities import leading
+from tactile_bayes.report.trial import trial_text
+from tactile_bayes.report.trial_html import trial_html
 from tactile_bayes.trial.visits import at_excision
 
 if TYPE_CHECKING:
@@ -67,8 +76,6 @@ class Excision:
 
     def table(self) -> Table:
         """Read and check the table."""
-        from tactile_bayes.api.trials import read_excision
-
         return read_excision(self.path, self.columns)
 
     def masses(self) -> set[tuple[str, str]]:
@@ -123,8 +130,6 @@ def write_outputs(campaign: Campaign, excision: Excision | None, protocol: Path 
     BadDataError
         When the table of excision sizes or the protocol is at fault.
     """
-    from tactile_bayes.files.atomic import write_text
-
     rows = exam_rows(campaign)
     masses = None if excision is None else excision.masses()
     write_tables(campaign, rows, masses, campaign.folder)
@@ -170,8 +175,6 @@ def copy_outputs(folder: Path, address: str) -> None:
     UsageError
         When the store does not take it; what is done is kept.
     """
-    from tactile_bayes.files.remote import put
-
     for name in (*WRITTEN, JOURNAL):
         if (folder / name).exists():
             put(folder / name, f"{address}/{name}")
@@ -226,9 +229,6 @@ def _check_dates(excision: Excision, exams: Sequence[Exam]) -> None:
 
 def _trial_settings(protocol: Path | None) -> tuple[TrialSettings, str | None]:
     """Settings that a protocol fixes, the others by default, and its title."""
-    from tactile_bayes.api.trial_report import TrialSettings
-    from tactile_bayes.files.documents import read_protocol
-
     if protocol is None:
         return TrialSettings(), None
     read, default = read_protocol(protocol), TrialSettings()
@@ -245,13 +245,6 @@ def _counts(rows: Sequence[Row]) -> tuple[int, int, int]:
 
 def _write_report(folder: Path, excision: Excision, protocol: Path | None, growth: Sequence[Growth]) -> tuple[str, str]:
     """Write what `validate` writes for the trial table; returns its text, or why there is none."""
-    from tactile_bayes.api.trial_report import analyse
-    from tactile_bayes.api.trials import load_trial
-    from tactile_bayes.files.atomic import write_text
-    from tactile_bayes.files.documents import check_document, dump_json
-    from tactile_bayes.report.trial import trial_text
-    from tactile_bayes.report.trial_html import trial_html
-
     settings, title = _trial_settings(protocol)
     try:
         inputs = load_trial(folder / TRIAL, excision.path, excision.columns, tidy_trial=True)
@@ -273,8 +266,6 @@ def _page(
     links: Mapping[str, str],
     growth: Sequence[Growth],
 ) -> str:
-    from tactile_bayes.report.campaign_html import campaign_html, worst
-
     cards = worst((_card(campaign, row) for row in rows), _MOST_CARDS)
     if len(cards) <= _MOST_INLINE:
         cards = [_self_contained(card, campaign.folder) for card in cards]
@@ -289,8 +280,6 @@ def _page(
 
 def _self_contained(card: Card, folder: Path) -> Card:
     """The card with its picture instead of the picture's name."""
-    from tactile_bayes.files.reading import IMAGE_BYTES, read_bytes
-
     if not isinstance(card.thumbnail, str):
         return card
     return replace(card, thumbnail=read_bytes(folder / card.thumbnail, most=IMAGE_BYTES))

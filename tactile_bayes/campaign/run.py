@@ -28,11 +28,15 @@ from tactile_bayes.campaign.settings import CampaignSettings, digest_of
 from tactile_bayes.campaign.stages import CampaignState, Fault, Stages, steps_needed
 from tactile_bayes.campaign.steps import FEWEST_MASSES, NOT_LEARNED, Task, copy_tasks, exam_folders, taught_by, too_few
 from tactile_bayes.declarations import replace
+from tactile_bayes.files.atomic import sha256
 from tactile_bayes.files.campaign_names import ESTIMATE, EXAMS, GROWTH, MAP, MASSES, REPEATABILITY, SHAPE
 from tactile_bayes.files.manifest_csv import Exam
 from tactile_bayes.files.provenance import recordings
 from tactile_bayes.files.repeatability_json import read_repeatability
+from tactile_bayes.files.shipped import default_for, size_calibration_path
+from tactile_bayes.files.size_json import read_size_calibration
 from tactile_bayes.progress import Progress, untold
+from tactile_bayes.size.bodies import BodyCalibration
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
@@ -255,8 +259,6 @@ class Campaign:
 
     def _settings_key(self, settings: Settings, normalise: str) -> dict[str, Any]:
         """All that an estimate depends on besides its map: settings, and the digests of the files that they name."""
-        from tactile_bayes.files.shipped import default_for
-
         plain = {one.name: getattr(settings, one.name) for one in fields(settings)}
         name = str(plain.pop("calibration") or default_for(normalise))
         file = plain.pop("settings_file")
@@ -267,8 +269,6 @@ class Campaign:
         return {**plain, **used, "calibration_sha256": self._calibration_digest(name)}
 
     def _calibration_digest(self, name: str) -> str:
-        from tactile_bayes.files.shipped import size_calibration_path
-
         if name not in self._calibrations:
             path = size_calibration_path(name)
             self._calibrations[name] = "" if path is None else self._file_digest(path)
@@ -276,8 +276,6 @@ class Campaign:
 
     def _file_digest(self, path: Path) -> str:
         """Digest of a file that many exams use."""
-        from tactile_bayes.files.atomic import sha256
-
         if path not in self._digests:
             self._digests[path] = sha256(path)
         return self._digests[path]
@@ -337,8 +335,6 @@ class Campaign:
 
     def _by_repeatability(self, settings: Settings, normalise: str) -> Settings:
         """Settings with the learned repeatability, where it is for the calibration that they lead to."""
-        from tactile_bayes.files.shipped import default_for
-
         found = self.repeatability
         if found is None or self._calibration_digest(settings.calibration_name or default_for(normalise)) != (
             found.calibration_sha256
@@ -370,10 +366,6 @@ class Campaign:
 
     def _not_over_bodies(self) -> str:
         """Which calibration cannot size several maps together; empty for none."""
-        from tactile_bayes.files.shipped import size_calibration_path
-        from tactile_bayes.files.size_json import read_size_calibration
-        from tactile_bayes.size.bodies import BodyCalibration
-
         for name in {self.settings.of(exam).calibration for exam in self.exams} - {None}:
             path = size_calibration_path(str(name))
             if path is None or not isinstance(read_size_calibration(path), BodyCalibration):

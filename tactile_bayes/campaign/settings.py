@@ -13,6 +13,7 @@ from typing import Any, Final
 from tactile_bayes import __version__
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.declarations import replace
+from tactile_bayes.files.atomic import sha256
 from tactile_bayes.files.manifest_csv import Exam
 from tactile_bayes.presets import DEFAULT_NORMALISE, MATCH_MM
 from tactile_bayes.records import dataclass
@@ -106,8 +107,6 @@ def write_staged(folder: Path, writes: Writes, *, step: str, digest: str, names:
     UsageError, OSError
         When the disk does not take a file.
     """
-    from tactile_bayes.files.atomic import sha256
-
     staged = folder / f"{_PREFIX}{step}-{digest[:_DIGITS]}"
     try:
         if writes:

@@ -9,12 +9,19 @@ from dataclasses import field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+import numpy as np
+
+from tactile_bayes.api.comparing import compare_answers, drawn_maps
+from tactile_bayes.api.estimating import Answer, answer_of, choose_calibration, estimate_file, size_priors
+from tactile_bayes.api.maps import map_provenance
+from tactile_bayes.api.pooled import pool_answers
 from tactile_bayes.api.repeatability import ExamFolder, learn_from_exams, repeatability_setting
-from tactile_bayes.api.settings import Settings
+from tactile_bayes.api.settings import Comparing, Settings
 from tactile_bayes.campaign.match import OWN_AXES, NamedPlace, in_own_axes, matched_outcome
 from tactile_bayes.campaign.settings import Writes, digest_of, write_staged
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, UsageError
+from tactile_bayes.files.atomic import sha256, write_bytes, write_text
 from tactile_bayes.files.campaign_names import (
     COMPARED,
     COMPARED_FIGURE,
@@ -32,10 +39,25 @@ from tactile_bayes.files.campaign_names import (
     SIZED_FIGURE,
     THUMBNAIL,
 )
+from tactile_bayes.files.documents import check_document, dump_json, load_json
 from tactile_bayes.files.manifest_csv import Exam
-from tactile_bayes.findings import by_weight
+from tactile_bayes.files.map_nc import read_map, read_map_and_scans, write_map
+from tactile_bayes.files.posterior_nc import write_pooled
+from tactile_bayes.files.provenance import Provenance, scan_facts
+from tactile_bayes.files.reading import NETCDF_BYTES, kind_of, read_bytes
+from tactile_bayes.files.remote import fetched, put
+from tactile_bayes.findings import by_weight, findings_in
+from tactile_bayes.mapping import build_map
 from tactile_bayes.presets import CELL_MM, PRESSURE_WINDOW_KPA
 from tactile_bayes.records import dataclass
+from tactile_bayes.report.compare_figure import draw_comparison
+from tactile_bayes.report.estimate_document import rounded, size_diagnostics
+from tactile_bayes.report.estimate_figures import draw_map, draw_size
+from tactile_bayes.report.quantities import ANOTHER_EXAM
+from tactile_bayes.report.svg import thumbnail_png
+from tactile_bayes.size.bodies import BodyCalibration
+from tactile_bayes.size.draws import SIZES
+from tactile_bayes.size.site import size_alone
 
 if TYPE_CHECKING:
     from tactile_bayes.api.estimating import Answer, Outcome
@@ -161,9 +183,6 @@ def run_step(task: Task) -> Result:
 
 def _map(task: Task) -> tuple[Result, Writes]:
     """Make the exam's map from its scan or arrays, or take the map that it is; refuse what belongs to another exam."""
-    from tactile_bayes.files.atomic import sha256
-    from tactile_bayes.files.reading import kind_of
-
     if task.address:
         return _fetched_map(task)
     if sha256(task.source) != task.source_sha256:
@@ -178,15 +197,11 @@ def _map(task: Task) -> tuple[Result, Writes]:
 
 def _fetched_map(task: Task) -> tuple[Result, Writes]:
     """Fetch the exam's file from its object store for as long as the map is made."""
-    from tactile_bayes.files.remote import fetched
-
     with fetched(task.address) as path:
         return _map(replace(task, source=path, address=""))
 
 
 def _scanned_map(task: Task) -> tuple[Result, Writes]:
-    from tactile_bayes.api.maps import map_provenance
-    from tactile_bayes.files.provenance import Provenance, scan_facts
     from tactile_bayes.files.scan_mcap import read_scan
 
     scan = read_scan(task.source)
@@ -200,7 +215,6 @@ def _scanned_map(task: Task) -> tuple[Result, Writes]:
 def _imported_map(task: Task) -> tuple[Result, Writes]:
     """Bring in arrays as `import` does, and map the scan that they are."""
     from tactile_bayes.files.imports import read_arrays
-    from tactile_bayes.files.provenance import Provenance, scan_facts
     from tactile_bayes.files.scan_mcap import write_scan
 
     scan = read_arrays(task.source)
@@ -213,9 +227,6 @@ def _imported_map(task: Task) -> tuple[Result, Writes]:
 
 
 def _built(task: Task, scan: Scan, provenance: Any, facts: Mapping[str, str]) -> tuple[Result, Writes]:
-    from tactile_bayes.files.map_nc import write_map
-    from tactile_bayes.mapping import build_map
-
     tactile_map = build_map(scan, normalise=task.normalise)
     found = {
         "scans": [dict(facts)],
@@ -227,10 +238,6 @@ def _built(task: Task, scan: Scan, provenance: Any, facts: Mapping[str, str]) ->
 
 def _given_map(task: Task) -> tuple[Result, Writes]:
     """Take a map that was made before, byte for byte."""
-    from tactile_bayes.files.atomic import write_bytes
-    from tactile_bayes.files.map_nc import read_map_and_scans
-    from tactile_bayes.files.reading import NETCDF_BYTES, read_bytes
-
     tactile_map, scans = read_map_and_scans(task.source)
     for facts in scans:
         check_facts(task.expected, facts)
@@ -281,11 +288,7 @@ def check_facts(expected: Mapping[str, str], facts: Mapping[str, str]) -> None:
 
 
 def _estimate(task: Task) -> tuple[Result, Writes]:
-    from tactile_bayes.api.estimating import answer_of
-    from tactile_bayes.files.atomic import write_bytes, write_text
-    from tactile_bayes.files.documents import check_document, dump_json
     from tactile_bayes.files.npz import write_shape
-    from tactile_bayes.report.svg import thumbnail_png
 
     outcome = _outcome(task)
     answer = answer_of(outcome)
@@ -306,8 +309,6 @@ def _estimate(task: Task) -> tuple[Result, Writes]:
 
 def _outcome(task: Task) -> Outcome:
     """The exam's estimate: of the mass that its row names, where other exams have it."""
-    from tactile_bayes.api.estimating import estimate_file
-
     assert task.settings is not None
     path = task.folder / MAP
     if not task.places:
@@ -321,8 +322,6 @@ def _outcome(task: Task) -> Outcome:
 
 def _figures(task: Task) -> tuple[Result, Writes]:
     """Draw the figures of `estimate`; the estimate is made again, for it is not stored whole."""
-    from tactile_bayes.report.estimate_figures import draw_map, draw_size
-
     outcome = _outcome(task)
     settings = outcome.settings
     tactile_map, estimate = outcome.tactile_map, outcome.estimate
@@ -339,11 +338,6 @@ def _figures(task: Task) -> tuple[Result, Writes]:
 
 def _pool(task: Task) -> tuple[Result, Writes]:
     """Pool the exams of a mass as `estimate --pool` does, from what their estimates left in their folders."""
-    from tactile_bayes.api.pooled import pool_answers
-    from tactile_bayes.files.atomic import write_text
-    from tactile_bayes.files.documents import check_document, dump_json
-    from tactile_bayes.files.posterior_nc import write_pooled
-
     assert task.settings is not None
     answers = [_answer(folder) for _, folder in task.members]
     inputs = {f"map_{i}": folder / MAP for i, (_, folder) in enumerate(task.members, start=1)}
@@ -361,13 +355,6 @@ def _pool(task: Task) -> tuple[Result, Writes]:
 
 def _compare(task: Task) -> tuple[Result, Writes]:
     """Compare the visits of a mass as `compare` does; the table says that they are of one where landmarks do not."""
-    from tactile_bayes.api.comparing import compare_answers, drawn_maps
-    from tactile_bayes.api.settings import Comparing
-    from tactile_bayes.files.atomic import write_text
-    from tactile_bayes.files.documents import check_document, dump_json
-    from tactile_bayes.files.map_nc import read_map
-    from tactile_bayes.report.compare_figure import draw_comparison
-
     assert task.settings is not None
     answers = [[_answer(folder) for _, folder in exams] for exams in task.visits]
     found = [one for maps in answers for one in maps if one.shape is not None]
@@ -397,9 +384,6 @@ def _copy(task: Task) -> tuple[Result, Writes]:
 
 def _answer(folder: Path) -> Answer:
     """An exam's answer for pooling, from its folder."""
-    from tactile_bayes.api.estimating import Answer
-    from tactile_bayes.files.documents import load_json
-    from tactile_bayes.files.map_nc import read_map
     from tactile_bayes.files.npz import read_shape
 
     tactile_map: TactileMap = read_map(folder / MAP)
@@ -465,8 +449,6 @@ def copy_tasks(folder: Path, names: Sequence[str], results: Sequence[Mapping[str
 
 def copy_step(task: Task) -> tuple[Result, Writes]:
     """Copy files into an object store."""
-    from tactile_bayes.files.remote import put
-
     try:
         for name, address in task.copies.items():
             put(task.folder / name, address)
@@ -525,10 +507,6 @@ def learn_step(task: Task) -> tuple[Result, Writes]:
 
 def size_step(task: Task) -> tuple[Result, Writes]:
     """Size an exam by the site's repeatability: its estimate with other sizes. Nothing where it had no size."""
-    from tactile_bayes.files.atomic import write_text
-    from tactile_bayes.files.documents import check_document, dump_json, load_json
-    from tactile_bayes.findings import findings_in
-
     assert task.settings is not None
     settings = task.settings
     document: Any = load_json(task.folder / ESTIMATE)
@@ -539,8 +517,6 @@ def size_step(task: Task) -> tuple[Result, Writes]:
     check_document(sized, "estimate.schema.json", path=Path("the report"))
     writes: Writes = {SIZED: lambda path: write_text(path, dump_json(sized), force=True)}
     if task.figures:
-        from tactile_bayes.report.estimate_figures import draw_size
-
         findings = findings_in(sized["findings"])
         writes[SIZED_FIGURE] = lambda path: draw_size(
             size, path, name=task.name, probability=settings.interval, findings=findings, force=True
@@ -550,13 +526,7 @@ def size_step(task: Task) -> tuple[Result, Writes]:
 
 def _exam_size(folder: Path, settings: Settings) -> SizePosterior:
     """Size from the draws of an exam, in the axes of its map as `estimate` has it."""
-    import numpy as np
-
-    from tactile_bayes.api.estimating import choose_calibration, size_priors
-    from tactile_bayes.files.map_nc import read_map
     from tactile_bayes.files.npz import read_shape
-    from tactile_bayes.size.bodies import BodyCalibration
-    from tactile_bayes.size.site import size_alone
 
     tactile_map = read_map(folder / MAP)
     _, calibration, _ = choose_calibration(settings, tactile_map)
@@ -568,10 +538,6 @@ def _exam_size(folder: Path, settings: Settings) -> SizePosterior:
 
 def _resized(document: dict[str, Any], size: SizePosterior, settings: Settings) -> dict[str, Any]:
     """The estimate's JSON object with the sizes, their sources and their provenance replaced."""
-    from tactile_bayes.report.estimate_document import rounded, size_diagnostics
-    from tactile_bayes.report.quantities import ANOTHER_EXAM
-    from tactile_bayes.size.draws import SIZES
-
     found = settings.repeatability
     assert found is not None
     sizes = {name: size.summarise(name, probability=settings.interval).as_dict() for name in SIZES}

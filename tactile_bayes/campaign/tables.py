@@ -10,6 +10,7 @@ from typing import Any, Final
 from tactile_bayes.campaign.match import unnamed
 from tactile_bayes.campaign.run import Campaign
 from tactile_bayes.declarations import replace
+from tactile_bayes.files.atomic import write_text
 from tactile_bayes.files.campaign_names import DONE, ESTIMATE, EXAMS, FAILURES, MASSES, POOLED, SIZED, TRIAL
 from tactile_bayes.files.documents import load_json, load_schema
 from tactile_bayes.files.manifest_csv import Exam, table_text
@@ -264,8 +265,6 @@ def write_tables(
     campaign: Campaign, rows: Sequence[Row], masses: Collection[tuple[str, str]] | None, folder: Path
 ) -> None:
     """Write the three tables."""
-    from tactile_bayes.files.atomic import write_text
-
     texts = {DONE: done_text(rows), FAILURES: failures_text(campaign, rows), TRIAL: trial_text(campaign, rows, masses)}
     for name, text in texts.items():
         write_text(folder / name, text, force=True)

@@ -28,6 +28,8 @@ from tactile_bayes.exports.nrrd import ImagePlane, image_plane, lps_from_plane
 from tactile_bayes.findings import finding_lines
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.records import dataclass
+from tactile_bayes.report.estimate_text import no_estimate_line
+from tactile_bayes.report.map_figure import FitContour, Place, map_figure
 
 if TYPE_CHECKING:
     from tactile_bayes.report.map_figure import FitContour, Place
@@ -205,8 +207,6 @@ def map_picture(source: MapFile, estimate: EstimateFile | None) -> NDArray[np.ui
     from matplotlib import rc_context, rcdefaults
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-    from tactile_bayes.report.map_figure import map_figure
-
     document = estimate.document if estimate is not None and estimate.kind == "estimate" else None
     side = source.facts.get("side")
     with rc_context():
@@ -227,22 +227,16 @@ def map_picture(source: MapFile, estimate: EstimateFile | None) -> NDArray[np.ui
 
 
 def _note(estimate: EstimateFile) -> str:
-    from tactile_bayes.report.estimate_text import no_estimate_line
-
     reasons = [one.reason for one in estimate.masses if one.largest is None]
     return no_estimate_line(reasons[0][:_MOST_NOTE]) if reasons and not estimate.sized else ""
 
 
 def _places(document: Any) -> list[Place]:
-    from tactile_bayes.report.map_figure import Place
-
     return [Place((one["x_mm"], one["y_mm"]), one["fault"]) for one in document["candidates"] if one["fault"]]
 
 
 def _contour(document: Any) -> FitContour | None:
     """Ellipse and size at the medians."""
-    from tactile_bayes.report.map_figure import FitContour
-
     names = ("sigma_x_mm", "sigma_y_mm", "background", "amplitude")
     centre = document["centre_mm"] or {"x": None}
     if centre["x"] is None or centre["y"] is None or any(document[name] is None for name in names):

@@ -16,9 +16,10 @@ from tactile_bayes.exports.codes import NOT_DETECTED, NOT_SIZED, SIZED, Code
 from tactile_bayes.files.atomic import sha256
 from tactile_bayes.files.documents import load_json, parse_json
 from tactile_bayes.files.estimate_json import SCHEMAS, check_estimate
+from tactile_bayes.files.map_nc import read_map_and_scans
 from tactile_bayes.files.netcdf import open_netcdf
 from tactile_bayes.files.provenance import EXAM_FACTS, scans_of
-from tactile_bayes.files.reading import HDF5_MAGIC, open_input
+from tactile_bayes.files.reading import HDF5_MAGIC, kind_of, open_input, schema_kind
 from tactile_bayes.findings import Finding, Verdict, finding_lines, findings_in, verdict
 from tactile_bayes.records import dataclass
 from tactile_bayes.report.estimate_text import exams_label
@@ -204,8 +205,6 @@ def read_exam(path: Path) -> MapFile | list[EstimateFile]:
             attributes = None if group is None else group.attributes()
         return _read_map(path) if attributes is None else [_read_posterior(path, attributes)]
     if not head.removeprefix(codecs.BOM_UTF8).lstrip().startswith((b"{", b"[")):
-        from tactile_bayes.files.reading import kind_of
-
         kind = kind_of(path) or ("none of these" if head else "empty")
         raise BadDataError(f"is {kind}", way_out=_WAY_OUT, path=str(path))
     document = load_json(path, way_out=_WAY_OUT)
@@ -216,8 +215,6 @@ def read_exam(path: Path) -> MapFile | list[EstimateFile]:
 
 
 def _read_map(path: Path) -> MapFile:
-    from tactile_bayes.files.map_nc import read_map_and_scans
-
     tactile_map, scans = read_map_and_scans(path)
     return MapFile(path, sha256(path), tactile_map, shared_facts(scans))
 
@@ -245,8 +242,6 @@ def estimate_of(document: object, path: Path) -> EstimateFile:
     """
     schema = document.get("schema") if isinstance(document, dict) else None
     if not isinstance(document, dict) or not isinstance(schema, str) or schema not in SCHEMAS:
-        from tactile_bayes.files.reading import schema_kind
-
         raise BadDataError(f"is {schema_kind(schema) or 'no estimate'}", way_out=_WAY_OUT, path=str(path))
     check_estimate(document, SCHEMAS[schema], path=path)
     kind = schema.split("/")[1]

@@ -8,8 +8,13 @@ from typing import TYPE_CHECKING, Final, Literal, get_args
 
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import UsageError
+from tactile_bayes.exports.dicom import VALUES, dicom_files
 from tactile_bayes.exports.exam import EstimateFile, MapFile, check_pairs
+from tactile_bayes.exports.fhir import bundle_json
 from tactile_bayes.exports.identity import Identity
+from tactile_bayes.exports.nrrd import nrrd_bytes
+from tactile_bayes.exports.redcap import dictionary_csv, records_csv
+from tactile_bayes.files.atomic import check_suffix, refuse_existing, same_file, unwritable, write_all
 from tactile_bayes.records import dataclass
 
 if TYPE_CHECKING:
@@ -50,8 +55,6 @@ class Outputs:
         ------
         UsageError
         """
-        from tactile_bayes.files.atomic import check_suffix, refuse_existing, same_file
-
         if not files and self.dictionary is None:
             raise UsageError("no file was given to export; give a map, an estimate or both")
         if files and self.path is None:
@@ -75,9 +78,6 @@ class Outputs:
         UsageError
             When a file exists and `force` is false, or the folder holds files of another export.
         """
-        from tactile_bayes.exports.redcap import dictionary_csv
-        from tactile_bayes.files.atomic import write_all
-
         paths, folder = dict[Path, bytes](), None
         if exported is not None and self.path is not None:
             if "" not in exported.files:
@@ -96,8 +96,6 @@ class Outputs:
 
 def _prepared_folder(folder: Path, names: set[str], *, force: bool) -> Path | None:
     """Refuse a folder in which the files would stand beside those of another export; make it, and return a new one."""
-    from tactile_bayes.files.atomic import refuse_existing, unwritable
-
     new = not folder.exists()
     try:
         folder.mkdir(mode=0o700, exist_ok=True)
@@ -239,8 +237,6 @@ def _one_estimate(estimates: Sequence[EstimateFile], to: ExportFormat) -> Estima
 
 
 def _dicom(maps: Sequence[MapFile], estimates: Sequence[EstimateFile], identity: Identity) -> Exported:
-    from tactile_bayes.exports.dicom import VALUES, dicom_files
-
     if not maps:
         raise UsageError(f"a DICOM report refers to its map; give it too: export MAP.nc {estimates[0].path} --to dicom")
     estimate = _one_estimate(estimates, "dicom") if estimates else None
@@ -258,8 +254,6 @@ def _dicom(maps: Sequence[MapFile], estimates: Sequence[EstimateFile], identity:
 
 
 def _fhir(maps: Sequence[MapFile], estimates: Sequence[EstimateFile], identity: Identity) -> Exported:
-    from tactile_bayes.exports.fhir import bundle_json
-
     _refuse_maps(maps, estimates, "fhir")
     text = bundle_json(_one_estimate(estimates, "fhir"), identity)
     return Exported({"": text.encode()}, tuple(_no_patient(identity)))
@@ -276,8 +270,6 @@ def _refuse_maps(maps: Sequence[MapFile], estimates: Sequence[EstimateFile], to:
 
 
 def _nrrd(maps: Sequence[MapFile], estimates: Sequence[EstimateFile], *, id_from_scan: bool) -> Exported:
-    from tactile_bayes.exports.nrrd import nrrd_bytes
-
     if id_from_scan:
         raise UsageError("nrrd files hold no patient; leave out --patient-id-from-scan")
     if estimates:
@@ -290,7 +282,5 @@ def _nrrd(maps: Sequence[MapFile], estimates: Sequence[EstimateFile], *, id_from
 def _csv(
     maps: Sequence[MapFile], estimates: Sequence[EstimateFile], identity: Identity, *, id_from_scan: bool
 ) -> Exported:
-    from tactile_bayes.exports.redcap import records_csv
-
     _refuse_maps(maps, estimates, "csv")
     return Exported({"": records_csv(estimates, identity, id_from_scan=id_from_scan).encode()})

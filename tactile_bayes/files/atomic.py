@@ -7,6 +7,7 @@ import errno
 import hashlib
 import os
 import re
+import socket
 import tempfile
 import zlib
 from collections.abc import Iterable, Iterator, Mapping
@@ -166,8 +167,6 @@ def _stem(target: Path) -> str:
 
 def _host() -> str:
     """Eight letters that stand for this computer, because directories may be shared with others."""
-    import socket
-
     return f"{zlib.crc32(socket.gethostname().encode()):08x}"
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import sys
+import tomllib
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
@@ -274,8 +275,6 @@ def load_toml(path: Path, *, way_out: str) -> dict[str, Any]:
 
 def parse_toml(text: str, *, way_out: str) -> dict[str, Any]:
     """Parse a TOML text; for the errors see `load_toml`."""
-    import tomllib
-
     long = _LONG_KEY.search(text)
     if long:
         line = text.count("\n", 0, long.start()) + 1

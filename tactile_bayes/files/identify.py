@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -95,8 +96,6 @@ def _value_unit(tactile_map: TactileMap) -> str:
 
 
 def _map(path: Path) -> dict[str, Any]:
-    from dataclasses import asdict
-
     from tactile_bayes.files.map_nc import read_map, read_map_header
 
     header = read_map_header(path)

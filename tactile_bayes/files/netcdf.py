@@ -10,6 +10,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any, Final
 
+import h5py
 import numpy as np
 
 from tactile_bayes.errors import BadDataError
@@ -118,8 +119,6 @@ def grouped_netcdf_bytes(groups: Mapping[str, Contents]) -> bytes:
     """A netCDF-4 file of several groups by name, each with its own dimensions; ``/`` is the root.
 
     Equal contents give equal bytes under one version of HDF5 and zlib."""
-    import h5py
-
     with h5py.File("memory", "w", driver="core", backing_store=False, track_order=True) as file:
         written = 0
         for group, contents in groups.items():
@@ -197,8 +196,6 @@ class Group:
 
     def group(self, name: str) -> Group | None:
         """Subgroup by name; None where there is none."""
-        import h5py
-
         found = self._own(name)
         return (
             Group(found, most_bytes=self._most_bytes, way_out=self._way_out) if isinstance(found, h5py.Group) else None
@@ -259,16 +256,12 @@ class Group:
 
     def _own(self, name: str) -> Any:
         """Member of this file by name; links to other places and files are not followed."""
-        import h5py
-
         if not isinstance(self._place.get(name, getlink=True), h5py.HardLink):
             return None
         return self._place[name]
 
     def _dataset(self, name: str) -> Any:
         """Dataset whose values are in this file; None where there is none."""
-        import h5py
-
         found = self._own(name)
         if not isinstance(found, h5py.Dataset):
             return None
@@ -339,8 +332,6 @@ def _dimensions(dataset: Any) -> tuple[str, ...]:
 
 def _has_scales(dataset: Any) -> bool:
     """Whether a list of scales is attached as it must be: HDF5 ends the process over one of another type."""
-    import h5py
-
     if "DIMENSION_LIST" not in dataset.attrs:
         return False
     listed = dataset.attrs.get_id("DIMENSION_LIST")
@@ -358,8 +349,6 @@ def open_netcdf(path: Path, *, way_out: str) -> Iterator[Group]:
     BadDataError
         When the file cannot be read, is no netCDF-4 file or is damaged.
     """
-    import h5py
-
     try:
         with open_input(path) as stream, decoding(_DAMAGED, way_out=way_out):
             if stream.read(len(HDF5_MAGIC)) != HDF5_MAGIC:

@@ -12,6 +12,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.sparse import coo_array
+from scipy.sparse.linalg import splu
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.body import FAT_KPA, GLAND_RATIO, POISSON
@@ -171,8 +174,6 @@ def orders_needed(geometry: LumpGeometry) -> int:
 
 def skin_spline(radius_mm: FloatArray, values: FloatArray, *, order: int) -> CubicSpline[np.float64]:
     r"""Spline of (s, c) values at the skin nodes through the axis: even in r for even orders, odd for odd ones."""
-    from scipy.interpolate import CubicSpline
-
     parity = -1.0 if order % 2 else 1.0
     mirrored = np.concatenate([parity * values[::-1], values])
     return CubicSpline(np.concatenate([-radius_mm[::-1], radius_mm]), mirrored)
@@ -291,8 +292,6 @@ def order_unknowns(mesh: LumpMesh, order: int) -> tuple[IntArray, FloatArray]:
 
 
 def _condense(mesh: LumpMesh, elements: FloatArray, modulus_kpa: FloatArray, order: int) -> CondensedMode:
-    from scipy.sparse.linalg import splu
-
     number, sign = order_unknowns(mesh, order)
     inside = mesh.region >= INTERIOR_FAT
     stiffness = elements[0] + order * elements[1] + order**2 * elements[2]
@@ -328,8 +327,6 @@ def _assemble(
     sign: FloatArray,
 ) -> tuple[csc_array, IntArray]:
     """Sparse stiffness of the chosen elements, and the indices of its unknowns."""
-    from scipy.sparse import coo_array
-
     element = mesh.element[chosen]
     unknown = number[element].reshape(len(element), 27)
     signs = sign[element].reshape(len(element), 27)

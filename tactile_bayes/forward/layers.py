@@ -12,6 +12,8 @@ from itertools import pairwise
 from typing import Final
 
 import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.special import j0
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.body import POISSON
@@ -166,8 +168,6 @@ def layering_compliance(r_mm: FloatArray, body: LayeredBody) -> FloatArray:
     by Gauss-Legendre panels. The bracket decays as :math:`\exp(-2kH)` with the top layer's thickness H, so what is
     singular at r = 0 is left to the closed forms for the half-space.
     """
-    from scipy.special import j0
-
     r = np.asarray(r_mm, dtype=np.float64)
     if not body.thickness_mm:
         return np.zeros_like(r)
@@ -229,8 +229,6 @@ def taxel_compliance(body: LayeredBody, *, rows: int, columns: int, pitch_mm: fl
         Symmetric positive definite; taxels in row-major order. Both the load and the displacement are averaged over
         the square of a taxel (Galerkin), the self term included.
     """
-    from scipy.interpolate import CubicSpline
-
     node, weight = np.polynomial.legendre.leggauss(6)
     shift = node * pitch_mm / 2
     dx: FloatArray = np.arange(rows, dtype=np.float64) * pitch_mm

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import minimize_scalar
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.body import Layers
@@ -447,7 +448,6 @@ def fit_shape(shape: Callable[[float], FloatArray], data: FloatArray, *, grid: F
     The height is linear and leaves one unknown (variable projection; Golub & Pereyra 1973). Steps of Gauss and Newton
     do not settle here where the shape leaves more of the data than it explains, as a faint bump in its trough does.
     """
-    from scipy.optimize import minimize_scalar
 
     def left(parameter: float) -> float:
         return _fit_height(shape(parameter), data)[1]

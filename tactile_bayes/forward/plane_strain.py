@@ -6,6 +6,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.sparse import coo_matrix
+from scipy.sparse.linalg import splu
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.body import Body, Layers
@@ -45,8 +48,6 @@ def assemble(mesh: QuadMesh, *, young_kpa: FloatArray, poisson: float) -> csc_ma
     (2n, 2n) sparse matrix of kPa
         Unknowns are ordered ``x0, z0, x1, z1, ...``; times displacement in mm it gives force in N/m.
     """
-    from scipy.sparse import coo_matrix
-
     blocks = element_stiffness(mesh.nodes[mesh.elements], poisson=poisson) * young_kpa[:, None, None]
     unknowns = (2 * mesh.elements[:, :, None] + np.arange(2)).reshape(len(mesh.elements), 18)
     rows = np.repeat(unknowns, 18, axis=1).reshape(-1)
@@ -113,8 +114,6 @@ def skin_average(x_mm: FloatArray, *, edges_mm: FloatArray, even: bool) -> Float
     A cubic spline through the nodes, not the elements' own quadratics: their slopes jump from element to element, and a
     contact pressure answers a jump of slope with a spike. Frames are up to seven times closer to converged ones.
     """
-    from scipy.interpolate import CubicSpline
-
     k = len(x_mm)
     both = np.concatenate([-x_mm[:0:-1], x_mm])
     centre, half = 0.5 * (edges_mm[1:] + edges_mm[:-1]), 0.5 * np.diff(edges_mm)
@@ -445,8 +444,6 @@ def _hole_compliance(
 
 def _solve(matrix: csc_matrix, sides: FloatArray) -> FloatArray:
     """Solution of a symmetric positive definite system for many right-hand sides: one factorisation."""
-    from scipy.sparse.linalg import splu
-
     factor = splu(matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
     return np.asarray(factor.solve(sides))
 

@@ -11,7 +11,10 @@ import numpy as np
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.instrument import SimulatedScan, head_positions, level_kpa, record
+from tactile_bayes.forward.plane_scan import frames_at_poses as plane_frames_at_poses
+from tactile_bayes.forward.plane_scan import simulate_plane
 from tactile_bayes.forward.scene import Scene, normalised_pressure, refuse_bumps
+from tactile_bayes.forward.solid_scan import frames_at_poses, simulate_solid
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.presets import SHOULDERS_INSIDE
 
@@ -66,12 +69,8 @@ def simulate(
         if chosen == "solid" or head != SHOULDERS_INSIDE:
             scene = replace(scene, head=scene.head.with_shoulders(head))
     if chosen == "solid":
-        from tactile_bayes.forward.solid_scan import simulate_solid
-
         return simulate_solid(scene, rng=rng, progress=progress)
     if chosen in ("plane-strain", "empirical"):
-        from tactile_bayes.forward.plane_scan import simulate_plane
-
         return simulate_plane(scene, rng=rng, fidelity=chosen, shoulders=head or SHOULDERS_INSIDE, progress=progress)
     if scene.solid_lumps or scene.ribs:
         raise _tissue_for_bumps(scene)
@@ -130,11 +129,7 @@ def felt_at_poses(
     if head is not None and (chosen == "solid" or head != SHOULDERS_INSIDE):
         scene = replace(scene, head=scene.head.with_shoulders(head))
     if chosen == "solid":
-        from tactile_bayes.forward.solid_scan import frames_at_poses
-
         return frames_at_poses(scene, rotation, origin_mm, mean_kpa=mean_kpa, progress=progress)[0]
-    from tactile_bayes.forward.plane_scan import frames_at_poses as plane_frames_at_poses
-
     return plane_frames_at_poses(
         scene,
         rotation,

@@ -13,6 +13,7 @@ from tactile_bayes.hardware import head
 from tactile_bayes.hardware import serial_trackers as polhemus
 from tactile_bayes.hardware.head import DEFAULT_BAUD, HeadParser, encode_command
 from tactile_bayes.hardware.igtlink import IgtlinkParser
+from tactile_bayes.hardware.ndi import NdiPort
 from tactile_bayes.hardware.ports import ANSWER_S, Port, shown
 from tactile_bayes.hardware.readings import HelloReading, Parser, PoseReading
 from tactile_bayes.hardware.serial_trackers import BirdParser, FastrakParser, LibertyAsciiParser, LibertyParser
@@ -166,8 +167,6 @@ def open_tracker(protocol: str, url: str, *, baud: int | None = None, rom: Path 
         When it cannot be opened.
     """
     if protocol == "ndi":
-        from tactile_bayes.hardware.ndi import NdiPort
-
         return NdiPort(url, rom=rom)
     return Port(url, baud=baud or TRACKERS[protocol].baud or 9600, role="tracker")
 

@@ -7,6 +7,7 @@ holds the interpreter while it waits for the line, which is one more reason for 
 
 from __future__ import annotations
 
+import importlib
 import os
 import select
 import socket
@@ -252,8 +253,6 @@ def _say(words: str) -> None:
 
 def main(words: list[str]) -> int:
     """Run ``python -m tactile_bayes.hardware.ndi FD URL [ROM]``: prints ``ready``, or what is wrong."""
-    import importlib
-
     line = socket.socket(fileno=int(words[0]))
     try:
         tracker = NdiTracker(importlib.import_module(MODULE), words[1], rom=Path(words[2]) if len(words) > 2 else None)

@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tactile_bayes.forward.gaussian import principal_widths
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.draws import quantiles_of
 from tactile_bayes.posterior.result import Estimate
+from tactile_bayes.posterior.selection import fitted_values, pointwise_log_likelihood
 from tactile_bayes.records import dataclass
 from tactile_bayes.size.pooling import Calibration, SizePriors, draw_sizes
 
@@ -56,8 +58,6 @@ def fitted_cells(estimate: Estimate) -> FittedCells | None:
         cells = estimate.fit.cells
         fit = np.asarray(estimate.fit.bump.predict(estimate.fit.theta[None], cells)[0], dtype=np.float64)
         return FittedCells(cells.x_mm, cells.y_mm, cells.value, fit)
-    from tactile_bayes.posterior.selection import fitted_values
-
     target = estimate.scene.fit.target
     cells = target.window.cells
     return FittedCells(
@@ -153,8 +153,6 @@ def _statistics(estimate: Estimate, fit: FieldFit | None) -> DrawGroup | None:
 
 def _log_likelihood(theta: FloatArray, fit: FieldFit) -> DrawGroup:
     """Of some of the draws, evenly thinned, as many of each chain."""
-    from tactile_bayes.posterior.selection import pointwise_log_likelihood
-
     some = _thinned(theta, LIKELIHOOD_DRAWS)
     values = pointwise_log_likelihood(fit.target, some.reshape(-1, some.shape[2])).reshape(*some.shape[:2], -1)
     note = (
@@ -174,8 +172,6 @@ def _prior(
     fit: FieldFit, calibration: Calibration | None, size_priors: SizePriors, rng: np.random.Generator
 ) -> DrawGroup:
     """Draws of what has a proper prior, and the sizes that these imply where the calibration holds."""
-    from tactile_bayes.forward.gaussian import principal_widths
-
     problem, turned = fit.target.problem, fit.scene.shape == "rotated"
     prior, middle = problem.prior, problem.window.middle
     # more than needed: those wider than the window allows are left out

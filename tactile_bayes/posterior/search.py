@@ -13,8 +13,10 @@ from tactile_bayes.errors import Abstention, NotConvergedError
 from tactile_bayes.inference.draws import ParameterDraws
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.abstention import rim_fault, shape_fault
+from tactile_bayes.posterior.correlated import draw, look, with_neighbours
 from tactile_bayes.posterior.detection import Detection, detect
 from tactile_bayes.posterior.draws import MapPosterior, NoiseFigures
+from tactile_bayes.posterior.fit import modal_widths
 from tactile_bayes.posterior.fit_window import levelled, window_cells
 from tactile_bayes.posterior.lump_probability import NO_EVIDENCE, Weighed, weigh_candidate
 from tactile_bayes.posterior.options import DETECTED, EstimateOptions, FitOptions, scene_asked
@@ -164,13 +166,9 @@ class _Correlated:
         return ModalBump(fit.target.amplitude_at(fit.mode), x, y, *self.widths_mm())
 
     def widths_mm(self) -> tuple[float, float]:
-        from tactile_bayes.posterior.fit import modal_widths
-
         return modal_widths(self._answer.choice.fit)
 
     def draw(self, options: EstimateOptions, *, rng: np.random.Generator, progress: Progress | None) -> MapDraws:
-        from tactile_bayes.posterior.correlated import draw
-
         found = draw(self._answer, self.tactile_map, options, rng=rng, progress=progress)
         return MapDraws(found.detection, self.fit, found.draws, found.posterior, found.figures, self.scene)
 
@@ -185,8 +183,6 @@ class _Correlated:
 
 def _correlated(tactile_map: TactileMap, fit: BumpFit, options: EstimateOptions) -> _Correlated:
     """Assess under correlated errors, with neighbouring structures where there is a lump by the evidence."""
-    from tactile_bayes.posterior.correlated import look, with_neighbours
-
     try:
         seen = look(tactile_map, fit, options)
     except NotConvergedError:
@@ -200,8 +196,6 @@ def _correlated(tactile_map: TactileMap, fit: BumpFit, options: EstimateOptions)
 
 def _field_fault(tactile_map: TactileMap, seen: FieldAnswer) -> str:
     """Fault of a fit under correlated errors: beyond the map's rim, or shrunk to a single cell; empty if none."""
-    from tactile_bayes.posterior.fit import modal_widths
-
     plain = seen.choice.plain
     x, y = (float(plain.scene.column(plain.mode[None], name)[0]) for name in ("x", "y"))
     return rim_fault(tactile_map, (x, y), modal_widths(plain), radius_mm=plain.target.problem.radius_mm)

@@ -12,7 +12,16 @@ from tactile_bayes.declarations import replace
 from tactile_bayes.errors import NotConvergedError, UsageError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.draws import ParameterDraws, Solved
-from tactile_bayes.inference.modes import LeastSquaresFit, ModelFunction, fit_least_squares, inverse_information
+from tactile_bayes.inference.importance import importance, importance_options
+from tactile_bayes.inference.modes import (
+    LeastSquaresFit,
+    ModelFunction,
+    fit_least_squares,
+    inverse_information,
+    laplace,
+    mode_and_covariance,
+    optimise,
+)
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.bump import Bump, BumpPrior, block_size
 from tactile_bayes.posterior.detection import (
@@ -466,17 +475,11 @@ def _draw(
 ) -> ParameterDraws:
     match options.method:
         case "optimise":
-            from tactile_bayes.inference.modes import optimise
-
             return optimise(fit.theta, fit.covariance, dof=fit.errors.dof, rng=rng)
         case "laplace":
-            from tactile_bayes.inference.modes import laplace
-
             scale = np.sqrt(np.diag(fit.covariance))
             return laplace(target, fit.theta, scale=scale, dof=fit.errors.dof, rng=rng)
         case "importance":
-            from tactile_bayes.inference.importance import importance, importance_options
-
             mode, covariance = _mode(fit, target)
             density = partial(target.solved_density, solved=solved)
             try:
@@ -490,8 +493,6 @@ def _draw(
 
 def _mode(fit: BumpFit, target: Target) -> tuple[FloatArray, FloatArray]:
     """The posterior's mode and covariance, from least squares."""
-    from tactile_bayes.inference.modes import mode_and_covariance
-
     mode, covariance, _ = mode_and_covariance(target, fit.theta, scale=np.sqrt(np.diag(fit.covariance)))
     return mode, covariance
 

@@ -14,10 +14,12 @@ from tactile_bayes.errors import BadDataError
 from tactile_bayes.findings import Finding
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.map import TactileMap
-from tactile_bayes.posterior.arviz_groups import FittedCells
+from tactile_bayes.posterior.arviz_groups import FittedCells, fitted_cells
 from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.report.estimate_text import exams_label, no_estimate_line
 from tactile_bayes.report.figure_file import figure_file
-from tactile_bayes.report.map_figure import draw_panel
+from tactile_bayes.report.map_figure import FitContour, NumberedMass, Place, draw_panel, map_figure
+from tactile_bayes.report.quantities import leading_size
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -303,9 +305,6 @@ def draw_size(
     force: bool,
 ) -> Figure:
     """Draw the posterior of the largest and smallest size with their intervals, and what speaks against them."""
-    from tactile_bayes.report.estimate_text import exams_label
-    from tactile_bayes.report.quantities import leading_size
-
     leads = leading_size(size)
     quantities = {which: leads.summarise(f"{which}_size_mm", probability=probability) for which in ("max", "min")}
     intervals = {which: SizeInterval(q.low, q.high, q.probability, q.kind) for which, q in quantities.items()}
@@ -326,8 +325,6 @@ def draw_size(
 
 def draw_fit(tactile_map: TactileMap, estimate: Estimate, path: Path | None, *, name: str, force: bool) -> Figure:
     """Draw data, fit and residual of the fit window side by side."""
-    from tactile_bayes.posterior.arviz_groups import fitted_cells
-
     fitted = fitted_cells(estimate)
     assert fitted is not None
     return fit_figure(tactile_map, fitted, path, title=f"Fit: {name}", findings=estimate.findings, force=force)
@@ -335,9 +332,6 @@ def draw_fit(tactile_map: TactileMap, estimate: Estimate, path: Path | None, *, 
 
 def draw_map(tactile_map: TactileMap, estimate: Estimate, path: Path | None, *, name: str, force: bool) -> Figure:
     """Draw the map with the lump's ellipse and size, or with the places looked at and the reason for no number."""
-    from tactile_bayes.report.estimate_text import no_estimate_line
-    from tactile_bayes.report.map_figure import Place, map_figure
-
     places = [Place(one.centre_mm, one.fault) for one in estimate.candidates if one.fault]
     note = ""
     if estimate.reason and estimate.size is None:
@@ -358,10 +352,6 @@ def draw_map(tactile_map: TactileMap, estimate: Estimate, path: Path | None, *, 
 
 def _contour(estimate: Estimate) -> FitContour | None:
     """Ellipse and size at the posterior medians."""
-    import numpy as np
-
-    from tactile_bayes.report.map_figure import FitContour
-
     found, size = estimate.map_posterior, estimate.size
     if found is None:
         return None
@@ -373,8 +363,6 @@ def _contour(estimate: Estimate) -> FitContour | None:
 
 def _numbered(number: int, mass: Mass) -> NumberedMass:
     """A mass for the picture, its size at the medians."""
-    from tactile_bayes.report.map_figure import NumberedMass
-
     contour = _contour(mass.estimate)
     if contour is None:
         return NumberedMass(number, (mass.x_mm, mass.y_mm))

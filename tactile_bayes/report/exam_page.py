@@ -15,6 +15,7 @@ from typing import Final
 
 from tactile_bayes import __version__
 from tactile_bayes.errors import UsageError
+from tactile_bayes.files.atomic import check_suffix, refuse_existing, same_file, write_all
 from tactile_bayes.mapping.places import orientation_of
 from tactile_bayes.posterior.abstention import chance_text
 from tactile_bayes.posterior.lump_probability import SHARE_WITH_LUMP
@@ -74,8 +75,6 @@ class PageFiles:
             When a file exists and `force` is false, both are one file, one has the suffix of another format, or nothing
             is installed that prints.
         """
-        from tactile_bayes.files.atomic import check_suffix, refuse_existing, same_file
-
         check_suffix(self.html, "HTML")
         refuse_existing(self.html, force=self.force)
         if self.pdf is not None:
@@ -93,8 +92,6 @@ class PageFiles:
         UsageError
             As of `check`, and when the page could not be printed.
         """
-        from tactile_bayes.files.atomic import write_all
-
         page = exam_page(exam)
         files = {self.html: page.encode()}
         if self.pdf is not None:

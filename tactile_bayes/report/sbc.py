@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.report.figure_file import figure_file
 from tactile_bayes.studies.sbc import (
     BAND,
     DRAWS,
@@ -163,8 +164,6 @@ def sbc_figure(maps: Sequence[MapRanks], path: Path, *, force: bool = False) -> 
     UsageError
         When `path` exists and `force` is false.
     """
-    from tactile_bayes.report.figure_file import figure_file
-
     found = [one.ranks for one in maps if one.ranks is not None]
     names = RANKED[: len(found[0])] if found else RANKED
     ranks = np.array(found).reshape(-1, len(names))

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
+from scipy.special import ndtr
 
 from tactile_bayes.trial.calibration import BINS, Calibration, Prediction
 from tactile_bayes.trial.readings import FloatArray, ModalitySizes
@@ -145,8 +146,6 @@ def _draw_pit(axes: Axes, found: Calibration) -> None:
 
 
 def _draw_ecdf(axes: Axes, prediction: Prediction, found: Calibration) -> None:
-    from scipy.special import ndtr
-
     pit = np.sort(ndtr(prediction.z))
     share = np.arange(1, len(pit) + 1) / len(pit)
     line = np.array([0.0, 1.0])

@@ -7,6 +7,8 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, field
 
 import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.optimize import minimize_scalar
 
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError
@@ -417,8 +419,6 @@ def find_lookalikes(
     Frames are interpolated between the depths solved (cubic splines in h/d); the best depth of the larger lump of the
     best pair is then sought with the model itself.
     """
-    from scipy.optimize import minimize_scalar
-
     coarse = replace(settings, fineness=1)
     tried = np.round(np.arange(depth_ratios[0], depth_ratios[-1] + 1e-9, _STEP), 6)
     shares, added = {}, {}
@@ -453,8 +453,6 @@ def _interpolated(
     frames: Sequence[CentredFrame], depth_ratios: Sequence[float], tried: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Frames (k, n) of one size of lump at the depths tried, and what the lump adds to them."""
-    from scipy.interpolate import CubicSpline
-
     knots = np.asarray(depth_ratios)
     shares = CubicSpline(knots, np.stack([frame.share for frame in frames]))(tried)
     return shares, CubicSpline(knots, np.stack([frame.added for frame in frames]))(tried)

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import minimize
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.axisymmetric import CondensedLump, Tissue, condense_lump
@@ -20,7 +21,13 @@ from tactile_bayes.forward.scene import Head
 from tactile_bayes.forward.solid import RANK_TOLERANCE, PlacedLump, SolidHead, skin_perturbation, solid_head
 from tactile_bayes.forward.solid_scan import face_of
 from tactile_bayes.geometry import FloatArray
+from tactile_bayes.mapping.accumulate import FlatField
+from tactile_bayes.mapping.build import build_map
+from tactile_bayes.posterior.bump import Bump
+from tactile_bayes.posterior.fit_window import window_cells
+from tactile_bayes.posterior.white import LEAST_WIDTH_IN_CELLS, MOST_AXIS_RATIO, WIDEST_IN_RADII
 from tactile_bayes.presets import FIT_RADIUS_MM
+from tactile_bayes.scan import ElementCalibration, HeadGeometry, PressureFrames, Scan, TrackerPoses
 from tactile_bayes.studies.paper import DETECTABLE, Geometry, StudyRow, seat_name
 
 if TYPE_CHECKING:
@@ -43,10 +50,6 @@ _TRIED: Final = 14
 
 def raster_scan(frames: RasterFrames) -> Scan:
     """Convert a raster to a scan: level poses in the body's frame, readings over the frame's mean."""
-    import numpy as np
-
-    from tactile_bayes.scan import ElementCalibration, HeadGeometry, PressureFrames, Scan, TrackerPoses
-
     head, count = frames.head, len(frames.x_mm)
     time = np.arange(float(count)) / 100.0
     readings = _readings(frames.pressure_kpa)
@@ -73,9 +76,6 @@ def raster_map(frames: RasterFrames) -> TactileMap:
     Where the raster has a plain frame, the head's own response is taken off as `map --flat-field` takes off a
     patient's. There it is found from the scan's own calm frames; here it is known.
     """
-    from tactile_bayes.mapping.accumulate import FlatField
-    from tactile_bayes.mapping.build import build_map
-
     scan = raster_scan(frames)
     if frames.plain_kpa is not None:
         plain = _readings(frames.plain_kpa)
@@ -85,8 +85,6 @@ def raster_map(frames: RasterFrames) -> TactileMap:
 
 def _readings(pressure_kpa: FloatArray) -> CountArray:
     """(..., rows, columns) frames over their means, as whole numbers."""
-    import numpy as np
-
     share = pressure_kpa / pressure_kpa.mean(axis=(-2, -1), keepdims=True)
     counts: CountArray = np.clip(np.rint(share * _COUNTS), 0, np.iinfo(np.uint16).max - 1).astype(np.uint16)
     return counts
@@ -104,13 +102,6 @@ def fit_raster(frames: RasterFrames, settings: SolidSettings) -> RasterFit:
     a free level, eliminated, as in `study.fit_line`: steps of Gauss and Newton do not settle on a faint bump in its
     trough.
     """
-    from dataclasses import replace
-
-    import numpy as np
-
-    from tactile_bayes.posterior.fit_window import window_cells
-    from tactile_bayes.posterior.white import LEAST_WIDTH_IN_CELLS, MOST_AXIS_RATIO, WIDEST_IN_RADII
-
     radius_mm, free = settings.fit_radius_mm, settings.background == "free"
     cells = replace(window_cells(raster_map(frames), (0.0, 0.0), radius_mm=radius_mm), cell_mm=0.0)
     pitch = frames.head.pitch_mm
@@ -129,10 +120,6 @@ def fit_raster(frames: RasterFrames, settings: SolidSettings) -> RasterFit:
 
 def _height(log_widths: FloatArray, cells: FitCells, *, free: bool) -> tuple[float, float]:
     """Best amplitude of a bump of given widths on a level of 1 or a free one, and the remaining sum of squares."""
-    import numpy as np
-
-    from tactile_bayes.posterior.bump import Bump
-
     p, q = np.array([[0.5, 0.5], [0.5, -0.5]]) @ log_widths
     shape = Bump(background=1.0).unit_bump(np.array([[1.0, 0.0, 0.0, p, q]]), cells)[0]
     excess = cells.value - 1.0
@@ -145,8 +132,6 @@ def _height(log_widths: FloatArray, cells: FitCells, *, free: bool) -> tuple[flo
 
 def _lowest(cells: FitCells, ends: FloatArray, *, free: bool) -> FloatArray:
     """(2,) log widths of the lowest minimum between the ends."""
-    import numpy as np
-    from scipy.optimize import minimize
 
     def left(log_widths: FloatArray) -> float:
         return _height(log_widths, cells, free=free)[1]

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import binom, chi2, poisson
 
 from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.geometry import FloatArray
@@ -108,8 +109,6 @@ def rank_test(name: str, ranks: IntArray, *, draws: int, strays: FloatArray | No
 
 def chi2_p(ranks: IntArray, draws: int) -> float:
     """P value of the counts in equal bins of ranks: at most 20 bins, each with `LEAST_IN_BIN` or more expected."""
-    from scipy.stats import chi2
-
     bins = [b for b in range(2, 21) if (draws + 1) % b == 0 and len(ranks) >= LEAST_IN_BIN * b]
     if not bins:
         return 1.0
@@ -141,8 +140,6 @@ def ecdf_counts(ranks: IntArray, draws: int) -> IntArray:
 
 def stray(counts: IntArray, n: int) -> FloatArray:
     """(m,) smallest two-sided binomial tail of (m, draws) counts of n ranks: small where an ECDF departs somewhere."""
-    from scipy.stats import binom
-
     at = np.arange(1, counts.shape[-1] + 1) / (counts.shape[-1] + 1)
     number = np.arange(n + 1)[:, None]
     tails = 2.0 * np.minimum(binom.cdf(number, n, at), binom.sf(number - 1, n, at))
@@ -161,8 +158,6 @@ def ecdf_band(n: int, draws: int) -> tuple[FloatArray, FloatArray]:
 
     Each point's binomial limits are as wide as makes the whole path stay inside with probability `BAND`.
     """
-    from scipy.stats import binom
-
     level = float(np.quantile(uniform_strays(n, draws), 1.0 - BAND))
     at = np.arange(1, draws + 1) / (draws + 1)
     return np.asarray(binom.ppf(level / 2.0, n, at) / n), np.asarray(binom.isf(level / 2.0, n, at) / n)
@@ -341,8 +336,6 @@ class OtherRises:
 
 def other_rises(maps: list[MapRanks]) -> OtherRises:
     """Compare the number of maps measured elsewhere with what their estimates predicted, by a Poisson probability."""
-    from scipy.stats import poisson
-
     number = sum(one.outcome == ELSEWHERE for one in maps)
     announced = sum(1.0 - one.probability for one in maps if one.probability is not None)
     return OtherRises(number, announced, float(poisson.sf(number - 1, announced)) if number else 1.0)

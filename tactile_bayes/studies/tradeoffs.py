@@ -12,6 +12,8 @@ from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.body import THICKNESS_MM, Body
 from tactile_bayes.forward.line import build_line, fit_empirical, head_positions, press, press_layers
+from tactile_bayes.forward.mesh import lump_mesh
+from tactile_bayes.forward.plane_strain import rim_nodes
 from tactile_bayes.forward.scene import Scene
 from tactile_bayes.forward.tissue import SceneBody, fat_thickness
 from tactile_bayes.geometry import FloatArray
@@ -284,12 +286,8 @@ def _element_mm(case: LumpCase, setting: Setting) -> float:
     """Half the lump's circumference over the elements on it."""
     settings = setting.settings
     if isinstance(settings, SolidSettings):
-        from tactile_bayes.forward.mesh import lump_mesh
-
         nodes = len(lump_mesh(settings.geometry(case.body), settings.mesh_size).arc)
     else:
-        from tactile_bayes.forward.plane_strain import rim_nodes
-
         nodes = rim_nodes(case.body, fineness=settings.fineness)
     return float(np.pi * case.body.radius_mm / ((nodes - 1) / 2))
 

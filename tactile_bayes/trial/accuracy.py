@@ -10,6 +10,7 @@ from itertools import combinations
 
 import numpy as np
 import numpy.typing as npt
+from scipy.special import betaincinv
 
 from tactile_bayes.declarations import replace
 from tactile_bayes.trial.figures import (
@@ -105,8 +106,6 @@ def share_interval(share: float, number: float, *, confidence: float) -> Ends:
     share, number
         Share observed, and of how many trials, which need not be a whole number.
     """
-    from scipy.special import betaincinv
-
     tail, a, b = 0.5 * (1 - confidence), share * number + 0.5, (1 - share) * number + 0.5
     return min(share, float(betaincinv(a, b, tail))), max(share, float(betaincinv(a, b, 1 - tail)))
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from itertools import groupby
 
 import numpy as np
+from scipy.special import chdtri, kolmogi, ndtr, ndtri
 
 from tactile_bayes.trial.figures import MIN_PATIENTS, clopper_pearson
 from tactile_bayes.trial.readings import FloatArray, IntervalReading
@@ -155,8 +156,6 @@ def calibration(prediction: Prediction, *, confidence: float) -> Calibration | N
     """
     if len(prediction) == 0:
         return None
-    from scipy.special import kolmogi, ndtr
-
     z = prediction.z
     pit = ndtr(z)
     masses = len(np.unique(prediction.mass))
@@ -193,8 +192,6 @@ def crps_log_normal(prediction: Prediction) -> FloatArray:
 
     Baran & Lerch (2015), Q. J. R. Meteorol. Soc. 141, 2289.
     """
-    from scipy.special import ndtr
-
     w, sd, found = prediction.z, prediction.sd_log, np.exp(prediction.found_log)
     mean = np.exp(prediction.median_log + sd**2 / 2)
     score: FloatArray = found * (2 * ndtr(w) - 1) - 2 * mean * (ndtr(w - sd) + ndtr(sd / math.sqrt(2)) - 1)
@@ -203,8 +200,6 @@ def crps_log_normal(prediction: Prediction) -> FloatArray:
 
 def interval_score(prediction: Prediction, *, probability: float) -> FloatArray:
     """(n,) interval scores in mm: Gneiting & Raftery (2007), J. Am. Stat. Assoc. 102, 359, eq. 43."""
-    from scipy.special import ndtri
-
     reach = float(ndtri(0.5 + 0.5 * probability)) * prediction.sd_log
     low, high = np.exp(prediction.median_log - reach), np.exp(prediction.median_log + reach)
     found = np.exp(prediction.found_log)
@@ -217,8 +212,6 @@ def log_normal(
     low_mm: float | None, high_mm: float | None, probability: float | None, size_mm: float, sd_mm: float | None
 ) -> tuple[float, float] | None:
     """Median (log of mm) and SD of the log of a reading: from its interval, else from size and SD."""
-    from scipy.special import ndtri
-
     if low_mm is not None and high_mm is not None and probability is not None and 0 < low_mm < high_mm:
         reach = float(ndtri(0.5 + 0.5 * probability))
         return (math.log(low_mm) + math.log(high_mm)) / 2, (math.log(high_mm) - math.log(low_mm)) / (2 * reach)
@@ -249,8 +242,6 @@ def predictions(
 
 
 def _level(z: FloatArray, masses: int, level: float, *, confidence: float) -> LevelCoverage:
-    from scipy.special import ndtri
-
     covered = int(np.sum(np.abs(z) <= float(ndtri(0.5 + 0.5 * level))))
     share = clopper_pearson(covered * masses / len(z), masses, confidence=confidence)
     return LevelCoverage(level, covered, len(z), share)
@@ -258,8 +249,6 @@ def _level(z: FloatArray, masses: int, level: float, *, confidence: float) -> Le
 
 def _scale(z: FloatArray, mass: FloatArray, *, confidence: float) -> tuple[float, tuple[float, float]]:
     """Root mean square of z, and its chi-squared interval with one degree of freedom per mass."""
-    from scipy.special import chdtri
-
     masses = len(np.unique(mass))
     mean = float(np.mean(z**2))
     tail = 0.5 - 0.5 * confidence

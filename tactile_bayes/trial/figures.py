@@ -11,6 +11,7 @@ from typing import Literal, Protocol, TypeVar, assert_never
 
 import numpy as np
 import numpy.typing as npt
+from scipy.special import betaincinv, ndtr, ndtri, stdtrit
 
 from tactile_bayes.declarations import replace
 from tactile_bayes.trial.readings import FloatArray, ModalitySizes
@@ -72,8 +73,6 @@ def interval_from_values(
 
     for G patients: Tukey (1958), Ann. Math. Statist. 29, 614; Efron & Tibshirani (1993), ch. 11.
     """
-    from scipy.special import stdtrit
-
     groups = len(values)
     need_patients(groups)
     left_out = np.asarray(values, dtype=np.float64)
@@ -217,8 +216,6 @@ def clopper_pearson(k: float, n: float, *, confidence: float) -> tuple[float, fl
     -----
     The ends are quantiles of Beta(k, n-k+1) and Beta(k+1, n-k). Clopper & Pearson (1934), Biometrika 26, 404.
     """
-    from scipy.special import betaincinv
-
     if not 0 <= k <= n or n <= 0:
         raise ValueError(f"need 0 <= k <= n and n > 0 (found k = {k}, n = {n})")
     tail = 0.5 * (1 - confidence)
@@ -283,8 +280,6 @@ def bca_interval(value: float, drawn: FloatArray, left_out: FloatArray, *, confi
     Efron (1987), J. Am. Stat. Assoc. 82, 171: bias from the share of draws below the figure (ties by half),
     acceleration from the skewness of the values with one patient left out.
     """
-    from scipy.special import ndtr, ndtri
-
     drawn = _defined(drawn)
     share = (np.sum(drawn < value) + 0.5 * np.sum(drawn == value)) / len(drawn)
     bias = float(ndtri(np.clip(share, 0.5 / len(drawn), 1 - 0.5 / len(drawn))))

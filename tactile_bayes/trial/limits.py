@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from functools import cache, partial
 
 import numpy as np
+from scipy.special import chdtri, gammaincc, gammaincinv, gammaln, ndtr, ndtri, stdtr
 
 from tactile_bayes.declarations import replace
 from tactile_bayes.trial.figures import (
@@ -24,7 +25,7 @@ from tactile_bayes.trial.figures import (
     on_scale,
     ratio,
 )
-from tactile_bayes.trial.lines import centred, student
+from tactile_bayes.trial.lines import centred, least_squares, student
 from tactile_bayes.trial.readings import FloatArray, ModalitySizes
 
 # --- Exact factors k such that mean + k SD of a normal sample bounds its percentiles with a stated confidence.
@@ -39,8 +40,6 @@ def percentile_factor(n: int, *, percentile: float, confidence: float) -> float:
     A quantile of the noncentral t distribution over root n: the one-sided tolerance factor (Odeh & Owen 1980).
     Carkeet (2015), Optom. Vis. Sci. 92, e71, uses it for limits of agreement taken one at a time.
     """
-    from scipy.special import ndtr, ndtri
-
     z = float(ndtri(percentile))
     chi, weight = _chi_nodes(n - 1)
 
@@ -57,8 +56,6 @@ def content_factor(n: int, *, content: float, confidence: float) -> float:
     Two-sided tolerance factor of Wald & Wolfowitz (1946), exact as in Odeh & Owen (1980); Carkeet (2015) uses it for
     the two limits of agreement taken as a pair.
     """
-    from scipy.special import gammaincc, ndtri
-
     at, normal = np.polynomial.legendre.leggauss(_NODES)
     reach = min(9.0, float(ndtri(1 - 1e-17)))
     off = (at + 1) / 2 * reach
@@ -76,8 +73,6 @@ def content_factor(n: int, *, content: float, confidence: float) -> float:
 
 def _radius(shift: FloatArray, content: float) -> FloatArray:
     """Solve Phi(shift + r) - Phi(shift - r) = content for r."""
-    from scipy.special import ndtr, ndtri
-
     low, high = np.zeros_like(shift), np.abs(shift) + float(ndtri(0.5 + 0.5 * content)) + 1e-9
     for _ in range(80):
         middle = (low + high) / 2
@@ -88,8 +83,6 @@ def _radius(shift: FloatArray, content: float) -> FloatArray:
 
 def _chi_nodes(freedom: int) -> tuple[FloatArray, FloatArray]:
     """Values of s / sigma and their probabilities: Gauss-Legendre in the logarithm of s^2 / sigma^2."""
-    from scipy.special import gammaincinv, gammaln
-
     half = freedom / 2
     low = max(float(gammaincinv(half, 1e-18)), 1e-300) / half
     high = float(half + 12 * math.sqrt(half) + 80) / half
@@ -246,10 +239,6 @@ def trend(differences: FloatArray, sizes: FloatArray, *, confidence: float = 0.9
     `sizes` are the means of both methods (Bland & Altman 1999) or, when the reference is much the better of the two,
     the reference itself (Krouwer 2008, Stat. Med. 27, 778): against the mean, unequal errors alone make a slope.
     """
-    from scipy.special import stdtr
-
-    from tactile_bayes.trial.lines import least_squares
-
     line = least_squares(sizes, differences)
     both = line.intervals(confidence=confidence)
     if both is None or line.slope_se is None:
@@ -330,8 +319,6 @@ def _recovered(
     parts: Sequence[tuple[float, int]], total: float, *, z: float, bias_variance: float, confidence: float
 ) -> Ends:
     """Outer and inner reach of a limit's interval, from chi-squared intervals of each variance (Zou 2013)."""
-    from scipy.special import chdtri
-
     tail = 0.5 - 0.5 * confidence
     below = above = 0.0
     for variance, freedom in parts:
@@ -347,8 +334,6 @@ def _recovered(
 
 
 def _normal(probability: float) -> float:
-    from scipy.special import ndtri
-
     return float(ndtri(probability))
 
 

@@ -9,6 +9,7 @@ from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
+from scipy.special import ndtri, stdtrit
 
 from tactile_bayes.trial.figures import UndefinedError
 from tactile_bayes.trial.readings import FloatArray
@@ -229,8 +230,6 @@ def passing_bablok(
 def _slope_ends(
     angles: PairAngles, shift: int, *, rising: bool, confidence: float, measure: Measure, n: int
 ) -> tuple[float, float]:
-    from scipy.special import ndtri
-
     sd = math.sqrt(n * (n - 1) * (2 * n + 5) / 18)
     reach = math.floor(float(ndtri(0.5 + 0.5 * confidence)) * sd + 0.5)
     low, high = angles.number - reach + shift, angles.number + reach + shift
@@ -434,8 +433,6 @@ def centred(values: FloatArray, mean: float) -> FloatArray:
 
 def student(freedom: float, *, confidence: float) -> float:
     """Quantile of Student's t for a two-sided interval."""
-    from scipy.special import stdtrit
-
     return float(stdtrit(freedom, 0.5 + 0.5 * confidence))
 
 
@@ -535,8 +532,6 @@ def concordance(x: FloatArray, y: FloatArray, *, confidence: float = 0.95) -> Co
 
 
 def _fisher(rho: float, r: float, shift: float, n: int, confidence: float) -> tuple[float, float] | None:
-    from scipy.special import ndtri
-
     if n < 4 or r == 0 or abs(rho) >= 1:
         return None
     spread = (1 - r**2) * rho**2 * (1 - rho**2) / r**2 + 2 * rho**3 * (1 - rho) * shift**2 / r

@@ -26,6 +26,7 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
+from scipy.special import erf, expit, log_expit
 
 from tactile_bayes.trial.figures import MIN_PATIENTS
 from tactile_bayes.trial.readings import FloatArray, MassKey, ModalitySizes, Reading, gather, mass_numbers
@@ -280,8 +281,6 @@ def variances(theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         Bias, slope, logarithm of the total SD, logit of the share of the total variance that single readings have,
         logit of the patients' share of the rest.
     """
-    from scipy.special import expit
-
     total2 = _total_variance(theta[:, 2])
     # at least 1e-12 of the variance is the readings' own, so that no logarithm of 0 is taken
     of_readings, of_patients = np.clip(expit(theta[:, 3]), 1e-12, 1.0), expit(theta[:, 4])
@@ -305,8 +304,6 @@ def log_prior(theta: FloatArray, *, spread: float, caliper: float) -> FloatArray
     caliper's c: given the SD, bias and slope error are bivariate Cauchy with the SD as scale (Zellner & Siow 1980), and
     the SD has Jeffreys' prior. Both shares of the variance are uniform. Normal priors keep bias and slope finite.
     """
-    from scipy.special import log_expit
-
     bias, slope, log_total, *logits = theta.T
     off = slope - 1
     square = bias**2 + (off * spread) ** 2 + _total_variance(log_total) + caliper**2
@@ -336,8 +333,6 @@ def _total_variance(log_sd: FloatArray) -> FloatArray:
 
 
 def _erf(values: FloatArray) -> FloatArray:
-    from scipy.special import erf
-
     return np.asarray(erf(values))
 
 

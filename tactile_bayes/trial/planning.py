@@ -13,6 +13,7 @@ import numpy as np
 from tactile_bayes.trial.accuracy import mape_figure, mape_percent, mape_ratio, sign_flip
 from tactile_bayes.trial.figures import MIN_PATIENTS, Intervals, clopper_pearson, figure
 from tactile_bayes.trial.readings import FloatArray, ModalitySizes
+from tactile_bayes.trial.replicates import log_sd_within
 
 # --- Coverage of the chosen intervals in simulated trials with this trial's size and errors.
 
@@ -343,8 +344,6 @@ def assumptions_from(
     None when a modality found fewer than 3 masses; without ``map_sd`` and ``mass_sd`` when the pilot has no replicates
     and none is given, for then the two cannot be told apart.
     """
-    from tactile_bayes.trial.replicates import log_sd_within
-
     mine, theirs = observed_errors(tactile), observed_errors(other)
     if mine is None or theirs is None:
         return None

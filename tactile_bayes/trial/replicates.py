@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -228,8 +228,6 @@ def replicate_figures(sizes: ModalitySizes, *, confidence: float) -> dict[str, F
 
 def _swapped(one: Figure) -> Figure:
     """Figure whose ends are swapped, because it falls as its source rises."""
-    from dataclasses import replace
-
     return one if one.interval is None else replace(one, interval=(one.interval[1], one.interval[0]))
 
 
