@@ -168,11 +168,13 @@ def test_ctrl_c_prints_the_maps_that_are_done(folder: Path, alone: dict[str, str
 def test_without_an_estimate_the_figure_is_the_map_with_what_was_looked_at_and_why(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, option: str
 ) -> None:
-    from tactile_bayes.report import map_figure
+    from tactile_bayes.report import estimate_figures
 
     drawn: list[dict[str, Any]] = []
-    whole = map_figure.map_figure
-    monkeypatch.setattr(map_figure, "map_figure", lambda *given, **more: drawn.append(more) or whole(*given, **more))
+    whole = estimate_figures.map_figure
+    monkeypatch.setattr(
+        estimate_figures, "map_figure", lambda *given, **more: drawn.append(more) or whole(*given, **more)
+    )
     done = run_here("estimate", "empty.nc", *FAST, "-v", option, tmp_path / "f.svg", cwd=folder)
     assert done.returncode == 6
     assert (tmp_path / "f.svg").read_bytes().startswith(b"<?xml")

@@ -76,7 +76,7 @@ def test_lumps_of_another_origin_widen_the_interval(table: Path, tmp_path: Path)
     assert "bodies of another origin: SD of ln d 0.0" in done.stdout
     found = read_size_calibration(tmp_path / "size.json")
     assert isinstance(found, BodyCalibration)
-    assert (found.fit["other_masses"], found.other_source) == (40.0, f"40 lumps of {table.name}")
+    assert (found.fit["other_masses"], found.spread.other_source) == (40.0, f"40 lumps of {table.name}")
     lumps = run_here("calibrate", "size", PHANTOMS, "--against", table, "-o", "l.json", cwd=tmp_path)
     assert "--against is for a table of `population`" in lumps.stderr
 
