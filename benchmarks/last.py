@@ -8,8 +8,10 @@ from __future__ import annotations
 import csv
 import datetime
 import platform
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
+
+from tactile_bayes.declarations import as_dict
 
 LAST = Path(__file__).resolve().parent / "last.csv"
 MARGIN = 0.2
@@ -93,7 +95,7 @@ class Comparison:
         with self.path.open("w", encoding="utf-8", newline="") as file:
             table = csv.DictWriter(file, [one.name for one in fields(Figure)], lineterminator="\n")
             table.writeheader()
-            table.writerows(asdict(self._kept[key]) for key in sorted(self._kept))
+            table.writerows(as_dict(self._kept[key]) for key in sorted(self._kept))
 
     def _is_worse(self, name: str) -> bool:
         last = self._kept.get((self.bench, name))

@@ -74,6 +74,31 @@ def replace(record: T, **changes: Any) -> T:
     return copy
 
 
+def settle(record: Any, **values: Any) -> None:
+    """Set fields of a record in its ``__post_init__``, such as an array that was checked; never later."""
+    for name, value in values.items():
+        msgspec.structs.force_setattr(record, name, value)
+
+
+def names_of(kind: Any) -> tuple[str, ...]:
+    """Names of the fields of a record, or of a data class."""
+    names: tuple[str, ...] = getattr(kind, "__struct_fields__", None) or tuple(kind.__dataclass_fields__)
+    return names
+
+
+def as_dict(record: Any) -> dict[str, Any]:
+    """A record's values by name, those of records and data classes in it too; for what JSON holds see `to_plain`."""
+    return {name: _unfolded(getattr(record, name)) for name in names_of(record)}
+
+
+def _unfolded(value: Any) -> Any:
+    if isinstance(value, msgspec.Struct) or dataclasses.is_dataclass(value):
+        return as_dict(value)
+    if isinstance(value, dict):
+        return {key: _unfolded(one) for key, one in value.items()}
+    return type(value)(map(_unfolded, value)) if type(value) in (list, tuple) else value
+
+
 def from_plain(kind: type[T], document: object) -> T:
     """A record of plain data: dictionaries, lists, texts and numbers.
 

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict
 from typing import Final, Literal, get_args
 
-from tactile_bayes.declarations import replace
+from tactile_bayes.declarations import as_dict, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.records import dataclass
 
@@ -104,7 +103,7 @@ class Finding:
 
     def as_dict(self) -> dict[str, str]:
         """Plain data, as files have it."""
-        return {"severity": self.severity} | asdict(self)
+        return {"severity": self.severity} | as_dict(self)
 
 
 def by_weight(findings: Iterable[Finding]) -> tuple[Finding, ...]:

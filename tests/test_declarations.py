@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 import json
 import pickle
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 import fastjsonschema
@@ -13,7 +15,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tactile_bayes.declarations import Meta, Record, field, from_plain, replace, schema_of, to_plain
+from tactile_bayes.declarations import (
+    Meta,
+    Record,
+    as_dict,
+    field,
+    from_plain,
+    names_of,
+    replace,
+    schema_of,
+    settle,
+    to_plain,
+)
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.documents import read_record
 from tactile_bayes.geometry import Matrix, Vector
@@ -184,6 +197,50 @@ def test_a_record_is_a_value_that_nothing_changes():
     assert pickle.loads(pickle.dumps(ball)) == copy.deepcopy(ball) == ball
     with pytest.raises(AttributeError):
         ball.d_mm = 4.0  # type: ignore[misc]
+    with pytest.raises(AttributeError):
+        del ball.d_mm
+    assert not hasattr(ball, "__dict__")
+
+
+def test_values_decide_equality_and_hash_but_for_records_of_arrays():
+    assert len({Ball(1.0), Ball(1.0), Ball(2.0)}) == 2
+    assert Ball(1.0) != Rod(1.0)
+    one, other = from_plain(Scene, GOOD), from_plain(Scene, GOOD)
+    assert one == one != other
+    assert len({one, other}) == 2
+
+
+class Settled(Record, eq=False):
+    """A record that makes an array of what it is given."""
+
+    values: Vector
+    balls: tuple[Ball, ...] = ()
+    where: Mapping[str, Ball] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        settle(self, values=np.asarray(self.values, dtype=float))
+
+
+def test_a_record_settles_its_fields_when_it_is_made_and_when_it_is_changed():
+    assert Settled([1, 2]).values.dtype == np.float64  # type: ignore[arg-type]
+    assert replace(Settled([1]), values=[3]).values.shape == (1,)  # type: ignore[arg-type]
+
+
+@dataclasses.dataclass
+class Mutable:
+    """A data class of the standard library, for what changes."""
+
+    ball: Ball
+
+
+def test_the_values_of_a_record_by_name_are_those_of_its_parts_too():
+    assert names_of(Ball) == names_of(Ball(1.0)) == ("d_mm",)
+    values = np.ones(2)
+    found = as_dict(Settled(values, (Ball(1.0),), {"a": Ball(2.0)}))
+    assert found.pop("values") is values
+    assert found == {"balls": ({"d_mm": 1.0},), "where": {"a": {"d_mm": 2.0}}}
+    assert names_of(Mutable) == ("ball",)
+    assert as_dict(replace(Mutable(Ball(1.0)), ball=Ball(2.0))) == {"ball": {"d_mm": 2.0}}
 
 
 def test_a_record_prints_no_draws():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -18,7 +18,7 @@ from tactile_bayes.api.maps import Map, PathLike, map_of, output_path, path_of
 from tactile_bayes.api.pooled import elsewhere, pool_answers
 from tactile_bayes.api.settings import Settings, refuse_checkpoint
 from tactile_bayes.api.sized import Draws, MassEstimate, Sized
-from tactile_bayes.declarations import replace
+from tactile_bayes.declarations import names_of, replace
 from tactile_bayes.errors import UsageError
 from tactile_bayes.files.repeatability_json import read_repeatability
 from tactile_bayes.findings import Finding, findings_in
@@ -335,7 +335,7 @@ def _repeatability(given: Any) -> Repeatability | None:
 def _keywords() -> dict[str, str]:
     """Translate keywords of `estimate` into settings."""
     renamed = {"calibration": "size_calibration"}
-    names = [one.name for one in fields(Settings) if one.name != "settings_file"]
+    names = [name for name in names_of(Settings) if name != "settings_file"]
     return {renamed.get(name, name): name for name in names}
 
 

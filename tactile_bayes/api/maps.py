@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, overload
@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, overload
 import numpy as np
 
 from tactile_bayes.api.arguments import check_keywords, door, plain
+from tactile_bayes.declarations import as_dict
 from tactile_bayes.errors import UsageError, check_number
 from tactile_bayes.files.atomic import Format, check_suffix, sha256
 from tactile_bayes.files.map_nc import read_map_and_scans, write_map
@@ -336,4 +337,4 @@ def map_of(given: Any) -> Map:
 
 
 def _provenance(made: Map) -> Provenance:
-    return Provenance("map", {"called_from": "Python", **asdict(made.tactile_map.recipe)}, scans=made.scans)
+    return Provenance("map", {"called_from": "Python", **as_dict(made.tactile_map.recipe)}, scans=made.scans)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import fields
 from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,7 +12,7 @@ import numpy as np
 from tactile_bayes.api.estimating import Answer, size_priors
 from tactile_bayes.api.repeatability import check_repeatability, repeatability_digest, repeatability_setting
 from tactile_bayes.api.settings import Settings
-from tactile_bayes.declarations import replace
+from tactile_bayes.declarations import names_of, replace
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.provenance import Provenance, hash_inputs, scans_of
 from tactile_bayes.files.shipped import default_for, size_calibration_path
@@ -310,7 +309,7 @@ def _check_heads(answers: Sequence[Answer], calibration: BodyCalibration, names:
 
 def _plain(settings: Settings) -> dict[str, Any]:
     """Settings as JSON values."""
-    plain = {one.name: getattr(settings, one.name) for one in fields(settings)}
+    plain = {name: getattr(settings, name) for name in names_of(settings)}
     plain = {name: list(v) if isinstance(v, tuple) else v for name, v in plain.items()}
     del plain["seed"], plain["settings_file"], plain["repeatability"]
     plain |= repeatability_setting(settings)

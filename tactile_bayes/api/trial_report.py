@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
+from tactile_bayes.declarations import as_dict
 from tactile_bayes.errors import check_choice, check_number
 from tactile_bayes.presets import INTERVAL, RESEARCH_USE
 from tactile_bayes.records import dataclass
@@ -114,7 +114,7 @@ def _provenance(inputs: TrialInputs, settings: TrialSettings, protocol: Path | N
     from tactile_bayes.files.provenance import Provenance, hash_inputs
 
     files = inputs.files | ({} if protocol is None else {"protocol": protocol})
-    kept = {name: value for name, value in asdict(settings).items() if name != "seed"}
+    kept = {name: value for name, value in as_dict(settings).items() if name != "seed"}
     return Provenance(
         command="validate",
         settings={"interval_probability": INTERVAL, **kept},

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -14,6 +14,7 @@ from tactile_bayes.api.repeatability import exams_in, learn_from_exams
 from tactile_bayes.api.site_correction import correct_size
 from tactile_bayes.api.size_calibration import FORMS, is_population, learn_eq6, learn_population
 from tactile_bayes.api.trial_report import TrialSettings, analyse
+from tactile_bayes.declarations import names_of
 from tactile_bayes.errors import UsageError, check_choice, check_number
 from tactile_bayes.files.column_map import read_mapping, read_wide, read_wide_excision
 from tactile_bayes.files.estimate_json import fill_from_posteriors
@@ -171,7 +172,7 @@ def validate(
     BadDataError
         Naming the table, the line (1 is the header), the column, the value and the way out.
     """
-    check_keywords("validate", settings, [one.name for one in fields(TrialSettings)])
+    check_keywords("validate", settings, names_of(TrialSettings))
     used = TrialSettings(**{name: plain(value) for name, value in settings.items()})
     inputs = load_trial(_table(trial, "trial"), _table(excision, "excision"), path_of(columns))
     return TrialResult(analyse(inputs, used))

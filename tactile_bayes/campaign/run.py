@@ -16,7 +16,6 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
@@ -27,7 +26,7 @@ from tactile_bayes.campaign.match import Breasts, NamedPlace, Visits, days_of, g
 from tactile_bayes.campaign.settings import CampaignSettings, digest_of
 from tactile_bayes.campaign.stages import CampaignState, Fault, Stages, steps_needed
 from tactile_bayes.campaign.steps import FEWEST_MASSES, NOT_LEARNED, Task, copy_tasks, exam_folders, taught_by, too_few
-from tactile_bayes.declarations import replace
+from tactile_bayes.declarations import names_of, replace
 from tactile_bayes.files.atomic import sha256
 from tactile_bayes.files.campaign_names import ESTIMATE, EXAMS, GROWTH, MAP, MASSES, REPEATABILITY, SHAPE
 from tactile_bayes.files.manifest_csv import Exam
@@ -259,7 +258,7 @@ class Campaign:
 
     def _settings_key(self, settings: Settings, normalise: str) -> dict[str, Any]:
         """All that an estimate depends on besides its map: settings, and the digests of the files that they name."""
-        plain = {one.name: getattr(settings, one.name) for one in fields(settings)}
+        plain = {name: getattr(settings, name) for name in names_of(settings)}
         name = str(plain.pop("calibration") or default_for(normalise))
         file = plain.pop("settings_file")
         repeatability = plain.pop("repeatability")

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from tactile_bayes.commands.options import FORCE, MOST_ITEMS, WORKERS, FilePath, scheduler_option, seed_option
+from tactile_bayes.declarations import as_dict, names_of
 from tactile_bayes.presets import DEFAULT_NORMALISE
 
 if TYPE_CHECKING:
@@ -88,7 +89,6 @@ def command(
 
     Example: tactile-bayes population --head head.json --masses 100 --workers 4 -o population.csv
     """
-    from dataclasses import asdict
     from functools import partial
 
     from tactile_bayes.batch import fault_lines, open_executor, run_batch
@@ -112,7 +112,7 @@ def command(
         "first_centred": masses if centred else None,
         "normalise": list(dict.fromkeys(normalise)),
         **as_settings(bodies, exams),
-        "head": asdict(simulated),
+        "head": as_dict(simulated),
     }
     kept = output.with_name(f"{output.name}.unfinished")
     with (
@@ -196,9 +196,7 @@ def rows_of_mass(
 
 
 def _encode(rows: list[MassRow]) -> list[dict[str, Any]]:
-    from dataclasses import asdict
-
-    return [asdict(row) for row in rows]
+    return [as_dict(row) for row in rows]
 
 
 def _decode(rows: list[dict[str, Any]]) -> list[MassRow]:
@@ -209,12 +207,10 @@ def _decode(rows: list[dict[str, Any]]) -> list[MassRow]:
 
 def table_text(rows: list[MassRow]) -> str:
     """CSV of the rows, with the header of `data_schema/population.table.json`."""
-    from dataclasses import astuple, fields
-
     from tactile_bayes.studies.population import MassRow
 
-    lines = [",".join(field.name for field in fields(MassRow))]
-    return "\n".join(lines + [",".join(map(_cell, astuple(row))) for row in rows]) + "\n"
+    lines = [",".join(names_of(MassRow))]
+    return "\n".join(lines + [",".join(map(_cell, as_dict(row).values())) for row in rows]) + "\n"
 
 
 def _cell(value: Any) -> str:

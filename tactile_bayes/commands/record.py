@@ -18,6 +18,7 @@ import click
 
 from tactile_bayes.commands.emulate import PROTOCOLS
 from tactile_bayes.commands.options import FORCE, FilePath, FiniteRange, also_read, live_options
+from tactile_bayes.declarations import as_dict
 from tactile_bayes.errors import EXIT_INTERRUPTED, DeviceError, UsageError
 from tactile_bayes.presets import PRESSURE_RANGE_KPA
 
@@ -416,7 +417,6 @@ def make_recording(request: Request) -> tuple[Report, bool]:
     DeviceError
         When a port cannot be opened, or another device answers on it.
     """
-    from dataclasses import asdict
     from datetime import date
 
     from tactile_bayes.files.atomic import refuse_existing, unwritable
@@ -461,7 +461,7 @@ def make_recording(request: Request) -> tuple[Report, bool]:
         stopper = stack.enter_context(Stopper(recorder))
         try:
             report = _run(recorder, stopper, head, request)
-            writer.close(asdict(report) | {"cautions": "\n".join(report.cautions)})
+            writer.close(as_dict(report) | {"cautions": "\n".join(report.cautions)})
         except OSError as error:
             writer.stop_syncing()
             with suppress(OSError):  # what is still in its buffer cannot be written either

@@ -22,6 +22,7 @@ from tactile_bayes.commands.options import (
     scheduler_option,
     seed_option,
 )
+from tactile_bayes.declarations import as_dict
 from tactile_bayes.presets import MOST_FIELD_COSINES, Method
 
 if TYPE_CHECKING:
@@ -204,9 +205,7 @@ def _finish(outcomes: list[Outcome[MapRanks]], output: Path | None) -> int:
 
 
 def _encode(one: MapRanks) -> dict[str, Any]:
-    from dataclasses import asdict
-
-    return asdict(one)
+    return as_dict(one)
 
 
 def _decode(value: dict[str, Any]) -> MapRanks:

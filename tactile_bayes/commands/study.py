@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from tactile_bayes.commands.options import FORCE, WORKERS, FilePath, FiniteRange, head_option, scheduler_option
+from tactile_bayes.declarations import as_dict
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -418,9 +419,7 @@ def store_path(output: Path) -> Path:
 
 
 def _encode(rows: list[StudyRow]) -> list[dict[str, Any]]:
-    from dataclasses import asdict
-
-    return [asdict(row) for row in rows]
+    return [as_dict(row) for row in rows]
 
 
 def _decode(rows: list[dict[str, Any]]) -> list[StudyRow]:

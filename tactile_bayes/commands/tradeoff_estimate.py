@@ -17,6 +17,7 @@ from tactile_bayes.commands.options import (
     seed_option,
 )
 from tactile_bayes.commands.tradeoff_options import CALIBRATION, RUNS, TOLERANCE
+from tactile_bayes.declarations import replace
 
 _FILE = FilePath()
 
@@ -69,7 +70,6 @@ def command(
     from tactile_bayes.commands.options import settings_of
     from tactile_bayes.commands.progress import progress_bar
     from tactile_bayes.commands.tradeoff_options import forecast, fresh_cpu_s, show
-    from tactile_bayes.declarations import replace
     from tactile_bayes.errors import UsageError
     from tactile_bayes.files.atomic import given_twice, refuse_existing
     from tactile_bayes.files.provenance import Provenance, hash_inputs

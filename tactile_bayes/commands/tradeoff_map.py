@@ -8,6 +8,7 @@ import click
 
 from tactile_bayes.commands.options import FORCE, JSON, METAVAR, FigurePath, FilePath, seed_option
 from tactile_bayes.commands.tradeoff_options import RUNS, TOLERANCE
+from tactile_bayes.declarations import replace
 
 _FILE = FilePath()
 
@@ -48,7 +49,6 @@ def command(
     from tactile_bayes.api.tradeoffs import tradeoff_of_scan
     from tactile_bayes.commands.progress import progress_bar
     from tactile_bayes.commands.tradeoff_options import forecast, show
-    from tactile_bayes.declarations import replace
     from tactile_bayes.files.atomic import refuse_existing
     from tactile_bayes.files.provenance import Provenance, hash_inputs
     from tactile_bayes.files.scan_mcap import read_scan

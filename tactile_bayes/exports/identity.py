@@ -8,11 +8,10 @@ import logging
 import re
 import warnings
 from collections.abc import Iterator, Mapping
-from dataclasses import fields
 from pathlib import Path
 from typing import Any, Final
 
-from tactile_bayes.declarations import replace
+from tactile_bayes.declarations import names_of, replace
 from tactile_bayes.errors import BadDataError, TactileBayesError, UsageError
 from tactile_bayes.exports.exam import required
 from tactile_bayes.files.documents import check_document, load_json, load_schema, refuse_unknown
@@ -120,8 +119,8 @@ class Identity:
     content_date: str = ""
 
     def __post_init__(self) -> None:
-        for one in fields(self):
-            _check_text(one.name, getattr(self, one.name))
+        for name in names_of(self):
+            _check_text(name, getattr(self, name))
         for name in _NAMES:
             _check_name(name, getattr(self, name))
         if self.sex not in ("", *SEXES):
@@ -139,7 +138,7 @@ class Identity:
     @property
     def given(self) -> dict[str, str]:
         """What was given, by name."""
-        return {one.name: value for one in fields(self) if (value := getattr(self, one.name))}
+        return {name: value for name in names_of(self) if (value := getattr(self, name))}
 
     @property
     def study(self) -> Moment | None:

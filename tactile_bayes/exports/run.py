@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal, get_args
 
-from tactile_bayes.declarations import replace
+from tactile_bayes.declarations import names_of, replace
 from tactile_bayes.errors import UsageError
 from tactile_bayes.exports.dicom import VALUES, dicom_files
 from tactile_bayes.exports.exam import EstimateFile, MapFile, check_pairs
@@ -115,7 +115,7 @@ def _prepared_folder(folder: Path, names: set[str], *, force: bool) -> Path | No
 
 ExportFormat = Literal["dicom", "fhir", "nrrd", "csv"]
 FORMATS: Final[tuple[ExportFormat, ...]] = get_args(ExportFormat)
-_EVERYTHING: Final = tuple(Identity().__dataclass_fields__)
+_EVERYTHING: Final = names_of(Identity)
 TAKES: Final[dict[ExportFormat, tuple[str, ...]]] = {
     "dicom": _EVERYTHING,
     "fhir": ("patient_id", "patient_name", "birth_date", "sex", "issuer", "accession", "study_date"),

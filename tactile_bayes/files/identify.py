@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import csv
 import io
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from tactile_bayes.declarations import as_dict
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.documents import load_json, parse_json
 from tactile_bayes.files.reading import HDF5_MAGIC, MCAP_MAGIC, open_input
@@ -113,7 +113,7 @@ def _map(path: Path) -> dict[str, Any]:
         "patient_frame": tactile_map.patient_from_plane is not None,
         **({} if tactile_map.nipple_mm is None else {"nipple_mm": tactile_map.nipple_mm.tolist()}),
         "findings": finding_lines(tactile_map.findings),
-        "recipe": asdict(tactile_map.recipe),
+        "recipe": as_dict(tactile_map.recipe),
         **({} if tactile_map.head is None else {"head": tactile_map.head.as_dict()}),
         "quality": dict(tactile_map.quality),
         "masked_taxels": list(tactile_map.masked_taxels),

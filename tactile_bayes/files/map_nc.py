@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from tactile_bayes.declarations import as_dict
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.atomic import write_bytes
 from tactile_bayes.files.documents import parse_json
@@ -161,7 +161,7 @@ def _attributes(tactile_map: TactileMap, provenance: Provenance) -> dict[str, st
     return ({"Conventions": "CF-1.11"} if tactile_map.recipe.value_unit in _CF_UNITS else {}) | {
         "title": "Tactile map: mean normalised pressure on the best-fit plane",
         "schema": SCHEMA,
-        "recipe": _json(asdict(tactile_map.recipe)),
+        "recipe": _json(as_dict(tactile_map.recipe)),
         "background": _json(tactile_map.background),
         "frame_count": _json(int(tactile_map.frame_count)),
         "quality": _json({name: _finite(value) for name, value in tactile_map.quality.items()}),

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
 from typing import Any, Final
 
 import numpy as np
 
+from tactile_bayes.declarations import as_dict
 from tactile_bayes.forward.scene import Background, Scene, Strokes, Taxels, rotation_from_vector
 from tactile_bayes.geometry import FloatArray, apply, inverse, patient_from_base, quaternion_from_rotation
 from tactile_bayes.presets import PRESSURE_RANGE_KPA
@@ -214,8 +214,8 @@ def _truth(scene: Scene, model: Mapping[str, Any]) -> dict[str, Any]:
         "schema": TRUTH_SCHEMA,
         **model,
         "lumps": [_lump_truth(lump, base_from_plane, patient_from_plane) for lump in lumps],
-        "background": asdict(scene.background),
-        "noise": asdict(scene.noise),
+        "background": as_dict(scene.background),
+        "noise": as_dict(scene.noise),
         "latency_ms": scene.tracker.latency_ms,
         "plane_from_base": inverse(base_from_plane).tolist(),
         "patient_from_plane": None if patient_from_plane is None else patient_from_plane.tolist(),

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict
 from typing import Final
 
 import numpy as np
 
-from tactile_bayes.declarations import replace
+from tactile_bayes.declarations import as_dict, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.instrument import SimulatedScan, head_positions, level_kpa, record
 from tactile_bayes.forward.plane_scan import frames_at_poses as plane_frames_at_poses
@@ -144,8 +143,8 @@ def felt_at_poses(
 def _simulate_gaussian(scene: Scene, *, rng: np.random.Generator) -> SimulatedScan:
     truth = {
         "model": "gaussian",
-        "lumps": [asdict(lump) for lump in scene.lumps],
-        "background": asdict(scene.background),
+        "lumps": [as_dict(lump) for lump in scene.lumps],
+        "background": as_dict(scene.background),
     }
     return record(scene, felt=lambda time_s: _pressure(scene, time_s), truth=truth, rng=rng)
 

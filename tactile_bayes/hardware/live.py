@@ -10,12 +10,12 @@ import struct
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from tactile_bayes.declarations import replace
+from tactile_bayes.declarations import as_dict, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import FloatArray, apply, patient_from_plane
 from tactile_bayes.hardware.readings import CountArray, PoseReading
@@ -99,7 +99,7 @@ class Feed:
 
     def told(self, report: Report) -> None:
         """Send the account so far."""
-        self._send(REPORT, json.dumps(asdict(report)).encode()[: select.PIPE_BUF - _HEADER.size])
+        self._send(REPORT, json.dumps(as_dict(report)).encode()[: select.PIPE_BUF - _HEADER.size])
 
     def _send(self, kind: int, payload: bytes) -> None:
         message = _HEADER.pack(kind, len(payload)) + payload

@@ -5,12 +5,11 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import asdict
 from typing import Literal, assert_never
 
 import numpy as np
 
-from tactile_bayes.declarations import replace
+from tactile_bayes.declarations import as_dict, replace
 from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.draws import END_ERROR, INDEPENDENT_DRAWS, ParameterDraws, Solved, distinct_rows
@@ -278,13 +277,13 @@ def checkpoint_key(fit: FieldFit, settings: str, rng: np.random.Generator) -> st
     for values in arrays:
         digest.update(np.ascontiguousarray(values, dtype="<f8").tobytes())
     said = {
-        "scene": asdict(fit.scene),
+        "scene": as_dict(fit.scene),
         "prior": target.problem.prior.as_dict(),
         "scale": target.problem.amplitude_scale,
         "bounds": [target.problem.widest_mm, target.problem.radius_mm],
         "fields": target.chosen_fields(),
         "cosines": target.window.cosines,
-        "pose_noise": None if cells.pose_noise is None else asdict(cells.pose_noise),
+        "pose_noise": None if cells.pose_noise is None else as_dict(cells.pose_noise),
         "settings": settings,
         "rng": str(rng.bit_generator.state),
     }

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from tactile_bayes.declarations import as_dict
 from tactile_bayes.findings import Finding
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.draws import ParameterDraws, weighted_quantiles_of
@@ -126,7 +126,7 @@ class Rise:
 
     def as_dict(self) -> dict[str, float | None]:
         """Plain data, as in the JSON."""
-        return {name: None if value is None else float(f"{value:.6g}") for name, value in asdict(self).items()}
+        return {name: None if value is None else float(f"{value:.6g}") for name, value in as_dict(self).items()}
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, astuple, fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from tactile_bayes.declarations import as_dict, names_of
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.figure_file import figure_file
 from tactile_bayes.studies.sbc import (
@@ -56,7 +56,7 @@ def sbc_document(
             sorted(Counter(one.outcome for one in maps if one.ranks is None and one.probability is None).items())
         ),
         "drawn_by": dict(sorted(Counter(one.outcome for one in ranked).items())),
-        "elsewhere": asdict(others) | {"too_many": others.too_many},
+        "elsewhere": as_dict(others) | {"too_many": others.too_many},
         "draws": DRAWS,
         "maps_per_s": maps_per_s,
         "parameters": [_as_dict(one) for one in tests],
@@ -66,7 +66,7 @@ def sbc_document(
 
 
 def _as_dict(test: RankTest) -> dict[str, Any]:
-    return asdict(test) | {"inside_band": test.inside, "verdict": verdict(test)}
+    return as_dict(test) | {"inside_band": test.inside, "verdict": verdict(test)}
 
 
 def verdict(test: RankTest) -> str:
@@ -140,7 +140,7 @@ def table_text(maps: Sequence[MapRanks]) -> str:
     """CSV with one row per map: truth, ranks (empty without an estimate) and outcome."""
     header = [
         "map",
-        *(one.name for one in fields(Truth)),
+        *names_of(Truth),
         *(f"rank_{name}" for name in RANKED),
         "outcome",
         "probability",
@@ -152,7 +152,7 @@ def _table_row(one: MapRanks) -> str:
     ranks = [str(rank) for rank in one.ranks or ()]
     ranks += [""] * (len(RANKED) - len(ranks))
     probability = "" if one.probability is None else f"{one.probability:.8g}"
-    truth = (f"{value:.8g}" for value in astuple(one.truth))
+    truth = (f"{value:.8g}" for value in as_dict(one.truth).values())
     return ",".join([str(one.index), *truth, *ranks, one.outcome, probability])
 
 

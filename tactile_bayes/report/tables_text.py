@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from textwrap import wrap
 
+from tactile_bayes.declarations import as_dict
 from tactile_bayes.forward.contact import Head
 from tactile_bayes.forward.line import RANGE, outside_range
 from tactile_bayes.report.paper_head import named
@@ -140,11 +140,11 @@ def tables_document(found: ByHead, phantoms: ByHead, *, seat: float) -> dict[str
             "frames": {f"{h:g}": list(row) for h, row in PRINTED_FRAMES.items()},
             "maps": {f"{h:g}": list(row) for h, row in PRINTED_MAPS.items()},
         },
-        "cases": [asdict(one) for one in found[first]],
-        "phantoms": [asdict(one) for one in phantoms[first]],
+        "cases": [as_dict(one) for one in found[first]],
+        "phantoms": [as_dict(one) for one in phantoms[first]],
         "heads": [
             {
-                **asdict(head),
+                **as_dict(head),
                 "distance": table_distance(rows),
                 "frames": [one.centred_frame for one in rows],
                 "all_frames": [one.all_frames for one in rows],

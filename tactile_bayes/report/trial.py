@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, is_dataclass
 from typing import Any
 
+from tactile_bayes.declarations import names_of
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.trial.accuracy import ModalityRatio, PairedComparison, least_p
 from tactile_bayes.trial.figures import Figure
@@ -197,7 +198,7 @@ def _paired_document(one: PairedComparison) -> dict[str, Any]:
 def _plain(value: object) -> Any:
     """Convert dataclasses, tuples and numbers to JSON values; what is not finite becomes null."""
     if is_dataclass(value):
-        return {one.name: _plain(getattr(value, one.name)) for one in fields(value)}
+        return {name: _plain(getattr(value, name)) for name in names_of(value)}
     if isinstance(value, Mapping):
         return {key: _plain(one) for key, one in value.items()}
     if isinstance(value, tuple | list):

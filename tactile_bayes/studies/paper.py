@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.optimize import minimize_scalar
 
-from tactile_bayes.declarations import replace
+from tactile_bayes.declarations import as_dict, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.body import FAT_KPA, GLAND_RATIO, POISSON, SEATS, Body
 from tactile_bayes.forward.contact import Head
@@ -72,7 +72,7 @@ class StudySettings:
 
     def as_dict(self) -> dict[str, object]:
         """Plain data for a store's header and for a report."""
-        return asdict(self)
+        return as_dict(self)
 
     def body(self, d_mm: float, depth_ratio: float, *, seat: float) -> Body:
         """The body of a case."""

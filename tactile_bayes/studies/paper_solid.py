@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
+from tactile_bayes.declarations import as_dict, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.axisymmetric import CondensedLump, Tissue, condense_lump
 from tactile_bayes.forward.body import FAT_KPA, GLAND_RATIO, POISSON, Body
@@ -222,7 +223,7 @@ class SolidSettings:
 
     def as_dict(self) -> dict[str, object]:
         """Plain data for a store's header."""
-        return {"model": "solid", **asdict(self)}
+        return {"model": "solid", **as_dict(self)}
 
     def body(self, d_mm: float, depth_ratio: float, *, seat: float) -> Body:
         """The body of a case."""

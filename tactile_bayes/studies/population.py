@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from tactile_bayes.declarations import replace
+from tactile_bayes.declarations import as_dict, names_of, replace
 from tactile_bayes.errors import BadDataError, TactileBayesError
 from tactile_bayes.forward.scene import FLAT_MM, Background, Head, Noise, Scene, Strokes, Tracker
 from tactile_bayes.forward.tissue import SceneBody, SolidLump
@@ -181,7 +181,7 @@ def centred(bodies: BodyPrior) -> BodyPrior:
 
 def as_settings(bodies: BodyPrior, exams: ExamPrior) -> Mapping[str, object]:
     """Plain data for a table's header and a calibration's provenance."""
-    return {"bodies": asdict(bodies), "exams": asdict(exams)}
+    return {"bodies": as_dict(bodies), "exams": as_dict(exams)}
 
 
 def _log_uniform(ends: Range, rng: np.random.Generator) -> float:
@@ -194,7 +194,7 @@ UNKNOWNS = ("depth_mm", "stiffness_ratio", "seat", "fat_kpa", "gland_ratio", "th
 SHAPE_COVARIANCE = ("var_log_a", "cov_log_a_p", "cov_log_a_q", "var_p", "cov_p_q", "var_q")
 FIT_RADIUS_MM = 20.0
 _DRAWS_SEED = 1
-BODY_COLUMNS = tuple(one.name for one in fields(BodyPrior))
+BODY_COLUMNS = names_of(BodyPrior)
 
 
 def measuring_options() -> EstimateOptions:
@@ -337,7 +337,7 @@ def _measured(tactile_map: TactileMap) -> dict[str, Any]:
 
 def head_columns(head: Head) -> dict[str, Any]:
     """Columns of a table that name its head."""
-    found: dict[str, Any] = {f"head_{name}": value for name, value in asdict(head).items()}
+    found: dict[str, Any] = {f"head_{name}": value for name, value in as_dict(head).items()}
     return found | ({"head_radius_mm": None} if head.radius_mm >= FLAT_RADIUS_MM else {})
 
 
@@ -349,7 +349,7 @@ def table_head(columns: Mapping[str, Sequence[Any]]) -> HeadShape:
     BadDataError
         When rows differ in it.
     """
-    names = [f"head_{one.name}" for one in fields(Head)]
+    names = [f"head_{name}" for name in names_of(Head)]
     found = set(zip(*(columns[name] for name in names), strict=True))
     if len(found) > 1:
         raise BadDataError("its maps were made with several heads", way_out="learn from the rows of one head")

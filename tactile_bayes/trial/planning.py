@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
+from tactile_bayes.declarations import as_dict
 from tactile_bayes.trial.accuracy import mape_figure, mape_percent, mape_ratio, sign_flip
 from tactile_bayes.trial.figures import MIN_PATIENTS, Intervals, clopper_pearson, figure
 from tactile_bayes.trial.readings import FloatArray, ModalitySizes
@@ -230,7 +231,7 @@ class PlanResult:
 
     def as_dict(self) -> dict[str, Any]:
         """Plain data."""
-        return asdict(self) | {"power_interval": list(self.power_interval)}
+        return as_dict(self) | {"power_interval": list(self.power_interval)}
 
 
 def designs(patients: Sequence[int], maps: Sequence[int], **assumptions: Any) -> Iterator[PlanCase]:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.trial.figures import Figure, SumStatistic, UndefinedError, columns, figure, ratio
 from tactile_bayes.trial.readings import FloatArray, ModalitySizes
 

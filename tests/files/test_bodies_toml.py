@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from pathlib import Path
 
 import pytest
 
+from tactile_bayes.declarations import as_dict
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.documents import load_schema, read_bodies
 from tactile_bayes.studies.population import BodyPrior, ExamPrior, draw_mass
@@ -22,7 +22,7 @@ def test_the_schema_has_the_programs_defaults() -> None:
     tables = load_schema("bodies.schema.json")["properties"]
     for name, prior in (("bodies", BodyPrior()), ("exams", ExamPrior())):
         defaults = {key: tuple(rule["default"]) for key, rule in tables[name]["properties"].items()}
-        assert defaults == asdict(prior)
+        assert defaults == as_dict(prior)
 
 
 def test_what_is_given_is_drawn_from(tmp_path: Path) -> None:

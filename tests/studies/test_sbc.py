@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict
 
 import numpy as np
 import pytest
 
 from tactile_bayes.commands.sbc import _shipped
-from tactile_bayes.declarations import replace
+from tactile_bayes.declarations import as_dict, replace
 from tactile_bayes.posterior import draw
 from tactile_bayes.posterior.bump import BumpPrior
 from tactile_bayes.posterior.draws import MapPosterior
@@ -137,7 +136,7 @@ def test_a_field_is_as_strong_at_the_rim_of_a_map_as_inside(length: float) -> No
 
 def test_a_map_has_the_errors_it_says() -> None:
     """Without field, slope and bump, what is left varies as the map's own variance over count says."""
-    truth = Truth(**asdict(TRUTH) | {"share": 0.0, "amplitude": 0.0})
+    truth = Truth(**as_dict(TRUTH) | {"share": 0.0, "amplitude": 0.0})
     tactile_map = sbc.draw_map(truth, np.random.default_rng(1), BumpPrior(tilt_sd=0.0))
     z = (tactile_map.mean - 1.0) / np.sqrt(tactile_map.variance / tactile_map.count)
     assert np.std(z) == pytest.approx(1.0, abs=0.05)
@@ -170,7 +169,7 @@ def test_other_rises_are_held_against_what_the_probabilities_announce() -> None:
 
 
 def test_another_rise_is_one_that_neither_reaches() -> None:
-    at = {name: np.array([value]) for name, value in asdict(TRUTH).items() if name in sbc.PARAMETERS}
+    at = {name: np.array([value]) for name, value in as_dict(TRUTH).items() if name in sbc.PARAMETERS}
     rest = {"angle_rad": np.zeros(1), "background": np.ones(1), "noise_sd": np.ones(1)}
     near = MapPosterior(**(at | rest | {"x_mm": np.array([TRUTH.x_mm + 5.9])}))
     far = MapPosterior(**(at | rest | {"x_mm": np.array([TRUTH.x_mm + 6.1])}))
@@ -188,7 +187,7 @@ def size_ranks(n: int, *, wider: float = 1.0) -> np.ndarray:
         true |= {name: wider * true[name] for name in ("sigma_x_mm", "sigma_y_mm")}
         rest = ("x_mm", "y_mm", "angle_rad", "background", "noise_sd")
         posterior = MapPosterior(**drawn, **dict.fromkeys(rest, np.zeros(1000)))
-        ranks.append(sbc._ranks_in(posterior, Truth(**asdict(TRUTH) | true), rng, _shipped())[-1])
+        ranks.append(sbc._ranks_in(posterior, Truth(**as_dict(TRUTH) | true), rng, _shipped())[-1])
     return np.array(ranks)
 
 
