@@ -3,56 +3,55 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, cast
+from typing import TYPE_CHECKING, Any, Final, Literal, cast
 
 import numpy as np
 
-from tactile_bayes.declarations import replace
+from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError, NotConvergedError, UsageError
 from tactile_bayes.files.reading import open_input
-from tactile_bayes.presets import FIT_RADIUS_MM, LEAST_HARD_RATIO, Background, Noise
+from tactile_bayes.files.tables import Sheet, Table
+from tactile_bayes.geometry import FloatArray
+from tactile_bayes.presets import FIT_RADIUS_MM, LEAST_HARD_RATIO, Background
 from tactile_bayes.scan import HeadShape
-from tactile_bayes.size.terms import Recipe
+from tactile_bayes.size.bodies import BodyCalibration
+from tactile_bayes.size.eq6 import LeftOutErrors, SizeCalibration
+from tactile_bayes.size.learn import bodies as learning
+from tactile_bayes.size.learn.cross_validation import left_out_of_study
+from tactile_bayes.size.learn.eq6 import (
+    OtherFit,
+    SizeTable,
+    StudyCases,
+    axis_in_two_stages,
+    learn_size_calibration,
+    learn_two_stage,
+    other_fit,
+    width_changes,
+)
+from tactile_bayes.size.terms import Normalise, Recipe
+from tactile_bayes.studies.population import measuring_options, population_table, table_bodies, table_head
 
 if TYPE_CHECKING:
     from tactile_bayes.api.estimating import Progress
-    from tactile_bayes.files.tables import Sheet, Table
-    from tactile_bayes.scan import HeadShape
-    from tactile_bayes.size.bodies import BodyCalibration
-    from tactile_bayes.size.eq6 import LeftOutErrors, SizeCalibration
-    from tactile_bayes.size.learn.eq6 import OtherFit, SizeTable, StudyCases
-    from tactile_bayes.size.terms import Normalise, Recipe
-
-_SOURCE = "balls in a population of bodies, scanned by the solid model"
-
 
 EqSixFit = Literal["joint", "two-stage"]
 PopulationForm = Literal["eq6", "eq6-residual"]
-FORMS: tuple[PopulationForm, ...] = ("eq6", "eq6-residual")
+FORMS: Final[tuple[PopulationForm, ...]] = ("eq6", "eq6-residual")
 """What can be learned from a table of `population`; only the first from a table of lumps."""
+_SOURCE: Final = "balls in a population of bodies, scanned by the solid model"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Learned:
-    """A learned size calibration, with its table and the settings for its provenance.
-
-    Parameters
-    ----------
-    lumps
-        Rows of the table as Eq 6 takes them.
-    not_left_out
-        Why no geometry could be left out; empty where they were, or the table is no study.
-    other_fit
-        What the other of the two fits makes of the table; None where it has none.
-    """
+class Learned(Record, eq=False):
+    """A learned size calibration, with its table as Eq 6 takes it and the settings for its provenance."""
 
     calibration: SizeCalibration
     lumps: SizeTable
     not_left_out: str
+    """Why no geometry could be left out; empty where they were, or the table is no study."""
     settings: dict[str, Any]
     other_fit: OtherFit | None = None
+    """What the other of the two fits makes of the table; None where it has none."""
 
 
 def learn_eq6(
@@ -64,16 +63,9 @@ def learn_eq6(
     seed: int = 1,
     progress: Progress | None = None,
 ) -> Learned:
-    """Learn Eq 6 from a table of lumps.
+    """Learn Eq 6 from a table of lumps, of which those softer than `least_stiffness_ratio` take no part.
 
-    Parameters
-    ----------
-    declared
-        As for `table_recipe`.
-    fit
-        ``"joint"``: the posterior of all coefficients from all rows; ``"two-stage"``: as printed, with a bootstrap.
-    least_stiffness_ratio
-        Softer lumps take no part.
+    By the posterior of all coefficients from all rows (``"joint"``), or as printed, with a bootstrap (``"two-stage"``).
 
     Raises
     ------
@@ -82,8 +74,6 @@ def learn_eq6(
     NotConvergedError
         When the sampler does not converge.
     """
-    from tactile_bayes.size.learn.eq6 import learn_size_calibration, learn_two_stage, other_fit
-
     recipe = table_recipe(rows, declared)
     try:
         lumps = size_table(rows, least_stiffness_ratio=least_stiffness_ratio)
@@ -130,14 +120,8 @@ def learn_population(
 ) -> tuple[BodyCalibration, dict[str, Any]]:
     """Learn a calibration from a table of `population`; the calibration, and settings for its provenance.
 
-    Parameters
-    ----------
-    form
-        One of `FORMS`.
-    normalise
-        Of the rows to learn from; may be left out where all are alike.
-    against
-        Lumps of another origin, in the same columns: they tell by how much such bodies depart.
+    `normalise` is that of the rows to learn from, and may be left out where all are alike. Lumps of another origin, in
+    the same columns, tell by how much such bodies depart: `against`.
 
     Raises
     ------
@@ -146,9 +130,6 @@ def learn_population(
     NotConvergedError
         When the posterior has no mode.
     """
-    from tactile_bayes.size.learn import bodies as learning
-    from tactile_bayes.studies.population import measuring_options, population_table, table_bodies, table_head
-
     fit = measuring_options().fit
     way, columns = rows_of_one_way(rows, normalise)
     settings: dict[str, Any] = {"form": form, "masses": len(set(columns["body"])), "bodies": table_bodies(columns)}
@@ -189,12 +170,7 @@ def is_population(source: Path | Sheet) -> bool:
 
 
 def table_recipe(table: Table, declared: Mapping[str, Any]) -> Recipe:
-    """Recipe of a size table's maps: from its columns, else as declared, else the default.
-
-    Parameters
-    ----------
-    declared
-        The options ``normalise``, ``background``, ``fit_radius_mm`` and ``noise``; None where one was not given.
+    """Recipe of a size table's maps: from its columns, else as the options of these names declare, else the default.
 
     Raises
     ------
@@ -212,15 +188,12 @@ def table_recipe(table: Table, declared: Mapping[str, Any]) -> Recipe:
     background: Background = found["background"] or ("free" if normalise == "none" else "fixed")
     if normalise == "none" and background == "fixed":
         raise UsageError("maps of --normalise none have no level to fix a background at; give --background free")
-    radius_mm = found["fit_radius_mm"] or FIT_RADIUS_MM
-    noise: Noise = found["noise"] or "independent"
-    by_hand = any(said[name] is None for name in declared)
     return Recipe(
         normalise,
         background,
-        radius_mm,
-        declared=by_hand,
-        noise=noise,
+        found["fit_radius_mm"] or FIT_RADIUS_MM,
+        declared=any(said[name] is None for name in declared),
+        noise=found["noise"] or "independent",
         flat_field=said["flat_field"],
         head=_named_head(table),
     )
@@ -251,17 +224,15 @@ def _contradiction(table: Table, name: str, said: object, declared: object) -> B
     option = f"--{name.replace('_', '-')}"
     way_out = f"leave out {option}"
     if name == "normalise":
-        way_out += f", and size maps made with `map --normalise {said}`"
-        way_out += "; `population` gives a table for --normalise gain"
+        way_out += (
+            f", and size maps made with `map --normalise {said}`; `population` gives a table for --normalise gain"
+        )
     what = f"its {name} is {said}, not {declared} as {option} says"
     return BadDataError(what, way_out=way_out, path=str(table.path))
 
 
 def _left_out(lumps: SizeTable, fit: EqSixFit, *, least_stiffness_ratio: float) -> tuple[LeftOutErrors | None, str]:
     """Cross-validated errors, or the reason why Eq 6 has none."""
-    from tactile_bayes.size.learn.cross_validation import left_out_of_study
-    from tactile_bayes.size.learn.eq6 import axis_in_two_stages
-
     one_axis = axis_in_two_stages if fit == "two-stage" else None
     try:
         return left_out_of_study(lumps, least_stiffness_ratio=least_stiffness_ratio, fit=one_axis), ""
@@ -295,8 +266,6 @@ def rows_of_one_way(rows: Table, normalise: str | None) -> tuple[Normalise, dict
 
 def size_table(table: Table, *, least_stiffness_ratio: float = 0.0) -> SizeTable:
     """Columns of a table as arrays, with Delta sigma where depths are given; without softer lumps."""
-    from tactile_bayes.size.learn.eq6 import SizeTable, width_changes
-
     # only lumps marked as detectable: fits to the others describe a trough
     shown = [
         flag is not False and (ratio is None or ratio >= least_stiffness_ratio)
@@ -306,7 +275,7 @@ def size_table(table: Table, *, least_stiffness_ratio: float = 0.0) -> SizeTable
         name: [v for v, keep in zip(values, shown, strict=True) if keep] for name, values in table.columns.items()
     }
 
-    def array(name: str) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]] | None:
+    def array(name: str) -> FloatArray | None:
         values = columns[name]
         if all(value is None for value in values):
             return None
@@ -330,8 +299,6 @@ def size_table(table: Table, *, least_stiffness_ratio: float = 0.0) -> SizeTable
 
 def _study_cases(columns: dict[str, list[Any]]) -> StudyCases | None:
     """Study case of each row; None where a row lacks the lump's stiffness."""
-    from tactile_bayes.size.learn.eq6 import StudyCases
-
     if None in columns["stiffness_ratio"]:
         return None
     depth, ratio = (np.asarray(columns[name], dtype=np.float64) for name in ("depth_ratio", "stiffness_ratio"))

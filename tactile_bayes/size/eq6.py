@@ -118,22 +118,10 @@ class AxisCalibration(Record, eq=False):
         check_shapes(self, draws=(max(len(self.draws), 1), len(COEFFICIENTS)))
 
     def size_mm(self, sigma_mm: FloatArray, amplitude: FloatArray, *, draws: FloatArray | None = None) -> FloatArray:
-        r"""Diameter by Eq 6, without residual scatter: :math:`d = m\,\sigma / (e\,a^f) + b`.
+        r"""Diameter in mm by Eq 6, without residual scatter: :math:`d = m\,\sigma / (e\,a^f) + b`.
 
-        Parameters
-        ----------
-        sigma_mm, amplitude : (n,) arrays
-        draws : (n, 6) or (6,) array
-            Coefficients for each; the mean of the posterior when left out.
-
-        Returns
-        -------
-        (n,) array of mm
-            NaN where the amplitude is not positive.
-
-        Notes
-        -----
-        Wellman & Howe (1999) eq. 6 with their Delta sigma as a ratio of widths, 1 at one diameter depth.
+        For (n,) values and (n, 6) or (6,) draws, the mean of the posterior when left out; NaN where the amplitude is
+        not positive. Wellman & Howe (1999) eq. 6 with their Delta sigma as a ratio of widths, 1 at one diameter depth.
         """
         use = self.draws.mean(axis=0) if draws is None else draws
         m, b, e, f = (use[..., i] for i in range(4))
@@ -238,16 +226,8 @@ def push_sizes(
 ) -> SizePosterior:
     """Convert each map draw by Eq 6, with a draw of its coefficients and one of its residual scatter.
 
-    Parameters
-    ----------
-    amplitude, sigma_x_mm, sigma_y_mm, angle_rad : (chain, draw) arrays
-        Joint draws: amplitude and width go together (a stronger bump is a narrower one), which must not be lost.
-    rng
-        Of the points that pair map draws with calibration draws and scatter, see `paired_points`.
-    replicates : (chain * draw,) array
-        Label of the independent replicate of each draw. Default: the draws are independent.
-    another_exam
-        Spread between exams of a mass, for `SizePosterior.another_exam`.
+    The (chain, draw) draws are joint: amplitude and width go together (a stronger bump is a narrower one), which must
+    not be lost. `another_exam` is the spread between exams of a mass, for `SizePosterior.another_exam`.
 
     Notes
     -----

@@ -52,10 +52,7 @@ def learn_population(
 ) -> BodyCalibration:
     """Learn the calibration: Eq 6, by the depth of the fat where maps have a head profile, and what it leaves.
 
-    Parameters
-    ----------
-    residual
-        False for Eq 6 alone. A table without profiles has no other.
+    Without `residual`, and from a table without profiles, it is Eq 6 alone.
 
     Raises
     ------
@@ -280,13 +277,7 @@ class Eq6Fit(Record, eq=False):
 
 
 def fit_eq6(table: PopulationTable, rows: Eq6Rows) -> Eq6Fit:
-    """The regression on the tangent at the mode, and the posterior's mean and covariance.
-
-    Raises
-    ------
-    NotConvergedError
-        When the posterior has no mode.
-    """
+    """The regression on the tangent at the mode, and the posterior's mean and covariance."""
     theta = _least_squares(table, rows)
     for _ in range(_MOST_TANGENTS):
         data = _regression(table, rows, theta)
@@ -342,13 +333,7 @@ class Sized(Record):
 
 
 def sized(calibration: BodyCalibration, table: PopulationTable, *, known: Sequence[str] = ()) -> Sized:
-    """The bodies of a table, each by all its exams.
-
-    Parameters
-    ----------
-    known
-        Properties of which the true value is told.
-    """
+    """The bodies of a table, each by all its exams; of the properties in `known` the true value is told."""
     bodies = np.unique(table.body)
     found = np.array([size_error(calibration, table.rows(table.body == one), known=known) for one in bodies])
     return Sized(*found.T)
@@ -377,11 +362,6 @@ def learn_other_sd(calibration: BodyCalibration, table: PopulationTable, *, sour
     """The calibration with `other_sd` from lumps of another origin: the most probable tau, even a priori.
 
     Its fit tells ``other_masses``, ``other_sd_most``, below which tau lies with 95 % probability, and the errors.
-
-    Parameters
-    ----------
-    source
-        In words: what the table was made of.
     """
     found = sized(calibration.with_other_sd(0.0), table)
     variance = found.variance + _OTHER_SDS[:, None] ** 2

@@ -11,6 +11,7 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.presets import LEAST_HARD_RATIO
 from tactile_bayes.size.eq6 import AxisCalibration, LeftOutErrors
 from tactile_bayes.size.learn.eq6 import AxisRows, SizeTable, StudyCases, axis_at_mode, width_changes
+from tactile_bayes.size.learn.regression import rows_of
 from tactile_bayes.size.terms import monomials, powers
 
 LEAST_GEOMETRIES = 8
@@ -27,14 +28,8 @@ def left_out_of_study(
 ) -> LeftOutErrors | None:
     """Cross-validated errors of Eq 6 and of a log-quadratic, leaving out each geometry in turn.
 
-    Parameters
-    ----------
-    table
-        Of detectable cases; None is returned unless it has `StudyCases` in at least eight geometries.
-    least_stiffness_ratio
-        Softer lumps take no part; 0 is `LEAST_HARD_RATIO`.
-    fit
-        Eq 6 from the rows of one axis; the joint posterior's mode when left out.
+    None unless the table has `StudyCases` in at least eight geometries. Softer lumps take no part; a least ratio of 0
+    is `LEAST_HARD_RATIO`. `fit` is the joint posterior's mode when left out.
 
     Raises
     ------
@@ -47,15 +42,13 @@ def left_out_of_study(
     -----
     A geometry is one seat, diameter and h/d. All stiffnesses of it go out together: they differ so little that one
     would tell the others' size. Where a lump's case at one diameter depth is out, so are the width changes against it.
-
-    Eq 6 is by default taken at the mode of the posterior that a calibration is drawn from; by both widths its size is
-    the geometric mean of those by each. The quadratic of ln d in ln a and ln sigma is one of least squares, as its
-    spread is not asked for; by both widths sigma is their geometric mean, as in `LogQuadratic`.
+    By both widths the size of Eq 6 is the geometric mean of those by each; the quadratic, of least squares, takes the
+    geometric mean of the widths.
     """
     if table.cases is None:
         return None
     least = least_stiffness_ratio or LEAST_HARD_RATIO
-    table = _rows(table, table.cases, (table.cases.stiffness_ratio >= least) & (table.amplitude > 0))
+    table = rows_of(table, (table.cases.stiffness_ratio >= least) & (table.amplitude > 0))
     assert table.cases is not None
     geometry = geometry_numbers(table.d_mm, table.cases)
     if len(geometry) == 0 or geometry.max() + 1 < LEAST_GEOMETRIES:
@@ -80,13 +73,6 @@ def geometry_numbers(d_mm: FloatArray, cases: StudyCases) -> np.ndarray[tuple[in
     names = list(zip(cases.seat, d_mm.tolist(), cases.depth_ratio.tolist(), strict=True))
     number = {name: i for i, name in enumerate(dict.fromkeys(names))}
     return np.array([number[name] for name in names], dtype=np.intp)
-
-
-def _rows(table: SizeTable, cases: StudyCases, keep: _Rows) -> SizeTable:
-    sigma_y = None if table.sigma_y_mm is None else table.sigma_y_mm[keep]
-    return SizeTable(
-        table.d_mm[keep], table.amplitude[keep], table.sigma_x_mm[keep], sigma_y, None, None, cases.rows(keep)
-    )
 
 
 def _left_out(geometry: np.ndarray[tuple[int], np.dtype[np.intp]], predict: _Predict) -> FloatArray:

@@ -15,17 +15,20 @@ e is then 1 by convention.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.special import ndtri, stdtrit
 
-from tactile_bayes.declarations import Record, field
+from tactile_bayes.declarations import Record, field, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.inference.ensemble import EnsembleOptions, Progress, ensemble
 from tactile_bayes.inference.modes import mode_and_covariance
 from tactile_bayes.size.eq6 import AxisCalibration, SizeCalibration
 from tactile_bayes.size.terms import Recipe
+
+if TYPE_CHECKING:
+    from tactile_bayes.inference.ensemble import Progress
 
 DRAWS_KEPT = 1000
 # Steps of the search, about one posterior deviation each, of ln M, b, f, ln s, g, ln e, ln t.
@@ -33,28 +36,12 @@ _SCALE = (0.05, 0.5, 0.03, 0.1, 0.1, 0.05, 0.1)
 
 
 class StudyCases(Record, eq=False):
-    """The study case of each row of a table.
-
-    Parameters
-    ----------
-    seat
-        (n,) names or numbers as text; None where the table does not say.
-    depth_ratio, stiffness_ratio : (n,) arrays
-        h/d, and E2/E1.
-    others
-        (n,) arrays of what else the table tells of every row: ``thickness_mm``, ``head_radius_mm``.
-    """
+    """The study case of each row of a table: seat, h/d, E2/E1, and what else the table tells of every row."""
 
     seat: tuple[str | None, ...]
     depth_ratio: FloatArray
     stiffness_ratio: FloatArray
     others: Mapping[str, FloatArray] = field(default_factory=dict)
-
-    def rows(self, keep: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> StudyCases:
-        """Copy with the rows where `keep` is true."""
-        seat = tuple(name for name, kept in zip(self.seat, keep, strict=True) if kept)
-        others = {name: values[keep] for name, values in self.others.items()}
-        return StudyCases(seat, self.depth_ratio[keep], self.stiffness_ratio[keep], others)
 
     def lumps(self, d_mm: FloatArray) -> list[tuple[object, ...]]:
         """Key of each row's lump, shared by rows that differ in depth only."""
@@ -63,20 +50,7 @@ class StudyCases(Record, eq=False):
 
 
 class SizeTable(Record, eq=False):
-    """Table of a study or a set of phantoms, one row per lump.
-
-    Parameters
-    ----------
-    d_mm, amplitude, sigma_x_mm : (n,) arrays
-        True diameter, and the fit of its map.
-    sigma_y_mm : (n,) array or None
-    width_change_x, width_change_y : (n,) arrays or None
-        Width over the width of the same lump at one diameter depth; NaN where the table has no such row.
-    cases
-        Of a study; None for other tables.
-    depth_ratio : (n,) array or None
-        h/d; None where the table does not say.
-    """
+    """Table of a study or a set of phantoms, one of n rows per lump: its diameter, and the fit of its map."""
 
     d_mm: FloatArray
     amplitude: FloatArray
@@ -84,19 +58,15 @@ class SizeTable(Record, eq=False):
     sigma_y_mm: FloatArray | None
     width_change_x: FloatArray | None = None
     width_change_y: FloatArray | None = None
+    """Width over the width of the same lump at one diameter depth; NaN where the table has no such row."""
     cases: StudyCases | None = None
+    """Of a study; None for other tables."""
     depth_ratio: FloatArray | None = None
+    """h/d; None where the table does not say."""
 
 
 class AxisRows(Record, eq=False):
-    """Rows for the regression of one axis, with positive amplitudes.
-
-    Parameters
-    ----------
-    d_mm, amplitude, sigma_mm : (n,) arrays
-    width_change, depth_ratio : (n,) arrays or None
-        As in `SizeTable`.
-    """
+    """The n rows with positive amplitudes for the regression of one axis, as in `SizeTable`."""
 
     d_mm: FloatArray
     amplitude: FloatArray
@@ -119,16 +89,7 @@ def width_changes(sigma_mm: FloatArray, *, depth_ratio: FloatArray, group: Seque
 def learn_size_calibration(
     table: SizeTable, *, recipe: Recipe, rng: np.random.Generator, progress: Progress | None = None
 ) -> SizeCalibration:
-    """Learn Eq 6 from a table.
-
-    Parameters
-    ----------
-    table
-        At least eight rows with positive amplitude.
-    recipe
-        How the table's maps were made.
-    progress
-        As of `ensemble`, for each axis anew.
+    """Learn Eq 6 from a table of at least eight rows with positive amplitude.
 
     Raises
     ------
@@ -206,6 +167,8 @@ def _mode(data: AxisRows) -> tuple[AxisRows, FloatArray, FloatArray]:
 
 
 def _learn_axis(data: AxisRows, *, rng: np.random.Generator, progress: Progress | None) -> AxisCalibration:
+    from tactile_bayes.inference.ensemble import EnsembleOptions, ensemble  # emcee, which no other command here loads
+
     data, mode, covariance = _mode(data)
 
     def log_density(theta: FloatArray) -> FloatArray:
@@ -215,13 +178,8 @@ def _learn_axis(data: AxisRows, *, rng: np.random.Generator, progress: Progress 
     draws = ensemble(log_density, mode, covariance, rng=rng, options=options, progress=progress)
     coefficients = _coefficients(draws.flat, data)
     axis = AxisCalibration(coefficients, data.centre[0], domain_of(data))
-    figures = {
-        **agreement(axis, data),
-        "e_identified": float(data.width_change is not None),
-        "rhat": draws.diagnostics["rhat"],
-        "ess_tail": draws.diagnostics["ess_tail"],
-    }
-    return AxisCalibration(coefficients, data.centre[0], domain_of(data), figures)
+    told = {name: draws.diagnostics[name] for name in ("rhat", "ess_tail")}
+    return replace(axis, fit={**agreement(axis, data), "e_identified": float(data.width_change is not None), **told})
 
 
 def agreement(axis: AxisCalibration, data: AxisRows) -> dict[str, float]:
@@ -289,37 +247,30 @@ _WAY_OUT = "give depth_ratio and at least 3 diameters at depth_ratio 1, or use -
 
 
 class OtherFit(Record):
-    """What the other of the two fits makes of the same rows.
-
-    Parameters
-    ----------
-    name
-        ``"joint"`` or ``"two-stage"``.
-    coefficients
-        m, b (mm), e, f of each axis.
-    difference
-        Mean absolute difference of the two fits' sizes over the rows, as a share of the true size, of each axis.
-    """
+    """What the other of the two fits, joint or two-stage, makes of the same rows."""
 
     name: str
     coefficients: tuple[tuple[float, float, float, float], ...]
+    """m, b (mm), e, f of each axis."""
     difference: tuple[float, ...]
+    """Mean absolute difference of the two fits' sizes over the rows, as a share of the true size, of each axis."""
 
 
 def learn_two_stage(table: SizeTable, *, recipe: Recipe, rng: np.random.Generator) -> SizeCalibration:
-    """Learn Eq 6 in two stages from a table.
+    r"""Learn Eq 6 in the two stages of the paper's section 2.4, with a bootstrap for its uncertainty.
 
-    Parameters
-    ----------
-    table
-        At least eight rows with positive amplitude, with h/d, and three diameters at h/d 1.
-    recipe
-        How the table's maps were made.
+    Stage one is least squares of :math:`d` on :math:`\sigma` in the rows at one diameter depth, stage two of
+    :math:`\ln\Delta\sigma` on :math:`\ln a` in all rows whose lump has a row at one diameter depth:
+
+    .. math:: d = m\,\sigma + b \; (h/d = 1), \qquad \ln\Delta\sigma = \ln e + f \ln a.
+
+    The joint posterior takes m and b from all rows instead, on the scale of ln d, where a row counts the less the
+    fainter its map is. Both agree where Eq 6 holds; decision record 0098 gives how far they part where it does not.
 
     Raises
     ------
     BadDataError
-        When rows are too few, do not vary, or have no depths.
+        When rows are too few, do not vary, have no depths, or not three diameters at h/d 1.
     """
     x, y = axis_rows(table)
     return both_axes(
@@ -328,13 +279,7 @@ def learn_two_stage(table: SizeTable, *, recipe: Recipe, rng: np.random.Generato
 
 
 def axis_in_two_stages(data: AxisRows) -> AxisCalibration:
-    """Eq 6 fitted in two stages to the rows themselves: a single draw, as `axis_at_mode` of the joint posterior.
-
-    Raises
-    ------
-    BadDataError
-        When the rows do not give three diameters at one diameter depth.
-    """
+    """Eq 6 fitted in two stages to the rows themselves: a single draw, as `axis_at_mode` of the joint posterior."""
     ones = np.ones((1, len(data.d_mm)))
     coefficients = _two_stage_coefficients(data, ones)
     return AxisCalibration(_with_scatter(coefficients, data, ones), data.centre[0], domain_of(data))
@@ -377,14 +322,8 @@ def _learn_in_two_stages(data: AxisRows, rng: np.random.Generator) -> AxisCalibr
     draws[:, shifted] += fitted.draws[0, shifted] - draws[:, shifted].mean(axis=0)
     axis = AxisCalibration(draws, data.centre[0], domain_of(data))
     level, known = _stages(data)
-    figures = {
-        **agreement(axis, data),
-        "e_identified": 1.0,
-        "two_stage": 1.0,
-        "level_rows": float(level.sum()),
-        "width_change_rows": float(known.sum()),
-    }
-    return AxisCalibration(draws, data.centre[0], domain_of(data), figures)
+    told = {"level_rows": float(level.sum()), "width_change_rows": float(known.sum())}
+    return replace(axis, fit={**agreement(axis, data), "e_identified": 1.0, "two_stage": 1.0, **told})
 
 
 def _stretch(draws: FloatArray, *, diameters: int) -> None:

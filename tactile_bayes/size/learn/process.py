@@ -98,10 +98,7 @@ def drawn_points(x: FloatArray, count: int) -> FloatArray:
 def given(bodies: BodiesLeft, points: FloatArray, theta: FloatArray) -> FittedResidual:
     """Posterior of the weights for one kernel and spread, and each body as the others predict it.
 
-    Parameters
-    ----------
-    theta : (k + 1 + s,) array
-        Logs of the k lengths and of the scale, coefficients of ln SD(B).
+    `theta` holds the logs of the lengths and of the scale, and the coefficients of ln SD(B).
     """
     k = bodies.x.shape[1]
     kernel = Kernel(points, np.exp(theta[:k]), float(np.exp(theta[k])))
@@ -119,10 +116,7 @@ def given(bodies: BodiesLeft, points: FloatArray, theta: FloatArray) -> FittedRe
 def left_out_density(features: FloatArray, error: FloatArray, noise: FloatArray) -> Callable[[FloatArray], float]:
     """Log density of all bodies, each left out, with the prior, by (s,) coefficients of ln SD(B).
 
-    Parameters
-    ----------
-    error, noise : (b,) arrays
-        Of each body as the others predict it, and its variance without B's.
+    `error` and `noise` are (b,): of each body as the others predict it, and its variance without B's.
     """
 
     def density(log_spread: FloatArray) -> float:
@@ -132,13 +126,7 @@ def left_out_density(features: FloatArray, error: FloatArray, noise: FloatArray)
 
 
 def body_spread(features: FloatArray, error: FloatArray, noise: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """(s,) coefficients of ln SD(B) by which bodies left out are most probable, and their (s, s) covariance.
-
-    Raises
-    ------
-    NotConvergedError
-        When they have no mode.
-    """
+    """(s,) coefficients of ln SD(B) by which bodies left out are most probable, and their (s, s) covariance."""
     density, s = left_out_density(features, error, noise), features.shape[1]
 
     def many(spreads: FloatArray) -> FloatArray:

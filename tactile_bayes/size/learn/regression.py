@@ -13,17 +13,19 @@ bodies and spread between exams are so told apart, and a patient's map adds its 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Final
+from itertools import compress
+from typing import Any, Final, TypeVar, cast
 
 import numpy as np
 from scipy.optimize import minimize
 
-from tactile_bayes.declarations import Record, field
+from tactile_bayes.declarations import Record, field, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.modes import mode_and_covariance
 from tactile_bayes.size.terms import INVERTED, HiddenTerms, RoundLumps
 
+T = TypeVar("T")
 LEAST_BODIES = 20
 EXPLAINED: Final = 0.75
 """Of the table's bodies, by SD(B), those of which what is known tells as much as it does of all, in that SD."""
@@ -36,60 +38,47 @@ _PRIOR = np.array([[np.log(0.1), 1.0], [0.0, 0.3], [np.log(0.03), 1.0]])
 
 
 class PopulationTable(Record, eq=False):
-    """Maps of known lumps, one per row.
-
-    Parameters
-    ----------
-    body : (n,) array of int or str
-        Rows of one name are exams of one body.
-    d_mm, log_amplitude, log_width, half_log_ratio : (n,) arrays
-        True diameter; ln a, p and q of the map.
-    covariance : (n, 3, 3) array
-        Posterior covariance of the latter three.
-    unknowns
-        (n,) arrays of what was varied and no map shows, by name; logarithms of those in `LOGGED`.
-    profile : (n, 3) array
-        `presets.HEAD_PROFILE` of each map, NaN for a map without; None where no map has it.
-    log_fat : (n,) array
-        ln of the depth of the fat-gland boundary in mm; None with `profile`.
-    """
+    """Maps of known lumps, one per row: true diameter; ln a, p and q of the map."""
 
     body: np.ndarray[tuple[int], np.dtype[np.generic]]
+    """(n,) of int or str: rows of one name are exams of one body."""
     d_mm: FloatArray
     log_amplitude: FloatArray
     log_width: FloatArray
     half_log_ratio: FloatArray
     covariance: FloatArray
+    """(n, 3, 3) posterior covariance of the latter three."""
     unknowns: Mapping[str, FloatArray] = field(default_factory=dict)
+    """(n,) arrays of what was varied and no map shows, by name; logarithms of those in `LOGGED`."""
     profile: FloatArray | None = None
+    """(n, 3) `presets.HEAD_PROFILE` of each map, NaN for a map without; None where no map has it."""
     log_fat: FloatArray | None = None
+    """(n,) ln of the depth of the fat-gland boundary in mm; None with `profile`."""
 
     def __len__(self) -> int:
         return len(self.d_mm)
 
     def rows(self, keep: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> PopulationTable:
         """Copy with the rows where `keep` is true."""
-        return PopulationTable(
-            self.body[keep],
-            self.d_mm[keep],
-            self.log_amplitude[keep],
-            self.log_width[keep],
-            self.half_log_ratio[keep],
-            self.covariance[keep],
-            {name: values[keep] for name, values in self.unknowns.items()},
-            None if self.profile is None else self.profile[keep],
-            None if self.log_fat is None else self.log_fat[keep],
-        )
+        return rows_of(self, keep)
+
+
+def rows_of(columns: T, keep: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> T:
+    """A copy of a table, whose fields are columns or tables or None, with the rows where `keep` is true."""
+    if columns is None:
+        return columns
+    found: Any = columns
+    if isinstance(found, np.ndarray):
+        return cast("T", found[keep])
+    if isinstance(found, tuple):
+        return cast("T", tuple(compress(found, keep)))
+    if isinstance(found, dict):
+        return cast("T", {name: rows_of(one, keep) for name, one in found.items()})
+    return replace(columns, **{name: rows_of(getattr(found, name), keep) for name in found.__struct_fields__})
 
 
 class ExamSpread(Record):
-    """How far exams of one body differ in their sizes.
-
-    Parameters
-    ----------
-    log_sd, variance
-        Posterior mean and variance of ln t, t beyond the maps' own noise.
-    """
+    """How far exams of one body differ in their sizes: mean and variance of ln t, t beyond the maps' own noise."""
 
     log_sd: float
     variance: float
@@ -101,42 +90,30 @@ class ExamSpread(Record):
 
 
 class BodyRegression(Record, eq=False):
-    """Data of the likelihood: maps as rows, and their means over each body's exams.
-
-    Parameters
-    ----------
-    terms : (n, k) array
-        What ln d is linear in.
-    constant, map_variance, group : (n,) arrays
-        What ln d has beside the terms; variance of the predicted ln d by the map's own posterior; number of the body.
-    exams, mean_terms, mean_log_d, mean_u
-        Of the bodies; the third is the mean of ln d less the constant, the fourth of the centred ln a.
-    """
+    """Data of the likelihood: maps as rows, and their means over each body's exams."""
 
     terms: FloatArray
+    """(n, k) in which ln d is linear."""
     constant: FloatArray
+    """(n,) that ln d has beside the terms."""
     map_variance: FloatArray
+    """(n,) of the predicted ln d by the map's own posterior."""
     group: np.ndarray[tuple[int], np.dtype[np.intp]]
+    """(n,) number of the body."""
     exams: FloatArray
     mean_terms: FloatArray
     mean_log_d: FloatArray
+    """Of ln d less the constant, over each body's exams."""
     mean_u: FloatArray
+    """Of the centred ln a."""
 
     @classmethod
     def linear(
         cls, table: PopulationTable, terms: FloatArray, *, u: FloatArray, constant: FloatArray, slope: FloatArray
     ) -> BodyRegression:
-        """The regression of a table on given terms.
+        """The regression of a table on (n, k) terms; `slope` has the (2, n) derivatives of ln d by ln a and p.
 
-        Parameters
-        ----------
-        terms : (n, k) array
-        u : (n,) array
-            Centred ln a, with which the spread between bodies changes.
-        constant : (n,) array
-            What ln d has beside the terms.
-        slope : (2, n) array
-            Derivatives of the predicted ln d by ln a and p.
+        The spread between bodies changes with u, the centred ln a.
         """
         group = np.asarray(np.unique(table.body, return_inverse=True)[1])
         exams = np.bincount(group).astype(np.float64)
@@ -160,13 +137,8 @@ class BodyRegression(Record, eq=False):
     def exam_spread(self, size: FloatArray) -> ExamSpread:
         """Spread of sizes between exams of a body beyond their maps' own noise, by t on a grid.
 
-        Squares of a body's exams about their mean are :math:`(t^2 + m) \\chi^2`, m the mean variance of its maps.
-        Without bodies examined twice, the prior.
-
-        Parameters
-        ----------
-        size : (n,) array
-            ln d by each map.
+        `size` is (n,) ln d by each map. Squares of a body's exams about their mean are :math:`(t^2 + m) \\chi^2`, m the
+        mean variance of its maps. Without bodies examined twice, the prior.
         """
         square = np.bincount(self.group, (size - self.mean(size)[self.group]) ** 2)
         freedom, noise = self.exams - 1.0, self.mean(self.map_variance)
@@ -219,17 +191,7 @@ def map_variance(table: PopulationTable, slope: FloatArray) -> FloatArray:
 def error_figures(
     table: PopulationTable, data: BodyRegression, spreads: Mapping[str, float], error: FloatArray, share_held: float
 ) -> dict[str, float]:
-    """Figures of a fit.
-
-    Parameters
-    ----------
-    spreads
-        ``body_sd`` and ``exam_sd``.
-    error : (groups,) array
-        ln(predicted / true size) of bodies left out.
-    share_held
-        Of them in their interval of probability `HELD`.
-    """
+    """Figures of a fit, with (groups,) ln(predicted / true size) of bodies left out and the share of them held."""
     return {
         "maps": float(len(table)),
         "bodies": float(data.groups),
@@ -268,15 +230,10 @@ def hidden_terms(
     body_sd: FloatArray,
     features: FloatArray,
 ) -> HiddenTerms | None:
-    """Second moments of what was varied, about what the map leads one to expect of it, and with B.
+    """Second moments of what was varied, about what the map leads one to expect of it by its features, and with B.
 
-    Parameters
-    ----------
-    body, body_sd : (groups,) arrays
-        B of each body, which took no part in the fit that says so, and SD(B) at its place. Bodies count by their B in
-        that SD: faint and deep lumps, of which B is large, would decide alone otherwise.
-    features : (n, c) array
-        What a map leads one to expect is linear in these.
+    `body` and `body_sd` are (groups,): B of each body, which took no part in the fit that says so, and SD(B) at its
+    place. Bodies count by their B in that SD: faint and deep lumps, of which B is large, would decide alone otherwise.
     """
     if not table.unknowns:
         return None

@@ -51,21 +51,14 @@ MOST_SPREAD = 2.0
 
 
 class SitePrior(Record):
-    """Prior of a site's shift, as standard deviations; see docs/decisions/0102 for the figures.
-
-    Parameters
-    ----------
-    shift_sd
-        Of c_0: how far off all sizes of a site may be, in ln d.
-    slope_sd
-        Of c_1: how much more wide maps than narrow ones.
-    spread_log_sd
-        Of ln k, about 0.
-    """
+    """Prior of a site's shift, as standard deviations; see docs/decisions/0102 for the figures."""
 
     shift_sd: float = 0.15
+    """Of c_0: how far off all sizes of a site may be, in ln d."""
     slope_sd: float = 0.10
+    """Of c_1: how much more wide maps than narrow ones."""
     spread_log_sd: float = 0.5
+    """Of ln k, about 0."""
 
     @property
     def sd(self) -> FloatArray:
@@ -74,48 +67,28 @@ class SitePrior(Record):
 
 
 class PhantomMap(Record, eq=False):
-    """One map of a phantom.
-
-    Parameters
-    ----------
-    phantom
-        Its name; maps of one phantom share it.
-    d_mm
-        Its diameter.
-    shape
-        Draws of the map, or a single point.
-    known
-        Its properties, by the names of `HiddenTerms`.
-    """
+    """One map of a phantom: draws, or a single point; maps of one phantom share its name and diameter."""
 
     phantom: str
     d_mm: float
     shape: ShapeDraws
     known: Mapping[str, float]
+    """The phantom's properties, by the names of `HiddenTerms`."""
 
 
 class Residuals(Record, eq=False):
-    """What a calibration leaves of n phantoms, each (n,).
-
-    Parameters
-    ----------
-    residual
-        y.
-    width
-        p - p_0, mean over the maps.
-    spread_variance
-        Of B and E, before the factor k^2.
-    map_variance
-        Of the maps' own noise.
-    common
-        s: loading of what the phantoms share.
-    """
+    """What a calibration leaves of n phantoms, each (n,)."""
 
     residual: FloatArray
+    """y."""
     width: FloatArray
+    """p - p_0, mean over the maps."""
     spread_variance: FloatArray
+    """Of B and E, before the factor k^2."""
     map_variance: FloatArray
+    """Of the maps' own noise."""
     common: FloatArray
+    """s: loading of what the phantoms share."""
 
     def without(self, index: int) -> Residuals:
         """All phantoms but one."""
@@ -128,16 +101,7 @@ class Residuals(Record, eq=False):
 
 
 class ShiftPosterior(Record, eq=False):
-    """Posterior of c_0, c_1 and M, and of k.
-
-    Parameters
-    ----------
-    mean, covariance : (3,), (3, 3) arrays
-    spread
-        Posterior mean of k.
-    spread_square
-        Posterior mean of k^2.
-    """
+    """Posterior of c_0, c_1 and M, and posterior means of k and k^2."""
 
     mean: FloatArray
     covariance: FloatArray
@@ -172,16 +136,10 @@ def correct_calibration(
     prior: SitePrior | None = None,
     left_out: Sequence[str] = (),
 ) -> BodyCalibration:
-    """The calibration with a site's correction.
+    """The calibration, called `base` in reports, with a site's correction.
 
-    Parameters
-    ----------
-    maps
-        Of at least `LEAST_PHANTOMS` phantoms, made and fitted by the calibration's recipe.
-    base
-        Name of the calibration, for reports.
-    left_out
-        Phantoms that take no part for reasons found before, in words.
+    It takes at least `LEAST_PHANTOMS` phantoms, made and fitted by the calibration's recipe; `left_out` tells in words
+    which take no part for reasons found before.
 
     Raises
     ------
@@ -207,8 +165,7 @@ def correct_calibration(
             f"{len(rows)} phantom{'' if len(rows) == 1 else 's'} in the range of {base}{why}",
             way_out=f"a correction needs at least {LEAST_PHANTOMS} distinct phantoms; 5 to 20 are better",
         )
-    data = Residuals(*(np.array([getattr(row, name) for _, row in rows]) for name in Residuals.__struct_fields__))
-    uses_fat = 2 * sum(row.uses_fat for _, row in rows) > len(rows)
+    data = Residuals(*np.array([row.left for _, row in rows]).T)
     found = shift_posterior(data, prior)
     site = SiteShift(
         centre=calibration.centre.log_width,
@@ -217,7 +174,7 @@ def correct_calibration(
         phantoms=len(rows),
         maps=sum(row.maps for _, row in rows),
         base=base,
-        uses_fat=uses_fat,
+        uses_fat=2 * sum(row.uses_fat for _, row in rows) > len(rows),
         fit=_figures(data, found, calibration.centre.log_width),
         cautions=(
             *no_depth(calibration, [groups[name][0].known for name, _ in rows]),
@@ -228,12 +185,9 @@ def correct_calibration(
     return replace(calibration, site=site)
 
 
-class _Phantom(Record, eq=False):
-    residual: float
-    width: float
-    spread_variance: float
-    map_variance: float
-    common: float
+class _Phantom(Record):
+    left: tuple[float, ...]
+    """As the columns of `Residuals`."""
     maps: int
     uses_fat: bool
 
@@ -259,15 +213,9 @@ def _phantom(calibration: BodyCalibration, maps: Sequence[PhantomMap]) -> _Phant
     n = len(maps)
     exam = used.between_exams.sd**2 / n
     noise = float(np.mean([np.nanvar(size) for size in log_size])) / n
-    return _Phantom(
-        residual=float(left.mean()) - expected,
-        width=float(log_width.mean()) - centre,
-        spread_variance=alone + used.other_sd**2 + exam,
-        map_variance=noise,
-        common=float(np.sqrt(together)),
-        maps=n,
-        uses_fat=used.fat_mm is not None or calibration.depth is None,
-    )
+    variances = alone + used.other_sd**2 + exam, noise
+    found = float(left.mean()) - expected, float(log_width.mean()) - centre, *variances, float(np.sqrt(together))
+    return _Phantom(found, n, used.fat_mm is not None or calibration.depth is None)
 
 
 def _known(
@@ -361,57 +309,29 @@ GRID: Final = np.geomspace(1e-3, 1.5, 600)
 
 
 class RepeatedExams(Record, eq=False):
-    """Exams of one mass at one visit.
-
-    Parameters
-    ----------
-    name
-        Of the mass at this visit.
-    mass
-        Of the mass at any visit.
-    centre, noise : (k,) arrays
-        Mean and variance of ln d by each map alone.
-    """
+    """Exams of one mass at one visit: (k,) mean and variance of ln d by each map alone."""
 
     name: str
+    """Of the mass at this visit."""
     mass: str
+    """Of the mass at any visit."""
     centre: FloatArray
     noise: FloatArray
 
 
 class LearnedSpread(Record, eq=False):
-    """What repeated exams say of the spread.
-
-    Parameters
-    ----------
-    density : (n,) array
-        Posterior weights on `GRID`.
-    by_chance
-        For each of the given exams of a mass: the probability of a spread as large as theirs, by the other masses.
-    repeatability
-        The summary, without the calibration's name.
-    """
+    """What repeated exams say of the spread: posterior weights on `GRID`, and their summary."""
 
     density: FloatArray
     by_chance: tuple[float, ...]
+    """For each of the given exams of a mass: the probability of a spread as large as theirs, by the other masses."""
     repeatability: Repeatability
 
 
 def learn_repeatability(repeats: Sequence[RepeatedExams], *, fewest: int = FEWEST_MASSES) -> LearnedSpread:
-    """Learn the spread between exams of one mass.
+    """Learn the spread between exams of one mass, from `fewest` masses or more with two exams at a visit.
 
-    Parameters
-    ----------
-    repeats
-        One for each mass and visit with two exams or more; those of one mass are left out together when its exams are
-        compared with the others'.
-    fewest
-        Masses with repeated exams that it takes.
-
-    Raises
-    ------
-    BadDataError
-        When fewer masses have repeated exams.
+    Those of one mass are left out together when its exams are compared with the others'.
     """
     repeats = [one for one in repeats if len(one.centre) > 1]
     masses = sorted({one.mass for one in repeats})
@@ -423,7 +343,8 @@ def learn_repeatability(repeats: Sequence[RepeatedExams], *, fewest: int = FEWES
     by_chance = []
     for one in repeats:
         others = [row for row, other in zip(by_exams, repeats, strict=True) if other.mass != one.mass]
-        by_chance.append(_by_chance(one, _density(np.sum(others, axis=0))))
+        chances = apart_by_chance(one.centre, one.noise, GRID)
+        by_chance.append(float(_density(np.sum(others, axis=0)) @ chances))
     limit = FALSE_ALARMS / len(repeats)
     outlying = tuple(one.name for one, chance in zip(repeats, by_chance, strict=True) if chance < limit)
     maps = sum(len(one.centre) for one in repeats)
@@ -449,11 +370,3 @@ def _summary(density: FloatArray, masses: int, maps: int, outlying: tuple[str, .
     return Repeatability(
         float(np.sqrt(square)), log_sd, float(median), float(low), float(high), masses, maps, outlying=outlying
     )
-
-
-def _by_chance(one: RepeatedExams, density: FloatArray) -> float:
-    """Probability, given the other masses, that exams of a mass lie as far apart as these or further.
-
-    Given tau the weighted sum of squares about their mean has a chi-squared distribution.
-    """
-    return float(density @ apart_by_chance(one.centre, one.noise, GRID))

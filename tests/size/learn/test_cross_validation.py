@@ -18,6 +18,7 @@ from tactile_bayes.size.eq6 import AxisCalibration
 from tactile_bayes.size.learn import cross_validation as left_out
 from tactile_bayes.size.learn.cross_validation import geometry_numbers, left_out_of_study
 from tactile_bayes.size.learn.eq6 import AxisRows, SizeTable, StudyCases, axis_at_mode
+from tactile_bayes.size.learn.regression import rows_of
 
 PHANTOMS = Path(tactile_bayes.__file__).parent / "demo" / "phantoms.csv"
 D, H, K = (5.0, 10.0, 15.0, 20.0, 25.0), (0.6, 0.8, 1.0, 1.2, 1.5), (2.0, 8.0, 100.0)
@@ -97,7 +98,7 @@ def test_tables_that_are_no_study_have_none() -> None:
     assert left_out_of_study(replace(table, cases=None)) is None
     few = table.d_mm < 8  # five geometries
     assert table.cases is not None
-    cut = SizeTable(table.d_mm[few], table.amplitude[few], table.sigma_x_mm[few], None, cases=table.cases.rows(few))
+    cut = SizeTable(table.d_mm[few], table.amplitude[few], table.sigma_x_mm[few], None, cases=rows_of(table.cases, few))
     assert left_out_of_study(cut) is None
     assert left_out_of_study(study(), least_stiffness_ratio=1000.0) is None
 
