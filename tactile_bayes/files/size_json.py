@@ -98,10 +98,7 @@ def write_size_calibration(
 ) -> None:
     """Write a size calibration of any form atomically.
 
-    Parameters
-    ----------
-    base
-        Document of the calibration that a site's phantoms correct: the file stays valid when that is learned anew.
+    With a site's correction the whole calibration that it corrects, `base`, is kept in the file.
     """
     if isinstance(calibration, SizeCalibration):
         header, body = ("tactile-bayes/size-calibration/1", "eq6"), _eq6_document(calibration)

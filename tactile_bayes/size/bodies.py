@@ -210,12 +210,7 @@ class BodyCalibration(BodyLaw, eq=False, kw_only=True):
     def constants(self, sigma_mm: float | None = None, *, fat_mm: float | None = None) -> dict[str, float]:
         """m, b in mm, e and f of Eq 6 as it is printed, at the mean of the posterior.
 
-        Parameters
-        ----------
-        sigma_mm
-            Mean width of the map; the table's middle where left out.
-        fat_mm
-            Depth of fat; the mass's where left out, or else the table's middle.
+        For a map's mean width, else the table's middle, and a depth of fat, else the mass's or the table's middle.
         """
         v = np.array(0.0 if sigma_mm is None else np.log(sigma_mm) - self.centre.log_width)
         fat_mm = fat_mm or self.fat_mm
@@ -376,13 +371,7 @@ def known_body(
     log_width: FloatArray,
     own_sd: FloatArray,
 ) -> BodyLeft:
-    """B given known properties, for (n,) ln a and p of maps and SD(B) there as `BodyCalibration.own_sd` gives it.
-
-    Raises
-    ------
-    UsageError
-        When the calibration knows nothing of a property.
-    """
+    """B given known properties, for (n,) ln a and p of maps and SD(B) there as `BodyCalibration.own_sd` gives it."""
     hidden, none = calibration.hidden, np.zeros(len(log_width))
     if not known:
         return BodyLeft(none, own_sd**2)
@@ -402,12 +391,7 @@ def suppositions(
 ) -> dict[str, Supposition]:
     """Of `SUPPOSED` those that the calibration's bodies hold, that the map leaves open and that nobody knows, by name.
 
-    Parameters
-    ----------
-    middle
-        Mean ln a and p of the maps.
-    variance
-        Of ln d as it is.
+    For the mean ln a and p of the maps, and the variance of ln d as it is.
     """
     hidden, found = calibration.hidden, {}
     if hidden is None:

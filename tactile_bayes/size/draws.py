@@ -138,16 +138,9 @@ def shown_share(log_size: FloatArray, log_width: FloatArray) -> float:
 
 
 def elongation(excess: FloatArray, covariance: FloatArray, *, shown: float, prior: ShapePrior) -> Elongation:
-    """Compare a round lump with an oval one.
+    """Compare a round lump with an oval one, by the (2,) half log axis ratio of the map beyond a ball's.
 
-    Parameters
-    ----------
-    excess : (2,) array
-        Half log axis ratio of the map beyond a ball's, along and 45 degrees from the head's x axis.
-    covariance : (2, 2) array
-        Of the map's noise and of balls about their own curve.
-    shown
-        Share of the lump's half log axis ratio that the map shows, see `shown_share`.
+    Its covariance is of the map's noise and of balls about their own curve; for `shown` see `shown_share`.
 
     Notes
     -----

@@ -184,21 +184,11 @@ def pooled_size(
     rng: np.random.Generator,
     number: int | None = None,
 ) -> SizePosterior:
-    """Size of a mass from its maps, by the calibration at their depth of fat.
+    """Size of a mass from its maps on which the lump was found, by the calibration at their depth of fat.
 
-    Parameters
-    ----------
-    maps
-        One for each map on which the lump was found.
-    number
-        Draws of the result; None keeps those of a single map one by one.
-
-    Returns
-    -------
-    SizePosterior
-        Draws of shape (n,). `figures` holds ``between_map_sd`` (root mean square), ``oval_probability``,
-        ``oval_half_log_ratio``, ``irregular_outline`` (1 where at least half of the maps have one) and, for several
-        maps, ``weight_1``...; `outliers` the maps that lie apart.
+    In (`number`,) draws; None keeps those of a single map one by one. `figures` holds ``between_map_sd`` (root mean
+    square), ``oval_probability``, ``oval_half_log_ratio``, ``irregular_outline`` (1 where at least half of the maps
+    have one) and, for several maps, ``weight_1``...; `outliers` the maps that lie apart.
 
     Notes
     -----

@@ -21,23 +21,9 @@ PROBABILITY: Final = 0.95
 class Repeatability(Record):
     """Spread of ln d between exams of one mass at a site, beyond the maps' own errors.
 
-    Parameters
-    ----------
-    sd, log_sd
-        As of `BetweenMaps`: root mean square of the posterior, and the log-SD of the log-normal that has the same mean
-        of tau^2 and of tau^4.
-    median, low, high
-        Of the posterior, with its equal-tailed interval of `PROBABILITY`.
-    masses, maps
-        Masses with repeated exams, and the maps of these exams.
-    calibration, calibration_sha256
-        Name and digest of the calibration that the maps were sized by.
-    normalise
-        How their frames were normalised.
-    outlying
-        Masses whose exams lie further apart than those of the other masses lead one to expect.
-    sha256
-        Digest of the file that it was read from; empty where it is in none.
+    `sd` and `log_sd` are as of `BetweenMaps`: root mean square of the posterior, and the log-SD of the log-normal that
+    has the same mean of tau^2 and of tau^4; median, low and high are the posterior's, with its interval of
+    `PROBABILITY`. `sha256` is of the file that it was read from, empty where it is in none.
     """
 
     sd: float

@@ -251,20 +251,11 @@ def joint_sizes(
     law: SharedBody | None = None,
     number: int = POOLED_DRAWS,
 ) -> JointSizes:
-    """Joint posterior of a mass's sizes at several visits.
+    """Joint posterior of a mass's sizes at several visits, from the maps of each on which the lump was found.
 
-    Parameters
-    ----------
-    visits
-        Maps of each visit on which the lump was found, at least one each.
-    calibration
-        For any depth of fat; that at the depth that each visit's maps tell is used.
-    priors
-        Of the lump's shape and of the spread between the exams of a visit; properties that somebody knows take no part.
-    between
-        Spread between exams in place of the priors'.
-    law
-        How far B is the same at the visits; None for `SHARED_BODY`, or `SHARED_WITHOUT_DEPTH` where maps tell no depth.
+    The calibration is used at the depth of fat that each visit's maps tell; properties that somebody knows take no
+    part. `between` is a spread between exams in place of the priors', `law` how far B is the same at the visits, by
+    default `SHARED_BODY`, or `SHARED_WITHOUT_DEPTH` where maps tell no depth.
 
     Raises
     ------

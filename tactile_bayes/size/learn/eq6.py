@@ -14,7 +14,7 @@ e is then 1 by convention.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -25,6 +25,7 @@ from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.modes import mode_and_covariance
 from tactile_bayes.size.eq6 import AxisCalibration, SizeCalibration
+from tactile_bayes.size.learn.regression import ranges_of, rows_of
 from tactile_bayes.size.terms import Recipe
 
 if TYPE_CHECKING:
@@ -79,6 +80,11 @@ class AxisRows(Record, eq=False):
         """Geometric means of amplitude and width."""
         return float(np.exp(np.log(self.amplitude).mean())), float(np.exp(np.log(self.sigma_mm).mean()))
 
+    def calibration(self, draws: FloatArray) -> AxisCalibration:
+        """Draws of Eq 6's coefficients with the ranges of these rows."""
+        values = {"amplitude": self.amplitude, "sigma_mm": self.sigma_mm, "d_mm": self.d_mm}
+        return AxisCalibration(draws, self.centre[0], ranges_of(values))
+
 
 def width_changes(sigma_mm: FloatArray, *, depth_ratio: FloatArray, group: Sequence[tuple[object, ...]]) -> FloatArray:
     """Delta sigma: each width over that of its group's row at one diameter depth; NaN without such a row."""
@@ -98,20 +104,11 @@ def learn_size_calibration(
     NotConvergedError
         When the sampler does not converge.
     """
-    x_data, y_data = axis_rows(table)
-    x = _learn_axis(x_data, rng=rng, progress=progress)
-    y = None if y_data is None else _learn_axis(y_data, rng=rng, progress=progress)
-    return both_axes((x, x_data), None if y is None or y_data is None else (y, y_data), recipe=recipe)
+    return _by_axes(table, recipe, lambda data: _learn_axis(data, rng=rng, progress=progress))
 
 
 def axis_rows(table: SizeTable) -> tuple[AxisRows, AxisRows | None]:
-    """Rows with positive amplitude for the regression of each axis; None along the head without widths along it.
-
-    Raises
-    ------
-    BadDataError
-        When rows are too few, or do not vary.
-    """
+    """Rows with positive amplitude for the regression of each axis; None along the head without widths along it."""
     rising = table.amplitude > 0
     if rising.sum() < 8:
         raise BadDataError(
@@ -121,24 +118,22 @@ def axis_rows(table: SizeTable) -> tuple[AxisRows, AxisRows | None]:
         raise BadDataError("all rows have one diameter", way_out="a calibration needs lumps of several sizes")
     if any(s is not None and np.ptp(s[rising]) <= 0 for s in (table.sigma_x_mm, table.sigma_y_mm)):
         raise BadDataError("all rows have one width", way_out="m and b need maps of several widths to be told apart")
-    depth = None if table.depth_ratio is None else table.depth_ratio[rising]
-
-    def axis(sigma: FloatArray, change: FloatArray | None) -> AxisRows:
-        kept = None if change is None else change[rising]
-        return AxisRows(table.d_mm[rising], table.amplitude[rising], sigma[rising], kept, depth)
-
-    x = axis(table.sigma_x_mm, table.width_change_x)
-    return x, None if table.sigma_y_mm is None else axis(table.sigma_y_mm, table.width_change_y)
+    kept = rows_of(table, rising)
+    x = AxisRows(kept.d_mm, kept.amplitude, kept.sigma_x_mm, kept.width_change_x, kept.depth_ratio)
+    if kept.sigma_y_mm is None:
+        return x, None
+    return x, AxisRows(kept.d_mm, kept.amplitude, kept.sigma_y_mm, kept.width_change_y, kept.depth_ratio)
 
 
-def both_axes(
-    x: tuple[AxisCalibration, AxisRows], y: tuple[AxisCalibration, AxisRows] | None, *, recipe: Recipe
-) -> SizeCalibration:
-    """Calibration of the axes across and along the head, each with its rows; `y` is None where there is one width."""
-    if y is None:
-        return SizeCalibration(x[0], x[0], 1.0, recipe, axes=("both",))
-    correlation = np.corrcoef(_standard_residuals(*x), _standard_residuals(*y))[0, 1]
-    return SizeCalibration(x[0], y[0], float(np.clip(correlation, -1, 1)), recipe)
+def _by_axes(table: SizeTable, recipe: Recipe, learn: Callable[[AxisRows], AxisCalibration]) -> SizeCalibration:
+    """Calibration of the axes across and along the head; both alike where the table has one width."""
+    x_rows, y_rows = axis_rows(table)
+    x = learn(x_rows)
+    if y_rows is None:
+        return SizeCalibration(x, x, 1.0, recipe, axes=("both",))
+    y = learn(y_rows)
+    correlation = np.corrcoef(_standard_residuals(x, x_rows), _standard_residuals(y, y_rows))[0, 1]
+    return SizeCalibration(x, y, float(np.clip(correlation, -1, 1)), recipe)
 
 
 def _standard_residuals(axis: AxisCalibration, data: AxisRows) -> FloatArray:
@@ -153,7 +148,7 @@ def log_error(size_mm: FloatArray, d_mm: FloatArray) -> FloatArray:
 def axis_at_mode(data: AxisRows) -> AxisCalibration:
     """Eq 6 at the mode of its posterior: a single draw, a hundred times faster than a thousand draws."""
     data, mode, _ = _mode(data)
-    return AxisCalibration(_coefficients(mode[None], data), data.centre[0], domain_of(data))
+    return data.calibration(_coefficients(mode[None], data))
 
 
 def _mode(data: AxisRows) -> tuple[AxisRows, FloatArray, FloatArray]:
@@ -176,8 +171,7 @@ def _learn_axis(data: AxisRows, *, rng: np.random.Generator, progress: Progress 
 
     options = EnsembleOptions(keep=DRAWS_KEPT, max_steps=20_000, block=300)
     draws = ensemble(log_density, mode, covariance, rng=rng, options=options, progress=progress)
-    coefficients = _coefficients(draws.flat, data)
-    axis = AxisCalibration(coefficients, data.centre[0], domain_of(data))
+    axis = data.calibration(_coefficients(draws.flat, data))
     told = {name: draws.diagnostics[name] for name in ("rhat", "ess_tail")}
     return replace(axis, fit={**agreement(axis, data), "e_identified": float(data.width_change is not None), **told})
 
@@ -234,12 +228,6 @@ def _coefficients(theta: FloatArray, data: AxisRows) -> FloatArray:
     return np.stack([m, theta[:, 1], e, f, np.exp(theta[:, 3]), theta[:, 4]], axis=1)
 
 
-def domain_of(data: AxisRows) -> dict[str, tuple[float, float]]:
-    """Ranges of amplitude, width and diameter in the rows."""
-    pairs = (("amplitude", data.amplitude), ("sigma_mm", data.sigma_mm), ("d_mm", data.d_mm))
-    return {name: (float(values.min()), float(values.max())) for name, values in pairs}
-
-
 LEAST_DIAMETERS = 3
 """Two diameters always lie on a line, and leave nothing to resample."""
 _SLOPES = np.linspace(-1.0, 2.0, 301)
@@ -272,17 +260,13 @@ def learn_two_stage(table: SizeTable, *, recipe: Recipe, rng: np.random.Generato
     BadDataError
         When rows are too few, do not vary, have no depths, or not three diameters at h/d 1.
     """
-    x, y = axis_rows(table)
-    return both_axes(
-        (_learn_in_two_stages(x, rng), x), None if y is None else (_learn_in_two_stages(y, rng), y), recipe=recipe
-    )
+    return _by_axes(table, recipe, lambda data: _learn_in_two_stages(data, rng))
 
 
 def axis_in_two_stages(data: AxisRows) -> AxisCalibration:
     """Eq 6 fitted in two stages to the rows themselves: a single draw, as `axis_at_mode` of the joint posterior."""
     ones = np.ones((1, len(data.d_mm)))
-    coefficients = _two_stage_coefficients(data, ones)
-    return AxisCalibration(_with_scatter(coefficients, data, ones), data.centre[0], domain_of(data))
+    return data.calibration(_with_scatter(_two_stage_coefficients(data, ones), data, ones))
 
 
 def other_fit(calibration: SizeCalibration, table: SizeTable) -> OtherFit | None:
@@ -320,7 +304,7 @@ def _learn_in_two_stages(data: AxisRows, rng: np.random.Generator) -> AxisCalibr
     draws[:, scaled] *= fitted.draws[0, scaled] / draws[:, scaled].mean(axis=0)
     shifted = [0, 1, 3, 5]
     draws[:, shifted] += fitted.draws[0, shifted] - draws[:, shifted].mean(axis=0)
-    axis = AxisCalibration(draws, data.centre[0], domain_of(data))
+    axis = data.calibration(draws)
     level, known = _stages(data)
     told = {"level_rows": float(level.sum()), "width_change_rows": float(known.sum())}
     return replace(axis, fit={**agreement(axis, data), "e_identified": 1.0, "two_stage": 1.0, **told})
@@ -400,7 +384,7 @@ def _line(x: FloatArray, y: FloatArray, counts: FloatArray) -> tuple[FloatArray,
 
 def _with_scatter(coefficients: FloatArray, data: AxisRows, counts: FloatArray) -> FloatArray:
     """(k, 6) coefficients with scatter s and slope g of ln d about them, by maximum likelihood on a grid of g."""
-    axis = AxisCalibration(np.zeros((1, 6)), data.centre[0], {})
+    axis = data.calibration(np.zeros((1, 6)))
     padded = np.pad(coefficients, ((0, 0), (0, 2)))[:, None, :]
     error = log_error(axis.size_mm(data.sigma_mm, data.amplitude, draws=padded), data.d_mm)
     log_a = np.log(data.amplitude / data.centre[0])

@@ -218,7 +218,13 @@ def check_population(table: PopulationTable) -> None:
 
 def domain_of(table: PopulationTable) -> dict[str, tuple[float, float]]:
     """Ranges of amplitude, mean width and diameter."""
-    values = {"amplitude": np.exp(table.log_amplitude), "sigma_mm": np.exp(table.log_width), "d_mm": table.d_mm}
+    return ranges_of(
+        {"amplitude": np.exp(table.log_amplitude), "sigma_mm": np.exp(table.log_width), "d_mm": table.d_mm}
+    )
+
+
+def ranges_of(values: Mapping[str, FloatArray]) -> dict[str, tuple[float, float]]:
+    """Least and largest of each."""
     return {name: (float(v.min()), float(v.max())) for name, v in values.items()}
 
 
