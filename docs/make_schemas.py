@@ -6,17 +6,20 @@ import json
 from pathlib import Path
 
 from tactile_bayes.declarations import Record, schema_of
+from tactile_bayes.files.scene_toml import SceneFile
 from tactile_bayes.files.size_json import Eq6File, PopulationFile, SiteFile
 
 SCHEMAS = Path(__file__).resolve().parent.parent / "data_schema"
-RECORDS: dict[str, type[Record]] = {
+OF_JSON: dict[str, type[Record]] = {
     "size_calibration.schema.json": Eq6File,
     "size_population.schema.json": PopulationFile,
     "size_site.schema.json": SiteFile,
 }
+OF_TOML: dict[str, type[Record]] = {"scene.schema.json": SceneFile}
 
 
 def schemas() -> dict[Path, str]:
     """What each generated schema has to hold."""
-    texts = {name: json.dumps(schema_of(kind), indent=2, ensure_ascii=False) + "\n" for name, kind in RECORDS.items()}
-    return {SCHEMAS / name: text for name, text in texts.items()}
+    found = {name: schema_of(kind) for name, kind in OF_JSON.items()}
+    found |= {name: schema_of(kind, nulls=False) for name, kind in OF_TOML.items()}
+    return {SCHEMAS / name: json.dumps(one, indent=2, ensure_ascii=False) + "\n" for name, one in found.items()}

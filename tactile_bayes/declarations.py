@@ -99,8 +99,13 @@ def _unfolded(value: Any) -> Any:
     return type(value)(map(_unfolded, value)) if type(value) in (list, tuple) else value
 
 
-def from_plain(kind: type[T], document: object) -> T:
+def from_plain(kind: type[T], document: object, *, where: str = "") -> T:
     """A record of plain data: dictionaries, lists, texts and numbers.
+
+    Parameters
+    ----------
+    where
+        Place of the data in their file, for the error.
 
     Raises
     ------
@@ -110,7 +115,12 @@ def from_plain(kind: type[T], document: object) -> T:
     try:
         return msgspec.convert(document, kind, dec_hook=_array)
     except msgspec.ValidationError:
-        raise _fault(kind, document, "") from None
+        raise _fault(kind, document, where) from None
+
+
+def check(record: Record, where: str = "") -> None:
+    """Hold a record that was made in Python against its declaration; for the errors see `from_plain`."""
+    from_plain(type(record), to_plain(record, digits=17), where=where)
 
 
 def to_plain(record: object, *, digits: int = 9) -> Any:
@@ -118,19 +128,35 @@ def to_plain(record: object, *, digits: int = 9) -> Any:
     return _rounded(msgspec.to_builtins(record, enc_hook=_lists, str_keys=True), digits)
 
 
-def schema_of(kind: Any, *, title: str = "") -> dict[str, Any]:
-    """JSON schema (draft 7) of a record's files, from its declaration.
+def schema_of(kind: Any, *, nulls: bool = True) -> dict[str, Any]:
+    """JSON schema (draft 7) of a record's files, from its declaration; the first line of its docstring is the title.
 
     Parameters
     ----------
-    title
-        Of the schema; the first line of the record's docstring where left out.
+    nulls
+        Whether the files can hold null: those of TOML cannot.
     """
     found = msgspec.json.schema(kind, schema_hook=lambda _: {"type": "array"})
     definitions = found.pop("$defs", {})
     body = _inlined(found, definitions)
-    title = title or body.pop("description", "").split("\n")[0].rstrip(".")
-    return {"$schema": "http://json-schema.org/draft-07/schema#", "title": title, **body}
+    title, _, meaning = body.pop("description", "").partition("\n")
+    head = {"$schema": "http://json-schema.org/draft-07/schema#", "title": title.rstrip(".")}
+    if meaning.strip():
+        head["description"] = " ".join(meaning.split())
+    return {**head, **(body if nulls else _without_nulls(body))}
+
+
+def _without_nulls(schema: Any) -> Any:
+    """A schema in which what may be left out may not be null."""
+    if isinstance(schema, list):
+        return [_without_nulls(one) for one in schema]
+    if not isinstance(schema, dict):
+        return schema
+    found = {key: _without_nulls(one) for key, one in schema.items() if key != "default" or one is not None}
+    if "anyOf" in found:
+        forms = [one for one in found.pop("anyOf") if one != {"type": "null"}]
+        found = {**(forms[0] if len(forms) == 1 else {"anyOf": forms}), **found}
+    return found
 
 
 def schema_name(kind: Any) -> str | None:
@@ -212,6 +238,8 @@ def _inlined(schema: Any, definitions: Mapping[str, Any]) -> Any:
             found |= {"items": parts, "additionalItems": False}
     if len(found.get("enum", ())) == 1:
         found = {"const" if key == "enum" else key: one[0] if key == "enum" else one for key, one in found.items()}
+    if not found.get("required", True):
+        del found["required"]
     if "discriminator" in found:
         del found["discriminator"]
     return found
@@ -360,8 +388,10 @@ def _in_words(kind: Any) -> str:
         return _texts(rules)
     if origin is tuple and args[-1] is not Ellipsis:
         return f"a list of {len(args)}"
-    if "min_length" in rules and origin in (list, tuple):
-        return f"a list of {rules['min_length']} or more"
+    if origin in (list, tuple):
+        least, most = rules.get("min_length"), rules.get("max_length")
+        told = "" if least is None else f" of {least} or more" if most is None else f" of {least} to {most}"
+        return f"a list{told or ('' if most is None else f' of at most {most}')}"
     return "a table of keys" if _is_record(bare) else _KINDS.get(origin, "a list of numbers")
 
 

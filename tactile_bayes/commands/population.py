@@ -94,6 +94,7 @@ def command(
     from tactile_bayes.batch import fault_lines, open_executor, run_batch
     from tactile_bayes.batch_store import open_store
     from tactile_bayes.commands.progress import progress_bar
+    from tactile_bayes.declarations import as_dict
     from tactile_bayes.errors import TactileBayesError
     from tactile_bayes.files.atomic import refuse_existing, write_text
     from tactile_bayes.files.documents import read_bodies

@@ -1,34 +1,110 @@
-"""Scenes as TOML: units in the keys, defaults and ranges in one schema, one error line per mistake."""
+"""Scenes as TOML."""
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Mapping, Sequence
-from functools import cache
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
+from tactile_bayes.declarations import Meta, Record, as_dict, field, from_plain, names_of
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.files.documents import load_schema, parse_toml
+from tactile_bayes.files.documents import parse_toml
 from tactile_bayes.files.reading import TOML_BYTES, read_text
-from tactile_bayes.forward.scene import Background, Head, Lump, Noise, Scene, SceneLandmarks, Strokes, Taxels, Tracker
-from tactile_bayes.forward.tissue import Rib, SceneBody, SolidLump
+from tactile_bayes.forward.scene import (
+    Amplitude,
+    Angle,
+    Background,
+    Head,
+    Lump,
+    Noise,
+    Scene,
+    SceneLandmarks,
+    SigmaX,
+    SigmaY,
+    Strokes,
+    Taxels,
+    Timing,
+    Tracker,
+)
+from tactile_bayes.forward.tissue import (
+    DepthRatio,
+    Diameter,
+    Height,
+    Place,
+    Rib,
+    SceneBody,
+    Seat,
+    SolidLump,
+    Stiffness,
+)
 
-_SCHEMA: Final = "scene.schema.json"
 # A lump with one of the first is tissue; only a Gaussian one may have the others.
 _OF_TISSUE: Final = ("depth_ratio", "stiffness_ratio", "seat", "height_mm")
 _OF_BUMPS: Final = ("amplitude", "sigma_x_mm", "sigma_y_mm", "angle_deg")
-_TYPES: Final = {
-    "number": "a number",
-    "integer": "a whole number",
-    "boolean": "true or false",
-    "array": "a list",
-    "object": "a table",
-}
+_BUMP: Final = Lump()
+
+
+class LumpTable(Record):
+    """One lump."""
+
+    x_mm: Place = _BUMP.x_mm
+    y_mm: Place = _BUMP.y_mm
+    amplitude: Amplitude = _BUMP.amplitude
+    sigma_x_mm: SigmaX = _BUMP.sigma_x_mm
+    sigma_y_mm: SigmaY = _BUMP.sigma_y_mm
+    angle_deg: Angle = _BUMP.angle_deg
+    d_mm: Diameter | None = None
+    height_mm: Height | None = None
+    depth_ratio: DepthRatio | None = None
+    stiffness_ratio: Stiffness | None = None
+    seat: Seat | None = None
+
+
+class SceneFile(Record):
+    """Scene of a simulated scan.
+
+    The TOML document `simulate` reads. Everything may be left out. Units are in the keys; lumps and landmarks lie in
+    the scene's plane: origin at the centre of the strokes, x along them (across the head), y along the head, z into the
+    tissue.
+    """
+
+    scene: Annotated[Timing, Meta(description="Length and rates.")] = field(default_factory=Timing)
+    background: Annotated[Background, Meta(description="Mean pressure away from lumps, against time.")] = field(
+        default_factory=Background
+    )
+    body: SceneBody | None = None
+    lump: Annotated[
+        tuple[LumpTable, ...],
+        Meta(
+            max_length=100,
+            description="Lumps: either Gaussian rises of the normalised pressure (amplitude, sigma), or tissue (d_mm, "
+            "depth_ratio).",
+        ),
+    ] = ()
+    rib: Annotated[
+        tuple[Annotated[Rib, Meta(description="One rib.")], ...],
+        Meta(max_length=10, description="Ribs for the solid model: rows of stiff balls along x, across the head."),
+    ] = ()
+    strokes: Annotated[Strokes, Meta(description="Back and forth across the head, line after line along it.")] = field(
+        default_factory=Strokes
+    )
+    head: Annotated[Head, Meta(description="A section of a circular cylinder.")] = field(default_factory=Head)
+    noise: Annotated[Noise, Meta(description="Standard deviations of everything random.")] = field(
+        default_factory=Noise
+    )
+    tracker: Annotated[
+        Tracker, Meta(description="Where the tracker's base stands and how its sensor sits in the handle.")
+    ] = field(default_factory=Tracker)
+    taxels: Annotated[Taxels, Meta(description="Faulty elements as [row, column] from 0.")] = field(
+        default_factory=Taxels
+    )
+    landmarks: Annotated[SceneLandmarks, Meta(description="Points touched before the scan, in the plane.")] = field(
+        default_factory=SceneLandmarks
+    )
 
 
 def read_scene(path: Path) -> Scene:
-    """Read a scene; missing keys take the defaults of ``scene.schema.json``.
+    """Read a scene; missing keys take their defaults.
 
     Raises
     ------
@@ -45,126 +121,31 @@ def read_scene(path: Path) -> Scene:
 def scene_from_toml(text: str) -> Scene:
     """Parse a scene from a TOML text; for the errors see `read_scene`."""
     document = parse_toml(text, way_out="see the scene in the documentation")
-    _check(document)
-    return _scene(document)
+    file = from_plain(SceneFile, document)
+    given = {name: getattr(file, name) for name in names_of(file)}
+    bumps, tissue = _lumps(given.pop("lump"), document.get("lump", ()))
+    return Scene(**as_dict(given.pop("scene")), lumps=bumps, solid_lumps=tissue, ribs=given.pop("rib"), **given)
 
 
-def _check(document: dict[str, Any]) -> None:
-    import fastjsonschema
-
-    try:
-        _validator()(document)
-    except fastjsonschema.JsonSchemaValueException as error:
-        raise _told(error) from None
-
-
-@cache
-def _validator() -> Any:
-    import fastjsonschema
-
-    return fastjsonschema.compile(load_schema(_SCHEMA), use_default=False)
-
-
-def _told(error: Any) -> BadDataError:
-    """Error line for a broken rule of the schema."""
-    where, value, rule = _where(error.path[1:]), error.value, error.definition
-    if error.rule == "additionalProperties":
-        return _unknown_key(where, value, rule)
-    if error.rule == "type":
-        kind = _TYPES.get(rule["type"], rule["type"])
-        return BadDataError(f"{where} is {_short(value)}", way_out=f"it must be {kind}{_range(rule)}")
-    if error.rule in ("minItems", "maxItems"):
-        low, high = rule.get("minItems", 0), rule.get("maxItems")
-        wanted = f"{low}" if low == high else f"{low} to {high}"
-        return BadDataError(f"{where} has {len(value)} entries", way_out=f"it must have {wanted}")
-    return BadDataError(f"{where} is {_short(value)}", way_out=f"it must be {_TYPES[rule['type']]}{_range(rule)}")
-
-
-def _where(path: list[Any]) -> str:
-    text = ""
-    for part in path:
-        text += f"[{part}]" if str(part).isdigit() else f".{part}" if text else str(part)
-    return text
-
-
-def _short(value: object) -> str:
-    text = repr(value)
-    return text if len(text) <= 60 else text[:57] + "..."
-
-
-def _range(rule: Mapping[str, Any]) -> str:
-    """Allowed range in words: " above 0, at most 600"."""
-    words = []
-    for key, word in (
-        ("minimum", "at least"),
-        ("exclusiveMinimum", "above"),
-        ("maximum", "at most"),
-        ("exclusiveMaximum", "below"),
-    ):
-        if key in rule:
-            words.append(f"{word} {rule[key]:g}")
-    return " " + ", ".join(words) if words else ""
-
-
-def _unknown_key(where: str, table: Mapping[str, Any], rule: Mapping[str, Any]) -> BadDataError:
-    known = list(rule["properties"])
-    key = next(name for name in table if name not in known)
-    full = f"{where}.{key}" if where else key
-    stem = _stem(key)
-    other_unit = [name for name in known if _stem(name) == stem]
-    if other_unit:
-        return BadDataError(f"{full} is not known", way_out=f"give {other_unit[0]}, in the unit it names")
-    close = difflib.get_close_matches(key, known, n=1) or [name for name in known if name.startswith(key)][:1]
-    hint = f"did you mean {close[0]}?" if close else f"known are {', '.join(known)}"
-    return BadDataError(f"{full} is not known", way_out=hint)
-
-
-def _stem(key: str) -> str:
-    """Key without its unit: ``x_cm`` and ``x_mm`` are one quantity."""
-    stem, _, unit = key.rpartition("_")
-    units = {"mm", "cm", "m", "um", "in", "kpa", "pa", "mpa", "psi", "s", "ms", "us", "min", "hz", "khz", "deg", "rad"}
-    return stem if stem and unit.lower() in units else key
-
-
-def _scene(document: Mapping[str, Any]) -> Scene:
-    taxels = document.get("taxels", {})
-    bumps, tissue = _lumps(document.get("lump", []))
-    return Scene(
-        **document.get("scene", {}),
-        background=Background(**document.get("background", {})),
-        lumps=bumps,
-        body=SceneBody(**document["body"]) if "body" in document else None,
-        solid_lumps=tissue,
-        ribs=tuple(Rib(**table) for table in document.get("rib", [])),
-        strokes=Strokes(**document.get("strokes", {})),
-        head=Head(**document.get("head", {})),
-        noise=Noise(**document.get("noise", {})),
-        tracker=Tracker(**_tuples(document.get("tracker", {}))),
-        taxels=Taxels(**{kind: tuple((row, column) for row, column in pairs) for kind, pairs in taxels.items()}),
-        landmarks=SceneLandmarks(**_tuples(document.get("landmarks", {}))),
-    )
-
-
-def _lumps(tables: Sequence[Mapping[str, Any]]) -> tuple[tuple[Lump, ...], tuple[SolidLump, ...]]:
-    """Lumps that are bumps, and lumps that are tissue."""
+def _lumps(
+    tables: Sequence[LumpTable], given: Sequence[Mapping[str, Any]]
+) -> tuple[tuple[Lump, ...], tuple[SolidLump, ...]]:
+    """Lumps that are bumps, and lumps that are tissue, by the keys that the file gives."""
     bumps, tissue = [], []
-    for i, table in enumerate(tables):
-        solid = [key for key in _OF_TISSUE if key in table]
-        both = [key for key in _OF_BUMPS if key in table]
+    for i, (table, keys) in enumerate(zip(tables, given, strict=True)):
+        values = {key: getattr(table, key) for key in keys}
+        solid = [key for key in _OF_TISSUE if key in keys]
+        both = [key for key in _OF_BUMPS if key in keys]
         if solid and both:
             raise BadDataError(
                 f"lump[{i}] gives {both[0]}, of a bump, and {solid[0]}, of tissue",
                 way_out=f"leave out {', '.join(both)} or {', '.join(solid)}",
             )
         if not solid:
-            bumps.append(Lump(**table))
+            bumps.append(Lump(**values))
             continue
         for key in ("d_mm", "depth_ratio"):
-            if key not in table:
+            if key not in keys:
                 raise BadDataError(f"lump[{i}] gives no {key}", way_out=f"a lump of tissue with {solid[0]} needs it")
-        tissue.append(SolidLump(**table))
+        tissue.append(SolidLump(**values))
     return tuple(bumps), tuple(tissue)
-
-
-def _tuples(table: Mapping[str, Any]) -> dict[str, Any]:
-    return {key: tuple(value) if isinstance(value, list) else value for key, value in table.items()}

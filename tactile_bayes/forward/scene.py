@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field, fields
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
 import numpy as np
 
-from tactile_bayes.declarations import replace
+from tactile_bayes.declarations import Meta, Record, as_dict, check, field, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.contact import Head as Section
-from tactile_bayes.forward.tissue import Rib, SceneBody, SolidLump, check_solid, fat_thickness
+from tactile_bayes.forward.tissue import Diameter, Place, Rib, SceneBody, SolidLump, check_solid, fat_thickness
 from tactile_bayes.geometry import FloatArray, rigid, rotation_from_quaternion
 from tactile_bayes.presets import (
     HEAD_COLUMNS,
@@ -25,103 +24,108 @@ from tactile_bayes.presets import (
 #
 # Frames: a scene has its own `plane` frame. Its origin is the centre of the strokes, x runs across the head (along
 # the strokes), y along the head, z into the tissue. Lumps and landmarks are given in it; with landmarks, the
-# `patient` frame follows from them as for a real scan. `data_schema/scene.schema.json` holds the same names,
-# defaults and ranges.
+# `patient` frame follows from them as for a real scan.
 
-Point = tuple[float, float, float]
-Taxel = tuple[int, int]
+Degrees = Annotated[float, Meta(ge=-360, le=360)]
+Rotation = tuple[Degrees, Degrees, Degrees]
+"""Rotation vector."""
+Coordinate = Annotated[float, Meta(ge=-2000, le=2000)]
+Point = tuple[Coordinate, Coordinate, Coordinate]
+LeverMm = Annotated[float, Meta(ge=-1000, le=1000)]
+BaseMm = Annotated[float, Meta(ge=-100_000, le=100_000)]
+TaxelIndex = Annotated[int, Meta(ge=0, le=255)]
+Taxel = tuple[TaxelIndex, TaxelIndex]
 
 FLAT_MM: Final = 100_000.0
 """Radius that stands for a flat head, the largest of a scene: over 24 mm it rises by 0.7 um."""
 
 
-@dataclass(frozen=True, slots=True)
-class Background:
-    """Mean pressure under the head away from lumps, over time.
+class Background(Record):
+    """Mean pressure under the head away from lumps, over time."""
 
-    Parameters
-    ----------
-    mean_kpa
-        Level once contact is made.
-    drift_kpa, drift_period_s
-        A sine on top of it.
-    ramp_s
-        Time to press down at the start; 0 for full contact from the first frame.
-    load_sharing
-        True: the head bears a given force, so each frame is divided to keep its mean at the level, and the background
-        falls beside a lump. False: the background stays where it is.
-    """
-
-    mean_kpa: float = 9.5
-    drift_kpa: float = 0.5
-    drift_period_s: float = 3.0
-    ramp_s: float = 0.2
-    load_sharing: bool = False
+    mean_kpa: Annotated[float, Meta(gt=0, le=34, description="Level once contact is made, kPa.")] = 9.5
+    drift_kpa: Annotated[
+        float, Meta(ge=0, le=34, description="Amplitude of a sine on top of it, kPa; below mean_kpa.")
+    ] = 0.5
+    drift_period_s: Annotated[float, Meta(gt=0, le=600, description="Its period, s.")] = 3.0
+    ramp_s: Annotated[float, Meta(ge=0, le=60, description="Time to press down at the start, s.")] = 0.2
+    load_sharing: Annotated[
+        bool,
+        Meta(description="true: constant force, each frame keeps its mean and the background falls beside a lump."),
+    ] = False
 
 
-@dataclass(frozen=True, slots=True)
-class Lump:
-    """A Gaussian rise of the normalised pressure (the paper's Eq 5, elliptical and rotated).
-
-    Parameters
-    ----------
-    x_mm, y_mm
-        Centre in the scene's `plane`.
-    amplitude
-        Above a background of 1; may be negative.
-    sigma_x_mm, sigma_y_mm
-        Standard deviations along the lump's own axes.
-    angle_deg
-        From the plane's x axis to the lump's, positive towards y.
-    d_mm
-        True diameter, where one is declared. It is kept as truth; nothing is computed from it.
-    """
-
-    x_mm: float = 0.0
-    y_mm: float = 0.0
-    amplitude: float = 0.3
-    sigma_x_mm: float = 5.0
-    sigma_y_mm: float = 5.0
-    angle_deg: float = 0.0
-    d_mm: float | None = None
+Amplitude = Annotated[float, Meta(ge=-1, le=20, description="Height above a background of 1.")]
+SigmaX = Annotated[float, Meta(ge=0.1, le=200, description="Standard deviation along the lump's first axis, mm.")]
+SigmaY = Annotated[float, Meta(ge=0.1, le=200, description="Standard deviation along its second axis, mm.")]
+Angle = Annotated[
+    float,
+    Meta(
+        ge=-360,
+        le=360,
+        description="From the plane's x axis to the lump's first axis, positive towards y, degrees.",
+    ),
+]
 
 
-@dataclass(frozen=True, slots=True)
-class Strokes:
-    """Path of the head: back and forth across, line after line along.
+class Lump(Record):
+    """A Gaussian rise of the normalised pressure (the paper's Eq 5, elliptical and rotated)."""
 
-    Parameters
-    ----------
-    lines, spacing_mm, half_length_mm
-        Parallel lines, their distance, and how far each reaches either side of the middle.
-    wander_mm, tilt_deg
-        Amplitudes of the slow departure from the line and of the head's rocking.
-    yaw_deg
-        By how much the head is turned about the normal, away from square to the strokes.
-    """
-
-    lines: int = 5
-    spacing_mm: float = 6.0
-    half_length_mm: float = 34.0
-    wander_mm: float = 0.5
-    tilt_deg: float = 2.0
-    yaw_deg: float = 0.0
+    x_mm: Place = 0.0
+    y_mm: Place = 0.0
+    amplitude: Amplitude = 0.3
+    sigma_x_mm: SigmaX = 5.0
+    sigma_y_mm: SigmaY = 5.0
+    angle_deg: Angle = 0.0
+    d_mm: Diameter | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class Head:
-    """A section of a circular cylinder, its edges rounded off.
+class Strokes(Record):
+    """Path of the head: back and forth across, line after line along."""
 
-    `shoulder_mm` is the radius of shoulders cut into the array. Where it is 0, `rim_mm` is the radius of the rounded
-    edge *around* the taxels, which presses but senses nothing; in two dimensions it is cut into the array unless asked.
-    """
+    lines: Annotated[int, Meta(ge=1, le=200, description="Parallel lines.")] = 5
+    spacing_mm: Annotated[float, Meta(ge=0, le=100, description="Distance between lines, mm.")] = 6.0
+    half_length_mm: Annotated[
+        float, Meta(ge=0, le=500, description="Reach of each line either side of the middle, mm.")
+    ] = 34.0
+    wander_mm: Annotated[float, Meta(ge=0, le=50, description="Amplitude of the slow departure from the line, mm.")] = (
+        0.5
+    )
+    tilt_deg: Annotated[float, Meta(ge=0, le=30, description="Amplitude of the head's rocking, degrees.")] = 2.0
+    yaw_deg: Annotated[
+        float,
+        Meta(
+            ge=-90,
+            le=90,
+            description="Turn of the head about the normal, away from square to the strokes, degrees.",
+        ),
+    ] = 0.0
 
-    rows: int = HEAD_ROWS
-    columns: int = HEAD_COLUMNS
-    pitch_mm: float = HEAD_PITCH_MM
-    radius_mm: float = HEAD_RADIUS_MM
-    shoulder_mm: float = 0.0
-    rim_mm: float = 3.0
+
+Rows = Annotated[int, Meta(ge=1, le=256, description="Taxels across the head.")]
+Columns = Annotated[int, Meta(ge=1, le=256, description="Taxels along the head.")]
+Pitch = Annotated[float, Meta(gt=0, lt=100, description="Distance between neighbouring taxels, mm.")]
+
+
+class Head(Record):
+    """A section of a circular cylinder, its edges rounded off."""
+
+    rows: Rows = HEAD_ROWS
+    columns: Columns = HEAD_COLUMNS
+    pitch_mm: Pitch = HEAD_PITCH_MM
+    radius_mm: Annotated[float, Meta(gt=0, le=100_000, description="Radius of the face, mm; above half the width.")] = (
+        HEAD_RADIUS_MM
+    )
+    shoulder_mm: Annotated[float, Meta(ge=0, le=100, description="Radius of its rounded edges, mm; 0 for none.")] = 0.0
+    rim_mm: Annotated[
+        float,
+        Meta(
+            ge=0,
+            le=100,
+            description="Radius of the rounded edge around the taxels, mm, which presses but feels nothing (solid "
+            "model); in two dimensions the edge lies within the array, unless simulate --head shoulders-outside.",
+        ),
+    ] = 3.0
 
     def surface_mm(self) -> FloatArray:
         """(rows, columns, 3) taxel centres in `scanhead`: origin at the apex, z into the tissue, so z <= 0."""
@@ -157,48 +161,47 @@ class Head:
         return Section(self.rows * self.pitch_mm, self.radius_mm, edge, shoulders)
 
 
-@dataclass(frozen=True, slots=True)
-class Noise:
-    """Standard deviations of all random errors.
+class Noise(Record):
+    """Standard deviations of all random errors."""
 
-    Parameters
-    ----------
-    element_kpa
-        Of each reading.
-    tracker_mm, tracker_deg
-        Of each pose, per axis.
-    gain_spread
-        Between the true gains of the taxels; the calibration knows them.
-    gain_share
-        Error of the calibration, as a share of the true gain.
-    """
-
-    element_kpa: float = 0.2
-    tracker_mm: float = 0.4
-    tracker_deg: float = 0.2
-    gain_spread: float = 0.03
-    gain_share: float = 0.01
+    element_kpa: Annotated[float, Meta(ge=0, le=34, description="Of each reading, kPa.")] = 0.2
+    tracker_mm: Annotated[float, Meta(ge=0, le=50, description="Of each position, per axis, mm.")] = 0.4
+    tracker_deg: Annotated[float, Meta(ge=0, le=30, description="Of each rotation, per axis, degrees.")] = 0.2
+    gain_spread: Annotated[
+        float,
+        Meta(
+            ge=0,
+            le=0.2,
+            description="Between the true gains of the taxels, as a share; the calibration knows it.",
+        ),
+    ] = 0.03
+    gain_share: Annotated[
+        float, Meta(ge=0, le=0.2, description="Error of the calibration, as a share of the gain.")
+    ] = 0.01
 
 
-@dataclass(frozen=True, slots=True)
-class Tracker:
-    """Place of the tracker's base, and the sensor's pose in the handle.
+class Tracker(Record):
+    """Place of the tracker's base, and the sensor's pose in the handle; rotations are vectors."""
 
-    Parameters
-    ----------
-    latency_ms
-        By how much the stamp of a pose is late.
-    base_rotation_deg, base_offset_mm
-        `base` from the scene's `plane`: a rotation vector and a shift.
-    lever_rotation_deg, lever_offset_mm
-        `scanhead` from the tracker's sensor.
-    """
-
-    latency_ms: float = 0.0
-    base_rotation_deg: Point = (165.0, 25.0, -20.0)
-    base_offset_mm: Point = (175.0, -112.0, 133.0)
-    lever_rotation_deg: Point = (0.0, 3.0, -90.0)
-    lever_offset_mm: Point = (0.0, 10.0, -55.0)
+    latency_ms: Annotated[float, Meta(ge=0, le=1000, description="By how much a pose's stamp is late, ms.")] = 0.0
+    base_rotation_deg: Annotated[Rotation, Meta(description="Rotation vector of base from plane, degrees.")] = (
+        165.0,
+        25.0,
+        -20.0,
+    )
+    base_offset_mm: Annotated[tuple[BaseMm, BaseMm, BaseMm], Meta(description="The plane's origin in base, mm.")] = (
+        175.0,
+        -112.0,
+        133.0,
+    )
+    lever_rotation_deg: Annotated[Rotation, Meta(description="Rotation vector of scanhead from tracker, degrees.")] = (
+        0.0,
+        3.0,
+        -90.0,
+    )
+    lever_offset_mm: Annotated[
+        tuple[LeverMm, LeverMm, LeverMm], Meta(description="The tracker's sensor in scanhead, mm.")
+    ] = (0.0, 10.0, -55.0)
 
     def base_from_plane(self) -> FloatArray:
         """(4, 4) transform."""
@@ -209,35 +212,37 @@ class Tracker:
         return _rigid(self.lever_rotation_deg, self.lever_offset_mm)
 
 
-@dataclass(frozen=True, slots=True)
-class Taxels:
+class Taxels(Record):
     """Faulty elements as (row, column): dead ones read 0, saturated ones full scale."""
 
-    dead: tuple[Taxel, ...] = ()
-    saturated: tuple[Taxel, ...] = ()
+    dead: Annotated[tuple[Taxel, ...], Meta(description="Read 0 throughout.")] = ()
+    saturated: Annotated[tuple[Taxel, ...], Meta(description="Read full scale throughout.")] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class SceneLandmarks:
-    """Landmarks in the scene's `plane`; `touched` false leaves them out of the scan, None the nipple alone."""
+class SceneLandmarks(Record):
+    """Landmarks in the scene's `plane`."""
 
-    touched: bool = True
-    xiphoid_mm: Point = (-60.0, -90.0, 0.0)
-    sternal_notch_mm: Point = (-60.0, 90.0, 0.0)
-    nipple_mm: Point | None = None
+    touched: Annotated[bool, Meta(description="false leaves them out of the scan.")] = True
+    xiphoid_mm: Annotated[Point, Meta(description="Xiphoid, mm.")] = (-60.0, -90.0, 0.0)
+    sternal_notch_mm: Annotated[Point, Meta(description="Sternal notch, mm.")] = (-60.0, 90.0, 0.0)
+    nipple_mm: Annotated[Point, Meta(description="Nipple, mm; left out where it is not touched.")] | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class Scene:
+class Timing(Record):
+    """Length and rates of a scan."""
+
+    seed: Annotated[int, Meta(ge=0, le=2**63 - 1, description="Seed of the random numbers; --seed replaces it.")] = 1
+    duration_s: Annotated[float, Meta(gt=0, le=600, description="Duration of the scan, s.")] = 7.0
+    frame_rate_hz: Annotated[float, Meta(gt=0, le=2000, description="Pressure frames per second.")] = 200.0
+    pose_rate_hz: Annotated[float, Meta(gt=0, le=2000, description="Tracker poses per second.")] = 120.0
+
+
+class Scene(Timing):
     """All input of `simulate` except the random numbers.
 
     What lies below the skin is given either as Gaussian bumps (`lumps`) or as tissue (`body`, `solid_lumps`, `ribs`).
     """
 
-    seed: int = 1
-    duration_s: float = 7.0
-    frame_rate_hz: float = 200.0
-    pose_rate_hz: float = 120.0
     background: Background = field(default_factory=Background)
     lumps: tuple[Lump, ...] = ()
     body: SceneBody | None = None
@@ -251,15 +256,12 @@ class Scene:
     landmarks: SceneLandmarks = field(default_factory=SceneLandmarks)
 
     def __post_init__(self) -> None:
-        """Check the rules that involve several values; ranges of single values are in `scene.schema.json`."""
-        for name in ("duration_s", "frame_rate_hz", "pose_rate_hz"):
-            _above_zero(f"scene.{name}", getattr(self, name))
+        """Check each part by its declaration, then the rules that involve several."""
+        check(Timing(self.seed, self.duration_s, self.frame_rate_hz, self.pose_rate_hz), "scene")
+        for name in ("background", "strokes", "head", "noise", "tracker", "taxels", "landmarks"):
+            check(getattr(self, name), name)
         for i, lump in enumerate(self.lumps):
-            for name in ("sigma_x_mm", "sigma_y_mm"):
-                _above_zero(f"lump[{i}].{name}", getattr(lump, name))
-        for noise in fields(self.noise):
-            if not getattr(self.noise, noise.name) >= 0:
-                raise BadDataError(f"noise.{noise.name} is {getattr(self.noise, noise.name)}", way_out="give 0 or more")
+            check(lump, f"lump[{i}]")
         self._check_head()
         self._check_level()
         if self.lumps and self.solid_lumps:
@@ -290,26 +292,25 @@ class Scene:
             raise BadDataError(
                 f"head.radius_mm is {self.head.radius_mm:g}", way_out=f"it must exceed the half width of {half:g} mm"
             )
-        if not 0 <= self.head.shoulder_mm <= half:
+        if not self.head.shoulder_mm <= half:
             raise BadDataError(
                 f"head.shoulder_mm is {self.head.shoulder_mm:g}", way_out=f"it must lie in 0 to {half:g} mm"
             )
-        if not 0 <= self.head.rim_mm < self.head.radius_mm:
+        if not self.head.rim_mm < self.head.radius_mm:
             raise BadDataError(
                 f"head.rim_mm is {self.head.rim_mm:g}",
                 way_out=f"it must lie in 0 to below radius_mm, {self.head.radius_mm:g} mm",
             )
         for kind in ("dead", "saturated"):
             for row, column in getattr(self.taxels, kind):
-                if not (0 <= row < self.head.rows and 0 <= column < self.head.columns):
+                if not (row < self.head.rows and column < self.head.columns):
                     raise BadDataError(
                         f"taxels.{kind} names [{row}, {column}]",
                         way_out=f"rows are 0 to {self.head.rows - 1}, columns 0 to {self.head.columns - 1}",
                     )
 
     def _check_level(self) -> None:
-        _above_zero("background.mean_kpa", self.background.mean_kpa)
-        if abs(self.background.drift_kpa) >= self.background.mean_kpa:
+        if self.background.drift_kpa >= self.background.mean_kpa:
             raise BadDataError(
                 f"background.drift_kpa is {self.background.drift_kpa:g}",
                 way_out=f"it must stay below mean_kpa, {self.background.mean_kpa:g} kPa",
@@ -349,13 +350,8 @@ def rotation_from_vector(vector_rad: FloatArray) -> FloatArray:
     return rotation_from_quaternion(quaternion)
 
 
-def _rigid(rotation_deg: Point, offset_mm: Point) -> FloatArray:
+def _rigid(rotation_deg: Rotation, offset_mm: tuple[float, float, float]) -> FloatArray:
     return rigid(rotation_from_vector(np.radians(np.array(rotation_deg))), np.array(offset_mm))
-
-
-def _above_zero(name: str, value: float) -> None:
-    if not value > 0:
-        raise BadDataError(f"{name} is {value}", way_out="it must be above 0")
 
 
 # --- Truth of a simulated scan of tissue.
@@ -367,9 +363,9 @@ def tissue_truth(scene: Scene) -> dict[str, Any]:
     fat = fat_thickness(body, scene.solid_lumps)
     return {
         "lumps": [_lump_truth(lump, body, fat) for lump in scene.solid_lumps],
-        "ribs": [asdict(rib) | {"ball_x_mm": [ball.x_mm for ball in rib.balls()]} for rib in scene.ribs],
-        "body": asdict(body) | {"fat_mm": fat},
-        "background": asdict(scene.background),
+        "ribs": [as_dict(rib) | {"ball_x_mm": [ball.x_mm for ball in rib.balls()]} for rib in scene.ribs],
+        "body": as_dict(body) | {"fat_mm": fat},
+        "background": as_dict(scene.background),
     }
 
 
@@ -384,7 +380,7 @@ def refuse_bumps(scene: Scene, model: str) -> None:
 
 def _lump_truth(lump: SolidLump, body: SceneBody, fat_mm: float) -> dict[str, Any]:
     seat = (fat_mm - lump.depth_mm) / (lump.vertical_mm / 2)
-    return asdict(lump) | {
+    return as_dict(lump) | {
         "height_mm": lump.vertical_mm,
         "seat": seat,
         "depth_mm": lump.depth_mm,

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import Annotated
 
+from tactile_bayes.declarations import Meta, Record, check
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.body import FAT_KPA, GLAND_RATIO, POISSON, THICKNESS_MM
 
@@ -15,61 +16,78 @@ _SAME_MM = 0.01
 # The skin over a lump, and the tissue under it, as a share of its half height.
 _LEAST_COVER = 0.02
 
+Place = Annotated[float, Meta(ge=-500, le=500, description="Centre in the plane, mm.")]
+Diameter = Annotated[
+    float,
+    Meta(
+        gt=0,
+        le=500,
+        description="Diameter, mm. Of a Gaussian lump the declared truth, from which nothing is computed; of tissue "
+        "the diameter across the vertical (15).",
+    ),
+]
+Height = Annotated[
+    float, Meta(gt=0, le=500, description="Tissue: diameter along the vertical, mm; left out for a ball.")
+]
+DepthRatio = Annotated[
+    float,
+    Meta(
+        gt=0,
+        le=100,
+        description="Tissue: h/d, depth of the centre over the diameter; the lump must fit between skin and chest "
+        "wall.",
+    ),
+]
+Stiffness = Annotated[
+    float, Meta(gt=0, le=1_000_000, description="Tissue: modulus of the lump over that of fat (100).")
+]
+Seat = Annotated[
+    float,
+    Meta(
+        ge=0,
+        le=20,
+        description="Tissue: the fat-gland boundary lies at the centre's depth + seat x half the height: 0 through the "
+        "centre (centred), 1 under the lowest point; the phantoms' resting lumps have 1.2.",
+    ),
+]
 
-@dataclass(frozen=True, slots=True)
-class SceneBody:
-    """Fat over gland on a rigid chest wall.
 
-    Parameters
-    ----------
-    fat_kpa
-        Young's modulus of fat.
-    gland_ratio
-        That of gland over that of fat.
-    thickness_mm
-        Depth of the chest wall below the skin.
-    nu
-        Poisson's ratio of everything, lumps included; below 0.5.
-    fat_mm
-        Depth of the boundary between fat and gland; None lets the lumps' seats decide (15 mm without lumps).
-    """
+class SceneBody(Record):
+    """Fat over gland on a rigid chest wall, for lumps of tissue."""
 
-    fat_kpa: float = FAT_KPA
-    gland_ratio: float = GLAND_RATIO
-    thickness_mm: float = THICKNESS_MM
-    nu: float = POISSON
-    fat_mm: float | None = None
+    fat_kpa: Annotated[float, Meta(gt=0, le=10_000, description="Young's modulus of fat, kPa.")] = FAT_KPA
+    gland_ratio: Annotated[float, Meta(gt=0, le=10_000, description="Modulus of gland over that of fat.")] = GLAND_RATIO
+    thickness_mm: Annotated[float, Meta(gt=0, le=500, description="Depth of the chest wall below the skin, mm.")] = (
+        THICKNESS_MM
+    )
+    nu: Annotated[float, Meta(ge=0, lt=0.5, description="Poisson's ratio of everything, lumps included.")] = POISSON
+    fat_mm: (
+        Annotated[
+            float,
+            Meta(
+                gt=0,
+                le=500,
+                description="Depth of the boundary between fat and gland, mm. Left out, the lumps' seats decide; 15 mm "
+                "without lumps.",
+            ),
+        ]
+        | None
+    ) = None
 
 
-@dataclass(frozen=True, slots=True)
-class SolidLump:
+class SolidLump(Record):
     """A lump of stiff or soft tissue: a ball, or with another height a spheroid about the vertical.
 
-    Parameters
-    ----------
-    x_mm, y_mm
-        Place of its vertical axis in the scene's `plane`.
-    d_mm
-        Diameter across the vertical.
-    height_mm
-        Diameter along the vertical; None for `d_mm`.
-    depth_ratio
-        h/d: depth of its centre over `d_mm`.
-    stiffness_ratio
-        Its modulus over that of fat.
-    seat
-        How far it stands out of the gland: the boundary lies at ``h + seat * height / 2``, through the centre at 0
-        (centred), under the lowest point at 1, below it from there on. The phantoms' "resting" lumps, a tenth of their
-        diameter above the gland, have 1.2. None is 0, or follows from the body's `fat_mm`.
+    The seat says how far it stands out of the gland; None is 0, or follows from the body's `fat_mm`.
     """
 
-    x_mm: float = 0.0
-    y_mm: float = 0.0
-    d_mm: float = 15.0
-    height_mm: float | None = None
-    depth_ratio: float = 1.0
-    stiffness_ratio: float = 100.0
-    seat: float | None = None
+    x_mm: Place = 0.0
+    y_mm: Place = 0.0
+    d_mm: Diameter = 15.0
+    height_mm: Height | None = None
+    depth_ratio: DepthRatio = 1.0
+    stiffness_ratio: Stiffness = 100.0
+    seat: Seat | None = None
 
     @property
     def depth_mm(self) -> float:
@@ -82,32 +100,23 @@ class SolidLump:
         return self.d_mm if self.height_mm is None else self.height_mm
 
 
-@dataclass(frozen=True, slots=True)
-class Rib:
+class Rib(Record):
     """A row of stiff balls along x, across the head: what a rib looks like to a map.
 
-    Parameters
-    ----------
-    x_mm, y_mm
-        Middle of the row in the scene's `plane`.
-    d_mm, depth_mm
-        Diameter of the balls, and the depth of their centres. The balls have no seat: the boundary of fat and gland is
-        the lumps' or the body's.
-    spacing_mm
-        From ball to ball; they may overlap.
-    half_length_mm
-        The row's outermost balls lie at most this far from its middle.
-    stiffness_ratio
-        Their modulus over that of fat.
+    The balls have no seat: the boundary of fat and gland is the lumps' or the body's.
     """
 
-    x_mm: float = 0.0
-    y_mm: float = 26.0
-    d_mm: float = 12.0
-    depth_mm: float = 12.0
-    spacing_mm: float = 8.0
-    half_length_mm: float = 40.0
-    stiffness_ratio: float = 100.0
+    x_mm: Annotated[float, Meta(ge=-500, le=500, description="Middle of the row in the plane, mm.")] = 0.0
+    y_mm: Annotated[float, Meta(ge=-500, le=500, description="Middle of the row in the plane, mm.")] = 26.0
+    d_mm: Annotated[float, Meta(gt=0, le=100, description="Diameter of the balls, mm.")] = 12.0
+    depth_mm: Annotated[float, Meta(gt=0, le=500, description="Depth of the balls' centres, mm.")] = 12.0
+    spacing_mm: Annotated[float, Meta(ge=0.5, le=100, description="From ball to ball, mm; they may overlap.")] = 8.0
+    half_length_mm: Annotated[
+        float, Meta(gt=0, le=500, description="The outermost balls lie at most this far from the middle, mm.")
+    ] = 40.0
+    stiffness_ratio: Annotated[
+        float, Meta(gt=0, le=1_000_000, description="Modulus of the balls over that of fat.")
+    ] = 100.0
 
     def balls(self) -> tuple[SolidLump, ...]:
         """The row as lumps."""
@@ -166,28 +175,17 @@ def check_solid(body: SceneBody, lumps: Sequence[SolidLump], ribs: Sequence[Rib]
     ------
     BadDataError
     """
-    for name in ("fat_kpa", "gland_ratio", "thickness_mm", "fat_mm"):
-        value = getattr(body, name)
-        if value is not None:
-            _above_zero(f"body.{name}", value)
-    if not 0 <= body.nu < 0.5:
-        raise BadDataError(f"body.nu is {body.nu}", way_out="it must be at least 0, below 0.5")
+    check(body, "body")
     for i, lump in enumerate(lumps):
-        for name in ("d_mm", "height_mm", "depth_ratio", "stiffness_ratio"):
-            value = getattr(lump, name)
-            if value is not None:
-                _above_zero(f"lump[{i}].{name}", value)
-        if lump.seat is not None and not lump.seat >= 0:
-            raise BadDataError(f"lump[{i}].seat is {lump.seat}", way_out="it must be at least 0")
+        check(lump, f"lump[{i}]")
         _check_depth(i, lump, body)
     for i, rib in enumerate(ribs):
+        check(rib, f"rib[{i}]")
         _check_rib(i, rib, body)
     fat_thickness(body, lumps)
 
 
 def _check_rib(index: int, rib: Rib, body: SceneBody) -> None:
-    for name in ("d_mm", "depth_mm", "spacing_mm", "half_length_mm", "stiffness_ratio"):
-        _above_zero(f"rib[{index}].{name}", getattr(rib, name))
     half = (1.0 + _LEAST_COVER) * rib.d_mm / 2
     if not half <= rib.depth_mm <= body.thickness_mm - half:
         where = "stands out of the skin" if rib.depth_mm < half else "reaches into the chest wall"
@@ -217,8 +215,3 @@ def _check_depth(index: int, lump: SolidLump, body: SceneBody) -> None:
         f"lump[{index}].depth_ratio is {lump.depth_ratio:g}: the lump {where}",
         way_out=f"it must lie in {least:.4g} to {most:.4g} for this size and body",
     )
-
-
-def _above_zero(name: str, value: float) -> None:
-    if not value > 0:
-        raise BadDataError(f"{name} is {value:g}", way_out="it must be above 0")
