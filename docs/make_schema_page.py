@@ -79,7 +79,7 @@ def _keys(schema: Mapping[str, Any], table: str = "") -> Iterator[str]:
         if "properties" in inner:
             tables.append((name, rule, inner))
             continue
-        default = json.dumps(rule["default"]).strip('"') if "default" in rule else ""
+        default = json.dumps(rule["default"]).strip('"') if rule.get("default") is not None else ""
         needed = "required" if key in schema.get("required", []) else default
         yield _row(f"`{name}`", _value(rule), needed, rule.get("description", ""))
     for name, rule, inner in tables:

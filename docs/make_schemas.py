@@ -6,11 +6,13 @@ import json
 from pathlib import Path
 
 from tactile_bayes.declarations import Record, schema_of
+from tactile_bayes.files.instrument_json import HeadFile
 from tactile_bayes.files.scene_toml import SceneFile
 from tactile_bayes.files.size_json import Eq6File, PopulationFile, SiteFile
 
 SCHEMAS = Path(__file__).resolve().parent.parent / "data_schema"
 OF_JSON: dict[str, type[Record]] = {
+    "head.schema.json": HeadFile,
     "size_calibration.schema.json": Eq6File,
     "size_population.schema.json": PopulationFile,
     "size_site.schema.json": SiteFile,

@@ -20,6 +20,7 @@ from __future__ import annotations
 import dataclasses
 import types
 from collections.abc import Iterator, Mapping
+from datetime import date
 from typing import (
     TYPE_CHECKING,
     Annotated,
@@ -240,6 +241,9 @@ def _inlined(schema: Any, definitions: Mapping[str, Any]) -> Any:
         found = {"const" if key == "enum" else key: one[0] if key == "enum" else one for key, one in found.items()}
     if not found.get("required", True):
         del found["required"]
+    if len(found.get("anyOf", ())) == 2 and {"type": "null"} in found["anyOf"]:
+        for one in found["anyOf"]:
+            found |= {"description": one.pop("description")} if "description" in one else {}
     if "discriminator" in found:
         del found["discriminator"]
     return found
@@ -372,6 +376,7 @@ _KINDS: Final[Mapping[Any, str]] = {
     Mapping: "a table of keys",
     list: "a list",
     tuple: "a list",
+    date: "a date such as 2026-01-31",
     type(None): "null",
 }
 

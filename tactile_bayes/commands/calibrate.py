@@ -26,6 +26,7 @@ def calibrate_array(
     steps: tuple[tuple[float, Path], ...], output: Path, *, head_id: str | None, day: date, force: bool
 ) -> str:
     """Fit the calibration, write it, and print the result."""
+    from tactile_bayes.declarations import as_dict
     from tactile_bayes.files.instrument_json import ArrayCalibrationFile, write_array_calibration
     from tactile_bayes.files.provenance import Provenance, hash_inputs
     from tactile_bayes.files.scan_mcap import read_scan
@@ -43,8 +44,10 @@ def calibrate_array(
     fit = fit_array(levels, saturation_count=full)
     inputs = hash_inputs(**{f"step_{number}": path for number, (_, path) in enumerate(steps, start=1)})
     made = Provenance("calibrate array", {"pressure_kpa": [kpa for kpa, _ in steps]}, inputs)
-    content = ArrayCalibrationFile(fit.calibration, head, day, _quality(fit))
-    write_array_calibration(output, content, provenance=made, force=force)
+    content = ArrayCalibrationFile(
+        head_id=head, day=day, quality=_quality(fit), provenance=made.as_dict(), **as_dict(fit.calibration)
+    )
+    write_array_calibration(output, content, force=force)
     return _text(fit, head, output)
 
 

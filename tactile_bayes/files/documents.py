@@ -208,10 +208,13 @@ def read_record(path: Path, kind: type[T], *, way_out: str = "give a file this p
 
 def parse_record(document: object, kind: type[T], *, path: Path) -> T:
     """A record from a document that was read; for the errors see `read_record`."""
-    wanted = schema_kind(schema_name(kind))
+    schema = schema_name(kind)
+    wanted = schema_kind(schema)
     found = schema_kind(document.get("schema")) if isinstance(document, dict) else ""
     if wanted and found and found != wanted:
         raise BadDataError(f"is {found}, not {wanted}", way_out=f"give {wanted}", path=str(path))
+    if schema and isinstance(document, dict) and document.get("schema", schema) != schema:
+        raise BadDataError(f"schema is {_shown(document['schema'])}", way_out=f"give {schema!r}", path=str(path))
     try:
         return from_plain(kind, document)
     except BadDataError as error:

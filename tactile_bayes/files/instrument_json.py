@@ -6,17 +6,17 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Annotated, Any, Final, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_bayes.declarations import Meta, Record, field, to_plain
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.atomic import write_text
-from tactile_bayes.files.documents import check_document, dump_json, load_json, load_schema, refuse_unknown
-from tactile_bayes.files.provenance import Provenance
-from tactile_bayes.forward.scene import FLAT_MM, Head, Scene
-from tactile_bayes.geometry import FloatArray
+from tactile_bayes.files.documents import dump_json, load_json, parse_record, read_record
+from tactile_bayes.forward.scene import FLAT_MM, Columns, Head, Pitch, Rows, Scene
+from tactile_bayes.geometry import FloatArray, Matrix
 from tactile_bayes.scan import ElementCalibration, HeadGeometry, HeadShape, Landmarks, Scan
 
 # --- Parts of a scan file besides MCAP: head and calibration documents, times in ns, the reader's report.
@@ -138,15 +138,77 @@ def _build(name: str, make: Callable[[], _T]) -> _T:
 
 # --- Heads as JSON: places of the taxels, or their grid and arc, for `record` and for simulated bodies.
 
-HEAD_SCHEMA: Final = "tactile-bayes/head/1"
-SCHEMA_FILE: Final = "head.schema.json"
-_OF_ARC: Final = ("rows", "columns", "radius_mm")
 _DEFAULT_RIM_MM: Final = Head().rim_mm
 # Taxels further than this from a regular grid on an arc make a head that the models do not have.
 _REGULAR_MM: Final = 0.05
 _WAY_OUT: Final = (
     "give pitch_mm, and surface_mm or rows, columns and radius_mm; `record` needs scanhead_from_tracker too"
 )
+Triple = tuple[float, float, float]
+Row = tuple[float, float, float, float]
+TaxelRow = Annotated[list[Triple], Meta(min_length=1, max_length=256)]
+
+
+class HeadFile(Record, kw_only=True):
+    """A scan head: where its taxels are, and where the tracker's sensor is on it."""
+
+    schema: Literal["tactile-bayes/head/1"]
+    note: Annotated[str, Meta(description="Anything, for people.")] | None = None
+    pitch_mm: Pitch
+    surface_mm: (
+        Annotated[
+            list[TaxelRow],
+            Meta(
+                min_length=1,
+                max_length=256,
+                description="(rows, columns, 3) centres of the taxels in `scanhead`: origin at the apex, x across the "
+                "head, y along it, z into the tissue. Or give rows, columns and radius_mm.",
+            ),
+        ]
+        | None
+    ) = None
+    rows: Rows | None = None
+    columns: Columns | None = None
+    radius_mm: (
+        Annotated[
+            float,
+            Meta(
+                gt=0,
+                le=100_000,
+                description="Radius of the arc across the head, mm, above half its width; null for a flat head.",
+            ),
+        ]
+        | None
+    ) = None
+    shoulder_mm: Annotated[
+        float, Meta(ge=0, le=100, description="Radius of rounded edges cut into the array across the head, mm.")
+    ] = 0.0
+    rim_mm: (
+        Annotated[
+            float,
+            Meta(
+                ge=0,
+                le=100,
+                description="Radius of the rounded edge around the taxels, which presses but senses nothing, mm; for "
+                "`population`. Default: 3, or 0 with shoulder_mm.",
+            ),
+        ]
+        | None
+    ) = None
+    scanhead_from_tracker: (
+        Annotated[
+            tuple[Row, Row, Row, Row],
+            Meta(description="(4, 4) transform from the tracker's sensor to the head; `record` needs it."),
+        ]
+        | None
+    ) = None
+
+    def __post_init__(self) -> None:
+        if self.surface_mm is not None and len({len(row) for row in self.surface_mm}) > 1:
+            raise BadDataError("surface_mm has rows of different lengths", way_out="give every row a taxel each")
+        if self.shoulder_mm and self.rim_mm:
+            what = f"shoulder_mm is {self.shoulder_mm:g} and rim_mm {self.rim_mm:g}"
+            raise BadDataError(what, way_out="give one of them above 0")
 
 
 def read_head_geometry(path: Path) -> HeadGeometry:
@@ -157,13 +219,12 @@ def read_head_geometry(path: Path) -> HeadGeometry:
     BadDataError
         Naming the file, the key, its value and what is allowed.
     """
-    document = _read_head(path)
+    file = _read_head(path)
     try:
-        if "scanhead_from_tracker" not in document:
+        if file.scanhead_from_tracker is None:
             raise BadDataError("lacks scanhead_from_tracker", way_out="add the transform from the sensor to the head")
-        if "surface_mm" not in document:
-            document = {**document, "surface_mm": _arc(document).surface_mm()}
-        return head_from_document(document)
+        surface = _arc(file).surface_mm() if file.surface_mm is None else np.array(file.surface_mm)
+        return HeadGeometry(surface, file.pitch_mm, np.array(file.scanhead_from_tracker))
     except BadDataError as error:
         raise error.at(path) from None
 
@@ -176,117 +237,98 @@ def read_simulated_head(path: Path) -> Head:
     BadDataError
         Naming the file, the key, its value and what is allowed; also for taxels on another surface.
     """
-    document = _read_head(path)
+    file = _read_head(path)
     try:
-        return _arc(document) if "surface_mm" not in document else _fitted(document)
+        return _arc(file) if file.surface_mm is None else _fitted(file, np.array(file.surface_mm))
     except BadDataError as error:
         raise error.at(path) from None
 
 
-def _read_head(path: Path) -> dict[str, Any]:
-    document: Any = load_json(path, way_out=_WAY_OUT)
-    found = document.get("schema") if isinstance(document, dict) else None
-    if found != HEAD_SCHEMA:
-        raise BadDataError(f"has schema {found!r}, not {HEAD_SCHEMA!r}", way_out=_WAY_OUT, path=str(path))
-    refuse_unknown(document, load_schema(SCHEMA_FILE)["properties"], path=path)
-    check_document(document, SCHEMA_FILE, path=path)
-    given = [name for name in _OF_ARC if name in document]
-    if "surface_mm" in document and given:
+def _read_head(path: Path) -> HeadFile:
+    document = load_json(path, way_out=_WAY_OUT)
+    file = parse_record(document, HeadFile, path=path)
+    given = [name for name in ("rows", "columns", "radius_mm") if isinstance(document, dict) and name in document]
+    if file.surface_mm is not None and given:
         what = f"gives both surface_mm and {given[0]}"
         raise BadDataError(what, way_out="leave out one of the two descriptions", path=str(path))
-    missing = [] if "surface_mm" in document else [name for name in _OF_ARC if name not in document]
-    if missing:
-        raise BadDataError(f"lacks {missing[0]}", way_out=_WAY_OUT, path=str(path))
-    return dict(document)
+    if file.surface_mm is None and (missing := {"rows", "columns", "radius_mm"} - set(given)):
+        raise BadDataError(f"lacks {min(missing)}", way_out=_WAY_OUT, path=str(path))
+    return file
 
 
-def _arc(document: Mapping[str, Any]) -> Head:
+def _arc(file: HeadFile) -> Head:
     """Head of a grid on an arc, checked as a scene's."""
-    radius = document["radius_mm"]
-    return _checked(document, document["rows"], document["columns"], FLAT_MM if radius is None else float(radius))
+    assert file.rows is not None
+    assert file.columns is not None
+    return _checked(file, file.rows, file.columns, file.radius_mm)
 
 
-def _checked(document: Mapping[str, Any], rows: int, columns: int, radius_mm: float) -> Head:
-    shoulder = float(document.get("shoulder_mm", 0.0))
-    rim = float(document.get("rim_mm", 0.0 if shoulder else _DEFAULT_RIM_MM))
-    if shoulder and rim:
-        raise BadDataError(f"gives shoulder_mm {shoulder:g} and rim_mm {rim:g}", way_out="give one of them above 0")
-    head = Head(rows, columns, float(document["pitch_mm"]), radius_mm, shoulder, rim)
+def _checked(file: HeadFile, rows: int, columns: int, radius_mm: float | None) -> Head:
+    rim = (0.0 if file.shoulder_mm else _DEFAULT_RIM_MM) if file.rim_mm is None else file.rim_mm
+    head = Head(rows, columns, file.pitch_mm, FLAT_MM if radius_mm is None else radius_mm, file.shoulder_mm, rim)
     Scene(head=head)  # refuses what is no head
     return head
 
 
-def _fitted(document: Mapping[str, Any]) -> Head:
+def _fitted(file: HeadFile, surface_mm: FloatArray) -> Head:
     """Head whose taxels are where `surface_mm` has them."""
-    surface = _surface(document)
-    pitch = float(document["pitch_mm"])
-    shape = HeadShape.of(surface, pitch)
-    head = _checked(document, shape.rows, shape.columns, FLAT_MM if shape.radius_mm is None else shape.radius_mm)
-    apart = float(np.abs(_centred(surface) - _centred(head.surface_mm())).max())
+    shape = HeadShape.of(surface_mm, file.pitch_mm)
+    head = _checked(file, shape.rows, shape.columns, shape.radius_mm)
+    apart = float(np.abs(_centred(surface_mm) - _centred(head.surface_mm())).max())
     if apart > _REGULAR_MM:
         raise BadDataError(
-            f"surface_mm lies up to {apart:.2g} mm from a regular grid of {pitch:g} mm on an arc across the head",
+            f"surface_mm lies up to {apart:.2g} mm from a regular grid of {file.pitch_mm:g} mm on an arc across the "
+            "head",
             way_out="the model has such heads only: give rows, columns and radius_mm of the nearest one (null: flat)",
         )
     return head
 
 
-def _surface(document: Mapping[str, Any]) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
-    try:
-        surface = np.array(document["surface_mm"], dtype=np.float64)
-    except ValueError:
-        raise BadDataError("surface_mm has rows of different lengths", way_out="give every row a taxel each") from None
-    return surface
-
-
-def _centred(surface_mm: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> Any:
+def _centred(surface_mm: FloatArray) -> FloatArray:
     """Places about the array's middle: where a site puts the origin does not change the head."""
-    middle = surface_mm.reshape(-1, 3).mean(axis=0)
-    return surface_mm - middle
+    places = surface_mm.reshape(-1, 3)
+    return np.asarray(places - places.mean(axis=0))
 
 
 # --- Instrument files of `record`, as JSON: array calibration and landmarks.
 
-ARRAY_SCHEMA: Final = "tactile-bayes/array-calibration/1"
-LANDMARKS_SCHEMA: Final = "tactile-bayes/landmarks/1"
+_UNITS: Final = {"gain": "kPa per count", "offset": "kPa", "curvature": "kPa per count squared"}
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ArrayCalibrationFile:
-    """An array's calibration and its origin.
+class ArrayCalibrationFile(Record, eq=False, kw_only=True):
+    """Calibration of a pressure array."""
 
-    Parameters
-    ----------
-    calibration
-        Gains, offsets, curvatures.
-    head_id
-        The head it was measured on.
-    day
-        When it was measured.
-    quality
-        Figures of the fit.
-    """
+    schema: Literal["tactile-bayes/array-calibration/1"] = "tactile-bayes/array-calibration/1"
+    head_id: Annotated[str, Meta(description="The head it was measured on.")]
+    day: Annotated[date, Meta(description="When it was measured.")] = field(name="date")
+    units: dict[str, str] = field(default_factory=_UNITS.copy)
+    saturation_count: Annotated[int, Meta(ge=1, description="Readings at or above it carry no pressure.")]
+    gain_kpa_per_count: Matrix
+    offset_kpa: Matrix
+    quality: Annotated[dict[str, Any], Meta(description="Figures of the fit.")] = field(default_factory=dict)
+    provenance: dict[str, Any] = field(default_factory=dict)
 
-    calibration: ElementCalibration
-    head_id: str
-    day: date
-    quality: Mapping[str, Any]
+    def __post_init__(self) -> None:
+        _ = self.calibration  # refuses what is none
+
+    @property
+    def calibration(self) -> ElementCalibration:
+        """Gains and offsets of the taxels."""
+        return ElementCalibration(self.gain_kpa_per_count, self.offset_kpa, self.saturation_count)
 
 
-def write_array_calibration(
-    path: Path, content: ArrayCalibrationFile, *, provenance: Provenance, force: bool = False
-) -> None:
+class LandmarksFile(Record, kw_only=True):
+    """Landmarks touched before a scan, in `base`."""
+
+    schema: Literal["tactile-bayes/landmarks/1"]
+    sternal_notch_mm: Annotated[Triple, Meta(description="Sternal notch, mm.")]
+    xiphoid_mm: Annotated[Triple, Meta(description="Xiphoid, mm.")]
+    nipple_mm: Annotated[Triple, Meta(description="Nipple, mm; left out where it was not touched.")] | None = None
+
+
+def write_array_calibration(path: Path, content: ArrayCalibrationFile, *, force: bool = False) -> None:
     """Write the calibration of an array."""
-    document = {
-        "schema": ARRAY_SCHEMA,
-        "head_id": content.head_id,
-        "date": content.day.isoformat(),
-        "units": {"gain": "kPa per count", "offset": "kPa", "curvature": "kPa per count squared"},
-        **calibration_document(content.calibration),
-        "quality": dict(content.quality),
-        "provenance": provenance.as_dict(),
-    }
-    write_text(path, dump_json(document), force=force)
+    write_text(path, dump_json(to_plain(content, digits=17)), force=force)
 
 
 def read_array_calibration(path: Path) -> ArrayCalibrationFile:
@@ -297,36 +339,11 @@ def read_array_calibration(path: Path) -> ArrayCalibrationFile:
     BadDataError
         When it is another file, or damaged.
     """
-    document = _read(path, ARRAY_SCHEMA, way_out="give a file from `tactile-bayes calibrate array`")
-    try:
-        return ArrayCalibrationFile(
-            calibration=calibration_from_document(document),
-            head_id=str(document["head_id"]),
-            day=date.fromisoformat(document["date"]),
-            quality=document.get("quality", {}),
-        )
-    except BadDataError as error:
-        raise error.at(path) from None
-    except (KeyError, TypeError, ValueError) as error:
-        raise BadDataError(f"lacks a head_id or a date ({error})", way_out="calibrate again", path=str(path)) from None
+    return read_record(path, ArrayCalibrationFile, way_out="give a file from `tactile-bayes calibrate array`")
 
 
 def read_landmarks(path: Path) -> Landmarks:
     """Read sternal notch and xiphoid in `base`, and the nipple where the file has it."""
-    document = _read(path, LANDMARKS_SCHEMA, way_out="give sternal_notch_mm and xiphoid_mm, three numbers each")
-    try:
-        notch, xiphoid = (np.array(document[name], dtype=np.float64) for name in ("sternal_notch_mm", "xiphoid_mm"))
-        nipple = np.array(document["nipple_mm"], dtype=np.float64) if document.get("nipple_mm") is not None else None
-        return Landmarks(notch, xiphoid, nipple_mm=nipple)
-    except BadDataError as error:
-        raise error.at(path) from None
-    except (KeyError, TypeError, ValueError) as error:
-        raise BadDataError(f"lacks a landmark ({error})", way_out="give three numbers each", path=str(path)) from None
-
-
-def _read(path: Path, schema: str, *, way_out: str) -> dict[str, Any]:
-    document: Any = load_json(path, way_out=way_out)
-    found = document.get("schema") if isinstance(document, dict) else None
-    if found != schema:
-        raise BadDataError(f"has schema {found!r}, not {schema!r}", way_out=way_out, path=str(path))
-    return dict(document)
+    found = read_record(path, LandmarksFile, way_out="give sternal_notch_mm and xiphoid_mm, three numbers each")
+    nipple = None if found.nipple_mm is None else np.array(found.nipple_mm)
+    return Landmarks(np.array(found.sternal_notch_mm), np.array(found.xiphoid_mm), nipple_mm=nipple)

@@ -75,13 +75,16 @@ def sphere() -> dict[str, Any]:
         ({**ARC, "rows": 0}, "rows"),
         ({**ARC, "pitch_mm": "1.5"}, "pitch_mm"),
         ({**ARC, "rim_mm": 30}, "rim_mm is 30"),
-        ({**ARC, "shoulder_mm": 2, "rim_mm": 3}, "gives shoulder_mm 2 and rim_mm 3"),
+        ({**ARC, "shoulder_mm": 2, "rim_mm": 3}, "shoulder_mm is 2 and rim_mm 3"),
         ({name: ARC[name] for name in ARC if name != "columns"}, "lacks columns"),
         ({**of_surface(20.0), "rows": 10}, "gives both surface_mm and rows"),
         (sphere(), "from a regular grid of 1.5 mm on an arc"),
         ({**of_surface(20.0), "pitch_mm": 2.0}, "from a regular grid of 2 mm"),
         ({**of_surface(20.0), "surface_mm": [[[0, 0, 0], [0, 1, 0]], [[1, 0, 0]]]}, "rows of different lengths"),
-        ({**ARC, "schema": "tactile-bayes/landmarks/1"}, "has schema"),
+        (
+            {**ARC, "schema": "tactile-bayes/landmarks/1"},
+            "is a landmarks (JSON), not a head (JSON)",
+        ),
     ],
 )
 def test_what_is_no_head_is_one_line(tmp_path: Path, document: dict[str, Any], words: str) -> None:

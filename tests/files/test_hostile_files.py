@@ -334,6 +334,6 @@ def test_a_report_with_control_characters_is_refused_without_obeying_it(tmp_path
 def test_an_error_repeats_little_of_what_a_file_says(tmp_path: Path) -> None:
     path = tmp_path / "landmarks.json"
     path.write_text(json.dumps({"schema": "tactile-bayes/landmarks/" + "9" * 5000}))
-    with pytest.raises(BadDataError, match=r"has schema 'tactile-bayes/landmarks/9+ \.\.\. ") as refusal:
+    with pytest.raises(BadDataError, match=r"schema is 'tactile-bayes/landmarks/9+") as refusal:
         read_landmarks(path)
     assert len(str(refusal.value)) < 1000 + len(str(path))

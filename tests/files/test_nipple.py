@@ -102,7 +102,7 @@ def test_a_landmarks_file_may_have_a_nipple(tmp_path: Path) -> None:
     path.write_text(json.dumps({**document, "nipple_mm": [-80, 60, -3]}))
     np.testing.assert_array_equal(read_landmarks(path).nipple_mm, NIPPLE)
     path.write_text(json.dumps({**document, "nipple_mm": [1, 2]}))
-    with pytest.raises(BadDataError, match=r"nipple_mm has shape \(2,\)"):
+    with pytest.raises(BadDataError, match=r"nipple_mm is \[1, 2\]; give a list of 3"):
         read_landmarks(path)
 
 
