@@ -21,11 +21,11 @@ import numpy as np
 
 import tactile_bayes as tb
 from tactile_bayes.errors import TactileBayesError
-from tactile_bayes.files.documents import read_bodies
+from tactile_bayes.files.documents import read_record
 from tactile_bayes.files.instrument_json import read_simulated_head
 from tactile_bayes.forward.scene import Head, Scene
 from tactile_bayes.forward.simulate import simulate
-from tactile_bayes.studies.population import BodyPrior, ExamPrior, draw_mass
+from tactile_bayes.studies.population import BodiesFile, BodyPrior, ExamPrior, draw_mass
 
 SEED, TRIAL_SEED = 7, 20261215
 
@@ -136,7 +136,8 @@ def main() -> None:
     given = parser.parse_args()
     given.folder.mkdir(parents=True, exist_ok=True)
     size = learn(given.head, given.folder, bodies=given.bodies, masses=given.masses, form=given.form)
-    priors = read_bodies(given.bodies) if given.bodies else None
+    found = read_record(given.bodies, BodiesFile) if given.bodies else None
+    priors = found and (found.bodies, found.exams)
     scenes = trial_scenes(
         read_simulated_head(given.head), given.trial, given.exams, seed=given.trial_seed, priors=priors
     )

@@ -6,9 +6,11 @@ import json
 from pathlib import Path
 
 from tactile_bayes.declarations import Record, schema_of
+from tactile_bayes.files.documents import Protocol
 from tactile_bayes.files.instrument_json import HeadFile
 from tactile_bayes.files.scene_toml import SceneFile
 from tactile_bayes.files.size_json import Eq6File, PopulationFile, SiteFile
+from tactile_bayes.studies.population import BodiesFile
 
 SCHEMAS = Path(__file__).resolve().parent.parent / "data_schema"
 OF_JSON: dict[str, type[Record]] = {
@@ -17,7 +19,11 @@ OF_JSON: dict[str, type[Record]] = {
     "size_population.schema.json": PopulationFile,
     "size_site.schema.json": SiteFile,
 }
-OF_TOML: dict[str, type[Record]] = {"scene.schema.json": SceneFile}
+OF_TOML: dict[str, type[Record]] = {
+    "bodies.schema.json": BodiesFile,
+    "protocol.schema.json": Protocol,
+    "scene.schema.json": SceneFile,
+}
 
 
 def schemas() -> dict[Path, str]:

@@ -114,9 +114,25 @@ def from_plain(kind: type[T], document: object, *, where: str = "") -> T:
         In one line: the field at fault, its value, and what it may be.
     """
     try:
-        return msgspec.convert(document, kind, dec_hook=_array)
+        return _converted(kind, document)
     except msgspec.ValidationError:
         raise _fault(kind, document, where) from None
+
+
+def _converted(kind: type[T], document: object) -> T:
+    """A record of plain data, in which 200.0 is a whole number, as it is to a schema."""
+    try:
+        return msgspec.convert(document, kind, dec_hook=_array)
+    except msgspec.ValidationError:
+        return msgspec.convert(_whole(document), kind, dec_hook=_array)
+
+
+def _whole(value: object) -> object:
+    if isinstance(value, dict):
+        return {key: _whole(one) for key, one in value.items()}
+    if isinstance(value, list):
+        return [_whole(one) for one in value]
+    return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
 def check(record: Record, where: str = "") -> None:
@@ -284,7 +300,7 @@ def _of_rule(where: str, what: str, record: Any) -> str:
 def _refused(kind: Any, value: Any) -> Exception | None:
     """Why a value is none of its kind; None where it is one."""
     try:
-        msgspec.convert(value, kind, dec_hook=_array)
+        _converted(kind, value)
     except msgspec.ValidationError as error:
         return error.__cause__ if isinstance(error.__cause__, BadDataError) else error
     return None

@@ -125,6 +125,11 @@ def test_a_whole_document_comes_back_as_it_was():
     assert to_plain(record) == WHOLE
 
 
+def test_a_whole_number_written_as_a_float_is_one():
+    record = from_plain(Scene, GOOD | {"rows": 7.0, "weights": [2.0]})
+    assert (record.rows, type(record.rows), record.weights.dtype) == (7, int, np.float64)
+
+
 def test_floats_are_written_with_nine_digits_and_whole_numbers_stay():
     record = from_plain(Scene, GOOD | {"rows": 7, "weights": [1 / 3]})
     assert to_plain(record)["weights"] == [0.333333333]

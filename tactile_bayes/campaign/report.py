@@ -231,10 +231,8 @@ def _trial_settings(protocol: Path | None) -> tuple[TrialSettings, str | None]:
     """Settings that a protocol fixes, the others by default, and its title."""
     if protocol is None:
         return TrialSettings(), None
-    read, default = read_protocol(protocol), TrialSettings()
-    # TOML and its schema take 1000.0 for a whole number
-    fixed = {name: type(getattr(default, name))(value) for name, value in read.analysis.items()}
-    return TrialSettings(**fixed), read.title
+    read = read_protocol(protocol)
+    return TrialSettings(**read.fixed), read.title
 
 
 def _counts(rows: Sequence[Row]) -> tuple[int, int, int]:

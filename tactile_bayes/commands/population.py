@@ -97,15 +97,16 @@ def command(
     from tactile_bayes.declarations import as_dict
     from tactile_bayes.errors import TactileBayesError
     from tactile_bayes.files.atomic import refuse_existing, write_text
-    from tactile_bayes.files.documents import read_bodies
+    from tactile_bayes.files.documents import read_record
     from tactile_bayes.files.instrument_json import read_simulated_head
     from tactile_bayes.forward.scene import Head
     from tactile_bayes.presets import RESEARCH_USE
-    from tactile_bayes.studies.population import BodyPrior, ExamPrior, as_settings
+    from tactile_bayes.studies.population import BodiesFile, as_settings
 
     refuse_existing(output, force=force)
     simulated = read_simulated_head(head) if head else Head()
-    bodies, exams = read_bodies(bodies_file) if bodies_file else (BodyPrior(), ExamPrior())
+    drawn = read_record(bodies_file, BodiesFile) if bodies_file else BodiesFile()
+    bodies, exams = drawn.bodies, drawn.exams
     # results are kept by number: where the centred ones begin decides what a number is
     settings = {
         "scans": scans,

@@ -122,14 +122,12 @@ def _settings(given: dict[str, Any], protocol: Path | None) -> tuple[str | None,
         return None, TrialSettings(**given)
     context = click.get_current_context()
     read = read_protocol(protocol)
-    # TOML and its schema take 1000.0 for a whole number
-    fixed = {name: type(given[name])(value) for name, value in read.analysis.items()}
-    for name, value in fixed.items():
+    for name, value in read.fixed.items():
         typed = context.get_parameter_source(name) is click.core.ParameterSource.COMMANDLINE
         if typed and given[name] != value:
             option = f"--{name.replace('_', '-')} {given[name]}"
             raise UsageError(f"{option} contradicts {protocol}, which fixes {name} = {value}; leave the option out")
-    return read.title, TrialSettings(**(given | fixed))
+    return read.title, TrialSettings(**(given | read.fixed))
 
 
 def _text(outcome: TrialOutcome, *, methods: bool) -> str:

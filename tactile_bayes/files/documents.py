@@ -8,15 +8,13 @@ import sys
 import tomllib
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypeVar
 
-from tactile_bayes.declarations import from_plain, replace, schema_name
+from tactile_bayes.declarations import Meta, Record, as_dict, field, from_plain, replace, schema_name
 from tactile_bayes.errors import BadDataError, meant
 from tactile_bayes.files.reading import JSON_BYTES, TOML_BYTES, decoding, kind_of, read_text, schema_kind
-from tactile_bayes.studies.population import BodyPrior, ExamPrior
 
 if TYPE_CHECKING:
     from tactile_bayes.scan import Scan
@@ -341,12 +339,43 @@ def check_text(where: str, text: str, *, way_out: str) -> None:
 # --- A pre-specified analysis in TOML: settings fixed before the data were seen, and other text.
 
 
-@dataclass(frozen=True, slots=True)
-class Protocol:
-    """The settings that a protocol fixes, and its title where it has one."""
+class Analysis(Record):
+    """Settings of a trial's analysis that were fixed beforehand; None for what was not."""
 
-    analysis: dict[str, Any]
-    title: str | None = None
+    intervals: (
+        Annotated[Literal["corrected", "jackknife", "bca"], Meta(description="As the option --intervals.")] | None
+    ) = None
+    resamples: Annotated[int, Meta(ge=200, le=100_000, description="Resamples of the bootstraps.")] | None = None
+    seed: Annotated[int, Meta(ge=0, description="Random seed.")] | None = None
+    error_ratio: (
+        Annotated[
+            float,
+            Meta(
+                ge=1e-6,
+                le=1e6,
+                description="Variance of the ex-vivo error over the modality's, for the Deming lines.",
+            ),
+        ]
+        | None
+    ) = None
+    check_intervals: (
+        Annotated[int, Meta(ge=0, description="Simulated trials that check the intervals; 0 for none.")] | None
+    ) = None
+    bayes: Annotated[bool, Meta(description="Whether to estimate the error of the next mass.")] | None = None
+
+
+class Protocol(Record, forbid_unknown_fields=False):
+    """A pre-specified analysis of a trial."""
+
+    title: Annotated[str, Meta(description="Title of the report.")] | None = None
+    analysis: Annotated[
+        Analysis, Meta(description="Settings fixed beforehand; an option that contradicts one is refused.")
+    ] = field(default_factory=Analysis)
+
+    @property
+    def fixed(self) -> dict[str, Any]:
+        """The settings that it fixes, by name."""
+        return {name: value for name, value in as_dict(self.analysis).items() if value is not None}
 
 
 def read_protocol(path: Path) -> Protocol:
@@ -357,9 +386,7 @@ def read_protocol(path: Path) -> Protocol:
     BadDataError
         When the file is not TOML or fixes something that is no setting.
     """
-    document = load_toml(path, way_out="give the analysis as TOML")
-    check_document(document, "protocol.schema.json", path=path)
-    return Protocol(document.get("analysis", {}), document.get("title"))
+    return parse_record(load_toml(path, way_out="give the analysis as TOML"), Protocol, path=path)
 
 
 # --- Settings of `estimate` as TOML: priors and rarely used options; an unknown key is refused.
@@ -419,39 +446,3 @@ def read_session(path: Path) -> dict[str, str]:
             raise BadDataError(f"{key} is set by the recording itself", way_out=f"leave {key} out", path=str(path))
     check_document(document, SESSION_SCHEMA, path=path)
     return {key: str(value) for key, value in document.items()}
-
-
-# --- Bodies and exams of a simulated population as TOML: ranges, and an unknown key is refused.
-
-SCHEMA_FILE: Final = "bodies.schema.json"
-
-
-def read_bodies(path: Path) -> tuple[BodyPrior, ExamPrior]:
-    """Read the ranges of bodies and exams; missing keys keep the defaults.
-
-    Raises
-    ------
-    BadDataError
-        Naming the file, the key, its value and what is allowed.
-    """
-    document = load_toml(path, way_out=f"see {SCHEMA_FILE}")
-    tables = load_schema(SCHEMA_FILE)["properties"]
-    refuse_unknown(document, tables, path=path)
-    for name, table in document.items():
-        if isinstance(table, dict):
-            refuse_unknown(table, tables[name]["properties"], path=path, where=name)
-    check_document(document, SCHEMA_FILE, path=path)
-    bodies, exams = (_ranges(document.get(name, {}), name, path) for name in ("bodies", "exams"))
-    found = BodyPrior(**bodies), ExamPrior(**exams)
-    if found[1].drift_kpa[1] >= found[1].mean_kpa[0]:
-        what = f"exams.drift_kpa reaches {found[1].drift_kpa[1]:g}, and mean_kpa begins at {found[1].mean_kpa[0]:g}"
-        raise BadDataError(what, way_out="keep the drift below the mean pressure", path=str(path))
-    return found
-
-
-def _ranges(table: Mapping[str, Any], where: str, path: Path) -> dict[str, Any]:
-    for name, (low, high) in table.items():
-        if low > high:
-            what = f"{where}.{name} runs backwards, from {low:g} to {high:g}"
-            raise BadDataError(what, way_out="give the lower end first", path=str(path))
-    return {name: (low, high) for name, (low, high) in table.items()}

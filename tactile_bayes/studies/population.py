@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
-from tactile_bayes.declarations import as_dict, names_of, replace
+from tactile_bayes.declarations import Meta, Record, as_dict, field, names_of, replace
 from tactile_bayes.errors import BadDataError, TactileBayesError
 from tactile_bayes.forward.scene import FLAT_MM, Background, Head, Noise, Scene, Strokes, Tracker
 from tactile_bayes.forward.tissue import SceneBody, SolidLump
@@ -26,73 +26,119 @@ from tactile_bayes.size.terms import LOGGED
 # --- Simulated exams that vary as bodies and examiners do: the training set of a size calibration.
 
 Range = tuple[float, float]
+Diameter = Annotated[float, Meta(gt=0, le=100)]
+DepthRatio = Annotated[float, Meta(ge=0.52, le=10)]
+Ratio = Annotated[float, Meta(ge=1, le=10_000)]
+Seat = Annotated[float, Meta(ge=0, le=2)]
+Modulus = Annotated[float, Meta(ge=0.1, le=1000)]
+Thickness = Annotated[float, Meta(gt=0, le=200)]
+Pressure = Annotated[float, Meta(ge=1, le=30)]
+To10 = Annotated[float, Meta(ge=0, le=10)]
+Yaw = Annotated[float, Meta(ge=-180, le=180)]
+Tilt = Annotated[float, Meta(ge=0, le=30)]
+Lines = Annotated[int, Meta(ge=2, le=50)]
+Length = Annotated[float, Meta(ge=0.5, le=200)]
+Shift = Annotated[float, Meta(ge=-50, le=50)]
+Seconds = Annotated[float, Meta(ge=0.1, le=20)]
+Share = Annotated[float, Meta(ge=0, le=0.2)]
+Latency = Annotated[float, Meta(ge=0, le=200)]
 
 # Half the rate of a real head: twice the frames would halve the readings' noise, which is small beside the rest.
 FRAME_RATE_HZ = 100.0
 
 
-@dataclass(frozen=True, slots=True)
-class BodyPrior:
+class _Ranges(Record):
+    """Ranges, the low end first."""
+
+    def __post_init__(self) -> None:
+        for name in names_of(self):
+            low, high = getattr(self, name)
+            if low > high:
+                what = f"{name} runs backwards, from {low:g} to {high:g}"
+                raise BadDataError(what, way_out="give the lower end first")
+
+
+class BodyPrior(_Ranges):
     """Ranges of lumps and bodies, drawn independently; sizes, stiffnesses and moduli on the log scale.
 
-    Parameters
-    ----------
-    d_mm
-        Diameter of the lump, a ball.
-    depth_ratio
-        h/d, from just under the skin to where nothing is felt any more.
-    stiffness_ratio
-        E2/E1, from the softer carcinomas under a few per cent of strain (Samani et al. 2007) to rigid.
-    seat
-        From centred on the fat-gland boundary to a tenth of a diameter above the gland.
-    fat_kpa, gland_ratio
-        About the paper's 5 kPa and 10.
-    thickness_mm
-        Of the breast under the head; more where the lump needs it.
+    Lumps lie from just under the skin to where nothing is felt any more; their stiffness goes from that of the softer
+    carcinomas under a few per cent of strain (Samani et al. 2007) to rigid, moduli lie about the paper's 5 kPa and 10.
     """
 
-    d_mm: Range = (5.0, 30.0)
-    depth_ratio: Range = (0.56, 1.8)
-    stiffness_ratio: Range = (6.0, 100.0)
-    seat: Range = (0.0, 1.2)
-    fat_kpa: Range = (3.5, 7.5)
-    gland_ratio: Range = (5.0, 16.0)
-    thickness_mm: Range = (40.0, 90.0)
+    d_mm: Annotated[tuple[Diameter, Diameter], Meta(description="Diameter of the lump, a ball, mm.")] = (5.0, 30.0)
+    depth_ratio: Annotated[
+        tuple[DepthRatio, DepthRatio], Meta(description="Depth of its centre over its diameter.")
+    ] = (0.56, 1.8)
+    stiffness_ratio: Annotated[tuple[Ratio, Ratio], Meta(description="Its modulus over that of fat.")] = (6.0, 100.0)
+    seat: Annotated[
+        tuple[Seat, Seat],
+        Meta(
+            description="How far it stands out of the gland: 0 centred on the gland's surface, 1 touching it from "
+            "above."
+        ),
+    ] = (0.0, 1.2)
+    fat_kpa: Annotated[tuple[Modulus, Modulus], Meta(description="Young's modulus of fat, kPa.")] = (3.5, 7.5)
+    gland_ratio: Annotated[tuple[Ratio, Ratio], Meta(description="Modulus of gland over that of fat.")] = (5.0, 16.0)
+    thickness_mm: Annotated[
+        tuple[Thickness, Thickness],
+        Meta(description="Thickness of the breast under the head, mm; more where the lump needs it."),
+    ] = (40.0, 90.0)
 
 
-@dataclass(frozen=True, slots=True)
-class ExamPrior:
-    """Ranges of an examiner's technique and of the instrument's errors, drawn anew for each scan.
+class ExamPrior(_Ranges):
+    """Ranges of an examiner's technique and of the instrument's errors, drawn anew for each scan."""
 
-    Parameters
-    ----------
-    mean_kpa, drift_kpa, tilt_deg, wander_mm, yaw_deg
-        As in `Background` and `Strokes`.
-    lines, spacing_mm, half_length_mm
-        As in `Strokes`.
-    off_centre_mm
-        How far the strokes' middle lies from the lump, each way.
-    line_s
-        Time for a line.
-    element_kpa, tracker_mm, tracker_deg, gain_share, latency_ms
-        As in `Noise` and `Tracker`.
+    mean_kpa: Annotated[tuple[Pressure, Pressure], Meta(description="Mean pressure of a scan, kPa.")] = (7.0, 12.0)
+    drift_kpa: Annotated[
+        tuple[To10, To10], Meta(description="Amplitude of its drift, kPa; below the lowest mean_kpa.")
+    ] = (0.2, 1.5)
+    yaw_deg: Annotated[tuple[Yaw, Yaw], Meta(description="Turn of the head about the normal, degrees.")] = (-30.0, 30.0)
+    tilt_deg: Annotated[tuple[Tilt, Tilt], Meta(description="Amplitude of its rocking, degrees.")] = (0.5, 4.0)
+    wander_mm: Annotated[tuple[To10, To10], Meta(description="Departure from the line, mm.")] = (0.2, 1.5)
+    lines: Annotated[tuple[Lines, Lines], Meta(description="Parallel lines.")] = (4, 7)
+    spacing_mm: Annotated[tuple[Length, Length], Meta(description="Distance between them, mm.")] = (4.0, 7.0)
+    half_length_mm: Annotated[
+        tuple[Length, Length], Meta(description="Reach of a line either side of the middle, mm.")
+    ] = (28.0, 38.0)
+    off_centre_mm: Annotated[
+        tuple[Shift, Shift], Meta(description="Distance of the strokes' middle from the lump, each way, mm.")
+    ] = (-6.0, 6.0)
+    line_s: Annotated[tuple[Seconds, Seconds], Meta(description="Time for a line, s.")] = (1.0, 1.8)
+    element_kpa: Annotated[tuple[To10, To10], Meta(description="SD of a reading, kPa.")] = (0.02, 0.3)
+    tracker_mm: Annotated[tuple[To10, To10], Meta(description="SD of the tracker's position, mm.")] = (0.05, 0.6)
+    tracker_deg: Annotated[tuple[To10, To10], Meta(description="SD of its attitude, degrees.")] = (0.02, 0.3)
+    gain_share: Annotated[
+        tuple[Share, Share], Meta(description="Error of the array's calibration, as a share of the gain.")
+    ] = (0.002, 0.02)
+    latency_ms: Annotated[tuple[Latency, Latency], Meta(description="By how much the stamp of a pose is late, ms.")] = (
+        0.0,
+        12.0,
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.drift_kpa[1] >= self.mean_kpa[0]:
+            what = f"drift_kpa reaches {self.drift_kpa[1]:g}, and mean_kpa begins at {self.mean_kpa[0]:g}"
+            raise BadDataError(what, way_out="keep the drift below the mean pressure")
+
+
+class BodiesFile(Record):
+    """Bodies and exams of `population --bodies`.
+
+    Each value is a range, low end first; a missing key keeps its default.
     """
 
-    mean_kpa: Range = (7.0, 12.0)
-    drift_kpa: Range = (0.2, 1.5)
-    yaw_deg: Range = (-30.0, 30.0)
-    tilt_deg: Range = (0.5, 4.0)
-    wander_mm: Range = (0.2, 1.5)
-    lines: tuple[int, int] = (4, 7)
-    spacing_mm: Range = (4.0, 7.0)
-    half_length_mm: Range = (28.0, 38.0)
-    off_centre_mm: Range = (-6.0, 6.0)
-    line_s: Range = (1.0, 1.8)
-    element_kpa: Range = (0.02, 0.3)
-    tracker_mm: Range = (0.05, 0.6)
-    tracker_deg: Range = (0.02, 0.3)
-    gain_share: Range = (0.002, 0.02)
-    latency_ms: Range = (0.0, 12.0)
+    bodies: Annotated[
+        BodyPrior,
+        Meta(
+            description="Lumps and bodies, each property drawn by itself; sizes, stiffnesses and moduli on the log "
+            "scale."
+        ),
+    ] = field(default_factory=BodyPrior)
+    exams: Annotated[
+        ExamPrior,
+        Meta(description="Technique of the examiner and errors of the instrument, drawn anew for each exam."),
+    ] = field(default_factory=ExamPrior)
 
 
 def draw_body(prior: BodyPrior, rng: np.random.Generator) -> tuple[SceneBody, SolidLump]:

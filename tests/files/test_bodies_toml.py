@@ -6,10 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from tactile_bayes.declarations import as_dict
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.files.documents import load_schema, read_bodies
-from tactile_bayes.studies.population import BodyPrior, ExamPrior, draw_mass
+from tactile_bayes.files.documents import read_record
+from tactile_bayes.studies.population import BodiesFile, BodyPrior, draw_mass
 
 
 def written(folder: Path, text: str) -> Path:
@@ -18,16 +17,10 @@ def written(folder: Path, text: str) -> Path:
     return path
 
 
-def test_the_schema_has_the_programs_defaults() -> None:
-    tables = load_schema("bodies.schema.json")["properties"]
-    for name, prior in (("bodies", BodyPrior()), ("exams", ExamPrior())):
-        defaults = {key: tuple(rule["default"]) for key, rule in tables[name]["properties"].items()}
-        assert defaults == as_dict(prior)
-
-
 def test_what_is_given_is_drawn_from(tmp_path: Path) -> None:
     text = "[bodies]\nd_mm = [8, 9]\nseat = [0, 0]\n[exams]\nlines = [3, 3]\n"
-    bodies, exams = read_bodies(written(tmp_path, text))
+    found = read_record(written(tmp_path, text), BodiesFile)
+    bodies, exams = found.bodies, found.exams
     assert bodies.d_mm == (8, 9)
     assert bodies.fat_kpa == BodyPrior().fat_kpa
     for i in range(20):
@@ -35,7 +28,7 @@ def test_what_is_given_is_drawn_from(tmp_path: Path) -> None:
         assert 8 <= scene.solid_lumps[0].d_mm <= 9
         assert scene.solid_lumps[0].seat == 0
         assert scene.strokes.lines == 3
-    assert read_bodies(written(tmp_path, "")) == (BodyPrior(), ExamPrior())
+    assert read_record(written(tmp_path, ""), BodiesFile) == BodiesFile()
 
 
 @pytest.mark.parametrize(
@@ -58,7 +51,7 @@ def test_what_is_given_is_drawn_from(tmp_path: Path) -> None:
 def test_what_is_no_range_is_one_line(tmp_path: Path, text: str, words: str) -> None:
     path = written(tmp_path, text)
     with pytest.raises(BadDataError) as caught:
-        read_bodies(path)
+        read_record(path, BodiesFile)
     assert words in str(caught.value)
     assert "\n" not in str(caught.value)
     assert str(path) in str(caught.value)
