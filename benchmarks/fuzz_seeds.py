@@ -273,8 +273,9 @@ def _read_wide(path: Path) -> object:
 
 
 def _read_tomls(path: Path) -> object:
+    from tactile_bayes.api.settings import read_settings
     from tactile_bayes.files.column_map import read_mapping
-    from tactile_bayes.files.documents import read_protocol, read_settings
+    from tactile_bayes.files.documents import read_protocol
     from tactile_bayes.files.scene_toml import read_scene
 
     return _first([lambda read=read: read(path) for read in (read_settings, read_protocol, read_mapping, read_scene)])

@@ -26,7 +26,7 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.ensemble import EnsembleOptions, ensemble
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import MapRecipe, TactileMap
-from tactile_bayes.posterior.bump import BumpPrior
+from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior.draw import Sampled, importance_draws
 from tactile_bayes.posterior.fit import FieldFit, fit_scene
 from tactile_bayes.posterior.options import EstimateOptions, FitOptions

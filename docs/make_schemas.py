@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+from tactile_bayes.api.settings import SettingsFile
 from tactile_bayes.declarations import Record, schema_of
 from tactile_bayes.files.documents import Protocol
 from tactile_bayes.files.instrument_json import HeadFile
@@ -23,6 +24,7 @@ OF_TOML: dict[str, type[Record]] = {
     "bodies.schema.json": BodiesFile,
     "protocol.schema.json": Protocol,
     "scene.schema.json": SceneFile,
+    "settings.schema.json": SettingsFile,
 }
 
 

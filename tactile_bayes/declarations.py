@@ -18,9 +18,12 @@ No other module imports msgspec.
 from __future__ import annotations
 
 import dataclasses
+import math
 import types
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from datetime import date
+from functools import cache
+from pathlib import Path
 from typing import (
     TYPE_CHECKING,
     Annotated,
@@ -39,7 +42,7 @@ import msgspec
 from msgspec import Meta as Meta
 from msgspec import field as field
 
-from tactile_bayes.errors import BadDataError, meant, number_words
+from tactile_bayes.errors import BadDataError, UsageError, meant, number_words
 
 T = TypeVar("T")
 MOST_SHOWN: Final = 100
@@ -66,6 +69,77 @@ class Record(_Struct, frozen=True, forbid_unknown_fields=True):
     def __repr__(self) -> str:
         values = (f"{name}={_short(getattr(self, name))}" for name in self.__struct_fields__)
         return f"{type(self).__qualname__}({', '.join(values)})"
+
+
+class Options(Record):
+    """Options of a command or function: a value that its declaration does not allow is a `UsageError`, also in Python.
+
+    What the command line needs besides stands in a field's ``extra``, see `commands.options.takes`.
+    """
+
+    def __post_init__(self) -> None:
+        for name, kind in kinds(type(self)).items():
+            value = getattr(self, name)
+            if not _allowed(kind, value):
+                fault = _fault(kind, value, name)
+                raise UsageError(f"{fault.what}; {fault.way_out}")
+
+
+def _allowed(kind: Any, value: object) -> bool:
+    """Whether a value of Python's is what is declared, as it is: 3.0 is no whole number here."""
+    try:
+        msgspec.convert(value, kind, dec_hook=_custom)
+    except msgspec.ValidationError:
+        return False
+    return _finite(value)
+
+
+def kinds(record: Any) -> Mapping[str, Any]:
+    """What is declared for each field of a record."""
+    return _kinds(record)
+
+
+@cache
+def _kinds(record: Any) -> Mapping[str, Any]:
+    return {part.name: part.type for part in msgspec.structs.fields(record)}
+
+
+def default_of(record: Any, name: str) -> Any:
+    """The default of a field; None where it has none."""
+    part = next(one for one in msgspec.structs.fields(record) if one.name == name)
+    return None if part.default is msgspec.NODEFAULT else part.default
+
+
+def value_kind(kind: Any) -> Any:
+    """What a value is that somebody gives: the declaration without None, range and meaning."""
+    members = [one for one in _members(kind) if one is not type(None)]
+    return _bare(members[0] if len(members) == 1 else kind)
+
+
+def range_of(kind: Any) -> tuple[Any, Any, tuple[str, ...]]:
+    """Least and largest value, None for no end, and which of the ends ("min", "max") are left out."""
+    rules = _rules(next(one for one in _members(kind) if one is not type(None)))
+    ends = tuple(end for end, rule in (("min", "gt"), ("max", "lt")) if rule in rules)
+    return rules.get("gt", rules.get("ge")), rules.get("lt", rules.get("le")), ends
+
+
+def meaning_of(kind: Any) -> str:
+    """What a field's declaration says that it means."""
+    return str(_rules(kind).get("description", ""))
+
+
+def extra_of(kind: Any) -> Mapping[str, Any]:
+    """What a declaration says besides, in ``Meta(extra=...)``."""
+    found: Mapping[str, Any] = _rules(kind).get("extra", {})
+    return found
+
+
+def part_of(record: Any, names: Sequence[str], meaning: str) -> Any:
+    """A record of some fields of another, with this docstring: of a file that holds no others."""
+    fields = [(part.name, part.type, part.default) for part in msgspec.structs.fields(record) if part.name in names]
+    fields.sort(key=lambda one: names.index(one[0]))
+    name = f"{record.__name__}Part"
+    return msgspec.defstruct(name, fields, bases=(Record,), namespace={"__doc__": meaning}, frozen=True, kw_only=True)
 
 
 def replace(record: T, **changes: Any) -> T:
@@ -122,9 +196,9 @@ def from_plain(kind: type[T], document: object, *, where: str = "") -> T:
 def _converted(kind: type[T], document: object) -> T:
     """A record of plain data, in which 200.0 is a whole number, as it is to a schema."""
     try:
-        return msgspec.convert(document, kind, dec_hook=_array)
+        return msgspec.convert(document, kind, dec_hook=_custom)
     except msgspec.ValidationError:
-        return msgspec.convert(_whole(document), kind, dec_hook=_array)
+        return msgspec.convert(_whole(document), kind, dec_hook=_custom)
 
 
 def _whole(value: object) -> object:
@@ -153,7 +227,7 @@ def schema_of(kind: Any, *, nulls: bool = True) -> dict[str, Any]:
     nulls
         Whether the files can hold null: those of TOML cannot.
     """
-    found = msgspec.json.schema(kind, schema_hook=lambda _: {"type": "array"})
+    found = msgspec.json.schema(kind, schema_hook=_custom_schema)
     definitions = found.pop("$defs", {})
     body = _inlined(found, definitions)
     title, _, meaning = body.pop("description", "").partition("\n")
@@ -173,6 +247,8 @@ def _without_nulls(schema: Any) -> Any:
     if "anyOf" in found:
         forms = [one for one in found.pop("anyOf") if one != {"type": "null"}]
         found = {**(forms[0] if len(forms) == 1 else {"anyOf": forms}), **found}
+    if None in found.get("enum", ()):
+        found["enum"] = [one for one in found["enum"] if one is not None]
     return found
 
 
@@ -196,8 +272,12 @@ def _short(value: Any) -> str:
     return f"<{kind} of {len(value)}>" if hasattr(value, "__len__") else f"<{kind}>"
 
 
-def _array(kind: Any, value: object) -> object:
-    """An array of nested lists of numbers, for a field that is declared as one."""
+def _custom(kind: Any, value: object) -> object:
+    """A path of a text, or an array of nested lists of numbers, for a field that is declared as one."""
+    if kind is Path:
+        if value and isinstance(value, str | Path):
+            return Path(value)
+        raise BadDataError("", way_out="give the name of a file")
     import numpy as np  # a record without arrays is made without it: `--help` stays quick
 
     if not _is_array(kind):
@@ -265,6 +345,10 @@ def _inlined(schema: Any, definitions: Mapping[str, Any]) -> Any:
     return found
 
 
+def _custom_schema(kind: Any) -> dict[str, Any]:
+    return {"type": "string", "minLength": 1} if kind is Path else {"type": "array"}
+
+
 def _meaning(schema: Mapping[str, Any]) -> dict[str, Any]:
     return {name: schema[name] for name in ("title", "description", "default") if name in schema}
 
@@ -303,7 +387,13 @@ def _refused(kind: Any, value: Any) -> Exception | None:
         _converted(kind, value)
     except msgspec.ValidationError as error:
         return error.__cause__ if isinstance(error.__cause__, BadDataError) else error
-    return None
+    return None if _finite(value) else ValueError("no finite number")
+
+
+def _finite(value: Any) -> bool:
+    if isinstance(value, list | tuple):
+        return all(map(_finite, value))
+    return not isinstance(value, float) or math.isfinite(value)
 
 
 def _key_at_fault(record: Any, value: Mapping[str, Any], where: str) -> BadDataError | None:
@@ -330,7 +420,7 @@ def _parts(kind: Any, value: Any, where: str) -> Iterator[tuple[str, Any, Any]]:
         ):
             yield from ((_joined(where, f"key {_shown(key)}"), of_key, key) for key in value)
             yield from ((_joined(where, _shown_key(key)), of_value, one) for key, one in value.items())
-    if isinstance(value, list):
+    if isinstance(value, list | tuple):
         for one in map(_bare, _members(kind)):
             args = get_args(one)
             if _is_array(one):

@@ -16,7 +16,7 @@ from tactile_bayes.api.estimates import SizeEstimate, estimated, of_one_mass, se
 from tactile_bayes.api.estimating import Answer, size_priors
 from tactile_bayes.api.maps import Map, PathLike, path_of
 from tactile_bayes.api.pooled import common_calibration, place_of
-from tactile_bayes.api.repeatability import check_repeatability, repeatability_digest, repeatability_setting
+from tactile_bayes.api.repeatability import check_repeatability, repeatability_digest
 from tactile_bayes.api.settings import GROWN_BY, Comparing, Settings, refuse_checkpoint, times_of
 from tactile_bayes.api.sized import Draws
 from tactile_bayes.declarations import replace
@@ -99,7 +99,7 @@ def compare_answers(
     if len(visits) < 2 or not all(visits):
         raise UsageError("a comparison needs two visits of a map or more each: `compare VISIT1.nc --with VISIT2.nc`")
     comparing.check_visits(len(visits))
-    if settings.calibration == "none":
+    if settings.size_calibration == "none":
         raise UsageError("a comparison needs a size calibration; leave out --size-calibration none")
     every = list(chain.from_iterable(visits))
     path, calibration = common_calibration(every, settings, names=list(chain.from_iterable(names)))
@@ -280,15 +280,14 @@ def _scans(answers: Sequence[Answer]) -> list[Mapping[str, str]]:
     return [scan for one in answers if one.document is not None for scan in scans_of(one.document["provenance"])]
 
 
+_RECORDED = ("size_calibration", "method", "interval", "scene", "between_map_sd", "repeatability")
+
+
 def _recorded(settings: Settings, comparing: Comparing) -> dict[str, Any]:
     """Settings for the provenance."""
+    plain = settings.recorded()
     return {
-        "size_calibration": settings.calibration_name,
-        "method": settings.method,
-        "interval": settings.interval,
-        "scene": settings.scene,
-        "between_map_sd": settings.between_map_sd,
-        **repeatability_setting(settings),
+        **{name: plain[name] for name in _RECORDED if name in plain},
         "days": None if comparing.days is None else list(comparing.days),
         "grown_by": list(comparing.grown_by),
         "same_mass": comparing.same_mass,

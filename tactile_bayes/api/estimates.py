@@ -19,7 +19,7 @@ from tactile_bayes.api.pooled import elsewhere, pool_answers
 from tactile_bayes.api.settings import Settings, refuse_checkpoint
 from tactile_bayes.api.sized import Draws, MassEstimate, Sized
 from tactile_bayes.declarations import names_of, replace
-from tactile_bayes.errors import UsageError
+from tactile_bayes.errors import UsageError, check_number
 from tactile_bayes.files.repeatability_json import read_repeatability
 from tactile_bayes.findings import Finding, findings_in
 from tactile_bayes.report.estimate_document import patient_mm
@@ -38,6 +38,7 @@ if TYPE_CHECKING:
 
 # --- Estimates of a lump's size: from one map, or from several maps of one mass.
 
+_KEYWORDS = tuple(name for name in names_of(Settings) if name != "settings_file")
 _SHAPES = ("amplitude", "sigma_x_mm", "sigma_y_mm", "x_mm", "y_mm", "angle_rad", "background", "noise_sd")
 
 
@@ -296,18 +297,18 @@ def settings_of(options: Mapping[str, Any]) -> Settings:
     TypeError
         Naming a keyword that is none, and those that are.
     """
-    known = _keywords()
-    check_keywords("estimate", options, known)
-    given = {known[name]: plain(value) for name, value in options.items()}
-    if "calibration" in given:
-        given["calibration"] = _calibration(given["calibration"])
+    check_keywords("estimate", options, _KEYWORDS)
+    given = {name: plain(value) for name, value in options.items()}
+    if "size_calibration" in given:
+        given["size_calibration"] = _calibration(given["size_calibration"])
     if "known" in given:
         given["known"] = _properties(given["known"])
     if "repeatability" in given:
         given["repeatability"] = _repeatability(given["repeatability"])
-    if given.get("prior") is not None and not isinstance(given["prior"], Mapping):
-        raise UsageError(f'prior is {given["prior"]!r}; give a mapping such as {{"amplitude_sd": 2.0}}')
-    given["checkpoint"] = path_of(given.get("checkpoint"))
+    if "checkpoint" in given:
+        given["checkpoint"] = path_of(given["checkpoint"])
+    if isinstance(given.get("centre_mm"), Sequence | np.ndarray) and not isinstance(given["centre_mm"], str):
+        given["centre_mm"] = tuple(plain(one) for one in given["centre_mm"])
     return Settings(**given)
 
 
@@ -323,6 +324,8 @@ def _properties(given: Any) -> tuple[tuple[str, float], ...]:
     pairs = list(given.items()) if isinstance(given, Mapping) else given
     if isinstance(pairs, str) or not isinstance(pairs, Sequence) or any(np.shape(one) != (2,) for one in pairs):
         raise UsageError(f'known is {given!r}; give a mapping such as {{"seat": 1.2}}')
+    for name, value in pairs:
+        check_number(f"known {name}", value)
     return tuple((str(name), plain(value)) for name, value in pairs)
 
 
@@ -330,13 +333,6 @@ def _repeatability(given: Any) -> Repeatability | None:
     if given is None or hasattr(given, "between_maps"):
         return cast("Repeatability | None", given)
     return read_repeatability(path_of(given))
-
-
-def _keywords() -> dict[str, str]:
-    """Translate keywords of `estimate` into settings."""
-    renamed = {"calibration": "size_calibration"}
-    names = [name for name in names_of(Settings) if name != "settings_file"]
-    return {renamed.get(name, name): name for name in names}
 
 
 @door
@@ -452,10 +448,11 @@ def _several(maps: Iterable[Any]) -> Sequence[Any]:
 
 def _signature() -> inspect.Signature:
     """The signature of `estimate` with every setting and its default, for help and completion."""
-    kind = inspect.Parameter.KEYWORD_ONLY
-    defaults, known = Settings(), _keywords()
+    defaults = Settings()
+    more = [
+        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=getattr(defaults, name)) for name in _KEYWORDS
+    ]
     first = [one for one in inspect.signature(estimate).parameters.values() if one.kind is not one.VAR_KEYWORD]
-    more = [inspect.Parameter(name, kind, default=getattr(defaults, known[name])) for name in known]
     return inspect.Signature([*first, *more])
 
 

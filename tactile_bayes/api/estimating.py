@@ -7,11 +7,12 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tactile_bayes.api.repeatability import check_repeatability, repeatability_digest, repeatability_setting
+from tactile_bayes.api.repeatability import check_repeatability, repeatability_digest
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import EXIT_DONE, EXIT_NO_ESTIMATE, NO_LUMP, BadDataError, TactileBayesError
 from tactile_bayes.findings import Finding, by_weight, findings_in
+from tactile_bayes.options import PRIORS
 from tactile_bayes.presets import FIT_RADIUS_MM
 from tactile_bayes.records import dataclass
 
@@ -25,6 +26,8 @@ if TYPE_CHECKING:
     from tactile_bayes.size.draws import ShapeDraws
     from tactile_bayes.size.pooling import Calibration, SizePriors
 
+_UNRECORDED = (*PRIORS, "max_steps", "checkpoint")
+"""Settings that the provenance leaves out: the priors stand in the report, the others change how long it takes."""
 NO_CALIBRATION_ON_PAPER = "a size needs a calibration that fits this map"
 Progress = Callable[[int, int], None]
 Notice = Callable[[str], None]
@@ -217,7 +220,13 @@ def estimate_one(
         diagnostics = replace(estimate.diagnostics, calibration=by, size_calibration=words, repeatability=site)
         estimate = replace(estimate, diagnostics=diagnostics)
     named = settings.calibration_name or (f"{shipped} (shipped)" if calibration is not None else "none")
-    recorded = _recorded(settings, options, calibration=named)
+    used_fit = {
+        "background": options.fit.background,
+        "fit_radius_mm": options.fit.radius_mm,
+        "noise": options.fit.noise,
+    }
+    recorded = settings.recorded(size_calibration=named, **used_fit)
+    recorded = {name: value for name, value in recorded.items() if name not in _UNRECORDED}
     provenance = Provenance("estimate", recorded, digests, seed=settings.seed, scans=scans)
     return Outcome(tactile_map, estimate, provenance, settings, used)
 
@@ -244,27 +253,6 @@ def _with_place(
     return replace(estimate, findings=by_weight((*side, *estimate.findings, *touching)))
 
 
-def _recorded(settings: Settings, options: EstimateOptions, *, calibration: str) -> dict[str, Any]:
-    """Settings for an answer's provenance."""
-    return {
-        "size_calibration": calibration,
-        "method": settings.method,
-        "interval": settings.interval,
-        "background": options.fit.background,
-        "fit_radius_mm": options.fit.radius_mm,
-        "rotation": settings.rotation,
-        "centre_mm": list(settings.centre_mm) if settings.centre_mm else None,
-        "noise": options.fit.noise,
-        "field_cosines": options.fit.field_cosines or "auto",
-        "accuracy_sd": settings.accuracy_sd,
-        "accuracy_mm": settings.accuracy_mm,
-        "scene": settings.scene,
-        "between_map_sd": settings.between_map_sd,
-        **repeatability_setting(settings),
-        "known": dict(settings.known),
-    }
-
-
 def choose_calibration(
     settings: Settings, tactile_map: TactileMap
 ) -> tuple[Path | None, Calibration | None, NoSize | None]:
@@ -281,19 +269,19 @@ def choose_calibration(
     from tactile_bayes.files.size_json import read_size_calibration
     from tactile_bayes.posterior.estimate import OTHER_HEAD, recipe_differences
 
-    if settings.calibration is None or isinstance(settings.calibration, str):
-        path = size_calibration_path(settings.calibration or default_for(tactile_map.recipe.normalise))
+    if settings.size_calibration is None or isinstance(settings.size_calibration, str):
+        path = size_calibration_path(settings.size_calibration or default_for(tactile_map.recipe.normalise))
         if path is None:
             return None, None, None
         calibration = read_size_calibration(path)
     else:
-        path, calibration = None, settings.calibration
+        path, calibration = None, settings.size_calibration
     if tactile_map.background is None and calibration.recipe.normalise != tactile_map.recipe.normalise:
         why_none = _level_unknown(tactile_map, _options(settings, None, tactile_map).fit)
-        if settings.calibration is None:
+        if settings.size_calibration is None:
             return None, None, replace(why_none, reason=f"{why_none.reason}; widths only")
         raise BadDataError(f"{settings.calibration_name} does not fit: {why_none.reason}", way_out=why_none.advice)
-    if settings.calibration is not None:
+    if settings.size_calibration is not None:
         return path, calibration, None
     fit = _options(settings, calibration, tactile_map).fit
     differs = recipe_differences(tactile_map, calibration, fit)
@@ -326,7 +314,6 @@ def _options(settings: Settings, calibration: Calibration | None, tactile_map: T
 
     Without a calibration `default_errors` decides; a background that is given alone goes with independent errors.
     """
-    from tactile_bayes.posterior.bump import BumpPrior
     from tactile_bayes.posterior.options import EstimateOptions, FitOptions
     from tactile_bayes.posterior.white import default_errors
 
@@ -346,7 +333,7 @@ def _options(settings: Settings, calibration: Calibration | None, tactile_map: T
         rotation=settings.rotation,
         centre_mm=settings.centre_mm,
         noise=noise,
-        field_cosines=settings.field_cosines,
+        field_cosines=None if settings.field_cosines == "auto" else settings.field_cosines,
     )
     return EstimateOptions(
         method=settings.method,
@@ -354,7 +341,7 @@ def _options(settings: Settings, calibration: Calibration | None, tactile_map: T
         max_steps=settings.max_steps,
         accuracy_sd=settings.accuracy_sd,
         size_priors=size_priors(settings),
-        prior=BumpPrior(**(settings.prior or {})),
+        prior=settings.prior,
         scene=settings.scene,
         accuracy_mm=settings.accuracy_mm,
     )
@@ -388,27 +375,25 @@ def size_priors(settings: Settings) -> SizePriors:
 
 def answer_of(outcome: Outcome) -> Answer:
     """Report of an outcome as JSON and text."""
-    from tactile_bayes.posterior.bump import BumpPrior
     from tactile_bayes.report.estimate_document import estimate_document
     from tactile_bayes.report.estimate_text import estimate_summary, estimate_text
     from tactile_bayes.report.quantities import estimate_quantities, lump_place
 
     tactile_map, estimate, settings = outcome.tactile_map, outcome.estimate, outcome.settings
-    prior = BumpPrior(**(settings.prior or {}))
     quantities = estimate_quantities(estimate, tactile_map, probability=settings.interval)
     place = lump_place(estimate.map_posterior, tactile_map, outcome.provenance.scans)
     document = estimate_document(
         estimate,
         tactile_map,
         probability=settings.interval,
-        prior=prior,
+        prior=settings.prior,
         provenance=outcome.provenance,
         quantities=quantities,
         place=place,
     )
     told: dict[str, Any] = {"probability": settings.interval, "masses": document["masses"], "place": place}
     text = estimate_summary(estimate, quantities, **told)
-    full_text = estimate_text(estimate, tactile_map, prior=prior, quantities=quantities, **told)
+    full_text = estimate_text(estimate, tactile_map, prior=settings.prior, quantities=quantities, **told)
     exit_code = EXIT_DONE if estimate.status == "estimate" else EXIT_NO_ESTIMATE
     shape, normalise = pooling_shape(tactile_map, estimate), tactile_map.recipe.normalise
     return Answer(document, text, exit_code, shape, normalise, tactile_map.fingerprint, full_text, tactile_map.head)

@@ -10,13 +10,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tactile_bayes.api.estimating import Answer, size_priors
-from tactile_bayes.api.repeatability import check_repeatability, repeatability_digest, repeatability_setting
+from tactile_bayes.api.repeatability import check_repeatability, repeatability_digest
 from tactile_bayes.api.settings import Settings
-from tactile_bayes.declarations import names_of, replace
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.provenance import Provenance, hash_inputs, scans_of
 from tactile_bayes.files.shipped import default_for, size_calibration_path
 from tactile_bayes.files.size_json import read_size_calibration
+from tactile_bayes.options import PRIORS
 from tactile_bayes.posterior.estimate import way_to_head
 from tactile_bayes.presets import MATCH_MM
 from tactile_bayes.records import dataclass
@@ -211,7 +212,7 @@ def pool_answers(
     pooled = replace(pooled, one_place=chance)
     if pooled.status == DISAGREE and pooled.one_size is not None:
         pooled = replace(pooled, reason=f"{pooled.reason}, {_sizes(documents)}")
-    provenance = Provenance("estimate --pool", _plain(settings), digests, seed=settings.seed, scans=scans)
+    provenance = Provenance("estimate --pool", _recorded(settings), digests, seed=settings.seed, scans=scans)
     document = pooled_document(
         pooled,
         list(names),
@@ -284,7 +285,7 @@ def _shipped_for(answers: Sequence[Answer]) -> str:
 
 def _calibration(answers: Sequence[Answer], settings: Settings) -> tuple[Path | None, BodyCalibration]:
     """The calibration that pools, and its file if it is in one."""
-    path, calibration = None, settings.calibration
+    path, calibration = None, settings.size_calibration
     if calibration is None or isinstance(calibration, str):
         path = size_calibration_path(calibration or _shipped_for(answers))
         if path is None:
@@ -307,14 +308,11 @@ def _check_heads(answers: Sequence[Answer], calibration: BodyCalibration, names:
             raise BadDataError(what, way_out=way_to_head(answer.head))
 
 
-def _plain(settings: Settings) -> dict[str, Any]:
-    """Settings as JSON values."""
-    plain = {name: getattr(settings, name) for name in names_of(settings)}
-    plain = {name: list(v) if isinstance(v, tuple) else v for name, v in plain.items()}
-    del plain["seed"], plain["settings_file"], plain["repeatability"]
-    plain |= repeatability_setting(settings)
-    checkpoint = None if settings.checkpoint is None else settings.checkpoint.name
-    return plain | {"calibration": settings.calibration_name, "known": dict(settings.known), "checkpoint": checkpoint}
+def _recorded(settings: Settings) -> dict[str, Any]:
+    """Settings by the keys that pooled files have: `calibration`, and the priors together."""
+    plain = settings.recorded()
+    prior = {name: plain.pop(name) for name in PRIORS}
+    return {"calibration": plain.pop("size_calibration"), **plain, "prior": prior}
 
 
 def common_calibration(

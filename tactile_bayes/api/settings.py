@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from datetime import date
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
-from tactile_bayes.errors import UsageError, check_choice, check_number, meant
+from tactile_bayes.declarations import Meta, extra_of, kinds, part_of
+from tactile_bayes.errors import UsageError, check_number
+from tactile_bayes.options import PRIORS, BumpPrior
 from tactile_bayes.presets import (
     INTERVAL,
-    METHODS,
     MOST_FIELD_COSINES,
-    NOISE,
     REGISTRATION_MM,
-    SCENES,
     Background,
     Method,
     Noise,
@@ -26,137 +25,203 @@ from tactile_bayes.records import dataclass
 if TYPE_CHECKING:
     from tactile_bayes.size.pooling import Calibration
     from tactile_bayes.size.site import Repeatability
+else:
+    Calibration = Repeatability = Any  # which take numpy to load
 
 
 # --- Settings of `estimate`, shared by the command line, Python and batches.
 
 GIVEN: Final = "given in Python"
 """Name of a calibration that is in no file."""
-
-_CHOICES: Final[Mapping[str, tuple[str, ...]]] = {
-    "method": METHODS,
-    "noise": NOISE,
-    "scene": SCENES,
-    "background": get_args(Background),
-    "rotation": get_args(Rotation),
-}
+_FILE: Final = {"file": True}
+"""Of a setting that stands in the file of `--settings`, not on the command line."""
+_SITE: Final = {"metavar": "SITE.json", "path": True}
 
 
-_RANGES: Final[Mapping[str, tuple[float, float | None, str]]] = {
-    "seed": (0, None, "whole"),
-    "interval": (0, 1, "open"),
-    "fit_radius_mm": (0, None, "open"),
-    "max_steps": (150, None, "whole"),
-    "accuracy_sd": (0.001, 0.5, ""),
-    "between_map_sd": (0, 2, ""),
-    "accuracy_mm": (0.0001, 10, ""),
-    "field_cosines": (6, MOST_FIELD_COSINES, "whole"),
-}
-"""Ranges of settings, as `settings.schema.json` and the command line have them; open: without the ends."""
-_MOST_PRIOR: Final[Mapping[str, float]] = {
-    "amplitude_sd": 1000,
-    "width_median_mm": 100,
-    "log_width_sd": 10,
-    "log_ratio_sd": 5,
-    "tilt_sd": 1000,
-}
-"""Largest value of each field of `BumpPrior`; all are above 0."""
+class Settings(BumpPrior, kw_only=True):
+    """Settings of `estimate`; picklable, so that worker processes can receive them."""
 
-
-@dataclass(frozen=True, slots=True)
-class Settings:
-    """Settings of `estimate`; picklable, so that worker processes can receive them.
-
-    Parameters
-    ----------
-    calibration
-        Name or path, or the calibration itself; None takes the shipped one, if it fits.
-    method
-        One of `presets.METHODS`.
-    seed
-        Of the random numbers.
-    interval
-        Probability of the intervals.
-    background, fit_radius_mm, rotation, centre_mm, noise, field_cosines
-        As `FitOptions`; None takes what the calibration's maps were fitted with.
-    max_steps, accuracy_sd, scene, accuracy_mm
-        As `EstimateOptions`.
-    between_map_sd
-        SD of ln size between maps of one mass, taken as known; None learns it.
-    repeatability
-        Spread between exams of one mass as this site's repeated exams show it; sizes then have one interval.
-    known
-        Properties of the body, by the names of `HiddenTerms`.
-    prior
-        Values of `BumpPrior` that differ from its defaults.
-    checkpoint
-        Where MCMC keeps its state.
-    settings_file
-        Where some of these were read from, for the provenance.
-
-    Raises
-    ------
-    UsageError
-        When a setting has a value that it cannot have.
-    """
-
-    calibration: str | Calibration | None = None
-    method: Method = "importance"
-    seed: int = 1
-    interval: float = INTERVAL
-    background: Background | None = None
-    fit_radius_mm: float | None = None
-    rotation: Rotation = "auto"
-    centre_mm: tuple[float, float] | None = None
-    max_steps: int | None = None
-    noise: Noise | None = None
-    accuracy_sd: float | None = None
-    between_map_sd: float | None = None
-    repeatability: Repeatability | None = None
-    known: tuple[tuple[str, float], ...] = ()
-    scene: SceneAsked = "auto"
-    accuracy_mm: float | None = None
-    prior: Mapping[str, float] | None = None
-    checkpoint: Path | None = None
-    field_cosines: int | None = None
-    settings_file: Path | None = None
+    size_calibration: Annotated[
+        str | Calibration | None,
+        Meta(
+            description="Calibration from widths to sizes: a shipped one, your own file, or none (widths only). "
+            "Default: solid, or solid-mean for maps of frames divided by their means; eq6 is the paper's Eq 6 over "
+            "such bodies.",
+            extra={"metavar": "solid|eq6|solid-mean|plane-strain|none|SIZE.json"},
+        ),
+    ] = None
+    method: Annotated[
+        Method,
+        Meta(
+            description="importance: weighted draws; ensemble: MCMC; laplace: mode, curvature; optimise: the paper's "
+            "least squares."
+        ),
+    ] = "importance"
+    seed: Annotated[int, Meta(ge=0, description="Random seed.")] = 1
+    interval: Annotated[float, Meta(gt=0.0, lt=1.0, description="Probability of the intervals.")] = INTERVAL
+    background: Annotated[
+        Background | None,
+        Meta(
+            description="Level about the lump: fixed at 1, or fitted. Default: as for the calibration's maps; free "
+            "where the level is not known (normalise none)",
+            extra=_FILE,
+        ),
+    ] = None
+    fit_radius_mm: Annotated[
+        Annotated[float, Meta(gt=0)] | None,
+        Meta(description="Radius of the fitted window. Default: the calibration's, else 20", extra=_FILE),
+    ] = None
+    rotation: Annotated[
+        Rotation,
+        Meta(
+            description="Rotated ellipse: used where the map favours it, always, or never. Correlated noise: "
+            "`--scene` decides",
+            extra=_FILE,
+        ),
+    ] = "auto"
+    centre_mm: Annotated[
+        tuple[float, float] | None,
+        Meta(
+            description="Place on the map to measure. Default: the highest bump that can be a lump.",
+            extra={"metavar": "X Y"},
+        ),
+    ] = None
+    noise: Annotated[
+        Noise | None,
+        Meta(
+            description="independent: white noise, the likelihood divided by the inflation of correlated errors; "
+            "field: correlated noise in the model. Default: the calibration's",
+            extra=_FILE,
+        ),
+    ] = None
+    field_cosines: Annotated[
+        Annotated[int, Meta(ge=6, le=MOST_FIELD_COSINES)] | Literal["auto"],
+        Meta(
+            description="Basis functions of the correlated noise along each axis: more are slower and resolve shorter "
+            "correlation; `tradeoff estimate` measures the difference. auto: 18, up to 30 for a narrow lump",
+            extra=_FILE,
+        ),
+    ] = "auto"
+    accuracy_sd: Annotated[
+        Annotated[float, Meta(ge=0.001, le=0.5)] | None,
+        Meta(
+            description="Monte-Carlo error to reach in the interval ends of sizes and map widths, in posterior SDs. "
+            "Default: 0.02 for importance, 0.1 for ensemble."
+        ),
+    ] = None
+    accuracy_mm: Annotated[
+        Annotated[float, Meta(ge=0.0001, le=10)] | None,
+        Meta(
+            description="Wanted Monte-Carlo error of interval ends, in mm; the finer of this and --accuracy-sd holds",
+            extra=_FILE,
+        ),
+    ] = None
+    scene: Annotated[
+        SceneAsked,
+        Meta(description="Structures in the fit window; auto: the simplest scene that the map supports."),
+    ] = "auto"
+    between_map_sd: Annotated[
+        Annotated[float, Meta(ge=0, le=2)] | None,
+        Meta(
+            description="SD of ln size between maps of one mass, taken as known. Default: one interval for exams as "
+            "the calibration's (0.05 if solid), one as the paper's (0.15)",
+            extra=_FILE,
+        ),
+    ] = None
+    repeatability: Annotated[
+        Repeatability | None,
+        Meta(
+            description="Spread between exams of one mass at this site, from `calibrate repeatability`: sizes then "
+            "have one interval, for any exam there. Default: two, for exams as the paper's and as simulated ones.",
+            extra=_SITE,
+        ),
+    ] = None
+    known: Annotated[
+        tuple[tuple[str, float], ...],
+        Meta(
+            description="Known property of the body: seat (0 centred on the gland's edge, 1.2 clear of it), depth_mm, "
+            "stiffness_ratio, fat_kpa, gland_ratio or thickness_mm.",
+            extra={"metavar": "NAME VALUE"},
+        ),
+    ] = ()
+    max_steps: Annotated[
+        Annotated[int, Meta(ge=150)] | None,
+        Meta(description="Longest MCMC chain (method ensemble) before it gives up", extra=_FILE),
+    ] = None
+    checkpoint: Annotated[
+        Path | None,
+        Meta(
+            description="File that MCMC (method ensemble) saves its state in and resumes from; relative to the "
+            "settings file",
+            extra=_FILE,
+        ),
+    ] = None
+    settings_file: Annotated[
+        Path | None,
+        Meta(
+            description="Priors and rarely used options: background, fit_radius_mm, noise, max_steps... "
+            "(settings.schema.json).",
+            extra={"metavar": "FILE.toml", "path": True, "option": "settings"},
+        ),
+    ] = None
 
     def __post_init__(self) -> None:
-        for name, choices in _CHOICES.items():
-            value = getattr(self, name)
-            if value is not None or name not in ("background", "noise"):
-                check_choice(name, value, choices)
-        for name, (least, most, how) in _RANGES.items():
-            value = getattr(self, name)
-            if value is not None or name in ("seed", "interval"):
-                check_number(name, value, least, most, whole=how == "whole", open_ends=how == "open")
-        for part in () if self.centre_mm is None else _pair("centre_mm", self.centre_mm):
-            check_number("a coordinate of centre_mm", part)
-        for name, value in self.known:
-            check_number(f"known {name}", value)
-        _check_prior(self.prior or {})
+        super().__post_init__()
         if self.between_map_sd is not None and self.repeatability is not None:
             raise UsageError("between_map_sd states the spread that the repeatability has learned; give one of them")
-        if self.repeatability is not None and self.calibration == "none":
+        if self.repeatability is not None and self.size_calibration == "none":
             raise UsageError("a repeatability is for sizes; leave it out, or name a size calibration")
 
     @property
     def calibration_name(self) -> str | None:
         """The calibration's name or path; None where none was named."""
-        return self.calibration if self.calibration is None or isinstance(self.calibration, str) else GIVEN
+        given = self.size_calibration
+        return given if given is None or isinstance(given, str) else GIVEN
+
+    @property
+    def prior(self) -> BumpPrior:
+        """The priors on the bump alone."""
+        return BumpPrior(**{name: getattr(self, name) for name in PRIORS})
+
+    def recorded(self, **used: Any) -> dict[str, Any]:
+        """Plain data of all settings but the seed, for a provenance; `used` stands in place of what was asked for."""
+        plain = {name: used.get(name, getattr(self, name)) for name in self.__struct_fields__}
+        del plain["seed"], plain["settings_file"]
+        plain["size_calibration"] = used.get("size_calibration", self.calibration_name)
+        plain["centre_mm"] = None if self.centre_mm is None else list(self.centre_mm)
+        plain["known"] = dict(self.known)
+        plain["checkpoint"] = None if self.checkpoint is None else self.checkpoint.name
+        if self.repeatability is None:
+            del plain["repeatability"]
+        else:
+            plain["repeatability"] = self.repeatability.as_dict()
+        return plain
 
 
-def _pair(name: str, value: object) -> tuple[object, object]:
-    if isinstance(value, str) or not isinstance(value, Sequence) or len(value) != 2:
-        raise UsageError(f"{name} is {value!r}; give two numbers")
-    return value[0], value[1]
+SettingsFile: Final = part_of(
+    Settings,
+    [*PRIORS, *(name for name, kind in kinds(Settings).items() if extra_of(kind).get("file"))],
+    "Settings of `estimate --settings`: priors and rarely used options; a missing key keeps its default.",
+)
+"""Record of the file."""
 
 
-def _check_prior(prior: Mapping[str, float]) -> None:
-    for name, value in prior.items():
-        if name not in _MOST_PRIOR:
-            raise UsageError(f"no prior is called {name!r}; {meant(str(name), _MOST_PRIOR)}")
-        check_number(f"prior {name}", value, 0, _MOST_PRIOR[name], open_ends=True)
+def read_settings(path: Path) -> dict[str, Any]:
+    """What a settings file sets, by the names of `Settings`.
+
+    Raises
+    ------
+    BadDataError
+        Naming the file, the key, its value and what is allowed.
+    """
+    from tactile_bayes.files.documents import load_toml, parse_record
+
+    document = load_toml(path, way_out="see settings.schema.json")
+    read = parse_record(document, SettingsFile, path=path)
+    found = {name: getattr(read, name) for name in document}
+    if "checkpoint" in found:
+        found["checkpoint"] = path.parent / found["checkpoint"]
+    return found | {"settings_file": path}
 
 
 def refuse_checkpoint(settings: Settings) -> None:

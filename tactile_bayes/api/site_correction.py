@@ -174,7 +174,7 @@ def _from_maps(source: Path | Sheet, base: str, *, seed: int, progress: Progress
 
     rows = read_table(source, "phantom_maps.table.json")
     folder = source.parent if isinstance(source, Path) else Path()
-    settings, columns = Settings(calibration=base, seed=seed), rows.columns
+    settings, columns = Settings(size_calibration=base, seed=seed), rows.columns
     maps, left_out, inputs = [], [], {}
     for i, name in enumerate(_names(rows, [str(one) for one in columns["file"]])):
         path = folder / columns["file"][i]

@@ -259,7 +259,7 @@ class Campaign:
     def _settings_key(self, settings: Settings, normalise: str) -> dict[str, Any]:
         """All that an estimate depends on besides its map: settings, and the digests of the files that they name."""
         plain = {name: getattr(settings, name) for name in names_of(settings)}
-        name = str(plain.pop("calibration") or default_for(normalise))
+        name = str(plain.pop("size_calibration") or default_for(normalise))
         file = plain.pop("settings_file")
         repeatability = plain.pop("repeatability")
         if repeatability is not None:
@@ -365,7 +365,7 @@ class Campaign:
 
     def _not_over_bodies(self) -> str:
         """Which calibration cannot size several maps together; empty for none."""
-        for name in {self.settings.of(exam).calibration for exam in self.exams} - {None}:
+        for name in {self.settings.of(exam).size_calibration for exam in self.exams} - {None}:
             path = size_calibration_path(str(name))
             if path is None or not isinstance(read_size_calibration(path), BodyCalibration):
                 return f"size calibration {name} is not learned over bodies"

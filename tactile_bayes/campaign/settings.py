@@ -68,7 +68,7 @@ class CampaignSettings:
         """Settings of one exam's estimate."""
         given: dict[str, Any] = {
             "centre_mm": exam.centre_mm,
-            "calibration": exam.calibration,
+            "size_calibration": exam.calibration,
             "known": exam.known or None,
         }
         return replace(self.estimate, **{name: value for name, value in given.items() if value is not None})

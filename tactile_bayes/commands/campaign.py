@@ -5,10 +5,11 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
+from tactile_bayes.api.settings import Settings
 from tactile_bayes.commands.options import (
     FORCE,
     WORKERS,
@@ -17,10 +18,11 @@ from tactile_bayes.commands.options import (
     also_read,
     refuse_same,
     scheduler_option,
-    seed_option,
+    settings_of,
+    takes,
 )
 from tactile_bayes.errors import BadDataError, UsageError
-from tactile_bayes.presets import DEFAULT_NORMALISE, METHODS, NORMALISE, RESEARCH_USE
+from tactile_bayes.presets import DEFAULT_NORMALISE, NORMALISE, RESEARCH_USE
 
 if TYPE_CHECKING:
     from tactile_bayes.campaign.exams import Found
@@ -130,9 +132,9 @@ def _to_correct(output: Path) -> str:
 @click.option(
     "--protocol", metavar="FILE.toml", type=_FILE, help="Pre-specified analysis of the trial, as for `validate`."
 )
-@click.option("--method", type=click.Choice(METHODS), default="importance", show_default=True, help="As `estimate`.")
-@click.option("--size-calibration", metavar="NAME|SIZE.json", help="As `estimate`, unless a row names its own.")
-@click.option("--settings", "settings_file", metavar="FILE.toml", type=_FILE, help="Priors and more, as `estimate`.")
+@takes(Settings, "method", help="As `estimate`.")
+@takes(Settings, "size_calibration", metavar="NAME|SIZE.json", help="As `estimate`, unless a row names its own.")
+@takes(Settings, "settings_file", help="Priors and more, as `estimate`.")
 @click.option(
     "--normalise", type=click.Choice(NORMALISE), default=DEFAULT_NORMALISE, show_default=True, help="As `map`."
 )
@@ -151,7 +153,7 @@ def _to_correct(output: Path) -> str:
     "for patients, the tables hold the narrower). Default: learned from this campaign's repeats, where 5 masses "
     "have them.",
 )
-@seed_option(1)
+@takes(Settings, "seed")
 @click.option("--figures", is_flag=True, help="Draw map and size posterior of each exam.")
 @click.option("--dry-run", is_flag=True, help="Print what would be done, and do nothing.")
 @click.option(
@@ -165,18 +167,16 @@ def run(
     excision: Path | None,
     columns: Path | None,
     protocol: Path | None,
-    method: str,
-    size_calibration: str | None,
     settings_file: Path | None,
     normalise: str,
     match_mm: float,
     repeatability: str | None,
-    seed: int,
     figures: bool,
     dry_run: bool,
     copy_to: str | None,
     workers: int,
     scheduler: str | None,
+    **asked: Any,
 ) -> None:
     """Map, estimate and pool the exams of a table, and report the trial.
 
@@ -196,7 +196,6 @@ def run(
     from tactile_bayes.campaign.report import WRITTEN, Excision, check_inputs, copy_outputs, write_outputs
     from tactile_bayes.campaign.run import Campaign
     from tactile_bayes.campaign.settings import CampaignSettings
-    from tactile_bayes.commands.options import repeatability_in, settings_of
     from tactile_bayes.commands.progress import progress_bar
     from tactile_bayes.files.manifest_csv import read_manifest
     from tactile_bayes.files.remote import check_address
@@ -204,9 +203,7 @@ def run(
 
     given = None if repeatability in (None, NONE) else Path(str(repeatability))
     also_read(given)
-    settings = settings_of(
-        settings_file, calibration=size_calibration, method=method, seed=seed, repeatability=repeatability_in(given)
-    )
+    settings = settings_of(settings_file=settings_file, repeatability=given, **asked)
     of_all = CampaignSettings(
         settings,
         normalise,
@@ -259,7 +256,7 @@ def _check_paths(table: Sequence[Exam], output: Path, settings: CampaignSettings
     inside = next((exam.file for exam in local if Path(os.path.realpath(exam.path)).is_relative_to(folder)), None)
     if inside is not None:
         raise UsageError(f"{inside} lies in the output folder {output}; choose another folder")
-    for name in {settings.of(exam).calibration for exam in table} - {None}:
+    for name in {settings.of(exam).size_calibration for exam in table} - {None}:
         also_read(size_calibration_path(str(name)))
 
 

@@ -9,10 +9,19 @@ from typing import TYPE_CHECKING, Any, Final
 import click
 
 from tactile_bayes.api.settings import GROWN_BY, Comparing, Settings, refuse_checkpoint, times_of
-from tactile_bayes.commands.options import FORCE, METAVAR, FigurePath, FilePath, FiniteRange, also_read, seed_option
+from tactile_bayes.commands.options import (
+    FORCE,
+    METAVAR,
+    FigurePath,
+    FilePath,
+    FiniteRange,
+    also_read,
+    settings_of,
+    takes,
+)
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import UsageError
-from tactile_bayes.presets import METHODS, REGISTRATION_MM
+from tactile_bayes.presets import REGISTRATION_MM
 
 if TYPE_CHECKING:
     from tactile_bayes.api.comparing import ComparedOutcome
@@ -76,7 +85,6 @@ def groups_of(later: Sequence[tuple[int, Path]]) -> list[tuple[Path, ...]]:
 # --- `compare`: change of a mass's size between visits.
 
 _FILE = FilePath()
-_DEFAULTS = Settings()
 _PERCENT = tuple(100 * share for share in GROWN_BY)
 
 
@@ -120,30 +128,20 @@ _PERCENT = tuple(100 * share for share in GROWN_BY)
     show_default=True,
     help="SD each way of one mass's place between visits, by posture and landmarks.",
 )
-@click.option(
-    "--size-calibration", metavar="solid|eq6|solid-mean|SIZE.json", help="Calibration over bodies. Default: solid, or "
-    "solid-mean for maps of frames divided by their means."
+@takes(
+    Settings, "size_calibration", metavar="solid|eq6|solid-mean|SIZE.json",
+    help="Calibration over bodies. Default: solid, or solid-mean for maps of frames divided by their means."
 )  # fmt: skip
-@click.option(
-    "--method", type=click.Choice(METHODS), default=_DEFAULTS.method, show_default=True, help="As `estimate`."
-)
-@click.option(
-    "--settings", "settings_file", metavar="FILE.toml", type=_FILE,
-    help="As `estimate`; between_map_sd states the spread between exams of a visit."
+@takes(Settings, "method", help="As `estimate`.")
+@takes(
+    Settings, "settings_file", help="As `estimate`; between_map_sd states the spread between exams of a visit."
 )  # fmt: skip
-@click.option(
-    "--repeatability", metavar="SITE.json", type=_FILE,
+@takes(
+    Settings, "repeatability",
     help="Spread between exams of one mass at this site, from `calibrate repeatability`. Default: two intervals, for "
     "exams as alike as simulated ones and as the paper's."
 )  # fmt: skip
-@seed_option(_DEFAULTS.seed)
-@click.option(
-    "--interval",
-    type=FiniteRange(min=0.0, max=1.0, min_open=True, max_open=True),
-    default=_DEFAULTS.interval,
-    show_default=True,
-    help="Probability of the intervals.",
-)
+@takes(Settings, "seed", "interval")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 @click.option("--figure", metavar=METAVAR, type=FigurePath(), help="Draw the maps, their difference and the change.")
 @FORCE
@@ -159,16 +157,11 @@ def command(
     grown_by: tuple[float, ...],
     same_mass: bool,
     registration_mm: float,
-    size_calibration: str | None,
-    method: str,
-    settings_file: Path | None,
-    repeatability: Path | None,
-    seed: int,
-    interval: float,
     as_json: bool,
     figure: Path | None,
     force: bool,
     verbose: bool,
+    **asked: Any,
 ) -> None:
     """Compare the size of a mass at two visits and more.
 
@@ -180,7 +173,6 @@ def command(
 
     Example: tactile-bayes compare jan1.nc jan2.nc --with apr1.nc apr2.nc --days 92
     """
-    from tactile_bayes.commands.options import repeatability_in, settings_of
     from tactile_bayes.files.atomic import refuse_existing
     from tactile_bayes.files.documents import check_document, dump_json
     from tactile_bayes.files.shipped import size_calibration_path
@@ -192,14 +184,7 @@ def command(
         same_mass=same_mass,
         registration_mm=registration_mm,
     )
-    settings = settings_of(
-        settings_file,
-        calibration=size_calibration,
-        method=method,
-        seed=seed,
-        interval=interval,
-        repeatability=repeatability_in(repeatability),
-    )
+    settings, size_calibration = settings_of(**asked), asked["size_calibration"]
     visits = [first, *groups_of(later)]
     _check_maps(visits, settings)
     comparing.check_visits(len(visits))

@@ -7,7 +7,7 @@ import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -18,42 +18,23 @@ from tactile_bayes.commands.options import (
     METAVAR,
     FigurePath,
     FilePath,
-    FiniteRange,
     also_read,
     scheduler_option,
-    seed_option,
+    settings_of,
+    takes,
 )
 from tactile_bayes.errors import EXIT_DONE, EXIT_FAULT, EXIT_NO_ESTIMATE, UsageError
-from tactile_bayes.presets import METHODS, SCENES
 
 if TYPE_CHECKING:
     from tactile_bayes.api.estimating import Outcome as MapOutcome
     from tactile_bayes.batch import Outcome
 
 _FILE = FilePath()
-_DEFAULTS = Settings()
-_PROBABILITY = FiniteRange(min=0.0, max=1.0, min_open=True, max_open=True)
 
 
 @click.command("estimate")
 @click.argument("maps", metavar="MAP.nc...", nargs=-1, required=True, type=_FILE)
-@click.option(
-    "--size-calibration",
-    metavar="solid|eq6|solid-mean|plane-strain|none|SIZE.json",
-    help="Calibration from widths to sizes: a shipped one, your own file, or none (widths only). Default: "
-    "solid, or solid-mean for maps of frames divided by their means; eq6 is the paper's Eq 6 over such bodies.",
-)
-@click.option(
-    "--method",
-    type=click.Choice(METHODS),
-    default=_DEFAULTS.method,
-    show_default=True,
-    help="importance: weighted draws; ensemble: MCMC; laplace: mode, curvature; optimise: the paper's least squares.",
-)
-@seed_option(_DEFAULTS.seed)
-@click.option(
-    "--interval", type=_PROBABILITY, default=_DEFAULTS.interval, show_default=True, help="Probability of the intervals."
-)
+@takes(Settings, "size_calibration", "method", "seed", "interval")
 @click.option(
     "-o",
     "--output",
@@ -77,47 +58,7 @@ _PROBABILITY = FiniteRange(min=0.0, max=1.0, min_open=True, max_open=True)
     type=FigurePath(),
     help="Draw data, fit and residual of the fit window, or the map where there is no estimate.",
 )
-@click.option(
-    "--centre-mm",
-    type=(FiniteRange(), FiniteRange()),
-    metavar="X Y",
-    help="Place on the map to measure. Default: the highest bump that can be a lump.",
-)
-@click.option(
-    "--scene",
-    type=click.Choice(SCENES),
-    default=_DEFAULTS.scene,
-    show_default=True,
-    help="Structures in the fit window; auto: the simplest scene that the map supports.",
-)
-@click.option(
-    "--settings",
-    "settings_file",
-    metavar="FILE.toml",
-    type=_FILE,
-    help="Priors and rarely used options: background, fit_radius_mm, noise, max_steps... (settings.schema.json).",
-)
-@click.option(
-    "--accuracy-sd",
-    type=FiniteRange(min=0.001, max=0.5),
-    help="Monte-Carlo error to reach in the interval ends of sizes and map widths, in posterior SDs. Default: "
-    "0.02 for importance, 0.1 for ensemble.",
-)
-@click.option(
-    "--known",
-    type=(str, FiniteRange()),
-    multiple=True,
-    metavar="NAME VALUE",
-    help="Known property of the body: seat (0 centred on the gland's edge, 1.2 clear of it), depth_mm, "
-    "stiffness_ratio, fat_kpa, gland_ratio or thickness_mm.",
-)
-@click.option(
-    "--repeatability",
-    metavar="SITE.json",
-    type=_FILE,
-    help="Spread between exams of one mass at this site, from `calibrate repeatability`: sizes then have one interval, "
-    "for any exam there. Default: two, for exams as the paper's and as simulated ones.",
-)
+@takes(Settings, "centre_mm", "scene", "settings_file", "accuracy_sd", "known", "repeatability")
 @click.option("--pool", is_flag=True, help="Pool the maps, all of one mass, into one size.")
 @click.option(
     "--workers",
@@ -136,26 +77,17 @@ def command(
     ctx: click.Context,
     /,
     maps: tuple[Path, ...],
-    size_calibration: str | None,
-    method: str,
-    seed: int,
-    interval: float,
     output: Path | None,
     as_json: bool,
     figure: Path | None,
     map_figure: Path | None,
     fit_figure: Path | None,
-    centre_mm: tuple[float, float] | None,
-    accuracy_sd: float | None,
-    scene: str,
-    settings_file: Path | None,
-    known: tuple[tuple[str, float], ...],
-    repeatability: Path | None,
     pool: bool,
     workers: int,
     scheduler: str | None,
     force: bool,
     verbose: bool,
+    **asked: Any,
 ) -> None:
     """Estimate a lump's size from tactile maps, with a credible interval.
 
@@ -166,20 +98,7 @@ def command(
 
     Example: tactile-bayes estimate map.nc --figure size.png
     """
-    from tactile_bayes.commands.options import repeatability_in, settings_of
-
-    settings = settings_of(
-        settings_file,
-        calibration=size_calibration,
-        method=method,
-        seed=seed,
-        interval=interval,
-        centre_mm=centre_mm,
-        accuracy_sd=accuracy_sd,
-        known=known,
-        scene=scene,
-        repeatability=repeatability_in(repeatability),
-    )
+    settings, size_calibration = settings_of(**asked), asked["size_calibration"]
     if len(maps) > 1:
         refuse_checkpoint(settings)
     if figure is not None and size_calibration == "none":

@@ -5,20 +5,17 @@ from __future__ import annotations
 import contextlib
 import math
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Literal, get_args, get_origin
 
 import click
 
 from tactile_bayes.api.settings import Settings
+from tactile_bayes.declarations import Record, default_of, extra_of, kinds, meaning_of, range_of, value_kind
 from tactile_bayes.errors import UsageError, number_words
 from tactile_bayes.files.atomic import Format, check_suffix, same_file
 from tactile_bayes.presets import HEADS, PRESSURE_WINDOW_KPA
-
-if TYPE_CHECKING:
-    from tactile_bayes.size.site import Repeatability
-
 
 # --- Paths on the command line: an output may be neither an input nor another output of the same command.
 
@@ -136,8 +133,8 @@ def head_option(default: str) -> Callable[[Callable[..., Any]], Callable[..., An
 # --- Settings of a call from its options and its settings file.
 
 
-def settings_of(path: Path | None, **options: Any) -> Settings:
-    """Make settings from options and a settings file.
+def settings_of(*, settings_file: Path | None = None, repeatability: Path | None = None, **options: Any) -> Settings:
+    """Make settings from options and from the files that they name.
 
     Raises
     ------
@@ -146,24 +143,18 @@ def settings_of(path: Path | None, **options: Any) -> Settings:
     UsageError
         When the checkpoint that the file names is another file of the call.
     """
-    if path is None:
-        return Settings(**options)
-    from tactile_bayes.files.documents import read_settings
-
-    settings = Settings(**options, **read_settings(path))
-    also_read(settings.checkpoint)
-    if settings.checkpoint is not None:
-        refuse_same([settings.checkpoint], [path])
-    return settings
-
-
-def repeatability_in(path: Path | None) -> Repeatability | None:
-    """The repeatability that an option names; None where it names none."""
-    if path is None:
-        return None
+    from tactile_bayes.api.settings import read_settings
     from tactile_bayes.files.repeatability_json import read_repeatability
 
-    return read_repeatability(path)
+    if repeatability is not None:
+        options["repeatability"] = read_repeatability(repeatability)
+    if settings_file is None:
+        return Settings(**options)
+    settings = Settings(**options, **read_settings(settings_file))
+    also_read(settings.checkpoint)
+    if settings.checkpoint is not None:
+        refuse_same([settings.checkpoint], [settings_file])
+    return settings
 
 
 # --- Options shared by several commands, and value types: finite numbers, numbers or words.
@@ -231,6 +222,60 @@ class NumberOr(_ParamType):
             return float(value)
         except ValueError:
             self.fail(f"{value!r} is not a number, nor {' nor '.join(map(repr, self.words))}", param, ctx)
+
+
+# --- Options made from the records that declare them.
+
+
+def takes(record: type[Record], *names: str, **attributes: Any) -> Decorator:
+    """The options of a command for some fields of a record, in this order.
+
+    Type, range, default and help come from the field's declaration, `metavar` and the name from its ``extra``.
+
+    Parameters
+    ----------
+    **attributes
+        Of `click.option`, in place of what comes from the declaration.
+    """
+
+    def add(command: Callable[..., Any]) -> Callable[..., Any]:
+        for name in reversed(names):
+            command = _option(record, name, attributes)(command)
+        return command
+
+    return add
+
+
+def _option(record: type[Record], name: str, attributes: Mapping[str, Any]) -> Decorator:
+    kind, default = kinds(record)[name], default_of(record, name)
+    extra = extra_of(kind)
+    flag = f"--{extra.get('option', name).replace('_', '-')}"
+    of_field: dict[str, Any] = {"help": meaning_of(kind), "metavar": extra.get("metavar")}
+    if default is False:
+        of_field["is_flag"] = True
+    else:
+        bare = value_kind(kind)
+        pairs = get_origin(bare) is tuple and get_args(bare)[1:] == (...,)
+        shown = default is not None and default != ()
+        of_field |= {"type": FilePath() if extra.get("path") else _click_type(get_args(bare)[0] if pairs else kind)}
+        of_field |= {"multiple": True} if pairs else {}
+        of_field |= {"default": default, "show_default": True} if shown else {}
+    return click.option(flag, name, **{**of_field, **attributes})
+
+
+def _click_type(kind: Any) -> Any:
+    """What click makes of a value, by what is declared for it."""
+    bare = value_kind(kind)
+    if get_origin(bare) is Literal:
+        return click.Choice(get_args(bare))
+    if get_origin(bare) is tuple:
+        return tuple(map(_click_type, get_args(bare)))
+    if bare not in (int, float):
+        return str
+    least, most, open_ends = range_of(kind)
+    if bare is int:
+        return click.IntRange(least, most)
+    return FiniteRange(least, most, min_open="min" in open_ends, max_open="max" in open_ends)
 
 
 MOST_ITEMS = 1_000_000

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import click
 from click.core import ParameterSource
 
-from tactile_bayes.commands.options import FORCE, FilePath, FiniteRange, also_read, seed_option
+from tactile_bayes.api.settings import Settings
+from tactile_bayes.commands.options import FORCE, FilePath, also_read, settings_of, takes
 from tactile_bayes.errors import UsageError
-from tactile_bayes.presets import INTERVAL, RESEARCH_USE
+from tactile_bayes.presets import RESEARCH_USE
 
 _FILE = FilePath()
-_OF_ESTIMATE = ("size_calibration", "settings_file", "repeatability", "seed", "interval")
 
 
 @click.command("report")
@@ -25,26 +26,19 @@ _OF_ESTIMATE = ("size_calibration", "settings_file", "repeatability", "seed", "i
 @click.option("--title", default="", help="Title of the page. Default: Tactile exam.")
 @click.option("--name", default="", help="Name to print on the page. Default: none.")
 @click.option("--date", "day", default="", metavar="YYYY-MM-DD", help="Date to print on the page. Default: none.")
-@click.option(
-    "--size-calibration",
+@takes(
+    Settings,
+    "size_calibration",
     metavar="solid|eq6|solid-mean|plane-strain|SIZE.json",
     help="Calibration from widths to sizes, as of `estimate`. Default: the one that fits the maps.",
 )
-@click.option("--settings", "settings_file", metavar="FILE.toml", type=_FILE, help="Settings, as of `estimate`.")
-@click.option(
-    "--repeatability",
-    metavar="SITE.json",
-    type=_FILE,
+@takes(Settings, "settings_file", help="Settings, as of `estimate`.")
+@takes(
+    Settings,
+    "repeatability",
     help="Spread between exams of one mass at this site, as of `estimate`. Default: two intervals.",
 )
-@seed_option(1)
-@click.option(
-    "--interval",
-    type=FiniteRange(min=0.0, max=1.0, min_open=True, max_open=True),
-    default=INTERVAL,
-    show_default=True,
-    help="Probability of the intervals.",
-)
+@takes(Settings, "seed", "interval")
 @FORCE
 @click.pass_context
 def command(
@@ -57,12 +51,8 @@ def command(
     title: str,
     name: str,
     day: str,
-    size_calibration: str | None,
-    settings_file: Path | None,
-    repeatability: Path | None,
-    seed: int,
-    interval: float,
     force: bool,
+    **asked: Any,
 ) -> None:
     """Write one page of an exam: the map, the size with its intervals, the place, and how good the exam was.
 
@@ -74,7 +64,6 @@ def command(
     Example: tactile-bayes report map.nc -o exam.html
     """
     from tactile_bayes.api.exam_report import ExamFiles, Given, read_exam
-    from tactile_bayes.commands.options import repeatability_in, settings_of
     from tactile_bayes.files.shipped import size_calibration_path
     from tactile_bayes.report.exam_page import PageFiles
     from tactile_bayes.report.exam_words import headline
@@ -83,10 +72,8 @@ def command(
     page.check()
     sorted_files = ExamFiles.sort(files)
     if sorted_files.estimates:
-        _refuse_settings(ctx)
-    options: dict[str, Any] = {"calibration": size_calibration, "seed": seed, "interval": interval}
-    options["repeatability"] = repeatability_in(repeatability)
-    settings = settings_of(settings_file, **options)
+        _refuse_settings(ctx, asked)
+    settings, size_calibration = settings_of(**asked), asked["size_calibration"]
     also_read(None if size_calibration is None else size_calibration_path(size_calibration))
     exam = read_exam(sorted_files, settings, given, notice=lambda line: click.echo(line, err=True))
     page.write(exam)
@@ -96,9 +83,9 @@ def command(
     click.echo(RESEARCH_USE)
 
 
-def _refuse_settings(ctx: click.Context) -> None:
+def _refuse_settings(ctx: click.Context, asked: Iterable[str]) -> None:
     """Refuse options of the estimate where an estimate is given: they would change nothing."""
-    for name in _OF_ESTIMATE:
+    for name in asked:
         if ctx.get_parameter_source(name) is ParameterSource.COMMANDLINE:
             option = "--settings" if name == "settings_file" else f"--{name.replace('_', '-')}"
             raise UsageError(f"an estimate has settings of its own; leave out {option}, or give the map alone")

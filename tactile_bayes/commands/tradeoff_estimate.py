@@ -6,18 +6,18 @@ from pathlib import Path
 
 import click
 
+from tactile_bayes.api.settings import Settings
 from tactile_bayes.commands.options import (
     FORCE,
     JSON,
     METAVAR,
     FigurePath,
     FilePath,
-    FiniteRange,
     also_read,
-    seed_option,
+    settings_of,
+    takes,
 )
 from tactile_bayes.commands.tradeoff_options import CALIBRATION, RUNS, TOLERANCE
-from tactile_bayes.declarations import replace
 
 _FILE = FilePath()
 
@@ -25,17 +25,12 @@ _FILE = FilePath()
 @click.command("estimate")
 @click.argument("maps", metavar="MAP.nc...", nargs=-1, required=True, type=_FILE)
 @CALIBRATION
-@click.option(
-    "--centre-mm",
-    type=(FiniteRange(), FiniteRange()),
-    metavar="X Y",
-    help="Place on the map to measure. Default: the highest bump that can be a lump.",
-)
-@click.option("--settings", "settings_file", metavar="FILE.toml", type=_FILE, help="Settings, as in `estimate`.")
+@takes(Settings, "centre_mm")
+@takes(Settings, "settings_file", help="Settings, as in `estimate`.")
 @TOLERANCE
 @RUNS
 @click.option("--figure", metavar=METAVAR, type=FigurePath(), help="Draw error against time.")
-@seed_option(1)
+@takes(Settings, "seed")
 @JSON
 @FORCE
 @click.pass_context
@@ -67,9 +62,9 @@ def command(
     import time
 
     from tactile_bayes.api.tradeoffs import pooled_rows, tradeoff_of_map
-    from tactile_bayes.commands.options import settings_of
     from tactile_bayes.commands.progress import progress_bar
     from tactile_bayes.commands.tradeoff_options import forecast, fresh_cpu_s, show
+    from tactile_bayes.declarations import replace
     from tactile_bayes.errors import UsageError
     from tactile_bayes.files.atomic import given_twice, refuse_existing
     from tactile_bayes.files.provenance import Provenance, hash_inputs
@@ -82,7 +77,9 @@ def command(
         refuse_existing(figure, force=force)
     if twice := given_twice(maps):
         raise UsageError(f"{twice} is given twice; give each map once")
-    settings = settings_of(settings_file, calibration=size_calibration, centre_mm=centre_mm, seed=seed)
+    settings = settings_of(
+        settings_file=settings_file, size_calibration=size_calibration, centre_mm=centre_mm, seed=seed
+    )
     if len(maps) > 1 and centre_mm is not None:
         raise UsageError("--centre-mm is a place on one map; give one map")
     with progress_bar("settings") as progress:

@@ -8,6 +8,7 @@ import numpy as np
 
 from tactile_bayes.forward.gaussian import cell_mean_gaussian, covariance_from_log_widths, principal_widths
 from tactile_bayes.geometry import FloatArray
+from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior.fit_window import FitCells
 from tactile_bayes.records import dataclass
 
@@ -22,40 +23,6 @@ IntArray = np.ndarray[tuple[int, ...], np.dtype[np.intp]]
 def block_size(cells: int) -> int:
     """Number of parameter vectors to predict at a time, for a window of this many cells."""
     return min(BLOCK, max(LEAST_BLOCK, BLOCK_VALUES // max(cells, 1)))
-
-
-@dataclass(frozen=True, slots=True)
-class BumpPrior:
-    """Proper, weak priors, all of them printed with the estimate.
-
-    Parameters
-    ----------
-    amplitude_sd
-        Normal, centred on 0 and signed: a depression must be able to show itself. In units of the map's scale.
-    width_median_mm, log_width_sd
-        Log-normal on the geometric mean of the two widths.
-    log_ratio_sd
-        Normal on q and r, half the log of the axis ratio (and its direction).
-    tilt_sd
-        Normal on the level's slope along each axis, in units of the map's scale over half a window. It counts where
-        a tilt is weighed against none; once there is one it is flat.
-    """
-
-    amplitude_sd: float = 2.0
-    width_median_mm: float = 5.0
-    log_width_sd: float = 1.0
-    log_ratio_sd: float = 0.5
-    tilt_sd: float = 0.1
-
-    def as_dict(self) -> dict[str, float]:
-        """The numbers, for the report."""
-        return {
-            "amplitude_sd": self.amplitude_sd,
-            "width_median_mm": self.width_median_mm,
-            "log_width_sd": self.log_width_sd,
-            "log_ratio_sd": self.log_ratio_sd,
-            "tilt_sd": self.tilt_sd,
-        }
 
 
 @dataclass(frozen=True, slots=True)

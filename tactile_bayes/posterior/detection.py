@@ -9,7 +9,8 @@ import numpy as np
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.modes import inverse_information
 from tactile_bayes.mapping.map import TactileMap
-from tactile_bayes.posterior.bump import Bump, BumpPrior
+from tactile_bayes.options import BumpPrior
+from tactile_bayes.posterior.bump import Bump
 from tactile_bayes.posterior.fit_window import FitCells, window_cells
 from tactile_bayes.records import dataclass
 

@@ -278,7 +278,7 @@ def checkpoint_key(fit: FieldFit, settings: str, rng: np.random.Generator) -> st
         digest.update(np.ascontiguousarray(values, dtype="<f8").tobytes())
     said = {
         "scene": as_dict(fit.scene),
-        "prior": target.problem.prior.as_dict(),
+        "prior": as_dict(target.problem.prior),
         "scale": target.problem.amplitude_scale,
         "bounds": [target.problem.widest_mm, target.problem.radius_mm],
         "fields": target.chosen_fields(),

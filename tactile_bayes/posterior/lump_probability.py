@@ -9,7 +9,7 @@ import numpy as np
 
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.map import TactileMap
-from tactile_bayes.posterior.bump import BumpPrior
+from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior.detection import Detection
 from tactile_bayes.posterior.field import Window
 from tactile_bayes.posterior.fit_window import covered_share, trusted, value_scale, window_cells

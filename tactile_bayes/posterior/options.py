@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from tactile_bayes.errors import UsageError, check_choice
 from tactile_bayes.inference.draws import INDEPENDENT_DRAWS
-from tactile_bayes.posterior.bump import BumpPrior
+from tactile_bayes.options import BumpPrior
 from tactile_bayes.presets import METHODS, Background, Method, Noise, Rotation, SceneAsked
 from tactile_bayes.records import dataclass
 from tactile_bayes.size.pooling import SizePriors

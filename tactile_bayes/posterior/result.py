@@ -12,7 +12,7 @@ from tactile_bayes.findings import Finding
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.draws import ParameterDraws, weighted_quantiles_of
 from tactile_bayes.inference.importance import smooth_weights
-from tactile_bayes.posterior.bump import BumpPrior
+from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior.detection import Detection
 from tactile_bayes.posterior.draws import Diagnostics, MapPosterior
 from tactile_bayes.posterior.lump_probability import Weighed

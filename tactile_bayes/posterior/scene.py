@@ -9,7 +9,7 @@ import numpy as np
 
 from tactile_bayes.declarations import replace
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.posterior.bump import BumpPrior
+from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior.field import Profiles, Window
 from tactile_bayes.posterior.white import WIDEST_IN_RADII
 from tactile_bayes.records import dataclass

@@ -23,7 +23,8 @@ from tactile_bayes.inference.modes import (
     optimise,
 )
 from tactile_bayes.mapping.map import TactileMap
-from tactile_bayes.posterior.bump import Bump, BumpPrior, block_size
+from tactile_bayes.options import BumpPrior
+from tactile_bayes.posterior.bump import Bump, block_size
 from tactile_bayes.posterior.detection import (
     Detection,
     ErrorModel,

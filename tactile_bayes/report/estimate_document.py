@@ -8,14 +8,15 @@ from typing import Any
 
 import numpy as np
 
+from tactile_bayes.declarations import as_dict
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.findings import verdict
 from tactile_bayes.geometry import apply
 from tactile_bayes.inference.draws import Quantity, nine_digits
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.mapping.places import ClockPosition
+from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior.abstention import chance_text
-from tactile_bayes.posterior.bump import BumpPrior
 from tactile_bayes.posterior.field import LENGTHS_MM, SHARES
 from tactile_bayes.posterior.result import Estimate, Mass, Sensitivity
 from tactile_bayes.posterior.selection import SceneChoice, Structure
@@ -398,7 +399,7 @@ def estimate_document(
         "masses": masses,
         "touching": touching_masses(masses),
         "left_out": list(estimate.left_out),
-        "prior": prior.as_dict(),
+        "prior": as_dict(prior),
         "research_use": RESEARCH_USE,
         "provenance": provenance.as_dict(),
     }

@@ -8,10 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import binom, chi2, poisson
 
+from tactile_bayes.declarations import as_dict
 from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.map import MapRecipe, TactileMap
-from tactile_bayes.posterior.bump import BumpPrior
+from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior.draws import MapPosterior
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.field import LENGTHS_MM, SHARES, cell_mean_profile
@@ -274,7 +275,7 @@ def settings(method: str, seed: int, *, size: str = "", cosines: int | None = No
         "shares": list(SHARES),
         "field": "exponential",
         "field_cosines": cosines or "auto",
-        **BumpPrior().as_dict(),
+        **as_dict(BumpPrior()),
     }
 
 

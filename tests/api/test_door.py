@@ -21,7 +21,7 @@ import tactile_bayes as tb
 from tactile_bayes.api.trial_report import TrialSettings
 from tactile_bayes.cli import cli
 from tactile_bayes.errors import BadDataError, DeviceError, UsageError
-from tactile_bayes.files.documents import PRIORS, load_schema
+from tactile_bayes.files.documents import load_schema
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.scan_mcap import write_scan
 from tactile_bayes.mapping import build_map
@@ -75,8 +75,8 @@ def test_the_defaults_are_the_command_lines() -> None:
     shared = set(given) & set(shown)
     assert shared >= {"size_calibration", "method", "seed", "interval", "centre_mm", "scene", "accuracy_sd", "known"}
     assert {name: given[name] for name in shared} == {name: shown[name] for name in shared}
-    from_file = set(load_schema("settings.schema.json")["properties"]) - {*PRIORS}
-    assert set(given) - shared == {"tactile_map", "progress", "prior", *from_file}
+    from_file = set(load_schema("settings.schema.json")["properties"])
+    assert set(given) - shared == {"tactile_map", "progress", *from_file}
     trial, shown = TrialSettings(), defaults_of("validate", "t.csv", "--excision", "e.csv")
     for name in ("intervals", "resamples", "seed", "error_ratio", "check_intervals", "bayes"):
         assert getattr(trial, name) == shown[name]

@@ -324,7 +324,7 @@ def test_priors_come_from_a_file_and_are_printed(folder: Path) -> None:
     assert document["prior_sensitivity"]["width_prior_times"] == 2.0
     wrong = field(folder, width=3.5)
     assert (wrong.returncode, wrong.stderr.count("\n")) == (3, 1)
-    assert "unknown key width" in wrong.stderr
+    assert "width is not known" in wrong.stderr
 
 
 def test_a_checkpoint_goes_on_where_it_stopped(folder: Path) -> None:

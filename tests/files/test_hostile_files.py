@@ -14,10 +14,11 @@ import hostile
 import numpy as np
 import pytest
 
+from tactile_bayes.api.settings import read_settings
 from tactile_bayes.batch_store import open_store
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.column_map import read_mapping
-from tactile_bayes.files.documents import parse_toml, read_protocol, read_settings
+from tactile_bayes.files.documents import parse_toml, read_protocol
 from tactile_bayes.files.estimate_json import read_stated_size
 from tactile_bayes.files.identify import describe
 from tactile_bayes.files.imports import read_arrays, read_grid

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
 from pathlib import Path
 
 import pytest
 
-from tactile_bayes.api.settings import Settings
+from tactile_bayes.api.settings import Settings, read_settings
+from tactile_bayes.declarations import to_plain
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.files.documents import PRIORS, load_schema, read_settings
-from tactile_bayes.posterior.bump import BumpPrior
+from tactile_bayes.files.documents import load_schema
+from tactile_bayes.options import PRIORS, BumpPrior
 from tactile_bayes.presets import FIELD_COSINES, FINE_FIELD_COSINES, MOST_FIELD_COSINES
 
 
@@ -24,20 +24,20 @@ def test_a_missing_key_keeps_its_default(tmp_path: Path) -> None:
     path = written(tmp_path, 'width_median_mm = 4\nnoise = "field"\ncheckpoint = "c.npz"\nfield_cosines = "auto"\n')
     found = read_settings(path)
     assert found == {
-        "prior": {"width_median_mm": 4.0},
+        "width_median_mm": 4.0,
         "noise": "field",
         "checkpoint": tmp_path / "c.npz",
-        "field_cosines": None,
+        "field_cosines": "auto",
         "settings_file": path,
     }
     assert Settings(**found).rotation == Settings().rotation == "auto"
-    assert BumpPrior(**found["prior"]) == BumpPrior(width_median_mm=4.0)
+    assert Settings(**found).prior == BumpPrior(width_median_mm=4.0)
 
 
 def test_the_schema_has_every_key_with_the_programs_defaults() -> None:
     properties = load_schema("settings.schema.json")["properties"]
-    assert {name: properties[name]["default"] for name in PRIORS} == BumpPrior().as_dict()
-    assert set(properties) - {*PRIORS} <= {one.name for one in fields(Settings)}
+    assert {name: properties[name]["default"] for name in PRIORS} == to_plain(BumpPrior())
+    assert set(properties) - {*PRIORS} <= set(Settings.__struct_fields__)
     cosines = properties["field_cosines"]
     assert cosines["anyOf"][0]["maximum"] == MOST_FIELD_COSINES
     assert f"auto: {FIELD_COSINES}, up to {FINE_FIELD_COSINES}" in cosines["description"]
@@ -46,7 +46,7 @@ def test_the_schema_has_every_key_with_the_programs_defaults() -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("widht_median_mm = 4", "unknown key widht_median_mm; did you mean width_median_mm"),
+        ("widht_median_mm = 4", "widht_median_mm is not known; did you mean width_median_mm"),
         ("width_median_mm = -4", "width_median_mm is -4; give a number above 0"),
         ("width_median_mm = nan", "width_median_mm is nan"),
         ("tilt_sd = inf", "tilt_sd"),
@@ -59,7 +59,7 @@ def test_the_schema_has_every_key_with_the_programs_defaults() -> None:
         ("field_cosines = 5", "field_cosines"),
         ("max_steps = 149", "max_steps is 149; give a whole number from 150 on"),
         ('noise = "white"', "noise is 'white'; give one of independent, field"),
-        ('method = "laplace"', "unknown key method"),
+        ('method = "laplace"', "method is not known"),
     ],
 )
 def test_a_bad_setting_is_one_line(tmp_path: Path, text: str, message: str) -> None:

@@ -8,10 +8,10 @@ from posterior_maps import bump_map, bump_values, grid_map
 
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import CODES, NO_LUMP, NotConvergedError, UsageError
+from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior import draw as methods
 from tactile_bayes.posterior import estimate, search
 from tactile_bayes.posterior.abstention import extend_advice, missing_strokes, no_bump, shape_fault
-from tactile_bayes.posterior.bump import BumpPrior
 from tactile_bayes.posterior.detection import Detection
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.lump_probability import Weighed

@@ -10,7 +10,7 @@ from posterior_maps import TRUTH, bump_map, correlated_field, grid_map
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, NotConvergedError, UsageError
 from tactile_bayes.files.provenance import Provenance
-from tactile_bayes.posterior.bump import BumpPrior
+from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.options import EstimateOptions, FitOptions
 from tactile_bayes.posterior.result import Estimate

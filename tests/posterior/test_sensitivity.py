@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tactile_bayes.posterior.bump import BumpPrior
+from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior.result import prior_sensitivity
 from tactile_bayes.report.estimate_document import prior_line, sensitivity_line
 

@@ -57,7 +57,7 @@ def test_a_spread_out_of_order_or_stated_twice_is_refused() -> None:
     with pytest.raises(UsageError, match="give one of them"):
         Settings(between_map_sd=0.1, repeatability=SITE)
     with pytest.raises(UsageError, match="a repeatability is for sizes"):
-        Settings(calibration="none", repeatability=SITE)
+        Settings(size_calibration="none", repeatability=SITE)
 
 
 def test_words_say_the_spread_its_interval_and_where_it_is_from() -> None:

@@ -9,8 +9,8 @@ import pytest
 
 from tactile_bayes.commands.sbc import _shipped
 from tactile_bayes.declarations import as_dict, replace
+from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior import draw
-from tactile_bayes.posterior.bump import BumpPrior
 from tactile_bayes.posterior.draws import MapPosterior
 from tactile_bayes.posterior.field import LENGTHS_MM
 from tactile_bayes.report.sbc import verdict

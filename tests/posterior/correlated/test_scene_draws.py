@@ -13,8 +13,8 @@ from tactile_bayes.errors import BadDataError, NotConvergedError
 from tactile_bayes.files.npz import CheckpointFile
 from tactile_bayes.inference.draws import ParameterDraws
 from tactile_bayes.inference.importance import ImportanceOptions, importance
+from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior import draw as methods
-from tactile_bayes.posterior.bump import BumpPrior
 from tactile_bayes.posterior.draw import Sampled, disagreement, draw_scene, importance_draws
 from tactile_bayes.posterior.fit import FieldFit, fit_scene
 from tactile_bayes.posterior.options import EstimateOptions

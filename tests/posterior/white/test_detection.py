@@ -15,7 +15,7 @@ from tactile_bayes.files.scene_toml import read_scene
 from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import TactileMap
-from tactile_bayes.posterior.bump import BumpPrior
+from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior.detection import detect
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.options import EstimateOptions, FitOptions

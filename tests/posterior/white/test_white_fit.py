@@ -11,8 +11,8 @@ from scipy.special import erf
 
 from tactile_bayes.declarations import replace
 from tactile_bayes.mapping.map import TactileMap
+from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior import white as fit_module
-from tactile_bayes.posterior.bump import BumpPrior
 from tactile_bayes.posterior.options import FitOptions
 from tactile_bayes.posterior.white import BumpFit, fit_bump, rotation_odds
 
