@@ -38,9 +38,10 @@ HEAD_PROFILE: Final = ("head_profile_x2", "head_profile_y2", "head_profile_y4")
 # frames with an error of their own felt a cell for each reading in it, see `mapping.pose_noise`.
 POSE_NOISE: Final = ("pose_noise_x_mm", "pose_noise_y_mm", "frame_side_x_mm", "frame_side_y_mm", "frames_per_reading")
 
-NORMALISE: Final = ("mean", "gain", "none")
+Normalise = Literal["mean", "gain", "none"]
+NORMALISE: Final[tuple[Normalise, ...]] = get_args(Normalise)
 # See docs/decisions/0065; the paper divides by the mean.
-DEFAULT_NORMALISE: Final = "gain"
+DEFAULT_NORMALISE: Final[Normalise] = "gain"
 Method = Literal["optimise", "laplace", "importance", "ensemble"]
 METHODS: Final[tuple[Method, ...]] = get_args(Method)
 Noise = Literal["independent", "field"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,7 +12,7 @@ from typing import TYPE_CHECKING, Any, overload
 import numpy as np
 
 from tactile_bayes.api.arguments import check_keywords, door, plain
-from tactile_bayes.declarations import as_dict
+from tactile_bayes.declarations import as_dict, names_of
 from tactile_bayes.errors import UsageError, check_number
 from tactile_bayes.files.atomic import Format, check_suffix, sha256
 from tactile_bayes.files.map_nc import read_map_and_scans, write_map
@@ -22,6 +21,7 @@ from tactile_bayes.files.scene_toml import read_scene
 from tactile_bayes.findings import finding_lines
 from tactile_bayes.mapping import build_map as build
 from tactile_bayes.mapping.map import TactileMap
+from tactile_bayes.options import MapOptions
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.map_figure import map_figure
 from tactile_bayes.scan import Scan
@@ -241,7 +241,7 @@ def build_map(scans: Any, **options: Any) -> Map:
     scans
         A scan, a simulated scan, a path, or a sequence of them.
     **options
-        As of `tactile_bayes.mapping.build_map`: cell_mm, pressure_window_kpa, normalise...
+        As of `tactile_bayes.options.MapOptions`: cell_mm, pressure_window_kpa, normalise...
 
     Raises
     ------
@@ -250,7 +250,7 @@ def build_map(scans: Any, **options: Any) -> Map:
     UsageError
         When an option cannot be so, or a recording is given twice.
     """
-    check_keywords("build_map", options, set(inspect.signature(build).parameters) - {"scans"})
+    check_keywords("build_map", options, (*names_of(MapOptions), "max_pose_gap_ms", "progress"))
     given = [scans] if isinstance(scans, str | Path) or not isinstance(scans, Sequence) else list(scans)
     loaded: list[Scan] = []
     facts: list[dict[str, str]] = []

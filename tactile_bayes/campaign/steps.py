@@ -19,7 +19,7 @@ from tactile_bayes.api.repeatability import ExamFolder, learn_from_exams, repeat
 from tactile_bayes.api.settings import Comparing, Settings
 from tactile_bayes.campaign.match import OWN_AXES, NamedPlace, in_own_axes, matched_outcome
 from tactile_bayes.campaign.settings import Writes, digest_of, write_staged
-from tactile_bayes.declarations import replace
+from tactile_bayes.declarations import EXACT, from_plain, replace, to_plain
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.atomic import sha256, write_bytes, write_text
 from tactile_bayes.files.campaign_names import (
@@ -48,7 +48,7 @@ from tactile_bayes.files.reading import NETCDF_BYTES, kind_of, read_bytes
 from tactile_bayes.files.remote import fetched, put
 from tactile_bayes.findings import by_weight, findings_in
 from tactile_bayes.mapping import build_map
-from tactile_bayes.presets import CELL_MM, PRESSURE_WINDOW_KPA
+from tactile_bayes.options import MapOptions
 from tactile_bayes.records import dataclass
 from tactile_bayes.report.compare_figure import draw_comparison
 from tactile_bayes.report.estimate_document import rounded, size_diagnostics
@@ -248,16 +248,8 @@ def _given_map(task: Task) -> tuple[Result, Writes]:
 
 def map_settings(normalise: str) -> dict[str, Any]:
     """Settings of `map` by its options: their defaults, but for the normalisation."""
-    return {
-        "cell_mm": CELL_MM,
-        "pressure_window_kpa": list(PRESSURE_WINDOW_KPA),
-        "normalise": normalise,
-        "latency_ms": 0.0,
-        "plane_radius_mm": "all",
-        "flat_field": False,
-        "register_strokes": False,
-        "every": 1,
-    }
+    settings: dict[str, Any] = to_plain(from_plain(MapOptions, {"normalise": normalise}), digits=EXACT)
+    return settings
 
 
 def check_facts(expected: Mapping[str, str], facts: Mapping[str, str]) -> None:

@@ -22,7 +22,8 @@ from tactile_bayes.commands.options import (
     takes,
 )
 from tactile_bayes.errors import BadDataError, UsageError
-from tactile_bayes.presets import DEFAULT_NORMALISE, NORMALISE, RESEARCH_USE
+from tactile_bayes.options import MapOptions
+from tactile_bayes.presets import RESEARCH_USE
 
 if TYPE_CHECKING:
     from tactile_bayes.campaign.exams import Found
@@ -135,9 +136,7 @@ def _to_correct(output: Path) -> str:
 @takes(Settings, "method", help="As `estimate`.")
 @takes(Settings, "size_calibration", metavar="NAME|SIZE.json", help="As `estimate`, unless a row names its own.")
 @takes(Settings, "settings_file", help="Priors and more, as `estimate`.")
-@click.option(
-    "--normalise", type=click.Choice(NORMALISE), default=DEFAULT_NORMALISE, show_default=True, help="As `map`."
-)
+@takes(MapOptions, "normalise", help="As `map`.")
 @click.option(
     "--match-mm",
     type=FiniteRange(min=0.0, min_open=True),

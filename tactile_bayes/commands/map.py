@@ -5,12 +5,14 @@ from __future__ import annotations
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import click
 
-from tactile_bayes.commands.options import FORCE, METAVAR, PRESSURE_WINDOW, FigurePath, FilePath, NumberOr
+from tactile_bayes.commands.options import FORCE, METAVAR, FigurePath, FilePath, takes
+from tactile_bayes.declarations import EXACT, names_of, to_plain
 from tactile_bayes.errors import UsageError
-from tactile_bayes.presets import CELL_MM, DEFAULT_NORMALISE, NORMALISE
+from tactile_bayes.options import MapOptions
 
 _FILE = FilePath()
 
@@ -20,60 +22,17 @@ _FILE = FilePath()
 @click.option(
     "-o", "--output", required=True, metavar="MAP.nc", type=FilePath(writes="netCDF"), help="Where to write the map."
 )
-@click.option("--cell-mm", type=float, default=CELL_MM, show_default=True, help="Side of the square cells, mm.")
-@PRESSURE_WINDOW
-@click.option(
-    "--normalise",
-    type=click.Choice(NORMALISE),
-    default=DEFAULT_NORMALISE,
-    show_default=True,
-    help="gain: estimate one gain per frame; mean: divide each frame by its mean (the paper); none: keep kPa.",
-)
-@click.option(
-    "--latency-ms",
-    type=NumberOr("auto"),
-    metavar="MS|auto",
-    default="0",
-    show_default=True,
-    help="Delay of the tracker's time stamps; auto: estimate it from the scan, or refuse.",
-)
-@click.option(
-    "--plane-radius-mm",
-    type=NumberOr("auto", "all"),
-    metavar="MM|auto|all",
-    default="all",
-    show_default=True,
-    help="Fit the plane to frames within this distance of the mass; auto: those whose array can reach it.",
-)
-@click.option("--flat-field", is_flag=True, help="Remove the head's own response, measured on frames without a lump.")
-@click.option(
-    "--register-strokes", is_flag=True, help="Align the strokes with each other, for a lump that moves with the head."
-)
-@click.option(
-    "--every",
-    type=click.IntRange(min=1),
-    metavar="N",
-    default=1,
-    show_default=True,
-    help="Use one frame of every N: quicker, and noisier; `tradeoff map` measures both.",
-)
+@takes(MapOptions, *names_of(MapOptions))
 @click.option("--figure", metavar=METAVAR, type=FigurePath(), help="Draw the map and its coverage.")
 @FORCE
 @click.option("-v", "--verbose", is_flag=True, help="Print the time of each step on stderr.")
 def command(
     scans: tuple[Path, ...],
     output: Path,
-    cell_mm: float,
-    pressure_window_kpa: tuple[float, float],
-    normalise: str,
-    latency_ms: float | str,
-    plane_radius_mm: float | str,
-    flat_field: bool,
-    register_strokes: bool,
-    every: int,
     figure: Path | None,
     force: bool,
     verbose: bool,
+    **options: Any,
 ) -> None:
     """Build a tactile map from one scan, or one common map from several scans of the same examination.
 
@@ -92,16 +51,7 @@ def command(
     from tactile_bayes.report.map_text import map_text
 
     _check_paths(scans, output, figure, force=force)
-    settings = {
-        "cell_mm": cell_mm,
-        "pressure_window_kpa": list(pressure_window_kpa),
-        "normalise": normalise,
-        "latency_ms": latency_ms,
-        "plane_radius_mm": plane_radius_mm,
-        "flat_field": flat_field,
-        "register_strokes": register_strokes,
-        "every": every,
-    }
+    settings = to_plain(MapOptions(**options), digits=EXACT)
     clock = _Clock(verbose)
     loaded = [read_scan(path) for path in scans]
     provenance = map_provenance(scans, loaded, settings)
@@ -109,18 +59,7 @@ def command(
         raise UsageError(f"{scans[later]} holds the recording of {scans[earlier]}; give each recording once")
     clock.tell("read")
     with progress_bar("frames") as progress:
-        tactile_map = build_map(
-            loaded,
-            cell_mm=cell_mm,
-            pressure_window_kpa=pressure_window_kpa,
-            normalise=normalise,
-            latency_ms=latency_ms,
-            plane_radius_mm=None if plane_radius_mm == "all" else plane_radius_mm,
-            flat_field=flat_field,
-            register_strokes=register_strokes,
-            every=every,
-            progress=progress,
-        )
+        tactile_map = build_map(loaded, **options, progress=progress)
     clock.tell("map")
     write_map(output, tactile_map, provenance=provenance, force=force)
     try:

@@ -15,7 +15,8 @@ from tactile_bayes.api.settings import Settings
 from tactile_bayes.declarations import Record, default_of, extra_of, kinds, meaning_of, range_of, value_kind
 from tactile_bayes.errors import UsageError, number_words
 from tactile_bayes.files.atomic import Format, check_suffix, same_file
-from tactile_bayes.presets import HEADS, PRESSURE_WINDOW_KPA
+from tactile_bayes.options import MapOptions
+from tactile_bayes.presets import HEADS
 
 # --- Paths on the command line: an output may be neither an input nor another output of the same command.
 
@@ -260,12 +261,16 @@ def _option(record: type[Record], name: str, attributes: Mapping[str, Any]) -> D
         of_field |= {"type": FilePath() if extra.get("path") else _click_type(get_args(bare)[0] if pairs else kind)}
         of_field |= {"multiple": True} if pairs else {}
         of_field |= {"default": default, "show_default": True} if shown else {}
+        if isinstance(of_field["type"], NumberOr):
+            of_field["default"] = default if isinstance(default, str) else f"{default:g}"
     return click.option(flag, name, **{**of_field, **attributes})
 
 
 def _click_type(kind: Any) -> Any:
     """What click makes of a value, by what is declared for it."""
     bare = value_kind(kind)
+    if words := [word for one in get_args(bare) if get_origin(one) is Literal for word in get_args(one)]:
+        return NumberOr(*words)
     if get_origin(bare) is Literal:
         return click.Choice(get_args(bare))
     if get_origin(bare) is tuple:
@@ -289,14 +294,7 @@ SESSION = click.option(
     help="Facts of the exam for the scan: subject, side, posture, examiner, visit and more, in plain text.",
 )
 JSON = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-PRESSURE_WINDOW = click.option(
-    "--pressure-window-kpa",
-    type=(float, float),
-    metavar="LOW HIGH",
-    default=PRESSURE_WINDOW_KPA,
-    show_default=True,
-    help="Leave out frames whose mean pressure lies outside.",
-)
+PRESSURE_WINDOW = takes(MapOptions, "pressure_window_kpa")
 SPEED = click.option(
     "--speed",
     type=FiniteRange(0.01, 100.0),

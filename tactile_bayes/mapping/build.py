@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from tactile_bayes.errors import BadDataError, UsageError, check_choice, check_number
+from tactile_bayes.errors import BadDataError, check_number
 from tactile_bayes.findings import Finding, by_weight
 from tactile_bayes.geometry import FloatArray, Plane, apply, inverse, patient_from_plane
 from tactile_bayes.mapping.accumulate import Accumulated, Progress, accumulate, add_all, no_progress, sources_of
@@ -29,7 +30,7 @@ from tactile_bayes.mapping.select import (
 )
 from tactile_bayes.mapping.strokes import StrokeShift, mobility, stroke_count, stroke_lag_figures
 from tactile_bayes.mapping.strokes import register_strokes as find_shifts
-from tactile_bayes.presets import CELL_MM, DEFAULT_NORMALISE, NORMALISE, PRESSURE_WINDOW_KPA
+from tactile_bayes.options import MapOptions
 from tactile_bayes.scan import HeadShape, Scan
 
 # --- Frames near the mass, to which the paper fits its plane.
@@ -203,16 +204,9 @@ _SHARED_FACTS = ("subject", "side", "posture")
 def build_map(
     scans: Scan | Sequence[Scan],
     *,
-    cell_mm: float = CELL_MM,
-    pressure_window_kpa: tuple[float, float] = PRESSURE_WINDOW_KPA,
-    normalise: str = DEFAULT_NORMALISE,
-    latency_ms: float | str = 0.0,
     max_pose_gap_ms: float = MAX_POSE_GAP_MS,
-    plane_radius_mm: float | str | None = None,
-    flat_field: bool = False,
-    register_strokes: bool = False,
-    every: int = 1,
     progress: Progress = no_progress,
+    **options: Any,
 ) -> TactileMap:
     """Build the tactile map of one scan, or of several scans of one examination on a common plane.
 
@@ -220,27 +214,12 @@ def build_map(
     ----------
     scans
         With the tracker's base and the patient unmoved between them.
-    cell_mm
-        Side of the square cells.
-    pressure_window_kpa
-        Frames whose mean lies outside are left out.
-    normalise
-        ``"mean"`` (the paper), ``"gain"`` or ``"none"``; see `tactile_bayes.mapping.accumulate.accumulate`.
-    latency_ms
-        By how much a pose's stamp is late against the frames; ``"auto"`` finds it from the scans.
     max_pose_gap_ms
         Frames between two distinct poses further apart than this are left out.
-    plane_radius_mm
-        Fit the plane to the frames within this distance of the mass, ``"auto"`` to those whose array can reach it;
-        None to all frames used.
-    flat_field
-        Take off the head's own response, found from the frames that saw no lump.
-    register_strokes
-        Shift the strokes onto each other before they are averaged, for a lump that follows the head.
-    every
-        Use one frame of every so many: quicker, and noisier.
     progress
         Called with frames done and frames in all, anew in each pass over the scans.
+    **options
+        As of `options.MapOptions`.
 
     Raises
     ------
@@ -253,39 +232,38 @@ def build_map(
     rest by their mean, (iii) project and average. All sums are over whole numbers: the order of frames and scans does
     not change a bit of the map.
     """
-    _check_options(cell_mm, pressure_window_kpa, normalise, latency_ms, plane_radius_mm, max_pose_gap_ms, every)
+    how = MapOptions(**options)
+    check_number("max_pose_gap_ms", max_pose_gap_ms, 0, open_ends=True)
     given = [scans] if isinstance(scans, Scan) else list(scans)
-    parts = [every_nth(scan, every) for scan in given]
-    if latency_ms == "auto" and register_strokes:
-        raise UsageError(
-            "a lump that follows the head mimics a latency; with register_strokes give latency_ms a number"
-        )
+    parts = [every_nth(scan, how.every) for scan in given]
     _check_same_examination(parts)
-    rules = _Rules(_window(pressure_window_kpa), max_pose_gap_ms)
-    figures: dict[str, float] = {} if every == 1 else {"frames_every": float(every)}
-    late_ms = 0.0 if isinstance(latency_ms, str) else float(latency_ms)
+    rules = _Rules(_window(how.pressure_window_kpa), max_pose_gap_ms)
+    figures: dict[str, float] = {} if how.every == 1 else {"frames_every": float(how.every)}
+    late_ms = 0.0 if isinstance(how.latency_ms, str) else float(how.latency_ms)
     selections = rules.select(parts, late_ms)
     figures |= head_profile_figures(selections)
-    if flat_field:
+    if how.flat_field:
         selections = _flattened(selections, rules, late_ms, figures)
-    if isinstance(latency_ms, str):
-        late_ms = _latency(selections, rules, cell_mm, figures)
+    if how.latency_ms == "auto":
+        late_ms = _latency(selections, rules, how.cell_mm, figures)
         selections = rules.select([part.scan for part in selections], late_ms)
     figures |= check_convention(selections)
     plane = _plane(selections)
-    if plane_radius_mm is not None:
-        radius = None if isinstance(plane_radius_mm, str) else plane_radius_mm
+    if how.plane_radius_mm != "all":
+        radius = None if how.plane_radius_mm == "auto" else how.plane_radius_mm
         plane, near = local_plane(selections, plane, radius_mm=radius)
         figures.update(near)
-    sources = sources_of(selections, plane_from_base=plane.plane_from_base, cell_mm=cell_mm)
-    if register_strokes:
+    sources = sources_of(selections, plane_from_base=plane.plane_from_base, cell_mm=how.cell_mm)
+    if how.register_strokes:
         sources, strokes = find_shifts(sources)
         figures.update(stroke_figures(strokes))
-    done = accumulate(sources, cell_mm=cell_mm, normalise=normalise, progress=progress)
+    done = accumulate(sources, cell_mm=how.cell_mm, normalise=how.normalise, progress=progress)
     figures.update(shared_frame_figures(sources, done.levels, done.sums))
     figures |= evenness_figures(selections, plane) | stroke_lag_figures(sources)
     figures["stroke_count"] = float(stroke_count(sources))
-    recipe = MapRecipe("scan", normalise, float(cell_mm), rules.window_kpa, late_ms, flat_field, register_strokes)
+    recipe = MapRecipe(
+        "scan", how.normalise, float(how.cell_mm), rules.window_kpa, late_ms, how.flat_field, how.register_strokes
+    )
     return _as_map(done, selections, plane, recipe, figures, findings=_of_scans(given))
 
 
@@ -373,33 +351,6 @@ def _check_same_examination(scans: list[Scan]) -> None:
             raise BadDataError(
                 f"the scans differ in {name} ({', '.join(values)})", way_out="build one map per examination"
             )
-
-
-def _check_options(
-    cell_mm: float,
-    window: tuple[float, float],
-    normalise: str,
-    latency_ms: float | str,
-    plane_radius_mm: float | str | None,
-    max_pose_gap_ms: float,
-    every: int,
-) -> None:
-    check_number("cell_mm", cell_mm, 0.01, 50)
-    if isinstance(window, str) or np.shape(window) != (2,):
-        raise UsageError(f"pressure_window_kpa is {window!r}; give two rising pressures, in kPa")
-    for end in window:
-        check_number("an end of pressure_window_kpa", end, 0)
-    if not window[0] < window[1]:
-        raise UsageError(f"pressure_window_kpa is {window}; give two rising pressures, in kPa")
-    check_choice("normalise", normalise, NORMALISE)
-    if normalise != "none" and not window[0] > 0:
-        raise UsageError("pressure_window_kpa starts at 0; frames are divided by their mean, give more")
-    if latency_ms != "auto":
-        check_number("latency_ms", latency_ms, -10_000, 10_000)
-    if plane_radius_mm not in (None, "auto"):
-        check_number("plane_radius_mm", plane_radius_mm, 0, open_ends=True)
-    check_number("max_pose_gap_ms", max_pose_gap_ms, 0, open_ends=True)
-    check_number("every", every, 1, whole=True)
 
 
 def _as_map(

@@ -80,7 +80,10 @@ CALLS: dict[str, tuple[Callable[..., Any], str]] = {
     "a scan twice": (lambda _: tb.build_map([tb.demo_scan(), tb.demo_scan()]), "scan 2 is the recording of scan 1"),
     "a scan and its file": (lambda _: tb.build_map([DEMO / "scan.mcap", tb.demo_scan()]), "would count twice"),
     "a cell as text": (lambda _: tb.build_map(tb.demo_scan(), cell_mm="2"), "cell_mm is '2'; give a number"),
-    "one end of a window": (lambda _: tb.build_map(tb.demo_scan(), pressure_window_kpa=5), "two rising pressures"),
+    "one end of a window": (
+        lambda _: tb.build_map(tb.demo_scan(), pressure_window_kpa=5),
+        "pressure_window_kpa is 5; give a list of 2",
+    ),
     "an estimate to pool": (lambda one: tb.pool(one), "pool takes several maps; give a list"),
     "nothing to pool": (lambda _: tb.pool(None), "maps is None; give a list"),  # type: ignore[arg-type]
     "days as a number": (lambda one: tb.compare(one, one, days=3), "days is 3; give a list"),  # type: ignore[arg-type]

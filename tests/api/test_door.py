@@ -20,11 +20,12 @@ from in_process import run_here
 import tactile_bayes as tb
 from tactile_bayes.api.trial_report import TrialSettings
 from tactile_bayes.cli import cli
+from tactile_bayes.declarations import names_of
 from tactile_bayes.errors import BadDataError, DeviceError, UsageError
 from tactile_bayes.files.documents import load_schema
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.scan_mcap import write_scan
-from tactile_bayes.mapping import build_map
+from tactile_bayes.options import MapOptions
 from tactile_bayes.presets import RESEARCH_USE
 
 DEMO = Path(tb.__file__).parent / "demo"
@@ -80,10 +81,8 @@ def test_the_defaults_are_the_command_lines() -> None:
     trial, shown = TrialSettings(), defaults_of("validate", "t.csv", "--excision", "e.csv")
     for name in ("intervals", "resamples", "seed", "error_ratio", "check_intervals", "bayes"):
         assert getattr(trial, name) == shown[name]
-    by_hand = {name: one.default for name, one in inspect.signature(build_map).parameters.items()}
     shown = defaults_of("map", "s.mcap", "-o", "m.nc")
-    for name in ("cell_mm", "pressure_window_kpa", "normalise", "latency_ms", "flat_field", "register_strokes"):
-        assert by_hand[name] == shown[name], name
+    assert MapOptions(**{name: shown[name] for name in names_of(MapOptions)}) == MapOptions()
 
 
 def test_a_map_from_python_names_its_scans_as_the_command_lines_does(folder: Path, tmp_path: Path) -> None:

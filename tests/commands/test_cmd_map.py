@@ -112,7 +112,7 @@ REFUSED = {
     "a scan twice": (["one.mcap", "one.mcap"], 2, "given twice"),
     "an unknown way": (["one.mcap", "--normalise", "median"], 2, "'mean', 'gain', 'none'"),
     "no window": (["one.mcap", "--pressure-window-kpa", "9", "3"], 2, "two rising pressures"),
-    "no cell": (["one.mcap", "--cell-mm", "0"], 2, "cell_mm is 0; give a number from 0.01 to 50"),
+    "no cell": (["one.mcap", "--cell-mm", "0"], 2, "'--cell-mm': '0' is not a number from 0.01 to 50"),
     "figure over the map": (["one.mcap", "--figure", "map.nc"], 2, "written as one of .png, .pdf, .svg"),
     "no directory": (["one.mcap", "--figure", "nowhere/map.png"], 2, "nowhere is not a directory"),
 }

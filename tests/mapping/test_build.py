@@ -311,10 +311,10 @@ def test_scans_without_a_map_are_refused_in_one_line(make, message):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"cell_mm": 0.0}, "cell_mm is 0; give a number from 0.01 to 50"),
+        ({"cell_mm": 0.0}, "cell_mm is 0.0; give a number from 0.01 to 50"),
         ({"cell_mm": float("nan")}, "cell_mm is nan"),
         ({"cell_mm": "2"}, "cell_mm is '2'; give a number"),
-        ({"pressure_window_kpa": 5.0}, "two rising pressures"),
+        ({"pressure_window_kpa": 5.0}, "pressure_window_kpa is 5.0; give a list of 2"),
         ({"pressure_window_kpa": (14.0, 5.0)}, "two rising pressures"),
         ({"pressure_window_kpa": (0.0, 5.0)}, "divided by their mean"),
         ({"normalise": "median"}, "give one of mean, gain, none"),
