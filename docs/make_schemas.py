@@ -7,8 +7,10 @@ from pathlib import Path
 
 from tactile_bayes.api.settings import SettingsFile
 from tactile_bayes.declarations import Record, schema_of
+from tactile_bayes.files.column_map import ColumnMap
 from tactile_bayes.files.documents import Protocol
 from tactile_bayes.files.instrument_json import HeadFile
+from tactile_bayes.files.repeatability_json import RepeatabilityFile
 from tactile_bayes.files.scene_toml import SceneFile
 from tactile_bayes.files.size_json import Eq6File, PopulationFile, SiteFile
 from tactile_bayes.studies.population import BodiesFile
@@ -16,12 +18,14 @@ from tactile_bayes.studies.population import BodiesFile
 SCHEMAS = Path(__file__).resolve().parent.parent / "data_schema"
 OF_JSON: dict[str, type[Record]] = {
     "head.schema.json": HeadFile,
+    "repeatability.schema.json": RepeatabilityFile,
     "size_calibration.schema.json": Eq6File,
     "size_population.schema.json": PopulationFile,
     "size_site.schema.json": SiteFile,
 }
 OF_TOML: dict[str, type[Record]] = {
     "bodies.schema.json": BodiesFile,
+    "column_map.schema.json": ColumnMap,
     "protocol.schema.json": Protocol,
     "scene.schema.json": SceneFile,
     "settings.schema.json": SettingsFile,

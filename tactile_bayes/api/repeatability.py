@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from tactile_bayes.declarations import replace, to_plain
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.atomic import sha256
 from tactile_bayes.files.campaign_names import DONE, ESTIMATE, EXAMS, SHAPE, exam_name, mass_name
@@ -139,7 +139,7 @@ def learn_from_exams(
         When the calibration's file is not found, or it is not learned over bodies.
     """
     from tactile_bayes.files.provenance import Provenance
-    from tactile_bayes.files.repeatability_json import repeatability_document
+    from tactile_bayes.files.repeatability_json import HalfWidth, RepeatedMass, repeatability_document
     from tactile_bayes.size.learn.site import FEWEST_MASSES, PRIOR_LOG_SD, PRIOR_MEDIAN, learn_repeatability
 
     groups, left_out = _repeats(exams)
@@ -156,19 +156,19 @@ def learn_from_exams(
         normalise=calibration.recipe.normalise,
     )
     entries = [
-        {
-            "name": mass.name,
-            "exams": [repeat.exam.name for repeat in group],
-            "log_size": [to_plain(value) for value in mass.centre],
-            "map_sd": [to_plain(math.sqrt(value)) for value in mass.noise],
-            "by_chance": to_plain(chance),
-        }
+        RepeatedMass(
+            name=mass.name,
+            exams=[repeat.exam.name for repeat in group],
+            log_size=list(mass.centre),
+            map_sd=[math.sqrt(value) for value in mass.noise],
+            by_chance=chance,
+        )
         for mass, group, chance in zip(masses, groups, learned.by_chance, strict=True)
     ]
     settings = {"prior": {"median": PRIOR_MEDIAN, "log_sd": PRIOR_LOG_SD}}
     inputs = {f"draws_{i}": repeat.digest for i, repeat in enumerate(one_by_one, start=1)}
     provenance = Provenance(COMMAND, settings, {"size_calibration": digest, **inputs})
-    half_width = _half_widths(one_by_one, found.sd)
+    half_width = HalfWidth(**_half_widths(one_by_one, found.sd))
     document = repeatability_document(
         found, repeats=entries, left_out=left_out, half_width=half_width, provenance=provenance
     )

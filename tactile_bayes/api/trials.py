@@ -69,7 +69,7 @@ def load_trial(
         Whether the trial is tidy whatever the mapping holds.
     """
     sizes = read_excision(excision, columns)
-    if columns is None or tidy_trial or isinstance(trial, Sheet) or "reading" not in read_mapping(columns):
+    if columns is None or tidy_trial or isinstance(trial, Sheet) or read_mapping(columns).reading is None:
         table = read_table(trial, "trial.table.json")
     else:
         table = read_wide(trial, columns)
@@ -92,7 +92,7 @@ def load_trial(
 
 def read_excision(excision: Path | Sheet, columns: Path | None) -> Table:
     """Sizes after excision: from a wide table where the mapping has ``[excision]``, otherwise from a tidy one."""
-    if columns is None or not isinstance(excision, Path) or "excision" not in read_mapping(columns):
+    if columns is None or not isinstance(excision, Path) or read_mapping(columns).excision is None:
         return read_table(excision, "excision.table.json")
     return read_wide_excision(excision, columns)
 

@@ -6,17 +6,83 @@ word that the table writes for a mass that was looked for and not found.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from datetime import date
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
+from tactile_bayes.declarations import Meta, Record
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.files.documents import check_document, load_toml
+from tactile_bayes.files.documents import load_toml, parse_record
 from tactile_bayes.files.tables import RawTable, Table, parse_date, read_raw
 
 _EXCISION = ("patient", "mass", "ex_vivo_mm", "ex_vivo_second_mm", "sd_mm", "date")
 _FACTOR = {"mm": 1.0, "cm": 10.0, "in": 25.4}
+Unit = Literal["mm", "cm", "in"]
+Column = Annotated[str, Meta(min_length=1)]
+Modality = Annotated[
+    str, Meta(pattern="^[a-z][a-z0-9_-]*$", extra={"words": "small letters, digits, _ and -, a letter first"})
+]
+
+
+class ReadingColumns(Record, kw_only=True):
+    """Columns of a modality's readings."""
+
+    modality: Modality
+    replicate: Annotated[int, Meta(ge=1)] = 1
+    size: Annotated[Column, Meta(description="Column of the size.")]
+    unit: Unit | None = None
+    sd: Column | None = None
+    low: Column | None = None
+    high: Column | None = None
+    probability: Annotated[float, Meta(gt=0, lt=1)] | None = None
+    reader: Column | None = None
+    visit: Annotated[Column, Meta(description="Code of the visit that these readings are of, such as 1.")] | None = None
+    date: Annotated[Column, Meta(description="Column of the readings' date.")] | None = None
+
+
+class ExcisionColumns(Record):
+    """Columns of the ex-vivo sizes, when --excision names a wide table too."""
+
+    size: Column
+    second: Column | None = None
+    sd: Column | None = None
+    unit: Unit | None = None
+    date: Annotated[Column, Meta(description="Column of the date of excision.")] | None = None
+
+    def names(self) -> list[str]:
+        """Columns of the wide table that are named."""
+        return [name for name in (self.size, self.second, self.sd, self.date) if name is not None]
+
+
+class ColumnMap(Record):
+    """Which column of a wide table holds which reading."""
+
+    patient: Annotated[Column, Meta(description="Column of the coded patient.")]
+    mass: (
+        Annotated[Column, Meta(description="Column of the mass within the patient; without it every patient has one.")]
+        | None
+    ) = None
+    unit: Annotated[Unit, Meta(description="Of all sizes, unless a reading says otherwise.")] = "mm"
+    not_detected: Annotated[
+        tuple[str, ...], Meta(description="Words that the table writes for a mass looked for and not found.")
+    ] = ()
+    not_done: Annotated[
+        tuple[str, ...], Meta(description="Words for a mass not looked for; a blank is one already.")
+    ] = ()
+    synthetic: Annotated[bool, Meta(description="Whether all readings were made by a generator.")] | None = None
+    reading: (
+        Annotated[
+            tuple[ReadingColumns, ...],
+            Meta(min_length=1, description="One for each modality and replicate of a wide table of readings."),
+        ]
+        | None
+    ) = None
+    excision: ExcisionColumns | None = None
+
+    def key_columns(self) -> list[str]:
+        """Columns of the patient and of the mass."""
+        return [self.patient] if self.mass is None else [self.patient, self.mass]
 
 
 def read_wide(path: Path, mapping_path: Path) -> Table:
@@ -28,16 +94,16 @@ def read_wide(path: Path, mapping_path: Path) -> Table:
         At the first fault of the mapping or of a cell, naming file, line and column of the wide table.
     """
     mapping = read_mapping(mapping_path)
-    if "reading" not in mapping:
+    if mapping.reading is None:
         way_out = "add one for each modality, or give a table of readings that is tidy"
         raise BadDataError("has no [[reading]]", way_out=way_out, path=str(mapping_path))
     raw = read_raw(path)
-    _check_columns(raw, [*_key_columns(mapping), *_reading_columns(mapping)])
+    _check_columns(raw, [*mapping.key_columns(), *_reading_columns(mapping.reading)])
     columns: dict[str, list[Any]] = {}
     line_numbers = []
     for line, row in zip(raw.line_numbers, raw.rows, strict=True):
-        for reading in _readings(raw, line, row, mapping):
-            for name, value in reading.items():
+        for reading in mapping.reading:
+            for name, value in _reading(raw, line, row, reading, mapping).items():
                 columns.setdefault(name, []).append(value)
             line_numbers.append(line)
     table = Table(path=path, columns=columns, line_numbers=line_numbers)
@@ -55,52 +121,41 @@ def read_wide_excision(path: Path, mapping_path: Path) -> Table:
         mass.
     """
     mapping = read_mapping(mapping_path)
-    if "excision" not in mapping:
+    if mapping.excision is None:
         way_out = "add it, with size as the column of the sizes"
         raise BadDataError("has no table [excision]", way_out=way_out, path=str(mapping_path))
     raw = read_raw(path)
-    excision = mapping["excision"]
-    _check_columns(raw, [*_key_columns(mapping), *excision_columns(excision)])
+    excision = mapping.excision
+    _check_columns(raw, [*mapping.key_columns(), *excision.names()])
     columns: dict[str, list[Any]] = {name: [] for name in _EXCISION}
-    factor = _FACTOR[excision.get("unit", mapping.get("unit", "mm"))]
+    factor = _FACTOR[excision.unit or mapping.unit]
     kept = []
     for line, row in zip(raw.line_numbers, raw.rows, strict=True):
-        if not row[excision["size"]]:
+        if not row[excision.size]:
             continue
         kept.append(line)
         patient, mass = _key(raw, line, row, mapping)
-        size = factor * _positive(raw, line, excision["size"], row[excision["size"]])
-        second, sd = (_number(raw, line, row, excision, key, factor) for key in ("second", "sd"))
-        day = _date(raw, line, row, excision)
+        size = factor * _positive(raw, line, excision.size, row[excision.size])
+        second, sd = (_number(raw, line, row, column, factor) for column in (excision.second, excision.sd))
+        day = _date(raw, line, row, excision.date)
         for name, value in zip(_EXCISION, (patient, mass, size, second, sd, day), strict=True):
             columns[name].append(value)
     if not kept:
-        what = f"column {excision['size']}: holds no size"
+        what = f"column {excision.size}: holds no size"
         raise BadDataError(what, way_out="correct the mapping or the table", path=str(path))
     table = Table(path=path, columns=columns, line_numbers=kept)
     _check_keys(table, ("patient", "mass"))
     return table
 
 
-def excision_columns(excision: Mapping[str, Any]) -> list[str]:
-    """Columns of the wide table that the mapping's ``[excision]`` names."""
-    return [excision[key] for key in ("size", "second", "sd", "date") if key in excision]
+def read_mapping(path: Path) -> ColumnMap:
+    """Read the mapping; for the errors see `files.documents.read_record`."""
+    return parse_record(load_toml(path, way_out="see the column mapping in the tutorial"), ColumnMap, path=path)
 
 
-def read_mapping(path: Path) -> dict[str, Any]:
-    """Read the mapping and check it against ``column_map.schema.json``."""
-    document = load_toml(path, way_out="see the column mapping in the tutorial")
-    check_document(document, "column_map.schema.json", path=path)
-    return document
-
-
-def _key_columns(mapping: Mapping[str, Any]) -> list[str]:
-    return [mapping[key] for key in ("patient", "mass") if key in mapping]
-
-
-def _reading_columns(mapping: Mapping[str, Any]) -> list[str]:
-    keys = ("size", "sd", "low", "high", "reader", "date")
-    return [reading[key] for reading in mapping["reading"] for key in keys if key in reading]
+def _reading_columns(readings: Sequence[ReadingColumns]) -> list[str]:
+    columns = [(one.size, one.sd, one.low, one.high, one.reader, one.date) for one in readings]
+    return [name for names in columns for name in names if name is not None]
 
 
 def _check_columns(table: RawTable, names: Sequence[str]) -> None:
@@ -110,69 +165,58 @@ def _check_columns(table: RawTable, names: Sequence[str]) -> None:
             raise _fault(table.path, 1, name, "is missing", f"correct the mapping; the table has {held}")
 
 
-def _readings(
-    table: RawTable, line: int, row: Mapping[str, str], mapping: Mapping[str, Any]
-) -> Iterator[dict[str, Any]]:
-    patient, mass = _key(table, line, row, mapping)
-    for reading in mapping["reading"]:
-        yield {"patient": patient, "mass": mass, **_reading(table, line, row, reading, mapping)}
-
-
-def _key(table: RawTable, line: int, row: Mapping[str, str], mapping: Mapping[str, Any]) -> tuple[str, str]:
+def _key(table: RawTable, line: int, row: Mapping[str, str], mapping: ColumnMap) -> tuple[str, str]:
     """Patient and mass of a row."""
-    for name in _key_columns(mapping):
+    for name in mapping.key_columns():
         if not row[name]:
             raise _fault(table.path, line, name, "is blank", "every row needs its patient and mass")
-    return row[mapping["patient"]], row[mapping["mass"]] if "mass" in mapping else "1"
+    return row[mapping.patient], "1" if mapping.mass is None else row[mapping.mass]
 
 
 def _reading(
-    table: RawTable, line: int, row: Mapping[str, str], reading: Mapping[str, Any], mapping: Mapping[str, Any]
+    table: RawTable, line: int, row: Mapping[str, str], reading: ReadingColumns, mapping: ColumnMap
 ) -> dict[str, Any]:
-    factor = _FACTOR[reading.get("unit", mapping.get("unit", "mm"))]
-    text = row[reading["size"]]
+    patient, mass = _key(table, line, row, mapping)
+    factor = _FACTOR[reading.unit or mapping.unit]
+    text = row[reading.size]
     status, size = "not_done", None
-    if text and text in mapping.get("not_detected", []):
+    if text and text in mapping.not_detected:
         status = "not_detected"
-    elif text and text not in mapping.get("not_done", []):
-        status, size = "detected", factor * _positive(table, line, reading["size"], text)
-    values = {key: _number(table, line, row, reading, key, factor) for key in ("sd", "low", "high")}
-    probability = reading.get("probability") if values["low"] is not None else None
-    if status == "detected" and values["low"] is not None and probability is None:
-        raise _fault(
-            table.path, line, reading["low"], "is an interval's end without probability", "add it to the mapping"
-        )
+    elif text and text not in mapping.not_done:
+        status, size = "detected", factor * _positive(table, line, reading.size, text)
+    sd, low, high = (_number(table, line, row, column, factor) for column in (reading.sd, reading.low, reading.high))
+    probability = None if low is None else reading.probability
+    if status == "detected" and reading.low and low is not None and probability is None:
+        raise _fault(table.path, line, reading.low, "is an interval's end without probability", "add it to the mapping")
     return {
-        "modality": reading["modality"],
-        "replicate": reading.get("replicate", 1),
+        "patient": patient,
+        "mass": mass,
+        "modality": reading.modality,
+        "replicate": reading.replicate,
         "size_mm": size,
         "status": status,
-        "sd_mm": values["sd"],
-        "low_mm": values["low"],
-        "high_mm": values["high"],
+        "sd_mm": sd,
+        "low_mm": low,
+        "high_mm": high,
         "probability": probability,
-        "reader": (row[reading["reader"]] or None) if "reader" in reading else None,
-        "visit": reading.get("visit"),
-        "date": _date(table, line, row, reading),
+        "reader": (row[reading.reader] or None) if reading.reader else None,
+        "visit": reading.visit,
+        "date": _date(table, line, row, reading.date),
         "posterior": None,
-        "synthetic": mapping.get("synthetic"),
+        "synthetic": mapping.synthetic,
     }
 
 
-def _number(
-    table: RawTable, line: int, row: Mapping[str, str], reading: Mapping[str, Any], key: str, factor: float
-) -> float | None:
-    if key not in reading or not row[reading[key]]:
-        return None
-    return factor * table.number(line, reading[key], row[reading[key]])
+def _number(table: RawTable, line: int, row: Mapping[str, str], column: str | None, factor: float) -> float | None:
+    return factor * table.number(line, column, row[column]) if column and row[column] else None
 
 
-def _date(table: RawTable, line: int, row: Mapping[str, str], columns: Mapping[str, Any]) -> date | None:
-    text = row[columns["date"]] if "date" in columns else ""
+def _date(table: RawTable, line: int, row: Mapping[str, str], column: str | None) -> date | None:
+    text = row[column] if column else ""
     try:
         return parse_date(text) if text else None
     except ValueError:
-        raise _fault(table.path, line, columns["date"], f"{text!r} is no date", "write it as 2026-03-01") from None
+        raise _fault(table.path, line, str(column), f"{text!r} is no date", "write it as 2026-03-01") from None
 
 
 def _positive(table: RawTable, line: int, column: str, text: str) -> float:
