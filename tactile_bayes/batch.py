@@ -10,13 +10,13 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
 from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from tactile_bayes import __version__
 from tactile_bayes.batch_store import BatchStore
+from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError, UsageError, one_line
 from tactile_bayes.shell import raise_if_asked
 
@@ -278,8 +278,7 @@ DIED_OFTEN = "several workers of the cluster ended over it (killed, perhaps for 
 CLUSTER_LOST = "the dask scheduler was lost before an answer came; start it again and run what is missing"
 
 
-@dataclass(frozen=True, slots=True)
-class Outcome(Generic[Result]):
+class Outcome(Record, Generic[Result]):
     """The outcome of one item: its result, or its error.
 
     Parameters

@@ -6,8 +6,7 @@ import difflib
 import math
 import numbers
 from collections.abc import Collection
-
-from tactile_bayes.records import dataclass
+from dataclasses import dataclass
 
 # --- Every error the program can explain in one line, each with the exit code it ends in.
 #

@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Final, Literal, get_args
 
-from tactile_bayes.declarations import as_dict, replace
+from tactile_bayes.declarations import Record, as_dict, replace
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.records import dataclass
 
 Severity = Literal["caution", "check"]
 Verdict = Literal["sound", "doubtful", "no_answer"]
@@ -58,8 +57,7 @@ LEADS: Final[Mapping[Severity, str]] = {"caution": "CAUTION: ", "check": "To che
 _WAY_OUT: Final = "give the file as this program wrote it"
 
 
-@dataclass(frozen=True, slots=True)
-class Finding:
+class Finding(Record):
     """Something that speaks against a result.
 
     Parameters

@@ -13,9 +13,8 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_bayes.declarations import Meta
+from tactile_bayes.declarations import Meta, Record
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.records import dataclass
 
 FloatArray = NDArray[np.float64]
 Vector = Annotated[FloatArray, Meta(extra_json_schema={"items": {"type": "number"}})]
@@ -106,8 +105,7 @@ def check_rigid(transform: FloatArray, *, name: str) -> None:
         )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Plane:
+class Plane(Record, eq=False):
     """A plane fitted to points, with how well it is determined.
 
     Parameters

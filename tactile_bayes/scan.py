@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import field
 from typing import Annotated, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_bayes.declarations import Meta, Record, from_plain, to_plain
+from tactile_bayes.declarations import Meta, Record, field, from_plain, settle, to_plain
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.findings import Finding
 from tactile_bayes.geometry import FloatArray, check_rigid
 from tactile_bayes.presets import HEAD_COLUMNS, HEAD_PITCH_MM, HEAD_RADIUS_MM, HEAD_ROWS, PRESSURE_RANGE_KPA
-from tactile_bayes.records import dataclass
 
 # --- Shape of a head's sensing face in a few numbers, by which a size calibration knows the maps it was made for.
 
@@ -203,8 +201,7 @@ def _check_times(time_s: FloatArray, *, name: str) -> FloatArray:
     return values
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class HeadGeometry:
+class HeadGeometry(Record, eq=False):
     """Where the taxels sit and how the tracker is mounted.
 
     Parameters
@@ -224,12 +221,11 @@ class HeadGeometry:
 
     def __post_init__(self) -> None:
         surface = _check_finite(self.surface_mm, name="surface_mm", shape=(None, None, 3))
-        object.__setattr__(self, "surface_mm", surface)
         if not 0 < self.pitch_mm < 100:
             raise BadDataError(f"pitch_mm is {self.pitch_mm}", way_out="it must be positive, in mm")
         transform = _check_finite(self.scanhead_from_tracker, name="scanhead_from_tracker", shape=(4, 4))
         check_rigid(transform, name="scanhead_from_tracker")
-        object.__setattr__(self, "scanhead_from_tracker", transform)
+        settle(self, surface_mm=surface, scanhead_from_tracker=transform)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -237,8 +233,7 @@ class HeadGeometry:
         return (self.surface_mm.shape[0], self.surface_mm.shape[1])
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ElementCalibration:
+class ElementCalibration(Record, eq=False):
     """Bladder calibration of each taxel: pressure in kPa = gain x counts + offset.
 
     Parameters
@@ -260,8 +255,7 @@ class ElementCalibration:
             raise BadDataError(
                 f"gain_kpa_per_count is negative at {index} ({gain[index]:.4g})", way_out="calibrate again"
             )
-        object.__setattr__(self, "gain_kpa_per_count", gain)
-        object.__setattr__(self, "offset_kpa", offset)
+        settle(self, gain_kpa_per_count=gain, offset_kpa=offset)
 
     def to_kpa(self, counts: CountArray) -> FloatArray:
         """Pressure in kPa of (n, rows, columns) counts; NaN where a reading is saturated (count or 34 kPa)."""
@@ -270,8 +264,7 @@ class ElementCalibration:
         return pressure
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PressureFrames:
+class PressureFrames(Record, eq=False):
     """Raw frames of the array.
 
     Parameters
@@ -286,15 +279,15 @@ class PressureFrames:
     counts: CountArray
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "time_s", _check_times(self.time_s, name="frame_time_s"))
-        if self.counts.dtype != np.uint16 or self.counts.ndim != 3 or len(self.counts) != len(self.time_s):
+        time = _check_times(self.time_s, name="frame_time_s")
+        if self.counts.dtype != np.uint16 or self.counts.ndim != 3 or len(self.counts) != len(time):
             raise BadDataError(
-                f"counts is {self.counts.dtype} of shape {self.counts.shape} for {len(self.time_s)} frame times",
+                f"counts is {self.counts.dtype} of shape {self.counts.shape} for {len(time)} frame times",
                 way_out="it must be uint16 (n, rows, columns), one frame per time",
             )
         view = self.counts.view()
         view.flags.writeable = False
-        object.__setattr__(self, "counts", view)
+        settle(self, time_s=time, counts=view)
 
     def __len__(self) -> int:
         return len(self.time_s)
@@ -307,8 +300,7 @@ class PressureFrames:
         return digest.hexdigest()
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class TrackerPoses:
+class TrackerPoses(Record, eq=False):
     """Poses of the tracker's sensor in `base`.
 
     Parameters
@@ -336,15 +328,13 @@ class TrackerPoses:
                 f"quaternion_wxyz has norm {norm[i]:.4g} at index {i} ({len(off)} in all depart from 1 by over 1 %)",
                 way_out="give unit quaternions, scalar first",
             )
-        for name, value in (("time_s", time), ("position_mm", position), ("quaternion_wxyz", quaternion)):
-            object.__setattr__(self, name, value)
+        settle(self, time_s=time, position_mm=position, quaternion_wxyz=quaternion)
 
     def __len__(self) -> int:
         return len(self.time_s)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Landmarks:
+class Landmarks(Record, eq=False):
     """Points touched just before the scan, in `base`, mm.
 
     Parameters
@@ -358,15 +348,15 @@ class Landmarks:
 
     sternal_notch_mm: FloatArray
     xiphoid_mm: FloatArray
-    spread_mm: float | None = field(default=None, kw_only=True)
-    nipple_mm: FloatArray | None = field(default=None, kw_only=True)
+    spread_mm: float | None = None
+    nipple_mm: FloatArray | None = None
 
     def __post_init__(self) -> None:
         if self.spread_mm is not None and not 0 <= self.spread_mm < np.inf:
             raise BadDataError(f"spread_mm is {self.spread_mm}", way_out="give a distance of 0 mm or more")
         for name in ("sternal_notch_mm", "xiphoid_mm", "nipple_mm"):
             if getattr(self, name) is not None:
-                object.__setattr__(self, name, _check_finite(getattr(self, name), name=name, shape=(3,)))
+                settle(self, **{name: _check_finite(getattr(self, name), name=name, shape=(3,))})
 
     def points(self) -> dict[str, FloatArray]:
         """(3,) points in `base` by name: ``sternal_notch``, ``xiphoid``, and ``nipple`` where it was touched."""
@@ -374,8 +364,7 @@ class Landmarks:
         return named if self.nipple_mm is None else {**named, "nipple": self.nipple_mm}
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Scan:
+class Scan(Record, eq=False):
     """All data of one scan.
 
     Parameters

@@ -19,12 +19,11 @@ from tactile_bayes.api.pooled import common_calibration, place_of
 from tactile_bayes.api.repeatability import check_repeatability, repeatability_digest
 from tactile_bayes.api.settings import GROWN_BY, Comparing, Settings, refuse_checkpoint, times_of
 from tactile_bayes.api.sized import Draws
-from tactile_bayes.declarations import replace
+from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import EXIT_DONE, EXIT_NO_ESTIMATE, UsageError
 from tactile_bayes.files.provenance import Provenance, hash_inputs, repeated_scans, scans_of
 from tactile_bayes.findings import Finding, Verdict, by_weight, finding_lines, verdict
 from tactile_bayes.presets import REGISTRATION_MM, RESEARCH_USE
-from tactile_bayes.records import dataclass
 from tactile_bayes.report.compare import compare_document, compare_summary, compare_text
 from tactile_bayes.report.compare_figure import DrawnMap, draw_comparison
 from tactile_bayes.report.pooled import disagreement, fat_apart
@@ -55,8 +54,7 @@ if TYPE_CHECKING:
 # --- Two visits and more compared: whether they are of one mass, and the change of its size.
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ComparedOutcome:
+class ComparedOutcome(Record, eq=False):
     """A comparison with its JSON object."""
 
     compared: Compared

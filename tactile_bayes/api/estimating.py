@@ -9,12 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 from tactile_bayes.api.repeatability import check_repeatability, repeatability_digest
 from tactile_bayes.api.settings import Settings
-from tactile_bayes.declarations import replace
+from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import EXIT_DONE, EXIT_NO_ESTIMATE, NO_LUMP, BadDataError, TactileBayesError
 from tactile_bayes.findings import Finding, by_weight, findings_in
 from tactile_bayes.options import PRIORS
 from tactile_bayes.presets import FIT_RADIUS_MM
-from tactile_bayes.records import dataclass
 
 if TYPE_CHECKING:
     from tactile_bayes.files.provenance import Provenance
@@ -33,8 +32,7 @@ Progress = Callable[[int, int], None]
 Notice = Callable[[str], None]
 
 
-@dataclass(frozen=True, slots=True)
-class Answer:
+class Answer(Record):
     """Answer for one map: its JSON object and its text, or an error with its exit code.
 
     `text` is the report in at most 12 lines, `full_text` all of it. `shape` holds what pooling
@@ -57,8 +55,7 @@ class Answer:
         return () if self.document is None else findings_in(self.document["findings"])
 
 
-@dataclass(frozen=True, slots=True)
-class NoSize:
+class NoSize(Record):
     """Reason for widths without a size where no calibration was named, and a remedy."""
 
     reason: str
@@ -73,8 +70,7 @@ _LEAST_SQUARES = NoSize(
 )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Outcome:
+class Outcome(Record, eq=False):
     """One map with its estimate, provenance and settings."""
 
     tactile_map: TactileMap

@@ -11,7 +11,7 @@ from typing import Any, Final
 from tactile_bayes.api.estimating import Answer, answer_of, estimate_one
 from tactile_bayes.api.pooled import check_one_mass, elsewhere, pool_answers
 from tactile_bayes.api.settings import Settings, refuse_checkpoint
-from tactile_bayes.declarations import replace
+from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.atomic import given_twice, sha256
 from tactile_bayes.files.documents import load_json
@@ -21,7 +21,6 @@ from tactile_bayes.files.posterior_nc import is_posterior, read_estimate
 from tactile_bayes.files.provenance import scans_of
 from tactile_bayes.files.reading import HDF5_MAGIC, open_input
 from tactile_bayes.mapping.map import TactileMap
-from tactile_bayes.records import dataclass
 from tactile_bayes.report.exam_words import Exam, exam_map
 from tactile_bayes.report.quantities import side_of
 
@@ -31,8 +30,7 @@ _LONGEST: Final = {"title": 60, "name": 50}
 _DATE: Final = re.compile(r"\d{4}-\d{2}-\d{2}", re.ASCII)
 
 
-@dataclass(frozen=True, slots=True)
-class Given:
+class Given(Record):
     """What was given for the page besides maps: title, name and date, empty where they were not.
 
     Raises
@@ -64,8 +62,7 @@ def _is_date(text: str) -> bool:
         return False
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class EstimatedMap:
+class EstimatedMap(Record, eq=False):
     """A map with its answer and the scans it was made from."""
 
     tactile_map: TactileMap
@@ -73,8 +70,7 @@ class EstimatedMap:
     scans: Scans
 
 
-@dataclass(frozen=True, slots=True)
-class ExamFiles:
+class ExamFiles(Record):
     """Files of a page: maps, and estimates as JSON or as a posterior's file."""
 
     maps: tuple[Path, ...]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -11,7 +10,7 @@ from typing import Any
 from tactile_bayes.api.arguments import check_keywords, door
 from tactile_bayes.api.estimates import PooledSize, SizeEstimate, listed
 from tactile_bayes.api.maps import Map, PathLike, path_of
-from tactile_bayes.declarations import replace
+from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import UsageError, check_choice
 from tactile_bayes.exports.exam import EstimateFile, MapFile, estimate_of, read_exam, shared_facts
 from tactile_bayes.exports.identity import identity_of
@@ -24,8 +23,7 @@ _IN_PYTHON = Path("what was given in Python")
 """What messages call a map or an estimate that is in no file."""
 
 
-@dataclass(frozen=True, slots=True)
-class ExportedFiles:
+class ExportedFiles(Record):
     """What an export wrote.
 
     Parameters

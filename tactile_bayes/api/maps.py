@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, overload
@@ -12,7 +11,7 @@ from typing import TYPE_CHECKING, Any, overload
 import numpy as np
 
 from tactile_bayes.api.arguments import check_keywords, door, plain
-from tactile_bayes.declarations import as_dict, names_of
+from tactile_bayes.declarations import Record, as_dict, names_of
 from tactile_bayes.errors import UsageError, check_number
 from tactile_bayes.files.atomic import Format, check_suffix, sha256
 from tactile_bayes.files.map_nc import read_map_and_scans, write_map
@@ -123,8 +122,7 @@ def exam_facts(paths: Sequence[Path], scans: Sequence[Scan]) -> list[dict[str, s
 _DEMO = Path(__file__).resolve().parents[1] / "demo" / "scan.mcap"
 
 
-@dataclass(frozen=True, slots=True, eq=False, repr=False)
-class Map:
+class Map(Record, eq=False):
     """A tactile map: mean normalised pressure in square cells of the best-fit plane.
 
     Parameters

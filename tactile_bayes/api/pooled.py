@@ -12,7 +12,7 @@ import numpy as np
 from tactile_bayes.api.estimating import Answer, size_priors
 from tactile_bayes.api.repeatability import check_repeatability, repeatability_digest
 from tactile_bayes.api.settings import Settings
-from tactile_bayes.declarations import replace
+from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.provenance import Provenance, hash_inputs, scans_of
 from tactile_bayes.files.shipped import default_for, size_calibration_path
@@ -20,7 +20,6 @@ from tactile_bayes.files.size_json import read_size_calibration
 from tactile_bayes.options import PRIORS
 from tactile_bayes.posterior.estimate import way_to_head
 from tactile_bayes.presets import MATCH_MM
-from tactile_bayes.records import dataclass
 from tactile_bayes.report.pooled import pooled_document
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.pooling import DISAGREE, PooledEstimate, pool_maps
@@ -44,8 +43,7 @@ Document = Mapping[str, Any]
 MapPlace = tuple[float, float]
 
 
-@dataclass(frozen=True, slots=True)
-class _Mass:
+class _Mass(Record):
     """A mass of one map: its places in the patient and on the map, mm, and what ranks it."""
 
     patient_mm: MapPlace
@@ -157,8 +155,7 @@ def place_of(document: Document | None) -> PatientPlace | None:
 # --- One size from several maps of one mass.
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PooledOutcome:
+class PooledOutcome(Record, eq=False):
     """Size of one mass, with its JSON object and provenance."""
 
     pooled: PooledEstimate

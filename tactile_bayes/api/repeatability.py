@@ -7,11 +7,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from tactile_bayes.declarations import replace
+from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.atomic import sha256
 from tactile_bayes.files.campaign_names import DONE, ESTIMATE, EXAMS, SHAPE, exam_name, mass_name
-from tactile_bayes.records import dataclass
 
 if TYPE_CHECKING:
     from tactile_bayes.api.settings import Settings
@@ -25,8 +24,7 @@ _AGAIN: Final = "run the campaign again"
 _LEARN: Final = "learn one from exams that were sized so: `calibrate repeatability`; or leave --repeatability out"
 
 
-@dataclass(frozen=True, slots=True)
-class ExamFolder:
+class ExamFolder(Record):
     """An exam that was estimated, of a mass at a visit.
 
     Parameters
@@ -45,8 +43,7 @@ class ExamFolder:
     folder: Path
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class LearnedRepeatability:
+class LearnedRepeatability(Record, eq=False):
     """A repeatability and its JSON object, see data_schema/repeatability.schema.json."""
 
     repeatability: Repeatability
@@ -59,8 +56,7 @@ class LearnedRepeatability:
         write_repeatability(path, self.document, force=force)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Repeat:
+class _Repeat(Record, eq=False):
     """A repeated exam with a size.
 
     Parameters

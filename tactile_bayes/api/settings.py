@@ -7,7 +7,7 @@ from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
-from tactile_bayes.declarations import Meta, extra_of, kinds, part_of
+from tactile_bayes.declarations import Meta, Record, extra_of, kinds, part_of
 from tactile_bayes.errors import UsageError, check_number
 from tactile_bayes.options import PRIORS, BumpPrior
 from tactile_bayes.presets import (
@@ -20,7 +20,6 @@ from tactile_bayes.presets import (
     Rotation,
     SceneAsked,
 )
-from tactile_bayes.records import dataclass
 
 if TYPE_CHECKING:
     from tactile_bayes.size.pooling import Calibration
@@ -241,8 +240,7 @@ GROWN_BY = (0.2,)
 """Shares of the diameter that a growth's probability is told for; 20 % is the step of RECIST 1.1."""
 
 
-@dataclass(frozen=True, slots=True)
-class Comparing:
+class Comparing(Record):
     """How visits are compared.
 
     Parameters

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +13,7 @@ import numpy as np
 from tactile_bayes.api.estimating import estimate_file, pooling_shape
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.api.size_calibration import table_recipe
-from tactile_bayes.declarations import replace
+from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.documents import load_json
 from tactile_bayes.files.provenance import Provenance, hash_inputs
@@ -37,8 +36,7 @@ HARDEST_RATIO = 100.0
 """Largest E2/E1 of the simulated bodies; a harder lump counts as this one, because widths hardly change beyond it."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Corrected:
+class Corrected(Record, eq=False):
     """A corrected calibration, with what its file holds.
 
     Parameters
@@ -66,8 +64,7 @@ class Corrected:
         write_size_calibration(path, self.calibration, base=self.base, provenance=provenance, force=force)
 
 
-@dataclass(frozen=True, slots=True)
-class _Phantoms:
+class _Phantoms(Record):
     maps: list[PhantomMap]
     left_out: list[str]
     inputs: dict[str, Path]

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tactile_bayes.api.arguments import door
+from tactile_bayes.declarations import Record
 from tactile_bayes.errors import UsageError, check_number
 from tactile_bayes.findings import Finding, Verdict, finding_lines, verdict
 from tactile_bayes.geometry import FloatArray
@@ -29,8 +30,7 @@ if TYPE_CHECKING:
 # --- Posterior draws of one quantity, with its median and intervals.
 
 
-@dataclass(frozen=True, slots=True, eq=False, repr=False)
-class Draws:
+class Draws(Record, eq=False):
     """Posterior draws of one quantity.
 
     Parameters

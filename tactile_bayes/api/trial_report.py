@@ -5,10 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
-from tactile_bayes.declarations import as_dict
+from tactile_bayes.declarations import Record, as_dict
 from tactile_bayes.errors import check_choice, check_number
 from tactile_bayes.presets import INTERVAL, RESEARCH_USE
-from tactile_bayes.records import dataclass
 
 if TYPE_CHECKING:
     from tactile_bayes.api.trials import TrialInputs
@@ -21,8 +20,7 @@ IntervalMethod = Literal["corrected", "jackknife", "bca"]
 SCHEMA = "tactile-bayes/validate/1"
 
 
-@dataclass(frozen=True, slots=True)
-class TrialSettings:
+class TrialSettings(Record):
     """Settings of the analysis; each is part of the provenance."""
 
     intervals: IntervalMethod = "corrected"
@@ -40,8 +38,7 @@ class TrialSettings:
         check_number("check_intervals", self.check_intervals, 0, whole=True)
 
 
-@dataclass(frozen=True, slots=True)
-class TrialOutcome:
+class TrialOutcome(Record):
     """Results of an analysis."""
 
     report: TrialReport

@@ -14,7 +14,7 @@ from tactile_bayes.api.repeatability import exams_in, learn_from_exams
 from tactile_bayes.api.site_correction import correct_size
 from tactile_bayes.api.size_calibration import FORMS, is_population, learn_eq6, learn_population
 from tactile_bayes.api.trial_report import TrialSettings, analyse
-from tactile_bayes.declarations import names_of
+from tactile_bayes.declarations import Record, names_of
 from tactile_bayes.errors import UsageError, check_choice, check_number
 from tactile_bayes.files.column_map import read_mapping, read_wide, read_wide_excision
 from tactile_bayes.files.estimate_json import fill_from_posteriors
@@ -41,8 +41,7 @@ if TYPE_CHECKING:
 # --- Input of `validate` and `plan`: the tables of a trial, tidy or wide, and the estimates that they name.
 
 
-@dataclass(frozen=True, slots=True)
-class TrialInputs:
+class TrialInputs(Record):
     """Input of a trial's analysis, with every file read, by role.
 
     The readings are those of each mass's last visit before excision; `other_visits` counts what that leaves out.

@@ -5,17 +5,16 @@ from __future__ import annotations
 import os
 from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import field
 from pathlib import Path
 from typing import Any, Final
 
+from tactile_bayes.declarations import Record, field
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.atomic import sha256
 from tactile_bayes.files.campaign_names import JOURNAL
 from tactile_bayes.files.manifest_csv import natural
 from tactile_bayes.files.map_nc import read_map_and_scans
 from tactile_bayes.files.remote import check_address, fetched, files_below, is_address
-from tactile_bayes.records import dataclass
 
 # --- What a file says of its exam: facts of the session, and the files that it was made from.
 
@@ -25,8 +24,7 @@ _FACTS: Final = {"patient": "subject", "visit": "visit", "mass": "mass", "side":
 """Columns of the table of exams, and what a scan calls the same."""
 
 
-@dataclass(frozen=True, slots=True)
-class Said:
+class Said(Record):
     """What a file says of its exam.
 
     Parameters
@@ -211,8 +209,7 @@ _DEFAULTS: Final = {"patient": "", "visit": "1", "mass": "1", "side": ""}
 _CODES: Final = ("patient", "visit", "mass")
 
 
-@dataclass(frozen=True, slots=True)
-class Found:
+class Found(Record):
     """Rows for exams.csv, and what somebody should know of the folder.
 
     Parameters

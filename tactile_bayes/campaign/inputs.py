@@ -17,12 +17,12 @@ from tactile_bayes.batch_store import BatchStore, open_store
 from tactile_bayes.campaign.match import Breasts
 from tactile_bayes.campaign.settings import STAGED, clear_staged, put_in_place, stamp
 from tactile_bayes.campaign.steps import FILES, UNWRITTEN, Result
+from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError, TactileBayesError, UsageError
 from tactile_bayes.files.atomic import sha256, unwritable
 from tactile_bayes.files.campaign_names import EXAMS, GROWTH, JOURNAL, MASSES
 from tactile_bayes.files.manifest_csv import Exam
 from tactile_bayes.files.remote import sha256_of, version_of
-from tactile_bayes.records import dataclass
 
 # --- The output folder of a campaign: its journal, and the files that belong to its steps.
 
@@ -185,8 +185,7 @@ _SETTLED_S: Final = 10.0
 """A file that was last changed so long ago has times that tell this content from a later one."""
 
 
-@dataclass(frozen=True, slots=True)
-class Sources:
+class Sources(Record):
     """What the files of the exams are.
 
     Parameters
@@ -201,8 +200,7 @@ class Sources:
     faults: dict[Path, str]
 
 
-@dataclass(frozen=True, slots=True)
-class _Source:
+class _Source(Record):
     path: Path
     key: str
     address: str = ""

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from tactile_bayes.api.estimating import estimate_file
-from tactile_bayes.declarations import replace
+from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.campaign_names import COMPARED, GROWTH
 from tactile_bayes.files.documents import load_json, load_schema
@@ -19,7 +19,6 @@ from tactile_bayes.files.manifest_csv import Exam, natural, table_text
 from tactile_bayes.files.map_nc import read_map
 from tactile_bayes.findings import Finding, finding_lines
 from tactile_bayes.posterior.result import Estimate
-from tactile_bayes.records import dataclass
 from tactile_bayes.report.compare import Growth, of_document
 from tactile_bayes.trial.visits import day_of, in_order
 
@@ -44,8 +43,7 @@ OWN_AXES: Final = Finding(
 )
 
 
-@dataclass(frozen=True, slots=True)
-class NamedPlace:
+class NamedPlace(Record):
     """Where an exam of the breast has a mass, as the table says.
 
     Parameters

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import field
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -13,7 +12,7 @@ from tactile_bayes.api.trials import load_trial, read_excision
 from tactile_bayes.campaign.match import growth_rows, growth_text
 from tactile_bayes.campaign.run import Campaign
 from tactile_bayes.campaign.tables import Row, exam_rows, write_tables
-from tactile_bayes.declarations import replace
+from tactile_bayes.declarations import Record, field, replace
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.atomic import write_text
 from tactile_bayes.files.campaign_names import (
@@ -35,7 +34,6 @@ from tactile_bayes.files.campaign_names import (
 from tactile_bayes.files.documents import check_document, dump_json, read_protocol
 from tactile_bayes.files.reading import IMAGE_BYTES, read_bytes
 from tactile_bayes.files.remote import put
-from tactile_bayes.records import dataclass
 from tactile_bayes.report.campaign_html import campaign_html, worst
 from tactile_bayes.report.compare import Growth, growth_line
 from tactile_bayes.report.quantities import leading
@@ -59,8 +57,7 @@ _MOST_CARDS: Final = 10_000
 _LINKS: Final = (MAP_FIGURE, SIZE_FIGURE, SIZED_FIGURE, ESTIMATE, SIZED, MAP)
 
 
-@dataclass(frozen=True, slots=True)
-class Excision:
+class Excision(Record):
     """Where the sizes after excision are.
 
     Parameters
@@ -84,8 +81,7 @@ class Excision:
         return set(zip(columns["patient"], columns["mass"], strict=True))
 
 
-@dataclass(frozen=True, slots=True)
-class Written:
+class Written(Record):
     """What was written, in numbers and words.
 
     Parameters

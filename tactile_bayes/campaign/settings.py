@@ -6,17 +6,15 @@ import hashlib
 import json
 import shutil
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import field
 from pathlib import Path
 from typing import Any, Final
 
 from tactile_bayes import __version__
 from tactile_bayes.api.settings import Settings
-from tactile_bayes.declarations import replace
+from tactile_bayes.declarations import Record, field, replace
 from tactile_bayes.files.atomic import sha256
 from tactile_bayes.files.manifest_csv import Exam
 from tactile_bayes.presets import DEFAULT_NORMALISE, MATCH_MM
-from tactile_bayes.records import dataclass
 
 # --- What tells a campaign that something changed: digests of plain data, and stamps of files.
 
@@ -36,8 +34,7 @@ def stamp(path: Path) -> str:
 # --- Settings of all exams of a campaign.
 
 
-@dataclass(frozen=True, slots=True)
-class CampaignSettings:
+class CampaignSettings(Record):
     """Settings of all exams.
 
     Parameters

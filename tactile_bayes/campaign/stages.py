@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Sequence
 from concurrent.futures import Executor
-from dataclasses import field
 from typing import Final
 
 from tactile_bayes.batch import CLUSTER_LOST, BatchInterrupted, Outcome, run_batch
@@ -13,24 +12,22 @@ from tactile_bayes.batch_store import BatchStore
 from tactile_bayes.campaign.inputs import StepResults, unchanged
 from tactile_bayes.campaign.settings import CampaignSettings
 from tactile_bayes.campaign.steps import FILES, Result, Task, run_step
+from tactile_bayes.declarations import Record, field
 from tactile_bayes.errors import TactileBayesError
 from tactile_bayes.progress import Progress, untold
-from tactile_bayes.records import dataclass
 
 FEW: Final = 5
 """So many exams are named in a line."""
 
 
-@dataclass(frozen=True, slots=True)
-class Fault:
+class Fault(Record):
     """Why a step of an exam or a mass gave nothing."""
 
     step: str
     reason: str
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class CampaignState:
+class CampaignState(Record, eq=False):
     """How far a campaign is: results by step and name, faults by name, counts of steps.
 
     Parameters

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -19,7 +18,7 @@ from tactile_bayes.api.repeatability import ExamFolder, learn_from_exams, repeat
 from tactile_bayes.api.settings import Comparing, Settings
 from tactile_bayes.campaign.match import OWN_AXES, NamedPlace, in_own_axes, matched_outcome
 from tactile_bayes.campaign.settings import Writes, digest_of, write_staged
-from tactile_bayes.declarations import EXACT, from_plain, replace, to_plain
+from tactile_bayes.declarations import EXACT, Record, field, from_plain, replace, to_plain
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.atomic import sha256, write_bytes, write_text
 from tactile_bayes.files.campaign_names import (
@@ -49,7 +48,6 @@ from tactile_bayes.files.remote import fetched, put
 from tactile_bayes.findings import by_weight, findings_in
 from tactile_bayes.mapping import build_map
 from tactile_bayes.options import MapOptions
-from tactile_bayes.records import dataclass
 from tactile_bayes.report.compare_figure import draw_comparison
 from tactile_bayes.report.estimate_document import rounded, size_diagnostics
 from tactile_bayes.report.estimate_figures import draw_map, draw_size
@@ -93,8 +91,7 @@ _SAME: Final = {"patient": "subject", "side": "side", "reader": "examiner", "vis
 Result = dict[str, Any]
 
 
-@dataclass(frozen=True, slots=True)
-class Task:
+class Task(Record):
     """One step of one exam or mass.
 
     Parameters

@@ -9,13 +9,12 @@ from typing import Any, Final
 
 from tactile_bayes.campaign.match import unnamed
 from tactile_bayes.campaign.run import Campaign
-from tactile_bayes.declarations import replace
+from tactile_bayes.declarations import Record, replace
 from tactile_bayes.files.atomic import write_text
 from tactile_bayes.files.campaign_names import DONE, ESTIMATE, EXAMS, FAILURES, MASSES, POOLED, SIZED, TRIAL
 from tactile_bayes.files.documents import load_json, load_schema
 from tactile_bayes.files.manifest_csv import Exam, table_text
 from tactile_bayes.findings import Finding, Verdict, by_weight, finding_lines, findings_in, verdict
-from tactile_bayes.records import dataclass
 
 TACTILE, POOLED_MODALITY = "tactile", "tactile-pooled"
 _TRIAL_COLUMNS: Final = (
@@ -29,8 +28,7 @@ _OF_POOLED: Final = ("status", "reason", "max_size_mm", "findings")
 """What tables and pages show of a document: the rest of it is a hundred times as much."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Row:
+class Row(Record, eq=False):
     """One exam as the tables and the contact sheet show it.
 
     Parameters

@@ -6,13 +6,13 @@ import shlex
 import shutil
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from tactile_bayes.commands.options import FilePath
+from tactile_bayes.declarations import Record
 from tactile_bayes.errors import UsageError
 from tactile_bayes.presets import METHODS, RESEARCH_USE
 
@@ -67,8 +67,7 @@ def command(ctx: click.Context, output: Path, method: str, force: bool) -> None:
     click.echo(RESEARCH_USE)
 
 
-@dataclass(frozen=True, slots=True)
-class Steps:
+class Steps(Record):
     """Steps of the demo, run in the folder with its inputs.
 
     Parameters

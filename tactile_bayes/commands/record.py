@@ -8,7 +8,6 @@ import select
 import signal
 import sys
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
 from types import TracebackType
@@ -18,7 +17,7 @@ import click
 
 from tactile_bayes.commands.emulate import PROTOCOLS
 from tactile_bayes.commands.options import FORCE, FilePath, FiniteRange, also_read, live_options
-from tactile_bayes.declarations import as_dict
+from tactile_bayes.declarations import Record, as_dict
 from tactile_bayes.errors import EXIT_INTERRUPTED, DeviceError, UsageError
 from tactile_bayes.presets import PRESSURE_RANGE_KPA
 
@@ -33,8 +32,7 @@ if TYPE_CHECKING:
 # --- Options of one recording, and the part of them that the file stores.
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Request:
+class Request(Record, kw_only=True):
     """Options of one recording, as given."""
 
     output: Path

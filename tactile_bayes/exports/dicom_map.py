@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_bayes import __version__
+from tactile_bayes.declarations import Record
 from tactile_bayes.errors import UsageError
 from tactile_bayes.exports.codes import (
     BREAST,
@@ -27,7 +28,6 @@ from tactile_bayes.exports.identity import Identity, Moment
 from tactile_bayes.exports.nrrd import ImagePlane, image_plane, lps_from_plane
 from tactile_bayes.findings import finding_lines
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.records import dataclass
 from tactile_bayes.report.estimate_text import no_estimate_line
 from tactile_bayes.report.map_figure import FitContour, Place, map_figure
 
@@ -53,8 +53,7 @@ _OF_THE_CLOCK: Final = (
 NO_SERIAL_NUMBER: Final = "unknown"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Study:
+class Study(Record, eq=False):
     """Patient and study of one export.
 
     Parameters

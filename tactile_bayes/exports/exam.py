@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from tactile_bayes.declarations import replace
+from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import NO_LUMP, BadDataError, UsageError
 from tactile_bayes.exports.codes import NOT_DETECTED, NOT_SIZED, SIZED, Code
 from tactile_bayes.files.atomic import sha256
@@ -21,7 +21,6 @@ from tactile_bayes.files.netcdf import open_netcdf
 from tactile_bayes.files.provenance import EXAM_FACTS, scans_of
 from tactile_bayes.files.reading import HDF5_MAGIC, kind_of, open_input, schema_kind
 from tactile_bayes.findings import Finding, Verdict, finding_lines, findings_in, verdict
-from tactile_bayes.records import dataclass
 from tactile_bayes.report.estimate_text import exams_label
 from tactile_bayes.report.quantities import leading
 
@@ -60,8 +59,7 @@ _MOST_TEXT: Final = 2000
 Facts = Mapping[str, str]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class MapFile:
+class MapFile(Record, eq=False):
     """A map with its file's digest and the facts of its scans.
 
     Parameters
@@ -78,8 +76,7 @@ class MapFile:
     facts: Facts
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SizedMass:
+class SizedMass(Record, eq=False):
     """One mass of an estimate, or why it has no size.
 
     Parameters
@@ -118,8 +115,7 @@ class SizedMass:
         return NOT_DETECTED if self.code in NO_LUMP else NOT_SIZED
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class EstimateFile:
+class EstimateFile(Record, eq=False):
     """An estimate: of one map, pooled from several, or the draws of either.
 
     Parameters

@@ -11,12 +11,11 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 
-from tactile_bayes.declarations import names_of, replace
+from tactile_bayes.declarations import Record, names_of, replace
 from tactile_bayes.errors import BadDataError, TactileBayesError, UsageError
 from tactile_bayes.exports.exam import required
 from tactile_bayes.files.documents import check_document, load_json, load_schema, refuse_unknown
 from tactile_bayes.files.reading import read_bytes
-from tactile_bayes.records import dataclass
 
 # --- Who was examined, and when: only what the user or a worklist says, checked against what the formats can hold.
 
@@ -30,8 +29,7 @@ _LONGEST: Final = {"patient_id": 64, "issuer": 64, "accession": 16, "study_id": 
 _NAMES: Final = ("patient_name", "referring_physician")
 
 
-@dataclass(frozen=True, slots=True)
-class Moment:
+class Moment(Record):
     """A date, with the time of day and its zone where they are known.
 
     Parameters
@@ -85,8 +83,7 @@ class Moment:
         return f"{self.iso_date}T{self.time[:2]}:{self.time[2:4]}:{seconds}{self.zone[:3]}:{self.zone[3:]}"
 
 
-@dataclass(frozen=True, slots=True)
-class Identity:
+class Identity(Record):
     """Identity of patient and study; empty where nobody gave it.
 
     Parameters

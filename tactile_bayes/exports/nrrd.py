@@ -8,6 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.exports.exam import MapFile, required
 from tactile_bayes.findings import finding_lines
@@ -15,7 +16,6 @@ from tactile_bayes.geometry import FloatArray, apply
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.mapping.places import orientation_of
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.records import dataclass
 
 # --- Place of a map in the coordinate system of DICOM and 3D Slicer: L, P, S in mm from the xiphoid.
 #
@@ -42,8 +42,7 @@ def on_plane(transform: FloatArray, point_mm: tuple[float, float]) -> FloatArray
     return apply(transform, np.array([*point_mm, 0.0]))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ImagePlane:
+class ImagePlane(Record, eq=False):
     """A map's values as the rows of an image that faces the viewer as every picture of the program does.
 
     Parameters

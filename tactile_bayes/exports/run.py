@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal, get_args
 
-from tactile_bayes.declarations import names_of, replace
+from tactile_bayes.declarations import Record, names_of, replace
 from tactile_bayes.errors import UsageError
 from tactile_bayes.exports.dicom import VALUES, dicom_files
 from tactile_bayes.exports.exam import EstimateFile, MapFile, check_pairs
@@ -15,7 +15,6 @@ from tactile_bayes.exports.identity import Identity
 from tactile_bayes.exports.nrrd import nrrd_bytes
 from tactile_bayes.exports.redcap import dictionary_csv, records_csv
 from tactile_bayes.files.atomic import check_suffix, refuse_existing, same_file, unwritable, write_all
-from tactile_bayes.records import dataclass
 
 if TYPE_CHECKING:
     from tactile_bayes.files.atomic import Format
@@ -27,8 +26,7 @@ _WRITTEN: Final[dict[str, Format]] = {"csv": "CSV", "fhir": "JSON", "nrrd": "NRR
 """Formats of exports that are one file."""
 
 
-@dataclass(frozen=True, slots=True)
-class Outputs:
+class Outputs(Record):
     """What an export writes.
 
     Parameters
@@ -125,8 +123,7 @@ TAKES: Final[dict[ExportFormat, tuple[str, ...]]] = {
 """Which parts of an identity each format holds."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Exported:
+class Exported(Record, eq=False):
     """Files of an export.
 
     Parameters

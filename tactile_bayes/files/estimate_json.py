@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
+from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.documents import check_document, load_json
 from tactile_bayes.files.netcdf import open_netcdf
@@ -20,8 +20,7 @@ from tactile_bayes.findings import findings_in, verdict
 PROBABILITY = 0.95
 
 
-@dataclass(frozen=True, slots=True)
-class StatedSize:
+class StatedSize(Record):
     """Largest size in mm with its interval; None throughout where there was no estimate."""
 
     size_mm: float | None = None

@@ -482,6 +482,8 @@ def _scan(arrays: Arrays) -> Scan:
         element_calibration=ElementCalibration(
             values["gain_kpa_per_count"], values["offset_kpa"], int(values.get("saturation_count", 4095))
         ),
-        landmarks=None if landmarks is None else Landmarks(*landmarks, nipple_mm=values.get("nipple_mm")),
+        landmarks=None
+        if landmarks is None
+        else Landmarks(landmarks[0], landmarks[1], nipple_mm=values.get("nipple_mm")),
         session={"source": "imported"},
     )

@@ -6,11 +6,11 @@ import csv
 import io
 import os
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import field
 from datetime import date
 from pathlib import Path
 from typing import Any, Final
 
+from tactile_bayes.declarations import Record, field
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.atomic import write_text
 from tactile_bayes.files.campaign_names import exam_name, mass_name
@@ -19,7 +19,6 @@ from tactile_bayes.files.reading import TABLE_BYTES, read_bytes
 from tactile_bayes.files.remote import check_address, is_address
 from tactile_bayes.files.shipped import NONE, SHIPPED
 from tactile_bayes.files.tables import RawTable, Table, read_raw, read_table
-from tactile_bayes.records import dataclass
 from tactile_bayes.trial.readings import Reading
 from tactile_bayes.trial.visits import at_excision
 
@@ -29,8 +28,7 @@ KNOWN: Final = ("seat", "depth_mm", "stiffness_ratio", "fat_kpa", "gland_ratio",
 _WRITTEN: Final = ("file", "patient", "visit", "mass", "replicate", "side", "reader")
 
 
-@dataclass(frozen=True, slots=True)
-class Exam:
+class Exam(Record):
     """One exam of one mass: a row of the table.
 
     Parameters

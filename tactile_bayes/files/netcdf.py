@@ -13,6 +13,7 @@ from typing import Any, Final
 import h5py
 import numpy as np
 
+from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.documents import check_text
 from tactile_bayes.files.reading import (
@@ -24,7 +25,6 @@ from tactile_bayes.files.reading import (
     open_input,
     unpacked_limit,
 )
-from tactile_bayes.records import dataclass
 
 # --- Check of an HDF5 file's text heaps before the library opens it: a damaged size makes the library loop forever.
 
@@ -74,8 +74,7 @@ _CHECKSUM_BYTES: Final = 4
 _DAMAGED: Final = "not a readable netCDF file"
 
 
-@dataclass(frozen=True, slots=True)
-class Variable:
+class Variable(Record):
     """One array of a netCDF file.
 
     Parameters
@@ -99,8 +98,7 @@ class Variable:
     scale: float | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class Contents:
+class Contents(Record):
     """What one group of a netCDF file holds.
 
     Parameters

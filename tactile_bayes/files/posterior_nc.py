@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.atomic import write_bytes
 from tactile_bayes.files.documents import parse_json
@@ -21,7 +22,6 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.posterior.arviz_groups import DrawGroup
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.records import dataclass
 from tactile_bayes.size.draws import SizePosterior
 
 SCHEMA = "tactile-bayes/posterior/1"
@@ -119,8 +119,7 @@ def _with_coordinates(arrays: Mapping[str, tuple[tuple[str, ...], FloatArray]]) 
     return held | {name: Variable(values, axes, {}) for name, (axes, values) in arrays.items()}
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PosteriorDraws:
+class PosteriorDraws(Record, eq=False):
     """What a posterior file says.
 
     Parameters

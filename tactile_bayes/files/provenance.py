@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import field
 from pathlib import Path
 from typing import Any, Final
 
 from tactile_bayes import __version__
+from tactile_bayes.declarations import Record, field
 from tactile_bayes.files.atomic import sha256
-from tactile_bayes.records import dataclass
 
 EXAM_FACTS: Final = ("subject", "side", "posture", "examiner", "visit", "mass", "array_calibration_days")
 """What a scan's session says of its exam and array calibration; codes only, see ``scan_session.schema.json``."""
@@ -17,8 +16,7 @@ _DIGESTS: Final = ("sha256", "frames_sha256")
 """Of a scan's file, and of its frames alone, which stays when the scan is written again with another session."""
 
 
-@dataclass(frozen=True, slots=True)
-class Provenance:
+class Provenance(Record):
     """The origin of one output; equal inputs and settings give equal bytes.
 
     Inputs are named by their role, not by their file name: file names may hold patients' names. `scans` are the scans

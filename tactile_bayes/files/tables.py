@@ -9,11 +9,11 @@ import math
 import operator
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
 from typing import Any, Final
 
+from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.documents import load_schema
 from tactile_bayes.files.reading import TABLE_BYTES, ZIP_MAGIC, decoded, read_bytes
@@ -37,8 +37,7 @@ _NOT_TEXT: Final = (
 """First bytes of files that are no UTF-8 text, what they are, and the way out."""
 
 
-@dataclass(frozen=True, slots=True)
-class Cells:
+class Cells(Record):
     """A CSV file's rows that are not blank.
 
     Parameters
@@ -159,16 +158,14 @@ _NOT_FINITE = {"nan", "inf", "infinity"}
 _TO_MM = {"cm": "10", "m": "1000", "in": "25.4", "inch": "25.4", "um": "0.001"}
 
 
-@dataclass(frozen=True, slots=True)
-class Sheet:
+class Sheet(Record):
     """A table without a file: CSV text with a name for its errors."""
 
     name: Path
     text: str
 
 
-@dataclass(frozen=True, slots=True)
-class Table:
+class Table(Record):
     """A validated table, column by column.
 
     Attributes
@@ -236,8 +233,7 @@ def read_table(source: Path | Sheet, schema_name: str) -> Table:
     return table
 
 
-@dataclass(frozen=True, slots=True)
-class RawTable:
+class RawTable(Record):
     """A CSV table under no schema.
 
     Parameters

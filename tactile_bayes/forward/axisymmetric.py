@@ -8,7 +8,6 @@ dense matrix on that boundary.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -16,6 +15,7 @@ from scipy.interpolate import CubicSpline
 from scipy.sparse import coo_array
 from scipy.sparse.linalg import splu
 
+from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.body import FAT_KPA, GLAND_RATIO, POISSON
 from tactile_bayes.forward.mesh import (
@@ -38,8 +38,7 @@ if TYPE_CHECKING:
 _LEAST_SHARE: Final = 1e-4
 
 
-@dataclass(frozen=True, slots=True)
-class Tissue:
+class Tissue(Record):
     """Moduli of the two layers, fat over gland, with one Poisson's ratio below 0.5 for both and the lump."""
 
     fat_kpa: float = FAT_KPA
@@ -54,8 +53,7 @@ class Tissue:
             raise BadDataError(f"nu is {self.nu}", way_out="it must lie in 0 to below 0.5")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ModePerturbation:
+class ModePerturbation(Record, eq=False):
     """Perturbation of Fourier order m.
 
     Parameters
@@ -70,8 +68,7 @@ class ModePerturbation:
     matrix: FloatArray
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class CondensedMode:
+class CondensedMode(Record, eq=False):
     """One Fourier order of the body around the lump, condensed onto the lump's boundary.
 
     Parameters
@@ -114,8 +111,7 @@ class CondensedMode:
         return ModePerturbation(self.order, (matrix + matrix.T) / 2)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class CondensedLump:
+class CondensedLump(Record, eq=False):
     """All Fourier orders of one geometry; the perturbation for a stiffness takes milliseconds.
 
     Parameters

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError, NotConvergedError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.presets import HEAD_PITCH_MM, HEAD_RADIUS_MM, HEAD_ROWS, HEADS, SHOULDERS_INSIDE
@@ -28,8 +28,7 @@ SHOULDER_MM = 3.0
 _MOST_ROUNDS = 40
 
 
-@dataclass(frozen=True, slots=True)
-class Head:
+class Head(Record):
     """The head's cross-section: an arc with rounded shoulders.
 
     Parameters
@@ -126,8 +125,7 @@ class Head:
         return np.pad(np.ones(count, dtype=bool), around)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Contact:
+class Contact(Record, eq=False):
     """Solutions of the contact at m positions over n cells.
 
     Parameters
@@ -264,8 +262,7 @@ _MOST_STEPS: Final = 2000
 _PATIENCE: Final = 4
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SolidContact:
+class SolidContact(Record, eq=False):
     """The solved contact of a head.
 
     Parameters
@@ -285,8 +282,7 @@ class SolidContact:
     touching: BoolArray
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ContactStiffness:
+class ContactStiffness(Record, eq=False):
     r"""Inverse of a compliance that is a fixed matrix less a low-rank change.
 
     Parameters

@@ -7,11 +7,10 @@ from typing import Any, Final
 
 import numpy as np
 
-from tactile_bayes.declarations import as_dict
+from tactile_bayes.declarations import Record, as_dict
 from tactile_bayes.forward.scene import Background, Scene, Strokes, Taxels, rotation_from_vector
 from tactile_bayes.geometry import FloatArray, apply, inverse, patient_from_base, quaternion_from_rotation
 from tactile_bayes.presets import PRESSURE_RANGE_KPA
-from tactile_bayes.records import dataclass
 from tactile_bayes.scan import (
     CountArray,
     ElementCalibration,
@@ -37,8 +36,7 @@ Felt = Callable[[FloatArray], FloatArray]
 Depth = Callable[[FloatArray], FloatArray]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SimulatedScan:
+class SimulatedScan(Record, eq=False):
     """A simulated scan with its truth.
 
     Parameters

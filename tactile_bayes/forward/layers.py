@@ -7,7 +7,6 @@ half-space as its lowest layer. z runs into the body; a displacement is positive
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import Final
 
@@ -15,6 +14,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.special import j0
 
+from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.body import POISSON
 from tactile_bayes.geometry import FloatArray
@@ -27,8 +27,7 @@ _POINTS: Final = 24
 _LEAST: Final = 1e-3
 
 
-@dataclass(frozen=True, slots=True)
-class LayeredBody:
+class LayeredBody(Record):
     """Flat isotropic layers from the skin down.
 
     Parameters

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import minimize_scalar
 
+from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.body import Layers
 from tactile_bayes.forward.contact import Contact, Head, solve_contact
@@ -26,8 +26,7 @@ POSITIONS_MM = (-60.0, 60.0, 0.5)
 _NOMINAL_HEAD = Head()
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class LineFrames:
+class LineFrames(Record, eq=False):
     """Pressure across the head at each of its positions.
 
     Parameters
@@ -71,8 +70,7 @@ class LineFrames:
         return LineFrames(self.x_c_mm, self.s_mm.reshape(-1, group).mean(axis=1), means)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class TactileLine:
+class TactileLine(Record, eq=False):
     """A one-dimensional tactile map: the counterpart of `TactileMap` for a line.
 
     Parameters
@@ -317,8 +315,7 @@ def kappa(x_c_mm: FloatArray, *, d_mm: float) -> FloatArray:
     return np.minimum(1.0, 0.5 * (1.0 + 3.0 / (8.0 * d_mm) * np.abs(np.asarray(x_c_mm, dtype=np.float64))))
 
 
-@dataclass(frozen=True, slots=True)
-class EmpiricalModel:
+class EmpiricalModel(Record):
     """The fitted parameters of one case.
 
     Parameters
@@ -423,8 +420,7 @@ def _fit_lump(x_mm: FloatArray, pressure: FloatArray) -> tuple[float, float]:
     return fit.height, float(np.exp(fit.parameter))
 
 
-@dataclass(frozen=True, slots=True)
-class ShapeFit:
+class ShapeFit(Record):
     """The multiple of a shape that fits best: its height, the shape's parameter and the sum of squares left."""
 
     height: float

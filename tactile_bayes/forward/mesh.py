@@ -10,6 +10,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.body import Body
 from tactile_bayes.geometry import FloatArray
@@ -37,8 +38,7 @@ _TOP, _UP, _DOWN, _OUT, _IN = 8, 4, 2, 2, 2
 _GROWTH = 2.2
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class QuadMesh:
+class QuadMesh(Record, eq=False):
     """Nine-node quadrilaterals.
 
     Parameters
@@ -103,8 +103,7 @@ def joined(meshes: Sequence[QuadMesh], *, scale_mm: float) -> QuadMesh:
     return QuadMesh(points, np.concatenate(elements), np.concatenate([mesh.gland for mesh in meshes]))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Box:
+class _Box(Record, eq=False):
     """The rectangle about the lump and the rows above and below it; positions include the elements' middles."""
 
     body: Body
@@ -287,8 +286,7 @@ EXTERIOR_FAT, EXTERIOR_GLAND, INTERIOR_FAT, INTERIOR_GLAND = range(4)
 LEAST_CAP: Final = 0.04
 
 
-@dataclass(frozen=True, slots=True)
-class LumpGeometry:
+class LumpGeometry(Record):
     """A spheroid on the vertical axis of a body of two layers on a rigid base.
 
     Parameters
@@ -340,8 +338,7 @@ class LumpGeometry:
         return float(self.depth_mm + moved * self.half_height_mm)
 
 
-@dataclass(frozen=True, slots=True)
-class MeshSize:
+class MeshSize(Record):
     """How fine a mesh is.
 
     Parameters
@@ -363,8 +360,7 @@ class MeshSize:
     reach_mm: float = 300.0
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class LumpMesh:
+class LumpMesh(Record, eq=False):
     """Nodes and elements of a mesh.
 
     Parameters

@@ -8,11 +8,10 @@ poses, not in the pressures, and how deep the head sinks is not followed.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
-from tactile_bayes.declarations import replace
+from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.body import MOST_SEAT, Body, Layers
 from tactile_bayes.forward.contact import Head
@@ -73,8 +72,7 @@ def simulate_plane(
     return record(scene, felt=lambda at: pressure[np.searchsorted(time, at)], truth=truth, rng=rng)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PlaneSection:
+class PlaneSection(Record, eq=False):
     """A scene's section across the lump.
 
     Parameters

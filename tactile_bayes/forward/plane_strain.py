@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,6 +9,7 @@ from scipy.interpolate import CubicSpline
 from scipy.sparse import coo_matrix
 from scipy.sparse.linalg import splu
 
+from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.body import Body, Layers
 from tactile_bayes.forward.mesh import IndexArray as IntArray
@@ -293,8 +293,7 @@ _RIGID = 1e-11
 _FAINT = 1e-9
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SurfaceCompliance:
+class SurfaceCompliance(Record, eq=False):
     """Mean vertical displacement of each surface cell per unit pressure on each cell, for one geometry.
 
     Parameters

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_bayes.declarations import Record
 from tactile_bayes.forward.axisymmetric import CondensedLump, skin_spline
 from tactile_bayes.forward.body import HeadFace
 from tactile_bayes.forward.contact import ContactStiffness, press
@@ -34,8 +34,7 @@ _LEAST_WEIGHT: Final = 1e-6
 _DIRECTIONS: Final = 24
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SkinPerturbation:
+class SkinPerturbation(Record, eq=False):
     r"""Low-rank change of the skin's compliance by one lump.
 
     Parameters
@@ -129,8 +128,7 @@ def square_mean(
     return mean
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PlacedLump:
+class PlacedLump(Record, eq=False):
     """A perturbation and the place of its axis in the scene's `plane`, mm."""
 
     perturbation: SkinPerturbation
@@ -138,8 +136,7 @@ class PlacedLump:
     y_mm: float
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SolidFrame:
+class SolidFrame(Record, eq=False):
     """The solved frame of a head at one pose.
 
     Parameters
@@ -157,8 +154,7 @@ class SolidFrame:
     contact: Contact
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SolidHead:
+class SolidHead(Record, eq=False):
     """A rigid head on a layered body; made by `solid_head`.
 
     Parameters

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import FloatArray, rotation_from_quaternion
 from tactile_bayes.hardware.readings import CountArray
@@ -24,8 +24,7 @@ MIN_FRAMES: Final = 10
 STEPS_FOR_CURVATURE: Final = 4
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class BladderStep:
+class BladderStep(Record, eq=False):
     """Mean counts of the array under one known pressure.
 
     Parameters
@@ -61,8 +60,7 @@ class BladderStep:
         return cls(float(pressure_kpa), frames.mean(axis=0), saturated)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ArrayFit:
+class ArrayFit(Record, eq=False):
     """The fit of each taxel.
 
     Parameters
@@ -181,8 +179,7 @@ LEAST_TURN_DEG: Final = 20.0
 CLEAR: Final = 3.0
 
 
-@dataclass(frozen=True, slots=True)
-class RotationSense:
+class RotationSense(Record):
     """Fit of a fixed point under each sense of rotation, and the angle that the sensor was turned by.
 
     Parameters

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, NamedTuple
 
+from tactile_bayes.declarations import Record
 from tactile_bayes.errors import DeviceError
 from tactile_bayes.hardware import head
 from tactile_bayes.hardware import serial_trackers as polhemus
@@ -24,8 +24,7 @@ _BETWEEN_COMMANDS_S: Final = 0.02
 _ASK_AGAIN_S: Final = 0.5
 
 
-@dataclass(frozen=True, slots=True)
-class TrackerDriver:
+class TrackerDriver(Record):
     """Commands of one tracker protocol.
 
     Parameters

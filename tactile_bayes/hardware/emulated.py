@@ -6,11 +6,11 @@ import re
 import struct
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Final, Protocol
 
 import numpy as np
 
+from tactile_bayes.declarations import Record
 from tactile_bayes.geometry import rotation_from_quaternion
 from tactile_bayes.hardware import head
 from tactile_bayes.hardware.head import PacketParser
@@ -28,8 +28,7 @@ _NS: Final = 1_000_000_000
 _SETTING: Final = re.compile(rb"[A-Za-z][0-9*,][^\r]*\r")
 
 
-@dataclass(frozen=True, slots=True)
-class Faults:
+class Faults(Record):
     """Faults of an emulated device.
 
     Parameters

@@ -15,7 +15,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from tactile_bayes.declarations import as_dict, replace
+from tactile_bayes.declarations import Record, as_dict, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import FloatArray, apply, patient_from_plane
 from tactile_bayes.hardware.readings import CountArray, PoseReading
@@ -181,8 +181,7 @@ _KEPT_POSES: Final = 400
 _PATIENCE_NS: Final = 150_000_000
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class LiveState:
+class LiveState(Record, eq=False):
     """Data of one drawing of the live view.
 
     Parameters

@@ -11,6 +11,7 @@ from typing import Final, Protocol
 
 import numpy as np
 
+from tactile_bayes.declarations import Record
 from tactile_bayes.errors import DeviceError
 from tactile_bayes.geometry import FloatArray, inverse, rotation_from_quaternion
 from tactile_bayes.hardware.clocks import PoseClock
@@ -110,8 +111,7 @@ SAMPLES: Final = 60
 STEADY_MM: Final = 2.0
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Touch:
+class Touch(Record, eq=False):
     """A touched landmark.
 
     Parameters

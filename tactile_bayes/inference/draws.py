@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import field
 
 import numpy as np
 
+from tactile_bayes.declarations import Record, field
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.records import dataclass
 
 # --- Draws of a model's parameters, the result of every method.
 
@@ -26,8 +25,7 @@ def even_replicates(number: int) -> Labels:
     return np.arange(number) * REPLICATES // max(number, 1)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ParameterDraws:
+class ParameterDraws(Record, eq=False):
     """Draws of a parameter vector.
 
     Parameters
@@ -109,8 +107,7 @@ def nine_digits(value: float) -> float:
     return float(f"{value:.9g}")
 
 
-@dataclass(frozen=True, slots=True)
-class Quantity:
+class Quantity(Record):
     """Summary of one quantity's draws.
 
     Parameters

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Any, Protocol
 
 import emcee
 import numpy as np
 
+from tactile_bayes.declarations import Record, names_of
 from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.arviz_data import chain_diagnostics
@@ -18,8 +18,7 @@ from tactile_bayes.inference.modes import LogDensity
 # --- State of an interrupted ensemble, from which it continues exactly.
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ChainState:
+class ChainState(Record, eq=False):
     """State of all ensembles after the same number of steps.
 
     Parameters
@@ -44,7 +43,7 @@ class ChainState:
 
     def as_arrays(self) -> Mapping[str, Any]:
         """The state as arrays by name."""
-        return {name: getattr(self, name) for name in self.__slots__}
+        return {name: getattr(self, name) for name in names_of(self)}
 
 
 class ChainStore(Protocol):
@@ -64,8 +63,7 @@ WALKERS_PER_PARAMETER = 4
 """Of each ensemble."""
 
 
-@dataclass(frozen=True, slots=True)
-class EnsembleOptions:
+class EnsembleOptions(Record):
     """Stopping rule of the ensembles.
 
     Parameters

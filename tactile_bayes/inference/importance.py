@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from tactile_bayes.declarations import Record
 from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.draws import REPLICATES, ParameterDraws, weighted_quantiles_of
 from tactile_bayes.inference.modes import LogDensity
 from tactile_bayes.inference.points import BITS, normal_quantile, shifted_sobol
-from tactile_bayes.records import dataclass
 
 # --- Pareto-smoothed importance sampling (PSIS): smoothed weights, and the shape that shows if they can be trusted.
 
@@ -90,8 +90,7 @@ def _pareto_quantile(probability: FloatArray, shape: float, scale: float) -> Flo
 # --- The density that importance sampling draws from: one Gaussian or a mixture of several, their tails bent outwards.
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Gaussians:
+class Gaussians(Record, eq=False):
     """A mixture of Gaussians.
 
     Parameters
@@ -312,8 +311,7 @@ HEAVY_POINTS, HEAVY = 2048, 0.1
 """With as many points a replicate and a tail heavier than trusted by this, more points do not help."""
 
 
-@dataclass(frozen=True, slots=True)
-class ImportanceOptions:
+class ImportanceOptions(Record):
     """Stopping rule of importance sampling.
 
     Parameters

@@ -6,10 +6,10 @@ from collections.abc import Callable
 
 import numpy as np
 
+from tactile_bayes.declarations import Record
 from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.draws import INDEPENDENT_DRAWS, ParameterDraws, student_draws
-from tactile_bayes.records import dataclass
 
 # --- Gradient and Hessian of a scalar function by central differences, evaluated in one call.
 
@@ -76,8 +76,7 @@ SETTLED = 0.01
 """Of the residual variance: a step that lowers the sum of squares by less moves nothing that the data could tell."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class LeastSquaresFit:
+class LeastSquaresFit(Record, eq=False):
     """The minimum of a weighted sum of squares.
 
     Parameters

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_bayes.declarations import replace
+from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.cells import CellSums, Projection, Projector, Readout
@@ -25,8 +24,7 @@ def no_progress(done: int, total: int) -> None:
     """Report no progress."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Source:
+class Source(Record, eq=False):
     """Used frames of one scan, which can be read chunk by chunk any number of times.
 
     Parameters
@@ -79,8 +77,7 @@ _CHUNK = 128
 _Weight = Callable[[FloatArray, "NDArray[np.bool_] | None", slice], "NDArray[np.generic]"]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SolvedGains:
+class SolvedGains(Record, eq=False):
     """Gains of the used frames, one array per scan, and the course of the solution."""
 
     gains: list[FloatArray]
@@ -193,8 +190,7 @@ CALM_FACTOR = 1.1
 LEAST_FRAMES = 50
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class FlatField:
+class FlatField(Record, eq=False):
     """Response of each taxel relative to the array's mean.
 
     Parameters
@@ -269,8 +265,7 @@ def _calm(ratio: FloatArray) -> BoolArray:
 GAIN_TOLERANCE = 1e-4
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Accumulated:
+class Accumulated(Record, eq=False):
     """Sums over all frames, and how the gains were solved.
 
     Parameters

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError, check_number
 from tactile_bayes.findings import Finding, by_weight
 from tactile_bayes.geometry import FloatArray, Plane, apply, inverse, patient_from_plane
@@ -277,8 +277,7 @@ def _of_scans(scans: list[Scan]) -> tuple[Finding, ...]:
     )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Rules:
+class _Rules(Record, eq=False):
     """Rules for using frames, independent of the latency."""
 
     window_kpa: tuple[float, float]

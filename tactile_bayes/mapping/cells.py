@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from math import floor
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import FloatArray, apply, inverse
 from tactile_bayes.mapping.plane import FramePoses
@@ -243,32 +245,29 @@ _MOST_CELLS = 2**15
 _WHOLE = 2.0**52
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ProjectedTaxels:
+class ProjectedTaxels(Record, eq=False, dict=True):
     """The taxels of a head to be projected.
 
     Parameters
     ----------
     place_mm : (3, k) array
         Their centres in the tracker's axes, about their middle.
-    place_and_one : (4, k) array
-        The same over a row of ones, with which a shift is one more term of a product.
-    reach_mm : (4,) array
-        How far they reach from their middle along each axis, and 0.
     """
 
     place_mm: FloatArray
-    place_and_one: FloatArray = field(init=False)
-    reach_mm: FloatArray = field(init=False)
 
-    def __post_init__(self) -> None:
-        ones = np.ones(self.place_mm.shape[1])
-        object.__setattr__(self, "place_and_one", np.vstack([self.place_mm, ones]))
-        object.__setattr__(self, "reach_mm", np.append(np.abs(self.place_mm).max(axis=1, initial=0.0), 0.0))
+    @cached_property
+    def place_and_one(self) -> FloatArray:
+        """(4, k) places over a row of ones, with which a shift is one more term of a product."""
+        return np.vstack([self.place_mm, np.ones(self.place_mm.shape[1])])
+
+    @cached_property
+    def reach_mm(self) -> FloatArray:
+        """(4,) how far they reach from their middle along each axis, and 0."""
+        return np.append(np.abs(self.place_mm).max(axis=1, initial=0.0), 0.0)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Projection:
+class Projection(Record, eq=False):
     """Frames' taxels on the lattice of cells: ``uv = turn @ taxel + shift``, frame by frame; the cell is floor(uv).
 
     The face of the head is curved, so its true surface is used: two rows of each frame's rotation against three
@@ -441,8 +440,7 @@ BoolArray = NDArray[np.bool_]
 PRESSURE_STEP_KPA = 2.0**-34
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Readout:
+class Readout(Record, eq=False, dict=True):
     """The taxels used, and the conversion of their counts to pressures.
 
     Parameters
@@ -455,10 +453,6 @@ class Readout:
         On the grid of `PRESSURE_STEP_KPA`.
     full_count
         Readings at or above it carry no pressure.
-    plain_count
-        Up to it no taxel is saturated; -1 where that holds for no count.
-    never_negative
-        Whether no count gives a pressure below 0.
     """
 
     taxels: NDArray[np.intp]
@@ -466,18 +460,24 @@ class Readout:
     gain_kpa: FloatArray
     offset_kpa: FloatArray
     full_count: int
-    plain_count: int = field(init=False)
-    never_negative: bool = field(init=False)
-    _ones: FloatArray = field(init=False, repr=False)
 
-    def __post_init__(self) -> None:
+    @cached_property
+    def plain_count(self) -> int:
+        """Up to it no taxel is saturated; -1 where that holds for no count."""
         used = self.gain_kpa > 0
         room = (PRESSURE_RANGE_KPA[1] - self.offset_kpa[used]) / self.gain_kpa[used]
         plain = min(float(room.min(initial=np.inf)) - 1, self.full_count - 1, 65535)
         sound = bool((self.offset_kpa < PRESSURE_RANGE_KPA[1]).all())
-        object.__setattr__(self, "plain_count", int(max(plain, -1)) if sound else -1)
-        object.__setattr__(self, "_ones", np.ones(len(self.taxels)))
-        object.__setattr__(self, "never_negative", bool(self.offset_kpa.min(initial=0.0) >= 0))
+        return int(max(plain, -1)) if sound else -1
+
+    @cached_property
+    def never_negative(self) -> bool:
+        """Whether no count gives a pressure below 0."""
+        return bool(self.offset_kpa.min(initial=0.0) >= 0)
+
+    @cached_property
+    def _ones(self) -> FloatArray:
+        return np.ones(len(self.taxels))
 
     @classmethod
     def of(cls, calibration: ElementCalibration, good: BoolArray) -> Readout:

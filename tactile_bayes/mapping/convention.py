@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.findings import Finding
 from tactile_bayes.geometry import FloatArray, inverse, rotation_from_quaternion
@@ -53,8 +53,7 @@ def _slot(time_s: FloatArray) -> FloatArray:
     return np.asarray(np.floor(time_s / POOL_S))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class CoarseFrames:
+class CoarseFrames(Record, eq=False):
     """Some frames of one scan, averaged.
 
     Parameters

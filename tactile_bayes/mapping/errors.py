@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_bayes.declarations import Record
 from tactile_bayes.geometry import FloatArray, Plane, apply, inverse, rotation_from_quaternion
 from tactile_bayes.mapping.accumulate import Source
 from tactile_bayes.mapping.cells import VALUE_STEP, CellSums
@@ -49,8 +49,7 @@ def pose_noise_figures(selections: Sequence[SelectedFrames], plane: Plane, *, ce
     return {name: float(f"{value:.4g}") for name, value in zip(POSE_NOISE, figures, strict=True)}
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Places:
+class _Places(Record, eq=False):
     """Position errors of a scan's used frames.
 
     Parameters
@@ -191,8 +190,7 @@ def _sampled(source: Source, of_frames: int) -> list[slice]:
     return [slice(start, start + length) for start in starts.tolist()]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Run:
+class _Run(Record, eq=False):
     """Errors of one run of frames; (f, k) arrays, 0 where not known.
 
     Parameters

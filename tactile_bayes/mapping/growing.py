@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
+from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.geometry import FloatArray, Plane, check_rigid
 from tactile_bayes.mapping.cells import CellSums, Projection, Projector, Readout
@@ -24,8 +25,7 @@ _TALLIES = ("frames_total", "frames_used", "dropped_no_pose", "dropped_elements"
 _PORTION = 4096
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class MapGrid:
+class MapGrid(Record, eq=False):
     """Lattice of a map's cells on a plane.
 
     Parameters
@@ -54,8 +54,7 @@ class MapGrid:
         return self.cell_mm == other.cell_mm and np.array_equal(self.plane_from_base, other.plane_from_base)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Instrument:
+class Instrument(Record, eq=False, dict=True):
     """Conversion of counts and poses to pressures on a plane, and the rules for frames that count.
 
     Parameters
@@ -75,12 +74,15 @@ class Instrument:
     faults: Sequence[TaxelFault] = ()
     pressure_window_kpa: tuple[float, float] = PRESSURE_WINDOW_KPA
     normalise: str = "mean"
-    readout: Readout = field(init=False)
 
     def __post_init__(self) -> None:
         if self.normalise not in ("mean", "none"):
             raise UsageError(f"frames cannot be added one by one with normalise {self.normalise!r}; use mean or none")
-        object.__setattr__(self, "readout", Readout.of(self.element_calibration, self.good))
+
+    @cached_property
+    def readout(self) -> Readout:
+        """The taxels used, and the conversion of their counts."""
+        return Readout.of(self.element_calibration, self.good)
 
     @property
     def good(self) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_bayes.declarations import replace
+from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import FloatArray, Plane
 from tactile_bayes.mapping.cells import Projector
@@ -39,8 +38,7 @@ _LEVELLING_ROUNDS, _GRADIENT_ROUNDS = 12, 2
 _PROJECTION_ROUNDS, _PROJECTION_TOLERANCE = 40, 1e-4
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ShiftFit:
+class ShiftFit(Record, eq=False):
     """Readings of one or several scans at supposed places, ready for a regression on shifts.
 
     Parameters
@@ -97,8 +95,7 @@ class ShiftFit:
         return np.asarray(np.einsum("ni,ni->n", self.gradient, moved))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Cells:
+class Cells(Record, eq=False):
     """The cells of the map that readings fall in.
 
     Parameters
@@ -144,8 +141,7 @@ class Cells:
         return np.asarray(np.nan_to_num(slopes)[self.number])
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Nuisance:
+class Nuisance(Record, eq=False):
     """What varies besides the map: in each frame, in each block of taxels, and from row to row of the head.
 
     Parameters
@@ -230,8 +226,7 @@ _CROSSES = 0.1
 _NEEDED = "scan back and forth over a lump for 20 s, or give the number of the instrument"
 
 
-@dataclass(frozen=True, slots=True)
-class LatencyEstimate:
+class LatencyEstimate(Record):
     """Estimated latency of the poses' time stamps.
 
     Parameters
@@ -318,8 +313,7 @@ def _lack(found: LatencyEstimate) -> str:
     return f"{lack}{known}, within {MOST_SD_MS:g} ms are needed"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Part:
+class _Part(Record, eq=False):
     """Frames of one scan whose pose is known at every latency tried."""
 
     selection: SelectedFrames
@@ -383,8 +377,7 @@ def _strokes(parts: Sequence[_Part], latency_ms: float) -> tuple[IndexArray, Flo
     return np.concatenate(labels), np.concatenate(ways)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Regression:
+class _Regression(Record, eq=False):
     """The regression at the latency found, and the groups that its errors are shared in.
 
     Parameters

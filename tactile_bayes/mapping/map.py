@@ -5,16 +5,15 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import field
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_bayes.declarations import Record, field, settle
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.findings import Finding
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.records import dataclass
 from tactile_bayes.scan import HeadShape
 
 # --- Binomial smoothing of sums in cells.
@@ -37,8 +36,7 @@ def smooth(values: NDArray[np.generic], *, passes: int = 4) -> FloatArray:
 FEW_READINGS = 10
 
 
-@dataclass(frozen=True, slots=True)
-class MapRecipe:
+class MapRecipe(Record):
     """How a map was built; a size calibration fits only maps of its own recipe.
 
     Parameters
@@ -92,8 +90,7 @@ class MapRecipe:
         return self.flat_field if self.source == "scan" else None
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class TactileMap:
+class TactileMap(Record, eq=False):
     """Mean normalised pressure on the best-fit plane.
 
     Parameters
@@ -157,7 +154,7 @@ class TactileMap:
         for name in ("mean", "variance", "count", "x_mm", "y_mm"):
             view = getattr(self, name).view()
             view.flags.writeable = False
-            object.__setattr__(self, name, view)
+            settle(self, **{name: view})
         infinite = np.isinf(self.mean)
         if infinite.any() and (infinite & (self.count > 0)).any():
             raise BadDataError("mean holds infinite values", way_out="mark cells without data by count 0")
@@ -383,8 +380,7 @@ _SMOOTHED_CELLS = 2.0  # variance that `smooth` adds, in cells squared
 _LEAST_RISE = 4.0
 
 
-@dataclass(frozen=True, slots=True)
-class CellAdvice:
+class CellAdvice(Record):
     """Advice on the size of the cells.
 
     Parameters

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from statistics import NormalDist
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_bayes.declarations import Record
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.map import TactileMap
 
@@ -27,8 +27,7 @@ _PATIENT_SIDES: Final = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class Orientation:
+class Orientation(Record):
     """Which axes of the plane point right and up on the screen.
 
     Parameters
@@ -130,8 +129,7 @@ _ON_AXIS_DEG: Final = 15.0
 _DEGREES_PER_HOUR: Final = 30.0
 
 
-@dataclass(frozen=True, slots=True)
-class ClockPosition:
+class ClockPosition(Record):
     """Place of a point about the nipple, as the examiner sees it who faces the patient: 12 is towards the head.
 
     Parameters

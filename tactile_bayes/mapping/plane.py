@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import reduce
 from math import sqrt
 from operator import add, mul
@@ -12,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import (
     FloatArray,
@@ -29,8 +29,7 @@ from tactile_bayes.scan import HeadGeometry, TrackerPoses
 MAX_POSE_GAP_MS = 50.0
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class FramePoses:
+class FramePoses(Record, eq=False):
     """The pose of the tracker's sensor at each frame.
 
     Parameters
@@ -128,8 +127,7 @@ _LEAST_RESULTANT = 0.3
 Whole = tuple[int, ...]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class HeadMoments:
+class HeadMoments(Record, eq=False):
     """First two moments of all taxel centres over frames, in whole steps; add two with ``+``.
 
     Parameters

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import NDArray
 
+from tactile_bayes.declarations import Record
 from tactile_bayes.geometry import FloatArray, Plane, apply, inverse
 from tactile_bayes.mapping.cells import Readout
 from tactile_bayes.mapping.convention import stroke_starts
@@ -258,8 +258,7 @@ class GrowingProfile:
         self._marks, self._rows = np.concatenate([before[0], marks]), np.concatenate([before[1], rows])
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ProfileReader:
+class ProfileReader(Record, eq=False):
     """Fits smooth pressure profiles to frames.
 
     Parameters

@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_bayes.declarations import replace
+from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.findings import Finding
 from tactile_bayes.geometry import FloatArray
@@ -325,8 +325,7 @@ BoolArray = NDArray[np.bool_]
 VALID_SHARE = 0.9
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SelectedFrames:
+class SelectedFrames(Record, eq=False):
     """A scan with the selection of its frames.
 
     Parameters

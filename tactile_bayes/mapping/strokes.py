@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_bayes.declarations import replace
+from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.accumulate import Source
@@ -38,8 +37,7 @@ _ROUNDS = 4
 _MOST_NUMBERS = 3e7
 
 
-@dataclass(frozen=True, slots=True)
-class StrokeShift:
+class StrokeShift(Record):
     """Shift of one stroke against all others.
 
     Parameters
@@ -156,8 +154,7 @@ def mobility(strokes: Sequence[StrokeShift]) -> tuple[float, float]:
     return float(means[0] - means[1]) / 2, float(np.hypot(*errors)) / 2
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Part:
+class _Part(Record, eq=False):
     """One scan's averaged frames.
 
     Parameters
@@ -193,8 +190,7 @@ class _Part:
         return moved
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Round:
+class _Round(Record, eq=False):
     """The regression at some shifts.
 
     Parameters

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import field
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tactile_bayes.declarations import Record, field
 from tactile_bayes.forward.gaussian import principal_widths
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.draws import quantiles_of
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.posterior.selection import fitted_values, pointwise_log_likelihood
-from tactile_bayes.records import dataclass
 from tactile_bayes.size.pooling import Calibration, SizePriors, draw_sizes
 
 if TYPE_CHECKING:
@@ -23,8 +22,7 @@ if TYPE_CHECKING:
 # --- Fitted values of an estimate's window beside its data: level, tilt, bump and what lies beside it, without noise.
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class FittedCells:
+class FittedCells(Record, eq=False):
     """Cells of a fit window.
 
     Parameters
@@ -76,8 +74,7 @@ LEAST_SIZED = 100
 """Fewer prior draws within the calibration's range say nothing of a size."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class DrawGroup:
+class DrawGroup(Record, eq=False):
     """Arrays of one group with the names of their axes, and what is to be said of it.
 
     Parameters

@@ -6,11 +6,11 @@ from functools import lru_cache
 
 import numpy as np
 
+from tactile_bayes.declarations import Record
 from tactile_bayes.forward.gaussian import cell_mean_gaussian, covariance_from_log_widths, principal_widths
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior.fit_window import FitCells
-from tactile_bayes.records import dataclass
 
 BLOCK, LEAST_BLOCK = 64, 4
 """Parameter vectors predicted at a time: few enough for the intermediate arrays to stay in a processor's cache."""
@@ -25,8 +25,7 @@ def block_size(cells: int) -> int:
     return min(BLOCK, max(LEAST_BLOCK, BLOCK_VALUES // max(cells, 1)))
 
 
-@dataclass(frozen=True, slots=True)
-class Bump:
+class Bump(Record):
     """The parameters of the model: rotation and a free background are optional.
 
     The parameter vector is ``(amplitude, x, y, p, q[, r][, background])``: mm for the centre, p and q the log widths

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from tactile_bayes.declarations import replace
+from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.forward.gaussian import covariance_from_log_widths
 from tactile_bayes.geometry import FloatArray
@@ -33,7 +33,6 @@ from tactile_bayes.posterior.selection import (
 )
 from tactile_bayes.posterior.white import BumpFit
 from tactile_bayes.presets import FIELD_COSINES, SceneAsked
-from tactile_bayes.records import dataclass
 
 # --- Outline of a lump: whether its bump is skewed, or rounder inside than outside, more than a ball's is.
 #
@@ -157,8 +156,7 @@ LEAST_VARIANCE = 1e-12
 """Directions in which errors of the frames' places spread less, as a share of the largest, are left out."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class FieldAnswer:
+class FieldAnswer(Record, eq=False):
     """Detection and scene of a map under correlated errors.
 
     Parameters
@@ -173,8 +171,7 @@ class FieldAnswer:
     choice: SceneChoice
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class FieldDraws:
+class FieldDraws(Record, eq=False):
     """Draws under correlated errors: of the scene's parameters, by name, and figures of fit and noise."""
 
     detection: Detection

@@ -6,19 +6,18 @@ from math import lgamma, log, pi
 
 import numpy as np
 
+from tactile_bayes.declarations import Record
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.modes import inverse_information
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior.bump import Bump
 from tactile_bayes.posterior.fit_window import FitCells, window_cells
-from tactile_bayes.records import dataclass
 
 # --- Error model from a fit's residuals: variance, weights by count, correlation.
 
 
-@dataclass(frozen=True, slots=True)
-class ErrorModel:
+class ErrorModel(Record):
     """Size and correlation of a map's errors, from a fit's residuals.
 
     Parameters
@@ -189,8 +188,7 @@ FIELD_SHARES = (0.5, 0.9, 0.99)
 MOST_BLOCKS = 480
 
 
-@dataclass(frozen=True, slots=True)
-class Detection:
+class Detection(Record):
     """Odds of a bump against smooth errors alone; see `lump_probability` for whether it is a lump.
 
     Parameters
@@ -208,8 +206,7 @@ class Detection:
     ridge: str = ""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Blocks:
+class _Blocks(Record, eq=False):
     """The map about a candidate, averaged over square blocks of cells."""
 
     x_mm: FloatArray

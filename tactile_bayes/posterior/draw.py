@@ -9,7 +9,7 @@ from typing import Literal, assert_never
 
 import numpy as np
 
-from tactile_bayes.declarations import as_dict, replace
+from tactile_bayes.declarations import Record, as_dict, replace
 from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.draws import END_ERROR, INDEPENDENT_DRAWS, ParameterDraws, Solved, distinct_rows
@@ -17,7 +17,6 @@ from tactile_bayes.inference.importance import TRUSTED_SHAPE, Gaussians, importa
 from tactile_bayes.posterior.fit import FieldFit, laplace_mixture, newton_mixture
 from tactile_bayes.posterior.marginal import NEGLIGIBLE
 from tactile_bayes.posterior.options import EstimateOptions
-from tactile_bayes.records import dataclass
 
 Sampler = Literal["laplace", "importance", "ensemble"]
 LADDER: tuple[Sampler, ...] = ("laplace", "importance", "ensemble")
@@ -120,8 +119,7 @@ def judged_laplace(fit: FieldFit, *, rng: np.random.Generator, draws: int = INDE
     return replace(drawn, diagnostics=dict(drawn.diagnostics) | {"pareto_k": float(shape)})
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Sampled:
+class Sampled(Record, eq=False):
     """Density to be sampled: the bump's parameters, with a second structure's fixed at their mode.
 
     A rib whose crest lies outside the window shows a flank only: its place and width trade against each other along a

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import field
 
 import numpy as np
 
+from tactile_bayes.declarations import Record, field
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.records import dataclass
 
 # --- Joint posterior draws, the result of every method and noise model.
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class MapPosterior:
+class MapPosterior(Record, eq=False):
     """Joint draws of the quantities in Eq 7, each (chain, draw).
 
     Parameters
@@ -47,8 +45,7 @@ class MapPosterior:
 # --- Diagnostics of an estimate: of the fit, the errors, the method and the size calibration.
 
 
-@dataclass(frozen=True, slots=True)
-class NoiseFigures:
+class NoiseFigures(Record):
     """Figures of the errors, and the decisions made under them.
 
     Parameters
@@ -85,8 +82,7 @@ class NoiseFigures:
         return {"noise": self.noise, **decided, **self.figures, **passed, "places_share": self.places_share}
 
 
-@dataclass(frozen=True, slots=True)
-class Diagnostics:
+class Diagnostics(Record):
     """Diagnostics of an estimate.
 
     Parameters

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from tactile_bayes.declarations import Record
 from tactile_bayes.forward.gaussian import cell_mean_gaussian, covariance_from_log_widths
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.posterior.fit_window import FitCells
 from tactile_bayes.presets import FIELD_COSINES, FINE_FIELD_COSINES
-from tactile_bayes.records import dataclass
 
 # --- Correlated noise model: a Gaussian random field on a cosine basis plus white noise, whitened once for many fits.
 #
@@ -33,8 +33,7 @@ TOUCHED = 1e-2
 """Directions in which the field's variance is a smaller part of the independent one are dropped."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Whitening:
+class Whitening(Record, eq=False):
     """The noise field of one correlation length, prepared for every share.
 
     Parameters
@@ -149,8 +148,7 @@ RESOLVED = 3.0
 """Widths above as many cells need no more than a cell's variance."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Projected:
+class Projected(Record, eq=False):
     """Inner products of m templates, with cells weighted by their inverse independent variance.
 
     Parameters
@@ -168,8 +166,7 @@ class Projected:
     square: FloatArray
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Profiles:
+class Profiles(Record, eq=False):
     """m templates on the grid: products of `rows` (m, ny) and `columns` (m, nx), or `grid` (m, ny, nx) as it is."""
 
     rows: FloatArray | None = None

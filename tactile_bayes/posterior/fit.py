@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from tactile_bayes.declarations import Record
 from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.forward.gaussian import principal_widths
 from tactile_bayes.geometry import FloatArray
@@ -15,7 +16,6 @@ from tactile_bayes.posterior.marginal import CollapsedTarget, independent_varian
 from tactile_bayes.posterior.scene import Problem, Scene
 from tactile_bayes.posterior.white import BumpFit
 from tactile_bayes.presets import FIELD_COSINES
-from tactile_bayes.records import dataclass
 
 # --- Posterior of a scene under correlated errors: its mode, a Gaussian for each noise field, and draws.
 
@@ -26,8 +26,7 @@ LEAST_SHARE = 1e-2
 """Fields with a smaller share of the density at the mode have no Gaussian of their own in what `laplace` draws."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Mixture(Gaussians):
+class Mixture(Gaussians, eq=False):
     """One Gaussian for each noise field that matters: what `laplace` draws from.
 
     Parameters
@@ -41,8 +40,7 @@ class Mixture(Gaussians):
     log_evidence: float
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class FieldFit:
+class FieldFit(Record, eq=False):
     """A scene fitted at the mode of its marginal posterior.
 
     Parameters

@@ -6,11 +6,10 @@ from functools import lru_cache
 
 import numpy as np
 
-from tactile_bayes.declarations import replace
+from tactile_bayes.declarations import Record, replace
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.presets import POSE_NOISE
-from tactile_bayes.records import dataclass
 
 SMOOTHING_MM = 3.0
 """Width of the Gaussian that smooths a map before candidates are sought: about that of a small lump's bump."""
@@ -22,8 +21,7 @@ MAPS_AT_HAND = 4
 """Maps of which what was worked out once is kept: the map, its levelled one, and both without the measured lump."""
 
 
-@dataclass(frozen=True, slots=True)
-class PoseNoise:
+class PoseNoise(Record):
     """Tracker position error of a map, one error per frame: the figures `presets.POSE_NOISE`.
 
     Parameters
@@ -49,8 +47,7 @@ class PoseNoise:
         return cls((figures[0], figures[1]), (figures[2], figures[3]), figures[4])
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class FitCells:
+class FitCells(Record, eq=False):
     """The cells of one window, flattened.
 
     Parameters

@@ -6,9 +6,9 @@ from math import lgamma, log, pi
 
 import numpy as np
 
+from tactile_bayes.declarations import Record, names_of
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.posterior.field import Profiles, Projected, Whitening, Window
-from tactile_bayes.records import dataclass
 
 # --- Solutions for the linear parameters (amplitudes, level, tilt) given the shape, for many shapes and noise fields.
 
@@ -20,8 +20,7 @@ LEAST_POWER = 1e-9
 """Of a template, over what the prior on its amplitude is worth: less tells nothing and would only overflow."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class LinearSolution:
+class LinearSolution(Record, eq=False):
     """Conditional posterior of the linear parameters for m shapes and h fields: a multivariate t.
 
     Parameters
@@ -45,8 +44,7 @@ class LinearSolution:
     sum_of_squares: FloatArray
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class FieldColumns:
+class FieldColumns(Record, eq=False):
     """Fixed columns and data under the noise fields of one length: the part that does not depend on the shape.
 
     Parameters
@@ -109,8 +107,7 @@ class FieldColumns:
         return self.log_prior - 0.5 * self.log_det + lgamma(dof / 2) - 0.5 * dof * np.log(pi * squares)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Inner:
+class Inner(Record, eq=False):
     """Inner products of m templates under the noise fields of one length with h shares.
 
     Parameters
@@ -192,7 +189,7 @@ def joined(solutions: list[LinearSolution]) -> LinearSolution:
     return LinearSolution(
         *(
             np.concatenate([getattr(one, name) for one in solutions], axis=0 if name in by_field else 1)
-            for name in LinearSolution.__slots__
+            for name in names_of(LinearSolution)
         )
     )
 

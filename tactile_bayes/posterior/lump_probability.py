@@ -7,6 +7,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from tactile_bayes.declarations import Record
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.options import BumpPrior
@@ -18,7 +19,6 @@ from tactile_bayes.posterior.options import DETECTED
 from tactile_bayes.posterior.scene import Problem, Scene
 from tactile_bayes.posterior.white import Candidate
 from tactile_bayes.presets import FIELD_COSINES, FIT_RADIUS_MM
-from tactile_bayes.records import dataclass
 
 # --- Probability that a rise of a map is a lump, calibrated on simulated exams with and without one.
 
@@ -37,8 +37,7 @@ WIDE_MM: Final = 8.0
 NO_EVIDENCE: Final = "no lump by the evidence"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Weighed:
+class Weighed(Record, eq=False):
     """A rise with the odds of a bump there, and the probability that it is a lump.
 
     Parameters
@@ -133,8 +132,7 @@ AMPLITUDES: Final = np.geomspace(1e-3, 10.0, 120)
 LEAST_CELLS, LEAST_SHARE, NEAR_MM = 100, 0.6, 7.5
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SmallestLumps:
+class SmallestLumps(Record, eq=False):
     """Diameters in mm of the smallest ball that a map would have shown with `PROBABILITY`.
 
     Parameters

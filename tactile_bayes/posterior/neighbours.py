@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from tactile_bayes.declarations import replace
+from tactile_bayes.declarations import Record, replace
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.fit import FieldFit
@@ -32,7 +32,6 @@ from tactile_bayes.posterior.selection import (
     odds,
 )
 from tactile_bayes.presets import SceneAsked
-from tactile_bayes.records import dataclass
 
 # --- Check of structures at the window's rim against the map around it.
 
@@ -45,8 +44,7 @@ LEAST_CELLS, LEAST_IN_PIECE = 4.0, 1.0
 """Of a place's weight, and of a piece's: with less of it on the map there is nothing to see."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Surroundings:
+class Surroundings(Record, eq=False):
     """Smoothed map less its level, not finite where the map has no data.
 
     Parameters

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import field
 from typing import TYPE_CHECKING
 
+from tactile_bayes.declarations import Record, field
 from tactile_bayes.errors import UsageError, check_choice
 from tactile_bayes.inference.draws import INDEPENDENT_DRAWS
 from tactile_bayes.options import BumpPrior
 from tactile_bayes.presets import METHODS, Background, Method, Noise, Rotation, SceneAsked
-from tactile_bayes.records import dataclass
 from tactile_bayes.size.pooling import SizePriors
 
 if TYPE_CHECKING:
@@ -21,8 +20,7 @@ ROTATION_ODDS = 3.0
 """Odds above which a rotated ellipse is used instead of one along the head's axes."""
 
 
-@dataclass(frozen=True, slots=True)
-class FitOptions:
+class FitOptions(Record):
     """How a map is fitted; must agree with the size calibration's recipe.
 
     Parameters
@@ -61,8 +59,7 @@ class FitOptions:
         return self.noise == "field"
 
 
-@dataclass(frozen=True, slots=True)
-class EstimateOptions:
+class EstimateOptions(Record):
     """Settings of an estimate.
 
     Parameters

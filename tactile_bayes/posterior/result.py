@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from tactile_bayes.declarations import as_dict
+from tactile_bayes.declarations import Record, as_dict
 from tactile_bayes.findings import Finding
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.draws import ParameterDraws, weighted_quantiles_of
@@ -17,7 +17,6 @@ from tactile_bayes.posterior.detection import Detection
 from tactile_bayes.posterior.draws import Diagnostics, MapPosterior
 from tactile_bayes.posterior.lump_probability import Weighed
 from tactile_bayes.posterior.white import BumpFit, Candidate
-from tactile_bayes.records import dataclass
 from tactile_bayes.size.draws import SizePosterior
 
 if TYPE_CHECKING:
@@ -31,8 +30,7 @@ WIDER = 2.0
 TAIL = 0.025
 
 
-@dataclass(frozen=True, slots=True)
-class Sensitivity:
+class Sensitivity(Record):
     """Effect of doubling the width prior's SD, in posterior SDs.
 
     Parameters
@@ -89,8 +87,7 @@ def prior_sensitivity(
 Status = Literal["estimate", "no_estimate"]
 
 
-@dataclass(frozen=True, slots=True)
-class ModalBump:
+class ModalBump(Record):
     """The bump at the mode: its amplitude, its centre and its widths along the ellipse's axes."""
 
     amplitude: float
@@ -100,8 +97,7 @@ class ModalBump:
     sigma_y_mm: float
 
 
-@dataclass(frozen=True, slots=True)
-class Rise:
+class Rise(Record):
     """Another rise on the map.
 
     Parameters
@@ -129,8 +125,7 @@ class Rise:
         return {name: None if value is None else float(f"{value:.6g}") for name, value in as_dict(self).items()}
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Estimate:
+class Estimate(Record, eq=False):
     """The answer for one map.
 
     Parameters
@@ -197,8 +192,7 @@ class Estimate:
         return None if self.weighed is None else self.weighed.probability
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Mass:
+class Mass(Record, eq=False):
     """One of the masses on a map.
 
     Parameters

@@ -7,18 +7,16 @@ from typing import Final, Literal, assert_never
 
 import numpy as np
 
-from tactile_bayes.declarations import replace
+from tactile_bayes.declarations import Record, replace
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior.field import Profiles, Window
 from tactile_bayes.posterior.white import WIDEST_IN_RADII
-from tactile_bayes.records import dataclass
 
 # --- The fit problem that all scenes of one window share: cells, prior and bounds.
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Problem:
+class Problem(Record, eq=False):
     """A window with its cells, and the assumptions about a bump in it.
 
     Parameters
@@ -89,8 +87,7 @@ _NEIGHBOUR_NAMES: Final[Mapping[Extra, tuple[str, ...]]] = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class Scene:
+class Scene(Record):
     """Structures in a model.
 
     The parameters are ``u, v, x, y`` (logs of the widths while nothing is turned, and the centre), without v for a

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from tactile_bayes.declarations import replace
+from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import Abstention, NotConvergedError
 from tactile_bayes.inference.draws import ParameterDraws
 from tactile_bayes.mapping.map import TactileMap
@@ -33,7 +33,6 @@ from tactile_bayes.posterior.white import (
     judged_noise,
 )
 from tactile_bayes.presets import INTERVAL
-from tactile_bayes.records import dataclass
 from tactile_bayes.size.draws import EXTREMES, SizePosterior
 from tactile_bayes.size.pooling import Calibration, SizePriors, draw_sizes
 
@@ -47,8 +46,7 @@ if TYPE_CHECKING:
 Progress = Callable[[int, int], None]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class MapDraws:
+class MapDraws(Record, eq=False):
     """Posterior draws of one lump under a noise model.
 
     Parameters
@@ -124,8 +122,7 @@ def assess(tactile_map: TactileMap, fit: BumpFit, options: EstimateOptions) -> A
     return _correlated(tactile_map, fit, options)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _White:
+class _White(Record, eq=False):
     """An assessment under independent errors."""
 
     tactile_map: TactileMap
@@ -146,8 +143,7 @@ class _White:
         return MapDraws(self.detection, fit, draws, posterior, judged_noise(fit, odds))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Correlated:
+class _Correlated(Record, eq=False):
     """An assessment under correlated errors; `answer` is None where the density has no mode."""
 
     tactile_map: TactileMap
@@ -208,8 +204,7 @@ DEFAULT_ACCURACY_SD = {"importance": 0.02, "ensemble": 0.1}
 MOST_REFINEMENTS, SAFETY, LEAST_ACCURACY_SD = 3, 0.8, 1e-3
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Drawn:
+class Drawn(Record, eq=False):
     """Draws of one map with its size by `calibration`; `fault` and `too_far` say why there is none."""
 
     made: MapDraws

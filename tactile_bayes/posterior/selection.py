@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import field
 from functools import partial
 from itertools import islice
 from math import lgamma, log, pi
@@ -11,7 +10,7 @@ from typing import assert_never
 
 import numpy as np
 
-from tactile_bayes.declarations import replace
+from tactile_bayes.declarations import Record, field, replace
 from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.forward.gaussian import covariance_from_log_widths
 from tactile_bayes.geometry import FloatArray
@@ -22,7 +21,6 @@ from tactile_bayes.posterior.marginal import CollapsedTarget, linear_columns
 from tactile_bayes.posterior.options import ROTATION_ODDS
 from tactile_bayes.posterior.scene import Problem, Scene, Shape
 from tactile_bayes.presets import SceneAsked
-from tactile_bayes.records import dataclass
 
 # --- What draws say of a window's cells under correlated errors: the density of each given the others.
 #
@@ -142,8 +140,7 @@ LEAST_ODDS = 3.0
 ASKING = ("auto", "second-lump", "rib")
 
 
-@dataclass(frozen=True, slots=True)
-class Structure:
+class Structure(Record):
     """A question about the scene, with its answer.
 
     Parameters
@@ -176,8 +173,7 @@ class Structure:
     place: str = ""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SceneChoice:
+class SceneChoice(Record, eq=False):
     """The scene chosen for the draws, and the evidence for it.
 
     Parameters

@@ -8,7 +8,7 @@ from typing import assert_never
 
 import numpy as np
 
-from tactile_bayes.declarations import replace
+from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import NotConvergedError, UsageError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.draws import ParameterDraws, Solved
@@ -44,7 +44,6 @@ from tactile_bayes.posterior.fit_window import (
 )
 from tactile_bayes.posterior.options import ROTATION_ODDS, EstimateOptions, FitOptions
 from tactile_bayes.presets import Background, Noise
-from tactile_bayes.records import dataclass
 
 # --- Log posterior density of a least-squares model, with the noise scale integrated out.
 
@@ -56,8 +55,7 @@ def flat_prior(theta: FloatArray) -> FloatArray:
     return np.zeros(theta.shape[:-1])
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Target:
+class Target(Record, eq=False):
     r"""Posterior density of a model's parameters, up to a constant.
 
     Parameters
@@ -147,8 +145,7 @@ JOINED = 0.05
 """So near to a minimum, in the same units, a fit ends in it."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class BumpFit:
+class BumpFit(Record, eq=False):
     """A least-squares bump, with all that the methods need.
 
     Parameters
@@ -214,8 +211,7 @@ class BumpFit:
         return log_prior
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Candidate:
+class Candidate(Record, eq=False):
     """A candidate place.
 
     Parameters

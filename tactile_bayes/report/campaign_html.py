@@ -7,13 +7,12 @@ import hashlib
 import heapq
 import html
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import field
 from typing import Final
 from urllib.parse import quote
 
+from tactile_bayes.declarations import Record, field
 from tactile_bayes.findings import SEVERITIES, Finding, finding_lines
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.records import dataclass
 from tactile_bayes.report.compare import Growth, growth_section
 
 FAILED, UNSIZED, SIZED = "failed", "without a size", "sized"
@@ -68,8 +67,7 @@ _LEGEND: Final = (
 _CLASSES: Final = {FAILED: "failed", UNSIZED: "without", SIZED: "sized"}
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Card:
+class Card(Record, eq=False):
     """One exam on the page.
 
     Parameters

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from tactile_bayes.declarations import Record
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.findings import Finding, finding_lines, finding_summary, findings_in
 from tactile_bayes.findings import verdict as verdict_of
 from tactile_bayes.inference.draws import nine_digits
 from tactile_bayes.inference.points import normal_quantile
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.records import dataclass
 from tactile_bayes.size.visits import VOLUME, Trend, doubling_days, straight_line
 
 if TYPE_CHECKING:
@@ -32,8 +32,7 @@ _NOTE: Final = (
 )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Growth:
+class Growth(Record, eq=False):
     """Change of one mass from its first visit to a later one.
 
     Parameters

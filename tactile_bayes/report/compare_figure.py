@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from tactile_bayes.declarations import Record
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.mapping.places import PATIENT_WORDS, PLANE_WORDS, Orientation
@@ -31,16 +31,14 @@ _LEAST_COLOURS: Final = (0.9, 1.3)
 _MOST_VISITS: Final = 4
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class DrawnMap:
+class DrawnMap(Record, eq=False):
     """A map and the place of its lump on the plane; None where none was found."""
 
     tactile_map: TactileMap
     centre_mm: tuple[float, float] | None
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Laid:
+class _Laid(Record, eq=False):
     """A visit's maps averaged on a common grid about its mass.
 
     Parameters

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from tactile_bayes.declarations import replace
+from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.findings import Finding
 from tactile_bayes.geometry import FloatArray
@@ -110,8 +109,7 @@ _SIZES: Final = {"max": "largest", "min": "smallest"}
 _KINDS: Final = {"eti": "equal-tailed", "hdi": "highest-density"}
 
 
-@dataclass(frozen=True, slots=True)
-class SizeInterval:
+class SizeInterval(Record):
     """A labelled credible interval: ``SizeInterval(12.1, 15.9, 0.95, "equal-tailed")``, with what it `supposes`."""
 
     low_mm: float

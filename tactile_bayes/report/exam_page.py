@@ -14,13 +14,13 @@ from pathlib import Path
 from typing import Final
 
 from tactile_bayes import __version__
+from tactile_bayes.declarations import Record
 from tactile_bayes.errors import UsageError
 from tactile_bayes.files.atomic import check_suffix, refuse_existing, same_file, write_all
 from tactile_bayes.mapping.places import orientation_of
 from tactile_bayes.posterior.abstention import chance_text
 from tactile_bayes.posterior.lump_probability import SHARE_WITH_LUMP
 from tactile_bayes.presets import INTERVAL, RESEARCH_USE
-from tactile_bayes.records import dataclass
 from tactile_bayes.report.exam_words import (
     Exam,
     Quantity,
@@ -50,8 +50,7 @@ from tactile_bayes.report.svg import (
 # --- The page of an exam as files: HTML, and printed to PDF.
 
 
-@dataclass(frozen=True, slots=True)
-class PageFiles:
+class PageFiles(Record):
     """Where the page of an exam goes.
 
     Parameters

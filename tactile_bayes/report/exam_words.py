@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 
-from tactile_bayes.declarations import replace
+from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import NO_LUMP
 from tactile_bayes.findings import finding_lines, findings_in
 from tactile_bayes.geometry import apply
@@ -26,8 +25,7 @@ from tactile_bayes.size.pooling import DISAGREE
 Quantity = Mapping[str, Any]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ExamMass:
+class ExamMass(Record, eq=False):
     """One mass on a map.
 
     Parameters
@@ -62,8 +60,7 @@ class ExamMass:
     why: str = ""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ExamMap:
+class ExamMap(Record, eq=False):
     """One map of an exam, with the estimate's JSON object and its masses, the reported one first.
 
     `tactile_map` is None where only the estimate is at hand.
@@ -74,8 +71,7 @@ class ExamMap:
     masses: tuple[ExamMass, ...]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Exam:
+class Exam(Record, eq=False):
     """What one page shows.
 
     Parameters

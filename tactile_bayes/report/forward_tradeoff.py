@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from tactile_bayes.declarations import Record
 from tactile_bayes.forward.line import outside_range
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.presets import RESEARCH_USE
@@ -25,8 +25,7 @@ _MESHES = ("mesh", "default", "contact cell", "reference")
 _NAME = 52
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class TradeoffReport:
+class TradeoffReport(Record, eq=False):
     """All measurements of a trade-off.
 
     Parameters

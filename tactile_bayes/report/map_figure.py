@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.findings import Finding
 from tactile_bayes.mapping.map import FEW_READINGS, TactileMap
@@ -41,8 +41,7 @@ _ABOVE: Final[dict[str, Any]] = {
 _EXPLAINED_PLACES: Final = 4
 
 
-@dataclass(frozen=True, slots=True)
-class FitContour:
+class FitContour(Record):
     """Place and size of a fitted lump on the map.
 
     Parameters
@@ -68,16 +67,14 @@ class FitContour:
     amplitude: float | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class Place:
+class Place(Record):
     """A place looked at on the map, and why no lump was measured there."""
 
     centre_mm: tuple[float, float]
     reason: str
 
 
-@dataclass(frozen=True, slots=True)
-class NumberedMass:
+class NumberedMass(Record):
     """One of several masses on the map; `size_mm` along its ellipse's axes, None without a size."""
 
     number: int

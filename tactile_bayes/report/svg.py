@@ -7,12 +7,12 @@ import html
 import io
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_bayes.declarations import Record
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.mapping.places import Orientation, orientation_of
@@ -208,8 +208,7 @@ _BAR_STEPS: Final = 40
 _BARBS: Final = ((0.87, 0.5), (0.87, -0.5))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Frame:
+class Frame(Record, eq=False):
     """Where the map's points lie on the page, in mm from the picture's upper left corner without its margin.
 
     Parameters

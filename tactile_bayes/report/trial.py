@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, is_dataclass
 from typing import Any
 
-from tactile_bayes.declarations import names_of
+from tactile_bayes.declarations import Record, names_of
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.trial.accuracy import ModalityRatio, PairedComparison, least_p
 from tactile_bayes.trial.figures import Figure
@@ -196,8 +195,8 @@ def _paired_document(one: PairedComparison) -> dict[str, Any]:
 
 
 def _plain(value: object) -> Any:
-    """Convert dataclasses, tuples and numbers to JSON values; what is not finite becomes null."""
-    if is_dataclass(value):
+    """Convert records, tuples and numbers to JSON values; what is not finite becomes null."""
+    if isinstance(value, Record):
         return {name: _plain(getattr(value, name)) for name in names_of(value)}
     if isinstance(value, Mapping):
         return {key: _plain(one) for key, one in value.items()}
@@ -280,8 +279,7 @@ def _limits_lines(report: ModalityReport) -> Iterator[str]:
         yield f"{report.name}: limits of agreement {row.words}: bias {row.bias}, {row.low} to {row.high}"
 
 
-@dataclass(frozen=True, slots=True)
-class LimitRow:
+class LimitRow(Record):
     """Limits of agreement on one scale, formatted."""
 
     words: str

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
-from tactile_bayes.declarations import replace
+from tactile_bayes.declarations import Record, field, replace
 from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.estimate import estimate_map
@@ -27,8 +26,7 @@ MOST_S = 4.0
 """CPU seconds after which a setting is not run again: its least time is known well enough."""
 
 
-@dataclass(frozen=True, slots=True)
-class Work:
+class Work(Record):
     """How a study is run.
 
     Parameters
@@ -79,8 +77,7 @@ class Choice(Protocol):
 Chosen = TypeVar("Chosen", bound=Choice)
 
 
-@dataclass(frozen=True, slots=True)
-class Priced:
+class Priced(Record):
     """One setting.
 
     Parameters
@@ -120,8 +117,7 @@ class Priced:
         return self.answers[0]
 
 
-@dataclass(frozen=True, slots=True)
-class Reference:
+class Reference(Record):
     """What the settings are compared with.
 
     Parameters
@@ -145,8 +141,7 @@ class Reference:
         return float("nan") if found is None else found.mc_error
 
 
-@dataclass(frozen=True, slots=True)
-class PooledRow:
+class PooledRow(Record):
     """The size by the first few of several maps of one mass.
 
     Parameters
@@ -167,8 +162,7 @@ class PooledRow:
     another_half_mm: float = float("nan")
 
 
-@dataclass(frozen=True, slots=True)
-class Ladder:
+class Ladder(Record):
     """All settings of a study.
 
     Parameters
@@ -294,8 +288,7 @@ RADII_MM = (8.0, 12.0, 16.0, 20.0, 25.0, 30.0)
 METHOD, ACCURACY, FIELD, WINDOW = "method", "draws", "noise field", "fit window"
 
 
-@dataclass(frozen=True, slots=True)
-class Setting:
+class Setting(Record):
     """One way to estimate.
 
     Parameters
@@ -403,8 +396,7 @@ def _by(options: EstimateOptions, method: Any, accuracy_sd: float | None = None)
     return replace(options, method=method, accuracy_sd=accuracy_sd, accuracy_mm=None, step_up=False)
 
 
-@dataclass(frozen=True, slots=True)
-class Estimator:
+class Estimator(Record):
     """Estimates of one map, seeded by the map and the number of the run.
 
     Parameters

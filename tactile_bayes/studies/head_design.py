@@ -8,10 +8,10 @@ linear, so that only the ratio of mean pressure to modulus matters.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
+from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.body import POISSON, THICKNESS_MM, Layers
 from tactile_bayes.forward.contact import Head
@@ -29,8 +29,7 @@ SHOULDERS_MM = (0.0, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 10.0, 12.0, 15.0, 20.0)
 _CELL_MM = 0.5
 
 
-@dataclass(frozen=True, slots=True)
-class HomogeneousTissue:
+class HomogeneousTissue(Record):
     """Tissue and pressures over which a head should press evenly.
 
     Parameters
@@ -81,8 +80,7 @@ class HomogeneousTissue:
         return frames.s_mm, share.reshape(3, 3, -1)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Uniformity:
+class Uniformity(Record, eq=False):
     """How evenly one head presses.
 
     Parameters

@@ -12,7 +12,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_bayes.declarations import replace
+from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.line import fit_shape, lump_pressure
 from tactile_bayes.forward.scene import Scene
@@ -24,7 +24,6 @@ from tactile_bayes.mapping.select import SelectedFrames, select_frames
 from tactile_bayes.posterior.options import FitOptions
 from tactile_bayes.posterior.white import BumpFit, fit_bump, fitted_candidates
 from tactile_bayes.presets import CELL_MM, FIT_RADIUS_MM, PRESSURE_WINDOW_KPA
-from tactile_bayes.records import dataclass
 from tactile_bayes.scan import CountArray, ElementCalibration, PressureFrames, Scan
 from tactile_bayes.studies.paper_tables import mean_squared_difference
 
@@ -35,8 +34,7 @@ NEAR_MM = 40.0
 _COUNTS_PER_KPA = 1900.0
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class MeasuredFrames:
+class MeasuredFrames(Record, eq=False):
     """The frames of a scan that are compared.
 
     Parameters
@@ -67,8 +65,7 @@ class MeasuredFrames:
     lump: BumpFit | None
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ModelComparison:
+class ModelComparison(Record, eq=False):
     """How far one model is from the measured frames and map; differences as shares of the model's sum of squares.
 
     Parameters

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.optimize import minimize_scalar
 
-from tactile_bayes.declarations import as_dict, replace
+from tactile_bayes.declarations import Record, as_dict, field, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.body import FAT_KPA, GLAND_RATIO, POISSON, SEATS, Body
 from tactile_bayes.forward.contact import Head
@@ -39,8 +38,7 @@ DETECTABLE = 0.02
 HARD_RATIO = 100.0
 
 
-@dataclass(frozen=True, slots=True)
-class StudySettings:
+class StudySettings(Record):
     """Settings of a study: everything but its cases that the table depends on.
 
     Parameters
@@ -89,8 +87,7 @@ class StudySettings:
         return slide(surface, stiffness_ratio, head=self.head, mean_kpa=self.mean_kpa, positions_mm=self.positions_mm)
 
 
-@dataclass(frozen=True, slots=True)
-class Geometry:
+class Geometry(Record):
     """Cases with the same geometry, which share one factorisation: one body, several stiffnesses of its lump.
 
     Parameters
@@ -113,8 +110,7 @@ class Geometry:
         return f"seat {self.seat:g}, d {self.d_mm:g} mm, h/d {self.depth_ratio:g}, E2/E1 {ratios}"
 
 
-@dataclass(frozen=True, slots=True)
-class LineFit:
+class LineFit(Record):
     """The fit of Eq 5 to a line.
 
     Parameters
@@ -137,8 +133,7 @@ Fit = Callable[[TactileLine, float], LineFit]
 """Fits Eq 5 to a line within a radius in mm."""
 
 
-@dataclass(frozen=True, slots=True)
-class StudyRow:
+class StudyRow(Record):
     """One case and the Gaussian its map shows; the fields are the columns of a size table.
 
     A map in two dimensions has no `sigma_y_mm`. `thickness_mm` (depth of the chest wall), `head_radius_mm` (of its arc)
@@ -232,8 +227,7 @@ def run_geometry(geometry: Geometry, *, settings: StudySettings, fit: Fit) -> li
     return rows
 
 
-@dataclass(frozen=True, slots=True)
-class PrintedEq6:
+class PrintedEq6(Record):
     """Eq 6 learned in two stages as in the paper, without uncertainty.
 
     Parameters
@@ -331,8 +325,7 @@ ALIKE = 0.05
 _STEP = 0.01
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class CentredFrame:
+class CentredFrame(Record, eq=False):
     """The frame with the head's centre over a lump, as taxels see it.
 
     Parameters
@@ -359,8 +352,7 @@ class CentredFrame:
         return float(_middle(self.added))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Lookalikes:
+class Lookalikes(Record, eq=False):
     """Two lumps of different size with the most alike frames.
 
     Parameters

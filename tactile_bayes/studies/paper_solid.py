@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from tactile_bayes.declarations import as_dict, replace
+from tactile_bayes.declarations import Record, as_dict, field, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.axisymmetric import CondensedLump, Tissue, condense_lump
 from tactile_bayes.forward.body import FAT_KPA, GLAND_RATIO, POISSON, Body
@@ -167,8 +166,7 @@ BACKGROUNDS = ("fixed", "free")
 _LEVEL = np.eye(3)
 
 
-@dataclass(frozen=True, slots=True)
-class SolidSettings:
+class SolidSettings(Record):
     """Settings of a solid study: everything but its cases that the table depends on.
 
     Parameters
@@ -275,8 +273,7 @@ def mesh_size(fineness: int, *, reach_mm: float = MeshSize().reach_mm) -> MeshSi
     )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class RasterFrames:
+class RasterFrames(Record, eq=False):
     """Frames of a level head on a raster of places.
 
     Parameters
@@ -298,8 +295,7 @@ class RasterFrames:
     plain_kpa: FloatArray | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class RasterFit:
+class RasterFit(Record):
     """The fit of Eq 7 to a raster's map.
 
     Parameters

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
-from tactile_bayes.declarations import replace
+from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.contact import Head
 from tactile_bayes.forward.line import (
@@ -72,8 +71,7 @@ NEAREST_HEADS = {
 """By seat: of `TRIED_HEADS` the one whose tables lie nearest to the printed ones (`table_distance`; record 0096)."""
 
 
-@dataclass(frozen=True, slots=True)
-class Scene:
+class Scene(Record):
     """A lump for which both models are compared.
 
     Parameters
@@ -93,8 +91,7 @@ class Scene:
     stiffness_ratio: float = HARD_RATIO
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Curves:
+class Curves(Record, eq=False):
     """Frames and maps of both models for one scene.
 
     Parameters
@@ -114,8 +111,7 @@ class Curves:
     model: EmpiricalModel
 
 
-@dataclass(frozen=True, slots=True)
-class Agreement:
+class Agreement(Record):
     """How far the empirical model is from the elastic one; differences as shares, not percent.
 
     Parameters
@@ -227,8 +223,7 @@ def mean_squared_difference(values: FloatArray, reference: FloatArray) -> float:
 LEAST_TAXELS = 4
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class MeasuredFrame:
+class MeasuredFrame(Record, eq=False):
     """One frame along the centre line of the head.
 
     Parameters
@@ -259,8 +254,7 @@ class MeasuredFrame:
             )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class FrameAgreement:
+class FrameAgreement(Record, eq=False):
     """A measured frame and both models at its place and mean pressure.
 
     Parameters

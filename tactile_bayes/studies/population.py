@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Annotated, Any
 
 import numpy as np
@@ -248,8 +247,7 @@ def measuring_options() -> EstimateOptions:
     return EstimateOptions(method="laplace", fit=FitOptions("free", FIT_RADIUS_MM, "off", None, "field"))
 
 
-@dataclass(frozen=True, slots=True)
-class MassRow:
+class MassRow(Record):
     """One exam of one mass: true properties and measurements; the fields are the table's columns.
 
     Parameters

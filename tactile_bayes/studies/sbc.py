@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.stats import binom, chi2, poisson
 
-from tactile_bayes.declarations import as_dict
+from tactile_bayes.declarations import Record, as_dict
 from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.map import MapRecipe, TactileMap
@@ -38,8 +37,7 @@ LEAST_IN_BIN = 5
 IntArray = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
 
 
-@dataclass(frozen=True, slots=True)
-class Coverage:
+class Coverage(Record):
     """Share of truths that a central interval of nominal probability covered, with its binomial standard error."""
 
     probability: float
@@ -47,8 +45,7 @@ class Coverage:
     error: float
 
 
-@dataclass(frozen=True, slots=True)
-class RankTest:
+class RankTest(Record):
     """Results of the tests on one parameter's ranks.
 
     Parameters
@@ -213,8 +210,7 @@ MANY_ELSEWHERE = 1e-3
 ROUND = SizePriors(shape=ShapePrior(oval_sd=1e-9))
 
 
-@dataclass(frozen=True, slots=True)
-class Truth:
+class Truth(Record):
     """True parameters of one simulated map.
 
     Parameters
@@ -237,8 +233,7 @@ class Truth:
     noise_sd: float
 
 
-@dataclass(frozen=True, slots=True)
-class MapRanks:
+class MapRanks(Record):
     """Ranks of one simulated map's true parameters in its posterior.
 
     Parameters
@@ -311,8 +306,7 @@ def elsewhere(posterior: MapPosterior, truth: Truth) -> bool:
     return bool(away > max(widths))
 
 
-@dataclass(frozen=True, slots=True)
-class OtherRises:
+class OtherRises(Record):
     """Maps whose estimate measured another rise than the true lump.
 
     Parameters

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 
 import numpy as np
 
+from tactile_bayes.declarations import Record, field
 from tactile_bayes.inference.draws import Quantity, summarise
 from tactile_bayes.posterior.result import Estimate
 
@@ -14,8 +14,7 @@ SIZE = "max_size_mm"
 WIDTHS = ("sigma_x_mm", "sigma_y_mm")
 
 
-@dataclass(frozen=True, slots=True)
-class SizeAnswer:
+class SizeAnswer(Record):
     """What one estimate says.
 
     Parameters
@@ -76,8 +75,7 @@ def answer_of(estimate: Estimate, *, probability: float) -> SizeAnswer:
     return SizeAnswer("", estimate.probability, found, estimate.draws.method, shares)
 
 
-@dataclass(frozen=True, slots=True)
-class Deviation:
+class Deviation(Record):
     """Root mean square distances from a reference, mm.
 
     Parameters

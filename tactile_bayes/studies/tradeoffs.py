@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from tactile_bayes.declarations import replace
+from tactile_bayes.declarations import Record, field, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.body import THICKNESS_MM, Body
 from tactile_bayes.forward.line import build_line, fit_empirical, head_positions, press, press_layers
@@ -59,8 +58,7 @@ Clock = Callable[[], float]
 """Seconds of CPU."""
 
 
-@dataclass(frozen=True, slots=True)
-class LumpCase:
+class LumpCase(Record):
     """The lump of a comparison.
 
     Parameters
@@ -90,8 +88,7 @@ class LumpCase:
         return {PLANE: self.plane.head.shoulders, SOLID: self.solid.head.shoulders}
 
 
-@dataclass(frozen=True, slots=True)
-class Setting:
+class Setting(Record):
     """One way to compute the map.
 
     Parameters
@@ -113,8 +110,7 @@ class Setting:
     kind: str
 
 
-@dataclass(frozen=True, slots=True)
-class Measured:
+class Measured(Record):
     """Cost and map of one setting.
 
     Parameters
@@ -330,8 +326,7 @@ Outside = Callable[[float, float, float | None], list[str]]
 """In what the same lie outside the table that a calibration was learned from, in words."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SizeRule:
+class SizeRule(Record, eq=False):
     """Rule that converts amplitude and widths to a size.
 
     Parameters
@@ -436,8 +431,7 @@ CELL, FRAMES, TIME, LEVEL = "cell size", "frames used", "time of strokes", "norm
 Inputs = Callable[[TactileMap], tuple[Calibration | None, EstimateOptions]]
 
 
-@dataclass(frozen=True, slots=True)
-class MapSetting:
+class MapSetting(Record):
     """One way to build a map.
 
     Parameters

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from itertools import combinations
 
@@ -12,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import betaincinv
 
-from tactile_bayes.declarations import replace
+from tactile_bayes.declarations import Record, replace
 from tactile_bayes.trial.figures import (
     Figure,
     Sample,
@@ -288,8 +287,7 @@ def _need_spread(values: FloatArray, reason: str) -> None:
 REFERENCE = "tactile"
 
 
-@dataclass(frozen=True, slots=True)
-class ModalityRatio:
+class ModalityRatio(Record):
     """Percent error of one modality over the tactile one's on common masses.
 
     Attributes
@@ -341,8 +339,7 @@ def mape_ratio(sizes: ModalitySizes, reference: ModalitySizes, *, confidence: fl
     return resampled(Pair(sizes, reference, _quotient), scale="log", confidence=confidence)
 
 
-@dataclass(frozen=True, slots=True)
-class Pair:
+class Pair(Record):
     """A statistic of two modalities' percent errors, which can be resampled by patients."""
 
     sizes: ModalitySizes
@@ -392,8 +389,7 @@ FLIPS = 9_999
 _AT_ONCE = 111
 
 
-@dataclass(frozen=True, slots=True)
-class PairedComparison:
+class PairedComparison(Record):
     """Percent errors of `first` against `second` on their common masses; a mass not found counts as size 0.
 
     Attributes

@@ -4,20 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import groupby
 
 import numpy as np
 from scipy.special import chdtri, kolmogi, ndtr, ndtri
 
+from tactile_bayes.declarations import Record
 from tactile_bayes.trial.figures import MIN_PATIENTS, clopper_pearson
 from tactile_bayes.trial.readings import FloatArray, IntervalReading
 
 # --- Coverage of stated intervals against the size after excision.
 
 
-@dataclass(frozen=True, slots=True)
-class Coverage:
+class Coverage(Record):
     """Coverage of the ex-vivo size by intervals of one nominal probability: `covered` of `n`, on `masses` masses.
 
     The ex-vivo size is itself a measurement (+-5 % in the paper), so even honest intervals of the true size cover it a
@@ -72,8 +71,7 @@ LEVELS = (0.5, 0.8, 0.9, 0.95)
 BINS = 10
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Prediction:
+class Prediction(Record, eq=False):
     """Predictive distributions of log ex-vivo sizes, one per reading, with the sizes found.
 
     Attributes
@@ -101,8 +99,7 @@ class Prediction:
         return (self.found_log - self.median_log) / self.sd_log
 
 
-@dataclass(frozen=True, slots=True)
-class LevelCoverage:
+class LevelCoverage(Record):
     """Central intervals of one nominal probability: `covered` of the readings, with an exact interval by masses."""
 
     probability: float
@@ -111,8 +108,7 @@ class LevelCoverage:
     interval: tuple[float, float]
 
 
-@dataclass(frozen=True, slots=True)
-class Calibration:
+class Calibration(Record):
     """Figures that show how well the stated uncertainties are calibrated.
 
     Attributes

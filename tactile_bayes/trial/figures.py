@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import Literal, Protocol, TypeVar, assert_never
 
@@ -13,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import betaincinv, ndtr, ndtri, stdtrit
 
-from tactile_bayes.declarations import replace
+from tactile_bayes.declarations import Record, replace
 from tactile_bayes.trial.readings import FloatArray, ModalitySizes
 
 # --- Jackknife intervals over patients, keeping a patient's masses together.
@@ -141,8 +140,7 @@ def on_scale(values: Values, scale: Scale) -> Values:
 # --- Statistics that depend on masses only through sums, so that resampling patients is cheap.
 
 
-@dataclass(frozen=True, slots=True)
-class SumStatistic:
+class SumStatistic(Record):
     """A figure computed from the sums of a few terms over the masses.
 
     Parameters
@@ -309,8 +307,7 @@ Statistic = Callable[[ModalitySizes], float]
 Leverage = Callable[[ModalitySizes], FloatArray]
 
 
-@dataclass(frozen=True, slots=True)
-class Figure:
+class Figure(Record):
     """A number about one modality, never NaN or infinite.
 
     Attributes
@@ -393,8 +390,7 @@ class Resampled(Protocol):
         ...
 
 
-@dataclass(frozen=True, slots=True)
-class Sample:
+class Sample(Record):
     """A statistic of one modality, which can be resampled."""
 
     statistic: Statistic

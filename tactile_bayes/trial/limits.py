@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import cache, partial
 
 import numpy as np
 from scipy.special import chdtri, gammaincc, gammaincinv, gammaln, ndtr, ndtri, stdtr
 
-from tactile_bayes.declarations import replace
+from tactile_bayes.declarations import Record, replace
 from tactile_bayes.trial.figures import (
     Figure,
     Sample,
@@ -122,8 +121,7 @@ LIKELIER = 3.0
 LEAST_MASSES = 8
 
 
-@dataclass(frozen=True, slots=True)
-class Limits:
+class Limits(Record):
     """Limits of agreement and their intervals; all in the unit of the differences.
 
     Attributes
@@ -224,8 +222,7 @@ def limits_unlinked(x: Sequence[FloatArray], y: Sequence[FloatArray], *, confide
     return _from_means(means, parts, names=("reference_within", "within"), confidence=confidence)
 
 
-@dataclass(frozen=True, slots=True)
-class Trend:
+class Trend(Record):
     """How differences change with size: slope of a least-squares line, per unit of size, with its t test."""
 
     slope: float
@@ -270,8 +267,7 @@ def errors_are_proportional(x: FloatArray, y: FloatArray) -> bool:
     return bool(np.isfinite(gain) and gain > np.log(LIKELIER))
 
 
-@dataclass(frozen=True, slots=True)
-class _Within:
+class _Within(Record):
     """Pooled within-mass variance, its degrees of freedom and the harmonic mean number of replicates."""
 
     variance: float

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 from scipy.special import ndtri, stdtrit
 
+from tactile_bayes.declarations import Record
 from tactile_bayes.trial.figures import UndefinedError
 from tactile_bayes.trial.readings import FloatArray
 
@@ -170,8 +170,7 @@ def _inversions_of_permutation(rank: npt.NDArray[np.int64]) -> int:
 Measure = Literal["radian", "tangent"]
 
 
-@dataclass(frozen=True, slots=True)
-class PassingBablok:
+class PassingBablok(Record):
     """A Passing-Bablok line with its intervals; ends may be infinite for few masses."""
 
     intercept: float
@@ -270,8 +269,7 @@ THRESHOLD = 1e-6
 EQUAL = 1e-12
 
 
-@dataclass(frozen=True, slots=True)
-class Line:
+class Line(Record):
     """y = intercept + slope x, fitted to n pairs.
 
     Attributes
@@ -471,8 +469,7 @@ def _about(value: float, reach: float) -> tuple[float, float]:
 # --- Lin's concordance correlation: precision and accuracy about the line of identity.
 
 
-@dataclass(frozen=True, slots=True)
-class Concordance:
+class Concordance(Record):
     """Concordance coefficient and its parts.
 
     Attributes

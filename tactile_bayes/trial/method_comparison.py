@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
 from functools import partial
 from typing import TypeVar
 
 import numpy as np
 
+from tactile_bayes.declarations import Record, field
 from tactile_bayes.trial import limits as bland_altman
 from tactile_bayes.trial import limits as patient_limits
 from tactile_bayes.trial.figures import (
@@ -47,8 +47,7 @@ Ends = tuple[float, float]
 _T = TypeVar("_T")
 
 
-@dataclass(frozen=True, slots=True)
-class MethodComparison:
+class MethodComparison(Record):
     """Comparison of one modality's detected sizes with excision.
 
     Attributes

@@ -22,12 +22,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
 from scipy.special import erf, expit, log_expit
 
+from tactile_bayes.declarations import Record, field
 from tactile_bayes.trial.figures import MIN_PATIENTS
 from tactile_bayes.trial.readings import FloatArray, MassKey, ModalitySizes, Reading, gather, mass_numbers
 
@@ -49,8 +49,7 @@ class Sampler(Protocol):
     ) -> Any: ...
 
 
-@dataclass(frozen=True, slots=True)
-class Posterior:
+class Posterior(Record):
     """Posterior of one modality: draws of its parameters and of the next mass's expected percent error.
 
     Attributes
@@ -70,8 +69,7 @@ class Posterior:
     diagnostics: Mapping[str, float]
 
 
-@dataclass(frozen=True, slots=True)
-class NextMass:
+class NextMass(Record):
     """Posteriors of all modalities, and for every pair the probability that the first errs less on the next mass."""
 
     posteriors: Mapping[str, Posterior]

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
-from tactile_bayes.declarations import as_dict
+from tactile_bayes.declarations import Record, as_dict, field
 from tactile_bayes.trial.accuracy import mape_figure, mape_percent, mape_ratio, sign_flip
 from tactile_bayes.trial.figures import MIN_PATIENTS, Intervals, clopper_pearson, figure
 from tactile_bayes.trial.readings import FloatArray, ModalitySizes
@@ -19,8 +18,7 @@ from tactile_bayes.trial.replicates import log_sd_within
 # --- Coverage of the chosen intervals in simulated trials with this trial's size and errors.
 
 
-@dataclass(frozen=True, slots=True)
-class ErrorModel:
+class ErrorModel(Record):
     """Errors of one modality in log size: normal, partly shared by the masses of a patient.
 
     Attributes
@@ -49,8 +47,7 @@ class ErrorModel:
         return 100 * ((1 - self.miss) * (found - math.erf(self.bias / s / math.sqrt(2))) + self.miss)
 
 
-@dataclass(frozen=True, slots=True)
-class IntervalCheck:
+class IntervalCheck(Record):
     """Coverage of the percent error's intervals in simulated trials.
 
     Attributes
@@ -174,8 +171,7 @@ FLIPS = 999
 LEVEL = 0.05
 
 
-@dataclass(frozen=True, slots=True)
-class PlanCase:
+class PlanCase(Record):
     """One design with assumed errors: all that its simulation depends on.
 
     Attributes
@@ -206,8 +202,7 @@ class PlanCase:
         return f"{self.patients} patients, {self.maps} maps"
 
 
-@dataclass(frozen=True, slots=True)
-class PlanResult:
+class PlanResult(Record):
     """Results of the simulated trials of one design.
 
     Attributes
@@ -281,8 +276,7 @@ def map_gains(results: Mapping[tuple[int, int], PlanResult | Mapping[str, Any]])
     return gains
 
 
-@dataclass(frozen=True, slots=True)
-class _Found:
+class _Found(Record):
     won: bool
     tactile: float
     other: float

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
 from datetime import date
 from itertools import compress, groupby
 from typing import Any, Protocol
@@ -11,6 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from tactile_bayes.declarations import Record, field, settle
 from tactile_bayes.errors import BadDataError
 
 # --- Readings of masses by several modalities, checked for consistency and grouped by mass.
@@ -25,8 +25,7 @@ class CellFault(Protocol):
     def __call__(self, row: int, column: str, what: str, /, *, way_out: str) -> BadDataError: ...
 
 
-@dataclass(frozen=True, slots=True)
-class Interval:
+class Interval(Record):
     """A credible interval of a size, in mm, with its nominal probability."""
 
     low_mm: float
@@ -34,8 +33,7 @@ class Interval:
     probability: float
 
 
-@dataclass(frozen=True, slots=True)
-class Reading:
+class Reading(Record):
     """One reading of one mass: a size in mm when detected, nothing otherwise."""
 
     key: MassKey
@@ -51,8 +49,7 @@ class Reading:
     day: date | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class IntervalReading:
+class IntervalReading(Record):
     """A stated interval beside the size found after excision."""
 
     key: MassKey
@@ -65,8 +62,7 @@ class IntervalReading:
         return self.interval.low_mm <= self.ex_vivo_mm <= self.interval.high_mm
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ModalitySizes:
+class ModalitySizes(Record, eq=False):
     """Sizes of n masses by one modality, ordered by patient and mass whatever the order of the rows.
 
     Attributes
@@ -101,7 +97,7 @@ class ModalitySizes:
     def __post_init__(self) -> None:
         n = len(self.ex_vivo_mm)
         if len(self.mass) != n:
-            object.__setattr__(self, "mass", np.arange(n))
+            settle(self, mass=np.arange(n))
         if not (
             self.patient.shape == self.ex_vivo_mm.shape == self.size_mm.shape == (n,) == (len(self.replicates_mm),)
         ):

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-from tactile_bayes.declarations import replace
+from tactile_bayes.declarations import Record, replace
 from tactile_bayes.trial.figures import Figure, SumStatistic, UndefinedError, columns, figure, ratio
 from tactile_bayes.trial.readings import FloatArray, ModalitySizes
 
@@ -19,8 +18,7 @@ Index = npt.NDArray[np.int64]
 _Criterion = Callable[[FloatArray], float]
 
 
-@dataclass(frozen=True, slots=True)
-class Components:
+class Components(Record):
     """Variances of the model y = mean + mass + reader + map, each independent and normal.
 
     `reader` is None where only one reader read, so that its variance is part of the mean.

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import field
 
 import numpy as np
 
-from tactile_bayes.records import dataclass
+from tactile_bayes.declarations import Record, field
 from tactile_bayes.trial import accuracy, replicates
 from tactile_bayes.trial import accuracy as origin_line
 from tactile_bayes.trial import replicates as spread
@@ -43,8 +42,7 @@ FAMILIES: tuple[Callable[..., dict[str, Figure]], ...] = (
 )
 
 
-@dataclass(frozen=True, slots=True)
-class ModalityReport:
+class ModalityReport(Record):
     """Counts, figures and coverage of one modality on its `n` masses."""
 
     name: str
@@ -66,8 +64,7 @@ class ModalityReport:
     cautions: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class TrialReport:
+class TrialReport(Record):
     """Reports of all modalities, ratios to the tactile one, paired comparisons, and counts.
 
     `sizes` are those that the figures were made from; `ex_vivo_sd_mm` is by the number of the mass. `doubts` says what

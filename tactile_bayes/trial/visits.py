@@ -5,18 +5,17 @@ from __future__ import annotations
 import re
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
 from datetime import date
 from itertools import pairwise
 
+from tactile_bayes.declarations import Record, field
 from tactile_bayes.trial.readings import CellFault, MassKey, Reading
 
 _NUMBERED = re.compile(r"(\D*)([0-9]{1,9})")
 Row = tuple[int, Reading]
 
 
-@dataclass(frozen=True, slots=True)
-class OtherVisits:
+class OtherVisits(Record):
     """Readings that a trial's analysis leaves out because they are of other visits than the excision's.
 
     Parameters

@@ -9,6 +9,7 @@ import pytest
 from posterior_maps import TRUTH, bump_map, correlated_field
 from scipy.stats import kstest, t
 
+from tactile_bayes.declarations import names_of
 from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.inference.draws import ParameterDraws, student_draws
 from tactile_bayes.inference.ensemble import EnsembleOptions, ensemble
@@ -221,7 +222,7 @@ class TestContract:
         assert found.map_posterior is not None
         assert found.draws.method == method
         assert found.draws.theta.ndim == 3
-        for name in set(found.map_posterior.__slots__) - {"oblique", "irregular"}:
+        for name in set(names_of(found.map_posterior)) - {"oblique", "irregular"}:
             values = getattr(found.map_posterior, name)
             assert values.shape == found.draws.theta.shape[:2], name
             assert np.isfinite(values).all(), name

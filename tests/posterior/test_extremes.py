@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from posterior_maps import bump_values, grid_map
 
+from tactile_bayes.declarations import names_of
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.options import EstimateOptions, FitOptions
@@ -113,7 +114,7 @@ def test_a_sane_answer_where_there_is_a_lump(name: str, method: str) -> None:
     assert found.status == "estimate", found.reason
     posterior = found.map_posterior
     assert posterior is not None
-    for one in set(posterior.__slots__) - {"oblique", "irregular"}:
+    for one in set(names_of(posterior)) - {"oblique", "irregular"}:
         assert np.isfinite(getattr(posterior, one)).all(), one
     medians = [np.median(posterior.sigma_x_mm), np.median(posterior.sigma_y_mm)]
     np.testing.assert_allclose(medians, widths, rtol=tolerance)

@@ -9,7 +9,7 @@ import pytest
 from mapping_scans import shared_scan
 from posterior_maps import bump_values, grid_map
 
-from tactile_bayes.declarations import replace
+from tactile_bayes.declarations import names_of, replace
 from tactile_bayes.errors import UsageError
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import TactileMap
@@ -76,7 +76,7 @@ def test_a_sane_answer_where_there_is_a_lump(name: str, method: str) -> None:
     assert found.status == "estimate", found.reason
     posterior = found.map_posterior
     assert posterior is not None
-    for one in posterior.__slots__:
+    for one in names_of(posterior):
         assert np.isfinite(getattr(posterior, one)).all(), one
     medians = [np.median(posterior.sigma_x_mm), np.median(posterior.sigma_y_mm)]
     np.testing.assert_allclose(medians, widths, rtol=tolerance)
@@ -103,7 +103,7 @@ def twice(scan: Scan) -> Scan:
     frames = scan.frames
     time = np.repeat(frames.time_s, 2)
     time[1::2] += 1e-6
-    names = [n for n in frames.__slots__ if np.shape(getattr(frames, n))[:1] == (len(frames.time_s),) and n != "time_s"]
+    names = [n for n in names_of(frames) if np.shape(getattr(frames, n))[:1] == (len(frames.time_s),) and n != "time_s"]
     doubled = {name: np.repeat(getattr(frames, name), 2, axis=0) for name in names}
     return replace(scan, frames=replace(frames, time_s=time, **doubled))
 
