@@ -33,7 +33,7 @@ import numpy as np
 from scipy.sparse.linalg import splu
 
 from benchmarks.measure import environment
-from tactile_bayes.commands.study import fit_line
+from tactile_bayes.actions.study import fit_line
 from tactile_bayes.forward.body import Body
 from tactile_bayes.forward.contact import Head, solve_contact
 from tactile_bayes.forward.line import MEAN_KPA, build_line, head_positions, press

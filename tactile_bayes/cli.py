@@ -14,34 +14,52 @@ from tactile_bayes import __version__
 from tactile_bayes.errors import EXIT_FAULT, EXIT_INTERRUPTED, EXIT_READER_GONE, EXIT_USAGE, TactileBayesError
 from tactile_bayes.shell import ReaderGoneError, ended_in_order, protect_streams, release_streams
 
-# name -> (module under tactile_bayes.commands, one line of help). A module is imported when its command runs.
+# name -> (function in a module under tactile_bayes.commands, one line of help); imported when its command runs.
 COMMANDS: dict[str, tuple[str, str]] = {
-    "demo": ("demo", "Run the main job on an embedded scan: map, estimate, the report of a trial."),
-    "import": ("import_", "Bring other people's arrays, grids and images in."),
-    "map": ("map", "Build a tactile map from one or more scans (paper steps i-iii)."),
-    "calibrate": ("calibrate", "Learn a calibration: `calibrate size`, `calibrate array`."),
-    "estimate": ("estimate", "Lump size with a credible interval from tactile maps."),
-    "compare": ("compare", "Compare a mass's size at two visits and more: has it grown?"),
-    "report": ("report", "Write one page of an exam to read and to print."),
-    "diagnose": ("diagnose", "Check a posterior's draws: R-hat, effective draws, trace, rank and corner figures."),
-    "validate": ("validate", "Compare sizes with excision: accuracy of each modality."),
-    "campaign": ("campaign", "From a folder of exams to the trial's report: `campaign init`, `campaign run`."),
-    "export": ("export", "Write maps and estimates as DICOM, FHIR, NRRD (3D Slicer) or CSV (REDCap)."),
-    "plan": ("plan", "Plan a trial: power and the worth of more maps, by simulation."),
-    "study": ("study", "Run the forward study: amplitude and width over sizes, depths, stiffnesses."),
-    "tables": ("tables", "Compute Tables 1 and 2 of the paper again."),
-    "head": ("head", "How evenly a scan head presses, and the head that does best."),
-    "compare-model": ("compare_model", "Compare a scan's frames and map with a forward model of a scene."),
-    "tradeoff": ("tradeoff", "Measure what more accuracy costs, here and now: `tradeoff estimate`, `map`, `forward`."),
-    "population": ("population", "Simulate and fit exams of varied bodies: what a calibration is learned from."),
-    "sbc": ("sbc", "Check the posterior of a map against itself: ranks and coverage on simulated maps."),
-    "simulate": ("simulate", "Make a scan with known truth from a scene."),
-    "record": ("record", "Record a scan head and a tracker into a scan file."),
-    "repair": ("repair", "Close a scan file that was cut off: what is intact is kept."),
-    "replay": ("replay", "Play a scan through the path of a recording, with the live view."),
-    "devices": ("devices", "List the serial ports with a guess at what is on them."),
-    "emulate": ("emulate", "Serve a scan as a scan head or a tracker would send it."),
-    "show": ("show", "Say what any of our files is and how good it is."),
+    "demo": ("exam.demo_command", "Run the main job on an embedded scan: map, estimate, the report of a trial."),
+    "import": ("exam.import_command", "Bring other people's arrays, grids and images in."),
+    "map": ("map.command", "Build a tactile map from one or more scans (paper steps i-iii)."),
+    "calibrate": ("calibrate.command", "Learn a calibration: `calibrate size`, `calibrate array`."),
+    "estimate": ("estimate.command", "Lump size with a credible interval from tactile maps."),
+    "compare": ("compare.command", "Compare a mass's size at two visits and more: has it grown?"),
+    "report": ("report.command", "Write one page of an exam to read and to print."),
+    "diagnose": (
+        "exam.diagnose_command",
+        "Check a posterior's draws: R-hat, effective draws, trace, rank and corner figures.",
+    ),
+    "validate": ("trial.validate_command", "Compare sizes with excision: accuracy of each modality."),
+    "campaign": ("campaign.command", "From a folder of exams to the trial's report: `campaign init`, `campaign run`."),
+    "export": ("exam.export_command", "Write maps and estimates as DICOM, FHIR, NRRD (3D Slicer) or CSV (REDCap)."),
+    "plan": ("trial.plan_command", "Plan a trial: power and the worth of more maps, by simulation."),
+    "study": (
+        "laboratory.study_command",
+        "Run the forward study: amplitude and width over sizes, depths, stiffnesses.",
+    ),
+    "tables": ("laboratory.tables_command", "Compute Tables 1 and 2 of the paper again."),
+    "head": ("laboratory.head_command", "How evenly a scan head presses, and the head that does best."),
+    "compare-model": (
+        "laboratory.compare_model_command",
+        "Compare a scan's frames and map with a forward model of a scene.",
+    ),
+    "tradeoff": (
+        "tradeoff.tradeoff_command",
+        "Measure what more accuracy costs, here and now: `tradeoff estimate`, `map`, `forward`.",
+    ),
+    "population": (
+        "laboratory.population_command",
+        "Simulate and fit exams of varied bodies: what a calibration is learned from.",
+    ),
+    "sbc": (
+        "laboratory.sbc_command",
+        "Check the posterior of a map against itself: ranks and coverage on simulated maps.",
+    ),
+    "simulate": ("laboratory.simulate_command", "Make a scan with known truth from a scene."),
+    "record": ("record.command", "Record a scan head and a tracker into a scan file."),
+    "repair": ("devices.repair_command", "Close a scan file that was cut off: what is intact is kept."),
+    "replay": ("devices.replay_command", "Play a scan through the path of a recording, with the live view."),
+    "devices": ("devices.devices_command", "List the serial ports with a guess at what is on them."),
+    "emulate": ("devices.emulate_command", "Serve a scan as a scan head or a tracker would send it."),
+    "show": ("exam.show_command", "Say what any of our files is and how good it is."),
 }
 
 
@@ -67,8 +85,8 @@ class LazyGroup(click.Group):
         del ctx
         if cmd_name not in COMMANDS:
             return None
-        module, _ = COMMANDS[cmd_name]
-        command = importlib.import_module(f"tactile_bayes.commands.{module}").command
+        module, name = COMMANDS[cmd_name][0].split(".")
+        command = getattr(importlib.import_module(f"tactile_bayes.commands.{module}"), name)
         assert isinstance(command, click.Command)
         return command
 

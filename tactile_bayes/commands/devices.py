@@ -1,13 +1,66 @@
-"""`devices`: list serial ports and check which way a tracker's rotations go."""
+"""Options of the commands on devices: `devices`, `emulate`, `replay`, `repair`."""
 
 from __future__ import annotations
 
-import time
+from typing import Any
 
 import click
 
-from tactile_bayes.commands.emulate import PROTOCOLS
-from tactile_bayes.commands.options import FiniteRange
+from tactile_bayes.commands.options import FORCE, SPEED, FilePath, FiniteRange, live_options
+
+# --- `emulate`: serve a scan as a device would send it.
+
+PROTOCOLS = ("open", "fastrak", "fastrak-ascii", "liberty", "liberty-ascii", "bird", "igtlink", "ndi")
+_SHARE = FiniteRange(0.0, 1.0)
+
+
+@click.command("emulate")
+@click.argument("kind", metavar="head|tracker|both", type=click.Choice(["head", "tracker", "both"]))
+@click.argument("scan", metavar="SCAN.mcap", type=FilePath())
+@click.option(
+    "--protocol", type=click.Choice(PROTOCOLS), default="open", show_default=True, help="Protocol of the tracker."
+)
+@click.option(
+    "--tcp",
+    metavar="HOST:PORT",
+    help="Listen there (port 0: any; both: the tracker on the next port); without HOST for this computer only. "
+    "Default: a pseudo-terminal.",
+)
+@click.option(
+    "--once", is_flag=True, help="End when the scan has been sent and read. Default: wait for the next start."
+)
+@SPEED
+@click.option("--drop", type=_SHARE, default=0.0, help="Share of the records that are not sent.")
+@click.option("--corrupt", type=_SHARE, default=0.0, help="Share of the records with one bit changed.")
+@click.option(
+    "--stall",
+    type=(FiniteRange(min=0.0), FiniteRange(min=0.0)),
+    metavar="AT FOR",
+    help="Send nothing for FOR s from AT s on; those records are lost.",
+)
+@click.option("--disconnect", type=FiniteRange(min=0.0), metavar="AT", help="Disconnect at AT s.")
+@click.option(
+    "--hold", type=click.IntRange(min=1), default=1, show_default=True, help="Tracker: measure only every n-th pose."
+)
+@click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Random seed of the faults.")
+def emulate_command(**given: Any) -> None:
+    """Serve a scan as a scan head or a tracker would send it, or as both, at its own rate, with faults on request.
+
+    Prints the URL for `record`; with both, a line "head URL" and a line "tracker URL". Each START plays the scan from
+    its beginning. With both, the head's START begins the scan for the two devices, and until then the tracker repeats
+    its first pose: frames and poses belong together however long `record` waits for a key. A tracker emulated alone
+    plays from its own START, which `record` sends again when it starts; one that needs no START (igtlink, ndi) plays
+    from when a host connects. The head speaks the open framing of docs/scan-head-protocol.md; so does the tracker by
+    default, whose poses then come without rounding.
+
+    Example: tactile-bayes emulate both scan.mcap
+    """
+    from tactile_bayes.actions.devices import emulate_action
+
+    emulate_action(**given)
+
+
+# --- `devices`: list serial ports and check which way a tracker's rotations go.
 
 
 @click.command("devices")
@@ -35,7 +88,7 @@ from tactile_bayes.commands.options import FiniteRange
     metavar="S",
     help="How long to rotate it, s.",
 )
-def command(*, url: str | None, pivot_url: str | None, tracker_protocol: str, duration: float) -> None:
+def devices_command(**given: Any) -> None:
     """List the serial ports and the devices that are probably on them.
 
     With --pivot, hold the head's apex on one point and turn the handle about it: the right sense of the rotations keeps
@@ -43,48 +96,53 @@ def command(*, url: str | None, pivot_url: str | None, tracker_protocol: str, du
 
     Example: tactile-bayes devices
     """
-    if url:
-        from tactile_bayes.hardware.drivers import probe
+    from tactile_bayes.actions.devices import devices_action
 
-        click.echo(f"{url}: {probe(url)}")
-    elif pivot_url:
-        _pivot(pivot_url, tracker_protocol, duration)
-    else:
-        _list()
+    devices_action(**given)
 
 
-def _list() -> None:
-    from tactile_bayes.hardware.drivers import list_ports
+# --- `replay`: play a scan through emulated devices and the recorder.
 
-    ports = list_ports()
-    for port in ports:
-        click.echo(f"{port.url}  {port.description}: {port.guess}")
-    if not ports:
-        click.echo("no serial ports; other URLs: socket://HOST:PORT, rfc2217://HOST:PORT, a pseudo-terminal's path")
+_FILE = FilePath()
 
 
-def _pivot(url: str, protocol: str, duration_s: float) -> None:
-    import numpy as np
+@click.command("replay")
+@click.argument("scan", metavar="SCAN.mcap", type=_FILE)
+@click.option("-o", "--output", metavar="OUT.mcap", type=FilePath(writes="MCAP"), help="Save what is recorded.")
+@live_options
+@SPEED
+@FORCE
+@click.pass_context
+def replay_command(ctx: click.Context, /, **given: Any) -> None:
+    """Replay a scan through emulated devices, recorder and live view, as if it were being recorded.
 
-    from tactile_bayes.hardware.bladder import rotation_sense
-    from tactile_bayes.hardware.drivers import TRACKERS, open_tracker
-    from tactile_bayes.hardware.readings import PoseReading
+    Example: tactile-bayes replay scan.mcap --live
+    """
+    from tactile_bayes.actions.devices import replay_action
 
-    driver = TRACKERS[protocol]
-    port = open_tracker(protocol, url)
-    try:
-        driver.check(port)
-        click.echo("turn it", err=True)
-        port.write(driver.start)
-        parser, poses, end = driver.parser(), [], time.monotonic() + duration_s
-        while time.monotonic() < end:
-            found = parser.feed(port.read_some(0.1))
-            poses += [one for one in found if isinstance(one, PoseReading) and not one.flags]
-        port.write(driver.stop)
-    finally:
-        port.close()
-    sense = rotation_sense(
-        np.array([pose.position_mm for pose in poses]).reshape(-1, 3),
-        np.array([pose.quaternion_wxyz for pose in poses]).reshape(-1, 4),
-    )
-    click.echo(f"{len(poses)} poses, turned by {sense.turn_deg:.0f} degrees: {sense}")
+    replay_action(ctx, **given)
+
+
+# --- `repair`: close a scan file that was cut off.
+
+
+@click.command("repair")
+@click.argument("scan", metavar="SCAN.mcap", type=FilePath())
+@click.option(
+    "-o",
+    "--output",
+    metavar="OUT.mcap",
+    type=FilePath(writes="MCAP"),
+    help="Write to this file instead of replacing SCAN.mcap.",
+)
+@FORCE
+def repair_command(**given: Any) -> None:
+    """Repair a scan that was cut off or damaged: keep what is intact, report what is lost.
+
+    The file is replaced when the new one is whole, unless -o is given. A file that is whole already is left alone.
+
+    Example: tactile-bayes repair scan.mcap
+    """
+    from tactile_bayes.actions.devices import repair_action
+
+    repair_action(**given)

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from tactile_bayes.commands.emulate import PROTOCOLS
+from tactile_bayes.commands.devices import PROTOCOLS
 from tactile_bayes.commands.options import FORCE, FilePath, FiniteRange, also_read, live_options
 from tactile_bayes.declarations import Record, as_dict
 from tactile_bayes.errors import EXIT_INTERRUPTED, DeviceError, UsageError

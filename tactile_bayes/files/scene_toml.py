@@ -26,17 +26,7 @@ from tactile_bayes.forward.scene import (
     Timing,
     Tracker,
 )
-from tactile_bayes.forward.tissue import (
-    DepthRatio,
-    Diameter,
-    Height,
-    Place,
-    Rib,
-    SceneBody,
-    Seat,
-    SolidLump,
-    Stiffness,
-)
+from tactile_bayes.forward.tissue import DepthRatio, Diameter, Height, Place, Rib, SceneBody, Seat, SolidLump, Stiffness
 
 # A lump with one of the first is tissue; only a Gaussian one may have the others.
 _OF_TISSUE: Final = ("depth_ratio", "stiffness_ratio", "seat", "height_mm")

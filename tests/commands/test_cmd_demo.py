@@ -11,7 +11,7 @@ from subprocess import CompletedProcess
 
 import pytest
 
-from tactile_bayes.commands.demo import _how_to_type
+from tactile_bayes.actions.exam import _how_to_type
 from tactile_bayes.files.scene_toml import read_scene
 from tactile_bayes.forward.tissue import SolidLump
 

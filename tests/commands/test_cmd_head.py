@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from tactile_bayes.actions import study as tables
+from tactile_bayes.actions.study import study_settings
 from tactile_bayes.cli import cli
-from tactile_bayes.commands.study import study_settings
 from tactile_bayes.files.scan_mcap import read_scan, read_truth
 from tactile_bayes.presets import HEADS, SHOULDERS_INSIDE, SHOULDERS_OUTSIDE
-from tactile_bayes.studies import paper_tables as tables
 
 DEFAULTS = {"plane-strain": SHOULDERS_INSIDE, "empirical": SHOULDERS_INSIDE, "solid": SHOULDERS_OUTSIDE}
 # The layers without a lump, so that nothing is meshed; four frames.

@@ -14,7 +14,7 @@ import pytest
 from in_process import run_here
 
 import tactile_bayes
-from tactile_bayes.commands.import_ import command
+from tactile_bayes.commands.exam import import_command as command
 from tactile_bayes.files.arrays_layout import LAYOUT, in_words
 from tactile_bayes.files.map_nc import read_map
 from tactile_bayes.files.scan_mcap import read_scan, read_scan_report

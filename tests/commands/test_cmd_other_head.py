@@ -14,8 +14,8 @@ from map_files import assert_same
 from posterior_files import MADE
 from posterior_maps import bump_map
 
+from tactile_bayes.actions import simulation as population
 from tactile_bayes.api.size_calibration import table_recipe
-from tactile_bayes.commands import population
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.map_nc import read_map, write_map

@@ -9,7 +9,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 import tactile_bayes
-from tactile_bayes.commands.plan import command
+from tactile_bayes.commands.trial import plan_command as command
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.documents import check_document
 from tactile_bayes.presets import RESEARCH_USE

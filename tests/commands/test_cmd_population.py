@@ -9,7 +9,7 @@ import pytest
 from in_process import run_here
 
 import tactile_bayes
-from tactile_bayes.commands import population
+from tactile_bayes.actions import simulation as population
 from tactile_bayes.declarations import replace
 from tactile_bayes.files.size_json import read_size_calibration
 from tactile_bayes.files.tables import read_table

@@ -83,8 +83,8 @@ def test_a_grid_may_say_its_seats(run_cli: Run, tmp_path: Path) -> None:
 
 def test_an_interrupted_study_goes_on_where_it_stopped(folder: Path, run_cli: Run, tmp_path: Path) -> None:
     """The store of a killed run: two geometries, and a third half written."""
+    from tactile_bayes.actions.study import study_settings
     from tactile_bayes.batch_store import open_store
-    from tactile_bayes.commands.study import study_settings
 
     settings = study_settings(
         head_radius_mm=35.0,

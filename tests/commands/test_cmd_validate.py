@@ -12,7 +12,7 @@ from click.testing import CliRunner, Result
 from synthetic_trial import excision_csv, trial_csv
 
 import tactile_bayes
-from tactile_bayes.commands.validate import command
+from tactile_bayes.commands.trial import validate_command as command
 from tactile_bayes.errors import EXIT_BAD_DATA, EXIT_USAGE, BadDataError, UsageError
 from tactile_bayes.files.documents import check_document
 from tactile_bayes.presets import RESEARCH_USE
@@ -145,9 +145,9 @@ def test_exit_codes_and_single_lines_of_the_program(tmp_path: Path, run_cli: Run
 
 def test_validate_needs_no_slow_library(run_python: Run) -> None:
     code = (
-        "import sys\nfrom tactile_bayes.commands.validate import command\n"
+        "import sys\nfrom tactile_bayes.commands.trial import validate_command\n"
         "assert 'numpy' not in sys.modules\n"
-        f"command(['{TRIAL}', '--excision', '{EXCISION}', '--json'], standalone_mode=False)\n"
+        f"validate_command(['{TRIAL}', '--excision', '{EXCISION}', '--json'], standalone_mode=False)\n"
         "print({'scipy.stats', 'scipy.optimize', 'pandas', 'matplotlib'} & set(sys.modules), file=sys.stderr)"
     )
     done = run_python("-c", code)

@@ -13,7 +13,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 import tactile_bayes
-from tactile_bayes.commands.validate import command
+from tactile_bayes.commands.trial import validate_command as command
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.presets import RESEARCH_USE
 

@@ -131,7 +131,7 @@ def test_a_missing_extra_is_named_with_its_command(
 
 
 def test_the_command_offers_every_format() -> None:
-    from tactile_bayes.commands import export
+    from tactile_bayes.commands import exam as export
     from tactile_bayes.exports import run
 
     assert export._FORMATS == run.FORMATS

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from emulated_devices import serving, short_scan
 
-from tactile_bayes.commands.emulate import _link
+from tactile_bayes.actions.devices import _link
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.scan_mcap import write_scan
 from tactile_bayes.hardware import head

@@ -16,7 +16,7 @@ from emulated_devices import short_scan
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tactile_bayes.commands.emulate import PROTOCOLS as CHOICES
+from tactile_bayes.commands.devices import PROTOCOLS as CHOICES
 from tactile_bayes.errors import DeviceError
 from tactile_bayes.files import scan_recording
 from tactile_bayes.files.provenance import Provenance

@@ -267,19 +267,19 @@ OUTPUTS: dict[str, Output] = {
 }
 PRINTERS = {
     # behind the outputs above
-    "api/comparing", "api/maps", "api/sized", "commands/diagnose", "commands/show", "exports/dicom",
+    "api/comparing", "api/maps", "api/sized", "exports/dicom",
     "exports/dicom_map", "exports/fhir", "exports/nrrd", "exports/redcap", "files/posterior_nc",
     "report/campaign_html", "report/compare", "report/compare_figure", "report/estimate_document",
     "report/estimate_figures", "report/estimate_text", "report/exam_page", "report/map_figure", "report/map_text",
     "report/pooled",
     # the live view says cautions alone, see below; recorder and import speak of a scan that has no size yet
-    "report/live", "commands/import_", "commands/repair",
+    "report/live",
     # of draws, not of a size; names of files that were written
-    "report/posterior_figures", "commands/campaign", "commands/demo", "commands/export", "commands/report",
+    "report/posterior_figures", "commands/campaign", "commands/report",
     # of trials, calibrations, devices and studies
-    "api/trial_report", "api/trials", "commands/calibrate", "commands/compare_model", "commands/head",
-    "commands/plan", "commands/population", "commands/simulate", "commands/study", "commands/tables",
-    "commands/tradeoff_forward", "files/repeatability_json", "files/size_json", "presets", "report/calibration",
+    "api/trial_report", "api/trials", "actions/calibrate", "actions/devices", "actions/exam", "actions/heads",
+    "actions/simulation", "actions/study",
+    "actions/tradeoff", "actions/trial", "files/repeatability_json", "files/size_json", "presets", "report/calibration",
     "report/calibration_text", "report/forward_tradeoff", "report/paper_head", "report/sbc", "report/solid_figures",
     "report/study", "report/tradeoff", "report/trial", "report/trial_html",
 }  # fmt: skip

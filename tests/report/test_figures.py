@@ -347,8 +347,9 @@ def test_every_command_that_draws_refuses_another_suffix_before_any_work():
         return [one for part in inner for one in commands(part)]
 
     found = []
-    for module, _ in COMMANDS.values():
-        top = importlib.import_module(f"tactile_bayes.commands.{module}").command
+    for place, _ in COMMANDS.values():
+        module, name = place.split(".")
+        top = getattr(importlib.import_module(f"tactile_bayes.commands.{module}"), name)
         for command in commands(top):
             found += [
                 one.type for one in command.params if one.name in ("figure", "map_figure", "trace", "rank", "corner")

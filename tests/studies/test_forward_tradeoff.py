@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from tactile_bayes.commands import tradeoff_forward
-from tactile_bayes.commands.study import fit_line
+from tactile_bayes.actions import tradeoff as tradeoff_forward
+from tactile_bayes.actions.study import fit_line
+from tactile_bayes.commands.tradeoff import tradeoff_forward_command
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import EXIT_BAD_DATA, EXIT_USAGE, BadDataError
 from tactile_bayes.files.shipped import size_calibration_path
@@ -125,7 +126,7 @@ def test_the_head_without_its_edge_is_another_head(head: str | None, edge: str) 
 def test_the_command_hands_its_head_on_and_names_it(head: str | None, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tradeoff_forward, "run_tradeoff", lambda case, *_, **__: report(case))
     words = [] if head is None else ["--head", head]
-    found = {form: CliRunner().invoke(tradeoff_forward.command, [*words, *form]) for form in ((), ("--json",))}
+    found = {form: CliRunner().invoke(tradeoff_forward_command, [*words, *form]) for form in ((), ("--json",))}
     heads = case_of(Scene(body=SceneBody(), solid_lumps=(BALL,)), head=head).heads
     assert json.loads(found[("--json",)].stdout)["head"] == heads
     assert f"head: {heads[PLANE]} (plane-strain), {heads[SOLID]} (solid)" in found[()].stdout

@@ -11,8 +11,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 import tactile_bayes
-from tactile_bayes.commands.plan import command as plan_command
-from tactile_bayes.commands.validate import command as validate_command
+from tactile_bayes.commands.trial import plan_command, validate_command
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.documents import check_document
 from tactile_bayes.report.trial import trial_text

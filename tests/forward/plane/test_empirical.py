@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tactile_bayes.commands.study import fit_line
+from tactile_bayes.actions.study import fit_line
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.line import (
     SHARE,

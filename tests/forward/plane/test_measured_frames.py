@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from in_process import run_here
 
-from tactile_bayes.commands.study import read_frames
+from tactile_bayes.actions.study import read_frames
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.presets import HEAD_PITCH_MM
 from tactile_bayes.studies.paper import StudySettings

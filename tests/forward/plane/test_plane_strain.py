@@ -13,7 +13,7 @@ import pytest
 from scipy.linalg import expm
 from scipy.sparse.linalg import spsolve
 
-from tactile_bayes.commands.study import fit_line
+from tactile_bayes.actions.study import fit_line
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward import plane_strain as strain
 from tactile_bayes.forward.body import Body, Layers, parse_seat

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from tactile_bayes.actions.study import fit_line, table_text
 from tactile_bayes.cli import cli
-from tactile_bayes.commands.study import fit_line, table_text
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.contact import Head

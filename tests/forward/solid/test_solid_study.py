@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from tactile_bayes.commands.study import table_text
+from tactile_bayes.actions.study import table_text
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import EXIT_BAD_DATA, EXIT_USAGE, BadDataError
 from tactile_bayes.studies.paper import Geometry, StudyRow

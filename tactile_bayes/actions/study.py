@@ -1,4 +1,4 @@
-"""The paper's forward study, with its figures."""
+"""The paper's forward study and its tables, run, kept and drawn."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from tactile_bayes.commands.options import FORCE, WORKERS, FilePath, FiniteRange, head_option, scheduler_option
 from tactile_bayes.declarations import as_dict
 
 if TYPE_CHECKING:
@@ -22,6 +21,8 @@ if TYPE_CHECKING:
     from tactile_bayes.studies.paper_solid import SolidSettings
     from tactile_bayes.studies.paper_tables import MeasuredFrame
 
+
+# --- The paper's forward study, with its figures.
 
 # --- Figures of `study`: where they go, the frames that a user measured, and what is drawn from either model.
 
@@ -106,100 +107,14 @@ def draw_figures(
     return [f"figures 5 to 8 are in {folder}"]
 
 
-# --- `study`: amplitude and width of the maps of simulated lumps.
-
-_FILE = FilePath()
-_ABOVE_0 = FiniteRange(min=0.0, min_open=True)
-_RADIUS = FiniteRange(min=0.0, max=1e6, min_open=True)
 # The line is a map that does not change in y: a bump of this width there.
 _NO_CHANGE_MM = 1e6
 _GRID_SCHEMA = "study_grid.table.json"
-MODELS = ("plane-strain", "solid")
 RECIPE = ("normalise", "background", "fit_radius_mm", "noise", "flat_field")
 """Columns that say how the maps of a table were made and fitted; `calibrate size` refuses what contradicts them."""
 
 
-@click.command("study")
-@click.option(
-    "--model",
-    type=click.Choice(MODELS),
-    default="plane-strain",
-    show_default=True,
-    help="The paper's two-dimensional body, or balls under the whole head in three dimensions.",
-)
-@click.option(
-    "--grid",
-    default="paper",
-    show_default=True,
-    metavar="paper|FILE",
-    help="The paper's 150 cases, or a table of cases.",
-)
-@click.option(
-    "--seat",
-    default="centred",
-    show_default=True,
-    metavar="centred|resting|0..2",
-    help="How far the lump stands out of the gland, if the grid does not state it.",
-)
-@click.option(
-    "-o", "--output", metavar="TABLE.csv", type=FilePath(writes="CSV"), help="Write the table. Default: print it."
-)
-@click.option(
-    "--figures",
-    metavar="DIR",
-    type=_FILE,
-    help="Draw figures 5 to 8 of the paper into this directory, and in two dimensions the frames of four lumps. "
-    "The empirical model in them holds for lumps of 10 mm and more down to h/d 1.",
-)
-@click.option(
-    "--measured-frames",
-    metavar="FRAMES.csv",
-    type=_FILE,
-    help="Your own frames, drawn into figure 6 beside both models: columns s_mm, pressure_kpa and optionally x_c_mm.",
-)
-@click.option(
-    "--phantom",
-    type=(_ABOVE_0, _ABOVE_0),
-    metavar="D H/D",
-    help="Lump of figure 6: diameter in mm, and depth over diameter. Default: 12.5 0.825, the paper's.",
-)
-@click.option("--head-radius-mm", type=_RADIUS, default=35.0, show_default=True, help="Radius of the head's arc.")
-@click.option(
-    "--shoulder-mm",
-    type=float,
-    default=3.0,
-    show_default=True,
-    help="Radius of the head's shoulders.",
-)
-@head_option("Default: shoulders-inside for plane-strain, shoulders-outside for solid.")
-@click.option("--mean-kpa", type=_ABOVE_0, default=9.5, show_default=True, help="Mean pressure on the head.")
-@click.option("--fat-kpa", type=_ABOVE_0, default=5.0, show_default=True, help="Young's modulus of fat.")
-@click.option("--poisson", type=float, default=0.495, show_default=True, help="Poisson's ratio of the tissues.")
-@click.option("--gland-ratio", type=_ABOVE_0, default=10.0, show_default=True, help="Modulus of gland over fat.")
-@click.option(
-    "--thickness-mm", type=_ABOVE_0, help="Depth of the chest wall, mm. Default: 70, or deeper for deep lumps."
-)
-@click.option(
-    "--fineness",
-    type=click.IntRange(1, 8),
-    default=2,
-    show_default=True,
-    help="Mesh fineness; doubling it halves the elements.",
-)
-@click.option(
-    "--background",
-    type=click.Choice(["fixed", "free"]),
-    help="Background of Eq 7, solid only: free (default) is fitted, fixed is 1. In two dimensions it is 1.",
-)
-@click.option(
-    "--flat-field/--no-flat-field",
-    default=None,
-    help="Remove what the head reads of the same body without the lump, solid only. Default: on.",
-)
-@WORKERS
-@scheduler_option("the geometries")
-@FORCE
-def command(
+def study_action(
     *,
     model: str,
     grid: str,
@@ -213,21 +128,7 @@ def command(
     force: bool,
     **options: Any,
 ) -> None:
-    """Run the forward study of section 2.4: amplitude and width of the map over sizes, depths and stiffnesses.
-
-    A head slides over each lump in a layered body; its frames become a map, and a Gaussian is fitted to it: Eq 5 across
-    a cylinder in two dimensions, with the background at 1, Eq 7 over a ball in three. There the head's few lines leave
-    stripes and the lump a trough, which a flat field and a free background take off. Cases with an amplitude below
-    0.02 or a width that is not resolved are marked as not detectable. With -o an interrupted study goes on where it
-    stopped. `calibrate size` learns from either table as it is: the table says how its maps were made and fitted. A
-    calibration from the solid model is for maps made with `map --normalise mean --flat-field`. From the joined tables
-    of several seats, thicknesses or heads `calibrate size` also tells what each would change.
-
-    A grid file has the columns d_mm, depth_ratio, stiffness_ratio and optionally seat. Seat 0 (centred) puts the
-    lump's centre on the fat-gland boundary, 1 (resting) its lowest point; above 1 the lump stands clear of the gland.
-
-    Example: tactile-bayes study --model solid --seat resting -o study.csv
-    """
+    """Run the forward study of section 2.4: amplitude and width of the map over sizes, depths and stiffnesses."""
     from tactile_bayes.batch import open_executor
     from tactile_bayes.errors import UsageError
     from tactile_bayes.files.atomic import refuse_existing, write_text
@@ -474,3 +375,67 @@ def _cell(value: Any) -> str:
     if isinstance(value, bool):
         return "true" if value else "false"
     return value if isinstance(value, str) else f"{value:.6g}"
+
+
+# --- `tables`: recompute Tables 1 and 2 of the paper.
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from tactile_bayes.forward.contact import Head
+    from tactile_bayes.studies.paper_tables import Agreement
+
+    ByHead = Mapping[Head, Sequence[Agreement]]
+
+
+def tables_action(
+    *, seat: str, head_radius_mm: float, shoulder_mm: float, head: str | None, search: bool, workers: int, as_json: bool
+) -> None:
+    """Recompute Tables 1 and 2 of the paper beside the printed figures."""
+    import json
+
+    from tactile_bayes.forward.body import parse_seat
+    from tactile_bayes.forward.contact import Head
+    from tactile_bayes.presets import RESEARCH_USE, SHOULDERS_INSIDE
+    from tactile_bayes.report.tables_text import heads_text, tables_document, tables_text
+    from tactile_bayes.studies.paper_tables import NEAREST_HEADS, TRIED_HEADS
+
+    at = parse_seat(seat)
+    asked = Head(radius_mm=head_radius_mm, shoulder_mm=shoulder_mm, shoulders=head or SHOULDERS_INSIDE)
+    nearest = NEAREST_HEADS.get(at)
+    heads = list(dict.fromkeys([asked, *([nearest] if nearest else []), *(TRIED_HEADS if search else ())]))
+    found, phantoms = run_tables(at, heads=heads, workers=workers)
+    if as_json:
+        click.echo(json.dumps(tables_document(found, phantoms, seat=at), indent=2))
+        return
+    beside = found[nearest] if nearest and nearest != asked else None
+    click.echo(tables_text(found[asked], phantoms[asked], head=asked, nearest=nearest, beside=beside))
+    if search:
+        click.echo(heads_text(found))
+    click.echo(RESEARCH_USE)
+
+
+def run_tables(seat: float, *, heads: Sequence[Head], workers: int) -> tuple[ByHead, ByHead]:
+    """Agreement of both models over the cases of the tables, and over the phantoms, under each head."""
+    from functools import partial
+
+    from tactile_bayes.batch import open_executor, run_batch
+    from tactile_bayes.commands.progress import progress_bar
+    from tactile_bayes.errors import TactileBayesError
+    from tactile_bayes.studies.paper import StudySettings
+    from tactile_bayes.studies.paper_tables import compare_heads, phantom_scenes, table_scenes
+
+    scenes = table_scenes(seat) + phantom_scenes(seat)
+    work = partial(compare_heads, settings=StudySettings(), heads=heads, fit=fit_line)
+    with open_executor(workers=workers) as executor, progress_bar("lumps") as progress:
+        outcomes = run_batch(work, scenes, key=lambda scene: scene.name, executor=executor, progress=progress)
+    for outcome in outcomes:
+        if outcome.value is None:
+            raise TactileBayesError(f"{outcome.key}: {outcome.error}")
+    found = [outcome.value for outcome in outcomes if outcome.value is not None]
+    count = len(table_scenes(seat))
+    by_head = {head: [per_scene[i] for per_scene in found] for i, head in enumerate(heads)}
+    return (
+        {head: rows[:count] for head, rows in by_head.items()},
+        {head: rows[count:] for head, rows in by_head.items()},
+    )

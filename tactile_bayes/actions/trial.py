@@ -1,4 +1,4 @@
-"""`plan`: sample size of a trial, and the value of more maps per mass."""
+"""A trial validated or planned, printed and written."""
 
 from __future__ import annotations
 
@@ -8,79 +8,92 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from tactile_bayes.commands.options import FORCE, JSON, MOST_ITEMS, WORKERS, FilePath, FiniteRange, seed_option
+from tactile_bayes.api.trial_report import TrialOutcome, TrialSettings, analyse
+from tactile_bayes.commands.options import also_read
 from tactile_bayes.errors import UsageError
 
 if TYPE_CHECKING:
     from tactile_bayes.trial.planning import PlanCase
 
+
+# --- `validate`: compare each modality with excision.
+
+
+def validate_action(
+    trial: Path,
+    excision: Path,
+    columns: Path | None,
+    methods: bool,
+    as_json: bool,
+    output: Path | None,
+    html: Path | None,
+    protocol: Path | None,
+    force: bool,
+    **settings: Any,
+) -> None:
+    """Compare sizes with excision: errors, lines, agreement, repeatability and calibration of each modality."""
+    from tactile_bayes.api.trials import load_trial
+    from tactile_bayes.files.atomic import refuse_existing, write_text
+    from tactile_bayes.files.documents import check_document, dump_json
+
+    for target in (output, html):
+        if target:
+            refuse_existing(target, force=force)
+    title, chosen = _settings(settings, protocol)
+    inputs = load_trial(trial, excision, columns)
+    also_read(*inputs.files.values())
+    outcome = analyse(inputs, chosen, protocol=protocol, title=title)
+    if output or as_json:
+        check_document(outcome.document, "validate.schema.json", path=output or Path("the report"))
+    try:
+        if output:
+            write_text(output, dump_json(outcome.document), force=force)
+        if html:
+            _write_html(html, outcome, force=force)
+    finally:  # what was computed is not lost with a file
+        if as_json:
+            for doubt in outcome.report.doubts:
+                click.echo(f"doubtful: {doubt}", err=True)
+        click.echo(dump_json(outcome.document) if as_json else _text(outcome, methods=methods), nl=False)
+
+
+def _settings(given: dict[str, Any], protocol: Path | None) -> tuple[str | None, TrialSettings]:
+    """Title and settings of the protocol, if there is one; refuses options that contradict it."""
+    from tactile_bayes.files.documents import read_protocol
+
+    if protocol is None:
+        return None, TrialSettings(**given)
+    context = click.get_current_context()
+    read = read_protocol(protocol)
+    for name, value in read.fixed.items():
+        typed = context.get_parameter_source(name) is click.core.ParameterSource.COMMANDLINE
+        if typed and given[name] != value:
+            option = f"--{name.replace('_', '-')} {given[name]}"
+            raise UsageError(f"{option} contradicts {protocol}, which fixes {name} = {value}; leave the option out")
+    return read.title, TrialSettings(**(given | read.fixed))
+
+
+def _text(outcome: TrialOutcome, *, methods: bool) -> str:
+    from tactile_bayes.report.trial import trial_text
+
+    more = [] if outcome.next_mass is None else outcome.next_mass.lines()
+    return trial_text(outcome.report, methods=methods, checks=outcome.checks, more=more)
+
+
+def _write_html(path: Path, outcome: TrialOutcome, *, force: bool) -> None:
+    from tactile_bayes.files.atomic import write_text
+    from tactile_bayes.report.trial_html import trial_html
+
+    write_text(path, trial_html(outcome.report, outcome.document, text=_text(outcome, methods=True)), force=force)
+
+
+# --- `plan`: sample size of a trial, and the value of more maps per mass.
+
 SCHEMA = "tactile-bayes/plan/1"
-_FILE = FilePath()
-# ln size: 3 is a factor of 20.
-_BIAS, _SD = FiniteRange(-3, 3), FiniteRange(0, 3)
 _ERRORS = ("tactile_bias", "mass_sd", "map_sd", "other_bias", "other_sd", "other_miss")
 
 
-@click.command("plan")
-@click.option(
-    "--patients",
-    type=click.IntRange(8, 10_000),
-    multiple=True,
-    default=(16, 24, 32, 48),
-    show_default=True,
-    help="Number of patients, one mass each.",
-)
-@click.option(
-    "--maps",
-    type=click.IntRange(1, 1000),
-    multiple=True,
-    default=(1, 3, 5),
-    show_default=True,
-    help="Number of tactile maps per mass.",
-)
-@click.option("--tactile-bias", type=_BIAS, default=0.02, show_default=True, help="Mean of ln(size / ex vivo).")
-@click.option("--mass-sd", type=_SD, default=0.18, show_default=True, help="SD of ln size shared by a mass's maps.")
-@click.option("--map-sd", type=_SD, default=0.15, show_default=True, help="SD of ln size of single maps.")
-@click.option(
-    "--other-bias",
-    type=_BIAS,
-    default=-0.08,
-    show_default=True,
-    help="Mean of ln(size / ex vivo) of the modality compared with.",
-)
-@click.option(
-    "--other-sd", type=_SD, default=0.40, show_default=True, help="SD of ln size of the modality compared with."
-)
-@click.option(
-    "--other-miss",
-    type=FiniteRange(0, 1),
-    default=0.04,
-    show_default=True,
-    help="Share of masses that the modality compared with misses.",
-)
-@click.option(
-    "--pilot",
-    metavar="TRIAL.csv",
-    type=_FILE,
-    help="Take the errors that no option gives from this trial; needs --excision.",
-)
-@click.option("--excision", metavar="EX.csv", type=_FILE, help="Sizes measured after excision in the pilot.")
-@click.option("--against", default="ultrasound", show_default=True, help="Modality of the pilot to compare with.")
-@click.option(
-    "--trials",
-    type=click.IntRange(50, MOST_ITEMS),
-    default=1000,
-    show_default=True,
-    help="Number of simulated trials per design.",
-)
-@seed_option(1999)
-@WORKERS
-@JSON
-@click.option(
-    "-o", "--output", metavar="PLAN.json", type=FilePath(writes="JSON"), help="Write the plan as JSON to this file."
-)
-@FORCE
-def command(
+def plan_action(
     patients: tuple[int, ...],
     maps: tuple[int, ...],
     pilot: Path | None,
@@ -94,13 +107,7 @@ def command(
     force: bool,
     **errors: float,
 ) -> None:
-    """Plan a trial: power, widths of intervals and the worth of more maps, by simulation.
-
-    Each design is simulated with log-normal errors. Power is the share of trials in which the tactile percent error is
-    the smaller one and a sign-flip test by patient finds p < 0.05. SDs are of ln size: 0.15 is about 15 %.
-
-    Example: tactile-bayes plan --patients 24 --patients 40 --maps 3 --maps 5 -o plan.json
-    """
+    """Plan a trial: power, widths of intervals and the worth of more maps, by simulation."""
     from tactile_bayes.files.atomic import refuse_existing, write_text
     from tactile_bayes.files.documents import check_document, dump_json
     from tactile_bayes.trial.planning import designs
@@ -126,7 +133,7 @@ def command(
         if output:
             write_text(output, dump_json(document), force=force)
     finally:  # what was computed is not lost with the file
-        click.echo(dump_json(document) if as_json else _text(document), nl=False)
+        click.echo(dump_json(document) if as_json else _plan_text(document), nl=False)
 
 
 def _sources(typed: set[str], *, pilot: bool) -> dict[str, str]:
@@ -212,7 +219,7 @@ def _document(
     }
 
 
-def _text(document: dict[str, Any]) -> str:
+def _plan_text(document: dict[str, Any]) -> str:
     from tactile_bayes.report.trial import plan_text
 
     return plan_text(document)

@@ -1,0 +1,226 @@
+"""`calibrate`: a size calibration, a scan head's gains, a site's repeatability."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from tactile_bayes.commands.options import also_read
+from tactile_bayes.errors import BadDataError
+from tactile_bayes.presets import RESEARCH_USE
+
+if TYPE_CHECKING:
+    from datetime import date, datetime
+
+    from tactile_bayes.api.size_calibration import EqSixFit, PopulationForm
+    from tactile_bayes.hardware.bladder import ArrayFit
+    from tactile_bayes.scan import Scan
+
+
+# --- `calibrate array`: learn an array's calibration from recorded bladder steps, for `record` to attach.
+
+
+def calibrate_array(
+    steps: tuple[tuple[float, Path], ...], output: Path, *, head_id: str | None, day: date, force: bool
+) -> str:
+    """Fit the calibration, write it, and print the result."""
+    from tactile_bayes.declarations import as_dict
+    from tactile_bayes.files.instrument_json import ArrayCalibrationFile, write_array_calibration
+    from tactile_bayes.files.provenance import Provenance, hash_inputs
+    from tactile_bayes.files.scan_mcap import read_scan
+    from tactile_bayes.hardware.bladder import BladderStep, fit_array
+
+    scans = [read_scan(path) for _, path in steps]
+    head = head_id or _one_head(scans)
+    full = scans[0].element_calibration.saturation_count
+    levels = []
+    for (kpa, path), scan in zip(steps, scans, strict=True):
+        try:
+            levels.append(BladderStep.of(kpa, scan.frames.counts, saturation_count=full))
+        except BadDataError as error:
+            raise error.at(path) from None
+    fit = fit_array(levels, saturation_count=full)
+    inputs = hash_inputs(**{f"step_{number}": path for number, (_, path) in enumerate(steps, start=1)})
+    made = Provenance("calibrate array", {"pressure_kpa": [kpa for kpa, _ in steps]}, inputs)
+    content = ArrayCalibrationFile(
+        head_id=head, day=day, quality=_quality(fit), provenance=made.as_dict(), **as_dict(fit.calibration)
+    )
+    write_array_calibration(output, content, force=force)
+    return _text(fit, head, output)
+
+
+def _one_head(scans: list[Scan]) -> str:
+    found = {scan.session.get("head_id", "") for scan in scans}
+    shapes = {scan.head.shape for scan in scans}
+    if len(found) > 1 or len(shapes) > 1:
+        raise BadDataError("the steps are of two heads or more", way_out="give steps of one head, or --head-id")
+    (head,) = found
+    if not head:
+        raise BadDataError("the steps do not say which head they are of", way_out="give --head-id")
+    return head
+
+
+def _quality(fit: ArrayFit) -> dict[str, Any]:
+    def shares(values: Any) -> list[float | None]:
+        return [None if value != value else float(value) for value in values]
+
+    return {
+        "pressure_kpa": fit.pressure_kpa.tolist(),
+        "nonuniformity": shares(fit.nonuniformity),
+        "nonuniformity_with_curvature": shares(fit.curved_nonuniformity),
+        "curvature_kpa_per_count2": fit.curvature_kpa_per_count2.tolist(),
+        "dead": [list(taxel) for taxel in fit.dead],
+        "hot": [list(taxel) for taxel in fit.hot],
+    }
+
+
+def _text(fit: ArrayFit, head: str, output: Path) -> str:
+    gain = fit.calibration.gain_kpa_per_count
+    lines = [f"{output}: {gain.size} taxels of head {head}, {len(fit.pressure_kpa)} steps"]
+    for name, taxels in (("dead", fit.dead), ("hot", fit.hot)):
+        places = ", ".join(f"row {row} column {column}" for row, column in taxels)
+        lines.append(f"{name} taxels: {places or 'none'}")
+    for kpa, line, curve in zip(fit.pressure_kpa, fit.nonuniformity, fit.curved_nonuniformity, strict=True):
+        if line == line:
+            lines.append(f"{kpa:g} kPa: residual non-uniformity {100 * line:.2f} %, with curvature {100 * curve:.2f} %")
+    return "\n".join([*lines, RESEARCH_USE]) + "\n"
+
+
+def calibrate_size_action(
+    ctx: click.Context,
+    /,
+    table: Path,
+    output: Path,
+    form: PopulationForm,
+    correct: str | None,
+    against: Path | None,
+    fit: EqSixFit,
+    normalise: str | None,
+    background: str | None,
+    fit_radius_mm: float | None,
+    noise: str | None,
+    least_stiffness_ratio: float,
+    figure: Path | None,
+    seed: int,
+    force: bool,
+) -> None:
+    """Learn Eq 6, d = m sigma / (e a^f) + b, from a study or a set of phantoms, or over a population of bodies."""
+    from tactile_bayes.api.size_calibration import is_population, learn_eq6
+    from tactile_bayes.commands.progress import progress_bar
+    from tactile_bayes.errors import UsageError
+    from tactile_bayes.files.atomic import refuse_existing
+    from tactile_bayes.files.provenance import Provenance, hash_inputs
+    from tactile_bayes.files.size_json import write_size_calibration
+    from tactile_bayes.files.tables import read_table
+    from tactile_bayes.report.calibration_text import calibration_text
+
+    for path in filter(None, (output, figure)):
+        refuse_existing(path, force=force)
+    declared = {"normalise": normalise, "background": background, "fit_radius_mm": fit_radius_mm, "noise": noise}
+    if correct is not None:
+        _refuse_with_correct(ctx)
+        click.echo(_corrected(table, output, correct, declared, seed=seed, force=force), nl=False)
+        return
+    if form != "eq6" or is_population(table):
+        _refuse_declared(ctx)
+        click.echo(_over_bodies(table, output, form, normalise, against=against, force=force), nl=False)
+        return
+    if against is not None:
+        raise UsageError("--against is for a table of `population`; leave it out")
+    rows = read_table(table, "size_table.table.json")
+    with progress_bar("effective draws") as progress:
+        learned = learn_eq6(
+            rows, declared, fit=fit, least_stiffness_ratio=least_stiffness_ratio, seed=seed, progress=progress
+        )
+    provenance = Provenance("calibrate size", learned.settings, hash_inputs(table=table), seed=seed)
+    write_size_calibration(output, learned.calibration, provenance=provenance, force=force)
+    if figure is not None:
+        from tactile_bayes.report.study import eq6_figure
+
+        eq6_figure(learned.calibration, learned.lumps, figure, title=table.name, force=force)
+    words = calibration_text(
+        learned.calibration,
+        not_left_out=learned.not_left_out,
+        other_fit=learned.other_fit,
+    )
+    click.echo(words, nl=False)
+
+
+def _refuse_with_correct(ctx: click.Context) -> None:
+    from tactile_bayes.errors import UsageError
+
+    for name in ("form", "against", "fit", "least_stiffness_ratio", "figure"):
+        if ctx.get_parameter_source(name) is click.core.ParameterSource.COMMANDLINE:
+            option = name.replace("_", "-")
+            raise UsageError(f"--{option} is for learning a calibration; leave it out with --correct")
+
+
+def _corrected(
+    table: Path, output: Path, base: str, declared: dict[str, str | float | None], *, seed: int, force: bool
+) -> str:
+    from tactile_bayes.api.site_correction import correct_size
+    from tactile_bayes.commands.progress import progress_bar
+    from tactile_bayes.report.calibration import site_calibration_text
+
+    with progress_bar("maps") as progress:
+        found = correct_size(table, base, declared, seed=seed, progress=progress)
+    also_read(*found.inputs.values())
+    found.write(output, force=force)
+    return site_calibration_text(found.calibration)
+
+
+def _refuse_declared(ctx: click.Context) -> None:
+    from tactile_bayes.errors import UsageError
+
+    for name in ("fit", "background", "fit_radius_mm", "noise", "least_stiffness_ratio", "figure", "seed"):
+        if ctx.get_parameter_source(name) is click.core.ParameterSource.COMMANDLINE:
+            option = name.replace("_", "-")
+            raise UsageError(f"--{option} is for tables of lumps: a table of `population` fixes how its maps were made")
+
+
+def _over_bodies(
+    table: Path, output: Path, form: PopulationForm, normalise: str | None, *, against: Path | None, force: bool
+) -> str:
+    from tactile_bayes.api.size_calibration import learn_population
+    from tactile_bayes.files.provenance import Provenance, hash_inputs
+    from tactile_bayes.files.size_json import write_size_calibration
+    from tactile_bayes.files.tables import read_table
+    from tactile_bayes.report.calibration import body_calibration_text
+
+    others = None if against is None else read_table(against, "population.table.json")
+    calibration, settings = learn_population(
+        read_table(table, "population.table.json"), form, normalise, against=others
+    )
+    inputs = hash_inputs(table=table) if against is None else hash_inputs(table=table, against=against)
+    provenance = Provenance("calibrate size", settings, inputs)
+    write_size_calibration(output, calibration, provenance=provenance, force=force)
+    return body_calibration_text(calibration)
+
+
+def calibrate_repeatability_action(folder: Path, output: Path, size_calibration: str | None, force: bool) -> None:
+    """Learn how far sizes of one mass lie apart between its exams at this site."""
+    from tactile_bayes.api.repeatability import exams_in, learn_from_exams
+    from tactile_bayes.files.atomic import refuse_existing
+    from tactile_bayes.files.shipped import size_calibration_path
+    from tactile_bayes.report.calibration import repeatability_text
+
+    also_read(None if size_calibration is None else size_calibration_path(size_calibration))
+    refuse_existing(output, force=force)
+    learned = learn_from_exams(exams_in(folder), size_calibration=size_calibration)
+    learned.write(output, force=force)
+    click.echo(repeatability_text(learned.document), nl=False)
+
+
+def calibrate_array_action(
+    steps: tuple[tuple[float, Path], ...], output: Path, head_id: str | None, day: datetime | None, force: bool
+) -> None:
+    """Learn the gain and offset of each taxel from a pressure bladder, and how uneven they stay."""
+    from datetime import date
+
+    from tactile_bayes.files.atomic import refuse_existing
+
+    refuse_existing(output, force=force)
+    measured = day.date() if day else date.today()
+    click.echo(calibrate_array(steps, output, head_id=head_id, day=measured, force=force), nl=False)

@@ -1,0 +1,279 @@
+"""Devices listed, emulated and replayed; scans repaired."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from tactile_bayes.errors import BadDataError, DeviceError, UsageError
+from tactile_bayes.presets import RESEARCH_USE
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from tactile_bayes.hardware.emulated import Device, Faults
+    from tactile_bayes.hardware.emulator import Emulator, Link, Served, Stage
+    from tactile_bayes.scan import Scan
+
+
+# --- `emulate`: serve a scan as a device would send it.
+
+
+def emulate_action(
+    *,
+    kind: str,
+    scan: Path,
+    protocol: str,
+    tcp: str | None,
+    once: bool,
+    speed: float,
+    drop: float,
+    corrupt: float,
+    stall: tuple[float, float] | None,
+    disconnect: float | None,
+    hold: int,
+    seed: int,
+) -> None:
+    """Serve a scan as a scan head or a tracker would send it, or as both, at its own rate, with faults on request."""
+    from tactile_bayes.files.scan_mcap import read_scan
+    from tactile_bayes.hardware.emulated import Faults
+    from tactile_bayes.hardware.emulator import Stage
+    from tactile_bayes.hardware.reading import ask_for_priority
+
+    roles = ("head", "tracker") if kind == "both" else (kind,)
+    faults, stage, data = Faults(drop, corrupt, stall, disconnect, hold), Stage(speed=speed), read_scan(scan)
+    if protocol == "ndi" and "tracker" in roles:
+        _refuse_for_ndi(faults, once=once)
+    held = stage if kind == "both" else None
+    devices = [_device(role, data, protocol, faults, path=scan, held=held) for role in roles]
+    links = [_link(tcp, after=number) for number in range(len(roles))]
+    for role, link in zip(roles, links, strict=True):
+        click.echo(f"{role} {link.url}" if kind == "both" else link.url)
+    ask_for_priority()  # a real device does not wait for this computer's other programs
+    emulators = [
+        _emulator(device, link, faults, stage, leads=number == 0, seed=seed + number)
+        for number, (device, link) in enumerate(zip(devices, links, strict=True))
+    ]
+    try:
+        _serve(emulators, once=once)
+    finally:
+        for role, emulator in zip(roles, emulators, strict=True):
+            click.echo(_account(role if kind == "both" else "", emulator.served), err=True)
+
+
+def _emulator(device: Device, link: Link, faults: Faults, stage: Stage, *, leads: bool, seed: int) -> Emulator:
+    import numpy as np
+
+    from tactile_bayes.hardware.emulator import Emulator
+
+    return Emulator(device, link, faults=faults, rng=np.random.default_rng(seed), stage=stage, leads=leads)
+
+
+def _serve(emulators: list[Emulator], *, once: bool) -> None:
+    """Run the first emulator here and the others in threads, until all have ended or a signal comes."""
+    from threading import Thread
+
+    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+        signal.signal(number, _leave)
+    others = [Thread(target=one.run, kwargs={"once": once}, daemon=True) for one in emulators[1:]]
+    with contextlib.suppress(_LeaveError):
+        for other in others:
+            other.start()
+        emulators[0].run(once=once)
+        for other in others:
+            other.join()
+
+
+def _account(role: str, served: Served) -> str:
+    words = f"{served.sent} records sent, {served.dropped} dropped, {served.faulty} spoilt on request"
+    return f"{role}: {words}" if role else words
+
+
+class _LeaveError(Exception):
+    """A signal asked this program to end."""
+
+
+def _leave(number: int, frame: object) -> None:
+    del number, frame
+    raise _LeaveError
+
+
+def _device(kind: str, scan: Scan, protocol: str, faults: Faults, *, path: Path, held: Stage | None) -> Device:
+    """Make the emulated device; an NDI tracker, which only answers, follows a shared stage itself."""
+    from tactile_bayes.hardware.emulated import EmulatedHead, EmulatedTracker
+
+    if kind == "head" and len(scan.frames):
+        return EmulatedHead(scan)
+    if kind == "tracker" and len(scan.poses) and protocol == "ndi":
+        from tactile_bayes.hardware.emulated import EmulatedNdi
+
+        elapsed: Callable[[], float | None] | None = None if held is None else lambda: held.now()[1]
+        return EmulatedNdi(scan.poses, hold=faults.hold, elapsed=elapsed)
+    if kind == "tracker" and len(scan.poses):
+        return EmulatedTracker(scan.poses, protocol=protocol, hold=faults.hold)
+    what = "frames" if kind == "head" else "poses"
+    raise BadDataError(f"holds no {what}", way_out="give another scan", path=str(path))
+
+
+def _refuse_for_ndi(faults: Faults, *, once: bool) -> None:
+    if faults.drop or faults.corrupt or faults.stall or faults.disconnect_s is not None or once:
+        raise UsageError(
+            "an NDI tracker sends nothing by itself: --drop, --corrupt, --stall, --disconnect and --once have nothing "
+            "to act on; leave them out, or emulate another protocol"
+        )
+
+
+def _link(tcp: str | None, *, after: int) -> Link:
+    """Make a device's link; the one `after` others listens on a port that many numbers higher."""
+    from tactile_bayes.hardware.emulator import PtyLink, TcpLink
+
+    if tcp is None:
+        return PtyLink()
+    host, colon, port = tcp.rpartition(":")
+    number = int(port) + after if port.isdigit() and int(port) else 0
+    if not colon or not port.isdigit() or number > 65535:
+        raise UsageError(f"--tcp {tcp!r} is not HOST:PORT; give 127.0.0.1:0 for any free port")
+    return TcpLink(host or "127.0.0.1", number)  # a patient's scan: other computers only where an address is given
+
+
+# --- `devices`: list serial ports and check which way a tracker's rotations go.
+
+
+def devices_action(*, url: str | None, pivot_url: str | None, tracker_protocol: str, duration: float) -> None:
+    """List the serial ports and the devices that are probably on them."""
+    if url:
+        from tactile_bayes.hardware.drivers import probe
+
+        click.echo(f"{url}: {probe(url)}")
+    elif pivot_url:
+        _pivot(pivot_url, tracker_protocol, duration)
+    else:
+        _list()
+
+
+def _list() -> None:
+    from tactile_bayes.hardware.drivers import list_ports
+
+    ports = list_ports()
+    for port in ports:
+        click.echo(f"{port.url}  {port.description}: {port.guess}")
+    if not ports:
+        click.echo("no serial ports; other URLs: socket://HOST:PORT, rfc2217://HOST:PORT, a pseudo-terminal's path")
+
+
+def _pivot(url: str, protocol: str, duration_s: float) -> None:
+    import numpy as np
+
+    from tactile_bayes.hardware.bladder import rotation_sense
+    from tactile_bayes.hardware.drivers import TRACKERS, open_tracker
+    from tactile_bayes.hardware.readings import PoseReading
+
+    driver = TRACKERS[protocol]
+    port = open_tracker(protocol, url)
+    try:
+        driver.check(port)
+        click.echo("turn it", err=True)
+        port.write(driver.start)
+        parser, poses, end = driver.parser(), [], time.monotonic() + duration_s
+        while time.monotonic() < end:
+            found = parser.feed(port.read_some(0.1))
+            poses += [one for one in found if isinstance(one, PoseReading) and not one.flags]
+        port.write(driver.stop)
+    finally:
+        port.close()
+    sense = rotation_sense(
+        np.array([pose.position_mm for pose in poses]).reshape(-1, 3),
+        np.array([pose.quaternion_wxyz for pose in poses]).reshape(-1, 4),
+    )
+    click.echo(f"{len(poses)} poses, turned by {sense.turn_deg:.0f} degrees: {sense}")
+
+
+# --- `replay`: play a scan through emulated devices and the recorder.
+
+
+def replay_action(
+    ctx: click.Context,
+    scan: Path,
+    output: Path | None,
+    live: bool,
+    serve: str | None,
+    size_calibration: str,
+    speed: float,
+    force: bool,
+) -> None:
+    """Replay a scan through emulated devices, recorder and live view, as if it were being recorded."""
+    from tactile_bayes.commands import record
+    from tactile_bayes.files.atomic import refuse_existing
+    from tactile_bayes.files.scan_mcap import read_scan
+
+    if output is not None:
+        refuse_existing(output, force=force)
+    found = read_scan(scan)
+    with tempfile.TemporaryDirectory() as folder, _emulated(scan, speed, poses=bool(len(found.poses))) as urls:
+        options = {"like": scan, "clock": "shared", "at_once": True, "live": live, "serve": serve, "force": force}
+        options |= {"output": output or Path(folder) / "replayed.mcap", "size_calibration": size_calibration}
+        options |= {f"{role}_url": url for role, url in urls.items()} | {"tracker_protocol": "open"}
+        if found.landmarks is not None:
+            options["landmarks"] = scan
+        ctx.invoke(record.command, **options)
+
+
+@contextmanager
+def _emulated(scan: Path, speed: float, *, poses: bool) -> Iterator[dict[str, str]]:
+    """Start emulated devices that play one scan together, in one process; gives their URLs by role."""
+    words = ["emulate", "both" if poses else "head", str(scan), "--speed", str(speed)]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "tactile_bayes", *words],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+        start_new_session=True,  # Ctrl-C and what `timeout` sends are for the recorder: a device goes on meanwhile
+    )
+    assert process.stdout is not None
+    try:
+        told = [process.stdout.readline().split() for _ in range(1 + poses)]
+        if not all(told):
+            raise DeviceError(f"the emulated devices did not start; try `tactile-bayes {' '.join(words[:3])}`")
+        yield {role: line[-1] for role, line in zip(("head", "tracker"), told, strict=False)}
+    finally:
+        process.terminate()
+        process.wait()
+        process.stdout.close()
+
+
+# --- `repair`: close a scan file that was cut off.
+
+
+def repair_action(*, scan: Path, output: Path | None, force: bool) -> None:
+    """Repair a scan that was cut off or damaged: keep what is intact, report what is lost."""
+    from tactile_bayes.actions.exam import describe_scan
+    from tactile_bayes.files.atomic import refuse_existing
+    from tactile_bayes.files.provenance import Provenance, hash_inputs
+    from tactile_bayes.files.scan_mcap import read_scan_report, read_truth, write_scan
+    from tactile_bayes.files.scan_recording import refuse_recording
+
+    if output is not None:
+        refuse_existing(output, force=force)
+    if output is None:
+        refuse_recording(scan)
+    file = read_scan_report(scan)
+    if file.complete and output is None:
+        click.echo(f"{scan}: is whole, nothing to repair")
+        return
+    made = {"was": dict(file.provenance), "lost": list(file.lost)}
+    provenance = Provenance("repair", made, inputs=hash_inputs(scan=scan))
+    target = output or scan
+    write_scan(target, file.scan, provenance=provenance, truth=read_truth(scan), force=force or output is None)
+    lines = [f"{target}: scan", *describe_scan(file.scan), *(f"lost: {line}" for line in file.lost), RESEARCH_USE]
+    for line in lines:
+        click.echo(line)

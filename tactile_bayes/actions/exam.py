@@ -1,0 +1,504 @@
+"""Demonstration, imports, exports and draws, as their commands do them."""
+
+from __future__ import annotations
+
+import shlex
+import shutil
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from tactile_bayes.declarations import Record
+from tactile_bayes.errors import UsageError
+from tactile_bayes.presets import RESEARCH_USE
+
+if TYPE_CHECKING:
+    from tactile_bayes.files.estimate_json import StatedSize
+    from tactile_bayes.files.posterior_nc import PosteriorDraws
+    from tactile_bayes.geometry import FloatArray
+    from tactile_bayes.mapping.map import TactileMap
+    from tactile_bayes.scan import Scan
+
+
+# --- `import`: import scans, grids and images from other programs.
+
+_LONGEST_UNITS = 20
+
+
+def import_action(
+    *,
+    source: Path,
+    output: Path,
+    kind: str | None,
+    spacing_mm: float | None,
+    normalise: str | None,
+    units: str | None,
+    session_file: Path | None,
+    force: bool,
+) -> None:
+    """Import scans, grids and images from other programs."""
+    from tactile_bayes.errors import UsageError
+    from tactile_bayes.files.atomic import check_suffix, refuse_existing
+
+    refuse_existing(output, force=force)
+    kind = kind or _kind_of(source, output)
+    check_suffix(output, "MCAP" if kind == "scan" else "netCDF")
+    if kind == "scan" and (spacing_mm is not None or normalise is not None or units is not None):
+        raise UsageError("--spacing-mm, --normalise and --units are for maps; leave them out or give --as map")
+    if kind == "map" and session_file is not None:
+        raise UsageError("--session is for scans; leave it out or give --as scan")
+    _check_units(units, normalise)
+    if kind == "scan":
+        lines = _import_scan(source, output, session_file, force=force)
+    else:
+        lines = _import_map(
+            source, output, spacing_mm=spacing_mm, normalise=normalise or "none", units=units or "", force=force
+        )
+    for line in (f"{output}: {kind}", *lines, RESEARCH_USE):
+        click.echo(line)
+
+
+def _kind_of(source: Path, output: Path) -> str:
+    """Default kind of output: a map where the output is .nc or the source can only be a grid."""
+    as_map = output.suffix.lower() == ".nc" and source.suffix.lower() != ".mcap"
+    return "scan" if source.suffix.lower() in (".npz", ".mcap") and not as_map else "map"
+
+
+def _check_units(units: str | None, normalise: str | None) -> None:
+    from tactile_bayes.errors import UsageError
+
+    if units is None:
+        return
+    if normalise not in (None, "none"):
+        raise UsageError(f"--units is for values that were not divided; leave it out or --normalise {normalise}")
+    if not (units.isprintable() and 0 < len(units.strip()) <= _LONGEST_UNITS):
+        raise UsageError(f"--units {units[:30]!r} is not a unit; give up to {_LONGEST_UNITS} letters, such as kPa")
+
+
+def _import_scan(source: Path, output: Path, session_file: Path | None, *, force: bool) -> list[str]:
+    from tactile_bayes.files.documents import with_session
+    from tactile_bayes.files.provenance import Provenance, hash_inputs
+    from tactile_bayes.files.scan_mcap import read_scan_report, read_truth, write_scan
+
+    lost: tuple[str, ...] = ()
+    truth = None
+    if source.suffix.lower() == ".mcap":
+        file = read_scan_report(source)
+        scan, lost, truth = file.scan, file.lost, read_truth(source)
+    else:
+        from tactile_bayes.files.imports import read_arrays
+
+        scan = read_arrays(source)
+    files = {"source": source} | ({"session": session_file} if session_file else {})
+    provenance = Provenance("import", {"as": "scan", "lost": list(lost)}, inputs=hash_inputs(**files))
+    write_scan(output, with_session(scan, session_file), provenance=provenance, truth=truth, force=force)
+    return [*describe_scan(scan), *(f"lost: {line}" for line in lost)]
+
+
+def _import_map(
+    source: Path, output: Path, *, spacing_mm: float | None, normalise: str, units: str, force: bool
+) -> list[str]:
+    from tactile_bayes.files.imports import read_grid
+    from tactile_bayes.files.map_nc import write_map
+    from tactile_bayes.files.provenance import Provenance, hash_inputs
+
+    tactile_map = read_grid(source, spacing_mm=spacing_mm, normalise=normalise, units=units)
+    settings = {"as": "map", "spacing_mm": tactile_map.recipe.cell_mm, "normalise": normalise, "units": units}
+    provenance = Provenance("import", settings, inputs=hash_inputs(source=source))
+    write_map(output, tactile_map, provenance=provenance, force=force)
+    return _describe_map(tactile_map)
+
+
+def _describe_map(tactile_map: TactileMap) -> list[str]:
+    import numpy as np
+
+    ny, nx = tactile_map.mean.shape
+    covered = int(tactile_map.covered.sum())
+    low, high = np.nanmin(tactile_map.mean), np.nanmax(tactile_map.mean)
+    level = "unknown" if tactile_map.background is None else f"{tactile_map.background:g}"
+    return [
+        f"{ny} x {nx} cells of {tactile_map.recipe.cell_mm:g} mm, {covered} with data",
+        f"values {low:.4g} to {high:.4g}{_unit(tactile_map)}, background level {level} "
+        f"(normalise {tactile_map.recipe.normalise})",
+    ]
+
+
+def _unit(tactile_map: TactileMap) -> str:
+    """Unit of the values, to follow them; empty where they were divided by a level."""
+    unit = tactile_map.recipe.value_unit
+    return "" if unit == "1" else f" {unit or '(unit unknown: give --units)'}"
+
+
+def describe_scan(scan: Scan) -> list[str]:
+    """Summary of a scan in a few lines."""
+    times, poses = scan.frames.time_s, scan.poses
+    span = float(times[-1] - times[0]) if len(times) else 0.0
+    calibration = scan.element_calibration
+    saturated = int((scan.frames.counts >= calibration.saturation_count).sum())
+    marks = [] if scan.landmarks is None else [name.replace("_", " ") for name in scan.landmarks.points()]
+    return [
+        f"{len(times)} frames of {scan.head.shape[0]} x {scan.head.shape[1]} taxels in {span:.3f} s, {_rate(times)}",
+        f"{len(poses)} poses, {_rate(poses.time_s)}",
+        f"dropped frames {_dropped(times)}, dropped poses {_dropped(poses.time_s)}, "
+        f"duplicate pose stamps {_duplicates(poses.time_s)}, saturated readings {saturated}",
+        f"landmarks: {' and '.join(', '.join(marks).rsplit(', ', 1)) or 'not touched'}",
+    ]
+
+
+def _rate(times: FloatArray) -> str:
+    import numpy as np
+
+    steps = np.diff(times)
+    steps = steps[steps > 0]
+    return f"{1 / np.median(steps):.1f} Hz" if len(steps) else "no rate"
+
+
+def _dropped(times: FloatArray) -> int:
+    """Number of records missing, by the median period."""
+    import numpy as np
+
+    steps = np.diff(times)
+    if not (steps > 0).any():
+        return 0
+    periods = np.rint(steps / np.median(steps[steps > 0]))
+    return int(np.clip(periods - 1, 0, None).sum())
+
+
+def _duplicates(times: FloatArray) -> int:
+    import numpy as np
+
+    return int((np.diff(times) == 0).sum())
+
+
+# --- `show`: describe a file.
+
+
+def show_action(file: Path, as_json: bool) -> None:
+    """Show what a file holds: schema, shape, units, quality, provenance."""
+    from tactile_bayes.files.documents import dump_json
+    from tactile_bayes.files.identify import describe
+    from tactile_bayes.files.shipped import SHIPPED, size_calibration_path
+
+    shipped = size_calibration_path(file.name) if str(file) in SHIPPED and not file.exists() else None
+    found = describe(shipped or file)
+    if as_json:
+        click.echo(dump_json(found), nl=False)
+        return
+    click.echo(shown(found))
+    click.echo(RESEARCH_USE)
+
+
+def shown(found: dict[str, Any]) -> str:
+    """Description of a file, one fact per line."""
+    return "\n".join(_lines(found))
+
+
+def _lines(found: dict[str, Any], indent: str = "") -> Iterator[str]:
+    """Nested facts as lines."""
+    width = max((len(name) for name in found), default=0)
+    for name, value in found.items():
+        if isinstance(value, dict) and value:
+            yield f"{indent}{name}"
+            yield from _lines(value, indent + "  ")
+        else:
+            yield f"{indent}{name.ljust(width)}  {_plain(value)}"
+
+
+def _plain(value: Any) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, list):
+        return ", ".join(_plain(item) for item in value) if value else "none"
+    if isinstance(value, dict):
+        return "none" if not value else "; ".join(f"{k} {_plain(v)}" for k, v in value.items())
+    return "none" if value is None else str(value)
+
+
+# --- `export`: write maps and estimates as the files that other systems take.
+
+
+def export_action(
+    *,
+    files: tuple[Path, ...],
+    to: Any,
+    output: Path | None,
+    worklist: Path | None,
+    patient_id_from_scan: bool,
+    dictionary: Path | None,
+    force: bool,
+    **identity: str | None,
+) -> None:
+    """Export maps and estimates as DICOM, FHIR, NRRD (3D Slicer) or CSV (REDCap)."""
+    from tactile_bayes.exports.exam import read_exam
+    from tactile_bayes.exports.identity import identity_of
+    from tactile_bayes.exports.run import Outputs, export, refuse_untaken
+
+    given = {name: value for name, value in identity.items() if value is not None}
+    refuse_untaken(to, given)
+    outputs = Outputs(output, dictionary, to=to, force=force)
+    outputs.check(files=bool(files))
+    exported = None
+    if files:
+        who = identity_of(worklist, given)
+        exported = export(map(read_exam, files), to=to, identity=who, id_from_scan=patient_id_from_scan)
+    for path in outputs.write(exported):
+        is_dictionary = path == dictionary
+        click.echo(f"{path}: {'data dictionary for REDCap' if is_dictionary else f'{path.stat().st_size} bytes'}")
+    for note in () if exported is None else exported.notes:
+        click.echo(f"note: {note}", err=True)
+    click.echo(RESEARCH_USE)
+
+
+# --- `diagnose`: how far the draws of a posterior can be trusted, as a table and as pictures.
+
+_QUANTITIES = ("max_size_mm", "min_size_mm", "d_x_mm", "d_y_mm", "amplitude", "sigma_x_mm", "sigma_y_mm")
+
+
+def diagnose_action(
+    posterior: Path, trace: Path | None, rank: Path | None, corner: Path | None, as_json: bool, force: bool
+) -> None:
+    """Check the draws of a posterior: R-hat, effective draws and Monte-Carlo errors of every size and width."""
+    from tactile_bayes.errors import UsageError
+    from tactile_bayes.files.atomic import refuse_existing
+    from tactile_bayes.files.documents import dump_json
+    from tactile_bayes.files.posterior_nc import read_posterior
+    from tactile_bayes.findings import finding_lines
+
+    for path in (trace, rank, corner):
+        if path is not None:
+            refuse_existing(path, force=force)
+    found = read_posterior(posterior)
+    chains = len(next(iter(found.draws.values())))
+    if rank is not None and chains < 2:
+        raise UsageError(f"--rank compares chains and {posterior} has one; estimate with --method ensemble")
+    quantities = _figures(found)
+    _draw(found, posterior.stem, trace, rank, corner, force=force)
+    if as_json:
+        document = {"method": found.method, "chains": chains, "quantities": quantities, "research_use": RESEARCH_USE}
+        document["findings"] = [one.as_dict() for one in found.findings]
+        click.echo(dump_json(document), nl=False)
+        return
+    click.echo("\n".join([*finding_lines(found.findings), *_table(found, chains, quantities), RESEARCH_USE]))
+
+
+def _figures(found: PosteriorDraws) -> dict[str, dict[str, Any]]:
+    """Median of each quantity, and of chains how far they agree on it."""
+    import numpy as np
+
+    shown = {name: found.draws[name] for name in _QUANTITIES if name in found.draws}
+    figures: dict[str, dict[str, Any]] = {name: {"median": float(np.nanmedian(d))} for name, d in shown.items()}
+    if all(len(draws) > 1 for draws in shown.values()):
+        from tactile_bayes.inference.arviz_data import convergence
+
+        for name, draws in shown.items():
+            figures[name] |= convergence(draws)
+    return figures
+
+
+def _draw(
+    found: PosteriorDraws, name: str, trace: Path | None, rank: Path | None, corner: Path | None, *, force: bool
+) -> None:
+    if not (trace or rank or corner):
+        return
+    from tactile_bayes.report.figure_file import named_exam
+    from tactile_bayes.report.posterior_figures import corner_figure, rank_figure, trace_figure
+
+    title = f"{named_exam(name, found.scans)}, method {found.method}"
+    for path, figure in ((trace, trace_figure), (rank, rank_figure), (corner, corner_figure)):
+        if path is not None:
+            figure(found.draws, path, title=title, force=force)
+
+
+def _table(found: PosteriorDraws, chains: int, quantities: dict[str, dict[str, Any]]) -> list[str]:
+    number = next(iter(found.draws.values())).size
+    lines = [f"method {found.method}: {number} draws in {chains} chain{'s' if chains > 1 else ''}"]
+    if chains == 1:
+        shape = found.diagnostics.get("pareto_k")
+        lines += [] if shape is None else [f"Pareto shape of the weights {shape:.2f} (trusted up to 0.7)"]
+        return [*lines, *(f"{name:14}{one['median']:>10.4g}" for name, one in quantities.items())]
+    lines.append(
+        f"{'':14}{'median':>10}{'R-hat':>8}{'bulk ESS':>10}{'tail ESS':>10}{'MCSE of median':>16}{'of 95 % ends':>16}"
+    )
+    for name, one in quantities.items():
+        ends = max(one["mcse_low"], one["mcse_high"])
+        lines.append(
+            f"{name:14}{one['median']:>10.4g}{one['rhat']:>8.3f}{one['ess_bulk']:>10.0f}{one['ess_tail']:>10.0f}"
+            f"{one['mcse_median']:>16.2g}{ends:>16.2g}"
+        )
+    return lines
+
+
+# --- `demo`: the main steps on data that comes with the program.
+
+EMBEDDED = ("scan.mcap", "phantoms.csv", "trial.csv", "excision.csv", "scene.toml", "empty.toml")
+PROGRAM = "tactile-bayes"
+
+
+def demo_action(ctx: click.Context, output: Path, method: str, force: bool) -> None:
+    """Run the main job on an embedded scan: map, estimate, and the report of a trial."""
+    _prepare(output, force=force)
+    steps = Steps(ctx, output, method=method, force=force)
+    truth = _truth(output / "scan.mcap")
+    click.echo(f"The scan is simulated: a ball of {truth:g} mm in a breast of fat and gland ({output / 'scene.toml'}).")
+    click.echo(f"Each step is printed as the command that repeats it by hand.{_how_to_type()}")
+    results = {
+        "estimate, the default": steps.default_road(),
+        "the paper's Eq 6": steps.paper_road(),
+    }
+    steps.trial()
+    click.echo(_summary(truth, results))
+    click.echo(_apart(*results.values()))
+    click.echo(f"Written to {output}: {', '.join(sorted(path.name for path in output.iterdir()))}.")
+    click.echo(f"Your own data: `{PROGRAM} import --help` says how arrays, grids and images come in.")
+    click.echo(RESEARCH_USE)
+
+
+class Steps(Record):
+    """Steps of the demo, run in the folder with its inputs.
+
+    Parameters
+    ----------
+    ctx
+        Of the demo itself; every step is invoked from it.
+    folder
+        Holds the embedded files and takes what is made of them.
+    method
+        Of the default road's estimate.
+    force
+        Whether files of an earlier demo are overwritten.
+    """
+
+    ctx: click.Context
+    folder: Path
+    method: str
+    force: bool
+
+    def default_road(self) -> StatedSize:
+        """Map and estimate with default options; returns the size."""
+        from tactile_bayes.commands import estimate, map
+
+        self._say("1. Build the tactile map: all readings of the scan, averaged in cells of 1 mm.")
+        tactile_map, posterior = self.folder / "map.nc", self.folder / "posterior.nc"
+        self._run(map.command, "map", scans=(self.folder / "scan.mcap",), output=tactile_map)
+        self._say("2. Estimate the size of the lump, with the calibration that comes with the program.")
+        figures = {"figure": self.folder / "size.png", "map_figure": self.folder / "map.png"}
+        self._estimate(estimate.command, tactile_map, output=posterior, **figures)
+        return _stated(posterior)
+
+    def paper_road(self) -> StatedSize:
+        """The same map by the paper's own way: Markov chains through Eq 6."""
+        from tactile_bayes.commands import estimate
+
+        self._say("3. The same map by the paper's own road: Markov chains over the bump, each draw through Eq 6.")
+        tactile_map, posterior = self.folder / "map.nc", self.folder / "posterior_eq6.nc"
+        options = {"size_calibration": "eq6", "output": posterior}
+        self._run(estimate.command, "estimate", maps=(tactile_map,), method="ensemble", **options)
+        return _stated(posterior)
+
+    def trial(self) -> None:
+        """Report a synthetic trial."""
+        from tactile_bayes.commands import trial as validate
+
+        self._say("4. Compare sizes with excision, in a synthetic trial of the paper's size.")
+        inputs = {"trial": self.folder / "trial.csv", "excision": self.folder / "excision.csv"}
+        outputs = {"output": self.folder / "trial.json", "html": self.folder / "trial.html"}
+        self._run(validate.validate_command, "validate", **inputs, **outputs)
+
+    def _estimate(self, command: click.Command, tactile_map: Path, **options: Any) -> None:
+        self._run(command, "estimate", maps=(tactile_map,), method=self.method, **options)
+
+    def _say(self, text: str) -> None:
+        click.echo(f"\n{text}\n")
+
+    def _run(self, command: click.Command, name: str, **parameters: Any) -> None:
+        # typed again, it meets what the demo made
+        click.secho(f"$ {PROGRAM} {name} {_as_typed(command, parameters | {'force': True})}", bold=True)
+        try:
+            self.ctx.invoke(command, **parameters, force=self.force)
+        except click.exceptions.Exit as end:  # a step that says its exit code; anything but 0 ends the demo with it
+            if end.exit_code:
+                raise
+        click.echo()
+
+
+def _prepare(output: Path, *, force: bool) -> None:
+    """Copy the embedded inputs to where the user can look at them."""
+    from tactile_bayes.files.atomic import unwritable, write_bytes
+
+    if output.exists() and not output.is_dir():
+        raise UsageError(f"{output} is a file; choose another name")
+    if output.exists() and any(output.iterdir()) and not force:
+        raise UsageError(f"{output} is not empty; choose another name or give --force")
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise unwritable(output, error) from None
+    for name in EMBEDDED:
+        write_bytes(output / name, (Path(__file__).resolve().parent.parent / "demo" / name).read_bytes(), force=True)
+
+
+def _how_to_type(which: Callable[[str], str | None] = shutil.which) -> str:
+    """Command to type where the program is not on the PATH, as after `make demo`; else empty."""
+    if which(PROGRAM):
+        return ""
+    started = Path(sys.argv[0])
+    typed = str(started) if started.name == PROGRAM else f"{shlex.quote(sys.executable)} -m tactile_bayes"
+    return f" {PROGRAM} is not on your PATH: type {typed} for it."
+
+
+def _as_typed(command: click.Command, parameters: dict[str, Any]) -> str:
+    """Options of a step as the user would type them."""
+    words: list[str] = []
+    for parameter in command.params:
+        value = parameters.get(parameter.name or "")
+        if value is None or value is False or value == parameter.get_default(click.Context(command)):
+            continue
+        values = [str(one) for one in value] if isinstance(value, tuple) else [str(value)]
+        if isinstance(parameter, click.Option):
+            words.append(parameter.opts[0])
+            values = [] if parameter.is_flag else values
+        words += values
+    return shlex.join(words)
+
+
+def _truth(scan: Path) -> float:
+    from tactile_bayes.files.scan_mcap import read_truth
+
+    truth = read_truth(scan)
+    if truth is None:
+        raise UsageError(f"{scan} holds no truth; it is not the embedded scan")
+    return float(truth["lumps"][0]["d_mm"])
+
+
+def _stated(posterior: Path) -> StatedSize:
+    from tactile_bayes.files.estimate_json import read_stated_size
+
+    return read_stated_size(posterior)
+
+
+def _apart(default: StatedSize, paper: StatedSize) -> str:
+    """How far the paper's road lies from the default, and why one would want either."""
+    if default.size_mm is None or paper.size_mm is None:
+        return "One of the two roads has no size; its reason is above."
+    share = 100 * (paper.size_mm / default.size_mm - 1.0)
+    return (
+        f"Eq 6 lies {share:+.0f} % from the default here. The default follows the bodies it was learned over more "
+        "closely;\nEq 6 has four constants, which -v prints for each map and the paper explains."
+    )
+
+
+def _summary(truth_mm: float, results: dict[str, StatedSize]) -> str:
+    """True size and estimates, one per line."""
+    lines = [f"{'Largest size of the lump':28}{'mm':>9}   95 % interval", f"{'true':28}{truth_mm:>9.1f}"]
+    for name, size in results.items():
+        if size.size_mm is None or size.low_mm is None or size.high_mm is None:
+            lines.append(f"{name:28}{'none':>9}")
+            continue
+        covered = "covers the true size" if size.low_mm <= truth_mm <= size.high_mm else "misses the true size"
+        lines.append(f"{name:28}{size.size_mm:>9.1f}   {size.low_mm:.1f} to {size.high_mm:.1f} mm, {covered}")
+    return "\n".join(lines)

@@ -1,0 +1,295 @@
+"""Trade-offs measured, printed and drawn."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from tactile_bayes.commands.options import also_read, settings_of
+from tactile_bayes.declarations import replace
+
+if TYPE_CHECKING:
+    from tactile_bayes.report.forward_tradeoff import TradeoffReport
+    from tactile_bayes.studies.estimate_tradeoff import Ladder
+    from tactile_bayes.studies.tradeoffs import LumpCase, Measured, SizeRule
+
+
+# --- Options of the trade-offs, and the CPU time of a command in a process of its own.
+
+# --- CPU time of this program in a process of its own: what a user who types one command waits for.
+
+TIMES = 2
+
+
+def fresh_cpu_s(words: Sequence[str]) -> float | None:
+    """Least CPU seconds of a command in a fresh process; None where the system does not tell them.
+
+    Parameters
+    ----------
+    words
+        Of the command, without the program's name.
+    """
+    spent = []
+    for _ in range(TIMES):
+        before = os.times()
+        subprocess.run(
+            [sys.executable, "-m", "tactile_bayes", *words],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            check=False,
+        )
+        after = os.times()
+        spent.append(after.children_user - before.children_user + after.children_system - before.children_system)
+    least = min(spent)
+    return least if least > 0 else None
+
+
+def forecast(seconds: float) -> None:
+    """Say on stderr how long it will take."""
+    click.echo(f"about {max(round(seconds), 1)} s of CPU to go", err=True)
+
+
+def show(
+    ladder: Ladder,
+    *,
+    what: str,
+    title: str,
+    figure: Path | None,
+    as_json: bool,
+    force: bool,
+    provenance: Mapping[str, Any],
+) -> int:
+    """Draw and print; the exit code."""
+    from tactile_bayes.errors import EXIT_DONE, EXIT_NO_ESTIMATE
+    from tactile_bayes.files.documents import check_document, dump_json
+    from tactile_bayes.report.tradeoff import SCHEMA_FILE, draw_ladder, ladder_document, ladder_text
+
+    try:
+        if figure is not None:
+            draw_ladder(ladder, figure, title=title, force=force)
+    finally:  # what was measured is not lost with the figure
+        if as_json:
+            document = ladder_document(ladder, what=what, provenance=provenance)
+            check_document(document, SCHEMA_FILE, path=Path("the report"))
+            click.echo(dump_json(document), nl=False)
+        else:
+            click.echo(ladder_text(ladder))
+    return EXIT_NO_ESTIMATE if ladder.reference.answer is None else EXIT_DONE
+
+
+# --- `tradeoff forward`: error in amplitude, width and size against CPU time, for one lump and every forward model.
+
+LEARNED = "learned"
+
+
+def tradeoff_forward_action(
+    *,
+    scene: Path | None,
+    size_calibration: str | None,
+    head: str | None,
+    figure: Path | None,
+    tolerance_percent: float,
+    runs: int,
+    as_json: bool,
+    force: bool,
+) -> None:
+    """Measure error in amplitude, width and size against CPU time, for the lump of a scene."""
+    import json
+
+    from tactile_bayes.commands.options import also_read
+    from tactile_bayes.files.atomic import refuse_existing
+    from tactile_bayes.files.shipped import size_calibration_path
+    from tactile_bayes.presets import RESEARCH_USE
+    from tactile_bayes.report.forward_tradeoff import tradeoff_document, tradeoff_text
+
+    if figure is not None:
+        refuse_existing(figure, force=force)
+    if size_calibration not in (None, "learned"):
+        also_read(size_calibration_path(size_calibration))
+    report = run_tradeoff(_case(scene, head), size_calibration, tolerance=tolerance_percent / 100, runs=runs)
+    try:
+        if figure is not None:
+            from tactile_bayes.report.forward_tradeoff import draw_tradeoff
+
+            draw_tradeoff(report, figure, force=force)
+    finally:  # what was measured is not lost with the figure
+        click.echo(json.dumps(tradeoff_document(report), indent=2) if as_json else tradeoff_text(report))
+    if as_json:
+        return
+    if figure is not None:
+        click.echo(f"the figure is in {figure}")
+    click.echo(RESEARCH_USE)
+
+
+def _case(path: Path | None, head: str | None) -> LumpCase:
+    from tactile_bayes.errors import BadDataError
+    from tactile_bayes.files.scene_toml import read_scene
+    from tactile_bayes.forward.scene import Scene
+    from tactile_bayes.forward.tissue import SceneBody, SolidLump
+    from tactile_bayes.studies.tradeoffs import case_of
+
+    if path is None:
+        return case_of(Scene(body=SceneBody(), solid_lumps=(SolidLump(seat=0.0),)), head=head)
+    try:
+        return case_of(read_scene(path), head=head)
+    except BadDataError as error:
+        raise error.at(path) from None
+
+
+def run_tradeoff(case: LumpCase, calibration: str | None, *, tolerance: float, runs: int) -> TradeoffReport:
+    """Learn Eq 6 or read the calibrations, then measure all settings."""
+    import time
+
+    from tactile_bayes.actions.study import fit_line
+    from tactile_bayes.commands.progress import progress_bar
+    from tactile_bayes.report.forward_tradeoff import TradeoffReport
+    from tactile_bayes.studies.paper_solid import fit_raster
+    from tactile_bayes.studies.tradeoffs import PLANE, SOLID
+    from tactile_bayes.studies.tradeoffs import forward_settings as settings_of
+    from tactile_bayes.studies.tradeoffs import measure_forward as measure
+
+    # a raster's frames are divided by their means
+    own = {PLANE: "plane-strain", SOLID: "solid-mean"}
+    rules = {model: _rule(case, model, calibration or own[model]) for model in (PLANE, SOLID)}
+    found: list[Measured] = []
+    settings = settings_of(case)
+    measure(case, settings[0], fit=fit_line, raster_fit=fit_raster, clock=time.process_time)  # imports cost nothing
+    measure(case, settings[-1], fit=fit_line, raster_fit=fit_raster, clock=time.process_time)
+    with progress_bar("settings") as progress:
+        for number, setting in enumerate(settings, start=1):
+            clock: Callable[[], float] = time.process_time
+            found.append(measure(case, setting, fit=fit_line, raster_fit=fit_raster, clock=clock, runs=runs))
+            progress(number, len(settings))
+    return TradeoffReport(case, tuple(found), rules, tolerance)
+
+
+def _rule(case: LumpCase, model: str, name: str) -> SizeRule:
+    """Rule from a model's widths to sizes: a calibration by name or path, or one learned here."""
+    from tactile_bayes.actions.study import fit_line
+    from tactile_bayes.commands.progress import progress_bar
+    from tactile_bayes.errors import UsageError
+    from tactile_bayes.files.shipped import size_calibration_path
+    from tactile_bayes.files.size_json import read_size_calibration
+    from tactile_bayes.studies.paper_solid import fit_raster
+    from tactile_bayes.studies.tradeoffs import calibrated_rule, learned_rule, teach
+
+    if name == LEARNED:
+        with progress_bar(f"lumps for Eq 6, {model}") as progress:
+            return learned_rule(teach(case, model, fit=fit_line, raster_fit=fit_raster, progress=progress))
+    path = size_calibration_path(name)
+    if path is None:
+        raise UsageError(f"--size-calibration {name} gives no sizes; name a calibration, or say {LEARNED}")
+    return calibrated_rule(read_size_calibration(path), name=path.name)
+
+
+# --- `tradeoff estimate`: every setting of `estimate` on the user's own map, against a long reference.
+
+
+def tradeoff_estimate_action(
+    ctx: click.Context,
+    /,
+    maps: tuple[Path, ...],
+    size_calibration: str | None,
+    centre_mm: tuple[float, float] | None,
+    settings_file: Path | None,
+    tolerance_mm: float,
+    runs: int,
+    figure: Path | None,
+    seed: int,
+    as_json: bool,
+    force: bool,
+) -> None:
+    """Measure what each setting of `estimate` costs on a map, and how far its size interval is off."""
+    import time
+
+    from tactile_bayes.api.tradeoffs import pooled_rows, tradeoff_of_map
+    from tactile_bayes.commands.progress import progress_bar
+    from tactile_bayes.declarations import replace
+    from tactile_bayes.errors import UsageError
+    from tactile_bayes.files.atomic import given_twice, refuse_existing
+    from tactile_bayes.files.provenance import Provenance, hash_inputs
+    from tactile_bayes.files.shipped import size_calibration_path
+    from tactile_bayes.studies.estimate_tradeoff import Work
+
+    if size_calibration is not None:
+        also_read(size_calibration_path(size_calibration))
+    if figure is not None:
+        refuse_existing(figure, force=force)
+    if twice := given_twice(maps):
+        raise UsageError(f"{twice} is given twice; give each map once")
+    settings = settings_of(
+        settings_file=settings_file, size_calibration=size_calibration, centre_mm=centre_mm, seed=seed
+    )
+    if len(maps) > 1 and centre_mm is not None:
+        raise UsageError("--centre-mm is a place on one map; give one map")
+    with progress_bar("settings") as progress:
+        work = Work(time.process_time, tolerance_mm, runs, forecast, progress)
+        _, ladder = tradeoff_of_map(maps[0], settings, work)
+        if len(maps) > 1:
+            ladder = replace(ladder, pooled=pooled_rows(maps, settings, clock=time.process_time))
+    cold = fresh_cpu_s(["estimate", str(maps[0]), *_said(size_calibration, centre_mm, settings_file)])
+    if cold is not None:
+        shared = {"start of the program and reading the map": max(cold - ladder.default.seconds, 0.0)}
+        ladder = replace(ladder, shared_cpu_s=shared)
+    inputs = hash_inputs(**{f"map_{number}": path for number, path in enumerate(maps, start=1)})
+    kept = {"size_calibration": size_calibration, "tolerance_mm": tolerance_mm, "runs": runs}
+    provenance = Provenance("tradeoff estimate", kept, inputs, seed=seed).as_dict()
+    title = f"{maps[0].stem}: what more time for `estimate` buys"
+    ctx.exit(
+        show(ladder, what="estimate", title=title, figure=figure, as_json=as_json, force=force, provenance=provenance)
+    )
+
+
+def _said(calibration: str | None, centre_mm: tuple[float, float] | None, settings_file: Path | None) -> list[str]:
+    """The options of an `estimate` that does the same as the default row."""
+    words = [] if calibration is None else ["--size-calibration", calibration]
+    words += [] if centre_mm is None else ["--centre-mm", *map(repr, centre_mm)]
+    return words + ([] if settings_file is None else ["--settings", str(settings_file)])
+
+
+# --- `tradeoff map`: every setting of `map` on the user's own scan, up to the size.
+
+
+def tradeoff_map_action(
+    ctx: click.Context,
+    /,
+    scan: Path,
+    tolerance_mm: float,
+    runs: int,
+    figure: Path | None,
+    seed: int,
+    as_json: bool,
+    force: bool,
+) -> None:
+    """Measure what each setting of `map` costs on a scan, and how far it moves the size interval."""
+    import time
+
+    from tactile_bayes.api.settings import Settings
+    from tactile_bayes.api.tradeoffs import tradeoff_of_scan
+    from tactile_bayes.commands.progress import progress_bar
+    from tactile_bayes.files.atomic import refuse_existing
+    from tactile_bayes.files.provenance import Provenance, hash_inputs
+    from tactile_bayes.files.scan_mcap import read_scan
+    from tactile_bayes.studies.estimate_tradeoff import Work
+
+    if figure is not None:
+        refuse_existing(figure, force=force)
+    read_scan(scan)  # imports and first calls cost nothing afterwards
+    begun = time.process_time()
+    loaded = read_scan(scan)
+    read_s = time.process_time() - begun
+    with progress_bar("settings") as progress:
+        work = Work(time.process_time, tolerance_mm, runs, forecast, progress)
+        ladder = tradeoff_of_scan(loaded, Settings(seed=seed), work)
+    ladder = replace(ladder, shared_cpu_s={"reading the scan": read_s})
+    kept = {"tolerance_mm": tolerance_mm, "runs": runs}
+    provenance = Provenance("tradeoff map", kept, hash_inputs(scan=scan), seed=seed).as_dict()
+    title = f"{scan.stem}: what finer cells and more frames buy"
+    ctx.exit(show(ladder, what="map", title=title, figure=figure, as_json=as_json, force=force, provenance=provenance))

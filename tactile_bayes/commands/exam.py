@@ -1,0 +1,190 @@
+"""Options of the commands that show, carry and demonstrate exams: `demo`, `import`, `show`, `export`, `diagnose`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from inspect import cleandoc
+from pathlib import Path
+from typing import Any, Final
+
+import click
+
+from tactile_bayes.commands.options import FORCE, JSON, METAVAR, SESSION, FigurePath, FilePath
+from tactile_bayes.files.arrays_layout import layout_lines
+from tactile_bayes.presets import METHODS, NORMALISE
+
+# --- `demo`: the main steps on data that comes with the program.
+
+
+@click.command("demo")
+@click.option(
+    "-o",
+    "--output",
+    type=FilePath(),
+    default=Path("tactile-bayes-demo"),
+    show_default=True,
+    metavar="DIR",
+    help="Folder for the files.",
+)
+@click.option(
+    "--method",
+    type=click.Choice(METHODS[:3]),
+    default="importance",
+    show_default=True,
+    help="Method of the first estimate; see `estimate --help`.",
+)
+@click.option("--force", is_flag=True, help="Overwrite the files of an earlier demo.")
+@click.pass_context
+def demo_command(ctx: click.Context, /, **given: Any) -> None:
+    """Run the main job on an embedded scan: map, estimate, and the report of a trial.
+
+    The scan is simulated: a hard ball of 15 mm, one diameter deep in a breast of fat and gland, with the noise and
+    tracker errors of a real examination. It is sized twice, by the default calibration and by the paper's own road,
+    Markov chains through Eq 6, and both results are compared with the true size. The trial is synthetic. Each step is
+    printed as the command that does it by hand.
+    """
+    from tactile_bayes.actions.exam import demo_action
+
+    demo_action(ctx, **given)
+
+
+# --- `import`: import scans, grids and images from other programs.
+
+
+@click.command("import")
+@click.argument("source", metavar="SRC", type=FilePath())
+@click.option("-o", "--output", required=True, type=FilePath(), help="File to write: .mcap or .nc.")
+@click.option(
+    "--as",
+    "kind",
+    type=click.Choice(["scan", "map"]),
+    help="What SRC holds. Default: a map if the output ends in .nc or SRC is a table or an image, otherwise a scan.",
+)
+@click.option("--spacing-mm", type=float, metavar="H", help="Map: side of the square cells, in mm.")
+@click.option(
+    "--normalise",
+    type=click.Choice(NORMALISE),
+    help="Map: how the values are already normalised. Default: none.",
+)
+@click.option(
+    "--units", metavar="TEXT", help="Map: unit of values that are not normalised, such as kPa. Default: unknown."
+)
+@SESSION
+@FORCE
+def import_command(**given: Any) -> None:
+    """Import scans, grids and images from other programs.
+
+    SRC is an .npz of raw counts and poses (a scan), a scan file to repair (what is intact is kept), or a grid of
+    values (a map): .npz with `mean`, .csv (commas, semicolons or tabs), or a grey .tif, .pgm or .png image. The first
+    row of a grid has the lowest y and the first column the lowest x; pictures of the map show the first row on top,
+    as the file reads.
+    """
+    from tactile_bayes.actions.exam import import_action
+
+    import_action(**given)
+
+
+_HEADING = "Arrays of a scan in an .npz file, in mm, kPa and s, for n frames and m poses:"
+_ARRAYS = "\n".join([_HEADING, "", "\b", *layout_lines()])
+import_command.help = f"{cleandoc(import_command.help or '')}\n\n{_ARRAYS}"
+
+
+# --- `show`: describe a file.
+
+
+@click.command("show")
+@click.argument("file", type=FilePath())
+@JSON
+def show_command(**given: Any) -> None:
+    """Show what a file holds: schema, shape, units, quality, provenance.
+
+    Knows scans, maps, posteriors, size calibrations, reports and the tables of trials and phantoms. Calibrations that
+    come with the program are known by their names where no file is called so: solid, solid-mean, eq6, plane-strain.
+
+    Example: tactile-bayes show map.nc
+    """
+    from tactile_bayes.actions.exam import show_action
+
+    show_action(**given)
+
+
+# --- `export`: write maps and estimates as the files that other systems take.
+
+_FORMATS: Final = ("dicom", "fhir", "nrrd", "csv")
+# Name of the part of an identity, metavar, help.
+_IDENTITY: Final = (
+    ("patient_id", "ID", "Patient ID; in csv files the beginning of the record ID."),
+    ("patient_name", "FAMILY^GIVEN", "Patient's name."),
+    ("birth_date", "YYYY-MM-DD", "Patient's date of birth."),
+    ("sex", "F|M|O", "Patient's sex."),
+    ("issuer", "NAME", "Who issued the patient ID."),
+    ("accession", "NUMBER", "Accession number."),
+    ("referring_physician", "FAMILY^GIVEN", "Referring physician's name."),
+    ("study_id", "ID", "Study ID."),
+    ("study_description", "TEXT", "Study description."),
+    ("study_uid", "UID", "Study Instance UID. Default: one that follows from the maps."),
+    ("study_date", "DATE", "Date of the exam: YYYY-MM-DD or YYYY-MM-DDTHH:MM, with +HH:MM for the zone."),
+    ("content_date", "DATE", "Date at which the content was made. Default: the exam's."),
+)
+
+
+def _identity_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """One option for each part of an identity."""
+    for name, metavar, text in reversed(_IDENTITY):
+        command = click.option(f"--{name.replace('_', '-')}", metavar=metavar, help=text)(command)
+    return command
+
+
+@click.command("export")
+@click.argument("files", metavar="FILE...", nargs=-1, type=FilePath())
+@click.option("--to", required=True, type=click.Choice(_FORMATS), help="Format to write.")
+@click.option(
+    "-o", "--output", metavar="OUT", type=FilePath(), help="File to write; for dicom the folder of the files."
+)
+@click.option(
+    "--worklist",
+    metavar="ITEM",
+    type=FilePath(),
+    help="Patient and study from a modality worklist item (.dcm or DICOM JSON), or from JSON of plain keys.",
+)
+@click.option("--patient-id-from-scan", is_flag=True, help="Use the scan's subject code as the patient ID.")
+@_identity_options
+@click.option(
+    "--dictionary", metavar="DICT.csv", type=FilePath(), help="With csv: write the data dictionary of the REDCap form."
+)
+@FORCE
+def export_command(**given: Any) -> None:
+    """Export maps and estimates as DICOM, FHIR, NRRD (3D Slicer) or CSV (REDCap).
+
+    dicom takes a map, or a map and its estimate: values, picture and report, into a folder. fhir takes an estimate
+    (what `estimate --json` prints), nrrd a map, csv one or more estimates. Files are told apart by their content; an
+    estimate of another map is refused. Who was examined comes from options or a worklist and is never invented.
+
+    Example: tactile-bayes export map.nc estimate.json --to dicom --study-date 2026-11-24T10:30 -o exam
+    """
+    from tactile_bayes.actions.exam import export_action
+
+    export_action(**given)
+
+
+# --- `diagnose`: how far the draws of a posterior can be trusted, as a table and as pictures.
+
+
+@click.command("diagnose")
+@click.argument("posterior", metavar="POST.nc", type=FilePath())
+@click.option("--trace", metavar=METAVAR, type=FigurePath(), help="Draw densities and traces.")
+@click.option("--rank", metavar=METAVAR, type=FigurePath(), help="Draw the ranks of each chain's draws among all.")
+@click.option("--corner", metavar=METAVAR, type=FigurePath(), help="Draw the pairs of sizes, amplitude and widths.")
+@JSON
+@FORCE
+def diagnose_command(**given: Any) -> None:
+    """Check the draws of a posterior: R-hat, effective draws and Monte-Carlo errors of every size and width.
+
+    POST.nc is what `estimate -o` wrote. R-hat and effective draws compare chains, so they are of `--method ensemble`;
+    weighted and independent draws are one chain, and their Pareto shape is shown instead.
+
+    Example: tactile-bayes diagnose post.nc --trace trace.png --rank rank.png --corner corner.png
+    """
+    from tactile_bayes.actions.exam import diagnose_action
+
+    diagnose_action(**given)

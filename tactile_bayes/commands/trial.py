@@ -1,0 +1,161 @@
+"""Options of the commands on trials: `validate`, `plan`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import click
+
+from tactile_bayes.api.trial_report import TrialSettings
+from tactile_bayes.commands.options import FORCE, JSON, MOST_ITEMS, WORKERS, FilePath, FiniteRange, seed_option
+
+# --- `validate`: compare each modality with excision.
+
+_FILE = FilePath()
+_DEFAULTS = TrialSettings()
+
+
+@click.command("validate")
+@click.argument("trial", metavar="TRIAL.csv", type=_FILE)
+@click.option("--excision", required=True, metavar="EX.csv", type=_FILE, help="Sizes measured after excision.")
+@click.option(
+    "--columns", metavar="MAP.toml", type=_FILE, help="Layout of a wide TRIAL.csv: which column holds which reading."
+)
+@click.option(
+    "--intervals",
+    type=click.Choice(["corrected", "jackknife", "bca"]),
+    default=_DEFAULTS.intervals,
+    show_default=True,
+    help="Interval method, resampling patients. corrected: jackknife with Student's t, corrected for rare "
+    "misses and few influential patients; jackknife: uncorrected; bca: bootstrap.",
+)
+@click.option(
+    "--resamples",
+    type=click.IntRange(200, 100_000),
+    default=_DEFAULTS.resamples,
+    show_default=True,
+    help="Number of bootstrap resamples.",
+)
+@seed_option(_DEFAULTS.seed)
+@click.option(
+    "--error-ratio",
+    type=FiniteRange(1e-6, 1e6),
+    default=_DEFAULTS.error_ratio,
+    show_default=True,
+    help="Ratio of the ex-vivo error's variance to the modality's, for Deming lines.",
+)
+@click.option(
+    "--check-intervals",
+    type=click.IntRange(0),
+    default=0,
+    metavar="TRIALS",
+    help="Simulate this many trials of this size and report how often the intervals cover.",
+)
+@click.option(
+    "--bayes", is_flag=True, help="Predict the error of the next mass, by an errors-in-variables model and MCMC."
+)
+@click.option("--methods", is_flag=True, help="Also print lines, limits of agreement, repeatability and pairs.")
+@JSON
+@click.option(
+    "-o", "--output", metavar="REPORT.json", type=FilePath(writes="JSON"), help="Write the report as JSON to this file."
+)
+@click.option(
+    "--html",
+    metavar="REPORT.html",
+    type=FilePath(writes="HTML"),
+    help="Write tables and figures as one self-contained page.",
+)
+@click.option(
+    "--protocol", metavar="FILE.toml", type=_FILE, help="Pre-specified analysis; the report records its hash."
+)
+@FORCE
+def validate_command(**given: Any) -> None:
+    """Compare sizes with excision: errors, lines, agreement, repeatability and calibration of each modality.
+
+    TRIAL.csv has the columns patient, mass, modality, replicate, size_mm, status (detected, not_detected, not_done or
+    blank) and optionally sd_mm, low_mm, high_mm, probability, reader, posterior, synthetic. EX.csv has patient, mass,
+    ex_vivo_mm and optionally ex_vivo_second_mm, sd_mm, synthetic. Sizes are in mm.
+
+    Example: tactile-bayes validate trial.csv --excision excision.csv -o report.json
+    """
+    from tactile_bayes.actions.trial import validate_action
+
+    validate_action(**given)
+
+
+# --- `plan`: sample size of a trial, and the value of more maps per mass.
+
+# ln size: 3 is a factor of 20.
+_BIAS, _SD = FiniteRange(-3, 3), FiniteRange(0, 3)
+
+
+@click.command("plan")
+@click.option(
+    "--patients",
+    type=click.IntRange(8, 10_000),
+    multiple=True,
+    default=(16, 24, 32, 48),
+    show_default=True,
+    help="Number of patients, one mass each.",
+)
+@click.option(
+    "--maps",
+    type=click.IntRange(1, 1000),
+    multiple=True,
+    default=(1, 3, 5),
+    show_default=True,
+    help="Number of tactile maps per mass.",
+)
+@click.option("--tactile-bias", type=_BIAS, default=0.02, show_default=True, help="Mean of ln(size / ex vivo).")
+@click.option("--mass-sd", type=_SD, default=0.18, show_default=True, help="SD of ln size shared by a mass's maps.")
+@click.option("--map-sd", type=_SD, default=0.15, show_default=True, help="SD of ln size of single maps.")
+@click.option(
+    "--other-bias",
+    type=_BIAS,
+    default=-0.08,
+    show_default=True,
+    help="Mean of ln(size / ex vivo) of the modality compared with.",
+)
+@click.option(
+    "--other-sd", type=_SD, default=0.40, show_default=True, help="SD of ln size of the modality compared with."
+)
+@click.option(
+    "--other-miss",
+    type=FiniteRange(0, 1),
+    default=0.04,
+    show_default=True,
+    help="Share of masses that the modality compared with misses.",
+)
+@click.option(
+    "--pilot",
+    metavar="TRIAL.csv",
+    type=_FILE,
+    help="Take the errors that no option gives from this trial; needs --excision.",
+)
+@click.option("--excision", metavar="EX.csv", type=_FILE, help="Sizes measured after excision in the pilot.")
+@click.option("--against", default="ultrasound", show_default=True, help="Modality of the pilot to compare with.")
+@click.option(
+    "--trials",
+    type=click.IntRange(50, MOST_ITEMS),
+    default=1000,
+    show_default=True,
+    help="Number of simulated trials per design.",
+)
+@seed_option(1999)
+@WORKERS
+@JSON
+@click.option(
+    "-o", "--output", metavar="PLAN.json", type=FilePath(writes="JSON"), help="Write the plan as JSON to this file."
+)
+@FORCE
+def plan_command(**given: Any) -> None:
+    """Plan a trial: power, widths of intervals and the worth of more maps, by simulation.
+
+    Each design is simulated with log-normal errors. Power is the share of trials in which the tactile percent error is
+    the smaller one and a sign-flip test by patient finds p < 0.05. SDs are of ln size: 0.15 is about 15 %.
+
+    Example: tactile-bayes plan --patients 24 --patients 40 --maps 3 --maps 5 -o plan.json
+    """
+    from tactile_bayes.actions.trial import plan_action
+
+    plan_action(**given)
