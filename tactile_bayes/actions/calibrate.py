@@ -2,14 +2,30 @@
 
 from __future__ import annotations
 
+from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
+from tactile_bayes.api.repeatability import exams_in, learn_from_exams
+from tactile_bayes.api.site_correction import correct_size
+from tactile_bayes.api.size_calibration import is_population, learn_eq6, learn_population
 from tactile_bayes.commands.options import also_read
-from tactile_bayes.errors import BadDataError
+from tactile_bayes.commands.progress import progress_bar
+from tactile_bayes.declarations import as_dict
+from tactile_bayes.errors import BadDataError, UsageError
+from tactile_bayes.files.atomic import refuse_existing
+from tactile_bayes.files.instrument_json import ArrayCalibrationFile, write_array_calibration
+from tactile_bayes.files.provenance import Provenance, hash_inputs
+from tactile_bayes.files.shipped import size_calibration_path
+from tactile_bayes.files.size_json import write_size_calibration
+from tactile_bayes.files.tables import read_table
+from tactile_bayes.hardware.bladder import BladderStep, fit_array
 from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.report.calibration import body_calibration_text, repeatability_text, site_calibration_text
+from tactile_bayes.report.calibration_text import calibration_text
+from tactile_bayes.report.study import eq6_figure
 
 if TYPE_CHECKING:
     from datetime import date, datetime
@@ -26,11 +42,7 @@ def calibrate_array(
     steps: tuple[tuple[float, Path], ...], output: Path, *, head_id: str | None, day: date, force: bool
 ) -> str:
     """Fit the calibration, write it, and print the result."""
-    from tactile_bayes.declarations import as_dict
-    from tactile_bayes.files.instrument_json import ArrayCalibrationFile, write_array_calibration
-    from tactile_bayes.files.provenance import Provenance, hash_inputs
     from tactile_bayes.files.scan_mcap import read_scan
-    from tactile_bayes.hardware.bladder import BladderStep, fit_array
 
     scans = [read_scan(path) for _, path in steps]
     head = head_id or _one_head(scans)
@@ -107,15 +119,6 @@ def calibrate_size_action(
     force: bool,
 ) -> None:
     """Learn Eq 6, d = m sigma / (e a^f) + b, from a study or a set of phantoms, or over a population of bodies."""
-    from tactile_bayes.api.size_calibration import is_population, learn_eq6
-    from tactile_bayes.commands.progress import progress_bar
-    from tactile_bayes.errors import UsageError
-    from tactile_bayes.files.atomic import refuse_existing
-    from tactile_bayes.files.provenance import Provenance, hash_inputs
-    from tactile_bayes.files.size_json import write_size_calibration
-    from tactile_bayes.files.tables import read_table
-    from tactile_bayes.report.calibration_text import calibration_text
-
     for path in filter(None, (output, figure)):
         refuse_existing(path, force=force)
     declared = {"normalise": normalise, "background": background, "fit_radius_mm": fit_radius_mm, "noise": noise}
@@ -137,8 +140,6 @@ def calibrate_size_action(
     provenance = Provenance("calibrate size", learned.settings, hash_inputs(table=table), seed=seed)
     write_size_calibration(output, learned.calibration, provenance=provenance, force=force)
     if figure is not None:
-        from tactile_bayes.report.study import eq6_figure
-
         eq6_figure(learned.calibration, learned.lumps, figure, title=table.name, force=force)
     words = calibration_text(
         learned.calibration,
@@ -149,8 +150,6 @@ def calibrate_size_action(
 
 
 def _refuse_with_correct(ctx: click.Context) -> None:
-    from tactile_bayes.errors import UsageError
-
     for name in ("form", "against", "fit", "least_stiffness_ratio", "figure"):
         if ctx.get_parameter_source(name) is click.core.ParameterSource.COMMANDLINE:
             option = name.replace("_", "-")
@@ -160,10 +159,6 @@ def _refuse_with_correct(ctx: click.Context) -> None:
 def _corrected(
     table: Path, output: Path, base: str, declared: dict[str, str | float | None], *, seed: int, force: bool
 ) -> str:
-    from tactile_bayes.api.site_correction import correct_size
-    from tactile_bayes.commands.progress import progress_bar
-    from tactile_bayes.report.calibration import site_calibration_text
-
     with progress_bar("maps") as progress:
         found = correct_size(table, base, declared, seed=seed, progress=progress)
     also_read(*found.inputs.values())
@@ -172,8 +167,6 @@ def _corrected(
 
 
 def _refuse_declared(ctx: click.Context) -> None:
-    from tactile_bayes.errors import UsageError
-
     for name in ("fit", "background", "fit_radius_mm", "noise", "least_stiffness_ratio", "figure", "seed"):
         if ctx.get_parameter_source(name) is click.core.ParameterSource.COMMANDLINE:
             option = name.replace("_", "-")
@@ -183,12 +176,6 @@ def _refuse_declared(ctx: click.Context) -> None:
 def _over_bodies(
     table: Path, output: Path, form: PopulationForm, normalise: str | None, *, against: Path | None, force: bool
 ) -> str:
-    from tactile_bayes.api.size_calibration import learn_population
-    from tactile_bayes.files.provenance import Provenance, hash_inputs
-    from tactile_bayes.files.size_json import write_size_calibration
-    from tactile_bayes.files.tables import read_table
-    from tactile_bayes.report.calibration import body_calibration_text
-
     others = None if against is None else read_table(against, "population.table.json")
     calibration, settings = learn_population(
         read_table(table, "population.table.json"), form, normalise, against=others
@@ -201,11 +188,6 @@ def _over_bodies(
 
 def calibrate_repeatability_action(folder: Path, output: Path, size_calibration: str | None, force: bool) -> None:
     """Learn how far sizes of one mass lie apart between its exams at this site."""
-    from tactile_bayes.api.repeatability import exams_in, learn_from_exams
-    from tactile_bayes.files.atomic import refuse_existing
-    from tactile_bayes.files.shipped import size_calibration_path
-    from tactile_bayes.report.calibration import repeatability_text
-
     also_read(None if size_calibration is None else size_calibration_path(size_calibration))
     refuse_existing(output, force=force)
     learned = learn_from_exams(exams_in(folder), size_calibration=size_calibration)
@@ -217,10 +199,6 @@ def calibrate_array_action(
     steps: tuple[tuple[float, Path], ...], output: Path, head_id: str | None, day: datetime | None, force: bool
 ) -> None:
     """Learn the gain and offset of each taxel from a pressure bladder, and how uneven they stay."""
-    from datetime import date
-
-    from tactile_bayes.files.atomic import refuse_existing
-
     refuse_existing(output, force=force)
     measured = day.date() if day else date.today()
     click.echo(calibrate_array(steps, output, head_id=head_id, day=measured, force=force), nl=False)

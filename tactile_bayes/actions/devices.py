@@ -11,11 +11,23 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from threading import Thread
 from typing import TYPE_CHECKING
 
 import click
+import numpy as np
 
+from tactile_bayes.actions.exam import describe_scan
+from tactile_bayes.commands import record
 from tactile_bayes.errors import BadDataError, DeviceError, UsageError
+from tactile_bayes.files.atomic import refuse_existing
+from tactile_bayes.files.provenance import Provenance, hash_inputs
+from tactile_bayes.hardware.bladder import rotation_sense
+from tactile_bayes.hardware.drivers import TRACKERS, list_ports, open_tracker, probe
+from tactile_bayes.hardware.emulated import EmulatedHead, EmulatedNdi, EmulatedTracker, Faults
+from tactile_bayes.hardware.emulator import Emulator, PtyLink, Stage, TcpLink
+from tactile_bayes.hardware.reading import ask_for_priority
+from tactile_bayes.hardware.readings import PoseReading
 from tactile_bayes.presets import RESEARCH_USE
 
 if TYPE_CHECKING:
@@ -46,9 +58,6 @@ def emulate_action(
 ) -> None:
     """Serve a scan as a scan head or a tracker would send it, or as both, at its own rate, with faults on request."""
     from tactile_bayes.files.scan_mcap import read_scan
-    from tactile_bayes.hardware.emulated import Faults
-    from tactile_bayes.hardware.emulator import Stage
-    from tactile_bayes.hardware.reading import ask_for_priority
 
     roles = ("head", "tracker") if kind == "both" else (kind,)
     faults, stage, data = Faults(drop, corrupt, stall, disconnect, hold), Stage(speed=speed), read_scan(scan)
@@ -72,17 +81,11 @@ def emulate_action(
 
 
 def _emulator(device: Device, link: Link, faults: Faults, stage: Stage, *, leads: bool, seed: int) -> Emulator:
-    import numpy as np
-
-    from tactile_bayes.hardware.emulator import Emulator
-
     return Emulator(device, link, faults=faults, rng=np.random.default_rng(seed), stage=stage, leads=leads)
 
 
 def _serve(emulators: list[Emulator], *, once: bool) -> None:
     """Run the first emulator here and the others in threads, until all have ended or a signal comes."""
-    from threading import Thread
-
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
         signal.signal(number, _leave)
     others = [Thread(target=one.run, kwargs={"once": once}, daemon=True) for one in emulators[1:]]
@@ -110,13 +113,9 @@ def _leave(number: int, frame: object) -> None:
 
 def _device(kind: str, scan: Scan, protocol: str, faults: Faults, *, path: Path, held: Stage | None) -> Device:
     """Make the emulated device; an NDI tracker, which only answers, follows a shared stage itself."""
-    from tactile_bayes.hardware.emulated import EmulatedHead, EmulatedTracker
-
     if kind == "head" and len(scan.frames):
         return EmulatedHead(scan)
     if kind == "tracker" and len(scan.poses) and protocol == "ndi":
-        from tactile_bayes.hardware.emulated import EmulatedNdi
-
         elapsed: Callable[[], float | None] | None = None if held is None else lambda: held.now()[1]
         return EmulatedNdi(scan.poses, hold=faults.hold, elapsed=elapsed)
     if kind == "tracker" and len(scan.poses):
@@ -135,8 +134,6 @@ def _refuse_for_ndi(faults: Faults, *, once: bool) -> None:
 
 def _link(tcp: str | None, *, after: int) -> Link:
     """Make a device's link; the one `after` others listens on a port that many numbers higher."""
-    from tactile_bayes.hardware.emulator import PtyLink, TcpLink
-
     if tcp is None:
         return PtyLink()
     host, colon, port = tcp.rpartition(":")
@@ -152,8 +149,6 @@ def _link(tcp: str | None, *, after: int) -> Link:
 def devices_action(*, url: str | None, pivot_url: str | None, tracker_protocol: str, duration: float) -> None:
     """List the serial ports and the devices that are probably on them."""
     if url:
-        from tactile_bayes.hardware.drivers import probe
-
         click.echo(f"{url}: {probe(url)}")
     elif pivot_url:
         _pivot(pivot_url, tracker_protocol, duration)
@@ -162,8 +157,6 @@ def devices_action(*, url: str | None, pivot_url: str | None, tracker_protocol: 
 
 
 def _list() -> None:
-    from tactile_bayes.hardware.drivers import list_ports
-
     ports = list_ports()
     for port in ports:
         click.echo(f"{port.url}  {port.description}: {port.guess}")
@@ -172,12 +165,6 @@ def _list() -> None:
 
 
 def _pivot(url: str, protocol: str, duration_s: float) -> None:
-    import numpy as np
-
-    from tactile_bayes.hardware.bladder import rotation_sense
-    from tactile_bayes.hardware.drivers import TRACKERS, open_tracker
-    from tactile_bayes.hardware.readings import PoseReading
-
     driver = TRACKERS[protocol]
     port = open_tracker(protocol, url)
     try:
@@ -212,8 +199,6 @@ def replay_action(
     force: bool,
 ) -> None:
     """Replay a scan through emulated devices, recorder and live view, as if it were being recorded."""
-    from tactile_bayes.commands import record
-    from tactile_bayes.files.atomic import refuse_existing
     from tactile_bayes.files.scan_mcap import read_scan
 
     if output is not None:
@@ -256,9 +241,6 @@ def _emulated(scan: Path, speed: float, *, poses: bool) -> Iterator[dict[str, st
 
 def repair_action(*, scan: Path, output: Path | None, force: bool) -> None:
     """Repair a scan that was cut off or damaged: keep what is intact, report what is lost."""
-    from tactile_bayes.actions.exam import describe_scan
-    from tactile_bayes.files.atomic import refuse_existing
-    from tactile_bayes.files.provenance import Provenance, hash_inputs
     from tactile_bayes.files.scan_mcap import read_scan_report, read_truth, write_scan
     from tactile_bayes.files.scan_recording import refuse_recording
 

@@ -10,10 +10,27 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+import numpy as np
 
+from tactile_bayes.commands import estimate
+from tactile_bayes.commands import trial as validate
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import UsageError
+from tactile_bayes.exports.exam import read_exam
+from tactile_bayes.exports.identity import identity_of
+from tactile_bayes.exports.run import Outputs, export, refuse_untaken
+from tactile_bayes.files.atomic import check_suffix, refuse_existing, unwritable, write_bytes
+from tactile_bayes.files.documents import dump_json, with_session
+from tactile_bayes.files.estimate_json import read_stated_size
+from tactile_bayes.files.identify import describe
+from tactile_bayes.files.map_nc import write_map
+from tactile_bayes.files.posterior_nc import read_posterior
+from tactile_bayes.files.provenance import Provenance, hash_inputs
+from tactile_bayes.files.shipped import SHIPPED, size_calibration_path
+from tactile_bayes.findings import finding_lines
 from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.report.figure_file import named_exam
+from tactile_bayes.report.posterior_figures import corner_figure, rank_figure, trace_figure
 
 if TYPE_CHECKING:
     from tactile_bayes.files.estimate_json import StatedSize
@@ -40,9 +57,6 @@ def import_action(
     force: bool,
 ) -> None:
     """Import scans, grids and images from other programs."""
-    from tactile_bayes.errors import UsageError
-    from tactile_bayes.files.atomic import check_suffix, refuse_existing
-
     refuse_existing(output, force=force)
     kind = kind or _kind_of(source, output)
     check_suffix(output, "MCAP" if kind == "scan" else "netCDF")
@@ -68,8 +82,6 @@ def _kind_of(source: Path, output: Path) -> str:
 
 
 def _check_units(units: str | None, normalise: str | None) -> None:
-    from tactile_bayes.errors import UsageError
-
     if units is None:
         return
     if normalise not in (None, "none"):
@@ -79,8 +91,6 @@ def _check_units(units: str | None, normalise: str | None) -> None:
 
 
 def _import_scan(source: Path, output: Path, session_file: Path | None, *, force: bool) -> list[str]:
-    from tactile_bayes.files.documents import with_session
-    from tactile_bayes.files.provenance import Provenance, hash_inputs
     from tactile_bayes.files.scan_mcap import read_scan_report, read_truth, write_scan
 
     lost: tuple[str, ...] = ()
@@ -102,8 +112,6 @@ def _import_map(
     source: Path, output: Path, *, spacing_mm: float | None, normalise: str, units: str, force: bool
 ) -> list[str]:
     from tactile_bayes.files.imports import read_grid
-    from tactile_bayes.files.map_nc import write_map
-    from tactile_bayes.files.provenance import Provenance, hash_inputs
 
     tactile_map = read_grid(source, spacing_mm=spacing_mm, normalise=normalise, units=units)
     settings = {"as": "map", "spacing_mm": tactile_map.recipe.cell_mm, "normalise": normalise, "units": units}
@@ -113,8 +121,6 @@ def _import_map(
 
 
 def _describe_map(tactile_map: TactileMap) -> list[str]:
-    import numpy as np
-
     ny, nx = tactile_map.mean.shape
     covered = int(tactile_map.covered.sum())
     low, high = np.nanmin(tactile_map.mean), np.nanmax(tactile_map.mean)
@@ -149,8 +155,6 @@ def describe_scan(scan: Scan) -> list[str]:
 
 
 def _rate(times: FloatArray) -> str:
-    import numpy as np
-
     steps = np.diff(times)
     steps = steps[steps > 0]
     return f"{1 / np.median(steps):.1f} Hz" if len(steps) else "no rate"
@@ -158,8 +162,6 @@ def _rate(times: FloatArray) -> str:
 
 def _dropped(times: FloatArray) -> int:
     """Number of records missing, by the median period."""
-    import numpy as np
-
     steps = np.diff(times)
     if not (steps > 0).any():
         return 0
@@ -168,8 +170,6 @@ def _dropped(times: FloatArray) -> int:
 
 
 def _duplicates(times: FloatArray) -> int:
-    import numpy as np
-
     return int((np.diff(times) == 0).sum())
 
 
@@ -178,10 +178,6 @@ def _duplicates(times: FloatArray) -> int:
 
 def show_action(file: Path, as_json: bool) -> None:
     """Show what a file holds: schema, shape, units, quality, provenance."""
-    from tactile_bayes.files.documents import dump_json
-    from tactile_bayes.files.identify import describe
-    from tactile_bayes.files.shipped import SHIPPED, size_calibration_path
-
     shipped = size_calibration_path(file.name) if str(file) in SHIPPED and not file.exists() else None
     found = describe(shipped or file)
     if as_json:
@@ -234,10 +230,6 @@ def export_action(
     **identity: str | None,
 ) -> None:
     """Export maps and estimates as DICOM, FHIR, NRRD (3D Slicer) or CSV (REDCap)."""
-    from tactile_bayes.exports.exam import read_exam
-    from tactile_bayes.exports.identity import identity_of
-    from tactile_bayes.exports.run import Outputs, export, refuse_untaken
-
     given = {name: value for name, value in identity.items() if value is not None}
     refuse_untaken(to, given)
     outputs = Outputs(output, dictionary, to=to, force=force)
@@ -263,12 +255,6 @@ def diagnose_action(
     posterior: Path, trace: Path | None, rank: Path | None, corner: Path | None, as_json: bool, force: bool
 ) -> None:
     """Check the draws of a posterior: R-hat, effective draws and Monte-Carlo errors of every size and width."""
-    from tactile_bayes.errors import UsageError
-    from tactile_bayes.files.atomic import refuse_existing
-    from tactile_bayes.files.documents import dump_json
-    from tactile_bayes.files.posterior_nc import read_posterior
-    from tactile_bayes.findings import finding_lines
-
     for path in (trace, rank, corner):
         if path is not None:
             refuse_existing(path, force=force)
@@ -288,8 +274,6 @@ def diagnose_action(
 
 def _figures(found: PosteriorDraws) -> dict[str, dict[str, Any]]:
     """Median of each quantity, and of chains how far they agree on it."""
-    import numpy as np
-
     shown = {name: found.draws[name] for name in _QUANTITIES if name in found.draws}
     figures: dict[str, dict[str, Any]] = {name: {"median": float(np.nanmedian(d))} for name, d in shown.items()}
     if all(len(draws) > 1 for draws in shown.values()):
@@ -305,9 +289,6 @@ def _draw(
 ) -> None:
     if not (trace or rank or corner):
         return
-    from tactile_bayes.report.figure_file import named_exam
-    from tactile_bayes.report.posterior_figures import corner_figure, rank_figure, trace_figure
-
     title = f"{named_exam(name, found.scans)}, method {found.method}"
     for path, figure in ((trace, trace_figure), (rank, rank_figure), (corner, corner_figure)):
         if path is not None:
@@ -392,8 +373,6 @@ class Steps(Record):
 
     def paper_road(self) -> StatedSize:
         """The same map by the paper's own way: Markov chains through Eq 6."""
-        from tactile_bayes.commands import estimate
-
         self._say("3. The same map by the paper's own road: Markov chains over the bump, each draw through Eq 6.")
         tactile_map, posterior = self.folder / "map.nc", self.folder / "posterior_eq6.nc"
         options = {"size_calibration": "eq6", "output": posterior}
@@ -402,8 +381,6 @@ class Steps(Record):
 
     def trial(self) -> None:
         """Report a synthetic trial."""
-        from tactile_bayes.commands import trial as validate
-
         self._say("4. Compare sizes with excision, in a synthetic trial of the paper's size.")
         inputs = {"trial": self.folder / "trial.csv", "excision": self.folder / "excision.csv"}
         outputs = {"output": self.folder / "trial.json", "html": self.folder / "trial.html"}
@@ -428,8 +405,6 @@ class Steps(Record):
 
 def _prepare(output: Path, *, force: bool) -> None:
     """Copy the embedded inputs to where the user can look at them."""
-    from tactile_bayes.files.atomic import unwritable, write_bytes
-
     if output.exists() and not output.is_dir():
         raise UsageError(f"{output} is a file; choose another name")
     if output.exists() and any(output.iterdir()) and not force:
@@ -476,8 +451,6 @@ def _truth(scan: Path) -> float:
 
 
 def _stated(posterior: Path) -> StatedSize:
-    from tactile_bayes.files.estimate_json import read_stated_size
-
     return read_stated_size(posterior)
 
 

@@ -2,10 +2,36 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+
+from tactile_bayes.commands.progress import progress_bar
+from tactile_bayes.errors import UsageError
+from tactile_bayes.files.atomic import refuse_existing
+from tactile_bayes.files.documents import dump_json
+from tactile_bayes.files.provenance import hash_inputs
+from tactile_bayes.files.scene_toml import read_scene
+from tactile_bayes.findings import finding_lines
+from tactile_bayes.forward.contact import Head
+from tactile_bayes.forward.line import outside_range
+from tactile_bayes.mapping.select import scan_findings
+from tactile_bayes.presets import HEADS, RESEARCH_USE, SHOULDERS_INSIDE
+from tactile_bayes.report.paper_head import (
+    comparison_document,
+    comparison_figure,
+    comparison_text,
+    design_document,
+    design_figure,
+    design_text,
+    named,
+    uniformity_document,
+    uniformity_text,
+)
+from tactile_bayes.studies.head_design import HomogeneousTissue, most_even, narrowest, search_heads, uniformity
+from tactile_bayes.studies.model_comparison import compare_model, measured_frames
 
 if TYPE_CHECKING:
     from tactile_bayes.studies.head_design import HomogeneousTissue
@@ -24,11 +50,6 @@ def head_uniformity_action(
     **tissue: Any,
 ) -> None:
     """Compute how evenly one head presses on homogeneous tissue."""
-    from tactile_bayes.forward.contact import Head
-    from tactile_bayes.presets import RESEARCH_USE, SHOULDERS_INSIDE
-    from tactile_bayes.report.paper_head import uniformity_document, uniformity_text
-    from tactile_bayes.studies.head_design import uniformity
-
     body, limit = _tissue(**tissue), limit_percent / 100
     section = Head(radius_mm=head_radius_mm, shoulder_mm=shoulder_mm, shoulders=head or SHOULDERS_INSIDE)
     found = uniformity(section, body)
@@ -43,12 +64,6 @@ def head_design_action(
     *, head: str | None, limit_percent: float, figure: Path | None, as_json: bool, force: bool, **tissue: Any
 ) -> None:
     """Find the head that presses evenly on homogeneous tissue (section 2.1 of the paper)."""
-    from tactile_bayes.errors import UsageError
-    from tactile_bayes.files.atomic import refuse_existing
-    from tactile_bayes.presets import HEADS, RESEARCH_USE
-    from tactile_bayes.report.paper_head import design_document, design_figure, design_text, named
-    from tactile_bayes.studies.head_design import most_even, narrowest, search_heads
-
     body, limit = _tissue(**tissue), limit_percent / 100
     if figure is not None:
         refuse_existing(figure, force=force)
@@ -76,14 +91,10 @@ def _tissue(
     thickness_mm: float,
     poisson: float,
 ) -> HomogeneousTissue:
-    from tactile_bayes.studies.head_design import HomogeneousTissue
-
     return HomogeneousTissue(modulus_kpa, pressure_kpa, thickness_mm, poisson)
 
 
 def _print_json(document: dict[str, object]) -> None:
-    import json
-
     click.echo(json.dumps(document, indent=2))
 
 
@@ -106,18 +117,7 @@ def compare_model_action(
     force: bool,
 ) -> None:
     """Compare a scan's frames and map with a forward model of SCENE (section 2.3 of the paper)."""
-    from tactile_bayes.commands.progress import progress_bar
-    from tactile_bayes.files.atomic import refuse_existing
-    from tactile_bayes.files.documents import dump_json
-    from tactile_bayes.files.provenance import hash_inputs
     from tactile_bayes.files.scan_mcap import read_scan
-    from tactile_bayes.files.scene_toml import read_scene
-    from tactile_bayes.findings import finding_lines
-    from tactile_bayes.forward.line import outside_range
-    from tactile_bayes.mapping.select import scan_findings
-    from tactile_bayes.presets import RESEARCH_USE
-    from tactile_bayes.report.paper_head import comparison_document, comparison_figure, comparison_text
-    from tactile_bayes.studies.model_comparison import compare_model, measured_frames
 
     if figure is not None:
         refuse_existing(figure, force=force)

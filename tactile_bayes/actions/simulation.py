@@ -4,14 +4,34 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
+from time import monotonic
 from typing import TYPE_CHECKING, Any
 
 import click
+import numpy as np
 
+from tactile_bayes.actions.exam import describe_scan
+from tactile_bayes.batch import BatchInterrupted, fault_lines, open_executor, run_batch
+from tactile_bayes.batch_store import open_store
+from tactile_bayes.commands.progress import progress_bar
 from tactile_bayes.declarations import as_dict, names_of
-from tactile_bayes.presets import DEFAULT_NORMALISE, Method
+from tactile_bayes.errors import TactileBayesError
+from tactile_bayes.files.atomic import refuse_existing, write_text
+from tactile_bayes.files.documents import dump_json, read_record, with_session
+from tactile_bayes.files.instrument_json import read_simulated_head
+from tactile_bayes.files.provenance import Provenance, hash_inputs
+from tactile_bayes.files.scene_toml import read_scene
+from tactile_bayes.files.shipped import DEFAULT, size_calibration_path
+from tactile_bayes.files.size_json import read_size_calibration
+from tactile_bayes.forward.line import outside_range
+from tactile_bayes.forward.scene import Head
+from tactile_bayes.forward.simulate import simulate
+from tactile_bayes.presets import DEFAULT_NORMALISE, RESEARCH_USE, Method
+from tactile_bayes.size.bodies import BodyCalibration
+from tactile_bayes.studies.population import BodiesFile, BodyPrior, MassRow, as_settings, draw_mass, measure_mass
+from tactile_bayes.studies.population import centred as on_the_boundary
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -39,9 +59,6 @@ def simulate_action(
     force: bool,
 ) -> None:
     """Make a scan with known truth from SCENE, a TOML file."""
-    from tactile_bayes.files.atomic import refuse_existing
-    from tactile_bayes.presets import RESEARCH_USE
-
     refuse_existing(output, force=force)
     for line in _run(scene, output, session_file, seed=seed, fidelity=fidelity, head=head, force=force):
         click.echo(line)
@@ -58,16 +75,7 @@ def _run(
     head: str | None,
     force: bool,
 ) -> list[str]:
-    import numpy as np
-
-    from tactile_bayes.actions.exam import describe_scan
-    from tactile_bayes.commands.progress import progress_bar
-    from tactile_bayes.files.documents import with_session
-    from tactile_bayes.files.provenance import Provenance, hash_inputs
     from tactile_bayes.files.scan_mcap import write_scan
-    from tactile_bayes.files.scene_toml import read_scene
-    from tactile_bayes.forward.line import outside_range
-    from tactile_bayes.forward.simulate import simulate
 
     scene = read_scene(scene_path)
     for lump in scene.solid_lumps if fidelity == "empirical" else ():
@@ -131,20 +139,6 @@ def population_action(
     force: bool,
 ) -> None:
     """Simulate exams of varied bodies and fit their maps: the table that a size calibration is learned from."""
-    from functools import partial
-
-    from tactile_bayes.batch import fault_lines, open_executor, run_batch
-    from tactile_bayes.batch_store import open_store
-    from tactile_bayes.commands.progress import progress_bar
-    from tactile_bayes.declarations import as_dict
-    from tactile_bayes.errors import TactileBayesError
-    from tactile_bayes.files.atomic import refuse_existing, write_text
-    from tactile_bayes.files.documents import read_record
-    from tactile_bayes.files.instrument_json import read_simulated_head
-    from tactile_bayes.forward.scene import Head
-    from tactile_bayes.presets import RESEARCH_USE
-    from tactile_bayes.studies.population import BodiesFile, as_settings
-
     refuse_existing(output, force=force)
     simulated = read_simulated_head(head) if head else Head()
     drawn = read_record(bodies_file, BodiesFile) if bodies_file else BodiesFile()
@@ -222,12 +216,6 @@ def rows_of_mass(
     normalise
         As `studies.population.measure_mass`'s.
     """
-    import numpy as np
-
-    from tactile_bayes.forward.simulate import simulate
-    from tactile_bayes.studies.population import BodyPrior, draw_mass, measure_mass
-    from tactile_bayes.studies.population import centred as on_the_boundary
-
     prior = bodies or BodyPrior()
     prior = on_the_boundary(prior) if index >= first_centred else prior
     scenes = draw_mass(index, scans=scans, seed=seed, bodies=prior, exams=exams, head=head)
@@ -244,15 +232,11 @@ def _encode(rows: list[MassRow]) -> list[dict[str, Any]]:
 
 
 def _decode(rows: list[dict[str, Any]]) -> list[MassRow]:
-    from tactile_bayes.studies.population import MassRow
-
     return [MassRow(**row) for row in rows]
 
 
 def table_text(rows: list[MassRow]) -> str:
     """CSV of the rows, with the header of `data_schema/population.table.json`."""
-    from tactile_bayes.studies.population import MassRow
-
     lines = [",".join(names_of(MassRow))]
     return "\n".join(lines + [",".join(map(_cell, as_dict(row).values())) for row in rows]) + "\n"
 
@@ -281,12 +265,6 @@ def sbc_action(
     force: bool,
 ) -> None:
     """Check the posterior against itself: simulation-based calibration and coverage."""
-    from time import monotonic
-
-    from tactile_bayes.batch import BatchInterrupted
-    from tactile_bayes.errors import TactileBayesError
-    from tactile_bayes.files.atomic import refuse_existing, write_text
-    from tactile_bayes.files.documents import dump_json
     from tactile_bayes.report.sbc import sbc_document, sbc_figure, sbc_text, table_text
 
     for path in (output, figure):
@@ -331,11 +309,6 @@ def _run_sbc(
     output: Path | None,
 ) -> tuple[list[Outcome[MapRanks]], int]:
     """Outcomes of all maps, and the number that this run made."""
-    from functools import partial
-
-    from tactile_bayes.batch import open_executor, run_batch
-    from tactile_bayes.commands.progress import progress_bar
-    from tactile_bayes.files.shipped import DEFAULT
     from tactile_bayes.studies.sbc import settings
 
     with (
@@ -364,10 +337,6 @@ def ranks_of_map(index: int, *, method: Method, seed: int, cosines: int | None) 
 
 @cache
 def _shipped() -> BodyCalibration:
-    from tactile_bayes.files.shipped import DEFAULT, size_calibration_path
-    from tactile_bayes.files.size_json import read_size_calibration
-    from tactile_bayes.size.bodies import BodyCalibration
-
     path = size_calibration_path(DEFAULT)
     calibration = None if path is None else read_size_calibration(path)
     assert isinstance(calibration, BodyCalibration)
@@ -381,8 +350,6 @@ def _kept(output: Path) -> Path:
 @contextmanager
 def _open_kept(output: Path | None, settings: dict[str, Any]) -> Iterator[BatchStore | None]:
     """Open the store of results beside the output; None without an output."""
-    from tactile_bayes.batch_store import open_store
-
     if output is None:
         yield None
         return
@@ -392,8 +359,6 @@ def _open_kept(output: Path | None, settings: dict[str, Any]) -> Iterator[BatchS
 
 def _finish(outcomes: list[Outcome[MapRanks]], output: Path | None) -> int:
     """Report maps that failed; if none did, remove the stored results."""
-    from tactile_bayes.batch import fault_lines
-
     failed = [outcome for outcome in outcomes if not outcome.ok]
     for line in fault_lines(failed):
         click.echo(f"could not be estimated: map {line}", err=True)

@@ -2,12 +2,44 @@
 
 from __future__ import annotations
 
+import json
+from contextlib import nullcontext
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+import numpy as np
 
+from tactile_bayes.batch import BatchInterrupted, open_executor, run_batch
+from tactile_bayes.batch_store import open_store
+from tactile_bayes.commands.progress import progress_bar
 from tactile_bayes.declarations import as_dict
+from tactile_bayes.errors import BadDataError, TactileBayesError, UsageError
+from tactile_bayes.files.atomic import refuse_existing, write_text
+from tactile_bayes.files.tables import read_table
+from tactile_bayes.forward.body import parse_seat
+from tactile_bayes.forward.contact import Head
+from tactile_bayes.forward.gaussian import cell_mean_gaussian
+from tactile_bayes.forward.line import fit_shape
+from tactile_bayes.forward.scene import Head as Array
+from tactile_bayes.posterior.white import LEAST_WIDTH_IN_CELLS, WIDEST_IN_RADII
+from tactile_bayes.presets import RESEARCH_USE, SHOULDERS_INSIDE, SHOULDERS_OUTSIDE
+from tactile_bayes.report.solid_figures import solid_figures
+from tactile_bayes.report.study import frames_text, lookalikes_text, study_figures, study_text
+from tactile_bayes.report.tables_text import heads_text, tables_document, tables_text
+from tactile_bayes.studies.paper import LineFit, StudyRow, StudySettings, group_cases, paper_grid, run_geometry
+from tactile_bayes.studies.paper_solid import SolidSettings, fit_raster, raster_map, run_solid_geometry
+from tactile_bayes.studies.paper_tables import (
+    NEAREST_HEADS,
+    PHANTOMS,
+    TRIED_HEADS,
+    MeasuredFrame,
+    compare_frames,
+    compare_heads,
+    phantom_scenes,
+    table_scenes,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -31,12 +63,6 @@ _FRAMES_SCHEMA = "measured_frames.table.json"
 
 def read_frames(path: Path) -> list[MeasuredFrame]:
     """The frames of a table, one for each place of the head, in the order in which they first appear."""
-    import numpy as np
-
-    from tactile_bayes.errors import BadDataError
-    from tactile_bayes.files.tables import read_table
-    from tactile_bayes.studies.paper_tables import MeasuredFrame
-
     columns = read_table(path, _FRAMES_SCHEMA).columns
     place = np.array([0.0 if x is None else x for x in columns["x_c_mm"]])
     s, pressure = np.array(columns["s_mm"]), np.array(columns["pressure_kpa"])
@@ -54,9 +80,6 @@ def figure_paths(folder: Path, *, model: str) -> list[Path]:
 
 def prepare_figures(folder: Path, *, model: str, force: bool) -> None:
     """Make the directory, and stop before any work where a figure is in the way."""
-    from tactile_bayes.errors import UsageError
-    from tactile_bayes.files.atomic import refuse_existing
-
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -87,21 +110,13 @@ def draw_figures(
     phantom, frames
         Lump and measured frames of figure 6; None and none for the paper's phantom.
     """
-    from tactile_bayes.studies.paper import StudySettings
-
     if isinstance(settings, StudySettings):
-        from tactile_bayes.report.study import frames_text, lookalikes_text, study_figures
-        from tactile_bayes.studies.paper_tables import PHANTOMS, compare_frames
-
         paths = figure_paths(folder, model="plane-strain")
         d, h = phantom or PHANTOMS["phantom 12.5 mm"]
         compared = compare_frames(frames, d_mm=d, depth_ratio=h, seat=seat, settings=settings) if frames else []
         found = study_figures(rows, settings, paths, seat=seat, fit=fit, phantom=(d, h), measured=compared, force=force)
         where = f"figures 5 to 8 and the frames of four lumps are in {folder}"
         return [lookalikes_text(found), *frames_text(compared), where]
-    from tactile_bayes.report.solid_figures import solid_figures
-    from tactile_bayes.studies.paper_solid import fit_raster, raster_map
-
     paths = figure_paths(folder, model="solid")
     solid_figures(rows, settings, paths, seat=seat, fit=fit_raster, build=raster_map, force=force)
     return [f"figures 5 to 8 are in {folder}"]
@@ -129,14 +144,6 @@ def study_action(
     **options: Any,
 ) -> None:
     """Run the forward study of section 2.4: amplitude and width of the map over sizes, depths and stiffnesses."""
-    from tactile_bayes.batch import open_executor
-    from tactile_bayes.errors import UsageError
-    from tactile_bayes.files.atomic import refuse_existing, write_text
-    from tactile_bayes.forward.body import parse_seat
-    from tactile_bayes.presets import RESEARCH_USE
-    from tactile_bayes.report.study import study_text
-    from tactile_bayes.studies.paper import paper_grid
-
     chosen = parse_seat(seat)
     settings = study_settings(model=model, **options)
     if (measured_frames or phantom) and (figures is None or model != "plane-strain"):
@@ -187,11 +194,6 @@ def study_settings(
     UsageError
         When a level or a flat field is asked of the model that has neither.
     """
-    from tactile_bayes.errors import UsageError
-    from tactile_bayes.forward.contact import Head
-    from tactile_bayes.presets import SHOULDERS_INSIDE, SHOULDERS_OUTSIDE
-    from tactile_bayes.studies.paper import StudySettings
-
     default = SHOULDERS_INSIDE if model == "plane-strain" else SHOULDERS_OUTSIDE
     section = Head(radius_mm=head_radius_mm, shoulder_mm=shoulder_mm, shoulders=head or default)
     if model == "plane-strain":
@@ -199,9 +201,6 @@ def study_settings(
             asked = "--background free" if background == "free" else "--flat-field"
             raise UsageError(f"{asked} is for --model solid: in two dimensions Eq 5 is fitted with a background of 1")
         return StudySettings(section, mean_kpa, poisson, fat_kpa, gland_ratio, thickness_mm, fineness=fineness)
-    from tactile_bayes.forward.scene import Head as Array
-    from tactile_bayes.studies.paper_solid import SolidSettings
-
     array = Array(radius_mm=head_radius_mm, rim_mm=shoulder_mm).with_shoulders(section.shoulders)
     return SolidSettings(
         array,
@@ -218,11 +217,6 @@ def study_settings(
 
 def read_grid(path: Path, *, seat: float) -> list[Geometry]:
     """Read the cases of a table; `seat` is the default of rows without one."""
-    from tactile_bayes.errors import BadDataError
-    from tactile_bayes.files.tables import read_table
-    from tactile_bayes.forward.body import parse_seat
-    from tactile_bayes.studies.paper import group_cases
-
     table = read_table(path, _GRID_SCHEMA)
     seats = [seat if text is None else parse_seat(text) for text in table.columns["seat"]]
     names = ("d_mm", "depth_ratio", "stiffness_ratio")
@@ -246,10 +240,6 @@ def run_study(
     BadDataError
         When a geometry cannot be, before any is computed.
     """
-    from contextlib import nullcontext
-
-    from tactile_bayes.batch_store import open_store
-
     for geometry in geometries:
         settings.body(geometry.d_mm, geometry.depth_ratio, seat=geometry.seat)
     opened = (
@@ -263,14 +253,8 @@ def run_study(
 
 def _rows_of(settings: StudySettings | SolidSettings) -> Callable[[Geometry], list[StudyRow]]:
     """Function that computes a geometry's rows, importable by name in another process."""
-    from functools import partial
-
-    from tactile_bayes.studies.paper import StudySettings, run_geometry
-
     if isinstance(settings, StudySettings):
         return partial(run_geometry, settings=settings, fit=fit_line)
-    from tactile_bayes.studies.paper_solid import fit_raster, run_solid_geometry
-
     return partial(run_solid_geometry, settings=settings, fit=fit_raster)
 
 
@@ -281,10 +265,6 @@ def _run_all(
     executor: Executor,
     store: BatchStore | None,
 ) -> list[StudyRow]:
-    from tactile_bayes.batch import BatchInterrupted, run_batch
-    from tactile_bayes.commands.progress import progress_bar
-    from tactile_bayes.errors import TactileBayesError
-
     try:
         with progress_bar("geometries") as progress:
             outcomes = run_batch(
@@ -324,8 +304,6 @@ def _encode(rows: list[StudyRow]) -> list[dict[str, Any]]:
 
 
 def _decode(rows: list[dict[str, Any]]) -> list[StudyRow]:
-    from tactile_bayes.studies.paper import StudyRow
-
     return [StudyRow(**row) for row in rows]
 
 
@@ -337,13 +315,6 @@ def fit_line(line: TactileLine, radius_mm: float) -> LineFit:
     Only widths from half a cell to three quarters of the radius count, also as for a patient's map. A bump that runs
     to either end is reported there.
     """
-    import numpy as np
-
-    from tactile_bayes.forward.gaussian import cell_mean_gaussian
-    from tactile_bayes.forward.line import fit_shape
-    from tactile_bayes.posterior.white import LEAST_WIDTH_IN_CELLS, WIDEST_IN_RADII
-    from tactile_bayes.studies.paper import LineFit
-
     inside = (np.abs(line.x_mm) <= radius_mm) & (line.count > 0)
     x, excess = line.x_mm[inside], line.mean[inside] - 1.0
 
@@ -392,14 +363,6 @@ def tables_action(
     *, seat: str, head_radius_mm: float, shoulder_mm: float, head: str | None, search: bool, workers: int, as_json: bool
 ) -> None:
     """Recompute Tables 1 and 2 of the paper beside the printed figures."""
-    import json
-
-    from tactile_bayes.forward.body import parse_seat
-    from tactile_bayes.forward.contact import Head
-    from tactile_bayes.presets import RESEARCH_USE, SHOULDERS_INSIDE
-    from tactile_bayes.report.tables_text import heads_text, tables_document, tables_text
-    from tactile_bayes.studies.paper_tables import NEAREST_HEADS, TRIED_HEADS
-
     at = parse_seat(seat)
     asked = Head(radius_mm=head_radius_mm, shoulder_mm=shoulder_mm, shoulders=head or SHOULDERS_INSIDE)
     nearest = NEAREST_HEADS.get(at)
@@ -417,14 +380,6 @@ def tables_action(
 
 def run_tables(seat: float, *, heads: Sequence[Head], workers: int) -> tuple[ByHead, ByHead]:
     """Agreement of both models over the cases of the tables, and over the phantoms, under each head."""
-    from functools import partial
-
-    from tactile_bayes.batch import open_executor, run_batch
-    from tactile_bayes.commands.progress import progress_bar
-    from tactile_bayes.errors import TactileBayesError
-    from tactile_bayes.studies.paper import StudySettings
-    from tactile_bayes.studies.paper_tables import compare_heads, phantom_scenes, table_scenes
-
     scenes = table_scenes(seat) + phantom_scenes(seat)
     work = partial(compare_heads, settings=StudySettings(), heads=heads, fit=fit_line)
     with open_executor(workers=workers) as executor, progress_bar("lumps") as progress:

@@ -2,17 +2,39 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
+from tactile_bayes.actions.study import fit_line
+from tactile_bayes.api.settings import Settings
+from tactile_bayes.api.tradeoffs import pooled_rows, tradeoff_of_map, tradeoff_of_scan
 from tactile_bayes.commands.options import also_read, settings_of
+from tactile_bayes.commands.progress import progress_bar
 from tactile_bayes.declarations import replace
+from tactile_bayes.errors import EXIT_DONE, EXIT_NO_ESTIMATE, BadDataError, UsageError
+from tactile_bayes.files.atomic import given_twice, refuse_existing
+from tactile_bayes.files.documents import check_document, dump_json
+from tactile_bayes.files.provenance import Provenance, hash_inputs
+from tactile_bayes.files.scene_toml import read_scene
+from tactile_bayes.files.shipped import size_calibration_path
+from tactile_bayes.files.size_json import read_size_calibration
+from tactile_bayes.forward.scene import Scene
+from tactile_bayes.forward.tissue import SceneBody, SolidLump
+from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.report.forward_tradeoff import TradeoffReport, draw_tradeoff, tradeoff_document, tradeoff_text
+from tactile_bayes.report.tradeoff import SCHEMA_FILE, draw_ladder, ladder_document, ladder_text
+from tactile_bayes.studies.estimate_tradeoff import Work
+from tactile_bayes.studies.paper_solid import fit_raster
+from tactile_bayes.studies.tradeoffs import PLANE, SOLID, calibrated_rule, case_of, learned_rule, teach
+from tactile_bayes.studies.tradeoffs import measure_forward as measure
 
 if TYPE_CHECKING:
     from tactile_bayes.report.forward_tradeoff import TradeoffReport
@@ -67,10 +89,6 @@ def show(
     provenance: Mapping[str, Any],
 ) -> int:
     """Draw and print; the exit code."""
-    from tactile_bayes.errors import EXIT_DONE, EXIT_NO_ESTIMATE
-    from tactile_bayes.files.documents import check_document, dump_json
-    from tactile_bayes.report.tradeoff import SCHEMA_FILE, draw_ladder, ladder_document, ladder_text
-
     try:
         if figure is not None:
             draw_ladder(ladder, figure, title=title, force=force)
@@ -101,14 +119,6 @@ def tradeoff_forward_action(
     force: bool,
 ) -> None:
     """Measure error in amplitude, width and size against CPU time, for the lump of a scene."""
-    import json
-
-    from tactile_bayes.commands.options import also_read
-    from tactile_bayes.files.atomic import refuse_existing
-    from tactile_bayes.files.shipped import size_calibration_path
-    from tactile_bayes.presets import RESEARCH_USE
-    from tactile_bayes.report.forward_tradeoff import tradeoff_document, tradeoff_text
-
     if figure is not None:
         refuse_existing(figure, force=force)
     if size_calibration not in (None, "learned"):
@@ -116,8 +126,6 @@ def tradeoff_forward_action(
     report = run_tradeoff(_case(scene, head), size_calibration, tolerance=tolerance_percent / 100, runs=runs)
     try:
         if figure is not None:
-            from tactile_bayes.report.forward_tradeoff import draw_tradeoff
-
             draw_tradeoff(report, figure, force=force)
     finally:  # what was measured is not lost with the figure
         click.echo(json.dumps(tradeoff_document(report), indent=2) if as_json else tradeoff_text(report))
@@ -129,12 +137,6 @@ def tradeoff_forward_action(
 
 
 def _case(path: Path | None, head: str | None) -> LumpCase:
-    from tactile_bayes.errors import BadDataError
-    from tactile_bayes.files.scene_toml import read_scene
-    from tactile_bayes.forward.scene import Scene
-    from tactile_bayes.forward.tissue import SceneBody, SolidLump
-    from tactile_bayes.studies.tradeoffs import case_of
-
     if path is None:
         return case_of(Scene(body=SceneBody(), solid_lumps=(SolidLump(seat=0.0),)), head=head)
     try:
@@ -145,15 +147,7 @@ def _case(path: Path | None, head: str | None) -> LumpCase:
 
 def run_tradeoff(case: LumpCase, calibration: str | None, *, tolerance: float, runs: int) -> TradeoffReport:
     """Learn Eq 6 or read the calibrations, then measure all settings."""
-    import time
-
-    from tactile_bayes.actions.study import fit_line
-    from tactile_bayes.commands.progress import progress_bar
-    from tactile_bayes.report.forward_tradeoff import TradeoffReport
-    from tactile_bayes.studies.paper_solid import fit_raster
-    from tactile_bayes.studies.tradeoffs import PLANE, SOLID
     from tactile_bayes.studies.tradeoffs import forward_settings as settings_of
-    from tactile_bayes.studies.tradeoffs import measure_forward as measure
 
     # a raster's frames are divided by their means
     own = {PLANE: "plane-strain", SOLID: "solid-mean"}
@@ -172,14 +166,6 @@ def run_tradeoff(case: LumpCase, calibration: str | None, *, tolerance: float, r
 
 def _rule(case: LumpCase, model: str, name: str) -> SizeRule:
     """Rule from a model's widths to sizes: a calibration by name or path, or one learned here."""
-    from tactile_bayes.actions.study import fit_line
-    from tactile_bayes.commands.progress import progress_bar
-    from tactile_bayes.errors import UsageError
-    from tactile_bayes.files.shipped import size_calibration_path
-    from tactile_bayes.files.size_json import read_size_calibration
-    from tactile_bayes.studies.paper_solid import fit_raster
-    from tactile_bayes.studies.tradeoffs import calibrated_rule, learned_rule, teach
-
     if name == LEARNED:
         with progress_bar(f"lumps for Eq 6, {model}") as progress:
             return learned_rule(teach(case, model, fit=fit_line, raster_fit=fit_raster, progress=progress))
@@ -207,17 +193,6 @@ def tradeoff_estimate_action(
     force: bool,
 ) -> None:
     """Measure what each setting of `estimate` costs on a map, and how far its size interval is off."""
-    import time
-
-    from tactile_bayes.api.tradeoffs import pooled_rows, tradeoff_of_map
-    from tactile_bayes.commands.progress import progress_bar
-    from tactile_bayes.declarations import replace
-    from tactile_bayes.errors import UsageError
-    from tactile_bayes.files.atomic import given_twice, refuse_existing
-    from tactile_bayes.files.provenance import Provenance, hash_inputs
-    from tactile_bayes.files.shipped import size_calibration_path
-    from tactile_bayes.studies.estimate_tradeoff import Work
-
     if size_calibration is not None:
         also_read(size_calibration_path(size_calibration))
     if figure is not None:
@@ -269,15 +244,7 @@ def tradeoff_map_action(
     force: bool,
 ) -> None:
     """Measure what each setting of `map` costs on a scan, and how far it moves the size interval."""
-    import time
-
-    from tactile_bayes.api.settings import Settings
-    from tactile_bayes.api.tradeoffs import tradeoff_of_scan
-    from tactile_bayes.commands.progress import progress_bar
-    from tactile_bayes.files.atomic import refuse_existing
-    from tactile_bayes.files.provenance import Provenance, hash_inputs
     from tactile_bayes.files.scan_mcap import read_scan
-    from tactile_bayes.studies.estimate_tradeoff import Work
 
     if figure is not None:
         refuse_existing(figure, force=force)

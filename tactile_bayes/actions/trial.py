@@ -7,10 +7,22 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+import numpy as np
 
 from tactile_bayes.api.trial_report import TrialOutcome, TrialSettings, analyse
+from tactile_bayes.api.trials import load_trial
+from tactile_bayes.batch import open_executor, run_batch
 from tactile_bayes.commands.options import also_read
-from tactile_bayes.errors import UsageError
+from tactile_bayes.commands.progress import progress_bar
+from tactile_bayes.errors import BadDataError, UsageError
+from tactile_bayes.files.atomic import refuse_existing, write_text
+from tactile_bayes.files.documents import check_document, dump_json, read_protocol
+from tactile_bayes.files.provenance import Provenance, hash_inputs
+from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.report.trial import plan_text, trial_text
+from tactile_bayes.report.trial_html import trial_html
+from tactile_bayes.trial.planning import assumptions_from, designs, map_gains, run_case
+from tactile_bayes.trial.readings import gather, unit_doubts
 
 if TYPE_CHECKING:
     from tactile_bayes.trial.planning import PlanCase
@@ -32,10 +44,6 @@ def validate_action(
     **settings: Any,
 ) -> None:
     """Compare sizes with excision: errors, lines, agreement, repeatability and calibration of each modality."""
-    from tactile_bayes.api.trials import load_trial
-    from tactile_bayes.files.atomic import refuse_existing, write_text
-    from tactile_bayes.files.documents import check_document, dump_json
-
     for target in (output, html):
         if target:
             refuse_existing(target, force=force)
@@ -59,8 +67,6 @@ def validate_action(
 
 def _settings(given: dict[str, Any], protocol: Path | None) -> tuple[str | None, TrialSettings]:
     """Title and settings of the protocol, if there is one; refuses options that contradict it."""
-    from tactile_bayes.files.documents import read_protocol
-
     if protocol is None:
         return None, TrialSettings(**given)
     context = click.get_current_context()
@@ -74,16 +80,11 @@ def _settings(given: dict[str, Any], protocol: Path | None) -> tuple[str | None,
 
 
 def _text(outcome: TrialOutcome, *, methods: bool) -> str:
-    from tactile_bayes.report.trial import trial_text
-
     more = [] if outcome.next_mass is None else outcome.next_mass.lines()
     return trial_text(outcome.report, methods=methods, checks=outcome.checks, more=more)
 
 
 def _write_html(path: Path, outcome: TrialOutcome, *, force: bool) -> None:
-    from tactile_bayes.files.atomic import write_text
-    from tactile_bayes.report.trial_html import trial_html
-
     write_text(path, trial_html(outcome.report, outcome.document, text=_text(outcome, methods=True)), force=force)
 
 
@@ -108,10 +109,6 @@ def plan_action(
     **errors: float,
 ) -> None:
     """Plan a trial: power, widths of intervals and the worth of more maps, by simulation."""
-    from tactile_bayes.files.atomic import refuse_existing, write_text
-    from tactile_bayes.files.documents import check_document, dump_json
-    from tactile_bayes.trial.planning import designs
-
     if output:
         refuse_existing(output, force=force)
     typed = _typed()
@@ -151,14 +148,6 @@ def _typed() -> set[str]:
 
 def _from_pilot(pilot: Path, excision: Path, against: str, given: dict[str, float]) -> dict[str, float]:
     """Errors from the pilot, where no option gives them."""
-    import numpy as np
-
-    from tactile_bayes.api.trials import load_trial
-    from tactile_bayes.commands.options import also_read
-    from tactile_bayes.errors import BadDataError
-    from tactile_bayes.trial.planning import assumptions_from
-    from tactile_bayes.trial.readings import gather, unit_doubts
-
     inputs = load_trial(pilot, excision, None)
     also_read(*inputs.files.values())
     for line in inputs.other_visits.lines():
@@ -181,11 +170,6 @@ def _from_pilot(pilot: Path, excision: Path, against: str, given: dict[str, floa
 
 
 def _simulate(cases: list[PlanCase], *, workers: int) -> list[dict[str, Any]]:
-    from tactile_bayes.batch import open_executor, run_batch
-    from tactile_bayes.commands.progress import progress_bar
-    from tactile_bayes.errors import BadDataError
-    from tactile_bayes.trial.planning import run_case
-
     with open_executor(workers=workers) as executor, progress_bar("designs") as progress:
         outcomes = run_batch(run_case, cases, key=attrgetter("key"), executor=executor, progress=progress)
     for outcome in outcomes:
@@ -201,10 +185,6 @@ def _document(
     sources: dict[str, str],
     files: dict[str, Path],
 ) -> dict[str, Any]:
-    from tactile_bayes.files.provenance import Provenance, hash_inputs
-    from tactile_bayes.presets import RESEARCH_USE
-    from tactile_bayes.trial.planning import map_gains
-
     by_design = {(case.patients, case.maps): result for case, result in zip(cases, results, strict=True)}
     assumed = {name: float(f"{errors[name]:.9g}") for name in _ERRORS}
     settings = {"trials": cases[0].trials, "errors": assumed, "errors_from": sources}
@@ -220,6 +200,4 @@ def _document(
 
 
 def _plan_text(document: dict[str, Any]) -> str:
-    from tactile_bayes.report.trial import plan_text
-
     return plan_text(document)
