@@ -6,11 +6,12 @@ settings of a provenance are made of these records.
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated, Final, Literal
 
 from tactile_bayes.declarations import Meta, Options
 from tactile_bayes.errors import UsageError
-from tactile_bayes.presets import CELL_MM, DEFAULT_NORMALISE, PRESSURE_WINDOW_KPA, Normalise
+from tactile_bayes.presets import CELL_MM, DEFAULT_NORMALISE, PRESSURE_WINDOW_KPA, Normalise, TrackerProtocol
 
 
 class BumpPrior(Options):
@@ -96,3 +97,88 @@ class MapOptions(Options):
             raise UsageError(
                 "a lump that follows the head mimics a latency; with register_strokes give latency_ms a number"
             )
+
+
+class RecordOptions(Options, kw_only=True):
+    """Options of one recording, as given."""
+
+    output: Path
+    head_url: str
+    tracker_url: Annotated[
+        str | None,
+        Meta(
+            description="Port of the tracker; without, there are no poses.",
+            extra={"metavar": "URL", "option": "tracker"},
+        ),
+    ] = None
+    tracker_protocol: Annotated[
+        TrackerProtocol, Meta(description="Protocol of the tracker; a PATRIOT speaks liberty.")
+    ] = "fastrak"
+    head_baud: Annotated[int, Meta(ge=300, description="Baud rate of the head's port.")] = 2_000_000
+    tracker_baud: Annotated[
+        Annotated[int, Meta(ge=300)] | None,
+        Meta(description="Baud rate of the tracker's port. Default: the protocol's."),
+    ] = None
+    tracker_rom: Annotated[
+        Path | None,
+        Meta(description="ndi: description of a wireless tool.", extra={"metavar": "TOOL.rom", "path": True}),
+    ] = None
+    every: Annotated[int, Meta(ge=1, le=255, description="Record every n-th frame only.")] = 1
+    duration_s: Annotated[
+        Annotated[float, Meta(gt=0.0)] | None,
+        Meta(description="Stop after this time, s.", extra={"metavar": "S", "option": "duration"}),
+    ] = None
+    at_once: Annotated[
+        bool, Meta(description="Start at once, without waiting for space. Default: only with --duration.")
+    ] = False
+    clock: Annotated[
+        Literal["arrival", "shared"],
+        Meta(description="Time the poses by their arrival, or trust one clock of both devices."),
+    ] = "arrival"
+    invert_rotation: Annotated[bool, Meta(description="The tracker gives the inverse rotation.")] = False
+    like: Annotated[
+        Path | None,
+        Meta(description="Take geometry and calibration from this scan.", extra={"metavar": "SCAN.mcap", "path": True}),
+    ] = None
+    head_geometry: Annotated[
+        Path | None,
+        Meta(
+            description="Positions of the taxels and of the tracker's sensor.",
+            extra={"metavar": "HEAD.json", "path": True},
+        ),
+    ] = None
+    array_calibration: Annotated[
+        Path | None,
+        Meta(
+            description="Array calibration, made by `calibrate array`.", extra={"metavar": "ARRAY.json", "path": True}
+        ),
+    ] = None
+    uncalibrated: Annotated[bool, Meta(description="Record with the nominal gain: for bladder steps.")] = False
+    accept_calibration: Annotated[
+        bool, Meta(description="Accept an array calibration that is stale or of another head.")
+    ] = False
+    calibration_days: Annotated[
+        float, Meta(ge=0.0, description="Age from which an array calibration is stale, days.")
+    ] = 1.0
+    landmarks: Annotated[
+        Path | None,
+        Meta(description="Take landmarks from a JSON file or a scan.", extra={"metavar": "FILE", "path": True}),
+    ] = None
+    side: Annotated[Literal["left", "right", "phantom"] | None, Meta(description="Breast that is scanned.")] = None
+    posture: Annotated[
+        Literal["supine", "oblique", "sitting", "phantom"] | None, Meta(description="Posture during the scan.")
+    ] = None
+    lubricant: Annotated[str | None, Meta(description="Lubricant on the skin.", extra={"metavar": "TEXT"})] = None
+    examiner: Annotated[str | None, Meta(description="A code, not a name.", extra={"metavar": "CODE"})] = None
+    subject: Annotated[str | None, Meta(description="A code, not a name.", extra={"metavar": "CODE"})] = None
+    session_file: Annotated[
+        Path | None,
+        Meta(
+            description="Read these five, and other facts in plain text, from a file; an option overrides it.",
+            extra={"metavar": "SESSION.toml", "path": True, "option": "session"},
+        ),
+    ] = None
+    live: bool = False
+    serve: str | None = None
+    size_calibration: str = "solid-mean"
+    force: bool = False

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-import click
-
-from tactile_bayes.api.arguments import check_keywords, door
+from tactile_bayes.api.arguments import check_keywords, door, plain
 from tactile_bayes.api.maps import PathLike, path_of
-from tactile_bayes.commands.record import Request, command, make_recording
-from tactile_bayes.errors import DeviceError, UsageError, check_number
+from tactile_bayes.commands.record import Request, make_recording
+from tactile_bayes.declarations import names_of
+from tactile_bayes.errors import DeviceError, check_number
+from tactile_bayes.options import RecordOptions
 
 if TYPE_CHECKING:
     from tactile_bayes.hardware.recorder import Report
@@ -48,31 +48,12 @@ def record(output: PathLike, *, head: str, duration_s: float, **options: Any) ->
     UsageError
         When options contradict each other, or the file exists and `force` is false.
     """
-    words = ["-o", str(path_of(output)), "--head", head]
-    context = command.make_context("record", words)
-    defaults = context.params
-    given = {_RENAMED.get(name, name): value for name, value in options.items()}
-    check_keywords("record", given, sorted(set(defaults) - {"output", "head_url", "duration_s"}))
+    given = {_RENAMED.get(name, name): plain(value) for name, value in options.items()}
+    check_keywords("record", given, sorted({*names_of(RecordOptions)} - {"output", "head_url", "duration_s"}))
     check_number("duration_s", duration_s, 0, open_ends=True)
     given |= {name: path_of(given[name]) for name in _PATHS if name in given}
-    given = {name: _converted(context, name, value) for name, value in given.items()}
     given |= {"output": path_of(output), "head_url": head, "duration_s": duration_s, "at_once": True}
-    arguments: dict[str, Any] = {**defaults, **given}
-    report, _ = make_recording(Request(**arguments))
+    report, _ = make_recording(Request(**given))
     if report.fault:
         raise DeviceError(report.fault)
     return report
-
-
-def _converted(context: click.Context, name: str, value: Any) -> Any:
-    """An option's value, checked as the command line checks it."""
-    option = next((one for one in context.command.params if one.name == name), None)
-    if option is None or value is None:
-        return value
-    try:
-        made = option.type_cast_value(context, value)
-    except click.ClickException as error:
-        raise UsageError(f"{name} is {value!r}: {error.format_message().rstrip('.')}") from None
-    if isinstance(value, float) and made != value:
-        raise UsageError(f"{name} is {value:g}; give a whole number")
-    return made

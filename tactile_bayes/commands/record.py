@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from tactile_bayes.commands.devices import PROTOCOLS
-from tactile_bayes.commands.options import FORCE, FilePath, FiniteRange, also_read, live_options
-from tactile_bayes.declarations import Record, as_dict
+from tactile_bayes.commands.options import FORCE, FilePath, also_read, live_options, takes
+from tactile_bayes.declarations import as_dict, names_of
 from tactile_bayes.errors import EXIT_INTERRUPTED, DeviceError, UsageError
+from tactile_bayes.options import RecordOptions
 from tactile_bayes.presets import PRESSURE_RANGE_KPA
 
 if TYPE_CHECKING:
@@ -32,38 +32,8 @@ if TYPE_CHECKING:
 # --- Options of one recording, and the part of them that the file stores.
 
 
-class Request(Record, kw_only=True):
-    """Options of one recording, as given."""
-
-    output: Path
-    head_url: str
-    tracker_url: str | None
-    tracker_protocol: str
-    head_baud: int
-    tracker_baud: int | None
-    tracker_rom: Path | None
-    every: int
-    duration_s: float | None
-    at_once: bool
-    clock: str
-    invert_rotation: bool
-    like: Path | None
-    head_geometry: Path | None
-    array_calibration: Path | None
-    uncalibrated: bool
-    accept_calibration: bool
-    calibration_days: float
-    landmarks: Path | None
-    side: str | None
-    posture: str | None
-    lubricant: str | None
-    examiner: str | None
-    subject: str | None
-    session_file: Path | None
-    live: bool
-    serve: str | None
-    size_calibration: str
-    force: bool
+class Request(RecordOptions, kw_only=True):
+    """Options of one recording, and what of them its file stores."""
 
     def facts(self) -> dict[str, str]:
         """Session facts as text: from the file, overridden by options.
@@ -291,7 +261,8 @@ class Keys:
 # --- `record`: record a scan head and a tracker to a scan file without losing data.
 
 _FILE = FilePath()
-_CODE = "A code, not a name."
+ON_THE_COMMAND_LINE = names_of(RecordOptions)[2:-4]
+"""Between the output with the head's port and the options of the live view."""
 
 
 @click.command("record")
@@ -299,79 +270,7 @@ _CODE = "A code, not a name."
     "-o", "--output", required=True, metavar="SCAN.mcap", type=FilePath(writes="MCAP"), help="Scan file to write."
 )
 @click.option("--head", "head_url", required=True, metavar="URL", help="Port of the scan head.")
-@click.option("--tracker", "tracker_url", metavar="URL", help="Port of the tracker; without, there are no poses.")
-@click.option(
-    "--tracker-protocol",
-    type=click.Choice(PROTOCOLS),
-    default="fastrak",
-    show_default=True,
-    help="Protocol of the tracker; a PATRIOT speaks liberty.",
-)
-@click.option(
-    "--head-baud",
-    type=click.IntRange(min=300),
-    default=2_000_000,
-    show_default=True,
-    help="Baud rate of the head's port.",
-)
-@click.option(
-    "--tracker-baud", type=click.IntRange(min=300), help="Baud rate of the tracker's port. Default: the protocol's."
-)
-@click.option("--tracker-rom", type=_FILE, metavar="TOOL.rom", help="ndi: description of a wireless tool.")
-@click.option(
-    "--every", type=click.IntRange(1, 255), default=1, show_default=True, help="Record every n-th frame only."
-)
-@click.option(
-    "--duration",
-    "duration_s",
-    type=FiniteRange(min=0.0, min_open=True),
-    metavar="S",
-    help="Stop after this time, s.",
-)
-@click.option(
-    "--at-once", is_flag=True, help="Start at once, without waiting for space. Default: only with --duration."
-)
-@click.option(
-    "--clock",
-    type=click.Choice(["arrival", "shared"]),
-    default="arrival",
-    show_default=True,
-    help="Time the poses by their arrival, or trust one clock of both devices.",
-)
-@click.option("--invert-rotation", is_flag=True, help="The tracker gives the inverse rotation.")
-@click.option("--like", type=_FILE, metavar="SCAN.mcap", help="Take geometry and calibration from this scan.")
-@click.option(
-    "--head-geometry", type=_FILE, metavar="HEAD.json", help="Positions of the taxels and of the tracker's sensor."
-)
-@click.option(
-    "--array-calibration", type=_FILE, metavar="ARRAY.json", help="Array calibration, made by `calibrate array`."
-)
-@click.option("--uncalibrated", is_flag=True, help="Record with the nominal gain: for bladder steps.")
-@click.option(
-    "--accept-calibration", is_flag=True, help="Accept an array calibration that is stale or of another head."
-)
-@click.option(
-    "--calibration-days",
-    type=FiniteRange(min=0.0),
-    default=1.0,
-    show_default=True,
-    help="Age from which an array calibration is stale, days.",
-)
-@click.option("--landmarks", type=_FILE, metavar="FILE", help="Take landmarks from a JSON file or a scan.")
-@click.option("--side", type=click.Choice(["left", "right", "phantom"]), help="Breast that is scanned.")
-@click.option(
-    "--posture", type=click.Choice(["supine", "oblique", "sitting", "phantom"]), help="Posture during the scan."
-)
-@click.option("--lubricant", metavar="TEXT", help="Lubricant on the skin.")
-@click.option("--examiner", metavar="CODE", help=_CODE)
-@click.option("--subject", metavar="CODE", help=_CODE)
-@click.option(
-    "--session",
-    "session_file",
-    type=_FILE,
-    metavar="SESSION.toml",
-    help="Read these five, and other facts in plain text, from a file; an option overrides it.",
-)
+@takes(RecordOptions, *ON_THE_COMMAND_LINE)
 @live_options
 @FORCE
 @click.pass_context

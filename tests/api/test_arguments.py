@@ -110,7 +110,7 @@ CALLS: dict[str, tuple[Callable[..., Any], str]] = {
     "a broken step": (lambda _: tb.record("x", head="y", duration_s=1, every=1.5), "every is 1.5; give a whole number"),
     "a protocol of no kind": (
         lambda _: tb.record("x", head="y", duration_s=1, tracker_protocol="z"),
-        "tracker_protocol is 'z': .*is not one of",
+        "tracker_protocol is 'z'; give one of open, fastrak",
     ),
     "an interval of draws": (lambda one: one.max_size_mm.interval(95), "is 95; give a number above 0 and below 1"),
     "a file that exists": (lambda one: one.save(__file__), "give force=True"),
