@@ -58,27 +58,18 @@ _WAY_OUT: Final = "give the file as this program wrote it"
 
 
 class Finding(Record):
-    """Something that speaks against a result.
-
-    Parameters
-    ----------
-    kind
-        A key of `KINDS`.
-    text
-        One plain sentence with its figures, without capital and full stop, and without a name of an option.
-    remedy
-        What to do about it at the command line; may name options and commands. Empty where nothing helps.
-    on_paper
-        The same for a reader of the page, who has no command line.
-    about
-        What it is about, where a result is of several: "map 2", "visit 1"; else empty.
-    """
+    """Something that speaks against a result."""
 
     kind: str
+    """A key of `KINDS`."""
     text: str
+    """One plain sentence with its figures, without capital and full stop, and without a name of an option."""
     remedy: str = ""
+    """What to do about it at the command line; may name options and commands. Empty where nothing helps."""
     on_paper: str = ""
+    """The same for a reader of the page, who has no command line."""
     about: str = ""
+    """What it is about, where a result is of several: "map 2", "visit 1"; else empty."""
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:

@@ -25,18 +25,12 @@ _FACTS: Final = {"patient": "subject", "visit": "visit", "mass": "mass", "side":
 
 
 class Said(Record):
-    """What a file says of its exam.
-
-    Parameters
-    ----------
-    facts
-        By the columns of the table of exams.
-    sources
-        SHA-256 of the files that it was made from.
-    """
+    """What a file says of its exam."""
 
     facts: Mapping[str, str] = field(default_factory=dict)
+    """By the columns of the table of exams."""
     sources: frozenset[str] = frozenset()
+    """SHA-256 of the files that it was made from."""
 
 
 def said_by(path: Path, name: str) -> Said:
@@ -210,27 +204,18 @@ _CODES: Final = ("patient", "visit", "mass")
 
 
 class Found(Record):
-    """Rows for exams.csv, and what somebody should know of the folder.
-
-    Parameters
-    ----------
-    rows
-        Of files that the table does not list yet.
-    skipped
-        Files that give none, with the reason.
-    spelled
-        Codes that a file writes in other capitals than the table, in words.
-    gone
-        Files that the table lists and that are not there.
-    others
-        How many files are no exams by their names, by the ends of these.
-    """
+    """Rows for exams.csv, and what somebody should know of the folder."""
 
     rows: list[dict[str, Any]] = field(default_factory=list)
+    """Of files that the table does not list yet."""
     skipped: list[str] = field(default_factory=list)
+    """Files that give none, with the reason."""
     spelled: list[str] = field(default_factory=list)
+    """Codes that a file writes in other capitals than the table, in words."""
     gone: list[str] = field(default_factory=list)
+    """Files that the table lists and that are not there."""
     others: Mapping[str, int] = field(default_factory=dict)
+    """How many files are no exams by their names, by the ends of these."""
 
 
 def find_exams(folder: Path | str, table: Path, *, listed: Sequence[Mapping[str, str]] = ()) -> Found:

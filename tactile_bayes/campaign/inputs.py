@@ -186,18 +186,12 @@ _SETTLED_S: Final = 10.0
 
 
 class Sources(Record):
-    """What the files of the exams are.
-
-    Parameters
-    ----------
-    digests
-        SHA-256 by path.
-    faults
-        Why a file cannot be read, by path.
-    """
+    """What the files of the exams are."""
 
     digests: dict[Path, str]
+    """SHA-256 by path."""
     faults: dict[Path, str]
+    """Why a file cannot be read, by path."""
 
 
 class _Source(Record):

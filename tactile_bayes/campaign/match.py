@@ -44,22 +44,15 @@ OWN_AXES: Final = Finding(
 
 
 class NamedPlace(Record):
-    """Where an exam of the breast has a mass, as the table says.
-
-    Parameters
-    ----------
-    mass, exam
-        Their codes and names.
-    path
-        Of that exam's map.
-    centre_mm
-        On that map.
-    """
+    """Where an exam of the breast has a mass, as the table says."""
 
     mass: str
     exam: str
+    """`mass`, `exam`: Their codes and names."""
     path: Path
+    """Of that exam's map."""
     centre_mm: tuple[float, float]
+    """On that map."""
 
 
 def named_exams(exam: Exam, exams: Sequence[Exam]) -> list[Exam]:

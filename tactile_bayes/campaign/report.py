@@ -58,18 +58,12 @@ _LINKS: Final = (MAP_FIGURE, SIZE_FIGURE, SIZED_FIGURE, ESTIMATE, SIZED, MAP)
 
 
 class Excision(Record):
-    """Where the sizes after excision are.
-
-    Parameters
-    ----------
-    path
-        Of the table.
-    columns
-        The mapping of a wide table; None for a tidy one.
-    """
+    """Where the sizes after excision are."""
 
     path: Path
+    """Of the table."""
     columns: Path | None = None
+    """The mapping of a wide table; None for a tidy one."""
 
     def table(self) -> Table:
         """Read and check the table."""
@@ -82,38 +76,26 @@ class Excision(Record):
 
 
 class Written(Record):
-    """What was written, in numbers and words.
-
-    Parameters
-    ----------
-    sized, unsized, failed
-        Exams by how they ended.
-    pooled
-        Masses at a visit that were pooled.
-    left_out
-        Masses without a size after excision, as ``patient mass``.
-    report
-        The trial report as text; empty where there is none.
-    no_report
-        Why there is none, where excision sizes were given.
-    unnamed
-        Exams whose map shows a mass that no row names.
-    growth
-        What became of masses with several visits, in a sentence; empty where there are none.
-    disagreeing
-        Masses at a visit whose exams are not of one size or place.
-    """
+    """What was written, in numbers and words."""
 
     sized: int
     unsized: int
     failed: int
+    """`sized`, `unsized`, `failed`: Exams by how they ended."""
     pooled: int
+    """Masses at a visit that were pooled."""
     left_out: tuple[str, ...] = ()
+    """Masses without a size after excision, as ``patient mass``."""
     report: str = ""
+    """The trial report as text; empty where there is none."""
     no_report: str = field(default="")
+    """Why there is none, where excision sizes were given."""
     unnamed: tuple[str, ...] = ()
+    """Exams whose map shows a mass that no row names."""
     growth: str = ""
+    """What became of masses with several visits, in a sentence; empty where there are none."""
     disagreeing: tuple[str, ...] = ()
+    """Masses at a visit whose exams are not of one size or place."""
 
 
 def write_outputs(campaign: Campaign, excision: Excision | None, protocol: Path | None = None) -> Written:

@@ -35,31 +35,22 @@ def stamp(path: Path) -> str:
 
 
 class CampaignSettings(Record):
-    """Settings of all exams.
-
-    Parameters
-    ----------
-    estimate
-        As of `estimate`; a row of the table may replace place, known values and calibration.
-    normalise
-        As of `map`.
-    match_mm
-        Within this distance a mass is that which another exam of the breast names by its place.
-    figures
-        Whether the figures of `estimate` are drawn for each exam.
-    own_repeatability
-        Whether the spread between exams is learned from the campaign's own repeats, where enough masses have them and
-        the estimate's settings do not say it.
-    copy_to
-        Address of a folder in an object store that gets a copy of every file; empty for none.
-    """
+    """Settings of all exams."""
 
     estimate: Settings = field(default_factory=Settings)
+    """As of `estimate`; a row of the table may replace place, known values and calibration."""
     normalise: str = DEFAULT_NORMALISE
+    """As of `map`."""
     figures: bool = False
+    """Whether the figures of `estimate` are drawn for each exam."""
     match_mm: float = MATCH_MM
+    """Within this distance a mass is that which another exam of the breast names by its place."""
     own_repeatability: bool = True
+    """Whether the spread between exams is learned from the campaign's own repeats, where enough masses have them and
+    the estimate's settings do not say it.
+    """
     copy_to: str = ""
+    """Address of a folder in an object store that gets a copy of every file; empty for none."""
 
     def of(self, exam: Exam) -> Settings:
         """Settings of one exam's estimate."""

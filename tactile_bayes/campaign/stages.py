@@ -28,25 +28,17 @@ class Fault(Record):
 
 
 class CampaignState(Record, eq=False):
-    """How far a campaign is: results by step and name, faults by name, counts of steps.
-
-    Parameters
-    ----------
-    results
-        By step, then by the name of the exam or mass.
-    faults
-        By the name of the exam or mass.
-    kept, todo
-        Steps done by earlier runs, and steps of this run, by step; for a plan those that it would do.
-    names
-        By step, the first few exams or masses of `todo`.
-    """
+    """How far a campaign is: results by step and name, faults by name, counts of steps."""
 
     results: dict[str, StepResults]
+    """By step, then by the name of the exam or mass."""
     faults: dict[str, Fault] = field(default_factory=dict)
+    """By the name of the exam or mass."""
     kept: dict[str, int] = field(default_factory=lambda: defaultdict(int))
     todo: dict[str, int] = field(default_factory=lambda: defaultdict(int))
+    """`kept`, `todo`: Steps done by earlier runs, and steps of this run, by step; for a plan those that it would do."""
     names: dict[str, list[str]] = field(default_factory=lambda: defaultdict(list))
+    """By step, the first few exams or masses of `todo`."""
 
     def of(self, step: str, name: str) -> Result | None:
         """Result of a step of an exam or mass; None where there is none."""

@@ -29,29 +29,20 @@ _OF_POOLED: Final = ("status", "reason", "max_size_mm", "findings")
 
 
 class Row(Record, eq=False):
-    """One exam as the tables and the contact sheet show it.
-
-    Parameters
-    ----------
-    exam
-        Of exams.csv.
-    document
-        The estimate's JSON object, by the campaign's repeatability where it has one; None where a step failed.
-    step, fault
-        Which step failed and why; empty where none did.
-    scans, synthetic
-        Of the file: digests and facts, whether it is simulated (None: unknown).
-    findings
-        What speaks against the exam: of its estimate, of the pooled size of its mass, of the table.
-    """
+    """One exam as the tables and the contact sheet show it."""
 
     exam: Exam
+    """Of exams.csv."""
     document: Mapping[str, Any] | None
+    """The estimate's JSON object, by the campaign's repeatability where it has one; None where a step failed."""
     step: str = ""
     fault: str = ""
+    """`step`, `fault`: Which step failed and why; empty where none did."""
     scans: tuple[Mapping[str, str], ...] = ()
     synthetic: bool | None = None
+    """`scans`, `synthetic`: Of the file: digests and facts, whether it is simulated (None: unknown)."""
     findings: tuple[Finding, ...] = ()
+    """What speaks against the exam: of its estimate, of the pooled size of its mass, of the table."""
 
     @property
     def size(self) -> Mapping[str, float] | None:

@@ -54,25 +54,17 @@ NO_SERIAL_NUMBER: Final = "unknown"
 
 
 class Study(Record, eq=False):
-    """Patient and study of one export.
-
-    Parameters
-    ----------
-    identity
-        As given; its `patient_id` may come from the scan.
-    moment, content
-        When the exam was and when the content was made, with the time of day.
-    study_uid
-        As given, or by the content of the maps.
-    key
-        What identifiers of the objects follow from, besides their own content.
-    """
+    """Patient and study of one export."""
 
     identity: Identity
+    """As given; its `patient_id` may come from the scan."""
     moment: Moment
     content: Moment
+    """`moment`, `content`: When the exam was and when the content was made, with the time of day."""
     study_uid: str
+    """As given, or by the content of the maps."""
     key: tuple[str, ...]
+    """What identifiers of the objects follow from, besides their own content."""
 
     def uid(self, role: str, *parts: str) -> str:
         """Identifier of an object, or of its series, by the study and the object's content."""

@@ -60,52 +60,39 @@ Facts = Mapping[str, str]
 
 
 class MapFile(Record, eq=False):
-    """A map with its file's digest and the facts of its scans.
-
-    Parameters
-    ----------
-    digest
-        SHA-256 of the file.
-    facts
-        What all of its scans say alike of the exam; see `EXAM_FACTS`.
-    """
+    """A map with its file's digest and the facts of its scans."""
 
     path: Path
     digest: str
+    """SHA-256 of the file."""
     tactile_map: TactileMap
     facts: Facts
+    """What all of its scans say alike of the exam; see `EXAM_FACTS`."""
 
 
 class SizedMass(Record, eq=False):
-    """One mass of an estimate, or why it has no size.
-
-    Parameters
-    ----------
-    number
-        From 1, in the order of the estimate.
-    largest, smallest
-        Quantities in mm as the estimate's JSON has them, with the intervals that lead; None without a size.
-    code
-        Reason code of the estimate where there is no number; empty with a size.
-    reason
-        Why there is no number, or no size.
-    probability
-        That there is a lump; None where the file does not tell.
-    centre_mm, centre_patient_mm
-        Medians of x and y in `plane` and in `patient`; None where the file does not tell.
-    alike_exams
-        The interval if exams of the mass differ less, in words; empty where there is one interval.
-    """
+    """One mass of an estimate, or why it has no size."""
 
     number: int
+    """From 1, in the order of the estimate."""
     largest: Mapping[str, Any] | None
     smallest: Mapping[str, Any] | None
+    """`largest`, `smallest`: Quantities in mm as the estimate's JSON has them, with the intervals that lead; None
+    without a size.
+    """
     code: str = ""
+    """Reason code of the estimate where there is no number; empty with a size."""
     reason: str = ""
+    """Why there is no number, or no size."""
     probability: float | None = None
+    """That there is a lump; None where the file does not tell."""
     centre_mm: tuple[float, float] | None = None
     centre_patient_mm: tuple[float, float] | None = None
+    """`centre_mm`, `centre_patient_mm`: Medians of x and y in `plane` and in `patient`; None where the file does not
+    tell.
+    """
     alike_exams: str = ""
+    """The interval if exams of the mass differ less, in words; empty where there is one interval."""
 
     @property
     def outcome(self) -> Code:
@@ -116,28 +103,20 @@ class SizedMass(Record, eq=False):
 
 
 class EstimateFile(Record, eq=False):
-    """An estimate: of one map, pooled from several, or the draws of either.
-
-    Parameters
-    ----------
-    kind
-        ``"estimate"``, ``"pooled"`` or ``"posterior"``.
-    digest
-        SHA-256 of the estimate's content.
-    maps
-        SHA-256 of the maps that it was made from; empty where the file does not tell.
-    findings
-        What speaks against it, cautions first.
-    """
+    """An estimate: of one map, pooled from several, or the draws of either."""
 
     path: Path
     kind: str
+    """``"estimate"``, ``"pooled"`` or ``"posterior"``."""
     digest: str
+    """SHA-256 of the estimate's content."""
     document: Mapping[str, Any]
     masses: tuple[SizedMass, ...]
     maps: tuple[str, ...]
+    """SHA-256 of the maps that it was made from; empty where the file does not tell."""
     facts: Facts
     findings: tuple[Finding, ...] = ()
+    """What speaks against it, cautions first."""
 
     @property
     def sized(self) -> bool:

@@ -30,21 +30,14 @@ _NAMES: Final = ("patient_name", "referring_physician")
 
 
 class Moment(Record):
-    """A date, with the time of day and its zone where they are known.
-
-    Parameters
-    ----------
-    date
-        ``YYYYMMDD``.
-    time
-        ``HHMM`` or ``HHMMSS``; empty where unknown.
-    zone
-        ``+HHMM`` or ``-HHMM``; empty where unknown.
-    """
+    """A date, with the time of day and its zone where they are known."""
 
     date: str
+    """``YYYYMMDD``."""
     time: str = ""
+    """``HHMM`` or ``HHMMSS``; empty where unknown."""
     zone: str = ""
+    """``+HHMM`` or ``-HHMM``; empty where unknown."""
 
     @classmethod
     def of(cls, text: str, *, name: str) -> Moment:

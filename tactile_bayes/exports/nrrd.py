@@ -43,22 +43,15 @@ def on_plane(transform: FloatArray, point_mm: tuple[float, float]) -> FloatArray
 
 
 class ImagePlane(Record, eq=False):
-    """A map's values as the rows of an image that faces the viewer as every picture of the program does.
-
-    Parameters
-    ----------
-    values : (rows, columns) array
-        Row 0 on top; NaN without data.
-    row_direction, column_direction : (3,) arrays
-        Unit vectors in L, P, S: along a row, and down a column.
-    corner_mm : (3,) array
-        Centre of the first value of the first row.
-    """
+    """A map's values as the rows of an image that faces the viewer as every picture of the program does."""
 
     values: FloatArray
+    """(rows, columns) array: Row 0 on top; NaN without data."""
     row_direction: FloatArray
     column_direction: FloatArray
+    """`row_direction`, `column_direction` (3,) arrays: Unit vectors in L, P, S: along a row, and down a column."""
     corner_mm: FloatArray
+    """(3,) array: Centre of the first value of the first row."""
 
 
 def image_plane(tactile_map: TactileMap, transform: FloatArray) -> ImagePlane:

@@ -29,39 +29,30 @@ _WRITTEN: Final = ("file", "patient", "visit", "mass", "replicate", "side", "rea
 
 
 class Exam(Record):
-    """One exam of one mass: a row of the table.
-
-    Parameters
-    ----------
-    file, path
-        As the table has it, and where it is, absolute; of a file in an object store the path is no more than a name.
-    patient, visit, mass, replicate
-        Codes that name the exam.
-    day, side, reader
-        None where the table leaves them blank.
-    centre_mm
-        Place of the mass on the map; None takes the highest bump that can be a lump.
-    known
-        Properties of the body, by the names of `KNOWN`.
-    calibration
-        Name or path of a size calibration; None takes the campaign's.
-    line
-        Of the table.
-    """
+    """One exam of one mass: a row of the table."""
 
     file: str
     path: Path
+    """`file`, `path`: As the table has it, and where it is, absolute; of a file in an object store the path is no more
+    than a name.
+    """
     patient: str
     visit: str
     mass: str
     replicate: int
+    """`patient`, `visit`, `mass`, `replicate`: Codes that name the exam."""
     day: date | None = None
     side: str | None = None
     reader: str | None = None
+    """`day`, `side`, `reader`: None where the table leaves them blank."""
     centre_mm: tuple[float, float] | None = None
+    """Place of the mass on the map; None takes the highest bump that can be a lump."""
     known: tuple[tuple[str, float], ...] = ()
+    """Properties of the body, by the names of `KNOWN`."""
     calibration: str | None = None
+    """Name or path of a size calibration; None takes the campaign's."""
     line: int = field(default=0)
+    """Of the table."""
 
     @property
     def address(self) -> str:

@@ -75,42 +75,27 @@ _DAMAGED: Final = "not a readable netCDF file"
 
 
 class Variable(Record):
-    """One array of a netCDF file.
-
-    Parameters
-    ----------
-    values
-        Numbers; their type is the variable's.
-    dimensions
-        The name of each axis.
-    attributes
-        Text by name: units, a long name.
-    fill
-        What stands for "no value" in a variable that may have none: its ``_FillValue``. Not for coordinates.
-    scale
-        What the stored numbers are to be multiplied by: the ``scale_factor`` of the CF conventions.
-    """
+    """One array of a netCDF file."""
 
     values: Any
+    """Numbers; their type is the variable's."""
     dimensions: tuple[str, ...]
+    """The name of each axis."""
     attributes: Mapping[str, str]
+    """Text by name: units, a long name."""
     fill: float | None = None
+    """What stands for "no value" in a variable that may have none: its ``_FillValue``. Not for coordinates."""
     scale: float | None = None
+    """What the stored numbers are to be multiplied by: the ``scale_factor`` of the CF conventions."""
 
 
 class Contents(Record):
-    """What one group of a netCDF file holds.
-
-    Parameters
-    ----------
-    variables
-        By name; one that is called as its only dimension becomes that dimension's coordinate.
-    attributes
-        Text by name.
-    """
+    """What one group of a netCDF file holds."""
 
     variables: Mapping[str, Variable]
+    """By name; one that is called as its only dimension becomes that dimension's coordinate."""
     attributes: Mapping[str, str]
+    """Text by name."""
 
 
 def grouped_netcdf_bytes(groups: Mapping[str, Contents]) -> bytes:

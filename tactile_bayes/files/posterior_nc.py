@@ -120,27 +120,18 @@ def _with_coordinates(arrays: Mapping[str, tuple[tuple[str, ...], FloatArray]]) 
 
 
 class PosteriorDraws(Record, eq=False):
-    """What a posterior file says.
-
-    Parameters
-    ----------
-    method
-        That gave the draws.
-    draws
-        (chain, draw) arrays by name.
-    diagnostics
-        As the estimate's JSON has them.
-    scans
-        The scans at the beginning, as `Provenance.scans` has them.
-    findings
-        What speaks against the estimate.
-    """
+    """What a posterior file says."""
 
     method: str
+    """That gave the draws."""
     draws: dict[str, FloatArray]
+    """(chain, draw) arrays by name."""
     diagnostics: dict[str, Any]
+    """As the estimate's JSON has them."""
     scans: tuple[dict[str, str], ...] = ()
+    """The scans at the beginning, as `Provenance.scans` has them."""
     findings: tuple[Finding, ...] = ()
+    """What speaks against the estimate."""
 
 
 def read_posterior(path: Path) -> PosteriorDraws:

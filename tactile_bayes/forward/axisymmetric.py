@@ -54,42 +54,29 @@ class Tissue(Record):
 
 
 class ModePerturbation(Record, eq=False):
-    """Perturbation of Fourier order m.
-
-    Parameters
-    ----------
-    order
-        m.
-    matrix : (s, s) array
-        Symmetric: sinking in mm at skin node i for a unit force in kPa mm^2 at skin node j, per cos(m dtheta).
-    """
+    """Perturbation of Fourier order m."""
 
     order: int
+    """m."""
     matrix: FloatArray
+    """(s, s) array: Symmetric: sinking in mm at skin node i for a unit force in kPa mm^2 at skin node j, per cos(m
+    dtheta).
+    """
 
 
 class CondensedMode(Record, eq=False):
-    """One Fourier order of the body around the lump, condensed onto the lump's boundary.
-
-    Parameters
-    ----------
-    order
-        m.
-    flexibility : (b, b) array
-        Displacements on the boundary for unit forces there, with nothing inside; mm per kPa mm^2.
-    skin : (s, b) array
-        Sinking of the skin for the same forces.
-    unit_stiffness : (b, b) array
-        The lump, condensed on its boundary, for a modulus of 1 kPa.
-    original_stiffness : (b, b) array
-        The tissue that the lump replaces.
-    """
+    """One Fourier order of the body around the lump, condensed onto the lump's boundary."""
 
     order: int
+    """m."""
     flexibility: FloatArray
+    """(b, b) array: Displacements on the boundary for unit forces there, with nothing inside; mm per kPa mm^2."""
     skin: FloatArray
+    """(s, b) array: Sinking of the skin for the same forces."""
     unit_stiffness: FloatArray
+    """(b, b) array: The lump, condensed on its boundary, for a modulus of 1 kPa."""
     original_stiffness: FloatArray
+    """(b, b) array: The tissue that the lump replaces."""
 
     def perturbation(self, lump_kpa: float) -> ModePerturbation:
         r"""Change of the skin's compliance when tissue is replaced by a lump of modulus `lump_kpa`.
@@ -112,18 +99,12 @@ class CondensedMode(Record, eq=False):
 
 
 class CondensedLump(Record, eq=False):
-    """All Fourier orders of one geometry; the perturbation for a stiffness takes milliseconds.
-
-    Parameters
-    ----------
-    radius_mm : (s,) array
-        Skin nodes, by increasing distance from the lump's axis, the axis itself left out.
-    modes
-        Orders 0, 1, ...
-    """
+    """All Fourier orders of one geometry; the perturbation for a stiffness takes milliseconds."""
 
     radius_mm: FloatArray
+    """(s,) array: Skin nodes, by increasing distance from the lump's axis, the axis itself left out."""
     modes: tuple[CondensedMode, ...]
+    """Orders 0, 1, ..."""
 
     def perturbation(self, lump_kpa: float) -> tuple[ModePerturbation, ...]:
         """Perturbations of all orders, for a lump of modulus `lump_kpa`."""

@@ -31,18 +31,6 @@ _MOST_ROUNDS = 40
 class Head(Record):
     """The head's cross-section: an arc with rounded shoulders.
 
-    Parameters
-    ----------
-    width_mm
-        Of the sensing part.
-    radius_mm
-        Of the arc; infinity for a flat head.
-    shoulder_mm
-        Radius of the round between arc and side, tangent to both; 0 for a sharp edge.
-    shoulders
-        ``"shoulders-inside"``: the rounds are cut into the sensing width, which is the whole face.
-        ``"shoulders-outside"``: the arc spans the sensing width, and the rounds lie around it, press and sense nothing.
-
     Notes
     -----
     The paper has "nearly a section of a circular cylinder" of 24 mm (section 2.1); radius and shoulders are assumed.
@@ -50,9 +38,15 @@ class Head(Record):
     """
 
     width_mm: float = HEAD_ROWS * HEAD_PITCH_MM
+    """Of the sensing part."""
     radius_mm: float = HEAD_RADIUS_MM
+    """Of the arc; infinity for a flat head."""
     shoulder_mm: float = SHOULDER_MM
+    """Radius of the round between arc and side, tangent to both; 0 for a sharp edge."""
     shoulders: str = SHOULDERS_INSIDE
+    """``"shoulders-inside"``: the rounds are cut into the sensing width, which is the whole face.
+    ``"shoulders-outside"``: the arc spans the sensing width, and the rounds lie around it, press and sense nothing.
+    """
 
     def __post_init__(self) -> None:
         if not 0 < self.width_mm < np.inf:
@@ -126,22 +120,15 @@ class Head(Record):
 
 
 class Contact(Record, eq=False):
-    """Solutions of the contact at m positions over n cells.
-
-    Parameters
-    ----------
-    pressure_kpa, gap_mm : (m, n) arrays
-        At each cell one is 0 and the other is not negative.
-    depth_mm : (m,) array
-        How deep the head's lowest point is pushed.
-    rounds
-        In which cells changed between touching and not touching, the last (without a change) included.
-    """
+    """Solutions of the contact at m positions over n cells."""
 
     pressure_kpa: FloatArray
     gap_mm: FloatArray
+    """`pressure_kpa`, `gap_mm` (m, n) arrays: At each cell one is 0 and the other is not negative."""
     depth_mm: FloatArray
+    """(m,) array: How deep the head's lowest point is pushed."""
     rounds: int
+    """In which cells changed between touching and not touching, the last (without a change) included."""
 
 
 def solve_contact(
@@ -263,40 +250,27 @@ _PATIENCE: Final = 4
 
 
 class SolidContact(Record, eq=False):
-    """The solved contact of a head.
-
-    Parameters
-    ----------
-    pressure_kpa : (n,) array
-        Of each taxel; 0 where it does not touch.
-    gap_mm : (n,) array
-        Between each taxel and the skin; 0 where it touches.
-    depth_mm
-        Of the head's highest point of `height_mm` 0 below the undisturbed skin.
-    touching : (n,) array of bool
-    """
+    """The solved contact of a head."""
 
     pressure_kpa: FloatArray
+    """(n,) array: Of each taxel; 0 where it does not touch."""
     gap_mm: FloatArray
+    """(n,) array: Between each taxel and the skin; 0 where it touches."""
     depth_mm: float
+    """Of the head's highest point of `height_mm` 0 below the undisturbed skin."""
     touching: BoolArray
+    """(n,) array of bool."""
 
 
 class ContactStiffness(Record, eq=False):
-    r"""Inverse of a compliance that is a fixed matrix less a low-rank change.
-
-    Parameters
-    ----------
-    plain : (n, n) array
-        Inverse of the compliance without the change, kPa / mm.
-    factor : (n, k) array
-    core : (k, k) array
-        The stiffness is ``plain + factor @ core @ factor.T``.
-    """
+    r"""Inverse of a compliance that is a fixed matrix less a low-rank change."""
 
     plain: FloatArray
+    """(n, n) array: Inverse of the compliance without the change, kPa / mm."""
     factor: FloatArray
+    """(n, k) array."""
     core: FloatArray
+    """(k, k) array: The stiffness is ``plain + factor @ core @ factor.T``."""
 
     @classmethod
     def of(cls, compliance: FloatArray) -> ContactStiffness:

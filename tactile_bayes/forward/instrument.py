@@ -37,19 +37,14 @@ Depth = Callable[[FloatArray], FloatArray]
 
 
 class SimulatedScan(Record, eq=False):
-    """A simulated scan with its truth.
-
-    Parameters
-    ----------
-    scan
-        As an instrument would have recorded it.
-    truth
-        Plain data for JSON: the lumps in the scene's `plane`, in `patient` and in `base`, the transforms, the latency
-        and the level.
-    """
+    """A simulated scan with its truth."""
 
     scan: Scan
+    """As an instrument would have recorded it."""
     truth: Mapping[str, Any]
+    """Plain data for JSON: the lumps in the scene's `plane`, in `patient` and in `base`, the transforms, the latency
+    and the level.
+    """
 
     def __repr__(self) -> str:
         return f"<SimulatedScan of {self.scan!r}, with its truth>"

@@ -28,21 +28,14 @@ _LEAST: Final = 1e-3
 
 
 class LayeredBody(Record):
-    """Flat isotropic layers from the skin down.
-
-    Parameters
-    ----------
-    modulus_kpa
-        Young's modulus of each layer.
-    thickness_mm
-        Of each layer on a rigid base; one entry fewer than `modulus_kpa` when the last is a half-space.
-    nu
-        Poisson's ratio of all, above -1 and up to 0.5 (incompressible).
-    """
+    """Flat isotropic layers from the skin down."""
 
     modulus_kpa: tuple[float, ...]
+    """Young's modulus of each layer."""
     thickness_mm: tuple[float, ...]
+    """Of each layer on a rigid base; one entry fewer than `modulus_kpa` when the last is a half-space."""
     nu: float = POISSON
+    """Poisson's ratio of all, above -1 and up to 0.5 (incompressible)."""
 
     def __post_init__(self) -> None:
         if len(self.modulus_kpa) - len(self.thickness_mm) not in (0, 1) or not self.modulus_kpa:

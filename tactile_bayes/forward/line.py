@@ -27,20 +27,14 @@ _NOMINAL_HEAD = Head()
 
 
 class LineFrames(Record, eq=False):
-    """Pressure across the head at each of its positions.
-
-    Parameters
-    ----------
-    x_c_mm : (m,) array
-        Centre of the head, from the lump's axis.
-    s_mm : (n,) array
-        Centres of the cells from the head's centre.
-    pressure_kpa : (m, n) array
-    """
+    """Pressure across the head at each of its positions."""
 
     x_c_mm: FloatArray
+    """(m,) array: Centre of the head, from the lump's axis."""
     s_mm: FloatArray
+    """(n,) array: Centres of the cells from the head's centre."""
     pressure_kpa: FloatArray
+    """(m, n) array."""
 
     def __post_init__(self) -> None:
         shape = (len(self.x_c_mm), len(self.s_mm))
@@ -71,23 +65,16 @@ class LineFrames(Record, eq=False):
 
 
 class TactileLine(Record, eq=False):
-    """A one-dimensional tactile map: the counterpart of `TactileMap` for a line.
-
-    Parameters
-    ----------
-    x_mm : (k,) array
-        Centres of the map's cells.
-    mean : (k,) array
-        Mean of the readings in a cell; NaN without any.
-    count : (k,) int array
-    cell_mm
-        Width of the map's cells.
-    """
+    """A one-dimensional tactile map: the counterpart of `TactileMap` for a line."""
 
     x_mm: FloatArray
+    """(k,) array: Centres of the map's cells."""
     mean: FloatArray
+    """(k,) array: Mean of the readings in a cell; NaN without any."""
     count: np.ndarray[tuple[int, ...], np.dtype[np.int64]]
+    """(k,) int array."""
     cell_mm: float
+    """Width of the map's cells."""
 
 
 def head_positions(positions_mm: tuple[float, float, float] = POSITIONS_MM) -> FloatArray:
@@ -316,26 +303,18 @@ def kappa(x_c_mm: FloatArray, *, d_mm: float) -> FloatArray:
 
 
 class EmpiricalModel(Record):
-    """The fitted parameters of one case.
-
-    Parameters
-    ----------
-    peak_kpa, curvature_per_mm2
-        Of the homogeneous profile (Eq 1).
-    height_kpa, width_mm
-        g and sigma of Eq 2.
-    d_mm
-        Diameter of the lump.
-    half_width_mm
-        Of the head.
-    """
+    """The fitted parameters of one case."""
 
     peak_kpa: float
     curvature_per_mm2: float
+    """`peak_kpa`, `curvature_per_mm2`: Of the homogeneous profile (Eq 1)."""
     height_kpa: float
     width_mm: float
+    """`height_kpa`, `width_mm`: g and sigma of Eq 2."""
     d_mm: float
+    """Diameter of the lump."""
     half_width_mm: float
+    """Of the head."""
 
     def homogeneous(self, s_mm: FloatArray) -> FloatArray:
         """P1 of this case."""

@@ -137,36 +137,23 @@ class PlacedLump(Record, eq=False):
 
 
 class SolidFrame(Record, eq=False):
-    """The solved frame of a head at one pose.
-
-    Parameters
-    ----------
-    pressure_kpa : (rows, columns) array
-        Mean pressure on each taxel.
-    depth_mm
-        z of the head's origin in the scene's `plane`, whose z = 0 is the undisturbed skin.
-    contact
-        Of the whole face, rim included.
-    """
+    """The solved frame of a head at one pose."""
 
     pressure_kpa: FloatArray
+    """(rows, columns) array: Mean pressure on each taxel."""
     depth_mm: float
+    """z of the head's origin in the scene's `plane`, whose z = 0 is the undisturbed skin."""
     contact: Contact
+    """Of the whole face, rim included."""
 
 
 class SolidHead(Record, eq=False):
-    """A rigid head on a layered body; made by `solid_head`.
-
-    Parameters
-    ----------
-    face
-        What can touch.
-    plain
-        Stiffness of the skin under the face, without lumps.
-    """
+    """A rigid head on a layered body; made by `solid_head`."""
 
     face: HeadFace
+    """What can touch."""
     plain: ContactStiffness
+    """Stiffness of the skin under the face, without lumps."""
 
     def frame(
         self,

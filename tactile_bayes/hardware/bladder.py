@@ -25,21 +25,14 @@ STEPS_FOR_CURVATURE: Final = 4
 
 
 class BladderStep(Record, eq=False):
-    """Mean counts of the array under one known pressure.
-
-    Parameters
-    ----------
-    pressure_kpa
-        Of the bladder.
-    counts : (rows, columns) array
-        Mean over the frames.
-    saturated : (rows, columns) bool array
-        Taxels that reached full scale in any frame.
-    """
+    """Mean counts of the array under one known pressure."""
 
     pressure_kpa: float
+    """Of the bladder."""
     counts: FloatArray
+    """(rows, columns) array: Mean over the frames."""
     saturated: NDArray[np.bool_]
+    """(rows, columns) bool array: Taxels that reached full scale in any frame."""
 
     @classmethod
     def of(cls, pressure_kpa: float, frames: CountArray, *, saturation_count: int) -> BladderStep:
@@ -61,32 +54,25 @@ class BladderStep(Record, eq=False):
 
 
 class ArrayFit(Record, eq=False):
-    """The fit of each taxel.
-
-    Parameters
-    ----------
-    calibration
-        Pressure = gain x counts + offset, which is what maps use; gain 0 for dead and hot taxels.
-    curvature_kpa_per_count2 : (rows, columns) array
-        Of a parabola through the same steps; 0 where there are too few. Maps do not use it: it tells how far the
-        straight line is from enough.
-    dead, hot
-        (row, column) of taxels that hardly answer, or far too much.
-    nonuniformity : (steps,) array
-        Standard deviation over the good taxels of the calibrated pressure, as a share of the step's (NaN at 0).
-    curved_nonuniformity : (steps,) array
-        The same with the parabolas.
-    pressure_kpa : (steps,) array
-        Rising.
-    """
+    """The fit of each taxel."""
 
     calibration: ElementCalibration
+    """Pressure = gain x counts + offset, which is what maps use; gain 0 for dead and hot taxels."""
     curvature_kpa_per_count2: FloatArray
+    """(rows, columns) array: Of a parabola through the same steps; 0 where there are too few. Maps do not use it: it
+    tells how far the straight line is from enough.
+    """
     dead: tuple[tuple[int, int], ...]
     hot: tuple[tuple[int, int], ...]
+    """`dead`, `hot`: (row, column) of taxels that hardly answer, or far too much."""
     nonuniformity: FloatArray
+    """(steps,) array: Standard deviation over the good taxels of the calibrated pressure, as a share of the step's (NaN
+    at 0).
+    """
     curved_nonuniformity: FloatArray
+    """(steps,) array: The same with the parabolas."""
     pressure_kpa: FloatArray
+    """(steps,) array: Rising."""
 
 
 def fit_array(steps: Sequence[BladderStep], *, saturation_count: int) -> ArrayFit:
@@ -180,19 +166,13 @@ CLEAR: Final = 3.0
 
 
 class RotationSense(Record):
-    """Fit of a fixed point under each sense of rotation, and the angle that the sensor was turned by.
-
-    Parameters
-    ----------
-    as_given_mm, inverted_mm
-        Root mean square distance of the point from its mean.
-    turn_deg
-        Largest rotation between two poses.
-    """
+    """Fit of a fixed point under each sense of rotation, and the angle that the sensor was turned by."""
 
     as_given_mm: float
     inverted_mm: float
+    """`as_given_mm`, `inverted_mm`: Root mean square distance of the point from its mean."""
     turn_deg: float
+    """Largest rotation between two poses."""
 
     def __str__(self) -> str:
         figures = f"the point stays within {self.as_given_mm:.2f} mm as given, {self.inverted_mm:.2f} mm inverted"

@@ -29,25 +29,17 @@ _SETTING: Final = re.compile(rb"[A-Za-z][0-9*,][^\r]*\r")
 
 
 class Faults(Record):
-    """Faults of an emulated device.
-
-    Parameters
-    ----------
-    drop, corrupt
-        Share of the records that are not sent, or sent with one bit changed.
-    stall
-        From this time of the scan on, for this long, nothing is sent; what was measured then is lost. In s.
-    disconnect_s
-        The cable is pulled at this time of the scan.
-    hold
-        Only every n-th pose is measured anew, those between repeat it.
-    """
+    """Faults of an emulated device."""
 
     drop: float = 0.0
     corrupt: float = 0.0
+    """`drop`, `corrupt`: Share of the records that are not sent, or sent with one bit changed."""
     stall: tuple[float, float] | None = None
+    """From this time of the scan on, for this long, nothing is sent; what was measured then is lost. In s."""
     disconnect_s: float | None = None
+    """The cable is pulled at this time of the scan."""
     hold: int = 1
+    """Only every n-th pose is measured anew, those between repeat it."""
 
     def stalls(self, time_s: float) -> bool:
         """Whether the device sends nothing at a time of the scan."""

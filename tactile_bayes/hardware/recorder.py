@@ -112,24 +112,16 @@ STEADY_MM: Final = 2.0
 
 
 class Touch(Record, eq=False):
-    """A touched landmark.
-
-    Parameters
-    ----------
-    name
-        ``sternal_notch``, ``xiphoid`` or ``nipple``.
-    position_mm : (3,) array
-        Mean in `base`.
-    spread_mm
-        Standard deviation of the samples about it (root of the sum over axes).
-    samples
-        How many there were.
-    """
+    """A touched landmark."""
 
     name: str
+    """``sternal_notch``, ``xiphoid`` or ``nipple``."""
     position_mm: FloatArray
+    """(3,) array: Mean in `base`."""
     spread_mm: float
+    """Standard deviation of the samples about it (root of the sum over axes)."""
     samples: int
+    """How many there were."""
 
     @property
     def steady(self) -> bool:

@@ -26,27 +26,22 @@ def even_replicates(number: int) -> Labels:
 
 
 class ParameterDraws(Record, eq=False):
-    """Draws of a parameter vector.
-
-    Parameters
-    ----------
-    theta : (chain, draw, p) array
-    method
-        One of `presets.METHODS`.
-    diagnostics
-        Figures of the method (R-hat, effective draws, evaluations...), for the report.
-    labels : (chain * draw,) array or None
-        The independent replicate that each draw comes from, for draws in one chain; None for independent draws.
-    statistics
-        (chain, draw) arrays of the sampler by name: ``lp``, the log density at the draw; ``log_weight``, of the point
-        that importance sampling took it from; ``accepted``, 1 where the chain's walker moved there in that step.
-    """
+    """Draws of a parameter vector."""
 
     theta: FloatArray
+    """(chain, draw, p) array."""
     method: str
+    """One of `presets.METHODS`."""
     diagnostics: Mapping[str, float] = field(default_factory=dict)
+    """Figures of the method (R-hat, effective draws, evaluations...), for the report."""
     labels: Labels | None = None
+    """(chain * draw,) array or None: The independent replicate that each draw comes from, for draws in one chain; None
+    for independent draws.
+    """
     statistics: Mapping[str, FloatArray] = field(default_factory=dict)
+    """(chain, draw) arrays of the sampler by name: ``lp``, the log density at the draw; ``log_weight``, of the point
+    that importance sampling took it from; ``accepted``, 1 where the chain's walker moved there in that step.
+    """
 
     @property
     def flat(self) -> FloatArray:
@@ -108,23 +103,17 @@ def nine_digits(value: float) -> float:
 
 
 class Quantity(Record):
-    """Summary of one quantity's draws.
-
-    Parameters
-    ----------
-    low, high
-        Ends of the equal-tailed interval of `probability`.
-    mc_error
-        Monte-Carlo standard error of the wider of the two ends; digits beyond it mean nothing.
-    """
+    """Summary of one quantity's draws."""
 
     median: float
     mean: float
     sd: float
     low: float
     high: float
+    """`low`, `high`: Ends of the equal-tailed interval of `probability`."""
     probability: float
     mc_error: float
+    """Monte-Carlo standard error of the wider of the two ends; digits beyond it mean nothing."""
     kind: str = INTERVAL_KIND
 
     def as_dict(self) -> dict[str, float | str]:

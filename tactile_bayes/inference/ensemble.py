@@ -19,27 +19,18 @@ from tactile_bayes.inference.modes import LogDensity
 
 
 class ChainState(Record, eq=False):
-    """State of all ensembles after the same number of steps.
-
-    Parameters
-    ----------
-    chain : (ensemble, step, walker, p) array
-        In standardised coordinates.
-    log_density : (ensemble, walker) array
-        At the last step.
-    accepted : (ensemble,) array
-        Mean accepted proposals of a walker so far.
-    twister : (ensemble, 624) uint32 array
-        The random generators' keys.
-    cursor : (ensemble, 3) array
-        Their positions, whether a normal draw is kept, and that draw.
-    """
+    """State of all ensembles after the same number of steps."""
 
     chain: FloatArray
+    """(ensemble, step, walker, p) array: In standardised coordinates."""
     log_density: FloatArray
+    """(ensemble, walker) array: At the last step."""
     accepted: FloatArray
+    """(ensemble,) array: Mean accepted proposals of a walker so far."""
     twister: np.ndarray[tuple[int, ...], np.dtype[np.uint32]]
+    """(ensemble, 624) uint32 array: The random generators' keys."""
     cursor: FloatArray
+    """(ensemble, 3) array: Their positions, whether a normal draw is kept, and that draw."""
 
     def as_arrays(self) -> Mapping[str, Any]:
         """The state as arrays by name."""
@@ -64,28 +55,19 @@ WALKERS_PER_PARAMETER = 4
 
 
 class EnsembleOptions(Record):
-    """Stopping rule of the ensembles.
-
-    Parameters
-    ----------
-    ensembles
-        Independent ensembles; walkers of one ensemble share their history, so R-hat compares ensembles.
-    block
-        Steps between two looks at the diagnostics.
-    max_steps
-        Give up after this many.
-    least_ess, most_rhat
-        Bulk and tail effective draws, and R-hat, that every parameter must reach.
-    keep
-        Draws kept, thinned evenly over all ensembles.
-    """
+    """Stopping rule of the ensembles."""
 
     ensembles: int = 4
+    """Independent ensembles; walkers of one ensemble share their history, so R-hat compares ensembles."""
     block: int = 150
+    """Steps between two looks at the diagnostics."""
     max_steps: int = 6000
+    """Give up after this many."""
     least_ess: float = 800.0
     most_rhat: float = 1.01
+    """`least_ess`, `most_rhat`: Bulk and tail effective draws, and R-hat, that every parameter must reach."""
     keep: int = 8000
+    """Draws kept, thinned evenly over all ensembles."""
 
     def identity(self) -> str:
         """Settings that a checkpoint belongs to: all but the number of steps."""

@@ -91,18 +91,13 @@ def _pareto_quantile(probability: FloatArray, shape: float, scale: float) -> Flo
 
 
 class Gaussians(Record, eq=False):
-    """A mixture of Gaussians.
-
-    Parameters
-    ----------
-    weight : (h,) array
-        Sum 1.
-    mean, covariance : (h, p), (h, p, p) arrays
-    """
+    """A mixture of Gaussians."""
 
     weight: FloatArray
+    """(h,) array: Sum 1."""
     mean: FloatArray
     covariance: FloatArray
+    """`mean`, `covariance` (h, p), (h, p, p) arrays."""
 
     @classmethod
     def one(cls, mean: FloatArray, covariance: FloatArray) -> Gaussians:
@@ -312,19 +307,13 @@ HEAVY_POINTS, HEAVY = 2048, 0.1
 
 
 class ImportanceOptions(Record):
-    """Stopping rule of importance sampling.
-
-    Parameters
-    ----------
-    accuracy_sd
-        Wanted Monte-Carlo error of the ends of a 95 % interval, in posterior standard deviations.
-    first, most
-        Points of a replicate to begin with, and at most.
-    """
+    """Stopping rule of importance sampling."""
 
     accuracy_sd: float = 0.02
+    """Wanted Monte-Carlo error of the ends of a 95 % interval, in posterior standard deviations."""
     first: int = 256
     most: int = 16384
+    """`first`, `most`: Points of a replicate to begin with, and at most."""
 
 
 def importance_options(accuracy_sd: float | None) -> ImportanceOptions:

@@ -77,27 +77,18 @@ SETTLED = 0.01
 
 
 class LeastSquaresFit(Record, eq=False):
-    """The minimum of a weighted sum of squares.
-
-    Parameters
-    ----------
-    theta : (p,) array
-        Parameters at the minimum.
-    jacobian : (k, p) array
-        Derivatives of the predictions there.
-    residual : (k,) array
-        Data minus prediction.
-    sse
-        Weighted sum of squared residuals.
-    converged
-        Whether the relative step fell below the tolerance.
-    """
+    """The minimum of a weighted sum of squares."""
 
     theta: FloatArray
+    """(p,) array: Parameters at the minimum."""
     jacobian: FloatArray
+    """(k, p) array: Derivatives of the predictions there."""
     residual: FloatArray
+    """(k,) array: Data minus prediction."""
     sse: float
+    """Weighted sum of squared residuals."""
     converged: bool
+    """Whether the relative step fell below the tolerance."""
     iterations: int
 
     def covariance(self, weight: FloatArray) -> FloatArray:

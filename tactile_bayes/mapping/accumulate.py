@@ -25,19 +25,13 @@ def no_progress(done: int, total: int) -> None:
 
 
 class Source(Record, eq=False):
-    """Used frames of one scan, which can be read chunk by chunk any number of times.
-
-    Parameters
-    ----------
-    selection, readout
-        The scan with its used frames, and the taxels that are read.
-    projection
-        Of the used frames only, in their order.
-    """
+    """Used frames of one scan, which can be read chunk by chunk any number of times."""
 
     selection: SelectedFrames
     readout: Readout
+    """`selection`, `readout`: The scan with its used frames, and the taxels that are read."""
     projection: Projection
+    """Of the used frames only, in their order."""
 
     @classmethod
     def of(cls, selection: SelectedFrames, *, plane_from_base: FloatArray, cell_mm: float) -> Source:
@@ -191,18 +185,12 @@ LEAST_FRAMES = 50
 
 
 class FlatField(Record, eq=False):
-    """Response of each taxel relative to the array's mean.
-
-    Parameters
-    ----------
-    response : (rows, columns) array
-        1 where the taxel reads as much as its frame's mean; 1 for taxels left out.
-    frames
-        Lump-free frames it was taken from.
-    """
+    """Response of each taxel relative to the array's mean."""
 
     response: FloatArray
+    """(rows, columns) array: 1 where the taxel reads as much as its frame's mean; 1 for taxels left out."""
     frames: int
+    """Lump-free frames it was taken from."""
 
     @property
     def spread(self) -> float:
@@ -266,27 +254,18 @@ GAIN_TOLERANCE = 1e-4
 
 
 class Accumulated(Record, eq=False):
-    """Sums over all frames, and how the gains were solved.
-
-    Parameters
-    ----------
-    sums
-        The cells.
-    scale
-        What the sums' values must be divided by (1 but for ``gain``, whose level is set afterwards).
-    passes
-        Passes over the scan.
-    last_change
-        Largest relative change of a frame's gain in the last pass; 0 unless the gains are solved for.
-    levels
-        What the frames were divided by, one array a scan.
-    """
+    """Sums over all frames, and how the gains were solved."""
 
     sums: CellSums
+    """The cells."""
     levels: list[FloatArray]
+    """What the frames were divided by, one array a scan."""
     scale: float = 1.0
+    """What the sums' values must be divided by (1 but for ``gain``, whose level is set afterwards)."""
     passes: int = 1
+    """Passes over the scan."""
     last_change: float = 0.0
+    """Largest relative change of a frame's gain in the last pass; 0 unless the gains are solved for."""
 
     @property
     def settled(self) -> bool:

@@ -246,15 +246,10 @@ _WHOLE = 2.0**52
 
 
 class ProjectedTaxels(Record, eq=False, dict=True):
-    """The taxels of a head to be projected.
-
-    Parameters
-    ----------
-    place_mm : (3, k) array
-        Their centres in the tracker's axes, about their middle.
-    """
+    """The taxels of a head to be projected."""
 
     place_mm: FloatArray
+    """(3, k) array: Their centres in the tracker's axes, about their middle."""
 
     @cached_property
     def place_and_one(self) -> FloatArray:
@@ -272,21 +267,16 @@ class Projection(Record, eq=False):
 
     The face of the head is curved, so its true surface is used: two rows of each frame's rotation against three
     coordinates of each taxel.
-
-    Parameters
-    ----------
-    taxels
-        What is projected.
-    matrix : (n, 2, 4) array
-        First two rows of the rotation from the tracker to the plane, in cells a mm; and beside them where the taxels'
-        middle lies on the lattice, in cells. Half a cell is added, so that cell k is centred on k.
-    cell_mm
-        Side of a cell.
     """
 
     taxels: ProjectedTaxels
+    """What is projected."""
     matrix: FloatArray
+    """(n, 2, 4) array: First two rows of the rotation from the tracker to the plane, in cells a mm; and beside them
+    where the taxels' middle lies on the lattice, in cells. Half a cell is added, so that cell k is centred on k.
+    """
     cell_mm: float
+    """Side of a cell."""
 
     def __len__(self) -> int:
         return len(self.matrix)
@@ -441,25 +431,17 @@ PRESSURE_STEP_KPA = 2.0**-34
 
 
 class Readout(Record, eq=False, dict=True):
-    """The taxels used, and the conversion of their counts to pressures.
-
-    Parameters
-    ----------
-    taxels : (k,) int array
-        Flat indices of the used taxels, rising.
-    size
-        Taxels of the whole array.
-    gain_kpa, offset_kpa : (k,) arrays
-        On the grid of `PRESSURE_STEP_KPA`.
-    full_count
-        Readings at or above it carry no pressure.
-    """
+    """The taxels used, and the conversion of their counts to pressures."""
 
     taxels: NDArray[np.intp]
+    """(k,) int array: Flat indices of the used taxels, rising."""
     size: int
+    """Taxels of the whole array."""
     gain_kpa: FloatArray
     offset_kpa: FloatArray
+    """`gain_kpa`, `offset_kpa` (k,) arrays: On the grid of `PRESSURE_STEP_KPA`."""
     full_count: int
+    """Readings at or above it carry no pressure."""
 
     @cached_property
     def plain_count(self) -> int:

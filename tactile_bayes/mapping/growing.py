@@ -26,18 +26,12 @@ _PORTION = 4096
 
 
 class MapGrid(Record, eq=False):
-    """Lattice of a map's cells on a plane.
-
-    Parameters
-    ----------
-    plane_from_base : (4, 4) array
-        Cells are centred on whole multiples of their side in this `plane`.
-    cell_mm
-        Side of the square cells.
-    """
+    """Lattice of a map's cells on a plane."""
 
     plane_from_base: FloatArray
+    """(4, 4) array: Cells are centred on whole multiples of their side in this `plane`."""
     cell_mm: float = CELL_MM
+    """Side of the square cells."""
 
     def __post_init__(self) -> None:
         check_rigid(self.plane_from_base, name="plane_from_base")
@@ -55,25 +49,17 @@ class MapGrid(Record, eq=False):
 
 
 class Instrument(Record, eq=False, dict=True):
-    """Conversion of counts and poses to pressures on a plane, and the rules for frames that count.
-
-    Parameters
-    ----------
-    head, element_calibration
-        Of the scan head.
-    faults
-        Taxels left out of every frame.
-    pressure_window_kpa
-        Frames whose mean lies outside are left out.
-    normalise
-        ``"mean"`` or ``"none"``. A gain a frame needs all frames at once: see `tactile_bayes.mapping.build_map`.
-    """
+    """Conversion of counts and poses to pressures on a plane, and the rules for frames that count."""
 
     head: HeadGeometry
     element_calibration: ElementCalibration
+    """`head`, `element_calibration`: Of the scan head."""
     faults: Sequence[TaxelFault] = ()
+    """Taxels left out of every frame."""
     pressure_window_kpa: tuple[float, float] = PRESSURE_WINDOW_KPA
+    """Frames whose mean lies outside are left out."""
     normalise: str = "mean"
+    """``"mean"`` or ``"none"``. A gain a frame needs all frames at once: see `tactile_bayes.mapping.build_map`."""
 
     def __post_init__(self) -> None:
         if self.normalise not in ("mean", "none"):

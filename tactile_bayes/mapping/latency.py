@@ -39,27 +39,18 @@ _PROJECTION_ROUNDS, _PROJECTION_TOLERANCE = 40, 1e-4
 
 
 class ShiftFit(Record, eq=False):
-    """Readings of one or several scans at supposed places, ready for a regression on shifts.
-
-    Parameters
-    ----------
-    cells
-        Where the readings lie.
-    levelled : (n,) array
-        Readings without what frames and taxels add to one common map.
-    gradient : (n, 2) array
-        Of the map at each reading, 1/mm along x and y.
-    data : (n,) array
-        Readings with the nuisances taken off.
-    nuisance
-        What is taken off.
-    """
+    """Readings of one or several scans at supposed places, ready for a regression on shifts."""
 
     cells: Cells
+    """Where the readings lie."""
     levelled: FloatArray
+    """(n,) array: Readings without what frames and taxels add to one common map."""
     gradient: FloatArray
+    """(n, 2) array: Of the map at each reading, 1/mm along x and y."""
     data: FloatArray
+    """(n,) array: Readings with the nuisances taken off."""
     nuisance: Nuisance
+    """What is taken off."""
 
     @classmethod
     def of(cls, parts: Sequence[CoarseFrames], places_mm: Sequence[FloatArray]) -> ShiftFit:
@@ -96,21 +87,14 @@ class ShiftFit(Record, eq=False):
 
 
 class Cells(Record, eq=False):
-    """The cells of the map that readings fall in.
-
-    Parameters
-    ----------
-    number : (n,) int array
-        Cell of each reading, row by row of a block of `shape`.
-    offset_mm : (n, 2) array
-        From the cell's centre.
-    shape
-        Rows and columns.
-    """
+    """The cells of the map that readings fall in."""
 
     number: IndexArray
+    """(n,) int array: Cell of each reading, row by row of a block of `shape`."""
     offset_mm: FloatArray
+    """(n, 2) array: From the cell's centre."""
     shape: tuple[int, int]
+    """Rows and columns."""
 
     @classmethod
     def of(cls, places_mm: Sequence[FloatArray]) -> Cells:
@@ -142,23 +126,18 @@ class Cells(Record, eq=False):
 
 
 class Nuisance(Record, eq=False):
-    """What varies besides the map: in each frame, in each block of taxels, and from row to row of the head.
-
-    Parameters
-    ----------
-    bases : (k, 6) arrays
-        Of each scan.
-    shapes
-        Frames and blocks of taxels of each scan.
-    frame, taxel, row_cell : (n,) int arrays
-        Averaged frame, block of taxels, and cell of the map of the head's rows that each reading is of.
-    """
+    """What varies besides the map: in each frame, in each block of taxels, and from row to row of the head."""
 
     bases: tuple[FloatArray, ...]
+    """(k, 6) arrays: Of each scan."""
     shapes: tuple[tuple[int, int], ...]
+    """Frames and blocks of taxels of each scan."""
     frame: IndexArray
     taxel: IndexArray
     row_cell: IndexArray
+    """`frame`, `taxel`, `row_cell` (n,) int arrays: Averaged frame, block of taxels, and cell of the map of the head's
+    rows that each reading is of.
+    """
 
     @classmethod
     def of(cls, parts: Sequence[CoarseFrames], cell: IndexArray) -> Nuisance:
@@ -227,25 +206,17 @@ _NEEDED = "scan back and forth over a lump for 20 s, or give the number of the i
 
 
 class LatencyEstimate(Record):
-    """Estimated latency of the poses' time stamps.
-
-    Parameters
-    ----------
-    latency_ms, sd_ms
-        The delay at which strokes both ways agree, and its standard error.
-    bound_ms
-        Standard error that independent errors of the readings and the tracker's noise alone would leave.
-    frames
-        Frames it was found from.
-    crossings
-        Strokes that cross a lump, towards +x of the plane (or along +y) and back.
-    """
+    """Estimated latency of the poses' time stamps."""
 
     latency_ms: float
     sd_ms: float
+    """`latency_ms`, `sd_ms`: The delay at which strokes both ways agree, and its standard error."""
     bound_ms: float
+    """Standard error that independent errors of the readings and the tracker's noise alone would leave."""
     frames: int
+    """Frames it was found from."""
     crossings: tuple[int, int]
+    """Strokes that cross a lump, towards +x of the plane (or along +y) and back."""
 
 
 def estimate_latency(
@@ -378,28 +349,22 @@ def _strokes(parts: Sequence[_Part], latency_ms: float) -> tuple[IndexArray, Flo
 
 
 class _Regression(Record, eq=False):
-    """The regression at the latency found, and the groups that its errors are shared in.
-
-    Parameters
-    ----------
-    fit
-        Of which the readings and their gradient are used.
-    design, halves : (n,), (2, n) arrays
-        Design of the latency with the whole gradient, and with those of two halves of the strokes.
-    raw : (n,) array
-        Design within frames, with the map left in.
-    stroke, block : (frames,) int arrays
-        Of each averaged frame.
-    ways : (strokes,) array
-    """
+    """The regression at the latency found, and the groups that its errors are shared in."""
 
     fit: ShiftFit
+    """Of which the readings and their gradient are used."""
     design: FloatArray
     halves: FloatArray
+    """`design`, `halves` (n,), (2, n) arrays: Design of the latency with the whole gradient, and with those of two
+    halves of the strokes.
+    """
     raw: FloatArray
+    """(n,) array: Design within frames, with the map left in."""
     stroke: IndexArray
     block: IndexArray
+    """`stroke`, `block` (frames,) int arrays: Of each averaged frame."""
     ways: FloatArray
+    """(strokes,) array."""
 
     @classmethod
     def of(

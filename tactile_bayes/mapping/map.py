@@ -37,36 +37,24 @@ FEW_READINGS = 10
 
 
 class MapRecipe(Record):
-    """How a map was built; a size calibration fits only maps of its own recipe.
-
-    Parameters
-    ----------
-    source
-        ``"scan"`` or ``"grid"`` (a map imported as it is).
-    normalise
-        ``"mean"``, ``"gain"`` or ``"none"``.
-    cell_mm
-        Side of the square cells.
-    pressure_window_kpa
-        The gate on the frame's mean; None for an imported grid.
-    latency_ms
-        By how much a pose's stamp is late against the frames.
-    flat_field
-        Whether the head's own response was taken off.
-    registered
-        Whether the strokes were shifted onto each other.
-    units
-        Of an imported grid's values, as the user named them; empty where unknown. A scan's are kPa.
-    """
+    """How a map was built; a size calibration fits only maps of its own recipe."""
 
     source: str
+    """``"scan"`` or ``"grid"`` (a map imported as it is)."""
     normalise: str
+    """``"mean"``, ``"gain"`` or ``"none"``."""
     cell_mm: float
+    """Side of the square cells."""
     pressure_window_kpa: tuple[float, float] | None = None
+    """The gate on the frame's mean; None for an imported grid."""
     latency_ms: float = 0.0
+    """By how much a pose's stamp is late against the frames."""
     flat_field: bool = False
+    """Whether the head's own response was taken off."""
     registered: bool = False
+    """Whether the strokes were shifted onto each other."""
     units: str = ""
+    """Of an imported grid's values, as the user named them; empty where unknown. A scan's are kPa."""
 
     @property
     def value_unit(self) -> str:
@@ -91,54 +79,38 @@ class MapRecipe(Record):
 
 
 class TactileMap(Record, eq=False):
-    """Mean normalised pressure on the best-fit plane.
-
-    Parameters
-    ----------
-    mean, variance : (ny, nx) arrays
-        Mean and within-cell variance of the readings; NaN where `count` is 0. Without unit after normalising,
-        kPa with ``normalise="none"``.
-    count : (ny, nx) int64 array
-        Readings per cell.
-    x_mm, y_mm : (nx,), (ny,) arrays
-        Cell centres in `plane`; x runs across the head, y along it.
-    recipe
-        How the map was built.
-    plane_from_base : (4, 4) array or None
-        None for an imported grid.
-    patient_from_plane : (4, 4) array or None
-        None without landmarks.
-    background
-        Level far from the lump that normalising defines (1 in the paper's Eqs 5 and 7); None when it is not known.
-    frame_count
-        Frames that went in. Cells share frames, so a map has fewer independent errors than readings.
-    quality
-        Counts and figures for the report (frames dropped low/high, tilt, rms...).
-    masked_taxels
-        Taxels that were left out, one line each: ``"row 3 column 7 dead"``.
-    head
-        Shape of the head that made the scan; None for an imported grid.
-    nipple_mm : (3,) array or None
-        The nipple in `plane`; None where it was not touched.
-    findings
-        What speaks against sizes from it.
-    """
+    """Mean normalised pressure on the best-fit plane."""
 
     mean: FloatArray
     variance: FloatArray
+    """`mean`, `variance` (ny, nx) arrays: Mean and within-cell variance of the readings; NaN where `count` is 0.
+    Without unit after normalising, kPa with ``normalise="none"``.
+    """
     count: np.ndarray[tuple[int, ...], np.dtype[np.int64]]
+    """(ny, nx) int64 array: Readings per cell."""
     x_mm: FloatArray
     y_mm: FloatArray
+    """`x_mm`, `y_mm` (nx,), (ny,) arrays: Cell centres in `plane`; x runs across the head, y along it."""
     recipe: MapRecipe
+    """How the map was built."""
     plane_from_base: FloatArray | None = None
+    """(4, 4) array or None: None for an imported grid."""
     patient_from_plane: FloatArray | None = None
+    """(4, 4) array or None: None without landmarks."""
     background: float | None = 1.0
+    """Level far from the lump that normalising defines (1 in the paper's Eqs 5 and 7); None when it is not known."""
     frame_count: int = 0
+    """Frames that went in. Cells share frames, so a map has fewer independent errors than readings."""
     quality: Mapping[str, float] = field(default_factory=dict)
+    """Counts and figures for the report (frames dropped low/high, tilt, rms...)."""
     masked_taxels: tuple[str, ...] = ()
+    """Taxels that were left out, one line each: ``"row 3 column 7 dead"``."""
     head: HeadShape | None = None
+    """Shape of the head that made the scan; None for an imported grid."""
     nipple_mm: FloatArray | None = None
+    """(3,) array or None: The nipple in `plane`; None where it was not touched."""
     findings: tuple[Finding, ...] = ()
+    """What speaks against sizes from it."""
 
     def __post_init__(self) -> None:
         shape = (len(self.y_mm), len(self.x_mm))
@@ -381,24 +353,16 @@ _LEAST_RISE = 4.0
 
 
 class CellAdvice(Record):
-    """Advice on the size of the cells.
-
-    Parameters
-    ----------
-    sigma_mm
-        Width of the narrower side of the map's highest bump, from its half height.
-    coarsest_mm
-        Largest cell that leaves its widths within one posterior SD of those by cells of 1 mm.
-    cell_mm
-        The map's own.
-    readings
-        Median readings a cell.
-    """
+    """Advice on the size of the cells."""
 
     sigma_mm: float
+    """Width of the narrower side of the map's highest bump, from its half height."""
     coarsest_mm: float
+    """Largest cell that leaves its widths within one posterior SD of those by cells of 1 mm."""
     cell_mm: float
+    """The map's own."""
     readings: float
+    """Median readings a cell."""
 
     def text(self) -> str:
         """One line: which cells measure the bump, and what cells of half the present size would cost."""

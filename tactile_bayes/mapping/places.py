@@ -28,23 +28,19 @@ _PATIENT_SIDES: Final = {
 
 
 class Orientation(Record):
-    """Which axes of the plane point right and up on the screen.
-
-    Parameters
-    ----------
-    right, up
-        ``"+x"``, ``"-x"``, ``"+y"`` or ``"-y"``. Of the eight pairs only four are used: z, into the tissue, always
-        points away from the viewer.
-    words
-        The orientation in a phrase, for captions.
-    notch : (2,) tuple or None
-        Unit vector to the sternal notch on the screen (to the right, upwards); None without landmarks.
-    """
+    """Which axes of the plane point right and up on the screen."""
 
     right: str
     up: str
+    """`right`, `up`: ``"+x"``, ``"-x"``, ``"+y"`` or ``"-y"``. Of the eight pairs only four are used: z, into the
+    tissue, always points away from the viewer.
+    """
     words: str
+    """The orientation in a phrase, for captions."""
     notch: tuple[float, float] | None = None
+    """(2,) tuple or None: Unit vector to the sternal notch on the screen (to the right, upwards); None without
+    landmarks.
+    """
 
     @property
     def swapped(self) -> bool:
@@ -130,27 +126,18 @@ _DEGREES_PER_HOUR: Final = 30.0
 
 
 class ClockPosition(Record):
-    """Place of a point about the nipple, as the examiner sees it who faces the patient: 12 is towards the head.
-
-    Parameters
-    ----------
-    side
-        ``"left"`` or ``"right"``: which breast.
-    distance_mm
-        From the nipple, along the map's plane.
-    distance_sd_mm
-        Its SD, from the lump's centre and the touch of the nipple.
-    angle_deg
-        From the head's direction, clockwise as the examiner sees it, 0 to 360.
-    angle_sd_deg
-        Its SD.
-    """
+    """Place of a point about the nipple, as the examiner sees it who faces the patient: 12 is towards the head."""
 
     side: str
+    """``"left"`` or ``"right"``: which breast."""
     distance_mm: float
+    """From the nipple, along the map's plane."""
     distance_sd_mm: float
+    """Its SD, from the lump's centre and the touch of the nipple."""
     angle_deg: float
+    """From the head's direction, clockwise as the examiner sees it, 0 to 360."""
     angle_sd_deg: float
+    """Its SD."""
 
     @classmethod
     def of_dict(cls, document: Mapping[str, Any] | None) -> ClockPosition | None:

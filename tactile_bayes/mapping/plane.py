@@ -30,21 +30,16 @@ MAX_POSE_GAP_MS = 50.0
 
 
 class FramePoses(Record, eq=False):
-    """The pose of the tracker's sensor at each frame.
-
-    Parameters
-    ----------
-    position_mm : (n, 3) array
-        Tracker sensor in `base`.
-    rotation : (n, 3, 3) array
-        ``p_base = position + rotation @ p_tracker``.
-    known : (n,) bool array
-        False where the tracker said nothing close enough; position and rotation are then meaningless but finite.
-    """
+    """The pose of the tracker's sensor at each frame."""
 
     position_mm: FloatArray
+    """(n, 3) array: Tracker sensor in `base`."""
     rotation: FloatArray
+    """(n, 3, 3) array: ``p_base = position + rotation @ p_tracker``."""
     known: NDArray[np.bool_]
+    """(n,) bool array: False where the tracker said nothing close enough; position and rotation are then meaningless
+    but finite.
+    """
 
     def part(self, frames: slice | NDArray[np.bool_] | NDArray[np.intp]) -> FramePoses:
         """A subset of the frames."""
@@ -128,16 +123,12 @@ Whole = tuple[int, ...]
 
 
 class HeadMoments(Record, eq=False):
-    """First two moments of all taxel centres over frames, in whole steps; add two with ``+``.
-
-    Parameters
-    ----------
-    sums : 28 whole numbers
-        Frames (1), and sums over them: of the mean taxel centre in `base` (3), of its outer products (9, row by row),
-        of the covariance of the taxels about their mean (9), of the head's x axis and of its normal (6).
-    """
+    """First two moments of all taxel centres over frames, in whole steps; add two with ``+``."""
 
     sums: Whole
+    """28 whole numbers: Frames (1), and sums over them: of the mean taxel centre in `base` (3), of its outer products
+    (9, row by row), of the covariance of the taxels about their mean (9), of the head's x axis and of its normal (6).
+    """
 
     def __add__(self, other: HeadMoments) -> HeadMoments:
         return HeadMoments(_sum(self.sums, other.sums))

@@ -259,19 +259,14 @@ class GrowingProfile:
 
 
 class ProfileReader(Record, eq=False):
-    """Fits smooth pressure profiles to frames.
-
-    Parameters
-    ----------
-    solve : (9, taxels) array
-        Takes readings to coefficients of Legendre polynomials at the good taxels, by least squares; no taxel where too
-        few rows or columns have one to tell the polynomials apart.
-    gram : (9, 9) array
-        Inner products of the polynomials.
-    """
+    """Fits smooth pressure profiles to frames."""
 
     solve: FloatArray
+    """(9, taxels) array: Takes readings to coefficients of Legendre polynomials at the good taxels, by least squares;
+    no taxel where too few rows or columns have one to tell the polynomials apart.
+    """
     gram: FloatArray
+    """(9, 9) array: Inner products of the polynomials."""
 
     @classmethod
     def of(cls, good: BoolArray) -> ProfileReader:

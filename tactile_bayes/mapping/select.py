@@ -326,34 +326,25 @@ VALID_SHARE = 0.9
 
 
 class SelectedFrames(Record, eq=False):
-    """A scan with the selection of its frames.
-
-    Parameters
-    ----------
-    scan
-        As recorded.
-    faults
-        Taxels left out of every frame.
-    poses
-        Pose of the tracker at each frame.
-    level_kpa : (n,) array
-        Mean over the valid taxels; NaN where there is none.
-    valid_share : (n,) array
-        Share of the taxels of the array that are good and not saturated.
-    low, high : (n,) bool arrays
-        Frames whose level is below or above the window, among those with a pose and enough valid taxels.
-    used : (n,) bool array
-        Frames that go into the map.
-    """
+    """A scan with the selection of its frames."""
 
     scan: Scan
+    """As recorded."""
     faults: tuple[TaxelFault, ...]
+    """Taxels left out of every frame."""
     poses: FramePoses
+    """Pose of the tracker at each frame."""
     level_kpa: FloatArray
+    """(n,) array: Mean over the valid taxels; NaN where there is none."""
     valid_share: FloatArray
+    """(n,) array: Share of the taxels of the array that are good and not saturated."""
     low: BoolArray
     high: BoolArray
+    """`low`, `high` (n,) bool arrays: Frames whose level is below or above the window, among those with a pose and
+    enough valid taxels.
+    """
     used: BoolArray
+    """(n,) bool array: Frames that go into the map."""
 
     @property
     def dropped_no_pose(self) -> int:

@@ -38,29 +38,20 @@ _MOST_NUMBERS = 3e7
 
 
 class StrokeShift(Record):
-    """Shift of one stroke against all others.
-
-    Parameters
-    ----------
-    start, stop
-        Among the used frames of its scan.
-    scan
-        Number of the scan, from 0.
-    direction
-        +1 where the head moved along +x of the plane, else -1.
-    shift_mm, sd_mm
-        Along x of the plane, and its standard error.
-    known
-        Whether the stroke crossed a lump or an edge that fixes a shift; else the shift is 0.
-    """
+    """Shift of one stroke against all others."""
 
     start: int
     stop: int
+    """`start`, `stop`: Among the used frames of its scan."""
     scan: int
+    """Number of the scan, from 0."""
     direction: int
+    """+1 where the head moved along +x of the plane, else -1."""
     shift_mm: float = 0.0
     sd_mm: float = np.inf
+    """`shift_mm`, `sd_mm`: Along x of the plane, and its standard error."""
     known: bool = False
+    """Whether the stroke crossed a lump or an edge that fixes a shift; else the shift is 0."""
 
 
 def find_strokes(source: Source, number: int) -> list[StrokeShift]:
@@ -155,21 +146,15 @@ def mobility(strokes: Sequence[StrokeShift]) -> tuple[float, float]:
 
 
 class _Part(Record, eq=False):
-    """One scan's averaged frames.
-
-    Parameters
-    ----------
-    coarse
-        Thinned out where there are many strokes.
-    places_mm : (m, k, 2) array
-    stroke, block : (m,) int arrays
-        Among the strokes of all scans, and which frames share errors.
-    """
+    """One scan's averaged frames."""
 
     coarse: CoarseFrames
+    """Thinned out where there are many strokes."""
     places_mm: FloatArray
+    """(m, k, 2) array."""
     stroke: IndexArray
     block: IndexArray
+    """`stroke`, `block` (m,) int arrays: Among the strokes of all scans, and which frames share errors."""
 
     @classmethod
     def of(cls, source: Source, number: int, strokes: Sequence[StrokeShift]) -> _Part:
@@ -191,21 +176,14 @@ class _Part(Record, eq=False):
 
 
 class _Round(Record, eq=False):
-    """The regression at some shifts.
-
-    Parameters
-    ----------
-    normal : (K, K) array
-        Product of the strokes' designs over the variance of what is left.
-    score : (K,) array
-        Their product with what is left, over the same.
-    widened : (K,) array
-        By how much standard errors exceed those of independent errors and exact slopes.
-    """
+    """The regression at some shifts."""
 
     normal: FloatArray
+    """(K, K) array: Product of the strokes' designs over the variance of what is left."""
     score: FloatArray
+    """(K,) array: Their product with what is left, over the same."""
     widened: FloatArray
+    """(K,) array: By how much standard errors exceed those of independent errors and exact slopes."""
 
     @classmethod
     def of(cls, parts: Sequence[_Part], shifts_mm: FloatArray) -> _Round:

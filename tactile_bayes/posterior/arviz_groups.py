@@ -23,20 +23,14 @@ if TYPE_CHECKING:
 
 
 class FittedCells(Record, eq=False):
-    """Cells of a fit window.
-
-    Parameters
-    ----------
-    x_mm, y_mm : (n,) arrays
-        Their centres in `plane`.
-    value, fit : (n,) arrays
-        The map's values, and the model's at the posterior's middle.
-    """
+    """Cells of a fit window."""
 
     x_mm: FloatArray
     y_mm: FloatArray
+    """`x_mm`, `y_mm` (n,) arrays: Their centres in `plane`."""
     value: FloatArray
     fit: FloatArray
+    """`value`, `fit` (n,) arrays: The map's values, and the model's at the posterior's middle."""
 
     @property
     def residual(self) -> FloatArray:
@@ -75,18 +69,12 @@ LEAST_SIZED = 100
 
 
 class DrawGroup(Record, eq=False):
-    """Arrays of one group with the names of their axes, and what is to be said of it.
-
-    Parameters
-    ----------
-    arrays
-        Names of the axes, and values.
-    notes
-        Text by name.
-    """
+    """Arrays of one group with the names of their axes, and what is to be said of it."""
 
     arrays: Mapping[str, tuple[tuple[str, ...], FloatArray]]
+    """Names of the axes, and values."""
     notes: Mapping[str, str] = field(default_factory=dict)
+    """Text by name."""
 
 
 def inference_groups(

@@ -30,20 +30,14 @@ class Bump(Record):
 
     The parameter vector is ``(amplitude, x, y, p, q[, r][, background])``: mm for the centre, p and q the log widths
     of `covariance_from_log_widths`.
-
-    Parameters
-    ----------
-    rotated
-        Whether the axes of the ellipse may turn (adds r).
-    background
-        Fixed level (1 in Eq 7), or None to fit it.
-    scale
-        Unit of amplitude for priors and steps, see `cells.value_scale`.
     """
 
     rotated: bool = False
+    """Whether the axes of the ellipse may turn (adds r)."""
     background: float | None = 1.0
+    """Fixed level (1 in Eq 7), or None to fit it."""
     scale: float = 1.0
+    """Unit of amplitude for priors and steps, see `cells.value_scale`."""
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -157,18 +157,12 @@ LEAST_VARIANCE = 1e-12
 
 
 class FieldAnswer(Record, eq=False):
-    """Detection and scene of a map under correlated errors.
-
-    Parameters
-    ----------
-    detection
-        Whether there is a lump.
-    choice
-        The scene.
-    """
+    """Detection and scene of a map under correlated errors."""
 
     detection: Detection
+    """Whether there is a lump."""
     choice: SceneChoice
+    """The scene."""
 
 
 class FieldDraws(Record, eq=False):

@@ -125,30 +125,23 @@ class Sampled(Record, eq=False):
     A rib whose crest lies outside the window shows a flank only: its place and width trade against each other along a
     curve that no sampler follows cheaply and that hardly concerns the bump. What that costs the bump in certainty is
     added afterwards, as large as the Gaussians have it.
-
-    Parameters
-    ----------
-    mean, covariance : (k,), (k, k) arrays
-        About, for the density.
-    beside : (j,) array
-        The second structure's parameters.
-    spread : (k, k) array
-        Root of the covariance that the second structure's uncertainty adds.
-    parts
-        A Gaussian for each noise field, also for those with little share of the density at the mode: under strongly
-        correlated errors the widths are less certain, so that a field with 0.3 % of the density there had 4 % of the
-        posterior, and all of its tails. None where one of them has no maximum.
-    solved
-        Where solutions are kept; None keeps none.
     """
 
     fit: FieldFit
     mean: FloatArray
     covariance: FloatArray
+    """`mean`, `covariance` (k,), (k, k) arrays: About, for the density."""
     beside: FloatArray
+    """(j,) array: The second structure's parameters."""
     spread: FloatArray
+    """(k, k) array: Root of the covariance that the second structure's uncertainty adds."""
     parts: Gaussians | None = None
+    """A Gaussian for each noise field, also for those with little share of the density at the mode: under strongly
+    correlated errors the widths are less certain, so that a field with 0.3 % of the density there had 4 % of the
+    posterior, and all of its tails. None where one of them has no maximum.
+    """
     solved: Solved | None = None
+    """Where solutions are kept; None keeps none."""
 
     @classmethod
     def of(cls, fit: FieldFit) -> Sampled:

@@ -13,16 +13,7 @@ from tactile_bayes.geometry import FloatArray
 
 
 class MapPosterior(Record, eq=False):
-    """Joint draws of the quantities in Eq 7, each (chain, draw).
-
-    Parameters
-    ----------
-    oblique
-        Mean and SD of r, the half log axis ratio 45 degrees from the map's x axis, where the draws have none and it was
-        measured beside them; None otherwise.
-    irregular
-        Whether the bump is less regular than a ball's, see `correlated.outline`.
-    """
+    """Joint draws of the quantities in Eq 7, each (chain, draw)."""
 
     amplitude: FloatArray
     sigma_x_mm: FloatArray
@@ -33,7 +24,11 @@ class MapPosterior(Record, eq=False):
     background: FloatArray
     noise_sd: FloatArray
     oblique: tuple[float, float] | None = None
+    """Mean and SD of r, the half log axis ratio 45 degrees from the map's x axis, where the draws have none and it was
+    measured beside them; None otherwise.
+    """
     irregular: bool = False
+    """Whether the bump is less regular than a ball's, see `correlated.outline`."""
 
     @property
     def medians(self) -> tuple[float, float, float]:
@@ -46,32 +41,25 @@ class MapPosterior(Record, eq=False):
 
 
 class NoiseFigures(Record):
-    """Figures of the errors, and the decisions made under them.
-
-    Parameters
-    ----------
-    noise
-        ``"independent"`` or ``"field"``.
-    rotated, rotation_odds
-        Whether the ellipse is rotated, and the odds of it; None where that was decided beforehand.
-    figures
-        Of the noise model: inflation and degrees of freedom, or the field's cosines, length and share.
-    level_offset
-        Of the cells about the bump from the background, under independent errors; None where the level is integrated
-        out.
-    places_share
-        Of the width variance, that errors of the frames' places make; None where a map does not give them.
-    passed_over
-        Methods that could not be trusted, and why.
-    """
+    """Figures of the errors, and the decisions made under them."""
 
     noise: str
+    """``"independent"`` or ``"field"``."""
     rotated: bool
     rotation_odds: float | None
+    """`rotated`, `rotation_odds`: Whether the ellipse is rotated, and the odds of it; None where that was decided
+    beforehand.
+    """
     figures: Mapping[str, float]
+    """Of the noise model: inflation and degrees of freedom, or the field's cosines, length and share."""
     level_offset: float | None = None
+    """Of the cells about the bump from the background, under independent errors; None where the level is integrated
+    out.
+    """
     places_share: float | None = None
+    """Of the width variance, that errors of the frames' places make; None where a map does not give them."""
     passed_over: tuple[str, ...] = ()
+    """Methods that could not be trusted, and why."""
 
     def as_dict(self) -> dict[str, object]:
         """The figures as plain data."""
@@ -83,38 +71,26 @@ class NoiseFigures(Record):
 
 
 class Diagnostics(Record):
-    """Diagnostics of an estimate.
-
-    Parameters
-    ----------
-    cells, covered_share
-        Cells in the fit window, and the share of it that they cover.
-    fat_mm
-        Depth of fat that the size is for; None where the map does not give it.
-    method, sampler
-        The method that drew, and its own figures.
-    noise
-        Of the errors.
-    calibration
-        Name of the calibration that gave the size, in words; not in the JSON.
-    size_calibration
-        Which calibration gave the size and what it cannot know, in words.
-    repeatability
-        How far exams of one mass lie apart at the site, in words; empty where nobody learned it.
-    convergence
-        Of chains: R-hat, effective draws and Monte-Carlo errors of each size and width, see `arviz_data.convergence`.
-    """
+    """Diagnostics of an estimate."""
 
     cells: int
     covered_share: float
+    """`cells`, `covered_share`: Cells in the fit window, and the share of it that they cover."""
     fat_mm: float | None
+    """Depth of fat that the size is for; None where the map does not give it."""
     method: str
     sampler: Mapping[str, float]
+    """`method`, `sampler`: The method that drew, and its own figures."""
     noise: NoiseFigures
+    """Of the errors."""
     calibration: str = ""
+    """Name of the calibration that gave the size, in words; not in the JSON."""
     size_calibration: str = ""
+    """Which calibration gave the size and what it cannot know, in words."""
     repeatability: str = ""
+    """How far exams of one mass lie apart at the site, in words; empty where nobody learned it."""
     convergence: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    """Of chains: R-hat, effective draws and Monte-Carlo errors of each size and width, see `arviz_data.convergence`."""
 
     def as_dict(self) -> dict[str, object]:
         """The diagnostics as plain data."""

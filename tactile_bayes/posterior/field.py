@@ -34,21 +34,16 @@ TOUCHED = 1e-2
 
 
 class Whitening(Record, eq=False):
-    """The noise field of one correlation length, prepared for every share.
-
-    Parameters
-    ----------
-    length_mm
-        Correlation length.
-    turn : (cosines^2, k) array
-        Takes inner products with the cosines, ``D^-1 Phi``, to directions in which the field's precision is diagonal.
-    eigenvalues : (k,) array
-        Of ``S^1/2 Phi' D^-1 Phi S^1/2``.
-    """
+    """The noise field of one correlation length, prepared for every share."""
 
     length_mm: float
+    """Correlation length."""
     turn: FloatArray
+    """(cosines^2, k) array: Takes inner products with the cosines, ``D^-1 Phi``, to directions in which the field's
+    precision is diagonal.
+    """
     eigenvalues: FloatArray
+    """(k,) array: Of ``S^1/2 Phi' D^-1 Phi S^1/2``."""
 
     def shrinkage(self, share: float | FloatArray) -> FloatArray:
         """(..., k) weights of the squared projections that the field absorbs: ``rho / (1 + rho lambda)``."""
@@ -149,21 +144,14 @@ RESOLVED = 3.0
 
 
 class Projected(Record, eq=False):
-    """Inner products of m templates, with cells weighted by their inverse independent variance.
-
-    Parameters
-    ----------
-    low : (m, cosines^2) array
-        With the cosines.
-    plain : (m, c) array
-        With the fixed vectors.
-    square : (m,) array
-        With themselves.
-    """
+    """Inner products of m templates, with cells weighted by their inverse independent variance."""
 
     low: FloatArray
+    """(m, cosines^2) array: With the cosines."""
     plain: FloatArray
+    """(m, c) array: With the fixed vectors."""
     square: FloatArray
+    """(m,) array: With themselves."""
 
 
 class Profiles(Record, eq=False):

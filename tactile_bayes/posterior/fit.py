@@ -41,22 +41,17 @@ class Mixture(Gaussians, eq=False):
 
 
 class FieldFit(Record, eq=False):
-    """A scene fitted at the mode of its marginal posterior.
-
-    Parameters
-    ----------
-    target
-        Its density, with the noise fields that matter there.
-    mode, covariance : (p,), (p, p) arrays
-        Of the scene's parameters; the covariance is the mixture's, not the curvature at the mode.
-    mixture
-        One Gaussian per noise field.
-    """
+    """A scene fitted at the mode of its marginal posterior."""
 
     target: CollapsedTarget
+    """Its density, with the noise fields that matter there."""
     mode: FloatArray
     covariance: FloatArray
+    """`mode`, `covariance` (p,), (p, p) arrays: Of the scene's parameters; the covariance is the mixture's, not the
+    curvature at the mode.
+    """
     mixture: Mixture
+    """One Gaussian per noise field."""
 
     @property
     def scene(self) -> Scene:

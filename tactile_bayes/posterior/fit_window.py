@@ -22,21 +22,14 @@ MAPS_AT_HAND = 4
 
 
 class PoseNoise(Record):
-    """Tracker position error of a map, one error per frame: the figures `presets.POSE_NOISE`.
-
-    Parameters
-    ----------
-    sd_mm
-        SD of a frame's place along x and y: bumps are that much wider on the map.
-    side_mm
-        Sides of the array along x and y: cells closer together than these share frames, and with them errors.
-    frames_per_reading
-        Frames with an error of their own that felt a cell, over the readings in it.
-    """
+    """Tracker position error of a map, one error per frame: the figures `presets.POSE_NOISE`."""
 
     sd_mm: tuple[float, float]
+    """SD of a frame's place along x and y: bumps are that much wider on the map."""
     side_mm: tuple[float, float]
+    """Sides of the array along x and y: cells closer together than these share frames, and with them errors."""
     frames_per_reading: float
+    """Frames with an error of their own that felt a cell, over the readings in it."""
 
     @classmethod
     def of(cls, tactile_map: TactileMap) -> PoseNoise | None:
@@ -48,31 +41,24 @@ class PoseNoise(Record):
 
 
 class FitCells(Record, eq=False):
-    """The cells of one window, flattened.
-
-    Parameters
-    ----------
-    x_mm, y_mm : (k,) arrays
-        Cell centres in `plane`.
-    value, variance, count : (k,) arrays
-        Mean, within-cell variance (NaN where it is not known) and number of readings.
-    row, column : (k,) int arrays
-        Where the cells lie in the map's grid.
-    cell_mm
-        Side of a cell.
-    pose_noise
-        Of the frames; None where the map does not tell.
-    """
+    """The cells of one window, flattened."""
 
     x_mm: FloatArray
     y_mm: FloatArray
+    """`x_mm`, `y_mm` (k,) arrays: Cell centres in `plane`."""
     value: FloatArray
     variance: FloatArray
     count: FloatArray
+    """`value`, `variance`, `count` (k,) arrays: Mean, within-cell variance (NaN where it is not known) and number of
+    readings.
+    """
     row: np.ndarray[tuple[int, ...], np.dtype[np.intp]]
     column: np.ndarray[tuple[int, ...], np.dtype[np.intp]]
+    """`row`, `column` (k,) int arrays: Where the cells lie in the map's grid."""
     cell_mm: float
+    """Side of a cell."""
     pose_noise: PoseNoise | None = None
+    """Of the frames; None where the map does not tell."""
 
     def __len__(self) -> int:
         return len(self.value)

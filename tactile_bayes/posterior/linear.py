@@ -21,62 +21,44 @@ LEAST_POWER = 1e-9
 
 
 class LinearSolution(Record, eq=False):
-    """Conditional posterior of the linear parameters for m shapes and h fields: a multivariate t.
-
-    Parameters
-    ----------
-    amplitude : (m, h, v) array
-        Conditional means under a flat prior.
-    power : (m, h, v, v) array
-        Their precision times tau^2.
-    level, level_covariance : (h, c), (h, c, c) arrays
-        Level and tilt at amplitudes of 0, and their covariance over tau^2 given the amplitudes.
-    level_slope : (m, h, v, c) array
-        By how much level and tilt fall as an amplitude rises.
-    sum_of_squares : (m, h) array
-    """
+    """Conditional posterior of the linear parameters for m shapes and h fields: a multivariate t."""
 
     amplitude: FloatArray
+    """(m, h, v) array: Conditional means under a flat prior."""
     power: FloatArray
+    """(m, h, v, v) array: Their precision times tau^2."""
     level: FloatArray
     level_covariance: FloatArray
+    """`level`, `level_covariance` (h, c), (h, c, c) arrays: Level and tilt at amplitudes of 0, and their covariance
+    over tau^2 given the amplitudes.
+    """
     level_slope: FloatArray
+    """(m, h, v, c) array: By how much level and tilt fall as an amplitude rises."""
     sum_of_squares: FloatArray
+    """(m, h) array."""
 
 
 class FieldColumns(Record, eq=False):
-    """Fixed columns and data under the noise fields of one length: the part that does not depend on the shape.
-
-    Parameters
-    ----------
-    field
-        The length.
-    shares : (h,) array
-    log_prior
-        Log prior probability of each share.
-    weight : (k, h) array
-        Of the squared projections that the field takes away, a column a share.
-    plain : (k, h * (c + 1)) array
-        Projections of the fixed columns and the data, so weighted.
-    gram : (h, c + 1, c + 1) array
-        Columns and data with each other.
-    inverse : (h, c, c) array
-        Of the columns' part.
-    log_det : (h,) array
-        Log determinant of the covariance (over that of D) and of the columns' part.
-    floor
-        Sum of squares that is noise in any case.
-    """
+    """Fixed columns and data under the noise fields of one length: the part that does not depend on the shape."""
 
     field: Whitening
+    """The length."""
     shares: FloatArray
+    """(h,) array."""
     log_prior: float
+    """Log prior probability of each share."""
     weight: FloatArray
+    """(k, h) array: Of the squared projections that the field takes away, a column a share."""
     plain: FloatArray
+    """(k, h * (c + 1)) array: Projections of the fixed columns and the data, so weighted."""
     gram: FloatArray
+    """(h, c + 1, c + 1) array: Columns and data with each other."""
     inverse: FloatArray
+    """(h, c, c) array: Of the columns' part."""
     log_det: FloatArray
+    """(h,) array: Log determinant of the covariance (over that of D) and of the columns' part."""
     floor: float
+    """Sum of squares that is noise in any case."""
 
     @classmethod
     def of(
@@ -108,21 +90,14 @@ class FieldColumns(Record, eq=False):
 
 
 class Inner(Record, eq=False):
-    """Inner products of m templates under the noise fields of one length with h shares.
-
-    Parameters
-    ----------
-    plain : (m, h, c + 1) array
-        With the fixed columns and the data.
-    square : (m, h) array
-        With themselves.
-    low : (m, k) array
-        Projections on the field's directions; none where templates are never held against others.
-    """
+    """Inner products of m templates under the noise fields of one length with h shares."""
 
     plain: FloatArray
+    """(m, h, c + 1) array: With the fixed columns and the data."""
     square: FloatArray
+    """(m, h) array: With themselves."""
     low: FloatArray
+    """(m, k) array: Projections on the field's directions; none where templates are never held against others."""
 
     @classmethod
     def of(cls, projected: Projected, columns: FieldColumns) -> Inner:

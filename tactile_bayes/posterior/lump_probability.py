@@ -38,25 +38,18 @@ NO_EVIDENCE: Final = "no lump by the evidence"
 
 
 class Weighed(Record, eq=False):
-    """A rise with the odds of a bump there, and the probability that it is a lump.
-
-    Parameters
-    ----------
-    detection
-        Of a bump against smooth errors, and a ridge where one rises.
-    centre_mm
-        Of the bump.
-    features
-        Log of 1 plus the log Bayes factor, log of the axis ratio, by how much the log of the width exceeds that of
-        `WIDE_MM`, share of the bump that the map does not cover, and 1 where a fault speaks against measuring it.
-    candidate
-        Where the search met it.
-    """
+    """A rise with the odds of a bump there, and the probability that it is a lump."""
 
     detection: Detection
+    """Of a bump against smooth errors, and a ridge where one rises."""
     centre_mm: tuple[float, float]
+    """Of the bump."""
     features: tuple[float, ...]
+    """Log of 1 plus the log Bayes factor, log of the axis ratio, by how much the log of the width exceeds that of
+    `WIDE_MM`, share of the bump that the map does not cover, and 1 where a fault speaks against measuring it.
+    """
     candidate: Candidate | None = None
+    """Where the search met it."""
 
     @property
     def axis_ratio(self) -> float:
@@ -133,24 +126,16 @@ LEAST_CELLS, LEAST_SHARE, NEAR_MM = 100, 0.6, 7.5
 
 
 class SmallestLumps(Record, eq=False):
-    """Diameters in mm of the smallest ball that a map would have shown with `PROBABILITY`.
-
-    Parameters
-    ----------
-    places_mm : (n, 2) array
-        In `plane`.
-    depths_mm : (k,) array
-        Of the ball's middle below the skin.
-    d_mm : (n, k) array
-        At each place for each depth; inf where not even the largest ball would have shown.
-    spacing_mm
-        Between the places.
-    """
+    """Diameters in mm of the smallest ball that a map would have shown with `PROBABILITY`."""
 
     places_mm: FloatArray
+    """(n, 2) array: In `plane`."""
     depths_mm: FloatArray
+    """(k,) array: Of the ball's middle below the skin."""
     d_mm: FloatArray
+    """(n, k) array: At each place for each depth; inf where not even the largest ball would have shown."""
     spacing_mm: float
+    """Between the places."""
 
     def as_dict(self) -> dict[str, Any]:
         """Plain data, as in the JSON."""

@@ -45,18 +45,14 @@ LEAST_CELLS, LEAST_IN_PIECE = 4.0, 1.0
 
 
 class Surroundings(Record, eq=False):
-    """Smoothed map less its level, not finite where the map has no data.
-
-    Parameters
-    ----------
-    x_mm : (nx,) array
-    y_mm : (ny,) array
-    excess : (ny, nx) array
-    """
+    """Smoothed map less its level, not finite where the map has no data."""
 
     x_mm: FloatArray
+    """(nx,) array."""
     y_mm: FloatArray
+    """(ny,) array."""
     excess: FloatArray
+    """(ny, nx) array."""
 
     @classmethod
     def of(cls, tactile_map: TactileMap) -> Surroundings:

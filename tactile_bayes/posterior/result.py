@@ -31,19 +31,13 @@ TAIL = 0.025
 
 
 class Sensitivity(Record):
-    """Effect of doubling the width prior's SD, in posterior SDs.
-
-    Parameters
-    ----------
-    median, ends
-        By quantity: shift of the median, and the larger shift of the two ends of the 95 % interval.
-    pareto_k
-        Shape of the weights; above 0.7 the shifts are not to be trusted.
-    """
+    """Effect of doubling the width prior's SD, in posterior SDs."""
 
     median: Mapping[str, float]
     ends: Mapping[str, float]
+    """`median`, `ends`: By quantity: shift of the median, and the larger shift of the two ends of the 95 % interval."""
     pareto_k: float
+    """Shape of the weights; above 0.7 the shifts are not to be trusted."""
 
     def as_dict(self) -> dict[str, object]:
         """Plain data."""
@@ -98,27 +92,19 @@ class ModalBump(Record):
 
 
 class Rise(Record):
-    """Another rise on the map.
-
-    Parameters
-    ----------
-    x_mm, y_mm
-        Its centre in `plane`.
-    distance_mm
-        From the lump that was measured; None where there is none.
-    amplitude, sigma_x_mm, sigma_y_mm
-        Of its bump at the mode; widths along the axes of its ellipse.
-    probability
-        That it is a lump, as `Detection` has it.
-    """
+    """Another rise on the map."""
 
     x_mm: float
     y_mm: float
+    """`x_mm`, `y_mm`: Its centre in `plane`."""
     distance_mm: float | None
+    """From the lump that was measured; None where there is none."""
     amplitude: float
     sigma_x_mm: float
     sigma_y_mm: float
+    """`amplitude`, `sigma_x_mm`, `sigma_y_mm`: Of its bump at the mode; widths along the axes of its ellipse."""
     probability: float
+    """That it is a lump, as `Detection` has it."""
 
     def as_dict(self) -> dict[str, float | None]:
         """Plain data, as in the JSON."""
@@ -126,65 +112,50 @@ class Rise(Record):
 
 
 class Estimate(Record, eq=False):
-    """The answer for one map.
-
-    Parameters
-    ----------
-    status, reason
-        ``"estimate"``, or ``"no_estimate"`` and why. With an estimate the reason says what is missing from it, if
-        anything.
-    detection
-        None when no bump could be tested.
-    fit, draws, map_posterior, size
-        None without an estimate; `size` is None also without a size calibration.
-    candidates
-        Every place that was looked at.
-    diagnostics
-        Figures and flags for the report; None where nothing was drawn.
-    left_out
-        What the estimate does not contain, in words.
-    code, advice, on_paper, about_mm
-        Without an estimate: as in `Abstention`.
-    weighed
-        The lump of the answer, or the rise that is most like one, with its probability; None where nothing was weighed.
-    smallest
-        On a map without a lump: the smallest that it would have shown; None where nobody has asked.
-    scene
-        Under a noise field: what the window holds, and what was asked about it.
-    sensitivity
-        How far the answer leans on the prior of the widths.
-    other_rises
-        Other rises that are lumps by the evidence, see `other_rises.other_rises`; empty where nobody has looked.
-    bump
-        The bump at the mode of the lump that the answer is about, sized or not; None where there is no lump.
-    masses
-        All masses of the map, see `masses.with_masses`; empty where nobody has looked.
-    findings
-        What speaks against the answer, cautions first.
-    """
+    """The answer for one map."""
 
     status: Status
     reason: str
+    """`status`, `reason`: ``"estimate"``, or ``"no_estimate"`` and why. With an estimate the reason says what is
+    missing from it, if anything.
+    """
     detection: Detection | None = None
+    """None when no bump could be tested."""
     fit: BumpFit | None = None
     draws: ParameterDraws | None = None
     map_posterior: MapPosterior | None = None
     size: SizePosterior | None = None
+    """`fit`, `draws`, `map_posterior`, `size`: None without an estimate; `size` is None also without a size
+    calibration.
+    """
     candidates: tuple[Candidate, ...] = ()
+    """Every place that was looked at."""
     diagnostics: Diagnostics | None = None
+    """Figures and flags for the report; None where nothing was drawn."""
     left_out: tuple[str, ...] = ()
+    """What the estimate does not contain, in words."""
     code: str = ""
     advice: str = ""
     on_paper: str = ""
     about_mm: tuple[float, float] | None = None
+    """`code`, `advice`, `on_paper`, `about_mm`: Without an estimate: as in `Abstention`."""
     weighed: Weighed | None = None
+    """The lump of the answer, or the rise that is most like one, with its probability; None where nothing was weighed.
+    """
     smallest: SmallestLumps | None = None
+    """On a map without a lump: the smallest that it would have shown; None where nobody has asked."""
     scene: SceneChoice | None = None
+    """Under a noise field: what the window holds, and what was asked about it."""
     sensitivity: Sensitivity | None = None
+    """How far the answer leans on the prior of the widths."""
     other_rises: tuple[Rise, ...] = ()
+    """Other rises that are lumps by the evidence, see `other_rises.other_rises`; empty where nobody has looked."""
     bump: ModalBump | None = None
+    """The bump at the mode of the lump that the answer is about, sized or not; None where there is no lump."""
     masses: tuple[Mass, ...] = ()
+    """All masses of the map, see `masses.with_masses`; empty where nobody has looked."""
     findings: tuple[Finding, ...] = ()
+    """What speaks against the answer, cautions first."""
 
     @property
     def probability(self) -> float | None:
@@ -193,25 +164,17 @@ class Estimate(Record, eq=False):
 
 
 class Mass(Record, eq=False):
-    """One of the masses on a map.
-
-    Parameters
-    ----------
-    x_mm, y_mm
-        Its centre in `plane`: the posterior median, or where the fit has it.
-    probability
-        That it is a lump; of a second lump in another's window, by its odds.
-    estimate
-        Its own: draws and size, or why there is none.
-    reported
-        Whether the map's `Estimate` is this mass's.
-    """
+    """One of the masses on a map."""
 
     x_mm: float
     y_mm: float
+    """`x_mm`, `y_mm`: Its centre in `plane`: the posterior median, or where the fit has it."""
     probability: float
+    """That it is a lump; of a second lump in another's window, by its odds."""
     estimate: Estimate
+    """Its own: draws and size, or why there is none."""
     reported: bool = False
+    """Whether the map's `Estimate` is this mass's."""
 
     @property
     def largest_mm(self) -> float | None:

@@ -17,27 +17,18 @@ from tactile_bayes.posterior.white import WIDEST_IN_RADII
 
 
 class Problem(Record, eq=False):
-    """A window with its cells, and the assumptions about a bump in it.
-
-    Parameters
-    ----------
-    window
-        The cells; scenes share one, and with it the noise fields.
-    prior
-        On widths and amplitudes.
-    radius_mm
-        Of the window; bounds the centre about the window's middle.
-    amplitude_scale
-        Unit of the amplitudes' prior, see `cells.value_scale`.
-    departure : (k, n) array
-        Further fixed columns, see `correlated.peakedness`; None for none.
-    """
+    """A window with its cells, and the assumptions about a bump in it."""
 
     window: Window
+    """The cells; scenes share one, and with it the noise fields."""
     prior: BumpPrior
+    """On widths and amplitudes."""
     radius_mm: float
+    """Of the window; bounds the centre about the window's middle."""
     amplitude_scale: float = 1.0
+    """Unit of the amplitudes' prior, see `cells.value_scale`."""
     departure: FloatArray | None = None
+    """(k, n) array: Further fixed columns, see `correlated.peakedness`; None for none."""
 
     @property
     def widest_mm(self) -> float:
@@ -93,20 +84,14 @@ class Scene(Record):
     The parameters are ``u, v, x, y`` (logs of the widths while nothing is turned, and the centre), without v for a
     round bump, with r for a turned one; then ``x2, y2, w2`` (centre and log width of a second round lump) or
     ``angle, offset, w2`` (a ridge). A ridge in the bump's place has ``u, along, across``: log width, angle, offset.
-
-    Parameters
-    ----------
-    shape
-        Of the bump.
-    tilt
-        Whether the level may slope.
-    extra
-        What lies beside the bump.
     """
 
     shape: Shape = "ellipse"
+    """Of the bump."""
     tilt: bool = True
+    """Whether the level may slope."""
     extra: Extra = ""
+    """What lies beside the bump."""
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -47,30 +47,20 @@ Progress = Callable[[int, int], None]
 
 
 class MapDraws(Record, eq=False):
-    """Posterior draws of one lump under a noise model.
-
-    Parameters
-    ----------
-    detection
-        The odds of a lump, as the draws left them.
-    fit
-        The least-squares fit that the draws started from.
-    draws
-        Of the model's own parameters.
-    posterior
-        The joint draws by name.
-    figures
-        Of the fit and the noise, for the report.
-    scene
-        What the window holds, under correlated errors.
-    """
+    """Posterior draws of one lump under a noise model."""
 
     detection: Detection
+    """The odds of a lump, as the draws left them."""
     fit: BumpFit
+    """The least-squares fit that the draws started from."""
     draws: ParameterDraws
+    """Of the model's own parameters."""
     posterior: MapPosterior
+    """The joint draws by name."""
     figures: NoiseFigures
+    """Of the fit and the noise, for the report."""
     scene: SceneChoice | None = None
+    """What the window holds, under correlated errors."""
 
 
 class Assessment(Protocol):

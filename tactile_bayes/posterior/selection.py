@@ -141,57 +141,40 @@ ASKING = ("auto", "second-lump", "rib")
 
 
 class Structure(Record):
-    """A question about the scene, with its answer.
-
-    Parameters
-    ----------
-    name
-        ``"ellipse"`` (against round), ``"rotated"``, ``"tilt"``, ``"second lump"``, ``"rib"``, ``"departure"`` (from a
-        Gaussian).
-    odds
-        Bayes factor of the scene with it against the scene without; an upper bound where `bound`.
-    supported
-        Whether the evidence supports it: the odds exceed a threshold.
-    used
-        Whether the draws have it.
-    bound
-        Whether the odds are a bound from the best of a grid of templates.
-    change_x_sd, change_y_sd
-        By how many posterior SDs the median of ln sigma_x and ln sigma_y would change, had it been decided the other
-        way; None where that was not fitted.
-    place
-        Where it lies or what it is like, in words; empty when there is nothing to say.
-    """
+    """A question about the scene, with its answer."""
 
     name: str
+    """``"ellipse"`` (against round), ``"rotated"``, ``"tilt"``, ``"second lump"``, ``"rib"``, ``"departure"`` (from a
+    Gaussian).
+    """
     odds: float
+    """Bayes factor of the scene with it against the scene without; an upper bound where `bound`."""
     supported: bool
+    """Whether the evidence supports it: the odds exceed a threshold."""
     used: bool
+    """Whether the draws have it."""
     bound: bool = False
+    """Whether the odds are a bound from the best of a grid of templates."""
     change_x_sd: float | None = None
     change_y_sd: float | None = None
+    """`change_x_sd`, `change_y_sd`: By how many posterior SDs the median of ln sigma_x and ln sigma_y would change, had
+    it been decided the other way; None where that was not fitted.
+    """
     place: str = ""
+    """Where it lies or what it is like, in words; empty when there is nothing to say."""
 
 
 class SceneChoice(Record, eq=False):
-    """The scene chosen for the draws, and the evidence for it.
-
-    Parameters
-    ----------
-    fit
-        Its mode.
-    plain
-        The fit without a second structure, by which a lump is detected.
-    supported
-        The simplest shape that the map supports: ``"round"``, ``"ellipse"`` or ``"rotated"``.
-    structures
-        Every question asked.
-    """
+    """The scene chosen for the draws, and the evidence for it."""
 
     fit: FieldFit
+    """Its mode."""
     plain: FieldFit
+    """The fit without a second structure, by which a lump is detected."""
     supported: str
+    """The simplest shape that the map supports: ``"round"``, ``"ellipse"`` or ``"rotated"``."""
     structures: tuple[Structure, ...] = field(default_factory=tuple)
+    """Every question asked."""
 
 
 def choose_shape(problem: Problem, start: FloatArray, *, scene: SceneAsked = "auto") -> SceneChoice:

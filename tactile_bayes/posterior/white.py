@@ -146,25 +146,22 @@ JOINED = 0.05
 
 
 class BumpFit(Record, eq=False):
-    """A least-squares bump, with all that the methods need.
-
-    Parameters
-    ----------
-    bump, cells, weight, fit, errors
-        Model, cells of the window, their weights, the minimum, the judged errors.
-    covariance : (p, p) array
-        Of the parameters, correlated errors included; under a noise field, which has them in the model, not.
-    covered_share
-        Share of the disc of 1.5 widths about the centre that the map covers.
-    """
+    """A least-squares bump, with all that the methods need."""
 
     bump: Bump
     cells: FitCells
     weight: FloatArray
     fit: LeastSquaresFit
     errors: ErrorModel
+    """`bump`, `cells`, `weight`, `fit`, `errors`: Model, cells of the window, their weights, the minimum, the judged
+    errors.
+    """
     covariance: FloatArray
+    """(p, p) array: Of the parameters, correlated errors included; under a noise field, which has them in the model,
+    not.
+    """
     covered_share: float
+    """Share of the disc of 1.5 widths about the centre that the map covers."""
 
     @property
     def theta(self) -> FloatArray:
@@ -212,24 +209,16 @@ class BumpFit(Record, eq=False):
 
 
 class Candidate(Record, eq=False):
-    """A candidate place.
-
-    Parameters
-    ----------
-    centre_mm
-        Where the search began.
-    fit
-        None where least squares found no minimum.
-    fault
-        Why the place cannot be a lump; empty when it can.
-    detection
-        Odds of a lump there; None where nobody has weighed them.
-    """
+    """A candidate place."""
 
     centre_mm: tuple[float, float]
+    """Where the search began."""
     fit: BumpFit | None
+    """None where least squares found no minimum."""
     fault: str
+    """Why the place cannot be a lump; empty when it can."""
     detection: Detection | None = None
+    """Odds of a lump there; None where nobody has weighed them."""
 
 
 def fitted_candidates(tactile_map: TactileMap, options: FitOptions) -> Iterator[Candidate]:

@@ -33,40 +33,28 @@ _NOTE: Final = (
 
 
 class Growth(Record, eq=False):
-    """Change of one mass from its first visit to a later one.
-
-    Parameters
-    ----------
-    patient, mass, earlier, later
-        Codes; `later` is blank where the visits could not be compared.
-    status, reason
-        As `compare` has them, or ``failed``.
-    days
-        Between the visits; None where it is not known.
-    sizes_mm
-        Largest size at both visits: median, ends and probability; empty without a comparison.
-    percent
-        Change of the diameter, likewise; None without one.
-    verdict
-        ``grown``, ``shrunk`` or ``no_change_shown``; empty without one.
-    findings
-        What speaks against the comparison.
-    link
-        File of the comparison from the page's folder; empty for none.
-    """
+    """Change of one mass from its first visit to a later one."""
 
     patient: str
     mass: str
     earlier: str
     later: str
+    """`patient`, `mass`, `earlier`, `later`: Codes; `later` is blank where the visits could not be compared."""
     status: str
     reason: str = ""
+    """`status`, `reason`: As `compare` has them, or ``failed``."""
     days: float | None = None
+    """Between the visits; None where it is not known."""
     sizes_mm: tuple[Mapping[str, float], ...] = ()
+    """Largest size at both visits: median, ends and probability; empty without a comparison."""
     percent: Mapping[str, float] | None = None
+    """Change of the diameter, likewise; None without one."""
     verdict: str = ""
+    """``grown``, ``shrunk`` or ``no_change_shown``; empty without one."""
     findings: tuple[Finding, ...] = ()
+    """What speaks against the comparison."""
     link: str = ""
+    """File of the comparison from the page's folder; empty for none."""
 
     @property
     def words(self) -> str:

@@ -39,18 +39,12 @@ class DrawnMap(Record, eq=False):
 
 
 class _Laid(Record, eq=False):
-    """A visit's maps averaged on a common grid about its mass.
-
-    Parameters
-    ----------
-    values : (n, n) array
-        Rows upwards, columns to the right on the screen; NaN without data.
-    origin_mm : (2,) array
-        Left of and above the xiphoid, where the mass lies; (0, 0) without landmarks.
-    """
+    """A visit's maps averaged on a common grid about its mass."""
 
     values: FloatArray
+    """(n, n) array: Rows upwards, columns to the right on the screen; NaN without data."""
     origin_mm: FloatArray
+    """(2,) array: Left of and above the xiphoid, where the mass lies; (0, 0) without landmarks."""
 
 
 def draw_comparison(

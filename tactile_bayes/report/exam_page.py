@@ -51,19 +51,13 @@ from tactile_bayes.report.svg import (
 
 
 class PageFiles(Record):
-    """Where the page of an exam goes.
-
-    Parameters
-    ----------
-    html, pdf
-        Files to write; no PDF where it is None.
-    force
-        Overwrite them.
-    """
+    """Where the page of an exam goes."""
 
     html: Path
     pdf: Path | None = None
+    """`html`, `pdf`: Files to write; no PDF where it is None."""
     force: bool = False
+    """Overwrite them."""
 
     def check(self) -> None:
         """Refuse, before any work is done, what could not be written.

@@ -26,38 +26,30 @@ Quantity = Mapping[str, Any]
 
 
 class ExamMass(Record, eq=False):
-    """One mass on a map.
-
-    Parameters
-    ----------
-    number
-        On the map, from 1.
-    centre_mm
-        x and y in `plane`.
-    axes_mm, angle_deg
-        Diameters of the ellipse along its own axes, and the angle from x to the first; None without a size.
-    largest, smallest
-        Largest and smallest size with the intervals that lead, as the estimate's JSON has them; None without.
-    probability
-        That it is a lump; None where it is not told.
-    place
-        About the nipple; None where that is not known.
-    patient_mm
-        From the xiphoid to the patient's right and up; None without landmarks.
-    why
-        Why there is no size; empty where there is one.
-    """
+    """One mass on a map."""
 
     number: int
+    """On the map, from 1."""
     centre_mm: tuple[float, float]
+    """x and y in `plane`."""
     axes_mm: tuple[float, float] | None = None
     angle_deg: float = 0.0
+    """`axes_mm`, `angle_deg`: Diameters of the ellipse along its own axes, and the angle from x to the first; None
+    without a size.
+    """
     largest: Quantity | None = None
     smallest: Quantity | None = None
+    """`largest`, `smallest`: Largest and smallest size with the intervals that lead, as the estimate's JSON has them;
+    None without.
+    """
     probability: float | None = None
+    """That it is a lump; None where it is not told."""
     place: ClockPosition | None = None
+    """About the nipple; None where that is not known."""
     patient_mm: tuple[float, float] | None = None
+    """From the xiphoid to the patient's right and up; None without landmarks."""
     why: str = ""
+    """Why there is no size; empty where there is one."""
 
 
 class ExamMap(Record, eq=False):
@@ -72,26 +64,18 @@ class ExamMap(Record, eq=False):
 
 
 class Exam(Record, eq=False):
-    """What one page shows.
-
-    Parameters
-    ----------
-    maps
-        Several are repeats of one mass.
-    pooled
-        The JSON object of the size from all maps; None with one map.
-    scans
-        The scans at the beginning, as `Provenance.scans` has them.
-    title, name, day
-        Given for the page; empty where they were not.
-    """
+    """What one page shows."""
 
     maps: tuple[ExamMap, ...]
+    """Several are repeats of one mass."""
     pooled: Mapping[str, Any] | None = None
+    """The JSON object of the size from all maps; None with one map."""
     scans: Sequence[Mapping[str, str]] = ()
+    """The scans at the beginning, as `Provenance.scans` has them."""
     title: str = ""
     name: str = ""
     day: str = ""
+    """`title`, `name`, `day`: Given for the page; empty where they were not."""
 
     @property
     def main(self) -> ExamMap:

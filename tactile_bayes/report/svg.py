@@ -209,18 +209,12 @@ _BARBS: Final = ((0.87, 0.5), (0.87, -0.5))
 
 
 class Frame(Record, eq=False):
-    """Where the map's points lie on the page, in mm from the picture's upper left corner without its margin.
-
-    Parameters
-    ----------
-    tactile_map
-        The map that is drawn.
-    scale
-        Of life size.
-    """
+    """Where the map's points lie on the page, in mm from the picture's upper left corner without its margin."""
 
     tactile_map: TactileMap
+    """The map that is drawn."""
     scale: float
+    """Of life size."""
 
     @classmethod
     def within(cls, tactile_map: TactileMap, *, width_mm: float, height_mm: float) -> Frame:

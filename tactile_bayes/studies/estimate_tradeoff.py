@@ -27,33 +27,22 @@ MOST_S = 4.0
 
 
 class Work(Record):
-    """How a study is run.
-
-    Parameters
-    ----------
-    clock
-        CPU seconds so far.
-    tolerance_mm
-        See `Ladder`.
-    runs
-        Of each setting: times are the least of them, distances their root mean square.
-    announce
-        Called once, when the default has been timed, with about how many CPU seconds the rest will take.
-    progress
-        Called with settings done and in all.
-    seed
-        Of the random numbers.
-    probability
-        Of the intervals.
-    """
+    """How a study is run."""
 
     clock: Clock
+    """CPU seconds so far."""
     tolerance_mm: float
+    """See `Ladder`."""
     runs: int = 3
+    """Of each setting: times are the least of them, distances their root mean square."""
     announce: Callable[[float], None] = lambda _seconds: None
+    """Called once, when the default has been timed, with about how many CPU seconds the rest will take."""
     progress: Progress | None = None
+    """Called with settings done and in all."""
     seed: int = 1
+    """Of the random numbers."""
     probability: float = INTERVAL
+    """Of the intervals."""
 
 
 class Choice(Protocol):
@@ -78,33 +67,22 @@ Chosen = TypeVar("Chosen", bound=Choice)
 
 
 class Priced(Record):
-    """One setting.
-
-    Parameters
-    ----------
-    axis
-        What is varied.
-    label
-        The setting in a few words; an option of the command line where there is one.
-    cpu_s
-        Least CPU time of the runs, each part by name ("map", "estimate"); their sum is the setting's cost.
-    answers
-        One for each run.
-    off
-        From the reference.
-    default
-        Whether this is what the program does by itself.
-    usable
-        Whether a user can choose it to save or to spend time; other rows show what the answer depends on.
-    """
+    """One setting."""
 
     axis: str
+    """What is varied."""
     label: str
+    """The setting in a few words; an option of the command line where there is one."""
     cpu_s: dict[str, float]
+    """Least CPU time of the runs, each part by name ("map", "estimate"); their sum is the setting's cost."""
     answers: tuple[SizeAnswer, ...]
+    """One for each run."""
     off: Deviation
+    """From the reference."""
     default: bool = False
+    """Whether this is what the program does by itself."""
     usable: bool = True
+    """Whether a user can choose it to save or to spend time; other rows show what the answer depends on."""
 
     @property
     def seconds(self) -> float:
@@ -118,21 +96,14 @@ class Priced(Record):
 
 
 class Reference(Record):
-    """What the settings are compared with.
-
-    Parameters
-    ----------
-    words
-        How it was made.
-    answer
-        None where there is none.
-    cpu_s
-        What it took.
-    """
+    """What the settings are compared with."""
 
     words: str
+    """How it was made."""
     answer: SizeAnswer | None
+    """None where there is none."""
     cpu_s: float
+    """What it took."""
 
     @property
     def error_mm(self) -> float:
@@ -142,48 +113,31 @@ class Reference(Record):
 
 
 class PooledRow(Record):
-    """The size by the first few of several maps of one mass.
-
-    Parameters
-    ----------
-    maps
-        How many.
-    cpu_s
-        Of their estimates and of pooling.
-    answer
-        The reported size; a reason where there is none.
-    another_half_mm
-        Half width of the second interval, of another exam that may differ as in the paper; NaN where there is none.
-    """
+    """The size by the first few of several maps of one mass."""
 
     maps: int
+    """How many."""
     cpu_s: float
+    """Of their estimates and of pooling."""
     answer: SizeAnswer
+    """The reported size; a reason where there is none."""
     another_half_mm: float = float("nan")
+    """Half width of the second interval, of another exam that may differ as in the paper; NaN where there is none."""
 
 
 class Ladder(Record):
-    """All settings of a study.
-
-    Parameters
-    ----------
-    rows
-        In the order of the table.
-    reference
-        What they are compared with.
-    tolerance_mm
-        Distance of interval ends below which more is not worth its cost.
-    shared_cpu_s
-        What every setting needs besides, by name, such as reading the file or starting the program.
-    pooled
-        The size by the first map of one mass, by the first two, and so on; empty where one was given.
-    """
+    """All settings of a study."""
 
     rows: tuple[Priced, ...]
+    """In the order of the table."""
     reference: Reference
+    """What they are compared with."""
     tolerance_mm: float
+    """Distance of interval ends below which more is not worth its cost."""
     shared_cpu_s: dict[str, float] = field(default_factory=dict)
+    """What every setting needs besides, by name, such as reading the file or starting the program."""
     pooled: tuple[PooledRow, ...] = ()
+    """The size by the first map of one mass, by the first two, and so on; empty where one was given."""
 
     @property
     def default(self) -> Priced:
@@ -397,25 +351,17 @@ def _by(options: EstimateOptions, method: Any, accuracy_sd: float | None = None)
 
 
 class Estimator(Record):
-    """Estimates of one map, seeded by the map and the number of the run.
-
-    Parameters
-    ----------
-    calibration
-        From widths to sizes; None stops at widths.
-    seed
-        Of the random numbers.
-    clock
-        CPU seconds so far.
-    probability
-        Of the intervals.
-    """
+    """Estimates of one map, seeded by the map and the number of the run."""
 
     tactile_map: TactileMap
     calibration: Calibration | None
+    """From widths to sizes; None stops at widths."""
     seed: int
+    """Of the random numbers."""
     clock: Clock
+    """CPU seconds so far."""
     probability: float = INTERVAL
+    """Of the intervals."""
 
     def run(self, options: EstimateOptions) -> Run:
         """A whole estimate, from the map to the size, as a function of the number of the run."""

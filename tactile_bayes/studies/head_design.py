@@ -32,15 +32,6 @@ _CELL_MM = 0.5
 class HomogeneousTissue(Record):
     """Tissue and pressures over which a head should press evenly.
 
-    Parameters
-    ----------
-    young_kpa, mean_kpa
-        Lowest and highest Young's modulus, and lowest and highest mean pressure over the sensing width.
-    thickness_mm
-        Of the tissue, bonded to a rigid base.
-    poisson
-        Poisson's ratio.
-
     Raises
     ------
     BadDataError
@@ -49,8 +40,13 @@ class HomogeneousTissue(Record):
 
     young_kpa: tuple[float, float] = PAPER_MODULI_KPA
     mean_kpa: tuple[float, float] = PAPER_PRESSURES_KPA
+    """`young_kpa`, `mean_kpa`: Lowest and highest Young's modulus, and lowest and highest mean pressure over the
+    sensing width.
+    """
     thickness_mm: float = THICKNESS_MM
+    """Of the tissue, bonded to a rigid base."""
     poisson: float = POISSON
+    """Poisson's ratio."""
 
     def __post_init__(self) -> None:
         for name in ("young_kpa", "mean_kpa"):
@@ -81,21 +77,14 @@ class HomogeneousTissue(Record):
 
 
 class Uniformity(Record, eq=False):
-    """How evenly one head presses.
-
-    Parameters
-    ----------
-    head
-        Its section.
-    s_mm : (n,) array
-        Taxel positions across the head.
-    share : (3, 3, n) array
-        Pressure over the frame's mean, for each modulus and each mean pressure.
-    """
+    """How evenly one head presses."""
 
     head: Head
+    """Its section."""
     s_mm: FloatArray
+    """(n,) array: Taxel positions across the head."""
     share: FloatArray
+    """(3, 3, n) array: Pressure over the frame's mean, for each modulus and each mean pressure."""
 
     @property
     def largest(self) -> FloatArray:

@@ -39,34 +39,24 @@ HARD_RATIO = 100.0
 
 
 class StudySettings(Record):
-    """Settings of a study: everything but its cases that the table depends on.
-
-    Parameters
-    ----------
-    head
-        Cross-section of the head.
-    mean_kpa
-        Force over the head's area.
-    poisson, fat_kpa, gland_ratio, thickness_mm
-        As in `body.Body`.
-    positions_mm
-        First and last position of the head and the step between them.
-    fit_radius_mm
-        Eq 5 is fitted where abs(x) is at most this.
-    cell_mm, fineness
-        Of the contact and of the mesh, see `condense.condense`.
-    """
+    """Settings of a study: everything but its cases that the table depends on."""
 
     head: Head = field(default_factory=Head)
+    """Cross-section of the head."""
     mean_kpa: float = MEAN_KPA
+    """Force over the head's area."""
     poisson: float = POISSON
     fat_kpa: float = FAT_KPA
     gland_ratio: float = GLAND_RATIO
     thickness_mm: float | None = None
+    """`poisson`, `fat_kpa`, `gland_ratio`, `thickness_mm`: As in `body.Body`."""
     positions_mm: tuple[float, float, float] = POSITIONS_MM
+    """First and last position of the head and the step between them."""
     fit_radius_mm: float = FIT_RADIUS_MM
+    """Eq 5 is fitted where abs(x) is at most this."""
     cell_mm: float = CELL_MM
     fineness: int = FINENESS
+    """`cell_mm`, `fineness`: Of the contact and of the mesh, see `condense.condense`."""
 
     def as_dict(self) -> dict[str, object]:
         """Plain data for a store's header and for a report."""
@@ -88,20 +78,14 @@ class StudySettings(Record):
 
 
 class Geometry(Record):
-    """Cases with the same geometry, which share one factorisation: one body, several stiffnesses of its lump.
-
-    Parameters
-    ----------
-    seat, d_mm, depth_ratio
-        As in `body.Body`.
-    stiffness_ratios
-        E2/E1, the lump's modulus over that of fat.
-    """
+    """Cases with the same geometry, which share one factorisation: one body, several stiffnesses of its lump."""
 
     seat: float
     d_mm: float
     depth_ratio: float
+    """`seat`, `d_mm`, `depth_ratio`: As in `body.Body`."""
     stiffness_ratios: tuple[float, ...]
+    """E2/E1, the lump's modulus over that of fat."""
 
     @property
     def key(self) -> str:
@@ -111,22 +95,15 @@ class Geometry(Record):
 
 
 class LineFit(Record):
-    """The fit of Eq 5 to a line.
-
-    Parameters
-    ----------
-    amplitude, sigma_mm
-        a and sigma of Eq 5.
-    rms
-        Root mean square of what the Gaussian leaves, in units of the background.
-    resolved
-        Whether the width lies within what the fit looks at, and not at an end of it.
-    """
+    """The fit of Eq 5 to a line."""
 
     amplitude: float
     sigma_mm: float
+    """`amplitude`, `sigma_mm`: a and sigma of Eq 5."""
     rms: float
+    """Root mean square of what the Gaussian leaves, in units of the background."""
     resolved: bool = True
+    """Whether the width lies within what the fit looks at, and not at an end of it."""
 
 
 Fit = Callable[[TactileLine, float], LineFit]
@@ -228,23 +205,16 @@ def run_geometry(geometry: Geometry, *, settings: StudySettings, fit: Fit) -> li
 
 
 class PrintedEq6(Record):
-    """Eq 6 learned in two stages as in the paper, without uncertainty.
-
-    Parameters
-    ----------
-    m, b_mm
-        Line of d on sigma at one diameter depth.
-    e, f
-        Power law of the width change on the amplitude.
-    cases
-        Hard, detectable cases that e and f were learned from.
-    """
+    """Eq 6 learned in two stages as in the paper, without uncertainty."""
 
     m: float
     b_mm: float
+    """`m`, `b_mm`: Line of d on sigma at one diameter depth."""
     e: float
     f: float
+    """`e`, `f`: Power law of the width change on the amplitude."""
     cases: int
+    """Hard, detectable cases that e and f were learned from."""
 
 
 def hard_cases(rows: Sequence[StudyRow]) -> list[StudyRow]:
@@ -326,25 +296,17 @@ _STEP = 0.01
 
 
 class CentredFrame(Record, eq=False):
-    """The frame with the head's centre over a lump, as taxels see it.
-
-    Parameters
-    ----------
-    d_mm, depth_ratio
-        Size and depth of the lump.
-    s_mm : (n,) array
-        Taxel positions across the head.
-    share : (n,) array
-        Pressure over the frame's mean.
-    added : (n,) array
-        `share` less that of the same layers without the lump.
-    """
+    """The frame with the head's centre over a lump, as taxels see it."""
 
     d_mm: float
     depth_ratio: float
+    """`d_mm`, `depth_ratio`: Size and depth of the lump."""
     s_mm: FloatArray
+    """(n,) array: Taxel positions across the head."""
     share: FloatArray
+    """(n,) array: Pressure over the frame's mean."""
     added: FloatArray
+    """(n,) array: `share` less that of the same layers without the lump."""
 
     @property
     def rise(self) -> float:
@@ -353,19 +315,13 @@ class CentredFrame(Record, eq=False):
 
 
 class Lookalikes(Record, eq=False):
-    """Two lumps of different size with the most alike frames.
-
-    Parameters
-    ----------
-    small, large
-        Their frames.
-    difference
-        Root mean square difference of the frames over the root mean square of what the smaller lump adds.
-    """
+    """Two lumps of different size with the most alike frames."""
 
     small: CentredFrame
     large: CentredFrame
+    """`small`, `large`: Their frames."""
     difference: float
+    """Root mean square difference of the frames over the root mean square of what the smaller lump adds."""
 
     @property
     def of_mean(self) -> float:

@@ -167,47 +167,34 @@ _LEVEL = np.eye(3)
 
 
 class SolidSettings(Record):
-    """Settings of a solid study: everything but its cases that the table depends on.
-
-    Parameters
-    ----------
-    head
-        The array and the rim around it.
-    mean_kpa
-        Mean over the taxels.
-    poisson, fat_kpa, gland_ratio, thickness_mm
-        As in `body.Body`.
-    reach_mm, lines_mm
-        The head stands at steps of the taxels' pitch out to `reach_mm` either side across it, on lines at these
-        distances either side along it, which must be whole steps.
-    fit_radius_mm
-        Eq 7 is fitted within this distance of the lump's axis.
-    fineness
-        Of the mesh; twice is half the element. See `mesh_size`.
-    rank_tolerance
-        See `frames.skin_perturbation`.
-    mesh_reach_mm
-        Radius at which the mesh ends, on a rim that does not move.
-    background
-        ``"free"``: Eq 7's level is fitted; ``"fixed"``: it is 1.
-    flat_field
-        Whether each taxel is divided by what it reads of the same body without the lump.
-    """
+    """Settings of a solid study: everything but its cases that the table depends on."""
 
     head: Head = field(default_factory=Head)
+    """The array and the rim around it."""
     mean_kpa: float = MEAN_KPA
+    """Mean over the taxels."""
     poisson: float = POISSON
     fat_kpa: float = FAT_KPA
     gland_ratio: float = GLAND_RATIO
     thickness_mm: float | None = None
+    """`poisson`, `fat_kpa`, `gland_ratio`, `thickness_mm`: As in `body.Body`."""
     reach_mm: float = REACH_MM
     lines_mm: tuple[float, ...] = LINES_MM
+    """`reach_mm`, `lines_mm`: The head stands at steps of the taxels' pitch out to `reach_mm` either side across it, on
+    lines at these distances either side along it, which must be whole steps.
+    """
     fit_radius_mm: float = FIT_RADIUS_MM
+    """Eq 7 is fitted within this distance of the lump's axis."""
     fineness: int = FINENESS
+    """Of the mesh; twice is half the element. See `mesh_size`."""
     rank_tolerance: float = RANK_TOLERANCE
+    """See `frames.skin_perturbation`."""
     mesh_reach_mm: float = MeshSize().reach_mm
+    """Radius at which the mesh ends, on a rim that does not move."""
     background: str = "free"
+    """``"free"``: Eq 7's level is fitted; ``"fixed"``: it is 1."""
     flat_field: bool = True
+    """Whether each taxel is divided by what it reads of the same body without the lump."""
 
     def __post_init__(self) -> None:
         half = self.head.rows * self.head.pitch_mm / 2
@@ -274,45 +261,37 @@ def mesh_size(fineness: int, *, reach_mm: float = MeshSize().reach_mm) -> MeshSi
 
 
 class RasterFrames(Record, eq=False):
-    """Frames of a level head on a raster of places.
-
-    Parameters
-    ----------
-    x_mm, y_mm, depth_mm : (n,) arrays
-        Where the apex of the head's face is, from the lump's axis and from the undisturbed skin.
-    pressure_kpa : (n, rows, columns) array
-    head
-        What was pressed.
-    plain_kpa : (rows, columns) array
-        The head's frame over the same body without the lump, where the map is to be divided by it.
-    """
+    """Frames of a level head on a raster of places."""
 
     x_mm: FloatArray
     y_mm: FloatArray
     depth_mm: FloatArray
+    """`x_mm`, `y_mm`, `depth_mm` (n,) arrays: Where the apex of the head's face is, from the lump's axis and from the
+    undisturbed skin.
+    """
     pressure_kpa: FloatArray
+    """(n, rows, columns) array."""
     head: Head
+    """What was pressed."""
     plain_kpa: FloatArray | None = None
+    """(rows, columns) array: The head's frame over the same body without the lump, where the map is to be divided by
+    it.
+    """
 
 
 class RasterFit(Record):
-    """The fit of Eq 7 to a raster's map.
-
-    Parameters
-    ----------
-    amplitude, sigma_x_mm, sigma_y_mm
-        a (height above the level, in units of the map) and the widths of Eq 7, across and along the head.
-    rms
-        Root mean square of what the Gaussian leaves, in units of the background.
-    resolved
-        Whether both widths are ones that array and window can tell.
-    """
+    """The fit of Eq 7 to a raster's map."""
 
     amplitude: float
     sigma_x_mm: float
     sigma_y_mm: float
+    """`amplitude`, `sigma_x_mm`, `sigma_y_mm`: a (height above the level, in units of the map) and the widths of Eq 7,
+    across and along the head.
+    """
     rms: float
+    """Root mean square of what the Gaussian leaves, in units of the background."""
     resolved: bool
+    """Whether both widths are ones that array and window can tell."""
 
 
 RasterFitter = Callable[[RasterFrames, SolidSettings], RasterFit]

@@ -72,72 +72,51 @@ NEAREST_HEADS = {
 
 
 class Scene(Record):
-    """A lump for which both models are compared.
-
-    Parameters
-    ----------
-    name
-        For people.
-    d_mm, depth_ratio, seat
-        As in `body.Body`.
-    stiffness_ratio
-        E2/E1.
-    """
+    """A lump for which both models are compared."""
 
     name: str
+    """For people."""
     d_mm: float
     depth_ratio: float
     seat: float
+    """`d_mm`, `depth_ratio`, `seat`: As in `body.Body`."""
     stiffness_ratio: float = HARD_RATIO
+    """E2/E1."""
 
 
 class Curves(Record, eq=False):
-    """Frames and maps of both models for one scene.
-
-    Parameters
-    ----------
-    elastic, empirical
-        Frames at the same positions.
-    elastic_map, empirical_map
-        What they average to.
-    model
-        The fitted empirical model.
-    """
+    """Frames and maps of both models for one scene."""
 
     elastic: LineFrames
     empirical: LineFrames
+    """`elastic`, `empirical`: Frames at the same positions."""
     elastic_map: TactileLine
     empirical_map: TactileLine
+    """`elastic_map`, `empirical_map`: What they average to."""
     model: EmpiricalModel
+    """The fitted empirical model."""
 
 
 class Agreement(Record):
-    """How far the empirical model is from the elastic one; differences as shares, not percent.
-
-    Parameters
-    ----------
-    scene
-        What was compared.
-    centred_frame, all_frames, map, map_strict
-        Mean squared differences: of the frame centred on the lump (Table 1), of all frames of the map, of the map
-        within the fit's radius (Table 2), and of the map relative to map - 1.
-    elastic, empirical
-        Eq 5 fitted to both maps.
-    normalised_frame
-        As `centred_frame`, of frames divided by their means.
-    others
-        By each of `OTHER_DEFINITIONS`: of the frame centred on the lump, of the same divided by its mean, of the map.
-    """
+    """How far the empirical model is from the elastic one; differences as shares, not percent."""
 
     scene: Scene
+    """What was compared."""
     centred_frame: float
     all_frames: float
     map: float
     map_strict: float
+    """`centred_frame`, `all_frames`, `map`, `map_strict`: Mean squared differences: of the frame centred on the lump
+    (Table 1), of all frames of the map, of the map within the fit's radius (Table 2), and of the map relative to map -
+    1.
+    """
     elastic: LineFit
     empirical: LineFit
+    """`elastic`, `empirical`: Eq 5 fitted to both maps."""
     normalised_frame: float
+    """As `centred_frame`, of frames divided by their means."""
     others: tuple[tuple[float, float, float], ...]
+    """By each of `OTHER_DEFINITIONS`: of the frame centred on the lump, of the same divided by its mean, of the map."""
 
 
 def table_scenes(seat: float) -> list[Scene]:
@@ -226,15 +205,6 @@ LEAST_TAXELS = 4
 class MeasuredFrame(Record, eq=False):
     """One frame along the centre line of the head.
 
-    Parameters
-    ----------
-    x_c_mm
-        Where the head's centre stands, from the lump's axis.
-    s_mm : (n,) array
-        Taxel positions from the head's centre.
-    pressure_kpa : (n,) array
-        What the taxels read.
-
     Raises
     ------
     BadDataError
@@ -242,8 +212,11 @@ class MeasuredFrame(Record, eq=False):
     """
 
     x_c_mm: float
+    """Where the head's centre stands, from the lump's axis."""
     s_mm: FloatArray
+    """(n,) array: Taxel positions from the head's centre."""
     pressure_kpa: FloatArray
+    """(n,) array: What the taxels read."""
 
     def __post_init__(self) -> None:
         if len(self.s_mm) < LEAST_TAXELS or not self.pressure_kpa.mean() > 0:
@@ -255,19 +228,13 @@ class MeasuredFrame(Record, eq=False):
 
 
 class FrameAgreement(Record, eq=False):
-    """A measured frame and both models at its place and mean pressure.
-
-    Parameters
-    ----------
-    measured
-        As given.
-    elastic_kpa, empirical_kpa : (n,) arrays
-        The models at the same taxels.
-    """
+    """A measured frame and both models at its place and mean pressure."""
 
     measured: MeasuredFrame
+    """As given."""
     elastic_kpa: FloatArray
     empirical_kpa: FloatArray
+    """`elastic_kpa`, `empirical_kpa` (n,) arrays: The models at the same taxels."""
 
     @property
     def elastic_difference(self) -> float:

@@ -46,32 +46,23 @@ class Coverage(Record):
 
 
 class RankTest(Record):
-    """Results of the tests on one parameter's ranks.
-
-    Parameters
-    ----------
-    name
-        Of the parameter.
-    n
-        Ranks.
-    chi2_p
-        P value of equal numbers in bins of ranks.
-    ecdf_p
-        Share of uniform samples whose ECDF strays at least as far, anywhere.
-    mean_rank, spread
-        Mean of (rank + 1/2) / (draws + 1), 0.5 when calibrated; and its SD over that of a uniform one: above 1 the
-        posterior is too narrow, below 1 too wide.
-    coverage
-        Of central intervals.
-    """
+    """Results of the tests on one parameter's ranks."""
 
     name: str
+    """Of the parameter."""
     n: int
+    """Ranks."""
     chi2_p: float
+    """P value of equal numbers in bins of ranks."""
     ecdf_p: float
+    """Share of uniform samples whose ECDF strays at least as far, anywhere."""
     mean_rank: float
     spread: float
+    """`mean_rank`, `spread`: Mean of (rank + 1/2) / (draws + 1), 0.5 when calibrated; and its SD over that of a uniform
+    one: above 1 the posterior is too narrow, below 1 too wide.
+    """
     coverage: tuple[Coverage, ...]
+    """Of central intervals."""
 
     @property
     def inside(self) -> bool:
@@ -211,50 +202,36 @@ ROUND = SizePriors(shape=ShapePrior(oval_sd=1e-9))
 
 
 class Truth(Record):
-    """True parameters of one simulated map.
-
-    Parameters
-    ----------
-    amplitude, sigma_x_mm, sigma_y_mm, x_mm, y_mm
-        Of the bump.
-    length_mm, share
-        Of the noise field: correlation length, and its variance over the mean independent variance of a cell.
-    noise_sd
-        Root of that variance.
-    """
+    """True parameters of one simulated map."""
 
     amplitude: float
     sigma_x_mm: float
     sigma_y_mm: float
     x_mm: float
     y_mm: float
+    """`amplitude`, `sigma_x_mm`, `sigma_y_mm`, `x_mm`, `y_mm`: Of the bump."""
     length_mm: float
     share: float
+    """`length_mm`, `share`: Of the noise field: correlation length, and its variance over the mean independent variance
+    of a cell.
+    """
     noise_sd: float
+    """Root of that variance."""
 
 
 class MapRanks(Record):
-    """Ranks of one simulated map's true parameters in its posterior.
-
-    Parameters
-    ----------
-    index
-        The map's number.
-    truth
-        What was put in.
-    ranks
-        Of `RANKED`: how many of `DRAWS` draws lie below the truth; None without an estimate of this bump.
-    outcome
-        The method that gave the draws, the code of the abstention, or `ELSEWHERE` when another rise was measured.
-    probability
-        That the estimate gives to what it measured being a lump; None without an estimate.
-    """
+    """Ranks of one simulated map's true parameters in its posterior."""
 
     index: int
+    """The map's number."""
     truth: Truth
+    """What was put in."""
     ranks: tuple[int, ...] | None
+    """Of `RANKED`: how many of `DRAWS` draws lie below the truth; None without an estimate of this bump."""
     outcome: str
+    """The method that gave the draws, the code of the abstention, or `ELSEWHERE` when another rise was measured."""
     probability: float | None = None
+    """That the estimate gives to what it measured being a lump; None without an estimate."""
 
 
 def settings(method: str, seed: int, *, size: str = "", cosines: int | None = None) -> dict[str, object]:
@@ -307,21 +284,14 @@ def elsewhere(posterior: MapPosterior, truth: Truth) -> bool:
 
 
 class OtherRises(Record):
-    """Maps whose estimate measured another rise than the true lump.
-
-    Parameters
-    ----------
-    number
-        Of them.
-    announced
-        How many the probabilities of all estimates lead one to expect.
-    chance
-        Of so many or more, were the probabilities right.
-    """
+    """Maps whose estimate measured another rise than the true lump."""
 
     number: int
+    """Of them."""
     announced: float
+    """How many the probabilities of all estimates lead one to expect."""
     chance: float
+    """Of so many or more, were the probabilities right."""
 
     @property
     def too_many(self) -> bool:

@@ -15,31 +15,22 @@ WIDTHS = ("sigma_x_mm", "sigma_y_mm")
 
 
 class SizeAnswer(Record):
-    """What one estimate says.
-
-    Parameters
-    ----------
-    reason
-        Why there is no number; empty where there is one.
-    probability
-        Of a lump; None where nothing could be tested.
-    quantities
-        The largest size and the two widths by name, mm: the size is missing without a calibration, all are without an
-        estimate.
-    method
-        The method that drew; empty where none did.
-    shares
-        Percent of the variance of ln(largest size) by source, see `SizePosterior.variance_share`.
-    code
-        Of the reason, one of `abstention.CODES`; ``"method"`` where no method converged.
-    """
+    """What one estimate says."""
 
     reason: str
+    """Why there is no number; empty where there is one."""
     probability: float | None = None
+    """Of a lump; None where nothing could be tested."""
     quantities: dict[str, Quantity] = field(default_factory=dict)
+    """The largest size and the two widths by name, mm: the size is missing without a calibration, all are without an
+    estimate.
+    """
     method: str = ""
+    """The method that drew; empty where none did."""
     shares: dict[str, float] = field(default_factory=dict)
+    """Percent of the variance of ln(largest size) by source, see `SizePosterior.variance_share`."""
     code: str = ""
+    """Of the reason, one of `abstention.CODES`; ``"method"`` where no method converged."""
 
     @property
     def reported(self) -> Quantity | None:
@@ -76,19 +67,13 @@ def answer_of(estimate: Estimate, *, probability: float) -> SizeAnswer:
 
 
 class Deviation(Record):
-    """Root mean square distances from a reference, mm.
-
-    Parameters
-    ----------
-    median, ends
-        Of the reported quantity: its median, and both ends of its interval.
-    width_ends
-        Of both widths: the ends of their intervals.
-    """
+    """Root mean square distances from a reference, mm."""
 
     median: float
     ends: float
+    """`median`, `ends`: Of the reported quantity: its median, and both ends of its interval."""
     width_ends: float
+    """Of both widths: the ends of their intervals."""
 
 
 UNKNOWN = Deviation(float("nan"), float("nan"), float("nan"))

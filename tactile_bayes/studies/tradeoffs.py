@@ -59,23 +59,18 @@ Clock = Callable[[], float]
 
 
 class LumpCase(Record):
-    """The lump of a comparison.
-
-    Parameters
-    ----------
-    d_mm, depth_ratio, stiffness_ratio, seat
-        As in `study.Geometry`.
-    plane, solid
-        The default settings of both models for its body and head. All maps are as they are and fitted with a level of
-        1, as those in two dimensions are.
-    """
+    """The lump of a comparison."""
 
     d_mm: float
     depth_ratio: float
     stiffness_ratio: float
     seat: float
+    """`d_mm`, `depth_ratio`, `stiffness_ratio`, `seat`: As in `study.Geometry`."""
     plane: StudySettings
     solid: SolidSettings
+    """`plane`, `solid`: The default settings of both models for its body and head. All maps are as they are and fitted
+    with a level of 1, as those in two dimensions are.
+    """
 
     @property
     def body(self) -> Body:
@@ -89,51 +84,35 @@ class LumpCase(Record):
 
 
 class Setting(Record):
-    """One way to compute the map.
-
-    Parameters
-    ----------
-    model
-        ``"empirical"``, ``"plane-strain"`` or ``"solid"``.
-    label
-        For people.
-    settings
-        Of the model; the empirical one is fitted to plane-strain frames of these.
-    kind
-        ``"mesh"`` where only the elements differ from the default, ``"default"``, ``"reference"`` for the finest mesh,
-        else what differs.
-    """
+    """One way to compute the map."""
 
     model: str
+    """``"empirical"``, ``"plane-strain"`` or ``"solid"``."""
     label: str
+    """For people."""
     settings: StudySettings | SolidSettings
+    """Of the model; the empirical one is fitted to plane-strain frames of these."""
     kind: str
+    """``"mesh"`` where only the elements differ from the default, ``"default"``, ``"reference"`` for the finest mesh,
+    else what differs.
+    """
 
 
 class Measured(Record):
-    """Cost and map of one setting.
-
-    Parameters
-    ----------
-    setting
-        What was measured.
-    element_mm
-        Mean length of an element on the lump's surface.
-    lump_s
-        CPU for a lump: mesh, factorisation, condensing, the head on the body.
-    map_s
-        CPU for another stiffness of it: its frames and their map.
-    amplitude, sigma_x_mm, sigma_y_mm
-        The map's Gaussian; no `sigma_y_mm` in two dimensions.
-    """
+    """Cost and map of one setting."""
 
     setting: Setting
+    """What was measured."""
     element_mm: float
+    """Mean length of an element on the lump's surface."""
     lump_s: float
+    """CPU for a lump: mesh, factorisation, condensing, the head on the body."""
     map_s: float
+    """CPU for another stiffness of it: its frames and their map."""
     amplitude: float
     sigma_x_mm: float
     sigma_y_mm: float | None
+    """`amplitude`, `sigma_x_mm`, `sigma_y_mm`: The map's Gaussian; no `sigma_y_mm` in two dimensions."""
 
     @property
     def seconds(self) -> float:
@@ -327,24 +306,16 @@ Outside = Callable[[float, float, float | None], list[str]]
 
 
 class SizeRule(Record, eq=False):
-    """Rule that converts amplitude and widths to a size.
-
-    Parameters
-    ----------
-    sizes
-        Diameters; the largest is the size.
-    scatter
-        Standard deviation of ln d that it leaves: of what Eq 6 was learned from, or of bodies left out.
-    source
-        In words.
-    outside_of
-        What of a map is none of the calibration's.
-    """
+    """Rule that converts amplitude and widths to a size."""
 
     sizes: Sizes
+    """Diameters; the largest is the size."""
     scatter: float
+    """Standard deviation of ln d that it leaves: of what Eq 6 was learned from, or of bodies left out."""
     source: str
+    """In words."""
     outside_of: Outside | None = None
+    """What of a map is none of the calibration's."""
 
     def size_mm(self, one: Measured) -> float:
         """Size of a measured map; NaN where its amplitude allows none."""

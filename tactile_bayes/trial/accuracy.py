@@ -288,20 +288,14 @@ REFERENCE = "tactile"
 
 
 class ModalityRatio(Record):
-    """Percent error of one modality over the tactile one's on common masses.
-
-    Attributes
-    ----------
-    ratio
-        On the `masses` that both looked for, a mass not found counting 100 %.
-    ratio_detected
-        On the `masses_detected` that both found.
-    """
+    """Percent error of one modality over the tactile one's on common masses."""
 
     masses: int
     ratio: Figure
+    """On the `masses` that both looked for, a mass not found counting 100 %."""
     masses_detected: int
     ratio_detected: Figure
+    """On the `masses_detected` that both found."""
 
 
 def mape_ratios(sizes: Mapping[str, ModalitySizes], *, confidence: float) -> dict[str, ModalityRatio]:
@@ -390,17 +384,7 @@ _AT_ONCE = 111
 
 
 class PairedComparison(Record):
-    """Percent errors of `first` against `second` on their common masses; a mass not found counts as size 0.
-
-    Attributes
-    ----------
-    difference_percent, ratio
-        Mean error of the first less, or over, that of the second.
-    p_value
-        Two-sided, of the sign-flip test by patient; None where no patient differs.
-    p_holm
-        The same, corrected for all pairs of this trial.
-    """
+    """Percent errors of `first` against `second` on their common masses; a mass not found counts as size 0."""
 
     first: str
     second: str
@@ -410,8 +394,11 @@ class PairedComparison(Record):
     second_percent: float | None
     difference_percent: Figure
     ratio: Figure
+    """`difference_percent`, `ratio`: Mean error of the first less, or over, that of the second."""
     p_value: float | None
+    """Two-sided, of the sign-flip test by patient; None where no patient differs."""
     p_holm: float | None = None
+    """The same, corrected for all pairs of this trial."""
 
 
 def paired_comparisons(

@@ -72,23 +72,18 @@ BINS = 10
 
 
 class Prediction(Record, eq=False):
-    """Predictive distributions of log ex-vivo sizes, one per reading, with the sizes found.
-
-    Attributes
-    ----------
-    median_log, sd_log
-        (n,) arrays of each prediction: the logarithm of its median in mm and its SD, caliper error included.
-    found_log
-        (n,) array: logarithm of the ex-vivo size in mm.
-    mass, patient
-        (n,) arrays of numbers.
-    """
+    """Predictive distributions of log ex-vivo sizes, one per reading, with the sizes found."""
 
     median_log: FloatArray
     sd_log: FloatArray
+    """`median_log`, `sd_log`: (n,) arrays of each prediction: the logarithm of its median in mm and its SD, caliper
+    error included.
+    """
     found_log: FloatArray
+    """(n,) array: logarithm of the ex-vivo size in mm."""
     mass: FloatArray
     patient: FloatArray
+    """`mass`, `patient`: (n,) arrays of numbers."""
 
     def __len__(self) -> int:
         return len(self.found_log)
@@ -109,37 +104,26 @@ class LevelCoverage(Record):
 
 
 class Calibration(Record):
-    """Figures that show how well the stated uncertainties are calibrated.
-
-    Attributes
-    ----------
-    pit
-        Histogram of the integral transforms: counts in `BINS` equal bins; level when honest.
-    ecdf_band
-        Half-width of the simultaneous band about the transforms' distribution function (Kolmogorov, by masses).
-    ecdf_distance
-        Largest distance of that function from the diagonal; above the band, the uncertainties are refuted.
-    crps_mm
-        Mean continuous ranked probability score of the size in mm: an absolute error for whole distributions.
-    interval_score_mm
-        Mean interval score at 95 %: width, and 40 mm for each mm outside.
-    scale
-        Factor by which SDs should be multiplied to be honest in the mean square, with an interval by masses.
-    shift_percent
-        Median of the found sizes over the predicted, less 100 %.
-    """
+    """Figures that show how well the stated uncertainties are calibrated."""
 
     n: int
     masses: int
     levels: tuple[LevelCoverage, ...]
     pit: tuple[int, ...]
+    """Histogram of the integral transforms: counts in `BINS` equal bins; level when honest."""
     ecdf_band: float
+    """Half-width of the simultaneous band about the transforms' distribution function (Kolmogorov, by masses)."""
     ecdf_distance: float
+    """Largest distance of that function from the diagonal; above the band, the uncertainties are refuted."""
     crps_mm: float
+    """Mean continuous ranked probability score of the size in mm: an absolute error for whole distributions."""
     interval_score_mm: float
+    """Mean interval score at 95 %: width, and 40 mm for each mm outside."""
     scale: float
+    """Factor by which SDs should be multiplied to be honest in the mean square, with an interval by masses."""
     scale_interval: tuple[float, float]
     shift_percent: float
+    """Median of the found sizes over the predicted, less 100 %."""
     advice: str
 
 

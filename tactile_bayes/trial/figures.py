@@ -141,21 +141,14 @@ def on_scale(values: Values, scale: Scale) -> Values:
 
 
 class SumStatistic(Record):
-    """A figure computed from the sums of a few terms over the masses.
-
-    Parameters
-    ----------
-    terms
-        (n, k) array of what each mass adds; raises `UndefinedError` where the masses leave the figure undefined.
-    finish
-        The figure from the (..., k) sums, for all leading axes at once; NaN where it does not exist.
-    undefined
-        The reason when `finish` gives NaN.
-    """
+    """A figure computed from the sums of a few terms over the masses."""
 
     terms: Callable[[ModalitySizes], FloatArray]
+    """(n, k) array of what each mass adds; raises `UndefinedError` where the masses leave the figure undefined."""
     finish: Callable[[FloatArray], FloatArray]
+    """The figure from the (..., k) sums, for all leading axes at once; NaN where it does not exist."""
     undefined: str = "the masses do not determine it"
+    """The reason when `finish` gives NaN."""
 
     def __call__(self, sizes: ModalitySizes) -> float:
         """Compute the statistic of these masses."""
@@ -308,23 +301,16 @@ Leverage = Callable[[ModalitySizes], FloatArray]
 
 
 class Figure(Record):
-    """A number about one modality, never NaN or infinite.
-
-    Attributes
-    ----------
-    value
-        None where the data leave it undefined; `reason` then says why.
-    interval
-        Low and high end, None where none is given; `interval_reason` says why when one was asked for.
-    has_interval
-        Whether an interval belongs to this figure at all.
-    """
+    """A number about one modality, never NaN or infinite."""
 
     value: float | None
+    """None where the data leave it undefined; `reason` then says why."""
     reason: str = ""
     interval: tuple[float, float] | None = None
+    """Low and high end, None where none is given; `interval_reason` says why when one was asked for."""
     interval_reason: str = ""
     has_interval: bool = False
+    """Whether an interval belongs to this figure at all."""
 
     def mapped(self, function: Callable[[float], float]) -> Figure:
         """Convert the figure by an increasing function; ends beyond double precision drop the interval."""

@@ -122,35 +122,27 @@ LEAST_MASSES = 8
 
 
 class Limits(Record):
-    """Limits of agreement and their intervals; all in the unit of the differences.
-
-    Attributes
-    ----------
-    sd
-        Standard deviation that the limits are built on: of one difference, for single readings.
-    low, high
-        bias -+ z sd, between which the stated share of differences lies.
-    low_interval, high_interval
-        Each limit on its own: exact for single readings (Carkeet 2015), by variance recovery with replicates.
-    pair_intervals
-        Of both limits taken together, exact (Carkeet 2015); None with replicates.
-    approximate_intervals
-        Bland & Altman's (1986), for comparison with other programs; None with replicates.
-    components
-        Variances that add up to ``sd`` squared, by name; empty for single readings.
-    """
+    """Limits of agreement and their intervals; all in the unit of the differences."""
 
     n: int
     bias: float
     bias_interval: Ends | None
     sd: float
+    """Standard deviation that the limits are built on: of one difference, for single readings."""
     low: float
     high: float
+    """`low`, `high`: bias -+ z sd, between which the stated share of differences lies."""
     low_interval: Ends | None = None
     high_interval: Ends | None = None
+    """`low_interval`, `high_interval`: Each limit on its own: exact for single readings (Carkeet 2015), by variance
+    recovery with replicates.
+    """
     pair_intervals: tuple[Ends, Ends] | None = None
+    """Of both limits taken together, exact (Carkeet 2015); None with replicates."""
     approximate_intervals: tuple[Ends, Ends] | None = None
+    """Bland & Altman's (1986), for comparison with other programs; None with replicates."""
     components: dict[str, float] | None = None
+    """Variances that add up to ``sd`` squared, by name; empty for single readings."""
 
 
 def limits(differences: FloatArray, *, confidence: float = 0.95) -> Limits:

@@ -270,19 +270,16 @@ EQUAL = 1e-12
 
 
 class Line(Record):
-    """y = intercept + slope x, fitted to n pairs.
-
-    Attributes
-    ----------
-    intercept_se, slope_se
-        Analytic standard errors, as if the pairs were independent; None where there is no formula.
-    """
+    """y = intercept + slope x, fitted to n pairs."""
 
     intercept: float
     slope: float
     n: int
     intercept_se: float | None = None
     slope_se: float | None = None
+    """`intercept_se`, `slope_se`: Analytic standard errors, as if the pairs were independent; None where there is no
+    formula.
+    """
 
     def intervals(self, *, confidence: float) -> tuple[tuple[float, float], tuple[float, float]] | None:
         """Analytic intervals of intercept and slope, by Student's t with n - 2 degrees of freedom."""
@@ -470,28 +467,19 @@ def _about(value: float, reach: float) -> tuple[float, float]:
 
 
 class Concordance(Record):
-    """Concordance coefficient and its parts.
-
-    Attributes
-    ----------
-    coefficient
-        Lin's, -1 to 1: `pearson_r` times `bias_correction`.
-    bias_correction
-        C_b, above 0 to 1: 1 when means and standard deviations agree.
-    scale_shift
-        SD of y over that of x.
-    location_shift
-        Mean of y less that of x, over the geometric mean of the SDs (divisor n).
-    interval
-        By Fisher's z; None for fewer than 4 pairs or a perfect or uncorrelated sample.
-    """
+    """Concordance coefficient and its parts."""
 
     coefficient: float
+    """Lin's, -1 to 1: `pearson_r` times `bias_correction`."""
     pearson_r: float
     bias_correction: float
+    """C_b, above 0 to 1: 1 when means and standard deviations agree."""
     scale_shift: float
+    """SD of y over that of x."""
     location_shift: float
+    """Mean of y less that of x, over the geometric mean of the SDs (divisor n)."""
     interval: tuple[float, float] | None
+    """By Fisher's z; None for fewer than 4 pairs or a perfect or uncorrelated sample."""
 
 
 def concordance(x: FloatArray, y: FloatArray, *, confidence: float = 0.95) -> Concordance:

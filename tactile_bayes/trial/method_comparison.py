@@ -48,32 +48,22 @@ _T = TypeVar("_T")
 
 
 class MethodComparison(Record):
-    """Comparison of one modality's detected sizes with excision.
-
-    Attributes
-    ----------
-    error_ratio
-        Variance of the error of ex-vivo sizes over that of the modality's, as the Deming lines took it.
-    figures
-        Intercepts, slopes, concordance and limits with intervals over patients.
-    analytic
-        Customary intervals of the same figures, as if masses were independent; None where there is none.
-    limits
-        ``mm`` for differences, ``log_ratio`` for logarithms of ratios; of single readings, replicates allowed for.
-    trends
-        Slope of the differences on the ex-vivo size (``on_ex_vivo``) and on the mean of both (``on_mean``).
-    errors_grow
-        Errors are likelier proportional to size than constant, so that limits in mm suit no one size.
-    """
+    """Comparison of one modality's detected sizes with excision."""
 
     n: int
     error_ratio: float
+    """Variance of the error of ex-vivo sizes over that of the modality's, as the Deming lines took it."""
     figures: Mapping[str, Figure]
+    """Intercepts, slopes, concordance and limits with intervals over patients."""
     analytic: Mapping[str, Ends | None] = field(default_factory=dict)
+    """Customary intervals of the same figures, as if masses were independent; None where there is none."""
     limits: Mapping[str, Limits] = field(default_factory=dict)
+    """``mm`` for differences, ``log_ratio`` for logarithms of ratios; of single readings, replicates allowed for."""
     trends: Mapping[str, Trend] = field(default_factory=dict)
+    """Slope of the differences on the ex-vivo size (``on_ex_vivo``) and on the mean of both (``on_mean``)."""
     concordance: Concordance | None = None
     errors_grow: bool = False
+    """Errors are likelier proportional to size than constant, so that limits in mm suit no one size."""
 
 
 def compare_methods(sizes: ModalitySizes, *, confidence: float, error_ratio: float = 1.0) -> MethodComparison:

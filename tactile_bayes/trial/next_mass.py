@@ -50,22 +50,19 @@ class Sampler(Protocol):
 
 
 class Posterior(Record):
-    """Posterior of one modality: draws of its parameters and of the next mass's expected percent error.
-
-    Attributes
-    ----------
-    summaries
-        Median, low and high end of each figure, by name. `mape_detected_percent` is the error of a mass that is found.
-    mape_percent, mape_detected_percent
-        (n,) draws of the expected percent error of the next mass, misses included, and of one that is found.
-    """
+    """Posterior of one modality: draws of its parameters and of the next mass's expected percent error."""
 
     name: str
     masses: int
     patients: int
     summaries: Mapping[str, tuple[float, float, float]]
+    """Median, low and high end of each figure, by name. `mape_detected_percent` is the error of a mass that is found.
+    """
     mape_percent: FloatArray
     mape_detected_percent: FloatArray
+    """`mape_percent`, `mape_detected_percent`: (n,) draws of the expected percent error of the next mass, misses
+    included, and of one that is found.
+    """
     diagnostics: Mapping[str, float]
 
 

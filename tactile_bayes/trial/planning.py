@@ -48,25 +48,20 @@ class ErrorModel(Record):
 
 
 class IntervalCheck(Record):
-    """Coverage of the percent error's intervals in simulated trials.
-
-    Attributes
-    ----------
-    covered, low_misses, high_misses
-        Trials whose interval holds the true error, lies above it, or lies below it.
-    undefined
-        Trials without an interval; not counted in `trials`.
-    median_width_ratio
-        Median of the upper over the lower end.
-    """
+    """Coverage of the percent error's intervals in simulated trials."""
 
     model: ErrorModel
     trials: int
     covered: int
     low_misses: int
     high_misses: int
+    """`covered`, `low_misses`, `high_misses`: Trials whose interval holds the true error, lies above it, or lies below
+    it.
+    """
     undefined: int
+    """Trials without an interval; not counted in `trials`."""
     median_width_ratio: float
+    """Median of the upper over the lower end."""
     interval: tuple[float, float] = field(default=(0.0, 1.0))
 
     @property
@@ -172,26 +167,23 @@ LEVEL = 0.05
 
 
 class PlanCase(Record):
-    """One design with assumed errors: all that its simulation depends on.
-
-    Attributes
-    ----------
-    patients, maps
-        Patients with one mass each, and tactile maps per mass.
-    tactile_bias, mass_sd, map_sd
-        Of ln(size / ex vivo): mean, SD shared by all maps of a mass, SD of single maps.
-    other_bias, other_sd, other_miss
-        The same for the modality compared with, read once, and its probability of missing a mass.
-    """
+    """One design with assumed errors: all that its simulation depends on."""
 
     patients: int
     maps: int
+    """`patients`, `maps`: Patients with one mass each, and tactile maps per mass."""
     tactile_bias: float
     mass_sd: float
     map_sd: float
+    """`tactile_bias`, `mass_sd`, `map_sd`: Of ln(size / ex vivo): mean, SD shared by all maps of a mass, SD of single
+    maps.
+    """
     other_bias: float
     other_sd: float
     other_miss: float
+    """`other_bias`, `other_sd`, `other_miss`: The same for the modality compared with, read once, and its probability
+    of missing a mass.
+    """
     trials: int
     seed: int
     confidence: float = 0.95
@@ -203,26 +195,20 @@ class PlanCase(Record):
 
 
 class PlanResult(Record):
-    """Results of the simulated trials of one design.
-
-    Attributes
-    ----------
-    power
-        Share of trials with a smaller tactile error and a sign-flip test below 5 %.
-    power_interval
-        Exact 95 % interval of that share: the simulation's own error.
-    tactile_percent, other_percent
-        Mean percent errors over the trials.
-    tactile_width_ratio, ratio_width_ratio
-        Median upper over lower end of the interval of the tactile error, and of the ratio of errors.
-    """
+    """Results of the simulated trials of one design."""
 
     power: float
+    """Share of trials with a smaller tactile error and a sign-flip test below 5 %."""
     power_interval: tuple[float, float]
+    """Exact 95 % interval of that share: the simulation's own error."""
     tactile_percent: float
     other_percent: float
+    """`tactile_percent`, `other_percent`: Mean percent errors over the trials."""
     tactile_width_ratio: float | None
     ratio_width_ratio: float | None
+    """`tactile_width_ratio`, `ratio_width_ratio`: Median upper over lower end of the interval of the tactile error, and
+    of the ratio of errors.
+    """
 
     def as_dict(self) -> dict[str, Any]:
         """Plain data."""

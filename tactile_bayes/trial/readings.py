@@ -63,36 +63,27 @@ class IntervalReading(Record):
 
 
 class ModalitySizes(Record, eq=False):
-    """Sizes of n masses by one modality, ordered by patient and mass whatever the order of the rows.
-
-    Attributes
-    ----------
-    patient
-        (n,) array, the patient of each mass by number.
-    ex_vivo_mm
-        (n,) array, above 0.
-    size_mm
-        (n,) array: mean over the detected replicates; 0 where none was detected.
-    replicates_mm
-        n arrays: the detected replicates of each mass.
-    intervals
-        The credible intervals that the readings state.
-    masses_not_done, masses_without_reading
-        Excised masses left out: looked for in no replicate, or not in the table.
-    mass
-        (n,) array, the number of each mass among the excised ones; counted from 0 when not given.
-    """
+    """Sizes of n masses by one modality, ordered by patient and mass whatever the order of the rows."""
 
     name: str
     patient: npt.NDArray[np.int64]
+    """(n,) array, the patient of each mass by number."""
     ex_vivo_mm: FloatArray
+    """(n,) array, above 0."""
     size_mm: FloatArray
+    """(n,) array: mean over the detected replicates; 0 where none was detected."""
     replicates_mm: tuple[FloatArray, ...]
+    """n arrays: the detected replicates of each mass."""
     intervals: tuple[IntervalReading, ...] = ()
+    """The credible intervals that the readings state."""
     readings: int = 0
     masses_not_done: int = 0
     masses_without_reading: int = 0
+    """`masses_not_done`, `masses_without_reading`: Excised masses left out: looked for in no replicate, or not in the
+    table.
+    """
     mass: npt.NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    """(n,) array, the number of each mass among the excised ones; counted from 0 when not given."""
 
     def __post_init__(self) -> None:
         n = len(self.ex_vivo_mm)

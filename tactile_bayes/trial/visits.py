@@ -16,22 +16,15 @@ Row = tuple[int, Reading]
 
 
 class OtherVisits(Record):
-    """Readings that a trial's analysis leaves out because they are of other visits than the excision's.
-
-    Parameters
-    ----------
-    masses
-        How many masses were read at several visits.
-    earlier, later
-        Readings at visits before the last one, and after the excision.
-    only_there
-        By modality, masses that it read at other visits alone.
-    """
+    """Readings that a trial's analysis leaves out because they are of other visits than the excision's."""
 
     masses: int = 0
+    """How many masses were read at several visits."""
     earlier: int = 0
     later: int = 0
+    """`earlier`, `later`: Readings at visits before the last one, and after the excision."""
     only_there: Mapping[str, int] = field(default_factory=dict)
+    """By modality, masses that it read at other visits alone."""
 
     def lines(self) -> list[str]:
         """What was left out, in words; empty where nothing was."""
