@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, get_args
 
 import click
 
 from tactile_bayes.commands.options import FORCE, SPEED, FilePath, FiniteRange, live_options
+from tactile_bayes.presets import TrackerProtocol
 
 # --- `emulate`: serve a scan as a device would send it.
 
-PROTOCOLS = ("open", "fastrak", "fastrak-ascii", "liberty", "liberty-ascii", "bird", "igtlink", "ndi")
+PROTOCOLS = get_args(TrackerProtocol)
 _SHARE = FiniteRange(0.0, 1.0)
 
 
