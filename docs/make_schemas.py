@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 from tactile_bayes.api.settings import SettingsFile
 from tactile_bayes.declarations import Record, schema_of
+from tactile_bayes.exports.identity import Worklist
 from tactile_bayes.files.column_map import ColumnMap
-from tactile_bayes.files.documents import Protocol
+from tactile_bayes.files.documents import OF_A_PERSON, Fact, FactName, Protocol, Session
 from tactile_bayes.files.instrument_json import HeadFile
 from tactile_bayes.files.repeatability_json import RepeatabilityFile
 from tactile_bayes.files.scene_toml import SceneFile
@@ -22,6 +24,7 @@ OF_JSON: dict[str, type[Record]] = {
     "size_calibration.schema.json": Eq6File,
     "size_population.schema.json": PopulationFile,
     "size_site.schema.json": SiteFile,
+    "worklist.schema.json": Worklist,
 }
 OF_TOML: dict[str, type[Record]] = {
     "bodies.schema.json": BodiesFile,
@@ -36,4 +39,15 @@ def schemas() -> dict[Path, str]:
     """What each generated schema has to hold."""
     found = {name: schema_of(kind) for name, kind in OF_JSON.items()}
     found |= {name: schema_of(kind, nulls=False) for name, kind in OF_TOML.items()}
+    found["scan_session.schema.json"] = _session()
     return {SCHEMAS / name: json.dumps(one, indent=2, ensure_ascii=False) + "\n" for name, one in found.items()}
+
+
+def _session() -> dict[str, Any]:
+    """Schema of a session: known facts, and others by their names."""
+    others = schema_of(dict[FactName, Fact])
+    names = others["propertyNames"] | {"not": {"enum": list(OF_A_PERSON)}}
+    return schema_of(Session, nulls=False) | {
+        "propertyNames": names,
+        "additionalProperties": others["additionalProperties"],
+    }

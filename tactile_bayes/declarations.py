@@ -472,7 +472,7 @@ def _way_out(kind: Any, value: Any) -> str:
     if len(forms) > 1 and isinstance(value, dict):  # no form of that name
         names = ", ".join(str(one.__struct_config__.tag) for one in forms)
         return f"give as its {forms[0].__struct_config__.tag_field} one of {names}"
-    choices = [str(one) for kind in members for one in get_args(kind) if get_origin(kind) is Literal]
+    choices = [str(one) for form in map(_bare, members) if get_origin(form) is Literal for one in get_args(form)]
     if isinstance(value, str) and len(choices) > 1 and (near := meant(value, choices)).startswith("did"):
         return f"{near} Give one of {', '.join(choices)}"
     return f"give {' or '.join(dict.fromkeys(_in_words(one) for one in members))}"

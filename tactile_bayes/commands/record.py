@@ -41,15 +41,14 @@ class Request(RecordOptions, kw_only=True):
         Raises
         ------
         BadDataError
-            When the file cannot be read, or a fact is not as `scan_session.schema.json` has it.
+            When the file cannot be read, or a fact is none of `Session`.
         """
-        from tactile_bayes.files.documents import SESSION_SCHEMA as SCHEMA
-        from tactile_bayes.files.documents import check_document, read_session
+        from tactile_bayes.files.documents import check_session, read_session
 
         facts = read_session(self.session_file) if self.session_file else {}
         options = {name: getattr(self, name) for name in ("side", "posture", "lubricant", "examiner", "subject")}
         facts |= {name: value for name, value in options.items() if value}
-        check_document(facts, SCHEMA, path=self.output)
+        check_session(facts, path=self.output)
         return facts
 
     def session(self, hello: HelloReading, facts: dict[str, str]) -> dict[str, str]:
@@ -317,8 +316,7 @@ def make_recording(request: Request) -> tuple[Report, bool]:
     from datetime import date
 
     from tactile_bayes.files.atomic import refuse_existing, unwritable
-    from tactile_bayes.files.documents import SESSION_SCHEMA as SCHEMA
-    from tactile_bayes.files.documents import check_document
+    from tactile_bayes.files.documents import check_session
     from tactile_bayes.files.scan_recording import RecordingWriter, create_exclusive, full_disk
     from tactile_bayes.hardware.recorder import Recorder
 
@@ -330,7 +328,7 @@ def make_recording(request: Request) -> tuple[Report, bool]:
         hello, lines = _connect(request, stack)
         _check_fit(hello, head, request)
         session = request.session(hello, facts) | calibration_age(request, today=date.today())
-        check_document(session, SCHEMA, path=request.output)
+        check_session(session, path=request.output)
         refuse_calibration(request, head_id=hello.device_id, today=date.today())
         observer = _look_on(request, head, calibration, stack)
         stream = stack.enter_context(create_exclusive(request.output, force=request.force))

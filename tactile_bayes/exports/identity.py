@@ -9,12 +9,12 @@ import re
 import warnings
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final, Literal
 
-from tactile_bayes.declarations import Record, names_of, replace
+from tactile_bayes.declarations import Meta, Record, as_dict, names_of, replace
 from tactile_bayes.errors import BadDataError, TactileBayesError, UsageError
 from tactile_bayes.exports.exam import required
-from tactile_bayes.files.documents import check_document, load_json, load_schema, refuse_unknown
+from tactile_bayes.files.documents import load_json, parse_record
 from tactile_bayes.files.reading import read_bytes
 
 # --- Who was examined, and when: only what the user or a worklist says, checked against what the formats can hold.
@@ -181,7 +181,6 @@ def _short(value: str) -> str:
 
 # --- Identity from a worklist: a modality worklist item of DICOM (a file, or DICOM JSON), or plain keys in JSON.
 
-SCHEMA: Final = "worklist.schema.json"
 _WAY_OUT: Final = "give one worklist item: the answer of a modality worklist (.dcm), or JSON with patient_id and others"
 _MOST_BYTES: Final = 10**6
 # What a worklist item says, by the attributes of DICOM; scheduled dates are no dates of an exam.
@@ -197,6 +196,38 @@ _ATTRIBUTES: Final = {
     "study_uid": "StudyInstanceUID",
 }
 _TAG: Final = re.compile(r"[0-9A-Fa-f]{8}")
+
+
+class Worklist(Record):
+    """Worklist of an export.
+
+    Who was examined and when, for `export --worklist`; what is left out stays empty. The file may also be a modality
+    worklist item of DICOM.
+    """
+
+    patient_id: Annotated[str, Meta(max_length=64, description="Patient ID.")] = ""
+    patient_name: Annotated[str, Meta(max_length=194, description="FAMILY^GIVEN^MIDDLE^PREFIX^SUFFIX.")] = ""
+    birth_date: Annotated[str, Meta(max_length=10, description="YYYY-MM-DD.")] = ""
+    sex: Annotated[Literal["F", "M", "O", ""], Meta(description="F, M or O.")] = ""
+    issuer: Annotated[str, Meta(max_length=64, description="Who issued the patient ID.")] = ""
+    accession: Annotated[str, Meta(max_length=16, description="Accession number.")] = ""
+    referring_physician: Annotated[str, Meta(max_length=194, description="FAMILY^GIVEN.")] = ""
+    study_id: Annotated[str, Meta(max_length=16, description="Study ID.")] = ""
+    study_description: Annotated[str, Meta(max_length=64, description="Study description.")] = ""
+    study_uid: Annotated[
+        str, Meta(max_length=64, description="Study Instance UID. Without it, one that follows from the content.")
+    ] = ""
+    study_date: Annotated[
+        str,
+        Meta(
+            max_length=25,
+            description="When the exam was: YYYY-MM-DD or YYYY-MM-DDTHH:MM, with +HH:MM for the time zone if it is "
+            "known.",
+        ),
+    ] = ""
+    content_date: Annotated[
+        str, Meta(max_length=25, description="When the content was made, in the same form. Without it, `study_date`.")
+    ] = ""
 
 
 def identity_of(worklist: Path | None, given: Mapping[str, str]) -> Identity:
@@ -234,9 +265,8 @@ def read_worklist(path: Path) -> Identity:
         raise BadDataError("is no worklist item", way_out=_WAY_OUT, path=str(path))
     if document and all(_TAG.fullmatch(key) for key in document):
         return _identity(_of_dicom(_from_dicom_json(document, path), path), path)
-    refuse_unknown(document, load_schema(SCHEMA)["properties"], path=path)
-    check_document(document, SCHEMA, path=path)
-    return _identity({name: value for name, value in document.items() if value}, path)
+    found = as_dict(parse_record(document, Worklist, path=path))
+    return _identity({name: value for name, value in found.items() if value}, path)
 
 
 def _identity(given: dict[str, str], path: Path) -> Identity:

@@ -7,35 +7,17 @@ import re
 import sys
 import tomllib
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypeVar
 
-from tactile_bayes.declarations import Meta, Record, as_dict, field, from_plain, replace, schema_name
+from tactile_bayes.declarations import Meta, Record, as_dict, field, from_plain, names_of, replace, schema_name
 from tactile_bayes.errors import BadDataError, meant
 from tactile_bayes.files.reading import JSON_BYTES, TOML_BYTES, decoding, kind_of, read_text, schema_kind
 
 if TYPE_CHECKING:
     from tactile_bayes.scan import Scan
-
-
-# --- Refusal of keys that a file may not have, with the key that was probably meant.
-
-
-def refuse_unknown(table: Mapping[str, object], known: Collection[str], *, path: Path, where: str = "") -> None:
-    """Raise `BadDataError` for the first key of a table that is not known.
-
-    Parameters
-    ----------
-    where
-        Name of the table in the file; empty for the file itself.
-    """
-    for key in table:
-        if key in known:
-            continue
-        full = f"{where}.{key}" if where else key
-        raise BadDataError(f"{full} is not known", way_out=meant(key, known), path=str(path))
 
 
 # --- The schemas in data_schema/, from a wheel or a checkout, applied with one-line errors.
@@ -391,9 +373,101 @@ def read_protocol(path: Path) -> Protocol:
 
 # --- Session facts of a recording as TOML: side, posture, lubricant, examiner, subject and other text.
 
-SESSION_SCHEMA: Final = "scan_session.schema.json"
 SET_BY_RECORDING: Final = ("head_id", "tracker_id", "source", "clock", "rotation", "array_calibration_days")
 """Keys that the recording itself writes."""
+OF_A_PERSON: Final = (
+    "name",
+    "patient",
+    "patient_name",
+    "examiner_name",
+    "date_of_birth",
+    "birth_date",
+    "address",
+    "phone",
+)
+"""Keys that no session may have."""
+_LETTERS: Final = "letters from A to Z and a to z, digits, _ and -"
+Text64 = Annotated[str, Meta(max_length=64)]
+Code = Annotated[
+    str, Meta(pattern="^[A-Za-z0-9_-]{1,32}$", extra={"words": f"a text in quotes of up to 32 {_LETTERS}"})
+]
+_FACT_NAME: Final = "^[a-z][a-z0-9_]{0,39}$"
+FactName = Annotated[str, Meta(pattern=_FACT_NAME)]
+Fact = Annotated[str, Meta(max_length=2000)]
+
+
+class Session(Record, forbid_unknown_fields=False):
+    """Session of a scan.
+
+    Plain text facts about one scan: the metadata record `session` of a scan file. Every value is text. Codes only:
+    nothing here may identify a person.
+    """
+
+    head_id: Annotated[Text64, Meta(description="Identity of the scan head.")] | None = None
+    array_id: Annotated[Text64, Meta(description="Identity or serial number of the pressure array.")] | None = None
+    tracker_id: Annotated[Text64, Meta(description="Identity or serial number of the tracker.")] | None = None
+    side: Annotated[Literal["left", "right", "phantom"], Meta(description="Which breast, or a phantom.")] | None = None
+    posture: (
+        Annotated[Literal["supine", "oblique", "sitting", "phantom"], Meta(description="Posture during the scan.")]
+        | None
+    ) = None
+    lubricant: Annotated[Text64, Meta(description="What was put on the skin; `none` for none.")] | None = None
+    examiner: (
+        Annotated[
+            str,
+            Meta(
+                pattern="^[A-Za-z0-9_-]{1,16}$",
+                extra={"words": f"a text in quotes of up to 16 {_LETTERS}"},
+                description="Coded examiner, not a name.",
+            ),
+        ]
+        | None
+    ) = None
+    subject: Annotated[Code, Meta(description="Coded subject, not a name.")] | None = None
+    visit: (
+        Annotated[Code, Meta(description="Code of the visit; `campaign init` takes 1 where it is left out.")] | None
+    ) = None
+    mass: (
+        Annotated[
+            Code,
+            Meta(description="Code of the mass within the subject; `campaign init` takes 1 where it is left out."),
+        ]
+        | None
+    ) = None
+    array_calibration_days: (
+        Annotated[
+            str,
+            Meta(
+                pattern="^-?[0-9]{1,6}$",
+                extra={"words": "a whole number of days in quotes"},
+                description="Age of the array calibration at the recording, in whole days.",
+            ),
+        ]
+        | None
+    ) = None
+    source: Annotated[Text64, Meta(description="Where the scan came from: recorded, imported, simulated.")] | None = (
+        None
+    )
+
+
+def check_session(session: Mapping[str, object], *, path: Path) -> None:
+    """Hold the facts of a scan against `Session`; others are text by names in small letters.
+
+    Raises
+    ------
+    BadDataError
+        For a fact that is none, or may name a person.
+    """
+    for name in session:
+        if name in OF_A_PERSON:
+            way_out = "leave it out: nothing here may identify a person"
+            raise BadDataError(f"{name} may not be given", way_out=way_out, path=str(path))
+        if not re.search(_FACT_NAME, name):
+            near = meant(name, names_of(Session))
+            way_out = near if near.startswith("did") else "keys are of small letters, digits and _"
+            raise BadDataError(f"{_shown(name)} is not known", way_out=way_out, path=str(path))
+    parse_record(dict(session), Session, path=path)
+    parse_record(dict(session), dict[FactName, Fact], path=path)
 
 
 def with_session(scan: Scan, path: Path | None) -> Scan:
@@ -407,12 +481,11 @@ def read_session(path: Path) -> dict[str, str]:
     Raises
     ------
     BadDataError
-        When the file is not TOML, a value is not text as `scan_session.schema.json` has it, or a key is one of
-        `SET_BY_RECORDING`.
+        When the file is not TOML, a fact is none of `Session`, or a key is one of `SET_BY_RECORDING`.
     """
-    document = load_toml(path, way_out=f"see {SESSION_SCHEMA}")
+    document = load_toml(path, way_out='give facts as TOML: side = "left"')
     for key in SET_BY_RECORDING:
         if key in document:
             raise BadDataError(f"{key} is set by the recording itself", way_out=f"leave {key} out", path=str(path))
-    check_document(document, SESSION_SCHEMA, path=path)
-    return {key: str(value) for key, value in document.items()}
+    check_session(document, path=path)
+    return document

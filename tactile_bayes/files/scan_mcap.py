@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from tactile_bayes import __version__
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.atomic import atomic_path, refuse_existing
-from tactile_bayes.files.documents import check_document, parse_json
+from tactile_bayes.files.documents import check_session, parse_json
 from tactile_bayes.files.instrument_json import (
     ScanFile,
     calibration_document,
@@ -69,7 +69,6 @@ LANDMARK_NAMES: Final = ("sternal_notch", "xiphoid")
 NIPPLE: Final = "nipple"
 """A landmark that a scan may do without; a file has a channel for it only where it was touched."""
 TOPICS: Final = ("/pressure", "/pose", "/landmark")
-_SESSION_SCHEMA: Final = "scan_session.schema.json"
 _NS: Final = 1_000_000_000
 _LATEST_NS: Final = 2**63 - 1
 
@@ -245,7 +244,7 @@ def write_scan(
         When the session holds what a scan file must not.
     """
     refuse_existing(path, force=force)
-    check_document(dict(scan.session), _SESSION_SCHEMA, path=path)
+    check_session(scan.session, path=path)
     with atomic_path(path, force=force) as partial, partial.open("wb") as stream:
         writer = ScanWriter(
             stream,
@@ -342,7 +341,7 @@ def _assemble(records: McapRecords, *, path: Path) -> ScanFile:
     head = head_from_document(json_attachment(records, "head.json"))
     calibration = calibration_from_document(json_attachment(records, "element_calibration.json"))
     session = records.metadata.get("session", {})
-    check_document(session, _SESSION_SCHEMA, path=path)
+    check_session(session, path=path)
     frames = _frames(records, head)
     if not len(frames) and not records.finished:
         raise BadDataError("was cut off before its first complete chunk", way_out="nothing can be kept; scan again")

@@ -388,8 +388,8 @@ def test_mistakes_end_in_one_line(record, tmp_path, source, scan, words, code, s
 
 SESSIONS = {
     'clock = "shared"': "clock is set by the recording itself; leave clock out",
-    'subject = "two words"': "subject is 'two words'; give up to 32 letters",
-    "subject = 7": "subject is 7; give a text, in quotes",
+    'subject = "two words"': "subject is 'two words'; give a text in quotes of up to 32 letters",
+    "subject = 7": "subject is 7; give a text in quotes",
     'patient_name = "x"': "patient_name may not be given; leave it out",
     'Side = "left"': "'Side' is not known; did you mean side?",
     'side = "Left"': "side is 'Left'; did you mean left? Give one of left, right, phantom",
