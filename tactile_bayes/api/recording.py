@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from tactile_bayes.actions.record import Request, make_recording
 from tactile_bayes.api.arguments import check_keywords, door, plain
 from tactile_bayes.api.maps import PathLike, path_of
-from tactile_bayes.commands.record import Request, make_recording
 from tactile_bayes.declarations import names_of
 from tactile_bayes.errors import DeviceError, check_number
 from tactile_bayes.options import RecordOptions

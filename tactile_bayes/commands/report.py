@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from pathlib import Path
 from typing import Any
 
 import click
-from click.core import ParameterSource
 
 from tactile_bayes.api.settings import Settings
-from tactile_bayes.commands.options import FORCE, FilePath, also_read, settings_of, takes
-from tactile_bayes.errors import UsageError
-from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.commands.options import FORCE, FilePath, takes
 
 _FILE = FilePath()
 
@@ -41,19 +36,7 @@ _FILE = FilePath()
 @takes(Settings, "seed", "interval")
 @FORCE
 @click.pass_context
-def command(
-    ctx: click.Context,
-    /,
-    *,
-    files: tuple[Path, ...],
-    output: Path,
-    pdf: Path | None,
-    title: str,
-    name: str,
-    day: str,
-    force: bool,
-    **asked: Any,
-) -> None:
+def command(ctx: click.Context, /, **given: Any) -> None:
     """Write one page of an exam: the map, the size with its intervals, the place, and how good the exam was.
 
     The page is one HTML file that loads nothing and prints to one side of A4. Several maps are repeats of one mass:
@@ -63,29 +46,6 @@ def command(
 
     Example: tactile-bayes report map.nc -o exam.html
     """
-    from tactile_bayes.api.exam_report import ExamFiles, Given, read_exam
-    from tactile_bayes.files.shipped import size_calibration_path
-    from tactile_bayes.report.exam_page import PageFiles
-    from tactile_bayes.report.exam_words import headline
+    from tactile_bayes.actions.maps import report_action
 
-    given, page = Given(title, name, day), PageFiles(output, pdf, force)
-    page.check()
-    sorted_files = ExamFiles.sort(files)
-    if sorted_files.estimates:
-        _refuse_settings(ctx, asked)
-    settings, size_calibration = settings_of(**asked), asked["size_calibration"]
-    also_read(None if size_calibration is None else size_calibration_path(size_calibration))
-    exam = read_exam(sorted_files, settings, given, notice=lambda line: click.echo(line, err=True))
-    page.write(exam)
-    if exam.main.tactile_map is None:
-        click.echo("note: without its map the page has no picture and no coverage; give MAP.nc too", err=True)
-    click.echo(f"{output}: {headline(exam)}")
-    click.echo(RESEARCH_USE)
-
-
-def _refuse_settings(ctx: click.Context, asked: Iterable[str]) -> None:
-    """Refuse options of the estimate where an estimate is given: they would change nothing."""
-    for name in asked:
-        if ctx.get_parameter_source(name) is ParameterSource.COMMANDLINE:
-            option = "--settings" if name == "settings_file" else f"--{name.replace('_', '-')}"
-            raise UsageError(f"an estimate has settings of its own; leave out {option}, or give the map alone")
+    report_action(ctx, **given)

@@ -29,7 +29,7 @@ from tactile_bayes.hardware.serve import LiveServer
 
 WARM_ESTIMATOR = """
 import multiprocessing, sys, time
-from tactile_bayes.commands.live_view import Estimator
+from tactile_bayes.actions.live_view import Estimator
 
 if __name__ == "__main__":
     estimator = Estimator(None)

@@ -18,7 +18,7 @@ from emulated_devices import head_and_tracker, short_scan
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
-from tactile_bayes.commands.live_view import Turn, live_estimate
+from tactile_bayes.actions.live_view import Turn, live_estimate
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import UsageError
 from tactile_bayes.hardware.live import (

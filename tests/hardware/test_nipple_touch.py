@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from test_orientation import scan_of
 
-from tactile_bayes.commands.record import Keys, calibration_age
+from tactile_bayes.actions.record import Keys, calibration_age
 from tactile_bayes.hardware.live import LiveMap, SeenFrame, SeenLandmark, SeenPose
 
 

@@ -362,7 +362,7 @@ def test_what_speaks_against_a_map_reaches_pool_comparison_and_campaign(tmp_path
 
 
 def test_the_live_view_says_a_caution_before_the_size() -> None:
-    from tactile_bayes.commands.live_view import Turn, live_estimate
+    from tactile_bayes.actions.live_view import Turn, live_estimate
 
     shipped = Path(tb.__file__).parent / "calibrations" / "solid.json"
     live = replace(plain_map(1), findings=(finding("late_poses"), finding("few_strokes")))

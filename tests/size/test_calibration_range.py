@@ -11,7 +11,7 @@ from in_process import run_here
 from posterior_files import MADE
 from posterior_maps import bump_map
 
-from tactile_bayes.commands.live_view import Turn, live_estimate
+from tactile_bayes.actions.live_view import Turn, live_estimate
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import EXIT_DONE, EXIT_NO_ESTIMATE
 from tactile_bayes.files.map_nc import write_map

@@ -162,10 +162,7 @@ def _mode(data: AxisRows) -> tuple[AxisRows, FloatArray, FloatArray]:
 
 
 def _learn_axis(data: AxisRows, *, rng: np.random.Generator, progress: Progress | None) -> AxisCalibration:
-    from tactile_bayes.inference.ensemble import (
-        EnsembleOptions,
-        ensemble,  # emcee, which no other command here loads
-    )
+    from tactile_bayes.inference.ensemble import EnsembleOptions, ensemble
 
     data, mode, covariance = _mode(data)
 

@@ -60,7 +60,7 @@ def live_view(
         "size_calibration": _calibration_file(size_calibration),
     }
     theirs, ours = os.pipe()
-    command = [sys.executable, "-m", "tactile_bayes.commands.live_view", str(theirs)]
+    command = [sys.executable, "-m", "tactile_bayes.actions.live_view", str(theirs)]
     process = subprocess.Popen(command, pass_fds=(theirs,), stdin=subprocess.PIPE, text=True)
     os.close(theirs)
     assert process.stdin is not None

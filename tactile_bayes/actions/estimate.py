@@ -1,0 +1,359 @@
+"""Maps estimated, pooled and compared, printed and written."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from tactile_bayes.api.estimating import Answer, answer_file, answer_of, estimate_file
+from tactile_bayes.api.settings import Comparing, Settings, refuse_checkpoint, times_of
+from tactile_bayes.commands.options import also_read, settings_of
+from tactile_bayes.declarations import replace
+from tactile_bayes.errors import EXIT_DONE, EXIT_FAULT, EXIT_NO_ESTIMATE, UsageError
+
+if TYPE_CHECKING:
+    from tactile_bayes.api.comparing import ComparedOutcome
+    from tactile_bayes.api.estimating import Outcome as MapOutcome
+    from tactile_bayes.api.pooled import PooledOutcome
+    from tactile_bayes.batch import Outcome
+
+
+# --- `estimate --pool`: one size from several maps of one mass.
+
+
+def estimate_pool(
+    maps: tuple[Path, ...],
+    answers: list[Answer],
+    settings: Settings,
+    output: Path | None,
+    figure: Path | None,
+    *,
+    as_json: bool,
+    verbose: bool,
+    force: bool,
+) -> int:
+    """Pool the maps, print and write the result; return the exit code.
+
+    A map that could not be read stops it: its error is printed, for a mass is not sized from what is left by accident.
+    """
+    from tactile_bayes.api.estimating import answer_file
+    from tactile_bayes.api.pooled import of_one_mass, pool_answers
+    from tactile_bayes.files.documents import check_document, dump_json
+    from tactile_bayes.report.pooled import pooled_summary, pooled_text
+
+    if settings.centre_mm is None:
+        answers = of_one_mass(
+            answers, lambda i, place: answer_file(maps[i], settings=replace(settings, centre_mm=place))
+        )
+    failed = [answer for answer in answers if answer.document is None]
+    for answer in failed:
+        click.echo(answer.text, err=True)
+    if failed:
+        return failed[0].exit_code
+    inputs = {f"map_{i + 1}": one for i, one in enumerate(maps)}
+    found = pool_answers(answers, settings, names=[str(one) for one in maps], inputs=inputs)
+    check_document(found.document, "pooled.schema.json", path=Path("the report"))
+    text_of = dump_json if as_json else pooled_text if verbose else pooled_summary
+    try:
+        if found.pooled.size is not None:
+            _write_pooled(found, maps, settings, output, figure, force=force)
+    finally:  # what was computed is not lost with a file
+        click.echo(text_of(found.document), nl=False)
+    return EXIT_DONE if found.pooled.size is not None else EXIT_NO_ESTIMATE
+
+
+def _write_pooled(
+    found: PooledOutcome,
+    maps: tuple[Path, ...],
+    settings: Settings,
+    output: Path | None,
+    figure: Path | None,
+    *,
+    force: bool,
+) -> None:
+    size, provenance = found.pooled.size, found.provenance
+    assert size is not None
+    if output is not None:
+        from tactile_bayes.files.posterior_nc import write_pooled
+
+        write_pooled(output, size, provenance=provenance, document=found.document, force=force)
+    if figure is not None:
+        from tactile_bayes.findings import findings_in
+        from tactile_bayes.report.estimate_figures import draw_size
+        from tactile_bayes.report.figure_file import named_exam
+
+        name = named_exam(f"{len(maps)} maps pooled", provenance.scans)
+        findings = findings_in(found.document["findings"])
+        draw_size(size, figure, name=name, probability=settings.interval, findings=findings, force=force)
+
+
+# --- `estimate`: estimate sizes from tactile maps.
+
+
+def estimate_action(
+    ctx: click.Context,
+    /,
+    maps: tuple[Path, ...],
+    output: Path | None,
+    as_json: bool,
+    figure: Path | None,
+    map_figure: Path | None,
+    fit_figure: Path | None,
+    pool: bool,
+    workers: int,
+    scheduler: str | None,
+    force: bool,
+    verbose: bool,
+    **asked: Any,
+) -> None:
+    """Estimate a lump's size from tactile maps, with a credible interval."""
+    settings, size_calibration = settings_of(**asked), asked["size_calibration"]
+    if len(maps) > 1:
+        refuse_checkpoint(settings)
+    if figure is not None and size_calibration == "none":
+        raise UsageError("--figure draws sizes and needs a --size-calibration; --map-figure draws the fit")
+    outputs = {"output": output, "figure": figure, "map figure": map_figure, "fit figure": fit_figure}
+    _check_outputs([path for path in outputs.values() if path], maps, pool, force=force)
+    also_read(_named(size_calibration))
+    begun = time.perf_counter()
+    if pool:
+        if map_figure or fit_figure:
+            raise UsageError("--map-figure and --fit-figure draw one map; leave out --pool")
+        answers = _many_maps(maps, settings, workers=workers, scheduler=scheduler)
+        printed = {"as_json": as_json, "verbose": verbose}
+        ctx.exit(estimate_pool(maps, answers, settings, output, figure, **printed, force=force))
+    if len(maps) == 1:
+        outcome = _one_map(maps[0], settings)
+        answers = [answer_of(outcome)]
+    else:
+        outcome = None
+        with _printed_if_interrupted(maps, as_json=as_json, verbose=verbose):
+            answers = _many_maps(maps, settings, workers=workers, scheduler=scheduler)
+    try:
+        if outcome is not None:
+            _write(outcome, answers[0], output, (figure, map_figure, fit_figure), name=maps[0].stem, force=force)
+    finally:  # what was computed is not lost with a file
+        if verbose:
+            print(f"estimate: {time.perf_counter() - begun:.3f} s", file=sys.stderr)
+        _print(maps, answers, as_json=as_json, verbose=verbose, listed=len(maps) > 1)
+    ctx.exit(_exit_code(answers))
+
+
+def _named(calibration: str | None) -> Path | None:
+    from tactile_bayes.files.shipped import size_calibration_path
+
+    return None if calibration is None else size_calibration_path(calibration)
+
+
+def _check_outputs(outputs: list[Path], maps: tuple[Path, ...], pool: bool, *, force: bool) -> None:
+    """Raise an error, before any work is done, if an output cannot be written."""
+    from tactile_bayes.files.atomic import given_twice, refuse_existing
+
+    if twice := given_twice(maps):
+        raise UsageError(f"{twice} is given twice; give each map once")
+    if outputs and len(maps) > 1 and not pool:
+        raise UsageError("--output and the figures take one map at a time; use --json for several")
+    for path in outputs:
+        refuse_existing(path, force=force)
+
+
+def _one_map(path: Path, settings: Settings) -> MapOutcome:
+    from tactile_bayes.commands.progress import progress_bar
+
+    with progress_bar("effective draws") as progress:
+        return estimate_file(
+            path, settings, progress=progress, notice=lambda line: click.echo(f"{path}: {line}", err=True)
+        )
+
+
+def _write(
+    outcome: MapOutcome,
+    answer: Answer,
+    output: Path | None,
+    figures: tuple[Path | None, Path | None, Path | None],
+    *,
+    name: str,
+    force: bool,
+) -> None:
+    tactile_map, estimate = outcome.tactile_map, outcome.estimate
+    if output and estimate.status == "estimate":
+        outcome.write(output, document=answer.document, force=force)
+    if any(figures):
+        from tactile_bayes.report.estimate_figures import draw_figures
+        from tactile_bayes.report.figure_file import named_exam
+
+        name = named_exam(name, outcome.provenance.scans)
+        draw_figures(tactile_map, estimate, *figures, name=name, probability=outcome.settings.interval, force=force)
+
+
+def _many_maps(maps: tuple[Path, ...], settings: Settings, *, workers: int, scheduler: str | None) -> list[Answer]:
+    from functools import partial
+
+    from tactile_bayes.batch import cluster_executor, local_executor, run_batch
+    from tactile_bayes.commands.progress import progress_bar
+
+    chosen = cluster_executor(scheduler) if scheduler else local_executor(min(workers, len(maps)))
+    with chosen as executor, progress_bar("maps") as progress:
+        outcomes = run_batch(
+            partial(answer_file, settings=settings), maps, key=str, executor=executor, progress=progress
+        )
+    return _answers(outcomes)
+
+
+def _answers(outcomes: Iterable[Outcome[Answer]]) -> list[Answer]:
+    """Answers for all maps; maps with the same error of the batch are named together in the first's answer."""
+    from tactile_bayes.batch import fault_lines
+
+    found = list(outcomes)
+    lines = dict(zip(dict.fromkeys(one.error for one in found if not one.ok), fault_lines(found), strict=True))
+    faults = (lines.pop(one.error, "") if not one.ok else "" for one in found)
+    return [
+        one.value if one.value is not None else Answer(None, f"error: {fault}" if fault else "", EXIT_FAULT)
+        for one, fault in zip(found, faults, strict=True)
+    ]
+
+
+@contextmanager
+def _printed_if_interrupted(maps: tuple[Path, ...], *, as_json: bool, verbose: bool) -> Iterator[None]:
+    """On Ctrl-C print the finished answers, and pass the interruption on."""
+    from tactile_bayes.batch import BatchInterrupted
+
+    try:
+        yield
+    except BatchInterrupted as stop:
+        done = {one.key for one in stop.outcomes}
+        finished = [path for path in maps if str(path) in done]
+        _print(finished, _answers(stop.outcomes), as_json=as_json, verbose=verbose, listed=True)
+        raise
+
+
+def _print(maps: Sequence[Path], answers: list[Answer], *, as_json: bool, verbose: bool, listed: bool) -> None:
+    """Print errors on stderr and answers on stdout: in full with `verbose`, `listed` for several maps."""
+    from tactile_bayes.files.documents import check_document, dump_json
+
+    for answer in answers:
+        if answer.document is None and answer.text:
+            click.echo(answer.text, err=True)
+    if as_json:
+        documents = [answer.document for answer in answers if answer.document is not None]
+        for document in documents:
+            check_document(document, "estimate.schema.json", path=Path("the report"))
+        click.echo(dump_json(documents if listed else documents[0]), nl=False)
+        return
+    for path, answer in zip(maps, answers, strict=True):
+        if answer.document is not None:
+            click.echo((f"{path}\n" if listed else "") + (answer.full_text if verbose else answer.text), nl=listed)
+
+
+def _exit_code(answers: list[Answer]) -> int:
+    """The first error's code, else 6 when a map gave no estimate, else 0."""
+    failed = [answer.exit_code for answer in answers if answer.document is None]
+    if failed:
+        return failed[0]
+    return EXIT_NO_ESTIMATE if any(answer.exit_code for answer in answers) else EXIT_DONE
+
+
+# --- `compare`: the maps of two visits and more.
+
+
+def groups_of(later: Sequence[tuple[int, Path]]) -> list[tuple[Path, ...]]:
+    """Files of each group, in the order of the groups."""
+    found: dict[int, list[Path]] = {}
+    for number, path in later:
+        found.setdefault(number, []).append(path)
+    return [tuple(found[number]) for number in sorted(found)]
+
+
+def compare_action(
+    ctx: click.Context,
+    /,
+    first: tuple[Path, ...],
+    later: tuple[tuple[int, Path], ...],
+    days: tuple[float, ...],
+    dates: str | None,
+    grown_by: tuple[float, ...],
+    same_mass: bool,
+    registration_mm: float,
+    as_json: bool,
+    figure: Path | None,
+    force: bool,
+    verbose: bool,
+    **asked: Any,
+) -> None:
+    """Compare the size of a mass at two visits and more."""
+    from tactile_bayes.files.atomic import refuse_existing
+    from tactile_bayes.files.documents import check_document, dump_json
+    from tactile_bayes.files.shipped import size_calibration_path
+    from tactile_bayes.report.compare import compare_summary, compare_text
+
+    comparing = Comparing(
+        days=times_of(days or None, None if dates is None else dates.split(",")),
+        grown_by=tuple(percent / 100 for percent in grown_by),
+        same_mass=same_mass,
+        registration_mm=registration_mm,
+    )
+    settings, size_calibration = settings_of(**asked), asked["size_calibration"]
+    visits = [first, *groups_of(later)]
+    _check_maps(visits, settings)
+    comparing.check_visits(len(visits))
+    if figure is not None:
+        refuse_existing(figure, force=force)
+    also_read(None if size_calibration is None else size_calibration_path(size_calibration))
+    outcome, draw = _compare(visits, settings, comparing)
+    check_document(outcome.document, "compare.schema.json", path=Path("the report"))
+    text_of = dump_json if as_json else compare_text if verbose else compare_summary
+    try:
+        if figure is not None:
+            draw(figure, force)
+    finally:  # what was computed is not lost with the figure
+        click.echo(text_of(outcome.document), nl=False)
+    ctx.exit(outcome.exit_code)
+
+
+def _check_maps(visits: list[tuple[Path, ...]], settings: Settings) -> None:
+    """Refuse a map that is given twice, and a checkpoint."""
+    from tactile_bayes.files.atomic import given_twice
+
+    if twice := given_twice(path for maps in visits for path in maps):
+        raise UsageError(f"{twice} is given twice; give each map once, at its own visit")
+    refuse_checkpoint(settings)
+
+
+def _compare(
+    visits: list[tuple[Path, ...]], settings: Settings, comparing: Comparing
+) -> tuple[ComparedOutcome, Callable[[Path, bool], None]]:
+    """Estimate every map and compare; also gives what draws the figure. An error with one map stops it."""
+    from tactile_bayes.api.comparing import compare_answers, drawn_maps
+    from tactile_bayes.api.estimating import answer_of, estimate_file
+    from tactile_bayes.api.pooled import elsewhere
+    from tactile_bayes.commands.progress import progress_bar
+
+    total, outcomes = sum(len(maps) for maps in visits), []
+    with progress_bar("maps") as progress:
+        for maps in visits:
+            outcomes.append([estimate_file(path, settings) for path in maps])
+            progress(sum(len(one) for one in outcomes), total)
+    answers = [[answer_of(outcome) for outcome in maps] for maps in outcomes]
+    if settings.centre_mm is None:
+        places = [(v, i) for v, maps in enumerate(visits) for i in range(len(maps))]
+        for number, place in elsewhere([answers[v][i].document for v, i in places]).items():
+            v, i = places[number]
+            outcomes[v][i] = estimate_file(visits[v][i], replace(settings, centre_mm=place))
+            answers[v][i] = answer_of(outcomes[v][i])
+    names = [[str(path) for path in maps] for maps in visits]
+    inputs = {f"visit_{v}_map_{i}": path for v, maps in enumerate(visits, 1) for i, path in enumerate(maps, 1)}
+    compared = compare_answers(answers, settings, comparing=comparing, names=names, inputs=inputs)
+
+    def draw(figure: Path, force: bool) -> None:
+        from tactile_bayes.report.compare_figure import draw_comparison
+
+        drawn = drawn_maps([[outcome.tactile_map for outcome in maps] for maps in outcomes], answers)
+        draw_comparison(compared.compared, compared.document, drawn, figure, force=force)
+
+    return compared, draw

@@ -1,0 +1,435 @@
+"""`record`: a scan head and a tracker into a scan file."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import signal
+import sys
+from contextlib import ExitStack, suppress
+from datetime import date
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from tactile_bayes.commands.options import FilePath, also_read
+from tactile_bayes.declarations import as_dict
+from tactile_bayes.errors import EXIT_INTERRUPTED, DeviceError, UsageError
+from tactile_bayes.options import RecordOptions
+from tactile_bayes.presets import PRESSURE_RANGE_KPA
+
+if TYPE_CHECKING:
+    from tactile_bayes.files.provenance import Provenance
+    from tactile_bayes.geometry import FloatArray
+    from tactile_bayes.hardware.readings import HelloReading
+    from tactile_bayes.hardware.recorder import Line, Observer, Recorder, Report
+    from tactile_bayes.scan import ElementCalibration, HeadGeometry, Landmarks
+
+
+# --- Options of one recording, and the part of them that the file stores.
+
+
+class Request(RecordOptions, kw_only=True):
+    """Options of one recording, and what of them its file stores."""
+
+    def facts(self) -> dict[str, str]:
+        """Session facts as text: from the file, overridden by options.
+
+        Raises
+        ------
+        BadDataError
+            When the file cannot be read, or a fact is none of `Session`.
+        """
+        from tactile_bayes.files.documents import check_session, read_session
+
+        facts = read_session(self.session_file) if self.session_file else {}
+        options = {name: getattr(self, name) for name in ("side", "posture", "lubricant", "examiner", "subject")}
+        facts |= {name: value for name, value in options.items() if value}
+        check_session(facts, path=self.output)
+        return facts
+
+    def session(self, hello: HelloReading, facts: dict[str, str]) -> dict[str, str]:
+        """Session as the file stores it: devices, clock and facts."""
+        tracker = self.tracker_protocol if self.tracker_url else "none"
+        devices = {"source": "recorded", "head_id": hello.device_id[:64], "tracker_id": tracker, "clock": self.clock}
+        return devices | ({"rotation": "inverted"} if self.invert_rotation else {}) | facts
+
+    def settings(self, hello: HelloReading) -> dict[str, Any]:
+        """Settings for the provenance."""
+        return {
+            "tracker_protocol": self.tracker_protocol if self.tracker_url else None,
+            "rate_hz": hello.rate_hz / self.every,
+            "every": self.every,
+            "clock": self.clock,
+            "invert_rotation": self.invert_rotation,
+            "calibrated": not self.uncalibrated,
+        }
+
+
+# --- Instrument and provenance of a recording, checked before it starts.
+
+_NOMINAL_FULL_SCALE = 4095
+
+
+def instrument_of(request: Request) -> tuple[HeadGeometry, ElementCalibration, Landmarks | None]:
+    """Read geometry, calibration and landmarks from the files given.
+
+    Raises
+    ------
+    UsageError
+        When one is missing or given twice.
+    """
+    from tactile_bayes.files.instrument_json import read_head_geometry
+    from tactile_bayes.files.scan_mcap import read_scan
+
+    like = read_scan(request.like) if request.like else None
+    if request.head_geometry:
+        head = read_head_geometry(request.head_geometry)
+    elif like is not None:
+        head = like.head
+    else:
+        raise UsageError("the head's geometry is missing; give --head-geometry HEAD.json or --like SCAN.mcap")
+    return head, _calibration(request, head, like), _landmarks(request)
+
+
+def _calibration(request: Request, head: HeadGeometry, like: Any) -> ElementCalibration:
+    import numpy as np
+
+    from tactile_bayes.files.instrument_json import read_array_calibration
+    from tactile_bayes.scan import ElementCalibration
+
+    if request.uncalibrated:
+        gain = np.full(head.shape, PRESSURE_RANGE_KPA[1] / _NOMINAL_FULL_SCALE)
+        return ElementCalibration(gain, np.zeros(head.shape), saturation_count=_NOMINAL_FULL_SCALE)
+    if request.array_calibration:
+        return read_array_calibration(request.array_calibration).calibration
+    if like is not None:
+        return like.element_calibration  # type: ignore[no-any-return]
+    raise UsageError("the array's calibration is missing; give --array-calibration, --like or --uncalibrated")
+
+
+def refuse_calibration(request: Request, *, head_id: str, today: date) -> None:
+    """Raise `UsageError` for a calibration that is stale or of another head, unless accepted."""
+    from tactile_bayes.files.instrument_json import read_array_calibration
+
+    if not request.array_calibration or request.uncalibrated or request.accept_calibration:
+        return
+    found = read_array_calibration(request.array_calibration)
+    age = (today - found.day).days
+    if found.head_id != head_id:
+        raise UsageError(
+            f"{request.array_calibration} was measured on head {found.head_id!r}, this is {head_id!r}; calibrate this "
+            "head, or give --accept-calibration"
+        )
+    if not 0 <= age <= request.calibration_days:
+        raise UsageError(
+            f"{request.array_calibration} is of {found.day}, {age} days ago (at most {request.calibration_days:g}); "
+            "calibrate again, or give --accept-calibration"
+        )
+
+
+def calibration_age(request: Request, *, today: date) -> dict[str, str]:
+    """Session fact on the age of the array calibration, in days; empty where it came from no calibration file."""
+    from tactile_bayes.files.instrument_json import read_array_calibration
+
+    if not request.array_calibration or request.uncalibrated:
+        return {}
+    return {"array_calibration_days": str((today - read_array_calibration(request.array_calibration).day).days)}
+
+
+def _landmarks(request: Request) -> Landmarks | None:
+    from tactile_bayes.files.instrument_json import read_landmarks
+    from tactile_bayes.files.scan_mcap import read_scan
+
+    if request.landmarks is None:
+        return None
+    if request.landmarks.suffix.lower() != ".mcap":
+        return read_landmarks(request.landmarks)
+    found = read_scan(request.landmarks).landmarks
+    if found is None:
+        raise UsageError(f"{request.landmarks} holds no landmarks; give a scan whose landmarks were touched")
+    return found
+
+
+def provenance_of(request: Request, settings: dict[str, Any]) -> Provenance:
+    """Provenance of the recording, without its ports."""
+    from tactile_bayes.files.provenance import Provenance, hash_inputs
+
+    names = ("like", "head_geometry", "array_calibration", "landmarks")
+    inputs = {name: path for name in names if (path := getattr(request, name)) is not None}
+    return Provenance("record", settings, hash_inputs(**inputs))
+
+
+# --- Control of a recording by signals and terminal keys.
+
+
+class Stopper:
+    """Ends a recording in order on Ctrl-C, SIGTERM or SIGHUP."""
+
+    def __init__(self, recorder: Recorder) -> None:
+        self._recorder = recorder
+        self._why = ""
+        self._before: dict[int, Any] = {}
+
+    @property
+    def interrupted(self) -> bool:
+        """Whether a signal has come."""
+        return bool(self._why)
+
+    def look(self) -> None:
+        """Stop the recorder if a signal has come."""
+        if self._why:
+            self._recorder.stop(self._why)
+
+    def _note(self, number: int, frame: object) -> None:
+        del frame
+        self._why = "Ctrl-C" if number == signal.SIGINT else signal.Signals(number).name
+
+    def __enter__(self) -> Stopper:
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            self._before[number] = signal.signal(number, self._note)
+        return self
+
+    def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+
+class Keys:
+    """Keys of a terminal for landmarks, start and stop; without a terminal there are none."""
+
+    def __init__(self, recorder: Recorder, scanhead_from_tracker: FloatArray, *, wait: bool) -> None:
+        self._recorder = recorder
+        self._lever = scanhead_from_tracker
+        self._terminal = sys.stdin.isatty()
+        self.waiting = wait and self._terminal
+        self._settings: list[Any] = []
+        self._told = 0
+
+    def __enter__(self) -> Keys:
+        if self._terminal:
+            import termios
+            import tty
+
+            self._settings = termios.tcgetattr(sys.stdin)
+            tty.setcbreak(sys.stdin)
+        if self.waiting:
+            click.echo("n sternal notch, x xiphoid, p nipple, space start, q stop", err=True)
+            self._recorder.listen()
+        return self
+
+    def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        if self._terminal:
+            import termios
+
+            with contextlib.suppress(termios.error):  # the terminal was closed
+                termios.tcsetattr(sys.stdin, termios.TCSADRAIN, self._settings)
+
+    def look(self) -> None:
+        """Act on the keys pressed since the last call, and report landmarks."""
+        for text in self._recorder.report.landmarks[self._told :]:
+            click.echo(text, err=True)
+            self._told += 1
+        if not self._terminal or not select.select([sys.stdin], [], [], 0)[0]:
+            return
+        keys = b""
+        with contextlib.suppress(OSError):  # a closed terminal is at its end, or fails
+            keys = os.read(sys.stdin.fileno(), 64)
+        if not keys:
+            self._recorder.stop("a closed terminal")
+        for key in keys.decode("latin-1"):
+            self._press(key)
+
+    def _press(self, key: str) -> None:
+        from tactile_bayes.hardware.recorder import LandmarkTouch
+
+        names = {"n": "sternal_notch", "x": "xiphoid", "p": "nipple"}
+        if key in names:
+            self._recorder.touch(LandmarkTouch(names[key], scanhead_from_tracker=self._lever))
+        elif key == " " and self.waiting:
+            self.waiting = False
+            self._recorder.start()
+            click.echo("recording", err=True)
+        elif key == "q":
+            self._recorder.stop("q")
+
+
+# --- `record`: record a scan head and a tracker to a scan file without losing data.
+
+_FILE = FilePath()
+
+
+def record_action(ctx: click.Context, /, output: Path, **options: Any) -> None:
+    """Record a scan head and a tracker."""
+    from tactile_bayes.files.shipped import size_calibration_path
+    from tactile_bayes.report.live import record_text
+
+    request = Request(output=output, **options)
+    also_read(size_calibration_path(request.size_calibration))
+    report, interrupted = make_recording(request)
+    click.echo(record_text(report, output=str(output)), nl=False)
+    if report.fault:
+        raise DeviceError(report.fault)
+    ctx.exit(EXIT_INTERRUPTED if interrupted and request.duration_s is not None else 0)
+
+
+def _check_rom(request: Request) -> None:
+    if request.tracker_rom is not None and (request.tracker_protocol != "ndi" or not request.tracker_rom.is_file()):
+        raise UsageError(
+            f"--tracker-rom {request.tracker_rom} is "
+            + ("not a file" if request.tracker_protocol == "ndi" else f"not for {request.tracker_protocol}")
+            + "; give a wireless NDI tool's .rom file with --tracker-protocol ndi"
+        )
+
+
+def make_recording(request: Request) -> tuple[Report, bool]:
+    """Check the devices, record and close the file; returns the account, and whether it was interrupted.
+
+    Raises
+    ------
+    UsageError
+        When the options contradict each other, the files or the head.
+    DeviceError
+        When a port cannot be opened, or another device answers on it.
+    """
+    from datetime import date
+
+    from tactile_bayes.files.atomic import refuse_existing, unwritable
+    from tactile_bayes.files.documents import check_session
+    from tactile_bayes.files.scan_recording import RecordingWriter, create_exclusive, full_disk
+    from tactile_bayes.hardware.recorder import Recorder
+
+    _check_rom(request)
+    refuse_existing(request.output, force=request.force)
+    head, calibration, landmarks = instrument_of(request)
+    facts = request.facts()
+    with ExitStack() as stack:
+        hello, lines = _connect(request, stack)
+        _check_fit(hello, head, request)
+        session = request.session(hello, facts) | calibration_age(request, today=date.today())
+        check_session(session, path=request.output)
+        refuse_calibration(request, head_id=hello.device_id, today=date.today())
+        observer = _look_on(request, head, calibration, stack)
+        stream = stack.enter_context(create_exclusive(request.output, force=request.force))
+        provenance = provenance_of(request, request.settings(hello))
+        try:
+            writer = RecordingWriter(
+                stream, head=head, element_calibration=calibration, session=session, provenance=provenance
+            )
+        except OSError as error:
+            with suppress(OSError):  # what is still in its buffer cannot be written either
+                stream.close()
+            request.output.unlink(missing_ok=True)  # it holds nothing of a scan yet
+            raise unwritable(request.output, error) from None
+        stack.callback(writer.stop_syncing)
+        recorder = Recorder(
+            *lines,
+            writer,
+            shared_clock=request.clock == "shared",
+            invert_rotation=request.invert_rotation,
+            duration_s=request.duration_s,
+            rate_hz=hello.rate_hz / request.every,
+            observer=observer,
+        )
+        _place(landmarks, writer, observer)
+        stopper = stack.enter_context(Stopper(recorder))
+        try:
+            report = _run(recorder, stopper, head, request)
+            writer.close(as_dict(report) | {"cautions": "\n".join(report.cautions)})
+        except OSError as error:
+            writer.stop_syncing()
+            with suppress(OSError):  # what is still in its buffer cannot be written either
+                stream.close()
+            raise full_disk(request.output, error) from None
+    return report, stopper.interrupted
+
+
+def _look_on(
+    request: Request, head: HeadGeometry, calibration: ElementCalibration, stack: ExitStack
+) -> Observer | None:
+    """Start the live view, if requested."""
+    if not (request.live or request.serve):
+        return None
+    from tactile_bayes.actions.live_view import live_view
+
+    view = live_view(
+        head, calibration, terminal=request.live, serve=request.serve, size_calibration=request.size_calibration
+    )
+    observer: Observer = stack.enter_context(view)
+    return observer
+
+
+def _connect(request: Request, stack: ExitStack) -> tuple[HelloReading, tuple[Line, Line | None]]:
+    """Open the ports, identify the devices and start the reading processes."""
+    from tactile_bayes.hardware import head
+    from tactile_bayes.hardware.drivers import TRACKERS, check_head, open_tracker
+    from tactile_bayes.hardware.head import HeadParser
+    from tactile_bayes.hardware.ports import Port
+    from tactile_bayes.hardware.recorder import Line
+    from tactile_bayes.hardware.streams import read_in_process
+
+    port = Port(request.head_url, baud=request.head_baud, role="head")
+    stack.callback(port.close)
+    hello = check_head(port, every=request.every)
+    start = head.encode_command(head.START, every=request.every)
+    parser = HeadParser(every=request.every)
+    parser.hello = hello
+    stop = head.encode_command(head.STOP)
+    tracker_port = None
+    if request.tracker_url:
+        driver = TRACKERS[request.tracker_protocol]
+        tracker_port = open_tracker(
+            request.tracker_protocol, request.tracker_url, baud=request.tracker_baud, rom=request.tracker_rom
+        )
+        stack.callback(tracker_port.close)
+        driver.check(tracker_port)
+    head_stream = read_in_process(port)
+    stack.callback(head_stream.close)
+    line = Line("head", port, head_stream, parser, start, stop)
+    if tracker_port is None:
+        head_stream.wait_until_ready()
+        return hello, (line, None)
+    tracker_stream = read_in_process(tracker_port)
+    stack.callback(tracker_stream.close)
+    for stream in (head_stream, tracker_stream):
+        stream.wait_until_ready()
+    return hello, (line, Line("tracker", tracker_port, tracker_stream, driver.parser(), driver.start, driver.stop))
+
+
+def _check_fit(hello: HelloReading, head: HeadGeometry, request: Request) -> None:
+    if not hello.rows * hello.columns:
+        raise DeviceError(
+            f"head {request.head_url}: {hello.device_id!r} is a device without taxels; give a head's port"
+        )
+    if (hello.rows, hello.columns) != head.shape:
+        raise UsageError(
+            f"head {request.head_url} has {hello.rows} x {hello.columns} taxels, the geometry given is for "
+            f"{head.shape[0]} x {head.shape[1]}; give this head's"
+        )
+    if request.every > 1:
+        click.echo(f"one frame in {request.every}: {hello.rate_hz / request.every:g} Hz", err=True)
+
+
+def _place(landmarks: Landmarks | None, writer: Any, observer: Observer | None) -> None:
+    """Write the landmarks given in a file, and show them in the live view."""
+    if landmarks is None:
+        return
+    for name, position_mm in landmarks.points().items():
+        writer.add_landmark(name, position_mm, device_ns=0, host_ns=0)
+        if observer is not None:
+            observer.landmark(name, position_mm)
+
+
+def _run(recorder: Recorder, stopper: Any, head: HeadGeometry, request: Request) -> Report:
+    with Keys(recorder, head.scanhead_from_tracker, wait=request.duration_s is None and not request.at_once) as keys:
+        if not keys.waiting:
+            recorder.start()
+
+        def look() -> None:
+            keys.look()
+            stopper.look()
+
+        return recorder.run(look)
