@@ -3,14 +3,35 @@
 from __future__ import annotations
 
 import os
+import shlex
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
+from tactile_bayes.batch import open_executor
+from tactile_bayes.campaign.exams import find_exams
+from tactile_bayes.campaign.inputs import open_campaign, tidy
+from tactile_bayes.campaign.report import (
+    WRITTEN,
+    Excision,
+    check_inputs,
+    copy_outputs,
+    counts_words,
+    repeatability_words,
+    write_outputs,
+)
+from tactile_bayes.campaign.run import Campaign
+from tactile_bayes.campaign.settings import CampaignSettings
 from tactile_bayes.commands.options import also_read, refuse_same, settings_of
+from tactile_bayes.commands.progress import progress_bar
 from tactile_bayes.errors import BadDataError, UsageError
+from tactile_bayes.files.atomic import refuse_existing
+from tactile_bayes.files.manifest_csv import add_rows, read_manifest, read_rows, write_manifest
+from tactile_bayes.files.remote import check_address
+from tactile_bayes.files.shipped import NONE, size_calibration_path
 from tactile_bayes.presets import RESEARCH_USE
 
 if TYPE_CHECKING:
@@ -27,10 +48,6 @@ _LOG_EVERY_S = 60.0
 
 def campaign_init_action(folder: Path | str, output: Path, add: bool, force: bool) -> None:
     """Write the table of exams from a folder of scans and what they carry."""
-    from tactile_bayes.campaign.exams import find_exams
-    from tactile_bayes.files.atomic import refuse_existing
-    from tactile_bayes.files.manifest_csv import add_rows, read_rows, write_manifest
-
     if add and force:
         raise UsageError("--add keeps the rows of a table, --force writes it anew; give one of them")
     before = read_rows(output) if add and output.exists() else None
@@ -53,8 +70,6 @@ def campaign_init_action(folder: Path | str, output: Path, add: bool, force: boo
 
 def _say_found(found: Found, output: Path, before: Sequence[Mapping[str, str]] | None) -> None:
     """What the table holds now, what is to be looked at, and the next command."""
-    import shlex
-
     rows = [*(before or ()), *found.rows]
     patients = {row["patient"].casefold() for row in rows} - {""}
     added = "" if before is None else f" ({len(found.rows)} added, {len(before)} kept)"
@@ -77,8 +92,6 @@ def _say_found(found: Found, output: Path, before: Sequence[Mapping[str, str]] |
 
 def _to_correct(output: Path) -> str:
     """Why `campaign run` would refuse the table; empty where it would take it."""
-    from tactile_bayes.files.manifest_csv import read_manifest
-
     try:
         read_manifest(output)
     except BadDataError as error:
@@ -104,18 +117,6 @@ def campaign_run_action(
     **asked: Any,
 ) -> None:
     """Map, estimate and pool the exams of a table, and report the trial."""
-    from functools import partial
-
-    from tactile_bayes.batch import open_executor
-    from tactile_bayes.campaign.inputs import open_campaign, tidy
-    from tactile_bayes.campaign.report import WRITTEN, Excision, check_inputs, copy_outputs, write_outputs
-    from tactile_bayes.campaign.run import Campaign
-    from tactile_bayes.campaign.settings import CampaignSettings
-    from tactile_bayes.commands.progress import progress_bar
-    from tactile_bayes.files.manifest_csv import read_manifest
-    from tactile_bayes.files.remote import check_address
-    from tactile_bayes.files.shipped import NONE
-
     given = None if repeatability in (None, NONE) else Path(str(repeatability))
     also_read(given)
     settings = settings_of(settings_file=settings_file, repeatability=given, **asked)
@@ -160,8 +161,6 @@ def campaign_run_action(
 
 def _check_paths(table: Sequence[Exam], output: Path, settings: CampaignSettings) -> None:
     """Refuse exams inside the output folder, an output folder that is a file, and a checkpoint for many maps."""
-    from tactile_bayes.files.shipped import size_calibration_path
-
     if output.exists() and not output.is_dir():
         raise UsageError(f"{output} is a file; give the name of a folder")
     if settings.estimate.checkpoint is not None:
@@ -193,8 +192,6 @@ def _few(found: CampaignState, step: str) -> bool:
 
 
 def _say_done(campaign: Campaign, written: Written, output: Path, left: Sequence[str]) -> None:
-    from tactile_bayes.campaign.report import counts_words, repeatability_words
-
     found = campaign.found
     counts = counts_words(written.sized, written.unsized, written.failed)
     click.echo(f"{output}: {len(campaign.exams)} exams: {counts}")

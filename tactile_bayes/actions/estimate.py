@@ -6,16 +6,31 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
+from tactile_bayes.api.comparing import compare_answers, drawn_maps
 from tactile_bayes.api.estimating import Answer, answer_file, answer_of, estimate_file
+from tactile_bayes.api.pooled import elsewhere, of_one_mass, pool_answers
 from tactile_bayes.api.settings import Comparing, Settings, refuse_checkpoint, times_of
+from tactile_bayes.batch import BatchInterrupted, cluster_executor, fault_lines, local_executor, run_batch
 from tactile_bayes.commands.options import also_read, settings_of
+from tactile_bayes.commands.progress import progress_bar
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import EXIT_DONE, EXIT_FAULT, EXIT_NO_ESTIMATE, UsageError
+from tactile_bayes.files.atomic import given_twice, refuse_existing
+from tactile_bayes.files.documents import check_document, dump_json
+from tactile_bayes.files.posterior_nc import write_pooled
+from tactile_bayes.files.shipped import size_calibration_path
+from tactile_bayes.findings import findings_in
+from tactile_bayes.report.compare import compare_summary, compare_text
+from tactile_bayes.report.compare_figure import draw_comparison
+from tactile_bayes.report.estimate_figures import draw_figures, draw_size
+from tactile_bayes.report.figure_file import named_exam
+from tactile_bayes.report.pooled import pooled_summary, pooled_text
 
 if TYPE_CHECKING:
     from tactile_bayes.api.comparing import ComparedOutcome
@@ -42,11 +57,6 @@ def estimate_pool(
 
     A map that could not be read stops it: its error is printed, for a mass is not sized from what is left by accident.
     """
-    from tactile_bayes.api.estimating import answer_file
-    from tactile_bayes.api.pooled import of_one_mass, pool_answers
-    from tactile_bayes.files.documents import check_document, dump_json
-    from tactile_bayes.report.pooled import pooled_summary, pooled_text
-
     if settings.centre_mm is None:
         answers = of_one_mass(
             answers, lambda i, place: answer_file(maps[i], settings=replace(settings, centre_mm=place))
@@ -80,14 +90,8 @@ def _write_pooled(
     size, provenance = found.pooled.size, found.provenance
     assert size is not None
     if output is not None:
-        from tactile_bayes.files.posterior_nc import write_pooled
-
         write_pooled(output, size, provenance=provenance, document=found.document, force=force)
     if figure is not None:
-        from tactile_bayes.findings import findings_in
-        from tactile_bayes.report.estimate_figures import draw_size
-        from tactile_bayes.report.figure_file import named_exam
-
         name = named_exam(f"{len(maps)} maps pooled", provenance.scans)
         findings = findings_in(found.document["findings"])
         draw_size(size, figure, name=name, probability=settings.interval, findings=findings, force=force)
@@ -146,15 +150,11 @@ def estimate_action(
 
 
 def _named(calibration: str | None) -> Path | None:
-    from tactile_bayes.files.shipped import size_calibration_path
-
     return None if calibration is None else size_calibration_path(calibration)
 
 
 def _check_outputs(outputs: list[Path], maps: tuple[Path, ...], pool: bool, *, force: bool) -> None:
     """Raise an error, before any work is done, if an output cannot be written."""
-    from tactile_bayes.files.atomic import given_twice, refuse_existing
-
     if twice := given_twice(maps):
         raise UsageError(f"{twice} is given twice; give each map once")
     if outputs and len(maps) > 1 and not pool:
@@ -164,8 +164,6 @@ def _check_outputs(outputs: list[Path], maps: tuple[Path, ...], pool: bool, *, f
 
 
 def _one_map(path: Path, settings: Settings) -> MapOutcome:
-    from tactile_bayes.commands.progress import progress_bar
-
     with progress_bar("effective draws") as progress:
         return estimate_file(
             path, settings, progress=progress, notice=lambda line: click.echo(f"{path}: {line}", err=True)
@@ -185,19 +183,11 @@ def _write(
     if output and estimate.status == "estimate":
         outcome.write(output, document=answer.document, force=force)
     if any(figures):
-        from tactile_bayes.report.estimate_figures import draw_figures
-        from tactile_bayes.report.figure_file import named_exam
-
         name = named_exam(name, outcome.provenance.scans)
         draw_figures(tactile_map, estimate, *figures, name=name, probability=outcome.settings.interval, force=force)
 
 
 def _many_maps(maps: tuple[Path, ...], settings: Settings, *, workers: int, scheduler: str | None) -> list[Answer]:
-    from functools import partial
-
-    from tactile_bayes.batch import cluster_executor, local_executor, run_batch
-    from tactile_bayes.commands.progress import progress_bar
-
     chosen = cluster_executor(scheduler) if scheduler else local_executor(min(workers, len(maps)))
     with chosen as executor, progress_bar("maps") as progress:
         outcomes = run_batch(
@@ -208,8 +198,6 @@ def _many_maps(maps: tuple[Path, ...], settings: Settings, *, workers: int, sche
 
 def _answers(outcomes: Iterable[Outcome[Answer]]) -> list[Answer]:
     """Answers for all maps; maps with the same error of the batch are named together in the first's answer."""
-    from tactile_bayes.batch import fault_lines
-
     found = list(outcomes)
     lines = dict(zip(dict.fromkeys(one.error for one in found if not one.ok), fault_lines(found), strict=True))
     faults = (lines.pop(one.error, "") if not one.ok else "" for one in found)
@@ -222,8 +210,6 @@ def _answers(outcomes: Iterable[Outcome[Answer]]) -> list[Answer]:
 @contextmanager
 def _printed_if_interrupted(maps: tuple[Path, ...], *, as_json: bool, verbose: bool) -> Iterator[None]:
     """On Ctrl-C print the finished answers, and pass the interruption on."""
-    from tactile_bayes.batch import BatchInterrupted
-
     try:
         yield
     except BatchInterrupted as stop:
@@ -235,8 +221,6 @@ def _printed_if_interrupted(maps: tuple[Path, ...], *, as_json: bool, verbose: b
 
 def _print(maps: Sequence[Path], answers: list[Answer], *, as_json: bool, verbose: bool, listed: bool) -> None:
     """Print errors on stderr and answers on stdout: in full with `verbose`, `listed` for several maps."""
-    from tactile_bayes.files.documents import check_document, dump_json
-
     for answer in answers:
         if answer.document is None and answer.text:
             click.echo(answer.text, err=True)
@@ -287,11 +271,6 @@ def compare_action(
     **asked: Any,
 ) -> None:
     """Compare the size of a mass at two visits and more."""
-    from tactile_bayes.files.atomic import refuse_existing
-    from tactile_bayes.files.documents import check_document, dump_json
-    from tactile_bayes.files.shipped import size_calibration_path
-    from tactile_bayes.report.compare import compare_summary, compare_text
-
     comparing = Comparing(
         days=times_of(days or None, None if dates is None else dates.split(",")),
         grown_by=tuple(percent / 100 for percent in grown_by),
@@ -318,8 +297,6 @@ def compare_action(
 
 def _check_maps(visits: list[tuple[Path, ...]], settings: Settings) -> None:
     """Refuse a map that is given twice, and a checkpoint."""
-    from tactile_bayes.files.atomic import given_twice
-
     if twice := given_twice(path for maps in visits for path in maps):
         raise UsageError(f"{twice} is given twice; give each map once, at its own visit")
     refuse_checkpoint(settings)
@@ -329,11 +306,6 @@ def _compare(
     visits: list[tuple[Path, ...]], settings: Settings, comparing: Comparing
 ) -> tuple[ComparedOutcome, Callable[[Path, bool], None]]:
     """Estimate every map and compare; also gives what draws the figure. An error with one map stops it."""
-    from tactile_bayes.api.comparing import compare_answers, drawn_maps
-    from tactile_bayes.api.estimating import answer_of, estimate_file
-    from tactile_bayes.api.pooled import elsewhere
-    from tactile_bayes.commands.progress import progress_bar
-
     total, outcomes = sum(len(maps) for maps in visits), []
     with progress_bar("maps") as progress:
         for maps in visits:
@@ -351,8 +323,6 @@ def _compare(
     compared = compare_answers(answers, settings, comparing=comparing, names=names, inputs=inputs)
 
     def draw(figure: Path, force: bool) -> None:
-        from tactile_bayes.report.compare_figure import draw_comparison
-
         drawn = drawn_maps([[outcome.tactile_map for outcome in maps] for maps in outcomes], answers)
         draw_comparison(compared.compared, compared.document, drawn, figure, force=force)
 

@@ -19,7 +19,28 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numpy as np
+
+from tactile_bayes.batch import prepare_worker
 from tactile_bayes.declarations import replace
+from tactile_bayes.errors import TactileBayesError
+from tactile_bayes.files.instrument_json import (
+    calibration_document,
+    calibration_from_document,
+    head_document,
+    head_from_document,
+)
+from tactile_bayes.files.shipped import size_calibration_path
+from tactile_bayes.files.size_json import read_size_calibration
+from tactile_bayes.findings import finding_summary
+from tactile_bayes.geometry import apply, inverse
+from tactile_bayes.hardware.live import Feed, FeedReader, LiveMap
+from tactile_bayes.hardware.serve import LiveServer, address_of
+from tactile_bayes.posterior.estimate import estimate_map
+from tactile_bayes.posterior.fit_window import candidate_centres
+from tactile_bayes.posterior.options import EstimateOptions, FitOptions
+from tactile_bayes.presets import FIELD_COSINES, FIT_RADIUS_MM, INTERVAL
+from tactile_bayes.report.live import colours_wanted, live_line, live_text
 
 if TYPE_CHECKING:
     from tactile_bayes.geometry import FloatArray
@@ -45,10 +66,6 @@ def live_view(
     size_calibration: str,
 ) -> Iterator[Any]:
     """Start the view's process; returns an observer for the recorder."""
-    from tactile_bayes.files.instrument_json import calibration_document, head_document
-    from tactile_bayes.hardware.live import Feed
-    from tactile_bayes.hardware.serve import address_of
-
     if serve:
         address_of(serve)  # report a mistake before anything is recorded
     setup = {
@@ -139,8 +156,6 @@ class Estimator:
 
 
 def _prepare() -> None:
-    from tactile_bayes.batch import prepare_worker
-
     prepare_worker()
     import tactile_bayes.files.size_json
     import tactile_bayes.posterior.estimate  # noqa: F401
@@ -186,30 +201,17 @@ LIVE_DRAWS = 400
 
 
 def _calibration_file(name: str) -> str | None:
-    from tactile_bayes.files.shipped import size_calibration_path
-
     path = size_calibration_path(name)
     return None if path is None else str(path)
 
 
 @cache
 def _calibration_of(path: str) -> Calibration:
-    from tactile_bayes.files.size_json import read_size_calibration
-
     return read_size_calibration(Path(path))
 
 
 def live_estimate(tactile_map: TactileMap, calibration_path: str | None, turn: Turn = _TURN) -> LiveAnswer:
     """Size by the fast method with the lump's place, or the reason why there is none."""
-    import numpy as np
-
-    from tactile_bayes.errors import TactileBayesError
-    from tactile_bayes.findings import finding_summary
-    from tactile_bayes.posterior.estimate import estimate_map
-    from tactile_bayes.posterior.fit_window import candidate_centres
-    from tactile_bayes.posterior.options import EstimateOptions, FitOptions
-    from tactile_bayes.presets import FIELD_COSINES, FIT_RADIUS_MM, INTERVAL
-
     try:
         centres = candidate_centres(tactile_map)
         if not centres:
@@ -241,10 +243,6 @@ def live_estimate(tactile_map: TactileMap, calibration_path: str | None, turn: T
 
 def _in_base(tactile_map: TactileMap, posterior: MapPosterior) -> FloatArray | None:
     """Centre of the lump in `base`, which stays valid when the map's plane changes."""
-    import numpy as np
-
-    from tactile_bayes.geometry import apply, inverse
-
     if tactile_map.plane_from_base is None:
         return None
     centre = np.array([np.median(posterior.x_mm), np.median(posterior.y_mm), 0.0])
@@ -252,8 +250,6 @@ def _in_base(tactile_map: TactileMap, posterior: MapPosterior) -> FloatArray | N
 
 
 def _interval(name: str, draws: FloatArray, probability: float) -> str:
-    import numpy as np
-
     tail = (1 - probability) / 2
     low, middle, high = np.nanquantile(draws, [tail, 0.5, 1 - tail])
     return f"{name} {middle:.1f} mm ({low:.1f} to {high:.1f}, {100 * probability:g} % equal-tailed)"
@@ -261,10 +257,6 @@ def _interval(name: str, draws: FloatArray, probability: float) -> str:
 
 def run(pipe: int, setup: dict[str, Any]) -> None:
     """Follow a recording until it ends."""
-    from tactile_bayes.files.instrument_json import calibration_from_document, head_from_document
-    from tactile_bayes.hardware.live import FeedReader, LiveMap
-    from tactile_bayes.hardware.serve import LiveServer, address_of
-
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)  # it ends the recording, and that ends the view
     reader = FeedReader(pipe)
@@ -311,8 +303,6 @@ def terminal_view(*, keys: bool = False) -> Iterator[Callable[[LiveState], None]
 
     `keys` says whether the recording's keys can be pressed there.
     """
-    from tactile_bayes.report.live import colours_wanted, live_line, live_text
-
     out = sys.stderr
     if not out.isatty() or os.environ.get("TERM", "dumb") in ("dumb", ""):
         last = 0.0

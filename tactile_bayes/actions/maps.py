@@ -11,11 +11,24 @@ from typing import Any
 import click
 from click.core import ParameterSource
 
+from tactile_bayes.api.exam_report import ExamFiles, Given, read_exam
+from tactile_bayes.api.maps import map_provenance
 from tactile_bayes.commands.options import also_read, settings_of
+from tactile_bayes.commands.progress import progress_bar
 from tactile_bayes.declarations import EXACT, to_plain
 from tactile_bayes.errors import UsageError
+from tactile_bayes.files.atomic import given_twice, refuse_existing
+from tactile_bayes.files.map_nc import write_map
+from tactile_bayes.files.provenance import repeated_scans
+from tactile_bayes.files.shipped import size_calibration_path
+from tactile_bayes.mapping import build_map
 from tactile_bayes.options import MapOptions
 from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.report.exam_page import PageFiles
+from tactile_bayes.report.exam_words import headline
+from tactile_bayes.report.figure_file import named_exam
+from tactile_bayes.report.map_figure import map_figure
+from tactile_bayes.report.map_text import map_text
 
 # --- `map`: from scans to a tactile map.
 
@@ -29,13 +42,7 @@ def map_action(
     **options: Any,
 ) -> None:
     """Build a tactile map from one scan, or one common map from several scans of the same examination."""
-    from tactile_bayes.api.maps import map_provenance
-    from tactile_bayes.commands.progress import progress_bar
-    from tactile_bayes.files.map_nc import write_map
-    from tactile_bayes.files.provenance import repeated_scans
     from tactile_bayes.files.scan_mcap import read_scan
-    from tactile_bayes.mapping import build_map
-    from tactile_bayes.report.map_text import map_text
 
     _check_paths(scans, output, figure, force=force)
     settings = to_plain(MapOptions(**options), digits=EXACT)
@@ -51,9 +58,6 @@ def map_action(
     write_map(output, tactile_map, provenance=provenance, force=force)
     try:
         if figure:
-            from tactile_bayes.report.figure_file import named_exam
-            from tactile_bayes.report.map_figure import map_figure
-
             title = f"Tactile map: {named_exam(output.stem, provenance.scans)}"
             map_figure(tactile_map, figure, title=title, force=force)
         clock.tell("write")
@@ -63,8 +67,6 @@ def map_action(
 
 def _check_paths(scans: tuple[Path, ...], output: Path, figure: Path | None, *, force: bool) -> None:
     """Raise an error, before any work, for an output that cannot be written or a scan given twice."""
-    from tactile_bayes.files.atomic import given_twice, refuse_existing
-
     if twice := given_twice(scans):
         raise UsageError(f"{twice} is given twice; its frames would count twice: give each scan once")
     for path in [output, *([figure] if figure else [])]:
@@ -102,11 +104,6 @@ def report_action(
     **asked: Any,
 ) -> None:
     """Write one page of an exam: the map, the size with its intervals, the place, and how good the exam was."""
-    from tactile_bayes.api.exam_report import ExamFiles, Given, read_exam
-    from tactile_bayes.files.shipped import size_calibration_path
-    from tactile_bayes.report.exam_page import PageFiles
-    from tactile_bayes.report.exam_words import headline
-
     given, page = Given(title, name, day), PageFiles(output, pdf, force)
     page.check()
     sorted_files = ExamFiles.sort(files)

@@ -14,12 +14,27 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 import click
+import numpy as np
 
+from tactile_bayes.actions.live_view import live_view
 from tactile_bayes.commands.options import FilePath, also_read
 from tactile_bayes.declarations import as_dict
 from tactile_bayes.errors import EXIT_INTERRUPTED, DeviceError, UsageError
+from tactile_bayes.files.atomic import refuse_existing, unwritable
+from tactile_bayes.files.documents import check_session, read_session
+from tactile_bayes.files.instrument_json import read_array_calibration, read_head_geometry, read_landmarks
+from tactile_bayes.files.provenance import Provenance, hash_inputs
+from tactile_bayes.files.shipped import size_calibration_path
+from tactile_bayes.hardware import head
+from tactile_bayes.hardware.drivers import TRACKERS, check_head, open_tracker
+from tactile_bayes.hardware.head import HeadParser
+from tactile_bayes.hardware.ports import Port
+from tactile_bayes.hardware.recorder import LandmarkTouch, Line, Recorder
+from tactile_bayes.hardware.streams import read_in_process
 from tactile_bayes.options import RecordOptions
 from tactile_bayes.presets import PRESSURE_RANGE_KPA
+from tactile_bayes.report.live import record_text
+from tactile_bayes.scan import ElementCalibration
 
 if TYPE_CHECKING:
     from tactile_bayes.files.provenance import Provenance
@@ -43,8 +58,6 @@ class Request(RecordOptions, kw_only=True):
         BadDataError
             When the file cannot be read, or a fact is none of `Session`.
         """
-        from tactile_bayes.files.documents import check_session, read_session
-
         facts = read_session(self.session_file) if self.session_file else {}
         options = {name: getattr(self, name) for name in ("side", "posture", "lubricant", "examiner", "subject")}
         facts |= {name: value for name, value in options.items() if value}
@@ -82,7 +95,6 @@ def instrument_of(request: Request) -> tuple[HeadGeometry, ElementCalibration, L
     UsageError
         When one is missing or given twice.
     """
-    from tactile_bayes.files.instrument_json import read_head_geometry
     from tactile_bayes.files.scan_mcap import read_scan
 
     like = read_scan(request.like) if request.like else None
@@ -96,11 +108,6 @@ def instrument_of(request: Request) -> tuple[HeadGeometry, ElementCalibration, L
 
 
 def _calibration(request: Request, head: HeadGeometry, like: Any) -> ElementCalibration:
-    import numpy as np
-
-    from tactile_bayes.files.instrument_json import read_array_calibration
-    from tactile_bayes.scan import ElementCalibration
-
     if request.uncalibrated:
         gain = np.full(head.shape, PRESSURE_RANGE_KPA[1] / _NOMINAL_FULL_SCALE)
         return ElementCalibration(gain, np.zeros(head.shape), saturation_count=_NOMINAL_FULL_SCALE)
@@ -113,8 +120,6 @@ def _calibration(request: Request, head: HeadGeometry, like: Any) -> ElementCali
 
 def refuse_calibration(request: Request, *, head_id: str, today: date) -> None:
     """Raise `UsageError` for a calibration that is stale or of another head, unless accepted."""
-    from tactile_bayes.files.instrument_json import read_array_calibration
-
     if not request.array_calibration or request.uncalibrated or request.accept_calibration:
         return
     found = read_array_calibration(request.array_calibration)
@@ -133,15 +138,12 @@ def refuse_calibration(request: Request, *, head_id: str, today: date) -> None:
 
 def calibration_age(request: Request, *, today: date) -> dict[str, str]:
     """Session fact on the age of the array calibration, in days; empty where it came from no calibration file."""
-    from tactile_bayes.files.instrument_json import read_array_calibration
-
     if not request.array_calibration or request.uncalibrated:
         return {}
     return {"array_calibration_days": str((today - read_array_calibration(request.array_calibration).day).days)}
 
 
 def _landmarks(request: Request) -> Landmarks | None:
-    from tactile_bayes.files.instrument_json import read_landmarks
     from tactile_bayes.files.scan_mcap import read_scan
 
     if request.landmarks is None:
@@ -156,8 +158,6 @@ def _landmarks(request: Request) -> Landmarks | None:
 
 def provenance_of(request: Request, settings: dict[str, Any]) -> Provenance:
     """Provenance of the recording, without its ports."""
-    from tactile_bayes.files.provenance import Provenance, hash_inputs
-
     names = ("like", "head_geometry", "array_calibration", "landmarks")
     inputs = {name: path for name in names if (path := getattr(request, name)) is not None}
     return Provenance("record", settings, hash_inputs(**inputs))
@@ -244,8 +244,6 @@ class Keys:
             self._press(key)
 
     def _press(self, key: str) -> None:
-        from tactile_bayes.hardware.recorder import LandmarkTouch
-
         names = {"n": "sternal_notch", "x": "xiphoid", "p": "nipple"}
         if key in names:
             self._recorder.touch(LandmarkTouch(names[key], scanhead_from_tracker=self._lever))
@@ -264,9 +262,6 @@ _FILE = FilePath()
 
 def record_action(ctx: click.Context, /, output: Path, **options: Any) -> None:
     """Record a scan head and a tracker."""
-    from tactile_bayes.files.shipped import size_calibration_path
-    from tactile_bayes.report.live import record_text
-
     request = Request(output=output, **options)
     also_read(size_calibration_path(request.size_calibration))
     report, interrupted = make_recording(request)
@@ -295,12 +290,7 @@ def make_recording(request: Request) -> tuple[Report, bool]:
     DeviceError
         When a port cannot be opened, or another device answers on it.
     """
-    from datetime import date
-
-    from tactile_bayes.files.atomic import refuse_existing, unwritable
-    from tactile_bayes.files.documents import check_session
     from tactile_bayes.files.scan_recording import RecordingWriter, create_exclusive, full_disk
-    from tactile_bayes.hardware.recorder import Recorder
 
     _check_rom(request)
     refuse_existing(request.output, force=request.force)
@@ -353,8 +343,6 @@ def _look_on(
     """Start the live view, if requested."""
     if not (request.live or request.serve):
         return None
-    from tactile_bayes.actions.live_view import live_view
-
     view = live_view(
         head, calibration, terminal=request.live, serve=request.serve, size_calibration=request.size_calibration
     )
@@ -364,13 +352,6 @@ def _look_on(
 
 def _connect(request: Request, stack: ExitStack) -> tuple[HelloReading, tuple[Line, Line | None]]:
     """Open the ports, identify the devices and start the reading processes."""
-    from tactile_bayes.hardware import head
-    from tactile_bayes.hardware.drivers import TRACKERS, check_head, open_tracker
-    from tactile_bayes.hardware.head import HeadParser
-    from tactile_bayes.hardware.ports import Port
-    from tactile_bayes.hardware.recorder import Line
-    from tactile_bayes.hardware.streams import read_in_process
-
     port = Port(request.head_url, baud=request.head_baud, role="head")
     stack.callback(port.close)
     hello = check_head(port, every=request.every)

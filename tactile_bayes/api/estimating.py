@@ -7,13 +7,43 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from tactile_bayes.api.repeatability import check_repeatability, repeatability_digest
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import EXIT_DONE, EXIT_NO_ESTIMATE, NO_LUMP, BadDataError, TactileBayesError
+from tactile_bayes.files.map_nc import read_map_and_scans
+from tactile_bayes.files.posterior_nc import write_posterior
+from tactile_bayes.files.provenance import Provenance, hash_inputs
+from tactile_bayes.files.shipped import SHIPPED, default_for, size_calibration_path
+from tactile_bayes.files.size_json import read_size_calibration
 from tactile_bayes.findings import Finding, by_weight, findings_in
+from tactile_bayes.mapping.map import many_cells
 from tactile_bayes.options import PRIORS
+from tactile_bayes.posterior.arviz_groups import inference_groups
+from tactile_bayes.posterior.estimate import OTHER_HEAD, calibration_for, estimate_map, recipe_differences
+from tactile_bayes.posterior.lump_probability import smallest_lumps
+from tactile_bayes.posterior.masses import with_masses
+from tactile_bayes.posterior.options import EstimateOptions, FitOptions
+from tactile_bayes.posterior.white import default_errors
 from tactile_bayes.presets import FIT_RADIUS_MM
+from tactile_bayes.report.calibration import calibration_line, site_words
+from tactile_bayes.report.estimate_document import estimate_document, patient_mm
+from tactile_bayes.report.estimate_text import estimate_summary, estimate_text
+from tactile_bayes.report.quantities import (
+    estimate_quantities,
+    lump_place,
+    side_findings,
+    side_of,
+    touching_findings,
+    touching_masses,
+)
+from tactile_bayes.size.bodies import BodyCalibration, mean_width_mm
+from tactile_bayes.size.draws import ShapeDraws
+from tactile_bayes.size.fat import head_profile
+from tactile_bayes.size.pooling import SizePriors
+from tactile_bayes.size.spread import BetweenMaps
 
 if TYPE_CHECKING:
     from tactile_bayes.files.provenance import Provenance
@@ -87,8 +117,6 @@ class Outcome(Record, eq=False):
         document
             The JSON object of `answer_of`, where it was made already.
         """
-        from tactile_bayes.files.posterior_nc import write_posterior
-
         told = document or answer_of(self).document
         assert told is not None  # only the answer of an error has none
         provenance = self.provenance
@@ -96,10 +124,6 @@ class Outcome(Record, eq=False):
 
     def groups(self) -> dict[str, DrawGroup]:
         """What goes with the draws, see `inference_groups`."""
-        import numpy as np
-
-        from tactile_bayes.posterior.arviz_groups import inference_groups
-
         rng = np.random.default_rng([self.settings.seed, self.tactile_map.fingerprint, 1])
         return inference_groups(
             self.estimate, calibration=self.calibration, size_priors=size_priors(self.settings), rng=rng
@@ -119,8 +143,6 @@ def estimate_file(
     path: Path, settings: Settings, *, progress: Progress | None = None, notice: Notice | None = None
 ) -> Outcome:
     """Read a map and estimate it; see `estimate_one`."""
-    from tactile_bayes.files.map_nc import read_map_and_scans
-
     tactile_map, scans = read_map_and_scans(path)
     try:
         return estimate_one(tactile_map, settings, inputs={"map": path}, scans=scans, progress=progress, notice=notice)
@@ -159,16 +181,6 @@ def estimate_one(
     NotConvergedError
         When the method asked for does not converge.
     """
-    import numpy as np
-
-    from tactile_bayes.files.provenance import Provenance, hash_inputs
-    from tactile_bayes.files.shipped import SHIPPED, default_for
-    from tactile_bayes.mapping.map import many_cells
-    from tactile_bayes.posterior.estimate import calibration_for, estimate_map
-    from tactile_bayes.posterior.masses import with_masses
-    from tactile_bayes.report.calibration import calibration_line, site_words
-    from tactile_bayes.size.bodies import BodyCalibration, mean_width_mm
-
     shipped = default_for(tactile_map.recipe.normalise)
     source, calibration, why_none = choose_calibration(settings, tactile_map)
     options = _options(settings, calibration, tactile_map)
@@ -198,8 +210,6 @@ def estimate_one(
     if why_none is not None and estimate.status == "estimate":
         estimate = replace(estimate, reason=why_none.reason, advice=why_none.advice, on_paper=NO_CALIBRATION_ON_PAPER)
     if estimate.code in NO_LUMP and tactile_map.covered.any():
-        from tactile_bayes.posterior.lump_probability import smallest_lumps
-
         fat_mm = None if calibration is None else calibration.fat_mm
         estimate = replace(estimate, smallest=smallest_lumps(tactile_map, fat_mm=fat_mm))
     posterior = estimate.map_posterior
@@ -231,9 +241,6 @@ def _with_place(
     estimate: Estimate, tactile_map: TactileMap, scans: Sequence[Mapping[str, str]], *, probability: float
 ) -> Estimate:
     """The estimate with what speaks against the place of its masses: side and landmarks, and how near they lie."""
-    from tactile_bayes.report.estimate_document import patient_mm
-    from tactile_bayes.report.quantities import side_findings, side_of, touching_findings, touching_masses
-
     here = [patient_mm(tactile_map, one.x_mm, one.y_mm) for one in estimate.masses if one.reported]
     side = side_findings(side_of(scans), here[0] if here else None)
     sized = [
@@ -261,10 +268,6 @@ def choose_calibration(
     why_none
         Why the shipped one was not used; None when it was, or when the user decided.
     """
-    from tactile_bayes.files.shipped import default_for, size_calibration_path
-    from tactile_bayes.files.size_json import read_size_calibration
-    from tactile_bayes.posterior.estimate import OTHER_HEAD, recipe_differences
-
     if settings.size_calibration is None or isinstance(settings.size_calibration, str):
         path = size_calibration_path(settings.size_calibration or default_for(tactile_map.recipe.normalise))
         if path is None:
@@ -310,9 +313,6 @@ def _options(settings: Settings, calibration: Calibration | None, tactile_map: T
 
     Without a calibration `default_errors` decides; a background that is given alone goes with independent errors.
     """
-    from tactile_bayes.posterior.options import EstimateOptions, FitOptions
-    from tactile_bayes.posterior.white import default_errors
-
     background, noise = default_errors(tactile_map)
     if settings.background or settings.method == "optimise":
         noise = "independent"
@@ -359,9 +359,6 @@ def estimate_inputs(
 
 def size_priors(settings: Settings) -> SizePriors:
     """Priors of a size; a spread between maps that is stated, or learned at the site, leaves it one interval."""
-    from tactile_bayes.size.pooling import SizePriors
-    from tactile_bayes.size.spread import BetweenMaps
-
     fixed, learned = settings.between_map_sd, settings.repeatability
     if learned is None and fixed is None:
         return SizePriors(known=dict(settings.known))
@@ -371,10 +368,6 @@ def size_priors(settings: Settings) -> SizePriors:
 
 def answer_of(outcome: Outcome) -> Answer:
     """Report of an outcome as JSON and text."""
-    from tactile_bayes.report.estimate_document import estimate_document
-    from tactile_bayes.report.estimate_text import estimate_summary, estimate_text
-    from tactile_bayes.report.quantities import estimate_quantities, lump_place
-
     tactile_map, estimate, settings = outcome.tactile_map, outcome.estimate, outcome.settings
     quantities = estimate_quantities(estimate, tactile_map, probability=settings.interval)
     place = lump_place(estimate.map_posterior, tactile_map, outcome.provenance.scans)
@@ -397,9 +390,6 @@ def answer_of(outcome: Outcome) -> Answer:
 
 def pooling_shape(tactile_map: TactileMap, estimate: Estimate) -> ShapeDraws | None:
     """Draws that pooling needs of a map, with the direction of its axes if landmarks define it."""
-    from tactile_bayes.size.draws import ShapeDraws
-    from tactile_bayes.size.fat import head_profile
-
     posterior, turn = estimate.map_posterior, tactile_map.patient_from_plane
     if posterior is None or estimate.draws is None:
         return None

@@ -7,10 +7,21 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+import numpy as np
+
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.atomic import sha256
 from tactile_bayes.files.campaign_names import DONE, ESTIMATE, EXAMS, SHAPE, exam_name, mass_name
+from tactile_bayes.files.documents import check_document, load_json
+from tactile_bayes.files.provenance import Provenance, recordings, scans_of
+from tactile_bayes.files.repeatability_json import HalfWidth, RepeatedMass, repeatability_document, write_repeatability
+from tactile_bayes.files.shipped import SHIPPED, default_for, size_calibration_path
+from tactile_bayes.files.size_json import read_size_calibration
+from tactile_bayes.files.tables import read_raw
+from tactile_bayes.inference.points import normal_quantile
+from tactile_bayes.size.bodies import BodyCalibration
+from tactile_bayes.size.site import log_size_alone
 
 if TYPE_CHECKING:
     from tactile_bayes.api.settings import Settings
@@ -51,8 +62,6 @@ class LearnedRepeatability(Record, eq=False):
 
     def write(self, path: Path, *, force: bool = False) -> None:
         """Write the file that `estimate --repeatability` takes."""
-        from tactile_bayes.files.repeatability_json import write_repeatability
-
         write_repeatability(path, self.document, force=force)
 
 
@@ -94,8 +103,6 @@ def exams_in(folder: Path) -> list[ExamFolder]:
     BadDataError
         When the folder is no campaign's output.
     """
-    from tactile_bayes.files.tables import read_raw
-
     table = folder / DONE
     if not table.is_file():
         raise BadDataError(f"holds no {DONE}", way_out="give a folder of `campaign run`", path=str(folder))
@@ -134,8 +141,6 @@ def learn_from_exams(
     UsageError
         When the calibration's file is not found, or it is not learned over bodies.
     """
-    from tactile_bayes.files.provenance import Provenance
-    from tactile_bayes.files.repeatability_json import HalfWidth, RepeatedMass, repeatability_document
     from tactile_bayes.size.learn.site import FEWEST_MASSES, PRIOR_LOG_SD, PRIOR_MEDIAN, learn_repeatability
 
     groups, left_out = _repeats(exams)
@@ -199,9 +204,6 @@ def _repeats(exams: Sequence[ExamFolder]) -> tuple[list[list[_Repeat]], list[str
 
 def _read(exam: ExamFolder) -> _Repeat | None:
     """What an exam's estimate says of it; None where it has no size."""
-    from tactile_bayes.files.documents import check_document, load_json
-    from tactile_bayes.files.provenance import recordings, scans_of
-
     path = exam.folder / ESTIMATE
     document: Any = load_json(path, way_out=_AGAIN)
     check_document(document, "estimate.schema.json", path=path)
@@ -239,10 +241,6 @@ def _calibration_named(repeats: Sequence[_Repeat]) -> tuple[str, str]:
 
 def _calibration(name: str, digest: str, given: str | None) -> BodyCalibration:
     """The calibration with this digest: the one given, or that of the name, or a shipped one."""
-    from tactile_bayes.files.shipped import SHIPPED, size_calibration_path
-    from tactile_bayes.files.size_json import read_size_calibration
-    from tactile_bayes.size.bodies import BodyCalibration
-
     names = [name, *SHIPPED] if given is None else [given]
     paths = [path for one in names if (path := size_calibration_path(one)) is not None]
     path = next((path for path in paths if (given is not None or path.is_file()) and sha256(path) == digest), None)
@@ -258,11 +256,8 @@ def _calibration(name: str, digest: str, given: str | None) -> BodyCalibration:
 
 
 def _repeated(group: Sequence[_Repeat], calibration: BodyCalibration) -> RepeatedExams:
-    import numpy as np
-
     from tactile_bayes.files.npz import read_shape
     from tactile_bayes.size.learn.site import RepeatedExams
-    from tactile_bayes.size.site import log_size_alone
 
     first = group[0].exam
     values = np.array([log_size_alone(calibration, read_shape(repeat.shape_path)) for repeat in group])
@@ -274,10 +269,6 @@ def _half_widths(repeats: Sequence[_Repeat], sd: float) -> dict[str, float]:
 
     Each interval is taken as a normal of ln d, of which the spread that it was made with is a part.
     """
-    import numpy as np
-
-    from tactile_bayes.inference.points import normal_quantile
-
     before, after = [], []
     for repeat in repeats:
         size, spread = repeat.size, repeat.spread
@@ -316,8 +307,6 @@ def check_repeatability(settings: Settings, calibration: Calibration, digests: M
     BadDataError
         Naming both.
     """
-    from tactile_bayes.files.shipped import default_for
-
     found = settings.repeatability
     if found is None or digests.get("size_calibration") == found.calibration_sha256:
         return

@@ -133,7 +133,7 @@ def kill_worker_of_b(path: Path, *, settings: Any) -> Any:
 
 
 def test_a_killed_worker_loses_no_other_map(folder: Path, alone: dict[str, str], monkeypatch: Any) -> None:
-    from tactile_bayes.commands import estimate
+    from tactile_bayes.actions import estimate
 
     monkeypatch.setattr(estimate, "answer_file", kill_worker_of_b)
     words = ("b.nc", "empty.nc", "a.nc", *FAST, "--size-calibration", "size.json", "--json", "--workers", 2)
@@ -145,7 +145,7 @@ def test_a_killed_worker_loses_no_other_map(folder: Path, alone: dict[str, str],
 
 
 def test_ctrl_c_prints_the_maps_that_are_done(folder: Path, alone: dict[str, str], monkeypatch: Any) -> None:
-    from tactile_bayes.commands import estimate
+    from tactile_bayes.actions import estimate
 
     def interrupted(path: Path, *, settings: Any) -> Any:
         if path.name == "b.nc":
