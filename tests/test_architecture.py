@@ -17,6 +17,7 @@ MODULES = sorted(PACKAGE.rglob("*.py"))
 SHELL = {"cli.py", "__main__.py", "actions", "commands", "report"}
 CORE = [path for path in MODULES if path.relative_to(PACKAGE).parts[0] not in SHELL]
 MOST_LINES = 600
+MOST_INSIDE = 300
 
 
 def name_of(path: Path) -> str:
@@ -59,6 +60,63 @@ def test_imports_go_one_way(capsys, monkeypatch):
     monkeypatch.syspath_prepend(str(ROOT))
     status = lint_imports(config_filename="pyproject.toml", no_cache=True)
     assert status == 0, capsys.readouterr().out
+
+
+def circles(arrows: dict[str, set[str]]) -> list[list[str]]:
+    """Modules that import themselves by way of others; arrows lead from a module to those that it imports."""
+
+    def reached(start: str) -> set[str]:
+        seen: set[str] = set()
+        waiting = [start]
+        while waiting:
+            for module in arrows.get(waiting.pop(), set()) - seen:
+                seen.add(module)
+                waiting.append(module)
+        return seen
+
+    reach = {module: reached(module) for module in arrows}
+    found = {frozenset(b for b in reach[a] if a in reach.get(b, ())) for a in arrows if a in reach[a]}
+    return sorted(sorted(circle) for circle in found)
+
+
+def arrows_of_the_package() -> dict[str, set[str]]:
+    """Imports that happen when the program runs, at the top or in a function."""
+    names = {".".join(path.relative_to(ROOT).with_suffix("").parts): path for path in MODULES}
+    found: dict[str, set[str]] = {}
+    for name, path in names.items():
+        for_types = {
+            id(node)
+            for block in ast.walk(tree_of(path))
+            if isinstance(block, ast.If) and "TYPE_CHECKING" in ast.unparse(block.test)
+            for node in ast.walk(block)
+        }
+        run = [node for node in ast.walk(tree_of(path)) if id(node) not in for_types]
+        wanted = {alias.name for node in run if isinstance(node, ast.Import) for alias in node.names}
+        for node in run:
+            if isinstance(node, ast.ImportFrom) and node.module:
+                wanted |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+        found[name] = wanted & set(names) - {name}
+    return found
+
+
+def test_no_file_imports_itself_by_way_of_others():
+    assert circles({"a": {"b"}, "b": {"c"}, "c": {"a"}, "d": {"a"}}) == [["a", "b", "c"]]  # the control
+    arrows = arrows_of_the_package()
+    assert sum(map(len, arrows.values())) > 500
+    assert circles(arrows) == []
+
+
+def test_few_imports_stand_in_functions():
+    """A reader sees at the top what a file needs; figures, devices and help texts spare their heavy ones."""
+    inside = {
+        f"{name_of(path)}:{node.lineno}"
+        for path in MODULES
+        for function in ast.walk(tree_of(path))
+        if isinstance(function, ast.FunctionDef | ast.AsyncFunctionDef)
+        for node in ast.walk(function)
+        if isinstance(node, ast.Import | ast.ImportFrom)
+    }
+    assert len(inside) <= MOST_INSIDE
 
 
 @pytest.mark.parametrize("package", ["emcee", "arviz", "msgspec"])
