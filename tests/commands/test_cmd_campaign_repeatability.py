@@ -12,7 +12,7 @@ import pytest
 from campaign_files import JOURNAL, contents, rows_of, steps, thinned, write, write_table
 from in_process import run_here
 
-from tactile_bayes.commands import progress
+from tactile_bayes.actions import campaign as actions
 
 MASSES, EXAMS = ("01", "02", "03", "04", "05"), (1, 2)
 ROWS = [(f"scans/{mass}-{exam}.mcap", mass, exam, "left") for mass in MASSES for exam in EXAMS]
@@ -116,7 +116,7 @@ def test_a_changed_exam_redoes_sizes_and_fits_no_other_map(own: Path, monkeypatc
     def tell(done: int, total: int) -> None:
         told.append((done, total))
 
-    monkeypatch.setattr(progress, "progress_bar", lambda _label, **_: nullcontext(tell))
+    monkeypatch.setattr(actions, "progress_bar", lambda _label, **_: nullcontext(tell))
     count = len(steps(own / "out"))
     write(own / "scans" / "03-2.mcap", thinned(2, 6, subject="03", side="left"))
     campaign(own)

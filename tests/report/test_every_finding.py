@@ -275,7 +275,7 @@ PRINTERS = {
     # the live view says cautions alone, see below; recorder and import speak of a scan that has no size yet
     "report/live",
     # of draws, not of a size; names of files that were written
-    "report/posterior_figures", "commands/campaign", "commands/report",
+    "report/posterior_figures", "actions/campaign", "actions/maps",
     # of trials, calibrations, devices and studies
     "api/trial_report", "api/trials", "actions/calibrate", "actions/devices", "actions/exam", "actions/heads",
     "actions/simulation", "actions/study",
