@@ -193,8 +193,8 @@ def _map(folder: Path) -> bytes:
 
 
 def _posterior() -> bytes:
+    from tactile_bayes.files.map_nc import POSTERIOR_SCHEMA as SCHEMA
     from tactile_bayes.files.netcdf import Contents, Variable, grouped_netcdf_bytes
-    from tactile_bayes.files.posterior_nc import SCHEMA
 
     sizes = np.random.default_rng(2).lognormal(2.5, 0.1, (1, 60))
     names = ("d_x_mm", "d_y_mm", "max_size_mm", "min_size_mm", "amplitude")
@@ -284,8 +284,7 @@ def _read_tomls(path: Path) -> object:
 def _read_jsons(path: Path) -> object:
     from tactile_bayes.files.estimate_json import read_stated_size
     from tactile_bayes.files.instrument_json import read_array_calibration, read_head_geometry, read_landmarks
-    from tactile_bayes.files.repeatability_json import read_repeatability
-    from tactile_bayes.files.size_json import read_size_calibration
+    from tactile_bayes.files.size_json import read_repeatability, read_size_calibration
 
     readers = (
         read_size_calibration, read_stated_size, read_head_geometry, read_array_calibration, read_landmarks,

@@ -343,8 +343,7 @@ def report_sizes(rows: list[Row]) -> None:
 
 
 def _size_mass(bodies: str, index: int) -> Row:
-    from tactile_bayes.files.shipped import DEFAULT, size_calibration_path
-    from tactile_bayes.files.size_json import read_size_calibration
+    from tactile_bayes.files.size_json import DEFAULT, read_size_calibration, size_calibration_path
     from tactile_bayes.size.bodies import BodyCalibration
     from tactile_bayes.size.draws import ShapeDraws
     from tactile_bayes.size.fat import head_profile

@@ -28,9 +28,16 @@ from tactile_bayes.forward.scene import Head, Scene, Strokes
 from tactile_bayes.forward.simulate import head_positions
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping import Instrument, MapAccumulator, MapGrid
-from tactile_bayes.mapping.cells import CellSums, ProjectedTaxels, Projection, Projector, Readout
+from tactile_bayes.mapping.cells import (
+    CellSums,
+    ProjectedTaxels,
+    Projection,
+    Projector,
+    Readout,
+    add_frames,
+    chunk_frames,
+)
 from tactile_bayes.mapping.plane import FramePoses
-from tactile_bayes.mapping.scatter import add_frames, chunk_frames
 from tactile_bayes.mapping.select import chunks
 from tactile_bayes.scan import ElementCalibration, HeadGeometry
 

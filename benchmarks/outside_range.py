@@ -30,8 +30,7 @@ import numpy as np
 from tactile_bayes.api.size_calibration import size_table
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import TactileBayesError
-from tactile_bayes.files.shipped import size_calibration_path
-from tactile_bayes.files.size_json import read_size_calibration
+from tactile_bayes.files.size_json import read_size_calibration, size_calibration_path
 from tactile_bayes.files.tables import read_table
 from tactile_bayes.forward.scene import Lump, Scene
 from tactile_bayes.forward.simulate import simulate

@@ -38,9 +38,9 @@ def simulated_fit() -> Any:
     from tactile_bayes.forward.gaussian import cell_mean_gaussian
     from tactile_bayes.mapping.map import MapRecipe, TactileMap
     from tactile_bayes.options import BumpPrior
+    from tactile_bayes.posterior.bump import window_cells
     from tactile_bayes.posterior.field import Window
     from tactile_bayes.posterior.fit import fit_scene
-    from tactile_bayes.posterior.fit_window import window_cells
     from tactile_bayes.posterior.marginal import independent_variance
     from tactile_bayes.posterior.scene import Problem, Scene
 

@@ -36,8 +36,8 @@ from scipy.special import ndtr, ndtri
 from benchmarks.interval_coverage import share
 from tactile_bayes.declarations import replace
 from tactile_bayes.geometry import FloatArray
+from tactile_bayes.size.fat import BetweenMaps
 from tactile_bayes.size.learn.site import GRID, RepeatedExams, learn_repeatability
-from tactile_bayes.size.spread import BetweenMaps
 
 SEED = 20261124
 MAP_SD, MAP_LOG_SD, BODY_SD = 0.03, 0.4, 0.07

@@ -17,13 +17,11 @@ from typing import Any
 
 import numpy as np
 
-from tactile_bayes.forward.axisymmetric import CondensedLump, Tissue, condense_lump
+from tactile_bayes.forward.axisymmetric import CondensedLump, LayeredBody, Tissue, condense_lump, taxel_compliance
 from tactile_bayes.forward.contact import ContactStiffness, press
-from tactile_bayes.forward.layers import LayeredBody, taxel_compliance
 from tactile_bayes.forward.mesh import LumpGeometry, MeshSize, lump_mesh
 from tactile_bayes.forward.scene import Head
-from tactile_bayes.forward.solid import PlacedLump, SolidHead, skin_perturbation, solid_head
-from tactile_bayes.forward.solid_scan import face_of
+from tactile_bayes.forward.solid import PlacedLump, SolidHead, face_of, skin_perturbation, solid_head
 
 SCHEMA = "tactile-bayes/benchmarks/solid/1"
 LUMPS = {

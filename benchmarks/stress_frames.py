@@ -28,12 +28,20 @@ from typing import Any
 import numpy as np
 
 from tactile_bayes.declarations import replace
+from tactile_bayes.forward.axisymmetric import LayeredBody, skin_flexibility, taxel_compliance
 from tactile_bayes.forward.contact import ContactStiffness
 from tactile_bayes.forward.instrument import frame_times, head_positions, level_kpa, record
-from tactile_bayes.forward.layers import LayeredBody, skin_flexibility, taxel_compliance
 from tactile_bayes.forward.scene import Scene, rotation_from_vector
-from tactile_bayes.forward.solid import PlacedLump, SolidFrame, SolidHead, skin_perturbation, solid_head
-from tactile_bayes.forward.solid_scan import condensed_lump, face_of, layers_of
+from tactile_bayes.forward.solid import (
+    PlacedLump,
+    SolidFrame,
+    SolidHead,
+    condensed_lump,
+    face_of,
+    layers_of,
+    skin_perturbation,
+    solid_head,
+)
 from tactile_bayes.forward.tissue import SceneBody, fat_thickness
 from tactile_bayes.geometry import FloatArray, apply, inverse, quaternion_from_rotation, rotation_from_quaternion
 from tactile_bayes.scan import Scan, TrackerPoses

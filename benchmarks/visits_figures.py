@@ -10,8 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.visits import draw_visits
-from tactile_bayes.files.shipped import size_calibration_path
-from tactile_bayes.files.size_json import read_size_calibration
+from tactile_bayes.files.size_json import read_size_calibration, size_calibration_path
 from tactile_bayes.forward.scene import Scene
 from tactile_bayes.geometry import FloatArray, apply, patient_from_base
 from tactile_bayes.report.compare import verdict

@@ -12,9 +12,8 @@ from tactile_bayes.exports.identity import Worklist
 from tactile_bayes.files.column_map import ColumnMap
 from tactile_bayes.files.documents import OF_A_PERSON, Fact, FactName, Protocol, Session
 from tactile_bayes.files.instrument_json import HeadFile
-from tactile_bayes.files.repeatability_json import RepeatabilityFile
 from tactile_bayes.files.scene_toml import SceneFile
-from tactile_bayes.files.size_json import Eq6File, PopulationFile, SiteFile
+from tactile_bayes.files.size_json import Eq6File, PopulationFile, RepeatabilityFile, SiteFile
 from tactile_bayes.studies.population import BodiesFile
 
 SCHEMAS = Path(__file__).resolve().parent.parent / "data_schema"

@@ -18,17 +18,20 @@ from tactile_bayes.shell import ReaderGoneError, ended_in_order, protect_streams
 COMMANDS: dict[str, tuple[str, str]] = {
     "demo": ("exam.demo_command", "Run the main job on an embedded scan: map, estimate, the report of a trial."),
     "import": ("exam.import_command", "Bring other people's arrays, grids and images in."),
-    "map": ("map.command", "Build a tactile map from one or more scans (paper steps i-iii)."),
+    "map": ("estimate.map_command", "Build a tactile map from one or more scans (paper steps i-iii)."),
     "calibrate": ("calibrate.command", "Learn a calibration: `calibrate size`, `calibrate array`."),
-    "estimate": ("estimate.command", "Lump size with a credible interval from tactile maps."),
-    "compare": ("compare.command", "Compare a mass's size at two visits and more: has it grown?"),
-    "report": ("report.command", "Write one page of an exam to read and to print."),
+    "estimate": ("estimate.estimate_command", "Lump size with a credible interval from tactile maps."),
+    "compare": ("estimate.compare_command", "Compare a mass's size at two visits and more: has it grown?"),
+    "report": ("estimate.report_command", "Write one page of an exam to read and to print."),
     "diagnose": (
         "exam.diagnose_command",
         "Check a posterior's draws: R-hat, effective draws, trace, rank and corner figures.",
     ),
     "validate": ("trial.validate_command", "Compare sizes with excision: accuracy of each modality."),
-    "campaign": ("campaign.command", "From a folder of exams to the trial's report: `campaign init`, `campaign run`."),
+    "campaign": (
+        "trial.campaign_command",
+        "From a folder of exams to the trial's report: `campaign init`, `campaign run`.",
+    ),
     "export": ("exam.export_command", "Write maps and estimates as DICOM, FHIR, NRRD (3D Slicer) or CSV (REDCap)."),
     "plan": ("trial.plan_command", "Plan a trial: power and the worth of more maps, by simulation."),
     "study": (

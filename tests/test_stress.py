@@ -7,9 +7,9 @@ import pytest
 
 from benchmarks.stress import CONTROL, STRESSES, jobs
 from benchmarks.stress_frames import Physics, VaryingLayers, shear_sinking, stressed_frames
-from tactile_bayes.forward.layers import LayeredBody
+from tactile_bayes.forward.axisymmetric import LayeredBody
 from tactile_bayes.forward.scene import Scene, Strokes
-from tactile_bayes.forward.solid_scan import solid_frames
+from tactile_bayes.forward.solid import solid_frames
 from tactile_bayes.forward.tissue import SceneBody, SolidLump
 
 SCENE = Scene(

@@ -18,13 +18,16 @@ from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.atomic import refuse_existing
 from tactile_bayes.files.instrument_json import ArrayCalibrationFile, write_array_calibration
 from tactile_bayes.files.provenance import Provenance, hash_inputs
-from tactile_bayes.files.shipped import size_calibration_path
-from tactile_bayes.files.size_json import write_size_calibration
+from tactile_bayes.files.size_json import size_calibration_path, write_size_calibration
 from tactile_bayes.files.tables import read_table
 from tactile_bayes.hardware.bladder import BladderStep, fit_array
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.report.calibration import body_calibration_text, repeatability_text, site_calibration_text
-from tactile_bayes.report.calibration_text import calibration_text
+from tactile_bayes.report.calibration import (
+    body_calibration_text,
+    calibration_text,
+    repeatability_text,
+    site_calibration_text,
+)
 from tactile_bayes.report.study import eq6_figure
 
 if TYPE_CHECKING:

@@ -23,11 +23,11 @@ from tactile_bayes.errors import BadDataError, DeviceError, UsageError
 from tactile_bayes.files.atomic import refuse_existing
 from tactile_bayes.files.provenance import Provenance, hash_inputs
 from tactile_bayes.hardware.bladder import rotation_sense
-from tactile_bayes.hardware.drivers import TRACKERS, list_ports, open_tracker, probe
 from tactile_bayes.hardware.emulated import EmulatedHead, EmulatedNdi, EmulatedTracker, Faults
 from tactile_bayes.hardware.emulator import Emulator, PtyLink, Stage, TcpLink
 from tactile_bayes.hardware.reading import ask_for_priority
 from tactile_bayes.hardware.readings import PoseReading
+from tactile_bayes.hardware.serial_trackers import TRACKERS, list_ports, open_tracker, probe
 from tactile_bayes.presets import RESEARCH_USE
 
 if TYPE_CHECKING:

@@ -23,10 +23,9 @@ from tactile_bayes.files.atomic import check_suffix, refuse_existing, unwritable
 from tactile_bayes.files.documents import dump_json, with_session
 from tactile_bayes.files.estimate_json import read_stated_size
 from tactile_bayes.files.identify import describe
-from tactile_bayes.files.map_nc import write_map
-from tactile_bayes.files.posterior_nc import read_posterior
+from tactile_bayes.files.map_nc import read_posterior, write_map
 from tactile_bayes.files.provenance import Provenance, hash_inputs
-from tactile_bayes.files.shipped import SHIPPED, size_calibration_path
+from tactile_bayes.files.size_json import SHIPPED, size_calibration_path
 from tactile_bayes.findings import finding_lines
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.figure_file import named_exam
@@ -34,7 +33,7 @@ from tactile_bayes.report.posterior_figures import corner_figure, rank_figure, t
 
 if TYPE_CHECKING:
     from tactile_bayes.files.estimate_json import StatedSize
-    from tactile_bayes.files.posterior_nc import PosteriorDraws
+    from tactile_bayes.files.map_nc import PosteriorDraws
     from tactile_bayes.geometry import FloatArray
     from tactile_bayes.mapping.map import TactileMap
     from tactile_bayes.scan import Scan
@@ -361,14 +360,15 @@ class Steps(Record):
 
     def default_road(self) -> StatedSize:
         """Map and estimate with default options; returns the size."""
-        from tactile_bayes.commands import estimate, map
+        from tactile_bayes.commands import estimate
+        from tactile_bayes.commands import estimate as map
 
         self._say("1. Build the tactile map: all readings of the scan, averaged in cells of 1 mm.")
         tactile_map, posterior = self.folder / "map.nc", self.folder / "posterior.nc"
-        self._run(map.command, "map", scans=(self.folder / "scan.mcap",), output=tactile_map)
+        self._run(map.map_command, "map", scans=(self.folder / "scan.mcap",), output=tactile_map)
         self._say("2. Estimate the size of the lump, with the calibration that comes with the program.")
         figures = {"figure": self.folder / "size.png", "map_figure": self.folder / "map.png"}
-        self._estimate(estimate.command, tactile_map, output=posterior, **figures)
+        self._estimate(estimate.estimate_command, tactile_map, output=posterior, **figures)
         return _stated(posterior)
 
     def paper_road(self) -> StatedSize:
@@ -376,7 +376,7 @@ class Steps(Record):
         self._say("3. The same map by the paper's own road: Markov chains over the bump, each draw through Eq 6.")
         tactile_map, posterior = self.folder / "map.nc", self.folder / "posterior_eq6.nc"
         options = {"size_calibration": "eq6", "output": posterior}
-        self._run(estimate.command, "estimate", maps=(tactile_map,), method="ensemble", **options)
+        self._run(estimate.estimate_command, "estimate", maps=(tactile_map,), method="ensemble", **options)
         return _stated(posterior)
 
     def trial(self) -> None:

@@ -30,17 +30,16 @@ from tactile_bayes.files.instrument_json import (
     head_document,
     head_from_document,
 )
-from tactile_bayes.files.shipped import size_calibration_path
-from tactile_bayes.files.size_json import read_size_calibration
+from tactile_bayes.files.size_json import read_size_calibration, size_calibration_path
 from tactile_bayes.findings import finding_summary
 from tactile_bayes.geometry import apply, inverse
 from tactile_bayes.hardware.live import Feed, FeedReader, LiveMap
 from tactile_bayes.hardware.serve import LiveServer, address_of
+from tactile_bayes.posterior.bump import candidate_centres
 from tactile_bayes.posterior.estimate import estimate_map
-from tactile_bayes.posterior.fit_window import candidate_centres
 from tactile_bayes.posterior.options import EstimateOptions, FitOptions
 from tactile_bayes.presets import FIELD_COSINES, FIT_RADIUS_MM, INTERVAL
-from tactile_bayes.report.live import colours_wanted, live_line, live_text
+from tactile_bayes.report.map_text import colours_wanted, live_line, live_text
 
 if TYPE_CHECKING:
     from tactile_bayes.geometry import FloatArray

@@ -24,16 +24,15 @@ from tactile_bayes.files.atomic import refuse_existing, unwritable
 from tactile_bayes.files.documents import check_session, read_session
 from tactile_bayes.files.instrument_json import read_array_calibration, read_head_geometry, read_landmarks
 from tactile_bayes.files.provenance import Provenance, hash_inputs
-from tactile_bayes.files.shipped import size_calibration_path
+from tactile_bayes.files.size_json import size_calibration_path
 from tactile_bayes.hardware import head
-from tactile_bayes.hardware.drivers import TRACKERS, check_head, open_tracker
 from tactile_bayes.hardware.head import HeadParser
-from tactile_bayes.hardware.ports import Port
+from tactile_bayes.hardware.ports import Port, read_in_process
 from tactile_bayes.hardware.recorder import LandmarkTouch, Line, Recorder
-from tactile_bayes.hardware.streams import read_in_process
+from tactile_bayes.hardware.serial_trackers import TRACKERS, check_head, open_tracker
 from tactile_bayes.options import RecordOptions
 from tactile_bayes.presets import PRESSURE_RANGE_KPA
-from tactile_bayes.report.live import record_text
+from tactile_bayes.report.map_text import record_text
 from tactile_bayes.scan import ElementCalibration
 
 if TYPE_CHECKING:

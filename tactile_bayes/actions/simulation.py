@@ -23,8 +23,7 @@ from tactile_bayes.files.documents import dump_json, read_record, with_session
 from tactile_bayes.files.instrument_json import read_simulated_head
 from tactile_bayes.files.provenance import Provenance, hash_inputs
 from tactile_bayes.files.scene_toml import read_scene
-from tactile_bayes.files.shipped import DEFAULT, size_calibration_path
-from tactile_bayes.files.size_json import read_size_calibration
+from tactile_bayes.files.size_json import DEFAULT, read_size_calibration, size_calibration_path
 from tactile_bayes.forward.line import outside_range
 from tactile_bayes.forward.scene import Head
 from tactile_bayes.forward.simulate import simulate
@@ -265,7 +264,7 @@ def sbc_action(
     force: bool,
 ) -> None:
     """Check the posterior against itself: simulation-based calibration and coverage."""
-    from tactile_bayes.report.sbc import sbc_document, sbc_figure, sbc_text, table_text
+    from tactile_bayes.report.laboratory import sbc_document, sbc_figure, sbc_text, table_text
 
     for path in (output, figure):
         if path is not None:

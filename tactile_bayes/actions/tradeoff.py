@@ -24,12 +24,11 @@ from tactile_bayes.files.atomic import given_twice, refuse_existing
 from tactile_bayes.files.documents import check_document, dump_json
 from tactile_bayes.files.provenance import Provenance, hash_inputs
 from tactile_bayes.files.scene_toml import read_scene
-from tactile_bayes.files.shipped import size_calibration_path
-from tactile_bayes.files.size_json import read_size_calibration
+from tactile_bayes.files.size_json import read_size_calibration, size_calibration_path
 from tactile_bayes.forward.scene import Scene
 from tactile_bayes.forward.tissue import SceneBody, SolidLump
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.report.forward_tradeoff import TradeoffReport, draw_tradeoff, tradeoff_document, tradeoff_text
+from tactile_bayes.report.laboratory import TradeoffReport, draw_tradeoff, tradeoff_document, tradeoff_text
 from tactile_bayes.report.tradeoff import SCHEMA_FILE, draw_ladder, ladder_document, ladder_text
 from tactile_bayes.studies.estimate_tradeoff import Work
 from tactile_bayes.studies.paper_solid import fit_raster
@@ -37,7 +36,7 @@ from tactile_bayes.studies.tradeoffs import PLANE, SOLID, calibrated_rule, case_
 from tactile_bayes.studies.tradeoffs import measure_forward as measure
 
 if TYPE_CHECKING:
-    from tactile_bayes.report.forward_tradeoff import TradeoffReport
+    from tactile_bayes.report.laboratory import TradeoffReport
     from tactile_bayes.studies.estimate_tradeoff import Ladder
     from tactile_bayes.studies.tradeoffs import LumpCase, Measured, SizeRule
 

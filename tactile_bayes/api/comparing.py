@@ -25,10 +25,10 @@ from tactile_bayes.files.provenance import Provenance, hash_inputs, repeated_sca
 from tactile_bayes.findings import Finding, Verdict, by_weight, finding_lines, verdict
 from tactile_bayes.presets import REGISTRATION_MM, RESEARCH_USE
 from tactile_bayes.report.compare import compare_document, compare_summary, compare_text
-from tactile_bayes.report.compare_figure import DrawnMap, draw_comparison
+from tactile_bayes.report.estimate_figures import DrawnMap, draw_comparison
 from tactile_bayes.report.pooled import disagreement, fat_apart
+from tactile_bayes.size.fat import LEAST_PROBABILITY, one_size_of
 from tactile_bayes.size.pooling import MOST_INVALID, log_sizes
-from tactile_bayes.size.spread import LEAST_PROBABILITY, one_size_of
 from tactile_bayes.size.visits import (
     Compared,
     Place,
@@ -43,11 +43,11 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from tactile_bayes.mapping.map import TactileMap
-    from tactile_bayes.report.compare_figure import DrawnMap
+    from tactile_bayes.report.estimate_figures import DrawnMap
     from tactile_bayes.size.bodies import BodyCalibration
     from tactile_bayes.size.draws import ShapeDraws
+    from tactile_bayes.size.fat import BetweenMaps
     from tactile_bayes.size.pooling import SizePriors
-    from tactile_bayes.size.spread import BetweenMaps
     from tactile_bayes.size.visits import Apart, Change, Compared, JointSizes
 
 

@@ -20,7 +20,7 @@ from tactile_bayes.api.settings import Settings, refuse_checkpoint
 from tactile_bayes.api.sized import Draws, MassEstimate, Sized
 from tactile_bayes.declarations import names_of, replace
 from tactile_bayes.errors import UsageError, check_number
-from tactile_bayes.files.repeatability_json import read_repeatability
+from tactile_bayes.files.size_json import read_repeatability
 from tactile_bayes.findings import Finding, findings_in
 from tactile_bayes.report.estimate_document import patient_mm
 from tactile_bayes.report.estimate_figures import draw_fit, draw_map, draw_size
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
     from tactile_bayes.api.pooled import PooledOutcome
     from tactile_bayes.size.draws import SizePosterior
-    from tactile_bayes.size.site import Repeatability
+    from tactile_bayes.size.pooling import Repeatability
 
 
 # --- Estimates of a lump's size: from one map, or from several maps of one mass.

@@ -13,11 +13,9 @@ from tactile_bayes.api.repeatability import check_repeatability, repeatability_d
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import EXIT_DONE, EXIT_NO_ESTIMATE, NO_LUMP, BadDataError, TactileBayesError
-from tactile_bayes.files.map_nc import read_map_and_scans
-from tactile_bayes.files.posterior_nc import write_posterior
+from tactile_bayes.files.map_nc import read_map_and_scans, write_posterior
 from tactile_bayes.files.provenance import Provenance, hash_inputs
-from tactile_bayes.files.shipped import SHIPPED, default_for, size_calibration_path
-from tactile_bayes.files.size_json import read_size_calibration
+from tactile_bayes.files.size_json import SHIPPED, default_for, read_size_calibration, size_calibration_path
 from tactile_bayes.findings import Finding, by_weight, findings_in
 from tactile_bayes.mapping.map import many_cells
 from tactile_bayes.options import PRIORS
@@ -41,9 +39,8 @@ from tactile_bayes.report.quantities import (
 )
 from tactile_bayes.size.bodies import BodyCalibration, mean_width_mm
 from tactile_bayes.size.draws import ShapeDraws
-from tactile_bayes.size.fat import head_profile
+from tactile_bayes.size.fat import BetweenMaps, head_profile
 from tactile_bayes.size.pooling import SizePriors
-from tactile_bayes.size.spread import BetweenMaps
 
 if TYPE_CHECKING:
     from tactile_bayes.files.provenance import Provenance

@@ -16,8 +16,7 @@ from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.atomic import given_twice, sha256
 from tactile_bayes.files.documents import load_json
 from tactile_bayes.files.estimate_json import check_estimate
-from tactile_bayes.files.map_nc import read_map_and_scans
-from tactile_bayes.files.posterior_nc import is_posterior, read_estimate
+from tactile_bayes.files.map_nc import is_posterior, read_estimate, read_map_and_scans
 from tactile_bayes.files.provenance import scans_of
 from tactile_bayes.files.reading import HDF5_MAGIC, open_input
 from tactile_bayes.mapping.map import TactileMap

@@ -15,15 +15,14 @@ from tactile_bayes.api.settings import Settings
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.provenance import Provenance, hash_inputs, scans_of
-from tactile_bayes.files.shipped import default_for, size_calibration_path
-from tactile_bayes.files.size_json import read_size_calibration
+from tactile_bayes.files.size_json import default_for, read_size_calibration, size_calibration_path
 from tactile_bayes.options import PRIORS
 from tactile_bayes.posterior.estimate import way_to_head
 from tactile_bayes.presets import MATCH_MM
 from tactile_bayes.report.pooled import pooled_document
 from tactile_bayes.size.bodies import BodyCalibration
+from tactile_bayes.size.fat import LEAST_PROBABILITY
 from tactile_bayes.size.pooling import DISAGREE, PooledEstimate, pool_maps
-from tactile_bayes.size.spread import LEAST_PROBABILITY
 from tactile_bayes.size.visits import Place as PatientPlace
 from tactile_bayes.size.visits import one_place_probability
 

@@ -15,20 +15,26 @@ from tactile_bayes.files.atomic import sha256
 from tactile_bayes.files.campaign_names import DONE, ESTIMATE, EXAMS, SHAPE, exam_name, mass_name
 from tactile_bayes.files.documents import check_document, load_json
 from tactile_bayes.files.provenance import Provenance, recordings, scans_of
-from tactile_bayes.files.repeatability_json import HalfWidth, RepeatedMass, repeatability_document, write_repeatability
-from tactile_bayes.files.shipped import SHIPPED, default_for, size_calibration_path
-from tactile_bayes.files.size_json import read_size_calibration
+from tactile_bayes.files.size_json import (
+    SHIPPED,
+    HalfWidth,
+    RepeatedMass,
+    default_for,
+    read_size_calibration,
+    repeatability_document,
+    size_calibration_path,
+    write_repeatability,
+)
 from tactile_bayes.files.tables import read_raw
 from tactile_bayes.inference.points import normal_quantile
 from tactile_bayes.size.bodies import BodyCalibration
-from tactile_bayes.size.site import log_size_alone
+from tactile_bayes.size.pooling import log_size_alone
 
 if TYPE_CHECKING:
     from tactile_bayes.api.settings import Settings
     from tactile_bayes.size.bodies import BodyCalibration
     from tactile_bayes.size.learn.site import RepeatedExams
-    from tactile_bayes.size.pooling import Calibration
-    from tactile_bayes.size.site import Repeatability
+    from tactile_bayes.size.pooling import Calibration, Repeatability
 
 COMMAND: Final = "calibrate repeatability"
 _AGAIN: Final = "run the campaign again"

@@ -22,8 +22,7 @@ from tactile_bayes.presets import (
 )
 
 if TYPE_CHECKING:
-    from tactile_bayes.size.pooling import Calibration
-    from tactile_bayes.size.site import Repeatability
+    from tactile_bayes.size.pooling import Calibration, Repeatability
 else:
     Calibration = Repeatability = Any  # which take numpy to load
 

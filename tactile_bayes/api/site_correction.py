@@ -18,10 +18,9 @@ from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.documents import load_json
 from tactile_bayes.files.provenance import Provenance, hash_inputs
 from tactile_bayes.files.reading import open_input
-from tactile_bayes.files.shipped import SHIPPED, size_calibration_path
-from tactile_bayes.files.size_json import read_size_calibration, write_size_calibration
+from tactile_bayes.files.size_json import SHIPPED, read_size_calibration, size_calibration_path, write_size_calibration
 from tactile_bayes.files.tables import read_table
-from tactile_bayes.forward.body import parse_seat
+from tactile_bayes.forward.tissue import parse_seat
 from tactile_bayes.presets import HEAD_PROFILE, LEAST_HARD_RATIO
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.draws import ShapeDraws

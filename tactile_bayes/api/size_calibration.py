@@ -18,7 +18,6 @@ from tactile_bayes.scan import HeadShape
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.eq6 import LeftOutErrors, SizeCalibration
 from tactile_bayes.size.learn import bodies as learning
-from tactile_bayes.size.learn.cross_validation import left_out_of_study
 from tactile_bayes.size.learn.eq6 import (
     OtherFit,
     SizeTable,
@@ -26,6 +25,7 @@ from tactile_bayes.size.learn.eq6 import (
     axis_in_two_stages,
     learn_size_calibration,
     learn_two_stage,
+    left_out_of_study,
     other_fit,
     width_changes,
 )

@@ -23,8 +23,7 @@ from tactile_bayes.files.size_json import write_size_calibration
 from tactile_bayes.files.tables import Sheet, check_references, read_table
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.trial import trial_text
-from tactile_bayes.trial.readings import readings_from_columns
-from tactile_bayes.trial.visits import at_excision
+from tactile_bayes.trial.readings import at_excision, readings_from_columns
 
 if TYPE_CHECKING:
     import pandas
@@ -32,10 +31,8 @@ if TYPE_CHECKING:
     from tactile_bayes.api.size_calibration import EqSixFit, PopulationForm
     from tactile_bayes.api.trial_report import TrialOutcome
     from tactile_bayes.files.tables import Sheet, Table
-    from tactile_bayes.size.pooling import Calibration
-    from tactile_bayes.size.site import Repeatability
-    from tactile_bayes.trial.readings import MassKey, Reading
-    from tactile_bayes.trial.visits import OtherVisits
+    from tactile_bayes.size.pooling import Calibration, Repeatability
+    from tactile_bayes.trial.readings import MassKey, OtherVisits, Reading
 
 
 # --- Input of `validate` and `plan`: the tables of a trial, tidy or wide, and the estimates that they name.

@@ -20,7 +20,7 @@ from tactile_bayes.files.map_nc import read_map
 from tactile_bayes.findings import Finding, finding_lines
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.report.compare import Growth, of_document
-from tactile_bayes.trial.visits import day_of, in_order
+from tactile_bayes.trial.readings import day_of, in_order
 
 if TYPE_CHECKING:
     from tactile_bayes.api.estimating import Outcome

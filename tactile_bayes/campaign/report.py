@@ -39,7 +39,7 @@ from tactile_bayes.report.compare import Growth, growth_line
 from tactile_bayes.report.quantities import leading
 from tactile_bayes.report.trial import trial_text
 from tactile_bayes.report.trial_html import trial_html
-from tactile_bayes.trial.visits import at_excision
+from tactile_bayes.trial.readings import at_excision
 
 if TYPE_CHECKING:
     from tactile_bayes.api.trial_report import TrialSettings

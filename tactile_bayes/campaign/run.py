@@ -31,16 +31,14 @@ from tactile_bayes.files.atomic import sha256
 from tactile_bayes.files.campaign_names import ESTIMATE, EXAMS, GROWTH, MAP, MASSES, REPEATABILITY, SHAPE
 from tactile_bayes.files.manifest_csv import Exam
 from tactile_bayes.files.provenance import recordings
-from tactile_bayes.files.repeatability_json import read_repeatability
-from tactile_bayes.files.shipped import default_for, size_calibration_path
-from tactile_bayes.files.size_json import read_size_calibration
+from tactile_bayes.files.size_json import default_for, read_repeatability, read_size_calibration, size_calibration_path
 from tactile_bayes.progress import Progress, untold
 from tactile_bayes.size.bodies import BodyCalibration
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
 
-    from tactile_bayes.size.site import Repeatability
+    from tactile_bayes.size.pooling import Repeatability
 
 Bar = Callable[[str], AbstractContextManager[Progress]]
 _Any = TypeVar("_Any")

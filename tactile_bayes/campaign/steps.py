@@ -40,22 +40,20 @@ from tactile_bayes.files.campaign_names import (
 )
 from tactile_bayes.files.documents import check_document, dump_json, load_json
 from tactile_bayes.files.manifest_csv import Exam
-from tactile_bayes.files.map_nc import read_map, read_map_and_scans, write_map
-from tactile_bayes.files.posterior_nc import write_pooled
+from tactile_bayes.files.map_nc import read_map, read_map_and_scans, write_map, write_pooled
 from tactile_bayes.files.provenance import Provenance, scan_facts
 from tactile_bayes.files.reading import NETCDF_BYTES, kind_of, read_bytes
 from tactile_bayes.files.remote import fetched, put
 from tactile_bayes.findings import by_weight, findings_in
 from tactile_bayes.mapping import build_map
 from tactile_bayes.options import MapOptions
-from tactile_bayes.report.compare_figure import draw_comparison
 from tactile_bayes.report.estimate_document import rounded, size_diagnostics
-from tactile_bayes.report.estimate_figures import draw_map, draw_size
+from tactile_bayes.report.estimate_figures import draw_comparison, draw_map, draw_size
 from tactile_bayes.report.quantities import ANOTHER_EXAM
 from tactile_bayes.report.svg import thumbnail_png
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.draws import SIZES
-from tactile_bayes.size.site import size_alone
+from tactile_bayes.size.pooling import size_alone
 
 if TYPE_CHECKING:
     from tactile_bayes.api.estimating import Answer, Outcome

@@ -403,7 +403,7 @@ def head_uniformity_command(**given: Any) -> None:
 
     Example: tactile-bayes head uniformity --head-radius-mm 35 --head shoulders-outside
     """
-    from tactile_bayes.actions.heads import head_uniformity_action
+    from tactile_bayes.actions.study import head_uniformity_action
 
     head_uniformity_action(**given)
 
@@ -423,7 +423,7 @@ def head_design_command(**given: Any) -> None:
 
     Example: tactile-bayes head design --figure head.png
     """
-    from tactile_bayes.actions.heads import head_design_action
+    from tactile_bayes.actions.study import head_design_action
 
     head_design_action(**given)
 
@@ -468,6 +468,6 @@ def compare_model_command(**given: Any) -> None:
 
     Example: tactile-bayes compare-model scan.mcap scene.toml --fidelity plane-strain --fidelity empirical
     """
-    from tactile_bayes.actions.heads import compare_model_action
+    from tactile_bayes.actions.study import compare_model_action
 
     compare_model_action(**given)

@@ -145,7 +145,7 @@ def settings_of(*, settings_file: Path | None = None, repeatability: Path | None
         When the checkpoint that the file names is another file of the call.
     """
     from tactile_bayes.api.settings import read_settings
-    from tactile_bayes.files.repeatability_json import read_repeatability
+    from tactile_bayes.files.size_json import read_repeatability
 
     if repeatability is not None:
         options["repeatability"] = read_repeatability(repeatability)

@@ -1,4 +1,4 @@
-"""Options of the commands on trials: `validate`, `plan`."""
+"""Options of the commands on trials: `campaign`, `validate`, `plan`."""
 
 from __future__ import annotations
 
@@ -6,8 +6,22 @@ from typing import Any
 
 import click
 
+from tactile_bayes.api.settings import Settings
 from tactile_bayes.api.trial_report import TrialSettings
-from tactile_bayes.commands.options import FORCE, JSON, MOST_ITEMS, WORKERS, FilePath, FiniteRange, seed_option
+from tactile_bayes.commands.options import (
+    FORCE,
+    JSON,
+    MOST_ITEMS,
+    WORKERS,
+    FilePath,
+    FiniteRange,
+    scheduler_option,
+    seed_option,
+    takes,
+)
+from tactile_bayes.options import MapOptions
+
+# --- Options of the commands on trials: `validate`, `plan`.
 
 # --- `validate`: compare each modality with excision.
 
@@ -159,3 +173,90 @@ def plan_command(**given: Any) -> None:
     from tactile_bayes.actions.trial import plan_action
 
     plan_action(**given)
+
+
+# --- `campaign`: from a folder of exams to the trial's report.
+
+
+@click.group("campaign")
+def campaign_command() -> None:
+    """From a folder of exams to the trial's report, in one resumable run."""
+
+
+@campaign_command.command("init")
+@click.argument("folder", metavar="FOLDER", type=FilePath(addresses=True))
+@click.option(
+    "-o", "--output", required=True, metavar="EXAMS.csv", type=FilePath(writes="CSV"), help="Where to write the table."
+)
+@click.option("--add", is_flag=True, help="Keep the rows of an EXAMS.csv that is there, and add those of other files.")
+@FORCE
+def campaign_init_command(**given: Any) -> None:
+    """Write the table of exams from a folder of scans and what they carry.
+
+    FOLDER may be one in an object store, as s3://bucket/scans; the maps in it are passed over.
+
+    Patient, side and reader are the `subject`, `side` and `examiner` that `record` wrote into each scan; visit and mass
+    are its `visit` and `mass`, or 1. Exams of a mass are numbered in the order of their file names. Cells that no scan
+    fills stay blank. Copies, and maps of scans that are listed, are left out and named.
+
+    Example: tactile-bayes campaign init scans -o exams.csv
+    """
+    from tactile_bayes.actions.trial import campaign_init_action
+
+    campaign_init_action(**given)
+
+
+@campaign_command.command("run")
+@click.argument("exams", metavar="EXAMS.csv", type=_FILE)
+@click.option("-o", "--output", required=True, metavar="DIR", type=_FILE, help="Folder for all files.")
+@click.option(
+    "--excision", metavar="EX.csv", type=_FILE, help="Sizes measured after excision: adds the trial's report."
+)
+@click.option(
+    "--columns", metavar="MAP.toml", type=_FILE, help="Layout of a wide EX.csv: which column holds what, in which unit."
+)
+@click.option(
+    "--protocol", metavar="FILE.toml", type=_FILE, help="Pre-specified analysis of the trial, as for `validate`."
+)
+@takes(Settings, "method", help="As `estimate`.")
+@takes(Settings, "size_calibration", metavar="NAME|SIZE.json", help="As `estimate`, unless a row names its own.")
+@takes(Settings, "settings_file", help="Priors and more, as `estimate`.")
+@takes(MapOptions, "normalise", help="As `map`.")
+@click.option(
+    "--match-mm",
+    type=FiniteRange(min=0.0, min_open=True),
+    metavar="MM",
+    default=15.0,
+    show_default=True,
+    help="Distance within which a mass is the one that another exam of the breast names by place.",
+)
+@click.option(
+    "--repeatability",
+    metavar="none|SITE.json",
+    help="Spread between exams of one mass: a file as for `estimate`, or none (two intervals: the page leads with that "
+    "for patients, the tables hold the narrower). Default: learned from this campaign's repeats, where 5 masses "
+    "have them.",
+)
+@takes(Settings, "seed")
+@click.option("--figures", is_flag=True, help="Draw map and size posterior of each exam.")
+@click.option("--dry-run", is_flag=True, help="Print what would be done, and do nothing.")
+@click.option(
+    "--copy-to", metavar="s3://BUCKET/FOLDER", help="Copy every file into this folder of an object store, step by step."
+)
+@WORKERS
+@scheduler_option("the exams")
+def campaign_run_command(**given: Any) -> None:
+    """Map, estimate and pool the exams of a table, and report the trial.
+
+    DIR gets a folder for each exam and each pooled mass, exams_done.csv, failures.csv, trial.csv (which `validate`
+    takes), index.html (all exams, worst first) and, with --excision, report.html and report.json. Masses with several
+    visits are compared (growth.csv), and the report is of the last visit before excision. Where 5 masses have
+    several exams at one visit, the spread between exams is learned from them and every size is by it. An exam's fault
+    is its row in failures.csv; the others go on. The same call again goes on where it was interrupted, and does again
+    what depends on a file or setting that changed, and what failed.
+
+    Example: tactile-bayes campaign run exams.csv --excision excision.csv -o out
+    """
+    from tactile_bayes.actions.trial import campaign_run_action
+
+    campaign_run_action(**given)

@@ -10,8 +10,7 @@ import numpy as np
 
 from tactile_bayes import __version__
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.exports import codes
-from tactile_bayes.exports.codes import Code, content_uid
+from tactile_bayes.exports import exam as codes
 from tactile_bayes.exports.dicom_map import (
     MANUFACTURER,
     MODEL,
@@ -26,7 +25,7 @@ from tactile_bayes.exports.dicom_map import (
     secondary_capture,
     study_of,
 )
-from tactile_bayes.exports.exam import EstimateFile, MapFile, SizedMass, required, verdict_words
+from tactile_bayes.exports.exam import Code, EstimateFile, MapFile, SizedMass, content_uid, required, verdict_words
 from tactile_bayes.exports.identity import Identity
 from tactile_bayes.exports.nrrd import lps_from_plane, on_plane
 from tactile_bayes.presets import RESEARCH_USE

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from tactile_bayes import __version__
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import UsageError
-from tactile_bayes.exports.codes import (
+from tactile_bayes.exports.exam import (
     BREAST,
     OWN_SCHEME,
     OWN_SCHEME_NAME,
@@ -21,9 +21,11 @@ from tactile_bayes.exports.codes import (
     PRESSURE,
     RELATIVE_PRESSURE,
     Code,
+    EstimateFile,
+    MapFile,
     content_uid,
+    required,
 )
-from tactile_bayes.exports.exam import EstimateFile, MapFile, required
 from tactile_bayes.exports.identity import Identity, Moment
 from tactile_bayes.exports.nrrd import ImagePlane, image_plane, lps_from_plane
 from tactile_bayes.findings import finding_lines

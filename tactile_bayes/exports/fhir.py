@@ -8,9 +8,17 @@ from typing import Any, Final
 
 from tactile_bayes import __version__
 from tactile_bayes.errors import BadDataError, one_line
-from tactile_bayes.exports import codes
-from tactile_bayes.exports.codes import FHIR_SYSTEMS, Code, content_uuid
-from tactile_bayes.exports.exam import EstimateFile, SizedMass, required, size_words, verdict_words
+from tactile_bayes.exports import exam as codes
+from tactile_bayes.exports.exam import (
+    FHIR_SYSTEMS,
+    Code,
+    EstimateFile,
+    SizedMass,
+    content_uuid,
+    required,
+    size_words,
+    verdict_words,
+)
 from tactile_bayes.exports.identity import Identity
 from tactile_bayes.files.documents import dump_json
 from tactile_bayes.presets import RESEARCH_USE

@@ -9,8 +9,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
 from tactile_bayes.errors import UsageError
-from tactile_bayes.exports.codes import NOT_DETECTED, NOT_SIZED, SIZED, content_uuid
-from tactile_bayes.exports.exam import EstimateFile, SizedMass
+from tactile_bayes.exports.exam import NOT_DETECTED, NOT_SIZED, SIZED, EstimateFile, SizedMass, content_uuid
 from tactile_bayes.exports.identity import Identity
 from tactile_bayes.presets import RESEARCH_USE
 

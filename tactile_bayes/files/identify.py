@@ -162,7 +162,7 @@ def _site_calibration(path: Path, document: dict[str, Any]) -> dict[str, Any]:
 
 
 def _repeatability(path: Path, document: dict[str, Any]) -> dict[str, Any]:
-    from tactile_bayes.files.repeatability_json import read_repeatability
+    from tactile_bayes.files.size_json import read_repeatability
 
     found = read_repeatability(path)
     provenance = dict(document["provenance"])

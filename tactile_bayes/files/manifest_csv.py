@@ -17,10 +17,9 @@ from tactile_bayes.files.campaign_names import exam_name, mass_name
 from tactile_bayes.files.documents import load_schema
 from tactile_bayes.files.reading import TABLE_BYTES, read_bytes
 from tactile_bayes.files.remote import check_address, is_address
-from tactile_bayes.files.shipped import NONE, SHIPPED
+from tactile_bayes.files.size_json import NONE, SHIPPED
 from tactile_bayes.files.tables import RawTable, Table, read_raw, read_table
-from tactile_bayes.trial.readings import Reading
-from tactile_bayes.trial.visits import at_excision
+from tactile_bayes.trial.readings import Reading, at_excision
 
 SCHEMA: Final = "exams.table.json"
 KNOWN: Final = ("seat", "depth_mm", "stiffness_ratio", "fat_kpa", "gland_ratio", "thickness_mm")

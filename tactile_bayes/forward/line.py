@@ -9,9 +9,9 @@ from scipy.optimize import minimize_scalar
 
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.forward.body import Layers
 from tactile_bayes.forward.contact import Contact, Head, solve_contact
 from tactile_bayes.forward.plane_strain import CELL_MM, SurfaceCompliance, surface_compliance
+from tactile_bayes.forward.tissue import Layers
 from tactile_bayes.geometry import FloatArray
 
 # --- Frames of a head that slides over the lump in two dimensions, and the map they average to.

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.forward.body import Body
+from tactile_bayes.forward.tissue import Body
 from tactile_bayes.geometry import FloatArray
 
 # --- Quadrilateral meshes of half the body, graded and with every material boundary on element edges.

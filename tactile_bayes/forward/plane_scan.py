@@ -13,14 +13,13 @@ import numpy as np
 
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.forward.body import MOST_SEAT, Body, Layers
 from tactile_bayes.forward.contact import Head
 from tactile_bayes.forward.instrument import SimulatedScan, frame_times, head_positions, level_kpa, record
 from tactile_bayes.forward.line import EmpiricalModel, fit_empirical, press, press_layers
 from tactile_bayes.forward.mesh import REACH_MM
 from tactile_bayes.forward.plane_strain import SurfaceCompliance, condense
 from tactile_bayes.forward.scene import Scene, refuse_bumps, tissue_truth
-from tactile_bayes.forward.tissue import SceneBody, SolidLump, fat_thickness
+from tactile_bayes.forward.tissue import MOST_SEAT, Body, Layers, SceneBody, SolidLump, fat_thickness
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.presets import SHOULDERS_INSIDE
 

@@ -11,9 +11,9 @@ from scipy.sparse.linalg import splu
 
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.forward.body import Body, Layers
 from tactile_bayes.forward.mesh import IndexArray as IntArray
 from tactile_bayes.forward.mesh import QuadMesh, body_mesh, disc_mesh
+from tactile_bayes.forward.tissue import Body, Layers
 from tactile_bayes.geometry import FloatArray
 
 if TYPE_CHECKING:

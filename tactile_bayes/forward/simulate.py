@@ -13,7 +13,7 @@ from tactile_bayes.forward.instrument import SimulatedScan, head_positions, leve
 from tactile_bayes.forward.plane_scan import frames_at_poses as plane_frames_at_poses
 from tactile_bayes.forward.plane_scan import simulate_plane
 from tactile_bayes.forward.scene import Scene, normalised_pressure, refuse_bumps
-from tactile_bayes.forward.solid_scan import frames_at_poses, simulate_solid
+from tactile_bayes.forward.solid import frames_at_poses, simulate_solid
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.presets import SHOULDERS_INSIDE
 

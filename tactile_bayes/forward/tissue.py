@@ -1,13 +1,240 @@
-"""Lumps of tissue in a body, as a scene gives them: sizes, depths and stiffness instead of a bump's shape."""
+"""What a scene is made of: bodies, their tissues, lumps."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
 
 from tactile_bayes.declarations import Meta, Record, check
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.forward.body import FAT_KPA, GLAND_RATIO, POISSON, THICKNESS_MM
+from tactile_bayes.forward.contact import Head
+from tactile_bayes.geometry import FloatArray
+from tactile_bayes.presets import SHOULDERS_OUTSIDE
+
+# --- A body under the head: its layers, its lump, the head's face.
+
+# --- The layered breast model: fat over gland over a rigid chest wall, with a circular lump at or above their boundary.
+
+FAT_KPA = 5.0
+GLAND_RATIO = 10.0
+POISSON = 0.495
+THICKNESS_MM = 70.0
+LEAST_DEPTH_RATIO = 0.52
+MOST_SEAT = 2.0
+# Lumps and layers outside are no breast's: a mesh of them would have elements without end, or none that differ.
+LEAST_MM, MOST_MM = 0.1, 1e4
+# A lump that reaches less than this far into the gland, in radii, rests on it: the mesh could not tell its nodes apart.
+_RESTS = 1e-4
+# A film of fat under the lump that is thinner than this, in radii, is none: no element could be as thin.
+_THINNEST_FILM = 0.01
+SEATS = {"centred": 0.0, "resting": 1.0}
+"""Named seats. Where the lump's centre lies on the fat-gland boundary, and where the lump only touches it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Layers:
+    """The layered body without a lump.
+
+    Parameters
+    ----------
+    fat_mm
+        Thickness of the fat: depth of the fat-gland boundary.
+    thickness_mm
+        Depth of the rigid chest wall, to which the gland is bonded.
+    fat_kpa
+        Young's modulus of fat.
+    gland_ratio
+        Young's modulus of gland over that of fat.
+    poisson
+        Poisson's ratio of all tissues, at least 0 and below 0.5.
+    """
+
+    fat_mm: float
+    thickness_mm: float = THICKNESS_MM
+    fat_kpa: float = FAT_KPA
+    gland_ratio: float = GLAND_RATIO
+    poisson: float = POISSON
+
+    def __post_init__(self) -> None:
+        _require(0 < self.fat_mm < self.thickness_mm, "fat_mm", self.fat_mm, f"above 0 and below {self.thickness_mm:g}")
+        _require(self.thickness_mm < MOST_MM, "thickness_mm", self.thickness_mm, f"below {MOST_MM:g}")
+        _require(self.fat_kpa > 0, "fat_kpa", self.fat_kpa, "above 0")
+        _require(self.gland_ratio > 0, "gland_ratio", self.gland_ratio, "above 0")
+        _require(0 <= self.poisson < 0.5, "poisson", self.poisson, "at least 0 and below 0.5")
+
+
+@dataclass(frozen=True, slots=True)
+class Body:
+    """Three layers and the place of a circular lump; the lump's stiffness is given elsewhere.
+
+    Parameters
+    ----------
+    d_mm
+        Diameter of the lump.
+    depth_ratio
+        h/d: depth of the lump's centre below the skin over its diameter, at least 0.52 (at 0.5 it touches the skin).
+    seat
+        How far the lump stands out of the gland, 0 to 2. The fat-gland boundary lies at depth ``h + seat d/2``: through
+        the lump's centre at 0 (centred), under its lowest point at 1 (resting, the lump wholly in the fat), below it
+        from there on. From 1e-4 below 1 to 0.01 above it, it is 1.
+    thickness_mm
+        Depth of the chest wall; None takes 70 mm, or 2 mm below ``h + 0.6 d`` and below the fat where that is deeper.
+    fat_kpa, gland_ratio, poisson
+        As in `Layers`; the lump has the tissues' Poisson's ratio.
+
+    Notes
+    -----
+    Wellman & Howe (1999) section 2.2: fat of 5 kPa, gland ten times as stiff, a rigid chest wall, plane strain.
+    """
+
+    d_mm: float
+    depth_ratio: float
+    seat: float = 0.0
+    thickness_mm: float | None = None
+    fat_kpa: float = FAT_KPA
+    gland_ratio: float = GLAND_RATIO
+    poisson: float = POISSON
+
+    def __post_init__(self) -> None:
+        _require(LEAST_MM <= self.d_mm < MOST_MM, "d_mm", self.d_mm, f"at least {LEAST_MM:g} and below {MOST_MM:g}")
+        limit = f"at least {LEAST_DEPTH_RATIO:g}: the skin over the lump is too thin to be resolved, or there is none"
+        _require(LEAST_DEPTH_RATIO <= self.depth_ratio < 1e4, "depth_ratio", self.depth_ratio, limit)
+        _require(0 <= self.seat <= MOST_SEAT, "seat", self.seat, f"between 0 (centred) and {MOST_SEAT:g}; 1 is resting")
+        if 1.0 - _RESTS < self.seat < 1.0 + _THINNEST_FILM:
+            object.__setattr__(self, "seat", 1.0)
+        if self.thickness_mm is None:
+            deep = self.centre_mm + max(0.6, 0.5 * self.seat) * self.d_mm + 2.0
+            object.__setattr__(self, "thickness_mm", max(THICKNESS_MM, deep))
+        bottom = self.centre_mm + self.radius_mm
+        _require(
+            self.layers.thickness_mm > 1.0001 * bottom,
+            "thickness_mm",
+            self.layers.thickness_mm,
+            f"above {bottom:g} mm, the depth of the lump's lowest point",
+        )
+
+    @property
+    def centre_mm(self) -> float:
+        """Depth h of the lump's centre."""
+        return self.depth_ratio * self.d_mm
+
+    @property
+    def radius_mm(self) -> float:
+        """Half the diameter."""
+        return 0.5 * self.d_mm
+
+    @property
+    def layers(self) -> Layers:
+        """The body without the lump."""
+        thickness = THICKNESS_MM if self.thickness_mm is None else self.thickness_mm
+        fat = self.centre_mm + self.seat * self.radius_mm
+        return Layers(fat, thickness, self.fat_kpa, self.gland_ratio, self.poisson)
+
+
+def parse_seat(text: str) -> float:
+    """Convert ``centred``, ``resting`` or a number from 0 to 2 to a seat.
+
+    Raises
+    ------
+    BadDataError
+        When it is none of these.
+    """
+    try:
+        seat = SEATS[text] if text in SEATS else float(text)
+    except ValueError:
+        seat = -1.0
+    if not 0 <= seat <= MOST_SEAT:
+        raise BadDataError(f"seat is {text!r}", way_out=f"give centred, resting or a number from 0 to {MOST_SEAT:g}")
+    return seat
+
+
+def _require(holds: bool, name: str, value: float, rule: str) -> None:
+    if not holds:
+        raise BadDataError(f"{name} is {value:g}", way_out=f"it must be {rule}")
+
+
+# --- The face of a rigid head that can touch the skin: the taxels and the rounded rim around them.
+#
+# A flat end without a rim would press like a punch, with a singular pressure along its edge that no taxel array
+# shows.
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HeadFace:
+    """Squares of the face on the taxels' pitch, with the rows and columns of the rim.
+
+    Parameters
+    ----------
+    surface_mm : (rows, columns, 3) array
+        Centres in `scanhead`: origin at the apex of the face, z into the tissue.
+    sensing : (rows, columns) bool array
+        True for taxels, False for the rim.
+    pitch_mm
+        Side of a square.
+    """
+
+    surface_mm: FloatArray
+    sensing: NDArray[np.bool_]
+    pitch_mm: float
+
+    @property
+    def taxels(self) -> tuple[int, int]:
+        """Rows and columns of the array itself."""
+        return int(self.sensing.any(axis=1).sum()), int(self.sensing.any(axis=0).sum())
+
+    def taxel_frame(self, pressure_kpa: FloatArray) -> FloatArray:
+        """(rows, columns) of the array from the (n,) pressures of the whole face."""
+        return pressure_kpa[self.sensing.ravel()].reshape(self.taxels)
+
+
+def head_face(taxel_mm: FloatArray, *, pitch_mm: float, radius_mm: float, rim_mm: float = 0.0) -> HeadFace:
+    r"""Add a rounded rim to the taxels of a head.
+
+    Parameters
+    ----------
+    taxel_mm : (rows, columns, 3) array
+        Taxel centres in `scanhead`.
+    pitch_mm
+        Distance of neighbours.
+    radius_mm
+        Of the arc across the face.
+    rim_mm
+        Radius of the quarter round that leaves the face at the edge of the taxels, tangent to it; 0 for none.
+
+    Notes
+    -----
+    Across the head the face is the section `contact.Head` with its shoulders outside: the rim is tangent to the arc at
+    the array's edge. Along the head the rim is tangent to a line.
+    Squares whose centres lie on the rim are added.
+    """
+    rows, columns = taxel_mm.shape[:2]
+    if not 0 <= rim_mm < radius_mm:
+        raise BadDataError(f"rim_mm is {rim_mm:g}", way_out=f"it must lie in 0 to below radius_mm, {radius_mm:g} mm")
+    half_x, half_y = rows * pitch_mm / 2, columns * pitch_mm / 2
+    section = Head(2 * half_x, radius_mm, rim_mm, SHOULDERS_OUTSIDE)
+    more_x = _squares(half_x, section.half_face_mm, pitch_mm)
+    more_y = _squares(half_y, half_y + rim_mm, pitch_mm)
+    x = (np.arange(rows + 2 * more_x) - (rows + 2 * more_x - 1) / 2) * pitch_mm
+    y = (np.arange(columns + 2 * more_y) - (columns + 2 * more_y - 1) / 2) * pitch_mm
+    across = -section.profile_mm(x)
+    along = np.sqrt(np.maximum(rim_mm**2 - np.clip(np.abs(y) - half_y, 0.0, None) ** 2, 0.0)) - rim_mm
+    surface = np.stack(np.broadcast_arrays(x[:, None], y[None, :], across[:, None] + along[None, :]), axis=-1).copy()
+    sensing = np.zeros(surface.shape[:2], dtype=bool)
+    sensing[more_x : more_x + rows, more_y : more_y + columns] = True
+    surface[sensing] = taxel_mm.reshape(-1, 3)
+    return HeadFace(surface, sensing, pitch_mm)
+
+
+def _squares(half_mm: float, reach_mm: float, pitch_mm: float) -> int:
+    """Number of squares beyond `half_mm` whose centres are nearer than `reach_mm`."""
+    return max(0, int(np.ceil((reach_mm - half_mm) / pitch_mm - 0.5 - 1e-9)))
+
+
+# --- Lumps of tissue in a body, as a scene gives them: sizes, depths and stiffness instead of a bump's shape.
 
 # Default thickness of the fat in a scene without lumps.
 PLAIN_FAT_MM = 15.0

@@ -14,9 +14,9 @@ from tactile_bayes.declarations import Record
 from tactile_bayes.geometry import rotation_from_quaternion
 from tactile_bayes.hardware import head
 from tactile_bayes.hardware.head import PacketParser
-from tactile_bayes.hardware.igtlink import encode_transform
 from tactile_bayes.hardware.readings import MM_PER_INCH, HelloReading, PoseReading
 from tactile_bayes.hardware.serial_trackers import SCALE_INCH, record_bytes
+from tactile_bayes.hardware.trackers import encode_transform
 from tactile_bayes.scan import Scan, TrackerPoses
 
 # --- Emulated devices: a scan's frames and poses as a head or a tracker sends them, with faults on request.

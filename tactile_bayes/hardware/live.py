@@ -18,9 +18,9 @@ import numpy as np
 from tactile_bayes.declarations import Record, as_dict, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import FloatArray, apply, patient_from_plane
+from tactile_bayes.hardware.ports import PIPE_BYTES
 from tactile_bayes.hardware.readings import CountArray, PoseReading
 from tactile_bayes.hardware.recorder import Report
-from tactile_bayes.hardware.streams import PIPE_BYTES
 from tactile_bayes.mapping.growing import Instrument, MapAccumulator, MapGrid
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.mapping.plane import poses_at

@@ -1,4 +1,4 @@
-"""Device readings, independent of the protocol: frames, poses, identity and end of transmission."""
+"""Readings of devices, and their clocks."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ from typing import Final, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+
+# --- Device readings, independent of the protocol: frames, poses, identity and end of transmission.
 
 CountArray = NDArray[np.uint16]
 MM_PER_INCH: Final = 25.4
@@ -155,3 +157,193 @@ class SequenceCheck:
             return 0
         self.lost += gap
         return gap
+
+
+# --- Continuous device times, and the tracker's times on the head's clock.
+
+_WINDOW_NS: Final = 2_000_000_000
+_S: Final = 1_000_000_000
+# Files hold times as signed 64-bit ns. A clock that has counted for longer than this (146 years) loses whole periods.
+LATEST_NS: Final = 1 << 62
+# A record cannot be measured this much later than it arrives: its clock has stepped forward.
+AHEAD_NS: Final = 2 * _S
+# How well a wrap must agree with the time that passed on this computer.
+_SLIP_NS: Final = _S // 4
+# After so many steps a clock is not believed any more.
+MOST_STEPS: Final = 20
+HEAD_STILL_NS: Final = _S // 10
+TRACKER_STILL_NS: Final = _S
+# Counters that start again: 2^16 ms, 2^31 and 2^32 of ns, us and ms, 2^24 us, and clocks of a minute to a day.
+WRAPS_NS: Final = tuple(
+    sorted(
+        [bits * unit for unit in (1, 1_000, 1_000_000) for bits in (1 << 31, 1 << 32)]
+        + [(1 << 24) * 1_000, (1 << 16) * 1_000_000]
+        + [seconds * _S for seconds in (60, 100, 1_000, 3_600, 86_400)]
+    )
+)
+
+
+class ArrivalClock:
+    """Offset of a device's clock from the host's, estimated from the arrival of its records.
+
+    A record arrives at ``device time + offset + delay`` with a delay that is never negative: the least difference of
+    the last seconds is the offset, and the rest is delay. It follows clocks that drift apart.
+    """
+
+    def __init__(self) -> None:
+        self._begun_ns: int | None = None
+        self._last = self._now = 0
+
+    @property
+    def known(self) -> bool:
+        """Whether any record has arrived."""
+        return self._begun_ns is not None
+
+    @property
+    def offset_ns(self) -> int:
+        """Host time of device time 0."""
+        return min(self._last, self._now)
+
+    def observe(self, device_ns: int, host_ns: int) -> None:
+        """Add one record's times."""
+        difference = host_ns - device_ns
+        if self._begun_ns is None:
+            self._begun_ns, self._last, self._now = host_ns, difference, difference
+        elif host_ns - self._begun_ns > _WINDOW_NS:
+            self._begun_ns, self._last, self._now = host_ns, self._now, difference
+        else:
+            self._now = min(self._now, difference)
+
+
+class Moment(NamedTuple):
+    """Time at which a record was measured.
+
+    Parameters
+    ----------
+    time_ns
+        On the device's clock made continuous: 0 or more, never below the time before, below 2^63.
+    event
+        What the clock did just now in words; empty when it went on as it should.
+    """
+
+    time_ns: int
+    event: str = ""
+
+
+class DeviceClock:
+    """Continuous time from one device's time stamps, through wraps and restarts of its counter.
+
+    A counter that wraps is unwrapped when its period is one of `WRAPS_NS` and agrees with the host's clock. Any other
+    step, back or forward, is replaced by the time that passed on the host since, by `ArrivalClock`; from there the
+    device's clock goes on. A clock that stands still, or steps again and again, is replaced by the host's for good.
+
+    Parameters
+    ----------
+    still_ns
+        For how long records may carry the same time before the clock counts as standing still.
+    arrival
+        Shared between devices whose clocks count from one zero; by default this device's own.
+    """
+
+    def __init__(self, *, still_ns: int, arrival: ArrivalClock | None = None) -> None:
+        self.arrival = ArrivalClock() if arrival is None else arrival
+        self.wraps = self.steps = 0
+        self._still_ns = still_ns
+        self._trusted = True
+        self._shift_ns = 0
+        self._raw_ns: int | None = None
+        self._host_ns = self._moved_ns = self._last_ns = 0
+
+    def read(self, raw_ns: int, host_ns: int) -> Moment:
+        """Time of a record stamped `raw_ns` that arrived at `host_ns`."""
+        moment = self._first(raw_ns) if self._raw_ns is None else self._next(raw_ns, host_ns, self._raw_ns)
+        if self._raw_ns is None or moment.time_ns > self._last_ns:
+            self._moved_ns = host_ns
+        self._raw_ns, self._host_ns, self._last_ns = raw_ns, host_ns, moment.time_ns
+        self.arrival.observe(moment.time_ns, host_ns)
+        return moment
+
+    def _first(self, raw_ns: int) -> Moment:
+        time_ns = raw_ns % LATEST_NS
+        self._shift_ns = time_ns - raw_ns
+        if time_ns == raw_ns:
+            return Moment(time_ns)
+        self.steps += 1
+        return Moment(time_ns, f"the clock begins at {raw_ns / 1e9:.0f} s, taken as {time_ns / 1e9:.3f} s")
+
+    def _next(self, raw_ns: int, host_ns: int, before_ns: int) -> Moment:
+        time_ns = raw_ns + self._shift_ns
+        if not self._trusted:
+            return Moment(self._by_host(host_ns))
+        if time_ns < self._last_ns:
+            return self._back(raw_ns, host_ns, before_ns)
+        if time_ns == self._last_ns and host_ns - self._moved_ns > self._still_ns:
+            self._trusted = False
+            return self._step(raw_ns, host_ns, "stood still")
+        ahead_ns = time_ns + self.arrival.offset_ns - host_ns
+        if ahead_ns > AHEAD_NS:
+            return self._step(raw_ns, host_ns, f"stepped forward by {ahead_ns / 1e9:.3f} s")
+        return Moment(time_ns)
+
+    def _back(self, raw_ns: int, host_ns: int, before_ns: int) -> Moment:
+        period_ns = wrap_period(before_ns, raw_ns, passed_ns=host_ns - self._host_ns)
+        if period_ns is None:
+            return self._step(raw_ns, host_ns, f"stepped back by {(before_ns - raw_ns) / 1e9:.3f} s")
+        self.wraps += 1
+        self._shift_ns += period_ns
+        return Moment(max(self._last_ns, raw_ns + self._shift_ns), f"the clock wrapped after {period_ns / 1e9:.6f} s")
+
+    def _step(self, raw_ns: int, host_ns: int, what: str) -> Moment:
+        time_ns = self._by_host(host_ns)
+        self.steps += 1
+        self._shift_ns = time_ns - raw_ns
+        self._trusted = self._trusted and self.steps < MOST_STEPS
+        stands_in = "is used for the step" if self._trusted else "is used from here on"
+        return Moment(time_ns, f"the clock {what}, to {raw_ns / 1e9:.3f} s; this computer's clock {stands_in}")
+
+    def _by_host(self, host_ns: int) -> int:
+        return max(self._last_ns, host_ns - self.arrival.offset_ns)
+
+
+def wrap_period(before_ns: int, after_ns: int, *, passed_ns: int) -> int | None:
+    """Period of `WRAPS_NS` that explains a counter's restart by the time passed, if any."""
+    for period_ns in WRAPS_NS:
+        if before_ns < period_ns and abs(after_ns + period_ns - before_ns - passed_ns) < _SLIP_NS:
+            return period_ns
+    return None
+
+
+class PoseClock:
+    """The time of each pose on the head's clock, never running backwards.
+
+    Parameters
+    ----------
+    shared
+        Both devices count from one zero (they are synchronised by wire, or one program emulates both): the tracker's
+        own time is taken as it is. Otherwise poses are placed by when they and the frames arrive; what is then left is
+        the tracker's constant latency, which ``map --latency-ms`` takes away.
+    """
+
+    def __init__(self, *, shared: bool) -> None:
+        self.head = DeviceClock(still_ns=HEAD_STILL_NS)
+        self.tracker = DeviceClock(still_ns=TRACKER_STILL_NS, arrival=self.head.arrival if shared else None)
+        self._shared = shared
+        self._last_ns = 0
+
+    def place(self, device_ns: int | None, host_ns: int) -> Moment | None:
+        """Time of a pose on the head's clock; None before the first frame, or when it would be negative."""
+        if self._shared:
+            return None if device_ns is None else self._in_order(self.tracker.read(device_ns, host_ns))
+        if not self.head.arrival.known:
+            return None
+        moment = Moment(host_ns)
+        if device_ns is not None:
+            measured = self.tracker.read(device_ns, host_ns)
+            moment = Moment(measured.time_ns + self.tracker.arrival.offset_ns, measured.event)
+        return self._in_order(moment._replace(time_ns=moment.time_ns - self.head.arrival.offset_ns))
+
+    def _in_order(self, moment: Moment) -> Moment | None:
+        if moment.time_ns < 0:
+            return None
+        self._last_ns = max(self._last_ns, moment.time_ns)
+        return moment._replace(time_ns=self._last_ns)

@@ -14,10 +14,8 @@ import numpy as np
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import DeviceError
 from tactile_bayes.geometry import FloatArray, inverse, rotation_from_quaternion
-from tactile_bayes.hardware.clocks import PoseClock
-from tactile_bayes.hardware.ports import Port
-from tactile_bayes.hardware.readings import CountArray, EndReading, FrameReading, Parser, PoseReading
-from tactile_bayes.hardware.streams import Stream
+from tactile_bayes.hardware.ports import Port, Stream
+from tactile_bayes.hardware.readings import CountArray, EndReading, FrameReading, Parser, PoseClock, PoseReading
 from tactile_bayes.mapping.select import Span, apart, overlap_cautions
 
 # --- Summary of a recording: what arrived, what was lost, and what makes it unfit for use.

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.mapping.cells import CellSums, Projection, Projector, Readout
-from tactile_bayes.mapping.scatter import add_frames, chunk_frames
+from tactile_bayes.mapping.cells import CellSums, Projection, Projector, Readout, add_frames, chunk_frames
 from tactile_bayes.mapping.select import BoolArray, SelectedFrames, chunks
 from tactile_bayes.scan import CountArray, Scan
 

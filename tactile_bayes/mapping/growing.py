@@ -10,11 +10,10 @@ import numpy as np
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.geometry import FloatArray, Plane, check_rigid
-from tactile_bayes.mapping.cells import CellSums, Projection, Projector, Readout
+from tactile_bayes.mapping.cells import CellSums, Projection, Projector, Readout, add_frames, chunk_frames
 from tactile_bayes.mapping.map import MapRecipe, TactileMap
 from tactile_bayes.mapping.plane import FramePoses, HeadMoments, MomentSums, head_moments
 from tactile_bayes.mapping.profile import GrowingProfile
-from tactile_bayes.mapping.scatter import add_frames, chunk_frames
 from tactile_bayes.mapping.select import BoolArray, TaxelFault, chunks, gate
 from tactile_bayes.presets import CELL_MM, PRESSURE_WINDOW_KPA
 from tactile_bayes.scan import CountArray, ElementCalibration, HeadGeometry, HeadShape

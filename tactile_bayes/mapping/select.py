@@ -13,9 +13,8 @@ from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.findings import Finding
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.mapping.cells import Readout
+from tactile_bayes.mapping.cells import Readout, chunk_frames
 from tactile_bayes.mapping.plane import MAX_POSE_GAP_MS, FramePoses, distinct_poses, poses_at
-from tactile_bayes.mapping.scatter import chunk_frames
 from tactile_bayes.scan import PressureFrames, Scan
 
 # --- Detection of faulty taxels over a whole scan.

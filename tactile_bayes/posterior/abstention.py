@@ -11,7 +11,7 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.mapping.places import orientation_of
 from tactile_bayes.options import BumpPrior
-from tactile_bayes.posterior.fit_window import covered_share, map_ends, on_map, trusted, window_cells
+from tactile_bayes.posterior.bump import covered_share, map_ends, on_map, trusted, window_cells
 from tactile_bayes.posterior.lump_probability import LIKELY, Weighed
 from tactile_bayes.posterior.options import DETECTED
 from tactile_bayes.posterior.white import AT_RIM, LEAST_COVERED_SHARE, LEAST_WIDTH_IN_CELLS, MOST_AXIS_RATIO, Candidate

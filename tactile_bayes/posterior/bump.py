@@ -1,4 +1,4 @@
-"""The paper's model of a map: one Gaussian bump on a level background (Eq 7), with its priors."""
+"""The bump of a lump on a map, and the window that it is fitted in."""
 
 from __future__ import annotations
 
@@ -6,11 +6,239 @@ from functools import lru_cache
 
 import numpy as np
 
-from tactile_bayes.declarations import Record
+from tactile_bayes.declarations import Record, replace
 from tactile_bayes.forward.gaussian import cell_mean_gaussian, covariance_from_log_widths, principal_widths
 from tactile_bayes.geometry import FloatArray
+from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.options import BumpPrior
-from tactile_bayes.posterior.fit_window import FitCells
+from tactile_bayes.presets import POSE_NOISE
+
+# --- Cells to be fitted: candidates for a lump, and the window about one of them.
+
+SMOOTHING_MM = 3.0
+"""Width of the Gaussian that smooths a map before candidates are sought: about that of a small lump's bump."""
+RIM_MM, RIM_SHARE = 6.0, 0.6
+"""A place is at the map's rim where less than the share of the disc of this radius about it is covered."""
+FEW_READINGS = 0.1
+"""A cell with a smaller share of the median count is left out of the fit."""
+MAPS_AT_HAND = 4
+"""Maps of which what was worked out once is kept: the map, its levelled one, and both without the measured lump."""
+
+
+class PoseNoise(Record):
+    """Tracker position error of a map, one error per frame: the figures `presets.POSE_NOISE`."""
+
+    sd_mm: tuple[float, float]
+    """SD of a frame's place along x and y: bumps are that much wider on the map."""
+    side_mm: tuple[float, float]
+    """Sides of the array along x and y: cells closer together than these share frames, and with them errors."""
+    frames_per_reading: float
+    """Frames with an error of their own that felt a cell, over the readings in it."""
+
+    @classmethod
+    def of(cls, tactile_map: TactileMap) -> PoseNoise | None:
+        """Read from a map; None where it lacks a figure."""
+        figures = [float(tactile_map.quality.get(name, np.nan)) for name in POSE_NOISE]
+        if not (np.isfinite(figures).all() and min(figures[:2]) >= 0 and min(figures[2:]) > 0):
+            return None
+        return cls((figures[0], figures[1]), (figures[2], figures[3]), figures[4])
+
+
+class FitCells(Record, eq=False):
+    """The cells of one window, flattened."""
+
+    x_mm: FloatArray
+    y_mm: FloatArray
+    """`x_mm`, `y_mm` (k,) arrays: Cell centres in `plane`."""
+    value: FloatArray
+    variance: FloatArray
+    count: FloatArray
+    """`value`, `variance`, `count` (k,) arrays: Mean, within-cell variance (NaN where it is not known) and number of
+    readings.
+    """
+    row: np.ndarray[tuple[int, ...], np.dtype[np.intp]]
+    column: np.ndarray[tuple[int, ...], np.dtype[np.intp]]
+    """`row`, `column` (k,) int arrays: Where the cells lie in the map's grid."""
+    cell_mm: float
+    """Side of a cell."""
+    pose_noise: PoseNoise | None = None
+    """Of the frames; None where the map does not tell."""
+
+    def __len__(self) -> int:
+        return len(self.value)
+
+    @property
+    def reading_variance(self) -> float:
+        """Variance of a reading within its cell, pooled over the cells that have one; 0 without any."""
+        known = np.isfinite(self.variance)
+        readings = float(np.sum(self.count[known]))
+        return float(np.sum(self.variance[known] * self.count[known])) / readings if readings > 0 else 0.0
+
+
+@lru_cache(maxsize=MAPS_AT_HAND)
+def trusted(tactile_map: TactileMap) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+    """(ny, nx) True for covered cells with at least a tenth of the median count.
+
+    At the rim of a map a handful of readings from one side of the head decide a cell, and they are off together.
+    Worked out once per map, and read-only.
+    """
+    covered = tactile_map.covered
+    if covered.any():
+        covered = covered & (tactile_map.count >= FEW_READINGS * np.median(tactile_map.count[covered]))
+    covered.setflags(write=False)
+    return covered
+
+
+def window_cells(tactile_map: TactileMap, centre_mm: tuple[float, float], *, radius_mm: float) -> FitCells:
+    """The trusted cells whose centres lie within `radius_mm` of `centre_mm`."""
+    dx = tactile_map.x_mm[None, :] - centre_mm[0]
+    dy = tactile_map.y_mm[:, None] - centre_mm[1]
+    inside = trusted(tactile_map) & (dx**2 + dy**2 <= radius_mm**2)
+    row, column = np.nonzero(inside)
+    return FitCells(
+        x_mm=tactile_map.x_mm[column],
+        y_mm=tactile_map.y_mm[row],
+        value=tactile_map.mean[inside].astype(np.float64),
+        variance=tactile_map.variance[inside],
+        count=tactile_map.count[inside].astype(np.float64),
+        row=row,
+        column=column,
+        cell_mm=tactile_map.recipe.cell_mm,
+        pose_noise=PoseNoise.of(tactile_map),
+    )
+
+
+def map_ends(tactile_map: TactileMap) -> dict[str, tuple[float, float]]:
+    """Ends of the map's outermost cells along x and y, mm."""
+    half = tactile_map.recipe.cell_mm / 2.0
+    axes = {"x": tactile_map.x_mm, "y": tactile_map.y_mm}
+    return {name: (float(axis[0]) - half, float(axis[-1]) + half) for name, axis in axes.items()}
+
+
+def on_map(tactile_map: TactileMap, x_mm: float, y_mm: float) -> bool:
+    """Whether a place lies on the map's cells, covered or not."""
+    ends = map_ends(tactile_map)
+    return ends["x"][0] <= x_mm <= ends["x"][1] and ends["y"][0] <= y_mm <= ends["y"][1]
+
+
+def covered_share(tactile_map: TactileMap, centre_mm: tuple[float, float], *, radius_mm: float) -> float:
+    """Share of the disc about `centre_mm` that the map covers, counting what lies beyond its edge as not covered."""
+    cell = tactile_map.recipe.cell_mm
+    disc = np.pi * max(radius_mm, 0.75 * cell) ** 2 / cell**2
+    return min(1.0, len(window_cells(tactile_map, centre_mm, radius_mm=max(radius_mm, 0.75 * cell))) / disc)
+
+
+def typical_level(tactile_map: TactileMap) -> float:
+    """Level away from the lump: fixed by normalising, else the median of the covered cells."""
+    if tactile_map.background is not None:
+        return tactile_map.background
+    return float(np.median(tactile_map.mean[trusted(tactile_map)]))
+
+
+def value_scale(tactile_map: TactileMap) -> float:
+    """Scale of amplitudes: 1 for a normalised map, else the largest departure from its level."""
+    if tactile_map.background is not None:
+        return 1.0
+    covered = tactile_map.mean[tactile_map.covered]
+    scale = float(np.abs(covered - np.median(covered)).max())
+    return scale if scale > 0 else 1.0
+
+
+def candidate_centres(tactile_map: TactileMap, *, limit: int = 16, rim_limit: int = 8) -> list[tuple[float, float]]:
+    """Local maxima of the smoothed map, the candidates for a lump, highest first.
+
+    Parameters
+    ----------
+    limit
+        At most this many inside the map.
+    rim_limit
+        At most this many at its rim, which only the head's own rim has felt: on deep fat that presses hardest, and a
+        score of such places can be higher than the lump.
+
+    Returns
+    -------
+    list of (x_mm, y_mm)
+        Empty where no covered cell rises above the background.
+    """
+    excess = smoothed_excess(tactile_map)
+    padded = np.pad(excess, 1, constant_values=-np.inf)
+    ny, nx = excess.shape
+    neighbours = [
+        padded[1 + i : 1 + i + ny, 1 + j : 1 + j + nx] for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)
+    ]
+    peak = np.isfinite(excess) & (excess > 0) & np.logical_and.reduce([excess >= other for other in neighbours])
+    rows, columns = np.nonzero(peak)
+    order = np.argsort(-excess[rows, columns], kind="stable")
+    found: list[tuple[float, float]] = []
+    left = {False: limit, True: rim_limit}
+    for i in order:
+        centre = (float(tactile_map.x_mm[columns[i]]), float(tactile_map.y_mm[rows[i]]))
+        if any(np.hypot(centre[0] - x, centre[1] - y) <= 2 * SMOOTHING_MM for x, y in found):
+            continue
+        at_rim = covered_share(tactile_map, centre, radius_mm=RIM_MM) < RIM_SHARE
+        if left[at_rim]:
+            found.append(centre)
+            left[at_rim] -= 1
+        if not left[False]:
+            break
+    return found
+
+
+@lru_cache(maxsize=MAPS_AT_HAND)
+def smoothed_excess(tactile_map: TactileMap) -> FloatArray:
+    """(ny, nx) count-weighted Gaussian smoothing of map minus background; -inf where there is no data.
+
+    Worked out once per map, and read-only.
+    """
+    covered = trusted(tactile_map)
+    excess = np.where(covered, tactile_map.mean - typical_level(tactile_map), 0.0)
+    weight = np.where(covered, np.sqrt(tactile_map.count.astype(np.float64)), 0.0)
+    cell = tactile_map.recipe.cell_mm
+    top = _smooth(excess * weight, SMOOTHING_MM / cell)
+    bottom = _smooth(weight, SMOOTHING_MM / cell)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        smoothed = np.where(covered & (bottom > 0), top / bottom, -np.inf)
+    smoothed.setflags(write=False)
+    return smoothed
+
+
+@lru_cache(maxsize=MAPS_AT_HAND)
+def levelled(tactile_map: TactileMap) -> TactileMap:
+    """The map less its mean over the head's positions that cover a cell, as frame means would remove it.
+
+    A wide rise, as of a stiff layer, is off it, and lumps stand out. Only a map with a gain per frame needs it. Worked
+    out once per map.
+    """
+    noise = PoseNoise.of(tactile_map)
+    if tactile_map.recipe.normalise != "gain" or noise is None:
+        return tactile_map
+    covered = trusted(tactile_map)
+    excess = np.where(covered, tactile_map.mean - typical_level(tactile_map), 0.0)
+    across, along = overlap(tactile_map.x_mm, noise.side_mm[0]), overlap(tactile_map.y_mm, noise.side_mm[1])
+    around = (along @ excess @ across) / np.maximum(along @ covered @ across, 1.0)
+    return replace(tactile_map, mean=np.where(covered, tactile_map.mean - around, tactile_map.mean))
+
+
+def overlap(axis_mm: FloatArray, side_mm: float) -> FloatArray:
+    """(n, n) overlap of two equal intervals about points of an axis, as a share of one."""
+    away: FloatArray = np.abs(np.subtract.outer(axis_mm, axis_mm))
+    return np.clip(1.0 - away / side_mm, 0.0, None)
+
+
+def _smooth(array: FloatArray, width_cells: float) -> FloatArray:
+    """Separable Gaussian smoothing with zeros beyond the edge."""
+    along, across = (_kernel(n, width_cells) for n in array.shape)
+    return np.asarray(along @ array @ across)
+
+
+def _kernel(n: int, width_cells: float) -> FloatArray:
+    """(n, n) Gaussian weights between the cells of a line, zero beyond four widths."""
+    away = np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
+    weight = np.exp(-0.5 * (away / max(width_cells, 0.3)) ** 2)
+    return np.where(away <= max(1, int(np.ceil(4 * width_cells))), weight, 0.0)
+
+
+# --- The paper's model of a map: one Gaussian bump on a level background (Eq 7), with its priors.
 
 BLOCK, LEAST_BLOCK = 64, 4
 """Parameter vectors predicted at a time: few enough for the intermediate arrays to stay in a processor's cache."""

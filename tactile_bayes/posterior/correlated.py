@@ -13,12 +13,12 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.draws import ParameterDraws, Solved
 from tactile_bayes.inference.points import MOST_PAIRED, normal_quantile, paired_points
 from tactile_bayes.mapping.map import TactileMap
+from tactile_bayes.posterior.bump import PoseNoise, overlap, trusted
 from tactile_bayes.posterior.detection import Detection, detection_from_odds
 from tactile_bayes.posterior.draw import draw_scene
 from tactile_bayes.posterior.draws import MapPosterior, NoiseFigures
 from tactile_bayes.posterior.field import Window, cosines_for
 from tactile_bayes.posterior.fit import FieldFit, field_window, modal_widths, shape_draws, start_vector, tangent_columns
-from tactile_bayes.posterior.fit_window import PoseNoise, overlap, trusted
 from tactile_bayes.posterior.linear import FLOOR
 from tactile_bayes.posterior.neighbours import WANTED, Surroundings, add_beside, ridge_instead, ridge_text, rising_ribs
 from tactile_bayes.posterior.options import EstimateOptions, scene_asked

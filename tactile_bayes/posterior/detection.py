@@ -11,8 +11,7 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.modes import inverse_information
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.options import BumpPrior
-from tactile_bayes.posterior.bump import Bump
-from tactile_bayes.posterior.fit_window import FitCells, window_cells
+from tactile_bayes.posterior.bump import Bump, FitCells, window_cells
 
 # --- Error model from a fit's residuals: variance, weights by count, correlation.
 

@@ -11,9 +11,9 @@ from tactile_bayes.declarations import Record
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.options import BumpPrior
+from tactile_bayes.posterior.bump import covered_share, trusted, value_scale, window_cells
 from tactile_bayes.posterior.detection import Detection
 from tactile_bayes.posterior.field import Window
-from tactile_bayes.posterior.fit_window import covered_share, trusted, value_scale, window_cells
 from tactile_bayes.posterior.marginal import CollapsedTarget, independent_variance
 from tactile_bayes.posterior.options import DETECTED
 from tactile_bayes.posterior.scene import Problem, Scene

@@ -21,8 +21,8 @@ import numpy as np
 
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.draws import Solution, Solved, distinct_rows
+from tactile_bayes.posterior.bump import FitCells
 from tactile_bayes.posterior.field import LENGTHS_MM, SHARES, Profiles, Projected, Whitening, no_field
-from tactile_bayes.posterior.fit_window import FitCells
 from tactile_bayes.posterior.linear import LEAST_BUMPS, FieldColumns, Inner, LinearSolution, Spanned, joined, solve
 from tactile_bayes.posterior.scene import Problem, Scene
 

@@ -9,8 +9,8 @@ import numpy as np
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.map import TactileMap
+from tactile_bayes.posterior.bump import SMOOTHING_MM, smoothed_excess
 from tactile_bayes.posterior.fit import FieldFit
-from tactile_bayes.posterior.fit_window import SMOOTHING_MM, smoothed_excess
 from tactile_bayes.posterior.marginal import BLOCK
 from tactile_bayes.posterior.scene import (
     APART,

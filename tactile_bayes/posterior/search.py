@@ -13,11 +13,11 @@ from tactile_bayes.errors import Abstention, NotConvergedError
 from tactile_bayes.inference.draws import ParameterDraws
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.abstention import rim_fault, shape_fault
+from tactile_bayes.posterior.bump import levelled, window_cells
 from tactile_bayes.posterior.correlated import draw, look, with_neighbours
 from tactile_bayes.posterior.detection import Detection, detect
 from tactile_bayes.posterior.draws import MapPosterior, NoiseFigures
 from tactile_bayes.posterior.fit import modal_widths
-from tactile_bayes.posterior.fit_window import levelled, window_cells
 from tactile_bayes.posterior.lump_probability import NO_EVIDENCE, Weighed, weigh_candidate
 from tactile_bayes.posterior.options import DETECTED, EstimateOptions, FitOptions, scene_asked
 from tactile_bayes.posterior.result import ModalBump

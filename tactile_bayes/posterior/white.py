@@ -24,7 +24,16 @@ from tactile_bayes.inference.modes import (
 )
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.options import BumpPrior
-from tactile_bayes.posterior.bump import Bump, block_size
+from tactile_bayes.posterior.bump import (
+    Bump,
+    FitCells,
+    block_size,
+    candidate_centres,
+    covered_share,
+    typical_level,
+    value_scale,
+    window_cells,
+)
 from tactile_bayes.posterior.detection import (
     Detection,
     ErrorModel,
@@ -34,14 +43,6 @@ from tactile_bayes.posterior.detection import (
     level_offset,
 )
 from tactile_bayes.posterior.draws import MapPosterior, NoiseFigures
-from tactile_bayes.posterior.fit_window import (
-    FitCells,
-    candidate_centres,
-    covered_share,
-    typical_level,
-    value_scale,
-    window_cells,
-)
 from tactile_bayes.posterior.options import ROTATION_ODDS, EstimateOptions, FitOptions
 from tactile_bayes.presets import Background, Noise
 

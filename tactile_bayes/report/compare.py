@@ -18,7 +18,7 @@ from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.size.visits import VOLUME, Trend, doubling_days, straight_line
 
 if TYPE_CHECKING:
-    from tactile_bayes.size.site import Repeatability
+    from tactile_bayes.size.pooling import Repeatability
     from tactile_bayes.size.visits import Apart, Change, Compared, JointSizes
 
 

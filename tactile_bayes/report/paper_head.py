@@ -14,7 +14,6 @@ from tactile_bayes.posterior.white import BumpFit
 from tactile_bayes.presets import RESEARCH_USE, SHOULDERS_INSIDE
 from tactile_bayes.report.figure_file import figure_file
 from tactile_bayes.report.study import finish
-from tactile_bayes.studies.head_design import HomogeneousTissue, Uniformity, most_even, narrowest
 from tactile_bayes.studies.model_comparison import (
     NEAR_MM,
     MeasuredFrames,
@@ -25,6 +24,7 @@ from tactile_bayes.studies.model_comparison import (
     residual_map,
     residual_slope,
 )
+from tactile_bayes.studies.paper import HomogeneousTissue, Uniformity, most_even, narrowest
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -27,9 +27,8 @@ from tactile_bayes.report.estimate_text import (
 from tactile_bayes.report.quantities import ANOTHER_EXAM, another_exam, leading
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.draws import EXTREMES, SizePosterior
-from tactile_bayes.size.pooling import DISAGREE, PooledEstimate
-from tactile_bayes.size.site import Repeatability
-from tactile_bayes.size.spread import LEAST_PROBABILITY
+from tactile_bayes.size.fat import LEAST_PROBABILITY
+from tactile_bayes.size.pooling import DISAGREE, PooledEstimate, Repeatability
 from tactile_bayes.size.terms import unknown_head
 
 SCHEMA = "tactile-bayes/pooled/1"

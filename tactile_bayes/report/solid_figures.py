@@ -12,10 +12,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tactile_bayes.forward.body import THICKNESS_MM, Layers
-from tactile_bayes.forward.layers import LayeredBody
-from tactile_bayes.forward.solid import solid_head
-from tactile_bayes.forward.solid_scan import face_of
+from tactile_bayes.forward.axisymmetric import LayeredBody
+from tactile_bayes.forward.solid import face_of, solid_head
+from tactile_bayes.forward.tissue import THICKNESS_MM, Layers
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.presets import RESEARCH_USE

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tactile_bayes.forward.body import THICKNESS_MM, Layers
 from tactile_bayes.forward.line import LineFrames, build_line, fit_empirical, press, press_layers
+from tactile_bayes.forward.tissue import THICKNESS_MM, Layers
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.presets import HEAD_PITCH_MM, RESEARCH_USE
 from tactile_bayes.report.figure_file import figure_file

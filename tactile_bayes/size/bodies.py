@@ -31,9 +31,7 @@ from tactile_bayes.errors import BadDataError, UsageError, check_number, meant
 from tactile_bayes.geometry import FloatArray, Matrix, Vector
 from tactile_bayes.size.draws import ShapeDraws, Supposition
 from tactile_bayes.size.eq6 import Eq6Law, Power, Powers, eq6_coefficients, eq6_log_size, eq6_terms
-from tactile_bayes.size.fat import WEIGHTS, FatDepth
-from tactile_bayes.size.process import Residual
-from tactile_bayes.size.spread import BetweenMaps
+from tactile_bayes.size.fat import WEIGHTS, BetweenMaps, FatDepth, Residual
 from tactile_bayes.size.terms import (
     LEARN_ANEW,
     Above0,

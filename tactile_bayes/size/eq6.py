@@ -27,7 +27,7 @@ from tactile_bayes.geometry import FloatArray, Matrix, Vector
 from tactile_bayes.inference.draws import Labels, even_replicates
 from tactile_bayes.inference.points import normal_quantile, paired_points
 from tactile_bayes.size.draws import SizePosterior, shares
-from tactile_bayes.size.spread import BetweenMaps
+from tactile_bayes.size.fat import BetweenMaps
 from tactile_bayes.size.terms import (
     LEARN_ANEW,
     ONE_WIDTH,

@@ -31,8 +31,8 @@ from tactile_bayes.inference.points import evened, normal_cdf, normal_quantile, 
 from tactile_bayes.presets import REGISTRATION_MM
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.draws import ShapeDraws, matched_draws
+from tactile_bayes.size.fat import BetweenMaps, above_chi_square
 from tactile_bayes.size.pooling import POOLED_DRAWS, MassMaps, SizePriors, Weighted, log_sizes, lump_shape
-from tactile_bayes.size.spread import BetweenMaps, above_chi_square
 
 MOST_VISITS: Final = 10
 DIMENSIONS: Final = 5

@@ -11,20 +11,17 @@ from scipy.optimize import minimize
 
 from tactile_bayes.declarations import Record, as_dict, field, replace
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.forward.axisymmetric import CondensedLump, Tissue, condense_lump
-from tactile_bayes.forward.body import FAT_KPA, GLAND_RATIO, POISSON, Body
-from tactile_bayes.forward.layers import LayeredBody
+from tactile_bayes.forward.axisymmetric import CondensedLump, LayeredBody, Tissue, condense_lump
 from tactile_bayes.forward.line import MEAN_KPA
 from tactile_bayes.forward.mesh import LumpGeometry, MeshSize
 from tactile_bayes.forward.plane_strain import FINENESS
 from tactile_bayes.forward.scene import Head
-from tactile_bayes.forward.solid import RANK_TOLERANCE, PlacedLump, SolidHead, skin_perturbation, solid_head
-from tactile_bayes.forward.solid_scan import face_of
+from tactile_bayes.forward.solid import RANK_TOLERANCE, PlacedLump, SolidHead, face_of, skin_perturbation, solid_head
+from tactile_bayes.forward.tissue import FAT_KPA, GLAND_RATIO, POISSON, Body
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.accumulate import FlatField
 from tactile_bayes.mapping.build import build_map
-from tactile_bayes.posterior.bump import Bump
-from tactile_bayes.posterior.fit_window import window_cells
+from tactile_bayes.posterior.bump import Bump, window_cells
 from tactile_bayes.posterior.white import LEAST_WIDTH_IN_CELLS, MOST_AXIS_RATIO, WIDEST_IN_RADII
 from tactile_bayes.presets import FIT_RADIUS_MM
 from tactile_bayes.scan import ElementCalibration, HeadGeometry, PressureFrames, Scan, TrackerPoses
@@ -32,7 +29,7 @@ from tactile_bayes.studies.paper import DETECTABLE, Geometry, StudyRow, seat_nam
 
 if TYPE_CHECKING:
     from tactile_bayes.mapping.map import TactileMap
-    from tactile_bayes.posterior.fit_window import FitCells
+    from tactile_bayes.posterior.bump import FitCells
     from tactile_bayes.scan import CountArray, Scan
 
 

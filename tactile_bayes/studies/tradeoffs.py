@@ -9,12 +9,11 @@ import numpy as np
 
 from tactile_bayes.declarations import Record, field, replace
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.forward.body import THICKNESS_MM, Body
 from tactile_bayes.forward.line import build_line, fit_empirical, head_positions, press, press_layers
 from tactile_bayes.forward.mesh import lump_mesh
 from tactile_bayes.forward.plane_strain import rim_nodes
 from tactile_bayes.forward.scene import Scene
-from tactile_bayes.forward.tissue import SceneBody, fat_thickness
+from tactile_bayes.forward.tissue import THICKNESS_MM, Body, SceneBody, fat_thickness
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping import build_map
 from tactile_bayes.mapping.map import TactileMap

@@ -26,6 +26,7 @@ from tactile_bayes.trial.method_comparison import MethodComparison, compare_meth
 from tactile_bayes.trial.readings import (
     MassKey,
     ModalitySizes,
+    OtherVisits,
     Reading,
     gather,
     mass_numbers,
@@ -33,7 +34,6 @@ from tactile_bayes.trial.readings import (
     unit_doubts,
 )
 from tactile_bayes.trial.replicates import Components, reader_components
-from tactile_bayes.trial.visits import OtherVisits
 
 FAMILIES: tuple[Callable[..., dict[str, Figure]], ...] = (
     accuracy.accuracy_figures,

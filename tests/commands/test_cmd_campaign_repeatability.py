@@ -12,7 +12,7 @@ import pytest
 from campaign_files import JOURNAL, contents, rows_of, steps, thinned, write, write_table
 from in_process import run_here
 
-from tactile_bayes.actions import campaign as actions
+from tactile_bayes.actions import trial as actions
 
 MASSES, EXAMS = ("01", "02", "03", "04", "05"), (1, 2)
 ROWS = [(f"scans/{mass}-{exam}.mcap", mass, exam, "left") for mass in MASSES for exam in EXAMS]

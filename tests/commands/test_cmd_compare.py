@@ -13,7 +13,7 @@ from posterior_maps import bump_map
 from settings_files import settings
 
 import tactile_bayes as tb
-from tactile_bayes.commands.compare import numbered
+from tactile_bayes.commands.estimate import numbered
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import UsageError
 from tactile_bayes.files.documents import check_document
@@ -273,7 +273,7 @@ def test_python_names_why_nothing_is_compared(folder: Path) -> None:
 
 
 def test_help_tells_the_options_groups() -> None:
-    from tactile_bayes.commands.compare import command
+    from tactile_bayes.commands.estimate import compare_command as command
 
     text = command.get_help(click.Context(command))
     assert "--with VISIT2.nc..." in text

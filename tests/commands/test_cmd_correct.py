@@ -13,8 +13,7 @@ from in_process import run_here
 
 import tactile_bayes as tb
 from tactile_bayes.errors import UsageError
-from tactile_bayes.files.shipped import size_calibration_path
-from tactile_bayes.files.size_json import read_size_calibration
+from tactile_bayes.files.size_json import read_size_calibration, size_calibration_path
 from tactile_bayes.size.bodies import BodyCalibration
 
 DEMO = Path(tb.__file__).parent / "demo"

@@ -17,9 +17,9 @@ from tactile_bayes.files.scan_mcap import read_scan, write_scan
 from tactile_bayes.forward.scene import rotation_from_vector
 from tactile_bayes.geometry import quaternion_from_rotation
 from tactile_bayes.hardware.bladder import rotation_sense
-from tactile_bayes.hardware.drivers import guess
 from tactile_bayes.hardware.emulated import EmulatedHead, EmulatedTracker
 from tactile_bayes.hardware.emulator import PtyLink
+from tactile_bayes.hardware.serial_trackers import guess
 from tactile_bayes.scan import TrackerPoses
 
 

@@ -16,8 +16,7 @@ from tactile_bayes.declarations import replace
 from tactile_bayes.files.documents import check_document
 from tactile_bayes.files.estimate_json import read_stated_size
 from tactile_bayes.files.map_nc import write_map
-from tactile_bayes.files.shipped import SHIPPED, size_calibration_path
-from tactile_bayes.files.size_json import read_size_calibration
+from tactile_bayes.files.size_json import SHIPPED, read_size_calibration, size_calibration_path
 from tactile_bayes.report.pooled import pooled_text
 
 FAST = ("--method", "laplace")

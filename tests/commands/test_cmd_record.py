@@ -357,7 +357,7 @@ def test_a_port_in_use_is_refused(record, scan):
 
 
 def test_another_device_on_the_port_is_told_by_what_it_says(record, scan, monkeypatch):
-    monkeypatch.setattr("tactile_bayes.hardware.drivers.ANSWER_S", 0.3)
+    monkeypatch.setattr("tactile_bayes.hardware.serial_trackers.ANSWER_S", 0.3)
     with serving(EmulatedTracker(scan.poses, protocol="bird"), PtyLink()) as emulator:
         done = record("--head", emulator._link.url)
     assert done.returncode == 4

@@ -13,7 +13,7 @@ from repeated_exams import shape, write_done, write_exam, write_repeats
 
 import tactile_bayes as tb
 from tactile_bayes.files.documents import check_document
-from tactile_bayes.files.shipped import size_calibration_path
+from tactile_bayes.files.size_json import size_calibration_path
 
 FAST = ("--method", "laplace")
 DEMO = Path(tb.__file__).parent / "demo"

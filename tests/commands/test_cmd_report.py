@@ -12,7 +12,7 @@ import pytest
 from in_process import run_here
 from repeated_exams import write_repeats
 
-from tactile_bayes.commands import report as command
+from tactile_bayes.commands import estimate as command
 from tactile_bayes.declarations import replace
 from tactile_bayes.files.map_nc import read_map, write_map
 from tactile_bayes.files.provenance import Provenance
@@ -198,4 +198,4 @@ def test_the_printed_file_is_private_too(folder: Path, monkeypatch: pytest.Monke
 
 
 def test_the_command_is_documented() -> None:
-    assert "prints to one side of A4" in (command.command.help or "")
+    assert "prints to one side of A4" in (command.report_command.help or "")

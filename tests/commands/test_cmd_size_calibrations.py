@@ -11,8 +11,7 @@ from in_process import run_here
 import tactile_bayes as tb
 from tactile_bayes.api.size_calibration import table_cautions
 from tactile_bayes.files.provenance import Provenance
-from tactile_bayes.files.shipped import size_calibration_path
-from tactile_bayes.files.size_json import read_size_calibration, write_size_calibration
+from tactile_bayes.files.size_json import read_size_calibration, size_calibration_path, write_size_calibration
 
 DEMO = Path(tb.__file__).parent / "demo"
 TRUE_MM = 15.0  # the scene of the demo

@@ -12,7 +12,7 @@ import pytest
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import EXIT_BAD_DATA
 from tactile_bayes.forward.contact import Head
-from tactile_bayes.report.tables_text import heads_text, tables_text
+from tactile_bayes.report.laboratory import heads_text, tables_text
 from tactile_bayes.studies.paper import LineFit
 from tactile_bayes.studies.paper_tables import (
     NEAREST_HEADS,

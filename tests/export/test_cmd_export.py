@@ -139,7 +139,7 @@ def test_the_command_offers_every_format() -> None:
 
 
 def test_the_guide_lists_the_codes_of_the_own_scheme() -> None:
-    from tactile_bayes.exports import codes
+    from tactile_bayes.exports import exam as codes
     from tests.conftest import ROOT
 
     own = [one for one in vars(codes).values() if isinstance(one, codes.Code) and one.scheme == codes.OWN_SCHEME]

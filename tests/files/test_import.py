@@ -17,7 +17,7 @@ from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.imports import read_arrays, read_grid
 from tactile_bayes.forward.scene import Scene
 from tactile_bayes.forward.simulate import simulate
-from tactile_bayes.posterior.fit_window import window_cells
+from tactile_bayes.posterior.bump import window_cells
 
 Arrays = dict[str, Any]
 

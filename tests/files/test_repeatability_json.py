@@ -14,7 +14,7 @@ from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.atomic import sha256
 from tactile_bayes.files.identify import describe
-from tactile_bayes.files.repeatability_json import read_repeatability
+from tactile_bayes.files.size_json import read_repeatability
 
 
 @pytest.fixture(scope="module")

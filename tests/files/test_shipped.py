@@ -8,7 +8,7 @@ import pytest
 from in_process import run_here
 
 from tactile_bayes.errors import UsageError
-from tactile_bayes.files.shipped import SHIPPED, size_calibration_path
+from tactile_bayes.files.size_json import SHIPPED, size_calibration_path
 
 
 @pytest.mark.parametrize("name", SHIPPED)

@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward import contact
-from tactile_bayes.forward.body import Body, Layers
 from tactile_bayes.forward.contact import Head, solve_contact
 from tactile_bayes.forward.line import build_line, head_positions, press, press_layers, slide
 from tactile_bayes.forward.plane_strain import SurfaceCompliance, condense, surface_compliance
+from tactile_bayes.forward.tissue import Body, Layers
 
 DEEP = Layers(2000.0, 6000.0, gland_ratio=1.0)  # as good as a half-plane for loads of millimetres
 PLANE_KPA = DEEP.fat_kpa / (1 - DEEP.poisson**2)

@@ -11,17 +11,21 @@ from hypothesis import strategies as st
 from tactile_bayes.errors import BadDataError, DeviceError
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.scan_mcap import ScanWriter, read_scan
-from tactile_bayes.hardware.clocks import (
+from tactile_bayes.hardware.readings import (
     HEAD_STILL_NS,
     LATEST_NS,
+    MOST_LOST,
     MOST_STEPS,
     TRACKER_STILL_NS,
     WRAPS_NS,
     DeviceClock,
+    EndReading,
+    FrameReading,
     PoseClock,
+    PoseReading,
+    SequenceCheck,
     wrap_period,
 )
-from tactile_bayes.hardware.readings import MOST_LOST, EndReading, FrameReading, PoseReading, SequenceCheck
 from tactile_bayes.hardware.recorder import Line, Recorder, Report
 
 S = 1_000_000_000

@@ -18,12 +18,12 @@ from tactile_bayes.actions.devices import _link
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.scan_mcap import write_scan
 from tactile_bayes.hardware import head
-from tactile_bayes.hardware.drivers import TRACKERS
 from tactile_bayes.hardware.emulated import EmulatedHead, EmulatedTracker, Faults
 from tactile_bayes.hardware.emulator import Emulator, PtyLink, Stage, TcpLink
 from tactile_bayes.hardware.head import HeadParser, encode_command
 from tactile_bayes.hardware.ports import Port
 from tactile_bayes.hardware.readings import EndReading, FrameReading, PoseReading
+from tactile_bayes.hardware.serial_trackers import TRACKERS
 
 SCAN = short_scan(0.2)
 START = encode_command(head.START, every=1)

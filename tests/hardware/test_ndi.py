@@ -11,12 +11,12 @@ import pytest
 from emulated_devices import serving, short_scan
 
 from tactile_bayes.errors import DeviceError
-from tactile_bayes.hardware import ndi
-from tactile_bayes.hardware.drivers import TRACKERS, open_tracker
+from tactile_bayes.hardware import trackers as ndi
 from tactile_bayes.hardware.emulated import EmulatedHead, EmulatedNdi, crc16
 from tactile_bayes.hardware.emulator import PtyLink, TcpLink
-from tactile_bayes.hardware.ndi import NdiTracker
 from tactile_bayes.hardware.readings import HelloReading, PoseReading
+from tactile_bayes.hardware.serial_trackers import TRACKERS, open_tracker
+from tactile_bayes.hardware.trackers import NdiTracker
 
 TURN = (0.5, 0.5, -0.5, 0.5)
 

@@ -22,13 +22,11 @@ from tactile_bayes.files import scan_recording
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.geometry import inverse, quaternion_from_rotation, rigid
 from tactile_bayes.hardware import reading
-from tactile_bayes.hardware.clocks import ArrivalClock, PoseClock
-from tactile_bayes.hardware.drivers import TRACKERS
 from tactile_bayes.hardware.emulated import PROTOCOLS, EmulatedTracker, Faults
-from tactile_bayes.hardware.ports import Port, shown
-from tactile_bayes.hardware.readings import PoseReading
+from tactile_bayes.hardware.ports import Port, Stream, read_in_process, shown
+from tactile_bayes.hardware.readings import ArrivalClock, PoseClock, PoseReading
 from tactile_bayes.hardware.recorder import LandmarkTouch
-from tactile_bayes.hardware.streams import Stream, read_in_process
+from tactile_bayes.hardware.serial_trackers import TRACKERS
 
 
 def read_all(stream: Stream, size: int) -> bytes:
@@ -158,7 +156,7 @@ def test_what_came_is_shown(data, words):
 
 @pytest.mark.parametrize("name", TRACKERS)
 def test_every_driver_says_in_one_line_that_nobody_answers(name, monkeypatch):
-    monkeypatch.setattr("tactile_bayes.hardware.drivers.ANSWER_S", 0.05)
+    monkeypatch.setattr("tactile_bayes.hardware.serial_trackers.ANSWER_S", 0.05)
     near, far = os.openpty()
     port = Port(os.ttyname(far), baud=9600, role="tracker")
     with pytest.raises(DeviceError) as error:

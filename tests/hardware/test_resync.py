@@ -14,10 +14,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tactile_bayes.hardware.drivers import TRACKERS
 from tactile_bayes.hardware.emulated import PROTOCOLS
 from tactile_bayes.hardware.readings import Parser, PoseReading
-from tactile_bayes.hardware.serial_trackers import BirdParser
+from tactile_bayes.hardware.serial_trackers import TRACKERS, BirdParser
 
 BEFORE, AFTER = 2, 5
 STREAMS = 40

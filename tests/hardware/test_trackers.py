@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 
 from tactile_bayes.geometry import quaternion_from_rotation, rotation_from_quaternion
 from tactile_bayes.hardware.head import HeadParser, encode_pose
-from tactile_bayes.hardware.igtlink import IgtlinkParser, crc64, encode_transform
 from tactile_bayes.hardware.readings import PoseReading
 from tactile_bayes.hardware.serial_trackers import (
     FASTRAK_ASCII,
@@ -24,6 +23,7 @@ from tactile_bayes.hardware.serial_trackers import (
     quaternion_from_euler,
     record_bytes,
 )
+from tactile_bayes.hardware.trackers import IgtlinkParser, crc64, encode_transform
 
 AS_AFTER_A_RESET = (2, 4, 1)
 """Records of a FASTRAK that nobody asked for others: position and Euler angles."""

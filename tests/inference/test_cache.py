@@ -10,10 +10,9 @@ from tactile_bayes.declarations import replace
 from tactile_bayes.forward.gaussian import cell_mean_gaussian, covariance_from_log_widths
 from tactile_bayes.inference.draws import Solution, Solved
 from tactile_bayes.options import BumpPrior
-from tactile_bayes.posterior.bump import Bump
+from tactile_bayes.posterior.bump import Bump, window_cells
 from tactile_bayes.posterior.draw import draw_scene
 from tactile_bayes.posterior.fit import FieldFit
-from tactile_bayes.posterior.fit_window import window_cells
 from tactile_bayes.posterior.options import EstimateOptions, FitOptions
 from tests.posterior.correlated.test_marginal import cells_of, fitted, noise
 

@@ -13,8 +13,7 @@ from numpy.polynomial import legendre
 
 from tactile_bayes.declarations import replace
 from tactile_bayes.files.imports import read_arrays
-from tactile_bayes.files.shipped import DEFAULT, size_calibration_path
-from tactile_bayes.files.size_json import read_size_calibration
+from tactile_bayes.files.size_json import DEFAULT, read_size_calibration, size_calibration_path
 from tactile_bayes.forward.scene import Background, Noise, Scene, Strokes
 from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.forward.tissue import SceneBody, SolidLump

@@ -10,8 +10,8 @@ from scipy.ndimage import gaussian_filter
 from tactile_bayes.declarations import replace
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior import search
+from tactile_bayes.posterior.bump import levelled
 from tactile_bayes.posterior.estimate import estimate_map
-from tactile_bayes.posterior.fit_window import levelled
 from tactile_bayes.posterior.options import EstimateOptions, FitOptions
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.posterior.white import BumpFit

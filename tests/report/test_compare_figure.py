@@ -8,7 +8,7 @@ from posterior_maps import bump_values, grid_map
 
 from tactile_bayes.declarations import replace
 from tactile_bayes.geometry import rigid
-from tactile_bayes.report.compare_figure import DrawnMap, draw_comparison
+from tactile_bayes.report.estimate_figures import DrawnMap, draw_comparison
 from tactile_bayes.size.visits import Compared
 
 PLACE = np.array([60.0, 90.0])

@@ -38,8 +38,7 @@ from tactile_bayes.exports.fhir import bundle_of
 from tactile_bayes.exports.identity import Identity
 from tactile_bayes.exports.redcap import records_csv
 from tactile_bayes.files.manifest_csv import Exam as Listed
-from tactile_bayes.files.map_nc import read_map, write_map
-from tactile_bayes.files.posterior_nc import write_pooled
+from tactile_bayes.files.map_nc import read_map, write_map, write_pooled
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.scan_mcap import read_scan, write_scan
 from tactile_bayes.findings import KINDS, LEADS, Finding, by_weight, verdict
@@ -49,7 +48,7 @@ from tactile_bayes.mapping.map import MapRecipe, TactileMap
 from tactile_bayes.mapping.select import scan_findings
 from tactile_bayes.report.campaign_html import SIZED, Card, campaign_html
 from tactile_bayes.report.compare import Growth, compare_summary, compare_text, of_document
-from tactile_bayes.report.compare_figure import draw_comparison
+from tactile_bayes.report.estimate_figures import draw_comparison
 from tactile_bayes.report.exam_page import exam_page
 from tactile_bayes.report.map_figure import map_figure
 from tactile_bayes.report.map_text import map_text
@@ -268,19 +267,17 @@ OUTPUTS: dict[str, Output] = {
 PRINTERS = {
     # behind the outputs above
     "api/comparing", "api/maps", "api/sized", "exports/dicom",
-    "exports/dicom_map", "exports/fhir", "exports/nrrd", "exports/redcap", "files/posterior_nc",
-    "report/campaign_html", "report/compare", "report/compare_figure", "report/estimate_document",
+    "exports/dicom_map", "exports/fhir", "exports/nrrd", "exports/redcap", "files/map_nc",
+    "report/campaign_html", "report/compare", "report/estimate_document",
     "report/estimate_figures", "report/estimate_text", "report/exam_page", "report/map_figure", "report/map_text",
     "report/pooled",
-    # the live view says cautions alone, see below; recorder and import speak of a scan that has no size yet
-    "report/live",
     # of draws, not of a size; names of files that were written
-    "report/posterior_figures", "actions/campaign", "actions/maps",
+    "report/posterior_figures", "actions/estimate",
     # of trials, calibrations, devices and studies
-    "api/trial_report", "api/trials", "actions/calibrate", "actions/devices", "actions/exam", "actions/heads",
+    "api/trial_report", "api/trials", "actions/calibrate", "actions/devices", "actions/exam",
     "actions/simulation", "actions/study",
-    "actions/tradeoff", "actions/trial", "files/repeatability_json", "files/size_json", "presets", "report/calibration",
-    "report/calibration_text", "report/forward_tradeoff", "report/paper_head", "report/sbc", "report/solid_figures",
+    "actions/tradeoff", "actions/trial", "files/size_json", "presets", "report/calibration",
+    "report/paper_head", "report/laboratory", "report/solid_figures",
     "report/study", "report/tradeoff", "report/trial", "report/trial_html",
 }  # fmt: skip
 

@@ -15,8 +15,7 @@ from tactile_bayes.actions.live_view import Turn, live_estimate
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import EXIT_DONE, EXIT_NO_ESTIMATE
 from tactile_bayes.files.map_nc import write_map
-from tactile_bayes.files.shipped import size_calibration_path
-from tactile_bayes.files.size_json import read_size_calibration
+from tactile_bayes.files.size_json import read_size_calibration, size_calibration_path
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.presets import HEAD_PROFILE
 from tactile_bayes.size.bodies import BodyCalibration

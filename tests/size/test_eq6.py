@@ -14,7 +14,7 @@ from plain_calibration import RECIPE
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.size_json import read_size_calibration, write_size_calibration
-from tactile_bayes.report.calibration_text import calibration_text
+from tactile_bayes.report.calibration import calibration_text
 from tactile_bayes.size.eq6 import AxisCalibration, SizeCalibration
 from tactile_bayes.size.learn.eq6 import SizeTable, learn_size_calibration, width_changes
 from tactile_bayes.size.terms import Recipe, outside_domain

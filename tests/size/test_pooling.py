@@ -20,8 +20,8 @@ from tactile_bayes.size.draws import (
     shown_share,
     turn_matrix,
 )
+from tactile_bayes.size.fat import BetweenMaps, outlying_maps
 from tactile_bayes.size.pooling import IRREGULAR_SD, SizePriors, pool_maps, pooled_size
-from tactile_bayes.size.spread import BetweenMaps, outlying_maps
 from tactile_bayes.size.terms import HiddenTerms
 
 BODY_SD = 0.08

@@ -23,8 +23,8 @@ from tactile_bayes.posterior.options import EstimateOptions
 from tactile_bayes.posterior.search import MapDraws
 from tactile_bayes.size.draws import ShapeDraws
 from tactile_bayes.size.eq6 import AxisCalibration, SizeCalibration, push_sizes
+from tactile_bayes.size.fat import BetweenMaps
 from tactile_bayes.size.pooling import SizePriors, pool_maps, pooled_size
-from tactile_bayes.size.spread import BetweenMaps
 
 SEEDS = 24
 PROBABILITY = 0.95

@@ -18,12 +18,11 @@ from tactile_bayes.actions.study import fit_line
 from tactile_bayes.commands.tradeoff import tradeoff_forward_command
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import EXIT_BAD_DATA, EXIT_USAGE, BadDataError
-from tactile_bayes.files.shipped import size_calibration_path
-from tactile_bayes.files.size_json import read_size_calibration
+from tactile_bayes.files.size_json import read_size_calibration, size_calibration_path
 from tactile_bayes.forward.scene import Head, Lump, Scene
 from tactile_bayes.forward.tissue import Rib, SceneBody, SolidLump
 from tactile_bayes.presets import HEADS, SHOULDERS_INSIDE, SHOULDERS_OUTSIDE
-from tactile_bayes.report.forward_tradeoff import TradeoffReport, tradeoff_document, tradeoff_text
+from tactile_bayes.report.laboratory import TradeoffReport, tradeoff_document, tradeoff_text
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.draws import ShapeDraws, ShapePrior
 from tactile_bayes.size.eq6 import SizeCalibration
@@ -221,7 +220,7 @@ def test_the_document_is_plain_data() -> None:
 
 
 def test_the_figure_is_the_same_bytes_each_time(tmp_path: Path) -> None:
-    from tactile_bayes.report.forward_tradeoff import draw_tradeoff
+    from tactile_bayes.report.laboratory import draw_tradeoff
 
     for name in ("one.png", "two.png"):
         draw_tradeoff(report(), tmp_path / name)

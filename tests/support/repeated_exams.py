@@ -13,8 +13,7 @@ import numpy as np
 import tactile_bayes as tb
 from tactile_bayes.files.atomic import sha256
 from tactile_bayes.files.npz import write_shape
-from tactile_bayes.files.shipped import size_calibration_path
-from tactile_bayes.files.size_json import read_size_calibration
+from tactile_bayes.files.size_json import read_size_calibration, size_calibration_path
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.draws import ShapeDraws
 

@@ -9,8 +9,7 @@ import pytest
 from in_process import run_here
 
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.trial.readings import Reading
-from tactile_bayes.trial.visits import OtherVisits, at_excision, in_order
+from tactile_bayes.trial.readings import OtherVisits, Reading, at_excision, in_order
 
 MASS = ("P1", "1")
 JAN, MARCH, MAY = date(2026, 1, 10), date(2026, 3, 10), date(2026, 5, 10)

@@ -23,14 +23,17 @@ from tactile_bayes.presets import HELD
 from tactile_bayes.size.bodies import CUBIC, QUADRATIC, BodyCalibration, Centre, Spread, known_body
 from tactile_bayes.size.eq6 import BY_DEPTH, MU, PLAIN, Eq6Law, F, Powers, eq6_log_size, eq6_terms
 from tactile_bayes.size.fat import FatDepth, profile_terms
-from tactile_bayes.size.learn.process import BodiesLeft, FittedResidual, body_spread, fit_residual
 from tactile_bayes.size.learn.regression import (
+    BodiesLeft,
     BodyRegression,
     ExamSpread,
+    FittedResidual,
     PopulationTable,
+    body_spread,
     check_population,
     domain_of,
     error_figures,
+    fit_residual,
     hidden_terms,
     learn_round,
     leverages,

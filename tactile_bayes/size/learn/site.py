@@ -29,9 +29,8 @@ from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.draws import ShapeDraws
-from tactile_bayes.size.pooling import log_sizes
-from tactile_bayes.size.site import PROBABILITY, Repeatability
-from tactile_bayes.size.spread import apart_by_chance, restricted_log_likelihood
+from tactile_bayes.size.fat import apart_by_chance, restricted_log_likelihood
+from tactile_bayes.size.pooling import PROBABILITY, Repeatability, log_sizes
 from tactile_bayes.size.terms import SiteShift
 
 LEAST_PHANTOMS = 3

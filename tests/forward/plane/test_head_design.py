@@ -12,7 +12,7 @@ from tactile_bayes.cli import cli
 from tactile_bayes.errors import EXIT_USAGE, BadDataError, UsageError
 from tactile_bayes.forward.contact import Head
 from tactile_bayes.presets import SHOULDERS_INSIDE, SHOULDERS_OUTSIDE
-from tactile_bayes.studies.head_design import HomogeneousTissue, most_even, narrowest, search_heads, uniformity
+from tactile_bayes.studies.paper import HomogeneousTissue, most_even, narrowest, search_heads, uniformity
 
 PAPER_LIMIT = 0.075
 """Largest departure of the pressure from its mean, as a share of it: Wellman & Howe (1999), section 2.1."""
@@ -119,7 +119,7 @@ def test_the_command_says_what_one_head_does() -> None:
 def test_where_no_head_meets_the_limit_the_command_says_so_and_fails(monkeypatch) -> None:
     from functools import partial
 
-    from tactile_bayes.studies import head_design
+    from tactile_bayes.studies import paper as head_design
 
     monkeypatch.setattr(head_design, "search_heads", partial(search_heads, **SMALL))
     done = run("head", "design", "--head", SHOULDERS_INSIDE)
@@ -132,7 +132,7 @@ def test_where_no_head_meets_the_limit_the_command_says_so_and_fails(monkeypatch
 def test_the_picture_and_the_json_hold_the_search(tmp_path, monkeypatch) -> None:
     from functools import partial
 
-    from tactile_bayes.studies import head_design
+    from tactile_bayes.studies import paper as head_design
 
     monkeypatch.setattr(head_design, "search_heads", partial(search_heads, **SMALL))
     done = run("head", "design", "--figure", tmp_path / "head.png", "--json")

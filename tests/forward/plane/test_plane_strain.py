@@ -16,7 +16,6 @@ from scipy.sparse.linalg import spsolve
 from tactile_bayes.actions.study import fit_line
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward import plane_strain as strain
-from tactile_bayes.forward.body import Body, Layers, parse_seat
 from tactile_bayes.forward.line import build_line, slide
 from tactile_bayes.forward.mesh import QuadMesh, body_mesh, disc_mesh, joined, rectangle_mesh
 from tactile_bayes.forward.plane_strain import (
@@ -28,6 +27,7 @@ from tactile_bayes.forward.plane_strain import (
     surface_compliance,
     surface_transfer,
 )
+from tactile_bayes.forward.tissue import Body, Layers, parse_seat
 
 NEARLY_INCOMPRESSIBLE = pytest.mark.parametrize("poisson", [0.3, 0.495, 0.4999])
 

@@ -12,15 +12,16 @@ from scipy.sparse.linalg import splu
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.axisymmetric import (
     CondensedLump,
+    LayeredBody,
     Tissue,
     _assemble,
     condense_lump,
     element_stiffness,
+    layering_compliance,
     order_unknowns,
     orders_needed,
     skin_spline,
 )
-from tactile_bayes.forward.layers import LayeredBody, layering_compliance
 from tactile_bayes.forward.mesh import EXTERIOR_GLAND, INTERIOR_FAT, LumpGeometry, LumpMesh, MeshSize, lump_mesh
 
 CENTRED = LumpGeometry(7.5, 7.5, 15.0, 15.0, 70.0)

@@ -11,13 +11,12 @@ import pytest
 from scipy.optimize import least_squares
 
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.forward.axisymmetric import Tissue, condense_lump
-from tactile_bayes.forward.body import HeadFace, head_face
+from tactile_bayes.forward.axisymmetric import LayeredBody, Tissue, condense_lump, taxel_compliance
 from tactile_bayes.forward.contact import ContactStiffness, press
-from tactile_bayes.forward.layers import LayeredBody, taxel_compliance
 from tactile_bayes.forward.mesh import LumpGeometry, MeshSize
 from tactile_bayes.forward.scene import Head, rotation_from_vector
 from tactile_bayes.forward.solid import PlacedLump, SkinPerturbation, SolidHead, skin_perturbation, solid_head
+from tactile_bayes.forward.tissue import HeadFace, head_face
 
 LEVEL = np.eye(3)
 PITCH = 1.5

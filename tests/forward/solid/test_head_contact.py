@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 from scipy.optimize import nnls
 
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.forward.body import head_face
+from tactile_bayes.forward.axisymmetric import LayeredBody, taxel_compliance
 from tactile_bayes.forward.contact import ContactStiffness, press
-from tactile_bayes.forward.layers import LayeredBody, taxel_compliance
 from tactile_bayes.forward.scene import Head
+from tactile_bayes.forward.tissue import head_face
 
 NU = 0.495
 HALF_SPACE = LayeredBody((5.0,), (), NU)

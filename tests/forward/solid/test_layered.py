@@ -10,8 +10,7 @@ from scipy.integrate import dblquad, quad
 from scipy.special import j0
 
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.forward.body import Layers
-from tactile_bayes.forward.layers import (
+from tactile_bayes.forward.axisymmetric import (
     LayeredBody,
     layering_compliance,
     skin_flexibility,
@@ -20,6 +19,7 @@ from tactile_bayes.forward.layers import (
     taxel_compliance,
 )
 from tactile_bayes.forward.plane_strain import surface_transfer
+from tactile_bayes.forward.tissue import Layers
 
 NU = 0.495
 BREAST = LayeredBody((5.0, 50.0), (15.0, 55.0), NU)

@@ -19,8 +19,16 @@ from tactile_bayes.files.scene_toml import read_scene, scene_from_toml
 from tactile_bayes.forward.instrument import SimulatedScan, frame_times, head_positions, level_kpa
 from tactile_bayes.forward.scene import Background, Head, Lump, Noise, Scene, Strokes, Tracker
 from tactile_bayes.forward.simulate import simulate
-from tactile_bayes.forward.solid import PlacedLump, SolidHead, skin_perturbation, solid_head
-from tactile_bayes.forward.solid_scan import condensed_lump, face_of, layers_of, solid_frames
+from tactile_bayes.forward.solid import (
+    PlacedLump,
+    SolidHead,
+    condensed_lump,
+    face_of,
+    layers_of,
+    skin_perturbation,
+    solid_frames,
+    solid_head,
+)
 from tactile_bayes.forward.tissue import Rib, SceneBody, SolidLump, fat_thickness
 from tactile_bayes.geometry import (
     apply,

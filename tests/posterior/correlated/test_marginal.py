@@ -11,10 +11,10 @@ from posterior_maps import TRUTH, bump_map, correlated_field
 from tactile_bayes.forward.gaussian import cell_mean_gaussian, covariance_from_log_widths
 from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior import marginal as collapsed
+from tactile_bayes.posterior.bump import FitCells, window_cells
 from tactile_bayes.posterior.draw import draw_scene
 from tactile_bayes.posterior.field import Window, cosine_profiles, gram_of_cosines, spectrum
 from tactile_bayes.posterior.fit import FieldFit, fit_scene, shape_draws
-from tactile_bayes.posterior.fit_window import FitCells, window_cells
 from tactile_bayes.posterior.linear import _one
 from tactile_bayes.posterior.marginal import CollapsedTarget, independent_variance
 from tactile_bayes.posterior.options import EstimateOptions

@@ -20,11 +20,11 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.errors import MOST_MM, _departures, _interpolation
 from tactile_bayes.mapping.map import TactileMap
+from tactile_bayes.posterior.bump import PoseNoise, window_cells
 from tactile_bayes.posterior.correlated import pose_covariance
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.field import Window
 from tactile_bayes.posterior.fit import FieldFit, tangent_columns
-from tactile_bayes.posterior.fit_window import PoseNoise, window_cells
 from tactile_bayes.posterior.marginal import independent_variance
 from tactile_bayes.posterior.options import EstimateOptions, FitOptions
 from tactile_bayes.posterior.result import Estimate

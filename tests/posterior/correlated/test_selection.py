@@ -11,8 +11,8 @@ from posterior_maps import bump_values, correlated_field, grid_map
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior import neighbours as beside
+from tactile_bayes.posterior.bump import window_cells
 from tactile_bayes.posterior.field import Window
-from tactile_bayes.posterior.fit_window import window_cells
 from tactile_bayes.posterior.marginal import independent_variance
 from tactile_bayes.posterior.neighbours import Surroundings, add_beside, rising_ribs
 from tactile_bayes.posterior.scene import Problem, Scene

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tactile_bayes.posterior.fit_window import SMOOTHING_MM
+from tactile_bayes.posterior.bump import SMOOTHING_MM
 from tactile_bayes.posterior.neighbours import CLEAR_IN_WIDTHS, LEAST_CELLS, PIECE_MM, Surroundings
 from tactile_bayes.posterior.scene import Extra
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from posterior_maps import bump_map, bump_values, grid_map
 
-from tactile_bayes.posterior.fit_window import (
+from tactile_bayes.posterior.bump import (
     candidate_centres,
     covered_share,
     smoothed_excess,

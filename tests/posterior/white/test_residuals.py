@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from posterior_maps import bump_map, correlated_field, grid_map
 
+from tactile_bayes.posterior.bump import window_cells
 from tactile_bayes.posterior.detection import count_weights, fitted_tilt, level_offset, residual_autocorrelation
-from tactile_bayes.posterior.fit_window import window_cells
 from tactile_bayes.posterior.options import FitOptions
 from tactile_bayes.posterior.white import BumpFit, fit_bump
 

@@ -15,9 +15,15 @@ from tactile_bayes.declarations import replace
 from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.files.size_json import read_size_calibration
 from tactile_bayes.size.eq6 import AxisCalibration
-from tactile_bayes.size.learn import cross_validation as left_out
-from tactile_bayes.size.learn.cross_validation import geometry_numbers, left_out_of_study
-from tactile_bayes.size.learn.eq6 import AxisRows, SizeTable, StudyCases, axis_at_mode
+from tactile_bayes.size.learn import eq6 as left_out
+from tactile_bayes.size.learn.eq6 import (
+    AxisRows,
+    SizeTable,
+    StudyCases,
+    axis_at_mode,
+    geometry_numbers,
+    left_out_of_study,
+)
 from tactile_bayes.size.learn.regression import rows_of
 
 PHANTOMS = Path(tactile_bayes.__file__).parent / "demo" / "phantoms.csv"

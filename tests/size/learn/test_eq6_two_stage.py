@@ -9,7 +9,7 @@ import pytest
 from plain_calibration import RECIPE
 
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.report.calibration_text import calibration_text
+from tactile_bayes.report.calibration import calibration_text
 from tactile_bayes.size.eq6 import AxisCalibration
 from tactile_bayes.size.learn.eq6 import (
     AxisRows,

@@ -8,8 +8,8 @@ from scipy.linalg import null_space
 from scipy.stats import binomtest, chi2, multivariate_normal
 
 from tactile_bayes.errors import BadDataError
+from tactile_bayes.size.fat import BetweenMaps, restricted_log_likelihood
 from tactile_bayes.size.learn.site import GRID, RepeatedExams, learn_repeatability
-from tactile_bayes.size.spread import BetweenMaps, restricted_log_likelihood
 
 
 def exams(masses: int, spread: float, *, maps: int = 3, noise_sd: float = 0.03, seed: int = 1) -> list[RepeatedExams]:

@@ -1,0 +1,578 @@
+"""Checks, tables and trade-offs of forward models in words."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from textwrap import wrap
+from typing import Any
+
+import numpy as np
+
+from tactile_bayes.declarations import Record, as_dict, names_of
+from tactile_bayes.forward.contact import Head
+from tactile_bayes.forward.line import RANGE, outside_range
+from tactile_bayes.geometry import FloatArray
+from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.report.figure_file import figure_file
+from tactile_bayes.report.paper_head import named
+from tactile_bayes.report.study import COLOURS, MARKS, finish
+from tactile_bayes.studies.paper import seat_name
+from tactile_bayes.studies.paper_tables import (
+    DEFINITION,
+    OTHER_DEFINITIONS,
+    PRINTED_FRAMES,
+    PRINTED_MAPS,
+    TABLE_DIAMETERS_MM,
+    Agreement,
+    table_distance,
+)
+from tactile_bayes.studies.sbc import (
+    BAND,
+    DRAWS,
+    RANKED,
+    MapRanks,
+    RankTest,
+    Truth,
+    ecdf_band,
+    ecdf_counts,
+    other_rises,
+    rank_tests,
+)
+from tactile_bayes.studies.tradeoffs import EMPIRICAL, PLANE, SOLID, LumpCase, Measured, SizeRule, change, cheapest
+
+# --- Reports of simulation-based calibration: text, data, table and figure.
+
+SCHEMA = "tactile-bayes/sbc/1"
+_COLOURS = ("#1f3b73", "#c8641e")
+NARROW = 1.05
+"""A larger spread of the ranks is called too narrow a posterior, and too wide below its inverse."""
+SHIFT = 3.0
+"""Standard errors of the mean rank beyond which a posterior is called too low or too high."""
+
+
+def sbc_document(
+    maps: Sequence[MapRanks], *, method: str, seed: int, maps_per_s: float | None, cosines: int | None = None
+) -> dict[str, Any]:
+    """All results as plain data.
+
+    Parameters
+    ----------
+    maps_per_s
+        Of the maps that this run made; None where it made none.
+    """
+    ranked = [one for one in maps if one.ranks is not None]
+    tests, others = rank_tests(list(maps)), other_rises(list(maps))
+    return {
+        "schema": SCHEMA,
+        "method": method,
+        "field_cosines": cosines or "auto",
+        "seed": seed,
+        "maps": len(maps),
+        "ranked": len(ranked),
+        "abstained": dict(
+            sorted(Counter(one.outcome for one in maps if one.ranks is None and one.probability is None).items())
+        ),
+        "drawn_by": dict(sorted(Counter(one.outcome for one in ranked).items())),
+        "elsewhere": as_dict(others) | {"too_many": others.too_many},
+        "draws": DRAWS,
+        "maps_per_s": maps_per_s,
+        "parameters": [_as_dict(one) for one in tests],
+        "p_together": min(1.0, len(tests) * min(one.ecdf_p for one in tests)) if tests else None,
+        "research_use": RESEARCH_USE,
+    }
+
+
+def _as_dict(test: RankTest) -> dict[str, Any]:
+    return as_dict(test) | {"inside_band": test.inside, "verdict": verdict(test)}
+
+
+def verdict(test: RankTest) -> str:
+    """``"ok"``, or the way in which a parameter's posterior fails."""
+    if test.inside:
+        return "ok"
+    off = (test.mean_rank - 0.5) * np.sqrt(12.0 * test.n)
+    found = ["too narrow"] * (test.spread > NARROW) + ["too wide"] * (test.spread < 1.0 / NARROW)
+    if abs(off) > SHIFT:
+        found.append("too low" if off > 0 else "too high")
+    return "FAILS: " + (", ".join(found) or "ranks are not uniform")
+
+
+def sbc_text(document: dict[str, Any]) -> str:
+    """Full text report, ending with the research-use line."""
+    return "\n".join(_lines(document)) + "\n"
+
+
+def _lines(document: dict[str, Any]) -> Iterator[str]:
+    speed = document["maps_per_s"]
+    rate = "" if speed is None else f", {speed:.3g} maps/s"
+    made = f"method {document['method']}, {document['field_cosines']} cosines, seed {document['seed']}"
+    yield f"{document['maps']} maps from the model's own prior, {made}{rate}"
+    others = document["elsewhere"]
+    abstained = document["maps"] - document["ranked"] - others["number"]
+    why = ", ".join(f"{code} {number}" for code, number in document["abstained"].items())
+    yield f"no estimate on {abstained}{f' ({why})' if why else ''}: left out, ranks are conditional on detection"
+    told = f"another rise was measured on {others['number']}, announced {others['announced']:.1f}"
+    sure = f"FAILS, the draws keep to one place (p = {others['chance']:.1g})" if others["too_many"] else "ok"
+    yield f"{told}: {sure}; left out"
+    drawn = ", ".join(f"{name} {number}" for name, number in document["drawn_by"].items())
+    if not document["parameters"]:
+        yield "No map gave an estimate: there is nothing to rank; give more --maps"
+        yield RESEARCH_USE
+        return
+    yield f"ranks among {DRAWS} draws, drawn by: {drawn}"
+    yield ""
+    yield f"{'parameter':<12}{'chi2 p':>8}{'ECDF p':>8}  {'in band':<8}{'50 % holds':<17}{'90 % holds':<17}verdict"
+    for one in document["parameters"]:
+        yield _row(one)
+    yield ""
+    yield from _conclusion(document["parameters"], document["p_together"])
+    yield RESEARCH_USE
+
+
+def _row(one: dict[str, Any]) -> str:
+    held = [f"{100 * c['covered']:.1f} +- {100 * c['error']:.1f} %" for c in one["coverage"]]
+    inside = "yes" if one["inside_band"] else "NO"
+    return (
+        f"{one['name']:<12}{one['chi2_p']:>8.3f}{one['ecdf_p']:>8.3f}  {inside:<8}"
+        f"{held[0]:<17}{held[1]:<17}{one['verdict']}"
+    )
+
+
+def _conclusion(parameters: list[dict[str, Any]], together: float) -> Iterator[str]:
+    failed = [one["name"] for one in parameters if not one["inside_band"]]
+    band, number = f"{100 * BAND:g} % band", len(parameters)
+    if failed:
+        yield f"FAILS for {', '.join(failed)}: the ranks leave their simultaneous {band}."
+        seldom = (
+            f"of {number} calibrated parameters one or more leave theirs in {100 * (1 - BAND**number):.0f} % of runs"
+        )
+        advice = "run again with another --seed" if together > 1 - BAND else "that is no chance"
+        yield f"All {number} together: p = {together:.2g} ({seldom}); {advice}."
+    else:
+        yield f"All ranks stay in their simultaneous {band}s."
+    yield "+- is one binomial standard error of a calibrated interval."
+
+
+def table_text(maps: Sequence[MapRanks]) -> str:
+    """CSV with one row per map: truth, ranks (empty without an estimate) and outcome."""
+    header = [
+        "map",
+        *names_of(Truth),
+        *(f"rank_{name}" for name in RANKED),
+        "outcome",
+        "probability",
+    ]
+    return "\n".join([",".join(header), *(_table_row(one) for one in maps)]) + "\n"
+
+
+def _table_row(one: MapRanks) -> str:
+    ranks = [str(rank) for rank in one.ranks or ()]
+    ranks += [""] * (len(RANKED) - len(ranks))
+    probability = "" if one.probability is None else f"{one.probability:.8g}"
+    truth = (f"{value:.8g}" for value in as_dict(one.truth).values())
+    return ",".join([str(one.index), *truth, *ranks, one.outcome, probability])
+
+
+def sbc_figure(maps: Sequence[MapRanks], path: Path, *, force: bool = False) -> None:
+    """Draw the ECDF of each parameter's ranks minus the uniform one, with the simultaneous band, as PNG.
+
+    Raises
+    ------
+    UsageError
+        When `path` exists and `force` is false.
+    """
+    found = [one.ranks for one in maps if one.ranks is not None]
+    names = RANKED[: len(found[0])] if found else RANKED
+    ranks = np.array(found).reshape(-1, len(names))
+    n, at = len(ranks), np.arange(1, DRAWS + 1) / (DRAWS + 1)
+    inside = {test.name: test.inside for test in rank_tests(list(maps))}
+    with figure_file(path, size_in=(2.2 * len(names), 2.9), force=force) as figure:
+        all_axes = figure.subplots(1, len(names), sharey=True)
+        for axes, name, column in zip(all_axes, names, ranks.T, strict=True):
+            if n:
+                low, high = ecdf_band(n, DRAWS)
+                share = ecdf_counts(column[None], DRAWS)[0] / n
+                axes.fill_between(at, low - at, high - at, step="mid", color="0.85", linewidth=0)
+                axes.step(at, share - at, where="mid", color=_COLOURS[0 if inside[name] else 1], linewidth=1.2)
+            axes.axhline(0.0, color="0.5", linewidth=0.6)
+            axes.set_title(name, loc="left", fontsize=10)
+            axes.set_xticks([0.0, 0.5, 1.0])
+            axes.set_xlabel("rank / (draws + 1)", fontsize=9)
+            axes.tick_params(labelsize=8)
+            axes.spines[["top", "right"]].set_visible(False)
+        all_axes[0].set_ylabel("ECDF of ranks - uniform", fontsize=9)
+        caption = (
+            f"{n} maps with an estimate of {len(maps)}; grey: {100 * BAND:g} % band of the whole path. {RESEARCH_USE}"
+        )
+        figure.text(0.01, 0.01, caption, fontsize=7.5, color="0.3")
+
+
+# --- Tables 1 and 2 of the paper as text and as plain data: ours, the nearest head's and the printed figures.
+
+ByHead = Mapping[Head, Sequence[Agreement]]
+
+
+def tables_text(
+    found: Sequence[Agreement],
+    phantoms: Sequence[Agreement],
+    *,
+    head: Head,
+    nearest: Head | None = None,
+    beside: Sequence[Agreement] | None = None,
+) -> str:
+    """Both tables, the widths and amplitudes, and the phantoms.
+
+    Parameters
+    ----------
+    found, phantoms
+        Of the ten lumps and of the phantoms, under `head`.
+    nearest, beside
+        The head nearest to the printed tables, and its ten lumps; None where there is none, or it is `head`.
+    """
+    lines = [DEFINITION, "", f"head: {named(head)}"]
+    if nearest is not None and beside is not None:
+        lines.append(f"after the slash the head nearest to the print: {named(nearest)}")
+    lines += ["in brackets the printed figure", ""]
+    lines += _table("Table 1: frame centred on the lump, MSD %", found, "centred_frame", PRINTED_FRAMES, beside)
+    lines += _table("The same of frames divided by their means, MSD %", found, "normalised_frame", None, beside)
+    lines += _table("All frames of the map, MSD % (printed average 4.3)", found, "all_frames", None, beside)
+    lines += _table("Table 2: map, MSD %", found, "map", PRINTED_MAPS, beside)
+    lines += _table("Map, strict MSD %", found, "map_strict", None, beside)
+    lines += _others(found)
+    lines += ["Eq 5 fitted to both maps (background 1); the elastic model first:"]
+    lines += [f"{'lump':<24}{'a':>16}{'sigma, mm':>18}{'frame %':>10}{'map %':>8}{'strict %':>10}"]
+    for one in [*found, *phantoms]:
+        amplitudes = f"{one.elastic.amplitude:.3f} {one.empirical.amplitude:.3f}"
+        widths = f"{one.elastic.sigma_mm:.2f} {one.empirical.sigma_mm:.2f}"
+        shares = f"{100 * one.centred_frame:>10.1f}{100 * one.map:>8.1f}{100 * one.map_strict:>10.1f}"
+        lines.append(f"{one.scene.name:<24}{amplitudes:>16}{widths:>18}{shares}")
+    outside = [one.scene.name for one in [*found, *phantoms] if outside_range(one.scene.d_mm, one.scene.depth_ratio)]
+    lines.append(f"the empirical model: {RANGE}; outside:")
+    lines += wrap("; ".join(outside), width=100)
+    return "\n".join(lines)
+
+
+def heads_text(found: ByHead) -> str:
+    """The tables' means and ranges under each head, nearest first."""
+    lines = [
+        "",
+        "Tables under each head: mean (least to largest), %; distance from the 20 printed cells, percentage points",
+        f"{'head':<38}{'Table 1 (4.1)':>20}{'all (4.3)':>11}{'Table 2 (2.4)':>20}{'distance':>10}",
+    ]
+    for head, rows in sorted(found.items(), key=lambda item: table_distance(item[1])):
+        frames, maps = _span(rows, "centred_frame"), _span(rows, "map")
+        every = f"{100 * sum(one.all_frames for one in rows) / len(rows):.1f}"
+        lines.append(f"{named(head):<38}{frames:>20}{every:>11}{maps:>20}{table_distance(rows):>10.2f}")
+    return "\n".join(lines)
+
+
+def _span(rows: Sequence[Agreement], name: str) -> str:
+    shares = [100 * getattr(one, name) for one in rows]
+    return f"{sum(shares) / len(shares):.1f} ({min(shares):.1f} to {max(shares):.1f})"
+
+
+def _others(found: Sequence[Agreement]) -> list[str]:
+    """What other definitions would give: means over the cases with the least and the largest."""
+    lines = [
+        "Other definitions, %: mean over the cases (least to largest); printed 4.0 to 4.3 and 2.2 to 2.7",
+        f"{'':<37}{'frame':>21}{'frame over its mean':>21}{'map':>21}",
+    ]
+    for i, name in enumerate(OTHER_DEFINITIONS):
+        cells = []
+        for of in range(3):
+            shares = [100 * one.others[i][of] for one in found]
+            cells.append(f"{sum(shares) / len(shares):.1f} ({min(shares):.1f} to {max(shares):.1f})")
+        lines.append(f"{name:<37}" + "".join(f"{cell:>21}" for cell in cells))
+    return [*lines, ""]
+
+
+def _table(
+    title: str,
+    found: Sequence[Agreement],
+    name: str,
+    printed: Mapping[float, Sequence[float]] | None,
+    beside: Sequence[Agreement] | None,
+) -> list[str]:
+    """One table with diameters across: this head / the nearest head (printed)."""
+    lines = [title, f"{'h/d':>5}" + "".join(f"{f'd {d:g} mm':>18}" for d in TABLE_DIAMETERS_MM)]
+    for depth in dict.fromkeys(one.scene.depth_ratio for one in found):
+        cells = [f"{value:.1f}" for value in _row_of_tables(found, name, depth)]
+        if beside is not None:
+            cells = [
+                f"{cell} / {value:.1f}" for cell, value in zip(cells, _row_of_tables(beside, name, depth), strict=True)
+            ]
+        if printed is not None:
+            cells = [f"{cell} ({value:.1f})" for cell, value in zip(cells, printed[depth], strict=True)]
+        lines.append(f"{depth:>5g}" + "".join(f"{cell:>18}" for cell in cells))
+    mean = f"mean {_mean(found, name):.1f}" + ("" if beside is None else f" / {_mean(beside, name):.1f}")
+    if printed is None:
+        return [*lines, mean, ""]
+    values = [value for row in printed.values() for value in row]
+    return [*lines, f"{mean} (of the printed cells {sum(values) / len(values):.1f})", ""]
+
+
+def _row_of_tables(found: Sequence[Agreement], name: str, depth_ratio: float) -> list[float]:
+    return [100 * getattr(one, name) for one in found if one.scene.depth_ratio == depth_ratio]
+
+
+def _mean(found: Sequence[Agreement], name: str) -> float:
+    return float(sum(100 * getattr(one, name) for one in found) / len(found))
+
+
+def tables_document(found: ByHead, phantoms: ByHead, *, seat: float) -> dict[str, object]:
+    """The same as plain data, shares instead of percent; the head that was asked for first."""
+    first = next(iter(found))
+    return {
+        "schema": "tactile-bayes/tables/1",
+        "definition": DEFINITION,
+        "other_definitions": list(OTHER_DEFINITIONS),
+        "seat": seat,
+        "head": first.shoulders,
+        "printed_percent": {
+            "frames": {f"{h:g}": list(row) for h, row in PRINTED_FRAMES.items()},
+            "maps": {f"{h:g}": list(row) for h, row in PRINTED_MAPS.items()},
+        },
+        "cases": [as_dict(one) for one in found[first]],
+        "phantoms": [as_dict(one) for one in phantoms[first]],
+        "heads": [
+            {
+                **as_dict(head),
+                "distance": table_distance(rows),
+                "frames": [one.centred_frame for one in rows],
+                "all_frames": [one.all_frames for one in rows],
+                "maps": [one.map for one in rows],
+            }
+            for head, rows in found.items()
+        ],
+    }
+
+
+# --- The forward model's trade-off in words and figures.
+
+# --- Text and data of the forward models' trade-off, with the settings that a case does not need.
+
+# Settings that differ in how finely the same thing is computed.
+_MESHES = ("mesh", "default", "contact cell", "reference")
+_NAME = 52
+
+
+class TradeoffReport(Record, eq=False):
+    """All measurements of a trade-off."""
+
+    case: LumpCase
+    """The lump."""
+    found: tuple[Measured, ...]
+    """Every setting."""
+    rules: Mapping[str, SizeRule]
+    """From widths to sizes, for plane strain and for the solid model."""
+    tolerance: float
+    """Error in size, as a share, below which nothing is gained."""
+
+    def of(self, model: str) -> list[Measured]:
+        """Measurements of one model."""
+        return [one for one in self.found if one.setting.model == model]
+
+    def reference(self, model: str) -> Measured:
+        """Finest setting of the model; for the empirical model, that of plane strain."""
+        family = PLANE if model == EMPIRICAL else model
+        (found,) = (one for one in self.of(family) if one.setting.kind == "reference")
+        return found
+
+    def size_mm(self, one: Measured) -> float:
+        """Size by the model's own rule; for the empirical model, by that of plane strain."""
+        return self.rules[SOLID if one.setting.model == SOLID else PLANE].size_mm(one)
+
+    def size_error(self, one: Measured) -> float:
+        """Error of the size against the model's reference, as a share."""
+        return change(self.size_mm(one), self.size_mm(self.reference(one.setting.model)))
+
+    def size_change_mm(self, one: Measured) -> float:
+        """Difference of the size from the model's reference, in mm."""
+        return self.size_mm(one) - self.size_mm(self.reference(one.setting.model))
+
+
+def tradeoff_text(report: TradeoffReport) -> str:
+    """Table of all settings, and accuracy that the case does not need."""
+    case = report.case
+    lines = [
+        f"ball of {case.d_mm:g} mm, h/d {case.depth_ratio:g}, {case.stiffness_ratio:g} times as stiff as fat, "
+        f"{seat_name(case.seat)}",
+        f"head: {', '.join(f'{where} ({model})' for model, where in case.heads.items())}",
+        "",
+        f"{'':<{_NAME}}{'element':>8}{'a lump':>8}{'a map':>8}{'':>8}{'sigma_x':>8}{'sigma_y':>8}{'size':>7}"
+        f"   off from the model's finest, %       mm",
+        f"{'model and setting':<{_NAME}}{'mm':>8}{'s CPU':>8}{'s CPU':>8}{'a':>8}{'mm':>8}{'mm':>8}{'mm':>7}"
+        f"{'a':>8}{'sigma_x':>8}{'sigma_y':>8}{'size':>7}{'size':>8}",
+    ]
+    lines += [_line(one, report) for one in report.found]
+    return "\n".join([*lines, "", *advice(report)])
+
+
+def _line(one: Measured, report: TradeoffReport) -> str:
+    best = report.reference(one.setting.model)
+    mark = {"default": " (default)", "reference": " (finest)"}.get(one.setting.kind, "")
+    name = f"{one.setting.model}, {one.setting.label}{mark}"
+    along = "" if one.sigma_y_mm is None else f"{one.sigma_y_mm:.3f}"
+    off = (
+        change(one.amplitude, best.amplitude),
+        change(one.sigma_x_mm, best.sigma_x_mm),
+        change(one.sigma_y_mm, best.sigma_y_mm),
+        report.size_error(one),
+    )
+    shares = [f"{100 * value:+.2f}" if np.isfinite(value) else "" for value in off]
+    in_mm = report.size_change_mm(one)
+    return (
+        f"{name:<{_NAME}}{one.element_mm:>8.2f}{one.lump_s:>8.2f}{one.map_s:>8.2f}{one.amplitude:>8.4f}"
+        f"{one.sigma_x_mm:>8.3f}{along:>8}{report.size_mm(one):>7.2f}"
+        f"{shares[0]:>8}{shares[1]:>8}{shares[2]:>8}{shares[3]:>7}{f'{in_mm:+.3f}' if np.isfinite(in_mm) else '':>8}"
+    )
+
+
+def advice(report: TradeoffReport) -> list[str]:
+    """The setting that is enough, wasted accuracy, and the error of the models themselves."""
+    lines = [_enough(report, SOLID), _enough(report, PLANE)]
+    solid, plane, empirical = report.reference(SOLID), report.reference(PLANE), report.of(EMPIRICAL)[0]
+    if report.rules[PLANE].source == report.rules[SOLID].source:
+        mistaken = f"a cylinder's map read by the same calibration gives {report.size_mm(plane):.1f} mm"
+    else:
+        mistaken = f"a ball's map read by the cylinder's calibration gives {report.rules[PLANE].size_mm(solid):.1f} mm"
+    lines.append(
+        f"two dimensions: a cylinder shows {_percent(change(plane.amplitude, solid.amplitude))} in amplitude and "
+        f"{_percent(change(plane.sigma_x_mm, solid.sigma_x_mm))} in width against a ball; {mistaken} for "
+        f"{report.case.d_mm:g}: no mesh mends that"
+    )
+    lines.append(f"Eqs 1 to 4 stand in for plane strain with {_percent(report.size_error(empirical))} in size")
+    if warning := outside_range(report.case.d_mm, report.case.depth_ratio):
+        lines.append(warning)
+    for model in (SOLID, PLANE):
+        rule = report.rules[model]
+        default = _default(report, model)
+        lines.append(
+            f"{model}: sizes by {rule.source}, which itself leaves {100 * rule.scatter:.0f} % (SD of ln d); "
+            f"the default mesh leaves {_percent(report.size_error(default))} ({report.size_change_mm(default):+.3f} mm)"
+        )
+        if outside := rule.outside(report.reference(model)):
+            lines.append(f"{model}: the map is none of the calibration's: {', '.join(outside)}")
+    return lines
+
+
+def _enough(report: TradeoffReport, model: str) -> str:
+    """The cheapest sufficient setting of a model, compared with its default and its reference."""
+    found = [one for one in report.of(model) if one.setting.kind in _MESHES]
+    errors: FloatArray = np.array([report.size_error(one) for one in found])
+    least = cheapest(found, errors, tolerance=report.tolerance)
+    limit = f"{100 * report.tolerance:g} %"
+    if least is None or least.setting.kind == "reference":
+        return f"{model}: only the finest setting keeps the size within {limit}"
+    finest, default = report.reference(model), _default(report, model)
+    text = (
+        f"{model}: {least.setting.label} (elements of {least.element_mm:.1f} mm) keeps the size within {limit} at "
+        f"{least.seconds:.2f} s CPU; a mesh finer than {least.element_mm:.1f} mm is wasted below that, "
+        f"the finest costs {finest.seconds / least.seconds:.0f} times as much"
+    )
+    return text if default is least else f"{text}, the default {default.seconds / least.seconds:.1f} times"
+
+
+def _default(report: TradeoffReport, model: str) -> Measured:
+    return next(one for one in report.of(model) if one.setting.kind == "default")
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:+.1f} %"
+
+
+def tradeoff_document(report: TradeoffReport) -> dict[str, Any]:
+    """The trade-off as plain data; errors as shares."""
+    case = report.case
+    return {
+        "schema": "tactile-bayes/tradeoff-forward/1",
+        "lump": {
+            "d_mm": case.d_mm,
+            "depth_ratio": case.depth_ratio,
+            "stiffness_ratio": case.stiffness_ratio,
+            "seat": case.seat,
+        },
+        "head": case.heads,
+        "tolerance": report.tolerance,
+        "sizes": {model: {"source": rule.source, "sd_ln_d": rule.scatter} for model, rule in report.rules.items()},
+        "settings": [_row_of_setting(one, report) for one in report.found],
+        "advice": advice(report),
+    }
+
+
+def _row_of_setting(one: Measured, report: TradeoffReport) -> dict[str, Any]:
+    best = report.reference(one.setting.model)
+    return {
+        "model": one.setting.model,
+        "setting": one.setting.label,
+        "kind": one.setting.kind,
+        "element_mm": one.element_mm,
+        "lump_cpu_s": one.lump_s,
+        "map_cpu_s": one.map_s,
+        "amplitude": one.amplitude,
+        "sigma_x_mm": one.sigma_x_mm,
+        "sigma_y_mm": one.sigma_y_mm,
+        "size_mm": report.size_mm(one),
+        "amplitude_error": change(one.amplitude, best.amplitude),
+        "sigma_x_error": change(one.sigma_x_mm, best.sigma_x_mm),
+        "size_error": report.size_error(one),
+        "size_change_mm": report.size_change_mm(one),
+    }
+
+
+# --- Figure of the forward models' trade-off: error in size against CPU time.
+
+# Smaller errors are drawn here: below rounding of what anybody reads.
+_LEAST_PERCENT = 0.003
+_SIZE_IN = (8.5, 5.0)
+
+
+def draw_tradeoff(report: TradeoffReport, path: Path, *, force: bool = False) -> None:
+    """Draw all settings except the references, whose error is 0 by definition.
+
+    Raises
+    ------
+    UsageError
+        When the file exists and `force` is false.
+    """
+    with figure_file(path, size_in=_SIZE_IN, force=force) as figure:
+        axes = figure.subplots()
+        taken: Counter[tuple[int, int]] = Counter()
+        for i, model in enumerate((EMPIRICAL, PLANE, SOLID)):
+            shown = [one for one in report.of(model) if one.setting.kind != "reference"]
+            seconds = [one.seconds for one in shown]
+            error = [max(100 * abs(report.size_error(one)), _LEAST_PERCENT) for one in shown]
+            axes.plot(seconds, error, MARKS[i], color=COLOURS[i], label=model)
+            for one, x, y in zip(shown, seconds, error, strict=True):
+                name = one.setting.label + (" (default)" if one.setting.kind == "default" else "")
+                place = (round(2 * np.log10(x)), round(4 * np.log10(y)))
+                axes.annotate(name, (x, y), xytext=(7, 3 + 9 * taken[place]), textcoords="offset points", fontsize=7)
+                taken[place] += 1
+            if model != EMPIRICAL:
+                finest = report.reference(model).seconds
+                axes.axvline(finest, color=COLOURS[i], lw=0.8, ls=":")
+                axes.annotate(
+                    f"{model}, finest",
+                    (finest, _LEAST_PERCENT),
+                    xytext=(2, 2),
+                    textcoords="offset points",
+                    fontsize=7,
+                    rotation=90,
+                )
+        axes.axhline(100 * report.tolerance, color="0.6", lw=0.8)
+        for model in (PLANE, SOLID):
+            scatter = 100 * report.rules[model].scatter
+            if np.isfinite(scatter):
+                axes.axhline(scatter, color=COLOURS[1 if model == PLANE else 2], lw=0.8, ls="--")
+        axes.set_xscale("log")
+        axes.set_yscale("log")
+        axes.margins(x=0.2, y=0.1)
+        case = report.case
+        title = (
+            f"one lump, d {case.d_mm:g} mm, h/d {case.depth_ratio:g}; "
+            "grey: not worth paying for; dashed: the calibration itself"
+        )
+        finish(axes, title, "CPU for one map (s)", "error in size (%)")
+        figure.text(0.01, 0.01, RESEARCH_USE, fontsize=7.5, color="0.3")
