@@ -39,7 +39,7 @@ def test_the_live_view_has_the_patients_axes_from_notch_and_xiphoid_alone(names:
 
 def test_a_recording_tells_the_age_of_its_array_calibration(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
-        "tactile_bayes.files.instrument_json.read_array_calibration", lambda _: SimpleNamespace(day=date(2026, 1, 30))
+        "tactile_bayes.actions.record.read_array_calibration", lambda _: SimpleNamespace(day=date(2026, 1, 30))
     )
     request = SimpleNamespace(array_calibration="array.json", uncalibrated=False)
     assert calibration_age(request, today=date(2026, 2, 2)) == {"array_calibration_days": "3"}
