@@ -82,10 +82,22 @@ def number_words(least: float | None, most: float | None, *, whole: bool = False
 
 
 def meant(name: str, known: Collection[str]) -> str:
-    """The way out for a name that is not known: the one that was probably meant, else all of them."""
+    """The way out for a name that is not known: that of another unit, the one that was probably meant, or all."""
+    stem = _without_unit(name)
+    if stem != name and (alike := [one for one in known if _without_unit(one) == stem]):
+        return f"give {alike[0]}, in the unit it names"
     lower = {one.lower(): one for one in known}
     near = difflib.get_close_matches(name.lower(), lower, n=1)
     return f"did you mean {lower[near[0]]}?" if near else f"known are {', '.join(known)}"
+
+
+_UNITS = {"mm", "cm", "m", "um", "in", "kpa", "pa", "mpa", "psi", "s", "ms", "us", "min", "hz", "khz", "deg", "rad"}
+
+
+def _without_unit(name: str) -> str:
+    """``x_cm`` and ``x_mm`` are one quantity."""
+    stem, _, unit = name.rpartition("_")
+    return stem if stem and unit.lower() in _UNITS else name
 
 
 _MOST_SHOWN = 1000  # characters of what a file holds that an error repeats

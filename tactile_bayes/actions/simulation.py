@@ -19,7 +19,7 @@ from tactile_bayes.commands.progress import progress_bar
 from tactile_bayes.declarations import as_dict, names_of
 from tactile_bayes.errors import TactileBayesError
 from tactile_bayes.files.atomic import refuse_existing, write_text
-from tactile_bayes.files.documents import dump_json, read_record, with_session
+from tactile_bayes.files.documents import dump_json, read_toml_record, with_session
 from tactile_bayes.files.instrument_json import read_simulated_head
 from tactile_bayes.files.provenance import Provenance, hash_inputs
 from tactile_bayes.files.scene_toml import read_scene
@@ -140,7 +140,9 @@ def population_action(
     """Simulate exams of varied bodies and fit their maps: the table that a size calibration is learned from."""
     refuse_existing(output, force=force)
     simulated = read_simulated_head(head) if head else Head()
-    drawn = read_record(bodies_file, BodiesFile) if bodies_file else BodiesFile()
+    drawn = BodiesFile()
+    if bodies_file:
+        drawn = read_toml_record(bodies_file, BodiesFile, way_out="see bodies.schema.json")
     bodies, exams = drawn.bodies, drawn.exams
     # results are kept by number: where the centred ones begin decides what a number is
     settings = {

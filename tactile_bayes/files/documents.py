@@ -175,15 +175,19 @@ _LONG_KEY: Final = re.compile(
 
 
 def read_record(path: Path, kind: type[T], *, way_out: str = "give a file this program wrote") -> T:
-    """Read a record from its JSON or TOML file.
+    """Read a record from its JSON file.
 
     Raises
     ------
     BadDataError
         When the file cannot be read, is of another kind, or a field is none of what the record declares.
     """
-    document = load_toml(path, way_out=way_out) if path.suffix == ".toml" else load_json(path, way_out=way_out)
-    return parse_record(document, kind, path=path)
+    return parse_record(load_json(path, way_out=way_out), kind, path=path)
+
+
+def read_toml_record(path: Path, kind: type[T], *, way_out: str) -> T:
+    """Read a record from its TOML file, whatever it is called; for the errors see `read_record`."""
+    return parse_record(load_toml(path, way_out=way_out), kind, path=path)
 
 
 def parse_record(document: object, kind: type[T], *, path: Path) -> T:

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.files.documents import read_record
+from tactile_bayes.files.documents import read_toml_record
 from tactile_bayes.studies.population import BodiesFile, BodyPrior, draw_mass
 
 
@@ -19,7 +19,7 @@ def written(folder: Path, text: str) -> Path:
 
 def test_what_is_given_is_drawn_from(tmp_path: Path) -> None:
     text = "[bodies]\nd_mm = [8, 9]\nseat = [0, 0]\n[exams]\nlines = [3, 3]\n"
-    found = read_record(written(tmp_path, text), BodiesFile)
+    found = read_toml_record(written(tmp_path, text), BodiesFile, way_out="see the schema")
     bodies, exams = found.bodies, found.exams
     assert bodies.d_mm == (8, 9)
     assert bodies.fat_kpa == BodyPrior().fat_kpa
@@ -28,7 +28,7 @@ def test_what_is_given_is_drawn_from(tmp_path: Path) -> None:
         assert 8 <= scene.solid_lumps[0].d_mm <= 9
         assert scene.solid_lumps[0].seat == 0
         assert scene.strokes.lines == 3
-    assert read_record(written(tmp_path, ""), BodiesFile) == BodiesFile()
+    assert read_toml_record(written(tmp_path, ""), BodiesFile, way_out="see the schema") == BodiesFile()
 
 
 @pytest.mark.parametrize(
@@ -51,7 +51,7 @@ def test_what_is_given_is_drawn_from(tmp_path: Path) -> None:
 def test_what_is_no_range_is_one_line(tmp_path: Path, text: str, words: str) -> None:
     path = written(tmp_path, text)
     with pytest.raises(BadDataError) as caught:
-        read_record(path, BodiesFile)
+        read_toml_record(path, BodiesFile, way_out="see the schema")
     assert words in str(caught.value)
     assert "\n" not in str(caught.value)
     assert str(path) in str(caught.value)

@@ -317,7 +317,7 @@ def test_scans_without_a_map_are_refused_in_one_line(make, message):
         ({"pressure_window_kpa": 5.0}, "pressure_window_kpa is 5.0; give a list of 2"),
         ({"pressure_window_kpa": (14.0, 5.0)}, "two rising pressures"),
         ({"pressure_window_kpa": (0.0, 5.0)}, "divided by their mean"),
-        ({"normalise": "median"}, "give one of mean, gain, none"),
+        ({"normalise": "median"}, "Give one of mean, gain, none"),
         ({"latency_ms": float("inf")}, "latency_ms is inf; give a number"),
     ],
 )

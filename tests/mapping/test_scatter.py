@@ -68,8 +68,7 @@ def by_loop(source: Source, level: np.ndarray, limit: float) -> tuple[dict[tuple
 @pytest.mark.parametrize("cell_mm", [0.7, 2.0])
 @pytest.mark.parametrize("seed", range(2))
 def test_sums_are_those_of_a_loop_over_the_readings(seed, cell_mm, limit, monkeypatch):
-    for module in ("cells", "scatter"):
-        monkeypatch.setattr(f"tactile_bayes.mapping.{module}.LIMIT_STEPS", limit)
+    monkeypatch.setattr("tactile_bayes.mapping.cells.LIMIT_STEPS", limit)
     source = source_of(seed, cell_mm)
     level = source.selection.level_kpa[source.selection.used]
     expected, clipped = by_loop(source, level, limit)
