@@ -28,7 +28,7 @@ from tactile_bayes.declarations import (
     to_plain,
 )
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.files.documents import read_record
+from tactile_bayes.files.documents import read_record, read_toml_record
 from tactile_bayes.geometry import Matrix, Vector
 
 Name = Annotated[
@@ -277,4 +277,4 @@ def test_a_file_is_guarded_before_it_is_read(tmp_path, text, words):
 def test_a_toml_file_is_read_as_one_of_json(tmp_path):
     path = tmp_path / "scene.toml"
     path.write_text('schema = "tactile-bayes/test-scene/1"\nname = "one"\nside = "left"\nweights = [1, 2.5]\n')
-    assert to_plain(read_record(path, Scene)) == to_plain(from_plain(Scene, GOOD))
+    assert to_plain(read_toml_record(path, Scene, way_out="see the schema")) == to_plain(from_plain(Scene, GOOD))
