@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 
 from tactile_bayes.declarations import Meta, Record
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.files.documents import load_toml, parse_record
+from tactile_bayes.files.documents import read_toml_record
 from tactile_bayes.files.tables import RawTable, Table, parse_date, read_raw
 
 _EXCISION = ("patient", "mass", "ex_vivo_mm", "ex_vivo_second_mm", "sd_mm", "date")
@@ -150,7 +150,7 @@ def read_wide_excision(path: Path, mapping_path: Path) -> Table:
 
 def read_mapping(path: Path) -> ColumnMap:
     """Read the mapping; for the errors see `files.documents.read_record`."""
-    return parse_record(load_toml(path, way_out="see the column mapping in the tutorial"), ColumnMap, path=path)
+    return read_toml_record(path, ColumnMap, way_out="see the column mapping in the tutorial")
 
 
 def _reading_columns(readings: Sequence[ReadingColumns]) -> list[str]:

@@ -372,7 +372,7 @@ def read_protocol(path: Path) -> Protocol:
     BadDataError
         When the file is not TOML or fixes something that is no setting.
     """
-    return parse_record(load_toml(path, way_out="give the analysis as TOML"), Protocol, path=path)
+    return read_toml_record(path, Protocol, way_out="give the analysis as TOML")
 
 
 # --- Session facts of a recording as TOML: side, posture, lubricant, examiner, subject and other text.

@@ -111,12 +111,34 @@ def _ruler_text(x: float, y: float, text: str) -> str:
     return f'<text x="{x:.2f}" y="{y:g}" text-anchor="middle" font-size="2.7">{html.escape(text)}</text>'
 
 
+# --- Colours of a map, and pixels as PNG.
+
+# From low to high: five colours of viridis (van der Walt & Smith 2015), which also read in grey.
+COLOURS: Final = ((68, 1, 84), (59, 82, 139), (33, 145, 140), (94, 201, 98), (253, 231, 37))
+
+
+def _coloured(values: FloatArray, limits: tuple[float, float], no_data: tuple[int, int, int]) -> NDArray[np.uint8]:
+    """(n, m, 3) colours of values; cells without data are grey."""
+    low, high = limits
+    covered, colours = np.isfinite(values), np.array(COLOURS, dtype=float)
+    at = np.clip((np.where(covered, values, low) - low) / (high - low), 0.0, 1.0) * (len(colours) - 1)
+    mixed = np.stack([np.interp(at, np.arange(len(colours)), colours[:, i]) for i in range(3)], axis=-1)
+    return np.where(covered[..., None], np.rint(mixed), np.array(no_data)).astype(np.uint8)
+
+
+def _png(pixels: NDArray[np.uint8], *, colours: int) -> bytes:
+    """PNG of pixels in a palette of so many colours."""
+    from PIL import Image
+
+    out = io.BytesIO()
+    Image.fromarray(pixels).quantize(colours, dither=Image.Dither.NONE).save(out, "PNG", optimize=True)
+    return out.getvalue()
+
+
 # --- A map as a small picture for a page of many: its values, and a ring where the lump was sized.
 
 LONGEST_PX: Final = 300
 _WIDEST_CELL_PX: Final = 3
-# From low to high: five colours of viridis (van der Walt & Smith 2015), which also read in grey.
-_COLOURS: Final = np.array([(68, 1, 84), (59, 82, 139), (33, 145, 140), (94, 201, 98), (253, 231, 37)], dtype=float)
 _THUMB_NO_DATA: Final = (235, 235, 235)
 _RING: Final = (255, 255, 255)
 # Shares of the cells that the colours' ends leave outside, and the least span between the ends, of the middle value.
@@ -139,19 +161,11 @@ def thumbnail_png(tactile_map: TactileMap, document: Mapping[str, Any]) -> bytes
     step = -(-max(values.shape) // LONGEST_PX)
     values = values[::step, ::step]
     scale = min(_WIDEST_CELL_PX, max(1, LONGEST_PX // max(values.shape)))
-    pixels = _thumb_coloured(values).repeat(scale, axis=0).repeat(scale, axis=1)
-    _draw_ring(pixels, tactile_map, view, document, px_per_cell=scale / step)
-    return _thumb_png(pixels)
-
-
-def _thumb_coloured(values: FloatArray) -> NDArray[np.uint8]:
-    """(n, m, 3) colours of values; cells without data are grey."""
-    covered = np.isfinite(values)
-    low, high = np.quantile(values[covered], _ENDS) if covered.any() else (0.0, 1.0)
+    low, high = np.quantile(values[np.isfinite(values)], _ENDS) if np.isfinite(values).any() else (0.0, 1.0)
     high = max(high, low + _THUMB_LEAST_SPAN * abs(low), low + 1e-12)
-    at = np.clip((np.where(covered, values, low) - low) / (high - low), 0.0, 1.0) * (len(_COLOURS) - 1)
-    mixed = np.stack([np.interp(at, np.arange(len(_COLOURS)), _COLOURS[:, i]) for i in range(3)], axis=-1)
-    return np.where(covered[..., None], np.rint(mixed), np.array(_THUMB_NO_DATA)).astype(np.uint8)
+    pixels = _coloured(values, (low, high), _THUMB_NO_DATA).repeat(scale, axis=0).repeat(scale, axis=1)
+    _draw_ring(pixels, tactile_map, view, document, px_per_cell=scale / step)
+    return _png(pixels, colours=64)
 
 
 def _draw_ring(
@@ -178,18 +192,8 @@ def _draw_ring(
     pixels[rows[inside], columns[inside]] = _RING
 
 
-def _thumb_png(pixels: NDArray[np.uint8]) -> bytes:
-    from PIL import Image
-
-    out = io.BytesIO()
-    Image.fromarray(pixels).quantize(64, dither=Image.Dither.NONE).save(out, "PNG", optimize=True)
-    return out.getvalue()
-
-
 # --- A map as inline SVG: its values, the size ellipse and its interval to scale, sides, nipple, scale bar.
 
-# From low to high: five colours of viridis (van der Walt & Smith 2015), which also read in grey.
-COLOURS: Final = ((68, 1, 84), (59, 82, 139), (33, 145, 140), (94, 201, 98), (253, 231, 37))
 MARGIN_MM: Final = 5.0
 """Round the map, for the names of its sides."""
 _MOST_PIXELS: Final = 1200
@@ -310,7 +314,7 @@ def colour_bar(exam: ExamMap) -> str:
     tactile_map = _map_of(exam)
     covered = tactile_map.covered
     more = " or more" if covered.any() and float(tactile_map.mean[covered].max()) > high else ""
-    steps = _coloured(np.linspace(0.0, 1.0, _BAR_STEPS)[None], (0.0, 1.0))[0]
+    steps = _coloured(np.linspace(0.0, 1.0, _BAR_STEPS)[None], (0.0, 1.0), _NO_DATA)[0]
     width = _BAR_MM / _BAR_STEPS  # plain boxes: not every printer of SVG knows gradients
     boxes = "".join(
         f'<rect x="{14 + width * i:g}" y="0.5" width="{width + 0.05:g}" height="3" fill="#{bytes(colour).hex()}"/>'
@@ -335,35 +339,18 @@ def _cells(exam: ExamMap, frame: Frame) -> str:
     tactile_map, (width, height) = frame.tactile_map, frame.size_mm
     values = frame.view.screen(np.where(tactile_map.covered, tactile_map.mean, np.nan))
     step = -(-max(values.shape) // _MOST_PIXELS)
-    pixels = _coloured(values[::step, ::step], colour_limits(exam))
+    pixels = _coloured(values[::step, ::step], colour_limits(exam), _NO_DATA)
     times = max(1, min(_CELL_PX, _MOST_PIXELS // max(pixels.shape[:2])))
     pixels = pixels.repeat(times, axis=0).repeat(times, axis=1)
     few = frame.view.screen(tactile_map.few)[::step, ::step].repeat(times, axis=0).repeat(times, axis=1)
     rows, columns = np.indices(few.shape)
     pixels[few & ((rows + columns) % _STRIPES_PX < _STRIPES_PX // 4)] = 255
-    data = base64.b64encode(_png(pixels)).decode("ascii")
+    data = base64.b64encode(_png(pixels, colours=128)).decode("ascii")
     box = f'x="0" y="0" width="{width:.2f}" height="{height:.2f}"'
     return (
         f'<image {box} preserveAspectRatio="none" href="data:image/png;base64,{data}"/>'
         f'<rect {box} fill="none" stroke="#333" stroke-width="0.3"/>'
     )
-
-
-def _coloured(values: FloatArray, limits: tuple[float, float]) -> NDArray[np.uint8]:
-    """(n, m, 3) colours of values; cells without data are grey."""
-    low, high = limits
-    covered, colours = np.isfinite(values), np.array(COLOURS, dtype=float)
-    at = np.clip((np.where(covered, values, low) - low) / (high - low), 0.0, 1.0) * (len(colours) - 1)
-    mixed = np.stack([np.interp(at, np.arange(len(colours)), colours[:, i]) for i in range(3)], axis=-1)
-    return np.where(covered[..., None], np.rint(mixed), np.array(_NO_DATA)).astype(np.uint8)
-
-
-def _png(pixels: NDArray[np.uint8]) -> bytes:
-    from PIL import Image
-
-    out = io.BytesIO()
-    Image.fromarray(pixels).quantize(128, dither=Image.Dither.NONE).save(out, "PNG", optimize=True)
-    return out.getvalue()
 
 
 def _edges(frame: Frame, *, small: bool) -> Iterator[str]:
