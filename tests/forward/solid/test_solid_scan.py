@@ -178,7 +178,7 @@ IMPOSSIBLE = [
     ("[body]\nfat_mm = 80", "body.fat_mm puts the gland 80 mm deep"),
     ("[body]\nnu = 0.5", "body.nu is 0.5; give a number from 0 to below 0.5"),
     ("[body]\nfat = 5", "body.fat is not known; did you mean fat_mm"),
-    ("[body]\nthickness_cm = 7", "body.thickness_cm is not known; did you mean thickness_mm"),
+    ("[body]\nthickness_cm = 7", "body.thickness_cm is not known; give thickness_mm, in the unit it names"),
     ("[body]\nfat_kpa = -5", "body.fat_kpa is -5"),
     (LUMP + "depth_ratio = 1\n[[lump]]\namplitude = 0.2", "some lumps are bumps"),
     ("[head]\nrim_mm = 40", "head.rim_mm is 40; it must lie in 0 to below radius_mm, 35"),
@@ -188,7 +188,7 @@ IMPOSSIBLE = [
     ("[[rib]]\nspacing_mm = 1", r"rib\[0\] is a row of 81 balls; give spacing_mm or half_length_mm for 60 or fewer"),
     ("[[rib]]\nstiffness_ratio = 0", r"rib\[0\].stiffness_ratio is 0; give a number above 0 up to 1e"),
     ("[[rib]]\ndiameter_mm = 9", r"rib\[0\].diameter_mm is not known"),
-    ("[[rib]]\ny_cm = 2", r"rib\[0\].y_cm is not known; did you mean y_mm"),
+    ("[[rib]]\ny_cm = 2", r"rib\[0\].y_cm is not known; give y_mm, in the unit it names"),
     ("[[rib]]\n[[lump]]\namplitude = 0.2", r"lump\[0\] is a bump and rib\[0\] is tissue"),
 ]
 
