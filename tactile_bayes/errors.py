@@ -83,10 +83,11 @@ def number_words(least: float | None, most: float | None, *, whole: bool = False
 
 def meant(name: str, known: Collection[str]) -> str:
     """The way out for a name that is not known: that of another unit, the one that was probably meant, or all."""
-    stem = _without_unit(name)
-    if stem != name and (alike := [one for one in known if _without_unit(one) == stem]):
-        return f"give {alike[0]}, in the unit it names"
     lower = {one.lower(): one for one in known}
+    stem = _without_unit(name)
+    alike = [one for one in known if _without_unit(one) == stem]
+    if stem != name and alike and name.lower() not in lower:
+        return f"give {alike[0]}, in the unit it names"
     near = difflib.get_close_matches(name.lower(), lower, n=1)
     return f"did you mean {lower[near[0]]}?" if near else f"known are {', '.join(known)}"
 

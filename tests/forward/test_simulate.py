@@ -155,7 +155,7 @@ def test_an_empty_scene_is_the_default_scene() -> None:
 
 
 BAD_SCENES = [
-    ("[noise]\nelement_kPa = 1", "noise.element_kPa is not known; give element_kpa, in the unit it names"),
+    ("[noise]\nelement_kPa = 1", "noise.element_kPa is not known; did you mean element_kpa"),
     ("[[lump]]\nx_cm = 1", r"lump\[0\].x_cm is not known; give x_mm, in the unit it names"),
     ("[[lump]]\namplitud = 1", "did you mean amplitude"),
     ("[strks]\nlines = 1", "strks is not known; did you mean strokes"),
