@@ -462,7 +462,7 @@ def _is_record(kind: Any) -> bool:
 
 
 def _is_array(kind: Any) -> bool:
-    return getattr(get_origin(kind) or kind, "__name__", "") == "ndarray"
+    return getattr(get_origin(kind) or kind, "__name__", "") in ("ndarray", "NDArray")  # an alias from numpy 2.5 on
 
 
 def _way_out(kind: Any, value: Any) -> str:
