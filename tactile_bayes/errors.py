@@ -134,7 +134,7 @@ class BadDataError(TactileBayesError, ValueError):
     def __str__(self) -> str:
         what = _shortened(self.what)
         head = f"{self.path}: {what}" if self.path else what
-        text = f"{head}; {self.way_out}" if self.way_out else head
+        text = f"{head}; {_shortened(self.way_out)}" if self.way_out else head
         return "\\n".join(text.splitlines())  # names and values from a file may hold newlines
 
     def at(self, path: object) -> BadDataError:

@@ -17,7 +17,7 @@ import pytest
 from tactile_bayes.api.settings import read_settings
 from tactile_bayes.batch_store import open_store
 from tactile_bayes.errors import BadDataError, UsageError
-from tactile_bayes.files.column_map import read_mapping
+from tactile_bayes.files.column_map import read_mapping, read_wide
 from tactile_bayes.files.documents import parse_toml, read_protocol
 from tactile_bayes.files.estimate_json import read_stated_size
 from tactile_bayes.files.identify import describe
@@ -202,6 +202,14 @@ def test_a_calibration_with_a_short_row_is_one_line(place: tuple[str, ...], tmp_
     path.write_text(hostile.ragged_calibration(PACKAGE / "calibrations" / "solid.json", *place))
     with pytest.raises(BadDataError, match=place[-1]):
         read_size_calibration(path)
+
+
+def test_a_header_without_end_is_told_in_short(tmp_path: Path) -> None:
+    (tmp_path / "map.toml").write_text('patient = "record_id"\n[[reading]]\nmodality = "palpation"\nsize = "ex"\n')
+    (tmp_path / "wide.csv").write_text("[" * 5000 + ",ex\n1,2\n")
+    with pytest.raises(BadDataError, match="record_id: is missing") as error:
+        read_wide(tmp_path / "wide.csv", tmp_path / "map.toml")
+    assert len(str(error.value)) < 2000
 
 
 CHUNKS: dict[str, tuple[bytes, str]] = {
