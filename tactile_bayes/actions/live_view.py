@@ -95,18 +95,12 @@ def live_view(
 
 
 class LiveAnswer(NamedTuple):
-    """Result of one live estimate; empty where the previous one stays.
-
-    Parameters
-    ----------
-    text
-        The size in a line, or why there is none.
-    lump_base_mm : (3,) array or None
-        Centre of the lump in `base`.
-    """
+    """Result of one live estimate; empty where the previous one stays."""
 
     text: str = ""
+    """The size in a line, or why there is none."""
     lump_base_mm: FloatArray | None = None
+    """Centre of the lump in `base`."""
 
 
 class Estimator:

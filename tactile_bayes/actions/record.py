@@ -50,13 +50,7 @@ class Request(RecordOptions, kw_only=True):
     """Options of one recording, and what of them its file stores."""
 
     def facts(self) -> dict[str, str]:
-        """Session facts as text: from the file, overridden by options.
-
-        Raises
-        ------
-        BadDataError
-            When the file cannot be read, or a fact is none of `Session`.
-        """
+        """Session facts as text: from the file, overridden by options."""
         facts = read_session(self.session_file) if self.session_file else {}
         options = {name: getattr(self, name) for name in ("side", "posture", "lubricant", "examiner", "subject")}
         facts |= {name: value for name, value in options.items() if value}
@@ -87,13 +81,7 @@ _NOMINAL_FULL_SCALE = 4095
 
 
 def instrument_of(request: Request) -> tuple[HeadGeometry, ElementCalibration, Landmarks | None]:
-    """Read geometry, calibration and landmarks from the files given.
-
-    Raises
-    ------
-    UsageError
-        When one is missing or given twice.
-    """
+    """Read geometry, calibration and landmarks from the files given; one missing or given twice is an error."""
     from tactile_bayes.files.scan_mcap import read_scan
 
     like = read_scan(request.like) if request.like else None
@@ -175,7 +163,7 @@ class Stopper:
 
     @property
     def interrupted(self) -> bool:
-        """Whether a signal has come."""
+        """True when a signal has come."""
         return bool(self._why)
 
     def look(self) -> None:
@@ -280,15 +268,7 @@ def _check_rom(request: Request) -> None:
 
 
 def make_recording(request: Request) -> tuple[Report, bool]:
-    """Check the devices, record and close the file; returns the account, and whether it was interrupted.
-
-    Raises
-    ------
-    UsageError
-        When the options contradict each other, the files or the head.
-    DeviceError
-        When a port cannot be opened, or another device answers on it.
-    """
+    """Check the devices, record and close the file; returns the account, and whether it was interrupted."""
     from tactile_bayes.files.scan_recording import RecordingWriter, create_exclusive, full_disk
 
     _check_rom(request)

@@ -204,19 +204,7 @@ def rows_of_mass(
     exams: ExamPrior | None = None,
     head: Head | None = None,
 ) -> list[MassRow]:
-    """Rows of one mass, in any process.
-
-    Parameters
-    ----------
-    index
-        Number of the mass.
-    scans, seed, bodies, exams, head
-        As `forward.population.draw_mass`'s.
-    first_centred
-        From this mass on the lumps are centred on the gland's surface.
-    normalise
-        As `studies.population.measure_mass`'s.
-    """
+    """Rows of one mass, in any process; from mass `first_centred` on the lumps are centred on the gland's surface."""
     prior = bodies or BodyPrior()
     prior = on_the_boundary(prior) if index >= first_centred else prior
     scenes = draw_mass(index, scans=scans, seed=seed, bodies=prior, exams=exams, head=head)

@@ -130,14 +130,8 @@ def draw_figures(
 ) -> list[str]:
     """Draw figures 5 to 8 of the paper; say where they are and what was found for them.
 
-    Parameters
-    ----------
-    seat
-        Of the lumps that are drawn and not in the table.
-    fit
-        Of Eq 5 to a line, for the plane-strain model.
-    phantom, frames
-        Lump and measured frames of figure 6; None and none for the paper's phantom.
+    The seat is of the lumps that are drawn and not in the table; without a phantom and its frames figure 6 shows the
+    paper's.
     """
     if isinstance(settings, StudySettings):
         paths = figure_paths(folder, model="plane-strain")
@@ -216,13 +210,7 @@ def study_settings(
     flat_field: bool | None = None,
     head: str | None = None,
 ) -> StudySettings | SolidSettings:
-    """Make the study's settings from the command line's options.
-
-    Raises
-    ------
-    UsageError
-        When a level or a flat field is asked of the model that has neither.
-    """
+    """Make the study's settings from the command line's options."""
     default = SHOULDERS_INSIDE if model == "plane-strain" else SHOULDERS_OUTSIDE
     section = Head(radius_mm=head_radius_mm, shoulder_mm=shoulder_mm, shoulders=head or default)
     if model == "plane-strain":
@@ -262,13 +250,7 @@ def run_study(
     executor: Executor,
     output: Path | None = None,
 ) -> list[StudyRow]:
-    """Compute all rows, in order of the geometries; finished ones are stored beside `output`.
-
-    Raises
-    ------
-    BadDataError
-        When a geometry cannot be, before any is computed.
-    """
+    """Compute all rows, in order of the geometries; finished ones are stored beside `output`."""
     for geometry in geometries:
         settings.body(geometry.d_mm, geometry.depth_ratio, seat=geometry.seat)
     opened = (
@@ -339,10 +321,8 @@ def _decode(rows: list[dict[str, Any]]) -> list[StudyRow]:
 def fit_line(line: TactileLine, radius_mm: float) -> LineFit:
     """Fit Eq 5 with background 1 and the bump on the lump's axis, averaged over cells as for a patient's map.
 
-    Notes
-    -----
-    Only widths from half a cell to three quarters of the radius count, also as for a patient's map. A bump that runs
-    to either end is reported there.
+    Only widths from half a cell to three quarters of the radius count, also as for a patient's map. A bump that runs to
+    either end is reported there.
     """
     inside = (np.abs(line.x_mm) <= radius_mm) & (line.count > 0)
     x, excess = line.x_mm[inside], line.mean[inside] - 1.0

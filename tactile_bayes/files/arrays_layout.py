@@ -8,27 +8,17 @@ Shape = tuple[str | int, ...]
 
 
 class ArrayLayout(NamedTuple):
-    """One array of a scan in an .npz file.
-
-    Parameters
-    ----------
-    shape
-        Lengths of its axes; n frames, m poses. Letters are lengths that must agree between arrays.
-    meaning
-        What it holds.
-    kind
-        Numbers it may have: ``integer`` or ``real``.
-    unit
-        Of its numbers; ``1`` where they have none.
-    frame
-        Coordinate frame of places and directions, or the clock of times; empty where there is none.
-    """
+    """One array of a scan in an .npz file."""
 
     shape: Shape
+    """Lengths of its axes; n frames, m poses. Letters are lengths that must agree between arrays."""
     meaning: str
     kind: str = "real"
+    """Numbers it may have: ``integer`` or ``real``."""
     unit: str = "1"
+    """Of its numbers; ``1`` where they have none."""
     frame: str = ""
+    """Coordinate frame of places and directions, or the clock of times; empty where there is none."""
 
 
 LAYOUT: Final[dict[str, ArrayLayout]] = {

@@ -39,13 +39,7 @@ _PROMISED: Final = frozenset(suffix for known in _SUFFIXES.values() for suffix i
 
 
 def check_suffix(path: Path, written: Format) -> None:
-    """Refuse a name that promises another format than the one written; any unknown suffix may be given, or none.
-
-    Raises
-    ------
-    UsageError
-        Naming the suffix, the format and a name that fits.
-    """
+    """Refuse a name that promises another format than the one written; any unknown suffix may be given, or none."""
     suffix = path.suffix.lower()
     if suffix in _PROMISED and suffix not in _SUFFIXES[written]:
         fitting = path.with_suffix(_SUFFIXES[written][0]).name
@@ -53,7 +47,7 @@ def check_suffix(path: Path, written: Format) -> None:
 
 
 def same_file(one: Path, other: Path) -> bool:
-    """Whether two paths lead to one file, by symbolic or hard links too; neither needs to exist."""
+    """True when two paths lead to one file, by symbolic or hard links too; neither needs to exist."""
     return _identity(one) == _identity(other)
 
 
@@ -68,7 +62,7 @@ def given_twice(paths: Iterable[Path]) -> Path | None:
 
 
 def _identity(path: Path) -> tuple[int, int] | str:
-    """What all names of a file have in common; where it does not exist, the name that it would have."""
+    """Identity that all names of a file share; where it does not exist, the name that it would have."""
     try:
         found = path.stat()
     except OSError:  # opening it says what is wrong with it
@@ -88,13 +82,8 @@ _WAYS_OUT = {
 
 
 def refuse_existing(path: Path, *, force: bool) -> None:
-    """Raise an error, before any work is done, when `path` cannot become an output.
-
-    Raises
-    ------
-    UsageError
-        When `path` exists and --force was not given; when it is a directory, a FIFO, a socket or a device, whether or
-        not --force was given; when its directory does not exist or may not be written.
+    """Raise an error, before any work is done, when `path` exists and --force was not given, is a directory or a device
+    (with or without --force), or lies in a directory that does not exist or may not be written.
     """
     try:
         kind = special_kind(path.stat().st_mode)
@@ -123,15 +112,10 @@ def _target(path: Path) -> Path:
 def atomic_path(path: Path, *, force: bool = False) -> Iterator[Path]:
     """Give a temporary path beside `path`, which becomes `path` when the block ends without an error.
 
-    The file is created with mode 0600, flushed to disk and renamed over the target, so that a kill at any
-    moment leaves the old file or none. If the block raises, the temporary file goes; what a killed process of this
-    computer left beside the same target goes with the next write. A symbolic link stays, and what it points to is
-    replaced. Nothing but the writing belongs inside the block: each `OSError` in it is told as a failed write.
-
-    Raises
-    ------
-    UsageError
-        As `refuse_existing`, or when the system does not take the file (a full disk, a read-only one, a long name).
+    The file is created with mode 0600, flushed to disk and renamed over the target, so that a kill at any moment leaves
+    the old file or none. If the block raises, the temporary file goes; what a killed process of this computer left
+    beside the same target goes with the next write. A symbolic link stays, and what it points to is replaced. Nothing
+    but the writing belongs inside the block: each `OSError` in it is told as a failed write.
     """
     refuse_existing(path, force=force)
     target = _target(path)
@@ -213,13 +197,7 @@ def write_bytes(path: Path, data: bytes, *, force: bool = False) -> None:
 
 
 def write_all(files: Mapping[Path, bytes], *, force: bool = False) -> None:
-    """Write several files atomically: none is there before the system has taken the bytes of all.
-
-    Raises
-    ------
-    UsageError
-        As `atomic_path`.
-    """
+    """Write several files atomically: none is there before the system has taken the bytes of all."""
     with contextlib.ExitStack() as stack:
         for path, data in files.items():
             stack.enter_context(atomic_path(path, force=force)).write_bytes(data)
@@ -233,13 +211,7 @@ def unwritable(path: Path, error: OSError) -> UsageError:
 
 
 def sha256(path: Path) -> str:
-    """Hex digest of a file's bytes.
-
-    Raises
-    ------
-    BadDataError
-        When the file cannot be read.
-    """
+    """Hex digest of a file's bytes."""
     with open_input(path) as file:
         try:
             return hashlib.file_digest(file, "sha256").hexdigest()

@@ -86,13 +86,7 @@ class ColumnMap(Record):
 
 
 def read_wide(path: Path, mapping_path: Path) -> Table:
-    """Convert a wide table to a tidy one with the columns of ``trial.table.json``; readings keep their line numbers.
-
-    Raises
-    ------
-    BadDataError
-        At the first fault of the mapping or of a cell, naming file, line and column of the wide table.
-    """
+    """Convert a wide table to a tidy one with the columns of ``trial.table.json``; readings keep their line numbers."""
     mapping = read_mapping(mapping_path)
     if mapping.reading is None:
         way_out = "add one for each modality, or give a table of readings that is tidy"
@@ -112,13 +106,8 @@ def read_wide(path: Path, mapping_path: Path) -> Table:
 
 
 def read_wide_excision(path: Path, mapping_path: Path) -> Table:
-    """Read ex-vivo sizes from a wide table into columns of ``excision.table.json``; rows without a size are left out.
-
-    Raises
-    ------
-    BadDataError
-        At the first fault, as `read_wide`, when the mapping has no table ``[excision]``, or when two rows are of one
-        mass.
+    """Read ex-vivo sizes from a wide table into columns of ``excision.table.json``; rows without a size are
+    left out.
     """
     mapping = read_mapping(mapping_path)
     if mapping.excision is None:

@@ -36,13 +36,7 @@ def load_schema(name: str) -> dict[str, Any]:
 
 
 def check_document(document: object, schema_name: str, *, path: Path) -> None:
-    """Check a JSON document against its schema.
-
-    Raises
-    ------
-    BadDataError
-        Naming the file, the field, its value and the rule it breaks.
-    """
+    """Check a JSON document against its schema."""
     import fastjsonschema
 
     _check_kind(document, schema_name, path=path)
@@ -66,7 +60,7 @@ _KINDS: Final = {
 
 
 def _in_words(error: Any) -> tuple[str, str]:
-    """What is wrong in a document, and what can be given instead, without the words of schemas."""
+    """Fault of a document and what can be given instead, without the words of schemas."""
     where = ".".join(map(str, error.path[1:])) or "the document"
     what, wanted, definition = f"{where} is {_shown(error.value)}", error.rule_definition, error.definition
     if error.rule == "required":
@@ -91,7 +85,7 @@ def _in_words(error: Any) -> tuple[str, str]:
 
 
 def _allowed(definition: Mapping[str, Any]) -> str:
-    """What a definition allows, such as "give a number above 0"."""
+    """Values that a definition allows, such as "give a number above 0"."""
     for several in ("anyOf", "oneOf"):
         if several in definition:
             return f"give {' or '.join(_allowed(one).removeprefix('give ') for one in definition[several])}"
@@ -175,13 +169,7 @@ _LONG_KEY: Final = re.compile(
 
 
 def read_record(path: Path, kind: type[T], *, way_out: str = "give a file this program wrote") -> T:
-    """Read a record from its JSON file.
-
-    Raises
-    ------
-    BadDataError
-        When the file cannot be read, is of another kind, or a field is none of what the record declares.
-    """
+    """Read a record from its JSON file."""
     return parse_record(load_json(path, way_out=way_out), kind, path=path)
 
 
@@ -206,13 +194,7 @@ def parse_record(document: object, kind: type[T], *, path: Path) -> T:
 
 
 def load_json(path: Path, *, way_out: str = "give a file this program wrote") -> object:
-    """Read a JSON file of any content.
-
-    Raises
-    ------
-    BadDataError
-        When it cannot be read or is not JSON, is too large or too deep, or holds a number that no double holds.
-    """
+    """Read a JSON file of any content. Too large, too deep or a number that no double holds is an error."""
     try:
         return parse_json(read_text(path, most=JSON_BYTES, way_out=way_out), way_out=way_out)
     except BadDataError as error:
@@ -223,13 +205,7 @@ def load_json(path: Path, *, way_out: str = "give a file this program wrote") ->
 
 
 def parse_json(text: str, *, name: str = "", way_out: str = "copy the file again") -> object:
-    """Parse a JSON text; for the errors see `load_json`.
-
-    Parameters
-    ----------
-    name
-        Of the part of a file that the text is, for the error; empty for a whole file.
-    """
+    """Parse a JSON text as `load_json` does; `name` is the part of a file that the text is, empty for a whole file."""
     with decoding(f"{name} is not JSON".lstrip(), way_out=way_out):
         document: object = json.loads(text, object_pairs_hook=partial(_object, way_out=way_out))
     check_plain(document, way_out=way_out, name=name)
@@ -246,13 +222,7 @@ def _object(pairs: list[tuple[str, Any]], *, way_out: str) -> dict[str, Any]:
 
 
 def load_toml(path: Path, *, way_out: str) -> dict[str, Any]:
-    """Read a TOML file.
-
-    Raises
-    ------
-    BadDataError
-        When it cannot be read or is not TOML, is too large or too deep, or holds a number that no double holds.
-    """
+    """Read a TOML file. Too large, too deep or a number that no double holds is an error."""
     try:
         text = read_text(path, most=TOML_BYTES, way_out=way_out)
         return parse_toml(text.removeprefix("\ufeff"), way_out=way_out)  # the mark that some editors begin a file with
@@ -273,13 +243,7 @@ def parse_toml(text: str, *, way_out: str) -> dict[str, Any]:
 
 
 def check_plain(document: object, *, way_out: str, name: str = "") -> None:
-    """Refuse data that no report can hold: too deep, no finite numbers, broken or control characters.
-
-    Raises
-    ------
-    BadDataError
-        Naming the first such value.
-    """
+    """Refuse data that no report can hold: too deep, no finite numbers, broken or control characters."""
     level = [(name, document)]
     for _ in range(MOST_LEVELS):
         level = [part for where, item in level for part in _parts(where, item, way_out=way_out)]
@@ -308,13 +272,7 @@ def _parts(where: str, item: object, *, way_out: str) -> Iterator[tuple[str, obj
 
 
 def check_text(where: str, text: str, *, way_out: str) -> None:
-    """Refuse a text with surrogates, control characters or marks that turn what follows.
-
-    Raises
-    ------
-    BadDataError
-        Naming the place and the character.
-    """
+    """Refuse a text with surrogates, control characters or marks that turn what follows."""
     if not text.isascii() and any("\ud800" <= letter <= "\udfff" for letter in text):
         raise BadDataError(f"{where or 'a key'} holds a broken character: {text[:40]!a}", way_out=way_out)
     if not text.isprintable() and (found := _CONTROL.search(text)):
@@ -365,13 +323,7 @@ class Protocol(Record, forbid_unknown_fields=False):
 
 
 def read_protocol(path: Path) -> Protocol:
-    """Read the title and the settings under ``[analysis]``; the rest counts only through the file's hash.
-
-    Raises
-    ------
-    BadDataError
-        When the file is not TOML or fixes something that is no setting.
-    """
+    """Read the title and the settings under ``[analysis]``; the rest counts only through the file's hash."""
     return read_toml_record(path, Protocol, way_out="give the analysis as TOML")
 
 
@@ -455,13 +407,7 @@ class Session(Record, forbid_unknown_fields=False):
 
 
 def check_session(session: Mapping[str, object], *, path: Path) -> None:
-    """Hold the facts of a scan against `Session`; others are text by names in small letters.
-
-    Raises
-    ------
-    BadDataError
-        For a fact that is none, or may name a person.
-    """
+    """Hold the facts of a scan against `Session`; others are text by names in small letters."""
     for name in session:
         if name in OF_A_PERSON:
             way_out = "leave it out: nothing here may identify a person"
@@ -480,13 +426,7 @@ def with_session(scan: Scan, path: Path | None) -> Scan:
 
 
 def read_session(path: Path) -> dict[str, str]:
-    """Read the session facts.
-
-    Raises
-    ------
-    BadDataError
-        When the file is not TOML, a fact is none of `Session`, or a key is one of `SET_BY_RECORDING`.
-    """
+    """Read the session facts."""
     document = load_toml(path, way_out='give facts as TOML: side = "left"')
     for key in SET_BY_RECORDING:
         if key in document:

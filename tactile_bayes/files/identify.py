@@ -28,18 +28,7 @@ _TABLES = (
 
 
 def describe(path: Path) -> dict[str, Any]:
-    """Describe a file: schema, shape, units, quality and provenance.
-
-    Returns
-    -------
-    dict
-        With ``schema``, ``kind`` and whatever the kind has to say.
-
-    Raises
-    ------
-    BadDataError
-        When it is none of our files.
-    """
+    """Describe a file of ours: ``schema``, ``kind``, and shape, units, quality and provenance as the kind has them."""
     with open_input(path) as file:
         head = file.read(4096)
     if head.startswith(MCAP_MAGIC):
@@ -190,7 +179,7 @@ def _size_calibration(path: Path, document: dict[str, Any]) -> dict[str, Any]:
 
 
 def _described(calibration: Calibration, document: dict[str, Any]) -> dict[str, Any]:
-    """What a calibration's document says of it, without its long arrays."""
+    """Facts of a calibration's document, without its long arrays."""
     from tactile_bayes.size.bodies import BodyCalibration
 
     if isinstance(calibration, BodyCalibration):

@@ -34,13 +34,7 @@ _MOST_COUNTED: Final = 8
 
 
 def read_table(path: Path) -> FloatArray:
-    """Read a table as an (ny, nx) array, NaN where a field is empty.
-
-    Raises
-    ------
-    BadDataError
-        Naming the row and column, what it holds and the way out.
-    """
+    """Read a table as an (ny, nx) array, NaN where a field is empty."""
     text = _text(path)
     separator = next((one for one in ";\t" if one in text), ",")
     with decoding("is not a table of text", way_out=_WAY_OUT):
@@ -119,7 +113,7 @@ def _refuse(line: FloatArray, where: str) -> None:
 
 
 def _evenly(line: FloatArray) -> bool:
-    """Whether three numbers or more run in equal steps."""
+    """True when three numbers or more run in equal steps."""
     steps = np.diff(line)
     return len(line) > 2 and bool(steps[0] != 0.0) and bool(np.allclose(steps, steps[0], rtol=1e-6, atol=0.0))
 
@@ -145,26 +139,13 @@ _MOST_KPA: Final = 1000.0
 
 
 def read_grid(path: Path, *, spacing_mm: float | None = None, normalise: str = "none", units: str = "") -> TactileMap:
-    """Read a grid of values as a map.
+    """Read a grid of values as a map: an ``.npz`` with ``mean (ny, nx)`` and, if known, ``count``, ``variance`` (NaN
+    where count is 1) and ``spacing_mm``; a table of numbers (see `grid_table`), an empty field for a cell without data;
+    or a grey ``.tif``, ``.pgm`` or ``.png`` image.
 
-    Parameters
-    ----------
-    path
-        ``.npz`` with ``mean (ny, nx)`` and, if known, ``count``, ``variance`` (NaN where count is 1) and
-        ``spacing_mm``; a table of numbers (see `grid_table`), an empty field for a cell without data; or a grey
-        ``.tif``, ``.pgm`` or ``.png`` image.
-    spacing_mm
-        Side of the square cells; may be left out when the ``.npz`` holds it.
-    normalise
-        What was done to the values already: ``"mean"`` or ``"gain"`` when 1 is the level far from a lump, ``"none"``
-        when the level is not known. Nothing is divided here.
-    units
-        Of the values, where nothing was divided, for labels; empty if unknown.
-
-    Raises
-    ------
-    BadDataError, UsageError
-        Naming the file, the array or row, its value and the way out.
+    `spacing_mm` is the side of the square cells and may be left out when the ``.npz`` holds it. `normalise` says what
+    was done to the values already: ``"mean"`` or ``"gain"`` when 1 is the level far from a lump, ``"none"`` when the
+    level is not known. Nothing is divided here. `units` labels values that were not divided.
     """
     suffix = path.suffix.lower()
     try:
@@ -348,13 +329,7 @@ _LARGEST: Final = 1e12
 
 
 def read_arrays(path: Path) -> Scan:
-    """Read a scan from an .npz file of the layout above.
-
-    Raises
-    ------
-    BadDataError
-        Naming the file, the array, its value and the way out.
-    """
+    """Read a scan from an .npz file of the layout above."""
     try:
         required = [name for name in LAYOUT if name not in OPTIONAL]
         shapes = {name: in_words(layout.shape) for name, layout in LAYOUT.items()}

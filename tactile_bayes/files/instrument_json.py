@@ -27,33 +27,21 @@ _T = TypeVar("_T")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScanFile:
-    """A scan and the report on its file.
-
-    Parameters
-    ----------
-    scan
-        Everything that could be read.
-    complete
-        True when the file was closed properly and nothing was lost.
-    damaged
-        True when bytes changed after they were written (a checksum failed); an unfinished file is not damaged.
-    lost
-        One line a loss, for people.
-    topics
-        Messages read, by topic.
-    provenance
-        What made the file, as `Provenance.as_dict` wrote it.
-    schema
-        Schema id of the file.
-    """
+    """A scan and the report on its file."""
 
     scan: Scan
     complete: bool
+    """The file was closed properly and nothing was lost."""
     damaged: bool
+    """A checksum failed: bytes changed after they were written. An unfinished file is not damaged."""
     lost: tuple[str, ...]
+    """One line a loss, for people."""
     topics: Mapping[str, int]
+    """Messages read, by topic."""
     provenance: Mapping[str, Any]
+    """As `Provenance.as_dict` wrote it."""
     schema: str
+    """Schema id of the file."""
 
 
 def ns_from_s(time_s: FloatArray) -> NDArray[np.int64]:
@@ -212,13 +200,7 @@ class HeadFile(Record, kw_only=True):
 
 
 def read_head_geometry(path: Path) -> HeadGeometry:
-    """Read the places of the taxels and the mounting of the tracker.
-
-    Raises
-    ------
-    BadDataError
-        Naming the file, the key, its value and what is allowed.
-    """
+    """Read the places of the taxels and the mounting of the tracker."""
     file = _read_head(path)
     try:
         if file.scanhead_from_tracker is None:
@@ -230,13 +212,7 @@ def read_head_geometry(path: Path) -> HeadGeometry:
 
 
 def read_simulated_head(path: Path) -> Head:
-    """Read a head for the solid model, in which taxels form a regular grid on an arc, or on a plane.
-
-    Raises
-    ------
-    BadDataError
-        Naming the file, the key, its value and what is allowed; also for taxels on another surface.
-    """
+    """Read a head for the solid model, in which taxels form a regular grid on an arc, or on a plane."""
     file = _read_head(path)
     try:
         return _arc(file) if file.surface_mm is None else _fitted(file, np.array(file.surface_mm))
@@ -332,13 +308,7 @@ def write_array_calibration(path: Path, content: ArrayCalibrationFile, *, force:
 
 
 def read_array_calibration(path: Path) -> ArrayCalibrationFile:
-    """Read the calibration of an array.
-
-    Raises
-    ------
-    BadDataError
-        When it is another file, or damaged.
-    """
+    """Read the calibration of an array."""
     return read_record(path, ArrayCalibrationFile, way_out="give a file from `tactile-bayes calibrate array`")
 
 

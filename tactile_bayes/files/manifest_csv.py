@@ -93,12 +93,9 @@ def natural(code: str) -> tuple[int, str]:
 def read_manifest(path: Path) -> list[Exam]:
     """Read the table; exams come in the order of `Exam.order`, whatever the order of the rows.
 
-    Raises
-    ------
-    BadDataError
-        Naming the line, the column, the value and the way out: a cell that is not as ``exams.table.json`` has it, a
-        path that leaves the table's folder or has backslashes, half a place, codes that differ by capitals alone, rows
-        of one mass that contradict each other, visits of one mass whose order is not known.
+    Besides cells that are not as ``exams.table.json`` has them it refuses a path that leaves the table's folder or has
+    backslashes, half a place, codes that differ by capitals alone, rows of one mass that contradict each other, and
+    visits of one mass whose order is not known.
     """
     table = read_table(path, SCHEMA)
     exams = [_exam(table, row) for row in range(len(table))]
@@ -197,13 +194,7 @@ def write_manifest(path: Path, rows: Iterable[Mapping[str, object]], *, force: b
 
 
 def read_rows(path: Path) -> RawTable:
-    """Read the rows of a table as they stand, cells that are still blank included.
-
-    Raises
-    ------
-    BadDataError
-        When it is no CSV table, or lacks one of the columns that every table of exams has.
-    """
+    """Read the rows of a table as they stand, cells that are still blank included."""
     table = read_raw(path)
     for name in ("file", "patient", "visit", "mass", "replicate"):
         if name not in table.header:

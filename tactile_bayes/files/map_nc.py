@@ -66,23 +66,8 @@ _TRANSFORMS = {
 
 
 def write_map(path: Path, tactile_map: TactileMap, *, provenance: Provenance, force: bool = False) -> None:
-    """Write a map atomically, readable by its owner only.
-
-    Parameters
-    ----------
-    path
-        Usually ``*.nc``.
-    provenance
-        What made the map; it holds no clock time, so that equal maps give equal bytes.
-    force
-        Overwrite an existing file.
-
-    Raises
-    ------
-    UsageError
-        When `path` exists and `force` is false.
-    BadDataError
-        When the map's axes do not step by its cell.
+    """Write a map atomically, readable by its owner only; `provenance` holds no clock time, so equal maps give equal
+    bytes.
     """
     _check_lattice({"x_mm": tactile_map.x_mm, "y_mm": tactile_map.y_mm}, tactile_map.recipe.cell_mm)
     groups = {"/": Contents(_variables(tactile_map), _attributes(tactile_map, provenance))}
@@ -106,13 +91,7 @@ def _variables(tactile_map: TactileMap) -> dict[str, Variable]:
 
 
 def read_map(path: Path) -> TactileMap:
-    """Read a map and check all of it.
-
-    Raises
-    ------
-    BadDataError
-        Naming the file, the variable or attribute, its value and the way out.
-    """
+    """Read a map and check all of it."""
     return read_map_and_scans(path)[0]
 
 
@@ -141,12 +120,8 @@ def read_map_and_scans(path: Path) -> tuple[TactileMap, tuple[dict[str, str], ..
 
 
 def read_map_header(path: Path) -> dict[str, Any]:
-    """Read a map's schema, recipe, quality and provenance without its arrays.
-
-    Returns
-    -------
-    dict with ``schema``, ``recipe`` (`MapRecipe`), ``quality``, ``masked_taxels``, ``head``, ``nipple_mm``,
-    ``findings``, ``provenance``, ``background``, ``frame_count`` and ``shape`` (ny, nx).
+    """Read a map without its arrays: ``schema``, ``recipe`` (`MapRecipe`), ``quality``, ``masked_taxels``, ``head``,
+    ``nipple_mm``, ``findings``, ``provenance``, ``background``, ``frame_count`` and ``shape`` (ny, nx).
     """
     with open_netcdf(path, way_out=_WAY_OUT) as file:
         shape = tuple(_dimension(file, name) for name in ("y", "x"))
@@ -349,17 +324,8 @@ def write_posterior(
 ) -> None:
     """Write the draws of an estimate atomically; equal draws give equal bytes, see `grouped_netcdf_bytes`.
 
-    Parameters
-    ----------
-    groups
-        What goes beside the draws, see `inference_groups`.
-    document
-        The estimate's JSON object, which `read_estimate` gives back.
-
-    Raises
-    ------
-    ValueError
-        When there is no estimate: there are no draws to write.
+    `groups` go beside the draws, see `inference_groups`; `document` is the estimate's JSON object, which
+    `read_estimate` gives back. A map without an estimate has no draws: a ValueError.
     """
     if estimate.map_posterior is None or estimate.draws is None:
         raise ValueError("no estimate, so no posterior to write")
@@ -431,7 +397,7 @@ def _with_coordinates(arrays: Mapping[str, tuple[tuple[str, ...], FloatArray]]) 
 
 
 class PosteriorDraws(Record, eq=False):
-    """What a posterior file says."""
+    """Contents of a posterior file."""
 
     method: str
     """That gave the draws."""
@@ -442,17 +408,11 @@ class PosteriorDraws(Record, eq=False):
     scans: tuple[dict[str, str], ...] = ()
     """The scans at the beginning, as `Provenance.scans` has them."""
     findings: tuple[Finding, ...] = ()
-    """What speaks against the estimate."""
+    """They speak against the estimate."""
 
 
 def read_posterior(path: Path) -> PosteriorDraws:
-    """Read what `write_posterior` or `write_pooled` wrote.
-
-    Raises
-    ------
-    BadDataError
-        When the file is no posterior, holds no draws, or is damaged.
-    """
+    """Read what `write_posterior` or `write_pooled` wrote."""
     way_out = "give what `estimate` wrote with -o"
     with open_netcdf(path, way_out=way_out) as file:
         group = file.group("posterior")
@@ -475,12 +435,8 @@ def read_posterior(path: Path) -> PosteriorDraws:
 
 
 def read_estimate(path: Path) -> dict[str, Any]:
-    """The estimate's JSON object, as ``estimate --json`` prints it, from its posterior's file.
-
-    Raises
-    ------
-    BadDataError
-        When the file is no posterior, is of several maps, or is damaged.
+    """The estimate's JSON object, as ``estimate --json`` prints it, from its posterior's file. A pooled posterior has
+    none and is refused.
     """
     with open_netcdf(path, way_out="give what `estimate` wrote with -o") as file:
         group = file.group("posterior")
@@ -497,7 +453,7 @@ def read_estimate(path: Path) -> dict[str, Any]:
 
 
 def is_posterior(path: Path) -> bool:
-    """Whether a netCDF file holds a posterior, of this program or another, and no map."""
+    """True when a netCDF file holds a posterior, of this program or another, and no map."""
     with open_netcdf(path, way_out="give a map, or what `estimate` wrote with -o") as file:
         return file.group("posterior") is not None
 

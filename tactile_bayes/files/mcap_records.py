@@ -27,39 +27,19 @@ _MOST_WINDOW: Final = 2**27
 
 
 class Unpacker:
-    """Unpacks chunks and counts the bytes that come out.
-
-    Parameters
-    ----------
-    file_bytes
-        Size of the file.
-    """
+    """Unpacks chunks and counts the bytes that come out, against a limit that grows with the size of the file."""
 
     def __init__(self, file_bytes: int) -> None:
         self._most = unpacked_limit(file_bytes)
         self._unpacked = 0
 
     def count(self, number: int) -> None:
-        """Add to the number of unpacked bytes.
-
-        Raises
-        ------
-        BadDataError
-            When it is over the limit.
-        """
+        """Add to the number of unpacked bytes."""
         self._unpacked += number
         check_limit(self._unpacked, self._most, what="it unpacks to {} bytes or more")
 
     def unpack(self, chunk: Any) -> bytes:
-        """The records of a chunk.
-
-        Raises
-        ------
-        BadDataError
-            When the file unpacks to more than its limit.
-        Exception
-            Of many kinds, when the chunk is damaged; `damage` says it in words.
-        """
+        """The records of a chunk; a damaged one raises exceptions of many kinds, which `damage` says in words."""
         data = self._decompress(chunk)
         if len(data) != chunk.uncompressed_size:
             raise ValueError(f"it holds {len(data)} bytes and declares {chunk.uncompressed_size}")
@@ -119,13 +99,7 @@ _KINDS: Final = {
 
 
 class Messages:
-    """Times and bodies of messages in file order, without a Python object per message.
-
-    Parameters
-    ----------
-    keep
-        Whether bodies are kept, or times only.
-    """
+    """Times of messages in file order, and bodies if `keep`, without a Python object per message."""
 
     def __init__(self, *, keep: bool = True) -> None:
         self._times = array("Q")
@@ -166,46 +140,32 @@ class Messages:
 
 @dataclass(slots=True)
 class McapRecords:
-    """Content of a file, as far as it could be read.
-
-    Parameters
-    ----------
-    keep
-        Topics whose messages are kept; of others only the times are. None keeps all.
-    by_channel
-        Messages by channel id.
-    chunks, last_ns
-        Chunks met, and the host time at which the last intact one ends.
-    all_data
-        Every message was met, whatever follows.
-    finished
-        The file was closed properly.
-    damaged
-        A checksum failed or a record made no sense before the end.
-    lost
-        One line a loss.
-    """
+    """Content of a file, as far as it could be read."""
 
     keep: Collection[str] | None = None
+    """Topics whose messages are kept; of others only the times are. None keeps all."""
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
     attachments: dict[str, bytes] = field(default_factory=dict)
     schemas: dict[int, str] = field(default_factory=dict)
     channels: dict[int, Any] = field(default_factory=dict)
     by_channel: dict[int, Messages] = field(default_factory=dict)
+    """Messages by channel id."""
     chunks: int = 0
+    """Chunks met."""
     last_ns: int = 0
+    """Host time at which the last intact chunk ends."""
     all_data: bool = False
+    """Every message was met, whatever follows."""
     finished: bool = False
+    """The file was closed properly."""
     damaged: bool = False
+    """A checksum failed or a record made no sense before the end."""
     lost: list[str] = field(default_factory=list)
+    """One line a loss."""
 
     def messages(self, topic: str, *, schema: str, name: str | None = None) -> Messages:
-        """Messages of a topic (and of channels with that `name` in their metadata).
-
-        Raises
-        ------
-        BadDataError
-            When a channel of the topic holds another type.
+        """Messages of a topic (and of channels with that `name` in their metadata). A channel of another type is an
+        error.
         """
         found = Messages()
         for number, channel in self.channels.items():
@@ -239,17 +199,8 @@ class McapRecords:
 
 
 def read_records(path: Path, *, keep: Collection[str] | None = None) -> McapRecords:
-    """Read a file from front to back, with or without its index.
-
-    Parameters
-    ----------
-    keep
-        Topics whose messages are kept; of others only the times are. None keeps all.
-
-    Raises
-    ------
-    BadDataError
-        When the file cannot be opened, is no MCAP file or unpacks to more than its limit.
+    """Read a file from front to back, with or without its index; of topics not in `keep` only the times, None keeps
+    all.
     """
     records = McapRecords(keep=keep)
     with open_input(path) as stream:

@@ -34,18 +34,10 @@ _ALIGNMENT: Final = 8
 
 
 def check_heaps(data: bytes, *, way_out: str) -> None:
-    """Refuse a file whose global heap has free space of size 0.
+    """Refuse a file whose global heap has free space of size 0, or heaps inside one another.
 
-    The HDF5 library (seen with 2.0) walks from object to object by their sizes and would stay at that one.
-
-    Raises
-    ------
-    BadDataError
-        When there is such a heap, or when heaps lie inside one another.
-
-    References
-    ----------
-    HDF5 File Format Specification 3.0, III.E, "Disk Format: Level 1E - Global Heap".
+    The HDF5 library (seen with 2.0) walks from object to object by their sizes and would stay at that one. HDF5 File
+    Format Specification 3.0, III.E, "Disk Format: Level 1E - Global Heap".
     """
     steps = len(data) // _OBJECT.size  # as many objects as the file can hold
     start = data.find(_COLLECTION)
@@ -84,13 +76,13 @@ class Variable(Record):
     attributes: Mapping[str, str]
     """Text by name: units, a long name."""
     fill: float | None = None
-    """What stands for "no value" in a variable that may have none: its ``_FillValue``. Not for coordinates."""
+    """Stands for "no value" in a variable that may have none: its ``_FillValue``. Not for coordinates."""
     scale: float | None = None
-    """What the stored numbers are to be multiplied by: the ``scale_factor`` of the CF conventions."""
+    """Factor on the stored numbers: the ``scale_factor`` of the CF conventions."""
 
 
 class Contents(Record):
-    """What one group of a netCDF file holds."""
+    """Contents of one group of a netCDF file."""
 
     variables: Mapping[str, Variable]
     """By name; one that is called as its only dimension becomes that dimension's coordinate."""
@@ -160,17 +152,7 @@ MOST: Final = 1e12
 
 
 class Group:
-    """One group of an open netCDF file; all that is read is checked first.
-
-    Parameters
-    ----------
-    place
-        The group, of h5py.
-    most_bytes
-        What the arrays of the file may unpack to.
-    way_out
-        What to do about a fault of the file.
-    """
+    """One group of an open netCDF file; all that is read is checked first, and may unpack to `most_bytes` in all."""
 
     def __init__(self, place: Any, *, most_bytes: int, way_out: str) -> None:
         self._place = place
@@ -198,7 +180,7 @@ class Group:
         return None if found is None or len(found.shape) != 1 else int(found.shape[0])
 
     def holds(self, name: str) -> bool:
-        """Whether an array of this name exists; a dimension without values is not one."""
+        """True when an array of this name exists; a dimension without values is not one."""
         found = self._dataset(name)
         return found is not None and not _is_bare(found)
 
@@ -207,19 +189,8 @@ class Group:
         return sorted(name for name in map(str, self._place) if self.holds(name))
 
     def array(self, name: str, *, kind: str, dimensions: tuple[str, ...]) -> Any:
-        """The values of a variable; None where there is none.
-
-        Parameters
-        ----------
-        kind
-            The type that it must have: ``f8``, ``i8``, ``u2``.
-        dimensions
-            The dimensions that it must have.
-
-        Raises
-        ------
-        BadDataError
-            When it has other dimensions or another type, is over the limits, or its bytes are damaged.
+        """The values of a variable of the given type (``f8``, ``i8``, ``u2``) and dimensions; None where
+        there is none.
         """
         found = self._dataset(name)
         if found is None or _is_bare(found):
@@ -298,7 +269,7 @@ def _text(value: Any) -> str | None:
 
 
 def _is_bare(dataset: Any) -> bool:
-    """Whether a dataset only represents a dimension without values."""
+    """True when a dataset only represents a dimension without values."""
     name = dataset.attrs.get("NAME", b"")
     text = name.decode("utf-8", "replace") if isinstance(name, bytes) else str(name)
     return text.startswith(_NO_VARIABLE.partition("{")[0])
@@ -314,7 +285,7 @@ def _dimensions(dataset: Any) -> tuple[str, ...]:
 
 
 def _has_scales(dataset: Any) -> bool:
-    """Whether a list of scales is attached as it must be: HDF5 ends the process over one of another type."""
+    """True when a list of scales is attached as it must be: HDF5 ends the process over one of another type."""
     if "DIMENSION_LIST" not in dataset.attrs:
         return False
     listed = dataset.attrs.get_id("DIMENSION_LIST")
@@ -325,13 +296,7 @@ def _has_scales(dataset: Any) -> bool:
 
 @contextlib.contextmanager
 def open_netcdf(path: Path, *, way_out: str) -> Iterator[Group]:
-    """The root group of a netCDF-4 file; every fault in the block becomes a `BadDataError` that names `path`.
-
-    Raises
-    ------
-    BadDataError
-        When the file cannot be read, is no netCDF-4 file or is damaged.
-    """
+    """The root group of a netCDF-4 file; every fault in the block becomes a `BadDataError` that names `path`."""
     try:
         with open_input(path) as stream, decoding(_DAMAGED, way_out=way_out):
             if stream.read(len(HDF5_MAGIC)) != HDF5_MAGIC:

@@ -34,18 +34,10 @@ _HEADERS: Final = {
 def load_npz(
     path: Path, *, required: Sequence[str], optional: Sequence[str], shapes: Mapping[str, str] | None = None
 ) -> Arrays:
-    """Read the named arrays of an .npz file.
+    """Read the named arrays of an .npz file; `shapes` says in words what a missing one should be.
 
-    Parameters
-    ----------
-    shapes
-        In words, for the error where an array is missing.
-
-    Raises
-    ------
-    BadDataError
-        When the file is no .npz, is cut off, encrypted or damaged, lacks a required array, unpacks to more than its
-        limit, or holds an array that only pickle could read. The error names no path.
+    An encrypted file, one that unpacks to more than its limit and an array that only pickle could read are errors. They
+    name no path.
     """
     with open_input(path) as stream:
         _check_zip(stream)
@@ -104,27 +96,16 @@ SHAPES = {"chain": 4, "log_density": 2, "accepted": 1, "twister": 2, "cursor": 2
 
 
 class CheckpointFile:
-    """A checkpoint file, rewritten after each block of steps.
+    """A checkpoint file, made when it does not exist and rewritten after each block of steps.
 
-    Parameters
-    ----------
-    path
-        Made when it does not exist.
-    context
-        What else the chain depends on, for example the calibration's hash; another's checkpoint is refused.
+    `context` is what else the chain depends on, for example the calibration's hash; another's checkpoint is refused.
     """
 
     def __init__(self, path: Path, *, context: str = "") -> None:
         self.path, self.context = path, context
 
     def load(self, key: str) -> ChainState | None:
-        """Read the state; None when there is no file.
-
-        Raises
-        ------
-        BadDataError
-            When the file is of another map, calibration or setting, or no checkpoint.
-        """
+        """Read the state; None when there is no file, an error when it is of another map, calibration or setting."""
         if not self.path.exists():
             return None
         try:
@@ -181,13 +162,7 @@ def write_shape(path: Path, shape: ShapeDraws, *, force: bool = False) -> None:
 
 
 def read_shape(path: Path) -> ShapeDraws:
-    """Read what `write_shape` wrote.
-
-    Raises
-    ------
-    BadDataError
-        When the file is damaged, or its draws are not of one length.
-    """
+    """Read what `write_shape` wrote."""
     try:
         optional = [name for name in ShapeDraws.__struct_fields__ if name not in _DRAWS]
         arrays = load_npz(path, required=_DRAWS, optional=optional)

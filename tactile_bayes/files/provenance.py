@@ -11,7 +11,7 @@ from tactile_bayes.declarations import Record, field
 from tactile_bayes.files.atomic import sha256
 
 EXAM_FACTS: Final = ("subject", "side", "posture", "examiner", "visit", "mass", "array_calibration_days")
-"""What a scan's session says of its exam and array calibration; codes only, see ``scan_session.schema.json``."""
+"""Facts of a scan's session on its exam and array calibration; codes only, see ``scan_session.schema.json``."""
 _DIGESTS: Final = ("sha256", "frames_sha256")
 """Of a scan's file, and of its frames alone, which stays when the scan is written again with another session."""
 
@@ -49,14 +49,8 @@ def hash_inputs(**paths: Path) -> dict[str, str]:
 
 
 def scan_facts(session: Mapping[str, str], *, frames: str, file: str = "") -> dict[str, str]:
-    """Digests of a scan and what its session says of the exam, for `Provenance.scans`.
-
-    Parameters
-    ----------
-    frames
-        As `PressureFrames.sha256` gives it.
-    file
-        SHA-256 of the scan's file; empty for a scan that is in none.
+    """Digests of a scan and what its session says of the exam, for `Provenance.scans`: `frames` as
+    `PressureFrames.sha256` gives it, `file` the SHA-256 of its file, empty for a scan that is in none.
     """
     facts = {name: session[name] for name in EXAM_FACTS if session.get(name)}
     return {**({"sha256": file} if file else {}), **facts, "frames_sha256": frames}
@@ -74,7 +68,7 @@ def scans_of(document: object) -> tuple[dict[str, str], ...]:
 
 
 def recordings(scans: Sequence[Mapping[str, str]]) -> Iterator[str]:
-    """What tells the recordings of some scans from others: digests of their frames and of their files.
+    """Digests of scans' frames and files, which tell their recordings from others.
 
     Two exams are of one recording where they share any of them.
     """

@@ -1,4 +1,4 @@
-"""What kind of file it is, and reading it within limits."""
+"""The kind of a file, and reading it within limits."""
 
 from __future__ import annotations
 
@@ -41,13 +41,7 @@ _KINDS: Final = (
 
 
 def open_input(path: Path) -> io.BufferedReader:
-    """Open a regular file for reading; never waits on a pipe or a device.
-
-    Raises
-    ------
-    BadDataError
-        When there is no such file, it may not be read, or it is a directory, a FIFO, a socket or a device.
-    """
+    """Open a regular file for reading; a directory, a FIFO, a socket or a device is refused, never waited on."""
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOCTTY)
     except OSError as error:
@@ -65,13 +59,7 @@ def special_kind(mode: int) -> str:
 
 
 def read_bytes(path: Path, *, most: int) -> bytes:
-    """All bytes of a regular file of up to `most` bytes (times ``TACTILE_BAYES_LIMITS``).
-
-    Raises
-    ------
-    BadDataError
-        When the file cannot be read or is larger.
-    """
+    """All bytes of a regular file of up to `most` bytes (times ``TACTILE_BAYES_LIMITS``)."""
     with open_input(path) as file:
         try:
             check_limit(os.fstat(file.fileno()).st_size, most, what="it has {} bytes")
@@ -101,19 +89,8 @@ def decoded(data: bytes, *, path: Path, way_out: str, encoding: str = "utf-8") -
 
 
 def check_limit(size: int, most: int, *, what: str) -> None:
-    """Refuse a declared size over a limit.
-
-    Parameters
-    ----------
-    size, most
-        Both of one unit; `most` is multiplied by ``TACTILE_BAYES_LIMITS``.
-    what
-        Says what was declared, with ``{}`` for the number: ``"mean has {} cells"``.
-
-    Raises
-    ------
-    BadDataError
-        When `size` is larger.
+    """Refuse a declared size over `most` times ``TACTILE_BAYES_LIMITS``; `what` is a sentence with ``{}`` for the
+    number: ``"mean has {} cells"``.
     """
     allowed = most * limit_factor()
     if size > allowed:
@@ -130,13 +107,7 @@ def unpacked_limit(file_bytes: int) -> int:
 
 
 def limit_factor() -> float:
-    """Factor on every limit, from ``TACTILE_BAYES_LIMITS``.
-
-    Raises
-    ------
-    UsageError
-        When ``TACTILE_BAYES_LIMITS`` is no number above 0.
-    """
+    """Factor on every limit, from ``TACTILE_BAYES_LIMITS``."""
     text = os.environ.get(LIMITS_VARIABLE, "1")
     try:
         factor = float(text)
@@ -149,15 +120,11 @@ def limit_factor() -> float:
 
 @contextlib.contextmanager
 def decoding(what: str, *, way_out: str) -> Iterator[None]:
-    """Turn any error of a decoder on damaged bytes into one `BadDataError`.
+    """Turn any error of a decoder on damaged bytes into one `BadDataError`; `what` is the fault: ``"cannot be
+    decoded"``.
 
     Only calls into decoders of other packages belong inside: each of them has error classes of its own, and damaged
     bytes bring out others as well.
-
-    Parameters
-    ----------
-    what
-        What could not be done: ``"cannot be decoded"``.
     """
     try:
         yield
@@ -226,12 +193,8 @@ def kind_of(path: Path) -> str:
 
 
 def schema_kind(schema: object) -> str:
-    """Kind of a document by its schema, in words; empty for a schema that is not this program's.
-
-    Parameters
-    ----------
-    schema
-        The value of the document's ``schema``, such as ``tactile-bayes/estimate/1``.
+    """Kind of a document in words by its ``schema``, such as ``tactile-bayes/estimate/1``; empty for another
+    program's.
     """
     parts = schema.split("/") if isinstance(schema, str) else []
     if len(parts) < 2 or parts[0] != "tactile-bayes":
@@ -240,16 +203,10 @@ def schema_kind(schema: object) -> str:
 
 
 def not_a(path: Path, wanted: str, *, what: str, way_out: str) -> BadDataError:
-    """Error for a file of another kind than the reader's; names the kind where it is known.
+    """Error for a file of another kind than `wanted` (in the words of `kind_of`); names the kind where it is known.
 
-    Parameters
-    ----------
-    path
-        The file.
-    wanted
-        What the reader reads, as `kind_of` would call it.
-    what, way_out
-        The fault and the remedy where the file's kind is unknown, or is the wanted one and damaged.
+    `what` and `way_out` are the fault and the remedy where it is not, or where the file is of the wanted kind and
+    damaged.
     """
     found = kind_of(path)
     if not found or found == wanted:

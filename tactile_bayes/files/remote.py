@@ -23,18 +23,12 @@ _READ_BYTES: Final = 2**20
 
 
 def is_address(name: object) -> bool:
-    """Whether a name is the address of a file or folder in an object store, as ``s3://bucket/scan.mcap``."""
+    """True when a name is the address of a file or folder in an object store, as ``s3://bucket/scan.mcap``."""
     return isinstance(name, str) and name.startswith(tuple(f"{scheme}://" for scheme in SCHEMES))
 
 
 def check_address(address: str) -> str:
-    """Address without a slash at its end.
-
-    Raises
-    ------
-    UsageError
-        When it has no bucket, or holds what does not belong into an address, as a user or a password.
-    """
+    """Address without a slash at its end; it must have a bucket and no user or password."""
     if not _ADDRESS.fullmatch(address):
         raise UsageError(
             "the address of the object store is not as s3://bucket/folder; no user, port or password in it"
@@ -43,15 +37,7 @@ def check_address(address: str) -> str:
 
 
 def version_of(address: str) -> str:
-    """What the store says of a file's content without reading it: size, time and tag.
-
-    Raises
-    ------
-    BadDataError
-        When there is none, or nobody with these credentials may read it.
-    UsageError
-        When the store does not answer or the package for it is missing.
-    """
+    """Size, time and tag that the store gives of a file's content without reading it."""
     try:
         known = _store(address).info(address)
     except Exception as error:
@@ -86,13 +72,7 @@ def fetched(address: str) -> Iterator[Path]:
 
 
 def put(path: Path, address: str) -> None:
-    """Copy a local file into a store; it appears there whole or not at all.
-
-    Raises
-    ------
-    UsageError
-        When the store does not take it.
-    """
+    """Copy a local file into a store; it appears there whole or not at all."""
     try:
         _store(address).put_file(str(path), address)
     except Exception as error:

@@ -74,18 +74,11 @@ _LATEST_NS: Final = 2**63 - 1
 
 
 class ScanWriter:
-    """Writer of one scan to a stream: first its description, then messages in order of arrival.
+    """Writer of one scan to a binary stream, which stays open: first its description, then messages in order of
+    arrival.
 
-    Parameters
-    ----------
-    stream
-        Binary, opened for writing; it stays open.
-    head, element_calibration, session, provenance
-        Written before the first message.
-    truth
-        What a simulated scan was made from; `read_truth` returns it, `read_scan` does not.
-    findings
-        What speaks against the scan, where it is a copy of another file's.
+    `truth` is what a simulated scan was made from; `read_truth` returns it, `read_scan` does not. `findings` speak
+    against a scan that is a copy of another file's.
     """
 
     def __init__(
@@ -235,13 +228,6 @@ def write_scan(
     """Write a scan; equal scans give equal bytes under one version of zstd and protobuf.
 
     A `Scan` knows no host times: ``log_time`` is then the device time. Landmarks, which have no time, carry the first.
-
-    Raises
-    ------
-    UsageError
-        When `path` exists and `force` is false.
-    BadDataError
-        When the session holds what a scan file must not.
     """
     refuse_existing(path, force=force)
     check_session(scan.session, path=path)
@@ -278,11 +264,8 @@ def _write_messages(writer: ScanWriter, scan: Scan) -> None:
 def read_scan(path: Path) -> Scan:
     """Read a scan; from an unfinished file, everything up to the last complete chunk.
 
-    Raises
-    ------
-    BadDataError
-        When the file is no scan, or holds damaged chunks: a scan with a hole must not pass for a whole one.
-        `read_scan_report` reads around the damage.
+    Damaged chunks are an error: a scan with a hole must not pass for a whole one. `read_scan_report` reads around the
+    damage.
     """
     file = read_scan_report(path)
     if file.damaged:
@@ -295,12 +278,8 @@ def read_scan(path: Path) -> Scan:
 
 
 def read_scan_report(path: Path) -> ScanFile:
-    """Read a scan, with a report of the file's content and losses.
-
-    Raises
-    ------
-    BadDataError
-        When the file cannot be read, is no scan, or was cut off before its first complete chunk.
+    """Read a scan, with a report of the file's content and losses. A file cut off before its first complete chunk is an
+    error.
     """
     records = scan_records(path, keep=TOPICS)
     try:
@@ -316,13 +295,7 @@ def read_truth(path: Path) -> dict[str, Any] | None:
 
 
 def scan_records(path: Path, *, keep: Collection[str]) -> McapRecords:
-    """Read all records, after checking that the file is a scan of a known version.
-
-    Parameters
-    ----------
-    keep
-        Topics whose messages are kept; of others only the times are.
-    """
+    """Read all records of a scan of a known version; of topics not in `keep` only the times."""
     records = read_records(path, keep=keep)
     schema = records.metadata.get("tactile-bayes", {}).get("schema")
     if schema is None:
@@ -367,7 +340,7 @@ def _assemble(records: McapRecords, *, path: Path) -> ScanFile:
 
 
 def file_findings(records: McapRecords) -> tuple[Finding, ...]:
-    """What a scan's file had lost, what its recorder noted, and what the file said that it is a copy of."""
+    """Losses of a scan's file, notes of its recorder, and findings of the file that it is a copy of."""
     kept = parse_json(records.metadata.get("findings", {}).get("json", "[]"), name="findings")
     noted = records.metadata.get("recording", {}).get("cautions", "").splitlines()
     lost = [Finding("data_lost", text) for text in records.lost]
@@ -390,13 +363,7 @@ def json_object(text: str, *, name: str) -> dict[str, Any]:
 
 
 def message_times(messages: Messages, *, topic: str) -> FloatArray:
-    """Times of messages, s.
-
-    Raises
-    ------
-    BadDataError
-        When one lies beyond what 63 bits of nanoseconds hold.
-    """
+    """Times of messages, s; one beyond what 63 bits of nanoseconds hold is an error."""
     times = messages.times_ns
     latest = int(times.max()) if len(times) else 0
     if latest > _LATEST_NS:
@@ -468,10 +435,7 @@ def _decode(kind: Any, body: bytes) -> Any:
 def summarise_scan(path: Path) -> dict[str, Any]:
     """Summarise frames, poses, duration, losses, session and provenance; memory grows by one time per message.
 
-    Raises
-    ------
-    BadDataError
-        As `read_scan_report`, but for messages that hold what they must not: nothing looks into them.
+    Nothing looks into the messages: those that hold what they must not are not met.
     """
     records = scan_records(path, keep=())
     try:

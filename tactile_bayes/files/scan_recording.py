@@ -33,11 +33,6 @@ def create_exclusive(path: Path, *, force: bool) -> IO[bytes]:
     """Create a new file for its owner only; under its final name, because it must survive a kill.
 
     It is locked until it is closed: another recording, or `repair`, leaves it alone.
-
-    Raises
-    ------
-    UsageError
-        When `path` exists and `force` is false, cannot be made, or is being recorded.
     """
     refuse_existing(path, force=force)
     flags = os.O_WRONLY | os.O_CREAT | (0 if force else os.O_EXCL)
@@ -115,14 +110,8 @@ def _to_disk(descriptor: int) -> None:
 
 
 class RecordingWriter(ScanWriter):
-    """A `ScanWriter` that can flush at once, and stores notes about problems.
-
-    Parameters
-    ----------
-    stream
-        A new file.
-    head, element_calibration, session, provenance
-        As for `ScanWriter`; the session was checked, before the file was made.
+    """A `ScanWriter` that can flush at once, and stores notes about problems; the session was checked before the file
+    was made.
     """
 
     def __init__(
@@ -154,12 +143,8 @@ class RecordingWriter(ScanWriter):
     def flush(self) -> None:
         """Close the chunk and hand it to the system, from where it survives this process.
 
-        Within `SYNC_S` it is on the disk too, and survives the computer.
-
-        Raises
-        ------
-        OSError
-            When the system, or the disk before this, could not take it.
+        Within `SYNC_S` it is on the disk too, and survives the computer. An OSError may be that of the disk before this
+        call.
         """
         self._writer.flush()
         if self._syncer is None:

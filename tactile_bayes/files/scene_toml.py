@@ -94,13 +94,7 @@ class SceneFile(Record):
 
 
 def read_scene(path: Path) -> Scene:
-    """Read a scene; missing keys take their defaults.
-
-    Raises
-    ------
-    BadDataError
-        Naming the file, the key, its value and what is allowed.
-    """
+    """Read a scene; missing keys take their defaults."""
     text = read_text(path, most=TOML_BYTES, way_out="give a scene as TOML")
     try:
         return scene_from_toml(text)

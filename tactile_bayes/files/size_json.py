@@ -35,7 +35,7 @@ _FOLDER = Path(__file__).resolve().parents[1] / "calibrations"
 
 
 def is_shipped(path: Path) -> bool:
-    """Whether a file comes with the program; the tests check those against their schemas."""
+    """True when a file comes with the program; the tests check those against their schemas."""
     return path.parent == _FOLDER
 
 
@@ -45,14 +45,9 @@ def default_for(normalise: str) -> str:
 
 
 def size_calibration_path(name: str) -> Path | None:
-    """Path of a calibration given by name or path; None for ``none``.
+    """Path of a calibration given by name or path; None for ``none``; a name that is neither is an error.
 
     A file of the same name in the working directory needs a ``./`` before it.
-
-    Raises
-    ------
-    UsageError
-        When it is no name of a calibration and no file either: most likely a name that was typed wrong.
     """
     if name == NONE:
         return None
@@ -179,13 +174,7 @@ def _eq6_document(calibration: SizeCalibration) -> dict[str, Any]:
 
 
 def read_size_calibration(path: Path) -> Calibration:
-    """Read a size calibration of any form; one that comes with the program is read once in a process.
-
-    Raises
-    ------
-    BadDataError
-        When the file is not one, or a field is none of what its record declares.
-    """
+    """Read a size calibration of any form; one that comes with the program is read once in a process."""
     return _shipped(path) if is_shipped(path) else parse_size_calibration(load_json(path), path=path)
 
 
@@ -336,14 +325,8 @@ def repeatability_document(
     half_width: HalfWidth | None,
     provenance: Provenance,
 ) -> dict[str, Any]:
-    """The JSON object; numbers keep nine significant digits.
-
-    Parameters
-    ----------
-    repeats, half_width
-        As `RepeatabilityFile` has them.
-    left_out
-        Exams that took no part, with the reason.
+    """The JSON object, in numbers of nine significant digits; `left_out` are exams that took no part, with
+    the reason.
     """
     file = RepeatabilityFile(
         schema="tactile-bayes/repeatability/1",
@@ -374,12 +357,6 @@ def write_repeatability(path: Path, document: dict[str, Any], *, force: bool = F
 
 
 def read_repeatability(path: Path) -> Repeatability:
-    """Read what `write_repeatability` wrote.
-
-    Raises
-    ------
-    BadDataError
-        When the file is none, or a field is none of what `RepeatabilityFile` declares.
-    """
+    """Read what `write_repeatability` wrote."""
     found = read_record(path, RepeatabilityFile, way_out="give a file of `calibrate repeatability`")
     return found.repeatability(sha256(path))

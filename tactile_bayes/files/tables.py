@@ -47,17 +47,11 @@ class Cells(Record):
     separator: str = ","
     """Between the cells."""
     decimal_comma: bool = False
-    """Whether numbers are written as 12,5."""
+    """True when numbers are written as 12,5."""
 
 
 def read_text(path: Path) -> str:
-    """Text of a CSV file in UTF-8, with or without a byte order mark.
-
-    Raises
-    ------
-    BadDataError
-        When it is something else; spreadsheets and other encodings are named.
-    """
+    """Text of a CSV file in UTF-8, with or without a byte order mark."""
     data = read_bytes(path, most=TABLE_BYTES)
     for marks, what, way_out in _NOT_TEXT:
         if data.startswith(marks):
@@ -66,13 +60,7 @@ def read_text(path: Path) -> str:
 
 
 def cells_of(path: Path, text: str) -> Cells:
-    """Split CSV text into cells; columns without a name or any filled cell are left out.
-
-    Raises
-    ------
-    BadDataError
-        Naming the line where it is not CSV.
-    """
+    """Split CSV text into cells; columns without a name or any filled cell are left out."""
     separator = separator_in(text)
     rows = _rows(path, text, separator)
     if not rows:
@@ -97,7 +85,7 @@ def separator_in(text: str) -> str:
 
 
 def may_be_thousands(number: str) -> bool:
-    """Whether the comma of a number may separate thousands as well as decimals: 1,234 but not 0,234 or 1,23."""
+    """True when the comma of a number may separate thousands as well as decimals: 1,234 but not 0,234 or 1,23."""
     whole, _, rest = number.partition(",")
     return len(rest) == 3 and not whole.lstrip("+-").startswith("0")
 
@@ -131,7 +119,7 @@ def _without_blank_columns(
 
 
 def _has_decimal_commas(body: Sequence[tuple[int, list[str]]]) -> bool:
-    """Whether some cell can be read as a number with a decimal comma alone."""
+    """True when some cell can be read as a number with a decimal comma alone."""
     cells = (cell.strip() for _, row in body for cell in row)
     return any(DECIMAL_COMMA.fullmatch(cell) and not may_be_thousands(cell) for cell in cells)
 
@@ -173,26 +161,13 @@ class Table(Record):
         return len(self.line_numbers)
 
     def error(self, row: int, column: str, what: str, *, way_out: str) -> BadDataError:
-        """Error for a cell found wrong after reading, in the reader's own form.
-
-        Parameters
-        ----------
-        row
-            Index into the columns, from 0.
-        """
+        """Error for a cell found wrong after reading, in the reader's own form; rows count from 0."""
         return _fault(self.path, self.line_numbers[row], column, what, way_out=way_out)
 
 
 def read_table(source: Path | Sheet, schema_name: str) -> Table:
     """Read a CSV file under the Table Schema ``data_schema/SCHEMA_NAME`` (``trial.table.json``...).
 
-    Raises
-    ------
-    BadDataError
-        At the first fault: encoding, header, a cell against its type and constraints, or a repeated primary key.
-
-    Notes
-    -----
     The file is UTF-8, with or without a byte order mark. Between the cells are commas, semicolons or tabs, and with the
     last two a number may have a decimal comma. Blank lines are skipped, and so are rows without a filled cell and
     columns without a name or a filled cell, which spreadsheets write.
@@ -231,7 +206,7 @@ class RawTable(Record):
     rows: list[dict[str, str]]
     """Cells as text, without blanks around them, by their columns."""
     decimal_comma: bool = False
-    """Whether its numbers are written as 12,5."""
+    """True when its numbers are written as 12,5."""
     separator: str = ","
     """Between its cells."""
 
@@ -259,17 +234,8 @@ def read_raw(path: Path) -> RawTable:
 
 
 def check_references(table: Table, schema_name: str, *, targets: Mapping[str, Table]) -> None:
-    """Check that each row refers to an existing row, by the schema's ``foreignKeys``.
-
-    Parameters
-    ----------
-    targets
-        The tables pointed at, by the name that the schema gives them (``excision``).
-
-    Raises
-    ------
-    BadDataError
-        Naming the first row whose key the other table does not hold.
+    """Check by the schema's ``foreignKeys`` that each row refers to an existing row of `targets`, which has the other
+    tables by the schema's names (``excision``).
     """
     for key in load_schema(schema_name).get("foreignKeys", []):
         target = targets[key["reference"]["resource"]]
@@ -409,13 +375,7 @@ def _parse_date(text: str, field: Mapping[str, Any]) -> date:
 
 
 def parse_date(text: str) -> date:
-    """Date of a cell, year-month-day.
-
-    Raises
-    ------
-    ValueError
-        When it is none.
-    """
+    """Date of a cell, year-month-day; else a ValueError."""
     if not _DATE.fullmatch(text):
         raise ValueError(text)
     return date.fromisoformat(text)

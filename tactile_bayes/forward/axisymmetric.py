@@ -70,43 +70,25 @@ class LayeredBody(Record):
 
     @property
     def on_rigid_base(self) -> bool:
-        """Whether the lowest layer is bonded to a rigid base rather than being a half-space."""
+        """True when the lowest layer is bonded to a rigid base rather than being a half-space."""
         return len(self.modulus_kpa) == len(self.thickness_mm)
 
 
 def surface_flexibility(wave_number: FloatArray, body: LayeredBody) -> FloatArray:
-    r"""Sinking of the skin under a pressure that varies as J0(k r), in mm per kPa.
+    r"""Sinking of the skin under a pressure that varies as J0(k r), in mm per kPa, for k in 1/mm above 0.
 
-    Parameters
-    ----------
-    wave_number : (n,) array
-        k in 1/mm, above 0.
-
-    Returns
-    -------
-    (n,) array
-        :math:`2(1-\nu^2)/(E k)` for a half-space.
+    :math:`2(1-\nu^2)/(E k)` for a half-space.
     """
     return np.asarray(skin_flexibility(wave_number, body)[:, 1, 1], dtype=np.float64)
 
 
 def skin_flexibility(wave_number: FloatArray, body: LayeredBody) -> FloatArray:
-    r"""Displacements of the skin under shear and pressure of one wave number, in mm per kPa.
+    r"""Displacements of the skin under shear and pressure of one wave number k (1/mm, above 0), in mm per kPa.
 
-    Parameters
-    ----------
-    wave_number : (n,) array
-        k in 1/mm, above 0.
+    The (n, 2, 2) array takes the factors of a radial shear traction :math:`J_1(kr)` and a pressure :math:`J_0(kr)` to
+    those of the radial displacement and the sinking. Entry (1, 0), sinking under shear, is
+    :math:`-(1-2\nu)(1+\nu)/(E k)` for a half-space.
 
-    Returns
-    -------
-    (n, 2, 2) array
-        From the factors of a radial shear traction :math:`J_1(kr)` and a pressure :math:`J_0(kr)` to those of the
-        radial displacement and the sinking. Entry (1, 0), sinking under shear, is :math:`-(1-2\nu)(1+\nu)/(E k)` for a
-        half-space.
-
-    Notes
-    -----
     For one k the fields are :math:`u_r = U(z) J_1(kr)`, :math:`u_z = W(z) J_0(kr)`, which obey the equations of plane
     strain with a wave of number k. Each layer is replaced by its exact stiffness between the displacements of its two
     faces (the static limit of Kausel & Roesset 1981), and the stiffness felt at a face is carried upwards. All
@@ -165,14 +147,8 @@ def _layer_stiffness(k: FloatArray, modulus_kpa: float, thickness_mm: float, nu:
 
 def layering_compliance(r_mm: FloatArray, body: LayeredBody) -> FloatArray:
     r"""Sinking at distances r from a unit normal force, less that of a half-space of the top layer, in mm / (kPa mm^2).
+    Smooth through r = 0.
 
-    Parameters
-    ----------
-    r_mm : (n,) array
-        Not negative. The result is smooth through r = 0.
-
-    Notes
-    -----
     .. math:: \frac{1}{2\pi}\int_0^\infty \left[F(k) - \frac{2(1-\nu^2)}{E_1 k}\right] J_0(kr)\, k\, dk
 
     by Gauss-Legendre panels. The bracket decays as :math:`\exp(-2kH)` with the top layer's thickness H, so what is
@@ -209,8 +185,6 @@ def square_compliance(
 ) -> FloatArray:
     r"""Sinking of a half-space at (dx, dy) from the centre of a square under unit pressure, in mm / kPa.
 
-    Notes
-    -----
     .. math:: \frac{1-\nu^2}{\pi E} \sum_{\pm\pm} \pm\left[x \sinh^{-1}\frac{y}{|x|} + y \sinh^{-1}\frac{x}{|y|}\right]
 
     over the corners (Love 1929; Johnson 1985, eq. 3.25).
@@ -231,13 +205,10 @@ def _corner(x: FloatArray, y: FloatArray) -> FloatArray:
 
 
 def taxel_compliance(body: LayeredBody, *, rows: int, columns: int, pitch_mm: float) -> FloatArray:
-    """Mean sinking of every taxel under unit pressure on every other, in mm / kPa.
+    """Mean sinking of every taxel under unit pressure on every other, in mm / kPa, symmetric and positive definite.
 
-    Returns
-    -------
-    (rows * columns, rows * columns) array
-        Symmetric positive definite; taxels in row-major order. Both the load and the displacement are averaged over
-        the square of a taxel (Galerkin), the self term included.
+    Taxels are in row-major order. Both the load and the displacement are averaged over the square of a taxel
+    (Galerkin), the self term included.
     """
     node, weight = np.polynomial.legendre.leggauss(6)
     shift = node * pitch_mm / 2
@@ -325,13 +296,11 @@ class CondensedMode(Record, eq=False):
     """(b, b) array: The tissue that the lump replaces."""
 
     def perturbation(self, lump_kpa: float) -> ModePerturbation:
-        r"""Change of the skin's compliance when tissue is replaced by a lump of modulus `lump_kpa`.
+        """Change of the skin's compliance when tissue is replaced by a lump of modulus `lump_kpa`.
 
-        Notes
-        -----
         With the flexibility F of the surroundings and the stiffness S inside, the boundary moves by
-        :math:`(I + F S)^{-1} F f`. The difference of two such answers is written as one product, so that it is exact
-        to rounding however small it is, and vanishes for equal stiffness:
+        :math:`(I + F S)^{-1} F f`. The difference of two such answers is written as one product, so that it is exact to
+        rounding however small it is, and vanishes for equal stiffness:
 
         .. math:: -F_s (I + S_1 F)^{-1} (S_1 - S_0) (I + F S_0)^{-1} F_s^T
         """
@@ -364,14 +333,8 @@ def condense_lump(
 ) -> CondensedLump:
     """Condense the body around a lump onto the lump's boundary and the skin.
 
-    Parameters
-    ----------
-    geometry, tissue
-        Where the lump lies, in what.
-    size
-        Of the mesh; None for the default, which a test holds to 1 % in amplitude and 0.5 % in width.
-    orders
-        How many Fourier orders; None takes as many as the lump's depth asks for (see `orders_needed`).
+    The default mesh is held by a test to 1 % in amplitude and 0.5 % in width; the lump's depth decides the number of
+    Fourier orders where none is given (`orders_needed`).
     """
     mesh = lump_mesh(geometry, size)
     elements = element_stiffness(mesh, nu=tissue.nu)
@@ -385,11 +348,9 @@ def condense_lump(
 def orders_needed(geometry: LumpGeometry) -> int:
     r"""Fourier orders that carry all but 1e-4 of the perturbation.
 
-    Notes
-    -----
     A force at distance rho from the centre is felt by a sphere of radius a as multipoles falling as :math:`(a/\rho)^l`,
-    and its order m starts at l = m with :math:`(\sin\varphi)^m`; a force on the skin has
-    :math:`\sin\varphi = r/\rho`, so :math:`(a r/\rho^2)^{2m} \le (a/2h)^{2m}` for force and displacement together.
+    and its order m starts at l = m with :math:`(\sin\varphi)^m`; a force on the skin has :math:`\sin\varphi = r/\rho`,
+    so :math:`(a r/\rho^2)^{2m} \le (a/2h)^{2m}` for force and displacement together.
     """
     share = max(geometry.radius_mm, geometry.half_height_mm) / (2.0 * geometry.depth_mm)
     return 2 + int(np.ceil(np.log(_LEAST_SHARE) / (2.0 * np.log(min(share, 0.6)))))
@@ -403,19 +364,14 @@ def skin_spline(radius_mm: FloatArray, values: FloatArray, *, order: int) -> Cub
 
 
 def element_stiffness(mesh: LumpMesh, *, nu: float) -> FloatArray:
-    r"""Stiffness of every element for a modulus of 1 kPa, as a polynomial in the order m.
+    """Stiffness of every element for a modulus of 1 kPa, as a polynomial in the order m: (3, e, 27, 27) of
+    :math:`K = K_0 + m K_1 + m^2 K_2`, without the factor of the integral over the angle.
 
-    Returns
-    -------
-    (3, e, 27, 27) array
-        :math:`K = K_0 + m K_1 + m^2 K_2`, without the factor of the integral over the angle. Unknowns: (u_r, u_theta,
-        u_z) of each of the nine nodes.
+    Unknowns are (u_r, u_theta, u_z) of each of the nine nodes.
 
-    Notes
-    -----
     Biquadratic displacements with the volume change projected on linear functions of (r, z) in each element: the pair
-    Q2-P1, which satisfies the inf-sup condition and so does not lock (Brezzi & Fortin 1991, sec. VI.3; Hughes 1980
-    for the projection).
+    Q2-P1, which satisfies the inf-sup condition and so does not lock (Brezzi & Fortin 1991, sec. VI.3; Hughes 1980 for
+    the projection).
     """
     shape, gradient, point, weight = _quadrature(mesh)
     strain = _strains(shape, gradient, point[..., 0])

@@ -31,8 +31,6 @@ _MOST_ROUNDS = 40
 class Head(Record):
     """The head's cross-section: an arc with rounded shoulders.
 
-    Notes
-    -----
     The paper has "nearly a section of a circular cylinder" of 24 mm (section 2.1); radius and shoulders are assumed.
     Where the shoulders lie decides how many faint lumps show: decision record 0075.
     """
@@ -139,31 +137,15 @@ def solve_contact(
     touching: BoolArray | None = None,
     counted: BoolArray | None = None,
 ) -> Contact:
-    """Solve the contact of a rigid profile with a surface at many positions at once.
+    """Solve the contact of a rigid profile (mm above its lowest point) with a surface at m positions at once.
 
-    Parameters
-    ----------
-    compliance : (m, n, n) array of mm per kPa
-        Symmetric and positive definite, one matrix a position.
-    profile_mm : (n,) array
-        Head's face above its lowest point.
-    total_kpa
-        Sum of the counted cells' pressures: force per unit length over the width of a cell. Above 0; one, or (m,).
-    touching : (n,) or (m, n) bool array, optional
-        A first guess of the cells in contact.
-    counted : (n,) bool array, optional
-        Cells whose pressures add up to `total_kpa`, the sensing ones; by default all.
+    The compliance is (m, n, n) mm per kPa, symmetric and positive definite. `total_kpa`, above 0, is the sum of the
+    `counted` (sensing; by default all) cells' pressures: force per unit length over the width of a cell. `touching` is
+    a first guess, (n,) or (m, n).
 
-    Raises
-    ------
-    NotConvergedError
-        When a contact is not found.
-
-    Notes
-    -----
     Cells that would pull are let go and cells that would overlap are taken in, all at once, until none changes (the
     primal-dual active set method; Hintermueller, Ito & Kunisch 2003). A position at which that does not end is solved
-    cell by cell, which always ends where all cells are counted.
+    cell by cell, which always ends where all cells are counted; else a NotConvergedError.
     """
     m, n = compliance.shape[:2]
     share = np.ones(n) if counted is None else counted.astype(np.float64)
@@ -286,17 +268,9 @@ class ContactStiffness(Record, eq=False):
         return cls((inverse + inverse.T) / 2, empty, np.zeros((0, 0)))
 
     def changed(self, vectors: FloatArray, signs: FloatArray) -> ContactStiffness:
-        r"""Stiffness after ``vectors @ diag(signs) @ vectors.T`` is added to the compliance.
+        """Stiffness after ``vectors @ diag(signs) @ vectors.T`` is added to the compliance: (n, k) in mm^(1/2)
+        kPa^(-1/2), and signs of 1 or -1.
 
-        Parameters
-        ----------
-        vectors : (n, k) array
-            In mm^(1/2) kPa^(-1/2).
-        signs : (k,) array
-            1 or -1.
-
-        Notes
-        -----
         :math:`(C + V s V^T)^{-1} = H - H V (s + V^T H V)^{-1} V^T H` (Woodbury). The sum is positive definite when the
         bracket has as many negative eigenvalues as s (Sylvester's law of inertia).
         """
@@ -330,27 +304,16 @@ def press(
     counted: BoolArray | None = None,
     touching: BoolArray | None = None,
 ) -> SolidContact:
-    r"""Press a head on the body until its mean pressure is `mean_kpa`.
+    r"""Press a head on the body until the force over the area of the counted squares, touching or not, is `mean_kpa`.
 
-    Parameters
-    ----------
-    stiffness
-        Of the skin under the taxels.
-    height_mm : (n,) array
-        How far each taxel lies above the head's reference point before it touches; its minimum may be any number.
-    mean_kpa
-        Force over the area of the counted squares, touching or not.
-    counted : (n,) bool array
-        Squares whose force is meant: the taxels of a head that also has a rim. None for all.
-    touching
-        Where to start; a neighbouring frame's saves steps.
+    Each taxel touches when the head has come down by its `height_mm`, of which the minimum may be any number. `counted`
+    are the taxels of a head that also has a rim, None for all; `touching` is where to start: a neighbouring frame's
+    saves steps.
 
-    Notes
-    -----
-    With H the stiffness and I the taxels off the skin, :math:`p = H(\delta - g + w)`, :math:`p_I = 0` and
-    :math:`w = 0` elsewhere: a system as large as the part of the head that does not touch. Signs are put right by block
-    principal pivoting, with one taxel at a time where blocks fail (Judice & Pires 1994), which ends because the matrix
-    is positive definite.
+    With H the stiffness and I the taxels off the skin, :math:`p = H(\delta - g + w)`, :math:`p_I = 0` and :math:`w = 0`
+    elsewhere: a system as large as the part of the head that does not touch. Signs are put right by block principal
+    pivoting, with one taxel at a time where blocks fail (Judice & Pires 1994), which ends because the matrix is
+    positive definite.
     """
     count = len(height_mm)
     if not mean_kpa > 0:

@@ -8,29 +8,15 @@ from tactile_bayes.geometry import FloatArray
 
 
 def cell_mean_gaussian(x_mm: FloatArray, y_mm: FloatArray, *, covariance_mm2: FloatArray, cell_mm: float) -> FloatArray:
-    r"""Mean over a square cell of a Gaussian of unit height, at cell centres relative to its centre.
+    r"""Mean over a square cell of a Gaussian of unit height, at cell centres relative to its centre, in mm.
 
-    Parameters
-    ----------
-    x_mm, y_mm : (..., k) arrays
-        Cell centres minus the Gaussian's centre; the leading axes are those of `covariance_mm2`.
-    covariance_mm2 : (..., 2, 2) array
-        Symmetric positive definite; its diagonal is sigma_x^2, sigma_y^2 when the axes agree.
-    cell_mm
-        Side of the cells; 0 gives the Gaussian at the centres.
+    Leading axes of x and y are those of the (..., 2, 2) covariance, whose diagonal is sigma_x^2, sigma_y^2 when the
+    axes agree. A cell of 0 gives the Gaussian at the centres.
 
-    Returns
-    -------
-    (..., k) array
-        Without unit; the value at the centre is just below 1.
-
-    Notes
-    -----
     Averaging over a cell is a convolution with a box, which adds :math:`h^2/12` to each variance and brings a fourth
-    cumulant of :math:`-h^4/120` along each axis of the grid. Both are kept (Edgeworth series); the first term left
-    out is :math:`h^6/(12096\,\sigma^6)` for each axis, below 3e-5 of the height at :math:`h = 0.75\,\sigma`.
-
-    Wellman & Howe (1999) eq. 7 is the case ``cell_mm=0`` and a diagonal covariance.
+    cumulant of :math:`-h^4/120` along each axis of the grid. Both are kept (Edgeworth series); the first term left out
+    is :math:`h^6/(12096\,\sigma^6)` for each axis, below 3e-5 of the height at :math:`h = 0.75\,\sigma`. Wellman & Howe
+    (1999) eq. 7 is the case ``cell_mm=0`` and a diagonal covariance.
     """
     wide = covariance_mm2 + (cell_mm**2 / 12.0) * np.eye(2)
     sxx, sxy, syy = wide[..., 0, 0, None], wide[..., 0, 1, None], wide[..., 1, 1, None]
@@ -49,18 +35,12 @@ def cell_mean_gaussian(x_mm: FloatArray, y_mm: FloatArray, *, covariance_mm2: Fl
 
 
 def covariance_from_log_widths(p: FloatArray, q: FloatArray, r: FloatArray) -> FloatArray:
-    r"""Covariance of a Gaussian from unconstrained coordinates that are smooth through the round case.
+    r"""Covariance in mm^2, (..., 2, 2), of a Gaussian from unconstrained coordinates that are smooth through the round
+    case.
 
-    Parameters
-    ----------
-    p, q, r : (...) arrays
-        :math:`\Sigma^{1/2} = \exp\begin{pmatrix}p+q & r\\ r & p-q\end{pmatrix}` with lengths in mm: p is the log of the
-        geometric mean width, ``(q, r)`` the log axis ratio and its direction. For r = 0, sigma_x = exp(p + q) and
-        sigma_y = exp(p - q).
-
-    Returns
-    -------
-    (..., 2, 2) array of mm^2
+    :math:`\Sigma^{1/2} = \exp\begin{pmatrix}p+q & r\\ r & p-q\end{pmatrix}` with lengths in mm: p is the log of the
+    geometric mean width, ``(q, r)`` the log axis ratio and its direction. For r = 0, sigma_x = exp(p + q) and sigma_y =
+    exp(p - q).
     """
     ratio = np.hypot(q, r)
     scale = np.exp(2.0 * p)
@@ -73,14 +53,10 @@ def covariance_from_log_widths(p: FloatArray, q: FloatArray, r: FloatArray) -> F
 
 
 def principal_widths(p: FloatArray, q: FloatArray, r: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Widths along the ellipse's own axes, each named after the head axis it lies nearest to.
+    """Widths (mm) along the ellipse's own axes, and the angle of the first.
 
-    Returns
-    -------
-    sigma_x_mm, sigma_y_mm : (...) arrays
-        Standard deviation along the axis within 45 degrees of x, and along the one at right angles to it.
-    angle_rad : (...) array
-        Angle from x to the axis of ``sigma_x_mm``, in (-pi/4, pi/4]; 0 for a round Gaussian.
+    ``sigma_x_mm`` is the standard deviation along the axis within 45 degrees of x, ``sigma_y_mm`` the one at right
+    angles to it; ``angle_rad`` goes from x to the axis of ``sigma_x_mm``, in (-pi/4, pi/4], 0 for a round Gaussian.
     """
     ratio = np.hypot(q, r)
     signed = np.where(q >= 0, ratio, -ratio)

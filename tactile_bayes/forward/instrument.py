@@ -53,20 +53,12 @@ class SimulatedScan(Record, eq=False):
 def record(
     scene: Scene, *, felt: Felt, truth: Mapping[str, Any], rng: np.random.Generator, depth: Depth | None = None
 ) -> SimulatedScan:
-    """Simulate the recording of a scan from the pressures on the head.
+    """Simulate the recording of a scan from the pressures on the head, of which `felt` gives up to 512 frames at once,
+    in order.
 
-    Parameters
-    ----------
-    scene
-        Strokes, head, noise and tracker are used; what lies below the skin is not.
-    felt
-        Called with up to 512 frame times at once, in order.
-    truth
-        What the model of the tissue adds to the truth; `lumps` is a list of mappings with `x_mm` and `y_mm`.
-    rng
-        Split into independent streams, so that a longer scan of the same seed keeps its gains and calibration.
-    depth
-        Where the model says how deep the head sinks; None lets it wander about 5 mm.
+    What lies below the skin of `scene` is not used; `truth` is what the model of the tissue adds to the truth, where
+    `lumps` is a list of mappings with `x_mm` and `y_mm`. `rng` is split into independent streams, so that a longer scan
+    of the same seed keeps its gains and calibration. Without a `depth` the head wanders about 5 mm.
     """
     gain_rng, element_rng, tracker_rng = rng.spawn(3)
     true_gain, calibration = _calibration(scene, rng=gain_rng)
@@ -93,13 +85,8 @@ def _times(duration_s: float, rate_hz: float) -> FloatArray:
 
 
 def head_positions(scene: Scene, time_s: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """True pose of the head in the scene's `plane` at times from 0.
-
-    Returns
-    -------
-    rotation : (n, 3, 3) array
-    origin_mm : (n, 3) array
-        ``p_plane = rotation @ p_scanhead + origin``.
+    """True pose of the head in the scene's `plane` at times from 0: ``p_plane = rotation @ p_scanhead + origin`` with
+    (n, 3, 3) rotations and (n, 3) origins in mm.
     """
     x, y = _stroke(scene.strokes, time_s / scene.duration_s)
     phase = {name: 2 * np.pi * hz * time_s for name, hz in _WOBBLE_HZ.items()}

@@ -91,24 +91,11 @@ def press(
     head: Head = _NOMINAL_HEAD,
     mean_kpa: float | FloatArray = MEAN_KPA,
 ) -> LineFrames:
-    """Frames of a head pressed with given force at positions `x_c_mm`.
+    """Frames of a head pressed with given force at positions `x_c_mm`; the mean pressure over the sensing width is one
+    or (m,).
 
-    Parameters
-    ----------
-    stiffness_ratio
-        E2/E1 of the lump; None for the body without a lump.
-    mean_kpa
-        Mean pressure over the sensing width: one for all, or (m,) of them.
-
-    Returns
-    -------
-    LineFrames
-        Of the sensing cells; shoulders outside them press and are not in the frames.
-
-    Raises
-    ------
-    BadDataError
-        When the head would leave the surface.
+    A `stiffness_ratio` (E2/E1) of None is the body without a lump. Shoulders outside the sensing cells press and are
+    not in the frames.
     """
     cell = surface.cell_mm
     profile, senses = head.cell_profile_mm(cell), head.sensing_cells(cell)
@@ -188,14 +175,9 @@ def slide(
 
 
 def build_line(frames: LineFrames, *, normalise: str = "mean") -> TactileLine:
-    """Average frames, each divided by its mean, in cells along the line.
+    """Average frames at equal steps in cells as wide as a step, with edges at multiples of it.
 
-    Parameters
-    ----------
-    frames
-        At equal steps; the map's cells are as wide as a step, with edges at multiples of it.
-    normalise
-        ``"mean"`` divides each frame by its mean, ``"none"`` keeps kPa.
+    ``normalise="mean"`` divides each frame by its mean, ``"none"`` keeps kPa.
     """
     if normalise not in ("mean", "none"):
         raise BadDataError(f"normalise is {normalise!r}", way_out="give mean or none")
@@ -233,8 +215,6 @@ RANGE = f"it holds for cylinders of {LEAST_D_MM:g} mm and more down to h/d {DEEP
 def outside_range(d_mm: float, depth_ratio: float) -> str | None:
     """Warn in one line of a lump that the empirical model does not stand for; None inside its range.
 
-    Notes
-    -----
     Below, the frame over the lump has no bump of its own: least squares of Eq 2 makes it as flat as the homogeneous
     profile, and Eq 3's map has no lump, or too low a one. Smaller lumps get a bump two to three times too wide.
     """
@@ -249,26 +229,12 @@ def outside_range(d_mm: float, depth_ratio: float) -> str | None:
 def homogeneous_pressure(
     s_mm: FloatArray, *, peak_kpa: float, curvature_per_mm2: float, half_width_mm: float
 ) -> FloatArray:
-    r"""Pressure across the head far from the lump, P1 (Eq 1).
+    r"""Pressure across the head far from the lump, P1 (Eq 1); 0 outside the head and where the root would be imaginary.
 
-    Parameters
-    ----------
-    s_mm : (n,) array
-        Position on the head from its centre.
-    peak_kpa
-        :math:`P_o(t)`, the pressure at the centre.
-    curvature_per_mm2
-        :math:`1/a(t)^2`. Positive for a profile that falls off to the sides, negative for one that rises.
-    half_width_mm
-        w, half the head's width.
-
-    Returns
-    -------
-    (n,) array of kPa; 0 outside the head and where the root would be imaginary.
-
-    Notes
-    -----
     .. math:: P_1(s) = P_o \sqrt{1 - s^2 / a^2}
+
+    `peak_kpa` is :math:`P_o(t)`, `curvature_per_mm2` :math:`1/a(t)^2`: positive for a profile that falls off to the
+    sides, negative for one that rises.
 
     Wellman & Howe (1999) eq. 1, after Hertz (Johnson 1985, section 4.2). On thick tissue the pressure under this head
     rises to its sides, which no real a describes: the square may have either sign.
@@ -281,8 +247,6 @@ def homogeneous_pressure(
 def lump_pressure(x_mm: FloatArray, *, height_kpa: float, width_mm: float) -> FloatArray:
     r"""Pressure that the lump adds at a point of the skin, P2 (Eq 2).
 
-    Notes
-    -----
     .. math:: P_2(x) = g \exp(-x^2 / (2 \sigma^2))
 
     Wellman & Howe (1999) eq. 2; the printed s is sigma.
@@ -293,8 +257,6 @@ def lump_pressure(x_mm: FloatArray, *, height_kpa: float, width_mm: float) -> Fl
 def kappa(x_c_mm: FloatArray, *, d_mm: float) -> FloatArray:
     r"""Share of the homogeneous profile that stays under the head at a distance from the lump.
 
-    Notes
-    -----
     .. math:: \kappa(x_c, d) = \min\left(1, \tfrac12 \left(1 + \tfrac{3}{8d} |x_c|\right)\right)
 
     Wellman & Howe (1999) eq. 4 with the slope turned over, so that it is continuous: decision record 0004.
@@ -328,8 +290,6 @@ class EmpiricalModel(Record):
     def surface_pressure(self, s_mm: FloatArray, x_c_mm: FloatArray) -> FloatArray:
         r"""Pressure at position s on the head whose centre is at x_c; the arguments broadcast.
 
-        Notes
-        -----
         .. math:: P(x, s) = P_2(x) (P_1(s) / \max P_1)^2 + \kappa(x_c, d) P_1(s), \quad x = s + x_c
 
         Wellman & Howe (1999) eq. 3.
@@ -348,25 +308,10 @@ class EmpiricalModel(Record):
 def fit_empirical(
     s_mm: FloatArray, far_kpa: FloatArray, centred_kpa: FloatArray, *, d_mm: float, half_width_mm: float
 ) -> EmpiricalModel:
-    """Fit Eqs 1 and 2 to two frames, as section 2.2 does.
+    """Fit Eqs 1 and 2 to two frames, one far from the lump (Fig 5a) and one with the head's centre over it (P0, Fig
+    5b), as section 2.2 does.
 
-    Parameters
-    ----------
-    s_mm : (n,) array
-        Positions across the head.
-    far_kpa : (n,) array
-        Frame far from the lump (Fig 5a).
-    centred_kpa : (n,) array
-        Frame with the head's centre over the lump, P0 (Fig 5b).
-    d_mm
-        Diameter of the lump, for Eq 4.
-    half_width_mm
-        Of the head.
-
-    Raises
-    ------
-    BadDataError
-        When the frames are too short or empty.
+    The diameter is for Eq 4.
     """
     if len(s_mm) < 4 or not (far_kpa > 0).any():
         raise BadDataError(f"a frame of {len(s_mm)} cells", way_out="give at least 4, some of them above 0 kPa")
@@ -408,20 +353,11 @@ class ShapeFit(Record):
 
 
 def fit_shape(shape: Callable[[float], FloatArray], data: FloatArray, *, grid: FloatArray) -> ShapeFit:
-    """Least squares of ``height * shape(parameter)``: the lowest minimum between the ends of a grid.
+    """Least squares of ``height * shape(parameter)``: the lowest minimum between the ends of an increasing grid.
 
-    Parameters
-    ----------
-    shape
-        (n,) values for one parameter.
-    data : (n,) array
-    grid : (k,) array
-        Where the parameter is looked for first, increasing; about the best place it is then refined.
-
-    Notes
-    -----
-    The height is linear and leaves one unknown (variable projection; Golub & Pereyra 1973). Steps of Gauss and Newton
-    do not settle here where the shape leaves more of the data than it explains, as a faint bump in its trough does.
+    The height is linear and leaves one unknown (variable projection; Golub & Pereyra 1973), which is looked for on the
+    grid first and then refined about the best place. Steps of Gauss and Newton do not settle here where the shape
+    leaves more of the data than it explains, as a faint bump in its trough does.
     """
 
     def left(parameter: float) -> float:

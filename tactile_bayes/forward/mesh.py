@@ -52,13 +52,7 @@ class QuadMesh(Record, eq=False):
 
 
 def body_mesh(body: Body, *, fineness: int) -> QuadMesh:
-    """The body on x >= 0 with a hole where the lump is.
-
-    Parameters
-    ----------
-    fineness
-        Elements along each part of the box; twice the fineness is half the element size everywhere.
-    """
+    """The body on x >= 0 with a hole where the lump is; twice the fineness is half the element size everywhere."""
     box = _Box.around(body, fineness)
     ring = _rays(_circle(body, box.angles_rad()), box.outline(), np.linspace(0.0, 1.0, 2 * _OUT * fineness + 1))
     across = _graded(box.half_width_mm, REACH_MM + _BEYOND * body.layers.thickness_mm, box.row_mm, fineness)
@@ -72,10 +66,7 @@ def body_mesh(body: Body, *, fineness: int) -> QuadMesh:
 def disc_mesh(body: Body, *, fineness: int, layered: bool) -> QuadMesh:
     """The lump on x >= 0 with the same nodes on its circle as `body_mesh`.
 
-    Parameters
-    ----------
-    layered
-        Whether the fat-gland boundary runs along element edges through the disc; else the rays meet in its centre.
+    Layered, the fat-gland boundary runs along element edges through the disc; else the rays meet in its centre.
     """
     circle = _circle(body, _Box.around(body, fineness).angles_rad())
     depth = body.layers.fat_mm if layered else body.centre_mm

@@ -42,26 +42,13 @@ def simulate_plane(
     shoulders: str = SHOULDERS_INSIDE,
     progress: Progress | None = None,
 ) -> SimulatedScan:
-    """Make a scan of a scene that gives tissue, in two dimensions.
+    """Make a scan in two dimensions of a scene that gives tissue: at most one lump, whose section is a circle, and no
+    rib.
 
-    Parameters
-    ----------
-    scene
-        At most one lump, whose section is a circle, and no rib; without a body it takes the default one.
-    rng
-        Used by the instrument alone.
-    fidelity
-        ``"plane-strain"``: the head's contact is solved at each place and force. ``"empirical"``: Eqs 1 to 4 as
-        printed, fitted to two frames of the plane-strain model at the nominal pressure, and scaled with the pressure.
-    shoulders
-        One of `presets.HEADS`: where the head's shoulders lie.
-    progress
-        Called with frames done and frames in all.
-
-    Raises
-    ------
-    BadDataError
-        When the scene is not one of two dimensions, or the head leaves the skin that was solved for.
+    ``fidelity="plane-strain"`` solves the head's contact at each place and force; ``"empirical"`` takes Eqs 1 to 4 as
+    printed, fitted to two frames of the plane-strain model at the nominal pressure, and scaled with the pressure.
+    `shoulders` is one of `presets.HEADS`. `rng` is the instrument's alone; `progress` is called with frames done and
+    frames in all.
     """
     section = plane_section(scene, fidelity, shoulders=shoulders)
     sections = section.empirical if fidelity == "empirical" else section.solved
@@ -79,7 +66,7 @@ class PlaneSection(Record, eq=False):
     layers: Layers
     """The body without the lump."""
     lump: tuple[Body, float] | None
-    """What is below the skin; None for nothing."""
+    """Below the skin; None for nothing."""
     x_mm: float
     """Place of the lump's axis."""
     mean_kpa: float
@@ -141,18 +128,7 @@ class PlaneSection(Record, eq=False):
 
 
 def plane_section(scene: Scene, fidelity: str, *, shoulders: str = SHOULDERS_INSIDE) -> PlaneSection:
-    """Prepare the section of a scene.
-
-    Parameters
-    ----------
-    shoulders
-        One of `presets.HEADS`: where the head's shoulders lie.
-
-    Raises
-    ------
-    BadDataError
-        Naming the key that two dimensions cannot follow.
-    """
+    """Prepare the section of a scene; a key that two dimensions cannot follow is an error."""
     refuse_bumps(scene, fidelity)
     many = "a rib" if scene.ribs else f"{len(scene.solid_lumps)} lumps" if len(scene.solid_lumps) > 1 else ""
     if many:
@@ -223,8 +199,6 @@ def plane_frames(
 ) -> FloatArray:
     """(n, rows, columns) kPa that the taxels feel at (n,) times, before any noise.
 
-    Notes
-    -----
     A head turned about the normal has its columns at different places across the lump. Sections are computed no more
     than 0.25 mm apart and interpolated between.
     """
@@ -243,27 +217,11 @@ def frames_at_poses(
     shoulders: str = SHOULDERS_INSIDE,
     progress: Progress | None = None,
 ) -> FloatArray:
-    """What the scene's head feels at given poses and levels, without noise.
+    """Pressure in kPa, (n, rows, columns), that the scene's head feels at given poses and mean pressures, without
+    noise.
 
-    Parameters
-    ----------
-    rotation : (n, 3, 3) array
-        From `scanhead` to the scene's `plane`; tilts are not followed.
-    origin_mm : (n, 3) array
-        Of the head's face; its depth is not used.
-    mean_kpa : (n,) array
-        Mean over the taxels.
-    fidelity, shoulders
-        As in `simulate_plane`.
-
-    Returns
-    -------
-    (n, rows, columns) array of kPa
-
-    Raises
-    ------
-    BadDataError
-        When the scene is not one of two dimensions, or a pose lies beyond the skin that can be solved for.
+    Rotations lead from `scanhead` to the scene's `plane`; tilts are not followed and depths not used. A pose beyond the
+    skin that can be solved for is an error.
     """
     section = plane_section(scene, fidelity, shoulders=shoulders)
     half_face = 0.5 * section.cell_mm * len(section.head.sensing_cells(section.cell_mm))

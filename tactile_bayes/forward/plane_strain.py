@@ -36,17 +36,9 @@ def lame(young: FloatArray | float, poisson: float) -> tuple[FloatArray, FloatAr
 
 
 def assemble(mesh: QuadMesh, *, young_kpa: FloatArray, poisson: float) -> csc_matrix:
-    """Assemble the stiffness matrix of a mesh of unit thickness.
+    """Assemble the stiffness matrix (kPa, (2n, 2n)) of a mesh of unit thickness from each element's Young's modulus.
 
-    Parameters
-    ----------
-    young_kpa : (m,) array
-        Young's modulus of each element.
-
-    Returns
-    -------
-    (2n, 2n) sparse matrix of kPa
-        Unknowns are ordered ``x0, z0, x1, z1, ...``; times displacement in mm it gives force in N/m.
+    Unknowns are ordered ``x0, z0, x1, z1, ...``; times displacement in mm it gives force in N/m.
     """
     blocks = element_stiffness(mesh.nodes[mesh.elements], poisson=poisson) * young_kpa[:, None, None]
     unknowns = (2 * mesh.elements[:, :, None] + np.arange(2)).reshape(len(mesh.elements), 18)
@@ -57,19 +49,8 @@ def assemble(mesh: QuadMesh, *, young_kpa: FloatArray, poisson: float) -> csc_ma
 
 
 def element_stiffness(corners: FloatArray, *, poisson: float) -> FloatArray:
-    r"""Stiffness of elements with Young's modulus 1.
+    r"""Stiffness, (m, 18, 18), of elements with Young's modulus 1 from their nodes' places, (m, 9, 2) as in `QuadMesh`.
 
-    Parameters
-    ----------
-    corners : (m, 9, 2) array
-        Positions of the nodes in the order of `QuadMesh`.
-
-    Returns
-    -------
-    (m, 18, 18) array
-
-    Notes
-    -----
     .. math:: K = \int 2\mu\,\varepsilon(v):\varepsilon(u) + \lambda\,\Pi(\nabla\cdot v)\,\Pi(\nabla\cdot u)
 
     with :math:`\Pi` the projection onto linear functions of x and z on the element (Boffi, Brezzi & Fortin, *Mixed
@@ -94,23 +75,10 @@ def element_stiffness(corners: FloatArray, *, poisson: float) -> FloatArray:
 
 
 def skin_average(x_mm: FloatArray, *, edges_mm: FloatArray, even: bool) -> FloatArray:
-    """Matrix that takes displacements of the skin's nodes to their averages over surface cells.
+    """Matrix (c, k) that takes displacements of the skin's k nodes, from 0 on, to their averages over c cells.
 
-    Parameters
-    ----------
-    x_mm : (k,) array
-        Places of the nodes, increasing from 0.
-    edges_mm : (c + 1,) array
-        Edges of the cells, within the nodes.
-    even
-        Whether the displacement continues to x < 0 with the same sign, or with the other.
+    `even`: the displacement continues to x < 0 with the same sign, or else with the other.
 
-    Returns
-    -------
-    (c, k) array
-
-    Notes
-    -----
     A cubic spline through the nodes, not the elements' own quadratics: their slopes jump from element to element, and a
     contact pressure answers a jump of slope with a spike. Frames are up to seven times closer to converged ones.
     """
@@ -166,13 +134,6 @@ def _linear_functions(place: FloatArray, weight: FloatArray) -> FloatArray:
 def surface_transfer(k_per_mm: FloatArray, layers: Layers) -> FloatArray:
     r"""Downward displacement of the skin per unit of pressure that varies as cos kx; mm per kPa.
 
-    Parameters
-    ----------
-    k_per_mm : (n,) array
-        Wave numbers, above 0.
-
-    Notes
-    -----
     In each layer of depth range 0..H the displacements are combinations of :math:`e^{-kz}, z e^{-kz}` and of the same
     measured from the layer's floor, which no thickness makes overflow (Johnson 1985, section 2.2 gives one such pair).
     For large k, :math:`c \to 2(1-\nu^2)/(Ek)`, the half-plane of fat.
@@ -216,21 +177,9 @@ def _fields(k: FloatArray, z_mm: float, height_mm: float, nu: float, young: floa
 
 
 def surface_compliance(offset_mm: FloatArray, *, cell_mm: float, layers: Layers) -> FloatArray:
-    r"""Mean displacement of a surface cell under unit pressure on another cell of the same width.
+    r"""Mean displacement, mm per kPa downwards, of a surface cell under unit pressure on another cell of the same
+    width.
 
-    Parameters
-    ----------
-    offset_mm : (n,) array
-        Distances between the cells' centres.
-    cell_mm
-        Width of the cells.
-
-    Returns
-    -------
-    (n,) array of mm per kPa, positive downwards
-
-    Notes
-    -----
     .. math:: C(x) = \frac{\delta}{\pi}\int_0^\infty c(k)\,\mathrm{sinc}^2(k\delta/2) \cos kx \, dk
 
     The part of :math:`c` that falls off slowly, :math:`A(1-e^{-kb})/k`, is integrated in closed form (the half-plane's
@@ -294,29 +243,21 @@ _FAINT = 1e-9
 
 
 class SurfaceCompliance(Record, eq=False):
-    """Mean vertical displacement of each surface cell per unit pressure on each cell, for one geometry.
-
-    Parameters
-    ----------
-    body
-        Geometry and moduli of the tissues.
-    edges_mm : (n + 1,) array
-        Edges of the cells along x, symmetric about the lump's axis.
-    row : (n,) array
-        First row of the (Toeplitz) matrix of the body without the lump, mm per kPa.
-    own, own_stiffness : (n, j), (j,) arrays
-        Shapes on the skin by which the layers' own tissue fills the hole, and each one's compliance relative to it.
-    lump, lump_stiffness : (n, i), (i,) arrays
-        The same of a lump of unit modulus.
-    """
+    """Mean vertical displacement of each surface cell per unit pressure on each cell, for one geometry."""
 
     body: Body
     edges_mm: FloatArray
+    """(n + 1,) array, symmetric about the lump's axis."""
     row: FloatArray
+    """(n,) array: first row of the (Toeplitz) matrix of the body without the lump, mm per kPa."""
     own: FloatArray
+    """(n, j) array: shapes on the skin by which the layers' own tissue fills the hole."""
     own_stiffness: FloatArray
+    """(j,) array: each one's compliance relative to the hole."""
     lump: FloatArray
+    """(n, i) array: as `own`, of a lump of unit modulus."""
     lump_stiffness: FloatArray
+    """(i,) array."""
 
     @property
     def x_mm(self) -> FloatArray:
@@ -334,13 +275,7 @@ class SurfaceCompliance(Record, eq=False):
         return np.asarray(self.row[np.abs(index[:, None] - index[None, :])])
 
     def with_lump(self, stiffness_ratio: float) -> FloatArray:
-        """(n, n) compliance with a lump of E2/E1 = `stiffness_ratio`, symmetric and positive definite.
-
-        Raises
-        ------
-        BadDataError
-            When the ratio is not above 0.
-        """
+        """(n, n) compliance with a lump of E2/E1 = `stiffness_ratio`, symmetric and positive definite."""
         if not (stiffness_ratio > 0 and np.isfinite(stiffness_ratio)):
             raise BadDataError(f"stiffness_ratio is {stiffness_ratio:g}", way_out="it must be finite and above 0")
         young = stiffness_ratio * self.body.fat_kpa
@@ -352,16 +287,8 @@ class SurfaceCompliance(Record, eq=False):
 def condense(
     body: Body, *, reach_mm: float = 72.0, cell_mm: float = CELL_MM, fineness: int = FINENESS
 ) -> SurfaceCompliance:
-    """Condense a body onto the cells of its skin.
-
-    Parameters
-    ----------
-    reach_mm
-        The cells cover x from ``-reach_mm`` to ``reach_mm``.
-    cell_mm
-        Width of the cells; the reach is rounded up to a whole number of them.
-    fineness
-        Of the meshes, see `mesh.body_mesh`.
+    """Condense a body onto cells of its skin from ``-reach_mm`` to ``reach_mm``, rounded up to a whole number
+    of cells.
     """
     count = int(np.ceil(reach_mm / cell_mm - 1e-9))
     half: FloatArray = cell_mm * np.arange(count + 1.0)
@@ -387,7 +314,7 @@ def condense(
 
 
 def _is_layered(body: Body) -> bool:
-    """Whether the fat-gland boundary cuts the lump."""
+    """True when the fat-gland boundary cuts the lump."""
     return body.seat < 1.0 and body.gland_ratio != 1.0
 
 

@@ -150,12 +150,8 @@ class Head(Record):
         return replace(self, shoulder_mm=edge if inside else 0.0, rim_mm=0.0 if inside else edge)
 
     def section(self, shoulders: str) -> Section:
-        """Section across the head, with shoulders of this head's radius placed as `shoulders` says.
-
-        Raises
-        ------
-        BadDataError
-            When `shoulders` is not one of `presets.HEADS`, or the radius does not fit there.
+        """Section across the head, with shoulders of this head's radius placed as `shoulders`, one of `presets.HEADS`,
+        says.
         """
         edge = self.shoulder_mm if self.shoulder_mm > 0 else self.rim_mm
         return Section(self.rows * self.pitch_mm, self.radius_mm, edge, shoulders)
@@ -326,8 +322,6 @@ class Scene(Timing):
 def normalised_pressure(lumps: tuple[Lump, ...], x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
     r"""Pressure over its background at points of the scene's `plane`.
 
-    Notes
-    -----
     .. math:: p = 1 + \sum_k a_k \exp\left(-\tfrac12 \delta_k^T \Sigma_k^{-1} \delta_k\right)
 
     Wellman & Howe (1999) Eq 7, rotated, with a background of 1.

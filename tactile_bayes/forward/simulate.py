@@ -29,31 +29,14 @@ def simulate(
     head: str | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> SimulatedScan:
-    """Make a scan from a scene.
+    """Make a scan from a scene: frames at ``k / frame_rate_hz``; poses at ``k / pose_rate_hz``, stamped late by the
+    latency.
 
-    Parameters
-    ----------
-    scene
-        What is simulated; its own seed is not used here.
-    rng
-        Split into independent streams, so that a longer scan of the same seed keeps its gains and calibration.
-    fidelity
-        One of `FIDELITIES`; None takes the one the scene is written for (`Scene.fidelity`).
-    head
-        One of `presets.HEADS`: where the shoulders of the scene's head lie. None: as the scene gives them in three
-        dimensions, and inside the array in two.
-    progress
-        Called with frames done and frames in all; the bumps alone are too quick to call it.
-
-    Returns
-    -------
-    SimulatedScan
-        Frames at ``k / frame_rate_hz``; poses at ``k / pose_rate_hz``, stamped late by the latency.
-
-    Raises
-    ------
-    BadDataError
-        When the model cannot make this scene, or has no head whose shoulders could lie elsewhere.
+    The scene's own seed is not used; `rng` is split into independent streams, so that a longer scan of the same seed
+    keeps its gains and calibration. `fidelity` is one of `FIDELITIES`, by default the one the scene is written for.
+    `head`, one of `presets.HEADS`, says where the shoulders of the scene's head lie: by default as the scene gives them
+    in three dimensions, and inside the array in two. `progress` is called with frames done and frames in all; the bumps
+    alone are too quick to call it.
     """
     chosen = scene.fidelity if fidelity is None else fidelity
     if chosen not in FIDELITIES:
@@ -93,29 +76,11 @@ def felt_at_poses(
     head: str | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> FloatArray:
-    """What a model's head feels at given poses and mean pressures, without any noise.
+    """Pressure in kPa, (n, rows, columns), that a model's head feels at given poses and mean pressures, without any
+    noise.
 
-    Parameters
-    ----------
-    scene
-        Tissue and head are used; strokes, noise and tracker are not.
-    rotation : (n, 3, 3) array
-        From `scanhead` to the scene's `plane`.
-    origin_mm : (n, 3) array
-        Origin of the head's face in the scene's `plane`.
-    mean_kpa : (n,) array
-        Mean over the taxels of each frame.
-    fidelity, head, progress
-        As in `simulate`.
-
-    Returns
-    -------
-    (n, rows, columns) array of kPa
-
-    Raises
-    ------
-    BadDataError
-        When the model cannot make this scene.
+    Tissue and head of the scene are used; strokes, noise and tracker are not. Rotations (n, 3, 3) and origins (n, 3) of
+    the head's face lead from `scanhead` to the scene's `plane`; the rest is as in `simulate`.
     """
     chosen = scene.fidelity if fidelity is None else fidelity
     if chosen not in FIDELITIES:

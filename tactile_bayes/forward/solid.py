@@ -49,23 +49,15 @@ _DIRECTIONS: Final = 24
 class SkinPerturbation(Record, eq=False):
     r"""Low-rank change of the skin's compliance by one lump.
 
-    Parameters
-    ----------
-    table : (t, k) array
-        Functions of the distance from the lump's axis, every 0.05 mm, in mm (kPa mm^2)^(-1/2).
-    order : (k,) int array
-        Angular order of each.
-    sign : (k,) array
-        -1 where the lump stiffens.
-
-    Notes
-    -----
     :math:`\Delta C(x, y) = \sum_k s_k f_k(r_x) f_k(r_y) \cos m_k(\theta_x - \theta_y)`.
     """
 
     table: FloatArray
+    """(t, k) array: functions of the distance from the lump's axis, every 0.05 mm, in mm (kPa mm^2)^(-1/2)."""
     order: NDArray[np.int64]
+    """(k,) array: angular order of each."""
     sign: FloatArray
+    """(k,) array: -1 where the lump stiffens."""
 
     @property
     def reach_mm(self) -> float:
@@ -97,16 +89,10 @@ def skin_perturbation(
     square_mm: float = HEAD_PITCH_MM,
     tolerance: float = RANK_TOLERANCE,
 ) -> SkinPerturbation:
-    """Condense a lump's perturbation to its leading functions.
+    """Condense a lump's perturbation to its leading functions, those above a share `tolerance` of the largest
+    eigenvalue.
 
-    Parameters
-    ----------
-    condensed, lump_kpa
-        The lump's surroundings, and its modulus.
-    square_mm
-        Side of the squares over which load and displacement are averaged; 0 for points.
-    tolerance
-        Share of the largest eigenvalue below which a function is left out.
+    Load and displacement are averaged over squares of `square_mm`; 0 for points.
     """
     parts = [(mode.order, *np.linalg.eigh(mode.matrix)) for mode in condensed.perturbation(lump_kpa)]
     largest = max(float(np.abs(value).max()) for _, value, _ in parts)
@@ -163,7 +149,7 @@ class SolidHead(Record, eq=False):
     """A rigid head on a layered body; made by `solid_head`."""
 
     face: HeadFace
-    """What can touch."""
+    """Squares that can touch."""
     plain: ContactStiffness
     """Stiffness of the skin under the face, without lumps."""
 
@@ -177,20 +163,11 @@ class SolidHead(Record, eq=False):
         mean_kpa: float,
         touching: NDArray[np.bool_] | None = None,
     ) -> SolidFrame:
-        """Pressures of the head at a pose and a force.
+        """Pressures of the head at a pose and a mean over the taxels: what the examiner's tone holds, and the gate of a
+        map looks at.
 
-        Parameters
-        ----------
-        lumps
-            What is below the skin.
-        rotation : (3, 3) array
-            ``p_plane = rotation @ p_scanhead + (x, y, depth)``. The head keeps it; only the depth adapts.
-        x_mm, y_mm
-            Origin of the head's face in the scene's `plane`.
-        mean_kpa
-            Mean over the taxels: what the examiner's tone holds, and what the gate of the map looks at.
-        touching
-            Where to start: `contact.touching` of a neighbouring frame.
+        ``p_plane = rotation @ p_scanhead + (x, y, depth)``. The head keeps its rotation; only the depth adapts.
+        `touching` is where to start: `contact.touching` of a neighbouring frame.
         """
         place = self.face.surface_mm.reshape(-1, 3) @ rotation.T
         stiffness = self.plain
@@ -215,8 +192,6 @@ class SolidHead(Record, eq=False):
 def solid_head(face: HeadFace, body: LayeredBody) -> SolidHead:
     """Prepare a head on a body without lumps.
 
-    Notes
-    -----
     The compliance is that of the squares on the flat skin: the head's curvature and tilt enter as heights, as the
     linear theory has it (Johnson 1985, ch. 4).
     """
@@ -231,19 +206,8 @@ Progress = Callable[[int, int], None]
 
 
 def simulate_solid(scene: Scene, *, rng: np.random.Generator, progress: Progress | None = None) -> SimulatedScan:
-    """Make a scan of a scene that gives tissue.
+    """Make a scan of a scene that gives tissue; `rng` is the instrument's alone. Ribs are rows of balls.
 
-    Parameters
-    ----------
-    scene
-        Its Gaussian lumps must be none; without a body it takes the default one. Ribs are rows of balls.
-    rng
-        Used by the instrument alone: the tissue has no chance in it.
-    progress
-        Called with frames done and frames in all.
-
-    Notes
-    -----
     The mean over the taxels follows the scene's background, as an examiner holds it by the tone; where the head sinks
     less, over a lump, its pose says so. Tilts are the scene's. Each frame is at rest: nothing slides, creeps or lags.
     """
@@ -262,13 +226,8 @@ def simulate_solid(scene: Scene, *, rng: np.random.Generator, progress: Progress
 def solid_frames(
     scene: Scene, time_s: FloatArray, *, progress: Progress | None = None
 ) -> tuple[FloatArray, FloatArray]:
-    """Pressures on the head at (n,) times, without noise.
-
-    Returns
-    -------
-    pressure_kpa : (n, rows, columns) array
-    depth_mm : (n,) array
-        z of the head's apex in the scene's `plane`.
+    """Pressures in kPa, (n, rows, columns), on the head at (n,) times, without noise, and z in mm of its apex in the
+    scene's `plane`.
     """
     rotation, origin = head_positions(scene, time_s)
     level = level_kpa(scene.background, time_s)
@@ -283,16 +242,8 @@ def frames_at_poses(
     mean_kpa: FloatArray,
     progress: Progress | None = None,
 ) -> tuple[FloatArray, FloatArray]:
-    """What the scene's head feels at given poses and levels, without noise; returns as `solid_frames`.
-
-    Parameters
-    ----------
-    rotation : (n, 3, 3) array
-        From `scanhead` to the scene's `plane`.
-    origin_mm : (n, 3) array
-        Of the head's face; its depth is not used, the level decides it.
-    mean_kpa : (n,) array
-        Mean over the taxels.
+    """As `solid_frames`, at given poses from `scanhead` to the scene's `plane` and mean pressures, which decide the
+    depth.
     """
     body = scene.body or SceneBody()
     head, lumps = _head(scene.head, body, fat_thickness(body, scene.solid_lumps)), _placed(scene)

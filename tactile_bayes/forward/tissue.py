@@ -1,4 +1,4 @@
-"""What a scene is made of: bodies, their tissues, lumps."""
+"""Bodies, their tissues and lumps, of which scenes are made."""
 
 from __future__ import annotations
 
@@ -37,27 +37,17 @@ SEATS = {"centred": 0.0, "resting": 1.0}
 
 @dataclass(frozen=True, slots=True)
 class Layers:
-    """The layered body without a lump.
-
-    Parameters
-    ----------
-    fat_mm
-        Thickness of the fat: depth of the fat-gland boundary.
-    thickness_mm
-        Depth of the rigid chest wall, to which the gland is bonded.
-    fat_kpa
-        Young's modulus of fat.
-    gland_ratio
-        Young's modulus of gland over that of fat.
-    poisson
-        Poisson's ratio of all tissues, at least 0 and below 0.5.
-    """
+    """The layered body without a lump."""
 
     fat_mm: float
+    """Depth of the fat-gland boundary."""
     thickness_mm: float = THICKNESS_MM
+    """Depth of the rigid chest wall, to which the gland is bonded."""
     fat_kpa: float = FAT_KPA
     gland_ratio: float = GLAND_RATIO
+    """Young's modulus of gland over that of fat."""
     poisson: float = POISSON
+    """Of all tissues, at least 0 and below 0.5."""
 
     def __post_init__(self) -> None:
         _require(0 < self.fat_mm < self.thickness_mm, "fat_mm", self.fat_mm, f"above 0 and below {self.thickness_mm:g}")
@@ -71,30 +61,19 @@ class Layers:
 class Body:
     """Three layers and the place of a circular lump; the lump's stiffness is given elsewhere.
 
-    Parameters
-    ----------
-    d_mm
-        Diameter of the lump.
-    depth_ratio
-        h/d: depth of the lump's centre below the skin over its diameter, at least 0.52 (at 0.5 it touches the skin).
-    seat
-        How far the lump stands out of the gland, 0 to 2. The fat-gland boundary lies at depth ``h + seat d/2``: through
-        the lump's centre at 0 (centred), under its lowest point at 1 (resting, the lump wholly in the fat), below it
-        from there on. From 1e-4 below 1 to 0.01 above it, it is 1.
-    thickness_mm
-        Depth of the chest wall; None takes 70 mm, or 2 mm below ``h + 0.6 d`` and below the fat where that is deeper.
-    fat_kpa, gland_ratio, poisson
-        As in `Layers`; the lump has the tissues' Poisson's ratio.
-
-    Notes
-    -----
     Wellman & Howe (1999) section 2.2: fat of 5 kPa, gland ten times as stiff, a rigid chest wall, plane strain.
     """
 
     d_mm: float
     depth_ratio: float
+    """h/d: depth of the lump's centre below the skin over its diameter, at least 0.52 (at 0.5 it touches the skin)."""
     seat: float = 0.0
+    """How far the lump stands out of the gland, 0 to 2. The fat-gland boundary lies at depth ``h + seat d/2``: through
+    the lump's centre at 0 (centred), under its lowest point at 1 (resting, the lump wholly in the fat), below it from
+    there on. From 1e-4 below 1 to 0.01 above it, it is 1.
+    """
     thickness_mm: float | None = None
+    """Depth of the chest wall; None takes 70 mm, or 2 mm below ``h + 0.6 d`` and below the fat where that is deeper."""
     fat_kpa: float = FAT_KPA
     gland_ratio: float = GLAND_RATIO
     poisson: float = POISSON
@@ -136,13 +115,7 @@ class Body:
 
 
 def parse_seat(text: str) -> float:
-    """Convert ``centred``, ``resting`` or a number from 0 to 2 to a seat.
-
-    Raises
-    ------
-    BadDataError
-        When it is none of these.
-    """
+    """Convert ``centred``, ``resting`` or a number from 0 to 2 to a seat."""
     try:
         seat = SEATS[text] if text in SEATS else float(text)
     except ValueError:
@@ -165,20 +138,12 @@ def _require(holds: bool, name: str, value: float, rule: str) -> None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeadFace:
-    """Squares of the face on the taxels' pitch, with the rows and columns of the rim.
-
-    Parameters
-    ----------
-    surface_mm : (rows, columns, 3) array
-        Centres in `scanhead`: origin at the apex of the face, z into the tissue.
-    sensing : (rows, columns) bool array
-        True for taxels, False for the rim.
-    pitch_mm
-        Side of a square.
-    """
+    """Squares of the face on the taxels' pitch, with the rows and columns of the rim."""
 
     surface_mm: FloatArray
+    """(rows, columns, 3) array: centres in `scanhead`: origin at the apex of the face, z into the tissue."""
     sensing: NDArray[np.bool_]
+    """(rows, columns) bool array: true for taxels, False for the rim."""
     pitch_mm: float
 
     @property
@@ -192,24 +157,11 @@ class HeadFace:
 
 
 def head_face(taxel_mm: FloatArray, *, pitch_mm: float, radius_mm: float, rim_mm: float = 0.0) -> HeadFace:
-    r"""Add a rounded rim to the taxels of a head.
+    """Add a rounded rim to the taxels of a head, (rows, columns, 3) in `scanhead`: a quarter round of `rim_mm` at the
+    edge, tangent to the face.
 
-    Parameters
-    ----------
-    taxel_mm : (rows, columns, 3) array
-        Taxel centres in `scanhead`.
-    pitch_mm
-        Distance of neighbours.
-    radius_mm
-        Of the arc across the face.
-    rim_mm
-        Radius of the quarter round that leaves the face at the edge of the taxels, tangent to it; 0 for none.
-
-    Notes
-    -----
-    Across the head the face is the section `contact.Head` with its shoulders outside: the rim is tangent to the arc at
-    the array's edge. Along the head the rim is tangent to a line.
-    Squares whose centres lie on the rim are added.
+    Across the head, an arc of `radius_mm`, the face is the section `contact.Head` with its shoulders outside. Along the
+    head the rim is tangent to a line. Squares whose centres lie on the rim are added.
     """
     rows, columns = taxel_mm.shape[:2]
     if not 0 <= rim_mm < radius_mm:
@@ -366,13 +318,7 @@ MOST_BALLS = 60
 
 
 def fat_thickness(body: SceneBody, lumps: Sequence[SolidLump]) -> float:
-    """Depth of the fat-gland boundary in the scene, checked against every lump.
-
-    Raises
-    ------
-    BadDataError
-        Naming the key when lumps imply different boundaries, or one that is not in the body.
-    """
+    """Depth of the fat-gland boundary in the scene, checked against every lump."""
     implied = [
         lump.depth_mm + (lump.seat or 0.0) * lump.vertical_mm / 2
         for lump in lumps
@@ -396,12 +342,7 @@ def fat_thickness(body: SceneBody, lumps: Sequence[SolidLump]) -> float:
 
 
 def check_solid(body: SceneBody, lumps: Sequence[SolidLump], ribs: Sequence[Rib] = ()) -> None:
-    """Raise an error for an impossible body, naming the key, its value and the allowed range.
-
-    Raises
-    ------
-    BadDataError
-    """
+    """Raise an error for an impossible body, naming the key, its value and the allowed range."""
     check(body, "body")
     for i, lump in enumerate(lumps):
         check(lump, f"lump[{i}]")

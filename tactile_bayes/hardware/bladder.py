@@ -36,13 +36,7 @@ class BladderStep(Record, eq=False):
 
     @classmethod
     def of(cls, pressure_kpa: float, frames: CountArray, *, saturation_count: int) -> BladderStep:
-        """Average the frames of a step.
-
-        Raises
-        ------
-        BadDataError
-            When there are too few, or the pressure is not one.
-        """
+        """Average the frames of a step."""
         if not np.isfinite(pressure_kpa) or pressure_kpa < 0:
             raise BadDataError(f"a step of {pressure_kpa} kPa", way_out="give the bladder's pressure, 0 or more")
         if len(frames) < MIN_FRAMES:
@@ -79,11 +73,6 @@ def fit_array(steps: Sequence[BladderStep], *, saturation_count: int) -> ArrayFi
     """Fit a line (and a parabola) of pressure on counts for each taxel by least squares.
 
     Steps at which a taxel is saturated are left out for it.
-
-    Raises
-    ------
-    BadDataError
-        When there are fewer than two different pressures, or no taxel answers.
     """
     ordered = sorted(steps, key=lambda step: step.pressure_kpa)
     pressure = np.array([step.pressure_kpa for step in ordered])
@@ -184,21 +173,10 @@ class RotationSense(Record):
 
 
 def rotation_sense(position_mm: FloatArray, quaternion_wxyz: FloatArray) -> RotationSense:
-    """Fit a point that is fixed both in `base` and on the sensor, with the rotations as given and inverted.
+    """Fit a point that is fixed both in `base` and on the sensor, with the (n, 4) rotations as given and inverted.
 
-    Parameters
-    ----------
-    position_mm : (n, 3) array
-    quaternion_wxyz : (n, 4) array
-
-    Raises
-    ------
-    BadDataError
-        When the sensor was hardly turned: then both fit.
-
-    Notes
-    -----
     The point is at t on the sensor and at c in `base` with ``p + R t = c`` for every pose: six unknowns, least squares.
+    Both fit a sensor that was hardly turned, which is refused.
     """
     if len(position_mm) < 10:
         raise BadDataError(f"{len(position_mm)} poses are too few", way_out="turn the sensor for some seconds")

@@ -42,7 +42,7 @@ class Faults(Record):
     """Only every n-th pose is measured anew, those between repeat it."""
 
     def stalls(self, time_s: float) -> bool:
-        """Whether the device sends nothing at a time of the scan."""
+        """True when the device sends nothing at a time of the scan."""
         return self.stall is not None and self.stall[0] <= time_s < self.stall[0] + self.stall[1]
 
     def disturb(self, record: bytes, rng: np.random.Generator) -> bytes:
@@ -66,7 +66,7 @@ class Device(Protocol):
 
     @property
     def streaming(self) -> bool:
-        """Whether the device sends, or will when the scan begins."""
+        """True when the device sends, or will when the scan begins."""
 
     @property
     def starts(self) -> int:
@@ -74,11 +74,11 @@ class Device(Protocol):
 
     @property
     def stopped(self) -> bool:
-        """Whether the host's last command about sending was STOP."""
+        """True when the host's last command about sending was STOP."""
 
     @property
     def said_end(self) -> bool:
-        """Whether the device has told the host that everything was sent, as some protocols do."""
+        """True when the device has told the host that everything was sent, as some protocols do."""
 
     def greet(self) -> None:
         """React to a new connection."""
@@ -114,13 +114,7 @@ class _Sender:
 
 
 class EmulatedHead(_Sender):
-    """An emulated head in the open framing.
-
-    Parameters
-    ----------
-    scan
-        Its frames are sent at their own times.
-    """
+    """An emulated head in the open framing that sends a scan's frames at their own times."""
 
     def __init__(self, scan: Scan) -> None:
         super().__init__()
@@ -165,16 +159,8 @@ class EmulatedHead(_Sender):
 
 
 class EmulatedTracker(_Sender):
-    """An emulated tracker of a maker's protocol, or in the open framing.
-
-    Parameters
-    ----------
-    poses
-        Sent at their own times.
-    protocol
-        A name of `PROTOCOLS`.
-    hold
-        Only every n-th pose is measured anew.
+    """An emulated tracker of one of `PROTOCOLS`, or in the open framing; of the poses only every `hold`-th is measured
+    anew.
     """
 
     def __init__(self, poses: TrackerPoses, *, protocol: str, hold: int = 1) -> None:
@@ -315,18 +301,9 @@ def crc16(data: bytes) -> int:
 class EmulatedNdi:
     """NDI tracker that answers with the pose of the present time, counted from TSTART; it never sends unasked.
 
-    Parameters
-    ----------
-    poses
-        What it measures, one frame each.
-    hold
-        Only every n-th is measured anew.
-    wireless
-        The tool has to be described by the host first.
-    clock
-        Seconds from anywhere.
-    elapsed
-        Seconds of the scan that other devices play too, None while it waits; by default the scan begins with TSTART.
+    Only every `hold`-th pose is measured anew. A `wireless` tool has to be described by the host first. `clock` gives
+    seconds from anywhere; `elapsed` the seconds of the scan that other devices play too, None while it waits: by
+    default the scan begins with TSTART.
     """
 
     starts = 0

@@ -43,7 +43,7 @@ class Link(Protocol):
         """File descriptor to wait on; ready for reading when a command or a connection has come."""
 
     def connected(self) -> bool:
-        """Whether a host may be listening."""
+        """True when a host may be listening."""
 
     def read(self) -> bytes:
         """Read bytes from the host; empty when none have come."""
@@ -125,7 +125,7 @@ class TcpLink:
         return (self._host or self._listener).fileno()
 
     def connected(self) -> bool:
-        """Whether a host is connected."""
+        """True when a host is connected."""
         return self._host is not None
 
     def read(self) -> bytes:
@@ -184,14 +184,8 @@ class Served:
 
 
 class Stage:
-    """Clock of a scan being played, shared by all devices that play it together.
-
-    Parameters
-    ----------
-    speed
-        Seconds of the scan in a second.
-    clock
-        Seconds from anywhere.
+    """Clock of a scan being played, shared by all devices that play it together; `speed` is seconds of the scan in a
+    second.
     """
 
     def __init__(self, *, speed: float = 1.0, clock: Callable[[], float] = time.monotonic) -> None:
@@ -217,19 +211,10 @@ class Stage:
 
 
 class Emulator:
-    """Runs an emulated device on a link.
+    """Runs an emulated device on a link, with the given faults; records keep their device times.
 
-    Parameters
-    ----------
-    device, link
-        What is emulated, and where.
-    faults, rng
-        What goes wrong, and the numbers that decide when.
-    stage
-        When the scan is played; records keep their device times.
-    leads
-        Each START of this device begins the scan. A device that follows another's stage repeats its first record while
-        it streams and the scan has not begun, as a tracker does whose sensor is held still.
+    Each START of a device that `leads` begins the scan. A device that follows another's stage repeats its first record
+    while it streams and the scan has not begun, as a tracker does whose sensor is held still.
     """
 
     def __init__(
@@ -279,7 +264,7 @@ class Emulator:
         self._pass_on()
 
     def _left_alone(self) -> bool:
-        """Whether the host is done: the device's END, the host's STOP, or time enough has passed."""
+        """True when the host is done: the device's END, the host's STOP, or time enough has passed."""
         if self._waiting:
             return False
         return self._device.said_end or self._device.stopped or time.monotonic() - self._finished_at > LINGER_S

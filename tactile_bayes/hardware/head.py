@@ -37,23 +37,13 @@ _LONGEST: Final = MAX_PACKET_BYTES + MAX_PACKET_BYTES // 254 + 1
 
 
 class Packet(NamedTuple):
-    """One valid packet.
-
-    Parameters
-    ----------
-    kind
-        Packet type.
-    sequence
-        Counts the packets of this kind, modulo 2^32.
-    device_us
-        The device's clock in microseconds, modulo 2^64.
-    payload
-        What is left.
-    """
+    """One valid packet."""
 
     kind: int
     sequence: int
+    """Counts the packets of this kind, modulo 2^32."""
     device_us: int
+    """The device's clock in microseconds, modulo 2^64."""
     payload: bytes
 
 
@@ -102,18 +92,7 @@ def cobs_decode(data: bytes) -> bytes | None:
 
 
 def encode_packet(kind: int, payload: bytes, *, sequence: int, device_us: int) -> bytes:
-    """Encode one packet for the wire, with a zero byte before and after it.
-
-    Parameters
-    ----------
-    sequence, device_us
-        Taken modulo 2^32 and 2^64, as counters in firmware wrap.
-
-    Raises
-    ------
-    BadDataError
-        When the payload is longer than a packet may be.
-    """
+    """Encode one packet for the wire, with a zero byte before and after it; counters wrap as in firmware."""
     body = HEADER.pack(VERSION, kind, sequence % 2**32, device_us % 2**64) + payload
     if len(body) + CRC_BYTES > MAX_PACKET_BYTES:
         raise BadDataError(f"a payload of {len(payload)} bytes", way_out=f"a packet holds {MAX_PACKET_BYTES}")
@@ -122,24 +101,16 @@ def encode_packet(kind: int, payload: bytes, *, sequence: int, device_us: int) -
 
 @dataclass(slots=True)
 class FramingCounts:
-    """Counts of a stream's packets and bytes.
-
-    Parameters
-    ----------
-    packets
-        Packets whose checksum held.
-    damaged
-        Stretches between zero bytes that are no packet: a checksum that fails, codes that make no sense, noise.
-    damaged_bytes
-        Their length.
-    foreign
-        Packets of another version of the framing.
-    """
+    """Counts of a stream's packets and bytes."""
 
     packets: int = 0
+    """With a checksum that held."""
     damaged: int = 0
+    """Stretches between zero bytes that are no packet: a checksum that fails, codes that make no sense, noise."""
     damaged_bytes: int = 0
+    """Their length."""
     foreign: int = 0
+    """Packets of another version of the framing."""
 
 
 class PacketParser:
@@ -320,19 +291,8 @@ def needed_baud(taxels: int, *, rate_hz: float) -> int:
 
 
 def check_link_rate(hello: HelloReading, *, baud: int, every: int = 1, port: str = "head") -> None:
-    """Refuse a line too slow for the head's frames.
-
-    Parameters
-    ----------
-    every
-        The head sends every n-th frame.
-    port
-        Named in the message.
-
-    Raises
-    ------
-    DeviceError
-        With the line rate that is needed and the decimation that would fit.
+    """Refuse a line too slow for every n-th of the head's frames, with the rate needed and the decimation that would
+    fit.
     """
     need = needed_baud(hello.rows * hello.columns, rate_hz=hello.rate_hz / every)
     if need <= baud:

@@ -69,13 +69,7 @@ Seen = SeenFrame | SeenPose | SeenLandmark | dict[str, Any]
 
 
 class Feed:
-    """The recorder's end of the feed; an `Observer`.
-
-    Parameters
-    ----------
-    pipe
-        File descriptor to write to.
-    """
+    """The recorder's end of the feed, a pipe; an `Observer`."""
 
     def __init__(self, pipe: int) -> None:
         self._pipe = pipe
@@ -119,13 +113,7 @@ class Feed:
 
 
 class FeedReader:
-    """The live view's end of the feed.
-
-    Parameters
-    ----------
-    pipe
-        File descriptor to read from.
-    """
+    """The live view's end of the feed."""
 
     def __init__(self, pipe: int) -> None:
         self.pipe = pipe
@@ -250,13 +238,7 @@ class LiveState(Record, eq=False):
 
 @dataclass(slots=True)
 class LiveMap:
-    """Builds a map from a `Feed`.
-
-    Parameters
-    ----------
-    head, calibration
-        Of the recording.
-    """
+    """Builds a map from a `Feed`."""
 
     head: HeadGeometry
     calibration: ElementCalibration

@@ -41,16 +41,10 @@ _NETWORK: Final = ("socket://", "rfc2217://")
 
 
 class Port:
-    """One open port.
+    """One open port by a pyserial URL: ``/dev/ttyUSB0``, ``socket://host:port``, ``rfc2217://host:port`` or
+    ``loop://``.
 
-    Parameters
-    ----------
-    url
-        ``/dev/ttyUSB0``, ``socket://host:port``, ``rfc2217://host:port`` or ``loop://``; the pyserial URLs.
-    baud
-        Line rate; sockets and pseudo-terminals have none.
-    role
-        ``head`` or ``tracker``, for messages.
+    `role`, ``head`` or ``tracker``, is for messages.
     """
 
     def __init__(self, url: str, *, baud: int, role: str) -> None:
@@ -67,7 +61,7 @@ class Port:
 
     @property
     def has_line_rate(self) -> bool:
-        """Whether the line has a baud rate: sockets have none."""
+        """True when the line has a baud rate: sockets have none."""
         return not self.url.startswith(("socket://", "rfc2217://", "loop://"))
 
     def write(self, data: bytes) -> None:
@@ -199,27 +193,17 @@ class Piece(NamedTuple):
 
 @dataclass(slots=True)
 class Stream:
-    """A device read by a process of its own.
-
-    Parameters
-    ----------
-    process
-        The reader.
-    pipe
-        Where its records come out; not blocking.
-    overrun_bytes
-        Bytes that the reader had to drop because the pipe was full.
-    ready
-        The reader has begun to read.
-    ended
-        The device has gone, or the reader has.
-    """
+    """A device read by a process of its own."""
 
     process: subprocess.Popen[bytes]
     pipe: int
+    """Where its records come out; not blocking."""
     overrun_bytes: int = 0
+    """Bytes that the reader had to drop because the pipe was full."""
     ready: bool = False
+    """The reader has begun to read."""
     ended: bool = False
+    """The device has gone, or the reader has."""
     cpu_s: float = 0.0
     _rest: bytes = field(default=b"", repr=False)
 

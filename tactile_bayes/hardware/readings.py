@@ -16,47 +16,30 @@ MM_PER_INCH: Final = 25.4
 
 
 class FrameReading(NamedTuple):
-    """One frame of the array.
-
-    Parameters
-    ----------
-    counts : (rows, columns) uint16 array
-    device_ns
-        The head's clock.
-    lost
-        Frames missing just before this one, by the sequence numbers.
-    restarted
-        The sequence numbers do not go on from the frame before: the device has restarted, or its counter is damaged.
-    """
+    """One frame of the array."""
 
     counts: CountArray
+    """(rows, columns) uint16 array."""
     device_ns: int
+    """The head's clock."""
     lost: int = 0
+    """Frames missing just before this one, by the sequence numbers."""
     restarted: bool = False
+    """The sequence numbers do not go on from the frame before: the device has restarted, or its counter is damaged."""
 
 
 class PoseReading(NamedTuple):
-    """One pose of the tracker's sensor in `base`.
-
-    Parameters
-    ----------
-    position_mm
-        Converted from the device's unit.
-    quaternion_wxyz
-        Scalar first, as the device gave it: not normalised, sign free.
-    device_ns
-        The tracker's clock; None when the protocol carries none.
-    flags
-        What the device said against this pose, for example ``"error W"`` or ``"distortion 12"``.
-    station
-        Number of the sensor.
-    """
+    """One pose of the tracker's sensor in `base`."""
 
     position_mm: tuple[float, float, float]
     quaternion_wxyz: tuple[float, float, float, float]
+    """Scalar first, as the device gave it: not normalised, sign free."""
     device_ns: int | None = None
+    """The tracker's clock; None when the protocol carries none."""
     flags: tuple[str, ...] = ()
+    """The device's objections to this pose, for example ``"error W"`` or ``"distortion 12"``."""
     station: int = 1
+    """Number of the sensor."""
 
 
 class HelloReading(NamedTuple):
@@ -123,7 +106,7 @@ class RecordParser:
 
 
 def plausible(position_mm: Sequence[float], quaternion_wxyz: Sequence[float]) -> bool:
-    """Whether numbers can be a pose: finite, within 25 m, quaternion of unit length within tolerance."""
+    """True when numbers can be a pose: finite, within 25 m, quaternion of unit length within tolerance."""
     if not all(map(math.isfinite, (*position_mm, *quaternion_wxyz))):
         return False
     return max(map(abs, position_mm)) < 25_000 and abs(math.hypot(*quaternion_wxyz) - 1) < 0.009
@@ -134,12 +117,8 @@ MOST_LOST: Final = 100_000
 
 
 class SequenceCheck:
-    """Counts missing records by a 32-bit counter that wraps.
-
-    Parameters
-    ----------
-    lost, restarts
-        Records missing so far; how often the counter went back, or forward by more than `MOST_LOST`.
+    """Counts missing records by a 32-bit counter that wraps, and restarts: back, or forward by more than
+    `MOST_LOST`.
     """
 
     def __init__(self) -> None:
@@ -196,7 +175,7 @@ class ArrivalClock:
 
     @property
     def known(self) -> bool:
-        """Whether any record has arrived."""
+        """True when any record has arrived."""
         return self._begun_ns is not None
 
     @property
@@ -216,18 +195,12 @@ class ArrivalClock:
 
 
 class Moment(NamedTuple):
-    """Time at which a record was measured.
-
-    Parameters
-    ----------
-    time_ns
-        On the device's clock made continuous: 0 or more, never below the time before, below 2^63.
-    event
-        What the clock did just now in words; empty when it went on as it should.
-    """
+    """Time at which a record was measured."""
 
     time_ns: int
+    """On the device's clock made continuous: 0 or more, never below the time before, below 2^63."""
     event: str = ""
+    """Step of the clock just now in words; empty when it went on as it should."""
 
 
 class DeviceClock:
@@ -235,14 +208,8 @@ class DeviceClock:
 
     A counter that wraps is unwrapped when its period is one of `WRAPS_NS` and agrees with the host's clock. Any other
     step, back or forward, is replaced by the time that passed on the host since, by `ArrivalClock`; from there the
-    device's clock goes on. A clock that stands still, or steps again and again, is replaced by the host's for good.
-
-    Parameters
-    ----------
-    still_ns
-        For how long records may carry the same time before the clock counts as standing still.
-    arrival
-        Shared between devices whose clocks count from one zero; by default this device's own.
+    device's clock goes on. A clock that stands still for `still_ns`, or steps again and again, is replaced by the
+    host's for good. Devices whose clocks count from one zero share an `arrival`.
     """
 
     def __init__(self, *, still_ns: int, arrival: ArrivalClock | None = None) -> None:
@@ -316,12 +283,9 @@ def wrap_period(before_ns: int, after_ns: int, *, passed_ns: int) -> int | None:
 class PoseClock:
     """The time of each pose on the head's clock, never running backwards.
 
-    Parameters
-    ----------
-    shared
-        Both devices count from one zero (they are synchronised by wire, or one program emulates both): the tracker's
-        own time is taken as it is. Otherwise poses are placed by when they and the frames arrive; what is then left is
-        the tracker's constant latency, which ``map --latency-ms`` takes away.
+    `shared`: both devices count from one zero (they are synchronised by wire, or one program emulates both), and the
+    tracker's own time is taken as it is. Otherwise poses are placed by when they and the frames arrive; what is then
+    left is the tracker's constant latency, which ``map --latency-ms`` takes away.
     """
 
     def __init__(self, *, shared: bool) -> None:

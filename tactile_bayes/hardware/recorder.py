@@ -60,18 +60,10 @@ class Report:
 
 
 def recording_cautions(report: Report, frames: Span, poses: Span, *, passed_s: float, rate_hz: float) -> list[str]:
-    """Cautions before a recording is used, one line each.
+    """Cautions before a recording is used, one line each, from a report that is otherwise complete.
 
-    Parameters
-    ----------
-    report
-        Complete but for its cautions.
-    frames, poses
-        When they were measured, on the head's clock.
-    passed_s
-        Between the first frame and the last by the host's clock.
-    rate_hz
-        Frames that the head promised; 0 when it promised none.
+    Frames and poses were measured at times on the head's clock; `passed_s` is the time between the first frame and the
+    last by the host's. The head promised `rate_hz`, or nothing when that is 0.
     """
     found = [*overlap_cautions(frames, poses), *_rates(report, passed_s, rate_hz), *_counters(report)]
     if report.poses > _STUCK_POSES and report.poses_repeated >= report.poses - 1:
@@ -123,7 +115,7 @@ class Touch(Record, eq=False):
 
     @property
     def steady(self) -> bool:
-        """Whether the head was held still enough."""
+        """True when the head was held still enough."""
         return self.spread_mm <= STEADY_MM
 
     def __str__(self) -> str:
@@ -136,16 +128,8 @@ class Touch(Record, eq=False):
 
 
 class LandmarkTouch:
-    """Collects the next poses to average one landmark.
-
-    Parameters
-    ----------
-    name
-        Of the landmark.
-    scanhead_from_tracker : (4, 4) array
-        The apex of the head touches, the tracker sits in the handle.
-    samples
-        How many to average.
+    """Averages the next `samples` poses to a landmark: the apex of the head touches it, the tracker sits in
+    the handle.
     """
 
     def __init__(self, name: str, *, scanhead_from_tracker: FloatArray, samples: int = SAMPLES) -> None:
@@ -227,27 +211,12 @@ class Line:
 
 
 class Recorder:
-    """Runs one recording.
+    """Runs one recording of devices that were checked and do not stream yet; without a tracker it has no poses.
 
-    Parameters
-    ----------
-    head, tracker
-        Devices that were checked and do not stream yet; a recording without tracker has no poses.
-    sink
-        Gets everything in order of arrival.
-    shared_clock
-        See `PoseClock`.
-    invert_rotation
-        The tracker gives the rotation from base to sensor; it is turned round.
-    duration_s
-        By the head's clock made continuous, and at most `OVERTIME_S` longer by the host's; None goes on until it is
-        stopped.
-    rate_hz
-        Frames that the head promised; 0 when it promised none.
-    observer
-        Looks on.
-    clock_ns
-        Host time, the one the reading processes stamp with.
+    The sink gets everything in order of arrival. `invert_rotation` turns round what a tracker gives as the rotation
+    from base to sensor. `duration_s` is by the head's clock made continuous, and at most `OVERTIME_S` longer by the
+    host's; None goes on until it is stopped. The head promised `rate_hz`, or nothing when that is 0. `clock_ns` is the
+    host time that the reading processes stamp with.
     """
 
     def __init__(
@@ -480,7 +449,7 @@ class Recorder:
             )
 
     def _done(self) -> bool:
-        """Whether all data of the recording have arrived."""
+        """True when all data of the recording have arrived."""
         if self._drain_until_ns is None:
             return False
         tracker = self._tracker

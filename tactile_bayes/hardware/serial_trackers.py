@@ -40,12 +40,8 @@ _WORDS: Final = 7
 class BirdParser(RecordParser):
     """Parser of Flock of Birds records.
 
-    Parameters
-    ----------
-    scale_inch
-        Full scale of a position: 36, or 72 with the long scaling, 144 with the extended range transmitter.
-    group
-        Group mode: the bird's address follows each record.
+    A position's full scale is 36 inches, or 72 with the long scaling, 144 with the extended range transmitter. In group
+    mode the bird's address follows each record.
     """
 
     def __init__(self, *, scale_inch: float = SCALE_INCH, group: bool = False) -> None:
@@ -298,16 +294,10 @@ class TrackerDriver(Record):
     has_clock: bool = False
     """Its records carry the tracker's own time."""
     hint: str = "check its power, cable and line rate, or give another --tracker-protocol"
-    """What to try when nothing comes."""
+    """Advice when nothing comes."""
 
     def check(self, port: Port) -> PoseReading | HelloReading:
-        """Set the tracker up and ask for one record.
-
-        Raises
-        ------
-        DeviceError
-            When none comes that fits the protocol.
-        """
+        """Set the tracker up and ask for one record; one that does not fit the protocol is a DeviceError."""
         if self.stop:
             port.write(self.stop)
             port.drain()
@@ -396,19 +386,8 @@ TRACKERS: Final[dict[str, TrackerDriver]] = {
 
 
 def open_tracker(protocol: str, url: str, *, baud: int | None = None, rom: Path | None = None) -> Port:
-    """Open the port of a tracker.
-
-    Parameters
-    ----------
-    baud
-        None for the protocol's own.
-    rom
-        Description of a wireless NDI tool.
-
-    Raises
-    ------
-    DeviceError
-        When it cannot be opened.
+    """Open the port of a tracker, at the protocol's own rate where none is given; `rom` describes a wireless
+    NDI tool.
     """
     if protocol == "ndi":
         return NdiPort(url, rom=rom)
@@ -416,13 +395,7 @@ def open_tracker(protocol: str, url: str, *, baud: int | None = None, rom: Path 
 
 
 def check_head(port: Port, *, every: int = 1) -> HelloReading:
-    """Ask a head for its identity, and refuse a line too slow for its frames.
-
-    Raises
-    ------
-    DeviceError
-        When no HELLO comes, or when the line rate is too low.
-    """
+    """Ask a head for its identity, and refuse a line too slow for its frames."""
     port.write(encode_command(head.STOP))
     port.drain()
     parser, came, end = HeadParser(), b"", time.monotonic() + ANSWER_S
@@ -485,13 +458,7 @@ def guess(vendor: int | None, product: str) -> str:
 
 
 def probe(url: str) -> str:
-    """Identify the device on a port by trying each protocol; this writes to the port.
-
-    Raises
-    ------
-    DeviceError
-        When the port cannot be opened.
-    """
+    """Identify the device on a port by trying each protocol; this writes to the port."""
     port = Port(url, baud=DEFAULT_BAUD, role="device")
     try:
         hello = check_head(port)

@@ -43,13 +43,7 @@ _SECURITY: Final = (
 
 
 def address_of(text: str) -> tuple[str, int]:
-    """Parse the HOST:PORT of a server that only this computer can reach.
-
-    Raises
-    ------
-    UsageError
-        When it is not one, or not of this computer: the data are a patient's.
-    """
+    """Parse the HOST:PORT of a server that only this computer can reach: the data are a patient's."""
     host, colon, port = text.rpartition(":")
     if not colon or not port.isdigit() or int(port) > 65535:
         raise UsageError(f"--serve {text!r} is not HOST:PORT; give 127.0.0.1:0 for any free port")
@@ -111,15 +105,7 @@ class _Door(socket.socket):
 
 
 class LiveServer:
-    """Sends states to the pages whose address has the secret.
-
-    Parameters
-    ----------
-    host, port
-        Where to listen; port 0 takes a free one.
-    token
-        The secret in the address; a random one by default.
-    """
+    """Sends states to the pages whose address has the secret, a random one by default; port 0 takes a free one."""
 
     def __init__(self, host: str, port: int, *, token: str | None = None) -> None:
         try:

@@ -209,21 +209,10 @@ _TRANSFORMS: Final = 0x0001  # without 0x0800: a tool outside the volume that wa
 
 
 class NdiTracker:
-    """A connected NDI tracker that follows one tool.
+    """A connected NDI tracker that follows one tool, through the module ``ndicapy`` or one that does the same.
 
-    Parameters
-    ----------
-    api
-        The module ``ndicapy``, or one that does the same.
-    url
-        A serial device, or ``socket://HOST:PORT``.
-    rom
-        Description of a wireless tool; tools on a wire bring their own.
-
-    Raises
-    ------
-    DeviceError
-        When the tracker does not answer, refuses a command, or has no tool.
+    `url` is a serial device or ``socket://HOST:PORT``. `rom` describes a wireless tool; tools on a wire bring their
+    own.
     """
 
     def __init__(self, api: Any, url: str, *, rom: Path | None = None) -> None:
@@ -294,12 +283,8 @@ class NdiTracker:
         return enabled[0]
 
     def pose(self) -> PoseReading | None:
-        """Next pose; None while there is no new one, or the tool is out of sight.
-
-        Raises
-        ------
-        DeviceError
-            When the tracker has not answered several times in a row.
+        """Next pose; None while there is no new one, or the tool is out of sight. Several silences in a row are a
+        DeviceError.
         """
         try:
             self._command(f"BX:{_TRANSFORMS:04X}")
@@ -340,13 +325,7 @@ def serve(tracker: NdiTracker, line: socket.socket) -> None:
 
 
 class NdiPort(Port):
-    """An NDI tracker in a process of its own, as a port in the open framing.
-
-    Raises
-    ------
-    DeviceError
-        When the extra is missing, or the tracker cannot be set up.
-    """
+    """An NDI tracker in a process of its own, as a port in the open framing."""
 
     def __init__(self, url: str, *, rom: Path | None = None) -> None:
         self.url, self.baud, self.role = url, 0, "tracker"

@@ -55,13 +55,7 @@ SHIFT = 3.0
 def sbc_document(
     maps: Sequence[MapRanks], *, method: str, seed: int, maps_per_s: float | None, cosines: int | None = None
 ) -> dict[str, Any]:
-    """All results as plain data.
-
-    Parameters
-    ----------
-    maps_per_s
-        Of the maps that this run made; None where it made none.
-    """
+    """All results as plain data; `maps_per_s` is of the maps that this run made, None where it made none."""
     ranked = [one for one in maps if one.ranks is not None]
     tests, others = rank_tests(list(maps)), other_rises(list(maps))
     return {
@@ -176,13 +170,7 @@ def _table_row(one: MapRanks) -> str:
 
 
 def sbc_figure(maps: Sequence[MapRanks], path: Path, *, force: bool = False) -> None:
-    """Draw the ECDF of each parameter's ranks minus the uniform one, with the simultaneous band, as PNG.
-
-    Raises
-    ------
-    UsageError
-        When `path` exists and `force` is false.
-    """
+    """Draw the ECDF of each parameter's ranks minus the uniform one, with the simultaneous band, as PNG."""
     found = [one.ranks for one in maps if one.ranks is not None]
     names = RANKED[: len(found[0])] if found else RANKED
     ranks = np.array(found).reshape(-1, len(names))
@@ -222,14 +210,10 @@ def tables_text(
     nearest: Head | None = None,
     beside: Sequence[Agreement] | None = None,
 ) -> str:
-    """Both tables, the widths and amplitudes, and the phantoms.
+    """Both tables, the widths and amplitudes of the ten lumps, and the phantoms, under `head`.
 
-    Parameters
-    ----------
-    found, phantoms
-        Of the ten lumps and of the phantoms, under `head`.
-    nearest, beside
-        The head nearest to the printed tables, and its ten lumps; None where there is none, or it is `head`.
+    `nearest` is the head nearest to the printed tables, `beside` its ten lumps; None where there is none, or it is
+    `head`.
     """
     lines = [DEFINITION, "", f"head: {named(head)}"]
     if nearest is not None and beside is not None:
@@ -274,7 +258,7 @@ def _span(rows: Sequence[Agreement], name: str) -> str:
 
 
 def _others(found: Sequence[Agreement]) -> list[str]:
-    """What other definitions would give: means over the cases with the least and the largest."""
+    """Results of other definitions: means over the cases with the least and the largest."""
     lines = [
         "Other definitions, %: mean over the cases (least to largest); printed 4.0 to 4.3 and 2.2 to 2.7",
         f"{'':<37}{'frame':>21}{'frame over its mean':>21}{'map':>21}",
@@ -530,13 +514,7 @@ _SIZE_IN = (8.5, 5.0)
 
 
 def draw_tradeoff(report: TradeoffReport, path: Path, *, force: bool = False) -> None:
-    """Draw all settings except the references, whose error is 0 by definition.
-
-    Raises
-    ------
-    UsageError
-        When the file exists and `force` is false.
-    """
+    """Draw all settings except the references, whose error is 0 by definition."""
     with figure_file(path, size_in=_SIZE_IN, force=force) as figure:
         axes = figure.subplots()
         taken: Counter[tuple[int, int]] = Counter()

@@ -91,27 +91,11 @@ def map_figure(
     It is shown as `orientation_of` says, with the patient's sides or the plane's axes named at its edges. Cells with
     fewer than `FEW_READINGS` readings are hatched in both panels, where the readings of cells are known.
 
-    Parameters
-    ----------
-    fit
-        Drawn as an ellipse of the lump's size, and dashed as one of the fitted bump's sigmas.
-    masses
-        Numbered where there are several; those besides the fitted lump with an ellipse of their size.
-    looked_at
-        Drawn as numbered crosses, the first few with their reasons below the coverage.
-    title
-        Above the map; nothing that identifies a person.
-    note
-        A sentence above the whole figure, for example why there is no estimate.
-    findings
-        What speaks against what is shown, told above it; the map's own where none are given.
-
-    Raises
-    ------
-    BadDataError
-        When no cell holds data.
-    UsageError
-        When `path` exists and `force` is false, or its suffix is unknown.
+    `fit` is drawn as an ellipse of the lump's size, and dashed as one of the fitted bump's sigmas; `masses` are
+    numbered where there are several, and those besides the fitted lump get an ellipse of their size. Places `looked_at`
+    are numbered crosses, the first few with their reasons below the coverage. The title, which identifies nobody, and
+    `findings`, by default the map's own, stand above the map; a `note`, for example why there is no estimate, above the
+    whole figure.
     """
     if not tactile_map.covered.any():
         raise BadDataError("the map holds no data to draw", way_out="make it from a scan with frames in the window")

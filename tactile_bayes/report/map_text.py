@@ -73,7 +73,7 @@ _STEPS: Final = 256
 
 
 def colours_wanted(environment: Mapping[str, str]) -> bool:
-    """Whether to use colours: not when NO_COLOR is set, nor on a dumb terminal."""
+    """True when to use colours: not when NO_COLOR is set, nor on a dumb terminal."""
     return not environment.get("NO_COLOR") and environment.get("TERM", "dumb") not in ("dumb", "")
 
 

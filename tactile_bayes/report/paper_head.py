@@ -171,20 +171,7 @@ _MODULUS_COLOURS = ("#1f3b73", "#2a8c6e", "#c8641e")
 def design_figure(
     found: Sequence[Uniformity], tissue: HomogeneousTissue, *, limit: float, path: Path, force: bool = False
 ) -> None:
-    """Draw the search.
-
-    Parameters
-    ----------
-    found
-        Of `head_design.search_heads`; the place of the shoulders that holds the answer is drawn.
-    limit
-        Largest allowed departure, as a share of the mean.
-
-    Raises
-    ------
-    UsageError
-        When `path` exists and `force` is false.
-    """
+    """Draw the search, for the place of the shoulders that holds the answer; `limit` is a share of the mean."""
     answer = narrowest(found, limit=limit) or most_even(found)
     shown = [one for one in found if one.head.shoulders == answer.head.shoulders]
     with figure_file(path, size_in=_HEAD_SIZE_IN, force=force) as figure:
@@ -372,13 +359,7 @@ _ALONG_MM = 6.0
 def comparison_figure(
     measured: MeasuredFrames, found: Sequence[ModelComparison], path: Path, *, title: str, force: bool = False
 ) -> None:
-    """Draw the comparison; maps and residual are those of the first model.
-
-    Raises
-    ------
-    UsageError
-        When `path` exists and `force` is false.
-    """
+    """Draw the comparison; maps and residual are those of the first model."""
     with figure_file(path, size_in=_MODEL_SIZE_IN, force=force) as figure:
         (frames, line, beside), (seen, model, left) = figure.subplots(2, 3)
         _draw_frames(frames, measured, found, _PLACES_MM[0], "(a)")

@@ -57,21 +57,7 @@ def solid_figures(
 ) -> None:
     """Draw the four figures as PNG files.
 
-    Parameters
-    ----------
-    rows
-        The study's table; figures 7b and 8 show what it holds of this seat.
-    seat
-        Of the lumps in figures 5b to 7a.
-    fit, build
-        Of Eq 7 to a raster, and of the raster's map.
-    paths
-        Of figures 5, 6, 7 and 8.
-
-    Raises
-    ------
-    UsageError
-        When one of them exists and `force` is false.
+    Figures 7b and 8 show what the table holds of this seat, which is that of the lumps in figures 5b to 7a as well.
     """
     of_seat = [row for row in rows if row.seat == seat_name(seat)]
     figure_5(settings, paths[0], seat=seat, force=force)

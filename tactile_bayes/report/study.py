@@ -101,32 +101,11 @@ def study_figures(
     measured: Sequence[FrameAgreement] = (),
     force: bool = False,
 ) -> Lookalikes | None:
-    """Draw figures 5 to 8, and the frames of four lumps, as PNG files.
+    """Draw figures 5 to 8, and the frames of four lumps, as PNG files; returns the pair of lumps that figure 5b shows.
 
-    Parameters
-    ----------
-    rows
-        The study's table; figures 7b and 8 show what it holds of this seat.
-    seat
-        Of the lumps in figures 5b to 7a.
-    fit
-        Fits Eq 5 to a map.
-    phantom
-        Diameter in mm and h/d of the lump of figure 6.
-    measured
-        Frames for figure 6a, in place of the places drawn without any.
-    paths
-        Of figures 5, 6, 7 and 8, and of the frames of four lumps.
-
-    Returns
-    -------
-    Lookalikes or None
-        The pair that figure 5b shows.
-
-    Raises
-    ------
-    UsageError
-        When one of them exists and `force` is false.
+    Figures 7b and 8 show what the table holds of this seat, which is that of the lumps in figures 5b to 7a as well.
+    `fit` fits Eq 5 to a map. `phantom` is the diameter in mm and h/d of the lump of figure 6; `measured` are frames for
+    figure 6a, in place of the places drawn without any.
     """
     of_seat = [row for row in rows if row.seat == seat_name(seat)]
     found = find_lookalikes(settings, seat=seat)
@@ -353,17 +332,7 @@ def eq6_figure(
 ) -> None:
     """Draw width change against amplitude, diameter against corrected width, and the plane of amplitude and width.
 
-    Parameters
-    ----------
-    lumps
-        What the calibration was learned from; rows without a positive amplitude take no part.
-    title
-        Name of the table, for the caption.
-
-    Raises
-    ------
-    UsageError
-        When `path` exists and `force` is false.
+    Rows of `lumps` without a positive amplitude take no part.
     """
     rising = lumps.amplitude > 0
     axes = [("x", calibration.x, lumps.sigma_x_mm, lumps.width_change_x)]

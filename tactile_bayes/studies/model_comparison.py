@@ -90,21 +90,9 @@ def measured_frames(
     latency_ms: float = 0.0,
     place_mm: tuple[float, float] | None = None,
 ) -> MeasuredFrames:
-    """The frames of a scan that a map takes, their poses in its plane, and the place of the lump.
+    """Every n-th frame of a scan that a map takes, their poses in its plane, and the place of the lump.
 
-    Parameters
-    ----------
-    every
-        Take one used frame in so many.
-    cell_mm, pressure_window_kpa, latency_ms
-        As in `mapping.build.build_map`.
-    place_mm
-        The lump in the map's plane; None takes the highest bump that can be a lump.
-
-    Raises
-    ------
-    BadDataError
-        When no frame is left, or no lump is found and no place is given.
+    Settings are as in `mapping.build.build_map`; without a place it is the highest bump that can be a lump.
     """
     selected = select_frames(scan, pressure_window_kpa=pressure_window_kpa, latency_ms=latency_ms)
     used = np.flatnonzero(selected.used)[::every]
@@ -131,20 +119,7 @@ def compare_model(
     head: str | None = None,
     progress: Progress | None = None,
 ) -> ModelComparison:
-    """One model of a scene against measured frames.
-
-    Parameters
-    ----------
-    scene
-        Its first lump is put where the measured one is; a scene without a lump stays where it is.
-    fidelity, head
-        As in `forward.simulate.simulate`.
-
-    Raises
-    ------
-    BadDataError
-        When the scene's array is not the scan's, or the model cannot make the scene.
-    """
+    """One model of a scene, with its first lump put where the measured one is, against measured frames."""
     _check_array(measured.scan, scene)
     lump = scene.solid_lumps[0] if scene.solid_lumps else scene.lumps[0] if scene.lumps else None
     at = measured.place_mm if lump is None else (lump.x_mm, lump.y_mm)
@@ -263,13 +238,7 @@ def _model_map(measured: MeasuredFrames, pressure_kpa: FloatArray) -> TactileMap
 
 
 def _map_cells(measured: MeasuredFrames, made: TactileMap) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
-    """(ny, nx) cells within `NEAR_MM` of the lump that both maps cover.
-
-    Raises
-    ------
-    BadDataError
-        When the maps' cells differ, which they do not for frames at the same poses.
-    """
+    """(ny, nx) cells within `NEAR_MM` of the lump that both maps cover."""
     mine = measured.tactile_map
     if mine.mean.shape != made.mean.shape or not np.allclose(mine.x_mm, made.x_mm):
         raise BadDataError(

@@ -105,7 +105,7 @@ class LineFit(Record):
     rms: float
     """Root mean square of what the Gaussian leaves, in units of the background."""
     resolved: bool = True
-    """Whether the width lies within what the fit looks at, and not at an end of it."""
+    """True when the width lies within what the fit looks at, and not at an end of it."""
 
 
 Fit = Callable[[TactileLine, float], LineFit]
@@ -152,12 +152,8 @@ def paper_grid(seat: float) -> list[Geometry]:
 
 
 def group_cases(cases: Iterable[tuple[float, float, float, float]]) -> list[Geometry]:
-    """Geometries of cases (seat, d_mm, depth_ratio, stiffness_ratio), in the order in which they first appear.
-
-    Raises
-    ------
-    BadDataError
-        When a case appears twice or cannot be.
+    """Geometries of cases (seat, d_mm, depth_ratio, stiffness_ratio), in the order in which they first appear; a case
+    that appears twice is an error.
     """
     ratios: dict[tuple[float, float, float], list[float]] = {}
     for seat, d, h, ratio in cases:
@@ -172,13 +168,7 @@ def group_cases(cases: Iterable[tuple[float, float, float, float]]) -> list[Geom
 
 
 def run_geometry(geometry: Geometry, *, settings: StudySettings, fit: Fit) -> list[StudyRow]:
-    """The rows of one geometry.
-
-    Parameters
-    ----------
-    fit
-        How Eq 5 is fitted; importable by name, as `batch` needs it.
-    """
+    """The rows of one geometry; `fit` fits Eq 5 and is importable by name, as `batch` needs it."""
     body = settings.body(geometry.d_mm, geometry.depth_ratio, seat=geometry.seat)
     surface = settings.surface(body)
     rows = []
@@ -258,14 +248,8 @@ def stiffness_changes(rows: Sequence[StudyRow], *, least_ratio: float = 8.0) -> 
 def learn_as_printed(rows: Sequence[StudyRow], *, axis: str = "x") -> PrintedEq6 | None:
     """Eq 6 in two stages from the hard, detectable cases of one seat; None where they are too few.
 
-    Parameters
-    ----------
-    axis
-        Of the head: ``"x"`` across it, ``"y"`` along it.
-
-    Notes
-    -----
-    Figure 8: least squares of d on sigma at h/d = 1, and of ln Delta sigma on ln a over all depths.
+    Figure 8: least squares of d on sigma at h/d = 1, and of ln Delta sigma on ln a over all depths. The sigma is along
+    the head's `axis`, ``"x"`` across it.
     """
     hard = hard_cases(rows)
     change = width_changes(hard, axis=axis)
@@ -312,7 +296,7 @@ class CentredFrame(Record, eq=False):
 
     @property
     def rise(self) -> float:
-        """What the lump adds in the middle of the head."""
+        """Pressure that the lump adds in the middle of the head."""
         return float(_middle(self.added))
 
 
@@ -351,23 +335,12 @@ def find_lookalikes(
     depth_ratios: Sequence[float] = DEPTH_RATIOS,
     least_size_ratio: float = LEAST_SIZE_RATIO,
 ) -> Lookalikes | None:
-    """The pair of visible lumps of different size whose frames are most alike; None where no two are visible.
+    """The pair of visible hard lumps whose frames are most alike though one's diameter is `least_size_ratio` times the
+    other's; None where no two are visible.
 
-    Parameters
-    ----------
-    settings
-        Body, head and pressure; hard lumps (E2/E1 = 100).
-    seat
-        As in `body.Body`.
-    diameters_mm, depth_ratios
-        Rising; depths between the first and the last are tried in steps of 0.01.
-    least_size_ratio
-        Diameter of the larger lump over that of the smaller, at least.
-
-    Notes
-    -----
-    Frames are interpolated between the depths solved (cubic splines in h/d); the best depth of the larger lump of the
-    best pair is then sought with the model itself.
+    Diameters and depths rise; depths between the first and the last are tried in steps of 0.01. Frames are interpolated
+    between the depths solved (cubic splines in h/d); the best depth of the larger lump of the best pair is then sought
+    with the model itself.
     """
     coarse = replace(settings, fineness=1)
     tried = np.round(np.arange(depth_ratios[0], depth_ratios[-1] + 1e-9, _STEP), 6)
@@ -443,13 +416,7 @@ _CELL_MM = 0.5
 
 
 class HomogeneousTissue(Record):
-    """Tissue and pressures over which a head should press evenly.
-
-    Raises
-    ------
-    BadDataError
-        When a range runs backwards or is not above 0.
-    """
+    """Tissue and pressures over which a head should press evenly."""
 
     young_kpa: tuple[float, float] = PAPER_MODULI_KPA
     mean_kpa: tuple[float, float] = PAPER_PRESSURES_KPA
@@ -537,14 +504,8 @@ def search_heads(
     radii_mm: Sequence[float] = RADII_MM,
     shoulders_mm: Sequence[float] = SHOULDERS_MM,
 ) -> list[Uniformity]:
-    """Uniformity of every head of a grid of radii and shoulders; sections that cannot be are left out.
-
-    Parameters
-    ----------
-    kinds
-        Some of `presets.HEADS`: where the shoulders lie.
-    radii_mm, shoulders_mm
-        Radii of the arc and of the shoulders.
+    """Uniformity of every head of a grid of places (`presets.HEADS`) and radii of arc and shoulders; sections that
+    cannot be are left out.
     """
     found = []
     for kind in kinds:
@@ -564,14 +525,10 @@ def most_even(found: Sequence[Uniformity]) -> Uniformity:
 
 
 def narrowest(found: Sequence[Uniformity], *, limit: float, by_rms: bool = False) -> Uniformity | None:
-    """Of the heads within `limit`, the one with the narrowest face, and of those the most even; None without any.
+    """The head with the narrowest face, and of those the most even, whose largest departure as a share of the mean is
+    within `limit`; None without any.
 
-    Parameters
-    ----------
-    limit
-        Largest allowed departure, as a share of the mean.
-    by_rms
-        Hold the root mean square departure to it, not the largest: another reading of the paper's "variation".
+    `by_rms` holds the root mean square departure to it: another reading of the paper's "variation".
     """
     departure = {id(one): one.worst_rms if by_rms else one.worst for one in found}
     within = [one for one in found if departure[id(one)] <= limit]

@@ -68,8 +68,6 @@ def raster_scan(frames: RasterFrames) -> Scan:
 def raster_map(frames: RasterFrames) -> TactileMap:
     """Build the map of a raster with cells of half a pitch, so that every reading lies in the middle of one.
 
-    Notes
-    -----
     Where the raster has a plain frame, the head's own response is taken off as `map --flat-field` takes off a
     patient's. There it is found from the scan's own calm frames; here it is known.
     """
@@ -90,8 +88,6 @@ def _readings(pressure_kpa: FloatArray) -> CountArray:
 def fit_raster(frames: RasterFrames, settings: SolidSettings) -> RasterFit:
     """Fit Eq 7 about the lump's axis with equal weights; the level is fitted or 1, by the settings.
 
-    Notes
-    -----
     All readings of a cell come from its middle, so the Gaussian is not averaged over it. A patient's readings are
     spread over their cells and the Gaussian is averaged there; what remains in both is the average over a taxel.
 
@@ -191,7 +187,7 @@ class SolidSettings(Record):
     background: str = "free"
     """``"free"``: Eq 7's level is fitted; ``"fixed"``: it is 1."""
     flat_field: bool = True
-    """Whether each taxel is divided by what it reads of the same body without the lump."""
+    """True when each taxel is divided by what it reads of the same body without the lump."""
 
     def __post_init__(self) -> None:
         half = self.head.rows * self.head.pitch_mm / 2
@@ -269,7 +265,7 @@ class RasterFrames(Record, eq=False):
     pressure_kpa: FloatArray
     """(n, rows, columns) array."""
     head: Head
-    """What was pressed."""
+    """The head that was pressed."""
     plain_kpa: FloatArray | None = None
     """(rows, columns) array: The head's frame over the same body without the lump, where the map is to be divided by
     it.
@@ -288,7 +284,7 @@ class RasterFit(Record):
     rms: float
     """Root mean square of what the Gaussian leaves, in units of the background."""
     resolved: bool
-    """Whether both widths are ones that array and window can tell."""
+    """True when both widths are ones that array and window can tell."""
 
 
 RasterFitter = Callable[[RasterFrames, SolidSettings], RasterFit]
@@ -298,8 +294,6 @@ RasterFitter = Callable[[RasterFrames, SolidSettings], RasterFit]
 def raster_frames(head: SolidHead, lump: PlacedLump | None, settings: SolidSettings) -> RasterFrames:
     """Frames of the raster over a lump, or over the plain body.
 
-    Notes
-    -----
     The lump is symmetric about both axes of the level head, so the frame at (-x, y) is the one at (x, y) with its rows
     turned about, and that at (x, -y) with its columns. The layers are alike everywhere, so one frame tells all that the
     head reads without the lump.
@@ -335,10 +329,7 @@ def raster_frames(head: SolidHead, lump: PlacedLump | None, settings: SolidSetti
 def run_solid_geometry(geometry: Geometry, *, settings: SolidSettings, fit: RasterFitter) -> list[StudyRow]:
     """The rows of one geometry: the body is condensed once for all stiffnesses of its lump.
 
-    Parameters
-    ----------
-    fit
-        How the map is built and Eq 7 fitted; importable by name, as `batch` needs it.
+    `fit` builds the map and fits Eq 7; it is importable by name, as `batch` needs it.
     """
     body = settings.body(geometry.d_mm, geometry.depth_ratio, seat=geometry.seat)
     head, condensed = settings.on(body), settings.condensed(body)

@@ -49,7 +49,7 @@ OTHER_DEFINITIONS: dict[str, Callable[[FloatArray, FloatArray], float]] = {
     "mean absolute over the mean": lambda u, v: float(np.mean(np.abs(u - v)) / np.mean(v)),
     "over the squares about the mean": lambda u, v: float(np.sum((u - v) ** 2) / np.sum((v - v.mean()) ** 2)),
 }
-"""What else a paper could mean by a mean squared difference: tried because the printed tables are not met."""
+"""Other meanings of a mean squared difference: tried because the printed tables are not met."""
 PHANTOMS = {
     "phantom 12.5 mm": (12.5, 0.825),
     "phantom 15.5 mm": (15.5, 1.0),
@@ -101,7 +101,7 @@ class Agreement(Record):
     """How far the empirical model is from the elastic one; differences as shares, not percent."""
 
     scene: Scene
-    """What was compared."""
+    """The lump compared."""
     centred_frame: float
     all_frames: float
     map: float
@@ -132,10 +132,7 @@ def phantom_scenes(seat: float) -> list[Scene]:
 def scene_curves(scene: Scene, settings: StudySettings, *, surface: SurfaceCompliance | None = None) -> Curves:
     """Frames and maps of both models; the empirical one is fitted to what the taxels see far from and over the lump.
 
-    Parameters
-    ----------
-    surface
-        The scene's body condensed onto its skin, where it is at hand.
+    `surface` is the scene's body condensed onto its skin, where it is at hand.
     """
     if surface is None:
         surface = settings.surface(settings.body(scene.d_mm, scene.depth_ratio, seat=scene.seat))
@@ -203,13 +200,7 @@ LEAST_TAXELS = 4
 
 
 class MeasuredFrame(Record, eq=False):
-    """One frame along the centre line of the head.
-
-    Raises
-    ------
-    BadDataError
-        When taxels are few or no pressure is above 0.
-    """
+    """One frame along the centre line of the head."""
 
     x_c_mm: float
     """Where the head's centre stands, from the lump's axis."""
@@ -252,17 +243,8 @@ def compare_frames(
 ) -> list[FrameAgreement]:
     """Both models of a hard lump at the places and mean pressures of measured frames.
 
-    Parameters
-    ----------
-    d_mm, depth_ratio, seat
-        Of the lump, as in `body.Body`.
-    settings
-        Body and head; the empirical model is fitted at its mean pressure and scaled with the frame's.
-
-    Raises
-    ------
-    BadDataError
-        When a taxel lies outside the head, or the head beyond the study's positions.
+    The empirical model is fitted at the settings' mean pressure and scaled with the frame's. A taxel outside the head,
+    or a head beyond the study's positions, is an error.
     """
     half, most = settings.head.half_width_mm, max(abs(end) for end in settings.positions_mm[:2])
     for frame in frames:

@@ -193,18 +193,8 @@ def draw_mass(
     exams: ExamPrior | None = None,
     head: Head | None = None,
 ) -> list[Scene]:
-    """Draw the scenes of one mass, examined several times; they depend only on index, seed, priors and head.
-
-    Parameters
-    ----------
-    index
-        Number of the mass.
-    scans
-        Exams of it.
-    bodies, exams
-        Priors; None for the defaults.
-    head
-        None for the paper's.
+    """Draw the scenes of one mass, examined several times; they depend only on index, seed, priors and head, by default
+    the paper's.
     """
     rng = np.random.default_rng([seed, index])
     body, lump = draw_body(bodies or BodyPrior(), rng)
@@ -248,34 +238,10 @@ def measuring_options() -> EstimateOptions:
 
 
 class MassRow(Record):
-    """One exam of one mass: true properties and measurements; the fields are the table's columns.
-
-    Parameters
-    ----------
-    body
-        Number of the mass: exams of one share it.
-    exam
-        From 0.
-    d_mm, depth_ratio, stiffness_ratio, seat, fat_kpa, gland_ratio, thickness_mm
-        What no map says.
-    mean_kpa
-        Mean pressure of the frames used.
-    detected
-        Whether a patient's path would give an estimate; if not, what follows is None.
-    amplitude, sigma_x_mm, sigma_y_mm
-        Medians.
-    var_log_a ... var_q
-        Posterior covariance of ln a, p and q (p and q: half sum and half difference of the logs of the widths).
-    head_profile_x2, head_profile_y2, head_profile_y4
-        How pressure was spread over the head where it felt no lump, see `mapping.head_profile`; None where it always
-        felt one.
-    normalise
-        How the map's frames were, see `MapRecipe`.
-    head_rows, head_columns, head_pitch_mm, head_radius_mm, head_shoulder_mm, head_rim_mm
-        As in `forward.scene.Head`; the radius is None for a flat head.
-    """
+    """One exam of one mass: true properties and measurements; the fields are the table's columns."""
 
     body: int
+    """Number of the mass: exams of one share it."""
     exam: int
     d_mm: float
     depth_ratio: float
@@ -285,24 +251,36 @@ class MassRow(Record):
     gland_ratio: float
     thickness_mm: float
     mean_kpa: float | None = None
+    """Mean pressure of the frames used."""
     detected: bool = False
+    """True when a patient's path would give an estimate; if not, what follows is None."""
     amplitude: float | None = None
+    """Median, as those of the widths."""
     sigma_x_mm: float | None = None
     sigma_y_mm: float | None = None
     var_log_a: float | None = None
+    """Posterior covariance of ln a, p and q (p and q: half sum and half difference of the logs of the widths), to
+    `var_q`.
+    """
     cov_log_a_p: float | None = None
     cov_log_a_q: float | None = None
     var_p: float | None = None
     cov_p_q: float | None = None
     var_q: float | None = None
     head_profile_x2: float | None = None
+    """How pressure was spread over the head where it felt no lump, see `mapping.profile`; None where it always felt
+    one.
+    """
     head_profile_y2: float | None = None
     head_profile_y4: float | None = None
     normalise: str = "mean"
+    """How the map's frames were, see `MapRecipe`."""
     head_rows: int | None = None
+    """These and the next as in `forward.scene.Head`."""
     head_columns: int | None = None
     head_pitch_mm: float | None = None
     head_radius_mm: float | None = None
+    """None for a flat head."""
     head_shoulder_mm: float | None = None
     head_rim_mm: float | None = None
 
@@ -314,16 +292,8 @@ def measure_mass(
     scan: Callable[[Scene], Scan],
     normalise: Sequence[str] = (DEFAULT_NORMALISE,),
 ) -> list[MassRow]:
-    """Scan each scene of a mass, map and fit it; returns a row for each scene and normalisation.
-
-    Parameters
-    ----------
-    scenes
-        Exams of one lump in one body, see `forward.population.draw_mass`.
-    scan
-        Makes the scan of a scene.
-    normalise
-        As `build_map`'s: a map by each from one scan.
+    """Scan each scene of a mass, map and fit it; returns a row for each scene and normalisation (a map by each from one
+    scan).
     """
     rows = []
     for i, scene in enumerate(scenes):
@@ -386,13 +356,7 @@ def head_columns(head: Head) -> dict[str, Any]:
 
 
 def table_head(columns: Mapping[str, Sequence[Any]]) -> HeadShape:
-    """Head that a table's maps were made with.
-
-    Raises
-    ------
-    BadDataError
-        When rows differ in it.
-    """
+    """Head that a table's maps were made with."""
     names = [f"head_{name}" for name in names_of(Head)]
     found = set(zip(*(columns[name] for name in names), strict=True))
     if len(found) > 1:

@@ -66,19 +66,13 @@ class RankTest(Record):
 
     @property
     def inside(self) -> bool:
-        """Whether the ECDF stays inside its simultaneous band."""
+        """True when the ECDF stays inside its simultaneous band."""
         return self.ecdf_p > 1.0 - BAND
 
 
 def rank_test(name: str, ranks: IntArray, *, draws: int, strays: FloatArray | None = None) -> RankTest:
-    """Run all tests on one parameter's ranks.
-
-    Parameters
-    ----------
-    ranks : (n,) array
-        Each from 0 to `draws`.
-    strays
-        From `uniform_strays`, where it is at hand.
+    """Run all tests on one parameter's (n,) ranks from 0 to `draws`; `strays` are from `uniform_strays`,
+    where at hand.
     """
     known = uniform_strays(len(ranks), draws) if strays is None else strays
     # equally likely strays of discrete counts differ by rounding
@@ -107,12 +101,8 @@ def chi2_p(ranks: IntArray, draws: int) -> float:
 
 
 def coverage(ranks: IntArray, draws: int, probability: float) -> Coverage:
-    """Share of truths in the central interval between two draws that holds exactly the nominal share of ranks.
-
-    Raises
-    ------
-    ValueError
-        When no central interval between draws has that probability.
+    """Share of truths in the central interval between two draws that holds exactly the nominal share of ranks. A
+    probability that no interval between draws has is a ValueError.
     """
     tail = (1.0 - probability) / 2.0 * (draws + 1)
     if abs(tail - round(tail)) > 1e-9:
@@ -225,7 +215,7 @@ class MapRanks(Record):
     index: int
     """The map's number."""
     truth: Truth
-    """What was put in."""
+    """True values."""
     ranks: tuple[int, ...] | None
     """Of `RANKED`: how many of `DRAWS` draws lie below the truth; None without an estimate of this bump."""
     outcome: str
@@ -277,7 +267,7 @@ def ranks_of_map(
 
 
 def elsewhere(posterior: MapPosterior, truth: Truth) -> bool:
-    """Whether the estimate measured another rise: its centre is further from the true one than both widths."""
+    """True when the estimate measured another rise: its centre is further from the true one than both widths."""
     away = np.hypot(np.median(posterior.x_mm) - truth.x_mm, np.median(posterior.y_mm) - truth.y_mm)
     widths = truth.sigma_x_mm, truth.sigma_y_mm, np.median(posterior.sigma_x_mm), np.median(posterior.sigma_y_mm)
     return bool(away > max(widths))
@@ -295,7 +285,7 @@ class OtherRises(Record):
 
     @property
     def too_many(self) -> bool:
-        """Whether there are more such maps than the estimates' own probabilities allow."""
+        """True when there are more such maps than the estimates' own probabilities allow."""
         return self.chance < MANY_ELSEWHERE
 
 

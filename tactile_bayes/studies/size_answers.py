@@ -1,4 +1,4 @@
-"""What one estimate answers, as the numbers that are reported, and how far it lies from a reference."""
+"""The reported numbers of one estimate, and how far they lie from a reference."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ WIDTHS = ("sigma_x_mm", "sigma_y_mm")
 
 
 class SizeAnswer(Record):
-    """What one estimate says."""
+    """Reported numbers of one estimate."""
 
     reason: str
     """Why there is no number; empty where there is one."""
@@ -45,13 +45,7 @@ class SizeAnswer(Record):
 
 
 def answer_of(estimate: Estimate, *, probability: float) -> SizeAnswer:
-    """An estimate as its reported numbers.
-
-    Parameters
-    ----------
-    probability
-        Of the intervals.
-    """
+    """An estimate as its reported numbers, with intervals of the given probability."""
     if estimate.map_posterior is None or estimate.draws is None:
         return SizeAnswer(estimate.reason, estimate.probability, code=estimate.code)
     replicates = estimate.draws.replicates
