@@ -53,14 +53,7 @@ def check_number(
 ) -> None:
     """Refuse what is no finite number, or lies outside a range, with a `UsageError` that says what can be given.
 
-    Parameters
-    ----------
-    least, most
-        Ends of the range; None for no end.
-    whole
-        Whether only whole numbers are taken.
-    open_ends
-        Whether the ends themselves are refused.
+    `open_ends` refuses the range's ends themselves.
     """
     if isinstance(value, numbers.Integral if whole else numbers.Real) and not isinstance(value, bool):
         number = float(value)
@@ -183,24 +176,15 @@ NO_LUMP = ("empty", "undetected", "ridge")
 
 @dataclass(frozen=True, slots=True)
 class Abstention:
-    """The reason for giving no number.
-
-    Parameters
-    ----------
-    code
-        One of `CODES`.
-    reason
-        With the figure and the limit.
-    advice
-        What would fix it, at the command line; empty when nothing would.
-    on_paper
-        The same for a reader of the exam's page, who has no command line.
-    about_mm
-        The place on the map that the reason is about; None where it is about no one place.
-    """
+    """The reason for giving no number."""
 
     code: str
+    """One of `CODES`."""
     reason: str
+    """With the figure and the limit."""
     advice: str = ""
+    """What would fix it, at the command line; empty when nothing would."""
     on_paper: str = ""
+    """The same for a reader of the exam's page, who has no command line."""
     about_mm: tuple[float, float] | None = None
+    """The place on the map that the reason is about; None where it is about no one place."""

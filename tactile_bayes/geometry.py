@@ -26,17 +26,9 @@ NOT_RIGID = 1e-6
 
 
 def rotation_from_quaternion(quaternion_wxyz: FloatArray) -> FloatArray:
-    """Rotation matrices of unit quaternions, scalar first.
+    """(..., 3, 3) rotations of (..., 4) quaternions, scalar first; ``p_outer = R @ p_inner``.
 
-    Parameters
-    ----------
-    quaternion_wxyz : (..., 4) array
-        Normalised here, so that rounding in a device does not stretch a head.
-
-    Returns
-    -------
-    (..., 3, 3) array
-        Proper rotations; ``p_outer = R @ p_inner``.
+    They are normalised here, so that rounding in a device does not stretch a head.
     """
     unit = quaternion_wxyz / np.linalg.norm(quaternion_wxyz, axis=-1, keepdims=True)
     w, x, y, z = np.moveaxis(unit, -1, 0)
@@ -106,44 +98,24 @@ def check_rigid(transform: FloatArray, *, name: str) -> None:
 
 
 class Plane(Record, eq=False):
-    """A plane fitted to points, with how well it is determined.
-
-    Parameters
-    ----------
-    plane_from_base : (4, 4) array
-        Origin at the centroid, z along the sensor normal (into the tissue), x along the mean head x axis.
-    rms_mm
-        Root mean square distance of the points from the plane.
-    spread_mm : (3,) array
-        Standard deviations of the points along the principal axes, descending.
-    """
+    """A plane fitted to points, with how well it is determined."""
 
     plane_from_base: FloatArray
+    """(4, 4) array: Origin at the centroid, z along the sensor normal (into the tissue), x along the mean head x axis.
+    """
     rms_mm: float
+    """Root mean square distance of the points from the plane."""
     spread_mm: FloatArray
+    """(3,) array: Standard deviations of the points along the principal axes, descending."""
 
 
 def fit_plane(centroid_mm: FloatArray, covariance_mm2: FloatArray, *, head_x: FloatArray, head_z: FloatArray) -> Plane:
-    """Best-fit plane from the first two moments of taxel centres (paper step i).
+    """Best-fit plane from the (3,) mean and (3, 3) covariance of taxel centres in `base` (paper step i).
 
     Moments can be streamed and added, so the same plane comes from one scan or from its parts. The sign of the normal
-    follows `head_z`, because eigenvectors have none; the x axis follows `head_x`, because widths are calibrated
-    per axis of the head.
-
-    Parameters
-    ----------
-    centroid_mm : (3,) array
-        Mean of the taxel centres in `base`.
-    covariance_mm2 : (3, 3) array
-        Their covariance.
-    head_x, head_z : (3,) arrays
-        Mean directions of the head's x axis and of its normal (into the tissue) in `base`.
-
-    Raises
-    ------
-    BadDataError
-        When the points lie too nearly on a line to span a plane, the normal disagrees with the head's, or `head_x` is
-        zero or along the normal.
+    follows `head_z`, because eigenvectors have none; the x axis follows `head_x`, because widths are calibrated per
+    axis of the head. Both are (3,) mean directions in `base`. `BadDataError` when the points lie too nearly on a line
+    to span a plane, the normal disagrees with the head's, or `head_x` is zero or along the normal.
     """
     variances, axes = np.linalg.eigh(covariance_mm2)
     shortest, middle, longest = (math.sqrt(max(variance, 0.0)) for variance in variances.tolist())
@@ -180,13 +152,9 @@ def fit_plane(centroid_mm: FloatArray, covariance_mm2: FloatArray, *, head_x: Fl
 def patient_from_base(sternal_notch_mm: FloatArray, xiphoid_mm: FloatArray, *, normal: FloatArray) -> FloatArray:
     """Transform to the patient frame, from two landmarks and the direction into the body.
 
-    Origin at the xiphoid, y towards the sternal notch, z the part of `normal` (into the body) at right angles to y,
-    x = y cross z. The two landmarks of the paper fix only y; z is this program's choice of the third direction.
-
-    Raises
-    ------
-    BadDataError
-        When the landmarks coincide or their line runs along the normal.
+    Origin at the xiphoid, y towards the sternal notch, z the part of `normal` (into the body) at right angles to y, x =
+    y cross z. The two landmarks of the paper fix only y; z is this program's choice of the third direction.
+    `BadDataError` when the landmarks coincide or their line runs along the normal.
     """
     along = sternal_notch_mm - xiphoid_mm
     length = float(np.linalg.norm(along))
@@ -207,12 +175,7 @@ def patient_from_base(sternal_notch_mm: FloatArray, xiphoid_mm: FloatArray, *, n
 
 
 def patient_from_plane(sternal_notch_mm: FloatArray, xiphoid_mm: FloatArray, plane_from_base: FloatArray) -> FloatArray:
-    """As `patient_from_base`, from two landmarks in `base` and a plane whose z points into the body.
-
-    Returns
-    -------
-    (4, 4) transform from the plane to the patient.
-    """
+    """(4, 4) as `patient_from_base` but from the plane, whose z points into the body; landmarks in `base`."""
     patient = patient_from_base(sternal_notch_mm, xiphoid_mm, normal=plane_from_base[2, :3])
     transform: FloatArray = patient @ inverse(plane_from_base)
     return transform

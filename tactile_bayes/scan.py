@@ -55,17 +55,9 @@ class HeadShape(Record):
 
     @classmethod
     def of(cls, surface_mm: FloatArray, pitch_mm: float, *, rim_mm: float | None = None) -> HeadShape:
-        r"""Shape of a head from the places of its taxels.
+        """Shape of a head from its (rows, columns, 3) taxel centres in `scanhead`: origin at the apex, z into the
+        tissue, mm.
 
-        Parameters
-        ----------
-        surface_mm : (rows, columns, 3) array
-            Centres in `scanhead`: origin at the apex, z into the tissue.
-        pitch_mm
-            As stated.
-
-        Notes
-        -----
         Least squares of :math:`z = c + s_x x + s_y y - (x^2 + z^2)/(2 R_x) - y^2/(2 R_y)`, which holds to the digit for
         a cylinder, a sphere and a plane, tilted or not.
         """
@@ -130,13 +122,7 @@ class HeadShape(Record):
 
     @classmethod
     def from_document(cls, document: Mapping[str, Any]) -> HeadShape:
-        """Undo `as_dict`, checking everything.
-
-        Raises
-        ------
-        BadDataError
-            When a value cannot be that of a head.
-        """
+        """Undo `as_dict`; a value that cannot be that of a head is a `BadDataError`."""
         try:
             return from_plain(cls, dict(document))
         except BadDataError as error:
@@ -202,22 +188,16 @@ def _check_times(time_s: FloatArray, *, name: str) -> FloatArray:
 
 
 class HeadGeometry(Record, eq=False):
-    """Where the taxels sit and how the tracker is mounted.
-
-    Parameters
-    ----------
-    surface_mm : (rows, columns, 3) array
-        Taxel centres in `scanhead`: origin at the apex of the face, z into the tissue, axis 0 across the head (x),
-        axis 1 along it (y).
-    pitch_mm
-        Distance between neighbouring taxels.
-    scanhead_from_tracker : (4, 4) array
-        The lever arm: ``p_scanhead = scanhead_from_tracker @ p_tracker``.
-    """
+    """Positions of the taxels, and how the tracker is mounted."""
 
     surface_mm: FloatArray
+    """(rows, columns, 3) array: Taxel centres in `scanhead`: origin at the apex of the face, z into the tissue, axis 0
+    across the head (x), axis 1 along it (y).
+    """
     pitch_mm: float
+    """Distance between neighbouring taxels."""
     scanhead_from_tracker: FloatArray
+    """(4, 4) array: The lever arm: ``p_scanhead = scanhead_from_tracker @ p_tracker``."""
 
     def __post_init__(self) -> None:
         surface = _check_finite(self.surface_mm, name="surface_mm", shape=(None, None, 3))
@@ -234,18 +214,12 @@ class HeadGeometry(Record, eq=False):
 
 
 class ElementCalibration(Record, eq=False):
-    """Bladder calibration of each taxel: pressure in kPa = gain x counts + offset.
-
-    Parameters
-    ----------
-    gain_kpa_per_count, offset_kpa : (rows, columns) arrays
-    saturation_count
-        Readings at or above it are saturated and carry no pressure.
-    """
+    """Bladder calibration of each taxel: pressure in kPa = gain x counts + offset, (rows, columns) arrays."""
 
     gain_kpa_per_count: FloatArray
     offset_kpa: FloatArray
     saturation_count: int = 4095
+    """Readings at or above it are saturated and carry no pressure."""
 
     def __post_init__(self) -> None:
         gain = _check_finite(self.gain_kpa_per_count, name="gain_kpa_per_count", shape=(None, None))
@@ -265,18 +239,12 @@ class ElementCalibration(Record, eq=False):
 
 
 class PressureFrames(Record, eq=False):
-    """Raw frames of the array.
-
-    Parameters
-    ----------
-    time_s : (n,) array
-        Device time of each frame; never runs backwards.
-    counts : (n, rows, columns) uint16 array
-        Raw readings.
-    """
+    """Raw frames of the array."""
 
     time_s: FloatArray
+    """(n,) array: Device time of each frame; never runs backwards."""
     counts: CountArray
+    """(n, rows, columns) uint16 array."""
 
     def __post_init__(self) -> None:
         time = _check_times(self.time_s, name="frame_time_s")
@@ -301,20 +269,13 @@ class PressureFrames(Record, eq=False):
 
 
 class TrackerPoses(Record, eq=False):
-    """Poses of the tracker's sensor in `base`.
-
-    Parameters
-    ----------
-    time_s : (m,) array
-        Device time on the frames' clock.
-    position_mm : (m, 3) array
-    quaternion_wxyz : (m, 4) array
-        Scalar first; ``p_base = position + R(q) p_tracker``. Signs are free.
-    """
+    """Poses of the tracker's sensor in `base`: (m, 3) positions and (m, 4) quaternions."""
 
     time_s: FloatArray
+    """(m,) array: Device time on the frames' clock."""
     position_mm: FloatArray
     quaternion_wxyz: FloatArray
+    """Scalar first; ``p_base = position + R(q) p_tracker``. Signs are free."""
 
     def __post_init__(self) -> None:
         time = _check_times(self.time_s, name="pose_time_s")
@@ -335,21 +296,14 @@ class TrackerPoses(Record, eq=False):
 
 
 class Landmarks(Record, eq=False):
-    """Points touched just before the scan, in `base`, mm.
-
-    Parameters
-    ----------
-    sternal_notch_mm, xiphoid_mm : (3,) arrays
-    spread_mm
-        Largest distance of an earlier touch from the last one, where a landmark was touched again; else None.
-    nipple_mm : (3,) array or None
-        None where it was not touched: a lump then has no place by the clock.
-    """
+    """Points touched just before the scan, (3,) in `base`, mm."""
 
     sternal_notch_mm: FloatArray
     xiphoid_mm: FloatArray
     spread_mm: float | None = None
+    """Largest distance of an earlier touch from the last one, where a landmark was touched again; else None."""
     nipple_mm: FloatArray | None = None
+    """None where it was not touched: a lump then has no place by the clock."""
 
     def __post_init__(self) -> None:
         if self.spread_mm is not None and not 0 <= self.spread_mm < np.inf:
@@ -365,27 +319,18 @@ class Landmarks(Record, eq=False):
 
 
 class Scan(Record, eq=False):
-    """All data of one scan.
-
-    Parameters
-    ----------
-    frames, poses, head, element_calibration
-        As recorded.
-    landmarks
-        None when they were not touched: the map then has no patient frame.
-    session
-        Plain text facts (device ids, side, posture...); no names.
-    findings
-        What its file had lost and what its recorder noted.
-    """
+    """All data of one scan."""
 
     frames: PressureFrames
     poses: TrackerPoses
     head: HeadGeometry
     element_calibration: ElementCalibration
     landmarks: Landmarks | None = None
+    """None when they were not touched: the map then has no patient frame."""
     session: Mapping[str, str] = field(default_factory=dict)
+    """Plain text facts (device ids, side, posture...); no names."""
     findings: tuple[Finding, ...] = ()
+    """What its file had lost and what its recorder noted."""
 
     def __post_init__(self) -> None:
         taxels = self.frames.counts.shape[1:]

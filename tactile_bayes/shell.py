@@ -36,12 +36,7 @@ def printable(text: str) -> str:
 class PrintableStream:
     """A text stream that escapes control characters; all else goes to the stream underneath.
 
-    Parameters
-    ----------
-    stream
-        Where to write.
-    required
-        Whether a failed write is an error (standard output) or let go (standard error, where no one could be told).
+    A failed write is an error where `required` (standard output), else let go (standard error: no one could be told).
     """
 
     def __init__(self, stream: TextIO, *, required: bool) -> None:
@@ -63,15 +58,7 @@ class PrintableStream:
         return len(text)
 
     def flush(self) -> None:
-        """Flush the stream underneath.
-
-        Raises
-        ------
-        UsageError
-            When the standard output cannot take it.
-        ReaderGoneError
-            When its reader has gone.
-        """
+        """Flush the stream underneath; `UsageError` when it cannot take it, `ReaderGoneError` when its reader has gone."""
         self._try(self._stream.flush)
 
     def _try(self, action: Callable[..., object], *arguments: object) -> None:
@@ -161,13 +148,7 @@ def ended_in_order() -> Iterator[None]:
 
 
 def raise_if_asked() -> None:
-    """Raise the interruption again where code of others let it go, as compiled modules do while they are imported.
-
-    Raises
-    ------
-    KeyboardInterrupt
-        When a signal has come in the block of `ended_in_order`.
-    """
+    """Raise `KeyboardInterrupt` again where code of others let it go, as compiled modules do while they are imported."""
     if _asked:
         raise KeyboardInterrupt
 

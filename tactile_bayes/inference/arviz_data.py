@@ -16,14 +16,9 @@ with warnings.catch_warnings():
 
 
 def chain_diagnostics(chains: FloatArray) -> dict[str, float]:
-    """Worst rank-normalised R-hat and smallest bulk and tail effective draws over the parameters.
+    """Worst rank-normalised R-hat and smallest bulk and tail effective draws over the parameters of (chain, draw, p)
+    draws.
 
-    Parameters
-    ----------
-    chains : (chain, draw, p) array
-
-    References
-    ----------
     Vehtari, Gelman, Simpson, Carpenter & Buerkner (2021), Bayesian Analysis 16:667.
     """
     columns = [np.ascontiguousarray(chains[:, :, i]) for i in range(chains.shape[2])]
@@ -35,18 +30,11 @@ def chain_diagnostics(chains: FloatArray) -> dict[str, float]:
 
 
 def convergence(draws: FloatArray) -> dict[str, float]:
-    """R-hat, effective draws and Monte-Carlo errors of one quantity.
+    """R-hat, effective draws and Monte-Carlo errors of one quantity from (chain, draw) draws.
 
-    Parameters
-    ----------
-    draws : (chain, draw) array
-        Draws without a value (NaN) count as the smallest, as they do among ranks.
-
-    Returns
-    -------
-    dict
-        ``rhat`` (rank-normalised, split), ``ess_bulk``, ``ess_tail``, and ``mcse_median``, ``mcse_low``, ``mcse_high``
-        of the median and the ends of the central 95 %, in the quantity's unit.
+    ``rhat`` (rank-normalised, split), ``ess_bulk``, ``ess_tail``, and ``mcse_median``, ``mcse_low``, ``mcse_high`` of
+    the median and the ends of the central 95 %, in the quantity's unit. Draws without a value (NaN) count as the
+    smallest, as they do among ranks.
     """
     known = np.where(np.isfinite(draws), draws, np.nanmin(draws))
     errors = {"mcse_median": 0.5, "mcse_low": 0.025, "mcse_high": 0.975}
@@ -64,14 +52,9 @@ Arrays = Mapping[str, tuple[tuple[str, ...], FloatArray]]
 def inference_data(
     draws: Mapping[str, FloatArray], groups: Mapping[str, tuple[Arrays, Mapping[str, str]]] | None = None
 ) -> Any:
-    """Convert draws to `arviz.InferenceData`: a group ``posterior``, and those given.
+    """Convert (chain, draw) arrays to `arviz.InferenceData`: a group ``posterior``, and those given.
 
-    Parameters
-    ----------
-    draws
-        (chain, draw) arrays by name.
-    groups
-        Of each other group the names of axes and values by variable, and its attributes.
+    Each other group has the names of axes and values by variable, and its attributes.
     """
     import xarray
 

@@ -67,12 +67,7 @@ def student_draws(
 ) -> FloatArray:
     """(number, p) draws of a multivariate t: normal draws whose noise scale is itself uncertain.
 
-    Parameters
-    ----------
-    centre, scale : (p,), (p, p) arrays
-        Location and scale matrix, which may be near-singular.
-    dof
-        Degrees of freedom of the noise estimate; ``inf`` gives normal draws.
+    The (p, p) scale matrix may be near-singular; `dof` are those of the noise estimate, and ``inf`` gives normal draws.
     """
     values, vectors = np.linalg.eigh(scale)
     root = vectors * np.sqrt(np.clip(values, 0.0, None))
@@ -130,23 +125,11 @@ def summarise(
     effective_draws: float | None = None,
     replicates: Labels | None = None,
 ) -> Quantity:
-    """Summarise draws, leaving NaN out.
+    """Summarise draws with their equal-tailed interval, leaving NaN out; `ValueError` when no draw is finite.
 
-    Parameters
-    ----------
-    draws : (...) array
-    probability
-        Of the equal-tailed interval, in (0, 1).
-    effective_draws
-        How many independent draws they are worth for a tail. Default: all of them.
-    replicates : (n,) array
-        Label of the independent replicate of each draw, in the order of ``draws.ravel()``: the Monte-Carlo error then
-        comes from the spread between replicates, and `effective_draws` is not used.
-
-    Raises
-    ------
-    ValueError
-        When no draw is finite.
+    `effective_draws` is how many independent draws they are worth for a tail (by default all). With `replicates`, the
+    label of the independent replicate of each draw in the order of ``draws.ravel()``, the Monte-Carlo error comes from
+    the spread between replicates instead.
     """
     flat = draws.ravel()
     finite = np.isfinite(flat)
@@ -178,8 +161,6 @@ def summarise(
 def _tail_error(values: FloatArray, replicates: Labels, ends: tuple[float, float]) -> float:
     """Standard error of the probability beyond an interval's end, from the replicates; one value for both ends.
 
-    Notes
-    -----
     Of a ratio of sums over replicates (Cochran 1977, Sampling Techniques, ch. 6). Taking both ends together doubles the
     few degrees of freedom. It is no less than what one draw moves.
     """
@@ -213,15 +194,10 @@ Solution = tuple[FloatArray, ...]
 
 
 class Solved:
-    """Cache of solutions by parameter vector.
+    """Cache of solutions by parameter vector; `solve` maps (m, p) vectors to arrays of m rows.
 
-    Importance sampling evaluates the density at points that its draws are then chosen from. Solving those a second
-    time for the amplitude, level and noise scale of the draws cost as much as the sampling.
-
-    Parameters
-    ----------
-    solve
-        (m, p) parameter vectors to arrays of m rows.
+    Importance sampling evaluates the density at points that its draws are then chosen from. Solving those a second time
+    for the amplitude, level and noise scale of the draws cost as much as the sampling.
     """
 
     def __init__(self, solve: Callable[[FloatArray], Solution]) -> None:

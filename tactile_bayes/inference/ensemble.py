@@ -86,31 +86,16 @@ def ensemble(
     store: ChainStore | None = None,
     key: str = "",
 ) -> ParameterDraws:
-    """Draw from a log density, starting from given draws or from overdispersed normal draws about its mode.
+    """Draw from a log density, (m, p) to (m,), starting from given draws or from overdispersed normal draws about its
+    mode.
 
-    Parameters
-    ----------
-    log_density
-        Vectorised: (m, p) to (m,).
-    centre, covariance : (p,), (p, p) arrays
-        Mode and approximate covariance.
-    progress
-        Called with the effective draws so far and those wanted.
-    start : (n, p) array
-        Draws of about this density; walkers begin at some of them.
-    store, key
-        Where the state is kept after each block, and what it is bound to. A run goes on from a state that it finds,
-        and on one machine ends in the same draws as a run that was never stopped.
+    Differential-evolution moves (ter Braak 2006) in emcee (Foreman-Mackey et al. 2013), from the (p,) mode and (p, p)
+    approximate covariance or from some of the (n, p) draws in `start`. The first third of each ensemble's steps is
+    dropped. Diagnostics are rank-normalised (Vehtari et al. 2021); when they are not reached in ``max_steps`` a
+    `NotConvergedError` says about how many steps would do. Progress is effective draws so far and those wanted.
 
-    Raises
-    ------
-    NotConvergedError
-        When the diagnostics are not reached in ``max_steps``; says about how many steps would do.
-
-    Notes
-    -----
-    Differential-evolution moves (ter Braak 2006) in emcee (Foreman-Mackey et al. 2013). The first third of each
-    ensemble's steps is dropped. Diagnostics are rank-normalised (Vehtari et al. 2021).
+    `store` keeps the state after each block, bound to `key`. A run goes on from a state that it finds, and on one
+    machine ends in the same draws as a run that was never stopped.
     """
     options = options or EnsembleOptions()
     samplers = [_Ensemble(log_density, centre, covariance, rng=rng, start=start) for _ in range(options.ensembles)]

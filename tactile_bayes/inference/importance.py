@@ -20,21 +20,9 @@ TRUSTED_SHAPE = 0.7
 def smooth_weights(log_weights: FloatArray) -> tuple[FloatArray, float]:
     """Smooth weights (PSIS): replace the upper tail by quantiles of a fitted Pareto tail, and normalise.
 
-    Parameters
-    ----------
-    log_weights : (n,) array
-        Unnormalised; -inf for draws without density.
-
-    Returns
-    -------
-    weights : (n,) array
-        Non-negative, sum 1.
-    shape
-        The tail's shape k; NaN when the tail is too short to fit, -inf when all its weights are equal.
-
-    References
-    ----------
-    Vehtari, Simpson, Gelman, Yao & Gabry (2024), Journal of Machine Learning Research 25(72).
+    From (n,) unnormalised log weights (-inf without density) to non-negative weights of sum 1 and the tail's shape k:
+    NaN when the tail is too short to fit, -inf when all its weights are equal. Vehtari, Simpson, Gelman, Yao & Gabry
+    (2024), Journal of Machine Learning Research 25(72).
     """
     n = len(log_weights)
     weights = np.exp(log_weights - log_weights.max())
@@ -57,8 +45,6 @@ def smooth_weights(log_weights: FloatArray) -> tuple[FloatArray, float]:
 def fit_generalised_pareto(excess: FloatArray) -> tuple[float, float]:
     """Fit shape and scale of a generalised Pareto distribution to ascending positive excesses.
 
-    Notes
-    -----
     The posterior mean under a weak prior of Zhang & Stephens (2009), Technometrics 51:316, with the shape drawn towards
     0.5 by the weight of ten observations as in Vehtari et al. (2024), appendix C.
     """
@@ -144,15 +130,7 @@ class Gaussians(Record, eq=False):
 
 
 class Proposal:
-    """Bent Gaussians: normal coordinates z become sinh(b z) / b, normal in the middle and log-normal outside.
-
-    Parameters
-    ----------
-    gaussians
-        What is bent.
-    stretch
-        The bend b.
-    """
+    """Bent Gaussians: normal coordinates z become sinh(b z) / b, normal in the middle and log-normal outside."""
 
     def __init__(self, gaussians: Gaussians, stretch: float) -> None:
         self._gaussians, self._stretch = gaussians, stretch
@@ -222,23 +200,9 @@ def fitted_gaussians(
     *,
     rng: np.random.Generator,
 ) -> tuple[Gaussians, int]:
-    """Gaussians whose mixture resembles a density, from points of another proposal.
+    """Gaussians whose mixture resembles a density, from (n, p) points of another proposal and their (n,) log density.
 
-    Parameters
-    ----------
-    log_density
-        Vectorised: (m, p) to (m,).
-    first
-        The proposal that the points come from.
-    theta, log_target : (n, p), (n,) arrays
-        The points, and the log density there.
-
-    Returns
-    -------
-    gaussians
-        The first of them is a defensive one: mean and covariance of all the weighted points.
-    evaluations
-        Densities asked for.
+    The first of them is a defensive one: mean and covariance of all the weighted points. Also counts the evaluations.
     """
     # a point's share: over all the proposals, their number of points times their density there
     n, log_share = len(theta), first.log_density(theta) + np.log(len(theta))
@@ -330,29 +294,16 @@ def importance(
     options: ImportanceOptions | None = None,
     parts: Gaussians | None = None,
 ) -> ParameterDraws:
-    """Draw from a log density by importance sampling; returns draws of equal weight.
+    """Draw from a log density, (m, p) to (m,), by importance sampling; returns draws of equal weight.
 
-    Parameters
-    ----------
-    log_density
-        Vectorised: (m, p) to (m,).
-    mode, covariance : (p,), (p, p) arrays
-        Of the proposal.
-    parts
-        Gaussians that the density is about a mixture of. They are the proposal where one of them is `TOO_WIDE` for the
-        one above.
+    The proposal has the (p,) mode and (p, p) covariance given, or is made of `parts`, Gaussians that the density is
+    about a mixture of, where one of them is `TOO_WIDE` for the one above. `NotConvergedError` when the weights' tail is
+    too heavy, or the error is not reached; `ensemble` is the next method to try.
 
-    Raises
-    ------
-    NotConvergedError
-        When the weights' tail is too heavy, or the error is not reached; `ensemble` is the next method to try.
-
-    Notes
-    -----
     The points are a Sobol set under random digital shifts. The proposal is smooth, close to a normal in its middle and
     wider in its tails, so that the points stay even and the weights bounded where the density falls a little more
-    slowly than a normal. Put the parameters that matter first: a Sobol set fills its first coordinates most evenly,
-    and the proposal's root is triangular. Where the weights' tail stays too heavy a mixture is fitted to the points
+    slowly than a normal. Put the parameters that matter first: a Sobol set fills its first coordinates most evenly, and
+    the proposal's root is triangular. Where the weights' tail stays too heavy a mixture is fitted to the points
     (`fitted_gaussians`), once, and new points are drawn from it.
     """
     options = options or ImportanceOptions()

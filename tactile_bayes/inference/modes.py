@@ -48,19 +48,11 @@ def optimise(
     dof: float,
     rng: np.random.Generator,
 ) -> ParameterDraws:
-    """Draw about the least-squares estimate, with its covariance and t tails for the estimated noise.
+    """Draw about the (p,) least-squares estimate, with its (p, p) covariance and t tails for the estimated noise.
 
-    Parameters
-    ----------
-    theta, covariance : (p,), (p, p) arrays
-        The estimate and its covariance, correlated errors included.
-    dof
-        Effective degrees of freedom of the noise estimate.
-
-    Notes
-    -----
-    Wellman & Howe (1999), section 2.4, minimise the squared error between map and Eq 7; the covariance of that
-    estimate is this program's addition.
+    The covariance includes correlated errors; `dof` are the noise estimate's effective degrees of freedom. Wellman &
+    Howe (1999), section 2.4, minimise the squared error between map and Eq 7; the covariance of that estimate is this
+    program's addition.
     """
     flat = student_draws(theta, covariance, dof=dof, number=INDEPENDENT_DRAWS, rng=rng)
     return ParameterDraws(flat[None], "optimise", {"draws": float(INDEPENDENT_DRAWS)})
@@ -133,25 +125,12 @@ def fit_least_squares(
 ) -> LeastSquaresFit:
     """Minimise ``sum(weight * (data - model(theta))**2)`` by Levenberg-Marquardt.
 
-    Parameters
-    ----------
-    model
-        Vectorised over parameter vectors, see `ModelFunction`.
-    start, scale : (p,) arrays
-        Where to begin, and the typical size of a change of each parameter (steps are damped in these units).
-    data, weight : (k,) arrays
-        Weights are inverse variances up to one common factor.
-    tolerance
-        Stop when the Gauss-Newton step is this small in units of `scale`.
-    abandon
-        Stop, not converged, at parameters from which no useful minimum can follow.
-    patience
-        After so many iterations a minimum is good enough once a step lowers the sum of squares by less than
-        `SETTLED` of the residual variance. Beside large residuals steps shrink by a few per cent each.
-
-    Notes
-    -----
-    Marquardt (1963); the gain ratio controls the damping as in Madsen, Nielsen & Tingleff (2004), section 3.2.
+    Marquardt (1963); the gain ratio controls the damping as in Madsen, Nielsen & Tingleff (2004), section 3.2. The (k,)
+    weights are inverse variances up to one common factor; the (p,) scale is the typical size of a change of each
+    parameter, and steps are damped in these units. It stops when the Gauss-Newton step is smaller than `tolerance` in
+    units of `scale`, or, not converged, where `abandon` is true: at parameters from which no useful minimum can follow.
+    After `patience` iterations a minimum is good enough once a step lowers the sum of squares by less than `SETTLED` of
+    the residual variance: beside large residuals steps shrink by a few per cent each.
     """
     theta = np.array(start, dtype=np.float64)
     residual = data - model(theta[None])[0]
@@ -227,28 +206,10 @@ def laplace(
 def mode_and_covariance(
     log_density: LogDensity, start: FloatArray, *, scale: FloatArray, tolerance: float = 1e-4
 ) -> tuple[FloatArray, FloatArray, int]:
-    """Find the mode of a log density by damped Newton steps, and the inverse of its negative Hessian there.
+    """Mode of a log density by damped Newton steps, the inverse of its negative Hessian there, and the number of steps.
 
-    Parameters
-    ----------
-    log_density
-        Vectorised: (m, p) to (m,).
-    start, scale : (p,) arrays
-        Where to begin, and about one posterior standard deviation of each parameter.
-    tolerance
-        See `find_mode`.
-
-    Returns
-    -------
-    mode : (p,) array
-    covariance : (p, p) array
-    steps
-        Newton steps taken.
-
-    Raises
-    ------
-    NotConvergedError
-        When no mode is found or the curvature there is not that of a maximum.
+    The density maps (m, p) to (m,); the (p,) scale is about one posterior standard deviation of each parameter.
+    `NotConvergedError` when no mode is found or the curvature there is not that of a maximum.
     """
     mode, taken = find_mode(log_density, start, scale=scale, tolerance=tolerance)
     return mode, _covariance(log_density, mode, scale=scale), taken
@@ -259,11 +220,8 @@ def find_mode(
 ) -> tuple[FloatArray, int]:
     """As `mode_and_covariance`, without the curvature.
 
-    Parameters
-    ----------
-    tolerance
-        Of the last step taken, in units of `scale`. A mode is nearer than that: steps shrink as their squares, down to
-        the error of differences.
+    The last step is smaller than `tolerance` in units of `scale`. A mode is nearer than that: steps shrink as their
+    squares, down to the error of differences.
     """
     theta = np.array(start, dtype=np.float64)
     value = float(log_density(theta[None])[0])

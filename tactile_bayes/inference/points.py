@@ -73,12 +73,9 @@ MOST_DIMENSIONS = len(_POLYNOMIALS) + 1
 
 
 def sobol_integers(start: int, number: int, dimension: int) -> np.ndarray[tuple[int, ...], np.dtype[np.uint32]]:
-    """Points `start` to ``start + number`` of the Sobol sequence as integers of `BITS` bits, (number, dimension).
+    """(number, dimension) points of the Sobol sequence from `start` on, as integers of `BITS` bits.
 
-    Raises
-    ------
-    ValueError
-        For more dimensions than the table holds.
+    `ValueError` for more dimensions than the table holds.
     """
     if dimension > MOST_DIMENSIONS:
         raise ValueError(f"{dimension} dimensions; the table holds {MOST_DIMENSIONS}")
@@ -93,15 +90,8 @@ def sobol_integers(start: int, number: int, dimension: int) -> np.ndarray[tuple[
 
 
 def shifted_sobol(start: int, number: int, *, shifts: np.ndarray[tuple[int, ...], np.dtype[np.uint32]]) -> FloatArray:
-    """Uniform points in (0, 1): the sequence under one digital shift for each row of `shifts`.
-
-    Parameters
-    ----------
-    shifts : (replicates, dimension) uint32 array of `BITS` bits
-
-    Returns
-    -------
-    (replicates, number, dimension) array
+    """(replicates, number, dimension) uniform points in (0, 1): the sequence under the digital shift of each row of
+    `shifts`.
     """
     points = sobol_integers(start, number, shifts.shape[1])
     return np.asarray(((points ^ shifts[:, None, :]) + 0.5) / 2.0**BITS)
@@ -134,26 +124,13 @@ LEAST_SD = 1e-2
 
 
 def paired_points(key: FloatArray, replicates: Labels, dimension: int, rng: np.random.Generator) -> FloatArray:
-    """Uniform points in (0, 1) for drawing further quantities, one point per draw.
+    """(n, dimension) uniform points in (0, 1) for drawing further quantities, one point per draw.
 
-    Parameters
-    ----------
-    key : (n,) array
-        What the result depends on most among the draws, such as their log size.
-    replicates : (n,) array
-        Label of the independent replicate of each draw; every replicate gets a random shift of its own.
-    dimension
-        Number of further quantities, at most `MOST_PAIRED`.
-
-    Returns
-    -------
-    (n, dimension) array
-
-    Notes
-    -----
-    Within a replicate the rank of the key and the point together are a Sobol set under a random digital shift, sorted
-    by its first coordinate (L'Ecuyer, Lecot & Tuffin 2008, Operations Research 56:958, sort their chains so). A sum
-    over the draws then has the error of an integral of few dimensions, not that of as many random numbers.
+    The (n,) `key` is what the result depends on most among the draws, such as their log size; every replicate gets a
+    random shift of its own; `dimension` is at most `MOST_PAIRED`. Within a replicate the rank of the key and the point
+    together are a Sobol set under a random digital shift, sorted by its first coordinate (L'Ecuyer, Lecot & Tuffin
+    2008, Operations Research 56:958, sort their chains so). A sum over the draws then has the error of an integral of
+    few dimensions, not that of as many random numbers.
     """
     counts = np.bincount(replicates)
     shifts = rng.integers(2**BITS, size=(len(counts), dimension + 1), dtype=np.uint32)
@@ -167,24 +144,11 @@ def paired_points(key: FloatArray, replicates: Labels, dimension: int, rng: np.r
 
 
 def evened(values: FloatArray, mean: FloatArray, sd: FloatArray, replicates: Labels) -> FloatArray:
-    """Replace normal draws by evenly spaced quantiles of the mixture of their normals.
+    """Replace (n,) normal draws by evenly spaced quantiles of the mixture of the normals that they were drawn from.
 
-    Parameters
-    ----------
-    values, mean, sd : (n,) arrays
-        Draws, and the means and standard deviations of the normals that they were drawn from; NaN stays.
-    replicates : (n,) array
-        Label of the independent replicate of each draw; each is evened by itself, so that they stay independent.
-
-    Returns
-    -------
-    (n,) array
-        In the order of `values` within each replicate: what goes with a large draw still does.
-
-    Notes
-    -----
-    The mixture's distribution function is the mean of the normals', not of steps at the draws (Rao-Blackwell). It is
-    inverted on a grid, as normal scores, in which it is nearly straight.
+    Each replicate is done by itself, so that they stay independent, and keeps the order of its values: what goes with a
+    large draw still does. NaN stays. The mixture's distribution function is the mean of the normals', not of steps at
+    the draws (Rao-Blackwell). It is inverted on a grid, as normal scores, in which it is nearly straight.
     """
     found = values.copy()
     for label in range(int(replicates.max(initial=-1)) + 1):

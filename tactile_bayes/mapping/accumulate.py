@@ -83,14 +83,10 @@ def solve_gains(
 ) -> SolvedGains:
     """Alternate between the map, given the gains, and each frame's least-squares gain, given the map.
 
-    The model is pressure = gain of the frame x map at the cell. Only the product is determined: the level is set in
-    the end so that the median of the map's cells is 1, since most cells lie beside the lump.
-
-    Notes
-    -----
-    Frames far apart are tied only through those between them, so plain alternation creeps. Every third step goes
-    further along the direction of the last two (SQUAREM, Varadhan & Roland 2008, Scand. J. Statist. 35, scheme S3),
-    on the logarithms of the gains.
+    The model is pressure = gain of the frame x map at the cell. Only the product is determined: the level is set in the
+    end so that the median of the map's cells is 1, since most cells lie beside the lump. Frames far apart are tied only
+    through those between them, so plain alternation creeps. Every third step extrapolates along the direction of the
+    last two (SQUAREM, Varadhan & Roland 2008, Scand. J. Statist. 35, scheme S3), on the logarithms of the gains.
     """
     system = _System(sources, progress)
     ends = np.cumsum([len(level) for level in levels])[:-1]
@@ -208,15 +204,8 @@ class FlatField(Record, eq=False):
 
 
 def flat_field(selection: SelectedFrames) -> FlatField:
-    """Estimate the taxels' response over the lump-free frames of a scan.
+    """Estimate the taxels' response over the lump-free frames of a scan; `BadDataError` when too few frames look alike.
 
-    Raises
-    ------
-    BadDataError
-        When too few frames look alike to be called lump-free.
-
-    Notes
-    -----
     The usual profile of the head is each taxel's median over frames, which a lump under a minority of them does not
     move. Frames that depart from it no more than the calmest ones are lump-free; their mean is the response. A lump
     under most frames would be taken for the head's own profile and be flattened away.
@@ -279,16 +268,11 @@ def accumulate(
     normalise: str,
     progress: Progress = no_progress,
 ) -> Accumulated:
-    """Average the normalised readings of all used frames in cells on the plane.
+    """Average the normalised readings of all used frames in cells on the plane; progress starts anew in each pass.
 
-    Parameters
-    ----------
-    normalise
-        ``"mean"`` divides each frame by its mean over the valid taxels, as the paper does. A lump under the head is
-        in that mean, so the map's amplitude and widths come out low by a few per cent. ``"gain"`` solves for one gain
-        a frame jointly with the map. ``"none"`` keeps kPa.
-    progress
-        Called with the frames done and the frames in all, anew in each pass.
+    ``"mean"`` divides each frame by its mean over the valid taxels, as the paper does. A lump under the head is in that
+    mean, so the map's amplitude and widths come out low by a few per cent. ``"gain"`` solves for one gain per frame
+    jointly with the map. ``"none"`` keeps kPa.
     """
     levels = [source.selection.level_kpa[source.selection.used] for source in sources]
     if normalise == "none":

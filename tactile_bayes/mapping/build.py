@@ -54,23 +54,10 @@ def find_mass(selections: Sequence[SelectedFrames], plane: Plane) -> FloatArray:
 def local_plane(
     selections: Sequence[SelectedFrames], plane: Plane, *, radius_mm: float | None
 ) -> tuple[Plane, dict[str, float]]:
-    """Best-fit plane of the frames near the mass.
+    """Best-fit plane of the frames whose array is centred within `radius_mm` of the mass, and its figures.
 
-    Parameters
-    ----------
-    radius_mm
-        Frames whose array is centred within it of the mass are used; None takes half the diagonal of the array, within
-        which an array reaches the mass, and widens it while those frames span no plane.
-
-    Returns
-    -------
-    plane, figures
-        ``plane_radius_mm`` and ``plane_frames``.
-
-    Raises
-    ------
-    BadDataError
-        When no frame lies within a given radius, or they span no plane.
+    None takes half the diagonal of the array, within which an array reaches the mass, and widens it while those frames
+    span no plane. A given radius without frames, or whose frames span no plane, is a `BadDataError`.
     """
     mass = find_mass(selections, plane)
     radius = radius_mm or max(_half_diagonal(part) for part in selections)
@@ -210,27 +197,11 @@ def build_map(
 ) -> TactileMap:
     """Build the tactile map of one scan, or of several scans of one examination on a common plane.
 
-    Parameters
-    ----------
-    scans
-        With the tracker's base and the patient unmoved between them.
-    max_pose_gap_ms
-        Frames between two distinct poses further apart than this are left out.
-    progress
-        Called with frames done and frames in all, anew in each pass over the scans.
-    **options
-        As of `options.MapOptions`.
-
-    Raises
-    ------
-    BadDataError
-        When no frame is left, no taxel works, the taxels span no plane, or the scans do not belong together.
-
-    Notes
-    -----
-    Wellman & Howe (1999), section 2.2: (i) fit the plane, (ii) drop frames outside the pressure range and divide the
-    rest by their mean, (iii) project and average. All sums are over whole numbers: the order of frames and scans does
-    not change a bit of the map.
+    Between scans the tracker's base and the patient must not have moved. Frames between two distinct poses further
+    apart than `max_pose_gap_ms` are left out; `options` are those of `options.MapOptions`. Wellman & Howe (1999),
+    section 2.2: (i) fit the plane, (ii) drop frames outside the pressure range and divide the rest by their mean, (iii)
+    project and average. All sums are over whole numbers: the order of frames and scans does not change a bit of the
+    map.
     """
     how = MapOptions(**options)
     check_number("max_pose_gap_ms", max_pose_gap_ms, 0, open_ends=True)

@@ -44,38 +44,28 @@ def cell_index(position_mm: FloatArray, cell_mm: float) -> IntArray:
 
 @dataclass(slots=True, eq=False)
 class CellSums:
-    """Count, sum and sum of squares of the readings in each cell, in whole steps.
-
-    Parameters
-    ----------
-    cell_mm
-        Side of a cell.
-    first : (2,) tuple
-        Row (y) and column (x) index of ``count[0, 0]`` on the lattice.
-    count, total, square : (ny, nx) int64 arrays
-        Readings, their sum in `VALUE_STEP` and the sum of their squares in `VALUE_STEP` squared.
-    clipped
-        Readings beyond `VALUE_LIMIT` that were added at the limit.
-    negative
-        Readings below 0, which noise about nothing gives. They are added as they are: cut off at 0, they would lift
-        the mean.
-    """
+    """Count, sum and sum of squares of the readings in each cell, in whole steps."""
 
     cell_mm: float
     first: tuple[int, int] = (0, 0)
+    """Row (y) and column (x) index of ``count[0, 0]`` on the lattice."""
     count: IntArray = field(default_factory=_no_cells)
     total: IntArray = field(default_factory=_no_cells)
     square: IntArray = field(default_factory=_no_cells)
+    """`count`, `total`, `square`: (ny, nx) int64 arrays of readings, their sum in `VALUE_STEP` and the sum of their
+    squares in `VALUE_STEP` squared.
+    """
     clipped: int = 0
+    """Readings beyond `VALUE_LIMIT` that were added at the limit."""
     negative: int = 0
+    """Readings below 0, which noise about nothing gives. They are added as they are: cut off at 0, they would lift the
+    mean.
+    """
 
     def add(self, x_mm: FloatArray, y_mm: FloatArray, value: FloatArray) -> None:
         """Add readings at positions on the plane; arrays of one shape, all finite, of at most `READINGS_PER_CALL`.
 
-        Raises
-        ------
-        BadDataError
-            When the readings lie so far apart that the map would have over `MAX_CELLS` cells.
+        Readings so far apart that the map would have over `MAX_CELLS` cells are a `BadDataError`.
         """
         if value.size > READINGS_PER_CALL:
             raise ValueError(f"{value.size} readings in one call; sums are exact up to {READINGS_PER_CALL}")
@@ -98,18 +88,11 @@ class CellSums:
         *,
         bounded: bool = False,
     ) -> None:
-        """Add at most `READINGS_PER_CALL` values in whole steps; overwrites `steps`.
+        """Add at most `READINGS_PER_CALL` values in whole steps to cells of the block `first`, `shape`; overwrites
+        `steps`.
 
-        Parameters
-        ----------
-        first, shape
-            Block of the lattice that holds all of them.
-        flat : (...) int array
-            Cell of each in the block, row by row.
-        steps : (...) array
-            Whole numbers; beyond `LIMIT_STEPS` either way they are clipped and counted.
-        bounded
-            Whether they are known to lie in 0 to `LIMIT_STEPS`.
+        `flat` is the cell of each in the block, row by row. Values beyond `LIMIT_STEPS` either way are clipped and
+        counted, unless `bounded` says that all lie in 0 to `LIMIT_STEPS`.
         """
         self.make_room(first, shape)
         if not bounded:
@@ -306,10 +289,7 @@ class Projection(Record, eq=False):
     def block(self) -> tuple[tuple[int, int], tuple[int, int]]:
         """First row and column, and shape, of the block of the lattice that contains every reading.
 
-        Raises
-        ------
-        BadDataError
-            When the block would be so wide that cells could not be told exactly.
+        A block so wide that cells could not be told exactly is a `BadDataError`.
         """
         left, top, right, bottom = self._ends_of_one() if len(self) == 1 else self._ends()
         columns, rows = right - left + 1, bottom - top + 1
@@ -354,12 +334,8 @@ class Projection(Record, eq=False):
 
 
 class Projector:
-    """The constants of a projection, the same for all frames.
-
-    Parameters
-    ----------
-    taxels : (rows, columns) bool array
-        Taxels to project, in row order.
+    """The constants of a projection of the taxels in a (rows, columns) bool array, in row order; the same for all
+    frames.
     """
 
     def __init__(
@@ -400,13 +376,10 @@ class Projector:
         return np.array(found).reshape(1, 2, 4)
 
     def _columns(self, r: Any, offset: Any) -> list[Any]:
-        """The eight numbers of each frame's matrix, mm.
+        """The eight numbers, mm, of the matrix of one frame or of many, from 3 x 3 rotation `r` and 3 coordinates
+        `offset`.
 
-        Parameters
-        ----------
-        r, offset
-            3 x 3 rotation and 3 coordinates of one frame as numbers, or of many as arrays. Term by term and not by
-            matrix products: the bits of a frame do not hang on how many others there are.
+        Term by term and not by matrix products: the bits of a frame do not depend on how many others there are.
         """
         (x, y, z), (m0, m1, m2), columns = offset, self._middle, []
         for a, b, c in self._rows:

@@ -74,11 +74,8 @@ class CoarseFrames(Record, eq=False):
 
     @classmethod
     def of(cls, selection: SelectedFrames, frames: IndexArray) -> CoarseFrames:
-        """Average the given frames of a scan, in the order of time.
-
-        Notes
-        -----
-        The few saturated readings count as their frame's mean.
+        """Average the given frames of a scan, in the order of time; the few saturated readings count as their frame's
+        mean.
         """
         good, scan = selection.good_taxels, selection.scan
         readout = Readout.of(scan.element_calibration, good)
@@ -129,12 +126,9 @@ def block_means(values: FloatArray, first: IndexArray) -> FloatArray:
 
 
 def stroke_starts(x_mm: FloatArray) -> list[int]:
-    """Where runs in one direction begin, and the end of the last; what lies at a turn is part of the run before.
+    """Indices where runs in one direction begin along (n,) positions of the head, and the end of the last run.
 
-    Parameters
-    ----------
-    x_mm : (n,) array
-        Place of the head along the strokes.
+    A turn is part of the run before.
     """
     ends, start, far = [0], 0, 0
     for i in range(len(x_mm)):
@@ -190,24 +184,15 @@ def convention_agreement(selections: Sequence[SelectedFrames]) -> dict[str, floa
 def check_convention(selections: Sequence[SelectedFrames]) -> dict[str, float]:
     """Refuse rotations that cannot follow the declared convention; name the one that agrees best.
 
-    Returns
-    -------
-    dict
-        ``normal_agreement`` of the rotations as declared; ``other_convention`` (its number among `CONVENTIONS`) and
-        ``other_agreement`` where another one agrees better. Empty where the motion has no normal.
+    Gives ``normal_agreement`` of the rotations as declared, and ``other_convention`` (its number among `CONVENTIONS`)
+    and ``other_agreement`` where another one agrees better; nothing where the motion has no normal. `BadDataError` when
+    the head's face and its motion agree to less than `AGREEMENT` as declared and to more in another convention, or to
+    less than `LEAST_AGREEMENT`.
 
-    Raises
-    ------
-    BadDataError
-        When the head's face and its motion agree to less than `AGREEMENT` as declared and to more in another
-        convention, or to less than `LEAST_AGREEMENT`.
-
-    Notes
-    -----
-    Of 900 scans told in a wrong convention, with the tracker mounted and the base turned at random, the refusal finds
-    76 to 90 % and the comparison all but 0 to 3 %; of 300 told rightly none was refused or doubted. With the face
-    leaning on its motion by 8 degrees 1 to 7 % are missed and 3 % doubted, by 15 degrees 11 to 21 and 11 %. What is
-    missed are mounts for which the wrong reading, too, turns the face along its motion.
+    Of 900 scans read in a wrong convention, with the tracker mounted and the base turned at random, the refusal finds
+    76 to 90 % and the comparison all but 0 to 3 %; of 300 read rightly none was refused or doubted. With the face
+    leaning on its motion by 8 degrees 1 to 7 % are missed and 3 % doubted, by 15 degrees 11 to 21 and 11 %. Missed are
+    mounts for which the wrong reading, too, turns the face along its motion.
     """
     agreement = convention_agreement(selections)
     if not agreement:

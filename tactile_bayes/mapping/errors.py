@@ -123,26 +123,15 @@ _LENGTHS = 400
 
 
 def shared_frame_figures(sources: Sequence[Source], levels: Sequence[FloatArray], sums: CellSums) -> dict[str, float]:
-    """Figures of the error correlation within a frame, from at most `RUNS` x `RUN_FRAMES` frames.
+    """Figures of the error correlation within a frame, from at most `RUNS` x `RUN_FRAMES` of the frames that made
+    `sums`.
 
-    Parameters
-    ----------
-    sources, levels
-        The used frames, and what each was divided by.
-    sums
-        The map that all of them made.
+    ``shared_share`` is the share of a reading's error variance that is common to its neighbours in the frame, and
+    ``shared_length_mm`` the distance over which it falls by e (only where the share is above `LEAST_SHARE`).
+    ``effective_readings`` is how many independent readings those of the median cell are worth, by what readings of one
+    cell within `RUN_FRAMES` successive frames have in common; ``shared_frames`` counts the frames looked at. Empty
+    where that is undetermined: too few frames, or readings without any scatter.
 
-    Returns
-    -------
-    dict
-        ``shared_share``: share of a reading's error variance that is common to the neighbours in its frame.
-        ``shared_length_mm``: over which distance it falls by e; only where the share is above `LEAST_SHARE`.
-        ``effective_readings``: independent readings that the median cell's are worth, by what readings of one cell
-        within `RUN_FRAMES` successive frames have in common. ``shared_frames``: frames looked at. Empty where
-        that is undetermined: too few frames, or readings without any scatter.
-
-    Notes
-    -----
     The correlation at distance d is fitted with share x exp(-d / length). A product of errors takes one about the map
     of all frames and one about the map without the run of frames: with independent runs its mean is the covariance
     itself, however few readings a cell has. What lasts longer than a run (a latency, a moving patient) is not in

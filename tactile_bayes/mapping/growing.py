@@ -95,20 +95,9 @@ class Instrument(Record, eq=False, dict=True):
 class MapAccumulator:
     """Accumulates frames, in any portions and order, into a map that can be read at any time.
 
-    Parameters
-    ----------
-    grid
-        Where the cells lie.
-    instrument
-        Head, calibration, gate and way to normalise.
-    keep_frames
-        Keep counts and poses (0.9 kB a frame of 416 taxels), which `rebuild` needs. Without, memory grows with the
-        number of cells only.
-
-    Notes
-    -----
     Everything that is added up is a whole number of tiny steps (`CellSums`, `HeadMoments`, `Readout`), so neither
-    portions nor order leave a trace.
+    portions nor order leave a trace. `rebuild` needs `keep_frames`, which keeps counts and poses (0.9 kB a frame of 416
+    taxels); without it memory grows with the number of cells only.
     """
 
     def __init__(self, grid: MapGrid, instrument: Instrument, *, keep_frames: bool = True) -> None:
@@ -135,19 +124,7 @@ class MapAccumulator:
         return {name: float(value) for name, value in (self._tally | more).items()}
 
     def add(self, counts: CountArray, poses: FramePoses) -> int:
-        """Add frames.
-
-        Parameters
-        ----------
-        counts : (n, rows, columns) uint16 array
-        poses
-            The n poses at the frames' times.
-
-        Returns
-        -------
-        int
-            Frames used.
-        """
+        """Add (n, rows, columns) uint16 frames with the n poses at their times; returns how many were used."""
         if counts.dtype != np.uint16 or counts.shape != (len(poses.known), *self.instrument.head.shape):
             raise BadDataError(
                 f"counts is {counts.dtype} of shape {counts.shape} for {len(poses.known)} poses",
@@ -204,10 +181,7 @@ class MapAccumulator:
     def merge(self, other: MapAccumulator) -> None:
         """Add everything that another accumulator was given.
 
-        Raises
-        ------
-        BadDataError
-            When its cells, plane, head, calibration or rules differ: its sums mean something else.
+        Another lattice, plane, head, calibration or rule is a `BadDataError`: its sums mean something else.
         """
         differs = "" if self.grid.same(other.grid) else "plane or cell size"
         differs = differs or self.instrument.differs(other.instrument)
@@ -224,13 +198,7 @@ class MapAccumulator:
         self._kept = None if self._kept is None or other._kept is None else self._kept + other._kept
 
     def plane(self) -> Plane:
-        """Best-fit plane of the frames used so far.
-
-        Raises
-        ------
-        BadDataError
-            When no frame was used, or they span no plane; see `HeadMoments.plane`.
-        """
+        """Best-fit plane of the frames used so far; `BadDataError` when there are none, or they span no plane."""
         moments = self._all_moments()
         if not moments.count:
             raise BadDataError("no frame was used yet", way_out="press within the window and move the head")
@@ -241,12 +209,8 @@ class MapAccumulator:
         return self._merged + moments if self._merged.count else moments
 
     def rebuild(self) -> MapAccumulator:
-        """Make a new accumulator from the frames kept so far, on their best-fit plane.
-
-        Raises
-        ------
-        UsageError
-            When the frames were not kept.
+        """Make a new accumulator from the frames kept so far, on their best-fit plane; `UsageError` when none were
+        kept.
         """
         if self._kept is None:
             raise UsageError("the frames were not kept; make the accumulator with keep_frames=True")

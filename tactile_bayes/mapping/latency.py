@@ -224,32 +224,17 @@ def estimate_latency(
 ) -> LatencyEstimate:
     r"""Estimate the latency at which strokes there and back show a lump at one place.
 
-    Parameters
-    ----------
-    selections
-        The scans, selected with any latency.
-    plane
-        A latency hardly moves it.
-    cell_mm
-        Of the lattice that poses are projected on.
-    max_pose_gap_ms
-        As for the map.
+    The scans may be selected with any latency, which hardly moves the plane. `BadDataError` names what a scan lacks
+    that does not determine the latency.
 
-    Raises
-    ------
-    BadDataError
-        When the scan does not determine it, with what it lacks.
-
-    Notes
-    -----
-    Steps of Gauss and Newton on the regression of `tactile_bayes.mapping.latency`, with the head's velocity v as
-    design: the information on the latency is :math:`\sum (v \cdot \nabla m)^2 / s^2` over what the nuisances leave of
-    it. In strokes one way at one speed they leave nothing, since a map shifted by v tau looks the same.
+    Gauss-Newton steps on the regression of `tactile_bayes.mapping.latency`, with the head's velocity v as design: the
+    information on the latency is :math:`\sum (v \cdot \nabla m)^2 / s^2` over what the nuisances leave of it. In
+    strokes one way at one speed they leave nothing, since a map shifted by v tau looks the same.
 
     The standard error is the largest of three: leaving out a stroke at a time (jackknife), the regression's own with
-    errors shared over 0.2 s, and the bound; widened as Student's t of that many strokes is. Noise has slopes too:
-    the information is the product of two gradients, from alternate stretches of the scan. A lump that follows the head
-    by delta looks like a latency of -delta / v.
+    errors shared over 0.2 s, and the bound; widened as Student's t of that many strokes is. Noise has slopes too: the
+    information is the product of two gradients, from alternate stretches of the scan. A lump that follows the head by
+    delta looks like a latency of -delta / v.
     """
     parts = [_Part.of(one, plane=plane, cell_mm=cell_mm, gap_ms=max_pose_gap_ms) for one in selections]
     parts = [part for part in parts if len(part.coarse.frames)]

@@ -174,19 +174,9 @@ MANY_CELLS: Final = 20_000
 
 
 def many_cells(tactile_map: TactileMap, radius_mm: float) -> str | None:
-    """Notice for a window of `MANY_CELLS` or more: what it costs, and which cells would do; else None.
+    """Notice for a fit window of `MANY_CELLS` or more: its cost, and which cells would do; None where it holds fewer.
 
-    Parameters
-    ----------
-    tactile_map
-        What is to be fitted.
-    radius_mm
-        Of the window. The cells are those of a covered disc, or all that the map has where these are fewer.
-
-    Returns
-    -------
-    str or None
-        None where a window holds fewer.
+    Counts the cells of a covered disc of `radius_mm`, or all that the map has where these are fewer.
     """
     cell = tactile_map.recipe.cell_mm
     cells = min(int(tactile_map.covered.sum()), int(math.pi * radius_mm**2 / cell**2))
@@ -230,12 +220,9 @@ _ERRORS = 2.5
 
 
 def broken_assumptions(quality: Mapping[str, float]) -> tuple[Finding, ...]:
-    """What a map's figures say against the assumptions of a size.
+    """Findings from a map's `quality` figures (of evenness and stroke lag) against the assumptions of a size.
 
-    Parameters
-    ----------
-    quality
-        A map's figures, see `evenness.evenness_figures` and `stroke_lag.stroke_lag_figures`; missing ones say nothing.
+    Missing figures say nothing.
     """
     found = (_lag(quality), _uneven(quality), _curved(quality), _few_strokes(quality))
     return tuple(one for one in found if one is not None)
@@ -376,9 +363,7 @@ class CellAdvice(Record):
 def advise_cell(tactile_map: TactileMap) -> CellAdvice | None:
     """Advise on the cell from a map's highest bump; None where nothing stands out.
 
-    Notes
-    -----
-    The rule is h <= 0.5 sigma_min, by what the widths of simulated bodies change with the cell (record 0074). For a
+    The rule is h <= 0.5 sigma_min, from how the widths of simulated bodies change with the cell (record 0074). For a
     Gaussian bump the fit, which integrates its model over the cells, is exact to 0.1 % at 0.75 sigma; but lumps are not
     quite Gaussian, and errors of the map change with the cell as well.
     """

@@ -222,21 +222,12 @@ class ClockPosition(Record):
 def clock_position(
     tactile_map: TactileMap, centre_mm: tuple[float, float], *, side: str, covariance_mm2: FloatArray | None = None
 ) -> ClockPosition | None:
-    """Place of a point of the plane about the nipple; None without landmarks, a nipple, or a side that is a breast's.
+    """Position of a point of the plane about the nipple; None without landmarks, a nipple, or a `side` that is a
+    breast's.
 
-    Parameters
-    ----------
-    centre_mm
-        x and y in `plane`.
-    side
-        As a scan's session has it.
-    covariance_mm2 : (2, 2) array
-        Of the centre; none is taken for exact.
-
-    Notes
-    -----
-    The patient's head is where the line from xiphoid to sternal notch points on the plane, which z leaves away from the
-    viewer, so the patient's left is z cross up.
+    `centre_mm` is x and y in `plane`, with a (2, 2) covariance; without one it counts as exact. The patient's head is
+    where the line from xiphoid to sternal notch points on the plane, which z leaves away from the viewer, so the
+    patient's left is z cross up.
     """
     nipple, patient = tactile_map.nipple_mm, tactile_map.patient_from_plane
     if nipple is None or patient is None or side not in SIDES:

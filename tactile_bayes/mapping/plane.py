@@ -62,22 +62,12 @@ def distinct_poses(poses: TrackerPoses) -> TrackerPoses:
 def poses_at(
     poses: TrackerPoses, time_s: FloatArray, *, latency_ms: float = 0.0, max_gap_ms: float = MAX_POSE_GAP_MS
 ) -> FramePoses:
-    """Interpolate the poses to the frames' times.
+    """Interpolate the poses to the (n,) times of the frames on the poses' clock.
 
-    Parameters
-    ----------
-    time_s : (n,) array
-        Times of the frames on the poses' clock.
-    latency_ms
-        By how much a pose's stamp is late: the pose belongs to ``time_s - latency``.
-    max_gap_ms
-        Frames between two poses further apart than this are not known. Nor are frames before the first pose or
-        after the last: a head is not extrapolated.
-
-    Notes
-    -----
-    Positions are interpolated linearly, rotations by normalised linear interpolation of neighbouring quaternions,
-    which departs from the great arc by less than (angle between poses)^3 / 60: nothing at tracker rates.
+    A pose stamped t was measured at ``t - latency``. Frames between two poses further apart than `max_gap_ms` have no
+    pose; nor have frames before the first pose or after the last: a head is not extrapolated. Positions are
+    interpolated linearly, rotations by normalised linear interpolation of neighbouring quaternions, which departs from
+    the great arc by less than (angle between poses)^3 / 60: nothing at tracker rates.
     """
     fresh = distinct_poses(poses)
     moments_s = fresh.time_s - latency_ms / 1000.0
@@ -144,13 +134,9 @@ class HeadMoments(Record, eq=False):
         return self.sums[0]
 
     def plane(self) -> Plane:
-        """Best-fit plane of the taxel centres.
+        """Best-fit plane of the taxel centres, see `tactile_bayes.geometry.fit_plane`.
 
-        Raises
-        ------
-        BadDataError
-            When the head was turned all round, so that its x axis has no mean direction; or see
-            `tactile_bayes.geometry.fit_plane`.
+        A head that was turned all round, so that its x axis has no mean direction, is a `BadDataError`.
         """
         n, x = self.count, self.sums[1:4]
         # In Python's integers up to the last division: positions far from the base lose nothing. Products are
@@ -178,10 +164,7 @@ class HeadMoments(Record, eq=False):
 class MomentSums:
     """Moments of one head, added frame by frame.
 
-    Parameters
-    ----------
-    head
-        Every taxel counts, working or not: where the head was does not depend on what it read.
+    Every taxel counts, working or not: where the head was does not depend on what it read.
     """
 
     def __init__(self, head: HeadGeometry) -> None:
@@ -196,10 +179,7 @@ class MomentSums:
     def add(self, poses: FramePoses) -> None:
         """Add the frames whose pose is known.
 
-        Raises
-        ------
-        BadDataError
-            When the head was so far from the tracker's base that steps would have gaps.
+        A head so far from the tracker's base that steps would have gaps is a `BadDataError`.
         """
         rotation, position = poses.rotation, poses.position_mm
         if not poses.known.all():
@@ -247,13 +227,11 @@ class MomentSums:
         return HeadMoments((1, x, y, z, x * x, xy, xz, xy, y * y, yz, xz, yz, z * z, *others))
 
     def _values(self, r: Any, p: Any) -> list[Any]:
-        """Mean taxel centre (3), covariance of the taxels (9) and axes (6) in `base`.
+        """Mean taxel centre (3), covariance of the taxels (9) and axes (6) in `base`, from rotation `r` and position
+        `p`.
 
-        Parameters
-        ----------
-        r, p
-            3 x 3 rotation and 3 coordinates of one frame as numbers, or of many as arrays. Term by term and not by
-            matrix products: the bits of a frame do not hang on how many others there are.
+        Of one frame as numbers, or of many as arrays. Term by term and not by matrix products: the bits of a frame do
+        not depend on how many others there are.
         """
         m0, m1, m2 = self._middle
         centre = [x + (a * m0 + b * m1 + c * m2) for x, (a, b, c) in zip(p, r, strict=True)]

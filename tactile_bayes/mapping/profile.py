@@ -28,19 +28,8 @@ _LAST_SHIFT = np.uint64(31)
 
 
 def frame_marks(level_kpa: FloatArray) -> NDArray[np.uint64]:
-    """Hash of each frame's level.
+    """(f,) hashes of the frames' exact mean levels; equal levels have equal hashes, whatever computes them.
 
-    Parameters
-    ----------
-    level_kpa : (f,) array
-        Exact means, the same to the bit whatever computes them (see `tactile_bayes.mapping.cells`).
-
-    Returns
-    -------
-    (f,) uint64 array; equal levels have equal marks.
-
-    Notes
-    -----
     The mixing function of SplitMix64 (Steele, Lea & Flood 2014, Fast splittable pseudorandom number generators).
     """
     mark = np.ascontiguousarray(level_kpa).view(np.uint64)
@@ -161,15 +150,7 @@ def _rows(reader: ProfileReader, readout: Readout, counts: CountArray, level_kpa
 
 
 class GrowingProfile:
-    """Profiles of at most `MOST_FRAMES` frames of a growing scan, the same in any portions and order.
-
-    Parameters
-    ----------
-    good : (rows, columns) bool array
-        Taxels that are used.
-    readout
-        How their counts become pressures.
-    """
+    """Profiles of at most `MOST_FRAMES` frames of a growing scan, the same in any portions and order."""
 
     def __init__(self, good: BoolArray, readout: Readout) -> None:
         self._good, self._readout, self._reader = good, readout, ProfileReader.of(good)
@@ -181,15 +162,7 @@ class GrowingProfile:
         self._number_new = 0
 
     def add(self, counts: CountArray, level_kpa: FloatArray, valid_share: FloatArray) -> None:
-        """Add frames.
-
-        Parameters
-        ----------
-        counts : (f, k) uint16 array
-            Of the used taxels.
-        level_kpa, valid_share : (f,) arrays
-            The frames' means, and the share of all taxels that is valid.
-        """
+        """Add frames: (f, k) uint16 counts of the used taxels, (f,) means in kPa and (f,) valid shares of all taxels."""
         if not self._reader.solve.size:
             return
         if len(counts) >= _FEW:
@@ -278,20 +251,10 @@ class ProfileReader(Record, eq=False):
         return cls(np.ascontiguousarray(np.linalg.pinv(terms)), terms.T @ terms)
 
     def read(self, pressure_kpa: FloatArray, level_kpa: FloatArray) -> FloatArray:
-        """Coefficients and residuals of frames; a frame's bits do not depend on the frames read with it.
+        """(f, 4) `HEAD_PROFILE` and residual of frames, from (f, taxels) pressures, all valid, and (f,) means above 0.
 
-        Parameters
-        ----------
-        pressure_kpa : (f, taxels) array
-            Of the good taxels, all valid.
-        level_kpa : (f,) array
-            The frames' means, above 0.
-
-        Returns
-        -------
-        (f, 4) array
-            `HEAD_PROFILE`, and the root mean square of the residual of the nine terms. NaN where the array has too few
-            rows or columns.
+        The residual is the root mean square of what the nine terms leave. NaN where the array has too few rows or
+        columns. A frame's bits do not depend on the frames read with it.
         """
         whole = self.whole(pressure_kpa, level_kpa)
         return np.ascontiguousarray(np.delete(whole, np.s_[len(HEAD_PROFILE) : -1], axis=1))
@@ -340,15 +303,11 @@ _X, _Y, _WAY = 1, 2, 3
 def evenness_figures(selections: Sequence[SelectedFrames], plane: Plane) -> dict[str, float]:
     """Figures of the map's evenness, with standard errors where they come from a regression.
 
-    Returns
-    -------
-    dict
-        ``skin_curvature_per_m``: by how much the head's normal turned outwards as it moved outwards, rad per m; above 0
-        on convex skin. ``profile_change``, ``profile_change_sd``: change of `head_profile_x2` over `SPAN_MM` in the
-        direction in which it changes most. ``stroke_skew``, ``stroke_skew_sd``: first-order coefficient of the
-        profile along the strokes, half the difference between strokes towards +x and towards -x; not given where all
-        strokes went one way. The last four are missing where too few frames are free of a lump or the head hardly
-        moved.
+    ``skin_curvature_per_m`` is by how much the head's normal turned outwards as it moved outwards, rad per m; above 0
+    on convex skin. ``profile_change`` and its ``_sd`` are the change of `head_profile_x2` over `SPAN_MM` in the
+    direction in which it changes most. ``stroke_skew`` and its ``_sd`` are the first-order coefficient of the profile
+    along the strokes, half the difference between strokes towards +x and towards -x; missing where all strokes went one
+    way. The last four are missing where too few frames are free of a lump or the head hardly moved.
     """
     parts = [_Frames.of(part, plane) for part in selections if part.used.any()]
     figures = _curvature(parts)

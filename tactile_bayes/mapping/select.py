@@ -138,15 +138,11 @@ _GAP_INTERVALS = 1.5
 
 
 def timing_figures(scans: Sequence[Scan]) -> dict[str, float]:
-    """Figures for a map's report, over all scans.
+    """Figures for a map's report, over all scans; rates of scans with less than two records are left out.
 
-    Returns
-    -------
-    dict
-        ``frame_rate_hz``, ``frame_jitter_ms`` (spread of the intervals without gaps), ``frames_missing``,
-        ``frames_repeated`` (two of one time), ``pose_rate_hz`` and ``pose_jitter_ms`` of distinct poses,
-        ``pose_repeats`` (samples told again) and ``pose_gap_ms`` (the longest between distinct poses). Rates of scans
-        with less than two records are left out.
+    ``frame_rate_hz``, ``frame_jitter_ms`` (spread of the intervals without gaps), ``frames_missing``,
+    ``frames_repeated`` (two of one time), ``pose_rate_hz`` and ``pose_jitter_ms`` of distinct poses, ``pose_repeats``
+    (samples sent again) and ``pose_gap_ms`` (the longest between distinct poses).
     """
     frames = [scan.frames.time_s for scan in scans]
     fresh = [distinct_poses(scan.poses) for scan in scans]
@@ -187,13 +183,7 @@ def _missing(time_s: FloatArray) -> int:
 
 
 def every_nth(scan: Scan, every: int) -> Scan:
-    """The scan with one frame of every `every`, the first one included; all poses stay.
-
-    Raises
-    ------
-    BadDataError
-        When `every` is no whole number from 1 on.
-    """
+    """The scan with one frame of every `every` (a whole number from 1 on), the first one included; all poses stay."""
     if isinstance(every, bool) or not isinstance(every, int) or every < 1:
         raise BadDataError(f"every is {every}", way_out="give a whole number from 1 on: 4 uses every fourth frame")
     if every == 1:
@@ -202,13 +192,7 @@ def every_nth(scan: Scan, every: int) -> Scan:
 
 
 def first_seconds(scan: Scan, duration_s: float) -> Scan:
-    """The scan with the frames of its first `duration_s` seconds; all poses stay.
-
-    Raises
-    ------
-    BadDataError
-        When the duration is not above 0.
-    """
+    """The scan with the frames of its first `duration_s` seconds (above 0); all poses stay."""
     if not duration_s > 0:
         raise BadDataError(f"duration_s is {duration_s}", way_out="give a time above 0 s")
     time_s = scan.frames.time_s
@@ -232,23 +216,15 @@ _LONG_INTERVALS: Final = 5.0
 
 @dataclass(slots=True)
 class Span:
-    """Range of the times at which a device's records were measured.
-
-    Parameters
-    ----------
-    number
-        Records so far.
-    first_s, last_s
-        Times of the first and the last.
-    gap_s, gap_at_s
-        Longest interval between two records, and when it began.
-    """
+    """Range of the times at which a device's records were measured."""
 
     number: int = 0
+    """Records so far."""
     first_s: float = 0.0
     last_s: float = 0.0
     gap_s: float = 0.0
     gap_at_s: float = 0.0
+    """`gap_s`, `gap_at_s`: Longest interval between two records, and when it began."""
 
     def add(self, time_s: float) -> None:
         """Add the next record's time, which must not be below the one before."""
@@ -387,15 +363,10 @@ def select_frames(
     latency_ms: float = 0.0,
     max_pose_gap_ms: float = MAX_POSE_GAP_MS,
 ) -> SelectedFrames:
-    """Decide for every frame of a scan whether it is used.
+    """Decide for every frame of a scan whether it is used; a head without a working taxel is a `BadDataError`.
 
     A frame is used when the tracker knew where it was, nine taxels in ten are valid, and the mean over the valid ones
     lies in the window, its ends included.
-
-    Raises
-    ------
-    BadDataError
-        When no taxel works.
     """
     faults = find_faults(scan)
     _refuse_dead(scan, faults)

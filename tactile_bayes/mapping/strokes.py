@@ -75,24 +75,13 @@ def stroke_count(sources: Sequence[Source]) -> int:
 def register_strokes(sources: Sequence[Source]) -> tuple[list[Source], list[StrokeShift]]:
     """Estimate each stroke's shift along x against the others, and shift its frames back.
 
-    Returns
-    -------
-    sources
-        With the projections of the known strokes shifted; shifts are about their mean, so the map stays where it is.
-    strokes
-        With their shifts.
+    Shifts are about their mean, so the map stays where it is. `BadDataError` when there are fewer than two strokes, or
+    fewer than two crossed a lump or an edge that fixes a shift.
 
-    Raises
-    ------
-    BadDataError
-        When there are fewer than two strokes, or fewer than two crossed a lump or an edge that fixes a shift.
-
-    Notes
-    -----
-    The regression of `tactile_bayes.mapping.latency` with one unknown a stroke, a few rounds. Along y nothing is
-    shifted: each line lies at another y, so other columns of the head pass the lump, and what they read differently
-    looks like a shift of half a millimetre (record 0097). Standard errors are those of the regression, widened for
-    errors shared by neighbouring frames and for the part of the slopes that is noise; their floor is 0.06 mm.
+    The regression of `tactile_bayes.mapping.latency` with one unknown per stroke, a few rounds. Along y nothing is
+    shifted: each line lies at another y, so other columns of the head pass the lump, and their different readings look
+    like a shift of half a millimetre (record 0097). Standard errors are those of the regression, widened for errors
+    shared by neighbouring frames and for the part of the slopes that is noise; their floor is 0.06 mm.
     """
     strokes = [stroke for number, source in enumerate(sources) for stroke in find_strokes(source, number)]
     if len(strokes) < 2:
@@ -268,15 +257,13 @@ MOST_FRAMES = 160
 
 
 def stroke_lag_figures(sources: Sequence[Source]) -> dict[str, float]:
-    """Figures ``stroke_lag_mm`` and ``stroke_lag_sd_mm``: half the way between what strokes to +x and to -x see.
+    """Figures ``stroke_lag_mm`` and ``stroke_lag_sd_mm``: half the way between where strokes to +x and to -x see a
+    lump.
 
-    Above 0 the lump is ahead of its mean place in the direction of the stroke, as if dragged along; a pose that is
-    late by t against the frames gives -v t. Empty where strokes went one way only, or nothing in the map has a slope.
-
-    Notes
-    -----
-    One linear step from no shift, so a figure above 1 mm is rough. The standard error holds errors that frames share
-    over 0.2 s.
+    Above 0 the lump is ahead of its mean place in the direction of the stroke, as if dragged along; a pose that is late
+    by t against the frames gives -v t. Empty where strokes went one way only, or nothing in the map has a slope. One
+    linear step from no shift, so a figure above 1 mm is rough. The standard error holds errors that frames share over
+    0.2 s.
     """
     every = thinning((source.selection.scan.frames.time_s[source.frames] for source in sources), most=MOST_FRAMES)
     parts, places, moves, blocks = [], [], [], []

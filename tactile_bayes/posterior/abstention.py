@@ -51,13 +51,7 @@ SIDES = {"-x": (-1.0, 0.0), "+x": (1.0, 0.0), "-y": (0.0, -1.0), "+y": (0.0, 1.0
 
 
 def searched(tactile_map: TactileMap, centre_mm: tuple[float, float] | None) -> str:
-    """Where a lump was searched, in words: the place given, or the area that the map covers.
-
-    Raises
-    ------
-    UsageError
-        When the place lies off the map.
-    """
+    """The area searched for a lump, in words: the place given, which must lie on the map, or all that the map covers."""
     if centre_mm is None:
         area = float(trusted(tactile_map).sum()) * tactile_map.recipe.cell_mm**2 / 100.0
         return f"on the {f'{area:.0f}' if area >= 10 else f'{area:.2g}'} cm2 that the map covers"
@@ -89,12 +83,7 @@ def no_bump(
 ) -> Abstention:
     """Reason when no candidate can be measured: no lump, or one that the map covers too poorly.
 
-    Parameters
-    ----------
-    likeliest
-        The candidate that is most likely a lump all the same, see `search.best_chance`.
-    where
-        What was searched, see `searched`.
+    `likeliest` is the candidate that is most likely a lump all the same, see `search.best_chance`.
     """
     candidate = None if likeliest is None else likeliest.candidate
     if candidate is not None and likeliest is not None and likeliest.probability >= LIKELY:
@@ -178,13 +167,7 @@ def _reached(along: FloatArray, covered: BoolArray, cell: float, reach: float) -
 def rim_fault(
     tactile_map: TactileMap, centre_mm: tuple[float, float], widths_mm: tuple[float, float], *, radius_mm: float
 ) -> str:
-    """Fault of a bump mostly beyond the map's rim, or within a single cell; empty if neither.
-
-    Parameters
-    ----------
-    radius_mm
-        Of the fit window.
-    """
+    """Fault of a bump mostly beyond the map's rim, or within a single cell; empty if neither."""
     wide, narrow, cell = max(widths_mm), min(widths_mm), tactile_map.recipe.cell_mm
     share = covered_share(tactile_map, centre_mm, radius_mm=1.5 * wide)
     if share < LEAST_COVERED_SHARE:

@@ -86,18 +86,8 @@ def inference_groups(
 ) -> dict[str, DrawGroup]:
     """The groups that an estimate has besides ``posterior``; empty without an estimate.
 
-    Parameters
-    ----------
-    calibration, size_priors
-        What the sizes were drawn by: the prior's sizes are too.
-    rng
-        Of the prior's draws.
-
-    Returns
-    -------
-    dict
-        ``sample_stats``, ``log_likelihood`` (of chains under a noise field), ``observed_data`` and ``prior`` (under a
-        noise field).
+    ``sample_stats``, ``log_likelihood`` (of chains under a noise field), ``observed_data`` and ``prior`` (under a noise
+    field); the prior's sizes are drawn by the `calibration` and `size_priors` of the posterior's.
     """
     if estimate.draws is None or estimate.fit is None:
         return {}

@@ -145,20 +145,11 @@ def value_scale(tactile_map: TactileMap) -> float:
 
 
 def candidate_centres(tactile_map: TactileMap, *, limit: int = 16, rim_limit: int = 8) -> list[tuple[float, float]]:
-    """Local maxima of the smoothed map, the candidates for a lump, highest first.
+    """Local maxima (x_mm, y_mm) of the smoothed map, the candidates for a lump, highest first.
 
-    Parameters
-    ----------
-    limit
-        At most this many inside the map.
-    rim_limit
-        At most this many at its rim, which only the head's own rim has felt: on deep fat that presses hardest, and a
-        score of such places can be higher than the lump.
-
-    Returns
-    -------
-    list of (x_mm, y_mm)
-        Empty where no covered cell rises above the background.
+    At most `limit` inside the map and `rim_limit` at its rim, which only the head's own rim has felt: on deep fat that
+    presses hardest, and the score of such places can be higher than the lump's. Empty where no covered cell rises above
+    the background.
     """
     excess = smoothed_excess(tactile_map)
     padded = np.pad(excess, 1, constant_values=-np.inf)

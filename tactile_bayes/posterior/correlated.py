@@ -175,14 +175,10 @@ class FieldDraws(Record, eq=False):
 
 
 def look(tactile_map: TactileMap, fit: BumpFit, options: EstimateOptions) -> FieldAnswer:
-    """Fit the bump under correlated errors, and compare it with no bump.
+    """Fit the bump under correlated errors, and compare it with no bump; `NotConvergedError` when the density has no
+    mode.
 
     Where the options give no `field_cosines`, a narrow bump that may be a lump is fitted once more, with a finer field.
-
-    Raises
-    ------
-    NotConvergedError
-        When the density has no mode.
     """
 
     def under(number: int, start: FloatArray) -> FieldAnswer:
@@ -247,13 +243,7 @@ def draw(
     rng: np.random.Generator,
     progress: Progress | None = None,
 ) -> FieldDraws:
-    """Draw from the posterior of an answer.
-
-    Raises
-    ------
-    NotConvergedError
-        When no method converges, or the scene's neighbour was not found.
-    """
+    """Draw from the posterior; `NotConvergedError` when no method converges, or the scene's neighbour was not found."""
     scene = scene_asked(options)
     choice, wanted = answer.choice, WANTED.get(scene, "")
     if wanted and choice.fit.scene.extra != wanted:

@@ -32,21 +32,11 @@ MINIMUM_DOF = 6.0
 
 
 def count_weights(cells: FitCells, residual_variance: float) -> FloatArray:
-    """Weights from counts: the variance of a cell is ``v / n + delta^2``.
+    """(k,) weights from counts, of mean 1: the variance of a cell is ``v / n + delta^2``.
 
-    v is the pooled within-cell variance of a reading, n the count; delta^2 is what is left of the residual variance:
-    the model's own misfit, that more readings do not reduce. So counts weigh where readings are few, and level off
-    where the model, not the sensor, is the limit.
-
-    Parameters
-    ----------
-    residual_variance
-        Mean squared residual of a fit with equal weights.
-
-    Returns
-    -------
-    (k,) array
-        Scaled so that their mean is 1.
+    v is the pooled within-cell variance of a reading, n the count; delta^2 is the rest of `residual_variance`, the mean
+    squared residual of a fit with equal weights: the model's own misfit, that more readings do not reduce. So counts
+    weigh where readings are few, and level off where the model, not the sensor, is the limit.
     """
     reading = cells.reading_variance
     if not reading > 0:
@@ -64,19 +54,16 @@ def independent_errors(*, jacobian: FloatArray, residual: FloatArray, weight: Fl
 
 
 def error_model(cells: FitCells, *, jacobian: FloatArray, residual: FloatArray, weight: FloatArray) -> ErrorModel:
-    r"""Estimate the error model from a fit's residuals.
+    """Estimate the error model from a fit's residuals.
 
     Neighbouring cells share frames and the model's misfit, so their errors correlate. The least-squares estimate stays
-    what it is; its covariance becomes the sandwich :math:`H^{-1} J^T W C W J H^{-1}` with C from the residuals'
+    as it is; its covariance becomes the sandwich :math:`H^{-1} J^T W C W J H^{-1}` with C from the residuals'
     autocorrelation, and `inflation` is the mean factor over the parameters. Dividing the log-likelihood by it is the
-    magnitude adjustment of composite likelihoods.
+    magnitude adjustment of composite likelihoods (Chandler & Bate 2007, Biometrika 94:167; Pauli, Racugno & Ventura
+    2011, Statistica Sinica 21:149).
 
     A level and a tilt are taken out of the residuals first. They are the misfit of a fixed background, which the maps
     that a size calibration was learned from share; `level_offset` reports it instead.
-
-    References
-    ----------
-    Chandler & Bate (2007), Biometrika 94:167; Pauli, Racugno & Ventura (2011), Statistica Sinica 21:149.
     """
     k, p = jacobian.shape
     dof = max(k - p, 1)
@@ -123,14 +110,9 @@ def _on_grid(cells: FitCells, values: FloatArray) -> tuple[FloatArray, FloatArra
 
 
 def residual_autocorrelation(grid: FloatArray, mask: FloatArray) -> tuple[FloatArray, int]:
-    """Radial autocorrelation of whitened residuals, up to where it first falls below its noise.
+    """Radial autocorrelation of whitened residuals, (2 half + 1, 2 half + 1) by lag in cells, and the largest lag kept.
 
-    Returns
-    -------
-    correlation : (2 half + 1, 2 half + 1) array
-        By lag in cells, 1 in the middle; isotropic, and 0 beyond the first lag that is not clearly positive.
-    half
-        Largest lag kept, in cells.
+    1 in the middle, isotropic, and 0 beyond the first lag that is not clearly above its noise.
     """
     ny, nx = grid.shape
     size = (2 * ny, 2 * nx)
@@ -204,26 +186,16 @@ class _Blocks(Record, eq=False):
 def detect(
     tactile_map: TactileMap, bump: Bump, *, theta: FloatArray, covariance: FloatArray, prior: BumpPrior
 ) -> Detection:
-    r"""Bayes factor of "a bump of this shape somewhere on the map" against "correlated noise on a level background".
+    """Bayes factor of "a bump of this shape somewhere on the map" against "correlated noise on a level background".
 
-    Parameters
-    ----------
-    theta, covariance : (p,), (p, p) arrays
-        Least-squares estimate of the bump and its covariance.
-
-    Notes
-    -----
-    Both models carry the same noise, an exponentially correlated field plus independent errors, whose length and
-    share are averaged over a grid. The field is either alike all over the map, as what the model misses is, or larger
-    where readings are few, as errors are that a frame's readings share: few frames reach the map's rim, and with the
-    same errors there as in the middle a rise of the rim would be "detected". Level, amplitude and noise scale are
-    integrated out; position and widths enter by their Laplace volume against the map's area and the prior, so that a
-    search over a large map costs what it should. A lump-free map has bumps of its own, and with independent noise each
-    would be "detected".
-
-    References
-    ----------
-    MacKay (2003), Information Theory, Inference, and Learning Algorithms, ch. 28 (Occam factor).
+    `theta` (p,) is the least-squares estimate of the bump. Both models carry the same noise, an exponentially
+    correlated field plus independent errors, whose length and share are averaged over a grid. The field is either alike
+    all over the map, as the model's misfit is, or larger where readings are few, as errors are that a frame's readings
+    share: few frames reach the map's rim, and with the same errors there as in the middle a rise of the rim would be
+    "detected". Level, amplitude and noise scale are integrated out; position and widths enter by their Laplace volume
+    against the map's area and the prior (the Occam factor, MacKay 2003, Information Theory, Inference, and Learning
+    Algorithms, ch. 28), so that a search over a large map costs what it should. A lump-free map has bumps of its own,
+    and with independent noise each would be "detected".
     """
     blocks = _blocks(tactile_map, bump, theta)
     if len(blocks.value) < 8 or theta[0] <= 0:

@@ -51,23 +51,11 @@ def draw_scene(
     progress: Progress | None = None,
     solved: Solved | None = None,
 ) -> tuple[ParameterDraws, tuple[str, ...]]:
-    """Draw by the requested method, or by the next one if its diagnostics fail.
+    """Draw by the requested method, or by the next one if its diagnostics fail; says what was wrong with those before
+    it.
 
-    Parameters
-    ----------
-    solved
-        Where importance sampling leaves what it solved, for `CollapsedTarget.draw_linear`.
-
-    Returns
-    -------
-    draws
-    passed_over
-        What was wrong with the methods before it, a sentence each.
-
-    Raises
-    ------
-    NotConvergedError
-        When the last method does not converge either; the message says what was wrong with each.
+    Importance sampling leaves what it solved in `solved`, for `CollapsedTarget.draw_linear`. `NotConvergedError` when
+    the last method does not converge either; its message says what was wrong with each.
     """
     passed_over: list[str] = []
     figures: Mapping[str, float] = {}
@@ -196,12 +184,9 @@ def ensemble_draws(
     accuracy_sd: float | None = None,
     progress: Progress | None = None,
 ) -> ParameterDraws:
-    """Draw by MCMC, starting from importance draws and compared with them.
+    """Draw by MCMC, starting from importance draws.
 
-    Raises
-    ------
-    NotConvergedError
-        When the chains do not agree with each other, or not with the importance draws.
+    `NotConvergedError` when the chains do not agree with each other, or not with the importance draws.
     """
     from tactile_bayes.inference.ensemble import EnsembleOptions, ensemble
 

@@ -58,21 +58,10 @@ def estimate_map(
     rng: np.random.Generator,
     progress: Callable[[int, int], None] | None = None,
 ) -> Estimate:
-    """Estimate the lump's size from one map.
+    """Estimate the lump's size from one map; without a calibration the estimate stops at widths and amplitude.
 
-    Parameters
-    ----------
-    calibration
-        Eq 6; without it the estimate stops at widths and amplitude.
-
-    Raises
-    ------
-    BadDataError
-        When the map or the fit options differ from the calibration's recipe.
-    NotConvergedError
-        When the method does not converge.
-    UsageError
-        When an option does not go with another, or with the map.
+    `BadDataError` when the map or the fit options differ from the calibration's recipe, `UsageError` when an option
+    does not go with another or with the map, `NotConvergedError` when the method does not converge.
     """
     check_background(tactile_map, options.fit)
     check_options(options)

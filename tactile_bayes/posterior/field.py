@@ -66,13 +66,9 @@ def no_field(cosines: int) -> Whitening:
 
 
 def cosine_profiles(axis_mm: FloatArray, *, cosines: int = FIELD_COSINES) -> tuple[FloatArray, FloatArray]:
-    """Cosines along one axis, with their squared angular frequencies.
+    """(n, cosines) cosines along one axis, and their (cosines,) squared angular frequencies, 1/mm^2.
 
-    Returns
-    -------
-    profiles : (n, cosines) array
-        Of mean square 1 over the axis and its margins.
-    frequency2 : (cosines,) array of 1/mm^2
+    Of mean square 1 over the axis and its margins.
     """
     phase, side = _phase(axis_mm)
     order = np.arange(cosines)
@@ -101,10 +97,7 @@ def _phase(axis_mm: FloatArray) -> tuple[FloatArray, float]:
 def gram_of_cosines(along: FloatArray, across: FloatArray, *, weight: FloatArray) -> FloatArray:
     """Inner products of the plane's cosines under (ny, nx) weights: (cosines^2, cosines^2), y's order counted first.
 
-    Parameters
-    ----------
-    along, across : (ny, cosines), (nx, cosines) arrays
-        As from `cosine_profiles`.
+    `along` and `across` are (ny, cosines) and (nx, cosines) arrays from `cosine_profiles`.
     """
     pairs = [(one[:, :, None] * one[:, None, :]).reshape(len(one), -1) for one in (along, across)]
     cosines = along.shape[1]
@@ -120,13 +113,8 @@ def spectrum(frequency2: FloatArray, length_mm: float) -> FloatArray:
 
 
 def whitening(gram: FloatArray, frequency2: FloatArray, *, length_mm: float) -> Whitening:
-    """Prepare the noise field of one length.
-
-    Parameters
-    ----------
-    gram : (k, k) array
-        ``Phi' D^-1 Phi``, see `gram_of_cosines`.
-    frequency2 : (k,) array of 1/mm^2
+    """Prepare the noise field of one length, from the (k, k) gram ``Phi' D^-1 Phi`` and (k,) frequencies squared,
+    1/mm^2.
     """
     root = np.sqrt(spectrum(frequency2, length_mm))
     values, vectors = np.linalg.eigh(root[:, None] * gram * root)
@@ -173,14 +161,7 @@ class Profiles(Record, eq=False):
 class Window:
     """Grid of one window with its cosines and the noise fields of several lengths (prepared on first use).
 
-    Parameters
-    ----------
-    cells
-        The window's cells.
-    variance : (k,) array
-        Independent variance of each cell, up to a common factor.
-    cosines
-        Of the noise field along each axis.
+    The (k,) `variance` is each cell's independent variance, up to a common factor; `cosines` counts along each axis.
     """
 
     def __init__(self, cells: FitCells, variance: FloatArray, *, cosines: int = FIELD_COSINES) -> None:

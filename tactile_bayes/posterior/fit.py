@@ -27,17 +27,10 @@ LEAST_SHARE = 1e-2
 
 
 class Mixture(Gaussians, eq=False):
-    """One Gaussian for each noise field that matters: what `laplace` draws from.
-
-    Parameters
-    ----------
-    weight, mean, covariance
-        As in `Gaussians`.
-    log_evidence
-        Log of the integral of the density that the mixture stands for.
-    """
+    """One Gaussian for each noise field that matters: the mixture that `laplace` draws from."""
 
     log_evidence: float
+    """Log of the integral of the density that the mixture stands for."""
 
 
 class FieldFit(Record, eq=False):
@@ -96,17 +89,9 @@ def fit_scene(
     scene: Scene,
     start: FloatArray,
 ) -> FieldFit:
-    """Find the mode, alternating with the choice of noise fields that matter there.
+    """Find the mode from (p,) parameters, alternating with the choice of noise fields that matter there.
 
-    Parameters
-    ----------
-    start : (p,) array
-        The scene's parameters, for example from least squares.
-
-    Raises
-    ------
-    NotConvergedError
-        When there is no mode.
+    `NotConvergedError` when there is no mode.
     """
     target = CollapsedTarget(problem, scene)
     target.settle_fields(start)
@@ -139,14 +124,8 @@ def newton_mixture(
 ) -> Mixture | None:
     """One Gaussian per field, each by one Newton step from a common start; None where one of them is no maximum.
 
-    Parameters
-    ----------
-    start : (p,) array
-        Near the mode of all of them.
-    covariance : (p, p) array
-        About theirs: it scales the finite differences and limits the step.
-    least_share
-        Of the density at the start, for a field to have a Gaussian.
+    The (p,) start is near the mode of all; the (p, p) covariance, about theirs, scales the finite differences and
+    limits the step. A field has a Gaussian from `least_share` of the density at the start on.
     """
     scale = np.sqrt(np.diag(covariance))
     points = stencil(start, step=0.3 * scale)

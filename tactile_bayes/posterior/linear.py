@@ -120,16 +120,8 @@ def solve(
 ) -> tuple[FloatArray, LinearSolution]:
     """Log of the fields' prior times evidence (m, h), and solutions for one or two structures, under one length.
 
-    Parameters
-    ----------
-    inner
-        Of each structure's (m,) templates.
-    cross : (m, h) array
-        Products of the two structures' templates; None when there is one.
-    dof
-        Cells minus linear parameters.
-    amplitude_sd
-        Of the normal prior on each amplitude.
+    `inner` holds the inner products of each structure's (m,) templates and `cross`, (m, h), those of one with the
+    other; `dof` is cells minus linear parameters, `amplitude_sd` that of the normal prior on each amplitude.
     """
     c = columns.inverse.shape[1]
     plain = [one.plain for one in inner]
@@ -223,14 +215,8 @@ MOST_PRODUCTS = 200
 class Spanned:
     """Bumps along the grid's axes in a shared basis: sums of products of two profiles.
 
-    Parameters
-    ----------
-    coefficients : (m, r) array
-        A row a bump.
-    products
-        Inner products of the r templates that span them.
-    gram : (r, r) array
-        Those with each other.
+    The (m, r) coefficients have a row per bump; `products` are inner products of the r templates that span them, the
+    (r, r) `gram` those with each other.
     """
 
     def __init__(self, coefficients: FloatArray, products: Projected, gram: FloatArray) -> None:

@@ -153,13 +153,7 @@ class SmallestLumps(Record, eq=False):
 
 
 def smallest_lumps(tactile_map: TactileMap, *, fat_mm: float | None = None) -> SmallestLumps:
-    """Smallest ball that a map would have shown at places over its covered area.
-
-    Parameters
-    ----------
-    fat_mm
-        Depth of the fat under the head; None where it is not known.
-    """
+    """Smallest ball that a map would have shown at places over its covered area, on fat of `fat_mm` (None: unknown)."""
     places, spacing = _places(tactile_map)
     needed = np.array([needed_amplitudes(tactile_map, (float(x), float(y))) for x, y in places])
     fat = USUAL_FAT_MM if fat_mm is None else fat_mm

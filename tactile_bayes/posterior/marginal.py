@@ -39,15 +39,7 @@ WithEvidence = tuple[FloatArray, LinearSolution]
 
 
 class CollapsedTarget:
-    """Log density of a scene's shape parameters (see `Scene`) for one window, mixed over noise fields.
-
-    Parameters
-    ----------
-    problem
-        The window, the priors and the bounds.
-    scene
-        What is in the window.
-    """
+    """Log density of a scene's shape parameters (see `Scene`) for one window, mixed over noise fields."""
 
     def __init__(self, problem: Problem, scene: Scene) -> None:
         self.problem, self.scene = problem, scene
@@ -127,12 +119,8 @@ class CollapsedTarget:
         return self.scene.log_prior(theta, self.problem)
 
     def settle_fields(self, theta: FloatArray) -> bool:
-        """Keep only the noise fields with evidence at one shape; the others cost time and add nothing.
-
-        Returns
-        -------
-        bool
-            Whether the set changed.
+        """Keep only the noise fields with evidence at one shape; the others cost time and add nothing. True if that
+        changed.
         """
         before = self.chosen_fields()
         projected, cross = self._project(self.scene.templates(theta[None], self.window))
@@ -205,11 +193,8 @@ class CollapsedTarget:
     def conditional(self, theta: FloatArray) -> Solution:
         """Linear solutions at (m, p) vectors under each of h fields.
 
-        Returns
-        -------
-        evidence, amplitude, power, slope, squares
-            Log of prior times evidence (m, h), and of `LinearSolution` the amplitudes (m, h, v), their power
-            (m, h, v, v), by how much the level falls with each (m, h, v), and the sum of squares (m, h).
+        Log of prior times evidence (m, h), and of `LinearSolution` the amplitudes (m, h, v), their power (m, h, v, v),
+        by how much the level falls with each (m, h, v), and the sum of squares (m, h).
         """
         parts = []
         for part in self._parts(theta):

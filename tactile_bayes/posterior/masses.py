@@ -206,15 +206,9 @@ Estimator = Callable[[TactileMap, EstimateOptions], Estimate]
 def with_masses(tactile_map: TactileMap, first: Estimate, options: EstimateOptions, estimator: Estimator) -> Estimate:
     """Find and size all masses of a map; returns the estimate of the surest (`by_evidence`), with all in `masses`.
 
-    The estimate of the place that was given is kept where one was, and of the first lump where properties of a lump are
-    known: they are of that lump.
-
-    Parameters
-    ----------
-    first
-        What `estimator` gives for the map and the options.
-    estimator
-        `estimate_map` with its calibration and random numbers.
+    The estimate of a place that was given is kept as the answer, and that of the first lump where properties of a lump
+    are known: they are of that lump. `first` is `estimator`'s result for the map, `estimator` being `estimate_map` with
+    its calibration and random numbers.
     """
     found = [] if first.bump is None else [Mass(*_place(first), _probability(first), first)]
     others = _others_options(options)

@@ -71,16 +71,12 @@ class Surroundings(Record, eq=False):
     ) -> FloatArray:
         """(g,) excess of the map, without the bump, under second lumps or ribs; -inf where the map has no data.
 
-        Under a lump it is the mean. Along a rib it is the median over pieces of `PIECE_MM` if that is lower: a rib
+        The (g, 3) places are as in `Scene`: ``x2, y2, w2`` or ``angle, offset, w2`` about the window's `middle`. Under
+        a lump the excess is the mean. Along a rib it is the median over pieces of `PIECE_MM` if that is lower: a rib
         rises along its whole length, while another lump on its line lifts the mean and only a piece or two.
 
         A head under constant force presses less beside a lump: the map dips there and comes back to its level. In a
         window that looks like a ridge along its rim. A rib or a lump rises above the level; a dip's far side does not.
-
-        Parameters
-        ----------
-        places : (g, 3) array
-            As in `Scene`: ``x2, y2, w2`` or ``angle, offset, w2``; `middle` is the window's.
         """
         away = np.hypot(self.x_mm - bump_mm[0], (self.y_mm - bump_mm[1])[:, None])
         clear = np.isfinite(self.excess) & (away > CLEAR_IN_WIDTHS * bump_width_mm)
@@ -314,15 +310,8 @@ def _place(fit: FieldFit) -> str:
 def ridge_instead(choice: SceneChoice, ridges: FloatArray) -> FieldFit | None:
     """Best scene with a ridge in place of the bump, alone or with the neighbour that the choice has.
 
-    Parameters
-    ----------
-    ridges : (g, 3) array
-        Where the map rises along a line beyond the bump, see `neighbour.rising_ribs`.
-
-    Returns
-    -------
-    FieldFit or None
-        None where there is no such place: then a ridge need not be feared, and no time is spent on it.
+    Ridges (g, 3) are where the map rises along a line beyond the bump, see `rising_ribs`. None without such a place:
+    then a ridge need not be feared, and no time is spent on it.
     """
     if not len(ridges):
         return None

@@ -49,13 +49,7 @@ def prior_sensitivity(
 ) -> Sensitivity:
     """Shifts of quantities under a width prior twice as wide, by reweighting without another fit.
 
-    Parameters
-    ----------
-    sigma_x, sigma_y : (...) arrays
-        Draws of the widths.
-    quantities
-        Draws of whatever is asked about, in the same order; those of another shape are left out, NaN draws count for
-        nothing.
+    Quantities are draws in the order of the widths'; those of another shape are left out, NaN draws count for nothing.
     """
     p = 0.5 * np.log(sigma_x * sigma_y).ravel()
     z = (p - np.log(prior.width_median_mm)) / prior.log_width_sd

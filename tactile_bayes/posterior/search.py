@@ -89,13 +89,7 @@ class Assessment(Protocol):
         """Widths of the bump at the mode, along the ellipse's axes; cheaper than `bump`."""
 
     def draw(self, options: EstimateOptions, *, rng: np.random.Generator, progress: Progress | None) -> MapDraws:
-        """Draw from the posterior of this place.
-
-        Raises
-        ------
-        NotConvergedError
-            When no method converges.
-        """
+        """Draw from the posterior of this place; `NotConvergedError` when no method converges."""
 
 
 def bump_of(fit: BumpFit) -> ModalBump:
@@ -297,12 +291,8 @@ MOST_LOOKS = 3
 def search(tactile_map: TactileMap, options: EstimateOptions) -> tuple[tuple[Candidate, ...], Assessment | None]:
     """Find the highest bump that can be a lump, also under correlated errors, and is one by the evidence.
 
-    Returns
-    -------
-    candidates
-        All that were looked at; the answer is the last one's.
-    assessment
-        None where no candidate can be a lump. Where none is one by the evidence, that of the first.
+    Returns all candidates that were looked at, the answer's last, and its assessment: None where none can be a lump,
+    that of the first where none is one by the evidence.
     """
     tried: list[Candidate] = []
     first: tuple[Candidate, Assessment] | None = None

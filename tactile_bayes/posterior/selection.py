@@ -43,15 +43,7 @@ LEAST_SHARE = 1e-6
 
 
 def pointwise_log_likelihood(target: CollapsedTarget, theta: FloatArray) -> FloatArray:
-    """(m, n) log density of each cell's value given the other cells, at (m, p) shape vectors.
-
-    Parameters
-    ----------
-    target
-        Window, scene and noise fields.
-    theta : (m, p) array
-        Draws of the scene's parameters.
-    """
+    """(m, n) log density of each cell's value given the other cells, at (m, p) draws of the scene's parameters."""
     evidence = target.by_field(theta)
     log_share = evidence - np.logaddexp.reduce(evidence, axis=1)[:, None]
     window, fixed = target.window, _fixed_columns(target)
@@ -178,20 +170,12 @@ class SceneChoice(Record, eq=False):
 
 
 def choose_shape(problem: Problem, start: FloatArray, *, scene: SceneAsked = "auto") -> SceneChoice:
-    """Fit the bump, and test whether it is round, rotated and on a slope.
+    """Fit the bump from (5,) ``(u, v, x, y, r)`` of a rotated ellipse; test whether it is round, rotated and on a
+    slope.
 
-    Parameters
-    ----------
-    start : (5,) array
-        ``(u, v, x, y, r)`` of a rotated ellipse.
-    scene
-        One of `presets.SCENES`: ``"auto"``, or what the draws shall have.
-
-    Notes
-    -----
     Level and tilt are always integrated out, and the axis ratio stays free unless `scene` says round: dropping either
-    where the evidence does not ask for it costs coverage and gains little (docs/decisions/0055). What the evidence says
-    of them is reported all the same.
+    where the evidence does not support it costs coverage and gains little (docs/decisions/0055). Their odds are
+    reported all the same.
     """
     wanted = Scene(_shape_asked(scene))
     chosen = fit_scene(problem, wanted, Scene("rotated").carried(start, wanted))

@@ -59,33 +59,23 @@ def flat_prior(theta: FloatArray) -> FloatArray:
 class Target(Record, eq=False):
     r"""Posterior density of a model's parameters, up to a constant.
 
-    Parameters
-    ----------
-    predict
-        (m, p) parameter vectors to (m, k) predictions.
-    data, weight : (k,) arrays
-        Weights are inverse variances up to a common factor.
-    log_prior
-        (m, p) to (m,).
-    errors
-        Size, correlation and degrees of freedom of the noise.
-    sse_min
-        Weighted sum of squares at the least-squares estimate.
-
-    Notes
-    -----
     With independent errors and the Jeffreys prior on their scale the noise integrates out to
     :math:`\mathrm{SSE}(\theta)^{-k/2}`. Correlated errors divide the log-likelihood by the inflation c and leave
-    :math:`\nu` effective degrees of freedom:
-    :math:`[1 + \Delta\mathrm{SSE} / (c\,\nu s^2)]^{-(\nu + p)/2}`, which is the former for c = 1 and nu = k - p.
+    :math:`\nu` effective degrees of freedom: :math:`[1 + \Delta\mathrm{SSE} / (c\,\nu s^2)]^{-(\nu + p)/2}`, which is
+    the former for c = 1 and nu = k - p.
     """
 
     predict: ModelFunction
+    """(m, p) parameter vectors to (m, k) predictions."""
     data: FloatArray
     weight: FloatArray
+    """`data`, `weight` (k,) arrays: Weights are inverse variances up to a common factor."""
     log_prior: LogPrior
+    """(m, p) to (m,)."""
     errors: ErrorModel
+    """Size, correlation and degrees of freedom of the noise."""
     sse_min: float
+    """Weighted sum of squares at the least-squares estimate."""
     dimension: int
 
     def excess(self, theta: FloatArray) -> FloatArray:
@@ -234,12 +224,8 @@ def fit_bump(
 ) -> tuple[BumpFit | None, str]:
     """Fit a bump near `centre_mm`; the window follows the fitted centre.
 
-    Returns
-    -------
-    fit
-        None when no fit can be made at all.
-    fault
-        Why the bump cannot be a lump; empty when it can.
+    The fit is None when none can be made at all; the fault says why the bump cannot be a lump, and is empty when it
+    can.
     """
     bump = _bump(tactile_map, options, rotated=options.rotation == "on")
     centre, start, weight_variance = centre_mm, None, None

@@ -140,12 +140,9 @@ def shown_share(log_size: FloatArray, log_width: FloatArray) -> float:
 def elongation(excess: FloatArray, covariance: FloatArray, *, shown: float, prior: ShapePrior) -> Elongation:
     """Compare a round lump with an oval one, by the (2,) half log axis ratio of the map beyond a ball's.
 
-    Its covariance is of the map's noise and of balls about their own curve; for `shown` see `shown_share`.
-
-    Notes
-    -----
-    Conjugate normal model; the odds are the ratio of the two marginal densities at the measured excess. The share is
-    known to `SHOWN_CV` only, which matters to an oval lump alone: to first order it adds to the noise along the excess.
+    Its covariance is of the map's noise and of balls about their own curve; for `shown` see `shown_share`. Conjugate
+    normal model; the odds are the ratio of the two marginal densities at the measured excess. The share is known to
+    `SHOWN_CV` only, which matters to an oval lump alone: to first order it adds to the noise along the excess.
     """
     measured, noise = excess / shown, covariance / shown**2
     wide = noise + prior.oval_sd**2 * np.eye(2)

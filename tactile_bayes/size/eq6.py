@@ -226,13 +226,10 @@ def push_sizes(
 ) -> SizePosterior:
     """Convert each map draw by Eq 6, with a draw of its coefficients and one of its residual scatter.
 
-    The (chain, draw) draws are joint: amplitude and width go together (a stronger bump is a narrower one), which must
-    not be lost. `another_exam` is the spread between exams of a mass, for `SizePosterior.another_exam`.
-
-    Notes
-    -----
     Wellman & Howe (1999) eq. 6, once for each axis. An ellipse turned by an angle takes, along each of its own axes,
-    the two head axes' calibrations in the proportion cos^2 to sin^2.
+    the two head axes' calibrations in the proportion cos^2 to sin^2. The (chain, draw) draws are joint: amplitude and
+    width go together (a stronger bump is a narrower one), which must not be lost. `another_exam` is the spread between
+    exams of a mass, for `SizePosterior.another_exam`.
     """
     shape = amplitude.shape
     inputs = _Inputs(amplitude.ravel(), sigma_x_mm.ravel(), sigma_y_mm.ravel(), angle_rad.ravel())

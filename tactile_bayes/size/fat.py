@@ -273,8 +273,6 @@ def spread_tested(known: BetweenMaps | None) -> BetweenMaps:
 def one_size_probability(centre: FloatArray, noise: FloatArray, between: BetweenMaps) -> float:
     """Probability that maps of one mass come out as far apart in size or farther, from their (k,) means and variances.
 
-    Notes
-    -----
     Cochran (1954), Biometrics 10, 101; DerSimonian and Laird (1986), Controlled Clinical Trials 7, 177.
     """
     if len(centre) < 2:

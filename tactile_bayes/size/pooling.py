@@ -193,11 +193,9 @@ def pooled_size(
     square), ``oval_probability``, ``oval_half_log_ratio``, ``irregular_outline`` (1 where at least half of the maps
     have one) and, for several maps, ``weight_1``...; `outliers` the maps that lie apart.
 
-    Notes
-    -----
-    Given tau and B, what the maps leave open of ln d is a sum of normals, so it is one normal. It, tau, the spread of
-    B and the lump's shape are the coordinates of low-discrepancy points, paired with the draws of the
-    maps in order of their log size; the draws then get the quantiles of the mixture of all these normals.
+    Given tau and B, what the maps leave open of ln d is a sum of normals, so it is one normal. It, tau, the spread of B
+    and the lump's shape are the coordinates of low-discrepancy points, paired with the draws of the maps in order of
+    their log size; the draws then get the quantiles of the mixture of all these normals.
     """
     calibration = calibration.at_fat([one.profile for one in maps])
     used, replicates = matched_draws(maps, number, rng)

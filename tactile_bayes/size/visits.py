@@ -255,12 +255,8 @@ def joint_sizes(
 
     The calibration is used at the depth of fat that each visit's maps tell; properties that somebody knows take no
     part. `between` is a spread between exams in place of the priors', `law` how far B is the same at the visits, by
-    default `SHARED_BODY`, or `SHARED_WITHOUT_DEPTH` where maps tell no depth.
-
-    Raises
-    ------
-    UsageError
-        When there are fewer than two visits, more than `MOST_VISITS`, or one has no map.
+    default `SHARED_BODY`, or `SHARED_WITHOUT_DEPTH` where maps tell no depth. `UsageError` for fewer than two visits,
+    more than `MOST_VISITS`, or one without a map.
     """
     _check(visits)
     fitted = visit_calibrations(visits, calibration)

@@ -55,14 +55,8 @@ def learn_population(
 ) -> BodyCalibration:
     """Learn the calibration: Eq 6, by the depth of the fat where maps have a head profile, and what it leaves.
 
-    Without `residual`, and from a table without profiles, it is Eq 6 alone.
-
-    Raises
-    ------
-    BadDataError
-        When bodies are too few or do not vary.
-    NotConvergedError
-        When the posterior has no mode.
+    Without `residual`, and from a table without profiles, it is Eq 6 alone. `BadDataError` when bodies are too few or
+    do not vary, `NotConvergedError` when the posterior has no mode.
     """
     check_population(table)
     rows = TableRows.of(table)

@@ -98,15 +98,7 @@ def width_changes(sigma_mm: FloatArray, *, depth_ratio: FloatArray, group: Seque
 def learn_size_calibration(
     table: SizeTable, *, recipe: Recipe, rng: np.random.Generator, progress: Progress | None = None
 ) -> SizeCalibration:
-    """Learn Eq 6 from a table of at least eight rows with positive amplitude.
-
-    Raises
-    ------
-    BadDataError
-        When rows are too few, or do not vary.
-    NotConvergedError
-        When the sampler does not converge.
-    """
+    """Learn Eq 6 from a table of at least eight rows with positive amplitude; `BadDataError` when they do not vary."""
     return _by_axes(table, recipe, lambda data: _learn_axis(data, rng=rng, progress=progress))
 
 
@@ -257,11 +249,7 @@ def learn_two_stage(table: SizeTable, *, recipe: Recipe, rng: np.random.Generato
 
     The joint posterior takes m and b from all rows instead, on the scale of ln d, where a row counts the less the
     fainter its map is. Both agree where Eq 6 holds; decision record 0098 gives how far they part where it does not.
-
-    Raises
-    ------
-    BadDataError
-        When rows are too few, do not vary, have no depths, or not three diameters at h/d 1.
+    `BadDataError` when rows are too few, do not vary, have no depths, or not three diameters at h/d 1.
     """
     return _by_axes(table, recipe, lambda data: _learn_in_two_stages(data, rng))
 
@@ -314,10 +302,8 @@ def _learn_in_two_stages(data: AxisRows, rng: np.random.Generator) -> AxisCalibr
 
 
 def _stretch(draws: FloatArray, *, diameters: int) -> None:
-    """Widen the draws of m, b, ln e and f about their means, as few clusters ask for.
+    """Widen the draws of m, b, ln e and f about their means, for few clusters.
 
-    Notes
-    -----
     Resamples of g clusters vary by (g - 1) / g too little, and normal intervals of few clusters hold too seldom. A
     Student t with g - 1 degrees of freedom mends that (Cameron & Miller 2015, J. Human Resources 50:317, section VI).
     """
@@ -348,12 +334,10 @@ def _stages(data: AxisRows) -> tuple[_Mask, _Mask]:
 def _resampled(data: AxisRows, rng: np.random.Generator) -> FloatArray:
     """(draws, rows) how often each row is drawn: all rows of one diameter together.
 
-    Notes
-    -----
-    Resamples with fewer than three diameters at one diameter depth (two, where the table has three) are drawn anew: a
-    line through two neighbours may have any slope.
     Cluster bootstrap (Davison & Hinkley 1997, section 3.8). The depths of a lump share the width that their changes
-    refer to, and lumps of one diameter that differ in stiffness have almost one map.
+    refer to, and lumps of one diameter that differ in stiffness have almost one map. Resamples with fewer than three
+    diameters at one diameter depth (two, where the table has three) are drawn anew: a line through two neighbours may
+    have any slope.
     """
     level, _ = _stages(data)
     names, group = np.unique(data.d_mm, return_inverse=True)
@@ -415,17 +399,9 @@ def left_out_of_study(
     """Cross-validated errors of Eq 6 and of a log-quadratic, leaving out each geometry in turn.
 
     None unless the table has `StudyCases` in at least eight geometries. Softer lumps take no part; a least ratio of 0
-    is `LEAST_HARD_RATIO`. `fit` is the joint posterior's mode when left out.
+    is `LEAST_HARD_RATIO`. `fit` is the joint posterior's mode when left out. Without one of the geometries Eq 6 may
+    have no mode (`NotConvergedError`), or the two-stage fit too few diameters (`BadDataError`).
 
-    Raises
-    ------
-    NotConvergedError
-        When Eq 6 has no mode without one of the geometries.
-    BadDataError
-        When the two-stage fit has too few diameters without one.
-
-    Notes
-    -----
     A geometry is one seat, diameter and h/d. All stiffnesses of it go out together: they differ so little that one
     would tell the others' size. Where a lump's case at one diameter depth is out, so are the width changes against it.
     By both widths the size of Eq 6 is the geometric mean of those by each; the quadratic, of least squares, takes the

@@ -167,10 +167,7 @@ class BodyRegression(Record, eq=False):
     def posterior(self) -> tuple[FloatArray, FloatArray]:
         """Mean and covariance of the k coefficients, as normal, with a spread of bodies that changes with ln a.
 
-        Raises
-        ------
-        NotConvergedError
-            When there is no mode.
+        `NotConvergedError` when there is no mode.
         """
         b = self.least_squares()
         left = float(np.var(self.mean_log_d - self.mean_terms @ b))
@@ -370,8 +367,6 @@ def fit_residual(bodies: BodiesLeft) -> FittedResidual:
 def drawn_points(x: FloatArray, count: int) -> FloatArray:
     """(m, k) of the (b, k) values, drawn at random: they lie as the bodies do, so most where most sizes are asked for.
 
-    Notes
-    -----
     Pivots of the kernel's incomplete Cholesky factor (Fine & Scheinberg 2001) lie at the table's ends first, and left
     bodies out with larger errors (record 0122).
     """

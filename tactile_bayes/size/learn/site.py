@@ -137,13 +137,9 @@ def correct_calibration(
 ) -> BodyCalibration:
     """The calibration, called `base` in reports, with a site's correction.
 
-    It takes at least `LEAST_PHANTOMS` phantoms, made and fitted by the calibration's recipe; `left_out` tells in words
-    which take no part for reasons found before.
-
-    Raises
-    ------
-    BadDataError
-        When too few phantoms lie in the calibration's range, or it is corrected already.
+    It takes at least `LEAST_PHANTOMS` phantoms in the calibration's range, made and fitted by its recipe; `left_out`
+    says in words which take no part for reasons found before. A calibration that is corrected already is a
+    `BadDataError`.
     """
     prior = prior or SitePrior()
     if calibration.site is not None:
