@@ -65,7 +65,7 @@ def check_number(
 
 
 def number_words(least: float | None, most: float | None, *, whole: bool = False, open_ends: bool = False) -> str:
-    """What can be given, in words: ``a number above 0 and below 1``."""
+    """The numbers that can be given, in words: ``a number above 0 and below 1``."""
     told = "" if least is None else f" above {least:g}" if open_ends else f" from {least:g}"
     if most is not None:
         told += f"{' and' if told else ''} below {most:g}" if open_ends else f"{' to' if told else ' up to'} {most:g}"
@@ -183,7 +183,7 @@ class Abstention:
     reason: str
     """With the figure and the limit."""
     advice: str = ""
-    """What would fix it, at the command line; empty when nothing would."""
+    """The remedy at the command line; empty when there is none."""
     on_paper: str = ""
     """The same for a reader of the exam's page, who has no command line."""
     about_mm: tuple[float, float] | None = None

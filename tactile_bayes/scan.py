@@ -330,7 +330,7 @@ class Scan(Record, eq=False):
     session: Mapping[str, str] = field(default_factory=dict)
     """Plain text facts (device ids, side, posture...); no names."""
     findings: tuple[Finding, ...] = ()
-    """What its file had lost and what its recorder noted."""
+    """Losses of its file and notes of its recorder."""
 
     def __post_init__(self) -> None:
         taxels = self.frames.counts.shape[1:]

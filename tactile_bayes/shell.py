@@ -58,7 +58,7 @@ class PrintableStream:
         return len(text)
 
     def flush(self) -> None:
-        """Flush the stream underneath; `UsageError` when it cannot take it, `ReaderGoneError` when its reader has gone."""
+        """Flush the stream underneath: `UsageError` if it cannot take it, `ReaderGoneError` if its reader has gone."""
         self._try(self._stream.flush)
 
     def _try(self, action: Callable[..., object], *arguments: object) -> None:
@@ -148,7 +148,7 @@ def ended_in_order() -> Iterator[None]:
 
 
 def raise_if_asked() -> None:
-    """Raise `KeyboardInterrupt` again where code of others let it go, as compiled modules do while they are imported."""
+    """Raise `KeyboardInterrupt` again where code of others dropped it, as compiled modules do while being imported."""
     if _asked:
         raise KeyboardInterrupt
 

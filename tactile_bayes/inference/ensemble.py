@@ -51,7 +51,7 @@ class ChainStore(Protocol):
 
 Progress = Callable[[int, int], None]
 WALKERS_PER_PARAMETER = 4
-"""Of each ensemble."""
+"""Walkers of each ensemble."""
 
 
 class EnsembleOptions(Record):

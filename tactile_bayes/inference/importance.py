@@ -189,7 +189,7 @@ ENOUGH = 0.75
 LIGHT_TAIL = 0.3
 """Pareto shape of weights that more points will hardly show to be heavier."""
 LEAST_VARIANCE = 1e-6
-"""Of a Gaussian in any direction, over that of all the points: points may lie in a plane."""
+"""Least variance of a Gaussian in any direction, over that of all the points: points may lie in a plane."""
 
 
 def fitted_gaussians(

@@ -65,7 +65,7 @@ ModelFunction = Callable[[FloatArray], FloatArray]
 
 MOST_ITERATIONS = 200
 SETTLED = 0.01
-"""Of the residual variance: a step that lowers the sum of squares by less moves nothing that the data could tell."""
+"""Share of the residual variance: a step that lowers the sum of squares by less moves nothing that the data show."""
 
 
 class LeastSquaresFit(Record, eq=False):
@@ -80,7 +80,7 @@ class LeastSquaresFit(Record, eq=False):
     sse: float
     """Weighted sum of squared residuals."""
     converged: bool
-    """Whether the relative step fell below the tolerance."""
+    """The relative step fell below the tolerance."""
     iterations: int
 
     def covariance(self, weight: FloatArray) -> FloatArray:

@@ -120,7 +120,7 @@ MERGED, LEAST_MERGED = 8, 512
 _NODES = np.sinh(np.linspace(-3.0, 3.0, 81))
 """Where a mixture's distribution function is computed, in SDs from its mean; dense in the middle."""
 LEAST_SD = 1e-2
-"""Of a component, as a share of the mixture's: a narrower one is widened to this."""
+"""Least SD of a component, as a share of the mixture's: a narrower one is widened to this."""
 
 
 def paired_points(key: FloatArray, replicates: Labels, dimension: int, rng: np.random.Generator) -> FloatArray:

@@ -30,7 +30,7 @@ class Source(Record, eq=False):
     readout: Readout
     """`selection`, `readout`: The scan with its used frames, and the taxels that are read."""
     projection: Projection
-    """Of the used frames only, in their order."""
+    """The used frames only, in their order."""
 
     @classmethod
     def of(cls, selection: SelectedFrames, *, plane_from_base: FloatArray, cell_mm: float) -> Source:
@@ -247,9 +247,9 @@ class Accumulated(Record, eq=False):
     sums: CellSums
     """The cells."""
     levels: list[FloatArray]
-    """What the frames were divided by, one array a scan."""
+    """Divisors of the frames, one array per scan."""
     scale: float = 1.0
-    """What the sums' values must be divided by (1 but for ``gain``, whose level is set afterwards)."""
+    """Divisor of the sums' values (1 but for ``gain``, whose level is set afterwards)."""
     passes: int = 1
     """Passes over the scan."""
     last_change: float = 0.0
@@ -257,7 +257,7 @@ class Accumulated(Record, eq=False):
 
     @property
     def settled(self) -> bool:
-        """Whether the gains converged."""
+        """True where the gains converged."""
         return self.last_change <= GAIN_TOLERANCE
 
 

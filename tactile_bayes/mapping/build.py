@@ -239,7 +239,7 @@ def build_map(
 
 
 def _of_scans(scans: list[Scan]) -> tuple[Finding, ...]:
-    """What speaks against each scan, by its number where there are several."""
+    """Findings against each scan, by its number where there are several."""
     several = len(scans) > 1
     return tuple(
         one.at(f"scan {number}") if several else one

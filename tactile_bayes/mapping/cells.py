@@ -255,7 +255,7 @@ class Projection(Record, eq=False):
     """
 
     taxels: ProjectedTaxels
-    """What is projected."""
+    """The taxels that are projected."""
     matrix: FloatArray
     """(n, 2, 4) array: First two rows of the rotation from the tracker to the plane, in cells a mm; and beside them
     where the taxels' middle lies on the lattice, in cells. Half a cell is added, so that cell k is centred on k.
@@ -429,7 +429,7 @@ class Readout(Record, eq=False, dict=True):
 
     @cached_property
     def never_negative(self) -> bool:
-        """Whether no count gives a pressure below 0."""
+        """True where no count gives a pressure below 0."""
         return bool(self.offset_kpa.min(initial=0.0) >= 0)
 
     @cached_property
@@ -512,7 +512,7 @@ def add_frames(
 
 
 def _bounded(readout: Readout, level: FloatArray) -> bool:
-    """Whether no valid reading over its frame's level can be negative or exceed what cells hold.
+    """True where no valid reading over its frame's level can be negative or exceed what cells hold.
 
     Valid readings lie below the sensor's range; then nobody has to look at each.
     """

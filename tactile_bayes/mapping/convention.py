@@ -38,7 +38,7 @@ def stretches(time_s: FloatArray) -> IndexArray:
 
 
 def thinning(times_s: Iterable[FloatArray], *, most: int) -> int:
-    """Of how many stretches one is averaged, so that scans with frames at these times give `most` at most, or so."""
+    """The n of "every nth stretch is averaged" so that scans with frames at these times give about `most` at most."""
     return max(1, -(-sum(int(stretches(one)[-1]) + 1 for one in times_s if len(one)) // most))
 
 
@@ -210,7 +210,7 @@ def check_convention(selections: Sequence[SelectedFrames]) -> dict[str, float]:
 
 
 def convention_findings(quality: Mapping[str, float]) -> tuple[Finding, ...]:
-    """What a map's figures say of its rotations, see `check_convention`; nothing of a map without a plane."""
+    """Findings on a map's rotations from its figures, see `check_convention`; none of a map without a plane."""
     if "other_convention" in quality:
         other, agreement = list(CONVENTIONS)[int(quality["other_convention"])], quality["other_agreement"]
         text = (

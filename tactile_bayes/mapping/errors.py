@@ -1,4 +1,4 @@
-"""What position errors and shared frames add to a map's errors."""
+"""Errors of a map from tracker position errors and from frames that readings share."""
 
 from __future__ import annotations
 

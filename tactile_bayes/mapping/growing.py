@@ -43,7 +43,7 @@ class MapGrid(Record, eq=False):
         return cls(head_moments(head, poses).plane().plane_from_base, cell_mm)
 
     def same(self, other: MapGrid) -> bool:
-        """Whether another grid is equal to the bit."""
+        """True where another grid is equal to the bit."""
         return self.cell_mm == other.cell_mm and np.array_equal(self.plane_from_base, other.plane_from_base)
 
 

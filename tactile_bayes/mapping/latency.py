@@ -50,7 +50,7 @@ class ShiftFit(Record, eq=False):
     data: FloatArray
     """(n,) array: Readings with the nuisances taken off."""
     nuisance: Nuisance
-    """What is taken off."""
+    """The nuisances that were taken off."""
 
     @classmethod
     def of(cls, parts: Sequence[CoarseFrames], places_mm: Sequence[FloatArray]) -> ShiftFit:
@@ -126,7 +126,7 @@ class Cells(Record, eq=False):
 
 
 class Nuisance(Record, eq=False):
-    """What varies besides the map: in each frame, in each block of taxels, and from row to row of the head."""
+    """Variation besides the map: in each frame, in each block of taxels, and from row to row of the head."""
 
     bases: tuple[FloatArray, ...]
     """(k, 6) arrays: Of each scan."""
@@ -141,7 +141,7 @@ class Nuisance(Record, eq=False):
 
     @classmethod
     def of(cls, parts: Sequence[CoarseFrames], cell: IndexArray) -> Nuisance:
-        """Of some scans, whose readings lie in the given cells."""
+        """Nuisances of some scans, whose readings lie in the given cells."""
         shapes = tuple((len(part.pressure), len(part.row)) for part in parts)
         frames = np.cumsum([0, *(m for m, _ in shapes)])
         taxels = np.cumsum([0, *(k for _, k in shapes)])
@@ -255,7 +255,7 @@ def _undetermined(why: str) -> BadDataError:
 
 
 def _lack(found: LatencyEstimate) -> str:
-    """What the scan lacks, in one line."""
+    """The scan's deficiency, in one line."""
     forth, back = found.crossings
     if not np.isfinite(found.sd_ms):
         lack = "no lump or other slope stands out of the noise"
@@ -337,7 +337,7 @@ class _Regression(Record, eq=False):
     """The regression at the latency found, and the groups that its errors are shared in."""
 
     fit: ShiftFit
-    """Of which the readings and their gradient are used."""
+    """Source of the readings and their gradient."""
     design: FloatArray
     halves: FloatArray
     """`design`, `halves` (n,), (2, n) arrays: Design of the latency with the whole gradient, and with those of two

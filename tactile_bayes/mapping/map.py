@@ -50,11 +50,11 @@ class MapRecipe(Record):
     latency_ms: float = 0.0
     """By how much a pose's stamp is late against the frames."""
     flat_field: bool = False
-    """Whether the head's own response was taken off."""
+    """True where the head's own response was taken off."""
     registered: bool = False
-    """Whether the strokes were shifted onto each other."""
+    """True where the strokes were shifted onto each other."""
     units: str = ""
-    """Of an imported grid's values, as the user named them; empty where unknown. A scan's are kPa."""
+    """Units of an imported grid's values, as the user named them; empty where unknown. A scan's are kPa."""
 
     @property
     def value_unit(self) -> str:
@@ -110,7 +110,7 @@ class TactileMap(Record, eq=False):
     nipple_mm: FloatArray | None = None
     """(3,) array or None: The nipple in `plane`; None where it was not touched."""
     findings: tuple[Finding, ...] = ()
-    """What speaks against sizes from it."""
+    """Findings against sizes from it."""
 
     def __post_init__(self) -> None:
         shape = (len(self.y_mm), len(self.x_mm))
@@ -155,7 +155,7 @@ class TactileMap(Record, eq=False):
 
     @property
     def counts_known(self) -> bool:
-        """Whether `count` is the number of readings per cell: an imported grid without counts has 1 everywhere."""
+        """True where `count` is the number of readings per cell: an imported grid without counts has 1 everywhere."""
         return self.recipe.source == "scan" or bool((self.count > 1).any())
 
     @property
@@ -200,7 +200,7 @@ def many_cells(tactile_map: TactileMap, radius_mm: float) -> str | None:
 # without stress, and a caution stands where sizes lay outside their intervals more often than they say.
 
 MOST_PROFILE_CHANGE = 0.01
-"""Of the head profile's second order across, over 30 mm: fat that deepens by 1 mm in 20 changes it by 0.01 to 0.06."""
+"""Change of the second order across the head, over 30 mm: fat that deepens by 1 mm in 20 changes it by 0.01 to 0.06."""
 BROKEN_PROFILE_CHANGE = 0.07
 """From here on sizes of simulated bodies lay outside their intervals: 1 mm in 5, or a step of 6 mm in thin fat."""
 MOST_SKEW = 0.01
@@ -210,7 +210,7 @@ MOST_CURVATURE_PER_M = 4.0
 MOST_LAG_MM = 1.2
 """A latency of 12 ms left in the poses makes up to 0.75 mm at a hand's 60 mm/s."""
 LEAST_STROKES = 4
-"""Of the exams that sizes were learned from: 3 strokes, 8 mm apart, made sizes 6 % larger (record 0123)."""
+"""As in the exams that sizes were learned from: 3 strokes, 8 mm apart, made sizes 6 % larger (record 0123)."""
 LEAST_COVERAGE = 0.5
 """A strip of the plane narrower than the head itself shows no lump's flanks."""
 MOST_TILT_DEG = 10.0
@@ -229,7 +229,7 @@ def broken_assumptions(quality: Mapping[str, float]) -> tuple[Finding, ...]:
 
 
 def handling_findings(quality: Mapping[str, float]) -> tuple[Finding, ...]:
-    """What a map's figures say against how the head was held and the array read; parameters as above."""
+    """Findings from a map's `quality` figures against how the head was held and the array read."""
     return tuple(_handling(quality))
 
 
@@ -302,7 +302,7 @@ def _curved(quality: Mapping[str, float]) -> Finding | None:
 
 
 def _uneven(quality: Mapping[str, float]) -> Finding | None:
-    """Of a profile that changes so far that sizes fail, or of one that changes less."""
+    """Finding of a profile that changes so far that sizes fail, or of one that changes less."""
     change = _beyond(quality, "profile_change", "profile_change_sd", MOST_PROFILE_CHANGE)
     if change is None:
         return None

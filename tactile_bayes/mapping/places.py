@@ -44,7 +44,7 @@ class Orientation(Record):
 
     @property
     def swapped(self) -> bool:
-        """Whether y, not x, runs across the screen."""
+        """True where y, not x, runs across the screen."""
         return self.right[1] == "y"
 
     @property
@@ -172,7 +172,7 @@ class ClockPosition(Record):
 
     @property
     def direction_known(self) -> bool:
-        """Whether the clock says more than that the lump lies behind the nipple."""
+        """False where the lump lies behind the nipple."""
         return _deviations(_KNOWN) * self.angle_sd_deg < LEAST_KNOWN_HOURS * _DEGREES_PER_HOUR
 
     def hours_between(self, probability: float) -> tuple[float, float] | None:

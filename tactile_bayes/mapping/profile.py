@@ -162,7 +162,7 @@ class GrowingProfile:
         self._number_new = 0
 
     def add(self, counts: CountArray, level_kpa: FloatArray, valid_share: FloatArray) -> None:
-        """Add frames: (f, k) uint16 counts of the used taxels, (f,) means in kPa and (f,) valid shares of all taxels."""
+        """Add frames: (f, k) uint16 counts of the used taxels, (f,) means in kPa, (f,) valid shares of all taxels."""
         if not self._reader.solve.size:
             return
         if len(counts) >= _FEW:

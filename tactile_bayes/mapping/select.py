@@ -246,7 +246,7 @@ class Span:
 
 
 def apart(frames: Span, poses: Span) -> bool:
-    """Whether no frame was measured between the first pose and the last."""
+    """True where no frame was measured between the first pose and the last."""
     if not frames.number or not poses.number:
         return True
     return poses.last_s < frames.first_s or poses.first_s > frames.last_s
@@ -274,7 +274,7 @@ def overlap_cautions(frames: Span, poses: Span) -> list[str]:
 
 
 def scan_findings(scan: Scan) -> tuple[Finding, ...]:
-    """What its file and recorder say against a scan, and its times."""
+    """Findings of a scan's file and recorder, and on its times."""
     return with_times(scan.findings, Span.of(scan.frames.time_s), Span.of(scan.poses.time_s))
 
 

@@ -51,7 +51,7 @@ class StrokeShift(Record):
     sd_mm: float = np.inf
     """`shift_mm`, `sd_mm`: Along x of the plane, and its standard error."""
     known: bool = False
-    """Whether the stroke crossed a lump or an edge that fixes a shift; else the shift is 0."""
+    """True where the stroke crossed a lump or an edge that fixes a shift; else the shift is 0."""
 
 
 def find_strokes(source: Source, number: int) -> list[StrokeShift]:
@@ -105,7 +105,7 @@ def register_strokes(sources: Sequence[Source]) -> tuple[list[Source], list[Stro
 
 
 def _lack(known: NDArray[np.bool_], last: _Round) -> str:
-    """What the scan lacks, in one line."""
+    """The scan's deficiency, in one line."""
     best = float(last.own_errors().min())
     told = f"the best is known to +-{best:.1f} mm" if np.isfinite(best) else "no slope stands out of the noise"
     fixed = f"crossed a lump or an edge that fixes a shift to {KNOWN_SD_MM:g} mm"

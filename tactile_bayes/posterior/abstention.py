@@ -51,7 +51,7 @@ SIDES = {"-x": (-1.0, 0.0), "+x": (1.0, 0.0), "-y": (0.0, -1.0), "+y": (0.0, 1.0
 
 
 def searched(tactile_map: TactileMap, centre_mm: tuple[float, float] | None) -> str:
-    """The area searched for a lump, in words: the place given, which must lie on the map, or all that the map covers."""
+    """The area searched for a lump, in words: the place given, which must lie on the map, or all that is covered."""
     if centre_mm is None:
         area = float(trusted(tactile_map).sum()) * tactile_map.recipe.cell_mm**2 / 100.0
         return f"on the {f'{area:.0f}' if area >= 10 else f'{area:.2g}'} cm2 that the map covers"

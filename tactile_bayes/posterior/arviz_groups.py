@@ -127,7 +127,7 @@ def _statistics(estimate: Estimate, fit: FieldFit | None) -> DrawGroup | None:
 
 
 def _log_likelihood(theta: FloatArray, fit: FieldFit) -> DrawGroup:
-    """Of some of the draws, evenly thinned, as many of each chain."""
+    """Log likelihood of some of the draws, evenly thinned, as many of each chain."""
     some = _thinned(theta, LIKELIHOOD_DRAWS)
     values = pointwise_log_likelihood(fit.target, some.reshape(-1, some.shape[2])).reshape(*some.shape[:2], -1)
     note = (

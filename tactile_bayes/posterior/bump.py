@@ -62,7 +62,7 @@ class FitCells(Record, eq=False):
     cell_mm: float
     """Side of a cell."""
     pose_noise: PoseNoise | None = None
-    """Of the frames; None where the map does not tell."""
+    """Tracker position error of the frames; None where the map does not give it."""
 
     def __len__(self) -> int:
         return len(self.value)
@@ -116,7 +116,7 @@ def map_ends(tactile_map: TactileMap) -> dict[str, tuple[float, float]]:
 
 
 def on_map(tactile_map: TactileMap, x_mm: float, y_mm: float) -> bool:
-    """Whether a place lies on the map's cells, covered or not."""
+    """True for a place on the map's cells, covered or not."""
     ends = map_ends(tactile_map)
     return ends["x"][0] <= x_mm <= ends["x"][1] and ends["y"][0] <= y_mm <= ends["y"][1]
 
@@ -252,7 +252,7 @@ class Bump(Record):
     """
 
     rotated: bool = False
-    """Whether the axes of the ellipse may turn (adds r)."""
+    """The axes of the ellipse may turn (adds r)."""
     background: float | None = 1.0
     """Fixed level (1 in Eq 7), or None to fit it."""
     scale: float = 1.0

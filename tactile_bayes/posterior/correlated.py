@@ -42,7 +42,7 @@ from tactile_bayes.presets import FIELD_COSINES, SceneAsked
 # noise field.
 
 BALLS_SD = (0.008, 0.01)
-"""Of skewness and change of balls' maps beyond their noise, over the amplitude (record 0107)."""
+"""SDs of skewness and change of balls' maps beyond their noise, over the amplitude (record 0107)."""
 NOISE_FACTOR = 2.5
 """Variance of both over that by the residuals: deep and faint lumps are off by more than they say."""
 MOST_SDS = 2.5
@@ -50,7 +50,7 @@ MOST_SDS = 2.5
 
 
 def irregular(fit: FieldFit) -> bool:
-    """Whether the bump is more skewed, or its axis ratio changes more outwards, than a ball's.
+    """True for a bump that is more skewed, or whose axis ratio changes more outwards, than a ball's.
 
     Judged where the lump stands alone: what is left of a neighbour would answer.
     """
@@ -105,7 +105,7 @@ def _columns(fit: FieldFit) -> tuple[FloatArray, FloatArray]:
 # of them; what they do to the estimate is added to its draws.
 
 LEAST_EIGENVALUE = 3e-3
-"""Of the overlap of two arrays, over its largest: less is left out."""
+"""Least eigenvalue of the overlap of two arrays, over its largest: less is left out."""
 
 
 def pose_covariance(fit: FieldFit) -> FloatArray:
@@ -160,7 +160,7 @@ class FieldAnswer(Record, eq=False):
     """Detection and scene of a map under correlated errors."""
 
     detection: Detection
-    """Whether there is a lump."""
+    """The odds of a lump."""
     choice: SceneChoice
     """The scene."""
 

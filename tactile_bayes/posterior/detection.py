@@ -166,7 +166,7 @@ class Detection(Record):
     """Odds of a bump against smooth errors alone; see `lump_probability` for whether it is a lump."""
 
     probability: float
-    """Of a bump, at even odds and if there were only bumps and smooth errors."""
+    """Probability of a bump, at even odds and if there were only bumps and smooth errors."""
     log_bayes_factor: float
     """Natural log of the evidence ratio."""
     ridge: str = ""

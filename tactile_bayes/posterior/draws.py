@@ -28,7 +28,7 @@ class MapPosterior(Record, eq=False):
     measured beside them; None otherwise.
     """
     irregular: bool = False
-    """Whether the bump is less regular than a ball's, see `correlated.outline`."""
+    """True where the bump is less regular than a ball's, see `correlated.outline`."""
 
     @property
     def medians(self) -> tuple[float, float, float]:
@@ -47,17 +47,13 @@ class NoiseFigures(Record):
     """``"independent"`` or ``"field"``."""
     rotated: bool
     rotation_odds: float | None
-    """`rotated`, `rotation_odds`: Whether the ellipse is rotated, and the odds of it; None where that was decided
-    beforehand.
-    """
+    """Odds of a rotated ellipse; None where that was decided beforehand."""
     figures: Mapping[str, float]
-    """Of the noise model: inflation and degrees of freedom, or the field's cosines, length and share."""
+    """Inflation and degrees of freedom, or the noise field's cosines, length and share."""
     level_offset: float | None = None
-    """Of the cells about the bump from the background, under independent errors; None where the level is integrated
-    out.
-    """
+    """Offset of the cells about the bump from the background, under independent errors; else None."""
     places_share: float | None = None
-    """Of the width variance, that errors of the frames' places make; None where a map does not give them."""
+    """Share of the width variance from tracker position error; None where a map does not give it."""
     passed_over: tuple[str, ...] = ()
     """Methods that could not be trusted, and why."""
 
@@ -82,7 +78,6 @@ class Diagnostics(Record):
     sampler: Mapping[str, float]
     """`method`, `sampler`: The method that drew, and its own figures."""
     noise: NoiseFigures
-    """Of the errors."""
     calibration: str = ""
     """Name of the calibration that gave the size, in words; not in the JSON."""
     size_calibration: str = ""
@@ -90,7 +85,7 @@ class Diagnostics(Record):
     repeatability: str = ""
     """How far exams of one mass lie apart at the site, in words; empty where nobody learned it."""
     convergence: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
-    """Of chains: R-hat, effective draws and Monte-Carlo errors of each size and width, see `arviz_data.convergence`."""
+    """R-hat, effective draws and Monte-Carlo errors of chains for each size and width, see `arviz_data.convergence`."""
 
     def as_dict(self) -> dict[str, object]:
         """The diagnostics as plain data."""

@@ -230,13 +230,13 @@ def check_recipe(tactile_map: TactileMap, calibration: Calibration, fit: FitOpti
 
 
 def way_to_head(head: HeadShape | None) -> str:
-    """What gives a calibration for a map's head."""
+    """Command that gives a calibration for a map's head."""
     shipped = head is not None and not DEFAULT_HEAD.differences(head)
     return f"give --size-calibration solid or eq6, which are for this head; or {OTHER_HEAD}" if shipped else OTHER_HEAD
 
 
 def _way_to(recipe: Recipe, tactile_map: TactileMap) -> str:
-    """What makes a map fit a calibration: its map command where the map differs, else the fit's options."""
+    """Command that makes a map fit a calibration: its map command where the map differs, else the fit's options."""
     if recipe.head_differences(tactile_map.head):
         return way_to_head(tactile_map.head)
     made = (tactile_map.recipe.normalise, tactile_map.recipe.flat_field_known)
@@ -262,7 +262,7 @@ def _diagnostics(found: Drawn) -> Diagnostics:
 
 
 def _findings(found: Drawn, *, cell_mm: float) -> Iterator[Finding]:
-    """What speaks against the size of a lump, besides what speaks against its map."""
+    """Findings against the size of a lump, besides those against its map."""
     posterior, calibration = found.made.posterior, found.calibration
     if calibration is not None:
         beyond = [] if found.size is None else calibration.beyond_lumps(found.size.median_mm)

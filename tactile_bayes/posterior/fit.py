@@ -21,7 +21,7 @@ from tactile_bayes.presets import FIELD_COSINES
 
 MOST_SETTLINGS = 6
 ROUGH, FINE = 0.3, 1e-3
-"""Of the last Newton step, in `Scene.steps`: under the start's fields, which are not the mode's; then under those."""
+"""Last Newton step, in `Scene.steps`: under the start's fields, which are not the mode's; then under those."""
 LEAST_SHARE = 1e-2
 """Fields with a smaller share of the density at the mode have no Gaussian of their own in what `laplace` draws."""
 
@@ -53,7 +53,7 @@ class FieldFit(Record, eq=False):
 
     @property
     def rotated(self) -> bool:
-        """Whether the ellipse may be rotated."""
+        """True where the ellipse may be rotated."""
         return self.target.rotated
 
     @property

@@ -17,7 +17,7 @@ FLOOR = 1e-9
 Without it a map free of noise leaves differences of large sums, which are rounding."""
 
 LEAST_POWER = 1e-9
-"""Of a template, over what the prior on its amplitude is worth: less tells nothing and would only overflow."""
+"""Power of a template, over what the prior on its amplitude is worth: less tells nothing and would only overflow."""
 
 
 class LinearSolution(Record, eq=False):

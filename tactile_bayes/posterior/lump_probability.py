@@ -23,9 +23,9 @@ from tactile_bayes.presets import FIELD_COSINES, FIT_RADIUS_MM
 # --- Probability that a rise of a map is a lump, calibrated on simulated exams with and without one.
 
 SHARE_WITH_LUMP: Final = 0.5
-"""Of the simulated exams, half hold a lump: the prior probability behind the answer."""
+"""Half of the simulated exams hold a lump: the prior probability behind the answer."""
 COEFFICIENTS: Final = (1.14, 0.8, -2.36, -4.3, -2.32, -2.47)
-"""Of 1 and `Weighed.features`; ``python -m benchmarks.lump_probability learn`` prints them (decision 0127)."""
+"""Intercept and those of `Weighed.features`; printed by ``python -m benchmarks.lump_probability learn``, 0127."""
 ENDS: Final = (0.01, 0.99)
 """The exams that were simulated cannot tell probabilities nearer to 0 or 1."""
 LIKELY: Final = 0.5
@@ -41,9 +41,9 @@ class Weighed(Record, eq=False):
     """A rise with the odds of a bump there, and the probability that it is a lump."""
 
     detection: Detection
-    """Of a bump against smooth errors, and a ridge where one rises."""
+    """Evidence for a bump against smooth errors, and a ridge where one rises."""
     centre_mm: tuple[float, float]
-    """Of the bump."""
+    """Centre of the bump."""
     features: tuple[float, ...]
     """Log of 1 plus the log Bayes factor, log of the axis ratio, by how much the log of the width exceeds that of
     `WIDE_MM`, share of the bump that the map does not cover, and 1 where a fault speaks against measuring it.
@@ -53,7 +53,7 @@ class Weighed(Record, eq=False):
 
     @property
     def axis_ratio(self) -> float:
-        """Of the bump, at most e^2."""
+        """Axis ratio of the bump, at most e^2."""
         return exp(self.features[1])
 
     @property
@@ -105,11 +105,11 @@ def weigh_candidate(tactile_map: TactileMap, candidate: Candidate, detection: De
 
 PROBABILITY: Final = 0.95
 DEPTHS_IN_FAT: Final = (0.5, 0.75, 1.0)
-"""Of the lump's middle below the skin, over the depth of fat: in it, and on its lower edge. Within the gland a lump
+"""Depth of the lump's middle below the skin, over that of the fat: in it, and on its lower edge. In the gland a lump
 that is no stiffer does not show at all."""
 SIZES_MM: Final = np.arange(4.0, 30.5, 0.5)
 LEAST_DEPTH_RATIO: Final = 0.56
-"""Of the ball's middle, over its diameter: nearer to the skin no ball was simulated."""
+"""Depth of the ball's middle, over its diameter: nearer to the skin no ball was simulated."""
 USUAL_FAT_MM: Final = 15.0
 """Where a map does not tell the depth of fat."""
 LOG_AMPLITUDE: Final = (-2.61, 3.393, -3.27, 1.003, 0.251, -0.049, -0.983)

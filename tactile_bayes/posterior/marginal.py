@@ -76,7 +76,7 @@ class CollapsedTarget:
 
     @property
     def rotated(self) -> bool:
-        """Whether the ellipse may be rotated."""
+        """True where the ellipse may be rotated."""
         return self.scene.shape == "rotated"
 
     @property

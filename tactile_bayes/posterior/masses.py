@@ -27,7 +27,7 @@ BESIDE_IN_WIDTHS = 2.5
 FAR_IN_WIDTHS, LEAST_RISE_FAR = 4.0, 0.02
 """Farther than so many widths a rise needs this share of the lump's amplitude only."""
 LEAST_RISE_AT_RIM = 0.5
-"""Of the lump's amplitude, for a rise that the map covers too poorly: the ends of strokes make small ones."""
+"""Share of the lump's amplitude, for a rise that the map covers too poorly: the ends of strokes make small ones."""
 MOST_NAMED, MOST_LOOKS = 4, 3
 """Rises that are named, and places that turn out to be none before the search ends: each look costs some 50 ms."""
 LEAST_PROBABILITY = 0.95
@@ -109,7 +109,7 @@ def _least_rise(x: float, y: float, estimate: Estimate) -> float:
 
 
 def _beside(x: float, y: float, rest: TactileMap, estimate: Estimate) -> bool:
-    """Whether a place is clear of the lump and of its scene's second structure."""
+    """True for a place clear of the lump and of its scene's second structure."""
     lump = _lump(estimate)
     if lump is None:
         return True
@@ -120,7 +120,7 @@ def _beside(x: float, y: float, rest: TactileMap, estimate: Estimate) -> bool:
 
 
 def _belongs_to_scene(x: float, y: float, rest: TactileMap, estimate: Estimate) -> bool:
-    """Whether a place belongs to the second lump or the rib of the lump's scene.
+    """True for a place that belongs to the second lump or the rib of the lump's scene.
 
     A second lump whose centre lies off the map stands for what rises at the rim, which is looked at as elsewhere.
     """
@@ -166,7 +166,7 @@ def _at_rim(
 
 
 def _stands_out(rise: Rise, rest: TactileMap) -> bool:
-    """Whether the map, or the map with wide rises taken off, is higher at a rise's centre than elsewhere.
+    """True where the map, or the map with wide rises taken off, is higher at a rise's centre than elsewhere.
 
     A centre beyond the covered cells is not judged.
     """
@@ -179,7 +179,7 @@ def _stands_out(rise: Rise, rest: TactileMap) -> bool:
 
 
 def _is_known(rise: Rise, rises: list[Rise], rest: TactileMap, estimate: Estimate) -> bool:
-    """Whether a fit moved to a place already found, or back to the measured lump."""
+    """True where a fit moved to another rise, or back to the measured lump."""
     again = any(np.hypot(rise.x_mm - one.x_mm, rise.y_mm - one.y_mm) < 2 * SMOOTHING_MM for one in rises)
     return again or not _beside(rise.x_mm, rise.y_mm, rest, estimate)
 
@@ -193,12 +193,12 @@ def _is_known(rise: Rise, rises: list[Rise], rest: TactileMap, estimate: Estimat
 OF_A_LUMP = ("seat", "depth_mm", "stiffness_ratio")
 """Known properties that are of one lump, not of the whole body."""
 LEAST_SHARE = 0.15
-"""Of the first lump's amplitude, for a size from the map less the first lump: of two with less, 21 mm from a lump 13
+"""Share of the first lump's amplitude, for a size from the map less that lump: of two with less, 21 mm from a lump 13
 times as high, one came out twice as large as it was, and what a lump leaves of itself is some per cent of it."""
 APART_IN_WIDTHS = 2.0
 """Two equal Gaussians nearer than this many widths have one maximum."""
 DOUBTFUL_SHARE = 0.3
-"""Of the highest measured mass's amplitude: a lower rise is in doubt, though the calibration may hold it alone."""
+"""Share of the highest mass's amplitude: a lower rise is in doubt, though the calibration may fit it alone."""
 BOTH = "scan again with more lines over both"
 Estimator = Callable[[TactileMap, EstimateOptions], Estimate]
 
@@ -249,7 +249,7 @@ def by_evidence(masses: Sequence[Mass]) -> list[Mass]:
 
 
 def _apart(one: Mass, other: Mass) -> bool:
-    """Whether two masses are not the same, found twice: two narrow bumps may stand close to each other."""
+    """True for two masses, not one measured twice: two narrow bumps may stand close to each other."""
     widths = [max(m.estimate.bump.sigma_x_mm, m.estimate.bump.sigma_y_mm) for m in (one, other) if m.estimate.bump]
     least = min(2 * SMOOTHING_MM, APART_IN_WIDTHS * max(widths, default=np.inf))
     return bool(np.hypot(one.x_mm - other.x_mm, one.y_mm - other.y_mm) > least)
@@ -324,7 +324,7 @@ def _estimated(tactile_map: TactileMap, options: EstimateOptions, estimator: Est
 
 
 def _stays(found: Estimate, rise: Rise, first: Estimate) -> bool:
-    """Whether an estimate is of the lump at a rise, and did not move towards the first lump."""
+    """True where an estimate is of the lump at a rise, and did not move towards the first lump."""
     if found.map_posterior is None or first.bump is None:
         return found.map_posterior is not None
     moved, apart = ((np.hypot(x - rise.x_mm, y - rise.y_mm)) for x, y in (_place(found), _place(first)))
@@ -332,7 +332,7 @@ def _stays(found: Estimate, rise: Rise, first: Estimate) -> bool:
 
 
 def _stands(found: Estimate, first: Estimate) -> bool:
-    """Whether what is left after the first lump is subtracted is high enough to be sized."""
+    """True where the map less the first lump is high enough to be sized."""
     return _amplitude(found) >= LEAST_SHARE * _amplitude(first)
 
 

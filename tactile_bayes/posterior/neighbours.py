@@ -1,4 +1,4 @@
-"""What stands beside a lump: other bumps, ridges, their surroundings."""
+"""Structures beside a lump: other bumps, ridges, their surroundings."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ STRIP_MM = 0.5
 PIECE_MM = 10.0
 """Length of the pieces of a ridge whose rises are compared."""
 LEAST_CELLS, LEAST_IN_PIECE = 4.0, 1.0
-"""Of a place's weight, and of a piece's: with less of it on the map there is nothing to see."""
+"""Least weight of a place, and of a piece: with less of it on the map there is nothing to see."""
 
 
 class Surroundings(Record, eq=False):
@@ -135,7 +135,7 @@ def _median_piece(number: FloatArray, total: FloatArray) -> FloatArray:
 SECOND_ODDS = 10.0
 """For a second lump or a rib: a bump that is not quite a Gaussian must not bring one."""
 LEAST_RISE = 0.05
-"""Of the bump's amplitude: beside 15 single simulated lumps the most was 0.01, beside a second one 0.08 and more."""
+"""Share of the bump's amplitude: beside 15 single simulated lumps at most 0.01, beside a second one 0.08 and more."""
 LONG = 1.5
 """A bump with a larger axis ratio is also tried as two round lumps side by side."""
 GRID_MM = 4.0

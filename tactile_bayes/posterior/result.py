@@ -127,7 +127,7 @@ class Estimate(Record, eq=False):
     diagnostics: Diagnostics | None = None
     """Figures and flags for the report; None where nothing was drawn."""
     left_out: tuple[str, ...] = ()
-    """What the estimate does not contain, in words."""
+    """Sources of error that the estimate does not contain, in words."""
     code: str = ""
     advice: str = ""
     on_paper: str = ""
@@ -149,7 +149,7 @@ class Estimate(Record, eq=False):
     masses: tuple[Mass, ...] = ()
     """All masses of the map, see `masses.with_masses`; empty where nobody has looked."""
     findings: tuple[Finding, ...] = ()
-    """What speaks against the answer, cautions first."""
+    """Findings against the answer, cautions first."""
 
     @property
     def probability(self) -> float | None:
@@ -168,7 +168,7 @@ class Mass(Record, eq=False):
     estimate: Estimate
     """Its own: draws and size, or why there is none."""
     reported: bool = False
-    """Whether the map's `Estimate` is this mass's."""
+    """The map's `Estimate` is this mass's."""
 
     @property
     def largest_mm(self) -> float | None:

@@ -24,7 +24,7 @@ class Problem(Record, eq=False):
     prior: BumpPrior
     """On widths and amplitudes."""
     radius_mm: float
-    """Of the window; bounds the centre about the window's middle."""
+    """Radius of the window; bounds the centre about the window's middle."""
     amplitude_scale: float = 1.0
     """Unit of the amplitudes' prior, see `cells.value_scale`."""
     departure: FloatArray | None = None
@@ -87,11 +87,11 @@ class Scene(Record):
     """
 
     shape: Shape = "ellipse"
-    """Of the bump."""
+    """Shape of the bump."""
     tilt: bool = True
-    """Whether the level may slope."""
+    """The level may slope."""
     extra: Extra = ""
-    """What lies beside the bump."""
+    """Structure beside the bump."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -128,7 +128,7 @@ class Scene(Record):
 
     @property
     def separable(self) -> bool:
-        """Whether the scene is only a bump along the grid's axes: the product of a profile along each."""
+        """True for a scene that is only a bump along the grid's axes: the product of a profile along each."""
         return self.shape in ("round", "ellipse") and not self.extra
 
     def templates(self, theta: FloatArray, window: Window) -> list[Profiles]:

@@ -1,4 +1,4 @@
-"""Looking for a lump: search, assessment, draws of what was found."""
+"""Search for a lump: candidate places, their assessment, draws of the one that is a lump."""
 
 from __future__ import annotations
 
@@ -54,13 +54,13 @@ class MapDraws(Record, eq=False):
     fit: BumpFit
     """The least-squares fit that the draws started from."""
     draws: ParameterDraws
-    """Of the model's own parameters."""
+    """Draws of the model's own parameters."""
     posterior: MapPosterior
     """The joint draws by name."""
     figures: NoiseFigures
-    """Of the fit and the noise, for the report."""
+    """Figures of the fit and the noise, for the report."""
     scene: SceneChoice | None = None
-    """What the window holds, under correlated errors."""
+    """Structures in the window, under correlated errors."""
 
 
 class Assessment(Protocol):
@@ -184,7 +184,7 @@ def _field_fault(tactile_map: TactileMap, seen: FieldAnswer) -> str:
 # --- Posterior draws of a map and its size, refined until the size interval is as exact as requested.
 
 DEFAULT_ACCURACY_SD = {"importance": 0.02, "ensemble": 0.1}
-"""Of interval ends of sizes, where none is given; the methods have the same for the widths."""
+"""Accuracy of interval ends of sizes, where none is given; the methods have the same for the widths."""
 MOST_REFINEMENTS, SAFETY, LEAST_ACCURACY_SD = 3, 0.8, 1e-3
 
 

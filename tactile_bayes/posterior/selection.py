@@ -1,4 +1,4 @@
-"""Which terms a scene needs, by evidence."""
+"""Choice of a scene's terms by evidence."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from tactile_bayes.posterior.options import ROTATION_ODDS
 from tactile_bayes.posterior.scene import Problem, Scene, Shape
 from tactile_bayes.presets import SceneAsked
 
-# --- What draws say of a window's cells under correlated errors: the density of each given the others.
+# --- Density of a window's cells under correlated errors: the density of each given the others.
 #
 # A likelihood with correlated errors is no product over cells. What takes the place of a cell's factor is the
 # density of its value given all the others, with level, tilt, amplitudes and the noise scale integrated out as in
@@ -73,7 +73,7 @@ def fitted_values(target: CollapsedTarget, theta: FloatArray) -> FloatArray:
 
 
 def _fields(target: CollapsedTarget) -> Iterator[Callable[[], _Precision]]:
-    """What makes the precision of each field and share, in the order of `CollapsedTarget.by_field`."""
+    """Makers of the precision of each field and share, in the order of `CollapsedTarget.by_field`."""
     cosines = _cosines(target)
     for columns in target.fields:
         low = cosines @ columns.field.turn
@@ -142,11 +142,11 @@ class Structure(Record):
     odds: float
     """Bayes factor of the scene with it against the scene without; an upper bound where `bound`."""
     supported: bool
-    """Whether the evidence supports it: the odds exceed a threshold."""
+    """The odds exceed a threshold."""
     used: bool
-    """Whether the draws have it."""
+    """The draws have it."""
     bound: bool = False
-    """Whether the odds are a bound from the best of a grid of templates."""
+    """The odds are a bound from the best of a grid of templates."""
     change_x_sd: float | None = None
     change_y_sd: float | None = None
     """`change_x_sd`, `change_y_sd`: By how many posterior SDs the median of ln sigma_x and ln sigma_y would change, had

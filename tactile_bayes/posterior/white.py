@@ -129,7 +129,7 @@ PATIENCE = 16
 """Iterations: a clear lump takes 4 to 15."""
 OUTGROWN, AT_RIM = "wider than the window", "at the rim of the map"
 FIT_TOLERANCE = 1e-8
-"""Of the least squares, in units of `Bump.step_scale`: far below any error that a map has."""
+"""Tolerance of the least squares, in units of `Bump.step_scale`: far below any error that a map has."""
 PLACE_TOLERANCE = 1e-2
 """The same where least squares only finds the place: the posterior's mode is sought from there."""
 JOINED = 0.05

@@ -102,7 +102,7 @@ class Spread(Record, eq=False):
 
 
 class BodyLaw(Record, eq=False, kw_only=True):
-    """What is learned over a population: Eq 6 by the depth of the fat, its residual, and what a map does not show."""
+    """Law learned over a population: Eq 6 by the depth of the fat, its residual, and what a map does not show."""
 
     source: Annotated[str, Meta(description="What the table was made of.")]
     bodies: Annotated[
@@ -305,7 +305,7 @@ class BodyCalibration(BodyLaw, eq=False, kw_only=True):
         return beyond_lumps(self.domain, largest_mm)
 
     def omissions(self) -> list[str]:
-        """What a size does not contain, in words."""
+        """Sources of error that a size does not contain, in words."""
         notes = [unknown_fat(self.fat_note, other_sd=self.other_sd)] if self.fat_note else []
         return [*notes, unlike_bodies(self.bodies)] if self.bodies else notes
 
@@ -314,7 +314,7 @@ class BodyCalibration(BodyLaw, eq=False, kw_only=True):
 
     @property
     def _averages(self) -> bool:
-        """Whether sizes are averaged over depths of fat."""
+        """True where sizes are averaged over depths of fat."""
         return self.depth is not None and self.fat_mm is None
 
     def _values(self, log_amplitude: FloatArray, log_width: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -387,7 +387,7 @@ def known_body(
 def suppositions(
     calibration: BodyCalibration, known: Mapping[str, float], middle: tuple[float, float], *, variance: float
 ) -> dict[str, Supposition]:
-    """Of `SUPPOSED` those that the calibration's bodies hold, that the map leaves open and that nobody knows, by name.
+    """Those of `SUPPOSED` that the calibration's bodies hold, that the map leaves open and that nobody knows, by name.
 
     For the mean ln a and p of the maps, and the variance of ln d as it is.
     """
@@ -408,7 +408,7 @@ def suppositions(
 
 
 def _supposition(name: str, value: float, before: BodyLeft, left: BodyLeft, *, variance: float) -> Supposition:
-    """What one more known property does to a size whose logarithm has this variance without it."""
+    """Effect of one more known property on a size whose logarithm has this variance without it."""
     gone = float((before.variance - left.variance)[0])
     variances = variance, float(np.clip(variance - gone, 0.0, variance))
     sds = float(np.sqrt(variances[0])), float(np.sqrt(variances[1]))

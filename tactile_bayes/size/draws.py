@@ -39,11 +39,11 @@ class ShapeDraws(Record, eq=False):
     profile: tuple[float, ...] | None = None
     """`presets.HEAD_PROFILE` of the map; None where it has none."""
     labels: Labels | None = None
-    """Of the draws' independent replicates, as `ParameterDraws.labels`."""
+    """Labels of the draws' independent replicates, as `ParameterDraws.labels`."""
     oblique: tuple[float, float] | None = None
     """Mean and SD of r where the draws have none, as `MapPosterior`'s."""
     irregular: bool = False
-    """Whether the map is that of an irregular lump."""
+    """The map is that of an irregular lump."""
 
     @property
     def replicates(self) -> Labels:
@@ -166,14 +166,14 @@ def _log_normal(x: FloatArray, covariance: FloatArray) -> float:
 
 
 class Supposition(Record):
-    """What the size would be if one more property of the body, by the names of `HiddenTerms`, had this value."""
+    """The size if one more property of the body, by the names of `HiddenTerms`, had this value."""
 
     name: str
     value: float
     log_shift: float
     """By which the median of ln d moves."""
     sds: tuple[float, float]
-    """Of ln d without and with it."""
+    """SDs of ln d without and with it."""
 
     @property
     def sd_ratio(self) -> float:
@@ -204,13 +204,13 @@ class SizePosterior(Record, eq=False):
     replicates: Labels
     """(chain * draw,) label of the independent replicate of each draw: their spread is the Monte-Carlo error."""
     figures: Mapping[str, float] = field(default_factory=dict)
-    """What else was found: the probability of a lump that is not round, the spread between maps..."""
+    """Further figures: the probability of a lump that is not round, the spread between maps..."""
     outliers: tuple[int, ...] = ()
-    """Of several maps, those that lie apart from the rest, by their place in the list."""
+    """Those of several maps that lie apart from the rest, by their place in the list."""
     another_exam: SizePosterior | None = None
     """The same if another exam of the mass may come out as far apart as in the paper's trial; None where not told."""
     supposing: Mapping[str, Supposition] = field(default_factory=dict)
-    """What the size would be if something more were known of the body, by the names of `bodies.SUPPOSED`."""
+    """Sizes if something more were known of the body, by the names of `bodies.SUPPOSED`."""
 
     @property
     def max_size_mm(self) -> FloatArray:

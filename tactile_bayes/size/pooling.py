@@ -42,7 +42,7 @@ Calibration = SizeCalibration | BodyCalibration
 """One learned from a study or phantoms, or over a population: whoever uses it needs to know no more."""
 POOLED_DRAWS = 8192
 DIMENSIONS = 6
-"""Of the points: ln d given all else, tau, the spread of B, oval or round, and the two components of an oval."""
+"""Coordinates of the points: ln d given all else, tau, the spread of B, oval or round, and an oval's two components."""
 _SCORE = 2
 """Coordinate of the spread of B."""
 MOST_INVALID = 0.05
@@ -382,7 +382,7 @@ def _one_size(centre: FloatArray, noise: FloatArray, priors: SizePriors) -> dict
 # --- A site's repeatability: how far sizes of one mass lie apart between its exams, learned from repeated exams there.
 
 PROBABILITY: Final = 0.95
-"""Of the interval of a learned spread."""
+"""Probability of the interval of a learned spread."""
 
 
 class Repeatability(Record):
@@ -417,7 +417,7 @@ class Repeatability(Record):
         return BetweenMaps(self.sd, self.log_sd)
 
     def as_dict(self) -> dict[str, float]:
-        """What a size used of it, as plain data."""
+        """The part that a size used, as plain data."""
         return {"between_map_sd": self.sd, "log_sd": self.log_sd, "masses": self.masses, "maps": self.maps}
 
     def words(self) -> str:

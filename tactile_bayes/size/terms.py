@@ -23,7 +23,7 @@ _NEEDED: Final = {"required": ["amplitude", "sigma_mm", "d_mm"]}
 Normalise = Literal["mean", "gain", "none"]
 Range = tuple[Annotated[float, Meta(gt=0)], Annotated[float, Meta(gt=0)]]
 Domain = Annotated[Mapping[str, Range], Meta(description="Ranges in the table.", extra_json_schema=_NEEDED)]
-"""Of amplitude, sigma_mm (geometric mean) and d_mm."""
+"""Ranges of amplitude, sigma_mm (geometric mean) and d_mm."""
 Share = Annotated[float, Meta(ge=0)]
 Above0 = Annotated[float, Meta(gt=0)]
 FARTHEST: Final = {"amplitude": 2.0, "sigma_mm": 1.2}

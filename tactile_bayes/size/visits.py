@@ -36,11 +36,11 @@ from tactile_bayes.size.pooling import POOLED_DRAWS, MassMaps, SizePriors, Weigh
 
 MOST_VISITS: Final = 10
 DIMENSIONS: Final = 5
-"""Of the points: the spread between exams, that of B, and three for the lump's shape."""
+"""Coordinates of the points: the spread between exams, that of B, and three for the lump's shape."""
 LEAST_SAME: Final = 0.02
 """One mass in fifty is refused though it is the same."""
 CODES: Final = {"subject": "patients", "side": "sides", "mass": "masses"}
-"""What scans may say that one mass has only one of, and its name for people."""
+"""Facts of which one mass has only one, and their names for people."""
 VOLUME: Final = 3.0
 """d ln V / d ln d of a lump that keeps its form."""
 
@@ -70,7 +70,7 @@ class Apart(Record):
     shift_mm: tuple[float, float]
     """From the earlier visit's place to the later one's."""
     sd_mm: float
-    """Of the distance of one mass between visits, in the direction of the shift."""
+    """SD of the distance of one mass between visits, in the direction of the shift."""
     probability: float
     """That one mass comes out as far apart or farther."""
 
@@ -81,7 +81,7 @@ class Apart(Record):
 
     @property
     def doubtful(self) -> bool:
-        """Whether one mass would come out so far apart in less than `LEAST_SAME`."""
+        """True where one mass would come out so far apart in less than `LEAST_SAME`."""
         return self.probability < LEAST_SAME
 
     @property
@@ -101,7 +101,7 @@ def apart(earlier: Place, later: Place, *, registration_mm: float = REGISTRATION
 
 
 def contradictions(visits: Sequence[Sequence[Mapping[str, str]]]) -> list[str]:
-    """What the scans of all visits contradict each other in, in words, by what each says of the exam."""
+    """Contradictions between the exam facts that the scans of all visits give, in words."""
     found = []
     for key, plural in CODES.items():
         said: dict[str, int] = {}
@@ -220,7 +220,7 @@ class JointSizes(Record, eq=False):
     correlation: FloatArray
     """(v, v) of B between the visits."""
     calibrations: tuple[BodyCalibration, ...]
-    """Of each visit: at the depth of fat that its maps tell."""
+    """One per visit: at the depth of fat that its maps give."""
 
     def change(self, earlier: int, later: int) -> Change:
         """Change from one visit to another."""
@@ -372,7 +372,7 @@ def doubling_days(rate_per_day: float) -> float | None:
 
 
 class Compared(Record, eq=False):
-    """Whether visits are of one mass, and its sizes: status compared, not_one_mass or no_estimate."""
+    """Comparison of visits and its sizes: status compared, not_one_mass or no_estimate."""
 
     status: str
     reason: str = ""
@@ -381,7 +381,7 @@ class Compared(Record, eq=False):
     apart: tuple[Apart | None, ...] = ()
     """How far the mass of each later visit lies from the first's; None where landmarks do not show it."""
     findings: tuple[Finding, ...] = ()
-    """What speaks against the comparison."""
+    """Findings against the comparison."""
     joint: JointSizes | None = None
     another: JointSizes | None = None
     """Sizes with the calibration's or the site's spread between exams, and with the paper's."""

@@ -113,7 +113,7 @@ class TableRows(Record, eq=False):
 
     @property
     def feature_powers(self) -> Powers:
-        """Of the features of a map, see `BodyLaw`."""
+        """Powers of the features of a map, see `BodyLaw`."""
         return QUADRATIC[:6] if self.depth is None else CUBIC
 
     @property
@@ -131,7 +131,7 @@ class TableRows(Record, eq=False):
 
 
 class Learned(Record, eq=False):
-    """What was learned of a table's bodies: the fits, `residual` None for Eq 6 alone, and the spread between exams.
+    """Fits learned from a table's bodies, `residual` None for Eq 6 alone, and the spread between exams.
 
     `left` and `noise` are (b,): ln d less what the other bodies lead one to expect of it, and its variance without B's.
     """
@@ -223,7 +223,7 @@ def _calibration(rows: TableRows, learned: Learned, *, recipe: Recipe, source: s
 def _hidden_at_any_depth(
     calibration: BodyCalibration, maps: PopulationTable, data: BodyRegression
 ) -> HiddenTerms | None:
-    """What B is made of where the depth of the fat is not known."""
+    """Components of B where the depth of the fat is not known."""
     at, a, p = calibration.at_fat([None]), maps.log_amplitude, maps.log_width
     body = data.mean(np.log(maps.d_mm) - at.log_size(a, p))
     body_sd = at.body_sd(data.mean(a), data.mean(p), np.zeros(data.groups))

@@ -64,7 +64,7 @@ class SizeTable(Record, eq=False):
     width_change_y: FloatArray | None = None
     """Width over the width of the same lump at one diameter depth; NaN where the table has no such row."""
     cases: StudyCases | None = None
-    """Of a study; None for other tables."""
+    """Cases of a study; None for other tables."""
     depth_ratio: FloatArray | None = None
     """h/d; None where the table does not say."""
 
@@ -230,7 +230,7 @@ _WAY_OUT = "give depth_ratio and at least 3 diameters at depth_ratio 1, or use -
 
 
 class OtherFit(Record):
-    """What the other of the two fits, joint or two-stage, makes of the same rows."""
+    """The same rows by the other of the two fits, joint or two-stage."""
 
     name: str
     coefficients: tuple[tuple[float, float, float, float], ...]
@@ -281,7 +281,7 @@ def other_fit(calibration: SizeCalibration, table: SizeTable) -> OtherFit | None
 
 
 def is_two_stage(calibration: SizeCalibration) -> bool:
-    """Whether a calibration was learned in two stages."""
+    """True for a calibration that was learned in two stages."""
     return calibration.x.fit.get("two_stage", 0.0) == 1.0
 
 

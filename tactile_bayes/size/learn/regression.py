@@ -31,11 +31,11 @@ from tactile_bayes.size.terms import INVERTED, HiddenTerms, RoundLumps
 T = TypeVar("T")
 LEAST_BODIES = 20
 EXPLAINED: Final = 0.75
-"""Of the table's bodies, by SD(B), those of which what is known tells as much as it does of all, in that SD."""
+"""Share of the table's bodies, by SD(B), of which known properties tell as much as they do of all, in that SD."""
 _ROUND_START = (np.log(0.01), np.log(2.0))
 """ln s and ln kappa where the search for the spread of balls' maps begins."""
 _ROUND_PRIOR_SD = 1.5
-"""Of either about these: with a dozen bodies they stay near."""
+"""Prior SD of either about these: with a dozen bodies they stay near."""
 # Centre and width of the priors on ln(sd between bodies), its slope with ln a, ln(sd between exams).
 _PRIOR = np.array([[np.log(0.1), 1.0], [0.0, 0.3], [np.log(0.03), 1.0]])
 
@@ -106,9 +106,9 @@ class BodyRegression(Record, eq=False):
     exams: FloatArray
     mean_terms: FloatArray
     mean_log_d: FloatArray
-    """Of ln d less the constant, over each body's exams."""
+    """Mean of ln d less the constant, over each body's exams."""
     mean_u: FloatArray
-    """Of the centred ln a."""
+    """Mean of the centred ln a."""
 
     @classmethod
     def linear(
@@ -302,7 +302,7 @@ POINTS: Final = 100
 """Points of the kernel; with fewer bodies a quarter of their number."""
 BODIES_PER_POINT: Final = 4
 SEED: Final = 1
-"""Of the bodies that are the points."""
+"""Seed of the choice of bodies that are the points."""
 _LENGTH, _SCALE, _BODY_SD = (np.log(2.0), 1.0), (np.log(0.3), 1.0), (np.log(0.1), 1.0)
 """Centre and width of the normal priors on the logs of lengths, scale and SD(B) at the centre."""
 _SLOPE_SD = 0.3
@@ -315,7 +315,7 @@ _DIFFERENCE = 1e-4
 
 
 class BodiesLeft(Record, eq=False):
-    """What Eq 6 leaves of b bodies."""
+    """Residuals of b bodies under Eq 6."""
 
     x: FloatArray
     """(b, 3) means of u, v and w over each body's exams: they differ little."""

@@ -53,11 +53,11 @@ class SitePrior(Record):
     """Prior of a site's shift, as standard deviations; see docs/decisions/0102 for the figures."""
 
     shift_sd: float = 0.15
-    """Of c_0: how far off all sizes of a site may be, in ln d."""
+    """SD of c_0: how far off all sizes of a site may be, in ln d."""
     slope_sd: float = 0.10
-    """Of c_1: how much more wide maps than narrow ones."""
+    """SD of c_1: how much more wide maps than narrow ones."""
     spread_log_sd: float = 0.5
-    """Of ln k, about 0."""
+    """SD of ln k, about 0."""
 
     @property
     def sd(self) -> FloatArray:
@@ -76,16 +76,16 @@ class PhantomMap(Record, eq=False):
 
 
 class Residuals(Record, eq=False):
-    """What a calibration leaves of n phantoms, each (n,)."""
+    """Residuals of n phantoms under a calibration, each (n,)."""
 
     residual: FloatArray
     """y."""
     width: FloatArray
     """p - p_0, mean over the maps."""
     spread_variance: FloatArray
-    """Of B and E, before the factor k^2."""
+    """Variance of B and E, before the factor k^2."""
     map_variance: FloatArray
-    """Of the maps' own noise."""
+    """Variance of the maps' own noise."""
     common: FloatArray
     """s: loading of what the phantoms share."""
 
@@ -188,7 +188,7 @@ class _Phantom(Record):
 
 
 def _phantom(calibration: BodyCalibration, maps: Sequence[PhantomMap]) -> _Phantom | str:
-    """What the calibration leaves of a phantom, or why it takes no part."""
+    """Residual of a phantom under the calibration, or why it takes no part."""
     if not all(np.isfinite(one.shape.log_amplitude).any() for one in maps):
         return "a map does not rise above its background"
     shapes = [one.shape for one in maps]
@@ -247,7 +247,7 @@ def _figures(data: Residuals, found: ShiftPosterior, centre: float) -> dict[str,
 
 
 def cautions_of(names: Sequence[str], data: Residuals, found: ShiftPosterior, prior: SitePrior) -> tuple[str, ...]:
-    """What is odd about a correction by the phantoms of these names, in words."""
+    """Oddities of a correction by the phantoms of these names, in words."""
     lines = []
     for value, sd, what in zip(found.mean[:2], prior.sd, ("shift", "slope with ln sigma"), strict=True):
         if abs(value) > FAR * sd:
@@ -295,7 +295,7 @@ def _apart(names: Sequence[str], data: Residuals, prior: SitePrior) -> list[str]
 
 FEWEST_MASSES: Final = 3
 PRIOR_MEDIAN: Final = 0.08
-"""Of tau: between the spread of simulated exams (5 %) and that of the paper's maps (15 %)."""
+"""Prior median of tau: between the spread of simulated exams (5 %) and that of the paper's maps (15 %)."""
 PRIOR_LOG_SD: Final = 1.0
 """95 % of the prior lies between 1.1 and 57 %."""
 FALSE_ALARMS: Final = 0.05
@@ -307,15 +307,15 @@ class RepeatedExams(Record, eq=False):
     """Exams of one mass at one visit: (k,) mean and variance of ln d by each map alone."""
 
     name: str
-    """Of the mass at this visit."""
+    """Name of the mass at this visit."""
     mass: str
-    """Of the mass at any visit."""
+    """Name of the mass at any visit."""
     centre: FloatArray
     noise: FloatArray
 
 
 class LearnedSpread(Record, eq=False):
-    """What repeated exams say of the spread: posterior weights on `GRID`, and their summary."""
+    """Spread from repeated exams: posterior weights on `GRID`, and their summary."""
 
     density: FloatArray
     by_chance: tuple[float, ...]
