@@ -14,7 +14,7 @@ from pathlib import Path
 import click
 import h5py
 import pytest
-from doc_pages import PROGRAM, Command, Reader, blocks_of, commands_of, not_printed
+from doc_pages import PROGRAM, Command, Reader, blocks_of, check_words, commands_of, not_printed
 
 import tactile_bayes as tb
 from tactile_bayes import errors
@@ -37,29 +37,6 @@ _spec.loader.exec_module(make_reference)
 
 EXAMPLES = [found for page in PAGES for found in commands_of(page)]
 RUN_PAGES = sorted({found.page for found in EXAMPLES if not found.mark} - set(RUN_ELSEWHERE))
-
-
-def check_words(words: tuple[str, ...]) -> None:
-    """Raise unless the program would understand the words (files need not exist)."""
-    command: click.Command = cli
-    rest = list(words)
-    while isinstance(command, click.Group) and rest and not rest[0].startswith("-"):
-        name = rest.pop(0)
-        found = command.get_command(click.Context(command), name)
-        if found is None:
-            raise click.UsageError(f"no command {name!r}")
-        command = found
-    if {"-h", "--help", "--version"} & set(rest):
-        return
-    context = click.Context(command, help_option_names=["-h", "--help"])
-    values, left, given = command.make_parser(context).parse_args(rest)
-    if left and not isinstance(command, click.Group):
-        raise click.UsageError(f"left over: {left}")
-    for parameter in command.params:
-        if parameter.required and not (parameter in given and values.get(parameter.name)):
-            raise click.UsageError(f"{parameter.name} is missing")
-        if isinstance(parameter.type, click.Choice) and isinstance(values.get(parameter.name), str):
-            parameter.type.convert(values[parameter.name], parameter, context)
 
 
 def all_commands() -> list[tuple[tuple[str, ...], click.Command]]:
@@ -248,20 +225,6 @@ def test_the_exit_codes_are_those_of_the_program():
     rows = re.findall(r"^\| (\d+) \|", (DOCS / "exit-codes.md").read_text(encoding="utf-8"), flags=re.MULTILINE)
     codes = {value for name, value in vars(errors).items() if name.startswith("EXIT_")}
     assert {int(row) for row in rows} == codes | {errors.TactileBayesError.exit_code}
-
-
-@pytest.mark.parametrize("page", DECISIONS, ids=lambda page: page.name)
-def test_a_decision_record_has_its_four_parts(page):
-    text = page.read_text(encoding="utf-8")
-    assert re.match(rf"# {page.name[:4]} \S", text)
-    parts = re.findall(r"^## (.+)$", text, flags=re.MULTILINE)
-    assert parts == ["Context", "Decision", "Figures", "Consequences"]
-
-
-def test_decision_records_are_numbered_once():
-    numbers = [page.name[:4] for page in DECISIONS]
-    assert len(set(numbers)) == len(numbers)
-    assert numbers[0] == "0001"
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])

@@ -25,7 +25,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import click
 from in_process import run_here
+
+from tactile_bayes.cli import cli
 
 PROGRAM = "tactile-bayes"
 NOT_RUN = {
@@ -37,6 +40,29 @@ NOT_RUN = {
 }
 """Why a block may be left out of the tests."""
 _SHELL = re.compile(r"[|<>;&$]|^\w+=")
+
+
+def check_words(words: tuple[str, ...]) -> None:
+    """Raise unless the program would understand the words (files need not exist)."""
+    command: click.Command = cli
+    rest = list(words)
+    while isinstance(command, click.Group) and rest and not rest[0].startswith("-"):
+        name = rest.pop(0)
+        found = command.get_command(click.Context(command), name)
+        if found is None:
+            raise click.UsageError(f"no command {name!r}")
+        command = found
+    if {"-h", "--help", "--version"} & set(rest):
+        return
+    context = click.Context(command, help_option_names=["-h", "--help"])
+    values, left, given = command.make_parser(context).parse_args(rest)
+    if left and not isinstance(command, click.Group):
+        raise click.UsageError(f"left over: {left}")
+    for parameter in command.params:
+        if parameter.required and not (parameter in given and values.get(parameter.name)):
+            raise click.UsageError(f"{parameter.name} is missing")
+        if isinstance(parameter.type, click.Choice) and isinstance(values.get(parameter.name), str):
+            parameter.type.convert(values[parameter.name], parameter, context)
 
 
 @dataclass(frozen=True)
