@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from datetime import date
+from datetime import date, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
 from tactile_bayes.api.repeatability import exams_in, learn_from_exams
 from tactile_bayes.api.site_correction import correct_size
-from tactile_bayes.api.size_calibration import is_population, learn_eq6, learn_population
+from tactile_bayes.api.size_calibration import EqSixFit, PopulationForm, is_population, learn_eq6, learn_population
 from tactile_bayes.commands.options import also_read
 from tactile_bayes.commands.progress import progress_bar
 from tactile_bayes.declarations import as_dict
@@ -18,9 +18,10 @@ from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.atomic import refuse_existing
 from tactile_bayes.files.instrument_json import ArrayCalibrationFile, write_array_calibration
 from tactile_bayes.files.provenance import Provenance, hash_inputs
+from tactile_bayes.files.scan_mcap import read_scan
 from tactile_bayes.files.size_json import size_calibration_path, write_size_calibration
 from tactile_bayes.files.tables import read_table
-from tactile_bayes.hardware.bladder import BladderStep, fit_array
+from tactile_bayes.hardware.bladder import ArrayFit, BladderStep, fit_array
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.calibration import (
     body_calibration_text,
@@ -29,14 +30,7 @@ from tactile_bayes.report.calibration import (
     site_calibration_text,
 )
 from tactile_bayes.report.study import eq6_figure
-
-if TYPE_CHECKING:
-    from datetime import date, datetime
-
-    from tactile_bayes.api.size_calibration import EqSixFit, PopulationForm
-    from tactile_bayes.hardware.bladder import ArrayFit
-    from tactile_bayes.scan import Scan
-
+from tactile_bayes.scan import Scan
 
 # --- `calibrate array`: learn an array's calibration from recorded bladder steps, for `record` to attach.
 
@@ -45,8 +39,6 @@ def calibrate_array(
     steps: tuple[tuple[float, Path], ...], output: Path, *, head_id: str | None, day: date, force: bool
 ) -> str:
     """Fit the calibration, write it, and print the result."""
-    from tactile_bayes.files.scan_mcap import read_scan
-
     scans = [read_scan(path) for _, path in steps]
     head = head_id or _one_head(scans)
     full = scans[0].element_calibration.saturation_count

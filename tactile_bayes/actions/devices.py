@@ -8,11 +8,10 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from threading import Thread
-from typing import TYPE_CHECKING
 
 import click
 import numpy as np
@@ -22,21 +21,16 @@ from tactile_bayes.commands import record
 from tactile_bayes.errors import BadDataError, DeviceError, UsageError
 from tactile_bayes.files.atomic import refuse_existing
 from tactile_bayes.files.provenance import Provenance, hash_inputs
+from tactile_bayes.files.scan_mcap import read_scan, read_scan_report, read_truth, write_scan
+from tactile_bayes.files.scan_recording import refuse_recording
 from tactile_bayes.hardware.bladder import rotation_sense
-from tactile_bayes.hardware.emulated import EmulatedHead, EmulatedNdi, EmulatedTracker, Faults
-from tactile_bayes.hardware.emulator import Emulator, PtyLink, Stage, TcpLink
+from tactile_bayes.hardware.emulated import Device, EmulatedHead, EmulatedNdi, EmulatedTracker, Faults
+from tactile_bayes.hardware.emulator import Emulator, Link, PtyLink, Served, Stage, TcpLink
 from tactile_bayes.hardware.reading import ask_for_priority
 from tactile_bayes.hardware.readings import PoseReading
 from tactile_bayes.hardware.serial_trackers import TRACKERS, list_ports, open_tracker, probe
 from tactile_bayes.presets import RESEARCH_USE
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from tactile_bayes.hardware.emulated import Device, Faults
-    from tactile_bayes.hardware.emulator import Emulator, Link, Served, Stage
-    from tactile_bayes.scan import Scan
-
+from tactile_bayes.scan import Scan
 
 # --- `emulate`: serve a scan as a device would send it.
 
@@ -57,8 +51,6 @@ def emulate_action(
     seed: int,
 ) -> None:
     """Serve a scan as a scan head or a tracker would send it, or as both, at its own rate, with faults on request."""
-    from tactile_bayes.files.scan_mcap import read_scan
-
     roles = ("head", "tracker") if kind == "both" else (kind,)
     faults, stage, data = Faults(drop, corrupt, stall, disconnect, hold), Stage(speed=speed), read_scan(scan)
     if protocol == "ndi" and "tracker" in roles:
@@ -199,8 +191,6 @@ def replay_action(
     force: bool,
 ) -> None:
     """Replay a scan through emulated devices, recorder and live view, as if it were being recorded."""
-    from tactile_bayes.files.scan_mcap import read_scan
-
     if output is not None:
         refuse_existing(output, force=force)
     found = read_scan(scan)
@@ -241,9 +231,6 @@ def _emulated(scan: Path, speed: float, *, poses: bool) -> Iterator[dict[str, st
 
 def repair_action(*, scan: Path, output: Path | None, force: bool) -> None:
     """Repair a scan that was cut off or damaged: keep what is intact, report what is lost."""
-    from tactile_bayes.files.scan_mcap import read_scan_report, read_truth, write_scan
-    from tactile_bayes.files.scan_recording import refuse_recording
-
     if output is not None:
         refuse_existing(output, force=force)
     if output is None:

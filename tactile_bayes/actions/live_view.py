@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import multiprocessing
 import os
 import shutil
 import signal
@@ -17,7 +18,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -32,22 +33,18 @@ from tactile_bayes.files.instrument_json import (
 )
 from tactile_bayes.files.size_json import read_size_calibration, size_calibration_path
 from tactile_bayes.findings import finding_summary
-from tactile_bayes.geometry import apply, inverse
-from tactile_bayes.hardware.live import Feed, FeedReader, LiveMap
+from tactile_bayes.geometry import FloatArray, apply, inverse
+from tactile_bayes.hardware.live import Feed, FeedReader, LiveMap, LiveState
 from tactile_bayes.hardware.serve import LiveServer, address_of
+from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.bump import candidate_centres
+from tactile_bayes.posterior.draws import MapPosterior
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.options import EstimateOptions, FitOptions
 from tactile_bayes.presets import FIELD_COSINES, FIT_RADIUS_MM, INTERVAL
 from tactile_bayes.report.map_text import colours_wanted, live_line, live_text
-
-if TYPE_CHECKING:
-    from tactile_bayes.geometry import FloatArray
-    from tactile_bayes.hardware.live import LiveMap, LiveState
-    from tactile_bayes.mapping.map import TactileMap
-    from tactile_bayes.posterior.draws import MapPosterior
-    from tactile_bayes.scan import ElementCalibration, HeadGeometry
-    from tactile_bayes.size.pooling import Calibration
+from tactile_bayes.scan import ElementCalibration, HeadGeometry
+from tactile_bayes.size.pooling import Calibration
 
 DRAWINGS_PER_S = 10.0
 TAKEN_EVERY_S = 1 / DRAWINGS_PER_S / 2
@@ -117,8 +114,6 @@ class Estimator:
 
     def warm_up(self) -> None:
         """Start the process and its imports before there is a map."""
-        import multiprocessing
-
         self._pool = ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn"), initializer=_prepare)
         self._running, self._begun = self._pool.submit(LiveAnswer), time.monotonic()
 
@@ -141,8 +136,6 @@ class Estimator:
     def close(self) -> None:
         """End the process, also during an estimate."""
         if self._pool is not None:
-            import multiprocessing
-
             self._pool.shutdown(wait=False, cancel_futures=True)
             for child in multiprocessing.active_children():
                 child.terminate()

@@ -11,7 +11,7 @@ from contextlib import ExitStack, suppress
 from datetime import date
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 import numpy as np
@@ -24,24 +24,20 @@ from tactile_bayes.files.atomic import refuse_existing, unwritable
 from tactile_bayes.files.documents import check_session, read_session
 from tactile_bayes.files.instrument_json import read_array_calibration, read_head_geometry, read_landmarks
 from tactile_bayes.files.provenance import Provenance, hash_inputs
+from tactile_bayes.files.scan_mcap import read_scan
+from tactile_bayes.files.scan_recording import RecordingWriter, create_exclusive, full_disk
 from tactile_bayes.files.size_json import size_calibration_path
+from tactile_bayes.geometry import FloatArray
 from tactile_bayes.hardware import head
 from tactile_bayes.hardware.head import HeadParser
 from tactile_bayes.hardware.ports import Port, read_in_process
-from tactile_bayes.hardware.recorder import LandmarkTouch, Line, Recorder
+from tactile_bayes.hardware.readings import HelloReading
+from tactile_bayes.hardware.recorder import LandmarkTouch, Line, Observer, Recorder, Report
 from tactile_bayes.hardware.serial_trackers import TRACKERS, check_head, open_tracker
 from tactile_bayes.options import RecordOptions
 from tactile_bayes.presets import PRESSURE_RANGE_KPA
 from tactile_bayes.report.map_text import record_text
-from tactile_bayes.scan import ElementCalibration
-
-if TYPE_CHECKING:
-    from tactile_bayes.files.provenance import Provenance
-    from tactile_bayes.geometry import FloatArray
-    from tactile_bayes.hardware.readings import HelloReading
-    from tactile_bayes.hardware.recorder import Line, Observer, Recorder, Report
-    from tactile_bayes.scan import ElementCalibration, HeadGeometry, Landmarks
-
+from tactile_bayes.scan import ElementCalibration, HeadGeometry, Landmarks
 
 # --- Options of one recording, and the part of them that the file stores.
 
@@ -82,8 +78,6 @@ _NOMINAL_FULL_SCALE = 4095
 
 def instrument_of(request: Request) -> tuple[HeadGeometry, ElementCalibration, Landmarks | None]:
     """Read geometry, calibration and landmarks from the files given; one missing or given twice is an error."""
-    from tactile_bayes.files.scan_mcap import read_scan
-
     like = read_scan(request.like) if request.like else None
     if request.head_geometry:
         head = read_head_geometry(request.head_geometry)
@@ -131,8 +125,6 @@ def calibration_age(request: Request, *, today: date) -> dict[str, str]:
 
 
 def _landmarks(request: Request) -> Landmarks | None:
-    from tactile_bayes.files.scan_mcap import read_scan
-
     if request.landmarks is None:
         return None
     if request.landmarks.suffix.lower() != ".mcap":
@@ -269,8 +261,6 @@ def _check_rom(request: Request) -> None:
 
 def make_recording(request: Request) -> tuple[Report, bool]:
     """Check the devices, record and close the file; returns the account, and whether it was interrupted."""
-    from tactile_bayes.files.scan_recording import RecordingWriter, create_exclusive, full_disk
-
     _check_rom(request)
     refuse_existing(request.output, force=request.force)
     head, calibration, landmarks = instrument_of(request)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cache, partial
 from pathlib import Path
@@ -13,8 +13,8 @@ import click
 import numpy as np
 
 from tactile_bayes.actions.exam import describe_scan
-from tactile_bayes.batch import BatchInterrupted, fault_lines, open_executor, run_batch
-from tactile_bayes.batch_store import open_store
+from tactile_bayes.batch import BatchInterrupted, Outcome, fault_lines, open_executor, run_batch
+from tactile_bayes.batch_store import BatchStore, open_store
 from tactile_bayes.commands.progress import progress_bar
 from tactile_bayes.declarations import as_dict, names_of
 from tactile_bayes.errors import TactileBayesError
@@ -22,25 +22,27 @@ from tactile_bayes.files.atomic import refuse_existing, write_text
 from tactile_bayes.files.documents import dump_json, read_toml_record, with_session
 from tactile_bayes.files.instrument_json import read_simulated_head
 from tactile_bayes.files.provenance import Provenance, hash_inputs
+from tactile_bayes.files.scan_mcap import write_scan
 from tactile_bayes.files.scene_toml import read_scene
 from tactile_bayes.files.size_json import DEFAULT, read_size_calibration, size_calibration_path
 from tactile_bayes.forward.line import outside_range
-from tactile_bayes.forward.scene import Head
+from tactile_bayes.forward.scene import Head, Lump
 from tactile_bayes.forward.simulate import simulate
+from tactile_bayes.forward.tissue import Rib, SolidLump
 from tactile_bayes.presets import DEFAULT_NORMALISE, RESEARCH_USE, Method
 from tactile_bayes.size.bodies import BodyCalibration
-from tactile_bayes.studies.population import BodiesFile, BodyPrior, MassRow, as_settings, draw_mass, measure_mass
+from tactile_bayes.studies.population import (
+    BodiesFile,
+    BodyPrior,
+    ExamPrior,
+    MassRow,
+    as_settings,
+    draw_mass,
+    measure_mass,
+)
 from tactile_bayes.studies.population import centred as on_the_boundary
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from tactile_bayes.batch import Outcome
-    from tactile_bayes.batch_store import BatchStore
-    from tactile_bayes.forward.scene import Head, Lump
-    from tactile_bayes.forward.tissue import Rib, SolidLump
-    from tactile_bayes.size.bodies import BodyCalibration
-    from tactile_bayes.studies.population import BodyPrior, ExamPrior, MassRow
     from tactile_bayes.studies.sbc import MapRanks
 
 
@@ -74,8 +76,6 @@ def _run(
     head: str | None,
     force: bool,
 ) -> list[str]:
-    from tactile_bayes.files.scan_mcap import write_scan
-
     scene = read_scene(scene_path)
     for lump in scene.solid_lumps if fidelity == "empirical" else ():
         if warning := outside_range(lump.d_mm, lump.depth_ratio):

@@ -3,30 +3,34 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import Executor
 from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 import numpy as np
 
-from tactile_bayes.batch import BatchInterrupted, open_executor, run_batch
-from tactile_bayes.batch_store import open_store
+from tactile_bayes.batch import BatchInterrupted, Outcome, open_executor, run_batch
+from tactile_bayes.batch_store import BatchStore, open_store
 from tactile_bayes.commands.progress import progress_bar
 from tactile_bayes.declarations import as_dict
 from tactile_bayes.errors import BadDataError, TactileBayesError, UsageError
 from tactile_bayes.files.atomic import refuse_existing, write_text
 from tactile_bayes.files.documents import dump_json
 from tactile_bayes.files.provenance import hash_inputs
+from tactile_bayes.files.scan_mcap import read_scan
 from tactile_bayes.files.scene_toml import read_scene
 from tactile_bayes.files.tables import read_table
 from tactile_bayes.findings import finding_lines
 from tactile_bayes.forward.contact import Head
 from tactile_bayes.forward.gaussian import cell_mean_gaussian
-from tactile_bayes.forward.line import fit_shape, outside_range
+from tactile_bayes.forward.line import TactileLine, fit_shape, outside_range
 from tactile_bayes.forward.scene import Head as Array
 from tactile_bayes.forward.tissue import parse_seat
+from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.select import scan_findings
 from tactile_bayes.posterior.white import LEAST_WIDTH_IN_CELLS, WIDEST_IN_RADII
 from tactile_bayes.presets import HEADS, RESEARCH_USE, SHOULDERS_INSIDE, SHOULDERS_OUTSIDE
@@ -46,6 +50,8 @@ from tactile_bayes.report.solid_figures import solid_figures
 from tactile_bayes.report.study import frames_text, lookalikes_text, study_figures, study_text
 from tactile_bayes.studies.model_comparison import compare_model, measured_frames
 from tactile_bayes.studies.paper import (
+    Fit,
+    Geometry,
     HomogeneousTissue,
     LineFit,
     StudyRow,
@@ -63,23 +69,13 @@ from tactile_bayes.studies.paper_tables import (
     NEAREST_HEADS,
     PHANTOMS,
     TRIED_HEADS,
+    Agreement,
     MeasuredFrame,
     compare_frames,
     compare_heads,
     phantom_scenes,
     table_scenes,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
-    from concurrent.futures import Executor
-
-    from tactile_bayes.batch import Outcome
-    from tactile_bayes.batch_store import BatchStore
-    from tactile_bayes.forward.line import TactileLine
-    from tactile_bayes.geometry import FloatArray
-    from tactile_bayes.studies.paper import Fit, Geometry
-
 
 # --- The paper's forward study and its tables, run, kept and drawn.
 
@@ -359,13 +355,7 @@ def _cell(value: Any) -> str:
 
 # --- `tables`: recompute Tables 1 and 2 of the paper.
 
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from tactile_bayes.forward.contact import Head
-    from tactile_bayes.studies.paper_tables import Agreement
-
-    ByHead = Mapping[Head, Sequence[Agreement]]
+ByHead = Mapping[Head, Sequence[Agreement]]
 
 
 def tables_action(
@@ -487,8 +477,6 @@ def compare_model_action(
     force: bool,
 ) -> None:
     """Compare a scan's frames and map with a forward model of SCENE (section 2.3 of the paper)."""
-    from tactile_bayes.files.scan_mcap import read_scan
-
     if figure is not None:
         refuse_existing(figure, force=force)
     body = read_scene(scene)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
@@ -290,14 +290,6 @@ def study_command(**given: Any) -> None:
 
 
 # --- `tables`: recompute Tables 1 and 2 of the paper.
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from tactile_bayes.forward.contact import Head
-    from tactile_bayes.studies.paper_tables import Agreement
-
-    ByHead = Mapping[Head, Sequence[Agreement]]
 
 
 @click.command("tables")

@@ -10,15 +10,14 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from functools import cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypeVar
+from typing import Annotated, Any, Final, Literal, TypeVar
+
+import fastjsonschema
 
 from tactile_bayes.declarations import Meta, Record, as_dict, field, from_plain, names_of, replace, schema_name
 from tactile_bayes.errors import BadDataError, meant
 from tactile_bayes.files.reading import JSON_BYTES, TOML_BYTES, decoding, kind_of, read_text, schema_kind
-
-if TYPE_CHECKING:
-    from tactile_bayes.scan import Scan
-
+from tactile_bayes.scan import Scan
 
 # --- The schemas in data_schema/, from a wheel or a checkout, applied with one-line errors.
 
@@ -37,8 +36,6 @@ def load_schema(name: str) -> dict[str, Any]:
 
 def check_document(document: object, schema_name: str, *, path: Path) -> None:
     """Check a JSON document against its schema."""
-    import fastjsonschema
-
     _check_kind(document, schema_name, path=path)
     try:
         _validator(schema_name)(document)
@@ -143,8 +140,6 @@ def _check_kind(document: object, schema_name: str, *, path: Path) -> None:
 
 @cache
 def _validator(schema_name: str) -> Any:
-    import fastjsonschema
-
     # our ids are names, not addresses: with one in place the compiler would try to fetch what "$ref" points to
     document = {key: value for key, value in load_schema(schema_name).items() if key != "$id"}
     return fastjsonschema.compile(document)

@@ -5,18 +5,21 @@ from __future__ import annotations
 import csv
 import io
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from tactile_bayes.declarations import as_dict
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.files.documents import load_json, parse_json
+from tactile_bayes.files.documents import load_json, load_schema, parse_json
+from tactile_bayes.files.map_nc import read_map, read_map_header
+from tactile_bayes.files.netcdf import Group, open_netcdf
 from tactile_bayes.files.reading import HDF5_MAGIC, MCAP_MAGIC, open_input
+from tactile_bayes.files.scan_mcap import summarise_scan
+from tactile_bayes.files.size_json import read_repeatability, read_size_calibration
+from tactile_bayes.files.tables import read_table, separator_in
 from tactile_bayes.findings import finding_lines, findings_in
-
-if TYPE_CHECKING:
-    from tactile_bayes.files.netcdf import Group
-    from tactile_bayes.mapping.map import TactileMap
-    from tactile_bayes.size.pooling import Calibration
+from tactile_bayes.mapping.map import TactileMap
+from tactile_bayes.size.bodies import BodyCalibration
+from tactile_bayes.size.pooling import Calibration
 
 _TABLES = (
     "trial.table.json",
@@ -41,14 +44,10 @@ def describe(path: Path) -> dict[str, Any]:
 
 
 def _scan(path: Path) -> dict[str, Any]:
-    from tactile_bayes.files.scan_mcap import summarise_scan
-
     return summarise_scan(path)
 
 
 def _netcdf(path: Path) -> dict[str, Any]:
-    from tactile_bayes.files.netcdf import open_netcdf
-
     with open_netcdf(path, way_out="it may be cut short; make it again") as file:
         group = file.group("posterior")
         if group is not None and "schema" in group.attributes():
@@ -85,8 +84,6 @@ def _value_unit(tactile_map: TactileMap) -> str:
 
 
 def _map(path: Path) -> dict[str, Any]:
-    from tactile_bayes.files.map_nc import read_map, read_map_header
-
     header = read_map_header(path)
     tactile_map = read_map(path)
     ny, nx = tactile_map.mean.shape
@@ -128,9 +125,6 @@ def _json(path: Path) -> dict[str, Any]:
 
 
 def _site_calibration(path: Path, document: dict[str, Any]) -> dict[str, Any]:
-    from tactile_bayes.files.size_json import read_size_calibration
-    from tactile_bayes.size.bodies import BodyCalibration
-
     calibration = read_size_calibration(path)
     assert isinstance(calibration, BodyCalibration)
     assert calibration.site is not None
@@ -151,8 +145,6 @@ def _site_calibration(path: Path, document: dict[str, Any]) -> dict[str, Any]:
 
 
 def _repeatability(path: Path, document: dict[str, Any]) -> dict[str, Any]:
-    from tactile_bayes.files.size_json import read_repeatability
-
     found = read_repeatability(path)
     provenance = dict(document["provenance"])
     if isinstance(inputs := provenance.get("inputs"), list):  # those of a long list that are no exam's draws
@@ -173,15 +165,11 @@ def _repeatability(path: Path, document: dict[str, Any]) -> dict[str, Any]:
 
 
 def _size_calibration(path: Path, document: dict[str, Any]) -> dict[str, Any]:
-    from tactile_bayes.files.size_json import read_size_calibration
-
     return _described(read_size_calibration(path), document)
 
 
 def _described(calibration: Calibration, document: dict[str, Any]) -> dict[str, Any]:
     """Facts of a calibration's document, without its long arrays."""
-    from tactile_bayes.size.bodies import BodyCalibration
-
     if isinstance(calibration, BodyCalibration):
         kept = ("form", "source", "bodies", "recipe", "centre", "constants", "domain", "fit", "provenance")
         return {
@@ -215,9 +203,6 @@ def _described(calibration: Calibration, document: dict[str, Any]) -> dict[str, 
 
 def _table(path: Path, head: bytes) -> dict[str, Any]:
     """Describe a CSV table whose header fits one of the schemas."""
-    from tactile_bayes.files.documents import load_schema
-    from tactile_bayes.files.tables import read_table, separator_in
-
     try:
         text = head.decode("utf-8-sig")
         header = next(csv.reader(io.StringIO(text), delimiter=separator_in(text)), [])

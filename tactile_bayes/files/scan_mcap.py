@@ -11,6 +11,7 @@ import numpy as np
 from foxglove_schemas_protobuf.Grid_pb2 import Grid
 from foxglove_schemas_protobuf.PackedElementField_pb2 import PackedElementField
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
+from google.protobuf.message import DecodeError
 from mcap.writer import CompressionType, Writer
 from mcap_protobuf.schema import build_file_descriptor_set
 from numpy.typing import NDArray
@@ -419,8 +420,6 @@ def _landmarks(records: McapRecords) -> Landmarks | None:
 
 
 def _decode(kind: Any, body: bytes) -> Any:
-    from google.protobuf.message import DecodeError
-
     try:
         return kind.FromString(body)
     except DecodeError:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from itertools import pairwise
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 from scipy.interpolate import CubicSpline
-from scipy.sparse import coo_array
+from scipy.sparse import coo_array, csc_array
 from scipy.sparse.linalg import splu
 from scipy.special import j0
 
@@ -26,10 +26,6 @@ from tactile_bayes.forward.mesh import (
 )
 from tactile_bayes.forward.tissue import FAT_KPA, GLAND_RATIO, POISSON
 from tactile_bayes.geometry import FloatArray
-
-if TYPE_CHECKING:
-    from scipy.sparse import csc_array
-
 
 # --- Sinking of a layered body's skin under normal loads: its exact Green's function, and means over taxels.
 #

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from scipy.interpolate import CubicSpline
-from scipy.sparse import coo_matrix
+from scipy.sparse import coo_matrix, csc_matrix
 from scipy.sparse.linalg import splu
 
 from tactile_bayes.declarations import Record
@@ -15,10 +13,6 @@ from tactile_bayes.forward.mesh import IndexArray as IntArray
 from tactile_bayes.forward.mesh import QuadMesh, body_mesh, disc_mesh
 from tactile_bayes.forward.tissue import Body, Layers
 from tactile_bayes.geometry import FloatArray
-
-if TYPE_CHECKING:
-    from scipy.sparse import csc_matrix
-
 
 # --- Nearly incompressible plane strain: stiffness of nine-node quadrilaterals without volumetric locking.
 #

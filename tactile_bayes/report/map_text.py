@@ -4,25 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from functools import cache
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tactile_bayes.findings import finding_lines
-from tactile_bayes.hardware.live import colour_limits, grey_levels
+from tactile_bayes.geometry import FloatArray
+from tactile_bayes.hardware.live import LiveState, colour_limits, grey_levels
+from tactile_bayes.hardware.recorder import Report
 from tactile_bayes.mapping.errors import LEAST_SHARE
 from tactile_bayes.mapping.map import FEW_READINGS, TactileMap, advise_cell, skewed
 from tactile_bayes.mapping.places import Orientation, orientation_of
 from tactile_bayes.mapping.profile import SPAN_MM
 from tactile_bayes.presets import CELL_PER_SIGMA, POSE_NOISE, RESEARCH_USE
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from tactile_bayes.geometry import FloatArray
-    from tactile_bayes.hardware.live import LiveState
-    from tactile_bayes.hardware.recorder import Report
-
 
 # --- A recording in words, while it runs and after.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,17 +21,12 @@ from tactile_bayes.forward.tissue import FAT_KPA, GLAND_RATIO, POISSON, Body
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.accumulate import FlatField
 from tactile_bayes.mapping.build import build_map
-from tactile_bayes.posterior.bump import Bump, window_cells
+from tactile_bayes.mapping.map import TactileMap
+from tactile_bayes.posterior.bump import Bump, FitCells, window_cells
 from tactile_bayes.posterior.white import LEAST_WIDTH_IN_CELLS, MOST_AXIS_RATIO, WIDEST_IN_RADII
 from tactile_bayes.presets import FIT_RADIUS_MM
-from tactile_bayes.scan import ElementCalibration, HeadGeometry, PressureFrames, Scan, TrackerPoses
+from tactile_bayes.scan import CountArray, ElementCalibration, HeadGeometry, PressureFrames, Scan, TrackerPoses
 from tactile_bayes.studies.paper import DETECTABLE, Geometry, StudyRow, seat_name
-
-if TYPE_CHECKING:
-    from tactile_bayes.mapping.map import TactileMap
-    from tactile_bayes.posterior.bump import FitCells
-    from tactile_bayes.scan import CountArray, Scan
-
 
 # --- Maps of a study's raster of frames, built and fitted like a patient's.
 
