@@ -46,8 +46,7 @@ from tactile_bayes.report.paper_head import (
     uniformity_document,
     uniformity_text,
 )
-from tactile_bayes.report.solid_figures import solid_figures
-from tactile_bayes.report.study import frames_text, lookalikes_text, study_figures, study_text
+from tactile_bayes.report.study import frames_text, lookalikes_text, solid_figures, study_figures, study_text
 from tactile_bayes.studies.model_comparison import compare_model, measured_frames
 from tactile_bayes.studies.paper import (
     Fit,

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tactile_bayes.forward.axisymmetric import LayeredBody
 from tactile_bayes.forward.line import LineFrames, build_line, fit_empirical, press, press_layers
-from tactile_bayes.forward.tissue import THICKNESS_MM, Layers
+from tactile_bayes.forward.solid import PlacedLump, SolidHead, face_of, solid_head
+from tactile_bayes.forward.tissue import THICKNESS_MM, Body, Layers
 from tactile_bayes.geometry import FloatArray
+from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.presets import HEAD_PITCH_MM, RESEARCH_USE
 from tactile_bayes.report.figure_file import figure_file
 from tactile_bayes.size.eq6 import AxisCalibration, SizeCalibration
@@ -29,15 +33,10 @@ from tactile_bayes.studies.paper import (
     seat_name,
     stiffness_changes,
     width_changes,
+    widths,
 )
-from tactile_bayes.studies.paper_tables import (
-    PHANTOMS,
-    Curves,
-    FrameAgreement,
-    Scene,
-    mean_squared_difference,
-    scene_curves,
-)
+from tactile_bayes.studies.paper_solid import RasterFitter, RasterFrames, SolidSettings, raster_frames
+from tactile_bayes.studies.paper_tables import PHANTOMS, FrameAgreement, Scene, mean_squared_difference, scene_curves
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -72,22 +71,31 @@ def study_text(rows: Sequence[StudyRow]) -> str:
     return "\n".join(lines)
 
 
-# --- Figures 5 to 8 of the paper, drawn from this program's own forward models.
+# --- Figures 5 to 8 of the paper, drawn from this program's own forward models, in two dimensions and in three.
 #
-# On one machine and its libraries equal input gives equal bytes.
+# On one machine and its libraries equal input gives equal bytes. The empirical model (Eqs 1 to 4) is one of cylinders
+# and is not drawn for balls, which show the whole head along both of its axes.
 
 # Tell apart in greyscale and by colour-blind eyes.
 COLOURS = ("#1f3b73", "#c8641e", "#2a8c6e", "#8a4fa3", "#7a7a7a", "#b8a100")
 MARKS = ("o", "s", "^", "D", "v", "P")
-FAT_MM = (5.0, 10.0, 15.0, 20.0, 30.0, 50.0)
+_FAT_MM = (5.0, 10.0, 15.0, 20.0, 30.0, 50.0)
 _FITTED_FAT_MM = 15.0
 _OTHER = (15.0, 1.0)
+_BALLS = ((10.0, 0.8), (15.0, 1.0), (20.0, 1.2))
 PHANTOM = "phantom 12.5 mm"
 _FRAME_PLACES_MM = (0.0, 6.0, 12.0, 20.0)
 _FOUR_SIZE_IN = (10.0, 7.6)
-_SMALL = (5.0, 1.0)
-RATIOS = (2.0, 5.0, 8.0, 10.0, 100.0)
-SIZE_IN = (10.0, 4.3)
+_SMALL, _SMALL_BALL = (5.0, 1.0), (10.0, 1.0)
+_RATIOS = (2.0, 5.0, 8.0, 10.0, 100.0)
+_SIZE_IN = (10.0, 4.3)
+_AXES = {"x": "across the head", "y": "along it"}
+_ON_HEAD, _ON_SKIN, _SHARE = "position on the head (mm)", "place on the skin (mm)", "pressure / mean of its frame"
+
+Build = Callable[[RasterFrames], TactileMap]
+"""Builds the map of a raster."""
+Curve = tuple[FloatArray, FloatArray, str]
+"""Places, values and the name of a line."""
 
 
 def study_figures(
@@ -109,12 +117,36 @@ def study_figures(
     """
     of_seat = [row for row in rows if row.seat == seat_name(seat)]
     found = find_lookalikes(settings, seat=seat)
-    figure_5(settings, paths[0], seat=seat, found=found, force=force)
-    figure_6(settings, paths[1], seat=seat, phantom=phantom, measured=measured, force=force)
-    figure_7(of_seat, settings, paths[2], seat=seat, fit=fit, force=force)
+    _frames_of_lumps(settings, paths[0], seat=seat, found=found, force=force)
+    _frames_and_maps(settings, paths[1], seat=seat, phantom=phantom, measured=measured, force=force)
+    d, h = _SMALL
+    curves = _lines_by_stiffness(settings, settings.body(d, h, seat=seat), fit)
+    title, caption = f"(a) maps, d {d:g} mm, h/d {h:g}", _caption("Figure 7", settings, seat)
+    _figure_7(of_seat, paths[2], curves=curves, title=title, caption=caption, force=force)
     figure_8(of_seat, paths[3], force=force)
-    four_lumps(settings, paths[4], seat=seat, force=force)
+    _four_lumps(settings, paths[4], seat=seat, force=force)
     return found
+
+
+def solid_figures(
+    rows: Sequence[StudyRow],
+    settings: SolidSettings,
+    paths: Sequence[Path],
+    *,
+    seat: float,
+    fit: RasterFitter,
+    build: Build,
+    force: bool = False,
+) -> None:
+    """Draw the four figures for balls as PNG files; rows and seat are as in `study_figures`."""
+    of_seat = [row for row in rows if row.seat == seat_name(seat)]
+    _frames_of_balls(settings, paths[0], seat=seat, force=force)
+    _map_of_ball(settings, paths[1], seat=seat, build=build, force=force)
+    d, h = _SMALL_BALL
+    curves = _sections_by_stiffness(settings, settings.body(d, h, seat=seat), fit, build)
+    title, caption = f"(a) across the head, d {d:g} mm, h/d {h:g}", _caption("Figure 7", settings, seat)
+    _figure_7(of_seat, paths[2], curves=curves, title=title, caption=caption, force=force)
+    figure_8(of_seat, paths[3], force=force)
 
 
 def lookalikes_text(found: Lookalikes | None) -> str:
@@ -128,46 +160,6 @@ def lookalikes_text(found: Lookalikes | None) -> str:
     return f"figure 5b: no pair within {100 * ALIKE:g} %; the most alike frames, {pair}, differ by {share}"
 
 
-def figure_5(
-    settings: StudySettings, path: Path, *, seat: float, found: Lookalikes | None, force: bool = False
-) -> None:
-    """Frames far from the lump on fat of six thicknesses with Eq 1, and frames over lumps, two of which look alike."""
-    with figure_file(path, size_in=SIZE_IN, force=force) as figure:
-        left, right = figure.subplots(1, 2)
-        for colour, fat in zip(COLOURS, FAT_MM, strict=True):
-            _draw_far(left, settings, fat, colour)
-        cases = [] if found is None else [(one.d_mm, one.depth_ratio) for one in (found.small, found.large)]
-        for colour, line, (d, h) in zip(COLOURS[1:], ("-", "--", "-"), [*cases, _OTHER], strict=False):
-            elastic = _centred(settings, d, h, seat)
-            right.plot(elastic.s_mm, elastic.at(0.0), line, color=colour, label=f"d {d:g} mm, h/d {h:.3g}")
-        title = (
-            "no two visible lumps" if found is None else f"two differ by {100 * found.difference:.1f} % of their rise"
-        )
-        finish(
-            left, "(a) far from the lump, fat over gland, 70 mm in all", "position on the head (mm)", "pressure (kPa)"
-        )
-        finish(right, f"(b) over the lump: {title}", "position on the head (mm)", "pressure (kPa)", headroom=0.15)
-        figure.text(0.01, 0.01, _caption("Figure 5", settings, seat), fontsize=7.5, color="0.3")
-
-
-def _draw_far(axes: Axes, settings: StudySettings, fat_mm: float, colour: str) -> None:
-    """P1 on one thickness of fat; on one of them, Eq 1 fitted to what the taxels see."""
-    layers = Layers(fat_mm, THICKNESS_MM, settings.fat_kpa, settings.gland_ratio, settings.poisson)
-    frame = press_layers(layers, head=settings.head, mean_kpa=settings.mean_kpa, cell_mm=settings.cell_mm)
-    axes.plot(frame.s_mm, frame.pressure_kpa[0], color=colour, label=f"fat {fat_mm:g} mm")
-    if fat_mm == _FITTED_FAT_MM:
-        seen, half = frame.as_taxels(HEAD_PITCH_MM), settings.head.half_width_mm
-        model = fit_empirical(seen.s_mm, seen.at(0.0), seen.at(0.0), d_mm=1.0, half_width_mm=half)
-        text = f"Eq 1 fitted to taxels, fat {fat_mm:g} mm"
-        axes.plot(frame.s_mm, model.homogeneous(frame.s_mm), "k:", label=text)
-
-
-def _centred(settings: StudySettings, d_mm: float, depth_ratio: float, seat: float) -> LineFrames:
-    """The frame over a hard lump, cell by cell."""
-    surface = settings.surface(settings.body(d_mm, depth_ratio, seat=seat))
-    return press(surface, HARD_RATIO, np.zeros(1), head=settings.head, mean_kpa=settings.mean_kpa)
-
-
 def frames_text(measured: Sequence[FrameAgreement]) -> list[str]:
     """How far measured frames are from both models, a line for each."""
     return [
@@ -177,130 +169,23 @@ def frames_text(measured: Sequence[FrameAgreement]) -> list[str]:
     ]
 
 
-def figure_6(
-    settings: StudySettings,
-    path: Path,
-    *,
-    seat: float,
-    phantom: tuple[float, float] = PHANTOMS[PHANTOM],
-    measured: Sequence[FrameAgreement] = (),
-    force: bool = False,
-) -> None:
-    """Frames and map of a phantom, elastic and empirical; measured frames, thick, where there are any."""
-    d, h = phantom
-    curves = scene_curves(Scene(PHANTOM, d, h, seat), settings)
-    with figure_file(path, size_in=SIZE_IN, force=force) as figure:
+@contextmanager
+def _panels(path: Path, caption: str, *, force: bool) -> Iterator[tuple[Axes, Axes]]:
+    """Two panels side by side over a caption, written when the block ends."""
+    with figure_file(path, size_in=_SIZE_IN, force=force) as figure:
         left, right = figure.subplots(1, 2)
-        for colour, one in zip(COLOURS, measured, strict=False):
-            s = one.measured.s_mm
-            text = f"measured, head at {one.measured.x_c_mm:g} mm"
-            left.plot(s, one.measured.pressure_kpa, color=colour, lw=3.5, alpha=0.4, label=text)
-            left.plot(s, one.elastic_kpa, color=colour)
-            left.plot(s, one.empirical_kpa, ":", color=colour)
-        for colour, place in zip(COLOURS, () if measured else _FRAME_PLACES_MM, strict=False):
-            left.plot(curves.elastic.s_mm, curves.elastic.at(place), color=colour, label=f"head at {place:g} mm")
-            left.plot(curves.empirical.s_mm, curves.empirical.at(place), ":", color=colour)
-        _draw_maps(right, curves)
-        finish(left, f"(a) frames, d {d:g} mm, h/d {h:g}; dotted: Eq 3", "position on the head (mm)", "pressure (kPa)")
-        finish(right, "(b) maps", "place on the skin (mm)", "pressure / mean of its frame", headroom=0.25)
-        figure.text(0.01, 0.01, _caption("Figure 6", settings, seat), fontsize=7.5, color="0.3")
+        yield left, right
+        figure.text(0.01, 0.01, caption, fontsize=7.5, color="0.3")
 
 
-def four_lumps(settings: StudySettings, path: Path, *, seat: float, force: bool = False) -> None:
-    """Frame by frame for the phantoms of section 2.3, elastic and empirical: its curves "for four lumps"."""
-    with figure_file(path, size_in=_FOUR_SIZE_IN, force=force) as figure:
-        for axes, (d, h) in zip(figure.subplots(2, 2).ravel(), PHANTOMS.values(), strict=True):
-            curves = scene_curves(Scene("", d, h, seat), settings)
-            ours, theirs = curves.empirical.as_taxels(HEAD_PITCH_MM), curves.elastic.as_taxels(HEAD_PITCH_MM)
-            share = 100 * mean_squared_difference(ours.pressure_kpa, theirs.pressure_kpa)
-            for colour, place in zip(COLOURS, _FRAME_PLACES_MM, strict=False):
-                axes.plot(theirs.s_mm, theirs.at(place), color=colour, label=f"head at {place:g} mm")
-                axes.plot(ours.s_mm, ours.at(place), ":", color=colour)
-            title = f"d {d:g} mm, h/d {h:g}; MSD of all frames {share:.1f} %"
-            finish(axes, title, "position on the head (mm)", "pressure (kPa)", headroom=0.15)
-        text = _caption("Dotted: Eq 3", settings, seat)
-        figure.text(0.01, 0.01, text, fontsize=7.5, color="0.3")
-
-
-def figure_7(
-    rows: Sequence[StudyRow], settings: StudySettings, path: Path, *, seat: float, fit: Fit, force: bool = False
-) -> None:
-    """Maps of a small lump of several stiffnesses, and how little the width depends on stiffness."""
-    d, h = _SMALL
-    surface = settings.surface(settings.body(d, h, seat=seat))
-    with figure_file(path, size_in=SIZE_IN, force=force) as figure:
-        left, right = figure.subplots(1, 2)
-        for colour, ratio in zip(COLOURS, RATIOS, strict=False):
-            line = build_line(settings.frames(surface, ratio))
-            found = fit(line, settings.fit_radius_mm)
-            near = np.abs(line.x_mm) <= 20.0
-            text = f"E2/E1 {ratio:g}: a {found.amplitude:.3f}, sigma {found.sigma_mm:.2f} mm"
-            left.plot(line.x_mm[near], line.mean[near], color=colour, label=text)
-        level = [row for row in rows if abs(row.depth_ratio - 1.0) < 1e-9 and row.detectable]
-        hardest = {row.d_mm: row.sigma_x_mm for row in level if row.stiffness_ratio == HARD_RATIO}
-        for i, diameter in enumerate(hardest):
-            points = sorted((r.stiffness_ratio, r.sigma_x_mm / hardest[diameter]) for r in level if r.d_mm == diameter)
-            right.plot(
-                *zip(*points, strict=True), marker=MARKS[i % 6], color=COLOURS[i % 6], label=f"d {diameter:g} mm"
-            )
-        right.axhspan(0.95, 1.05, color="0.9", zorder=0)
-        right.set_xscale("log")
-        finish(
-            left,
-            f"(a) maps, d {d:g} mm, h/d {h:g}",
-            "place on the skin (mm)",
-            "pressure / mean of its frame",
-            headroom=0.4,
-        )
-        finish(right, "(b) width, h/d 1; grey: 5 %", "stiffness ratio E2/E1", f"sigma / sigma at {HARD_RATIO:g}")
-        figure.text(0.01, 0.01, _caption("Figure 7", settings, seat), fontsize=7.5, color="0.3")
-
-
-def figure_8(rows: Sequence[StudyRow], path: Path, *, force: bool = False) -> None:
-    """Width change against amplitude with its power law, and width against diameter with its line."""
-    hard = hard_cases(rows)
-    learned = learn_as_printed(rows)
-    with figure_file(path, size_in=SIZE_IN, force=force) as figure:
-        left, right = figure.subplots(1, 2)
-        change = width_changes(hard)
-        for i, d in enumerate(dict.fromkeys(row.d_mm for row in hard)):
-            mine = [k for k, row in enumerate(hard) if row.d_mm == d]
-            amplitude = [hard[k].amplitude for k in mine]
-            left.plot(amplitude, change[mine], MARKS[i % 6], color=COLOURS[i % 6], label=f"d {d:g} mm")
-        level = [row for row in hard if abs(row.depth_ratio - 1.0) < 1e-9]
-        right.plot([row.sigma_x_mm for row in level], [row.d_mm for row in level], "o", color=COLOURS[0])
-        if learned is not None:
-            a = np.geomspace(min(row.amplitude for row in hard), max(row.amplitude for row in hard), 100)
-            power = f"{learned.e:.2f} a^{learned.f:.2f}"
-            left.plot(a, learned.e * a**learned.f, "k-", label=power)
-            sigma = np.linspace(0.0, max(row.sigma_x_mm for row in level) * 1.1, 2)
-            line = f"d = {learned.m:.2f} sigma {learned.b_mm:+.2f} mm"
-            right.plot(sigma, learned.m * sigma + learned.b_mm, "k-", label=line)
-        left.set_xscale("log")
-        right.set_ylim(bottom=0)
-        right.set_xlim(left=0)
-        finish(left, "(a) width change, referenced to h/d 1", "amplitude a", "sigma / sigma at h/d 1")
-        finish(right, "(b) at one diameter depth", "sigma (mm)", "diameter d (mm)")
-        seat = rows[0].seat if rows else "no cases"
-        text = f"Figure 8: {seat}, E2/E1 = {HARD_RATIO:g}, amplitude at least {DETECTABLE:g}.  {RESEARCH_USE}"
-        figure.text(0.01, 0.01, text, fontsize=7.5, color="0.3")
-
-
-def _draw_maps(axes: Axes, curves: Curves) -> None:
-    """Both maps within 40 mm, and their mean squared difference."""
-    near = np.abs(curves.elastic_map.x_mm) <= 40.0
-    elastic, empirical = curves.elastic_map.mean[near], curves.empirical_map.mean[near]
-    share = 100 * mean_squared_difference(empirical, elastic)
-    axes.plot(curves.elastic_map.x_mm[near], elastic, color=COLOURS[0], label="elastic model")
-    text = f"empirical model (MSD {share:.1f} %)"
-    axes.plot(curves.empirical_map.x_mm[near], empirical, ":", color=COLOURS[1], label=text)
-
-
-def _caption(name: str, settings: StudySettings, seat: float) -> str:
-    head = settings.head
+def _caption(name: str, settings: StudySettings | SolidSettings, seat: float) -> str:
+    if isinstance(settings, StudySettings):
+        kind, rim, more = "lumps", f"{settings.head.shoulder_mm:g} mm {settings.head.shoulders}", ""
+    else:
+        kind, rim, more = "balls", f"a {settings.head.rim_mm:g} mm rim", ", flat field" if settings.flat_field else ""
     return (
-        f"{name}: lumps {seat_name(seat)}, head R {head.radius_mm:g} mm with {head.shoulder_mm:g} mm {head.shoulders}, "
-        f"mean {settings.mean_kpa:g} kPa, nu {settings.poisson:g}, E2/E1 = {HARD_RATIO:g} unless said.  {RESEARCH_USE}"
+        f"{name}: {kind} {seat_name(seat)}, head R {settings.head.radius_mm:g} mm with {rim}, mean "
+        f"{settings.mean_kpa:g} kPa, nu {settings.poisson:g}, E2/E1 = {HARD_RATIO:g} unless said{more}.  {RESEARCH_USE}"
     )
 
 
@@ -317,12 +202,238 @@ def finish(axes: Axes, title: str, x_label: str, y_label: str, *, headroom: floa
         axes.legend(fontsize=7.5, frameon=False)
 
 
+def _frames_of_lumps(
+    settings: StudySettings, path: Path, *, seat: float, found: Lookalikes | None, force: bool
+) -> None:
+    """Fig 5: frames far from the lump on fat of six thicknesses with Eq 1, and over lumps, two of which look alike."""
+    with _panels(path, _caption("Figure 5", settings, seat), force=force) as (left, right):
+        for colour, fat in zip(COLOURS, _FAT_MM, strict=True):
+            _draw_far(left, settings, fat, colour)
+        cases = [] if found is None else [(one.d_mm, one.depth_ratio) for one in (found.small, found.large)]
+        for colour, line, (d, h) in zip(COLOURS[1:], ("-", "--", "-"), [*cases, _OTHER], strict=False):
+            surface = settings.surface(settings.body(d, h, seat=seat))
+            elastic = press(surface, HARD_RATIO, np.zeros(1), head=settings.head, mean_kpa=settings.mean_kpa)
+            right.plot(elastic.s_mm, elastic.at(0.0), line, color=colour, label=f"d {d:g} mm, h/d {h:.3g}")
+        title = (
+            "no two visible lumps" if found is None else f"two differ by {100 * found.difference:.1f} % of their rise"
+        )
+        finish(left, "(a) far from the lump, fat over gland, 70 mm in all", _ON_HEAD, "pressure (kPa)")
+        finish(right, f"(b) over the lump: {title}", _ON_HEAD, "pressure (kPa)", headroom=0.15)
+
+
+def _draw_far(axes: Axes, settings: StudySettings, fat_mm: float, colour: str) -> None:
+    """P1 on one thickness of fat; on one of them, Eq 1 fitted to what the taxels see."""
+    layers = Layers(fat_mm, THICKNESS_MM, settings.fat_kpa, settings.gland_ratio, settings.poisson)
+    frame = press_layers(layers, head=settings.head, mean_kpa=settings.mean_kpa, cell_mm=settings.cell_mm)
+    axes.plot(frame.s_mm, frame.pressure_kpa[0], color=colour, label=f"fat {fat_mm:g} mm")
+    if fat_mm == _FITTED_FAT_MM:
+        seen, half = frame.as_taxels(HEAD_PITCH_MM), settings.head.half_width_mm
+        model = fit_empirical(seen.s_mm, seen.at(0.0), seen.at(0.0), d_mm=1.0, half_width_mm=half)
+        text = f"Eq 1 fitted to taxels, fat {fat_mm:g} mm"
+        axes.plot(frame.s_mm, model.homogeneous(frame.s_mm), "k:", label=text)
+
+
+def _frames_of_balls(settings: SolidSettings, path: Path, *, seat: float, force: bool) -> None:
+    """Fig 5: frames through the middle of the head, far from the lump on fat of several thicknesses, and over balls."""
+    s = settings.head.surface_mm()[:, 0, 0]
+    with _panels(path, _caption("Figure 5", settings, seat), force=force) as (left, right):
+        for colour, fat in zip(COLOURS, _FAT_MM, strict=False):
+            moduli = (settings.fat_kpa, settings.fat_kpa * settings.gland_ratio)
+            plain = solid_head(face_of(settings.head), LayeredBody(moduli, (fat, THICKNESS_MM - fat), settings.poisson))
+            left.plot(s, _middle_frame(plain, [], settings), color=colour, label=f"fat {fat:g} mm")
+        for colour, (d, h) in zip(COLOURS, _BALLS, strict=False):
+            body = settings.body(d, h, seat=seat)
+            lump = settings.placed(settings.condensed(body), HARD_RATIO)
+            frame = _middle_frame(settings.on(body), [lump], settings)
+            right.plot(s, frame, color=colour, label=f"d {d:g} mm, h/d {h:g}")
+        where = "position across the head (mm)"
+        finish(left, "(a) far from the lump, middle of the head", where, "pressure (kPa)")
+        finish(right, "(b) over the ball, middle of the head", where, "pressure (kPa)", headroom=0.15)
+
+
+def _middle_frame(head: SolidHead, lumps: Sequence[PlacedLump], settings: SolidSettings) -> FloatArray:
+    """(rows,) the mean of the two middle columns of a level head over the lump."""
+    frame = head.frame(lumps, rotation=np.eye(3), x_mm=0.0, y_mm=0.0, mean_kpa=settings.mean_kpa).pressure_kpa
+    middle = frame.shape[1] // 2
+    return np.asarray(frame[:, middle - 1 : middle + 1].mean(axis=1))
+
+
+def _frames_and_maps(
+    settings: StudySettings,
+    path: Path,
+    *,
+    seat: float,
+    phantom: tuple[float, float],
+    measured: Sequence[FrameAgreement],
+    force: bool,
+) -> None:
+    """Fig 6: frames and map of a phantom, elastic and empirical; measured frames, thick, where there are any."""
+    d, h = phantom
+    curves = scene_curves(Scene(PHANTOM, d, h, seat), settings)
+    with _panels(path, _caption("Figure 6", settings, seat), force=force) as (left, right):
+        for colour, one in zip(COLOURS, measured, strict=False):
+            s = one.measured.s_mm
+            text = f"measured, head at {one.measured.x_c_mm:g} mm"
+            left.plot(s, one.measured.pressure_kpa, color=colour, lw=3.5, alpha=0.4, label=text)
+            left.plot(s, one.elastic_kpa, color=colour)
+            left.plot(s, one.empirical_kpa, ":", color=colour)
+        if not measured:
+            _draw_frames(left, curves.elastic, curves.empirical)
+        near = np.abs(curves.elastic_map.x_mm) <= 40.0
+        x, elastic, empirical = (
+            a[near] for a in (curves.elastic_map.x_mm, curves.elastic_map.mean, curves.empirical_map.mean)
+        )
+        share = 100 * mean_squared_difference(empirical, elastic)
+        right.plot(x, elastic, color=COLOURS[0], label="elastic model")
+        right.plot(x, empirical, ":", color=COLOURS[1], label=f"empirical model (MSD {share:.1f} %)")
+        finish(left, f"(a) frames, d {d:g} mm, h/d {h:g}; dotted: Eq 3", _ON_HEAD, "pressure (kPa)")
+        finish(right, "(b) maps", _ON_SKIN, _SHARE, headroom=0.25)
+
+
+def _draw_frames(axes: Axes, elastic: LineFrames, empirical: LineFrames) -> None:
+    """Frames of both models at a few places of the head, the empirical ones dotted."""
+    for colour, place in zip(COLOURS, _FRAME_PLACES_MM, strict=False):
+        axes.plot(elastic.s_mm, elastic.at(place), color=colour, label=f"head at {place:g} mm")
+        axes.plot(empirical.s_mm, empirical.at(place), ":", color=colour)
+
+
+def _four_lumps(settings: StudySettings, path: Path, *, seat: float, force: bool) -> None:
+    """Frame by frame for the phantoms of section 2.3, elastic and empirical: its curves "for four lumps"."""
+    with figure_file(path, size_in=_FOUR_SIZE_IN, force=force) as figure:
+        for axes, (d, h) in zip(figure.subplots(2, 2).ravel(), PHANTOMS.values(), strict=True):
+            curves = scene_curves(Scene("", d, h, seat), settings)
+            ours, theirs = curves.empirical.as_taxels(HEAD_PITCH_MM), curves.elastic.as_taxels(HEAD_PITCH_MM)
+            share = 100 * mean_squared_difference(ours.pressure_kpa, theirs.pressure_kpa)
+            _draw_frames(axes, theirs, ours)
+            title = f"d {d:g} mm, h/d {h:g}; MSD of all frames {share:.1f} %"
+            finish(axes, title, _ON_HEAD, "pressure (kPa)", headroom=0.15)
+        figure.text(0.01, 0.01, _caption("Dotted: Eq 3", settings, seat), fontsize=7.5, color="0.3")
+
+
+def _map_of_ball(settings: SolidSettings, path: Path, *, seat: float, build: Build, force: bool) -> None:
+    """Fig 6: the map of the first phantom, and its sections along both axes of the head."""
+    d, h = PHANTOMS[PHANTOM]
+    body = settings.body(d, h, seat=seat)
+    lump = settings.placed(settings.condensed(body), HARD_RATIO)
+    made = build(raster_frames(settings.on(body), lump, settings))
+    with _panels(path, _caption("Figure 6", settings, seat), force=force) as (left, right):
+        read_x, read_y = made.covered.any(axis=0), made.covered.any(axis=1)
+        x, y, mean = made.x_mm[read_x], made.y_mm[read_y], made.mean[np.ix_(read_y, read_x)]
+        picture = left.pcolormesh(x, y, mean, cmap="viridis", shading="nearest")
+        left.figure.colorbar(picture, ax=left, label=_SHARE)
+        left.set_aspect("equal")
+        for colour, (axis, name) in zip(COLOURS, _AXES.items(), strict=False):
+            place, value = _section(made, axis)
+            near = np.abs(place) <= 25.0
+            right.plot(place[near], value[near], color=colour, label=name)
+        finish(left, f"(a) map, d {d:g} mm, h/d {h:g}", "across the head (mm)", "along the head (mm)")
+        finish(right, "(b) sections", "distance from the ball's axis (mm)", _SHARE)
+
+
+def _section(made: TactileMap, axis: str) -> tuple[FloatArray, FloatArray]:
+    """The map along one axis of the head, from the two lines of cells nearest to the lump's."""
+    across, along = (made.x_mm, made.y_mm) if axis == "x" else (made.y_mm, made.x_mm)
+    mean, covered = (made.mean, made.covered) if axis == "x" else (made.mean.T, made.covered.T)
+    lines = np.flatnonzero(covered.any(axis=1))
+    chosen = lines[np.argsort(np.abs(along[lines]), kind="stable")[:2]]
+    read = covered[chosen].all(axis=0)
+    return across[read], np.asarray(mean[np.ix_(chosen, read)].mean(axis=0))
+
+
+def _lines_by_stiffness(settings: StudySettings, body: Body, fit: Fit) -> Iterator[Curve]:
+    """Maps of a lump of several stiffnesses, with Eq 5 fitted to them."""
+    surface = settings.surface(body)
+    for ratio in _RATIOS:
+        line = build_line(settings.frames(surface, ratio))
+        found = fit(line, settings.fit_radius_mm)
+        yield line.x_mm, line.mean, f"E2/E1 {ratio:g}: a {found.amplitude:.3f}, sigma {found.sigma_mm:.2f} mm"
+
+
+def _sections_by_stiffness(settings: SolidSettings, body: Body, fit: RasterFitter, build: Build) -> Iterator[Curve]:
+    """Sections across the head of maps of a ball of several stiffnesses, with Eq 7 fitted to the maps."""
+    head, condensed = settings.on(body), settings.condensed(body)
+    for ratio in _RATIOS:
+        frames = raster_frames(head, settings.placed(condensed, ratio), settings)
+        found = fit(frames, settings)
+        sigma = f"{found.sigma_x_mm:.1f} x {found.sigma_y_mm:.1f} mm"
+        yield *_section(build(frames), "x"), f"E2/E1 {ratio:g}: a {found.amplitude:.3f}, sigma {sigma}"
+
+
+def _figure_7(
+    rows: Sequence[StudyRow], path: Path, *, curves: Iterable[Curve], title: str, caption: str, force: bool
+) -> None:
+    """Maps of a small lump of several stiffnesses, and how little the widths depend on stiffness."""
+    with _panels(path, caption, force=force) as (left, right):
+        for colour, (x, value, text) in zip(COLOURS, curves, strict=False):
+            near = np.abs(x) <= 20.0
+            left.plot(x[near], value[near], color=colour, label=text)
+        level = [row for row in rows if abs(row.depth_ratio - 1.0) < 1e-9 and row.detectable]
+        for i, diameter in enumerate(dict.fromkeys(row.d_mm for row in hard_cases(level))):
+            of_size = [row for row in level if row.d_mm == diameter]
+            for axis, line in zip(_axes_of(rows), ("-", "--"), strict=False):
+                _draw_stiffness(right, of_size, axis, line, i)
+        right.axhspan(0.95, 1.05, color="0.9", zorder=0)
+        right.set_xscale("log")
+        finish(left, title, _ON_SKIN, _SHARE, headroom=0.4)
+        which = "; full across, dashed along" if len(_axes_of(rows)) > 1 else ""
+        finish(
+            right, f"(b) width, h/d 1{which}; grey: 5 %", "stiffness ratio E2/E1", f"sigma / sigma at {HARD_RATIO:g}"
+        )
+
+
+def _axes_of(rows: Sequence[StudyRow]) -> dict[str, str]:
+    """The head's axes, in words; of a line, which has one, without."""
+    return _AXES if any(row.sigma_y_mm is not None for row in rows) else {"x": ""}
+
+
+def _draw_stiffness(axes: Axes, rows: Sequence[StudyRow], axis: str, line: str, i: int) -> None:
+    """Widths of one size of lump over that of the hardest."""
+    sigma = widths(rows, axis=axis)
+    hardest = next(width for row, width in zip(rows, sigma, strict=True) if row.stiffness_ratio == HARD_RATIO)
+    label = f"d {rows[0].d_mm:g} mm" if axis == "x" else None
+    points = sorted(zip((row.stiffness_ratio for row in rows), sigma / hardest, strict=True))
+    axes.plot(*zip(*points, strict=True), line, marker=MARKS[i % 6], color=COLOURS[i % 6], label=label)
+
+
+def figure_8(rows: Sequence[StudyRow], path: Path, *, force: bool = False) -> None:
+    """Width change against amplitude and width against diameter, each with its line, for the axes that rows have."""
+    seat, kind = rows[0].seat if rows else "no cases", ", balls" if len(_axes_of(rows)) > 1 else ""
+    text = f"Figure 8{kind}: {seat}, E2/E1 = {HARD_RATIO:g}, amplitude at least {DETECTABLE:g}.  {RESEARCH_USE}"
+    with _panels(path, text, force=force) as (left, right):
+        for i, (axis, words) in enumerate(_axes_of(rows).items()):
+            _draw_printed_eq6(left, right, hard_cases(rows), axis, words, i)
+        left.set_xscale("log")
+        right.set_ylim(bottom=0)
+        right.set_xlim(left=0)
+        finish(left, "(a) width change, referenced to h/d 1", "amplitude a", "sigma / sigma at h/d 1")
+        finish(right, "(b) at one diameter depth", "sigma (mm)", "diameter d (mm)")
+
+
+def _draw_printed_eq6(left: Axes, right: Axes, hard: Sequence[StudyRow], axis: str, words: str, i: int) -> None:
+    """Points and lines of one axis of the head; the points of a line's one axis have a colour for each diameter."""
+    learned, change, sigma = learn_as_printed(hard, axis=axis), width_changes(hard, axis=axis), widths(hard, axis=axis)
+    amplitude, d = np.array([row.amplitude for row in hard]), np.array([row.d_mm for row in hard])
+    level = np.array([abs(row.depth_ratio - 1.0) < 1e-9 for row in hard], dtype=bool)
+    if words:
+        left.plot(amplitude, change, MARKS[i], color=COLOURS[i], label=words)
+    for k, diameter in enumerate(() if words else dict.fromkeys(d.tolist())):
+        mine = d == diameter
+        left.plot(amplitude[mine], change[mine], MARKS[k % 6], color=COLOURS[k % 6], label=f"d {diameter:g} mm")
+    right.plot(sigma[level], d[level], MARKS[i], color=COLOURS[i], label=words or None)
+    if learned is None:
+        return
+    colour = COLOURS[i] if words else "k"
+    a = np.geomspace(amplitude.min(), amplitude.max(), 100)
+    left.plot(a, learned.e * a**learned.f, color=colour, label=f"{learned.e:.2f} a^{learned.f:.2f}")
+    line = np.linspace(0.0, float(np.nanmax(sigma[level])) * 1.1, 2)
+    text = f"d = {learned.m:.2f} sigma {learned.b_mm:+.2f} mm"
+    right.plot(line, learned.m * line + learned.b_mm, color=colour, label=text)
+
+
 # --- Fig 8 of the paper for any table of lumps: Eq 6 with the points that it was learned from.
 
-_SIZE_IN = (13.0, 4.6)
-_COLOURS = {"x": "#1f3b73", "y": "#c8641e"}
-_MARKS = {"x": "o", "y": "s"}
-_NAMES = {"x": "across the head", "y": "along it"}
+_EQ6_SIZE_IN = (13.0, 4.6)
+_COLOURS, _MARKS = dict(zip("xy", COLOURS, strict=False)), dict(zip("xy", MARKS, strict=False))
 _BAND = (0.05, 0.95)
 _DIAMETERS_MM = (5.0, 10.0, 15.0, 20.0, 25.0)
 
@@ -338,7 +449,7 @@ def eq6_figure(
     axes = [("x", calibration.x, lumps.sigma_x_mm, lumps.width_change_x)]
     if lumps.sigma_y_mm is not None:
         axes.append(("y", calibration.y, lumps.sigma_y_mm, lumps.width_change_y))
-    with figure_file(path, size_in=_SIZE_IN, force=force) as figure:
+    with figure_file(path, size_in=_EQ6_SIZE_IN, force=force) as figure:
         change, line, plane = figure.subplots(1, 3)
         for name, axis, sigma, ratio in axes:
             known = None if ratio is None else ratio[rising]
@@ -358,7 +469,7 @@ def _draw_change(axes: Axes, name: str, axis: AxisCalibration, amplitude: FloatA
     """The power law, and the ratios of widths where the table has depths to take them from."""
     a = np.geomspace(amplitude.min(), amplitude.max(), 100)
     e, f = axis.draws[:, 2:3], axis.draws[:, 3:4]
-    words = f"{e.mean():.2f} a^{f.mean():.2f}, {_NAMES[name]}"
+    words = f"{e.mean():.2f} a^{f.mean():.2f}, {_AXES[name]}"
     low, high = np.quantile(e * a**f, _BAND, axis=0)
     axes.plot(a, e.mean() * a ** f.mean(), color=_COLOURS[name], label=words)
     axes.fill_between(a, low, high, color=_COLOURS[name], alpha=0.15, lw=0)
@@ -379,7 +490,7 @@ def _draw_line(
     low, high = np.quantile(m * scale * x + b, _BAND, axis=0)
     mean = np.mean(m * scale * x + b, axis=0)
     axes.plot(corrected, d_mm, _MARKS[name], color=_COLOURS[name], markersize=4)
-    axes.plot(x, mean, color=_COLOURS[name], label=f"m {m.mean():.2f}, b {b.mean():+.2f} mm, {_NAMES[name]}")
+    axes.plot(x, mean, color=_COLOURS[name], label=f"m {m.mean():.2f}, b {b.mean():+.2f} mm, {_AXES[name]}")
     axes.fill_between(x, low, high, color=_COLOURS[name], alpha=0.15, lw=0)
 
 

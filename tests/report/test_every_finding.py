@@ -277,7 +277,7 @@ PRINTERS = {
     "api/trial_report", "api/trials", "actions/calibrate", "actions/devices", "actions/exam",
     "actions/simulation", "actions/study",
     "actions/tradeoff", "actions/trial", "files/size_json", "presets", "report/calibration",
-    "report/paper_head", "report/laboratory", "report/solid_figures",
+    "report/paper_head", "report/laboratory",
     "report/study", "report/tradeoff", "report/trial", "report/trial_html",
 }  # fmt: skip
 

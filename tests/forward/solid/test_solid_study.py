@@ -228,7 +228,7 @@ def test_four_figures_are_drawn(folder: Path, run_cli: Run) -> None:
 
 
 def test_a_figure_of_balls_is_the_same_bytes_each_time(tmp_path: Path) -> None:
-    from tactile_bayes.report.solid_figures import figure_8
+    from tactile_bayes.report.study import figure_8
 
     cases = [(d, h) for d in (5.0, 15.0) for h in (0.6, 1.0)]
     known = [StudyRow("centred", d, h, 100.0, 0.3 / h**3, d * h / 4, 0.01, True, d * h / 5) for d, h in cases]
