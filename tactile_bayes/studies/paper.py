@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterable, Sequence
+from typing import Any
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -40,33 +41,39 @@ DETECTABLE = 0.02
 HARD_RATIO = 100.0
 
 
-class StudySettings(Record):
-    """Settings of a study: everything but its cases that the table depends on."""
+class CaseSettings(Record):
+    """Head, pressure and tissue of a study in two or three dimensions."""
 
-    head: Head = field(default_factory=Head)
-    """Cross-section of the head."""
+    head: Any = None
     mean_kpa: float = MEAN_KPA
-    """Force over the head's area."""
+    """Mean over the taxels, or force over the area of a section."""
     poisson: float = POISSON
     fat_kpa: float = FAT_KPA
     gland_ratio: float = GLAND_RATIO
     thickness_mm: float | None = None
-    """`poisson`, `fat_kpa`, `gland_ratio`, `thickness_mm`: As in `body.Body`."""
+    """`poisson`, `fat_kpa`, `gland_ratio`, `thickness_mm`: As in `tissue.Body`."""
+
+    def body(self, d_mm: float, depth_ratio: float, *, seat: float) -> Body:
+        """The body of a case."""
+        return Body(d_mm, depth_ratio, seat, self.thickness_mm, self.fat_kpa, self.gland_ratio, self.poisson)
+
+
+class StudySettings(CaseSettings):
+    """Settings of a study: everything but its cases that the table depends on."""
+
+    head: Head = field(default_factory=Head)
+    """Cross-section of the head."""
     positions_mm: tuple[float, float, float] = POSITIONS_MM
     """First and last position of the head and the step between them."""
     fit_radius_mm: float = FIT_RADIUS_MM
     """Eq 5 is fitted where abs(x) is at most this."""
     cell_mm: float = CELL_MM
     fineness: int = FINENESS
-    """`cell_mm`, `fineness`: Of the contact and of the mesh, see `condense.condense`."""
+    """`cell_mm`, `fineness`: Of the contact and of the mesh, see `plane_strain.condense`."""
 
     def as_dict(self) -> dict[str, object]:
         """Plain data for a store's header and for a report."""
         return as_dict(self)
-
-    def body(self, d_mm: float, depth_ratio: float, *, seat: float) -> Body:
-        """The body of a case."""
-        return Body(d_mm, depth_ratio, seat, self.thickness_mm, self.fat_kpa, self.gland_ratio, self.poisson)
 
     def surface(self, body: Body) -> SurfaceCompliance:
         """The body condensed onto the surface that the head travels over."""
@@ -85,7 +92,7 @@ class Geometry(Record):
     seat: float
     d_mm: float
     depth_ratio: float
-    """`seat`, `d_mm`, `depth_ratio`: As in `body.Body`."""
+    """`seat`, `d_mm`, `depth_ratio`: As in `tissue.Body`."""
     stiffness_ratios: tuple[float, ...]
     """E2/E1, the lump's modulus over that of fat."""
 

@@ -12,12 +12,11 @@ from scipy.optimize import minimize
 from tactile_bayes.declarations import Record, as_dict, field, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.axisymmetric import CondensedLump, LayeredBody, Tissue, condense_lump
-from tactile_bayes.forward.line import MEAN_KPA
 from tactile_bayes.forward.mesh import LumpGeometry, MeshSize
 from tactile_bayes.forward.plane_strain import FINENESS
 from tactile_bayes.forward.scene import Head
 from tactile_bayes.forward.solid import RANK_TOLERANCE, PlacedLump, SolidHead, face_of, skin_perturbation, solid_head
-from tactile_bayes.forward.tissue import FAT_KPA, GLAND_RATIO, POISSON, Body
+from tactile_bayes.forward.tissue import Body
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.accumulate import FlatField
 from tactile_bayes.mapping.build import build_map
@@ -26,7 +25,7 @@ from tactile_bayes.posterior.bump import Bump, FitCells, window_cells
 from tactile_bayes.posterior.white import LEAST_WIDTH_IN_CELLS, MOST_AXIS_RATIO, WIDEST_IN_RADII
 from tactile_bayes.presets import FIT_RADIUS_MM
 from tactile_bayes.scan import CountArray, ElementCalibration, HeadGeometry, PressureFrames, Scan, TrackerPoses
-from tactile_bayes.studies.paper import DETECTABLE, Geometry, StudyRow, seat_name
+from tactile_bayes.studies.paper import DETECTABLE, CaseSettings, Geometry, StudyRow, seat_name
 
 # --- Maps of a study's raster of frames, built and fitted like a patient's.
 
@@ -154,18 +153,11 @@ BACKGROUNDS = ("fixed", "free")
 _LEVEL = np.eye(3)
 
 
-class SolidSettings(Record):
+class SolidSettings(CaseSettings):
     """Settings of a solid study: everything but its cases that the table depends on."""
 
     head: Head = field(default_factory=Head)
     """The array and the rim around it."""
-    mean_kpa: float = MEAN_KPA
-    """Mean over the taxels."""
-    poisson: float = POISSON
-    fat_kpa: float = FAT_KPA
-    gland_ratio: float = GLAND_RATIO
-    thickness_mm: float | None = None
-    """`poisson`, `fat_kpa`, `gland_ratio`, `thickness_mm`: As in `body.Body`."""
     reach_mm: float = REACH_MM
     lines_mm: tuple[float, ...] = LINES_MM
     """`reach_mm`, `lines_mm`: The head stands at steps of the taxels' pitch out to `reach_mm` either side across it, on
@@ -176,7 +168,7 @@ class SolidSettings(Record):
     fineness: int = FINENESS
     """Of the mesh; twice is half the element. See `mesh_size`."""
     rank_tolerance: float = RANK_TOLERANCE
-    """See `frames.skin_perturbation`."""
+    """See `solid.skin_perturbation`."""
     mesh_reach_mm: float = MeshSize().reach_mm
     """Radius at which the mesh ends, on a rim that does not move."""
     background: str = "free"
@@ -197,10 +189,6 @@ class SolidSettings(Record):
     def as_dict(self) -> dict[str, object]:
         """Plain data for a store's header."""
         return {"model": "solid", **as_dict(self)}
-
-    def body(self, d_mm: float, depth_ratio: float, *, seat: float) -> Body:
-        """The body of a case."""
-        return Body(d_mm, depth_ratio, seat, self.thickness_mm, self.fat_kpa, self.gland_ratio, self.poisson)
 
     def geometry(self, body: Body) -> LumpGeometry:
         """The ball in the body."""
