@@ -57,7 +57,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "Check the posterior of a map against itself: ranks and coverage on simulated maps.",
     ),
     "simulate": ("laboratory.simulate_command", "Make a scan with known truth from a scene."),
-    "record": ("record.command", "Record a scan head and a tracker into a scan file."),
+    "record": ("devices.record_command", "Record a scan head and a tracker into a scan file."),
     "repair": ("devices.repair_command", "Close a scan file that was cut off: what is intact is kept."),
     "replay": ("devices.replay_command", "Play a scan through the path of a recording, with the live view."),
     "devices": ("devices.devices_command", "List the serial ports with a guess at what is on them."),

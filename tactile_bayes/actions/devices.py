@@ -17,7 +17,7 @@ import click
 import numpy as np
 
 from tactile_bayes.actions.exam import describe_scan
-from tactile_bayes.commands import record
+from tactile_bayes.commands.devices import record_command
 from tactile_bayes.errors import BadDataError, DeviceError, UsageError
 from tactile_bayes.files.atomic import refuse_existing
 from tactile_bayes.files.provenance import Provenance, hash_inputs
@@ -200,7 +200,7 @@ def replay_action(
         options |= {f"{role}_url": url for role, url in urls.items()} | {"tracker_protocol": "open"}
         if found.landmarks is not None:
             options["landmarks"] = scan
-        ctx.invoke(record.command, **options)
+        ctx.invoke(record_command, **options)
 
 
 @contextmanager

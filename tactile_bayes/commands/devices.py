@@ -1,4 +1,4 @@
-"""Options of the commands on devices: `devices`, `emulate`, `replay`, `repair`."""
+"""Options of the commands on devices: `record`, `devices`, `emulate`, `replay`, `repair`."""
 
 from __future__ import annotations
 
@@ -6,8 +6,39 @@ from typing import Any, get_args
 
 import click
 
-from tactile_bayes.commands.options import FORCE, SPEED, FilePath, FiniteRange, live_options
+from tactile_bayes.commands.options import FORCE, SPEED, FilePath, FiniteRange, live_options, takes
+from tactile_bayes.declarations import names_of
+from tactile_bayes.options import RecordOptions
 from tactile_bayes.presets import TrackerProtocol
+
+# --- `record`: a scan head and a tracker into a scan file.
+
+_RECORDING = names_of(RecordOptions)[2:-4]
+"""Between the output with the head's port and the options of the live view."""
+
+
+@click.command("record")
+@click.option(
+    "-o", "--output", required=True, metavar="SCAN.mcap", type=FilePath(writes="MCAP"), help="Scan file to write."
+)
+@click.option("--head", "head_url", required=True, metavar="URL", help="Port of the scan head.")
+@takes(RecordOptions, *_RECORDING)
+@live_options
+@FORCE
+@click.pass_context
+def record_command(ctx: click.Context, /, **given: Any) -> None:
+    """Record a scan head and a tracker.
+
+    On a terminal, `n` and `x` touch the sternal notch and the xiphoid, space starts, `q` or Ctrl-C stops; with
+    --duration or --at-once, or without a terminal, recording starts at once. The file can be read at any moment: a
+    kill costs at most the last fraction of a second, and `repair` closes what was cut off.
+
+    Example: tactile-bayes record -o scan.mcap --head /dev/ttyACM0 --tracker /dev/ttyUSB0 --like last.mcap
+    """
+    from tactile_bayes.actions.record import record_action
+
+    record_action(ctx, **given)
+
 
 # --- `emulate`: serve a scan as a device would send it.
 
