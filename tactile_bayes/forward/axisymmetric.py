@@ -8,8 +8,7 @@ from typing import Final
 
 import numpy as np
 from scipy.interpolate import CubicSpline
-from scipy.sparse import coo_array, csc_array
-from scipy.sparse.linalg import splu
+from scipy.sparse import csc_array
 from scipy.special import j0
 
 from tactile_bayes.declarations import Record
@@ -22,7 +21,13 @@ from tactile_bayes.forward.mesh import (
     LumpGeometry,
     LumpMesh,
     MeshSize,
+    condensed,
+    gathered,
+    lagrange_points,
     lump_mesh,
+    quadrature,
+    solved,
+    stiffness_factor,
 )
 from tactile_bayes.forward.tissue import FAT_KPA, GLAND_RATIO, POISSON
 from tactile_bayes.geometry import FloatArray
@@ -364,24 +369,10 @@ def element_stiffness(mesh: LumpMesh, *, nu: float) -> FloatArray:
     :math:`K = K_0 + m K_1 + m^2 K_2`, without the factor of the integral over the angle.
 
     Unknowns are (u_r, u_theta, u_z) of each of the nine nodes.
-
-    Biquadratic displacements with the volume change projected on linear functions of (r, z) in each element: the pair
-    Q2-P1, which satisfies the inf-sup condition and so does not lock (Brezzi & Fortin 1991, sec. VI.3; Hughes 1980 for
-    the projection).
     """
-    shape, gradient, point, weight = _quadrature(mesh)
-    strain = _strains(shape, gradient, point[..., 0])
-    shear, bulk = 0.5 / (1.0 + nu), nu / ((1.0 + nu) * (1.0 - 2.0 * nu))
-    measure = np.array([2.0, 2.0, 2.0, 1.0, 1.0, 1.0]) * shear
-    scaled = strain * np.sqrt(measure[:, None] * weight[:, :, None, None])
-    flat = scaled.reshape(2, len(weight), -1, 27)
-    terms = _polynomial(flat)
-    centre = point.mean(axis=1, keepdims=True)
-    pressure = np.concatenate([np.ones_like(point[..., :1]), point - centre], axis=-1)
-    mass = np.einsum("eq,eqa,eqb->eab", weight, pressure, pressure)
-    volume = np.einsum("eq,eqa,meqk->meak", weight, pressure, strain[..., :3, :].sum(axis=-2))
-    root = np.linalg.cholesky(np.linalg.inv(mass)).transpose(0, 2, 1)
-    return np.asarray(terms + bulk * _polynomial(root @ volume))
+    gradient, point, area = quadrature(mesh.node_mm[mesh.element])
+    strain = _strains(lagrange_points()[0], gradient, point[..., 0])
+    return _polynomial(stiffness_factor(strain, point, area * point[..., 0], normal=3, poisson=nu))
 
 
 def _polynomial(factor: FloatArray) -> FloatArray:
@@ -389,28 +380,6 @@ def _polynomial(factor: FloatArray) -> FloatArray:
     a, b = factor
     cross = a.transpose(0, 2, 1) @ b
     return np.stack([a.transpose(0, 2, 1) @ a, cross + cross.transpose(0, 2, 1), b.transpose(0, 2, 1) @ b])
-
-
-def _quadrature(mesh: LumpMesh) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Shape functions (9 points, 9 nodes), gradients (e, 9, 9, 2), points (e, 9, 2) and r dr dz weights (e, 9)."""
-    shape, local, cell = lagrange_points()
-    node = mesh.node_mm[mesh.element]
-    jacobian = np.einsum("qnk,enx->eqxk", local, node)
-    point = np.einsum("qn,enx->eqx", shape, node)
-    gradient = np.einsum("qnk,eqkx->eqnx", local, np.linalg.inv(jacobian))
-    weight = np.abs(np.linalg.det(jacobian)) * cell * point[..., 0]
-    return shape, gradient, point, weight
-
-
-def lagrange_points() -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Biquadratic shape functions (9 points, 9 nodes), local gradients (9, 9, 2) and weights (9,) at Gauss points."""
-    x, w = np.polynomial.legendre.leggauss(3)
-    value = np.stack([x * (x - 1) / 2, 1 - x * x, x * (x + 1) / 2], axis=-1)
-    slope = np.stack([x - 0.5, -2 * x, x + 0.5], axis=-1)
-    shape = np.einsum("ai,bj->abij", value, value).reshape(9, 9)
-    across, along = np.einsum("ai,bj->abij", slope, value), np.einsum("ai,bj->abij", value, slope)
-    slopes = np.stack([across, along], axis=-1).reshape(9, 9, 2)
-    return shape, slopes, np.outer(w, w).ravel()
 
 
 def _strains(shape: FloatArray, gradient: FloatArray, r_mm: FloatArray) -> FloatArray:
@@ -474,22 +443,21 @@ def _condense(mesh: LumpMesh, elements: FloatArray, modulus_kpa: FloatArray, ord
     boundary = boundary[boundary >= 0]
 
     outer, used = _assemble(mesh, stiffness, modulus_kpa, ~inside, number, sign)
-    factor = splu(outer, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
     at = np.searchsorted(used, boundary)
     unit = np.zeros((len(used), len(at)))
     unit[at, np.arange(len(at))] = 1.0
-    moved = factor.solve(unit)
+    moved = solved(outer, unit)
     sinking = number[_skin(mesh), 2]
     skin = moved[np.searchsorted(used, sinking)]
     flexibility = moved[at]
 
-    unit_kpa = np.ones_like(modulus_kpa)
-    lump = _condensed_core(mesh, stiffness, unit_kpa, inside, number, sign, boundary)
-    within = modulus_kpa[inside]
-    if (within == within[0]).all():
-        original = within[0] * lump
-    else:
-        original = _condensed_core(mesh, stiffness, modulus_kpa, inside, number, sign, boundary)
+    def core(kpa: FloatArray) -> FloatArray:
+        matrix, used = _assemble(mesh, stiffness, kpa, inside, number, sign)
+        on = np.isin(used, boundary)
+        return condensed(matrix, np.flatnonzero(on), np.flatnonzero(~on))
+
+    lump, within = core(np.ones_like(modulus_kpa)), modulus_kpa[inside]
+    original = within[0] * lump if (within == within[0]).all() else core(modulus_kpa)
     return CondensedMode(order, (flexibility + flexibility.T) / 2, skin, lump, original)
 
 
@@ -506,27 +474,5 @@ def _assemble(
     unknown = number[element].reshape(len(element), 27)
     signs = sign[element].reshape(len(element), 27)
     data = stiffness[chosen] * (modulus_kpa[chosen, None, None] * signs[:, :, None] * signs[:, None, :])
-    row, column = np.broadcast_arrays(unknown[:, :, None], unknown[:, None, :])
-    kept = (row >= 0) & (column >= 0)
     used = np.unique(unknown[unknown >= 0])
-    place = np.searchsorted(used, np.stack([row[kept], column[kept]]))
-    matrix = coo_array((data[kept], (place[0], place[1])), shape=(len(used), len(used)))
-    return matrix.tocsc(), used
-
-
-def _condensed_core(
-    mesh: LumpMesh,
-    stiffness: FloatArray,
-    modulus_kpa: FloatArray,
-    inside: np.ndarray[tuple[int, ...], np.dtype[np.bool_]],
-    number: IntArray,
-    sign: FloatArray,
-    boundary: IntArray,
-) -> FloatArray:
-    """Stiffness of the lump's inside, condensed onto its boundary (Guyan 1965: exact in statics)."""
-    matrix, used = _assemble(mesh, stiffness, modulus_kpa, inside, number, sign)
-    dense = matrix.toarray()
-    on = np.isin(used, boundary)
-    across = dense[np.ix_(~on, on)]
-    condensed = dense[np.ix_(on, on)] - across.T @ np.linalg.solve(dense[np.ix_(~on, ~on)], across)
-    return np.asarray((condensed + condensed.T) / 2)
+    return gathered(data, np.where(unknown >= 0, np.searchsorted(used, unknown), -1), len(used)), used

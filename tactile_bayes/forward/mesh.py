@@ -1,14 +1,15 @@
-"""Meshes of a box with a lump: plane and solid."""
+"""Meshes of a box with a lump, plane and solid, and the elements of both."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array, csc_array
+from scipy.sparse.linalg import splu
 
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError
@@ -54,7 +55,7 @@ class QuadMesh(Record, eq=False):
 def body_mesh(body: Body, *, fineness: int) -> QuadMesh:
     """The body on x >= 0 with a hole where the lump is; twice the fineness is half the element size everywhere."""
     box = _Box.around(body, fineness)
-    ring = _rays(_circle(body, box.angles_rad()), box.outline(), np.linspace(0.0, 1.0, 2 * _OUT * fineness + 1))
+    ring = _blend(_circle(body, box.angles_rad()), box.outline(), np.linspace(0.0, 1.0, 2 * _OUT * fineness + 1))
     across = _graded(box.half_width_mm, REACH_MM + _BEYOND * body.layers.thickness_mm, box.row_mm, fineness)
     rows = np.concatenate([box.above_mm[:-1], box.side_mm[:-1], box.below_mm])
     blocks = [ring, _grid(across, rows), _grid(box.bottom_x_mm, box.below_mm)]
@@ -71,7 +72,7 @@ def disc_mesh(body: Body, *, fineness: int, layered: bool) -> QuadMesh:
     circle = _circle(body, _Box.around(body, fineness).angles_rad())
     depth = body.layers.fat_mm if layered else body.centre_mm
     middle = np.broadcast_to([0.0, depth], circle.shape)
-    block = _rays(middle, circle, np.linspace(0.0, 1.0, 2 * _IN * fineness + 1))
+    block = _blend(middle, circle, np.linspace(0.0, 1.0, 2 * _IN * fineness + 1))
     return _join([block], boundary_mm=body.layers.fat_mm, scale_mm=body.d_mm)
 
 
@@ -194,11 +195,6 @@ def _circle(body: Body, angles_rad: FloatArray) -> FloatArray:
     return np.stack([r * np.sin(angles_rad), body.centre_mm - r * np.cos(angles_rad)], axis=1)
 
 
-def _rays(inner: FloatArray, outer: FloatArray, shares: FloatArray) -> FloatArray:
-    """(k, len(shares), 2) points on the straight lines between two outlines."""
-    return np.asarray(inner[:, None, :] + shares[None, :, None] * (outer - inner)[:, None, :])
-
-
 def _grid(x_mm: FloatArray, z_mm: FloatArray) -> FloatArray:
     """(len(x), len(z), 2) points."""
     return np.stack(np.meshgrid(x_mm, z_mm, indexing="ij"), axis=-1)
@@ -206,12 +202,7 @@ def _grid(x_mm: FloatArray, z_mm: FloatArray) -> FloatArray:
 
 def _graded(begin_mm: float, end_mm: float, first_mm: float, fineness: int) -> FloatArray:
     """Corners and midpoints of elements that grow from `first_mm`, by a factor that shrinks with the fineness."""
-    growth = _GROWTH ** (1.0 / fineness)
-    length = end_mm - begin_mm
-    count = int(np.ceil(np.log1p(length / first_mm * (growth - 1.0)) / np.log(growth)))
-    sizes = growth ** np.arange(max(count, fineness))
-    corners = begin_mm + length * np.concatenate([[0.0], np.cumsum(sizes) / sizes.sum()])
-    return _with_middles(corners)
+    return _graded_line(begin_mm, end_mm, first=first_mm, grade=_GROWTH ** (1.0 / fineness), least=fineness)
 
 
 def _with_middles(corners: FloatArray) -> FloatArray:
@@ -224,18 +215,25 @@ def _with_middles(corners: FloatArray) -> FloatArray:
 
 def _join(blocks: Sequence[FloatArray], *, boundary_mm: float, scale_mm: float) -> QuadMesh:
     """Merge blocks into one mesh; coinciding points become one node, elements without area are dropped."""
-    nodes, number = _merged(np.concatenate([block.reshape(-1, 2) for block in blocks]), scale_mm)
-    offsets = np.cumsum([0] + [block.shape[0] * block.shape[1] for block in blocks])
-    elements = np.concatenate(
-        [_elements(block.shape[0], block.shape[1]) + offset for block, offset in zip(blocks, offsets, strict=False)]
-    )
-    elements = number[elements]
+    nodes, elements = _numbered(blocks, scale_mm)
     corners = nodes[elements[:, [0, 2, 8, 6]]]
     x, z = corners[..., 0], corners[..., 1]
     area = 0.5 * np.abs(np.sum(x * np.roll(z, -1, axis=1) - z * np.roll(x, -1, axis=1), axis=1))
     kept = area > 1e-10 * scale_mm**2
-    gland = corners[..., 1].mean(axis=1) > boundary_mm
-    return _compact(nodes, elements[kept], gland[kept])
+    used, numbers = np.unique(elements[kept], return_inverse=True)
+    return QuadMesh(nodes[used], numbers.reshape(-1, 9), corners[kept, :, 1].mean(axis=1) > boundary_mm)
+
+
+def _numbered(blocks: Sequence[FloatArray], scale_mm: float) -> tuple[FloatArray, IndexArray]:
+    """Nodes, and (k, 9) their numbers in the elements of all (n, m, 2) blocks of points, n and m odd, in order."""
+    nodes, number = _merged(np.concatenate([block.reshape(-1, 2) for block in blocks]), scale_mm)
+    elements, start = [], 0
+    for n, m, _ in (block.shape for block in blocks):
+        index = number[start : start + n * m].reshape(n, m)
+        start += n * m
+        parts = [index[i : n - 2 + i : 2, j : m - 2 + j : 2].reshape(-1) for i in range(3) for j in range(3)]
+        elements.append(np.stack(parts, axis=1))
+    return nodes, np.concatenate(elements)
 
 
 def _merged(points: FloatArray, scale_mm: float) -> tuple[FloatArray, IndexArray]:
@@ -243,21 +241,6 @@ def _merged(points: FloatArray, scale_mm: float) -> tuple[FloatArray, IndexArray
     key = np.round(points / (1e-8 * scale_mm)).astype(np.int64)
     _, first, number = np.unique(key, axis=0, return_index=True, return_inverse=True)
     return points[first], np.asarray(number.reshape(-1), dtype=np.intp)
-
-
-def _elements(n: int, m: int) -> IndexArray:
-    """(k, 9) point numbers of the elements of an n by m block of points (both odd)."""
-    index = np.arange(n * m).reshape(n, m)
-    parts = [index[i : n - 2 + i : 2, j : m - 2 + j : 2].reshape(-1) for i in range(3) for j in range(3)]
-    return np.stack(parts, axis=1)
-
-
-def _compact(
-    nodes: FloatArray, elements: IndexArray, gland: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
-) -> QuadMesh:
-    """Remove the nodes that belong to no element."""
-    used, numbers = np.unique(elements, return_inverse=True)
-    return QuadMesh(nodes[used], numbers.reshape(elements.shape), gland)
 
 
 # --- Meshes of a layered body with a spheroid on its vertical axis: nine-node quadrilaterals in the (r, z) half-plane.
@@ -344,30 +327,21 @@ class LumpMesh(Record, eq=False):
     """(s,) int array: Nodes on the skin by increasing r."""
 
 
-@dataclass(slots=True)
-class _Patches:
-    """Lattices of nodes before equal nodes are merged."""
-
-    lattices: list[tuple[FloatArray, int]] = field(default_factory=list)
-
-    def add(self, lattice: FloatArray, region: int) -> None:
-        self.lattices.append((lattice, region))
-
-
 def lump_mesh(geometry: LumpGeometry, size: MeshSize | None = None) -> LumpMesh:
     """Mesh a lump in its body; the module describes the layout."""
     size = size or MeshSize()
     g, boundary = geometry, geometry.boundary_mm()
     corner_r, top, bottom = _box(g, boundary)
     lines = _Fan(g, boundary, corner_r, top, bottom, size.arc)
-    patches = _Patches()
+    patches: list[tuple[FloatArray, int]] = []
     for arc, rim in lines.sectors():
         middle = float(rim[len(rim) // 2, 1])
-        patches.add(_blend(arc, rim, _graded_share(size.rings, 1.25)), int(middle > boundary))
+        patches.append((_blend(arc, rim, _graded_share(size.rings, 1.25)), int(middle > boundary)))
         fat = float(arc[len(arc) // 2, 1]) < boundary
         centre = np.array([0.0, boundary if lines.cut else g.depth_mm])
         core = np.linspace(0.0, 1.0, 2 * size.core + 1)
-        patches.add(_blend(np.broadcast_to(centre, arc.shape), arc, core), INTERIOR_FAT if fat else INTERIOR_GLAND)
+        inside = _blend(np.broadcast_to(centre, arc.shape), arc, core)
+        patches.append((inside, INTERIOR_FAT if fat else INTERIOR_GLAND))
     _beyond_box(patches, lines, g, boundary, size)
     return _merge(patches)
 
@@ -452,10 +426,8 @@ class _Fan:
 
 def _graded_share(count: int, ratio: float) -> FloatArray:
     """(2 count + 1,) shares 0 to 1 whose elements grow by `ratio`, each with its mid-side node in the middle."""
-    steps = np.repeat(ratio ** np.arange(count), 2)
-    share: FloatArray = np.concatenate([[0.0], np.cumsum(steps)]) / float(steps.sum())
-    share[-1] = 1.0
-    return share
+    ends = np.concatenate([[0.0], np.cumsum(ratio ** np.arange(count))])
+    return _with_middles(ends / ends[-1])
 
 
 def _blend(start: FloatArray, end: FloatArray, share: FloatArray) -> FloatArray:
@@ -464,16 +436,18 @@ def _blend(start: FloatArray, end: FloatArray, share: FloatArray) -> FloatArray:
     return np.asarray((1.0 - s) * start + s * end)
 
 
-def _graded_line(start: float, stop: float, *, first: float, grade: float) -> FloatArray:
-    """Nodes of elements whose length grows from about `first` by at most `grade` until `stop`."""
+def _graded_line(start: float, stop: float, *, first: float, grade: float, least: int = 1) -> FloatArray:
+    """Nodes of elements, `least` or more, whose length grows from about `first` by at most `grade` until `stop`."""
     length = stop - start
-    count = max(1, int(np.ceil(np.log1p((grade - 1.0) * length / first) / np.log(grade))))
+    count = max(least, int(np.ceil(np.log1p((grade - 1.0) * length / first) / np.log(grade))))
     line = start + length * _graded_share(count, grade)
     line[0], line[-1] = start, stop
     return line
 
 
-def _beyond_box(patches: _Patches, fan: _Fan, g: LumpGeometry, boundary: float, size: MeshSize) -> None:
+def _beyond_box(
+    patches: list[tuple[FloatArray, int]], fan: _Fan, g: LumpGeometry, boundary: float, size: MeshSize
+) -> None:
     """The lattices outside, below and above the box."""
     reach = max(size.reach_mm, 2.0 * fan.corner_r, 4.0 * g.depth_mm)
     side = fan.side_mm()
@@ -498,32 +472,23 @@ def _down_from(start: float, stop: float, boundary: float, *, first: float, grad
     return np.concatenate([upper, lower[1:]])
 
 
-def _lattice(patches: _Patches, r: FloatArray, z: FloatArray, boundary: float) -> None:
+def _lattice(patches: list[tuple[FloatArray, int]], r: FloatArray, z: FloatArray, boundary: float) -> None:
     """A rectangle of elements, split at the layer boundary."""
     cuts = [0, *np.flatnonzero(z == boundary), len(z) - 1]
     for a, b in pairwise(cuts):
         if b > a:
             part = z[a : b + 1]
-            grid = np.stack(np.broadcast_arrays(r[None, :], part[:, None]), axis=-1)
-            patches.add(grid, int(part[len(part) // 2] > boundary))
+            patches.append((_grid(r, part), int(part[len(part) // 2] > boundary)))
 
 
-def _merge(patches: _Patches) -> LumpMesh:
-    points = np.concatenate([lattice.reshape(-1, 2) for lattice, _ in patches.lattices])
-    _, first, inverse = np.unique(np.round(points / 1e-7), axis=0, return_index=True, return_inverse=True)
-    node, inverse = points[first], inverse.reshape(-1).astype(np.int64)
-    elements, regions, start = [], [], 0
-    for lattice, region in patches.lattices:
-        rows, columns = lattice.shape[:2]
-        index = inverse[start : start + rows * columns].reshape(rows, columns)
-        start += rows * columns
-        corners = [index[i : rows - 2 + i : 2, j : columns - 2 + j : 2].ravel() for i in range(3) for j in range(3)]
-        elements.append(np.stack(corners, axis=-1))
-        regions.append(np.full(len(corners[0]), region))
-    element, region_of = np.concatenate(elements), np.concatenate(regions)
+def _merge(patches: list[tuple[FloatArray, int]]) -> LumpMesh:
+    node, element = _numbered([lattice for lattice, _ in patches], 10.0)
+    region_of = np.repeat(
+        [region for _, region in patches], [(len(one) // 2) * (one.shape[1] // 2) for one, _ in patches]
+    )
     surface = np.flatnonzero(np.abs(node[:, 1]) < 1e-7)
-    inside, outside = (set(element[mask].ravel()) for mask in (region_of >= INTERIOR_FAT, region_of < INTERIOR_FAT))
-    arc = np.array(sorted(inside & outside), dtype=np.int64)
+    inside, outside = (element[mask] for mask in (region_of >= INTERIOR_FAT, region_of < INTERIOR_FAT))
+    arc = np.intersect1d(inside, outside)
     return LumpMesh(
         node_mm=node,
         element=element,
@@ -531,3 +496,72 @@ def _merge(patches: _Patches) -> LumpMesh:
         arc=arc[np.argsort(node[arc, 1])],
         surface=surface[np.argsort(node[surface, 0])],
     )
+
+
+# --- Nine-node elements, for sections and for bodies round an axis: shape functions, stiffness, condensation.
+#
+# The volume change of an element is projected on linear functions of position (the pair Q2-P1, discontinuous), which
+# satisfies the inf-sup condition and so does not lock up to the incompressible limit (Brezzi & Fortin 1991, sec. VI.3;
+# Hughes 1980 for the projection). The pressure is eliminated in the element: the matrix is positive definite.
+
+
+def lagrange_points() -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Biquadratic shape functions (9 points, 9 nodes), local gradients (9, 9, 2) and weights (9,) at Gauss points."""
+    x, w = np.polynomial.legendre.leggauss(3)
+    value = np.stack([x * (x - 1) / 2, 1 - x * x, x * (x + 1) / 2], axis=-1)
+    slope = np.stack([x - 0.5, -2 * x, x + 0.5], axis=-1)
+    shape = np.einsum("ai,bj->abij", value, value).reshape(9, 9)
+    across, along = np.einsum("ai,bj->abij", slope, value), np.einsum("ai,bj->abij", value, slope)
+    return shape, np.stack([across, along], axis=-1).reshape(9, 9, 2), np.outer(w, w).ravel()
+
+
+def quadrature(corners: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Gradients (e, 9 points, 9 nodes, 2), points (e, 9, 2) and area weights (e, 9) of elements by (e, 9, 2) nodes."""
+    shape, local, cell = lagrange_points()
+    jacobian = np.einsum("qnk,enx->eqxk", local, corners)
+    gradient = np.einsum("qnk,eqkx->eqnx", local, np.linalg.inv(jacobian))
+    return gradient, np.einsum("qn,enx->eqx", shape, corners), np.abs(np.linalg.det(jacobian)) * cell
+
+
+def stiffness_factor(
+    strain: FloatArray, point: FloatArray, weight: FloatArray, *, normal: int, poisson: float
+) -> FloatArray:
+    r"""(..., e, n, k) factors A of the elements' stiffness :math:`A^T A` for a modulus of 1 kPa.
+
+    .. math:: K = \int 2\mu\,\varepsilon(v):\varepsilon(u) + \lambda\,\Pi(\nabla\cdot v)\,\Pi(\nabla\cdot u)
+
+    from the (..., e, 9, s, k) strains of unit unknowns, of which the first `normal` are normal and the rest shears;
+    :math:`\Pi` is the projection on linear functions of position.
+    """
+    shear, bulk = 0.5 / (1.0 + poisson), poisson / ((1.0 + poisson) * (1.0 - 2.0 * poisson))
+    measure = np.where(np.arange(strain.shape[-2]) < normal, 2.0, 1.0) * shear
+    scaled = strain * np.sqrt(measure[:, None] * weight[:, :, None, None])
+    scaled = scaled.reshape(*scaled.shape[:-3], -1, strain.shape[-1])
+    total = weight.sum(axis=1)[:, None, None]
+    middle = np.sum(weight[..., None] * point, axis=1, keepdims=True) / total
+    spread = np.sqrt(np.sum(weight[..., None] * (point - middle) ** 2, axis=1, keepdims=True) / total)
+    linear = np.concatenate([np.ones_like(point[..., :1]), (point - middle) / spread], axis=-1)
+    mass = np.einsum("eq,eqa,eqb->eab", weight, linear, linear)
+    volume = np.einsum("eq,eqa,...eqk->...eak", weight, linear, strain[..., :normal, :].sum(axis=-2))
+    root = np.linalg.cholesky(np.linalg.inv(mass)).transpose(0, 2, 1)
+    return np.concatenate([scaled, np.sqrt(bulk) * (root @ volume)], axis=-2)
+
+
+def gathered(blocks: FloatArray, unknown: IndexArray, size: int) -> csc_array:
+    """Sparse matrix of the elements' (e, k, k) blocks by their (e, k) unknowns; those of -1 are fixed."""
+    row, column = np.broadcast_arrays(unknown[:, :, None], unknown[:, None, :])
+    kept = (row >= 0) & (column >= 0)
+    return coo_array((blocks[kept], (row[kept], column[kept])), shape=(size, size)).tocsc()
+
+
+def solved(matrix: csc_array, sides: FloatArray) -> FloatArray:
+    """Solution of a symmetric positive definite system for many right-hand sides: one factorisation."""
+    factor = splu(matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    return np.asarray(factor.solve(sides))
+
+
+def condensed(matrix: csc_array, on: IndexArray, inner: IndexArray) -> FloatArray:
+    """Stiffness condensed onto the unknowns `on`, the inner ones free (Guyan 1965: exact in statics)."""
+    coupling = matrix[inner][:, on].toarray()
+    kept = matrix[on][:, on].toarray() - coupling.T @ solved(matrix[inner][:, inner], coupling)
+    return np.asarray(0.5 * (kept + kept.T))

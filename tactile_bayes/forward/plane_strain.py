@@ -4,21 +4,26 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.interpolate import CubicSpline
-from scipy.sparse import coo_matrix, csc_matrix
-from scipy.sparse.linalg import splu
+from scipy.sparse import csc_array
 
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError
+from tactile_bayes.forward.axisymmetric import LayeredBody, surface_flexibility
 from tactile_bayes.forward.mesh import IndexArray as IntArray
-from tactile_bayes.forward.mesh import QuadMesh, body_mesh, disc_mesh
+from tactile_bayes.forward.mesh import (
+    QuadMesh,
+    body_mesh,
+    condensed,
+    disc_mesh,
+    gathered,
+    quadrature,
+    solved,
+    stiffness_factor,
+)
 from tactile_bayes.forward.tissue import Body, Layers
 from tactile_bayes.geometry import FloatArray
 
-# --- Nearly incompressible plane strain: stiffness of nine-node quadrilaterals without volumetric locking.
-#
-# The volume change of an element is represented by a linear function of position (the Q2/P1 pair, discontinuous),
-# which is stable up to the incompressible limit and of optimal order. The pressure is eliminated in the element, so
-# that only displacements remain and the matrix is symmetric and positive definite.
+# --- Nearly incompressible plane strain: stiffness of nine-node quadrilaterals.
 
 _POINTS, _WEIGHTS = np.polynomial.legendre.leggauss(3)
 
@@ -29,43 +34,24 @@ def lame(young: FloatArray | float, poisson: float) -> tuple[FloatArray, FloatAr
     return young * poisson / ((1 + poisson) * (1 - 2 * poisson)), young / (2 * (1 + poisson))
 
 
-def assemble(mesh: QuadMesh, *, young_kpa: FloatArray, poisson: float) -> csc_matrix:
+def assemble(mesh: QuadMesh, *, young_kpa: FloatArray, poisson: float) -> csc_array:
     """Assemble the stiffness matrix (kPa, (2n, 2n)) of a mesh of unit thickness from each element's Young's modulus.
 
     Unknowns are ordered ``x0, z0, x1, z1, ...``; times displacement in mm it gives force in N/m.
     """
     blocks = element_stiffness(mesh.nodes[mesh.elements], poisson=poisson) * young_kpa[:, None, None]
     unknowns = (2 * mesh.elements[:, :, None] + np.arange(2)).reshape(len(mesh.elements), 18)
-    rows = np.repeat(unknowns, 18, axis=1).reshape(-1)
-    columns = np.tile(unknowns, (1, 18)).reshape(-1)
-    size = 2 * len(mesh.nodes)
-    return coo_matrix((blocks.reshape(-1), (rows, columns)), shape=(size, size)).tocsc()
+    return gathered(blocks, unknowns, 2 * len(mesh.nodes))
 
 
 def element_stiffness(corners: FloatArray, *, poisson: float) -> FloatArray:
-    r"""Stiffness, (m, 18, 18), of elements with Young's modulus 1 from their nodes' places, (m, 9, 2) as in `QuadMesh`.
-
-    .. math:: K = \int 2\mu\,\varepsilon(v):\varepsilon(u) + \lambda\,\Pi(\nabla\cdot v)\,\Pi(\nabla\cdot u)
-
-    with :math:`\Pi` the projection onto linear functions of x and z on the element (Boffi, Brezzi & Fortin, *Mixed
-    Finite Element Methods*, section 8.6), by Gauss's rule of 3 x 3 points.
-    """
-    lam, mu = lame(1.0, poisson)
-    gradient, weight, place = _shape_gradients(corners)
-    gx, gz = gradient[..., 0], gradient[..., 1]
-    parts = np.zeros((len(corners), 9, 2, 9, 2))
-    xx = np.einsum("eqa,eqb,eq->eab", gx, gx, weight)
-    zz = np.einsum("eqa,eqb,eq->eab", gz, gz, weight)
-    xz = np.einsum("eqa,eqb,eq->eab", gx, gz, weight)
-    parts[:, :, 0, :, 0] = mu * (2 * xx + zz)
-    parts[:, :, 1, :, 1] = mu * (2 * zz + xx)
-    parts[:, :, 0, :, 1] = mu * xz.transpose(0, 2, 1)
-    parts[:, :, 1, :, 0] = mu * xz
-    linear = _linear_functions(place, weight)
-    divergence = gradient.reshape(*gradient.shape[:2], 18)
-    mixed = np.einsum("eqp,eqa,eq->epa", linear, divergence, weight)
-    mass = np.einsum("eqp,eqr,eq->epr", linear, linear, weight)
-    return np.asarray(parts.reshape(-1, 18, 18) + lam * mixed.transpose(0, 2, 1) @ np.linalg.solve(mass, mixed))
+    """(m, 18, 18) stiffness of elements with Young's modulus 1 from the (m, 9, 2) places of their nodes."""
+    gradient, place, weight = quadrature(corners)
+    strain = np.zeros((*weight.shape, 3, 9, 2))  # xx, zz, xz
+    strain[..., 0, :, 0], strain[..., 1, :, 1] = gradient[..., 0], gradient[..., 1]
+    strain[..., 2, :, 0], strain[..., 2, :, 1] = gradient[..., 1], gradient[..., 0]
+    factor = stiffness_factor(strain.reshape(*weight.shape, 3, 18), place, weight, normal=2, poisson=poisson)
+    return np.asarray(factor.transpose(0, 2, 1) @ factor)
 
 
 def skin_average(x_mm: FloatArray, *, edges_mm: FloatArray, even: bool) -> FloatArray:
@@ -86,88 +72,17 @@ def skin_average(x_mm: FloatArray, *, edges_mm: FloatArray, even: bool) -> Float
     return right
 
 
-def _quadratics(t: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """(..., 3) Lagrange quadratics on -1, 0, 1, and their derivatives."""
-    values = np.stack([0.5 * t * (t - 1), 1 - t * t, 0.5 * t * (t + 1)], axis=-1)
-    return values, np.stack([t - 0.5, -2 * t, t + 0.5], axis=-1)
-
-
-def _shape_functions() -> tuple[FloatArray, FloatArray]:
-    """Values (9 points, 9 nodes) and local gradients (9, 9, 2)."""
-    value, slope = _quadratics(_POINTS)
-    values = np.einsum("pi,qj->pqij", value, value).reshape(9, 9)
-    first = np.einsum("pi,qj->pqij", slope, value).reshape(9, 9)
-    second = np.einsum("pi,qj->pqij", value, slope).reshape(9, 9)
-    return values, np.stack([first, second], axis=-1)
-
-
-def _shape_gradients(corners: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Gradients (m, 9 points, 9 nodes, 2), weights (m, 9) and places (m, 9, 2) at the integration points."""
-    values, local = _shape_functions()
-    jacobian = np.einsum("qal,eac->eqlc", local, corners)
-    determinant = np.linalg.det(jacobian)
-    gradient = np.einsum("eqcl,qal->eqac", np.linalg.inv(jacobian), local)
-    weight = np.abs(determinant) * np.outer(_WEIGHTS, _WEIGHTS).reshape(-1)
-    return gradient, weight, np.einsum("qa,eac->eqc", values, corners)
-
-
-def _linear_functions(place: FloatArray, weight: FloatArray) -> FloatArray:
-    """(m, 9, 3) the functions 1, x, z at the integration points, centred and scaled to the element."""
-    total = weight.sum(axis=1)[:, None, None]
-    middle = np.sum(weight[..., None] * place, axis=1, keepdims=True) / total
-    spread = np.sqrt(np.sum(weight[..., None] * (place - middle) ** 2, axis=1, keepdims=True) / total)
-    return np.concatenate([np.ones((*weight.shape, 1)), (place - middle) / spread], axis=2)
-
-
 # --- Exact surface response of the layered body without a lump, by Fourier transform along the skin.
 #
-# A pressure :math:`\cos kx` on the skin pushes it down by :math:`c(k) \cos kx`; :math:`c` comes from eight
-# exponential solutions of plane strain (four a layer) and the conditions on skin, boundary and wall.
+# A pressure :math:`\cos kx` on the skin pushes it down by :math:`c(k) \cos kx`, with the :math:`c` of a pressure
+# :math:`J_0(kr)`. For large k, :math:`c \to 2(1-\nu^2)/(Ek)`, the half-plane of fat.
 
 
 def surface_transfer(k_per_mm: FloatArray, layers: Layers) -> FloatArray:
-    r"""Downward displacement of the skin per unit of pressure that varies as cos kx; mm per kPa.
-
-    In each layer of depth range 0..H the displacements are combinations of :math:`e^{-kz}, z e^{-kz}` and of the same
-    measured from the layer's floor, which no thickness makes overflow (Johnson 1985, section 2.2 gives one such pair).
-    For large k, :math:`c \to 2(1-\nu^2)/(Ek)`, the half-plane of fat.
-    """
-    k = np.asarray(k_per_mm, dtype=np.float64)
-    nu, fat = layers.poisson, layers.fat_mm
-    gland = layers.thickness_mm - fat
-    # Depths are scaled by 1/k: one matrix for each wave number.
-    top0, top1 = _fields(k, 0.0, fat, nu, 1.0), _fields(k, fat, fat, nu, 1.0)
-    low0 = _fields(k, 0.0, gland, nu, layers.gland_ratio)
-    low1 = _fields(k, gland, gland, nu, layers.gland_ratio)
-    system = np.zeros((len(k), 8, 8))
-    system[:, 0:2, :4] = top0[:, 2:4]
-    system[:, 2:6, :4] = top1
-    system[:, 2:6, 4:] = -low0
-    system[:, 6:8, 4:] = low1[:, 0:2]
-    load = np.zeros((len(k), 8, 1))
-    load[:, 1, 0] = -1.0 / layers.fat_kpa
-    solution = np.linalg.solve(system, load)[..., 0]
-    return np.asarray(np.einsum("nj,nj->n", top0[:, 1], solution[:, :4]) / k)
-
-
-def _fields(k: FloatArray, z_mm: float, height_mm: float, nu: float, young: float) -> FloatArray:
-    """(n, 4, 4) rows u_x k, u_z k, shear and normal stress of the four solutions of a layer at depth `z_mm` in it.
-
-    u_x goes with sin kx, the other displacement and sigma_zz with cos kx; stresses per unit of fat modulus.
-    """
-    mu = young / (2 * (1 + nu))
-    up, down = np.exp(-k * z_mm), np.exp(-k * (height_mm - z_mm))
-    z, rest = k * z_mm, k * (height_mm - z_mm)
-    bulk = 3 - 4 * nu
-    one = np.ones_like(k)
-    shear, normal = 2 - 4 * nu, 4 - 4 * nu
-    first = np.stack([one, one, -2 * mu * one, -2 * mu * one], axis=1)
-    second = np.stack([z, z + bulk, -mu * (2 * z + shear), -mu * (2 * z + normal)], axis=1)
-    # Turned upside down, u_z and the shear change sign.
-    third = np.stack([one, -one, 2 * mu * one, -2 * mu * one], axis=1)
-    fourth = np.stack([rest, -(rest + bulk), mu * (2 * rest + shear), -mu * (2 * rest + normal)], axis=1)
-    columns = (first * up[:, None], second * up[:, None], third * down[:, None], fourth * down[:, None])
-    return np.stack(columns, axis=2)
+    """Downward displacement of the skin per unit of pressure that varies as cos kx, k above 0 in 1/mm; mm per kPa."""
+    moduli = (layers.fat_kpa, layers.fat_kpa * layers.gland_ratio)
+    body = LayeredBody(moduli, (layers.fat_mm, layers.thickness_mm - layers.fat_mm), layers.poisson)
+    return surface_flexibility(k_per_mm, body)
 
 
 def surface_compliance(offset_mm: FloatArray, *, cell_mm: float, layers: Layers) -> FloatArray:
@@ -338,7 +253,7 @@ def _held_on_axis(mesh: QuadMesh, *, even: bool) -> np.ndarray[tuple[int, ...], 
 
 
 def _hole_compliance(
-    mesh: QuadMesh, stiffness: csc_matrix, body: Body, *, edges_mm: FloatArray, even: bool
+    mesh: QuadMesh, stiffness: csc_array, body: Body, *, edges_mm: FloatArray, even: bool
 ) -> tuple[FloatArray, FloatArray]:
     """Displacements of rim (g, g) and of skin cells (c, g) per unit force on the rim's free unknowns."""
     held = _held_on_axis(mesh, even=even)
@@ -352,7 +267,7 @@ def _hole_compliance(
     rim = _rim_unknowns(mesh, body, held)
     load = np.zeros((len(free), len(rim)))
     load[place[rim], np.arange(len(rim))] = 1.0
-    solution = _solve(stiffness[free][:, free], load)
+    solution = solved(stiffness[free][:, free], load)
     skin = np.flatnonzero(z < 1e-9 * body.layers.thickness_mm)
     skin = skin[np.argsort(x[skin])]
     vertical = place[2 * skin + 1]
@@ -362,28 +277,18 @@ def _hole_compliance(
     return 0.5 * (at_rim + at_rim.T), average @ lowered
 
 
-def _solve(matrix: csc_matrix, sides: FloatArray) -> FloatArray:
-    """Solution of a symmetric positive definite system for many right-hand sides: one factorisation."""
-    factor = splu(matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-    return np.asarray(factor.solve(sides))
-
-
 def _rim_unknowns(mesh: QuadMesh, body: Body, held: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]) -> IntArray:
     unknowns = (2 * _rim(mesh, body)[:, None] + np.arange(2)).reshape(-1)
     return np.asarray(unknowns[~held[unknowns]])
 
 
-def _boundary_stiffness(mesh: QuadMesh, stiffness: csc_matrix, body: Body, *, even: bool) -> FloatArray:
+def _boundary_stiffness(mesh: QuadMesh, stiffness: csc_array, body: Body, *, even: bool) -> FloatArray:
     """(g, g) stiffness of a disc, condensed onto its rim."""
     held = _held_on_axis(mesh, even=even)
     rim = _rim_unknowns(mesh, body, held)
     inside = ~held
     inside[rim] = False
-    inner = np.flatnonzero(inside)
-    coupling = stiffness[inner][:, rim].toarray()
-    solved = _solve(stiffness[inner][:, inner], coupling)
-    condensed = stiffness[rim][:, rim].toarray() - coupling.T @ solved
-    return np.asarray(0.5 * (condensed + condensed.T))
+    return condensed(stiffness, rim, np.flatnonzero(inside))
 
 
 def _fill(at_hole: FloatArray, to_skin: FloatArray, disc: FloatArray) -> tuple[FloatArray, FloatArray]:

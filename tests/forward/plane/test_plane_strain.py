@@ -15,9 +15,16 @@ from scipy.sparse.linalg import spsolve
 
 from tactile_bayes.actions.study import fit_line
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.forward import plane_strain as strain
 from tactile_bayes.forward.line import build_line, slide
-from tactile_bayes.forward.mesh import QuadMesh, body_mesh, disc_mesh, joined, rectangle_mesh
+from tactile_bayes.forward.mesh import (
+    QuadMesh,
+    body_mesh,
+    disc_mesh,
+    joined,
+    lagrange_points,
+    quadrature,
+    rectangle_mesh,
+)
 from tactile_bayes.forward.plane_strain import (
     SurfaceCompliance,
     assemble,
@@ -59,8 +66,8 @@ def test_a_constant_strain_is_exact_on_distorted_elements(poisson: float) -> Non
 
 def body_force(mesh: QuadMesh, force: np.ndarray) -> np.ndarray:
     """(2n,) nodal forces of a force density given at the points of `quadrature_points`, (m, 9, 2)."""
-    _, weight, _ = strain._shape_gradients(mesh.nodes[mesh.elements])
-    values, _ = strain._shape_functions()
+    _, _, weight = quadrature(mesh.nodes[mesh.elements])
+    values, _, _ = lagrange_points()
     local = np.einsum("qa,eqc,eq->eac", values, force, weight)
     load = np.zeros((len(mesh.nodes), 2))
     np.add.at(load, mesh.elements, local)
@@ -69,13 +76,13 @@ def body_force(mesh: QuadMesh, force: np.ndarray) -> np.ndarray:
 
 def quadrature_points(mesh: QuadMesh) -> tuple[np.ndarray, np.ndarray]:
     """Positions (m, 9, 2) and weights (m, 9) in mm^2 of the integration points."""
-    _, weight, place = strain._shape_gradients(mesh.nodes[mesh.elements])
+    _, place, weight = quadrature(mesh.nodes[mesh.elements])
     return place, weight
 
 
 def interpolate(mesh: QuadMesh, values: np.ndarray) -> np.ndarray:
     """(m, 9, ...) values at the integration points of (n, ...) values at the nodes."""
-    shape, _ = strain._shape_functions()
+    shape, _, _ = lagrange_points()
     return np.einsum("qa,ea...->eq...", shape, values[mesh.elements])
 
 
