@@ -7,6 +7,8 @@ import os
 import select
 import signal
 import sys
+import termios
+import tty
 from contextlib import ExitStack, suppress
 from datetime import date
 from pathlib import Path
@@ -190,9 +192,6 @@ class Keys:
 
     def __enter__(self) -> Keys:
         if self._terminal:
-            import termios
-            import tty
-
             self._settings = termios.tcgetattr(sys.stdin)
             tty.setcbreak(sys.stdin)
         if self.waiting:
@@ -202,8 +201,6 @@ class Keys:
 
     def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
         if self._terminal:
-            import termios
-
             with contextlib.suppress(termios.error):  # the terminal was closed
                 termios.tcsetattr(sys.stdin, termios.TCSADRAIN, self._settings)
 

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import IO, Any, Final
 
 import numpy as np
+import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Chunk, Metadata, Schema
@@ -63,8 +64,6 @@ class Unpacker:
         raise ValueError(f"it is compressed by {chunk.compression[:20]!r}, which this program does not know")
 
     def _zstd(self, data: bytes, most: int) -> bytes:
-        import zstandard
-
         declared = zstandard.frame_content_size(data)  # -1 where the frame does not say
         if declared not in (-1, most):
             raise ValueError(f"its frame unpacks to {declared} bytes and it declares {most}")

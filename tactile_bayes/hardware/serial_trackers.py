@@ -10,6 +10,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
 
+from serial.tools.list_ports import comports
+
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import DeviceError
 from tactile_bayes.hardware import head
@@ -440,8 +442,6 @@ class FoundPort(NamedTuple):
 
 def list_ports() -> list[FoundPort]:
     """List the system's ports, in order, with a guess from their USB ids; opens none of them."""
-    from serial.tools.list_ports import comports
-
     found = [FoundPort(port.device, port.description or "", guess(port.vid, port.product or "")) for port in comports()]
     return sorted(found)
 

@@ -287,35 +287,32 @@ def draw_edges(axes: Axes, view: Orientation) -> None:
 
 def _draw_fit(axes: Axes, fit: FitContour, view: Orientation) -> None:
     """Draw the lump's size where there is one, and the fitted bump, which is wider than the lump, dashed."""
-    from matplotlib.patches import Ellipse
-
     bump = (2 * fit.sigma_x_mm, 2 * fit.sigma_y_mm)
     ellipses = [(bump, "--", 1.2, "fitted bump, 1 sigma (not the lump's edge)")]
     if fit.size_mm is not None:
         ellipses.insert(0, (fit.size_mm, "-", 1.8, "size, median {:.1f} by {:.1f} mm".format(*fit.size_mm)))
     centre = _pair(view, *fit.centre_mm)
-    for (along_x, along_y), dash, width, label in ellipses:
-        ellipse = Ellipse(
-            centre,
-            *_pair(view, along_x, along_y),
-            angle=-fit.angle_deg if view.swapped else fit.angle_deg,
-            fill=False,
-            edgecolor="white",
-            linewidth=width,
-            linestyle=dash,
-            label=label,
-        )
-        ellipse.set_path_effects(_outlined(width + 1.6))
-        axes.add_patch(ellipse)
+    for size_mm, dash, width, label in ellipses:
+        _draw_ellipse(axes, centre, size_mm, fit.angle_deg, view, linewidth=width, linestyle=dash, label=label)
     axes.plot(*centre, "+", color="white", markersize=9, markeredgewidth=1.6, path_effects=_outlined(3.2))
     place = (0.0, -0.13)  # below the picture, where it hides no cell
     axes.legend(loc="upper left", bbox_to_anchor=place, ncols=2, fontsize=8, facecolor="0.5", labelcolor="white")
 
 
-def _draw_masses(axes: Axes, masses: Sequence[NumberedMass], fit: FitContour | None, view: Orientation) -> None:
-    """Draw the number of each mass, and a cross and the size of those besides the fitted lump."""
+def _draw_ellipse(
+    axes: Axes, centre: Any, size_mm: tuple[float, float], angle_deg: float, view: Orientation, **line: Any
+) -> None:
+    """Draw an ellipse of the given diameters, outlined in black."""
     from matplotlib.patches import Ellipse
 
+    angle = -angle_deg if view.swapped else angle_deg
+    ellipse = Ellipse(centre, *_pair(view, *size_mm), angle=angle, fill=False, edgecolor="white", **line)
+    ellipse.set_path_effects(_outlined(line["linewidth"] + 1.6))
+    axes.add_patch(ellipse)
+
+
+def _draw_masses(axes: Axes, masses: Sequence[NumberedMass], fit: FitContour | None, view: Orientation) -> None:
+    """Draw the number of each mass, and a cross and the size of those besides the fitted lump."""
     for mass in masses:
         centre = _pair(view, *mass.centre_mm)
         above = max(mass.size_mm or (0.0, 0.0)) / 2.0
@@ -330,10 +327,7 @@ def _draw_masses(axes: Axes, masses: Sequence[NumberedMass], fit: FitContour | N
             continue
         axes.plot(*centre, "+", color="white", markersize=7, markeredgewidth=1.4, path_effects=_outlined(3.0))
         if mass.size_mm is not None:
-            angle = -mass.angle_deg if view.swapped else mass.angle_deg
-            ellipse = Ellipse(centre, *_pair(view, *mass.size_mm), angle=angle, fill=False, edgecolor="white")
-            ellipse.set_path_effects(_outlined(2.6))
-            axes.add_patch(ellipse)
+            _draw_ellipse(axes, centre, mass.size_mm, mass.angle_deg, view, linewidth=1.0)
 
 
 def _draw_places(axes: Axes, places: Sequence[Place], view: Orientation) -> None:

@@ -202,13 +202,11 @@ def _draw_grid(
     axes: Axes, worst: dict[tuple[float, float], float], title: str, limit: float, answer: Uniformity
 ) -> QuadMesh:
     """Radius across, shoulder up, colours on a logarithmic scale; the heads within the limit are outlined."""
-    from matplotlib.colors import LogNorm
-
     radii = sorted({key[0] for key in worst})
     shoulders = sorted({key[1] for key in worst})
     cells: FloatArray = np.array([[100 * worst.get((r, s), np.nan) for r in radii] for s in shoulders])
-    norm = LogNorm(_LEAST, _MOST)
-    mesh = axes.pcolormesh(np.arange(len(radii)), np.arange(len(shoulders)), cells, cmap="cividis", norm=norm)
+    places = np.arange(len(radii)), np.arange(len(shoulders))
+    mesh = axes.pcolormesh(*places, cells, cmap="cividis", norm="log", vmin=_LEAST, vmax=_MOST)
     for i, j in zip(*np.nonzero(cells <= 100 * limit), strict=True):
         axes.plot([j - 0.5, j + 0.5, j + 0.5, j - 0.5, j - 0.5], [i - 0.5, i - 0.5, i + 0.5, i + 0.5, i - 0.5], "k-")
     place = radii.index(answer.head.radius_mm), shoulders.index(answer.head.shoulder_mm)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -496,16 +496,14 @@ def _draw_line(
 
 def _draw_plane(axes: Axes, axis: AxisCalibration, d_mm: FloatArray, amplitude: FloatArray, sigma: FloatArray) -> None:
     """Where Eq 6 puts each diameter in the plane of amplitude and width; points in the colour of their true d."""
-    from matplotlib import colormaps
-    from matplotlib.colors import Normalize
-
-    norm, colours = Normalize(min(_DIAMETERS_MM), max(_DIAMETERS_MM)), colormaps["viridis"]
+    low, high = min(_DIAMETERS_MM), max(_DIAMETERS_MM)
+    looks: dict[str, Any] = {"vmin": low, "vmax": high, "cmap": "viridis", "edgecolors": "black", "linewidths": 0.4}
+    points = axes.scatter(amplitude, sigma, c=d_mm, s=22, **looks)
     m, b, e, f = axis.draws.mean(axis=0)[:4]
     a = np.geomspace(amplitude.min(), amplitude.max(), 100)
-    for d in _DIAMETERS_MM:
+    for d, colour in zip(_DIAMETERS_MM, points.to_rgba(np.array(_DIAMETERS_MM)), strict=True):
         width = (d - b) / m * e * a**f
         if (width > 0).any():
-            axes.plot(a, np.where(width > 0, width, np.nan), color=colours(norm(d)), label=f"d {d:g} mm")
-    axes.scatter(amplitude, sigma, c=d_mm, norm=norm, cmap=colours, s=22, edgecolors="black", linewidths=0.4)
+            axes.plot(a, np.where(width > 0, width, np.nan), color=colour, label=f"d {d:g} mm")
     axes.set_xscale("log")
     axes.set_ylim(0.0, 1.15 * sigma.max())
