@@ -17,7 +17,6 @@ import click
 import numpy as np
 
 from tactile_bayes.actions.exam import describe_scan
-from tactile_bayes.commands.devices import record_command
 from tactile_bayes.errors import BadDataError, DeviceError, UsageError
 from tactile_bayes.files.atomic import refuse_existing
 from tactile_bayes.files.provenance import Provenance, hash_inputs
@@ -181,7 +180,8 @@ def _pivot(url: str, protocol: str, duration_s: float) -> None:
 
 
 def replay_action(
-    ctx: click.Context,
+    record: Callable[..., object],
+    *,
     scan: Path,
     output: Path | None,
     live: bool,
@@ -190,7 +190,7 @@ def replay_action(
     speed: float,
     force: bool,
 ) -> None:
-    """Replay a scan through emulated devices, recorder and live view, as if it were being recorded."""
+    """Replay a scan through emulated devices, recorder and live view, as if it were being recorded by `record`."""
     if output is not None:
         refuse_existing(output, force=force)
     found = read_scan(scan)
@@ -200,7 +200,7 @@ def replay_action(
         options |= {f"{role}_url": url for role, url in urls.items()} | {"tracker_protocol": "open"}
         if found.landmarks is not None:
             options["landmarks"] = scan
-        ctx.invoke(record_command, **options)
+        record(**options)
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, get_args
 
 import click
@@ -152,7 +153,7 @@ def replay_command(ctx: click.Context, /, **given: Any) -> None:
     """
     from tactile_bayes.actions.devices import replay_action
 
-    replay_action(ctx, **given)
+    replay_action(partial(ctx.invoke, record_command), **given)
 
 
 # --- `repair`: close a scan file that was cut off.
