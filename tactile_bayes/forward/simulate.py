@@ -1,4 +1,4 @@
-"""Simulation of a scan with known truth, by one of four forward models."""
+"""Simulation of a scan with known truth, by one of four forward models; the solid one stands in `solid`."""
 
 from __future__ import annotations
 
@@ -7,16 +7,20 @@ from typing import Final
 
 import numpy as np
 
-from tactile_bayes.declarations import as_dict, replace
+from tactile_bayes.declarations import Record, as_dict, replace
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.forward.instrument import SimulatedScan, head_positions, level_kpa, record
-from tactile_bayes.forward.plane_scan import frames_at_poses as plane_frames_at_poses
-from tactile_bayes.forward.plane_scan import simulate_plane
-from tactile_bayes.forward.scene import Scene, normalised_pressure, refuse_bumps
+from tactile_bayes.forward.contact import Head
+from tactile_bayes.forward.instrument import SimulatedScan, frame_times, head_positions, level_kpa, record
+from tactile_bayes.forward.line import EmpiricalModel, fit_empirical, press, press_layers
+from tactile_bayes.forward.mesh import REACH_MM
+from tactile_bayes.forward.plane_strain import SurfaceCompliance, condense
+from tactile_bayes.forward.scene import Scene, normalised_pressure, refuse_bumps, tissue_truth
 from tactile_bayes.forward.solid import frames_at_poses, simulate_solid
+from tactile_bayes.forward.tissue import MOST_SEAT, Body, Layers, SceneBody, SolidLump, fat_thickness
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.presets import SHOULDERS_INSIDE
 
+Progress = Callable[[int, int], None]
 FIDELITIES: Final = ("empirical-gaussian", "empirical", "plane-strain", "solid")
 """A bump's own formula; and for lumps of tissue Eqs 1 to 4, a body in two dimensions, and one in three."""
 
@@ -27,7 +31,7 @@ def simulate(
     rng: np.random.Generator,
     fidelity: str | None = None,
     head: str | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> SimulatedScan:
     """Make a scan from a scene: frames at ``k / frame_rate_hz``; poses at ``k / pose_rate_hz``, stamped late by the
     latency.
@@ -74,7 +78,7 @@ def felt_at_poses(
     mean_kpa: FloatArray,
     fidelity: str | None = None,
     head: str | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> FloatArray:
     """Pressure in kPa, (n, rows, columns), that a model's head feels at given poses and mean pressures, without any
     noise.
@@ -132,3 +136,276 @@ def _gaussian_frames(
     if share_load:
         shape /= shape.mean(axis=(1, 2), keepdims=True)
     return np.asarray(level[:, None, None] * shape)
+
+
+# --- Scans in two dimensions of one lump of tissue: a cylinder along y under the head, solved or by Eqs 1 to 4.
+#
+# Nothing changes along y. Each column of taxels feels what a head of the same section feels at that column's place
+# across the lump: its profile is repeated along the head. The head stays level in this: tilts are in the poses, not in
+# the pressures, and how deep the head sinks is not followed.
+
+Sections = Callable[[FloatArray, FloatArray], FloatArray]
+"""Profiles (m, rows) in kPa of a head at (m,) places from the lump's axis, with (m,) mean pressures in kPa."""
+
+# Contact cells per taxel, and how far apart the places of neighbouring sections of one head may be.
+_CELLS_A_TAXEL = 6
+_APART_MM = 0.25
+_FRAMES_AT_ONCE = 100
+_SHAPE = "a cylinder along y: each frame's profile across the head is repeated along it"
+
+
+def simulate_plane(
+    scene: Scene,
+    *,
+    rng: np.random.Generator,
+    fidelity: str,
+    shoulders: str = SHOULDERS_INSIDE,
+    progress: Progress | None = None,
+) -> SimulatedScan:
+    """Make a scan in two dimensions of a scene that gives tissue: at most one lump, whose section is a circle, and no
+    rib.
+
+    ``fidelity="plane-strain"`` solves the head's contact at each place and force; ``"empirical"`` takes Eqs 1 to 4 as
+    printed, fitted to two frames of the plane-strain model at the nominal pressure, and scaled with the pressure.
+    `shoulders` is one of `presets.HEADS`. `rng` is the instrument's alone; `progress` is called with frames done and
+    frames in all.
+    """
+    section = plane_section(scene, fidelity, shoulders=shoulders)
+    sections = section.empirical if fidelity == "empirical" else section.solved
+    time = frame_times(scene)
+    pressure = plane_frames(scene, time, sections, lump_x_mm=section.x_mm, progress=progress)
+    truth = {"model": fidelity, "shape": _SHAPE, "head": shoulders, **tissue_truth(scene)}
+    return record(scene, felt=lambda at: pressure[np.searchsorted(time, at)], truth=truth, rng=rng)
+
+
+class PlaneSection(Record, eq=False):
+    """A scene's section across the lump."""
+
+    head: Head
+    """Section of the head: shoulders of the scene's `shoulder_mm`, or its `rim_mm` where that is 0."""
+    layers: Layers
+    """The body without the lump."""
+    lump: tuple[Body, float] | None
+    """Below the skin; None for nothing."""
+    x_mm: float
+    """Place of the lump's axis."""
+    mean_kpa: float
+    cell_mm: float
+    """`mean_kpa`, `cell_mm`: The nominal pressure; width of the contact's cells, of which a taxel has six."""
+    reach_mm: float
+    """How far from the lump's axis the head's edges get."""
+
+    def surface(self) -> SurfaceCompliance:
+        """Compliance of the skin over the lump."""
+        assert self.lump is not None
+        return condense(self.lump[0], reach_mm=self.reach_mm, cell_mm=self.cell_mm)
+
+    @property
+    def solved(self) -> Sections:
+        """Sections from the contact problem."""
+        if self.lump is None:
+            return self._plain
+        surface, ratio, head = self.surface(), self.lump[1], self.head
+
+        def sections(x_mm: FloatArray, mean_kpa: FloatArray) -> FloatArray:
+            return _taxels(press(surface, ratio, x_mm, head=head, mean_kpa=mean_kpa).pressure_kpa)
+
+        return sections
+
+    @property
+    def empirical(self) -> Sections:
+        """Sections from Eqs 1 to 4."""
+        if self.lump is None:
+            return self._plain
+        model, s = self.empirical_model()
+
+        def sections(x_mm: FloatArray, mean_kpa: FloatArray) -> FloatArray:
+            share = mean_kpa / self.mean_kpa
+            return np.asarray(share[:, None] * model.surface_pressure(s[None, :], x_mm[:, None]))
+
+        return sections
+
+    def empirical_model(self) -> tuple[EmpiricalModel, FloatArray]:
+        """Eqs 1 to 4 fitted to what taxels see far from and over the lump, and the taxels' places across the head."""
+        assert self.lump is not None
+        far = press_layers(self.layers, head=self.head, mean_kpa=self.mean_kpa, cell_mm=self.cell_mm)
+        over = press(self.surface(), self.lump[1], np.zeros(1), head=self.head, mean_kpa=self.mean_kpa)
+        s = _taxels(over.s_mm[None])[0]
+        model = fit_empirical(
+            s,
+            _taxels(far.pressure_kpa)[0],
+            _taxels(over.pressure_kpa)[0],
+            d_mm=self.lump[0].d_mm,
+            half_width_mm=self.head.half_width_mm,
+        )
+        return model, s
+
+    def _plain(self, x_mm: FloatArray, mean_kpa: FloatArray) -> FloatArray:
+        """Section over the body without a lump, which is the same at every place."""
+        del x_mm
+        found = press_layers(self.layers, head=self.head, mean_kpa=mean_kpa, cell_mm=self.cell_mm)
+        return _taxels(found.pressure_kpa)
+
+
+def plane_section(scene: Scene, fidelity: str, *, shoulders: str = SHOULDERS_INSIDE) -> PlaneSection:
+    """Prepare the section of a scene; a key that two dimensions cannot follow is an error."""
+    refuse_bumps(scene, fidelity)
+    many = "a rib" if scene.ribs else f"{len(scene.solid_lumps)} lumps" if len(scene.solid_lumps) > 1 else ""
+    if many:
+        raise BadDataError(
+            f"the scene has {many}", way_out=f"the {fidelity} model has one lump and no rib; use --fidelity solid"
+        )
+    body = scene.body or SceneBody()
+    fat = fat_thickness(body, scene.solid_lumps)
+    layers = Layers(fat, body.thickness_mm, body.fat_kpa, body.gland_ratio, body.nu)
+    lump = _cylinder(scene.solid_lumps[0], body, fat, fidelity) if scene.solid_lumps else None
+    x_mm = scene.solid_lumps[0].x_mm if scene.solid_lumps else 0.0
+    width = scene.head.rows * scene.head.pitch_mm
+    if shoulders == SHOULDERS_INSIDE and scene.head.rim_mm > width / 2:
+        raise BadDataError(
+            f"head.rim_mm is {scene.head.rim_mm:g}",
+            way_out=f"in two dimensions the rim is cut into the array: give at most {width / 2:g} mm",
+        )
+    head, cell_mm = scene.head.section(shoulders), scene.head.pitch_mm / _CELLS_A_TAXEL
+    return PlaneSection(
+        head,
+        layers,
+        lump,
+        x_mm,
+        scene.background.mean_kpa,
+        cell_mm,
+        _reach(scene, x_mm, 0.5 * cell_mm * len(head.sensing_cells(cell_mm)), layers.thickness_mm),
+    )
+
+
+def _cylinder(lump: SolidLump, body: SceneBody, fat_mm: float, fidelity: str) -> tuple[Body, float]:
+    """Body and stiffness ratio of the lump's section."""
+    if lump.height_mm is not None and lump.height_mm != lump.d_mm:
+        raise BadDataError(
+            f"lump[0].height_mm is {lump.height_mm:g}",
+            way_out=f"the {fidelity} model has a circle: leave it out, or use --fidelity solid",
+        )
+    seat = (fat_mm - lump.depth_mm) / (lump.d_mm / 2)
+    if not -1e-9 <= seat <= MOST_SEAT + 1e-9:
+        raise BadDataError(
+            f"the gland lies {fat_mm:g} mm deep, which seats lump[0] at {seat:.3g}",
+            way_out=f"the {fidelity} model has seats from 0 to {MOST_SEAT:g}; use --fidelity solid",
+        )
+    seat = float(np.clip(seat, 0.0, MOST_SEAT))
+    try:
+        section = Body(lump.d_mm, lump.depth_ratio, seat, body.thickness_mm, body.fat_kpa, body.gland_ratio, body.nu)
+    except BadDataError as error:
+        raise BadDataError(f"lump[0]: {error.what}", way_out=error.way_out) from None
+    return section, lump.stiffness_ratio
+
+
+def _reach(scene: Scene, lump_x_mm: float, half_width_mm: float, thickness_mm: float) -> float:
+    """Largest distance of the head's edges from the lump; an error where the mesh ends before."""
+    along = scene.head.columns * scene.head.pitch_mm / 2
+    wander = scene.strokes.half_length_mm + scene.strokes.wander_mm + along
+    reach = wander + abs(lump_x_mm) + half_width_mm + 1.0
+    most = REACH_MM + thickness_mm
+    if reach > most:
+        raise BadDataError(
+            f"the head gets {reach:.4g} mm from the lump (strokes.half_length_mm {scene.strokes.half_length_mm:g}, "
+            f"a head {2 * half_width_mm:g} mm wide)",
+            way_out=f"the mesh reaches {most:g} mm: shorten the strokes or narrow the head",
+        )
+    return reach
+
+
+def plane_frames(
+    scene: Scene, time_s: FloatArray, sections: Sections, *, lump_x_mm: float, progress: Progress | None = None
+) -> FloatArray:
+    """(n, rows, columns) kPa that the taxels feel at (n,) times, before any noise.
+
+    A head turned about the normal has its columns at different places across the lump. Sections are computed no more
+    than 0.25 mm apart and interpolated between.
+    """
+    rotation, origin = head_positions(scene, time_s)
+    level = level_kpa(scene.background, time_s)
+    return _frames_at(scene, rotation, origin, level, sections, lump_x_mm=lump_x_mm, progress=progress)
+
+
+def plane_frames_at_poses(
+    scene: Scene,
+    rotation: FloatArray,
+    origin_mm: FloatArray,
+    *,
+    mean_kpa: FloatArray,
+    fidelity: str,
+    shoulders: str = SHOULDERS_INSIDE,
+    progress: Progress | None = None,
+) -> FloatArray:
+    """Pressure in kPa, (n, rows, columns), that the scene's head feels at given poses and mean pressures, without
+    noise.
+
+    Rotations lead from `scanhead` to the scene's `plane`; tilts are not followed and depths not used. A pose beyond the
+    skin that can be solved for is an error.
+    """
+    section = plane_section(scene, fidelity, shoulders=shoulders)
+    half_face = 0.5 * section.cell_mm * len(section.head.sensing_cells(section.cell_mm))
+    place = _column_places(scene, rotation, origin_mm) - section.x_mm
+    reach, most = float(np.abs(place).max()) + half_face + 1.0, REACH_MM + section.layers.thickness_mm
+    if reach > most:
+        raise BadDataError(
+            f"the head gets {reach:.4g} mm from the lump", way_out=f"the {fidelity} model reaches {most:g} mm"
+        )
+    section = replace(section, reach_mm=reach)
+    sections = section.empirical if fidelity == "empirical" else section.solved
+    return _frames_at(scene, rotation, origin_mm, mean_kpa, sections, lump_x_mm=section.x_mm, progress=progress)
+
+
+def _column_places(scene: Scene, rotation: FloatArray, origin_mm: FloatArray) -> FloatArray:
+    """(n, columns) place of each column of taxels across the scene's `plane`."""
+    along = (np.arange(scene.head.columns) - (scene.head.columns - 1) / 2) * scene.head.pitch_mm
+    return np.asarray(origin_mm[:, :1] + rotation[:, 0, 1, None] * along)
+
+
+def _frames_at(
+    scene: Scene,
+    rotation: FloatArray,
+    origin_mm: FloatArray,
+    level_kpa: FloatArray,
+    sections: Sections,
+    *,
+    lump_x_mm: float,
+    progress: Progress | None,
+) -> FloatArray:
+    """(n, rows, columns) kPa from sections at the places of the head's columns."""
+    place = _column_places(scene, rotation, origin_mm) - lump_x_mm
+    count = len(level_kpa)
+    pressure = np.zeros((count, scene.head.rows, scene.head.columns))
+    pressed = np.flatnonzero(level_kpa > 0)
+    for chunk in np.array_split(pressed, max(1, len(pressed) // _FRAMES_AT_ONCE)):
+        across = [_places(place[i]) for i in chunk]
+        many = [len(x) for x in across]
+        profile = (
+            sections(np.concatenate(across), np.repeat(level_kpa[chunk], many)) if len(chunk) else np.zeros((0, 0))
+        )
+        for i, x, mine in zip(chunk, across, np.split(profile, np.cumsum(many)[:-1]), strict=bool(len(chunk))):
+            pressure[i] = _interpolated(x, mine, place[i]).T
+        if progress is not None and len(chunk):
+            progress(int(chunk[-1]) + 1, count)
+    return pressure
+
+
+def _places(place_mm: FloatArray) -> FloatArray:
+    """(m,) equally spaced places of sections that span those of the columns."""
+    low, high = float(place_mm.min()), float(place_mm.max())
+    return np.linspace(low, high, 1 + int(np.ceil((high - low) / _APART_MM - 1e-9)))
+
+
+def _interpolated(x_mm: FloatArray, profile: FloatArray, place_mm: FloatArray) -> FloatArray:
+    """(c, rows) profiles at `place_mm` between (m, rows) ones at equal steps."""
+    if len(x_mm) == 1:
+        return np.repeat(profile, len(place_mm), axis=0)
+    at = (place_mm - x_mm[0]) / (x_mm[1] - x_mm[0])
+    below = np.clip(at.astype(np.intp), 0, len(x_mm) - 2)
+    share = (at - below)[:, None]
+    return np.asarray((1 - share) * profile[below] + share * profile[below + 1])
+
+
+def _taxels(cells: FloatArray) -> FloatArray:
+    """(m, rows) means over whole taxels from (m, rows x cells) values."""
+    return np.asarray(cells.reshape(len(cells), -1, _CELLS_A_TAXEL).mean(axis=2))
