@@ -61,7 +61,7 @@ def emulate_action(
         click.echo(f"{role} {link.url}" if kind == "both" else link.url)
     ask_for_priority()  # a real device does not wait for this computer's other programs
     emulators = [
-        _emulator(device, link, faults, stage, leads=number == 0, seed=seed + number)
+        Emulator(device, link, faults=faults, rng=np.random.default_rng(seed + number), stage=stage, leads=number == 0)
         for number, (device, link) in enumerate(zip(devices, links, strict=True))
     ]
     try:
@@ -69,10 +69,6 @@ def emulate_action(
     finally:
         for role, emulator in zip(roles, emulators, strict=True):
             click.echo(_account(role if kind == "both" else "", emulator.served), err=True)
-
-
-def _emulator(device: Device, link: Link, faults: Faults, stage: Stage, *, leads: bool, seed: int) -> Emulator:
-    return Emulator(device, link, faults=faults, rng=np.random.default_rng(seed), stage=stage, leads=leads)
 
 
 def _serve(emulators: list[Emulator], *, once: bool) -> None:

@@ -342,7 +342,7 @@ def _open_kept(output: Path | None, settings: dict[str, Any]) -> Iterator[BatchS
     if output is None:
         yield None
         return
-    with open_store(_kept(output), settings=settings, encode=_encode_ranks, decode=_decode_ranks) as store:
+    with open_store(_kept(output), settings=settings, encode=as_dict, decode=_decode_ranks) as store:
         yield store
 
 
@@ -354,10 +354,6 @@ def _finish(outcomes: list[Outcome[MapRanks]], output: Path | None) -> int:
     if output is not None and not failed:
         _kept(output).unlink(missing_ok=True)
     return len(failed)
-
-
-def _encode_ranks(one: MapRanks) -> dict[str, Any]:
-    return as_dict(one)
 
 
 def _decode_ranks(value: dict[str, Any]) -> MapRanks:

@@ -115,7 +115,7 @@ def _json(path: Path) -> dict[str, Any]:
     if not isinstance(schema, str) or not schema.startswith("tactile-bayes/"):
         raise _foreign(path)
     if schema.startswith("tactile-bayes/size-calibration/"):
-        return _size_calibration(path, document)
+        return _described(read_size_calibration(path), document)
     if schema.startswith("tactile-bayes/site-calibration/"):
         return _site_calibration(path, document)
     if schema.startswith("tactile-bayes/repeatability/"):
@@ -162,10 +162,6 @@ def _repeatability(path: Path, document: dict[str, Any]) -> dict[str, Any]:
         "left_out": document["left_out"],
         "provenance": provenance,
     }
-
-
-def _size_calibration(path: Path, document: dict[str, Any]) -> dict[str, Any]:
-    return _described(read_size_calibration(path), document)
 
 
 def _described(calibration: Calibration, document: dict[str, Any]) -> dict[str, Any]:

@@ -29,7 +29,7 @@ from tactile_bayes.forward.mesh import (
     solved,
     stiffness_factor,
 )
-from tactile_bayes.forward.tissue import FAT_KPA, GLAND_RATIO, POISSON
+from tactile_bayes.forward.tissue import FAT_KPA, GLAND_RATIO, POISSON, Layers
 from tactile_bayes.geometry import FloatArray
 
 # --- Sinking of a layered body's skin under normal loads: its exact Green's function, and means over taxels.
@@ -68,6 +68,12 @@ class LayeredBody(Record):
                     raise BadDataError(f"{name}[{i}] is {value}", way_out="it must be above 0")
         if not -1 < self.nu <= 0.5:
             raise BadDataError(f"nu is {self.nu}", way_out="it must lie above -1 and at most 0.5")
+
+    @classmethod
+    def of(cls, layers: Layers) -> LayeredBody:
+        """Fat over gland on a rigid chest wall."""
+        moduli = (layers.fat_kpa, layers.fat_kpa * layers.gland_ratio)
+        return cls(moduli, (layers.fat_mm, layers.thickness_mm - layers.fat_mm), layers.poisson)
 
     @property
     def on_rigid_base(self) -> bool:

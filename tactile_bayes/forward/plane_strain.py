@@ -80,9 +80,7 @@ def skin_average(x_mm: FloatArray, *, edges_mm: FloatArray, even: bool) -> Float
 
 def surface_transfer(k_per_mm: FloatArray, layers: Layers) -> FloatArray:
     """Downward displacement of the skin per unit of pressure that varies as cos kx, k above 0 in 1/mm; mm per kPa."""
-    moduli = (layers.fat_kpa, layers.fat_kpa * layers.gland_ratio)
-    body = LayeredBody(moduli, (layers.fat_mm, layers.thickness_mm - layers.fat_mm), layers.poisson)
-    return surface_flexibility(k_per_mm, body)
+    return surface_flexibility(k_per_mm, LayeredBody.of(layers))
 
 
 def surface_compliance(offset_mm: FloatArray, *, cell_mm: float, layers: Layers) -> FloatArray:
@@ -204,7 +202,8 @@ def condense(
     row = surface_compliance(2 * half[-1] * np.arange(2 * count) / (2 * count), cell_mm=cell_mm, layers=body.layers)
     hole = body_mesh(body, fineness=fineness)
     disc = disc_mesh(body, fineness=fineness, layered=False)
-    filling = disc_mesh(body, fineness=fineness, layered=True) if _is_layered(body) else disc
+    cut = body.seat < 1.0 and body.gland_ratio != 1.0  # the lump, by the fat-gland boundary
+    filling = disc_mesh(body, fineness=fineness, layered=True) if cut else disc
     stiffness = [assemble(mesh, young_kpa=_tissue(mesh, body), poisson=body.poisson) for mesh in (hole, filling)]
     unit = assemble(disc, young_kpa=np.ones(len(disc.elements)), poisson=body.poisson)
     parts: list[list[FloatArray]] = [[], [], [], []]
@@ -220,11 +219,6 @@ def condense(
     return SurfaceCompliance(
         body, edges, row, own_shapes, np.concatenate(parts[1]), lump_shapes, np.concatenate(parts[3])
     )
-
-
-def _is_layered(body: Body) -> bool:
-    """True when the fat-gland boundary cuts the lump."""
-    return body.seat < 1.0 and body.gland_ratio != 1.0
 
 
 def _tissue(mesh: QuadMesh, body: Body) -> FloatArray:

@@ -42,9 +42,7 @@ def simulate(
     in three dimensions, and inside the array in two. `progress` is called with frames done and frames in all; the bumps
     alone are too quick to call it.
     """
-    chosen = scene.fidelity if fidelity is None else fidelity
-    if chosen not in FIDELITIES:
-        raise BadDataError(f"fidelity is {chosen!r}", way_out=f"choose {', '.join(FIDELITIES)}")
+    chosen = _chosen(scene, fidelity)
     if head is not None:
         if chosen == "empirical-gaussian":
             raise BadDataError(
@@ -61,6 +59,13 @@ def simulate(
     if scene.solid_lumps or scene.ribs:
         raise _tissue_for_bumps(scene)
     return _simulate_gaussian(scene, rng=rng)
+
+
+def _chosen(scene: Scene, fidelity: str | None) -> str:
+    chosen = scene.fidelity if fidelity is None else fidelity
+    if chosen not in FIDELITIES:
+        raise BadDataError(f"fidelity is {chosen!r}", way_out=f"choose {', '.join(FIDELITIES)}")
+    return chosen
 
 
 def _tissue_for_bumps(scene: Scene) -> BadDataError:
@@ -86,9 +91,7 @@ def felt_at_poses(
     Tissue and head of the scene are used; strokes, noise and tracker are not. Rotations (n, 3, 3) and origins (n, 3) of
     the head's face lead from `scanhead` to the scene's `plane`; the rest is as in `simulate`.
     """
-    chosen = scene.fidelity if fidelity is None else fidelity
-    if chosen not in FIDELITIES:
-        raise BadDataError(f"fidelity is {chosen!r}", way_out=f"choose {', '.join(FIDELITIES)}")
+    chosen = _chosen(scene, fidelity)
     if chosen == "empirical-gaussian":
         if scene.solid_lumps or scene.ribs:
             raise _tissue_for_bumps(scene)
@@ -110,19 +113,12 @@ def felt_at_poses(
 
 
 def _simulate_gaussian(scene: Scene, *, rng: np.random.Generator) -> SimulatedScan:
-    truth = {
-        "model": "gaussian",
-        "lumps": [as_dict(lump) for lump in scene.lumps],
-        "background": as_dict(scene.background),
-    }
-    return record(scene, felt=lambda time_s: _pressure(scene, time_s), truth=truth, rng=rng)
+    def felt(time_s: FloatArray) -> FloatArray:
+        poses, level = head_positions(scene, time_s), level_kpa(scene.background, time_s)
+        return _gaussian_frames(scene, *poses, level, share_load=scene.background.load_sharing)
 
-
-def _pressure(scene: Scene, time_s: FloatArray) -> FloatArray:
-    """(n, rows, columns) kPa at (n,) times."""
-    rotation, origin = head_positions(scene, time_s)
-    level = level_kpa(scene.background, time_s)
-    return _gaussian_frames(scene, rotation, origin, level, share_load=scene.background.load_sharing)
+    lumps, background = [as_dict(lump) for lump in scene.lumps], as_dict(scene.background)
+    return record(scene, felt=felt, truth={"model": "gaussian", "lumps": lumps, "background": background}, rng=rng)
 
 
 def _gaussian_frames(

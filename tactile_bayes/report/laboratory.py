@@ -72,14 +72,10 @@ def sbc_document(
         "elsewhere": as_dict(others) | {"too_many": others.too_many},
         "draws": DRAWS,
         "maps_per_s": maps_per_s,
-        "parameters": [_as_dict(one) for one in tests],
+        "parameters": [as_dict(one) | {"inside_band": one.inside, "verdict": verdict(one)} for one in tests],
         "p_together": min(1.0, len(tests) * min(one.ecdf_p for one in tests)) if tests else None,
         "research_use": RESEARCH_USE,
     }
-
-
-def _as_dict(test: RankTest) -> dict[str, Any]:
-    return as_dict(test) | {"inside_band": test.inside, "verdict": verdict(test)}
 
 
 def verdict(test: RankTest) -> str:
@@ -151,13 +147,7 @@ def _conclusion(parameters: list[dict[str, Any]], together: float) -> Iterator[s
 
 def table_text(maps: Sequence[MapRanks]) -> str:
     """CSV with one row per map: truth, ranks (empty without an estimate) and outcome."""
-    header = [
-        "map",
-        *names_of(Truth),
-        *(f"rank_{name}" for name in RANKED),
-        "outcome",
-        "probability",
-    ]
+    header = ["map", *names_of(Truth), *(f"rank_{name}" for name in RANKED), "outcome", "probability"]
     return "\n".join([",".join(header), *(_table_row(one) for one in maps)]) + "\n"
 
 

@@ -238,6 +238,7 @@ def _draw_shares(axes: Axes, one: Uniformity, tissue: HomogeneousTissue, limit: 
 # --- A scan against forward models, as text and as plain data.
 
 DEFINITION = "MSD = sum of squared differences over the sum of squares of the model (docs/decisions/0007)"
+_SLOPE = ("slope_x_per_10mm", "slope_y_per_10mm", "rms_beside_slope")
 _PRINTED = {"frames_centre": "below 15", "map_centre": "below 2.6"}
 _ROWS = {
     "frames_all": "frames, all taxels, MSD %",
@@ -307,7 +308,7 @@ def comparison_document(
                 **{name: _number(getattr(one, name)) for name in (*_ROWS, "rms_kpa")},
                 **_shape_document(one.lump),
                 **_line_document(line_bump(measured, one.tactile_map)),
-                **_slope_document(residual_slope(measured, one)),
+                **dict(zip(_SLOPE, residual_slope(measured, one), strict=True)),
             }
             for one in found
         ],
@@ -333,10 +334,6 @@ def _shape_document(lump: BumpFit | None) -> dict[str, float | None]:
 
 def _line_document(bump: tuple[float, float]) -> dict[str, float]:
     return {"line_amplitude": bump[0], "line_sigma_mm": bump[1]}
-
-
-def _slope_document(slope: tuple[float, float, float]) -> dict[str, float]:
-    return dict(zip(("slope_x_per_10mm", "slope_y_per_10mm", "rms_beside_slope"), slope, strict=True))
 
 
 def _number(value: float) -> float | None:

@@ -23,6 +23,7 @@ from tactile_bayes.studies.paper import (
     ALIKE,
     DETECTABLE,
     HARD_RATIO,
+    CaseSettings,
     Fit,
     Lookalikes,
     StudyRow,
@@ -221,9 +222,13 @@ def _frames_of_lumps(
         finish(right, f"(b) over the lump: {title}", _ON_HEAD, "pressure (kPa)", headroom=0.15)
 
 
+def _plain_layers(settings: CaseSettings, fat_mm: float) -> Layers:
+    return Layers(fat_mm, THICKNESS_MM, settings.fat_kpa, settings.gland_ratio, settings.poisson)
+
+
 def _draw_far(axes: Axes, settings: StudySettings, fat_mm: float, colour: str) -> None:
     """P1 on one thickness of fat; on one of them, Eq 1 fitted to what the taxels see."""
-    layers = Layers(fat_mm, THICKNESS_MM, settings.fat_kpa, settings.gland_ratio, settings.poisson)
+    layers = _plain_layers(settings, fat_mm)
     frame = press_layers(layers, head=settings.head, mean_kpa=settings.mean_kpa, cell_mm=settings.cell_mm)
     axes.plot(frame.s_mm, frame.pressure_kpa[0], color=colour, label=f"fat {fat_mm:g} mm")
     if fat_mm == _FITTED_FAT_MM:
@@ -238,8 +243,7 @@ def _frames_of_balls(settings: SolidSettings, path: Path, *, seat: float, force:
     s = settings.head.surface_mm()[:, 0, 0]
     with _panels(path, _caption("Figure 5", settings, seat), force=force) as (left, right):
         for colour, fat in zip(COLOURS, _FAT_MM, strict=False):
-            moduli = (settings.fat_kpa, settings.fat_kpa * settings.gland_ratio)
-            plain = solid_head(face_of(settings.head), LayeredBody(moduli, (fat, THICKNESS_MM - fat), settings.poisson))
+            plain = solid_head(face_of(settings.head), LayeredBody.of(_plain_layers(settings, fat)))
             left.plot(s, _middle_frame(plain, [], settings), color=colour, label=f"fat {fat:g} mm")
         for colour, (d, h) in zip(COLOURS, _BALLS, strict=False):
             body = settings.body(d, h, seat=seat)

@@ -207,10 +207,7 @@ class SolidSettings(CaseSettings):
 
     def on(self, body: Body) -> SolidHead:
         """The head on the body without a lump."""
-        layers = body.layers
-        moduli = (body.fat_kpa, body.fat_kpa * body.gland_ratio)
-        thicknesses = (layers.fat_mm, layers.thickness_mm - layers.fat_mm)
-        return solid_head(face_of(self.head), LayeredBody(moduli, thicknesses, body.poisson))
+        return solid_head(face_of(self.head), LayeredBody.of(body.layers))
 
     def placed(self, condensed: CondensedLump, stiffness_ratio: float) -> PlacedLump:
         """The lump under the middle of the raster."""
