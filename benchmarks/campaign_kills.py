@@ -38,7 +38,7 @@ import psutil
 from benchmarks.campaign_cluster import Cluster
 from benchmarks.campaign_scale import entries
 from benchmarks.campaign_scans import Faults, make
-from tactile_bayes.files.campaign_names import JOURNAL
+from tactile_bayes.files.manifest_csv import JOURNAL
 
 WHAT: Final = ("local", "repeats", "client", "worker", "scheduler")
 MASSES, REPEATS = 6, 3

@@ -33,8 +33,7 @@ from tactile_bayes.campaign import tables as campaign_tables
 from tactile_bayes.campaign.inputs import Sources, open_campaign
 from tactile_bayes.campaign.settings import CampaignSettings
 from tactile_bayes.campaign.steps import Task
-from tactile_bayes.files.campaign_names import ESTIMATE, EXAMS, JOURNAL
-from tactile_bayes.files.manifest_csv import Exam
+from tactile_bayes.files.manifest_csv import ESTIMATE, EXAMS, JOURNAL, Exam
 
 
 @contextmanager

@@ -30,7 +30,7 @@ import numpy as np
 import psutil
 
 from benchmarks.campaign_cluster import Cluster
-from tactile_bayes.files.campaign_names import JOURNAL
+from tactile_bayes.files.manifest_csv import JOURNAL
 
 PORT, SAMPLE_S = 18786, 5.0
 

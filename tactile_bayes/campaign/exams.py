@@ -11,8 +11,7 @@ from typing import Any, Final
 from tactile_bayes.declarations import Record, field
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.atomic import sha256
-from tactile_bayes.files.campaign_names import JOURNAL
-from tactile_bayes.files.manifest_csv import natural
+from tactile_bayes.files.manifest_csv import JOURNAL, natural
 from tactile_bayes.files.map_nc import read_map_and_scans
 from tactile_bayes.files.remote import check_address, fetched, files_below, is_address
 

@@ -20,8 +20,7 @@ from tactile_bayes.campaign.steps import FILES, UNWRITTEN, Result
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError, TactileBayesError, UsageError
 from tactile_bayes.files.atomic import sha256, unwritable
-from tactile_bayes.files.campaign_names import EXAMS, GROWTH, JOURNAL, MASSES
-from tactile_bayes.files.manifest_csv import Exam
+from tactile_bayes.files.manifest_csv import EXAMS, GROWTH, JOURNAL, MASSES, Exam
 from tactile_bayes.files.remote import sha256_of, version_of
 
 # --- The output folder of a campaign: its journal, and the files that belong to its steps.

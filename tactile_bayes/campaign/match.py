@@ -13,9 +13,8 @@ import numpy as np
 from tactile_bayes.api.estimating import estimate_file
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.files.campaign_names import COMPARED, GROWTH
 from tactile_bayes.files.documents import load_json, load_schema
-from tactile_bayes.files.manifest_csv import Exam, natural, table_text
+from tactile_bayes.files.manifest_csv import COMPARED, GROWTH, Exam, natural, table_text
 from tactile_bayes.files.map_nc import read_map
 from tactile_bayes.findings import Finding, finding_lines
 from tactile_bayes.posterior.result import Estimate

@@ -15,7 +15,8 @@ from tactile_bayes.campaign.tables import Row, exam_rows, write_tables
 from tactile_bayes.declarations import Record, field, replace
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.atomic import write_text
-from tactile_bayes.files.campaign_names import (
+from tactile_bayes.files.documents import check_document, dump_json, read_protocol
+from tactile_bayes.files.manifest_csv import (
     DONE,
     ESTIMATE,
     EXAMS,
@@ -31,7 +32,6 @@ from tactile_bayes.files.campaign_names import (
     THUMBNAIL,
     TRIAL,
 )
-from tactile_bayes.files.documents import check_document, dump_json, read_protocol
 from tactile_bayes.files.reading import IMAGE_BYTES, read_bytes
 from tactile_bayes.files.remote import put
 from tactile_bayes.report.campaign_html import campaign_html, worst

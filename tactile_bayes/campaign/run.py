@@ -28,8 +28,7 @@ from tactile_bayes.campaign.stages import CampaignState, Fault, Stages, steps_ne
 from tactile_bayes.campaign.steps import FEWEST_MASSES, NOT_LEARNED, Task, copy_tasks, exam_folders, taught_by, too_few
 from tactile_bayes.declarations import names_of, replace
 from tactile_bayes.files.atomic import sha256
-from tactile_bayes.files.campaign_names import ESTIMATE, EXAMS, GROWTH, MAP, MASSES, REPEATABILITY, SHAPE
-from tactile_bayes.files.manifest_csv import Exam
+from tactile_bayes.files.manifest_csv import ESTIMATE, EXAMS, GROWTH, MAP, MASSES, REPEATABILITY, SHAPE, Exam
 from tactile_bayes.files.provenance import recordings
 from tactile_bayes.files.size_json import default_for, read_repeatability, read_size_calibration, size_calibration_path
 from tactile_bayes.progress import Progress, untold

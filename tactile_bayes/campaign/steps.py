@@ -21,7 +21,8 @@ from tactile_bayes.campaign.settings import Writes, digest_of, write_staged
 from tactile_bayes.declarations import EXACT, Record, field, from_plain, replace, to_plain
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.atomic import sha256, write_bytes, write_text
-from tactile_bayes.files.campaign_names import (
+from tactile_bayes.files.documents import check_document, dump_json, load_json
+from tactile_bayes.files.manifest_csv import (
     COMPARED,
     COMPARED_FIGURE,
     ESTIMATE,
@@ -37,9 +38,8 @@ from tactile_bayes.files.campaign_names import (
     SIZED,
     SIZED_FIGURE,
     THUMBNAIL,
+    Exam,
 )
-from tactile_bayes.files.documents import check_document, dump_json, load_json
-from tactile_bayes.files.manifest_csv import Exam
 from tactile_bayes.files.map_nc import read_map, read_map_and_scans, write_map, write_pooled
 from tactile_bayes.files.provenance import Provenance, scan_facts
 from tactile_bayes.files.reading import NETCDF_BYTES, kind_of, read_bytes

@@ -11,9 +11,19 @@ from tactile_bayes.campaign.match import unnamed
 from tactile_bayes.campaign.run import Campaign
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.files.atomic import write_text
-from tactile_bayes.files.campaign_names import DONE, ESTIMATE, EXAMS, FAILURES, MASSES, POOLED, SIZED, TRIAL
 from tactile_bayes.files.documents import load_json, load_schema
-from tactile_bayes.files.manifest_csv import Exam, table_text
+from tactile_bayes.files.manifest_csv import (
+    DONE,
+    ESTIMATE,
+    EXAMS,
+    FAILURES,
+    MASSES,
+    POOLED,
+    SIZED,
+    TRIAL,
+    Exam,
+    table_text,
+)
 from tactile_bayes.findings import Finding, Verdict, by_weight, finding_lines, findings_in, verdict
 
 TACTILE, POOLED_MODALITY = "tactile", "tactile-pooled"

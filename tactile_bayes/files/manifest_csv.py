@@ -1,4 +1,4 @@
-"""The table of a campaign's exams, `exams.csv`: which file is which exam of which mass."""
+"""The table of a campaign's exams, `exams.csv`, and the names of exams, masses and files in its output folder."""
 
 from __future__ import annotations
 
@@ -13,13 +13,44 @@ from typing import Any, Final
 from tactile_bayes.declarations import Record, field
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.atomic import write_text
-from tactile_bayes.files.campaign_names import exam_name, mass_name
 from tactile_bayes.files.documents import load_schema
 from tactile_bayes.files.reading import TABLE_BYTES, read_bytes
 from tactile_bayes.files.remote import check_address, is_address
 from tactile_bayes.files.size_json import NONE, SHIPPED
 from tactile_bayes.files.tables import RawTable, Table, read_raw, read_table
 from tactile_bayes.trial.readings import Reading, at_excision
+
+# --- Names of exams and masses of a campaign, and of the files in its output folder.
+
+JOURNAL: Final = "campaign.journal"
+EXAMS, MASSES, GROWTH = "exams", "masses", "growth"
+"""Folders that hold one of each exam, of each mass pooled at a visit, and of each mass compared between visits."""
+DONE, FAILURES, TRIAL, GROWN = "exams_done.csv", "failures.csv", "trial.csv", "growth.csv"
+"""Tables beside them."""
+
+SCAN, MAP, ESTIMATE, POSTERIOR = "scan.mcap", "map.nc", "estimate.json", "posterior.nc"
+SHAPE, THUMBNAIL, MAP_FIGURE, SIZE_FIGURE = "shape.npz", "thumbnail.png", "map.png", "size.png"
+SIZED, SIZED_FIGURE = "sized.json", "sized.png"
+"""Files of an exam."""
+POOLED, POOLED_DRAWS = "pooled.json", "pooled.nc"
+"""Files of a mass at a visit."""
+COMPARED, COMPARED_FIGURE = "compare.json", "compare.png"
+"""Files of a mass over its visits."""
+REPEATABILITY: Final = "repeatability.json"
+"""Beside the folders, as the tables are."""
+
+
+def mass_name(*, patient: str, visit: str, mass: str) -> str:
+    """Name of a mass at a visit, which is also its folder's."""
+    return f"{patient}.v{visit}.m{mass}"
+
+
+def exam_name(of_mass: str, replicate: int | str) -> str:
+    """Name of an exam of the mass that `mass_name` names, which is also its folder's."""
+    return f"{of_mass}.r{replicate}"
+
+
+# --- The table: which file is which exam of which mass.
 
 SCHEMA: Final = "exams.table.json"
 KNOWN: Final = ("seat", "depth_mm", "stiffness_ratio", "fat_kpa", "gland_ratio", "thickness_mm")
