@@ -58,7 +58,7 @@ def _share(masses: ModalitySizes, model: ErrorModel, method: str, options: argpa
     check = check_intervals(masses, model, confidence=chosen, trials=options.trials, seed=options.seed)
     assert check is not None
     missing = f", {check.undefined} none" if check.undefined else ""
-    return f"{check.share:.3f} [{check.interval[0]:.3f}, {check.interval[1]:.3f}]{missing}"
+    return f"{check.share:.3f} [{check.share_interval[0]:.3f}, {check.share_interval[1]:.3f}]{missing}"
 
 
 def _ratio_share(masses: ModalitySizes, model: ErrorModel, method: str, options: argparse.Namespace) -> str:

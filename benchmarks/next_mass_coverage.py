@@ -18,7 +18,7 @@ from tactile_bayes.api.trial_sampler import draw
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.trial.figures import clopper_pearson
 from tactile_bayes.trial.planning import ErrorModel
-from tactile_bayes.trial.readings import MassKey, Reading
+from tactile_bayes.trial.readings import MassKey, Reading, Trial
 
 LEVELS = (0.5, 0.8, 0.95)
 BIAS, CALIPER = 0.05, 0.05
@@ -81,12 +81,12 @@ def ranks(
     for trial in range(trials):
         readings, ex_vivo_mm = simulate(design, np.random.default_rng([seed, trial]))
         rng = np.random.default_rng([seed, trial, 1])
-        found = model.next_mass(readings, ex_vivo_mm, {}, sample=sample, rng=rng).posteriors.get("tactile")
+        found = model.posteriors_of(Trial(readings, ex_vivo_mm), sample=sample, rng=rng)[0].get("tactile")
         if found is not None:
             yield (
                 float(np.mean(found.mape_percent < truth)),
                 float(np.mean(found.mape_detected_percent < of_found)),
-                found.summaries["mape_percent"][0],
+                found.summary.mape_percent.median,
             )
 
 

@@ -14,15 +14,21 @@ from tactile_bayes.files.documents import OF_A_PERSON, Fact, FactName, Protocol,
 from tactile_bayes.files.instrument_json import HeadFile
 from tactile_bayes.files.scene_toml import SceneFile
 from tactile_bayes.files.size_json import Eq6File, PopulationFile, RepeatabilityFile, SiteFile
+from tactile_bayes.report.tradeoff import TradeoffFile
 from tactile_bayes.studies.population import BodiesFile
+from tactile_bayes.trial.planning import PlanReport
+from tactile_bayes.trial.summary import TrialReport
 
 SCHEMAS = Path(__file__).resolve().parent.parent / "data_schema"
 OF_JSON: dict[str, type[Record]] = {
     "head.schema.json": HeadFile,
+    "plan.schema.json": PlanReport,
     "repeatability.schema.json": RepeatabilityFile,
     "size_calibration.schema.json": Eq6File,
     "size_population.schema.json": PopulationFile,
     "size_site.schema.json": SiteFile,
+    "tradeoff.schema.json": TradeoffFile,
+    "validate.schema.json": TrialReport,
     "worklist.schema.json": Worklist,
 }
 OF_TOML: dict[str, type[Record]] = {

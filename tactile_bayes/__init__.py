@@ -54,7 +54,7 @@ _HOME = {
     "Map": "api.maps",
     "PooledSize": "api.estimates",
     "SizeEstimate": "api.estimates",
-    "TrialResult": "api.trials",
+    "TrialResult": "api.trial_report",
     "build_map": "api.maps",
     "calibrate_repeatability": "api.trials",
     "calibrate_size": "api.trials",

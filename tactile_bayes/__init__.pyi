@@ -17,7 +17,7 @@ from tactile_bayes.api.maps import read_scan as read_scan
 from tactile_bayes.api.maps import simulate as simulate
 from tactile_bayes.api.recording import record as record
 from tactile_bayes.api.sized import Draws as Draws
-from tactile_bayes.api.trials import TrialResult as TrialResult
+from tactile_bayes.api.trial_report import TrialResult as TrialResult
 from tactile_bayes.api.trials import calibrate_repeatability as calibrate_repeatability
 from tactile_bayes.api.trials import calibrate_size as calibrate_size
 from tactile_bayes.api.trials import validate as validate

@@ -11,7 +11,8 @@ A declaration gives a field its type, range and meaning::
 `from_plain` makes one of what JSON or TOML held, `to_plain` the reverse, `schema_of` the schema in data_schema/. Files
 go through `files.documents.read_record`, which first refuses doubled keys, huge numbers and depth. Arrays are nested
 lists in files; `geometry.Vector` and `geometry.Matrix` declare them. A range belongs to its own member of a union:
-``Annotated[int, Meta(ge=1)] | None``. A rule between fields stands in ``__post_init__``, which raises `BadDataError`.
+``Annotated[int, Meta(ge=1)] | None``. A key that a file may lack is `UNSET`, with `UnsetType` in its union. A rule
+between fields stands in ``__post_init__``, which raises `BadDataError`.
 No other module imports msgspec.
 """
 
@@ -39,7 +40,9 @@ from typing import (
 )
 
 import msgspec
+from msgspec import UNSET as UNSET
 from msgspec import Meta as Meta
+from msgspec import UnsetType as UnsetType
 from msgspec import field as field
 
 from tactile_bayes.errors import BadDataError, UsageError, meant, number_words
@@ -467,7 +470,7 @@ def _is_array(kind: Any) -> bool:
 
 def _way_out(kind: Any, value: Any) -> str:
     """What can be given in place of a value, such as "give a number above 0"."""
-    members = [one for one in _members(kind) if one is not type(None)]
+    members = [one for one in _members(kind) if one not in (type(None), UnsetType)]
     forms = [one for one in map(_bare, members) if _is_record(one)]
     if len(forms) > 1 and isinstance(value, dict):  # no form of that name
         names = ", ".join(str(one.__struct_config__.tag) for one in forms)

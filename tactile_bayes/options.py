@@ -7,10 +7,10 @@ settings of a provenance are made of these records.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Final, Literal
+from typing import Annotated, Final, Literal, get_args
 
-from tactile_bayes.declarations import Meta, Options
-from tactile_bayes.errors import UsageError
+from tactile_bayes.declarations import Meta, Options, Record
+from tactile_bayes.errors import UsageError, check_choice, check_number
 from tactile_bayes.presets import CELL_MM, DEFAULT_NORMALISE, PRESSURE_WINDOW_KPA, Normalise, TrackerProtocol
 
 
@@ -182,3 +182,24 @@ class RecordOptions(Options, kw_only=True):
     serve: str | None = None
     size_calibration: str = "solid-mean"
     force: bool = False
+
+
+IntervalMethod = Literal["corrected", "jackknife", "bca"]
+
+
+class TrialSettings(Record):
+    """Settings of a trial's analysis; each is part of the provenance."""
+
+    intervals: IntervalMethod = "corrected"
+    resamples: int = 2000
+    seed: int = 1999
+    error_ratio: float = 1.0
+    check_intervals: int = 0
+    bayes: bool = False
+
+    def __post_init__(self) -> None:
+        check_choice("intervals", self.intervals, get_args(IntervalMethod))
+        check_number("resamples", self.resamples, 200, 100_000, whole=True)
+        check_number("seed", self.seed, 0, whole=True)
+        check_number("error_ratio", self.error_ratio, 1e-6, 1e6)
+        check_number("check_intervals", self.check_intervals, 0, whole=True)

@@ -9,7 +9,7 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
@@ -18,10 +18,10 @@ from tactile_bayes.api.settings import Settings
 from tactile_bayes.api.tradeoffs import pooled_rows, tradeoff_of_map, tradeoff_of_scan
 from tactile_bayes.commands.options import also_read, settings_of
 from tactile_bayes.commands.progress import progress_bar
-from tactile_bayes.declarations import replace
+from tactile_bayes.declarations import replace, to_plain
 from tactile_bayes.errors import EXIT_DONE, EXIT_NO_ESTIMATE, BadDataError, UsageError
 from tactile_bayes.files.atomic import given_twice, refuse_existing
-from tactile_bayes.files.documents import check_document, dump_json
+from tactile_bayes.files.documents import dump_json
 from tactile_bayes.files.provenance import Provenance, hash_inputs
 from tactile_bayes.files.scene_toml import read_scene
 from tactile_bayes.files.size_json import read_size_calibration, size_calibration_path
@@ -29,7 +29,7 @@ from tactile_bayes.forward.scene import Scene
 from tactile_bayes.forward.tissue import SceneBody, SolidLump
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.laboratory import TradeoffReport, draw_tradeoff, tradeoff_document, tradeoff_text
-from tactile_bayes.report.tradeoff import SCHEMA_FILE, draw_ladder, ladder_document, ladder_text
+from tactile_bayes.report.tradeoff import DIGITS, draw_ladder, ladder_file, ladder_text
 from tactile_bayes.studies.estimate_tradeoff import Work
 from tactile_bayes.studies.paper_solid import fit_raster
 from tactile_bayes.studies.tradeoffs import PLANE, SOLID, calibrated_rule, case_of, learned_rule, teach
@@ -80,7 +80,7 @@ def forecast(seconds: float) -> None:
 def show(
     ladder: Ladder,
     *,
-    what: str,
+    varied: Literal["estimate", "map"],
     title: str,
     figure: Path | None,
     as_json: bool,
@@ -93,9 +93,8 @@ def show(
             draw_ladder(ladder, figure, title=title, force=force)
     finally:  # what was measured is not lost with the figure
         if as_json:
-            document = ladder_document(ladder, what=what, provenance=provenance)
-            check_document(document, SCHEMA_FILE, path=Path("the report"))
-            click.echo(dump_json(document), nl=False)
+            found = ladder_file(ladder, varied=varied, provenance=provenance)
+            click.echo(dump_json(to_plain(found, digits=DIGITS)), nl=False)
         else:
             click.echo(ladder_text(ladder))
     return EXIT_NO_ESTIMATE if ladder.reference.answer is None else EXIT_DONE
@@ -217,7 +216,7 @@ def tradeoff_estimate_action(
     provenance = Provenance("tradeoff estimate", kept, inputs, seed=seed).as_dict()
     title = f"{maps[0].stem}: what more time for `estimate` buys"
     ctx.exit(
-        show(ladder, what="estimate", title=title, figure=figure, as_json=as_json, force=force, provenance=provenance)
+        show(ladder, varied="estimate", title=title, figure=figure, as_json=as_json, force=force, provenance=provenance)
     )
 
 
@@ -258,4 +257,6 @@ def tradeoff_map_action(
     kept = {"tolerance_mm": tolerance_mm, "runs": runs}
     provenance = Provenance("tradeoff map", kept, hash_inputs(scan=scan), seed=seed).as_dict()
     title = f"{scan.stem}: what finer cells and more frames buy"
-    ctx.exit(show(ladder, what="map", title=title, figure=figure, as_json=as_json, force=force, provenance=provenance))
+    ctx.exit(
+        show(ladder, varied="map", title=title, figure=figure, as_json=as_json, force=force, provenance=provenance)
+    )

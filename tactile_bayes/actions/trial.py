@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import click
 import numpy as np
 
-from tactile_bayes.api.trial_report import TrialOutcome, TrialSettings, analyse
+from tactile_bayes.api.trial_report import analyse
 from tactile_bayes.api.trials import load_trial
 from tactile_bayes.batch import open_executor, run_batch
 from tactile_bayes.campaign.exams import find_exams
@@ -31,18 +31,27 @@ from tactile_bayes.campaign.run import Campaign
 from tactile_bayes.campaign.settings import CampaignSettings
 from tactile_bayes.commands.options import also_read, refuse_same, settings_of
 from tactile_bayes.commands.progress import progress_bar
+from tactile_bayes.declarations import EXACT, to_plain
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.atomic import refuse_existing, write_text
-from tactile_bayes.files.documents import check_document, dump_json, read_protocol
+from tactile_bayes.files.documents import dump_json, read_protocol
 from tactile_bayes.files.manifest_csv import add_rows, read_manifest, read_rows, write_manifest
 from tactile_bayes.files.provenance import Provenance, hash_inputs
 from tactile_bayes.files.remote import check_address
 from tactile_bayes.files.size_json import NONE, size_calibration_path
+from tactile_bayes.options import TrialSettings
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.report.trial import plan_text, trial_text
-from tactile_bayes.report.trial_html import trial_html
-from tactile_bayes.trial.planning import assumptions_from, designs, map_gains, run_case
-from tactile_bayes.trial.readings import gather, unit_doubts
+from tactile_bayes.report.trial import plan_text
+from tactile_bayes.trial.planning import (
+    Design,
+    ErrorSource,
+    PlanReport,
+    assumptions_from,
+    designs,
+    map_gains,
+    run_case,
+)
+from tactile_bayes.trial.readings import unit_doubts
 
 if TYPE_CHECKING:
     from tactile_bayes.campaign.exams import Found
@@ -76,19 +85,17 @@ def validate_action(
     title, chosen = _settings(settings, protocol)
     inputs = load_trial(trial, excision, columns)
     also_read(*inputs.files.values())
-    outcome = analyse(inputs, chosen, protocol=protocol, title=title)
-    if output or as_json:
-        check_document(outcome.document, "validate.schema.json", path=output or Path("the report"))
+    found = analyse(inputs, chosen, protocol=protocol, title=title)
     try:
         if output:
-            write_text(output, dump_json(outcome.document), force=force)
+            found.write_json(output, force=force)
         if html:
-            _write_html(html, outcome, force=force)
+            found.write_html(html, force=force)
     finally:  # what was computed is not lost with a file
         if as_json:
-            for doubt in outcome.report.doubts:
+            for doubt in found.report.doubts:
                 click.echo(f"doubtful: {doubt}", err=True)
-        click.echo(dump_json(outcome.document) if as_json else _text(outcome, methods=methods), nl=False)
+        click.echo(dump_json(found.document) if as_json else found.told(methods=methods), nl=False)
 
 
 def _settings(given: dict[str, Any], protocol: Path | None) -> tuple[str | None, TrialSettings]:
@@ -105,18 +112,8 @@ def _settings(given: dict[str, Any], protocol: Path | None) -> tuple[str | None,
     return read.title, TrialSettings(**(given | read.fixed))
 
 
-def _text(outcome: TrialOutcome, *, methods: bool) -> str:
-    more = [] if outcome.next_mass is None else outcome.next_mass.lines()
-    return trial_text(outcome.report, methods=methods, checks=outcome.checks, more=more)
-
-
-def _write_html(path: Path, outcome: TrialOutcome, *, force: bool) -> None:
-    write_text(path, trial_html(outcome.report, outcome.document, text=_text(outcome, methods=True)), force=force)
-
-
 # --- `plan`: sample size of a trial, and the value of more maps per mass.
 
-SCHEMA = "tactile-bayes/plan/1"
 _ERRORS = ("tactile_bias", "mass_sd", "map_sd", "other_bias", "other_sd", "other_miss")
 
 
@@ -150,16 +147,16 @@ def plan_action(
         raise UsageError(f"--{unused[0]} says how a pilot is read; give --pilot TRIAL.csv, or leave it out")
     cases = list(designs(sorted(set(patients)), sorted(set(maps)), **errors, trials=trials, seed=seed))
     sources = _sources(typed, pilot=pilot is not None)
-    document = _document(cases, _simulate(cases, workers=workers), errors, sources, files)
-    check_document(document, "plan.schema.json", path=output or Path("the plan"))
+    plan = _plan(cases, _simulate(cases, workers=workers), errors, sources, files)
+    written = dump_json(to_plain(plan, digits=EXACT))
     try:
         if output:
-            write_text(output, dump_json(document), force=force)
+            write_text(output, written, force=force)
     finally:  # what was computed is not lost with the file
-        click.echo(dump_json(document) if as_json else _plan_text(document), nl=False)
+        click.echo(written if as_json else plan_text(plan), nl=False)
 
 
-def _sources(typed: set[str], *, pilot: bool) -> dict[str, str]:
+def _sources(typed: set[str], *, pilot: bool) -> dict[str, ErrorSource]:
     """Source of each assumed error: an option, the pilot or the default."""
     return {name: "option" if name in typed else "pilot" if pilot else "default" for name in _ERRORS}
 
@@ -178,7 +175,7 @@ def _from_pilot(pilot: Path, excision: Path, against: str, given: dict[str, floa
     also_read(*inputs.files.values())
     for line in inputs.other_visits.lines():
         click.echo(f"{pilot}: {line}", err=True)
-    sizes = gather(inputs.readings, inputs.ex_vivo_mm)
+    sizes = inputs.sizes()
     for doubt in unit_doubts(sizes, np.array(list(inputs.ex_vivo_mm.values()))):
         click.echo(f"{pilot}: doubtful: {doubt}", err=True)
     for name in ("tactile", against):
@@ -195,7 +192,7 @@ def _from_pilot(pilot: Path, excision: Path, against: str, given: dict[str, floa
     return found | given
 
 
-def _simulate(cases: list[PlanCase], *, workers: int) -> list[dict[str, Any]]:
+def _simulate(cases: list[PlanCase], *, workers: int) -> list[Design]:
     with open_executor(workers=workers) as executor, progress_bar("designs") as progress:
         outcomes = run_batch(run_case, cases, key=attrgetter("key"), executor=executor, progress=progress)
     for outcome in outcomes:
@@ -204,29 +201,24 @@ def _simulate(cases: list[PlanCase], *, workers: int) -> list[dict[str, Any]]:
     return [outcome.value for outcome in outcomes if outcome.value is not None]
 
 
-def _document(
+def _plan(
     cases: list[PlanCase],
-    results: list[dict[str, Any]],
+    found: list[Design],
     errors: dict[str, float],
-    sources: dict[str, str],
+    sources: dict[str, ErrorSource],
     files: dict[str, Path],
-) -> dict[str, Any]:
-    by_design = {(case.patients, case.maps): result for case, result in zip(cases, results, strict=True)}
+) -> PlanReport:
     assumed = {name: float(f"{errors[name]:.9g}") for name in _ERRORS}
     settings = {"trials": cases[0].trials, "errors": assumed, "errors_from": sources}
-    return {
-        "schema": SCHEMA,
-        "errors": assumed,
-        "errors_from": sources,
-        "designs": [{"patients": n, "maps": m, **result} for (n, m), result in by_design.items()],
-        "gains": map_gains(by_design),
-        "provenance": Provenance("plan", settings, hash_inputs(**files), seed=cases[0].seed).as_dict(),
-        "research_use": RESEARCH_USE,
-    }
-
-
-def _plan_text(document: dict[str, Any]) -> str:
-    return plan_text(document)
+    return PlanReport(
+        schema="tactile-bayes/plan/1",
+        errors=assumed,
+        errors_from=sources,
+        designs=tuple(found),
+        gains=map_gains(found),
+        provenance=Provenance("plan", settings, hash_inputs(**files), seed=cases[0].seed).as_dict(),
+        research_use=RESEARCH_USE,
+    )
 
 
 # --- `campaign`: from a folder of exams to the trial's report.

@@ -2,115 +2,112 @@
 
 from __future__ import annotations
 
+from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Any
 
-from tactile_bayes.declarations import Record, as_dict
-from tactile_bayes.errors import check_choice, check_number
+import numpy as np
+
+from tactile_bayes.api.trial_sampler import draw
+from tactile_bayes.declarations import Record, as_dict, replace, to_plain
+from tactile_bayes.files.atomic import write_text
+from tactile_bayes.files.documents import dump_json
+from tactile_bayes.files.provenance import Provenance, hash_inputs
+from tactile_bayes.options import TrialSettings
 from tactile_bayes.presets import INTERVAL, RESEARCH_USE
+from tactile_bayes.report.trial import DIGITS, trial_text
+from tactile_bayes.report.trial_html import trial_html
+from tactile_bayes.trial.figures import Intervals
+from tactile_bayes.trial.next_mass import next_mass
+from tactile_bayes.trial.planning import check_all
+from tactile_bayes.trial.readings import Trial
+from tactile_bayes.trial.summary import TrialReport, summarise
 
 if TYPE_CHECKING:
-    from tactile_bayes.api.trials import TrialInputs
-    from tactile_bayes.trial.figures import Intervals
-    from tactile_bayes.trial.next_mass import NextMass
-    from tactile_bayes.trial.planning import IntervalCheck
-    from tactile_bayes.trial.summary import TrialReport
+    from collections.abc import Sequence
 
-IntervalMethod = Literal["corrected", "jackknife", "bca"]
-SCHEMA = "tactile-bayes/validate/1"
+    import pandas
+
+    from tactile_bayes.report.compare import Growth
 
 
-class TrialSettings(Record):
-    """Settings of the analysis; each is part of the provenance."""
+class TrialResult(Record, eq=False):
+    """How each modality's sizes compare with excision.
 
-    intervals: IntervalMethod = "corrected"
-    resamples: int = 2000
-    seed: int = 1999
-    error_ratio: float = 1.0
-    check_intervals: int = 0
-    bayes: bool = False
-
-    def __post_init__(self) -> None:
-        check_choice("intervals", self.intervals, get_args(IntervalMethod))
-        check_number("resamples", self.resamples, 200, 100_000, whole=True)
-        check_number("seed", self.seed, 0, whole=True)
-        check_number("error_ratio", self.error_ratio, 1e-6, 1e6)
-        check_number("check_intervals", self.check_intervals, 0, whole=True)
-
-
-class TrialOutcome(Record):
-    """Results of an analysis."""
+    `report` is what the file of ``validate --json`` holds, and `trial` what it was made from.
+    """
 
     report: TrialReport
-    document: dict[str, Any]
-    checks: dict[str, IntervalCheck]
-    next_mass: NextMass | None
+    trial: Trial
 
+    @property
+    def document(self) -> dict[str, Any]:
+        """What ``validate --json`` prints."""
+        document: dict[str, Any] = to_plain(self.report, digits=DIGITS)
+        return document
 
-def intervals_of(settings: TrialSettings) -> Intervals:
-    """Intervals of a report: probability and method."""
-    from tactile_bayes.trial.figures import Intervals
+    @property
+    def text(self) -> str:
+        """What ``validate --methods`` prints."""
+        return self.told(methods=True)
 
-    return Intervals(INTERVAL, method=settings.intervals, resamples=settings.resamples, seed=settings.seed)
+    def told(self, *, methods: bool) -> str:
+        """The report as text, with or without the table of methods."""
+        return trial_text(self.report, left_out=self.trial.other_visits.lines(), methods=methods)
+
+    def write_json(self, path: Path, *, force: bool = False) -> None:
+        """Write what ``validate -o`` writes."""
+        write_text(path, dump_json(self.document), force=force)
+
+    def write_html(self, path: Path, *, growth: Sequence[Growth] = (), force: bool = False) -> None:
+        """Write what ``validate --html`` writes, with what became of masses with several visits."""
+        write_text(path, trial_html(self.report, self.trial, text=self.text, growth=growth), force=force)
+
+    def to_dataframe(self) -> pandas.DataFrame:
+        """One row for each modality and figure: value, and the ends of its interval (NaN where it has none)."""
+        import pandas
+
+        rows = []
+        for modality, figures in self.document["modalities"].items():
+            for name, value in figures.items():
+                if isinstance(value, int | float):
+                    counted = name == "detected"  # the interval beside it is of the share
+                    low, high = (None, None) if counted else figures.get(f"{name}_interval") or (None, None)
+                    rows.append((modality, name, value, low, high))
+        found = pandas.DataFrame(rows, columns=["modality", "figure", "value", "low", "high"])
+        return found.astype({"value": float, "low": float, "high": float})
+
+    def __repr__(self) -> str:
+        counts, names = self.report.counts, ", ".join(self.report.modalities)
+        return f"<TrialResult {counts.masses} masses of {counts.patients} patients: {names}>"
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{escape(self.text)}</pre><p><small>{escape(RESEARCH_USE)}</small></p>"
 
 
 def analyse(
-    inputs: TrialInputs, settings: TrialSettings, *, protocol: Path | None = None, title: str | None = None
-) -> TrialOutcome:
-    """Analyse a trial.
-
-    Parameters
-    ----------
-    protocol, title
-        File and title of the pre-specified analysis, where there is one.
-    """
-    from tactile_bayes.report.trial import as_document, checks_document
-    from tactile_bayes.trial.planning import check_all
-    from tactile_bayes.trial.summary import summarise
-
-    confidence = intervals_of(settings)
+    trial: Trial, settings: TrialSettings, *, protocol: Path | None = None, title: str | None = None
+) -> TrialResult:
+    """Analyse a trial; `protocol` and `title` are of the pre-specified analysis, where there is one."""
+    confidence = Intervals(INTERVAL, method=settings.intervals, resamples=settings.resamples, seed=settings.seed)
+    provenance = _provenance(trial, settings, protocol)
     report = summarise(
-        inputs.readings,
-        inputs.ex_vivo_mm,
-        confidence=confidence,
-        error_ratio=settings.error_ratio,
-        ex_vivo_sd_mm=inputs.ex_vivo_sd_mm,
-        seed=settings.seed,
-        other_visits=inputs.other_visits,
+        trial, confidence=confidence, error_ratio=settings.error_ratio, seed=settings.seed, provenance=provenance
     )
-    document = {"schema": SCHEMA, **({} if title is None else {"title": title}), **as_document(report)}
-    checks: dict[str, IntervalCheck] = {}
+    if title is not None:
+        report = replace(report, title=title)
     if settings.check_intervals:
-        checks = check_all(report.sizes, confidence=confidence, trials=settings.check_intervals, seed=settings.seed)
-        document["interval_check"] = checks_document(checks)
-    next_mass = _next_mass(inputs, settings) if settings.bayes else None
-    if next_mass is not None:
-        document["next_mass"] = next_mass.as_document()
-    document["provenance"] = _provenance(inputs, settings, protocol)
-    return TrialOutcome(report, {**document, "research_use": RESEARCH_USE}, checks, next_mass)
+        trials = settings.check_intervals
+        checks = check_all(trial.sizes(), confidence=confidence, trials=trials, seed=settings.seed)
+        report = replace(report, interval_check=checks)
+    if settings.bayes:
+        rng = np.random.default_rng(settings.seed)
+        report = replace(report, next_mass=next_mass(trial, sample=draw, rng=rng, probability=INTERVAL))
+    return TrialResult(report, trial)
 
 
-def _next_mass(inputs: TrialInputs, settings: TrialSettings) -> NextMass:
-    """Fit the Bayesian model of the next mass, with the sampler passed in (the trial package imports none)."""
-    import numpy as np
-
-    from tactile_bayes.api.trial_sampler import draw
-    from tactile_bayes.trial.next_mass import next_mass
-
-    return next_mass(
-        inputs.readings,
-        inputs.ex_vivo_mm,
-        inputs.ex_vivo_sd_mm,
-        sample=draw,
-        rng=np.random.default_rng(settings.seed),
-        probability=INTERVAL,
-    )
-
-
-def _provenance(inputs: TrialInputs, settings: TrialSettings, protocol: Path | None) -> dict[str, Any]:
-    from tactile_bayes.files.provenance import Provenance, hash_inputs
-
-    files = inputs.files | ({} if protocol is None else {"protocol": protocol})
+def _provenance(trial: Trial, settings: TrialSettings, protocol: Path | None) -> dict[str, Any]:
+    files = {**trial.files, **({} if protocol is None else {"protocol": protocol})}
     kept = {name: value for name, value in as_dict(settings).items() if name != "seed"}
     return Provenance(
         command="validate",

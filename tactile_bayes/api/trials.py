@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -13,47 +10,29 @@ from tactile_bayes.api.maps import PathLike, output_path, path_of, required_path
 from tactile_bayes.api.repeatability import exams_in, learn_from_exams
 from tactile_bayes.api.site_correction import correct_size
 from tactile_bayes.api.size_calibration import FORMS, is_population, learn_eq6, learn_population
-from tactile_bayes.api.trial_report import TrialSettings, analyse
-from tactile_bayes.declarations import Record, names_of
+from tactile_bayes.api.trial_report import TrialResult, analyse
+from tactile_bayes.declarations import names_of
 from tactile_bayes.errors import UsageError, check_choice, check_number
 from tactile_bayes.files.column_map import read_mapping, read_wide, read_wide_excision
 from tactile_bayes.files.estimate_json import fill_from_posteriors
 from tactile_bayes.files.provenance import Provenance, hash_inputs
 from tactile_bayes.files.size_json import write_size_calibration
 from tactile_bayes.files.tables import Sheet, check_references, read_table
-from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.report.trial import trial_text
-from tactile_bayes.trial.readings import at_excision, readings_from_columns
+from tactile_bayes.options import TrialSettings
+from tactile_bayes.trial.readings import Trial, at_excision, readings_from_columns
 
 if TYPE_CHECKING:
     import pandas
 
     from tactile_bayes.api.size_calibration import EqSixFit, PopulationForm
-    from tactile_bayes.api.trial_report import TrialOutcome
-    from tactile_bayes.files.tables import Sheet, Table
+    from tactile_bayes.files.tables import Table
     from tactile_bayes.size.pooling import Calibration, Repeatability
-    from tactile_bayes.trial.readings import MassKey, OtherVisits, Reading
 
 
 # --- Input of `validate` and `plan`: the tables of a trial, tidy or wide, and the estimates that they name.
 
 
-class TrialInputs(Record):
-    """Input of a trial's analysis, with every file read, by role.
-
-    The readings are those of each mass's last visit before excision; `other_visits` counts what that leaves out.
-    """
-
-    readings: list[Reading]
-    other_visits: OtherVisits
-    ex_vivo_mm: Mapping[MassKey, float]
-    ex_vivo_sd_mm: Mapping[MassKey, float | None]
-    files: dict[str, Path]
-
-
-def load_trial(
-    trial: Path | Sheet, excision: Path | Sheet, columns: Path | None, *, tidy_trial: bool = False
-) -> TrialInputs:
+def load_trial(trial: Path | Sheet, excision: Path | Sheet, columns: Path | None, *, tidy_trial: bool = False) -> Trial:
     """Read and check both tables.
 
     Parameters
@@ -77,7 +56,7 @@ def load_trial(
     analysed, other_visits = at_excision(readings, excised_on, fault=table.error)
     given = {"trial": trial, "excision": excision, "columns": columns}
     files = {role: path for role, path in given.items() if isinstance(path, Path)}
-    return TrialInputs(
+    return Trial(
         readings=analysed,
         other_visits=other_visits,
         ex_vivo_mm=dict(zip(keys, sizes.columns["ex_vivo_mm"], strict=True)),
@@ -94,52 +73,6 @@ def read_excision(excision: Path | Sheet, columns: Path | None) -> Table:
 
 
 # --- Size calibrations from lumps of known size, and reports of trials, from tables or DataFrames.
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class TrialResult:
-    """How each modality's sizes compare with excision.
-
-    Parameters
-    ----------
-    outcome
-        The report and its JSON object.
-    """
-
-    outcome: TrialOutcome
-
-    @property
-    def document(self) -> dict[str, Any]:
-        """What ``validate --json`` prints."""
-        return self.outcome.document
-
-    @property
-    def text(self) -> str:
-        """What ``validate --methods`` prints."""
-        more = [] if self.outcome.next_mass is None else self.outcome.next_mass.lines()
-        return trial_text(self.outcome.report, methods=True, checks=self.outcome.checks, more=more)
-
-    def to_dataframe(self) -> pandas.DataFrame:
-        """One row for each modality and figure: value, and the ends of its interval (NaN where it has none)."""
-        import pandas
-
-        rows = []
-        for modality, figures in self.document["modalities"].items():
-            for name, value in figures.items():
-                if isinstance(value, int | float):
-                    counted = name == "detected"  # the interval beside it is of the share
-                    low, high = (None, None) if counted else figures.get(f"{name}_interval") or (None, None)
-                    rows.append((modality, name, value, low, high))
-        found = pandas.DataFrame(rows, columns=["modality", "figure", "value", "low", "high"])
-        return found.astype({"value": float, "low": float, "high": float})
-
-    def __repr__(self) -> str:
-        counts = self.document["counts"]
-        names = ", ".join(self.document["modalities"])
-        return f"<TrialResult {counts['masses']} masses of {counts['patients']} patients: {names}>"
-
-    def _repr_html_(self) -> str:
-        return f"<pre>{escape(self.text)}</pre><p><small>{escape(RESEARCH_USE)}</small></p>"
 
 
 @door
@@ -161,7 +94,7 @@ def validate(
     columns
         For a wide CSV file: a TOML file that says which column holds which reading.
     **settings
-        As of `tactile_bayes.api.trial_report.TrialSettings`, by default as on the command line.
+        As of `tactile_bayes.options.TrialSettings`, by default as on the command line.
 
     Raises
     ------
@@ -170,8 +103,7 @@ def validate(
     """
     check_keywords("validate", settings, names_of(TrialSettings))
     used = TrialSettings(**{name: plain(value) for name, value in settings.items()})
-    inputs = load_trial(_table(trial, "trial"), _table(excision, "excision"), path_of(columns))
-    return TrialResult(analyse(inputs, used))
+    return analyse(load_trial(_table(trial, "trial"), _table(excision, "excision"), path_of(columns)), used)
 
 
 @door

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from tactile_bayes import __version__
-from tactile_bayes.api.trial_report import TrialSettings, analyse
+from tactile_bayes.api.trial_report import analyse
 from tactile_bayes.api.trials import load_trial, read_excision
 from tactile_bayes.campaign.match import growth_rows, growth_text
 from tactile_bayes.campaign.run import Campaign
@@ -15,7 +15,7 @@ from tactile_bayes.campaign.tables import Row, exam_rows, write_tables
 from tactile_bayes.declarations import Record, field, replace
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.atomic import write_text
-from tactile_bayes.files.documents import check_document, dump_json, read_protocol
+from tactile_bayes.files.documents import read_protocol
 from tactile_bayes.files.manifest_csv import (
     DONE,
     ESTIMATE,
@@ -34,18 +34,16 @@ from tactile_bayes.files.manifest_csv import (
 )
 from tactile_bayes.files.reading import IMAGE_BYTES, read_bytes
 from tactile_bayes.files.remote import put
-from tactile_bayes.report.campaign_html import campaign_html, worst
+from tactile_bayes.options import TrialSettings
+from tactile_bayes.report import campaign_html as sheet
+from tactile_bayes.report.campaign_html import Card, campaign_html, worst
 from tactile_bayes.report.compare import Growth, growth_line
 from tactile_bayes.report.quantities import leading
-from tactile_bayes.report.trial import trial_text
-from tactile_bayes.report.trial_html import trial_html
 from tactile_bayes.trial.readings import at_excision
 
 if TYPE_CHECKING:
-    from tactile_bayes.api.trial_report import TrialSettings
     from tactile_bayes.files.manifest_csv import Exam
     from tactile_bayes.files.tables import Table
-    from tactile_bayes.report.campaign_html import Card
 
 REPORT, PAGE, INDEX = "report.json", "report.html", "index.html"
 WRITTEN: Final = (DONE, FAILURES, TRIAL, GROWN, REPORT, PAGE, INDEX, REPEATABILITY)
@@ -224,15 +222,12 @@ def _write_report(folder: Path, excision: Excision, protocol: Path | None, growt
     settings, title = _trial_settings(protocol)
     try:
         inputs = load_trial(folder / TRIAL, excision.path, excision.columns, tidy_trial=True)
-        outcome = analyse(inputs, settings, protocol=protocol, title=title)
+        found = analyse(inputs, settings, protocol=protocol, title=title)
     except BadDataError as error:
         return "", error.what
-    check_document(outcome.document, "validate.schema.json", path=folder / REPORT)
-    more = [] if outcome.next_mass is None else outcome.next_mass.lines()
-    full = trial_text(outcome.report, methods=True, checks=outcome.checks, more=more)
-    write_text(folder / REPORT, dump_json(outcome.document), force=True)
-    write_text(folder / PAGE, trial_html(outcome.report, outcome.document, text=full, growth=growth), force=True)
-    return trial_text(outcome.report, methods=False, checks=outcome.checks, more=more), ""
+    found.write_json(folder / REPORT, force=True)
+    found.write_html(folder / PAGE, growth=growth, force=True)
+    return found.told(methods=False), ""
 
 
 def _page(
@@ -276,8 +271,6 @@ def counts_words(sized: int, unsized: int, failed: int) -> str:
 
 
 def _card(campaign: Campaign, row: Row) -> Card:
-    from tactile_bayes.report.campaign_html import FAILED, SIZED, UNSIZED, Card
-
     exam = row.exam
     made = {
         name
@@ -289,7 +282,7 @@ def _card(campaign: Campaign, row: Row) -> Card:
     facts += [fact for fact in (exam.side, exam.reader and f"reader {exam.reader}", exam.file) if fact]
     return Card(
         name=exam.name,
-        status=FAILED if row.document is None else UNSIZED if row.size is None else SIZED,
+        status=sheet.FAILED if row.document is None else sheet.UNSIZED if row.size is None else sheet.SIZED,
         facts=tuple(facts),
         reason=row.reason,
         size=None if row.document is None else leading(row.document)["max_size_mm"],

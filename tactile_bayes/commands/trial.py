@@ -7,7 +7,6 @@ from typing import Any
 import click
 
 from tactile_bayes.api.settings import Settings
-from tactile_bayes.api.trial_report import TrialSettings
 from tactile_bayes.commands.options import (
     FORCE,
     JSON,
@@ -19,7 +18,7 @@ from tactile_bayes.commands.options import (
     seed_option,
     takes,
 )
-from tactile_bayes.options import MapOptions
+from tactile_bayes.options import MapOptions, TrialSettings
 
 # --- Options of the commands on trials: `validate`, `plan`.
 

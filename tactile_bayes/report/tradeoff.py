@@ -6,8 +6,9 @@ import math
 from collections.abc import Iterator, Mapping
 from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
+from tactile_bayes.declarations import Meta, Record
 from tactile_bayes.posterior.lump_probability import LIKELY
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.estimate_text import SOURCES
@@ -105,81 +106,150 @@ def _span(low: float, high: float) -> str:
     return one if one == other else f"{one} to {other}"
 
 
-# --- Reports of `tradeoff estimate` and `tradeoff map` as JSON data.
+# --- What `tradeoff estimate --json` and `tradeoff map --json` print.
 
-SCHEMA = "tactile-bayes/tradeoff/1"
-SCHEMA_FILE = "tradeoff.schema.json"
-
-
-def ladder_document(ladder: Ladder, *, what: str, provenance: Mapping[str, Any]) -> dict[str, Any]:
-    """The same as plain data, by data_schema/tradeoff.schema.json.
-
-    Parameters
-    ----------
-    what
-        ``"estimate"`` or ``"map"``: what is varied.
-    """
-    reference, frontier = ladder.reference, ladder.frontier()
-    enough = ladder.enough()
-    return {
-        "schema": SCHEMA,
-        "varied": what,
-        "tolerance_mm": ladder.tolerance_mm,
-        "reference": {
-            "words": reference.words,
-            "mc_error_mm": _plain(reference.error_mm),
-            "half_width_mm": _plain(float("nan") if reference.answer is None else reference.answer.half_width_mm),
-            "cpu_s": _plain(reference.cpu_s),
-            "answer": None if reference.answer is None else _answer(reference.answer),
-        },
-        "settings": [_row_document(one) | {"frontier": any(one is other for other in frontier)} for one in ladder.rows],
-        "enough": None if enough is None else enough.label,
-        "pooled": [
-            {
-                "maps": one.maps,
-                "cpu_s": _plain(one.cpu_s),
-                "answer": _answer(one.answer),
-                "another_half_width_mm": _plain(one.another_half_mm),
-            }
-            for one in ladder.pooled
-        ],
-        "shared_cpu_s": {name: _plain(seconds) for name, seconds in ladder.shared_cpu_s.items()},
-        "advice": advice(ladder),
-        "provenance": dict(provenance),
-        "research_use": RESEARCH_USE,
-    }
+DIGITS: Final = 6
+Seconds = Annotated[dict[str, float], Meta(description="CPU seconds by part.")]
 
 
-def _row_document(one: Priced) -> dict[str, Any]:
-    return {
-        "axis": one.axis,
-        "setting": one.label,
-        "default": one.default,
-        "usable": one.usable,
-        "runs": len(one.answers),
-        "cpu_s": {name: _plain(seconds) for name, seconds in one.cpu_s.items()},
-        "median_off_mm": _plain(one.off.median),
-        "ends_off_mm": _plain(one.off.ends),
-        "width_ends_off_mm": _plain(one.off.width_ends),
-        "answer": _answer(one.answer),
-    }
+class QuantityFile(Record):
+    """A median with its interval, mm."""
+
+    median: float | None
+    low: float | None
+    high: float | None
+    mc_error: Annotated[float | None, Meta(description="Monte-Carlo error of the interval's ends.")]
 
 
-def _answer(answer: SizeAnswer) -> dict[str, Any]:
-    return {
-        "reason": answer.reason,
-        "detected_probability": None if answer.probability is None else _plain(answer.probability),
-        "method": answer.method,
-        "quantities": {
-            name: {part: _plain(getattr(one, part)) for part in ("median", "low", "high", "mc_error")}
+class AnswerFile(Record):
+    """What one estimate says."""
+
+    reason: Annotated[str, Meta(description="Why there is no number; empty where there is one.")]
+    detected_probability: Annotated[float, Meta(ge=0, le=1)] | None
+    method: Annotated[str, Meta(description="The method that drew.")]
+    quantities: Annotated[
+        dict[str, QuantityFile],
+        Meta(description="Medians and 95 % intervals, mm: max_size_mm, sigma_x_mm, sigma_y_mm."),
+    ]
+    variance_share: Annotated[
+        dict[str, float], Meta(description="Percent of the variance of ln(largest size) by source.")
+    ]
+
+
+class ReferenceFile(Record):
+    """What the settings are compared with."""
+
+    words: str
+    mc_error_mm: float | None
+    half_width_mm: float | None
+    cpu_s: float
+    answer: AnswerFile | None
+
+
+class SettingFile(Record):
+    """One setting, its cost and its distance from the reference."""
+
+    axis: str
+    setting: str
+    default: bool
+    usable: Annotated[
+        bool,
+        Meta(description="Whether it may be chosen to save time; other settings are another model or less data."),
+    ]
+    runs: Annotated[int, Meta(ge=1)]
+    cpu_s: Seconds
+    median_off_mm: float | None
+    ends_off_mm: Annotated[
+        float | None, Meta(description="Root mean square over runs and both ends of the reported interval.")
+    ]
+    width_ends_off_mm: float | None
+    answer: AnswerFile
+    frontier: Annotated[bool, Meta(description="No other setting is quicker and nearer at once.")]
+
+
+class PooledFile(Record):
+    """The size by the first few maps of a mass."""
+
+    maps: Annotated[int, Meta(ge=1)]
+    cpu_s: float
+    answer: AnswerFile
+    another_half_width_mm: Annotated[float | None, Meta(description="Half width of the interval of another exam, mm.")]
+
+
+class TradeoffFile(Record):
+    """Time against accuracy of estimates or maps."""
+
+    schema: Literal["tactile-bayes/tradeoff/1"]
+    varied: Literal["estimate", "map"]
+    tolerance_mm: Annotated[float, Meta(gt=0)]
+    reference: ReferenceFile
+    settings: Annotated[tuple[SettingFile, ...], Meta(min_length=1)]
+    enough: Annotated[str | None, Meta(description="The cheapest usable setting within the tolerance.")]
+    pooled: tuple[PooledFile, ...]
+    shared_cpu_s: Seconds
+    advice: Annotated[tuple[str, ...], Meta(min_length=1)]
+    provenance: dict[str, Any]
+    research_use: Annotated[str, Meta(min_length=1)]
+
+
+def ladder_file(ladder: Ladder, *, varied: Literal["estimate", "map"], provenance: Mapping[str, Any]) -> TradeoffFile:
+    """A ladder as its file."""
+    reference, frontier, enough = ladder.reference, ladder.frontier(), ladder.enough()
+    answer = reference.answer
+    return TradeoffFile(
+        schema="tactile-bayes/tradeoff/1",
+        varied=varied,
+        tolerance_mm=ladder.tolerance_mm,
+        reference=ReferenceFile(
+            reference.words,
+            _finite(reference.error_mm),
+            None if answer is None else _finite(answer.half_width_mm),
+            reference.cpu_s,
+            None if answer is None else _answer(answer),
+        ),
+        settings=tuple(_setting(one, frontier=any(one is other for other in frontier)) for one in ladder.rows),
+        enough=None if enough is None else enough.label,
+        pooled=tuple(
+            PooledFile(one.maps, one.cpu_s, _answer(one.answer), _finite(one.another_half_mm)) for one in ladder.pooled
+        ),
+        shared_cpu_s=ladder.shared_cpu_s,
+        advice=tuple(advice(ladder)),
+        provenance=dict(provenance),
+        research_use=RESEARCH_USE,
+    )
+
+
+def _setting(one: Priced, *, frontier: bool) -> SettingFile:
+    return SettingFile(
+        axis=one.axis,
+        setting=one.label,
+        default=one.default,
+        usable=one.usable,
+        runs=len(one.answers),
+        cpu_s=one.cpu_s,
+        median_off_mm=_finite(one.off.median),
+        ends_off_mm=_finite(one.off.ends),
+        width_ends_off_mm=_finite(one.off.width_ends),
+        answer=_answer(one.answer),
+        frontier=frontier,
+    )
+
+
+def _answer(answer: SizeAnswer) -> AnswerFile:
+    return AnswerFile(
+        answer.reason,
+        answer.probability,
+        answer.method,
+        {
+            name: QuantityFile(*map(_finite, (one.median, one.low, one.high, one.mc_error)))
             for name, one in answer.quantities.items()
         },
-        "variance_share": {name: _plain(share) for name, share in answer.shares.items()},
-    }
+        answer.shares,
+    )
 
 
-def _plain(value: float) -> float | None:
-    return float(f"{value:.6g}") if math.isfinite(value) else None
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
 
 
 # --- Reports of `tradeoff estimate` and `tradeoff map` as text: the table of settings.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import html
 import io
+import itertools
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal
@@ -12,13 +13,15 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from scipy.special import ndtr
 
+from tactile_bayes.declarations import UNSET
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.compare import Growth, growth_section
-from tactile_bayes.report.trial import growing_line, limit_rows, ratio_line, shown
+from tactile_bayes.report.trial import found_share, growing_line, limit_rows, number, ratio_line, shown
 from tactile_bayes.trial.calibration import BINS, Calibration, Prediction
-from tactile_bayes.trial.figures import Figure
-from tactile_bayes.trial.readings import FloatArray, ModalitySizes
-from tactile_bayes.trial.summary import ModalityReport, TrialReport
+from tactile_bayes.trial.figures import Ends, Figures
+from tactile_bayes.trial.method_comparison import MethodComparison
+from tactile_bayes.trial.readings import FloatArray, ModalitySizes, Trial, mass_numbers
+from tactile_bayes.trial.summary import ModalityReport, TrialReport, prediction_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -32,37 +35,37 @@ _PANEL_IN = 4.1
 Corner = Literal["upper left", "lower right"]
 
 
-def sizes_figure(report: TrialReport) -> bytes:
+def sizes_figure(report: TrialReport, trial: Trial) -> bytes:
     """Draw size against ex-vivo size, one panel per modality, as figure 10 of Wellman & Howe (1999).
 
     Error bars: +- 1 SD of the ex-vivo size where the table gives it, +- 1 SD of a mass's replicates. Dashed: identity;
     solid: line through zero. Hollow: not found, at size 0.
     """
-    modalities = [report.sizes[name] for name in report.modalities]
+    modalities = list(trial.sizes().values())
+    sds = {number: trial.ex_vivo_sd_mm.get(key) or 0.0 for key, number in mass_numbers(trial.ex_vivo_mm).items()}
     found = [np.concatenate([one.ex_vivo_mm, one.size_mm + _spread(one)]) for one in modalities]
     reach = 1.06 * float(max((values.max() for values in found if len(values)), default=1.0))
 
     def draw(axes: Sequence[Axes]) -> None:
         for one, panel in zip(modalities, axes, strict=True):
-            _draw_sizes(panel, one, report, reach)
+            _draw_sizes(panel, one, sds, report.modalities[one.name].slope_through_origin, reach)
 
     return _png(draw, len(modalities))
 
 
-def differences_figure(report: TrialReport) -> bytes:
+def differences_figure(report: TrialReport, trial: Trial) -> bytes:
     """Draw Bland-Altman plots: difference from the ex-vivo size against the mean, with limits and intervals.
 
     All panels have the same axes, so that modalities can be compared by eye.
     """
-    modalities = list(report.modalities.values())
-    found = [report.sizes[one.name].only_detected() for one in modalities]
+    found = [one.only_detected() for one in trial.sizes().values()]
 
     def draw(axes: Sequence[Axes]) -> None:
-        for one, sizes, panel in zip(modalities, found, axes, strict=True):
-            _draw_differences(panel, one, sizes)
+        for sizes, panel in zip(found, axes, strict=True):
+            _draw_differences(panel, report.modalities[sizes.name].method_comparison, sizes)
         _share_limits(axes)
 
-    return _png(draw, len(modalities))
+    return _png(draw, len(found))
 
 
 def _share_limits(axes: Sequence[Axes]) -> None:
@@ -101,14 +104,13 @@ def _spread(sizes: ModalitySizes) -> FloatArray:
     return np.array([group.std(ddof=1) if len(group) > 1 else 0.0 for group in sizes.replicates_mm])
 
 
-def _draw_sizes(axes: Axes, sizes: ModalitySizes, report: TrialReport, reach: float) -> None:
+def _draw_sizes(axes: Axes, sizes: ModalitySizes, sds: Mapping[int, float], slope: float | None, reach: float) -> None:
     found = sizes.only_detected()
     axes.plot([0, reach], [0, reach], linestyle="--", color=_GREY, linewidth=1, label="identity")
-    slope = report.modalities[sizes.name].figures["slope_through_origin"].value
     if slope is not None:
         end = min(reach, reach / slope) if slope > 0 else reach
         axes.plot([0, end], [0, slope * end], color=_LINE, linewidth=1.5, label=f"through zero, slope {slope:.2f}")
-    across = [report.ex_vivo_sd_mm.get(int(mass)) or 0.0 for mass in found.mass]
+    across = [sds[int(mass)] for mass in found.mass]
     bars: dict[str, Any] = {"elinewidth": 0.8, "capsize": 1.5, "ecolor": "0.6"}
     axes.errorbar(
         found.ex_vivo_mm,
@@ -129,22 +131,21 @@ def _draw_sizes(axes: Axes, sizes: ModalitySizes, report: TrialReport, reach: fl
     _label(axes, sizes.name, "ex-vivo size (mm)", "size (mm)", where="lower right")
 
 
-def _draw_differences(axes: Axes, report: ModalityReport, found: ModalitySizes) -> None:
+def _draw_differences(axes: Axes, methods: MethodComparison, found: ModalitySizes) -> None:
     mean, off = (found.ex_vivo_mm + found.size_mm) / 2, found.size_mm - found.ex_vivo_mm
     axes.plot(mean, off, "o", markersize=4, color=_DOTS)
     axes.axhline(0, color=_GREY, linestyle="--", linewidth=1)
-    one = report.methods.limits.get("mm")
+    one = methods.limits.get("mm")
     if one is not None:
         axes.axhline(one.bias, color=_LINE, linewidth=1.5, label=f"bias {one.bias:.1f}")
-        figures = report.methods.figures
-        for value, side in ((one.low, "low"), (one.high, "high")):
-            ends = figures[f"limit_{side}_mm"].interval
+        sides = ((one.low, methods.limit_low_mm_interval), (one.high, methods.limit_high_mm_interval))
+        for value, ends in sides:
             axes.axhline(value, color=_SECOND, linewidth=1.2, label=f"limit {value:.1f}")
             if ends is not None:
                 axes.axhspan(*ends, color=_SECOND, alpha=0.13, linewidth=0)
         axes.legend(fontsize=7.5, loc="upper left", framealpha=0.85)
     axes.tick_params(labelsize=8)
-    _label(axes, report.name, "mean of both (mm)", "size - ex vivo (mm)", legend=False)
+    _label(axes, found.name, "mean of both (mm)", "size - ex vivo (mm)", legend=False)
 
 
 def _draw_pit(axes: Axes, found: Calibration) -> None:
@@ -238,17 +239,10 @@ _METHODS = {
 }
 
 
-def trial_html(report: TrialReport, document: Mapping[str, Any], *, text: str, growth: Sequence[Growth] = ()) -> str:
-    """Full HTML page of a report.
+def trial_html(report: TrialReport, trial: Trial, *, text: str, growth: Sequence[Growth] = ()) -> str:
+    """Full HTML page of a trial's report, with the text report at its end for those who copy from it.
 
-    Parameters
-    ----------
-    document
-        What the JSON report holds; its provenance is shown.
-    text
-        The text report, kept at the end for those who copy from it.
-    growth
-        Of masses with several visits, beside the trial.
+    `growth` is of masses with several visits, beside the trial.
     """
     title = "Sizes against excision"
     parts = [
@@ -258,61 +252,64 @@ def trial_html(report: TrialReport, document: Mapping[str, Any], *, text: str, g
         '<meta name="viewport" content="width=device-width, initial-scale=1">',
         f"<title>{title}</title><style>{_STYLE}</style></head><body>",
         f"<h1>{title}</h1>",
-        *([f"<p>Protocol: {html.escape(document['title'])}</p>"] if "title" in document else []),
-        *_opening(report),
-        *_errors(report),
-        *_agreement(report),
+        *([] if report.title is UNSET else [f"<p>Protocol: {html.escape(report.title)}</p>"]),
+        *_opening(report, trial),
+        *_errors(report, trial),
+        *_agreement(report, trial),
         *_replicates(report),
-        *_calibrations(report),
+        *_calibrations(report, trial),
         *_comparisons(report),
         *growth_section(growth),
-        *_next_mass(document),
-        *_interval_check(document),
-        *_origin(document),
+        *_next_mass(report),
+        *_interval_check(report),
+        *_origin(report),
         f"<details><summary>The report as text</summary><pre>{html.escape(text)}</pre></details>",
         f'<p class="mark">{html.escape(RESEARCH_USE)}</p></body></html>',
     ]
     return "\n".join(parts) + "\n"
 
 
-def _opening(report: TrialReport) -> Iterator[str]:
+def _opening(report: TrialReport, trial: Trial) -> Iterator[str]:
+    counts = report.counts
     yield (
-        f"<p>{report.masses} masses of {report.patients} patients, {report.readings} readings. "
-        f"In brackets: {100 * report.confidence:g} % intervals over patients.</p>"
+        f"<p>{counts.masses} masses of {counts.patients} patients, {counts.readings} readings. "
+        f"In brackets: {100 * report.interval_probability:g} % intervals over patients.</p>"
     )
-    for line in report.other_visits.lines():
+    for line in trial.other_visits.lines():
         yield f'<p class="mark">{html.escape(line)}.</p>'
     for doubt in report.doubts:
         yield f'<p class="mark">Doubtful: {html.escape(doubt)}</p>'
-    if report.synthetic_readings:
-        share = "All" if report.synthetic_readings == report.readings else str(report.synthetic_readings)
+    if counts.synthetic_readings:
+        share = "All" if counts.synthetic_readings == counts.readings else str(counts.synthetic_readings)
         yield f'<p class="mark">{share} readings are synthetic: made by a generator, not measured.</p>'
 
 
-def _errors(report: TrialReport) -> Iterator[str]:
+def _errors(report: TrialReport, trial: Trial) -> Iterator[str]:
     yield "<h2>Errors</h2>"
-    rows = [[one.name, _found(one), *_cells(one.figures, _MAIN)] for one in report.modalities.values()]
+    rows = [[name, found_share(one), *_cells(one, _MAIN)] for name, one in report.modalities.items()]
     yield _table(["", "found", *(words for words, _ in _MAIN.values())], rows)
     yield (
         '<p class="note">A mass not found counts as size 0, an error of 100 %, except in columns that say "found". '
         "r2 centred is 1 - SSE0/SST of the line through zero, below 0 where it fails.</p>"
     )
-    for name, ratio in report.ratios.items():
+    for name, ratio in report.mape_ratio_to_tactile.items():
         yield f"<p>{html.escape(ratio_line(name, ratio))}.</p>"
-    for one in report.modalities.values():
+    for name, one in report.modalities.items():
         for caution in one.cautions:
-            yield f'<p class="note">{html.escape(f"{one.name}: {caution}")}.</p>'
-    yield _picture(sizes_figure(report), "Size against ex-vivo size for each modality, with identity and fitted line")
+            yield f'<p class="note">{html.escape(f"{name}: {caution}")}.</p>'
+    yield _picture(
+        sizes_figure(report, trial), "Size against ex-vivo size for each modality, with identity and fitted line"
+    )
     yield (
         '<p class="note">Points are means over the replicates of a mass. Bars: 1 SD of the ex-vivo size where the '
         "table gives it (across) and 1 SD of the replicates (up). Hollow points: masses not found, at size 0.</p>"
     )
 
 
-def _agreement(report: TrialReport) -> Iterator[str]:
-    ratio = next((one.methods.error_ratio for one in report.modalities.values()), 1.0)
+def _agreement(report: TrialReport, trial: Trial) -> Iterator[str]:
+    ratio = next((one.method_comparison.error_ratio for one in report.modalities.values()), 1.0)
     yield "<h2>Agreement</h2>"
-    rows = [[one.name, *_cells(one.methods.figures, _METHODS)] for one in report.modalities.values()]
+    rows = [[name, *_cells(one.method_comparison, _METHODS)] for name, one in report.modalities.items()]
     yield _table(["", *(words for words, _ in _METHODS.values())], rows)
     yield (
         '<p class="note">Masses found only; limits of agreement are for single readings. '
@@ -321,15 +318,17 @@ def _agreement(report: TrialReport) -> Iterator[str]:
     yield _table(
         ["", "scale", "bias", "lower limit", "upper limit"],
         [
-            [one.name, row.words, row.bias, row.low, row.high]
-            for one in report.modalities.values()
+            [name, row.words, row.bias, row.low, row.high]
+            for name, one in report.modalities.items()
             for row in limit_rows(one)
         ],
     )
-    for note in (growing_line(report), *map(_trend, report.modalities.values())):
+    for note in (growing_line(report), *itertools.starmap(_trend, report.modalities.items())):
         if note:
             yield f"<p>{html.escape(note)}</p>"
-    yield _picture(differences_figure(report), "Difference to the ex-vivo size against the mean of both, with limits")
+    yield _picture(
+        differences_figure(report, trial), "Difference to the ex-vivo size against the mean of both, with limits"
+    )
     yield (
         '<p class="note">Points are means over the replicates of a mass; the limits are for single readings and so are '
         "wider than the points where there are replicates. Bands: intervals of the limits over patients. All panels "
@@ -337,35 +336,34 @@ def _agreement(report: TrialReport) -> Iterator[str]:
     )
 
 
-def _trend(report: ModalityReport) -> str | None:
+def _trend(name: str, report: ModalityReport) -> str | None:
     """Whether the difference changes with the ex-vivo size, where it was tested."""
-    found = report.methods.trends.get("on_ex_vivo")
+    found = report.method_comparison.trends.get("on_ex_vivo")
     if found is None or found.p_value is None or found.p_value >= 0.05:
         return None
     return (
-        f"{report.name}: the difference changes by {found.slope:+.2f} mm per mm of ex-vivo size "
+        f"{name}: the difference changes by {found.slope:+.2f} mm per mm of ex-vivo size "
         f"(p {found.p_value:.3f}, masses taken as independent)."
     )
 
 
 def _replicates(report: TrialReport) -> Iterator[str]:
-    replicated = [one for one in report.modalities.values() if one.replicates["within_mass_log_sd"].value is not None]
+    replicated = {name: one for name, one in report.modalities.items() if one.replicates.within_mass_log_sd is not None}
     if not replicated:
         return
     yield "<h2>Replicates</h2>"
     rows = []
-    for one in replicated:
-        parts = one.components
+    for name, one in replicated.items():
+        found = one.replicates
+        parts = found.variance_components
         sds = [None, None, None] if parts is None else [parts.mass, parts.reader, parts.map]
         rows.append(
             [
-                one.name,
-                *_cells(
-                    one.figures, {"within_mass_cv_rms_percent": ("", ".1f"), "within_mass_cv_percent": ("", ".1f")}
-                ),
-                shown(one.replicates["repeatability_low_percent"], ".0f"),
-                shown(one.replicates["repeatability_high_percent"], "+.0f"),
-                shown(one.replicates["icc"], ".2f"),
+                name,
+                *_cells(one, {"within_mass_cv_rms_percent": ("", ".1f"), "within_mass_cv_percent": ("", ".1f")}),
+                shown(found.figure("repeatability_low_percent"), ".0f"),
+                shown(found.figure("repeatability_high_percent"), "+.0f"),
+                shown(found.figure("icc"), ".2f"),
                 *("-" if sd is None else f"{100 * sd**0.5:.0f}" for sd in sds),
             ]
         )
@@ -383,21 +381,21 @@ def _replicates(report: TrialReport) -> Iterator[str]:
     yield '<p class="note">The mean of SDs is low for few replicates. SDs are of the logarithm of size.</p>'
 
 
-def _calibrations(report: TrialReport) -> Iterator[str]:
-    for one in report.modalities.values():
-        if one.calibration is None or one.prediction is None:
+def _calibrations(report: TrialReport, trial: Trial) -> Iterator[str]:
+    for name, one in report.modalities.items():
+        found, prediction = one.calibration, prediction_of(trial, name)
+        if found is None or prediction is None:
             continue
-        found = one.calibration
-        yield f"<h2>Stated uncertainty: {html.escape(one.name)}</h2>"
+        yield f"<h2>Stated uncertainty: {html.escape(name)}</h2>"
         yield (
-            f"<p>{found.n} readings of {found.masses} masses; CRPS {found.crps_mm:.2f} mm, interval score "
-            f"{found.interval_score_mm:.1f} mm. Advice: {html.escape(found.advice)}.</p>"
+            f"<p>{found.n} readings of {found.masses} masses; CRPS {number(found.crps_mm, '.2f')} mm, interval score "
+            f"{number(found.interval_score_mm, '.1f')} mm. Advice: {html.escape(found.advice)}.</p>"
         )
-        yield _picture(calibration_figure(one.prediction, found), "Integral transforms and coverage")
+        yield _picture(calibration_figure(prediction, found), "Integral transforms and coverage")
 
 
 def _comparisons(report: TrialReport) -> Iterator[str]:
-    if not report.paired:
+    if not report.paired_comparisons:
         return
     yield "<h2>Modalities compared on common masses</h2>"
     yield _table(
@@ -406,19 +404,19 @@ def _comparisons(report: TrialReport) -> Iterator[str]:
             [
                 f"{one.first} - {one.second}",
                 str(one.masses),
-                shown(one.difference_percent, "+.1f"),
-                shown(one.ratio, ".2f"),
-                "-" if one.p_value is None else f"{one.p_value:.4f}",
-                "-" if one.p_holm is None else f"{one.p_holm:.4f}",
+                shown(one.figure("difference_percent"), "+.1f"),
+                shown(one.figure("ratio"), ".2f"),
+                number(one.p_value, ".4f"),
+                number(one.p_holm, ".4f"),
             ]
-            for one in report.paired
+            for one in report.paired_comparisons
         ],
     )
 
 
-def _next_mass(document: Mapping[str, Any]) -> Iterator[str]:
-    found = document.get("next_mass")
-    if not found:
+def _next_mass(report: TrialReport) -> Iterator[str]:
+    found = report.next_mass
+    if found is UNSET:
         return
     yield "<h2>The next mass</h2>"
     columns = {
@@ -429,33 +427,33 @@ def _next_mass(document: Mapping[str, Any]) -> Iterator[str]:
     }
     columns |= {"patient_sd": "SD patients", "mass_sd": "SD masses", "replicate_sd": "SD maps"}
     rows = [
-        [name, *(_with(one[key]["median"], (one[key]["low"], one[key]["high"])) for key in columns)]
-        for name, one in found["modalities"].items()
+        [name, *(_with(middle.median, (middle.low, middle.high)) for middle in (getattr(one, key) for key in columns))]
+        for name, one in found.modalities.items()
     ]
     yield _table(["", *columns.values()], rows)
-    for pair, probability in found["probability_less_error"].items():
+    for pair, probability in found.probability_less_error.items():
         yield f"<p>Probability that {html.escape(pair)}: {probability:.3f}</p>"
-    percent = 100 * found["interval"]["probability"]
+    percent = 100 * found.interval.probability
     yield (
         '<p class="note">Bayesian errors-in-variables model of ln size, for a single reading of a new patient\'s mass; '
         f"medians and equal-tailed {percent:g} % intervals. It stands beside the tables above and replaces none.</p>"
     )
 
 
-def _interval_check(document: Mapping[str, Any]) -> Iterator[str]:
-    found = document.get("interval_check")
-    if not found:
+def _interval_check(report: TrialReport) -> Iterator[str]:
+    found = report.interval_check
+    if found is UNSET or not found:
         return
     yield "<h2>Simulated coverage of the intervals</h2>"
     heads = ["", "simulated trials", "true MAPE %", "covered", "interval above it", "interval below it"]
     rows = [
         [
             name,
-            str(one["trials"]),
-            f"{one['true_mape_percent']:.1f}",
-            _with(one["share"], (one["share_interval"][0], one["share_interval"][1])),
-            str(one["above"]),
-            str(one["below"]),
+            str(one.trials),
+            f"{one.true_mape_percent:.1f}",
+            _with(one.share, one.share_interval),
+            str(one.above),
+            str(one.below),
         ]
         for name, one in found.items()
     ]
@@ -463,8 +461,8 @@ def _interval_check(document: Mapping[str, Any]) -> Iterator[str]:
     yield '<p class="note">Trials of this size with errors like those found; intervals of the percent error.</p>'
 
 
-def _origin(document: Mapping[str, Any]) -> Iterator[str]:
-    provenance = document["provenance"]
+def _origin(report: TrialReport) -> Iterator[str]:
+    provenance = report.provenance
     yield "<h2>Settings and origin</h2>"
     rows = [[key, json.dumps(value)] for key, value in provenance["settings"].items()]
     rows += [["seed", str(provenance["seed"])], ["program", f"{provenance['program']} {provenance['version']}"]]
@@ -474,18 +472,12 @@ def _origin(document: Mapping[str, Any]) -> Iterator[str]:
         yield '<p class="note">No pre-specified analysis was given (--protocol).</p>'
 
 
-def _cells(figures: Mapping[str, Figure], wanted: Mapping[str, tuple[str, str]]) -> list[str]:
-    return [shown(figures[key], spec) for key, (_, spec) in wanted.items()]
+def _cells(figures: Figures, wanted: Mapping[str, tuple[str, str]]) -> list[str]:
+    return [shown(figures.figure(key), spec) for key, (_, spec) in wanted.items()]
 
 
-def _with(value: float, ends: tuple[float, float] | None) -> str:
-    return f"{value:.3g}" if ends is None else f"{value:.3g} [{ends[0]:.3g}, {ends[1]:.3g}]"
-
-
-def _found(report: ModalityReport) -> str:
-    share = f"{report.detected}/{report.n}"
-    ends = report.detected_interval
-    return share if ends is None else f"{share} [{100 * ends[0]:.0f}, {100 * ends[1]:.0f} %]"
+def _with(value: float, ends: Ends) -> str:
+    return f"{value:.3g} [{ends[0]:.3g}, {ends[1]:.3g}]"
 
 
 def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

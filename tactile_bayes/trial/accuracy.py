@@ -6,20 +6,27 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from itertools import combinations
+from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
 from scipy.special import betaincinv
 
-from tactile_bayes.declarations import Record, replace
+from tactile_bayes.declarations import Meta, Record, replace
 from tactile_bayes.trial.figures import (
+    Count,
+    Ends,
     Figure,
+    Figures,
+    NotNegative,
+    Reasons,
     Sample,
     Scale,
     SumStatistic,
     UndefinedError,
     columns,
     effective_number,
+    fields_of,
     figure,
     method_of,
     ratio,
@@ -50,8 +57,6 @@ def cautions(sizes: ModalitySizes, *, confidence: float) -> tuple[str, ...]:
 # Where one mass in 25 is missed, a trial of 25 has none, one or two misses, and each moves the mean error by some 3
 # points. Leaving out or redrawing patients sees only the misses that occurred: without any, the interval allows for
 # none.
-
-Ends = tuple[float, float]
 
 
 def figure_with_misses(
@@ -287,15 +292,19 @@ def _need_spread(values: FloatArray, reason: str) -> None:
 REFERENCE = "tactile"
 
 
-class ModalityRatio(Record):
+class ModalityRatio(Figures):
     """Percent error of one modality over the tactile one's on common masses."""
 
-    masses: int
-    ratio: Figure
-    """On the `masses` that both looked for, a mass not found counting 100 %."""
-    masses_detected: int
-    ratio_detected: Figure
-    """On the `masses_detected` that both found."""
+    masses: Annotated[int, Meta(ge=0, description="That both modalities looked for.")]
+    masses_detected: Annotated[int, Meta(ge=0, description="That both found.")]
+    ratio: Annotated[
+        NotNegative | None,
+        Meta(description="On the masses that both looked for; masses not detected counted as size 0."),
+    ]
+    ratio_interval: Ends | None
+    ratio_detected: Annotated[NotNegative | None, Meta(description="On the masses that both detected.")]
+    ratio_detected_interval: Ends | None
+    reasons: Reasons
 
 
 def mape_ratios(sizes: Mapping[str, ModalitySizes], *, confidence: float) -> dict[str, ModalityRatio]:
@@ -311,12 +320,11 @@ def mape_ratios(sizes: Mapping[str, ModalitySizes], *, confidence: float) -> dic
 def _modality_ratio(sizes: ModalitySizes, reference: ModalitySizes, *, confidence: float) -> ModalityRatio:
     looked_for = on_common_masses(sizes, reference)
     found = on_common_masses(sizes.only_detected(), reference.only_detected())
-    return ModalityRatio(
-        masses=len(looked_for[0].size_mm),
-        ratio=mape_ratio(*looked_for, confidence=confidence),
-        masses_detected=len(found[0].size_mm),
-        ratio_detected=mape_ratio(*found, confidence=confidence),
-    )
+    figures = {
+        "ratio": mape_ratio(*looked_for, confidence=confidence),
+        "ratio_detected": mape_ratio(*found, confidence=confidence),
+    }
+    return ModalityRatio(masses=len(looked_for[0].size_mm), masses_detected=len(found[0].size_mm), **fields_of(figures))
 
 
 def on_common_masses(one: ModalitySizes, other: ModalitySizes) -> tuple[ModalitySizes, ModalitySizes]:
@@ -383,22 +391,24 @@ FLIPS = 9_999
 _AT_ONCE = 111
 
 
-class PairedComparison(Record):
+class PairedComparison(Figures):
     """Percent errors of `first` against `second` on their common masses; a mass not found counts as size 0."""
 
     first: str
     second: str
-    masses: int
-    patients: int
+    masses: Count
+    patients: Count
     first_percent: float | None
     second_percent: float | None
-    difference_percent: Figure
-    ratio: Figure
-    """`difference_percent`, `ratio`: Mean error of the first less, or over, that of the second."""
-    p_value: float | None
-    """Two-sided, of the sign-flip test by patient; None where no patient differs."""
-    p_holm: float | None = None
-    """The same, corrected for all pairs of this trial."""
+    p_value: Annotated[
+        float | None, Meta(description="Two-sided, of the sign-flip test by patient; null where no patient differs.")
+    ]
+    p_holm: Annotated[float | None, Meta(description="The same, corrected for all pairs of this trial.")]
+    difference_percent: Annotated[float | None, Meta(description="Mean error of the first less that of the second.")]
+    difference_percent_interval: Ends | None
+    ratio: Annotated[float | None, Meta(description="Mean error of the first over that of the second.")]
+    ratio_interval: Ends | None
+    reasons: Reasons
 
 
 def paired_comparisons(
@@ -478,9 +488,9 @@ def _compare(one: ModalitySizes, other: ModalitySizes, *, confidence: float, see
         patients=len(patients),
         first_percent=figure(mape_percent, first).value,
         second_percent=figure(mape_percent, second).value,
-        difference_percent=difference,
-        ratio=quotient,
         p_value=sign_flip(sums, seed=seed) if len(patients) and np.all(np.isfinite(sums)) else None,
+        p_holm=None,
+        **fields_of({"difference_percent": difference, "ratio": quotient}),
     )
 
 

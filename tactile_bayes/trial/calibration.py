@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from itertools import groupby
+from typing import Annotated
 
 import numpy as np
 from scipy.special import chdtri, kolmogi, ndtr, ndtri
 
-from tactile_bayes.declarations import Record
-from tactile_bayes.trial.figures import MIN_PATIENTS, clopper_pearson
+from tactile_bayes.declarations import Meta, Record
+from tactile_bayes.trial.figures import MIN_PATIENTS, Count, Ends, Share, clopper_pearson
 from tactile_bayes.trial.readings import FloatArray, IntervalReading
 
 # --- Coverage of stated intervals against the size after excision.
@@ -23,16 +24,12 @@ class Coverage(Record):
     little less often than they say.
     """
 
-    probability: float
-    n: int
-    covered: int
-    masses: int
-    interval: tuple[float, float]
-
-    @property
-    def fraction(self) -> float:
-        """Share covered."""
-        return self.covered / self.n
+    probability: Annotated[float, Meta(gt=0, lt=1)]
+    n: Annotated[int, Meta(ge=1)]
+    covered: Count
+    masses: Annotated[int, Meta(ge=1)]
+    fraction: Share
+    fraction_interval: Ends
 
 
 def coverage(intervals: Sequence[IntervalReading], *, confidence: float) -> list[Coverage]:
@@ -58,7 +55,8 @@ def _coverage(probability: float, group: Sequence[IntervalReading], *, confidenc
         n=len(group),
         covered=covered,
         masses=masses,
-        interval=clopper_pearson(covered * masses / len(group), masses, confidence=confidence),
+        fraction=covered / len(group),
+        fraction_interval=clopper_pearson(covered * masses / len(group), masses, confidence=confidence),
     )
 
 
@@ -98,32 +96,33 @@ class LevelCoverage(Record):
     """Central intervals of one nominal probability: `covered` of the readings, with an exact interval by masses."""
 
     probability: float
-    covered: int
-    n: int
-    interval: tuple[float, float]
+    covered: Count
+    n: Count
+    interval: Ends
 
 
 class Calibration(Record):
     """Figures that show how well the stated uncertainties are calibrated."""
 
-    n: int
-    masses: int
+    n: Count
+    masses: Count
     levels: tuple[LevelCoverage, ...]
-    pit: tuple[int, ...]
-    """Histogram of the integral transforms: counts in `BINS` equal bins; level when honest."""
-    ecdf_band: float
-    """Half-width of the simultaneous band about the transforms' distribution function (Kolmogorov, by masses)."""
-    ecdf_distance: float
-    """Largest distance of that function from the diagonal; above the band, the uncertainties are refuted."""
-    crps_mm: float
-    """Mean continuous ranked probability score of the size in mm: an absolute error for whole distributions."""
-    interval_score_mm: float
-    """Mean interval score at 95 %: width, and 40 mm for each mm outside."""
-    scale: float
-    """Factor by which SDs should be multiplied to be honest in the mean square, with an interval by masses."""
-    scale_interval: tuple[float, float]
-    shift_percent: float
-    """Median of the found sizes over the predicted, less 100 %."""
+    pit: Annotated[tuple[Count, ...], Meta(description="Integral transforms: counts in ten equal bins.")]
+    ecdf_band: Annotated[
+        float, Meta(description="Half-width of the band about the transforms' distribution function (Kolmogorov).")
+    ]
+    ecdf_distance: Annotated[
+        float, Meta(description="Largest distance from the diagonal; above the band, the uncertainties are refuted.")
+    ]
+    crps_mm: Annotated[float | None, Meta(description="Mean continuous ranked probability score of the size.")]
+    interval_score_mm: Annotated[
+        float | None, Meta(description="Mean interval score at 95 %: width, and 40 mm for each mm outside.")
+    ]
+    scale: Annotated[
+        float, Meta(description="Factor by which SDs should be multiplied to be honest in the mean square.")
+    ]
+    scale_interval: Ends
+    shift_percent: Annotated[float, Meta(description="Median of the found sizes over the predicted, less 100 %.")]
     advice: str
 
 
@@ -152,13 +151,19 @@ def calibration(prediction: Prediction, *, confidence: float) -> Calibration | N
         pit=tuple(int(count) for count in np.histogram(pit, bins=BINS, range=(0, 1))[0]),
         ecdf_band=band,
         ecdf_distance=distance,
-        crps_mm=float(np.mean(crps_log_normal(prediction))),
-        interval_score_mm=float(np.mean(interval_score(prediction, probability=0.95))),
+        crps_mm=_finite_mean(crps_log_normal(prediction)),
+        interval_score_mm=_finite_mean(interval_score(prediction, probability=0.95)),
         scale=scale,
         scale_interval=ends,
         shift_percent=shift,
         advice=_advice(scale, ends, masses, distance > band),
     )
+
+
+def _finite_mean(values: FloatArray) -> float | None:
+    """Mean; None where a stated uncertainty is too wide for double precision."""
+    mean = float(np.mean(values))
+    return mean if math.isfinite(mean) else None
 
 
 def crps_log_normal(prediction: Prediction) -> FloatArray:
@@ -227,7 +232,7 @@ def _level(z: FloatArray, masses: int, level: float, *, confidence: float) -> Le
     return LevelCoverage(level, covered, len(z), share)
 
 
-def _scale(z: FloatArray, mass: FloatArray, *, confidence: float) -> tuple[float, tuple[float, float]]:
+def _scale(z: FloatArray, mass: FloatArray, *, confidence: float) -> tuple[float, Ends]:
     """Root mean square of z, and its chi-squared interval with one degree of freedom per mass."""
     masses = len(np.unique(mass))
     mean = float(np.mean(z**2))
@@ -236,7 +241,7 @@ def _scale(z: FloatArray, mass: FloatArray, *, confidence: float) -> tuple[float
     return math.sqrt(mean), (math.sqrt(low), math.sqrt(high))
 
 
-def _advice(scale: float, ends: tuple[float, float], masses: int, refuted: bool) -> str:
+def _advice(scale: float, ends: Ends, masses: int, refuted: bool) -> str:
     if masses < MIN_PATIENTS:
         return f"too few masses ({masses}) to judge; at least {MIN_PATIENTS} are needed"
     if ends[0] <= 1 <= ends[1]:

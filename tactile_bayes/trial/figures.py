@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache, partial
-from typing import Literal, Protocol, TypeVar, assert_never
+from typing import Annotated, Any, Literal, Protocol, TypeVar, assert_never
 
 import numpy as np
 import numpy.typing as npt
 from scipy.special import betaincinv, ndtr, ndtri, stdtrit
 
-from tactile_bayes.declarations import Record, replace
+from tactile_bayes.declarations import UNSET, Meta, Record, replace
 from tactile_bayes.trial.readings import FloatArray, ModalitySizes
 
 # --- Jackknife intervals over patients, keeping a patient's masses together.
@@ -323,6 +323,44 @@ class Figure(Record):
             if abs(low) < LARGEST and abs(high) < LARGEST:
                 return replace(one, interval=(low, high))
         return replace(one, interval=None, interval_reason="the interval is wider than double precision holds")
+
+
+Ends = tuple[float, float]
+Count = Annotated[int, Meta(ge=0)]
+NotNegative = Annotated[float, Meta(ge=0)]
+AtMostOne = Annotated[float, Meta(le=1)]
+Share = Annotated[float, Meta(ge=0, le=1)]
+Correlation = Annotated[float, Meta(ge=-1, le=1)]
+Reason = Annotated[str, Meta(min_length=1)]
+Reasons = Annotated[dict[str, Reason], Meta(description="Why a figure or an interval is null.")]
+
+
+class Figures(Record):
+    """Base of the records that hold figures: the value of each, its ends as ``NAME_interval``, and `reasons`."""
+
+    def figure(self, name: str) -> Figure:
+        """A figure with its interval, by its name."""
+        interval, reasons = f"{name}_interval", getattr(self, "reasons", {})
+        ends: Any = getattr(self, interval, UNSET)
+        given = ends is not UNSET
+        return Figure(
+            getattr(self, name), reasons.get(name, ""), ends if given else None, reasons.get(interval, ""), given
+        )
+
+
+def fields_of(figures: Mapping[str, Figure]) -> dict[str, Any]:
+    """Fields of a record of `Figures`."""
+    fields: dict[str, Any] = {}
+    reasons: dict[str, str] = {}
+    for name, one in figures.items():
+        fields[name] = one.value
+        if one.value is None:
+            reasons[name] = one.reason
+        if one.has_interval:
+            fields[f"{name}_interval"] = one.interval
+            if one.interval is None:
+                reasons[f"{name}_interval"] = one.interval_reason
+    return {**fields, "reasons": reasons}
 
 
 def figure(

@@ -11,6 +11,8 @@ from scipy.special import chdtri, gammaincc, gammaincinv, gammaln, ndtr, ndtri, 
 
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.trial.figures import (
+    Count,
+    Ends,
     Figure,
     Sample,
     Scale,
@@ -112,8 +114,6 @@ def _root(function: Callable[[float], float], target: float) -> float:
 #
 # Differences are the method under test less the reference, y - x. Intervals take the masses as independent; where a
 # patient has several masses the jackknife over patients stands beside them.
-
-Ends = tuple[float, float]
 # Share of the differences that lie between the limits.
 SHARE = 0.95
 # Times that errors proportional to size must be likelier than constant ones, and masses needed to judge it.
@@ -124,7 +124,7 @@ LEAST_MASSES = 8
 class Limits(Record):
     """Limits of agreement and their intervals; all in the unit of the differences."""
 
-    n: int
+    n: Count
     bias: float
     bias_interval: Ends | None
     sd: float

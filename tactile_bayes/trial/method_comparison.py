@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
-from typing import TypeVar
+from typing import Annotated, Literal, TypeVar
 
 import numpy as np
 
-from tactile_bayes.declarations import Record, field
+from tactile_bayes.declarations import UNSET, Meta, UnsetType
 from tactile_bayes.trial import limits as bland_altman
 from tactile_bayes.trial import limits as patient_limits
 from tactile_bayes.trial.figures import (
+    Count,
+    Ends,
     Figure,
+    Figures,
+    Reasons,
     Scale,
     Statistic,
     SumStatistic,
     UndefinedError,
     columns,
+    fields_of,
     figure,
     method_of,
     ratio,
@@ -43,27 +48,72 @@ MOST_REFITTED = 300
 # Sizes beyond these have squares that double precision does not hold.
 _SMALLEST, _LARGEST = 1e-100, 1e100
 
-Ends = tuple[float, float]
 _T = TypeVar("_T")
 
 
-class MethodComparison(Record):
-    """Comparison of one modality's detected sizes with excision."""
+Unit = Literal["mm", "log_ratio"]
+Against = Literal["on_ex_vivo", "on_mean"]
+_Refitted = Ends | None | UnsetType
+"""The interval of a figure that has none where there are more than `MOST_REFITTED` masses."""
+_LimitMm = Annotated[
+    float, Meta(description="Limit of agreement in mm for single readings; the interval is over patients.")
+]
+_LimitLog = Annotated[
+    float,
+    Meta(description="Limit of agreement in ln(size / ex vivo) for single readings; the interval is over patients."),
+]
 
-    n: int
-    error_ratio: float
-    """Variance of the error of ex-vivo sizes over that of the modality's, as the Deming lines took it."""
-    figures: Mapping[str, Figure]
-    """Intercepts, slopes, concordance and limits with intervals over patients."""
-    analytic: Mapping[str, Ends | None] = field(default_factory=dict)
-    """Customary intervals of the same figures, as if masses were independent; None where there is none."""
-    limits: Mapping[str, Limits] = field(default_factory=dict)
-    """``mm`` for differences, ``log_ratio`` for logarithms of ratios; of single readings, replicates allowed for."""
-    trends: Mapping[str, Trend] = field(default_factory=dict)
-    """Slope of the differences on the ex-vivo size (``on_ex_vivo``) and on the mean of both (``on_mean``)."""
-    concordance: Concordance | None = None
-    errors_grow: bool = False
-    """Errors are likelier proportional to size than constant, so that limits in mm suit no one size."""
+
+class MethodComparison(Figures, kw_only=True):
+    """Detected masses as measurements: lines, concordance, limits of agreement, with intervals over patients."""
+
+    masses: Count
+    error_ratio: Annotated[float, Meta(gt=0, description="Variance of the ex-vivo error over that of the modality's.")]
+    ols_intercept_mm: float | None
+    ols_intercept_mm_interval: Ends | None
+    ols_slope: float | None
+    ols_slope_interval: Ends | None
+    deming_intercept_mm: float | None
+    deming_intercept_mm_interval: Ends | None
+    deming_slope: float | None
+    deming_slope_interval: Ends | None
+    weighted_deming_intercept_mm: float | None
+    weighted_deming_intercept_mm_interval: _Refitted = UNSET
+    passing_bablok_intercept_mm: float | None
+    passing_bablok_intercept_mm_interval: _Refitted = UNSET
+    weighted_deming_slope: float | None
+    weighted_deming_slope_interval: _Refitted = UNSET
+    passing_bablok_slope: float | None
+    passing_bablok_slope_interval: _Refitted = UNSET
+    concordance: float | None
+    concordance_interval: Ends | None
+    difference_mean_mm: float | None
+    difference_mean_mm_interval: Ends | None
+    difference_sd_mm: float | None
+    difference_sd_mm_interval: Ends | None
+    limit_low_mm: _LimitMm | None
+    limit_low_mm_interval: Ends | None
+    limit_high_mm: _LimitMm | None
+    limit_high_mm_interval: Ends | None
+    limit_low_log_ratio: _LimitLog | None
+    limit_low_log_ratio_interval: Ends | None
+    limit_high_log_ratio: _LimitLog | None
+    limit_high_log_ratio_interval: Ends | None
+    reasons: Reasons
+    analytic_intervals: Annotated[dict[str, Ends | None], Meta(description="As if masses were independent.")]
+    limits: Annotated[
+        dict[Unit, Limits],
+        Meta(description="Of differences and of logarithms of ratios; of single readings, replicates allowed for."),
+    ]
+    trends: Annotated[
+        dict[Against, Trend],
+        Meta(description="Slope of the differences on the ex-vivo size, and on the mean of both."),
+    ]
+    concordance_parts: Concordance | None
+    errors_grow_with_size: Annotated[
+        bool,
+        Meta(description="Errors are likelier proportional to size than constant: limits in mm suit no one size."),
+    ]
 
 
 def compare_methods(sizes: ModalitySizes, *, confidence: float, error_ratio: float = 1.0) -> MethodComparison:
@@ -72,17 +122,16 @@ def compare_methods(sizes: ModalitySizes, *, confidence: float, error_ratio: flo
     x, y = found.ex_vivo_mm, found.size_mm
     robust = _Fit(partial(passing_bablok, confidence=float(confidence)))
     figures = _figures(found, confidence=confidence, error_ratio=error_ratio, robust=robust)
-    if len(x) < 2 or not _squarable(x, y):
-        return MethodComparison(len(x), error_ratio, figures)
+    judged, level = len(x) >= 2 and _squarable(x, y), float(confidence)
     return MethodComparison(
-        n=len(x),
+        masses=len(x),
         error_ratio=error_ratio,
-        figures=figures,
-        analytic=_analytic(found, robust, confidence=float(confidence), error_ratio=error_ratio),
-        limits=_limits(found, confidence=float(confidence)),
-        trends=_trends(x, y, confidence=float(confidence)),
-        concordance=_or_none(lambda: concordance(x, y, confidence=float(confidence))),
-        errors_grow=bland_altman.errors_are_proportional(x, y),
+        **fields_of(figures),
+        analytic_intervals=_analytic(found, robust, confidence=level, error_ratio=error_ratio) if judged else {},
+        limits=_limits(found, confidence=level) if judged else {},
+        trends=_trends(x, y, confidence=level) if judged else {},
+        concordance_parts=_or_none(lambda: concordance(x, y, confidence=level)) if judged else None,
+        errors_grow_with_size=judged and bland_altman.errors_are_proportional(x, y),
     )
 
 
@@ -244,11 +293,14 @@ def _jackknifed(
     return {"intercept_mm": two[0], "slope": two[1]}
 
 
-def _limits(found: ModalitySizes, *, confidence: float) -> dict[str, Limits]:
+def _limits(found: ModalitySizes, *, confidence: float) -> dict[Unit, Limits]:
     x, y = [np.array([e]) for e in found.ex_vivo_mm], list(found.replicates_mm)
     logs = [np.log(e) for e in x], [np.log(group) for group in y]
     if all(len(group) == 1 for group in y):
-        plain = {"mm": found.size_mm - found.ex_vivo_mm, "log_ratio": np.log(found.size_mm / found.ex_vivo_mm)}
+        plain: dict[Unit, FloatArray] = {
+            "mm": found.size_mm - found.ex_vivo_mm,
+            "log_ratio": np.log(found.size_mm / found.ex_vivo_mm),
+        }
         return {name: bland_altman.limits(off, confidence=confidence) for name, off in plain.items()}
     return {
         "mm": bland_altman.limits_unlinked(x, y, confidence=confidence),
@@ -256,8 +308,8 @@ def _limits(found: ModalitySizes, *, confidence: float) -> dict[str, Limits]:
     }
 
 
-def _trends(x: FloatArray, y: FloatArray, *, confidence: float) -> dict[str, Trend]:
-    against = {"on_ex_vivo": x, "on_mean": (x + y) / 2}
+def _trends(x: FloatArray, y: FloatArray, *, confidence: float) -> dict[Against, Trend]:
+    against: dict[Against, FloatArray] = {"on_ex_vivo": x, "on_mean": (x + y) / 2}
     trends = {
         name: _or_none(partial(bland_altman.trend, y - x, size, confidence=confidence))
         for name, size in against.items()

@@ -21,15 +21,15 @@ says (record 0078). It is uniform in ln r, as far as the caliper's own error let
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any, Protocol
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal, Protocol
 
 import numpy as np
 from scipy.special import erf, expit, log_expit
 
-from tactile_bayes.declarations import Record, field
-from tactile_bayes.trial.figures import MIN_PATIENTS
-from tactile_bayes.trial.readings import FloatArray, MassKey, ModalitySizes, Reading, gather, mass_numbers
+from tactile_bayes.declarations import Meta, Record
+from tactile_bayes.trial.figures import MIN_PATIENTS, Count
+from tactile_bayes.trial.readings import FloatArray, ModalitySizes, Trial, mass_numbers
 
 # Largest total SD of ln size; normal prior SDs of bias and slope - 1.
 MOST_TOTAL_SD = 5.0
@@ -49,76 +49,72 @@ class Sampler(Protocol):
     ) -> Any: ...
 
 
-class Posterior(Record):
-    """Posterior of one modality: draws of its parameters and of the next mass's expected percent error."""
+class Middle(Record):
+    """Median and ends of the equal-tailed interval of a figure."""
 
-    name: str
-    masses: int
-    patients: int
-    summaries: Mapping[str, tuple[float, float, float]]
-    """Median, low and high end of each figure, by name. `mape_detected_percent` is the error of a mass that is found.
-    """
+    median: float
+    low: float
+    high: float
+
+
+class NextOfModality(Record):
+    """Posterior of one modality's errors."""
+
+    masses: Count
+    patients: Count
+    mape_percent: Annotated[Middle, Meta(description="Expected error of the next mass, misses included.")]
+    mape_detected_percent: Annotated[Middle, Meta(description="Expected error of one that is found.")]
+    bias_percent: Middle
+    log_slope: Annotated[Middle, Meta(description="Slope of ln size.")]
+    total_sd: Middle
+    patient_sd: Middle
+    mass_sd: Middle
+    replicate_sd: Middle
+    miss_share: Middle
+
+
+class IntervalKind(Record):
+    """How intervals are made."""
+
+    kind: Literal["eti"]
+    probability: float
+
+
+class Posterior(Record, eq=False):
+    """Posterior of one modality with its draws."""
+
+    summary: NextOfModality
     mape_percent: FloatArray
     mape_detected_percent: FloatArray
     """`mape_percent`, `mape_detected_percent`: (n,) draws of the expected percent error of the next mass, misses
     included, and of one that is found.
     """
-    diagnostics: Mapping[str, float]
+    diagnostics: dict[str, float]
 
 
 class NextMass(Record):
     """Posteriors of all modalities, and for every pair the probability that the first errs less on the next mass."""
 
-    posteriors: Mapping[str, Posterior]
-    probability_less_error: Mapping[str, float]
-    left_out: Mapping[str, str] = field(default_factory=dict)
-    probability: float = 0.95
-
-    def as_document(self) -> dict[str, Any]:
-        """Plain data for JSON."""
-        return {
-            "modalities": {
-                name: {
-                    "masses": one.masses,
-                    "patients": one.patients,
-                    **{key: dict(zip(("median", "low", "high"), map(_round, ends), strict=True))
-                       for key, ends in one.summaries.items()},
-                }
-                for name, one in self.posteriors.items()
-            },
-            "interval": {"kind": "eti", "probability": self.probability},
-            "probability_less_error": {name: _round(p) for name, p in self.probability_less_error.items()},
-            "left_out": dict(self.left_out),
-            "diagnostics": {
-                name: {key: _round(value) for key, value in one.diagnostics.items()}
-                for name, one in self.posteriors.items()
-            },
-        }  # fmt: skip
+    modalities: dict[str, NextOfModality]
+    interval: IntervalKind
+    probability_less_error: dict[str, float]
+    left_out: Annotated[dict[str, str], Meta(description="Modalities without a model, and why.")]
+    diagnostics: dict[str, dict[str, float]]
 
     def lines(self) -> list[str]:
         """Text lines of the report."""
         lines = ["Bayesian errors-in-variables model, beside the table above and not instead of it:"]
-        for name, one in self.posteriors.items():
-            error, found, bias, slope = (
-                one.summaries[key] for key in ("mape_percent", "mape_detected_percent", "bias_percent", "log_slope")
-            )
+        for name, one in self.modalities.items():
+            error, found = _shown(one.mape_percent, ".1f"), _shown(one.mape_detected_percent, ".1f")
             lines.append(
-                f"{name}: next mass: expected error {_shown(error, '.1f')} %, if it is found {_shown(found, '.1f')} %; "
-                f"bias {_shown(bias, '+.1f')} %, slope of ln size {_shown(slope, '.2f')}"
+                f"{name}: next mass: expected error {error} %, if it is found {found} %; "
+                f"bias {_shown(one.bias_percent, '+.1f')} %, slope of ln size {_shown(one.log_slope, '.2f')}"
             )
         lines += [f"probability that {pair}: {p:.3f}" for pair, p in self.probability_less_error.items()]
         return [*lines, *(f"{name}: no model: {reason}" for name, reason in self.left_out.items())]
 
 
-def next_mass(
-    readings: Sequence[Reading],
-    ex_vivo_mm: Mapping[MassKey, float],
-    ex_vivo_sd_mm: Mapping[MassKey, float | None],
-    *,
-    sample: Sampler,
-    rng: np.random.Generator,
-    probability: float = 0.95,
-) -> NextMass:
+def next_mass(trial: Trial, *, sample: Sampler, rng: np.random.Generator, probability: float = 0.95) -> NextMass:
     """Fit the model to each modality and compare them.
 
     Parameters
@@ -133,19 +129,33 @@ def next_mass(
     The expected error is that of one reading of a mass drawn from the sizes of this trial, of a new patient. Modalities
     are fitted one by one, so that the probability that one errs less takes their errors as independent.
     """
-    sizes = gather(readings, ex_vivo_mm)
-    numbers = mass_numbers(ex_vivo_mm)
-    caliper = {numbers[key]: (sd if sd else CALIPER * ex_vivo_mm[key]) / ex_vivo_mm[key]
-               for key, sd in ((key, ex_vivo_sd_mm.get(key)) for key in ex_vivo_mm)}  # fmt: skip
+    posteriors, left_out = posteriors_of(trial, sample=sample, rng=rng, probability=probability)
+    return NextMass(
+        {name: one.summary for name, one in posteriors.items()},
+        IntervalKind("eti", probability),
+        {name: _round(p) for name, p in _compared(posteriors).items()},
+        left_out,
+        {name: one.diagnostics for name, one in posteriors.items()},
+    )
+
+
+def posteriors_of(
+    trial: Trial, *, sample: Sampler, rng: np.random.Generator, probability: float = 0.95
+) -> tuple[dict[str, Posterior], dict[str, str]]:
+    """The model of each modality by its name, and why others have none; as `next_mass`."""
+    caliper = {
+        number: (trial.ex_vivo_sd_mm.get(key) or CALIPER * trial.ex_vivo_mm[key]) / trial.ex_vivo_mm[key]
+        for key, number in mass_numbers(trial.ex_vivo_mm).items()
+    }
     posteriors: dict[str, Posterior] = {}
     left_out: dict[str, str] = {}
-    for name, one in sizes.items():
+    for name, one in trial.sizes().items():
         found = one.only_detected()
         if len(found.patients) < MIN_PATIENTS:
             left_out[name] = f"needs at least {MIN_PATIENTS} patients with a mass found (has {len(found.patients)})"
             continue
         posteriors[name] = _fit(one, caliper, sample=sample, rng=rng, probability=probability)
-    return NextMass(posteriors, _compared(posteriors), left_out, probability)
+    return posteriors, left_out
 
 
 def _compared(posteriors: Mapping[str, Posterior]) -> dict[str, float]:
@@ -192,15 +202,12 @@ def _fit(
         "replicate_sd": sds[2],
         "miss_share": misses,
     }
-    quantiles = {name: np.quantile(values, tails) for name, values in figures.items()}
+    middles = {name: Middle(*map(_round, np.quantile(values, tails))) for name, values in figures.items()}
     return Posterior(
-        name=sizes.name,
-        masses=len(found.size_mm),
-        patients=len(found.patients),
-        summaries={name: (float(q[0]), float(q[1]), float(q[2])) for name, q in quantiles.items()},
+        NextOfModality(masses=len(found.size_mm), patients=len(found.patients), **middles),
         mape_percent=error,
         mape_detected_percent=of_found,
-        diagnostics=dict(drawn.diagnostics),
+        diagnostics={name: _round(value) for name, value in drawn.diagnostics.items()},
     )
 
 
@@ -335,5 +342,5 @@ def _round(value: float) -> float:
     return float(f"{value:.9g}")
 
 
-def _shown(ends: tuple[float, float, float], spec: str) -> str:
-    return f"{ends[0]:{spec}} [{ends[1]:{spec}}, {ends[2]:{spec}}]"
+def _shown(one: Middle, spec: str) -> str:
+    return f"{one.median:{spec}} [{one.low:{spec}}, {one.high:{spec}}]"

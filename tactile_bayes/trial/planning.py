@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import pairwise
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from tactile_bayes.declarations import Record, as_dict, field
+from tactile_bayes.declarations import Meta, Record
 from tactile_bayes.trial.accuracy import mape_figure, mape_percent, mape_ratio, sign_flip
-from tactile_bayes.trial.figures import MIN_PATIENTS, Intervals, clopper_pearson, figure
+from tactile_bayes.trial.figures import MIN_PATIENTS, Ends, Intervals, Share, clopper_pearson, figure
 from tactile_bayes.trial.readings import FloatArray, ModalitySizes
 from tactile_bayes.trial.replicates import log_sd_within
 
@@ -19,20 +19,12 @@ from tactile_bayes.trial.replicates import log_sd_within
 
 
 class ErrorModel(Record):
-    """Errors of one modality in log size: normal, partly shared by the masses of a patient.
+    """Errors of one modality in log size: normal, partly shared by the masses of a patient."""
 
-    Attributes
-    ----------
-    bias, patient_sd, mass_sd
-        Mean of ln(size / ex vivo), and SDs of the patient's and of the mass's own part.
-    miss
-        Probability that a mass is not found.
-    """
-
-    bias: float
-    mass_sd: float
-    patient_sd: float = 0.0
-    miss: float = 0.0
+    bias: Annotated[float, Meta(description="Mean of ln(size / ex vivo).")]
+    mass_sd: Annotated[float, Meta(description="SD of the mass's own part.")]
+    patient_sd: Annotated[float, Meta(description="SD of the part that a patient's masses share.")] = 0.0
+    miss: Annotated[float, Meta(description="Probability that a mass is not found.")] = 0.0
 
     @property
     def true_mape_percent(self) -> float:
@@ -50,24 +42,16 @@ class ErrorModel(Record):
 class IntervalCheck(Record):
     """Coverage of the percent error's intervals in simulated trials."""
 
+    trials: Annotated[int, Meta(ge=1, description="Simulated trials with an interval.")]
+    covered: Annotated[int, Meta(ge=0, description="Trials whose interval holds the true error.")]
+    share: Share
+    share_interval: Ends
+    above: Annotated[int, Meta(ge=0, description="Trials whose interval lies above the true error.")]
+    below: Annotated[int, Meta(ge=0, description="Trials whose interval lies below it.")]
+    undefined: Annotated[int, Meta(ge=0, description="Trials without an interval.")]
+    median_width_ratio: Annotated[float, Meta(description="Median of the upper over the lower end.")]
     model: ErrorModel
-    trials: int
-    covered: int
-    low_misses: int
-    high_misses: int
-    """`covered`, `low_misses`, `high_misses`: Trials whose interval holds the true error, lies above it, or lies below
-    it.
-    """
-    undefined: int
-    """Trials without an interval; not counted in `trials`."""
-    median_width_ratio: float
-    """Median of the upper over the lower end."""
-    interval: tuple[float, float] = field(default=(0.0, 1.0))
-
-    @property
-    def share(self) -> float:
-        """Share of trials whose interval covered the true error."""
-        return self.covered / self.trials
+    true_mape_percent: float
 
 
 def observed_errors(sizes: ModalitySizes) -> ErrorModel | None:
@@ -123,14 +107,16 @@ def check_intervals(
     below, above = int(np.sum(defined[:, 1] < truth)), int(np.sum(defined[:, 0] > truth))
     covered = len(defined) - below - above
     return IntervalCheck(
-        model=model,
         trials=len(defined),
         covered=covered,
-        low_misses=above,
-        high_misses=below,
+        share=covered / len(defined),
+        share_interval=clopper_pearson(covered, len(defined), confidence=0.95),
+        above=above,
+        below=below,
         undefined=trials - len(defined),
         median_width_ratio=float(np.median(defined[:, 1] / np.maximum(defined[:, 0], 1e-300))),
-        interval=clopper_pearson(covered, len(defined), confidence=0.95),
+        model=model,
+        true_mape_percent=truth,
     )
 
 
@@ -194,25 +180,49 @@ class PlanCase(Record):
         return f"{self.patients} patients, {self.maps} maps"
 
 
-class PlanResult(Record):
+ErrorSource = Literal["option", "pilot", "default"]
+
+
+class Design(Record):
     """Results of the simulated trials of one design."""
 
-    power: float
-    """Share of trials with a smaller tactile error and a sign-flip test below 5 %."""
-    power_interval: tuple[float, float]
-    """Exact 95 % interval of that share: the simulation's own error."""
-    tactile_percent: float
-    other_percent: float
-    """`tactile_percent`, `other_percent`: Mean percent errors over the trials."""
-    tactile_width_ratio: float | None
-    ratio_width_ratio: float | None
-    """`tactile_width_ratio`, `ratio_width_ratio`: Median upper over lower end of the interval of the tactile error, and
-    of the ratio of errors.
-    """
+    patients: int
+    maps: int
+    power: Annotated[
+        float,
+        Meta(ge=0, le=1, description="Share of trials with a smaller tactile error and a sign-flip test below 5 %."),
+    ]
+    power_interval: Annotated[Ends, Meta(description="Exact 95 % interval of that share: the simulation's own error.")]
+    tactile_percent: Annotated[float, Meta(description="Mean tactile error over the trials.")]
+    other_percent: Annotated[float, Meta(description="Mean error of the other modality over the trials.")]
+    tactile_width_ratio: Annotated[
+        float | None, Meta(description="Median upper over lower end of the tactile error's interval.")
+    ]
+    ratio_width_ratio: Annotated[
+        float | None, Meta(description="Median upper over lower end of the interval of the ratio of errors.")
+    ]
 
-    def as_dict(self) -> dict[str, Any]:
-        """Plain data."""
-        return as_dict(self) | {"power_interval": list(self.power_interval)}
+
+class Gain(Record):
+    """What more maps per mass bring at the same number of patients."""
+
+    patients: int
+    from_maps: int
+    to_maps: int
+    power_gain: float
+    tactile_percent_change: float
+
+
+class PlanReport(Record):
+    """Power and widths of planned trials."""
+
+    schema: Literal["tactile-bayes/plan/1"]
+    errors: Annotated[dict[str, float], Meta(description="Assumed errors of ln size.")]
+    errors_from: Annotated[dict[str, ErrorSource], Meta(description="Where each assumed error comes from.")]
+    designs: Annotated[tuple[Design, ...], Meta(min_length=1)]
+    gains: tuple[Gain, ...]
+    provenance: dict[str, Any]
+    research_use: Annotated[str, Meta(min_length=1)]
 
 
 def designs(patients: Sequence[int], maps: Sequence[int], **assumptions: Any) -> Iterator[PlanCase]:
@@ -222,44 +232,30 @@ def designs(patients: Sequence[int], maps: Sequence[int], **assumptions: Any) ->
             yield PlanCase(patients=n, maps=m, **assumptions)
 
 
-def run_case(case: PlanCase) -> dict[str, Any]:
-    """Simulate the trials of one design; returns plain data that can be sent between processes."""
+def run_case(case: PlanCase) -> Design:
+    """Simulate the trials of one design."""
     found = [_trial(case, trial) for trial in range(case.trials)]
     wins = sum(one.won for one in found)
-    return PlanResult(
+    return Design(
+        patients=case.patients,
+        maps=case.maps,
         power=wins / case.trials,
         power_interval=clopper_pearson(wins, case.trials, confidence=0.95),
         tactile_percent=float(np.mean([one.tactile for one in found])),
         other_percent=float(np.mean([one.other for one in found])),
         tactile_width_ratio=_median([one.tactile_width for one in found]),
         ratio_width_ratio=_median([one.ratio_width for one in found]),
-    ).as_dict()
+    )
 
 
-def map_gains(results: Mapping[tuple[int, int], PlanResult | Mapping[str, Any]]) -> list[dict[str, float | int]]:
-    """Gain from each further map at the same number of patients: change of power and of tactile error.
-
-    Parameters
-    ----------
-    results
-        By patients and maps.
-    """
-    gains: list[dict[str, float | int]] = []
-    ordered = sorted(results)
-    for before, after in pairwise(ordered):
-        if before[0] != after[0]:
-            continue
-        old, new = _plain(results[before]), _plain(results[after])
-        gains.append(
-            {
-                "patients": after[0],
-                "from_maps": before[1],
-                "to_maps": after[1],
-                "power_gain": new["power"] - old["power"],
-                "tactile_percent_change": new["tactile_percent"] - old["tactile_percent"],
-            }
-        )
-    return gains
+def map_gains(found: Iterable[Design]) -> tuple[Gain, ...]:
+    """Gain from each further map at the same number of patients: change of power and of tactile error."""
+    ordered = sorted(found, key=lambda one: (one.patients, one.maps))
+    return tuple(
+        Gain(new.patients, old.maps, new.maps, new.power - old.power, new.tactile_percent - old.tactile_percent)
+        for old, new in pairwise(ordered)
+        if old.patients == new.patients
+    )
 
 
 class _Found(Record):
@@ -304,10 +300,6 @@ def _width(ends: tuple[float, float] | None) -> float | None:
 def _median(values: Sequence[float | None]) -> float | None:
     known = [value for value in values if value is not None and math.isfinite(value)]
     return float(np.median(known)) if known else None
-
-
-def _plain(result: PlanResult | Mapping[str, Any]) -> Mapping[str, Any]:
-    return result.as_dict() if isinstance(result, PlanResult) else result
 
 
 def assumptions_from(

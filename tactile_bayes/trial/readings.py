@@ -7,6 +7,7 @@ from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from datetime import date
 from itertools import compress, groupby, pairwise
+from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
@@ -363,6 +364,30 @@ class OtherVisits(Record):
             for name, n in self.only_there.items()
         ]
         return [told + ", ".join(parts), *lost]
+
+
+class Trial(Record, eq=False):
+    """Readings and sizes after excision, as a trial's report is made from them."""
+
+    readings: Sequence[Reading]
+    """Those of each mass's last visit before excision, in any order."""
+    ex_vivo_mm: Mapping[MassKey, float]
+    """Size after excision, of every mass of the readings."""
+    ex_vivo_sd_mm: Mapping[MassKey, float | None] = field(default_factory=dict)
+    """Standard deviation of each ex-vivo size where it is known; enters the calibration in quadrature."""
+    other_visits: OtherVisits = field(default_factory=OtherVisits)
+    """What the readings leave out."""
+    files: Mapping[str, Path] = field(default_factory=dict)
+    """Files that they were read from, by role."""
+
+    def sizes(self) -> dict[str, ModalitySizes]:
+        """The sizes by each modality."""
+        return gather(self.readings, self.ex_vivo_mm)
+
+    def found(self, modality: str) -> list[Reading]:
+        """The readings with a size by a modality; in one order for every order of the rows."""
+        found = (one for one in self.readings if one.modality == modality and one.size_mm is not None)
+        return sorted(found, key=lambda one: (one.key, one.replicate))
 
 
 def in_order(visits: Mapping[str, date | None]) -> list[str] | None:

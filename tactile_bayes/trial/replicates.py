@@ -4,12 +4,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
 
-from tactile_bayes.declarations import Record, replace
-from tactile_bayes.trial.figures import Figure, SumStatistic, UndefinedError, columns, figure, ratio
+from tactile_bayes.declarations import Meta, Record, replace
+from tactile_bayes.trial.figures import (
+    Count,
+    Ends,
+    Figure,
+    Figures,
+    Reasons,
+    SumStatistic,
+    UndefinedError,
+    columns,
+    figure,
+    ratio,
+)
 from tactile_bayes.trial.readings import FloatArray, ModalitySizes
 
 # --- Variances of masses, readers and maps from unbalanced readings, by restricted maximum likelihood.
@@ -27,9 +39,28 @@ class Components(Record):
     mass: float
     reader: float | None
     map: float
-    n: int
-    masses: int
-    readers: int
+    n: Count
+    masses: Count
+    readers: Count
+
+
+class ReplicateFigures(Figures):
+    """Spread between the readings of one mass, on ln size, and the components of the scatter."""
+
+    within_mass_log_sd: float | None
+    within_mass_log_sd_interval: Ends | None
+    repeatability_low_percent: Annotated[
+        float | None, Meta(description="Change between two readings of one mass: lower end in 95 % of pairs.")
+    ]
+    repeatability_low_percent_interval: Ends | None
+    repeatability_high_percent: Annotated[
+        float | None, Meta(description="Change between two readings of one mass: upper end in 95 % of pairs.")
+    ]
+    repeatability_high_percent_interval: Ends | None
+    icc: Annotated[float | None, Meta(description="Intraclass correlation.")]
+    icc_interval: Ends | None
+    reasons: Reasons
+    variance_components: Annotated[Components | None, Meta(description="REML variances of ln size.")]
 
 
 def components(y: FloatArray, mass: Index, reader: Index) -> Components:

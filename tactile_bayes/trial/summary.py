@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from tactile_bayes.declarations import Record, field
-from tactile_bayes.trial import accuracy, replicates
-from tactile_bayes.trial import accuracy as origin_line
-from tactile_bayes.trial import replicates as spread
-from tactile_bayes.trial.accuracy import ModalityRatio, PairedComparison, cautions, mape_ratios, paired_comparisons
+from tactile_bayes.declarations import UNSET, Meta, Record, UnsetType
+from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.trial.accuracy import (
+    ModalityRatio,
+    PairedComparison,
+    accuracy_figures,
+    cautions,
+    mape_ratios,
+    origin_line_figures,
+    paired_comparisons,
+)
 from tactile_bayes.trial.calibration import (
     Calibration,
     Coverage,
@@ -21,160 +28,273 @@ from tactile_bayes.trial.calibration import (
     log_normal,
     predictions,
 )
-from tactile_bayes.trial.figures import SEED, Figure, clopper_pearson, effective_number
-from tactile_bayes.trial.method_comparison import MethodComparison, compare_methods
-from tactile_bayes.trial.readings import (
-    MassKey,
-    ModalitySizes,
-    OtherVisits,
-    Reading,
-    gather,
-    mass_numbers,
-    patient_numbers,
-    unit_doubts,
+from tactile_bayes.trial.figures import (
+    SEED,
+    AtMostOne,
+    Correlation,
+    Count,
+    Ends,
+    Figure,
+    Figures,
+    NotNegative,
+    Reasons,
+    Share,
+    clopper_pearson,
+    effective_number,
+    fields_of,
 )
-from tactile_bayes.trial.replicates import Components, reader_components
+from tactile_bayes.trial.method_comparison import MethodComparison, compare_methods
+from tactile_bayes.trial.next_mass import NextMass
+from tactile_bayes.trial.planning import IntervalCheck
+from tactile_bayes.trial.readings import ModalitySizes, Reading, Trial, mass_numbers, patient_numbers, unit_doubts
+from tactile_bayes.trial.replicates import (
+    Components,
+    ReplicateFigures,
+    reader_components,
+    replicate_figures,
+    spread_figures,
+)
 
 FAMILIES: tuple[Callable[..., dict[str, Figure]], ...] = (
-    accuracy.accuracy_figures,
-    origin_line.origin_line_figures,
-    spread.spread_figures,
+    accuracy_figures,
+    origin_line_figures,
+    spread_figures,
 )
 
 
-class ModalityReport(Record):
+CONVENTIONS: dict[str, str] = {
+    "masses": "sizes are averaged over the detected replicates of a mass first; a mass counts once",
+    "detected": "a mass found in at least one replicate",
+    "not_detected": "counted as size 0 (100 % error) in figures without '_detected', as in Wellman & Howe (1999)",
+    "not_done": "left out and counted",
+    "bias_percent": "100 (geometric mean of size / ex vivo - 1), over detected masses only",
+    "slope_through_origin": "sizes on ex-vivo sizes without an intercept",
+    "r2_centred": "1 - SSE0 / SST, the headline; below 0 when the mean would do better",
+    "r2_uncentred": "1 - SSE0 / sum of squared sizes",
+    "r2_pearson": "squared correlation",
+    "within_mass": "mean over masses of the SD of replicates; '_rms': root of the mean variance by degrees of freedom",
+    "weighted_mape_percent": "sum of absolute errors over the sum of ex-vivo sizes, in percent",
+    "median_error_percent": "median absolute error in percent of the ex-vivo size",
+    "method_comparison": "detected masses only; x is the ex-vivo size, differences are size - ex vivo; "
+    "'analytic_intervals' take masses as independent, the others are over patients",
+    "error_ratio": "variance of the ex-vivo error over that of the modality's, for the two Deming lines",
+    "passing_bablok": "shifted median of slopes, middle slopes averaged as angles",
+    "limits": "of agreement, for single readings, 95 % of differences; 'log_ratio' as ln(size / ex vivo); their "
+    "intervals take masses as independent and differences as normal, those of 'limit_low_mm' etc. are over patients",
+    "mape_ratio_to_tactile": "on the masses that both looked for, or that both found",
+    "repeatability": "change between two readings of one mass in 95 % of pairs, by the within-mass SD of ln size",
+    "calibration": "stated intervals as normal on ln size, the caliper's error added in quadrature",
+    "paired_comparisons": "masses that both modalities looked for; not detected counts as size 0; sign-flip test by "
+    "patient, p_holm corrected for all pairs",
+    "intervals": "over patients, as the setting 'intervals' says: 'corrected' and 'jackknife' leave one patient out "
+    "and take Student's t, 'corrected' allowing for misses not seen and few influential patients; shares: "
+    "Clopper-Pearson",
+}
+
+
+class ModalityReport(Figures):
     """Counts, figures and coverage of one modality on its `n` masses."""
 
-    name: str
-    n: int
-    detected: int
-    detected_interval: tuple[float, float] | None
-    patients: int
-    readings: int
-    readings_detected: int
-    masses_not_done: int
-    masses_without_reading: int
-    figures: Mapping[str, Figure]
+    n: Annotated[int, Meta(ge=0, description="Masses looked for.")]
+    detected: Count
+    detected_interval: Ends | None
+    patients: Count
+    readings: Count
+    readings_detected: Count
+    masses_not_done: Count
+    masses_without_reading: Count
+    mape_percent: Annotated[
+        NotNegative | None,
+        Meta(description="Mean absolute error in percent of the ex-vivo size; a mass not detected has size 0."),
+    ]
+    mape_percent_interval: Ends | None
+    mape_detected_percent: Annotated[NotNegative | None, Meta(description="The same over detected masses.")]
+    mape_detected_percent_interval: Ends | None
+    mae_mm: Annotated[
+        NotNegative | None, Meta(description="Mean absolute error in mm; a mass not detected has size 0.")
+    ]
+    mae_mm_interval: Ends | None
+    mae_detected_mm: Annotated[NotNegative | None, Meta(description="The same over detected masses.")]
+    mae_detected_mm_interval: Ends | None
+    weighted_mape_percent: Annotated[
+        NotNegative | None, Meta(description="Sum of absolute errors over the sum of ex-vivo sizes, percent.")
+    ]
+    weighted_mape_percent_interval: Ends | None
+    median_error_percent: Annotated[
+        NotNegative | None, Meta(description="Median absolute error in percent of the ex-vivo size.")
+    ]
+    bias_percent: Annotated[
+        Annotated[float, Meta(ge=-100)] | None,
+        Meta(description="100 (geometric mean of size over ex-vivo size - 1), over detected masses."),
+    ]
+    bias_percent_interval: Ends | None
+    slope_through_origin: Annotated[
+        NotNegative | None,
+        Meta(description="Slope of sizes on ex-vivo sizes without intercept; a mass not detected has size 0."),
+    ]
+    slope_through_origin_interval: Ends | None
+    r2_centred: Annotated[AtMostOne | None, Meta(description="1 - SSE0 / SST; a mass not detected has size 0.")]
+    r2_uncentred: Annotated[
+        AtMostOne | None, Meta(description="1 - SSE0 / sum of squared sizes; a mass not detected has size 0.")
+    ]
+    r2_pearson: Annotated[
+        Share | None, Meta(description="Squared correlation coefficient; a mass not detected has size 0.")
+    ]
+    pearson_r: Annotated[
+        Correlation | None, Meta(description="Correlation coefficient; a mass not detected has size 0.")
+    ]
+    slope_through_origin_detected: Annotated[
+        NotNegative | None, Meta(description="Slope of sizes on ex-vivo sizes without intercept, over detected masses.")
+    ]
+    slope_through_origin_detected_interval: Ends | None
+    r2_centred_detected: Annotated[AtMostOne | None, Meta(description="1 - SSE0 / SST, over detected masses.")]
+    r2_uncentred_detected: Annotated[
+        AtMostOne | None, Meta(description="1 - SSE0 / sum of squared sizes, over detected masses.")
+    ]
+    r2_pearson_detected: Annotated[
+        Share | None, Meta(description="Squared correlation coefficient, over detected masses.")
+    ]
+    pearson_r_detected: Annotated[
+        Correlation | None, Meta(description="Correlation coefficient, over detected masses.")
+    ]
+    within_mass_sd_mm: Annotated[
+        NotNegative | None, Meta(description="Mean over masses of the SD of detected replicates, mm.")
+    ]
+    within_mass_sd_mm_interval: Ends | None
+    within_mass_sd_rms_mm: Annotated[
+        NotNegative | None,
+        Meta(description="Root of the mean variance of detected replicates, by degrees of freedom, mm."),
+    ]
+    within_mass_sd_rms_mm_interval: Ends | None
+    within_mass_cv_percent: Annotated[
+        NotNegative | None, Meta(description="Mean over masses of SD over mean of detected replicates, percent.")
+    ]
+    within_mass_cv_percent_interval: Ends | None
+    within_mass_cv_rms_percent: Annotated[
+        NotNegative | None, Meta(description="Root mean square of SD over mean, by degrees of freedom, percent.")
+    ]
+    within_mass_cv_rms_percent_interval: Ends | None
+    reasons: Reasons
     coverage: tuple[Coverage, ...]
-    methods: MethodComparison
-    replicates: Mapping[str, Figure]
-    components: Components | None = None
-    calibration: Calibration | None = None
-    prediction: Prediction | None = None
-    cautions: tuple[str, ...] = ()
+    method_comparison: MethodComparison
+    replicates: ReplicateFigures
+    calibration: Calibration | None
+    cautions: Annotated[
+        tuple[str, ...],
+        Meta(description="Conditions of this trial under which intervals hold less often than they say."),
+    ]
 
 
-class TrialReport(Record):
-    """Reports of all modalities, ratios to the tactile one, paired comparisons, and counts.
+class Counts(Record):
+    """How much a trial is made of."""
 
-    `sizes` are those that the figures were made from; `ex_vivo_sd_mm` is by the number of the mass. `doubts` says what
-    looks like another unit than mm. `other_visits` counts the readings that are not of the last visit before excision.
-    """
+    patients: Count
+    masses: Count
+    masses_without_any_reading: Count
+    readings: Count
+    synthetic_readings: Count
+    masses_of_several_visits: Count
+    readings_of_earlier_visits: Count
+    readings_after_excision: Count
 
-    modalities: Mapping[str, ModalityReport]
-    ratios: Mapping[str, ModalityRatio]
-    patients: int
-    masses: int
-    masses_without_any_reading: int
-    synthetic_readings: int
-    readings: int
-    confidence: float
-    paired: tuple[PairedComparison, ...] = ()
-    sizes: Mapping[str, ModalitySizes] = field(default_factory=dict)
-    ex_vivo_sd_mm: Mapping[int, float | None] = field(default_factory=dict)
-    doubts: tuple[str, ...] = ()
-    other_visits: OtherVisits = field(default_factory=OtherVisits)
+
+class TrialReport(Record, kw_only=True):
+    """Accuracy of each modality against excision."""
+
+    schema: Literal["tactile-bayes/validate/1"]
+    title: Annotated[str, Meta(description="Of the protocol.")] | UnsetType = UNSET
+    interval_probability: Annotated[float, Meta(gt=0, lt=1, description="Of every interval in this document.")]
+    counts: Counts
+    modalities: Annotated[dict[str, ModalityReport], Meta(min_length=1)]
+    mape_ratio_to_tactile: Annotated[
+        dict[str, ModalityRatio],
+        Meta(
+            description="Percent error of each other modality over the tactile one's, on common masses; empty without "
+            "a tactile one."
+        ),
+    ]
+    paired_comparisons: Annotated[
+        tuple[PairedComparison, ...],
+        Meta(description="Every pair of modalities on the masses that both looked for."),
+    ]
+    doubts: Annotated[tuple[str, ...], Meta(description="What looks like another unit than mm.")]
+    conventions: dict[str, str]
+    interval_check: (
+        Annotated[
+            dict[str, IntervalCheck],
+            Meta(description="Simulated coverage of the intervals of mape_percent, by modality."),
+        ]
+        | UnsetType
+    ) = UNSET
+    next_mass: (
+        Annotated[NextMass, Meta(description="Errors-in-variables model: what the next mass may bring.")] | UnsetType
+    ) = UNSET
+    provenance: dict[str, Any]
+    research_use: Annotated[str, Meta(min_length=1)]
 
 
 def summarise(
-    readings: Iterable[Reading],
-    ex_vivo_mm: Mapping[MassKey, float],
+    trial: Trial,
     *,
     confidence: float = 0.95,
     error_ratio: float = 1.0,
-    ex_vivo_sd_mm: Mapping[MassKey, float | None] | None = None,
     seed: int = SEED,
-    other_visits: OtherVisits | None = None,
+    provenance: Mapping[str, Any] | None = None,
 ) -> TrialReport:
-    """Summarise a trial: compare each modality's sizes with excision.
+    """Compare each modality's sizes with excision.
 
-    Parameters
-    ----------
-    readings
-        In any order.
-    ex_vivo_mm
-        Size after excision in mm, by patient and mass; every mass of `readings` must be there.
-    confidence
-        Probability of the intervals; `Intervals` to choose how they are made.
-    error_ratio
-        Variance of the error of ex-vivo sizes over that of a modality's, for the Deming lines.
-    ex_vivo_sd_mm
-        Standard deviation of each ex-vivo size where it is known; enters the calibration in quadrature.
-    seed
-        Of the sign flips, where there are too many to try all.
-    other_visits
-        What was left out of the readings before, for the report.
+    `confidence` may be `Intervals`, to choose how the intervals are made; `error_ratio` is the variance of the error of
+    ex-vivo sizes over that of a modality's, for the Deming lines; `seed` is of the sign flips.
     """
-    # one order for every order of the rows: an iteration's last digits depend on it
-    readings = sorted(readings, key=lambda r: (r.key, r.modality, r.replicate))
-    sizes = gather(readings, ex_vivo_mm)
-    beside = _Beside(readings, ex_vivo_mm, ex_vivo_sd_mm or {})
+    readings, ex_vivo_mm, sizes = trial.readings, trial.ex_vivo_mm, trial.sizes()
     return TrialReport(
+        schema="tactile-bayes/validate/1",
+        interval_probability=float(confidence),
+        counts=Counts(
+            patients=len({patient for patient, _ in ex_vivo_mm}),
+            masses=len(ex_vivo_mm),
+            masses_without_any_reading=len(set(ex_vivo_mm) - {reading.key for reading in readings}),
+            readings=len(readings),
+            synthetic_readings=sum(reading.synthetic for reading in readings),
+            masses_of_several_visits=trial.other_visits.masses,
+            readings_of_earlier_visits=trial.other_visits.earlier,
+            readings_after_excision=trial.other_visits.later,
+        ),
         modalities={
-            name: modality_report(one, confidence=confidence, error_ratio=error_ratio, beside=beside)
+            name: modality_report(one, confidence=confidence, error_ratio=error_ratio, trial=trial)
             for name, one in sizes.items()
         },
-        ratios=mape_ratios(sizes, confidence=confidence),
-        patients=len({patient for patient, _ in ex_vivo_mm}),
-        masses=len(ex_vivo_mm),
-        masses_without_any_reading=len(set(ex_vivo_mm) - {reading.key for reading in readings}),
-        synthetic_readings=sum(reading.synthetic for reading in readings),
-        readings=len(readings),
-        confidence=float(confidence),
-        paired=tuple(paired_comparisons(sizes, confidence=confidence, seed=seed)),
-        sizes=sizes,
+        mape_ratio_to_tactile=mape_ratios(sizes, confidence=confidence),
+        paired_comparisons=tuple(paired_comparisons(sizes, confidence=confidence, seed=seed)),
         doubts=tuple(unit_doubts(sizes, np.array(list(ex_vivo_mm.values()), dtype=np.float64))),
-        other_visits=other_visits or OtherVisits(),
-        ex_vivo_sd_mm={number: (ex_vivo_sd_mm or {}).get(key) for key, number in mass_numbers(ex_vivo_mm).items()},
+        conventions=CONVENTIONS,
+        provenance=dict(provenance or {}),
+        research_use=RESEARCH_USE,
     )
 
 
-class _Beside:
-    """Readers and stated uncertainties of the single readings, by modality."""
+def _components(trial: Trial, modality: str) -> Components | None:
+    """Variances of log size between masses, readers and maps."""
+    found = trial.found(modality)
+    logs = [math.log(one.size_mm) for one in found if one.size_mm is not None]
+    return reader_components(logs, [one.key for one in found], [one.reader for one in found])
 
-    def __init__(
-        self,
-        readings: Iterable[Reading],
-        ex_vivo_mm: Mapping[MassKey, float],
-        ex_vivo_sd_mm: Mapping[MassKey, float | None],
-    ) -> None:
-        self._found: dict[str, list[Reading]] = {}
-        for reading in readings:
-            if reading.size_mm is not None:
-                self._found.setdefault(reading.modality, []).append(reading)
-        self._ex_vivo_mm, self._ex_vivo_sd_mm = ex_vivo_mm, ex_vivo_sd_mm
-        self._masses, self._patients = mass_numbers(ex_vivo_mm), patient_numbers(ex_vivo_mm)
 
-    def components(self, modality: str) -> Components | None:
-        """Variances of log size between masses, readers and maps."""
-        found = self._found.get(modality, [])
-        logs = [math.log(one.size_mm) for one in found if one.size_mm is not None]
-        return reader_components(logs, [one.key for one in found], [one.reader for one in found])
-
-    def prediction(self, modality: str) -> Prediction | None:
-        """Stated uncertainties as predictive distributions; None where no reading states one."""
-        stated = [(one, _stated(one)) for one in self._found.get(modality, [])]
-        kept = [(one, distribution) for one, distribution in stated if distribution is not None]
-        if not kept:
-            return None
-        keys = [one.key for one, _ in kept]
-        return predictions(
-            [distribution for _, distribution in kept],
-            [self._ex_vivo_mm[key] for key in keys],
-            [self._ex_vivo_sd_mm.get(key) for key in keys],
-            masses=[self._masses[key] for key in keys],
-            patients=[self._patients[patient] for patient, _ in keys],
-        )
+def prediction_of(trial: Trial, modality: str) -> Prediction | None:
+    """Stated uncertainties of a modality's readings as predictive distributions; None where no reading states one."""
+    stated = [(one, _stated(one)) for one in trial.found(modality)]
+    kept = [(one, distribution) for one, distribution in stated if distribution is not None]
+    if not kept:
+        return None
+    masses, patients = mass_numbers(trial.ex_vivo_mm), patient_numbers(trial.ex_vivo_mm)
+    keys = [one.key for one, _ in kept]
+    return predictions(
+        [distribution for _, distribution in kept],
+        [trial.ex_vivo_mm[key] for key in keys],
+        [trial.ex_vivo_sd_mm.get(key) for key in keys],
+        masses=[masses[key] for key in keys],
+        patients=[patients[patient] for patient, _ in keys],
+    )
 
 
 def _stated(reading: Reading) -> tuple[float, float] | None:
@@ -195,27 +315,29 @@ def _detected_interval(sizes: ModalitySizes, *, confidence: float) -> tuple[floa
 
 
 def modality_report(
-    sizes: ModalitySizes, *, confidence: float, error_ratio: float = 1.0, beside: _Beside | None = None
+    sizes: ModalitySizes, *, confidence: float, error_ratio: float = 1.0, trial: Trial | None = None
 ) -> ModalityReport:
     """Report one modality: counts, all figures, coverage."""
-    prediction = None if beside is None else beside.prediction(sizes.name)
-    n, detected = len(sizes.size_mm), int(sizes.detected.sum())
+    prediction = None if trial is None else prediction_of(trial, sizes.name)
+    fields = fields_of({name: one for family in FAMILIES for name, one in family(sizes, confidence=confidence).items()})
+    if prediction is None:
+        fields["reasons"]["calibration"] = "no reading states an interval or a standard deviation"
     return ModalityReport(
-        name=sizes.name,
-        n=n,
-        detected=detected,
+        n=len(sizes.size_mm),
+        detected=int(sizes.detected.sum()),
         detected_interval=_detected_interval(sizes, confidence=float(confidence)),
         patients=len(sizes.patients),
         readings=sizes.readings,
         readings_detected=sum(len(group) for group in sizes.replicates_mm),
         masses_not_done=sizes.masses_not_done,
         masses_without_reading=sizes.masses_without_reading,
-        figures={name: one for family in FAMILIES for name, one in family(sizes, confidence=confidence).items()},
+        **fields,
         coverage=tuple(coverage(sizes.intervals, confidence=float(confidence))),
-        methods=compare_methods(sizes, confidence=confidence, error_ratio=error_ratio),
-        replicates=replicates.replicate_figures(sizes, confidence=confidence),
-        components=None if beside is None else beside.components(sizes.name),
+        method_comparison=compare_methods(sizes, confidence=confidence, error_ratio=error_ratio),
+        replicates=ReplicateFigures(
+            **fields_of(replicate_figures(sizes, confidence=confidence)),
+            variance_components=None if trial is None else _components(trial, sizes.name),
+        ),
         calibration=None if prediction is None else calibration(prediction, confidence=float(confidence)),
-        prediction=prediction,
         cautions=cautions(sizes, confidence=confidence),
     )

@@ -18,14 +18,13 @@ from emulated_devices import head_and_tracker, short_scan
 from in_process import run_here
 
 import tactile_bayes as tb
-from tactile_bayes.api.trial_report import TrialSettings
 from tactile_bayes.cli import cli
 from tactile_bayes.declarations import names_of
 from tactile_bayes.errors import BadDataError, DeviceError, UsageError
 from tactile_bayes.files.documents import load_schema
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.scan_mcap import write_scan
-from tactile_bayes.options import MapOptions
+from tactile_bayes.options import MapOptions, TrialSettings
 from tactile_bayes.presets import RESEARCH_USE
 
 DEMO = Path(tb.__file__).parent / "demo"

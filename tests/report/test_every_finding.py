@@ -274,11 +274,11 @@ PRINTERS = {
     # of draws, not of a size; names of files that were written
     "report/posterior_figures", "actions/estimate",
     # of trials, calibrations, devices and studies
-    "api/trial_report", "api/trials", "actions/calibrate", "actions/devices", "actions/exam",
+    "api/trial_report", "actions/calibrate", "actions/devices", "actions/exam",
     "actions/simulation", "actions/study",
     "actions/tradeoff", "actions/trial", "files/size_json", "presets", "report/calibration",
     "report/paper_head", "report/laboratory",
-    "report/study", "report/tradeoff", "report/trial", "report/trial_html",
+    "report/study", "report/tradeoff", "report/trial_html", "trial/summary",
 }  # fmt: skip
 
 

@@ -18,14 +18,14 @@ from posterior_maps import bump_values, correlated_field, grid_map
 
 from tactile_bayes.api.estimating import estimate_inputs
 from tactile_bayes.api.settings import Settings
-from tactile_bayes.declarations import replace
+from tactile_bayes.declarations import replace, to_plain
 from tactile_bayes.files.documents import check_document
 from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.inference import importance as importance_module
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.options import EstimateOptions, FitOptions
-from tactile_bayes.report.tradeoff import advice, draw_ladder, ladder_document, ladder_text
+from tactile_bayes.report.tradeoff import advice, draw_ladder, ladder_file, ladder_text
 from tactile_bayes.size.eq6 import AxisCalibration, SizeCalibration
 from tactile_bayes.size.pooling import Calibration
 from tactile_bayes.size.terms import Recipe
@@ -197,7 +197,7 @@ def test_it_can_be_read_printed_and_drawn(tmp_path: Path):
     assert "5.00 if exams differ as in the paper" in text
     assert text.splitlines()[-1] == "Research use only: not a diagnostic device."
     assert sum(line.startswith("Advice: ") for line in text.splitlines()) == 1
-    document = json.loads(json.dumps(ladder_document(found, what="estimate", provenance={})))
+    document = json.loads(json.dumps(to_plain(ladder_file(found, varied="estimate", provenance={}))))
     check_document(document, "tradeoff.schema.json", path=tmp_path)
     assert [one["default"] for one in document["settings"]].count(True) == 1
     for name in ("a.png", "b.png"):
@@ -222,7 +222,9 @@ def test_without_a_size_it_says_what_each_setting_answers(case: str, tmp_path: P
     assert "Advice: " in text
     default = next(line for line in text.splitlines() if line.startswith("* --method importance"))
     assert re.search(why, default), default
-    check_document(ladder_document(found, what="estimate", provenance={}), "tradeoff.schema.json", path=tmp_path)
+    check_document(
+        to_plain(ladder_file(found, varied="estimate", provenance={})), "tradeoff.schema.json", path=tmp_path
+    )
     draw_ladder(found, tmp_path / "f.png", title=case)
 
 

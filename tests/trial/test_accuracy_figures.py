@@ -9,15 +9,15 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
+from tactile_bayes.declarations import to_plain
 from tactile_bayes.files.documents import dump_json
-from tactile_bayes.report.trial import as_document
 from tactile_bayes.trial import accuracy
 from tactile_bayes.trial import accuracy as origin_line
 from tactile_bayes.trial import replicates as spread
 from tactile_bayes.trial.accuracy import mape_ratios
 from tactile_bayes.trial.figures import UndefinedError
-from tactile_bayes.trial.readings import ModalitySizes, Reading
-from tactile_bayes.trial.summary import TrialReport, modality_report, summarise
+from tactile_bayes.trial.readings import ModalitySizes, Reading, Trial
+from tactile_bayes.trial.summary import FAMILIES, TrialReport, modality_report, summarise
 
 # R's data set `cars` (Ezekiel, 1930): speed in mph and stopping distance in ft.
 CARS = """
@@ -107,14 +107,14 @@ def paper_readings() -> tuple[list[Reading], dict[tuple[str, str], float]]:
 
 
 def test_the_papers_errors_and_the_ratio_as_measured() -> None:
-    report = summarise(*paper_readings())
-    errors = {name: one.figures["mape_percent"].value for name, one in report.modalities.items()}
+    report = summarise(Trial(*paper_readings()))
+    errors = {name: one.mape_percent for name, one in report.modalities.items()}
     assert errors == pytest.approx({"tactile": 17, "cbe": 47, "ultrasound": 34})
-    assert report.modalities["ultrasound"].figures["mape_detected_percent"].value == pytest.approx(31.25)
-    ultrasound = report.ratios["ultrasound"]
-    assert ultrasound.ratio.value == pytest.approx(2.0)  # "more than twice" is exactly twice
-    assert ultrasound.ratio_detected.value == pytest.approx(1.84, abs=0.005)
-    assert (report.patients, report.masses) == (24, 25)
+    assert report.modalities["ultrasound"].mape_detected_percent == pytest.approx(31.25)
+    ultrasound = report.mape_ratio_to_tactile["ultrasound"]
+    assert ultrasound.ratio == pytest.approx(2.0)  # "more than twice" is exactly twice
+    assert ultrasound.ratio_detected == pytest.approx(1.84, abs=0.005)
+    assert (report.counts.patients, report.counts.masses) == (24, 25)
     assert report.modalities["cbe"].detected == 24
 
 
@@ -156,10 +156,10 @@ def test_extremes_have_defined_answers(name: str) -> None:
     report = modality_report(single(ex_vivo, size), confidence=0.95)
     for key, value in expected.items():
         if value is None:
-            assert report.figures[key].value is None
-            assert report.figures[key].reason
+            assert report.figure(key).value is None
+            assert report.figure(key).reason
         else:
-            assert report.figures[key].value == pytest.approx(value, abs=1e-12)
+            assert report.figure(key).value == pytest.approx(value, abs=1e-12)
 
 
 @pytest.mark.parametrize("name", EXTREMES)
@@ -172,32 +172,33 @@ def test_no_extreme_puts_nan_in_json(name: str) -> None:
         for key, s, y in zip(keys, status, size, strict=True)
         for modality in ("tactile", "cbe")
     ]
-    document = as_document(summarise(readings, dict(zip(keys, ex_vivo, strict=True))))
+    document = to_plain(summarise(Trial(readings, dict(zip(keys, ex_vivo, strict=True)))))
     for one in json.loads(dump_json(document))["modalities"].values():
         reasoned = {key for key, value in one.items() if value is None}
         assert reasoned - {"detected_interval"} == set(one["reasons"])
 
 
 def test_a_modality_never_done_has_counts_and_reasons() -> None:
-    report = summarise([Reading(("P1", "1"), "cbe", 1, "not_done")], {("P1", "1"): 10.0, ("P2", "1"): 9.0})
+    report = summarise(Trial([Reading(("P1", "1"), "cbe", 1, "not_done")], {("P1", "1"): 10.0, ("P2", "1"): 9.0}))
     cbe = report.modalities["cbe"]
     assert (cbe.n, cbe.detected, cbe.masses_not_done, cbe.masses_without_reading) == (0, 0, 1, 1)
     assert cbe.detected_interval is None
-    assert all(one.value is None and one.reason for one in cbe.figures.values())
-    assert report.masses_without_any_reading == 1
-    assert dump_json(as_document(report))
+    figures = {name for family in FAMILIES for name in family(single([], []), confidence=0.95)}
+    assert all(cbe.figure(name).value is None and cbe.figure(name).reason for name in figures)
+    assert report.counts.masses_without_any_reading == 1
+    assert dump_json(to_plain(report))
 
 
 def test_ratio_to_an_error_of_zero_is_undefined() -> None:
     perfect, off = single([5, 10], [5, 10]), single([5, 10], [6, 12], name="cbe")
-    ratio = mape_ratios({"tactile": perfect, "cbe": off}, confidence=0.95)["cbe"].ratio
-    assert ratio.value is None
-    assert ratio.reason == "the error of tactile is 0"
+    ratio = mape_ratios({"tactile": perfect, "cbe": off}, confidence=0.95)["cbe"]
+    assert ratio.ratio is None
+    assert ratio.reasons["ratio"] == "the error of tactile is 0"
 
 
 def test_without_tactile_there_is_no_ratio() -> None:
-    report: TrialReport = summarise([Reading(("P1", "1"), "cbe", 1, "detected", 9.0)], {("P1", "1"): 10.0})
-    assert report.ratios == {}
+    report: TrialReport = summarise(Trial([Reading(("P1", "1"), "cbe", 1, "detected", 9.0)], {("P1", "1"): 10.0}))
+    assert report.mape_ratio_to_tactile == {}
 
 
 def test_statistics_of_nothing_are_undefined() -> None:

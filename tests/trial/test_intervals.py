@@ -126,7 +126,7 @@ def test_coverage_counts_ends_as_covered_and_splits_by_probability() -> None:
     half, full = coverage([*wide, interval_reading("1", 9, 11, probability=0.5)], confidence=NOMINAL)
     assert (half.probability, half.covered, half.n) == (0.5, 1, 1)
     assert (full.probability, full.covered, full.n, full.masses) == (0.95, 2, 3, 3)
-    assert full.interval == pytest.approx(clopper_pearson(2, 3, confidence=NOMINAL))
+    assert full.fraction_interval == pytest.approx(clopper_pearson(2, 3, confidence=NOMINAL))
 
 
 def test_repeating_the_maps_of_a_mass_does_not_sharpen_coverage() -> None:
@@ -134,4 +134,4 @@ def test_repeating_the_maps_of_a_mass_does_not_sharpen_coverage() -> None:
     (once,) = coverage(one_each, confidence=NOMINAL)
     (five_times,) = coverage(one_each * 5, confidence=NOMINAL)
     assert (five_times.n, five_times.covered, five_times.masses) == (100, 95, 20)
-    assert five_times.interval == pytest.approx(once.interval)
+    assert five_times.fraction_interval == pytest.approx(once.fraction_interval)

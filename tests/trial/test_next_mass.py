@@ -18,7 +18,7 @@ from tactile_bayes.inference.modes import mode_and_covariance
 from tactile_bayes.trial import next_mass as model_of
 from tactile_bayes.trial.next_mass import LogModel, expected_error_percent, next_mass, variances
 from tactile_bayes.trial.planning import ErrorModel
-from tactile_bayes.trial.readings import ModalitySizes, Reading
+from tactile_bayes.trial.readings import ModalitySizes, Reading, Trial
 
 CALIPER = 0.05
 
@@ -96,23 +96,23 @@ def quick(log_density, centre, covariance, *, rng):
 
 def test_draws_find_what_made_the_data_and_who_errs_less() -> None:
     made, ex_vivo = readings(2, patients=60)
-    found = next_mass(made, ex_vivo, {}, sample=quick, rng=np.random.default_rng(3))
-    tactile = found.posteriors["tactile"].summaries
-    assert tactile["bias_percent"][1] < 100 * math.expm1(0.05) < tactile["bias_percent"][2]
-    assert tactile["replicate_sd"][0] == pytest.approx(0.1, rel=0.25)
-    assert tactile["log_slope"][1] < 1 < tactile["log_slope"][2]
+    found = next_mass(Trial(made, ex_vivo), sample=quick, rng=np.random.default_rng(3))
+    tactile = found.modalities["tactile"]
+    assert tactile.bias_percent.low < 100 * math.expm1(0.05) < tactile.bias_percent.high
+    assert tactile.replicate_sd.median == pytest.approx(0.1, rel=0.25)
+    assert tactile.log_slope.low < 1 < tactile.log_slope.high
     truth = ErrorModel(0.05, math.hypot(0.1, 0.1)).true_mape_percent
-    assert tactile["mape_percent"][1] < truth < tactile["mape_percent"][2]
+    assert tactile.mape_percent.low < truth < tactile.mape_percent.high
     assert found.probability_less_error["tactile errs less than ultrasound"] > 0.99
     assert any("errs less" in line for line in found.lines())
 
 
 def test_few_patients_get_no_model_and_are_told_why() -> None:
     made, ex_vivo = readings(4, patients=5)
-    found = next_mass(made, ex_vivo, {}, sample=quick, rng=np.random.default_rng(0))
-    assert found.posteriors == {}
+    found = next_mass(Trial(made, ex_vivo), sample=quick, rng=np.random.default_rng(0))
+    assert found.modalities == {}
     assert "at least 8 patients" in found.left_out["tactile"]
-    assert found.as_document()["probability_less_error"] == {}
+    assert found.probability_less_error == {}
 
 
 def test_a_total_sd_splits_into_its_parts() -> None:
@@ -126,11 +126,11 @@ def test_a_total_sd_splits_into_its_parts() -> None:
 def test_a_trial_without_a_miss_does_not_rule_misses_out() -> None:
     """Beta(1/3, 25 1/3): median 0.5 %, 97.5 % quantile 7.6 % by scipy."""
     made, ex_vivo = readings(5, patients=25)
-    found = next_mass(made, ex_vivo, {}, sample=draw, rng=np.random.default_rng(0)).posteriors["tactile"]
-    middle, low, high = found.summaries["miss_share"]
+    found = next_mass(Trial(made, ex_vivo), sample=draw, rng=np.random.default_rng(0)).modalities["tactile"]
+    share = found.miss_share
     expected = stats.beta(1 / 3, 25 + 1 / 3).ppf([0.5, 0.025, 0.975])
-    assert (middle, low, high) == pytest.approx(tuple(expected), abs=0.006)
-    assert found.summaries["mape_percent"][2] > found.summaries["mape_detected_percent"][2]
+    assert (share.median, share.low, share.high) == pytest.approx(tuple(expected), abs=0.006)
+    assert found.mape_percent.high > found.mape_detected_percent.high
 
 
 def rough(log_density, centre, covariance, *, rng):

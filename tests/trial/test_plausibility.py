@@ -18,7 +18,7 @@ from tactile_bayes.report.trial import trial_text
 from tactile_bayes.trial.figures import Figure, Intervals, UndefinedError
 from tactile_bayes.trial.limits import errors_are_proportional
 from tactile_bayes.trial.lines import deming
-from tactile_bayes.trial.readings import ModalitySizes, Reading, unit_doubts
+from tactile_bayes.trial.readings import ModalitySizes, Reading, Trial, unit_doubts
 from tactile_bayes.trial.summary import TrialReport, summarise
 
 DEMO = Path(tactile_bayes.__file__).parent / "demo"
@@ -39,7 +39,7 @@ def report(masses: list[tuple[float, list[float]]], name: str = "cbe") -> TrialR
         for key, (_, sizes) in zip(ex_vivo, masses, strict=True)
         for number, size in enumerate(sizes, start=1)
     ]
-    return summarise(readings, ex_vivo, confidence=Intervals(0.95, method="corrected"))
+    return summarise(Trial(readings, ex_vivo), confidence=Intervals(0.95, method="corrected"))
 
 
 def test_replicates_of_one_patient_alone_give_a_figure_and_no_interval() -> None:
@@ -49,10 +49,10 @@ def test_replicates_of_one_patient_alone_give_a_figure_and_no_interval() -> None
     """
     pairs = [(10.0 + i, [11.0 + i, 11.0 + i]) for i in range(10)]
     made = report([*pairs, (20.0, [20.0, 20.1]), (24.0, [20.0, 28.0])])
-    figures = made.modalities["cbe"].replicates
-    assert figures["repeatability_high_percent"].value == pytest.approx(20.97, abs=0.01)
-    assert figures["repeatability_high_percent"].interval is None
-    assert "rests on one or two patients" in figures["repeatability_high_percent"].interval_reason
+    figure = made.modalities["cbe"].replicates.figure("repeatability_high_percent")
+    assert figure.value == pytest.approx(20.97, abs=0.01)
+    assert figure.interval is None
+    assert "rests on one or two patients" in figure.interval_reason
     assert "e+" not in trial_text(made, methods=True)
 
 
@@ -67,7 +67,7 @@ def test_any_scale_has_a_report(scale: float) -> None:
     """Numpy's warnings are errors here."""
     rng = np.random.default_rng(0)
     made = report([(scale * e, [scale * e * f for f in rng.lognormal(0, 0.2, 2)]) for e in rng.uniform(8, 30, 12)])
-    assert made.modalities["cbe"].figures["mape_percent"].interval is not None
+    assert made.modalities["cbe"].mape_percent_interval is not None
     assert any("are they in mm?" in doubt for doubt in made.doubts)
 
 
