@@ -25,6 +25,7 @@ HEAVY = (
     "h5py",
     "mcap",
     "PIL",
+    "jinja2",
     "serial",
 )
 NOT_FOR_LAPLACE = ("scipy.stats", "emcee", "arviz", "pandas", "matplotlib", "xarray")

@@ -58,6 +58,13 @@ def test_the_wheel_holds_the_demo(installed):
     assert [path for path in data if not (installed / path).is_file()] == []
 
 
+def test_the_wheel_holds_the_templates_of_pages(installed):
+    templates = Path("tactile_bayes", "report", "templates")
+    ours = sorted(path.name for path in (ROOT / templates).iterdir())
+    assert {"page.html", "style.css"} <= set(ours)
+    assert sorted(path.name for path in (installed / templates).iterdir()) == ours
+
+
 def test_the_wheel_holds_every_module_and_no_tests(installed):
     ours = {path.relative_to(ROOT) for path in (ROOT / "tactile_bayes").rglob("*.py")}
     theirs = {path.relative_to(installed) for path in installed.rglob("*.py")}

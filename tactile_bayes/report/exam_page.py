@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import html
 import os
 import re
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from tactile_bayes import __version__
 from tactile_bayes.declarations import Record
@@ -23,6 +22,7 @@ from tactile_bayes.posterior.lump_probability import SHARE_WITH_LUMP
 from tactile_bayes.presets import INTERVAL, RESEARCH_USE
 from tactile_bayes.report.exam_words import (
     Exam,
+    ExamMap,
     Quantity,
     facts,
     finding_sentences,
@@ -36,6 +36,7 @@ from tactile_bayes.report.exam_words import (
     size_sentences,
     why_no_clock,
 )
+from tactile_bayes.report.pages import cut, page
 from tactile_bayes.report.svg import (
     Frame,
     breast_dial,
@@ -85,10 +86,10 @@ class PageFiles(Record):
         UsageError
             As of `check`, and when the page could not be printed.
         """
-        page = exam_page(exam)
-        files = {self.html: page.encode()}
+        text = exam_page(exam)
+        files = {self.html: text.encode()}
         if self.pdf is not None:
-            files[self.pdf] = find_printer()(page)
+            files[self.pdf] = find_printer()(text)
         write_all(files, force=self.force)
 
 
@@ -111,7 +112,7 @@ def find_printer() -> Printer:
     """
     browser = next((found for name in BROWSERS if (found := shutil.which(name))), None)
     if browser is not None:
-        return lambda page: _by_browser(browser, page)
+        return lambda text: _by_browser(browser, text)
     if find_spec("weasyprint") is not None:
         return _by_weasyprint
     raise UsageError(
@@ -120,11 +121,11 @@ def find_printer() -> Printer:
     )
 
 
-def _by_browser(browser: str, page: str) -> bytes:
+def _by_browser(browser: str, text: str) -> bytes:
     """PDF by a headless browser with a profile of its own and no network."""
     with tempfile.TemporaryDirectory() as folder:
         source, target = Path(folder) / "page.html", Path(folder) / "page.pdf"
-        source.write_text(page, encoding="utf-8")
+        source.write_text(text, encoding="utf-8")
         words = [
             browser,
             "--headless",
@@ -154,10 +155,10 @@ def _timeless(found: re.Match[bytes]) -> bytes:
     return start + b"(D:" + re.sub(rb"[0-9]", b"0", time)
 
 
-def _by_weasyprint(page: str) -> bytes:
+def _by_weasyprint(text: str) -> bytes:
     from weasyprint import HTML
 
-    document: bytes = HTML(string=page).write_pdf()
+    document: bytes = HTML(string=text).write_pdf()
     return document
 
 
@@ -170,105 +171,56 @@ NO_MAP: Final = (
 )
 MOST_REPEATS: Final = 5
 MOST_MASSES: Final = 4
-_LONGEST: Final = 400
 _FINDINGS: Final = ((2, 320), (1, 220))
 """Findings and letters of each, and on a crowded page."""
 _PICTURE_MM: Final = (108.0, 96.0)
 _LOWER_MM: Final = 54.0
 """Height of the picture on a crowded page: one that has both repeats and several masses below it."""
 _REPEAT_MM: Final = (30.0, 19.0)
-_POLICY: Final = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
-_STYLE: Final = """
-@page{size:A4 portrait;margin:10mm}
-*{box-sizing:border-box}
-body{font:15px/1.4 system-ui,"Liberation Sans",Arial,sans-serif;color:#111;background:#fff;margin:1rem auto;
-max-width:56rem;padding:0 1rem;overflow-wrap:anywhere}
-h1{font-size:1.05rem;font-weight:600;margin:0}h2{font-size:.95rem;margin:.7rem 0 .2rem;border-bottom:1px solid #bbb}
-p{margin:.2rem 0}.finding{font-size:1.5rem;font-weight:700;line-height:1.25;
-margin:.4rem 0 .3rem}.place{display:flex;flex-wrap:wrap;gap:0 1rem;align-items:center}.place>div{flex:1 1 12rem}
-.facts{display:flex;flex-wrap:wrap;gap:0 1.1rem;margin:.1rem 0}.facts span b{font-weight:600}
-.mark{border:1.5px solid #111;padding:.2rem .5rem;font-weight:600;display:inline-block;margin:.3rem 0}
-.caution{border-left:4px solid #111;padding:.15rem .5rem;margin:.25rem 0;background:#eee}
-.columns{display:flex;flex-wrap:wrap;gap:0 1.2rem}.columns>div{flex:1 1 20rem;min-width:0}
-.picture{text-align:center}.picture svg.map{max-width:100%;height:auto}.small{font-size:.8rem;color:#333}
-table{border-collapse:collapse;width:100%;font-size:.87rem}th{text-align:left;font-weight:600;padding-right:.7rem;
-vertical-align:top;white-space:nowrap}td,th{border-bottom:1px solid #ddd;padding-top:.08rem;padding-bottom:.08rem}
-.masses td{padding-right:.7rem;vertical-align:top}.masses td:last-child{width:42%}
-.repeats{display:flex;flex-wrap:wrap;gap:.4rem .8rem}.repeats figure{margin:0;font-size:.8rem;text-align:center}
-.ruler,.bar,.dial{max-width:100%}svg text{font-family:system-ui,"Liberation Sans",Arial,sans-serif}
-svg image{image-rendering:pixelated}
-@media print{html{font-size:9.2pt}body{font-size:1rem;line-height:1.28;margin:0;padding:0;max-width:none}
-.crowded{font-size:.85rem;line-height:1.2}.crowded h2{margin:.25rem 0 .05rem}.crowded p{margin:.1rem 0}
-.crowded .dial{height:27mm}.crowded .small{font-size:.72rem}
-.columns{flex-wrap:nowrap;gap:0 4mm}.columns>div.figure{flex:0 0 108mm}h2{margin:.45rem 0 .1rem}
-.caution,.mark{-webkit-print-color-adjust:exact;print-color-adjust:exact}}
-"""
 
 
 def exam_page(exam: Exam) -> str:
     """Full HTML page of an exam; equal exams give equal text."""
-    title = _cut(exam.title, 60) or TITLE
-    most, longest = _FINDINGS[_crowded(exam)]
-    parts = [
-        "<!doctype html>",
-        '<html lang="en"><head><meta charset="utf-8">',
-        f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">',
-        '<meta name="viewport" content="width=device-width, initial-scale=1">',
-        f"<title>{html.escape(title)}</title><style>{_STYLE}</style></head>",
-        '<body class="crowded">' if _crowded(exam) else "<body>",
-        f"<h1>{html.escape(title)}</h1>",
-        *_facts(exam),
-        f'<p class="mark">{html.escape(RESEARCH_USE)}</p>',
-        f'<p class="finding">{html.escape(headline(exam))}</p>',
-        *_paragraphs([_cut(text, longest) for text in finding_sentences(exam, most)], kind="caution"),
-        '<div class="columns"><div class="figure">',
-        *_picture(exam),
-        *_smallest(exam),
-        *_place(exam),
-        "</div><div>",
-        *_findings(exam),
-        "</div></div>",
-        *_several_masses(exam),
-        *_repeats(exam),
-        *_quality(exam),
-        *_foot(exam),
-        "</body></html>",
-    ]
-    return "\n".join(parts) + "\n"
+    crowded = len(exam.maps) > 1 and len(exam.main.masses) > 1
+    most, longest = _FINDINGS[crowded]
+    size, several = largest(exam), len(exam.maps) > 1
+    masses = sorted(exam.main.masses, key=lambda one: one.number)
+    shown = exam.maps[:MOST_REPEATS] if several else ()
+    return page(
+        "exam",
+        title=cut(exam.title, 60) or TITLE,
+        crowded=crowded,
+        facts=list(facts(exam)),
+        research_use=RESEARCH_USE,
+        headline=headline(exam),
+        findings=finding_sentences(exam, most),
+        longest_finding=longest,
+        picture=_picture(exam, crowded=crowded),
+        no_map=NO_MAP,
+        smallest=_smallest(exam),
+        of_mass=f" of mass {exam.main.masses[0].number}" if len(masses) > 1 else "",
+        place=_place(exam) if masses else None,
+        size=size and {"ruler": size_ruler(_intervals(exam, size)), "sentences": list(size_sentences(exam))},
+        nothing=[] if size else list(nothing_sentences(exam)),
+        narrowing=narrowing_sentences(exam),
+        masses=[mass_row(one) for one in masses],
+        most_masses=MOST_MASSES,
+        maps=len(exam.maps),
+        disagrees=exam.disagrees,
+        repeats=list(zip(small_pictures(shown, room_mm=_REPEAT_MM), map(_alone, shown), strict=True)) if shown else [],
+        of_map=f" (map {exam.main_number})" if several else "",
+        quality=list(quality_rows(exam)),
+        foot=_foot(exam),
+    )
 
 
-def _cut(text: str, longest: int = _LONGEST) -> str:
-    """A text in one line of at most so many letters."""
-    line = " ".join(text.split())
-    return line if len(line) <= longest else f"{line[: longest - 1]}…"
-
-
-def _paragraphs(sentences: list[str], *, kind: str = "") -> Iterator[str]:
-    named = f' class="{kind}"' if kind else ""
-    for text in sentences:
-        yield f"<p{named}>{html.escape(_cut(text))}</p>"
-
-
-def _facts(exam: Exam) -> Iterator[str]:
-    found = [f"<span><b>{name}</b> {html.escape(_cut(text, 50))}</span>" for name, text in facts(exam)]
-    if found:
-        yield f'<p class="facts">{"".join(found)}</p>'
-
-
-def _crowded(exam: Exam) -> bool:
-    return len(exam.maps) > 1 and len(exam.main.masses) > 1
-
-
-def _picture(exam: Exam) -> Iterator[str]:
+def _picture(exam: Exam, *, crowded: bool) -> dict[str, str] | None:
     """The map, as large as it is where the page has room, with its colours and what the lines are."""
     tactile_map = exam.main.tactile_map
     if tactile_map is None:
-        yield f'<p class="caution">{html.escape(NO_MAP)}</p>'
-        return
-    height_mm = _LOWER_MM if _crowded(exam) else _PICTURE_MM[1]
+        return None
+    height_mm = _LOWER_MM if crowded else _PICTURE_MM[1]
     frame = Frame.within(tactile_map, width_mm=_PICTURE_MM[0], height_mm=height_mm)
-    yield f'<div class="picture">{exam_picture(exam.drawn, frame, label=f"Map: {headline(exam)}")}</div>'
-    yield colour_bar(exam.main)
     lines = [f"Map {exam.main_number} of {len(exam.maps)}."] if len(exam.maps) > 1 else []
     if largest(exam) is not None:
         of_all = " of all maps" if len(exam.maps) > 1 else ""
@@ -283,51 +235,25 @@ def _picture(exam: Exam) -> Iterator[str]:
     lines += ["Striped: few readings; grey: none."] if tactile_map.counts_known else []
     size = "Life size" if frame.scale == 1.0 else f"{frame.scale:.2f} of life size"
     lines.append(f"{size} when printed at 100 %.")
-    yield f'<p class="small">{html.escape(" ".join(lines))}</p>'
+    drawn = exam_picture(exam.drawn, frame, label=f"Map: {headline(exam)}")
+    return {"drawn": drawn, "colours": colour_bar(exam.main), "words": " ".join(lines)}
 
 
-def _findings(exam: Exam) -> Iterator[str]:
-    size = largest(exam)
-    if size is None:
-        yield from _paragraphs(list(nothing_sentences(exam)))
-    else:
-        yield f"<h2>Size{_of_mass(exam)}</h2>"
-        yield size_ruler(_intervals(exam, size))
-        yield from _paragraphs(list(size_sentences(exam)))
-    narrowing = narrowing_sentences(exam)
-    if narrowing:
-        yield "<h2>How sure</h2>"
-        yield from _paragraphs(narrowing)
-
-
-def _smallest(exam: Exam) -> Iterator[str]:
+def _smallest(exam: Exam) -> list[str]:
     """What the map would have shown, by place and depth."""
     smallest, tactile_map = exam.main.document.get("smallest_lump"), exam.main.tactile_map
-    if smallest is None or tactile_map is None:
-        return
-    yield "<h2>Smallest ball that would have shown: diameter in mm</h2>"
-    yield f'<div class="repeats">{"".join(smallest_pictures(tactile_map, smallest))}</div>'
+    return [] if smallest is None or tactile_map is None else list(smallest_pictures(tactile_map, smallest))
 
 
-def _of_mass(exam: Exam) -> str:
-    """Which of several masses a section is about."""
-    masses = exam.main.masses
-    return f" of mass {masses[0].number}" if len(masses) > 1 else ""
-
-
-def _place(exam: Exam) -> Iterator[str]:
+def _place(exam: Exam) -> dict[str, Any]:
     """Where the lump lies, beside a clock face of the breast."""
-    if not exam.main.masses:
-        return
     mass, size = exam.main.masses[0], largest(exam)
-    yield f'<h2>Place{_of_mass(exam)}</h2><div class="place">{breast_dial(exam.main.masses)}<div>'
-    yield from _paragraphs([place_sentence(mass, INTERVAL if size is None else size["probability"])])
+    sentences = [place_sentence(mass, INTERVAL if size is None else size["probability"])]
     if mass.probability is not None:
         which = f"map {exam.main_number}" if len(exam.maps) > 1 else "this map"
         told = f"Probability that it is a lump, by {which}: {chance_text(mass.probability)}"
-        yield from _paragraphs([f"{told}, where one such exam in {1 / SHARE_WITH_LUMP:g} holds one."])
-    yield from (f'<p class="small">{html.escape(text)}</p>' for text in [why_no_clock(exam)] if text)
-    yield "</div></div>"
+        sentences.append(f"{told}, where one such exam in {1 / SHARE_WITH_LUMP:g} holds one.")
+    return {"dial": breast_dial(exam.main.masses), "sentences": sentences, "no_clock": why_no_clock(exam)}
 
 
 def _intervals(exam: Exam, size: Quantity) -> list[tuple[str, Quantity]]:
@@ -340,54 +266,16 @@ def _intervals(exam: Exam, size: Quantity) -> list[tuple[str, Quantity]]:
     return [(patients, size), (narrow, exam.document["max_size_mm"])]
 
 
-def _several_masses(exam: Exam) -> Iterator[str]:
-    masses = sorted(exam.main.masses, key=lambda one: one.number)
-    if len(masses) < 2:
-        return
-    yield '<h2>All masses on the map</h2><table class="masses">'
-    yield "<tr><th>No.</th><th>Largest diameter (interval)</th><th>Place</th></tr>"
-    for mass in masses[:MOST_MASSES]:
-        longest = 62 if _crowded(exam) else 160
-        cells = "".join(f"<td>{html.escape(_cut(text, longest))}</td>" for text in mass_row(mass))
-        yield f"<tr>{cells}</tr>"
-    yield "</table>"
-    if len(masses) > MOST_MASSES:
-        yield from _paragraphs([f"And {len(masses) - MOST_MASSES} more."])
+def _alone(one: ExamMap) -> str:
+    """The size that a repeat gives by itself."""
+    size = one.document["max_size_mm"]
+    return "no size" if size is None else f"{size['median']:.1f} mm ({size['low']:.1f} to {size['high']:.1f})"
 
 
-def _repeats(exam: Exam) -> Iterator[str]:
-    """Repeat maps, small, each with its own size."""
-    if len(exam.maps) < 2:
-        return
-    assert exam.pooled is not None
-    yield f"<h2>The {len(exam.maps)} maps{'' if exam.disagrees else ' of this mass'}</h2>"
-    shown = exam.maps[:MOST_REPEATS]
-    yield '<div class="repeats">'
-    small = small_pictures(shown, room_mm=_REPEAT_MM)
-    for number, (one, picture) in enumerate(zip(shown, small, strict=True), start=1):
-        size = one.document["max_size_mm"]
-        alone = "no size" if size is None else f"{size['median']:.1f} mm ({size['low']:.1f} to {size['high']:.1f})"
-        yield f"<figure>{picture}<figcaption>{number}: {alone}</figcaption></figure>"
-    yield "</div>"
-    if len(exam.maps) > MOST_REPEATS:
-        yield from _paragraphs(
-            [f"And {len(exam.maps) - MOST_REPEATS} more maps{'' if exam.disagrees else ', pooled too'}."]
-        )
-
-
-def _quality(exam: Exam) -> Iterator[str]:
-    which = f" (map {exam.main_number})" if len(exam.maps) > 1 else ""
-    yield f"<h2>How good the exam was{which}</h2><table>"
-    for name, text in quality_rows(exam):
-        yield f"<tr><th>{html.escape(name)}</th><td>{html.escape(_cut(text, 240))}</td></tr>"
-    yield "</table>"
-
-
-def _foot(exam: Exam) -> Iterator[str]:
+def _foot(exam: Exam) -> str:
     digests = [scan["sha256"][:12] for scan in exam.scans if scan.get("sha256")][:MOST_REPEATS]
     settings = exam.main.document["provenance"]
     parts = [f"tactile-bayes {__version__}", f"method {settings['settings'].get('method', 'unknown')}"]
     parts += [f"seed {settings['seed']}"] if settings.get("seed") is not None else []
     parts += [f"scan{'s' if len(digests) > 1 else ''} {', '.join(digests)}"] if digests else []
-    text = f"{'; '.join(parts)}. Sizes come from simulated bodies; no scan of a person has been used. {RESEARCH_USE}"
-    yield f'<p class="small">{html.escape(text)}</p>'
+    return f"{'; '.join(parts)}. Sizes come from simulated bodies; no scan of a person has been used. {RESEARCH_USE}"

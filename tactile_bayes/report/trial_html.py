@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import html
 import io
 import itertools
 import json
@@ -14,12 +13,14 @@ import numpy as np
 from scipy.special import ndtr
 
 from tactile_bayes.declarations import UNSET
-from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.compare import Growth, growth_section
+from tactile_bayes.report.pages import page
 from tactile_bayes.report.trial import found_share, growing_line, limit_rows, number, ratio_line, shown
 from tactile_bayes.trial.calibration import BINS, Calibration, Prediction
 from tactile_bayes.trial.figures import Ends, Figures
 from tactile_bayes.trial.method_comparison import MethodComparison
+from tactile_bayes.trial.next_mass import NextMass
+from tactile_bayes.trial.planning import IntervalCheck
 from tactile_bayes.trial.readings import FloatArray, ModalitySizes, Trial, mass_numbers
 from tactile_bayes.trial.summary import ModalityReport, TrialReport, prediction_of
 
@@ -200,20 +201,8 @@ def _label(
 
 # --- Trial report as one self-contained page: tables, figures, settings, hashes; no script, no network.
 
-_STYLE = """
-body{font:15px/1.5 system-ui,sans-serif;color:#1b1b1b;max-width:72rem;margin:2rem auto;padding:0 1.2rem}
-h1{font-size:1.5rem;margin:0 0 .2rem}h2{font-size:1.12rem;margin:2rem 0 .5rem;border-bottom:1px solid #ccc}
-table{border-collapse:collapse;font-size:.86rem;margin:.6rem 0;font-variant-numeric:tabular-nums}
-th,td{padding:.22rem .7rem .22rem 0;text-align:left;vertical-align:top;border-bottom:1px solid #e4e4e4}
-th{font-weight:600}td small{color:#5a5a5a;white-space:nowrap}img{max-width:100%;height:auto}
-.wide{overflow-x:auto}.note{color:#5a5a5a;font-size:.86rem}pre{font-size:.76rem;overflow-x:auto;background:#f6f6f4;padding:.8rem}
-.mark{background:#fff3d6;padding:.35rem .7rem;border-left:4px solid #c8641e}code{font-size:.8rem;overflow-wrap:anywhere}
-@media print{body{margin:0;max-width:none;padding:0}h2{break-after:avoid}img,tr{break-inside:avoid}
-.wide{overflow:visible}table{font-size:7.5pt}th,td{padding-right:.3rem}td small{white-space:normal}
-pre{white-space:pre-wrap}}
-"""
-_POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
-
+Table = tuple[Sequence[str], Sequence[Sequence[str]]]
+"""Heads and rows; an interval in brackets is set in small type below its number."""
 _MAIN = {
     "mape_percent": ("MAPE %", ".1f"),
     "mape_detected_percent": ("MAPE % found", ".1f"),
@@ -237,6 +226,24 @@ _METHODS = {
     "passing_bablok_intercept_mm": ("intercept mm", ".1f"),
     "concordance": ("concordance", ".2f"),
 }
+_SPREAD = {
+    "within_mass_cv_rms_percent": ("wCV % (RMS)", ".1f"),
+    "within_mass_cv_percent": ("wCV % (mean of SDs)", ".1f"),
+}
+_REPEATS = {
+    "repeatability_low_percent": ("repeatability down %", ".0f"),
+    "repeatability_high_percent": ("up %", "+.0f"),
+    "icc": ("ICC", ".2f"),
+}
+_NEXT = {
+    "mape_percent": "expected error %",
+    "mape_detected_percent": "if found %",
+    "bias_percent": "bias %",
+    "log_slope": "slope of ln size",
+    "patient_sd": "SD patients",
+    "mass_sd": "SD masses",
+    "replicate_sd": "SD maps",
+}
 
 
 def trial_html(report: TrialReport, trial: Trial, *, text: str, growth: Sequence[Growth] = ()) -> str:
@@ -244,96 +251,72 @@ def trial_html(report: TrialReport, trial: Trial, *, text: str, growth: Sequence
 
     `growth` is of masses with several visits, beside the trial.
     """
-    title = "Sizes against excision"
-    parts = [
-        "<!doctype html>",
-        '<html lang="en"><head><meta charset="utf-8">',
-        f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">',
-        '<meta name="viewport" content="width=device-width, initial-scale=1">',
-        f"<title>{title}</title><style>{_STYLE}</style></head><body>",
-        f"<h1>{title}</h1>",
-        *([] if report.title is UNSET else [f"<p>Protocol: {html.escape(report.title)}</p>"]),
-        *_opening(report, trial),
-        *_errors(report, trial),
-        *_agreement(report, trial),
-        *_replicates(report),
-        *_calibrations(report, trial),
-        *_comparisons(report),
-        *growth_section(growth),
-        *_next_mass(report),
-        *_interval_check(report),
-        *_origin(report),
-        f"<details><summary>The report as text</summary><pre>{html.escape(text)}</pre></details>",
-        f'<p class="mark">{html.escape(RESEARCH_USE)}</p></body></html>',
-    ]
-    return "\n".join(parts) + "\n"
-
-
-def _opening(report: TrialReport, trial: Trial) -> Iterator[str]:
-    counts = report.counts
-    yield (
-        f"<p>{counts.masses} masses of {counts.patients} patients, {counts.readings} readings. "
-        f"In brackets: {100 * report.interval_probability:g} % intervals over patients.</p>"
+    ratio = next((one.method_comparison.error_ratio for one in report.modalities.values()), 1.0)
+    trends = itertools.starmap(_trend, report.modalities.items())
+    checks = {} if report.interval_check is UNSET else report.interval_check
+    return page(
+        "trial",
+        title="Sizes against excision",
+        protocol="" if report.title is UNSET else report.title,
+        opening=_opening(report),
+        marks=_marks(report, trial),
+        errors=_errors(report),
+        ratios=[ratio_line(name, one) for name, one in report.mape_ratio_to_tactile.items()],
+        cautions=[f"{name}: {caution}" for name, one in report.modalities.items() for caution in one.cautions],
+        sizes_png=_base64(sizes_figure(report, trial)),
+        lines=_lines(report),
+        error_ratio=f"{ratio:g}",
+        limits=_limits(report),
+        growing=[line for line in (growing_line(report), *trends) if line],
+        differences_png=_base64(differences_figure(report, trial)),
+        replicates=_replicates(report),
+        calibrations=list(_calibrations(report, trial)),
+        pairs=_pairs(report),
+        growth="\n".join(growth_section(growth)),
+        next_mass=None if report.next_mass is UNSET else _next_mass(report.next_mass),
+        checks=_checks(checks) if checks else None,
+        settings=_settings(report),
+        inputs=report.provenance["inputs"],
+        text=text,
+        research_use=report.research_use,
     )
-    for line in trial.other_visits.lines():
-        yield f'<p class="mark">{html.escape(line)}.</p>'
-    for doubt in report.doubts:
-        yield f'<p class="mark">Doubtful: {html.escape(doubt)}</p>'
+
+
+def _opening(report: TrialReport) -> str:
+    counts, percent = report.counts, f"{100 * report.interval_probability:g} %"
+    return (
+        f"{counts.masses} masses of {counts.patients} patients, {counts.readings} readings. In brackets: {percent} "
+        "intervals over patients."
+    )
+
+
+def _marks(report: TrialReport, trial: Trial) -> list[str]:
+    """What has to be known before the tables are read."""
+    counts = report.counts
+    marks = [f"{line}." for line in trial.other_visits.lines()] + [f"Doubtful: {doubt}" for doubt in report.doubts]
     if counts.synthetic_readings:
         share = "All" if counts.synthetic_readings == counts.readings else str(counts.synthetic_readings)
-        yield f'<p class="mark">{share} readings are synthetic: made by a generator, not measured.</p>'
+        marks.append(f"{share} readings are synthetic: made by a generator, not measured.")
+    return marks
 
 
-def _errors(report: TrialReport, trial: Trial) -> Iterator[str]:
-    yield "<h2>Errors</h2>"
+def _errors(report: TrialReport) -> Table:
     rows = [[name, found_share(one), *_cells(one, _MAIN)] for name, one in report.modalities.items()]
-    yield _table(["", "found", *(words for words, _ in _MAIN.values())], rows)
-    yield (
-        '<p class="note">A mass not found counts as size 0, an error of 100 %, except in columns that say "found". '
-        "r2 centred is 1 - SSE0/SST of the line through zero, below 0 where it fails.</p>"
-    )
-    for name, ratio in report.mape_ratio_to_tactile.items():
-        yield f"<p>{html.escape(ratio_line(name, ratio))}.</p>"
-    for name, one in report.modalities.items():
-        for caution in one.cautions:
-            yield f'<p class="note">{html.escape(f"{name}: {caution}")}.</p>'
-    yield _picture(
-        sizes_figure(report, trial), "Size against ex-vivo size for each modality, with identity and fitted line"
-    )
-    yield (
-        '<p class="note">Points are means over the replicates of a mass. Bars: 1 SD of the ex-vivo size where the '
-        "table gives it (across) and 1 SD of the replicates (up). Hollow points: masses not found, at size 0.</p>"
-    )
+    return ["", "found", *_heads(_MAIN)], rows
 
 
-def _agreement(report: TrialReport, trial: Trial) -> Iterator[str]:
-    ratio = next((one.method_comparison.error_ratio for one in report.modalities.values()), 1.0)
-    yield "<h2>Agreement</h2>"
+def _lines(report: TrialReport) -> Table:
     rows = [[name, *_cells(one.method_comparison, _METHODS)] for name, one in report.modalities.items()]
-    yield _table(["", *(words for words, _ in _METHODS.values())], rows)
-    yield (
-        '<p class="note">Masses found only; limits of agreement are for single readings. '
-        f"Error ratio of the Deming lines (ex vivo over modality): {ratio:g}.</p>"
-    )
-    yield _table(
-        ["", "scale", "bias", "lower limit", "upper limit"],
-        [
-            [name, row.words, row.bias, row.low, row.high]
-            for name, one in report.modalities.items()
-            for row in limit_rows(one)
-        ],
-    )
-    for note in (growing_line(report), *itertools.starmap(_trend, report.modalities.items())):
-        if note:
-            yield f"<p>{html.escape(note)}</p>"
-    yield _picture(
-        differences_figure(report, trial), "Difference to the ex-vivo size against the mean of both, with limits"
-    )
-    yield (
-        '<p class="note">Points are means over the replicates of a mass; the limits are for single readings and so are '
-        "wider than the points where there are replicates. Bands: intervals of the limits over patients. All panels "
-        "have the same axes.</p>"
-    )
+    return ["", *_heads(_METHODS)], rows
+
+
+def _limits(report: TrialReport) -> Table:
+    rows = [
+        [name, row.words, row.bias, row.low, row.high]
+        for name, one in report.modalities.items()
+        for row in limit_rows(one)
+    ]
+    return ["", "scale", "bias", "lower limit", "upper limit"], rows
 
 
 def _trend(name: str, report: ModalityReport) -> str | None:
@@ -347,104 +330,60 @@ def _trend(name: str, report: ModalityReport) -> str | None:
     )
 
 
-def _replicates(report: TrialReport) -> Iterator[str]:
-    replicated = {name: one for name, one in report.modalities.items() if one.replicates.within_mass_log_sd is not None}
-    if not replicated:
-        return
-    yield "<h2>Replicates</h2>"
+def _replicates(report: TrialReport) -> Table | None:
     rows = []
-    for name, one in replicated.items():
-        found = one.replicates
-        parts = found.variance_components
+    for name, one in report.modalities.items():
+        parts = one.replicates.variance_components
         sds = [None, None, None] if parts is None else [parts.mass, parts.reader, parts.map]
-        rows.append(
-            [
-                name,
-                *_cells(one, {"within_mass_cv_rms_percent": ("", ".1f"), "within_mass_cv_percent": ("", ".1f")}),
-                shown(found.figure("repeatability_low_percent"), ".0f"),
-                shown(found.figure("repeatability_high_percent"), "+.0f"),
-                shown(found.figure("icc"), ".2f"),
-                *("-" if sd is None else f"{100 * sd**0.5:.0f}" for sd in sds),
-            ]
-        )
-    heads = [
-        "",
-        "wCV % (RMS)",
-        "wCV % (mean of SDs)",
-        "repeatability down %",
-        "up %",
-        "ICC",
-        "SD masses %",
-        "readers %",
-    ]
-    yield _table([*heads, "maps %"], rows)
-    yield '<p class="note">The mean of SDs is low for few replicates. SDs are of the logarithm of size.</p>'
+        if one.replicates.within_mass_log_sd is not None:
+            of_sds = (number(None if sd is None else 100 * sd**0.5, ".0f") for sd in sds)
+            rows.append([name, *_cells(one, _SPREAD), *_cells(one.replicates, _REPEATS), *of_sds])
+    heads = ["", *_heads(_SPREAD), *_heads(_REPEATS), "SD masses %", "readers %", "maps %"]
+    return (heads, rows) if rows else None
 
 
-def _calibrations(report: TrialReport, trial: Trial) -> Iterator[str]:
+def _calibrations(report: TrialReport, trial: Trial) -> Iterator[tuple[str, str, str]]:
+    """Name, words and picture of each modality that states its uncertainty."""
     for name, one in report.modalities.items():
         found, prediction = one.calibration, prediction_of(trial, name)
         if found is None or prediction is None:
             continue
-        yield f"<h2>Stated uncertainty: {html.escape(name)}</h2>"
-        yield (
-            f"<p>{found.n} readings of {found.masses} masses; CRPS {number(found.crps_mm, '.2f')} mm, interval score "
-            f"{number(found.interval_score_mm, '.1f')} mm. Advice: {html.escape(found.advice)}.</p>"
+        words = (
+            f"{found.n} readings of {found.masses} masses; CRPS {number(found.crps_mm, '.2f')} mm, interval score "
+            f"{number(found.interval_score_mm, '.1f')} mm. Advice: {found.advice}."
         )
-        yield _picture(calibration_figure(prediction, found), "Integral transforms and coverage")
+        yield name, words, _base64(calibration_figure(prediction, found))
 
 
-def _comparisons(report: TrialReport) -> Iterator[str]:
-    if not report.paired_comparisons:
-        return
-    yield "<h2>Modalities compared on common masses</h2>"
-    yield _table(
-        ["", "masses", "difference of MAPE, points", "ratio", "p", "p Holm"],
-        [
-            [
-                f"{one.first} - {one.second}",
-                str(one.masses),
-                shown(one.figure("difference_percent"), "+.1f"),
-                shown(one.figure("ratio"), ".2f"),
-                number(one.p_value, ".4f"),
-                number(one.p_holm, ".4f"),
-            ]
-            for one in report.paired_comparisons
-        ],
-    )
-
-
-def _next_mass(report: TrialReport) -> Iterator[str]:
-    found = report.next_mass
-    if found is UNSET:
-        return
-    yield "<h2>The next mass</h2>"
-    columns = {
-        "mape_percent": "expected error %",
-        "mape_detected_percent": "if found %",
-        "bias_percent": "bias %",
-        "log_slope": "slope of ln size",
-    }
-    columns |= {"patient_sd": "SD patients", "mass_sd": "SD masses", "replicate_sd": "SD maps"}
+def _pairs(report: TrialReport) -> Table | None:
     rows = [
-        [name, *(_with(middle.median, (middle.low, middle.high)) for middle in (getattr(one, key) for key in columns))]
+        [
+            f"{one.first} - {one.second}",
+            str(one.masses),
+            shown(one.figure("difference_percent"), "+.1f"),
+            shown(one.figure("ratio"), ".2f"),
+            number(one.p_value, ".4f"),
+            number(one.p_holm, ".4f"),
+        ]
+        for one in report.paired_comparisons
+    ]
+    heads = ["", "masses", "difference of MAPE, points", "ratio", "p", "p Holm"]
+    return (heads, rows) if rows else None
+
+
+def _next_mass(found: NextMass) -> dict[str, Any]:
+    rows = [
+        [name, *(_with(middle.median, (middle.low, middle.high)) for middle in (getattr(one, key) for key in _NEXT))]
         for name, one in found.modalities.items()
     ]
-    yield _table(["", *columns.values()], rows)
-    for pair, probability in found.probability_less_error.items():
-        yield f"<p>Probability that {html.escape(pair)}: {probability:.3f}</p>"
-    percent = 100 * found.interval.probability
-    yield (
-        '<p class="note">Bayesian errors-in-variables model of ln size, for a single reading of a new patient\'s mass; '
-        f"medians and equal-tailed {percent:g} % intervals. It stands beside the tables above and replaces none.</p>"
-    )
+    return {
+        "table": (["", *_NEXT.values()], rows),
+        "less_error": [f"Probability that {pair}: {p:.3f}" for pair, p in found.probability_less_error.items()],
+        "percent": f"{100 * found.interval.probability:g}",
+    }
 
 
-def _interval_check(report: TrialReport) -> Iterator[str]:
-    found = report.interval_check
-    if found is UNSET or not found:
-        return
-    yield "<h2>Simulated coverage of the intervals</h2>"
+def _checks(found: Mapping[str, IntervalCheck]) -> Table:
     heads = ["", "simulated trials", "true MAPE %", "covered", "interval above it", "interval below it"]
     rows = [
         [
@@ -457,19 +396,21 @@ def _interval_check(report: TrialReport) -> Iterator[str]:
         ]
         for name, one in found.items()
     ]
-    yield _table(heads, rows)
-    yield '<p class="note">Trials of this size with errors like those found; intervals of the percent error.</p>'
+    return heads, rows
 
 
-def _origin(report: TrialReport) -> Iterator[str]:
-    provenance = report.provenance
-    yield "<h2>Settings and origin</h2>"
-    rows = [[key, json.dumps(value)] for key, value in provenance["settings"].items()]
-    rows += [["seed", str(provenance["seed"])], ["program", f"{provenance['program']} {provenance['version']}"]]
-    yield _table(["setting", "value"], rows)
-    yield _table(["input", "sha256"], [[one["role"], f"<code>{one['sha256']}</code>"] for one in provenance["inputs"]])
-    if not any(one["role"] == "protocol" for one in provenance["inputs"]):
-        yield '<p class="note">No pre-specified analysis was given (--protocol).</p>'
+def _settings(report: TrialReport) -> Table:
+    made = report.provenance
+    rows = [[key, json.dumps(value)] for key, value in made["settings"].items()]
+    return ["setting", "value"], [
+        *rows,
+        ["seed", str(made["seed"])],
+        ["program", f"{made['program']} {made['version']}"],
+    ]
+
+
+def _heads(wanted: Mapping[str, tuple[str, str]]) -> list[str]:
+    return [words for words, _ in wanted.values()]
 
 
 def _cells(figures: Figures, wanted: Mapping[str, tuple[str, str]]) -> list[str]:
@@ -480,20 +421,5 @@ def _with(value: float, ends: Ends) -> str:
     return f"{value:.3g} [{ends[0]:.3g}, {ends[1]:.3g}]"
 
 
-def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    head = "".join(f"<th>{html.escape(one)}</th>" for one in heads)
-    body = "".join(f"<tr>{''.join(f'<td>{_cell(one)}</td>' for one in row)}</tr>" for row in rows)
-    return f'<div class="wide" tabindex="0"><table><tr>{head}</tr>{body}</table></div>'
-
-
-def _cell(text: str) -> str:
-    """Text with an interval in brackets set in small type below the number."""
-    if text.startswith("<code>"):
-        return text
-    value, bracket, rest = text.partition(" [")
-    return html.escape(value) + (f"<br><small>[{html.escape(rest)}</small>" if bracket else "")
-
-
-def _picture(png: bytes, words: str) -> str:
-    data = base64.b64encode(png).decode("ascii")
-    return f'<p><img alt="{html.escape(words)}" src="data:image/png;base64,{data}"></p>'
+def _base64(png: bytes) -> str:
+    return base64.b64encode(png).decode("ascii")

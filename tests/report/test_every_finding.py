@@ -278,7 +278,7 @@ PRINTERS = {
     "actions/simulation", "actions/study",
     "actions/tradeoff", "actions/trial", "files/size_json", "presets", "report/calibration",
     "report/paper_head", "report/laboratory",
-    "report/study", "report/tradeoff", "report/trial_html", "trial/summary",
+    "report/study", "report/tradeoff", "trial/summary",
 }  # fmt: skip
 
 

@@ -55,7 +55,8 @@ class Page(HTMLParser):
         assert self._open.pop() == tag
 
     def handle_data(self, data: str) -> None:
-        self.text.append(data)
+        if "style" not in self._open:
+            self.text.append(data)
 
     @property
     def words(self) -> str:
