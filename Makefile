@@ -54,19 +54,19 @@ calibrations: $(VENV)/.installed
 	mkdir -p build
 	OPENBLAS_NUM_THREADS=1 $(BIN)/tactile-bayes population --masses 1500 --centred 750 --seed 7 --workers 2 \
 		--normalise gain --normalise mean -o build/population.csv --force
-	gzip -9 -n -c build/population.csv > benchmarks/population.csv.gz
+	gzip -9 -n -c build/population.csv > validation/population.csv.gz
 	$(MAKE) relearn
 
 # The same from the scans' table as it is kept, and what lumps of another simulator say of it: two minutes.
 relearn: $(VENV)/.installed
 	mkdir -p build
-	gzip -d -c benchmarks/population.csv.gz > build/population.csv
+	gzip -d -c validation/population.csv.gz > build/population.csv
 	$(BIN)/tactile-bayes calibrate size build/population.csv --normalise gain --form eq6-residual \
-		--against benchmarks/other_simulator.csv -o tactile_bayes/calibrations/solid.json --force
+		--against validation/other_simulator.csv -o tactile_bayes/calibrations/solid.json --force
 	$(BIN)/tactile-bayes calibrate size build/population.csv --normalise mean --form eq6-residual \
-		--against benchmarks/other_simulator.csv -o tactile_bayes/calibrations/solid_mean.json --force
+		--against validation/other_simulator.csv -o tactile_bayes/calibrations/solid_mean.json --force
 	$(BIN)/tactile-bayes calibrate size build/population.csv --normalise gain --form eq6 \
-		--against benchmarks/other_simulator.csv -o tactile_bayes/calibrations/eq6.json --force
+		--against validation/other_simulator.csv -o tactile_bayes/calibrations/eq6.json --force
 	$(BIN)/tactile-bayes study -o build/paper_grid.csv --force
 	$(BIN)/tactile-bayes calibrate size build/paper_grid.csv --fit-radius-mm 48 --least-stiffness-ratio 8 \
 		-o tactile_bayes/calibrations/plane_strain.json --force

@@ -80,7 +80,7 @@ MEASURED_ELSEWHERE = {
     "compare": "it needs two visits; its maps' estimates, measured here as `estimate`, are the cost",
     "diagnose": "it needs a posterior that `estimate` wrote; the chains are the cost",
     "tradeoff": "it measures itself: a minute of work",
-    "population": "hours of work; see benchmarks.own_trial for a scan's",
+    "population": "hours of work; see validation.own_trial for a scan's",
     "sbc": "it measures itself: its report tells maps per second",
     "record": "benchmarks.record: runs until it is stopped",
     "repair": "benchmarks.record: needs a recording that was cut off",

@@ -1,6 +1,6 @@
 """CPU time of exams in a warm process, by what lies in the body: ``python -m benchmarks.exam_time DIR``.
 
-DIR holds the scans of `masses_scenes` (``python -m benchmarks.masses make DIR --kind two --kind one --kind empty --kind
+DIR holds the scans of `masses_scenes` (``python -m validation masses make DIR --kind two --kind one --kind empty --kind
 faint``). Twelve of each kind are read, mapped and estimated with the defaults, as a worker of a campaign does it, and
 twelve maps with a rib, every other one beside a lump, are estimated: those are drawn as in `scene_rates`. One exam
 before them warms the process. The results are kept in DIR/exam_time.jsonl; a second call goes on.
@@ -17,13 +17,13 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.masses_scenes import KINDS
-from benchmarks.scene_rates import ROWS, draw_map
 from tactile_bayes.api.estimating import answer_of, estimate_one
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.files.scan_mcap import read_scan
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import TactileMap
+from validation.masses_scenes import KINDS
+from validation.scene_rates import ROWS, draw_map
 
 RESULTS, EACH, SEED = "exam_time.jsonl", 12, 20261124
 RIBBED = ("round and a rib", "a rib and no lump")

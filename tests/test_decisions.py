@@ -88,6 +88,8 @@ def missing(command: str) -> str:
         return ", ".join(set(words[1:]) - set(targets))
     if words[0] == "pytest":
         return ", ".join(word for word in words[1:] if not (ROOT / word).exists())
+    if words[0] == "python" and words[1].endswith(".py"):
+        return "" if (ROOT / words[1]).exists() else words[1]
     assert words[:2] == ["python", "-m"], command
     module = ROOT / words[2].replace(".", "/")
     files = [module.with_suffix(".py"), *([module / f"{words[3]}.py"] if len(words) > 3 else [])]
@@ -140,7 +142,9 @@ def test_a_command_that_measures_a_decision_exists(command: str) -> None:
     assert missing(command) == ""
 
 
-@pytest.mark.parametrize("command", ["make nothing", "python -m benchmarks.nothing", "pytest tests/nothing.py"])
+@pytest.mark.parametrize(
+    "command", ["make nothing", "python -m benchmarks.nothing", "python -m validation nothing", "python tests/no.py"]
+)
 def test_a_command_that_is_gone_would_be_found(command: str) -> None:
     assert missing(command)
 
@@ -149,7 +153,9 @@ def test_a_number_that_is_cited_has_a_record() -> None:
     """In the records, the documents and the code; so have files and benchmarks that a record in force names."""
     cited = re.compile(r"(?:records? |decisions/|\()(0[01]\d\d)\b")
     files = [*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")]
-    files += [path for room in ("tactile_bayes", "benchmarks", "tests") for path in (ROOT / room).rglob("*.py")]
+    files += [
+        path for room in ("tactile_bayes", "benchmarks", "validation", "tests") for path in (ROOT / room).rglob("*.py")
+    ]
     found = {(number, path.name) for path in files for number in cited.findall(path.read_text(encoding="utf-8"))}
     assert {(number, name) for number, name in found if number not in RECORDS} == set()
 
@@ -157,10 +163,10 @@ def test_a_number_that_is_cited_has_a_record() -> None:
 def test_files_and_benchmarks_that_a_record_names_exist() -> None:
     gone = []
     for record in RECORDS.values():
-        for name in re.findall(r"`((?:tests|docs|benchmarks|tactile_bayes)/[\w./]+)`", record.text):
+        for name in re.findall(r"`((?:tests|docs|benchmarks|validation|tactile_bayes)/[\w./]+)`", record.text):
             gone += [(record.number, name)] if not (ROOT / name).exists() else []
-        for name, rest in re.findall(r"`benchmarks\.(\w+)[^`]*`([^.]*)", record.text):
-            file = ROOT / "benchmarks" / f"{name}.py"
+        for room, name, rest in re.findall(r"`(benchmarks|validation)\.(\w+)[^`]*`([^.]*)", record.text):
+            file = ROOT / room / f"{name}.py"
             gone += [(record.number, name)] if "at commit" not in rest and not file.exists() else []
     assert gone == []
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.stress import CONTROL, STRESSES, jobs
-from benchmarks.stress_frames import Physics, VaryingLayers, shear_sinking, stressed_frames
 from tactile_bayes.forward.axisymmetric import LayeredBody
 from tactile_bayes.forward.scene import Scene, Strokes
 from tactile_bayes.forward.solid import solid_frames
 from tactile_bayes.forward.tissue import SceneBody, SolidLump
+from validation.stress import CONTROL, STRESSES, jobs
+from validation.stress_frames import Physics, VaryingLayers, shear_sinking, stressed_frames
 
 SCENE = Scene(
     duration_s=4.0,

@@ -25,7 +25,7 @@ from tactile_bayes.presets import FIELD_COSINES, FIT_RADIUS_MM
 SHARE_WITH_LUMP: Final = 0.5
 """Half of the simulated exams hold a lump: the prior probability behind the answer."""
 COEFFICIENTS: Final = (1.14, 0.8, -2.36, -4.3, -2.32, -2.47)
-"""Intercept and those of `Weighed.features`; printed by ``python -m benchmarks.lump_probability learn``, 0127."""
+"""Intercept and those of `Weighed.features`; printed by ``python -m validation lump_probability learn``, 0127."""
 ENDS: Final = (0.01, 0.99)
 """The exams that were simulated cannot tell probabilities nearer to 0 or 1."""
 LIKELY: Final = 0.5
@@ -114,7 +114,7 @@ USUAL_FAT_MM: Final = 15.0
 """Where a map does not tell the depth of fat."""
 LOG_AMPLITUDE: Final = (-2.61, 3.393, -3.27, 1.003, 0.251, -0.049, -0.983)
 LOG_SIGMA: Final = (1.865, -0.168, 0.988, -0.155)
-"""Coefficients of `lump_features`, and of its first four: ``python -m benchmarks.smallest_lump learn`` prints them."""
+"""Coefficients of `lump_features`, and of its first four: ``python -m validation smallest_lump learn`` prints them."""
 LOG_FACTOR: Final = 10.0
 MARGIN: Final = 0.5
 """ln of the expected amplitude over the one that `LOG_FACTOR` needs, from which 19 of 20 simulated lumps were found:

@@ -70,7 +70,7 @@ def test_the_surest_is_reported_though_another_is_sized_larger() -> None:
 
 
 def test_a_shoulder_sized_larger_than_the_lump_beside_it_is_not_reported() -> None:
-    """A lump, and a low wide shoulder of the level, as uneven pressure leaves it; `benchmarks.masses` has a hundred."""
+    """A lump, and a low wide shoulder of the level, as uneven pressure leaves it; `validation.masses` has a hundred."""
     rng = np.random.default_rng(1)
     values = bump_values(half_mm=40.0, x=-16.0, y=2.0, sigma_x=4.5, sigma_y=4.5, amplitude=0.31)
     values += bump_values(half_mm=40.0, x=14.0, y=2.0, sigma_x=9.0, sigma_y=9.0, amplitude=0.12, level=0.0)
@@ -115,7 +115,7 @@ def test_masses_are_ranked_by_evidence_inside_the_calibration() -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_one_lump_is_one_mass(seed: int) -> None:
-    """`benchmarks.masses` has the share over 200 simulated exams."""
+    """`validation.masses` has the share over 200 simulated exams."""
     estimate = found_on(scene(narrow=0.0, seed=seed)).estimate
     assert places(estimate.masses) == [WIDE]
     assert estimate.masses[0].reported

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.method_agreement import MAPS, differences, fit_of, rms, under_other_prior
 from tactile_bayes.inference import importance as sampling
 from tactile_bayes.inference.importance import TOO_WIDE, Gaussians
 from tactile_bayes.posterior.draw import Sampled, importance_draws
+from validation.method_agreement import MAPS, differences, fit_of, rms, under_other_prior
 
 
 @pytest.fixture(scope="module")

@@ -49,7 +49,7 @@ def test_another_lump_far_away_is_named_where_it_stands() -> None:
 
 
 def test_one_lump_is_not_named_twice() -> None:
-    """The control of the test above; `benchmarks.scene_rates` has the shares over hundreds of maps."""
+    """The control of the test above; `validation.scene_rates` has the shares over hundreds of maps."""
     for seed in range(3):
         assert looked(values(second=0.0, seed=seed))[1] == ()
 

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from benchmarks.next_mass_coverage import DESIGNS, Design, half_normal_log_prior, ranks
 from tactile_bayes.api.trial_sampler import draw
 from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.inference.ensemble import EnsembleOptions, ensemble
@@ -19,6 +18,7 @@ from tactile_bayes.trial import next_mass as model_of
 from tactile_bayes.trial.next_mass import LogModel, expected_error_percent, next_mass, variances
 from tactile_bayes.trial.planning import ErrorModel
 from tactile_bayes.trial.readings import ModalitySizes, Reading, Trial
+from validation.next_mass_coverage import DESIGNS, Design, half_normal_log_prior, ranks
 
 CALIPER = 0.05
 
