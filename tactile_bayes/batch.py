@@ -34,11 +34,6 @@ class LocalWorkers(Executor):
     A worker leaves Ctrl-C to its parent and ends when the parent does, even if that was killed. Each has a pipe of its
     own, so that one that is killed in the middle of handing over its result holds up nobody: its item comes back with
     `BrokenExecutor`, and another process takes its place. `concurrent.futures` has one pipe for all and waits for ever.
-
-    Parameters
-    ----------
-    workers
-        How many processes; they start when there is work for them.
     """
 
     def __init__(self, workers: int) -> None:
@@ -145,12 +140,7 @@ def prepare_worker() -> None:
 class ClusterWorkers(Executor):
     """Workers of a dask cluster.
 
-    Parameters
-    ----------
-    cluster
-        From ``Client.get_executor``.
-    threads
-        How many items the cluster runs at a time.
+    `threads` is how many items the cluster runs at a time.
     """
 
     def __init__(self, cluster: Executor, threads: int) -> None:
@@ -203,11 +193,6 @@ def cluster_executor(address: str, *, timeout_s: float = 10.0) -> Iterator[Execu
     """Executor over the workers of a running dask scheduler, for example ``tcp://10.0.0.5:8786``.
 
     The workers must have this version of the program installed: another one could give other results.
-
-    Raises
-    ------
-    UsageError
-        When the extra is not installed, the scheduler does not answer, or its workers do not fit.
     """
     try:
         from distributed import Client
@@ -297,16 +282,8 @@ class Outcome(Record, Generic[Result]):
 class BatchInterrupted(KeyboardInterrupt):
     """Ctrl-C during a batch, with the outcomes that were finished.
 
-    Parameters
-    ----------
-    outcomes
-        Of the finished items, in their order.
-    total
-        How many items there were.
-    store
-        Where the results are kept for the next run; None where nothing keeps them.
-    before
-        Items done by earlier batches of the same run, for the message.
+    `store` is where the results are kept for the next run, `before` counts items done by earlier batches of the same
+    run.
     """
 
     def __init__(self, outcomes: Sequence[Outcome[Any]], *, total: int, store: Path | None, before: int = 0) -> None:
@@ -344,27 +321,9 @@ def run_batch(
     killed: the items it may have held are run again, and one whose process ends twice is at fault. Ctrl-C, or any fault
     of the store, cancels what has not begun, keeps what is finished and goes on up.
 
-    Parameters
-    ----------
-    function
-        Must be importable by name in another process (a module's function or a `functools.partial` of one).
-    items
-        Picklable, each with the seed it needs.
-    key
-        The unique name of an item.
-    executor
-        From `open_executor`; None runs the items here, one by one.
-    store
-        Where results are kept as they come. Items it already has are not run again; failed ones are.
-    progress
-        Called with (done, total) once at the start and after each item.
-
-    Raises
-    ------
-    BadDataError
-        When two items have the same key.
-    BatchInterrupted
-        On Ctrl-C, with the outcomes so far.
+    The function must be importable by name in another process, an item picklable, with the seed it needs and a unique
+    key. Without an executor the items are run here, one by one. Items that the store already has are not run again;
+    failed ones are. `progress` is called with (done, total) once at the start and after each item.
     """
     work = dict(_named(items, key))
     kept = {} if store is None else store.values

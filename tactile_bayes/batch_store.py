@@ -56,21 +56,7 @@ class StoredValues(Mapping[str, Any]):
 class BatchStore:
     """Results on disk; open it with `open_store`. A line half written when the program was killed is dropped.
 
-    Parameters
-    ----------
-    descriptor
-        Of the open, locked file.
-    path
-        For messages.
-    encode, decode
-        To and from what JSON can hold.
-    read_only
-        The file is left as it is.
-
-    Attributes
-    ----------
-    values
-        Results by the names of their items.
+    `descriptor` is of the open, locked file, `values` holds results by the names of their items.
     """
 
     def __init__(
@@ -154,21 +140,10 @@ def open_store(
 ) -> Iterator[BatchStore]:
     """Open or create a store, readable by its owner only and locked against a second run.
 
-    Parameters
-    ----------
-    settings
-        All that the results depend on besides the items' keys (options, seed, digests of inputs), as plain data.
-    encode, decode
-        How a result becomes plain data, and back. JSON keeps floats exactly; tuples come back as lists.
-    read_only
-        Look at a store that exists, and leave it as it is: it may be another's, or on a disk that takes nothing.
-
-    Raises
-    ------
-    UsageError
-        When the store was made with other settings, is in use or cannot be opened.
-    BadDataError
-        When the file is something else, or a line in its middle is damaged.
+    `settings` are all that the results depend on besides the items' keys (options, seed, digests of inputs), as plain
+    data; a store of other settings, or one in use, is a `UsageError`, another file or a damaged line in its middle a
+    `BadDataError`. JSON keeps floats exactly; tuples come back as lists. A store that is read only is left as it is: it
+    may be another's, or on a disk that takes nothing.
     """
     access = os.O_RDONLY if read_only else os.O_RDWR | os.O_CREAT | os.O_APPEND
     try:

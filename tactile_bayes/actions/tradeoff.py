@@ -49,13 +49,7 @@ TIMES = 2
 
 
 def fresh_cpu_s(words: Sequence[str]) -> float | None:
-    """Least CPU seconds of a command in a fresh process; None where the system does not tell them.
-
-    Parameters
-    ----------
-    words
-        Of the command, without the program's name.
-    """
+    """Least CPU seconds of a command in a fresh process; None where the system does not tell them."""
     spent = []
     for _ in range(TIMES):
         before = os.times()

@@ -23,15 +23,7 @@ if TYPE_CHECKING:
 
 
 def tradeoff_of_map(path: Path, settings: Settings, work: Work) -> tuple[TactileMap, Ladder]:
-    """Every setting of `estimate` on a map that need not be built again; the map too.
-
-    Raises
-    ------
-    BadDataError
-        When the file is no map, or the calibration that was named does not fit it.
-    UsageError
-        When the settings name a checkpoint: the runs are many.
-    """
+    """Every setting of `estimate` on a map that need not be built again; the map too."""
     from tactile_bayes.studies.estimate_tradeoff import measure
 
     _refuse_checkpoint(settings)
@@ -44,15 +36,7 @@ def tradeoff_of_map(path: Path, settings: Settings, work: Work) -> tuple[Tactile
 
 
 def pooled_rows(paths: Sequence[Path], settings: Settings, *, clock: Clock) -> tuple[PooledRow, ...]:
-    """The size by the first map of one mass, by the first two, and so on.
-
-    Raises
-    ------
-    BadDataError
-        When a file is no map, or the maps were normalised in several ways.
-    UsageError
-        When the calibration cannot pool maps.
-    """
+    """The size by the first map of one mass, by the first two, and so on."""
     from tactile_bayes.studies.estimate_tradeoff import PooledRow
 
     def at_place(i: int, place: tuple[float, float]) -> Answer:
@@ -87,15 +71,7 @@ def _pooled_answer(pooled: PooledEstimate, settings: Settings) -> tuple[SizeAnsw
 
 
 def tradeoff_of_scan(scan: Scan, settings: Settings, work: Work) -> Ladder:
-    """Every setting of `map` on a scan, each with an estimate by default of the map that it makes.
-
-    Raises
-    ------
-    BadDataError
-        When no map can be built by default.
-    UsageError
-        When the settings name a checkpoint: the runs are many.
-    """
+    """Every setting of `map` on a scan, each with an estimate by default of the map that it makes."""
     from tactile_bayes.studies.tradeoffs import measure_map as measure
 
     _refuse_checkpoint(settings)

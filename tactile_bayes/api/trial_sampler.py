@@ -24,17 +24,8 @@ def draw(
 ) -> ParameterDraws:
     """Draw from a log density.
 
-    Parameters
-    ----------
-    log_density
-        Vectorised: (m, p) to (m,).
-    centre, covariance : (p,), (p, p) arrays
-        Guess of the mode and of the covariance about it.
-
-    Raises
-    ------
-    NotConvergedError
-        When MCMC, too, does not reach its criteria.
+    The density takes (m, p) arrays to (m,); `centre` and `covariance` guess the mode and the covariance about it. Where
+    MCMC, too, does not reach its criteria, `NotConvergedError` says so.
     """
     from tactile_bayes.inference.ensemble import ensemble
 

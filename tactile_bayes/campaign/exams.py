@@ -33,13 +33,7 @@ class Said(Record):
 
 
 def said_by(path: Path, name: str) -> Said:
-    """What a scan, arrays of a scan or a map say of the exam.
-
-    Raises
-    ------
-    BadDataError
-        When the table takes no such name, or the file is none of these.
-    """
+    """What a scan, arrays of a scan or a map say of the exam."""
     check_name(name)
     if name.lower().endswith(".npz"):
         return Said()
@@ -83,26 +77,9 @@ _ASIDE: Final = (".", "~$")
 class FolderFiles:
     """Files of a folder of this computer and of those below it.
 
-    Parameters
-    ----------
-    folder
-        Folders in it that a campaign wrote are passed over.
-    table
-        Where the table of exams will be: names are paths from its folder.
-
-    Attributes
-    ----------
-    paths
-        By name, of files that may be exams, in a fixed order.
-    others
-        How many other files there are, by the ends of their names.
-    closed
-        Folders in it that cannot be read, with the reason.
-
-    Raises
-    ------
-    UsageError
-        When the folder is none or cannot be read, or the table would lie outside it and not above it.
+    Folders that a campaign wrote are passed over, and names are paths from the table's folder, which must hold the
+    folder (else a `UsageError`). `paths` are of files that may be exams, in a fixed order; `others` counts the other
+    files by the ends of their names; `closed` names folders that cannot be read, with the reason.
     """
 
     def __init__(self, folder: Path, table: Path) -> None:
@@ -129,13 +106,6 @@ class FolderFiles:
 
         Of files of the same bytes the one that is listed stays, else that of the shortest name. Of a scan and its map,
         and of a scan and the arrays that it was imported from, the scan stays, unless the other is listed.
-
-        Parameters
-        ----------
-        said
-            By name, of the files that can be read.
-        listed
-            Names that the table of exams has already.
         """
         found: dict[str, str] = {}
         for names in self._alike(said):
@@ -220,19 +190,8 @@ class Found(Record):
 def find_exams(folder: Path | str, table: Path, *, listed: Sequence[Mapping[str, str]] = ()) -> Found:
     """Look through a folder and those below it for scans (.mcap), arrays of scans (.npz) and maps (.nc).
 
-    Parameters
-    ----------
-    folder
-        Of this computer, or the address of one in an object store, whose maps are passed over.
-    table
-        Where the table is or will be: paths are written from its folder.
-    listed
-        Rows that the table has already.
-
-    Raises
-    ------
-    UsageError
-        When the folder is none or cannot be read, or the table would lie outside it and not above it.
+    The folder may be an address in an object store, whose maps are passed over. `listed` are rows that the table has
+    already; paths are written from the table's folder.
     """
     known = {_normal(row["file"]): row for row in listed}
     found = _stored(folder, known) if isinstance(folder, str) else _local(folder, table, known)

@@ -36,10 +36,7 @@ _OTHERS: Final = ("pool", "compare", *_BESIDE)
 def open_campaign(folder: Path, *, dry: bool = False) -> Iterator[BatchStore | None]:
     """Open the journal of a folder, which is made if need be; for a dry run read it only, None where there is none.
 
-    Raises
-    ------
-    UsageError
-        When the folder holds something else, another run is using it, or it cannot be made or read.
+    A folder of something else, one that another run is using, or one that cannot be made or read is a `UsageError`.
     """
     journal = folder / JOURNAL
     try:
@@ -119,14 +116,7 @@ def tidy(
 ) -> list[str]:
     """Remove files of earlier runs that this one would not make, and name the folders of exams no longer listed.
 
-    Parameters
-    ----------
-    folder
-        Of the campaign.
-    results
-        By step, then by the name of the exam or mass.
-    unread
-        Exams whose file could not be read: a disk that is away costs nothing that is done.
+    `unread` are exams whose file could not be read: a disk that is away costs nothing that is done.
     """
     left = []
     spared = {*unread, *(name for exam in exams if exam.name in unread for name in (exam.of_mass, exam.of_visits))}
@@ -209,15 +199,8 @@ def read_sources(
 ) -> Sources:
     """Digest of every exam's file, from the journal where the file is as it was then.
 
-    Parameters
-    ----------
-    keep
-        Whether new digests go into the journal. Without, files in object stores that are not known are passed over.
-
-    Raises
-    ------
-    TactileBayesError
-        When the cluster was lost.
+    New digests go into the journal (`keep`), or else files in object stores that are not known are passed over. A lost
+    cluster is a `TactileBayesError`.
     """
     settled, fresh = _sorted_out({exam.path: exam for exam in exams})
     values: Mapping[str, Any] = {} if store is None else store.values
@@ -273,12 +256,7 @@ def _read(source: _Source) -> dict[str, Any]:
 class Alike:
     """Exams that share what only masses of one scan may share, told as they come.
 
-    Parameters
-    ----------
-    breasts
-        Of all exams.
-    what
-        What is shared, for people: ``"bytes"`` or ``"recording"``.
+    `what` is shared, for people: ``"bytes"`` or ``"recording"``.
     """
 
     def __init__(self, breasts: Breasts, what: str) -> None:

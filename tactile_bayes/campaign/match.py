@@ -90,10 +90,7 @@ def matched_outcome(
 
     Without a mass there the estimate is of the place, and says why it has no size.
 
-    Raises
-    ------
-    BadDataError
-        When several masses of the map may be the one, or its place lies off the map.
+    At fault (`BadDataError`) are several masses of the map that may be the one, and a place off the map.
     """
     outcome = estimate_file(path, settings)
     tactile_map, masses = outcome.tactile_map, outcome.estimate.masses
@@ -177,10 +174,7 @@ def _on_map(tactile_map: TactileMap, place: tuple[float, float]) -> bool:
 def unnamed(documents: Sequence[Mapping[str, Any]]) -> list[Finding]:
     """Masses of one scan that no row names.
 
-    Parameters
-    ----------
-    documents
-        The estimates of all rows of the scan.
+    `documents` are the estimates of all rows of the scan.
     """
     centres = [one["centre_mm"] for document in documents for one in document["masses"] if one["reported"]]
     found: list[Mapping[str, float]] = []

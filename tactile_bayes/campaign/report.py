@@ -97,15 +97,7 @@ class Written(Record):
 
 
 def write_outputs(campaign: Campaign, excision: Excision | None, protocol: Path | None = None) -> Written:
-    """Write tables, contact sheet and, where excision sizes are given, the trial's report.
-
-    Raises
-    ------
-    UsageError
-        When the disk does not take a file; what is done is kept.
-    BadDataError
-        When the table of excision sizes or the protocol is at fault.
-    """
+    """Write tables, contact sheet and, where excision sizes are given, the trial's report."""
     rows = exam_rows(campaign)
     masses = None if excision is None else excision.masses()
     write_tables(campaign, rows, masses, campaign.folder)
@@ -144,13 +136,7 @@ def write_outputs(campaign: Campaign, excision: Excision | None, protocol: Path 
 
 
 def copy_outputs(folder: Path, address: str) -> None:
-    """Copy what lies beside the exams into the object store, and last the journal: with it the copy is whole.
-
-    Raises
-    ------
-    UsageError
-        When the store does not take it; what is done is kept.
-    """
+    """Copy what lies beside the exams into the object store, and last the journal: with it the copy is whole."""
     for name in (*WRITTEN, JOURNAL):
         if (folder / name).exists():
             put(folder / name, f"{address}/{name}")
@@ -160,13 +146,6 @@ def check_inputs(exams: Sequence[Exam], excision: Excision | None, protocol: Pat
     """Read the table of excision sizes and the protocol, so that a fault in them costs no work.
 
     Codes of patients and masses must be spelled as those of the exams; other patients and masses may be there.
-
-    Raises
-    ------
-    UsageError
-        When there is a protocol and no table of excision sizes.
-    BadDataError
-        Naming the file, the line or key, and the way out.
     """
     if protocol is not None and excision is None:
         raise UsageError("--protocol is for the trial's report; give --excision too")

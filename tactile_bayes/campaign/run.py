@@ -50,35 +50,8 @@ _AHEAD_IN_BLOCK: Final = 8
 class Campaign:
     """A run, or the plan of one.
 
-    Parameters
-    ----------
-    exams
-        As `read_manifest` gives them.
-    folder
-        Of the output.
-    settings
-        Of all exams.
-    store
-        From `open_campaign`.
-    executor
-        As `run_batch`'s.
-    dry
-        Plan only: nothing is run and nothing written.
-    bar
-        Gives, for what is counted ("files read", "steps"), a context with a callback for those done and those needed.
-
-    Attributes
-    ----------
-    found
-        Results, faults and counts, filled by `run`.
-    not_pooled, not_compared
-        Why no mass is pooled, or compared between visits; empty where masses are, or none has several visits.
-    repeatability
-        Learned from the repeats; None where it was not.
-    not_learned
-        Why it was not, where masses have repeats; empty otherwise.
-    unread
-        Names of the exams whose file could not be read.
+    A plan (`dry`) runs and writes nothing. `bar` gives, for what is counted ("files read", "steps"), a context with a
+    callback for those done and those needed.
     """
 
     def __init__(
@@ -95,10 +68,13 @@ class Campaign:
         self.exams, self.folder, self.settings = exams, folder, settings
         self._stages = Stages(store=store, executor=executor, dry=dry)
         self.found: CampaignState = self._stages.found
-        self.not_pooled, self.not_compared = "", ""
-        self.unread: set[str] = set()
-        self.repeatability: Repeatability | None = None
-        self.not_learned = ""
+        self.not_pooled, self.not_compared = (
+            "",
+            "",
+        )  # why no mass is; empty where masses are, or none has several visits
+        self.unread: set[str] = set()  # names of the exams whose file could not be read
+        self.repeatability: Repeatability | None = None  # learned from the repeats
+        self.not_learned = ""  # why it was not, where masses have repeats
         self._sizes_unknown = False
         self._store, self._executor, self._dry = store, executor, dry
         self._bar: Bar = _no_bar if bar is None else bar
@@ -112,14 +88,8 @@ class Campaign:
     def run(self) -> CampaignState:
         """Run what is missing: maps, estimates and figures by blocks, repeatability, sizes by it, pools, growth.
 
-        Raises
-        ------
-        UsageError
-            When the disk does not take a result; all that is done is kept.
-        TactileBayesError
-            When the cluster was lost; all that is done is kept.
-        BatchInterrupted
-            On Ctrl-C; what is done is kept.
+        Where the disk does not take a result (`UsageError`), the cluster is lost (`TactileBayesError`) or on Ctrl-C
+        (`BatchInterrupted`), all that is done is kept.
         """
         self._read_sources()
         sound = [exam for exam in self.exams if exam.name not in self.found.faults]

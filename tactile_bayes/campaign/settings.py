@@ -79,21 +79,8 @@ Writes = dict[str, Callable[[Path], object]]
 def write_staged(folder: Path, writes: Writes, *, step: str, digest: str, names: Collection[str]) -> dict[str, Any]:
     """Write a step's files beside their place; returns their digests and where they are.
 
-    Parameters
-    ----------
-    folder
-        Where the files belong.
-    writes
-        How to write each file, by its name.
-    digest
-        Of all that the step's files depend on: equal files have equal folders.
-    names
-        Of all files that the step may write; those of earlier runs are removed when the others are put in place.
-
-    Raises
-    ------
-    UsageError, OSError
-        When the disk does not take a file.
+    `digest` is of all that the step's files depend on: equal files have equal folders. `names` are of all files that
+    the step may write; those of earlier runs are removed when the others are put in place.
     """
     staged = folder / f"{_PREFIX}{step}-{digest[:_DIGITS]}"
     try:
@@ -109,13 +96,7 @@ def write_staged(folder: Path, writes: Writes, *, step: str, digest: str, names:
 
 
 def put_in_place(result: Mapping[str, Any]) -> dict[str, Any]:
-    """Move the files of a result to their place, and remove those of earlier runs; returns it with their stamps.
-
-    Raises
-    ------
-    OSError
-        When a file cannot be moved.
-    """
+    """Move the files of a result to their place, and remove those of earlier runs; returns it with their stamps."""
     if STAGED not in result:
         return dict(result)
     staged = Path(result[STAGED]["folder"])

@@ -48,23 +48,8 @@ class CampaignState(Record, eq=False):
 class Stages:
     """Runs steps, or plans them.
 
-    Parameters
-    ----------
-    store
-        From `open_campaign`.
-    executor
-        As `run_batch`'s.
-    dry
-        Plan only.
-
-    Attributes
-    ----------
-    found
-        Filled as steps are run.
-    needed
-        By step, how many are still to be run or found done, as far as is known.
-    tell
-        Called with the steps of this run that are done, and those it does altogether.
+    `needed` counts by step how many are still to be run or found done, as far as is known; `tell` is called with the
+    steps of this run that are done, and those it does altogether.
     """
 
     def __init__(
@@ -85,10 +70,7 @@ class Stages:
     def run(self, step: str, tasks: Sequence[Task], *, without: int = 0) -> None:
         """Run one step for those that need it.
 
-        Parameters
-        ----------
-        without
-            How many more have no inputs: in a plan they will need the step, in a run they failed before it.
+        `without` is how many more have no inputs: in a plan they will need the step, in a run they failed before it.
         """
         kept = self._kept(tasks)
         for task in kept:
@@ -141,12 +123,8 @@ def steps_needed(
 ) -> dict[str, int]:
     """Steps that so many exams and masses take, done or not.
 
-    Parameters
-    ----------
-    masses, compared
-        To be pooled, and to be compared between visits.
-    learns
-        Whether the repeats may teach the spread between exams; then every exam gets its size by it.
+    `masses` are to be pooled, `compared` between visits; where the repeats may teach the spread between exams
+    (`learns`), every exam gets its size by it.
     """
     needed = {"map": exams, "estimate": exams, "figures": exams * settings.figures, "pool": masses, "compare": compared}
     needed |= {"repeatability": 1, "size": exams} if learns else {}

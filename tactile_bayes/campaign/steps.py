@@ -90,60 +90,43 @@ Result = dict[str, Any]
 
 
 class Task(Record):
-    """One step of one exam or mass.
-
-    Parameters
-    ----------
-    step
-        One of `RUN`.
-    name
-        Of the exam or mass.
-    folder
-        Of the exam or mass.
-    digest
-        Of all that the step's files depend on.
-    source, source_sha256, address
-        map: the exam's file; its address where it is in an object store.
-    expected
-        map: what the table says of the exam, by its columns.
-    normalise
-        map: as the option of `map`.
-    settings
-        estimate, figures, size, pool, compare: of the estimate.
-    mass, places, match_mm
-        estimate, figures: where other exams of the breast have the mass, see `campaign_match`; no places where the
-        exam is not matched.
-    members
-        pool: names and folders of the exams.
-    visits, days
-        compare: the same for each visit in order of time, and the visits' days from the first where they are known.
-    copies
-        copy: addresses in an object store, by the names of the files.
-    repeats
-        repeatability: the exams.
-    figures
-        size, compare: whether to draw it.
-    """
+    """One step of one exam or mass."""
 
     step: str
+    """One of `RUN`."""
     name: str
     folder: Path
+    """`name`, `folder`: Of the exam or mass."""
     digest: str
+    """Of all that the step's files depend on."""
     source: Path = Path()
     source_sha256: str = ""
+    """`source`, `source_sha256`: Of a map: the exam's file."""
     expected: Mapping[str, str] = field(default_factory=dict)
+    """Of a map: what the table says of the exam, by its columns."""
     normalise: str = ""
+    """Of a map: as the option of `map`."""
     settings: Settings | None = None
+    """Of all steps after the map: of the estimate."""
     mass: str = ""
     places: tuple[NamedPlace, ...] = ()
     match_mm: float = 0.0
+    """`mass`, `places`, `match_mm`: Of estimates and figures: where other exams of the breast have the mass; no places
+    where the exam is not matched.
+    """
     members: tuple[tuple[str, Path], ...] = ()
+    """Of a pooled mass: names and folders of the exams."""
     visits: tuple[tuple[tuple[str, Path], ...], ...] = ()
     days: tuple[float, ...] | None = None
+    """`visits`, `days`: Of a comparison: the exams of each visit in order of time, and its day from the first."""
     address: str = ""
+    """Of a map: the exam's file in an object store."""
     copies: Mapping[str, str] = field(default_factory=dict)
+    """Of a copy: addresses in an object store, by the names of the files."""
     repeats: tuple[ExamFolder, ...] = ()
+    """Of the repeatability: the exams."""
     figures: bool = False
+    """Of sizes and comparisons: whether to draw them."""
 
     @property
     def key(self) -> str:
@@ -156,10 +139,7 @@ def run_step(task: Task) -> Result:
 
     `put_in_place` brings the files to their place: a worker that outlives its command must not.
 
-    Raises
-    ------
-    TactileBayesError
-        What is wrong with the exam, without a path.
+    What is wrong with the exam is a `TactileBayesError` without a path.
     """
     begun, begun_cpu = time.perf_counter(), time.thread_time()
     try:
@@ -251,18 +231,6 @@ def check_facts(expected: Mapping[str, str], facts: Mapping[str, str]) -> None:
     """Refuse a file that says it is of another exam than the table does.
 
     What either leaves out is not compared, nor are capitals: the table has no two codes that differ by these alone.
-
-    Parameters
-    ----------
-    expected
-        By the columns of the table of exams.
-    facts
-        By the keys of a scan's session.
-
-    Raises
-    ------
-    BadDataError
-        Naming both.
     """
     both = {ours: facts[theirs] for ours, theirs in _SAME.items() if facts.get(theirs) and expected.get(ours)}
     differs = [name for name, value in both.items() if value.casefold() != expected[name].casefold()]
@@ -414,14 +382,7 @@ RUN: Final[dict[str, Callable[[Task], tuple[Result, Writes]]]] = {
 def copy_tasks(folder: Path, names: Sequence[str], results: Sequence[Mapping[str, Result]], *, to: str) -> list[Task]:
     """Tasks that copy what steps made of exams or of masses, keyed by the files' digests and by where they go.
 
-    Parameters
-    ----------
-    folder
-        Holds a folder for each of the names.
-    results
-        Of each step, by name.
-    to
-        Address that gets a folder for each of the names.
+    The folder, and the address, hold a folder for each of the names.
     """
     tasks = []
     for name in names:

@@ -203,10 +203,7 @@ def failures_text(campaign: Campaign, rows: Sequence[Row]) -> str:
 def trial_text(campaign: Campaign, rows: Sequence[Row], masses: Collection[tuple[str, str]] | None) -> str:
     """``trial.csv``: every exam as a reading of ``tactile``, every pooled visit as one of ``tactile-pooled``.
 
-    Parameters
-    ----------
-    masses
-        Patients and masses with a size after excision: the others are left out. None takes all.
+    `masses` have a size after excision: the others are left out. None takes all.
     """
     taken = [row for row in rows if masses is None or (row.exam.patient, row.exam.mass) in masses]
     count: dict[tuple[str, str], int] = {}

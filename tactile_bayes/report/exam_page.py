@@ -61,14 +61,7 @@ class PageFiles(Record):
     """Overwrite them."""
 
     def check(self) -> None:
-        """Refuse, before any work is done, what could not be written.
-
-        Raises
-        ------
-        UsageError
-            When a file exists and `force` is false, both are one file, one has the suffix of another format, or nothing
-            is installed that prints.
-        """
+        """Refuse, before any work is done, what could not be written."""
         check_suffix(self.html, "HTML")
         refuse_existing(self.html, force=self.force)
         if self.pdf is not None:
@@ -79,13 +72,7 @@ class PageFiles(Record):
             find_printer()
 
     def write(self, exam: Exam) -> None:
-        """Write the page and its print: both of them, or none.
-
-        Raises
-        ------
-        UsageError
-            As of `check`, and when the page could not be printed.
-        """
+        """Write the page and its print: both of them, or none."""
         text = exam_page(exam)
         files = {self.html: text.encode()}
         if self.pdf is not None:
@@ -103,13 +90,7 @@ _TIMES: Final = re.compile(rb"/(CreationDate|ModDate) ?\(D:[0-9+Z'-]*\)")
 
 
 def find_printer() -> Printer:
-    """What prints a page here.
-
-    Raises
-    ------
-    UsageError
-        When neither Chromium nor WeasyPrint is installed.
-    """
+    """What prints a page here."""
     browser = next((found for name in BROWSERS if (found := shutil.which(name))), None)
     if browser is not None:
         return lambda text: _by_browser(browser, text)

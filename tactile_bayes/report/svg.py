@@ -72,10 +72,7 @@ _STEPS_MM: Final = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 def size_ruler(rows: Sequence[tuple[str, Quantity]]) -> str:
     """A bar for each interval with its median, the first the thickest, above a scale from 0 mm.
 
-    Parameters
-    ----------
-    rows
-        What an interval supposes, and the interval as the estimate's JSON has it.
+    A row is what an interval supposes, and the interval.
     """
     end = max(q["high"] for _, q in rows) * 1.08
     bottom = _ROW_MM * len(rows) + 1.5
@@ -149,10 +146,7 @@ _THUMB_LEAST_SPAN: Final = 0.2
 def thumbnail_png(tactile_map: TactileMap, document: Mapping[str, Any]) -> bytes | None:
     """PNG of a map of up to `LONGEST_PX` pixels a side, oriented as every picture of a map; None without data.
 
-    Parameters
-    ----------
-    document
-        The estimate's JSON object: where it has a size, an ellipse of that size is drawn.
+    Where the estimate has a size, an ellipse of that size is drawn.
     """
     if not tactile_map.covered.any():
         return None
@@ -276,12 +270,7 @@ def colour_limits(exam: ExamMap) -> tuple[float, float]:
 def exam_picture(exam: ExamMap, frame: Frame, *, label: str, small: bool = False) -> str:
     """Inline SVG of a map, one unit a mm on the page.
 
-    Parameters
-    ----------
-    label
-        What it shows, for those who cannot see it.
-    small
-        Only the values, the ellipse and the sides.
+    `label` is for those who cannot see it; a `small` one has only the values, the ellipse and the sides.
     """
     (width, height), margin = frame.size_mm, 0.5 if small else MARGIN_MM
     whole = f"{width + 2 * margin:.2f}", f"{height + 2 * margin:.2f}"
@@ -469,13 +458,7 @@ _SHADES: Final = ((10.0, "#ffffff"), (15.0, "#e0e0e0"), (20.0, "#bdbdbd"), (np.i
 
 
 def smallest_pictures(tactile_map: TactileMap, smallest: Mapping[str, Any]) -> Iterator[str]:
-    """One picture a depth, with its caption.
-
-    Parameters
-    ----------
-    smallest
-        As `SmallestLumps.as_dict` has it.
-    """
+    """One picture a depth, with its caption."""
     frame = Frame.within(tactile_map, width_mm=_ROOM_MM[0], height_mm=_ROOM_MM[1])
     for number, depth in enumerate(smallest["depths_mm"]):
         caption = f"{depth:g} mm deep"

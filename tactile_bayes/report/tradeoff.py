@@ -350,11 +350,6 @@ def draw_ladder(ladder: Ladder, path: Path, *, title: str, force: bool = False) 
     """Draw every setting as a point, with the frontier and the lines that say what matters.
 
     Without a reference there is no distance: then the probability of a lump is drawn.
-
-    Raises
-    ------
-    UsageError
-        When the file exists and `force` is false.
     """
     shown = [one for one in ladder.rows if math.isfinite(_height(one, ladder))]
     with figure_file(path, size_in=_SIZE_IN, force=force) as figure:

@@ -70,14 +70,7 @@ def figure_with_misses(
 ) -> Figure:
     r"""Weighted mean over masses, found and missed, with an interval over patients.
 
-    Parameters
-    ----------
-    statistic
-        The mean.
-    weight
-        (n,) weights of the mean.
-    missed
-        What the mean would be if every mass were missed.
+    `weight` gives the (n,) weights of the mean, `missed` what the mean would be if every mass were missed.
 
     Notes
     -----
@@ -105,10 +98,7 @@ def figure_with_misses(
 def share_interval(share: float, number: float, *, confidence: float) -> Ends:
     """Equal-tailed interval of a proportion with Jeffreys' prior; it contains the observed share (Brown et al. 2001).
 
-    Parameters
-    ----------
-    share, number
-        Share observed, and of how many trials, which need not be a whole number.
+    `number` of trials need not be a whole number.
     """
     tail, a, b = 0.5 * (1 - confidence), share * number + 0.5, (1 - share) * number + 0.5
     return min(share, float(betaincinv(a, b, tail))), max(share, float(betaincinv(a, b, 1 - tail)))
@@ -441,14 +431,7 @@ def holm(p_values: Sequence[float | None]) -> list[float | None]:
 def sign_flip(by_patient: FloatArray, *, seed: int, flips: int = FLIPS) -> float | None:
     """Two-sided p value of a sum of patients' differences, by a permutation test that flips their signs.
 
-    Parameters
-    ----------
-    by_patient : (g,) array
-        Sum over each patient's masses of the difference of absolute errors.
-    seed
-        Of the random patterns, when there are too many to try all.
-    flips
-        How many random patterns.
+    `by_patient` is the (g,) sum over each patient's masses of the difference of absolute errors.
 
     Notes
     -----

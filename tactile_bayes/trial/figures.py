@@ -46,25 +46,11 @@ def interval_from_values(
 ) -> tuple[float, float]:
     r"""Two-sided jackknife interval of a statistic from its values with one patient left out.
 
-    Parameters
-    ----------
-    value
-        The statistic on all patients.
-    values : (G,) array
-        The statistic without each patient.
-    scale
-        ``log`` works on the logarithm (figures above 0: the interval then stays above 0), ``linear`` on the figure,
-        ``fisher`` on the inverse hyperbolic tangent (coefficients between -1 and 1), ``slope`` as ``log`` where the
-        figure is above 0 with every patient left out, else as ``linear``.
-    confidence
-        Probability of the interval.
-    freedom
-        Degrees of freedom of Student's t where they are fewer than G - 1.
-
-    Raises
-    ------
-    UndefinedError
-        With fewer than `MIN_PATIENTS` patients, or where the leave-one-out values do not exist or do not differ.
+    `values` are the statistic without each of G patients, `freedom` the degrees of freedom of Student's t where they
+    are fewer than G - 1. ``log`` works on the logarithm (figures above 0: the interval then stays above 0), ``linear``
+    on the figure, ``fisher`` on the inverse hyperbolic tangent (coefficients between -1 and 1), ``slope`` as ``log``
+    where the figure is above 0 with every patient left out, else as ``linear``. With fewer than `MIN_PATIENTS`
+    patients, or where the values do not exist or do not differ, it is undefined.
 
     Notes
     -----
@@ -96,12 +82,7 @@ def interval_from_values(
 def effective_number(weights: npt.NDArray[np.float64], patient: npt.NDArray[np.int64]) -> float:
     r"""Effective number of patients, :math:`(\sum_g W_g)^2 / \sum_g W_g^2` (Satterthwaite 1946).
 
-    Parameters
-    ----------
-    weights : (n,) array
-        Of each mass, not below 0; 0 is returned where all are 0.
-    patient : (n,) array
-        Patient of each mass.
+    Masses have (n,) weights, not below 0; where all are 0 so is the number.
     """
     _, group = np.unique(patient, return_inverse=True)
     by_patient = np.bincount(group, weights=weights / max(float(weights.max(initial=0.0)), 1e-300))
@@ -192,16 +173,7 @@ def ratio(above: FloatArray, below: FloatArray) -> FloatArray:
 def clopper_pearson(k: float, n: float, *, confidence: float) -> tuple[float, float]:
     r"""Exact two-sided interval of a binomial proportion.
 
-    Parameters
-    ----------
-    k, n
-        Successes of trials, 0 <= k <= n, n > 0. Fractions are allowed, for effective numbers of trials.
-    confidence
-        Probability that the interval covers the proportion, at least.
-
-    Returns
-    -------
-    Low and high end, in [0, 1].
+    Fractions of successes and trials are allowed, for effective numbers of trials.
 
     Notes
     -----
@@ -227,13 +199,8 @@ _LEAST_DEFINED = 0.99
 class Intervals(float):
     """Probability of intervals together with their method; a plain number means the jackknife.
 
-    Parameters
-    ----------
-    confidence
-        Probability, two-sided.
-    method, resamples, seed
-        ``corrected`` is the jackknife with the corrections of record 0077; ``bca`` draws the patients
-        `resamples` times from this seed.
+    ``corrected`` is the jackknife with the corrections of record 0077; ``bca`` draws the patients `resamples` times
+    from this seed.
     """
 
     method: Method
@@ -373,17 +340,9 @@ def figure(
 ) -> Figure:
     """Compute a statistic of these masses, with an interval over patients when `scale` and `confidence` are given.
 
-    Parameters
-    ----------
-    statistic
-        Returns a number or raises `UndefinedError` with the reason. A `SumStatistic` is left out in one step.
-    scale
-        ``log`` for a figure above 0, ``linear`` for one of either sign.
-    confidence
-        Probability of the interval, two-sided; or `Intervals`, to choose how it is made.
-    leverage
-        (n,) weight of each mass in the variance of the figure. The corrected jackknife takes the effective number of
-        patients by these weights as its degrees of freedom (Bell & McCaffrey 2002, Survey Methodology 28, 169).
+    `leverage` gives the (n,) weight of each mass in the variance of the figure: the corrected jackknife takes the
+    effective number of patients by these weights as its degrees of freedom (Bell & McCaffrey 2002, Survey Methodology
+    28, 169).
     """
     if scale is None or confidence is None:
         return _plain(partial(finite, statistic, sizes))

@@ -148,21 +148,13 @@ class Limits(Record):
 def limits(differences: FloatArray, *, confidence: float = 0.95) -> Limits:
     r"""Limits of agreement of single readings, between which `SHARE` of the differences lie.
 
-    Parameters
-    ----------
-    differences : (n,) array
-        y - x of each mass.
+    Differences are y - x; fewer than two leave the limits undefined.
 
     Notes
     -----
     Bland & Altman (1986), Lancet i, 307: limits :math:`\bar d \mp z s`, their standard error
     :math:`s\sqrt{1/n + z^2/(2(n-1))}` for the approximate intervals. The exact ones are tolerance factors: Carkeet
     (2015), Optom. Vis. Sci. 92, e71.
-
-    Raises
-    ------
-    UndefinedError
-        With fewer than two differences.
     """
     n = len(differences)
     if n < 2:
@@ -194,10 +186,7 @@ def limits(differences: FloatArray, *, confidence: float = 0.95) -> Limits:
 def limits_unlinked(x: Sequence[FloatArray], y: Sequence[FloatArray], *, confidence: float = 0.95) -> Limits:
     r"""Limits for single readings from unpaired replicates of an unchanging true size.
 
-    Parameters
-    ----------
-    x, y
-        Replicates of each mass by the reference and by the method under test, one or more each.
+    Each mass has one or more replicates x by the reference and y by the method under test.
 
     Notes
     -----
@@ -240,10 +229,7 @@ def trend(differences: FloatArray, sizes: FloatArray, *, confidence: float = 0.9
 def errors_are_proportional(x: FloatArray, y: FloatArray) -> bool:
     r"""Whether normal ln y - ln x with one SD is likelier than normal y - x, by a factor of `LIKELIER`.
 
-    Parameters
-    ----------
-    x, y : (n,) arrays, above 0
-        Ex-vivo sizes and sizes; False for fewer than `LEAST_MASSES`.
+    False for fewer than `LEAST_MASSES` masses.
 
     Notes
     -----

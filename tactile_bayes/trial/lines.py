@@ -27,11 +27,7 @@ _EQUAL = 1e-12
 class PairAngles:
     """Ordered angles in (-pi/2, pi/2] of all pairs of points that do not coincide.
 
-    Parameters
-    ----------
-    x, y : (n,) arrays
-    vertical
-        The angle of a pair of equal x: pi/2 or -pi/2.
+    `vertical` is the angle of a pair of equal x: pi/2 or -pi/2.
     """
 
     def __init__(self, x: FloatArray, y: FloatArray, *, vertical: float) -> None:
@@ -185,11 +181,8 @@ def passing_bablok(
 ) -> PassingBablok:
     """Fit y on x without assuming a distribution or knowing which method errs more.
 
-    Parameters
-    ----------
-    x, y : (n,) arrays
-    measure
-        How two middle slopes are averaged.
+    Undefined with fewer than two different points, when the middle slope is vertical, or when so many slopes are beyond
+    45 degrees against the line that the shifted median lies beyond the last.
 
     Notes
     -----
@@ -197,12 +190,6 @@ def passing_bablok(
     falls. The intercept is the median of y - slope x. Slope ends are order statistics at the shifted median -+
     :math:`z\\sqrt{n(n-1)(2n+5)/18}/2`, intercept ends the medians for the two slope ends. When either slope end lies
     beyond the ordered slopes, both ends of both intervals are infinite.
-
-    Raises
-    ------
-    UndefinedError
-        With fewer than two different points, when the middle slope is vertical, or when so many slopes are beyond 45
-        degrees against the line that the shifted median lies beyond the last.
     """
     if len(x) < 2:
         raise UndefinedError(f"a line needs at least 2 masses (found {len(x)})")
@@ -292,10 +279,7 @@ class Line(Record):
 def least_squares(x: FloatArray, y: FloatArray, *, weights: FloatArray | None = None) -> Line:
     """Fit by least vertical squares, weighted when asked (1/x^2 for a constant relative error).
 
-    Raises
-    ------
-    UndefinedError
-        With fewer than two different x.
+    Undefined with fewer than two different x.
     """
     _need_pairs(x, 2)
     w = np.ones_like(x) if weights is None else weights
@@ -314,6 +298,8 @@ def least_squares(x: FloatArray, y: FloatArray, *, weights: FloatArray | None = 
 def deming(x: FloatArray, y: FloatArray, *, error_ratio: float = 1.0) -> Line:
     r"""Fit a Deming line: both methods err, each with a constant SD.
 
+    Undefined without spread, or where every direction fits equally well.
+
     Notes
     -----
     With sums of squares u, q of x, y and of products p, and the error ratio :math:`\lambda`,
@@ -322,11 +308,6 @@ def deming(x: FloatArray, y: FloatArray, *, error_ratio: float = 1.0) -> Line:
 
     Linnet (1990), Stat. Med. 9, 1463. The analytic standard error of the slope,
     :math:`b \sqrt{(1 - r^2)/r^2/(n - 2)}`, is that of Strike (1991), Statistical Methods in Laboratory Medicine.
-
-    Raises
-    ------
-    UndefinedError
-        Without spread, or where every direction fits equally well.
     """
     _need_ratio(error_ratio)
     _need_pairs(x, 2)
@@ -350,22 +331,13 @@ def weighted_deming(
 ) -> Line:
     r"""Fit a Deming line whose errors grow in proportion to size: weights 1 over the squared fitted size.
 
-    Parameters
-    ----------
-    x, y : (n,) arrays, above 0
-    max_iterations, threshold
-        Iterate from the unweighted line until intercept and slope both change by less than `threshold`, in their own
-        units, or for so many rounds; the last round counts either way.
+    Iterated from the unweighted line until intercept and slope both change by less than `threshold`, in their own
+    units, or for `max_iterations`; undefined when a size is not above 0.
 
     Notes
     -----
     The fitted size is the mean of the two coordinates of the foot, :math:`(\hat x + \lambda \hat y) / (1 + \lambda)`:
     Linnet (1990), and (1993) Clin. Chem. 39, 424. There is no analytic standard error; the jackknife is customary.
-
-    Raises
-    ------
-    UndefinedError
-        When a size is not above 0.
     """
     if not (np.all(x > 0) and np.all(y > 0)):
         raise UndefinedError("weights by size need every size above 0")
@@ -399,10 +371,7 @@ def jackknife_errors(
 def deming_slope(u: float, q: float, p: float, error_ratio: float) -> float:
     """Deming's slope from sums of squares and products of x and y, by the formula without cancellation.
 
-    Raises
-    ------
-    UndefinedError
-        Where the products are 0 up to rounding and y varies at least as much as x, so that the line is vertical.
+    Undefined where the products are 0 up to rounding and y varies at least as much as x, so that the line is vertical.
     """
     if abs(p) <= EQUAL * math.sqrt(u * q):
         p = 0.0
@@ -485,17 +454,14 @@ class Concordance(Record):
 def concordance(x: FloatArray, y: FloatArray, *, confidence: float = 0.95) -> Concordance:
     r"""Concordance of y with x, as if the pairs were independent.
 
+    Undefined when x or y does not vary.
+
     Notes
     -----
     .. math:: \rho_c = \frac{2 s_{xy}}{s_x^2 + s_y^2 + (\bar y - \bar x)^2}
 
     with divisor n throughout: Lin (1989), Biometrics 45, 255; the variance as corrected in Lin (2000), Biometrics 56,
     324, with n - 2.
-
-    Raises
-    ------
-    UndefinedError
-        When x or y does not vary.
     """
     n = len(x)
     if n < 2 or all_equal(x) or all_equal(y):

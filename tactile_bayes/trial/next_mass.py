@@ -117,12 +117,7 @@ class NextMass(Record):
 def next_mass(trial: Trial, *, sample: Sampler, rng: np.random.Generator, probability: float = 0.95) -> NextMass:
     """Fit the model to each modality and compare them.
 
-    Parameters
-    ----------
-    sample
-        Draws from a log density; importance sampling or MCMC in the program.
-    probability
-        Of the equal-tailed intervals.
+    `sample` draws from a log density: by importance sampling or MCMC in the program.
 
     Notes
     -----
@@ -214,12 +209,7 @@ def _fit(
 class LogModel:
     """Likelihood and prior of one modality; masses with equal numbers of replicates need only their means.
 
-    Parameters
-    ----------
-    found
-        The detected masses.
-    caliper
-        (n,) relative SD of each ex-vivo size.
+    `found` are the detected masses, `caliper` the (n,) relative SD of each ex-vivo size.
     """
 
     def __init__(self, found: ModalitySizes, caliper: FloatArray) -> None:
@@ -277,11 +267,8 @@ class LogModel:
 def variances(theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Variances of ln size: between patients, between masses of a patient, between readings of a mass.
 
-    Parameters
-    ----------
-    theta : (m, 5) array
-        Bias, slope, logarithm of the total SD, logit of the share of the total variance that single readings have,
-        logit of the patients' share of the rest.
+    `theta` has (m, 5) rows: bias, slope, logarithm of the total SD, logit of the share of the total variance that
+    single readings have, logit of the patients' share of the rest.
     """
     total2 = _total_variance(theta[:, 2])
     # at least 1e-12 of the variance is the readings' own, so that no logarithm of 0 is taken
@@ -293,12 +280,8 @@ def variances(theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
 def log_prior(theta: FloatArray, *, spread: float, caliper: float) -> FloatArray:
     r"""(m,) unnormalised log prior, with the Jacobians of logarithms and logits.
 
-    Parameters
-    ----------
-    theta : (m, 5) array
-        See `variances`.
-    spread, caliper
-        SD of ln ex-vivo size over the masses, and root mean square of the calipers' relative SDs.
+    For `theta` see `variances`. `spread` is the SD of ln ex-vivo size over the masses, `caliper` the root mean square
+    of the calipers' relative SDs.
 
     Notes
     -----

@@ -86,16 +86,8 @@ def check_intervals(
 ) -> IntervalCheck | None:
     """Count how often intervals of the percent error, by the method in `confidence`, cover the true one.
 
-    Parameters
-    ----------
-    sizes
-        Gives the patients and the ex-vivo sizes, which stay as they are.
-    model
-        Of the errors; `observed_errors` gives those of the trial.
-
-    Returns
-    -------
-    None below `MIN_PATIENTS` patients, where no intervals are given.
+    Patients and ex-vivo sizes stay as they are; `observed_errors` gives the model of a trial. None below `MIN_PATIENTS`
+    patients, where no intervals are given.
     """
     if len(sizes.patients) < MIN_PATIENTS:
         return None
@@ -307,15 +299,9 @@ def assumptions_from(
 ) -> dict[str, float] | None:
     """Errors of a pilot trial: bias, SDs between and within masses, share missed.
 
-    Parameters
-    ----------
-    map_sd
-        SD of ln size of single maps; estimated from the pilot's replicates when not given.
-
-    Returns
-    -------
-    None when a modality found fewer than 3 masses; without ``map_sd`` and ``mass_sd`` when the pilot has no replicates
-    and none is given, for then the two cannot be told apart.
+    `map_sd` of single maps is estimated from the pilot's replicates when not given. None when a modality found fewer
+    than 3 masses; without ``map_sd`` and ``mass_sd`` when the pilot has no replicates and none is given, for then the
+    two cannot be told apart.
     """
     mine, theirs = observed_errors(tactile), observed_errors(other)
     if mine is None or theirs is None:

@@ -149,18 +149,9 @@ class ModalitySizes(Record, eq=False):
 def readings_from_columns(columns: Mapping[str, Sequence[Any]], *, fault: CellFault) -> list[Reading]:
     """Make readings from a trial table's columns, checking rules between the cells of a row.
 
-    Parameters
-    ----------
-    columns
-        As ``data_schema/trial.table.json`` names and types them.
-    fault
-        Makes the error for a cell, from the row's index, its column and what is wrong.
-
-    Raises
-    ------
-    BadDataError
-        A size without detection or detection without a size; an interval that is incomplete, upside down, does not
-        contain the reading's own size, or is stated for a mass that was not found.
+    Columns are as ``data_schema/trial.table.json`` names and types them; `fault` makes the error for a cell. At fault
+    is a size without detection or detection without a size, and an interval that is incomplete, upside down, does not
+    contain the reading's own size, or is stated for a mass that was not found.
     """
     names = ("patient", "mass", "modality", "replicate", "status", "size_mm", "low_mm", "high_mm", "probability")
     readings = []
@@ -224,12 +215,7 @@ def _interval(
 def gather(readings: Iterable[Reading], ex_vivo_mm: Mapping[MassKey, float]) -> dict[str, ModalitySizes]:
     """Each modality's sizes, masses averaged over their detected replicates first; tactile leads, then by name.
 
-    Parameters
-    ----------
-    readings
-        In any order; each mass must be in `ex_vivo_mm`.
-    ex_vivo_mm
-        Size after excision in mm, by patient and mass.
+    Readings come in any order; each mass must be in `ex_vivo_mm`.
     """
     with np.errstate(over="ignore"):  # a figure of an overflown mean is refused where it is formed
         return _gather(readings, ex_vivo_mm)
@@ -295,12 +281,7 @@ NEAR = 1.6
 def unit_doubts(sizes: Mapping[str, ModalitySizes], ex_vivo_mm: FloatArray) -> list[str]:
     """One sentence for each column that seems to be in another unit than mm; empty if none does.
 
-    Parameters
-    ----------
-    sizes
-        What each modality read.
-    ex_vivo_mm
-        (n,) array of all excised masses.
+    `ex_vivo_mm` is of all excised masses.
     """
     doubts = [] if (doubt := _outside("ex-vivo sizes", ex_vivo_mm)) is None else [doubt]
     for name, one in sizes.items():
@@ -393,10 +374,7 @@ class Trial(Record, eq=False):
 def in_order(visits: Mapping[str, date | None]) -> list[str] | None:
     """Codes of visits in order of time: by their dates, else by their numbers; None where neither gives an order.
 
-    Parameters
-    ----------
-    visits
-        Date of each visit, by its code. A code may itself be a date or end in a number, as in 2026-03-01, 2 or V2.
+    A code may itself be a date or end in a number, as in 2026-03-01, 2 or V2.
     """
     if len(visits) < 2:
         return list(visits)
@@ -433,18 +411,8 @@ def at_excision(
     Readings that name neither visit nor date stay. Without dates the visits are in order of their numbers, and the last
     one is taken to lie before excision.
 
-    Parameters
-    ----------
-    readings
-        In the order of the table's rows.
-    excised_on
-        Date of excision, by mass; None where it is not known.
-
-    Raises
-    ------
-    BadDataError
-        Naming the row: visits whose order is not known, an excision before every visit, a reading that does not say
-        of which of several visits it is.
+    Readings are in the order of the table's rows. At fault are visits whose order is not known, an excision before
+    every visit, and a reading that does not say of which of several visits it is.
     """
     by_mass: dict[MassKey, list[Row]] = defaultdict(list)
     for row in enumerate(readings):

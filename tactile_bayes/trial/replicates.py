@@ -66,11 +66,7 @@ class ReplicateFigures(Figures):
 def components(y: FloatArray, mass: Index, reader: Index) -> Components:
     """Estimate the variances by REML.
 
-    Parameters
-    ----------
-    y : (n,) array
-    mass, reader : (n,) arrays
-        Numbers from 0 without gaps.
+    Masses and readers are numbered from 0 without gaps.
 
     Notes
     -----
