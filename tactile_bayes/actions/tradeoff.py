@@ -7,7 +7,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -23,6 +23,7 @@ from tactile_bayes.errors import EXIT_DONE, EXIT_NO_ESTIMATE, BadDataError, Usag
 from tactile_bayes.files.atomic import given_twice, refuse_existing
 from tactile_bayes.files.documents import dump_json
 from tactile_bayes.files.provenance import Provenance, hash_inputs
+from tactile_bayes.files.scan_mcap import read_scan
 from tactile_bayes.files.scene_toml import read_scene
 from tactile_bayes.files.size_json import read_size_calibration, size_calibration_path
 from tactile_bayes.forward.scene import Scene
@@ -32,16 +33,21 @@ from tactile_bayes.report.laboratory import TradeoffReport, draw_tradeoff, trade
 from tactile_bayes.report.tradeoff import DIGITS, draw_ladder, ladder_file, ladder_text
 from tactile_bayes.studies.estimate_tradeoff import Work
 from tactile_bayes.studies.paper_solid import fit_raster
-from tactile_bayes.studies.tradeoffs import PLANE, SOLID, calibrated_rule, case_of, learned_rule, teach
-from tactile_bayes.studies.tradeoffs import measure_forward as measure
+from tactile_bayes.studies.tradeoffs import (
+    PLANE,
+    SOLID,
+    calibrated_rule,
+    case_of,
+    forward_settings,
+    learned_rule,
+    measure_forward,
+    teach,
+)
 
 if TYPE_CHECKING:
-    from tactile_bayes.report.laboratory import TradeoffReport
     from tactile_bayes.studies.estimate_tradeoff import Ladder
     from tactile_bayes.studies.tradeoffs import LumpCase, Measured, SizeRule
 
-
-# --- Options of the trade-offs, and the CPU time of a command in a process of its own.
 
 # --- CPU time of this program in a process of its own: what a user who types one command waits for.
 
@@ -139,19 +145,17 @@ def _case(path: Path | None, head: str | None) -> LumpCase:
 
 def run_tradeoff(case: LumpCase, calibration: str | None, *, tolerance: float, runs: int) -> TradeoffReport:
     """Learn Eq 6 or read the calibrations, then measure all settings."""
-    from tactile_bayes.studies.tradeoffs import forward_settings as settings_of
-
     # a raster's frames are divided by their means
     own = {PLANE: "plane-strain", SOLID: "solid-mean"}
     rules = {model: _rule(case, model, calibration or own[model]) for model in (PLANE, SOLID)}
     found: list[Measured] = []
-    settings = settings_of(case)
-    measure(case, settings[0], fit=fit_line, raster_fit=fit_raster, clock=time.process_time)  # imports cost nothing
-    measure(case, settings[-1], fit=fit_line, raster_fit=fit_raster, clock=time.process_time)
+    settings = forward_settings(case)
+    measure = partial(measure_forward, case, fit=fit_line, raster_fit=fit_raster, clock=time.process_time)
+    measure(settings[0])  # imports cost nothing afterwards
+    measure(settings[-1])
     with progress_bar("settings") as progress:
         for number, setting in enumerate(settings, start=1):
-            clock: Callable[[], float] = time.process_time
-            found.append(measure(case, setting, fit=fit_line, raster_fit=fit_raster, clock=clock, runs=runs))
+            found.append(measure(setting, runs=runs))
             progress(number, len(settings))
     return TradeoffReport(case, tuple(found), rules, tolerance)
 
@@ -236,8 +240,6 @@ def tradeoff_map_action(
     force: bool,
 ) -> None:
     """Measure what each setting of `map` costs on a scan, and how far it moves the size interval."""
-    from tactile_bayes.files.scan_mcap import read_scan
-
     if figure is not None:
         refuse_existing(figure, force=force)
     read_scan(scan)  # imports and first calls cost nothing afterwards

@@ -12,20 +12,20 @@ from tactile_bayes.api.settings import Settings
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.map_nc import read_map
+from tactile_bayes.studies.estimate_tradeoff import PooledRow, measure
+from tactile_bayes.studies.size_answers import SIZE, SizeAnswer
+from tactile_bayes.studies.tradeoffs import measure_map
 
 if TYPE_CHECKING:
     from tactile_bayes.mapping.map import TactileMap
     from tactile_bayes.posterior.options import EstimateOptions
     from tactile_bayes.scan import Scan
     from tactile_bayes.size.pooling import Calibration, PooledEstimate
-    from tactile_bayes.studies.estimate_tradeoff import Clock, Ladder, PooledRow, Work
-    from tactile_bayes.studies.size_answers import SizeAnswer
+    from tactile_bayes.studies.estimate_tradeoff import Clock, Ladder, Work
 
 
 def tradeoff_of_map(path: Path, settings: Settings, work: Work) -> tuple[TactileMap, Ladder]:
     """Every setting of `estimate` on a map that need not be built again; the map too."""
-    from tactile_bayes.studies.estimate_tradeoff import measure
-
     _refuse_checkpoint(settings)
     tactile_map = read_map(path)
     try:
@@ -37,7 +37,6 @@ def tradeoff_of_map(path: Path, settings: Settings, work: Work) -> tuple[Tactile
 
 def pooled_rows(paths: Sequence[Path], settings: Settings, *, clock: Clock) -> tuple[PooledRow, ...]:
     """The size by the first map of one mass, by the first two, and so on."""
-    from tactile_bayes.studies.estimate_tradeoff import PooledRow
 
     def at_place(i: int, place: tuple[float, float]) -> Answer:
         return answer_of(estimate_file(paths[i], replace(settings, centre_mm=place)))
@@ -58,8 +57,6 @@ def pooled_rows(paths: Sequence[Path], settings: Settings, *, clock: Clock) -> t
 
 def _pooled_answer(pooled: PooledEstimate, settings: Settings) -> tuple[SizeAnswer, float]:
     """The size of this exam, and half the width of the interval of another one."""
-    from tactile_bayes.studies.size_answers import SIZE, SizeAnswer
-
     if pooled.size is None:
         return SizeAnswer(pooled.reason), float("nan")
     found = {SIZE: pooled.size.summarise(SIZE, probability=settings.interval)}
@@ -72,15 +69,13 @@ def _pooled_answer(pooled: PooledEstimate, settings: Settings) -> tuple[SizeAnsw
 
 def tradeoff_of_scan(scan: Scan, settings: Settings, work: Work) -> Ladder:
     """Every setting of `map` on a scan, each with an estimate by default of the map that it makes."""
-    from tactile_bayes.studies.tradeoffs import measure_map as measure
-
     _refuse_checkpoint(settings)
 
     def inputs(tactile_map: TactileMap) -> tuple[Calibration | None, EstimateOptions]:
         calibration, options, _ = estimate_inputs(settings, tactile_map)
         return calibration, options
 
-    return measure(scan, inputs=inputs, work=_of(settings, work))
+    return measure_map(scan, inputs=inputs, work=_of(settings, work))
 
 
 def _of(settings: Settings, work: Work) -> Work:
