@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, Protocol, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
@@ -45,34 +45,31 @@ class Work(Record):
     """Of the intervals."""
 
 
-class Choice(Protocol):
-    """A setting to be tried: `axis`, `label`, `default` and `usable` as of `Priced`.
-
-    `weight` is about how many times the default's CPU time it takes, for a forecast.
-    """
-
-    @property
-    def axis(self) -> str: ...
-    @property
-    def label(self) -> str: ...
-    @property
-    def weight(self) -> float: ...
-    @property
-    def default(self) -> bool: ...
-    @property
-    def usable(self) -> bool: ...
+How = TypeVar("How")
 
 
-Chosen = TypeVar("Chosen", bound=Choice)
-
-
-class Priced(Record):
-    """One setting."""
+class Choice(Record, Generic[How]):
+    """A setting to be tried."""
 
     axis: str
     """What is varied."""
     label: str
     """The setting in a few words; an option of the command line where there is one."""
+    how: How
+    """Options of the estimate, or of the map."""
+    weight: float = 1.0
+    """About how many times the default's CPU time it takes, for a forecast."""
+    default: bool = False
+    """Whether this is what the program does by itself."""
+    usable: bool = True
+    """Whether a user can choose it to save or to spend time; other rows show what the answer depends on."""
+
+
+class Priced(Record):
+    """A setting with its cost and answers; `axis`, `label`, `default` and `usable` as of `Choice`."""
+
+    axis: str
+    label: str
     cpu_s: dict[str, float]
     """Least CPU time of the runs, each part by name ("map", "estimate"); their sum is the setting's cost."""
     answers: tuple[SizeAnswer, ...]
@@ -80,9 +77,7 @@ class Priced(Record):
     off: Deviation
     """From the reference."""
     default: bool = False
-    """Whether this is what the program does by itself."""
     usable: bool = True
-    """Whether a user can choose it to save or to spend time; other rows show what the answer depends on."""
 
     @property
     def seconds(self) -> float:
@@ -166,25 +161,8 @@ Run = Callable[[int], tuple[dict[str, float], SizeAnswer]]
 """From the number of the run, which seeds its random numbers, to CPU seconds by part, and the answer."""
 
 
-def priced(
-    axis: str,
-    label: str,
-    run: Run,
-    reference: Reference,
-    *,
-    runs: int,
-    default: bool = False,
-    usable: bool = True,
-) -> Priced:
-    """Run a setting, time it and compare its answers with the reference.
-
-    Parameters
-    ----------
-    runs
-        How often: once or twice only where that took `MOST_S`.
-    default, usable
-        As of `Priced`.
-    """
+def priced(one: Choice[Any], run: Run, reference: Reference, *, runs: int) -> Priced:
+    """Run a setting so often, or twice where that took `MOST_S`, and compare its answers with the reference."""
     spent: list[dict[str, float]] = []
     answers: list[SizeAnswer] = []
     for number in range(runs):
@@ -192,10 +170,10 @@ def priced(
         spent.append(seconds)
         answers.append(answer)
         # the first run also imports: a second one is worth its wait
-        if number >= 1 and sum(sum(one.values()) for one in spent) > MOST_S:
+        if number >= 1 and sum(sum(parts.values()) for parts in spent) > MOST_S:
             break
-    least = min(spent, key=lambda one: sum(one.values()))
-    return Priced(axis, label, least, tuple(answers), deviation(answers, reference.answer), default, usable)
+    least, off = min(spent, key=lambda parts: sum(parts.values())), deviation(answers, reference.answer)
+    return Priced(one.axis, one.label, least, tuple(answers), off, one.default, one.usable)
 
 
 def default_run(run: Run) -> tuple[float, SizeAnswer]:
@@ -206,25 +184,18 @@ def default_run(run: Run) -> tuple[float, SizeAnswer]:
 
 
 def climbed(
-    choices: Sequence[Chosen],
-    run_of: Callable[[Chosen], Run],
+    choices: Sequence[Choice[How]],
+    run_of: Callable[[How], Run],
     reference: Callable[[], Reference],
     *,
     default_s: float,
     work: Work,
 ) -> Ladder:
-    """Say how long it takes, make the reference and price every setting.
-
-    Parameters
-    ----------
-    default_s
-        CPU seconds of the default.
-    """
+    """Say how long it takes, by the CPU seconds of the default, make the reference and price every setting."""
     work.announce(default_s * (4.0 + work.runs * sum(one.weight for one in choices)))
     made, rows = reference(), []
     for number, one in enumerate(choices, start=1):
-        run = run_of(one)
-        rows.append(priced(one.axis, one.label, run, made, runs=work.runs, default=one.default, usable=one.usable))
+        rows.append(priced(one, run_of(one.how), made, runs=work.runs))
         if work.progress is not None:
             work.progress(number, len(choices))
     return Ladder(tuple(rows), made, work.tolerance_mm)
@@ -242,36 +213,13 @@ RADII_MM = (8.0, 12.0, 16.0, 20.0, 25.0, 30.0)
 METHOD, ACCURACY, FIELD, WINDOW = "method", "draws", "noise field", "fit window"
 
 
-class Setting(Record):
-    """One way to estimate.
-
-    Parameters
-    ----------
-    axis, label, default, usable
-        As of `Priced`.
-    options
-        Of the estimate.
-    weight
-        About how many times the default's CPU time it takes, for a forecast.
-    """
-
-    axis: str
-    label: str
-    options: EstimateOptions
-    weight: float = 1.0
-    default: bool = False
-    usable: bool = True
+Setting = Choice[EstimateOptions]
 
 
 def settings_of(options: EstimateOptions, *, level_known: bool) -> list[Setting]:
-    """Everything that is tried, the default first.
+    """Everything that is tried, the default, what `estimate` takes by itself for this map, first.
 
-    Parameters
-    ----------
-    options
-        What `estimate` takes by itself for this map.
-    level_known
-        Whether the map has a background that the paper's least squares can be fixed at.
+    `level_known` is whether the map has a background that the paper's least squares can be fixed at.
     """
     return [
         Setting(METHOD, f"--method {options.method}", options, default=True),
@@ -291,7 +239,7 @@ def worth_trying(settings: list[Setting], answer: SizeAnswer) -> list[Setting]:
     if answer.reported is None and answer.code != "method":
         kept = [one for one in settings if one.axis != ACCURACY]
         return [replace(one, weight=min(one.weight, 1.0)) if one.axis == METHOD else one for one in kept]
-    default = settings[0].options
+    default = settings[0].how
     if answer.method != "ensemble" or default.method == "ensemble":
         return settings
     return [settings[0], *map(_beside_chains, settings[1:])]
@@ -299,12 +247,10 @@ def worth_trying(settings: list[Setting], answer: SizeAnswer) -> list[Setting]:
 
 def _beside_chains(one: Setting) -> Setting:
     """A setting with a weight against chains; by laplace if it is another model."""
-    if one.options.method == "ensemble":
+    if one.how.method == "ensemble":
         return replace(one, weight=one.weight / 8.0)
     if one.axis in (FIELD, WINDOW):
-        return replace(
-            one, label=f"{one.label}, laplace", options=_by(one.options, "laplace"), weight=0.05 * one.weight
-        )
+        return replace(one, label=f"{one.label}, laplace", how=_by(one.how, "laplace"), weight=0.05 * one.weight)
     return replace(one, weight=0.2 * one.weight)
 
 
@@ -408,20 +354,8 @@ def fitted_as(calibration: Calibration | None, options: EstimateOptions) -> Cali
 def measure(
     tactile_map: TactileMap, *, calibration: Calibration | None, options: EstimateOptions, work: Work
 ) -> Ladder:
-    """Run every setting on one map.
-
-    Parameters
-    ----------
-    calibration, options
-        What `estimate` takes by itself for this map.
-    """
+    """Run every setting on one map, from the calibration and options that `estimate` takes by itself for it."""
     estimator = Estimator(tactile_map, calibration, work.seed, work.clock, work.probability)
     seconds, answer = default_run(estimator.run(options))
     settings = worth_trying(settings_of(options, level_known=tactile_map.background is not None), answer)
-    return climbed(
-        settings,
-        lambda one: estimator.run(one.options),
-        lambda: estimator.reference(options),
-        default_s=seconds,
-        work=work,
-    )
+    return climbed(settings, estimator.run, lambda: estimator.reference(options), default_s=seconds, work=work)

@@ -25,7 +25,16 @@ from tactile_bayes.size.bodies import BodyCalibration, mean_width_mm
 from tactile_bayes.size.eq6 import SizeCalibration
 from tactile_bayes.size.pooling import Calibration
 from tactile_bayes.size.terms import outside_domain
-from tactile_bayes.studies.estimate_tradeoff import Estimator, Ladder, Reference, Run, Work, climbed, default_run
+from tactile_bayes.studies.estimate_tradeoff import (
+    Choice,
+    Estimator,
+    Ladder,
+    Reference,
+    Run,
+    Work,
+    climbed,
+    default_run,
+)
 from tactile_bayes.studies.paper import (
     HARD_RATIO,
     Fit,
@@ -401,45 +410,30 @@ CELL, FRAMES, TIME, LEVEL = "cell size", "frames used", "time of strokes", "norm
 Inputs = Callable[[TactileMap], tuple[Calibration | None, EstimateOptions]]
 
 
-class MapSetting(Record):
-    """One way to build a map.
+class Built(Record):
+    """One way to build a map."""
 
-    Parameters
-    ----------
-    axis, label, default, usable
-        As of `Priced`.
-    options
-        Of `build_map`.
-    duration_s
-        Use the first so many seconds only; None uses all.
-    weight
-        About how many times the default's CPU time it takes, for a forecast.
-    """
-
-    axis: str
-    label: str
     options: dict[str, Any] = field(default_factory=dict)
+    """Of `build_map`."""
     duration_s: float | None = None
-    weight: float = 1.0
-    default: bool = False
-    usable: bool = True
+    """Use the first so many seconds only; None uses all."""
 
 
-def map_settings(scan: Scan) -> list[MapSetting]:
+def map_settings(scan: Scan) -> list[Choice[Built]]:
     """Everything that is tried, the default first."""
     time_s = scan.frames.time_s
     whole_s = float(time_s[-1] - time_s[0]) if len(time_s) else 0.0
     return [
-        MapSetting(CELL, f"--cell-mm {CELL_MM:g}", default=True),
-        *(MapSetting(CELL, f"--cell-mm {h:g}", {"cell_mm": h}, weight=0.5 + 0.5 / h**2) for h in CELLS_MM),
-        *(MapSetting(FRAMES, f"--every {n}", {"every": n}, weight=0.5 + 0.5 / n) for n in EVERY),
+        Choice(CELL, f"--cell-mm {CELL_MM:g}", Built(), default=True),
+        *(Choice(CELL, f"--cell-mm {h:g}", Built({"cell_mm": h}), 0.5 + 0.5 / h**2) for h in CELLS_MM),
+        *(Choice(FRAMES, f"--every {n}", Built({"every": n}), 0.5 + 0.5 / n) for n in EVERY),
         *(
-            MapSetting(TIME, f"the first {share * whole_s:.3g} s of {whole_s:.3g} s", {}, share * whole_s, usable=False)
-            for share in SHARES_OF_TIME
+            Choice(TIME, f"the first {s:.3g} s of {whole_s:.3g} s", Built(duration_s=s), usable=False)
+            for s in (share * whole_s for share in SHARES_OF_TIME)
             if whole_s > 0
         ),
         *(
-            MapSetting(LEVEL, f"--normalise {way}", {"normalise": way}, usable=False)
+            Choice(LEVEL, f"--normalise {way}", Built({"normalise": way}), usable=False)
             for way in NORMALISE
             if way != DEFAULT_NORMALISE
         ),
@@ -449,19 +443,12 @@ def map_settings(scan: Scan) -> list[MapSetting]:
 def measure_map(scan: Scan, *, inputs: Inputs, work: Work) -> Ladder:
     """Build and estimate the map of a scan at every setting.
 
-    Parameters
-    ----------
-    inputs
-        From a map to the calibration and the options with which `estimate` takes it by itself.
-
-    Raises
-    ------
-    BadDataError
-        When no map can be built by default.
+    `inputs` leads from a map to the calibration and the options with which `estimate` takes it by itself. Where no map
+    can be built by default, `BadDataError` says why.
     """
-    clock = work.clock
+    clock, settings = work.clock, map_settings(scan)
 
-    def run_of(one: MapSetting) -> Run:
+    def run_of(one: Built) -> Run:
         def once(number: int) -> tuple[dict[str, float], SizeAnswer]:
             begun = clock()
             try:
@@ -471,19 +458,18 @@ def measure_map(scan: Scan, *, inputs: Inputs, work: Work) -> Ladder:
                 estimator = Estimator(tactile_map, calibration, work.seed, clock, work.probability)
                 seconds, answer = estimator.run(options)(number)
             except BadDataError as error:
-                if one.default:
+                if one == settings[0].how:
                     raise
                 return {"map": clock() - begun, "estimate": 0.0}, SizeAnswer(str(error))
             return {"map": built_s, **seconds}, answer
 
         return once
 
-    settings = map_settings(scan)
-    seconds, _ = default_run(run_of(settings[0]))
+    seconds, _ = default_run(run_of(settings[0].how))
     return climbed(settings, run_of, lambda: _reference(scan, inputs, work), default_s=seconds, work=work)
 
 
-def _build(scan: Scan, one: MapSetting) -> TactileMap:
+def _build(scan: Scan, one: Built) -> TactileMap:
     used = scan if one.duration_s is None else first_seconds(scan, one.duration_s)
     return build_map(used, **one.options)
 

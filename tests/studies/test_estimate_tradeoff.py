@@ -31,6 +31,7 @@ from tactile_bayes.size.pooling import Calibration
 from tactile_bayes.size.terms import Recipe
 from tactile_bayes.studies import estimate_tradeoff as study
 from tactile_bayes.studies.estimate_tradeoff import (
+    Choice,
     Estimator,
     Ladder,
     PooledRow,
@@ -185,7 +186,9 @@ def test_the_frontier_and_what_is_enough():
 def test_least_time_counts_and_a_slow_setting_is_run_twice():
     spent = iter([5.0, 4.0, 1.0])
     some = row("--method laplace").answer
-    found = priced("a", "b", lambda _: ({"estimate": next(spent)}, some), Reference("", some, 0.0), runs=3)
+    found = priced(
+        Choice("a", "b", None), lambda _: ({"estimate": next(spent)}, some), Reference("", some, 0.0), runs=3
+    )
     assert (found.seconds, len(found.answers)) == (4.0, 2)
 
 
@@ -241,8 +244,8 @@ def test_beside_chains_other_models_are_tried_by_laplace():
     tried = study.worth_trying(settings, chains)
     assert [one.axis for one in tried] == [one.axis for one in settings]
     others = [one for one in tried if one.axis in (study.FIELD, study.WINDOW)]
-    assert {one.options.method for one in others} == {"laplace"}
-    assert all(one.label.endswith(", laplace") and not one.options.step_up for one in others)
+    assert {one.how.method for one in others} == {"laplace"}
+    assert all(one.label.endswith(", laplace") and not one.how.step_up for one in others)
     assert sum(one.weight for one in tried) < 0.2 * sum(one.weight for one in settings)
     silent = study.worth_trying(settings, SizeAnswer("no lump", 0.1, code="undetected"))
     assert {one.axis for one in silent} == {study.METHOD, study.FIELD, study.WINDOW}
