@@ -3,7 +3,7 @@ PYTHON ?= python3.11
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: schemas bench-posterior calibrations relearn bench-forward bench-record demo test check slow bench bench-map bench-trial docs clean
+.PHONY: schemas bench-posterior calibrations relearn bench-forward bench-record demo test check slow pages bench bench-map bench-trial docs clean
 
 $(VENV)/.installed: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -14,17 +14,22 @@ demo: $(VENV)/.installed
 	$(BIN)/tactile-bayes demo -o demo-output --force
 
 test: $(VENV)/.installed
-	$(BIN)/python -m pytest -n auto
+	$(BIN)/python -m pytest -n auto --dist worksteal
 
 check: $(VENV)/.installed
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
-	$(BIN)/python -m pytest -n auto
+	$(BIN)/python -m pytest -n auto --dist worksteal
 
+# All of it: hours. `PART="--begin-at N --budget S"` takes S seconds of it, from a place that N decides.
 slow: $(VENV)/.installed
-	$(BIN)/python -m pytest -m slow
+	$(BIN)/python -m pytest -m slow -n auto --dist worksteal $(PART)
+
+# What a reader types from the pages, as printed: minutes.
+pages: $(VENV)/.installed
+	$(BIN)/python -m pytest -m 'slow or not slow' -n auto -k test_a_page_runs_as_printed tests/test_docs.py
 
 bench: $(VENV)/.installed
 	$(BIN)/python -m benchmarks.run

@@ -5,16 +5,23 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, settings
+from in_process import run_here
 
 ROOT = Path(__file__).resolve().parent.parent
 
 # As the program does, and before a test module imports numpy: its threads would fight with the tests' own processes.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+# Bytecode is kept, whatever the shell says: without it every process of a test compiles the package again.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
 
 # The same examples at every run; `HYPOTHESIS_PROFILE=ci` looks at more of them.
 settings.register_profile("default", max_examples=20, derandomize=True, deadline=None)
@@ -23,7 +30,30 @@ settings.register_profile(
 )
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "default"))
 
+COLUMNS = "100"
+STARTED_S = time.monotonic()
+
 Run = Callable[..., "subprocess.CompletedProcess[str]"]
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Options by which a part of the slow tests is run, another one each time."""
+    parser.addoption("--begin-at", type=int, default=0, metavar="N", help="Begin at a place that N decides.")
+    parser.addoption("--budget", type=float, metavar="S", help="Skip tests that would begin after S seconds.")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Turn the order round, neighbours staying together; steps of a prime number visit every place."""
+    if begin := config.getoption("--begin-at"):
+        place = begin * 97 % max(len(items), 1)
+        items[:] = items[place:] + items[:place]
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Skip what would begin too late."""
+    budget = item.config.getoption("--budget")
+    if budget is not None and time.monotonic() - STARTED_S > budget:
+        pytest.skip("the time for slow tests is spent")
 
 
 @pytest.fixture(scope="session")
@@ -38,7 +68,7 @@ def shared_data() -> Path:
 @pytest.fixture(scope="session")
 def child_environment() -> dict[str, str]:
     """This process's variables, with the checkout importable and text wrapped at one width."""
-    return dict(os.environ) | {"PYTHONPATH": str(ROOT), "COLUMNS": "100", "PYTHONUTF8": "1"}
+    return dict(os.environ) | {"PYTHONPATH": str(ROOT), "COLUMNS": COLUMNS, "PYTHONUTF8": "1"}
 
 
 @pytest.fixture(scope="session")
@@ -66,5 +96,13 @@ def run_python(child_environment: dict[str, str]) -> Run:
 
 @pytest.fixture(scope="session")
 def run_cli(run_python: Run) -> Run:
-    """Run the program in a process of its own: ``run_cli("map", "scan.mcap", cwd=tmp_path)``; see `run_python`."""
-    return lambda *args, **options: run_python("-m", "tactile_bayes", *args, **options)
+    """Run the program: ``run_cli("map", "scan.mcap", cwd=tmp_path)``; in a process of its own where it gets options."""
+
+    def run(*args: object, cwd: Path | None = None, **options: Any) -> subprocess.CompletedProcess[str]:
+        if options:
+            return run_python("-m", "tactile_bayes", *args, cwd=cwd, **options)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setenv("COLUMNS", COLUMNS)
+            return run_here(*args, cwd=cwd or Path.cwd())
+
+    return run

@@ -146,7 +146,15 @@ EXTRAS = {"export.md": ("highdicom", "fhir.resources", "nrrd")}
 """Packages without which a page cannot run."""
 
 
-@pytest.mark.parametrize("page", RUN_PAGES, ids=lambda page: page.name)
+QUICK_PAGES = ("complete-with-tab.md", "import.md", "other-heads.md", "record.md")
+"""Those that take a second or two; the others run maps and estimates that have their own tests."""
+
+
+@pytest.mark.parametrize(
+    "page",
+    [pytest.param(one, marks=() if one.name in QUICK_PAGES else pytest.mark.slow) for one in RUN_PAGES],
+    ids=lambda page: page.name,
+)
 def test_a_page_runs_as_printed(page, tmp_path, demos):
     for package in EXTRAS.get(page.name, ()):
         pytest.importorskip(package)

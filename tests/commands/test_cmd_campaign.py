@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from campaign_files import JOURNAL, ROWS, contents, rows_of, steps, thinned, write, write_study, write_table
+from campaign_files import FAST, JOURNAL, ROWS, contents, rows_of, steps, thinned, write, write_study, write_table
 from in_process import run_here
 
 from tactile_bayes.campaign.inputs import open_campaign
@@ -29,7 +29,6 @@ from tactile_bayes.files.manifest_csv import Exam as Listed
 from tactile_bayes.files.tables import read_table
 
 Run = Callable[..., "subprocess.CompletedProcess[str]"]
-FAST = ("--method", "laplace")
 SIZED = ("07.v1.m1.r1", "07.v1.m1.r2", "09.v1.m1.r1")
 STEPS_OF_ALL = 4 + 4 + 3
 """Maps and estimates of the exams that are sound, and masses."""
@@ -544,7 +543,7 @@ def check_resumed(folder: Path, undisturbed: Path) -> None:
     assert len(done) == len(set(done)) == STEPS_OF_ALL
 
 
-@pytest.mark.parametrize("after", [0, 3, 7])
+@pytest.mark.parametrize("after", [3, *(pytest.param(n, marks=pytest.mark.slow) for n in (0, 7))])
 def test_a_killed_run_ends_in_the_same_bytes(
     after: int, undisturbed: Path, own: Path, child_environment: dict[str, str]
 ) -> None:
@@ -592,7 +591,10 @@ main()
 """
 
 
-@pytest.mark.parametrize(("limit", "workers"), [(100_000, 1), (400_000, 2), (300, 1)])
+@pytest.mark.parametrize(
+    ("limit", "workers"),
+    [(300, 1), *(pytest.param(*one, marks=pytest.mark.slow) for one in ((100_000, 1), (400_000, 2)))],
+)
 def test_a_full_disk_is_one_line_and_loses_nothing(
     limit: int, workers: int, undisturbed: Path, own: Path, run_python: Run
 ) -> None:

@@ -9,7 +9,7 @@ from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
-from campaign_files import JOURNAL, contents, rows_of, steps, thinned, write, write_table
+from campaign_files import FAST, JOURNAL, contents, rows_of, steps, thinned, write, write_table
 from in_process import run_here
 
 from tactile_bayes.actions import trial as actions
@@ -20,7 +20,7 @@ SAYS = "learned from the repeats (repeatability.json)"
 
 
 def campaign(folder: Path, *more: object, out: str = "out") -> subprocess.CompletedProcess[str]:
-    done = run_here("campaign", "run", "exams.csv", "-o", out, "--method", "laplace", *more, cwd=folder)
+    done = run_here("campaign", "run", "exams.csv", "-o", out, *FAST, *more, cwd=folder)
     assert done.returncode == 0, done.stderr
     return done
 
@@ -77,7 +77,7 @@ def test_the_tables_have_the_sizes_by_it(study: Path) -> None:
 def test_a_size_by_it_is_that_of_an_estimate_from_the_map(study: Path) -> None:
     """Two ways: from the kept draws, and the whole estimate with --repeatability."""
     folder = study / "out" / "exams" / "01.v1.m1.r1"
-    words = ("--method", "laplace", "--repeatability", study / "out" / "repeatability.json", "--json")
+    words = (*FAST, "--repeatability", study / "out" / "repeatability.json", "--json")
     by_hand = json.loads(run_here("estimate", folder / "map.nc", *words, cwd=study).stdout)
     sized = json.loads((folder / "sized.json").read_text())
     for name in ("max_size_mm", "min_size_mm"):
@@ -130,6 +130,12 @@ def test_a_changed_exam_redoes_sizes_and_fits_no_other_map(own: Path, monkeypatc
     ]
     assert told[-1] == (18, 18)
     assert (2, 18) in told  # sizes are counted before the spread is learned
+
+
+@pytest.mark.slow
+def test_after_a_changed_exam_all_is_as_if_it_had_been_so_from_the_beginning(own: Path) -> None:
+    write(own / "scans" / "03-2.mcap", thinned(2, 6, subject="03", side="left"))
+    campaign(own)
     campaign(own, out="fresh")
     assert contents(own / "out") == contents(own / "fresh")
 
@@ -161,7 +167,7 @@ def test_fewer_than_five_masses_with_repeats_do_not_teach_it(own: Path) -> None:
 
 
 def test_a_dry_run_knows_the_steps(own: Path) -> None:
-    words = ("campaign", "run", "exams.csv", "-o", "out", "--method", "laplace", "--dry-run")
+    words = ("campaign", "run", "exams.csv", "-o", "out", *FAST, "--dry-run")
     told = run_here(*words, cwd=own).stdout
     assert "repeatability: 0 to do, 1 done\nsize: 0 to do, 10 done\npool: 0 to do, 5 done\n" in told
     write(own / "scans" / "03-2.mcap", thinned(2, 6, subject="03", side="left"))

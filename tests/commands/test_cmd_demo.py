@@ -79,6 +79,7 @@ def test_it_leaves_every_file_behind_for_its_owner_only(shown: CompletedProcess[
     assert {path.stat().st_mode & 0o777 for path in files.values()} == {0o600}
 
 
+@pytest.mark.slow
 def test_the_printed_commands_do_it_by_hand(run_cli: Run, shown: CompletedProcess[str], place: Path) -> None:
     """Each as printed, in a folder whose name has a space, works and gives the same bytes again."""
     before = {path.name: path.read_bytes() for path in (place / "my demo").iterdir()}

@@ -167,6 +167,7 @@ def test_a_grid_with_a_fault_is_refused_before_any_work(
     assert not (tmp_path / "out.csv").exists()
 
 
+@pytest.mark.slow
 def test_four_figures_are_drawn(folder: Path, run_cli: Run) -> None:
     words = ("study", "--grid", "grid.csv", "--fineness", 1, "--figures", "figures")
     done = run_cli(*words, cwd=folder)

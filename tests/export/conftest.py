@@ -8,6 +8,9 @@ from typing import Any
 
 import pytest
 from export_files import write_exam
+from searched_once import searched_once
+
+__all__ = ["estimate", "exam", "searched_once"]
 
 
 @pytest.fixture(scope="session")

@@ -37,10 +37,17 @@ def said(*words: object) -> str:
     return done.stdout + done.stderr
 
 
-@pytest.fixture(params=EXAMS)
-def written(request: pytest.FixtureRequest, exam: Path, tmp_path: Path) -> list[Path]:
-    exported(exam, *EXAMS[request.param], "--to", "dicom", "-o", tmp_path / "out")
-    return sorted((tmp_path / "out").iterdir())
+@pytest.fixture(scope="module", params=EXAMS)
+def made(request: pytest.FixtureRequest, exam: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("dicom") / "out"
+    exported(exam, *EXAMS[request.param], "--to", "dicom", "-o", out)
+    return out
+
+
+@pytest.fixture
+def written(made: Path, tmp_path: Path) -> list[Path]:
+    """Files of an export, to be changed."""
+    return sorted(shutil.copytree(made, tmp_path / "out").iterdir())
 
 
 def test_dciodvfy_reports_no_error(written: list[Path]) -> None:

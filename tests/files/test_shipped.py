@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from in_process import run_here
 
+import tactile_bayes as tb
 from tactile_bayes.errors import UsageError
 from tactile_bayes.files.size_json import SHIPPED, size_calibration_path
 
@@ -33,7 +34,7 @@ def test_a_file_may_lack_a_suffix_and_a_missing_one_is_told_as_such(
 
 
 def test_the_command_line_tells_it_in_one_line(tmp_path: Path) -> None:
-    run_here("demo", "-o", "demo", cwd=tmp_path)
-    done = run_here("estimate", "demo/map.nc", "--size-calibration", "sold", cwd=tmp_path)
+    tb.demo_map().save(tmp_path / "map.nc")
+    done = run_here("estimate", "map.nc", "--size-calibration", "sold", cwd=tmp_path)
     assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
     assert "give solid, eq6, solid-mean, plane-strain or a file" in done.stderr

@@ -112,7 +112,7 @@ def mirrored(scan: Scan, axis: int) -> Scan:
     return flipped(replace(scan, head=head, poses=poses, landmarks=marks), axis)
 
 
-@pytest.mark.parametrize("axis", [0, 1], ids=["rows", "columns"])
+@pytest.mark.parametrize("axis", [0, pytest.param(1, marks=pytest.mark.slow)], ids=["rows", "columns"])
 def test_a_mirrored_head_gives_the_same_latency(axis):
     """Counting taxels from the other side changes nothing; a mirrored scene changes only where cells begin.
 

@@ -77,6 +77,7 @@ def coverage(method: str, noise: str, *, maps: int, stretch: float = 1.0) -> np.
     return np.mean(held, axis=0)
 
 
+@pytest.mark.slow
 def test_intervals_of_90_percent_cover_9_in_10() -> None:
     """100 maps with white errors: the binomial error of each share is 3 %, of their mean at most that."""
     found = coverage("optimise", "white", maps=100)
@@ -84,6 +85,7 @@ def test_intervals_of_90_percent_cover_9_in_10() -> None:
     assert 0.85 <= found.mean() <= 0.96
 
 
+@pytest.mark.slow
 def test_half_the_noise_is_found_out() -> None:
     assert coverage("optimise", "white", maps=60, stretch=0.5).mean() < 0.75
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from in_process import run_here
 from posterior_maps import bump_values, correlated_field, grid_map
+from searched_once import searched_once  # noqa: F401 - all tests of this file use it
 from settings_files import settings
 
 import tactile_bayes as tb

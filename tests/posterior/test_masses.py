@@ -11,6 +11,7 @@ from in_process import run_here
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 from posterior_maps import bump_values, correlated_field, grid_map
+from searched_once import searched_once  # noqa: F401 - all tests of this file use it
 
 import tactile_bayes as tb
 from tactile_bayes.api.estimates import SizeEstimate

@@ -160,6 +160,7 @@ def trial(
     return q.low <= growth <= q.high, not 0.025 <= change.probability_above(0.0) <= 0.975
 
 
+@pytest.mark.slow
 def test_intervals_hold_and_alarms_are_as_rare_as_stated():
     """Nominal 95 and 5 % over 300 pairs each; with the body taken as wholly the same, the control, neither does."""
     law, rng = SharedBody(0.3, 0.5), np.random.default_rng(17)
@@ -174,6 +175,7 @@ def test_intervals_hold_and_alarms_are_as_rare_as_stated():
     assert sure[:, 0].mean() < 0.88
 
 
+@pytest.mark.slow
 def test_changes_at_a_site_hold_by_its_repeatability_and_not_by_half_of_it():
     """Exams 12 % apart and a file learned from such: nominal 95 and 5 %. The controls take 3 %, as without a file."""
     law, rng = SharedBody(0.3, 0.5), np.random.default_rng(23)

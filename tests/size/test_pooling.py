@@ -93,6 +93,7 @@ def test_a_spread_that_is_stated_leaves_one_interval():
     assert size.figures["between_map_sd"] == pytest.approx(0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("maps", [1, 3])
 def test_both_intervals_hold_what_they_say(maps):
     """Nominal 95 %: exams as alike as the calibration's for the one, as far apart as the paper's for the other."""
@@ -117,12 +118,14 @@ def test_both_intervals_hold_what_they_say(maps):
     assert share["this where exams differ by 15 %"] < 0.90
 
 
-@pytest.mark.parametrize(("tau", "maps"), [(0.05, 3), (0.15, 3), (0.3, 5)])
-def test_intervals_of_pooled_masses_cover(tau, maps):
+MANY = [pytest.param(*one, 300, marks=pytest.mark.slow) for one in ((0.05, 3), (0.15, 3), (0.3, 5))]
+
+
+@pytest.mark.parametrize(("tau", "maps", "trials"), [(0.15, 3, 100), *MANY])
+def test_intervals_of_pooled_masses_cover(tau, maps, trials):
     """Masses drawn with a spread between maps from about the prior, and less: nominal 90 %."""
     rng = np.random.default_rng(7)
     inside = {"learned": 0, "left out": 0}
-    trials = 300
     for _ in range(trials):
         true, body = 2.7, rng.normal(0, BODY_SD)
         centres = true - body + rng.normal(0, tau, maps)

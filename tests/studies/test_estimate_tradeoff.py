@@ -112,6 +112,7 @@ def test_the_reference_has_the_interval_that_theory_gives(monkeypatch: pytest.Mo
     assert found.error_mm < 0.05 * half
 
 
+@pytest.mark.slow
 def test_the_reference_agrees_with_markov_chains():
     """Chains are another algorithm: their ends lie within their Monte-Carlo error of the reference's.
 
@@ -125,6 +126,7 @@ def test_the_reference_agrees_with_markov_chains():
     assert found.off.ends < max(4 * np.hypot(size.mc_error, ladder().reference.error_mm), 0.02 * size.sd)
 
 
+@pytest.mark.slow
 def test_chains_are_the_reference_where_weights_cannot_be_trusted(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(study, "LONG_RUNS", (("importance", 0.001), ("ensemble", 0.1)))
     monkeypatch.setattr(importance_module, "HEAVY_POINTS", 1)
@@ -270,7 +272,7 @@ def test_a_large_map_costs_what_its_window_costs():
     assert sizes[1].median == pytest.approx(sizes[0].median, rel=0.1)
 
 
-@pytest.mark.parametrize("case", ["cells without data", "one reading a cell"])
+@pytest.mark.parametrize("case", [pytest.param("cells without data", marks=pytest.mark.slow), "one reading a cell"])
 def test_poor_maps_are_measured_too(case: str):
     given = field_map(half_mm=20.0)
     if case == "cells without data":

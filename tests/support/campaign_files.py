@@ -17,6 +17,8 @@ from tactile_bayes.scan import PressureFrames, Scan
 DEMO = Path(__file__).resolve().parents[2] / "tactile_bayes" / "demo"
 EXCISION = "patient,mass,ex_vivo_mm\n07,1,15.0\n09,1,14\n11,1,9\n12,1,10\n"
 JOURNAL = "campaign.journal"
+FAST = ("--method", "laplace", "--settings", Path(__file__).with_name("fast.toml"))
+"""Options under which an exam is sized in half the time; its size is not what a test of campaigns is about."""
 
 
 def thinned(start: int, step: int, **session: str) -> Scan:

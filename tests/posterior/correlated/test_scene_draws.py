@@ -54,7 +54,7 @@ def ends(draws: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    "name", ["weak", "beside", *(pytest.param(name, marks=pytest.mark.slow) for name in ("strong", "half covered"))]
+    "name", ["weak", *(pytest.param(name, marks=pytest.mark.slow) for name in ("beside", "strong", "half covered"))]
 )
 def test_importance_ends_are_as_good_as_they_say(name: str) -> None:
     """Against one long run by other points: six runs, each end within four of its stated errors."""
