@@ -7,10 +7,10 @@ settings of a provenance are made of these records.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Final, Literal, get_args
+from typing import Annotated, Final, Literal
 
-from tactile_bayes.declarations import Meta, Options, Record
-from tactile_bayes.errors import UsageError, check_choice, check_number
+from tactile_bayes.declarations import Meta, Options
+from tactile_bayes.errors import UsageError
 from tactile_bayes.presets import CELL_MM, DEFAULT_NORMALISE, PRESSURE_WINDOW_KPA, Normalise, TrackerProtocol
 
 
@@ -185,21 +185,49 @@ class RecordOptions(Options, kw_only=True):
 
 
 IntervalMethod = Literal["corrected", "jackknife", "bca"]
+Seed = Annotated[int, Meta(ge=0, description="Random seed.")]
 
 
-class TrialSettings(Record):
+class TrialSettings(Options):
     """Settings of a trial's analysis; each is part of the provenance."""
 
-    intervals: IntervalMethod = "corrected"
-    resamples: int = 2000
-    seed: int = 1999
-    error_ratio: float = 1.0
-    check_intervals: int = 0
-    bayes: bool = False
+    intervals: Annotated[
+        IntervalMethod,
+        Meta(
+            description="Interval method, resampling patients. corrected: jackknife with Student's t, corrected for "
+            "rare misses and few influential patients; jackknife: uncorrected; bca: bootstrap."
+        ),
+    ] = "corrected"
+    resamples: Annotated[int, Meta(ge=200, le=100_000, description="Number of bootstrap resamples.")] = 2000
+    seed: Seed = 1999
+    error_ratio: Annotated[
+        float,
+        Meta(ge=1e-6, le=1e6, description="Ratio of the ex-vivo error's variance to the modality's, for Deming lines."),
+    ] = 1.0
+    check_intervals: Annotated[
+        int,
+        Meta(
+            ge=0,
+            description="Simulate this many trials of this size and report how often the intervals cover.",
+            extra={"metavar": "TRIALS"},
+        ),
+    ] = 0
+    bayes: Annotated[
+        bool,
+        Meta(description="Predict the error of the next mass, by an errors-in-variables model and MCMC."),
+    ] = False
 
-    def __post_init__(self) -> None:
-        check_choice("intervals", self.intervals, get_args(IntervalMethod))
-        check_number("resamples", self.resamples, 200, 100_000, whole=True)
-        check_number("seed", self.seed, 0, whole=True)
-        check_number("error_ratio", self.error_ratio, 1e-6, 1e6)
-        check_number("check_intervals", self.check_intervals, 0, whole=True)
+
+class PlanErrors(Options):
+    """Errors of ln size that a plan assumes; an SD of 0.15 is about 15 %."""
+
+    tactile_bias: Annotated[float, Meta(ge=-3, le=3, description="Mean of ln(size / ex vivo).")] = 0.02
+    mass_sd: Annotated[float, Meta(ge=0, le=3, description="SD of ln size shared by a mass's maps.")] = 0.18
+    map_sd: Annotated[float, Meta(ge=0, le=3, description="SD of ln size of single maps.")] = 0.15
+    other_bias: Annotated[
+        float, Meta(ge=-3, le=3, description="Mean of ln(size / ex vivo) of the modality compared with.")
+    ] = -0.08
+    other_sd: Annotated[float, Meta(ge=0, le=3, description="SD of ln size of the modality compared with.")] = 0.40
+    other_miss: Annotated[
+        float, Meta(ge=0, le=1, description="Share of masses that the modality compared with misses.")
+    ] = 0.04

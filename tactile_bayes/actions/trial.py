@@ -31,7 +31,7 @@ from tactile_bayes.campaign.run import Campaign
 from tactile_bayes.campaign.settings import CampaignSettings
 from tactile_bayes.commands.options import also_read, refuse_same, settings_of
 from tactile_bayes.commands.progress import progress_bar
-from tactile_bayes.declarations import EXACT, to_plain
+from tactile_bayes.declarations import EXACT, names_of, to_plain
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.atomic import refuse_existing, write_text
 from tactile_bayes.files.documents import dump_json, read_protocol
@@ -39,7 +39,7 @@ from tactile_bayes.files.manifest_csv import add_rows, read_manifest, read_rows,
 from tactile_bayes.files.provenance import Provenance, hash_inputs
 from tactile_bayes.files.remote import check_address
 from tactile_bayes.files.size_json import NONE, size_calibration_path
-from tactile_bayes.options import TrialSettings
+from tactile_bayes.options import PlanErrors, TrialSettings
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.trial import plan_text
 from tactile_bayes.trial.planning import (
@@ -114,7 +114,7 @@ def _settings(given: dict[str, Any], protocol: Path | None) -> tuple[str | None,
 
 # --- `plan`: sample size of a trial, and the value of more maps per mass.
 
-_ERRORS = ("tactile_bias", "mass_sd", "map_sd", "other_bias", "other_sd", "other_miss")
+_ERRORS = names_of(PlanErrors)
 
 
 def plan_action(

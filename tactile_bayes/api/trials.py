@@ -35,13 +35,8 @@ if TYPE_CHECKING:
 def load_trial(trial: Path | Sheet, excision: Path | Sheet, columns: Path | None, *, tidy_trial: bool = False) -> Trial:
     """Read and check both tables.
 
-    Parameters
-    ----------
-    columns
-        The mapping file of a wide table; None where both are tidy. One without ``[[reading]]`` is for the excision
-        sizes alone.
-    tidy_trial
-        Whether the trial is tidy whatever the mapping holds.
+    `columns` is the mapping file of a wide table; one without ``[[reading]]`` is for the excision sizes alone. A
+    `tidy_trial` is tidy whatever the mapping holds.
     """
     sizes = read_excision(excision, columns)
     if columns is None or tidy_trial or isinstance(trial, Sheet) or read_mapping(columns).reading is None:

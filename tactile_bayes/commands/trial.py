@@ -18,14 +18,14 @@ from tactile_bayes.commands.options import (
     seed_option,
     takes,
 )
-from tactile_bayes.options import MapOptions, TrialSettings
+from tactile_bayes.declarations import names_of
+from tactile_bayes.options import MapOptions, PlanErrors, TrialSettings
 
 # --- Options of the commands on trials: `validate`, `plan`.
 
 # --- `validate`: compare each modality with excision.
 
 _FILE = FilePath()
-_DEFAULTS = TrialSettings()
 
 
 @click.command("validate")
@@ -34,39 +34,9 @@ _DEFAULTS = TrialSettings()
 @click.option(
     "--columns", metavar="MAP.toml", type=_FILE, help="Layout of a wide TRIAL.csv: which column holds which reading."
 )
-@click.option(
-    "--intervals",
-    type=click.Choice(["corrected", "jackknife", "bca"]),
-    default=_DEFAULTS.intervals,
-    show_default=True,
-    help="Interval method, resampling patients. corrected: jackknife with Student's t, corrected for rare "
-    "misses and few influential patients; jackknife: uncorrected; bca: bootstrap.",
-)
-@click.option(
-    "--resamples",
-    type=click.IntRange(200, 100_000),
-    default=_DEFAULTS.resamples,
-    show_default=True,
-    help="Number of bootstrap resamples.",
-)
-@seed_option(_DEFAULTS.seed)
-@click.option(
-    "--error-ratio",
-    type=FiniteRange(1e-6, 1e6),
-    default=_DEFAULTS.error_ratio,
-    show_default=True,
-    help="Ratio of the ex-vivo error's variance to the modality's, for Deming lines.",
-)
-@click.option(
-    "--check-intervals",
-    type=click.IntRange(0),
-    default=0,
-    metavar="TRIALS",
-    help="Simulate this many trials of this size and report how often the intervals cover.",
-)
-@click.option(
-    "--bayes", is_flag=True, help="Predict the error of the next mass, by an errors-in-variables model and MCMC."
-)
+@takes(TrialSettings, "intervals", "resamples", "seed", "error_ratio")
+@takes(TrialSettings, "check_intervals", show_default=False)
+@takes(TrialSettings, "bayes")
 @click.option("--methods", is_flag=True, help="Also print lines, limits of agreement, repeatability and pairs.")
 @JSON
 @click.option(
@@ -98,9 +68,6 @@ def validate_command(**given: Any) -> None:
 
 # --- `plan`: sample size of a trial, and the value of more maps per mass.
 
-# ln size: 3 is a factor of 20.
-_BIAS, _SD = FiniteRange(-3, 3), FiniteRange(0, 3)
-
 
 @click.command("plan")
 @click.option(
@@ -119,26 +86,7 @@ _BIAS, _SD = FiniteRange(-3, 3), FiniteRange(0, 3)
     show_default=True,
     help="Number of tactile maps per mass.",
 )
-@click.option("--tactile-bias", type=_BIAS, default=0.02, show_default=True, help="Mean of ln(size / ex vivo).")
-@click.option("--mass-sd", type=_SD, default=0.18, show_default=True, help="SD of ln size shared by a mass's maps.")
-@click.option("--map-sd", type=_SD, default=0.15, show_default=True, help="SD of ln size of single maps.")
-@click.option(
-    "--other-bias",
-    type=_BIAS,
-    default=-0.08,
-    show_default=True,
-    help="Mean of ln(size / ex vivo) of the modality compared with.",
-)
-@click.option(
-    "--other-sd", type=_SD, default=0.40, show_default=True, help="SD of ln size of the modality compared with."
-)
-@click.option(
-    "--other-miss",
-    type=FiniteRange(0, 1),
-    default=0.04,
-    show_default=True,
-    help="Share of masses that the modality compared with misses.",
-)
+@takes(PlanErrors, *names_of(PlanErrors))
 @click.option(
     "--pilot",
     metavar="TRIAL.csv",

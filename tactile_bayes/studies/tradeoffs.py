@@ -131,16 +131,9 @@ class Measured(Record):
 def case_of(scene: Scene, *, head: str | None = None) -> LumpCase:
     """Lump of a scene, with both models' settings for its body and head.
 
-    Parameters
-    ----------
-    head
-        One of `presets.HEADS`: where the shoulders of the scene's head lie, in both models. None: inside the array in
-        two dimensions, and as the scene gives them in three.
-
-    Raises
-    ------
-    BadDataError
-        When it has not exactly one lump, a ball of tissue and no rib.
+    `head`, one of `presets.HEADS`, says where the shoulders of the scene's head lie, in both models; without it, inside
+    the array in two dimensions, and as the scene gives them in three. A scene without exactly one lump, a ball of
+    tissue, or with a rib, is at fault.
     """
     if scene.lumps or scene.ribs or len(scene.solid_lumps) != 1:
         many = "bumps" if scene.lumps else "a rib" if scene.ribs else f"{len(scene.solid_lumps)} lumps"
@@ -198,14 +191,8 @@ def measure_forward(
 ) -> Measured:
     """Compute the map by one setting and measure the time.
 
-    Parameters
-    ----------
-    fit, raster_fit
-        Of Eq 5 to a line, and of Eq 7 to a raster.
-    clock
-        Called before and after each part.
-    runs
-        The least of this many is kept.
+    `fit` is of Eq 5 to a line, `raster_fit` of Eq 7 to a raster; `clock` is called before and after each part, and the
+    least of so many `runs` is kept.
     """
     work = {EMPIRICAL: _empirical, PLANE: _plane, SOLID: _solid}[setting.model]
     times = []
