@@ -126,7 +126,7 @@ def _counts(line: FloatArray) -> bool:
 #
 # Orientation: arrays keep their order. Column 0 is the lowest x and row 0 the lowest y, so y runs down an image,
 # whose row 0 is its top; a lump's angle is positive from x towards y, clockwise on the image. Pictures of such a
-# map show it as the file reads, first row on top and first column on the left (see `mapping.orientation`). Cell
+# map show it as the file reads, first row on top and first column on the left (see `mapping.convention`). Cell
 # centres are placed about the centre of the grid, so x and y run from -(n-1)/2 to (n-1)/2 cells.
 
 IMAGE_SUFFIXES: Final = (".tif", ".tiff", ".pgm", ".png")
@@ -140,7 +140,7 @@ _MOST_KPA: Final = 1000.0
 
 def read_grid(path: Path, *, spacing_mm: float | None = None, normalise: str = "none", units: str = "") -> TactileMap:
     """Read a grid of values as a map: an ``.npz`` with ``mean (ny, nx)`` and, if known, ``count``, ``variance`` (NaN
-    where count is 1) and ``spacing_mm``; a table of numbers (see `grid_table`), an empty field for a cell without data;
+    where count is 1) and ``spacing_mm``; a table of numbers (see `read_table`), an empty field for a cell without data;
     or a grey ``.tif``, ``.pgm`` or ``.png`` image.
 
     `spacing_mm` is the side of the square cells and may be left out when the ``.npz`` holds it. `normalise` says what

@@ -30,7 +30,7 @@ class SizeAnswer(Record):
     shares: dict[str, float] = field(default_factory=dict)
     """Percent of the variance of ln(largest size) by source, see `SizePosterior.variance_share`."""
     code: str = ""
-    """Of the reason, one of `abstention.CODES`; ``"method"`` where no method converged."""
+    """Of the reason, see `posterior.abstention`; ``"method"`` where no method converged."""
 
     @property
     def reported(self) -> Quantity | None:
