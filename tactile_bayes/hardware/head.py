@@ -91,7 +91,7 @@ def cobs_decode(data: bytes) -> bytes | None:
     return bytes(out[1:])
 
 
-def encode_packet(kind: int, payload: bytes, *, sequence: int, device_us: int) -> bytes:
+def encode_packet(kind: int, payload: bytes, *, sequence: int = 0, device_us: int = 0) -> bytes:
     """Encode one packet for the wire, with a zero byte before and after it; counters wrap as in firmware."""
     body = HEADER.pack(VERSION, kind, sequence % 2**32, device_us % 2**64) + payload
     if len(body) + CRC_BYTES > MAX_PACKET_BYTES:
@@ -180,11 +180,11 @@ _POSE: Final = struct.Struct("<H7d")  # ns beyond the header's microseconds, x y
 _MAX_ID: Final = 64
 
 
-def encode_hello(hello: HelloReading, *, sequence: int = 0, device_us: int = 0) -> bytes:
+def encode_hello(hello: HelloReading) -> bytes:
     """Encode a device's identity: rows and columns (0 for a tracker), saturation count, rate, name."""
     numbers = _HELLO.pack(hello.rows, hello.columns, hello.saturation_count, round(hello.rate_hz * 1000))
     name = hello.device_id.encode()[:_MAX_ID]
-    return encode_packet(HELLO, numbers + name, sequence=sequence, device_us=device_us)
+    return encode_packet(HELLO, numbers + name)
 
 
 def encode_frame(counts: CountArray, *, sequence: int, device_us: int) -> bytes:
@@ -192,9 +192,9 @@ def encode_frame(counts: CountArray, *, sequence: int, device_us: int) -> bytes:
     return encode_packet(FRAME, counts.astype("<u2").tobytes(), sequence=sequence, device_us=device_us)
 
 
-def encode_end(sent: int, dropped: int, *, sequence: int = 0, device_us: int = 0) -> bytes:
+def encode_end(sent: int, dropped: int) -> bytes:
     """Encode the end of sending, with the numbers of records sent and dropped."""
-    return encode_packet(END, _END.pack(sent, dropped), sequence=sequence, device_us=device_us)
+    return encode_packet(END, _END.pack(sent, dropped))
 
 
 def encode_pose(pose: PoseReading, *, sequence: int) -> bytes:
@@ -207,7 +207,7 @@ def encode_pose(pose: PoseReading, *, sequence: int) -> bytes:
 def encode_command(kind: int, *, every: int = 1) -> bytes:
     """Encode `ASK`, `START` (send every n-th frame) or `STOP`."""
     payload = struct.pack("<B", every) if kind == START else b""
-    return encode_packet(kind, payload, sequence=0, device_us=0)
+    return encode_packet(kind, payload)
 
 
 class HeadParser:

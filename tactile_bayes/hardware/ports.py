@@ -85,15 +85,11 @@ class Port:
         except GONE as error:
             raise DeviceError(f"{self.name}: cannot be read ({_reason(error)}); check its cable") from None
 
-    def drain(self, quiet_s: float = 0.05) -> int:
-        """Discard input until the line is quiet (at most 2 s); return the number of bytes."""
-        count, end = 0, time.monotonic() + 2.0
-        while time.monotonic() < end:
-            data = self.read_some(quiet_s)
-            if not data:
-                break
-            count += len(data)
-        return count
+    def drain(self) -> None:
+        """Discard input until the line is quiet, at most 2 s."""
+        end = time.monotonic() + 2.0
+        while time.monotonic() < end and self.read_some(0.05):
+            pass
 
     @contextlib.contextmanager
     def descriptor(self) -> Iterator[int]:

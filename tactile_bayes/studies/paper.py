@@ -340,9 +340,8 @@ def find_lookalikes(
     seat: float,
     diameters_mm: Sequence[float] = DIAMETERS_MM,
     depth_ratios: Sequence[float] = DEPTH_RATIOS,
-    least_size_ratio: float = LEAST_SIZE_RATIO,
 ) -> Lookalikes | None:
-    """The pair of visible hard lumps whose frames are most alike though one's diameter is `least_size_ratio` times the
+    """The pair of visible hard lumps whose frames are most alike though one's diameter is `LEAST_SIZE_RATIO` times the
     other's; None where no two are visible.
 
     Diameters and depths rise; depths between the first and the last are tried in steps of 0.01. Frames are interpolated
@@ -357,7 +356,7 @@ def find_lookalikes(
         shares[d], added[d] = _interpolated(frames, depth_ratios, tried)
     best: tuple[float, float, float, float, float] | None = None
     for d, e in itertools.combinations(sorted(diameters_mm), 2):
-        if least_size_ratio * d > e:
+        if LEAST_SIZE_RATIO * d > e:
             continue
         gaps = np.sqrt(np.mean((shares[d][:, None] - shares[e]) ** 2, axis=2))
         gaps /= np.sqrt(np.mean(added[d] ** 2, axis=1))[:, None]
