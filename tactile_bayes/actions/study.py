@@ -76,10 +76,6 @@ from tactile_bayes.studies.paper_tables import (
     table_scenes,
 )
 
-# --- The paper's forward study and its tables, run, kept and drawn.
-
-# --- The paper's forward study, with its figures.
-
 # --- Figures of `study`: where they go, the frames that a user measured, and what is drawn from either model.
 
 _FRAMES_SCHEMA = "measured_frames.table.json"
@@ -393,8 +389,6 @@ def run_tables(seat: float, *, heads: Sequence[Head], workers: int) -> tuple[ByH
         {head: rows[count:] for head, rows in by_head.items()},
     )
 
-
-# --- A scan head's pressure and a scan's forward model, printed and drawn.
 
 # --- `head`: how evenly a scan head presses, and the head that presses most evenly (section 2.1 of the paper).
 

@@ -178,8 +178,6 @@ def sbc_command(**given: Any) -> None:
     sbc_action(**given)
 
 
-# --- The paper's forward study, with its figures.
-
 # --- `study`: amplitude and width of the maps of simulated lumps.
 
 

@@ -27,8 +27,6 @@ from tactile_bayes.forward.tissue import HeadFace, SceneBody, SolidLump, fat_thi
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.presets import HEAD_PITCH_MM
 
-# --- The solid model's frames.
-
 # --- Frames of the head on a layered body with lumps, in three dimensions.
 #
 # The skin's compliance under the head is the exact one of the layers without a lump, plus what each lump changes,

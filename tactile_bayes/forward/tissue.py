@@ -15,8 +15,6 @@ from tactile_bayes.forward.contact import Head
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.presets import SHOULDERS_OUTSIDE
 
-# --- A body under the head: its layers, its lump, the head's face.
-
 # --- The layered breast model: fat over gland over a rigid chest wall, with a circular lump at or above their boundary.
 
 FAT_KPA = 5.0

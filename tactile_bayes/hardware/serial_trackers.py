@@ -28,8 +28,6 @@ from tactile_bayes.hardware.readings import (
 )
 from tactile_bayes.hardware.trackers import IgtlinkParser, NdiPort
 
-# --- Trackers on a serial line: Ascension's Flock of Birds, Polhemus.
-
 # --- Parser for Ascension Flock of Birds and miniBIRD trackers, position and quaternion.
 #
 # A record is seven words of 14 bits, each sent as two bytes of seven; bit 7 marks the first byte of a record and no
@@ -269,8 +267,6 @@ def quaternion_from_euler(azimuth_deg: float, elevation_deg: float, roll_deg: fl
         sa * ce * cr - ca * se * sr,
     )
 
-
-# --- Drivers by name, and what is found on the ports.
 
 # --- Drivers of the devices: setup, start, stop and identification.
 

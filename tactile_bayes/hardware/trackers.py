@@ -25,8 +25,6 @@ from tactile_bayes.hardware.head import PacketParser
 from tactile_bayes.hardware.ports import Port
 from tactile_bayes.hardware.readings import HelloReading, PoseReading, Reading, plausible
 
-# --- OpenIGTLink: messages, their checksum, the tracker's driver.
-
 # --- CRC-64 as OpenIGTLink uses it: polynomial of ECMA-182, initial value 0, nothing inverted or reflected.
 #
 # The CRC of a message is the message as a polynomial over GF(2), times x^64, modulo the polynomial. That is linear:

@@ -323,8 +323,6 @@ def tables_document(found: ByHead, phantoms: ByHead, *, seat: float) -> dict[str
     }
 
 
-# --- The forward model's trade-off in words and figures.
-
 # --- Text and data of the forward models' trade-off, with the settings that a case does not need.
 
 # Settings that differ in how finely the same thing is computed.

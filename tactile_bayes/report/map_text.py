@@ -19,8 +19,6 @@ from tactile_bayes.mapping.places import Orientation, orientation_of
 from tactile_bayes.mapping.profile import SPAN_MM
 from tactile_bayes.presets import CELL_PER_SIGMA, POSE_NOISE, RESEARCH_USE
 
-# --- A recording in words, while it runs and after.
-
 # --- Text of a recording's account.
 
 

@@ -28,8 +28,6 @@ from tactile_bayes.forward.tissue import FAT_KPA, GLAND_RATIO, POISSON, SEATS, T
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.presets import HEAD_PITCH_MM, HEADS, SHOULDERS_INSIDE
 
-# --- The paper's forward study: sizes, depths and stiffnesses on a line.
-
 # --- The forward study of section 2.4: the Gaussian that each lump's map shows, over sizes, depths and stiffnesses.
 
 PAPER_DIAMETERS_MM = (5.0, 10.0, 15.0, 20.0, 25.0)
