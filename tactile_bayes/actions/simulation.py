@@ -25,6 +25,7 @@ from tactile_bayes.files.provenance import Provenance, hash_inputs
 from tactile_bayes.files.scan_mcap import write_scan
 from tactile_bayes.files.scene_toml import read_scene
 from tactile_bayes.files.size_json import DEFAULT, read_size_calibration, size_calibration_path
+from tactile_bayes.files.tables import csv_text
 from tactile_bayes.forward.line import outside_range
 from tactile_bayes.forward.scene import Head, Lump
 from tactile_bayes.forward.simulate import simulate
@@ -226,16 +227,7 @@ def _decode(rows: list[dict[str, Any]]) -> list[MassRow]:
 
 def table_text(rows: list[MassRow]) -> str:
     """CSV of the rows, with the header of `data_schema/population.table.json`."""
-    lines = [",".join(names_of(MassRow))]
-    return "\n".join(lines + [",".join(map(_cell, as_dict(row).values())) for row in rows]) + "\n"
-
-
-def _cell(value: Any) -> str:
-    if value is None:
-        return ""
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    return str(value) if isinstance(value, int | str) else f"{value:.8g}"
+    return csv_text(names_of(MassRow), (as_dict(row).values() for row in rows), digits=8)
 
 
 # --- `sbc`: simulation-based calibration of a map's posterior.

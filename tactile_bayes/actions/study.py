@@ -23,7 +23,7 @@ from tactile_bayes.files.documents import dump_json
 from tactile_bayes.files.provenance import hash_inputs
 from tactile_bayes.files.scan_mcap import read_scan
 from tactile_bayes.files.scene_toml import read_scene
-from tactile_bayes.files.tables import read_table
+from tactile_bayes.files.tables import csv_text, read_table
 from tactile_bayes.findings import finding_lines
 from tactile_bayes.forward.contact import Head
 from tactile_bayes.forward.gaussian import cell_mean_gaussian
@@ -335,17 +335,7 @@ def table_text(rows: list[StudyRow]) -> str:
         names.append("sigma_y_mm")
     names += ["fit_rms", "detectable", "thickness_mm", "head_radius_mm"]
     names += [name for name in ("head", *RECIPE) if any(getattr(row, name) is not None for row in rows)]
-    lines = [",".join(names)]
-    lines += [",".join(_cell(getattr(row, name)) for name in names) for row in rows]
-    return "\n".join(lines) + "\n"
-
-
-def _cell(value: Any) -> str:
-    if value is None:
-        return ""
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    return value if isinstance(value, str) else f"{value:.6g}"
+    return csv_text(names, ([getattr(row, name) for name in names] for row in rows), digits=6)
 
 
 # --- `tables`: recompute Tables 1 and 2 of the paper.

@@ -8,7 +8,7 @@ import io
 import math
 import operator
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from datetime import date
 from pathlib import Path
 from typing import Any, Final
@@ -231,6 +231,19 @@ def read_raw(path: Path) -> RawTable:
         _check_length(path, line, row, header)
     rows = [dict(zip(header, (cell.strip() for cell in row), strict=True)) for _, row in body]
     return RawTable(path, header, [line for line, _ in body], rows, cells.decimal_comma, cells.separator)
+
+
+def csv_text(names: Sequence[str], rows: Iterable[Iterable[object]], *, digits: int) -> str:
+    """CSV text of rows below their names; None is a blank cell, and numbers have so many significant digits."""
+
+    def cell(value: object) -> str:
+        if value is None:
+            return ""
+        if isinstance(value, bool):
+            return "true" if value else "false"
+        return f"{value:.{digits}g}" if isinstance(value, float) else str(value)
+
+    return "".join(f"{','.join(line)}\n" for line in (names, *(map(cell, row) for row in rows)))
 
 
 def check_references(table: Table, schema_name: str, *, targets: Mapping[str, Table]) -> None:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from tactile_bayes.declarations import Record, as_dict, names_of
+from tactile_bayes.files.tables import csv_text
 from tactile_bayes.forward.contact import Head
 from tactile_bayes.forward.line import RANGE, outside_range
 from tactile_bayes.geometry import FloatArray
@@ -148,15 +149,12 @@ def _conclusion(parameters: list[dict[str, Any]], together: float) -> Iterator[s
 def table_text(maps: Sequence[MapRanks]) -> str:
     """CSV with one row per map: truth, ranks (empty without an estimate) and outcome."""
     header = ["map", *names_of(Truth), *(f"rank_{name}" for name in RANKED), "outcome", "probability"]
-    return "\n".join([",".join(header), *(_table_row(one) for one in maps)]) + "\n"
-
-
-def _table_row(one: MapRanks) -> str:
-    ranks = [str(rank) for rank in one.ranks or ()]
-    ranks += [""] * (len(RANKED) - len(ranks))
-    probability = "" if one.probability is None else f"{one.probability:.8g}"
-    truth = (f"{value:.8g}" for value in as_dict(one.truth).values())
-    return ",".join([str(one.index), *truth, *ranks, one.outcome, probability])
+    rows = []
+    for one in maps:
+        ranks = one.ranks or ()
+        blank = [None] * (len(RANKED) - len(ranks))
+        rows.append([one.index, *as_dict(one.truth).values(), *ranks, *blank, one.outcome, one.probability])
+    return csv_text(header, rows, digits=8)
 
 
 def sbc_figure(maps: Sequence[MapRanks], path: Path, *, force: bool = False) -> None:
