@@ -44,7 +44,7 @@ bench-posterior: $(VENV)/.installed
 	OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.posterior
 
 bench-record: $(VENV)/.installed
-	$(BIN)/python -m benchmarks.record throughput
+	$(BIN)/python -m benchmarks.record
 
 bench-forward: $(VENV)/.installed
 	OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.forward

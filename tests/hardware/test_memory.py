@@ -11,10 +11,10 @@ from emulated_devices import short_scan
 from foxglove_schemas_protobuf.Grid_pb2 import Grid
 from mcap.reader import make_reader
 
-from benchmarks.record import write_moment
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.scan_mcap import write_scan
 from tactile_bayes.files.scan_recording import RecordingWriter
+from tests.endurance.recording import write_moment
 
 STATM = Path("/proc/self/statm")
 
