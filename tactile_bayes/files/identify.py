@@ -35,16 +35,12 @@ def describe(path: Path) -> dict[str, Any]:
     with open_input(path) as file:
         head = file.read(4096)
     if head.startswith(MCAP_MAGIC):
-        return _scan(path)
+        return summarise_scan(path)
     if head.startswith(HDF5_MAGIC):
         return _netcdf(path)
     if head.lstrip().startswith((b"{", b"[")):
         return _json(path)
     return _table(path, head)
-
-
-def _scan(path: Path) -> dict[str, Any]:
-    return summarise_scan(path)
 
 
 def _netcdf(path: Path) -> dict[str, Any]:
