@@ -1,8 +1,9 @@
 """Simulated visits of lumps that grow, shrink or stay: what `compare` says of them.
 
     python -m benchmarks.visits make DIR --bodies 50 [--seed N]   # exams, resumable: a file a body
-    python -m benchmarks.visits law DIR                           # the law of `size.shared_body`
+    python -m benchmarks.visits law DIR                           # `SHARED_BODY` of `size.visits`
     python -m benchmarks.visits judge DIR                         # false alarms, power, coverage, widths, same mass
+    python -m benchmarks.visits amplitude benchmarks/population.csv.gz  # `AMPLITUDE_LAW` of `size.visits`
 
 A body has three visits of two exams each: two with a lump of the same size, one with a lump 10, 20 or 35 % larger or
 20 % smaller. Its fat, gland and stiffness stay; the lump keeps its centre or the gap to the skin (drawn), so its seat
@@ -142,7 +143,7 @@ def make(folder: Path, *, bodies: int, seed: int, workers: int) -> None:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("step", choices=["make", "law", "judge"])
+    parser.add_argument("step", choices=["make", "law", "judge", "amplitude"])
     parser.add_argument("folder", type=Path)
     parser.add_argument("--bodies", type=int, default=50)
     parser.add_argument(

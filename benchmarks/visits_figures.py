@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import csv
+import gzip
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import combinations
+from itertools import combinations, combinations_with_replacement
 from pathlib import Path
 
 import numpy as np
@@ -13,11 +15,22 @@ from benchmarks.visits import draw_visits
 from tactile_bayes.files.size_json import read_size_calibration, size_calibration_path
 from tactile_bayes.forward.scene import Scene
 from tactile_bayes.geometry import FloatArray, apply, patient_from_base
+from tactile_bayes.presets import DEFAULT_NORMALISE
 from tactile_bayes.report.compare import verdict
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.draws import ShapeDraws
 from tactile_bayes.size.pooling import SizePriors, pool_maps
-from tactile_bayes.size.visits import SHARED_BODY, STRANGERS, JointSizes, Place, SharedBody, apart, joint_sizes
+from tactile_bayes.size.visits import (
+    AMPLITUDE_LAW,
+    SHARED_BODY,
+    STRANGERS,
+    AmplitudeLaw,
+    JointSizes,
+    Place,
+    SharedBody,
+    apart,
+    joint_sizes,
+)
 
 WHOLE = SharedBody(0.0, 1e6)
 """Everything shared: the body is the same whatever the growth."""
@@ -78,9 +91,16 @@ def _calibration() -> BodyCalibration:
     return found
 
 
-def _joint(maps: Sequence[Sequence[ShapeDraws]], calibration: BodyCalibration, law: SharedBody) -> JointSizes:
+def _joint(
+    maps: Sequence[Sequence[ShapeDraws]],
+    calibration: BodyCalibration,
+    law: SharedBody,
+    amplitudes: AmplitudeLaw | None = None,
+) -> JointSizes:
     rng = np.random.default_rng(1)
-    return joint_sizes(maps, calibration=calibration, priors=PRIORS, rng=rng, law=law, number=DRAWS)
+    return joint_sizes(
+        maps, calibration=calibration, priors=PRIORS, rng=rng, law=law, amplitudes=amplitudes, number=DRAWS
+    )
 
 
 def law(folder: Path) -> None:
@@ -141,14 +161,21 @@ class Judged:
 def judge(folder: Path) -> None:
     """Print false alarms, power, coverage and widths on pairs of visits, and how masses are told apart by place."""
     calibration, bodies = _calibration(), list(bodies_in(folder))
-    for name, one in (("product", SHARED_BODY), ("strangers", STRANGERS), ("wholly shared", WHOLE)):
-        rows = [row for body in bodies for row in _judged(body, calibration, one)]
+    for name, one, amplitudes in (
+        ("product", SHARED_BODY, AMPLITUDE_LAW),
+        ("sizes alone", SHARED_BODY, None),
+        ("strangers", STRANGERS, None),
+        ("wholly shared", WHOLE, None),
+    ):
+        rows = [row for body in bodies for row in _judged(body, calibration, one, amplitudes)]
         print(f"\n{name}: {len(bodies)} bodies, {sum(r.maps == 2 for r in rows)} pairs of two maps a visit")
         _print_pairs(rows, in_full=one is SHARED_BODY)
     _print_places(bodies)
 
 
-def _judged(body: Body, calibration: BodyCalibration, one: SharedBody) -> Iterator[Judged]:
+def _judged(
+    body: Body, calibration: BodyCalibration, one: SharedBody, amplitudes: AmplitudeLaw | None
+) -> Iterator[Judged]:
     """Comparisons of a body's pairs of visits, with one map a visit and with two."""
     for count in (1, 2):
         alone = [_log_variance(maps[:count], calibration) if one is SHARED_BODY else np.nan for maps in body.maps]
@@ -156,7 +183,7 @@ def _judged(body: Body, calibration: BodyCalibration, one: SharedBody) -> Iterat
             pair = [body.maps[i][:count], body.maps[j][:count]]
             if min(map(len, pair)) < count:
                 continue
-            change = _joint(pair, calibration, one).change(0, 1)
+            change = _joint(pair, calibration, one, amplitudes).change(0, 1)
             q, true = change.log_summary(0.95), float(body.log_d[j] - body.log_d[i])
             held, separate = q.low <= true <= q.high, float(np.sqrt(alone[i] + alone[j]))
             yield Judged(count, true, q.median - true, change.log_sd, held, verdict(change), separate)
@@ -175,11 +202,11 @@ def _print_pairs(rows: Sequence[Judged], *, in_full: bool) -> None:
         some = [r for r in rows if r.maps == count]
         still = [r for r in some if abs(r.growth) < 0.01]
         alarms = [r.verdict != "no_change_shown" for r in still]
+        rms, stated = (np.sqrt(np.mean(np.square(one))) for one in ([r.error for r in some], [r.sd for r in some]))
         held, scores = [r.held for r in some], [r.error / r.sd for r in some]
         print(
             f"  {count} map(s) a visit: false alarms {_share(alarms)}; 95 % intervals hold {_share(held)}; "
-            f"standardised errors SD {np.std(scores):.2f}; errors SD {np.std([r.error for r in some]):.3f}, "
-            f"stated {np.sqrt(np.mean([r.sd**2 for r in some])):.3f}"
+            f"standardised errors SD {np.std(scores):.2f}; errors rms {rms:.3f}, stated {stated:.3f}"
         )
         if in_full:
             ratio = np.array([r.sd / r.apart_sd for r in some])
@@ -201,6 +228,54 @@ def _print_power(rows: Sequence[Judged]) -> None:
         wrong = sum(a not in (b, "no_change_shown") for a, b in zip(found, right, strict=True))
         held = _share([r.held for r in some])
         print(f"    {percent:+d} %: shown {_share(detected)}, in the wrong direction {wrong}; intervals hold {held}")
+
+
+def amplitude(table: Path) -> None:
+    """Print how ln a goes with a lump's size and a posture's depths over a population's bodies, and with its exams.
+
+    By a regression on a full quadratic in the logs of size, depth of the lump and of the fat, moduli and thickness,
+    and a full cubic in the first three.
+    """
+    with gzip.open(table, "rt", encoding="utf-8") as file:
+        rows = [r for r in csv.DictReader(file) if r["normalise"] == DEFAULT_NORMALISE and r["detected"] == "true"]
+    bodies: dict[str, list[dict[str, str]]] = {}
+    for row in rows:
+        bodies.setdefault(row["body"], []).append(row)
+    log_a = [np.log([float(r["amplitude"]) for r in exams]) for exams in bodies.values()]
+
+    def of_body(name: str) -> FloatArray:
+        return np.array([float(exams[0][name]) for exams in bodies.values()])
+
+    d = of_body("d_mm")
+    depth, moduli = of_body("depth_ratio") * d, [np.log(of_body(name)) for name in ("fat_kpa", "gland_ratio")]
+    lengths = [np.log(one) for one in (d, depth, depth + of_body("seat") * d / 2)]
+    x = np.column_stack([*lengths, 1.0 / of_body("stiffness_ratio"), *moduli, np.log(of_body("thickness_mm"))])
+    centre, scale = x.mean(axis=0), x.std(axis=0)
+
+    def terms(at: FloatArray) -> FloatArray:
+        z = (at - centre) / scale
+        pairs = combinations_with_replacement(range(z.shape[1]), 2)
+        products = [*pairs, *combinations_with_replacement(range(3), 3)]
+        return np.column_stack([np.ones(len(z)), z, *(np.prod(z[:, list(one)], axis=1) for one in products)])
+
+    fitted = np.linalg.lstsq(terms(x), np.array([one.mean() for one in log_a]), rcond=None)[0]
+
+    def slope(*per_log: FloatArray | float) -> FloatArray:
+        step = 0.05 * np.column_stack([np.broadcast_to(one, len(x)) for one in per_log])
+        return np.asarray((terms(x + step) - terms(x - step)) @ fitted / 0.1)
+
+    half = 0.5 * d / depth
+    for name, found in (
+        ("size, the near face keeps its depth", slope(1, half, 0, 0, 0, 0, 0)),
+        ("size, the centre does", slope(1, 0, 0, 0, 0, 0, 0)),
+        ("size, the far face does", slope(1, -half, 0, 0, 0, 0, 0)),
+        ("all depths", slope(0, 1, 1, 0, 0, 0, 1)),
+    ):
+        print(f"d ln a / d ln of {name}: {found.mean():.2f}, SD over {len(found)} bodies {found.std():.2f}")
+    clear = [one for one in log_a if len(one) > 1 and one.mean() > np.log(0.4)]
+    print(
+        f"SD between exams of a body with a > 0.4: {np.sqrt(np.mean([one.var(ddof=1) for one in clear])):.3f} of ln a"
+    )
 
 
 def _print_places(bodies: Sequence[Body]) -> None:

@@ -146,7 +146,7 @@ def elongation(excess: FloatArray, covariance: FloatArray, *, shown: float, prio
     """
     measured, noise = excess / shown, covariance / shown**2
     wide = noise + prior.oval_sd**2 * np.eye(2)
-    log_odds = _log_normal(measured, wide) - _log_normal(measured, noise)
+    log_odds = log_normal(measured, wide) - log_normal(measured, noise)
     log_odds += np.log(prior.oval_probability) - np.log1p(-prior.oval_probability)
     probability = float(1.0 / (1.0 + np.exp(-np.clip(log_odds, -700, 700))))
     wide = wide + SHOWN_CV**2 * np.outer(measured, measured)
@@ -160,7 +160,8 @@ def turn_matrix(angle_rad: float) -> FloatArray:
     return np.array([[c, s], [-s, c]])
 
 
-def _log_normal(x: FloatArray, covariance: FloatArray) -> float:
+def log_normal(x: FloatArray, covariance: FloatArray) -> float:
+    """Log density of a normal about 0, but for a constant."""
     _, log_det = np.linalg.slogdet(covariance)
     return float(-0.5 * (x @ np.linalg.solve(covariance, x) + log_det))
 

@@ -30,13 +30,14 @@ from tactile_bayes.inference.draws import Labels, Quantity, summarise
 from tactile_bayes.inference.points import evened, normal_cdf, normal_quantile, paired_points
 from tactile_bayes.presets import REGISTRATION_MM
 from tactile_bayes.size.bodies import BodyCalibration
-from tactile_bayes.size.draws import ShapeDraws, matched_draws
+from tactile_bayes.size.draws import ShapeDraws, log_normal, matched_draws
 from tactile_bayes.size.fat import BetweenMaps, above_chi_square
 from tactile_bayes.size.pooling import POOLED_DRAWS, MassMaps, SizePriors, Weighted, log_sizes, lump_shape
 
 MOST_VISITS: Final = 10
-DIMENSIONS: Final = 5
-"""Coordinates of the points: the spread between exams, that of B, and three for the lump's shape."""
+DIMENSIONS: Final = 6
+"""Coordinates of the points: the spread between exams, that of B, three for the lump's shape, and the exponent of
+`AmplitudeLaw`."""
 LEAST_SAME: Final = 0.02
 """One mass in fifty is refused though it is the same."""
 CODES: Final = {"subject": "patients", "side": "sides", "mass": "masses"}
@@ -168,6 +169,52 @@ STRANGERS: Final = SharedBody(1.0, 1.0)
 """Nothing shared: each visit's size for itself, as two separate estimates have it."""
 
 
+class AmplitudeLaw(Record):
+    r"""How the amplitude of one mass goes with its size d and with a posture.
+
+    Between bodies an amplitude depends on the depth and the stiffness of a lump. From visit to visit these stay, and
+
+    .. math:: \Delta \ln a = \alpha\, \Delta \ln d - \beta\, \Delta \ln s + \epsilon
+
+    with s the factor by which a posture multiplies every depth, also that of the fat, F. Where a lump grows to is not
+    known: alpha is log-uniform from `least`, where the face next to the skin keeps its depth, to `most`, where the far
+    face does.
+    """
+
+    least: float
+    most: float
+    posture: float
+    """Beta."""
+    posture_sd: float
+    """Of ln s."""
+    fat_sd: float
+    """Of ln F between exams of one posture."""
+    exam_factor: float
+    """SD of ln a between exams, beside the maps' noise, over that of ln d."""
+
+    @property
+    def exponents(self) -> FloatArray:
+        """Values of alpha, equally probable before the maps."""
+        return np.geomspace(self.least, self.most, 15)
+
+    def at_one_depth(
+        self, parts: Sequence[Weighted], fitted: Sequence[BodyCalibration]
+    ) -> tuple[FloatArray, FloatArray]:
+        """(v, n) ln a corrected to the mean depth of fat, and (v,) variances of what posture and exams leave in it."""
+        log_amplitude = np.stack([one.log_amplitude for one in parts])
+        exams = self.exam_factor**2 * np.array([np.mean(one.variance) for one in parts])
+        told, posture = np.zeros(len(parts)), self.posture_sd**2
+        if fitted[0].fat_mm is not None:
+            told = posture / (posture + self.fat_sd**2 / np.array([len(one.weight) for one in parts]))
+            log_fat = np.log([one.fat_mm for one in fitted])
+            log_amplitude += (self.posture * told * (log_fat - log_fat.mean()))[:, None]
+        return log_amplitude, exams + self.posture**2 * posture * (1.0 - told)
+
+
+AMPLITUDE_LAW: Final = AmplitudeLaw(1.0, 6.2, 3.5, 0.04, 0.02, 3.6)
+"""From the bodies of the calibration's table, see record 0134: ``python -m benchmarks.visits amplitude``."""
+
+
 class Change(Record, eq=False):
     """Change of a mass between two visits."""
 
@@ -249,14 +296,15 @@ def joint_sizes(
     rng: np.random.Generator,
     between: BetweenMaps | None = None,
     law: SharedBody | None = None,
+    amplitudes: AmplitudeLaw | None = AMPLITUDE_LAW,
     number: int = POOLED_DRAWS,
 ) -> JointSizes:
     """Joint posterior of a mass's sizes at several visits, from the maps of each on which the lump was found.
 
     The calibration is used at the depth of fat that each visit's maps tell; properties that somebody knows take no
     part. `between` is a spread between exams in place of the priors', `law` how far B is the same at the visits, by
-    default `SHARED_BODY`, or `SHARED_WITHOUT_DEPTH` where maps tell no depth. `UsageError` for fewer than two visits,
-    more than `MOST_VISITS`, or one without a map.
+    default `SHARED_BODY`, or `SHARED_WITHOUT_DEPTH` where maps tell no depth. Without `amplitudes` only the sizes count.
+    `UsageError` for fewer than two visits, more than `MOST_VISITS`, or one without a map.
     """
     _check(visits)
     fitted = visit_calibrations(visits, calibration)
@@ -277,6 +325,9 @@ def joint_sizes(
     correlation = law.correlation(np.array([float(np.nanmean(one.mean)) for one in found]))
     covariance = _covariance(found, fitted, correlation, normal_quantile(points[:, 1]))
     mean = np.stack([one.mean for one in found]) + np.hypot(half[:, 0], half[:, 1])
+    if amplitudes is not None:
+        left, noise = amplitudes.at_one_depth(found, fitted)
+        mean, covariance = _with_amplitudes(mean, covariance, left, noise, amplitudes.exponents, points[:, 5])
     drawn = _drawn(mean, covariance, rng.standard_normal((len(replicates), len(visits))), replicates)
     spread = float(np.sqrt(np.mean(tau**2)))
     return JointSizes(drawn, mean, covariance, replicates, spread, correlation, tuple(fitted))
@@ -329,6 +380,42 @@ def _covariance(
         about = np.stack([np.ones_like(widths), widths], axis=-1)
         found = found + (about @ site.covariance) @ np.swapaxes(about, 1, 2)
     return np.asarray(found)
+
+
+def _with_amplitudes(
+    mean: FloatArray,
+    covariance: FloatArray,
+    log_amplitude: FloatArray,
+    noise: FloatArray,
+    exponents: FloatArray,
+    points: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """(v, n) means and (n, v, v) covariances of ln d given how the amplitudes changed.
+
+    By an exponent alpha, ln a - alpha ln d is one at all visits but for its (v,) noise. Sizes and amplitudes are of the
+    same draws of the maps, and each draw is corrected by its departure from that (Matheron's rule). The exponent of each
+    draw is from the posterior, by (n,) uniform points.
+    """
+    v = len(mean)
+    contrasts = np.diff(np.eye(v), axis=0)
+    departs = contrasts @ (log_amplitude - exponents[:, None, None] * mean)
+    finite = np.isfinite(departs).all(axis=(0, 1))
+    if finite.sum() < 2:
+        return mean, covariance
+    within, left = covariance[finite].mean(axis=0) @ contrasts.T, contrasts * noise @ contrasts.T
+    gains, scores = [], []
+    for alpha, one in zip(exponents, departs[:, :, finite], strict=True):
+        of_draws = np.cov(mean[:, finite], one)[:, v:]
+        spread = of_draws[v:] + alpha**2 * contrasts @ within + left
+        gains.append((of_draws[:v] - alpha * within) @ np.linalg.inv(spread))
+        scores.append(log_normal(one.mean(axis=1), spread))
+    weight = np.cumsum(np.exp(np.array(scores) - max(scores)))
+    index = np.minimum(np.searchsorted(weight / weight[-1], points), len(exponents) - 1)
+    gain = np.stack(gains)[index]
+    moved = np.einsum("nvc,nc->vn", gain, departs[index, :, np.arange(len(points))])
+    kept = np.eye(v) + exponents[index, None, None] * gain @ contrasts
+    turned = kept @ covariance @ np.swapaxes(kept, 1, 2) + gain @ left @ np.swapaxes(gain, 1, 2)
+    return mean - moved, turned
 
 
 def _drawn(mean: FloatArray, covariance: FloatArray, z: FloatArray, replicates: Labels) -> FloatArray:

@@ -15,12 +15,14 @@ from tactile_bayes.files.size_json import read_size_calibration, size_calibratio
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.draws import ShapeDraws, ShapePrior
 from tactile_bayes.size.fat import BetweenMaps
-from tactile_bayes.size.pooling import SizePriors, pooled_size
+from tactile_bayes.size.pooling import POOLED_DRAWS, SizePriors, pooled_size
 from tactile_bayes.size.terms import SiteShift
 from tactile_bayes.size.visits import (
+    AMPLITUDE_LAW,
     SHARED_BODY,
     SHARED_WITHOUT_DEPTH,
     STRANGERS,
+    AmplitudeLaw,
     JointSizes,
     SharedBody,
     doubling_days,
@@ -46,10 +48,23 @@ def shape(log_size: float, *, seed: int = 0, u: float = 0.0) -> ShapeDraws:
     return ShapeDraws(np.full(1000, -1.0 + u), v + 1.5, q, r)
 
 
-def joint(*visits: list[ShapeDraws], law: SharedBody = WHOLE, use: BodyCalibration | None = None, tau: float = EXAM_SD):
-    between = BetweenMaps(tau, 0.0)
+def joint(
+    *visits: list[ShapeDraws],
+    law: SharedBody = WHOLE,
+    use: BodyCalibration | None = None,
+    amplitudes: AmplitudeLaw | None = None,
+    number: int = POOLED_DRAWS,
+):
+    """Sizes of the visits together, by default by the sizes alone."""
     return joint_sizes(
-        visits, calibration=use or calibration(), priors=ROUND, rng=np.random.default_rng(3), between=between, law=law
+        visits,
+        calibration=use or calibration(),
+        priors=ROUND,
+        rng=np.random.default_rng(3),
+        between=BetweenMaps(EXAM_SD, 0.0),
+        law=law,
+        amplitudes=amplitudes,
+        number=number,
     )
 
 
@@ -153,6 +168,7 @@ def trial(
         rng=rng,
         between=between or BetweenMaps(EXAM_SD, 0.0),
         law=use,
+        amplitudes=None,
         number=512,
     )
     change = found.change(0, 1)
@@ -189,6 +205,94 @@ def test_changes_at_a_site_hold_by_its_repeatability_and_not_by_half_of_it():
     assert 0.02 < by_site[:, 1].mean() < 0.08
     assert half[:, 0].mean() < 0.88
     assert without[:, 0].mean() < 0.75
+
+
+ONE = AmplitudeLaw(2.0, 2.0, posture=3.0, posture_sd=0.04, fat_sd=0.02, exam_factor=3.0)
+"""A law with one exponent, by which everything is normal."""
+
+
+@pytest.mark.parametrize("u", [0.2, 0.3, 0.0])
+def test_amplitudes_are_weighted_by_what_posture_and_exams_leave_in_them(u):
+    """Two normals about one change: the sizes' own, and ln a over 2 with what posture and exams leave in it."""
+    visits = [shape(2.7)], [shape(2.8 + 0.3 * u, seed=1, u=u)]
+    alone, both = joint(*visits).change(0, 1), joint(*visits, amplitudes=ONE).change(0, 1)
+    by_size = 1 / (2 * (EXAM_SD**2 + NOISE**2))
+    by_amplitude = 2.0**2 / (2 * ((3.0 * EXAM_SD) ** 2 + (3.0 * 0.04) ** 2))
+    middle = (by_size * np.median(alone.log_ratio) + by_amplitude * u / 2.0) / (by_size + by_amplitude)
+    assert np.median(both.log_ratio) == pytest.approx(middle, abs=0.002)
+    assert both.log_sd == pytest.approx((by_size + by_amplitude) ** -0.5, rel=0.04)
+
+
+def test_noise_that_moves_size_and_amplitude_alike_shows_in_the_amplitude_and_goes():
+    """A mass that did not change, whose maps' errors of ln d and ln a are the same."""
+    rng = np.random.default_rng(5)
+
+    def faint(error: float) -> ShapeDraws:
+        one, common = shape(2.7, seed=int(rng.integers(1000))), 0.2 * rng.standard_normal(1000)
+        return replace(one, log_width=one.log_width + error + common, log_amplitude=one.log_amplitude + error + common)
+
+    visits = [faint(0.0)], [faint(0.2)]
+    sure = replace(ONE, least=1e-3, most=1e-3, posture_sd=0.0, exam_factor=0.1)
+    alone, both = joint(*visits).change(0, 1), joint(*visits, amplitudes=sure).change(0, 1)
+    assert np.median(alone.log_ratio) == pytest.approx(0.26, abs=0.03)
+    assert np.median(both.log_ratio) == pytest.approx(0.0, abs=0.03)
+    assert both.log_sd < 0.2 * alone.log_sd
+
+
+def test_an_amplitude_that_fell_with_deeper_fat_is_no_shrinkage():
+    """In the control, whose amplitudes do not depend on the posture, it is."""
+    path = size_calibration_path("solid")
+    assert path is not None
+    shipped = read_size_calibration(path)
+    profiles = (0.0, 0.0, 0.0), (0.03, 0.0, 0.0)
+    first, later = visit_calibrations([[replace(shape(2.5), profile=one)] for one in profiles], shipped)
+    deeper = float(np.log(later.fat_mm / first.fat_mm))
+    by_posture = -AMPLITUDE_LAW.posture * deeper
+    visits = [[replace(shape(2.5, u=u), profile=one)] for u, one in zip((0.0, by_posture), profiles, strict=True)]
+    law = replace(AMPLITUDE_LAW, posture_sd=1.0)
+    stayed, shrunk = (
+        joint(*visits, use=shipped, amplitudes=one).change(0, 1) for one in (law, replace(law, posture=0.0))
+    )
+    alone = joint(*visits, use=shipped).change(0, 1)
+    middle = [float(np.median(one.log_ratio)) for one in (stayed, shrunk, alone)]
+    assert np.sign(deeper) * (middle[0] - middle[1]) > 0.02
+    assert abs(middle[0]) < abs(middle[2])
+
+
+def seen(rng: np.random.Generator, growth: float, exponent: float, exam_factor: float) -> list[list[ShapeDraws]]:
+    """Two visits of two exams of one body, with amplitudes as a law has them."""
+    visits = []
+    for g, s in zip((0.0, growth), AMPLITUDE_LAW.posture_sd * rng.standard_normal(2), strict=True):
+        exams = []
+        for e in rng.standard_normal((2, 2)):
+            u = exponent * g - AMPLITUDE_LAW.posture * s + exam_factor * EXAM_SD * e[1]
+            exams.append(shape(2.6 + g + EXAM_SD * e[0], seed=int(rng.integers(1 << 30)), u=u))
+        visits.append(exams)
+    return visits
+
+
+def test_intervals_by_amplitudes_hold_wherever_the_lump_grew_to():
+    """Nominal 95 and 5 % over 200 pairs each; the control has a fifth of the spread between exams in ln a, no posture."""
+    rng, law = np.random.default_rng(29), replace(AMPLITUDE_LAW, exam_factor=3.0)
+
+    def judged(growth: float, use: AmplitudeLaw) -> tuple[float, float]:
+        found = []
+        for _ in range(200):
+            exponent = float(np.exp(rng.uniform(np.log(law.least), np.log(law.most))))
+            visits = seen(rng, growth, exponent, 3.0)
+            change = joint(*visits, amplitudes=use, number=512).change(0, 1)
+            q = change.log_summary(0.95)
+            found.append((q.low <= growth <= q.high, not 0.025 <= change.probability_above(0.0) <= 0.975))
+        held, alarmed = np.array(found).mean(axis=0)
+        return float(held), float(alarmed)
+
+    still, grown = judged(0.0, law), judged(0.15, law)
+    assert still[0] > 0.92
+    assert still[1] < 0.08
+    assert 0.92 < grown[0] < 0.99
+    assert grown[1] > 0.9
+    sure = judged(0.0, replace(law, posture_sd=0.001, exam_factor=0.6))
+    assert sure[1] > 0.12
 
 
 def test_the_smallest_detectable_change_is_that_whose_interval_begins_at_none():
