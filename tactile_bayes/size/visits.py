@@ -303,8 +303,8 @@ def joint_sizes(
 
     The calibration is used at the depth of fat that each visit's maps tell; properties that somebody knows take no
     part. `between` is a spread between exams in place of the priors', `law` how far B is the same at the visits, by
-    default `SHARED_BODY`, or `SHARED_WITHOUT_DEPTH` where maps tell no depth. Without `amplitudes` only the sizes count.
-    `UsageError` for fewer than two visits, more than `MOST_VISITS`, or one without a map.
+    default `SHARED_BODY`, or `SHARED_WITHOUT_DEPTH` where maps tell no depth. None for
+    `amplitudes` leaves them out. `UsageError` for fewer than two visits, more than `MOST_VISITS`, or one without a map.
     """
     _check(visits)
     fitted = visit_calibrations(visits, calibration)
@@ -393,8 +393,8 @@ def _with_amplitudes(
     """(v, n) means and (n, v, v) covariances of ln d given how the amplitudes changed.
 
     By an exponent alpha, ln a - alpha ln d is one at all visits but for its (v,) noise. Sizes and amplitudes are of the
-    same draws of the maps, and each draw is corrected by its departure from that (Matheron's rule). The exponent of each
-    draw is from the posterior, by (n,) uniform points.
+    same draws of the maps, and each draw is corrected by its departure from that (Matheron's rule). The exponent of
+    each draw is from the posterior, by (n,) uniform points.
     """
     v = len(mean)
     contrasts = np.diff(np.eye(v), axis=0)
