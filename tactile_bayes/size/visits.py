@@ -191,6 +191,8 @@ class AmplitudeLaw(Record):
     """Of ln F between exams of one posture."""
     exam_factor: float
     """SD of ln a between exams, beside the maps' noise, over that of ln d."""
+    otherwise: float
+    """Probability that something else changes the amplitude, with an SD of 1 in ln a."""
 
     @property
     def exponents(self) -> FloatArray:
@@ -211,7 +213,7 @@ class AmplitudeLaw(Record):
         return log_amplitude, exams + self.posture**2 * posture * (1.0 - told)
 
 
-AMPLITUDE_LAW: Final = AmplitudeLaw(1.0, 6.2, 3.5, 0.04, 0.02, 3.6)
+AMPLITUDE_LAW: Final = AmplitudeLaw(1.0, 6.2, 3.5, 0.04, 0.02, 3.6, 0.1)
 """From the bodies of the calibration's table, see record 0134: ``python -m benchmarks.visits amplitude``."""
 
 
@@ -327,7 +329,7 @@ def joint_sizes(
     mean = np.stack([one.mean for one in found]) + np.hypot(half[:, 0], half[:, 1])
     if amplitudes is not None:
         left, noise = amplitudes.at_one_depth(found, fitted)
-        mean, covariance = _with_amplitudes(mean, covariance, left, noise, amplitudes.exponents, points[:, 5])
+        mean, covariance = _with_amplitudes(mean, covariance, left, noise, amplitudes, points[:, 5])
     drawn = _drawn(mean, covariance, rng.standard_normal((len(replicates), len(visits))), replicates)
     spread = float(np.sqrt(np.mean(tau**2)))
     return JointSizes(drawn, mean, covariance, replicates, spread, correlation, tuple(fitted))
@@ -387,16 +389,16 @@ def _with_amplitudes(
     covariance: FloatArray,
     log_amplitude: FloatArray,
     noise: FloatArray,
-    exponents: FloatArray,
+    law: AmplitudeLaw,
     points: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
     """(v, n) means and (n, v, v) covariances of ln d given how the amplitudes changed.
 
     By an exponent alpha, ln a - alpha ln d is one at all visits but for its (v,) noise. Sizes and amplitudes are of the
     same draws of the maps, and each draw is corrected by its departure from that (Matheron's rule). The exponent of
-    each draw is from the posterior, by (n,) uniform points.
+    each draw, or that there is none, is from the posterior, by (n,) uniform points.
     """
-    v = len(mean)
+    v, exponents = len(mean), law.exponents
     contrasts = np.diff(np.eye(v), axis=0)
     departs = contrasts @ (log_amplitude - exponents[:, None, None] * mean)
     finite = np.isfinite(departs).all(axis=(0, 1))
@@ -409,8 +411,13 @@ def _with_amplitudes(
         spread = of_draws[v:] + alpha**2 * contrasts @ within + left
         gains.append((of_draws[:v] - alpha * within) @ np.linalg.inv(spread))
         scores.append(log_normal(one.mean(axis=1), spread))
-    weight = np.cumsum(np.exp(np.array(scores) - max(scores)))
-    index = np.minimum(np.searchsorted(weight / weight[-1], points), len(exponents) - 1)
+    changed = (contrasts @ log_amplitude)[:, finite].mean(axis=1)
+    scores.append(log_normal(changed, contrasts @ contrasts.T))
+    prior = np.append(np.full(len(exponents), (1.0 - law.otherwise) / len(exponents)), law.otherwise)
+    weight = np.cumsum(prior * np.exp(np.array(scores) - max(scores)))
+    index = np.searchsorted(weight[:-1] / weight[-1], points)
+    exponents, departs = np.append(exponents, 0.0), np.concatenate([departs, np.zeros_like(departs[:1])])
+    gains.append(np.zeros_like(gains[0]))
     gain = np.stack(gains)[index]
     moved = np.einsum("nvc,nc->vn", gain, departs[index, :, np.arange(len(points))])
     kept = np.eye(v) + exponents[index, None, None] * gain @ contrasts

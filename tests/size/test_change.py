@@ -207,7 +207,7 @@ def test_changes_at_a_site_hold_by_its_repeatability_and_not_by_half_of_it():
     assert without[:, 0].mean() < 0.75
 
 
-ONE = AmplitudeLaw(2.0, 2.0, posture=3.0, posture_sd=0.04, fat_sd=0.02, exam_factor=3.0)
+ONE = AmplitudeLaw(2.0, 2.0, posture=3.0, posture_sd=0.04, fat_sd=0.02, exam_factor=3.0, otherwise=0.0)
 """A law with one exponent, by which everything is normal."""
 
 
@@ -257,6 +257,16 @@ def test_an_amplitude_that_fell_with_deeper_fat_is_no_shrinkage():
     middle = [float(np.median(one.log_ratio)) for one in (stayed, shrunk, alone)]
     assert np.sign(deeper) * (middle[0] - middle[1]) > 0.02
     assert abs(middle[0]) < abs(middle[2])
+
+
+def test_an_amplitude_that_changed_for_another_reason_leaves_the_sizes_alone():
+    """A mass that became much softer: without room for that, the control, the change is wrong and sure."""
+    visits = [shape(2.7)], [shape(2.7, seed=1, u=-1.0)]
+    alone = joint(*visits).change(0, 1)
+    found, sure = (joint(*visits, amplitudes=one).change(0, 1) for one in (replace(ONE, otherwise=0.1), ONE))
+    assert np.median(found.log_ratio) == pytest.approx(np.median(alone.log_ratio), abs=0.01)
+    assert found.log_sd == pytest.approx(alone.log_sd, rel=0.05)
+    assert np.median(sure.log_ratio) < np.median(alone.log_ratio) - 0.02
 
 
 def seen(rng: np.random.Generator, growth: float, exponent: float, exam_factor: float) -> list[list[ShapeDraws]]:
