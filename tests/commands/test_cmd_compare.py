@@ -169,8 +169,9 @@ def test_a_stated_spread_between_exams_widens_the_change_and_leaves_one_interval
     stated = settings(folder, between_map_sd=0.15)
     done = run(folder, "a0.nc", "a1.nc", "--with", "grown0.nc", "grown1.nc", *stated, "--json")
     (change,) = json.loads(done.stdout)["changes"]
-    learned = grown["changes"][0]["log_ratio"]["sd"]  # 0.15 sqrt(2 / 2 maps) comes on top of the rest
-    assert change["log_ratio"]["sd"] == pytest.approx(np.hypot(0.15, learned), rel=0.1)
+    learned = grown["changes"][0]["log_ratio"]["sd"]
+    most = np.hypot(0.15, learned)  # 0.15 sqrt(2 / 2 maps) on top of the rest, were it not for the amplitudes
+    assert 0.75 * most < change["log_ratio"]["sd"] < 1.02 * most
     assert change["log_ratio"]["sd"] > 1.5 * learned
     assert change["another_exam"] is None
     assert grown["changes"][0]["another_exam"]["between_map_sd"] > 0.05
