@@ -206,9 +206,10 @@ class AmplitudeLaw(Record):
         log_amplitude = np.stack([one.log_amplitude for one in parts])
         exams = self.exam_factor**2 * np.array([np.mean(one.variance) for one in parts])
         told, posture = np.zeros(len(parts)), self.posture_sd**2
-        if fitted[0].fat_mm is not None:
+        fats = [one.fat_mm for one in fitted if one.fat_mm is not None]
+        if len(fats) == len(fitted):
             told = posture / (posture + self.fat_sd**2 / np.array([len(one.weight) for one in parts]))
-            log_fat = np.log([one.fat_mm for one in fitted])
+            log_fat = np.log(fats)
             log_amplitude += (self.posture * told * (log_fat - log_fat.mean()))[:, None]
         return log_amplitude, exams + self.posture**2 * posture * (1.0 - told)
 
