@@ -64,9 +64,9 @@ def simulated_fit() -> Any:
 
 def importance(fit: Any) -> Draw:
     """The program's default method, to the wanted accuracy."""
-    from tactile_bayes.posterior.draw import Sampled, importance_draws
+    from tactile_bayes.posterior.draw import importance_draws
 
-    return lambda rng: importance_draws(Sampled.of(fit), rng=rng, accuracy_sd=WANTED_SD).flat
+    return lambda rng: importance_draws(fit.sampled(), rng=rng, accuracy_sd=WANTED_SD).flat
 
 
 def laplace(fit: Any) -> Draw:
@@ -78,10 +78,10 @@ def laplace(fit: Any) -> Draw:
 
 def ensemble(fit: Any) -> Draw:
     """The program's MCMC with its own stopping rule."""
-    from tactile_bayes.posterior.draw import Sampled, ensemble_draws
+    from tactile_bayes.posterior.draw import ensemble_draws
     from tactile_bayes.posterior.options import EstimateOptions
 
-    return lambda rng: ensemble_draws(Sampled.of(fit), rng=rng, options=EstimateOptions("ensemble")).flat
+    return lambda rng: ensemble_draws(fit.sampled(), rng=rng, options=EstimateOptions("ensemble")).flat
 
 
 def emcee_plain(fit: Any) -> Draw:

@@ -355,9 +355,7 @@ def _size_mass(bodies: str, index: int) -> Row:
             single.append(None)
             continue
         one = found.map_posterior
-        profile = head_profile(tactile_map.quality)
-        told = {"profile": profile, "oblique": one.oblique, "irregular": one.irregular}
-        shapes.append(ShapeDraws.of(one.amplitude, one.sigma_x_mm, one.sigma_y_mm, one.angle_rad, **told))
+        shapes.append(ShapeDraws.of(one.bump(), profile=head_profile(tactile_map.quality)))
         single.append(_both(found.size))
     pooled = pool_maps(shapes, calibration=calibration, priors=SizePriors(), rng=np.random.default_rng([SEED, index]))
     return {

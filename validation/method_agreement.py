@@ -127,7 +127,7 @@ def under_other_prior(fit: FieldFit) -> FieldFit:
 def differences(density: Sampled, weighted: Sequence[Sampled], *, seed: int) -> list[FloatArray]:
     """(p, 3) differences of quantiles from the chains', in joint errors, for each density drawn by weights."""
     rng = np.random.default_rng([22, seed])
-    chains = ensemble(density, density.mean, density.covariance, rng=rng, options=CHAINS).theta
+    chains = ensemble(density.log_density, density.mean, density.covariance, rng=rng, options=CHAINS).theta
     names = range(chains.shape[2])
     error = np.array(
         [[float(arviz.mcse(chains[..., i], method="quantile", prob=q)) for q in PROBABILITIES] for i in names]
@@ -154,7 +154,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         fit = fit_of(MAPS[name]())
         try:
             own, other = differences(
-                Sampled.of(fit), [Sampled.of(fit), Sampled.of(under_other_prior(fit))], seed=tuple(MAPS).index(name)
+                fit.sampled(), [fit.sampled(), under_other_prior(fit).sampled()], seed=tuple(MAPS).index(name)
             )
         except NotConvergedError as error:
             print(f"| {name} | {error} | | | | | {time.process_time() - begun:.0f} |", flush=True)

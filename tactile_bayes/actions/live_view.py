@@ -38,7 +38,7 @@ from tactile_bayes.hardware.live import Feed, FeedReader, LiveMap, LiveState
 from tactile_bayes.hardware.serve import LiveServer, address_of
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.bump import candidate_centres
-from tactile_bayes.posterior.draws import MapPosterior
+from tactile_bayes.posterior.draw import MapPosterior
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.options import EstimateOptions, FitOptions
 from tactile_bayes.presets import FIELD_COSINES, FIT_RADIUS_MM, INTERVAL

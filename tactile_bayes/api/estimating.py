@@ -391,14 +391,5 @@ def pooling_shape(tactile_map: TactileMap, estimate: Estimate) -> ShapeDraws | N
     if posterior is None or estimate.draws is None:
         return None
     angle = 0.0 if turn is None else math.atan2(float(turn[1, 0]), float(turn[0, 0]))
-    return ShapeDraws.of(
-        posterior.amplitude,
-        posterior.sigma_x_mm,
-        posterior.sigma_y_mm,
-        posterior.angle_rad,
-        turn_rad=angle,
-        profile=head_profile(tactile_map.quality),
-        labels=estimate.draws.replicates,
-        oblique=posterior.oblique,
-        irregular=posterior.irregular,
-    )
+    bump = posterior.bump(estimate.draws.replicates)
+    return ShapeDraws.of(bump, turn_rad=angle, profile=head_profile(tactile_map.quality))

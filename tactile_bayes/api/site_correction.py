@@ -23,7 +23,7 @@ from tactile_bayes.files.tables import read_table
 from tactile_bayes.forward.tissue import parse_seat
 from tactile_bayes.presets import HEAD_PROFILE, LEAST_HARD_RATIO
 from tactile_bayes.size.bodies import BodyCalibration
-from tactile_bayes.size.draws import ShapeDraws
+from tactile_bayes.size.draws import BumpDraws, ShapeDraws
 
 if TYPE_CHECKING:
     from tactile_bayes.api.estimating import Progress
@@ -159,7 +159,7 @@ def _from_bumps(source: Path | Sheet, calibration: BodyCalibration, declared: Ma
             )
             told = tuple(columns[one][i] for one in HEAD_PROFILE)
             profile = None if None in told else told
-            shape = ShapeDraws.of(amplitude, sigma_x, sigma_y, np.zeros(1), profile=profile)
+            shape = ShapeDraws.of(BumpDraws(amplitude, sigma_x, sigma_y, np.zeros(1)), profile=profile)
             maps.append(PhantomMap(name, columns["d_mm"][i], shape, _known(rows, i)))
     return _Phantoms(maps, left_out, {})
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -11,13 +10,11 @@ from tactile_bayes.declarations import Record, field
 from tactile_bayes.forward.gaussian import principal_widths
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.draws import quantiles_of
+from tactile_bayes.posterior.fit import FieldFit
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.posterior.selection import fitted_values, pointwise_log_likelihood
+from tactile_bayes.size.draws import BumpDraws
 from tactile_bayes.size.pooling import Calibration, SizePriors, draw_sizes
-
-if TYPE_CHECKING:
-    from tactile_bayes.posterior.fit import FieldFit
-
 
 # --- Fitted values of an estimate's window beside its data: level, tilt, bump and what lies beside it, without noise.
 
@@ -169,8 +166,8 @@ def _prior(
         share = float(np.mean(inside))
         notes["sizes"] = f"of the {100 * share:.0f} % of draws within the calibration's range, at evenly spaced ranks"
         if sum(inside) >= LEAST_SIZED:
-            chosen = [one[inside][None] for one in (amplitude, sigma_x, sigma_y, angle)]
-            size = draw_sizes(*chosen, calibration=calibration, priors=size_priors, replicates=None, rng=rng)
+            a, x, y, turn = (one[inside][None] for one in (amplitude, sigma_x, sigma_y, angle))
+            size = draw_sizes(BumpDraws(a, x, y, turn), calibration=calibration, priors=size_priors, rng=rng)
             ranks = (np.arange(len(kept)) + 0.5) / len(kept)
             for name in ("max_size_mm", "min_size_mm"):
                 known = np.sort(getattr(size, name).ravel())

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 
 from tactile_bayes.declarations import Record, replace
@@ -13,15 +11,22 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.draws import ParameterDraws, Solved
 from tactile_bayes.inference.points import MOST_PAIRED, normal_quantile, paired_points
 from tactile_bayes.mapping.map import TactileMap
+from tactile_bayes.posterior.abstention import rim_fault
 from tactile_bayes.posterior.bump import PoseNoise, overlap, trusted
 from tactile_bayes.posterior.detection import Detection, detection_from_odds
-from tactile_bayes.posterior.draw import draw_scene
-from tactile_bayes.posterior.draws import MapPosterior, NoiseFigures
+from tactile_bayes.posterior.draw import MapPosterior, ModalBump, NoiseFigures, Progress, draw_parameters
 from tactile_bayes.posterior.field import Window, cosines_for
-from tactile_bayes.posterior.fit import FieldFit, field_window, modal_widths, shape_draws, start_vector, tangent_columns
+from tactile_bayes.posterior.fit import (
+    FieldFit,
+    field_window,
+    modal_widths,
+    shape_draws,
+    start_vector,
+    tangent_columns,
+)
 from tactile_bayes.posterior.linear import FLOOR
 from tactile_bayes.posterior.neighbours import WANTED, Surroundings, add_beside, ridge_instead, ridge_text, rising_ribs
-from tactile_bayes.posterior.options import EstimateOptions, scene_asked
+from tactile_bayes.posterior.options import DETECTED, EstimateOptions, scene_asked
 from tactile_bayes.posterior.scene import Problem, Scene
 from tactile_bayes.posterior.selection import (
     ASKING,
@@ -31,7 +36,7 @@ from tactile_bayes.posterior.selection import (
     exponent_covariance,
     near,
 )
-from tactile_bayes.posterior.white import BumpFit
+from tactile_bayes.posterior.white import BumpFit, MapDraws
 from tactile_bayes.presets import FIELD_COSINES, SceneAsked
 
 # --- Outline of a lump: whether its bump is skewed, or rounder inside than outside, more than a ball's is.
@@ -151,52 +156,89 @@ def _roots(axis_mm: FloatArray, side_mm: float) -> FloatArray:
 
 # --- Estimation under correlated errors: detection, scene and draws from a least-squares fit.
 
-Progress = Callable[[int, int], None]
 LEAST_VARIANCE = 1e-12
 """Directions in which errors of the frames' places spread less, as a share of the largest, are left out."""
 
 
-class FieldAnswer(Record, eq=False):
-    """Detection and scene of a map under correlated errors."""
+class Correlated(Record, eq=False):
+    """An `Assessment` under correlated errors."""
 
+    tactile_map: TactileMap
+    fit: BumpFit
     detection: Detection
-    """The odds of a lump."""
-    choice: SceneChoice
-    """The scene."""
+    scene: SceneChoice | None = None
+    """None where the density has no mode: no bump stands out from the correlated noise."""
+    fault: str = ""
+
+    @classmethod
+    def of(cls, tactile_map: TactileMap, fit: BumpFit, options: EstimateOptions) -> Correlated:
+        """Compare a bump with no bump, and where it is a lump by the evidence with neighbouring structures."""
+        try:
+            scene, detection = fit_and_test(tactile_map, fit, options)
+        except NotConvergedError:
+            return cls(tactile_map, fit, Detection(0.0, -np.inf))
+        x, y = (float(scene.plain.scene.column(scene.plain.mode[None], name)[0]) for name in "xy")
+        fault = rim_fault(tactile_map, (x, y), modal_widths(scene.plain), radius_mm=options.fit.radius_mm)
+        if not fault and detection.probability >= DETECTED:
+            scene, detection = with_neighbours(scene, detection, tactile_map, asked=scene_asked(options))
+        return cls(tactile_map, fit, detection, scene, fault)
+
+    def bump(self) -> ModalBump:
+        """The bump at the scene's mode."""
+        fit = self._scene.fit
+        x, y = (float(fit.scene.column(fit.mode, name)) for name in "xy")
+        return ModalBump(fit.target.amplitude_at(fit.mode), x, y, *self.widths_mm())
+
+    def widths_mm(self) -> tuple[float, float]:
+        """Its widths."""
+        return modal_widths(self._scene.fit)
+
+    @property
+    def _scene(self) -> SceneChoice:
+        if self.scene is None:
+            raise NotConvergedError(
+                "no bump at this place stands out from the correlated noise, so nothing can be drawn"
+            )
+        return self.scene
+
+    def draw(self, options: EstimateOptions, *, rng: np.random.Generator, progress: Progress | None) -> MapDraws:
+        """Draw from the posterior; `NotConvergedError` also when the scene's neighbour was not found."""
+        choice, asked = self._scene, scene_asked(options)
+        wanted = WANTED.get(asked, "")
+        if wanted and choice.fit.scene.extra != wanted:
+            raise NotConvergedError(f"no {wanted} found beside the bump; leave out --scene {asked}")
+        solved = Solved(choice.fit.target.conditional)
+        draws, passed_over = draw_parameters(choice.fit, options, rng=rng, progress=progress, solved=solved)
+        detection = self.detection
+        if choice.fit is choice.plain and not detection.ridge and "log_evidence" in draws.diagnostics:
+            detection = field_detection(choice.plain, self.tactile_map, draws.diagnostics["log_evidence"])
+        places = pose_covariance(choice.fit)
+        figures = _figures(choice, _places_share(choice.fit, places), passed_over)
+        return MapDraws(detection, self.fit, draws, _posterior(choice.fit, draws, rng, solved, places), figures)
 
 
-class FieldDraws(Record, eq=False):
-    """Draws under correlated errors: of the scene's parameters, by name, and figures of fit and noise."""
-
-    detection: Detection
-    draws: ParameterDraws
-    posterior: MapPosterior
-    figures: NoiseFigures
-
-
-def look(tactile_map: TactileMap, fit: BumpFit, options: EstimateOptions) -> FieldAnswer:
-    """Fit the bump under correlated errors, and compare it with no bump; `NotConvergedError` when the density has no
-    mode.
+def fit_and_test(tactile_map: TactileMap, fit: BumpFit, options: EstimateOptions) -> tuple[SceneChoice, Detection]:
+    """Fit the bump under correlated errors, and compare it with no bump; `NotConvergedError` without a mode.
 
     Where the options give no `field_cosines`, a narrow bump that may be a lump is fitted once more, with a finer field.
     """
 
-    def under(number: int, start: FloatArray) -> FieldAnswer:
+    def under(number: int, start: FloatArray) -> tuple[SceneChoice, Detection]:
         problem = Problem(field_window(fit, cosines=number), options.prior, options.fit.radius_mm, fit.bump.scale)
         choice = choose_shape(problem, start, scene=scene_asked(options))
-        return FieldAnswer(field_detection(choice.plain, tactile_map, choice.plain.log_evidence), choice)
+        return choice, field_detection(choice.plain, tactile_map, choice.plain.log_evidence)
 
     full, cosines = Scene("rotated"), options.fit.field_cosines
-    answer = under(cosines or FIELD_COSINES, start_vector(fit, full))
-    if cosines is not None or not answer.detection.log_bayes_factor > 0:
-        return answer
-    wanted = _called_for(answer.choice.plain)
+    choice, detection = under(cosines or FIELD_COSINES, start_vector(fit, full))
+    if cosines is not None or not detection.log_bayes_factor > 0:
+        return choice, detection
+    wanted = cosines_needed(choice.plain)
     if wanted <= FIELD_COSINES:
-        return answer
-    return under(wanted, answer.choice.plain.scene.carried(answer.choice.plain.mode, full))
+        return choice, detection
+    return under(wanted, choice.plain.scene.carried(choice.plain.mode, full))
 
 
-def _called_for(plain: FieldFit) -> int:
+def cosines_needed(plain: FieldFit) -> int:
     """Number of cosines for the narrower width of the fitted bump."""
     narrower, window = min(modal_widths(plain)), plain.target.window
     return max(cosines_for(narrower, axis) for axis in (window.x_mm, window.y_mm))
@@ -216,46 +258,24 @@ def _searched(plain: FieldFit, tactile_map: TactileMap) -> float:
     return float(np.log(max(area / (np.pi * plain.target.problem.radius_mm**2), 1.0)))
 
 
-def with_neighbours(answer: FieldAnswer, tactile_map: TactileMap, *, scene: SceneAsked = "auto") -> FieldAnswer:
+def with_neighbours(
+    choice: SceneChoice, detection: Detection, tactile_map: TactileMap, *, asked: SceneAsked
+) -> tuple[SceneChoice, Detection]:
     """Add a second structure where the evidence supports it, and compare the lump with a ridge where one rises.
 
     A bump alone is tested for a departure from a Gaussian. Only scenes in `ASKING` are compared with a ridge:
     without a rib in the model a lump beside one would lose to it.
     """
-    if scene not in ASKING:
-        return replace(answer, choice=ask_departure(answer.choice))
+    if asked not in ASKING:
+        return ask_departure(choice), detection
     surroundings = Surroundings.of(tactile_map)
-    ridges = rising_ribs(answer.choice.plain, surroundings)
-    choice = add_beside(answer.choice, surroundings, ridges=ridges, scene=scene)
+    ridges = rising_ribs(choice.plain, surroundings)
+    choice = add_beside(choice, surroundings, ridges=ridges, scene=asked)
     ridge = ridge_instead(choice, ridges)
-    found = replace(answer, choice=ask_departure(choice))
     if ridge is None or ridge.log_evidence < choice.plain.target.null_log_evidence():
-        return found
+        return ask_departure(choice), detection
     log_factor = choice.fit.log_evidence - ridge.log_evidence - _searched(choice.plain, tactile_map)
-    return replace(found, detection=detection_from_odds(log_factor, ridge=ridge_text(ridge)))
-
-
-def draw(
-    answer: FieldAnswer,
-    tactile_map: TactileMap,
-    options: EstimateOptions,
-    *,
-    rng: np.random.Generator,
-    progress: Progress | None = None,
-) -> FieldDraws:
-    """Draw from the posterior; `NotConvergedError` when no method converges, or the scene's neighbour was not found."""
-    scene = scene_asked(options)
-    choice, wanted = answer.choice, WANTED.get(scene, "")
-    if wanted and choice.fit.scene.extra != wanted:
-        raise NotConvergedError(f"no {wanted} found beside the bump; leave out --scene {scene}")
-    solved = Solved(choice.fit.target.conditional)
-    draws, passed_over = draw_scene(choice.fit, options, rng=rng, progress=progress, solved=solved)
-    detection = answer.detection
-    if choice.fit is choice.plain and not detection.ridge and "log_evidence" in draws.diagnostics:
-        detection = field_detection(choice.plain, tactile_map, draws.diagnostics["log_evidence"])
-    places = pose_covariance(choice.fit)
-    figures = _figures(choice, _places_share(choice.fit, places), passed_over)
-    return FieldDraws(detection, draws, _posterior(choice.fit, draws, rng, solved, places), figures)
+    return ask_departure(choice), detection_from_odds(log_factor, ridge=ridge_text(ridge))
 
 
 def _posterior(

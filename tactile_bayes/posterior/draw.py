@@ -1,110 +1,139 @@
-"""Posterior draws of a scene by the chosen method, or by the next one if its diagnostics fail."""
+"""Posterior draws of a bump, under either noise model: by the chosen method, or by the next one where it fails."""
 
 from __future__ import annotations
 
-import hashlib
-import json
-from collections.abc import Callable, Mapping
-from typing import Literal, assert_never
+from collections.abc import Callable, Mapping, Sequence
+from typing import Protocol
 
 import numpy as np
 
-from tactile_bayes.declarations import Record, as_dict, replace
+from tactile_bayes.declarations import Record, field, replace
 from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.inference.draws import END_ERROR, INDEPENDENT_DRAWS, ParameterDraws, Solved, distinct_rows
-from tactile_bayes.inference.importance import TRUSTED_SHAPE, Gaussians, importance, importance_options, smooth_weights
-from tactile_bayes.posterior.fit import FieldFit, laplace_mixture, newton_mixture
-from tactile_bayes.posterior.marginal import NEGLIGIBLE
+from tactile_bayes.inference.draws import END_ERROR, Labels, ParameterDraws, Solved, distinct_rows
+from tactile_bayes.inference.importance import TRUSTED_SHAPE, Gaussians, importance, importance_options
+from tactile_bayes.inference.modes import LogDensity
 from tactile_bayes.posterior.options import EstimateOptions
+from tactile_bayes.presets import Method
+from tactile_bayes.size.draws import BumpDraws
 
-Sampler = Literal["laplace", "importance", "ensemble"]
-LADDER: tuple[Sampler, ...] = ("laplace", "importance", "ensemble")
-STEPS_UP = 1
-"""Methods tried after the requested one: a user who wants a quick one does not wait minutes for chains."""
+# --- Joint posterior draws, the result of every method and noise model.
+
+
+class MapPosterior(Record, eq=False):
+    """Joint draws of the quantities in Eq 7, each (chain, draw)."""
+
+    amplitude: FloatArray
+    sigma_x_mm: FloatArray
+    sigma_y_mm: FloatArray
+    x_mm: FloatArray
+    y_mm: FloatArray
+    angle_rad: FloatArray
+    background: FloatArray
+    noise_sd: FloatArray
+    oblique: tuple[float, float] | None = None
+    """Mean and SD of r, the half log axis ratio 45 degrees from the map's x axis, where the draws have none and it was
+    measured beside them; None otherwise.
+    """
+    irregular: bool = False
+    """True where the bump is less regular than a ball's, see `correlated.outline`."""
+
+    @property
+    def medians(self) -> tuple[float, float, float]:
+        """Posterior medians of amplitude, sigma_x_mm and sigma_y_mm."""
+        amplitude, x, y = (float(np.median(v)) for v in (self.amplitude, self.sigma_x_mm, self.sigma_y_mm))
+        return amplitude, x, y
+
+    def bump(self, labels: Labels | None = None) -> BumpDraws:
+        """The draws that a size needs, with the labels of their independent replicates."""
+        drawn = self.amplitude, self.sigma_x_mm, self.sigma_y_mm, self.angle_rad
+        return BumpDraws(*drawn, labels=labels, oblique=self.oblique, irregular=self.irregular)
+
+
+class ModalBump(Record):
+    """The bump at the mode: its amplitude, its centre and its widths along the ellipse's axes."""
+
+    amplitude: float
+    x_mm: float
+    y_mm: float
+    sigma_x_mm: float
+    sigma_y_mm: float
+
+
+# --- Diagnostics of an estimate: of the fit, the errors, the method and the size calibration.
+
+
+class NoiseFigures(Record):
+    """Figures of the errors, and the decisions made under them."""
+
+    noise: str
+    """``"independent"`` or ``"field"``."""
+    rotated: bool
+    rotation_odds: float | None
+    """Odds of a rotated ellipse; None where that was decided beforehand."""
+    figures: Mapping[str, float]
+    """Inflation and degrees of freedom, or the noise field's cosines, length and share."""
+    level_offset: float | None = None
+    """Offset of the cells about the bump from the background, under independent errors; else None."""
+    places_share: float | None = None
+    """Share of the width variance from tracker position error; None where a map does not give it."""
+    passed_over: tuple[str, ...] = ()
+    """Methods that could not be trusted, and why."""
+
+    def as_dict(self) -> dict[str, object]:
+        """The figures as plain data."""
+        decided: dict[str, object] = {"rotation_odds": self.rotation_odds, "rotated": self.rotated}
+        if self.level_offset is not None:
+            return {"noise": self.noise, **self.figures, "level_offset": self.level_offset, **decided}
+        passed: dict[str, object] = {"passed_over": list(self.passed_over)} if self.passed_over else {}
+        return {"noise": self.noise, **decided, **self.figures, **passed, "places_share": self.places_share}
+
+
+class Diagnostics(Record):
+    """Diagnostics of an estimate."""
+
+    cells: int
+    covered_share: float
+    """`cells`, `covered_share`: Cells in the fit window, and the share of it that they cover."""
+    fat_mm: float | None
+    """Depth of fat that the size is for; None where the map does not give it."""
+    method: str
+    sampler: Mapping[str, float]
+    """`method`, `sampler`: The method that drew, and its own figures."""
+    noise: NoiseFigures
+    calibration: str = ""
+    """Name of the calibration that gave the size, in words; not in the JSON."""
+    size_calibration: str = ""
+    """Which calibration gave the size and what it cannot know, in words."""
+    repeatability: str = ""
+    """How far exams of one mass lie apart at the site, in words; empty where nobody learned it."""
+    convergence: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    """R-hat, effective draws and Monte-Carlo errors of chains for each size and width, see `arviz_data.convergence`."""
+
+    def as_dict(self) -> dict[str, object]:
+        """The diagnostics as plain data."""
+        words: dict[str, object] = {"size_calibration": self.size_calibration} if self.size_calibration else {}
+        if self.repeatability:
+            words["repeatability"] = self.repeatability
+        if self.convergence:
+            words["convergence"] = {name: dict(one) for name, one in self.convergence.items()}
+        return {
+            "cells": self.cells,
+            "covered_share": self.covered_share,
+            "fat_mm": self.fat_mm,
+            **self.sampler,
+            **self.noise.as_dict(),
+            "method": self.method,
+            **words,
+        }
+
+
+# --- The ladder of methods.
+
 DISAGREEMENT = 5.0
 """Ends of intervals by two methods differ by more than this many of their joint Monte-Carlo errors: one is wrong."""
 START_ACCURACY_SD = 0.05
-CHECKED = 512
-"""Draws of the Gaussians that are weighed to judge them."""
 Progress = Callable[[int, int], None]
-
-
-def accuracy_in_sd(fit: FieldFit, options: EstimateOptions) -> float | None:
-    """Requested accuracy in posterior SDs of this fit's widths; the finer of SD and mm counts."""
-    if options.accuracy_mm is None:
-        return options.accuracy_sd
-    return min(max(options.accuracy_mm / width_sd_mm(fit), 1e-3), options.accuracy_sd or 0.5)
-
-
-def width_sd_mm(fit: FieldFit) -> float:
-    """Posterior SD of the less certain width, from the Gaussian approximation."""
-    names = [name for name in ("u", "v") if name in fit.scene.names]
-    return max(fit.sd(name) * float(np.exp(fit.scene.column(fit.mode, name))) for name in names)
-
-
-def draw_scene(
-    fit: FieldFit,
-    options: EstimateOptions,
-    *,
-    rng: np.random.Generator,
-    progress: Progress | None = None,
-    solved: Solved | None = None,
-) -> tuple[ParameterDraws, tuple[str, ...]]:
-    """Draw by the requested method, or by the next one if its diagnostics fail; says what was wrong with those before
-    it.
-
-    Importance sampling leaves what it solved in `solved`, for `CollapsedTarget.draw_linear`. `NotConvergedError` when
-    the last method does not converge either; its message says what was wrong with each.
-    """
-    passed_over: list[str] = []
-    figures: Mapping[str, float] = {}
-    first = LADDER.index(options.method)
-    steps = STEPS_UP if options.step_up else 0
-    for name in LADDER[first : first + steps + 1]:
-        try:
-            draws = _draw(fit, name, rng=rng, options=options, progress=progress, solved=solved)
-        except NotConvergedError as error:
-            passed_over.append(f"{name}: {error}")
-            figures = error.diagnostics
-            continue
-        figures = draws.diagnostics
-        shape = figures.get("pareto_k", 0.0)
-        if shape == -np.inf or shape <= TRUSTED_SHAPE:
-            return with_end_error(fit, draws), tuple(passed_over)
-        passed_over.append(f"{name}: Pareto shape {shape:.2f} (trusted up to {TRUSTED_SHAPE:g})")
-    raise NotConvergedError("; ".join(passed_over), diagnostics=dict(figures))
-
-
-def _draw(
-    fit: FieldFit,
-    method: Sampler,
-    *,
-    rng: np.random.Generator,
-    options: EstimateOptions,
-    progress: Progress | None,
-    solved: Solved | None,
-) -> ParameterDraws:
-    if method == "laplace":
-        return judged_laplace(fit, rng=rng, draws=options.draws)
-    accuracy = accuracy_in_sd(fit, options)
-    density = Sampled.of(fit)
-    match method:
-        case "importance":
-            draws = importance_draws(density.keeping(solved), rng=rng, accuracy_sd=accuracy)
-        case "ensemble":
-            draws = ensemble_draws(density, rng=rng, accuracy_sd=accuracy, options=options, progress=progress)
-        case _:
-            assert_never(method)
-    return density.finished(draws, rng)
-
-
-def judged_laplace(fit: FieldFit, *, rng: np.random.Generator, draws: int = INDEPENDENT_DRAWS) -> ParameterDraws:
-    """Draw from the Gaussian mixture, with the Pareto shape of its importance weights."""
-    drawn = laplace_mixture(fit, rng=rng, draws=draws)
-    some = drawn.flat[:CHECKED]
-    _, shape = smooth_weights(fit.target(some) - fit.mixture.log_density(some))
-    return replace(drawn, diagnostics=dict(drawn.diagnostics) | {"pareto_k": float(shape)})
 
 
 class Sampled(Record, eq=False):
@@ -115,50 +144,24 @@ class Sampled(Record, eq=False):
     added afterwards, as large as the Gaussians have it.
     """
 
-    fit: FieldFit
+    log_density: LogDensity
+    """(m,) of (m, k) parameters of the bump."""
     mean: FloatArray
     covariance: FloatArray
     """`mean`, `covariance` (k,), (k, k) arrays: About, for the density."""
-    beside: FloatArray
-    """(j,) array: The second structure's parameters."""
-    spread: FloatArray
-    """(k, k) array: Root of the covariance that the second structure's uncertainty adds."""
     parts: Gaussians | None = None
     """A Gaussian for each noise field, also for those with little share of the density at the mode: under strongly
     correlated errors the widths are less certain, so that a field with 0.3 % of the density there had 4 % of the
-    posterior, and all of its tails. None where one of them has no maximum.
+    posterior, and all of its tails. None where one of them has no maximum, and under independent errors.
     """
-    solved: Solved | None = None
-    """Where solutions are kept; None keeps none."""
-
-    @classmethod
-    def of(cls, fit: FieldFit) -> Sampled:
-        """Prepare from a fit; without a second structure the density is the fit's own."""
-        mean, covariance = fit.mixture.moments()
-        k = len(fit.scene.alone().names)
-        parts = newton_mixture(fit.target, fit.mode, fit.covariance, least_share=NEGLIGIBLE)
-        if k == len(mean):
-            return cls(fit, mean, covariance, np.zeros(0), np.zeros((k, k)), parts)
-        across = covariance[:k, k:]
-        added = across @ np.linalg.solve(covariance[k:, k:], across.T)
-        values, vectors = np.linalg.eigh(0.5 * (added + added.T))
-        spread = vectors * np.sqrt(np.clip(values, 0.0, None))
-        given = None if parts is None else parts.given(fit.mode[k:])
-        return cls(fit, fit.mode[:k], covariance[:k, :k] - added, fit.mode[k:], spread, given)
-
-    def __call__(self, theta: FloatArray) -> FloatArray:
-        """(m,) log density of (m, k) parameters of the bump."""
-        if self.solved is None:
-            return self.fit.target(self.whole(theta))
-        return self.fit.target.solved_density(theta, self.solved)
-
-    def keeping(self, solved: Solved | None) -> Sampled:
-        """The same density, storing its solutions in `solved` if draws will be evaluated points."""
-        return self if len(self.beside) else replace(self, solved=solved)
-
-    def whole(self, theta: FloatArray) -> FloatArray:
-        """(..., p) parameters of the whole scene."""
-        return np.concatenate([theta, np.broadcast_to(self.beside, (*theta.shape[:-1], len(self.beside)))], axis=-1)
+    beside: FloatArray = field(default_factory=lambda: np.zeros(0))
+    """(j,) array: The second structure's parameters."""
+    spread: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
+    """(k, k) array: Root of the covariance that the second structure's uncertainty adds."""
+    checkpoint_key: Callable[[str, np.random.Generator], str] | None = None
+    """Hash of everything that chains of some settings and random numbers depend on; None under independent errors,
+    where chains start about the mode and are neither kept nor compared with importance draws.
+    """
 
     def finished(self, draws: ParameterDraws, rng: np.random.Generator) -> ParameterDraws:
         """Draws of the whole scene, from draws of the sampled density."""
@@ -167,13 +170,103 @@ class Sampled(Record, eq=False):
         # copies of a resampled point move together: each new point costs a linear solution
         points, back = distinct_rows(draws.flat)
         moved = (points + rng.standard_normal(points.shape) @ self.spread.T)[back]
-        return replace(draws, theta=self.whole(moved).reshape(*draws.theta.shape[:2], -1))
+        return replace(draws, theta=with_beside(moved, self.beside).reshape(*draws.theta.shape[:2], -1))
+
+
+def with_beside(theta: FloatArray, beside: FloatArray) -> FloatArray:
+    """(..., p) parameters of the whole scene, from (..., k) of the bump and (j,) of the second structure."""
+    return np.concatenate([theta, np.broadcast_to(beside, (*theta.shape[:-1], len(beside)))], axis=-1)
+
+
+class Drawable(Protocol):
+    """A bump fitted under one noise model."""
+
+    @property
+    def width_sd_mm(self) -> float | None:
+        """Posterior SD of the less certain width; None where accuracies in mm are not offered."""
+
+    def methods(self, options: EstimateOptions) -> Sequence[Method]:
+        """The requested method, and those that are tried where it fails."""
+
+    def at_mode(self, method: Method, number: int, rng: np.random.Generator) -> ParameterDraws:
+        """Draw from the mode and its curvature; under a noise field `number` draws."""
+
+    def sampled(self, solved: Solved | None = None) -> Sampled:
+        """The density, which stores its solutions in `solved` if draws will be evaluated points."""
+
+
+def draw_parameters(
+    fitted: Drawable,
+    options: EstimateOptions,
+    *,
+    rng: np.random.Generator,
+    progress: Progress | None = None,
+    solved: Solved | None = None,
+) -> tuple[ParameterDraws, tuple[str, ...]]:
+    """Draw by the requested method, or by the next one if its diagnostics fail, with the faults of those before it.
+
+    Importance sampling leaves what it solved in `solved`. `NotConvergedError` when the last method does not converge
+    either; its message says what was wrong with each.
+    """
+    passed_over: list[str] = []
+    figures: Mapping[str, float] = {}
+    for method in fitted.methods(options):
+        try:
+            draws = _draw(fitted, method, rng=rng, options=options, progress=progress, solved=solved)
+        except NotConvergedError as error:
+            passed_over.append(f"{method}: {error}")
+            figures = error.diagnostics
+            continue
+        figures = draws.diagnostics
+        shape = figures.get("pareto_k", 0.0)
+        if shape == -np.inf or shape <= TRUSTED_SHAPE:
+            return _with_end_error(draws, fitted.width_sd_mm), tuple(passed_over)
+        passed_over.append(f"{method}: Pareto shape {shape:.2f} (trusted up to {TRUSTED_SHAPE:g})")
+    raise NotConvergedError("; ".join(passed_over), diagnostics=dict(figures))
+
+
+def accuracy_in_sd(options: EstimateOptions, width_sd_mm: float | None) -> float | None:
+    """Requested accuracy in posterior SDs of the widths; the finer of SD and mm counts."""
+    if options.accuracy_mm is None or width_sd_mm is None:
+        return options.accuracy_sd
+    return min(max(options.accuracy_mm / width_sd_mm, 1e-3), options.accuracy_sd or 0.5)
+
+
+def _with_end_error(draws: ParameterDraws, width_sd_mm: float | None) -> ParameterDraws:
+    """Add the Monte-Carlo error of interval ends in SDs and mm (of the Gaussians: their bias is not included)."""
+    if width_sd_mm is None:
+        return draws
+    figures = dict(draws.diagnostics)
+    figures.setdefault("end_error_sd", END_ERROR / float(np.sqrt(draws.effective_draws)))
+    return replace(draws, diagnostics=figures | {"end_error_mm": figures["end_error_sd"] * width_sd_mm})
+
+
+def _draw(
+    fitted: Drawable,
+    method: Method,
+    *,
+    rng: np.random.Generator,
+    options: EstimateOptions,
+    progress: Progress | None,
+    solved: Solved | None,
+) -> ParameterDraws:
+    if method in ("optimise", "laplace"):
+        return fitted.at_mode(method, options.draws, rng)
+    accuracy = accuracy_in_sd(options, fitted.width_sd_mm)
+    density = fitted.sampled(solved if method == "importance" else None)
+    if method == "importance":
+        draws = importance_draws(density, rng=rng, accuracy_sd=accuracy)
+    else:
+        draws = ensemble_draws(density, rng=rng, accuracy_sd=accuracy, options=options, progress=progress)
+    return density.finished(draws, rng)
 
 
 def importance_draws(density: Sampled, *, rng: np.random.Generator, accuracy_sd: float | None = None) -> ParameterDraws:
     """Draw by importance sampling from the Gaussians' common mean and covariance, or from each of them."""
     options = importance_options(accuracy_sd)
-    return importance(density, density.mean, density.covariance, rng=rng, options=options, parts=density.parts)
+    return importance(
+        density.log_density, density.mean, density.covariance, rng=rng, options=options, parts=density.parts
+    )
 
 
 def ensemble_draws(
@@ -184,7 +277,7 @@ def ensemble_draws(
     accuracy_sd: float | None = None,
     progress: Progress | None = None,
 ) -> ParameterDraws:
-    """Draw by MCMC, starting from importance draws.
+    """Draw by MCMC, under a noise field starting from importance draws.
 
     `NotConvergedError` when the chains do not agree with each other, or not with the importance draws.
     """
@@ -193,14 +286,15 @@ def ensemble_draws(
     settings = EnsembleOptions()
     if options.max_steps is not None:
         settings = replace(settings, max_steps=options.max_steps)
+    about = density.log_density, density.mean, density.covariance
+    if density.checkpoint_key is None:
+        return ensemble(*about, rng=rng, options=settings, progress=progress)
     if accuracy_sd is not None:
         settings = replace(settings, least_ess=(END_ERROR / accuracy_sd) ** 2)
-    key = checkpoint_key(density.fit, settings.identity(), rng)
+    key = density.checkpoint_key(settings.identity(), rng)
     start = _start(density, rng)
     draws = ensemble(
-        density,
-        density.mean,
-        density.covariance,
+        *about,
         rng=rng,
         options=settings,
         progress=progress,
@@ -234,34 +328,3 @@ def disagreement(chains: ParameterDraws, weighted: ParameterDraws) -> float:
     mine = END_ERROR / np.sqrt(min(chains.diagnostics["ess_tail"], chains.diagnostics["ess_bulk"]))
     theirs = weighted.diagnostics["end_error_sd"]
     return float((np.abs(one - other) / sd).max() / np.hypot(mine, theirs))
-
-
-def with_end_error(fit: FieldFit, draws: ParameterDraws) -> ParameterDraws:
-    """Add the Monte-Carlo error of interval ends in SDs and mm (of the Gaussians: their bias is not included)."""
-    found = dict(draws.diagnostics)
-    found.setdefault("end_error_sd", END_ERROR / float(np.sqrt(draws.effective_draws)))
-    return replace(draws, diagnostics=found | {"end_error_mm": found["end_error_sd"] * width_sd_mm(fit)})
-
-
-def checkpoint_key(fit: FieldFit, settings: str, rng: np.random.Generator) -> str:
-    """Hash of everything that a chain depends on: cells, scene, priors, fields, settings and seed."""
-    target = fit.target
-    digest = hashlib.sha256()
-    cells = target.window.cells
-    arrays = [cells.x_mm, cells.y_mm, cells.value, cells.count, target.window.variance, fit.mode, fit.covariance]
-    arrays += [] if target.problem.departure is None else [target.problem.departure]
-    for values in arrays:
-        digest.update(np.ascontiguousarray(values, dtype="<f8").tobytes())
-    said = {
-        "scene": as_dict(fit.scene),
-        "prior": as_dict(target.problem.prior),
-        "scale": target.problem.amplitude_scale,
-        "bounds": [target.problem.widest_mm, target.problem.radius_mm],
-        "fields": target.chosen_fields(),
-        "cosines": target.window.cosines,
-        "pose_noise": None if cells.pose_noise is None else as_dict(cells.pose_noise),
-        "settings": settings,
-        "rng": str(rng.bit_generator.state),
-    }
-    digest.update(json.dumps(said, sort_keys=True).encode())
-    return digest.hexdigest()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -20,12 +20,12 @@ from tactile_bayes.posterior.abstention import (
     undetected,
 )
 from tactile_bayes.posterior.detection import Detection
-from tactile_bayes.posterior.draws import Diagnostics, MapPosterior, NoiseFigures
+from tactile_bayes.posterior.draw import Diagnostics, MapPosterior, ModalBump, NoiseFigures, Progress
 from tactile_bayes.posterior.lump_probability import LIKELY, Weighed, weigh
 from tactile_bayes.posterior.options import DETECTED, ROTATION_ODDS, EstimateOptions, FitOptions, check_options
-from tactile_bayes.posterior.result import Estimate, ModalBump, Sensitivity, prior_sensitivity
-from tactile_bayes.posterior.search import Assessment, Drawn, MapDraws, best_chance, bump_of, draw_sized, search
-from tactile_bayes.posterior.white import Candidate, check_background
+from tactile_bayes.posterior.result import Estimate, Sensitivity, prior_sensitivity
+from tactile_bayes.posterior.search import Assessment, SizedDraws, best_chance, draw_until_accurate, search
+from tactile_bayes.posterior.white import Candidate, MapDraws, check_background
 from tactile_bayes.presets import CELL_PER_SIGMA
 from tactile_bayes.scan import DEFAULT_HEAD, HeadShape
 from tactile_bayes.size.draws import SizePosterior
@@ -56,7 +56,7 @@ def estimate_map(
     calibration: Calibration | None,
     options: EstimateOptions,
     rng: np.random.Generator,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> Estimate:
     """Estimate the lump's size from one map; without a calibration the estimate stops at widths and amplitude.
 
@@ -80,7 +80,7 @@ def _answer(
     options: EstimateOptions,
     *,
     rng: np.random.Generator,
-    progress: Callable[[int, int], None] | None,
+    progress: Progress | None,
 ) -> Estimate:
     """The lump's size, or why there is none."""
     if not tactile_map.covered.any():
@@ -97,7 +97,7 @@ def _answer(
             return _none(why, candidates)
         fit, detection = None if likeliest.candidate is None else likeliest.candidate.fit, likeliest.detection
         lump = detection.probability >= DETECTED and why.code not in NO_LUMP
-        found = _none(why, candidates, detection, bump_of(fit) if lump and fit is not None else None)
+        found = _none(why, candidates, detection, fit.modal() if lump and fit is not None else None)
         return replace(found, weighed=likeliest)
     weighed = _weighed(tactile_map, seen, seen.detection)
     if seen.detection.probability < DETECTED or weighed.probability < LIKELY:
@@ -114,7 +114,7 @@ def _answer(
 
 def _weighed(tactile_map: TactileMap, seen: Assessment, detection: Detection) -> Weighed:
     """The assessed place: by its mode where it is a lump by the evidence, else by least squares."""
-    bump = seen.bump() if seen.detection.probability >= DETECTED else bump_of(seen.fit)
+    bump = seen.bump() if seen.detection.probability >= DETECTED else seen.fit.modal()
     widths = (bump.sigma_x_mm, bump.sigma_y_mm)
     return weigh(tactile_map, detection, centre_mm=(bump.x_mm, bump.y_mm), widths_mm=widths)
 
@@ -127,7 +127,7 @@ def _measured(
     options: EstimateOptions,
     *,
     rng: np.random.Generator,
-    progress: Callable[[int, int], None] | None,
+    progress: Progress | None,
 ) -> Estimate:
     """Draw a lump that is one by the evidence, and size it; or the reason why not."""
     detection, bump = seen.detection, seen.bump()
@@ -135,7 +135,7 @@ def _measured(
     if hopeless is not None:
         return _none(hopeless, candidates, detection, bump)
     try:
-        found = draw_sized(tactile_map, seen, calibration, options, rng=rng, progress=progress)
+        found = draw_until_accurate(tactile_map, seen, calibration, options, rng=rng, progress=progress)
     except NotConvergedError as error:
         if options.method == "ensemble" or not options.fit.correlated:
             raise
@@ -166,7 +166,7 @@ def _measured(
         candidates=candidates,
         diagnostics=diagnostics,
         left_out=_left_out(tactile_map, options, calibration, made.figures),
-        scene=made.scene,
+        scene=seen.scene,
         sensitivity=_sensitivity(made.posterior, size, options),
         bump=bump,
         findings=tuple(_findings(found, cell_mm=tactile_map.recipe.cell_mm)),
@@ -248,7 +248,7 @@ def _way_to(recipe: Recipe, tactile_map: TactileMap) -> str:
     return "leave the fit's options to the calibration, or learn a calibration for these"
 
 
-def _diagnostics(found: Drawn) -> Diagnostics:
+def _diagnostics(found: SizedDraws) -> Diagnostics:
     made, calibration = found.made, found.calibration
     return Diagnostics(
         cells=len(made.fit.cells),
@@ -261,7 +261,7 @@ def _diagnostics(found: Drawn) -> Diagnostics:
     )
 
 
-def _findings(found: Drawn, *, cell_mm: float) -> Iterator[Finding]:
+def _findings(found: SizedDraws, *, cell_mm: float) -> Iterator[Finding]:
     """Findings against the size of a lump, besides those against its map."""
     posterior, calibration = found.made.posterior, found.calibration
     if calibration is not None:

@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
+from collections.abc import Sequence
+from functools import partial
+
 import numpy as np
 
-from tactile_bayes.declarations import Record
+from tactile_bayes.declarations import Record, as_dict, replace
 from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.forward.gaussian import principal_widths
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.inference.draws import INDEPENDENT_DRAWS, ParameterDraws, student_draws
-from tactile_bayes.inference.importance import Gaussians
+from tactile_bayes.inference.draws import INDEPENDENT_DRAWS, ParameterDraws, Solved, student_draws
+from tactile_bayes.inference.importance import Gaussians, smooth_weights
 from tactile_bayes.inference.modes import find_mode, finite_differences, mode_and_covariance, stencil
+from tactile_bayes.posterior.draw import Sampled, with_beside
 from tactile_bayes.posterior.field import Window
-from tactile_bayes.posterior.marginal import CollapsedTarget, independent_variance, linear_columns
+from tactile_bayes.posterior.marginal import NEGLIGIBLE, CollapsedTarget, independent_variance, linear_columns
+from tactile_bayes.posterior.options import EstimateOptions
 from tactile_bayes.posterior.scene import Problem, Scene
 from tactile_bayes.posterior.white import BumpFit
-from tactile_bayes.presets import FIELD_COSINES
+from tactile_bayes.presets import FIELD_COSINES, Method
 
 # --- Posterior of a scene under correlated errors: its mode, a Gaussian for each noise field, and draws.
 
@@ -24,6 +31,11 @@ ROUGH, FINE = 0.3, 1e-3
 """Last Newton step, in `Scene.steps`: under the start's fields, which are not the mode's; then under those."""
 LEAST_SHARE = 1e-2
 """Fields with a smaller share of the density at the mode have no Gaussian of their own in what `laplace` draws."""
+LADDER: tuple[Method, ...] = ("laplace", "importance", "ensemble")
+STEPS_UP = 1
+"""Methods tried after the requested one: a user who wants a quick one does not wait minutes for chains."""
+CHECKED = 512
+"""Draws of the Gaussians that are weighed to judge them."""
 
 
 class Mixture(Gaussians, eq=False):
@@ -70,6 +82,49 @@ class FieldFit(Record, eq=False):
         """Posterior standard deviation of one parameter."""
         i = self.scene.names.index(name)
         return float(np.sqrt(self.covariance[i, i]))
+
+    @property
+    def width_sd_mm(self) -> float:
+        """Posterior SD of the less certain width, from the Gaussian approximation."""
+        names = [name for name in ("u", "v") if name in self.scene.names]
+        return max(self.sd(name) * float(np.exp(self.scene.column(self.mode, name))) for name in names)
+
+    def methods(self, options: EstimateOptions) -> Sequence[Method]:
+        """The requested method, and the next one where a step up is allowed."""
+        first = LADDER.index(options.method)
+        return LADDER[first : first + 1 + STEPS_UP * options.step_up]
+
+    def at_mode(self, method: Method, number: int, rng: np.random.Generator) -> ParameterDraws:
+        """Draw from the Gaussian mixture, with the Pareto shape of its importance weights."""
+        del method
+        drawn = laplace_mixture(self, rng=rng, draws=number)
+        some = drawn.flat[:CHECKED]
+        _, shape = smooth_weights(self.target(some) - self.mixture.log_density(some))
+        return replace(drawn, diagnostics=dict(drawn.diagnostics) | {"pareto_k": float(shape)})
+
+    def sampled(self, solved: Solved | None = None) -> Sampled:
+        """The density to sample; without a second structure it is the fit's own, and keeps its solutions."""
+        mean, covariance = self.mixture.moments()
+        k, target = len(self.scene.alone().names), self.target
+        parts = newton_mixture(target, self.mode, self.covariance, least_share=NEGLIGIBLE)
+        key = partial(checkpoint_key, self)
+        if k == len(mean):
+            density = target if solved is None else partial(target.solved_density, solved=solved)
+            return Sampled(density, mean, covariance, parts, checkpoint_key=key)
+        across, beside = covariance[:k, k:], self.mode[k:]
+        added = across @ np.linalg.solve(covariance[k:, k:], across.T)
+        values, vectors = np.linalg.eigh(0.5 * (added + added.T))
+        spread = vectors * np.sqrt(np.clip(values, 0.0, None))
+        given = None if parts is None else parts.given(beside)
+        return Sampled(
+            lambda theta: target(with_beside(theta, beside)),
+            self.mode[:k],
+            covariance[:k, :k] - added,
+            given,
+            beside,
+            spread,
+            key,
+        )
 
 
 def field_window(least_squares: BumpFit, *, cosines: int = FIELD_COSINES) -> Window:
@@ -180,6 +235,30 @@ def laplace_mixture(fit: FieldFit, *, rng: np.random.Generator, draws: int = IND
     ]
     flat = rng.permutation(np.concatenate(parts))
     return ParameterDraws(flat[None], "laplace", {"draws": float(draws), "fields": float(len(number))})
+
+
+def checkpoint_key(fit: FieldFit, settings: str, rng: np.random.Generator) -> str:
+    """Hash of everything that a chain depends on: cells, scene, priors, fields, settings and seed."""
+    target = fit.target
+    digest = hashlib.sha256()
+    cells = target.window.cells
+    arrays = [cells.x_mm, cells.y_mm, cells.value, cells.count, target.window.variance, fit.mode, fit.covariance]
+    arrays += [] if target.problem.departure is None else [target.problem.departure]
+    for values in arrays:
+        digest.update(np.ascontiguousarray(values, dtype="<f8").tobytes())
+    said = {
+        "scene": as_dict(fit.scene),
+        "prior": as_dict(target.problem.prior),
+        "scale": target.problem.amplitude_scale,
+        "bounds": [target.problem.widest_mm, target.problem.radius_mm],
+        "fields": target.chosen_fields(),
+        "cosines": target.window.cosines,
+        "pose_noise": None if cells.pose_noise is None else as_dict(cells.pose_noise),
+        "settings": settings,
+        "rng": str(rng.bit_generator.state),
+    }
+    digest.update(json.dumps(said, sort_keys=True).encode())
+    return digest.hexdigest()
 
 
 def shape_draws(fit: FieldFit, theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -12,12 +12,12 @@ from tactile_bayes.forward.gaussian import cell_mean_gaussian
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.bump import SMOOTHING_MM, candidate_centres, levelled, on_map, smoothed_excess
 from tactile_bayes.posterior.detection import Detection
-from tactile_bayes.posterior.draws import MapPosterior
+from tactile_bayes.posterior.draw import MapPosterior, ModalBump
 from tactile_bayes.posterior.lump_probability import LIKELY, weigh
 from tactile_bayes.posterior.neighbours import LEAST_RISE
 from tactile_bayes.posterior.options import EstimateOptions
-from tactile_bayes.posterior.result import Estimate, Mass, ModalBump, Rise
-from tactile_bayes.posterior.search import Assessment, best_chance, bump_of, search
+from tactile_bayes.posterior.result import Estimate, Mass, Rise
+from tactile_bayes.posterior.search import Assessment, best_chance, search
 from tactile_bayes.posterior.white import AT_RIM, Candidate
 
 # --- Other lumps on the map: their places and probabilities.
@@ -154,7 +154,7 @@ def _at_rim(
     """A rise that is a lump by the evidence and that the map covers too poorly to measure; None where there is none."""
     if not candidates or candidates[0].fit is None or not candidates[0].fault.startswith(AT_RIM):
         return None
-    bump, lump = bump_of(candidates[0].fit), _lump(estimate)
+    bump, lump = candidates[0].fit.modal(), _lump(estimate)
     if bump.amplitude <= (0.0 if lump is None else LEAST_RISE_AT_RIM * lump.amplitude):
         return None
     chance = best_chance(rest, candidates, options)

@@ -14,7 +14,7 @@ from tactile_bayes.inference.draws import ParameterDraws, weighted_quantiles_of
 from tactile_bayes.inference.importance import smooth_weights
 from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior.detection import Detection
-from tactile_bayes.posterior.draws import Diagnostics, MapPosterior
+from tactile_bayes.posterior.draw import Diagnostics, MapPosterior, ModalBump
 from tactile_bayes.posterior.lump_probability import Weighed
 from tactile_bayes.posterior.white import BumpFit, Candidate
 from tactile_bayes.size.draws import SizePosterior
@@ -73,16 +73,6 @@ def prior_sensitivity(
 # --- The answer for one map: an estimate, or the reason why there is none.
 
 Status = Literal["estimate", "no_estimate"]
-
-
-class ModalBump(Record):
-    """The bump at the mode: its amplitude, its centre and its widths along the ellipse's axes."""
-
-    amplitude: float
-    x_mm: float
-    y_mm: float
-    sigma_x_mm: float
-    sigma_y_mm: float
 
 
 class Rise(Record):

@@ -2,65 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import numpy as np
 
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import Abstention, NotConvergedError
-from tactile_bayes.inference.draws import ParameterDraws
 from tactile_bayes.mapping.map import TactileMap
-from tactile_bayes.posterior.abstention import rim_fault, shape_fault
+from tactile_bayes.posterior.abstention import shape_fault
 from tactile_bayes.posterior.bump import levelled, window_cells
-from tactile_bayes.posterior.correlated import draw, look, with_neighbours
-from tactile_bayes.posterior.detection import Detection, detect
-from tactile_bayes.posterior.draws import MapPosterior, NoiseFigures
-from tactile_bayes.posterior.fit import modal_widths
+from tactile_bayes.posterior.correlated import Correlated
+from tactile_bayes.posterior.detection import Detection
+from tactile_bayes.posterior.draw import ModalBump, Progress
 from tactile_bayes.posterior.lump_probability import NO_EVIDENCE, Weighed, weigh_candidate
-from tactile_bayes.posterior.options import DETECTED, EstimateOptions, FitOptions, scene_asked
-from tactile_bayes.posterior.result import ModalBump
+from tactile_bayes.posterior.options import DETECTED, EstimateOptions, FitOptions
+from tactile_bayes.posterior.selection import SceneChoice
 from tactile_bayes.posterior.white import (
     LEAST_WIDTH_IN_CELLS,
     OUTGROWN,
     BumpFit,
     Candidate,
-    chosen_rotation,
-    draw_independent,
+    MapDraws,
+    White,
     fit_close,
     fitted_candidates,
-    judged_noise,
 )
 from tactile_bayes.presets import INTERVAL
 from tactile_bayes.size.draws import EXTREMES, SizePosterior
-from tactile_bayes.size.pooling import Calibration, SizePriors, draw_sizes
-
-if TYPE_CHECKING:
-    from tactile_bayes.posterior.correlated import FieldAnswer
-    from tactile_bayes.posterior.selection import SceneChoice
-
+from tactile_bayes.size.pooling import Calibration, draw_sizes
 
 # --- Common interface of both noise models: assess a place on a map, then draw from its posterior.
-
-Progress = Callable[[int, int], None]
-
-
-class MapDraws(Record, eq=False):
-    """Posterior draws of one lump under a noise model."""
-
-    detection: Detection
-    """The odds of a lump, as the draws left them."""
-    fit: BumpFit
-    """The least-squares fit that the draws started from."""
-    draws: ParameterDraws
-    """Draws of the model's own parameters."""
-    posterior: MapPosterior
-    """The joint draws by name."""
-    figures: NoiseFigures
-    """Figures of the fit and the noise, for the report."""
-    scene: SceneChoice | None = None
-    """Structures in the window, under correlated errors."""
 
 
 class Assessment(Protocol):
@@ -92,93 +65,9 @@ class Assessment(Protocol):
         """Draw from the posterior of this place; `NotConvergedError` when no method converges."""
 
 
-def bump_of(fit: BumpFit) -> ModalBump:
-    """The bump of a least-squares fit."""
-    amplitude, x, y = (float(value) for value in fit.theta[:3])
-    return ModalBump(amplitude, x, y, *fit.widths()[:2])
-
-
 def assess(tactile_map: TactileMap, fit: BumpFit, options: EstimateOptions) -> Assessment:
     """Assess whether there is a lump at a fitted place, under the noise model of the options."""
-    if not options.fit.correlated:
-        detection = detect(tactile_map, fit.bump, theta=fit.theta, covariance=fit.covariance, prior=options.prior)
-        return _White(tactile_map, fit, detection)
-    return _correlated(tactile_map, fit, options)
-
-
-class _White(Record, eq=False):
-    """An assessment under independent errors."""
-
-    tactile_map: TactileMap
-    fit: BumpFit
-    detection: Detection
-    fault: str = ""
-    scene: None = None
-
-    def bump(self) -> ModalBump:
-        return bump_of(self.fit)
-
-    def widths_mm(self) -> tuple[float, float]:
-        return self.fit.widths()[:2]
-
-    def draw(self, options: EstimateOptions, *, rng: np.random.Generator, progress: Progress | None) -> MapDraws:
-        fit, odds = chosen_rotation(self.tactile_map, self.fit, options=options.fit, prior=options.prior)
-        draws, posterior = draw_independent(fit, options, rng=rng, progress=progress)
-        return MapDraws(self.detection, fit, draws, posterior, judged_noise(fit, odds))
-
-
-class _Correlated(Record, eq=False):
-    """An assessment under correlated errors; `answer` is None where the density has no mode."""
-
-    tactile_map: TactileMap
-    fit: BumpFit
-    detection: Detection
-    answer: FieldAnswer | None
-    fault: str = ""
-
-    @property
-    def scene(self) -> SceneChoice | None:
-        return None if self.answer is None else self.answer.choice
-
-    def bump(self) -> ModalBump:
-        fit = self._answer.choice.fit
-        x, y = (float(fit.scene.column(fit.mode, name)) for name in "xy")
-        return ModalBump(fit.target.amplitude_at(fit.mode), x, y, *self.widths_mm())
-
-    def widths_mm(self) -> tuple[float, float]:
-        return modal_widths(self._answer.choice.fit)
-
-    def draw(self, options: EstimateOptions, *, rng: np.random.Generator, progress: Progress | None) -> MapDraws:
-        found = draw(self._answer, self.tactile_map, options, rng=rng, progress=progress)
-        return MapDraws(found.detection, self.fit, found.draws, found.posterior, found.figures, self.scene)
-
-    @property
-    def _answer(self) -> FieldAnswer:
-        if self.answer is None:
-            raise NotConvergedError(
-                "no bump at this place stands out from the correlated noise, so nothing can be drawn"
-            )
-        return self.answer
-
-
-def _correlated(tactile_map: TactileMap, fit: BumpFit, options: EstimateOptions) -> _Correlated:
-    """Assess under correlated errors, with neighbouring structures where there is a lump by the evidence."""
-    try:
-        seen = look(tactile_map, fit, options)
-    except NotConvergedError:
-        # no mode: no bump stands out from the correlated noise
-        return _Correlated(tactile_map, fit, Detection(0.0, -np.inf), None)
-    fault = _field_fault(tactile_map, seen)
-    if not fault and seen.detection.probability >= DETECTED:
-        seen = with_neighbours(seen, tactile_map, scene=scene_asked(options))
-    return _Correlated(tactile_map, fit, seen.detection, seen, fault)
-
-
-def _field_fault(tactile_map: TactileMap, seen: FieldAnswer) -> str:
-    """Fault of a fit under correlated errors: beyond the map's rim, or shrunk to a single cell; empty if none."""
-    plain = seen.choice.plain
-    x, y = (float(plain.scene.column(plain.mode[None], name)[0]) for name in ("x", "y"))
-    return rim_fault(tactile_map, (x, y), modal_widths(plain), radius_mm=plain.target.problem.radius_mm)
+    return (Correlated if options.fit.correlated else White).of(tactile_map, fit, options)
 
 
 # --- Posterior draws of a map and its size, refined until the size interval is as exact as requested.
@@ -188,7 +77,7 @@ DEFAULT_ACCURACY_SD = {"importance": 0.02, "ensemble": 0.1}
 MOST_REFINEMENTS, SAFETY, LEAST_ACCURACY_SD = 3, 0.8, 1e-3
 
 
-class Drawn(Record, eq=False):
+class SizedDraws(Record, eq=False):
     """Draws of one map with its size by `calibration`; `fault` and `too_far` say why there is none."""
 
     made: MapDraws
@@ -198,88 +87,70 @@ class Drawn(Record, eq=False):
     too_far: tuple[str, ...] = ()
 
 
-def draw_sized(
+def draw_until_accurate(
     tactile_map: TactileMap,
     seen: Assessment,
     calibration: Calibration | None,
     options: EstimateOptions,
     *,
     rng: np.random.Generator,
-    progress: Callable[[int, int], None] | None,
-) -> Drawn:
+    progress: Progress | None,
+) -> SizedDraws:
     """Draw until the size interval is as accurate as requested.
 
     The method stops when the widths are exact enough, which mostly makes the size so too. Where a method cannot draw
     more finely the last draws stand, with their error.
     """
-    draw = partial(_drawn, tactile_map, seen, calibration, rng=rng, progress=progress)
-    found = draw(options)
+    draw = partial(draw_with_size, tactile_map, seen, calibration, rng=rng, progress=progress)
+    sized = draw(options)
     for _ in range(MOST_REFINEMENTS):
-        finer = _finer(found, options)
+        finer = _finer(sized, options)
         if finer is None:
             break
         options = replace(options, accuracy_sd=finer)
         try:
-            found = draw(options)
+            sized = draw(options)
         except NotConvergedError:
             break
-    return found
+    return sized
 
 
-def _finer(found: Drawn, options: EstimateOptions) -> float | None:
+def _finer(sized: SizedDraws, options: EstimateOptions) -> float | None:
     """Accuracy in SDs for the next draws; None where the size is accurate enough, or no accuracy is requested."""
-    wanted = options.accuracy_sd or DEFAULT_ACCURACY_SD.get(found.made.draws.method)
-    if found.size is None or wanted is None:
+    wanted = options.accuracy_sd or DEFAULT_ACCURACY_SD.get(sized.made.draws.method)
+    if sized.size is None or wanted is None:
         return None
-    ends = [found.size.summarise(name, probability=INTERVAL) for name in EXTREMES]
+    ends = [sized.size.summarise(name, probability=INTERVAL) for name in EXTREMES]
     short = min(wanted * one.sd / one.mc_error for one in ends)
     if options.accuracy_mm is not None:
         short = min(short, *(options.accuracy_mm / one.mc_error for one in ends))
     return None if short >= 1.0 else max(SAFETY * short * wanted, LEAST_ACCURACY_SD)
 
 
-def _drawn(
+def draw_with_size(
     tactile_map: TactileMap,
     seen: Assessment,
     calibration: Calibration | None,
     options: EstimateOptions,
     *,
     rng: np.random.Generator,
-    progress: Callable[[int, int], None] | None,
-) -> Drawn:
+    progress: Progress | None,
+) -> SizedDraws:
+    """Draw once, and size the draws where the calibration reaches so far."""
     made = seen.draw(options, rng=rng, progress=progress)
     posterior = made.posterior
     fault = shape_fault(
         posterior.sigma_x_mm, posterior.sigma_y_mm, cell_mm=tactile_map.recipe.cell_mm, prior=options.prior
     )
-    calibration = None if calibration is None else calibration.fitting(*posterior.medians)
-    far = () if calibration is None else tuple(calibration.too_far(*posterior.medians))
-    size = None if fault or far else _size(posterior, made.draws, calibration, options.size_priors, rng=rng)
-    return Drawn(made, size, fault, calibration, far)
-
-
-def _size(
-    posterior: MapPosterior,
-    draws: ParameterDraws,
-    calibration: Calibration | None,
-    priors: SizePriors,
-    *,
-    rng: np.random.Generator,
-) -> SizePosterior | None:
     if calibration is None:
-        return None
-    return draw_sizes(
-        posterior.amplitude,
-        posterior.sigma_x_mm,
-        posterior.sigma_y_mm,
-        posterior.angle_rad,
-        calibration=calibration,
-        priors=priors,
-        replicates=draws.replicates,
-        rng=rng,
-        oblique=posterior.oblique,
-        irregular=posterior.irregular,
-    )
+        return SizedDraws(made, None, fault, None)
+    calibration = calibration.fitting(*posterior.medians)
+    far = tuple(calibration.too_far(*posterior.medians))
+    if fault or far:
+        return SizedDraws(made, None, fault, calibration, far)
+    bump = posterior.bump(made.draws.replicates)
+    size = draw_sizes(bump, calibration=calibration, priors=options.size_priors, rng=rng)
+    return SizedDraws(made, size, None, calibration)
 
 
 # --- Search for the lump: candidate places, highest first, each fitted and assessed.

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from typing import assert_never
 
 import numpy as np
 
 from tactile_bayes.declarations import Record, replace
-from tactile_bayes.errors import NotConvergedError, UsageError
+from tactile_bayes.errors import UsageError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.draws import ParameterDraws, Solved
-from tactile_bayes.inference.importance import importance, importance_options
 from tactile_bayes.inference.modes import (
     LeastSquaresFit,
     ModelFunction,
@@ -38,13 +36,14 @@ from tactile_bayes.posterior.detection import (
     Detection,
     ErrorModel,
     count_weights,
+    detect,
     error_model,
     independent_errors,
     level_offset,
 )
-from tactile_bayes.posterior.draws import MapPosterior, NoiseFigures
+from tactile_bayes.posterior.draw import MapPosterior, ModalBump, NoiseFigures, Progress, Sampled, draw_parameters
 from tactile_bayes.posterior.options import ROTATION_ODDS, EstimateOptions, FitOptions
-from tactile_bayes.presets import Background, Noise
+from tactile_bayes.presets import Background, Method, Noise
 
 # --- Log posterior density of a least-squares model, with the noise scale integrated out.
 
@@ -163,6 +162,11 @@ class BumpFit(Record, eq=False):
         """sigma_x_mm, sigma_y_mm, angle_rad of the fit."""
         sigma_x, sigma_y, angle = self.bump.widths(self.theta)
         return float(sigma_x), float(sigma_y), float(angle)
+
+    def modal(self) -> ModalBump:
+        """The bump at the fit."""
+        amplitude, x, y = (float(value) for value in self.theta[:3])
+        return ModalBump(amplitude, x, y, *self.widths()[:2])
 
     def linear_excess(self, theta: FloatArray) -> FloatArray:
         """(m,) `Target.excess` for a model linearised about the fit, as mode-and-curvature methods assume."""
@@ -398,9 +402,55 @@ def rotation_odds(
     return float(np.exp(np.clip(log_odds, -700, 700))), turned
 
 
-# --- Estimation under independent errors: rotation and draws from a least-squares fit.
+# --- Estimation under independent errors: assessment, rotation and draws from a least-squares fit.
 
-Progress = Callable[[int, int], None]
+
+class MapDraws(Record, eq=False):
+    """Posterior draws of one lump under a noise model."""
+
+    detection: Detection
+    """The odds of a lump, as the draws left them."""
+    fit: BumpFit
+    """The least-squares fit that the draws started from."""
+    draws: ParameterDraws
+    """Draws of the model's own parameters."""
+    posterior: MapPosterior
+    """The joint draws by name."""
+    figures: NoiseFigures
+    """Figures of the fit and the noise, for the report."""
+
+
+class White(Record, eq=False):
+    """An `Assessment` under independent errors."""
+
+    tactile_map: TactileMap
+    fit: BumpFit
+    detection: Detection
+    fault: str = ""
+    scene: None = None
+
+    @classmethod
+    def of(cls, tactile_map: TactileMap, fit: BumpFit, options: EstimateOptions) -> White:
+        """Compare a fitted bump with no bump."""
+        detection = detect(tactile_map, fit.bump, theta=fit.theta, covariance=fit.covariance, prior=options.prior)
+        return cls(tactile_map, fit, detection)
+
+    def bump(self) -> ModalBump:
+        """The bump of the least-squares fit."""
+        return self.fit.modal()
+
+    def widths_mm(self) -> tuple[float, float]:
+        """Its widths."""
+        return self.fit.widths()[:2]
+
+    def draw(self, options: EstimateOptions, *, rng: np.random.Generator, progress: Progress | None) -> MapDraws:
+        """Draw from the posterior, rotated where the odds favour it."""
+        fit, odds = chosen_rotation(self.tactile_map, self.fit, options=options.fit, prior=options.prior)
+        draws, posterior = draw_independent(fit, options, rng=rng, progress=progress)
+        figures = {"noise_inflation": fit.errors.inflation, "noise_dof": fit.errors.dof}
+        offset = level_offset(fit.fit.residual, weight=fit.weight)
+        noise = NoiseFigures("independent", fit.bump.rotated, odds, figures, level_offset=offset)
+        return MapDraws(self.detection, fit, draws, posterior, noise)
 
 
 def chosen_rotation(
@@ -413,13 +463,38 @@ def chosen_rotation(
     return (turned, odds) if turned is not None and odds > ROTATION_ODDS else (fit, odds)
 
 
+class _Independent(Record, eq=False):
+    """A least-squares fit to be drawn, see `Drawable`."""
+
+    fit: BumpFit
+    target: Target
+    width_sd_mm: None = None
+
+    def methods(self, options: EstimateOptions) -> Sequence[Method]:
+        # weights that cannot be trusted are no matter of chains, which need none
+        return ("importance", "ensemble") if options.method == "importance" else (options.method,)
+
+    def at_mode(self, method: Method, number: int, rng: np.random.Generator) -> ParameterDraws:
+        del number
+        fit = self.fit
+        if method == "optimise":
+            return optimise(fit.theta, fit.covariance, dof=fit.errors.dof, rng=rng)
+        return laplace(self.target, fit.theta, scale=np.sqrt(np.diag(fit.covariance)), dof=fit.errors.dof, rng=rng)
+
+    def sampled(self, solved: Solved | None = None) -> Sampled:
+        scale = np.sqrt(np.diag(self.fit.covariance))
+        mode, covariance, _ = mode_and_covariance(self.target, self.fit.theta, scale=scale)
+        density = self.target if solved is None else partial(self.target.solved_density, solved=solved)
+        return Sampled(density, mode, covariance)
+
+
 def draw_independent(
     fit: BumpFit, options: EstimateOptions, *, rng: np.random.Generator, progress: Progress | None
 ) -> tuple[ParameterDraws, MapPosterior]:
     """Draw by the requested method, and name the joint draws."""
     target = fit.target(options.prior)
     solved = Solved(lambda theta: (target.excess(theta),))
-    draws = _draw(fit, target, solved, options, rng=rng, progress=progress)
+    draws, _ = draw_parameters(_Independent(fit, target), options, rng=rng, progress=progress, solved=solved)
     theta = draws.theta
     sigma_x, sigma_y, angle = fit.bump.widths(theta)
     # two of the methods are linear about the mode: for them the exact figure would cost more than all the rest
@@ -435,58 +510,3 @@ def draw_independent(
         background=fit.bump.level(theta),
         noise_sd=target.draw_noise_sd(excess, rng).reshape(theta.shape[:2]),
     )
-
-
-def _draw(
-    fit: BumpFit,
-    target: Target,
-    solved: Solved,
-    options: EstimateOptions,
-    *,
-    rng: np.random.Generator,
-    progress: Progress | None,
-) -> ParameterDraws:
-    match options.method:
-        case "optimise":
-            return optimise(fit.theta, fit.covariance, dof=fit.errors.dof, rng=rng)
-        case "laplace":
-            scale = np.sqrt(np.diag(fit.covariance))
-            return laplace(target, fit.theta, scale=scale, dof=fit.errors.dof, rng=rng)
-        case "importance":
-            mode, covariance = _mode(fit, target)
-            density = partial(target.solved_density, solved=solved)
-            try:
-                return importance(density, mode, covariance, rng=rng, options=importance_options(options.accuracy_sd))
-            except NotConvergedError:  # its weights cannot be trusted here; chains need none
-                return _chains(target, mode, covariance, options, rng=rng, progress=progress)
-        case "ensemble":
-            return _chains(target, *_mode(fit, target), options, rng=rng, progress=progress)
-    assert_never(options.method)
-
-
-def _mode(fit: BumpFit, target: Target) -> tuple[FloatArray, FloatArray]:
-    """The posterior's mode and covariance, from least squares."""
-    mode, covariance, _ = mode_and_covariance(target, fit.theta, scale=np.sqrt(np.diag(fit.covariance)))
-    return mode, covariance
-
-
-def _chains(
-    target: Target,
-    mode: FloatArray,
-    covariance: FloatArray,
-    options: EstimateOptions,
-    *,
-    rng: np.random.Generator,
-    progress: Progress | None,
-) -> ParameterDraws:
-    from tactile_bayes.inference.ensemble import EnsembleOptions, ensemble
-
-    settings = EnsembleOptions() if options.max_steps is None else EnsembleOptions(max_steps=options.max_steps)
-    return ensemble(target, mode, covariance, rng=rng, options=settings, progress=progress)
-
-
-def judged_noise(fit: BumpFit, odds: float | None) -> NoiseFigures:
-    """Figures of the errors, for the report."""
-    figures = {"noise_inflation": fit.errors.inflation, "noise_dof": fit.errors.dof}
-    offset = level_offset(fit.fit.residual, weight=fit.weight)
-    return NoiseFigures("independent", fit.bump.rotated, odds, figures, level_offset=offset)

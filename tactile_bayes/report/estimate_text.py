@@ -12,7 +12,7 @@ from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.mapping.places import ClockPosition
 from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior.abstention import chance_text
-from tactile_bayes.posterior.draws import Diagnostics
+from tactile_bayes.posterior.draw import Diagnostics
 from tactile_bayes.posterior.lump_probability import SHARE_WITH_LUMP
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.presets import RESEARCH_USE

@@ -17,7 +17,7 @@ from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.size.draws import EXTREMES, SIZES, SizePosterior
 
 if TYPE_CHECKING:
-    from tactile_bayes.posterior.draws import MapPosterior
+    from tactile_bayes.posterior.draw import MapPosterior
 
 
 # --- Summaries of an estimate's draws, by name.

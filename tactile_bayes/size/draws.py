@@ -23,6 +23,32 @@ OVAL_SD: Final = 0.4
 """SD of the log mean diameter by which an oval lump is off the calibration for balls, over its half log axis ratio."""
 
 
+class BumpDraws(Record, eq=False):
+    """Joint draws of one map's bump (Eq 7), arrays of one shape: the widths are along the ellipse's own axes."""
+
+    amplitude: FloatArray
+    sigma_x_mm: FloatArray
+    sigma_y_mm: FloatArray
+    angle_rad: FloatArray
+    labels: Labels | None = None
+    """(n,) labels of the draws' independent replicates, as `ParameterDraws.labels`."""
+    oblique: tuple[float, float] | None = None
+    """Mean and SD of r where the draws have none, as `MapPosterior`'s."""
+    irregular: bool = False
+    """The map is that of an irregular lump."""
+
+    def flat(self) -> BumpDraws:
+        """The same draws in one row."""
+        return replace(self, **{name: getattr(self, name).ravel() for name in BUMP})
+
+    def median(self) -> BumpDraws:
+        """A single draw: the medians."""
+        return replace(self, **{name: np.full(1, np.median(getattr(self, name))) for name in BUMP}, labels=None)
+
+
+BUMP: Final = ("amplitude", "sigma_x_mm", "sigma_y_mm", "angle_rad")
+
+
 class ShapeDraws(Record, eq=False):
     """Joint draws of one map's amplitude and shape, each (n,).
 
@@ -39,11 +65,9 @@ class ShapeDraws(Record, eq=False):
     profile: tuple[float, ...] | None = None
     """`presets.HEAD_PROFILE` of the map; None where it has none."""
     labels: Labels | None = None
-    """Labels of the draws' independent replicates, as `ParameterDraws.labels`."""
     oblique: tuple[float, float] | None = None
-    """Mean and SD of r where the draws have none, as `MapPosterior`'s."""
     irregular: bool = False
-    """The map is that of an irregular lump."""
+    """`labels`, `oblique`, `irregular`: As of `BumpDraws`."""
 
     @property
     def replicates(self) -> Labels:
@@ -56,26 +80,14 @@ class ShapeDraws(Record, eq=False):
         return tuple(float(np.nansum(v)) for v in (self.log_width, self.log_amplitude, self.q, self.r))
 
     @classmethod
-    def of(
-        cls,
-        amplitude: FloatArray,
-        sigma_x_mm: FloatArray,
-        sigma_y_mm: FloatArray,
-        angle_rad: FloatArray,
-        *,
-        turn_rad: float = 0.0,
-        profile: tuple[float, ...] | None = None,
-        labels: Labels | None = None,
-        oblique: tuple[float, float] | None = None,
-        irregular: bool = False,
-    ) -> ShapeDraws:
-        """Prepare from draws of Eq 7 of any shape; a draw without a rise becomes NaN."""
+    def of(cls, bump: BumpDraws, *, turn_rad: float = 0.0, profile: tuple[float, ...] | None = None) -> ShapeDraws:
+        """Prepare from draws of Eq 7; a draw without a rise becomes NaN."""
         with np.errstate(invalid="ignore", divide="ignore"):
-            log_a = np.log(np.where(amplitude > 0, amplitude, np.nan)).ravel()
-        half, angle = 0.5 * np.log(sigma_x_mm / sigma_y_mm).ravel(), angle_rad.ravel()
-        p = 0.5 * np.log(sigma_x_mm * sigma_y_mm).ravel()
+            log_a = np.log(np.where(bump.amplitude > 0, bump.amplitude, np.nan)).ravel()
+        half, angle = 0.5 * np.log(bump.sigma_x_mm / bump.sigma_y_mm).ravel(), bump.angle_rad.ravel()
+        p = 0.5 * np.log(bump.sigma_x_mm * bump.sigma_y_mm).ravel()
         q, r = half * np.cos(2 * angle), half * np.sin(2 * angle)
-        return cls(log_a, p, q, r, turn_rad, profile, labels, oblique, irregular)
+        return cls(log_a, p, q, r, turn_rad, profile, bump.labels, bump.oblique, bump.irregular)
 
     @property
     def middle(self) -> tuple[float, float]:

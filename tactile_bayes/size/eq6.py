@@ -24,9 +24,9 @@ import numpy as np
 from tactile_bayes.declarations import Meta, Record, field, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import FloatArray, Matrix, Vector
-from tactile_bayes.inference.draws import Labels, even_replicates
+from tactile_bayes.inference.draws import even_replicates
 from tactile_bayes.inference.points import normal_quantile, paired_points
-from tactile_bayes.size.draws import SizePosterior, shares
+from tactile_bayes.size.draws import BumpDraws, SizePosterior, shares
 from tactile_bayes.size.fat import BetweenMaps
 from tactile_bayes.size.terms import (
     LEARN_ANEW,
@@ -206,22 +206,11 @@ class SizeCalibration(Record, eq=False):
         return [ONE_WIDTH] if self.axes == ("both",) else []
 
 
-class _Inputs(Record, eq=False):
-    amplitude: FloatArray
-    sigma_x_mm: FloatArray
-    sigma_y_mm: FloatArray
-    angle_rad: FloatArray
-
-
 def push_sizes(
-    amplitude: FloatArray,
-    sigma_x_mm: FloatArray,
-    sigma_y_mm: FloatArray,
-    angle_rad: FloatArray,
+    bump: BumpDraws,
     *,
     calibration: SizeCalibration,
     rng: np.random.Generator,
-    replicates: Labels | None = None,
     another_exam: BetweenMaps | None = None,
 ) -> SizePosterior:
     """Convert each map draw by Eq 6, with a draw of its coefficients and one of its residual scatter.
@@ -231,21 +220,20 @@ def push_sizes(
     width go together (a stronger bump is a narrower one), which must not be lost. `another_exam` is the spread between
     exams of a mass, for `SizePosterior.another_exam`.
     """
-    shape = amplitude.shape
-    inputs = _Inputs(amplitude.ravel(), sigma_x_mm.ravel(), sigma_y_mm.ravel(), angle_rad.ravel())
-    replicates = even_replicates(amplitude.size) if replicates is None else replicates
-    key = np.maximum(*_sizes(inputs, calibration, calibration.x.draws.mean(axis=0), calibration.y.draws.mean(axis=0)))
+    shape, bump = bump.amplitude.shape, bump.flat()
+    replicates = even_replicates(bump.amplitude.size) if bump.labels is None else bump.labels
+    key = np.maximum(*_sizes(bump, calibration, calibration.x.draws.mean(axis=0), calibration.y.draws.mean(axis=0)))
     points = paired_points(key, replicates, 4, rng)
-    coefficients_x = _coefficients_at(points[:, 0], calibration.x, inputs.sigma_x_mm, inputs.amplitude)
-    coefficients_y = _coefficients_at(points[:, 1], calibration.y, inputs.sigma_y_mm, inputs.amplitude)
-    d_x, d_y = _sizes(inputs, calibration, coefficients_x, coefficients_y)
+    coefficients_x = _coefficients_at(points[:, 0], calibration.x, bump.sigma_x_mm, bump.amplitude)
+    coefficients_y = _coefficients_at(points[:, 1], calibration.y, bump.sigma_y_mm, bump.amplitude)
+    d_x, d_y = _sizes(bump, calibration, coefficients_x, coefficients_y)
     z = normal_quantile(points[:, 2:].T)
     rho = calibration.residual_correlation
     z[1] = rho * z[0] + np.sqrt(1.0 - rho**2) * z[1]
-    scattered_x = d_x * np.exp(calibration.x.scatter(inputs.amplitude, draws=coefficients_x) * z[0])
-    scattered_y = d_y * np.exp(calibration.y.scatter(inputs.amplitude, draws=coefficients_y) * z[1])
+    scattered_x = d_x * np.exp(calibration.x.scatter(bump.amplitude, draws=coefficients_x) * z[0])
+    scattered_y = d_y * np.exp(calibration.y.scatter(bump.amplitude, draws=coefficients_y) * z[1])
     valid = (d_x > 0) & (d_y > 0)
-    parts = _variances(inputs, calibration, coefficients_x, coefficients_y)
+    parts = _variances(bump, calibration, coefficients_x, coefficients_y)
     d_x, d_y = np.where(valid, scattered_x, np.nan), np.where(valid, scattered_y, np.nan)
     size = SizePosterior(d_x, d_y, shares(parts), int((~valid).sum()), replicates)
     if another_exam is not None:
@@ -279,27 +267,25 @@ def _coefficients_at(
 
 
 def _sizes(
-    inputs: _Inputs, calibration: SizeCalibration, coefficients_x: FloatArray, coefficients_y: FloatArray
+    bump: BumpDraws, calibration: SizeCalibration, coefficients_x: FloatArray, coefficients_y: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Diameters along the ellipse's own axes, without scatter."""
-    along = np.cos(inputs.angle_rad) ** 2
+    along = np.cos(bump.angle_rad) ** 2
 
     def blend(sigma: FloatArray, share_x: FloatArray) -> FloatArray:
-        across = calibration.x.size_mm(sigma, inputs.amplitude, draws=coefficients_x)
-        along_head = calibration.y.size_mm(sigma, inputs.amplitude, draws=coefficients_y)
+        across = calibration.x.size_mm(sigma, bump.amplitude, draws=coefficients_x)
+        along_head = calibration.y.size_mm(sigma, bump.amplitude, draws=coefficients_y)
         return share_x * across + (1.0 - share_x) * along_head
 
-    return blend(inputs.sigma_x_mm, along), blend(inputs.sigma_y_mm, 1.0 - along)
+    return blend(bump.sigma_x_mm, along), blend(bump.sigma_y_mm, 1.0 - along)
 
 
 def _variances(
-    inputs: _Inputs, calibration: SizeCalibration, coefficients_x: FloatArray, coefficients_y: FloatArray
+    bump: BumpDraws, calibration: SizeCalibration, coefficients_x: FloatArray, coefficients_y: FloatArray
 ) -> dict[str, float]:
     """Variance of ln(max size) with all but one source held at its centre."""
-    middle = _Inputs(*(np.full(1, np.median(values)) for values in (
-        inputs.amplitude, inputs.sigma_x_mm, inputs.sigma_y_mm, inputs.angle_rad
-    )))  # fmt: skip
-    by_map = _sizes(inputs, calibration, calibration.x.draws.mean(axis=0), calibration.y.draws.mean(axis=0))
+    middle = bump.median()
+    by_map = _sizes(bump, calibration, calibration.x.draws.mean(axis=0), calibration.y.draws.mean(axis=0))
     by_coefficients = _sizes(middle, calibration, coefficients_x, coefficients_y)
     larger: AxisCalibration = calibration.x if np.nanmedian(by_map[0] - by_map[1]) >= 0 else calibration.y
     return {

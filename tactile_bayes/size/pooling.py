@@ -16,6 +16,7 @@ from tactile_bayes.inference.points import evened, normal_quantile, paired_point
 from tactile_bayes.size.bodies import BodyCalibration, known_body, suppositions
 from tactile_bayes.size.draws import (
     OVAL_SD,
+    BumpDraws,
     Elongation,
     ShapeDraws,
     ShapePrior,
@@ -75,28 +76,17 @@ class SizePriors(Record):
 
 
 def draw_sizes(
-    amplitude: FloatArray,
-    sigma_x_mm: FloatArray,
-    sigma_y_mm: FloatArray,
-    angle_rad: FloatArray,
-    *,
-    calibration: Calibration,
-    priors: SizePriors,
-    replicates: Labels | None,
-    rng: np.random.Generator,
-    oblique: tuple[float, float] | None = None,
-    irregular: bool = False,
+    bump: BumpDraws, *, calibration: Calibration, priors: SizePriors, rng: np.random.Generator
 ) -> SizePosterior:
-    """Draw sizes from the (chain, draw) joint draws of one map, whose labels and rest are as `ShapeDraws` has them.
+    """Draw sizes from the (chain, draw) joint draws of one map.
 
     Eq 6 by axes uses of the priors the spread, for the interval of another exam, and nothing else.
     """
-    drawn = amplitude, sigma_x_mm, sigma_y_mm, angle_rad
     if isinstance(calibration, SizeCalibration):
         another = priors.another_exam or priors.between_maps
-        return push_sizes(*drawn, calibration=calibration, rng=rng, replicates=replicates, another_exam=another)
-    one = ShapeDraws.of(*drawn, labels=replicates, oblique=oblique, irregular=irregular)
-    return pooled_size([one], calibration=calibration, priors=priors, rng=rng).reshaped(amplitude.shape)
+        return push_sizes(bump, calibration=calibration, rng=rng, another_exam=another)
+    size = pooled_size([ShapeDraws.of(bump)], calibration=calibration, priors=priors, rng=rng)
+    return size.reshaped(bump.amplitude.shape)
 
 
 def log_sizes(calibration: BodyCalibration, maps: Sequence[ShapeDraws]) -> list[FloatArray]:

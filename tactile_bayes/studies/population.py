@@ -334,8 +334,7 @@ def _measured(tactile_map: TactileMap) -> dict[str, Any]:
     found = estimate_map(tactile_map, calibration=None, options=measuring_options(), rng=rng)
     if found.status != "estimate" or found.map_posterior is None:
         return {}
-    posterior = found.map_posterior
-    draws = ShapeDraws.of(posterior.amplitude, posterior.sigma_x_mm, posterior.sigma_y_mm, posterior.angle_rad)
+    draws = ShapeDraws.of(found.map_posterior.bump())
     shape = np.stack([draws.log_amplitude, draws.log_width, draws.q])
     shape = shape[:, np.isfinite(shape).all(axis=0)]
     mean, covariance = shape.mean(axis=1), np.cov(shape)

@@ -12,14 +12,14 @@ from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.map import MapRecipe, TactileMap
 from tactile_bayes.options import BumpPrior
-from tactile_bayes.posterior.draws import MapPosterior
+from tactile_bayes.posterior.draw import MapPosterior
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.field import LENGTHS_MM, SHARES, cell_mean_profile
 from tactile_bayes.posterior.options import EstimateOptions, FitOptions
 from tactile_bayes.posterior.white import WIDEST_IN_RADII
 from tactile_bayes.presets import Method
 from tactile_bayes.size.bodies import BodyCalibration
-from tactile_bayes.size.draws import ShapeDraws, ShapePrior
+from tactile_bayes.size.draws import BumpDraws, ShapeDraws, ShapePrior
 from tactile_bayes.size.pooling import SizePriors, pooled_size
 
 # --- Tests of uniform ranks, for simulation-based calibration.
@@ -315,7 +315,7 @@ def _ranks_in(
 def _sizes(bumps: Mapping[str, FloatArray], calibration: BodyCalibration, rng: np.random.Generator) -> FloatArray:
     """(n,) sizes in mm, one per bump; without a rise there is none, which ranks as small."""
     a, sigma_x, sigma_y = (bumps[name] for name in PARAMETERS[:3])
-    draws = ShapeDraws.of(a, sigma_x, sigma_y, np.zeros_like(a))
+    draws = ShapeDraws.of(BumpDraws(a, sigma_x, sigma_y, np.zeros_like(a)))
     return np.nan_to_num(pooled_size([draws], calibration=calibration, priors=ROUND, rng=rng).max_size_mm.ravel())
 
 

@@ -11,7 +11,7 @@ from tactile_bayes.forward.gaussian import cell_mean_gaussian, covariance_from_l
 from tactile_bayes.inference.draws import Solution, Solved
 from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior.bump import Bump, window_cells
-from tactile_bayes.posterior.draw import draw_scene
+from tactile_bayes.posterior.draw import draw_parameters
 from tactile_bayes.posterior.fit import FieldFit
 from tactile_bayes.posterior.options import EstimateOptions, FitOptions
 from tests.posterior.correlated.test_marginal import cells_of, fitted, noise
@@ -33,7 +33,7 @@ def drawn(method: str) -> tuple[Counting, list[np.ndarray], list[np.ndarray], li
     fit = fitted(cells_of(noise(5, field=0.01)))
     counting = Counting(fit)
     solved = Solved(counting)
-    draws, _ = draw_scene(fit, EstimateOptions(method), rng=np.random.default_rng(1), solved=solved)
+    draws, _ = draw_parameters(fit, EstimateOptions(method), rng=np.random.default_rng(1), solved=solved)
     kept = fit.target.draw_linear(draws.flat, np.random.default_rng(2), solved=solved)
     again, other = (fit.target.draw_linear(draws.flat, np.random.default_rng(seed)) for seed in (2, 3))
     return counting, list(kept), list(again), list(other)

@@ -67,14 +67,14 @@ def marginal_ends(z: np.ndarray, density: np.ndarray) -> np.ndarray:
 @cache
 def density_of(name: str) -> Sampled:
     """What is sampled for a map."""
-    return Sampled.of((MAPS | {"round": plainly_round})[name]())
+    return (MAPS | {"round": plainly_round})[name]().sampled()
 
 
 @cache
 def reference(name: str) -> np.ndarray:
     """A map's log density on the grid about its Gaussians."""
     density = density_of(name)
-    return on_grid(density, density.mean, np.sqrt(np.diag(density.covariance)))
+    return on_grid(density.log_density, density.mean, np.sqrt(np.diag(density.covariance)))
 
 
 def ends_in_sd(name: str, draws: np.ndarray) -> np.ndarray:

@@ -8,19 +8,25 @@ import pytest
 from tactile_bayes.inference import importance as sampling
 from tactile_bayes.inference.importance import TOO_WIDE, Gaussians
 from tactile_bayes.posterior.draw import Sampled, importance_draws
+from tactile_bayes.posterior.fit import FieldFit
 from validation.method_agreement import MAPS, differences, fit_of, rms, under_other_prior
 
 
 @pytest.fixture(scope="module")
-def nearly_independent() -> Sampled:
+def fit() -> FieldFit:
     """A strong wide lump in a scan: of its errors a field of little evidence would leave the widths much less sure."""
-    return Sampled.of(fit_of(MAPS["scan, wide and strong"]()))
+    return fit_of(MAPS["scan, wide and strong"]())
+
+
+@pytest.fixture(scope="module")
+def nearly_independent(fit: FieldFit) -> Sampled:
+    return fit.sampled()
 
 
 def tail_shape(density: Sampled, gaussians: Gaussians) -> float:
     """Pareto shape of the weights of 8,192 points."""
     rng = np.random.default_rng(2)
-    sampler = sampling._settled(density, gaussians, rng=rng, options=sampling.ImportanceOptions())
+    sampler = sampling._settled(density.log_density, gaussians, rng=rng, options=sampling.ImportanceOptions())
     while sampler.number < 8192:
         sampler.extend(sampler.points)
     return sampler.weights()[1]
@@ -38,9 +44,8 @@ def test_a_plain_map_with_nearly_independent_errors_needs_no_chains(nearly_indep
     assert tail_shape(density, Gaussians.one(density.mean, density.covariance)) > 0.5
 
 
-def test_gaussians_of_all_fields_hold_the_evidence(nearly_independent: Sampled) -> None:
+def test_gaussians_of_all_fields_hold_the_evidence(fit: FieldFit, nearly_independent: Sampled) -> None:
     """The sampled evidence is nearer to theirs than to that of fields with a hundredth of the density at the mode."""
-    fit = nearly_independent.fit
     sampled = importance_draws(nearly_independent, rng=np.random.default_rng(2)).diagnostics["log_evidence"]
     assert nearly_independent.parts is not None
     all_fields = nearly_independent.parts.log_evidence  # type: ignore[attr-defined]
@@ -52,7 +57,7 @@ def test_gaussians_of_all_fields_hold_the_evidence(nearly_independent: Sampled) 
 @pytest.mark.parametrize("name", ["field of 1.5 mm", "half covered", "scan, small"])
 def test_chains_and_weighted_draws_agree_and_another_prior_does_not(name: str) -> None:
     fit = fit_of(MAPS[name]())
-    own, other = differences(Sampled.of(fit), [Sampled.of(fit), Sampled.of(under_other_prior(fit))], seed=1)
+    own, other = differences(fit.sampled(), [fit.sampled(), under_other_prior(fit).sampled()], seed=1)
     assert rms(own) < 1.6
     assert np.abs(own).max() < 4.5
     assert rms(other) > 2.5

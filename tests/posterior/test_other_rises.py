@@ -80,7 +80,7 @@ def test_a_place_without_a_mode_is_no_rise(monkeypatch: pytest.MonkeyPatch) -> N
     def no_mode(*_: object, **__: object) -> None:
         raise NotConvergedError("no mode")
 
-    monkeypatch.setattr("tactile_bayes.posterior.search.look", no_mode)
+    monkeypatch.setattr("tactile_bayes.posterior.correlated.fit_and_test", no_mode)
     assert other_rises(tactile_map, found, options) == ()
 
 

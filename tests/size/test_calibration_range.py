@@ -19,7 +19,7 @@ from tactile_bayes.files.size_json import read_size_calibration, size_calibratio
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.presets import HEAD_PROFILE
 from tactile_bayes.size.bodies import BodyCalibration
-from tactile_bayes.size.draws import ShapeDraws
+from tactile_bayes.size.draws import BumpDraws, ShapeDraws
 from tactile_bayes.size.pooling import SizePriors, pool_maps
 
 SHIPPED = size_calibration_path("solid")
@@ -116,7 +116,7 @@ def test_one_map_too_far_stops_a_pool_and_a_caution_comes_first(folder: Path, sh
     assert done.returncode == EXIT_NO_ESTIMATE
     assert "No estimate: map 2: too far outside the calibration's range" in done.stdout
     ones = np.ones(200)
-    far = ShapeDraws.of(15.0 * ones, 5.0 * ones, 5.0 * ones, 0.0 * ones)
+    far = ShapeDraws.of(BumpDraws(15.0 * ones, 5.0 * ones, 5.0 * ones, 0.0 * ones))
     pooled = pool_maps([far], calibration=shipped, priors=SizePriors(), rng=np.random.default_rng(1))
     assert (pooled.status, pooled.size) == ("no_estimate", None)
     cautioned = run_here("estimate", "bump.nc", "sound.nc", "--pool", "--method", "laplace", cwd=folder)
@@ -127,7 +127,8 @@ def test_one_map_too_far_stops_a_pool_and_a_caution_comes_first(folder: Path, sh
 def test_a_size_beyond_the_tables_lumps_is_cautioned(shipped: BodyCalibration, sigma_mm: float, told: bool) -> None:
     """The shipped table's lumps have 5 to 30 mm; what lies beyond is the form's own."""
     rng, ones = np.random.default_rng(1), np.ones(400)
-    shape = ShapeDraws.of(0.12 * ones, *(sigma_mm * np.exp(0.01 * rng.standard_normal((2, 400)))), 0.0 * ones)
+    widths = sigma_mm * np.exp(0.01 * rng.standard_normal((2, 400)))
+    shape = ShapeDraws.of(BumpDraws(0.12 * ones, *widths, 0.0 * ones))
     pooled = pool_maps([shape], calibration=shipped, priors=SizePriors(), rng=rng)
     assert pooled.size is not None
     assert (pooled.size.median_mm > 30.0) == told

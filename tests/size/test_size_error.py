@@ -20,8 +20,8 @@ from tactile_bayes.inference.draws import ParameterDraws, Quantity, even_replica
 from tactile_bayes.inference.points import evened, normal_cdf, paired_points
 from tactile_bayes.posterior import search as drawn
 from tactile_bayes.posterior.options import EstimateOptions
-from tactile_bayes.posterior.search import MapDraws
-from tactile_bayes.size.draws import ShapeDraws
+from tactile_bayes.posterior.white import MapDraws
+from tactile_bayes.size.draws import BumpDraws, ShapeDraws
 from tactile_bayes.size.eq6 import AxisCalibration, SizeCalibration, push_sizes
 from tactile_bayes.size.fat import BetweenMaps
 from tactile_bayes.size.pooling import SizePriors, pool_maps, pooled_size
@@ -89,7 +89,7 @@ def test_ends_of_a_size_by_eq_6_stray_by_no_more_than_is_told() -> None:
 
     def make(rng: np.random.Generator):
         a, sx, sy = (m * np.exp(0.02 * rng.standard_normal((1, 4000))) for m in (0.3, 5.0, 4.5))
-        return push_sizes(a, sx, sy, np.zeros_like(a), calibration=eq6, rng=rng)
+        return push_sizes(BumpDraws(a, sx, sy, np.zeros_like(a)), calibration=eq6, rng=rng)
 
     spread, told = spread_and_told(sizes_of(make))
     assert spread < 1.3 * told
@@ -160,12 +160,12 @@ def test_draws_are_made_finer_until_the_size_is_as_exact_as_asked(monkeypatch: p
         size = pooled_size([shape(2.7, noise=0.02, seed=9)], calibration=calibration(), priors=SizePriors(),
                            rng=rng, number=number)  # fmt: skip
         draws = ParameterDraws(np.zeros((1, number, 1)), "importance")
-        return drawn.Drawn(MapDraws(None, None, draws, None, {}), size, None, None)
+        return drawn.SizedDraws(MapDraws(None, None, draws, None, {}), size, None, None)
 
-    monkeypatch.setattr(drawn, "_drawn", once)
+    monkeypatch.setattr(drawn, "draw_with_size", once)
     for options in (EstimateOptions(), EstimateOptions(accuracy_sd=0.01), EstimateOptions(accuracy_mm=0.005)):
         asked.clear()
-        found = drawn.draw_sized(None, None, None, options, rng=np.random.default_rng(2), progress=None)
+        found = drawn.draw_until_accurate(None, None, None, options, rng=np.random.default_rng(2), progress=None)
         size = found.size.summarise("max_size_mm", probability=PROBABILITY)
         if options.accuracy_mm is not None:
             assert size.mc_error <= options.accuracy_mm

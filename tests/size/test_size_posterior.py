@@ -10,7 +10,7 @@ from plain_calibration import RECIPE
 
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.size.draws import SizePosterior
+from tactile_bayes.size.draws import BumpDraws, SizePosterior
 from tactile_bayes.size.eq6 import AxisCalibration, SizeCalibration, push_sizes
 from tactile_bayes.size.terms import outside_domain
 
@@ -39,7 +39,7 @@ def push(
     use: SizeCalibration | None = None,
 ) -> SizePosterior:
     arrays = [np.array(np.broadcast_to(value, (2, N // 2))) for value in (a, sx, sy, angle)]
-    return push_sizes(*arrays, calibration=use or calibration(), rng=np.random.default_rng(51))
+    return push_sizes(BumpDraws(*arrays), calibration=use or calibration(), rng=np.random.default_rng(51))
 
 
 def equation_6(axis: AxisCalibration, sigma: float, a: float) -> float:

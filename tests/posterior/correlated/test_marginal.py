@@ -12,7 +12,7 @@ from tactile_bayes.forward.gaussian import cell_mean_gaussian, covariance_from_l
 from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior import marginal as collapsed
 from tactile_bayes.posterior.bump import FitCells, window_cells
-from tactile_bayes.posterior.draw import draw_scene
+from tactile_bayes.posterior.draw import draw_parameters
 from tactile_bayes.posterior.field import Window, cosine_profiles, gram_of_cosines, spectrum
 from tactile_bayes.posterior.fit import FieldFit, fit_scene, shape_draws
 from tactile_bayes.posterior.linear import _one
@@ -227,7 +227,8 @@ def test_amplitude_and_noise_come_back() -> None:
 def test_the_methods_agree(methods: tuple[str, ...]) -> None:
     fit = fitted(cells_of(noise(5, field=0.01)))
     drawn = {
-        method: draw_scene(fit, EstimateOptions(method), rng=np.random.default_rng(1))[0].flat for method in methods
+        method: draw_parameters(fit, EstimateOptions(method), rng=np.random.default_rng(1))[0].flat
+        for method in methods
     }
     sd = drawn["importance"].std(axis=0)
     for name, draws in drawn.items():

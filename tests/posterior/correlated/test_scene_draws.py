@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from tactile_bayes.inference.draws import ParameterDraws
 from tactile_bayes.inference.importance import ImportanceOptions, importance
 from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior import draw as methods
-from tactile_bayes.posterior.draw import Sampled, disagreement, draw_scene, importance_draws
+from tactile_bayes.posterior.draw import Sampled, disagreement, draw_parameters, importance_draws
 from tactile_bayes.posterior.fit import FieldFit, fit_scene
 from tactile_bayes.posterior.options import EstimateOptions
 from tactile_bayes.posterior.scene import Problem, Scene
@@ -58,9 +59,11 @@ def ends(draws: np.ndarray) -> np.ndarray:
 )
 def test_importance_ends_are_as_good_as_they_say(name: str) -> None:
     """Against one long run by other points: six runs, each end within four of its stated errors."""
-    density = Sampled.of(FITS[name]())
+    density = FITS[name]().sampled()
     many = ImportanceOptions(accuracy_sd=1.0, first=16384)
-    long = importance(density, density.mean, density.covariance, rng=np.random.default_rng(99), options=many)
+    long = importance(
+        density.log_density, density.mean, density.covariance, rng=np.random.default_rng(99), options=many
+    )
     sd = long.flat.std(axis=0)
     off = []
     for seed in range(6):
@@ -80,7 +83,7 @@ def test_evidence_is_that_of_a_quadrature() -> None:
     w = np.prod(np.stack([v.ravel() for v in np.meshgrid(weight, weight, weight, indexing="ij")]), axis=0)
     log_density = fit.target(fit.mode + z @ root.T) + 0.5 * np.sum(z**2, axis=1)
     exact = np.logaddexp.reduce(log_density + np.log(w)) + np.linalg.slogdet(root)[1]
-    draws = importance_draws(Sampled.of(fit), rng=np.random.default_rng(1))
+    draws = importance_draws(fit.sampled(), rng=np.random.default_rng(1))
     assert draws.diagnostics["log_evidence"] == pytest.approx(exact, abs=0.01)
     assert fit.log_evidence == pytest.approx(exact, abs=0.1)
     # the fields that were left out are made up for: with all of them the same
@@ -92,15 +95,15 @@ def test_evidence_is_that_of_a_quadrature() -> None:
 def test_gaussians_are_as_wide_as_the_density(name: str) -> None:
     fit = FITS[name]()
     k = len(fit.scene.alone().names)
-    exact = Sampled.of(fit).finished(
-        importance_draws(Sampled.of(fit), rng=np.random.default_rng(1)), np.random.default_rng(2)
+    exact = fit.sampled().finished(
+        importance_draws(fit.sampled(), rng=np.random.default_rng(1)), np.random.default_rng(2)
     )
-    drawn = methods.judged_laplace(fit, rng=np.random.default_rng(3))
+    drawn = fit.at_mode("laplace", 4000, np.random.default_rng(3))
     np.testing.assert_allclose(drawn.flat[:, :k].std(axis=0), exact.flat[:, :k].std(axis=0), rtol=0.15)
 
 
 def test_what_stands_beside_adds_its_uncertainty() -> None:
-    density = Sampled.of(beside())
+    density = beside().sampled()
     held = importance_draws(density, rng=np.random.default_rng(1))
     whole = density.finished(held, np.random.default_rng(2))
     assert whole.flat.shape[1] == len(beside().scene.names)
@@ -113,31 +116,31 @@ def test_a_method_that_fails_hands_on(monkeypatch: pytest.MonkeyPatch) -> None:
     def heavy(_: Sampled, **__: object) -> ParameterDraws:
         raise NotConvergedError("Pareto shape 0.91", diagnostics={"pareto_k": 0.91})
 
-    judged = methods.judged_laplace
+    judged = FieldFit.at_mode
 
-    def untrusted(fit: FieldFit, **options: np.random.Generator) -> ParameterDraws:
-        draws = judged(fit, **options)
+    def untrusted(fit: FieldFit, *options: Any) -> ParameterDraws:
+        draws = judged(fit, *options)
         return replace(draws, diagnostics=dict(draws.diagnostics) | {"pareto_k": float("nan")})
 
-    monkeypatch.setattr(methods, "judged_laplace", untrusted)
-    draws, passed = draw_scene(strong(), EstimateOptions("laplace"), rng=np.random.default_rng(1))
+    monkeypatch.setattr(FieldFit, "at_mode", untrusted)
+    draws, passed = draw_parameters(strong(), EstimateOptions("laplace"), rng=np.random.default_rng(1))
     assert draws.method == "importance"
     assert passed[0].startswith("laplace: Pareto shape nan")
     monkeypatch.setattr(methods, "importance_draws", heavy)
     with pytest.raises(NotConvergedError, match=r"laplace: .*importance: Pareto shape 0.91$"):
-        draw_scene(strong(), EstimateOptions("laplace"), rng=np.random.default_rng(1))
+        draw_parameters(strong(), EstimateOptions("laplace"), rng=np.random.default_rng(1))
     with pytest.raises(NotConvergedError, match=r"importance: Pareto shape 0.91; ensemble: .*max_steps"):
-        draw_scene(strong(), EstimateOptions(max_steps=150), rng=np.random.default_rng(1))
+        draw_parameters(strong(), EstimateOptions(max_steps=150), rng=np.random.default_rng(1))
 
 
 def test_accuracy_in_millimetres_is_accuracy_of_the_widths() -> None:
     fit = strong()
     options = EstimateOptions(accuracy_mm=0.004)
-    assert methods.accuracy_in_sd(fit, options) == pytest.approx(0.004 / methods.width_sd_mm(fit))
-    assert methods.accuracy_in_sd(fit, EstimateOptions(accuracy_sd=0.01, accuracy_mm=0.5)) == 0.01
-    draws, _ = draw_scene(fit, options, rng=np.random.default_rng(1))
+    assert methods.accuracy_in_sd(options, fit.width_sd_mm) == pytest.approx(0.004 / fit.width_sd_mm)
+    assert methods.accuracy_in_sd(EstimateOptions(accuracy_sd=0.01, accuracy_mm=0.5), fit.width_sd_mm) == 0.01
+    draws, _ = draw_parameters(fit, options, rng=np.random.default_rng(1))
     assert draws.diagnostics["end_error_mm"] <= 0.004
-    coarse, _ = draw_scene(fit, EstimateOptions(), rng=np.random.default_rng(1))
+    coarse, _ = draw_parameters(fit, EstimateOptions(), rng=np.random.default_rng(1))
     assert coarse.diagnostics["end_error_mm"] > 0.0
 
 
@@ -153,7 +156,7 @@ def run(
 ) -> ParameterDraws:
     store = None if path is None else CheckpointFile(path, context=context)
     options = EstimateOptions("ensemble", accuracy_sd=0.08, max_steps=max_steps, store=store)
-    return draw_scene(fit or quick(), options, rng=np.random.default_rng(seed))[0]
+    return draw_parameters(fit or quick(), options, rng=np.random.default_rng(seed))[0]
 
 
 @cache
@@ -229,6 +232,6 @@ def test_disagreement_counts_joint_errors() -> None:
 def test_a_rib_of_which_only_a_flank_shows_is_sampled_all_the_same() -> None:
     choice = choose(bump() + rib(y=22.0) + errors(8))
     assert choice.fit.scene.extra == "rib"
-    draws, passed = draw_scene(choice.fit, EstimateOptions(), rng=np.random.default_rng(1))
+    draws, passed = draw_parameters(choice.fit, EstimateOptions(), rng=np.random.default_rng(1))
     assert draws.method == "importance"
     assert not passed

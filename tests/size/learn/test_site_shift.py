@@ -16,7 +16,7 @@ from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.size_json import read_size_calibration, size_calibration_path
 from tactile_bayes.size.bodies import BodyCalibration
-from tactile_bayes.size.draws import ShapeDraws, ShapePrior
+from tactile_bayes.size.draws import BumpDraws, ShapeDraws, ShapePrior
 from tactile_bayes.size.fat import BetweenMaps
 from tactile_bayes.size.learn.site import LACK, PhantomMap, Residuals, SitePrior, correct_calibration, shift_posterior
 from tactile_bayes.size.pooling import SizePriors, pool_maps, pooled_size
@@ -277,7 +277,7 @@ def independent_phantoms(seat: str, *, stated: bool) -> list[PhantomMap]:
             d_mm, *bump = (np.array([float(row[n])]) for n in ("d_mm", "amplitude", "sigma_x_mm", "sigma_y_mm"))
             depth_mm = float(row["depth_ratio"]) * float(d_mm[0])
             known = {"depth_mm": depth_mm, "stiffness_ratio": 100.0, "seat": {"centred": 0.0, "resting": 1.2}[seat]}
-            shape = ShapeDraws.of(*bump, np.zeros(1))
+            shape = ShapeDraws.of(BumpDraws(*bump, np.zeros(1)))
             made.append(PhantomMap(f"row {i}", float(d_mm[0]), shape, known if stated else {}))
     return made
 
