@@ -63,14 +63,14 @@ class HeadShape(Record):
         """
         x, y, z = (surface_mm[..., i].ravel() for i in range(3))
         terms = np.stack([np.ones_like(x), x, y, -(x * x + z * z) / 2, -(y * y) / 2], axis=1)
-        found = np.linalg.lstsq(terms, z, rcond=None)[0]
-        uneven = float(np.sqrt(np.mean((terms @ found - z) ** 2)))
+        coefficients = np.linalg.lstsq(terms, z, rcond=None)[0]
+        uneven = float(np.sqrt(np.mean((terms @ coefficients - z) ** 2)))
         return cls(
             surface_mm.shape[0],
             surface_mm.shape[1],
             round(float(pitch_mm), 4),
-            _radius(float(found[3])),
-            _radius(float(found[4])),
+            _radius(float(coefficients[3])),
+            _radius(float(coefficients[4])),
             round(uneven, 3) + 0.0,
             rim_mm,
         )

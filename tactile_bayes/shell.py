@@ -30,7 +30,7 @@ def printable(text: str) -> str:
     What a file holds may reach a terminal only so: control characters can move its cursor, rename its window or hide
     what was printed before.
     """
-    return _CONTROL.sub(lambda found: ascii(found[0])[1:-1], text)
+    return _CONTROL.sub(lambda control: ascii(control[0])[1:-1], text)
 
 
 class PrintableStream:
@@ -117,8 +117,8 @@ def release_streams() -> None:
 
 def raw_stream(stream: Any) -> TextIO:
     """The stream underneath, for code that draws with control characters."""
-    found: TextIO = stream._stream if isinstance(stream, PrintableStream) else stream
-    return found
+    raw: TextIO = stream._stream if isinstance(stream, PrintableStream) else stream
+    return raw
 
 
 # --- Signals that end a command in order, as Ctrl-C does.

@@ -209,7 +209,7 @@ def fitted_gaussians(
     weight, _ = smooth_weights(log_target - log_share)
     mean = weight @ theta
     whole = _covariance(theta, weight, mean)
-    found = Gaussians.one(mean, whole)
+    fitted = Gaussians.one(mean, whole)
     means, covariances = [mean], [whole]
     for number in range(MOST_ADDED):
         weight, shape = smooth_weights(log_target - log_share)
@@ -226,8 +226,8 @@ def fitted_gaussians(
         log_share = np.concatenate([log_share, np.logaddexp(np.log(n) + first.log_density(points), there)])
         theta, log_target = np.concatenate([theta, points]), np.concatenate([log_target, log_density(points)])
         size = np.array([n, *[ADDED] * (number + 1)], dtype=np.float64)
-        found = Gaussians(size / size.sum(), np.array(means), np.array(covariances))
-    return found, ADDED * (len(found) - 1)
+        fitted = Gaussians(size / size.sum(), np.array(means), np.array(covariances))
+    return fitted, ADDED * (len(fitted) - 1)
 
 
 def _covariance(theta: FloatArray, weight: FloatArray, centre: FloatArray) -> FloatArray:
@@ -338,19 +338,19 @@ def _sampled(sampler: _Sampler, *, rng: np.random.Generator, options: Importance
 
     Where the fitted proposal turns out worse than the first one, the first one goes on if its points can be trusted.
     """
-    found = _extended(sampler, options, most=min(FITTED_AT, options.most), patience=ADAPTED_FROM)
-    if _reached(found, options):
-        return found
+    judged = _extended(sampler, options, most=min(FITTED_AT, options.most), patience=ADAPTED_FROM)
+    if _reached(judged, options):
+        return judged
     fitted = sampler.adapted(rng)
     fitted.extend(ADAPTED_FROM)
     # a fitted proposal may take twice the points: chains, which come next, are asked for a fifth of the accuracy
     better = _extended(fitted, options, most=2 * options.most, patience=HEAVY_POINTS, heavy=HEAVY)
     if _reached(better, options):
         return better
-    if _trusted(found[2]):
-        found = _extended(sampler, options, most=options.most, patience=ADAPTED_FROM)
-        if _reached(found, options, times=NEAR_ENOUGH):
-            return found
+    if _trusted(judged[2]):
+        judged = _extended(sampler, options, most=options.most, patience=ADAPTED_FROM)
+        if _reached(judged, options, times=NEAR_ENOUGH):
+            return judged
     sampler, _, shape, error = better
     raise NotConvergedError(
         f"importance sampling stopped at {sampler.number} points with an end-point error of {error:.3f} SD "
@@ -371,10 +371,10 @@ def _extended(
         weights, shape = sampler.weights()
         # a few replicates' spread misses what a heavy tail does now and then: 0.036 SD was seen where they said 0.015
         error = sampler.end_error(weights) * (1.0 + max(shape, 0.0) if np.isfinite(shape) else 1.0)
-        found = sampler, weights, shape, error
+        judged = sampler, weights, shape, error
         hopeless = sampler.points >= patience and not _trusted(shape - heavy)
-        if _reached(found, options) or sampler.points >= most or hopeless:
-            return found
+        if _reached(judged, options) or sampler.points >= most or hopeless:
+            return judged
         sampler.extend(sampler.points)
 
 
@@ -382,8 +382,8 @@ def _trusted(shape: float) -> bool:
     return shape == -np.inf or bool(np.isfinite(shape) and shape <= TRUSTED_SHAPE)
 
 
-def _reached(found: _Judged, options: ImportanceOptions, *, times: float = 1.0) -> bool:
-    _, _, shape, error = found
+def _reached(judged: _Judged, options: ImportanceOptions, *, times: float = 1.0) -> bool:
+    _, _, shape, error = judged
     return _trusted(shape) and error <= times * options.accuracy_sd
 
 

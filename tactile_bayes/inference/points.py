@@ -135,12 +135,12 @@ def paired_points(key: FloatArray, replicates: Labels, dimension: int, rng: np.r
     counts = np.bincount(replicates)
     shifts = rng.integers(2**BITS, size=(len(counts), dimension + 1), dtype=np.uint32)
     points = shifted_sobol(0, int(counts.max()), shifts=shifts)
-    found = np.empty((len(key), dimension))
+    paired = np.empty((len(key), dimension))
     for label, (count, one) in enumerate(zip(counts, points, strict=True)):
         members = np.flatnonzero(replicates == label)
         in_order = np.argsort(one[:count, 0])
-        found[members[np.argsort(key[members], kind="stable")]] = one[in_order, 1:]
-    return found
+        paired[members[np.argsort(key[members], kind="stable")]] = one[in_order, 1:]
+    return paired
 
 
 def evened(values: FloatArray, mean: FloatArray, sd: FloatArray, replicates: Labels) -> FloatArray:
@@ -150,13 +150,13 @@ def evened(values: FloatArray, mean: FloatArray, sd: FloatArray, replicates: Lab
     large draw still does. NaN stays. The mixture's distribution function is the mean of the normals', not of steps at
     the draws (Rao-Blackwell). It is inverted on a grid, as normal scores, in which it is nearly straight.
     """
-    found = values.copy()
+    even = values.copy()
     for label in range(int(replicates.max(initial=-1)) + 1):
         members = np.flatnonzero((replicates == label) & np.isfinite(values))
         if len(members):
             members = members[np.argsort(values[members])]
-            found[members] = _mixture_quantiles(mean[members], sd[members])
-    return found
+            even[members] = _mixture_quantiles(mean[members], sd[members])
+    return even
 
 
 def _mixture_quantiles(mean: FloatArray, sd: FloatArray) -> FloatArray:

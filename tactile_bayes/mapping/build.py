@@ -256,7 +256,7 @@ class _Rules(Record, eq=False):
 
     def select(self, scans: list[Scan], late_ms: float) -> list[SelectedFrames]:
         """Select the used frames of every scan; an error if none is left in any of them."""
-        found = [
+        selections = [
             select_frames(
                 scan,
                 pressure_window_kpa=self.window_kpa,
@@ -265,8 +265,8 @@ class _Rules(Record, eq=False):
             )
             for scan in scans
         ]
-        refuse_without_frames(found, pressure_window_kpa=self.window_kpa)
-        return found
+        refuse_without_frames(selections, pressure_window_kpa=self.window_kpa)
+        return selections
 
 
 def _flattened(
@@ -281,18 +281,18 @@ def _flattened(
 
 
 def _latency(selections: list[SelectedFrames], rules: _Rules, cell_mm: float, figures: dict[str, float]) -> float:
-    found = estimate_latency(
+    estimate = estimate_latency(
         selections,
         plane=_plane(selections),
         cell_mm=cell_mm,
         max_pose_gap_ms=rules.max_pose_gap_ms,
     )
     figures |= {
-        "latency_sd_ms": found.sd_ms,
-        "latency_bound_ms": found.bound_ms,
-        "latency_frames": float(found.frames),
+        "latency_sd_ms": estimate.sd_ms,
+        "latency_bound_ms": estimate.bound_ms,
+        "latency_frames": float(estimate.frames),
     }
-    return found.latency_ms
+    return estimate.latency_ms
 
 
 def _plane(selections: list[SelectedFrames]) -> Plane:
@@ -413,6 +413,6 @@ def _landmarks(scans: list[Scan], plane: Plane) -> tuple[FloatArray | None, Floa
 
 def _mean_point(points_mm: list[FloatArray]) -> tuple[FloatArray, float]:
     """Mean of points, and the largest distance from it."""
-    found = np.stack(points_mm)
-    mean = np.sort(found, axis=0).mean(axis=0)  # sorted, so that the order of the scans leaves no trace
-    return mean, float(np.linalg.norm(found - mean, axis=1).max())
+    points = np.stack(points_mm)
+    mean = np.sort(points, axis=0).mean(axis=0)  # sorted, so that the order of the scans leaves no trace
+    return mean, float(np.linalg.norm(points - mean, axis=1).max())

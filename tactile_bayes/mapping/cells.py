@@ -368,12 +368,12 @@ class Projector:
     def _matrix_of_one(self, poses: FramePoses) -> FloatArray:
         """(1, 2, 4) matrix of one frame with plain numbers, quicker for one and equal to the bit."""
         offset = [p - o for p, o in zip(poses.position_mm[0].tolist(), self._origin, strict=True)]
-        found, cell_mm = [], self._cell_mm
+        numbers, cell_mm = [], self._cell_mm
         columns = self._columns(poses.rotation[0].tolist(), offset)
         for value, (step, half) in zip(columns, _NUMBERS, strict=True):
             steps = (value / cell_mm + half) / step
-            found.append((round(steps) if -_WHOLE < steps < _WHOLE else steps) * step)
-        return np.array(found).reshape(1, 2, 4)
+            numbers.append((round(steps) if -_WHOLE < steps < _WHOLE else steps) * step)
+        return np.array(numbers).reshape(1, 2, 4)
 
     def _columns(self, r: Any, offset: Any) -> list[Any]:
         """The eight numbers, mm, of the matrix of one frame or of many, from 3 x 3 rotation `r` and 3 coordinates

@@ -177,8 +177,8 @@ def convention_agreement(selections: Sequence[SelectedFrames]) -> dict[str, floa
     poses = [(part, _near_used(part)) for part in selections]
     if sum(len(one) for _, one in poses) < 3:
         return {}
-    found = {name: _agreement(poses, *how) for name, how in CONVENTIONS.items()}
-    return found if np.isfinite(found[DECLARED]) else {}
+    agreement = {name: _agreement(poses, *how) for name, how in CONVENTIONS.items()}
+    return agreement if np.isfinite(agreement[DECLARED]) else {}
 
 
 def check_convention(selections: Sequence[SelectedFrames]) -> dict[str, float]:
@@ -265,8 +265,8 @@ def _agreement(parts: Sequence[tuple[SelectedFrames, TrackerPoses]], order: tupl
         levels.append(_level_at(part, poses))
     normal: FloatArray = np.concatenate(normals).mean(axis=0)
     raw = np.concatenate(places)
-    found = [_along(normal, one) for one in (raw, _without_sinking(raw, np.concatenate(levels)))]
-    return float("nan") if np.isnan(found[0]) else float(np.nanmax(found))
+    agreements = [_along(normal, one) for one in (raw, _without_sinking(raw, np.concatenate(levels)))]
+    return float("nan") if np.isnan(agreements[0]) else float(np.nanmax(agreements))
 
 
 def _along(normal: FloatArray, places_mm: FloatArray) -> float:

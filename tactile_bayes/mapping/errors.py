@@ -35,16 +35,16 @@ def pose_noise_figures(selections: Sequence[SelectedFrames], plane: Plane, *, ce
 
     The noise is what a pose departs by from the cubic through the two poses before and the two after it.
     """
-    found = [one for part in selections if (one := _Places.of(part, plane)) is not None]
-    if not found:
+    scans = [one for part in selections if (one := _Places.of(part, plane)) is not None]
+    if not scans:
         return {}
-    frames = np.array([one.frames for one in found])
-    variance = np.average([one.variance for one in found], axis=0, weights=frames)
+    frames = np.array([one.frames for one in scans])
+    variance = np.average([one.variance for one in scans], axis=0, weights=frames)
     if variance.max() > MOST_MM**2:
         return {}
     head = selections[0].scan.head
     sides = [taxels * head.pitch_mm for taxels in head.shape]
-    independent = sum(one.independent for one in found) / float(frames.sum())
+    independent = sum(one.independent for one in scans) / float(frames.sum())
     figures = [*np.sqrt(variance), *sides, (head.pitch_mm / cell_mm) ** 2 * independent]
     return {name: float(f"{value:.4g}") for name, value in zip(POSE_NOISE, figures, strict=True)}
 

@@ -154,12 +154,12 @@ class Nuisance(Record, eq=False):
 
     def within_frames(self, values: FloatArray) -> FloatArray:
         """(n,) values without their quadratic in each frame."""
-        found, start = np.empty_like(values), 0
+        rest, start = np.empty_like(values), 0
         for basis, (m, k) in zip(self.bases, self.shapes, strict=True):
             block = values[start : start + m * k].reshape(m, k)
-            found[start : start + m * k] = (block - (block @ basis) @ basis.T).reshape(-1)
+            rest[start : start + m * k] = (block - (block @ basis) @ basis.T).reshape(-1)
             start += m * k
-        return found
+        return rest
 
     def levelled(self, values: FloatArray, cells: Cells) -> FloatArray:
         """(n,) values without what frames and taxels add to one common map, which stays in."""
@@ -242,9 +242,9 @@ def estimate_latency(
         raise _undetermined("no frame has a pose at every delay")
     latency, fit = _solved(parts)
     strokes = _strokes(parts, latency)
-    found = _Regression.of(fit, parts, latency, strokes)
+    regression = _Regression.of(fit, parts, latency, strokes)
     noise = pose_noise_figures(selections, plane, cell_mm=cell_mm)
-    estimate = found.estimate(latency, noise, sum(len(part.coarse.frames) for part in parts))
+    estimate = regression.estimate(latency, noise, sum(len(part.coarse.frames) for part in parts))
     if not estimate.sd_ms < MOST_SD_MS:
         raise _undetermined(_lack(estimate))
     return estimate
@@ -254,10 +254,10 @@ def _undetermined(why: str) -> BadDataError:
     return BadDataError(f"the scan does not determine the tracker's latency ({why})", way_out=_NEEDED)
 
 
-def _lack(found: LatencyEstimate) -> str:
+def _lack(estimate: LatencyEstimate) -> str:
     """The scan's deficiency, in one line."""
-    forth, back = found.crossings
-    if not np.isfinite(found.sd_ms):
+    forth, back = estimate.crossings
+    if not np.isfinite(estimate.sd_ms):
         lack = "no lump or other slope stands out of the noise"
     elif min(forth, back) == 0:
         lack = f"a lump is crossed {max(forth, back)} times in one direction and never in the other"
@@ -265,7 +265,7 @@ def _lack(found: LatencyEstimate) -> str:
         lack = f"a lump is crossed {forth} times forth and {back} times back"
     if forth + back < LEAST_STROKES:
         return f"{lack}; at least two strokes each way are needed"
-    known = f"; it would be known to +-{found.sd_ms:.0f} ms only" if np.isfinite(found.sd_ms) else ""
+    known = f"; it would be known to +-{estimate.sd_ms:.0f} ms only" if np.isfinite(estimate.sd_ms) else ""
     return f"{lack}{known}, within {MOST_SD_MS:g} ms are needed"
 
 

@@ -224,8 +224,8 @@ def broken_assumptions(quality: Mapping[str, float]) -> tuple[Finding, ...]:
 
     Missing figures say nothing.
     """
-    found = (_lag(quality), _uneven(quality), _curved(quality), _few_strokes(quality))
-    return tuple(one for one in found if one is not None)
+    findings = (_lag(quality), _uneven(quality), _curved(quality), _few_strokes(quality))
+    return tuple(one for one in findings if one is not None)
 
 
 def handling_findings(quality: Mapping[str, float]) -> tuple[Finding, ...]:

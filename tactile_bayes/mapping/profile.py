@@ -265,13 +265,13 @@ class ProfileReader(Record, eq=False):
         if not self.solve.size:
             return np.full((len(pressure_kpa), terms + 1), np.nan)
         # One matrix times vector per frame: a product of all frames would be rounded by how many there are.
-        found = np.matmul(self.solve, pressure_kpa[:, :, None])[:, :, 0]
+        coefficients = np.matmul(self.solve, pressure_kpa[:, :, None])[:, :, 0]
         # The residual's square by Pythagoras: the residual itself would cost as much as the map.
-        fitted = np.matmul(self.gram, found[:, :, None])[:, :, 0]
-        square = np.einsum("ft,ft->f", pressure_kpa, pressure_kpa) - np.einsum("fi,fi->f", found, fitted)
+        fitted = np.matmul(self.gram, coefficients[:, :, None])[:, :, 0]
+        square = np.einsum("ft,ft->f", pressure_kpa, pressure_kpa) - np.einsum("fi,fi->f", coefficients, fitted)
         left = np.sqrt(np.maximum(square, 0.0) / self.solve.shape[1])
-        rows = np.empty((len(found), terms + 1))
-        rows[:, :-1], rows[:, -1] = found, left
+        rows = np.empty((len(coefficients), terms + 1))
+        rows[:, :-1], rows[:, -1] = coefficients, left
         rows /= level_kpa[:, None]
         return rows
 
@@ -386,16 +386,16 @@ def _profile_changes(rows: FloatArray, design: FloatArray, group: NDArray[np.int
     both_ways = np.std(design[:, _WAY]) > 0
     kept = np.flatnonzero(np.std(design, axis=0) > 0)
     columns = np.concatenate([[0], kept])
-    found, errors = _regression(design[:, columns], rows[:, :-1], group)
+    coefficients, errors = _regression(design[:, columns], rows[:, :-1], group)
     at = {int(column): i for i, column in enumerate(columns)}
-    slope, slope_error = (values[[at[_X], at[_Y]], 0] for values in (found, errors))
+    slope, slope_error = (values[[at[_X], at[_Y]], 0] for values in (coefficients, errors))
     change = float(np.hypot(*slope))
     figures = {
         "profile_change": change,
         "profile_change_sd": float(np.sqrt(np.sum((slope * slope_error) ** 2)) / change) if change > 0 else 0.0,
     }
     if both_ways:
-        figures |= {"stroke_skew": float(found[at[_WAY], SKEW]), "stroke_skew_sd": float(errors[at[_WAY], SKEW])}
+        figures |= {"stroke_skew": float(coefficients[at[_WAY], SKEW]), "stroke_skew_sd": float(errors[at[_WAY], SKEW])}
     return figures
 
 

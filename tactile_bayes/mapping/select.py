@@ -257,20 +257,20 @@ def overlap_cautions(frames: Span, poses: Span) -> list[str]:
 
     A scan without frames, or without poses, has no times to compare.
     """
-    found = _frame_gaps(frames)
+    cautions = _frame_gaps(frames)
     if not frames.number or not poses.number:
-        return found
+        return cautions
     if apart(frames, poses):
         when = f"{poses.first_s:.2f} to {poses.last_s:.2f} s, frames {frames.first_s:.2f} to {frames.last_s:.2f} s"
-        return [*found, f"no frame has a pose: poses cover {when}"]
+        return [*cautions, f"no frame has a pose: poses cover {when}"]
     late_s, early_s = poses.first_s - frames.first_s, frames.last_s - poses.last_s
     if late_s > TOLERATED_S:
-        found.append(f"poses start {late_s:.1f} s after the frames")
+        cautions.append(f"poses start {late_s:.1f} s after the frames")
     if early_s > TOLERATED_S:
-        found.append(f"poses end {early_s:.1f} s before the frames")
+        cautions.append(f"poses end {early_s:.1f} s before the frames")
     if poses.gap_s > TOLERATED_S:
-        found.append(f"no pose for {poses.gap_s:.2f} s from {poses.gap_at_s:.2f} s on (longest gap)")
-    return found
+        cautions.append(f"no pose for {poses.gap_s:.2f} s from {poses.gap_at_s:.2f} s on (longest gap)")
+    return cautions
 
 
 def scan_findings(scan: Scan) -> tuple[Finding, ...]:
@@ -280,9 +280,9 @@ def scan_findings(scan: Scan) -> tuple[Finding, ...]:
 
 def with_times(findings: Sequence[Finding], frames: Span, poses: Span) -> tuple[Finding, ...]:
     """Findings of a scan's file, and of its times where its recorder did not note them."""
-    found = overlap_cautions(frames, poses)
-    told = [one for one in findings if one.text not in found]
-    return (*told, *(Finding("times_apart", text) for text in found))
+    cautions = overlap_cautions(frames, poses)
+    told = [one for one in findings if one.text not in cautions]
+    return (*told, *(Finding("times_apart", text) for text in cautions))
 
 
 def _frame_gaps(frames: Span) -> list[str]:

@@ -97,11 +97,11 @@ def register_strokes(sources: Sequence[Source]) -> tuple[list[Source], list[Stro
     if known.sum() < 2:
         raise BadDataError(_lack(known, round_), way_out="scan back and forth over a lump, or leave out the option")
     shifts = np.where(known, shifts - shifts[known].mean(), 0.0)
-    found = [
+    shifted = [
         replace(one, shift_mm=float(shift), sd_mm=float(error), known=bool(sure))
         for one, shift, error, sure in zip(strokes, shifts, errors, known, strict=True)
     ]
-    return [_moved(source, [one for one in found if one.scan == n]) for n, source in enumerate(sources)], found
+    return [_moved(source, [one for one in shifted if one.scan == n]) for n, source in enumerate(sources)], shifted
 
 
 def _lack(known: NDArray[np.bool_], last: _Round) -> str:

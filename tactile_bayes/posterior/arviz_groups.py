@@ -91,17 +91,17 @@ def inference_groups(
     cells = estimate.fit.cells
     places = {"x_mm": cells.x_mm, "y_mm": cells.y_mm, "readings": cells.count}
     observed = {name: (("cell",), values) for name, values in {"value": cells.value, **places}.items()}
-    found = {"observed_data": DrawGroup(observed, {"value": "mean of the readings of each cell of the fit window"})}
+    groups = {"observed_data": DrawGroup(observed, {"value": "mean of the readings of each cell of the fit window"})}
     fit = None if estimate.scene is None else estimate.scene.fit
     statistics = _statistics(estimate, fit)
     if statistics is not None:
-        found["sample_stats"] = statistics
+        groups["sample_stats"] = statistics
     if fit is None:
-        return found
-    found["prior"] = _prior(fit, calibration, size_priors, rng)
+        return groups
+    groups["prior"] = _prior(fit, calibration, size_priors, rng)
     if estimate.draws.method == "ensemble":
-        found["log_likelihood"] = _log_likelihood(estimate.draws.theta, fit)
-    return found
+        groups["log_likelihood"] = _log_likelihood(estimate.draws.theta, fit)
+    return groups
 
 
 def _statistics(estimate: Estimate, fit: FieldFit | None) -> DrawGroup | None:

@@ -160,19 +160,19 @@ def candidate_centres(tactile_map: TactileMap, *, limit: int = 16, rim_limit: in
     peak = np.isfinite(excess) & (excess > 0) & np.logical_and.reduce([excess >= other for other in neighbours])
     rows, columns = np.nonzero(peak)
     order = np.argsort(-excess[rows, columns], kind="stable")
-    found: list[tuple[float, float]] = []
+    centres: list[tuple[float, float]] = []
     left = {False: limit, True: rim_limit}
     for i in order:
         centre = (float(tactile_map.x_mm[columns[i]]), float(tactile_map.y_mm[rows[i]]))
-        if any(np.hypot(centre[0] - x, centre[1] - y) <= 2 * SMOOTHING_MM for x, y in found):
+        if any(np.hypot(centre[0] - x, centre[1] - y) <= 2 * SMOOTHING_MM for x, y in centres):
             continue
         at_rim = covered_share(tactile_map, centre, radius_mm=RIM_MM) < RIM_SHARE
         if left[at_rim]:
-            found.append(centre)
+            centres.append(centre)
             left[at_rim] -= 1
         if not left[False]:
             break
-    return found
+    return centres
 
 
 @lru_cache(maxsize=MAPS_AT_HAND)

@@ -61,10 +61,10 @@ def irregular(fit: FieldFit) -> bool:
     """
     if fit.scene.extra or fit.scene.shape == "ridge":
         return False
-    found, covariance = outline(fit)
+    shape, covariance = outline(fit)
     pairs = ((slice(0, 2), BALLS_SD[0]), (slice(2, 4), BALLS_SD[1]))
     return any(
-        float(found[at] @ np.linalg.solve(NOISE_FACTOR * covariance[at, at] + sd**2 * np.eye(2), found[at]))
+        float(shape[at] @ np.linalg.solve(NOISE_FACTOR * covariance[at, at] + sd**2 * np.eye(2), shape[at]))
         > MOST_SDS**2
         for at, sd in pairs
     )
@@ -81,11 +81,11 @@ def outline(fit: FieldFit) -> tuple[FloatArray, FloatArray]:
     v = len(known)
     shared = np.linalg.lstsq(products[:v, :v], products[:v, v:], rcond=None)[0]
     left = products[v:, v:] - products[v:, :v] @ shared
-    found = np.linalg.solve(left[:4, :4], left[:4, 4])
-    squares = max(float(left[4, 4] - found @ left[:4, 4]), FLOOR * float(products[-1, -1]))
+    coefficients = np.linalg.solve(left[:4, :4], left[:4, 4])
+    squares = max(float(left[4, 4] - coefficients @ left[:4, 4]), FLOOR * float(products[-1, -1]))
     variance = squares / max(len(cells) - v - 4, 1)
     amplitude = fit.target.amplitude_at(fit.mode)
-    return np.asarray(found / amplitude), np.asarray(np.linalg.inv(left[:4, :4]) * variance / amplitude**2)
+    return np.asarray(coefficients / amplitude), np.asarray(np.linalg.inv(left[:4, :4]) * variance / amplitude**2)
 
 
 def _columns(fit: FieldFit) -> tuple[FloatArray, FloatArray]:
@@ -120,17 +120,17 @@ def pose_covariance(fit: FieldFit) -> FloatArray:
     """
     noise = fit.target.window.cells.pose_noise
     p = len(fit.scene.alone().names)
-    found = np.zeros((len(fit.mode), len(fit.mode)))
+    covariance = np.zeros((len(fit.mode), len(fit.mode)))
     if noise is None or fit.scene.shape == "ridge":
-        return found
+        return covariance
     known = tangent_columns(fit)
     slopes = [known[1 + fit.scene.names.index(name)] for name in ("x", "y")]
     errors = _error_columns(fit.target.window, noise, slopes)
     products = fit.target.products(known, np.concatenate([known, errors]), fit.mode)
     v = len(known)
     moved = np.linalg.solve(products[:, :v], products[:, v:])[1 : p + 1]
-    found[:p, :p] = moved @ moved.T
-    return found
+    covariance[:p, :p] = moved @ moved.T
+    return covariance
 
 
 def _error_columns(window: Window, noise: PoseNoise, slopes: list[FloatArray]) -> FloatArray:

@@ -68,10 +68,10 @@ def estimate_map(
     if calibration is not None:
         check_recipe(tactile_map, calibration, options.fit)
         calibration = calibration_for(tactile_map, calibration)
-    found = _answer(tactile_map, calibration, options, rng=rng, progress=progress)
-    if found.code in ("undetected", "ridge") and (why := no_verdict(tactile_map.recipe.cell_mm)) is not None:
-        found = _none(why, found.candidates)
-    return replace(found, findings=by_weight((*tactile_map.findings, *found.findings)))
+    estimate = _answer(tactile_map, calibration, options, rng=rng, progress=progress)
+    if estimate.code in ("undetected", "ridge") and (why := no_verdict(tactile_map.recipe.cell_mm)) is not None:
+        estimate = _none(why, estimate.candidates)
+    return replace(estimate, findings=by_weight((*tactile_map.findings, *estimate.findings)))
 
 
 def _answer(
@@ -97,19 +97,19 @@ def _answer(
             return _none(why, candidates)
         fit, detection = None if likeliest.candidate is None else likeliest.candidate.fit, likeliest.detection
         lump = detection.probability >= DETECTED and why.code not in NO_LUMP
-        found = _none(why, candidates, detection, fit.modal() if lump and fit is not None else None)
-        return replace(found, weighed=likeliest)
+        estimate = _none(why, candidates, detection, fit.modal() if lump and fit is not None else None)
+        return replace(estimate, weighed=likeliest)
     weighed = _weighed(tactile_map, seen, seen.detection)
     if seen.detection.probability < DETECTED or weighed.probability < LIKELY:
-        found = _none(undetected(weighed, where=where), candidates, seen.detection)
+        estimate = _none(undetected(weighed, where=where), candidates, seen.detection)
     elif options.scene == "none":
         why = Abstention("undetected", "no lump was assumed")
-        found = _none(why, candidates, seen.detection)
+        estimate = _none(why, candidates, seen.detection)
     else:
-        found = _measured(tactile_map, seen, candidates, calibration, options, rng=rng, progress=progress)
-    if found.code == "ridge" and not found.reason.startswith("no lump found"):
-        found = replace(found, reason=f"no lump found {where}: {found.reason}")
-    return replace(found, weighed=_weighed(tactile_map, seen, found.detection or seen.detection))
+        estimate = _measured(tactile_map, seen, candidates, calibration, options, rng=rng, progress=progress)
+    if estimate.code == "ridge" and not estimate.reason.startswith("no lump found"):
+        estimate = replace(estimate, reason=f"no lump found {where}: {estimate.reason}")
+    return replace(estimate, weighed=_weighed(tactile_map, seen, estimate.detection or seen.detection))
 
 
 def _weighed(tactile_map: TactileMap, seen: Assessment, detection: Detection) -> Weighed:
@@ -135,20 +135,20 @@ def _measured(
     if hopeless is not None:
         return _none(hopeless, candidates, detection, bump)
     try:
-        found = draw_until_accurate(tactile_map, seen, calibration, options, rng=rng, progress=progress)
+        sized = draw_until_accurate(tactile_map, seen, calibration, options, rng=rng, progress=progress)
     except NotConvergedError as error:
         if options.method == "ensemble" or not options.fit.correlated:
             raise
         advice = "give --method ensemble, with a larger max_steps in --settings FILE.toml"
         why = Abstention("method", f"no method converged: {error}", advice, OTHER_METHOD_ON_PAPER)
         return _none(why, candidates, detection, bump)
-    made, size, calibration = found.made, found.size, found.calibration
+    made, size, calibration = sized.made, sized.size, sized.calibration
     detection = made.detection
-    if found.fault is not None:
-        return _none(found.fault, candidates, detection, bump)
-    diagnostics = _diagnostics(found)
-    if found.too_far:
-        return _none(extrapolated(list(found.too_far)), candidates, detection, bump, diagnostics)
+    if sized.fault is not None:
+        return _none(sized.fault, candidates, detection, bump)
+    diagnostics = _diagnostics(sized)
+    if sized.too_far:
+        return _none(extrapolated(list(sized.too_far)), candidates, detection, bump, diagnostics)
     if size is not None and size.invalid > MOST_INVALID * size.d_x_mm.size:
         reason = f"no positive size in {size.invalid} of {size.d_x_mm.size} draws: outside the calibration"
         outside = Abstention(
@@ -169,7 +169,7 @@ def _measured(
         scene=seen.scene,
         sensitivity=_sensitivity(made.posterior, size, options),
         bump=bump,
-        findings=tuple(_findings(found, cell_mm=tactile_map.recipe.cell_mm)),
+        findings=tuple(_findings(sized, cell_mm=tactile_map.recipe.cell_mm)),
     )
 
 
@@ -248,8 +248,8 @@ def _way_to(recipe: Recipe, tactile_map: TactileMap) -> str:
     return "leave the fit's options to the calibration, or learn a calibration for these"
 
 
-def _diagnostics(found: SizedDraws) -> Diagnostics:
-    made, calibration = found.made, found.calibration
+def _diagnostics(sized: SizedDraws) -> Diagnostics:
+    made, calibration = sized.made, sized.calibration
     return Diagnostics(
         cells=len(made.fit.cells),
         covered_share=made.fit.covered_share,
@@ -257,15 +257,15 @@ def _diagnostics(found: SizedDraws) -> Diagnostics:
         method=made.draws.method,
         sampler=made.draws.diagnostics,
         noise=made.figures,
-        convergence=_convergence(made, found.size) if made.draws.method == "ensemble" else {},
+        convergence=_convergence(made, sized.size) if made.draws.method == "ensemble" else {},
     )
 
 
-def _findings(found: SizedDraws, *, cell_mm: float) -> Iterator[Finding]:
+def _findings(sized: SizedDraws, *, cell_mm: float) -> Iterator[Finding]:
     """Findings against the size of a lump, besides those against its map."""
-    posterior, calibration = found.made.posterior, found.calibration
+    posterior, calibration = sized.made.posterior, sized.calibration
     if calibration is not None:
-        beyond = [] if found.size is None else calibration.beyond_lumps(found.size.median_mm)
+        beyond = [] if sized.size is None else calibration.beyond_lumps(sized.size.median_mm)
         for text in (*calibration.outside(*posterior.medians), *beyond):
             yield Finding("outside_calibration", f"outside the calibration's range: {text}")
     if posterior.irregular:
@@ -274,7 +274,7 @@ def _findings(found: SizedDraws, *, cell_mm: float) -> Iterator[Finding]:
         text = f"cells of {cell_mm:g} mm are coarse for this width"
         remedy, on_paper = "map again with a smaller --cell-mm", "map the scan again with smaller cells"
         yield Finding("coarse_cells", text, remedy, on_paper)
-    offset = found.made.figures.level_offset
+    offset = sized.made.figures.level_offset
     if offset is not None and abs(offset) >= _NEAR_LEVEL:
         text = (
             f"the level about the bump is {offset:+.3f} off the fixed background: something else bears on the head (a "
@@ -288,8 +288,8 @@ def _convergence(made: MapDraws, size: SizePosterior | None) -> dict[str, dict[s
     from tactile_bayes.inference.arviz_data import convergence
 
     sizes = () if size is None else ("max_size_mm", "min_size_mm", "d_x_mm", "d_y_mm")
-    found = {name: convergence(getattr(size, name)) for name in sizes}
-    return found | {
+    figures = {name: convergence(getattr(size, name)) for name in sizes}
+    return figures | {
         name: convergence(getattr(made.posterior, name)) for name in ("amplitude", "sigma_x_mm", "sigma_y_mm")
     }
 

@@ -167,9 +167,9 @@ def gaussian_mixture(target: CollapsedTarget, mode: FloatArray, covariance: Floa
 
     The common curvature is sharper than the mixture is wide where fields with modes of their own share the evidence.
     """
-    found = newton_mixture(target, mode, covariance)
-    if found is not None:
-        return found
+    mixture = newton_mixture(target, mode, covariance)
+    if mixture is not None:
+        return mixture
     volume = 0.5 * float(np.linalg.slogdet(2.0 * np.pi * covariance)[1])
     return Mixture(np.ones(1), mode[None], covariance[None], float(target(mode[None])[0]) + volume)
 
@@ -192,10 +192,10 @@ def newton_mixture(
         if not np.isfinite(by_field[:, h]).all():
             return None
         gradient, hessian = finite_differences(by_field[:, h], step=0.3 * scale)
-        found = _newton_gaussian(gradient, hessian, scale, limit=covariance)
-        if found is None:
+        gaussian = _newton_gaussian(gradient, hessian, scale, limit=covariance)
+        if gaussian is None:
             return None
-        step, one, gained = found
+        step, one, gained = gaussian
         means.append(start + step)
         covariances.append(one)
         masses.append(by_field[0, h] + gained + 0.5 * float(np.linalg.slogdet(2.0 * np.pi * one)[1]))

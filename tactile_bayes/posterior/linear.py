@@ -137,10 +137,10 @@ def solve(
     least = LEAST_POWER * (np.maximum(rest, 0.0) + floor) / dof / amplitude_sd**2
     diagonal = [np.maximum(power(i, i, one.square), least) for i, one in enumerate(inner)]
     if cross is None:
-        found = _one(along[0], diagonal[0], rest, floor, dof=dof, amplitude_sd=amplitude_sd)
+        structures = _one(along[0], diagonal[0], rest, floor, dof=dof, amplitude_sd=amplitude_sd)
     else:
-        found = _two(along, diagonal, power(0, 1, cross), rest, floor, dof=dof, amplitude_sd=amplitude_sd)
-    log_factor, amplitude, matrix, squares = found
+        structures = _two(along, diagonal, power(0, 1, cross), rest, floor, dof=dof, amplitude_sd=amplitude_sd)
+    log_factor, amplitude, matrix, squares = structures
     constant = columns.log_prior - 0.5 * columns.log_det + lgamma(dof / 2) - 0.5 * dof * log(pi)
     evidence = constant + log_factor - 0.5 * dof * np.log(squares)
     # a dent is no lump: only rises have density

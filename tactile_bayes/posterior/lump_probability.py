@@ -169,11 +169,11 @@ def _places(tactile_map: TactileMap) -> tuple[FloatArray, float]:
     rows, columns = np.nonzero(mask)
     x, y = tactile_map.x_mm[columns], tactile_map.y_mm[rows]
     middle = (x.min() + x.max()) / 2, (y.min() + y.max()) / 2
-    found = []
+    axes = []
     for axis, low, high in ((0, x.min(), x.max()), (1, y.min(), y.max())):
         number = int((high - low) / spacing / 2)
-        found.append(middle[axis] + spacing * np.arange(-number, number + 1))
-    grid = [(a, b) for b in found[1] for a in found[0]]
+        axes.append(middle[axis] + spacing * np.arange(-number, number + 1))
+    grid = [(a, b) for b in axes[1] for a in axes[0]]
     kept = [at for at in grid if covered_share(tactile_map, at, radius_mm=NEAR_MM) >= LEAST_SHARE]
     return np.array(kept or [middle]), spacing
 
@@ -184,7 +184,7 @@ def _smallest(needed: FloatArray, depth_mm: float, fat_mm: float) -> FloatArray:
     log_a = features @ np.array(LOG_AMPLITUDE)
     log_sigma = np.clip(features[:, : len(LOG_SIGMA)] @ np.array(LOG_SIGMA), *np.log(WIDTHS_MM[[0, -1]]))
     fits = depth_mm >= LEAST_DEPTH_RATIO * SIZES_MM
-    found = np.full(len(needed), np.inf)
+    sizes = np.full(len(needed), np.inf)
     for i, row in enumerate(needed):
         least = np.interp(log_sigma, np.log(WIDTHS_MM), np.log(np.minimum(row, 1e9)))
         shown = (log_a - least >= MARGIN) & fits
@@ -192,8 +192,8 @@ def _smallest(needed: FloatArray, depth_mm: float, fat_mm: float) -> FloatArray:
         hidden = np.flatnonzero(~shown & fits)
         first = 0 if not len(hidden) else int(hidden[-1]) + 1
         if first < fits.sum():
-            found[i] = SIZES_MM[first]
-    return found
+            sizes[i] = SIZES_MM[first]
+    return sizes
 
 
 def lump_features(d_mm: FloatArray, depth_mm: FloatArray | float, fat_mm: FloatArray | float) -> FloatArray:

@@ -124,13 +124,13 @@ class CollapsedTarget:
         """
         before = self.chosen_fields()
         projected, cross = self._project(self.scene.templates(theta[None], self.window))
-        found = self._walk(lambda columns: self._under(projected, cross, columns)[0][0])
-        evidence = np.concatenate([one for _, one in found])
+        walked = self._walk(lambda columns: self._under(projected, cross, columns)[0][0])
+        evidence = np.concatenate([one for _, one in walked])
         if not np.isfinite(evidence.max()):
             self._fields, self._made_up = None, 0.0
             return before != self.chosen_fields()
         total = float(np.logaddexp.reduce(evidence))
-        kept = [(columns, one > total + np.log(NEGLIGIBLE)) for columns, one in found]
+        kept = [(columns, one > total + np.log(NEGLIGIBLE)) for columns, one in walked]
         self._fields = [
             self._columns(columns.field.pruned(float(columns.shares[keep].max())), columns.shares[keep])
             for columns, keep in kept
@@ -143,9 +143,9 @@ class CollapsedTarget:
     def settle_lengths(self) -> None:
         """Keep only the lengths with evidence where there is no structure, each with all its shares."""
         dof = max(len(self.window.cells) - len(self._plain) + 1, 1)
-        found = self._walk(lambda columns: columns.null_evidence(dof=dof))
-        total = float(np.logaddexp.reduce(np.concatenate([one for _, one in found])))
-        self._fields = [columns for columns, one in found if one.max() > total + np.log(NEGLIGIBLE)]
+        walked = self._walk(lambda columns: columns.null_evidence(dof=dof))
+        total = float(np.logaddexp.reduce(np.concatenate([one for _, one in walked])))
+        self._fields = [columns for columns, one in walked if one.max() > total + np.log(NEGLIGIBLE)]
         self._made_up = 0.0
 
     def chosen_fields(self) -> list[tuple[float, tuple[float, ...]]]:
@@ -155,21 +155,21 @@ class CollapsedTarget:
     def null_log_evidence(self) -> float:
         """Log evidence of level and tilt alone under all fields, on the scale of the log density."""
         dof = max(len(self.window.cells) - len(self._plain) + 1, 1)
-        found = self._walk(lambda columns: columns.null_evidence(dof=dof))
-        return float(np.logaddexp.reduce(np.concatenate([one for _, one in found])))
+        walked = self._walk(lambda columns: columns.null_evidence(dof=dof))
+        return float(np.logaddexp.reduce(np.concatenate([one for _, one in walked])))
 
     def _walk(self, evidence: Callable[[FieldColumns], FloatArray]) -> list[tuple[FieldColumns, FloatArray]]:
         """Evidence without a field, then from the longest length down, until it has vanished."""
-        found: list[tuple[FieldColumns, FloatArray]] = []
+        walked: list[tuple[FieldColumns, FloatArray]] = []
         best = before = -np.inf
         for columns in self._from_the_longest():
             one = evidence(columns)
-            found.append((columns, one))
+            walked.append((columns, one))
             if one.max() < min(before, best + np.log(NEGLIGIBLE)):
                 break
             best = max(best, float(one.max()))
             before = float(one.max()) if columns.shares[0] > 0 else -np.inf
-        return found
+        return walked
 
     def _from_the_longest(self) -> Iterator[FieldColumns]:
         """No field, then each length with all shares, computed when reached."""
@@ -268,11 +268,11 @@ class CollapsedTarget:
             self.window.project(Profiles(grid=self.window.on_grid(vectors)), self._weighted_plain).low
             for vectors in (one, other)
         ]
-        independent, found = (one / self.window.variance) @ other.T, []
+        independent, products = (one / self.window.variance) @ other.T, []
         for columns in self.fields:
             first, second = (vectors @ columns.field.turn for vectors in low)
-            found += [independent - (first * weight) @ second.T for weight in columns.weight.T]
-        return np.stack(found)
+            products += [independent - (first * weight) @ second.T for weight in columns.weight.T]
+        return np.stack(products)
 
     def field_weights(self, theta: FloatArray) -> FloatArray:
         """(h,) posterior probability of each noise field at one shape."""
@@ -344,9 +344,9 @@ class CollapsedTarget:
         return _side_by_side([self._under(projected, cross, columns) for columns in self.fields])
 
 
-def _side_by_side(found: list[WithEvidence]) -> WithEvidence:
+def _side_by_side(parts: list[WithEvidence]) -> WithEvidence:
     """Concatenate fields of all lengths."""
-    return np.concatenate([one for one, _ in found], axis=1), joined([solution for _, solution in found])
+    return np.concatenate([one for one, _ in parts], axis=1), joined([solution for _, solution in parts])
 
 
 def independent_variance(cells: FitCells) -> FloatArray:

@@ -51,13 +51,13 @@ def other_rises(tactile_map: TactileMap, estimate: Estimate, options: EstimateOp
         given = replace(options, fit=replace(options.fit, centre_mm=centre, start_width_mm=None), scene="auto")
         candidates, seen = search(rest, given)
         if seen is None:
-            found = _at_rim(rest, candidates, given, estimate)
+            rise = _at_rim(rest, candidates, given, estimate)
         else:
-            found = _rise_assessed(seen, estimate) if seen.detection.probability >= LEAST_PROBABILITY else None
-        if found is None or _is_known(found, rises, rest, estimate) or not _stands_out(found, rest):
+            rise = _rise_assessed(seen, estimate) if seen.detection.probability >= LEAST_PROBABILITY else None
+        if rise is None or _is_known(rise, rises, rest, estimate) or not _stands_out(rise, rest):
             misses += 1
         else:
-            rises.append(found)
+            rises.append(rise)
         if misses == MOST_LOOKS or len(rises) == MOST_NAMED:
             break
     return tuple(rises)
@@ -210,20 +210,20 @@ def with_masses(tactile_map: TactileMap, first: Estimate, options: EstimateOptio
     are known: they are of that lump. `first` is `estimator`'s result for the map, `estimator` being `estimate_map` with
     its calibration and random numbers.
     """
-    found = [] if first.bump is None else [Mass(*_place(first), _probability(first), first)]
+    sized = [] if first.bump is None else [Mass(*_place(first), _probability(first), first)]
     others = _others_options(options)
     rises = [*other_rises(tactile_map, first, options)]
     for rise in [*_second_lump_of_scene(tactile_map, first), *rises]:
         mass = _sized_at(tactile_map, rise, first, others, estimator)
         if mass is None and rise not in rises:
             mass = Mass(rise.x_mm, rise.y_mm, rise.probability, _hidden(rise))
-        if mass is not None and all(_apart(mass, one) for one in found):
-            found.append(mass)
-    found = by_evidence(found)
+        if mass is not None and all(_apart(mass, one) for one in sized):
+            sized.append(mass)
+    sized = by_evidence(sized)
     kept = options.fit.centre_mm is not None or bool(set(OF_A_LUMP) & set(options.size_priors.known))
-    reported = first if kept or not found else found[0].estimate
+    reported = first if kept or not sized else sized[0].estimate
     masses = tuple(
-        replace(one, reported=one.estimate is reported, probability=_calibrated(tactile_map, one)) for one in found
+        replace(one, reported=one.estimate is reported, probability=_calibrated(tactile_map, one)) for one in sized
     )
     beside = tuple(_rise_of_mass(one, masses) for one in masses if not one.reported)
     return replace(reported, candidates=first.candidates, masses=masses, other_rises=beside)
@@ -304,15 +304,15 @@ def _sized_at(
     if not on_map(tactile_map, rise.x_mm, rise.y_mm):
         return Mass(rise.x_mm, rise.y_mm, rise.probability, _beyond(rise))
     given = replace(options, fit=replace(options.fit, centre_mm=(rise.x_mm, rise.y_mm), start_width_mm=None))
-    found = _estimated(tactile_map, given, estimator)
-    if first.map_posterior is not None and not _stays(found, rise, first):
+    estimate = _estimated(tactile_map, given, estimator)
+    if first.map_posterior is not None and not _stays(estimate, rise, first):
         less = _estimated(without(tactile_map, first.map_posterior), given, estimator)
-        found = less if less.size is None or _stands(less, first) else _in_the_flank(less)
-    if found.code in (*NO_LUMP, "coarse"):
+        estimate = less if less.size is None or _stands(less, first) else _in_the_flank(less)
+    if estimate.code in (*NO_LUMP, "coarse"):
         return None
-    if _stays(found, rise, first):
-        return Mass(*_place(found), max(rise.probability, _probability(found)), found)
-    return Mass(rise.x_mm, rise.y_mm, rise.probability, replace(_no_size(found), bump=_bump_of(rise)))
+    if _stays(estimate, rise, first):
+        return Mass(*_place(estimate), max(rise.probability, _probability(estimate)), estimate)
+    return Mass(rise.x_mm, rise.y_mm, rise.probability, replace(_no_size(estimate), bump=_bump_of(rise)))
 
 
 def _estimated(tactile_map: TactileMap, options: EstimateOptions, estimator: Estimator) -> Estimate:
@@ -323,30 +323,30 @@ def _estimated(tactile_map: TactileMap, options: EstimateOptions, estimator: Est
         return Estimate("no_estimate", f"no method converged: {error}", code="method")
 
 
-def _stays(found: Estimate, rise: Rise, first: Estimate) -> bool:
+def _stays(estimate: Estimate, rise: Rise, first: Estimate) -> bool:
     """True where an estimate is of the lump at a rise, and did not move towards the first lump."""
-    if found.map_posterior is None or first.bump is None:
-        return found.map_posterior is not None
-    moved, apart = ((np.hypot(x - rise.x_mm, y - rise.y_mm)) for x, y in (_place(found), _place(first)))
+    if estimate.map_posterior is None or first.bump is None:
+        return estimate.map_posterior is not None
+    moved, apart = ((np.hypot(x - rise.x_mm, y - rise.y_mm)) for x, y in (_place(estimate), _place(first)))
     return bool(moved < apart / 2.0)
 
 
-def _stands(found: Estimate, first: Estimate) -> bool:
+def _stands(estimate: Estimate, first: Estimate) -> bool:
     """True where the map less the first lump is high enough to be sized."""
-    return _amplitude(found) >= LEAST_SHARE * _amplitude(first)
+    return _amplitude(estimate) >= LEAST_SHARE * _amplitude(first)
 
 
-def _in_the_flank(found: Estimate) -> Estimate:
+def _in_the_flank(estimate: Estimate) -> Estimate:
     reason = f"it stands in the flank of a lump more than {1 / LEAST_SHARE:.0f} times as high, which hides its shape"
-    return Estimate("no_estimate", reason, detection=found.detection, code="unresolved", advice=BOTH, on_paper=BOTH)
+    return Estimate("no_estimate", reason, detection=estimate.detection, code="unresolved", advice=BOTH, on_paper=BOTH)
 
 
-def _no_size(found: Estimate) -> Estimate:
+def _no_size(estimate: Estimate) -> Estimate:
     """The reason for no size of a mass that is not told from the first lump."""
-    if found.status == "no_estimate":
-        return found
+    if estimate.status == "no_estimate":
+        return estimate
     reason = "its fit moves to the lump beside it: the map does not tell them apart"
-    return Estimate("no_estimate", reason, detection=found.detection, code="unresolved", advice=BOTH, on_paper=BOTH)
+    return Estimate("no_estimate", reason, detection=estimate.detection, code="unresolved", advice=BOTH, on_paper=BOTH)
 
 
 def _hidden(rise: Rise) -> Estimate:

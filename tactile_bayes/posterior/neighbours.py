@@ -98,7 +98,7 @@ class Surroundings(Record, eq=False):
 
     def _along_ribs(self, places: FloatArray, values: FloatArray, middle: tuple[float, float]) -> FloatArray:
         """(g,) median excess over a ridge's pieces; ridges of one direction share strips of cells."""
-        found, flat = np.empty(len(places)), values.reshape(2, -1)
+        excess, flat = np.empty(len(places)), values.reshape(2, -1)
         x, y = self.x_mm - middle[0], self.y_mm[:, None] - middle[1]
         for angle in np.unique(places[:, 0]):
             these = places[:, 0] == angle
@@ -113,8 +113,8 @@ class Surroundings(Record, eq=False):
             near = (at - places[these, 1, None]) / np.exp(places[these, 2, None])
             number, total = np.exp(-0.5 * near**2) @ sums
             mean = _mean(number.sum(axis=1), total.sum(axis=1), LEAST_CELLS)
-            found[these] = np.minimum(mean, _median_piece(number, total))
-        return found
+            excess[these] = np.minimum(mean, _median_piece(number, total))
+        return excess
 
 
 def _mean(number: FloatArray, total: FloatArray, least: float) -> FloatArray:
@@ -155,8 +155,8 @@ def add_beside(
     if scene not in ASKING:
         return choice
     fit, beside = _beside_questions(choice.plain.target.problem, choice.plain, surroundings, ridges, scene)
-    found = choice if fit is choice.plain else asked_again(choice, fit)
-    return replace(found, structures=(*found.structures, *beside))
+    chosen = choice if fit is choice.plain else asked_again(choice, fit)
+    return replace(chosen, structures=(*chosen.structures, *beside))
 
 
 def _beside_questions(

@@ -135,17 +135,17 @@ class Scene(Record):
         """Templates of the bump, and of the second structure if there is one, for (m, p) vectors."""
         p, q, r = self.widths(theta)
         if self.shape == "ridge":
-            found = [window.ridges(self.column(theta, "along"), self.column(theta, "across"), log_width=p)]
+            templates = [window.ridges(self.column(theta, "along"), self.column(theta, "across"), log_width=p)]
         else:
             x, y = self.column(theta, "x"), self.column(theta, "y")
-            found = [window.bumps(x, y, p=p, q=q, r=r if self.shape == "rotated" else None)]
+            templates = [window.bumps(x, y, p=p, q=q, r=r if self.shape == "rotated" else None)]
         if self.extra:
-            found.append(
+            templates.append(
                 neighbour_templates(
                     window, self.extra, *(self.column(theta, name) for name in _NEIGHBOUR_NAMES[self.extra])
                 )
             )
-        return found
+        return templates
 
     def log_prior(self, theta: FloatArray, problem: Problem) -> FloatArray:
         """(m,) normalised log prior of the shape; -inf outside the window and where a bump is wider than it."""

@@ -53,9 +53,9 @@ def pointwise_log_likelihood(target: CollapsedTarget, theta: FloatArray) -> Floa
         precision = precision_of_field()
         for m in np.flatnonzero(log_share[:, h] > log(LEAST_SHARE)):
             regressors = np.stack([*fixed, *(one[m] for one in templates)])
-            found = _without_each(precision, regressors, window.cells.value)
+            log_density = _without_each(precision, regressors, window.cells.value)
             # p(field | the others) is its share over the cell's density under it
-            inverse[m] = np.logaddexp(inverse[m], log_share[m, h] - found)
+            inverse[m] = np.logaddexp(inverse[m], log_share[m, h] - log_density)
     return -inverse
 
 
@@ -179,11 +179,11 @@ def choose_shape(problem: Problem, start: FloatArray, *, scene: SceneAsked = "au
     """
     wanted = Scene(_shape_asked(scene))
     chosen = fit_scene(problem, wanted, Scene("rotated").carried(start, wanted))
-    found = [_ellipse_question(chosen)] if wanted.shape == "ellipse" else []
+    questions = [_ellipse_question(chosen)] if wanted.shape == "ellipse" else []
     if scene in ASKING:
         chosen, turned = _rotation_question(problem, chosen, start)
-        found.append(turned)
-    return SceneChoice(chosen, chosen, _supported_shape(chosen, found), (*found, _tilt_question(chosen)))
+        questions.append(turned)
+    return SceneChoice(chosen, chosen, _supported_shape(chosen, questions), (*questions, _tilt_question(chosen)))
 
 
 def _shape_asked(scene: SceneAsked) -> Shape:
@@ -229,10 +229,10 @@ def near(fit: FieldFit, scene: Scene) -> Mixture | None:
     return newton_mixture(target, start, scale)
 
 
-def _supported_shape(chosen: FieldFit, found: Sequence[Structure]) -> str:
+def _supported_shape(chosen: FieldFit, questions: Sequence[Structure]) -> str:
     if chosen.scene.shape != "ellipse":
         return chosen.scene.shape
-    return "ellipse" if any(one.name == "ellipse" and one.supported for one in found) else "round"
+    return "ellipse" if any(one.name == "ellipse" and one.supported for one in questions) else "round"
 
 
 def _ellipse_question(fit: FieldFit) -> Structure:
@@ -325,24 +325,24 @@ def ask_departure(choice: SceneChoice) -> SceneChoice:
     column, exponent, log_odds = _departure(fit)
     answer = Structure("departure", odds(log_odds), bool(log_odds > np.log(LEAST_ODDS)), False)
     if answer.supported:
-        found = _fitted(fit, column)
-        if found is not None:
-            x, y = change_in_sd(found, fit.mode)
+        refitted = _fitted(fit, column)
+        if refitted is not None:
+            x, y = change_in_sd(refitted, fit.mode)
             answer = replace(answer, used=True, change_x_sd=x, change_y_sd=y, place=_likeness(exponent))
-            fit = found
+            fit = refitted
     return replace(choice, fit=fit, structures=(*choice.structures, answer))
 
 
 def _fitted(fit: FieldFit, column: FloatArray) -> FieldFit | None:
     """Refit with the regressor, made orthogonal on average over the new noise fields; None where there is no mode."""
-    found: FieldFit | None = fit
+    refitted: FieldFit | None = fit
     for left in reversed(range(SETTLINGS)):
-        assert found is not None
-        found = fit_or_none(replace(fit.target.problem, departure=column[None]), fit.scene, found.mode)
-        if found is None or not left:
+        assert refitted is not None
+        refitted = fit_or_none(replace(fit.target.problem, departure=column[None]), fit.scene, refitted.mode)
+        if refitted is None or not left:
             break
-        column = _departure(found)[0]
-    return found
+        column = _departure(refitted)[0]
+    return refitted
 
 
 def exponent_covariance(fit: FieldFit) -> FloatArray:
@@ -351,14 +351,14 @@ def exponent_covariance(fit: FieldFit) -> FloatArray:
     A bump that is no Gaussian has other nearest widths under each noise field, by the exponent times what the raw
     column shares with a change of them. Draws have the mean over the fields; this is the spread about it.
     """
-    found = np.zeros((len(fit.mode), len(fit.mode)))
+    covariance = np.zeros((len(fit.mode), len(fit.mode)))
     if fit.target.problem.departure is None:
-        return found
+        return covariance
     shared, exponent, _ = _regression(fit)
     weight, p = fit.target.field_weights(fit.mode), len(fit.scene.alone().names)
     moved = exponent * (shared - weight @ shared)[:, 1 : p + 1]
-    found[:p, :p] = (weight[:, None] * moved).T @ moved
-    return found
+    covariance[:p, :p] = (weight[:, None] * moved).T @ moved
+    return covariance
 
 
 def _departure(fit: FieldFit) -> tuple[FloatArray, float, float]:

@@ -172,10 +172,10 @@ class BodyCalibration(BodyLaw, eq=False, kw_only=True):
 
     def for_maps(self, maps: Sequence[ShapeDraws]) -> BodyCalibration:
         """The calibration at the depth of fat that the maps of a mass tell, if all of them go with that depth."""
-        found = self.at_fat([one.profile for one in maps])
+        calibration = self.at_fat([one.profile for one in maps])
         for one in maps:
-            found = found.fitting(*one.middle)
-        return found
+            calibration = calibration.fitting(*one.middle)
+        return calibration
 
     def for_another_kind(self) -> BodyCalibration:
         """This calibration with room for a body unlike any of the table's: intervals without it held 38 of 48."""
@@ -221,11 +221,11 @@ class BodyCalibration(BodyLaw, eq=False, kw_only=True):
     def terms(self, log_amplitude: FloatArray, log_width: FloatArray) -> FloatArray:
         """(..., k + m) derivatives of ln d by the coefficients; NaN where Eq 6 has no positive size."""
         values = self._values(log_amplitude, log_width)
-        found = eq6_terms(*values, self.eq6.mean, self.eq6.powers)
+        terms = eq6_terms(*values, self.eq6.mean, self.eq6.powers)
         if self.residual is not None:
             functions = self.residual.functions(np.stack(np.broadcast_arrays(*values), axis=-1))
-            found = np.concatenate([found, functions], axis=-1)
-        return self._averaged(found)
+            terms = np.concatenate([terms, functions], axis=-1)
+        return self._averaged(terms)
 
     def features(self, log_amplitude: FloatArray, log_width: FloatArray) -> FloatArray:
         """(..., c) features, in which a map's leverage and what it leads one to expect of a body are linear."""
@@ -271,11 +271,11 @@ class BodyCalibration(BodyLaw, eq=False, kw_only=True):
     def coefficient_covariance(self) -> FloatArray:
         """(k + m, k + m) of Eq 6's coefficients and the residual's weights, which are independent."""
         k, m = len(self.eq6.mean), 0 if self.residual is None else len(self.residual.mean)
-        found = np.zeros((k + m, k + m))
-        found[:k, :k] = self.eq6.covariance
+        covariance = np.zeros((k + m, k + m))
+        covariance[:k, :k] = self.eq6.covariance
         if self.residual is not None:
-            found[k:, k:] = self.residual.covariance
-        return found
+            covariance[k:, k:] = self.residual.covariance
+        return covariance
 
     def coefficient_variance(self, terms: FloatArray) -> FloatArray:
         """(n,) variance of ln d by the coefficients' error, for (n, k + m) terms."""
@@ -291,9 +291,9 @@ class BodyCalibration(BodyLaw, eq=False, kw_only=True):
     def outside(self, amplitude: float, sigma_x_mm: float, sigma_y_mm: float | None = None) -> list[str]:
         """In what a map lies outside the table, in words; empty when it lies inside."""
         sigma_mm = mean_width_mm(sigma_x_mm, sigma_y_mm)
-        found = outside_domain(self.domain, amplitude, sigma_mm)
-        found = found or self._unlike(amplitude, sigma_mm, MOST_LEVERAGE)
-        return [*found, f"{self.fat_note}, so that depth is not used"] if self.fat_note.endswith(UNLIKE) else found
+        texts = outside_domain(self.domain, amplitude, sigma_mm)
+        texts = texts or self._unlike(amplitude, sigma_mm, MOST_LEVERAGE)
+        return [*texts, f"{self.fat_note}, so that depth is not used"] if self.fat_note.endswith(UNLIKE) else texts
 
     def too_far(self, amplitude: float, sigma_x_mm: float, sigma_y_mm: float | None = None) -> list[str]:
         """In what a map lies so far outside the table that there is no size, in words."""
@@ -336,10 +336,10 @@ class BodyCalibration(BodyLaw, eq=False, kw_only=True):
 
     def _log_sizes(self, log_amplitude: FloatArray, log_width: FloatArray) -> FloatArray:
         values = self._values(log_amplitude, log_width)
-        found = eq6_log_size(*values, self.eq6.mean, self.eq6.powers)
+        sizes = eq6_log_size(*values, self.eq6.mean, self.eq6.powers)
         if self.residual is None:
-            return found
-        return found + self.residual.at(np.stack(np.broadcast_arrays(*values), axis=-1))
+            return sizes
+        return sizes + self.residual.at(np.stack(np.broadcast_arrays(*values), axis=-1))
 
     def _unlike(self, amplitude: float, sigma_mm: float, most: float) -> list[str]:
         """The map's pair of amplitude and width where its leverage exceeds this multiple of the limit."""
@@ -391,7 +391,7 @@ def suppositions(
 
     For the mean ln a and p of the maps, and the variance of ln d as it is.
     """
-    hidden, found = calibration.hidden, {}
+    hidden, supposed = calibration.hidden, {}
     if hidden is None:
         return {}
     at = np.array([middle[0]]), np.array([middle[1]])
@@ -403,8 +403,8 @@ def suppositions(
             continue
         if hidden.score(name, value, features) <= LIKELY_SDS:
             left = known_body(calibration, {**known, name: value}, *at, own_sd)
-            found[label] = _supposition(name, value, before, left, variance=variance)
-    return found
+            supposed[label] = _supposition(name, value, before, left, variance=variance)
+    return supposed
 
 
 def _supposition(name: str, value: float, before: BodyLeft, left: BodyLeft, *, variance: float) -> Supposition:

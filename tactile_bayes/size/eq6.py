@@ -72,10 +72,10 @@ class Eq6Law(Record, eq=False):
 
 def eq6_coefficients(theta: Sequence[float] | FloatArray, powers: Powers, v: FloatArray, w: FloatArray) -> FloatArray:
     """(3, ...) mu, f and b of maps, for coefficients in the order of `powers`."""
-    found = np.zeros((3, *np.broadcast_shapes(v.shape, w.shape)))
+    coefficients = np.zeros((3, *np.broadcast_shapes(v.shape, w.shape)))
     for value, (row, i, k) in zip(theta, powers, strict=True):
-        found[row] += value * v**i * w**k
-    return found
+        coefficients[row] += value * v**i * w**k
+    return coefficients
 
 
 def eq6_parts(

@@ -254,15 +254,15 @@ def outlying_maps(centre: FloatArray, noise: FloatArray, prior: BetweenMaps) -> 
     """
     if len(centre) < 3:
         return ()
-    found = []
+    outlying = []
     for i in range(len(centre)):
         others = np.delete(centre, i), np.delete(noise, i)
         tau2 = float(prior.density(*others) @ prior.grid**2)
         weight = 1.0 / (others[1] + tau2)
         expected, variance = float(weight @ others[0] / weight.sum()), float(1.0 / weight.sum() + noise[i] + tau2)
         if abs(centre[i] - expected) > OUTLYING * np.sqrt(variance):
-            found.append(i)
-    return tuple(found)
+            outlying.append(i)
+    return tuple(outlying)
 
 
 def spread_tested(known: BetweenMaps | None) -> BetweenMaps:

@@ -321,25 +321,25 @@ def pool_maps(
     When fewer than half of the maps show the lump there is no size: those that do may be the noise's. Maps that are not
     of one size have none in common.
     """
-    found = [i for i, shape in enumerate(shapes) if shape is not None]
-    if 2 * len(found) < len(shapes) or not found:
-        return PooledEstimate("no_estimate", f"a lump was found on {len(found)} of {len(shapes)} maps")
+    places = [i for i, shape in enumerate(shapes) if shape is not None]
+    if 2 * len(places) < len(shapes) or not places:
+        return PooledEstimate("no_estimate", f"a lump was found on {len(places)} of {len(shapes)} maps")
     # one order whatever the caller's, so that the order leaves no trace in the draws
     in_order = sorted(((shape, i) for i, shape in enumerate(shapes) if shape is not None), key=lambda one: one[0].order)
-    used, found = [shape for shape, _ in in_order], [i for _, i in in_order]
+    used, places = [shape for shape, _ in in_order], [i for _, i in in_order]
     depth, at_depth = calibration.depth, calibration.for_maps(used)
     fat_apart_mm = None if depth is None else depth.apart([one.profile for one in used])
-    named = sorted(zip(found, [one.middle for one in used], strict=True))
+    named = sorted(zip(places, [one.middle for one in used], strict=True))
     far = [f"map {i + 1}: {text}" for i, middle in named for text in at_depth.too_far(*middle)]
     if far:
         return PooledEstimate("no_estimate", extrapolated(far).reason)
     sizes = log_sizes(at_depth, used)
-    centres = {i: float(np.nanmean(one)) for i, one in zip(found, sizes, strict=True)}
+    centres = {i: float(np.nanmean(one)) for i, one in zip(places, sizes, strict=True)}
     centre, noise = np.array(list(centres.values())), np.array([np.nanvar(one) for one in sizes])
     chances = _one_size(centre, noise, priors)
     if chances["one_size"] is not None and chances["one_size"] < LEAST_PROBABILITY:
         far_off = outlying_maps(centre, noise, priors.spread_of_others)
-        apart = tuple(sorted(found[i] for i in far_off))
+        apart = tuple(sorted(places[i] for i in far_off))
         return PooledEstimate(
             DISAGREE, "the maps show different sizes", None, centres, apart, (), at_depth, fat_apart_mm, **chances
         )
@@ -348,10 +348,12 @@ def pool_maps(
         return PooledEstimate("no_estimate", f"no positive size in {size.invalid} of {size.d_x_mm.size} draws")
     outside = [f"map {i + 1}: {text}" for i, middle in named for text in at_depth.outside(*middle)]
     outside += at_depth.beyond_lumps(size.median_mm)
-    reason = "" if len(found) == len(shapes) else f"a lump was found on {len(found)} of {len(shapes)} maps"
-    outlying = tuple(sorted(found[i] for i in size.outliers))
+    reason = "" if len(places) == len(shapes) else f"a lump was found on {len(places)} of {len(shapes)} maps"
+    outlying = tuple(sorted(places[i] for i in size.outliers))
     if len(used) > 1:
-        weights = {f"weight_{sorted(found).index(i) + 1}": size.figures[f"weight_{j + 1}"] for j, i in enumerate(found)}
+        weights = {
+            f"weight_{sorted(places).index(i) + 1}": size.figures[f"weight_{j + 1}"] for j, i in enumerate(places)
+        }
         size = replace(size, figures={**size.figures, **weights})
     return PooledEstimate(
         "estimate", reason, size, centres, outlying, tuple(outside), at_depth, fat_apart_mm, **chances

@@ -61,18 +61,18 @@ def monomials(values: Sequence[FloatArray], exponents: Sequence[tuple[int, ...]]
     """(..., terms) products of the (...) values' powers."""
     highest = max(max(one) for one in exponents)
     raised = [_raised(np.asarray(value, dtype=np.float64), highest) for value in values]
-    found = np.stack([raised[0][one[0]] for one in exponents], axis=-1)
+    products = np.stack([raised[0][one[0]] for one in exponents], axis=-1)
     for i in range(1, len(values)):
-        found *= np.stack([raised[i][one[i]] for one in exponents], axis=-1)
-    return found
+        products *= np.stack([raised[i][one[i]] for one in exponents], axis=-1)
+    return products
 
 
 def _raised(value: FloatArray, highest: int) -> list[FloatArray]:
     """Powers from 0 up, by multiplication."""
-    found = [np.ones_like(value)]
+    raised = [np.ones_like(value)]
     for _ in range(highest):
-        found.append(found[-1] * value)
-    return found
+        raised.append(raised[-1] * value)
+    return raised
 
 
 class Recipe(Record):
@@ -111,8 +111,8 @@ class Recipe(Record):
         ]
         if self.flat_field is not None and flat_field is not None:
             pairs.append(("flat field", _ON[self.flat_field], _ON[flat_field]))
-        found = [f"{name} {theirs} (the calibration: {ours})" for name, ours, theirs in pairs if ours != theirs]
-        return found + self.head_differences(head)
+        texts = [f"{name} {theirs} (the calibration: {ours})" for name, ours, theirs in pairs if ours != theirs]
+        return texts + self.head_differences(head)
 
     def head_differences(self, head: HeadShape | None) -> list[str]:
         """In what a map's head departs from the calibration's; empty where one of them is unknown."""
@@ -265,12 +265,12 @@ def too_far(domain: Domain, amplitude: float, sigma_mm: float) -> list[str]:
 
 
 def _beyond(domain: Domain, amplitude: float, sigma_mm: float, *, factors: Mapping[str, float]) -> list[str]:
-    found = []
+    texts = []
     for name, value, unit in (("amplitude", amplitude, ""), ("sigma_mm", sigma_mm, " mm")):
         (low, high), factor = domain[name], factors[name]
         if not low / factor <= value <= high * factor:
-            found.append(f"{name.removesuffix('_mm')} {value:.3g}{unit} (table: {low:.3g} to {high:.3g}{unit})")
-    return found
+            texts.append(f"{name.removesuffix('_mm')} {value:.3g}{unit} (table: {low:.3g} to {high:.3g}{unit})")
+    return texts
 
 
 def beyond_lumps(domain: Domain, largest_mm: float) -> list[str]:

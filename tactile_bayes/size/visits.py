@@ -103,7 +103,7 @@ def apart(earlier: Place, later: Place, *, registration_mm: float = REGISTRATION
 
 def contradictions(visits: Sequence[Sequence[Mapping[str, str]]]) -> list[str]:
     """Contradictions between the exam facts that the scans of all visits give, in words."""
-    found = []
+    texts = []
     for key, plural in CODES.items():
         said: dict[str, int] = {}
         for number, scans in enumerate(visits, start=1):
@@ -112,8 +112,8 @@ def contradictions(visits: Sequence[Sequence[Mapping[str, str]]]) -> list[str]:
                     said.setdefault(scan[key], number)
         if len(said) > 1:
             listed = ", ".join(f"{value} (visit {number})" for value, number in said.items())
-            found.append(f"the scans name different {plural}: {listed}")
-    return found
+            texts.append(f"the scans name different {plural}: {listed}")
+    return texts
 
 
 def one_place_probability(places: Sequence[Place], *, registration_mm: float = REGISTRATION_MM) -> float:
@@ -322,14 +322,14 @@ def joint_sizes(
     sizes = [one for maps, at in zip(visits, fitted, strict=True) for one in log_sizes(at, maps)]
     oval, _ = lump_shape(fitted[0], flat, sizes, priors.shape)
     half = oval.at(points[:, 2:5])
-    found = [one.weighted(tau) for one in parts]
+    averaged = [one.weighted(tau) for one in parts]
     if law is None:
         law = SHARED_WITHOUT_DEPTH if fitted[0].fat_mm is None else SHARED_BODY
-    correlation = law.correlation(np.array([float(np.nanmean(one.mean)) for one in found]))
-    covariance = _covariance(found, fitted, correlation, normal_quantile(points[:, 1]))
-    mean = np.stack([one.mean for one in found]) + np.hypot(half[:, 0], half[:, 1])
+    correlation = law.correlation(np.array([float(np.nanmean(one.mean)) for one in averaged]))
+    covariance = _covariance(averaged, fitted, correlation, normal_quantile(points[:, 1]))
+    mean = np.stack([one.mean for one in averaged]) + np.hypot(half[:, 0], half[:, 1])
     if amplitudes is not None:
-        left, noise = amplitudes.at_one_depth(found, fitted)
+        left, noise = amplitudes.at_one_depth(averaged, fitted)
         mean, covariance = _with_amplitudes(mean, covariance, left, noise, amplitudes, points[:, 5])
     drawn = _drawn(mean, covariance, rng.standard_normal((len(replicates), len(visits))), replicates)
     spread = float(np.sqrt(np.mean(tau**2)))
@@ -374,15 +374,15 @@ def _covariance(
         [at.body_sd(one.log_amplitude, one.log_width, score) for one, at in zip(parts, fitted, strict=True)], axis=1
     )
     terms = np.stack([one.terms for one in parts], axis=1)
-    found = bodies[:, :, None] * correlation * bodies[:, None, :]
-    found = found + (terms @ fitted[0].coefficient_covariance) @ np.swapaxes(terms, 1, 2)
+    covariance = bodies[:, :, None] * correlation * bodies[:, None, :]
+    covariance = covariance + (terms @ fitted[0].coefficient_covariance) @ np.swapaxes(terms, 1, 2)
     exams = np.stack([one.variance for one in parts], axis=1)
-    found[:, range(len(parts)), range(len(parts))] += exams
+    covariance[:, range(len(parts)), range(len(parts))] += exams
     if site is not None:
         widths = np.stack([one.log_width for one in parts], axis=1) - site.centre
         about = np.stack([np.ones_like(widths), widths], axis=-1)
-        found = found + (about @ site.covariance) @ np.swapaxes(about, 1, 2)
-    return np.asarray(found)
+        covariance = covariance + (about @ site.covariance) @ np.swapaxes(about, 1, 2)
+    return np.asarray(covariance)
 
 
 def _with_amplitudes(
@@ -454,11 +454,11 @@ def straight_line(log_size: FloatArray, covariance: FloatArray, days: Sequence[f
     columns = np.stack([np.ones(len(days)), np.array(days) - np.mean(days)], axis=1)
     weighted = np.linalg.solve(covariance, columns)
     spread = np.linalg.inv(columns.T @ weighted)
-    found = spread @ (weighted.T @ log_size)
-    left = log_size - columns @ found
+    line = spread @ (weighted.T @ log_size)
+    left = log_size - columns @ line
     square, dof = left @ np.linalg.solve(covariance, left), len(days) - 2
     departure = float(above_chi_square(square, dof)) if dof > 0 else None
-    return Trend(float(found[1]), float(np.sqrt(spread[1, 1])), departure)
+    return Trend(float(line[1]), float(np.sqrt(spread[1, 1])), departure)
 
 
 def doubling_days(rate_per_day: float) -> float | None:

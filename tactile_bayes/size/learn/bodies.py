@@ -199,7 +199,7 @@ def _calibration(rows: TableRows, learned: Learned, *, recipe: Recipe, source: s
     inverse, leverage = leverages(features)
     held = float(np.mean(np.abs(learned.left) <= ndtri(0.5 + HELD / 2) * np.sqrt(variance)))
     spreads = {"body_sd": float(np.median(body_sd)), "exam_sd": exam.sd}
-    found = BodyCalibration(
+    calibration = BodyCalibration(
         centre=rows.centre,
         eq6=Eq6Law(eq6.rows.powers, eq6.mean, eq6.covariance, _log_amplitude_one_deep(maps)),
         residual=None if fitted is None else fitted.residual,
@@ -217,7 +217,11 @@ def _calibration(rows: TableRows, learned: Learned, *, recipe: Recipe, source: s
         source=source,
         bodies={},
     )
-    return found if rows.depth is None else replace(found, hidden_any=_hidden_at_any_depth(found, maps, data))
+    return (
+        calibration
+        if rows.depth is None
+        else replace(calibration, hidden_any=_hidden_at_any_depth(calibration, maps, data))
+    )
 
 
 def _hidden_at_any_depth(
@@ -332,8 +336,8 @@ class Sized(Record):
 def sized(calibration: BodyCalibration, table: PopulationTable, *, known: Sequence[str] = ()) -> Sized:
     """The bodies of a table, each by all its exams; of the properties in `known` the true value is told."""
     bodies = np.unique(table.body)
-    found = np.array([size_error(calibration, table.rows(table.body == one), known=known) for one in bodies])
-    return Sized(*found.T)
+    errors = np.array([size_error(calibration, table.rows(table.body == one), known=known) for one in bodies])
+    return Sized(*errors.T)
 
 
 def size_error(
@@ -360,18 +364,18 @@ def learn_other_sd(calibration: BodyCalibration, table: PopulationTable, *, sour
 
     Its fit tells ``other_masses``, ``other_sd_most``, below which tau lies with 95 % probability, and the errors.
     """
-    found = sized(calibration.with_other_sd(0.0), table)
-    variance = found.variance + _OTHER_SDS[:, None] ** 2
-    log = -0.5 * np.sum(np.log(variance) + found.error**2 / variance, axis=1)
+    others = sized(calibration.with_other_sd(0.0), table)
+    variance = others.variance + _OTHER_SDS[:, None] ** 2
+    log = -0.5 * np.sum(np.log(variance) + others.error**2 / variance, axis=1)
     density = np.exp(log - log.max())
     other_sd = float(_OTHER_SDS[log.argmax()])
-    off = np.expm1(found.error)
+    off = np.expm1(others.error)
     fit = {
-        "other_masses": float(len(found.error)),
+        "other_masses": float(len(others.error)),
         "other_sd_most": float(_OTHER_SDS[np.searchsorted(np.cumsum(density / density.sum()), 0.95)]),
         "other_mae_percent": float(100 * np.abs(off).mean()),
         "other_bias_percent": float(100 * off.mean()),
-        "other_standard_sd": float(np.sqrt(np.mean(found.error**2 / (found.variance + other_sd**2)))),
+        "other_standard_sd": float(np.sqrt(np.mean(others.error**2 / (others.variance + other_sd**2)))),
     }
     found_out = calibration.with_other_sd(other_sd, other_source=source)
     return replace(found_out, fit={**calibration.fit, **fit})

@@ -70,14 +70,14 @@ def rows_of(columns: T, keep: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> T:
     """A copy of a table, whose fields are columns or tables or None, with the rows where `keep` is true."""
     if columns is None:
         return columns
-    found: Any = columns
-    if isinstance(found, np.ndarray):
-        return cast("T", found[keep])
-    if isinstance(found, tuple):
-        return cast("T", tuple(compress(found, keep)))
-    if isinstance(found, dict):
-        return cast("T", {name: rows_of(one, keep) for name, one in found.items()})
-    return replace(columns, **{name: rows_of(getattr(found, name), keep) for name in found.__struct_fields__})
+    whole: Any = columns
+    if isinstance(whole, np.ndarray):
+        return cast("T", whole[keep])
+    if isinstance(whole, tuple):
+        return cast("T", tuple(compress(whole, keep)))
+    if isinstance(whole, dict):
+        return cast("T", {name: rows_of(one, keep) for name, one in whole.items()})
+    return replace(columns, **{name: rows_of(getattr(whole, name), keep) for name in whole.__struct_fields__})
 
 
 class ExamSpread(Record):
@@ -281,9 +281,9 @@ def learn_round(table: PopulationTable, terms: FloatArray) -> RoundLumps:
         prior = np.sum(((values - _ROUND_START) / _ROUND_PRIOR_SD) ** 2)
         return float(0.5 * (np.sum(left**2 / whole + np.log(whole)) + prior))
 
-    found = np.asarray(minimize(misfit, _ROUND_START, method="Nelder-Mead").x)
-    body_sd, map_factor = (float(one) for one in np.exp(found))
-    return RoundLumps(_weighted(terms, q, spread_at(found)), body_sd, 0.0, map_factor)
+    mode = np.asarray(minimize(misfit, _ROUND_START, method="Nelder-Mead").x)
+    body_sd, map_factor = (float(one) for one in np.exp(mode))
+    return RoundLumps(_weighted(terms, q, spread_at(mode)), body_sd, 0.0, map_factor)
 
 
 def _weighted(terms: FloatArray, values: FloatArray, variance: FloatArray) -> FloatArray:
@@ -434,10 +434,10 @@ def _best(bodies: BodiesLeft, start: FloatArray, points: FloatArray) -> tuple[Fl
 
     bounds = [(-2.0, 4.0)] * k + [(-4.0, 2.0)] + [(-5.0, 1.0)]
     bounds += [(-1.5, 1.5)] * (len(start) - len(bounds))
-    found = minimize(
+    mode = minimize(
         cost, start, method="L-BFGS-B", bounds=bounds, options={"maxiter": _MOST_ITERATIONS, "eps": _DIFFERENCE}
     )
-    return np.asarray(found.x, dtype=np.float64), float(found.fun)
+    return np.asarray(mode.x, dtype=np.float64), float(mode.fun)
 
 
 def _spread_prior(log_spread: FloatArray) -> float:

@@ -161,19 +161,19 @@ def correct_calibration(
             way_out=f"a correction needs at least {LEAST_PHANTOMS} distinct phantoms; 5 to 20 are better",
         )
     data = Residuals(*np.array([row.left for _, row in rows]).T)
-    found = shift_posterior(data, prior)
+    posterior = shift_posterior(data, prior)
     site = SiteShift(
         centre=calibration.centre.log_width,
-        mean=found.mean[:2],
-        covariance=found.covariance[:2, :2],
+        mean=posterior.mean[:2],
+        covariance=posterior.covariance[:2, :2],
         phantoms=len(rows),
         maps=sum(row.maps for _, row in rows),
         base=base,
         uses_fat=2 * sum(row.uses_fat for _, row in rows) > len(rows),
-        fit=_figures(data, found, calibration.centre.log_width),
+        fit=_figures(data, posterior, calibration.centre.log_width),
         cautions=(
             *no_depth(calibration, [groups[name][0].known for name, _ in rows]),
-            *cautions_of([name for name, _ in rows], data, found, prior),
+            *cautions_of([name for name, _ in rows], data, posterior, prior),
         ),
         left_out=tuple(out),
     )
@@ -209,8 +209,8 @@ def _phantom(calibration: BodyCalibration, maps: Sequence[PhantomMap]) -> _Phant
     exam = used.between_exams.sd**2 / n
     noise = float(np.mean([np.nanvar(size) for size in log_size])) / n
     variances = alone + used.other_sd**2 + exam, noise
-    found = float(left.mean()) - expected, float(log_width.mean()) - centre, *variances, float(np.sqrt(together))
-    return _Phantom(found, n, used.fat_mm is not None or calibration.depth is None)
+    columns = float(left.mean()) - expected, float(log_width.mean()) - centre, *variances, float(np.sqrt(together))
+    return _Phantom(columns, n, used.fat_mm is not None or calibration.depth is None)
 
 
 def _known(
@@ -236,33 +236,33 @@ def _known(
     return explained_sd * float(hidden.expected_body(stated, features)), own, common
 
 
-def _figures(data: Residuals, found: ShiftPosterior, centre: float) -> dict[str, float]:
-    left = data.residual - data.design[:, :2] @ found.mean[:2]
+def _figures(data: Residuals, posterior: ShiftPosterior, centre: float) -> dict[str, float]:
+    left = data.residual - data.design[:, :2] @ posterior.mean[:2]
     return {
         "log_width": float(data.width.mean() + centre),
-        "spread_factor": found.spread,
+        "spread_factor": posterior.spread,
         "sd_before": float(np.sqrt(np.mean(data.residual**2))),
         "sd_after": float(np.sqrt(np.mean(left**2))),
     }
 
 
-def cautions_of(names: Sequence[str], data: Residuals, found: ShiftPosterior, prior: SitePrior) -> tuple[str, ...]:
+def cautions_of(names: Sequence[str], data: Residuals, posterior: ShiftPosterior, prior: SitePrior) -> tuple[str, ...]:
     """Oddities of a correction by the phantoms of these names, in words."""
     lines = []
-    for value, sd, what in zip(found.mean[:2], prior.sd, ("shift", "slope with ln sigma"), strict=True):
+    for value, sd, what in zip(posterior.mean[:2], prior.sd, ("shift", "slope with ln sigma"), strict=True):
         if abs(value) > FAR * sd:
             lines.append(
                 f"the {what} of {value:+.2f} in ln d is {abs(value) / sd:.1f} times what sites are expected to differ "
                 "by: check the sizes' unit, the recipe of the maps and the head"
             )
-    if data.width.std() < ALIKE and np.sqrt(found.covariance[1, 1]) > SLOPE_OPEN * prior.slope_sd:
+    if data.width.std() < ALIKE and np.sqrt(posterior.covariance[1, 1]) > SLOPE_OPEN * prior.slope_sd:
         lines.append(
             "the phantoms' maps are too alike in width to tell whether the shift changes with it: "
             "add smaller and larger phantoms"
         )
-    if found.spread > MOST_SPREAD:
+    if posterior.spread > MOST_SPREAD:
         lines.append(
-            f"the phantoms scatter {found.spread:.1f} times as much as the calibration expects: "
+            f"the phantoms scatter {posterior.spread:.1f} times as much as the calibration expects: "
             "check their sizes, depths, seats and stiffness"
         )
     return (*lines, *_apart(names, data, prior))
