@@ -17,6 +17,8 @@ from tactile_bayes.declarations import Meta, Record
 from tactile_bayes.errors import BadDataError
 
 FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+IndexArray = NDArray[np.intp]
 Vector = Annotated[FloatArray, Meta(extra_json_schema={"items": {"type": "number"}})]
 """Field of a record that holds a list of numbers in its files."""
 Matrix = Annotated[FloatArray, Meta(extra_json_schema={"items": {"type": "array", "items": {"type": "number"}}})]

@@ -50,7 +50,6 @@ NOISE: Final[tuple[Noise, ...]] = get_args(Noise)
 Background = Literal["fixed", "free"]
 Rotation = Literal["auto", "off", "on"]
 SceneAsked = Literal["auto", "none", "round", "ellipse", "rotated", "second-lump", "rib"]
-SCENES: Final[tuple[SceneAsked, ...]] = get_args(SceneAsked)
 INTERVAL: Final = 0.95
 # Probability of the intervals of a size calibration that are held against bodies left out.
 HELD: Final = 0.9

@@ -201,7 +201,7 @@ def _sized(
         for maps in visits
     ]
     fitted = visit_calibrations(shapes, calibration)
-    far = _by_visit(shapes, [one.too_far for one in fitted])
+    far = _by_visit(shapes, [one.extrapolation_faults for one in fitted])
     if far:
         return Compared("no_estimate", f"outside the calibration's range: {'; '.join(far)}", "", apart)
     priors = size_priors(settings)

@@ -26,6 +26,7 @@ from tactile_bayes.posterior.masses import with_masses
 from tactile_bayes.posterior.options import EstimateOptions, FitOptions
 from tactile_bayes.posterior.white import default_errors
 from tactile_bayes.presets import FIT_RADIUS_MM
+from tactile_bayes.progress import Progress
 from tactile_bayes.report.calibration import calibration_line, site_words
 from tactile_bayes.report.estimate_document import estimate_document, patient_mm
 from tactile_bayes.report.estimate_text import estimate_summary, estimate_text
@@ -55,7 +56,6 @@ if TYPE_CHECKING:
 _UNRECORDED = (*PRIORS, "max_steps", "checkpoint")
 """Settings that the provenance leaves out: the priors stand in the report, the others change how long it takes."""
 NO_CALIBRATION_ON_PAPER = "a size needs a calibration that fits this map"
-Progress = Callable[[int, int], None]
 Notice = Callable[[str], None]
 
 
@@ -210,7 +210,7 @@ def estimate_one(
         fat_mm = None if calibration is None else calibration.fat_mm
         estimate = replace(estimate, smallest=smallest_lumps(tactile_map, fat_mm=fat_mm))
     posterior = estimate.map_posterior
-    used = None if posterior is None or calibration is None else calibration.fitting(*posterior.medians)
+    used = None if posterior is None or calibration is None else calibration.at_depth_or_fallback(*posterior.medians)
     if posterior is not None and used is not None and estimate.size is not None:
         name = settings.calibration_name or shipped
         by = f"{'shipped ' if name in SHIPPED else ''}calibration {name}"

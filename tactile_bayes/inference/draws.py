@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from tactile_bayes.declarations import Record, field
-from tactile_bayes.geometry import FloatArray
+from tactile_bayes.geometry import FloatArray, IndexArray
 
 # --- Draws of a model's parameters, the result of every method.
 
@@ -17,7 +17,7 @@ INDEPENDENT_DRAWS = 4000
 """Draws of the methods that draw independently: end-point Monte-Carlo error of a 95 % interval about 0.04 SD."""
 REPLICATES = 4
 """Independent parts of every set of draws; what differs between them is the Monte-Carlo error."""
-Labels = np.ndarray[tuple[int, ...], np.dtype[np.intp]]
+Labels = IndexArray
 
 
 def even_replicates(number: int) -> Labels:
@@ -188,7 +188,6 @@ def weighted_quantiles_of(ordered: FloatArray, weights: FloatArray, probabilitie
 
 # --- Cache of conditional (linear) solutions by parameter vector, reused when those points become draws.
 
-IntArray = np.ndarray[tuple[int, ...], np.dtype[np.intp]]
 Solution = tuple[FloatArray, ...]
 """Arrays with a row a parameter vector; see `CollapsedTarget.conditional`."""
 
@@ -232,7 +231,7 @@ class Solved:
         return self._index
 
 
-def distinct_rows(rows: FloatArray) -> tuple[FloatArray, IntArray]:
+def distinct_rows(rows: FloatArray) -> tuple[FloatArray, IndexArray]:
     """Distinct rows in order, and the index of each row among them: ``np.unique``, quicker for random points.
 
     No two of those agree in their first coordinate; where some do, rows are compared as a whole.

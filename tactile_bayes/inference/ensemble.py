@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, Protocol
 
 import emcee
@@ -14,6 +14,7 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.arviz_data import chain_diagnostics
 from tactile_bayes.inference.draws import ParameterDraws, student_draws
 from tactile_bayes.inference.modes import LogDensity
+from tactile_bayes.progress import Progress
 
 # --- State of an interrupted ensemble, from which it continues exactly.
 
@@ -49,7 +50,6 @@ class ChainStore(Protocol):
 
 # --- Markov chain Monte Carlo by several independent emcee ensembles, which must agree before they stop.
 
-Progress = Callable[[int, int], None]
 WALKERS_PER_PARAMETER = 4
 """Walkers of each ensemble."""
 

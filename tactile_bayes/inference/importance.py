@@ -6,7 +6,7 @@ import numpy as np
 
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import NotConvergedError
-from tactile_bayes.geometry import FloatArray
+from tactile_bayes.geometry import FloatArray, IndexArray
 from tactile_bayes.inference.draws import REPLICATES, ParameterDraws, weighted_quantiles_of
 from tactile_bayes.inference.modes import LogDensity
 from tactile_bayes.inference.points import BITS, normal_quantile, shifted_sobol
@@ -507,9 +507,7 @@ def weighted_quantile(values: FloatArray, weights: FloatArray, probabilities: tu
     return weighted_quantiles_of(values[order], weights[order], np.array(probabilities))
 
 
-def systematic(
-    weights: FloatArray, number: int, rng: np.random.Generator
-) -> np.ndarray[tuple[int, ...], np.dtype[np.intp]]:
+def systematic(weights: FloatArray, number: int, rng: np.random.Generator) -> IndexArray:
     """Indices of `number` equal-weight draws by systematic resampling, then shuffled."""
     edges = np.cumsum(weights) / weights.sum()
     index = np.searchsorted(edges, (np.arange(number) + rng.uniform()) / number)

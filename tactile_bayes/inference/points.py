@@ -143,7 +143,7 @@ def paired_points(key: FloatArray, replicates: Labels, dimension: int, rng: np.r
     return paired
 
 
-def evened(values: FloatArray, mean: FloatArray, sd: FloatArray, replicates: Labels) -> FloatArray:
+def stratified_quantiles(values: FloatArray, mean: FloatArray, sd: FloatArray, replicates: Labels) -> FloatArray:
     """Replace (n,) normal draws by evenly spaced quantiles of the mixture of the normals that they were drawn from.
 
     Each replicate is done by itself, so that they stay independent, and keeps the order of its values: what goes with a

@@ -9,18 +9,13 @@ from numpy.typing import NDArray
 
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.geometry import FloatArray
-from tactile_bayes.mapping.cells import CellSums, Projection, Projector, Readout, add_frames, chunk_frames
-from tactile_bayes.mapping.select import BoolArray, SelectedFrames, chunks
+from tactile_bayes.geometry import BoolArray, FloatArray, IndexArray
+from tactile_bayes.mapping.cells import CellSums, Projection, Readout, add_frames, chunk_frames
+from tactile_bayes.mapping.select import SelectedFrames, chunks
+from tactile_bayes.progress import Progress, untold
 from tactile_bayes.scan import CountArray, Scan
 
 # --- Used frames of a scan on the map's lattice, which can be read any number of times.
-
-Progress = Callable[[int, int], None]
-
-
-def no_progress(done: int, total: int) -> None:
-    """Report no progress."""
 
 
 class Source(Record, eq=False):
@@ -35,13 +30,11 @@ class Source(Record, eq=False):
     @classmethod
     def of(cls, selection: SelectedFrames, *, plane_from_base: FloatArray, cell_mm: float) -> Source:
         """Project the used frames of a scan."""
-        good = selection.good_taxels
-        projector = Projector(selection.scan.head, plane_from_base=plane_from_base, taxels=good, cell_mm=cell_mm)
-        projection = projector.at(selection.poses.part(selection.used))
-        return cls(selection, Readout.of(selection.scan.element_calibration, good), projection)
+        projector = selection.projector(plane_from_base=plane_from_base, cell_mm=cell_mm)
+        return cls(selection, selection.readout, projector.at(selection.poses.part(selection.used)))
 
     @property
-    def frames(self) -> NDArray[np.intp]:
+    def frames(self) -> IndexArray:
         """Indices of the used frames in the scan."""
         return np.flatnonzero(self.selection.used)
 
@@ -67,7 +60,7 @@ KEPT_READINGS = 2**26
 _CHUNK = 128
 
 # Of pressures (f, k), which are valid, and the frames they are of: what is added up.
-_Weight = Callable[[FloatArray, "NDArray[np.bool_] | None", slice], "NDArray[np.generic]"]
+_Weight = Callable[[FloatArray, "BoolArray | None", slice], "NDArray[np.generic]"]
 
 
 class SolvedGains(Record, eq=False):
@@ -79,7 +72,7 @@ class SolvedGains(Record, eq=False):
 
 
 def solve_gains(
-    sources: list[Source], levels: list[FloatArray], *, tolerance: float, progress: Progress = no_progress
+    sources: list[Source], levels: list[FloatArray], *, tolerance: float, progress: Progress = untold
 ) -> SolvedGains:
     """Alternate between the map, given the gains, and each frame's least-squares gain, given the map.
 
@@ -148,7 +141,7 @@ class _System:
             total += np.bincount(flat.ravel(), weight(pressure, valid, frames).ravel(), cells)
         return total
 
-    def _parts(self) -> Iterator[tuple[slice, NDArray[np.integer], FloatArray, NDArray[np.bool_] | None]]:
+    def _parts(self) -> Iterator[tuple[slice, NDArray[np.integer], FloatArray, BoolArray | None]]:
         """Chunks: frames' indices, their cells, pressures (0 where not valid) and which are valid."""
         start, total = 0, sum(len(source.projection) for source in self._sources)
         for number, source in enumerate(self._sources):
@@ -213,7 +206,7 @@ def flat_field(selection: SelectedFrames) -> FlatField:
     scan, good = selection.scan, selection.good_taxels
     frames = np.flatnonzero(selection.used)
     frames = frames[:: max(1, len(frames) // MOST_FRAMES)][:MOST_FRAMES]
-    readout = Readout.of(scan.element_calibration, good)
+    readout = selection.readout
     pressure, valid = readout.pressure_kpa(readout.counts(scan.frames.counts[frames]))
     ratio = pressure / selection.level_kpa[frames, None]
     calm = _calm(ratio if valid is None else np.where(valid, ratio, 1.0))
@@ -266,7 +259,7 @@ def accumulate(
     *,
     cell_mm: float,
     normalise: str,
-    progress: Progress = no_progress,
+    progress: Progress = untold,
 ) -> Accumulated:
     """Average the normalised readings of all used frames in cells on the plane; progress starts anew in each pass.
 
@@ -289,7 +282,7 @@ def add_all(
     levels: list[FloatArray],
     *,
     cell_mm: float,
-    progress: Progress = no_progress,
+    progress: Progress = untold,
 ) -> CellSums:
     """One pass over all used frames, each divided by its level."""
     sums = CellSums(cell_mm)

@@ -11,7 +11,7 @@ from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError, check_number
 from tactile_bayes.findings import Finding, by_weight
 from tactile_bayes.geometry import FloatArray, Plane, apply, inverse, patient_from_plane
-from tactile_bayes.mapping.accumulate import Accumulated, Progress, accumulate, add_all, no_progress, sources_of
+from tactile_bayes.mapping.accumulate import Accumulated, accumulate, add_all, sources_of
 from tactile_bayes.mapping.accumulate import flat_field as find_flat_field
 from tactile_bayes.mapping.cells import CellSums, yaw_deg
 from tactile_bayes.mapping.convention import check_convention, convention_findings, hint
@@ -31,6 +31,7 @@ from tactile_bayes.mapping.select import (
 from tactile_bayes.mapping.strokes import StrokeShift, mobility, stroke_count, stroke_lag_figures
 from tactile_bayes.mapping.strokes import register_strokes as find_shifts
 from tactile_bayes.options import MapOptions
+from tactile_bayes.progress import Progress, untold
 from tactile_bayes.scan import HeadShape, Scan
 
 # --- Frames near the mass, to which the paper fits its plane.
@@ -60,7 +61,9 @@ def local_plane(
     span no plane. A given radius without frames, or whose frames span no plane, is a `BadDataError`.
     """
     mass = find_mass(selections, plane)
-    radius = radius_mm or max(_half_diagonal(part) for part in selections)
+    radius = radius_mm or max(
+        float(np.hypot(*np.ptp(part.scan.head.surface_mm[..., :2].reshape(-1, 2), axis=0))) / 2 for part in selections
+    )
     while True:
         try:
             return _plane_within(selections, plane, mass, radius)
@@ -68,11 +71,6 @@ def local_plane(
             if radius_mm is not None or radius > 500.0:
                 raise
             radius *= _WIDER
-
-
-def _half_diagonal(part: SelectedFrames) -> float:
-    extent = np.ptp(part.scan.head.surface_mm[..., :2].reshape(-1, 2), axis=0)
-    return float(np.hypot(*extent)) / 2
 
 
 def _plane_within(
@@ -192,7 +190,7 @@ def build_map(
     scans: Scan | Sequence[Scan],
     *,
     max_pose_gap_ms: float = MAX_POSE_GAP_MS,
-    progress: Progress = no_progress,
+    progress: Progress = untold,
     **options: Any,
 ) -> TactileMap:
     """Build the tactile map of one scan, or of several scans of one examination on a common plane.
@@ -208,7 +206,7 @@ def build_map(
     given = [scans] if isinstance(scans, Scan) else list(scans)
     parts = [every_nth(scan, how.every) for scan in given]
     _check_same_examination(parts)
-    rules = _Rules(_window(how.pressure_window_kpa), max_pose_gap_ms)
+    rules = _Rules((float(how.pressure_window_kpa[0]), float(how.pressure_window_kpa[1])), max_pose_gap_ms)
     figures: dict[str, float] = {} if how.every == 1 else {"frames_every": float(how.every)}
     late_ms = 0.0 if isinstance(how.latency_ms, str) else float(how.latency_ms)
     selections = rules.select(parts, late_ms)
@@ -306,10 +304,6 @@ def _plane(selections: list[SelectedFrames]) -> Plane:
         if "quaternion order" not in error.way_out:
             raise
         raise BadDataError(error.what, way_out=hint(selections)) from None
-
-
-def _window(window: tuple[float, float]) -> tuple[float, float]:
-    return (float(window[0]), float(window[1]))
 
 
 def _check_same_examination(scans: list[Scan]) -> None:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.geometry import FloatArray, apply, inverse
+from tactile_bayes.geometry import BoolArray, FloatArray, IndexArray, apply, inverse
 from tactile_bayes.mapping.plane import FramePoses
 from tactile_bayes.presets import PRESSURE_RANGE_KPA
 from tactile_bayes.scan import CountArray, ElementCalibration, HeadGeometry
@@ -276,7 +276,7 @@ class Projection(Record, eq=False):
         """(n, 2) shifts, in cells."""
         return self.matrix[:, :, 3]
 
-    def part(self, frames: slice | NDArray[np.intp] | NDArray[np.bool_]) -> Projection:
+    def part(self, frames: slice | IndexArray | BoolArray) -> Projection:
         """A subset of the frames."""
         return Projection(self.taxels, self.matrix[frames], self.cell_mm)
 
@@ -338,9 +338,7 @@ class Projector:
     frames.
     """
 
-    def __init__(
-        self, head: HeadGeometry, *, plane_from_base: FloatArray, taxels: NDArray[np.bool_], cell_mm: float
-    ) -> None:
+    def __init__(self, head: HeadGeometry, *, plane_from_base: FloatArray, taxels: BoolArray, cell_mm: float) -> None:
         self._rows = plane_from_base[:2, :3].tolist()
         self._origin_mm = inverse(plane_from_base)[:3, 3]
         self._origin = self._origin_mm.tolist()
@@ -398,8 +396,6 @@ def yaw_deg(head: HeadGeometry, rotation: FloatArray, *, plane_from_base: FloatA
 
 # --- Conversion of counts to pressures in whole multiples of a tiny step, so that sums have no rounding error.
 
-BoolArray = NDArray[np.bool_]
-
 # Gains and offsets are rounded to this (kPa): 6e-11. Counts below 2^16 times such a gain, plus such an offset, and the
 # sum of a thousand of them fit float64 exactly, so a frame's level does not depend on who adds it up and how.
 PRESSURE_STEP_KPA = 2.0**-34
@@ -408,7 +404,7 @@ PRESSURE_STEP_KPA = 2.0**-34
 class Readout(Record, eq=False, dict=True):
     """The taxels used, and the conversion of their counts to pressures."""
 
-    taxels: NDArray[np.intp]
+    taxels: IndexArray
     """(k,) int array: Flat indices of the used taxels, rising."""
     size: int
     """Taxels of the whole array."""

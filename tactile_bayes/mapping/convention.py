@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.findings import Finding
-from tactile_bayes.geometry import FloatArray, inverse, rotation_from_quaternion
-from tactile_bayes.mapping.cells import Projection, Projector, Readout
+from tactile_bayes.geometry import BoolArray, FloatArray, IndexArray, inverse, rotation_from_quaternion
+from tactile_bayes.mapping.cells import Projection
 from tactile_bayes.mapping.plane import MAX_POSE_GAP_MS, distinct_poses
 from tactile_bayes.mapping.select import SelectedFrames, chunks
 from tactile_bayes.scan import TrackerPoses
@@ -25,8 +24,6 @@ SHARED_S = 0.2
 # A stroke is a run in one direction over at least this far.
 LEAST_REACH_MM = 10.0
 _CHUNK = 512
-
-IndexArray = NDArray[np.intp]
 
 
 def stretches(time_s: FloatArray) -> IndexArray:
@@ -78,7 +75,7 @@ class CoarseFrames(Record, eq=False):
         mean.
         """
         good, scan = selection.good_taxels, selection.scan
-        readout = Readout.of(scan.element_calibration, good)
+        readout = selection.readout
         weight, row, block, basis = _taxel_blocks(good)
         first = np.flatnonzero(np.diff(stretches(scan.frames.time_s[frames]), prepend=-1))
         pooled = np.empty((len(frames), weight.shape[1]))
@@ -100,13 +97,7 @@ class CoarseFrames(Record, eq=False):
         return np.asarray(np.einsum("mij,jk->mki", matrix, taxels) * projection.cell_mm)
 
 
-def projector_of(selection: SelectedFrames, *, plane_from_base: FloatArray, cell_mm: float) -> Projector:
-    """The projector of a scan's good taxels."""
-    good = selection.good_taxels
-    return Projector(selection.scan.head, plane_from_base=plane_from_base, taxels=good, cell_mm=cell_mm)
-
-
-def _taxel_blocks(good: NDArray[np.bool_]) -> tuple[FloatArray, IndexArray, IndexArray, FloatArray]:
+def _taxel_blocks(good: BoolArray) -> tuple[FloatArray, IndexArray, IndexArray, FloatArray]:
     """Shares of the good taxels in blocks, each block's rows of the head, its number, and polynomials over them."""
     row, column = np.nonzero(good)
     number = row // POOL_TAXELS * good.shape[1] + column // POOL_TAXELS
@@ -116,6 +107,12 @@ def _taxel_blocks(good: NDArray[np.bool_]) -> tuple[FloatArray, IndexArray, Inde
     s, t = ((place - place.mean()) / len(good) @ weight for place in (row.astype(float), column.astype(float)))
     terms = [np.ones_like(s), s, t, s * s, s * t, t * t][: len(blocks)]
     return weight, blocks // good.shape[1], blocks, np.linalg.qr(np.stack(terms, axis=1))[0]
+
+
+def numbered_on(blocks: Sequence[IndexArray]) -> IndexArray:
+    """The scans' blocks, counted on from one scan to the next."""
+    starts = np.cumsum([0, *(int(one.max()) + 1 for one in blocks)])
+    return np.concatenate([one + start for one, start in zip(blocks, starts, strict=False)])
 
 
 def block_means(values: FloatArray, first: IndexArray) -> FloatArray:

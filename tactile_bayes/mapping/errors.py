@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_bayes.declarations import Record
-from tactile_bayes.geometry import FloatArray, Plane, apply, inverse, rotation_from_quaternion
+from tactile_bayes.geometry import BoolArray, FloatArray, Plane, apply, inverse, rotation_from_quaternion
 from tactile_bayes.mapping.accumulate import Source
 from tactile_bayes.mapping.cells import VALUE_STEP, CellSums
 from tactile_bayes.mapping.map import FEW_READINGS
@@ -183,7 +183,7 @@ class _Run(Record, eq=False):
     whole: FloatArray
     others: FloatArray
     """`whole`, `others`: Errors about the map, and about the map without this run."""
-    known: NDArray[np.bool_]
+    known: BoolArray
     """Valid readings in cells that enough readings of other frames fell into."""
 
     @classmethod

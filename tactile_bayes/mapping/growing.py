@@ -9,12 +9,12 @@ import numpy as np
 
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError, UsageError
-from tactile_bayes.geometry import FloatArray, Plane, check_rigid
+from tactile_bayes.geometry import BoolArray, FloatArray, Plane, check_rigid
 from tactile_bayes.mapping.cells import CellSums, Projection, Projector, Readout, add_frames, chunk_frames
 from tactile_bayes.mapping.map import MapRecipe, TactileMap
 from tactile_bayes.mapping.plane import FramePoses, HeadMoments, MomentSums, head_moments
 from tactile_bayes.mapping.profile import GrowingProfile
-from tactile_bayes.mapping.select import BoolArray, TaxelFault, chunks, gate
+from tactile_bayes.mapping.select import TaxelFault, chunks, gate, good_taxels
 from tactile_bayes.presets import CELL_MM, PRESSURE_WINDOW_KPA
 from tactile_bayes.scan import CountArray, ElementCalibration, HeadGeometry, HeadShape
 
@@ -70,12 +70,9 @@ class Instrument(Record, eq=False, dict=True):
         return Readout.of(self.element_calibration, self.good)
 
     @property
-    def good(self) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+    def good(self) -> BoolArray:
         """(rows, columns) True for taxels that are used."""
-        good = np.ones(self.head.shape, dtype=bool)
-        for fault in self.faults:
-            good[fault.row, fault.column] = False
-        return good
+        return good_taxels(self.head.shape, self.faults)
 
     def differs(self, other: Instrument) -> str:
         """Name of the first setting that differs; empty if none does."""

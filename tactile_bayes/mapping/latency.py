@@ -6,13 +6,12 @@ from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.geometry import FloatArray, Plane
+from tactile_bayes.geometry import BoolArray, FloatArray, IndexArray, Plane
 from tactile_bayes.mapping.cells import Projector
-from tactile_bayes.mapping.convention import CoarseFrames, IndexArray, projector_of, stroke_starts
+from tactile_bayes.mapping.convention import CoarseFrames, numbered_on, stroke_starts
 from tactile_bayes.mapping.errors import pose_noise_figures
 from tactile_bayes.mapping.map import smooth
 from tactile_bayes.mapping.plane import FramePoses, poses_at
@@ -65,7 +64,7 @@ class ShiftFit(Record, eq=False):
         data = nuisance.without(pressure - np.einsum("ni,ni->n", gradient, cells.offset_mm))
         return cls(cells, levelled, gradient, data, nuisance)
 
-    def of_some(self, keep: NDArray[np.bool_]) -> ShiftFit:
+    def of_some(self, keep: BoolArray) -> ShiftFit:
         """The same with the gradient of the map that some of the readings make."""
         return replace(self, gradient=self.cells.gradient(self.levelled, keep=keep))
 
@@ -111,7 +110,7 @@ class Cells(Record, eq=False):
         count = np.bincount(self.number, minlength=size)
         return np.asarray(np.bincount(self.number, values, size) / np.maximum(count, 1))
 
-    def gradient(self, values: FloatArray, *, keep: NDArray[np.bool_] | None = None) -> FloatArray:
+    def gradient(self, values: FloatArray, *, keep: BoolArray | None = None) -> FloatArray:
         """(n, 2) gradient at each reading of the values' map, smoothed once; 0 beside a cell without kept values."""
         size = self.shape[0] * self.shape[1]
         kept = np.ones(len(values)) if keep is None else keep.astype(np.float64)
@@ -283,7 +282,7 @@ class _Part(Record, eq=False):
         for edge in RANGE_MS:
             used &= _poses(selection, edge, gap_ms).known
         coarse = CoarseFrames.of(selection, np.flatnonzero(used)[:MOST_FRAMES])
-        projector = projector_of(selection, plane_from_base=plane.plane_from_base, cell_mm=cell_mm)
+        projector = selection.projector(plane_from_base=plane.plane_from_base, cell_mm=cell_mm)
         return cls(selection, coarse, projector, gap_ms)
 
     def places_mm(self, latency_ms: float) -> FloatArray:
@@ -357,12 +356,7 @@ class _Regression(Record, eq=False):
     ) -> _Regression:
         moves = [part.moves_mm(latency_ms) for part in parts]
         label, ways = strokes
-        blocks, past = [], 0
-        for part in parts:
-            number = part.coarse.blocks(part.selection.scan.frames.time_s)
-            blocks.append(number + past)
-            past += int(number.max()) + 1
-        block = np.concatenate(blocks)
+        block = numbered_on([part.coarse.blocks(part.selection.scan.frames.time_s) for part in parts])
         even = (block % 2 == 0)[fit.frame_numbers()]
         halves = np.array([fit.of_some(keep).design(moves) for keep in (even, ~even)])
         return cls(fit, fit.design(moves), halves, fit.raw_design(moves), label, block, ways)

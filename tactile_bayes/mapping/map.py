@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from tactile_bayes.declarations import Record, field, settle
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.findings import Finding
-from tactile_bayes.geometry import FloatArray
+from tactile_bayes.geometry import BoolArray, FloatArray
 from tactile_bayes.scan import HeadShape
 
 # --- Binomial smoothing of sums in cells.
@@ -148,9 +148,9 @@ class TactileMap(Record, eq=False):
         return int.from_bytes(digest.digest()[:8], "big")
 
     @property
-    def covered(self) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+    def covered(self) -> BoolArray:
         """(ny, nx) True where the map has data."""
-        covered: np.ndarray[tuple[int, ...], np.dtype[np.bool_]] = (self.count > 0) & np.isfinite(self.mean)
+        covered: BoolArray = (self.count > 0) & np.isfinite(self.mean)
         return covered
 
     @property
@@ -159,9 +159,9 @@ class TactileMap(Record, eq=False):
         return self.recipe.source == "scan" or bool((self.count > 1).any())
 
     @property
-    def few(self) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+    def few(self) -> BoolArray:
         """(ny, nx) True for cells with data from fewer than `FEW_READINGS` readings; none where counts are unknown."""
-        few: np.ndarray[tuple[int, ...], np.dtype[np.bool_]] = (self.count > 0) & (self.count < FEW_READINGS)
+        few: BoolArray = (self.count > 0) & (self.count < FEW_READINGS)
         if not self.counts_known:
             few = np.zeros_like(few)
         return few
@@ -182,8 +182,6 @@ def many_cells(tactile_map: TactileMap, radius_mm: float) -> str | None:
     cells = min(int(tactile_map.covered.sum()), int(math.pi * radius_mm**2 / cell**2))
     if cells < MANY_CELLS:
         return None
-    # only here: an ordinary estimate needs none of its imports
-
     advice = advise_cell(tactile_map)
     enough = "cells of half a bump's sigma measure it as well"
     if advice is not None and advice.coarsest_mm > cell:

@@ -9,12 +9,13 @@ from operator import add, mul
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import (
+    BoolArray,
     FloatArray,
+    IndexArray,
     Plane,
     apply,
     fit_plane,
@@ -36,12 +37,12 @@ class FramePoses(Record, eq=False):
     """(n, 3) array: Tracker sensor in `base`."""
     rotation: FloatArray
     """(n, 3, 3) array: ``p_base = position + rotation @ p_tracker``."""
-    known: NDArray[np.bool_]
+    known: BoolArray
     """(n,) bool array: False where the tracker said nothing close enough; position and rotation are then meaningless
     but finite.
     """
 
-    def part(self, frames: slice | NDArray[np.bool_] | NDArray[np.intp]) -> FramePoses:
+    def part(self, frames: slice | BoolArray | IndexArray) -> FramePoses:
         """A subset of the frames."""
         return FramePoses(self.position_mm[frames], self.rotation[frames], self.known[frames])
 

@@ -10,10 +10,10 @@ from numpy.polynomial import legendre
 from numpy.typing import NDArray
 
 from tactile_bayes.declarations import Record
-from tactile_bayes.geometry import FloatArray, Plane, apply, inverse
+from tactile_bayes.geometry import BoolArray, FloatArray, IndexArray, Plane, apply, inverse
 from tactile_bayes.mapping.cells import Readout
 from tactile_bayes.mapping.convention import stroke_starts
-from tactile_bayes.mapping.select import BoolArray, SelectedFrames, chunks
+from tactile_bayes.mapping.select import SelectedFrames, chunks
 from tactile_bayes.presets import HEAD_PROFILE
 from tactile_bayes.scan import CountArray
 
@@ -118,7 +118,7 @@ def lump_free(left: FloatArray) -> BoolArray:
     return free
 
 
-def profile_frames(part: SelectedFrames) -> NDArray[np.intp]:
+def profile_frames(part: SelectedFrames) -> IndexArray:
     """Frames of one scan that are read: those that are whole, at most `MOST_FRAMES` of them, in the order of time."""
     frames = np.flatnonzero(part.used & _whole(part.level_kpa, part.valid_share, part.good_taxels))
     marks = frame_marks(part.level_kpa[frames])
@@ -133,12 +133,11 @@ def _tenth(values: FloatArray) -> float:
     return float(low + share * (high - low))
 
 
-def _read(part: SelectedFrames, frames: NDArray[np.intp]) -> FloatArray:
+def _read(part: SelectedFrames, frames: IndexArray) -> FloatArray:
     if not len(frames):
         return np.zeros((0, _COLUMNS))
-    readout = Readout.of(part.scan.element_calibration, part.good_taxels)
-    counts = readout.counts(part.scan.frames.counts[frames])
-    return _rows(ProfileReader.of(part.good_taxels), readout, counts, part.level_kpa[frames])
+    counts = part.readout.counts(part.scan.frames.counts[frames])
+    return _rows(ProfileReader.of(part.good_taxels), part.readout, counts, part.level_kpa[frames])
 
 
 def _rows(reader: ProfileReader, readout: Readout, counts: CountArray, level_kpa: FloatArray) -> FloatArray:
@@ -341,8 +340,7 @@ class _Frames:
         reader = ProfileReader.of(part.good_taxels)
         among = np.searchsorted(np.flatnonzero(part.used), chosen)
         level = part.level_kpa[chosen]
-        readout = Readout.of(part.scan.element_calibration, part.good_taxels)
-        pressure = readout.pressure_kpa(readout.counts(part.scan.frames.counts[chosen]))[0]
+        pressure = part.readout.pressure_kpa(part.readout.counts(part.scan.frames.counts[chosen]))[0]
         place = self.place_mm[among, :2] / SPAN_MM
         tilt = self.axes[among, 2, :2]
         one = np.ones((len(chosen), 1))

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -12,8 +13,8 @@ from numpy.typing import NDArray
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.findings import Finding
-from tactile_bayes.geometry import FloatArray
-from tactile_bayes.mapping.cells import Readout, chunk_frames
+from tactile_bayes.geometry import BoolArray, FloatArray
+from tactile_bayes.mapping.cells import Projector, Readout, chunk_frames
 from tactile_bayes.mapping.plane import MAX_POSE_GAP_MS, FramePoses, distinct_poses, poses_at
 from tactile_bayes.scan import PressureFrames, Scan
 
@@ -294,13 +295,11 @@ def _frame_gaps(frames: Span) -> list[str]:
 
 # --- Selection of the frames that go into a map, and the reasons for leaving others out (paper step ii, the gate).
 
-BoolArray = NDArray[np.bool_]
-
 # A frame with a smaller share of valid taxels than this is dropped.
 VALID_SHARE = 0.9
 
 
-class SelectedFrames(Record, eq=False):
+class SelectedFrames(Record, eq=False, dict=True):
     """A scan with the selection of its frames."""
 
     scan: Scan
@@ -334,7 +333,17 @@ class SelectedFrames(Record, eq=False):
     @property
     def good_taxels(self) -> BoolArray:
         """(rows, columns) True for taxels that are not left out."""
-        return good_taxels(self.scan, self.faults)
+        return good_taxels(self.scan.head.shape, self.faults)
+
+    @cached_property
+    def readout(self) -> Readout:
+        """The good taxels, and the conversion of their counts."""
+        return Readout.of(self.scan.element_calibration, self.good_taxels)
+
+    def projector(self, *, plane_from_base: FloatArray, cell_mm: float) -> Projector:
+        """The projector of the good taxels."""
+        good = self.good_taxels
+        return Projector(self.scan.head, plane_from_base=plane_from_base, taxels=good, cell_mm=cell_mm)
 
     @property
     def used_poses(self) -> FramePoses:
@@ -342,9 +351,9 @@ class SelectedFrames(Record, eq=False):
         return FramePoses(self.poses.position_mm, self.poses.rotation, self.used)
 
 
-def good_taxels(scan: Scan, faults: tuple[TaxelFault, ...]) -> BoolArray:
+def good_taxels(shape: tuple[int, int], faults: Iterable[TaxelFault]) -> BoolArray:
     """(rows, columns) True for taxels without a fault."""
-    good = np.ones(scan.head.shape, dtype=bool)
+    good = np.ones(shape, dtype=bool)
     for fault in faults:
         good[fault.row, fault.column] = False
     return good
@@ -371,7 +380,7 @@ def select_frames(
     faults = find_faults(scan)
     _refuse_dead(scan, faults)
     poses = poses_at(scan.poses, scan.frames.time_s, latency_ms=latency_ms, max_gap_ms=max_pose_gap_ms)
-    level, share = _levels(scan, good_taxels(scan, faults))
+    level, share = _levels(scan, good_taxels(scan.head.shape, faults))
     low, high, used = gate(poses.known, level, share, pressure_window_kpa=pressure_window_kpa)
     return SelectedFrames(scan, faults, poses, level, share, low, high, used)
 

@@ -6,19 +6,17 @@ from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.geometry import FloatArray
+from tactile_bayes.geometry import BoolArray, FloatArray, IndexArray
 from tactile_bayes.mapping.accumulate import Source
-from tactile_bayes.mapping.cells import Projection
 from tactile_bayes.mapping.convention import (
     LEAST_REACH_MM,
     POOL_S,
     CoarseFrames,
-    IndexArray,
     every_stretch,
+    numbered_on,
     stroke_starts,
     thinning,
 )
@@ -104,7 +102,7 @@ def register_strokes(sources: Sequence[Source]) -> tuple[list[Source], list[Stro
     return [_moved(source, [one for one in shifted if one.scan == n]) for n, source in enumerate(sources)], shifted
 
 
-def _lack(known: NDArray[np.bool_], last: _Round) -> str:
+def _lack(known: BoolArray, last: _Round) -> str:
     """The scan's deficiency, in one line."""
     best = float(last.own_errors().min())
     told = f"the best is known to +-{best:.1f} mm" if np.isfinite(best) else "no slope stands out of the noise"
@@ -178,7 +176,7 @@ class _Round(Record, eq=False):
     def of(cls, parts: Sequence[_Part], shifts_mm: FloatArray) -> _Round:
         fit = ShiftFit.of([part.coarse for part in parts], [part.shifted_mm(shifts_mm) for part in parts])
         frame = fit.frame_numbers()
-        block = _numbered([part.block for part in parts])
+        block = numbered_on([part.block for part in parts])
         even = (block % 2 == 0)[frame]
         halves = [fit.of_some(keep) for keep in (even, ~even)]
         columns, told = [], []
@@ -205,7 +203,7 @@ class _Round(Record, eq=False):
         """(K,) standard error of each stroke's shift if all the others' were known."""
         return np.asarray(self.widened / np.sqrt(np.maximum(np.diag(self.normal), 1e-300)))
 
-    def errors(self) -> tuple[NDArray[np.bool_], FloatArray]:
+    def errors(self) -> tuple[BoolArray, FloatArray]:
         """(K,) strokes whose shift about the known strokes' mean is known, and the (K,) standard errors."""
         covariance = np.linalg.inv(self.normal + np.eye(len(self.normal)) / EXPECTED_MM**2)
         known, errors = self.own_errors() < KNOWN_SD_MM, np.full(len(self.normal), np.inf)
@@ -218,12 +216,6 @@ class _Round(Record, eq=False):
         return known, errors
 
 
-def _numbered(blocks: Sequence[IndexArray]) -> IndexArray:
-    """The scans' blocks counted on from one scan to the next."""
-    starts = np.cumsum([0, *(int(one.max()) + 1 for one in blocks)])
-    return np.concatenate([one + start for one, start in zip(blocks, starts, strict=False)])
-
-
 def _shared(design: FloatArray, left: FloatArray, block: IndexArray) -> float:
     """By how much errors shared within blocks widen the variance of the designs' coefficients, over all of them."""
     scores = np.array([np.bincount(block, column * left) for column in design])
@@ -232,18 +224,13 @@ def _shared(design: FloatArray, left: FloatArray, block: IndexArray) -> float:
     return float(widening * scores.shape[1] / free)
 
 
-def _shifted(projection: Projection, by_mm: FloatArray) -> Projection:
-    """Moved by (n, 2) mm."""
-    whole = np.rint(by_mm / projection.cell_mm * 2.0**30) / 2.0**30  # on the grid that keeps cells exact
-    return projection.moved(whole)
-
-
 def _moved(source: Source, strokes: list[StrokeShift]) -> Source:
     """Source with its strokes moved back by their shifts."""
     shift = np.zeros_like(source.projection.shift)
     for one in strokes:
-        shift[one.start : one.stop, 0] = one.shift_mm
-    return Source(source.selection, source.readout, _shifted(source.projection, -shift))
+        shift[one.start : one.stop, 0] = -one.shift_mm
+    whole = np.rint(shift / source.projection.cell_mm * 2.0**30) / 2.0**30  # on the grid that keeps cells exact
+    return replace(source, projection=source.projection.moved(whole))
 
 
 # --- How far apart strokes in opposite directions see the lump: one that is dragged along, or poses that come late.
@@ -291,16 +278,13 @@ def stroke_lag_figures(sources: Sequence[Source]) -> dict[str, float]:
     return _step(ShiftFit.of(parts, places), moves, blocks)
 
 
-def _step(
-    fit: ShiftFit, moves: Sequence[FloatArray], blocks: Sequence[np.ndarray[tuple[int, ...], np.dtype[np.intp]]]
-) -> dict[str, float]:
+def _step(fit: ShiftFit, moves: Sequence[FloatArray], blocks: Sequence[IndexArray]) -> dict[str, float]:
     design = fit.design(moves)
     whole = float(design @ design)
     if not whole > 0:
         return {}
     # a lump that is ahead of its place is seen at places that are behind theirs
     lag = -float(design @ fit.data) / whole
-    starts = np.cumsum([0, *(int(one.max()) + 1 for one in blocks)])
-    block = np.concatenate([one + start for one, start in zip(blocks, starts, strict=False)])[fit.frame_numbers()]
+    block = numbered_on(blocks)[fit.frame_numbers()]
     scores = np.bincount(block, design * (fit.data + lag * design))
     return {"stroke_lag_mm": lag, "stroke_lag_sd_mm": float(np.sqrt(np.sum(scores**2))) / whole}

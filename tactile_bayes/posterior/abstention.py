@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from tactile_bayes.errors import Abstention, UsageError
-from tactile_bayes.geometry import FloatArray
+from tactile_bayes.geometry import BoolArray, FloatArray
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.mapping.places import orientation_of
 from tactile_bayes.options import BumpPrior
@@ -16,7 +16,6 @@ from tactile_bayes.posterior.lump_probability import LIKELY, Weighed
 from tactile_bayes.posterior.options import DETECTED
 from tactile_bayes.posterior.white import AT_RIM, LEAST_COVERED_SHARE, LEAST_WIDTH_IN_CELLS, MOST_AXIS_RATIO, Candidate
 
-BoolArray = np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
 FEEL_AGAIN = "if a lump is felt, go over the place again, more slowly or with more lines, and map all scans together"
 FEEL_AGAIN_ON_PAPER = "if a lump is felt, scan its place again, more slowly or with more strokes"
 FEEL_A_RIB = "feel whether it is a rib; if a lump is felt, name its place with --centre-mm X Y"

@@ -160,7 +160,7 @@ def _prior(
     notes = {"left_out": "level, tilt and noise scale have improper priors"}
     if calibration is not None:
         inside = [
-            not calibration.too_far(a, x, y) if a > 0 else False
+            not calibration.extrapolation_faults(a, x, y) if a > 0 else False
             for a, x, y in zip(amplitude.tolist(), sigma_x.tolist(), sigma_y.tolist(), strict=True)
         ]
         share = float(np.mean(inside))

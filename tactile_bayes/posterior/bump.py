@@ -8,7 +8,7 @@ import numpy as np
 
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.forward.gaussian import cell_mean_gaussian, covariance_from_log_widths, principal_widths
-from tactile_bayes.geometry import FloatArray
+from tactile_bayes.geometry import BoolArray, FloatArray, IndexArray
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.options import BumpPrior
 from tactile_bayes.presets import POSE_NOISE
@@ -56,8 +56,8 @@ class FitCells(Record, eq=False):
     """`value`, `variance`, `count` (k,) arrays: Mean, within-cell variance (NaN where it is not known) and number of
     readings.
     """
-    row: np.ndarray[tuple[int, ...], np.dtype[np.intp]]
-    column: np.ndarray[tuple[int, ...], np.dtype[np.intp]]
+    row: IndexArray
+    column: IndexArray
     """`row`, `column` (k,) int arrays: Where the cells lie in the map's grid."""
     cell_mm: float
     """Side of a cell."""
@@ -76,7 +76,7 @@ class FitCells(Record, eq=False):
 
 
 @lru_cache(maxsize=MAPS_AT_HAND)
-def trusted(tactile_map: TactileMap) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+def trusted(tactile_map: TactileMap) -> BoolArray:
     """(ny, nx) True for covered cells with at least a tenth of the median count.
 
     At the rim of a map a handful of readings from one side of the head decide a cell, and they are off together.
@@ -236,8 +236,6 @@ BLOCK, LEAST_BLOCK = 64, 4
 BLOCK_VALUES = 512 * 1024
 """Cells times vectors in a block: beyond 8192 cells a block has fewer vectors, but `LEAST_BLOCK`."""
 
-IntArray = np.ndarray[tuple[int, ...], np.dtype[np.intp]]
-
 
 def block_size(cells: int) -> int:
     """Number of parameter vectors to predict at a time, for a window of this many cells."""
@@ -337,7 +335,7 @@ def straight_bump(x_mm: FloatArray, y_mm: FloatArray, *, p: FloatArray, q: Float
 
 
 @lru_cache(maxsize=2)
-def _lattice(cells: FitCells) -> tuple[FloatArray, FloatArray, IntArray]:
+def _lattice(cells: FitCells) -> tuple[FloatArray, FloatArray, IndexArray]:
     """Coordinates of the window's columns and rows, and each cell's index in their grid; cached."""
     column, row = cells.column - cells.column.min(), cells.row - cells.row.min()
     x_axis, y_axis = np.zeros(int(column.max()) + 1), np.zeros(int(row.max()) + 1)

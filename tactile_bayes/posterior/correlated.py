@@ -14,7 +14,7 @@ from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.abstention import rim_fault
 from tactile_bayes.posterior.bump import PoseNoise, overlap, trusted
 from tactile_bayes.posterior.detection import Detection, detection_from_odds
-from tactile_bayes.posterior.draw import MapPosterior, ModalBump, NoiseFigures, Progress, draw_parameters
+from tactile_bayes.posterior.draw import MapPosterior, ModalBump, NoiseFigures, draw_parameters
 from tactile_bayes.posterior.field import Window, cosines_for
 from tactile_bayes.posterior.fit import (
     FieldFit,
@@ -34,10 +34,11 @@ from tactile_bayes.posterior.selection import (
     ask_departure,
     choose_shape,
     exponent_covariance,
-    near,
+    newton_step_to,
 )
 from tactile_bayes.posterior.white import BumpFit, MapDraws
 from tactile_bayes.presets import FIELD_COSINES, SceneAsked
+from tactile_bayes.progress import Progress
 
 # --- Outline of a lump: whether its bump is skewed, or rounder inside than outside, more than a ball's is.
 #
@@ -309,7 +310,7 @@ def _oblique(fit: FieldFit, places: FloatArray) -> tuple[float, float] | None:
     if fit.scene.shape != "ellipse":
         return None
     scene = replace(fit.scene, shape="rotated")
-    mixture = near(fit, scene)
+    mixture = newton_step_to(fit, scene)
     if mixture is None:
         return None
     mean, covariance = mixture.moments()

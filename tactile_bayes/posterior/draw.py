@@ -15,6 +15,7 @@ from tactile_bayes.inference.importance import TRUSTED_SHAPE, Gaussians, importa
 from tactile_bayes.inference.modes import LogDensity
 from tactile_bayes.posterior.options import EstimateOptions
 from tactile_bayes.presets import Method
+from tactile_bayes.progress import Progress
 from tactile_bayes.size.draws import BumpDraws
 
 # --- Joint posterior draws, the result of every method and noise model.
@@ -133,7 +134,6 @@ class Diagnostics(Record):
 DISAGREEMENT = 5.0
 """Ends of intervals by two methods differ by more than this many of their joint Monte-Carlo errors: one is wrong."""
 START_ACCURACY_SD = 0.05
-Progress = Callable[[int, int], None]
 
 
 class Sampled(Record, eq=False):

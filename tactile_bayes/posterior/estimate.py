@@ -20,13 +20,14 @@ from tactile_bayes.posterior.abstention import (
     undetected,
 )
 from tactile_bayes.posterior.detection import Detection
-from tactile_bayes.posterior.draw import Diagnostics, MapPosterior, ModalBump, NoiseFigures, Progress
+from tactile_bayes.posterior.draw import Diagnostics, MapPosterior, ModalBump, NoiseFigures
 from tactile_bayes.posterior.lump_probability import LIKELY, Weighed, weigh
 from tactile_bayes.posterior.options import DETECTED, ROTATION_ODDS, EstimateOptions, FitOptions, check_options
 from tactile_bayes.posterior.result import Estimate, Sensitivity, prior_sensitivity
 from tactile_bayes.posterior.search import Assessment, SizedDraws, best_chance, draw_until_accurate, search
 from tactile_bayes.posterior.white import Candidate, MapDraws, check_background
 from tactile_bayes.presets import CELL_PER_SIGMA
+from tactile_bayes.progress import Progress
 from tactile_bayes.scan import DEFAULT_HEAD, HeadShape
 from tactile_bayes.size.draws import SizePosterior
 from tactile_bayes.size.fat import head_profile
@@ -147,8 +148,8 @@ def _measured(
     if sized.fault is not None:
         return _none(sized.fault, candidates, detection, bump)
     diagnostics = _diagnostics(sized)
-    if sized.too_far:
-        return _none(extrapolated(list(sized.too_far)), candidates, detection, bump, diagnostics)
+    if sized.extrapolation_faults:
+        return _none(extrapolated(list(sized.extrapolation_faults)), candidates, detection, bump, diagnostics)
     if size is not None and size.invalid > MOST_INVALID * size.d_x_mm.size:
         reason = f"no positive size in {size.invalid} of {size.d_x_mm.size} draws: outside the calibration"
         outside = Abstention(
@@ -302,7 +303,7 @@ def _left_out(
 ) -> tuple[str, ...]:
     notes = []
     if tactile_map.recipe.source == "scan" and noise.places_share is None:
-        notes.append("errors of the frames' places and their blur")
+        notes.append("tracker position error and its blur")
     odds = noise.rotation_odds
     if odds is not None and not noise.rotated and not options.fit.correlated:
         notes.append(f"rotation of the ellipse (odds {odds:.2g} to 1, used above {ROTATION_ODDS:g})")

@@ -7,7 +7,7 @@ from math import lgamma, log, pi
 import numpy as np
 
 from tactile_bayes.declarations import Record, names_of
-from tactile_bayes.geometry import FloatArray
+from tactile_bayes.geometry import FloatArray, IndexArray
 from tactile_bayes.posterior.field import Profiles, Projected, Whitening, Window
 
 # --- Solutions for the linear parameters (amplitudes, level, tilt) given the shape, for many shapes and noise fields.
@@ -203,7 +203,6 @@ def _two(
 # needs of a bump is linear or quadratic in it: it is worked out once for the products that span, and for a point
 # only its coefficients are left.
 
-IntArray = np.ndarray[tuple[int, ...], np.dtype[np.intp]]
 DROPPED = 1e-8
 """Norm of what is dropped of all the bumps together, over that of the least of them."""
 LEAST_BUMPS = 256
@@ -268,7 +267,7 @@ def _gram(window: Window, along: FloatArray, across: FloatArray) -> FloatArray:
     return np.asarray(rows @ window.weight @ columns.T).reshape(len(along), len(along), len(across), len(across))
 
 
-def _kept(size: FloatArray, least: float) -> tuple[IntArray, IntArray]:
+def _kept(size: FloatArray, least: float) -> tuple[IndexArray, IndexArray]:
     """Rows and columns kept of (ry, rx) squared norms; the dropped ones sum to `DROPPED` at most."""
     order = np.argsort(size, axis=None)
     kept = order[np.sqrt(np.cumsum(size.ravel()[order])) > DROPPED * least]

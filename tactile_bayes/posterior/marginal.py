@@ -19,7 +19,7 @@ from copy import copy
 
 import numpy as np
 
-from tactile_bayes.geometry import FloatArray
+from tactile_bayes.geometry import FloatArray, IndexArray
 from tactile_bayes.inference.draws import Solution, Solved, distinct_rows
 from tactile_bayes.posterior.bump import FitCells
 from tactile_bayes.posterior.field import LENGTHS_MM, SHARES, Profiles, Projected, Whitening, no_field
@@ -33,7 +33,6 @@ NEGLIGIBLE = 1e-3
 Once a length has as little, and less than the one before it, shorter ones are not looked at."""
 SPANNED = 2048
 """As many share a basis where they can, see `posterior.spanned`."""
-IntArray = np.ndarray[tuple[int, ...], np.dtype[np.intp]]
 WithEvidence = tuple[FloatArray, LinearSolution]
 """Log of the fields' prior times the evidence (m, h), and what is linear."""
 
@@ -365,7 +364,7 @@ def linear_columns(cells: FitCells, *, tilt: bool) -> FloatArray:
     return np.concatenate([ones, np.stack([x, y]) / size])
 
 
-def choose(evidence: FloatArray, rng: np.random.Generator) -> IntArray:
+def choose(evidence: FloatArray, rng: np.random.Generator) -> IndexArray:
     """(m,) random field for each draw by its share of the evidence; the first where a draw has none."""
     best = evidence.max(axis=1, keepdims=True)
     weight = np.exp(evidence - np.where(np.isfinite(best), best, 0.0))

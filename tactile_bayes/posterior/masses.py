@@ -54,7 +54,7 @@ def other_rises(tactile_map: TactileMap, estimate: Estimate, options: EstimateOp
             rise = _at_rim(rest, candidates, given, estimate)
         else:
             rise = _rise_assessed(seen, estimate) if seen.detection.probability >= LEAST_PROBABILITY else None
-        if rise is None or _is_known(rise, rises, rest, estimate) or not _stands_out(rise, rest):
+        if rise is None or _already_named(rise, rises, rest, estimate) or not _stands_out(rise, rest):
             misses += 1
         else:
             rises.append(rise)
@@ -94,7 +94,7 @@ def _places(rest: TactileMap, estimate: Estimate) -> Iterator[tuple[float, float
     height = smoothed_excess(found_on)
     for x, y in candidate_centres(found_on, rim_limit=0):
         row, column = (int(np.argmin(np.abs(axis - at))) for axis, at in ((rest.y_mm, y), (rest.x_mm, x)))
-        if height[row, column] > _least_rise(x, y, estimate) and _beside(x, y, rest, estimate):
+        if height[row, column] > _least_rise(x, y, estimate) and _clear_of_lump(x, y, rest, estimate):
             yield x, y
 
 
@@ -108,7 +108,7 @@ def _least_rise(x: float, y: float, estimate: Estimate) -> float:
     return (LEAST_RISE_FAR if far else LEAST_RISE) * lump.amplitude
 
 
-def _beside(x: float, y: float, rest: TactileMap, estimate: Estimate) -> bool:
+def _clear_of_lump(x: float, y: float, rest: TactileMap, estimate: Estimate) -> bool:
     """True for a place clear of the lump and of its scene's second structure."""
     lump = _lump(estimate)
     if lump is None:
@@ -178,10 +178,10 @@ def _stands_out(rise: Rise, rest: TactileMap) -> bool:
     return bool(max(levels) >= LEAST_STANDING * rise.amplitude)
 
 
-def _is_known(rise: Rise, rises: list[Rise], rest: TactileMap, estimate: Estimate) -> bool:
+def _already_named(rise: Rise, rises: list[Rise], rest: TactileMap, estimate: Estimate) -> bool:
     """True where a fit moved to another rise, or back to the measured lump."""
     again = any(np.hypot(rise.x_mm - one.x_mm, rise.y_mm - one.y_mm) < 2 * SMOOTHING_MM for one in rises)
-    return again or not _beside(rise.x_mm, rise.y_mm, rest, estimate)
+    return again or not _clear_of_lump(rise.x_mm, rise.y_mm, rest, estimate)
 
 
 # --- All masses of a map: each with its place, its probability and its size, or the reason for none.
@@ -211,12 +211,12 @@ def with_masses(tactile_map: TactileMap, first: Estimate, options: EstimateOptio
     its calibration and random numbers.
     """
     sized = [] if first.bump is None else [Mass(*_place(first), _probability(first), first)]
-    others = _others_options(options)
+    others = _options_of_others(options)
     rises = [*other_rises(tactile_map, first, options)]
     for rise in [*_second_lump_of_scene(tactile_map, first), *rises]:
         mass = _sized_at(tactile_map, rise, first, others, estimator)
         if mass is None and rise not in rises:
-            mass = Mass(rise.x_mm, rise.y_mm, rise.probability, _hidden(rise))
+            mass = Mass(rise.x_mm, rise.y_mm, rise.probability, _unresolved(rise))
         if mass is not None and all(_apart(mass, one) for one in sized):
             sized.append(mass)
     sized = by_evidence(sized)
@@ -273,7 +273,7 @@ def _amplitude(estimate: Estimate) -> float:
     return estimate.bump.amplitude
 
 
-def _others_options(options: EstimateOptions) -> EstimateOptions:
+def _options_of_others(options: EstimateOptions) -> EstimateOptions:
     """Options for the masses besides the first: what is known of a lump is of the first, and so is a checkpoint."""
     known = {name: value for name, value in options.size_priors.known.items() if name not in OF_A_LUMP}
     return replace(options, scene="auto", store=None, size_priors=replace(options.size_priors, known=known))
@@ -302,15 +302,15 @@ def _sized_at(
     None where neither shows a lump.
     """
     if not on_map(tactile_map, rise.x_mm, rise.y_mm):
-        return Mass(rise.x_mm, rise.y_mm, rise.probability, _beyond(rise))
+        return Mass(rise.x_mm, rise.y_mm, rise.probability, _off_map(rise))
     given = replace(options, fit=replace(options.fit, centre_mm=(rise.x_mm, rise.y_mm), start_width_mm=None))
     estimate = _estimated(tactile_map, given, estimator)
-    if first.map_posterior is not None and not _stays(estimate, rise, first):
+    if first.map_posterior is not None and not _same_lump(estimate, rise, first):
         less = _estimated(without(tactile_map, first.map_posterior), given, estimator)
-        estimate = less if less.size is None or _stands(less, first) else _in_the_flank(less)
+        estimate = less if less.size is None or _high_enough(less, first) else _in_the_flank(less)
     if estimate.code in (*NO_LUMP, "coarse"):
         return None
-    if _stays(estimate, rise, first):
+    if _same_lump(estimate, rise, first):
         return Mass(*_place(estimate), max(rise.probability, _probability(estimate)), estimate)
     return Mass(rise.x_mm, rise.y_mm, rise.probability, replace(_no_size(estimate), bump=_bump_of(rise)))
 
@@ -323,7 +323,7 @@ def _estimated(tactile_map: TactileMap, options: EstimateOptions, estimator: Est
         return Estimate("no_estimate", f"no method converged: {error}", code="method")
 
 
-def _stays(estimate: Estimate, rise: Rise, first: Estimate) -> bool:
+def _same_lump(estimate: Estimate, rise: Rise, first: Estimate) -> bool:
     """True where an estimate is of the lump at a rise, and did not move towards the first lump."""
     if estimate.map_posterior is None or first.bump is None:
         return estimate.map_posterior is not None
@@ -331,7 +331,7 @@ def _stays(estimate: Estimate, rise: Rise, first: Estimate) -> bool:
     return bool(moved < apart / 2.0)
 
 
-def _stands(estimate: Estimate, first: Estimate) -> bool:
+def _high_enough(estimate: Estimate, first: Estimate) -> bool:
     """True where the map less the first lump is high enough to be sized."""
     return _amplitude(estimate) >= LEAST_SHARE * _amplitude(first)
 
@@ -349,13 +349,13 @@ def _no_size(estimate: Estimate) -> Estimate:
     return Estimate("no_estimate", reason, detection=estimate.detection, code="unresolved", advice=BOTH, on_paper=BOTH)
 
 
-def _hidden(rise: Rise) -> Estimate:
+def _unresolved(rise: Rise) -> Estimate:
     """A second lump of a scene that is none without that scene."""
     reason = "the map shows it beside the first lump only, not by itself"
     return Estimate("no_estimate", reason, code="unresolved", advice=BOTH, on_paper=BOTH, bump=_bump_of(rise))
 
 
-def _beyond(rise: Rise) -> Estimate:
+def _off_map(rise: Rise) -> Estimate:
     """A rise at the rim whose fit has its centre off the map."""
     advice, reason = "extend the strokes beyond it", "its centre lies off the map"
     return Estimate("no_estimate", reason, code="window", advice=advice, on_paper=advice, bump=_bump_of(rise))

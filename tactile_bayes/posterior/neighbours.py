@@ -7,29 +7,21 @@ from collections.abc import Iterator
 import numpy as np
 
 from tactile_bayes.declarations import Record, replace
-from tactile_bayes.geometry import FloatArray
+from tactile_bayes.geometry import BoolArray, FloatArray
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.bump import SMOOTHING_MM, smoothed_excess
 from tactile_bayes.posterior.fit import FieldFit
 from tactile_bayes.posterior.marginal import BLOCK
-from tactile_bayes.posterior.scene import (
-    APART,
-    REACH_IN_RADII,
-    BoolArray,
-    Neighbour,
-    Problem,
-    Scene,
-    neighbour_templates,
-)
+from tactile_bayes.posterior.scene import APART, REACH_IN_RADII, Neighbour, Problem, Scene, neighbour_templates
 from tactile_bayes.posterior.selection import (
     ASKING,
     LEAST_ODDS,
     SceneChoice,
     Structure,
-    asked_again,
     change_in_sd,
     fit_or_none,
     odds,
+    retested,
 )
 from tactile_bayes.presets import SceneAsked
 
@@ -155,7 +147,7 @@ def add_beside(
     if scene not in ASKING:
         return choice
     fit, beside = _beside_questions(choice.plain.target.problem, choice.plain, surroundings, ridges, scene)
-    chosen = choice if fit is choice.plain else asked_again(choice, fit)
+    chosen = choice if fit is choice.plain else retested(choice, fit)
     return replace(chosen, structures=(*chosen.structures, *beside))
 
 

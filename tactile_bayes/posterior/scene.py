@@ -8,7 +8,7 @@ from typing import Final, Literal, assert_never
 import numpy as np
 
 from tactile_bayes.declarations import Record, replace
-from tactile_bayes.geometry import FloatArray
+from tactile_bayes.geometry import BoolArray, FloatArray
 from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior.field import Profiles, Window
 from tactile_bayes.posterior.white import WIDEST_IN_RADII
@@ -40,7 +40,6 @@ class Problem(Record, eq=False):
 #
 # Or a ridge in the bump's place: what a lump's evidence is held against where a ridge is to be feared.
 
-BoolArray = np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
 Shape = Literal["round", "ellipse", "rotated", "ridge"]
 Neighbour = Literal["second lump", "rib"]
 Extra = Literal[Neighbour, ""]

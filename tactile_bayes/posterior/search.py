@@ -15,7 +15,7 @@ from tactile_bayes.posterior.abstention import shape_fault
 from tactile_bayes.posterior.bump import levelled, window_cells
 from tactile_bayes.posterior.correlated import Correlated
 from tactile_bayes.posterior.detection import Detection
-from tactile_bayes.posterior.draw import ModalBump, Progress
+from tactile_bayes.posterior.draw import ModalBump
 from tactile_bayes.posterior.lump_probability import NO_EVIDENCE, Weighed, weigh_candidate
 from tactile_bayes.posterior.options import DETECTED, EstimateOptions, FitOptions
 from tactile_bayes.posterior.selection import SceneChoice
@@ -30,6 +30,7 @@ from tactile_bayes.posterior.white import (
     fitted_candidates,
 )
 from tactile_bayes.presets import INTERVAL
+from tactile_bayes.progress import Progress
 from tactile_bayes.size.draws import EXTREMES, SizePosterior
 from tactile_bayes.size.pooling import Calibration, draw_sizes
 
@@ -78,13 +79,13 @@ MOST_REFINEMENTS, SAFETY, LEAST_ACCURACY_SD = 3, 0.8, 1e-3
 
 
 class SizedDraws(Record, eq=False):
-    """Draws of one map with its size by `calibration`; `fault` and `too_far` say why there is none."""
+    """Draws of one map with its size by `calibration`; `fault` and `extrapolation_faults` say why there is none."""
 
     made: MapDraws
     size: SizePosterior | None
     fault: Abstention | None
     calibration: Calibration | None
-    too_far: tuple[str, ...] = ()
+    extrapolation_faults: tuple[str, ...] = ()
 
 
 def draw_until_accurate(
@@ -144,8 +145,8 @@ def draw_with_size(
     )
     if calibration is None:
         return SizedDraws(made, None, fault, None)
-    calibration = calibration.fitting(*posterior.medians)
-    far = tuple(calibration.too_far(*posterior.medians))
+    calibration = calibration.at_depth_or_fallback(*posterior.medians)
+    far = tuple(calibration.extrapolation_faults(*posterior.medians))
     if fault or far:
         return SizedDraws(made, None, fault, calibration, far)
     bump = posterior.bump(made.draws.replicates)

@@ -196,7 +196,7 @@ def _shape_asked(scene: SceneAsked) -> Shape:
     assert_never(scene)
 
 
-def asked_again(choice: SceneChoice, fit: FieldFit) -> SceneChoice:
+def retested(choice: SceneChoice, fit: FieldFit) -> SceneChoice:
     """Copy the choice with another fit, and repeat the tests for an ellipse and a slope.
 
     The flank of what lies beside a bump looks like a slope to a model without it.
@@ -217,7 +217,7 @@ def fit_or_none(problem: Problem, scene: Scene, start: FloatArray) -> FieldFit |
         return None
 
 
-def near(fit: FieldFit, scene: Scene) -> Mixture | None:
+def newton_step_to(fit: FieldFit, scene: Scene) -> Mixture | None:
     """Gaussians of another scene by one Newton step from a fit's mode; None where they are not close together."""
     target = fit.target.of_scene(scene)
     start = fit.scene.carried(fit.mode, scene)
@@ -250,7 +250,7 @@ def _ellipse_question(fit: FieldFit) -> Structure:
 def _rotation_question(problem: Problem, straight: FieldFit, start: FloatArray) -> tuple[FieldFit, Structure]:
     """Test a rotated ellipse against a straight one: by one Newton step, or by its mode where that is not clear."""
     scene = replace(straight.scene, shape="rotated")
-    mixture = near(straight, scene)
+    mixture = newton_step_to(straight, scene)
     axis = np.eye(5)[4]
     log_odds = np.inf if mixture is None else savage_dickey(mixture, axis, prior_sd=problem.prior.log_ratio_sd)
     turned = None
@@ -272,7 +272,7 @@ def _rotation_question(problem: Problem, straight: FieldFit, start: FloatArray) 
 
 def _tilt_question(fit: FieldFit) -> Structure:
     log_odds = fit.target.tilt_log_odds(fit.mode)
-    level_only = near(fit, replace(fit.scene, tilt=False))
+    level_only = newton_step_to(fit, replace(fit.scene, tilt=False))
     x, y = (None, None) if level_only is None else change_in_sd(fit, level_only.moments()[0])
     return Structure("tilt", odds(log_odds), bool(log_odds > np.log(LEAST_ODDS)), True, False, x, y)
 

@@ -41,9 +41,10 @@ from tactile_bayes.posterior.detection import (
     independent_errors,
     level_offset,
 )
-from tactile_bayes.posterior.draw import MapPosterior, ModalBump, NoiseFigures, Progress, Sampled, draw_parameters
+from tactile_bayes.posterior.draw import MapPosterior, ModalBump, NoiseFigures, Sampled, draw_parameters
 from tactile_bayes.posterior.options import ROTATION_ODDS, EstimateOptions, FitOptions
 from tactile_bayes.presets import Background, Method, Noise
+from tactile_bayes.progress import Progress
 
 # --- Log posterior density of a least-squares model, with the noise scale integrated out.
 

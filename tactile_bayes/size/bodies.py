@@ -43,10 +43,10 @@ from tactile_bayes.size.terms import (
     SiteShift,
     beyond_lumps,
     check_shapes,
+    extrapolation_faults,
     monomials,
     outside_domain,
     powers,
-    too_far,
     unknown_fat,
     unlike_bodies,
 )
@@ -159,25 +159,27 @@ class BodyCalibration(BodyLaw, eq=False, kw_only=True):
             return self._at_any_depth("the map has no pressure profile of the head")
         fat_mm, why_not = self.depth.of_mass(profiles)
         if fat_mm is None:
-            return self._at_any_depth(why_not).for_another_kind()
+            return self._at_any_depth(why_not).widened_for_atypical_body()
         return replace(self, fat_mm=fat_mm)
 
-    def fitting(self, amplitude: float, sigma_x_mm: float, sigma_y_mm: float | None = None) -> BodyCalibration:
+    def at_depth_or_fallback(
+        self, amplitude: float, sigma_x_mm: float, sigma_y_mm: float | None = None
+    ) -> BodyCalibration:
         """This calibration, or the one for any depth where no body of the table looks like the map at this depth."""
         sigma_mm = mean_width_mm(sigma_x_mm, sigma_y_mm)
         if self.fat_mm is None or self.leverage(amplitude, sigma_mm) <= MOST_LEVERAGE:
             return self
         what = f"amplitude {amplitude:.3g} with sigma {sigma_mm:.3g} mm over {self.fat_mm:.3g} mm of fat"
-        return self._at_any_depth(f"{what} {UNLIKE}").for_another_kind()
+        return self._at_any_depth(f"{what} {UNLIKE}").widened_for_atypical_body()
 
     def for_maps(self, maps: Sequence[ShapeDraws]) -> BodyCalibration:
         """The calibration at the depth of fat that the maps of a mass tell, if all of them go with that depth."""
         calibration = self.at_fat([one.profile for one in maps])
         for one in maps:
-            calibration = calibration.fitting(*one.middle)
+            calibration = calibration.at_depth_or_fallback(*one.middle)
         return calibration
 
-    def for_another_kind(self) -> BodyCalibration:
+    def widened_for_atypical_body(self) -> BodyCalibration:
         """This calibration with room for a body unlike any of the table's: intervals without it held 38 of 48."""
         return self.with_other_sd(float(np.hypot(self.other_sd, UNLIKE_SD)))
 
@@ -199,11 +201,6 @@ class BodyCalibration(BodyLaw, eq=False, kw_only=True):
     def unknowns(self) -> dict[str, float]:
         """Share of the variance between bodies that knowing each property alone would take away."""
         return {} if self.hidden is None else {name: self.hidden.share(name) for name in self.hidden.names}
-
-    @property
-    def form_name(self) -> str:
-        """The form, for people."""
-        return "Eq 6" if self.residual is None else "Eq 6 and its residual"
 
     def constants(self, sigma_mm: float | None = None, *, fat_mm: float | None = None) -> dict[str, float]:
         """m, b in mm, e and f of Eq 6 as it is printed, at the mean of the posterior.
@@ -295,10 +292,12 @@ class BodyCalibration(BodyLaw, eq=False, kw_only=True):
         texts = texts or self._unlike(amplitude, sigma_mm, MOST_LEVERAGE)
         return [*texts, f"{self.fat_note}, so that depth is not used"] if self.fat_note.endswith(UNLIKE) else texts
 
-    def too_far(self, amplitude: float, sigma_x_mm: float, sigma_y_mm: float | None = None) -> list[str]:
+    def extrapolation_faults(self, amplitude: float, sigma_x_mm: float, sigma_y_mm: float | None = None) -> list[str]:
         """In what a map lies so far outside the table that there is no size, in words."""
         sigma_mm = mean_width_mm(sigma_x_mm, sigma_y_mm)
-        return too_far(self.domain, amplitude, sigma_mm) or self._unlike(amplitude, sigma_mm, FARTHEST_LEVERAGE)
+        return extrapolation_faults(self.domain, amplitude, sigma_mm) or self._unlike(
+            amplitude, sigma_mm, FARTHEST_LEVERAGE
+        )
 
     def beyond_lumps(self, largest_mm: float) -> list[str]:
         """In what a size lies beyond the table's lumps, in words; empty when it lies within."""

@@ -16,7 +16,7 @@ From a study or phantoms it is learned for each axis of the head, as draws of it
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated, Final, Literal
 
 import numpy as np
@@ -37,8 +37,8 @@ from tactile_bayes.size.terms import (
     Share,
     beyond_lumps,
     check_shapes,
+    extrapolation_faults,
     outside_domain,
-    too_far,
 )
 
 MU, F, B = range(3)
@@ -179,23 +179,24 @@ class SizeCalibration(Record, eq=False):
         del profiles
         return self
 
-    def fitting(self, amplitude: float, sigma_x_mm: float, sigma_y_mm: float) -> SizeCalibration:
+    def at_depth_or_fallback(self, amplitude: float, sigma_x_mm: float, sigma_y_mm: float) -> SizeCalibration:
         """Return the calibration unchanged: it is the same for all maps."""
         del amplitude, sigma_x_mm, sigma_y_mm
         return self
 
     def outside(self, amplitude: float, sigma_x_mm: float, sigma_y_mm: float) -> list[str]:
         """In what a map lies or may lie outside the tables of the two axes, in words; empty when it lies inside."""
-        x, y = (
-            outside_domain(self.x.domain, amplitude, sigma_x_mm),
-            outside_domain(self.y.domain, amplitude, sigma_y_mm),
-        )
-        return [*self.cautions, *(f"x: {text}" for text in x), *(f"y: {text}" for text in y)]
+        return [*self.cautions, *self._by_axes(outside_domain, amplitude, sigma_x_mm, sigma_y_mm)]
 
-    def too_far(self, amplitude: float, sigma_x_mm: float, sigma_y_mm: float) -> list[str]:
+    def extrapolation_faults(self, amplitude: float, sigma_x_mm: float, sigma_y_mm: float) -> list[str]:
         """Quantities of a map so far outside the tables that no size is given, in words."""
-        x, y = too_far(self.x.domain, amplitude, sigma_x_mm), too_far(self.y.domain, amplitude, sigma_y_mm)
-        return [*(f"x: {text}" for text in x), *(f"y: {text}" for text in y)]
+        return self._by_axes(extrapolation_faults, amplitude, sigma_x_mm, sigma_y_mm)
+
+    def _by_axes(
+        self, faults: Callable[[Domain, float, float], list[str]], amplitude: float, x_mm: float, y_mm: float
+    ) -> list[str]:
+        axes = (("x", self.x.domain, x_mm), ("y", self.y.domain, y_mm))
+        return [f"{name}: {text}" for name, domain, width in axes for text in faults(domain, amplitude, width)]
 
     def beyond_lumps(self, largest_mm: float) -> list[str]:
         """In what a size lies beyond the tables' lumps, in words; empty when it lies within."""

@@ -12,7 +12,7 @@ from tactile_bayes.declarations import Record, field, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.draws import Labels
-from tactile_bayes.inference.points import evened, normal_quantile, paired_points
+from tactile_bayes.inference.points import normal_quantile, paired_points, stratified_quantiles
 from tactile_bayes.size.bodies import BodyCalibration, known_body, suppositions
 from tactile_bayes.size.draws import (
     OVAL_SD,
@@ -277,10 +277,10 @@ class _Pool(Record, eq=False, dict=True):
     def _evened(self, mean: FloatArray, sd: FloatArray, longer: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Logs of both sizes, smoothed separately for round and oval draws, so that a round lump's sizes stay equal."""
         z = normal_quantile(self.points[:, 0])
-        largest = evened(mean + sd * z, mean, sd, 2 * self.replicates + (longer > 0))
+        largest = stratified_quantiles(mean + sd * z, mean, sd, 2 * self.replicates + (longer > 0))
         smallest, o = largest.copy(), longer > 0
         shorter = 2.0 * longer[o]
-        smallest[o] = evened(largest[o] - shorter, mean[o] - shorter, sd[o], self.replicates[o])
+        smallest[o] = stratified_quantiles(largest[o] - shorter, mean[o] - shorter, sd[o], self.replicates[o])
         return largest, smallest
 
 
@@ -330,7 +330,7 @@ def pool_maps(
     depth, at_depth = calibration.depth, calibration.for_maps(used)
     fat_apart_mm = None if depth is None else depth.apart([one.profile for one in used])
     named = sorted(zip(places, [one.middle for one in used], strict=True))
-    far = [f"map {i + 1}: {text}" for i, middle in named for text in at_depth.too_far(*middle)]
+    far = [f"map {i + 1}: {text}" for i, middle in named for text in at_depth.extrapolation_faults(*middle)]
     if far:
         return PooledEstimate("no_estimate", extrapolated(far).reason)
     sizes = log_sizes(at_depth, used)

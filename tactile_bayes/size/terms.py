@@ -259,7 +259,7 @@ def outside_domain(domain: Domain, amplitude: float, sigma_mm: float) -> list[st
     return _beyond(domain, amplitude, sigma_mm, factors=dict.fromkeys(FARTHEST, 1.0))
 
 
-def too_far(domain: Domain, amplitude: float, sigma_mm: float) -> list[str]:
+def extrapolation_faults(domain: Domain, amplitude: float, sigma_mm: float) -> list[str]:
     """Quantities so far outside that no size is given, in words."""
     return _beyond(domain, amplitude, sigma_mm, factors=FARTHEST)
 

@@ -27,7 +27,7 @@ from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.findings import Finding
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.draws import Labels, Quantity, summarise
-from tactile_bayes.inference.points import evened, normal_cdf, normal_quantile, paired_points
+from tactile_bayes.inference.points import normal_cdf, normal_quantile, paired_points, stratified_quantiles
 from tactile_bayes.presets import REGISTRATION_MM
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.draws import ShapeDraws, log_normal, matched_draws
@@ -277,7 +277,7 @@ class JointSizes(Record, eq=False):
         c = self.covariance
         sd = np.sqrt(np.maximum(c[:, later, later] + c[:, earlier, earlier] - 2.0 * c[:, later, earlier], 1e-18))
         mean = self.mean[later] - self.mean[earlier]
-        drawn = evened(self.log_size[later] - self.log_size[earlier], mean, sd, self.replicates)
+        drawn = stratified_quantiles(self.log_size[later] - self.log_size[earlier], mean, sd, self.replicates)
         return Change(drawn, mean, sd, self.replicates)
 
     def size_mm(self, visit: int, probability: float) -> Quantity:
@@ -434,7 +434,7 @@ def _drawn(mean: FloatArray, covariance: FloatArray, z: FloatArray, replicates: 
     root[finite] = np.linalg.cholesky(covariance[finite] + 1e-12 * np.eye(v))
     raw = mean + np.einsum("nvw,nw->vn", root, z)
     sd = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)).T
-    return np.stack([evened(raw[i], mean[i], sd[i], replicates) for i in range(v)])
+    return np.stack([stratified_quantiles(raw[i], mean[i], sd[i], replicates) for i in range(v)])
 
 
 class Trend(Record):

@@ -44,18 +44,18 @@ def test_a_depth_that_no_body_goes_with_is_not_used(shipped: BodyCalibration) ->
     told = shipped.at_fat([EVEN])
     assert told.fat_mm is not None
     assert np.exp(log_size(told, *BUMP)) < 14  # by the cubic of before 6 mm, with an interval of 3.3 to 11.2 mm
-    used = told.fitting(*BUMP)
+    used = told.at_depth_or_fallback(*BUMP)
     assert used.fat_mm is None
     assert np.exp(log_size(used, *BUMP)) == pytest.approx(15.0, rel=0.1)
     (words,) = used.outside(*BUMP)
     assert "mm of fat is unlike the bodies of the table, so that depth is not used" in words
-    assert used.too_far(*BUMP) == []
+    assert used.extrapolation_faults(*BUMP) == []
 
 
 def test_a_depth_that_goes_with_the_map_stays(shipped: BodyCalibration) -> None:
     told = shipped.at_fat([(-0.024, -0.002, 0.0)])
     assert told.fat_mm is not None
-    assert told.fitting(0.323, 5.1) is told
+    assert told.at_depth_or_fallback(0.323, 5.1) is told
     assert told.outside(0.323, 5.1) == []
 
 
@@ -65,7 +65,7 @@ def test_a_depth_that_goes_with_the_map_stays(shipped: BodyCalibration) -> None:
      (0.7, 15.0, "sigma 15 mm", ""), (0.7, 18.0, "sigma 18 mm", "sigma 18 mm"), (0.01, 5.0, "0.01", "0.01")],
 )  # fmt: skip
 def test_how_far_decides(shipped: BodyCalibration, amplitude: float, sigma_mm: float, outside: str, far: str) -> None:
-    found = shipped.outside(amplitude, sigma_mm), shipped.too_far(amplitude, sigma_mm)
+    found = shipped.outside(amplitude, sigma_mm), shipped.extrapolation_faults(amplitude, sigma_mm)
     for texts, words in zip(found, (outside, far), strict=True):
         assert words in "; ".join(texts)
         assert bool(texts) == bool(words)

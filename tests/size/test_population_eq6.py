@@ -179,9 +179,9 @@ def test_a_profile_unlike_the_tables_leaves_room_for_another_kind_of_body(learne
 
 def test_a_map_unlike_the_tables_at_its_depth_is_sized_at_any_depth(learned) -> None:
     at = learned.at_fat([profile(0.0)])
-    far = at.fitting(np.exp(8.0), np.exp(4.0))
+    far = at.at_depth_or_fallback(np.exp(8.0), np.exp(4.0))
     assert (far.fat_mm, far.other_sd) == (None, UNLIKE_SD)
-    assert at.fitting(np.exp(-1.0), np.exp(1.5)) is at
+    assert at.at_depth_or_fallback(np.exp(-1.0), np.exp(1.5)) is at
 
 
 def test_maps_of_a_mass_share_their_depth_of_fat(learned) -> None:

@@ -17,7 +17,7 @@ from test_pooling import BODY_SD, calibration, shape
 from tactile_bayes.declarations import replace
 from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.inference.draws import ParameterDraws, Quantity, even_replicates, summarise
-from tactile_bayes.inference.points import evened, normal_cdf, paired_points
+from tactile_bayes.inference.points import normal_cdf, paired_points, stratified_quantiles
 from tactile_bayes.posterior import search as drawn
 from tactile_bayes.posterior.options import EstimateOptions
 from tactile_bayes.posterior.white import MapDraws
@@ -128,12 +128,14 @@ def test_evened_draws_have_the_quantiles_of_their_mixture() -> None:
     rng = np.random.default_rng(5)
     n = 8192
     mean, sd = 0.3 * rng.standard_normal(n), np.exp(0.6 * rng.standard_normal(n))
-    found = evened(mean + sd * rng.standard_normal(n), mean, sd, even_replicates(n))
+    found = stratified_quantiles(mean + sd * rng.standard_normal(n), mean, sd, even_replicates(n))
     for p in (0.025, 0.25, 0.5, 0.975):
         x = float(np.quantile(found, p))
         assert ndtr((x - mean) / sd).mean() == pytest.approx(p, abs=6e-4)
-    assert np.isnan(evened(np.full(3, np.nan), np.full(3, np.nan), np.ones(3), np.zeros(3, dtype=int))).all()
-    assert evened(np.zeros(0), np.zeros(0), np.zeros(0), np.zeros(0, dtype=int)).size == 0
+    assert np.isnan(
+        stratified_quantiles(np.full(3, np.nan), np.full(3, np.nan), np.ones(3), np.zeros(3, dtype=int))
+    ).all()
+    assert stratified_quantiles(np.zeros(0), np.zeros(0), np.zeros(0), np.zeros(0, dtype=int)).size == 0
 
 
 def test_the_normal_distribution_function_is_the_librarys() -> None:

@@ -3,23 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.special import ndtri, stdtrit
 
 from tactile_bayes.declarations import Record, field, replace
 from tactile_bayes.errors import BadDataError, NotConvergedError
-from tactile_bayes.geometry import FloatArray
+from tactile_bayes.geometry import BoolArray, FloatArray, IndexArray
 from tactile_bayes.inference.modes import mode_and_covariance
 from tactile_bayes.presets import LEAST_HARD_RATIO
+from tactile_bayes.progress import Progress
 from tactile_bayes.size.eq6 import AxisCalibration, LeftOutErrors, SizeCalibration
 from tactile_bayes.size.learn.regression import ranges_of, rows_of
 from tactile_bayes.size.terms import Recipe, monomials, powers
-
-if TYPE_CHECKING:
-    from tactile_bayes.inference.ensemble import Progress
-
 
 # --- Bayesian regression of Eq 6 from a table of known lumps: m, b, e, f and the residual scatter, jointly.
 #
@@ -315,10 +311,7 @@ def _stretch(draws: FloatArray, *, diameters: int) -> None:
     draws[:, 2] = np.exp(draws[:, 2])
 
 
-_Mask = np.ndarray[tuple[int], np.dtype[np.bool_]]
-
-
-def _stages(data: AxisRows) -> tuple[_Mask, _Mask]:
+def _stages(data: AxisRows) -> tuple[BoolArray, BoolArray]:
     """Rows of either stage."""
     if data.depth_ratio is None or data.width_change is None:
         raise BadDataError("the table has no depth_ratio, and the two-stage fit needs it", way_out=_WAY_OUT)
@@ -389,8 +382,7 @@ LEAST_GEOMETRIES = 8
 
 FitAxis = Callable[[AxisRows], AxisCalibration]
 """Eq 6 from the rows of one axis: `axis_at_mode` or `axis_in_two_stages`."""
-_Rows = np.ndarray[tuple[int], np.dtype[np.bool_]]
-_Predict = Callable[[_Rows], FloatArray]
+_Predict = Callable[[BoolArray], FloatArray]
 
 
 def left_out_of_study(
@@ -430,14 +422,14 @@ def left_out_of_study(
     return LeftOutErrors(len(geometry), int(geometry.max()) + 1, least, errors(eq6), errors(quadratic))
 
 
-def geometry_numbers(d_mm: FloatArray, cases: StudyCases) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
+def geometry_numbers(d_mm: FloatArray, cases: StudyCases) -> IndexArray:
     """(n,) index of each row's geometry: one seat, diameter and h/d."""
     names = list(zip(cases.seat, d_mm.tolist(), cases.depth_ratio.tolist(), strict=True))
     number = {name: i for i, name in enumerate(dict.fromkeys(names))}
     return np.array([number[name] for name in names], dtype=np.intp)
 
 
-def _left_out(geometry: np.ndarray[tuple[int], np.dtype[np.intp]], predict: _Predict) -> FloatArray:
+def _left_out(geometry: IndexArray, predict: _Predict) -> FloatArray:
     """(n,) sizes in mm, each predicted from the other geometries."""
     sizes = np.empty(len(geometry))
     for number in range(int(geometry.max()) + 1):
@@ -451,7 +443,7 @@ def _eq6(table: SizeTable, sigma_mm: FloatArray, fit: FitAxis) -> _Predict:
     assert cases is not None
     lump = cases.lumps(table.d_mm)
 
-    def predict(kept: _Rows) -> FloatArray:
+    def predict(kept: BoolArray) -> FloatArray:
         group = [key for key, is_kept in zip(lump, kept, strict=True) if is_kept]
         change = width_changes(sigma_mm[kept], depth_ratio=cases.depth_ratio[kept], group=group)
         try:
@@ -470,7 +462,7 @@ def _quadratic(table: SizeTable, sigma_mm: FloatArray) -> _Predict:
     u, v = np.log(table.amplitude), np.log(sigma_mm)
     terms = monomials((u - u.mean(), v - v.mean()), powers(2))
 
-    def predict(kept: _Rows) -> FloatArray:
+    def predict(kept: BoolArray) -> FloatArray:
         coefficients = np.linalg.lstsq(terms[kept], np.log(table.d_mm[kept]), rcond=None)[0]
         return np.asarray(np.exp(terms @ coefficients))
 

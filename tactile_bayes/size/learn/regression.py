@@ -11,7 +11,7 @@ from scipy.optimize import minimize
 
 from tactile_bayes.declarations import Record, field, replace
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.geometry import FloatArray
+from tactile_bayes.geometry import BoolArray, FloatArray, IndexArray
 from tactile_bayes.inference.modes import mode_and_covariance
 from tactile_bayes.size.fat import Kernel, Residual
 from tactile_bayes.size.terms import INVERTED, HiddenTerms, RoundLumps
@@ -61,12 +61,12 @@ class PopulationTable(Record, eq=False):
     def __len__(self) -> int:
         return len(self.d_mm)
 
-    def rows(self, keep: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> PopulationTable:
+    def rows(self, keep: BoolArray) -> PopulationTable:
         """Copy with the rows where `keep` is true."""
         return rows_of(self, keep)
 
 
-def rows_of(columns: T, keep: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> T:
+def rows_of(columns: T, keep: BoolArray) -> T:
     """A copy of a table, whose fields are columns or tables or None, with the rows where `keep` is true."""
     if columns is None:
         return columns
@@ -101,7 +101,7 @@ class BodyRegression(Record, eq=False):
     """(n,) that ln d has beside the terms."""
     map_variance: FloatArray
     """(n,) of the predicted ln d by the map's own posterior."""
-    group: np.ndarray[tuple[int], np.dtype[np.intp]]
+    group: IndexArray
     """(n,) number of the body."""
     exams: FloatArray
     mean_terms: FloatArray

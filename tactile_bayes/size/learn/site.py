@@ -332,7 +332,9 @@ def learn_repeatability(repeats: Sequence[RepeatedExams], *, fewest: int = FEWES
     masses = sorted({one.mass for one in repeats})
     if len(masses) < fewest:
         what = f"{len(masses)} {'mass has' if len(masses) == 1 else 'masses have'} repeated exams with sizes"
-        raise BadDataError(what, way_out=f"give at least {fewest}: {_WHY}")
+        raise BadDataError(
+            what, way_out=f"give at least {fewest}: one or two masses do not tell an unusual mass from a site's spread"
+        )
     by_exams = np.stack([restricted_log_likelihood(one.centre, one.noise, GRID) for one in repeats])
     density = _density(by_exams.sum(axis=0))
     by_chance = []
@@ -344,9 +346,6 @@ def learn_repeatability(repeats: Sequence[RepeatedExams], *, fewest: int = FEWES
     outlying = tuple(one.name for one, chance in zip(repeats, by_chance, strict=True) if chance < limit)
     maps = sum(len(one.centre) for one in repeats)
     return LearnedSpread(density, tuple(by_chance), _summary(density, len(masses), maps, outlying))
-
-
-_WHY: Final = "one or two masses do not tell an unusual mass from a site's spread"
 
 
 def _density(log_likelihood: FloatArray) -> FloatArray:

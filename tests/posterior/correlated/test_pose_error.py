@@ -215,7 +215,7 @@ def test_the_report_says_what_they_make_of_the_widths_or_that_they_are_left_out(
     untold = {name: value for name, value in tactile_map.quality.items() if name not in POSE_NOISE}
     without = replace(tactile_map, quality=untold)
     text = estimate_text(estimated(without), without, probability=0.95)
-    assert "Left out: errors of the frames' places and their blur" in text
+    assert "Left out: tracker position error and its blur" in text
     assert "variance of the widths" not in text
 
 

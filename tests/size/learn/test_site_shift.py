@@ -317,6 +317,6 @@ def test_a_correction_is_kept_by_every_copy_that_a_calibration_makes_of_itself()
         at = replace(use, site=site).at_fat([profile])
         assert at.fat_mm is not None
         assert at.site is site
-        assert at.fitting(1e4, 100.0).site is site
+        assert at.at_depth_or_fallback(1e4, 100.0).site is site
         silent = replace(use, site=replace(site, uses_fat=False)).at_fat([profile])
         assert silent.fat_mm is None
