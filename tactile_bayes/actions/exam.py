@@ -276,7 +276,7 @@ def _figures(found: PosteriorDraws) -> dict[str, dict[str, Any]]:
     shown = {name: found.draws[name] for name in _QUANTITIES if name in found.draws}
     figures: dict[str, dict[str, Any]] = {name: {"median": float(np.nanmedian(d))} for name, d in shown.items()}
     if all(len(draws) > 1 for draws in shown.values()):
-        from tactile_bayes.inference.arviz_data import convergence
+        from tactile_bayes.inference.ensemble import convergence
 
         for name, draws in shown.items():
             figures[name] |= convergence(draws)

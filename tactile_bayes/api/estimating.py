@@ -19,11 +19,11 @@ from tactile_bayes.files.size_json import SHIPPED, default_for, read_size_calibr
 from tactile_bayes.findings import Finding, by_weight, findings_in
 from tactile_bayes.mapping.map import many_cells
 from tactile_bayes.options import PRIORS
-from tactile_bayes.posterior.arviz_groups import inference_groups
 from tactile_bayes.posterior.estimate import OTHER_HEAD, calibration_for, estimate_map, recipe_differences
 from tactile_bayes.posterior.lump_probability import smallest_lumps
 from tactile_bayes.posterior.masses import with_masses
 from tactile_bayes.posterior.options import EstimateOptions, FitOptions
+from tactile_bayes.posterior.result import inference_groups
 from tactile_bayes.posterior.white import default_errors
 from tactile_bayes.presets import FIT_RADIUS_MM
 from tactile_bayes.progress import Progress
@@ -46,9 +46,8 @@ from tactile_bayes.size.pooling import SizePriors
 if TYPE_CHECKING:
     from tactile_bayes.files.provenance import Provenance
     from tactile_bayes.mapping.map import TactileMap
-    from tactile_bayes.posterior.arviz_groups import DrawGroup
     from tactile_bayes.posterior.options import EstimateOptions, FitOptions
-    from tactile_bayes.posterior.result import Estimate
+    from tactile_bayes.posterior.result import DrawGroup, Estimate
     from tactile_bayes.scan import HeadShape
     from tactile_bayes.size.draws import ShapeDraws
     from tactile_bayes.size.pooling import Calibration, SizePriors

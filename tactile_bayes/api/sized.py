@@ -189,7 +189,7 @@ class Sized:
         UsageError
             Without an estimate: there are no draws.
         """
-        from tactile_bayes.inference.arviz_data import inference_data
+        from tactile_bayes.inference.ensemble import inference_data
 
         columns = self._columns()
         if not columns:

@@ -21,8 +21,7 @@ from tactile_bayes.files.reading import CELLS, check_limit
 from tactile_bayes.findings import Finding, findings_in
 from tactile_bayes.geometry import FloatArray, check_rigid
 from tactile_bayes.mapping.map import MapRecipe, TactileMap
-from tactile_bayes.posterior.arviz_groups import DrawGroup
-from tactile_bayes.posterior.result import Estimate
+from tactile_bayes.posterior.result import DrawGroup, Estimate
 from tactile_bayes.presets import NORMALISE, RESEARCH_USE
 from tactile_bayes.scan import HeadShape
 from tactile_bayes.size.draws import SizePosterior

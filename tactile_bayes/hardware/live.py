@@ -21,7 +21,7 @@ from tactile_bayes.geometry import FloatArray, apply, patient_from_plane
 from tactile_bayes.hardware.ports import PIPE_BYTES
 from tactile_bayes.hardware.readings import CountArray, PoseReading
 from tactile_bayes.hardware.recorder import Report
-from tactile_bayes.mapping.growing import Instrument, MapAccumulator, MapGrid
+from tactile_bayes.mapping.accumulate import Instrument, MapAccumulator, MapGrid
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.mapping.plane import poses_at
 from tactile_bayes.presets import PRESSURE_WINDOW_KPA

@@ -6,8 +6,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from tactile_bayes.mapping.accumulate import Instrument, MapAccumulator, MapGrid
     from tactile_bayes.mapping.build import build_map
-    from tactile_bayes.mapping.growing import Instrument, MapAccumulator, MapGrid
     from tactile_bayes.mapping.map import MapRecipe, TactileMap
 
 __all__ = ["Instrument", "MapAccumulator", "MapGrid", "MapRecipe", "TactileMap", "build_map"]

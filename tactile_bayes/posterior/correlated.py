@@ -15,7 +15,7 @@ from tactile_bayes.posterior.abstention import rim_fault
 from tactile_bayes.posterior.bump import PoseNoise, overlap, trusted
 from tactile_bayes.posterior.detection import Detection, detection_from_odds
 from tactile_bayes.posterior.draw import MapPosterior, ModalBump, NoiseFigures, draw_parameters
-from tactile_bayes.posterior.field import Window, cosines_for
+from tactile_bayes.posterior.field import FLOOR, Window, cosines_for
 from tactile_bayes.posterior.fit import (
     FieldFit,
     field_window,
@@ -24,7 +24,6 @@ from tactile_bayes.posterior.fit import (
     start_vector,
     tangent_columns,
 )
-from tactile_bayes.posterior.linear import FLOOR
 from tactile_bayes.posterior.neighbours import WANTED, Surroundings, add_beside, ridge_instead, ridge_text, rising_ribs
 from tactile_bayes.posterior.options import DETECTED, EstimateOptions, scene_asked
 from tactile_bayes.posterior.scene import Problem, Scene

@@ -286,7 +286,7 @@ def _findings(sized: SizedDraws, *, cell_mm: float) -> Iterator[Finding]:
 
 def _convergence(made: MapDraws, size: SizePosterior | None) -> dict[str, dict[str, float]]:
     """How far the chains of each size and width agree."""
-    from tactile_bayes.inference.arviz_data import convergence
+    from tactile_bayes.inference.ensemble import convergence
 
     sizes = () if size is None else ("max_size_mm", "min_size_mm", "d_x_mm", "d_y_mm")
     figures = {name: convergence(getattr(size, name)) for name in sizes}

@@ -22,8 +22,21 @@ import numpy as np
 from tactile_bayes.geometry import FloatArray, IndexArray
 from tactile_bayes.inference.draws import Solution, Solved, distinct_rows
 from tactile_bayes.posterior.bump import FitCells
-from tactile_bayes.posterior.field import LENGTHS_MM, SHARES, Profiles, Projected, Whitening, no_field
-from tactile_bayes.posterior.linear import LEAST_BUMPS, FieldColumns, Inner, LinearSolution, Spanned, joined, solve
+from tactile_bayes.posterior.field import (
+    LEAST_BUMPS,
+    LENGTHS_MM,
+    SHARES,
+    FieldColumns,
+    Inner,
+    LinearSolution,
+    Profiles,
+    Projected,
+    Spanned,
+    Whitening,
+    joined,
+    no_field,
+    solve,
+)
 from tactile_bayes.posterior.scene import Problem, Scene
 
 BLOCK = 128

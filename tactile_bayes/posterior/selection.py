@@ -14,9 +14,8 @@ from tactile_bayes.declarations import Record, field, replace
 from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.forward.gaussian import covariance_from_log_widths
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.posterior.field import Profiles
+from tactile_bayes.posterior.field import FLOOR, FieldColumns, Profiles
 from tactile_bayes.posterior.fit import FieldFit, Mixture, fit_scene, newton_mixture, tangent_columns
-from tactile_bayes.posterior.linear import FLOOR, FieldColumns
 from tactile_bayes.posterior.marginal import CollapsedTarget, linear_columns
 from tactile_bayes.posterior.options import ROTATION_ODDS
 from tactile_bayes.posterior.scene import Problem, Scene, Shape

@@ -15,7 +15,7 @@ from tactile_bayes.findings import Finding
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.mapping.places import PATIENT_WORDS, PLANE_WORDS, Orientation
-from tactile_bayes.posterior.arviz_groups import FittedCells, fitted_cells
+from tactile_bayes.posterior.result import FittedCells, fitted_cells
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.compare import compare_summary
 from tactile_bayes.report.estimate_text import exams_label, no_estimate_line

@@ -34,7 +34,7 @@ from tactile_bayes.hardware.live import (
 from tactile_bayes.hardware.readings import PoseReading
 from tactile_bayes.hardware.recorder import Report
 from tactile_bayes.hardware.serve import LiveServer, address_of, document
-from tactile_bayes.mapping.growing import Instrument, MapAccumulator
+from tactile_bayes.mapping.accumulate import Instrument, MapAccumulator
 from tactile_bayes.mapping.plane import poses_at
 from tactile_bayes.report.map_text import colours_wanted, live_line, live_text
 

@@ -17,9 +17,9 @@ from tactile_bayes.files.size_json import DEFAULT, read_size_calibration, size_c
 from tactile_bayes.forward.scene import Background, Noise, Scene, Strokes
 from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.forward.tissue import SceneBody, SolidLump
+from tactile_bayes.mapping.accumulate import Instrument, MapAccumulator, MapGrid
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.cells import Readout
-from tactile_bayes.mapping.growing import Instrument, MapAccumulator, MapGrid
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.mapping.plane import poses_at
 from tactile_bayes.mapping.profile import (

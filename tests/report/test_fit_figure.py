@@ -13,7 +13,7 @@ import tactile_bayes as tb
 from tactile_bayes.api.estimates import SizeEstimate
 from tactile_bayes.api.maps import Map
 from tactile_bayes.files.map_nc import read_posterior
-from tactile_bayes.posterior.arviz_groups import fitted_cells
+from tactile_bayes.posterior.result import fitted_cells
 from tactile_bayes.report.figure_file import named_exam
 
 NOISE_SD = 0.004

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tactile_bayes.posterior import linear as spanned
+from tactile_bayes.posterior import field as spanned
 from tactile_bayes.posterior import marginal as collapsed
-from tactile_bayes.posterior.linear import Spanned
+from tactile_bayes.posterior.field import Spanned
 from tactile_bayes.posterior.marginal import CollapsedTarget
 from tactile_bayes.posterior.scene import Scene
 from tests.posterior.correlated.test_marginal import START, TURNED, cells_of, noise, target_of

@@ -13,9 +13,8 @@ from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior import marginal as collapsed
 from tactile_bayes.posterior.bump import FitCells, window_cells
 from tactile_bayes.posterior.draw import draw_parameters
-from tactile_bayes.posterior.field import Window, cosine_profiles, gram_of_cosines, spectrum
+from tactile_bayes.posterior.field import Window, _one, cosine_profiles, gram_of_cosines, spectrum
 from tactile_bayes.posterior.fit import FieldFit, fit_scene, shape_draws
-from tactile_bayes.posterior.linear import _one
 from tactile_bayes.posterior.marginal import CollapsedTarget, independent_variance
 from tactile_bayes.posterior.options import EstimateOptions
 from tactile_bayes.posterior.scene import Problem, Scene
