@@ -27,7 +27,7 @@ from benchmarks.map_peers import BINCOUNT_FRAMES, BOOST, BOOST_FRAMES, Job, binc
 from tactile_bayes.forward.scene import Head, Scene, Strokes
 from tactile_bayes.forward.simulate import head_positions
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.mapping import Instrument, MapAccumulator, MapGrid
+from tactile_bayes.mapping.accumulate import Instrument, MapAccumulator, MapGrid
 from tactile_bayes.mapping.cells import (
     CellSums,
     ProjectedTaxels,

@@ -30,7 +30,7 @@ from tactile_bayes.files.map_nc import write_map, write_pooled
 from tactile_bayes.files.provenance import repeated_scans
 from tactile_bayes.files.size_json import size_calibration_path
 from tactile_bayes.findings import findings_in
-from tactile_bayes.mapping import build_map
+from tactile_bayes.mapping.build import build_map
 from tactile_bayes.options import MapOptions
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.compare import compare_summary, compare_text

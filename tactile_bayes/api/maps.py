@@ -18,7 +18,7 @@ from tactile_bayes.files.map_nc import read_map_and_scans, write_map
 from tactile_bayes.files.provenance import Provenance, repeated_scans, scan_facts
 from tactile_bayes.files.scene_toml import read_scene
 from tactile_bayes.findings import finding_lines
-from tactile_bayes.mapping import build_map as build
+from tactile_bayes.mapping.build import build_map as build
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.options import MapOptions
 from tactile_bayes.presets import RESEARCH_USE

@@ -26,8 +26,8 @@ from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.draws import BumpDraws, ShapeDraws
 
 if TYPE_CHECKING:
-    from tactile_bayes.api.estimating import Progress
     from tactile_bayes.files.tables import Sheet, Table
+    from tactile_bayes.progress import Progress
     from tactile_bayes.size.bodies import BodyCalibration
     from tactile_bayes.size.learn.site import PhantomMap
 

@@ -33,7 +33,7 @@ from tactile_bayes.size.terms import Normalise, Recipe
 from tactile_bayes.studies.population import measuring_options, population_table, table_bodies, table_head
 
 if TYPE_CHECKING:
-    from tactile_bayes.api.estimating import Progress
+    from tactile_bayes.progress import Progress
 
 EqSixFit = Literal["joint", "two-stage"]
 PopulationForm = Literal["eq6", "eq6-residual"]

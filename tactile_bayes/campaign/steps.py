@@ -45,7 +45,7 @@ from tactile_bayes.files.provenance import Provenance, scan_facts
 from tactile_bayes.files.reading import NETCDF_BYTES, kind_of, read_bytes
 from tactile_bayes.files.remote import fetched, put
 from tactile_bayes.findings import by_weight, findings_in
-from tactile_bayes.mapping import build_map
+from tactile_bayes.mapping.build import build_map
 from tactile_bayes.options import MapOptions
 from tactile_bayes.report.estimate_document import rounded, size_diagnostics
 from tactile_bayes.report.estimate_figures import draw_comparison, draw_map, draw_size

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -17,16 +17,11 @@ from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior.detection import Detection
 from tactile_bayes.posterior.draw import Diagnostics, MapPosterior, ModalBump
 from tactile_bayes.posterior.fit import FieldFit
-from tactile_bayes.posterior.lump_probability import Weighed
-from tactile_bayes.posterior.selection import fitted_values, pointwise_log_likelihood
+from tactile_bayes.posterior.lump_probability import SmallestLumps, Weighed
+from tactile_bayes.posterior.selection import SceneChoice, fitted_values, pointwise_log_likelihood
 from tactile_bayes.posterior.white import BumpFit, Candidate
 from tactile_bayes.size.draws import BumpDraws, SizePosterior
 from tactile_bayes.size.pooling import Calibration, SizePriors, draw_sizes
-
-if TYPE_CHECKING:
-    from tactile_bayes.posterior.lump_probability import SmallestLumps
-    from tactile_bayes.posterior.selection import SceneChoice
-
 
 # --- Prior sensitivity: the draws reweighted under a width prior twice as wide.
 

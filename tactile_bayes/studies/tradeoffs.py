@@ -15,7 +15,7 @@ from tactile_bayes.forward.plane_strain import rim_nodes
 from tactile_bayes.forward.scene import Scene
 from tactile_bayes.forward.tissue import THICKNESS_MM, Body, SceneBody, fat_thickness
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.mapping import build_map
+from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.mapping.select import first_seconds
 from tactile_bayes.posterior.options import EstimateOptions

@@ -15,7 +15,7 @@ from in_process import run_here
 from tactile_bayes.files.map_nc import read_map, read_map_header
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.scan_mcap import write_scan
-from tactile_bayes.mapping import build_map
+from tactile_bayes.mapping.build import build_map
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.scan import Landmarks, Scan
 

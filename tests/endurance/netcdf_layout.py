@@ -25,7 +25,7 @@ import h5py
 import tactile_bayes as tb
 from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.files.provenance import Provenance
-from tactile_bayes.mapping import build_map
+from tactile_bayes.mapping.build import build_map
 
 
 @contextlib.contextmanager

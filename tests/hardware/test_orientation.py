@@ -12,7 +12,7 @@ from mapping_scans import gaussian, make_scan, strokes
 from tactile_bayes.declarations import replace
 from tactile_bayes.hardware.live import LiveMap, LiveState, SeenFrame, SeenLandmark, SeenPose
 from tactile_bayes.hardware.serve import document
-from tactile_bayes.mapping import build_map
+from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import MapRecipe, TactileMap
 from tactile_bayes.mapping.places import orientation_of
 from tactile_bayes.posterior.abstention import missing_strokes

@@ -20,7 +20,7 @@ from emulated_devices import short_scan
 from tactile_bayes.files.map_nc import read_map
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.scan_mcap import read_scan, write_scan
-from tactile_bayes.mapping import build_map
+from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.mapping.select import scan_findings
 from tactile_bayes.scan import Scan, TrackerPoses

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.geometry import rigid
-from tactile_bayes.mapping import Instrument, MapAccumulator, MapGrid, build_map
+from tactile_bayes.mapping.accumulate import Instrument, MapAccumulator, MapGrid
+from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.plane import FramePoses, poses_at
 from tactile_bayes.mapping.select import TaxelFault, find_faults
 from tactile_bayes.scan import ElementCalibration, Scan

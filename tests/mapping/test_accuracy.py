@@ -11,7 +11,9 @@ from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.scene import Background, Lump, Noise, Scene, Strokes
 from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.geometry import apply, rigid
-from tactile_bayes.mapping import Instrument, MapAccumulator, MapGrid, TactileMap, build_map
+from tactile_bayes.mapping.accumulate import Instrument, MapAccumulator, MapGrid
+from tactile_bayes.mapping.build import build_map
+from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.mapping.plane import FramePoses
 from tactile_bayes.posterior.options import FitOptions
 from tactile_bayes.posterior.white import fit_bump

@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.geometry import apply, rigid
-from tactile_bayes.mapping import TactileMap, build_map
+from tactile_bayes.mapping.build import build_map
+from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.scan import HeadGeometry, Landmarks, PressureFrames, Scan, TrackerPoses
 
 ALL = (0.0, 30.0)

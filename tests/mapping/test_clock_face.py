@@ -10,7 +10,7 @@ from mapping_scans import gaussian, make_scan, strokes
 
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.mapping import build_map
+from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.mapping.places import NIPPLE_SD_MM, ClockPosition, clock_position, clock_text
 from tactile_bayes.scan import Landmarks

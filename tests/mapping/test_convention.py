@@ -11,7 +11,8 @@ import pytest
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import inverse, quaternion_from_rotation, rigid, rotation_from_quaternion
-from tactile_bayes.mapping import build_map, convention
+from tactile_bayes.mapping import convention
+from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.convention import CONVENTIONS, check_convention
 from tactile_bayes.mapping.select import SelectedFrames, select_frames
 from tactile_bayes.report.map_text import map_text

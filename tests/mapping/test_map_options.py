@@ -8,7 +8,7 @@ import pytest
 
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, UsageError
-from tactile_bayes.mapping import build_map
+from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import advise_cell
 from tactile_bayes.mapping.select import timing_figures
 from tactile_bayes.report.map_text import map_text

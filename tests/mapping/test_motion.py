@@ -10,8 +10,9 @@ from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.forward.scene import Lump, Noise, Scene, Strokes, Tracker
 from tactile_bayes.forward.simulate import head_positions, simulate
-from tactile_bayes.mapping import TactileMap, build_map
+from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.convention import stroke_starts
+from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.options import FitOptions
 from tactile_bayes.posterior.white import fit_bump
 from tactile_bayes.scan import HeadGeometry, Landmarks, PressureFrames, Scan, TrackerPoses

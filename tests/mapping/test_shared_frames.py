@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from tactile_bayes.declarations import replace
-from tactile_bayes.mapping import Instrument, MapAccumulator, MapGrid, build_map
+from tactile_bayes.mapping.accumulate import Instrument, MapAccumulator, MapGrid
+from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.errors import LEAST_SHARE
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.mapping.plane import poses_at

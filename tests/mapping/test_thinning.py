@@ -9,7 +9,7 @@ import pytest
 import tactile_bayes as tb
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, UsageError
-from tactile_bayes.mapping import build_map
+from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.convention import POOL_S, every_stretch, thinning
 from tactile_bayes.mapping.select import every_nth, first_seconds
 from tactile_bayes.report.map_text import map_text

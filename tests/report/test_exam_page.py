@@ -19,7 +19,7 @@ from mapping_scans import gaussian, make_scan, strokes
 import tactile_bayes as tb
 from tactile_bayes.declarations import replace
 from tactile_bayes.findings import Finding
-from tactile_bayes.mapping import build_map
+from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.exam_page import BROWSERS, exam_page, find_printer
