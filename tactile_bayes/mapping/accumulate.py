@@ -344,7 +344,7 @@ class Instrument(Record, eq=False, dict=True):
     pressure_window_kpa: tuple[float, float] = PRESSURE_WINDOW_KPA
     """Frames whose mean lies outside are left out."""
     normalise: str = "mean"
-    """``"mean"`` or ``"none"``. A gain a frame needs all frames at once: see `tactile_bayes.mapping.build.build_map`."""
+    """``"mean"`` or ``"none"``. A gain per frame needs all frames at once: see `mapping.build.build_map`."""
 
     def __post_init__(self) -> None:
         if self.normalise not in ("mean", "none"):
