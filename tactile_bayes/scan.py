@@ -192,8 +192,7 @@ class HeadGeometry(Record, eq=False):
 
     surface_mm: FloatArray
     """(rows, columns, 3) array: Taxel centres in `scanhead`: origin at the apex of the face, z into the tissue, axis 0
-    across the head (x), axis 1 along it (y).
-    """
+    across the head (x), axis 1 along it (y)."""
     pitch_mm: float
     """Distance between neighbouring taxels."""
     scanhead_from_tracker: FloatArray

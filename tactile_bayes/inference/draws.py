@@ -36,12 +36,10 @@ class ParameterDraws(Record, eq=False):
     """Figures of the method (R-hat, effective draws, evaluations...), for the report."""
     labels: Labels | None = None
     """(chain * draw,) array or None: The independent replicate that each draw comes from, for draws in one chain; None
-    for independent draws.
-    """
+    for independent draws."""
     statistics: Mapping[str, FloatArray] = field(default_factory=dict)
     """(chain, draw) arrays of the sampler by name: ``lp``, the log density at the draw; ``log_weight``, of the point
-    that importance sampling took it from; ``accepted``, 1 where the chain's walker moved there in that step.
-    """
+    that importance sampling took it from; ``accepted``, 1 where the chain's walker moved there in that step."""
 
     @property
     def flat(self) -> FloatArray:
@@ -119,11 +117,7 @@ class Quantity(Record):
 
 
 def summarise(
-    draws: FloatArray,
-    *,
-    probability: float,
-    effective_draws: float | None = None,
-    replicates: Labels | None = None,
+    draws: FloatArray, *, probability: float, effective_draws: float | None = None, replicates: Labels | None = None
 ) -> Quantity:
     """Summarise draws with their equal-tailed interval, leaving NaN out; `ValueError` when no draw is finite.
 

@@ -193,12 +193,7 @@ LEAST_VARIANCE = 1e-6
 
 
 def fitted_gaussians(
-    log_density: LogDensity,
-    first: Proposal,
-    theta: FloatArray,
-    log_target: FloatArray,
-    *,
-    rng: np.random.Generator,
+    log_density: LogDensity, first: Proposal, theta: FloatArray, log_target: FloatArray, *, rng: np.random.Generator
 ) -> tuple[Gaussians, int]:
     """Gaussians whose mixture resembles a density, from (n, p) points of another proposal and their (n,) log density.
 

@@ -41,13 +41,7 @@ def _pairs(p: int) -> list[tuple[int, int]]:
 # --- The paper's method: least squares (Eq 7) with its covariance and no prior.
 
 
-def optimise(
-    theta: FloatArray,
-    covariance: FloatArray,
-    *,
-    dof: float,
-    rng: np.random.Generator,
-) -> ParameterDraws:
+def optimise(theta: FloatArray, covariance: FloatArray, *, dof: float, rng: np.random.Generator) -> ParameterDraws:
     """Draw about the (p,) least-squares estimate, with its (p, p) covariance and t tails for the estimated noise.
 
     The covariance includes correlated errors; `dof` are the noise estimate's effective degrees of freedom. Wellman &
@@ -184,12 +178,7 @@ MOST_STEPS = 100
 
 
 def laplace(
-    log_density: LogDensity,
-    start: FloatArray,
-    *,
-    scale: FloatArray,
-    dof: float,
-    rng: np.random.Generator,
+    log_density: LogDensity, start: FloatArray, *, scale: FloatArray, dof: float, rng: np.random.Generator
 ) -> ParameterDraws:
     """Draw from the t density with the mode and curvature of a log density.
 

@@ -91,8 +91,7 @@ def sobol_integers(start: int, number: int, dimension: int) -> np.ndarray[tuple[
 
 def shifted_sobol(start: int, number: int, *, shifts: np.ndarray[tuple[int, ...], np.dtype[np.uint32]]) -> FloatArray:
     """(replicates, number, dimension) uniform points in (0, 1): the sequence under the digital shift of each row of
-    `shifts`.
-    """
+    `shifts`."""
     points = sobol_integers(start, number, shifts.shape[1])
     return np.asarray(((points ^ shifts[:, None, :]) + 0.5) / 2.0**BITS)
 

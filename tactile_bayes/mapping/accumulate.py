@@ -259,13 +259,7 @@ class Accumulated(Record, eq=False):
         return self.last_change <= GAIN_TOLERANCE
 
 
-def accumulate(
-    sources: list[Source],
-    *,
-    cell_mm: float,
-    normalise: str,
-    progress: Progress = untold,
-) -> Accumulated:
+def accumulate(sources: list[Source], *, cell_mm: float, normalise: str, progress: Progress = untold) -> Accumulated:
     """Average the normalised readings of all used frames in cells on the plane; progress starts anew in each pass.
 
     ``"mean"`` divides each frame by its mean over the valid taxels, as the paper does. A lump under the head is in that
@@ -283,11 +277,7 @@ def accumulate(
 
 
 def add_all(
-    sources: list[Source],
-    levels: list[FloatArray],
-    *,
-    cell_mm: float,
-    progress: Progress = untold,
+    sources: list[Source], levels: list[FloatArray], *, cell_mm: float, progress: Progress = untold
 ) -> CellSums:
     """One pass over all used frames, each divided by its level."""
     sums = CellSums(cell_mm)
@@ -493,8 +483,7 @@ class MapAccumulator:
 
     def rebuild(self) -> MapAccumulator:
         """Make a new accumulator from the frames kept so far, on their best-fit plane; `UsageError` when none were
-        kept.
-        """
+        kept."""
         if self._kept is None:
             raise UsageError("the frames were not kept; make the accumulator with keep_frames=True")
         grid = MapGrid(self.plane().plane_from_base, self.grid.cell_mm)

@@ -256,10 +256,7 @@ class _Rules(Record, eq=False):
         """Select the used frames of every scan; an error if none is left in any of them."""
         selections = [
             select_frames(
-                scan,
-                pressure_window_kpa=self.window_kpa,
-                latency_ms=late_ms,
-                max_pose_gap_ms=self.max_pose_gap_ms,
+                scan, pressure_window_kpa=self.window_kpa, latency_ms=late_ms, max_pose_gap_ms=self.max_pose_gap_ms
             )
             for scan in scans
         ]
@@ -280,10 +277,7 @@ def _flattened(
 
 def _latency(selections: list[SelectedFrames], rules: _Rules, cell_mm: float, figures: dict[str, float]) -> float:
     estimate = estimate_latency(
-        selections,
-        plane=_plane(selections),
-        cell_mm=cell_mm,
-        max_pose_gap_ms=rules.max_pose_gap_ms,
+        selections, plane=_plane(selections), cell_mm=cell_mm, max_pose_gap_ms=rules.max_pose_gap_ms
     )
     figures |= {
         "latency_sd_ms": estimate.sd_ms,

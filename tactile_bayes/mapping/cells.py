@@ -53,14 +53,12 @@ class CellSums:
     total: IntArray = field(default_factory=_no_cells)
     square: IntArray = field(default_factory=_no_cells)
     """`count`, `total`, `square`: (ny, nx) int64 arrays of readings, their sum in `VALUE_STEP` and the sum of their
-    squares in `VALUE_STEP` squared.
-    """
+    squares in `VALUE_STEP` squared."""
     clipped: int = 0
     """Readings beyond `VALUE_LIMIT` that were added at the limit."""
     negative: int = 0
     """Readings below 0, which noise about nothing gives. They are added as they are: cut off at 0, they would lift the
-    mean.
-    """
+    mean."""
 
     def add(self, x_mm: FloatArray, y_mm: FloatArray, value: FloatArray) -> None:
         """Add readings at positions on the plane; arrays of one shape, all finite, of at most `READINGS_PER_CALL`.
@@ -258,8 +256,7 @@ class Projection(Record, eq=False):
     """The taxels that are projected."""
     matrix: FloatArray
     """(n, 2, 4) array: First two rows of the rotation from the tracker to the plane, in cells a mm; and beside them
-    where the taxels' middle lies on the lattice, in cells. Half a cell is added, so that cell k is centred on k.
-    """
+    where the taxels' middle lies on the lattice, in cells. Half a cell is added, so that cell k is centred on k."""
     cell_mm: float
     """Side of a cell."""
 
@@ -335,8 +332,7 @@ class Projection(Record, eq=False):
 
 class Projector:
     """The constants of a projection of the taxels in a (rows, columns) bool array, in row order; the same for all
-    frames.
-    """
+    frames."""
 
     def __init__(self, head: HeadGeometry, *, plane_from_base: FloatArray, taxels: BoolArray, cell_mm: float) -> None:
         self._rows = plane_from_base[:2, :3].tolist()

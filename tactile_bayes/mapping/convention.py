@@ -64,16 +64,14 @@ class CoarseFrames(Record, eq=False):
     row: IndexArray
     block: IndexArray
     """`row`, `block` (k,) int arrays: Which rows of the head a block of taxels is of, and its number among all blocks
-    of the head.
-    """
+    of the head."""
     basis: FloatArray
     """(k, 6) array: Orthonormal: a level, two slopes and three curvatures over the head's blocks."""
 
     @classmethod
     def of(cls, selection: SelectedFrames, frames: IndexArray) -> CoarseFrames:
         """Average the given frames of a scan, in the order of time; the few saturated readings count as their frame's
-        mean.
-        """
+        mean."""
         good, scan = selection.good_taxels, selection.scan
         readout = selection.readout
         weight, row, block, basis = _taxel_blocks(good)

@@ -135,8 +135,7 @@ class Nuisance(Record, eq=False):
     taxel: IndexArray
     row_cell: IndexArray
     """`frame`, `taxel`, `row_cell` (n,) int arrays: Averaged frame, block of taxels, and cell of the map of the head's
-    rows that each reading is of.
-    """
+    rows that each reading is of."""
 
     @classmethod
     def of(cls, parts: Sequence[CoarseFrames], cell: IndexArray) -> Nuisance:
@@ -340,8 +339,7 @@ class _Regression(Record, eq=False):
     design: FloatArray
     halves: FloatArray
     """`design`, `halves` (n,), (2, n) arrays: Design of the latency with the whole gradient, and with those of two
-    halves of the strokes.
-    """
+    halves of the strokes."""
     raw: FloatArray
     """(n,) array: Design within frames, with the map left in."""
     stroke: IndexArray

@@ -84,8 +84,7 @@ class TactileMap(Record, eq=False):
     mean: FloatArray
     variance: FloatArray
     """`mean`, `variance` (ny, nx) arrays: Mean and within-cell variance of the readings; NaN where `count` is 0.
-    Without unit after normalising, kPa with ``normalise="none"``.
-    """
+    Without unit after normalising, kPa with ``normalise="none"``."""
     count: np.ndarray[tuple[int, ...], np.dtype[np.int64]]
     """(ny, nx) int64 array: Readings per cell."""
     x_mm: FloatArray

@@ -33,14 +33,12 @@ class Orientation(Record):
     right: str
     up: str
     """`right`, `up`: ``"+x"``, ``"-x"``, ``"+y"`` or ``"-y"``. Of the eight pairs only four are used: z, into the
-    tissue, always points away from the viewer.
-    """
+    tissue, always points away from the viewer."""
     words: str
     """The orientation in a phrase, for captions."""
     notch: tuple[float, float] | None = None
     """(2,) tuple or None: Unit vector to the sternal notch on the screen (to the right, upwards); None without
-    landmarks.
-    """
+    landmarks."""
 
     @property
     def swapped(self) -> bool:

@@ -39,8 +39,7 @@ class FramePoses(Record, eq=False):
     """(n, 3, 3) array: ``p_base = position + rotation @ p_tracker``."""
     known: BoolArray
     """(n,) bool array: False where the tracker said nothing close enough; position and rotation are then meaningless
-    but finite.
-    """
+    but finite."""
 
     def part(self, frames: slice | BoolArray | IndexArray) -> FramePoses:
         """A subset of the frames."""

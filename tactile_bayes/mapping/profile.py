@@ -235,8 +235,7 @@ class ProfileReader(Record, eq=False):
 
     solve: FloatArray
     """(9, taxels) array: Takes readings to coefficients of Legendre polynomials at the good taxels, by least squares;
-    no taxel where too few rows or columns have one to tell the polynomials apart.
-    """
+    no taxel where too few rows or columns have one to tell the polynomials apart."""
     gram: FloatArray
     """(9, 9) array: Inner products of the polynomials."""
 

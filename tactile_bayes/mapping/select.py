@@ -315,8 +315,7 @@ class SelectedFrames(Record, eq=False, dict=True):
     low: BoolArray
     high: BoolArray
     """`low`, `high` (n,) bool arrays: Frames whose level is below or above the window, among those with a pose and
-    enough valid taxels.
-    """
+    enough valid taxels."""
     used: BoolArray
     """(n,) bool array: Frames that go into the map."""
 

@@ -54,8 +54,7 @@ class FitCells(Record, eq=False):
     variance: FloatArray
     count: FloatArray
     """`value`, `variance`, `count` (k,) arrays: Mean, within-cell variance (NaN where it is not known) and number of
-    readings.
-    """
+    readings."""
     row: IndexArray
     column: IndexArray
     """`row`, `column` (k,) int arrays: Where the cells lie in the map's grid."""

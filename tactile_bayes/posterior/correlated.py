@@ -16,14 +16,7 @@ from tactile_bayes.posterior.bump import PoseNoise, overlap, trusted
 from tactile_bayes.posterior.detection import Detection, detection_from_odds
 from tactile_bayes.posterior.draw import MapPosterior, ModalBump, NoiseFigures, draw_parameters
 from tactile_bayes.posterior.field import FLOOR, Window, cosines_for
-from tactile_bayes.posterior.fit import (
-    FieldFit,
-    field_window,
-    modal_widths,
-    shape_draws,
-    start_vector,
-    tangent_columns,
-)
+from tactile_bayes.posterior.fit import FieldFit, field_window, modal_widths, shape_draws, start_vector, tangent_columns
 from tactile_bayes.posterior.neighbours import WANTED, Surroundings, add_beside, ridge_instead, ridge_text, rising_ribs
 from tactile_bayes.posterior.options import DETECTED, EstimateOptions, scene_asked
 from tactile_bayes.posterior.scene import Problem, Scene
@@ -343,10 +336,5 @@ def _figures(choice: SceneChoice, places_share: float | None, passed_over: tuple
     target = choice.fit.target
     figures = {"field_cosines": target.window.cosines, **target.field_summary(choice.fit.mode)}
     return NoiseFigures(
-        "field",
-        choice.fit.rotated,
-        odds.get("rotated"),
-        figures,
-        places_share=places_share,
-        passed_over=passed_over,
+        "field", choice.fit.rotated, odds.get("rotated"), figures, places_share=places_share, passed_over=passed_over
     )

@@ -34,8 +34,7 @@ class MapPosterior(Record, eq=False):
     noise_sd: FloatArray
     oblique: tuple[float, float] | None = None
     """Mean and SD of r, the half log axis ratio 45 degrees from the map's x axis, where the draws have none and it was
-    measured beside them; None otherwise.
-    """
+    measured beside them; None otherwise."""
     irregular: bool = False
     """True where the bump is less regular than a ball's, see `correlated.outline`."""
 
@@ -152,16 +151,14 @@ class Sampled(Record, eq=False):
     parts: Gaussians | None = None
     """A Gaussian for each noise field, also for those with little share of the density at the mode: under strongly
     correlated errors the widths are less certain, so that a field with 0.3 % of the density there had 4 % of the
-    posterior, and all of its tails. None where one of them has no maximum, and under independent errors.
-    """
+    posterior, and all of its tails. None where one of them has no maximum, and under independent errors."""
     beside: FloatArray = field(default_factory=lambda: np.zeros(0))
     """(j,) array: The second structure's parameters."""
     spread: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
     """(k, k) array: Root of the covariance that the second structure's uncertainty adds."""
     checkpoint_key: Callable[[str, np.random.Generator], str] | None = None
     """Hash of everything that chains of some settings and random numbers depend on; None under independent errors,
-    where chains start about the mode and are neither kept nor compared with importance draws.
-    """
+    where chains start about the mode and are neither kept nor compared with importance draws."""
 
     def finished(self, draws: ParameterDraws, rng: np.random.Generator) -> ParameterDraws:
         """Draws of the whole scene, from draws of the sampled density."""

@@ -296,10 +296,7 @@ def _convergence(made: MapDraws, size: SizePosterior | None) -> dict[str, dict[s
 
 
 def _left_out(
-    tactile_map: TactileMap,
-    options: EstimateOptions,
-    calibration: Calibration | None,
-    noise: NoiseFigures,
+    tactile_map: TactileMap, options: EstimateOptions, calibration: Calibration | None, noise: NoiseFigures
 ) -> tuple[str, ...]:
     notes = []
     if tactile_map.recipe.source == "scan" and noise.places_share is None:

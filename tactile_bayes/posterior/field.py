@@ -42,8 +42,7 @@ class Whitening(Record, eq=False):
     """Correlation length."""
     turn: FloatArray
     """(cosines^2, k) array: Takes inner products with the cosines, ``D^-1 Phi``, to directions in which the field's
-    precision is diagonal.
-    """
+    precision is diagonal."""
     eigenvalues: FloatArray
     """(k,) array: Of ``S^1/2 Phi' D^-1 Phi S^1/2``."""
 
@@ -116,8 +115,7 @@ def spectrum(frequency2: FloatArray, length_mm: float) -> FloatArray:
 
 def whitening(gram: FloatArray, frequency2: FloatArray, *, length_mm: float) -> Whitening:
     """Prepare the noise field of one length, from the (k, k) gram ``Phi' D^-1 Phi`` and (k,) frequencies squared,
-    1/mm^2.
-    """
+    1/mm^2."""
     root = np.sqrt(spectrum(frequency2, length_mm))
     values, vectors = np.linalg.eigh(root[:, None] * gram * root)
     keep = values > 1e-9 * values[-1]
@@ -329,8 +327,7 @@ class LinearSolution(Record, eq=False):
     level: FloatArray
     level_covariance: FloatArray
     """`level`, `level_covariance` (h, c), (h, c, c) arrays: Level and tilt at amplitudes of 0, and their covariance
-    over tau^2 given the amplitudes.
-    """
+    over tau^2 given the amplitudes."""
     level_slope: FloatArray
     """(m, h, v, c) array: By how much level and tilt fall as an amplitude rises."""
     sum_of_squares: FloatArray

@@ -53,8 +53,7 @@ class FieldFit(Record, eq=False):
     mode: FloatArray
     covariance: FloatArray
     """`mode`, `covariance` (p,), (p, p) arrays: Of the scene's parameters; the covariance is the mixture's, not the
-    curvature at the mode.
-    """
+    curvature at the mode."""
     mixture: Mixture
     """One Gaussian per noise field."""
 
@@ -139,11 +138,7 @@ def start_vector(least_squares: BumpFit, scene: Scene) -> FloatArray:
     return Scene("rotated").carried(turned, scene)
 
 
-def fit_scene(
-    problem: Problem,
-    scene: Scene,
-    start: FloatArray,
-) -> FieldFit:
+def fit_scene(problem: Problem, scene: Scene, start: FloatArray) -> FieldFit:
     """Find the mode from (p,) parameters, alternating with the choice of noise fields that matter there.
 
     `NotConvergedError` when there is no mode.

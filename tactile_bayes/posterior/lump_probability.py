@@ -46,8 +46,7 @@ class Weighed(Record, eq=False):
     """Centre of the bump."""
     features: tuple[float, ...]
     """Log of 1 plus the log Bayes factor, log of the axis ratio, by how much the log of the width exceeds that of
-    `WIDE_MM`, share of the bump that the map does not cover, and 1 where a fault speaks against measuring it.
-    """
+    `WIDE_MM`, share of the bump that the map does not cover, and 1 where a fault speaks against measuring it."""
     candidate: Candidate | None = None
     """Where the search met it."""
 

@@ -132,8 +132,7 @@ class CollapsedTarget:
 
     def settle_fields(self, theta: FloatArray) -> bool:
         """Keep only the noise fields with evidence at one shape; the others cost time and add nothing. True if that
-        changed.
-        """
+        changed."""
         before = self.chosen_fields()
         projected, cross = self._project(self.scene.templates(theta[None], self.window))
         walked = self._walk(lambda columns: self._under(projected, cross, columns)[0][0])

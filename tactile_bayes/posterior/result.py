@@ -100,8 +100,7 @@ class Estimate(Record, eq=False):
     status: Status
     reason: str
     """`status`, `reason`: ``"estimate"``, or ``"no_estimate"`` and why. With an estimate the reason says what is
-    missing from it, if anything.
-    """
+    missing from it, if anything."""
     detection: Detection | None = None
     """None when no bump could be tested."""
     fit: BumpFit | None = None
@@ -109,8 +108,7 @@ class Estimate(Record, eq=False):
     map_posterior: MapPosterior | None = None
     size: SizePosterior | None = None
     """`fit`, `draws`, `map_posterior`, `size`: None without an estimate; `size` is None also without a size
-    calibration.
-    """
+    calibration."""
     candidates: tuple[Candidate, ...] = ()
     """Every place that was looked at."""
     diagnostics: Diagnostics | None = None
@@ -225,11 +223,7 @@ class DrawGroup(Record, eq=False):
 
 
 def inference_groups(
-    estimate: Estimate,
-    *,
-    calibration: Calibration | None,
-    size_priors: SizePriors,
-    rng: np.random.Generator,
+    estimate: Estimate, *, calibration: Calibration | None, size_priors: SizePriors, rng: np.random.Generator
 ) -> dict[str, DrawGroup]:
     """The groups that an estimate has besides ``posterior``; empty without an estimate.
 

@@ -136,8 +136,7 @@ class Structure(Record):
 
     name: str
     """``"ellipse"`` (against round), ``"rotated"``, ``"tilt"``, ``"second lump"``, ``"rib"``, ``"departure"`` (from a
-    Gaussian).
-    """
+    Gaussian)."""
     odds: float
     """Bayes factor of the scene with it against the scene without; an upper bound where `bound`."""
     supported: bool
@@ -149,8 +148,7 @@ class Structure(Record):
     change_x_sd: float | None = None
     change_y_sd: float | None = None
     """`change_x_sd`, `change_y_sd`: By how many posterior SDs the median of ln sigma_x and ln sigma_y would change, had
-    it been decided the other way; None where that was not fitted.
-    """
+    it been decided the other way; None where that was not fitted."""
     place: str = ""
     """Where it lies or what it is like, in words; empty when there is nothing to say."""
 

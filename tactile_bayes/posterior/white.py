@@ -145,12 +145,10 @@ class BumpFit(Record, eq=False):
     fit: LeastSquaresFit
     errors: ErrorModel
     """`bump`, `cells`, `weight`, `fit`, `errors`: Model, cells of the window, their weights, the minimum, the judged
-    errors.
-    """
+    errors."""
     covariance: FloatArray
     """(p, p) array: Of the parameters, correlated errors included; under a noise field, which has them in the model,
-    not.
-    """
+    not."""
     covered_share: float
     """Share of the disc of 1.5 widths about the centre that the map covers."""
 

@@ -208,11 +208,7 @@ class SizeCalibration(Record, eq=False):
 
 
 def push_sizes(
-    bump: BumpDraws,
-    *,
-    calibration: SizeCalibration,
-    rng: np.random.Generator,
-    another_exam: BetweenMaps | None = None,
+    bump: BumpDraws, *, calibration: SizeCalibration, rng: np.random.Generator, another_exam: BetweenMaps | None = None
 ) -> SizePosterior:
     """Convert each map draw by Eq 6, with a draw of its coefficients and one of its residual scatter.
 

@@ -310,11 +310,7 @@ class PooledEstimate(Record, eq=False):
 
 
 def pool_maps(
-    shapes: Sequence[ShapeDraws | None],
-    *,
-    calibration: BodyCalibration,
-    priors: SizePriors,
-    rng: np.random.Generator,
+    shapes: Sequence[ShapeDraws | None], *, calibration: BodyCalibration, priors: SizePriors, rng: np.random.Generator
 ) -> PooledEstimate:
     """Pool the maps of a mass to one size; None stands for a map on which no lump was found.
 

@@ -215,8 +215,7 @@ class SiteShift(Record, eq=False):
     maps: Annotated[int, Meta(ge=3)]
     base: Annotated[str, Meta(description="Name of the calibration that is corrected.")]
     uses_fat: Annotated[
-        bool,
-        Meta(description="Whether the phantoms were sized with the depth of fat; if not, no size with this is."),
+        bool, Meta(description="Whether the phantoms were sized with the depth of fat; if not, no size with this is.")
     ]
     fit: Annotated[
         Mapping[str, float],

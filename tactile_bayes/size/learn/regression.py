@@ -229,12 +229,7 @@ def ranges_of(values: Mapping[str, FloatArray]) -> dict[str, tuple[float, float]
 
 
 def hidden_terms(
-    table: PopulationTable,
-    data: BodyRegression,
-    *,
-    body: FloatArray,
-    body_sd: FloatArray,
-    features: FloatArray,
+    table: PopulationTable, data: BodyRegression, *, body: FloatArray, body_sd: FloatArray, features: FloatArray
 ) -> HiddenTerms | None:
     """Second moments of what was varied, about what the map leads one to expect of it by its features, and with B.
 
