@@ -496,16 +496,9 @@ def add_frames(
     np.rint(steps, out=steps)
     first, shape = projection.block()
     flat = projection.flat(first, shape)
-    bounded = _bounded(readout, level)
+    # valid readings lie below the range of the sensor: where none can be negative or clipped, none is looked at
+    bounded = readout.never_negative and PRESSURE_RANGE_KPA[1] / VALUE_STEP < LIMIT_STEPS * float(level.min())
     if valid is None:
         sums.add_steps(first, shape, flat, steps, bounded=bounded)
     elif valid.any():
         sums.add_steps(first, shape, flat[valid], steps[valid], bounded=bounded)
-
-
-def _bounded(readout: Readout, level: FloatArray) -> bool:
-    """True where no valid reading over its frame's level can be negative or exceed what cells hold.
-
-    Valid readings lie below the sensor's range; then nobody has to look at each.
-    """
-    return readout.never_negative and PRESSURE_RANGE_KPA[1] / VALUE_STEP < LIMIT_STEPS * float(level.min())

@@ -216,7 +216,8 @@ def _correlations(
         mine = [run for run in runs if run.source is source]
         if not mine:
             continue
-        distance = _distances(source)
+        place = source.projection.taxels.place_mm
+        distance = np.sqrt(sum((axis[:, None] - axis) ** 2 for axis in place))
         bins = np.minimum(np.rint(distance / source.selection.scan.head.pitch_mm).astype(int), REACH_PITCHES + 1)
         # Every other frame will do: one has 86,000 pairs.
         whole, others = (np.concatenate([getattr(run, name)[::2] for run in mine]) for name in ("whole", "others"))
@@ -227,14 +228,6 @@ def _correlations(
     filled = np.flatnonzero(totals[2, 1:] > 0) + 1
     distance_mm, products, pairs = totals[:, filled]
     return distance_mm / pairs, products / pairs / variance, pairs
-
-
-def _distances(source: Source) -> FloatArray:
-    """(k, k) distances between the taxels read, mm."""
-    place = source.projection.taxels.place_mm
-    square = sum((axis[:, None] - axis[None, :]) ** 2 for axis in place)
-    distance: FloatArray = np.sqrt(square)
-    return distance
 
 
 def _decay(distance_mm: FloatArray, correlation: FloatArray, pairs: FloatArray) -> tuple[float, float]:

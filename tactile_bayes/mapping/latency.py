@@ -370,7 +370,9 @@ class _Regression(Record, eq=False):
             return LatencyEstimate(latency_ms, np.inf, np.inf, frames, crossings)
         bound = self._bound(information, noise)
         widened = np.sqrt((len(self.ways) - 1) / (len(self.ways) - 3))
-        error = widened * max(bound, self._between_strokes(information), self._between_blocks(information))
+        by_block = np.bincount(self.block[self.fit.frame_numbers()], self.design * self.fit.data)
+        between_blocks = float(np.linalg.norm(by_block)) / information
+        error = widened * max(bound, self._between_strokes(information), between_blocks)
         return LatencyEstimate(latency_ms, error / true_share, bound / true_share, frames, crossings)
 
     def _between_strokes(self, information: float) -> float:
@@ -381,10 +383,6 @@ class _Regression(Record, eq=False):
         without = (scores.sum() - scores) / np.maximum(information - told, 1e-300)
         variance = (count - 1) / count * float(np.sum((without - without.mean()) ** 2))
         return float(np.sqrt(variance))
-
-    def _between_blocks(self, information: float) -> float:
-        scores = np.bincount(self.block[self.fit.frame_numbers()], self.design * self.fit.data)
-        return float(np.linalg.norm(scores)) / information
 
     def _bound(self, information: float, noise: dict[str, float]) -> float:
         """Standard error from independent errors of readings, and of the frames' places as the tracker tells them."""

@@ -242,7 +242,9 @@ class ProfileReader(Record, eq=False):
     @classmethod
     def of(cls, good: BoolArray) -> ProfileReader:
         """Prepare for the good taxels of an array, True in (rows, columns)."""
-        across, along = (_legendre(n) for n in good.shape)
+        # at the taxels' centres, the array's ends at -1 and 1
+        centres = ((2.0 * np.arange(n) + 1.0) / n - 1.0 for n in good.shape)
+        across, along = (legendre.legvander(one, _HIGHEST) for one in centres)
         terms = np.stack([np.outer(across[:, i], along[:, j])[good] for i, j in _ORDERS], axis=1)
         if min(np.count_nonzero(good.any(axis=1)), np.count_nonzero(good.any(axis=0))) <= _HIGHEST:
             terms = terms[:0]
@@ -272,11 +274,6 @@ class ProfileReader(Record, eq=False):
         rows[:, :-1], rows[:, -1] = coefficients, left
         rows /= level_kpa[:, None]
         return rows
-
-
-def _legendre(taxels: int) -> FloatArray:
-    """(taxels, 5) Legendre polynomials at the taxels' centres, the array's ends at -1 and 1."""
-    return np.asarray(legendre.legvander((2.0 * np.arange(taxels) + 1.0) / taxels - 1.0, _HIGHEST))
 
 
 # --- Figures of how even a scan's surroundings were: the head's profile from place to place and stroke to stroke.

@@ -84,7 +84,8 @@ def _classify(scan: Scan, levels: _Levels) -> NDArray[np.str_]:
     """(rows, columns) fault of each taxel, "" for a good one."""
     mean = levels.mean_kpa
     usual = float(np.median(mean))
-    low, high = _neighbour_levels(mean)
+    of_row, of_column = np.median(mean, axis=1)[:, None], np.median(mean, axis=0)[None, :]
+    low, high = np.minimum(of_row, of_column), np.maximum(of_row, of_column)
     constant = (levels.highest == levels.lowest) & (len(scan.frames) >= MIN_FRAMES)
     moving = bool(np.median(levels.highest - levels.lowest) > 0)
     empty = constant & ((levels.highest == 0) | (mean <= DEAD_SHARE * usual))
@@ -97,13 +98,6 @@ def _classify(scan: Scan, levels: _Levels) -> NDArray[np.str_]:
     faults[levels.saturated_share > SATURATED_SHARE] = "saturated"
     faults[(scan.element_calibration.gain_kpa_per_count == 0) | empty | weak] = "dead"
     return faults
-
-
-def _neighbour_levels(mean_kpa: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The lower and the higher of each taxel's row median and column median."""
-    rows = np.median(mean_kpa, axis=1)[:, None]
-    columns = np.median(mean_kpa, axis=0)[None, :]
-    return np.minimum(rows, columns), np.maximum(rows, columns)
 
 
 def _element_levels(scan: Scan) -> _Levels:

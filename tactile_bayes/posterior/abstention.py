@@ -218,7 +218,8 @@ def shape_fault(sigma_x: FloatArray, sigma_y: FloatArray, *, cell_mm: float, pri
     fault = _width_fault(float(np.median(sigma_x)), float(np.median(sigma_y)), cell_mm=cell_mm, margin=1.0)
     if fault is not None:
         return fault
-    share = prior_share(sigma_x, sigma_y, prior)
+    sd = max(float(np.std(np.log(sigma_x))), float(np.std(np.log(sigma_y))))
+    share = sd / float(np.hypot(prior.log_width_sd, prior.log_ratio_sd))
     if share > MOST_PRIOR_SHARE:
         reason = (
             f"the map hardly narrows the widths: their posterior SD is {share:.2f} of the prior's "
@@ -243,9 +244,3 @@ def _width_fault(x: float, y: float, *, cell_mm: float, margin: float) -> Absten
         reason = f"what rises is a ridge, not a lump (sigma {wide:.3g} by {narrow:.3g} mm)"
         return Abstention("ridge", reason, FEEL_A_RIB, FEEL_A_RIB_ON_PAPER)
     return None
-
-
-def prior_share(sigma_x: FloatArray, sigma_y: FloatArray, prior: BumpPrior) -> float:
-    """Posterior SD over prior SD of the less certain log width."""
-    sd = max(float(np.std(np.log(sigma_x))), float(np.std(np.log(sigma_y))))
-    return sd / float(np.hypot(prior.log_width_sd, prior.log_ratio_sd))

@@ -269,19 +269,13 @@ def _statistics(estimate: Estimate, fit: FieldFit | None) -> DrawGroup | None:
 
 def _log_likelihood(theta: FloatArray, fit: FieldFit) -> DrawGroup:
     """Log likelihood of some of the draws, evenly thinned, as many of each chain."""
-    some = _thinned(theta, LIKELIHOOD_DRAWS)
+    some = theta[:, :: max(1, -(-theta.shape[0] * theta.shape[1] // LIKELIHOOD_DRAWS))]
     values = pointwise_log_likelihood(fit.target, some.reshape(-1, some.shape[2])).reshape(*some.shape[:2], -1)
     note = (
         "log density of each cell's value given all the other cells (leave-one-out predictive, Buerkner, Gabry & "
         "Vehtari 2021), for evenly thinned draws: under correlated errors a likelihood is no product over cells"
     )
     return DrawGroup({"value": (("chain", "draw", "cell"), values)}, {"definition": note})
-
-
-def _thinned(theta: FloatArray, number: int) -> FloatArray:
-    """About so many of (chain, draw, p) draws, evenly, as many of each chain."""
-    chains, draws, _ = theta.shape
-    return theta[:, :: max(1, -(-chains * draws // number))]
 
 
 def _prior(

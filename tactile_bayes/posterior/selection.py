@@ -325,7 +325,9 @@ def ask_departure(choice: SceneChoice) -> SceneChoice:
         refitted = _fitted(fit, column)
         if refitted is not None:
             x, y = change_in_sd(refitted, fit.mode)
-            answer = replace(answer, used=True, change_x_sd=x, change_y_sd=y, place=_likeness(exponent))
+            middle, power = "flatter" if exponent > 0 else "sharper", 2 * (1 + exponent)
+            likeness = f"({middle} in the middle, exponent about {power:.1f} for 2)"
+            answer = replace(answer, used=True, change_x_sd=x, change_y_sd=y, place=likeness)
             fit = refitted
     return replace(choice, fit=fit, structures=(*choice.structures, answer))
 
@@ -400,8 +402,3 @@ def _raw_column(fit: FieldFit) -> FloatArray:
     covariance = covariance_from_log_widths(p, q, r)
     h = 0.5 * np.einsum("ni,ij,nj->n", away, np.linalg.inv(covariance), away)
     return np.asarray(-h * np.log(np.maximum(h, 1e-12)) * np.exp(-h))
-
-
-def _likeness(exponent: float) -> str:
-    """Description of a bump with this e - 1."""
-    return f"({'flatter' if exponent > 0 else 'sharper'} in the middle, exponent about {2 * (1 + exponent):.1f} for 2)"

@@ -331,6 +331,8 @@ def _best_fit(
         outgrown = max(bump.widths(theta)[:2]) > 4.0 * radius_mm
         return bool(away or outgrown or any(joins(theta, other) for other in fits))
 
+    mean = float(weight @ cells.value) / float(weight.sum())
+    about_mean = float(weight @ (cells.value - mean) ** 2)
     for begin in starts:
         fit = fit_least_squares(
             lambda theta: bump.predict(theta, cells),
@@ -343,15 +345,9 @@ def _best_fit(
             patience=PATIENCE if place_only else None,
         )
         fits.append(fit)
-        if place_only and fit.converged and fit.sse < (1.0 - CLEAR) * _about_mean(cells.value, weight):
+        if place_only and fit.converged and fit.sse < (1.0 - CLEAR) * about_mean:
             break
     return min(fits, key=lambda fit: (not fit.converged, fit.sse))
-
-
-def _about_mean(values: FloatArray, weight: FloatArray) -> float:
-    """Weighted sum of squares about the weighted mean."""
-    mean = float(weight @ values) / float(weight.sum())
-    return float(weight @ (values - mean) ** 2)
 
 
 def _start(

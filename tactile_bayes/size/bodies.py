@@ -407,13 +407,7 @@ def suppositions(
             continue
         if hidden.score(name, value, features) <= LIKELY_SDS:
             left = known_body(calibration, {**known, name: value}, *at, own_sd)
-            supposed[label] = _supposition(name, value, before, left, variance=variance)
+            remaining = float(np.clip(variance - float((before.variance - left.variance)[0]), 0.0, variance))
+            sds = float(np.sqrt(variance)), float(np.sqrt(remaining))
+            supposed[label] = Supposition(name, value, float((left.expected - before.expected)[0]), sds)
     return supposed
-
-
-def _supposition(name: str, value: float, before: BodyLeft, left: BodyLeft, *, variance: float) -> Supposition:
-    """Effect of one more known property on a size whose logarithm has this variance without it."""
-    gone = float((before.variance - left.variance)[0])
-    variances = variance, float(np.clip(variance - gone, 0.0, variance))
-    sds = float(np.sqrt(variances[0])), float(np.sqrt(variances[1]))
-    return Supposition(name, value, float((left.expected - before.expected)[0]), sds)

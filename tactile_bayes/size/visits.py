@@ -309,7 +309,10 @@ def joint_sizes(
     default `SHARED_BODY`, or `SHARED_WITHOUT_DEPTH` where maps tell no depth. None for
     `amplitudes` leaves them out. `UsageError` for fewer than two visits, more than `MOST_VISITS`, or one without a map.
     """
-    _check(visits)
+    if not 2 <= len(visits) <= MOST_VISITS:
+        raise UsageError(f"{len(visits)} visits are given; compare 2 to {MOST_VISITS}")
+    if not all(visits):
+        raise UsageError("a visit has no map with a lump; leave it out")
     fitted = visit_calibrations(visits, calibration)
     between = between or priors.between_maps or calibration.between_exams
     flat = [one for maps in visits for one in maps]
@@ -346,13 +349,6 @@ def visit_calibrations(visits: Sequence[Sequence[ShapeDraws]], calibration: Body
     fitted = [calibration.for_maps(maps) for maps in visits]
     without = [one for one in fitted if one.fat_mm is None]
     return [without[0]] * len(fitted) if without else fitted
-
-
-def _check(visits: Sequence[Sequence[ShapeDraws]]) -> None:
-    if not 2 <= len(visits) <= MOST_VISITS:
-        raise UsageError(f"{len(visits)} visits are given; compare 2 to {MOST_VISITS}")
-    if not all(visits):
-        raise UsageError("a visit has no map with a lump; leave it out")
 
 
 def _shared_tau(between: BetweenMaps, parts: Sequence[MassMaps], points: FloatArray) -> FloatArray:

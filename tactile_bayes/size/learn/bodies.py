@@ -103,7 +103,10 @@ class TableRows(Record, eq=False):
         centre = Centre(*means)
         u, v = known.log_amplitude - centre.log_amplitude, known.log_width - centre.log_width
         w = log_depth - centre.log_fat
-        return cls(known, _with_expected(depth, u, v, w), centre, np.column_stack([u, v, w]))
+        x = monomials((u, v), powers(2))  # what amplitude and width lead one to expect of w
+        expected = np.asarray(np.linalg.lstsq(x, w, rcond=None)[0])
+        depth = replace(depth, expected=expected, expected_sd=float(np.std(w - x @ expected)))
+        return cls(known, depth, centre, np.column_stack([u, v, w]))
 
     @property
     def eq6(self) -> Eq6Rows:
@@ -163,13 +166,6 @@ def learn_depth(profile: FloatArray, log_fat: FloatArray) -> FatDepth:
         expected=np.zeros(len(powers(2))),
         expected_sd=0.0,
     )
-
-
-def _with_expected(depth: FatDepth, u: FloatArray, v: FloatArray, w: FloatArray) -> FatDepth:
-    """With what amplitude and width lead one to expect of w."""
-    x = monomials((u, v), powers(2))
-    expected = np.linalg.lstsq(x, w, rcond=None)[0]
-    return replace(depth, expected=np.asarray(expected), expected_sd=float(np.std(w - x @ expected)))
 
 
 def _rounded_mean(values: FloatArray) -> float:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from itertools import compress
 from typing import Any, Final, TypeVar, cast
 
@@ -386,28 +386,18 @@ def given(bodies: BodiesLeft, points: FloatArray, theta: FloatArray) -> FittedRe
     return FittedResidual(kernel, mean, covariance, bodies.left - off, total * weight / (1.0 - weight))
 
 
-def left_out_density(features: FloatArray, error: FloatArray, noise: FloatArray) -> Callable[[FloatArray], float]:
-    """Log density of all bodies, each left out, with the prior, by (s,) coefficients of ln SD(B).
+def body_spread(features: FloatArray, error: FloatArray, noise: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """(s,) coefficients of ln SD(B) by which bodies left out are most probable, and their (s, s) covariance.
 
     `error` and `noise` are (b,): of each body as the others predict it, and its variance without B's.
     """
 
-    def density(log_spread: FloatArray) -> float:
-        return _log_density(features, error, noise, log_spread) + _spread_prior(log_spread)
+    def density(spreads: FloatArray) -> FloatArray:
+        return np.array([_log_density(features, error, noise, one) + _spread_prior(one) for one in spreads])
 
-    return density
-
-
-def body_spread(features: FloatArray, error: FloatArray, noise: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """(s,) coefficients of ln SD(B) by which bodies left out are most probable, and their (s, s) covariance."""
-    density, s = left_out_density(features, error, noise), features.shape[1]
-
-    def many(spreads: FloatArray) -> FloatArray:
-        return np.array([density(one) for one in spreads])
-
-    start = np.zeros(s)
+    start = np.zeros(features.shape[1])
     start[0] = _BODY_SD[0]
-    mode, covariance, _ = mode_and_covariance(many, start, scale=np.full(s, 0.05))
+    mode, covariance, _ = mode_and_covariance(density, start, scale=np.full(len(start), 0.05))
     return np.asarray(mode), np.asarray(covariance)
 
 
