@@ -31,11 +31,11 @@ CELL_PER_SIGMA: Final = 0.75
 # Radius about the lump's centre inside which the map is fitted, where no size calibration says otherwise.
 FIT_RADIUS_MM: Final = 20.0
 
-# Figures of a map: how pressure is spread over the head where it feels no lump, see `mapping.head_profile`.
+# Figures of a map: how pressure is spread over the head where it feels no lump, see `mapping.profile`.
 HEAD_PROFILE: Final = ("head_profile_x2", "head_profile_y2", "head_profile_y4")
 
 # Figures of a map: SD of a frame's place along the plane's axes and the sides of the array there, mm, and how many
-# frames with an error of their own felt a cell for each reading in it, see `mapping.pose_noise`.
+# frames with an error of their own felt a cell for each reading in it, see `mapping.errors`.
 POSE_NOISE: Final = ("pose_noise_x_mm", "pose_noise_y_mm", "frame_side_x_mm", "frame_side_y_mm", "frames_per_reading")
 
 Normalise = Literal["mean", "gain", "none"]

@@ -279,7 +279,7 @@ class ProfileReader(Record, eq=False):
 # --- Figures of how even a scan's surroundings were: the head's profile from place to place and stroke to stroke.
 #
 # Where no lump is felt, the profile of the head depends on the layers below it
-# (`tactile_bayes.mapping.head_profile`). A profile that changes with the head's place means layers whose depth
+# (`HEAD_PROFILE`). A profile that changes with the head's place means layers whose depth
 # changes; one that is skewed along the stroke, to the other side in strokes the other way, means that the skin is
 # dragged along. How the head's normal turns as it moves is the curvature of the skin, to which an examiner keeps
 # the head square.

@@ -236,8 +236,8 @@ def _moved(source: Source, strokes: list[StrokeShift]) -> Source:
 # --- How far apart strokes in opposite directions see the lump: one that is dragged along, or poses that come late.
 #
 # Either puts the lump's image ahead in one direction and behind in the other, and the map, which holds both, is too
-# wide. One unknown of the regression in `tactile_bayes.mapping.shift_fit`, in one round: enough for a warning.
-# `tactile_bayes.mapping.strokes.register_strokes` finds each stroke's shift.
+# wide. One unknown of the regression in `mapping.latency.ShiftFit`, in one round: enough for a warning.
+# `register_strokes` finds each stroke's shift.
 
 # Averaged frames that are used, spread evenly: more would cost as much as the map itself.
 MOST_FRAMES = 160

@@ -253,7 +253,7 @@ class Bump(Record):
     background: float | None = 1.0
     """Fixed level (1 in Eq 7), or None to fit it."""
     scale: float = 1.0
-    """Unit of amplitude for priors and steps, see `cells.value_scale`."""
+    """Unit of amplitude for priors and steps, see `bump.value_scale`."""
 
     @property
     def names(self) -> tuple[str, ...]:

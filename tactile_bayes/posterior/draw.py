@@ -108,7 +108,7 @@ class Diagnostics(Record):
     repeatability: str = ""
     """How far exams of one mass lie apart at the site, in words; empty where nobody learned it."""
     convergence: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
-    """R-hat, effective draws and Monte-Carlo errors of chains for each size and width, see `arviz_data.convergence`."""
+    """R-hat, effective draws and Monte-Carlo errors of chains for each size and width, see `ensemble.convergence`."""
 
     def as_dict(self) -> dict[str, object]:
         """The diagnostics as plain data."""

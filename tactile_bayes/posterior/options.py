@@ -42,7 +42,7 @@ class FitOptions(Record):
         About how wide the bump is, where a fit of the same place has told; None starts from `START_WIDTHS_MM`.
     field_cosines
         Of the noise field along each axis: more of them are slower and see finer correlation. None takes as many as the
-        bump's width calls for, see `correlated.noise.cosines_for`.
+        bump's width calls for, see `field.cosines_for`.
     """
 
     background: Background = "fixed"
@@ -78,7 +78,7 @@ class EstimateOptions(Record):
     size_priors
         Spread between maps and shape of the lump; only a calibration over bodies uses them.
     scene
-        One of `presets.SCENES`, under a noise field.
+        One of `presets.SceneAsked`, under a noise field.
     accuracy_mm
         The same in mm; the finer of the two holds. Under a noise field.
     store

@@ -130,7 +130,7 @@ class Estimate(Record, eq=False):
     sensitivity: Sensitivity | None = None
     """How far the answer leans on the prior of the widths."""
     other_rises: tuple[Rise, ...] = ()
-    """Other rises that are lumps by the evidence, see `other_rises.other_rises`; empty where nobody has looked."""
+    """Other rises that are lumps by the evidence, see `masses.other_rises`; empty where nobody has looked."""
     bump: ModalBump | None = None
     """The bump at the mode of the lump that the answer is about, sized or not; None where there is no lump."""
     masses: tuple[Mass, ...] = ()

@@ -4,7 +4,7 @@ With u, v and w as in `eq6`,
 
 .. math:: \ln d = \ln\text{Eq 6}(u, v, w) + h(u, v, w) + B + E
 
-Eq 6 has constants that depend on the depth of the fat. h is what it leaves (`process`); a calibration by Eq 6
+Eq 6 has constants that depend on the depth of the fat. h is what it leaves (`fat.Residual`); a calibration by Eq 6
 alone has none. B differs from body to body by what a map does not show (seat, stiffness, moduli): ln SD(B) is a full
 quadratic in u, v and w. E differs from exam to exam of one body. A body of another origin than the table's departs by
 more, `other_sd`.

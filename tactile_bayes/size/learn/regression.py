@@ -287,7 +287,7 @@ def _weighted(terms: FloatArray, values: FloatArray, variance: FloatArray) -> Fl
     return np.asarray(np.linalg.lstsq(terms * root[:, None], values * root, rcond=None)[0])
 
 
-# --- Learning of what Eq 6 leaves of a population's sizes, see `size.process`, and of the spread between bodies.
+# --- Learning of what Eq 6 leaves of a population's sizes, see `size.fat`, and of the spread between bodies.
 #
 # Given the kernel and the spread of B, the weights have a normal posterior in closed form, and with them each
 # body's size as the others predict it. Kernel and spread are those by which bodies left out are most probable, with
