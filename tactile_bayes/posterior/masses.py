@@ -143,9 +143,11 @@ def _rise_assessed(seen: Assessment, estimate: Estimate) -> Rise:
     bump, lump, away = seen.bump(), _lump(estimate), None
     if lump is not None and estimate.map_posterior is not None:
         away = float(np.hypot(bump.x_mm - lump.x_mm, bump.y_mm - lump.y_mm))
-    return Rise(
-        bump.x_mm, bump.y_mm, away, bump.amplitude, bump.sigma_x_mm, bump.sigma_y_mm, seen.detection.probability
-    )
+    return _rise(bump, away, seen.detection.probability)
+
+
+def _rise(bump: ModalBump, away_mm: float | None, probability: float) -> Rise:
+    return Rise(bump.x_mm, bump.y_mm, away_mm, bump.amplitude, bump.sigma_x_mm, bump.sigma_y_mm, probability)
 
 
 def _at_rim(
@@ -160,9 +162,7 @@ def _at_rim(
     chance = best_chance(rest, candidates, options)
     if chance is None or chance.detection.probability < LEAST_PROBABILITY or chance.probability < LIKELY:
         return None
-    return Rise(
-        bump.x_mm, bump.y_mm, None, bump.amplitude, bump.sigma_x_mm, bump.sigma_y_mm, chance.detection.probability
-    )
+    return _rise(bump, None, chance.detection.probability)
 
 
 def _stands_out(rise: Rise, rest: TactileMap) -> bool:
@@ -261,11 +261,9 @@ def _probability(estimate: Estimate) -> float:
 
 def _place(estimate: Estimate) -> tuple[float, float]:
     """Centre in `plane`: of the posterior where there is one."""
-    posterior = estimate.map_posterior
-    if posterior is not None:
-        return float(np.median(posterior.x_mm)), float(np.median(posterior.y_mm))
-    assert estimate.bump is not None
-    return estimate.bump.x_mm, estimate.bump.y_mm
+    lump = _lump(estimate)
+    assert lump is not None
+    return lump.x_mm, lump.y_mm
 
 
 def _amplitude(estimate: Estimate) -> float:
