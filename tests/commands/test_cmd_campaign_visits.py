@@ -19,12 +19,13 @@ from tactile_bayes.files.tables import read_table
 
 HEAD = "file,patient,visit,mass,replicate,date,side"
 WIDTHS = {"P1": (4.6, 6.2), "P2": (5.0, 5.0)}
-"""Sigma of the bump at each visit, mm: one mass grows, one stays."""
+"""Sigma of the bump at each visit, mm: one mass grows, and is felt higher, one stays."""
 
 
 def written(path: Path, *, sigma: float, seed: int, landmarks: bool = True) -> None:
     rng = np.random.default_rng(seed)
-    values = bump_values(half_mm=35.0, x=2.0, y=-3.0, sigma_x=sigma, sigma_y=sigma, amplitude=0.3, level=1.0)
+    shape = {"x": 2.0, "y": -3.0, "sigma_x": sigma, "sigma_y": sigma, "amplitude": 0.3 * (sigma / 5.0) ** 2}
+    values = bump_values(half_mm=35.0, **shape, level=1.0)
     values = values + 0.004 * correlated_field(rng, len(values), length_cells=3.0)
     tactile_map = grid_map(values + 0.004 * rng.standard_normal(values.shape), normalise="gain")
     turn = np.eye(4)
