@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from tactile_bayes.api.estimating import answer_of, estimate_one
+from tactile_bayes.api.estimating import estimate_one
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.files.scan_mcap import read_scan
 from tactile_bayes.mapping.build import build_map
@@ -52,7 +52,7 @@ def measured(name: str, source: Source) -> dict[str, Any]:
     begun = time.process_time()
     tactile_map = source()
     mapped = time.process_time()
-    document = answer_of(estimate_one(tactile_map, Settings())).document
+    document = estimate_one(tactile_map, Settings()).answer.document
     done = time.process_time()
     assert document is not None
     keys = ("status", "reason_code")

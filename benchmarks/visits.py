@@ -21,8 +21,9 @@ from typing import Any
 
 import numpy as np
 
-from tactile_bayes.api.estimating import estimate_one, pooling_shape
+from tactile_bayes.api.estimating import estimate_one
 from tactile_bayes.api.settings import Settings
+from tactile_bayes.api.sized import pooling_shape
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import TactileBayesError
 from tactile_bayes.forward.scene import Scene, SceneLandmarks

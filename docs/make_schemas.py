@@ -10,8 +10,10 @@ from tactile_bayes.api.settings import SettingsFile
 from tactile_bayes.declarations import Record, schema_of
 from tactile_bayes.exports.identity import Worklist
 from tactile_bayes.files.column_map import ColumnMap
+from tactile_bayes.files.comparison import CompareReport
 from tactile_bayes.files.documents import OF_A_PERSON, Fact, FactName, Protocol, Session
 from tactile_bayes.files.instrument_json import HeadFile
+from tactile_bayes.files.reports import EstimateReport, Figures, Origin, PooledFigures, PooledReport, Shares
 from tactile_bayes.files.scene_toml import SceneFile
 from tactile_bayes.files.size_json import Eq6File, PopulationFile, RepeatabilityFile, SiteFile
 from tactile_bayes.report.tradeoff import TradeoffFile
@@ -19,10 +21,20 @@ from tactile_bayes.studies.population import BodiesFile
 from tactile_bayes.trial.planning import PlanReport
 from tactile_bayes.trial.summary import TrialReport
 
+REPORTS = ("compare.schema.json", "estimate.schema.json", "pooled.schema.json")
+"""Of these each record that stands in several places is described once."""
+OPEN_TABLES: dict[str, dict[str, type[Record]]] = {
+    "estimate.schema.json": {"diagnostics": Figures, "provenance": Origin, "variance_share": Shares},
+    "pooled.schema.json": {"figures": PooledFigures},
+}
+"""Of tables with any keys those that readers use, which `__post_init__` of the report checks."""
 SCHEMAS = Path(__file__).resolve().parent.parent / "data_schema"
 OF_JSON: dict[str, type[Record]] = {
+    "compare.schema.json": CompareReport,
+    "estimate.schema.json": EstimateReport,
     "head.schema.json": HeadFile,
     "plan.schema.json": PlanReport,
+    "pooled.schema.json": PooledReport,
     "repeatability.schema.json": RepeatabilityFile,
     "size_calibration.schema.json": Eq6File,
     "size_population.schema.json": PopulationFile,
@@ -42,10 +54,20 @@ OF_TOML: dict[str, type[Record]] = {
 
 def schemas() -> dict[Path, str]:
     """What each generated schema has to hold."""
-    found = {name: schema_of(kind) for name, kind in OF_JSON.items()}
+    found = {name: schema_of(kind, shared=name in REPORTS) for name, kind in OF_JSON.items()}
     found |= {name: schema_of(kind, nulls=False) for name, kind in OF_TOML.items()}
     found["scan_session.schema.json"] = _session()
+    for name, tables in OPEN_TABLES.items():
+        for key, kind in tables.items():
+            _add_known(found[name]["properties"][key], schema_of(kind))
     return {SCHEMAS / name: json.dumps(one, indent=2, ensure_ascii=False) + "\n" for name, one in found.items()}
+
+
+def _add_known(table: dict[str, Any], known: dict[str, Any]) -> None:
+    """Say of a table with any keys what some of them hold."""
+    for form in table.get("anyOf", [table]):
+        if form.get("type") == "object":
+            form |= {name: known[name] for name in ("properties", "required") if name in known}
 
 
 def _session() -> dict[str, Any]:

@@ -49,11 +49,11 @@ __all__ = [
 
 _HOME = {
     "Comparison": "api.comparing",
-    "Draws": "api.sized",
+    "Draws": "api.draws",
     "ExportedFiles": "api.exporting",
     "Map": "api.maps",
-    "PooledSize": "api.estimates",
-    "SizeEstimate": "api.estimates",
+    "PooledSize": "api.pooled",
+    "SizeEstimate": "api.sized",
     "TrialResult": "api.trial_report",
     "build_map": "api.maps",
     "calibrate_repeatability": "api.trials",
@@ -62,7 +62,7 @@ _HOME = {
     "demo_map": "api.maps",
     "demo_scan": "api.maps",
     "estimate": "api.estimates",
-    "exam_report": "api.estimates",
+    "exam_report": "api.exam_report",
     "export": "api.exporting",
     "pool": "api.estimates",
     "read_map": "api.maps",

@@ -20,7 +20,9 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 import types
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from datetime import date
 from functools import cache
@@ -34,6 +36,7 @@ from typing import (
     Literal,
     TypeVar,
     Union,
+    cast,
     dataclass_transform,
     get_args,
     get_origin,
@@ -224,17 +227,36 @@ def to_plain(record: object, *, digits: int = 9) -> Any:
     return _rounded(msgspec.to_builtins(record, enc_hook=_lists, str_keys=True), digits)
 
 
-def schema_of(kind: Any, *, nulls: bool = True) -> dict[str, Any]:
+def rounded(value: T, digits: int = 9) -> T:
+    """A record, or plain data, whose floats have so many significant digits, as files have them."""
+    found: Any = value
+    if isinstance(value, msgspec.Struct):
+        found = type(value)(**{name: rounded(getattr(value, name), digits) for name in value.__struct_fields__})
+    elif isinstance(value, float):
+        found = float(f"{value:.{digits}g}")
+    elif isinstance(value, dict):
+        found = {key: rounded(one, digits) for key, one in value.items()}
+    elif isinstance(value, list | tuple):
+        found = type(value)(rounded(one, digits) for one in value)
+    return cast("T", found)
+
+
+def schema_of(kind: Any, *, nulls: bool = True, shared: bool = False) -> dict[str, Any]:
     """JSON schema (draft 7) of a record's files, from its declaration; the first line of its docstring is the title.
 
     Parameters
     ----------
     nulls
         Whether the files can hold null: those of TOML cannot.
+    shared
+        Whether a record that stands in several places is described once, among ``definitions``.
     """
     found = msgspec.json.schema(kind, schema_hook=_custom_schema)
     definitions = found.pop("$defs", {})
-    body = _inlined(found, definitions)
+    several = _repeated([found, definitions]) if shared else {}
+    body = _inlined(found, {**definitions, **several})
+    if several:
+        body["definitions"] = {name: _inlined(definitions[name], {**definitions, **several}) for name in several}
     title, _, meaning = body.pop("description", "").partition("\n")
     head = {"$schema": "http://json-schema.org/draft-07/schema#", "title": title.rstrip(".")}
     if meaning.strip():
@@ -317,6 +339,14 @@ def _rounded(value: Any, digits: int) -> Any:
 
 # Schemas
 
+_DEFINED: Final = "#/definitions/"
+
+
+def _repeated(schema: Any) -> dict[str, Any]:
+    """References to the definitions that are named in several places, by their names."""
+    names = Counter(re.findall(r'"\$ref":"#/\$defs/([^"]+)"', msgspec.json.encode(schema).decode()))
+    return {name: {"$ref": f"{_DEFINED}{name}"} for name, times in sorted(names.items()) if times > 1}
+
 
 def _inlined(schema: Any, definitions: Mapping[str, Any]) -> Any:
     """A schema with its definitions in place, tuples as draft 7 has them, and no names of classes."""
@@ -324,7 +354,12 @@ def _inlined(schema: Any, definitions: Mapping[str, Any]) -> Any:
         return [_inlined(one, definitions) for one in schema]
     if not isinstance(schema, dict):
         return schema
+    if str(schema.get("$ref")).startswith(_DEFINED):
+        return schema
     if "$ref" in schema:
+        named = definitions[schema["$ref"].rsplit("/", 1)[-1]]
+        if "$ref" in named:  # what stands beside a reference is not read
+            return {"allOf": [named], **rest} if (rest := {k: v for k, v in schema.items() if k != "$ref"}) else named
         schema = {**definitions[schema["$ref"].rsplit("/", 1)[-1]], **{k: v for k, v in schema.items() if k != "$ref"}}
     found = {key: _inlined(one, definitions) for key, one in schema.items()}
     if "properties" in found:

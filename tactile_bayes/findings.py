@@ -90,9 +90,30 @@ class Finding(Record):
         subject = f"{self.about}: " if self.about else ""
         return f"{subject}{self.text}{f'; {remedy}' if remedy else ''}"
 
+    @property
+    def entry(self) -> FindingEntry:
+        """The finding as files have it."""
+        return FindingEntry(self.severity, self.kind, self.text, self.remedy, self.on_paper, self.about)
+
     def as_dict(self) -> dict[str, str]:
         """Plain data, as files have it."""
-        return {"severity": self.severity} | as_dict(self)
+        return as_dict(self.entry)
+
+
+class FindingEntry(Record):
+    """A finding in a file, where its severity stands first."""
+
+    severity: Severity
+    kind: str
+    text: str
+    remedy: str
+    on_paper: str
+    about: str
+
+    @property
+    def finding(self) -> Finding:
+        """The finding; a `BadDataError` where this version does not know its kind."""
+        return Finding(self.kind, self.text, self.remedy, self.on_paper, self.about)
 
 
 def by_weight(findings: Iterable[Finding]) -> tuple[Finding, ...]:

@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from tactile_bayes.api.estimating import answer_of, estimate_one
+from tactile_bayes.api.estimating import estimate_one
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.declarations import replace
 from tactile_bayes.files.scan_mcap import read_scan
@@ -75,7 +75,7 @@ def shouldered(exam: Exam, tactile_map: TactileMap) -> TactileMap:
 
 def _answered(tactile_map: TactileMap) -> Row:
     """What an estimate lists on a map."""
-    document = answer_of(estimate_one(tactile_map, Settings())).document
+    document = estimate_one(tactile_map, Settings()).answer.document
     assert document is not None
     keys = ("reported", "centre_mm", "detected_probability", "max_size_mm", "reason", "reason_code")
     masses = [{name: mass[name] for name in keys} for mass in document["masses"]]

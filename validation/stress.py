@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from tactile_bayes.api.estimating import answer_of, estimate_one
+from tactile_bayes.api.estimating import estimate_one
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, TactileBayesError
@@ -147,7 +147,7 @@ def document_of(scan: Scan) -> dict[str, Any]:
     """What `map` and `estimate` make of a scan, as `estimate --json` prints it, with the map's figures."""
     tactile_map = build_map(scan)
     outcome = estimate_one(tactile_map, Settings())
-    return {**(answer_of(outcome).document or {}), "quality": dict(tactile_map.quality)}
+    return {**(outcome.answer.document or {}), "quality": dict(tactile_map.quality)}
 
 
 def simulate(folder: Path, bodies: int) -> None:

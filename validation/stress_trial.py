@@ -16,9 +16,10 @@ from typing import Any
 
 import numpy as np
 
-from tactile_bayes.api.estimating import Answer, answer_of, estimate_one
+from tactile_bayes.api.estimating import estimate_one
 from tactile_bayes.api.pooled import pool_answers
 from tactile_bayes.api.settings import Settings
+from tactile_bayes.api.sized import Answer
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import TactileBayesError
 from tactile_bayes.mapping.build import build_map
@@ -56,7 +57,7 @@ def answers_of(scans: list[Scan]) -> list[Answer]:
     found = []
     for scan in scans:
         try:
-            found.append(answer_of(estimate_one(build_map(scan), Settings())))
+            found.append(estimate_one(build_map(scan), Settings()).answer)
         except TactileBayesError as error:
             print(f"    no map: {error}")
     return found

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -13,39 +13,37 @@ from typing import TYPE_CHECKING, Any
 import click
 from click.core import ParameterSource
 
-from tactile_bayes.api.comparing import compare_answers, drawn_maps
-from tactile_bayes.api.estimating import Answer, answer_file, answer_of, estimate_file
-from tactile_bayes.api.exam_report import ExamFiles, Given, read_exam
+from tactile_bayes.api.comparing import Comparison, compare_estimates
+from tactile_bayes.api.estimating import answer_file, estimate_file
+from tactile_bayes.api.exam_report import ExamFiles, read_exam
 from tactile_bayes.api.maps import map_provenance
-from tactile_bayes.api.pooled import elsewhere, of_one_mass, pool_answers
+from tactile_bayes.api.pooled import PooledSize, of_one_mass, pool_answers
 from tactile_bayes.api.settings import Comparing, Settings, refuse_checkpoint, times_of
+from tactile_bayes.api.sized import Answer, SizeEstimate
 from tactile_bayes.batch import BatchInterrupted, cluster_executor, fault_lines, local_executor, run_batch
 from tactile_bayes.commands.options import also_read, settings_of
 from tactile_bayes.commands.progress import progress_bar
 from tactile_bayes.declarations import EXACT, replace, to_plain
 from tactile_bayes.errors import EXIT_DONE, EXIT_FAULT, EXIT_NO_ESTIMATE, UsageError
 from tactile_bayes.files.atomic import given_twice, refuse_existing
-from tactile_bayes.files.documents import check_document, dump_json
-from tactile_bayes.files.map_nc import write_map, write_pooled
+from tactile_bayes.files.documents import dump_json
+from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.files.provenance import repeated_scans
+from tactile_bayes.files.reports import json_text
 from tactile_bayes.files.size_json import size_calibration_path
-from tactile_bayes.findings import findings_in
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.options import MapOptions
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.compare import compare_summary, compare_text
-from tactile_bayes.report.estimate_figures import draw_comparison, draw_figures, draw_size
+from tactile_bayes.report.estimate_figures import draw_figures, draw_size
 from tactile_bayes.report.exam_page import PageFiles
-from tactile_bayes.report.exam_words import headline
+from tactile_bayes.report.exam_words import Given, headline
 from tactile_bayes.report.figure_file import named_exam
 from tactile_bayes.report.map_figure import map_figure
 from tactile_bayes.report.map_text import map_text
 from tactile_bayes.report.pooled import pooled_summary, pooled_text
 
 if TYPE_CHECKING:
-    from tactile_bayes.api.comparing import ComparedOutcome
-    from tactile_bayes.api.estimating import Outcome as MapOutcome
-    from tactile_bayes.api.pooled import PooledOutcome
     from tactile_bayes.batch import Outcome
 
 
@@ -169,43 +167,34 @@ def estimate_pool(
     A map that could not be read stops it: its error is printed, for a mass is not sized from what is left by accident.
     """
     if settings.centre_mm is None:
+        reports = [answer.report for answer in answers]
         answers = of_one_mass(
-            answers, lambda i, place: answer_file(maps[i], settings=replace(settings, centre_mm=place))
+            answers, reports, lambda i, place: answer_file(maps[i], settings=replace(settings, centre_mm=place))
         )
-    failed = [answer for answer in answers if answer.document is None]
+    failed = [answer for answer in answers if answer.report is None]
     for answer in failed:
         click.echo(answer.text, err=True)
     if failed:
         return failed[0].exit_code
     inputs = {f"map_{i + 1}": one for i, one in enumerate(maps)}
     found = pool_answers(answers, settings, names=[str(one) for one in maps], inputs=inputs)
-    check_document(found.document, "pooled.schema.json", path=Path("the report"))
-    text_of = dump_json if as_json else pooled_text if verbose else pooled_summary
+    report = found.pooled_report.checked()
+    text_of = json_text if as_json else pooled_text if verbose else pooled_summary
     try:
         if found.pooled.size is not None:
-            _write_pooled(found, maps, settings, output, figure, force=force)
+            _write_pooled(found, output, figure, force=force)
     finally:  # what was computed is not lost with a file
-        click.echo(text_of(found.document), nl=False)
+        click.echo(text_of(report), nl=False)
     return EXIT_DONE if found.pooled.size is not None else EXIT_NO_ESTIMATE
 
 
-def _write_pooled(
-    found: PooledOutcome,
-    maps: tuple[Path, ...],
-    settings: Settings,
-    output: Path | None,
-    figure: Path | None,
-    *,
-    force: bool,
-) -> None:
-    size, provenance = found.pooled.size, found.provenance
-    assert size is not None
+def _write_pooled(found: PooledSize, output: Path | None, figure: Path | None, *, force: bool) -> None:
     if output is not None:
-        write_pooled(output, size, provenance=provenance, document=found.document, force=force)
-    if figure is not None:
-        name = named_exam(f"{len(maps)} maps pooled", provenance.scans)
-        findings = findings_in(found.document["findings"])
-        draw_size(size, figure, name=name, probability=settings.interval, findings=findings, force=force)
+        found.write(output, force=force)
+    size, probability = found.pooled.size, found.probability
+    if figure is not None and size is not None:
+        name = named_exam(f"{len(found.pooled_report.maps)} maps pooled", found.provenance.scans)
+        draw_size(size, figure, name=name, probability=probability, findings=found.findings, force=force)
 
 
 # --- `estimate`: estimate sizes from tactile maps.
@@ -244,15 +233,15 @@ def estimate_action(
         printed = {"as_json": as_json, "verbose": verbose}
         ctx.exit(estimate_pool(maps, answers, settings, output, figure, **printed, force=force))
     if len(maps) == 1:
-        outcome = _one_map(maps[0], settings)
-        answers = [answer_of(outcome)]
+        found = _one_map(maps[0], settings)
+        answers = [found.answer]
     else:
-        outcome = None
+        found = None
         with _printed_if_interrupted(maps, as_json=as_json, verbose=verbose):
             answers = _many_maps(maps, settings, workers=workers, scheduler=scheduler)
     try:
-        if outcome is not None:
-            _write(outcome, answers[0], output, (figure, map_figure, fit_figure), name=maps[0].stem, force=force)
+        if found is not None:
+            _write(found, output, (figure, map_figure, fit_figure), force=force)
     finally:  # what was computed is not lost with a file
         if verbose:
             print(f"estimate: {time.perf_counter() - begun:.3f} s", file=sys.stderr)
@@ -274,7 +263,7 @@ def _check_outputs(outputs: list[Path], maps: tuple[Path, ...], pool: bool, *, f
         refuse_existing(path, force=force)
 
 
-def _one_map(path: Path, settings: Settings) -> MapOutcome:
+def _one_map(path: Path, settings: Settings) -> SizeEstimate:
     with progress_bar("effective draws") as progress:
         return estimate_file(
             path, settings, progress=progress, notice=lambda line: click.echo(f"{path}: {line}", err=True)
@@ -282,20 +271,17 @@ def _one_map(path: Path, settings: Settings) -> MapOutcome:
 
 
 def _write(
-    outcome: MapOutcome,
-    answer: Answer,
+    found: SizeEstimate,
     output: Path | None,
     figures: tuple[Path | None, Path | None, Path | None],
     *,
-    name: str,
     force: bool,
 ) -> None:
-    tactile_map, estimate = outcome.tactile_map, outcome.estimate
-    if output and estimate.status == "estimate":
-        outcome.write(output, document=answer.document, force=force)
+    if output and found.status == "estimate":
+        found.write(output, force=force)
     if any(figures):
-        name = named_exam(name, outcome.provenance.scans)
-        draw_figures(tactile_map, estimate, *figures, name=name, probability=outcome.settings.interval, force=force)
+        name, probability = named_exam(found.name, found.provenance.scans), found.probability
+        draw_figures(found.tactile_map, found.estimate, *figures, name=name, probability=probability, force=force)
 
 
 def _many_maps(maps: tuple[Path, ...], settings: Settings, *, workers: int, scheduler: str | None) -> list[Answer]:
@@ -333,22 +319,20 @@ def _printed_if_interrupted(maps: tuple[Path, ...], *, as_json: bool, verbose: b
 def _print(maps: Sequence[Path], answers: list[Answer], *, as_json: bool, verbose: bool, listed: bool) -> None:
     """Print errors on stderr and answers on stdout: in full with `verbose`, `listed` for several maps."""
     for answer in answers:
-        if answer.document is None and answer.text:
+        if answer.report is None and answer.text:
             click.echo(answer.text, err=True)
     if as_json:
-        documents = [answer.document for answer in answers if answer.document is not None]
-        for document in documents:
-            check_document(document, "estimate.schema.json", path=Path("the report"))
+        documents = [answer.report.checked().document for answer in answers if answer.report is not None]
         click.echo(dump_json(documents if listed else documents[0]), nl=False)
         return
     for path, answer in zip(maps, answers, strict=True):
-        if answer.document is not None:
+        if answer.report is not None:
             click.echo((f"{path}\n" if listed else "") + (answer.full_text if verbose else answer.text), nl=listed)
 
 
 def _exit_code(answers: list[Answer]) -> int:
     """The first error's code, else 6 when a map gave no estimate, else 0."""
-    failed = [answer.exit_code for answer in answers if answer.document is None]
+    failed = [answer.exit_code for answer in answers if answer.report is None]
     if failed:
         return failed[0]
     return EXIT_NO_ESTIMATE if any(answer.exit_code for answer in answers) else EXIT_DONE
@@ -395,15 +379,15 @@ def compare_action(
     if figure is not None:
         refuse_existing(figure, force=force)
     also_read(None if size_calibration is None else size_calibration_path(size_calibration))
-    outcome, draw = _compare(visits, settings, comparing)
-    check_document(outcome.document, "compare.schema.json", path=Path("the report"))
-    text_of = dump_json if as_json else compare_text if verbose else compare_summary
+    found = _compare(visits, settings, comparing)
+    report = found.report.checked()
+    text_of = json_text if as_json else compare_text if verbose else compare_summary
     try:
         if figure is not None:
-            draw(figure, force)
+            found.draw(figure, force=force)
     finally:  # what was computed is not lost with the figure
-        click.echo(text_of(outcome.document), nl=False)
-    ctx.exit(outcome.exit_code)
+        click.echo(text_of(report), nl=False)
+    ctx.exit(found.exit_code)
 
 
 def _check_maps(visits: list[tuple[Path, ...]], settings: Settings) -> None:
@@ -413,28 +397,13 @@ def _check_maps(visits: list[tuple[Path, ...]], settings: Settings) -> None:
     refuse_checkpoint(settings)
 
 
-def _compare(
-    visits: list[tuple[Path, ...]], settings: Settings, comparing: Comparing
-) -> tuple[ComparedOutcome, Callable[[Path, bool], None]]:
-    """Estimate every map and compare; also gives what draws the figure. An error with one map stops it."""
-    total, outcomes = sum(len(maps) for maps in visits), []
+def _compare(visits: list[tuple[Path, ...]], settings: Settings, comparing: Comparing) -> Comparison:
+    """Estimate every map and compare. An error with one map stops it."""
+    total, found = sum(len(maps) for maps in visits), list[list[SizeEstimate]]()
     with progress_bar("maps") as progress:
         for maps in visits:
-            outcomes.append([estimate_file(path, settings) for path in maps])
-            progress(sum(len(one) for one in outcomes), total)
-    answers = [[answer_of(outcome) for outcome in maps] for maps in outcomes]
-    if settings.centre_mm is None:
-        places = [(v, i) for v, maps in enumerate(visits) for i in range(len(maps))]
-        for number, place in elsewhere([answers[v][i].document for v, i in places]).items():
-            v, i = places[number]
-            outcomes[v][i] = estimate_file(visits[v][i], replace(settings, centre_mm=place))
-            answers[v][i] = answer_of(outcomes[v][i])
+            found.append([estimate_file(path, settings) for path in maps])
+            progress(sum(len(one) for one in found), total)
     names = [[str(path) for path in maps] for maps in visits]
     inputs = {f"visit_{v}_map_{i}": path for v, maps in enumerate(visits, 1) for i, path in enumerate(maps, 1)}
-    compared = compare_answers(answers, settings, comparing=comparing, names=names, inputs=inputs)
-
-    def draw(figure: Path, force: bool) -> None:
-        drawn = drawn_maps([[outcome.tactile_map for outcome in maps] for maps in outcomes], answers)
-        draw_comparison(compared.compared, compared.document, drawn, figure, force=force)
-
-    return compared, draw
+    return compare_estimates(found, settings, comparing=comparing, names=names, inputs=inputs)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from html import escape
 from itertools import chain
@@ -12,19 +11,21 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tactile_bayes.api.arguments import door, plain, sequence_of
-from tactile_bayes.api.estimates import SizeEstimate, estimated, of_one_mass, settings_of
-from tactile_bayes.api.estimating import Answer, size_priors
+from tactile_bayes.api.draws import Draws
+from tactile_bayes.api.estimates import estimated, settings_of
 from tactile_bayes.api.maps import Map, PathLike, path_of
-from tactile_bayes.api.pooled import common_calibration, place_of
+from tactile_bayes.api.pooled import common_calibration, one_mass, place_of
 from tactile_bayes.api.repeatability import check_repeatability, repeatability_digest
 from tactile_bayes.api.settings import GROWN_BY, Comparing, Settings, refuse_checkpoint, times_of
-from tactile_bayes.api.sized import Draws
+from tactile_bayes.api.sized import Answer, SizeEstimate, size_priors
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import EXIT_DONE, EXIT_NO_ESTIMATE, UsageError
+from tactile_bayes.files.comparison import CompareReport
 from tactile_bayes.files.provenance import Provenance, hash_inputs, repeated_scans, scans_of
+from tactile_bayes.files.reports import centre_of
 from tactile_bayes.findings import Finding, Verdict, by_weight, finding_lines, verdict
 from tactile_bayes.presets import REGISTRATION_MM, RESEARCH_USE
-from tactile_bayes.report.compare import compare_document, compare_summary, compare_text
+from tactile_bayes.report.compare import compare_report, compare_summary, compare_text
 from tactile_bayes.report.estimate_figures import DrawnMap, draw_comparison
 from tactile_bayes.report.pooled import disagreement, fat_apart
 from tactile_bayes.size.fat import LEAST_PROBABILITY, one_size_of
@@ -54,16 +55,112 @@ if TYPE_CHECKING:
 # --- Two visits and more compared: whether they are of one mass, and the change of its size.
 
 
-class ComparedOutcome(Record, eq=False):
-    """A comparison with its JSON object."""
+class Comparison(Record, eq=False):
+    """The size of one mass at several visits, and its change from the first to the last."""
 
     compared: Compared
-    document: dict[str, Any]
+    report: CompareReport
+    settings: Settings
+    visits: tuple[tuple[SizeEstimate, ...], ...] = ()
+    """The estimates of each visit's maps alone, where they are at hand."""
+
+    @property
+    def probability(self) -> float:
+        """Of the intervals that are shown where none is asked for."""
+        return self.settings.interval
 
     @property
     def exit_code(self) -> int:
         """0 for a comparison, else 6."""
         return EXIT_DONE if self.compared.joint is not None else EXIT_NO_ESTIMATE
+
+    @property
+    def _change(self) -> Change | None:
+        joint = self.compared.joint
+        return None if joint is None else joint.change(0, len(self.report.visits) - 1)
+
+    @property
+    def status(self) -> str:
+        """``"compared"``, ``"not_one_mass"`` or ``"no_estimate"``."""
+        return self.compared.status
+
+    @property
+    def why(self) -> str:
+        """Why nothing is compared; empty where something is."""
+        return self.compared.reason
+
+    @property
+    def change_percent(self) -> Draws | None:
+        """Change of the diameter in percent; None where nothing is compared."""
+        change = self._change
+        if change is None:
+            return None
+        percent = 100.0 * np.expm1(change.log_ratio)
+        return Draws(np.atleast_2d(percent), "%", self.probability, change.replicates)
+
+    @property
+    def sizes_mm(self) -> tuple[Draws, ...]:
+        """Largest diameter at each visit; empty where nothing is compared."""
+        joint = self.compared.joint
+        if joint is None:
+            return ()
+        drawn = np.exp(joint.log_size)
+        return tuple(Draws(np.atleast_2d(one), "mm", self.probability, joint.replicates) for one in drawn)
+
+    def probability_grown(self, share: float = 0.0) -> float | None:
+        """Probability that the diameter has grown by more than a share of it (0.2: by more than 20 %)."""
+        change = self._change
+        return None if change is None else change.probability_above(share)
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What speaks against the comparison, cautions first."""
+        return self.compared.findings
+
+    @property
+    def verdict(self) -> Verdict:
+        """``"sound"``, ``"doubtful"`` where a caution stands, or ``"no_answer"`` where nothing is compared."""
+        return verdict(self.findings, answered=self._change is not None)
+
+    @property
+    def growth(self) -> str | None:
+        """``"grown"``, ``"shrunk"`` or ``"no_change_shown"``; None where nothing is compared."""
+        changes = self.report.changes
+        return changes[-1].verdict if changes else None
+
+    @property
+    def document(self) -> dict[str, Any]:
+        """What ``compare --json`` prints."""
+        return self.report.document
+
+    @property
+    def text(self) -> str:
+        """What ``compare`` prints."""
+        return compare_summary(self.report)
+
+    @property
+    def full_text(self) -> str:
+        """What ``compare -v`` prints."""
+        return compare_text(self.report)
+
+    @door
+    def plot(self, path: PathLike | None = None, *, force: bool = False) -> Figure:
+        """Draw the visits' maps, their difference and the change; with a path also write it."""
+        return self.draw(path_of(path), force=force)
+
+    def draw(self, path: Path | None, *, force: bool) -> Figure:
+        """The same for the command line, whose errors name options."""
+        maps = [[one.tactile_map for one in visit] for visit in self.visits]
+        drawn = drawn_maps(maps, [[one.answer for one in visit] for visit in self.visits])
+        return draw_comparison(self.compared, self.report, drawn, path, force=force)
+
+    def __repr__(self) -> str:
+        cautions = finding_lines(self.findings, "caution", paper=True)
+        words = f"not compared: {self.why}" if self.growth is None else f"{self.change_percent}, {self.growth}"
+        return f"<Comparison {' '.join([*cautions, f'of {len(self.report.visits)} visits: {words}'])}>"
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{escape(self.text)}</pre><p><small>{escape(RESEARCH_USE)}</small></p>"
 
 
 def compare_answers(
@@ -73,7 +170,7 @@ def compare_answers(
     comparing: Comparing,
     names: Sequence[Sequence[str]],
     inputs: Mapping[str, Path],
-) -> ComparedOutcome:
+) -> Comparison:
     """Compare the visits of one mass.
 
     Parameters
@@ -108,9 +205,9 @@ def compare_answers(
     compared = replace(compared, findings=by_weight((*compared.findings, *_of_visits(visits))))
     scans = [scan for one in visits for scan in _scans(one)]
     provenance = Provenance("compare", _recorded(settings, comparing), digests, seed=settings.seed, scans=scans)
-    document = compare_document(
+    report = compare_report(
         compared,
-        [[answer.document or {} for answer in one] for one in visits],
+        [[answer.report for answer in one if answer.report is not None] for one in visits],
         names,
         days=comparing.days,
         grown_by=comparing.grown_by,
@@ -118,15 +215,29 @@ def compare_answers(
         provenance=provenance,
         repeatability=settings.repeatability,
     )
-    return ComparedOutcome(compared, document)
+    return Comparison(compared, report, settings)
+
+
+def compare_estimates(
+    visits: Sequence[Sequence[SizeEstimate]],
+    settings: Settings,
+    *,
+    comparing: Comparing,
+    names: Sequence[Sequence[str]],
+    inputs: Mapping[str, Path],
+) -> Comparison:
+    """Compare visits, maps estimated again where they are of another mass; see `compare_answers`."""
+    every = iter(one_mass([one for visit in visits for one in visit]))
+    same = tuple(tuple(next(every) for _ in visit) for visit in visits)
+    answers = [[one.answer for one in visit] for visit in same]
+    return replace(compare_answers(answers, settings, comparing=comparing, names=names, inputs=inputs), visits=same)
 
 
 def drawn_maps(maps: Sequence[Sequence[TactileMap]], visits: Sequence[Sequence[Answer]]) -> list[list[DrawnMap]]:
     """The maps of each visit with the places of their lumps, for the figure."""
 
     def place(answer: Answer) -> tuple[float, float] | None:
-        centre = None if answer.document is None or answer.shape is None else answer.document["centre_mm"]
-        return None if centre is None else (centre["x"]["median"], centre["y"]["median"])
+        return None if answer.report is None or answer.shape is None else centre_of(answer.report.centre_mm)
 
     return [
         [DrawnMap(one, place(answer)) for one, answer in zip(some, answers, strict=True)]
@@ -159,7 +270,7 @@ def _by_place(
     visits: Sequence[Sequence[Answer]], comparing: Comparing
 ) -> tuple[Compared | None, tuple[Apart | None, ...], list[Finding]]:
     """Refusal where the places do not show one mass, the distances from the first visit, and what else speaks of it."""
-    of_maps = [[place for answer in maps if (place := place_of(answer.document)) is not None] for maps in visits]
+    of_maps = [[place for answer in maps if (place := place_of(answer.report)) is not None] for maps in visits]
     places = [Place.mean_of(one) for one in of_maps]
     found = tuple(
         None if first is None or later is None else apart(first, later, registration_mm=comparing.registration_mm)
@@ -275,7 +386,7 @@ def _refuse_repeated(visits: Sequence[Sequence[Answer]], names: Sequence[str]) -
 
 
 def _scans(answers: Sequence[Answer]) -> list[Mapping[str, str]]:
-    return [scan for one in answers if one.document is not None for scan in scans_of(one.document["provenance"])]
+    return [scan for one in answers if one.report is not None for scan in scans_of(one.report.provenance)]
 
 
 _RECORDED = ("size_calibration", "method", "interval", "scene", "between_map_sd", "repeatability")
@@ -291,112 +402,6 @@ def _recorded(settings: Settings, comparing: Comparing) -> dict[str, Any]:
         "same_mass": comparing.same_mass,
         "registration_mm": comparing.registration_mm,
     }
-
-
-# --- Comparison of a mass's size at several visits.
-
-
-@dataclasses.dataclass(frozen=True, eq=False, repr=False)
-class Comparison:
-    """The size of one mass at several visits, and its change from the first to the last.
-
-    Parameters
-    ----------
-    outcome
-        The comparison and its JSON object.
-    visits
-        The estimates of each visit's maps alone.
-    probability
-        Of the intervals that are shown where none is asked for.
-    """
-
-    outcome: ComparedOutcome
-    visits: tuple[tuple[SizeEstimate, ...], ...]
-    probability: float
-
-    @property
-    def _change(self) -> Change | None:
-        joint = self.outcome.compared.joint
-        return None if joint is None else joint.change(0, len(self.visits) - 1)
-
-    @property
-    def status(self) -> str:
-        """``"compared"``, ``"not_one_mass"`` or ``"no_estimate"``."""
-        return self.outcome.compared.status
-
-    @property
-    def why(self) -> str:
-        """Why nothing is compared; empty where something is."""
-        return self.outcome.compared.reason
-
-    @property
-    def change_percent(self) -> Draws | None:
-        """Change of the diameter in percent; None where nothing is compared."""
-        change = self._change
-        if change is None:
-            return None
-        percent = 100.0 * np.expm1(change.log_ratio)
-        return Draws(np.atleast_2d(percent), "%", self.probability, change.replicates)
-
-    @property
-    def sizes_mm(self) -> tuple[Draws, ...]:
-        """Largest diameter at each visit; empty where nothing is compared."""
-        joint = self.outcome.compared.joint
-        if joint is None:
-            return ()
-        drawn = np.exp(joint.log_size)
-        return tuple(Draws(np.atleast_2d(one), "mm", self.probability, joint.replicates) for one in drawn)
-
-    def probability_grown(self, share: float = 0.0) -> float | None:
-        """Probability that the diameter has grown by more than a share of it (0.2: by more than 20 %)."""
-        change = self._change
-        return None if change is None else change.probability_above(share)
-
-    @property
-    def findings(self) -> tuple[Finding, ...]:
-        """What speaks against the comparison, cautions first."""
-        return self.outcome.compared.findings
-
-    @property
-    def verdict(self) -> Verdict:
-        """``"sound"``, ``"doubtful"`` where a caution stands, or ``"no_answer"`` where nothing is compared."""
-        return verdict(self.findings, answered=self._change is not None)
-
-    @property
-    def growth(self) -> str | None:
-        """``"grown"``, ``"shrunk"`` or ``"no_change_shown"``; None where nothing is compared."""
-        changes = self.document["changes"]
-        return str(changes[-1]["verdict"]) if changes else None
-
-    @property
-    def document(self) -> dict[str, Any]:
-        """What ``compare --json`` prints."""
-        return self.outcome.document
-
-    @property
-    def text(self) -> str:
-        """What ``compare`` prints."""
-        return compare_summary(self.document)
-
-    @property
-    def full_text(self) -> str:
-        """What ``compare -v`` prints."""
-        return compare_text(self.document)
-
-    @door
-    def plot(self, path: PathLike | None = None, *, force: bool = False) -> Figure:
-        """Draw the visits' maps, their difference and the change; with a path also write it."""
-        maps = [[one.outcome.tactile_map for one in visit] for visit in self.visits]
-        drawn = drawn_maps(maps, [[one.answer for one in visit] for visit in self.visits])
-        return draw_comparison(self.outcome.compared, self.document, drawn, path_of(path), force=force)
-
-    def __repr__(self) -> str:
-        cautions = finding_lines(self.findings, "caution", paper=True)
-        words = f"not compared: {self.why}" if self.growth is None else f"{self.change_percent}, {self.growth}"
-        return f"<Comparison {' '.join([*cautions, f'of {len(self.visits)} visits: {words}'])}>"
-
-    def _repr_html_(self) -> str:
-        return f"<pre>{escape(self.text)}</pre><p><small>{escape(RESEARCH_USE)}</small></p>"
 
 
 @door
@@ -449,15 +454,11 @@ def compare(
     comparing = Comparing(times, shares, same_mass, plain(registration_mm))
     comparing.check_visits(2 + len(more))
     visits = tuple(_visit(one, settings) for one in (first, second, *more))
-    prints = [one.outcome.tactile_map.fingerprint for visit in visits for one in visit]
+    prints = [one.tactile_map.fingerprint for visit in visits for one in visit]
     if len(set(prints)) < len(prints):
         raise UsageError("a map is given twice; give each map once, at its own visit")
-    same = iter(of_one_mass([one for visit in visits for one in visit]))
-    visits = tuple(tuple(next(same) for _ in visit) for visit in visits)
     names = [[one.name or f"visit {v} map {i}" for i, one in enumerate(visit, 1)] for v, visit in enumerate(visits, 1)]
-    answers = [[one.answer for one in visit] for visit in visits]
-    outcome = compare_answers(answers, used, comparing=comparing, names=names, inputs={})
-    return Comparison(outcome, visits, used.interval)
+    return compare_estimates(visits, used, comparing=comparing, names=names, inputs={})
 
 
 def _visit(given: Any, settings: dict[str, Any]) -> tuple[SizeEstimate, ...]:

@@ -1,292 +1,29 @@
-"""Estimates in Python: `estimate`, `pool`, `exam_report`, and what they return."""
+"""Estimates from Python: `estimate` and `pool`, with their keywords."""
 
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from tactile_bayes.api.arguments import check_keywords, door, in_keywords, plain, sequence_of
-from tactile_bayes.api.estimating import Answer, Outcome, answer_of, estimate_one
-from tactile_bayes.api.exam_report import EstimatedMap, ExamFiles, Given, make_exam, read_exam
-from tactile_bayes.api.maps import Map, PathLike, map_of, output_path, path_of
-from tactile_bayes.api.pooled import elsewhere, pool_answers
+from tactile_bayes.api.arguments import check_keywords, door, plain, sequence_of
+from tactile_bayes.api.estimating import estimate_one
+from tactile_bayes.api.maps import Map, map_of, path_of
+from tactile_bayes.api.pooled import PooledSize, pool_estimates
 from tactile_bayes.api.settings import Settings, refuse_checkpoint
-from tactile_bayes.api.sized import Draws, MassEstimate, Sized
+from tactile_bayes.api.sized import SizeEstimate
 from tactile_bayes.declarations import names_of, replace
 from tactile_bayes.errors import UsageError, check_number
 from tactile_bayes.files.size_json import read_repeatability
-from tactile_bayes.findings import Finding, findings_in
-from tactile_bayes.report.estimate_document import patient_mm
-from tactile_bayes.report.estimate_figures import draw_fit, draw_map, draw_size
-from tactile_bayes.report.exam_page import PageFiles
-from tactile_bayes.report.exam_words import Exam, headline
-from tactile_bayes.report.figure_file import named_exam
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from tactile_bayes.api.pooled import PooledOutcome
-    from tactile_bayes.size.draws import SizePosterior
     from tactile_bayes.size.pooling import Repeatability
 
 
-# --- Estimates of a lump's size: from one map, or from several maps of one mass.
-
 _KEYWORDS = tuple(name for name in names_of(Settings) if name != "settings_file")
-_SHAPES = ("amplitude", "sigma_x_mm", "sigma_y_mm", "x_mm", "y_mm", "angle_rad", "background", "noise_sd")
-
-
-class SizedExam(Sized):
-    """Base of the estimates of a whole exam, from one map or from several."""
-
-    @door
-    def report(
-        self,
-        path: PathLike,
-        *,
-        pdf: PathLike | None = None,
-        title: str = "",
-        name: str = "",
-        day: str = "",
-        force: bool = False,
-    ) -> None:
-        """Write one page of the exam as HTML, repeat maps on it, and with `pdf` also print it; see `exam_report`."""
-        exam_report(self, path, pdf=pdf, title=title, name=name, day=day, force=force)
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class SizeEstimate(SizedExam):
-    """The estimate of one map.
-
-    Parameters
-    ----------
-    outcome
-        Map, posterior, settings and provenance.
-    name
-        Of the map, for figures.
-    """
-
-    outcome: Outcome
-    name: str = ""
-
-    @property
-    def probability(self) -> float:  # type: ignore[override]
-        """Probability of the intervals shown by default."""
-        return self.outcome.settings.interval
-
-    @property
-    def _size(self) -> SizePosterior | None:
-        return self.outcome.estimate.size
-
-    @property
-    def status(self) -> str:
-        """``"estimate"`` or ``"no_estimate"``."""
-        return self.outcome.estimate.status
-
-    @property
-    def why(self) -> str:
-        """Why there is no size, or no estimate at all; empty where there is a size."""
-        return "" if self._size is not None else self.outcome.estimate.reason
-
-    @property
-    def advice(self) -> str:
-        """What would help where there is no size."""
-        return in_keywords(self.outcome.estimate.advice)
-
-    @property
-    def detected_probability(self) -> float | None:
-        """Probability that the lump, or the likeliest rise, is one where half of the exams hold one; None untested."""
-        return self.outcome.estimate.probability
-
-    @property
-    def findings(self) -> tuple[Finding, ...]:
-        """What speaks against the answer, cautions first."""
-        return self.outcome.estimate.findings
-
-    def _rows(self) -> Iterator[tuple[str, str]]:
-        yield from super()._rows()
-        if self.detected_probability is not None:
-            yield "probability of a lump", f"{self.detected_probability:.2f}"
-
-    @property
-    def amplitude(self) -> Draws | None:
-        """Height of the map's Gaussian over its level; None without an estimate."""
-        return self._of_shape("amplitude")
-
-    @property
-    def sigma_x_mm(self) -> Draws | None:
-        """Width of the map's Gaussian along its first axis; None without an estimate."""
-        return self._of_shape("sigma_x_mm")
-
-    @property
-    def sigma_y_mm(self) -> Draws | None:
-        """Width of the map's Gaussian along its second axis; None without an estimate."""
-        return self._of_shape("sigma_y_mm")
-
-    @property
-    def x_mm(self) -> Draws | None:
-        """Centre of the lump on the map, across the head; None without an estimate."""
-        return self._of_shape("x_mm")
-
-    @property
-    def y_mm(self) -> Draws | None:
-        """Centre of the lump on the map, along the head; None without an estimate."""
-        return self._of_shape("y_mm")
-
-    @property
-    def masses(self) -> tuple[MassEstimate, ...]:
-        """All masses of the map, the surest first; this estimate is of the one that is `reported`."""
-        found, tactile_map = self.outcome.estimate, self.outcome.tactile_map
-        return tuple(
-            MassEstimate(
-                number,
-                mass,
-                patient_mm(tactile_map, mass.x_mm, mass.y_mm),
-                self.probability,
-                "" if mass.estimate.size is not None else found.reason if mass.reported else mass.estimate.reason,
-            )
-            for number, mass in enumerate(found.masses, start=1)
-        )
-
-    def _of_shape(self, name: str) -> Draws | None:
-        found = self.outcome.estimate
-        if found.map_posterior is None or found.draws is None:
-            return None
-        unit = "mm" if name.endswith("_mm") else "rad" if name.endswith("_rad") else ""
-        values = getattr(found.map_posterior, name)
-        return Draws(values, unit, self.probability, found.draws.labels, found.draws.effective_draws)
-
-    def _columns(self) -> dict[str, Draws]:
-        shapes = {name: draws for name in _SHAPES if (draws := self._of_shape(name)) is not None}
-        return {**super()._columns(), **shapes}
-
-    def _groups(self) -> dict[str, Any]:
-        return {name: (group.arrays, group.notes) for name, group in self.outcome.groups().items()}
-
-    @cached_property
-    def answer(self) -> Answer:
-        """The report: `document` is what ``estimate --json`` prints, `text` what it prints for people."""
-        return answer_of(self.outcome)
-
-    @door
-    def plot(self, path: PathLike | None = None, *, force: bool = False) -> Figure:
-        """Draw the posterior of the size; without a size the map with the places looked at.
-
-        Parameters
-        ----------
-        path
-            Also write it there, as PNG, PDF or SVG.
-        """
-        size = self.outcome.estimate.size
-        if size is None:
-            return self.plot_map(path, force=force)
-        return draw_size(
-            size,
-            path_of(path),
-            name=self._titled,
-            probability=self.probability,
-            findings=self.findings,
-            force=force,
-        )
-
-    @door
-    def plot_map(self, path: PathLike | None = None, *, force: bool = False) -> Figure:
-        """Draw the map with the lump's ellipse and size, or with the places looked at."""
-        return draw_map(self.outcome.tactile_map, self.outcome.estimate, path_of(path), name=self._titled, force=force)
-
-    @door
-    def plot_fit(self, path: PathLike | None = None, *, force: bool = False) -> Figure:
-        """Draw data, fit and residual of the fit window side by side; without an estimate the map.
-
-        Parameters
-        ----------
-        path
-            Also write it there, as PNG, PDF or SVG.
-        """
-        if self.status != "estimate":
-            return self.plot_map(path, force=force)
-        return draw_fit(self.outcome.tactile_map, self.outcome.estimate, path_of(path), name=self._titled, force=force)
-
-    @property
-    def _titled(self) -> str:
-        """Name for the titles of figures, with the subject's code and the scan's digest."""
-        return named_exam(self.name, self.outcome.provenance.scans)
-
-    @door
-    def save(self, path: PathLike, *, force: bool = False) -> None:
-        """Write all draws as netCDF that arviz opens, as ``estimate -o`` does.
-
-        Raises
-        ------
-        UsageError
-            Without an estimate, or when the file exists and `force` is false.
-        """
-        if self.status != "estimate":
-            raise UsageError(f"there are no draws to write: {self.why}")
-        self.outcome.write(output_path(path, "netCDF"), document=self.answer.document, force=force)
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class PooledSize(SizedExam):
-    """One size from several maps of one mass.
-
-    Parameters
-    ----------
-    outcome
-        The pooled size, its JSON object, its provenance.
-    maps
-        The estimates of the maps alone.
-    probability
-        Of the intervals that are shown where none is asked for.
-    """
-
-    outcome: PooledOutcome
-    maps: tuple[SizeEstimate, ...]
-    probability: float
-    name: str = field(default="")
-    settings: Settings = field(default_factory=Settings)
-
-    @property
-    def _size(self) -> SizePosterior | None:
-        return self.outcome.pooled.size
-
-    @property
-    def why(self) -> str:
-        """Why there is no size; empty where there is one."""
-        return "" if self._size is not None else self.outcome.pooled.reason
-
-    @property
-    def findings(self) -> tuple[Finding, ...]:
-        """What speaks against the size, cautions first."""
-        return findings_in(self.document["findings"])
-
-    @property
-    def document(self) -> dict[str, Any]:
-        """What ``estimate --pool --json`` prints."""
-        return self.outcome.document
-
-    @door
-    def plot(self, path: PathLike | None = None, *, force: bool = False) -> Figure:
-        """Draw the posterior of the size; with a path also write it.
-
-        Raises
-        ------
-        UsageError
-            Without a size.
-        """
-        size = self._size
-        if size is None:
-            raise UsageError(f"there is no size to draw: {self.why}")
-        name = self.name or f"{len(self.maps)} maps pooled"
-        return draw_size(
-            size, path_of(path), name=name, probability=self.probability, findings=self.findings, force=force
-        )
 
 
 def settings_of(options: Mapping[str, Any]) -> Settings:
@@ -374,10 +111,8 @@ def estimate(tactile_map: Any, *, progress: Callable[[int, int], None] | None = 
     """
     given = map_of(tactile_map)
     inputs = {} if given.path is None else {"map": given.path}
-    outcome = estimate_one(
-        given.tactile_map, settings_of(settings), inputs=inputs, scans=given.scans, progress=progress
-    )
-    return SizeEstimate(outcome, "" if given.path is None else given.path.stem)
+    found = estimate_one(given.tactile_map, settings_of(settings), inputs=inputs, scans=given.scans, progress=progress)
+    return replace(found, name="" if given.path is None else given.path.stem)
 
 
 @door
@@ -403,34 +138,16 @@ def pool(maps: Iterable[Any], **settings: Any) -> PooledSize:
     found = estimated(_several(maps), settings)
     if not found:
         raise UsageError("there is no map to pool; give at least one")
-    prints = [one.outcome.tactile_map.fingerprint for one in found]
+    prints = [one.tactile_map.fingerprint for one in found]
     if len(set(prints)) < len(prints):
         raise UsageError("a map is given twice; give each map once")
-    found = of_one_mass(found)
     names = [one.name or f"map {i}" for i, one in enumerate(found, start=1)]
-    outcome = pool_answers([one.answer for one in found], used, names=names, inputs={})
-    return PooledSize(outcome, found, used.interval, settings=used)
+    return pool_estimates(found, used, names=names, inputs={})
 
 
 def estimated(given: Iterable[Any], settings: Mapping[str, Any]) -> tuple[SizeEstimate, ...]:
     """Estimates of maps, or of their paths; those that are estimates already keep their own settings."""
     return tuple(one if isinstance(one, SizeEstimate) else estimate(one, **settings) for one in given)
-
-
-def of_one_mass(found: Sequence[SizeEstimate]) -> tuple[SizeEstimate, ...]:
-    """The estimates; one of another mass than most maps show is made again at that one's place.
-
-    Estimates of a place that somebody gave stay as they are.
-    """
-    same = list(found)
-    for i, place in elsewhere([one.answer.document for one in found]).items():
-        outcome = same[i].outcome
-        if outcome.settings.centre_mm is None:
-            again = replace(outcome.settings, centre_mm=place)
-            at_place = estimate_one(outcome.tactile_map, again, scans=outcome.provenance.scans)
-            provenance = replace(at_place.provenance, inputs=outcome.provenance.inputs)
-            same[i] = SizeEstimate(replace(at_place, provenance=provenance), same[i].name)
-    return tuple(same)
 
 
 def listed(given: Any) -> list[Any]:
@@ -457,80 +174,3 @@ def _signature() -> inspect.Signature:
 
 
 estimate.__signature__ = _signature()  # type: ignore[attr-defined]
-
-
-# --- The page of an exam from Python.
-
-
-@door
-def exam_report(
-    files: Any,
-    path: PathLike,
-    *,
-    pdf: PathLike | None = None,
-    title: str = "",
-    name: str = "",
-    day: str = "",
-    force: bool = False,
-    **settings: Any,
-) -> str:
-    """Write one page of an exam as HTML, as ``tactile-bayes report`` does.
-
-    Parameters
-    ----------
-    files
-        Maps, estimates and pooled sizes, or the paths of their files; one, or a list. Several maps are repeats of one
-        mass and are pooled. A path of an estimate (JSON or posterior) goes alone, or with the path of its map.
-    path
-        Usually ``*.html``.
-    pdf
-        Also print the page there, by an installed Chromium or WeasyPrint.
-    title, name, day
-        To print on the page; nothing is where they are not given. The day as YEAR-MONTH-DAY.
-    **settings
-        As of `estimate`; estimates that are given keep their own.
-
-    Returns
-    -------
-    str
-        The page's headline.
-
-    Raises
-    ------
-    UsageError
-        When files do not fit each other, settings are given for an estimate's file, nothing is installed that prints,
-        or a file exists and `force` is false.
-    BadDataError
-        When a file is damaged or of another kind, or the maps are of different exams.
-    """
-    page = PageFiles(path_of(path), path_of(pdf), force)
-    page.check()
-    given = listed(files)
-    if not given:
-        raise UsageError("nothing was given to report; give maps, or an estimate")
-    exam = _exam(given, Given(title, name, day), settings)
-    page.write(exam)
-    return headline(exam)
-
-
-def _exam(given: Sequence[Any], words: Given, settings: dict[str, Any]) -> Exam:
-    """The exam of files alone, or of what Python holds."""
-    if all(isinstance(one, str | Path) for one in given):
-        files = ExamFiles.sort([path_of(one) for one in given])
-        if files.estimates and settings:
-            raise UsageError(f"an estimate has settings of its own; leave out {next(iter(settings))}, or give the map")
-        return read_exam(files, settings_of(settings), words)
-    found, used = _estimates(given, settings)
-    maps = [EstimatedMap(one.outcome.tactile_map, one.answer, one.outcome.provenance.scans) for one in found]
-    return make_exam(maps, used, words)
-
-
-def _estimates(given: Sequence[Any], settings: dict[str, Any]) -> tuple[tuple[SizeEstimate, ...], Settings]:
-    """Estimates of all maps, and the settings that pool them."""
-    if len(given) == 1 and isinstance(given[0], PooledSize):
-        return given[0].maps, given[0].settings
-    used = settings_of(settings)
-    if len(given) > 1:
-        refuse_checkpoint(used)
-    found = of_one_mass(estimated(given, settings))
-    return found, found[0].outcome.settings if len(found) == 1 else used

@@ -1,84 +1,49 @@
-"""One map: the calibration and options that fit it, the estimate, its report."""
+"""One map: the calibration and options that fit it, and the estimate."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from tactile_bayes.api.repeatability import check_repeatability, repeatability_digest
 from tactile_bayes.api.settings import Settings
+from tactile_bayes.api.sized import Answer, SizeEstimate, size_priors
 from tactile_bayes.declarations import Record, replace
-from tactile_bayes.errors import EXIT_DONE, EXIT_NO_ESTIMATE, NO_LUMP, BadDataError, TactileBayesError
-from tactile_bayes.files.map_nc import read_map_and_scans, write_posterior
+from tactile_bayes.errors import NO_LUMP, BadDataError, TactileBayesError
+from tactile_bayes.files.map_nc import read_map_and_scans
 from tactile_bayes.files.provenance import Provenance, hash_inputs
+from tactile_bayes.files.reports import Place
 from tactile_bayes.files.size_json import SHIPPED, default_for, read_size_calibration, size_calibration_path
-from tactile_bayes.findings import Finding, by_weight, findings_in
-from tactile_bayes.mapping.map import many_cells
+from tactile_bayes.findings import by_weight
+from tactile_bayes.mapping.map import TactileMap, many_cells
 from tactile_bayes.options import PRIORS
 from tactile_bayes.posterior.estimate import OTHER_HEAD, calibration_for, estimate_map, recipe_differences
 from tactile_bayes.posterior.lump_probability import smallest_lumps
 from tactile_bayes.posterior.masses import with_masses
 from tactile_bayes.posterior.options import EstimateOptions, FitOptions
-from tactile_bayes.posterior.result import inference_groups
+from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.posterior.white import default_errors
 from tactile_bayes.presets import FIT_RADIUS_MM
 from tactile_bayes.progress import Progress
 from tactile_bayes.report.calibration import calibration_line, site_words
-from tactile_bayes.report.estimate_document import estimate_document, patient_mm
-from tactile_bayes.report.estimate_text import estimate_summary, estimate_text
+from tactile_bayes.report.estimate_document import patient_mm
 from tactile_bayes.report.quantities import (
-    estimate_quantities,
-    lump_place,
+    SizedPlace,
     side_findings,
     side_of,
     touching_findings,
     touching_masses,
 )
 from tactile_bayes.size.bodies import BodyCalibration, mean_width_mm
-from tactile_bayes.size.draws import ShapeDraws
-from tactile_bayes.size.fat import BetweenMaps, head_profile
-from tactile_bayes.size.pooling import SizePriors
-
-if TYPE_CHECKING:
-    from tactile_bayes.files.provenance import Provenance
-    from tactile_bayes.mapping.map import TactileMap
-    from tactile_bayes.posterior.options import EstimateOptions, FitOptions
-    from tactile_bayes.posterior.result import DrawGroup, Estimate
-    from tactile_bayes.scan import HeadShape
-    from tactile_bayes.size.draws import ShapeDraws
-    from tactile_bayes.size.pooling import Calibration, SizePriors
+from tactile_bayes.size.pooling import Calibration
 
 _UNRECORDED = (*PRIORS, "max_steps", "checkpoint")
 """Settings that the provenance leaves out: the priors stand in the report, the others change how long it takes."""
 NO_CALIBRATION_ON_PAPER = "a size needs a calibration that fits this map"
 Notice = Callable[[str], None]
-
-
-class Answer(Record):
-    """Answer for one map: its JSON object and its text, or an error with its exit code.
-
-    `text` is the report in at most 12 lines, `full_text` all of it. `shape` holds what pooling
-    needs of a map on which a lump was found, `normalise` how the map's frames were, `head` what it was made with,
-    `fingerprint` what its values seed random numbers with.
-    """
-
-    document: dict[str, Any] | None
-    text: str
-    exit_code: int
-    shape: ShapeDraws | None = None
-    normalise: str = ""
-    fingerprint: int = 0
-    full_text: str = ""
-    head: HeadShape | None = None
-
-    @property
-    def findings(self) -> tuple[Finding, ...]:
-        """What speaks against the answer, cautions first; nothing for an error."""
-        return () if self.document is None else findings_in(self.document["findings"])
 
 
 class NoSize(Record):
@@ -96,40 +61,10 @@ _LEAST_SQUARES = NoSize(
 )
 
 
-class Outcome(Record, eq=False):
-    """One map with its estimate, provenance and settings."""
-
-    tactile_map: TactileMap
-    estimate: Estimate
-    provenance: Provenance
-    settings: Settings
-    calibration: Calibration | None = None
-
-    def write(self, path: Path, *, document: Mapping[str, Any] | None = None, force: bool = False) -> None:
-        """Write all draws, and what goes with them, as netCDF that arviz opens.
-
-        Parameters
-        ----------
-        document
-            The JSON object of `answer_of`, where it was made already.
-        """
-        told = document or answer_of(self).document
-        assert told is not None  # only the answer of an error has none
-        provenance = self.provenance
-        write_posterior(path, self.estimate, provenance=provenance, groups=self.groups(), document=told, force=force)
-
-    def groups(self) -> dict[str, DrawGroup]:
-        """What goes with the draws, see `inference_groups`."""
-        rng = np.random.default_rng([self.settings.seed, self.tactile_map.fingerprint, 1])
-        return inference_groups(
-            self.estimate, calibration=self.calibration, size_priors=size_priors(self.settings), rng=rng
-        )
-
-
 def answer_file(path: Path, *, settings: Settings) -> Answer:
     """Answer for a map file, in any process; an error with this map becomes its answer."""
     try:
-        return answer_of(estimate_file(path, settings))
+        return estimate_file(path, settings).answer
     except TactileBayesError as error:
         text = str(error) if str(path) in str(error) else f"{path}: {error}"
         return Answer(None, f"error: {text}", error.exit_code)
@@ -137,13 +72,14 @@ def answer_file(path: Path, *, settings: Settings) -> Answer:
 
 def estimate_file(
     path: Path, settings: Settings, *, progress: Progress | None = None, notice: Notice | None = None
-) -> Outcome:
+) -> SizeEstimate:
     """Read a map and estimate it; see `estimate_one`."""
     tactile_map, scans = read_map_and_scans(path)
     try:
-        return estimate_one(tactile_map, settings, inputs={"map": path}, scans=scans, progress=progress, notice=notice)
+        found = estimate_one(tactile_map, settings, inputs={"map": path}, scans=scans, progress=progress, notice=notice)
     except BadDataError as error:
         raise error.at(path) from None
+    return replace(found, name=path.stem)
 
 
 def estimate_one(
@@ -154,7 +90,7 @@ def estimate_one(
     scans: Sequence[Mapping[str, str]] = (),
     progress: Progress | None = None,
     notice: Notice | None = None,
-) -> Outcome:
+) -> SizeEstimate:
     """Choose the calibration and the options that fit a map, and estimate.
 
     Parameters
@@ -230,7 +166,7 @@ def estimate_one(
     recorded = settings.recorded(size_calibration=named, **used_fit)
     recorded = {name: value for name, value in recorded.items() if name not in _UNRECORDED}
     provenance = Provenance("estimate", recorded, digests, seed=settings.seed, scans=scans)
-    return Outcome(tactile_map, estimate, provenance, settings, used)
+    return SizeEstimate(tactile_map, estimate, provenance, settings, used)
 
 
 def _with_place(
@@ -240,11 +176,11 @@ def _with_place(
     here = [patient_mm(tactile_map, one.x_mm, one.y_mm) for one in estimate.masses if one.reported]
     side = side_findings(side_of(scans), here[0] if here else None)
     sized = [
-        {
-            "number": number,
-            "centre_mm": {"x": one.x_mm, "y": one.y_mm},
-            "max_size_mm": one.estimate.size.summarise("max_size_mm", probability=probability).as_dict(),
-        }
+        SizedPlace(
+            number,
+            Place(one.x_mm, one.y_mm),
+            one.estimate.size.summarise("max_size_mm", probability=probability).rounded,
+        )
         for number, one in enumerate(estimate.masses, start=1)
         if one.estimate.size is not None
     ]
@@ -339,6 +275,13 @@ def _options(settings: Settings, calibration: Calibration | None, tactile_map: T
     )
 
 
+def estimated_at(found: SizeEstimate, place: tuple[float, float]) -> SizeEstimate:
+    """The estimate of the same map at another place on it."""
+    settings = replace(found.settings, centre_mm=place)
+    there = estimate_one(found.tactile_map, settings, scans=found.provenance.scans)
+    return replace(there, provenance=replace(there.provenance, inputs=found.provenance.inputs), name=found.name)
+
+
 def estimate_inputs(
     settings: Settings, tactile_map: TactileMap
 ) -> tuple[Calibration | None, EstimateOptions, NoSize | None]:
@@ -351,44 +294,3 @@ def estimate_inputs(
     """
     _, calibration, why_none = choose_calibration(settings, tactile_map)
     return calibration, _options(settings, calibration, tactile_map), why_none
-
-
-def size_priors(settings: Settings) -> SizePriors:
-    """Priors of a size; a spread between maps that is stated, or learned at the site, leaves it one interval."""
-    fixed, learned = settings.between_map_sd, settings.repeatability
-    if learned is None and fixed is None:
-        return SizePriors(known=dict(settings.known))
-    between = learned.between_maps if learned is not None else BetweenMaps(fixed or 0.0, 0.0)
-    return SizePriors(between_maps=between, another_exam=None, known=dict(settings.known))
-
-
-def answer_of(outcome: Outcome) -> Answer:
-    """Report of an outcome as JSON and text."""
-    tactile_map, estimate, settings = outcome.tactile_map, outcome.estimate, outcome.settings
-    quantities = estimate_quantities(estimate, tactile_map, probability=settings.interval)
-    place = lump_place(estimate.map_posterior, tactile_map, outcome.provenance.scans)
-    document = estimate_document(
-        estimate,
-        tactile_map,
-        probability=settings.interval,
-        prior=settings.prior,
-        provenance=outcome.provenance,
-        quantities=quantities,
-        place=place,
-    )
-    told: dict[str, Any] = {"probability": settings.interval, "masses": document["masses"], "place": place}
-    text = estimate_summary(estimate, quantities, **told)
-    full_text = estimate_text(estimate, tactile_map, prior=settings.prior, quantities=quantities, **told)
-    exit_code = EXIT_DONE if estimate.status == "estimate" else EXIT_NO_ESTIMATE
-    shape, normalise = pooling_shape(tactile_map, estimate), tactile_map.recipe.normalise
-    return Answer(document, text, exit_code, shape, normalise, tactile_map.fingerprint, full_text, tactile_map.head)
-
-
-def pooling_shape(tactile_map: TactileMap, estimate: Estimate) -> ShapeDraws | None:
-    """Draws that pooling needs of a map, with the direction of its axes if landmarks define it."""
-    posterior, turn = estimate.map_posterior, tactile_map.patient_from_plane
-    if posterior is None or estimate.draws is None:
-        return None
-    angle = 0.0 if turn is None else math.atan2(float(turn[1, 0]), float(turn[0, 0]))
-    bump = posterior.bump(estimate.draws.replicates)
-    return ShapeDraws.of(bump, turn_rad=angle, profile=head_profile(tactile_map.quality))

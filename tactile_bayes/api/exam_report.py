@@ -2,71 +2,32 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Mapping, Sequence
-from datetime import date
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
-from tactile_bayes.api.estimating import Answer, answer_of, estimate_one
-from tactile_bayes.api.pooled import check_one_mass, elsewhere, pool_answers
+from tactile_bayes.api.arguments import door
+from tactile_bayes.api.estimates import estimated, listed, settings_of
+from tactile_bayes.api.estimating import estimate_file
+from tactile_bayes.api.maps import PathLike, path_of
+from tactile_bayes.api.pooled import PooledSize, pool_estimates
 from tactile_bayes.api.settings import Settings, refuse_checkpoint
-from tactile_bayes.declarations import Record, replace
+from tactile_bayes.api.sized import SizeEstimate
+from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.atomic import given_twice, sha256
 from tactile_bayes.files.documents import load_json
-from tactile_bayes.files.estimate_json import check_estimate
+from tactile_bayes.files.estimate_json import checked_report
 from tactile_bayes.files.map_nc import is_posterior, read_estimate, read_map_and_scans
 from tactile_bayes.files.provenance import scans_of
 from tactile_bayes.files.reading import HDF5_MAGIC, open_input
-from tactile_bayes.mapping.map import TactileMap
-from tactile_bayes.report.exam_words import Exam, exam_map
+from tactile_bayes.files.reports import EstimateReport
+from tactile_bayes.report.exam_page import PageFiles
+from tactile_bayes.report.exam_words import Exam, Given, exam_map, headline
 from tactile_bayes.report.quantities import side_of
 
 Notice = Callable[[str], None]
 Scans = Sequence[Mapping[str, str]]
-_LONGEST: Final = {"title": 60, "name": 50}
-_DATE: Final = re.compile(r"\d{4}-\d{2}-\d{2}", re.ASCII)
-
-
-class Given(Record):
-    """What was given for the page besides maps: title, name and date, empty where they were not.
-
-    Raises
-    ------
-    UsageError
-        When a text is too long for the page or not printable, or the day is no date.
-    """
-
-    title: str = ""
-    name: str = ""
-    day: str = ""
-
-    def __post_init__(self) -> None:
-        for option, longest in _LONGEST.items():
-            value = getattr(self, option)
-            if not isinstance(value, str):
-                raise UsageError(f"{option} is {value!r}; give a text")
-            if not value.isprintable() or len(value) > longest:
-                what = f"{option} is of {len(value)} letters or not printable"
-                raise UsageError(f"{what}; give up to {longest} letters")
-        if self.day and not _is_date(str(self.day)):
-            raise UsageError(f"date {str(self.day)[:40]!r} is no date; give it as YEAR-MONTH-DAY, such as 2026-03-01")
-
-
-def _is_date(text: str) -> bool:
-    try:
-        return bool(_DATE.fullmatch(text)) and bool(date.fromisoformat(text))
-    except ValueError:
-        return False
-
-
-class EstimatedMap(Record, eq=False):
-    """A map with its answer and the scans it was made from."""
-
-    tactile_map: TactileMap
-    answer: Answer
-    scans: Scans
 
 
 class ExamFiles(Record):
@@ -127,15 +88,12 @@ def read_exam(files: ExamFiles, settings: Settings, given: Given, *, notice: Not
     if len(maps) > 1:
         refuse_checkpoint(settings)
     found = [_estimated(path, settings, notice) for path in maps]
-    if settings.centre_mm is None:
-        for i, place in elsewhere([one.answer.document for one in found]).items():
-            found[i] = _estimated(maps[i], replace(settings, centre_mm=place), notice)
     inputs = {f"map_{number}": path for number, path in enumerate(maps, start=1)}
-    return make_exam(found, settings, given, inputs=inputs)
+    return exam_of(found, settings, given, inputs=inputs)
 
 
-def make_exam(
-    maps: Sequence[EstimatedMap], settings: Settings, given: Given, *, inputs: Mapping[str, Path] | None = None
+def exam_of(
+    found: Sequence[SizeEstimate], settings: Settings, given: Given, *, inputs: Mapping[str, Path] | None = None
 ) -> Exam:
     """Exam of maps that were estimated; several are pooled.
 
@@ -144,52 +102,101 @@ def make_exam(
     BadDataError
         When the maps are of different exams, or cannot be pooled.
     """
-    scans = [scan for one in maps for scan in one.scans]
-    check_one_mass(scans)
-    pooled = None
-    if len(maps) > 1:
-        names = [f"map {number}" for number in range(1, len(maps) + 1)]
-        answers = [one.answer for one in maps]
-        pooled = pool_answers(answers, settings, names=names, inputs=inputs or {}).document
-    side = side_of(scans)
-    shown = tuple(exam_map(one.tactile_map, _document(one.answer), side=side) for one in maps)
-    return Exam(shown, pooled, scans, title=given.title, name=given.name, day=given.day)
+    if len(found) == 1:
+        return given.on(found[0].exam())
+    names = [f"map {number}" for number in range(1, len(found) + 1)]
+    return given.on(pool_estimates(found, settings, names=names, inputs=inputs or {}).exam())
 
 
-def _document(answer: Answer) -> dict[str, Any]:
-    assert answer.document is not None
-    return answer.document
-
-
-def _estimated(path: Path, settings: Settings, notice: Notice | None) -> EstimatedMap:
-    tactile_map, scans = read_map_and_scans(path)
-    told = None if notice is None else lambda line: notice(f"{path}: {line}")
-    try:
-        outcome = estimate_one(tactile_map, settings, inputs={"map": path}, scans=scans, notice=told)
-    except BadDataError as error:
-        raise error.at(path) from None
-    return EstimatedMap(tactile_map, answer_of(outcome), scans)
+def _estimated(path: Path, settings: Settings, notice: Notice | None) -> SizeEstimate:
+    return estimate_file(path, settings, notice=None if notice is None else lambda line: notice(f"{path}: {line}"))
 
 
 def _from_estimate(source: Path, path: Path | None, given: Given) -> Exam:
     """Exam of an estimate, and of its map where that is given: the estimate must name it by its digest."""
-    document = _read_estimate(source)
-    scans: Scans = scans_of(document["provenance"])
+    report = _read_estimate(source)
+    scans: Scans = scans_of(report.provenance)
     tactile_map = None
     if path is not None:
-        digests = [one.get("sha256") for one in document["provenance"].get("inputs", []) if one.get("role") == "map"]
-        if sha256(path) not in digests:
+        if sha256(path) not in [one.sha256 for one in report.origin.inputs if one.role == "map"]:
             raise BadDataError(f"is not the estimate of {path}", way_out="give the map it names", path=str(source))
         tactile_map, scans = read_map_and_scans(path)
-    shown = exam_map(tactile_map, document, side=side_of(scans))
-    return Exam((shown,), None, scans, title=given.title, name=given.name, day=given.day)
+    shown = exam_map(tactile_map, report, side=side_of(scans))
+    return given.on(Exam((shown,), None, scans))
 
 
-def _read_estimate(source: Path) -> dict[str, Any]:
-    """An estimate's JSON object, from its JSON or its posterior's file."""
+def _read_estimate(source: Path) -> EstimateReport:
+    """An estimate, from its JSON or its posterior's file."""
     if not _is_json(source):
         return read_estimate(source)
-    document: Any = load_json(source, way_out="give what `estimate --json` printed for one map")
-    check_estimate(document, "estimate.schema.json", path=source)
-    found: dict[str, Any] = document
-    return found
+    document = load_json(source, way_out="give what `estimate --json` printed for one map")
+    return checked_report(document, EstimateReport, path=source)
+
+
+# --- The page of an exam from Python.
+
+
+@door
+def exam_report(
+    files: Any,
+    path: PathLike,
+    *,
+    pdf: PathLike | None = None,
+    title: str = "",
+    name: str = "",
+    day: str = "",
+    force: bool = False,
+    **settings: Any,
+) -> str:
+    """Write one page of an exam as HTML, as ``tactile-bayes report`` does.
+
+    Parameters
+    ----------
+    files
+        Maps, estimates and pooled sizes, or the paths of their files; one, or a list. Several maps are repeats of one
+        mass and are pooled. A path of an estimate (JSON or posterior) goes alone, or with the path of its map.
+    path
+        Usually ``*.html``.
+    pdf
+        Also print the page there, by an installed Chromium or WeasyPrint.
+    title, name, day
+        To print on the page; nothing is where they are not given. The day as YEAR-MONTH-DAY.
+    **settings
+        As of `estimate`; estimates that are given keep their own.
+
+    Returns
+    -------
+    str
+        The page's headline.
+
+    Raises
+    ------
+    UsageError
+        When files do not fit each other, settings are given for an estimate's file, nothing is installed that prints,
+        or a file exists and `force` is false.
+    BadDataError
+        When a file is damaged or of another kind, or the maps are of different exams.
+    """
+    page = PageFiles(path_of(path), path_of(pdf), force)
+    page.check()
+    given = listed(files)
+    if not given:
+        raise UsageError("nothing was given to report; give maps, or an estimate")
+    exam = _exam(given, Given(title, name, day), settings)
+    page.write(exam)
+    return headline(exam)
+
+
+def _exam(given: Sequence[Any], words: Given, settings: dict[str, Any]) -> Exam:
+    """The exam of files alone, or of what Python holds."""
+    if all(isinstance(one, str | Path) for one in given):
+        files = ExamFiles.sort([path_of(one) for one in given])
+        if files.estimates and settings:
+            raise UsageError(f"an estimate has settings of its own; leave out {next(iter(settings))}, or give the map")
+        return read_exam(files, settings_of(settings), words)
+    if len(given) == 1 and isinstance(given[0], PooledSize):
+        return words.on(given[0].exam())
+    used = settings_of(settings)
+    if len(given) > 1:
+        refuse_checkpoint(used)
+    return exam_of(estimated(given, settings), used, words)

@@ -8,8 +8,10 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from tactile_bayes.api.arguments import check_keywords, door
-from tactile_bayes.api.estimates import PooledSize, SizeEstimate, listed
+from tactile_bayes.api.estimates import listed
 from tactile_bayes.api.maps import Map, PathLike, path_of
+from tactile_bayes.api.pooled import PooledSize
+from tactile_bayes.api.sized import SizeEstimate
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import UsageError, check_choice
 from tactile_bayes.exports.exam import EstimateFile, MapFile, estimate_of, read_exam, shared_facts
@@ -128,10 +130,9 @@ def _read(given: Any) -> MapFile | Sequence[EstimateFile]:
 def _maps_of(given: Any) -> list[tuple[Map, str]]:
     """The maps of an estimate, with the digests of the files that they were read from, empty for a map in none."""
     found = (given,) if isinstance(given, SizeEstimate) else given.maps if isinstance(given, PooledSize) else ()
-    outcomes = [one.outcome for one in found]
     return [
         (Map(one.tactile_map, scans=tuple(map(dict, one.provenance.scans))), one.provenance.inputs.get("map", ""))
-        for one in outcomes
+        for one in found
     ]
 
 

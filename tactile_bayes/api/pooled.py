@@ -5,40 +5,47 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from itertools import combinations
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from tactile_bayes.api.estimating import Answer, size_priors
+from tactile_bayes.api.arguments import door
+from tactile_bayes.api.estimating import estimated_at
+from tactile_bayes.api.maps import PathLike, path_of
 from tactile_bayes.api.repeatability import check_repeatability, repeatability_digest
 from tactile_bayes.api.settings import Settings
+from tactile_bayes.api.sized import Answer, SizedExam, SizeEstimate, check_one_mass, size_priors
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError, UsageError
+from tactile_bayes.files.map_nc import write_pooled
 from tactile_bayes.files.provenance import Provenance, hash_inputs, scans_of
+from tactile_bayes.files.reports import EstimateReport, MassReport, Place, PooledReport
 from tactile_bayes.files.size_json import default_for, read_size_calibration, size_calibration_path
+from tactile_bayes.findings import Finding
 from tactile_bayes.options import PRIORS
 from tactile_bayes.posterior.estimate import way_to_head
 from tactile_bayes.presets import MATCH_MM
-from tactile_bayes.report.pooled import pooled_document
+from tactile_bayes.report.estimate_figures import draw_size
+from tactile_bayes.report.exam_words import Exam
+from tactile_bayes.report.pooled import pooled_report
+from tactile_bayes.report.quantities import side_of
 from tactile_bayes.size.bodies import BodyCalibration
+from tactile_bayes.size.draws import SizePosterior
 from tactile_bayes.size.fat import LEAST_PROBABILITY
 from tactile_bayes.size.pooling import DISAGREE, PooledEstimate, pool_maps
 from tactile_bayes.size.visits import Place as PatientPlace
 from tactile_bayes.size.visits import one_place_probability
 
 if TYPE_CHECKING:
-    from tactile_bayes.files.provenance import Provenance
-    from tactile_bayes.size.bodies import BodyCalibration
-    from tactile_bayes.size.pooling import PooledEstimate
-    from tactile_bayes.size.visits import Place
+    from matplotlib.figure import Figure
 
+T = TypeVar("T")
 
 # --- Which mass of each map is the one that is pooled: by its place in the patient.
 #
 # A report is about the surest mass of its map, so of two maps of one breast each may report another one. With
 # landmarks the masses of all maps have places in patient axes, and the one that most maps show is pooled.
 
-Document = Mapping[str, Any]
 MapPlace = tuple[float, float]
 
 
@@ -55,26 +62,45 @@ class _Mass(Record):
         return float(np.hypot(*np.subtract(self.patient_mm, other.patient_mm)))
 
 
-def of_one_mass(answers: Sequence[Answer], again: Callable[[int, MapPlace], Answer]) -> list[Answer]:
-    """Answers for the mass that most maps show; a map whose report is about another one is estimated at its place.
+def of_one_mass(
+    found: Sequence[T], reports: Sequence[EstimateReport | None], again: Callable[[int, MapPlace], T]
+) -> list[T]:
+    """Estimates of the mass that most maps show; a map whose report is about another one is estimated at its place.
 
     Parameters
     ----------
     again
-        Takes the number of a map in the list and a place on it, and gives the answer there.
+        Takes the number of a map in the list and a place on it, and gives the estimate there.
     """
-    found = list(answers)
-    for i, place in elsewhere([one.document for one in answers]).items():
-        found[i] = again(i, place)
-    return found
+    same = list(found)
+    for i, place in elsewhere(reports).items():
+        same[i] = again(i, place)
+    return same
 
 
-def elsewhere(documents: Sequence[Document | None]) -> dict[int, MapPlace]:
+def one_mass(found: Sequence[SizeEstimate]) -> tuple[SizeEstimate, ...]:
+    """The same with maps and draws at hand; estimates of a place that somebody gave stay as they are."""
+
+    def again(i: int, place: MapPlace) -> SizeEstimate:
+        return estimated_at(found[i], place) if found[i].settings.centre_mm is None else found[i]
+
+    return tuple(of_one_mass(found, [one.answer.report for one in found], again))
+
+
+def pool_estimates(
+    found: Sequence[SizeEstimate], settings: Settings, *, names: Sequence[str], inputs: Mapping[str, Path]
+) -> PooledSize:
+    """One size from the estimates of several maps, made again where they are of another mass; see `pool_answers`."""
+    same = one_mass(found)
+    return replace(pool_answers([one.answer for one in same], settings, names=names, inputs=inputs), maps=same)
+
+
+def elsewhere(reports: Sequence[EstimateReport | None]) -> dict[int, MapPlace]:
     """Maps that report another mass than the common one, with the place of that one on each, mm.
 
     Empty where a map with a lump has no landmarks, or no two maps show a mass at one place.
     """
-    maps = _masses(documents)
+    maps = _masses(reports)
     common = None if maps is None else _common(maps)
     if maps is None or common is None:
         return {}
@@ -82,9 +108,9 @@ def elsewhere(documents: Sequence[Document | None]) -> dict[int, MapPlace]:
     return {i: one.map_mm for i, one in there.items() if one is not None and not one.reported}
 
 
-def apart_from_others(documents: Sequence[Document | None]) -> dict[int, str]:
+def apart_from_others(reports: Sequence[EstimateReport | None]) -> dict[int, str]:
     """Maps whose reported mass lies elsewhere than the common one, in words; empty without landmarks."""
-    maps = _masses(documents)
+    maps = _masses(reports)
     if maps is None:
         return {}
     reported = {i: [one for one in masses if one.reported] for i, masses in maps.items()}
@@ -95,32 +121,31 @@ def apart_from_others(documents: Sequence[Document | None]) -> dict[int, str]:
     return {i: words.format(mm) for i, mm in away.items() if mm > MATCH_MM}
 
 
-def one_place(documents: Sequence[Document | None]) -> bool | None:
+def one_place(reports: Sequence[EstimateReport | None]) -> bool | None:
     """Whether the reported masses of all maps lie at one place; None where that cannot be told."""
-    maps = _masses(documents)
+    maps = _masses(reports)
     if maps is None or len(maps) < 2:
         return None
-    return not apart_from_others(documents)
+    return not apart_from_others(reports)
 
 
-def _masses(documents: Sequence[Document | None]) -> dict[int, list[_Mass]] | None:
+def _masses(reports: Sequence[EstimateReport | None]) -> dict[int, list[_Mass]] | None:
     """Masses of the maps with a lump, by the map's place in the list; None where one has no place in the patient."""
     found: dict[int, list[_Mass]] = {}
-    for i, document in enumerate(documents):
-        listed = [] if document is None else document.get("masses", [])
-        if any(one.get("centre_patient_mm") is None for one in listed):
+    for i, report in enumerate(reports):
+        listed = () if report is None else report.masses
+        placed = [_mass(one, one.centre_patient_mm) for one in listed if one.centre_patient_mm is not None]
+        if len(placed) < len(listed):
             return None
-        if listed:
-            found[i] = [_mass(one) for one in listed]
+        if placed:
+            found[i] = placed
     return found
 
 
-def _mass(document: Document) -> _Mass:
-    patient, here, amplitude = document["centre_patient_mm"], document["centre_mm"], document["amplitude"]
-    return _Mass(
-        (patient["x"], patient["y"]), (here["x"], here["y"]), document["max_size_mm"] is not None,
-        document["reported"], 0.0 if amplitude is None else amplitude["median"],
-    )  # fmt: skip
+def _mass(mass: MassReport, patient_mm: Place) -> _Mass:
+    height = 0.0 if mass.amplitude is None else mass.amplitude.median
+    sized = mass.max_size_mm is not None
+    return _Mass(patient_mm.median, mass.centre_mm.median, sized, mass.reported, height)
 
 
 def _common(maps: Mapping[int, Sequence[_Mass]]) -> _Mass | None:
@@ -142,29 +167,87 @@ def _nearest(masses: Sequence[_Mass], common: _Mass) -> _Mass | None:
     return near if near is not None and near.away_mm(common) <= MATCH_MM else None
 
 
-def place_of(document: Document | None) -> PatientPlace | None:
+def place_of(report: EstimateReport | None) -> PatientPlace | None:
     """Where a map's reported mass lies in the patient; None without a lump or landmarks."""
-    centre = None if document is None else document["centre_patient_mm"]
+    centre = None if report is None else report.centre_patient_mm
     if centre is None:
         return None
-    x, y = centre["x"], centre["y"]
-    return PatientPlace(np.array([x["median"], y["median"]]), np.diag([x["sd"] ** 2, y["sd"] ** 2]))
+    return PatientPlace(np.array(centre.median), np.diag([centre.x.sd**2, centre.y.sd**2]))
 
 
 # --- One size from several maps of one mass.
 
 
-class PooledOutcome(Record, eq=False):
-    """Size of one mass, with its JSON object and provenance."""
+class PooledSize(SizedExam, eq=False, dict=True):
+    """One size from several maps of one mass."""
 
     pooled: PooledEstimate
-    document: dict[str, Any]
+    """The size with what the maps together say of it, or why there is none."""
+    pooled_report: PooledReport
     provenance: Provenance
+    settings: Settings
+    maps: tuple[SizeEstimate, ...] = ()
+    """The estimates of the maps alone, where they are at hand."""
+    name: str = ""
+
+    @property
+    def probability(self) -> float:
+        """Of the intervals that are shown where none is asked for."""
+        return self.settings.interval
+
+    @property
+    def _interval(self) -> float:
+        return self.settings.interval
+
+    @property
+    def _size(self) -> SizePosterior | None:
+        return self.pooled.size
+
+    @property
+    def why(self) -> str:
+        """Why there is no size; empty where there is one."""
+        return "" if self._size is not None else self.pooled.reason
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What speaks against the size, cautions first."""
+        return self.pooled_report.findings
+
+    @property
+    def document(self) -> dict[str, Any]:
+        """What ``estimate --pool --json`` prints."""
+        return self.pooled_report.document
+
+    @door
+    def plot(self, path: PathLike | None = None, *, force: bool = False) -> Figure:
+        """Draw the posterior of the size; with a path also write it.
+
+        Raises
+        ------
+        UsageError
+            Without a size.
+        """
+        size = self._size
+        if size is None:
+            raise UsageError(f"there is no size to draw: {self.why}")
+        name = self.name or f"{len(self.pooled_report.maps)} maps pooled"
+        return draw_size(
+            size, path_of(path), name=name, probability=self.probability, findings=self.findings, force=force
+        )
+
+    def write(self, path: Path, *, force: bool = False) -> None:
+        """Write the draws of a size, with its report."""
+        assert self.pooled.size is not None
+        write_pooled(path, self.pooled.size, provenance=self.provenance, report=self.pooled_report, force=force)
+
+    def exam(self) -> Exam:
+        scans = self.provenance.scans
+        return Exam(tuple(one.page_map(side_of(scans)) for one in self.maps), self.pooled_report, scans)
 
 
 def pool_answers(
     answers: Sequence[Answer], settings: Settings, *, names: Sequence[str], inputs: Mapping[str, Path]
-) -> PooledOutcome:
+) -> PooledSize:
     """Pool the maps of one mass.
 
     Parameters
@@ -184,19 +267,19 @@ def pool_answers(
     UsageError
         When the calibration cannot pool maps.
     """
-    documents = [answer.document for answer in answers if answer.document is not None]
-    scans = [scan for document in documents for scan in scans_of(document["provenance"])]
+    reports = [answer.report for answer in answers if answer.report is not None]
+    scans = [scan for report in reports for scan in scans_of(report.provenance)]
     check_one_mass(scans)
     path, calibration = common_calibration(answers, settings, names=names)
     digests = hash_inputs(**inputs, **({"size_calibration": path} if path else {})) | repeatability_digest(settings)
     check_repeatability(settings, calibration, digests)
     # the maps' values in sorted order are part of the seed: their order on the command line leaves no trace
     words = sorted(answer.fingerprint for answer in answers)
-    places = [place for one in answers if one.shape is not None and (place := place_of(one.document)) is not None]
+    places = [place for one in answers if one.shape is not None and (place := place_of(one.report)) is not None]
     chance = one_place_probability(places) if len(places) > 1 else None
     pooled = (
         _too_far(answers)
-        or _none_can_show(documents)
+        or _none_can_show(reports)
         or _apart(places, chance)
         or pool_maps(
             [answer.shape for answer in answers],
@@ -207,38 +290,38 @@ def pool_answers(
     )
     pooled = replace(pooled, one_place=chance)
     if pooled.status == DISAGREE and pooled.one_size is not None:
-        pooled = replace(pooled, reason=f"{pooled.reason}, {_sizes(documents)}")
+        pooled = replace(pooled, reason=f"{pooled.reason}, {_sizes(reports)}")
     provenance = Provenance("estimate --pool", _recorded(settings), digests, seed=settings.seed, scans=scans)
-    document = pooled_document(
+    report = pooled_report(
         pooled,
         list(names),
-        documents,
+        reports,
         calibration,
         probability=settings.interval,
         provenance=provenance,
         repeatability=settings.repeatability,
-        apart=apart_from_others(documents),
-        one_place=one_place(documents),
+        apart=apart_from_others(reports),
+        one_place=one_place(reports),
     )
-    return PooledOutcome(pooled, document, provenance)
+    return PooledSize(pooled, report, provenance, settings)
 
 
 def _too_far(answers: Sequence[Answer]) -> PooledEstimate | None:
     """Reason for no size where a map is too far outside the calibration's range; else None."""
     for i, answer in enumerate(answers):
-        if answer.document is not None and answer.document["reason_code"] == "extrapolated":
-            return PooledEstimate("no_estimate", f"map {i + 1}: {answer.document['reason']}")
+        if answer.report is not None and answer.report.reason_code == "extrapolated":
+            return PooledEstimate("no_estimate", f"map {i + 1}: {answer.report.reason}")
     return None
 
 
-def _none_can_show(documents: Sequence[Mapping[str, Any]]) -> PooledEstimate | None:
+def _none_can_show(reports: Sequence[EstimateReport]) -> PooledEstimate | None:
     """Reason for no size where the cells of all maps are too large to show a lump; else None."""
-    if any(one["reason_code"] != "coarse" for one in documents):
+    if any(one.reason_code != "coarse" for one in reports):
         return None
     return PooledEstimate("no_estimate", "the maps cannot show whether there is a lump: their cells are too large")
 
 
-def _apart(places: Sequence[Place], chance: float | None) -> PooledEstimate | None:
+def _apart(places: Sequence[PatientPlace], chance: float | None) -> PooledEstimate | None:
     """Reason for no size where landmarks show that the maps are of several masses; else None."""
     if chance is None or chance >= LEAST_PROBABILITY:
         return None
@@ -246,26 +329,10 @@ def _apart(places: Sequence[Place], chance: float | None) -> PooledEstimate | No
     return PooledEstimate(DISAGREE, f"by the landmarks the masses of the maps lie up to {most:.0f} mm apart")
 
 
-def _sizes(documents: Sequence[Mapping[str, Any]]) -> str:
+def _sizes(reports: Sequence[EstimateReport]) -> str:
     """The maps' own sizes in words."""
-    found = [f"{one['max_size_mm']['median']:.1f}" for one in documents if one["max_size_mm"] is not None]
+    found = [f"{one.max_size_mm.median:.1f}" for one in reports if one.max_size_mm is not None]
     return f"{', '.join(found[:-1])} and {found[-1]} mm" if len(found) > 1 else f"{', '.join(found)} mm"
-
-
-def check_one_mass(scans: Sequence[Mapping[str, str]]) -> None:
-    """Refuse scans that say they are of different masses, or of one mass at different visits.
-
-    Raises
-    ------
-    BadDataError
-        Naming what they differ in.
-    """
-    for name in ("subject", "side", "mass", "visit"):
-        values = sorted({scan[name].casefold(): scan[name] for scan in scans if scan.get(name)}.values())
-        if len(values) > 1:
-            visits = "; `compare` takes several visits" if name == "visit" else ""
-            way_out = f"give the maps of one mass at one visit, and others by themselves{visits}"
-            raise BadDataError(f"the maps differ in {name} ({', '.join(values)})", way_out=way_out)
 
 
 def _shipped_for(answers: Sequence[Answer]) -> str:

@@ -12,9 +12,10 @@ import numpy as np
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.atomic import sha256
-from tactile_bayes.files.documents import check_document, load_json
+from tactile_bayes.files.documents import read_record
 from tactile_bayes.files.manifest_csv import DONE, ESTIMATE, EXAMS, SHAPE, exam_name, mass_name
 from tactile_bayes.files.provenance import Provenance, recordings, scans_of
+from tactile_bayes.files.reports import EstimateReport
 from tactile_bayes.files.size_json import (
     SHIPPED,
     HalfWidth,
@@ -26,6 +27,7 @@ from tactile_bayes.files.size_json import (
     write_repeatability,
 )
 from tactile_bayes.files.tables import read_raw
+from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.inference.points import normal_quantile
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.pooling import log_size_alone
@@ -93,7 +95,7 @@ class _Repeat(Record, eq=False):
     calibration_sha256: str
     scans: tuple[str, ...]
     digest: str
-    size: Mapping[str, float]
+    size: Quantity
     spread: float
 
     @property
@@ -211,24 +213,22 @@ def _repeats(exams: Sequence[ExamFolder]) -> tuple[list[list[_Repeat]], list[str
 def _read(exam: ExamFolder) -> _Repeat | None:
     """What an exam's estimate says of it; None where it has no size."""
     path = exam.folder / ESTIMATE
-    document: Any = load_json(path, way_out=_AGAIN)
-    check_document(document, "estimate.schema.json", path=path)
-    if document["max_size_mm"] is None:
+    report = read_record(path, EstimateReport, way_out=_AGAIN)
+    if report.max_size_mm is None:
         return None
-    provenance = document["provenance"]
-    try:
-        calibration = str(provenance["settings"]["size_calibration"]).removesuffix(" (shipped)")
-        digests = {one["role"]: one["sha256"] for one in provenance["inputs"]}
-    except (KeyError, TypeError):
-        raise BadDataError("does not say by which calibration", way_out=_AGAIN, path=str(path)) from None
+    made = report.origin
+    if "size_calibration" not in made.settings or "inputs" not in report.provenance:
+        raise BadDataError("does not say by which calibration", way_out=_AGAIN, path=str(path))
+    calibration = str(made.settings["size_calibration"]).removesuffix(" (shipped)")
+    digests = {one.role: one.sha256 for one in made.inputs}
     return _Repeat(
         exam,
         calibration,
         digests.get("size_calibration", ""),
-        tuple(recordings(scans_of(provenance))),
+        tuple(recordings(scans_of(report.provenance))),
         sha256(exam.folder / SHAPE),
-        document["max_size_mm"],
-        document["diagnostics"].get("between_map_sd") or 0.0,
+        report.max_size_mm,
+        report.diagnostics.get("between_map_sd") or 0.0,
     )
 
 
@@ -278,8 +278,8 @@ def _half_widths(repeats: Sequence[_Repeat], sd: float) -> dict[str, float]:
     before, after = [], []
     for repeat in repeats:
         size, spread = repeat.size, repeat.spread
-        score = float(normal_quantile(np.array(0.5 + 0.5 * size["probability"])))
-        variance = (math.log(size["high"] / size["low"]) / (2.0 * score)) ** 2
+        score = float(normal_quantile(np.array(0.5 + 0.5 * size.probability)))
+        variance = (math.log(size.high / size.low) / (2.0 * score)) ** 2
         before.append(variance)
         after.append(max(variance - spread**2, 0.0) + sd**2)
     names = {"as_estimated": before, "with_it": after}

@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tactile_bayes.api.estimating import estimate_file, pooling_shape
+from tactile_bayes.api.estimating import estimate_file
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.api.size_calibration import table_recipe
+from tactile_bayes.api.sized import pooling_shape
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.documents import load_json

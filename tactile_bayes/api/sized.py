@@ -1,129 +1,53 @@
-"""What an estimate is in Python: its draws, sizes and tables."""
+"""What an estimate is: its draws, sizes, tables, report and files, of a mass and of a map."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cached_property
 from html import escape
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tactile_bayes.api.arguments import door
+from tactile_bayes.api.arguments import door, in_keywords
+from tactile_bayes.api.draws import Draws
+from tactile_bayes.api.maps import PathLike, output_path, path_of
+from tactile_bayes.api.settings import Settings
 from tactile_bayes.declarations import Record
-from tactile_bayes.errors import UsageError, check_number
+from tactile_bayes.errors import EXIT_DONE, EXIT_NO_ESTIMATE, BadDataError, UsageError
+from tactile_bayes.files.map_nc import write_posterior
+from tactile_bayes.files.provenance import Provenance
+from tactile_bayes.files.reports import EstimateReport
 from tactile_bayes.findings import Finding, Verdict, finding_lines, verdict
-from tactile_bayes.geometry import FloatArray
-from tactile_bayes.inference.draws import Labels, Quantity, summarise
-from tactile_bayes.presets import INTERVAL, RESEARCH_USE
-from tactile_bayes.report.estimate_text import exams_label
-from tactile_bayes.report.quantities import leading_size
-from tactile_bayes.size.draws import EXTREMES, SIZES
+from tactile_bayes.mapping.map import TactileMap
+from tactile_bayes.posterior.result import DrawGroup, Estimate, Mass, inference_groups
+from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.report.estimate_document import estimate_report, patient_mm
+from tactile_bayes.report.estimate_figures import draw_fit, draw_map, draw_size
+from tactile_bayes.report.estimate_text import estimate_summary, estimate_text, exams_label
+from tactile_bayes.report.exam_page import PageFiles
+from tactile_bayes.report.exam_words import Exam, ExamMap, Given, exam_map
+from tactile_bayes.report.figure_file import named_exam
+from tactile_bayes.report.quantities import estimate_quantities, leading_size, lump_place, side_of
+from tactile_bayes.scan import HeadShape
+from tactile_bayes.size.draws import EXTREMES, SIZES, ShapeDraws, SizePosterior
+from tactile_bayes.size.fat import BetweenMaps, head_profile
+from tactile_bayes.size.pooling import Calibration, SizePriors
 
 if TYPE_CHECKING:
     import pandas
+    from matplotlib.figure import Figure
 
-    from tactile_bayes.posterior.result import Mass
-    from tactile_bayes.size.draws import SizePosterior
-
-
-# --- Posterior draws of one quantity, with its median and intervals.
-
-
-class Draws(Record, eq=False):
-    """Posterior draws of one quantity.
-
-    Parameters
-    ----------
-    values : (chain, draw) array
-        NaN where a draw has no value.
-    unit
-        Such as ``"mm"``; empty for a ratio.
-    probability
-        Of the interval that is shown where none is asked for.
-    replicates : (chain * draw,) array
-        Label of the independent replicate of each draw; their spread is the Monte-Carlo error.
-    effective_draws
-        How many independent draws they are worth, where there are no replicates.
-
-    Examples
-    --------
-    >>> import tactile_bayes as tb
-    >>> size = tb.estimate(tb.demo_map()).max_size_mm
-    >>> low, high = size.interval(0.9)
-    >>> bool(low < size.median < high)
-    True
-    """
-
-    values: FloatArray
-    unit: str = ""
-    probability: float = INTERVAL
-    replicates: Labels | None = None
-    effective_draws: float | None = None
-
-    def summary(self, probability: float | None = None) -> Quantity:
-        """Median, mean, SD, equal-tailed interval and its Monte-Carlo error, as the command line prints them.
-
-        Parameters
-        ----------
-        probability
-            Of the interval, between 0 and 1.
-
-        Raises
-        ------
-        UsageError
-            When the probability is not between 0 and 1.
-        """
-        wanted = self.probability if probability is None else probability
-        check_number("the probability of an interval", wanted, 0, 1, open_ends=True)
-        return summarise(
-            self.values, probability=wanted, effective_draws=self.effective_draws, replicates=self.replicates
-        )
-
-    def interval(self, probability: float | None = None) -> tuple[float, float]:
-        """Ends of the equal-tailed credible interval."""
-        found = self.summary(probability)
-        return found.low, found.high
-
-    @property
-    def median(self) -> float:
-        """The posterior's median."""
-        return self.summary().median
-
-    @property
-    def mean(self) -> float:
-        """The posterior's mean."""
-        return self.summary().mean
-
-    @property
-    def sd(self) -> float:
-        """The posterior's standard deviation."""
-        return self.summary().sd
-
-    @property
-    def mc_error(self) -> float:
-        """Monte-Carlo standard error of the interval's ends."""
-        return self.summary().mc_error
-
-    def __array__(self, dtype: object = None, copy: bool | None = None) -> FloatArray:
-        """The draws as an array."""
-        del copy
-        return np.asarray(self.values, dtype=dtype)  # type: ignore[call-overload, no-any-return]
-
-    def __repr__(self) -> str:
-        found = self.summary()
-        unit = f" {self.unit}" if self.unit else ""
-        return f"{found.median:.3g}{unit} ({found.low:.3g} to {found.high:.3g}, {100 * found.probability:g} % interval)"
+_SHAPES = ("amplitude", "sigma_x_mm", "sigma_y_mm", "x_mm", "y_mm", "angle_rad", "background", "noise_sd")
 
 
 # --- What all estimates of a size have in common, and the masses of a map.
 
 
-class Sized:
+class Sized(Record, eq=False, dict=True):
     """Base of the estimates from one map, of one of its masses, and from several maps."""
-
-    name: str
-    probability: float
 
     @property
     def _size(self) -> SizePosterior | None:
@@ -138,7 +62,12 @@ class Sized:
         size = self._size
         if size is None:
             return None
-        return Draws(np.atleast_2d(getattr(size, name)), "mm", self.probability, size.replicates)
+        return Draws(np.atleast_2d(getattr(size, name)), "mm", self._interval, size.replicates)
+
+    @property
+    def _interval(self) -> float:
+        """Probability of the intervals shown by default."""
+        raise NotImplementedError
 
     @property
     def max_size_mm(self) -> Draws | None:
@@ -164,7 +93,7 @@ class Sized:
         size = None if self._size is None else self._size.another_exam
         if size is None:
             return None
-        return Draws(np.atleast_2d(size.max_size_mm), "mm", self.probability, size.replicates)
+        return Draws(np.atleast_2d(size.max_size_mm), "mm", self._interval, size.replicates)
 
     def _columns(self) -> dict[str, Draws]:
         found = {name: self._of_size(name) for name in SIZES}
@@ -224,7 +153,7 @@ class Sized:
             return
         leads = leading_size(self._size)
         for name in EXTREMES:
-            draws = Draws(np.atleast_2d(getattr(leads, name)), "mm", self.probability, leads.replicates)
+            draws = Draws(np.atleast_2d(getattr(leads, name)), "mm", self._interval, leads.replicates)
             yield f"{'largest' if name == 'max_size_mm' else 'smallest'} size", repr(draws)
         if leads is not self._size:
             yield f"largest size {exams_label(self._size.figures.get('between_map_sd'))}", repr(self.max_size_mm)
@@ -237,29 +166,23 @@ class Sized:
         return f"{told}{why}{table}<p><small>{escape(RESEARCH_USE)}</small></p>"
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class MassEstimate(Sized):
-    """One of the masses on a map.
-
-    Parameters
-    ----------
-    number
-        By evidence, the surest first; those without a size come last.
-    mass
-        Its place and its own estimate.
-    patient_mm
-        x and y from the xiphoid, to the patient's right and up; None where the map has no landmarks.
-    probability
-        Of the intervals shown by default.
-    reason
-        Why it has no size; empty where it has one.
-    """
+class MassEstimate(Sized, eq=False, dict=True):
+    """One of the masses on a map."""
 
     number: int
+    """By evidence, the surest first; those without a size come last."""
     mass: Mass
+    """Its place and its own estimate."""
     patient_mm: tuple[float, float] | None
+    """x and y from the xiphoid, to the patient's right and up; None where the map has no landmarks."""
     probability: float
+    """Of the intervals shown by default."""
     reason: str
+    """Why it has no size; empty where it has one."""
+
+    @property
+    def _interval(self) -> float:
+        return self.probability
 
     @property
     def _size(self) -> SizePosterior | None:
@@ -297,3 +220,312 @@ class MassEstimate(Sized):
     def _words(self) -> str:
         x, y = self.centre_mm
         return f"{self.number} at ({x:.1f}, {y:.1f}) mm: {super()._words()}"
+
+
+# --- The answer for one map, as processes and campaigns pass it on, and the estimate with all that it was made of.
+
+
+class Answer(Record):
+    """Answer for one map: its report and its text, or an error with its exit code; without map and draws."""
+
+    report: EstimateReport | None
+    text: str
+    """The report in at most 12 lines, or the error."""
+    exit_code: int
+    shape: ShapeDraws | None = None
+    """What pooling needs of a map on which a lump was found."""
+    normalise: str = ""
+    """How the map's frames were normalised."""
+    fingerprint: int = 0
+    """What the map's values seed random numbers with."""
+    full_text: str = ""
+    """All of the report."""
+    head: HeadShape | None = None
+    """What the map was made with."""
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What speaks against the answer, cautions first; nothing for an error."""
+        return () if self.report is None else self.report.findings
+
+    @property
+    def document(self) -> dict[str, Any] | None:
+        """What ``estimate --json`` prints; None for an error."""
+        return None if self.report is None else self.report.document
+
+
+class SizedExam(Sized, eq=False, dict=True):
+    """Base of the estimates of a whole exam, from one map or from several."""
+
+    def exam(self) -> Exam:
+        """What a page of the exam shows."""
+        raise NotImplementedError
+
+    @door
+    def report(
+        self,
+        path: PathLike,
+        *,
+        pdf: PathLike | None = None,
+        title: str = "",
+        name: str = "",
+        day: str = "",
+        force: bool = False,
+    ) -> None:
+        """Write one page of the exam as HTML, repeat maps on it, and with `pdf` also print it; see `exam_report`."""
+        page, given = PageFiles(path_of(path), path_of(pdf), force), Given(title, name, day)
+        page.check()
+        page.write(given.on(self.exam()))
+
+
+class SizeEstimate(SizedExam, eq=False, dict=True):
+    """The estimate of one map."""
+
+    tactile_map: TactileMap
+    estimate: Estimate
+    """Posterior and size, or why there is none."""
+    provenance: Provenance
+    settings: Settings
+    calibration: Calibration | None = None
+    """The one that sized the lump, at its depth."""
+    name: str = ""
+    """Of the map, for figures."""
+
+    @property
+    def probability(self) -> float:
+        """Probability of the intervals shown by default."""
+        return self.settings.interval
+
+    @property
+    def _interval(self) -> float:
+        return self.settings.interval
+
+    @property
+    def _size(self) -> SizePosterior | None:
+        return self.estimate.size
+
+    @property
+    def status(self) -> str:
+        """``"estimate"`` or ``"no_estimate"``."""
+        return self.estimate.status
+
+    @property
+    def why(self) -> str:
+        """Why there is no size, or no estimate at all; empty where there is a size."""
+        return "" if self._size is not None else self.estimate.reason
+
+    @property
+    def advice(self) -> str:
+        """What would help where there is no size."""
+        return in_keywords(self.estimate.advice)
+
+    @property
+    def detected_probability(self) -> float | None:
+        """Probability that the lump, or the likeliest rise, is one where half of the exams hold one; None untested."""
+        return self.estimate.probability
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What speaks against the answer, cautions first."""
+        return self.estimate.findings
+
+    def _rows(self) -> Iterator[tuple[str, str]]:
+        yield from super()._rows()
+        if self.detected_probability is not None:
+            yield "probability of a lump", f"{self.detected_probability:.2f}"
+
+    @property
+    def amplitude(self) -> Draws | None:
+        """Height of the map's Gaussian over its level; None without an estimate."""
+        return self._of_shape("amplitude")
+
+    @property
+    def sigma_x_mm(self) -> Draws | None:
+        """Width of the map's Gaussian along its first axis; None without an estimate."""
+        return self._of_shape("sigma_x_mm")
+
+    @property
+    def sigma_y_mm(self) -> Draws | None:
+        """Width of the map's Gaussian along its second axis; None without an estimate."""
+        return self._of_shape("sigma_y_mm")
+
+    @property
+    def x_mm(self) -> Draws | None:
+        """Centre of the lump on the map, across the head; None without an estimate."""
+        return self._of_shape("x_mm")
+
+    @property
+    def y_mm(self) -> Draws | None:
+        """Centre of the lump on the map, along the head; None without an estimate."""
+        return self._of_shape("y_mm")
+
+    @property
+    def masses(self) -> tuple[MassEstimate, ...]:
+        """All masses of the map, the surest first; this estimate is of the one that is `reported`."""
+        found, tactile_map = self.estimate, self.tactile_map
+        return tuple(
+            MassEstimate(
+                number,
+                mass,
+                patient_mm(tactile_map, mass.x_mm, mass.y_mm),
+                self.probability,
+                "" if mass.estimate.size is not None else found.reason if mass.reported else mass.estimate.reason,
+            )
+            for number, mass in enumerate(found.masses, start=1)
+        )
+
+    def _of_shape(self, name: str) -> Draws | None:
+        found = self.estimate
+        if found.map_posterior is None or found.draws is None:
+            return None
+        unit = "mm" if name.endswith("_mm") else "rad" if name.endswith("_rad") else ""
+        values = getattr(found.map_posterior, name)
+        return Draws(values, unit, self.probability, found.draws.labels, found.draws.effective_draws)
+
+    def _columns(self) -> dict[str, Draws]:
+        shapes = {name: draws for name in _SHAPES if (draws := self._of_shape(name)) is not None}
+        return {**super()._columns(), **shapes}
+
+    def _groups(self) -> dict[str, Any]:
+        return {name: (group.arrays, group.notes) for name, group in self._beside().items()}
+
+    def _beside(self) -> dict[str, DrawGroup]:
+        """What goes with the draws, see `inference_groups`."""
+        rng = np.random.default_rng([self.settings.seed, self.tactile_map.fingerprint, 1])
+        priors = size_priors(self.settings)
+        return inference_groups(self.estimate, calibration=self.calibration, size_priors=priors, rng=rng)
+
+    @cached_property
+    def answer(self) -> Answer:
+        """The report: `document` is what ``estimate --json`` prints, `text` what it prints for people."""
+        tactile_map, estimate, settings = self.tactile_map, self.estimate, self.settings
+        quantities = estimate_quantities(estimate, tactile_map, probability=settings.interval)
+        place = lump_place(estimate.map_posterior, tactile_map, self.provenance.scans)
+        report = estimate_report(
+            estimate,
+            tactile_map,
+            probability=settings.interval,
+            prior=settings.prior,
+            provenance=self.provenance,
+            quantities=quantities,
+            place=place,
+        )
+        told: dict[str, Any] = {"probability": settings.interval, "masses": report.masses, "place": place}
+        return Answer(
+            report,
+            text=estimate_summary(estimate, quantities, **told),
+            exit_code=EXIT_DONE if self.status == "estimate" else EXIT_NO_ESTIMATE,
+            shape=pooling_shape(tactile_map, estimate),
+            normalise=tactile_map.recipe.normalise,
+            fingerprint=tactile_map.fingerprint,
+            full_text=estimate_text(estimate, tactile_map, prior=settings.prior, quantities=quantities, **told),
+            head=tactile_map.head,
+        )
+
+    def page_map(self, side: str) -> ExamMap:
+        """The map as a page of the exam shows it; `side` is the breast, as the scans have it."""
+        assert self.answer.report is not None
+        return exam_map(self.tactile_map, self.answer.report, side=side)
+
+    def exam(self) -> Exam:
+        scans = self.provenance.scans
+        check_one_mass(scans)
+        return Exam((self.page_map(side_of(scans)),), None, scans)
+
+    @door
+    def plot(self, path: PathLike | None = None, *, force: bool = False) -> Figure:
+        """Draw the posterior of the size; without a size the map with the places looked at.
+
+        Parameters
+        ----------
+        path
+            Also write it there, as PNG, PDF or SVG.
+        """
+        size = self.estimate.size
+        if size is None:
+            return self.plot_map(path, force=force)
+        return draw_size(
+            size,
+            path_of(path),
+            name=self._titled,
+            probability=self.probability,
+            findings=self.findings,
+            force=force,
+        )
+
+    @door
+    def plot_map(self, path: PathLike | None = None, *, force: bool = False) -> Figure:
+        """Draw the map with the lump's ellipse and size, or with the places looked at."""
+        return draw_map(self.tactile_map, self.estimate, path_of(path), name=self._titled, force=force)
+
+    @door
+    def plot_fit(self, path: PathLike | None = None, *, force: bool = False) -> Figure:
+        """Draw data, fit and residual of the fit window side by side; without an estimate the map.
+
+        Parameters
+        ----------
+        path
+            Also write it there, as PNG, PDF or SVG.
+        """
+        if self.status != "estimate":
+            return self.plot_map(path, force=force)
+        return draw_fit(self.tactile_map, self.estimate, path_of(path), name=self._titled, force=force)
+
+    @property
+    def _titled(self) -> str:
+        """Name for the titles of figures, with the subject's code and the scan's digest."""
+        return named_exam(self.name, self.provenance.scans)
+
+    @door
+    def save(self, path: PathLike, *, force: bool = False) -> None:
+        """Write all draws as netCDF that arviz opens, as ``estimate -o`` does.
+
+        Raises
+        ------
+        UsageError
+            Without an estimate, or when the file exists and `force` is false.
+        """
+        if self.status != "estimate":
+            raise UsageError(f"there are no draws to write: {self.why}")
+        self.write(output_path(path, "netCDF"), force=force)
+
+    def write(self, path: Path, *, force: bool = False) -> None:
+        """Write the draws of an estimate, and what goes with them."""
+        assert self.answer.report is not None
+        groups, report = self._beside(), self.answer.report
+        write_posterior(path, self.estimate, provenance=self.provenance, groups=groups, report=report, force=force)
+
+
+def size_priors(settings: Settings) -> SizePriors:
+    """Priors of a size; a spread between maps that is stated, or learned at the site, leaves it one interval."""
+    fixed, learned = settings.between_map_sd, settings.repeatability
+    if learned is None and fixed is None:
+        return SizePriors(known=dict(settings.known))
+    between = learned.between_maps if learned is not None else BetweenMaps(fixed or 0.0, 0.0)
+    return SizePriors(between_maps=between, another_exam=None, known=dict(settings.known))
+
+
+def pooling_shape(tactile_map: TactileMap, estimate: Estimate) -> ShapeDraws | None:
+    """Draws that pooling needs of a map, with the direction of its axes if landmarks define it."""
+    posterior, turn = estimate.map_posterior, tactile_map.patient_from_plane
+    if posterior is None or estimate.draws is None:
+        return None
+    angle = 0.0 if turn is None else math.atan2(float(turn[1, 0]), float(turn[0, 0]))
+    bump = posterior.bump(estimate.draws.replicates)
+    return ShapeDraws.of(bump, turn_rad=angle, profile=head_profile(tactile_map.quality))
+
+
+def check_one_mass(scans: Sequence[Mapping[str, str]]) -> None:
+    """Refuse scans that say they are of different masses, or of one mass at different visits.
+
+    Raises
+    ------
+    BadDataError
+        Naming what they differ in.
+    """
+    for name in ("subject", "side", "mass", "visit"):
+        values = sorted({scan[name].casefold(): scan[name] for scan in scans if scan.get(name)}.values())
+        if len(values) > 1:
+            visits = "; `compare` takes several visits" if name == "visit" else ""
+            way_out = f"give the maps of one mass at one visit, and others by themselves{visits}"
+            raise BadDataError(f"the maps differ in {name} ({', '.join(values)})", way_out=way_out)

@@ -6,9 +6,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tactile_bayes.api.estimating import Answer, answer_of, estimate_file, estimate_inputs
-from tactile_bayes.api.pooled import of_one_mass, pool_answers
+from tactile_bayes.api.estimating import estimate_file, estimate_inputs
+from tactile_bayes.api.pooled import pool_estimates
 from tactile_bayes.api.settings import Settings
+from tactile_bayes.api.sized import SizeEstimate
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.map_nc import read_map
@@ -38,20 +39,17 @@ def tradeoff_of_map(path: Path, settings: Settings, work: Work) -> tuple[Tactile
 def pooled_rows(paths: Sequence[Path], settings: Settings, *, clock: Clock) -> tuple[PooledRow, ...]:
     """The size by the first map of one mass, by the first two, and so on."""
 
-    def at_place(i: int, place: tuple[float, float]) -> Answer:
-        return answer_of(estimate_file(paths[i], replace(settings, centre_mm=place)))
-
-    rows, answers, spent = [], [], 0.0
+    rows, found, spent = [], list[SizeEstimate](), 0.0
     for number, path in enumerate(paths, start=1):
         begun = clock()
-        answers.append(answer_of(estimate_file(path, settings)))
+        found.append(estimate_file(path, settings))
+        assert found[-1].answer.report is not None  # made here: its time is the estimate's, not the pooling's
         spent += clock() - begun
         begun = clock()
-        if settings.centre_mm is None:
-            answers = of_one_mass(answers, at_place)
-        pooled = pool_answers(answers, settings, names=[one.stem for one in paths[:number]], inputs={}).pooled
+        together = pool_estimates(found, settings, names=[one.stem for one in paths[:number]], inputs={})
+        found = list(together.maps)
         pooling = clock() - begun
-        rows.append(PooledRow(number, spent + pooling, *_pooled_answer(pooled, settings)))
+        rows.append(PooledRow(number, spent + pooling, *_pooled_answer(together.pooled, settings)))
     return tuple(rows)
 
 

@@ -6,24 +6,26 @@ from collections import defaultdict
 from collections.abc import Container, Mapping, Sequence
 from datetime import date
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from tactile_bayes.api.estimating import estimate_file
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.files.documents import load_json, load_schema
+from tactile_bayes.files.comparison import CompareReport
+from tactile_bayes.files.documents import load_schema, read_record
 from tactile_bayes.files.manifest_csv import COMPARED, GROWTH, Exam, natural, table_text
 from tactile_bayes.files.map_nc import read_map
+from tactile_bayes.files.reports import EstimateReport, Place
 from tactile_bayes.findings import Finding, finding_lines
 from tactile_bayes.posterior.result import Estimate
-from tactile_bayes.report.compare import Growth, of_document
+from tactile_bayes.report.compare import Growth, growths
 from tactile_bayes.trial.readings import day_of, in_order
 
 if TYPE_CHECKING:
-    from tactile_bayes.api.estimating import Outcome
     from tactile_bayes.api.settings import Settings
+    from tactile_bayes.api.sized import SizeEstimate
     from tactile_bayes.campaign.run import Campaign
     from tactile_bayes.geometry import FloatArray
     from tactile_bayes.mapping.map import TactileMap
@@ -83,9 +85,7 @@ class Breasts:
         return named_exams(exam, breast if of is None else [one for one in breast if one.name in of])
 
 
-def matched_outcome(
-    path: Path, settings: Settings, *, mass: str, places: Sequence[NamedPlace], most_mm: float
-) -> Outcome:
+def matched(path: Path, settings: Settings, *, mass: str, places: Sequence[NamedPlace], most_mm: float) -> SizeEstimate:
     """Estimate the mass of a map that lies nearest to where another exam has it.
 
     Without a mass there the estimate is of the place, and says why it has no size.
@@ -112,7 +112,7 @@ def matched_outcome(
     return looked if _within(looked, place, most_mm) else _not_there(looked, mass, place, most_mm)
 
 
-def _within(outcome: Outcome, place: tuple[float, float], most_mm: float) -> bool:
+def _within(outcome: SizeEstimate, place: tuple[float, float], most_mm: float) -> bool:
     """Whether an estimate is of a lump near a place, or of none."""
     if outcome.estimate.status != "estimate":
         return True
@@ -120,7 +120,7 @@ def _within(outcome: Outcome, place: tuple[float, float], most_mm: float) -> boo
     return bool(np.hypot(here.x_mm - place[0], here.y_mm - place[1]) <= most_mm)
 
 
-def _not_there(outcome: Outcome, mass: str, place: tuple[float, float], most_mm: float) -> Outcome:
+def _not_there(outcome: SizeEstimate, mass: str, place: tuple[float, float], most_mm: float) -> SizeEstimate:
     """The outcome without its estimate, which is of a lump elsewhere."""
     found = outcome.estimate
     reason = f"no lump found within {most_mm:g} mm of mass {mass}'s place, ({place[0]:.1f}, {place[1]:.1f}) mm"
@@ -171,19 +171,16 @@ def _on_map(tactile_map: TactileMap, place: tuple[float, float]) -> bool:
     return all(float(axis[0]) <= at <= float(axis[-1]) for axis, at in zip(axes, place, strict=True))
 
 
-def unnamed(documents: Sequence[Mapping[str, Any]]) -> list[Finding]:
-    """Masses of one scan that no row names.
-
-    `documents` are the estimates of all rows of the scan.
-    """
-    centres = [one["centre_mm"] for document in documents for one in document["masses"] if one["reported"]]
-    found: list[Mapping[str, float]] = []
-    for mass in documents[0]["masses"]:
-        at = mass["centre_mm"]
-        if all(np.hypot(at["x"] - one["x"], at["y"] - one["y"]) > SAME_MM for one in [*centres, *found]):
+def unnamed(reports: Sequence[EstimateReport]) -> list[Finding]:
+    """Masses of one scan that no row names; the reports are those of all rows of the scan."""
+    centres = [one.centre_mm for report in reports for one in report.masses if one.reported]
+    found: list[Place] = []
+    for at in (one.centre_mm for one in reports[0].masses):
+        if all(np.hypot(at.x - one.x, at.y - one.y) > SAME_MM for one in [*centres, *found]):
             found.append(at)
-    words = "a mass at ({x:.1f}, {y:.1f}) mm on the map is named by no row"
-    return [Finding("unnamed_mass", words.format(**at)) for at in found]
+    return [
+        Finding("unnamed_mass", f"a mass at ({at.x:.1f}, {at.y:.1f}) mm on the map is named by no row") for at in found
+    ]
 
 
 # --- Growth between the visits of a campaign's masses: who is compared, and the table of what came of it.
@@ -226,24 +223,16 @@ def growth_rows(campaign: Campaign) -> list[Growth]:
     for name, visits in grown_masses(campaign.exams).items():
         codes, exam = [*visits], next(iter(visits.values()))[0]
         link = f"{GROWTH}/{name}/{COMPARED}"
-        document = load_json(campaign.folder / link) if name in compared else None
-        if isinstance(document, dict):
-            sized = [
-                code for code, exams in visits.items() if any(one.name in compared_names(document) for one in exams)
-            ]
-            rows += of_document(exam.patient, exam.mass, sized, document, link)
+        if name in compared:
+            report = read_record(campaign.folder / link, CompareReport)
+            of = {one.map for visit in report.visits for one in visit.maps}
+            sized = [code for code, exams in visits.items() if any(one.name in of for one in exams)]
+            rows += growths(exam.patient, exam.mass, sized, report, link)
         else:
             fault = campaign.found.faults.get(name)
             reason = "exams of fewer than two visits came through" if fault is None else fault.reason
             rows.append(Growth(exam.patient, exam.mass, codes[0], codes[-1], "failed", campaign.not_compared or reason))
     return rows
-
-
-def compared_names(document: Mapping[str, object]) -> set[str]:
-    """Names of the exams that a comparison is of."""
-    visits = document["visits"]
-    assert isinstance(visits, list)
-    return {one["map"] for visit in visits for one in visit["maps"]}
 
 
 def growth_text(rows: Sequence[Growth]) -> str:
@@ -252,8 +241,9 @@ def growth_text(rows: Sequence[Growth]) -> str:
 
 
 def _line(row: Growth) -> dict[str, object]:
-    first, later = (q["median"] for q in row.sizes_mm) if row.sizes_mm else (None, None)
-    ends = {} if row.percent is None else row.percent
+    first, later = (q.median for q in row.sizes_mm) if row.sizes_mm else (None, None)
+    change = row.percent
+    names = {"change_percent": "median", "low_percent": "low", "high_percent": "high", "probability": "probability"}
     return {
         "patient": row.patient,
         "mass": row.mass,
@@ -264,10 +254,7 @@ def _line(row: Growth) -> dict[str, object]:
         "reason": row.reason or None,
         "earlier_mm": first,
         "later_mm": later,
-        "change_percent": ends.get("median"),
-        "low_percent": ends.get("low"),
-        "high_percent": ends.get("high"),
-        "probability": ends.get("probability"),
+        **{column: None if change is None else getattr(change, name) for column, name in names.items()},
         "verdict": row.verdict or None,
         "findings": " ".join(finding_lines(row.findings)) or None,
     }

@@ -38,7 +38,6 @@ from tactile_bayes.options import TrialSettings
 from tactile_bayes.report import campaign_html as sheet
 from tactile_bayes.report.campaign_html import Card, campaign_html, worst
 from tactile_bayes.report.compare import Growth, growth_line
-from tactile_bayes.report.quantities import leading
 from tactile_bayes.trial.readings import at_excision
 
 if TYPE_CHECKING:
@@ -192,7 +191,7 @@ def _trial_settings(protocol: Path | None) -> tuple[TrialSettings, str | None]:
 
 def _counts(rows: Sequence[Row]) -> tuple[int, int, int]:
     sized = sum(row.size is not None for row in rows)
-    failed = sum(row.document is None for row in rows)
+    failed = sum(row.report is None for row in rows)
     return sized, len(rows) - sized - failed, failed
 
 
@@ -255,16 +254,16 @@ def _card(campaign: Campaign, row: Row) -> Card:
         name
         for step in ("map", "estimate", "figures", "size")
         for name in (campaign.found.of(step, exam.name) or {"files": ()})["files"]
-        if row.document is not None
+        if row.report is not None
     }
     facts = [f"patient {exam.patient}", f"visit {exam.visit}", f"mass {exam.mass}", f"exam {exam.replicate}"]
     facts += [fact for fact in (exam.side, exam.reader and f"reader {exam.reader}", exam.file) if fact]
     return Card(
         name=exam.name,
-        status=sheet.FAILED if row.document is None else sheet.UNSIZED if row.size is None else sheet.SIZED,
+        status=sheet.FAILED if row.report is None else sheet.UNSIZED if row.size is None else sheet.SIZED,
         facts=tuple(facts),
         reason=row.reason,
-        size=None if row.document is None else leading(row.document)["max_size_mm"],
+        size=row.size,
         findings=row.findings,
         thumbnail=f"{EXAMS}/{exam.name}/{THUMBNAIL}" if THUMBNAIL in made else None,
         links={name: f"{EXAMS}/{exam.name}/{name}" for name in _LINKS if name in made},

@@ -11,17 +11,18 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from tactile_bayes.api.comparing import compare_answers, drawn_maps
-from tactile_bayes.api.estimating import Answer, answer_of, choose_calibration, estimate_file, size_priors
+from tactile_bayes.api.estimating import choose_calibration, estimate_file
 from tactile_bayes.api.maps import map_provenance
 from tactile_bayes.api.pooled import pool_answers
 from tactile_bayes.api.repeatability import ExamFolder, learn_from_exams, repeatability_setting
 from tactile_bayes.api.settings import Comparing, Settings
-from tactile_bayes.campaign.match import OWN_AXES, NamedPlace, in_own_axes, matched_outcome
+from tactile_bayes.api.sized import Answer, SizeEstimate, size_priors
+from tactile_bayes.campaign.match import OWN_AXES, NamedPlace, in_own_axes, matched
 from tactile_bayes.campaign.settings import Writes, digest_of, write_staged
-from tactile_bayes.declarations import EXACT, Record, field, from_plain, replace, to_plain
+from tactile_bayes.declarations import EXACT, Record, field, from_plain, replace, rounded, to_plain
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.atomic import sha256, write_bytes, write_text
-from tactile_bayes.files.documents import check_document, dump_json, load_json
+from tactile_bayes.files.documents import read_record
 from tactile_bayes.files.manifest_csv import (
     COMPARED,
     COMPARED_FIGURE,
@@ -40,23 +41,22 @@ from tactile_bayes.files.manifest_csv import (
     THUMBNAIL,
     Exam,
 )
-from tactile_bayes.files.map_nc import read_map, read_map_and_scans, write_map, write_pooled
+from tactile_bayes.files.map_nc import read_map, read_map_and_scans, write_map
 from tactile_bayes.files.provenance import Provenance, scan_facts
 from tactile_bayes.files.reading import NETCDF_BYTES, kind_of, read_bytes
 from tactile_bayes.files.remote import fetched, put
-from tactile_bayes.findings import by_weight, findings_in
+from tactile_bayes.files.reports import EstimateReport, json_text
+from tactile_bayes.findings import by_weight
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.options import MapOptions
-from tactile_bayes.report.estimate_document import rounded, size_diagnostics
+from tactile_bayes.report.estimate_document import size_diagnostics
 from tactile_bayes.report.estimate_figures import draw_comparison, draw_map, draw_size
-from tactile_bayes.report.quantities import ANOTHER_EXAM
 from tactile_bayes.report.svg import thumbnail_png
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.draws import SIZES
 from tactile_bayes.size.pooling import size_alone
 
 if TYPE_CHECKING:
-    from tactile_bayes.api.estimating import Answer, Outcome
     from tactile_bayes.campaign.settings import CampaignSettings
     from tactile_bayes.mapping.map import TactileMap
     from tactile_bayes.scan import Scan
@@ -245,30 +245,29 @@ def check_facts(expected: Mapping[str, str], facts: Mapping[str, str]) -> None:
 def _estimate(task: Task) -> tuple[Result, Writes]:
     from tactile_bayes.files.npz import write_shape
 
-    outcome = _outcome(task)
-    answer = answer_of(outcome)
-    document = answer.document
-    assert document is not None
-    check_document(document, "estimate.schema.json", path=Path("the report"))
-    writes: Writes = {ESTIMATE: lambda path: write_text(path, dump_json(document), force=True)}
-    if outcome.estimate.status == "estimate":
-        writes[POSTERIOR] = lambda path: outcome.write(path, document=document, force=True)
+    found = _estimated(task)
+    answer = found.answer
+    assert answer.report is not None
+    report = answer.report.checked()
+    writes: Writes = {ESTIMATE: lambda path: write_text(path, json_text(report), force=True)}
+    if found.status == "estimate":
+        writes[POSTERIOR] = lambda path: found.write(path, force=True)
     shape = answer.shape
     if shape is not None:
         writes[SHAPE] = lambda path: write_shape(path, shape, force=True)
-    picture = thumbnail_png(outcome.tactile_map, document)
+    picture = thumbnail_png(found.tactile_map, report)
     if picture is not None:
         writes[THUMBNAIL] = lambda path: write_bytes(path, picture, force=True)
     return {"exit_code": answer.exit_code}, writes
 
 
-def _outcome(task: Task) -> Outcome:
+def _estimated(task: Task) -> SizeEstimate:
     """The exam's estimate: of the mass that its row names, where other exams have it."""
     assert task.settings is not None
     path = task.folder / MAP
     if not task.places:
         return estimate_file(path, task.settings)
-    found = matched_outcome(path, task.settings, mass=task.mass, places=task.places, most_mm=task.match_mm)
+    found = matched(path, task.settings, mass=task.mass, places=task.places, most_mm=task.match_mm)
     if not in_own_axes(found.tactile_map, task.places):
         return found
     findings = by_weight((*found.estimate.findings, OWN_AXES))
@@ -277,14 +276,13 @@ def _outcome(task: Task) -> Outcome:
 
 def _figures(task: Task) -> tuple[Result, Writes]:
     """Draw the figures of `estimate`; the estimate is made again, for it is not stored whole."""
-    outcome = _outcome(task)
-    settings = outcome.settings
-    tactile_map, estimate = outcome.tactile_map, outcome.estimate
+    found = _estimated(task)
+    tactile_map, estimate = found.tactile_map, found.estimate
     size, writes = estimate.size, Writes()
     if tactile_map.covered.any():
         writes[MAP_FIGURE] = lambda path: draw_map(tactile_map, estimate, path, name=task.name, force=True)
     if size is not None:
-        probability, findings = settings.interval, estimate.findings
+        probability, findings = found.probability, estimate.findings
         writes[SIZE_FIGURE] = lambda path: draw_size(
             size, path, name=task.name, probability=probability, findings=findings, force=True
         )
@@ -297,14 +295,11 @@ def _pool(task: Task) -> tuple[Result, Writes]:
     answers = [_answer(folder) for _, folder in task.members]
     inputs = {f"map_{i}": folder / MAP for i, (_, folder) in enumerate(task.members, start=1)}
     names = [name for name, _ in task.members]
-    outcome = pool_answers(answers, task.settings, names=names, inputs=inputs)
-    check_document(outcome.document, "pooled.schema.json", path=Path("the report"))
-    writes: Writes = {POOLED: lambda path: write_text(path, dump_json(outcome.document), force=True)}
-    size = outcome.pooled.size
-    if size is not None:
-        writes[POOLED_DRAWS] = lambda path: write_pooled(
-            path, size, provenance=outcome.provenance, document=outcome.document, force=True
-        )
+    found = pool_answers(answers, task.settings, names=names, inputs=inputs)
+    report = found.pooled_report.checked()
+    writes: Writes = {POOLED: lambda path: write_text(path, json_text(report), force=True)}
+    if found.pooled.size is not None:
+        writes[POOLED_DRAWS] = lambda path: found.write(path, force=True)
     return {}, writes
 
 
@@ -313,23 +308,21 @@ def _compare(task: Task) -> tuple[Result, Writes]:
     assert task.settings is not None
     answers = [[_answer(folder) for _, folder in exams] for exams in task.visits]
     found = [one for maps in answers for one in maps if one.shape is not None]
-    placed = all(one.document is not None and one.document["centre_patient_mm"] is not None for one in found)
+    placed = all(one.report is not None and one.report.centre_patient_mm is not None for one in found)
     numbered = [(v, i, folder) for v, exams in enumerate(task.visits, 1) for i, (_, folder) in enumerate(exams, 1)]
-    outcome = compare_answers(
+    compared = compare_answers(
         answers,
         task.settings,
         comparing=Comparing(days=task.days, same_mass=not placed),
         names=[[name for name, _ in exams] for exams in task.visits],
         inputs={f"visit_{v}_map_{i}": folder / MAP for v, i, folder in numbered},
     )
-    check_document(outcome.document, "compare.schema.json", path=Path("the report"))
-    writes: Writes = {COMPARED: lambda path: write_text(path, dump_json(outcome.document), force=True)}
-    if task.figures and outcome.compared.joint is not None:
+    report = compared.report.checked()
+    writes: Writes = {COMPARED: lambda path: write_text(path, json_text(report), force=True)}
+    if task.figures and compared.compared.joint is not None:
         maps = [[read_map(folder / MAP) for _, folder in exams] for exams in task.visits]
         drawn = drawn_maps(maps, answers)
-        writes[COMPARED_FIGURE] = lambda path: draw_comparison(
-            outcome.compared, outcome.document, drawn, path, force=True
-        )
+        writes[COMPARED_FIGURE] = lambda path: draw_comparison(compared.compared, report, drawn, path, force=True)
     return {}, writes
 
 
@@ -342,10 +335,8 @@ def _answer(folder: Path) -> Answer:
     from tactile_bayes.files.npz import read_shape
 
     tactile_map: TactileMap = read_map(folder / MAP)
-    document = load_json(folder / ESTIMATE)
-    assert isinstance(document, dict)
     return Answer(
-        document,
+        read_record(folder / ESTIMATE, EstimateReport),
         text="",
         exit_code=0,
         shape=read_shape(folder / SHAPE) if (folder / SHAPE).exists() else None,
@@ -457,15 +448,14 @@ def size_step(task: Task) -> tuple[Result, Writes]:
     """Size an exam by the site's repeatability: its estimate with other sizes. Nothing where it had no size."""
     assert task.settings is not None
     settings = task.settings
-    document: Any = load_json(task.folder / ESTIMATE)
-    if document["max_size_mm"] is None:
+    report = read_record(task.folder / ESTIMATE, EstimateReport)
+    if report.max_size_mm is None:
         return {}, {}
     size = _exam_size(task.folder, settings)
-    sized = _resized(document, size, settings)
-    check_document(sized, "estimate.schema.json", path=Path("the report"))
-    writes: Writes = {SIZED: lambda path: write_text(path, dump_json(sized), force=True)}
+    sized = _resized(report, size, settings).checked()
+    writes: Writes = {SIZED: lambda path: write_text(path, json_text(sized), force=True)}
     if task.figures:
-        findings = findings_in(sized["findings"])
+        findings = sized.findings
         writes[SIZED_FIGURE] = lambda path: draw_size(
             size, path, name=task.name, probability=settings.interval, findings=findings, force=True
         )
@@ -484,28 +474,26 @@ def _exam_size(folder: Path, settings: Settings) -> SizePosterior:
     return size_alone(shape, calibration=calibration, priors=size_priors(settings), rng=rng)
 
 
-def _resized(document: dict[str, Any], size: SizePosterior, settings: Settings) -> dict[str, Any]:
-    """The estimate's JSON object with the sizes, their sources and their provenance replaced."""
+def _resized(report: EstimateReport, size: SizePosterior, settings: Settings) -> EstimateReport:
+    """The estimate with the sizes, their sources and their provenance replaced."""
     found = settings.repeatability
     assert found is not None
-    sizes = {name: size.summarise(name, probability=settings.interval).as_dict() for name in SIZES}
-    own = {**sizes, ANOTHER_EXAM: None}
-    masses = [{**mass, **own} if mass["reported"] else mass for mass in document["masses"]]
-    diagnostics = {**document["diagnostics"], **size_diagnostics(size), "repeatability": found.words()}
+    own: dict[str, Any] = {name: size.summarise(name, probability=settings.interval).rounded for name in SIZES}
+    own["another_exam"] = None
+    diagnostics = {**report.diagnostics, **size_diagnostics(size), "repeatability": found.words()}
     diagnostics["convergence"] = {
         name: value for name, value in diagnostics.get("convergence", {}).items() if name not in SIZES
     }
     if not diagnostics["convergence"]:
         del diagnostics["convergence"]
-    provenance = dict(document["provenance"])
+    provenance = dict(report.provenance)
     provenance["settings"] = {**provenance["settings"], **repeatability_setting(settings)}
     provenance["inputs"] = [*provenance["inputs"], {"role": "repeatability", "sha256": found.sha256}]
-    return {
-        **document,
-        **sizes,
-        ANOTHER_EXAM: None,
-        "masses": masses,
-        "variance_share": rounded(dict(size.variance_share)),
-        "diagnostics": diagnostics,
-        "provenance": provenance,
-    }
+    return replace(
+        report,
+        **own,
+        masses=tuple(replace(one, **own) if one.reported else one for one in report.masses),
+        variance_share=rounded(dict(size.variance_share)),
+        diagnostics=diagnostics,
+        provenance=provenance,
+    )

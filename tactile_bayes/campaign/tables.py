@@ -11,7 +11,7 @@ from tactile_bayes.campaign.match import unnamed
 from tactile_bayes.campaign.run import Campaign
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.files.atomic import write_text
-from tactile_bayes.files.documents import load_json, load_schema
+from tactile_bayes.files.documents import load_schema, read_record
 from tactile_bayes.files.manifest_csv import (
     DONE,
     ESTIMATE,
@@ -24,18 +24,24 @@ from tactile_bayes.files.manifest_csv import (
     Exam,
     table_text,
 )
-from tactile_bayes.findings import Finding, Verdict, by_weight, finding_lines, findings_in, verdict
+from tactile_bayes.files.reports import EstimateReport, PooledReport, centre_of
+from tactile_bayes.findings import Finding, Verdict, by_weight, finding_lines, verdict
+from tactile_bayes.inference.draws import Quantity
 
 TACTILE, POOLED_MODALITY = "tactile", "tactile-pooled"
 _TRIAL_COLUMNS: Final = (
     "patient", "mass", "modality", "replicate", "size_mm", "status", "sd_mm", "low_mm", "high_mm", "probability",
     "reader", "visit", "date", "reason", "synthetic",
 )  # fmt: skip
-_OF_ESTIMATE: Final = (
-    "status", "reason", "reason_code", "max_size_mm", "min_size_mm", "centre_mm", "detected_probability", "findings",
+
+
+_OF_AN_ESTIMATE: Final = (
+    "smallest_lump", "d_x_mm", "d_y_mm", "amplitude", "sigma_x_mm", "sigma_y_mm", "background", "noise_sd",
+    "another_exam", "supposing", "centre_patient_mm", "position", "angle_deg", "variance_share", "scene",
+    "prior_sensitivity",
 )  # fmt: skip
-_OF_POOLED: Final = ("status", "reason", "max_size_mm", "findings")
-"""What tables and pages show of a document: the rest of it is a hundred times as much."""
+_OF_A_MASS: Final = ("amplitude", "max_size_mm", "min_size_mm", "d_x_mm", "d_y_mm", "angle_deg", "another_exam")
+"""`_OF_AN_ESTIMATE`, `_OF_A_MASS`: What no table shows."""
 
 
 class Row(Record, eq=False):
@@ -43,8 +49,8 @@ class Row(Record, eq=False):
 
     exam: Exam
     """Of exams.csv."""
-    document: Mapping[str, Any] | None
-    """The estimate's JSON object, by the campaign's repeatability where it has one; None where a step failed."""
+    report: EstimateReport | None
+    """The estimate, by the campaign's repeatability where it has one; None where a step failed."""
     step: str = ""
     fault: str = ""
     """`step`, `fault`: Which step failed and why; empty where none did."""
@@ -55,21 +61,21 @@ class Row(Record, eq=False):
     """What speaks against the exam: of its estimate, of the pooled size of its mass, of the table."""
 
     @property
-    def size(self) -> Mapping[str, float] | None:
+    def size(self) -> Quantity | None:
         """Largest size with its interval; None without one."""
-        return None if self.document is None else self.document["max_size_mm"]
+        return None if self.report is None else self.report.max_size_mm
 
     @property
     def reason(self) -> str:
         """Why there is no size; empty where there is one."""
-        if self.document is None:
+        if self.report is None:
             return f"{self.step} failed: {self.fault}"
-        return "" if self.size is not None else str(self.document["reason"])
+        return "" if self.size is not None else self.report.reason
 
     @property
     def status(self) -> str:
         """As the trial table has it: an exam without an estimate looked for the mass in vain, others were not done."""
-        return _status(self.document)
+        return _status(self.report)
 
     @property
     def verdict(self) -> Verdict:
@@ -77,26 +83,26 @@ class Row(Record, eq=False):
         return verdict(self.findings, answered=self.size is not None)
 
 
-def _status(document: Mapping[str, Any] | None) -> str:
-    if document is None:
+def _status(report: EstimateReport | PooledReport | None) -> str:
+    if report is None:
         return "not_done"
-    if document["max_size_mm"] is not None:
+    if report.max_size_mm is not None:
         return "detected"
-    looked = document["status"] == "no_estimate" and document.get("reason_code") != "coarse"
-    return "not_detected" if looked else "not_done"
+    coarse = isinstance(report, EstimateReport) and report.reason_code == "coarse"
+    return "not_detected" if report.status == "no_estimate" and not coarse else "not_done"
 
 
 def exam_rows(campaign: Campaign) -> list[Row]:
     """Every exam of the table, in its order."""
     together = _of_pooled(campaign)
     rows = [_row(campaign, exam, together.get(exam.name, ())) for exam in campaign.exams]
-    of_scan: dict[Path, list[Mapping[str, Any]]] = defaultdict(list)
+    of_scan: dict[Path, list[EstimateReport]] = defaultdict(list)
     for row in rows:
-        if row.document is not None:
-            of_scan[row.exam.path].append(row.document)
+        if row.report is not None:
+            of_scan[row.exam.path].append(row.report)
     return [
         row
-        if row.document is None
+        if row.report is None
         else replace(row, findings=by_weight((*row.findings, *unnamed(of_scan[row.exam.path]))))
         for row in rows
     ]
@@ -107,12 +113,12 @@ def _of_pooled(campaign: Campaign) -> dict[str, tuple[Finding, ...]]:
     return {
         name: tuple(
             replace(one, about="")
-            for one in findings_in(document["findings"])
+            for one in report.findings
             if (one.about == f"map {number}" and one.kind != "several_masses")  # its row says which mass it is of
             or one.kind == "maps_disagree"
         )
-        for document in pooled_documents(campaign).values()
-        for number, name in enumerate(document["maps"], start=1)
+        for report in pooled_reports(campaign).values()
+        for number, name in enumerate((one.map for one in report.maps), start=1)
     }
 
 
@@ -123,30 +129,26 @@ def _row(campaign: Campaign, exam: Exam, together: tuple[Finding, ...]) -> Row:
     if fault is not None and fault.step != "figures":
         return Row(exam, None, fault.step, fault.reason, **facts)
     by_site = SIZED in (campaign.found.of("size", exam.name) or {"files": ()})["files"]
-    document = estimate_facts(load_json(campaign.folder / EXAMS / exam.name / (SIZED if by_site else ESTIMATE)))
-    return Row(exam, document, findings=(*findings_in(document["findings"]), *together), **facts)
+    report = read_record(campaign.folder / EXAMS / exam.name / (SIZED if by_site else ESTIMATE), EstimateReport)
+    return Row(exam, _shortened(report), findings=(*report.findings, *together), **facts)
 
 
-def estimate_facts(document: Any) -> dict[str, Any]:
-    """What tables and pages need of an estimate's JSON object."""
-    masses = [{name: one[name] for name in ("centre_mm", "reported")} for one in document.get("masses", [])]
-    return {name: document.get(name) for name in _OF_ESTIMATE} | {"masses": masses}
+def _shortened(report: EstimateReport) -> EstimateReport:
+    """The report with what tables and pages show: the rest of it is a hundred times as much."""
+    masses = tuple(replace(one, **dict.fromkeys(_OF_A_MASS)) for one in report.masses)
+    rest: dict[str, Any] = {"candidates": (), "other_rises": (), "touching": (), "left_out": (), "prior": {}}
+    return replace(report, masses=masses, diagnostics={}, provenance={}, **dict.fromkeys(_OF_AN_ESTIMATE), **rest)
 
 
-def pooled_documents(campaign: Campaign) -> dict[str, dict[str, Any]]:
-    """What tables need of the JSON object of each pooled mass, by its name."""
-    found = {}
-    for name in campaign.found.results["pool"]:
-        document = load_json(campaign.folder / MASSES / name / POOLED)
-        if isinstance(document, dict):
-            found[name] = {key: document[key] for key in _OF_POOLED}
-            found[name]["maps"] = [one["map"] for one in document["maps"]]
-    return found
+def pooled_reports(campaign: Campaign) -> dict[str, PooledReport]:
+    """Each pooled mass, by its name."""
+    folder = campaign.folder / MASSES
+    return {name: read_record(folder / name / POOLED, PooledReport) for name in campaign.found.results["pool"]}
 
 
 def done_text(rows: Sequence[Row]) -> str:
     """``exams_done.csv``: exams with an estimate, or with the reason for none."""
-    return table_text([_done(row) for row in rows if row.document is not None], _columns("exams_done"))
+    return table_text([_done(row) for row in rows if row.report is not None], _columns("exams_done"))
 
 
 def _columns(table: str) -> list[str]:
@@ -154,10 +156,10 @@ def _columns(table: str) -> list[str]:
 
 
 def _done(row: Row) -> dict[str, object]:
-    document = row.document
-    assert document is not None
-    centre = document["centre_mm"] or {}
-    smallest = document["min_size_mm"]
+    report = row.report
+    assert report is not None
+    x_mm, y_mm = centre_of(report.centre_mm) or (None, None)
+    smallest = report.min_size_mm
     return {
         **_names(row.exam),
         "side": row.exam.side,
@@ -167,9 +169,10 @@ def _done(row: Row) -> dict[str, object]:
         "status": row.status,
         "reason": row.reason or None,
         **_sizes(row.size),
-        "smallest_mm": None if smallest is None else smallest["median"],
-        "detected_probability": document["detected_probability"],
-        **{f"centre_{axis}_mm": value["median"] for axis, value in centre.items()},
+        "smallest_mm": None if smallest is None else smallest.median,
+        "detected_probability": report.detected_probability,
+        "centre_x_mm": x_mm,
+        "centre_y_mm": y_mm,
         "verdict": row.verdict,
         "findings": " ".join(finding_lines(row.findings)) or None,
         "synthetic": row.synthetic,
@@ -180,11 +183,11 @@ def _names(exam: Exam) -> dict[str, object]:
     return {name: getattr(exam, name) for name in ("patient", "visit", "mass", "replicate", "file")}
 
 
-def _sizes(size: Mapping[str, float] | None) -> dict[str, object]:
+def _sizes(size: Quantity | None) -> dict[str, object]:
     if size is None:
         return {}
     names = {"size_mm": "median", "sd_mm": "sd", "low_mm": "low", "high_mm": "high", "probability": "probability"}
-    return {column: size[name] for column, name in names.items()}
+    return {column: getattr(size, name) for column, name in names.items()}
 
 
 def failures_text(campaign: Campaign, rows: Sequence[Row]) -> str:
@@ -207,18 +210,18 @@ def trial_text(campaign: Campaign, rows: Sequence[Row], masses: Collection[tuple
     """
     taken = [row for row in rows if masses is None or (row.exam.patient, row.exam.mass) in masses]
     count: dict[tuple[str, str], int] = {}
-    readings = [_reading(row.exam, TACTILE, count, row.document, reason=row.reason, of=row) for row in taken]
+    readings = [_reading(row.exam, TACTILE, count, row.report, reason=row.reason, of=row) for row in taken]
     count = {}
     visits = {row.exam.of_mass: row for row in taken}
     simulated: dict[str, bool] = {}
     for row in taken:  # a failed exam does not say
         if row.synthetic is not None:
             simulated[row.exam.of_mass] = row.synthetic or simulated.get(row.exam.of_mass, False)
-    pooled = pooled_documents(campaign)
+    pooled = pooled_reports(campaign)
     for name, row in visits.items() if campaign.found.results["pool"] else ():
-        document = pooled.get(name)
-        reason = _unpooled(campaign, name) if document is None else str(document["reason"])
-        readings.append(_reading(row.exam, POOLED_MODALITY, count, document, reason=reason))
+        report = pooled.get(name)
+        reason = _unpooled(campaign, name) if report is None else report.reason
+        readings.append(_reading(row.exam, POOLED_MODALITY, count, report, reason=reason))
         readings[-1] |= {"synthetic": simulated.get(name)}
     return table_text(readings, _TRIAL_COLUMNS)
 
@@ -233,7 +236,7 @@ def _reading(
     exam: Exam,
     modality: str,
     count: dict[tuple[str, str], int],
-    document: Mapping[str, Any] | None,
+    report: EstimateReport | PooledReport | None,
     *,
     reason: str,
     of: Row | None = None,
@@ -241,14 +244,14 @@ def _reading(
     """A reading; its number runs over the visits of the mass."""
     mass = (exam.patient, exam.mass)
     count[mass] = count.get(mass, 0) + 1
-    status = _status(document)
+    status = _status(report)
     return {
         "patient": exam.patient,
         "mass": exam.mass,
         "modality": modality,
         "replicate": count[mass],
         "status": status,
-        **_sizes(None if document is None else document["max_size_mm"]),
+        **_sizes(None if report is None else report.max_size_mm),
         "reader": None if of is None else exam.reader,
         "visit": exam.visit,
         "date": exam.day,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -28,6 +28,7 @@ from tactile_bayes.exports.dicom_map import (
 from tactile_bayes.exports.exam import Code, EstimateFile, MapFile, SizedMass, content_uid, required, verdict_words
 from tactile_bayes.exports.identity import Identity
 from tactile_bayes.exports.nrrd import lps_from_plane, on_plane
+from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.presets import RESEARCH_USE
 
 # --- An estimate as a DICOM Comprehensive 3D SR by TID 1500: one measurement group per mass.
@@ -159,17 +160,17 @@ def _measurements(finding: SizedMass, images: Sequence[Any]) -> Iterator[Any]:
         yield measurement(coded(codes.CERTAINTY), percent, coded(_PERCENT), referenced_images=images)
 
 
-def _size(name: Code, size: Mapping[str, Any], images: Sequence[Any]) -> Any:
+def _size(name: Code, size: Quantity, images: Sequence[Any]) -> Any:
     """A size's median, with its interval as properties of the number."""
     measurement = required("highdicom").sr.Measurement(
-        coded(name), size["median"], coded(_MM), derivation=coded(codes.MEDIAN), referenced_images=images
+        coded(name), size.median, coded(_MM), derivation=coded(codes.MEDIAN), referenced_images=images
     )
     properties = (
-        (codes.UPPER_RANGE, size["high"] - size["median"], _MM),
-        (codes.LOWER_RANGE, size["median"] - size["low"], _MM),
-        (codes.INTERVAL_LOW, size["low"], _MM),
-        (codes.INTERVAL_HIGH, size["high"], _MM),
-        (codes.INTERVAL_PROBABILITY, 100 * size["probability"], _PERCENT),
+        (codes.UPPER_RANGE, size.high - size.median, _MM),
+        (codes.LOWER_RANGE, size.median - size.low, _MM),
+        (codes.INTERVAL_LOW, size.low, _MM),
+        (codes.INTERVAL_HIGH, size.high, _MM),
+        (codes.INTERVAL_PROBABILITY, 100 * size.probability, _PERCENT),
     )
     for concept, value, unit in properties:
         measurement[0].ContentSequence.append(_number(concept, float(f"{value:.9g}"), unit))

@@ -28,6 +28,7 @@ from tactile_bayes.exports.exam import (
 )
 from tactile_bayes.exports.identity import Identity, Moment
 from tactile_bayes.exports.nrrd import ImagePlane, image_plane, lps_from_plane
+from tactile_bayes.files.reports import EstimateReport, centre_of
 from tactile_bayes.findings import finding_lines
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.estimate_text import no_estimate_line
@@ -200,15 +201,16 @@ def map_picture(source: MapFile, estimate: EstimateFile | None) -> NDArray[np.ui
     from matplotlib import rc_context, rcdefaults
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-    document = estimate.document if estimate is not None and estimate.kind == "estimate" else None
+    report = None if estimate is None or estimate.kind != "estimate" else estimate.report
+    alone = report if isinstance(report, EstimateReport) else None
     side = source.facts.get("side")
     with rc_context():
         rcdefaults()
         figure = map_figure(
             source.tactile_map,
             None,
-            fit=None if document is None else _contour(document),
-            looked_at=() if document is None else _places(document),
+            fit=None if alone is None else _contour(alone),
+            looked_at=() if alone is None else _places(alone),
             title="Tactile map" + (f" of the {side} breast" if side in ("left", "right") else ""),
             note="" if estimate is None else _note(estimate),
             findings=None if estimate is None else estimate.findings,
@@ -224,29 +226,20 @@ def _note(estimate: EstimateFile) -> str:
     return no_estimate_line(reasons[0][:_MOST_NOTE]) if reasons and not estimate.sized else ""
 
 
-def _places(document: Any) -> list[Place]:
-    return [Place((one["x_mm"], one["y_mm"]), one["fault"]) for one in document["candidates"] if one["fault"]]
+def _places(report: EstimateReport) -> list[Place]:
+    return [Place((one.x_mm, one.y_mm), one.fault) for one in report.candidates if one.fault]
 
 
-def _contour(document: Any) -> FitContour | None:
+def _contour(report: EstimateReport) -> FitContour | None:
     """Ellipse and size at the medians."""
-    names = ("sigma_x_mm", "sigma_y_mm", "background", "amplitude")
-    centre = document["centre_mm"] or {"x": None}
-    if centre["x"] is None or centre["y"] is None or any(document[name] is None for name in names):
+    centre, across, along = centre_of(report.centre_mm), report.sigma_x_mm, report.sigma_y_mm
+    level, height, size, angle = report.background, report.amplitude, None, report.angle_deg
+    if centre is None or across is None or along is None or level is None or height is None:
         return None
-    middle = {name: document[name]["median"] for name in names}
-    size = None
-    if document["d_x_mm"] is not None and document["d_y_mm"] is not None:
-        size = (document["d_x_mm"]["median"], document["d_y_mm"]["median"])
-    return FitContour(
-        (centre["x"]["median"], centre["y"]["median"]),
-        middle["sigma_x_mm"],
-        middle["sigma_y_mm"],
-        0.0 if document["angle_deg"] is None else document["angle_deg"]["median"],
-        size,
-        middle["background"],
-        middle["amplitude"],
-    )
+    if report.d_x_mm is not None and report.d_y_mm is not None:
+        size = (report.d_x_mm.median, report.d_y_mm.median)
+    turn = 0.0 if angle is None else angle.median
+    return FitContour(centre, across.median, along.median, turn, size, level.median, height.median)
 
 
 # --- The map's figure as a DICOM Secondary Capture, which every viewer shows.

@@ -15,14 +15,15 @@ from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import NO_LUMP, BadDataError, UsageError
 from tactile_bayes.files.atomic import sha256
 from tactile_bayes.files.documents import load_json, parse_json
-from tactile_bayes.files.estimate_json import SCHEMAS, check_estimate
+from tactile_bayes.files.estimate_json import REPORTS, checked_report
 from tactile_bayes.files.map_nc import read_map_and_scans
 from tactile_bayes.files.netcdf import open_netcdf
 from tactile_bayes.files.provenance import EXAM_FACTS, scans_of
 from tactile_bayes.files.reading import HDF5_MAGIC, kind_of, open_input, schema_kind
-from tactile_bayes.findings import Finding, Verdict, finding_lines, findings_in, verdict
+from tactile_bayes.files.reports import EstimateReport, MassReport, PooledReport, centre_of
+from tactile_bayes.findings import Finding, Verdict, finding_lines, verdict
+from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.report.estimate_text import exams_label
-from tactile_bayes.report.quantities import leading
 
 if TYPE_CHECKING:
     from tactile_bayes.mapping.map import TactileMap
@@ -151,11 +152,9 @@ class SizedMass(Record, eq=False):
 
     number: int
     """From 1, in the order of the estimate."""
-    largest: Mapping[str, Any] | None
-    smallest: Mapping[str, Any] | None
-    """`largest`, `smallest`: Quantities in mm as the estimate's JSON has them, with the intervals that lead; None
-    without a size.
-    """
+    largest: Quantity | None
+    smallest: Quantity | None
+    """`largest`, `smallest`: Sizes in mm with the intervals that lead; None without a size."""
     code: str = ""
     """Reason code of the estimate where there is no number; empty with a size."""
     reason: str = ""
@@ -186,13 +185,16 @@ class EstimateFile(Record, eq=False):
     """``"estimate"``, ``"pooled"`` or ``"posterior"``."""
     digest: str
     """SHA-256 of the estimate's content."""
-    document: Mapping[str, Any]
+    report: EstimateReport | PooledReport
     masses: tuple[SizedMass, ...]
     maps: tuple[str, ...]
     """SHA-256 of the maps that it was made from; empty where the file does not tell."""
     facts: Facts
-    findings: tuple[Finding, ...] = ()
-    """What speaks against it, cautions first."""
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What speaks against it, cautions first."""
+        return self.report.findings
 
     @property
     def sized(self) -> bool:
@@ -202,7 +204,7 @@ class EstimateFile(Record, eq=False):
     @property
     def verdict(self) -> Verdict:
         """Sound, doubtful or no answer."""
-        return verdict(self.findings, answered=self.document["max_size_mm"] is not None)
+        return verdict(self.findings, answered=self.report.max_size_mm is not None)
 
     @property
     def lines(self) -> list[str]:
@@ -212,8 +214,7 @@ class EstimateFile(Record, eq=False):
     @property
     def provenance(self) -> Mapping[str, Any]:
         """Origin of the estimate."""
-        found: Mapping[str, Any] = self.document["provenance"]
-        return found
+        return self.report.provenance
 
     @property
     def method_words(self) -> str:
@@ -292,64 +293,59 @@ def estimate_of(document: object, path: Path) -> EstimateFile:
         When it is no estimate.
     """
     schema = document.get("schema") if isinstance(document, dict) else None
-    if not isinstance(document, dict) or not isinstance(schema, str) or schema not in SCHEMAS:
+    if not isinstance(document, dict) or not isinstance(schema, str) or schema not in REPORTS:
         raise BadDataError(f"is {schema_kind(schema) or 'no estimate'}", way_out=_WAY_OUT, path=str(path))
-    check_estimate(document, SCHEMAS[schema], path=path)
-    kind = schema.split("/")[1]
+    report = checked_report(document, REPORTS[schema], path=path)
     text = json.dumps(document, sort_keys=True)
     return EstimateFile(
         path,
-        kind,
+        schema.split("/")[1],
         hashlib.sha256(text.encode()).hexdigest(),
-        document,
-        masses_of(document),
-        _map_digests(document["provenance"]),
-        shared_facts(scans_of(document["provenance"])),
-        findings_in(document["findings"]),
+        report,
+        masses_of(report),
+        _map_digests(report.provenance),
+        shared_facts(scans_of(report.provenance)),
     )
 
 
-def masses_of(document: Mapping[str, Any]) -> tuple[SizedMass, ...]:
-    """The masses of an estimate's JSON object: those that it lists, or the one that it is of."""
-    listed = document.get("masses") or ({"number": 1, **document},)
-    alike = (document.get("diagnostics") or document.get("figures") or {}).get("between_map_sd")
-    return tuple(_mass(one, alike) for one in listed)
+def masses_of(report: EstimateReport | PooledReport) -> tuple[SizedMass, ...]:
+    """The masses that an estimate lists, or the one that it is of."""
+    alike = report.figures.get("between_map_sd")
+    listed: Sequence[EstimateReport | PooledReport | MassReport] = ()
+    if isinstance(report, EstimateReport):
+        listed = report.masses
+    return tuple(_mass(one, alike) for one in listed or (report,))
 
 
-def _mass(mass: Mapping[str, Any], alike: float | None) -> SizedMass:
+def _mass(mass: EstimateReport | PooledReport | MassReport, alike: float | None) -> SizedMass:
     """A mass with the sizes that lead, and in words the interval for exams that differ by `alike`."""
-    leads = leading(mass)
-    narrow = "" if leads is mass else f"{_capital(exams_label(alike))}: largest size {size_words(mass['max_size_mm'])}"
-    code = "" if mass["max_size_mm"] else mass.get("reason_code") or "no size"
+    leads, size, code, narrow = mass.leading, mass.max_size_mm, "", ""
+    if size is None:
+        code = (not isinstance(mass, PooledReport) and mass.reason_code) or "no size"
+    elif leads is not mass:
+        narrow = f"{_capital(exams_label(alike))}: largest size {size_words(size)}"
+    placed = None if isinstance(mass, PooledReport) else mass
     return SizedMass(
-        int(mass["number"]),
-        leads["max_size_mm"],
-        leads["min_size_mm"],
+        mass.number if isinstance(mass, MassReport) else 1,
+        leads.max_size_mm,
+        leads.min_size_mm,
         code,
-        plain_line(mass["reason"]) if code else "",
-        mass.get("detected_probability"),
-        _point(mass.get("centre_mm")),
-        _point(mass.get("centre_patient_mm")),
+        plain_line(mass.reason) if code else "",
+        None if placed is None else placed.detected_probability,
+        None if placed is None else centre_of(placed.centre_mm),
+        None if placed is None else centre_of(placed.centre_patient_mm),
         narrow,
     )
-
-
-def _point(point: Mapping[str, Any] | None) -> tuple[float, float] | None:
-    """x and y in mm; of a quantity its median."""
-    if point is None or point["x"] is None or point["y"] is None:
-        return None
-    x, y = (point[axis]["median"] if isinstance(point[axis], Mapping) else point[axis] for axis in "xy")
-    return float(x), float(y)
 
 
 def _capital(text: str) -> str:
     return f"{text[0].upper()}{text[1:]}"
 
 
-def size_words(size: Mapping[str, Any]) -> str:
+def size_words(size: Quantity) -> str:
     """A size with its interval, for people."""
-    ends = f"{size['low']:.1f} to {size['high']:.1f} mm"
-    return f"{size['median']:.1f} mm, {100 * size['probability']:g} % credible interval {ends}"
+    ends = f"{size.low:.1f} to {size.high:.1f} mm"
+    return f"{size.median:.1f} mm, {100 * size.probability:g} % credible interval {ends}"
 
 
 def _map_digests(provenance: object) -> tuple[str, ...]:

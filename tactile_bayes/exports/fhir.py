@@ -21,6 +21,7 @@ from tactile_bayes.exports.exam import (
 )
 from tactile_bayes.exports.identity import Identity
 from tactile_bayes.files.documents import dump_json
+from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.presets import RESEARCH_USE
 
 UCUM: Final = "http://unitsofmeasure.org"
@@ -196,10 +197,10 @@ def _quantity(value: float, unit: str, code: str) -> dict[str, Any]:
     return {"value": value, "unit": unit, "system": UCUM, "code": code}
 
 
-def _size(size: Mapping[str, Any]) -> dict[str, Any]:
+def _size(size: Quantity) -> dict[str, Any]:
     """The median as the value, with its interval by HL7's extension and, for readers without it, as components."""
-    low, high = (_quantity(size[end], "mm", "mm") for end in ("low", "high"))
-    percent = float(f"{100 * size['probability']:.9g}")
+    low, high = (_quantity(end, "mm", "mm") for end in (size.low, size.high))
+    percent = float(f"{100 * size.probability:.9g}")
     parts = [
         {"url": "confidence", "valueDecimal": percent},
         {"url": "interval", "valueRange": {"low": low, "high": high}},
@@ -212,7 +213,7 @@ def _size(size: Mapping[str, Any]) -> dict[str, Any]:
         (codes.INTERVAL_PROBABILITY, probability),
     )
     return {
-        "valueQuantity": {"extension": extension, **_quantity(size["median"], "mm", "mm")},
+        "valueQuantity": {"extension": extension, **_quantity(size.median, "mm", "mm")},
         "component": [{"code": _concept(code), "valueQuantity": value} for code, value in components],
     }
 

@@ -5,12 +5,13 @@ from __future__ import annotations
 import csv
 import io
 import re
-from collections.abc import Mapping, Sequence
-from typing import Any, Final, NamedTuple
+from collections.abc import Sequence
+from typing import Final, NamedTuple
 
 from tactile_bayes.errors import UsageError
 from tactile_bayes.exports.exam import NOT_DETECTED, NOT_SIZED, SIZED, EstimateFile, SizedMass, content_uuid
 from tactile_bayes.exports.identity import Identity
+from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.presets import RESEARCH_USE
 
 FORM: Final = "tactile_exam"
@@ -200,11 +201,11 @@ def _row(estimate: EstimateFile, finding: SizedMass, identity: Identity) -> dict
     return {name: _plain(value) for name, value in row.items()}
 
 
-def _size(name: str, size: Mapping[str, Any] | None) -> dict[str, str]:
+def _size(name: str, size: Quantity | None) -> dict[str, str]:
     if size is None:
         return {}
-    ends = {f"tb_{name}_mm": "median", f"tb_{name}_low_mm": "low", f"tb_{name}_high_mm": "high"}
-    return {key: _number(size[what]) for key, what in ends.items()} | {"tb_interval_prob": _number(size["probability"])}
+    told = {f"tb_{name}_mm": size.median, f"tb_{name}_low_mm": size.low, f"tb_{name}_high_mm": size.high}
+    return {key: _number(value) for key, value in (told | {"tb_interval_prob": size.probability}).items()}
 
 
 def _choice(name: str, word: str | None) -> str:

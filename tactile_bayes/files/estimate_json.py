@@ -4,16 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import numpy as np
 
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.files.documents import check_document, load_json
+from tactile_bayes.files.documents import load_json, parse_record
 from tactile_bayes.files.netcdf import open_netcdf
 from tactile_bayes.files.reading import open_input
-from tactile_bayes.findings import findings_in, verdict
+from tactile_bayes.files.reports import (
+    ESTIMATE,
+    POOLED,
+    AnotherExam,
+    EstimateReport,
+    MassReport,
+    PooledReport,
+)
+from tactile_bayes.findings import verdict
+from tactile_bayes.inference.draws import Quantity
 
 # --- Sizes from the output of `estimate`: its JSON, or the draws in its netCDF.
 
@@ -119,17 +128,15 @@ def _check_status(status: str | None, stated: StatedSize, row: int, *, fault: Ca
 
 
 def _from_json(path: Path, number: int | None) -> StatedSize:
-    document: Any = load_json(path, way_out="give `estimate --json`")
+    document = load_json(path, way_out="give `estimate --json`")
     if isinstance(document, list):
         document = document[_index(path, len(document), number)]
     elif number is not None:
         raise BadDataError("holds one estimate, no list", way_out=f"leave out #{number}", path=str(path))
     pooled = isinstance(document, dict) and str(document.get("schema", "")).startswith("tactile-bayes/pooled/")
-    check_document(document, "pooled.schema.json" if pooled else "estimate.schema.json", path=path)
-    size = document["max_size_mm"]
-    if size is None:
-        return StatedSize()
-    return StatedSize(size["median"], size["low"], size["high"], size["probability"])
+    kind: type[EstimateReport | PooledReport] = PooledReport if pooled else EstimateReport
+    size = parse_record(document, kind, path=path).max_size_mm
+    return StatedSize() if size is None else StatedSize(size.median, size.low, size.high, size.probability)
 
 
 def _index(path: Path, length: int, number: int | None) -> int:
@@ -155,86 +162,90 @@ def _from_netcdf(path: Path) -> StatedSize:
     return StatedSize(float(median), float(low), float(high), PROBABILITY)
 
 
-# --- Checks of an estimate's JSON object beyond its schema: sizes that can be one lump's, in their order.
+# --- Checks of an estimate beyond its declaration: sizes that can be one lump's, in their order.
 
-SCHEMAS: Final = {"tactile-bayes/estimate/1": "estimate.schema.json", "tactile-bayes/pooled/1": "pooled.schema.json"}
-"""Schemas of what ``estimate`` prints as JSON, by their ids."""
+REPORTS: Final[Mapping[str, type[EstimateReport | PooledReport]]] = {ESTIMATE: EstimateReport, POOLED: PooledReport}
+"""What ``estimate`` prints as JSON, by the ids of its schemas."""
 MOST_MM: Final = 500.0
 """Sizes above it are no lump's."""
 _SIZES: Final = ("max_size_mm", "min_size_mm", "d_x_mm", "d_y_mm")
 _WAY_OUT: Final = "give the JSON as `estimate --json` printed it"
+R = TypeVar("R", bound=EstimateReport | PooledReport)
+Holder = EstimateReport | PooledReport | MassReport | AnotherExam
 
 
-def check_estimate(document: Mapping[str, Any], schema_name: str, *, path: Path) -> None:
-    """Check what ``estimate --json`` printed for one map, or for several: its fields, and its sizes against each other.
+def checked_report(document: object, kind: type[R], *, path: Path) -> R:
+    """What ``estimate --json`` printed for one map, or for several: its fields, and its sizes against each other.
 
     Raises
     ------
     BadDataError
         Naming the file, the field, its value and the rule it breaks.
     """
-    check_document(document, schema_name, path=path)
+    report = parse_record(document, kind, path=path)
     try:
-        _check_sizes(document)
-        _check_verdict(document)
+        _check_sizes(report)
+        _check_verdict(report)
     except BadDataError as error:
         raise error.at(path) from None
+    return report
 
 
-def _check_sizes(document: Mapping[str, Any]) -> None:
-    if document["status"] != "estimate" and document["max_size_mm"] is not None:
-        raise BadDataError(f"status is {document['status']!r}, and there is a max_size_mm", way_out=_WAY_OUT)
-    for where, holder in _holders(document):
+def _check_sizes(report: EstimateReport | PooledReport) -> None:
+    if report.status != "estimate" and report.max_size_mm is not None:
+        raise BadDataError(f"status is {report.status!r}, and there is a max_size_mm", way_out=_WAY_OUT)
+    for where, holder in _holders(report):
         for name in _SIZES:
-            if holder.get(name) is not None:
-                _check_size(f"{where}{name}", holder[name])
-        largest, smallest = holder["max_size_mm"], holder["min_size_mm"]
+            if (size := getattr(holder, name, None)) is not None:
+                _check_size(f"{where}{name}", size)
+        largest, smallest = holder.max_size_mm, holder.min_size_mm
         if (largest is None) != (smallest is None):
             raise BadDataError(f"{where}max_size_mm and min_size_mm are not both there", way_out=_WAY_OUT)
-        if largest is not None and smallest["median"] > largest["median"]:
-            what = f"{where}min_size_mm is {smallest['median']:g} mm and max_size_mm {largest['median']:g} mm"
+        if largest is not None and smallest is not None and smallest.median > largest.median:
+            what = f"{where}min_size_mm is {smallest.median:g} mm and max_size_mm {largest.median:g} mm"
             raise BadDataError(what, way_out=_WAY_OUT)
-    _check_masses(document)
+    if isinstance(report, EstimateReport):
+        _check_masses(report)
 
 
-def _check_verdict(document: Mapping[str, Any]) -> None:
-    made = verdict(findings_in(document["findings"]), answered=document["max_size_mm"] is not None)
-    if document["verdict"] != made:
-        what = f"verdict is {document['verdict']!r}, and its findings make it {made!r}"
+def _check_verdict(report: EstimateReport | PooledReport) -> None:
+    made = verdict(report.findings, answered=report.max_size_mm is not None)
+    if report.verdict != made:
+        what = f"verdict is {report.verdict!r}, and its findings make it {made!r}"
         raise BadDataError(what, way_out=_WAY_OUT)
 
 
-def _holders(document: Mapping[str, Any]) -> Iterator[tuple[str, Mapping[str, Any]]]:
+def _holders(report: EstimateReport | PooledReport) -> Iterator[tuple[str, Holder]]:
     """Whatever holds sizes, with its place in the document."""
-    listed = document.get("masses") or ()
-    for where, one in [("", document), *((f"masses[{i}].", mass) for i, mass in enumerate(listed))]:
+    listed = report.masses if isinstance(report, EstimateReport) else ()
+    found: list[tuple[str, EstimateReport | PooledReport | MassReport]] = [("", report)]
+    for where, one in [*found, *((f"masses[{i}].", mass) for i, mass in enumerate(listed))]:
         yield where, one
-        if one.get("another_exam") is not None:
-            yield f"{where}another_exam.", one["another_exam"]
+        if one.another_exam is not None:
+            yield f"{where}another_exam.", one.another_exam
 
 
-def _check_size(where: str, size: Mapping[str, Any]) -> None:
-    low, median, high = (size[name] for name in ("low", "median", "high"))
+def _check_size(where: str, size: Quantity) -> None:
+    low, median, high = size.low, size.median, size.high
     if not 0 < low <= high <= MOST_MM:
         what = f"{where} has low {low:g} and high {high:g}"
         raise BadDataError(what, way_out=f"ends of an interval rise from above 0 to at most {MOST_MM:g} mm; {_WAY_OUT}")
-    if size["kind"] == "eti" and not low <= median <= high:
+    if size.kind == "eti" and not low <= median <= high:
         what = f"{where} has median {median:g} outside its interval of {low:g} to {high:g} mm"
         raise BadDataError(what, way_out=_WAY_OUT)
     if not 0 < median <= MOST_MM:
         raise BadDataError(f"{where} has median {median:g}", way_out=_WAY_OUT)
 
 
-def _check_masses(document: Mapping[str, Any]) -> None:
+def _check_masses(report: EstimateReport) -> None:
     """Each mass has its own number, one at most is the reported one, and that has the document's sizes."""
-    listed = document.get("masses") or ()
-    numbers = [one["number"] for one in listed]
+    numbers = [one.number for one in report.masses]
     if len(set(numbers)) < len(numbers):
         raise BadDataError(f"masses are numbered {', '.join(map(str, numbers[:9]))}", way_out=_WAY_OUT)
-    reported = [i for i, one in enumerate(listed) if one["reported"]]
+    reported = [(i, one) for i, one in enumerate(report.masses) if one.reported]
     if len(reported) > 1:
         raise BadDataError(f"{len(reported)} masses are the reported one", way_out=_WAY_OUT)
-    for i in reported:
+    for i, one in reported:
         for name in ("max_size_mm", "min_size_mm"):
-            if listed[i][name] != document[name]:
+            if getattr(one, name) != getattr(report, name):
                 raise BadDataError(f"masses[{i}].{name} is not the document's, of the same mass", way_out=_WAY_OUT)

@@ -14,10 +14,11 @@ from tactile_bayes.declarations import Record, as_dict
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.atomic import write_bytes
 from tactile_bayes.files.documents import parse_json
-from tactile_bayes.files.estimate_json import check_estimate
+from tactile_bayes.files.estimate_json import checked_report
 from tactile_bayes.files.netcdf import Contents, Group, Variable, grouped_netcdf_bytes, open_netcdf
 from tactile_bayes.files.provenance import Provenance, scans_of
 from tactile_bayes.files.reading import CELLS, check_limit
+from tactile_bayes.files.reports import EstimateReport, PooledReport
 from tactile_bayes.findings import Finding, findings_in
 from tactile_bayes.geometry import FloatArray, check_rigid
 from tactile_bayes.mapping.map import MapRecipe, TactileMap
@@ -318,13 +319,13 @@ def write_posterior(
     *,
     provenance: Provenance,
     groups: Mapping[str, DrawGroup],
-    document: Mapping[str, Any],
+    report: EstimateReport,
     force: bool = False,
 ) -> None:
     """Write the draws of an estimate atomically; equal draws give equal bytes, see `grouped_netcdf_bytes`.
 
-    `groups` go beside the draws, see `inference_groups`; `document` is the estimate's JSON object, which
-    `read_estimate` gives back. A map without an estimate has no draws: a ValueError.
+    `groups` go beside the draws, see `inference_groups`; `report` is the estimate's, which `read_estimate` gives back.
+    A map without an estimate has no draws: a ValueError.
     """
     if estimate.map_posterior is None or estimate.draws is None:
         raise ValueError("no estimate, so no posterior to write")
@@ -353,15 +354,15 @@ def write_posterior(
         "method": estimate.draws.method,
         "provenance": json.dumps(provenance.as_dict()),
         "diagnostics": json.dumps({k: v for k, v in figures.items() if _plain(v)}),
-        "estimate": json.dumps(document),
+        "estimate": json.dumps(report.document),
     }
     write_bytes(path, _posterior_bytes(variables, attributes, groups), force=force)
 
 
 def write_pooled(
-    path: Path, size: SizePosterior, *, provenance: Provenance, document: Mapping[str, Any], force: bool = False
+    path: Path, size: SizePosterior, *, provenance: Provenance, report: PooledReport, force: bool = False
 ) -> None:
-    """Write the draws of a mass's size from several maps, with its JSON object, atomically."""
+    """Write the draws of a mass's size from several maps, with its report, atomically."""
     names = ("d_x_mm", "d_y_mm", "max_size_mm", "min_size_mm")
     variables = {name: np.atleast_2d(getattr(size, name)) for name in names}
     attributes = {
@@ -370,7 +371,7 @@ def write_pooled(
         "method": "pooled",
         "provenance": json.dumps(provenance.as_dict()),
         "diagnostics": json.dumps({k: v for k, v in size.figures.items() if _plain(v)}),
-        "estimate": json.dumps(document),
+        "estimate": json.dumps(report.document),
     }
     write_bytes(path, _posterior_bytes(variables, attributes, {}), force=force)
 
@@ -433,9 +434,9 @@ def read_posterior(path: Path) -> PosteriorDraws:
     return PosteriorDraws(attributes.get("method", ""), draws, figures, scans, findings)
 
 
-def read_estimate(path: Path) -> dict[str, Any]:
-    """The estimate's JSON object, as ``estimate --json`` prints it, from its posterior's file. A pooled posterior has
-    none and is refused.
+def read_estimate(path: Path) -> EstimateReport:
+    """The estimate's report, as ``estimate --json`` prints it, from its posterior's file. A pooled posterior has none
+    and is refused.
     """
     with open_netcdf(path, way_out="give what `estimate` wrote with -o") as file:
         group = file.group("posterior")
@@ -445,10 +446,7 @@ def read_estimate(path: Path) -> dict[str, Any]:
     if "estimate" not in attributes:
         what = "holds draws without their estimate"
         raise BadDataError(what, way_out="give its map, or write it again with `estimate -o`", path=str(path))
-    document: Any = parse_json(attributes["estimate"])
-    check_estimate(document, "estimate.schema.json", path=path)
-    found: dict[str, Any] = document
-    return found
+    return checked_report(parse_json(attributes["estimate"]), EstimateReport, path=path)
 
 
 def is_posterior(path: Path) -> bool:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from typing import Annotated, Final, Literal
 
 import numpy as np
 
-from tactile_bayes.declarations import Record, field
+from tactile_bayes.declarations import Meta, Record, field, replace, rounded
 from tactile_bayes.geometry import FloatArray, IndexArray
 
 # --- Draws of a model's parameters, the result of every method.
@@ -87,33 +88,33 @@ def picked_rows(have: Labels, wanted: Labels, rng: np.random.Generator) -> Label
 
 # --- Summary of a posterior in seven numbers, with its interval's kind and probability.
 
-INTERVAL_KIND = "eti"
+INTERVAL_KIND: Final = "eti"
 
 
-def nine_digits(value: float) -> float:
-    """The value to nine significant digits, as JSON has them."""
-    return float(f"{value:.9g}")
-
-
-class Quantity(Record):
+class Quantity(Record, kw_only=True):
     """Summary of one quantity's draws."""
 
     median: float
     mean: float
-    sd: float
+    sd: Annotated[float, Meta(ge=0)]
     low: float
     high: float
     """`low`, `high`: Ends of the equal-tailed interval of `probability`."""
-    probability: float
-    mc_error: float
-    """Monte-Carlo standard error of the wider of the two ends; digits beyond it mean nothing."""
-    kind: str = INTERVAL_KIND
+    mc_error: Annotated[
+        float,
+        Meta(
+            ge=0,
+            description="Monte-Carlo standard error of the wider of low and high, in their unit: digits beyond it mean "
+            "nothing, whatever number of digits is written.",
+        ),
+    ] = 0.0
+    probability: Annotated[float, Meta(gt=0, lt=1)]
+    kind: Literal["eti", "hdi"]
 
-    def as_dict(self) -> dict[str, float | str]:
-        """Plain data, rounded to nine significant digits."""
-        names = ("median", "mean", "sd", "low", "high", "mc_error")
-        numbers: dict[str, float | str] = {name: nine_digits(getattr(self, name)) for name in names}
-        return numbers | {"probability": self.probability, "kind": self.kind}
+    @property
+    def rounded(self) -> Quantity:
+        """The same with nine significant digits, as files have it."""
+        return replace(rounded(self), probability=self.probability)
 
 
 def summarise(
@@ -147,8 +148,9 @@ def summarise(
         sd=float(values.std()),
         low=float(low),
         high=float(high),
-        probability=probability,
         mc_error=float(max(ends[1] - ends[0], ends[3] - ends[2]) / 2.0),
+        probability=probability,
+        kind=INTERVAL_KIND,
     )
 
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from statistics import NormalDist
-from typing import Any, Final
+from typing import Any, Final, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_bayes.declarations import Record
+from tactile_bayes.declarations import Record, rounded
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.map import TactileMap
 
@@ -113,21 +113,43 @@ def _opposite(axis: str) -> str:
 
 # --- Place of a lump as clinicians tell it: by the clock about the nipple, and by its distance from the nipple.
 
-SIDES: Final = ("left", "right")
+Side = Literal["left", "right"]
+SIDES: Final[tuple[Side, ...]] = get_args(Side)
 NIPPLE_SD_MM: Final = 3.0
 """SD of a touched nipple along each axis where repeats lie no further apart: assumed, not measured (record 0117)."""
 LEAST_KNOWN_HOURS: Final = 1.5
 """A direction whose interval of 95 % reaches so far either way (45 degrees) is none: behind the nipple."""
-_KNOWN: Final = 0.95
+_SURE: Final = 0.95
 _ON_AXIS_DEG: Final = 15.0
 _DEGREES_PER_HOUR: Final = 30.0
+_DIGITS: Final = 6
+"""Significant digits of a place in files."""
+
+
+class Placed(Record):
+    """Hours or mm with their interval; null throughout where there is no direction."""
+
+    median: float | None
+    low: float | None
+    high: float | None
+    probability: float
+
+
+class Position(Record):
+    """Place of a lump about the nipple with its intervals, as files have it."""
+
+    side: Side
+    clock_hours: Placed
+    distance_mm: Placed
+    quadrant: str
+    text: str
 
 
 class ClockPosition(Record):
     """Place of a point about the nipple, as the examiner sees it who faces the patient: 12 is towards the head."""
 
-    side: str
-    """``"left"`` or ``"right"``: which breast."""
+    side: Side
+    """Which breast."""
     distance_mm: float
     """From the nipple, along the map's plane."""
     distance_sd_mm: float
@@ -138,19 +160,18 @@ class ClockPosition(Record):
     """Its SD."""
 
     @classmethod
-    def of_dict(cls, document: Mapping[str, Any] | None) -> ClockPosition | None:
-        """The position that `as_dict` wrote; None for none, and behind the nipple, where no direction is kept."""
-        if document is None or document["clock_hours"]["median"] is None:
+    def of(cls, told: Position | None) -> ClockPosition | None:
+        """The position that `told` gave; None for none, and behind the nipple, where no direction is kept."""
+        if told is None or told.clock_hours.median is None:
             return None
-        hours, distance = document["clock_hours"], document["distance_mm"]
-        reach, wide = _deviations(hours["probability"]), _deviations(distance["probability"])
-        across = (hours["high"] - hours["median"]) % 12.0
+        hours, distance = told.clock_hours, told.distance_mm
+        across = (_known(hours.high) - _known(hours.median)) % 12.0
         return cls(
-            side=document["side"],
-            distance_mm=distance["median"],
-            distance_sd_mm=(distance["high"] - distance["median"]) / wide,
-            angle_deg=hours["median"] * _DEGREES_PER_HOUR % 360.0,
-            angle_sd_deg=across * _DEGREES_PER_HOUR / reach,
+            side=told.side,
+            distance_mm=_known(distance.median),
+            distance_sd_mm=(_known(distance.high) - _known(distance.median)) / _deviations(distance.probability),
+            angle_deg=_known(hours.median) * _DEGREES_PER_HOUR % 360.0,
+            angle_sd_deg=across * _DEGREES_PER_HOUR / _deviations(hours.probability),
         )
 
     @property
@@ -171,7 +192,7 @@ class ClockPosition(Record):
     @property
     def direction_known(self) -> bool:
         """False where the lump lies behind the nipple."""
-        return _deviations(_KNOWN) * self.angle_sd_deg < LEAST_KNOWN_HOURS * _DEGREES_PER_HOUR
+        return _deviations(_SURE) * self.angle_sd_deg < LEAST_KNOWN_HOURS * _DEGREES_PER_HOUR
 
     def hours_between(self, probability: float) -> tuple[float, float] | None:
         """Ends of the interval of the hours, clockwise; None where the direction is not known."""
@@ -194,27 +215,18 @@ class ClockPosition(Record):
             f"({self.quadrant})"
         )
 
-    def as_dict(self, probability: float) -> dict[str, Any]:
-        """Plain data, as in the JSON."""
-        hours, distance = self.hours_between(probability), self.distance_between(probability)
-        named = (None, None) if hours is None else hours
-        return {
-            "side": self.side,
-            "clock_hours": {
-                "median": None if hours is None else _rounded(self.hours),
-                "low": None if named[0] is None else _rounded(named[0]),
-                "high": None if named[1] is None else _rounded(named[1]),
-                "probability": probability,
-            },
-            "distance_mm": {
-                "median": _rounded(self.distance_mm),
-                "low": _rounded(distance[0]),
-                "high": _rounded(distance[1]),
-                "probability": probability,
-            },
-            "quadrant": self.quadrant if hours is not None else "behind the nipple",
-            "text": self.text(),
-        }
+    def told(self, probability: float) -> Position:
+        """The place with its intervals, as files have it."""
+        hours = self.hours_between(probability)
+        middle, low, high = (None, None, None) if hours is None else rounded((self.hours, *hours), _DIGITS)
+        distance, near, far = rounded((self.distance_mm, *self.distance_between(probability)), _DIGITS)
+        return Position(
+            side=self.side,
+            clock_hours=Placed(middle, low, high, probability),
+            distance_mm=Placed(distance, near, far, probability),
+            quadrant=self.quadrant if hours is not None else "behind the nipple",
+            text=self.text(),
+        )
 
 
 def clock_position(
@@ -228,7 +240,8 @@ def clock_position(
     patient's left is z cross up.
     """
     nipple, patient = tactile_map.nipple_mm, tactile_map.patient_from_plane
-    if nipple is None or patient is None or side not in SIDES:
+    breast = next((one for one in SIDES if one == side), None)
+    if nipple is None or patient is None or breast is None:
         return None
     up = patient[1, :2] / np.hypot(*patient[1, :2])
     axes = np.stack([[-up[1], up[0]], up])  # to the viewer's right, upwards
@@ -240,7 +253,7 @@ def clock_position(
     across = np.array([along[1], -along[0]])
     across_sd = math.sqrt(float(across @ spread @ across))
     return ClockPosition(
-        side=side,
+        side=breast,
         distance_mm=distance,
         distance_sd_mm=math.sqrt(float(along @ spread @ along)),
         angle_deg=math.degrees(math.atan2(right, above)) % 360.0,
@@ -264,5 +277,7 @@ def _deviations(probability: float) -> float:
     return NormalDist().inv_cdf(0.5 + probability / 2.0)
 
 
-def _rounded(value: float) -> float:
-    return float(f"{value:.6g}")
+def _known(value: float | None) -> float:
+    """A number of a place that has them all."""
+    assert value is not None
+    return value

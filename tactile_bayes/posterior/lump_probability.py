@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from math import exp, lgamma, log, log1p, pi
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -136,20 +136,6 @@ class SmallestLumps(Record, eq=False):
     spacing_mm: float
     """Between the places."""
 
-    def as_dict(self) -> dict[str, Any]:
-        """Plain data, as in the JSON."""
-        return {
-            "probability": PROBABILITY,
-            "depths_mm": [round(float(depth), 1) for depth in self.depths_mm],
-            "best_mm": [_plain(float(d)) for d in self.d_mm.min(axis=0)],
-            "worst_mm": [_plain(float(d)) for d in self.d_mm.max(axis=0)],
-            "spacing_mm": round(self.spacing_mm, 3),
-            "places": [
-                {"x_mm": round(float(x), 3), "y_mm": round(float(y), 3), "d_mm": [_plain(float(d)) for d in row]}
-                for (x, y), row in zip(self.places_mm, self.d_mm, strict=True)
-            ],
-        }
-
 
 def smallest_lumps(tactile_map: TactileMap, *, fat_mm: float | None = None) -> SmallestLumps:
     """Smallest ball that a map would have shown at places over its covered area, on fat of `fat_mm` (None: unknown)."""
@@ -233,7 +219,3 @@ def _log_factors(target: CollapsedTarget, power: FloatArray, amplitudes: FloatAr
     lump = base + lgamma(dof / 2) - 0.5 * dof * np.log(pi * rest)
     lump = lump - 0.5 * (np.log(p) + np.log(2 * pi * variance) + amplitudes**2 / variance)
     return np.asarray(np.logaddexp.reduce(lump, axis=1) - np.logaddexp.reduce(null, axis=1))
-
-
-def _plain(d_mm: float) -> float | None:
-    return d_mm if np.isfinite(d_mm) else None

@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from tactile_bayes.declarations import Record, as_dict, field
+from tactile_bayes.declarations import Record, field
 from tactile_bayes.findings import Finding
 from tactile_bayes.forward.gaussian import principal_widths
 from tactile_bayes.geometry import FloatArray
@@ -37,10 +37,6 @@ class Sensitivity(Record):
     """`median`, `ends`: By quantity: shift of the median, and the larger shift of the two ends of the 95 % interval."""
     pareto_k: float
     """Shape of the weights; above 0.7 the shifts are not to be trusted."""
-
-    def as_dict(self) -> dict[str, object]:
-        """Plain data."""
-        return {"width_prior_times": WIDER, "median_sd": dict(self.median), "ends_sd": dict(self.ends)}
 
 
 def prior_sensitivity(
@@ -88,10 +84,6 @@ class Rise(Record):
     """`amplitude`, `sigma_x_mm`, `sigma_y_mm`: Of its bump at the mode; widths along the axes of its ellipse."""
     probability: float
     """That it is a lump, as `Detection` has it."""
-
-    def as_dict(self) -> dict[str, float | None]:
-        """Plain data, as in the JSON."""
-        return {name: None if value is None else float(f"{value:.6g}") for name, value in as_dict(self).items()}
 
 
 class Estimate(Record, eq=False):

@@ -11,6 +11,7 @@ from urllib.parse import quote
 
 from tactile_bayes.declarations import Record, field
 from tactile_bayes.findings import SEVERITIES, Finding, finding_lines
+from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.compare import Growth, growth_section
 from tactile_bayes.report.pages import TEMPLATES, page
@@ -29,8 +30,8 @@ class Card(Record, eq=False):
     """What else the table says of the exam."""
     reason: str = ""
     """Why there is no size; empty where there is one."""
-    size: Mapping[str, float] | None = None
-    """Median, ends, probability and SD of the largest size, mm; None without one."""
+    size: Quantity | None = None
+    """Largest size, mm; None without one."""
     findings: tuple[Finding, ...] = ()
     """What speaks against the exam."""
     thumbnail: bytes | str | None = None
@@ -56,7 +57,7 @@ class Card(Record, eq=False):
     @property
     def alt(self) -> str:
         """What the picture shows, for those who do not see it."""
-        ring = "no lump ringed" if self.size is None else f"a ring around the lump of {self.size['median']:.1f} mm"
+        ring = "no lump ringed" if self.size is None else f"a ring around the lump of {self.size.median:.1f} mm"
         return f"Map of {self.name}, {ring}"
 
     @property
@@ -69,7 +70,7 @@ class Card(Record, eq=False):
     @property
     def badness(self) -> tuple[int, int, float]:
         """Sort key: failures, exams without a size, cautions, checks, and wide intervals come first."""
-        wide = 0.0 if self.size is None else (self.size["high"] - self.size["low"]) / self.size["median"]
+        wide = 0.0 if self.size is None else (self.size.high - self.size.low) / self.size.median
         order = (FAILED, UNSIZED, SIZED).index(self.status)
         return order, -sum(10 if one.severity == "caution" else 1 for one in self.findings), -wide
 

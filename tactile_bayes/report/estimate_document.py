@@ -1,39 +1,56 @@
-"""An estimate as a document: its masses and scene."""
+"""The report of one map made: its scene, suppositions and masses, with sentences of each."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
-from tactile_bayes.declarations import as_dict
+from tactile_bayes.declarations import as_dict, rounded
 from tactile_bayes.files.provenance import Provenance
+from tactile_bayes.files.reports import (
+    ESTIMATE,
+    EstimateReport,
+    MassReport,
+    OtherRise,
+    PassedOver,
+    Place,
+    Point,
+    PriorSensitivity,
+    ReasonCode,
+    SceneReport,
+    Shape,
+    SizeInterval,
+    SmallestAt,
+    SmallestLump,
+    StructureReport,
+    Supposed,
+)
 from tactile_bayes.findings import verdict
-from tactile_bayes.geometry import apply
-from tactile_bayes.inference.draws import Quantity, nine_digits
+from tactile_bayes.geometry import FloatArray, apply
+from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.mapping.places import ClockPosition
 from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior.abstention import chance_text
 from tactile_bayes.posterior.field import LENGTHS_MM, SHARES
-from tactile_bayes.posterior.result import Estimate, Mass, Sensitivity
+from tactile_bayes.posterior.lump_probability import PROBABILITY, SmallestLumps
+from tactile_bayes.posterior.result import WIDER, Estimate, Mass, Sensitivity
 from tactile_bayes.posterior.selection import SceneChoice, Structure
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.quantities import (
-    ANOTHER_EXAM,
     WIDTHS,
     another_exam,
     estimate_quantities,
-    leading,
     lump_place,
     together_words,
     touching_masses,
 )
-from tactile_bayes.size.draws import SIZES, SizePosterior
+from tactile_bayes.size.draws import SIZES, SizePosterior, Supposition
 
-# --- Sentences and plain data about the scene in the fit window.
+# --- The scene in the fit window.
 
 ASKED = {
     "ellipse": "an ellipse, not a circle",
@@ -135,33 +152,33 @@ def prior_line(prior: BumpPrior, *, field: bool) -> str:
     return f"Priors: {'; '.join(parts)}."
 
 
-def scene_document(choice: SceneChoice) -> dict[str, Any]:
-    """Scene as plain data for the JSON."""
+def scene_report(choice: SceneChoice) -> SceneReport:
+    """The scene, as files have it."""
     scene = choice.fit.scene
-    return {
-        "supported": choice.supported,
-        "shape": scene.shape,
-        "tilt": scene.tilt,
-        "beside": scene.extra or None,
-        "structures": [_structure(one) for one in choice.structures],
-    }
+    return SceneReport(
+        supported=cast("Shape", choice.supported),
+        shape=cast("Shape", scene.shape),
+        tilt=scene.tilt,
+        beside=scene.extra or None,
+        structures=tuple(_structure(one) for one in choice.structures),
+    )
 
 
-def _structure(one: Structure) -> dict[str, Any]:
-    return {
-        "name": one.name,
-        "odds": _six_digits(one.odds),
-        "odds_are_a_bound": one.bound,
-        "supported": one.supported,
-        "used": one.used,
-        "change_sigma_x_sd": _six_digits(one.change_x_sd),
-        "change_sigma_y_sd": _six_digits(one.change_y_sd),
-        "place": one.place,
-    }
+def _structure(one: Structure) -> StructureReport:
+    return StructureReport(
+        name=one.name,
+        odds=_six_digits(one.odds),
+        odds_are_a_bound=one.bound,
+        supported=one.supported,
+        used=one.used,
+        change_sigma_x_sd=_six_digits(one.change_x_sd),
+        change_sigma_y_sd=_six_digits(one.change_y_sd),
+        place=one.place,
+    )
 
 
 def _six_digits(value: float | None) -> float | None:
-    return None if value is None or not math.isfinite(value) else float(f"{value:.6g}")
+    return None if value is None or not math.isfinite(value) else rounded(value, 6)
 
 
 # --- How large a lump would be if it were soft, hard, centred on the gland's surface or resting on it: data and text.
@@ -175,37 +192,35 @@ PAIRS = (
 """Of suppositions, with the words of the first, and what follows each, a value in it."""
 
 
-def supposed_document(size: SizePosterior | None, largest: Quantity | None) -> dict[str, Any] | None:
+Suppositions = Mapping[str, Supposed]
+
+
+def suppositions(size: SizePosterior | None, largest: Quantity | None) -> dict[str, Supposed] | None:
     """The property that is supposed, its value, and the largest size with it, by name; None without a size."""
     if size is None or largest is None:
         return None
-    ends = {"median": largest.median, "low": largest.low, "high": largest.high}
-    return {
-        label: {
-            "property": one.name,
-            "value": one.value,
-            "max_size_mm": {
-                **{name: nine_digits(one.moved(end, median_mm=largest.median)) for name, end in ends.items()},
-                "probability": largest.probability,
-            },
-        }
-        for label, one in size.supposing.items()
-    }
+    ends = (largest.median, largest.low, largest.high)
+
+    def moved(one: Supposition) -> SizeInterval:
+        median, low, high = (rounded(one.moved(end, median_mm=largest.median)) for end in ends)
+        return SizeInterval(median, low, high, largest.probability)
+
+    return {label: Supposed(one.name, one.value, moved(one)) for label, one in size.supposing.items()}
 
 
-def supposed_lines(supposed: Mapping[str, Any] | None, median_mm: float, *, places: int) -> list[str]:
+def supposed_lines(supposed: Suppositions | None, median_mm: float, *, places: int) -> list[str]:
     """A line for each pair of suppositions that moves the largest size."""
     found = []
     for words, first, second, *follow in PAIRS:
         pair = _pair(supposed, median_mm, (first, second))
         if pair:
-            values = [after.format(one["value"]) for after, one in zip(follow, pair, strict=True)]
-            sizes = [_size(one["max_size_mm"], places) for one in pair]
+            values = [after.format(one.value) for after, one in zip(follow, pair, strict=True)]
+            sizes = [_size(one.max_size_mm, places) for one in pair]
             found.append(f"Were {words}{values[0]}: {sizes[0]}; {second}{values[1]}: {sizes[1]}.")
     return found
 
 
-def supposed_line(supposed: Mapping[str, Any] | None, median_mm: float, *, places: int) -> list[str]:
+def supposed_line(supposed: Suppositions | None, median_mm: float, *, places: int) -> list[str]:
     """A soft lump's size and a hard one's in a few words, for a short report; empty where they hardly differ.
 
     A lump softer than the calibration's may lie above the interval, and nothing on its map says so: the line does.
@@ -213,7 +228,7 @@ def supposed_line(supposed: Mapping[str, Any] | None, median_mm: float, *, place
     pair = _pair(supposed, median_mm, ("soft", "hard"))
     if not pair:
         return []
-    (soft, soft_ratio), (hard, hard_ratio) = ((one["max_size_mm"]["median"], one["value"]) for one in pair)
+    (soft, soft_ratio), (hard, hard_ratio) = ((one.max_size_mm.median, one.value) for one in pair)
     words = (
         f"No map shows stiffness: were the lump soft ({soft_ratio:g} times fat), {soft:.{places}f} mm; "
         f"hard ({hard_ratio:g} times), {hard:.{places}f} mm"
@@ -221,23 +236,21 @@ def supposed_line(supposed: Mapping[str, Any] | None, median_mm: float, *, place
     return [f"{words}; softer still, larger." if soft > hard else f"{words}."]
 
 
-def _pair(supposed: Mapping[str, Any] | None, median_mm: float, names: tuple[str, str]) -> list[Mapping[str, Any]]:
+def _pair(supposed: Suppositions | None, median_mm: float, names: tuple[str, str]) -> list[Supposed]:
     """Two suppositions, where one of them at least moves the largest size; empty otherwise."""
     pair = [] if supposed is None else [supposed[name] for name in names if name in supposed]
-    moves = any(abs(one["max_size_mm"]["median"] / median_mm - 1) >= LEAST_CHANGE for one in pair)
+    moves = any(abs(one.max_size_mm.median / median_mm - 1) >= LEAST_CHANGE for one in pair)
     return pair if moves and len(pair) == 2 else []
 
 
-def _size(size: Mapping[str, float], places: int) -> str:
-    return "{median:.{0}f} mm ({low:.{0}f} to {high:.{0}f})".format(places, **size)
+def _size(size: SizeInterval, places: int) -> str:
+    return f"{size.median:.{places}f} mm ({size.low:.{places}f} to {size.high:.{places}f})"
 
 
-# --- The masses of a map as plain data, and in sentences.
-
-MassDocument = Mapping[str, Any]
+# --- The masses of a map, and sentences on them.
 
 
-def masses_document(
+def mass_reports(
     masses: Sequence[Mass],
     tactile_map: TactileMap,
     *,
@@ -245,46 +258,38 @@ def masses_document(
     quantities: Mapping[str, Quantity],
     reason: str,
     scans: Sequence[Mapping[str, str]] = (),
-) -> list[dict[str, Any]]:
-    """JSON objects of a map's masses, numbered in their order; see data_schema/estimate.schema.json.
+) -> tuple[MassReport, ...]:
+    """A map's masses, numbered in their order.
 
-    Parameters
-    ----------
-    quantities, reason
-        Of the reported mass, as the estimate has them.
-    scans
-        The scans at the beginning, which say which breast it is.
+    `quantities` and `reason` are those of the reported mass; the `scans` at the beginning say which breast it is.
     """
     found = []
     for number, mass in enumerate(masses, start=1):
         own = quantities if mass.reported else estimate_quantities(mass.estimate, tactile_map, probability=probability)
         place = lump_place(mass.estimate.map_posterior, tactile_map, scans)
+        patient = patient_mm(tactile_map, mass.x_mm, mass.y_mm)
         why = reason if mass.reported else mass.estimate.reason
-        position = None if place is None else place.as_dict(probability)
-        found.append({"number": number, **_mass(mass, tactile_map, own, why), "position": position})
-    return found
+        found.append(
+            MassReport(
+                number=number,
+                reported=mass.reported,
+                centre_mm=rounded(Place(mass.x_mm, mass.y_mm)),
+                centre_patient_mm=None if patient is None else rounded(Place(*patient)),
+                detected_probability=rounded(mass.probability),
+                **_told(own, ("amplitude", *SIZES, "angle_deg")),
+                another_exam=another_exam(mass.estimate.size, own),
+                reason=why if mass.estimate.size is None else "",
+                reason_code=cast("ReasonCode", mass.estimate.code),
+                advice=mass.estimate.advice,
+                position=None if place is None else place.told(probability),
+            )
+        )
+    return tuple(found)
 
 
-def _mass(mass: Mass, tactile_map: TactileMap, quantities: Mapping[str, Quantity], reason: str) -> dict[str, Any]:
-    estimate = mass.estimate
-
-    def one(name: str) -> dict[str, Any] | None:
-        return quantities[name].as_dict() if name in quantities else None
-
-    patient = patient_mm(tactile_map, mass.x_mm, mass.y_mm)
-    return {
-        "reported": mass.reported,
-        "centre_mm": {"x": nine_digits(mass.x_mm), "y": nine_digits(mass.y_mm)},
-        "centre_patient_mm": None if patient is None else {"x": nine_digits(patient[0]), "y": nine_digits(patient[1])},
-        "detected_probability": nine_digits(mass.probability),
-        "amplitude": one("amplitude"),
-        **{name: one(name) for name in SIZES},
-        "angle_deg": one("angle_deg"),
-        ANOTHER_EXAM: another_exam(estimate.size, quantities),
-        "reason": reason if estimate.size is None else "",
-        "reason_code": estimate.code,
-        "advice": estimate.advice,
-    }
+def _told(quantities: Mapping[str, Quantity], names: Sequence[str]) -> dict[str, Any]:
+    """Some of the quantities as files have them; None where there is none."""
+    return {name: quantities[name].rounded if name in quantities else None for name in names}
 
 
 def patient_mm(tactile_map: TactileMap, x_mm: float, y_mm: float) -> tuple[float, float] | None:
@@ -295,50 +300,48 @@ def patient_mm(tactile_map: TactileMap, x_mm: float, y_mm: float) -> tuple[float
     return float(x), float(y)
 
 
-def others(masses: Sequence[MassDocument]) -> list[MassDocument]:
+def others(masses: Sequence[MassReport]) -> list[MassReport]:
     """The masses besides the reported one."""
-    return [one for one in masses if not one["reported"]]
+    return [one for one in masses if not one.reported]
 
 
-def mass_lines(masses: Sequence[MassDocument]) -> list[str]:
+def mass_lines(masses: Sequence[MassReport]) -> list[str]:
     """One line per mass besides the reported one: place, size or why there is none, probability."""
-    here = next((one for one in masses if one["reported"]), None)
-    return [f"Mass {one['number']} {mass_words(one, here)}." for one in others(masses)]
+    here = next((one for one in masses if one.reported), None)
+    return [f"Mass {one.number} {mass_words(one, here)}." for one in others(masses)]
 
 
-def mass_words(mass: MassDocument, here: MassDocument | None) -> str:
+def mass_words(mass: MassReport, here: MassReport | None) -> str:
     """A mass's place, its distance from the reported one, its size or why it has none, and its probability."""
-    x, y = (mass["centre_mm"][axis] for axis in "xy")
+    x, y = mass.centre_mm.x, mass.centre_mm.y
     place = f"at ({x:.1f}, {y:.1f}) mm"
     if here is not None:
-        away = np.hypot(x - here["centre_mm"]["x"], y - here["centre_mm"]["y"])
-        place += f", {away:.0f} mm from mass {here['number']}"
-    if mass.get("position") is not None:
-        place += f" ({mass['position']['text']})"
-    size = leading(mass)["max_size_mm"]
+        away = np.hypot(x - here.centre_mm.x, y - here.centre_mm.y)
+        place += f", {away:.0f} mm from mass {here.number}"
+    if mass.position is not None:
+        place += f" ({mass.position.text})"
+    size = mass.leading.max_size_mm
     if size is None:
-        told = f"no size: {mass['reason']}"
+        told = f"no size: {mass.reason}"
     else:
-        share = f"{100 * size['probability']:g} %"
-        told = f"largest size {size['median']:.1f} mm ({share} interval {size['low']:.1f} to {size['high']:.1f} mm)"
+        share = f"{100 * size.probability:g} %"
+        told = f"largest size {size.median:.1f} mm ({share} interval {size.low:.1f} to {size.high:.1f} mm)"
     if here is not None:
         for pair in touching_masses([here, mass]):
-            told += f"; may be one lump with mass {here['number']}, {together_words(pair)}"
-    return f"{place}: {told}; probability of a lump {chance_text(mass['detected_probability'])}"
+            told += f"; may be one lump with mass {here.number}, {together_words(pair)}"
+    return f"{place}: {told}; probability of a lump {chance_text(mass.detected_probability)}"
 
 
-def numbered(masses: Sequence[MassDocument]) -> str:
+def numbered(masses: Sequence[MassReport]) -> str:
     """Which of the masses is reported, in words; empty where it is the only one."""
-    here = next((one for one in masses if one["reported"]), None)
-    return "" if here is None or len(masses) == 1 else f"Mass {here['number']} of {len(masses)}"
+    here = next((one for one in masses if one.reported), None)
+    return "" if here is None or len(masses) == 1 else f"Mass {here.number} of {len(masses)}"
 
 
-# --- An estimate as plain data: the object that `estimate --json` prints.
-
-SCHEMA = "tactile-bayes/estimate/1"
+# --- The report of a map: what `estimate --json` prints.
 
 
-def estimate_document(
+def estimate_report(
     estimate: Estimate,
     tactile_map: TactileMap,
     *,
@@ -347,20 +350,17 @@ def estimate_document(
     provenance: Provenance,
     quantities: Mapping[str, Quantity] | None = None,
     place: ClockPosition | None = None,
-) -> dict[str, Any]:
-    """JSON object of one map, see data_schema/estimate.schema.json; `quantities` if already summarised."""
+) -> EstimateReport:
+    """Report of one map; `quantities` if already summarised."""
     if quantities is None:
         quantities = estimate_quantities(estimate, tactile_map, probability=probability)
 
-    def one(name: str) -> dict[str, float | str] | None:
-        return quantities[name].as_dict() if name in quantities else None
+    def point(name: str) -> Point | None:
+        x, y = f"{name}.x", f"{name}.y"
+        return Point(quantities[x].rounded, quantities[y].rounded) if x in quantities else None
 
-    def point(name: str) -> dict[str, Any] | None:
-        return {axis: one(f"{name}.{axis}") for axis in "xy"} if f"{name}.x" in quantities else None
-
-    about = estimate.about_mm
-    share = estimate.size.variance_share if estimate.size is not None else None
-    masses = masses_document(
+    about, size = estimate.about_mm, estimate.size
+    masses = mass_reports(
         estimate.masses,
         tactile_map,
         probability=probability,
@@ -368,48 +368,56 @@ def estimate_document(
         reason=estimate.reason,
         scans=provenance.scans,
     )
-    return {
-        "schema": SCHEMA,
-        "status": estimate.status,
-        "verdict": verdict(estimate.findings, answered=estimate.size is not None),
-        "findings": [one.as_dict() for one in estimate.findings],
-        "reason": estimate.reason,
-        "reason_code": estimate.code,
-        "advice": estimate.advice,
-        "on_paper": estimate.on_paper,
-        "about_mm": None if about is None else {"x": nine_digits(about[0]), "y": nine_digits(about[1])},
-        "smallest_lump": None if estimate.smallest is None else estimate.smallest.as_dict(),
-        **{name: one(name) for name in (*SIZES, *WIDTHS)},
-        ANOTHER_EXAM: another_exam(estimate.size, quantities),
-        "supposing": supposed_document(estimate.size, quantities.get("max_size_mm")),
-        "centre_mm": point("centre_mm"),
-        "centre_patient_mm": point("centre_patient_mm"),
-        "position": None if place is None else place.as_dict(probability),
-        "angle_deg": one("angle_deg"),
-        "detected_probability": None if estimate.probability is None else nine_digits(estimate.probability),
-        "variance_share": None if share is None else {k: nine_digits(v) for k, v in share.items()},
-        "scene": None if estimate.scene is None else scene_document(estimate.scene),
-        "prior_sensitivity": None if estimate.sensitivity is None else rounded(estimate.sensitivity.as_dict()),
-        "diagnostics": _diagnostics(estimate),
-        "candidates": [
-            {"x_mm": nine_digits(c.centre_mm[0]), "y_mm": nine_digits(c.centre_mm[1]), "fault": c.fault}
-            for c in estimate.candidates
-        ],
-        "other_rises": [rise.as_dict() for rise in estimate.other_rises],
-        "masses": masses,
-        "touching": touching_masses(masses),
-        "left_out": list(estimate.left_out),
-        "prior": as_dict(prior),
-        "research_use": RESEARCH_USE,
-        "provenance": provenance.as_dict(),
-    }
+    return EstimateReport(
+        schema=ESTIMATE,
+        status=estimate.status,
+        verdict=verdict(estimate.findings, answered=size is not None),
+        entries=tuple(one.entry for one in estimate.findings),
+        reason=estimate.reason,
+        reason_code=cast("ReasonCode", estimate.code),
+        advice=estimate.advice,
+        on_paper=estimate.on_paper,
+        about_mm=None if about is None else rounded(Place(*about)),
+        smallest_lump=None if estimate.smallest is None else smallest_lump(estimate.smallest),
+        **_told(quantities, (*SIZES, *WIDTHS, "angle_deg")),
+        another_exam=another_exam(size, quantities),
+        supposing=suppositions(size, quantities.get("max_size_mm")),
+        centre_mm=point("centre_mm"),
+        centre_patient_mm=point("centre_patient_mm"),
+        position=None if place is None else place.told(probability),
+        detected_probability=rounded(estimate.probability),
+        variance_share=None if size is None else rounded(dict(size.variance_share)),
+        scene=None if estimate.scene is None else scene_report(estimate.scene),
+        prior_sensitivity=None if estimate.sensitivity is None else _sensitivity(estimate.sensitivity),
+        diagnostics=_diagnostics(estimate),
+        candidates=tuple(PassedOver(*rounded(one.centre_mm), one.fault) for one in estimate.candidates),
+        other_rises=tuple(rounded(OtherRise(**as_dict(one)), 6) for one in estimate.other_rises),
+        masses=masses,
+        touching=touching_masses(masses),
+        left_out=tuple(estimate.left_out),
+        prior=as_dict(prior),
+        research_use=RESEARCH_USE,
+        provenance=provenance.as_dict(),
+    )
 
 
-def rounded(value: Any) -> Any:
-    """Plain data with its numbers rounded to nine significant digits."""
-    if isinstance(value, dict):
-        return {name: rounded(one) for name, one in value.items()}
-    return nine_digits(value) if isinstance(value, float) else value
+def smallest_lump(found: SmallestLumps) -> SmallestLump:
+    """What a map without a lump would have shown, as files have it."""
+
+    def row(diameters: FloatArray) -> Any:
+        return tuple(float(d) if math.isfinite(d) else None for d in diameters)
+
+    places = [
+        SmallestAt(round(float(x), 3), round(float(y), 3), row(d))
+        for (x, y), d in zip(found.places_mm, found.d_mm, strict=True)
+    ]
+    depths: Any = tuple(round(float(depth), 1) for depth in found.depths_mm)
+    best, worst = row(found.d_mm.min(axis=0)), row(found.d_mm.max(axis=0))
+    return SmallestLump(PROBABILITY, depths, best, worst, round(found.spacing_mm, 3), tuple(places))
+
+
+def _sensitivity(found: Sensitivity) -> PriorSensitivity:
+    return rounded(PriorSensitivity(WIDER, dict(found.median), dict(found.ends)))
 
 
 def _diagnostics(estimate: Estimate) -> dict[str, Any]:
@@ -427,6 +435,6 @@ def size_diagnostics(size: SizePosterior) -> dict[str, Any]:
 
 def _finite(found: Mapping[str, Any]) -> dict[str, Any]:
     return {
-        name: (nine_digits(value) if math.isfinite(value) else None) if isinstance(value, float) else value
+        name: (rounded(value) if math.isfinite(value) else None) if isinstance(value, float) else value
         for name, value in found.items()
     }

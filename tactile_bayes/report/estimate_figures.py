@@ -11,6 +11,7 @@ import numpy as np
 
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError
+from tactile_bayes.files.comparison import CompareReport
 from tactile_bayes.findings import Finding
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.map import TactileMap
@@ -399,7 +400,7 @@ class _Laid(Record, eq=False):
 
 def draw_comparison(
     compared: Compared,
-    document: Mapping[str, Any],
+    report: CompareReport,
     visits: Sequence[Sequence[DrawnMap]],
     path: Path | None,
     *,
@@ -412,8 +413,6 @@ def draw_comparison(
 
     Parameters
     ----------
-    document
-        `compare_document` of the comparison.
     visits
         Maps of each visit.
     path
@@ -428,20 +427,20 @@ def draw_comparison(
     laid = [_averaged(maps, in_patient=in_patient) for maps in visits]
     shown = [0, *range(max(1, len(laid) - _MOST_VISITS + 1), len(laid))]
     with figure_file(path, size_in=(4.0 * (len(shown) + 1), 7.4), force=force) as figure:
-        figure.suptitle(_title(document), x=0.01, ha="left", fontsize=11)
+        figure.suptitle(_title(report), x=0.01, ha="left", fontsize=11)
         grid = figure.add_gridspec(2, len(shown) + 1, height_ratios=(1.35, 1.0))
         panels = [figure.add_subplot(grid[0, i]) for i in range(len(shown) + 1)]
         words = visits[0][0].tactile_map.recipe.value_words
         _draw_maps(panels, [(i + 1, laid[i]) for i in shown], label=words, in_patient=in_patient)
         _draw_change(figure.add_subplot(grid[1, 0]), compared)
-        _write_words(figure.add_subplot(grid[1, 1:]), document)
+        _write_words(figure.add_subplot(grid[1, 1:]), report)
         figure.text(0.01, 0.01, _caption(in_patient=in_patient), fontsize=7.5, color="0.3")
     return figure
 
 
-def _title(document: Mapping[str, Any]) -> str:
+def _title(report: CompareReport) -> str:
     """Title with the subject's code and the scans' digests."""
-    exam = named_exam("", document.get("provenance", {}).get("scans", ()))
+    exam = named_exam("", report.provenance.get("scans", ()))
     return f"Comparison: {exam}" if exam else "Comparison"
 
 
@@ -549,10 +548,10 @@ def _draw_change(axes: Axes, compared: Compared) -> None:
     axes.set_title("Posterior of the change", loc="left", fontsize=11)
 
 
-def _write_words(axes: Axes, document: Mapping[str, Any]) -> None:
+def _write_words(axes: Axes, report: CompareReport) -> None:
     """The short report."""
     axes.set_axis_off()
-    lines = [part for line in compare_summary(document).splitlines()[:-1] for part in textwrap.wrap(line, 96)]
+    lines = [part for line in compare_summary(report).splitlines()[:-1] for part in textwrap.wrap(line, 96)]
     lines = [line for line in lines if not line.startswith("More (")]
     axes.text(0.0, 1.0, "\n".join(lines), va="top", fontsize=8.5, transform=axes.transAxes)
 

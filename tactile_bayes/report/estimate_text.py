@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
 
+from tactile_bayes.files.reports import MassReport, SmallestLump
 from tactile_bayes.findings import finding_lines, finding_summary
 from tactile_bayes.inference.draws import ParameterDraws, Quantity
 from tactile_bayes.mapping.map import TactileMap
@@ -17,18 +17,18 @@ from tactile_bayes.posterior.lump_probability import SHARE_WITH_LUMP
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.estimate_document import (
-    MassDocument,
     mass_lines,
-    masses_document,
+    mass_reports,
     numbered,
     others,
     prior_line,
     scene_line,
     scene_lines,
     sensitivity_line,
-    supposed_document,
+    smallest_lump,
     supposed_line,
     supposed_lines,
+    suppositions,
 )
 from tactile_bayes.report.quantities import (
     ANOTHER_EXAM,
@@ -43,17 +43,11 @@ from tactile_bayes.size.draws import EXTREMES, SIZES
 # --- The smallest lump that a map without one would have shown, in a sentence.
 
 
-def smallest_text(smallest: Mapping[str, Any]) -> str:
-    """What would have shown, by depth, where the map is best and where it is worst; without a full stop.
-
-    Parameters
-    ----------
-    smallest
-        As `SmallestLumps.as_dict` has it.
-    """
-    ends = zip(smallest["depths_mm"], smallest["best_mm"], smallest["worst_mm"], strict=True)
+def smallest_text(smallest: SmallestLump) -> str:
+    """What would have shown, by depth, where the map is best and where it is worst; without a full stop."""
+    ends = zip(smallest.depths_mm, smallest.best_mm, smallest.worst_mm, strict=True)
     told = [f"{_smallest_range(best, worst)} at a depth of {depth:g} mm" for depth, best, worst in ends]
-    share = f"{100 * smallest['probability']:g} %"
+    share = f"{100 * smallest.probability:g} %"
     return f"A ball would have shown with {share} from a diameter on of {'; '.join(told)} (of its middle), by its place"
 
 
@@ -216,17 +210,17 @@ def estimate_text(
     probability: float,
     prior: BumpPrior | None = None,
     quantities: Mapping[str, Quantity] | None = None,
-    masses: Sequence[MassDocument] | None = None,
+    masses: Sequence[MassReport] | None = None,
     place: ClockPosition | None = None,
 ) -> str:
     """Full report of one map: sizes with intervals, sources of uncertainty, omissions.
 
-    `quantities`, `masses` (see `masses_document`) and the lump's `place` about the nipple where they are at hand.
+    `quantities`, `masses` (see `mass_reports`) and the lump's `place` about the nipple where they are at hand.
     """
     if quantities is None:
         quantities = estimate_quantities(estimate, tactile_map, probability=probability)
     if masses is None:
-        masses = masses_document(
+        masses = mass_reports(
             estimate.masses, tactile_map, probability=probability, quantities=quantities, reason=estimate.reason
         )
     if estimate.status == "no_estimate":
@@ -256,7 +250,7 @@ def no_estimate_line(reason: str) -> str:
 
 def smallest_lines(estimate: Estimate) -> list[str]:
     """What a map without a lump would have shown, as one line; empty where nobody has asked."""
-    return [] if estimate.smallest is None else [f"{smallest_text(estimate.smallest.as_dict())}."]
+    return [] if estimate.smallest is None else [f"{smallest_text(smallest_lump(estimate.smallest))}."]
 
 
 def advice_lines(estimate: Estimate) -> list[str]:
@@ -288,7 +282,7 @@ def alike_spread(estimate: Estimate) -> float | None:
     return None if estimate.size is None else estimate.size.figures.get("between_map_sd")
 
 
-def _findings(estimate: Estimate, quantities: Mapping[str, Quantity], masses: Sequence[MassDocument]) -> list[str]:
+def _findings(estimate: Estimate, quantities: Mapping[str, Quantity], masses: Sequence[MassReport]) -> list[str]:
     lines, found = [], estimate.diagnostics
     if estimate.probability is not None:
         which = f"{number}. " if (number := numbered(masses)) else ""
@@ -303,7 +297,7 @@ def _findings(estimate: Estimate, quantities: Mapping[str, Quantity], masses: Se
         if found is not None and found.repeatability:
             lines.append(site_interval_text(found.repeatability))
         largest = quantities["max_size_mm"]
-        supposed, places = supposed_document(estimate.size, largest), size_decimals([largest])
+        supposed, places = suppositions(estimate.size, largest), size_decimals([largest])
         lines += supposed_lines(supposed, largest.median, places=places)
         if "oval_probability" in estimate.size.figures:
             lines.append(shape_text(estimate.size.figures))
@@ -364,16 +358,16 @@ def _ends(what: str, names: tuple[str, ...], quantities: Mapping[str, Quantity])
     return ends_text(what, worst.mc_error, worst.sd)
 
 
-def _scene(estimate: Estimate, masses: Sequence[MassDocument]) -> list[str]:
+def _scene(estimate: Estimate, masses: Sequence[MassReport]) -> list[str]:
     """Lines on the structures in the window, and on the influence of the prior."""
     lines = [] if estimate.scene is None else [*scene_lines(estimate.scene), *_elsewhere(masses)]
     prior = "" if estimate.sensitivity is None else sensitivity_line(estimate.sensitivity)
     return [*lines, prior] if prior else lines
 
 
-def _elsewhere(masses: Sequence[MassDocument]) -> list[str]:
+def _elsewhere(masses: Sequence[MassReport]) -> list[str]:
     """A line on what the odds of a second lump do not speak of; empty where there is one mass."""
-    numbers = " and ".join(str(one["number"]) for one in others(masses))
+    numbers = " and ".join(str(one.number) for one in others(masses))
     return [f"These odds are of this window alone: mass {numbers} of the map is above."] if numbers else []
 
 
@@ -403,7 +397,7 @@ def estimate_summary(
     quantities: Mapping[str, Quantity],
     *,
     probability: float,
-    masses: Sequence[MassDocument] = (),
+    masses: Sequence[MassReport] = (),
     place: ClockPosition | None = None,
 ) -> str:
     """Report of one map in at most `MOST_LINES` lines; `estimate_text` gives the rest.
@@ -415,7 +409,7 @@ def estimate_summary(
     probability
         Of the intervals.
     masses
-        As `masses_document` gives them.
+        As `mass_reports` gives them.
     place
         Of the lump about the nipple, where it is known.
     """
@@ -432,7 +426,7 @@ def _something(
     estimate: Estimate,
     quantities: Mapping[str, Quantity],
     probability: float,
-    masses: Sequence[MassDocument],
+    masses: Sequence[MassReport],
     place: ClockPosition | None,
 ) -> list[str]:
     """The body of a report with an estimate; what makes the interval wide gives way to masses."""
@@ -456,7 +450,7 @@ def _supposed(estimate: Estimate, quantities: Mapping[str, Quantity]) -> list[st
     largest = quantities.get("max_size_mm")
     if largest is None:
         return []
-    supposed = supposed_document(estimate.size, largest)
+    supposed = suppositions(estimate.size, largest)
     return supposed_line(supposed, largest.median, places=size_decimals([largest]))
 
 
@@ -477,7 +471,7 @@ def _lump(
     return [f"{number}: {text[0].lower()}{text[1:]}." if number else f"{text}."] if parts else []
 
 
-def _masses(masses: Sequence[MassDocument], *, room: int) -> list[str]:
+def _masses(masses: Sequence[MassReport], *, room: int) -> list[str]:
     """At most `room` lines on the masses besides the reported one, at least one; the last counts those left out."""
     lines = mass_lines(masses)
     shown = lines[: max(room, 1)]

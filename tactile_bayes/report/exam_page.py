@@ -16,6 +16,7 @@ from tactile_bayes import __version__
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import UsageError
 from tactile_bayes.files.atomic import check_suffix, refuse_existing, same_file, write_all
+from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.mapping.places import orientation_of
 from tactile_bayes.posterior.abstention import chance_text
 from tactile_bayes.posterior.lump_probability import SHARE_WITH_LUMP
@@ -23,7 +24,6 @@ from tactile_bayes.presets import INTERVAL, RESEARCH_USE
 from tactile_bayes.report.exam_words import (
     Exam,
     ExamMap,
-    Quantity,
     facts,
     finding_sentences,
     headline,
@@ -222,14 +222,14 @@ def _picture(exam: Exam, *, crowded: bool) -> dict[str, str] | None:
 
 def _smallest(exam: Exam) -> list[str]:
     """What the map would have shown, by place and depth."""
-    smallest, tactile_map = exam.main.document.get("smallest_lump"), exam.main.tactile_map
+    smallest, tactile_map = exam.main.report.smallest_lump, exam.main.tactile_map
     return [] if smallest is None or tactile_map is None else list(smallest_pictures(tactile_map, smallest))
 
 
 def _place(exam: Exam) -> dict[str, Any]:
     """Where the lump lies, beside a clock face of the breast."""
     mass, size = exam.main.masses[0], largest(exam)
-    sentences = [place_sentence(mass, INTERVAL if size is None else size["probability"])]
+    sentences = [place_sentence(mass, INTERVAL if size is None else size.probability)]
     if mass.probability is not None:
         which = f"map {exam.main_number}" if len(exam.maps) > 1 else "this map"
         told = f"Probability that it is a lump, by {which}: {chance_text(mass.probability)}"
@@ -239,24 +239,25 @@ def _place(exam: Exam) -> dict[str, Any]:
 
 def _intervals(exam: Exam, size: Quantity) -> list[tuple[str, Quantity]]:
     """Both intervals of the largest size, with what they suppose."""
-    another, alike = exam.document.get("another_exam"), exam.figures.get("between_map_sd")
-    if another is None:
+    another, alike = exam.report.another_exam, exam.figures.get("between_map_sd")
+    narrow_size = exam.report.max_size_mm
+    if another is None or narrow_size is None:
         return [("this exam" if exam.pooled is None else "these exams", size)]
     narrow = "exams alike" if alike is None else f"if exams differ by {100 * alike:.0f} %"
-    patients = f"as exams of patients differ, {100 * another['between_map_sd']:.0f} %"
-    return [(patients, size), (narrow, exam.document["max_size_mm"])]
+    patients = f"as exams of patients differ, {100 * another.between_map_sd:.0f} %"
+    return [(patients, size), (narrow, narrow_size)]
 
 
 def _alone(one: ExamMap) -> str:
     """The size that a repeat gives by itself."""
-    size = one.document["max_size_mm"]
-    return "no size" if size is None else f"{size['median']:.1f} mm ({size['low']:.1f} to {size['high']:.1f})"
+    size = one.report.max_size_mm
+    return "no size" if size is None else f"{size.median:.1f} mm ({size.low:.1f} to {size.high:.1f})"
 
 
 def _foot(exam: Exam) -> str:
     digests = [scan["sha256"][:12] for scan in exam.scans if scan.get("sha256")][:MOST_REPEATS]
-    settings = exam.main.document["provenance"]
-    parts = [f"tactile-bayes {__version__}", f"method {settings['settings'].get('method', 'unknown')}"]
-    parts += [f"seed {settings['seed']}"] if settings.get("seed") is not None else []
+    made = exam.main.report.provenance
+    parts = [f"tactile-bayes {__version__}", f"method {exam.main.report.origin.settings.get('method', 'unknown')}"]
+    parts += [f"seed {made['seed']}"] if made.get("seed") is not None else []
     parts += [f"scan{'s' if len(digests) > 1 else ''} {', '.join(digests)}"] if digests else []
     return f"{'; '.join(parts)}. Sizes come from simulated bodies; no scan of a person has been used. {RESEARCH_USE}"

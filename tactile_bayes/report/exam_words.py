@@ -4,25 +4,29 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from datetime import date
 from typing import Any, Final
 
 import numpy as np
 
 from tactile_bayes.declarations import Record, replace
-from tactile_bayes.errors import NO_LUMP
-from tactile_bayes.findings import finding_lines, findings_in
+from tactile_bayes.errors import NO_LUMP, UsageError
+from tactile_bayes.files.reports import EstimateReport, Interval, MassReport, PooledReport, centre_of
+from tactile_bayes.findings import finding_lines
 from tactile_bayes.geometry import apply
+from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.mapping.map import FEW_READINGS, TactileMap
 from tactile_bayes.mapping.places import ClockPosition, clock_position, clock_text
 from tactile_bayes.posterior.abstention import chance_text
-from tactile_bayes.report.estimate_document import patient_mm
+from tactile_bayes.report.estimate_document import others, patient_mm
 from tactile_bayes.report.estimate_text import shape_text, smallest_text, width_lines
-from tactile_bayes.report.quantities import from_xiphoid, leading
+from tactile_bayes.report.quantities import from_xiphoid
 from tactile_bayes.size.pooling import DISAGREE
 
-# --- What the page of an exam shows: its maps, the masses on them, and what the scans say of the exam.
+_LONGEST: Final = {"title": 60, "name": 50}
+_DATE: Final = re.compile(r"\d{4}-\d{2}-\d{2}", re.ASCII)
 
-Quantity = Mapping[str, Any]
+# --- What the page of an exam shows: its maps, the masses on them, and what the scans say of the exam.
 
 
 class ExamMass(Record, eq=False):
@@ -39,9 +43,7 @@ class ExamMass(Record, eq=False):
     """
     largest: Quantity | None = None
     smallest: Quantity | None = None
-    """`largest`, `smallest`: Largest and smallest size with the intervals that lead, as the estimate's JSON has them;
-    None without.
-    """
+    """`largest`, `smallest`: Largest and smallest size with the intervals that lead; None without."""
     probability: float | None = None
     """That it is a lump; None where it is not told."""
     place: ClockPosition | None = None
@@ -53,13 +55,13 @@ class ExamMass(Record, eq=False):
 
 
 class ExamMap(Record, eq=False):
-    """One map of an exam, with the estimate's JSON object and its masses, the reported one first.
+    """One map of an exam, with its estimate and its masses, the reported one first.
 
     `tactile_map` is None where only the estimate is at hand.
     """
 
     tactile_map: TactileMap | None
-    document: Mapping[str, Any]
+    report: EstimateReport
     masses: tuple[ExamMass, ...]
 
 
@@ -68,8 +70,8 @@ class Exam(Record, eq=False):
 
     maps: tuple[ExamMap, ...]
     """Several are repeats of one mass."""
-    pooled: Mapping[str, Any] | None = None
-    """The JSON object of the size from all maps; None with one map."""
+    pooled: PooledReport | None = None
+    """The size from all maps; None with one map."""
     scans: Sequence[Mapping[str, str]] = ()
     """The scans at the beginning, as `Provenance.scans` has them."""
     title: str = ""
@@ -90,91 +92,82 @@ class Exam(Record, eq=False):
     @property
     def drawn(self) -> ExamMap:
         """The map that is drawn large; of several maps its first mass has the pooled size, in its own shape."""
-        if self.pooled is None or self.pooled["max_size_mm"] is None or not self.main.masses:
+        if self.pooled is None or not self.main.masses:
             return self.main
         first, *others = self.main.masses
-        if first.axes_mm is None or first.largest is None:
+        size, alone = self.pooled.leading.max_size_mm, first.largest
+        if size is None or first.axes_mm is None or alone is None:
             return self.main
-        size = leading(self.pooled)["max_size_mm"]
-        along, across = (axis * size["median"] / first.largest["median"] for axis in first.axes_mm)
+        along, across = (axis * size.median / alone.median for axis in first.axes_mm)
         return replace(self.main, masses=(replace(first, axes_mm=(along, across), largest=size), *others))
 
     @property
-    def document(self) -> Mapping[str, Any]:
-        """The JSON object of the size that the page reports: the pooled one of several maps."""
-        return self.main.document if self.pooled is None else self.pooled
+    def report(self) -> EstimateReport | PooledReport:
+        """The report of the size that the page tells: the pooled one of several maps."""
+        return self.main.report if self.pooled is None else self.pooled
 
     @property
     def disagrees(self) -> bool:
         """Whether the maps are not of one size, or not of one mass."""
-        return self.pooled is not None and self.pooled["status"] == DISAGREE
+        return self.pooled is not None and self.pooled.status == DISAGREE
 
     @property
     def figures(self) -> Mapping[str, Any]:
         """Figures of the size: spread between exams, whether the lump is oval."""
-        found: Mapping[str, Any] = self.document["diagnostics" if self.pooled is None else "figures"]
-        return found
+        return self.report.figures
 
 
-def exam_map(tactile_map: TactileMap | None, document: Mapping[str, Any], *, side: str) -> ExamMap:
-    """A map with its masses, from what `estimate --json` says of it.
+class Given(Record):
+    """What was given for the page besides maps: title, name and date, empty where they were not.
 
-    Parameters
-    ----------
-    side
-        Which breast, as the scans have it.
+    Raises
+    ------
+    UsageError
+        When a text is too long for the page or not printable, or the day is no date.
     """
-    return ExamMap(tactile_map, document, tuple(_masses(tactile_map, document, side)))
+
+    title: str = ""
+    name: str = ""
+    day: str = ""
+
+    def __post_init__(self) -> None:
+        for option, longest in _LONGEST.items():
+            value = getattr(self, option)
+            if not isinstance(value, str):
+                raise UsageError(f"{option} is {value!r}; give a text")
+            if not value.isprintable() or len(value) > longest:
+                what = f"{option} is of {len(value)} letters or not printable"
+                raise UsageError(f"{what}; give up to {longest} letters")
+        if self.day and not _is_date(str(self.day)):
+            raise UsageError(f"date {str(self.day)[:40]!r} is no date; give it as YEAR-MONTH-DAY, such as 2026-03-01")
+
+    def on(self, exam: Exam) -> Exam:
+        """The exam with them."""
+        return replace(exam, title=self.title, name=self.name, day=self.day)
 
 
-def _masses(tactile_map: TactileMap | None, document: Mapping[str, Any], side: str) -> Iterator[ExamMass]:
-    """The reported mass first, then the others in the JSON's order."""
-    listed = document["masses"]
-    if document["centre_mm"] is not None:
-        number = next((one["number"] for one in listed if one["reported"]), 1)
-        yield _reported(number, tactile_map, document, side)
-    for one in listed:
-        if not one["reported"]:
-            yield _listed(one, tactile_map, side)
+def _is_date(text: str) -> bool:
+    try:
+        return bool(_DATE.fullmatch(text)) and bool(date.fromisoformat(text))
+    except ValueError:
+        return False
 
 
-def _reported(number: int, tactile_map: TactileMap | None, document: Mapping[str, Any], side: str) -> ExamMass:
-    point, angle = document["centre_mm"], document["angle_deg"]
-    sized = document["max_size_mm"] is not None
-    leads = leading(document)
-    return _placed(
-        number,
-        (point["x"]["median"], point["y"]["median"]),
-        tactile_map,
-        side,
-        told=document,
-        centre_sd_mm=(point["x"]["sd"], point["y"]["sd"]),
-        axes_mm=(document["d_x_mm"]["median"], document["d_y_mm"]["median"]) if sized else None,
-        angle_deg=0.0 if angle is None else angle["median"],
-        largest=leads["max_size_mm"],
-        smallest=leads["min_size_mm"],
-        probability=document["detected_probability"],
-        why="" if sized else document["reason"],
-    )
+def exam_map(tactile_map: TactileMap | None, report: EstimateReport, *, side: str) -> ExamMap:
+    """A map with its masses, from its estimate; `side` is the breast, as the scans have it."""
+    return ExamMap(tactile_map, report, tuple(_masses(tactile_map, report, side)))
 
 
-def _listed(one: Mapping[str, Any], tactile_map: TactileMap | None, side: str) -> ExamMass:
-    """A mass besides the reported one."""
-    leads, angle = leading(one), one["angle_deg"]
-    largest, along, across = leads["max_size_mm"], one["d_x_mm"], one["d_y_mm"]
-    return _placed(
-        one["number"],
-        (one["centre_mm"]["x"], one["centre_mm"]["y"]),
-        tactile_map,
-        side,
-        told=one,
-        axes_mm=None if largest is None else (along["median"], across["median"]),
-        angle_deg=0.0 if angle is None else angle["median"],
-        largest=largest,
-        smallest=leads["min_size_mm"],
-        probability=one["detected_probability"],
-        why=one["reason"],
-    )
+def _masses(tactile_map: TactileMap | None, report: EstimateReport, side: str) -> Iterator[ExamMass]:
+    """The reported mass first, then the others in their order."""
+    centre = report.centre_mm
+    if centre is not None:
+        number = next((one.number for one in report.masses if one.reported), 1)
+        why = "" if report.max_size_mm is not None else report.reason
+        sd_mm = (centre.x.sd, centre.y.sd)
+        yield _placed(number, centre.median, tactile_map, side, told=report, centre_sd_mm=sd_mm, why=why)
+    for one in others(report.masses):
+        yield _placed(one.number, one.centre_mm.median, tactile_map, side, told=one, why=one.reason)
 
 
 def _placed(
@@ -183,26 +176,30 @@ def _placed(
     tactile_map: TactileMap | None,
     side: str,
     *,
-    told: Mapping[str, Any] | None = None,
+    told: EstimateReport | MassReport,
     centre_sd_mm: tuple[float, float] = (0.0, 0.0),
-    **facts: Any,
+    why: str,
 ) -> ExamMass:
     """A mass with its place: by the map, or as its estimate has `told` it where that is all there is."""
     if tactile_map is None:
-        said = told or {}
-        place = ClockPosition.of_dict(said.get("position"))
-        return ExamMass(number, centre_mm, place=place, patient_mm=_point(said.get("centre_patient_mm")), **facts)
-    covariance = np.diag(np.square(centre_sd_mm))
-    place = clock_position(tactile_map, centre_mm, side=side, covariance_mm2=covariance)
-    return ExamMass(number, centre_mm, place=place, patient_mm=patient_mm(tactile_map, *centre_mm), **facts)
-
-
-def _point(point: Mapping[str, Any] | None) -> tuple[float, float] | None:
-    """x and y in mm of an estimate's JSON; of a quantity its median."""
-    if point is None:
-        return None
-    x, y = (point[axis]["median"] if isinstance(point[axis], Mapping) else point[axis] for axis in "xy")
-    return float(x), float(y)
+        place, patient = ClockPosition.of(told.position), centre_of(told.centre_patient_mm)
+    else:
+        covariance = np.diag(np.square(centre_sd_mm))
+        place = clock_position(tactile_map, centre_mm, side=side, covariance_mm2=covariance)
+        patient = patient_mm(tactile_map, *centre_mm)
+    along, across = told.d_x_mm, told.d_y_mm
+    return ExamMass(
+        number,
+        centre_mm,
+        axes_mm=None if along is None or across is None else (along.median, across.median),
+        angle_deg=0.0 if told.angle_deg is None else told.angle_deg.median,
+        largest=told.leading.max_size_mm,
+        smallest=told.leading.min_size_mm,
+        probability=told.detected_probability,
+        place=place,
+        patient_mm=patient,
+        why=why,
+    )
 
 
 # --- Sentences of an exam's page, in plain words: the size and its intervals, what was covered, how good the exam was.
@@ -221,61 +218,60 @@ def headline(exam: Exam) -> str:
     size, masses = largest(exam), exam.main.masses
     if size is not None:
         what = "Lump of" if len(masses) < 2 else f"{len(masses)} masses, mass {masses[0].number}"
-        interval = f"{_percent(size)} interval {size['low']:.1f} to {size['high']:.1f} mm"
-        return f"{what} about {size['median']:.1f} mm, {interval}"
+        interval = f"{_percent(size)} interval {size.low:.1f} to {size.high:.1f} mm"
+        return f"{what} about {size.median:.1f} mm, {interval}"
     if exam.disagrees:
-        return _capital(exam.document["reason"])
+        return _capital(exam.report.reason)
     if masses:
         return f"{'Lump' if len(masses) < 2 else f'{len(masses)} masses'} seen, no size"
-    return "No lump found in the area covered" if exam.main.document["reason_code"] in NO_LUMP else "No size"
+    return "No lump found in the area covered" if exam.main.report.reason_code in NO_LUMP else "No size"
 
 
 def largest(exam: Exam) -> Quantity | None:
     """The largest size that the page reports: the pooled one of several maps."""
-    size: Quantity | None = leading(exam.document)["max_size_mm"]
-    return size
+    return exam.report.leading.max_size_mm
 
 
 def size_sentences(exam: Exam) -> Iterator[str]:
     """The largest size with both intervals and the smallest size."""
-    document, size = exam.document, largest(exam)
+    report, size = exam.report, largest(exam)
     if size is None:
         return
     share = _percent(size)
-    yield f"The largest diameter is about {size['median']:.1f} mm (the middle of its probable values)."
-    yield f"With a probability of {share} it lies between {size['low']:.1f} and {size['high']:.1f} mm{_supposed(exam)}."
-    if document.get("another_exam") is not None:
-        alike, spread = document["max_size_mm"], exam.figures.get("between_map_sd")
+    yield f"The largest diameter is about {size.median:.1f} mm (the middle of its probable values)."
+    yield f"With a probability of {share} it lies between {size.low:.1f} and {size.high:.1f} mm{_supposed(exam)}."
+    alike, spread = report.max_size_mm, exam.figures.get("between_map_sd")
+    if report.another_exam is not None and alike is not None:
         told = "did not differ" if spread is None else f"differed by {100 * spread:.0f} % alone"
         learned = "as is learned from these maps" if exam.pooled is not None else "as those of simulated bodies do"
         yield (
-            f"Were exams of a lump known to have {told}, {learned}, it would lie between {alike['low']:.1f} and "
-            f"{alike['high']:.1f} mm ({share}): repeat exams can show that."
+            f"Were exams of a lump known to have {told}, {learned}, it would lie between {alike.low:.1f} and "
+            f"{alike.high:.1f} mm ({share}): repeat exams can show that."
         )
-    least = leading(document)["min_size_mm"]
+    least = report.leading.min_size_mm
     if least is not None:
-        ends = f"{share}: {least['low']:.1f} to {least['high']:.1f} mm"
-        yield f"The smallest diameter is about {least['median']:.1f} mm ({ends})."
+        ends = f"{share}: {least.low:.1f} to {least.high:.1f} mm"
+        yield f"The smallest diameter is about {least.median:.1f} mm ({ends})."
     if "oval_probability" in exam.figures:
         yield shape_text(exam.figures)
 
 
 def _supposed(exam: Exam) -> str:
     """What the size's interval supposes of the spread between exams, and where that is from."""
-    document, spread = exam.document, exam.figures.get("between_map_sd")
-    if document.get("another_exam") is not None:
+    report, spread = exam.report, exam.figures.get("between_map_sd")
+    if report.another_exam is not None:
         after = " after these maps" if exam.pooled is not None else ""
-        share = f"{100 * document['another_exam']['between_map_sd']:.0f} %"
+        share = f"{100 * report.another_exam.between_map_sd:.0f} %"
         return f", if exams of a lump differ by {share}{after}, as those of patients did in the published trial"
     if spread is None:
         return ""
-    at_site = document.get("repeatability") or exam.figures.get("repeatability")
+    at_site = exam.figures.get("repeatability") if exam.pooled is None else exam.pooled.site_words
     if at_site and exam.pooled is None:
         return f"; {at_site}"
     told = f"; exams of a lump are taken to differ by {100 * spread:.0f} %"
     if at_site:
         return f"{told}, by these maps and this site's other exams"
-    stated = document["provenance"].get("settings", {}).get("between_map_sd")
+    stated = report.origin.settings.get("between_map_sd")
     if stated is not None:
         return f"{told}, as was stated"
     if exam.pooled is not None:
@@ -287,27 +283,27 @@ def nothing_sentences(exam: Exam) -> Iterator[str]:
     """Why there is no size, what could have been missed, and what would help."""
     if exam.disagrees:
         yield "No common size is given: look at each map."
-        for number, one in enumerate(exam.document["maps"], start=1):
-            size = one["max_size_mm"]
+        for number, one in enumerate(() if exam.pooled is None else exam.pooled.maps, start=1):
+            size = one.max_size_mm
             if size is not None:
-                ends = f"{_percent(size)}: {size['low']:.1f} to {size['high']:.1f} mm"
-                yield f"By map {number} alone the largest diameter is about {size['median']:.1f} mm ({ends})."
+                ends = f"{_percent(size)}: {size.low:.1f} to {size.high:.1f} mm"
+                yield f"By map {number} alone the largest diameter is about {size.median:.1f} mm ({ends})."
         return
-    document, tactile_map = exam.main.document, exam.main.tactile_map
+    report, tactile_map = exam.main.report, exam.main.tactile_map
     if exam.pooled is not None:
-        yield f"{_capital(exam.pooled['reason'])}."
-    if document["reason_code"] in NO_LUMP:
+        yield f"{_capital(exam.pooled.reason)}."
+    if report.reason_code in NO_LUMP:
         area = "" if tactile_map is None else f": {covered_text(tactile_map)}"
         yield f"No lump was found in the area that was covered{area}."
-        if document["reason_code"] == "ridge":
+        if report.reason_code == "ridge":
             yield "What rises at the cross on the picture is long like a rib, not round like a lump."
-        if document.get("smallest_lump"):
-            yield f"{smallest_text(document['smallest_lump'])}."
+        if report.smallest_lump is not None:
+            yield f"{smallest_text(report.smallest_lump)}."
         yield "A lump may be smaller, deeper or softer than these, or lie outside the area that was covered."
     else:
-        yield f"{_capital(document['reason'])}."
-    if document.get("on_paper"):
-        yield f"What would help: {document['on_paper']}."
+        yield f"{_capital(report.reason)}."
+    if report.on_paper:
+        yield f"What would help: {report.on_paper}."
 
 
 def place_sentence(mass: ExamMass, probability: float) -> str:
@@ -344,14 +340,13 @@ def why_no_clock(exam: Exam) -> str:
 
 def narrowing_sentences(exam: Exam) -> list[str]:
     """What makes the interval wide and what would narrow it, without the program's options."""
-    document = exam.document
-    share = leading(document)["variance_share"]
+    share = exam.report.leading.variance_share
     return [] if share is None else [_OPTIONS.sub("", line) for line in width_lines(share)]
 
 
 def finding_sentences(exam: Exam, most: int) -> list[str]:
     """What speaks against the result, cautions first; lists longer than `most` end with their number."""
-    told = finding_lines(findings_in(exam.document["findings"]), paper=True)
+    told = finding_lines(exam.report.findings, paper=True)
     more = len(told) - most
     return [*told[:most], f"And {more} more, which the full report tells."] if more > 0 else told
 
@@ -361,7 +356,7 @@ def quality_rows(exam: Exam) -> Iterator[tuple[str, str]]:
     if exam.main.tactile_map is not None:
         yield from _scan_rows(exam.main.tactile_map)
     yield "array calibration", _age(exam)
-    calibration = exam.main.document["provenance"].get("settings", {}).get("size_calibration")
+    calibration = exam.main.report.origin.settings.get("size_calibration")
     if calibration:
         yield "size calibration", str(calibration)[:60]
 
@@ -451,7 +446,7 @@ def mass_row(mass: ExamMass) -> tuple[str, str, str]:
         chance = "" if mass.probability is None else f" (probability of a lump {chance_text(mass.probability)})"
         size = f"no size{chance}: {mass.why}"
     else:
-        size = f"{mass.largest['median']:.1f} mm ({mass.largest['low']:.1f} to {mass.largest['high']:.1f})"
+        size = f"{mass.largest.median:.1f} mm ({mass.largest.low:.1f} to {mass.largest.high:.1f})"
     return str(mass.number), size, short_place(mass)
 
 
@@ -469,8 +464,8 @@ def facts(exam: Exam) -> Iterator[tuple[str, str]]:
         yield "Date", exam.day
 
 
-def _percent(quantity: Mapping[str, Any]) -> str:
-    return f"{100 * quantity['probability']:g} %"
+def _percent(quantity: Quantity | Interval) -> str:
+    return f"{100 * quantity.probability:g} %"
 
 
 def _capital(text: str) -> str:

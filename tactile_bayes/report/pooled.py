@@ -1,16 +1,17 @@
-"""Reports of one size from several maps, as plain data and as text."""
+"""Reports of one size from several maps, made and in words."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
 
+from tactile_bayes.declarations import UNSET, rounded
 from tactile_bayes.files.provenance import Provenance, repeated_scans, scans_of
-from tactile_bayes.findings import Finding, by_weight, finding_lines, finding_summary, findings_in, verdict
-from tactile_bayes.inference.draws import nine_digits
+from tactile_bayes.files.reports import POOLED, EstimateReport, Interval, PooledMap, PooledReport
+from tactile_bayes.findings import Finding, by_weight, finding_lines, finding_summary, verdict
+from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.calibration import fat_text, site_words, unknowns_text
-from tactile_bayes.report.estimate_document import supposed_document, supposed_line, supposed_lines
+from tactile_bayes.report.estimate_document import supposed_line, supposed_lines, suppositions
 from tactile_bayes.report.estimate_text import (
     MORE,
     MOST_LINES,
@@ -24,21 +25,20 @@ from tactile_bayes.report.estimate_text import (
     table_row,
     width_lines,
 )
-from tactile_bayes.report.quantities import ANOTHER_EXAM, another_exam, leading
+from tactile_bayes.report.quantities import ANOTHER_EXAM, another_exam
 from tactile_bayes.size.bodies import BodyCalibration
-from tactile_bayes.size.draws import EXTREMES, SizePosterior
+from tactile_bayes.size.draws import EXTREMES
 from tactile_bayes.size.fat import LEAST_PROBABILITY
 from tactile_bayes.size.pooling import DISAGREE, PooledEstimate, Repeatability
 from tactile_bayes.size.terms import unknown_head
 
-SCHEMA = "tactile-bayes/pooled/1"
 MOST_NAMED = 4
 
 
-def pooled_document(
+def pooled_report(
     pooled: PooledEstimate,
     names: Sequence[str],
-    documents: Sequence[Mapping[str, Any]],
+    reports: Sequence[EstimateReport],
     calibration: BodyCalibration,
     *,
     probability: float,
@@ -46,13 +46,11 @@ def pooled_document(
     repeatability: Repeatability | None = None,
     apart: Mapping[int, str] | None = None,
     one_place: bool | None = None,
-) -> dict[str, Any]:
-    """JSON object of a mass, see data_schema/pooled.schema.json.
+) -> PooledReport:
+    """Report of a mass from what `estimate` says of its maps.
 
     Parameters
     ----------
-    names, documents
-        Of the maps, with what `estimate` says of each.
     repeatability
         The site's, where the size is by it.
     apart
@@ -61,77 +59,68 @@ def pooled_document(
         Whether the masses of all maps lie at one place in the patient; None where that cannot be told.
     """
     size, used = pooled.size, pooled.calibration or calibration
-    sizes: dict[str, Any] = dict.fromkeys(EXTREMES)
-    largest = None if size is None else size.summarise("max_size_mm", probability=probability)
+    found: dict[str, Quantity] = {}
     if size is not None:
-        sizes = {name: size.summarise(name, probability=probability).as_dict() for name in EXTREMES}
-    findings = by_weight(_findings(pooled, documents, apart or {}, one_place=one_place))
-    return {
-        "schema": SCHEMA,
-        "status": pooled.status,
-        "verdict": verdict(findings, answered=size is not None),
-        "findings": [one.as_dict() for one in findings],
-        "reason": pooled.reason,
-        **sizes,
-        ANOTHER_EXAM: _another_exam(size, probability),
-        "supposing": supposed_document(size, largest),
-        "maps": [_map(i, name, documents[i], pooled) for i, name in enumerate(names)],
-        "one_size_probability": None if pooled.one_size is None else nine_digits(pooled.one_size),
-        "one_place_probability": None if pooled.one_place is None else nine_digits(pooled.one_place),
-        "variance_share": None if size is None else {k: nine_digits(v) for k, v in size.variance_share.items()},
-        "figures": {} if size is None else {name: nine_digits(value) for name, value in size.figures.items()},
-        "left_out": _omitted(used, documents),
-        "fat_mm": None if used.fat_mm is None else nine_digits(used.fat_mm),
-        "unknowns": {name: nine_digits(share) for name, share in used.unknowns.items()},
-        "site": None if used.site is None else site_words(used.site),
-        **({} if repeatability is None else {"repeatability": repeatability.words()}),
-        "research_use": RESEARCH_USE,
-        "provenance": provenance.as_dict(),
-    }
+        found = {name: size.summarise(name, probability=probability) for name in EXTREMES}
+        if size.another_exam is not None:
+            another = size.another_exam
+            found |= {f"{ANOTHER_EXAM}.{n}": another.summarise(n, probability=probability) for n in EXTREMES}
+    findings = by_weight(_findings(pooled, reports, apart or {}, one_place=one_place))
+    return PooledReport(
+        schema=POOLED,
+        status=pooled.status,
+        verdict=verdict(findings, answered=size is not None),
+        entries=tuple(one.entry for one in findings),
+        reason=pooled.reason,
+        max_size_mm=found["max_size_mm"].rounded if found else None,
+        min_size_mm=found["min_size_mm"].rounded if found else None,
+        another_exam=another_exam(size, found),
+        supposing=suppositions(size, found.get("max_size_mm")),
+        maps=tuple(_map(i, name, reports[i], pooled) for i, name in enumerate(names)),
+        one_size_probability=rounded(pooled.one_size),
+        one_place_probability=rounded(pooled.one_place),
+        variance_share=None if size is None else rounded(dict(size.variance_share)),
+        figures={} if size is None else rounded(dict(size.figures)),
+        left_out=tuple(_omitted(used, reports)),
+        fat_mm=rounded(used.fat_mm),
+        unknowns=rounded(dict(used.unknowns)),
+        site=None if used.site is None else site_words(used.site),
+        repeatability=UNSET if repeatability is None else repeatability.words(),
+        research_use=RESEARCH_USE,
+        provenance=provenance.as_dict(),
+    )
 
 
-def _omitted(used: BodyCalibration, documents: Sequence[Mapping[str, Any]]) -> list[str]:
+def _omitted(used: BodyCalibration, reports: Sequence[EstimateReport]) -> list[str]:
     """What the pooled size does not contain, in words."""
     head = unknown_head(used.recipe.head)
-    unknown = any(head in document["left_out"] for document in documents)
+    unknown = any(head in one.left_out for one in reports)
     return [*([head] if unknown else []), *used.omissions()]
 
 
-def _another_exam(size: SizePosterior | None, probability: float) -> dict[str, Any] | None:
-    another = None if size is None else size.another_exam
-    if another is None:
-        return None
-    names = {f"{ANOTHER_EXAM}.{name}": another.summarise(name, probability=probability) for name in EXTREMES}
-    return another_exam(size, names)
+def _map(index: int, name: str, report: EstimateReport, pooled: PooledEstimate) -> PooledMap:
+    size = report.max_size_mm
+    return PooledMap(
+        map=name,
+        mass=_reported(report),
+        status=report.status,
+        reason=report.reason,
+        detected_probability=report.detected_probability,
+        max_size_mm=None if size is None else Interval(size.median, size.low, size.high, size.probability),
+        outlying=index in pooled.outlying,
+    )
 
 
-def _map(index: int, name: str, document: Mapping[str, Any], pooled: PooledEstimate) -> dict[str, Any]:
-    return {
-        "map": name,
-        "mass": _reported(document),
-        "status": document["status"],
-        "reason": document["reason"],
-        "detected_probability": document["detected_probability"],
-        "max_size_mm": _alone(document["max_size_mm"]),
-        "outlying": index in pooled.outlying,
-    }
-
-
-def _alone(size: Mapping[str, Any] | None) -> dict[str, float] | None:
-    """The largest size by one map, as its own estimate has it."""
-    return None if size is None else {name: size[name] for name in ("median", "low", "high", "probability")}
-
-
-def _reported(document: Mapping[str, Any]) -> list[int]:
+def _reported(report: EstimateReport) -> tuple[int, ...]:
     """Number of the mass that was sized and how many its map has; empty where it is the only one."""
-    masses = document.get("masses", [])
-    numbers = [one["number"] for one in masses if one["reported"]]
-    return [*numbers, len(masses)] if len(masses) > 1 and numbers else []
+    masses = report.masses
+    numbers = [one.number for one in masses if one.reported]
+    return (*numbers, len(masses)) if len(masses) > 1 and numbers else ()
 
 
 def _findings(
     pooled: PooledEstimate,
-    documents: Sequence[Mapping[str, Any]],
+    reports: Sequence[EstimateReport],
     apart: Mapping[int, str],
     *,
     one_place: bool | None,
@@ -139,14 +128,14 @@ def _findings(
     """What speaks against the size: of the maps in which a lump was found, and of the maps together."""
     if pooled.status == DISAGREE:
         yield disagreement(pooled.reason, *_chances(pooled))
-    sized = [i for i, document in enumerate(documents) if document["status"] == "estimate"]
+    sized = [i for i, report in enumerate(reports) if report.status == "estimate"]
     for index in sized if pooled.status == DISAGREE else sorted(pooled.centres):
-        for one in findings_in(documents[index]["findings"]):
+        for one in reports[index].findings:
             if one.kind != "outside_calibration":  # of the size alone
                 yield one.at(_number(index))
     for index, words in apart.items():
         yield Finding("another_mass", words, about=_number(index))
-    for index, earlier in repeated_scans([scans_of(one["provenance"]) for one in documents]).items():
+    for index, earlier in repeated_scans([scans_of(one.provenance) for one in reports]).items():
         words = f"a map of the same scan as {_number(earlier)} is no repeat: the interval is too narrow"
         yield Finding("same_scan", words, about=_number(index))
     if pooled.fat_apart_mm is not None:
@@ -155,9 +144,9 @@ def _findings(
         yield Finding("outside_calibration", f"outside the calibration's range: {text}")
     for index in pooled.outlying:
         yield Finding("outlying", "lies apart from the others: look at this map", about=_number(index))
-    for index, document in enumerate(documents):
-        for rise in () if one_place else document["other_rises"]:
-            text = f"another rise stands at ({rise['x_mm']:.1f}, {rise['y_mm']:.1f}) mm"
+    for index, report in enumerate(reports):
+        for rise in () if one_place else report.other_rises:
+            text = f"another rise stands at ({rise.x_mm:.1f}, {rise.y_mm:.1f}) mm"
             same = "check that every map was sized at the same mass"
             yield Finding("several_masses", text, same, same, _number(index))
 
@@ -201,105 +190,99 @@ def fat_apart(depths_mm: tuple[float, float]) -> Finding:
     return Finding("fat_apart", text.format(*depths_mm))
 
 
-def pooled_summary(document: Mapping[str, Any]) -> str:
+def pooled_summary(report: PooledReport) -> str:
     """Report of a mass in at most 12 lines; `pooled_text` gives the rest."""
-    findings = findings_in(document["findings"])
-    apart = document["status"] == DISAGREE
-    lines = finding_summary(findings, "caution", most=2) + _maps_lines(document["maps"], with_ends=apart)
+    findings, largest = report.findings, report.max_size_mm
+    apart = report.status == DISAGREE
+    lines = finding_summary(findings, "caution", most=2) + _maps_lines(report.maps, with_ends=apart)
     lines += finding_summary(findings, "check", most=2)
-    if document["max_size_mm"] is None:
-        lines.append(_no_size(document))
+    if largest is None:
+        lines.append(_no_size(report))
     else:
-        largest, spread = document["max_size_mm"], document["figures"]["between_map_sd"]
-        lines += _table(document) + width_lines(leading(document)["variance_share"])
-        ends = f"interval ends to {largest['mc_error'] / largest['sd']:.3f} SD; " if largest["sd"] > 0 else ""
-        by = f"sizes by {document['site']}; " if document["site"] else ""
-        site = f"; {document['repeatability']}" if "repeatability" in document else ""
-        form = "; irregular outline, with a wider interval" if document["figures"].get("irregular_outline") else ""
-        lines.append(f"Quality: {by}{ends}the maps of this mass differ by {100 * spread:.0f} %{site}{form}.")
+        lines += _table(report) + width_lines(report.leading.variance_share or {})
+        ends = f"interval ends to {largest.mc_error / largest.sd:.3f} SD; " if largest.sd > 0 else ""
+        by = f"sizes by {report.site}; " if report.site else ""
+        site = f"; {report.site_words}" if report.site_words else ""
+        form = "; irregular outline, with a wider interval" if report.figures.get("irregular_outline") else ""
+        spread = 100 * report.figures["between_map_sd"]
+        lines.append(f"Quality: {by}{ends}the maps of this mass differ by {spread:.0f} %{site}{form}.")
         if len(lines) < MOST_LINES - 2:
-            places = decimals(_worst(document)["mc_error"], most=SIZE_DECIMALS)
-            lines += supposed_line(document["supposing"], largest["median"], places=places)
+            places = decimals(_worst(report).mc_error, most=SIZE_DECIMALS)
+            lines += supposed_line(report.supposing, largest.median, places=places)
     return "\n".join([*lines, MORE, RESEARCH_USE]) + "\n"
 
 
-def _maps_lines(maps: Sequence[Mapping[str, Any]], *, with_ends: bool) -> list[str]:
+def _maps_lines(maps: Sequence[PooledMap], *, with_ends: bool) -> list[str]:
     """Sizes of the maps in one line."""
-    found = [one for one in maps if one["max_size_mm"] is not None]
-    sizes = ", ".join(_size_words(one["max_size_mm"], with_ends=with_ends) for one in found[:MOST_NAMED])
+    found = [one.max_size_mm for one in maps if one.max_size_mm is not None]
+    sizes = ", ".join(_size_words(one, with_ends=with_ends) for one in found[:MOST_NAMED])
     more = f" and {len(found) - MOST_NAMED} more" if len(found) > MOST_NAMED else ""
     return [f"A lump was found on {len(found)} of {len(maps)} maps, alone sized at {sizes}{more} mm."] if found else []
 
 
-def _size_words(size: Mapping[str, float], *, with_ends: bool) -> str:
-    return f"{size['median']:.1f}" + (f" ({size['low']:.1f} to {size['high']:.1f})" if with_ends else "")
+def _size_words(size: Interval, *, with_ends: bool) -> str:
+    return f"{size.median:.1f}" + (f" ({size.low:.1f} to {size.high:.1f})" if with_ends else "")
 
 
-def _no_size(document: Mapping[str, Any]) -> str:
-    head = "No common size" if document["status"] == DISAGREE else "No estimate"
-    return f"{head}: {document['reason']}."
+def _no_size(report: PooledReport) -> str:
+    head = "No common size" if report.status == DISAGREE else "No estimate"
+    return f"{head}: {report.reason}."
 
 
-def pooled_text(document: Mapping[str, Any]) -> str:
+def pooled_text(report: PooledReport) -> str:
     """Full report of a mass."""
-    findings = findings_in(document["findings"])
-    lines = finding_lines(findings, "caution")
-    lines += [f"{number}. {_map_line(one)}" for number, one in enumerate(document["maps"], start=1)]
-    lines += finding_lines(findings, "check")
-    if document["max_size_mm"] is None:
-        return "\n".join([*lines, _no_size(document), RESEARCH_USE]) + "\n"
-    worst, figures = _worst(document), document["figures"]
-    lines += ["", *_table(document)]
-    lines += ["", *width_lines(leading(document)["variance_share"])]
-    places = decimals(worst["mc_error"], most=SIZE_DECIMALS)
-    lines += supposed_lines(document["supposing"], document["max_size_mm"]["median"], places=places)
+    lines = finding_lines(report.findings, "caution")
+    lines += [f"{number}. {_map_line(one)}" for number, one in enumerate(report.maps, start=1)]
+    lines += finding_lines(report.findings, "check")
+    if report.max_size_mm is None:
+        return "\n".join([*lines, _no_size(report), RESEARCH_USE]) + "\n"
+    worst, figures = _worst(report), report.figures
+    lines += ["", *_table(report)]
+    lines += ["", *width_lines(report.leading.variance_share or {})]
+    places = decimals(worst.mc_error, most=SIZE_DECIMALS)
+    lines += supposed_lines(report.supposing, report.max_size_mm.median, places=places)
     lines.append(f"Spread between the maps of this mass: {100 * figures['between_map_sd']:.0f} %.")
-    if document["one_size_probability"] is not None:
-        chance = _chance(document["one_size_probability"])
+    if report.one_size_probability is not None:
+        chance = _chance(report.one_size_probability)
         lines.append(f"Probability that maps of one mass are as far apart in size or farther: {chance}.")
-    if "repeatability" in document:
-        lines.append(site_interval_text(document["repeatability"]))
+    if report.site_words:
+        lines.append(site_interval_text(report.site_words))
     lines.append(shape_text(figures))
-    lines.append(f"Monte-Carlo error of the interval ends: {ends_text('sizes', worst['mc_error'], worst['sd'])}.")
-    lines.append(_unknowns(document))
-    if document["site"]:
-        lines.append(f"Sizes by {document['site']}.")
-    if document["left_out"]:
-        lines.append(f"Left out: {'; '.join(document['left_out'])}.")
-    if document["reason"]:
-        lines.append(f"{document['reason']}.")
+    lines.append(f"Monte-Carlo error of the interval ends: {ends_text('sizes', worst.mc_error, worst.sd)}.")
+    lines.append(_unknowns(report))
+    if report.site:
+        lines.append(f"Sizes by {report.site}.")
+    if report.left_out:
+        lines.append(f"Left out: {'; '.join(report.left_out)}.")
+    if report.reason:
+        lines.append(f"{report.reason}.")
     return "\n".join([*lines, RESEARCH_USE]) + "\n"
 
 
-def _worst(document: Mapping[str, Any]) -> Mapping[str, float]:
+def _worst(report: PooledReport) -> Quantity:
     """Summary of the size with the larger Monte-Carlo error."""
-    return max((document[name] for name in EXTREMES), key=lambda q: q["mc_error"])
+    sizes = (report.max_size_mm, report.min_size_mm)
+    return max((one for one in sizes if one is not None), key=lambda q: q.mc_error)
 
 
-def _table(document: Mapping[str, Any]) -> list[str]:
+def _table(report: PooledReport) -> list[str]:
     """Table of both sizes with their intervals."""
-    probability = document["max_size_mm"]["probability"]
-    places = decimals(_worst(document)["mc_error"], most=SIZE_DECIMALS)
-    lines = [table_head(probability)]
-    for name, label in zip(EXTREMES, ("largest size", "smallest size"), strict=True):
-        lines.append(_row(label, leading(document)[name], places))
-    if document[ANOTHER_EXAM] is not None:
-        lines.append(_row(exams_label(document["figures"].get("between_map_sd")), document["max_size_mm"], places))
-    return lines
+    worst, leads = _worst(report), report.leading
+    rows = [("largest size", leads.max_size_mm), ("smallest size", leads.min_size_mm)]
+    if report.another_exam is not None:
+        rows.append((exams_label(report.figures.get("between_map_sd")), report.max_size_mm))
+    places = decimals(worst.mc_error, most=SIZE_DECIMALS)
+    told = (table_row(label, q.median, (q.low, q.high), unit="mm", places=places) for label, q in rows if q is not None)
+    return [table_head(worst.probability), *told]
 
 
-def _row(label: str, q: Mapping[str, float], places: int) -> str:
-    return table_row(label, q["median"], (q["low"], q["high"]), unit="mm", places=places)
+def _map_line(one: PooledMap) -> str:
+    if one.max_size_mm is None:
+        return f"{one.map}: no estimate ({one.reason})"
+    mass = "  (mass {} of {} on this map)".format(*one.mass) if one.mass else ""
+    return f"{one.map}: {_size_words(one.max_size_mm, with_ends=True)} mm alone{mass}"
 
 
-def _map_line(one: Mapping[str, Any]) -> str:
-    size = one["max_size_mm"]
-    if size is None:
-        return f"{one['map']}: no estimate ({one['reason']})"
-    mass = "  (mass {} of {} on this map)".format(*one["mass"]) if one.get("mass") else ""
-    return f"{one['map']}: {_size_words(size, with_ends=True)} mm alone{mass}"
-
-
-def _unknowns(document: Mapping[str, Any]) -> str:
-    text = fat_text(document["fat_mm"]) + unknowns_text(document["unknowns"])
+def _unknowns(report: PooledReport) -> str:
+    text = fat_text(report.fat_mm) + unknowns_text(report.unknowns)
     return text[0].upper() + text[1:] + "."

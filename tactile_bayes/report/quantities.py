@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from itertools import combinations
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from tactile_bayes.declarations import Record, rounded
+from tactile_bayes.files.reports import AnotherExam, Interval, MassReport, Place, Touching
 from tactile_bayes.findings import Finding
 from tactile_bayes.geometry import FloatArray, apply
-from tactile_bayes.inference.draws import Quantity, nine_digits, summarise
+from tactile_bayes.inference.draws import Quantity, summarise
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.mapping.places import SIDES, ClockPosition, clock_position, clock_text
 from tactile_bayes.posterior.result import Estimate
@@ -25,16 +27,6 @@ if TYPE_CHECKING:
 ANOTHER_EXAM = "another_exam"
 """Prefix of the sizes' quantities if another exam of the mass may come out apart, see `SizePosterior.another_exam`."""
 WIDTHS = ("amplitude", "sigma_x_mm", "sigma_y_mm", "background", "noise_sd")
-
-
-def leading(told: Mapping[str, Any]) -> Mapping[str, Any]:
-    """What holds the sizes that lead, of an estimate's JSON object or one of its masses (record 0130).
-
-    Until a site's repeatability is known these are the sizes for exams as far apart as patients' (`another_exam`); with
-    it, or a stated spread, there is one interval.
-    """
-    another = told.get(ANOTHER_EXAM)
-    return told if another is None else another
 
 
 def leading_size(size: SizePosterior) -> SizePosterior:
@@ -76,14 +68,17 @@ def xiphoid_mm(quantities: Mapping[str, Quantity]) -> tuple[float, float] | None
     return quantities["centre_patient_mm.x"].median, quantities["centre_patient_mm.y"].median
 
 
-def another_exam(size: SizePosterior | None, quantities: Mapping[str, Quantity]) -> dict[str, Any] | None:
+def another_exam(size: SizePosterior | None, quantities: Mapping[str, Quantity]) -> AnotherExam | None:
     """The spread between exams of a mass as a share of its size, and both sizes with it; None where it is not told."""
     if size is None or size.another_exam is None:
         return None
-    sizes = {name: quantities[f"{ANOTHER_EXAM}.{name}"].as_dict() for name in EXTREMES}
-    share = {name: nine_digits(value) for name, value in size.another_exam.variance_share.items()}
-    spread = nine_digits(size.another_exam.figures["between_map_sd"])
-    return {"between_map_sd": spread, **sizes, "variance_share": share}
+    another = size.another_exam
+    return AnotherExam(
+        between_map_sd=rounded(another.figures["between_map_sd"]),
+        max_size_mm=quantities[f"{ANOTHER_EXAM}.max_size_mm"].rounded,
+        min_size_mm=quantities[f"{ANOTHER_EXAM}.min_size_mm"].rounded,
+        variance_share=rounded(dict(another.variance_share)),
+    )
 
 
 # --- Place of a lump in the breast, by clock and distance from the nipple, of an estimate and in words.
@@ -147,57 +142,47 @@ def side_findings(side: str, patient_mm: tuple[float, float] | None) -> tuple[Fi
 
 # --- Masses of a map that may be one lump: whether they touch, and how long they are together.
 
-Touching = Mapping[str, Any]
-_ENDS = ("median", "low", "high")
+
+class SizedPlace(Record):
+    """A mass with its place and size, as far as it takes to tell whether it touches another."""
+
+    number: int
+    centre_mm: Place
+    max_size_mm: Quantity | None
 
 
-def touching_masses(masses: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Pairs of sized masses whose outlines may touch, as the JSON of an estimate has them.
-
-    Parameters
-    ----------
-    masses
-        As `masses_document` gives them.
-
-    Returns
-    -------
-    list of dict
-        ``masses``: their numbers; ``apart_mm``: between their centres; ``together_mm``: length over both, with the
-        ends of its interval, in mm.
+def touching_masses(masses: Sequence[MassReport | SizedPlace]) -> tuple[Touching, ...]:
+    """Pairs of sized masses whose outlines may touch.
 
     Notes
     -----
     Both lie in one body, so their errors go together: ends of the length are made of the same ends of both sizes. A
     pair touches where the upper ends of its radii reach over the distance of the centres.
     """
-    sized = [one for one in masses if one["max_size_mm"] is not None]
     found = []
-    for one, other in combinations(sized, 2):
-        apart = _apart_mm(one, other)
-        radii = {end: (one["max_size_mm"][end] + other["max_size_mm"][end]) / 2 for end in _ENDS}
-        if apart <= radii["high"]:
+    for one, other in combinations(masses, 2):
+        size, beside = one.max_size_mm, other.max_size_mm
+        if size is None or beside is None:
+            continue
+        apart = float(np.hypot(one.centre_mm.x - other.centre_mm.x, one.centre_mm.y - other.centre_mm.y))
+        if apart <= (size.high + beside.high) / 2:
+            ends = zip((size.median, size.low, size.high), (beside.median, beside.low, beside.high), strict=True)
             # one may lie within the other's outline
-            larger = {end: max(mass["max_size_mm"][end] for mass in (one, other)) for end in _ENDS}
-            together = {end: nine_digits(max(apart + radii[end], larger[end])) for end in _ENDS}
-            together["probability"] = one["max_size_mm"]["probability"]
-            numbers = [one["number"], other["number"]]
-            found.append({"masses": numbers, "apart_mm": nine_digits(apart), "together_mm": together})
-    return found
-
-
-def _apart_mm(one: Mapping[str, Any], other: Mapping[str, Any]) -> float:
-    return float(np.hypot(*(one["centre_mm"][axis] - other["centre_mm"][axis] for axis in "xy")))
+            median, low, high = (rounded(max(apart + (a + b) / 2, a, b)) for a, b in ends)
+            length = Interval(median, low, high, size.probability)
+            found.append(Touching((one.number, other.number), rounded(apart), length))
+    return tuple(found)
 
 
 def together_words(pair: Touching) -> str:
     """How long two masses are together."""
-    length = pair["together_mm"]
-    return f"together {length['median']:.1f} mm long ({length['low']:.1f} to {length['high']:.1f})"
+    length = pair.together_mm
+    return f"together {length.median:.1f} mm long ({length.low:.1f} to {length.high:.1f})"
 
 
 def touching_findings(pairs: Sequence[Touching]) -> list[Finding]:
     """Which masses may be one lump."""
     return [
-        Finding("touching", "masses {} and {} may be one lump: ".format(*one["masses"]) + together_words(one))
+        Finding("touching", "masses {} and {} may be one lump: ".format(*one.masses) + together_words(one))
         for one in pairs
     ]

@@ -6,17 +6,19 @@ import base64
 import html
 import io
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, Final
+from collections.abc import Iterator, Sequence
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tactile_bayes.declarations import Record
+from tactile_bayes.files.reports import EstimateReport, SmallestLump, centre_of
 from tactile_bayes.geometry import FloatArray
+from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.mapping.places import Orientation, orientation_of
-from tactile_bayes.report.exam_words import ExamMap, ExamMass, Quantity
+from tactile_bayes.report.exam_words import ExamMap, ExamMass
 
 # --- A clock face of the breast with the masses on it, as inline SVG: what charts of a breast exam show.
 
@@ -74,7 +76,7 @@ def size_ruler(rows: Sequence[tuple[str, Quantity]]) -> str:
 
     A row is what an interval supposes, and the interval.
     """
-    end = max(q["high"] for _, q in rows) * 1.08
+    end = max(q.high for _, q in rows) * 1.08
     bottom = _ROW_MM * len(rows) + 1.5
     parts = [
         *(part for i, (words, q) in enumerate(rows) for part in _bar(i, words, q, _LENGTH_MM / end)),
@@ -86,11 +88,11 @@ def size_ruler(rows: Sequence[tuple[str, Quantity]]) -> str:
 
 
 def _bar(row: int, words: str, q: Quantity, scale: float) -> Iterator[str]:
-    y, left, right = 4.0 + _ROW_MM * row, scale * q["low"], scale * q["high"]
+    y, left, right = 4.0 + _ROW_MM * row, scale * q.low, scale * q.high
     middle = min(max((left + right) / 2, 12.0), _LENGTH_MM - 12.0)
     yield _ruler_text(middle, y - 1.7, words)
     yield f'<path d="M{left:.2f} {y:g}H{right:.2f}" stroke="#111" stroke-width="{1.6 / (1 + 0.6 * row):.2f}"/>'
-    yield f'<path d="M{scale * q["median"]:.2f} {y - 1:g}v2" stroke="#111" stroke-width="0.7"/>'
+    yield f'<path d="M{scale * q.median:.2f} {y - 1:g}v2" stroke="#111" stroke-width="0.7"/>'
 
 
 def _scale(end_mm: float, y: float) -> Iterator[str]:
@@ -143,10 +145,10 @@ _ENDS: Final = (0.01, 0.995)
 _THUMB_LEAST_SPAN: Final = 0.2
 
 
-def thumbnail_png(tactile_map: TactileMap, document: Mapping[str, Any]) -> bytes | None:
+def thumbnail_png(tactile_map: TactileMap, report: EstimateReport) -> bytes | None:
     """PNG of a map of up to `LONGEST_PX` pixels a side, oriented as every picture of a map; None without data.
 
-    Where the estimate has a size, an ellipse of that size is drawn.
+    Where its estimate has a size, an ellipse of that size is drawn.
     """
     if not tactile_map.covered.any():
         return None
@@ -158,7 +160,7 @@ def thumbnail_png(tactile_map: TactileMap, document: Mapping[str, Any]) -> bytes
     low, high = np.quantile(values[np.isfinite(values)], _ENDS) if np.isfinite(values).any() else (0.0, 1.0)
     high = max(high, low + _THUMB_LEAST_SPAN * abs(low), low + 1e-12)
     pixels = _coloured(values, (low, high), _THUMB_NO_DATA).repeat(scale, axis=0).repeat(scale, axis=1)
-    _draw_ring(pixels, tactile_map, view, document, px_per_cell=scale / step)
+    _draw_ring(pixels, tactile_map, view, report, px_per_cell=scale / step)
     return _png(pixels, colours=64)
 
 
@@ -166,16 +168,16 @@ def _draw_ring(
     pixels: NDArray[np.uint8],
     tactile_map: TactileMap,
     view: Orientation,
-    document: Mapping[str, Any],
+    report: EstimateReport,
     *,
     px_per_cell: float,
 ) -> None:
     """Draw the ellipse of the estimated size at the estimated place."""
-    if document["max_size_mm"] is None or document["centre_mm"] is None:
+    if report.d_x_mm is None or report.d_y_mm is None or report.centre_mm is None:
         return
-    x, y = (document["centre_mm"][axis]["median"] for axis in "xy")
-    angle = 0.0 if document["angle_deg"] is None else np.radians(document["angle_deg"]["median"])
-    half_x, half_y = (document[name]["median"] / 2 for name in ("d_x_mm", "d_y_mm"))
+    x, y = report.centre_mm.median
+    angle = 0.0 if report.angle_deg is None else np.radians(report.angle_deg.median)
+    half_x, half_y = report.d_x_mm.median / 2, report.d_y_mm.median / 2
     t = np.linspace(0.0, 2 * np.pi, 720)
     along, across = half_x * np.cos(t), half_y * np.sin(t)
     xs = x + along * np.cos(angle) - across * np.sin(angle)
@@ -249,21 +251,19 @@ def _map_of(exam: ExamMap) -> TactileMap:
 
 def marked(exam: ExamMap) -> tuple[float, float] | None:
     """Place that the reason for no size is about, where no mass is drawn there; None without one."""
-    place = exam.document.get("about_mm")
-    return None if exam.masses or place is None else (place["x"], place["y"])
+    return None if exam.masses else centre_of(exam.report.about_mm)
 
 
 def colour_limits(exam: ExamMap) -> tuple[float, float]:
     """Values at the ends of the colours: a rib beside the lump does not take them all, noise alone is no lump."""
-    tactile_map, document = _map_of(exam), exam.document
+    tactile_map, report = _map_of(exam), exam.report
     well = tactile_map.covered & ~tactile_map.few
     values = tactile_map.mean[well if well.any() else tactile_map.covered]
     if not values.size:
         return 0.0, 1.0
     low, high = (float(end) for end in np.quantile(values, _ENDS))
-    if document["amplitude"] is not None and document["background"] is not None:
-        level, amplitude = document["background"]["median"], document["amplitude"]["median"]
-        high = min(high, level + _AMPLITUDES_SHOWN * amplitude)
+    if report.amplitude is not None and report.background is not None:
+        high = min(high, report.background.median + _AMPLITUDES_SHOWN * report.amplitude.median)
     return low, max(high, low + _LEAST_SPAN * abs(float(np.median(values))), low + 1e-9)
 
 
@@ -366,13 +366,14 @@ def _mass(mass: ExamMass, exam: ExamMap, frame: Frame, *, small: bool) -> Iterat
     """The ellipse of the size, those of its interval's ends, a cross at the centre; numbers where there are several."""
     (x, y), arm = frame.at(mass.centre_mm), 0.6 if small else 1.6
     if mass.axes_mm is not None and mass.largest is not None:
-        for end in () if small else ("low", "high"):
-            outline = _ellipse(mass, mass.largest[end] / mass.largest["median"], frame)
+        ends = {"low": mass.largest.low, "high": mass.largest.high}
+        for end, size in () if small else ends.items():
+            outline = _ellipse(mass, size / mass.largest.median, frame)
             yield _stroked(outline, 0.3, kind=f"size-{end}", dash="1.2 0.9")
         yield _stroked(_ellipse(mass, 1.0, frame), 0.3 if small else 0.55, kind="size")
     yield _stroked(f"M{x - arm:.2f} {y:.2f}h{2 * arm:g}M{x:.2f} {y - arm:.2f}v{2 * arm:g}", 0.25 * arm, kind="centre")
     if not small and len(exam.masses) > 1:
-        above = 0.0 if mass.largest is None else frame.scale * mass.largest["high"] / 2
+        above = 0.0 if mass.largest is None else frame.scale * mass.largest.high / 2
         yield _text(x, y - above - 1.5, f"{mass.number}", size=4.2)
 
 
@@ -457,24 +458,24 @@ _SHADES: Final = ((10.0, "#ffffff"), (15.0, "#e0e0e0"), (20.0, "#bdbdbd"), (np.i
 """Grey of a place by the diameter in mm below which it lies: darker where only larger lumps show."""
 
 
-def smallest_pictures(tactile_map: TactileMap, smallest: Mapping[str, Any]) -> Iterator[str]:
+def smallest_pictures(tactile_map: TactileMap, smallest: SmallestLump) -> Iterator[str]:
     """One picture a depth, with its caption."""
     frame = Frame.within(tactile_map, width_mm=_ROOM_MM[0], height_mm=_ROOM_MM[1])
-    for number, depth in enumerate(smallest["depths_mm"]):
+    for number, depth in enumerate(smallest.depths_mm):
         caption = f"{depth:g} mm deep"
         yield f"<figure>{_picture(frame, smallest, number, caption)}<figcaption>{caption}</figcaption></figure>"
 
 
-def _picture(frame: Frame, smallest: Mapping[str, Any], number: int, caption: str) -> str:
-    (width, height), side = frame.size_mm, frame.scale * smallest["spacing_mm"]
+def _picture(frame: Frame, smallest: SmallestLump, number: int, caption: str) -> str:
+    (width, height), side = frame.size_mm, frame.scale * smallest.spacing_mm
     label = html.escape(f"Smallest lump that would have shown, {caption}")
     parts = [
         f'<svg role="img" aria-label="{label}" viewBox="0 0 {width:.2f} {height:.2f}" width="{width:.2f}mm" '
         f'height="{height:.2f}mm"><rect width="{width:.2f}" height="{height:.2f}" fill="#fff" stroke="#333" '
         'stroke-width="0.3"/>'
     ]
-    for one in smallest["places"]:
-        (x, y), d = frame.at((one["x_mm"], one["y_mm"])), one["d_mm"][number]
+    for one in smallest.places:
+        (x, y), d = frame.at((one.x_mm, one.y_mm)), one.d_mm[number]
         shade = next(grey for most, grey in _SHADES if (np.inf if d is None else d) <= most)
         box = f'x="{x - side / 2:.2f}" y="{y - side / 2:.2f}" width="{side:.2f}" height="{side:.2f}"'
         text = "–" if d is None else f"{np.ceil(d):.0f}"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import cached_property
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 
@@ -47,7 +47,7 @@ DIMENSIONS = 6
 _SCORE = 2
 """Coordinate of the spread of B."""
 MOST_INVALID = 0.05
-DISAGREE = "maps_disagree"
+DISAGREE: Final = "maps_disagree"
 """Status of maps that are not of one size, or not of one mass."""
 IRREGULAR_SD = 0.15
 """SD of ln d by which the mean diameter of a lump with an irregular outline is off (record 0107)."""
@@ -287,7 +287,7 @@ class _Pool(Record, eq=False, dict=True):
 class PooledEstimate(Record, eq=False):
     """Result of pooling the maps of one mass."""
 
-    status: str
+    status: Literal["estimate", "no_estimate", "maps_disagree"]
     reason: str
     """As of `Estimate`; also ``maps_disagree``, where the maps are not of one size, or not of one mass."""
     size: SizePosterior | None = None

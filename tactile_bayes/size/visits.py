@@ -18,7 +18,7 @@ interval is about as wide on both sides.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 
@@ -463,9 +463,9 @@ def doubling_days(rate_per_day: float) -> float | None:
 
 
 class Compared(Record, eq=False):
-    """Comparison of visits and its sizes: status compared, not_one_mass or no_estimate."""
+    """Comparison of visits and its sizes."""
 
-    status: str
+    status: Literal["compared", "not_one_mass", "no_estimate"]
     reason: str = ""
     advice: str = ""
     """Why there is no comparison, and what would help; empty where there is one."""

@@ -177,7 +177,7 @@ def _public(value: Any, depth: int = 5) -> Iterator[Any]:
 
 
 def test_nothing_that_a_result_leads_to_prints_an_array(found: tb.SizeEstimate, made: tb.Map) -> None:
-    """`found.outcome` printed 589 lines, of a comparison 914."""
+    """An estimate's parts once printed 589 lines, a comparison's 914."""
     scan = tb.simulate(DEMO / "scene.toml", seed=2)
     later = tb.build_map(scan)
     several = tb.pool([found, later], **FAST), tb.compare(found, later, **FAST), tb.validate(TRIAL, EXCISION)

@@ -19,7 +19,7 @@ from in_process import run_here
 
 import tactile_bayes as tb
 from tactile_bayes.cli import cli
-from tactile_bayes.declarations import names_of
+from tactile_bayes.declarations import names_of, replace
 from tactile_bayes.errors import BadDataError, DeviceError, UsageError
 from tactile_bayes.files.documents import load_schema
 from tactile_bayes.files.provenance import Provenance
@@ -132,7 +132,7 @@ def test_what_is_shown_is_short_and_says_research(found: tb.SizeEstimate, folder
         assert len(repr(one)) < 120
         assert RESEARCH_USE in one._repr_html_()
     assert "largest size" in repr(found)
-    assert "<script>" not in tb.SizeEstimate(found.outcome, "<script>")._repr_html_()
+    assert "<script>" not in replace(found, name="<script>")._repr_html_()
 
 
 def test_no_lump_is_a_result(folder: Path) -> None:

@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 from campaign_files import FAST, JOURNAL, ROWS, contents, rows_of, steps, thinned, write, write_study, write_table
 from in_process import run_here
+from plain_reports import estimate_report
 
 from tactile_bayes.campaign.inputs import open_campaign
 from tactile_bayes.campaign.steps import Task, run_step
@@ -281,8 +282,8 @@ def test_half_a_place_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("code", "status"), [("coarse", "not_done"), ("undetected", "not_detected")])
 def test_an_exam_on_cells_too_large_was_not_done(code: str, status: str) -> None:
     """Not held against the modality; the control is a map that could have shown a lump."""
-    document = {"status": "no_estimate", "reason_code": code, "max_size_mm": None}
-    assert Row(Listed("a.nc", Path("a.nc"), "P", "1", "1", 1), document).status == status
+    report = estimate_report(reason_code=code)
+    assert Row(Listed("a.nc", Path("a.nc"), "P", "1", "1", 1), report).status == status
 
 
 def test_every_exam_has_its_row_and_its_status(undisturbed: Path) -> None:

@@ -14,8 +14,9 @@ from settings_files import settings
 
 import tactile_bayes as tb
 from tactile_bayes.commands.estimate import numbered
-from tactile_bayes.declarations import replace
+from tactile_bayes.declarations import from_plain, replace
 from tactile_bayes.errors import UsageError
+from tactile_bayes.files.comparison import CompareReport
 from tactile_bayes.files.documents import check_document
 from tactile_bayes.files.map_nc import read_map, write_map
 from tactile_bayes.files.provenance import Provenance
@@ -320,14 +321,18 @@ def test_what_is_shown_is_beyond_the_smallest_detectable_change_and_what_is_not_
 
 def reworded(grown: dict, **figures: object) -> str:
     (change,) = grown["changes"]
-    return compare_summary({**grown, "changes": [{**change, **figures}]})
+    return summary({**grown, "changes": [{**change, **figures}]})
+
+
+def summary(document: dict) -> str:
+    return compare_summary(from_plain(CompareReport, document))
 
 
 def test_growth_and_shrinkage_are_worded_alike_in_one_verdict(grown: dict) -> None:
     unlikely = {"probability_grown": 0.004, "grown_by": [{"percent": 20.0, "probability": 0.0001}]}
     shrunk = reworded(grown, verdict="shrunk", **unlikely)
     assert "Probability that it has shrunk: 0.996; that it has grown by more than 20 %: <0.001." in shrunk
-    for text, word in ((compare_summary(grown), "grown"), (shrunk, "shrunk")):
+    for text, word in ((summary(grown), "grown"), (shrunk, "shrunk")):
         assert f"The mass has {word}." in text
         assert "No change shown" not in text
         assert "can stay unseen" not in text

@@ -12,10 +12,11 @@ from posterior_files import MADE, write_calibration, write_maps
 from posterior_maps import bump_map, correlated_field, grid_map
 from settings_files import settings
 
-from tactile_bayes.declarations import replace
+from tactile_bayes.declarations import from_plain, replace
 from tactile_bayes.files.documents import check_document
 from tactile_bayes.files.estimate_json import read_stated_size
 from tactile_bayes.files.map_nc import write_map
+from tactile_bayes.files.reports import PooledReport
 from tactile_bayes.files.size_json import SHIPPED, read_size_calibration, size_calibration_path
 from tactile_bayes.report.pooled import pooled_text
 
@@ -137,8 +138,9 @@ def test_maps_that_do_not_tell_the_depth_of_the_fat_are_pooled_without_and_say_s
     assert "the map does not name its head" in head
     assert fat.startswith("the depth of the fat")
     assert bodies.startswith("bodies unlike the calibration's (lumps 6 to 100 times as stiff as fat")
-    assert f"Left out: {head}; the depth of the fat" in pooled_text(pooled)
-    assert "Fat under the head 12.3 mm deep" in pooled_text(pooled | {"fat_mm": 12.3, "left_out": []})
+    report = from_plain(PooledReport, pooled)
+    assert f"Left out: {head}; the depth of the fat" in pooled_text(report)
+    assert "Fat under the head 12.3 mm deep" in pooled_text(replace(report, fat_mm=12.3, left_out=()))
 
 
 def test_validate_reads_a_pooled_mass_from_json_and_from_draws(pooled: dict, folder: Path) -> None:

@@ -12,7 +12,6 @@ workers per task. One core's worth of the busiest of them is where a cluster sat
 from __future__ import annotations
 
 import argparse
-import json
 import resource
 import tempfile
 import time
@@ -33,6 +32,7 @@ from tactile_bayes.campaign import tables as campaign_tables
 from tactile_bayes.campaign.inputs import Sources, open_campaign
 from tactile_bayes.campaign.settings import CampaignSettings
 from tactile_bayes.campaign.steps import Task
+from tactile_bayes.files.documents import read_record
 from tactile_bayes.files.manifest_csv import ESTIMATE, EXAMS, JOURNAL, Exam
 
 
@@ -65,8 +65,8 @@ def client(out: Path, exams: int) -> None:
             (campaign_stages, "run_step", step),
             (campaigns, "read_sources", sources),
             (campaign_stages, "unchanged", lambda *_: True),
-            (campaign_tables, "load_json", lambda _path: json.loads(estimate.read_text())),
-            (campaign_tables, "pooled_documents", lambda _campaign: {}),
+            (campaign_tables, "read_record", lambda _path, kind: read_record(estimate, kind)),
+            (campaign_tables, "pooled_reports", lambda _campaign: {}),
         ):
             stack.enter_context(mock.patch.object(module, name, fake))
         folder = Path(place) / "out"

@@ -11,7 +11,9 @@ from typing import Any
 import pytest
 from export_files import exported
 
+from tactile_bayes.declarations import from_plain, replace
 from tactile_bayes.exports.exam import masses_of
+from tactile_bayes.files.reports import EstimateReport, Place
 from tactile_bayes.findings import Finding
 
 bundles = pytest.importorskip("fhir.resources.R4B.bundle")
@@ -139,15 +141,12 @@ def test_markup_in_words_stays_words(estimate: dict[str, Any], tmp_path: Path) -
 
 def test_every_mass_of_an_estimate_has_its_observations(estimate: dict[str, Any]) -> None:
     """By the list of masses in newer estimates: places are plain numbers there."""
-    keys = ("max_size_mm", "min_size_mm", "reason", "reason_code", "detected_probability", "another_exam")
-    one = {key: estimate[key] for key in keys}
-    place = {"x": 1.0, "y": 2.0}
-    masses = [
-        {"number": 1, **one, "centre_mm": place, "centre_patient_mm": place},
-        {"number": 2, **one, "max_size_mm": None, "min_size_mm": None, "reason": "too near the rim"}
-        | {"reason_code": "window", "another_exam": None, "centre_mm": place, "centre_patient_mm": None},
-    ]
-    found = masses_of(estimate | {"masses": masses})
+    report = from_plain(EstimateReport, estimate)
+    place = Place(1.0, 2.0)
+    first = replace(report.masses[0], centre_mm=place, centre_patient_mm=place)
+    nothing = dict.fromkeys(("max_size_mm", "min_size_mm", "another_exam", "centre_patient_mm"))
+    second = replace(first, number=2, reason="too near the rim", reason_code="window", **nothing)
+    found = masses_of(replace(report, masses=(first, second)))
     assert [mass.number for mass in found] == [1, 2]
     assert found[0].centre_patient_mm == (1.0, 2.0)
     assert [mass.outcome.value for mass in found] == ["sized", "not-sized"]

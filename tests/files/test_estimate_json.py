@@ -13,7 +13,8 @@ from in_process import run_here
 from repeated_exams import estimate_document
 
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.files.estimate_json import MOST_MM, SCHEMAS, check_estimate
+from tactile_bayes.files.estimate_json import MOST_MM, REPORTS, checked_report
+from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.report.svg import size_ruler
 
 FIELDS = ("kind", "text", "remedy", "on_paper", "about")
@@ -77,7 +78,7 @@ EDITS: dict[str, tuple[Edit, str]] = {
     ),
     "inputs of nothing": (
         lambda one: one["provenance"].update(inputs=[None]),
-        "inputs.0 is None; give a table",
+        r"inputs\[0\] is None; give a table",
     ),
     "findings of letters": (lambda one: one.update(findings="abc"), "findings is 'abc'; give a list"),
     "a finding of no kind": (
@@ -98,7 +99,7 @@ def edited(edit: Edit) -> Document:
 
 
 def check(document: Document) -> None:
-    check_estimate(document, SCHEMAS[document["schema"]], path=Path("exam.json"))
+    checked_report(document, REPORTS[document["schema"]], path=Path("exam.json"))
 
 
 def test_what_the_program_printed_passes() -> None:
@@ -137,5 +138,6 @@ def test_a_file_that_begins_with_a_mark_is_told_so(tmp_path: Path) -> None:
 @pytest.mark.parametrize("high", [3.0, 17.6, MOST_MM, 3e4, 1e12])
 def test_the_scale_of_sizes_has_few_numbers_whatever_it_reaches(high: float) -> None:
     """A posterior's own size may be far above what a file may say; the scale once had a number for every metre."""
-    scale = size_ruler([("this exam", {"low": high / 2, "median": high / 1.5, "high": high})])
+    size = Quantity(median=high / 1.5, mean=high / 1.5, sd=1.0, low=high / 2, high=high, probability=0.95, kind="eti")
+    scale = size_ruler([("this exam", size)])
     assert 2 <= scale.count("<text") <= 12

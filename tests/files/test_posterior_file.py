@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from posterior_maps import bump_map
 
-from tactile_bayes.api.estimates import SizeEstimate
-from tactile_bayes.api.estimating import Outcome, estimate_one
+from tactile_bayes.api.estimating import estimate_one
 from tactile_bayes.api.settings import Settings
+from tactile_bayes.api.sized import SizeEstimate
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.map_nc import read_posterior
 from tactile_bayes.presets import RESEARCH_USE
@@ -24,26 +24,26 @@ with warnings.catch_warnings():
 GROUPS = ("posterior", "sample_stats", "observed_data", "prior")
 
 
-def estimated(method: str) -> Outcome:
+def estimated(method: str) -> SizeEstimate:
     noise = 0.02 * np.random.default_rng(91).standard_normal((51, 51))
     return estimate_one(bump_map(noise=noise), Settings(method=method, accuracy_sd=0.3))
 
 
 @pytest.fixture(scope="module")
-def chains(tmp_path_factory: pytest.TempPathFactory) -> tuple[Outcome, Path]:
+def chains(tmp_path_factory: pytest.TempPathFactory) -> tuple[SizeEstimate, Path]:
     path = tmp_path_factory.mktemp("chains") / "post.nc"
-    outcome = estimated("ensemble")
-    outcome.write(path)
-    return outcome, path
+    made = estimated("ensemble")
+    made.write(path)
+    return made, path
 
 
-def test_arviz_opens_all_groups_and_its_figures_and_summaries_work(chains: tuple[Outcome, Path]) -> None:
-    outcome, path = chains
+def test_arviz_opens_all_groups_and_its_figures_and_summaries_work(chains: tuple[SizeEstimate, Path]) -> None:
+    made, path = chains
     data = arviz.from_netcdf(path)
     assert set(data.groups()) == {*GROUPS, "log_likelihood"}
     assert data.posterior.attrs["research_use"] == RESEARCH_USE
     summary = arviz.summary(data, var_names=["max_size_mm", "sigma_x_mm"])
-    found = outcome.estimate.diagnostics.convergence["max_size_mm"]
+    found = made.estimate.diagnostics.convergence["max_size_mm"]
     assert summary.loc["max_size_mm", "r_hat"] == pytest.approx(found["rhat"], abs=0.005)
     assert summary.loc["max_size_mm", "ess_tail"] == pytest.approx(found["ess_tail"], abs=0.6)
     with warnings.catch_warnings():
@@ -58,9 +58,9 @@ def test_arviz_opens_all_groups_and_its_figures_and_summaries_work(chains: tuple
     assert drawn.shape == (1, 2)
 
 
-def test_statistics_are_of_the_draws(chains: tuple[Outcome, Path]) -> None:
-    outcome, path = chains
-    estimate, data = outcome.estimate, arviz.from_netcdf(path)
+def test_statistics_are_of_the_draws(chains: tuple[SizeEstimate, Path]) -> None:
+    made, path = chains
+    estimate, data = made.estimate, arviz.from_netcdf(path)
     assert estimate.draws is not None
     assert estimate.scene is not None
     some = estimate.draws.theta[:, ::97]
@@ -71,9 +71,9 @@ def test_statistics_are_of_the_draws(chains: tuple[Outcome, Path]) -> None:
     )
 
 
-def test_python_gives_arviz_the_groups_of_the_file(chains: tuple[Outcome, Path]) -> None:
-    outcome, path = chains
-    held, found = arviz.from_netcdf(path), SizeEstimate(outcome).to_arviz()
+def test_python_gives_arviz_the_groups_of_the_file(chains: tuple[SizeEstimate, Path]) -> None:
+    made, path = chains
+    held, found = arviz.from_netcdf(path), made.to_arviz()
     assert set(found.groups()) == set(held.groups())
     for group in held.groups():
         assert set(found[group].data_vars) == set(held[group].data_vars)
@@ -82,7 +82,7 @@ def test_python_gives_arviz_the_groups_of_the_file(chains: tuple[Outcome, Path])
             assert found[group][name].dims == held[group][name].dims
 
 
-def test_the_prior_is_the_models(chains: tuple[Outcome, Path]) -> None:
+def test_the_prior_is_the_models(chains: tuple[SizeEstimate, Path]) -> None:
     """ln of the mean width normal about ln 5 mm with SD 1, half the log ratio with SD 0.5, both below 15 mm."""
     prior = arviz.from_netcdf(chains[1]).prior
     mean_width = 0.5 * np.log(prior["sigma_x_mm"] * prior["sigma_y_mm"]).values.ravel()
@@ -92,7 +92,7 @@ def test_the_prior_is_the_models(chains: tuple[Outcome, Path]) -> None:
     assert prior["max_size_mm"].values.min() > 0
 
 
-def test_the_netcdf_library_reads_every_group(chains: tuple[Outcome, Path]) -> None:
+def test_the_netcdf_library_reads_every_group(chains: tuple[SizeEstimate, Path]) -> None:
     import netCDF4
 
     with netCDF4.Dataset(chains[1]) as file:
@@ -103,21 +103,21 @@ def test_the_netcdf_library_reads_every_group(chains: tuple[Outcome, Path]) -> N
 
 @pytest.mark.parametrize("method", ["importance", "laplace"])
 def test_other_methods_write_the_groups_that_they_have(method: str, tmp_path: Path) -> None:
-    outcome = estimated(method)
-    outcome.write(tmp_path / "post.nc")
+    made = estimated(method)
+    made.write(tmp_path / "post.nc")
     data = arviz.from_netcdf(tmp_path / "post.nc")
     assert set(data.groups()) == set(GROUPS)
     shape = float(data.sample_stats.attrs["sampler_pareto_k"])
-    assert shape == pytest.approx(outcome.estimate.draws.diagnostics["pareto_k"], abs=1e-6)
+    assert shape == pytest.approx(made.estimate.draws.diagnostics["pareto_k"], abs=1e-6)
     assert np.isfinite(data.sample_stats["log_weight"]).all()
 
 
-def test_equal_estimates_give_equal_bytes(chains: tuple[Outcome, Path], tmp_path: Path) -> None:
+def test_equal_estimates_give_equal_bytes(chains: tuple[SizeEstimate, Path], tmp_path: Path) -> None:
     chains[0].write(tmp_path / "again.nc")
     assert (tmp_path / "again.nc").read_bytes() == chains[1].read_bytes()
 
 
-def test_damage_and_other_files_are_refused(chains: tuple[Outcome, Path], tmp_path: Path) -> None:
+def test_damage_and_other_files_are_refused(chains: tuple[SizeEstimate, Path], tmp_path: Path) -> None:
     whole = chains[1].read_bytes()
     (tmp_path / "cut.nc").write_bytes(whole[: len(whole) // 2])
     with pytest.raises(BadDataError, match=r"cut\.nc"):

@@ -55,9 +55,9 @@ def test_draws_without_a_value_are_left_out_and_none_is_refused() -> None:
 
 
 def test_numbers_are_written_with_nine_digits() -> None:
-    plain = summarise(np.full(3, 1 / 3), probability=0.5, effective_draws=3).as_dict()
-    assert plain["median"] == 0.333333333
-    assert plain["kind"] == "eti"
+    written = summarise(np.full(3, 1 / 3), probability=0.5, effective_draws=3).rounded
+    assert written.median == 0.333333333
+    assert written.kind == "eti"
 
 
 @pytest.mark.parametrize(

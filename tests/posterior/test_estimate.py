@@ -14,7 +14,7 @@ from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.options import EstimateOptions, FitOptions
 from tactile_bayes.posterior.result import Estimate
-from tactile_bayes.report.estimate_document import estimate_document
+from tactile_bayes.report.estimate_document import estimate_report
 from tactile_bayes.report.estimate_text import estimate_text
 from tactile_bayes.size.eq6 import AxisCalibration, SizeCalibration
 from tactile_bayes.size.terms import Recipe
@@ -216,13 +216,13 @@ def test_the_map_is_left_as_it_was() -> None:
 
 def test_documents_say_null_where_there_is_nothing() -> None:
     nothing = run(noise=WHITE, amplitude=0.0)
-    document = estimate_document(
+    report = estimate_report(
         nothing, bump_map(), probability=0.95, prior=BumpPrior(), provenance=Provenance("estimate", {})
     )
-    assert document["status"] == "no_estimate"
-    assert document["reason"]
+    assert report.status == "no_estimate"
+    assert report.reason
     for name in ("max_size_mm", "d_x_mm", "amplitude", "sigma_x_mm", "centre_mm", "variance_share", "noise_sd"):
-        assert document[name] is None
+        assert getattr(report, name) is None
     assert estimate_text(nothing, bump_map(), probability=0.95).startswith("No lump found on the ")
 
 
@@ -233,9 +233,10 @@ def test_the_centre_is_told_in_the_patients_frame() -> None:
     found = estimate_map(
         tactile_map, calibration=None, options=EstimateOptions("laplace", OFF), rng=np.random.default_rng(1)
     )
-    document = estimate_document(
+    report = estimate_report(
         found, tactile_map, probability=0.95, prior=BumpPrior(), provenance=Provenance("estimate", {})
     )
-    for axis, shift in (("x", 100.0), ("y", 50.0)):
-        there, here = document["centre_patient_mm"][axis]["median"], document["centre_mm"][axis]["median"]
-        assert there == pytest.approx(here + shift, abs=1e-6)
+    assert report.centre_mm is not None
+    assert report.centre_patient_mm is not None
+    x, y = report.centre_mm.median
+    assert report.centre_patient_mm.median == pytest.approx((x + 100.0, y + 50.0), abs=1e-6)

@@ -14,9 +14,9 @@ from posterior_maps import bump_values, correlated_field, grid_map
 from searched_once import searched_once  # noqa: F401 - all tests of this file use it
 
 import tactile_bayes as tb
-from tactile_bayes.api.estimates import SizeEstimate
-from tactile_bayes.api.estimating import Outcome, answer_of, estimate_one
+from tactile_bayes.api.estimating import estimate_one
 from tactile_bayes.api.settings import Settings
+from tactile_bayes.api.sized import SizeEstimate
 from tactile_bayes.declarations import replace
 from tactile_bayes.files.documents import check_document
 from tactile_bayes.files.map_nc import write_map
@@ -46,7 +46,7 @@ def scene(*, narrow: float, away: float = 33.0, seed: int = 1, half_mm: float = 
     return grid_map(values + 0.005 * rng.standard_normal(values.shape), normalise="gain")
 
 
-def found_on(tactile_map: TactileMap, **settings: object) -> Outcome:
+def found_on(tactile_map: TactileMap, **settings: object) -> SizeEstimate:
     return estimate_one(tactile_map, Settings(method="laplace", **settings))
 
 
@@ -144,7 +144,7 @@ def narrow_bumps(*, second: float, seed: int = 1) -> TactileMap:
 
 
 def test_two_narrow_bumps_close_to_each_other_are_two_masses_that_may_be_one_lump() -> None:
-    document = answer_of(found_on(narrow_bumps(second=0.7))).document
+    document = found_on(narrow_bumps(second=0.7)).answer.document
     assert document is not None
     assert [round(one["centre_mm"]["x"], 0) for one in document["masses"]] in ([-2, 4], [4, -2], [-2, 3], [3, -2])
     (pair,) = document["touching"]
@@ -153,7 +153,7 @@ def test_two_narrow_bumps_close_to_each_other_are_two_masses_that_may_be_one_lum
     assert pair["together_mm"]["median"] == pytest.approx(pair["apart_mm"] + sum(sizes) / 2, rel=1e-6)
     check_document(document, "estimate.schema.json", path=Path("estimate.json"))
     # the control: one bump of that width is one mass
-    alone = answer_of(found_on(narrow_bumps(second=0.0))).document
+    alone = found_on(narrow_bumps(second=0.0)).answer.document
     assert alone is not None
     assert len(alone["masses"]) == 1
     assert alone["touching"] == []
@@ -250,7 +250,7 @@ def test_a_mass_besides_the_reported_one_has_its_axes_their_angle_and_its_ellips
     values += 0.005 * correlated_field(rng, len(values), length_cells=3.0)
     noisy = values + 0.005 * rng.standard_normal(values.shape)
     found = found_on(grid_map(noisy, normalise="gain"))
-    document = answer_of(found).document
+    document = found.answer.document
     assert document is not None
     check_document(document, "estimate.schema.json", path=Path("two.json"))
     reported, second = document["masses"]
@@ -267,8 +267,8 @@ def test_a_mass_besides_the_reported_one_has_its_axes_their_angle_and_its_ellips
     assert drawn.angle % 180.0 == pytest.approx(angle["median"], abs=0.01)
 
 
-def draw_map(outcome: Outcome) -> Figure:
-    return SizeEstimate(outcome).plot_map()
+def draw_map(outcome: SizeEstimate) -> Figure:
+    return outcome.plot_map()
 
 
 def test_both_masses_of_a_shared_scan_are_listed_and_hold(shared_data: Path, tmp_path: Path) -> None:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from in_process import run_here
+from plain_reports import estimate_report
 from posterior_maps import bump_values, correlated_field, grid_map
 from searched_once import searched_once  # noqa: F401 - all tests of this file use it
 
@@ -18,29 +18,41 @@ from tactile_bayes.api.pooled import apart_from_others, elsewhere, one_place
 from tactile_bayes.declarations import replace
 from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.files.provenance import Provenance
+from tactile_bayes.files.reports import EstimateReport, MassReport, Place
+from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.mapping.map import TactileMap
 
 FAST = ("--method", "laplace")
 CALIBRATION = "solid"
 
 
-def document(*masses: tuple[float, float | None, bool], landmarks: bool = True, shift: float = 0.0) -> dict[str, Any]:
+def document(*masses: tuple[float, float | None, bool], landmarks: bool = True, shift: float = 0.0) -> EstimateReport:
     """An estimate with masses at x in the patient, of a size and a hundredth of it high, reported or not.
 
     On the map they lie `shift` farther.
     """
-    return {
-        "masses": [
-            {
-                "centre_patient_mm": {"x": x, "y": 90.0} if landmarks else None,
-                "centre_mm": {"x": x + shift, "y": 0.0},
-                "max_size_mm": None if size is None else {"median": size},
-                "amplitude": None if size is None else {"median": size / 100.0},
-                "reported": reported,
-            }
-            for x, size, reported in masses
-        ]
-    }
+
+    def mass(x: float, size: float | None, reported: bool) -> MassReport:
+        found = height = None
+        if size is not None:
+            found = Quantity(median=size, mean=size, sd=1.0, low=size, high=size, probability=0.95, kind="eti")
+            height = replace(found, median=size / 100.0)
+        unknown = ("min_size_mm", "d_x_mm", "d_y_mm", "angle_deg", "another_exam")
+        return MassReport(
+            number=1,
+            reported=reported,
+            centre_mm=Place(x + shift, 0.0),
+            centre_patient_mm=Place(x, 90.0) if landmarks else None,
+            detected_probability=1.0,
+            amplitude=height,
+            max_size_mm=found,
+            reason="",
+            reason_code="",
+            advice="",
+            **dict.fromkeys(unknown),
+        )
+
+    return estimate_report(masses=tuple(mass(*one) for one in masses))
 
 
 def test_a_map_that_reports_another_mass_is_told_the_place_of_the_common_one_on_it() -> None:
@@ -137,7 +149,7 @@ def test_python_and_the_page_size_the_same_mass(exams: Path, tmp_path: Path) -> 
     paths = [exams / f"m{i}.nc" for i in (1, 2, 3)]
     by_path = tb.pool(paths, method="laplace")
     assert [one["mass"] for one in by_path.document["maps"]] == [[], [], [2, 2]]
-    assert by_path.maps[2].outcome.estimate.masses[1].reported
+    assert by_path.maps[2].estimate.masses[1].reported
     own = [tb.estimate(path, method="laplace") for path in paths]
     assert tb.pool(own).max_size_mm.median == pytest.approx(by_path.max_size_mm.median, rel=1e-6)
     # an estimate of a place that was given stays what it is, and is told

@@ -10,6 +10,7 @@ from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.lump_probability import WIDTHS_MM, needed_amplitudes, smallest_lumps
 from tactile_bayes.posterior.options import EstimateOptions, FitOptions
+from tactile_bayes.report.estimate_document import smallest_lump
 
 FIELD = EstimateOptions(method="laplace", fit=FitOptions(background="free", noise="field"), draws=400)
 
@@ -39,9 +40,9 @@ def test_places_lie_on_what_is_covered() -> None:
 
 
 def test_as_plain_data_a_lump_that_nothing_shows_is_null() -> None:
-    told = smallest_lumps(empty(1.0), fat_mm=30.0).as_dict()
-    assert told["worst_mm"][-1] is None
-    assert told["probability"] == 0.95
+    told = smallest_lump(smallest_lumps(empty(1.0), fat_mm=30.0))
+    assert told.worst_mm[-1] is None
+    assert told.probability == 0.95
 
 
 @pytest.mark.parametrize(("times", "shown"), [(2.0, True), (0.4, False)])

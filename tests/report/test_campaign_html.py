@@ -9,16 +9,20 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
+from plain_reports import estimate_report
 from posterior_maps import bump_map
 
+from tactile_bayes.declarations import replace
+from tactile_bayes.files.reports import Point
 from tactile_bayes.findings import Finding
+from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.campaign_html import FAILED, SIZED, UNSIZED, Card, campaign_html, worst
 from tactile_bayes.report.svg import LONGEST_PX, thumbnail_png
 
 HOSTILE = "\"><img src=x onerror=alert(1)><script>alert(2)</script>'&lt; </p></article></main>"
-SIZE = {"median": 14.0, "low": 12.0, "high": 17.5, "probability": 0.95, "sd": 1.4}
-NO_SIZE = {"max_size_mm": None, "centre_mm": None}
+SIZE = Quantity(median=14.0, mean=14.0, sd=1.4, low=12.0, high=17.5, probability=0.95, kind="eti")
+NO_SIZE = estimate_report()
 
 
 class Tags(HTMLParser):
@@ -83,7 +87,7 @@ def test_the_page_loads_nothing_and_runs_its_own_script_alone() -> None:
 
 def test_the_worst_come_first() -> None:
     cards = [
-        Card("narrow", SIZED, size=SIZE | {"low": 13.5, "high": 14.5}),
+        Card("narrow", SIZED, size=replace(SIZE, low=13.5, high=14.5)),
         Card("wide", SIZED, size=SIZE),
         Card("checked", SIZED, size=SIZE, findings=(Finding("few_strokes", "a"), Finding("curved_skin", "b"))),
         Card("doubtful", SIZED, size=SIZE, findings=(Finding("side", "a"),)),
@@ -138,15 +142,9 @@ def test_the_ring_lies_about_the_lump() -> None:
 
     tactile_map = bump_map(noise=np.zeros((51, 51)), amplitude=0.3, sigma_x=4.0, sigma_y=4.0)
     row, column = np.unravel_index(np.nanargmax(tactile_map.mean), tactile_map.mean.shape)
-    centre = {"x": tactile_map.x_mm[column], "y": tactile_map.y_mm[row]}
-    document = {
-        "max_size_mm": {"median": 12.0},
-        "centre_mm": {axis: {"median": float(value)} for axis, value in centre.items()},
-        "angle_deg": None,
-        "d_x_mm": {"median": 12.0},
-        "d_y_mm": {"median": 8.0},
-    }
-    png = thumbnail_png(tactile_map, document)
+    centre = [replace(SIZE, median=float(at)) for at in (tactile_map.x_mm[column], tactile_map.y_mm[row])]
+    across, along = (replace(SIZE, median=value) for value in (12.0, 8.0))
+    png = thumbnail_png(tactile_map, replace(NO_SIZE, centre_mm=Point(*centre), d_x_mm=across, d_y_mm=along))
     assert png is not None
     pixels = np.asarray(Image.open(io.BytesIO(png)).convert("RGB")).astype(int)
     scale = pixels.shape[0] / tactile_map.mean.shape[0]

@@ -11,9 +11,10 @@ import pytest
 from in_process import run_here
 from posterior_maps import bump_values, correlated_field, grid_map
 
-from tactile_bayes.declarations import replace
+from tactile_bayes.declarations import from_plain, replace
 from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.files.provenance import Provenance
+from tactile_bayes.files.reports import Supposed
 from tactile_bayes.findings import Finding
 from tactile_bayes.inference.draws import summarise
 from tactile_bayes.mapping.map import TactileMap, broken_assumptions
@@ -22,7 +23,7 @@ from tactile_bayes.posterior.options import EstimateOptions, FitOptions
 from tactile_bayes.posterior.result import Estimate, Mass, Sensitivity
 from tactile_bayes.posterior.selection import Structure
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.report.estimate_document import _change, masses_document, sensitivity_line, supposed_line
+from tactile_bayes.report.estimate_document import _change, mass_reports, sensitivity_line, supposed_line
 from tactile_bayes.report.estimate_text import (
     MOST_LINES,
     decimals,
@@ -107,14 +108,14 @@ def test_what_a_soft_lump_would_measure_is_what_it_does_where_it_is_known(folder
     def document(*more: str) -> dict:
         return json.loads(run_here("estimate", "clear.nc", "--method", "laplace", "--json", *more, cwd=folder).stdout)
 
-    supposed = document()["supposing"]
-    assert supposed["soft"]["property"] == "stiffness_ratio"
+    supposed = from_plain(dict[str, Supposed], document()["supposing"])
+    assert supposed["soft"].property == "stiffness_ratio"
     soft, hard = (
-        document("--known", "stiffness_ratio", str(supposed[name]["value"]))["max_size_mm"] for name in ("soft", "hard")
+        document("--known", "stiffness_ratio", str(supposed[name].value))["max_size_mm"] for name in ("soft", "hard")
     )
     for name, told in (("soft", soft), ("hard", hard)):
-        ends = supposed[name]["max_size_mm"]
-        assert [ends[end] for end in ("low", "median", "high")] == pytest.approx(
+        ends = supposed[name].max_size_mm
+        assert [ends.low, ends.median, ends.high] == pytest.approx(
             [told[end] for end in ("low", "median", "high")], rel=0.01
         )
     assert soft["median"] > 1.02 * hard["median"]
@@ -123,13 +124,13 @@ def test_what_a_soft_lump_would_measure_is_what_it_does_where_it_is_known(folder
     assert "Were the lump soft (11 times as stiff as fat): " in whole
     assert "bodies unlike the calibration's (lumps 6 to 100 times as stiff as fat" in whole
     words = "No map shows stiffness: were the lump soft (11 times fat), {:.1f} mm; hard (70 times), {:.1f} mm"
-    sizes = [supposed[name]["max_size_mm"]["median"] for name in ("soft", "hard")]
+    sizes = [supposed[name].max_size_mm.median for name in ("soft", "hard")]
     assert supposed_line(supposed, supposed_median := sum(sizes) / 2, places=1) == [
         f"{words.format(*sizes)}; softer still, larger."
     ]
     exchanged = {
-        "soft": {**supposed["soft"], "max_size_mm": supposed["hard"]["max_size_mm"]},
-        "hard": {**supposed["hard"], "max_size_mm": supposed["soft"]["max_size_mm"]},
+        "soft": replace(supposed["soft"], max_size_mm=supposed["hard"].max_size_mm),
+        "hard": replace(supposed["hard"], max_size_mm=supposed["soft"].max_size_mm),
     }
     assert supposed_line(exchanged, supposed_median, places=1) == [f"{words.format(*sizes[::-1])}."]
 
@@ -163,7 +164,7 @@ def test_the_worst_case_takes_at_most_12_lines_and_counts_what_it_does_not_show(
     size = {name: summarise(np.linspace(10.0, 20.0, 99), probability=0.9) for name in ("max_size_mm", "min_size_mm")}
     another = size | {f"another_exam.{name}": quantity for name, quantity in size.items()}
     told = {"probability": 0.9, "quantities": quantities, "reason": full.reason}
-    masses = masses_document(full.masses, MAPS["clear.nc"], **told)
+    masses = mass_reports(full.masses, MAPS["clear.nc"], **told)
     sized = replace(full, reason="", advice="")
     for one, shown in ((full, quantities), (full, quantities | size), (sized, quantities | another)):
         text = estimate_summary(one, shown, probability=0.9, masses=masses)

@@ -24,12 +24,12 @@ from in_process import run_here
 from posterior_maps import bump_map
 
 import tactile_bayes as tb
-from tactile_bayes.api.comparing import ComparedOutcome, Comparison, drawn_maps
-from tactile_bayes.api.estimates import PooledSize, SizeEstimate
-from tactile_bayes.api.estimating import answer_of, estimate_one
-from tactile_bayes.api.exam_report import EstimatedMap, Given, make_exam
+from tactile_bayes.api.comparing import Comparison, drawn_maps
+from tactile_bayes.api.estimating import estimate_one
 from tactile_bayes.api.maps import Map
+from tactile_bayes.api.pooled import PooledSize
 from tactile_bayes.api.settings import Settings
+from tactile_bayes.api.sized import SizeEstimate
 from tactile_bayes.campaign.match import growth_text
 from tactile_bayes.campaign.tables import Row, done_text
 from tactile_bayes.declarations import replace
@@ -38,16 +38,17 @@ from tactile_bayes.exports.fhir import bundle_of
 from tactile_bayes.exports.identity import Identity
 from tactile_bayes.exports.redcap import records_csv
 from tactile_bayes.files.manifest_csv import Exam as Listed
-from tactile_bayes.files.map_nc import read_map, write_map, write_pooled
+from tactile_bayes.files.map_nc import read_map, write_map
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.scan_mcap import read_scan, write_scan
 from tactile_bayes.findings import KINDS, LEADS, Finding, by_weight, verdict
 from tactile_bayes.geometry import rigid
+from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import MapRecipe, TactileMap
 from tactile_bayes.mapping.select import scan_findings
 from tactile_bayes.report.campaign_html import SIZED, Card, campaign_html
-from tactile_bayes.report.compare import Growth, compare_summary, compare_text, of_document
+from tactile_bayes.report.compare import Growth, compare_summary, compare_text, growths
 from tactile_bayes.report.estimate_figures import draw_comparison
 from tactile_bayes.report.exam_page import exam_page
 from tactile_bayes.report.map_figure import map_figure
@@ -79,7 +80,7 @@ def plain_map(seed: int) -> TactileMap:
 def sound() -> tuple[SizeEstimate, PooledSize, Comparison]:
     """An estimate, a pooled size and a comparison that nothing speaks against."""
     ones = [
-        SizeEstimate(estimate_one(plain_map(seed), FAST, scans=({**SCANS[0], "sha256": f"{seed:064x}"},)), "exam")
+        replace(estimate_one(plain_map(seed), FAST, scans=({**SCANS[0], "sha256": f"{seed:064x}"},)), name="exam")
         for seed in (1, 2)
     ]
     return ones[0], tb.pool(ones, method="laplace"), tb.compare(*ones, method="laplace")
@@ -91,16 +92,15 @@ class Made:
     def __init__(self, findings: Sequence[Finding]) -> None:
         self.findings = by_weight(findings)
         one, pooled, compared = sound()
-        outcome = one.outcome
-        told = {"findings": [each.as_dict() for each in self.findings], "verdict": verdict(findings, answered=True)}
-        self.map = replace(outcome.tactile_map, findings=self.findings)
-        estimate = replace(outcome.estimate, findings=self.findings)
-        self.estimate = SizeEstimate(replace(outcome, tactile_map=self.map, estimate=estimate), "exam")
-        self.answer = answer_of(self.estimate.outcome)
-        self.pooled = replace(pooled, outcome=replace(pooled.outcome, document={**pooled.outcome.document, **told}))
-        document = {**compared.outcome.document, **told}
-        inside = replace(compared.outcome.compared, findings=self.findings)
-        self.compared = replace(compared, outcome=ComparedOutcome(inside, document))
+        told: Any = {"entries": tuple(each.entry for each in self.findings)}
+        told["verdict"] = verdict(findings, answered=True)
+        self.map = replace(one.tactile_map, findings=self.findings)
+        estimate = replace(one.estimate, findings=self.findings)
+        self.estimate = replace(one, tactile_map=self.map, estimate=estimate)
+        self.answer = self.estimate.answer
+        self.pooled = replace(pooled, pooled_report=replace(pooled.pooled_report, **told))
+        inside = replace(compared.compared, findings=self.findings)
+        self.compared = replace(compared, compared=inside, report=replace(compared.report, **told))
 
     @property
     def exported(self) -> Any:
@@ -140,14 +140,14 @@ def stored_map(made: Made) -> str:
 
 def stored_estimate(made: Made, *words: str) -> str:
     path = folder() / "post.nc"
-    made.estimate.outcome.write(path, document=made.answer.document)
+    made.estimate.write(path)
     return run_here(*(words or ("show",)), path.name, cwd=path.parent).stdout
 
 
 def stored_pool(made: Made) -> str:
-    path, found = folder() / "post.nc", made.pooled.outcome
+    path, found = folder() / "post.nc", made.pooled
     assert found.pooled.size is not None
-    write_pooled(path, found.pooled.size, provenance=found.provenance, document=found.document)
+    found.write(path)
     return shown(path)
 
 
@@ -163,8 +163,8 @@ def stored_scan(made: Made) -> str:
 
 
 def exam_words(made: Made, *, several: bool) -> str:
-    exam = make_exam([EstimatedMap(made.map, made.answer, SCANS)], FAST, Given())
-    return words_of(exam_page(replace(exam, pooled=made.pooled.document) if several else exam))
+    exam = made.estimate.exam()
+    return words_of(exam_page(replace(exam, pooled=made.pooled.pooled_report) if several else exam))
 
 
 def nrrd(made: Made) -> str:
@@ -185,13 +185,13 @@ def dicom(made: Made, name: str) -> str:
 
 
 def campaign_row(made: Made) -> str:
-    row = Row(Listed("a.nc", Path("a.nc"), "P", "1", "1", 1), made.answer.document, scans=SCANS, findings=made.findings)
+    row = Row(Listed("a.nc", Path("a.nc"), "P", "1", "1", 1), made.answer.report, scans=SCANS, findings=made.findings)
     (cells,) = csv.DictReader(io.StringIO(done_text([row])))
     return f"{cells['verdict']} {cells['findings']}"
 
 
 def growth_of(made: Made) -> Growth:
-    (row,) = of_document("P", "1", ["1", "2"], made.compared.document, "")
+    (row,) = growths("P", "1", ["1", "2"], made.compared.report, "")
     return row
 
 
@@ -201,14 +201,14 @@ def growth_table(made: Made) -> str:
 
 
 def campaign_card(made: Made) -> str:
-    size = {"median": 15.0, "low": 13.0, "high": 17.0, "probability": 0.95, "sd": 1.0}
+    size = Quantity(median=15.0, mean=15.0, sd=1.0, low=13.0, high=17.0, probability=0.95, kind="eti")
     cards = [Card("a", SIZED, size=size, findings=made.findings)]
     return words_of(campaign_html(cards, lines=(), links={}, version="1"))
 
 
 def drawn(made: Made) -> Any:
     maps = drawn_maps([[made.map], [made.map]], [[made.answer], [made.answer]])
-    return draw_comparison(made.compared.outcome.compared, made.compared.document, maps, None)
+    return draw_comparison(made.compared.compared, made.compared.report, maps, None)
 
 
 @dataclass(frozen=True)
@@ -246,16 +246,16 @@ OUTPUTS: dict[str, Output] = {
     "estimate: DICOM": Output(lambda made: dicom(made, "report"), paper=True, verdict="Verdict: {}."),
     "estimate: FHIR": Output(lambda made: fhir(made.exported), paper=True, verdict="Verdict: {}."),
     "estimate: REDCap": Output(lambda made: records_csv([made.exported], Identity(), id_from_scan=False), paper=True),
-    "pool: text": Output(lambda made: pooled_summary(made.pooled.document), paper=False, shortens=True),
-    "pool: text -v": Output(lambda made: pooled_text(made.pooled.document), paper=False),
+    "pool: text": Output(lambda made: pooled_summary(made.pooled.pooled_report), paper=False, shortens=True),
+    "pool: text -v": Output(lambda made: pooled_text(made.pooled.pooled_report), paper=False),
     "pool: JSON": Output(lambda made: told_in(made.pooled.document), paper=False, verdict="{}"),
     "pool: file, show": Output(stored_pool, paper=False, verdict="{}"),
     "pool: figure": Output(lambda made: figure_words(made.pooled.plot()), paper=True),
     "pool: notebook": Output(lambda made: words_of(made.pooled._repr_html_()), paper=True),
     "pool: page": Output(lambda made: exam_words(made, several=True), paper=True, shortens=True),
     "pool: FHIR": Output(lambda made: fhir(made.pooled_export), paper=True, verdict="Verdict: {}."),
-    "compare: text": Output(lambda made: compare_summary(made.compared.document), paper=False, shortens=True),
-    "compare: text -v": Output(lambda made: compare_text(made.compared.document), paper=False),
+    "compare: text": Output(lambda made: compare_summary(made.compared.report), paper=False, shortens=True),
+    "compare: text -v": Output(lambda made: compare_text(made.compared.report), paper=False),
     "compare: JSON": Output(lambda made: told_in(made.compared.document), paper=False, verdict="{}"),
     "compare: figure": Output(lambda made: figure_words(drawn(made)), paper=False, shortens=True),
     "compare: notebook": Output(lambda made: words_of(made.compared._repr_html_()), paper=False, shortens=True),

@@ -15,9 +15,20 @@ from typing import Any
 import numpy as np
 import pytest
 from mapping_scans import gaussian, make_scan, strokes
+from plain_reports import estimate_report, pooled_report
 
 import tactile_bayes as tb
 from tactile_bayes.declarations import replace
+from tactile_bayes.files.reports import (
+    EstimateReport,
+    MassReport,
+    Place,
+    Point,
+    PooledMap,
+    PooledReport,
+    SmallestAt,
+    SmallestLump,
+)
 from tactile_bayes.findings import Finding
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import TactileMap
@@ -67,54 +78,57 @@ class Page(HTMLParser):
 
 
 @cache
-def demo() -> tuple[TactileMap, dict[str, Any]]:
+def demo() -> tuple[TactileMap, EstimateReport]:
     """The demo's map with a nipple 30 mm below and 25 mm to the patient's right of its lump, and its estimate."""
     found = tb.estimate(tb.demo_map())
-    document = found.answer.document
-    assert document is not None
-    tactile_map = found.outcome.tactile_map
+    report = found.answer.report
+    assert report is not None
+    assert report.centre_mm is not None
+    tactile_map = found.tactile_map
     patient = tactile_map.patient_from_plane
     assert patient is not None
-    lump = np.array([document["centre_mm"]["x"]["median"], document["centre_mm"]["y"]["median"], 0.0])
+    lump = np.array([*report.centre_mm.median, 0.0])
     nipple = lump + patient[:3, :3].T @ np.array([25.0, -30.0, 0.0])
-    return replace(tactile_map, nipple_mm=nipple), document
+    return replace(tactile_map, nipple_mm=nipple), report
 
 
 def exam(scans: tuple[Mapping[str, str], ...] = SCANS, **more: Any) -> Exam:
-    tactile_map, document = demo()
+    tactile_map, report = demo()
     side = scans[0].get("side", "") if scans else ""
-    return Exam((exam_map(tactile_map, document, side=side),), None, scans, **more)
+    return Exam((exam_map(tactile_map, report, side=side),), None, scans, **more)
 
 
-SMALLEST = {
-    "probability": 0.95,
-    "depths_mm": [8.0, 15.0],
-    "best_mm": [5.5, 13.0],
-    "worst_mm": [7.0, None],
-    "spacing_mm": 20.0,
-    "places": [{"x_mm": -10.0, "y_mm": 0.0, "d_mm": [5.5, 13.0]}, {"x_mm": 10.0, "y_mm": 0.0, "d_mm": [7.0, None]}],
-}
+SMALLEST = SmallestLump(
+    0.95,
+    depths_mm=(8.0, 15.0),
+    best_mm=(5.5, 13.0),
+    worst_mm=(7.0, None),
+    spacing_mm=20.0,
+    places=(SmallestAt(-10.0, 0.0, (5.5, 13.0)), SmallestAt(10.0, 0.0, (7.0, None))),
+)
 
 
-def without_lump(reason_code: str = "undetected", **more: Any) -> Exam:
-    tactile_map, document = demo()
-    nothing = dict.fromkeys(
-        ("max_size_mm", "min_size_mm", "another_exam", "centre_mm", "amplitude", "background", "variance_share")
+def without_lump(reason_code: Any = "undetected", **more: Any) -> Exam:
+    tactile_map, _ = demo()
+    gone = estimate_report(
+        reason="no lump found on the 50 cm2 that the map covers",
+        reason_code=reason_code,
+        detected_probability=0.03,
+        smallest_lump=SMALLEST,
+        on_paper="scan the place again",
+        **more,
     )
-    told = {"reason": "no lump found on the 50 cm2 that the map covers", "reason_code": reason_code}
-    gone = {**document, **nothing, **told, "status": "no_estimate", "masses": [], "detected_probability": 0.03}
-    gone |= {"smallest_lump": SMALLEST, "on_paper": "scan the place again", "about_mm": None, **more}
     return Exam((exam_map(tactile_map, gone, side="left"),), None, SCANS)
 
 
 def test_the_page_says_size_both_intervals_place_and_use() -> None:
-    _, document = demo()
-    alike, size = document["max_size_mm"], document["another_exam"]["max_size_mm"]
+    _, report = demo()
+    alike, size = report.max_size_mm, report.another_exam.max_size_mm
     page = Page(exam_page(exam()))
     for text in (
-        f"Lump of about {size['median']:.1f} mm, 95 % interval {size['low']:.1f} to {size['high']:.1f} mm",
-        f"it lies between {size['low']:.1f} and {size['high']:.1f} mm, if exams of a lump differ by",
-        f"as those of simulated bodies do, it would lie between {alike['low']:.1f} and {alike['high']:.1f} mm",
+        f"Lump of about {size.median:.1f} mm, 95 % interval {size.low:.1f} to {size.high:.1f} mm",
+        f"it lies between {size.low:.1f} and {size.high:.1f} mm, if exams of a lump differ by",
+        f"as those of simulated bodies do, it would lie between {alike.low:.1f} and {alike.high:.1f} mm",
         "What would narrow it:",
         "Left breast, 1:30 o'clock, 39 mm from the nipple (upper outer)",
         "Subject P07",
@@ -181,10 +195,11 @@ def test_a_lump_at_the_upper_outer_left_is_drawn_at_the_upper_right_and_told_so(
     marks = Landmarks(200 * up, -100 * up, nipple_mm=np.zeros(3))
     field = gaussian(x=lump[0], y=lump[1], sigma_x=3.0, sigma_y=3.0)
     tactile_map = build_map([make_scan(strokes(lines=7), field=field, landmarks=marks)], normalise="mean")
-    _, document = demo()
+    _, report = demo()
     row, column = np.unravel_index(np.nanargmax(tactile_map.mean), tactile_map.mean.shape)
     x, y = float(tactile_map.x_mm[column]), float(tactile_map.y_mm[row])
-    placed = {**document, "centre_mm": {"x": {"median": x, "sd": 0.1}, "y": {"median": y, "sd": 0.1}}}
+    there = report.centre_mm
+    placed = replace(report, centre_mm=Point(replace(there.x, median=x, sd=0.1), replace(there.y, median=y, sd=0.1)))
     text = exam_page(Exam((exam_map(tactile_map, placed, side="left"),), None, SCANS))
     page = Page(text)
     (drawn,) = page.named("svg", **{"class": "map"})
@@ -217,7 +232,7 @@ def _brightest(page: Page) -> tuple[str, str]:
 
 
 def test_the_ellipses_are_drawn_to_scale() -> None:
-    _, document = demo()
+    _, report = demo()
     page = Page(exam_page(exam()))
     (drawn,) = page.named("svg", **{"class": "map"})
     tactile_map = demo()[0]
@@ -228,10 +243,10 @@ def test_the_ellipses_are_drawn_to_scale() -> None:
         points = np.array([[float(n) for n in pair.split()] for pair in one["d"].strip("MZ").split("L")])
         return float(np.ptp(points[:, 0]))
 
-    largest = document["another_exam"]["max_size_mm"]  # the interval that leads
-    assert width("size") == pytest.approx(scale * document["d_x_mm"]["median"], rel=0.01)
-    assert width("size-high") / width("size") == pytest.approx(largest["high"] / largest["median"], rel=0.01)
-    assert width("size-low") / width("size") == pytest.approx(largest["low"] / largest["median"], rel=0.01)
+    largest = report.another_exam.max_size_mm  # the interval that leads
+    assert width("size") == pytest.approx(scale * report.d_x_mm.median, rel=0.01)
+    assert width("size-high") / width("size") == pytest.approx(largest.high / largest.median, rel=0.01)
+    assert width("size-low") / width("size") == pytest.approx(largest.low / largest.median, rel=0.01)
     (bar,) = page.named("path", **{"class": "scale"})
     assert float(bar["d"].split("h")[1]) == pytest.approx(10 * scale, rel=0.01)
 
@@ -259,34 +274,26 @@ def test_no_lump_found_is_told_with_what_was_covered_and_what_would_have_shown()
 
 
 def test_one_cross_marks_the_rise_that_the_reason_is_about() -> None:
-    page = Page(exam_page(without_lump("ridge", about_mm={"x": 3.0, "y": 2.0})))
+    page = Page(exam_page(without_lump("ridge", about_mm=Place(3.0, 2.0))))
     assert len(page.named("path", **{"class": "meant"})) == 1
     assert "What rises at the cross on the picture is long like a rib, not round like a lump." in page.words
     assert "Cross: the rise that the reason is about." in page.words
     assert "--" not in page.words
 
 
-def unsized(reason: str) -> dict[str, Any]:
-    """A second mass without a size, as the JSON has it."""
+def unsized(reason: str, **more: Any) -> MassReport:
+    """A second mass without a size."""
     names = ("centre_patient_mm", "amplitude", "max_size_mm", "min_size_mm", "d_x_mm", "d_y_mm", "angle_deg")
-    sizes = dict.fromkeys((*names, "another_exam"))
-    return {
-        "number": 2,
-        "reported": False,
-        "centre_mm": {"x": 15.0, "y": 8.0},
-        "detected_probability": 0.99,
-        **sizes,
-        "reason": reason,
-        "reason_code": "window",
-        "advice": "",
-    }
+    nothing = dict.fromkeys((*names, "another_exam"))
+    told = {"detected_probability": 0.99, "reason": reason, "reason_code": "window", "advice": ""}
+    return MassReport(**nothing | {"number": 2, "reported": False, "centre_mm": Place(15.0, 8.0)} | told | more)
 
 
 def test_several_masses_are_numbered_with_a_place_each() -> None:
-    tactile_map, document = demo()
+    tactile_map, report = demo()
     second = unsized("its window reaches beyond the map")
-    first = {**second, "number": 1, "reported": True, "reason": ""}
-    both = {**document, "masses": [first, second]}
+    first = replace(second, number=1, reported=True, reason="")
+    both = replace(report, masses=(first, second))
     page = Page(exam_page(Exam((exam_map(tactile_map, both, side="left"),), None, SCANS)))
     assert "2 masses, mass 1 about" in page.words
     assert "Size of mass 1" in page.words
@@ -295,14 +302,14 @@ def test_several_masses_are_numbered_with_a_place_each() -> None:
 
 
 def test_a_second_mass_is_drawn_as_its_ellipse() -> None:
-    tactile_map, document = demo()
-    size = document["max_size_mm"]
-    axes = {"d_x_mm": size, "d_y_mm": {**size, "median": size["median"] / 2}, "angle_deg": {"median": 90.0}}
-    first = {**unsized(""), "number": 1, "reported": True}
-    second = {**unsized(""), "centre_mm": {"x": 0.0, "y": 0.0}, "max_size_mm": size, "min_size_mm": size}
+    tactile_map, report = demo()
+    size = report.max_size_mm
+    axes = {"d_x_mm": size, "d_y_mm": replace(size, median=size.median / 2), "angle_deg": replace(size, median=90.0)}
+    first = unsized("", number=1, reported=True)
+    second = unsized("", centre_mm=Place(0.0, 0.0), max_size_mm=size, min_size_mm=size)
 
-    def extents(mass: dict[str, Any]) -> tuple[float, float]:
-        both = {**document, "masses": [first, mass]}
+    def extents(mass: MassReport) -> tuple[float, float]:
+        both = replace(report, masses=(first, mass))
         page = Page(exam_page(Exam((exam_map(tactile_map, both, side="left"),), None, SCANS)))
         path = page.named("path", **{"class": "size"})[1]["d"]
         points = np.array([[float(n) for n in pair.split()] for pair in path.strip("MZ").split("L")])
@@ -310,16 +317,26 @@ def test_a_second_mass_is_drawn_as_its_ellipse() -> None:
 
     (frame,) = Page(exam_page(exam())).named("svg", **{"class": "map"})
     scale = (float(frame["viewbox"].split()[2]) - 10) / (tactile_map.mean.shape[1] * tactile_map.recipe.cell_mm)
-    long = scale * size["median"]
-    assert extents({**second, **axes}) == pytest.approx((long / 2, long), rel=0.01)
+    long = scale * size.median
+    assert extents(replace(second, **axes)) == pytest.approx((long / 2, long), rel=0.01)
+
+
+def pooled_as(report: EstimateReport, maps: int, **more: Any) -> PooledReport:
+    """One size from several maps, that of an estimate."""
+    names = ("max_size_mm", "min_size_mm", "another_exam", "variance_share", "provenance")
+    shown = tuple(
+        PooledMap(
+            map=f"map {n}", status="estimate", reason="", detected_probability=1.0, max_size_mm=None, outlying=False
+        )
+        for n in range(1, maps + 1)
+    )
+    told = {name: getattr(report, name) for name in names} | {"status": "estimate", "maps": shown}
+    return pooled_report(**told, figures=report.diagnostics, **more)
 
 
 def test_of_several_maps_the_first_that_shows_a_lump_is_drawn() -> None:
     with_lump, without = exam().maps[0], without_lump().maps[0]
-    size = {name: with_lump.document[name] for name in ("max_size_mm", "min_size_mm", "another_exam", "variance_share")}
-    pooled = {**size, "status": "estimate", "reason": "", "figures": with_lump.document["diagnostics"], "findings": []}
-    pooled["provenance"] = with_lump.document["provenance"]
-    pooled["maps"] = [{"map": f"map {n}", "outlying": False} for n in (1, 2)]
+    pooled = pooled_as(with_lump.report, 2)
     both = Exam((without, with_lump), pooled, SCANS)
     assert both.main is with_lump
     page = Page(exam_page(both))
@@ -350,17 +367,17 @@ def test_what_was_reached_is_told_by_the_patients_left_and_right() -> None:
 
 
 def test_without_a_nipple_the_xiphoid_tells_the_place_and_the_page_says_why() -> None:
-    tactile_map, document = demo()
-    page = Page(exam_page(Exam((exam_map(replace(tactile_map, nipple_mm=None), document, side=""),), None, ())))
+    tactile_map, report = demo()
+    page = Page(exam_page(Exam((exam_map(replace(tactile_map, nipple_mm=None), report, side=""),), None, ())))
     assert "of the xiphoid and" in page.words
     assert "No clock position: the scan names no nipple and no side." in page.words
     assert page.named("svg", **{"class": "dial"}) == []
 
 
 def test_a_nipple_off_the_map_is_pointed_to() -> None:
-    tactile_map, document = demo()
+    tactile_map, report = demo()
     far = replace(tactile_map, nipple_mm=tactile_map.nipple_mm + np.array([200.0, 0.0, 0.0]))
-    page = Page(exam_page(Exam((exam_map(far, document, side="left"),), None, SCANS)))
+    page = Page(exam_page(Exam((exam_map(far, report, side="left"),), None, SCANS)))
     assert len(page.named("path", **{"class": "nipple-off"})) == 1
     assert page.named("path", **{"class": "nipple"}) == []
 
@@ -384,15 +401,13 @@ def test_a_page_from_python_is_the_same_and_private(tmp_path: Path) -> None:
 
 def full() -> Exam:
     """As much as a page can hold: repeats, masses, cautions, long texts, a tall map."""
-    tactile_map, document = demo()
-    mass = unsized("a reason that is long " * 20)
-    masses = [{**mass, "number": 1, "reported": True}, *({**mass, "number": n} for n in range(2, 12))]
-    told = {**document, "masses": masses}
-    findings = [Finding("side", f"caution {n} " * 80).as_dict() for n in range(9)]
+    tactile_map, report = demo()
+    reason = "a reason that is long " * 20
+    masses = tuple(unsized(reason, number=n, reported=n == 1) for n in range(1, 12))
+    told = replace(report, masses=masses)
+    entries = tuple(Finding("side", f"caution {n} " * 80).entry for n in range(9))
     tall = replace(tactile_map, patient_from_plane=np.eye(4)[[1, 0, 2, 3]] * np.array([1, 1, -1, 1])[:, None])
-    size = {name: document[name] for name in ("max_size_mm", "min_size_mm", "another_exam", "variance_share")}
-    pooled = {**size, "status": "estimate", "reason": "", "figures": document["diagnostics"], "findings": findings}
-    pooled |= {"provenance": document["provenance"], "maps": [{"map": f"map {n}", "outlying": True} for n in range(12)]}
+    pooled = pooled_as(report, 12, entries=entries)
     facts = dict.fromkeys(("subject", "posture", "examiner", "visit", "mass"), "W" * 99)
     scans = tuple({**facts, "side": "left", "sha256": f"{n}" * 64, "subject": f"{n}" + "W" * 99} for n in range(12))
     maps = (exam_map(tall, told, side="left"),) * 12

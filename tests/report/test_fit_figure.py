@@ -10,8 +10,9 @@ from in_process import run_here
 from posterior_maps import bump_map
 
 import tactile_bayes as tb
-from tactile_bayes.api.estimates import SizeEstimate
 from tactile_bayes.api.maps import Map
+from tactile_bayes.api.sized import SizeEstimate
+from tactile_bayes.declarations import replace
 from tactile_bayes.files.map_nc import read_posterior
 from tactile_bayes.posterior.result import fitted_cells
 from tactile_bayes.report.figure_file import named_exam
@@ -37,7 +38,7 @@ def estimated(noise: str, *, slope: float) -> SizeEstimate:
 
 @pytest.mark.parametrize(("noise", "slope"), [("field", SLOPE), ("field", 0.0), ("independent", 0.0)])
 def test_the_fit_is_the_truth_to_within_its_noise_and_the_residual_is_the_noise(noise: str, slope: float) -> None:
-    fitted = fitted_cells(estimated(noise, slope=slope).outcome.estimate)
+    fitted = fitted_cells(estimated(noise, slope=slope).estimate)
     assert fitted is not None
     off = fitted.fit - truth(fitted.x_mm, fitted.y_mm, amplitude=0.4, slope=slope)
     assert np.abs(off).max() < NOISE_SD  # some ten parameters from over a thousand cells
@@ -78,7 +79,7 @@ def test_titles_carry_the_subjects_code_and_the_scans_digest(
 
 
 def test_a_dollar_in_a_name_starts_no_formula(tmp_path: Path) -> None:
-    found = SizeEstimate(estimated("independent", slope=0.0).outcome, r"a$\frac$")
+    found = replace(estimated("independent", slope=0.0), name=r"a$\frac$")
     found.plot_map(tmp_path / "map.png")
     assert (tmp_path / "map.png").exists()
 

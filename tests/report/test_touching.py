@@ -2,27 +2,40 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import pytest
 
+from tactile_bayes.files.reports import Interval, MassReport, Place
+from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.report.estimate_document import mass_words
 from tactile_bayes.report.quantities import touching_findings, touching_masses
 
 
-def mass(number: int, x: float, size: float | None, *, half: float = 1.0) -> dict[str, Any]:
+def mass(number: int, x: float, size: float | None, *, half: float = 1.0) -> MassReport:
     """A mass on the x axis, with the ends of its interval `half` mm from its size."""
-    quantity = {"median": size, "low": (size or 0) - half, "high": (size or 0) + half, "probability": 0.95}
-    told = {"detected_probability": 1.0, "reason": "too deep", "reported": number == 1, "position": None}
-    return {"number": number, "centre_mm": {"x": x, "y": 0.0}, "max_size_mm": size and quantity, **told}
+    found = None
+    if size is not None:
+        ends = {"low": size - half, "high": size + half}
+        found = Quantity(median=size, mean=size, sd=half / 2, probability=0.95, kind="eti", **ends)
+    unknown = ("centre_patient_mm", "amplitude", "min_size_mm", "d_x_mm", "d_y_mm", "angle_deg", "another_exam")
+    return MassReport(
+        number=number,
+        reported=number == 1,
+        centre_mm=Place(x, 0.0),
+        max_size_mm=found,
+        detected_probability=1.0,
+        reason="too deep",
+        reason_code="",
+        advice="",
+        **dict.fromkeys(unknown),
+    )
 
 
 def test_balls_in_a_row_are_as_long_as_their_distance_and_radii() -> None:
     """Two balls of 12 and 8 mm that touch are 20 mm long: geometry."""
     (pair,) = touching_masses([mass(1, 0.0, 12.0), mass(2, 10.0, 8.0)])
-    assert pair["masses"] == [1, 2]
-    assert pair["apart_mm"] == 10.0
-    assert pair["together_mm"] == {"median": 20.0, "low": 19.0, "high": 21.0, "probability": 0.95}
+    assert pair.masses == (1, 2)
+    assert pair.apart_mm == 10.0
+    assert pair.together_mm == Interval(20.0, 19.0, 21.0, 0.95)
 
 
 def test_they_touch_where_the_upper_ends_of_the_intervals_meet() -> None:
@@ -34,7 +47,7 @@ def test_they_touch_where_the_upper_ends_of_the_intervals_meet() -> None:
 
 def test_a_small_one_within_the_outline_of_a_large_one_adds_nothing() -> None:
     (pair,) = touching_masses([mass(1, 0.0, 20.0), mass(2, 3.0, 6.0)])
-    assert pair["together_mm"]["median"] == 20.0
+    assert pair.together_mm.median == 20.0
 
 
 def test_a_mass_without_a_size_takes_no_part() -> None:

@@ -24,7 +24,7 @@ def demo() -> tb.SizeEstimate:
 
 def test_sizes_from_the_kept_draws_are_the_estimates_without_fitting_the_map_again(demo: tb.SizeEstimate) -> None:
     calibration = read_size_calibration(size_calibration_path("solid"))
-    shape, size = demo.answer.shape, demo.outcome.estimate.size
+    shape, size = demo.answer.shape, demo.estimate.size
     again = size_alone(
         replace(shape, turn_rad=0.0), calibration=calibration, priors=SizePriors(), rng=np.random.default_rng(5)
     )

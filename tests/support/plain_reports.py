@@ -1,0 +1,30 @@
+"""Reports that say nothing, to which a test adds what it is about."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from tactile_bayes.declarations import names_of
+from tactile_bayes.files.reports import ESTIMATE, POOLED, EstimateReport, PooledReport
+from tactile_bayes.presets import RESEARCH_USE
+
+_HEAD: dict[str, Any] = {"status": "no_estimate", "verdict": "no_answer", "entries": (), "reason": "", "left_out": ()}
+_FOOT: dict[str, Any] = {"research_use": RESEARCH_USE, "provenance": {"settings": {}, "inputs": []}}
+
+
+def estimate_report(**more: Any) -> EstimateReport:
+    """The report of a map without a lump."""
+    own = {"diagnostics": {}, "candidates": (), "masses": (), "prior": {}, "schema": ESTIMATE}
+    return EstimateReport(**_nothing(EstimateReport) | _HEAD | own | _FOOT | more)
+
+
+def pooled_report(**more: Any) -> PooledReport:
+    """The report of a mass without a size."""
+    return PooledReport(
+        **_nothing(PooledReport) | _HEAD | {"figures": {}, "unknowns": {}, "schema": POOLED} | _FOOT | more
+    )
+
+
+def _nothing(kind: Any) -> dict[str, Any]:
+    """None for each field that may hold it."""
+    return {name: None for name in names_of(kind) if "None" in str(kind.__annotations__.get(name, ""))}
