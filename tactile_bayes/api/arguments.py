@@ -56,26 +56,14 @@ def door(function: Callable[_Given, _Returned]) -> Callable[_Given, _Returned]:
 
 
 def check_keywords(function: str, given: Iterable[str], known: Collection[str]) -> None:
-    """Refuse a keyword that a function does not have.
-
-    Raises
-    ------
-    TypeError
-        Naming it, and the one that was probably meant or all that there are.
-    """
+    """Refuse a keyword that a function does not have."""
     for name in given:
         if name not in known:
             raise TypeError(f"{function} has no keyword {name!r}; {meant(name, known)}")
 
 
 def sequence_of(name: str, given: Any, what: str) -> Sequence[Any]:
-    """A list or other sequence as it is.
-
-    Raises
-    ------
-    UsageError
-        When it is a text, a number or anything else that is no sequence.
-    """
+    """A list or other sequence as it is."""
     if isinstance(given, str | bytes) or not isinstance(given, Iterable):
         raise UsageError(f"{name} is {given!r}; give a list of {what}")
     return list(given)

@@ -173,23 +173,8 @@ def compare_answers(
 ) -> Comparison:
     """Compare the visits of one mass.
 
-    Parameters
-    ----------
-    visits
-        Answers for the maps of each visit, in order of time; none of them an error.
-    names
-        Of the maps, for the report.
-    inputs
-        Files that the maps came from, by role, for the provenance.
-
-    Raises
-    ------
-    BadDataError
-        When the maps were normalised in several ways, one was made with another head than the calibration's, or the
-        site's repeatability is of sizes by another calibration.
-    UsageError
-        When there are fewer than two visits, two maps are of one scan, days do not fit, or the calibration cannot pool
-        maps.
+    `visits`: answers for the maps of each visit, in order of time; none of them an error; `names`: of the maps, for the
+    report; `inputs`: files that the maps came from, by role, for the provenance.
     """
     if len(visits) < 2 or not all(visits):
         raise UsageError("a comparison needs two visits of a map or more each: `compare VISIT1.nc --with VISIT2.nc`")

@@ -27,13 +27,7 @@ _KEYWORDS = tuple(name for name in names_of(Settings) if name != "settings_file"
 
 
 def settings_of(options: Mapping[str, Any]) -> Settings:
-    """Make settings from keywords; the defaults are the command line's.
-
-    Raises
-    ------
-    TypeError
-        Naming a keyword that is none, and those that are.
-    """
+    """Make settings from keywords; the defaults are the command line's."""
     check_keywords("estimate", options, _KEYWORDS)
     given = {name: plain(value) for name, value in options.items()}
     if "size_calibration" in given:

@@ -93,25 +93,9 @@ def estimate_one(
 ) -> SizeEstimate:
     """Choose the calibration and the options that fit a map, and estimate.
 
-    Parameters
-    ----------
-    inputs
-        Files that the map came from, by role, for the provenance.
-    scans
-        The scans at the beginning, as `Provenance.scans` has them.
-    progress
-        Called with draws done and wanted.
-    notice
-        Called before the work with a line that a user may want to read while waiting.
-
-    Raises
-    ------
-    BadDataError
-        When the calibration that was named does not fit the map.
-    UsageError
-        When settings contradict each other, or the map.
-    NotConvergedError
-        When the method asked for does not converge.
+    `inputs`: files that the map came from, by role, for the provenance; `scans`: the scans at the beginning, as
+    `Provenance.scans` has them; `progress`: called with draws done and wanted; `notice`: called before the work with a
+    line that a user may want to read while waiting.
     """
     shipped = default_for(tactile_map.recipe.normalise)
     source, calibration, why_none = choose_calibration(settings, tactile_map)
@@ -285,12 +269,6 @@ def estimated_at(found: SizeEstimate, place: tuple[float, float]) -> SizeEstimat
 def estimate_inputs(
     settings: Settings, tactile_map: TactileMap
 ) -> tuple[Calibration | None, EstimateOptions, NoSize | None]:
-    """What `estimate_one` takes for a map: calibration and options, and why there is no calibration if nobody said so.
-
-    Raises
-    ------
-    BadDataError
-        When the calibration that was named does not fit the map.
-    """
+    """What `estimate_one` takes for a map: calibration and options, and why there is no calibration where there is none."""
     _, calibration, why_none = choose_calibration(settings, tactile_map)
     return calibration, _options(settings, calibration, tactile_map), why_none

@@ -38,15 +38,7 @@ class ExamFiles(Record):
 
     @classmethod
     def sort(cls, paths: Sequence[Path]) -> ExamFiles:
-        """Tell maps from estimates, in any order.
-
-        Raises
-        ------
-        BadDataError
-            When a file is neither.
-        UsageError
-            When a file is given twice, or several estimates are.
-        """
+        """Tell maps from estimates, in any order."""
         if twice := given_twice(paths):
             raise UsageError(f"{twice} is given twice; give each file once")
         estimates = tuple(path for path in paths if _is_json(path) or _is_posterior(path))
@@ -69,18 +61,8 @@ def _is_posterior(path: Path) -> bool:
 def read_exam(files: ExamFiles, settings: Settings, given: Given, *, notice: Notice | None = None) -> Exam:
     """Read maps, or an estimate and its map, and put a page's exam together.
 
-    Parameters
-    ----------
-    files
-        Maps of one mass; or an estimate, best with its map: what ``estimate`` printed with ``--json`` or wrote with
-        ``-o``.
-    notice
-        Called with a line that a user may want to read while waiting.
-
-    Raises
-    ------
-    BadDataError
-        When a file is not what it must be, or the maps are of different exams.
+    `files`: maps of one mass; or an estimate, best with its map: what ``estimate`` printed with ``--json`` or wrote
+    with ``-o``; `notice`: called with a line that a user may want to read while waiting.
     """
     maps = files.maps
     if files.estimates:
@@ -95,13 +77,7 @@ def read_exam(files: ExamFiles, settings: Settings, given: Given, *, notice: Not
 def exam_of(
     found: Sequence[SizeEstimate], settings: Settings, given: Given, *, inputs: Mapping[str, Path] | None = None
 ) -> Exam:
-    """Exam of maps that were estimated; several are pooled.
-
-    Raises
-    ------
-    BadDataError
-        When the maps are of different exams, or cannot be pooled.
-    """
+    """Exam of maps that were estimated; several are pooled."""
     if len(found) == 1:
         return given.on(found[0].exam())
     names = [f"map {number}" for number in range(1, len(found) + 1)]

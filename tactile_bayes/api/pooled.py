@@ -67,10 +67,7 @@ def of_one_mass(
 ) -> list[T]:
     """Estimates of the mass that most maps show; a map whose report is about another one is estimated at its place.
 
-    Parameters
-    ----------
-    again
-        Takes the number of a map in the list and a place on it, and gives the estimate there.
+    `again`: takes the number of a map in the list and a place on it, and gives the estimate there.
     """
     same = list(found)
     for i, place in elsewhere(reports).items():
@@ -250,22 +247,8 @@ def pool_answers(
 ) -> PooledSize:
     """Pool the maps of one mass.
 
-    Parameters
-    ----------
-    answers
-        Of each map; none of them an error.
-    names
-        Of the maps, for the report.
-    inputs
-        Files that the maps came from, by role, for the provenance.
-
-    Raises
-    ------
-    BadDataError
-        When the maps were normalised in several ways, one was made with another head than the calibration's, or their
-        scans name different patients, sides, masses or visits.
-    UsageError
-        When the calibration cannot pool maps.
+    `answers`: of each map; none of them an error; `names`: of the maps, for the report; `inputs`: files that the maps
+    came from, by role, for the provenance.
     """
     reports = [answer.report for answer in answers if answer.report is not None]
     scans = [scan for report in reports for scan in scans_of(report.provenance)]
@@ -381,15 +364,7 @@ def _recorded(settings: Settings) -> dict[str, Any]:
 def common_calibration(
     answers: Sequence[Answer], settings: Settings, *, names: Sequence[str]
 ) -> tuple[Path | None, BodyCalibration]:
-    """The calibration that sizes all these maps together, and its file if it is in one.
-
-    Raises
-    ------
-    BadDataError
-        When the maps were normalised in several ways, or one was made with another head than the calibration's.
-    UsageError
-        When the calibration cannot pool maps.
-    """
+    """The calibration that sizes all these maps together, and its file if it is in one."""
     path, calibration = _calibration(answers, settings)
     _check_heads(answers, calibration, names)
     return path, calibration

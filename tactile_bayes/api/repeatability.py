@@ -44,22 +44,15 @@ _LEARN: Final = "learn one from exams that were sized so: `calibrate repeatabili
 
 
 class ExamFolder(Record):
-    """An exam that was estimated, of a mass at a visit.
-
-    Parameters
-    ----------
-    name
-        Of the exam.
-    of_mass, mass
-        Names of the mass at this visit, and at any.
-    folder
-        Which holds what its estimate left.
-    """
+    """An exam that was estimated, of a mass at a visit."""
 
     name: str
+    """Of the exam."""
     of_mass: str
     mass: str
+    """`of_mass`, `mass`: Names of the mass at this visit, and at any."""
     folder: Path
+    """Which holds what its estimate left."""
 
 
 class LearnedRepeatability(Record, eq=False):
@@ -74,29 +67,20 @@ class LearnedRepeatability(Record, eq=False):
 
 
 class _Repeat(Record, eq=False):
-    """A repeated exam with a size.
-
-    Parameters
-    ----------
-    calibration, calibration_sha256
-        That sized it, as its estimate names it.
-    scans
-        Recordings that it came from, as `recordings` names them; empty where its estimate does not say.
-    digest
-        Of the draws that pooling keeps.
-    size
-        The largest, with its interval.
-    spread
-        Between exams, that the size was estimated with.
-    """
+    """A repeated exam with a size."""
 
     exam: ExamFolder
     calibration: str
     calibration_sha256: str
+    """`calibration`, `calibration_sha256`: That sized it, as its estimate names it."""
     scans: tuple[str, ...]
+    """Recordings that it came from, as `recordings` names them; empty where its estimate does not say."""
     digest: str
+    """Of the draws that pooling keeps."""
     size: Quantity
+    """The largest, with its interval."""
     spread: float
+    """Between exams, that the size was estimated with."""
 
     @property
     def shape_path(self) -> Path:
@@ -104,13 +88,7 @@ class _Repeat(Record, eq=False):
 
 
 def exams_in(folder: Path) -> list[ExamFolder]:
-    """Exams that a campaign estimated, by its ``exams_done.csv``.
-
-    Raises
-    ------
-    BadDataError
-        When the folder is no campaign's output.
-    """
+    """Exams that a campaign estimated, by its ``exams_done.csv``."""
     table = folder / DONE
     if not table.is_file():
         raise BadDataError(f"holds no {DONE}", way_out="give a folder of `campaign run`", path=str(folder))
@@ -133,21 +111,10 @@ def learn_from_exams(
 ) -> LearnedRepeatability:
     """Learn the spread between exams of one mass from those that were repeated within a visit.
 
-    Parameters
-    ----------
-    exams
-        Estimated ones; those without a size and those of a scan that another exam has are left out.
-    size_calibration
-        Name or path of the calibration that they were sized by, where it is in no file that the estimates name.
-    fewest
-        Masses with repeated exams that it takes. Default: `size.learn.repeatability.FEWEST_MASSES`.
-
-    Raises
-    ------
-    BadDataError
-        When too few masses have repeated exams, or the exams were sized by several calibrations or another one.
-    UsageError
-        When the calibration's file is not found, or it is not learned over bodies.
+    `exams`: estimated ones; those without a size and those of a scan that another exam has are left out;
+    `size_calibration`: name or path of the calibration that they were sized by, where it is in no file that the
+    estimates name; `fewest`: masses with repeated exams that it takes. Default:
+    `size.learn.repeatability.FEWEST_MASSES`.
     """
     from tactile_bayes.size.learn.site import FEWEST_MASSES, PRIOR_LOG_SD, PRIOR_MEDIAN, learn_repeatability
 
@@ -301,17 +268,7 @@ def repeatability_setting(settings: Settings) -> dict[str, Any]:
 def check_repeatability(settings: Settings, calibration: Calibration, digests: Mapping[str, str]) -> None:
     """Refuse a repeatability of sizes by another calibration: another form has another slope, so another spread.
 
-    Parameters
-    ----------
-    calibration
-        The one that sizes.
-    digests
-        Of the inputs, by role.
-
-    Raises
-    ------
-    BadDataError
-        Naming both.
+    `calibration`: the one that sizes; `digests`: of the inputs, by role.
     """
     found = settings.repeatability
     if found is None or digests.get("size_calibration") == found.calibration_sha256:

@@ -205,13 +205,7 @@ SettingsFile: Final = part_of(
 
 
 def read_settings(path: Path) -> dict[str, Any]:
-    """What a settings file sets, by the names of `Settings`.
-
-    Raises
-    ------
-    BadDataError
-        Naming the file, the key, its value and what is allowed.
-    """
+    """What a settings file sets, by the names of `Settings`."""
     from tactile_bayes.files.documents import load_toml, parse_record
 
     document = load_toml(path, way_out="see settings.schema.json")
@@ -223,12 +217,7 @@ def read_settings(path: Path) -> dict[str, Any]:
 
 
 def refuse_checkpoint(settings: Settings) -> None:
-    """Refuse a checkpoint where several maps are estimated: they would all go on from one.
-
-    Raises
-    ------
-    UsageError
-    """
+    """Refuse a checkpoint where several maps are estimated: they would all go on from one."""
     if settings.checkpoint is not None:
         raise UsageError("a checkpoint is of one map; give one map, or leave checkpoint out of the settings")
 
@@ -240,29 +229,16 @@ GROWN_BY = (0.2,)
 
 
 class Comparing(Record):
-    """How visits are compared.
-
-    Parameters
-    ----------
-    days
-        Time of each visit in days, the first at 0; None where it is not known.
-    grown_by
-        Shares of the diameter by which it may have grown or more.
-    same_mass
-        Whether somebody says that the visits are of one mass, where their places do not show it.
-    registration_mm
-        SD each way of a mass's place between two visits.
-
-    Raises
-    ------
-    UsageError
-        When a value cannot be one.
-    """
+    """How visits are compared."""
 
     days: tuple[float, ...] | None = None
+    """Time of each visit in days, the first at 0; None where it is not known."""
     grown_by: tuple[float, ...] = GROWN_BY
+    """Shares of the diameter by which it may have grown or more."""
     same_mass: bool = False
+    """Whether somebody says that the visits are of one mass, where their places do not show it."""
     registration_mm: float = REGISTRATION_MM
+    """SD each way of a mass's place between two visits."""
 
     def __post_init__(self) -> None:
         for share in self.grown_by:
@@ -272,12 +248,7 @@ class Comparing(Record):
         check_number("registration_mm", self.registration_mm, 0, open_ends=True)
 
     def check_visits(self, visits: int) -> None:
-        """Refuse days that are no times of so many visits.
-
-        Raises
-        ------
-        UsageError
-        """
+        """Refuse days that are no times of so many visits."""
         if self.days is None:
             return
         if len(self.days) != visits:
@@ -289,13 +260,7 @@ class Comparing(Record):
 
 
 def times_of(days: Sequence[float] | None, dates: Sequence[str] | None) -> tuple[float, ...] | None:
-    """Time of each visit in days, the first at 0, from the days of the later ones or from all dates; None for neither.
-
-    Raises
-    ------
-    UsageError
-        When both are given, or something is no date.
-    """
+    """Time of each visit in days, the first at 0, from the later ones' days or from all dates; None for neither."""
     if days is not None and dates is not None:
         raise UsageError("days and dates both say when the visits were; give one of them")
     if dates is not None:
@@ -304,13 +269,7 @@ def times_of(days: Sequence[float] | None, dates: Sequence[str] | None) -> tuple
 
 
 def days_of_dates(dates: Sequence[str]) -> tuple[float, ...]:
-    """Days from the first of some dates, such as 2026-03-01.
-
-    Raises
-    ------
-    UsageError
-        Naming what is no date.
-    """
+    """Days from the first of some dates, such as 2026-03-01."""
     found = []
     for text in dates:
         try:

@@ -37,25 +37,17 @@ HARDEST_RATIO = 100.0
 
 
 class Corrected(Record, eq=False):
-    """A corrected calibration, with what its file holds.
-
-    Parameters
-    ----------
-    base
-        Document of the calibration that was corrected.
-    settings
-        For the provenance.
-    inputs
-        Files by role, for the provenance.
-    seed
-        Of the random numbers, where maps were estimated.
-    """
+    """A corrected calibration, with what its file holds."""
 
     calibration: BodyCalibration
     base: dict[str, Any]
+    """Document of the calibration that was corrected."""
     settings: dict[str, Any]
+    """For the provenance."""
     inputs: dict[str, Path]
+    """Files by role, for the provenance."""
     seed: int | None = None
+    """Of the random numbers, where maps were estimated."""
 
     def write(self, path: Path, *, force: bool = False) -> None:
         """Write the file that `estimate --size-calibration` takes."""
@@ -75,24 +67,9 @@ def correct_size(
 ) -> Corrected:
     """Correct a calibration over bodies by phantoms.
 
-    Parameters
-    ----------
-    table
-        A row for each map of a phantom: its bump (size_table) or its file (phantom_maps).
-    base
-        Name or path of the calibration.
-    declared
-        As for `table_recipe`; for a table of bumps.
-    seed
-        Of the random numbers with which maps are estimated.
-
-    Raises
-    ------
-    BadDataError
-        When the table is not what it must be, its maps were made by another recipe or under another head than the
-        calibration's, or fewer than three phantoms are in its range.
-    UsageError
-        When the calibration cannot be corrected, or options do not go with the table.
+    `table`: a row for each map of a phantom: its bump (size_table) or its file (phantom_maps); `base`: name or path of
+    the calibration; `declared`: as for `table_recipe`; for a table of bumps; `seed`: of the random numbers with which
+    maps are estimated.
     """
     from tactile_bayes.size.learn.site import correct_calibration
 

@@ -66,13 +66,6 @@ def learn_eq6(
     """Learn Eq 6 from a table of lumps, of which those softer than `least_stiffness_ratio` take no part.
 
     By the posterior of all coefficients from all rows (``"joint"``), or as printed, with a bootstrap (``"two-stage"``).
-
-    Raises
-    ------
-    BadDataError
-        When the table does not hold what Eq 6 needs.
-    NotConvergedError
-        When the sampler does not converge.
     """
     recipe = table_recipe(rows, declared)
     try:
@@ -122,13 +115,6 @@ def learn_population(
 
     `normalise` is that of the rows to learn from, and may be left out where all are alike. Lumps of another origin, in
     the same columns, tell by how much such bodies depart: `against`.
-
-    Raises
-    ------
-    BadDataError
-        When bodies are too few or do not vary.
-    NotConvergedError
-        When the posterior has no mode.
     """
     fit = measuring_options().fit
     way, columns = rows_of_one_way(rows, normalise)
@@ -170,15 +156,7 @@ def is_population(source: Path | Sheet) -> bool:
 
 
 def table_recipe(table: Table, declared: Mapping[str, Any]) -> Recipe:
-    """Recipe of a size table's maps: from its columns, else as the options of these names declare, else the default.
-
-    Raises
-    ------
-    BadDataError
-        When rows differ in it, or the table says something else than an option.
-    UsageError
-        When a level is to be fixed on maps that have none.
-    """
+    """Recipe of a size table's maps: from its columns, else as the options of these names declare, else the default."""
     said = {name: _alike(table, name) for name in (*declared, "flat_field")}
     for name, value in declared.items():
         if None not in (value, said[name]) and value != said[name]:

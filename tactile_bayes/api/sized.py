@@ -516,13 +516,7 @@ def pooling_shape(tactile_map: TactileMap, estimate: Estimate) -> ShapeDraws | N
 
 
 def check_one_mass(scans: Sequence[Mapping[str, str]]) -> None:
-    """Refuse scans that say they are of different masses, or of one mass at different visits.
-
-    Raises
-    ------
-    BadDataError
-        Naming what they differ in.
-    """
+    """Refuse scans that say they are of different masses, or of one mass at different visits."""
     for name in ("subject", "side", "mass", "visit"):
         values = sorted({scan[name].casefold(): scan[name] for scan in scans if scan.get(name)}.values())
         if len(values) > 1:

@@ -44,12 +44,7 @@ def structured_report(estimate: EstimateFile, maps: Sequence[MapFile], *, eviden
     A size is the median; the ends of its interval, with its probability, are properties of that measurement. A mass
     without a size is a group with a finding and the reason, and no number.
 
-    Parameters
-    ----------
-    maps
-        That the estimate was made from.
-    evidence
-        The DICOM objects of the maps.
+    `maps`: that the estimate was made from; `evidence`: the DICOM objects of the maps.
     """
     sr = required("highdicom").sr
     report = sr.MeasurementReport(
@@ -214,13 +209,6 @@ def dicom_files(maps: Sequence[MapFile], estimate: EstimateFile | None, *, ident
     """Bytes of the files by their names.
 
     Maps whose place in the patient is not known have a picture and no values: a Parametric Map must have a place.
-
-    Raises
-    ------
-    BadDataError
-        When a map holds no data.
-    UsageError
-        When the date and time of the exam are not given, or the extra is not installed.
     """
     required("highdicom")
     for one in maps:

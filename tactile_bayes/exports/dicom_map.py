@@ -75,13 +75,7 @@ class Study(Record, eq=False):
 
 
 def study_of(identity: Identity, maps: Sequence[MapFile]) -> Study:
-    """The study that maps of one exam belong to.
-
-    Raises
-    ------
-    UsageError
-        When the date and time that DICOM wants are not given.
-    """
+    """The study that maps of one exam belong to."""
     moment, content = identity.study, identity.content
     if moment is None or content is None:
         raise UsageError(
@@ -101,10 +95,7 @@ def study_of(identity: Identity, maps: Sequence[MapFile]) -> Study:
 def add_study(dataset: Any, study: Study, facts: Mapping[str, str] | None = None) -> None:
     """Write the modules of patient, study and equipment into a dataset; what nobody gave stays empty.
 
-    Parameters
-    ----------
-    facts
-        Of an image's exam, for the breast and its side; neither is written of a phantom.
+    `facts`: of an image's exam, for the breast and its side; neither is written of a phantom.
     """
     identity = study.identity
     dataset.SpecificCharacterSet = UTF_8
@@ -250,10 +241,7 @@ PICTURE_SERIES: Final = 2
 def secondary_capture(source: MapFile, estimate: EstimateFile | None, *, study: Study, number: int) -> Any:
     """The figure as a Secondary Capture in red, green and blue.
 
-    Parameters
-    ----------
-    number
-        Of the instance in its series, from 1.
+    `number`: of the instance in its series, from 1.
     """
     highdicom = required("highdicom")
     digest = "" if estimate is None else estimate.digest
@@ -309,15 +297,7 @@ def parametric_map(source: MapFile, *, study: Study, number: int) -> Any:
     Cells without data are NaN, which is also the padding value. A Parametric Map must lie in a frame of reference, so a
     map without a place in the patient cannot be one.
 
-    Parameters
-    ----------
-    number
-        Of the instance in its series, from 1.
-
-    Raises
-    ------
-    ValueError
-        When the map's place in the patient is not known, see `frame_of_reference`.
+    `number`: of the instance in its series, from 1.
     """
     reference = frame_of_reference(source)
     transform = lps_from_plane(source.tactile_map)

@@ -112,13 +112,7 @@ EXTRAS: Final = {"pydicom": "dicom", "highdicom": "dicom", "fhir.resources": "fh
 
 
 def required(module: str) -> Any:
-    """Import a module of an optional package, for example ``highdicom.sr``.
-
-    Raises
-    ------
-    UsageError
-        When its package is not installed, with the command that installs it.
-    """
+    """Import a module of an optional package, for example ``highdicom.sr``."""
     package = next(name for name in EXTRAS if module == name or module.startswith(f"{name}."))
     try:
         return importlib.import_module(module)
@@ -242,13 +236,7 @@ def plain_line(text: str) -> str:
 
 
 def read_exam(path: Path) -> MapFile | list[EstimateFile]:
-    """Read a file of this program, whichever kind it is; a list of estimates gives several.
-
-    Raises
-    ------
-    BadDataError
-        When it is neither a map nor an estimate nor a posterior, or is damaged.
-    """
+    """Read a file of this program, whichever kind it is; a list of estimates gives several."""
     with open_input(path) as file:
         head = file.read(8)
     if head.startswith(HDF5_MAGIC):
@@ -285,13 +273,7 @@ def shared_facts(scans: Iterable[Mapping[str, str]]) -> dict[str, str]:
 
 
 def estimate_of(document: object, path: Path) -> EstimateFile:
-    """An estimate from its JSON object; `path` is what messages call it.
-
-    Raises
-    ------
-    BadDataError
-        When it is no estimate.
-    """
+    """An estimate from its JSON object; `path` is what messages call it."""
     schema = document.get("schema") if isinstance(document, dict) else None
     if not isinstance(document, dict) or not isinstance(schema, str) or schema not in REPORTS:
         raise BadDataError(f"is {schema_kind(schema) or 'no estimate'}", way_out=_WAY_OUT, path=str(path))
@@ -367,13 +349,7 @@ def _read_posterior(path: Path, attributes: Mapping[str, str]) -> EstimateFile:
 
 
 def check_pairs(maps: Sequence[MapFile], estimates: Sequence[EstimateFile]) -> None:
-    """Refuse maps and estimates of which one was not made from the other.
-
-    Raises
-    ------
-    UsageError
-        Naming both files.
-    """
+    """Refuse maps and estimates of which one was not made from the other."""
     for estimate in estimates:
         for one in maps:
             if not estimate.maps:

@@ -35,15 +35,7 @@ _XHTML: Final = "http://www.w3.org/1999/xhtml"
 
 
 def bundle_json(estimate: EstimateFile, identity: Identity) -> str:
-    """The Bundle as JSON, checked by the models of fhir.resources.
-
-    Raises
-    ------
-    BadDataError
-        When a text or number is one that FHIR cannot hold.
-    UsageError
-        When the extra is not installed.
-    """
+    """The Bundle as JSON, checked by the models of fhir.resources."""
     bundle = bundle_of(estimate, identity)
     # R4B has all resources used here as R4 has them; the package's R4 ended with its version 6
     models = required("fhir.resources.R4B.bundle")

@@ -41,13 +41,7 @@ class Moment(Record):
 
     @classmethod
     def of(cls, text: str, *, name: str) -> Moment:
-        """Read ``YYYY-MM-DD``, or ``YYYY-MM-DDTHH:MM[:SS]`` with ``Z`` or ``+HH:MM`` behind it if it is known.
-
-        Raises
-        ------
-        UsageError
-            Naming what the text was given for.
-        """
+        """Read ``YYYY-MM-DD``, or ``YYYY-MM-DDTHH:MM[:SS]`` with ``Z`` or ``+HH:MM`` behind it if it is known."""
         found = _MOMENT.fullmatch(text)
         way_out = "give YYYY-MM-DD or YYYY-MM-DDTHH:MM, with +HH:MM for the time zone if you know it"
         if found is None:
@@ -77,36 +71,28 @@ class Moment(Record):
 
 
 class Identity(Record):
-    """Identity of patient and study; empty where nobody gave it.
-
-    Parameters
-    ----------
-    patient_id, issuer
-        Patient ID and who issued it.
-    patient_name, referring_physician
-        As ``FAMILY^GIVEN^MIDDLE^PREFIX^SUFFIX``.
-    birth_date
-        ``YYYY-MM-DD``.
-    sex
-        ``F``, ``M`` or ``O``.
-    accession, study_id, study_description, study_uid
-        Of the study.
-    study_date, content_date
-        When the exam was, and when its content was made (as the exam where it is not given); see `Moment.of`.
-    """
+    """Identity of patient and study; empty where nobody gave it."""
 
     patient_id: str = ""
     patient_name: str = ""
     birth_date: str = ""
+    """``YYYY-MM-DD``."""
     sex: str = ""
+    """``F``, ``M`` or ``O``."""
     issuer: str = ""
+    """`patient_id`, `issuer`: Patient ID and who issued it."""
     accession: str = ""
     referring_physician: str = ""
+    """`patient_name`, `referring_physician`: As ``FAMILY^GIVEN^MIDDLE^PREFIX^SUFFIX``."""
     study_id: str = ""
     study_description: str = ""
     study_uid: str = ""
+    """`accession`, `study_id`, `study_description`, `study_uid`: Of the study."""
     study_date: str = ""
     content_date: str = ""
+    """`study_date`, `content_date`: When the exam was, and when its content was made (as the exam where it is not
+    given); see `Moment.of`.
+    """
 
     def __post_init__(self) -> None:
         for name in names_of(self):
@@ -141,13 +127,7 @@ class Identity(Record):
         return Moment.of(self.content_date, name="content_date") if self.content_date else self.study
 
     def with_options(self, options: Mapping[str, str]) -> Identity:
-        """The identity with what the command line gives besides.
-
-        Raises
-        ------
-        UsageError
-            When an option contradicts the worklist.
-        """
+        """The identity with what the command line gives besides."""
         for name, value in options.items():
             known = getattr(self, name)
             if known and known != value:
@@ -231,28 +211,12 @@ class Worklist(Record):
 
 
 def identity_of(worklist: Path | None, given: Mapping[str, str]) -> Identity:
-    """The identity that a worklist gives, where there is one, with what is given besides.
-
-    Raises
-    ------
-    BadDataError
-        As of `read_worklist`.
-    UsageError
-        When both say something else.
-    """
+    """The identity that a worklist gives, where there is one, with what is given besides."""
     return Identity(**given) if worklist is None else read_worklist(worklist).with_options(given)
 
 
 def read_worklist(path: Path) -> Identity:
-    """Read the identity that a worklist file gives.
-
-    Raises
-    ------
-    BadDataError
-        When the file is no worklist item, or holds what cannot be an identity.
-    UsageError
-        When it is DICOM and the extra is not installed.
-    """
+    """Read the identity that a worklist file gives."""
     data = read_bytes(path, most=_MOST_BYTES)
     if not data.lstrip().startswith((b"{", b"[")):
         return _identity(_of_dicom(_read_dicom(path), path), path)

@@ -77,13 +77,6 @@ def nrrd_bytes(source: MapFile) -> bytes:
     """A map as the bytes of a NRRD file: float32 values (nx, ny, 1), NaN where there are none.
 
     The axes are the plane's, in ``left-posterior-superior`` and mm; the slice is as thick as a cell is wide.
-
-    Raises
-    ------
-    BadDataError
-        When the map has no landmarks, and so no place in the patient.
-    UsageError
-        When the extra is not installed.
     """
     nrrd = required("nrrd")
     one = source.tactile_map

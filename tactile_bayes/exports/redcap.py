@@ -121,17 +121,8 @@ def _dictionary_row(one: Field) -> dict[str, str]:
 def records_csv(estimates: Sequence[EstimateFile], identity: Identity, *, id_from_scan: bool) -> str:
     """One record per mass of each estimate.
 
-    Parameters
-    ----------
-    identity
-        Its `patient_id` begins the record IDs; without one they follow from the estimates' content.
-    id_from_scan
-        Take the subject codes of the scans for patient IDs.
-
-    Raises
-    ------
-    UsageError
-        When two records would have one ID, or an ID is none that REDCap takes.
+    `identity`: its `patient_id` begins the record IDs; without one they follow from the estimates' content;
+    `id_from_scan`: take the subject codes of the scans for patient IDs.
     """
     rows, seen = [], dict[str, EstimateFile]()
     for estimate in estimates:

@@ -39,12 +39,7 @@ class Outputs(Record):
     """Overwrite files."""
 
     def check(self, *, files: bool) -> None:
-        """Refuse, before any work is done, what could not be written; `files` says whether something is exported.
-
-        Raises
-        ------
-        UsageError
-        """
+        """Refuse, before any work is done, what could not be written; `files` says whether something is exported."""
         if not files and self.dictionary is None:
             raise UsageError("no file was given to export; give a map, an estimate or both")
         if files and self.path is None:
@@ -61,13 +56,7 @@ class Outputs(Record):
                 refuse_existing(path, force=self.force)
 
     def write(self, exported: Exported | None) -> tuple[Path, ...]:
-        """Write the files of the export, and the dictionary: all of them, or none.
-
-        Raises
-        ------
-        UsageError
-            When a file exists and `force` is false, or the folder holds files of another export.
-        """
+        """Write the files of the export, and the dictionary: all of them, or none."""
         paths, folder = dict[Path, bytes](), None
         if exported is not None and self.path is not None:
             if "" not in exported.files:
@@ -125,13 +114,7 @@ class Exported(Record, eq=False):
 
 
 def refuse_untaken(to: ExportFormat, options: Iterable[str]) -> None:
-    """Refuse parts of an identity that a format does not hold, rather than drop them.
-
-    Raises
-    ------
-    UsageError
-        Naming the first one's option.
-    """
+    """Refuse parts of an identity that a format does not hold, rather than drop them."""
     for name in options:
         if name not in TAKES[to]:
             taken = ", ".join(_option(one) for one in TAKES[to]) or "nothing of a patient or study"
@@ -151,19 +134,9 @@ def export(
 ) -> Exported:
     """Export maps and estimates.
 
-    Parameters
-    ----------
-    files
-        As `read_exam` gives them for maps, estimates (JSON) and posteriors, in any order.
-    identity
-        Of patient and study; what the format does not hold is left out.
-    id_from_scan
-        Take the subject code of the scans for the patient ID where none is given.
-
-    Raises
-    ------
-    UsageError
-        When the files do not fit the format or each other, or something that the format needs is missing.
+    `files`: as `read_exam` gives them for maps, estimates (JSON) and posteriors, in any order; `identity`: of patient
+    and study; what the format does not hold is left out; `id_from_scan`: take the subject code of the scans for the
+    patient ID where none is given.
     """
     maps, estimates = _sorted(files)
     check_pairs(maps, estimates)

@@ -41,15 +41,7 @@ class StatedSize(Record):
 def read_stated_size(path: Path, number: int | None = None) -> StatedSize:
     """The largest size that an estimate states.
 
-    Parameters
-    ----------
-    number
-        Which estimate of a list, from 1; a list of one needs none.
-
-    Raises
-    ------
-    BadDataError
-        When the file is neither `estimate --json` of one map or one mass nor a posterior, or holds no size.
+    `number`: which estimate of a list, from 1; a list of one needs none.
     """
     with open_input(path) as file:
         head = file.read(8)
@@ -68,12 +60,8 @@ def fill_from_posteriors(
 ) -> tuple[dict[str, list[Any]], list[Path]]:
     """Fill sizes and intervals in a trial table from the files in its ``posterior`` column.
 
-    Parameters
-    ----------
-    folder
-        Relative paths start here: the folder of the table. ``batch.json#3`` is the third of a list.
-    fault
-        Makes the error for a cell, as `Table.error` does.
+    `folder`: relative paths start here: the folder of the table. ``batch.json#3`` is the third of a list; `fault`:
+    makes the error for a cell, as `Table.error` does.
 
     Returns
     -------
@@ -175,13 +163,7 @@ Holder = EstimateReport | PooledReport | MassReport | AnotherExam
 
 
 def checked_report(document: object, kind: type[R], *, path: Path) -> R:
-    """What ``estimate --json`` printed for one map, or for several: its fields, and its sizes against each other.
-
-    Raises
-    ------
-    BadDataError
-        Naming the file, the field, its value and the rule it breaks.
-    """
+    """What ``estimate --json`` printed for one map, or for several: its fields, and its sizes against each other."""
     report = parse_record(document, kind, path=path)
     try:
         _check_sizes(report)

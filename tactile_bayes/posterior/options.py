@@ -21,37 +21,30 @@ ROTATION_ODDS = 3.0
 
 
 class FitOptions(Record):
-    """How a map is fitted; must agree with the size calibration's recipe.
-
-    Parameters
-    ----------
-    background
-        ``"fixed"`` at the level that normalising defines (1 in Eq 7), or ``"free"``. A map whose level is not known
-        can only have a free one.
-    radius_mm
-        Cells within this distance of the lump's centre are fitted.
-    rotation
-        ``"auto"`` rotates the ellipse only where the odds exceed `ROTATION_ODDS`; ``"off"`` and ``"on"`` decide
-        beforehand.
-    centre_mm
-        Where to look, in `plane`; None takes the highest bump that can be a lump.
-    noise
-        ``"independent"``: least squares, the likelihood divided by the inflation of correlated errors.
-        ``"field"``: correlated errors in the model; level and tilt are integrated out with them.
-    start_width_mm
-        About how wide the bump is, where a fit of the same place has told; None starts from `START_WIDTHS_MM`.
-    field_cosines
-        Of the noise field along each axis: more of them are slower and see finer correlation. None takes as many as the
-        bump's width calls for, see `field.cosines_for`.
-    """
+    """How a map is fitted; must agree with the size calibration's recipe."""
 
     background: Background = "fixed"
+    """``"fixed"`` at the level that normalising defines (1 in Eq 7), or ``"free"``. A map whose level is not known can
+    only have a free one.
+    """
     radius_mm: float = 20.0
+    """Cells within this distance of the lump's centre are fitted."""
     rotation: Rotation = "auto"
+    """``"auto"`` rotates the ellipse only where the odds exceed `ROTATION_ODDS`; ``"off"`` and ``"on"`` decide
+    beforehand.
+    """
     centre_mm: tuple[float, float] | None = None
+    """Where to look, in `plane`; None takes the highest bump that can be a lump."""
     noise: Noise = "independent"
+    """``"independent"``: least squares, the likelihood divided by the inflation of correlated errors. ``"field"``:
+    correlated errors in the model; level and tilt are integrated out with them.
+    """
     start_width_mm: float | None = None
+    """About how wide the bump is, where a fit of the same place has told; None starts from `START_WIDTHS_MM`."""
     field_cosines: int | None = None
+    """Of the noise field along each axis: more of them are slower and see finer correlation. None takes as many as the
+    bump's width calls for, see `field.cosines_for`.
+    """
 
     @property
     def correlated(self) -> bool:
@@ -60,46 +53,32 @@ class FitOptions(Record):
 
 
 class EstimateOptions(Record):
-    """Settings of an estimate.
-
-    Parameters
-    ----------
-    method
-        One of `presets.METHODS`.
-    fit
-        Background, window, rotation, centre, noise.
-    prior
-        On the bump.
-    max_steps
-        Of the ensemble; None for its default.
-    accuracy_sd
-        Wanted Monte-Carlo error of the ends of 95 % intervals, of sizes and widths alike, in posterior SDs; None for
-        the method's default.
-    size_priors
-        Spread between maps and shape of the lump; only a calibration over bodies uses them.
-    scene
-        One of `presets.SceneAsked`, under a noise field.
-    accuracy_mm
-        The same in mm; the finer of the two holds. Under a noise field.
-    store
-        Where an ensemble keeps its state between runs, under a noise field.
-    draws
-        Of ``laplace`` under a noise field; 400 know the ends of an interval to a tenth of an SD.
-    step_up
-        Under a noise field: whether the next method is tried where the one asked for fails.
-    """
+    """Settings of an estimate."""
 
     method: Method = "importance"
+    """One of `presets.METHODS`."""
     fit: FitOptions = field(default_factory=FitOptions)
+    """Background, window, rotation, centre, noise."""
     prior: BumpPrior = field(default_factory=BumpPrior)
+    """On the bump."""
     max_steps: int | None = None
+    """Of the ensemble; None for its default."""
     accuracy_sd: float | None = None
+    """Wanted Monte-Carlo error of the ends of 95 % intervals, of sizes and widths alike, in posterior SDs; None for the
+    method's default.
+    """
     size_priors: SizePriors = field(default_factory=SizePriors)
+    """Spread between maps and shape of the lump; only a calibration over bodies uses them."""
     scene: SceneAsked = "auto"
+    """One of `presets.SceneAsked`, under a noise field."""
     accuracy_mm: float | None = None
+    """The same in mm; the finer of the two holds. Under a noise field."""
     store: ChainStore | None = None
+    """Where an ensemble keeps its state between runs, under a noise field."""
     draws: int = INDEPENDENT_DRAWS
+    """Of ``laplace`` under a noise field; 400 know the ends of an interval to a tenth of an SD."""
     step_up: bool = True
+    """Under a noise field: whether the next method is tried where the one asked for fails."""
 
 
 def check_options(options: EstimateOptions) -> None:

@@ -23,10 +23,7 @@ from tactile_bayes.size.terms import SiteShift
 def site_words(site: SiteShift, log_width: float | None = None) -> str:
     """Which calibration was corrected, by how many phantoms and by how much.
 
-    Parameters
-    ----------
-    log_width
-        ln of the mean width in mm of the map in question; that of the phantoms where left out.
+    `log_width`: ln of the mean width in mm of the map in question; that of the phantoms where left out.
     """
     p = site.phantoms_log_width if log_width is None else log_width
     middle, low, high = site.percent(p)
@@ -259,12 +256,8 @@ def calibration_text(
 ) -> str:
     """Text of a size calibration: fit, domain and r2 of each axis, and recipe.
 
-    Parameters
-    ----------
-    not_left_out
-        Why the table's geometries could not be left out in turn, where that is so.
-    other_fit
-        What the other of the two fits makes of the same rows.
+    `not_left_out`: why the table's geometries could not be left out in turn, where that is so; `other_fit`: what the
+    other of the two fits makes of the same rows.
     """
     how = "two-stage fit as printed +- SD of a bootstrap" if is_two_stage(calibration) else "posterior mean +- SD"
     lines = [f"Eq 6: d = m sigma / (e a^f) + b, {how}"]

@@ -150,14 +150,8 @@ def compare_report(
 ) -> CompareReport:
     """Report of a comparison from what `estimate` says of each visit's maps.
 
-    Parameters
-    ----------
-    days
-        Time of each visit; None where it is not known.
-    grown_by
-        Shares of the diameter.
-    repeatability
-        Of the site, where the comparison used one.
+    `days`: time of each visit; None where it is not known; `grown_by`: shares of the diameter; `repeatability`: of the
+    site, where the comparison used one.
     """
     joint = compared.joint
     changes: list[ChangeReport] = []

@@ -56,16 +56,8 @@ def fit_figure(
 ) -> Figure:
     """Draw data, fit and residual of a fit window, data and fit in the same colours; see `figure_file` for the file.
 
-    Parameters
-    ----------
-    tactile_map
-        The map that the window is of.
-    fitted
-        The window's cells, see `fitted_cells`.
-    title
-        Above the figure; nothing that identifies a person.
-    findings
-        What speaks against the fit, told above it.
+    `tactile_map`: the map that the window is of; `fitted`: the window's cells, see `fitted_cells`; `title`: above the
+    figure; nothing that identifies a person; `findings`: what speaks against the fit, told above it.
     """
     window, (value, fit, residual) = _window(tactile_map, fitted)
     low, high = (float(end) for end in np.nanquantile(np.stack([value, fit]), _ENDS))
@@ -137,24 +129,10 @@ def size_figure(
 ) -> Figure:
     """Draw the posterior of a lump's largest and smallest size; with a path, also write it (PNG, PDF or SVG).
 
-    Parameters
-    ----------
-    draws_max_mm, draws_min_mm : (n,) arrays
-        Posterior draws; those that are not finite are left out.
-    intervals
-        For ``"max"``, ``"min"`` and ``"alike"``, drawn as bars labelled with probability and kind; the last is of the
-        largest size if exams differ less.
-    title
-        Above the figure; nothing that identifies a person.
-    findings
-        What speaks against the size, told above it.
-
-    Raises
-    ------
-    BadDataError
-        When there are fewer than two finite draws.
-    UsageError
-        When `path` exists and `force` is false, or its suffix is unknown.
+    `draws_max_mm`, `draws_min_mm` (n,) arrays: posterior draws; those that are not finite are left out; `intervals`:
+    for ``"max"``, ``"min"`` and ``"alike"``, drawn as bars labelled with probability and kind; the last is of the
+    largest size if exams differ less; `title`: above the figure; nothing that identifies a person; `findings`: what
+    speaks against the size, told above it.
     """
     size_in = (7.0, 4.0 + 0.4 * ("alike" in intervals))
     with figure_file(path, size_in=size_in, force=force, findings=findings) as figure:
@@ -278,14 +256,8 @@ def draw_figures(
 ) -> None:
     """Draw the requested figures. Without a size, or a fit, they show the map, the places looked at and the reason.
 
-    Parameters
-    ----------
-    figure, map_figure, fit_figure
-        Where to; None draws nothing. A map without data cannot be drawn.
-    name
-        Of the map, for the titles.
-    probability
-        Of the interval of the size.
+    `figure`, `map_figure`, `fit_figure`: where to; None draws nothing. A map without data cannot be drawn; `name`: of
+    the map, for the titles; `probability`: of the interval of the size.
     """
     if figure is not None and estimate.size is not None:
         draw_size(estimate.size, figure, name=name, probability=probability, findings=estimate.findings, force=force)
@@ -411,17 +383,7 @@ def draw_comparison(
     Maps of a visit are averaged about the mass. With landmarks on all maps the axes are the patient's, at the first
     visit's place, and later visits are moved so that the mass lies on itself. Without, they are the plane's.
 
-    Parameters
-    ----------
-    visits
-        Maps of each visit.
-    path
-        Written as PNG, PDF or SVG; None writes nothing.
-
-    Raises
-    ------
-    UsageError
-        When `path` exists and `force` is false, or its suffix is unknown.
+    `visits`: maps of each visit; `path`: written as PNG, PDF or SVG; None writes nothing.
     """
     in_patient = all(one.tactile_map.patient_from_plane is not None for maps in visits for one in maps)
     laid = [_averaged(maps, in_patient=in_patient) for maps in visits]

@@ -153,10 +153,7 @@ WORTH_NARROWING = 10.0
 def width_lines(variance_share: Mapping[str, float]) -> list[str]:
     """Sources of a size's variance, largest first, and ways to narrow the interval.
 
-    Parameters
-    ----------
-    variance_share
-        Percent of the variance of the largest size, by source.
+    `variance_share`: percent of the variance of the largest size, by source.
     """
     ranked = sorted(variance_share.items(), key=lambda pair: -pair[1])
     parts = [f"{share:.0f} % {SOURCES.get(name, name)}" for name, share in ranked if share >= 0.5]
@@ -402,16 +399,8 @@ def estimate_summary(
 ) -> str:
     """Report of one map in at most `MOST_LINES` lines; `estimate_text` gives the rest.
 
-    Parameters
-    ----------
-    quantities
-        As `estimate_quantities` gives them; empty without an estimate.
-    probability
-        Of the intervals.
-    masses
-        As `mass_reports` gives them.
-    place
-        Of the lump about the nipple, where it is known.
+    `quantities`: as `estimate_quantities` gives them; empty without an estimate; `probability`: of the intervals;
+    `masses`: as `mass_reports` gives them; `place`: of the lump about the nipple, where it is known.
     """
     if estimate.status == "no_estimate":
         body = finding_summary(estimate.findings, "caution", most=MOST_CAUTIONS)

@@ -118,13 +118,7 @@ class Exam(Record, eq=False):
 
 
 class Given(Record):
-    """What was given for the page besides maps: title, name and date, empty where they were not.
-
-    Raises
-    ------
-    UsageError
-        When a text is too long for the page or not printable, or the day is no date.
-    """
+    """What was given for the page besides maps: title, name and date, empty where they were not."""
 
     title: str = ""
     name: str = ""

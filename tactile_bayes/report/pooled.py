@@ -49,14 +49,9 @@ def pooled_report(
 ) -> PooledReport:
     """Report of a mass from what `estimate` says of its maps.
 
-    Parameters
-    ----------
-    repeatability
-        The site's, where the size is by it.
-    apart
-        What is to be said of maps whose mass lies elsewhere than the others', by their place in the list.
-    one_place
-        Whether the masses of all maps lie at one place in the patient; None where that cannot be told.
+    `repeatability`: the site's, where the size is by it; `apart`: what is to be said of maps whose mass lies elsewhere
+    than the others', by their place in the list; `one_place`: whether the masses of all maps lie at one place in the
+    patient; None where that cannot be told.
     """
     size, used = pooled.size, pooled.calibration or calibration
     found: dict[str, Quantity] = {}
@@ -162,10 +157,8 @@ def _chances(pooled: PooledEstimate) -> tuple[float, float | None]:
 def disagreement(what: str, probability: float, if_exams_differ: float | None = None) -> Finding:
     """Caution where maps are not of one size, or not of one mass.
 
-    Parameters
-    ----------
-    probability, if_exams_differ
-        Of maps of one mass that are as far apart or farther, by the spread supposed and by the paper's.
+    `probability`, `if_exams_differ`: of maps of one mass that are as far apart or farther, by the spread supposed and
+    by the paper's.
     """
     patients = (
         "" if if_exams_differ is None else f" ({_chance(if_exams_differ)} if exams differ as those of patients did)"

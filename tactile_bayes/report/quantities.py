@@ -124,12 +124,8 @@ def from_xiphoid(x_mm: float, y_mm: float) -> str:
 def side_findings(side: str, patient_mm: tuple[float, float] | None) -> tuple[Finding, ...]:
     """Caution where the landmarks put a lump on the other side of the body than the scans say; empty where they do not.
 
-    Parameters
-    ----------
-    side
-        As `side_of` gives it.
-    patient_mm
-        From the xiphoid to the patient's right and up; None without landmarks or a lump.
+    `side`: as `side_of` gives it; `patient_mm`: from the xiphoid to the patient's right and up; None without landmarks
+    or a lump.
     """
     if side not in SIDES or patient_mm is None or abs(patient_mm[0]) < MIDDLE_MM:
         return ()
