@@ -269,6 +269,6 @@ def estimated_at(found: SizeEstimate, place: tuple[float, float]) -> SizeEstimat
 def estimate_inputs(
     settings: Settings, tactile_map: TactileMap
 ) -> tuple[Calibration | None, EstimateOptions, NoSize | None]:
-    """What `estimate_one` takes for a map: calibration and options, and why there is no calibration where there is none."""
+    """What `estimate_one` takes for a map: calibration and options, and why there is no calibration."""
     _, calibration, why_none = choose_calibration(settings, tactile_map)
     return calibration, _options(settings, calibration, tactile_map), why_none

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from in_process import run_here
 from posterior_maps import bump_map
+from published_schemas import check_document
 from settings_files import settings
 
 import tactile_bayes as tb
@@ -17,7 +18,6 @@ from tactile_bayes.commands.estimate import numbered
 from tactile_bayes.declarations import from_plain, replace
 from tactile_bayes.errors import UsageError
 from tactile_bayes.files.comparison import CompareReport
-from tactile_bayes.files.documents import check_document
 from tactile_bayes.files.map_nc import read_map, write_map
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.geometry import rigid
@@ -76,7 +76,7 @@ def grown(folder: Path) -> dict:
     done = run(folder, "a0.nc", "a1.nc", "--with", "grown0.nc", "grown1.nc", "--days", 100, "--json")
     assert done.returncode == 0, done.stderr
     document = json.loads(done.stdout)
-    check_document(document, "compare.schema.json", path=Path("the report"))
+    check_document(document, "compare.schema.json")
     return document
 
 
@@ -133,7 +133,7 @@ def test_visits_that_are_not_shown_to_be_of_one_mass_are_refused_with_the_reason
     assert "Change of the diameter" not in done.stdout
     assert done.stdout.splitlines()[-1] == RESEARCH_USE
     document = json.loads(run(folder, "a0.nc", "--with", later, "--json").stdout)
-    check_document(document, "compare.schema.json", path=Path("the report"))
+    check_document(document, "compare.schema.json")
     assert document["status"] == ("no_estimate" if later == "empty.nc" else "not_one_mass")
     assert document["changes"] == []
 

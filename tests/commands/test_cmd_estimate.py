@@ -15,10 +15,11 @@ import pytest
 from in_process import run_here
 from plain_calibration import RECIPE
 from posterior_files import write_calibration, write_maps
+from published_schemas import check_document
 from settings_files import settings
 
 from tactile_bayes.declarations import replace
-from tactile_bayes.files.documents import check_document, load_schema
+from tactile_bayes.files.documents import load_schema
 
 Run = Callable[..., "CompletedProcess[str]"]
 FAST = ("--method", "laplace")
@@ -54,7 +55,7 @@ def test_json_has_every_documented_key_and_passes_its_schema(alone: dict[str, st
     for text in alone.values():
         document = json.loads(text)
         assert set(schema["required"]) <= set(document)
-        check_document(document, "estimate.schema.json", path=Path("stdout"))
+        check_document(document, "estimate.schema.json")
     found = json.loads(alone["a"])
     assert found["status"] == "estimate"
     for name in ("max_size_mm", "min_size_mm", "d_x_mm", "d_y_mm", "amplitude", "sigma_x_mm", "sigma_y_mm"):
@@ -70,7 +71,7 @@ def test_a_document_out_of_order_would_not_pass(alone: dict[str, str]) -> None:
     document = json.loads(alone["a"])
     document["amplitude"].pop("kind")
     with pytest.raises(ValueError, match="amplitude"):
-        check_document(document, "estimate.schema.json", path=Path("stdout"))
+        check_document(document, "estimate.schema.json")
 
 
 def test_text_tells_the_size_its_interval_and_what_was_left_out(ensemble_run: CompletedProcess[str]) -> None:

@@ -10,10 +10,10 @@ import pytest
 from in_process import run_here
 from posterior_files import MADE, write_calibration, write_maps
 from posterior_maps import bump_map, correlated_field, grid_map
+from published_schemas import check_document
 from settings_files import settings
 
 from tactile_bayes.declarations import from_plain, replace
-from tactile_bayes.files.documents import check_document
 from tactile_bayes.files.estimate_json import read_stated_size
 from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.files.reports import PooledReport
@@ -60,7 +60,7 @@ def test_each_shipped_calibration_opens_and_says_what_it_was_made_of(name: str) 
     document = json.loads(path.read_text())
     read_size_calibration(path)  # trusted: what comes with the program is held against its schema here
     schemas = {"population": "size_population", "eq6": "size_calibration"}
-    check_document(document, f"{schemas[document['form']]}.schema.json", path=path)
+    check_document(document, f"{schemas[document['form']]}.schema.json")
     assert document["provenance"]["command"].startswith("calibrate size")
     assert document["provenance"]["inputs"]
 
@@ -118,7 +118,7 @@ def test_none_gives_widths_and_a_map_made_otherwise_says_why_it_has_no_size(fold
 
 
 def test_a_pooled_mass_keeps_its_schema_and_its_maps(pooled: dict, folder: Path) -> None:
-    check_document(pooled, "pooled.schema.json", path=Path("stdout"))
+    check_document(pooled, "pooled.schema.json")
     assert [one["map"] for one in pooled["maps"]] == ["mass1.nc", "mass2.nc", "mass3.nc"]
     alone = json.loads(run_here("estimate", "mass1.nc", *FAST, "--json", cwd=folder).stdout)
     size, another = pooled["max_size_mm"], pooled["another_exam"]["max_size_mm"]

@@ -11,6 +11,7 @@ from in_process import run_here
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 from posterior_maps import bump_values, correlated_field, grid_map
+from published_schemas import check_document
 from searched_once import searched_once  # noqa: F401 - all tests of this file use it
 
 import tactile_bayes as tb
@@ -18,7 +19,6 @@ from tactile_bayes.api.estimating import estimate_one
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.api.sized import SizeEstimate
 from tactile_bayes.declarations import replace
-from tactile_bayes.files.documents import check_document
 from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.findings import Finding
@@ -151,7 +151,7 @@ def test_two_narrow_bumps_close_to_each_other_are_two_masses_that_may_be_one_lum
     sizes = [one["max_size_mm"]["median"] for one in document["masses"]]
     assert pair["apart_mm"] == pytest.approx(5.5, abs=0.3)
     assert pair["together_mm"]["median"] == pytest.approx(pair["apart_mm"] + sum(sizes) / 2, rel=1e-6)
-    check_document(document, "estimate.schema.json", path=Path("estimate.json"))
+    check_document(document, "estimate.schema.json")
     # the control: one bump of that width is one mass
     alone = found_on(narrow_bumps(second=0.0)).answer.document
     assert alone is not None
@@ -215,7 +215,7 @@ def test_json_text_figure_and_python_list_them(tmp_path: Path) -> None:
     write_map(tmp_path / "two.nc", scene(narrow=0.6), provenance=Provenance("import", {}))
     words = ("estimate", "two.nc", "--method", "laplace")
     document = json.loads(run_here(*words, "--json", cwd=tmp_path).stdout)
-    check_document(document, "estimate.schema.json", path=tmp_path / "two.json")
+    check_document(document, "estimate.schema.json")
     masses = document["masses"]
     assert [(one["number"], one["reported"]) for one in masses] == [(1, True), (2, False)]
     assert masses[0]["max_size_mm"] == document["max_size_mm"]
@@ -252,7 +252,7 @@ def test_a_mass_besides_the_reported_one_has_its_axes_their_angle_and_its_ellips
     found = found_on(grid_map(noisy, normalise="gain"))
     document = found.answer.document
     assert document is not None
-    check_document(document, "estimate.schema.json", path=Path("two.json"))
+    check_document(document, "estimate.schema.json")
     reported, second = document["masses"]
     for name in ("d_x_mm", "d_y_mm", "angle_deg"):
         assert reported[name] == document[name], name  # which are the first mass's

@@ -15,11 +15,11 @@ from subprocess import CompletedProcess
 import numpy as np
 import pytest
 from posterior_maps import bump_values, correlated_field, grid_map
+from published_schemas import check_document
 
 from tactile_bayes.api.estimating import estimate_inputs
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.declarations import replace, to_plain
-from tactile_bayes.files.documents import check_document
 from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.inference import importance as importance_module
@@ -203,7 +203,7 @@ def test_it_can_be_read_printed_and_drawn(tmp_path: Path):
     assert text.splitlines()[-1] == "Research use only: not a diagnostic device."
     assert sum(line.startswith("Advice: ") for line in text.splitlines()) == 1
     document = json.loads(json.dumps(to_plain(ladder_file(found, varied="estimate", provenance={}))))
-    check_document(document, "tradeoff.schema.json", path=tmp_path)
+    check_document(document, "tradeoff.schema.json")
     assert [one["default"] for one in document["settings"]].count(True) == 1
     for name in ("a.png", "b.png"):
         draw_ladder(found, tmp_path / name, title="a map")

@@ -8,13 +8,13 @@ from functools import cache
 from pathlib import Path
 
 import pytest
+from published_schemas import check_document
 
 import tactile_bayes
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.api.tradeoffs import tradeoff_of_scan
 from tactile_bayes.declarations import to_plain
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.files.documents import check_document
 from tactile_bayes.files.scan_mcap import read_scan
 from tactile_bayes.mapping.select import first_seconds
 from tactile_bayes.report.tradeoff import ladder_file, ladder_text
@@ -68,7 +68,7 @@ def test_cells_too_large_come_out_as_wrong():
     assert ladder().enough() is not wrong
 
 
-def test_what_cannot_be_built_or_sized_is_a_row_too(tmp_path: Path):
+def test_what_cannot_be_built_or_sized_is_a_row_too():
     short = next(one for one in ladder().rows if one.axis == study.TIME)
     for one in (short, row("--every 1000")):
         assert one.answer.reported is None
@@ -80,7 +80,7 @@ def test_what_cannot_be_built_or_sized_is_a_row_too(tmp_path: Path):
     text = ladder_text(ladder())
     assert "a width: this map has no size" in text
     assert "map s  estimate s" in text
-    check_document(to_plain(ladder_file(ladder(), varied="map", provenance={})), "tradeoff.schema.json", path=tmp_path)
+    check_document(to_plain(ladder_file(ladder(), varied="map", provenance={})), "tradeoff.schema.json")
 
 
 def test_a_scan_without_a_map_is_refused():
