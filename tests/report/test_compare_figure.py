@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from plain_reports import compare_report
 from posterior_maps import bump_values, grid_map
 
 from tactile_bayes.declarations import replace
@@ -14,7 +15,7 @@ from tactile_bayes.size.visits import Compared
 PLACE = np.array([60.0, 90.0])
 BESIDE = np.array([12.0, 6.0])
 """From the mass to a second bump, in the patient's frame: to the patient's right, and up."""
-REFUSED = {"status": "not_one_mass", "reason": "a test", "advice": "", "findings": []}
+REFUSED = compare_report(reason="a test")
 
 
 def visit(angle_rad: float, *, height: float, landmarks: bool = True) -> DrawnMap:
@@ -67,8 +68,8 @@ def test_a_visit_without_a_lump_is_left_empty() -> None:
     assert np.ma.getmaskarray(found[1].get_array()).all()
 
 
-def panels(*visits: DrawnMap, **document: object):
-    figure = draw_comparison(Compared("not_one_mass"), {**REFUSED, **document}, [[one] for one in visits], None)
+def panels(*visits: DrawnMap, **told: object):
+    figure = draw_comparison(Compared("not_one_mass"), replace(REFUSED, **told), [[one] for one in visits], None)
     figure.canvas.draw()
     return figure, [axes for axes in figure.axes if axes.images and axes.get_title(loc="left")]
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from tactile_bayes.declarations import names_of
+from tactile_bayes.files.comparison import COMPARE, CompareReport
 from tactile_bayes.files.reports import ESTIMATE, POOLED, EstimateReport, PooledReport
 from tactile_bayes.presets import RESEARCH_USE
 
@@ -23,6 +24,12 @@ def pooled_report(**more: Any) -> PooledReport:
     return PooledReport(
         **_nothing(PooledReport) | _HEAD | {"figures": {}, "unknowns": {}, "schema": POOLED} | _FOOT | more
     )
+
+
+def compare_report(**more: Any) -> CompareReport:
+    """The report of a comparison that was refused."""
+    own = {"advice": "", "visits": (), "places": (), "changes": (), "schema": COMPARE, "status": "not_one_mass"}
+    return CompareReport(**_nothing(CompareReport) | _HEAD | own | _FOOT | more)
 
 
 def _nothing(kind: Any) -> dict[str, Any]:
