@@ -13,7 +13,7 @@ from tactile_bayes.declarations import Record, field
 from tactile_bayes.findings import SEVERITIES, Finding, finding_lines
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.report.compare import Growth, growth_section
+from tactile_bayes.report.compare import Growth
 from tactile_bayes.report.pages import TEMPLATES, page
 
 FAILED, UNSIZED, SIZED = "failed", "without a size", "sized"
@@ -103,7 +103,7 @@ def campaign_html(
         research_use=RESEARCH_USE,
         lines=lines,
         beside=links,
-        growth="\n".join(growth_section(growth)),
+        growth=growth,
         counts={status: sum(card.status == status for card in cards) for status in _CLASSES},
         cards=cards,
         version=version,

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import html
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
@@ -40,12 +39,7 @@ if TYPE_CHECKING:
 
 # --- Growth of masses between visits, as `compare` told it: rows of a table and a section of a page.
 
-HEADS: Final = ("mass", "visits", "days", "earlier mm", "later mm", "change", "")
 _VERDICTS: Final = {"grown": "grown", "shrunk": "shrunk", "no_change_shown": "no change shown"}
-_NOTE: Final = (
-    "Change of the largest diameter from the first visit; intervals in brackets. What the body hides "
-    "from all maps cancels in it. It is no part of the errors against excision, which are of the last visit."
-)
 
 
 class Growth(Record, eq=False):
@@ -103,32 +97,6 @@ def growth_line(rows: Sequence[Growth], table: str) -> str:
     masses = len({(row.patient, row.mass) for row in rows})
     told = ", ".join(f"{count} {words}" for words, count in counts.items() if count)
     return f"growth of {masses} mass{'es' * (masses > 1)} with several visits: {told} ({table})"
-
-
-def growth_section(rows: Sequence[Growth]) -> Iterator[str]:
-    """Section of a page; nothing without rows. Every text is escaped."""
-    if not rows:
-        return
-    yield '<section class="growth"><h2>Growth between visits</h2>'
-    heads = "".join(f"<th>{html.escape(head)}</th>" for head in HEADS)
-    lines = "".join(f"<tr>{''.join(f'<td>{cell}</td>' for cell in _cells(row))}</tr>" for row in rows)
-    yield f'<div class="wide" tabindex="0"><table><tr>{heads}</tr>{lines}</table></div>'
-    yield f'<p class="note">{html.escape(_NOTE)}</p></section>'
-
-
-def _cells(row: Growth) -> list[str]:
-    name = html.escape(f"{row.patient} {row.mass}")
-    sizes = [f"{q.median:.1f} <small>[{q.low:.1f}, {q.high:.1f}]</small>" for q in row.sizes_mm] or ["", ""]
-    q = row.percent
-    change = "" if q is None else f"{q.median:+.0f} % <small>[{q.low:+.0f}, {q.high:+.0f}]</small>"
-    return [
-        f'<a href="{html.escape(row.link)}">{name}</a>' if row.link else name,
-        html.escape(f"{row.earlier} to {row.later}"),
-        "" if row.days is None else f"{row.days:g}",
-        *sizes,
-        change,
-        html.escape(row.words),
-    ]
 
 
 # --- The report of a comparison: what `compare --json` prints.

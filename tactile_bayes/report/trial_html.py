@@ -13,7 +13,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from tactile_bayes.declarations import UNSET
-from tactile_bayes.report.compare import Growth, growth_section
+from tactile_bayes.report.compare import Growth
 from tactile_bayes.report.pages import page
 from tactile_bayes.report.trial import found_share, growing_line, limit_rows, number, ratio_line, shown
 from tactile_bayes.trial.calibration import BINS, Calibration, Prediction
@@ -272,7 +272,7 @@ def trial_html(report: TrialReport, trial: Trial, *, text: str, growth: Sequence
         replicates=_replicates(report),
         calibrations=list(_calibrations(report, trial)),
         pairs=_pairs(report),
-        growth="\n".join(growth_section(growth)),
+        growth=growth,
         next_mass=None if report.next_mass is UNSET else _next_mass(report.next_mass),
         checks=_checks(checks) if checks else None,
         settings=_settings(report),
