@@ -23,10 +23,13 @@ from tactile_bayes.files.atomic import check_suffix, refuse_existing, unwritable
 from tactile_bayes.files.documents import dump_json, with_session
 from tactile_bayes.files.estimate_json import read_stated_size
 from tactile_bayes.files.identify import describe
+from tactile_bayes.files.imports import read_arrays, read_grid
 from tactile_bayes.files.map_nc import read_posterior, write_map
 from tactile_bayes.files.provenance import Provenance, hash_inputs
+from tactile_bayes.files.scan_mcap import read_scan_report, read_truth, write_scan
 from tactile_bayes.files.size_json import SHIPPED, size_calibration_path
 from tactile_bayes.findings import finding_lines
+from tactile_bayes.inference.ensemble import convergence
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.figure_file import named_exam
 from tactile_bayes.report.posterior_figures import corner_figure, rank_figure, trace_figure
@@ -90,16 +93,12 @@ def _check_units(units: str | None, normalise: str | None) -> None:
 
 
 def _import_scan(source: Path, output: Path, session_file: Path | None, *, force: bool) -> list[str]:
-    from tactile_bayes.files.scan_mcap import read_scan_report, read_truth, write_scan
-
     lost: tuple[str, ...] = ()
     truth = None
     if source.suffix.lower() == ".mcap":
         file = read_scan_report(source)
         scan, lost, truth = file.scan, file.lost, read_truth(source)
     else:
-        from tactile_bayes.files.imports import read_arrays
-
         scan = read_arrays(source)
     files = {"source": source} | ({"session": session_file} if session_file else {})
     provenance = Provenance("import", {"as": "scan", "lost": list(lost)}, inputs=hash_inputs(**files))
@@ -110,8 +109,6 @@ def _import_scan(source: Path, output: Path, session_file: Path | None, *, force
 def _import_map(
     source: Path, output: Path, *, spacing_mm: float | None, normalise: str, units: str, force: bool
 ) -> list[str]:
-    from tactile_bayes.files.imports import read_grid
-
     tactile_map = read_grid(source, spacing_mm=spacing_mm, normalise=normalise, units=units)
     settings = {"as": "map", "spacing_mm": tactile_map.recipe.cell_mm, "normalise": normalise, "units": units}
     provenance = Provenance("import", settings, inputs=hash_inputs(source=source))
@@ -276,8 +273,6 @@ def _figures(found: PosteriorDraws) -> dict[str, dict[str, Any]]:
     shown = {name: found.draws[name] for name in _QUANTITIES if name in found.draws}
     figures: dict[str, dict[str, Any]] = {name: {"median": float(np.nanmedian(d))} for name, d in shown.items()}
     if all(len(draws) > 1 for draws in shown.values()):
-        from tactile_bayes.inference.ensemble import convergence
-
         for name, draws in shown.items():
             figures[name] |= convergence(draws)
     return figures
@@ -352,7 +347,6 @@ class Steps(Record):
 
     def default_road(self) -> StatedSize:
         """Map and estimate with default options; returns the size."""
-        from tactile_bayes.commands import estimate
         from tactile_bayes.commands import estimate as map
 
         self._say("1. Build the tactile map: all readings of the scan, averaged in cells of 1 mm.")
@@ -434,8 +428,6 @@ def _as_typed(command: click.Command, parameters: dict[str, Any]) -> str:
 
 
 def _truth(scan: Path) -> float:
-    from tactile_bayes.files.scan_mcap import read_truth
-
     truth = read_truth(scan)
     if truth is None:
         raise UsageError(f"{scan} holds no truth; it is not the embedded scan")

@@ -14,6 +14,7 @@ from tactile_bayes.api.sized import Answer, SizeEstimate, size_priors
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import NO_LUMP, BadDataError, TactileBayesError
 from tactile_bayes.files.map_nc import read_map_and_scans
+from tactile_bayes.files.npz import CheckpointFile
 from tactile_bayes.files.provenance import Provenance, hash_inputs
 from tactile_bayes.files.reports import Place
 from tactile_bayes.files.size_json import SHIPPED, default_for, read_size_calibration, size_calibration_path
@@ -109,8 +110,6 @@ def estimate_one(
         check_repeatability(settings, calibration, digests)
         calibration = calibration_for(tactile_map, calibration)
     if settings.checkpoint is not None:
-        from tactile_bayes.files.npz import CheckpointFile
-
         context = digests.get("size_calibration", "no calibration")
         options = replace(options, store=CheckpointFile(settings.checkpoint, context=context))
 

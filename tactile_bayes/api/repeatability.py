@@ -14,6 +14,7 @@ from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.atomic import sha256
 from tactile_bayes.files.documents import read_record
 from tactile_bayes.files.manifest_csv import DONE, ESTIMATE, EXAMS, SHAPE, exam_name, mass_name
+from tactile_bayes.files.npz import read_shape
 from tactile_bayes.files.provenance import Provenance, recordings, scans_of
 from tactile_bayes.files.reports import EstimateReport
 from tactile_bayes.files.size_json import (
@@ -30,6 +31,7 @@ from tactile_bayes.files.tables import read_raw
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.inference.points import normal_quantile
 from tactile_bayes.size.bodies import BodyCalibration
+from tactile_bayes.size.learn.site import FEWEST_MASSES, PRIOR_LOG_SD, PRIOR_MEDIAN, RepeatedExams, learn_repeatability
 from tactile_bayes.size.pooling import log_size_alone
 
 if TYPE_CHECKING:
@@ -116,8 +118,6 @@ def learn_from_exams(
     estimates name; `fewest`: masses with repeated exams that it takes. Default:
     `size.learn.repeatability.FEWEST_MASSES`.
     """
-    from tactile_bayes.size.learn.site import FEWEST_MASSES, PRIOR_LOG_SD, PRIOR_MEDIAN, learn_repeatability
-
     groups, left_out = _repeats(exams)
     one_by_one = [repeat for group in groups for repeat in group]
     name, digest = _calibration_named(one_by_one)
@@ -229,9 +229,6 @@ def _calibration(name: str, digest: str, given: str | None) -> BodyCalibration:
 
 
 def _repeated(group: Sequence[_Repeat], calibration: BodyCalibration) -> RepeatedExams:
-    from tactile_bayes.files.npz import read_shape
-    from tactile_bayes.size.learn.site import RepeatedExams
-
     first = group[0].exam
     values = np.array([log_size_alone(calibration, read_shape(repeat.shape_path)) for repeat in group])
     return RepeatedExams(first.of_mass, first.mass, values[:, 0], values[:, 1])

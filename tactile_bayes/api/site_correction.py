@@ -25,6 +25,7 @@ from tactile_bayes.forward.tissue import parse_seat
 from tactile_bayes.presets import HEAD_PROFILE, LEAST_HARD_RATIO
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.draws import BumpDraws, ShapeDraws
+from tactile_bayes.size.learn.site import PhantomMap, correct_calibration
 
 if TYPE_CHECKING:
     from tactile_bayes.files.tables import Sheet, Table
@@ -71,8 +72,6 @@ def correct_size(
     the calibration; `declared`: as for `table_recipe`; for a table of bumps; `seed`: of the random numbers with which
     maps are estimated.
     """
-    from tactile_bayes.size.learn.site import correct_calibration
-
     path = size_calibration_path(base)
     calibration = None if path is None else read_size_calibration(path)
     if path is None or not isinstance(calibration, BodyCalibration):
@@ -118,8 +117,6 @@ def _refuse(declared: Mapping[str, Any]) -> None:
 
 def _from_bumps(source: Path | Sheet, calibration: BodyCalibration, declared: Mapping[str, Any]) -> _Phantoms:
     """The phantoms of a table of amplitudes and widths."""
-    from tactile_bayes.size.learn.site import PhantomMap
-
     rows = read_table(source, "size_table.table.json")
     _check_recipe(rows, calibration, declared)
     _check_head(rows, calibration)
@@ -144,8 +141,6 @@ def _from_bumps(source: Path | Sheet, calibration: BodyCalibration, declared: Ma
 
 def _from_maps(source: Path | Sheet, base: str, *, seed: int, progress: Progress | None) -> _Phantoms:
     """The phantoms of a table of map files, each estimated by the calibration's recipe."""
-    from tactile_bayes.size.learn.site import PhantomMap
-
     rows = read_table(source, "phantom_maps.table.json")
     folder = source.parent if isinstance(source, Path) else Path()
     settings, columns = Settings(size_calibration=base, seed=seed), rows.columns

@@ -21,6 +21,7 @@ from tactile_bayes.files.map_nc import write_posterior
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.reports import EstimateReport
 from tactile_bayes.findings import Finding, Verdict, finding_lines, verdict
+from tactile_bayes.inference.ensemble import inference_data
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.result import DrawGroup, Estimate, Mass, inference_groups
 from tactile_bayes.presets import RESEARCH_USE
@@ -118,8 +119,6 @@ class Sized(Record, eq=False, dict=True):
         UsageError
             Without an estimate: there are no draws.
         """
-        from tactile_bayes.inference.ensemble import inference_data
-
         columns = self._columns()
         if not columns:
             raise UsageError(f"there are no draws: {self.why}")

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tactile_bayes.errors import NotConvergedError
+from tactile_bayes.inference.ensemble import ensemble
 from tactile_bayes.inference.importance import importance, importance_options
 from tactile_bayes.inference.modes import mode_and_covariance
 
@@ -27,8 +28,6 @@ def draw(
     The density takes (m, p) arrays to (m,); `centre` and `covariance` guess the mode and the covariance about it. Where
     MCMC, too, does not reach its criteria, `NotConvergedError` says so.
     """
-    from tactile_bayes.inference.ensemble import ensemble
-
     try:
         mode, about, _ = mode_and_covariance(log_density, centre, scale=np.sqrt(np.diag(covariance)))
         return importance(log_density, mode, about, rng=rng, options=importance_options(_ACCURACY_SD))

@@ -14,6 +14,7 @@ from tactile_bayes.files.atomic import sha256
 from tactile_bayes.files.manifest_csv import JOURNAL, natural
 from tactile_bayes.files.map_nc import read_map_and_scans
 from tactile_bayes.files.remote import check_address, fetched, files_below, is_address
+from tactile_bayes.files.scan_mcap import json_object, scan_records
 
 # --- What a file says of its exam: facts of the session, and the files that it was made from.
 
@@ -47,8 +48,6 @@ def check_name(name: str) -> None:
 
 
 def _of_scan(path: Path) -> Said:
-    from tactile_bayes.files.scan_mcap import json_object, scan_records
-
     metadata = scan_records(path, keep=()).metadata
     made = json_object(metadata.get("provenance", {}).get("json", "{}"), name="provenance").get("inputs")
     inputs = made if isinstance(made, list) else []

@@ -23,6 +23,7 @@ from tactile_bayes.declarations import EXACT, Record, field, from_plain, replace
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.atomic import sha256, write_bytes, write_text
 from tactile_bayes.files.documents import read_record
+from tactile_bayes.files.imports import read_arrays
 from tactile_bayes.files.manifest_csv import (
     COMPARED,
     COMPARED_FIGURE,
@@ -42,10 +43,12 @@ from tactile_bayes.files.manifest_csv import (
     Exam,
 )
 from tactile_bayes.files.map_nc import read_map, read_map_and_scans, write_map
+from tactile_bayes.files.npz import read_shape, write_shape
 from tactile_bayes.files.provenance import Provenance, scan_facts
 from tactile_bayes.files.reading import NETCDF_BYTES, kind_of, read_bytes
 from tactile_bayes.files.remote import fetched, put
 from tactile_bayes.files.reports import EstimateReport, json_text
+from tactile_bayes.files.scan_mcap import read_scan, write_scan
 from tactile_bayes.findings import by_weight
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.options import MapOptions
@@ -177,8 +180,6 @@ def _fetched_map(task: Task) -> tuple[Result, Writes]:
 
 
 def _scanned_map(task: Task) -> tuple[Result, Writes]:
-    from tactile_bayes.files.scan_mcap import read_scan
-
     scan = read_scan(task.source)
     check_facts(task.expected, scan.session)
     settings = map_settings(task.normalise)
@@ -189,9 +190,6 @@ def _scanned_map(task: Task) -> tuple[Result, Writes]:
 
 def _imported_map(task: Task) -> tuple[Result, Writes]:
     """Bring in arrays as `import` does, and map the scan that they are."""
-    from tactile_bayes.files.imports import read_arrays
-    from tactile_bayes.files.scan_mcap import write_scan
-
     scan = read_arrays(task.source)
     made = Provenance("import", {"as": "scan", "lost": []}, inputs={"source": task.source_sha256})
     facts = scan_facts(scan.session, frames=scan.frames.sha256, file=task.source_sha256)
@@ -243,8 +241,6 @@ def check_facts(expected: Mapping[str, str], facts: Mapping[str, str]) -> None:
 
 
 def _estimate(task: Task) -> tuple[Result, Writes]:
-    from tactile_bayes.files.npz import write_shape
-
     found = _estimated(task)
     answer = found.answer
     assert answer.report is not None
@@ -332,8 +328,6 @@ def _copy(task: Task) -> tuple[Result, Writes]:
 
 def _answer(folder: Path) -> Answer:
     """An exam's answer for pooling, from its folder."""
-    from tactile_bayes.files.npz import read_shape
-
     tactile_map: TactileMap = read_map(folder / MAP)
     return Answer(
         read_record(folder / ESTIMATE, EstimateReport),
@@ -464,8 +458,6 @@ def size_step(task: Task) -> tuple[Result, Writes]:
 
 def _exam_size(folder: Path, settings: Settings) -> SizePosterior:
     """Size from the draws of an exam, in the axes of its map as `estimate` has it."""
-    from tactile_bayes.files.npz import read_shape
-
     tactile_map = read_map(folder / MAP)
     _, calibration, _ = choose_calibration(settings, tactile_map)
     assert isinstance(calibration, BodyCalibration)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping
+from functools import cache
 from typing import Any, Protocol
 
-import emcee
 import numpy as np
 
 from tactile_bayes.declarations import Record, names_of
@@ -18,9 +18,14 @@ from tactile_bayes.progress import Progress
 
 # --- The only use of arviz: chain diagnostics, and draws as InferenceData.
 
-with warnings.catch_warnings():
-    warnings.simplefilter("ignore", FutureWarning)  # its notice of the next major version, which is pinned away
-    import arviz
+
+@cache
+def _arviz() -> Any:
+    """Arviz, which takes longer to import than an estimate to make: loaded where its figures are asked for."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FutureWarning)  # its notice of the next major version, which is pinned away
+        import arviz
+    return arviz
 
 
 def chain_diagnostics(chains: FloatArray) -> dict[str, float]:
@@ -30,6 +35,7 @@ def chain_diagnostics(chains: FloatArray) -> dict[str, float]:
     Vehtari, Gelman, Simpson, Carpenter & Buerkner (2021), Bayesian Analysis 16:667.
     """
     columns = [np.ascontiguousarray(chains[:, :, i]) for i in range(chains.shape[2])]
+    arviz = _arviz()
     return {
         "rhat": float(max(arviz.rhat(column, method="rank") for column in columns)),
         "ess_bulk": float(min(arviz.ess(column, method="bulk") for column in columns)),
@@ -46,6 +52,7 @@ def convergence(draws: FloatArray) -> dict[str, float]:
     """
     known = np.where(np.isfinite(draws), draws, np.nanmin(draws))
     errors = {"mcse_median": 0.5, "mcse_low": 0.025, "mcse_high": 0.975}
+    arviz = _arviz()
     return {
         "rhat": float(arviz.rhat(known, method="rank")),
         "ess_bulk": float(arviz.ess(known, method="bulk")),
@@ -71,7 +78,7 @@ def inference_data(
     for name, (arrays, notes) in {"posterior": (posterior, {}), **(groups or {})}.items():
         dataset = xarray.Dataset(dict(arrays), attrs=dict(notes))
         datasets[name] = dataset.assign_coords({axis: np.arange(size) for axis, size in dataset.sizes.items()})
-    return arviz.InferenceData(**datasets)
+    return _arviz().InferenceData(**datasets)
 
 
 # --- State of an interrupted ensemble, from which it continues exactly.
@@ -196,7 +203,10 @@ class _Ensemble:
         rng: np.random.Generator,
         start: FloatArray | None,
     ) -> None:
+        import emcee  # loads scipy.stats, which nothing else here needs
+
         p = len(centre)
+        self._emcee_state = emcee.State
         self._centre, self._scale = centre, np.sqrt(np.diag(covariance))
         self.walkers = max(2 * ((WALKERS_PER_PARAMETER * p + 1) // 2), 2 * p + 2)
         self._sampler = emcee.EnsembleSampler(
@@ -211,7 +221,7 @@ class _Ensemble:
             begin = unique[rng.choice(len(unique), size=self.walkers, replace=len(unique) < self.walkers)]
         # emcee takes neither an integer nor a Generator: it must be handed the state of a RandomState
         random_state = np.random.RandomState(int(rng.integers(2**32))).get_state()
-        self._state = emcee.State((begin - self._centre) / self._scale, random_state=random_state)
+        self._state = self._emcee_state((begin - self._centre) / self._scale, random_state=random_state)
         self._chain = np.empty((0, self.walkers, p))
         self._log_density = np.empty((0, self.walkers))
         self._accepted = 0.0
@@ -261,7 +271,7 @@ class _Ensemble:
         self._log_density = np.full(self._chain.shape[:2], np.nan)
         position, has_normal, normal = state.cursor[index]
         random_state = ("MT19937", state.twister[index], int(position), int(has_normal), float(normal))
-        self._state = emcee.State(
+        self._state = self._emcee_state(
             self._chain[-1].copy(), log_prob=state.log_density[index].copy(), random_state=random_state
         )
 

@@ -11,6 +11,7 @@ from tactile_bayes.declarations import Record, field, replace
 from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.draws import END_ERROR, Labels, ParameterDraws, Solved, distinct_rows
+from tactile_bayes.inference.ensemble import EnsembleOptions, ensemble
 from tactile_bayes.inference.importance import TRUSTED_SHAPE, Gaussians, importance, importance_options
 from tactile_bayes.inference.modes import LogDensity
 from tactile_bayes.posterior.options import EstimateOptions
@@ -278,8 +279,6 @@ def ensemble_draws(
 
     `NotConvergedError` when the chains do not agree with each other, or not with the importance draws.
     """
-    from tactile_bayes.inference.ensemble import EnsembleOptions, ensemble
-
     settings = EnsembleOptions()
     if options.max_steps is not None:
         settings = replace(settings, max_steps=options.max_steps)

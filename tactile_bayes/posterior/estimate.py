@@ -9,6 +9,7 @@ import numpy as np
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import NO_LUMP, Abstention, BadDataError, NotConvergedError
 from tactile_bayes.findings import Finding, by_weight
+from tactile_bayes.inference.ensemble import convergence
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.abstention import (
     FEEL_AGAIN,
@@ -286,8 +287,6 @@ def _findings(sized: SizedDraws, *, cell_mm: float) -> Iterator[Finding]:
 
 def _convergence(made: MapDraws, size: SizePosterior | None) -> dict[str, dict[str, float]]:
     """How far the chains of each size and width agree."""
-    from tactile_bayes.inference.ensemble import convergence
-
     sizes = () if size is None else ("max_size_mm", "min_size_mm", "d_x_mm", "d_y_mm")
     figures = {name: convergence(getattr(size, name)) for name in sizes}
     return figures | {

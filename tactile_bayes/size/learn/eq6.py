@@ -10,6 +10,7 @@ from scipy.special import ndtri, stdtrit
 from tactile_bayes.declarations import Record, field, replace
 from tactile_bayes.errors import BadDataError, NotConvergedError
 from tactile_bayes.geometry import BoolArray, FloatArray, IndexArray
+from tactile_bayes.inference.ensemble import EnsembleOptions, ensemble
 from tactile_bayes.inference.modes import mode_and_covariance
 from tactile_bayes.presets import LEAST_HARD_RATIO
 from tactile_bayes.progress import Progress
@@ -153,8 +154,6 @@ def _mode(data: AxisRows) -> tuple[AxisRows, FloatArray, FloatArray]:
 
 
 def _learn_axis(data: AxisRows, *, rng: np.random.Generator, progress: Progress | None) -> AxisCalibration:
-    from tactile_bayes.inference.ensemble import EnsembleOptions, ensemble
-
     data, mode, covariance = _mode(data)
 
     def log_density(theta: FloatArray) -> FloatArray:
