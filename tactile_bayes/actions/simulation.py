@@ -32,7 +32,6 @@ from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.forward.tissue import Rib, SolidLump
 from tactile_bayes.presets import DEFAULT_NORMALISE, RESEARCH_USE, Method
 from tactile_bayes.size.bodies import BodyCalibration
-from tactile_bayes.studies import sbc
 from tactile_bayes.studies.population import (
     BodiesFile,
     BodyPrior,
@@ -43,7 +42,6 @@ from tactile_bayes.studies.population import (
     measure_mass,
 )
 from tactile_bayes.studies.population import centred as on_the_boundary
-from tactile_bayes.studies.sbc import MapRanks, Truth, settings
 
 if TYPE_CHECKING:
     from tactile_bayes.studies.sbc import MapRanks
@@ -292,6 +290,8 @@ def _run_sbc(
     output: Path | None,
 ) -> tuple[list[Outcome[MapRanks]], int]:
     """Outcomes of all maps, and the number that this run made."""
+    from tactile_bayes.studies.sbc import settings
+
     with (
         open_executor(workers=workers, cluster=scheduler) as executor,
         _open_kept(output, settings(method, seed, size=DEFAULT, cosines=cosines)) as store,
@@ -311,6 +311,8 @@ def _run_sbc(
 
 def ranks_of_map(index: int, *, method: Method, seed: int, cosines: int | None) -> MapRanks:
     """Ranks of one map, in any process."""
+    from tactile_bayes.studies import sbc
+
     return sbc.ranks_of_map(index, method=method, seed=seed, calibration=_shipped(), cosines=cosines)
 
 
@@ -347,5 +349,7 @@ def _finish(outcomes: list[Outcome[MapRanks]], output: Path | None) -> int:
 
 
 def _decode_ranks(value: dict[str, Any]) -> MapRanks:
+    from tactile_bayes.studies.sbc import MapRanks, Truth
+
     ranks = None if value["ranks"] is None else tuple(value["ranks"])
     return MapRanks(value["index"], Truth(**value["truth"]), ranks, value["outcome"], value["probability"])

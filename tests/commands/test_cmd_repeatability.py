@@ -90,7 +90,8 @@ def test_a_pooled_size_has_it_as_the_prior_of_its_maps(site: Path, tmp_path: Pat
 
 
 def test_a_comparison_is_at_the_sites_repeatability(site: Path, tmp_path: Path) -> None:
-    """With one exam a visit the variance of the change has twice that of an exam, which sites of 8 and 2 % give."""
+    """With one exam a visit the sizes' variance has twice that of an exam, which sites of 8 and 2 % give; the
+    amplitudes' change, a second witness, takes a part of it away."""
     for name in ("map.nc", "site.json"):
         shutil.copy(site / name, tmp_path)
     run_here("simulate", DEMO / "scene.toml", "--seed", 2, "-o", "two.mcap", cwd=tmp_path)
@@ -112,7 +113,7 @@ def test_a_comparison_is_at_the_sites_repeatability(site: Path, tmp_path: Path) 
         assert found[name]["another_exam"] is None
     least = {name: np.log1p(one["smallest_detectable_percent"]["growth"] / 100) / 1.96 for name, one in found.items()}
     apart = 2 * (spread["site"] ** 2 - spread["alike"] ** 2)
-    assert least["site"] ** 2 - least["alike"] ** 2 == pytest.approx(apart, rel=0.15)
+    assert 0.5 * apart < least["site"] ** 2 - least["alike"] ** 2 < apart
     plain = run_here(*words, cwd=tmp_path).stdout
     assert "If exams of one mass differ by" in plain
     told = run_here(*words, "--repeatability", "site.json", cwd=tmp_path).stdout
