@@ -227,9 +227,7 @@ def test_without_a_size_it_says_what_each_setting_answers(case: str, tmp_path: P
     assert "Advice: " in text
     default = next(line for line in text.splitlines() if line.startswith("* --method importance"))
     assert re.search(why, default), default
-    check_document(
-        to_plain(ladder_file(found, varied="estimate", provenance={})), "tradeoff.schema.json", path=tmp_path
-    )
+    check_document(to_plain(ladder_file(found, varied="estimate", provenance={})), "tradeoff.schema.json")
     draw_ladder(found, tmp_path / "f.png", title=case)
 
 
