@@ -521,7 +521,13 @@ def test_a_dry_run_says_what_it_would_do_and_writes_nothing(finished: Path) -> N
 def start(folder: Path, environment: dict[str, str], *more: str) -> subprocess.Popen[str]:
     words = [sys.executable, "-m", "tactile_bayes", "campaign", "run", "exams.csv"]
     return subprocess.Popen(
-        [*words, "-o", "out", *FAST, *more], cwd=folder, env=environment, stderr=subprocess.PIPE, text=True
+        [*words, "-o", "out", *FAST, *more],
+        cwd=folder,
+        env=environment,
+        stderr=subprocess.PIPE,
+        text=True,
+        # a shell's background job is born with Ctrl-C ignored
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
     )
 
 
