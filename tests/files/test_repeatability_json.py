@@ -70,7 +70,7 @@ def test_a_strange_provenance_is_shown_as_it_is(written: Path, tmp_path: Path) -
     [
         ("settings", {}, "does not say by which calibration; run the campaign again"),
         ("settings", [1], "provenance.settings is .1.; give a table"),
-        ("inputs", [1], "provenance.inputs.0 is 1; give a table"),
+        ("inputs", [1], "provenance.inputs.0. is 1; give a table"),
     ],
 )
 def test_an_estimate_that_does_not_say_its_calibration_is_refused(

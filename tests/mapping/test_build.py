@@ -7,7 +7,7 @@ from itertools import pairwise
 import mapping_scans as scans
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from tactile_bayes.declarations import replace
@@ -103,6 +103,7 @@ def test_moving_the_whole_scan_leaves_the_map(angle, about, shift):
 def test_scans_in_parts_and_any_order_give_the_same_bits(cuts, reverse, normalise):
     scan = stroke_scan(yaw_deg=np.linspace(-5, 5, 120))
     ends = [0, *sorted(cuts), 120]
+    assume(all(b == a or b - a >= 20 for a, b in pairwise(ends)))  # in few frames a good taxel may read as stuck
     parts = [scans.part(scan, slice(a, b)) for a, b in pairwise(ends)]
     merged = build_map(parts[::-1] if reverse else parts, normalise=normalise)
     assert same(merged, build_map(scan, normalise=normalise))
