@@ -91,10 +91,16 @@ def _two(rng: np.random.Generator, index: int) -> Drawn:
     second = SolidLump(d_mm=d, depth_ratio=depth / d, stiffness_ratio=float(np.exp(rng.uniform(*np.log([8.0, 100.0])))))
     least = (first.d_mm + d) / 2 + LEAST_GAP_MM
     away, turn = rng.uniform(max(APART_MM[0], least), APART_MM[1]), rng.uniform(0.0, 2 * np.pi)
+    return _pair(body, first, second, away=away, turn=turn)
+
+
+def _pair(body: SceneBody, first: SolidLump, second: SolidLump, *, away: float, turn: float) -> Drawn:
+    """Two lumps so far apart, mm, on either side of the middle; the body is thick enough for the second."""
     fat = first.depth_mm + (first.seat or 0.0) * first.vertical_mm / 2
-    body = replace(body, fat_mm=fat, thickness_mm=max(body.thickness_mm, depth + 0.6 * d + 4.0))
+    thickness = max(body.thickness_mm, second.depth_mm + 0.6 * second.d_mm + 4.0)
     x, y = away / 2 * np.cos(turn), away / 2 * np.sin(turn)
-    return body, (replace(first, seat=None, x_mm=-x, y_mm=-y), replace(second, x_mm=x, y_mm=y)), ()
+    pair = replace(first, seat=None, x_mm=-x, y_mm=-y), replace(second, x_mm=x, y_mm=y)
+    return replace(body, fat_mm=fat, thickness_mm=thickness), pair, ()
 
 
 def _near(rng: np.random.Generator, index: int) -> Drawn:
@@ -108,10 +114,7 @@ def _near(rng: np.random.Generator, index: int) -> Drawn:
     alike = rng.uniform() < 0.5
     stiffness = first.stiffness_ratio if alike else float(np.exp(rng.uniform(*np.log([8.0, 100.0]))))
     second = SolidLump(d_mm=d, depth_ratio=depth / d, stiffness_ratio=stiffness)
-    fat = first.depth_mm + (first.seat or 0.0) * first.vertical_mm / 2
-    body = replace(body, fat_mm=fat, thickness_mm=max(body.thickness_mm, depth + 0.6 * d + 4.0))
-    x, y = away / 2 * np.cos(turn), away / 2 * np.sin(turn)
-    return body, (replace(first, seat=None, x_mm=-x, y_mm=-y), replace(second, x_mm=x, y_mm=y)), ()
+    return _pair(body, first, second, away=away, turn=turn)
 
 
 def _single(rng: np.random.Generator, index: int) -> Drawn:
