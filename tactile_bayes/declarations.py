@@ -19,6 +19,7 @@ No other module imports msgspec.
 from __future__ import annotations
 
 import dataclasses
+import inspect
 import math
 import re
 import types
@@ -362,6 +363,8 @@ def _inlined(schema: Any, definitions: Mapping[str, Any]) -> Any:
             return {"allOf": [named], **rest} if (rest := {k: v for k, v in schema.items() if k != "$ref"}) else named
         schema = {**definitions[schema["$ref"].rsplit("/", 1)[-1]], **{k: v for k, v in schema.items() if k != "$ref"}}
     found = {key: _inlined(one, definitions) for key, one in schema.items()}
+    if isinstance(schema.get("description"), str):  # Python 3.13 takes off the indents of docstrings, 3.11 does not
+        found["description"] = inspect.cleandoc(schema["description"])
     if "properties" in found:
         found.pop("title", None)
         found["properties"] = {key: _inlined(one, definitions) for key, one in schema["properties"].items()}
