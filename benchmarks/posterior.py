@@ -35,10 +35,9 @@ Draw = Callable[[np.random.Generator], np.ndarray]
 
 def simulated_fit() -> Any:
     """The mode of a bump of 6 by 4.5 mm with white errors of 0.01 and a field of 0.01 and 4 mm, seed 1."""
-    from tactile_bayes.forward.gaussian import cell_mean_gaussian
     from tactile_bayes.mapping.map import MapRecipe, TactileMap
     from tactile_bayes.options import BumpPrior
-    from tactile_bayes.posterior.bump import window_cells
+    from tactile_bayes.posterior.bump import cell_mean_gaussian, window_cells
     from tactile_bayes.posterior.field import Window
     from tactile_bayes.posterior.fit import fit_scene
     from tactile_bayes.posterior.marginal import independent_variance

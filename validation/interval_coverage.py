@@ -32,12 +32,12 @@ from scipy.optimize import least_squares
 
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import TactileBayesError
-from tactile_bayes.forward.gaussian import cell_mean_gaussian
 from tactile_bayes.forward.scene import Lump, Noise, Scene, Strokes, Tracker
 from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import MapRecipe, TactileMap
+from tactile_bayes.posterior.bump import cell_mean_gaussian
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.options import EstimateOptions, FitOptions
 from tactile_bayes.posterior.result import Estimate

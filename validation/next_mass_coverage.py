@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 import tactile_bayes.trial.next_mass as model
-from tactile_bayes.api.trial_sampler import draw
+from tactile_bayes.api.trials import draw
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.trial.planning import ErrorModel
 from tactile_bayes.trial.readings import MassKey, Reading, Trial

@@ -18,10 +18,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tactile_bayes.forward.gaussian import cell_mean_gaussian
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.map import MapRecipe, TactileMap
 from tactile_bayes.options import BumpPrior
+from tactile_bayes.posterior.bump import cell_mean_gaussian
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.field import LENGTHS_MM
 from tactile_bayes.posterior.masses import other_rises

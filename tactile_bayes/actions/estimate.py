@@ -15,9 +15,9 @@ from click.core import ParameterSource
 
 from tactile_bayes.api.comparing import Comparison, compare_estimates
 from tactile_bayes.api.estimating import answer_file, estimate_file
-from tactile_bayes.api.exam_report import ExamFiles, read_exam
 from tactile_bayes.api.maps import map_provenance
 from tactile_bayes.api.pooled import PooledSize, of_one_mass, pool_answers
+from tactile_bayes.api.reports import ExamFiles, exam_of_files
 from tactile_bayes.api.settings import Comparing, Settings, refuse_checkpoint, times_of
 from tactile_bayes.api.sized import Answer, SizeEstimate
 from tactile_bayes.batch import BatchInterrupted, cluster_executor, fault_lines, local_executor, run_batch
@@ -130,7 +130,7 @@ def report_action(
         _refuse_settings(ctx, asked)
     settings, size_calibration = settings_of(**asked), asked["size_calibration"]
     also_read(None if size_calibration is None else size_calibration_path(size_calibration))
-    exam = read_exam(sorted_files, settings, given, notice=lambda line: click.echo(line, err=True))
+    exam = exam_of_files(sorted_files, settings, given, notice=lambda line: click.echo(line, err=True))
     page.write(exam)
     if exam.main.tactile_map is None:
         click.echo("note: without its map the page has no picture and no coverage; give MAP.nc too", err=True)

@@ -26,12 +26,12 @@ from tactile_bayes.files.scene_toml import read_scene
 from tactile_bayes.files.tables import csv_text, read_table
 from tactile_bayes.findings import finding_lines
 from tactile_bayes.forward.contact import Head
-from tactile_bayes.forward.gaussian import cell_mean_gaussian
 from tactile_bayes.forward.line import TactileLine, fit_shape, outside_range
 from tactile_bayes.forward.scene import Head as Array
 from tactile_bayes.forward.tissue import parse_seat
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.select import scan_findings
+from tactile_bayes.posterior.bump import cell_mean_gaussian
 from tactile_bayes.posterior.white import LEAST_WIDTH_IN_CELLS, WIDEST_IN_RADII
 from tactile_bayes.presets import HEADS, RESEARCH_USE, SHOULDERS_INSIDE, SHOULDERS_OUTSIDE
 from tactile_bayes.report.laboratory import heads_text, tables_document, tables_text

@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, Any
 import click
 import numpy as np
 
-from tactile_bayes.api.trial_report import analyse
-from tactile_bayes.api.trials import load_trial
+from tactile_bayes.api.trials import analyse, load_trial
 from tactile_bayes.batch import open_executor, run_batch
 from tactile_bayes.campaign.exams import find_exams
 from tactile_bayes.campaign.inputs import open_campaign, tidy
@@ -37,26 +36,18 @@ from tactile_bayes.files.atomic import refuse_existing, write_text
 from tactile_bayes.files.documents import dump_json, read_protocol
 from tactile_bayes.files.manifest_csv import add_rows, read_manifest, read_rows, write_manifest
 from tactile_bayes.files.provenance import Provenance, hash_inputs
-from tactile_bayes.files.remote import check_address
+from tactile_bayes.files.reading import check_address
 from tactile_bayes.files.size_json import NONE, size_calibration_path
 from tactile_bayes.options import PlanErrors, TrialSettings
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.trial import plan_text
-from tactile_bayes.trial.planning import (
-    Design,
-    ErrorSource,
-    PlanReport,
-    assumptions_from,
-    designs,
-    map_gains,
-    run_case,
-)
+from tactile_bayes.trial.planning import Design, ErrorSource, PlanReport, assumptions_from, designs, map_gains, run_case
 from tactile_bayes.trial.readings import unit_doubts
 
 if TYPE_CHECKING:
     from tactile_bayes.campaign.exams import Found
     from tactile_bayes.campaign.report import Written
-    from tactile_bayes.campaign.stages import CampaignState
+    from tactile_bayes.campaign.run import CampaignState
     from tactile_bayes.files.manifest_csv import Exam
     from tactile_bayes.trial.planning import PlanCase
 

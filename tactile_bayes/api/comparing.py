@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tactile_bayes.api.arguments import door, plain, sequence_of
-from tactile_bayes.api.draws import Draws
 from tactile_bayes.api.estimates import estimated, settings_of
 from tactile_bayes.api.maps import Map, PathLike, path_of
 from tactile_bayes.api.pooled import common_calibration, one_mass, place_of
@@ -24,6 +23,7 @@ from tactile_bayes.files.comparison import CompareReport
 from tactile_bayes.files.provenance import Provenance, hash_inputs, repeated_scans, scans_of
 from tactile_bayes.files.reports import centre_of
 from tactile_bayes.findings import Finding, Verdict, by_weight, finding_lines, verdict
+from tactile_bayes.inference.draws import Draws
 from tactile_bayes.presets import REGISTRATION_MM, RESEARCH_USE
 from tactile_bayes.report.compare import compare_report, compare_summary, compare_text
 from tactile_bayes.report.estimate_figures import DrawnMap, draw_comparison

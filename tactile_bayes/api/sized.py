@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tactile_bayes.api.arguments import door, in_keywords
-from tactile_bayes.api.draws import Draws
 from tactile_bayes.api.maps import PathLike, output_path, path_of
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.declarations import Record
@@ -21,6 +20,7 @@ from tactile_bayes.files.map_nc import write_posterior
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.reports import EstimateReport
 from tactile_bayes.findings import Finding, Verdict, finding_lines, verdict
+from tactile_bayes.inference.draws import Draws
 from tactile_bayes.inference.ensemble import inference_data
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.result import DrawGroup, Estimate, Mass, inference_groups

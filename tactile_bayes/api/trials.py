@@ -2,32 +2,164 @@
 
 from __future__ import annotations
 
+from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
 
 from tactile_bayes.api.arguments import check_keywords, door, plain
 from tactile_bayes.api.maps import PathLike, output_path, path_of, required_path
 from tactile_bayes.api.repeatability import exams_in, learn_from_exams
 from tactile_bayes.api.site_correction import correct_size
 from tactile_bayes.api.size_calibration import FORMS, is_population, learn_eq6, learn_population
-from tactile_bayes.api.trial_report import TrialResult, analyse
-from tactile_bayes.declarations import names_of
-from tactile_bayes.errors import UsageError, check_choice, check_number
+from tactile_bayes.declarations import Record, as_dict, names_of, replace, to_plain
+from tactile_bayes.errors import NotConvergedError, UsageError, check_choice, check_number
+from tactile_bayes.files.atomic import write_text
 from tactile_bayes.files.column_map import read_mapping, read_wide, read_wide_excision
+from tactile_bayes.files.documents import dump_json
 from tactile_bayes.files.estimate_json import fill_from_posteriors
 from tactile_bayes.files.provenance import Provenance, hash_inputs
 from tactile_bayes.files.size_json import write_size_calibration
 from tactile_bayes.files.tables import Sheet, check_references, read_table
+from tactile_bayes.inference.ensemble import ensemble
+from tactile_bayes.inference.importance import importance, importance_options
+from tactile_bayes.inference.modes import mode_and_covariance
 from tactile_bayes.options import TrialSettings
+from tactile_bayes.presets import INTERVAL, RESEARCH_USE
+from tactile_bayes.report.trial import DIGITS, trial_text
+from tactile_bayes.report.trial_html import trial_html
+from tactile_bayes.trial.figures import Intervals
+from tactile_bayes.trial.next_mass import next_mass
+from tactile_bayes.trial.planning import check_all
 from tactile_bayes.trial.readings import Trial, at_excision, readings_from_columns
+from tactile_bayes.trial.summary import TrialReport, summarise
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     import pandas
 
     from tactile_bayes.api.size_calibration import EqSixFit, PopulationForm
     from tactile_bayes.files.tables import Table
+    from tactile_bayes.geometry import FloatArray
+    from tactile_bayes.inference.draws import ParameterDraws
+    from tactile_bayes.inference.modes import LogDensity
+    from tactile_bayes.report.compare import Growth
     from tactile_bayes.size.pooling import Calibration, Repeatability
 
+
+# --- Sampler for the next mass's model: importance sampling about the mode, or MCMC where it cannot be trusted.
+
+# Monte-Carlo error of interval ends, in posterior SDs.
+_ACCURACY_SD = 0.03
+
+
+def draw(
+    log_density: LogDensity, centre: FloatArray, covariance: FloatArray, *, rng: np.random.Generator
+) -> ParameterDraws:
+    """Draw from a log density.
+
+    The density takes (m, p) arrays to (m,); `centre` and `covariance` guess the mode and the covariance about it. Where
+    MCMC, too, does not reach its criteria, `NotConvergedError` says so.
+    """
+    try:
+        mode, about, _ = mode_and_covariance(log_density, centre, scale=np.sqrt(np.diag(covariance)))
+        return importance(log_density, mode, about, rng=rng, options=importance_options(_ACCURACY_SD))
+    except NotConvergedError:
+        return ensemble(log_density, centre, covariance, rng=rng)
+
+
+# --- Analysis of a trial from its tables: errors, lines, agreement and calibration of each modality.
+
+
+class TrialResult(Record, eq=False):
+    """How each modality's sizes compare with excision.
+
+    `report` is what the file of ``validate --json`` holds, and `trial` what it was made from.
+    """
+
+    report: TrialReport
+    trial: Trial
+
+    @property
+    def document(self) -> dict[str, Any]:
+        """What ``validate --json`` prints."""
+        document: dict[str, Any] = to_plain(self.report, digits=DIGITS)
+        return document
+
+    @property
+    def text(self) -> str:
+        """What ``validate --methods`` prints."""
+        return self.told(methods=True)
+
+    def told(self, *, methods: bool) -> str:
+        """The report as text, with or without the table of methods."""
+        return trial_text(self.report, left_out=self.trial.other_visits.lines(), methods=methods)
+
+    def write_json(self, path: Path, *, force: bool = False) -> None:
+        """Write what ``validate -o`` writes."""
+        write_text(path, dump_json(self.document), force=force)
+
+    def write_html(self, path: Path, *, growth: Sequence[Growth] = (), force: bool = False) -> None:
+        """Write what ``validate --html`` writes, with what became of masses with several visits."""
+        write_text(path, trial_html(self.report, self.trial, text=self.text, growth=growth), force=force)
+
+    def to_dataframe(self) -> pandas.DataFrame:
+        """One row for each modality and figure: value, and the ends of its interval (NaN where it has none)."""
+        import pandas
+
+        rows = []
+        for modality, figures in self.document["modalities"].items():
+            for name, value in figures.items():
+                if isinstance(value, int | float):
+                    counted = name == "detected"  # the interval beside it is of the share
+                    low, high = (None, None) if counted else figures.get(f"{name}_interval") or (None, None)
+                    rows.append((modality, name, value, low, high))
+        found = pandas.DataFrame(rows, columns=["modality", "figure", "value", "low", "high"])
+        return found.astype({"value": float, "low": float, "high": float})
+
+    def __repr__(self) -> str:
+        counts, names = self.report.counts, ", ".join(self.report.modalities)
+        return f"<TrialResult {counts.masses} masses of {counts.patients} patients: {names}>"
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{escape(self.text)}</pre><p><small>{escape(RESEARCH_USE)}</small></p>"
+
+
+def analyse(
+    trial: Trial, settings: TrialSettings, *, protocol: Path | None = None, title: str | None = None
+) -> TrialResult:
+    """Analyse a trial; `protocol` and `title` are of the pre-specified analysis, where there is one."""
+    confidence = Intervals(INTERVAL, method=settings.intervals, resamples=settings.resamples, seed=settings.seed)
+    provenance = _provenance(trial, settings, protocol)
+    report = summarise(
+        trial, confidence=confidence, error_ratio=settings.error_ratio, seed=settings.seed, provenance=provenance
+    )
+    if title is not None:
+        report = replace(report, title=title)
+    if settings.check_intervals:
+        trials = settings.check_intervals
+        checks = check_all(trial.sizes(), confidence=confidence, trials=trials, seed=settings.seed)
+        report = replace(report, interval_check=checks)
+    if settings.bayes:
+        rng = np.random.default_rng(settings.seed)
+        report = replace(report, next_mass=next_mass(trial, sample=draw, rng=rng, probability=INTERVAL))
+    return TrialResult(report, trial)
+
+
+def _provenance(trial: Trial, settings: TrialSettings, protocol: Path | None) -> dict[str, Any]:
+    files = {**trial.files, **({} if protocol is None else {"protocol": protocol})}
+    kept = {name: value for name, value in as_dict(settings).items() if name != "seed"}
+    return Provenance(
+        command="validate",
+        settings={"interval_probability": INTERVAL, **kept},
+        inputs=hash_inputs(**files),
+        seed=settings.seed,
+    ).as_dict()
+
+
+# --- A trial's tables to its report, and tables of scans to a calibration.
 
 # --- Input of `validate` and `plan`: the tables of a trial, tidy or wide, and the estimates that they name.
 

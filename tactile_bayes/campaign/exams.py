@@ -13,7 +13,7 @@ from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.atomic import sha256
 from tactile_bayes.files.manifest_csv import JOURNAL, natural
 from tactile_bayes.files.map_nc import read_map_and_scans
-from tactile_bayes.files.remote import check_address, fetched, files_below, is_address
+from tactile_bayes.files.reading import check_address, fetched, files_below, is_address
 from tactile_bayes.files.scan_mcap import json_object, scan_records
 
 # --- What a file says of its exam: facts of the session, and the files that it was made from.

@@ -21,7 +21,7 @@ from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError, TactileBayesError, UsageError
 from tactile_bayes.files.atomic import sha256, unwritable
 from tactile_bayes.files.manifest_csv import EXAMS, GROWTH, JOURNAL, MASSES, Exam
-from tactile_bayes.files.remote import sha256_of, version_of
+from tactile_bayes.files.reading import sha256_of, version_of
 
 # --- The output folder of a campaign: its journal, and the files that belong to its steps.
 

@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from tactile_bayes import __version__
-from tactile_bayes.api.trial_report import analyse
-from tactile_bayes.api.trials import load_trial, read_excision
+from tactile_bayes.api.trials import analyse, load_trial, read_excision
 from tactile_bayes.campaign.match import growth_rows, growth_text
 from tactile_bayes.campaign.run import Campaign
 from tactile_bayes.campaign.tables import Row, exam_rows, write_tables
@@ -32,12 +31,11 @@ from tactile_bayes.files.manifest_csv import (
     THUMBNAIL,
     TRIAL,
 )
-from tactile_bayes.files.reading import IMAGE_BYTES, read_bytes
-from tactile_bayes.files.remote import put
+from tactile_bayes.files.reading import IMAGE_BYTES, put, read_bytes
 from tactile_bayes.options import TrialSettings
-from tactile_bayes.report import campaign_html as sheet
-from tactile_bayes.report.campaign_html import Card, campaign_html, worst
+from tactile_bayes.report import pages as sheet
 from tactile_bayes.report.compare import Growth, growth_line
+from tactile_bayes.report.pages import Card, campaign_html, worst
 from tactile_bayes.trial.readings import at_excision
 
 if TYPE_CHECKING:

@@ -45,8 +45,7 @@ from tactile_bayes.files.manifest_csv import (
 from tactile_bayes.files.map_nc import read_map, read_map_and_scans, write_map
 from tactile_bayes.files.npz import read_shape, write_shape
 from tactile_bayes.files.provenance import Provenance, scan_facts
-from tactile_bayes.files.reading import NETCDF_BYTES, kind_of, read_bytes
-from tactile_bayes.files.remote import fetched, put
+from tactile_bayes.files.reading import NETCDF_BYTES, fetched, kind_of, put, read_bytes
 from tactile_bayes.files.reports import EstimateReport, json_text
 from tactile_bayes.files.scan_mcap import read_scan, write_scan
 from tactile_bayes.findings import by_weight

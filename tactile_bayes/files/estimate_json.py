@@ -13,14 +13,7 @@ from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.documents import load_json, parse_record
 from tactile_bayes.files.netcdf import open_netcdf
 from tactile_bayes.files.reading import open_input
-from tactile_bayes.files.reports import (
-    ESTIMATE,
-    POOLED,
-    AnotherExam,
-    EstimateReport,
-    MassReport,
-    PooledReport,
-)
+from tactile_bayes.files.reports import ESTIMATE, POOLED, AnotherExam, EstimateReport, MassReport, PooledReport
 from tactile_bayes.findings import verdict
 from tactile_bayes.inference.draws import Quantity
 

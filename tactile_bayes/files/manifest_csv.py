@@ -14,8 +14,7 @@ from tactile_bayes.declarations import Record, field
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.atomic import write_text
 from tactile_bayes.files.documents import load_schema
-from tactile_bayes.files.reading import TABLE_BYTES, read_bytes
-from tactile_bayes.files.remote import check_address, is_address
+from tactile_bayes.files.reading import TABLE_BYTES, check_address, is_address, read_bytes
 from tactile_bayes.files.size_json import NONE, SHIPPED
 from tactile_bayes.files.tables import RawTable, Table, read_raw, read_table
 from tactile_bayes.trial.readings import Reading, at_excision

@@ -6,13 +6,12 @@ import numpy as np
 
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import NotConvergedError
-from tactile_bayes.forward.gaussian import covariance_from_log_widths
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.draws import ParameterDraws, Solved
 from tactile_bayes.inference.points import MOST_PAIRED, normal_quantile, paired_points
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.abstention import rim_fault
-from tactile_bayes.posterior.bump import PoseNoise, overlap, trusted
+from tactile_bayes.posterior.bump import PoseNoise, covariance_from_log_widths, overlap, trusted
 from tactile_bayes.posterior.detection import Detection, detection_from_odds
 from tactile_bayes.posterior.draw import MapPosterior, ModalBump, NoiseFigures, draw_parameters
 from tactile_bayes.posterior.field import FLOOR, Window, cosines_for

@@ -7,9 +7,8 @@ from math import lgamma, log, pi
 import numpy as np
 
 from tactile_bayes.declarations import Record, names_of
-from tactile_bayes.forward.gaussian import cell_mean_gaussian, covariance_from_log_widths
 from tactile_bayes.geometry import FloatArray, IndexArray
-from tactile_bayes.posterior.bump import FitCells
+from tactile_bayes.posterior.bump import FitCells, cell_mean_gaussian, covariance_from_log_widths
 from tactile_bayes.presets import FIELD_COSINES, FINE_FIELD_COSINES
 
 # --- Correlated noise model: a Gaussian random field on a cosine basis plus white noise, whitened once for many fits.

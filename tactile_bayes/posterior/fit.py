@@ -11,11 +11,11 @@ import numpy as np
 
 from tactile_bayes.declarations import Record, as_dict, replace
 from tactile_bayes.errors import NotConvergedError
-from tactile_bayes.forward.gaussian import principal_widths
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.draws import INDEPENDENT_DRAWS, ParameterDraws, Solved, student_draws
 from tactile_bayes.inference.importance import Gaussians, smooth_weights
 from tactile_bayes.inference.modes import find_mode, finite_differences, mode_and_covariance, stencil
+from tactile_bayes.posterior.bump import principal_widths
 from tactile_bayes.posterior.draw import Sampled, with_beside
 from tactile_bayes.posterior.field import Window
 from tactile_bayes.posterior.marginal import NEGLIGIBLE, CollapsedTarget, independent_variance, linear_columns

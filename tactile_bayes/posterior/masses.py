@@ -8,9 +8,15 @@ import numpy as np
 
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import NO_LUMP, NotConvergedError
-from tactile_bayes.forward.gaussian import cell_mean_gaussian
 from tactile_bayes.mapping.map import TactileMap
-from tactile_bayes.posterior.bump import SMOOTHING_MM, candidate_centres, levelled, on_map, smoothed_excess
+from tactile_bayes.posterior.bump import (
+    SMOOTHING_MM,
+    candidate_centres,
+    cell_mean_gaussian,
+    levelled,
+    on_map,
+    smoothed_excess,
+)
 from tactile_bayes.posterior.detection import Detection
 from tactile_bayes.posterior.draw import MapPosterior, ModalBump
 from tactile_bayes.posterior.lump_probability import LIKELY, weigh

@@ -9,11 +9,11 @@ import numpy as np
 
 from tactile_bayes.declarations import Record, field
 from tactile_bayes.findings import Finding
-from tactile_bayes.forward.gaussian import principal_widths
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.draws import ParameterDraws, quantiles_of, weighted_quantiles_of
 from tactile_bayes.inference.importance import smooth_weights
 from tactile_bayes.options import BumpPrior
+from tactile_bayes.posterior.bump import principal_widths
 from tactile_bayes.posterior.detection import Detection
 from tactile_bayes.posterior.draw import Diagnostics, MapPosterior, ModalBump
 from tactile_bayes.posterior.fit import FieldFit

@@ -12,8 +12,8 @@ import numpy as np
 
 from tactile_bayes.declarations import Record, field, replace
 from tactile_bayes.errors import NotConvergedError
-from tactile_bayes.forward.gaussian import covariance_from_log_widths
 from tactile_bayes.geometry import FloatArray
+from tactile_bayes.posterior.bump import covariance_from_log_widths
 from tactile_bayes.posterior.field import FLOOR, FieldColumns, Profiles
 from tactile_bayes.posterior.fit import FieldFit, Mixture, fit_scene, newton_mixture, tangent_columns
 from tactile_bayes.posterior.marginal import CollapsedTarget, linear_columns

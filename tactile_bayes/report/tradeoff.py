@@ -13,8 +13,7 @@ from tactile_bayes.posterior.lump_probability import LIKELY
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.estimate_text import SOURCES
 from tactile_bayes.report.figure_file import figure_file
-from tactile_bayes.studies.estimate_tradeoff import Ladder, PooledRow, Priced
-from tactile_bayes.studies.size_answers import SIZE, SizeAnswer
+from tactile_bayes.studies.estimate_tradeoff import SIZE, Ladder, PooledRow, Priced, SizeAnswer
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

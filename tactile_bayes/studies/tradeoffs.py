@@ -31,6 +31,7 @@ from tactile_bayes.studies.estimate_tradeoff import (
     Ladder,
     Reference,
     Run,
+    SizeAnswer,
     Work,
     climbed,
     default_run,
@@ -45,7 +46,6 @@ from tactile_bayes.studies.paper import (
     run_geometry,
 )
 from tactile_bayes.studies.paper_solid import RasterFitter, SolidSettings, raster_frames, run_solid_geometry
-from tactile_bayes.studies.size_answers import SizeAnswer
 
 # --- Cost and error of each forward model and setting for one lump, measured on this machine.
 #

@@ -21,7 +21,7 @@ from in_process import run_here
 from tactile_bayes.campaign import inputs as campaign_inputs
 from tactile_bayes.campaign import report as campaign_report
 from tactile_bayes.campaign import run as campaigns
-from tactile_bayes.files import remote
+from tactile_bayes.files import reading
 
 
 @pytest.fixture(scope="module")
@@ -156,7 +156,7 @@ def store(monkeypatch: pytest.MonkeyPatch) -> Any:
         def find(self, address: str) -> list[str]:
             return [name.lstrip("/") for name in memory.find(address.removeprefix("s3://"))]
 
-    monkeypatch.setattr(remote, "_store", lambda _address: Bucket())
+    monkeypatch.setattr(reading, "_store", lambda _address: Bucket())
     return memory
 
 
@@ -196,7 +196,7 @@ def test_a_store_that_does_not_answer_ends_the_run_and_a_missing_file_does_not(
     def away(_address: str) -> Any:
         raise ConnectionError("Could not connect to https://store/trial/gone.mcap?X-Amz-Signature=secret")
 
-    monkeypatch.setattr(remote, "_store", away)
+    monkeypatch.setattr(reading, "_store", away)
     done = campaign(tmp_path)
     assert (done.returncode, done.stderr.count("\n")) == (2, 1)
     assert "check network and credentials, then run again" in done.stderr

@@ -27,7 +27,6 @@ from campaign_scale import PORT, Cluster, Watch, entries
 from tactile_bayes.batch import open_executor, run_batch
 from tactile_bayes.campaign import report as campaign_report
 from tactile_bayes.campaign import run as campaigns
-from tactile_bayes.campaign import stages as campaign_stages
 from tactile_bayes.campaign import tables as campaign_tables
 from tactile_bayes.campaign.inputs import Sources, open_campaign
 from tactile_bayes.campaign.settings import CampaignSettings
@@ -62,9 +61,9 @@ def client(out: Path, exams: int) -> None:
         table = [_exam(number) for number in range(exams)]
     with tempfile.TemporaryDirectory() as place, ExitStack() as stack:
         for module, name, fake in (
-            (campaign_stages, "run_step", step),
+            (campaigns, "run_step", step),
             (campaigns, "read_sources", sources),
-            (campaign_stages, "unchanged", lambda *_: True),
+            (campaigns, "unchanged", lambda *_: True),
             (campaign_tables, "read_record", lambda _path, kind: read_record(estimate, kind)),
             (campaign_tables, "pooled_reports", lambda _campaign: {}),
         ):

@@ -7,10 +7,9 @@ import pytest
 from posterior_maps import bump_map, find_bump
 
 from tactile_bayes.declarations import replace
-from tactile_bayes.forward.gaussian import cell_mean_gaussian, covariance_from_log_widths
 from tactile_bayes.inference.draws import Solution, Solved
 from tactile_bayes.options import BumpPrior
-from tactile_bayes.posterior.bump import Bump, window_cells
+from tactile_bayes.posterior.bump import Bump, cell_mean_gaussian, covariance_from_log_widths, window_cells
 from tactile_bayes.posterior.draw import draw_parameters
 from tactile_bayes.posterior.fit import FieldFit
 from tactile_bayes.posterior.options import EstimateOptions, FitOptions

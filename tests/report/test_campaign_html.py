@@ -17,7 +17,7 @@ from tactile_bayes.files.reports import Point
 from tactile_bayes.findings import Finding
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.report.campaign_html import FAILED, SIZED, UNSIZED, Card, campaign_html, worst
+from tactile_bayes.report.pages import FAILED, SIZED, UNSIZED, Card, campaign_html, worst
 from tactile_bayes.report.svg import LONGEST_PX, thumbnail_png
 
 HOSTILE = "\"><img src=x onerror=alert(1)><script>alert(2)</script>'&lt; </p></article></main>"

@@ -47,12 +47,12 @@ from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import MapRecipe, TactileMap
 from tactile_bayes.mapping.select import scan_findings
-from tactile_bayes.report.campaign_html import SIZED, Card, campaign_html
 from tactile_bayes.report.compare import Growth, compare_summary, compare_text, growths
 from tactile_bayes.report.estimate_figures import draw_comparison
 from tactile_bayes.report.exam_page import exam_page
 from tactile_bayes.report.map_figure import map_figure
 from tactile_bayes.report.map_text import map_text
+from tactile_bayes.report.pages import SIZED, Card, campaign_html
 from tactile_bayes.report.pooled import pooled_summary, pooled_text
 
 FAST = Settings(method="laplace")
@@ -268,13 +268,13 @@ PRINTERS = {
     # behind the outputs above
     "api/comparing", "api/maps", "api/sized", "exports/dicom",
     "exports/dicom_map", "exports/fhir", "exports/nrrd", "exports/redcap", "files/map_nc",
-    "report/campaign_html", "report/compare", "report/estimate_document",
+    "report/pages", "report/compare", "report/estimate_document",
     "report/estimate_figures", "report/estimate_text", "report/exam_page", "report/map_figure", "report/map_text",
     "report/pooled",
     # of draws, not of a size; names of files that were written
     "report/posterior_figures", "actions/estimate",
     # of trials, calibrations, devices and studies
-    "api/trial_report", "actions/calibrate", "actions/devices", "actions/exam",
+    "api/trials", "actions/calibrate", "actions/devices", "actions/exam",
     "actions/simulation", "actions/study",
     "actions/tradeoff", "actions/trial", "files/size_json", "presets", "report/calibration",
     "report/paper_head", "report/laboratory",

@@ -31,17 +31,19 @@ from tactile_bayes.size.pooling import Calibration
 from tactile_bayes.size.terms import Recipe
 from tactile_bayes.studies import estimate_tradeoff as study
 from tactile_bayes.studies.estimate_tradeoff import (
+    SIZE,
     Choice,
     Estimator,
     Ladder,
     PooledRow,
     Priced,
     Reference,
+    SizeAnswer,
     Work,
+    deviation,
     measure,
     priced,
 )
-from tactile_bayes.studies.size_answers import SIZE, SizeAnswer, deviation
 
 Run = Callable[..., "CompletedProcess[str]"]
 
@@ -301,7 +303,7 @@ def test_the_command_says_how_long_it_takes_and_pools(tmp_path: Path, run_cli: R
 
 
 def test_more_maps_of_one_mass_narrow_the_interval(tmp_path: Path):
-    from tactile_bayes.api.tradeoffs import pooled_rows
+    from tactile_bayes.actions.tradeoff import pooled_rows
 
     paths = []
     for seed in (1, 2, 3):

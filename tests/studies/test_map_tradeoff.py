@@ -11,8 +11,8 @@ import pytest
 from published_schemas import check_document
 
 import tactile_bayes
+from tactile_bayes.actions.tradeoff import tradeoff_of_scan
 from tactile_bayes.api.settings import Settings
-from tactile_bayes.api.tradeoffs import tradeoff_of_scan
 from tactile_bayes.declarations import to_plain
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.scan_mcap import read_scan
@@ -21,8 +21,7 @@ from tactile_bayes.report.tradeoff import ladder_file, ladder_text
 from tactile_bayes.scan import Scan
 from tactile_bayes.studies import estimate_tradeoff
 from tactile_bayes.studies import tradeoffs as study
-from tactile_bayes.studies.estimate_tradeoff import Ladder, Priced, Work
-from tactile_bayes.studies.size_answers import SIZE, WIDTHS
+from tactile_bayes.studies.estimate_tradeoff import SIZE, WIDTHS, Ladder, Priced, Work
 
 DEMO = Path(tactile_bayes.__file__).parent / "demo" / "scan.mcap"
 

@@ -6,8 +6,8 @@ from functools import cache
 
 import numpy as np
 
-from tactile_bayes.forward.gaussian import cell_mean_gaussian
 from tactile_bayes.mapping.map import MapRecipe, TactileMap
+from tactile_bayes.posterior.bump import cell_mean_gaussian
 from tactile_bayes.posterior.options import FitOptions
 from tactile_bayes.posterior.white import Candidate, fitted_candidates
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from tactile_bayes.api.trial_sampler import draw
+from tactile_bayes.api.trials import draw
 from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.inference.ensemble import EnsembleOptions, ensemble
 from tactile_bayes.inference.importance import ImportanceOptions, importance

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 from posterior_maps import TRUTH, bump_map, correlated_field
 
-from tactile_bayes.forward.gaussian import cell_mean_gaussian, covariance_from_log_widths
 from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior import marginal as collapsed
-from tactile_bayes.posterior.bump import FitCells, window_cells
+from tactile_bayes.posterior.bump import FitCells, cell_mean_gaussian, covariance_from_log_widths, window_cells
 from tactile_bayes.posterior.draw import draw_parameters
 from tactile_bayes.posterior.field import Window, _one, cosine_profiles, gram_of_cosines, spectrum
 from tactile_bayes.posterior.fit import FieldFit, fit_scene, shape_draws

@@ -13,14 +13,13 @@ from posterior_maps import bump_map
 from scipy.stats import chi2
 
 from tactile_bayes.declarations import replace
-from tactile_bayes.forward.gaussian import cell_mean_gaussian
 from tactile_bayes.forward.scene import Lump, Noise, Scene, Strokes
 from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.errors import MOST_MM, _departures, _interpolation
 from tactile_bayes.mapping.map import TactileMap
-from tactile_bayes.posterior.bump import PoseNoise, window_cells
+from tactile_bayes.posterior.bump import PoseNoise, cell_mean_gaussian, window_cells
 from tactile_bayes.posterior.correlated import pose_covariance
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.field import Window
@@ -141,7 +140,7 @@ def with_figures(tactile_map: TactileMap, **changed: float) -> TactileMap:
 @pytest.mark.parametrize("r", [0.0, 0.15])
 def test_a_template_is_blurred_by_the_noise(r: float) -> None:
     """Against the Gaussian of the summed covariances, which keeps its volume."""
-    from tactile_bayes.forward.gaussian import covariance_from_log_widths
+    from tactile_bayes.posterior.bump import covariance_from_log_widths
 
     window = window_of(with_figures(bump_map(), pose_noise_x_mm=1.0, pose_noise_y_mm=0.5))
     p, q = np.array([1.6]), np.array([0.1])

@@ -11,7 +11,7 @@ from scipy.integrate import dblquad
 from scipy.linalg import expm
 from scipy.special import erf
 
-from tactile_bayes.forward.gaussian import cell_mean_gaussian, covariance_from_log_widths, principal_widths
+from tactile_bayes.posterior.bump import cell_mean_gaussian, covariance_from_log_widths, principal_widths
 
 DOCUMENTED_ERROR = 3e-5  # at cells of 0.75 sigma
 
