@@ -1,12 +1,8 @@
 from tactile_bayes import errors as errors
 from tactile_bayes.api.comparing import Comparison as Comparison
 from tactile_bayes.api.comparing import compare as compare
-from tactile_bayes.api.draws import Draws as Draws
 from tactile_bayes.api.estimates import estimate as estimate
 from tactile_bayes.api.estimates import pool as pool
-from tactile_bayes.api.exam_report import exam_report as exam_report
-from tactile_bayes.api.exporting import ExportedFiles as ExportedFiles
-from tactile_bayes.api.exporting import export as export
 from tactile_bayes.api.maps import Map as Map
 from tactile_bayes.api.maps import build_map as build_map
 from tactile_bayes.api.maps import demo_map as demo_map
@@ -16,11 +12,15 @@ from tactile_bayes.api.maps import read_scan as read_scan
 from tactile_bayes.api.maps import simulate as simulate
 from tactile_bayes.api.pooled import PooledSize as PooledSize
 from tactile_bayes.api.recording import record as record
+from tactile_bayes.api.reports import ExportedFiles as ExportedFiles
+from tactile_bayes.api.reports import exam_report as exam_report
+from tactile_bayes.api.reports import export as export
 from tactile_bayes.api.sized import SizeEstimate as SizeEstimate
-from tactile_bayes.api.trial_report import TrialResult as TrialResult
+from tactile_bayes.api.trials import TrialResult as TrialResult
 from tactile_bayes.api.trials import calibrate_repeatability as calibrate_repeatability
 from tactile_bayes.api.trials import calibrate_size as calibrate_size
 from tactile_bayes.api.trials import validate as validate
+from tactile_bayes.inference.draws import Draws as Draws
 
 __version__: str
 __all__: list[str]
