@@ -15,9 +15,9 @@ import numpy as np
 
 from tactile_bayes.api.trials import analyse, load_trial
 from tactile_bayes.batch import open_executor, run_batch
-from tactile_bayes.campaign.exams import find_exams
-from tactile_bayes.campaign.inputs import open_campaign, tidy
-from tactile_bayes.campaign.report import (
+from tactile_bayes.campaigns.exams import find_exams
+from tactile_bayes.campaigns.inputs import open_campaign, tidy
+from tactile_bayes.campaigns.report import (
     WRITTEN,
     Excision,
     check_inputs,
@@ -26,8 +26,8 @@ from tactile_bayes.campaign.report import (
     repeatability_words,
     write_outputs,
 )
-from tactile_bayes.campaign.run import Campaign
-from tactile_bayes.campaign.settings import CampaignSettings
+from tactile_bayes.campaigns.run import Campaign
+from tactile_bayes.campaigns.settings import CampaignSettings
 from tactile_bayes.commands.options import also_read, refuse_same, settings_of
 from tactile_bayes.commands.progress import progress_bar
 from tactile_bayes.declarations import EXACT, names_of, to_plain
@@ -45,9 +45,9 @@ from tactile_bayes.trial.planning import Design, ErrorSource, PlanReport, assump
 from tactile_bayes.trial.readings import unit_doubts
 
 if TYPE_CHECKING:
-    from tactile_bayes.campaign.exams import Found
-    from tactile_bayes.campaign.report import Written
-    from tactile_bayes.campaign.run import CampaignState
+    from tactile_bayes.campaigns.exams import Found
+    from tactile_bayes.campaigns.report import Written
+    from tactile_bayes.campaigns.run import CampaignState
     from tactile_bayes.files.manifest_csv import Exam
     from tactile_bayes.trial.planning import PlanCase
 

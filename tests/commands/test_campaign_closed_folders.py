@@ -10,7 +10,7 @@ import pytest
 from campaign_files import JOURNAL, thinned, write
 from in_process import run_here
 
-from tactile_bayes.campaign.inputs import open_campaign
+from tactile_bayes.campaigns.inputs import open_campaign
 from tactile_bayes.errors import UsageError
 
 DRY = ("campaign", "run", "exams.csv", "-o", "out", "--dry-run")

@@ -21,9 +21,9 @@ from campaign_files import FAST, JOURNAL, ROWS, contents, rows_of, steps, thinne
 from in_process import run_here
 from plain_reports import estimate_report
 
-from tactile_bayes.campaign.inputs import open_campaign
-from tactile_bayes.campaign.steps import Task, run_step
-from tactile_bayes.campaign.tables import Row
+from tactile_bayes.campaigns.inputs import open_campaign
+from tactile_bayes.campaigns.steps import Task, run_step
+from tactile_bayes.campaigns.tables import Row
 from tactile_bayes.errors import UsageError
 from tactile_bayes.files.documents import load_schema
 from tactile_bayes.files.manifest_csv import Exam as Listed

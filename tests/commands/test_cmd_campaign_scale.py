@@ -18,9 +18,9 @@ import pytest
 from campaign_files import FAST, ROWS, contents, rows_of, steps, write_study, write_table
 from in_process import run_here
 
-from tactile_bayes.campaign import inputs as campaign_inputs
-from tactile_bayes.campaign import report as campaign_report
-from tactile_bayes.campaign import run as campaigns
+from tactile_bayes.campaigns import inputs as campaign_inputs
+from tactile_bayes.campaigns import report as campaign_report
+from tactile_bayes.campaigns import run as campaigns
 from tactile_bayes.files import reading
 
 

@@ -13,7 +13,7 @@ from campaign_files import rows_of, thinned, write, write_table
 from in_process import run_here
 
 import tactile_bayes as tb
-from tactile_bayes.campaign import run as campaigns
+from tactile_bayes.campaigns import run as campaigns
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import UsageError
 from tactile_bayes.files.map_nc import read_map_and_scans, write_map

@@ -24,8 +24,8 @@ import psutil
 
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.batch import LocalWorkers, open_executor, run_batch
-from tactile_bayes.campaign.settings import put_in_place
-from tactile_bayes.campaign.steps import Task, run_step
+from tactile_bayes.campaigns.settings import put_in_place
+from tactile_bayes.campaigns.steps import Task, run_step
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import TactileBayesError
 from tactile_bayes.files.atomic import sha256

@@ -25,12 +25,12 @@ import psutil
 from campaign_scale import PORT, Cluster, Watch, entries
 
 from tactile_bayes.batch import open_executor, run_batch
-from tactile_bayes.campaign import report as campaign_report
-from tactile_bayes.campaign import run as campaigns
-from tactile_bayes.campaign import tables as campaign_tables
-from tactile_bayes.campaign.inputs import Sources, open_campaign
-from tactile_bayes.campaign.settings import CampaignSettings
-from tactile_bayes.campaign.steps import Task
+from tactile_bayes.campaigns import report as campaign_report
+from tactile_bayes.campaigns import run as campaigns
+from tactile_bayes.campaigns import tables as campaign_tables
+from tactile_bayes.campaigns.inputs import Sources, open_campaign
+from tactile_bayes.campaigns.settings import CampaignSettings
+from tactile_bayes.campaigns.steps import Task
 from tactile_bayes.files.documents import read_record
 from tactile_bayes.files.manifest_csv import ESTIMATE, EXAMS, JOURNAL, Exam
 

@@ -30,8 +30,8 @@ from tactile_bayes.api.maps import Map
 from tactile_bayes.api.pooled import PooledSize
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.api.sized import SizeEstimate
-from tactile_bayes.campaign.match import growth_text
-from tactile_bayes.campaign.tables import Row, done_text
+from tactile_bayes.campaigns.match import growth_text
+from tactile_bayes.campaigns.tables import Row, done_text
 from tactile_bayes.declarations import replace
 from tactile_bayes.exports.exam import MapFile, estimate_of
 from tactile_bayes.exports.fhir import bundle_of

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Final
 
 from tactile_bayes import __version__
 from tactile_bayes.api.trials import analyse, load_trial, read_excision
-from tactile_bayes.campaign.match import growth_rows, growth_text
-from tactile_bayes.campaign.run import Campaign
-from tactile_bayes.campaign.tables import Row, exam_rows, write_tables
+from tactile_bayes.campaigns.match import growth_rows, growth_text
+from tactile_bayes.campaigns.run import Campaign
+from tactile_bayes.campaigns.tables import Row, exam_rows, write_tables
 from tactile_bayes.declarations import Record, field, replace
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.atomic import write_text

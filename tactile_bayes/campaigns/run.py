@@ -2,7 +2,7 @@
 
 Layout of the output folder: ``exams/EXAM/`` (map.nc, estimate.json, posterior.nc, shape.npz, thumbnail.png...),
 ``masses/MASS/`` (pooled.json, pooled.nc) and ``growth/MASS/`` (compare.json), the tables and pages beside them
-(`campaign_report`), repeatability.json where it was learned (the sizes by it are ``exams/EXAM/sized.json``), and the
+(`campaigns.report`), repeatability.json where it was learned (the sizes by it are ``exams/EXAM/sized.json``), and the
 journal, which holds for each step its key, the digests of its files and how long it took. The key is the step, the exam
 or mass, and a digest of the program's version, the settings and the content of the inputs. A step whose
 key is in the journal and whose files are what it made is not run again.
@@ -23,10 +23,10 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.batch import CLUSTER_LOST, BatchInterrupted, Outcome, run_batch
 from tactile_bayes.batch_store import BatchStore
-from tactile_bayes.campaign.inputs import READ, Alike, StepResults, read_sources, unchanged
-from tactile_bayes.campaign.match import Breasts, NamedPlace, Visits, days_of, grown_masses
-from tactile_bayes.campaign.settings import CampaignSettings, digest_of
-from tactile_bayes.campaign.steps import (
+from tactile_bayes.campaigns.inputs import READ, Alike, StepResults, read_sources, unchanged
+from tactile_bayes.campaigns.match import Breasts, NamedPlace, Visits, days_of, grown_masses
+from tactile_bayes.campaigns.settings import CampaignSettings, digest_of
+from tactile_bayes.campaigns.steps import (
     FEWEST_MASSES,
     FILES,
     NOT_LEARNED,
@@ -176,7 +176,7 @@ def _key(task: Task) -> str:
 #
 # Layout of the output folder: ``exams/EXAM/`` (map.nc, estimate.json, posterior.nc, shape.npz, thumbnail.png...),
 # ``masses/MASS/`` (pooled.json, pooled.nc) and ``growth/MASS/`` (compare.json), the tables and pages beside them
-# (`campaign_report`), repeatability.json where it was learned (the sizes by it are ``exams/EXAM/sized.json``), and
+# (`campaigns.report`), repeatability.json where it was learned (the sizes by it are ``exams/EXAM/sized.json``), and
 # the journal, which holds for each step its key, the digests of its files and how long it took. The key is the
 # step, the exam or mass, and a digest of the program's version, the settings and the content of the inputs. A step
 # whose key is in the journal and whose files are what it made is not run again.

@@ -14,9 +14,9 @@ from typing import Any, Final
 
 from tactile_bayes.batch import CLUSTER_LOST, run_batch
 from tactile_bayes.batch_store import BatchStore, open_store
-from tactile_bayes.campaign.match import Breasts
-from tactile_bayes.campaign.settings import STAGED, clear_staged, put_in_place, stamp
-from tactile_bayes.campaign.steps import FILES, UNWRITTEN, Result
+from tactile_bayes.campaigns.match import Breasts
+from tactile_bayes.campaigns.settings import STAGED, clear_staged, put_in_place, stamp
+from tactile_bayes.campaigns.steps import FILES, UNWRITTEN, Result
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError, TactileBayesError, UsageError
 from tactile_bayes.files.atomic import sha256, unwritable

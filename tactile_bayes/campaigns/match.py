@@ -26,7 +26,7 @@ from tactile_bayes.trial.readings import day_of, in_order
 if TYPE_CHECKING:
     from tactile_bayes.api.settings import Settings
     from tactile_bayes.api.sized import SizeEstimate
-    from tactile_bayes.campaign.run import Campaign
+    from tactile_bayes.campaigns.run import Campaign
     from tactile_bayes.geometry import FloatArray
     from tactile_bayes.mapping.map import TactileMap
 

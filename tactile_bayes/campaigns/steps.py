@@ -17,8 +17,8 @@ from tactile_bayes.api.pooled import pool_answers
 from tactile_bayes.api.repeatability import ExamFolder, learn_from_exams, repeatability_setting
 from tactile_bayes.api.settings import Comparing, Settings
 from tactile_bayes.api.sized import Answer, SizeEstimate, size_priors
-from tactile_bayes.campaign.match import OWN_AXES, NamedPlace, in_own_axes, matched
-from tactile_bayes.campaign.settings import Writes, digest_of, write_staged
+from tactile_bayes.campaigns.match import OWN_AXES, NamedPlace, in_own_axes, matched
+from tactile_bayes.campaigns.settings import Writes, digest_of, write_staged
 from tactile_bayes.declarations import EXACT, Record, field, from_plain, replace, rounded, to_plain
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.atomic import sha256, write_bytes, write_text
@@ -59,7 +59,7 @@ from tactile_bayes.size.draws import SIZES
 from tactile_bayes.size.pooling import size_alone
 
 if TYPE_CHECKING:
-    from tactile_bayes.campaign.settings import CampaignSettings
+    from tactile_bayes.campaigns.settings import CampaignSettings
     from tactile_bayes.mapping.map import TactileMap
     from tactile_bayes.scan import Scan
     from tactile_bayes.size.draws import SizePosterior

@@ -7,8 +7,8 @@ from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from tactile_bayes.campaign.match import unnamed
-from tactile_bayes.campaign.run import Campaign
+from tactile_bayes.campaigns.match import unnamed
+from tactile_bayes.campaigns.run import Campaign
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.files.atomic import write_text
 from tactile_bayes.files.documents import load_schema, read_record
