@@ -7,12 +7,15 @@
 - `estimate`, `pool`: from a map, or from several maps of one mass, to a size
 - `compare`: from the maps of two visits to the change of a mass's size
 - `calibrate_size`, `validate`: from tables to a size calibration, or to a trial's report
+- `campaign`: from a table of exams to their maps and sizes, and to the trial's report
+- `plan`: from assumed errors, or a pilot's tables, to the power of a trial
+- `diagnose`: from a posterior's file to how far its draws can be trusted
 - `calibrate_repeatability`: from a campaign's folder to the spread between exams of one mass at its site
 - `exam_report`: from maps and estimates to the page of an exam, HTML or PDF
 - `export`: from maps and estimates to DICOM, FHIR, NRRD and CSV
 - `record`: from devices to a scan
-- `Map`, `SizeEstimate`, `PooledSize`, `Comparison`, `TrialResult`, `ExportedFiles`, `Draws`: what they return;
-  `errors`: what they raise
+- `Map`, `SizeEstimate`, `PooledSize`, `Comparison`, `TrialResult`, `CampaignResult`, `TrialPlan`, `Diagnosis`,
+  `ExportedFiles`, `Draws`: what they return; `errors`: what they raise
 """
 
 from __future__ import annotations
@@ -22,23 +25,29 @@ from importlib import import_module
 __version__ = "0.1.0"
 
 __all__ = [
+    "CampaignResult",
     "Comparison",
+    "Diagnosis",
     "Draws",
     "ExportedFiles",
     "Map",
     "PooledSize",
     "SizeEstimate",
+    "TrialPlan",
     "TrialResult",
     "build_map",
     "calibrate_repeatability",
     "calibrate_size",
+    "campaign",
     "compare",
     "demo_map",
     "demo_scan",
+    "diagnose",
     "errors",
     "estimate",
     "exam_report",
     "export",
+    "plan",
     "pool",
     "read_map",
     "read_scan",
@@ -48,22 +57,28 @@ __all__ = [
 ]
 
 _HOME = {
+    "CampaignResult": "campaigns.campaign",
     "Comparison": "api.comparing",
+    "Diagnosis": "api.diagnosing",
     "Draws": "inference.draws",
     "ExportedFiles": "api.reports",
     "Map": "api.maps",
     "PooledSize": "api.pooled",
     "SizeEstimate": "api.sized",
+    "TrialPlan": "api.planning",
     "TrialResult": "api.trials",
     "build_map": "api.maps",
     "calibrate_repeatability": "api.trials",
     "calibrate_size": "api.trials",
+    "campaign": "campaigns.campaign",
     "compare": "api.comparing",
     "demo_map": "api.maps",
     "demo_scan": "api.maps",
+    "diagnose": "api.diagnosing",
     "estimate": "api.estimates",
     "exam_report": "api.reports",
     "export": "api.reports",
+    "plan": "api.planning",
     "pool": "api.estimates",
     "read_map": "api.maps",
     "read_scan": "api.maps",

@@ -1,6 +1,8 @@
 from tactile_bayes import errors as errors
 from tactile_bayes.api.comparing import Comparison as Comparison
 from tactile_bayes.api.comparing import compare as compare
+from tactile_bayes.api.diagnosing import Diagnosis as Diagnosis
+from tactile_bayes.api.diagnosing import diagnose as diagnose
 from tactile_bayes.api.estimates import estimate as estimate
 from tactile_bayes.api.estimates import pool as pool
 from tactile_bayes.api.maps import Map as Map
@@ -10,6 +12,8 @@ from tactile_bayes.api.maps import demo_scan as demo_scan
 from tactile_bayes.api.maps import read_map as read_map
 from tactile_bayes.api.maps import read_scan as read_scan
 from tactile_bayes.api.maps import simulate as simulate
+from tactile_bayes.api.planning import TrialPlan as TrialPlan
+from tactile_bayes.api.planning import plan as plan
 from tactile_bayes.api.pooled import PooledSize as PooledSize
 from tactile_bayes.api.recording import record as record
 from tactile_bayes.api.reports import ExportedFiles as ExportedFiles
@@ -20,6 +24,8 @@ from tactile_bayes.api.trials import TrialResult as TrialResult
 from tactile_bayes.api.trials import calibrate_repeatability as calibrate_repeatability
 from tactile_bayes.api.trials import calibrate_size as calibrate_size
 from tactile_bayes.api.trials import validate as validate
+from tactile_bayes.campaigns.campaign import CampaignResult as CampaignResult
+from tactile_bayes.campaigns.campaign import campaign as campaign
 from tactile_bayes.inference.draws import Draws as Draws
 
 __version__: str

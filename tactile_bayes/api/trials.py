@@ -230,7 +230,7 @@ def validate(
     """
     check_keywords("validate", settings, names_of(TrialSettings))
     used = TrialSettings(**{name: plain(value) for name, value in settings.items()})
-    return analyse(load_trial(_table(trial, "trial"), _table(excision, "excision"), path_of(columns)), used)
+    return analyse(load_trial(table_of(trial, "trial"), table_of(excision, "excision"), path_of(columns)), used)
 
 
 @door
@@ -287,7 +287,7 @@ def calibrate_size(
     check_number("seed", seed, 0, whole=True)
     check_number("least_stiffness_ratio", least_stiffness_ratio, 0)
     target = None if path is None else output_path(path, "JSON")
-    source = _table(table, "table")
+    source = table_of(table, "table")
     over_bodies_alone = form != "eq6" or (correct is None and is_population(source))
     names = ("normalise",) if over_bodies_alone else ("normalise", "background", "fit_radius_mm", "noise")
     check_keywords(f"calibrate_size for form {form!r} and this table", declared, names)
@@ -353,7 +353,7 @@ def calibrate_repeatability(
     return learned.repeatability
 
 
-def _table(given: PathLike | pandas.DataFrame, name: str) -> Path | Sheet:
+def table_of(given: PathLike | pandas.DataFrame, name: str) -> Path | Sheet:
     """Return a path as it is, and a DataFrame as CSV text."""
     if hasattr(given, "to_csv"):
         return Sheet(Path(f"{name} (DataFrame)"), given.to_csv(index=False))

@@ -14,8 +14,10 @@ from in_process import run_here
 
 import tactile_bayes as tb
 from tactile_bayes.cli import cli
+from tactile_bayes.declarations import names_of
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.exports.run import TAKES
+from tactile_bayes.options import PlanErrors
 from tactile_bayes.report import exam_page as exam_files
 from tactile_bayes.report import exam_page as printed
 
@@ -23,6 +25,8 @@ DEMO = Path(tb.__file__).parent / "demo"
 FAST = {"method": "laplace"}
 BY_PYTHON = {"as_json": "document", "verbose": "full_text", "figure": "plot"}
 """Options of the command line that are members of what Python returns."""
+FIGURES = ("trace", "rank", "corner")
+"""Options of `diagnose` that are kinds of its plots."""
 
 
 def options(command: str) -> set[str]:
@@ -50,6 +54,16 @@ def test_every_option_of_report_is_a_keyword() -> None:
     assert options("report") - keywords(tb.exam_report) - keywords(tb.estimate) == {"output"}
     for kind in (tb.SizeEstimate, tb.PooledSize):
         assert keywords(tb.exam_report) - {"files", "settings"} <= keywords(kind.report)
+
+
+def test_every_option_of_campaign_plan_and_diagnose_is_a_keyword_or_a_member() -> None:
+    run = cli.get_command(click.Context(cli), "campaign").get_command(click.Context(cli), "run")  # type: ignore[union-attr]
+    assert {str(one.name) for one in run.params} - {"settings_file"} <= keywords(tb.campaign) | keywords(tb.estimate)
+    assert options("plan") - keywords(tb.plan) - set(names_of(PlanErrors)) == {"as_json", "output", "force"}
+    assert hasattr(tb.TrialPlan, "document")
+    assert hasattr(tb.TrialPlan, "write_json")
+    assert options("diagnose") - keywords(tb.diagnose) - keywords(tb.Diagnosis.plot) == {"as_json", *FIGURES}
+    assert hasattr(tb.Diagnosis, "document")
 
 
 @pytest.fixture(scope="module")

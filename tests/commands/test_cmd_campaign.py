@@ -21,6 +21,7 @@ from campaign_files import FAST, JOURNAL, ROWS, contents, rows_of, steps, thinne
 from in_process import run_here
 from plain_reports import estimate_report
 
+import tactile_bayes as tb
 from tactile_bayes.campaigns.inputs import open_campaign
 from tactile_bayes.campaigns.steps import Task, run_step
 from tactile_bayes.campaigns.tables import Row
@@ -224,6 +225,33 @@ def test_a_step_that_ends_after_its_command_was_killed_changes_nothing_that_is_r
     assert campaign(finished).returncode == 0
     assert contents(out) == before
     assert steps(out) == done
+
+
+def test_python_runs_what_the_command_runs(own: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The command has nothing left to do."""
+    monkeypatch.chdir(own)
+    write_table(own / "exams.csv", [ROWS[3], ROWS[5]])
+    words = ("campaign", "run", "exams.csv", "-o", "out", "--method", "laplace")
+    planned = tb.campaign("exams.csv", "out", method="laplace", dry_run=True)
+    assert planned.text == run_here(*words, "--dry-run", cwd=own).stdout
+    assert repr(planned) == "<CampaignResult of 2 exams: nothing was run>"
+    tb.campaign("exams.csv", "out", method="laplace")
+    done = run_here(*words, "--excision", "excision.csv", cwd=own)
+    found = tb.campaign("exams.csv", Path("out"), excision="excision.csv", method="laplace")
+    assert "1 steps run, 2 kept" in found.text
+    assert found.text == done.stdout
+    assert [f"failed: {line}" for line in found.failed] == done.stderr.splitlines()
+    assert repr(found) == "<CampaignResult of 2 exams: 1 sized, 0 without a size, 1 failed>"
+    with pytest.raises(UsageError, match="protocol is for the trial's report; give excision too"):
+        tb.campaign("exams.csv", "out", protocol="p.toml")
+    with pytest.raises(UsageError, match="normalise is 'twice'; give one of"):
+        tb.campaign("exams.csv", "out", normalise="twice")
+
+
+def test_an_output_that_is_an_input_is_refused(finished: Path) -> None:
+    shutil.copy(finished / "excision.csv", finished / "out" / "trial.csv")
+    done = campaign(finished, "--excision", "out/trial.csv")
+    assert "out/trial.csv is an input of this command; choose another name for the output" in done.stderr
 
 
 @pytest.mark.parametrize("name", ["exams_done", "failures"])

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 from in_process import run_here
 
+import tactile_bayes as tb
+from tactile_bayes.errors import UsageError
 from tactile_bayes.files.atomic import write_bytes
 from tactile_bayes.files.netcdf import Contents, Variable, grouped_netcdf_bytes
 
@@ -79,3 +81,19 @@ def test_convergence_is_arvizs_own(tmp_path: Path) -> None:
         "max_size_mm"
     ]
     assert found["ess_bulk"] == pytest.approx(float(arviz.ess(draws, method="bulk")))
+
+
+def test_python_diagnoses_as_the_command_does(tmp_path: Path) -> None:
+    for chains in (1, 4):
+        path = tmp_path / f"{chains}.nc"
+        write(path, chains)
+        found = tb.diagnose(path)
+        assert found.text == run_here("diagnose", path, cwd=tmp_path).stdout
+        assert found.document == json.loads(run_here("diagnose", path, "--json", cwd=tmp_path).stdout)
+        assert f"{chains} chain" in repr(found)
+    assert found.plot("rank", tmp_path / "r.svg").axes
+    assert (tmp_path / "r.svg").exists()
+    with pytest.raises(UsageError, match=r'rank compares chains and .* has one; estimate with method="ensemble"'):
+        tb.diagnose(tmp_path / "1.nc").plot("rank")
+    with pytest.raises(UsageError, match="kind is 'r'; give one of trace, rank, corner"):
+        found.plot("r")

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
+import pandas
 import pytest
 from click.testing import CliRunner, Result
 from published_schemas import check_document
 
-import tactile_bayes
+import tactile_bayes as tb
 from tactile_bayes.commands.trial import plan_command as command
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.presets import RESEARCH_USE
 
-DEMO = Path(tactile_bayes.__file__).parent / "demo"
+DEMO = Path(tb.__file__).parent / "demo"
 SMALL = ("--patients", 12, "--maps", 1, "--maps", 3, "--trials", 50)
 
 
@@ -55,3 +57,33 @@ def test_refusals_name_the_way_out() -> None:
     assert isinstance(error, BadDataError)
     assert "choose one with --against" in str(error)
     assert plan("--patients", 7).exit_code == 2
+
+
+def test_python_plans_as_the_command_does(tmp_path: Path) -> None:
+    tables = {"pilot": DEMO / "trial.csv", "excision": DEMO / "excision.csv"}
+    words = [word for name, path in tables.items() for word in (f"--{name}", path)]
+    told = plan(*SMALL, *words, "--map-sd", 0.2, "--json", "-o", tmp_path / "a.json")
+    given = {"patients": [12], "maps": (3, 1), "trials": 50, "map_sd": 0.2}
+    found = tb.plan(**given, **tables)
+    assert found.document == json.loads(told.stdout)
+    found.write_json(tmp_path / "b.json")
+    assert (tmp_path / "b.json").read_bytes() == (tmp_path / "a.json").read_bytes()
+    assert found.text == plan(*SMALL, *words, "--map-sd", 0.2).stdout
+    frames = {name: pandas.read_csv(path) for name, path in tables.items()}
+    assert {**tb.plan(**given, **frames).document, "provenance": 0} == {**found.document, "provenance": 0}
+
+
+@pytest.mark.parametrize(
+    ("given", "fault"),
+    [
+        ({"patients": [7]}, "patients is 7; give a whole number from 8"),
+        ({"maps": 3}, "maps is 3; give a list of whole numbers"),
+        ({"trials": 49}, "trials is 49"),
+        ({"map_sd": -1.0}, "map_sd is -1"),
+        ({"against": "mri"}, "against says how a pilot is read"),
+        ({"pilot": DEMO / "trial.csv"}, "pilot needs excision"),
+    ],
+)
+def test_python_refuses_with_its_own_words(given: dict[str, Any], fault: str) -> None:
+    with pytest.raises(UsageError, match=fault):
+        tb.plan(**given)

@@ -275,7 +275,8 @@ PRINTERS = {
     # of draws, not of a size; names of files that were written
     "report/posterior_figures", "actions/estimate",
     # of trials, calibrations, devices and studies
-    "api/trials", "actions/calibrate", "actions/devices", "actions/exam",
+    "api/trials", "actions/calibrate", "actions/devices", "api/diagnosing", "api/planning",
+    "campaigns/campaign", "actions/exam",
     "actions/simulation", "actions/study",
     "actions/tradeoff", "actions/trial", "files/size_json", "presets", "report/calibration",
     "report/paper_head", "report/laboratory",

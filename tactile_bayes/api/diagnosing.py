@@ -1,0 +1,126 @@
+"""How far the draws of a posterior can be trusted, as a table and as pictures."""
+
+from __future__ import annotations
+
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from tactile_bayes.api.arguments import door
+from tactile_bayes.api.maps import PathLike, path_of, required_path
+from tactile_bayes.declarations import Record
+from tactile_bayes.errors import UsageError, check_choice
+from tactile_bayes.files.map_nc import PosteriorDraws, read_posterior
+from tactile_bayes.findings import finding_lines
+from tactile_bayes.inference.ensemble import convergence
+from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.report.figure_file import named_exam
+from tactile_bayes.report.posterior_figures import corner_figure, rank_figure, trace_figure
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_QUANTITIES = ("max_size_mm", "min_size_mm", "d_x_mm", "d_y_mm", "amplitude", "sigma_x_mm", "sigma_y_mm")
+_FIGURES = {"trace": trace_figure, "rank": rank_figure, "corner": corner_figure}
+
+
+class Diagnosis(Record, eq=False):
+    """How far the draws of a posterior can be trusted."""
+
+    posterior: PosteriorDraws
+    path: Path
+    """Of its file."""
+    quantities: dict[str, dict[str, float]]
+    """Median of each size and width, and of chains R-hat, effective draws and Monte-Carlo errors."""
+
+    @property
+    def chains(self) -> int:
+        """Number of chains; 1 for draws that are independent."""
+        return len(next(iter(self.posterior.draws.values())))
+
+    @property
+    def document(self) -> dict[str, Any]:
+        """What ``diagnose --json`` prints."""
+        return {
+            "method": self.posterior.method,
+            "chains": self.chains,
+            "quantities": self.quantities,
+            "research_use": RESEARCH_USE,
+            "findings": [one.as_dict() for one in self.posterior.findings],
+        }
+
+    @property
+    def text(self) -> str:
+        """What ``diagnose`` prints."""
+        return "\n".join([*finding_lines(self.posterior.findings), *self._table(), RESEARCH_USE]) + "\n"
+
+    def _table(self) -> list[str]:
+        found, chains = self.posterior, self.chains
+        number = next(iter(found.draws.values())).size
+        lines = [f"method {found.method}: {number} draws in {chains} chain{'s' if chains > 1 else ''}"]
+        if chains == 1:
+            shape = found.diagnostics.get("pareto_k")
+            lines += [] if shape is None else [f"Pareto shape of the weights {shape:.2f} (trusted up to 0.7)"]
+            return [*lines, *(f"{name:14}{one['median']:>10.4g}" for name, one in self.quantities.items())]
+        lines.append(
+            f"{'':14}{'median':>10}{'R-hat':>8}{'bulk ESS':>10}{'tail ESS':>10}"
+            f"{'MCSE of median':>16}{'of 95 % ends':>16}"
+        )
+        for name, one in self.quantities.items():
+            ends = max(one["mcse_low"], one["mcse_high"])
+            lines.append(
+                f"{name:14}{one['median']:>10.4g}{one['rhat']:>8.3f}{one['ess_bulk']:>10.0f}{one['ess_tail']:>10.0f}"
+                f"{one['mcse_median']:>16.2g}{ends:>16.2g}"
+            )
+        return lines
+
+    def draw(self, kind: str, path: Path | None, *, force: bool = False) -> Figure:
+        """Draw one of the pictures of ``diagnose``; that of ranks compares chains, and needs several."""
+        if kind == "rank" and self.chains < 2:
+            raise UsageError(f"--rank compares chains and {self.path} has one; estimate with --method ensemble")
+        title = f"{named_exam(self.path.stem, self.posterior.scans)}, method {self.posterior.method}"
+        return _FIGURES[kind](self.posterior.draws, path, title=title, force=force)
+
+    @door
+    def plot(self, kind: str = "trace", path: PathLike | None = None, *, force: bool = False) -> Figure:
+        """Draw the ``"trace"`` of the draws, their ``"rank"`` among all chains or the ``"corner"`` of all pairs."""
+        check_choice("kind", kind, tuple(_FIGURES))
+        return self.draw(kind, path_of(path), force=force)
+
+    def __repr__(self) -> str:
+        worst = max((one.get("rhat", np.nan) for one in self.quantities.values()), default=np.nan)
+        agree = f", R-hat up to {worst:.3f}" if self.chains > 1 else ""
+        return f"<Diagnosis of {self.path.name}: method {self.posterior.method}, {self.chains} chains{agree}>"
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{escape(self.text)}</pre>"
+
+
+@door
+def diagnose(posterior: PathLike) -> Diagnosis:
+    """Check the draws of a posterior: R-hat, effective draws and Monte-Carlo errors of every size and width.
+
+    Parameters
+    ----------
+    posterior
+        What ``estimate -o`` or `save` wrote.
+
+    Raises
+    ------
+    BadDataError
+        When the file holds no draws of this program.
+    """
+    return diagnosed(required_path(posterior, "posterior"))
+
+
+def diagnosed(path: Path) -> Diagnosis:
+    """Read a posterior's file, and say how far its draws can be trusted."""
+    found = read_posterior(path)
+    shown = {name: found.draws[name] for name in _QUANTITIES if name in found.draws}
+    figures = {name: {"median": float(np.nanmedian(draws))} for name, draws in shown.items()}
+    if all(len(draws) > 1 for draws in shown.values()):
+        for name, draws in shown.items():
+            figures[name] |= convergence(draws)
+    return Diagnosis(found, path, figures)

@@ -1,0 +1,225 @@
+"""A trial planned: power, widths of intervals and the worth of more maps, by simulation."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from html import escape
+from operator import attrgetter
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from tactile_bayes.api.arguments import check_keywords, door, plain, sequence_of
+from tactile_bayes.api.maps import PathLike
+from tactile_bayes.api.trials import load_trial, table_of
+from tactile_bayes.batch import open_executor, run_batch
+from tactile_bayes.declarations import EXACT, Record, as_dict, names_of, to_plain
+from tactile_bayes.errors import BadDataError, UsageError, check_number
+from tactile_bayes.files.atomic import write_text
+from tactile_bayes.files.documents import dump_json
+from tactile_bayes.files.provenance import Provenance, hash_inputs
+from tactile_bayes.files.tables import Sheet
+from tactile_bayes.options import PlanErrors
+from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.progress import Progress, untold
+from tactile_bayes.report.trial import plan_text
+from tactile_bayes.trial.planning import ErrorSource, PlanReport, assumptions_from, designs, map_gains, run_case
+from tactile_bayes.trial.readings import Trial, unit_doubts
+
+if TYPE_CHECKING:
+    import pandas
+
+PATIENTS, MAPS, TRIALS, SEED = (16, 24, 32, 48), (1, 3, 5), 1000, 1999
+"""Defaults of a plan."""
+_AGAINST = "ultrasound"
+_ERRORS = names_of(PlanErrors)
+
+
+class TrialPlan(Record, eq=False):
+    """Power and widths of intervals of planned trials; `report` is what the file of ``plan -o`` holds."""
+
+    report: PlanReport
+    doubts: tuple[str, ...] = ()
+    """What speaks against the pilot's tables."""
+
+    @property
+    def document(self) -> dict[str, Any]:
+        """What ``plan --json`` prints."""
+        document: dict[str, Any] = to_plain(self.report, digits=EXACT)
+        return document
+
+    @property
+    def text(self) -> str:
+        """What ``plan`` prints."""
+        return plan_text(self.report)
+
+    def write_json(self, path: Path, *, force: bool = False) -> None:
+        """Write what ``plan -o`` writes."""
+        write_text(path, dump_json(self.document), force=force)
+
+    def __repr__(self) -> str:
+        first, last = self.report.designs[0], self.report.designs[-1]
+        return f"<TrialPlan power {first.power:.2f} ({first.patients} patients) to {last.power:.2f} ({last.patients})>"
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{escape(self.text)}</pre>"
+
+
+class Pilot(Record, eq=False):
+    """An earlier trial that errors are taken from."""
+
+    trial: Trial
+    path: Path
+    """Of its readings, for errors; the name of a DataFrame."""
+
+    def doubts(self) -> Iterator[str]:
+        """What speaks against its tables, a line each."""
+        yield from self.trial.other_visits.lines()
+        sizes, ex_vivo = self.trial.sizes(), np.array(list(self.trial.ex_vivo_mm.values()))
+        yield from (f"doubtful: {doubt}" for doubt in unit_doubts(sizes, ex_vivo))
+
+    def errors(self, against: str, given: Mapping[str, float]) -> dict[str, float]:
+        """Errors of ln size, those that are given as they are."""
+        sizes = self.trial.sizes()
+        for name in ("tactile", against):
+            if name not in sizes:
+                way_out = f"it has {', '.join(sizes)}; choose one with --against"
+                raise BadDataError(f"holds no readings by {name}", way_out=way_out, path=str(self.path))
+        found = assumptions_from(sizes["tactile"], sizes[against], map_sd=given.get("map_sd"))
+        if found is None:
+            way_out = "give the errors by options"
+            raise BadDataError("has fewer than 3 masses found by a modality", way_out=way_out, path=str(self.path))
+        if "map_sd" not in found:
+            what = "has no mass with two tactile readings, so the SD of single maps is unknown"
+            raise BadDataError(what, way_out="give it with --map-sd", path=str(self.path))
+        return {**found, **given}
+
+    @property
+    def files(self) -> dict[str, Path]:
+        """The two tables, where they are files."""
+        files = self.trial.files
+        return {role: files[name] for role, name in (("pilot", "trial"), ("excision", "excision")) if name in files}
+
+
+def read_pilot(pilot: Path | Sheet | None, excision: Path | Sheet | None, against: str | None) -> Pilot | None:
+    """Read a pilot's tables, None without one; refuses what goes only with one, and a pilot without its excision."""
+    if pilot is None:
+        for name, given in (("excision", excision), ("against", against)):
+            if given is not None:
+                raise UsageError(f"--{name} says how a pilot is read; give --pilot TRIAL.csv, or leave it out")
+        return None
+    if excision is None:
+        raise UsageError("--pilot needs --excision; give the pilot's excision table")
+    if against == "tactile":
+        raise UsageError("--against tactile compares tactile sizes with themselves; name another modality")
+    return Pilot(load_trial(pilot, excision, None), pilot.name if isinstance(pilot, Sheet) else pilot)
+
+
+@door
+def plan(
+    *,
+    patients: Sequence[int] = PATIENTS,
+    maps: Sequence[int] = MAPS,
+    pilot: PathLike | pandas.DataFrame | None = None,
+    excision: PathLike | pandas.DataFrame | None = None,
+    against: str | None = None,
+    trials: int = TRIALS,
+    seed: int = SEED,
+    workers: int = 1,
+    progress: Progress = untold,
+    **errors: float,
+) -> TrialPlan:
+    """Plan a trial: power, widths of intervals and the worth of more maps, by simulation.
+
+    Parameters
+    ----------
+    patients, maps
+        Numbers of patients, one mass each, and of tactile maps per mass; every pair is a design.
+    pilot, excision
+        Tables of an earlier trial, files or DataFrames: the errors that no keyword gives are taken from it.
+    against
+        Modality of the pilot to compare with, by default ultrasound.
+    trials, seed
+        Simulated trials per design, and of their random numbers.
+    workers
+        Number of worker processes; 1 for none but this one.
+    progress
+        Called with designs done and wanted.
+    **errors
+        As of `tactile_bayes.options.PlanErrors`, by default as on the command line.
+
+    Raises
+    ------
+    BadDataError
+        When a table is not what it must be, or tells too little of the errors.
+    UsageError
+        When a value cannot be one, or goes only with a pilot.
+
+    Examples
+    --------
+    >>> import tactile_bayes as tb
+    >>> tb.plan(patients=[24], maps=[3], trials=50).report.designs[0].patients
+    24
+    """
+    check_keywords("plan", errors, _ERRORS)
+    for name, numbers, least, most in (("patients", patients, 8, 10_000), ("maps", maps, 1, 1000)):
+        for one in sequence_of(name, numbers, "whole numbers"):
+            check_number(name, one, least, most, whole=True)
+    check_number("trials", trials, 50, whole=True)
+    check_number("seed", seed, 0, whole=True)
+    found = read_pilot(_table(pilot, "pilot"), _table(excision, "excision"), against)
+    return planned(
+        patients,
+        maps,
+        {name: plain(value) for name, value in errors.items()},
+        pilot=found,
+        against=against,
+        trials=trials,
+        seed=seed,
+        workers=workers,
+        progress=progress,
+    )
+
+
+def _table(given: PathLike | pandas.DataFrame | None, name: str) -> Path | Sheet | None:
+    return None if given is None else table_of(given, name)
+
+
+def planned(
+    patients: Sequence[int],
+    maps: Sequence[int],
+    given: Mapping[str, float],
+    *,
+    pilot: Pilot | None,
+    against: str | None,
+    trials: int,
+    seed: int,
+    workers: int,
+    progress: Progress,
+) -> TrialPlan:
+    """Plan with the errors that are given, those of the pilot, and the defaults, in this order."""
+    by_default = as_dict(PlanErrors(**given))
+    errors = by_default if pilot is None else pilot.errors(against or _AGAINST, given)
+    rest: ErrorSource = "default" if pilot is None else "pilot"
+    cases = list(designs(sorted(set(patients)), sorted(set(maps)), **errors, trials=trials, seed=seed))
+    with open_executor(workers=workers) as executor:
+        outcomes = run_batch(run_case, cases, key=attrgetter("key"), executor=executor, progress=progress)
+    for outcome in outcomes:
+        if outcome.value is None:
+            raise BadDataError(f"{outcome.key}: {outcome.error}", way_out="change the errors assumed")
+    found = tuple(outcome.value for outcome in outcomes if outcome.value is not None)
+    assumed = {name: float(f"{errors[name]:.9g}") for name in _ERRORS}
+    sources: dict[str, ErrorSource] = {name: "option" if name in given else rest for name in _ERRORS}
+    inputs = hash_inputs(**({} if pilot is None else pilot.files))
+    settings = {"trials": trials, "errors": assumed, "errors_from": sources}
+    report = PlanReport(
+        schema="tactile-bayes/plan/1",
+        errors=assumed,
+        errors_from=sources,
+        designs=found,
+        gains=map_gains(found),
+        provenance=Provenance("plan", settings, inputs, seed=seed).as_dict(),
+        research_use=RESEARCH_USE,
+    )
+    return TrialPlan(report, () if pilot is None else tuple(pilot.doubts()))

@@ -1,0 +1,268 @@
+"""A campaign from its table of exams to the trial's report: what is checked, run, written and told."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator, Sequence
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from tactile_bayes.api.arguments import door, plain
+from tactile_bayes.api.estimates import settings_of
+from tactile_bayes.api.maps import PathLike, path_of, required_path
+from tactile_bayes.batch import open_executor
+from tactile_bayes.campaigns.inputs import open_campaign, tidy
+from tactile_bayes.campaigns.report import (
+    WRITTEN,
+    Excision,
+    Written,
+    check_inputs,
+    copy_outputs,
+    counts_words,
+    repeatability_words,
+    write_outputs,
+)
+from tactile_bayes.campaigns.run import Bar, Campaign, CampaignState
+from tactile_bayes.campaigns.settings import CampaignSettings
+from tactile_bayes.declarations import Record
+from tactile_bayes.errors import UsageError, check_number
+from tactile_bayes.files.atomic import same_file
+from tactile_bayes.files.manifest_csv import read_manifest
+from tactile_bayes.files.reading import check_address
+from tactile_bayes.files.size_json import NONE, size_calibration_path
+from tactile_bayes.options import MapOptions
+from tactile_bayes.presets import DEFAULT_NORMALISE, MATCH_MM, RESEARCH_USE
+
+if TYPE_CHECKING:
+    from tactile_bayes.files.manifest_csv import Exam
+    from tactile_bayes.size.pooling import Repeatability
+
+MOST_NAMED: Final = 5
+"""So many exams or masses are named in a line."""
+
+
+class CampaignResult(Record, eq=False):
+    """What a campaign did, or would do."""
+
+    campaign: Campaign
+    folder: Path
+    written: Written | None
+    """What was written; None where nothing was run."""
+    unlisted: tuple[str, ...] = ()
+    """Folders of exams that the table does not list."""
+
+    @property
+    def text(self) -> str:
+        """What ``campaign run`` prints."""
+        lines = self._planned() if self.written is None else self._done(self.written)
+        report = "" if self.written is None else self.written.report  # which ends with the words of research
+        return "\n".join([*lines, report or f"{RESEARCH_USE}\n"])
+
+    @property
+    def failed(self) -> tuple[str, ...]:
+        """A line for each of the first exams or masses that failed, and one that counts the others."""
+        faults = self.campaign.found.faults
+        lines = [f"{name}: {fault.step}: {fault.reason}" for name, fault in list(faults.items())[:MOST_NAMED]]
+        more = [f"{len(faults) - MOST_NAMED} more, see failures.csv"] if len(faults) > MOST_NAMED else []
+        return (*lines, *more)
+
+    def _planned(self) -> Iterator[str]:
+        found = self.campaign.found
+        for step, todo in found.todo.items():
+            named = f" ({', '.join(found.names[step])})" if _few(found, step) and found.kept[step] else ""
+            yield f"{step}: {todo} to do{named}, {found.kept[step]} done"
+        for name, fault in list(found.faults.items())[:MOST_NAMED]:
+            yield f"{name}: {fault.step} failed: {fault.reason}"
+        if len(found.faults) > MOST_NAMED:
+            yield f"{len(found.faults) - MOST_NAMED} more failed"
+        yield "Nothing was run."
+
+    def _done(self, written: Written) -> Iterator[str]:
+        campaign, found = self.campaign, self.campaign.found
+        counts = counts_words(written.sized, written.unsized, written.failed)
+        yield f"{self.folder}: {len(campaign.exams)} exams: {counts}"
+        if written.pooled:
+            yield f"{written.pooled} masses pooled, each at one visit"
+        elif campaign.not_pooled:
+            yield f"no mass pooled: {campaign.not_pooled}"
+        yield from filter(None, (repeatability_words(campaign), written.growth))
+        yield f"{sum(found.todo.values())} steps run, {sum(found.kept.values())} kept from earlier runs"
+        for step, todo in found.todo.items():
+            more = "" if _few(found, step) else f" and {todo - len(found.names[step])} more"
+            if todo and any(found.kept.values()):
+                yield f"{step} run: {', '.join(found.names[step])}{more}"
+        yield from names_line("no size after excision, left out of trial.csv", written.left_out)
+        yield from names_line("masses whose exams disagree, without a pooled size", written.disagreeing)
+        yield from names_line("exams with a mass that no row names, see their findings", written.unnamed)
+        yield from names_line("folders of exams that the table does not list", self.unlisted)
+        if written.no_report and not written.report:
+            yield f"no trial report: {written.no_report}"
+
+    def __repr__(self) -> str:
+        if self.written is None:
+            return f"<CampaignResult of {len(self.campaign.exams)} exams: nothing was run>"
+        counts = counts_words(self.written.sized, self.written.unsized, self.written.failed)
+        return f"<CampaignResult of {len(self.campaign.exams)} exams: {counts}>"
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{escape(self.text)}</pre>"
+
+
+@door
+def campaign(
+    exams: PathLike,
+    output: PathLike,
+    *,
+    excision: PathLike | None = None,
+    columns: PathLike | None = None,
+    protocol: PathLike | None = None,
+    normalise: str = DEFAULT_NORMALISE,
+    match_mm: float = MATCH_MM,
+    repeatability: PathLike | Repeatability | None = None,
+    figures: bool = False,
+    dry_run: bool = False,
+    copy_to: str | None = None,
+    workers: int = 1,
+    scheduler: str | None = None,
+    bar: Bar | None = None,
+    **settings: Any,
+) -> CampaignResult:
+    """Map, estimate and pool the exams of a table, and report the trial; goes on where it was interrupted.
+
+    Parameters
+    ----------
+    exams
+        The table, as ``campaign init`` writes it.
+    output
+        Folder for all files.
+    excision
+        Sizes measured after excision: adds the trial's report.
+    columns
+        Layout of a wide table of them.
+    protocol
+        Pre-specified analysis of the trial.
+    normalise
+        As of `build_map`.
+    match_mm
+        Distance within which a mass is the one that another exam of the breast names by place.
+    repeatability
+        Spread between exams of one mass: a file, what `calibrate_repeatability` returns, or ``"none"``. By default it
+        is learned from the repeats, where 5 masses have them.
+    figures
+        Whether map and size posterior of each exam are drawn.
+    dry_run
+        Say what would be done, and do nothing.
+    copy_to
+        Folder of an object store that gets every file.
+    workers, scheduler
+        Number of worker processes, or the address of a dask scheduler.
+    bar
+        Gives, for what is counted, a context with a callback for those done and wanted.
+    **settings
+        As of `estimate`.
+
+    Raises
+    ------
+    BadDataError
+        When a table or the protocol is not what it must be; an exam's own fault is a row of ``failures.csv``.
+    UsageError
+        When settings contradict each other, or the folder is another's.
+    """
+    spread = {} if repeatability in (None, NONE) else {"repeatability": repeatability}
+    check_number("match_mm", match_mm, 0, open_ends=True)
+    of_all = CampaignSettings(
+        settings_of({**settings, **spread}),
+        MapOptions(normalise=plain(normalise)).normalise,
+        figures,
+        match_mm,
+        own_repeatability=repeatability is None,
+        copy_to="" if copy_to is None else check_address(copy_to),
+    )
+    return run_campaign(
+        required_path(exams, "exams"),
+        required_path(output, "output"),
+        of_all,
+        excision=path_of(excision),
+        columns=path_of(columns),
+        protocol=path_of(protocol),
+        read=(Path(str(one)) for one in spread.values() if isinstance(one, str | os.PathLike)),
+        dry_run=dry_run,
+        workers=workers,
+        scheduler=scheduler,
+        bar=bar,
+    )
+
+
+def run_campaign(
+    exams: Path,
+    output: Path,
+    settings: CampaignSettings,
+    *,
+    excision: Path | None,
+    columns: Path | None,
+    protocol: Path | None,
+    read: Iterable[Path],
+    dry_run: bool,
+    workers: int,
+    scheduler: str | None,
+    bar: Bar | None,
+) -> CampaignResult:
+    """Check all inputs, run what is missing, and write what is beside the exams; `read` are further inputs."""
+    table = read_manifest(exams)
+    _check_folder(table, output, settings)
+    _keep_inputs([exams, excision, columns, protocol, *read, *_calibrations(table, settings)], output)
+    if columns is not None and excision is None:
+        raise UsageError("--columns is the layout of the excision table; give --excision too")
+    measured = None if excision is None else Excision(excision, columns)
+    check_inputs(table, measured, protocol)
+    with (
+        open_campaign(output, dry=dry_run) as store,
+        open_executor(workers=workers, cluster=None if dry_run else scheduler) as executor,
+    ):
+        place = Path(os.path.abspath(output))  # noqa: PTH100 (links stay links)
+        run = Campaign(table, place, settings, store=store, executor=executor, dry=dry_run, bar=bar)
+        run.run()
+        if dry_run:
+            return CampaignResult(run, output, None)
+        left = tidy(place, table, run.found.results, unread=run.unread)
+        written = write_outputs(run, measured, protocol)
+        if settings.copy_to:
+            copy_outputs(place, settings.copy_to)
+    return CampaignResult(run, output, written, tuple(left))
+
+
+def _check_folder(table: Sequence[Exam], output: Path, settings: CampaignSettings) -> None:
+    """Refuse exams inside the output folder, an output folder that is a file, and a checkpoint for many maps."""
+    if output.exists() and not output.is_dir():
+        raise UsageError(f"{output} is a file; give the name of a folder")
+    if settings.estimate.checkpoint is not None:
+        raise UsageError("a checkpoint is for one map; leave it out of the settings file")
+    folder = Path(os.path.realpath(output))
+    local = [exam for exam in table if not exam.address]
+    inside = next((exam.file for exam in local if Path(os.path.realpath(exam.path)).is_relative_to(folder)), None)
+    if inside is not None:
+        raise UsageError(f"{inside} lies in the output folder {output}; choose another folder")
+
+
+def _calibrations(table: Sequence[Exam], settings: CampaignSettings) -> Iterator[Path | None]:
+    for name in {settings.of(exam).calibration_name for exam in table} - {None}:
+        yield size_calibration_path(str(name))
+
+
+def _keep_inputs(read: Sequence[Path | None], output: Path) -> None:
+    """Refuse a folder where a file that is read would be written over."""
+    for path in (output / name for name in WRITTEN):
+        if any(one is not None and same_file(path, one) for one in read):
+            raise UsageError(f"{path} is an input of this command; choose another name for the output")
+
+
+def names_line(words: str, names: Sequence[str]) -> list[str]:
+    """The first names in a line that counts the others; none without any."""
+    more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
+    return [f"{words}: {', '.join(names[:MOST_NAMED])}{more}"] if names else []
+
+
+def _few(found: CampaignState, step: str) -> bool:
+    """Whether all exams or masses that need a step are known by name, and fit a line."""
+    return 0 < found.todo[step] == len(found.names[step])
