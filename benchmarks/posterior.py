@@ -78,9 +78,9 @@ def laplace(fit: Any) -> Draw:
 def ensemble(fit: Any) -> Draw:
     """The program's MCMC with its own stopping rule."""
     from tactile_bayes.posterior.draw import ensemble_draws
-    from tactile_bayes.posterior.options import EstimateOptions
+    from tactile_bayes.posterior.options import SamplerSettings
 
-    return lambda rng: ensemble_draws(fit.sampled(), rng=rng, options=EstimateOptions("ensemble")).flat
+    return lambda rng: ensemble_draws(fit.sampled(), rng=rng, options=SamplerSettings(method="ensemble")).flat
 
 
 def emcee_plain(fit: Any) -> Draw:

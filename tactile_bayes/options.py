@@ -11,7 +11,19 @@ from typing import Annotated, Final, Literal
 
 from tactile_bayes.declarations import Meta, Options
 from tactile_bayes.errors import UsageError
-from tactile_bayes.presets import CELL_MM, DEFAULT_NORMALISE, PRESSURE_WINDOW_KPA, Normalise, TrackerProtocol
+from tactile_bayes.presets import (
+    CELL_MM,
+    DEFAULT_NORMALISE,
+    MOST_FIELD_COSINES,
+    PRESSURE_WINDOW_KPA,
+    Background,
+    Method,
+    Noise,
+    Normalise,
+    Rotation,
+    SceneAsked,
+    TrackerProtocol,
+)
 
 
 class BumpPrior(Options):
@@ -39,6 +51,97 @@ class BumpPrior(Options):
 
 
 PRIORS: Final = BumpPrior.__struct_fields__
+
+
+IN_FILE: Final = {"file": True}
+"""Of a setting that stands in the file of `--settings`, not on the command line."""
+
+
+class FitSettings(BumpPrior, kw_only=True):
+    """How a map is fitted and its posterior drawn; must agree with the recipe of the size calibration."""
+
+    method: Annotated[
+        Method,
+        Meta(
+            description="importance: weighted draws; ensemble: MCMC; laplace: mode, curvature; optimise: the paper's "
+            "least squares."
+        ),
+    ] = "importance"
+    background: Annotated[
+        Background | None,
+        Meta(
+            description="Level about the lump: fixed at 1, or fitted. Default: as for the calibration's maps; free "
+            "where the level is not known (normalise none)",
+            extra=IN_FILE,
+        ),
+    ] = None
+    fit_radius_mm: Annotated[
+        Annotated[float, Meta(gt=0)] | None,
+        Meta(description="Radius of the fitted window. Default: the calibration's, else 20", extra=IN_FILE),
+    ] = None
+    rotation: Annotated[
+        Rotation,
+        Meta(
+            description="Rotated ellipse: used where the map favours it, always, or never. Correlated noise: "
+            "`--scene` decides",
+            extra=IN_FILE,
+        ),
+    ] = "auto"
+    centre_mm: Annotated[
+        tuple[float, float] | None,
+        Meta(
+            description="Place on the map to measure. Default: the highest bump that can be a lump.",
+            extra={"metavar": "X Y"},
+        ),
+    ] = None
+    noise: Annotated[
+        Noise | None,
+        Meta(
+            description="independent: white noise, the likelihood divided by the inflation of correlated errors; "
+            "field: correlated noise in the model. Default: the calibration's",
+            extra=IN_FILE,
+        ),
+    ] = None
+    field_cosines: Annotated[
+        Annotated[int, Meta(ge=6, le=MOST_FIELD_COSINES)] | Literal["auto"],
+        Meta(
+            description="Basis functions of the correlated noise along each axis: more are slower and resolve shorter "
+            "correlation; `tradeoff estimate` measures the difference. auto: 18, up to 30 for a narrow lump",
+            extra=IN_FILE,
+        ),
+    ] = "auto"
+    accuracy_sd: Annotated[
+        Annotated[float, Meta(ge=0.001, le=0.5)] | None,
+        Meta(
+            description="Monte-Carlo error to reach in the interval ends of sizes and map widths, in posterior SDs. "
+            "Default: 0.02 for importance, 0.1 for ensemble."
+        ),
+    ] = None
+    accuracy_mm: Annotated[
+        Annotated[float, Meta(ge=0.0001, le=10)] | None,
+        Meta(
+            description="Wanted Monte-Carlo error of interval ends, in mm; the finer of this and --accuracy-sd holds",
+            extra=IN_FILE,
+        ),
+    ] = None
+    scene: Annotated[
+        SceneAsked,
+        Meta(description="Structures in the fit window; auto: the simplest scene that the map supports."),
+    ] = "auto"
+    max_steps: Annotated[
+        Annotated[int, Meta(ge=150)] | None,
+        Meta(description="Longest MCMC chain (method ensemble) before it gives up", extra=IN_FILE),
+    ] = None
+
+    @property
+    def prior(self) -> BumpPrior:
+        """The priors on the bump alone."""
+        return BumpPrior(**{name: getattr(self, name) for name in PRIORS})
+
+    @property
+    def correlated(self) -> bool:
+        """Whether the model has correlated errors; least squares then only finds the place."""
+        return self.noise == "field"
 
 
 class MapOptions(Options):

@@ -39,7 +39,7 @@ from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import MapRecipe, TactileMap
 from tactile_bayes.posterior.bump import cell_mean_gaussian
 from tactile_bayes.posterior.estimate import estimate_map
-from tactile_bayes.posterior.options import EstimateOptions, FitOptions
+from tactile_bayes.posterior.options import SamplerSettings
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.posterior.white import default_errors, fit_bump
 from tactile_bayes.presets import FIELD_COSINES, POSE_NOISE
@@ -127,12 +127,13 @@ def widths(run: Callable[..., Iterable[Any]], maps: int, rows: Iterable[int]) ->
 
 def _one_map(kind: str, index: int) -> tuple[bool, bool] | None:
     rng = np.random.default_rng([SEED, index])
-    fit = FitOptions("free", 20.0, "off", None, "field", field_cosines=NARROW.get(kind))
-    method = "importance"
+    options = SamplerSettings(
+        background="free", rotation="off", noise="field", field_cosines=NARROW.get(kind) or "auto"
+    )
     if kind in LEVELLESS:
-        tactile_map, truth, fit = _levelless(kind, index, rng)
+        tactile_map, truth, options = _levelless(kind, index, rng)
         # independent errors with many of them shared leave importance sampling to chains of minutes
-        method = "laplace" if fit.noise == "independent" else method
+        options = replace(options, method="laplace") if options.noise == "independent" else options
     elif kind in HEADS:
         tactile_map, truth = _head_map(index, kind)
     elif kind in NARROW:
@@ -142,7 +143,6 @@ def _one_map(kind: str, index: int) -> tuple[bool, bool] | None:
         tactile_map, truth = _grid_map(KINDS[same.get(kind, kind)], rng, by_squares=kind == BY_SQUARES)
     if kind == CONTROL:
         return _held_by_independent(tactile_map, truth)
-    options = EstimateOptions(method=method, fit=fit)
     found = estimate_map(tactile_map, calibration=None, options=options, rng=rng)
     if found.map_posterior is None:
         return None
@@ -154,7 +154,9 @@ def _one_map(kind: str, index: int) -> tuple[bool, bool] | None:
     return bool(x[0] <= truth[0] <= x[1]), bool(y[0] <= truth[1] <= y[1])
 
 
-def _levelless(kind: str, index: int, rng: np.random.Generator) -> tuple[TactileMap, tuple[float, float], FitOptions]:
+def _levelless(
+    kind: str, index: int, rng: np.random.Generator
+) -> tuple[TactileMap, tuple[float, float], SamplerSettings]:
     """A map whose level is not known, its truth, and the fit that `estimate` takes by default, or took before."""
     row = HELD.get(kind, kind)
     if row == HEAD_LEVELLESS:
@@ -169,9 +171,9 @@ def _levelless(kind: str, index: int, rng: np.random.Generator) -> tuple[Tactile
     if kind in HELD:
         level = float(np.median(tactile_map.mean[tactile_map.covered]))
         divided = {"mean": tactile_map.mean / level, "variance": tactile_map.variance / level**2}
-        return replace(tactile_map, background=1.0, **divided), truth, FitOptions("fixed", 20.0, "off")
+        return replace(tactile_map, background=1.0, **divided), truth, SamplerSettings(rotation="off")
     background, noise = default_errors(tactile_map)
-    return tactile_map, truth, FitOptions(background, 20.0, "off", noise=noise)
+    return tactile_map, truth, SamplerSettings(background=background, rotation="off", noise=noise)
 
 
 def _cropped(tactile_map: TactileMap) -> TactileMap:
@@ -183,7 +185,7 @@ def _cropped(tactile_map: TactileMap) -> TactileMap:
 
 def _held_by_independent(tactile_map: TactileMap, truth: tuple[float, float]) -> tuple[bool, bool] | None:
     """Least squares with independent errors, as a textbook has it."""
-    fit, _ = fit_bump(tactile_map, (0.0, 0.0), options=FitOptions("free", 20.0, "off"))
+    fit, _ = fit_bump(tactile_map, (0.0, 0.0), options=SamplerSettings(background="free", rotation="off"))
     if fit is None:
         return None
     p, q = (fit.bump.names.index(name) for name in ("p", "q"))
@@ -288,7 +290,7 @@ def _head_map(index: int, kind: str) -> tuple[TactileMap, tuple[float, float]]:
         told = {name: value for name, value in found.quality.items() if name not in POSE_NOISE}
         return (replace(found, quality=told) if kind == UNTOLD else found), SIGMA
     noisy, exact = mapped(scene, "mean"), mapped(clean, "mean")
-    options = EstimateOptions(method="laplace", fit=FitOptions("free", 20.0, "off", None, "field"))
+    options = SamplerSettings(method="laplace", background="free", rotation="off", noise="field")
     truth = estimate_map(exact, calibration=None, options=options, rng=rng).map_posterior
     assert truth is not None
     return noisy, (float(np.median(truth.sigma_x_mm)), float(np.median(truth.sigma_y_mm)))
@@ -369,12 +371,11 @@ def _size_mass(bodies: str, index: int) -> Row:
 
 def _estimates(scenes: Sequence[Scene], calibration: Any) -> Iterator[tuple[TactileMap | None, Estimate | None]]:
     recipe = calibration.recipe
-    fit = FitOptions(recipe.background, recipe.radius_mm, "auto", None, recipe.noise)
+    options = SamplerSettings(background=recipe.background, fit_radius_mm=recipe.radius_mm, noise=recipe.noise)
     for scene in scenes:
         rng = np.random.default_rng([SEED, scene.seed])
         try:
             tactile_map = build_map(simulate(scene, rng=rng).scan)
-            options = EstimateOptions(fit=fit)
             yield tactile_map, estimate_map(tactile_map, calibration=calibration, options=options, rng=rng)
         except TactileBayesError:
             yield None, None

@@ -26,7 +26,7 @@ from tactile_bayes.mapping.map import MapRecipe, TactileMap
 from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior.draw import Sampled, importance_draws
 from tactile_bayes.posterior.fit import FieldFit, fit_scene
-from tactile_bayes.posterior.options import EstimateOptions, FitOptions
+from tactile_bayes.posterior.options import SamplerSettings
 from tactile_bayes.posterior.search import search
 from tactile_bayes.studies.population import ExamPrior, draw_exam
 from tactile_bayes.studies.sbc import draw_field
@@ -113,7 +113,7 @@ MAPS: dict[str, Make] = {
 
 def fit_of(tactile_map: TactileMap) -> FieldFit:
     """The scene that `estimate` would draw from."""
-    _, seen = search(tactile_map, EstimateOptions(fit=FitOptions("free", noise="field")))
+    _, seen = search(tactile_map, SamplerSettings(background="free", noise="field"))
     if seen is None or seen.scene is None:
         raise NotConvergedError("no lump found")
     return seen.scene.fit

@@ -25,7 +25,7 @@ from tactile_bayes.posterior.bump import cell_mean_gaussian
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.field import LENGTHS_MM
 from tactile_bayes.posterior.masses import other_rises
-from tactile_bayes.posterior.options import EstimateOptions, FitOptions
+from tactile_bayes.posterior.options import SamplerSettings
 from tactile_bayes.studies.sbc import draw_field, draw_truth
 from validation.common import Table, parser, percent
 
@@ -157,7 +157,7 @@ def draw_map(row: Truths, rng: np.random.Generator) -> TactileMap:
 
 def found_on(tactile_map: TactileMap, rng: np.random.Generator) -> set[str]:
     """Names of `COLUMNS` that the report of one map would have."""
-    options = EstimateOptions(method="laplace", fit=FitOptions("free", RADIUS_MM, "auto", None, "field"), draws=1000)
+    options = SamplerSettings(method="laplace", background="free", fit_radius_mm=RADIUS_MM, noise="field", draws=1000)
     answer = estimate_map(tactile_map, calibration=None, options=options, rng=rng)
     others = {"another rise"} if other_rises(tactile_map, answer, options) else set()
     if answer.scene is None:

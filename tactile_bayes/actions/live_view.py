@@ -40,8 +40,8 @@ from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.bump import candidate_centres
 from tactile_bayes.posterior.draw import MapPosterior
 from tactile_bayes.posterior.estimate import estimate_map
-from tactile_bayes.posterior.options import EstimateOptions, FitOptions
-from tactile_bayes.presets import FIELD_COSINES, FIT_RADIUS_MM, INTERVAL
+from tactile_bayes.posterior.options import SamplerSettings
+from tactile_bayes.presets import FIELD_COSINES, INTERVAL
 from tactile_bayes.report.map_text import colours_wanted, live_line, live_text
 from tactile_bayes.scan import ElementCalibration, HeadGeometry
 from tactile_bayes.size.pooling import Calibration
@@ -205,11 +205,17 @@ def live_estimate(tactile_map: TactileMap, calibration_path: str | None, turn: T
         centre = centres[turn.of(len(centres))]
         calibration = _calibration_of(calibration_path) if calibration_path else None
         # no test for rotation: it takes a third of the time and can be made afterwards
-        fit = FitOptions("fixed", FIT_RADIUS_MM, "off", centre, "independent", turn.width_mm, FIELD_COSINES)
+        options = SamplerSettings(
+            method="laplace",
+            rotation="off",
+            centre_mm=centre,
+            start_width_mm=turn.width_mm,
+            field_cosines=FIELD_COSINES,
+            draws=LIVE_DRAWS,
+        )
         if calibration is not None:
-            recipe = calibration.recipe
-            fit = replace(fit, background=recipe.background, radius_mm=recipe.radius_mm, noise=recipe.noise)
-        options = EstimateOptions(method="laplace", fit=fit, draws=LIVE_DRAWS)
+            made = calibration.recipe
+            options = replace(options, background=made.background, fit_radius_mm=made.radius_mm, noise=made.noise)
         found = estimate_map(tactile_map, calibration=calibration, options=options, rng=np.random.default_rng(1))
     except TactileBayesError as error:
         return LiveAnswer(f"no estimate: {error}" if turn.tell(lump=False) else "")

@@ -51,7 +51,7 @@ from tactile_bayes.studies.tradeoffs import (
 
 if TYPE_CHECKING:
     from tactile_bayes.mapping.map import TactileMap
-    from tactile_bayes.posterior.options import EstimateOptions
+    from tactile_bayes.posterior.options import SamplerSettings
     from tactile_bayes.scan import Scan
     from tactile_bayes.size.pooling import Calibration, PooledEstimate
     from tactile_bayes.studies.estimate_tradeoff import Clock, Ladder
@@ -105,7 +105,7 @@ def tradeoff_of_scan(scan: Scan, settings: Settings, work: Work) -> Ladder:
     """Every setting of `map` on a scan, each with an estimate by default of the map that it makes."""
     _refuse_checkpoint(settings)
 
-    def inputs(tactile_map: TactileMap) -> tuple[Calibration | None, EstimateOptions]:
+    def inputs(tactile_map: TactileMap) -> tuple[Calibration | None, SamplerSettings]:
         calibration, options, _ = estimate_inputs(settings, tactile_map)
         return calibration, options
 

@@ -11,7 +11,7 @@ import numpy as np
 from tactile_bayes.api.repeatability import check_repeatability, repeatability_digest
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.api.sized import Answer, SizeEstimate, size_priors
-from tactile_bayes.declarations import Record, replace
+from tactile_bayes.declarations import Record, names_of, replace
 from tactile_bayes.errors import NO_LUMP, BadDataError, TactileBayesError
 from tactile_bayes.files.map_nc import read_map_and_scans
 from tactile_bayes.files.npz import CheckpointFile
@@ -20,11 +20,11 @@ from tactile_bayes.files.reports import Place
 from tactile_bayes.files.size_json import SHIPPED, default_for, read_size_calibration, size_calibration_path
 from tactile_bayes.findings import by_weight
 from tactile_bayes.mapping.map import TactileMap, many_cells
-from tactile_bayes.options import PRIORS
+from tactile_bayes.options import PRIORS, FitSettings
 from tactile_bayes.posterior.estimate import OTHER_HEAD, calibration_for, estimate_map, recipe_differences
 from tactile_bayes.posterior.lump_probability import smallest_lumps
 from tactile_bayes.posterior.masses import with_masses
-from tactile_bayes.posterior.options import EstimateOptions, FitOptions
+from tactile_bayes.posterior.options import SamplerSettings
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.posterior.white import default_errors
 from tactile_bayes.presets import FIT_RADIUS_MM
@@ -95,7 +95,7 @@ def estimate_one(
     shipped = default_for(tactile_map.recipe.normalise)
     source, calibration, why_none = choose_calibration(settings, tactile_map)
     options = _options(settings, calibration, tactile_map)
-    if notice is not None and (line := many_cells(tactile_map, options.fit.radius_mm)) is not None:
+    if notice is not None and (line := many_cells(tactile_map, options.fit_radius_mm)) is not None:
         notice(line)
     files = {**(inputs or {}), **({"size_calibration": source} if source else {})}
     files |= {"settings": settings.settings_file} if settings.settings_file else {}
@@ -109,7 +109,7 @@ def estimate_one(
 
     # the map's values are part of the seed: an answer depends neither on the place in a list nor on the file's history,
     # and a mass has the numbers that its place alone would give
-    def estimated(a_map: TactileMap, given: EstimateOptions) -> Estimate:
+    def estimated(a_map: TactileMap, given: SamplerSettings) -> Estimate:
         rng = np.random.default_rng([settings.seed, tactile_map.fingerprint])
         told = progress if given is options else None
         return estimate_map(a_map, calibration=calibration, options=given, rng=rng, progress=told)
@@ -136,9 +136,9 @@ def estimate_one(
         estimate = replace(estimate, diagnostics=diagnostics)
     named = settings.calibration_name or (f"{shipped} (shipped)" if calibration is not None else "none")
     used_fit = {
-        "background": options.fit.background,
-        "fit_radius_mm": options.fit.radius_mm,
-        "noise": options.fit.noise,
+        "background": options.background,
+        "fit_radius_mm": options.fit_radius_mm,
+        "noise": options.noise,
     }
     recorded = settings.recorded(size_calibration=named, **used_fit)
     recorded = {name: value for name, value in recorded.items() if name not in _UNRECORDED}
@@ -185,13 +185,13 @@ def choose_calibration(
     else:
         path, calibration = None, settings.size_calibration
     if tactile_map.background is None and calibration.recipe.normalise != tactile_map.recipe.normalise:
-        why_none = _level_unknown(tactile_map, _options(settings, None, tactile_map).fit)
+        why_none = _level_unknown(tactile_map, _options(settings, None, tactile_map))
         if settings.size_calibration is None:
             return None, None, replace(why_none, reason=f"{why_none.reason}; widths only")
         raise BadDataError(f"{settings.calibration_name} does not fit: {why_none.reason}", way_out=why_none.advice)
     if settings.size_calibration is not None:
         return path, calibration, None
-    fit = _options(settings, calibration, tactile_map).fit
+    fit = _options(settings, calibration, tactile_map)
     differs = recipe_differences(tactile_map, calibration, fit)
     if settings.method == "optimise":
         return None, None, _LEAST_SQUARES
@@ -201,13 +201,13 @@ def choose_calibration(
     return path, calibration, None
 
 
-def _level_unknown(tactile_map: TactileMap, fit: FitOptions) -> NoSize:
+def _level_unknown(tactile_map: TactileMap, fit: SamplerSettings) -> NoSize:
     """Reason for widths only where a map's level is unknown, with the commands that lead to a size."""
     made = f"--normalise {tactile_map.recipe.normalise} --background {fit.background} --noise {fit.noise}"
     learn = (
         "estimate maps of at least 8 lumps of known size made the same way, list their d_mm, amplitude, sigma_x_mm and "
         f"sigma_y_mm in LUMPS.csv, run `tactile-bayes calibrate size LUMPS.csv {made} --fit-radius-mm "
-        f"{fit.radius_mm:g} -o size.json` and give --size-calibration size.json"
+        f"{fit.fit_radius_mm:g} -o size.json` and give --size-calibration size.json"
     )
     if tactile_map.recipe.source == "scan":
         reason = "the map is in kPa, and the shipped calibrations are for maps of normalised frames"
@@ -217,7 +217,7 @@ def _level_unknown(tactile_map: TactileMap, fit: FitOptions) -> NoSize:
     return NoSize(reason, f"{declare} (frames divided by their means: mean); otherwise {learn}")
 
 
-def _options(settings: Settings, calibration: Calibration | None, tactile_map: TactileMap) -> EstimateOptions:
+def _options(settings: Settings, calibration: Calibration | None, tactile_map: TactileMap) -> SamplerSettings:
     """Options of an estimate: unset ones from the calibration's recipe, else from the paper.
 
     Without a calibration `default_errors` decides; a background that is given alone goes with independent errors.
@@ -232,24 +232,9 @@ def _options(settings: Settings, calibration: Calibration | None, tactile_map: T
         background = "free"
     background = settings.background or background
     radius = settings.fit_radius_mm or (calibration.recipe.radius_mm if calibration else FIT_RADIUS_MM)
-    fit = FitOptions(
-        background=background,
-        radius_mm=radius,
-        rotation=settings.rotation,
-        centre_mm=settings.centre_mm,
-        noise=noise,
-        field_cosines=None if settings.field_cosines == "auto" else settings.field_cosines,
-    )
-    return EstimateOptions(
-        method=settings.method,
-        fit=fit,
-        max_steps=settings.max_steps,
-        accuracy_sd=settings.accuracy_sd,
-        size_priors=size_priors(settings),
-        prior=settings.prior,
-        scene=settings.scene,
-        accuracy_mm=settings.accuracy_mm,
-    )
+    asked = {name: getattr(settings, name) for name in names_of(FitSettings)}
+    asked |= {"background": background, "fit_radius_mm": radius, "noise": noise}
+    return SamplerSettings(**asked, size_priors=size_priors(settings))
 
 
 def estimated_at(found: SizeEstimate, place: tuple[float, float]) -> SizeEstimate:
@@ -261,7 +246,7 @@ def estimated_at(found: SizeEstimate, place: tuple[float, float]) -> SizeEstimat
 
 def estimate_inputs(
     settings: Settings, tactile_map: TactileMap
-) -> tuple[Calibration | None, EstimateOptions, NoSize | None]:
+) -> tuple[Calibration | None, SamplerSettings, NoSize | None]:
     """What `estimate_one` takes for a map: calibration and options, and why there is no calibration."""
     _, calibration, why_none = choose_calibration(settings, tactile_map)
     return calibration, _options(settings, calibration, tactile_map), why_none

@@ -5,21 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from datetime import date
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from tactile_bayes.declarations import Meta, Record, extra_of, kinds, part_of
 from tactile_bayes.errors import UsageError, check_number
-from tactile_bayes.options import PRIORS, BumpPrior
-from tactile_bayes.presets import (
-    INTERVAL,
-    MOST_FIELD_COSINES,
-    REGISTRATION_MM,
-    Background,
-    Method,
-    Noise,
-    Rotation,
-    SceneAsked,
-)
+from tactile_bayes.options import IN_FILE, PRIORS, FitSettings
+from tactile_bayes.presets import INTERVAL, REGISTRATION_MM
 
 if TYPE_CHECKING:
     from tactile_bayes.size.pooling import Calibration, Repeatability
@@ -31,12 +22,10 @@ else:
 
 GIVEN: Final = "given in Python"
 """Name of a calibration that is in no file."""
-_FILE: Final = {"file": True}
-"""Of a setting that stands in the file of `--settings`, not on the command line."""
 _SITE: Final = {"metavar": "SITE.json", "path": True}
 
 
-class Settings(BumpPrior, kw_only=True):
+class Settings(FitSettings, kw_only=True):
     """Settings of `estimate`; picklable, so that worker processes can receive them."""
 
     size_calibration: Annotated[
@@ -48,82 +37,14 @@ class Settings(BumpPrior, kw_only=True):
             extra={"metavar": "solid|eq6|solid-mean|plane-strain|none|SIZE.json"},
         ),
     ] = None
-    method: Annotated[
-        Method,
-        Meta(
-            description="importance: weighted draws; ensemble: MCMC; laplace: mode, curvature; optimise: the paper's "
-            "least squares."
-        ),
-    ] = "importance"
     seed: Annotated[int, Meta(ge=0, description="Random seed.")] = 1
     interval: Annotated[float, Meta(gt=0.0, lt=1.0, description="Probability of the intervals.")] = INTERVAL
-    background: Annotated[
-        Background | None,
-        Meta(
-            description="Level about the lump: fixed at 1, or fitted. Default: as for the calibration's maps; free "
-            "where the level is not known (normalise none)",
-            extra=_FILE,
-        ),
-    ] = None
-    fit_radius_mm: Annotated[
-        Annotated[float, Meta(gt=0)] | None,
-        Meta(description="Radius of the fitted window. Default: the calibration's, else 20", extra=_FILE),
-    ] = None
-    rotation: Annotated[
-        Rotation,
-        Meta(
-            description="Rotated ellipse: used where the map favours it, always, or never. Correlated noise: "
-            "`--scene` decides",
-            extra=_FILE,
-        ),
-    ] = "auto"
-    centre_mm: Annotated[
-        tuple[float, float] | None,
-        Meta(
-            description="Place on the map to measure. Default: the highest bump that can be a lump.",
-            extra={"metavar": "X Y"},
-        ),
-    ] = None
-    noise: Annotated[
-        Noise | None,
-        Meta(
-            description="independent: white noise, the likelihood divided by the inflation of correlated errors; "
-            "field: correlated noise in the model. Default: the calibration's",
-            extra=_FILE,
-        ),
-    ] = None
-    field_cosines: Annotated[
-        Annotated[int, Meta(ge=6, le=MOST_FIELD_COSINES)] | Literal["auto"],
-        Meta(
-            description="Basis functions of the correlated noise along each axis: more are slower and resolve shorter "
-            "correlation; `tradeoff estimate` measures the difference. auto: 18, up to 30 for a narrow lump",
-            extra=_FILE,
-        ),
-    ] = "auto"
-    accuracy_sd: Annotated[
-        Annotated[float, Meta(ge=0.001, le=0.5)] | None,
-        Meta(
-            description="Monte-Carlo error to reach in the interval ends of sizes and map widths, in posterior SDs. "
-            "Default: 0.02 for importance, 0.1 for ensemble."
-        ),
-    ] = None
-    accuracy_mm: Annotated[
-        Annotated[float, Meta(ge=0.0001, le=10)] | None,
-        Meta(
-            description="Wanted Monte-Carlo error of interval ends, in mm; the finer of this and --accuracy-sd holds",
-            extra=_FILE,
-        ),
-    ] = None
-    scene: Annotated[
-        SceneAsked,
-        Meta(description="Structures in the fit window; auto: the simplest scene that the map supports."),
-    ] = "auto"
     between_map_sd: Annotated[
         Annotated[float, Meta(ge=0, le=2)] | None,
         Meta(
             description="SD of ln size between maps of one mass, taken as known. Default: one interval for exams as "
             "the calibration's (0.05 if solid), one as the paper's (0.15)",
-            extra=_FILE,
+            extra=IN_FILE,
         ),
     ] = None
     repeatability: Annotated[
@@ -142,16 +63,12 @@ class Settings(BumpPrior, kw_only=True):
             extra={"metavar": "NAME VALUE"},
         ),
     ] = ()
-    max_steps: Annotated[
-        Annotated[int, Meta(ge=150)] | None,
-        Meta(description="Longest MCMC chain (method ensemble) before it gives up", extra=_FILE),
-    ] = None
     checkpoint: Annotated[
         Path | None,
         Meta(
             description="File that MCMC (method ensemble) saves its state in and resumes from; relative to the "
             "settings file",
-            extra=_FILE,
+            extra=IN_FILE,
         ),
     ] = None
     settings_file: Annotated[
@@ -176,14 +93,10 @@ class Settings(BumpPrior, kw_only=True):
         given = self.size_calibration
         return given if given is None or isinstance(given, str) else GIVEN
 
-    @property
-    def prior(self) -> BumpPrior:
-        """The priors on the bump alone."""
-        return BumpPrior(**{name: getattr(self, name) for name in PRIORS})
-
     def recorded(self, **used: Any) -> dict[str, Any]:
         """Plain data of all settings but the seed, for a provenance; `used` stands in place of what was asked for."""
-        plain = {name: used.get(name, getattr(self, name)) for name in self.__struct_fields__}
+        first = dict.fromkeys(("size_calibration", "method", "interval"))
+        plain: dict[str, Any] = first | {name: used.get(name, getattr(self, name)) for name in self.__struct_fields__}
         del plain["seed"], plain["settings_file"]
         plain["size_calibration"] = used.get("size_calibration", self.calibration_name)
         plain["centre_mm"] = None if self.centre_mm is None else list(self.centre_mm)

@@ -116,13 +116,13 @@ def learn_population(
     `normalise` is that of the rows to learn from, and may be left out where all are alike. Lumps of another origin, in
     the same columns, tell by how much such bodies depart: `against`.
     """
-    fit = measuring_options().fit
+    fit = measuring_options()
     way, columns = rows_of_one_way(rows, normalise)
     settings: dict[str, Any] = {"form": form, "masses": len(set(columns["body"])), "bodies": table_bodies(columns)}
     try:
         head = table_head(columns)
         recipe = Recipe(
-            way, fit.background, fit.radius_mm, declared=False, noise=fit.noise, flat_field=False, head=head
+            way, fit.background, fit.fit_radius_mm, declared=False, noise=fit.noise, flat_field=False, head=head
         )
         found = learning.learn_population(
             population_table(columns), recipe=recipe, source=_SOURCE, residual=form == "eq6-residual"

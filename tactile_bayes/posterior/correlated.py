@@ -17,7 +17,7 @@ from tactile_bayes.posterior.draw import MapPosterior, ModalBump, NoiseFigures, 
 from tactile_bayes.posterior.field import FLOOR, Window, cosines_for
 from tactile_bayes.posterior.fit import FieldFit, field_window, modal_widths, shape_draws, start_vector, tangent_columns
 from tactile_bayes.posterior.neighbours import WANTED, Surroundings, add_beside, ridge_instead, ridge_text, rising_ribs
-from tactile_bayes.posterior.options import DETECTED, EstimateOptions, scene_asked
+from tactile_bayes.posterior.options import DETECTED, SamplerSettings, scene_asked
 from tactile_bayes.posterior.scene import Problem, Scene
 from tactile_bayes.posterior.selection import (
     ASKING,
@@ -163,14 +163,14 @@ class Correlated(Record, eq=False):
     fault: str = ""
 
     @classmethod
-    def of(cls, tactile_map: TactileMap, fit: BumpFit, options: EstimateOptions) -> Correlated:
+    def of(cls, tactile_map: TactileMap, fit: BumpFit, options: SamplerSettings) -> Correlated:
         """Compare a bump with no bump, and where it is a lump by the evidence with neighbouring structures."""
         try:
             scene, detection = fit_and_test(tactile_map, fit, options)
         except NotConvergedError:
             return cls(tactile_map, fit, Detection(0.0, -np.inf))
         x, y = (float(scene.plain.scene.column(scene.plain.mode[None], name)[0]) for name in "xy")
-        fault = rim_fault(tactile_map, (x, y), modal_widths(scene.plain), radius_mm=options.fit.radius_mm)
+        fault = rim_fault(tactile_map, (x, y), modal_widths(scene.plain), radius_mm=options.fit_radius_mm)
         if not fault and detection.probability >= DETECTED:
             scene, detection = with_neighbours(scene, detection, tactile_map, asked=scene_asked(options))
         return cls(tactile_map, fit, detection, scene, fault)
@@ -193,7 +193,7 @@ class Correlated(Record, eq=False):
             )
         return self.scene
 
-    def draw(self, options: EstimateOptions, *, rng: np.random.Generator, progress: Progress | None) -> MapDraws:
+    def draw(self, options: SamplerSettings, *, rng: np.random.Generator, progress: Progress | None) -> MapDraws:
         """Draw from the posterior; `NotConvergedError` also when the scene's neighbour was not found."""
         choice, asked = self._scene, scene_asked(options)
         wanted = WANTED.get(asked, "")
@@ -209,20 +209,20 @@ class Correlated(Record, eq=False):
         return MapDraws(detection, self.fit, draws, _posterior(choice.fit, draws, rng, solved, places), figures)
 
 
-def fit_and_test(tactile_map: TactileMap, fit: BumpFit, options: EstimateOptions) -> tuple[SceneChoice, Detection]:
+def fit_and_test(tactile_map: TactileMap, fit: BumpFit, options: SamplerSettings) -> tuple[SceneChoice, Detection]:
     """Fit the bump under correlated errors, and compare it with no bump; `NotConvergedError` without a mode.
 
-    Where the options give no `field_cosines`, a narrow bump that may be a lump is fitted once more, with a finer field.
+    Where `field_cosines` is "auto", a narrow bump that may be a lump is fitted once more, with a finer field.
     """
 
     def under(number: int, start: FloatArray) -> tuple[SceneChoice, Detection]:
-        problem = Problem(field_window(fit, cosines=number), options.prior, options.fit.radius_mm, fit.bump.scale)
+        problem = Problem(field_window(fit, cosines=number), options.prior, options.fit_radius_mm, fit.bump.scale)
         choice = choose_shape(problem, start, scene=scene_asked(options))
         return choice, field_detection(choice.plain, tactile_map, choice.plain.log_evidence)
 
-    full, cosines = Scene("rotated"), options.fit.field_cosines
-    choice, detection = under(cosines or FIELD_COSINES, start_vector(fit, full))
-    if cosines is not None or not detection.log_bayes_factor > 0:
+    full, asked = Scene("rotated"), options.field_cosines
+    choice, detection = under(FIELD_COSINES if asked == "auto" else asked, start_vector(fit, full))
+    if asked != "auto" or not detection.log_bayes_factor > 0:
         return choice, detection
     wanted = cosines_needed(choice.plain)
     if wanted <= FIELD_COSINES:

@@ -14,7 +14,7 @@ from tactile_bayes.inference.draws import END_ERROR, Labels, ParameterDraws, Sol
 from tactile_bayes.inference.ensemble import EnsembleOptions, ensemble
 from tactile_bayes.inference.importance import TRUSTED_SHAPE, Gaussians, importance, importance_options
 from tactile_bayes.inference.modes import LogDensity
-from tactile_bayes.posterior.options import EstimateOptions
+from tactile_bayes.posterior.options import SamplerSettings
 from tactile_bayes.presets import Method
 from tactile_bayes.progress import Progress
 from tactile_bayes.size.draws import BumpDraws
@@ -183,7 +183,7 @@ class Drawable(Protocol):
     def width_sd_mm(self) -> float | None:
         """Posterior SD of the less certain width; None where accuracies in mm are not offered."""
 
-    def methods(self, options: EstimateOptions) -> Sequence[Method]:
+    def methods(self, options: SamplerSettings) -> Sequence[Method]:
         """The requested method, and those that are tried where it fails."""
 
     def at_mode(self, method: Method, number: int, rng: np.random.Generator) -> ParameterDraws:
@@ -195,7 +195,7 @@ class Drawable(Protocol):
 
 def draw_parameters(
     fitted: Drawable,
-    options: EstimateOptions,
+    options: SamplerSettings,
     *,
     rng: np.random.Generator,
     progress: Progress | None = None,
@@ -223,7 +223,7 @@ def draw_parameters(
     raise NotConvergedError("; ".join(passed_over), diagnostics=dict(figures))
 
 
-def accuracy_in_sd(options: EstimateOptions, width_sd_mm: float | None) -> float | None:
+def accuracy_in_sd(options: SamplerSettings, width_sd_mm: float | None) -> float | None:
     """Requested accuracy in posterior SDs of the widths; the finer of SD and mm counts."""
     if options.accuracy_mm is None or width_sd_mm is None:
         return options.accuracy_sd
@@ -244,7 +244,7 @@ def _draw(
     method: Method,
     *,
     rng: np.random.Generator,
-    options: EstimateOptions,
+    options: SamplerSettings,
     progress: Progress | None,
     solved: Solved | None,
 ) -> ParameterDraws:
@@ -271,7 +271,7 @@ def ensemble_draws(
     density: Sampled,
     *,
     rng: np.random.Generator,
-    options: EstimateOptions,
+    options: SamplerSettings,
     accuracy_sd: float | None = None,
     progress: Progress | None = None,
 ) -> ParameterDraws:

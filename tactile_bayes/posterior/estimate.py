@@ -23,7 +23,7 @@ from tactile_bayes.posterior.abstention import (
 from tactile_bayes.posterior.detection import Detection
 from tactile_bayes.posterior.draw import Diagnostics, MapPosterior, ModalBump, NoiseFigures
 from tactile_bayes.posterior.lump_probability import LIKELY, Weighed, weigh
-from tactile_bayes.posterior.options import DETECTED, ROTATION_ODDS, EstimateOptions, FitOptions, check_options
+from tactile_bayes.posterior.options import DETECTED, ROTATION_ODDS, SamplerSettings, check_options
 from tactile_bayes.posterior.result import Estimate, Sensitivity, prior_sensitivity
 from tactile_bayes.posterior.search import Assessment, SizedDraws, best_chance, draw_until_accurate, search
 from tactile_bayes.posterior.white import Candidate, MapDraws, check_background
@@ -56,7 +56,7 @@ def estimate_map(
     tactile_map: TactileMap,
     *,
     calibration: Calibration | None,
-    options: EstimateOptions,
+    options: SamplerSettings,
     rng: np.random.Generator,
     progress: Progress | None = None,
 ) -> Estimate:
@@ -65,10 +65,10 @@ def estimate_map(
     `BadDataError` when the map or the fit options differ from the calibration's recipe, `UsageError` when an option
     does not go with another or with the map, `NotConvergedError` when the method does not converge.
     """
-    check_background(tactile_map, options.fit)
+    check_background(tactile_map, options)
     check_options(options)
     if calibration is not None:
-        check_recipe(tactile_map, calibration, options.fit)
+        check_recipe(tactile_map, calibration, options)
         calibration = calibration_for(tactile_map, calibration)
     estimate = _answer(tactile_map, calibration, options, rng=rng, progress=progress)
     if estimate.code in ("undetected", "ridge") and (why := no_verdict(tactile_map.recipe.cell_mm)) is not None:
@@ -79,7 +79,7 @@ def estimate_map(
 def _answer(
     tactile_map: TactileMap,
     calibration: Calibration | None,
-    options: EstimateOptions,
+    options: SamplerSettings,
     *,
     rng: np.random.Generator,
     progress: Progress | None,
@@ -87,7 +87,7 @@ def _answer(
     """The lump's size, or why there is none."""
     if not tactile_map.covered.any():
         return _none(Abstention("empty", "the map has no covered cell", "map a scan that covers the place", SCAN_AGAIN))
-    where = searched(tactile_map, options.fit.centre_mm)
+    where = searched(tactile_map, options.centre_mm)
     candidates, seen = search(tactile_map, options)
     if not candidates:
         reason = f"no lump found {where}: nothing rises above the background"
@@ -126,7 +126,7 @@ def _measured(
     seen: Assessment,
     candidates: tuple[Candidate, ...],
     calibration: Calibration | None,
-    options: EstimateOptions,
+    options: SamplerSettings,
     *,
     rng: np.random.Generator,
     progress: Progress | None,
@@ -139,7 +139,7 @@ def _measured(
     try:
         sized = draw_until_accurate(tactile_map, seen, calibration, options, rng=rng, progress=progress)
     except NotConvergedError as error:
-        if options.method == "ensemble" or not options.fit.correlated:
+        if options.method == "ensemble" or not options.correlated:
             raise
         advice = "give --method ensemble, with a larger max_steps in --settings FILE.toml"
         why = Abstention("method", f"no method converged: {error}", advice, OTHER_METHOD_ON_PAPER)
@@ -197,7 +197,7 @@ def _none(
     )
 
 
-def _sensitivity(posterior: MapPosterior, size: SizePosterior | None, options: EstimateOptions) -> Sensitivity:
+def _sensitivity(posterior: MapPosterior, size: SizePosterior | None, options: SamplerSettings) -> Sensitivity:
     quantities = {"sigma_x_mm": posterior.sigma_x_mm, "sigma_y_mm": posterior.sigma_y_mm}
     if size is not None:
         quantities["max_size_mm"] = size.max_size_mm
@@ -209,19 +209,19 @@ def calibration_for(tactile_map: TactileMap, calibration: Calibration) -> Calibr
     return calibration.at_fat([head_profile(tactile_map.quality)])
 
 
-def recipe_differences(tactile_map: TactileMap, calibration: Calibration, fit: FitOptions) -> list[str]:
+def recipe_differences(tactile_map: TactileMap, calibration: Calibration, fit: SamplerSettings) -> list[str]:
     """Differences of a map and its fit options from the calibration's recipe, in words; empty without any."""
     return calibration.recipe.differences(
         normalise=tactile_map.recipe.normalise,
         background=fit.background,
-        radius_mm=fit.radius_mm,
+        radius_mm=fit.fit_radius_mm,
         noise=fit.noise,
         flat_field=tactile_map.recipe.flat_field_known,
         head=tactile_map.head,
     )
 
 
-def check_recipe(tactile_map: TactileMap, calibration: Calibration, fit: FitOptions) -> None:
+def check_recipe(tactile_map: TactileMap, calibration: Calibration, fit: SamplerSettings) -> None:
     """Refuse a map or fit options that differ from the recipe the calibration was learned with."""
     differs = recipe_differences(tactile_map, calibration, fit)
     if differs:
@@ -295,15 +295,15 @@ def _convergence(made: MapDraws, size: SizePosterior | None) -> dict[str, dict[s
 
 
 def _left_out(
-    tactile_map: TactileMap, options: EstimateOptions, calibration: Calibration | None, noise: NoiseFigures
+    tactile_map: TactileMap, options: SamplerSettings, calibration: Calibration | None, noise: NoiseFigures
 ) -> tuple[str, ...]:
     notes = []
     if tactile_map.recipe.source == "scan" and noise.places_share is None:
         notes.append("tracker position error and its blur")
     odds = noise.rotation_odds
-    if odds is not None and not noise.rotated and not options.fit.correlated:
+    if odds is not None and not noise.rotated and not options.correlated:
         notes.append(f"rotation of the ellipse (odds {odds:.2g} to 1, used above {ROTATION_ODDS:g})")
-    if options.fit.background == "fixed":
+    if options.background == "fixed":
         notes.append("a free background (fixed where normalising puts it, as printed in Eq 7)")
     if calibration is None:
         return (*notes, SPREAD)

@@ -19,7 +19,7 @@ from tactile_bayes.posterior.bump import principal_widths
 from tactile_bayes.posterior.draw import Sampled, with_beside
 from tactile_bayes.posterior.field import Window
 from tactile_bayes.posterior.marginal import NEGLIGIBLE, CollapsedTarget, independent_variance, linear_columns
-from tactile_bayes.posterior.options import EstimateOptions
+from tactile_bayes.posterior.options import SamplerSettings
 from tactile_bayes.posterior.scene import Problem, Scene
 from tactile_bayes.posterior.white import BumpFit
 from tactile_bayes.presets import FIELD_COSINES, Method
@@ -88,7 +88,7 @@ class FieldFit(Record, eq=False):
         names = [name for name in ("u", "v") if name in self.scene.names]
         return max(self.sd(name) * float(np.exp(self.scene.column(self.mode, name))) for name in names)
 
-    def methods(self, options: EstimateOptions) -> Sequence[Method]:
+    def methods(self, options: SamplerSettings) -> Sequence[Method]:
         """The requested method, and the next one where a step up is allowed."""
         first = LADDER.index(options.method)
         return LADDER[first : first + 1 + STEPS_UP * options.step_up]

@@ -21,7 +21,7 @@ from tactile_bayes.posterior.detection import Detection
 from tactile_bayes.posterior.draw import MapPosterior, ModalBump
 from tactile_bayes.posterior.lump_probability import LIKELY, weigh
 from tactile_bayes.posterior.neighbours import LEAST_RISE
-from tactile_bayes.posterior.options import EstimateOptions
+from tactile_bayes.posterior.options import SamplerSettings
 from tactile_bayes.posterior.result import Estimate, Mass, Rise
 from tactile_bayes.posterior.search import Assessment, best_chance, search
 from tactile_bayes.posterior.white import AT_RIM, Candidate
@@ -42,19 +42,19 @@ LEAST_STANDING, STANDING_MM = 0.35, 2.5
 falls towards the rim on two sides is like a bump's flanks, and no lump."""
 
 
-def other_rises(tactile_map: TactileMap, estimate: Estimate, options: EstimateOptions) -> tuple[Rise, ...]:
+def other_rises(tactile_map: TactileMap, estimate: Estimate, options: SamplerSettings) -> tuple[Rise, ...]:
     """Find rises that are lumps by the evidence once the measured lump is subtracted, the highest first.
 
     A structure that the lump's own scene holds (a second lump, a rib) is named there. Where there is no lump the whole
     map has been searched, unless a place was given: then the rest of the map is searched here.
     """
-    if estimate.bump is None and options.fit.centre_mm is None:
+    if estimate.bump is None and options.centre_mm is None:
         return ()
     rest = tactile_map if estimate.map_posterior is None else without(tactile_map, estimate.map_posterior)
     rises: list[Rise] = []
     misses = 0
     for centre in _places(rest, estimate):
-        given = replace(options, fit=replace(options.fit, centre_mm=centre, start_width_mm=None), scene="auto")
+        given = replace(options, centre_mm=centre, start_width_mm=None, scene="auto")
         candidates, seen = search(rest, given)
         if seen is None:
             rise = _at_rim(rest, candidates, given, estimate)
@@ -157,7 +157,7 @@ def _rise(bump: ModalBump, away_mm: float | None, probability: float) -> Rise:
 
 
 def _at_rim(
-    rest: TactileMap, candidates: tuple[Candidate, ...], options: EstimateOptions, estimate: Estimate
+    rest: TactileMap, candidates: tuple[Candidate, ...], options: SamplerSettings, estimate: Estimate
 ) -> Rise | None:
     """A rise that is a lump by the evidence and that the map covers too poorly to measure; None where there is none."""
     if not candidates or candidates[0].fit is None or not candidates[0].fault.startswith(AT_RIM):
@@ -206,10 +206,10 @@ APART_IN_WIDTHS = 2.0
 DOUBTFUL_SHARE = 0.3
 """Share of the highest mass's amplitude: a lower rise is in doubt, though the calibration may fit it alone."""
 BOTH = "scan again with more lines over both"
-Estimator = Callable[[TactileMap, EstimateOptions], Estimate]
+Estimator = Callable[[TactileMap, SamplerSettings], Estimate]
 
 
-def with_masses(tactile_map: TactileMap, first: Estimate, options: EstimateOptions, estimator: Estimator) -> Estimate:
+def with_masses(tactile_map: TactileMap, first: Estimate, options: SamplerSettings, estimator: Estimator) -> Estimate:
     """Find and size all masses of a map; returns the estimate of the surest (`by_evidence`), with all in `masses`.
 
     The estimate of a place that was given is kept as the answer, and that of the first lump where properties of a lump
@@ -226,7 +226,7 @@ def with_masses(tactile_map: TactileMap, first: Estimate, options: EstimateOptio
         if mass is not None and all(_apart(mass, one) for one in sized):
             sized.append(mass)
     sized = by_evidence(sized)
-    kept = options.fit.centre_mm is not None or bool(set(OF_A_LUMP) & set(options.size_priors.known))
+    kept = options.centre_mm is not None or bool(set(OF_A_LUMP) & set(options.size_priors.known))
     reported = first if kept or not sized else sized[0].estimate
     masses = tuple(
         replace(one, reported=one.estimate is reported, probability=_calibrated(tactile_map, one)) for one in sized
@@ -277,7 +277,7 @@ def _amplitude(estimate: Estimate) -> float:
     return estimate.bump.amplitude
 
 
-def _options_of_others(options: EstimateOptions) -> EstimateOptions:
+def _options_of_others(options: SamplerSettings) -> SamplerSettings:
     """Options for the masses besides the first: what is known of a lump is of the first, and so is a checkpoint."""
     known = {name: value for name, value in options.size_priors.known.items() if name not in OF_A_LUMP}
     return replace(options, scene="auto", store=None, size_priors=replace(options.size_priors, known=known))
@@ -299,7 +299,7 @@ def _second_lump_of_scene(tactile_map: TactileMap, first: Estimate) -> list[Rise
 
 
 def _sized_at(
-    tactile_map: TactileMap, rise: Rise, first: Estimate, options: EstimateOptions, estimator: Estimator
+    tactile_map: TactileMap, rise: Rise, first: Estimate, options: SamplerSettings, estimator: Estimator
 ) -> Mass | None:
     """The mass at a rise: by the whole map if it shows a lump there, else by the map less the first lump.
 
@@ -307,7 +307,7 @@ def _sized_at(
     """
     if not on_map(tactile_map, rise.x_mm, rise.y_mm):
         return Mass(rise.x_mm, rise.y_mm, rise.probability, _off_map(rise))
-    given = replace(options, fit=replace(options.fit, centre_mm=(rise.x_mm, rise.y_mm), start_width_mm=None))
+    given = replace(options, centre_mm=(rise.x_mm, rise.y_mm), start_width_mm=None)
     estimate = _estimated(tactile_map, given, estimator)
     if first.map_posterior is not None and not _same_lump(estimate, rise, first):
         less = _estimated(without(tactile_map, first.map_posterior), given, estimator)
@@ -319,7 +319,7 @@ def _sized_at(
     return Mass(rise.x_mm, rise.y_mm, rise.probability, replace(_no_size(estimate), bump=_bump_of(rise)))
 
 
-def _estimated(tactile_map: TactileMap, options: EstimateOptions, estimator: Estimator) -> Estimate:
+def _estimated(tactile_map: TactileMap, options: SamplerSettings, estimator: Estimator) -> Estimate:
     """An estimate; where the method asked for does not converge the reason for none, for the first lump has its own."""
     try:
         return estimator(tactile_map, options)

@@ -17,7 +17,7 @@ from tactile_bayes.posterior.correlated import Correlated
 from tactile_bayes.posterior.detection import Detection
 from tactile_bayes.posterior.draw import ModalBump
 from tactile_bayes.posterior.lump_probability import NO_EVIDENCE, Weighed, weigh_candidate
-from tactile_bayes.posterior.options import DETECTED, EstimateOptions, FitOptions
+from tactile_bayes.posterior.options import DETECTED, SamplerSettings
 from tactile_bayes.posterior.selection import SceneChoice
 from tactile_bayes.posterior.white import (
     LEAST_WIDTH_IN_CELLS,
@@ -62,13 +62,13 @@ class Assessment(Protocol):
     def widths_mm(self) -> tuple[float, float]:
         """Widths of the bump at the mode, along the ellipse's axes; cheaper than `bump`."""
 
-    def draw(self, options: EstimateOptions, *, rng: np.random.Generator, progress: Progress | None) -> MapDraws:
+    def draw(self, options: SamplerSettings, *, rng: np.random.Generator, progress: Progress | None) -> MapDraws:
         """Draw from the posterior of this place; `NotConvergedError` when no method converges."""
 
 
-def assess(tactile_map: TactileMap, fit: BumpFit, options: EstimateOptions) -> Assessment:
+def assess(tactile_map: TactileMap, fit: BumpFit, options: SamplerSettings) -> Assessment:
     """Assess whether there is a lump at a fitted place, under the noise model of the options."""
-    return (Correlated if options.fit.correlated else White).of(tactile_map, fit, options)
+    return (Correlated if options.correlated else White).of(tactile_map, fit, options)
 
 
 # --- Posterior draws of a map and its size, refined until the size interval is as exact as requested.
@@ -92,7 +92,7 @@ def draw_until_accurate(
     tactile_map: TactileMap,
     seen: Assessment,
     calibration: Calibration | None,
-    options: EstimateOptions,
+    options: SamplerSettings,
     *,
     rng: np.random.Generator,
     progress: Progress | None,
@@ -116,7 +116,7 @@ def draw_until_accurate(
     return sized
 
 
-def _finer(sized: SizedDraws, options: EstimateOptions) -> float | None:
+def _finer(sized: SizedDraws, options: SamplerSettings) -> float | None:
     """Accuracy in SDs for the next draws; None where the size is accurate enough, or no accuracy is requested."""
     wanted = options.accuracy_sd or DEFAULT_ACCURACY_SD.get(sized.made.draws.method)
     if sized.size is None or wanted is None:
@@ -132,7 +132,7 @@ def draw_with_size(
     tactile_map: TactileMap,
     seen: Assessment,
     calibration: Calibration | None,
-    options: EstimateOptions,
+    options: SamplerSettings,
     *,
     rng: np.random.Generator,
     progress: Progress | None,
@@ -160,7 +160,7 @@ MOST_LOOKS = 3
 """Places that are no lump by the evidence before the search ends: each look is a chance to be wrong."""
 
 
-def search(tactile_map: TactileMap, options: EstimateOptions) -> tuple[tuple[Candidate, ...], Assessment | None]:
+def search(tactile_map: TactileMap, options: SamplerSettings) -> tuple[tuple[Candidate, ...], Assessment | None]:
     """Find the highest bump that can be a lump, also under correlated errors, and is one by the evidence.
 
     Returns all candidates that were looked at, the answer's last, and its assessment: None where none can be a lump,
@@ -186,7 +186,7 @@ def search(tactile_map: TactileMap, options: EstimateOptions) -> tuple[tuple[Can
         rather = f": rather {detection.ridge}" if detection.ridge else ""
         fault = f"{NO_EVIDENCE}{rather}"
         tried[-1] = replace(candidate, fault=fault)
-    if options.fit.correlated:
+    if options.correlated:
         close = _close_search(tactile_map, tried, options)
         if close is not None:
             return close
@@ -195,10 +195,10 @@ def search(tactile_map: TactileMap, options: EstimateOptions) -> tuple[tuple[Can
     return (*(one for one in tried if one.centre_mm != first[0].centre_mm), first[0]), first[1]
 
 
-def _places(tactile_map: TactileMap, options: EstimateOptions) -> Iterator[Candidate]:
+def _places(tactile_map: TactileMap, options: SamplerSettings) -> Iterator[Candidate]:
     """Candidate places, highest first, fitted on demand."""
-    settings = _search_options(tactile_map, options.fit)
-    if not options.fit.correlated:
+    settings = _search_options(tactile_map, options)
+    if not options.correlated:
         yield from fitted_candidates(tactile_map, settings)
         return
     found_on = levelled(tactile_map)
@@ -209,23 +209,23 @@ def _places(tactile_map: TactileMap, options: EstimateOptions) -> Iterator[Candi
             yield replace(one, fit=_with_cells_of(tactile_map, one.fit, settings))
 
 
-def _with_cells_of(tactile_map: TactileMap, fit: BumpFit, settings: FitOptions) -> BumpFit:
+def _with_cells_of(tactile_map: TactileMap, fit: BumpFit, settings: SamplerSettings) -> BumpFit:
     """Replace a fit's cells by the map's cells in the whole window.
 
     Under a noise field least squares is only a start.
     """
     centre = (float(fit.theta[1]), float(fit.theta[2]))
-    return replace(fit, cells=window_cells(tactile_map, centre, radius_mm=settings.radius_mm))
+    return replace(fit, cells=window_cells(tactile_map, centre, radius_mm=settings.fit_radius_mm))
 
 
 def _close_search(
-    tactile_map: TactileMap, tried: list[Candidate], options: EstimateOptions
+    tactile_map: TactileMap, tried: list[Candidate], options: SamplerSettings
 ) -> tuple[tuple[Candidate, ...], Assessment] | None:
     """Search again close to the highest places from which the fit moved away; None where none is a lump.
 
     Beside a rib, least squares grows over both. Correlated errors can represent the rib, and it is tested for later.
     """
-    looks, settings, found_on = 0, _search_options(tactile_map, options.fit), levelled(tactile_map)
+    looks, settings, found_on = 0, _search_options(tactile_map, options), levelled(tactile_map)
     for i, candidate in enumerate(tried):
         if candidate.fit is not None and not candidate.fault.startswith(OUTGROWN):
             continue
@@ -245,7 +245,7 @@ def _close_search(
     return None
 
 
-def best_chance(tactile_map: TactileMap, candidates: Sequence[Candidate], options: EstimateOptions) -> Weighed | None:
+def best_chance(tactile_map: TactileMap, candidates: Sequence[Candidate], options: SamplerSettings) -> Weighed | None:
     """The most probable lump among rises that cannot be measured; None where none can be assessed.
 
     Those that the search has weighed count. Where they are fewer than `MOST_LOOKS` the highest others are weighed too,
@@ -266,10 +266,10 @@ def best_chance(tactile_map: TactileMap, candidates: Sequence[Candidate], option
 
 
 def _weighed(
-    tactile_map: TactileMap, candidate: Candidate, options: EstimateOptions
+    tactile_map: TactileMap, candidate: Candidate, options: SamplerSettings
 ) -> tuple[BumpFit, Detection] | None:
     """Odds of a lump at a faulty place, fitted from close by where the first fit moved away or grew too large."""
-    fit, settings = candidate.fit, _search_options(tactile_map, options.fit)
+    fit, settings = candidate.fit, _search_options(tactile_map, options)
     if fit is None or candidate.fault.startswith(OUTGROWN):
         fit, _ = fit_close(levelled(tactile_map), candidate.centre_mm, options=settings)
     if fit is None or min(fit.widths()[:2]) < LEAST_WIDTH_IN_CELLS * fit.cells.cell_mm:
@@ -277,7 +277,7 @@ def _weighed(
     return fit, assess(tactile_map, _with_cells_of(tactile_map, fit, settings), options).detection
 
 
-def _search_options(tactile_map: TactileMap, fit: FitOptions) -> FitOptions:
+def _search_options(tactile_map: TactileMap, fit: SamplerSettings) -> SamplerSettings:
     """Options of the least-squares search for a lump.
 
     Under a noise field it only has to find the place: there the known level holds it better than a free one, which a

@@ -42,7 +42,7 @@ from tactile_bayes.posterior.detection import (
     level_offset,
 )
 from tactile_bayes.posterior.draw import MapPosterior, ModalBump, NoiseFigures, Sampled, draw_parameters
-from tactile_bayes.posterior.options import ROTATION_ODDS, EstimateOptions, FitOptions
+from tactile_bayes.posterior.options import ROTATION_ODDS, SamplerSettings
 from tactile_bayes.presets import Background, Method, Noise
 from tactile_bayes.progress import Progress
 
@@ -215,7 +215,7 @@ class Candidate(Record, eq=False):
     """Odds of a lump there; None where nobody has weighed them."""
 
 
-def fitted_candidates(tactile_map: TactileMap, options: FitOptions) -> Iterator[Candidate]:
+def fitted_candidates(tactile_map: TactileMap, options: SamplerSettings) -> Iterator[Candidate]:
     """Candidate places, highest first, each fitted on demand."""
     centres = [options.centre_mm] if options.centre_mm is not None else candidate_centres(tactile_map)
     for centre in centres:
@@ -223,7 +223,7 @@ def fitted_candidates(tactile_map: TactileMap, options: FitOptions) -> Iterator[
 
 
 def fit_bump(
-    tactile_map: TactileMap, centre_mm: tuple[float, float], *, options: FitOptions
+    tactile_map: TactileMap, centre_mm: tuple[float, float], *, options: SamplerSettings
 ) -> tuple[BumpFit | None, str]:
     """Fit a bump near `centre_mm`; the window follows the fitted centre.
 
@@ -234,14 +234,14 @@ def fit_bump(
     centre, start, weight_variance = centre_mm, None, None
     widths = START_WIDTHS_MM if options.start_width_mm is None else (options.start_width_mm,)
     for _ in range(6):
-        cells = window_cells(tactile_map, centre, radius_mm=options.radius_mm)
+        cells = window_cells(tactile_map, centre, radius_mm=options.fit_radius_mm)
         if len(cells) < len(bump.names) + 2:
             return None, f"{len(cells)} covered cells for {len(bump.names)} parameters"
         weight = np.ones(len(cells)) if weight_variance is None else count_weights(cells, weight_variance)
         starts = [start] if start is not None else [_start(tactile_map, bump, cells, centre, width) for width in widths]
         fit = _best_fit(bump, cells, starts, weight=weight, centre=centre, options=options)
         moved = float(np.hypot(fit.theta[1] - centre[0], fit.theta[2] - centre[1]))
-        if not fit.converged or moved > options.radius_mm / 2:
+        if not fit.converged or moved > options.fit_radius_mm / 2:
             return None, "no bump that the window holds: the fit ran away"
         settled = weight_variance is not None and moved < 0.25 * cells.cell_mm
         centre, start = (float(fit.theta[1]), float(fit.theta[2])), fit.theta
@@ -263,13 +263,13 @@ def fit_bump(
 
 
 def fit_close(
-    tactile_map: TactileMap, centre_mm: tuple[float, float], *, options: FitOptions
+    tactile_map: TactileMap, centre_mm: tuple[float, float], *, options: SamplerSettings
 ) -> tuple[BumpFit | None, str]:
     """Fit in a window of `CLOSE_IN_RADII`, where a neighbour would pull the bump away.
 
     The ellipse may turn, so that a ridge shows as one.
     """
-    near = replace(options, radius_mm=CLOSE_IN_RADII * options.radius_mm, rotation="on")
+    near = replace(options, fit_radius_mm=CLOSE_IN_RADII * options.fit_radius_mm, rotation="on")
     return fit_bump(tactile_map, centre_mm, options=near)
 
 
@@ -286,7 +286,7 @@ def default_errors(tactile_map: TactileMap) -> tuple[Background, Noise]:
     return "free", "field" if bool((tactile_map.count > 1).any()) else "independent"
 
 
-def check_background(tactile_map: TactileMap, options: FitOptions) -> None:
+def check_background(tactile_map: TactileMap, options: SamplerSettings) -> None:
     """Refuse a fixed background for a map whose level is not known.
 
     The map's median, which is the nearest guess, moves with the lump itself: nominal 90 % intervals of widths then
@@ -299,7 +299,7 @@ def check_background(tactile_map: TactileMap, options: FitOptions) -> None:
         )
 
 
-def _bump(tactile_map: TactileMap, options: FitOptions, *, rotated: bool) -> Bump:
+def _bump(tactile_map: TactileMap, options: SamplerSettings, *, rotated: bool) -> Bump:
     check_background(tactile_map, options)
     level = None if options.background == "free" else tactile_map.background
     return Bump(rotated=rotated, background=level, scale=value_scale(tactile_map))
@@ -312,7 +312,7 @@ def _best_fit(
     *,
     weight: FloatArray,
     centre: tuple[float, float],
-    options: FitOptions,
+    options: SamplerSettings,
 ) -> LeastSquaresFit:
     """The lowest minimum from several starts.
 
@@ -320,7 +320,7 @@ def _best_fit(
     a noise field least squares only finds the place: it need not dwell on a rise that is hardly one, nor look for
     another minimum beside one that is `CLEAR`.
     """
-    radius_mm, place_only = options.radius_mm, options.correlated
+    radius_mm, place_only = options.fit_radius_mm, options.correlated
     fits: list[LeastSquaresFit] = []
 
     def joins(theta: FloatArray, other: LeastSquaresFit) -> bool:
@@ -361,7 +361,7 @@ def _start(
     return np.array([values.get(name, 0.0) for name in bump.names])
 
 
-def lump_fault(result: BumpFit, options: FitOptions) -> str:
+def lump_fault(result: BumpFit, options: SamplerSettings) -> str:
     """Reason why a fitted bump is not measured, with the figure and the limit; empty if it can be."""
     sigma_x, sigma_y, _ = result.widths()
     cell = result.cells.cell_mm
@@ -372,8 +372,8 @@ def lump_fault(result: BumpFit, options: FitOptions) -> str:
         return "the map does not determine the bump (singular fit)"
     if narrow < LEAST_WIDTH_IN_CELLS * cell:
         return f"narrower than a cell (sigma {narrow:.2g} mm on {cell:g} mm cells): not resolved"
-    if wide > WIDEST_IN_RADII * options.radius_mm:
-        return f"{OUTGROWN} (sigma {wide:.3g} mm in a radius of {options.radius_mm:g} mm)"
+    if wide > WIDEST_IN_RADII * options.fit_radius_mm:
+        return f"{OUTGROWN} (sigma {wide:.3g} mm in a radius of {options.fit_radius_mm:g} mm)"
     if result.covered_share < LEAST_COVERED_SHARE:
         return f"{AT_RIM} ({100 * result.covered_share:.0f} % of the bump is covered)"
     if wide / narrow > MOST_AXIS_RATIO:
@@ -382,7 +382,7 @@ def lump_fault(result: BumpFit, options: FitOptions) -> str:
 
 
 def rotation_odds(
-    tactile_map: TactileMap, unrotated: BumpFit, *, options: FitOptions, prior: BumpPrior
+    tactile_map: TactileMap, unrotated: BumpFit, *, options: SamplerSettings
 ) -> tuple[float, BumpFit | None]:
     """Bayes factor of a rotated ellipse against one along the head's axes, and the rotated fit.
 
@@ -393,7 +393,7 @@ def rotation_odds(
     if turned is None or fault:
         return 0.0, None
     r, sd = float(turned.theta[5]), float(np.sqrt(turned.covariance[5, 5]))
-    log_odds = np.log(sd / prior.log_ratio_sd) + 0.5 * (r / sd) ** 2
+    log_odds = np.log(sd / options.log_ratio_sd) + 0.5 * (r / sd) ** 2
     return float(np.exp(np.clip(log_odds, -700, 700))), turned
 
 
@@ -425,7 +425,7 @@ class White(Record, eq=False):
     scene: None = None
 
     @classmethod
-    def of(cls, tactile_map: TactileMap, fit: BumpFit, options: EstimateOptions) -> White:
+    def of(cls, tactile_map: TactileMap, fit: BumpFit, options: SamplerSettings) -> White:
         """Compare a fitted bump with no bump."""
         detection = detect(tactile_map, fit.bump, theta=fit.theta, covariance=fit.covariance, prior=options.prior)
         return cls(tactile_map, fit, detection)
@@ -438,9 +438,9 @@ class White(Record, eq=False):
         """Its widths."""
         return self.fit.widths()[:2]
 
-    def draw(self, options: EstimateOptions, *, rng: np.random.Generator, progress: Progress | None) -> MapDraws:
+    def draw(self, options: SamplerSettings, *, rng: np.random.Generator, progress: Progress | None) -> MapDraws:
         """Draw from the posterior, rotated where the odds favour it."""
-        fit, odds = chosen_rotation(self.tactile_map, self.fit, options=options.fit, prior=options.prior)
+        fit, odds = chosen_rotation(self.tactile_map, self.fit, options=options)
         draws, posterior = draw_independent(fit, options, rng=rng, progress=progress)
         figures = {"noise_inflation": fit.errors.inflation, "noise_dof": fit.errors.dof}
         offset = level_offset(fit.fit.residual, weight=fit.weight)
@@ -448,13 +448,11 @@ class White(Record, eq=False):
         return MapDraws(self.detection, fit, draws, posterior, noise)
 
 
-def chosen_rotation(
-    tactile_map: TactileMap, fit: BumpFit, *, options: FitOptions, prior: BumpPrior
-) -> tuple[BumpFit, float | None]:
+def chosen_rotation(tactile_map: TactileMap, fit: BumpFit, *, options: SamplerSettings) -> tuple[BumpFit, float | None]:
     """The fit, rotated where the odds favour it, and those odds; None where rotation was not tested."""
     if options.rotation != "auto":
         return fit, None
-    odds, turned = rotation_odds(tactile_map, fit, options=options, prior=prior)
+    odds, turned = rotation_odds(tactile_map, fit, options=options)
     return (turned, odds) if turned is not None and odds > ROTATION_ODDS else (fit, odds)
 
 
@@ -465,7 +463,7 @@ class _Independent(Record, eq=False):
     target: Target
     width_sd_mm: None = None
 
-    def methods(self, options: EstimateOptions) -> Sequence[Method]:
+    def methods(self, options: SamplerSettings) -> Sequence[Method]:
         # weights that cannot be trusted are no matter of chains, which need none
         return ("importance", "ensemble") if options.method == "importance" else (options.method,)
 
@@ -484,7 +482,7 @@ class _Independent(Record, eq=False):
 
 
 def draw_independent(
-    fit: BumpFit, options: EstimateOptions, *, rng: np.random.Generator, progress: Progress | None
+    fit: BumpFit, options: SamplerSettings, *, rng: np.random.Generator, progress: Progress | None
 ) -> tuple[ParameterDraws, MapPosterior]:
     """Draw by the requested method, and name the joint draws."""
     target = fit.target(options.prior)

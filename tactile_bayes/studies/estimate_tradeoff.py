@@ -12,9 +12,9 @@ from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.inference.draws import Quantity, summarise
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.estimate import estimate_map
-from tactile_bayes.posterior.options import EstimateOptions
+from tactile_bayes.posterior.options import SamplerSettings
 from tactile_bayes.posterior.result import Estimate
-from tactile_bayes.presets import INTERVAL, MOST_FIELD_COSINES
+from tactile_bayes.presets import INTERVAL, MOST_FIELD_COSINES, Background
 from tactile_bayes.size.pooling import Calibration
 
 # --- The reported numbers of one estimate, and how far they lie from a reference.
@@ -304,10 +304,10 @@ RADII_MM = (8.0, 12.0, 16.0, 20.0, 25.0, 30.0)
 METHOD, ACCURACY, FIELD, WINDOW = "method", "draws", "noise field", "fit window"
 
 
-Setting = Choice[EstimateOptions]
+Setting = Choice[SamplerSettings]
 
 
-def settings_of(options: EstimateOptions, *, level_known: bool) -> list[Setting]:
+def settings_of(options: SamplerSettings, *, level_known: bool) -> list[Setting]:
     """Everything that is tried, the default, what `estimate` takes by itself for this map, first.
 
     `level_known` is whether the map has a background that the paper's least squares can be fixed at.
@@ -316,7 +316,7 @@ def settings_of(options: EstimateOptions, *, level_known: bool) -> list[Setting]
         Setting(METHOD, f"--method {options.method}", options, default=True),
         *_methods(options, level_known=level_known),
         *_draws(options),
-        *(_fields(options) if options.fit.correlated else ()),
+        *(_fields(options) if options.correlated else ()),
         *_windows(options),
     ]
 
@@ -345,44 +345,46 @@ def _beside_chains(one: Setting) -> Setting:
     return replace(one, weight=0.2 * one.weight)
 
 
-def _methods(options: EstimateOptions, *, level_known: bool) -> Iterator[Setting]:
-    printed = replace(options.fit, noise="independent", background="fixed" if level_known else "free")
+def _methods(options: SamplerSettings, *, level_known: bool) -> Iterator[Setting]:
     if options.method != "optimise":
+        level: Background = "fixed" if level_known else "free"
         # another model: no noise field, no prior
-        plain = replace(options, method="optimise", fit=printed, scene="auto", accuracy_mm=None)
+        plain = replace(
+            options, method="optimise", scene="auto", accuracy_mm=None, noise="independent", background=level
+        )
         yield Setting(METHOD, "--method optimise", plain, 0.5, usable=False)
     for method, weight in (("laplace", 1.0), ("importance", 1.0), ("ensemble", 8.0)):
         if method != options.method:
             yield Setting(METHOD, f"--method {method}", _by(options, method), weight)
 
 
-def _draws(options: EstimateOptions) -> Iterator[Setting]:
+def _draws(options: SamplerSettings) -> Iterator[Setting]:
     for number in LAPLACE_DRAWS:
         drawn = replace(_by(options, "laplace"), draws=number)
-        if options.fit.correlated:
+        if options.correlated:
             yield Setting(ACCURACY, f"laplace, {number} draws", drawn, usable=False)
     for accuracy in ACCURACIES_SD:
         label = f"--accuracy-sd {accuracy:g}"
         yield Setting(ACCURACY, label, _by(options, "importance", accuracy), 1.0 + 0.005 / accuracy)
-    for accuracy in CHAIN_ACCURACIES_SD if options.fit.correlated else ():
+    for accuracy in CHAIN_ACCURACIES_SD if options.correlated else ():
         label = f"--method ensemble --accuracy-sd {accuracy:g}"
         yield Setting(ACCURACY, label, _by(options, "ensemble", accuracy), 25.0)
 
 
-def _fields(options: EstimateOptions) -> Iterator[Setting]:
+def _fields(options: SamplerSettings) -> Iterator[Setting]:
     for number in FIELDS:
-        finer = replace(options, fit=replace(options.fit, field_cosines=number))
+        finer = replace(options, field_cosines=number)
         yield Setting(FIELD, f"field_cosines {number}", finer, max(0.7, (number / 18.0) ** 3.2), usable=False)
 
 
-def _windows(options: EstimateOptions) -> Iterator[Setting]:
+def _windows(options: SamplerSettings) -> Iterator[Setting]:
     for radius in RADII_MM:
-        if radius != options.fit.radius_mm:
-            other = replace(options, fit=replace(options.fit, radius_mm=radius))
+        if radius != options.fit_radius_mm:
+            other = replace(options, fit_radius_mm=radius)
             yield Setting(WINDOW, f"fit_radius_mm {radius:g}", other, usable=False)
 
 
-def _by(options: EstimateOptions, method: Any, accuracy_sd: float | None = None) -> EstimateOptions:
+def _by(options: SamplerSettings, method: Any, accuracy_sd: float | None = None) -> SamplerSettings:
     """The options with another method, which stands for itself: where it fails no other one is tried."""
     return replace(options, method=method, accuracy_sd=accuracy_sd, accuracy_mm=None, step_up=False)
 
@@ -400,7 +402,7 @@ class Estimator(Record):
     probability: float = INTERVAL
     """Of the intervals."""
 
-    def run(self, options: EstimateOptions) -> Run:
+    def run(self, options: SamplerSettings) -> Run:
         """A whole estimate, from the map to the size, as a function of the number of the run."""
         calibration = fitted_as(self.calibration, options)
 
@@ -416,7 +418,7 @@ class Estimator(Record):
 
         return once
 
-    def reference(self, options: EstimateOptions) -> Reference:
+    def reference(self, options: SamplerSettings) -> Reference:
         """The same posterior by the first long run that converges; without one, or without a lump, no answer."""
         spent, answer = 0.0, SizeAnswer("")
         for method, accuracy in LONG_RUNS:
@@ -430,20 +432,20 @@ class Estimator(Record):
         return Reference(f"none: {answer.reason}", None, spent)
 
 
-def fitted_as(calibration: Calibration | None, options: EstimateOptions) -> Calibration | None:
+def fitted_as(calibration: Calibration | None, options: SamplerSettings) -> Calibration | None:
     """The calibration as if it had been learned from maps fitted as the options say.
 
     `estimate` refuses a size from a map fitted in another way; here it is wanted, to see how far off it would be.
     """
     if calibration is None:
         return None
-    fit = options.fit
-    recipe = replace(calibration.recipe, background=fit.background, radius_mm=fit.radius_mm, noise=fit.noise)
+    used = {"background": options.background, "radius_mm": options.fit_radius_mm, "noise": options.noise}
+    recipe = replace(calibration.recipe, **used)
     return replace(calibration, recipe=recipe)
 
 
 def measure(
-    tactile_map: TactileMap, *, calibration: Calibration | None, options: EstimateOptions, work: Work
+    tactile_map: TactileMap, *, calibration: Calibration | None, options: SamplerSettings, work: Work
 ) -> Ladder:
     """Run every setting on one map, from the calibration and options that `estimate` takes by itself for it."""
     estimator = Estimator(tactile_map, calibration, work.seed, work.clock, work.probability)

@@ -21,7 +21,7 @@ from tactile_bayes.geometry import FloatArray, inverse
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.mapping.select import SelectedFrames, select_frames
-from tactile_bayes.posterior.options import FitOptions
+from tactile_bayes.posterior.options import SamplerSettings
 from tactile_bayes.posterior.white import BumpFit, fit_bump, fitted_candidates
 from tactile_bayes.presets import CELL_MM, FIT_RADIUS_MM, PRESSURE_WINDOW_KPA
 from tactile_bayes.scan import CountArray, ElementCalibration, PressureFrames, Scan
@@ -262,7 +262,7 @@ def _shares(seen: FloatArray, model: FloatArray) -> FloatArray:
 
 def _bump(made: TactileMap, place_mm: tuple[float, float] | None) -> BumpFit | None:
     """Eq 7 with a background of 1: at a place, or at the highest bump that can be a lump."""
-    options = FitOptions()
+    options = SamplerSettings()
     if place_mm is not None:
         return fit_bump(made, place_mm, options=options)[0]
     return next((one.fit for one in fitted_candidates(made, options) if one.fit is not None and not one.fault), None)

@@ -15,7 +15,7 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.estimate import estimate_map
-from tactile_bayes.posterior.options import EstimateOptions, FitOptions
+from tactile_bayes.posterior.options import SamplerSettings
 from tactile_bayes.presets import DEFAULT_NORMALISE, HEAD_PROFILE
 from tactile_bayes.scan import FLAT_RADIUS_MM, HeadShape, Scan
 from tactile_bayes.size.draws import ShapeDraws
@@ -232,9 +232,9 @@ _DRAWS_SEED = 1
 BODY_COLUMNS = names_of(BodyPrior)
 
 
-def measuring_options() -> EstimateOptions:
+def measuring_options() -> SamplerSettings:
     """Fit options for a population's maps: as for a patient's, along the head's axes, by mode and curvature."""
-    return EstimateOptions(method="laplace", fit=FitOptions("free", FIT_RADIUS_MM, "off", None, "field"))
+    return SamplerSettings(method="laplace", background="free", rotation="off", noise="field")
 
 
 class MassRow(Record):

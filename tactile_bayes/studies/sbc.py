@@ -15,7 +15,7 @@ from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior.draw import MapPosterior
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.field import LENGTHS_MM, SHARES, cell_mean_profile
-from tactile_bayes.posterior.options import EstimateOptions, FitOptions
+from tactile_bayes.posterior.options import SamplerSettings
 from tactile_bayes.posterior.white import WIDEST_IN_RADII
 from tactile_bayes.presets import Method
 from tactile_bayes.size.bodies import BodyCalibration
@@ -251,8 +251,15 @@ def ranks_of_map(
     rng = np.random.default_rng([seed, index])
     prior = BumpPrior()
     truth = draw_truth(rng, prior)
-    fit = FitOptions("free", RADIUS_MM, "off", None, "field", field_cosines=cosines)
-    options = EstimateOptions(method=method, fit=fit, prior=prior)
+    options = SamplerSettings(
+        method=method,
+        background="free",
+        fit_radius_mm=RADIUS_MM,
+        rotation="off",
+        noise="field",
+        field_cosines=cosines or "auto",
+        **as_dict(prior),
+    )
     try:
         found = estimate_map(draw_map(truth, rng, prior), calibration=None, options=options, rng=rng)
     except NotConvergedError:  # of the ensemble, which no method follows

@@ -18,7 +18,7 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.mapping.select import first_seconds
-from tactile_bayes.posterior.options import EstimateOptions
+from tactile_bayes.posterior.options import SamplerSettings
 from tactile_bayes.presets import CELL_MM, DEFAULT_NORMALISE, HEAD_PITCH_MM, NORMALISE, SHOULDERS_INSIDE
 from tactile_bayes.scan import Scan
 from tactile_bayes.size.bodies import BodyCalibration, mean_width_mm
@@ -394,7 +394,7 @@ CELLS_MM = (FINEST_CELL_MM, 0.75, 1.5, 2.0, 3.0, 4.0)
 EVERY = (2, 4, 8, 16, 32)
 SHARES_OF_TIME = (0.75, 0.5, 0.25)
 CELL, FRAMES, TIME, LEVEL = "cell size", "frames used", "time of strokes", "normalising"
-Inputs = Callable[[TactileMap], tuple[Calibration | None, EstimateOptions]]
+Inputs = Callable[[TactileMap], tuple[Calibration | None, SamplerSettings]]
 
 
 class Built(Record):

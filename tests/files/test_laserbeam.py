@@ -17,7 +17,7 @@ from scipy.optimize import curve_fit
 from tactile_bayes.files.imports import read_grid
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.estimate import estimate_map
-from tactile_bayes.posterior.options import EstimateOptions, FitOptions
+from tactile_bayes.posterior.options import SamplerSettings
 from tactile_bayes.posterior.result import Estimate
 
 PIXEL_MM = 0.1
@@ -41,7 +41,7 @@ def by_scipy(tactile_map: TactileMap, centre: np.ndarray, radius: float) -> np.n
 
 
 def fitted(tactile_map: TactileMap, radius: float) -> Estimate:
-    options = EstimateOptions(method="optimise", fit=FitOptions("free", radius, "on"))
+    options = SamplerSettings(method="optimise", background="free", fit_radius_mm=radius, rotation="on")
     return estimate_map(tactile_map, calibration=None, options=options, rng=np.random.default_rng(1))
 
 

@@ -316,10 +316,10 @@ def test_the_next_fit_of_a_lump_begins_with_its_width_and_a_glance_does_not():
 
 def test_the_live_estimate_is_the_estimate(state):
     from tactile_bayes.posterior.estimate import estimate_map
-    from tactile_bayes.posterior.options import EstimateOptions, FitOptions
+    from tactile_bayes.posterior.options import SamplerSettings
 
     text, lump_base_mm = live_estimate(state.tactile_map, None, Turn())
-    options = EstimateOptions(method="laplace", fit=FitOptions(rotation="off"))
+    options = SamplerSettings(method="laplace", rotation="off")
     found = estimate_map(state.tactile_map, calibration=None, options=options, rng=np.random.default_rng(1))
     widths = np.maximum(found.map_posterior.sigma_x_mm, found.map_posterior.sigma_y_mm)
     assert text.startswith(f"map width sigma {np.median(widths):.1f} mm (")

@@ -12,7 +12,7 @@ from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior.bump import Bump, cell_mean_gaussian, covariance_from_log_widths, window_cells
 from tactile_bayes.posterior.draw import draw_parameters
 from tactile_bayes.posterior.fit import FieldFit
-from tactile_bayes.posterior.options import EstimateOptions, FitOptions
+from tactile_bayes.posterior.options import SamplerSettings
 from tests.posterior.correlated.test_marginal import cells_of, fitted, noise
 
 
@@ -32,7 +32,7 @@ def drawn(method: str) -> tuple[Counting, list[np.ndarray], list[np.ndarray], li
     fit = fitted(cells_of(noise(5, field=0.01)))
     counting = Counting(fit)
     solved = Solved(counting)
-    draws, _ = draw_parameters(fit, EstimateOptions(method), rng=np.random.default_rng(1), solved=solved)
+    draws, _ = draw_parameters(fit, SamplerSettings(method=method), rng=np.random.default_rng(1), solved=solved)
     kept = fit.target.draw_linear(draws.flat, np.random.default_rng(2), solved=solved)
     again, other = (fit.target.draw_linear(draws.flat, np.random.default_rng(seed)) for seed in (2, 3))
     return counting, list(kept), list(again), list(other)
@@ -75,7 +75,7 @@ def test_a_memory_is_of_its_own_points_only() -> None:
 
 
 def test_independent_errors_keep_their_sums_of_squares() -> None:
-    fit = find_bump(bump_map(noise=noise(3)), FitOptions(rotation="off"))[-1].fit
+    fit = find_bump(bump_map(noise=noise(3)), SamplerSettings(rotation="off"))[-1].fit
     assert fit is not None
     target = fit.target(BumpPrior())
     solved = Solved(lambda theta: (np.full(len(theta), np.nan),))

@@ -17,7 +17,7 @@ from tactile_bayes.inference.modes import find_mode, finite_differences, laplace
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.detection import ErrorModel
 from tactile_bayes.posterior.estimate import estimate_map
-from tactile_bayes.posterior.options import EstimateOptions, FitOptions
+from tactile_bayes.posterior.options import SamplerSettings
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.posterior.white import Target, flat_prior
 from tactile_bayes.presets import METHODS
@@ -188,7 +188,7 @@ def strong_map(errors: str) -> TactileMap:
 
 @cache
 def answer(method: str, errors: str = "white", seed: int = 1) -> Estimate:
-    options = EstimateOptions(method=method, fit=FitOptions(rotation="off"))
+    options = SamplerSettings(method=method, rotation="off")
     return estimate_map(strong_map(errors), calibration=None, options=options, rng=np.random.default_rng(seed))
 
 
@@ -252,7 +252,7 @@ class TestContract:
 
 @pytest.mark.parametrize("method", ["optimise", "laplace"])
 def test_one_seed_gives_the_same_draws_and_another_does_not(method: str) -> None:
-    options = EstimateOptions(method=method, fit=FitOptions(rotation="off"))
+    options = SamplerSettings(method=method, rotation="off")
     again = estimate_map(strong_map("white"), calibration=None, options=options, rng=np.random.default_rng(1))
     first, other = answer(method).draws, answer(method, seed=2).draws
     assert first is not None

@@ -15,7 +15,7 @@ from tactile_bayes.mapping.accumulate import Instrument, MapAccumulator, MapGrid
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.mapping.plane import FramePoses
-from tactile_bayes.posterior.options import FitOptions
+from tactile_bayes.posterior.options import SamplerSettings
 from tactile_bayes.posterior.white import fit_bump
 from tactile_bayes.scan import Scan
 
@@ -36,7 +36,7 @@ def scene_of(lump: Lump, *, load_sharing: bool = False) -> Scene:
 def fitted(tactile_map: TactileMap, base_mm) -> np.ndarray:
     """Amplitude, sigma_x and sigma_y of the bump at a known place."""
     place = apply(tactile_map.plane_from_base, np.array(base_mm))
-    fit, fault = fit_bump(tactile_map, (float(place[0]), float(place[1])), options=FitOptions(background="free"))
+    fit, fault = fit_bump(tactile_map, (float(place[0]), float(place[1])), options=SamplerSettings(background="free"))
     assert fit is not None, fault
     return np.array([fit.theta[0], *fit.widths()[:2]])
 

@@ -33,7 +33,7 @@ from tactile_bayes.mapping.profile import (
     profile_figures,
 )
 from tactile_bayes.posterior.estimate import estimate_map
-from tactile_bayes.posterior.options import EstimateOptions, FitOptions
+from tactile_bayes.posterior.options import SamplerSettings
 from tactile_bayes.presets import HEAD_PROFILE
 from tactile_bayes.scan import ElementCalibration, Scan
 from tactile_bayes.size.bodies import BodyCalibration
@@ -238,8 +238,8 @@ def test_the_simulated_bodys_fat_is_found() -> None:
 def test_the_depth_tells_seats_apart_that_the_map_does_not() -> None:
     """With the profile both sizes are within 12 %; without it the two are told apart by none, and differ by a fifth."""
     calibration = shipped()
-    fit = FitOptions("free", 20.0, "off", None, "field")
-    options = EstimateOptions(method="laplace", fit=fit)
+    fit = SamplerSettings(background="free", rotation="off", noise="field")
+    options = replace(fit, method="laplace")
     sizes: dict[str, list[float]] = {"with": [], "without": []}
     for seat in (0.0, 1.2):
         tactile_map = scanned(seat)

@@ -13,7 +13,7 @@ from tactile_bayes.forward.simulate import head_positions, simulate
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.convention import stroke_starts
 from tactile_bayes.mapping.map import TactileMap
-from tactile_bayes.posterior.options import FitOptions
+from tactile_bayes.posterior.options import SamplerSettings
 from tactile_bayes.posterior.white import fit_bump
 from tactile_bayes.scan import HeadGeometry, Landmarks, PressureFrames, Scan, TrackerPoses
 
@@ -50,7 +50,7 @@ def sigma_x(tactile_map: TactileMap) -> float:
         int(np.nanargmax(np.where(tactile_map.count > 30, tactile_map.mean, np.nan))), tactile_map.mean.shape
     )
     centre = (float(tactile_map.x_mm[column]), float(tactile_map.y_mm[row]))
-    fit, _ = fit_bump(tactile_map, centre, options=FitOptions(background="free"))
+    fit, _ = fit_bump(tactile_map, centre, options=SamplerSettings(background="free"))
     assert fit is not None
     return fit.widths()[0]
 

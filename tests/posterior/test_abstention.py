@@ -15,17 +15,17 @@ from tactile_bayes.posterior.abstention import extend_advice, missing_strokes, n
 from tactile_bayes.posterior.detection import Detection
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.lump_probability import Weighed
-from tactile_bayes.posterior.options import EstimateOptions, FitOptions
+from tactile_bayes.posterior.options import SamplerSettings
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.posterior.white import Candidate, fit_bump
 from tactile_bayes.report.estimate_text import estimate_text
 
-FIELD = FitOptions(background="free", noise="field")
+FIELD = SamplerSettings(background="free", noise="field")
 WHITE = 0.01 * np.random.default_rng(4).standard_normal((51, 51))
 
 
 def run(values: np.ndarray, *, count: np.ndarray | int = 40, **options: object) -> Estimate:
-    settings = EstimateOptions(fit=FIELD, **options)  # type: ignore[arg-type]
+    settings = replace(FIELD, **options)  # type: ignore[arg-type]
     return estimate_map(grid_map(values, count=count), calibration=None, options=settings, rng=np.random.default_rng(1))
 
 
@@ -58,7 +58,7 @@ def test_the_reason_has_a_code_and_a_way_out(values: np.ndarray, code: str, advi
 def test_cells_too_large_to_show_a_lump_are_no_verdict_on_the_breast() -> None:
     """A lump of sigma 3 mm on cells of 10 mm once read "no lump found"; the control is the same map on fine cells."""
     coarse = grid_map(1.0 + WHITE[:9, :9], cell_mm=10.0)
-    settings = EstimateOptions(fit=FIELD)
+    settings = FIELD
     found = estimate_map(coarse, calibration=None, options=settings, rng=np.random.default_rng(1))
     assert found.code == "coarse"
     assert found.reason == "the map cannot show whether there is a lump: its cells of 10 mm are too large"
@@ -80,7 +80,7 @@ def test_a_bump_that_cannot_be_measured_has_its_code(
     bump: dict[str, float], fault: str, code: str, advice: str
 ) -> None:
     tactile_map = grid_map(bump_values(half_mm=45.0, **bump))
-    fit, found = fit_bump(tactile_map, (bump.get("x", 1.3), bump.get("y", -0.8)), options=FitOptions())
+    fit, found = fit_bump(tactile_map, (bump.get("x", 1.3), bump.get("y", -0.8)), options=SamplerSettings())
     assert fault in found
     candidate = Candidate((0.0, 0.0), fit, found)
     lump = Weighed(Detection(1.0, 50.0), (0.0, 0.0), (4.0, 0.0, 0.0, 0.0, 0.0), candidate)
@@ -95,7 +95,7 @@ def test_a_bump_that_cannot_be_measured_has_its_code(
 def test_no_lump_is_said_first_with_the_place(centre: tuple[float, float] | None) -> None:
     tactile_map = grid_map(1 + WHITE)
     fit = replace(FIELD, centre_mm=centre)
-    found = estimate_map(tactile_map, calibration=None, options=EstimateOptions(fit=fit), rng=np.random.default_rng(1))
+    found = estimate_map(tactile_map, calibration=None, options=fit, rng=np.random.default_rng(1))
     first = estimate_text(found, tactile_map, probability=0.95).splitlines()[0]
     assert first.startswith("No lump found ")
     assert ("on the 26 cm2 that the map covers" if centre is None else "near (3.0, 2.0) mm") in first
@@ -124,11 +124,16 @@ def test_a_spot_that_a_few_frames_made_is_no_lump() -> None:
     assert enough.status == "estimate"
 
 
-@pytest.mark.parametrize("centre", [(26.0, 0.0), (0.0, -300.0), (float("nan"), 0.0)])
+@pytest.mark.parametrize("centre", [(26.0, 0.0), (0.0, -300.0)])
 def test_a_place_off_the_map_is_a_usage_error(centre: tuple[float, float]) -> None:
-    options = EstimateOptions(fit=replace(FIELD, centre_mm=centre))
+    options = replace(FIELD, centre_mm=centre)
     with pytest.raises(UsageError, match=r"off the map, which has x from -25.5 to 25.5 mm and y from -25.5 to 25.5 mm"):
         estimate_map(grid_map(1 + WHITE), calibration=None, options=options, rng=np.random.default_rng(1))
+
+
+def test_no_place_at_all_is_a_usage_error() -> None:
+    with pytest.raises(UsageError, match=r"centre_mm\[0\] is nan; give a number"):
+        replace(FIELD, centre_mm=(float("nan"), 0.0))
 
 
 def test_a_measurable_lump_has_neither() -> None:
@@ -177,7 +182,7 @@ def test_what_needs_a_field_is_refused_without(options: dict[str, object]) -> No
         estimate_map(
             bump_map(noise=WHITE),
             calibration=None,
-            options=EstimateOptions(fit=FitOptions(), **options),  # type: ignore[arg-type]
+            options=SamplerSettings(**options),  # type: ignore[arg-type]
             rng=np.random.default_rng(1),
         )
 
@@ -190,7 +195,7 @@ def test_a_shape_far_beyond_the_limits_at_its_mode_costs_no_draws(
 ) -> None:
     """A stripe of readings took 30 s of chains; a shape only just beyond a limit is still drawn, and judged by that."""
     tactile_map = bump_map(noise=WHITE, cell_mm=cell_mm)
-    options = EstimateOptions(method="laplace", fit=FIELD)
+    options = replace(FIELD, method="laplace")
     candidates, seen = search.search(tactile_map, options)
     assert seen is not None
 

@@ -12,7 +12,7 @@ from tactile_bayes.errors import BadDataError, NotConvergedError, UsageError
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior.estimate import estimate_map
-from tactile_bayes.posterior.options import EstimateOptions, FitOptions
+from tactile_bayes.posterior.options import SamplerSettings
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.report.estimate_document import estimate_report
 from tactile_bayes.report.estimate_text import estimate_text
@@ -21,7 +21,7 @@ from tactile_bayes.size.terms import Recipe
 
 SIZE = 51
 NOISE = 0.02
-OFF = FitOptions(rotation="off")
+OFF = SamplerSettings(rotation="off")
 DOMAIN = {"amplitude": (0.05, 0.8), "sigma_mm": (2.0, 9.0), "d_mm": (5.0, 25.0)}
 WHITE = NOISE * np.random.default_rng(71).standard_normal((SIZE, SIZE))
 
@@ -38,12 +38,12 @@ def run(
     noise: np.ndarray | float = WHITE,
     *,
     method: str = "laplace",
-    fit: FitOptions = OFF,
+    fit: SamplerSettings = OFF,
     use: SizeCalibration | None = None,
     seed: int = 1,
     **bump: float,
 ) -> Estimate:
-    options = EstimateOptions(method=method, fit=fit)
+    options = replace(fit, method=method)
     return estimate_map(
         bump_map(noise=noise, **bump), calibration=use, options=options, rng=np.random.default_rng(seed)
     )
@@ -168,7 +168,7 @@ def test_without_a_calibration_there_are_widths_only() -> None:
 
 
 def test_rotation_is_spent_where_the_map_asks_for_it() -> None:
-    straight, turned = run(fit=FitOptions()), run(fit=FitOptions(), angle_deg=30.0)
+    straight, turned = run(fit=SamplerSettings()), run(fit=SamplerSettings(), angle_deg=30.0)
     assert straight.diagnostics.noise.rotated is False
     assert any("rotation of the ellipse" in note for note in straight.left_out)
     assert turned.diagnostics.noise.rotated is True
@@ -180,7 +180,7 @@ def test_coarse_cells_are_flagged() -> None:
     noise = 0.005 * np.random.default_rng(74).standard_normal((13, 13))
     tactile_map = bump_map(cell_mm=4.0, half_mm=24.0, noise=noise)
     found = estimate_map(
-        tactile_map, calibration=None, options=EstimateOptions("optimise", OFF), rng=np.random.default_rng(1)
+        tactile_map, calibration=None, options=replace(OFF, method="optimise"), rng=np.random.default_rng(1)
     )
     assert "coarse_cells" in [one.kind for one in found.findings]
     assert "smaller --cell-mm" in estimate_text(found, tactile_map, probability=0.95)
@@ -189,7 +189,7 @@ def test_coarse_cells_are_flagged() -> None:
 def test_a_level_off_the_background_is_reported() -> None:
     tactile_map = grid_map(bump_map(noise=WHITE).mean + 0.05)
     found = estimate_map(
-        tactile_map, calibration=None, options=EstimateOptions("optimise", OFF), rng=np.random.default_rng(1)
+        tactile_map, calibration=None, options=replace(OFF, method="optimise"), rng=np.random.default_rng(1)
     )
     assert found.status == "estimate"
     level = [one.diagnostics.noise.level_offset for one in (found, run(method="optimise"))]
@@ -197,7 +197,7 @@ def test_a_level_off_the_background_is_reported() -> None:
 
 
 def test_too_few_steps_are_not_convergence() -> None:
-    options = EstimateOptions("ensemble", OFF, max_steps=150)
+    options = replace(OFF, method="ensemble", max_steps=150)
     with pytest.raises(NotConvergedError, match=r"run about .* times as long \(max_steps = "):
         estimate_map(bump_map(noise=WHITE), calibration=None, options=options, rng=np.random.default_rng(1))
 
@@ -210,7 +210,7 @@ def test_an_unknown_method_is_refused() -> None:
 def test_the_map_is_left_as_it_was() -> None:
     tactile_map = bump_map(noise=WHITE)
     before = tactile_map.mean.copy()
-    estimate_map(tactile_map, calibration=None, options=EstimateOptions("laplace"), rng=np.random.default_rng(1))
+    estimate_map(tactile_map, calibration=None, options=SamplerSettings(method="laplace"), rng=np.random.default_rng(1))
     np.testing.assert_array_equal(tactile_map.mean, before)
 
 
@@ -231,7 +231,7 @@ def test_the_centre_is_told_in_the_patients_frame() -> None:
     patient[:3, 3] = [100.0, 50.0, 0.0]
     tactile_map = replace(bump_map(noise=WHITE), patient_from_plane=patient)
     found = estimate_map(
-        tactile_map, calibration=None, options=EstimateOptions("laplace", OFF), rng=np.random.default_rng(1)
+        tactile_map, calibration=None, options=replace(OFF, method="laplace"), rng=np.random.default_rng(1)
     )
     report = estimate_report(
         found, tactile_map, probability=0.95, prior=BumpPrior(), provenance=Provenance("estimate", {})

@@ -10,11 +10,11 @@ from posterior_maps import TRUTH, bump_map, bump_values, correlated_field, grid_
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.posterior.estimate import estimate_map
-from tactile_bayes.posterior.options import EstimateOptions, FitOptions
+from tactile_bayes.posterior.options import SamplerSettings
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.size.eq6 import AxisCalibration, SizeCalibration
 
-FIELD = EstimateOptions(method="importance", fit=FitOptions(background="free", noise="field"))
+FIELD = SamplerSettings(method="importance", background="free", noise="field")
 
 
 def errors(seed: int = 0) -> np.ndarray:
@@ -22,7 +22,7 @@ def errors(seed: int = 0) -> np.ndarray:
     return 0.005 * rng.standard_normal((51, 51)) + 0.01 * correlated_field(rng, 51, length_cells=4.0)
 
 
-def run(options: EstimateOptions = FIELD, calibration: SizeCalibration | None = None, **bump: float) -> Estimate:
+def run(options: SamplerSettings = FIELD, calibration: SizeCalibration | None = None, **bump: float) -> Estimate:
     tactile_map = bump_map(noise=errors(), **bump)
     return estimate_map(tactile_map, calibration=calibration, options=options, rng=np.random.default_rng(1))
 
@@ -62,7 +62,7 @@ def test_a_lifted_level_beside_the_lump_does_not_narrow_it() -> None:
     tactile_map = grid_map(values)
     free = estimate_map(tactile_map, calibration=None, options=FIELD, rng=np.random.default_rng(1))
     fixed = estimate_map(
-        tactile_map, calibration=None, options=EstimateOptions(method="laplace"), rng=np.random.default_rng(1)
+        tactile_map, calibration=None, options=SamplerSettings(method="laplace"), rng=np.random.default_rng(1)
     )
     assert free.map_posterior is not None
     assert fixed.map_posterior is not None
@@ -74,10 +74,10 @@ def test_a_lifted_level_beside_the_lump_does_not_narrow_it() -> None:
     ("options", "message"),
     [
         (replace(FIELD, method="optimise"), "optimise is the paper's least squares"),
-        (replace(FIELD, fit=FitOptions(noise="field")), 'give background = "free"'),
+        (replace(FIELD, background="fixed"), 'give background = "free"'),
     ],
 )
-def test_what_does_not_go_with_a_field_is_refused(options: EstimateOptions, message: str) -> None:
+def test_what_does_not_go_with_a_field_is_refused(options: SamplerSettings, message: str) -> None:
     with pytest.raises(UsageError, match=message):
         run(options)
 

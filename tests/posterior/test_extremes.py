@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 from posterior_maps import bump_values, grid_map
 
-from tactile_bayes.declarations import names_of
+from tactile_bayes.declarations import names_of, replace
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.estimate import estimate_map
-from tactile_bayes.posterior.options import EstimateOptions, FitOptions
+from tactile_bayes.posterior.options import SamplerSettings
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.presets import METHODS
 from tactile_bayes.report.estimate_text import estimate_text
 
 NOISE = 0.02 * np.random.default_rng(81).standard_normal((51, 51))
-FREE = FitOptions("free", 20.0, "auto")
+FREE = SamplerSettings(background="free")
 
 
 def unknown_level(values: np.ndarray) -> TactileMap:
@@ -40,51 +40,51 @@ def float32() -> TactileMap:
 
 # name: map, options, then either words of the reason or (sigma_x, sigma_y) with a relative tolerance
 NOTHING = {
-    "all NaN": (grid_map(np.full((9, 9), np.nan)), FitOptions(), "no covered cell"),
-    "no readings": (grid_map(np.ones((9, 9)), count=0), FitOptions(), "no covered cell"),
-    "one cell": (few(1), FitOptions(), "covered cells for"),
-    "three cells": (few(3), FitOptions(), "covered cells for"),
-    "flat": (grid_map(np.ones((51, 51))), FitOptions(), "nothing rises"),
+    "all NaN": (grid_map(np.full((9, 9), np.nan)), SamplerSettings(), "no covered cell"),
+    "no readings": (grid_map(np.ones((9, 9)), count=0), SamplerSettings(), "no covered cell"),
+    "one cell": (few(1), SamplerSettings(), "covered cells for"),
+    "three cells": (few(3), SamplerSettings(), "covered cells for"),
+    "flat": (grid_map(np.ones((51, 51))), SamplerSettings(), "nothing rises"),
     "flat, level unknown": (unknown_level(np.full((51, 51), 7.0)), FREE, "nothing rises"),
-    "noise only": (grid_map(1 + NOISE), FitOptions(), ""),
-    "a depression": (grid_map(bump_values(amplitude=-0.3) + NOISE), FitOptions(), ""),
+    "noise only": (grid_map(1 + NOISE), SamplerSettings(), ""),
+    "a depression": (grid_map(bump_values(amplitude=-0.3) + NOISE), SamplerSettings(), ""),
     "narrower than a cell": (
         grid_map(bump_values(sigma_x=0.2, sigma_y=0.2, x=0.0, y=0.0)),
-        FitOptions(),
+        SamplerSettings(),
         "",
     ),
-    "wider than the map": (grid_map(bump_values(sigma_x=80.0, sigma_y=80.0) + 0.1 * NOISE), FitOptions(), ""),
-    "needle": (grid_map(bump_values(sigma_x=15.0, sigma_y=1.0) + NOISE), FitOptions(), ""),
-    "over the edge": (grid_map(bump_values(x=26.0) + NOISE), FitOptions(), ""),
-    "a ramp": (grid_map(1 + 0.01 * np.arange(51.0) + np.zeros((51, 1))), FitOptions(), ""),
-    "one huge cell": (grid_map(1 + 1e6 * (np.arange(2601).reshape(51, 51) == 1300)), FitOptions(), ""),
+    "wider than the map": (grid_map(bump_values(sigma_x=80.0, sigma_y=80.0) + 0.1 * NOISE), SamplerSettings(), ""),
+    "needle": (grid_map(bump_values(sigma_x=15.0, sigma_y=1.0) + NOISE), SamplerSettings(), ""),
+    "over the edge": (grid_map(bump_values(x=26.0) + NOISE), SamplerSettings(), ""),
+    "a ramp": (grid_map(1 + 0.01 * np.arange(51.0) + np.zeros((51, 1))), SamplerSettings(), ""),
+    "one huge cell": (grid_map(1 + 1e6 * (np.arange(2601).reshape(51, 51) == 1300)), SamplerSettings(), ""),
 }
 FOUND = {
     "amplitude 1e-6": (unknown_level(5 + 1e-6 * (bump_values(amplitude=1.0) + NOISE)), FREE, (6.0, 4.5), 0.05),
     "amplitude 1e6": (unknown_level(1e6 * (bump_values(amplitude=1.0) + NOISE)), FREE, (6.0, 4.5), 0.05),
     "offset 1e6": (unknown_level(1e6 + bump_values() + NOISE), FREE, (6.0, 4.5), 0.1),
-    "float32": (float32(), FitOptions(), (6.0, 4.5), 0.1),
-    "no noise": (grid_map(bump_values()), FitOptions(), (6.0, 4.5), 1e-4),
-    "no noise, exactly round": (grid_map(bump_values(sigma_x=5.0, sigma_y=5.0)), FitOptions(), (5.0, 5.0), 1e-4),
-    "exactly round": (grid_map(bump_values(sigma_x=5.0, sigma_y=5.0) + NOISE), FitOptions(), (5.0, 5.0), 0.1),
+    "float32": (float32(), SamplerSettings(), (6.0, 4.5), 0.1),
+    "no noise": (grid_map(bump_values()), SamplerSettings(), (6.0, 4.5), 1e-4),
+    "no noise, exactly round": (grid_map(bump_values(sigma_x=5.0, sigma_y=5.0)), SamplerSettings(), (5.0, 5.0), 1e-4),
+    "exactly round": (grid_map(bump_values(sigma_x=5.0, sigma_y=5.0) + NOISE), SamplerSettings(), (5.0, 5.0), 0.1),
     "round, rotation on": (
         grid_map(bump_values(sigma_x=5.0, sigma_y=5.0) + NOISE),
-        FitOptions(rotation="on"),
+        SamplerSettings(rotation="on"),
         (5.0, 5.0),
         0.1,
     ),
-    "a quadrant missing": (without_a_quadrant(), FitOptions(), (6.0, 4.5), 0.15),
+    "a quadrant missing": (without_a_quadrant(), SamplerSettings(), (6.0, 4.5), 0.15),
     "a million readings a cell": (
         grid_map(bump_values() + NOISE, count=10**6, variance=0.04),
-        FitOptions(),
+        SamplerSettings(),
         (6.0, 4.5),
         0.1,
     ),
 }
 
 
-def answer(tactile_map: TactileMap, method: str, fit: FitOptions) -> Estimate:
-    options = EstimateOptions(method=method, fit=fit)
+def answer(tactile_map: TactileMap, method: str, fit: SamplerSettings) -> Estimate:
+    options = replace(fit, method=method)
     found = estimate_map(tactile_map, calibration=None, options=options, rng=np.random.default_rng(1))
     assert "nan" not in estimate_text(found, tactile_map, probability=0.95).lower()
     return found

@@ -14,13 +14,13 @@ from tactile_bayes.errors import UsageError
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.estimate import estimate_map
-from tactile_bayes.posterior.options import EstimateOptions, FitOptions
+from tactile_bayes.posterior.options import SamplerSettings
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.report.estimate_text import estimate_text
 from tactile_bayes.scan import Scan
 from tests.posterior.test_extremes import NOISE, NOTHING, few, float32, unknown_level, without_a_quadrant
 
-FIELD = FitOptions("free", 20.0, "auto", None, "field")
+FIELD = SamplerSettings(background="free", noise="field")
 SLOW = [pytest.param(method, marks=pytest.mark.slow) for method in ("laplace", "ensemble")]
 METHOD = pytest.mark.parametrize("method", ["importance", *SLOW])
 ROUND = {"sigma_x": 5.0, "sigma_y": 5.0}
@@ -51,8 +51,8 @@ FOUND = {
 }
 
 
-def answer(tactile_map: TactileMap, method: str, fit: FitOptions = FIELD) -> Estimate:
-    options = EstimateOptions(method=method, fit=fit)
+def answer(tactile_map: TactileMap, method: str, fit: SamplerSettings = FIELD) -> Estimate:
+    options = replace(fit, method=method)
     found = estimate_map(tactile_map, calibration=None, options=options, rng=np.random.default_rng(1))
     assert "nan" not in estimate_text(found, tactile_map, probability=0.95).lower()
     return found
@@ -85,7 +85,7 @@ def test_a_sane_answer_where_there_is_a_lump(name: str, method: str) -> None:
 @METHOD
 @pytest.mark.parametrize("scene", ["round", "rotated"])
 def test_a_round_bump_in_every_shape(scene: str, method: str) -> None:
-    options = EstimateOptions(method=method, fit=FIELD, scene=scene)
+    options = replace(FIELD, method=method, scene=scene)
     tactile_map = grid_map(bump_values(**ROUND) + NOISE)
     found = estimate_map(tactile_map, calibration=None, options=options, rng=np.random.default_rng(1))
     assert found.map_posterior is not None
@@ -109,8 +109,8 @@ def twice(scan: Scan) -> Scan:
 
 
 def interval_widths(tactile_map: TactileMap, *, noise: str = "field") -> np.ndarray:
-    fit = FIELD if noise == "field" else FitOptions()
-    options = EstimateOptions(method="importance", fit=fit, scene="ellipse" if noise == "field" else "auto")
+    fit = FIELD if noise == "field" else SamplerSettings()
+    options = replace(fit, method="importance", scene="ellipse" if noise == "field" else "auto")
     found = estimate_map(tactile_map, calibration=None, options=options, rng=np.random.default_rng(1))
     posterior = found.map_posterior
     assert posterior is not None

@@ -18,7 +18,7 @@ from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.estimate import estimate_map
-from tactile_bayes.posterior.options import EstimateOptions, FitOptions
+from tactile_bayes.posterior.options import SamplerSettings
 from tactile_bayes.posterior.white import default_errors, fit_bump
 
 UNIT = 37.0
@@ -33,8 +33,8 @@ def in_other_units(*, amplitude: float = 0.3, width_mm: float = 5.0, seed: int =
     return grid_map(values, background=None, normalise="none", count=count)
 
 
-def widths(tactile_map: TactileMap, fit: FitOptions) -> tuple[float, float]:
-    options = EstimateOptions(method="laplace", fit=fit)
+def widths(tactile_map: TactileMap, fit: SamplerSettings) -> tuple[float, float]:
+    options = replace(fit, method="laplace")
     found = estimate_map(tactile_map, calibration=None, options=options, rng=np.random.default_rng(1))
     assert found.map_posterior is not None, found.reason
     low, high = np.quantile(found.map_posterior.sigma_x_mm, [0.05, 0.95])
@@ -50,9 +50,9 @@ def test_without_a_level_the_background_is_free_by_default() -> None:
 def test_a_level_that_is_not_known_cannot_be_fixed() -> None:
     words = r"not known \(normalise none\).*give background = \"free\""
     with pytest.raises(UsageError, match=words):
-        fit_bump(in_other_units(), (0.0, 0.0), options=FitOptions("fixed"))
+        fit_bump(in_other_units(), (0.0, 0.0), options=SamplerSettings())
     with pytest.raises(UsageError, match=words):
-        widths(in_other_units(), FitOptions("fixed", noise="field"))
+        widths(in_other_units(), SamplerSettings(noise="field"))
 
 
 def test_intervals_hold_without_a_level_and_not_at_the_median() -> None:
@@ -61,11 +61,11 @@ def test_intervals_hold_without_a_level_and_not_at_the_median() -> None:
     for seed in range(12):
         tactile_map = in_other_units(seed=seed, width_mm=6.0)
         background, noise = default_errors(tactile_map)
-        low, high = widths(tactile_map, FitOptions(background, 20.0, "off", noise=noise))
+        low, high = widths(tactile_map, SamplerSettings(background=background, rotation="off", noise=noise))
         held += low <= 6.0 <= high
         divided = tactile_map.mean / np.median(tactile_map.mean)
         at_median = replace(tactile_map, mean=divided, background=1.0)
-        low, high = widths(at_median, FitOptions("fixed", 20.0, "off"))
+        low, high = widths(at_median, SamplerSettings(rotation="off"))
         control += low <= 6.0 <= high
     assert held >= 9
     assert control <= 5

@@ -28,7 +28,7 @@ from tactile_bayes.posterior.detection import Detection
 from tactile_bayes.posterior.draw import ModalBump
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.masses import by_evidence, with_masses
-from tactile_bayes.posterior.options import EstimateOptions, FitOptions
+from tactile_bayes.posterior.options import SamplerSettings
 from tactile_bayes.posterior.result import Estimate, Mass, Rise
 from tactile_bayes.size.draws import SizePosterior
 
@@ -180,10 +180,10 @@ def test_what_is_known_of_a_lump_is_used_for_the_first_alone() -> None:
 
 def test_a_fit_that_moves_to_the_first_lump_gives_no_size() -> None:
     two = scene(narrow=0.2)
-    options = EstimateOptions(method="laplace", fit=FitOptions("free", 20.0, "auto", None, "field"), draws=400)
+    options = SamplerSettings(method="laplace", draws=400, background="free", noise="field")
     first = found_on(two).estimate
 
-    def always_first(_: TactileMap, __: EstimateOptions) -> Estimate:
+    def always_first(_: TactileMap, __: SamplerSettings) -> Estimate:
         return replace(first, masses=(), other_rises=())
 
     masses = with_masses(two, first, options, always_first).masses
@@ -195,11 +195,11 @@ def test_a_fit_that_moves_to_the_first_lump_gives_no_size() -> None:
 def test_a_mass_that_the_whole_map_does_not_show_has_the_size_of_the_map_less_the_first() -> None:
     """Also far from the first lump, which moves the least-squares start of the whole map."""
     two = scene(narrow=0.2, away=45.0, half_mm=45.0)
-    options = EstimateOptions(method="laplace", fit=FitOptions("free", 20.0, "auto", None, "field"), draws=400)
+    options = SamplerSettings(method="laplace", draws=400, background="free", noise="field")
     first = found_on(two).estimate
     unseen = Estimate("no_estimate", "errors explain it", code="undetected")
 
-    def on_the_rest(a_map: TactileMap, given: EstimateOptions) -> Estimate:
+    def on_the_rest(a_map: TactileMap, given: SamplerSettings) -> Estimate:
         if a_map is two:
             return unseen
         return estimate_map(a_map, calibration=None, options=given, rng=np.random.default_rng(1))

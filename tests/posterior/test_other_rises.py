@@ -15,7 +15,7 @@ from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.masses import _stands_out, other_rises
-from tactile_bayes.posterior.options import EstimateOptions, FitOptions
+from tactile_bayes.posterior.options import SamplerSettings
 from tactile_bayes.posterior.result import Estimate, Rise
 
 HALF_MM = 35.0
@@ -32,7 +32,7 @@ def values(*, second: float, seed: int = 1) -> np.ndarray:
 
 
 def looked(mean: np.ndarray, centre: tuple[float, float] | None = None) -> tuple[Estimate, tuple[Rise, ...]]:
-    options = EstimateOptions(method="laplace", fit=FitOptions("free", 20.0, "auto", centre, "field"), draws=400)
+    options = SamplerSettings(method="laplace", draws=400, background="free", centre_mm=centre, noise="field")
     tactile_map = grid_map(mean)
     found = estimate_map(tactile_map, calibration=None, options=options, rng=np.random.default_rng(1))
     return found, other_rises(tactile_map, found, options)
@@ -74,7 +74,7 @@ def test_a_larger_lump_far_away_is_no_rib_under_a_small_one() -> None:
 
 def test_a_place_without_a_mode_is_no_rise(monkeypatch: pytest.MonkeyPatch) -> None:
     tactile_map = grid_map(values(second=0.1))
-    options = EstimateOptions(method="laplace", fit=FitOptions("free", 20.0, "auto", None, "field"), draws=400)
+    options = SamplerSettings(method="laplace", draws=400, background="free", noise="field")
     found = estimate_map(tactile_map, calibration=None, options=options, rng=np.random.default_rng(1))
 
     def no_mode(*_: object, **__: object) -> None:

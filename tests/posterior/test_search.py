@@ -12,11 +12,11 @@ from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior import search
 from tactile_bayes.posterior.bump import levelled
 from tactile_bayes.posterior.estimate import estimate_map
-from tactile_bayes.posterior.options import EstimateOptions, FitOptions
+from tactile_bayes.posterior.options import SamplerSettings
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.posterior.white import BumpFit
 
-FIELD = EstimateOptions(method="laplace", fit=FitOptions("free", 20.0, "off", None, "field"))
+FIELD = SamplerSettings(method="laplace", background="free", rotation="off", noise="field")
 
 
 def noise(seed: int, n: int = 81) -> np.ndarray:
@@ -24,7 +24,7 @@ def noise(seed: int, n: int = 81) -> np.ndarray:
 
 
 def look(tactile_map: TactileMap, *, rotation: str = "off") -> Estimate:
-    options = replace(FIELD, fit=replace(FIELD.fit, rotation=rotation))
+    options = replace(FIELD, rotation=rotation)
     return estimate_map(tactile_map, calibration=None, options=options, rng=np.random.default_rng(1))
 
 
@@ -58,7 +58,7 @@ def test_no_place_is_weighed_twice_for_an_empty_map(monkeypatch: pytest.MonkeyPa
     hills = gaussian_filter(np.random.default_rng(5).standard_normal((81, 81)), 6.0, mode="wrap")
     weigh, places = search.assess, []
 
-    def counted(tactile_map: TactileMap, fit: BumpFit, options: EstimateOptions) -> object:
+    def counted(tactile_map: TactileMap, fit: BumpFit, options: SamplerSettings) -> object:
         places.append(tuple(fit.theta[1:3]))
         return weigh(tactile_map, fit, options)
 

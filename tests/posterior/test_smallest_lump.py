@@ -9,10 +9,10 @@ from posterior_maps import bump_values, grid_map
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.lump_probability import WIDTHS_MM, needed_amplitudes, smallest_lumps
-from tactile_bayes.posterior.options import EstimateOptions, FitOptions
+from tactile_bayes.posterior.options import SamplerSettings
 from tactile_bayes.report.estimate_document import smallest_lump
 
-FIELD = EstimateOptions(method="laplace", fit=FitOptions(background="free", noise="field"), draws=400)
+FIELD = SamplerSettings(method="laplace", draws=400, background="free", noise="field")
 
 
 def noise(sd: float = 0.01) -> np.ndarray:

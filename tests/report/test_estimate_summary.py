@@ -19,7 +19,7 @@ from tactile_bayes.findings import Finding
 from tactile_bayes.inference.draws import summarise
 from tactile_bayes.mapping.map import TactileMap, broken_assumptions
 from tactile_bayes.posterior.estimate import estimate_map
-from tactile_bayes.posterior.options import EstimateOptions, FitOptions
+from tactile_bayes.posterior.options import SamplerSettings
 from tactile_bayes.posterior.result import Estimate, Mass, Sensitivity
 from tactile_bayes.posterior.selection import Structure
 from tactile_bayes.presets import RESEARCH_USE
@@ -140,7 +140,7 @@ CHECKS = tuple(Finding(kind, f"a reason for {kind}") for kind in ("coarse_cells"
 
 def crowded() -> tuple[Estimate, dict]:
     """An estimate with everything there is to say about it."""
-    options = EstimateOptions(method="laplace", fit=FitOptions("free", 20.0, "auto", None, "field"), draws=400)
+    options = SamplerSettings(method="laplace", draws=400, background="free", noise="field")
     found = estimate_map(MAPS["clear.nc"], calibration=None, options=options, rng=np.random.default_rng(1))
     mass = Mass(10.0, 1.0, 0.97, Estimate("no_estimate", "a reason"))
     assert found.diagnostics is not None

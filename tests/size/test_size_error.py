@@ -19,7 +19,7 @@ from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.inference.draws import ParameterDraws, Quantity, even_replicates, summarise
 from tactile_bayes.inference.points import normal_cdf, paired_points, stratified_quantiles
 from tactile_bayes.posterior import search as drawn
-from tactile_bayes.posterior.options import EstimateOptions
+from tactile_bayes.posterior.options import SamplerSettings
 from tactile_bayes.posterior.white import MapDraws
 from tactile_bayes.size.draws import BumpDraws, ShapeDraws
 from tactile_bayes.size.eq6 import AxisCalibration, SizeCalibration, push_sizes
@@ -165,7 +165,7 @@ def test_draws_are_made_finer_until_the_size_is_as_exact_as_asked(monkeypatch: p
         return drawn.SizedDraws(MapDraws(None, None, draws, None, {}), size, None, None)
 
     monkeypatch.setattr(drawn, "draw_with_size", once)
-    for options in (EstimateOptions(), EstimateOptions(accuracy_sd=0.01), EstimateOptions(accuracy_mm=0.005)):
+    for options in (SamplerSettings(), SamplerSettings(accuracy_sd=0.01), SamplerSettings(accuracy_mm=0.005)):
         asked.clear()
         found = drawn.draw_until_accurate(None, None, None, options, rng=np.random.default_rng(2), progress=None)
         size = found.size.summarise("max_size_mm", probability=PROBABILITY)

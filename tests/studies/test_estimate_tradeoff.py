@@ -24,7 +24,7 @@ from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.inference import importance as importance_module
 from tactile_bayes.mapping.map import TactileMap
-from tactile_bayes.posterior.options import EstimateOptions, FitOptions
+from tactile_bayes.posterior.options import SamplerSettings
 from tactile_bayes.report.tradeoff import advice, draw_ladder, ladder_file, ladder_text
 from tactile_bayes.size.eq6 import AxisCalibration, SizeCalibration
 from tactile_bayes.size.pooling import Calibration
@@ -55,7 +55,7 @@ def field_map(*, seed: int = 3, half_mm: float = 25.0, **bump: float) -> Tactile
     return grid_map(bump_values(half_mm=half_mm, **bump) + errors, normalise="gain")
 
 
-def inputs_of(tactile_map: TactileMap) -> tuple[Calibration | None, EstimateOptions]:
+def inputs_of(tactile_map: TactileMap) -> tuple[Calibration | None, SamplerSettings]:
     calibration, options, _ = estimate_inputs(Settings(), tactile_map)
     return calibration, options
 
@@ -104,7 +104,7 @@ def test_the_reference_has_the_interval_that_theory_gives(monkeypatch: pytest.Mo
     monkeypatch.setattr(study, "LONG_RUNS", (("importance", 0.02),))
     rng, s, a, wide, narrow = np.random.default_rng(5), 0.005, 0.3, 6.0, 3.0
     values = bump_values(amplitude=a, sigma_x=wide, sigma_y=narrow) + s * rng.standard_normal((51, 51))
-    options = EstimateOptions(fit=FitOptions("fixed", 20.0, "off"))
+    options = SamplerSettings(rotation="off")
     found = estimator_of(grid_map(values), exact_eq6()).reference(options)
     assert found.answer is not None
     size = found.answer.quantities[SIZE]
@@ -240,7 +240,7 @@ def test_a_row_says_that_chains_took_over():
 
 
 def test_beside_chains_other_models_are_tried_by_laplace():
-    settings = study.settings_of(EstimateOptions(fit=FitOptions("free", noise="field")), level_known=True)
+    settings = study.settings_of(SamplerSettings(background="free", noise="field"), level_known=True)
     chains, weights = row("--method ensemble").answer, row("--method importance").answer
     assert study.worth_trying(settings, weights) == settings
     tried = study.worth_trying(settings, chains)

@@ -8,7 +8,7 @@ import numpy as np
 
 from tactile_bayes.mapping.map import MapRecipe, TactileMap
 from tactile_bayes.posterior.bump import cell_mean_gaussian
-from tactile_bayes.posterior.options import FitOptions
+from tactile_bayes.posterior.options import SamplerSettings
 from tactile_bayes.posterior.white import Candidate, fitted_candidates
 
 TRUTH = {"amplitude": 0.3, "x": 1.3, "y": -0.8, "sigma_x": 6.0, "sigma_y": 4.5}
@@ -86,7 +86,7 @@ def correlated_field(rng: np.random.Generator, n: int, *, length_cells: float) -
     return np.fft.ifft2(np.fft.fft2(white) * np.sqrt(spectrum)).real[:n, :n]
 
 
-def find_bump(tactile_map: TactileMap, options: FitOptions) -> list[Candidate]:
+def find_bump(tactile_map: TactileMap, options: SamplerSettings) -> list[Candidate]:
     """Fit the candidates, highest first, up to and including the first that can be a lump.
 
     Returns

@@ -39,7 +39,7 @@ from tactile_bayes.geometry import (
     unroll_quaternion_signs,
 )
 from tactile_bayes.mapping.build import build_map
-from tactile_bayes.posterior.options import FitOptions
+from tactile_bayes.posterior.options import SamplerSettings
 
 Run = Callable[..., "CompletedProcess[str]"]
 SILENT = Noise(0.0, 0.0, 0.0, 0.0, 0.0)
@@ -230,7 +230,7 @@ def test_the_map_of_a_ball_is_the_other_programs() -> None:
     """15 mm, h/d 1, centred, 100 times as stiff: amplitude .30, sigma 5.1 and 4.0 mm in a scan of the other program."""
     scene = replace(SHORT, duration_s=7.0, strokes=Strokes(tilt_deg=0.1), background=Background())
     made = simulate(scene, rng=np.random.default_rng(1))
-    fit = find_bump(build_map(made.scan, normalise="mean"), FitOptions())[-1].fit
+    fit = find_bump(build_map(made.scan, normalise="mean"), SamplerSettings())[-1].fit
     assert fit is not None
     sigma_x, sigma_y, _ = fit.widths()
     assert fit.theta[0] == pytest.approx(0.30, abs=0.01)

@@ -12,12 +12,12 @@ from posterior_maps import bump_map, correlated_field, grid_map
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.estimate import estimate_map
-from tactile_bayes.posterior.options import EstimateOptions, FitOptions
+from tactile_bayes.posterior.options import SamplerSettings
 from tactile_bayes.posterior.result import Estimate
 
 SIZE, NOISE = 51, 0.02
 # "none" stops after the question: no draws are made
-ONLY_ASK = EstimateOptions(fit=FitOptions("free", 20.0, "off", None, "field"), scene="none")
+ONLY_ASK = SamplerSettings(scene="none", background="free", rotation="off", noise="field")
 TILT = np.linspace(-0.05, 0.05, SIZE)[None, :] * np.ones((SIZE, 1))
 KINDS = ("white", "tilt", "3 mm", "6 mm", "both")
 

@@ -10,7 +10,7 @@ from posterior_maps import bump_map, correlated_field
 
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.field import cosines_for
-from tactile_bayes.posterior.options import EstimateOptions, FitOptions
+from tactile_bayes.posterior.options import SamplerSettings
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.presets import FIELD_COSINES, FINE_FIELD_COSINES
 
@@ -22,8 +22,8 @@ def estimate(seed: int, *, sigma: float, cosines: int | None = None) -> Estimate
     """A bump of one width under errors of which nearly all are correlated."""
     rng = np.random.default_rng([seed, 2])
     noise = 0.004 * rng.standard_normal((51, 51)) + 0.04 * correlated_field(rng, 51, length_cells=3.0)
-    options = EstimateOptions(
-        method="laplace", fit=FitOptions("free", 20.0, "off", None, "field", field_cosines=cosines), draws=1000
+    options = SamplerSettings(
+        method="laplace", draws=1000, background="free", rotation="off", noise="field", field_cosines=cosines or "auto"
     )
     tactile_map = bump_map(noise=noise, amplitude=0.5, sigma_x=sigma, sigma_y=sigma)
     return estimate_map(tactile_map, calibration=None, options=options, rng=np.random.default_rng(1))

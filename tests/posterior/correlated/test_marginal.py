@@ -15,7 +15,7 @@ from tactile_bayes.posterior.draw import draw_parameters
 from tactile_bayes.posterior.field import Window, _one, cosine_profiles, gram_of_cosines, spectrum
 from tactile_bayes.posterior.fit import FieldFit, fit_scene, shape_draws
 from tactile_bayes.posterior.marginal import CollapsedTarget, independent_variance
-from tactile_bayes.posterior.options import EstimateOptions
+from tactile_bayes.posterior.options import SamplerSettings
 from tactile_bayes.posterior.scene import Problem, Scene
 
 RADIUS = 20.0
@@ -225,7 +225,7 @@ def test_amplitude_and_noise_come_back() -> None:
 def test_the_methods_agree(methods: tuple[str, ...]) -> None:
     fit = fitted(cells_of(noise(5, field=0.01)))
     drawn = {
-        method: draw_parameters(fit, EstimateOptions(method), rng=np.random.default_rng(1))[0].flat
+        method: draw_parameters(fit, SamplerSettings(method=method), rng=np.random.default_rng(1))[0].flat
         for method in methods
     }
     sd = drawn["importance"].std(axis=0)

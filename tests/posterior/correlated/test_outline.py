@@ -13,7 +13,7 @@ from posterior_maps import correlated_field, grid_map
 
 from tactile_bayes.posterior.correlated import outline
 from tactile_bayes.posterior.estimate import estimate_map
-from tactile_bayes.posterior.options import EstimateOptions, FitOptions
+from tactile_bayes.posterior.options import SamplerSettings
 from tactile_bayes.posterior.result import Estimate
 
 AXIS = np.arange(-26.0, 27.0)
@@ -55,7 +55,7 @@ def estimated(form: str, seed: int = 0) -> Estimate:
     rng = np.random.default_rng(seed)
     errors = NOISE * (rng.standard_normal(X.shape) + correlated_field(rng, len(AXIS), length_cells=3.0))
     # two bumps are one lump's map here, not a lump with a neighbour
-    options = EstimateOptions(method="laplace", fit=FitOptions("free", 20.0, "off", None, "field"), scene="ellipse")
+    options = SamplerSettings(method="laplace", scene="ellipse", background="free", rotation="off", noise="field")
     found = estimate_map(grid_map(1 + 0.5 * FORMS[form] + errors), calibration=None, options=options, rng=rng)
     assert found.status == "estimate"
     assert found.map_posterior is not None

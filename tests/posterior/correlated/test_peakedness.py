@@ -13,7 +13,7 @@ from posterior_maps import correlated_field, grid_map
 
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.fit import FieldFit, tangent_columns
-from tactile_bayes.posterior.options import EstimateOptions, FitOptions
+from tactile_bayes.posterior.options import SamplerSettings
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.posterior.selection import Structure, _departure, ask_departure, exponent_covariance
 from tactile_bayes.report.estimate_document import scene_lines
@@ -35,7 +35,7 @@ def bump(exponent: float, *, amplitude: float = 0.3, x: float = 0.7, y: float = 
 def estimated(exponent: float, seed: int = 0, *, noise: float = NOISE) -> Estimate:
     rng = np.random.default_rng(seed)
     errors = noise * (rng.standard_normal((len(AXIS), len(AXIS))) + correlated_field(rng, len(AXIS), length_cells=3.0))
-    options = EstimateOptions(method="laplace", fit=FitOptions("free", 20.0, "off", None, "field"))
+    options = SamplerSettings(method="laplace", background="free", rotation="off", noise="field")
     found = estimate_map(grid_map(1 + bump(exponent) + errors), calibration=None, options=options, rng=rng)
     assert found.status == "estimate"
     return found
@@ -116,7 +116,7 @@ def test_a_bump_with_a_neighbour_is_not_asked() -> None:
     rng = np.random.default_rng(2)
     errors = 0.005 * rng.standard_normal((len(AXIS), len(AXIS)))
     both = 1 + bump(1.0, x=-5.0) + bump(1.0, x=11.0) + errors
-    options = EstimateOptions(method="laplace", fit=FitOptions("free", 20.0, "auto", None, "field"))
+    options = SamplerSettings(method="laplace", background="free", noise="field")
     found = estimate_map(grid_map(both), calibration=None, options=options, rng=rng)
     assert found.scene is not None
     assert found.scene.fit.scene.extra == "second lump"

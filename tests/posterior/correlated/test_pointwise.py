@@ -9,7 +9,7 @@ from scipy.stats import t
 from tactile_bayes.posterior.field import Profiles
 from tactile_bayes.posterior.fit import FieldFit
 from tactile_bayes.posterior.marginal import CollapsedTarget, linear_columns
-from tactile_bayes.posterior.options import EstimateOptions, FitOptions
+from tactile_bayes.posterior.options import SamplerSettings
 from tactile_bayes.posterior.search import search
 from tactile_bayes.posterior.selection import pointwise_log_likelihood
 
@@ -17,7 +17,7 @@ from tactile_bayes.posterior.selection import pointwise_log_likelihood
 def fit() -> FieldFit:
     rng = np.random.default_rng(3)
     noise = 0.02 * rng.standard_normal((51, 51)) + 0.02 * correlated_field(rng, 51, length_cells=4.0)
-    _, seen = search(bump_map(noise=noise), EstimateOptions(fit=FitOptions("free", 8.0, noise="field")))
+    _, seen = search(bump_map(noise=noise), SamplerSettings(background="free", fit_radius_mm=8.0, noise="field"))
     assert seen is not None
     assert seen.scene is not None
     return seen.scene.plain

@@ -25,7 +25,7 @@ from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.field import Window
 from tactile_bayes.posterior.fit import FieldFit, tangent_columns
 from tactile_bayes.posterior.marginal import independent_variance
-from tactile_bayes.posterior.options import EstimateOptions, FitOptions
+from tactile_bayes.posterior.options import SamplerSettings
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.presets import POSE_NOISE
 from tactile_bayes.report.estimate_text import estimate_text
@@ -156,7 +156,7 @@ def test_a_template_is_blurred_by_the_noise(r: float) -> None:
 
 
 def estimated(tactile_map: TactileMap) -> Estimate:
-    options = EstimateOptions(method="laplace", fit=FitOptions("free", 20.0, "off", None, "field"))
+    options = SamplerSettings(method="laplace", background="free", rotation="off", noise="field")
     found = estimate_map(tactile_map, calibration=None, options=options, rng=np.random.default_rng(1))
     assert found.map_posterior is not None
     return found

@@ -8,7 +8,7 @@ from posterior_maps import grid_map
 
 from tactile_bayes.posterior import correlated as field_estimate
 from tactile_bayes.posterior.estimate import estimate_map
-from tactile_bayes.posterior.options import EstimateOptions, FitOptions
+from tactile_bayes.posterior.options import SamplerSettings
 from tactile_bayes.posterior.result import Estimate
 from tests.posterior.correlated.test_selection import AXIS, bump, errors
 
@@ -22,7 +22,7 @@ def ridge(seed: int) -> np.ndarray:
 
 
 def estimate(values: np.ndarray) -> Estimate:
-    options = EstimateOptions(method="laplace", fit=FitOptions("free", 20.0, "auto", None, "field"), draws=400)
+    options = SamplerSettings(method="laplace", draws=400, background="free", noise="field")
     return estimate_map(grid_map(values), calibration=None, options=options, rng=np.random.default_rng(1))
 
 

@@ -18,7 +18,7 @@ from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior import draw as methods
 from tactile_bayes.posterior.draw import Sampled, disagreement, draw_parameters, importance_draws
 from tactile_bayes.posterior.fit import FieldFit, fit_scene
-from tactile_bayes.posterior.options import EstimateOptions
+from tactile_bayes.posterior.options import SamplerSettings
 from tactile_bayes.posterior.scene import Problem, Scene
 from tests.posterior.correlated.test_marginal import cells_of, fitted, noise
 from tests.posterior.correlated.test_selection import bump, choose, errors, rib, second
@@ -123,24 +123,24 @@ def test_a_method_that_fails_hands_on(monkeypatch: pytest.MonkeyPatch) -> None:
         return replace(draws, diagnostics=dict(draws.diagnostics) | {"pareto_k": float("nan")})
 
     monkeypatch.setattr(FieldFit, "at_mode", untrusted)
-    draws, passed = draw_parameters(strong(), EstimateOptions("laplace"), rng=np.random.default_rng(1))
+    draws, passed = draw_parameters(strong(), SamplerSettings(method="laplace"), rng=np.random.default_rng(1))
     assert draws.method == "importance"
     assert passed[0].startswith("laplace: Pareto shape nan")
     monkeypatch.setattr(methods, "importance_draws", heavy)
     with pytest.raises(NotConvergedError, match=r"laplace: .*importance: Pareto shape 0.91$"):
-        draw_parameters(strong(), EstimateOptions("laplace"), rng=np.random.default_rng(1))
+        draw_parameters(strong(), SamplerSettings(method="laplace"), rng=np.random.default_rng(1))
     with pytest.raises(NotConvergedError, match=r"importance: Pareto shape 0.91; ensemble: .*max_steps"):
-        draw_parameters(strong(), EstimateOptions(max_steps=150), rng=np.random.default_rng(1))
+        draw_parameters(strong(), SamplerSettings(max_steps=150), rng=np.random.default_rng(1))
 
 
 def test_accuracy_in_millimetres_is_accuracy_of_the_widths() -> None:
     fit = strong()
-    options = EstimateOptions(accuracy_mm=0.004)
+    options = SamplerSettings(accuracy_mm=0.004)
     assert methods.accuracy_in_sd(options, fit.width_sd_mm) == pytest.approx(0.004 / fit.width_sd_mm)
-    assert methods.accuracy_in_sd(EstimateOptions(accuracy_sd=0.01, accuracy_mm=0.5), fit.width_sd_mm) == 0.01
+    assert methods.accuracy_in_sd(SamplerSettings(accuracy_sd=0.01, accuracy_mm=0.5), fit.width_sd_mm) == 0.01
     draws, _ = draw_parameters(fit, options, rng=np.random.default_rng(1))
     assert draws.diagnostics["end_error_mm"] <= 0.004
-    coarse, _ = draw_parameters(fit, EstimateOptions(), rng=np.random.default_rng(1))
+    coarse, _ = draw_parameters(fit, SamplerSettings(), rng=np.random.default_rng(1))
     assert coarse.diagnostics["end_error_mm"] > 0.0
 
 
@@ -155,7 +155,7 @@ def run(
     path: Path | None, *, max_steps: int, seed: int = 3, fit: FieldFit | None = None, context: str = ""
 ) -> ParameterDraws:
     store = None if path is None else CheckpointFile(path, context=context)
-    options = EstimateOptions("ensemble", accuracy_sd=0.08, max_steps=max_steps, store=store)
+    options = SamplerSettings(method="ensemble", accuracy_sd=0.08, max_steps=max_steps, store=store)
     return draw_parameters(fit or quick(), options, rng=np.random.default_rng(seed))[0]
 
 
@@ -232,6 +232,6 @@ def test_disagreement_counts_joint_errors() -> None:
 def test_a_rib_of_which_only_a_flank_shows_is_sampled_all_the_same() -> None:
     choice = choose(bump() + rib(y=22.0) + errors(8))
     assert choice.fit.scene.extra == "rib"
-    draws, passed = draw_parameters(choice.fit, EstimateOptions(), rng=np.random.default_rng(1))
+    draws, passed = draw_parameters(choice.fit, SamplerSettings(), rng=np.random.default_rng(1))
     assert draws.method == "importance"
     assert not passed

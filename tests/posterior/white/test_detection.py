@@ -18,13 +18,13 @@ from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior.detection import detect
 from tactile_bayes.posterior.estimate import estimate_map
-from tactile_bayes.posterior.options import EstimateOptions, FitOptions
+from tactile_bayes.posterior.options import SamplerSettings
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.posterior.white import fitted_candidates
 
 SIZE = 51
 NOISE = 0.02
-FAST = EstimateOptions(method="optimise", fit=FitOptions(rotation="off"))
+FAST = SamplerSettings(method="optimise", rotation="off")
 TILT = np.linspace(-0.05, 0.05, SIZE)[None, :] * np.ones((SIZE, 1))
 
 
@@ -79,7 +79,7 @@ def test_few_readings_at_the_rim_make_no_lump() -> None:
     """A negative control: the same maps, whose counts say that the rim was read as often, do show lumps."""
     rng = np.random.default_rng(31)
     maps = [few_at_the_rim(rng) for _ in range(10)]
-    free = FitOptions("free", 20.0, "off")
+    free = SamplerSettings(background="free", rotation="off")
 
     def most(tactile_map: TactileMap) -> float:
         places = [
@@ -104,7 +104,7 @@ def test_an_empty_scan_gets_no_size_by_a_solid_study(scan: str, request: pytest.
     else:
         empty = shared_scan(request.getfixturevalue("shared_data") / "scans" / scan)
     tactile_map = build_map([empty], normalise="mean", flat_field=True)
-    options = EstimateOptions(method="laplace", fit=FitOptions("free", 20.0, "auto", None, "independent"))
+    options = SamplerSettings(method="laplace", background="free")
     found = estimate_map(tactile_map, calibration=None, options=options, rng=np.random.default_rng(1))
     assert found.status == "no_estimate"
 
@@ -122,7 +122,7 @@ def test_the_probability_rises_with_the_amplitude() -> None:
     factors = []
     for amplitude in (0.01, 0.02, 0.04, 0.3):
         tactile_map = bump_map(amplitude=amplitude, noise=noise)
-        found = find_bump(tactile_map, FitOptions(rotation="off", centre_mm=(1.0, -1.0)))[-1].fit
+        found = find_bump(tactile_map, SamplerSettings(rotation="off", centre_mm=(1.0, -1.0)))[-1].fit
         assert found is not None
         factors.append(
             detect(
@@ -149,7 +149,9 @@ def test_a_larger_map_asks_for_stronger_evidence() -> None:
     )
     factor = []
     for tactile_map in (wide, small):
-        found = find_bump(tactile_map, FitOptions(rotation="off", centre_mm=(1.0, -1.0), radius_mm=15.0))[-1].fit
+        found = find_bump(tactile_map, SamplerSettings(rotation="off", centre_mm=(1.0, -1.0), fit_radius_mm=15.0))[
+            -1
+        ].fit
         assert found is not None
         answer = detect(tactile_map, found.bump, theta=found.theta, covariance=found.covariance, prior=BumpPrior())
         factor.append(answer.log_bayes_factor)
@@ -158,7 +160,7 @@ def test_a_larger_map_asks_for_stronger_evidence() -> None:
 
 def test_a_depression_is_no_lump() -> None:
     tactile_map = bump_map(amplitude=-0.3)
-    found = find_bump(tactile_map, FitOptions(rotation="off", centre_mm=(1.0, -1.0)))[-1].fit
+    found = find_bump(tactile_map, SamplerSettings(rotation="off", centre_mm=(1.0, -1.0)))[-1].fit
     assert found is not None
     answer = detect(tactile_map, found.bump, theta=found.theta, covariance=found.covariance, prior=BumpPrior())
     assert answer.probability == 0.0

@@ -8,7 +8,7 @@ from posterior_maps import bump_map, correlated_field, grid_map
 
 from tactile_bayes.posterior.bump import window_cells
 from tactile_bayes.posterior.detection import count_weights, fitted_tilt, level_offset, residual_autocorrelation
-from tactile_bayes.posterior.options import FitOptions
+from tactile_bayes.posterior.options import SamplerSettings
 from tactile_bayes.posterior.white import BumpFit, fit_bump
 
 NOISE = 0.02
@@ -16,7 +16,7 @@ SIZE = 51
 
 
 def fitted(noise: np.ndarray, **options: object) -> BumpFit:
-    fit, fault = fit_bump(bump_map(noise=noise), (1.0, -1.0), options=FitOptions(rotation="off", **options))
+    fit, fault = fit_bump(bump_map(noise=noise), (1.0, -1.0), options=SamplerSettings(rotation="off", **options))
     assert fit is not None, fault
     return fit
 
@@ -90,7 +90,7 @@ def test_twice_the_readings_of_the_same_frames_do_not_shrink_the_posterior() -> 
     once, twice = (grid_map(bump_map(noise=noise).mean, count=n, variance=0.04) for n in (40, 80))
     sd = []
     for tactile_map in (once, twice):
-        fit, _ = fit_bump(tactile_map, (1.0, -1.0), options=FitOptions(rotation="off"))
+        fit, _ = fit_bump(tactile_map, (1.0, -1.0), options=SamplerSettings(rotation="off"))
         assert fit is not None
         sd.append(np.sqrt(np.diag(fit.covariance)))
     np.testing.assert_allclose(sd[1], sd[0], rtol=1e-3)

@@ -11,17 +11,16 @@ from scipy.special import erf
 
 from tactile_bayes.declarations import replace
 from tactile_bayes.mapping.map import TactileMap
-from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior import white as fit_module
-from tactile_bayes.posterior.options import FitOptions
+from tactile_bayes.posterior.options import SamplerSettings
 from tactile_bayes.posterior.white import BumpFit, fit_bump, rotation_odds
 
-OFF = FitOptions(rotation="off")
-ON = FitOptions(rotation="on")
+OFF = SamplerSettings(rotation="off")
+ON = SamplerSettings(rotation="on")
 NOISE = 0.02 * np.random.default_rng(11).standard_normal((51, 51))
 
 
-def fitted(tactile_map: TactileMap, options: FitOptions = OFF) -> BumpFit:
+def fitted(tactile_map: TactileMap, options: SamplerSettings = OFF) -> BumpFit:
     found = find_bump(tactile_map, options)[-1]
     assert found.fit is not None, found.fault
     assert found.fault == ""
@@ -127,7 +126,7 @@ def test_what_cannot_be_a_lump_is_named(bump: dict[str, float], fault: str) -> N
 
 
 def test_too_few_cells_for_the_parameters_is_no_fit() -> None:
-    fit, fault = fit_bump(bump_map(half_mm=1.0), (0.0, 0.0), options=replace(OFF, radius_mm=1.0))
+    fit, fault = fit_bump(bump_map(half_mm=1.0), (0.0, 0.0), options=replace(OFF, fit_radius_mm=1.0))
     assert fit is None
     assert fault == "5 covered cells for 5 parameters"
 
@@ -135,7 +134,7 @@ def test_too_few_cells_for_the_parameters_is_no_fit() -> None:
 def test_the_highest_bump_that_can_be_a_lump_is_taken() -> None:
     ridge = bump_values(x=-15, y=0, sigma_x=2.5, sigma_y=25.0, amplitude=0.6)
     values = ridge + bump_values(x=10, y=0, amplitude=0.3, sigma_x=4, sigma_y=4) - 1
-    tried = find_bump(grid_map(values), FitOptions(radius_mm=12.0, rotation="off"))
+    tried = find_bump(grid_map(values), SamplerSettings(fit_radius_mm=12.0, rotation="off"))
     assert tried[-1].fault == ""
     assert tried[-1].centre_mm[0] > 5
     assert len(tried) > 1
@@ -144,7 +143,7 @@ def test_the_highest_bump_that_can_be_a_lump_is_taken() -> None:
 
 def test_the_user_may_say_where_to_look() -> None:
     values = bump_values(x=-13, y=0, amplitude=0.5) + bump_values(x=13, y=0, amplitude=0.2) - 1
-    chosen = find_bump(grid_map(values), replace(OFF, radius_mm=11.0, centre_mm=(12.0, 0.0)))
+    chosen = find_bump(grid_map(values), replace(OFF, fit_radius_mm=11.0, centre_mm=(12.0, 0.0)))
     assert len(chosen) == 1
     assert chosen[0].fit is not None
     assert chosen[0].fit.theta[1] == pytest.approx(13.0, abs=0.5)
@@ -152,8 +151,8 @@ def test_the_user_may_say_where_to_look() -> None:
 
 def test_a_turned_ellipse_asks_for_its_rotation_and_a_straight_one_does_not() -> None:
     straight, turned = bump_map(noise=NOISE), bump_map(noise=NOISE, angle_deg=30.0)
-    options = FitOptions()
-    odds = [rotation_odds(m, fitted(m), options=options, prior=BumpPrior())[0] for m in (straight, turned)]
+    options = SamplerSettings()
+    odds = [rotation_odds(m, fitted(m), options=options)[0] for m in (straight, turned)]
     assert odds[0] < 1 / 3
     assert odds[1] > 1e6
 
@@ -174,6 +173,6 @@ def test_other_widths_are_tried_where_one_does_not_explain_the_window(
 
     monkeypatch.setattr(fit_module, "fit_least_squares", counted)
     values = bump_values() + errors * np.random.default_rng(2).standard_normal((51, 51))
-    fit_bump(grid_map(values), (1.0, -1.0), options=FitOptions(rotation="off", noise=noise))
+    fit_bump(grid_map(values), (1.0, -1.0), options=SamplerSettings(rotation="off", noise=noise))
     tried = {round(float(np.exp(start[3])), 6) for start in starts}
     assert len(tried & set(fit_module.START_WIDTHS_MM)) == widths
