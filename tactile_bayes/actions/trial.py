@@ -72,13 +72,13 @@ def _settings(given: dict[str, Any], protocol: Path | None) -> tuple[str | None,
     if protocol is None:
         return None, TrialSettings(**given)
     context = click.get_current_context()
-    read = read_protocol(protocol)
-    for name, value in read.fixed.items():
+    title, fixed = read_protocol(protocol)
+    for name, value in fixed.items():
         typed = context.get_parameter_source(name) is click.core.ParameterSource.COMMANDLINE
         if typed and given[name] != value:
             option = f"--{name.replace('_', '-')} {given[name]}"
             raise UsageError(f"{option} contradicts {protocol}, which fixes {name} = {value}; leave the option out")
-    return read.title, TrialSettings(**(given | read.fixed))
+    return title, TrialSettings(**(given | fixed))
 
 
 # --- `plan`: sample size of a trial, and the value of more maps per mass.

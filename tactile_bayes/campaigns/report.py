@@ -183,8 +183,8 @@ def _trial_settings(protocol: Path | None) -> tuple[TrialSettings, str | None]:
     """Settings that a protocol fixes, the others by default, and its title."""
     if protocol is None:
         return TrialSettings(), None
-    read = read_protocol(protocol)
-    return TrialSettings(**read.fixed), read.title
+    title, fixed = read_protocol(protocol)
+    return TrialSettings(**fixed), title
 
 
 def _counts(rows: Sequence[Row]) -> tuple[int, int, int]:

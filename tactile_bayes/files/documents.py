@@ -12,9 +12,10 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, TypeVar
 
-from tactile_bayes.declarations import Meta, Record, as_dict, field, from_plain, names_of, replace, schema_name
+from tactile_bayes.declarations import Meta, Record, field, from_plain, names_of, replace, schema_name
 from tactile_bayes.errors import BadDataError, meant
 from tactile_bayes.files.reading import JSON_BYTES, TOML_BYTES, decoding, kind_of, read_text, schema_kind
+from tactile_bayes.options import TrialSettings
 from tactile_bayes.scan import Scan
 
 # --- The schemas in data_schema/, from a wheel or a checkout.
@@ -170,48 +171,20 @@ def check_text(where: str, text: str, *, way_out: str) -> None:
 # --- A pre-specified analysis in TOML: settings fixed before the data were seen, and other text.
 
 
-class Analysis(Record):
-    """Settings of a trial's analysis that were fixed beforehand; None for what was not."""
-
-    intervals: (
-        Annotated[Literal["corrected", "jackknife", "bca"], Meta(description="As the option --intervals.")] | None
-    ) = None
-    resamples: Annotated[int, Meta(ge=200, le=100_000, description="Resamples of the bootstraps.")] | None = None
-    seed: Annotated[int, Meta(ge=0, description="Random seed.")] | None = None
-    error_ratio: (
-        Annotated[
-            float,
-            Meta(
-                ge=1e-6,
-                le=1e6,
-                description="Variance of the ex-vivo error over the modality's, for the Deming lines.",
-            ),
-        ]
-        | None
-    ) = None
-    check_intervals: (
-        Annotated[int, Meta(ge=0, description="Simulated trials that check the intervals; 0 for none.")] | None
-    ) = None
-    bayes: Annotated[bool, Meta(description="Whether to estimate the error of the next mass.")] | None = None
-
-
 class Protocol(Record, forbid_unknown_fields=False):
     """A pre-specified analysis of a trial."""
 
     title: Annotated[str, Meta(description="Title of the report.")] | None = None
     analysis: Annotated[
-        Analysis, Meta(description="Settings fixed beforehand; an option that contradicts one is refused.")
-    ] = field(default_factory=Analysis)
-
-    @property
-    def fixed(self) -> dict[str, Any]:
-        """The settings that it fixes, by name."""
-        return {name: value for name, value in as_dict(self.analysis).items() if value is not None}
+        TrialSettings, Meta(description="Settings fixed beforehand; an option that contradicts one is refused.")
+    ] = field(default_factory=TrialSettings)
 
 
-def read_protocol(path: Path) -> Protocol:
-    """Read the title and the settings under ``[analysis]``; the rest counts only through the file's hash."""
-    return read_toml_record(path, Protocol, way_out="give the analysis as TOML")
+def read_protocol(path: Path) -> tuple[str | None, dict[str, Any]]:
+    """The title, and what ``[analysis]`` fixes of `TrialSettings`; the rest counts only through the file's hash."""
+    document = load_toml(path, way_out="give the analysis as TOML")
+    read = parse_record(document, Protocol, path=path)
+    return read.title, {name: getattr(read.analysis, name) for name in document.get("analysis", {})}
 
 
 # --- Session facts of a recording as TOML: side, posture, lubricant, examiner, subject and other text.
