@@ -14,8 +14,15 @@ from tactile_bayes.errors import UsageError
 from tactile_bayes.presets import (
     CELL_MM,
     DEFAULT_NORMALISE,
+    FAT_KPA,
+    GLAND_RATIO,
+    HEAD_RADIUS_MM,
+    MEAN_KPA,
     MOST_FIELD_COSINES,
+    POISSON,
     PRESSURE_WINDOW_KPA,
+    SHOULDER_MM,
+    THICKNESS_MM,
     Background,
     Method,
     Noise,
@@ -53,8 +60,13 @@ class BumpPrior(Options):
 PRIORS: Final = BumpPrior.__struct_fields__
 
 
+MOST_ITEMS: Final = 1_000_000
+"""Of a batch: memory holds a name and an outcome for each."""
 IN_FILE: Final = {"file": True}
 """Of a setting that stands in the file of `--settings`, not on the command line."""
+
+
+FieldCosines = Annotated[int, Meta(ge=6, le=MOST_FIELD_COSINES)] | Literal["auto"]
 
 
 class FitSettings(BumpPrior, kw_only=True):
@@ -103,7 +115,7 @@ class FitSettings(BumpPrior, kw_only=True):
         ),
     ] = None
     field_cosines: Annotated[
-        Annotated[int, Meta(ge=6, le=MOST_FIELD_COSINES)] | Literal["auto"],
+        FieldCosines,
         Meta(
             description="Basis functions of the correlated noise along each axis: more are slower and resolve shorter "
             "correlation; `tradeoff estimate` measures the difference. auto: 18, up to 30 for a narrow lump",
@@ -319,6 +331,126 @@ class TrialSettings(Options):
         bool,
         Meta(description="Predict the error of the next mass, by an errors-in-variables model and MCMC."),
     ] = False
+
+
+SeatName = Annotated[
+    str,
+    Meta(
+        description="How far the lump stands out of the gland, if a grid does not state it.",
+        extra={"metavar": "centred|resting|0..2"},
+    ),
+]
+
+
+class SectionOptions(Options, kw_only=True):
+    """Cross-section of a simulated head."""
+
+    head_radius_mm: Annotated[float, Meta(gt=0, le=1e6, description="Radius of the head's arc, mm.")] = HEAD_RADIUS_MM
+    shoulder_mm: Annotated[float, Meta(ge=0, description="Radius of the head's shoulders, mm.")] = SHOULDER_MM
+
+
+class CaseOptions(Options, kw_only=True):
+    """Pressure, tissue and mesh of a forward study."""
+
+    mean_kpa: Annotated[float, Meta(gt=0, description="Mean pressure on the head.")] = MEAN_KPA
+    fat_kpa: Annotated[float, Meta(gt=0, description="Young's modulus of fat.")] = FAT_KPA
+    poisson: Annotated[float, Meta(description="Poisson's ratio of the tissues.")] = POISSON
+    gland_ratio: Annotated[float, Meta(gt=0, description="Modulus of gland over fat.")] = GLAND_RATIO
+    thickness_mm: Annotated[
+        Annotated[float, Meta(gt=0)] | None,
+        Meta(description="Depth of the chest wall, mm. Default: 70, or deeper for deep lumps."),
+    ] = None
+    fineness: Annotated[int, Meta(ge=1, le=8, description="Mesh fineness; doubling it halves the elements.")] = 2
+
+
+class StudyOptions(CaseOptions, kw_only=True):
+    """How the forward study is run."""
+
+    model: Annotated[
+        Literal["plane-strain", "solid"],
+        Meta(description="The paper's two-dimensional body, or balls under the whole head in three dimensions."),
+    ] = "plane-strain"
+    grid: Annotated[
+        str, Meta(description="The paper's 150 cases, or a table of cases.", extra={"metavar": "paper|FILE"})
+    ] = "paper"
+    seat: SeatName = "centred"
+    head: Literal["shoulders-inside", "shoulders-outside"] | None = None
+    background: Annotated[
+        Background | None,
+        Meta(
+            description="Background of Eq 7, solid only: free (default) is fitted, fixed is 1. In two dimensions it "
+            "is 1."
+        ),
+    ] = None
+    flat_field: Annotated[
+        bool | None,
+        Meta(description="Remove what the head reads of the same body without the lump, solid only. Default: on."),
+    ] = None
+
+
+KpaRange = tuple[Annotated[float, Meta(gt=0)], Annotated[float, Meta(gt=0)]]
+
+
+class TissueOptions(Options, kw_only=True):
+    """Homogeneous tissue under a head, the pressures on it, and how unevenly the head may press."""
+
+    modulus_kpa: Annotated[
+        KpaRange,
+        Meta(description="Young's moduli of the tissue (paper: 15 to 25).", extra={"metavar": "LOW HIGH"}),
+    ] = (15.0, 25.0)
+    pressure_kpa: Annotated[
+        KpaRange, Meta(description="Mean pressures under the head (paper: 5 to 14).", extra={"metavar": "LOW HIGH"})
+    ] = PRESSURE_WINDOW_KPA
+    thickness_mm: Annotated[
+        float,
+        Meta(gt=0, description="Thickness of the tissue on its rigid base, mm. The paper gives none."),
+    ] = THICKNESS_MM
+    poisson: Annotated[float, Meta(ge=0, lt=0.5, description="Poisson's ratio of the tissue.")] = POISSON
+    limit_percent: Annotated[
+        float,
+        Meta(gt=0, description="Largest allowed departure of a taxel from the frame's mean, % of it (paper: 7.5)."),
+    ] = 7.5
+
+
+class PopulationOptions(Options, kw_only=True):
+    """How many bodies are simulated, and how their maps are made."""
+
+    masses: Annotated[int, Meta(ge=1, le=MOST_ITEMS, description="Number of bodies, one lump each.")] = 400
+    centred: Annotated[
+        int,
+        Meta(
+            ge=0,
+            le=MOST_ITEMS,
+            description="Further bodies whose lump is centred on the gland's surface, as the paper has it.",
+        ),
+    ] = 0
+    scans: Annotated[int, Meta(ge=1, le=1000, description="Number of exams per body.")] = 2
+    normalise: Annotated[
+        tuple[Literal["gain", "mean"], ...],
+        Meta(
+            description="Normalisation of the maps, as in `map`; the calibration is for maps made the same way. Give "
+            "it twice for a row by each from one scan."
+        ),
+    ] = ("gain",)
+    seed: Seed = 7
+
+
+class SbcOptions(Options, kw_only=True):
+    """How simulation-based calibration is run."""
+
+    maps: Annotated[int, Meta(ge=1, le=MOST_ITEMS, description="Maps to simulate.")] = 200
+    method: Annotated[
+        Literal["laplace", "importance", "ensemble"],
+        Meta(description="Method of the posterior draws, as in `estimate`; ensemble takes about 20 times as long."),
+    ] = "importance"
+    field_cosines: Annotated[
+        FieldCosines,
+        Meta(
+            description="Basis functions of the noise field, as field_cosines of `estimate`.",
+            extra={"metavar": "N|auto"},
+        ),
+    ] = "auto"
+    seed: Seed = 1
 
 
 class PlanErrors(Options):

@@ -17,10 +17,18 @@ PRESSURE_WINDOW_KPA: Final = (5.0, 14.0)
 
 # The head as simulated: an arc with rounded shoulders (shared design notes; the paper: "nearly a circular cylinder").
 HEAD_RADIUS_MM: Final = 35.0
+SHOULDER_MM: Final = 3.0
 # Where the shoulders of the head's section lie: cut into the sensing width, or around it (docs/decisions/0075).
 SHOULDERS_INSIDE: Final = "shoulders-inside"
 SHOULDERS_OUTSIDE: Final = "shoulders-outside"
 HEADS: Final = (SHOULDERS_INSIDE, SHOULDERS_OUTSIDE)
+
+# The body as simulated, section 2.2: fat, gland ten times as stiff, a rigid chest wall; the pressure on it.
+FAT_KPA: Final = 5.0
+GLAND_RATIO: Final = 10.0
+POISSON: Final = 0.495
+THICKNESS_MM: Final = 70.0
+MEAN_KPA: Final = 9.5
 
 # E2/E1 from which the paper takes a lump for hard: widths change by less than 5 % from there on (section 2.4).
 LEAST_HARD_RATIO: Final = 8.0

@@ -30,6 +30,7 @@ from tactile_bayes.forward.line import outside_range
 from tactile_bayes.forward.scene import Head, Lump
 from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.forward.tissue import Rib, SolidLump
+from tactile_bayes.options import FieldCosines, PopulationOptions, SbcOptions
 from tactile_bayes.presets import DEFAULT_NORMALISE, RESEARCH_USE, Method
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.studies.population import (
@@ -127,16 +128,12 @@ def _tissue_line(lump: SolidLump) -> str:
 
 def population_action(
     output: Path,
-    masses: int,
-    centred: int,
-    scans: int,
-    normalise: tuple[str, ...],
     head: Path | None,
     bodies_file: Path | None,
-    seed: int,
     workers: int,
     scheduler: str | None,
     force: bool,
+    **options: Any,
 ) -> None:
     """Simulate exams of varied bodies and fit their maps: the table that a size calibration is learned from."""
     refuse_existing(output, force=force)
@@ -145,12 +142,14 @@ def population_action(
     if bodies_file:
         drawn = read_toml_record(bodies_file, BodiesFile, way_out="see bodies.schema.json")
     bodies, exams = drawn.bodies, drawn.exams
+    asked = PopulationOptions(**options)
+    ways = tuple(dict.fromkeys(asked.normalise))
     # results are kept by number: where the centred ones begin decides what a number is
     settings = {
-        "scans": scans,
-        "seed": seed,
-        "first_centred": masses if centred else None,
-        "normalise": list(dict.fromkeys(normalise)),
+        "scans": asked.scans,
+        "seed": asked.seed,
+        "first_centred": asked.masses if asked.centred else None,
+        "normalise": list(ways),
         **as_settings(bodies, exams),
         "head": as_dict(simulated),
     }
@@ -163,15 +162,15 @@ def population_action(
         outcomes = run_batch(
             partial(
                 rows_of_mass,
-                scans=scans,
-                seed=seed,
-                first_centred=masses,
-                normalise=tuple(dict.fromkeys(normalise)),
+                scans=asked.scans,
+                seed=asked.seed,
+                first_centred=asked.masses,
+                normalise=ways,
                 bodies=bodies,
                 exams=exams,
                 head=simulated,
             ),
-            range(masses + centred),
+            range(asked.masses + asked.centred),
             key=str,
             executor=executor,
             store=store,
@@ -186,7 +185,7 @@ def population_action(
         kept.unlink(missing_ok=True)
     found = sum(row.detected for row in rows)
     done = len(outcomes) - len(failed)
-    click.echo(f"{output}: {done} masses, {len(rows)} exams, a lump found in {found}, seed {seed}")
+    click.echo(f"{output}: {done} masses, {len(rows)} exams, a lump found in {found}, seed {asked.seed}")
     click.echo(RESEARCH_USE)
     if failed:
         raise TactileBayesError(
@@ -234,16 +233,13 @@ def table_text(rows: list[MassRow]) -> str:
 
 
 def sbc_action(
-    maps: int,
-    method: Method,
-    field_cosines: int | None,
-    seed: int,
     workers: int,
     scheduler: str | None,
     output: Path | None,
     figure: Path | None,
     as_json: bool,
     force: bool,
+    **options: Any,
 ) -> None:
     """Check the posterior against itself: simulation-based calibration and coverage."""
     from tactile_bayes.report.laboratory import sbc_document, sbc_figure, sbc_text, table_text
@@ -251,16 +247,15 @@ def sbc_action(
     for path in (output, figure):
         if path is not None:
             refuse_existing(path, force=force)
-    begun = monotonic()
+    asked, begun = SbcOptions(**options), monotonic()
+    how: dict[str, Any] = {"method": asked.method, "seed": asked.seed, "cosines": asked.field_cosines}
 
     def report(found: list[MapRanks], speed: float | None) -> None:
-        document = sbc_document(found, method=method, seed=seed, maps_per_s=speed, cosines=field_cosines)
+        document = sbc_document(found, maps_per_s=speed, **how)
         click.echo(dump_json(document) if as_json else sbc_text(document), nl=False)
 
     try:
-        outcomes, made = _run_sbc(
-            maps, method, seed, field_cosines, workers=workers, scheduler=scheduler, output=output
-        )
+        outcomes, made = _run_sbc(asked.maps, how, workers=workers, scheduler=scheduler, output=output)
     except BatchInterrupted as stop:
         if output is None:  # else the next run goes on
             report([one.value for one in stop.outcomes if one.value is not None], None)
@@ -281,9 +276,7 @@ def sbc_action(
 
 def _run_sbc(
     maps: int,
-    method: Method,
-    seed: int,
-    cosines: int | None,
+    how: Mapping[str, Any],
     *,
     workers: int,
     scheduler: str | None,
@@ -294,12 +287,12 @@ def _run_sbc(
 
     with (
         open_executor(workers=workers, cluster=scheduler) as executor,
-        _open_kept(output, settings(method, seed, size=DEFAULT, cosines=cosines)) as store,
+        _open_kept(output, settings(size=DEFAULT, **how)) as store,
         progress_bar("maps") as progress,
     ):
         had = 0 if store is None else len(store.values)
         outcomes = run_batch(
-            partial(ranks_of_map, method=method, seed=seed, cosines=cosines),
+            partial(ranks_of_map, **how),
             range(maps),
             key=str,
             executor=executor,
@@ -309,7 +302,7 @@ def _run_sbc(
     return outcomes, max(maps - had, 0)
 
 
-def ranks_of_map(index: int, *, method: Method, seed: int, cosines: int | None) -> MapRanks:
+def ranks_of_map(index: int, *, method: Method, seed: int, cosines: FieldCosines) -> MapRanks:
     """Ranks of one map, in any process."""
     from tactile_bayes.studies import sbc
 

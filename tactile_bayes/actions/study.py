@@ -16,7 +16,7 @@ import numpy as np
 from tactile_bayes.batch import BatchInterrupted, Outcome, open_executor, run_batch
 from tactile_bayes.batch_store import BatchStore, open_store
 from tactile_bayes.commands.progress import progress_bar
-from tactile_bayes.declarations import as_dict
+from tactile_bayes.declarations import as_dict, names_of
 from tactile_bayes.errors import BadDataError, TactileBayesError, UsageError
 from tactile_bayes.files.atomic import refuse_existing, write_text
 from tactile_bayes.files.documents import dump_json
@@ -31,6 +31,7 @@ from tactile_bayes.forward.scene import Head as Array
 from tactile_bayes.forward.tissue import parse_seat
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.select import scan_findings
+from tactile_bayes.options import CaseOptions, SectionOptions, StudyOptions
 from tactile_bayes.posterior.bump import cell_mean_gaussian
 from tactile_bayes.posterior.white import LEAST_WIDTH_IN_CELLS, WIDEST_IN_RADII
 from tactile_bayes.presets import HEADS, RESEARCH_USE, SHOULDERS_INSIDE, SHOULDERS_OUTSIDE
@@ -145,9 +146,6 @@ RECIPE = ("normalise", "background", "fit_radius_mm", "noise", "flat_field")
 
 def study_action(
     *,
-    model: str,
-    grid: str,
-    seat: str,
     output: Path | None,
     figures: Path | None,
     measured_frames: Path | None,
@@ -158,13 +156,15 @@ def study_action(
     **options: Any,
 ) -> None:
     """Run the forward study of section 2.4: amplitude and width of the map over sizes, depths and stiffnesses."""
-    chosen = parse_seat(seat)
-    settings = study_settings(model=model, **options)
+    section = {name: options.pop(name) for name in names_of(SectionOptions)}
+    asked = StudyOptions(**options)
+    chosen, model = parse_seat(asked.seat), asked.model
+    settings = study_settings(asked, SectionOptions(**section))
     if (measured_frames or phantom) and (figures is None or model != "plane-strain"):
         named = "--measured-frames" if measured_frames else "--phantom"
         raise UsageError(f"{named} is for --figures of the plane-strain model; give --figures DIR")
     frames = [] if measured_frames is None else read_frames(measured_frames)
-    geometries = paper_grid(chosen) if grid == "paper" else read_grid(Path(grid), seat=chosen)
+    geometries = paper_grid(chosen) if asked.grid == "paper" else read_grid(Path(asked.grid), seat=chosen)
     if output is not None:
         refuse_existing(output, force=force)
     if figures is not None:
@@ -186,41 +186,24 @@ def study_action(
     click.echo(RESEARCH_USE, err=output is None)
 
 
-def study_settings(
-    *,
-    head_radius_mm: float,
-    shoulder_mm: float,
-    mean_kpa: float,
-    poisson: float,
-    gland_ratio: float,
-    thickness_mm: float | None,
-    fineness: int,
-    fat_kpa: float = 5.0,
-    model: str = "plane-strain",
-    background: str | None = None,
-    flat_field: bool | None = None,
-    head: str | None = None,
-) -> StudySettings | SolidSettings:
-    """Make the study's settings from the command line's options."""
-    default = SHOULDERS_INSIDE if model == "plane-strain" else SHOULDERS_OUTSIDE
-    section = Head(radius_mm=head_radius_mm, shoulder_mm=shoulder_mm, shoulders=head or default)
-    if model == "plane-strain":
-        if background == "free" or flat_field:
-            asked = "--background free" if background == "free" else "--flat-field"
-            raise UsageError(f"{asked} is for --model solid: in two dimensions Eq 5 is fitted with a background of 1")
-        return StudySettings(section, mean_kpa, poisson, fat_kpa, gland_ratio, thickness_mm, fineness=fineness)
-    array = Array(radius_mm=head_radius_mm, rim_mm=shoulder_mm).with_shoulders(section.shoulders)
-    return SolidSettings(
-        array,
-        mean_kpa,
-        poisson,
-        fat_kpa,
-        gland_ratio,
-        thickness_mm,
-        fineness=fineness,
-        background=background or "free",
-        flat_field=flat_field is not False,
-    )
+def study_settings(asked: StudyOptions, at: SectionOptions) -> StudySettings | SolidSettings:
+    """Make the settings of the study of a model."""
+    default = SHOULDERS_INSIDE if asked.model == "plane-strain" else SHOULDERS_OUTSIDE
+    section = _section(at, asked.head or default)
+    case = {name: getattr(asked, name) for name in names_of(CaseOptions)}
+    if asked.model == "plane-strain":
+        if asked.background == "free" or asked.flat_field:
+            named = "--background free" if asked.background == "free" else "--flat-field"
+            raise UsageError(f"{named} is for --model solid: in two dimensions Eq 5 is fitted with a background of 1")
+        return StudySettings(head=section, **case)
+    array = Array(radius_mm=at.head_radius_mm, rim_mm=at.shoulder_mm).with_shoulders(section.shoulders)
+    solid: dict[str, Any] = {"background": asked.background or "free", "flat_field": asked.flat_field is not False}
+    return SolidSettings(head=array, **case, **solid)
+
+
+def _section(at: SectionOptions, shoulders: str | None) -> Head:
+    """The head's section; its shoulders lie inside the sensing width where nobody says."""
+    return Head(radius_mm=at.head_radius_mm, shoulder_mm=at.shoulder_mm, shoulders=shoulders or SHOULDERS_INSIDE)
 
 
 def read_grid(path: Path, *, seat: float) -> list[Geometry]:
@@ -343,12 +326,10 @@ def table_text(rows: list[StudyRow]) -> str:
 ByHead = Mapping[Head, Sequence[Agreement]]
 
 
-def tables_action(
-    *, seat: str, head_radius_mm: float, shoulder_mm: float, head: str | None, search: bool, workers: int, as_json: bool
-) -> None:
+def tables_action(*, seat: str, head: str | None, search: bool, workers: int, as_json: bool, **section: float) -> None:
     """Recompute Tables 1 and 2 of the paper beside the printed figures."""
     at = parse_seat(seat)
-    asked = Head(radius_mm=head_radius_mm, shoulder_mm=shoulder_mm, shoulders=head or SHOULDERS_INSIDE)
+    asked = _section(SectionOptions(**section), head)
     nearest = NEAREST_HEADS.get(at)
     heads = list(dict.fromkeys([asked, *([nearest] if nearest else []), *(TRIED_HEADS if search else ())]))
     found, phantoms = run_tables(at, heads=heads, workers=workers)
@@ -384,18 +365,12 @@ def run_tables(seat: float, *, heads: Sequence[Head], workers: int) -> tuple[ByH
 
 
 def head_uniformity_action(
-    *,
-    head_radius_mm: float,
-    shoulder_mm: float,
-    head: str | None,
-    limit_percent: float,
-    as_json: bool,
-    **tissue: Any,
+    *, head_radius_mm: float, shoulder_mm: float, head: str | None, as_json: bool, **tissue: Any
 ) -> None:
     """Compute how evenly one head presses on homogeneous tissue."""
-    body, limit = _tissue(**tissue), limit_percent / 100
-    section = Head(radius_mm=head_radius_mm, shoulder_mm=shoulder_mm, shoulders=head or SHOULDERS_INSIDE)
-    found = uniformity(section, body)
+    body = HomogeneousTissue(**tissue)
+    section = SectionOptions(head_radius_mm=head_radius_mm, shoulder_mm=shoulder_mm)
+    found, limit = uniformity(_section(section, head), body), body.limit_percent / 100
     if as_json:
         _print_json(uniformity_document(found, body, limit=limit))
         return
@@ -403,11 +378,10 @@ def head_uniformity_action(
     click.echo(RESEARCH_USE)
 
 
-def head_design_action(
-    *, head: str | None, limit_percent: float, figure: Path | None, as_json: bool, force: bool, **tissue: Any
-) -> None:
+def head_design_action(*, head: str | None, figure: Path | None, as_json: bool, force: bool, **tissue: Any) -> None:
     """Find the head that presses evenly on homogeneous tissue (section 2.1 of the paper)."""
-    body, limit = _tissue(**tissue), limit_percent / 100
+    body = HomogeneousTissue(**tissue)
+    limit = body.limit_percent / 100
     if figure is not None:
         refuse_existing(figure, force=force)
     found = search_heads(body, kinds=HEADS if head is None else (head,))
@@ -421,20 +395,10 @@ def head_design_action(
     if narrowest(found, limit=limit) is None:
         best = most_even(found)
         raise UsageError(
-            f"no head keeps the pressure within {limit_percent:g} % of its mean: the most even one, "
+            f"no head keeps the pressure within {body.limit_percent:g} % of its mean: the most even one, "
             f"{named(best.head)}, reaches {100 * best.worst:.1f} %; give a larger --limit-percent, narrower ranges or "
             "another --thickness-mm"
         )
-
-
-def _tissue(
-    *,
-    modulus_kpa: tuple[float, float],
-    pressure_kpa: tuple[float, float],
-    thickness_mm: float,
-    poisson: float,
-) -> HomogeneousTissue:
-    return HomogeneousTissue(modulus_kpa, pressure_kpa, thickness_mm, poisson)
 
 
 def _print_json(document: dict[str, object]) -> None:

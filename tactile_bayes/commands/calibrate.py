@@ -6,7 +6,8 @@ from typing import Any
 
 import click
 
-from tactile_bayes.commands.options import FORCE, METAVAR, FigurePath, FilePath, FiniteRange, seed_option
+from tactile_bayes.api.settings import Settings
+from tactile_bayes.commands.options import FORCE, METAVAR, FigurePath, FilePath, FiniteRange, takes
 from tactile_bayes.presets import FIT_RADIUS_MM, NOISE, NORMALISE
 
 # --- `calibrate`: learn a calibration from known objects, and a site's repeatability from its own exams.
@@ -92,7 +93,7 @@ def command() -> None:
     type=FigurePath(),
     help="Draw Fig 8 of the paper from the table's lumps (eq6 only).",
 )
-@seed_option(1)
+@takes(Settings, "seed")
 @FORCE
 @click.pass_context
 def size(ctx: click.Context, /, **given: Any) -> None:

@@ -10,20 +10,25 @@ from tactile_bayes.commands.options import (
     FORCE,
     JSON,
     METAVAR,
-    MOST_ITEMS,
-    PRESSURE_WINDOW,
     SESSION,
     WORKERS,
-    Decorator,
     FigurePath,
     FilePath,
     FiniteRange,
-    WholeOrAuto,
     head_option,
     scheduler_option,
-    seed_option,
+    takes,
 )
-from tactile_bayes.presets import CELL_MM, DEFAULT_NORMALISE, MOST_FIELD_COSINES
+from tactile_bayes.declarations import names_of
+from tactile_bayes.options import (
+    CaseOptions,
+    MapOptions,
+    PopulationOptions,
+    SbcOptions,
+    SectionOptions,
+    StudyOptions,
+    TissueOptions,
+)
 
 # --- `simulate`: make a scan with known truth from a scene.
 
@@ -69,30 +74,7 @@ _FILE = FilePath()
 @click.option(
     "-o", "--output", required=True, metavar="TABLE.csv", type=FilePath(writes="CSV"), help="Where to write the table."
 )
-@click.option(
-    "--masses",
-    type=click.IntRange(1, MOST_ITEMS),
-    default=400,
-    show_default=True,
-    help="Number of bodies, one lump each.",
-)
-@click.option(
-    "--centred",
-    type=click.IntRange(0, MOST_ITEMS),
-    default=0,
-    show_default=True,
-    help="Further bodies whose lump is centred on the gland's surface, as the paper has it.",
-)
-@click.option("--scans", type=click.IntRange(1, 1000), default=2, show_default=True, help="Number of exams per body.")
-@click.option(
-    "--normalise",
-    type=click.Choice(["gain", "mean"]),
-    multiple=True,
-    default=[DEFAULT_NORMALISE],
-    show_default=True,
-    help="Normalisation of the maps, as in `map`; the calibration is for maps made the same way. Give it twice for a "
-    "row by each from one scan.",
-)
+@takes(PopulationOptions, "masses", "centred", "scans", "normalise")
 @click.option(
     "--head",
     metavar="HEAD.json",
@@ -108,7 +90,7 @@ _FILE = FilePath()
     help="Ranges of lumps, bodies and exams, in the tables [bodies] and [exams]. Default: those of the shipped "
     "calibrations.",
 )
-@seed_option(7)
+@takes(PopulationOptions, "seed")
 @WORKERS
 @scheduler_option("the masses")
 @FORCE
@@ -132,23 +114,7 @@ def population_command(**given: Any) -> None:
 
 
 @click.command("sbc")
-@click.option("--maps", type=click.IntRange(1, MOST_ITEMS), default=200, show_default=True, help="Maps to simulate.")
-@click.option(
-    "--method",
-    type=click.Choice(["laplace", "importance", "ensemble"]),
-    default="importance",
-    show_default=True,
-    help="Method of the posterior draws, as in `estimate`; ensemble takes about 20 times as long.",
-)
-@click.option(
-    "--field-cosines",
-    type=WholeOrAuto(min=6, max=MOST_FIELD_COSINES),
-    metavar="N|auto",
-    default="auto",
-    show_default=True,
-    help="Basis functions of the noise field, as field_cosines of `estimate`.",
-)
-@seed_option(1)
+@takes(SbcOptions, *names_of(SbcOptions))
 @WORKERS
 @scheduler_option("the maps")
 @click.option(
@@ -181,33 +147,8 @@ def sbc_command(**given: Any) -> None:
 # --- `study`: amplitude and width of the maps of simulated lumps.
 
 
-_ABOVE_0 = FiniteRange(min=0.0, min_open=True)
-_RADIUS = FiniteRange(min=0.0, max=1e6, min_open=True)
-MODELS = ("plane-strain", "solid")
-
-
 @click.command("study")
-@click.option(
-    "--model",
-    type=click.Choice(MODELS),
-    default="plane-strain",
-    show_default=True,
-    help="The paper's two-dimensional body, or balls under the whole head in three dimensions.",
-)
-@click.option(
-    "--grid",
-    default="paper",
-    show_default=True,
-    metavar="paper|FILE",
-    help="The paper's 150 cases, or a table of cases.",
-)
-@click.option(
-    "--seat",
-    default="centred",
-    show_default=True,
-    metavar="centred|resting|0..2",
-    help="How far the lump stands out of the gland, if the grid does not state it.",
-)
+@takes(StudyOptions, "model", "grid", "seat")
 @click.option(
     "-o", "--output", metavar="TABLE.csv", type=FilePath(writes="CSV"), help="Write the table. Default: print it."
 )
@@ -226,43 +167,13 @@ MODELS = ("plane-strain", "solid")
 )
 @click.option(
     "--phantom",
-    type=(_ABOVE_0, _ABOVE_0),
+    type=(FiniteRange(min=0.0, min_open=True),) * 2,
     metavar="D H/D",
     help="Lump of figure 6: diameter in mm, and depth over diameter. Default: 12.5 0.825, the paper's.",
 )
-@click.option("--head-radius-mm", type=_RADIUS, default=35.0, show_default=True, help="Radius of the head's arc.")
-@click.option(
-    "--shoulder-mm",
-    type=float,
-    default=3.0,
-    show_default=True,
-    help="Radius of the head's shoulders.",
-)
+@takes(SectionOptions, *names_of(SectionOptions))
 @head_option("Default: shoulders-inside for plane-strain, shoulders-outside for solid.")
-@click.option("--mean-kpa", type=_ABOVE_0, default=9.5, show_default=True, help="Mean pressure on the head.")
-@click.option("--fat-kpa", type=_ABOVE_0, default=5.0, show_default=True, help="Young's modulus of fat.")
-@click.option("--poisson", type=float, default=0.495, show_default=True, help="Poisson's ratio of the tissues.")
-@click.option("--gland-ratio", type=_ABOVE_0, default=10.0, show_default=True, help="Modulus of gland over fat.")
-@click.option(
-    "--thickness-mm", type=_ABOVE_0, help="Depth of the chest wall, mm. Default: 70, or deeper for deep lumps."
-)
-@click.option(
-    "--fineness",
-    type=click.IntRange(1, 8),
-    default=2,
-    show_default=True,
-    help="Mesh fineness; doubling it halves the elements.",
-)
-@click.option(
-    "--background",
-    type=click.Choice(["fixed", "free"]),
-    help="Background of Eq 7, solid only: free (default) is fitted, fixed is 1. In two dimensions it is 1.",
-)
-@click.option(
-    "--flat-field/--no-flat-field",
-    default=None,
-    help="Remove what the head reads of the same body without the lump, solid only. Default: on.",
-)
+@takes(StudyOptions, *names_of(CaseOptions), "background", "flat_field")
 @WORKERS
 @scheduler_option("the geometries")
 @FORCE
@@ -291,17 +202,8 @@ def study_command(**given: Any) -> None:
 
 
 @click.command("tables")
-@click.option(
-    "--seat",
-    default="centred",
-    show_default=True,
-    metavar="centred|resting|0..2",
-    help="How far the lump stands out of the gland.",
-)
-@click.option("--head-radius-mm", type=_ABOVE_0, default=35.0, show_default=True, help="Radius of the head's arc, mm.")
-@click.option(
-    "--shoulder-mm", type=FiniteRange(min=0.0), default=3.0, show_default=True, help="Radius of the shoulders, mm."
-)
+@takes(StudyOptions, "seat", help="How far the lump stands out of the gland.")
+@takes(SectionOptions, *names_of(SectionOptions))
 @head_option("Default: shoulders-inside.")
 @click.option("--heads", "search", is_flag=True, help="Compute the tables for many heads, and name the nearest one.")
 @WORKERS
@@ -323,67 +225,16 @@ def tables_command(**given: Any) -> None:
 
 # --- `head`: how evenly a scan head presses, and the head that presses most evenly (section 2.1 of the paper).
 
-_RANGE = "LOW HIGH"
-
 
 @click.group("head")
 def head_command() -> None:
     """How evenly a scan head presses on tissue without a lump: the homogeneous-pressure condition of section 2.1."""
 
 
-def _tissue_options(wrapped: Any) -> Any:
-    """Tissue, pressures and limit, the same for both subcommands."""
-    options: list[Decorator] = [
-        click.option(
-            "--modulus-kpa",
-            type=(_ABOVE_0, _ABOVE_0),
-            metavar=_RANGE,
-            default=(15.0, 25.0),
-            show_default=True,
-            help="Young's moduli of the tissue (paper: 15 to 25).",
-        ),
-        click.option(
-            "--pressure-kpa",
-            type=(_ABOVE_0, _ABOVE_0),
-            metavar=_RANGE,
-            default=(5.0, 14.0),
-            show_default=True,
-            help="Mean pressures under the head (paper: 5 to 14).",
-        ),
-        click.option(
-            "--thickness-mm",
-            type=_ABOVE_0,
-            default=70.0,
-            show_default=True,
-            help="Thickness of the tissue on its rigid base, mm. The paper gives none.",
-        ),
-        click.option(
-            "--poisson",
-            type=FiniteRange(0.0, 0.5, max_open=True),
-            default=0.495,
-            show_default=True,
-            help="Poisson's ratio of the tissue.",
-        ),
-        click.option(
-            "--limit-percent",
-            type=_ABOVE_0,
-            default=7.5,
-            show_default=True,
-            help="Largest allowed departure of a taxel from the frame's mean, % of it (paper: 7.5).",
-        ),
-    ]
-    for option in reversed(options):
-        wrapped = option(wrapped)
-    return wrapped
-
-
 @head_command.command("uniformity")
-@click.option("--head-radius-mm", type=_ABOVE_0, default=35.0, show_default=True, help="Radius of the head's arc, mm.")
-@click.option(
-    "--shoulder-mm", type=FiniteRange(min=0.0), default=3.0, show_default=True, help="Radius of the shoulders, mm."
-)
+@takes(SectionOptions, *names_of(SectionOptions))
 @head_option("Default: shoulders-inside.")
-@_tissue_options
+@takes(TissueOptions, *names_of(TissueOptions))
 @JSON
 def head_uniformity_command(**given: Any) -> None:
     """Compute how evenly one head presses on homogeneous tissue.
@@ -400,7 +251,7 @@ def head_uniformity_command(**given: Any) -> None:
 
 @head_command.command("design")
 @head_option("Default: both are searched.")
-@_tissue_options
+@takes(TissueOptions, *names_of(TissueOptions))
 @click.option("--figure", metavar=METAVAR, type=FigurePath(), help="Draw the non-uniformity over radius and shoulder.")
 @JSON
 @FORCE
@@ -440,9 +291,8 @@ _FIDELITIES = ("solid", "plane-strain", "empirical", "empirical-gaussian")
     metavar="X Y",
     help="The lump's place on the scan's map, mm. Default: the highest bump that can be one; 0 0 for a scene of none.",
 )
-@click.option("--every", type=click.IntRange(min=1), default=1, show_default=True, help="Compare one frame in so many.")
-@click.option("--cell-mm", type=float, default=CELL_MM, show_default=True, help="Side of the map's cells, mm.")
-@PRESSURE_WINDOW
+@takes(MapOptions, "every", help="Compare one frame in so many.")
+@takes(MapOptions, "cell_mm", "pressure_window_kpa")
 @click.option("--latency-ms", type=float, default=0.0, show_default=True, help="Delay of the tracker's time stamps.")
 @click.option("--figure", metavar=METAVAR, type=FigurePath(), help="Draw frames, maps and what the model leaves.")
 @JSON

@@ -15,7 +15,6 @@ from tactile_bayes.api.settings import Settings
 from tactile_bayes.declarations import Record, default_of, extra_of, kinds, meaning_of, range_of, value_kind
 from tactile_bayes.errors import UsageError, number_words
 from tactile_bayes.files.atomic import Format, check_suffix, same_file
-from tactile_bayes.options import MapOptions
 from tactile_bayes.presets import HEADS
 
 # --- Paths on the command line: an output may be neither an input nor another output of the same command.
@@ -169,14 +168,6 @@ else:
 Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 
 
-class WholeOrAuto(click.IntRange):
-    """A whole number, or None for "auto"."""
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Convert to the number, or to None."""
-        return None if value == "auto" else super().convert(value, param, ctx)
-
-
 class FiniteRange(click.FloatRange):
     """A finite number in a range; nan and infinity are refused."""
 
@@ -200,27 +191,19 @@ class FiniteRange(click.FloatRange):
 
 
 class NumberOr(_ParamType):
-    """A number, or one of the words given.
-
-    Parameters
-    ----------
-    words
-        Taken as they are, in small letters.
-    """
+    """A number, whole or not, or one of the words given."""
 
     name = "number"
 
-    def __init__(self, *words: str) -> None:
-        self.words = words
+    def __init__(self, *words: str, number: type[float] = float) -> None:
+        self.words, self.number = words, number
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float | str:
         """Convert to the number, or return the word."""
-        if isinstance(value, int | float):
-            return float(value)
         if value in self.words:
             return str(value)
         try:
-            return float(value)
+            return self.number(value)
         except ValueError:
             self.fail(f"{value!r} is not a number, nor {' nor '.join(map(repr, self.words))}", param, ctx)
 
@@ -254,6 +237,8 @@ def _option(record: type[Record], name: str, attributes: Mapping[str, Any]) -> D
     of_field: dict[str, Any] = {"help": meaning_of(kind), "metavar": extra.get("metavar")}
     if default is False:
         of_field["is_flag"] = True
+    elif value_kind(kind) is bool:
+        flag, of_field["default"] = f"{flag}/--no-{flag[2:]}", None
     else:
         bare = value_kind(kind)
         pairs = get_origin(bare) is tuple and get_args(bare)[1:] == (...,)
@@ -270,7 +255,7 @@ def _click_type(kind: Any) -> Any:
     """What click makes of a value, by what is declared for it."""
     bare = value_kind(kind)
     if words := [word for one in get_args(bare) if get_origin(one) is Literal for word in get_args(one)]:
-        return NumberOr(*words)
+        return NumberOr(*words, number=int if int in map(value_kind, get_args(bare)) else float)
     if get_origin(bare) is Literal:
         return click.Choice(get_args(bare))
     if get_origin(bare) is tuple:
@@ -283,8 +268,6 @@ def _click_type(kind: Any) -> Any:
     return FiniteRange(least, most, min_open="min" in open_ends, max_open="max" in open_ends)
 
 
-MOST_ITEMS = 1_000_000
-"""Of a batch: memory holds a name and an outcome for each."""
 FORCE = click.option("--force", is_flag=True, help="Overwrite existing outputs.")
 SESSION = click.option(
     "--session",
@@ -294,7 +277,6 @@ SESSION = click.option(
     help="Facts of the exam for the scan: subject, side, posture, examiner, visit and more, in plain text.",
 )
 JSON = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-PRESSURE_WINDOW = takes(MapOptions, "pressure_window_kpa")
 SPEED = click.option(
     "--speed",
     type=FiniteRange(0.01, 100.0),
@@ -321,11 +303,6 @@ def live_options(command: Callable[..., Any]) -> Callable[..., Any]:
         help="Size calibration of the live view, whose frames are divided by their means.",
     )
     return live(serve(size_calibration(command)))
-
-
-def seed_option(default: int) -> Decorator:
-    """``--seed`` with a command's default."""
-    return click.option("--seed", type=click.IntRange(min=0), default=default, show_default=True, help="Random seed.")
 
 
 def scheduler_option(what: str) -> Decorator:

@@ -15,7 +15,6 @@ from tactile_bayes.commands.options import (
     FilePath,
     FiniteRange,
     head_option,
-    seed_option,
     takes,
 )
 
@@ -142,7 +141,7 @@ def tradeoff_estimate_command(ctx: click.Context, /, **given: Any) -> None:
 @TOLERANCE
 @RUNS
 @click.option("--figure", metavar=METAVAR, type=FigurePath(), help="Draw error against time.")
-@seed_option(1)
+@takes(Settings, "seed")
 @JSON
 @FORCE
 @click.pass_context

@@ -10,16 +10,14 @@ from tactile_bayes.api.settings import Settings
 from tactile_bayes.commands.options import (
     FORCE,
     JSON,
-    MOST_ITEMS,
     WORKERS,
     FilePath,
     FiniteRange,
     scheduler_option,
-    seed_option,
     takes,
 )
 from tactile_bayes.declarations import names_of
-from tactile_bayes.options import MapOptions, PlanErrors, TrialSettings
+from tactile_bayes.options import MOST_ITEMS, MapOptions, PlanErrors, TrialSettings
 
 # --- Options of the commands on trials: `validate`, `plan`.
 
@@ -102,7 +100,7 @@ def validate_command(**given: Any) -> None:
     show_default=True,
     help="Number of simulated trials per design.",
 )
-@seed_option(1999)
+@takes(TrialSettings, "seed")
 @WORKERS
 @JSON
 @click.option(

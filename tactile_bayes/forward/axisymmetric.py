@@ -29,8 +29,9 @@ from tactile_bayes.forward.mesh import (
     solved,
     stiffness_factor,
 )
-from tactile_bayes.forward.tissue import FAT_KPA, GLAND_RATIO, POISSON, Layers
+from tactile_bayes.forward.tissue import Layers
 from tactile_bayes.geometry import FloatArray
+from tactile_bayes.presets import FAT_KPA, GLAND_RATIO, POISSON
 
 # --- Sinking of a layered body's skin under normal loads: its exact Green's function, and means over taxels.
 #

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError, NotConvergedError
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.presets import HEAD_PITCH_MM, HEAD_RADIUS_MM, HEAD_ROWS, HEADS, SHOULDERS_INSIDE
+from tactile_bayes.presets import HEAD_PITCH_MM, HEAD_RADIUS_MM, HEAD_ROWS, HEADS, SHOULDER_MM, SHOULDERS_INSIDE
 
 # --- Frictionless contact of a rigid head with an elastic surface, under a given force.
 #
@@ -24,7 +24,6 @@ from tactile_bayes.presets import HEAD_PITCH_MM, HEAD_RADIUS_MM, HEAD_ROWS, HEAD
 
 BoolArray = np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
 
-SHOULDER_MM = 3.0
 _MOST_ROUNDS = 40
 
 

@@ -13,6 +13,7 @@ from tactile_bayes.forward.contact import Contact, Head, solve_contact
 from tactile_bayes.forward.plane_strain import CELL_MM, SurfaceCompliance, surface_compliance
 from tactile_bayes.forward.tissue import Layers
 from tactile_bayes.geometry import FloatArray
+from tactile_bayes.presets import MEAN_KPA
 
 # --- Frames of a head that slides over the lump in two dimensions, and the map they average to.
 #
@@ -21,7 +22,6 @@ from tactile_bayes.geometry import FloatArray
 # in it (whole cells always do). Far from the lump a map cell so collects the head's profile at equal distances over
 # the whole width, each once, and its mean is the mean of a frame: 1 after normalising, without a correction.
 
-MEAN_KPA = 9.5
 POSITIONS_MM = (-60.0, 60.0, 0.5)
 _NOMINAL_HEAD = Head()
 

@@ -13,14 +13,10 @@ from tactile_bayes.declarations import Meta, Record, check
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.contact import Head
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.presets import SHOULDERS_OUTSIDE
+from tactile_bayes.presets import FAT_KPA, GLAND_RATIO, POISSON, SHOULDERS_OUTSIDE, THICKNESS_MM
 
 # --- The layered breast model: fat over gland over a rigid chest wall, with a circular lump at or above their boundary.
 
-FAT_KPA = 5.0
-GLAND_RATIO = 10.0
-POISSON = 0.495
-THICKNESS_MM = 70.0
 LEAST_DEPTH_RATIO = 0.52
 MOST_SEAT = 2.0
 # Lumps and layers outside are no breast's: a mesh of them would have elements without end, or none that differ.

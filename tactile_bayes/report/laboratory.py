@@ -15,6 +15,7 @@ from tactile_bayes.files.tables import csv_text
 from tactile_bayes.forward.contact import Head
 from tactile_bayes.forward.line import RANGE, outside_range
 from tactile_bayes.geometry import FloatArray
+from tactile_bayes.options import FieldCosines
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.figure_file import figure_file
 from tactile_bayes.report.paper_head import named
@@ -54,7 +55,7 @@ SHIFT = 3.0
 
 
 def sbc_document(
-    maps: Sequence[MapRanks], *, method: str, seed: int, maps_per_s: float | None, cosines: int | None = None
+    maps: Sequence[MapRanks], *, method: str, seed: int, maps_per_s: float | None, cosines: FieldCosines = "auto"
 ) -> dict[str, Any]:
     """All results as plain data; `maps_per_s` is of the maps that this run made, None where it made none."""
     ranked = [one for one in maps if one.ranks is not None]
@@ -62,7 +63,7 @@ def sbc_document(
     return {
         "schema": SCHEMA,
         "method": method,
-        "field_cosines": cosines or "auto",
+        "field_cosines": cosines,
         "seed": seed,
         "maps": len(maps),
         "ranked": len(ranked),

@@ -100,7 +100,7 @@ def design_document(found: Sequence[Uniformity], tissue: HomogeneousTissue, *, l
 
 
 def _tissue_line(tissue: HomogeneousTissue) -> str:
-    moduli, pressures = tissue.young_kpa, tissue.mean_kpa
+    moduli, pressures = tissue.modulus_kpa, tissue.pressure_kpa
     return (
         f"homogeneous tissue of {moduli[0]:g} to {moduli[1]:g} kPa, {tissue.thickness_mm:g} mm thick on a rigid base, "
         f"nu {tissue.poisson:g}; mean pressures of {pressures[0]:g} to {pressures[1]:g} kPa"
@@ -187,8 +187,8 @@ def design_figure(
         plain = min(shown, key=lambda one: (abs(one.head.radius_mm - 35.0), abs(one.head.shoulder_mm - 3.0)))
         _draw_shares(axes[1, 2], plain, tissue, limit, "(f) simulated head")
         text = (
-            f"Homogeneous tissue of {tissue.young_kpa[0]:g} to {tissue.young_kpa[1]:g} kPa, {tissue.thickness_mm:g} mm "
-            f"thick, {answer.head.shoulders}; black line and grey band: {100 * limit:g} %; "
+            f"Homogeneous tissue of {tissue.modulus_kpa[0]:g} to {tissue.modulus_kpa[1]:g} kPa, "
+            f"{tissue.thickness_mm:g} mm thick, {answer.head.shoulders}; black line and grey band: {100 * limit:g} %; "
             f"cross: {named(answer.head)}.  {RESEARCH_USE}"
         )
         figure.text(0.01, 0.01, text, fontsize=8, color="0.3")

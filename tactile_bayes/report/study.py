@@ -12,10 +12,10 @@ import numpy as np
 from tactile_bayes.forward.axisymmetric import LayeredBody
 from tactile_bayes.forward.line import LineFrames, build_line, fit_empirical, press, press_layers
 from tactile_bayes.forward.solid import PlacedLump, SolidHead, face_of, solid_head
-from tactile_bayes.forward.tissue import THICKNESS_MM, Body, Layers
+from tactile_bayes.forward.tissue import Body, Layers
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.map import TactileMap
-from tactile_bayes.presets import HEAD_PITCH_MM, RESEARCH_USE
+from tactile_bayes.presets import HEAD_PITCH_MM, RESEARCH_USE, THICKNESS_MM
 from tactile_bayes.report.figure_file import figure_file
 from tactile_bayes.size.eq6 import AxisCalibration, SizeCalibration
 from tactile_bayes.size.learn.eq6 import SizeTable

@@ -14,7 +14,6 @@ from tactile_bayes.declarations import Record, as_dict, field, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.contact import Head
 from tactile_bayes.forward.line import (
-    MEAN_KPA,
     POSITIONS_MM,
     LineFrames,
     TactileLine,
@@ -23,9 +22,10 @@ from tactile_bayes.forward.line import (
     press_layers,
     slide,
 )
-from tactile_bayes.forward.plane_strain import CELL_MM, FINENESS, SurfaceCompliance, condense
-from tactile_bayes.forward.tissue import FAT_KPA, GLAND_RATIO, POISSON, SEATS, THICKNESS_MM, Body, Layers
+from tactile_bayes.forward.plane_strain import CELL_MM, SurfaceCompliance, condense
+from tactile_bayes.forward.tissue import SEATS, Body, Layers
 from tactile_bayes.geometry import FloatArray
+from tactile_bayes.options import CaseOptions, TissueOptions
 from tactile_bayes.presets import HEAD_PITCH_MM, HEADS, SHOULDERS_INSIDE
 
 # --- The forward study of section 2.4: the Gaussian that each lump's map shows, over sizes, depths and stiffnesses.
@@ -39,24 +39,17 @@ DETECTABLE = 0.02
 HARD_RATIO = 100.0
 
 
-class CaseSettings(Record):
+class CaseSettings(CaseOptions, kw_only=True):
     """Head, pressure and tissue of a study in two or three dimensions."""
 
     head: Any = None
-    mean_kpa: float = MEAN_KPA
-    """Mean over the taxels, or force over the area of a section."""
-    poisson: float = POISSON
-    fat_kpa: float = FAT_KPA
-    gland_ratio: float = GLAND_RATIO
-    thickness_mm: float | None = None
-    """`poisson`, `fat_kpa`, `gland_ratio`, `thickness_mm`: As in `tissue.Body`."""
 
     def body(self, d_mm: float, depth_ratio: float, *, seat: float) -> Body:
         """The body of a case."""
         return Body(d_mm, depth_ratio, seat, self.thickness_mm, self.fat_kpa, self.gland_ratio, self.poisson)
 
 
-class StudySettings(CaseSettings):
+class StudySettings(CaseSettings, kw_only=True):
     """Settings of a study: everything but its cases that the table depends on."""
 
     head: Head = field(default_factory=Head)
@@ -66,8 +59,7 @@ class StudySettings(CaseSettings):
     fit_radius_mm: float = FIT_RADIUS_MM
     """Eq 5 is fitted where abs(x) is at most this."""
     cell_mm: float = CELL_MM
-    fineness: int = FINENESS
-    """`cell_mm`, `fineness`: Of the contact and of the mesh, see `plane_strain.condense`."""
+    """Of the contact, see `plane_strain.condense`."""
 
     def as_dict(self) -> dict[str, object]:
         """Plain data for a store's header and for a report."""
@@ -409,33 +401,20 @@ def _rms(values: FloatArray) -> float:
 # kPa under mean pressures of 5-14 kPa, and say neither the radius of the head nor the thickness of the tissue. The
 # model is linear, so that only the ratio of mean pressure to modulus matters.
 
-PAPER_MODULI_KPA = (15.0, 25.0)
-"""Young's modulus of normal breast tissue, section 2.1."""
-PAPER_PRESSURES_KPA = (5.0, 14.0)
-"""Anticipated user-applied pressures, section 2.1."""
 RADII_MM = (13.0, 16.0, 20.0, 25.0, 30.0, 35.0, 45.0, 60.0, 70.0, 80.0, 100.0, 150.0, 300.0, np.inf)
 SHOULDERS_MM = (0.0, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 10.0, 12.0, 15.0, 20.0)
 # Contact cells: three a taxel. Six change the departure of a head that meets the limit by less than 0.001.
 _CELL_MM = 0.5
 
 
-class HomogeneousTissue(Record):
+class HomogeneousTissue(TissueOptions):
     """Tissue and pressures over which a head should press evenly."""
 
-    young_kpa: tuple[float, float] = PAPER_MODULI_KPA
-    mean_kpa: tuple[float, float] = PAPER_PRESSURES_KPA
-    """`young_kpa`, `mean_kpa`: Lowest and highest Young's modulus, and lowest and highest mean pressure over the
-    sensing width.
-    """
-    thickness_mm: float = THICKNESS_MM
-    """Of the tissue, bonded to a rigid base."""
-    poisson: float = POISSON
-    """Poisson's ratio."""
-
     def __post_init__(self) -> None:
-        for name in ("young_kpa", "mean_kpa"):
+        super().__post_init__()
+        for name in ("modulus_kpa", "pressure_kpa"):
             low, high = getattr(self, name)
-            if not 0 < low <= high < np.inf:
+            if not low <= high:
                 raise BadDataError(
                     f"{name} is {low:g} to {high:g}", way_out="give two numbers above 0, the lower first"
                 )
@@ -443,12 +422,12 @@ class HomogeneousTissue(Record):
     @property
     def moduli_kpa(self) -> FloatArray:
         """(3,) both ends and the middle."""
-        return np.linspace(*self.young_kpa, 3)
+        return np.linspace(*self.modulus_kpa, 3)
 
     @property
     def pressures_kpa(self) -> FloatArray:
         """(3,) both ends and the middle."""
-        return np.linspace(*self.mean_kpa, 3)
+        return np.linspace(*self.pressure_kpa, 3)
 
     def frames(self, head: Head, *, cell_mm: float = _CELL_MM) -> tuple[FloatArray, FloatArray]:
         """Taxel positions (n,) in mm, and pressure over its mean (3, 3, n) for each modulus and each mean pressure."""

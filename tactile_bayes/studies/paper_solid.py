@@ -153,7 +153,7 @@ BACKGROUNDS = ("fixed", "free")
 _LEVEL = np.eye(3)
 
 
-class SolidSettings(CaseSettings):
+class SolidSettings(CaseSettings, kw_only=True):
     """Settings of a solid study: everything but its cases that the table depends on."""
 
     head: Head = field(default_factory=Head)
@@ -165,8 +165,6 @@ class SolidSettings(CaseSettings):
     """
     fit_radius_mm: float = FIT_RADIUS_MM
     """Eq 7 is fitted within this distance of the lump's axis."""
-    fineness: int = FINENESS
-    """Of the mesh; twice is half the element. See `mesh_size`."""
     rank_tolerance: float = RANK_TOLERANCE
     """See `solid.skin_perturbation`."""
     mesh_reach_mm: float = MeshSize().reach_mm
@@ -177,6 +175,7 @@ class SolidSettings(CaseSettings):
     """True when each taxel is divided by what it reads of the same body without the lump."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         half = self.head.rows * self.head.pitch_mm / 2
         if not self.head.radius_mm > half:
             raise BadDataError(

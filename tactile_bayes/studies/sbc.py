@@ -11,7 +11,7 @@ from tactile_bayes.declarations import Record, as_dict
 from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.map import MapRecipe, TactileMap
-from tactile_bayes.options import BumpPrior
+from tactile_bayes.options import BumpPrior, FieldCosines
 from tactile_bayes.posterior.draw import MapPosterior
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.field import LENGTHS_MM, SHARES, cell_mean_profile
@@ -224,7 +224,7 @@ class MapRanks(Record):
     """That the estimate gives to what it measured being a lump; None without an estimate."""
 
 
-def settings(method: str, seed: int, *, size: str = "", cosines: int | None = None) -> dict[str, object]:
+def settings(method: str, seed: int, *, size: str = "", cosines: FieldCosines = "auto") -> dict[str, object]:
     """All settings that a map's ranks depend on besides its number."""
     return {
         "method": method,
@@ -236,13 +236,13 @@ def settings(method: str, seed: int, *, size: str = "", cosines: int | None = No
         "lengths_mm": list(LENGTHS_MM),
         "shares": list(SHARES),
         "field": "exponential",
-        "field_cosines": cosines or "auto",
+        "field_cosines": cosines,
         **as_dict(BumpPrior()),
     }
 
 
 def ranks_of_map(
-    index: int, *, method: Method, seed: int, calibration: BodyCalibration | None = None, cosines: int | None = None
+    index: int, *, method: Method, seed: int, calibration: BodyCalibration | None = None, cosines: FieldCosines = "auto"
 ) -> MapRanks:
     """Draw a map from the prior, estimate it and rank its truth; seed and index fix all random numbers.
 
@@ -257,7 +257,7 @@ def ranks_of_map(
         fit_radius_mm=RADIUS_MM,
         rotation="off",
         noise="field",
-        field_cosines=cosines or "auto",
+        field_cosines=cosines,
         **as_dict(prior),
     )
     try:

@@ -13,13 +13,13 @@ from tactile_bayes.forward.line import build_line, fit_empirical, head_positions
 from tactile_bayes.forward.mesh import lump_mesh
 from tactile_bayes.forward.plane_strain import rim_nodes
 from tactile_bayes.forward.scene import Scene
-from tactile_bayes.forward.tissue import THICKNESS_MM, Body, SceneBody, fat_thickness
+from tactile_bayes.forward.tissue import Body, SceneBody, fat_thickness
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.mapping.select import first_seconds
 from tactile_bayes.posterior.options import SamplerSettings
-from tactile_bayes.presets import CELL_MM, DEFAULT_NORMALISE, HEAD_PITCH_MM, NORMALISE, SHOULDERS_INSIDE
+from tactile_bayes.presets import CELL_MM, DEFAULT_NORMALISE, HEAD_PITCH_MM, NORMALISE, SHOULDERS_INSIDE, THICKNESS_MM
 from tactile_bayes.scan import Scan
 from tactile_bayes.size.bodies import BodyCalibration, mean_width_mm
 from tactile_bayes.size.eq6 import SizeCalibration
@@ -142,7 +142,8 @@ def case_of(scene: Scene, *, head: str | None = None) -> LumpCase:
     if lump.vertical_mm != lump.d_mm:
         raise BadDataError(f"lump[0].height_mm is {lump.vertical_mm:g}", way_out="leave it out: both models are round")
     seat = (fat_thickness(body, [lump]) - lump.depth_mm) / (lump.d_mm / 2)
-    tissue = (scene.background.mean_kpa, body.nu, body.fat_kpa, body.gland_ratio, body.thickness_mm)
+    tissue: dict[str, Any] = {"mean_kpa": scene.background.mean_kpa, "poisson": body.nu}
+    tissue |= {name: getattr(body, name) for name in ("fat_kpa", "gland_ratio", "thickness_mm")}
     section = scene.head.section(head or SHOULDERS_INSIDE)
     array = scene.head if head is None else scene.head.with_shoulders(head)
     case = LumpCase(
@@ -150,8 +151,8 @@ def case_of(scene: Scene, *, head: str | None = None) -> LumpCase:
         lump.depth_ratio,
         lump.stiffness_ratio,
         round(seat, 9) + 0.0,
-        StudySettings(section, *tissue),
-        SolidSettings(array, *tissue, background="fixed", flat_field=False),
+        StudySettings(head=section, **tissue),
+        SolidSettings(head=array, **tissue, background="fixed", flat_field=False),
     )
     _ = case.body  # refuses what neither model can do
     return case

@@ -15,6 +15,7 @@ from tactile_bayes.actions import study as tables
 from tactile_bayes.actions.study import study_settings
 from tactile_bayes.cli import cli
 from tactile_bayes.files.scan_mcap import read_scan, read_truth
+from tactile_bayes.options import SectionOptions, StudyOptions
 from tactile_bayes.presets import HEADS, SHOULDERS_INSIDE, SHOULDERS_OUTSIDE
 
 DEFAULTS = {"plane-strain": SHOULDERS_INSIDE, "empirical": SHOULDERS_INSIDE, "solid": SHOULDERS_OUTSIDE}
@@ -95,10 +96,7 @@ def test_how_many_cases_cannot_be_seen_depends_on_the_head(tmp_path: Path) -> No
 
 @pytest.mark.parametrize(("model", "default"), [("plane-strain", SHOULDERS_INSIDE), ("solid", SHOULDERS_OUTSIDE)])
 def test_each_model_of_the_study_has_its_default_by_name(model: str, default: str) -> None:
-    given = {"head_radius_mm": 35.0, "shoulder_mm": 3.0, "mean_kpa": 9.5, "poisson": 0.495, "gland_ratio": 10.0}
-    found = {
-        head: study_settings(**given, thickness_mm=None, fineness=2, model=model, head=head) for head in (None, *HEADS)
-    }
+    found = {head: study_settings(StudyOptions(model=model, head=head), SectionOptions()) for head in (None, *HEADS)}
     assert found[default] == found[None]
     assert found[HEADS[0]] != found[HEADS[1]]
 

@@ -85,16 +85,9 @@ def test_an_interrupted_study_goes_on_where_it_stopped(folder: Path, run_cli: Ru
     """The store of a killed run: two geometries, and a third half written."""
     from tactile_bayes.actions.study import study_settings
     from tactile_bayes.batch_store import open_store
+    from tactile_bayes.options import SectionOptions, StudyOptions
 
-    settings = study_settings(
-        head_radius_mm=35.0,
-        shoulder_mm=3.0,
-        mean_kpa=9.5,
-        poisson=0.495,
-        gland_ratio=10.0,
-        thickness_mm=None,
-        fineness=1,
-    )
+    settings = study_settings(StudyOptions(fineness=1), SectionOptions())
     (tmp_path / "grid.csv").write_text(GRID)
     store = tmp_path / "study.csv.unfinished"
     marked = {"seat": "centred", "d_mm": 10.0, "depth_ratio": 0.8, "stiffness_ratio": 100.0}

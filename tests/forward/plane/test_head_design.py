@@ -31,7 +31,7 @@ def taxel_means(primitive) -> np.ndarray:
 def test_a_flat_head_is_the_punch_of_a_half_plane() -> None:
     """p / mean = 2 / (pi sqrt(1 - s^2/w^2)), Johnson eq. 2.64, at every pressure."""
     found = uniformity(
-        Head(radius_mm=np.inf, shoulder_mm=0.0), HomogeneousTissue(thickness_mm=THICK_MM, young_kpa=(15.0, 25.0))
+        Head(radius_mm=np.inf, shoulder_mm=0.0), HomogeneousTissue(thickness_mm=THICK_MM, modulus_kpa=(15.0, 25.0))
     )
     expected = taxel_means(lambda s: np.arcsin(s / 12.0))
     np.testing.assert_allclose(found.share[..., 2:-2], np.broadcast_to(expected, (3, 3, 16))[..., 2:-2], rtol=0.01)
@@ -46,7 +46,9 @@ def test_a_round_head_that_touches_in_part_is_hertz() -> None:
     The radius is large, so that the head's circle is the parabola of the theory.
     """
     radius, nu, tissue_kpa, mean_kpa = 300.0, 0.3, 50.0, 0.5
-    tissue = HomogeneousTissue((tissue_kpa, tissue_kpa), (mean_kpa, mean_kpa), THICK_MM, nu)
+    tissue = HomogeneousTissue(
+        modulus_kpa=(tissue_kpa, tissue_kpa), pressure_kpa=(mean_kpa, mean_kpa), thickness_mm=THICK_MM, poisson=nu
+    )
     a = np.sqrt(4 * (24 * mean_kpa) * radius * (1 - nu**2) / (np.pi * tissue_kpa))
     assert 8.0 < a < 10.0
     inside = np.clip(EDGES, -a, a)
@@ -60,9 +62,9 @@ def test_a_round_head_that_touches_in_part_is_hertz() -> None:
 def test_only_the_ratio_of_pressure_to_modulus_matters() -> None:
     head = Head(radius_mm=60.0, shoulders=SHOULDERS_OUTSIDE)
     plain = uniformity(head, HomogeneousTissue())
-    scaled = uniformity(head, HomogeneousTissue(young_kpa=(45.0, 75.0), mean_kpa=(15.0, 42.0)))
+    scaled = uniformity(head, HomogeneousTissue(modulus_kpa=(45.0, 75.0), pressure_kpa=(15.0, 42.0)))
     np.testing.assert_allclose(plain.share, scaled.share, rtol=1e-9)
-    other = uniformity(head, HomogeneousTissue(young_kpa=(45.0, 75.0)))
+    other = uniformity(head, HomogeneousTissue(modulus_kpa=(45.0, 75.0)))
     assert np.abs(plain.share - other.share).max() > 0.1
 
 
@@ -96,8 +98,8 @@ def test_another_reading_of_variation_asks_less() -> None:
 
 
 def test_a_range_that_runs_backwards_is_refused() -> None:
-    with pytest.raises(BadDataError, match="mean_kpa is 14 to 5"):
-        HomogeneousTissue(mean_kpa=(14.0, 5.0))
+    with pytest.raises(BadDataError, match="pressure_kpa is 14 to 5"):
+        HomogeneousTissue(pressure_kpa=(14.0, 5.0))
 
 
 def run(*words: object):

@@ -168,7 +168,7 @@ def test_the_coefficients_of_the_papers_study(seat: float) -> None:
 def test_shoulders_around_the_sensing_width_show_deep_lumps_higher() -> None:
     """Record 0075: they decide how many of the paper's cases cannot be seen."""
     deep = Geometry(0.0, 15.0, 1.5, (100.0,))
-    settings = [StudySettings(Head(shoulders=where)) for where in HEADS]
+    settings = [StudySettings(head=Head(shoulders=where)) for where in HEADS]
     (inside,), (outside,) = (run_geometry(deep, settings=replace(one, fineness=1), fit=fit_line) for one in settings)
     assert (inside.head, outside.head) == HEADS
     assert outside.amplitude / inside.amplitude == pytest.approx(1.33, abs=0.05)
