@@ -34,11 +34,6 @@ NONE: Final = "none"
 _FOLDER = Path(__file__).resolve().parents[1] / "calibrations"
 
 
-def is_shipped(path: Path) -> bool:
-    """True when a file comes with the program; the tests check those against their schemas."""
-    return path.parent == _FOLDER
-
-
 def default_for(normalise: str) -> str:
     """Name of the default calibration for a way to normalise."""
     return "solid-mean" if normalise == "mean" else DEFAULT
@@ -175,12 +170,14 @@ def _eq6_document(calibration: SizeCalibration) -> dict[str, Any]:
 
 def read_size_calibration(path: Path) -> Calibration:
     """Read a size calibration of any form; one that comes with the program is read once in a process."""
-    return _shipped(path) if is_shipped(path) else parse_size_calibration(load_json(path), path=path)
+    return _shipped(path) if path.parent == _FOLDER else _read(path)
 
 
-@lru_cache(maxsize=len(SHIPPED))
-def _shipped(path: Path) -> Calibration:
+def _read(path: Path) -> Calibration:
     return parse_size_calibration(load_json(path), path=path)
+
+
+_shipped = lru_cache(maxsize=len(SHIPPED))(_read)
 
 
 def parse_size_calibration(document: Any, *, path: Path) -> Calibration:
@@ -209,6 +206,8 @@ def _check_domain(domain: Mapping[str, object]) -> None:
 
 # --- A site's repeatability as JSON.
 
+_SPREAD: Final = ("log_sd", "median", "low", "high", "masses", "maps", "outlying")
+"""What the file and `Repeatability` call alike."""
 Sha256 = Annotated[str, Meta(pattern="^[0-9a-f]{64}$", extra={"words": "a SHA-256, 64 digits from 0 to f"})]
 
 
@@ -301,19 +300,14 @@ class RepeatabilityFile(Record, kw_only=True, omit_defaults=True):
 
     def repeatability(self, digest: str = "") -> Repeatability:
         """The spread that a size uses, with the hash of the file it is from."""
+        used = self.calibration
         return Repeatability(
             sd=self.between_map_sd,
-            log_sd=self.log_sd,
-            median=self.median,
-            low=self.low,
-            high=self.high,
-            masses=self.masses,
-            maps=self.maps,
-            calibration=self.calibration.name,
-            calibration_sha256=self.calibration.sha256,
-            normalise=self.calibration.normalise,
-            outlying=self.outlying,
+            calibration=used.name,
+            calibration_sha256=used.sha256,
+            normalise=used.normalise,
             sha256=digest,
+            **{name: getattr(self, name) for name in _SPREAD},
         )
 
 
@@ -332,22 +326,15 @@ def repeatability_document(
         schema="tactile-bayes/repeatability/1",
         research_use=RESEARCH_USE,
         between_map_sd=found.sd,
-        log_sd=found.log_sd,
-        median=found.median,
-        low=found.low,
-        high=found.high,
         probability=PROBABILITY,
-        masses=found.masses,
-        maps=found.maps,
         calibration=UsedCalibration(found.calibration, found.calibration_sha256, found.normalise),
         half_width=half_width,
         repeats=list(repeats),
-        outlying=found.outlying,
         left_out=list(left_out),
+        **{name: getattr(found, name) for name in _SPREAD},
         provenance=provenance.as_dict(),
     )
-    document: dict[str, Any] = to_plain(file)
-    return document
+    return dict(to_plain(file))
 
 
 def write_repeatability(path: Path, document: dict[str, Any], *, force: bool = False) -> None:

@@ -43,7 +43,6 @@ from tactile_bayes.size.terms import (
     SiteShift,
     beyond_lumps,
     check_shapes,
-    extrapolation_faults,
     monomials,
     outside_domain,
     powers,
@@ -292,17 +291,12 @@ class BodyCalibration(BodyLaw, eq=False, kw_only=True):
 
     def outside(self, amplitude: float, sigma_x_mm: float, sigma_y_mm: float | None = None) -> list[str]:
         """In what a map lies outside the table, in words; empty when it lies inside."""
-        sigma_mm = mean_width_mm(sigma_x_mm, sigma_y_mm)
-        texts = outside_domain(self.domain, amplitude, sigma_mm)
-        texts = texts or self._unlike(amplitude, sigma_mm, MOST_LEVERAGE)
+        texts = self._outside(amplitude, mean_width_mm(sigma_x_mm, sigma_y_mm))
         return [*texts, f"{self.fat_note}, so that depth is not used"] if self.fat_note.endswith(UNLIKE) else texts
 
     def extrapolation_faults(self, amplitude: float, sigma_x_mm: float, sigma_y_mm: float | None = None) -> list[str]:
         """In what a map lies so far outside the table that there is no size, in words."""
-        sigma_mm = mean_width_mm(sigma_x_mm, sigma_y_mm)
-        return extrapolation_faults(self.domain, amplitude, sigma_mm) or self._unlike(
-            amplitude, sigma_mm, FARTHEST_LEVERAGE
-        )
+        return self._outside(amplitude, mean_width_mm(sigma_x_mm, sigma_y_mm), far=True)
 
     def beyond_lumps(self, largest_mm: float) -> list[str]:
         """In what a size lies beyond the table's lumps, in words; empty when it lies within."""
@@ -345,10 +339,12 @@ class BodyCalibration(BodyLaw, eq=False, kw_only=True):
             return sizes
         return sizes + self.residual.at(np.stack(np.broadcast_arrays(*values), axis=-1))
 
-    def _unlike(self, amplitude: float, sigma_mm: float, most: float) -> list[str]:
-        """The map's pair of amplitude and width where its leverage exceeds this multiple of the limit."""
+    def _outside(self, amplitude: float, sigma_mm: float, *, far: bool = False) -> list[str]:
+        """The map's amplitude and width where one is outside its range, or the pair unlike those of the table."""
+        if texts := outside_domain(self.domain, amplitude, sigma_mm, far=far):
+            return texts
         leverage = self.leverage(amplitude, sigma_mm)
-        if leverage <= most:
+        if leverage <= (FARTHEST_LEVERAGE if far else MOST_LEVERAGE):
             return []
         pair = f"amplitude {amplitude:.3g} with sigma {sigma_mm:.3g} mm, a pair unlike those of the table"
         return [f"{pair} (leverage {leverage:.1f} times the limit)"]

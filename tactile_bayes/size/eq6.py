@@ -16,7 +16,7 @@ From a study or phantoms it is learned for each axis of the head, as draws of it
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Final, Literal
 
 import numpy as np
@@ -37,7 +37,6 @@ from tactile_bayes.size.terms import (
     Share,
     beyond_lumps,
     check_shapes,
-    extrapolation_faults,
     outside_domain,
 )
 
@@ -186,17 +185,15 @@ class SizeCalibration(Record, eq=False):
 
     def outside(self, amplitude: float, sigma_x_mm: float, sigma_y_mm: float) -> list[str]:
         """In what a map lies or may lie outside the tables of the two axes, in words; empty when it lies inside."""
-        return [*self.cautions, *self._by_axes(outside_domain, amplitude, sigma_x_mm, sigma_y_mm)]
+        return [*self.cautions, *self._by_axes(amplitude, sigma_x_mm, sigma_y_mm)]
 
     def extrapolation_faults(self, amplitude: float, sigma_x_mm: float, sigma_y_mm: float) -> list[str]:
         """Quantities of a map so far outside the tables that no size is given, in words."""
-        return self._by_axes(extrapolation_faults, amplitude, sigma_x_mm, sigma_y_mm)
+        return self._by_axes(amplitude, sigma_x_mm, sigma_y_mm, far=True)
 
-    def _by_axes(
-        self, faults: Callable[[Domain, float, float], list[str]], amplitude: float, x_mm: float, y_mm: float
-    ) -> list[str]:
+    def _by_axes(self, amplitude: float, x_mm: float, y_mm: float, *, far: bool = False) -> list[str]:
         axes = (("x", self.x.domain, x_mm), ("y", self.y.domain, y_mm))
-        return [f"{name}: {text}" for name, domain, width in axes for text in faults(domain, amplitude, width)]
+        return [f"{name}: {text}" for name, own, mm in axes for text in outside_domain(own, amplitude, mm, far=far)]
 
     def beyond_lumps(self, largest_mm: float) -> list[str]:
         """In what a size lies beyond the tables' lumps, in words; empty when it lies within."""

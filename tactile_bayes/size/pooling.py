@@ -65,14 +65,10 @@ class SizePriors(Record):
     """Properties of the body that somebody knows, by the names of `HiddenTerms`."""
 
     @property
-    def learned_between_maps(self) -> BetweenMaps | None:
-        """The spread between the maps at hand where it was learned; None where it is stated, or the calibration's."""
-        return self.between_maps if self.between_maps is not None and self.between_maps.log_sd > 0 else None
-
-    @property
     def spread_of_others(self) -> BetweenMaps:
         """The prior from which maps teach the spread that a further one is held against."""
-        return self.another_exam or self.learned_between_maps or BetweenMaps()
+        learned = self.between_maps is not None and self.between_maps.log_sd > 0  # else it is stated
+        return self.another_exam or (self.between_maps if learned else None) or BetweenMaps()
 
 
 def draw_sizes(

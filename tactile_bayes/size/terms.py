@@ -253,20 +253,11 @@ class SiteShift(Record, eq=False):
         return float(self.fit.get("log_width", self.centre))
 
 
-def outside_domain(domain: Domain, amplitude: float, sigma_mm: float) -> list[str]:
-    """Quantities outside their ranges in a table, in words."""
-    return _beyond(domain, amplitude, sigma_mm, factors=dict.fromkeys(FARTHEST, 1.0))
-
-
-def extrapolation_faults(domain: Domain, amplitude: float, sigma_mm: float) -> list[str]:
-    """Quantities so far outside that no size is given, in words."""
-    return _beyond(domain, amplitude, sigma_mm, factors=FARTHEST)
-
-
-def _beyond(domain: Domain, amplitude: float, sigma_mm: float, *, factors: Mapping[str, float]) -> list[str]:
+def outside_domain(domain: Domain, amplitude: float, sigma_mm: float, *, far: bool = False) -> list[str]:
+    """Quantities outside their ranges in a table, or so `far` outside that no size is given, in words."""
     texts = []
     for name, value, unit in (("amplitude", amplitude, ""), ("sigma_mm", sigma_mm, " mm")):
-        (low, high), factor = domain[name], factors[name]
+        (low, high), factor = domain[name], FARTHEST[name] if far else 1.0
         if not low / factor <= value <= high * factor:
             texts.append(f"{name.removesuffix('_mm')} {value:.3g}{unit} (table: {low:.3g} to {high:.3g}{unit})")
     return texts

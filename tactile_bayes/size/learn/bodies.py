@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
+from scipy.optimize import least_squares
 from scipy.special import ndtri
 
 from tactile_bayes.declarations import Record, replace
@@ -287,34 +288,19 @@ def fit_eq6(table: PopulationTable, rows: Eq6Rows) -> Eq6Fit:
 
 
 def _least_squares(table: PopulationTable, rows: Eq6Rows) -> FloatArray:
-    """(k,) coefficients by least squares of the bodies' means: Gauss-Newton steps, halved while they lead uphill."""
-    theta = np.zeros(len(rows.powers))
-    theta[rows.powers.index((MU, 0, 0))] = np.log(table.d_mm).mean()
-    theta[rows.powers.index((F, 0, 0))] = -0.3
-    data = _regression(table, rows, theta)
-    for _ in range(_MOST_TANGENTS):
-        step = data.least_squares() - theta
-        if np.abs(data.mean_terms @ step).max() < _CLOSE:
-            return theta
-        theta, data = _downhill(table, rows, theta, step, _misfit(data, theta))
-    raise NotConvergedError("Eq 6 does not fit this table")
+    """(k,) coefficients by least squares of the bodies' means, for the tangents to begin at."""
 
+    def left(theta: FloatArray) -> FloatArray:
+        data = _regression(table, rows, theta)
+        return data.mean_log_d - data.mean_terms @ theta
 
-def _downhill(
-    table: PopulationTable, rows: Eq6Rows, theta: FloatArray, step: FloatArray, misfit: float
-) -> tuple[FloatArray, BodyRegression]:
-    for _ in range(_MOST_TANGENTS):
-        data = _regression(table, rows, theta + step)
-        if _misfit(data, theta + step) <= misfit * (1.0 + 1e-12):
-            return theta + step, data
-        step = step / 2.0
-    raise NotConvergedError("Eq 6 does not fit this table")
-
-
-def _misfit(data: BodyRegression, theta: FloatArray) -> float:
-    """Sum of squares where the tangent touches; infinite where a row has no size."""
-    total = float(np.sum((data.mean_log_d - data.mean_terms @ theta) ** 2))
-    return total if np.isfinite(total) else float("inf")
+    start = np.zeros(len(rows.powers))
+    start[rows.powers.index((MU, 0, 0))] = np.log(table.d_mm).mean()
+    start[rows.powers.index((F, 0, 0))] = -0.3
+    found = least_squares(left, start, x_scale="jac")
+    if not found.success:
+        raise NotConvergedError("Eq 6 does not fit this table")
+    return np.asarray(found.x)
 
 
 def _regression(table: PopulationTable, rows: Eq6Rows, theta: FloatArray) -> BodyRegression:
