@@ -19,7 +19,7 @@ from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.size.bodies import BodyCalibration, BodyLaw
 from tactile_bayes.size.eq6 import COEFFICIENTS, AxisCalibration, SizeCalibration
 from tactile_bayes.size.pooling import PROBABILITY, Calibration, Repeatability
-from tactile_bayes.size.terms import LEARN_ANEW, SiteShift
+from tactile_bayes.size.terms import SiteShift
 
 # --- Size calibrations that come with the program, by name.
 
@@ -61,7 +61,6 @@ def size_calibration_path(name: str) -> Path | None:
 
 FACTOR_DIGITS: Final = 6
 FORMS: Final = ("eq6", "population", "site")
-_RANGES: Final = {"amplitude", "sigma_mm", "d_mm"}
 Coefficients = tuple[
     Literal["m"], Literal["b_mm"], Literal["e"], Literal["f"], Literal["scatter"], Literal["scatter_slope"]
 ]
@@ -77,10 +76,6 @@ class PopulationFile(BodyLaw, eq=False, kw_only=True):
         Mapping[str, float], Meta(description="m, b in mm, e and f of Eq 6 at the centre; for people, not read.")
     ] = field(default_factory=dict)
     research_use: str = RESEARCH_USE
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _check_domain(self.domain)
 
 
 class SiteFile(Record, eq=False, kw_only=True):
@@ -101,10 +96,6 @@ class AxisFile(AxisCalibration, eq=False, kw_only=True):
     fit: Mapping[str, float]
     mean: Vector
     covariance: Matrix
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _check_domain(self.domain)
 
 
 class Eq6File(SizeCalibration, eq=False, kw_only=True):
@@ -196,12 +187,6 @@ def parse_size_calibration(document: Any, *, path: Path) -> Calibration:
         what = "its base is no uncorrected calibration over bodies"
         raise BadDataError(what, way_out="learn the correction anew: `calibrate size --correct`", path=str(path))
     return replace(base, site=corrected.site)
-
-
-def _check_domain(domain: Mapping[str, object]) -> None:
-    missing = sorted(_RANGES - set(domain))
-    if missing:
-        raise BadDataError(f"domain has no {missing[0]}", way_out=LEARN_ANEW)
 
 
 # --- A site's repeatability as JSON.

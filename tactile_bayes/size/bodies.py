@@ -42,6 +42,7 @@ from tactile_bayes.size.terms import (
     Share,
     SiteShift,
     beyond_lumps,
+    check_domain,
     check_shapes,
     monomials,
     outside_domain,
@@ -124,6 +125,7 @@ class BodyLaw(Record, eq=False, kw_only=True):
 
     def __post_init__(self) -> None:
         s, c = len(self.spread.powers), len(self.feature_powers)
+        check_domain(self.domain)
         check_shapes(self, information_inverse=(c, c))
         check_shapes(self.round_lumps, coefficients=(s,))
         for hidden in (self.hidden, self.hidden_any):

@@ -36,6 +36,7 @@ from tactile_bayes.size.terms import (
     Recipe,
     Share,
     beyond_lumps,
+    check_domain,
     check_shapes,
     outside_domain,
 )
@@ -115,6 +116,7 @@ class AxisCalibration(Record, eq=False):
 
     def __post_init__(self) -> None:
         check_shapes(self, draws=(max(len(self.draws), 1), len(COEFFICIENTS)))
+        check_domain(self.domain)
 
     def size_mm(self, sigma_mm: FloatArray, amplitude: FloatArray, *, draws: FloatArray | None = None) -> FloatArray:
         r"""Diameter in mm by Eq 6, without residual scatter: :math:`d = m\,\sigma / (e\,a^f) + b`.

@@ -19,10 +19,12 @@ from tactile_bayes.presets import INTERVAL, Background, Noise
 from tactile_bayes.scan import HeadShape
 
 LEARN_ANEW: Final = "learn the calibration anew"
-_NEEDED: Final = {"required": ["amplitude", "sigma_mm", "d_mm"]}
+_RANGES: Final = ("amplitude", "sigma_mm", "d_mm")
 Normalise = Literal["mean", "gain", "none"]
 Range = tuple[Annotated[float, Meta(gt=0)], Annotated[float, Meta(gt=0)]]
-Domain = Annotated[Mapping[str, Range], Meta(description="Ranges in the table.", extra_json_schema=_NEEDED)]
+Domain = Annotated[
+    Mapping[str, Range], Meta(description="Ranges in the table.", extra_json_schema={"required": [*_RANGES]})
+]
 """Ranges of amplitude, sigma_mm (geometric mean) and d_mm."""
 Share = Annotated[float, Meta(ge=0)]
 Above0 = Annotated[float, Meta(gt=0)]
@@ -50,6 +52,12 @@ def check_shapes(record: object, *, finite: bool = True, **shapes: tuple[int, ..
         if values.shape != shape or (finite and not np.isfinite(values).all()):
             there, wanted = ("x".join(map(str, one)) for one in (values.shape, shape))
             raise BadDataError(f"{name} has {there} numbers for {wanted} finite ones", way_out=LEARN_ANEW)
+
+
+def check_domain(domain: Domain) -> None:
+    """Refuse ranges of which one is missing."""
+    if missing := [name for name in sorted(_RANGES) if name not in domain]:
+        raise BadDataError(f"domain has no {missing[0]}", way_out=LEARN_ANEW)
 
 
 def powers(order: int) -> tuple[tuple[int, int], ...]:
@@ -265,8 +273,8 @@ def outside_domain(domain: Domain, amplitude: float, sigma_mm: float, *, far: bo
 
 def beyond_lumps(domain: Domain, largest_mm: float) -> list[str]:
     """A size beyond the lumps of a table, in words; empty within. There it is the form that speaks, not the table."""
-    low, high = domain.get("d_mm", (0.0, float("inf")))
-    if not (largest_mm < low or largest_mm > high):
+    low, high = domain["d_mm"]
+    if low <= largest_mm <= high:
         return []
     return [f"largest size {largest_mm:.3g} mm (the table's lumps: {low:.3g} to {high:.3g} mm)"]
 
