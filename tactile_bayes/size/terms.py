@@ -274,7 +274,7 @@ def outside_domain(domain: Domain, amplitude: float, sigma_mm: float, *, far: bo
 def beyond_lumps(domain: Domain, largest_mm: float) -> list[str]:
     """A size beyond the lumps of a table, in words; empty within. There it is the form that speaks, not the table."""
     low, high = domain["d_mm"]
-    if low <= largest_mm <= high:
+    if not (largest_mm < low or largest_mm > high):
         return []
     return [f"largest size {largest_mm:.3g} mm (the table's lumps: {low:.3g} to {high:.3g} mm)"]
 
