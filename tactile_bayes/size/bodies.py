@@ -203,11 +203,6 @@ class BodyCalibration(BodyLaw, eq=False, kw_only=True):
         """Share of the variance between bodies that knowing each property alone would take away."""
         return {} if self.hidden is None else {name: self.hidden.share(name) for name in self.hidden.names}
 
-    @property
-    def form_name(self) -> str:
-        """The form, for people."""
-        return "Eq 6" if self.residual is None else "Eq 6 and its residual"
-
     def constants(self, sigma_mm: float | None = None, *, fat_mm: float | None = None) -> dict[str, float]:
         """m, b in mm, e and f of Eq 6 as it is printed, at the mean of the posterior.
 

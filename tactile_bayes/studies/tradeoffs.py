@@ -385,7 +385,8 @@ def _body_rule(calibration: BodyCalibration, name: str) -> SizeRule:
         return [float(np.exp(calibration.corrected_log_size(log_a, log_width)))]
 
     scatter = calibration.fit.get("left_out_sd", float(np.exp(calibration.spread.mean[0])))
-    return SizeRule(sizes, float(scatter), f"{calibration.form_name} of {name}", calibration.outside)
+    form = "Eq 6" if calibration.residual is None else "Eq 6 and its residual"
+    return SizeRule(sizes, float(scatter), f"{form} of {name}", calibration.outside)
 
 
 # --- Cost of accuracy before the map: cells, frames, time of strokes and normalising, each up to the size.

@@ -40,7 +40,7 @@ from tactile_bayes.size.learn.regression import (
     leverages,
     map_variance,
 )
-from tactile_bayes.size.terms import LOGGED, HiddenTerms, Recipe, monomials, powers
+from tactile_bayes.size.terms import LOGGED, Recipe, monomials, powers
 
 LEAST_BODIES: Final = 80
 """With a head profile: with fewer bodies Eq 6 without the fat's depth is all that a table supports."""
@@ -70,10 +70,12 @@ def learn_population(
     fitted = None
     if residual and rows.depth is not None:
         fitted = fit_residual(BodiesLeft(rows.of_bodies(eq6.data), rows.spread_terms(eq6.data), left, noise))
-        size, slope = size + fitted.at(rows.values), slope + _residual_slopes(fitted, rows.values)
+        steps = np.eye(3)[:2] * _STEP  # along u and v
+        slopes = [(fitted.at(rows.values + h) - fitted.at(rows.values - h)) / (2 * _STEP) for h in steps]
+        size, slope = size + fitted.at(rows.values), slope + np.stack(slopes)
         exam, noise = _exams(maps, eq6, size, slope)
         left, noise = left - fitted.predicted, noise + fitted.variance
-    return _calibration(rows, Learned(eq6, fitted, exam, left, noise), recipe=recipe, source=source)
+    return _calibration(rows, eq6, fitted, exam, left=left, noise=noise, recipe=recipe, source=source)
 
 
 class TableRows(Record, eq=False):
@@ -134,19 +136,6 @@ class TableRows(Record, eq=False):
         return monomials(list(self.of_bodies(data).T), self.spread_powers)
 
 
-class Learned(Record, eq=False):
-    """Fits learned from a table's bodies, `residual` None for Eq 6 alone, and the spread between exams.
-
-    `left` and `noise` are (b,): ln d less what the other bodies lead one to expect of it, and its variance without B's.
-    """
-
-    eq6: Eq6Fit
-    residual: FittedResidual | None
-    exam: ExamSpread
-    left: FloatArray
-    noise: FloatArray
-
-
 def learn_depth(profile: FloatArray, log_fat: FloatArray) -> FatDepth:
     """Fit ln F by least squares on the full quadratic of (n, 3) profiles."""
     centre, scale = profile.mean(axis=0), profile.std(axis=0)
@@ -181,20 +170,23 @@ def _exams(maps: PopulationTable, eq6: Eq6Fit, size: FloatArray, slope: FloatArr
     return exam, (exam.sd**2 + data.mean(data.map_variance)) / data.exams + coefficients
 
 
-def _residual_slopes(fitted: FittedResidual, values: FloatArray) -> FloatArray:
-    """(2, n) derivatives of the residual by u and v at (n, 3) values."""
-    step = np.eye(values.shape[1]) * _STEP
-    return np.stack([(fitted.at(values + one) - fitted.at(values - one)) / (2 * _STEP) for one in step[:2]])
-
-
-def _calibration(rows: TableRows, learned: Learned, *, recipe: Recipe, source: str) -> BodyCalibration:
-    eq6, fitted, exam, maps = learned.eq6, learned.residual, learned.exam, rows.maps
-    data, features = eq6.data, monomials(list(rows.values.T), rows.feature_powers)
-    spread, of_spread = body_spread(rows.spread_terms(data), learned.left, learned.noise)
+def _calibration(
+    rows: TableRows,
+    eq6: Eq6Fit,
+    fitted: FittedResidual | None,
+    exam: ExamSpread,
+    *,
+    left: FloatArray,
+    noise: FloatArray,
+    recipe: Recipe,
+    source: str,
+) -> BodyCalibration:
+    """The calibration by (b,) ln d less what the other bodies lead one to expect of it, and its variance without B."""
+    data, maps, features = eq6.data, rows.maps, monomials(list(rows.values.T), rows.feature_powers)
+    spread, of_spread = body_spread(rows.spread_terms(data), left, noise)
     body_sd = np.exp(rows.spread_terms(data) @ spread)
-    variance = body_sd**2 + learned.noise
     inverse, leverage = leverages(features)
-    held = float(np.mean(np.abs(learned.left) <= ndtri(0.5 + HELD / 2) * np.sqrt(variance)))
+    held = float(np.mean(np.abs(left) <= ndtri(0.5 + HELD / 2) * np.sqrt(body_sd**2 + noise)))
     spreads = {"body_sd": float(np.median(body_sd)), "exam_sd": exam.sd}
     calibration = BodyCalibration(
         centre=rows.centre,
@@ -208,27 +200,19 @@ def _calibration(rows: TableRows, learned: Learned, *, recipe: Recipe, source: s
         domain=domain_of(maps),
         recipe=recipe,
         depth=rows.depth,
-        hidden=hidden_terms(maps, data, body=learned.left, body_sd=body_sd, features=features),
+        hidden=hidden_terms(maps, data, body=left, body_sd=body_sd, features=features),
         hidden_any=None,
-        fit=error_figures(maps, data, spreads, -learned.left, held),
+        fit=error_figures(maps, data, spreads, -left, held),
         source=source,
         bodies={},
     )
-    return (
-        calibration
-        if rows.depth is None
-        else replace(calibration, hidden_any=_hidden_at_any_depth(calibration, maps, data))
-    )
-
-
-def _hidden_at_any_depth(
-    calibration: BodyCalibration, maps: PopulationTable, data: BodyRegression
-) -> HiddenTerms | None:
-    """Components of B where the depth of the fat is not known."""
+    if rows.depth is None:
+        return calibration
     at, a, p = calibration.at_fat([None]), maps.log_amplitude, maps.log_width
     body = data.mean(np.log(maps.d_mm) - at.log_size(a, p))
     body_sd = at.body_sd(data.mean(a), data.mean(p), np.zeros(data.groups))
-    return hidden_terms(maps, data, body=body, body_sd=body_sd, features=at.features(a, p))
+    hidden_any = hidden_terms(maps, data, body=body, body_sd=body_sd, features=at.features(a, p))
+    return replace(calibration, hidden_any=hidden_any)
 
 
 def _log_amplitude_one_deep(table: PopulationTable) -> float:

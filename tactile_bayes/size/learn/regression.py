@@ -352,20 +352,14 @@ def fit_residual(bodies: BodiesLeft) -> FittedResidual:
     count = max(min(POINTS, len(bodies.left) // BODIES_PER_POINT), 1)
     starts = [_start(bodies, length) for length in _START_LENGTHS]
     for points_now in (max(count // 2, 1), count):
-        points = drawn_points(bodies.x, points_now)
+        # drawn at random they lie as the bodies do, most where most sizes are asked for; pivots of the kernel's
+        # incomplete Cholesky factor lie at the table's ends first, and left bodies out with larger errors (0122)
+        chosen = np.random.default_rng(SEED).choice(len(bodies.x), points_now, replace=False)
+        points = bodies.x[chosen]
         fits = [_best(bodies, one, points) for one in starts]
         theta, _ = min(fits, key=lambda one: one[1])
         starts = [theta]
     return given(bodies, points, theta)
-
-
-def drawn_points(x: FloatArray, count: int) -> FloatArray:
-    """(m, k) of the (b, k) values, drawn at random: they lie as the bodies do, so most where most sizes are asked for.
-
-    Pivots of the kernel's incomplete Cholesky factor (Fine & Scheinberg 2001) lie at the table's ends first, and left
-    bodies out with larger errors (record 0122).
-    """
-    return x[np.random.default_rng(SEED).choice(len(x), count, replace=False)]
 
 
 def given(bodies: BodiesLeft, points: FloatArray, theta: FloatArray) -> FittedResidual:
