@@ -14,9 +14,11 @@ import stat
 import time
 import zlib
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
+from tactile_bayes.declarations import EXACT, from_plain, to_plain
 from tactile_bayes.errors import BadDataError, UsageError
 
 STORE_SCHEMA: Final = "tactile-bayes.batch/2"
@@ -161,6 +163,22 @@ def open_store(
             os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def unfinished(output: Path) -> Path:
+    """Where the results of a batch are kept until its output is written."""
+    return output.with_name(f"{output.name}.unfinished")
+
+
+@contextlib.contextmanager
+def open_unfinished(output: Path | None, kind: Any, *, settings: Mapping[str, Any]) -> Iterator[BatchStore | None]:
+    """Open the store of results of a `kind`, a record or a list of them, beside the output; None without an output."""
+    if output is None:
+        yield None
+        return
+    encode, decode = partial(to_plain, digits=EXACT), partial(from_plain, kind)
+    with open_store(unfinished(output), settings=settings, encode=encode, decode=decode) as store:
+        yield store
 
 
 def _lock(descriptor: int, path: Path, *, shared: bool) -> None:

@@ -11,7 +11,7 @@ import click
 from tactile_bayes.api.repeatability import exams_in, learn_from_exams
 from tactile_bayes.api.site_correction import correct_size
 from tactile_bayes.api.size_calibration import EqSixFit, PopulationForm, is_population, learn_eq6, learn_population
-from tactile_bayes.commands.options import also_read
+from tactile_bayes.commands.options import also_read, typed_options
 from tactile_bayes.commands.progress import progress_bar
 from tactile_bayes.declarations import as_dict
 from tactile_bayes.errors import BadDataError, UsageError
@@ -19,8 +19,7 @@ from tactile_bayes.files.atomic import refuse_existing
 from tactile_bayes.files.instrument_json import ArrayCalibrationFile, write_array_calibration
 from tactile_bayes.files.provenance import Provenance, hash_inputs
 from tactile_bayes.files.scan_mcap import read_scan
-from tactile_bayes.files.size_json import size_calibration_path, write_size_calibration
-from tactile_bayes.files.tables import read_table
+from tactile_bayes.files.size_json import size_calibration_path
 from tactile_bayes.hardware.bladder import ArrayFit, BladderStep, fit_array
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.calibration import (
@@ -31,6 +30,7 @@ from tactile_bayes.report.calibration import (
 )
 from tactile_bayes.report.study import eq6_figure
 from tactile_bayes.scan import Scan
+from tactile_bayes.size.bodies import BodyCalibration
 
 # --- `calibrate array`: learn an array's calibration from recorded bladder steps, for `record` to attach.
 
@@ -96,8 +96,6 @@ def _text(fit: ArrayFit, head: str, output: Path) -> str:
 
 
 def calibrate_size_action(
-    ctx: click.Context,
-    /,
     table: Path,
     output: Path,
     form: PopulationForm,
@@ -118,72 +116,46 @@ def calibrate_size_action(
         refuse_existing(path, force=force)
     declared = {"normalise": normalise, "background": background, "fit_radius_mm": fit_radius_mm, "noise": noise}
     if correct is not None:
-        _refuse_with_correct(ctx)
-        click.echo(_corrected(table, output, correct, declared, seed=seed, force=force), nl=False)
+        why = "is for learning a calibration; leave it out with --correct"
+        _refuse(why, "form", "against", "fit", "least_stiffness_ratio", "figure")
+        with progress_bar("maps") as progress:
+            learned = correct_size(table, correct, declared, seed=seed, progress=progress)
+        also_read(*learned.inputs.values())
+    elif form != "eq6" or is_population(table):
+        why = "is for tables of lumps: a table of `population` fixes how its maps were made"
+        _refuse(why, "fit", "background", "fit_radius_mm", "noise", "least_stiffness_ratio", "figure", "seed")
+        learned = learn_population(table, form, normalise, against=against)
+    else:
+        if against is not None:
+            raise UsageError("--against is for a table of `population`; leave it out")
+        with progress_bar("effective draws") as progress:
+            learned = learn_eq6(
+                table, declared, fit=fit, least_stiffness_ratio=least_stiffness_ratio, seed=seed, progress=progress
+            )
+    learned.write(output, force=force)
+    calibration = learned.calibration
+    if isinstance(calibration, BodyCalibration):
+        text_of = body_calibration_text if calibration.site is None else site_calibration_text
+        click.echo(text_of(calibration), nl=False)
         return
-    if form != "eq6" or is_population(table):
-        _refuse_declared(ctx)
-        click.echo(_over_bodies(table, output, form, normalise, against=against, force=force), nl=False)
-        return
-    if against is not None:
-        raise UsageError("--against is for a table of `population`; leave it out")
-    rows = read_table(table, "size_table.table.json")
-    with progress_bar("effective draws") as progress:
-        learned = learn_eq6(
-            rows, declared, fit=fit, least_stiffness_ratio=least_stiffness_ratio, seed=seed, progress=progress
-        )
-    provenance = Provenance("calibrate size", learned.settings, hash_inputs(table=table), seed=seed)
-    write_size_calibration(output, learned.calibration, provenance=provenance, force=force)
-    if figure is not None:
-        eq6_figure(learned.calibration, learned.lumps, figure, title=table.name, force=force)
-    words = calibration_text(
-        learned.calibration,
-        not_left_out=learned.not_left_out,
-        other_fit=learned.other_fit,
-    )
+    if figure is not None and learned.lumps is not None:
+        eq6_figure(calibration, learned.lumps, figure, title=table.name, force=force)
+    words = calibration_text(calibration, not_left_out=learned.not_left_out, other_fit=learned.other_fit)
     click.echo(words, nl=False)
 
 
-def _refuse_with_correct(ctx: click.Context) -> None:
-    for name in ("form", "against", "fit", "least_stiffness_ratio", "figure"):
-        if ctx.get_parameter_source(name) is click.core.ParameterSource.COMMANDLINE:
-            option = name.replace("_", "-")
-            raise UsageError(f"--{option} is for learning a calibration; leave it out with --correct")
-
-
-def _corrected(
-    table: Path, output: Path, base: str, declared: dict[str, str | float | None], *, seed: int, force: bool
-) -> str:
-    with progress_bar("maps") as progress:
-        found = correct_size(table, base, declared, seed=seed, progress=progress)
-    also_read(*found.inputs.values())
-    found.write(output, force=force)
-    return site_calibration_text(found.calibration)
-
-
-def _refuse_declared(ctx: click.Context) -> None:
-    for name in ("fit", "background", "fit_radius_mm", "noise", "least_stiffness_ratio", "figure", "seed"):
-        if ctx.get_parameter_source(name) is click.core.ParameterSource.COMMANDLINE:
-            option = name.replace("_", "-")
-            raise UsageError(f"--{option} is for tables of lumps: a table of `population` fixes how its maps were made")
-
-
-def _over_bodies(
-    table: Path, output: Path, form: PopulationForm, normalise: str | None, *, against: Path | None, force: bool
-) -> str:
-    others = None if against is None else read_table(against, "population.table.json")
-    calibration, settings = learn_population(
-        read_table(table, "population.table.json"), form, normalise, against=others
-    )
-    inputs = hash_inputs(table=table) if against is None else hash_inputs(table=table, against=against)
-    provenance = Provenance("calibrate size", settings, inputs)
-    write_size_calibration(output, calibration, provenance=provenance, force=force)
-    return body_calibration_text(calibration)
+def _refuse(why: str, *others: str) -> None:
+    """Refuse an option that is for calibrations of another kind."""
+    typed = typed_options()
+    for name in others:
+        if name in typed:
+            raise UsageError(f"--{name.replace('_', '-')} {why}")
 
 
 def calibrate_repeatability_action(folder: Path, output: Path, size_calibration: str | None, force: bool) -> None:
     """Learn how far sizes of one mass lie apart between its exams at this site."""
-    also_read(None if size_calibration is None else size_calibration_path(size_calibration))
+    if size_calibration is not None:
+        also_read(size_calibration_path(size_calibration))
     refuse_existing(output, force=force)
     learned = learn_from_exams(exams_in(folder), size_calibration=size_calibration)
     learned.write(output, force=force)

@@ -24,7 +24,7 @@ from tactile_bayes.files.scan_mcap import read_scan, read_scan_report, read_trut
 from tactile_bayes.files.scan_recording import refuse_recording
 from tactile_bayes.hardware.bladder import rotation_sense
 from tactile_bayes.hardware.emulated import Device, EmulatedHead, EmulatedNdi, EmulatedTracker, Faults
-from tactile_bayes.hardware.emulator import Emulator, Link, PtyLink, Served, Stage, TcpLink
+from tactile_bayes.hardware.emulator import Emulator, Link, PtyLink, Stage, TcpLink
 from tactile_bayes.hardware.reading import ask_for_priority
 from tactile_bayes.hardware.readings import PoseReading
 from tactile_bayes.hardware.serial_trackers import TRACKERS, list_ports, open_tracker, probe
@@ -52,8 +52,12 @@ def emulate_action(
     """Serve a scan as a scan head or a tracker would send it, or as both, at its own rate, with faults on request."""
     roles = ("head", "tracker") if kind == "both" else (kind,)
     faults, stage, data = Faults(drop, corrupt, stall, disconnect, hold), Stage(speed=speed), read_scan(scan)
-    if protocol == "ndi" and "tracker" in roles:
-        _refuse_for_ndi(faults, once=once)
+    spoilt = faults.drop or faults.corrupt or faults.stall or faults.disconnect_s is not None
+    if protocol == "ndi" and "tracker" in roles and (spoilt or once):
+        raise UsageError(
+            "an NDI tracker sends nothing by itself: --drop, --corrupt, --stall, --disconnect and --once have nothing "
+            "to act on; leave them out, or emulate another protocol"
+        )
     held = stage if kind == "both" else None
     devices = [_device(role, data, protocol, faults, path=scan, held=held) for role in roles]
     links = [_link(tcp, after=number) for number in range(len(roles))]
@@ -68,7 +72,9 @@ def emulate_action(
         _serve(emulators, once=once)
     finally:
         for role, emulator in zip(roles, emulators, strict=True):
-            click.echo(_account(role if kind == "both" else "", emulator.served), err=True)
+            served = emulator.served
+            words = f"{served.sent} records sent, {served.dropped} dropped, {served.faulty} spoilt on request"
+            click.echo(f"{role}: {words}" if kind == "both" else words, err=True)
 
 
 def _serve(emulators: list[Emulator], *, once: bool) -> None:
@@ -82,11 +88,6 @@ def _serve(emulators: list[Emulator], *, once: bool) -> None:
         emulators[0].run(once=once)
         for other in others:
             other.join()
-
-
-def _account(role: str, served: Served) -> str:
-    words = f"{served.sent} records sent, {served.dropped} dropped, {served.faulty} spoilt on request"
-    return f"{role}: {words}" if role else words
 
 
 class _LeaveError(Exception):
@@ -111,14 +112,6 @@ def _device(kind: str, scan: Scan, protocol: str, faults: Faults, *, path: Path,
     raise BadDataError(f"holds no {what}", way_out="give another scan", path=str(path))
 
 
-def _refuse_for_ndi(faults: Faults, *, once: bool) -> None:
-    if faults.drop or faults.corrupt or faults.stall or faults.disconnect_s is not None or once:
-        raise UsageError(
-            "an NDI tracker sends nothing by itself: --drop, --corrupt, --stall, --disconnect and --once have nothing "
-            "to act on; leave them out, or emulate another protocol"
-        )
-
-
 def _link(tcp: str | None, *, after: int) -> Link:
     """Make a device's link; the one `after` others listens on a port that many numbers higher."""
     if tcp is None:
@@ -140,15 +133,11 @@ def devices_action(*, url: str | None, pivot_url: str | None, tracker_protocol: 
     elif pivot_url:
         _pivot(pivot_url, tracker_protocol, duration)
     else:
-        _list()
-
-
-def _list() -> None:
-    ports = list_ports()
-    for port in ports:
-        click.echo(f"{port.url}  {port.description}: {port.guess}")
-    if not ports:
-        click.echo("no serial ports; other URLs: socket://HOST:PORT, rfc2217://HOST:PORT, a pseudo-terminal's path")
+        ports = list_ports()
+        for port in ports:
+            click.echo(f"{port.url}  {port.description}: {port.guess}")
+        if not ports:
+            click.echo("no serial ports; other URLs: socket://HOST:PORT, rfc2217://HOST:PORT, a pseudo-terminal's path")
 
 
 def _pivot(url: str, protocol: str, duration_s: float) -> None:
@@ -239,6 +228,5 @@ def repair_action(*, scan: Path, output: Path | None, force: bool) -> None:
     provenance = Provenance("repair", made, inputs=hash_inputs(scan=scan))
     target = output or scan
     write_scan(target, file.scan, provenance=provenance, truth=read_truth(scan), force=force or output is None)
-    lines = [f"{target}: scan", *describe_scan(file.scan), *(f"lost: {line}" for line in file.lost), RESEARCH_USE]
-    for line in lines:
+    for line in (f"{target}: scan", *describe_scan(file.scan), *(f"lost: {one}" for one in file.lost), RESEARCH_USE):
         click.echo(line)

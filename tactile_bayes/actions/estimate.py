@@ -8,20 +8,19 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
-from click.core import ParameterSource
 
 from tactile_bayes.api.comparing import Comparison, compare_estimates
 from tactile_bayes.api.estimating import answer_file, estimate_file
 from tactile_bayes.api.maps import map_provenance
-from tactile_bayes.api.pooled import PooledSize, of_one_mass, pool_answers
+from tactile_bayes.api.pooled import of_one_mass, pool_answers
 from tactile_bayes.api.reports import ExamFiles, exam_of_files
 from tactile_bayes.api.settings import Comparing, Settings, refuse_checkpoint, times_of
 from tactile_bayes.api.sized import Answer, SizeEstimate
-from tactile_bayes.batch import BatchInterrupted, cluster_executor, fault_lines, local_executor, run_batch
-from tactile_bayes.commands.options import also_read, settings_of
+from tactile_bayes.batch import BatchInterrupted, Outcome, cluster_executor, fault_lines, local_executor, run_batch
+from tactile_bayes.commands.options import settings_of, typed_options
 from tactile_bayes.commands.progress import progress_bar
 from tactile_bayes.declarations import EXACT, replace, to_plain
 from tactile_bayes.errors import EXIT_DONE, EXIT_FAULT, EXIT_NO_ESTIMATE, UsageError
@@ -30,7 +29,6 @@ from tactile_bayes.files.documents import dump_json
 from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.files.provenance import repeated_scans
 from tactile_bayes.files.reports import json_text
-from tactile_bayes.files.size_json import size_calibration_path
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.options import MapOptions
 from tactile_bayes.presets import RESEARCH_USE
@@ -42,10 +40,6 @@ from tactile_bayes.report.figure_file import named_exam
 from tactile_bayes.report.map_figure import map_figure
 from tactile_bayes.report.map_text import map_text
 from tactile_bayes.report.pooled import pooled_summary, pooled_text
-
-if TYPE_CHECKING:
-    from tactile_bayes.batch import Outcome
-
 
 # --- Scans made maps, and exams made pages.
 
@@ -63,7 +57,10 @@ def map_action(
     """Build a tactile map from one scan, or one common map from several scans of the same examination."""
     from tactile_bayes.files.scan_mcap import read_scan
 
-    _check_paths(scans, output, figure, force=force)
+    if twice := given_twice(scans):
+        raise UsageError(f"{twice} is given twice; its frames would count twice: give each scan once")
+    for path in filter(None, (output, figure)):
+        refuse_existing(path, force=force)
     settings = to_plain(MapOptions(**options), digits=EXACT)
     clock = _Clock(verbose)
     loaded = [read_scan(path) for path in scans]
@@ -84,14 +81,6 @@ def map_action(
         click.echo(map_text(tactile_map), nl=False)
 
 
-def _check_paths(scans: tuple[Path, ...], output: Path, figure: Path | None, *, force: bool) -> None:
-    """Raise an error, before any work, for an output that cannot be written or a scan given twice."""
-    if twice := given_twice(scans):
-        raise UsageError(f"{twice} is given twice; its frames would count twice: give each scan once")
-    for path in [output, *([figure] if figure else [])]:
-        refuse_existing(path, force=force)
-
-
 class _Clock:
     """Prints the time of each step, if requested."""
 
@@ -110,8 +99,6 @@ class _Clock:
 
 
 def report_action(
-    ctx: click.Context,
-    /,
     *,
     files: tuple[Path, ...],
     output: Path,
@@ -127,23 +114,16 @@ def report_action(
     page.check()
     sorted_files = ExamFiles.sort(files)
     if sorted_files.estimates:
-        _refuse_settings(ctx, asked)
-    settings, size_calibration = settings_of(**asked), asked["size_calibration"]
-    also_read(None if size_calibration is None else size_calibration_path(size_calibration))
+        for name in (name for name in asked if name in typed_options()):  # they would change nothing
+            option = "--settings" if name == "settings_file" else f"--{name.replace('_', '-')}"
+            raise UsageError(f"an estimate has settings of its own; leave out {option}, or give the map alone")
+    settings = settings_of(**asked)
     exam = exam_of_files(sorted_files, settings, given, notice=lambda line: click.echo(line, err=True))
     page.write(exam)
     if exam.main.tactile_map is None:
         click.echo("note: without its map the page has no picture and no coverage; give MAP.nc too", err=True)
     click.echo(f"{output}: {headline(exam)}")
     click.echo(RESEARCH_USE)
-
-
-def _refuse_settings(ctx: click.Context, asked: Iterable[str]) -> None:
-    """Refuse options of the estimate where an estimate is given: they would change nothing."""
-    for name in asked:
-        if ctx.get_parameter_source(name) is ParameterSource.COMMANDLINE:
-            option = "--settings" if name == "settings_file" else f"--{name.replace('_', '-')}"
-            raise UsageError(f"an estimate has settings of its own; leave out {option}, or give the map alone")
 
 
 # --- Maps estimated, pooled and compared, printed and written.
@@ -181,20 +161,21 @@ def estimate_pool(
     report = found.pooled_report.checked()
     text_of = json_text if as_json else pooled_text if verbose else pooled_summary
     try:
-        if found.pooled.size is not None:
-            _write_pooled(found, output, figure, force=force)
+        if found.pooled.size is not None and output is not None:
+            found.write(output, force=force)
+        if found.pooled.size is not None and figure is not None:
+            name = named_exam(f"{len(found.pooled_report.maps)} maps pooled", found.provenance.scans)
+            draw_size(
+                found.pooled.size,
+                figure,
+                name=name,
+                probability=found.probability,
+                findings=found.findings,
+                force=force,
+            )
     finally:  # what was computed is not lost with a file
         click.echo(text_of(report), nl=False)
     return EXIT_DONE if found.pooled.size is not None else EXIT_NO_ESTIMATE
-
-
-def _write_pooled(found: PooledSize, output: Path | None, figure: Path | None, *, force: bool) -> None:
-    if output is not None:
-        found.write(output, force=force)
-    size, probability = found.pooled.size, found.probability
-    if figure is not None and size is not None:
-        name = named_exam(f"{len(found.pooled_report.maps)} maps pooled", found.provenance.scans)
-        draw_size(size, figure, name=name, probability=probability, findings=found.findings, force=force)
 
 
 # --- `estimate`: estimate sizes from tactile maps.
@@ -217,14 +198,18 @@ def estimate_action(
     **asked: Any,
 ) -> None:
     """Estimate a lump's size from tactile maps, with a credible interval."""
-    settings, size_calibration = settings_of(**asked), asked["size_calibration"]
+    settings = settings_of(**asked)
     if len(maps) > 1:
         refuse_checkpoint(settings)
-    if figure is not None and size_calibration == "none":
+    if figure is not None and settings.size_calibration == "none":
         raise UsageError("--figure draws sizes and needs a --size-calibration; --map-figure draws the fit")
-    outputs = {"output": output, "figure": figure, "map figure": map_figure, "fit figure": fit_figure}
-    _check_outputs([path for path in outputs.values() if path], maps, pool, force=force)
-    also_read(_named(size_calibration))
+    outputs = (output, figure, map_figure, fit_figure)
+    if twice := given_twice(maps):
+        raise UsageError(f"{twice} is given twice; give each map once")
+    if any(outputs) and len(maps) > 1 and not pool:
+        raise UsageError("--output and the figures take one map at a time; use --json for several")
+    for path in filter(None, outputs):
+        refuse_existing(path, force=force)
     begun = time.perf_counter()
     if pool:
         if map_figure or fit_figure:
@@ -240,27 +225,17 @@ def estimate_action(
         with _printed_if_interrupted(maps, as_json=as_json, verbose=verbose):
             answers = _many_maps(maps, settings, workers=workers, scheduler=scheduler)
     try:
-        if found is not None:
-            _write(found, output, (figure, map_figure, fit_figure), force=force)
+        if found is not None and output and found.status == "estimate":
+            found.write(output, force=force)
+        if found is not None and any(outputs[1:]):
+            name, share = named_exam(found.name, found.provenance.scans), found.probability
+            draw_figures(found.tactile_map, found.estimate, *outputs[1:], name=name, probability=share, force=force)
     finally:  # what was computed is not lost with a file
         if verbose:
             print(f"estimate: {time.perf_counter() - begun:.3f} s", file=sys.stderr)
         _print(maps, answers, as_json=as_json, verbose=verbose, listed=len(maps) > 1)
-    ctx.exit(_exit_code(answers))
-
-
-def _named(calibration: str | None) -> Path | None:
-    return None if calibration is None else size_calibration_path(calibration)
-
-
-def _check_outputs(outputs: list[Path], maps: tuple[Path, ...], pool: bool, *, force: bool) -> None:
-    """Raise an error, before any work is done, if an output cannot be written."""
-    if twice := given_twice(maps):
-        raise UsageError(f"{twice} is given twice; give each map once")
-    if outputs and len(maps) > 1 and not pool:
-        raise UsageError("--output and the figures take one map at a time; use --json for several")
-    for path in outputs:
-        refuse_existing(path, force=force)
+    failed = [answer.exit_code for answer in answers if answer.report is None]
+    ctx.exit(failed[0] if failed else max(answer.exit_code for answer in answers))
 
 
 def _one_map(path: Path, settings: Settings) -> SizeEstimate:
@@ -268,20 +243,6 @@ def _one_map(path: Path, settings: Settings) -> SizeEstimate:
         return estimate_file(
             path, settings, progress=progress, notice=lambda line: click.echo(f"{path}: {line}", err=True)
         )
-
-
-def _write(
-    found: SizeEstimate,
-    output: Path | None,
-    figures: tuple[Path | None, Path | None, Path | None],
-    *,
-    force: bool,
-) -> None:
-    if output and found.status == "estimate":
-        found.write(output, force=force)
-    if any(figures):
-        name, probability = named_exam(found.name, found.provenance.scans), found.probability
-        draw_figures(found.tactile_map, found.estimate, *figures, name=name, probability=probability, force=force)
 
 
 def _many_maps(maps: tuple[Path, ...], settings: Settings, *, workers: int, scheduler: str | None) -> list[Answer]:
@@ -330,14 +291,6 @@ def _print(maps: Sequence[Path], answers: list[Answer], *, as_json: bool, verbos
             click.echo((f"{path}\n" if listed else "") + (answer.full_text if verbose else answer.text), nl=listed)
 
 
-def _exit_code(answers: list[Answer]) -> int:
-    """The first error's code, else 6 when a map gave no estimate, else 0."""
-    failed = [answer.exit_code for answer in answers if answer.report is None]
-    if failed:
-        return failed[0]
-    return EXIT_NO_ESTIMATE if any(answer.exit_code for answer in answers) else EXIT_DONE
-
-
 # --- `compare`: the maps of two visits and more.
 
 
@@ -372,13 +325,14 @@ def compare_action(
         same_mass=same_mass,
         registration_mm=registration_mm,
     )
-    settings, size_calibration = settings_of(**asked), asked["size_calibration"]
+    settings = settings_of(**asked)
     visits = [first, *groups_of(later)]
-    _check_maps(visits, settings)
+    if twice := given_twice(path for maps in visits for path in maps):
+        raise UsageError(f"{twice} is given twice; give each map once, at its own visit")
+    refuse_checkpoint(settings)
     comparing.check_visits(len(visits))
     if figure is not None:
         refuse_existing(figure, force=force)
-    also_read(None if size_calibration is None else size_calibration_path(size_calibration))
     found = _compare(visits, settings, comparing)
     report = found.report.checked()
     text_of = json_text if as_json else compare_text if verbose else compare_summary
@@ -388,13 +342,6 @@ def compare_action(
     finally:  # what was computed is not lost with the figure
         click.echo(text_of(report), nl=False)
     ctx.exit(found.exit_code)
-
-
-def _check_maps(visits: list[tuple[Path, ...]], settings: Settings) -> None:
-    """Refuse a map that is given twice, and a checkpoint."""
-    if twice := given_twice(path for maps in visits for path in maps):
-        raise UsageError(f"{twice} is given twice; give each map once, at its own visit")
-    refuse_checkpoint(settings)
 
 
 def _compare(visits: list[tuple[Path, ...]], settings: Settings, comparing: Comparing) -> Comparison:

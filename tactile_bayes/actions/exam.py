@@ -7,7 +7,7 @@ import shutil
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 import numpy as np
@@ -22,7 +22,7 @@ from tactile_bayes.exports.identity import identity_of
 from tactile_bayes.exports.run import Outputs, export, refuse_untaken
 from tactile_bayes.files.atomic import check_suffix, refuse_existing, unwritable, write_bytes
 from tactile_bayes.files.documents import dump_json, with_session
-from tactile_bayes.files.estimate_json import read_stated_size
+from tactile_bayes.files.estimate_json import StatedSize, read_stated_size
 from tactile_bayes.files.identify import describe
 from tactile_bayes.files.imports import read_arrays, read_grid
 from tactile_bayes.files.map_nc import write_map
@@ -56,13 +56,18 @@ def import_action(
 ) -> None:
     """Import scans, grids and images from other programs."""
     refuse_existing(output, force=force)
-    kind = kind or _kind_of(source, output)
+    if kind is None:  # a map where the output is .nc, or the source can only be a grid
+        as_map = output.suffix.lower() == ".nc" and source.suffix.lower() != ".mcap"
+        kind = "scan" if source.suffix.lower() in (".npz", ".mcap") and not as_map else "map"
     check_suffix(output, "MCAP" if kind == "scan" else "netCDF")
     if kind == "scan" and (spacing_mm is not None or normalise is not None or units is not None):
         raise UsageError("--spacing-mm, --normalise and --units are for maps; leave them out or give --as map")
     if kind == "map" and session_file is not None:
         raise UsageError("--session is for scans; leave it out or give --as scan")
-    _check_units(units, normalise)
+    if units is not None and normalise not in (None, "none"):
+        raise UsageError(f"--units is for values that were not divided; leave it out or --normalise {normalise}")
+    if units is not None and not (units.isprintable() and 0 < len(units.strip()) <= _LONGEST_UNITS):
+        raise UsageError(f"--units {units[:30]!r} is not a unit; give up to {_LONGEST_UNITS} letters, such as kPa")
     if kind == "scan":
         lines = _import_scan(source, output, session_file, force=force)
     else:
@@ -71,21 +76,6 @@ def import_action(
         )
     for line in (f"{output}: {kind}", *lines, RESEARCH_USE):
         click.echo(line)
-
-
-def _kind_of(source: Path, output: Path) -> str:
-    """Default kind of output: a map where the output is .nc or the source can only be a grid."""
-    as_map = output.suffix.lower() == ".nc" and source.suffix.lower() != ".mcap"
-    return "scan" if source.suffix.lower() in (".npz", ".mcap") and not as_map else "map"
-
-
-def _check_units(units: str | None, normalise: str | None) -> None:
-    if units is None:
-        return
-    if normalise not in (None, "none"):
-        raise UsageError(f"--units is for values that were not divided; leave it out or --normalise {normalise}")
-    if not (units.isprintable() and 0 < len(units.strip()) <= _LONGEST_UNITS):
-        raise UsageError(f"--units {units[:30]!r} is not a unit; give up to {_LONGEST_UNITS} letters, such as kPa")
 
 
 def _import_scan(source: Path, output: Path, session_file: Path | None, *, force: bool) -> list[str]:
@@ -116,18 +106,13 @@ def _describe_map(tactile_map: TactileMap) -> list[str]:
     ny, nx = tactile_map.mean.shape
     covered = int(tactile_map.covered.sum())
     low, high = np.nanmin(tactile_map.mean), np.nanmax(tactile_map.mean)
+    unit = tactile_map.recipe.value_unit
+    unit = "" if unit == "1" else f" {unit or '(unit unknown: give --units)'}"
     level = "unknown" if tactile_map.background is None else f"{tactile_map.background:g}"
     return [
         f"{ny} x {nx} cells of {tactile_map.recipe.cell_mm:g} mm, {covered} with data",
-        f"values {low:.4g} to {high:.4g}{_unit(tactile_map)}, background level {level} "
-        f"(normalise {tactile_map.recipe.normalise})",
+        f"values {low:.4g} to {high:.4g}{unit}, background level {level} (normalise {tactile_map.recipe.normalise})",
     ]
-
-
-def _unit(tactile_map: TactileMap) -> str:
-    """Unit of the values, to follow them; empty where they were divided by a level."""
-    unit = tactile_map.recipe.value_unit
-    return "" if unit == "1" else f" {unit or '(unit unknown: give --units)'}"
 
 
 def describe_scan(scan: Scan) -> list[str]:
@@ -136,12 +121,13 @@ def describe_scan(scan: Scan) -> list[str]:
     span = float(times[-1] - times[0]) if len(times) else 0.0
     calibration = scan.element_calibration
     saturated = int((scan.frames.counts >= calibration.saturation_count).sum())
+    duplicates = int((np.diff(poses.time_s) == 0).sum())
     marks = [] if scan.landmarks is None else [name.replace("_", " ") for name in scan.landmarks.points()]
     return [
         f"{len(times)} frames of {scan.head.shape[0]} x {scan.head.shape[1]} taxels in {span:.3f} s, {_rate(times)}",
         f"{len(poses)} poses, {_rate(poses.time_s)}",
         f"dropped frames {_dropped(times)}, dropped poses {_dropped(poses.time_s)}, "
-        f"duplicate pose stamps {_duplicates(poses.time_s)}, saturated readings {saturated}",
+        f"duplicate pose stamps {duplicates}, saturated readings {saturated}",
         f"landmarks: {' and '.join(', '.join(marks).rsplit(', ', 1)) or 'not touched'}",
     ]
 
@@ -161,10 +147,6 @@ def _dropped(times: FloatArray) -> int:
     return int(np.clip(periods - 1, 0, None).sum())
 
 
-def _duplicates(times: FloatArray) -> int:
-    return int((np.diff(times) == 0).sum())
-
-
 # --- `show`: describe a file.
 
 
@@ -175,13 +157,8 @@ def show_action(file: Path, as_json: bool) -> None:
     if as_json:
         click.echo(dump_json(found), nl=False)
         return
-    click.echo(shown(found))
-    click.echo(RESEARCH_USE)
-
-
-def shown(found: dict[str, Any]) -> str:
-    """Description of a file, one fact per line."""
-    return "\n".join(_lines(found))
+    for line in (*_lines(found), RESEARCH_USE):
+        click.echo(line)
 
 
 def _lines(found: dict[str, Any], indent: str = "") -> Iterator[str]:
@@ -294,15 +271,14 @@ class Steps(Record):
 
     def default_road(self) -> StatedSize:
         """Map and estimate with default options; returns the size."""
-        from tactile_bayes.commands import estimate as map
-
         self._say("1. Build the tactile map: all readings of the scan, averaged in cells of 1 mm.")
         tactile_map, posterior = self.folder / "map.nc", self.folder / "posterior.nc"
-        self._run(map.map_command, "map", scans=(self.folder / "scan.mcap",), output=tactile_map)
+        self._run(estimate.map_command, "map", scans=(self.folder / "scan.mcap",), output=tactile_map)
         self._say("2. Estimate the size of the lump, with the calibration that comes with the program.")
         figures = {"figure": self.folder / "size.png", "map_figure": self.folder / "map.png"}
-        self._estimate(estimate.estimate_command, tactile_map, output=posterior, **figures)
-        return _stated(posterior)
+        options = {"method": self.method, "output": posterior, **figures}
+        self._run(estimate.estimate_command, "estimate", maps=(tactile_map,), **options)
+        return read_stated_size(posterior)
 
     def paper_road(self) -> StatedSize:
         """The same map by the paper's own way: Markov chains through Eq 6."""
@@ -310,7 +286,7 @@ class Steps(Record):
         tactile_map, posterior = self.folder / "map.nc", self.folder / "posterior_eq6.nc"
         options = {"size_calibration": "eq6", "output": posterior}
         self._run(estimate.estimate_command, "estimate", maps=(tactile_map,), method="ensemble", **options)
-        return _stated(posterior)
+        return read_stated_size(posterior)
 
     def trial(self) -> None:
         """Report a synthetic trial."""
@@ -318,9 +294,6 @@ class Steps(Record):
         inputs = {"trial": self.folder / "trial.csv", "excision": self.folder / "excision.csv"}
         outputs = {"output": self.folder / "trial.json", "html": self.folder / "trial.html"}
         self._run(validate.validate_command, "validate", **inputs, **outputs)
-
-    def _estimate(self, command: click.Command, tactile_map: Path, **options: Any) -> None:
-        self._run(command, "estimate", maps=(tactile_map,), method=self.method, **options)
 
     def _say(self, text: str) -> None:
         click.echo(f"\n{text}\n")
@@ -379,10 +352,6 @@ def _truth(scan: Path) -> float:
     if truth is None:
         raise UsageError(f"{scan} holds no truth; it is not the embedded scan")
     return float(truth["lumps"][0]["d_mm"])
-
-
-def _stated(posterior: Path) -> StatedSize:
-    return read_stated_size(posterior)
 
 
 def _apart(default: StatedSize, paper: StatedSize) -> str:

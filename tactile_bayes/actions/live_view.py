@@ -38,13 +38,11 @@ from tactile_bayes.hardware.live import Feed, FeedReader, LiveMap, LiveState
 from tactile_bayes.hardware.serve import LiveServer, address_of
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.bump import candidate_centres
-from tactile_bayes.posterior.draw import MapPosterior
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.options import SamplerSettings
 from tactile_bayes.presets import FIELD_COSINES, INTERVAL
 from tactile_bayes.report.map_text import colours_wanted, live_line, live_text
 from tactile_bayes.scan import ElementCalibration, HeadGeometry
-from tactile_bayes.size.pooling import Calibration
 
 DRAWINGS_PER_S = 10.0
 TAKEN_EVERY_S = 1 / DRAWINGS_PER_S / 2
@@ -64,13 +62,14 @@ def live_view(
     """Start the view's process; returns an observer for the recorder."""
     if serve:
         address_of(serve)  # report a mistake before anything is recorded
+    calibration_file = size_calibration_path(size_calibration)
     setup = {
         "head": head_document(head),
         "calibration": calibration_document(calibration),
         "terminal": terminal,
         "keys": sys.stdin.isatty(),
         "serve": serve,
-        "size_calibration": _calibration_file(size_calibration),
+        "size_calibration": calibration_file and str(calibration_file),
     }
     theirs, ours = os.pipe()
     command = [sys.executable, "-m", "tactile_bayes.actions.live_view", str(theirs)]
@@ -89,6 +88,9 @@ def live_view(
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()
+
+
+_calibration_of = cache(read_size_calibration)
 
 
 class LiveAnswer(NamedTuple):
@@ -186,16 +188,6 @@ _TURN = Turn()
 LIVE_DRAWS = 400
 
 
-def _calibration_file(name: str) -> str | None:
-    path = size_calibration_path(name)
-    return None if path is None else str(path)
-
-
-@cache
-def _calibration_of(path: str) -> Calibration:
-    return read_size_calibration(Path(path))
-
-
 def live_estimate(tactile_map: TactileMap, calibration_path: str | None, turn: Turn = _TURN) -> LiveAnswer:
     """Size by the fast method with the lump's place, or the reason why there is none."""
     try:
@@ -203,7 +195,7 @@ def live_estimate(tactile_map: TactileMap, calibration_path: str | None, turn: T
         if not centres:
             return LiveAnswer("no estimate: nothing rises above the background")
         centre = centres[turn.of(len(centres))]
-        calibration = _calibration_of(calibration_path) if calibration_path else None
+        calibration = _calibration_of(Path(calibration_path)) if calibration_path else None
         # no test for rotation: it takes a third of the time and can be made afterwards
         options = SamplerSettings(
             method="laplace",
@@ -225,20 +217,15 @@ def live_estimate(tactile_map: TactileMap, calibration_path: str | None, turn: T
     if found.status != "estimate" or found.map_posterior is None:
         why = f"the rise near {centre[0]:.0f}, {centre[1]:.0f} mm is no lump that can be measured"
         return LiveAnswer(f"no estimate: {found.reason if found.code == 'extrapolated' else why}")
-    lump = _in_base(tactile_map, found.map_posterior)
+    lump = None
+    if tactile_map.plane_from_base is not None:  # stays valid in `base` when the map's plane changes
+        centre_mm = [np.median(found.map_posterior.x_mm), np.median(found.map_posterior.y_mm), 0.0]
+        lump = apply(inverse(tactile_map.plane_from_base), np.array(centre_mm))
     if found.size is not None:
         cautions = finding_summary(found.findings, "caution", most=1)
         return LiveAnswer(" ".join([*cautions, _interval("largest size", found.size.max_size_mm, INTERVAL)]), lump)
     widths = np.maximum(found.map_posterior.sigma_x_mm, found.map_posterior.sigma_y_mm)
     return LiveAnswer(_interval("map width sigma", widths, INTERVAL), lump)
-
-
-def _in_base(tactile_map: TactileMap, posterior: MapPosterior) -> FloatArray | None:
-    """Centre of the lump in `base`, which stays valid when the map's plane changes."""
-    if tactile_map.plane_from_base is None:
-        return None
-    centre = np.array([np.median(posterior.x_mm), np.median(posterior.y_mm), 0.0])
-    return apply(inverse(tactile_map.plane_from_base), centre)
 
 
 def _interval(name: str, draws: FloatArray, probability: float) -> str:

@@ -19,7 +19,7 @@ import click
 import numpy as np
 
 from tactile_bayes.actions.live_view import live_view
-from tactile_bayes.commands.options import FilePath, also_read
+from tactile_bayes.commands.options import also_read
 from tactile_bayes.declarations import as_dict
 from tactile_bayes.errors import EXIT_INTERRUPTED, DeviceError, UsageError
 from tactile_bayes.files.atomic import refuse_existing, unwritable
@@ -233,8 +233,6 @@ class Keys:
 
 # --- `record`: record a scan head and a tracker to a scan file without losing data.
 
-_FILE = FilePath()
-
 
 def record_action(ctx: click.Context, /, output: Path, **options: Any) -> None:
     """Record a scan head and a tracker."""
@@ -247,18 +245,13 @@ def record_action(ctx: click.Context, /, output: Path, **options: Any) -> None:
     ctx.exit(EXIT_INTERRUPTED if interrupted and request.duration_s is not None else 0)
 
 
-def _check_rom(request: Request) -> None:
-    if request.tracker_rom is not None and (request.tracker_protocol != "ndi" or not request.tracker_rom.is_file()):
-        raise UsageError(
-            f"--tracker-rom {request.tracker_rom} is "
-            + ("not a file" if request.tracker_protocol == "ndi" else f"not for {request.tracker_protocol}")
-            + "; give a wireless NDI tool's .rom file with --tracker-protocol ndi"
-        )
-
-
 def make_recording(request: Request) -> tuple[Report, bool]:
     """Check the devices, record and close the file; returns the account, and whether it was interrupted."""
-    _check_rom(request)
+    rom, ndi = request.tracker_rom, request.tracker_protocol == "ndi"
+    if rom is not None and not (ndi and rom.is_file()):
+        fault = "not a file" if ndi else f"not for {request.tracker_protocol}"
+        way_out = "give a wireless NDI tool's .rom file with --tracker-protocol ndi"
+        raise UsageError(f"--tracker-rom {rom} is {fault}; {way_out}")
     refuse_existing(request.output, force=request.force)
     head, calibration, landmarks = instrument_of(request)
     facts = request.facts()
@@ -268,7 +261,12 @@ def make_recording(request: Request) -> tuple[Report, bool]:
         session = request.session(hello, facts) | calibration_age(request, today=date.today())
         check_session(session, path=request.output)
         refuse_calibration(request, head_id=hello.device_id, today=date.today())
-        observer = _look_on(request, head, calibration, stack)
+        observer: Observer | None = None
+        if request.live or request.serve:
+            view = live_view(
+                head, calibration, terminal=request.live, serve=request.serve, size_calibration=request.size_calibration
+            )
+            observer = stack.enter_context(view)
         stream = stack.enter_context(create_exclusive(request.output, force=request.force))
         provenance = provenance_of(request, request.settings(hello))
         try:
@@ -290,7 +288,10 @@ def make_recording(request: Request) -> tuple[Report, bool]:
             rate_hz=hello.rate_hz / request.every,
             observer=observer,
         )
-        _place(landmarks, writer, observer)
+        for name, position_mm in {} if landmarks is None else landmarks.points().items():
+            writer.add_landmark(name, position_mm, device_ns=0, host_ns=0)
+            if observer is not None:
+                observer.landmark(name, position_mm)
         stopper = stack.enter_context(Stopper(recorder))
         try:
             report = _run(recorder, stopper, head, request)
@@ -301,19 +302,6 @@ def make_recording(request: Request) -> tuple[Report, bool]:
                 stream.close()
             raise full_disk(request.output, error) from None
     return report, stopper.interrupted
-
-
-def _look_on(
-    request: Request, head: HeadGeometry, calibration: ElementCalibration, stack: ExitStack
-) -> Observer | None:
-    """Start the live view, if requested."""
-    if not (request.live or request.serve):
-        return None
-    view = live_view(
-        head, calibration, terminal=request.live, serve=request.serve, size_calibration=request.size_calibration
-    )
-    observer: Observer = stack.enter_context(view)
-    return observer
 
 
 def _connect(request: Request, stack: ExitStack) -> tuple[HelloReading, tuple[Line, Line | None]]:
@@ -358,16 +346,6 @@ def _check_fit(hello: HelloReading, head: HeadGeometry, request: Request) -> Non
         )
     if request.every > 1:
         click.echo(f"one frame in {request.every}: {hello.rate_hz / request.every:g} Hz", err=True)
-
-
-def _place(landmarks: Landmarks | None, writer: Any, observer: Observer | None) -> None:
-    """Write the landmarks given in a file, and show them in the live view."""
-    if landmarks is None:
-        return
-    for name, position_mm in landmarks.points().items():
-        writer.add_landmark(name, position_mm, device_ns=0, host_ns=0)
-        if observer is not None:
-            observer.landmark(name, position_mm)
 
 
 def _run(recorder: Recorder, stopper: Any, head: HeadGeometry, request: Request) -> Report:

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
 from functools import cache, partial
 from pathlib import Path
 from time import monotonic
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 import numpy as np
 
 from tactile_bayes.actions.exam import describe_scan
 from tactile_bayes.batch import BatchInterrupted, Outcome, fault_lines, open_executor, run_batch
-from tactile_bayes.batch_store import BatchStore, open_store
+from tactile_bayes.batch_store import open_unfinished, unfinished
 from tactile_bayes.commands.progress import progress_bar
 from tactile_bayes.declarations import as_dict, names_of
 from tactile_bayes.errors import TactileBayesError
@@ -27,9 +26,8 @@ from tactile_bayes.files.scene_toml import read_scene
 from tactile_bayes.files.size_json import DEFAULT, read_size_calibration, size_calibration_path
 from tactile_bayes.files.tables import csv_text
 from tactile_bayes.forward.line import outside_range
-from tactile_bayes.forward.scene import Head, Lump
+from tactile_bayes.forward.scene import Head, Scene
 from tactile_bayes.forward.simulate import simulate
-from tactile_bayes.forward.tissue import Rib, SolidLump
 from tactile_bayes.options import FieldCosines, PopulationOptions, SbcOptions
 from tactile_bayes.presets import DEFAULT_NORMALISE, RESEARCH_USE, Method
 from tactile_bayes.size.bodies import BodyCalibration
@@ -63,64 +61,38 @@ def simulate_action(
 ) -> None:
     """Make a scan with known truth from SCENE, a TOML file."""
     refuse_existing(output, force=force)
-    for line in _run(scene, output, session_file, seed=seed, fidelity=fidelity, head=head, force=force):
-        click.echo(line)
-    click.echo(RESEARCH_USE)
-
-
-def _run(
-    scene_path: Path,
-    output: Path,
-    session_file: Path | None,
-    *,
-    seed: int | None,
-    fidelity: str | None,
-    head: str | None,
-    force: bool,
-) -> list[str]:
-    scene = read_scene(scene_path)
-    for lump in scene.solid_lumps if fidelity == "empirical" else ():
+    drawn = read_scene(scene)
+    for lump in drawn.solid_lumps if fidelity == "empirical" else ():
         if warning := outside_range(lump.d_mm, lump.depth_ratio):
             click.echo(warning, err=True)
-    used = scene.seed if seed is None else seed
+    used = drawn.seed if seed is None else seed
     with progress_bar("frames") as progress:
-        simulated = simulate(scene, rng=np.random.default_rng(used), fidelity=fidelity, head=head, progress=progress)
-    files = {"scene": scene_path} | ({"session": session_file} if session_file else {})
-    provenance = Provenance("simulate", {"model": simulated.truth["model"]}, inputs=hash_inputs(**files), seed=used)
-    scan = with_session(simulated.scan, session_file)
-    write_scan(output, scan, provenance=provenance, truth=simulated.truth, force=force)
-    lumps = [*map(_bump_line, scene.lumps), *map(_tissue_line, scene.solid_lumps)]
-    found = [*(lumps or ["no lump"]), *map(_rib_line, scene.ribs)]
-    return [
-        f"{output}: scan, seed {used}",
-        *describe_scan(simulated.scan),
-        f"model {_model(simulated.truth)}",
-        *([f"head: {simulated.truth['head']}"] if "head" in simulated.truth else []),
-        *found,
-    ]
+        made = simulate(drawn, rng=np.random.default_rng(used), fidelity=fidelity, head=head, progress=progress)
+    files = {"scene": scene} | ({"session": session_file} if session_file else {})
+    provenance = Provenance("simulate", {"model": made.truth["model"]}, inputs=hash_inputs(**files), seed=used)
+    write_scan(output, with_session(made.scan, session_file), provenance=provenance, truth=made.truth, force=force)
+    shape = f": {made.truth['shape']}" if made.truth.get("shape") else ""
+    lines = [f"{output}: scan, seed {used}", *describe_scan(made.scan), f"model {made.truth['model']}{shape}"]
+    lines += [f"head: {made.truth['head']}"] if "head" in made.truth else []
+    for line in (*lines, *_scene_lines(drawn), RESEARCH_USE):
+        click.echo(line)
 
 
-def _model(truth: Mapping[str, Any]) -> str:
-    shape = truth.get("shape")
-    return str(truth["model"]) + (f": {shape}" if shape else "")
-
-
-def _rib_line(rib: Rib) -> str:
-    where = f"{rib.depth_mm:g} mm deep, {rib.spacing_mm:g} mm apart along x"
-    return f"rib at y {rib.y_mm:g} mm: {len(rib.balls())} balls of {rib.d_mm:g} mm, {where}"
-
-
-def _bump_line(lump: Lump) -> str:
-    declared = "" if lump.d_mm is None else f", d {lump.d_mm:g} mm"
-    widths = f"sigma {lump.sigma_x_mm:g} x {lump.sigma_y_mm:g} mm"
-    return f"lump at {lump.x_mm:g}, {lump.y_mm:g} mm: amplitude {lump.amplitude:g}, {widths}{declared}"
-
-
-def _tissue_line(lump: SolidLump) -> str:
-    size = f"d {lump.d_mm:g} mm"
-    size += "" if lump.height_mm is None else f", {lump.height_mm:g} mm high"
-    where = f"h/d {lump.depth_ratio:g}"
-    return f"lump at {lump.x_mm:g}, {lump.y_mm:g} mm: {size}, {where}, {lump.stiffness_ratio:g} times as stiff as fat"
+def _scene_lines(scene: Scene) -> Iterator[str]:
+    """The lumps and ribs of a scene, one a line."""
+    for lump in scene.lumps:
+        declared = "" if lump.d_mm is None else f", d {lump.d_mm:g} mm"
+        widths = f"sigma {lump.sigma_x_mm:g} x {lump.sigma_y_mm:g} mm"
+        yield f"lump at {lump.x_mm:g}, {lump.y_mm:g} mm: amplitude {lump.amplitude:g}, {widths}{declared}"
+    for ball in scene.solid_lumps:
+        size = f"d {ball.d_mm:g} mm" + ("" if ball.height_mm is None else f", {ball.height_mm:g} mm high")
+        where = f"h/d {ball.depth_ratio:g}, {ball.stiffness_ratio:g} times as stiff as fat"
+        yield f"lump at {ball.x_mm:g}, {ball.y_mm:g} mm: {size}, {where}"
+    if not (scene.lumps or scene.solid_lumps):
+        yield "no lump"
+    for rib in scene.ribs:
+        where = f"{rib.depth_mm:g} mm deep, {rib.spacing_mm:g} mm apart along x"
+        yield f"rib at y {rib.y_mm:g} mm: {len(rib.balls())} balls of {rib.d_mm:g} mm, {where}"
 
 
 # --- `population`: simulate, map and fit exams of varied bodies: the table for a size calibration.
@@ -153,10 +125,9 @@ def population_action(
         **as_settings(bodies, exams),
         "head": as_dict(simulated),
     }
-    kept = output.with_name(f"{output.name}.unfinished")
     with (
         open_executor(workers=workers, cluster=scheduler) as executor,
-        open_store(kept, settings=settings, encode=_encode, decode=_decode) as store,
+        open_unfinished(output, list[MassRow], settings=settings) as store,
         progress_bar("masses") as progress,
     ):
         outcomes = run_batch(
@@ -177,20 +148,20 @@ def population_action(
             progress=progress,
         )
     rows = [row for outcome in outcomes for row in outcome.value or []]
-    write_text(output, table_text(rows), force=force)
+    lines = (as_dict(row).values() for row in rows)
+    write_text(output, csv_text(names_of(MassRow), lines, digits=8), force=force)
     failed = [outcome for outcome in outcomes if not outcome.ok]
     for line in fault_lines(failed):
         click.echo(f"could not be simulated: mass {line}", err=True)
     if not failed:
-        kept.unlink(missing_ok=True)
+        unfinished(output).unlink(missing_ok=True)
     found = sum(row.detected for row in rows)
     done = len(outcomes) - len(failed)
     click.echo(f"{output}: {done} masses, {len(rows)} exams, a lump found in {found}, seed {asked.seed}")
     click.echo(RESEARCH_USE)
     if failed:
-        raise TactileBayesError(
-            f"{len(failed)} of {len(outcomes)} masses are missing; {kept} keeps the others: run again"
-        )
+        missing = f"{len(failed)} of {len(outcomes)} masses are missing"
+        raise TactileBayesError(f"{missing}; {unfinished(output)} keeps the others: run again")
 
 
 def rows_of_mass(
@@ -214,19 +185,6 @@ def rows_of_mass(
         scan=lambda scene: simulate(scene, rng=np.random.default_rng(scene.seed)).scan,
         normalise=normalise,
     )
-
-
-def _encode(rows: list[MassRow]) -> list[dict[str, Any]]:
-    return [as_dict(row) for row in rows]
-
-
-def _decode(rows: list[dict[str, Any]]) -> list[MassRow]:
-    return [MassRow(**row) for row in rows]
-
-
-def table_text(rows: list[MassRow]) -> str:
-    """CSV of the rows, with the header of `data_schema/population.table.json`."""
-    return csv_text(names_of(MassRow), (as_dict(row).values() for row in rows), digits=8)
 
 
 # --- `sbc`: simulation-based calibration of a map's posterior.
@@ -264,14 +222,18 @@ def sbc_action(
     found = [outcome.value for outcome in outcomes if outcome.value is not None]
     if output is not None:
         write_text(output, table_text(found), force=force)
-    failed = _finish(outcomes, output)
+    failed = [outcome for outcome in outcomes if not outcome.ok]
+    for line in fault_lines(failed):
+        click.echo(f"could not be estimated: map {line}", err=True)
+    if output is not None and not failed:
+        unfinished(output).unlink(missing_ok=True)
     try:
         if figure is not None:
             sbc_figure(found, figure, force=force)
     finally:  # what was computed is not lost with the figure
         report(found, speed)
     if failed:
-        raise TactileBayesError(f"{failed} of {len(outcomes)} maps are missing from this report")
+        raise TactileBayesError(f"{len(failed)} of {len(outcomes)} maps are missing from this report")
 
 
 def _run_sbc(
@@ -283,11 +245,11 @@ def _run_sbc(
     output: Path | None,
 ) -> tuple[list[Outcome[MapRanks]], int]:
     """Outcomes of all maps, and the number that this run made."""
-    from tactile_bayes.studies.sbc import settings
+    from tactile_bayes.studies.sbc import MapRanks, settings
 
     with (
         open_executor(workers=workers, cluster=scheduler) as executor,
-        _open_kept(output, settings(size=DEFAULT, **how)) as store,
+        open_unfinished(output, MapRanks, settings=settings(size=DEFAULT, **how)) as store,
         progress_bar("maps") as progress,
     ):
         had = 0 if store is None else len(store.values)
@@ -315,34 +277,3 @@ def _shipped() -> BodyCalibration:
     calibration = None if path is None else read_size_calibration(path)
     assert isinstance(calibration, BodyCalibration)
     return calibration
-
-
-def _kept(output: Path) -> Path:
-    return output.with_name(f"{output.name}.unfinished")
-
-
-@contextmanager
-def _open_kept(output: Path | None, settings: dict[str, Any]) -> Iterator[BatchStore | None]:
-    """Open the store of results beside the output; None without an output."""
-    if output is None:
-        yield None
-        return
-    with open_store(_kept(output), settings=settings, encode=as_dict, decode=_decode_ranks) as store:
-        yield store
-
-
-def _finish(outcomes: list[Outcome[MapRanks]], output: Path | None) -> int:
-    """Report maps that failed; if none did, remove the stored results."""
-    failed = [outcome for outcome in outcomes if not outcome.ok]
-    for line in fault_lines(failed):
-        click.echo(f"could not be estimated: map {line}", err=True)
-    if output is not None and not failed:
-        _kept(output).unlink(missing_ok=True)
-    return len(failed)
-
-
-def _decode_ranks(value: dict[str, Any]) -> MapRanks:
-    from tactile_bayes.studies.sbc import MapRanks, Truth
-
-    ranks = None if value["ranks"] is None else tuple(value["ranks"])
-    return MapRanks(value["index"], Truth(**value["truth"]), ranks, value["outcome"], value["probability"])

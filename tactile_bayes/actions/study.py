@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Executor
-from contextlib import nullcontext
 from functools import partial
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +14,9 @@ import click
 import numpy as np
 
 from tactile_bayes.batch import BatchInterrupted, Outcome, open_executor, run_batch
-from tactile_bayes.batch_store import BatchStore, open_store
+from tactile_bayes.batch_store import open_unfinished, unfinished
 from tactile_bayes.commands.progress import progress_bar
-from tactile_bayes.declarations import as_dict, names_of
+from tactile_bayes.declarations import names_of
 from tactile_bayes.errors import BadDataError, TactileBayesError, UsageError
 from tactile_bayes.files.atomic import refuse_existing, write_text
 from tactile_bayes.files.documents import dump_json
@@ -175,7 +175,7 @@ def study_action(
         click.echo(table_text(rows), nl=False)
     else:
         write_text(output, table_text(rows), force=force)
-        store_path(output).unlink(missing_ok=True)
+        unfinished(output).unlink(missing_ok=True)
     click.echo(study_text(rows), err=output is None)
     if figures is not None:
         drawn = draw_figures(
@@ -227,46 +227,26 @@ def run_study(
     """Compute all rows, in order of the geometries; finished ones are stored beside `output`."""
     for geometry in geometries:
         settings.body(geometry.d_mm, geometry.depth_ratio, seat=geometry.seat)
-    opened = (
-        nullcontext(None)
-        if output is None
-        else open_store(store_path(output), settings=settings.as_dict(), encode=_encode, decode=_decode)
+    work: Callable[[Geometry], list[StudyRow]] = (
+        partial(run_geometry, settings=settings, fit=fit_line)
+        if isinstance(settings, StudySettings)
+        else partial(run_solid_geometry, settings=settings, fit=fit_raster)
     )
-    with opened as store:
-        return _run_all(geometries, settings=settings, executor=executor, store=store)
-
-
-def _rows_of(settings: StudySettings | SolidSettings) -> Callable[[Geometry], list[StudyRow]]:
-    """Function that computes a geometry's rows, importable by name in another process."""
-    if isinstance(settings, StudySettings):
-        return partial(run_geometry, settings=settings, fit=fit_line)
-    return partial(run_solid_geometry, settings=settings, fit=fit_raster)
-
-
-def _run_all(
-    geometries: list[Geometry],
-    *,
-    settings: StudySettings | SolidSettings,
-    executor: Executor,
-    store: BatchStore | None,
-) -> list[StudyRow]:
-    try:
-        with progress_bar("geometries") as progress:
+    with (
+        open_unfinished(output, list[StudyRow], settings=settings.as_dict()) as store,
+        progress_bar("geometries") as progress,
+    ):
+        try:
             outcomes = run_batch(
-                _rows_of(settings),
-                geometries,
-                key=lambda geometry: geometry.key,
-                executor=executor,
-                store=store,
-                progress=progress,
+                work, geometries, key=attrgetter("key"), executor=executor, store=store, progress=progress
             )
-    except BatchInterrupted as stop:
-        if store is None:
-            click.echo(table_text(_rows(stop.outcomes)), nl=False)
-        raise
+        except BatchInterrupted as stop:
+            if output is None:  # else the next run goes on
+                click.echo(table_text(_rows(stop.outcomes)), nl=False)
+            raise
     failed = [outcome for outcome in outcomes if not outcome.ok]
     if failed:
-        if store is None:
+        if output is None:
             click.echo(table_text(_rows(outcomes)), nl=False)
         raise TactileBayesError(
             f"{len(failed)} of {len(outcomes)} geometries failed, the first ({failed[0].key}): {failed[0].error}"
@@ -275,21 +255,8 @@ def _run_all(
 
 
 def _rows(outcomes: Iterable[Outcome[list[StudyRow]]]) -> list[StudyRow]:
-    """Rows of the finished geometries; without an output file they are printed even if others failed."""
+    """Rows of the finished geometries."""
     return [row for outcome in outcomes for row in outcome.value or []]
-
-
-def store_path(output: Path) -> Path:
-    """Path of an unfinished study's results."""
-    return output.with_name(f"{output.name}.unfinished")
-
-
-def _encode(rows: list[StudyRow]) -> list[dict[str, Any]]:
-    return [as_dict(row) for row in rows]
-
-
-def _decode(rows: list[dict[str, Any]]) -> list[StudyRow]:
-    return [StudyRow(**row) for row in rows]
 
 
 def fit_line(line: TactileLine, radius_mm: float) -> LineFit:
@@ -372,7 +339,7 @@ def head_uniformity_action(
     section = SectionOptions(head_radius_mm=head_radius_mm, shoulder_mm=shoulder_mm)
     found, limit = uniformity(_section(section, head), body), body.limit_percent / 100
     if as_json:
-        _print_json(uniformity_document(found, body, limit=limit))
+        click.echo(json.dumps(uniformity_document(found, body, limit=limit), indent=2))
         return
     click.echo(uniformity_text(found, body, limit=limit))
     click.echo(RESEARCH_USE)
@@ -388,7 +355,7 @@ def head_design_action(*, head: str | None, figure: Path | None, as_json: bool, 
     if figure is not None:
         design_figure(found, body, limit=limit, path=figure, force=force)
     if as_json:
-        _print_json(design_document(found, body, limit=limit))
+        click.echo(json.dumps(design_document(found, body, limit=limit), indent=2))
     else:
         click.echo(design_text(found, body, limit=limit))
         click.echo(RESEARCH_USE)
@@ -399,10 +366,6 @@ def head_design_action(*, head: str | None, figure: Path | None, as_json: bool, 
             f"{named(best.head)}, reaches {100 * best.worst:.1f} %; give a larger --limit-percent, narrower ranges or "
             "another --thickness-mm"
         )
-
-
-def _print_json(document: dict[str, object]) -> None:
-    click.echo(json.dumps(document, indent=2))
 
 
 # --- `compare-model`: a scan's frames and map against a forward model of a scene (section 2.3 of the paper).

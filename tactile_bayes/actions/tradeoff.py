@@ -10,7 +10,7 @@ import time
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import click
 
@@ -32,14 +32,20 @@ from tactile_bayes.files.scene_toml import read_scene
 from tactile_bayes.files.size_json import read_size_calibration, size_calibration_path
 from tactile_bayes.forward.scene import Scene
 from tactile_bayes.forward.tissue import SceneBody, SolidLump
+from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.laboratory import TradeoffReport, draw_tradeoff, tradeoff_document, tradeoff_text
 from tactile_bayes.report.tradeoff import DIGITS, draw_ladder, ladder_file, ladder_text
-from tactile_bayes.studies.estimate_tradeoff import SIZE, PooledRow, SizeAnswer, Work, measure
+from tactile_bayes.scan import Scan
+from tactile_bayes.size.pooling import Calibration, PooledEstimate
+from tactile_bayes.studies.estimate_tradeoff import SIZE, Clock, Ladder, PooledRow, SizeAnswer, Work, measure
 from tactile_bayes.studies.paper_solid import fit_raster
 from tactile_bayes.studies.tradeoffs import (
     PLANE,
     SOLID,
+    LumpCase,
+    Measured,
+    SizeRule,
     calibrated_rule,
     case_of,
     forward_settings,
@@ -264,8 +270,6 @@ def tradeoff_estimate_action(
     force: bool,
 ) -> None:
     """Measure what each setting of `estimate` costs on a map, and how far its size interval is off."""
-    if size_calibration is not None:
-        also_read(size_calibration_path(size_calibration))
     if figure is not None:
         refuse_existing(figure, force=force)
     if twice := given_twice(maps):

@@ -6,7 +6,7 @@ import shlex
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
@@ -71,11 +71,10 @@ def _settings(given: dict[str, Any], protocol: Path | None) -> tuple[str | None,
     """Title and settings of the protocol, if there is one; refuses options that contradict it."""
     if protocol is None:
         return None, TrialSettings(**given)
-    context = click.get_current_context()
     title, fixed = read_protocol(protocol)
+    typed = typed_options()
     for name, value in fixed.items():
-        typed = context.get_parameter_source(name) is click.core.ParameterSource.COMMANDLINE
-        if typed and given[name] != value:
+        if name in typed and given[name] != value:
             option = f"--{name.replace('_', '-')} {given[name]}"
             raise UsageError(f"{option} contradicts {protocol}, which fixes {name} = {value}; leave the option out")
     return title, TrialSettings(**(given | fixed))
@@ -171,20 +170,14 @@ def _say_found(found: Found, output: Path, before: Sequence[Mapping[str, str]] |
     nameless = sum(not row["patient"] for row in rows)
     if nameless:
         click.echo(f"{nameless} of them do not say whose they are: fill in the column patient")
-    elif told := _to_correct(output):
-        click.echo(f"to correct before the run: {told}")
+    else:
+        try:
+            read_manifest(output)
+        except BadDataError as error:
+            click.echo(f"to correct before the run: {error}")
     folder = shlex.quote(str(output.with_name("out")))
     click.echo(f"next: tactile-bayes campaign run {shlex.quote(str(output))} -o {folder} --dry-run")
     click.echo(RESEARCH_USE)
-
-
-def _to_correct(output: Path) -> str:
-    """Why `campaign run` would refuse the table; empty where it would take it."""
-    try:
-        read_manifest(output)
-    except BadDataError as error:
-        return str(error)
-    return ""
 
 
 def campaign_run_action(

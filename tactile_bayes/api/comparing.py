@@ -17,21 +17,27 @@ from tactile_bayes.api.pooled import common_calibration, one_mass, place_of
 from tactile_bayes.api.repeatability import check_repeatability, repeatability_digest
 from tactile_bayes.api.settings import GROWN_BY, Comparing, Settings, refuse_checkpoint, times_of
 from tactile_bayes.api.sized import Answer, SizeEstimate, size_priors
-from tactile_bayes.declarations import Record, replace
+from tactile_bayes.declarations import Record, as_dict, replace
 from tactile_bayes.errors import EXIT_DONE, EXIT_NO_ESTIMATE, UsageError
 from tactile_bayes.files.comparison import CompareReport
 from tactile_bayes.files.provenance import Provenance, hash_inputs, repeated_scans, scans_of
 from tactile_bayes.files.reports import centre_of
 from tactile_bayes.findings import Finding, Verdict, by_weight, finding_lines, verdict
 from tactile_bayes.inference.draws import Draws
+from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.presets import REGISTRATION_MM, RESEARCH_USE
 from tactile_bayes.report.compare import compare_report, compare_summary, compare_text
 from tactile_bayes.report.estimate_figures import DrawnMap, draw_comparison
 from tactile_bayes.report.pooled import disagreement, fat_apart
-from tactile_bayes.size.fat import LEAST_PROBABILITY, one_size_of
-from tactile_bayes.size.pooling import MOST_INVALID, log_sizes
+from tactile_bayes.size.bodies import BodyCalibration
+from tactile_bayes.size.draws import ShapeDraws
+from tactile_bayes.size.fat import LEAST_PROBABILITY, BetweenMaps, one_size_of
+from tactile_bayes.size.pooling import MOST_INVALID, SizePriors, log_sizes
 from tactile_bayes.size.visits import (
+    Apart,
+    Change,
     Compared,
+    JointSizes,
     Place,
     apart,
     contradictions,
@@ -42,14 +48,6 @@ from tactile_bayes.size.visits import (
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-    from tactile_bayes.mapping.map import TactileMap
-    from tactile_bayes.report.estimate_figures import DrawnMap
-    from tactile_bayes.size.bodies import BodyCalibration
-    from tactile_bayes.size.draws import ShapeDraws
-    from tactile_bayes.size.fat import BetweenMaps
-    from tactile_bayes.size.pooling import SizePriors
-    from tactile_bayes.size.visits import Apart, Change, Compared, JointSizes
 
 
 # --- Two visits and more compared: whether they are of one mass, and the change of its size.
@@ -182,14 +180,17 @@ def compare_answers(
     if settings.size_calibration == "none":
         raise UsageError("a comparison needs a size calibration; leave out --size-calibration none")
     every = list(chain.from_iterable(visits))
-    path, calibration = common_calibration(every, settings, names=list(chain.from_iterable(names)))
-    _refuse_repeated(visits, list(chain.from_iterable(names)))
+    named = list(chain.from_iterable(names))
+    path, calibration = common_calibration(every, settings, names=named)
+    for index, earlier in repeated_scans([_scans([one]) for one in every]).items():  # they are no two exams
+        raise UsageError(f"{named[index]} and {named[earlier]} are of one scan; give one map of each scan")
     digests = hash_inputs(**inputs, **({"size_calibration": path} if path else {})) | repeatability_digest(settings)
     check_repeatability(settings, calibration, digests)
     compared = _compared(visits, calibration, settings, comparing)
     compared = replace(compared, findings=by_weight((*compared.findings, *_of_visits(visits))))
     scans = [scan for one in visits for scan in _scans(one)]
-    provenance = Provenance("compare", _recorded(settings, comparing), digests, seed=settings.seed, scans=scans)
+    recorded = {name: value for name, value in settings.recorded().items() if name in _RECORDED}
+    provenance = Provenance("compare", recorded | as_dict(comparing), digests, seed=settings.seed, scans=scans)
     report = compare_report(
         compared,
         [[answer.report for answer in one if answer.report is not None] for one in visits],
@@ -311,10 +312,12 @@ def _sized(
     if np.isnan(sizes.log_size).mean() > MOST_INVALID:
         return Compared("no_estimate", "too many draws have no positive size", "", apart)
     outside = _by_visit(shapes, [one.outside for one in fitted])
+    fat = calibration.depth
+    depths = None if fat is None else fat.apart([one.profile for maps in shapes for one in maps])
     findings = [
         *doubts,
         *(Finding("outside_calibration", f"outside the calibration's range: {text}") for text in outside),
-        *_fat_apart(shapes, calibration),
+        *([] if depths is None else [fat_apart(depths)]),
         *_sizes_apart(shapes, fitted, priors),
     ]
     another = None if priors.another_exam is None else joint(priors.another_exam)
@@ -346,13 +349,6 @@ def _sizes_apart(
     return found
 
 
-def _fat_apart(shapes: Sequence[Sequence[ShapeDraws]], calibration: BodyCalibration) -> list[Finding]:
-    """Caution where the maps differ too much in the depth of fat to be of one breast."""
-    fat = calibration.depth
-    depths = None if fat is None else fat.apart([one.profile for maps in shapes for one in maps])
-    return [] if depths is None else [fat_apart(depths)]
-
-
 def _of_visits(visits: Sequence[Sequence[Answer]]) -> list[Finding]:
     """What speaks against the maps of each visit; a size alone outside its calibration is judged anew."""
     return [
@@ -364,29 +360,11 @@ def _of_visits(visits: Sequence[Sequence[Answer]]) -> list[Finding]:
     ]
 
 
-def _refuse_repeated(visits: Sequence[Sequence[Answer]], names: Sequence[str]) -> None:
-    """Refuse two maps of one scan: they are no two exams, and less apart than those would be."""
-    for index, earlier in repeated_scans([_scans([one]) for one in chain.from_iterable(visits)]).items():
-        raise UsageError(f"{names[index]} and {names[earlier]} are of one scan; give one map of each scan")
-
-
 def _scans(answers: Sequence[Answer]) -> list[Mapping[str, str]]:
     return [scan for one in answers if one.report is not None for scan in scans_of(one.report.provenance)]
 
 
 _RECORDED = ("size_calibration", "method", "interval", "scene", "between_map_sd", "repeatability")
-
-
-def _recorded(settings: Settings, comparing: Comparing) -> dict[str, Any]:
-    """Settings for the provenance."""
-    plain = settings.recorded()
-    return {
-        **{name: plain[name] for name in _RECORDED if name in plain},
-        "days": None if comparing.days is None else list(comparing.days),
-        "grown_by": list(comparing.grown_by),
-        "same_mass": comparing.same_mass,
-        "registration_mm": comparing.registration_mm,
-    }
 
 
 @door

@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any
 
 import numpy as np
 
@@ -15,13 +15,9 @@ from tactile_bayes.api.maps import Map, map_of, path_of
 from tactile_bayes.api.pooled import PooledSize, pool_estimates
 from tactile_bayes.api.settings import Settings, refuse_checkpoint
 from tactile_bayes.api.sized import SizeEstimate
-from tactile_bayes.declarations import names_of, replace
+from tactile_bayes.declarations import default_of, names_of, replace
 from tactile_bayes.errors import UsageError, check_number
 from tactile_bayes.files.size_json import read_repeatability
-
-if TYPE_CHECKING:
-    from tactile_bayes.size.pooling import Repeatability
-
 
 _KEYWORDS = tuple(name for name in names_of(Settings) if name != "settings_file")
 
@@ -30,24 +26,18 @@ def settings_of(options: Mapping[str, Any]) -> Settings:
     """Make settings from keywords; the defaults are the command line's."""
     check_keywords("estimate", options, _KEYWORDS)
     given = {name: plain(value) for name, value in options.items()}
-    if "size_calibration" in given:
-        given["size_calibration"] = _calibration(given["size_calibration"])
+    calibration, repeatability = given.get("size_calibration"), given.get("repeatability")
+    if not (calibration is None or isinstance(calibration, str) or hasattr(calibration, "recipe")):
+        given["size_calibration"] = str(path_of(calibration))
     if "known" in given:
         given["known"] = _properties(given["known"])
-    if "repeatability" in given:
-        given["repeatability"] = _repeatability(given["repeatability"])
+    if not (repeatability is None or hasattr(repeatability, "between_maps")):
+        given["repeatability"] = read_repeatability(path_of(repeatability))
     if "checkpoint" in given:
         given["checkpoint"] = path_of(given["checkpoint"])
     if isinstance(given.get("centre_mm"), Sequence | np.ndarray) and not isinstance(given["centre_mm"], str):
         given["centre_mm"] = tuple(plain(one) for one in given["centre_mm"])
     return Settings(**given)
-
-
-def _calibration(given: Any) -> Any:
-    """A name, or the calibration itself."""
-    if given is None or isinstance(given, str) or hasattr(given, "recipe"):
-        return given
-    return str(path_of(given))
 
 
 def _properties(given: Any) -> tuple[tuple[str, float], ...]:
@@ -58,12 +48,6 @@ def _properties(given: Any) -> tuple[tuple[str, float], ...]:
     for name, value in pairs:
         check_number(f"known {name}", value)
     return tuple((str(name), plain(value)) for name, value in pairs)
-
-
-def _repeatability(given: Any) -> Repeatability | None:
-    if given is None or hasattr(given, "between_maps"):
-        return cast("Repeatability | None", given)
-    return read_repeatability(path_of(given))
 
 
 @door
@@ -129,7 +113,9 @@ def pool(maps: Iterable[Any], **settings: Any) -> PooledSize:
     """
     used = settings_of(settings)
     refuse_checkpoint(used)
-    found = estimated(_several(maps), settings)
+    if isinstance(maps, str | Path | Map | SizeEstimate | PooledSize):
+        raise UsageError("pool takes several maps; give a list")
+    found = estimated(sequence_of("maps", maps, "maps, paths or estimates"), settings)
     if not found:
         raise UsageError("there is no map to pool; give at least one")
     prints = [one.tactile_map.fingerprint for one in found]
@@ -151,20 +137,10 @@ def listed(given: Any) -> list[Any]:
     return list(sequence_of("files", given, "maps, estimates or paths"))
 
 
-def _several(maps: Iterable[Any]) -> Sequence[Any]:
-    if isinstance(maps, str | Path | Map | SizeEstimate | PooledSize):
-        raise UsageError("pool takes several maps; give a list")
-    return sequence_of("maps", maps, "maps, paths or estimates")
-
-
-def _signature() -> inspect.Signature:
-    """The signature of `estimate` with every setting and its default, for help and completion."""
-    defaults = Settings()
-    more = [
-        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=getattr(defaults, name)) for name in _KEYWORDS
+# every setting and its default, for help and completion
+estimate.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
+    [
+        *(one for one in inspect.signature(estimate).parameters.values() if one.kind is not one.VAR_KEYWORD),
+        *(inspect.Parameter(n, inspect.Parameter.KEYWORD_ONLY, default=default_of(Settings, n)) for n in _KEYWORDS),
     ]
-    first = [one for one in inspect.signature(estimate).parameters.values() if one.kind is not one.VAR_KEYWORD]
-    return inspect.Signature([*first, *more])
-
-
-estimate.__signature__ = _signature()  # type: ignore[attr-defined]
+)

@@ -143,7 +143,9 @@ def estimate_one(
     recorded = settings.recorded(size_calibration=named, **used_fit)
     recorded = {name: value for name, value in recorded.items() if name not in _UNRECORDED}
     provenance = Provenance("estimate", recorded, digests, seed=settings.seed, scans=scans)
-    return SizeEstimate(tactile_map, estimate, provenance, settings, used)
+    return SizeEstimate(
+        tactile_map=tactile_map, estimate=estimate, provenance=provenance, settings=settings, calibration=used
+    )
 
 
 def _with_place(

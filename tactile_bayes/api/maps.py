@@ -17,7 +17,9 @@ from tactile_bayes.files.atomic import Format, check_suffix, sha256
 from tactile_bayes.files.map_nc import read_map_and_scans, write_map
 from tactile_bayes.files.provenance import Provenance, repeated_scans, scan_facts
 from tactile_bayes.files.scene_toml import read_scene
-from tactile_bayes.findings import finding_lines
+from tactile_bayes.findings import Finding, finding_lines
+from tactile_bayes.forward.instrument import SimulatedScan
+from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.build import build_map as build
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.options import MapOptions
@@ -28,13 +30,6 @@ from tactile_bayes.scan import Scan
 if TYPE_CHECKING:
     import pandas
     from matplotlib.figure import Figure
-
-    from tactile_bayes.files.provenance import Provenance
-    from tactile_bayes.findings import Finding
-    from tactile_bayes.forward.instrument import SimulatedScan
-    from tactile_bayes.geometry import FloatArray
-    from tactile_bayes.mapping.map import TactileMap
-    from tactile_bayes.scan import Scan
 
 
 # --- Conversion of paths that Python callers give as str or Path.
@@ -95,15 +90,7 @@ def output_path(given: PathLike, written: Format) -> Path:
 
 
 def map_provenance(paths: Sequence[Path], scans: Sequence[Scan], settings: Mapping[str, Any]) -> Provenance:
-    """Provenance of a map: its settings, the scans' digests, and what the scans say of their exam.
-
-    Parameters
-    ----------
-    paths, scans
-        The files, and what was read from each.
-    settings
-        By the names of the command's options.
-    """
+    """Provenance of a map: its settings, the scans' digests, and what the scans say of their exam."""
     facts = exam_facts(paths, scans)
     inputs = {f"scan_{number}": fact["sha256"] for number, fact in enumerate(facts, start=1)}
     return Provenance("map", settings, inputs, scans=facts)
@@ -189,7 +176,9 @@ class Map(Record, eq=False):
         UsageError
             When the file exists and `force` is false.
         """
-        write_map(output_path(path, "netCDF"), self.tactile_map, provenance=_provenance(self), force=force)
+        made = {"called_from": "Python", **as_dict(self.tactile_map.recipe)}
+        provenance = Provenance("map", made, scans=self.scans)
+        write_map(output_path(path, "netCDF"), self.tactile_map, provenance=provenance, force=force)
 
     def __repr__(self) -> str:
         found = self.tactile_map
@@ -256,24 +245,19 @@ def build_map(scans: Any, **options: Any) -> Map:
         if isinstance(one, str | Path):
             loaded.append(read_scan(one))
             facts += exam_facts([path_of(one)], loaded[-1:])
-        else:
-            scan = _scan_of(one)
-            loaded.append(scan)
-            facts.append(scan_facts(scan.session, frames=scan.frames.sha256))
+            continue
+        scan = getattr(one, "scan", one)
+        if not isinstance(scan, Scan):
+            way_out = "read one with read_scan, or bring arrays in with `import`"
+            raise UsageError(f"a scan is wanted, not {type(one).__name__}; {way_out}")
+        loaded.append(scan)
+        facts.append(scan_facts(scan.session, frames=scan.frames.sha256))
     for later, earlier in repeated_scans([[one] for one in facts]).items():
         raise UsageError(
             f"scan {later + 1} is the recording of scan {earlier + 1}, whose frames would count twice; give it once"
         )
     made = build(loaded, **{name: plain(value) for name, value in options.items()})
     return Map(made, scans=tuple(facts))
-
-
-def _scan_of(given: Any) -> Scan:
-    scan = getattr(given, "scan", given)
-    if not isinstance(scan, Scan):
-        kind = type(given).__name__
-        raise UsageError(f"a scan is wanted, not {kind}; read one with read_scan, or bring arrays in with `import`")
-    return scan
 
 
 @door
@@ -332,7 +316,3 @@ def map_of(given: Any) -> Map:
     if isinstance(given, list | tuple):
         way_out = "give one map after the other, or pool the maps of one mass with pool"
     raise UsageError(f"a map is wanted, not {type(given).__name__}; {way_out}")
-
-
-def _provenance(made: Map) -> Provenance:
-    return Provenance("map", {"called_from": "Python", **as_dict(made.tactile_map.recipe)}, scans=made.scans)

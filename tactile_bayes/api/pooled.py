@@ -19,7 +19,7 @@ from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.map_nc import write_pooled
 from tactile_bayes.files.provenance import Provenance, hash_inputs, scans_of
-from tactile_bayes.files.reports import EstimateReport, MassReport, Place, PooledReport
+from tactile_bayes.files.reports import EstimateReport, PooledReport
 from tactile_bayes.files.size_json import default_for, read_size_calibration, size_calibration_path
 from tactile_bayes.findings import Finding
 from tactile_bayes.options import PRIORS
@@ -131,18 +131,22 @@ def _masses(reports: Sequence[EstimateReport | None]) -> dict[int, list[_Mass]] 
     found: dict[int, list[_Mass]] = {}
     for i, report in enumerate(reports):
         listed = () if report is None else report.masses
-        placed = [_mass(one, one.centre_patient_mm) for one in listed if one.centre_patient_mm is not None]
+        placed = [
+            _Mass(
+                one.centre_patient_mm.median,
+                one.centre_mm.median,
+                one.max_size_mm is not None,
+                one.reported,
+                0.0 if one.amplitude is None else one.amplitude.median,
+            )
+            for one in listed
+            if one.centre_patient_mm is not None
+        ]
         if len(placed) < len(listed):
             return None
         if placed:
             found[i] = placed
     return found
-
-
-def _mass(mass: MassReport, patient_mm: Place) -> _Mass:
-    height = 0.0 if mass.amplitude is None else mass.amplitude.median
-    sized = mass.max_size_mm is not None
-    return _Mass(patient_mm.median, mass.centre_mm.median, sized, mass.reported, height)
 
 
 def _common(maps: Mapping[int, Sequence[_Mass]]) -> _Mass | None:
@@ -175,26 +179,14 @@ def place_of(report: EstimateReport | None) -> PatientPlace | None:
 # --- One size from several maps of one mass.
 
 
-class PooledSize(SizedExam, eq=False, dict=True):
+class PooledSize(SizedExam, eq=False, dict=True, kw_only=True):
     """One size from several maps of one mass."""
 
     pooled: PooledEstimate
     """The size with what the maps together say of it, or why there is none."""
     pooled_report: PooledReport
-    provenance: Provenance
-    settings: Settings
     maps: tuple[SizeEstimate, ...] = ()
     """The estimates of the maps alone, where they are at hand."""
-    name: str = ""
-
-    @property
-    def probability(self) -> float:
-        """Of the intervals that are shown where none is asked for."""
-        return self.settings.interval
-
-    @property
-    def _interval(self) -> float:
-        return self.settings.interval
 
     @property
     def _size(self) -> SizePosterior | None:
@@ -260,21 +252,22 @@ def pool_answers(
     words = sorted(answer.fingerprint for answer in answers)
     places = [place for one in answers if one.shape is not None and (place := place_of(one.report)) is not None]
     chance = one_place_probability(places) if len(places) > 1 else None
-    pooled = (
-        _too_far(answers)
-        or _none_can_show(reports)
-        or _apart(places, chance)
-        or pool_maps(
-            [answer.shape for answer in answers],
-            calibration=calibration,
-            priors=size_priors(settings),
-            rng=np.random.default_rng([settings.seed, *words]),
-        )
+    pooled = _no_size(answers, places, chance) or pool_maps(
+        [answer.shape for answer in answers],
+        calibration=calibration,
+        priors=size_priors(settings),
+        rng=np.random.default_rng([settings.seed, *words]),
     )
     pooled = replace(pooled, one_place=chance)
     if pooled.status == DISAGREE and pooled.one_size is not None:
-        pooled = replace(pooled, reason=f"{pooled.reason}, {_sizes(reports)}")
-    provenance = Provenance("estimate --pool", _recorded(settings), digests, seed=settings.seed, scans=scans)
+        *first, last = [f"{one.max_size_mm.median:.1f}" for one in reports if one.max_size_mm is not None]
+        sizes = f"{', '.join(first)} and {last}" if first else last
+        pooled = replace(pooled, reason=f"{pooled.reason}, {sizes} mm")
+    # pooled files have the key `calibration`, and the priors together
+    recorded = settings.recorded()
+    prior = {name: recorded.pop(name) for name in PRIORS}
+    recorded = {"calibration": recorded.pop("size_calibration"), **recorded, "prior": prior}
+    provenance = Provenance("estimate --pool", recorded, digests, seed=settings.seed, scans=scans)
     report = pooled_report(
         pooled,
         list(names),
@@ -286,54 +279,37 @@ def pool_answers(
         apart=apart_from_others(reports),
         one_place=one_place(reports),
     )
-    return PooledSize(pooled, report, provenance, settings)
+    return PooledSize(pooled=pooled, pooled_report=report, provenance=provenance, settings=settings)
 
 
-def _too_far(answers: Sequence[Answer]) -> PooledEstimate | None:
-    """Reason for no size where a map is too far outside the calibration's range; else None."""
-    for i, answer in enumerate(answers):
+def _no_size(
+    answers: Sequence[Answer], places: Sequence[PatientPlace], one_place: float | None
+) -> PooledEstimate | None:
+    """Reason for no size: a map too far outside the calibration's range, cells too large, or several masses."""
+    for i, answer in enumerate(answers, start=1):
         if answer.report is not None and answer.report.reason_code == "extrapolated":
-            return PooledEstimate("no_estimate", f"map {i + 1}: {answer.report.reason}")
-    return None
-
-
-def _none_can_show(reports: Sequence[EstimateReport]) -> PooledEstimate | None:
-    """Reason for no size where the cells of all maps are too large to show a lump; else None."""
-    if any(one.reason_code != "coarse" for one in reports):
-        return None
-    return PooledEstimate("no_estimate", "the maps cannot show whether there is a lump: their cells are too large")
-
-
-def _apart(places: Sequence[PatientPlace], chance: float | None) -> PooledEstimate | None:
-    """Reason for no size where landmarks show that the maps are of several masses; else None."""
-    if chance is None or chance >= LEAST_PROBABILITY:
+            return PooledEstimate("no_estimate", f"map {i}: {answer.report.reason}")
+    if all(answer.report is None or answer.report.reason_code == "coarse" for answer in answers):
+        return PooledEstimate("no_estimate", "the maps cannot show whether there is a lump: their cells are too large")
+    if one_place is None or one_place >= LEAST_PROBABILITY:
         return None
     most = max(float(np.hypot(*(a.centre_mm - b.centre_mm))) for a, b in combinations(places, 2))
     return PooledEstimate(DISAGREE, f"by the landmarks the masses of the maps lie up to {most:.0f} mm apart")
 
 
-def _sizes(reports: Sequence[EstimateReport]) -> str:
-    """The maps' own sizes in words."""
-    found = [f"{one.max_size_mm.median:.1f}" for one in reports if one.max_size_mm is not None]
-    return f"{', '.join(found[:-1])} and {found[-1]} mm" if len(found) > 1 else f"{', '.join(found)} mm"
-
-
-def _shipped_for(answers: Sequence[Answer]) -> str:
-    """Shipped calibration for maps that are all normalised alike."""
-    ways = sorted({answer.normalise for answer in answers})
-    if len(ways) > 1:
-        raise BadDataError(
-            f"the maps were normalised in several ways ({', '.join(ways)})",
-            way_out="pool maps made by one recipe: make the others again with `map`",
-        )
-    return default_for(ways[0])
-
-
-def _calibration(answers: Sequence[Answer], settings: Settings) -> tuple[Path | None, BodyCalibration]:
-    """The calibration that pools, and its file if it is in one."""
+def common_calibration(
+    answers: Sequence[Answer], settings: Settings, *, names: Sequence[str]
+) -> tuple[Path | None, BodyCalibration]:
+    """The calibration that sizes all these maps together, and its file if it is in one."""
     path, calibration = None, settings.size_calibration
-    if calibration is None or isinstance(calibration, str):
-        path = size_calibration_path(calibration or _shipped_for(answers))
+    if calibration is None:
+        ways = sorted({answer.normalise for answer in answers})
+        if len(ways) > 1:
+            way_out = "pool maps made by one recipe: make the others again with `map`"
+            raise BadDataError(f"the maps were normalised in several ways ({', '.join(ways)})", way_out=way_out)
+        calibration = default_for(ways[0])
+    if isinstance(calibration, str):
+        path = size_calibration_path(calibration)
         if path is None:
             raise UsageError("--pool needs a size calibration; leave out --size-calibration none")
         calibration = read_size_calibration(path)
@@ -342,29 +318,8 @@ def _calibration(answers: Sequence[Answer], settings: Settings) -> tuple[Path | 
         raise UsageError(
             f"--pool needs a calibration learned over bodies; {what} is of a study or phantoms: use solid or eq6"
         )
-    return path, calibration
-
-
-def _check_heads(answers: Sequence[Answer], calibration: BodyCalibration, names: Sequence[str]) -> None:
-    """Refuse a map that was made with another head than the calibration's."""
     for answer, name in zip(answers, names, strict=True):
-        differs = calibration.recipe.head_differences(answer.head)
-        if differs:
+        if differs := calibration.recipe.head_differences(answer.head):
             what = f"{name}: the calibration is for another head: {'; '.join(differs)}"
             raise BadDataError(what, way_out=way_to_head(answer.head))
-
-
-def _recorded(settings: Settings) -> dict[str, Any]:
-    """Settings by the keys that pooled files have: `calibration`, and the priors together."""
-    plain = settings.recorded()
-    prior = {name: plain.pop(name) for name in PRIORS}
-    return {"calibration": plain.pop("size_calibration"), **plain, "prior": prior}
-
-
-def common_calibration(
-    answers: Sequence[Answer], settings: Settings, *, names: Sequence[str]
-) -> tuple[Path | None, BodyCalibration]:
-    """The calibration that sizes all these maps together, and its file if it is in one."""
-    path, calibration = _calibration(answers, settings)
-    _check_heads(answers, calibration, names)
     return path, calibration

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from tactile_bayes.actions.record import Request, make_recording
 from tactile_bayes.api.arguments import check_keywords, door, plain
 from tactile_bayes.api.maps import PathLike, path_of
 from tactile_bayes.declarations import names_of
 from tactile_bayes.errors import DeviceError, check_number
+from tactile_bayes.hardware.recorder import Report
 from tactile_bayes.options import RecordOptions
-
-if TYPE_CHECKING:
-    from tactile_bayes.hardware.recorder import Report
 
 _PATHS = ("like", "head_geometry", "array_calibration", "landmarks", "tracker_rom", "session_file")
 _RENAMED = {"head": "head_url", "tracker": "tracker_url", "session": "session_file"}

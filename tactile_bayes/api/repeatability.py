@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 
+from tactile_bayes.api.settings import Settings
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.atomic import sha256
@@ -32,13 +33,7 @@ from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.inference.points import normal_quantile
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.learn.site import FEWEST_MASSES, PRIOR_LOG_SD, PRIOR_MEDIAN, RepeatedExams, learn_repeatability
-from tactile_bayes.size.pooling import log_size_alone
-
-if TYPE_CHECKING:
-    from tactile_bayes.api.settings import Settings
-    from tactile_bayes.size.bodies import BodyCalibration
-    from tactile_bayes.size.learn.site import RepeatedExams
-    from tactile_bayes.size.pooling import Calibration, Repeatability
+from tactile_bayes.size.pooling import Calibration, Repeatability, log_size_alone
 
 COMMAND: Final = "calibrate repeatability"
 _AGAIN: Final = "run the campaign again"

@@ -49,18 +49,16 @@ class ExamFiles(Record):
         """Tell maps from estimates, in any order."""
         if twice := given_twice(paths):
             raise UsageError(f"{twice} is given twice; give each file once")
-        estimates = tuple(path for path in paths if _is_json(path) or _is_posterior(path))
+        estimates = tuple(path for path in paths if _is_estimate(path))
         maps = tuple(path for path in paths if path not in estimates)
         if len(estimates) > 1 or (estimates and len(maps) > 1):
             raise UsageError("an estimate goes with one map; several maps are estimated and pooled: give maps alone")
         return cls(maps, estimates)
 
 
-def _is_json(path: Path) -> bool:
-    return path.suffix.lower() == ".json"
-
-
-def _is_posterior(path: Path) -> bool:
+def _is_estimate(path: Path) -> bool:
+    if path.suffix.lower() == ".json":
+        return True
     with open_input(path) as file:
         netcdf = file.read(len(HDF5_MAGIC)) == HDF5_MAGIC
     return netcdf and is_posterior(path)
@@ -77,7 +75,10 @@ def exam_of_files(files: ExamFiles, settings: Settings, given: Given, *, notice:
         return _from_estimate(files.estimates[0], maps[0] if maps else None, given)
     if len(maps) > 1:
         refuse_checkpoint(settings)
-    found = [_estimated(path, settings, notice) for path in maps]
+    found = []
+    for path in maps:
+        tell = None if notice is None else lambda line, path=path: notice(f"{path}: {line}")
+        found.append(estimate_file(path, settings, notice=tell))
     inputs = {f"map_{number}": path for number, path in enumerate(maps, start=1)}
     return exam_of(found, settings, given, inputs=inputs)
 
@@ -92,13 +93,13 @@ def exam_of(
     return given.on(pool_estimates(found, settings, names=names, inputs=inputs or {}).exam())
 
 
-def _estimated(path: Path, settings: Settings, notice: Notice | None) -> SizeEstimate:
-    return estimate_file(path, settings, notice=None if notice is None else lambda line: notice(f"{path}: {line}"))
-
-
 def _from_estimate(source: Path, path: Path | None, given: Given) -> Exam:
     """Exam of an estimate, and of its map where that is given: the estimate must name it by its digest."""
-    report = _read_estimate(source)
+    if source.suffix.lower() == ".json":
+        document = load_json(source, way_out="give what `estimate --json` printed for one map")
+        report = checked_report(document, EstimateReport, path=source)
+    else:
+        report = read_estimate(source)
     scans: Scans = scans_of(report.provenance)
     tactile_map = None
     if path is not None:
@@ -107,14 +108,6 @@ def _from_estimate(source: Path, path: Path | None, given: Given) -> Exam:
         tactile_map, scans = read_map_and_scans(path)
     shown = exam_map(tactile_map, report, side=side_of(scans))
     return given.on(Exam((shown,), None, scans))
-
-
-def _read_estimate(source: Path) -> EstimateReport:
-    """An estimate, from its JSON or its posterior's file."""
-    if not _is_json(source):
-        return read_estimate(source)
-    document = load_json(source, way_out="give what `estimate --json` printed for one map")
-    return checked_report(document, EstimateReport, path=source)
 
 
 # --- The page of an exam from Python.
@@ -265,21 +258,12 @@ def export(
     outputs.check(files=bool(several))
     exported = None
     if several:
-        exported = exported_files(
-            _read_all(several, to),
-            to=to,
-            identity=identity_of(path_of(worklist), identity),
-            id_from_scan=patient_id_from_scan,
-        )
+        read = [_read(one) for one in several]
+        if to == "dicom" and not any(isinstance(one, MapFile) for one in read):  # a report refers to its maps
+            read = [*(_map_file(*one) for estimate in several for one in _maps_of(estimate)), *read]
+        who = identity_of(path_of(worklist), identity)
+        exported = exported_files(read, to=to, identity=who, id_from_scan=patient_id_from_scan)
     return ExportedFiles(outputs.write(exported), () if exported is None else exported.notes)
-
-
-def _read_all(given: Sequence[Any], to: Format) -> list[MapFile | Sequence[EstimateFile]]:
-    """What is exported of all that was given; estimates bring their maps where a report refers to them."""
-    read = [_read(one) for one in given]
-    if to != "dicom" or any(isinstance(one, MapFile) for one in read):
-        return read
-    return [*(_map_file(*one) for estimate in given for one in _maps_of(estimate)), *read]
 
 
 def _read(given: Any) -> MapFile | Sequence[EstimateFile]:

@@ -2,59 +2,30 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from tactile_bayes.api.estimating import estimate_file
 from tactile_bayes.api.settings import Settings
-from tactile_bayes.api.size_calibration import table_recipe
+from tactile_bayes.api.size_calibration import Learned, files_of, header_of, table_recipe
 from tactile_bayes.api.sized import pooling_shape
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.documents import load_json
-from tactile_bayes.files.provenance import Provenance, hash_inputs
-from tactile_bayes.files.reading import open_input
-from tactile_bayes.files.size_json import SHIPPED, read_size_calibration, size_calibration_path, write_size_calibration
-from tactile_bayes.files.tables import read_table
+from tactile_bayes.files.size_json import SHIPPED, read_size_calibration, size_calibration_path
+from tactile_bayes.files.tables import Sheet, Table, read_table
 from tactile_bayes.forward.tissue import parse_seat
 from tactile_bayes.presets import HEAD_PROFILE, LEAST_HARD_RATIO
+from tactile_bayes.progress import Progress
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.draws import BumpDraws, ShapeDraws
 from tactile_bayes.size.learn.site import PhantomMap, correct_calibration
 
-if TYPE_CHECKING:
-    from tactile_bayes.files.tables import Sheet, Table
-    from tactile_bayes.progress import Progress
-    from tactile_bayes.size.bodies import BodyCalibration
-    from tactile_bayes.size.learn.site import PhantomMap
-
 HARDEST_RATIO = 100.0
 """Largest E2/E1 of the simulated bodies; a harder lump counts as this one, because widths hardly change beyond it."""
-
-
-class Corrected(Record, eq=False):
-    """A corrected calibration, with what its file holds."""
-
-    calibration: BodyCalibration
-    base: dict[str, Any]
-    """Document of the calibration that was corrected."""
-    settings: dict[str, Any]
-    """For the provenance."""
-    inputs: dict[str, Path]
-    """Files by role, for the provenance."""
-    seed: int | None = None
-    """Of the random numbers, where maps were estimated."""
-
-    def write(self, path: Path, *, force: bool = False) -> None:
-        """Write the file that `estimate --size-calibration` takes."""
-        assert self.calibration.site is not None
-        provenance = Provenance("calibrate size", self.settings, hash_inputs(**self.inputs), seed=self.seed)
-        write_size_calibration(path, self.calibration, base=self.base, provenance=provenance, force=force)
 
 
 class _Phantoms(Record):
@@ -65,7 +36,7 @@ class _Phantoms(Record):
 
 def correct_size(
     table: Path | Sheet, base: str, declared: Mapping[str, Any], *, seed: int = 1, progress: Progress | None = None
-) -> Corrected:
+) -> Learned:
     """Correct a calibration over bodies by phantoms.
 
     `table`: a row for each map of a phantom: its bump (size_table) or its file (phantom_maps); `base`: name or path of
@@ -80,10 +51,13 @@ def correct_size(
             "give --correct solid, solid-mean or eq6, or a file learned from a table of `population`"
         )
     where = table if isinstance(table, Path) else table.name
-    by_files = "file" in _header(table)
+    by_files = "file" in header_of(table)
     try:
         if by_files:
-            _refuse(declared)
+            for name in (name for name, value in declared.items() if value is not None):
+                option = name.replace("_", "-")
+                what = f"--{option} is for tables of amplitudes and widths"
+                raise UsageError(f"{what}: map files state how they were made")
             found = _from_maps(table, base, seed=seed, progress=progress)
         else:
             found = _from_bumps(table, calibration, declared)
@@ -92,27 +66,9 @@ def correct_size(
     except BadDataError as error:
         raise error.at(where) from None
     document: Any = load_json(path)
-    inputs = {**({"table": table} if isinstance(table, Path) else {}), "size_calibration": path, **found.inputs}
-    return Corrected(
-        corrected, document, {"correct": name, "of": "maps" if by_files else "bumps", "seed": seed}, inputs
-    )
-
-
-def _header(source: Path | Sheet) -> list[str]:
-    """The names in a table's first line."""
-    if isinstance(source, Path):
-        with open_input(source) as file:
-            first = file.readline(4096).decode("utf-8-sig", errors="replace")
-    else:
-        first = source.text.partition("\n")[0]
-    return [name.strip() for name in next(csv.reader(io.StringIO(first)), [])]
-
-
-def _refuse(declared: Mapping[str, Any]) -> None:
-    for name, value in declared.items():
-        if value is not None:
-            option = name.replace("_", "-")
-            raise UsageError(f"--{option} is for tables of amplitudes and widths: map files state how they were made")
+    settings = {"correct": name, "of": "maps" if by_files else "bumps", "seed": seed}
+    inputs = {**files_of(table=table), "size_calibration": path, **found.inputs}
+    return Learned(corrected, settings, inputs, base=document)
 
 
 def _from_bumps(source: Path | Sheet, calibration: BodyCalibration, declared: Mapping[str, Any]) -> _Phantoms:

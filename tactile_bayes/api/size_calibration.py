@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+import csv
+import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal, cast
+from typing import Any, Final, Literal, cast
 
 import numpy as np
 
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError, NotConvergedError, UsageError
+from tactile_bayes.files.provenance import Provenance, hash_inputs
 from tactile_bayes.files.reading import open_input
-from tactile_bayes.files.tables import Sheet, Table
+from tactile_bayes.files.size_json import write_size_calibration
+from tactile_bayes.files.tables import Sheet, Table, read_table
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.presets import FIT_RADIUS_MM, LEAST_HARD_RATIO, Background
+from tactile_bayes.progress import Progress
 from tactile_bayes.scan import HeadShape
-from tactile_bayes.size.bodies import BodyCalibration
-from tactile_bayes.size.eq6 import LeftOutErrors, SizeCalibration
+from tactile_bayes.size.eq6 import LeftOutErrors
 from tactile_bayes.size.learn import bodies as learning
 from tactile_bayes.size.learn.eq6 import (
     OtherFit,
@@ -29,11 +33,9 @@ from tactile_bayes.size.learn.eq6 import (
     other_fit,
     width_changes,
 )
+from tactile_bayes.size.pooling import Calibration
 from tactile_bayes.size.terms import Normalise, Recipe
 from tactile_bayes.studies.population import measuring_options, population_table, table_bodies, table_head
-
-if TYPE_CHECKING:
-    from tactile_bayes.progress import Progress
 
 EqSixFit = Literal["joint", "two-stage"]
 PopulationForm = Literal["eq6", "eq6-residual"]
@@ -43,19 +45,37 @@ _SOURCE: Final = "balls in a population of bodies, scanned by the solid model"
 
 
 class Learned(Record, eq=False):
-    """A learned size calibration, with its table as Eq 6 takes it and the settings for its provenance."""
+    """A learned or corrected size calibration, with what its file holds besides."""
 
-    calibration: SizeCalibration
-    lumps: SizeTable
-    not_left_out: str
-    """Why no geometry could be left out; empty where they were, or the table is no study."""
+    calibration: Calibration
     settings: dict[str, Any]
+    """For the provenance."""
+    inputs: dict[str, Path]
+    """Files by role, for the provenance."""
+    seed: int | None = None
+    """Of the random numbers; None where it used none."""
+    base: dict[str, Any] | None = None
+    """Document of the calibration that was corrected."""
+    lumps: SizeTable | None = None
+    """The table as Eq 6 takes it, where that was learned."""
+    not_left_out: str = ""
+    """Why no geometry could be left out; empty where they were, or the table is no study."""
     other_fit: OtherFit | None = None
     """What the other of the two fits makes of the table; None where it has none."""
 
+    def write(self, path: Path, *, force: bool = False) -> None:
+        """Write the file that `estimate --size-calibration` takes."""
+        provenance = Provenance("calibrate size", self.settings, hash_inputs(**self.inputs), seed=self.seed)
+        write_size_calibration(path, self.calibration, base=self.base, provenance=provenance, force=force)
+
+
+def files_of(**tables: Path | Sheet | None) -> dict[str, Path]:
+    """Those of the tables that are files, by role."""
+    return {role: table for role, table in tables.items() if isinstance(table, Path)}
+
 
 def learn_eq6(
-    rows: Table,
+    table: Path | Sheet,
     declared: Mapping[str, Any],
     *,
     fit: EqSixFit = "joint",
@@ -67,6 +87,7 @@ def learn_eq6(
 
     By the posterior of all coefficients from all rows (``"joint"``), or as printed, with a bootstrap (``"two-stage"``).
     """
+    rows = read_table(table, "size_table.table.json")
     recipe = table_recipe(rows, declared)
     try:
         lumps = size_table(rows, least_stiffness_ratio=least_stiffness_ratio)
@@ -89,7 +110,7 @@ def learn_eq6(
     }
     cautions = table_cautions(rows.columns, least_stiffness_ratio=least_stiffness_ratio)
     learned = replace(calibration, left_out=left_out, cautions=cautions)
-    return Learned(learned, lumps, silent, settings, other)
+    return Learned(learned, settings, files_of(table=table), seed, lumps=lumps, not_left_out=silent, other_fit=other)
 
 
 def table_cautions(columns: Mapping[str, Sequence[Any]], *, least_stiffness_ratio: float = 0.0) -> tuple[str, ...]:
@@ -109,14 +130,15 @@ def table_cautions(columns: Mapping[str, Sequence[Any]], *, least_stiffness_rati
 
 
 def learn_population(
-    rows: Table, form: PopulationForm, normalise: str | None = None, *, against: Table | None = None
-) -> tuple[BodyCalibration, dict[str, Any]]:
-    """Learn a calibration from a table of `population`; the calibration, and settings for its provenance.
+    table: Path | Sheet, form: PopulationForm, normalise: str | None = None, *, against: Path | None = None
+) -> Learned:
+    """Learn a calibration from a table of `population`.
 
     `normalise` is that of the rows to learn from, and may be left out where all are alike. Lumps of another origin, in
     the same columns, tell by how much such bodies depart: `against`.
     """
-    fit = measuring_options()
+    given = None if against is None else read_table(against, "population.table.json")
+    rows, fit = read_table(table, "population.table.json"), measuring_options()
     way, columns = rows_of_one_way(rows, normalise)
     settings: dict[str, Any] = {"form": form, "masses": len(set(columns["body"])), "bodies": table_bodies(columns)}
     try:
@@ -136,23 +158,27 @@ def learn_population(
             path=str(rows.path),
         )
     found = replace(found, bodies=settings["bodies"])
-    if against is not None:
-        _, others = rows_of_one_way(against, way)
-        other_table = population_table(others)
-        source = f"{len(set(other_table.body.tolist()))} lumps of {against.path.name}"
-        found = learning.learn_other_sd(found, other_table, source=source)
+    if given is not None:
+        other_table = population_table(rows_of_one_way(given, way)[1])
         settings["other_masses"] = len(set(other_table.body.tolist()))
-    return found, settings
+        source = f"{settings['other_masses']} lumps of {given.path.name}"
+        found = learning.learn_other_sd(found, other_table, source=source)
+    return Learned(found, settings, files_of(table=table, against=against))
 
 
 def is_population(source: Path | Sheet) -> bool:
     """Whether a table is one of `population`: exams of bodies, by its header."""
+    return {"body", "exam"} <= set(header_of(source))
+
+
+def header_of(source: Path | Sheet) -> list[str]:
+    """The names in a table's first line."""
     if isinstance(source, Path):
         with open_input(source) as file:
-            header = file.readline(4096).decode("utf-8-sig", errors="replace")
+            first = file.readline(4096).decode("utf-8-sig", errors="replace")
     else:
-        header = source.text.partition("\n")[0]
-    return {"body", "exam"} <= {name.strip() for name in header.split(",")}
+        first = source.text.partition("\n")[0]
+    return [name.strip() for name in next(csv.reader(io.StringIO(first)), [])]
 
 
 def table_recipe(table: Table, declared: Mapping[str, Any]) -> Recipe:

@@ -63,11 +63,11 @@ class Sized(Record, eq=False, dict=True):
         size = self._size
         if size is None:
             return None
-        return Draws(np.atleast_2d(getattr(size, name)), "mm", self._interval, size.replicates)
+        return Draws(np.atleast_2d(getattr(size, name)), "mm", self.probability, size.replicates)
 
     @property
-    def _interval(self) -> float:
-        """Probability of the intervals shown by default."""
+    def probability(self) -> float:
+        """Of the intervals that are shown where none is asked for."""
         raise NotImplementedError
 
     @property
@@ -94,7 +94,7 @@ class Sized(Record, eq=False, dict=True):
         size = None if self._size is None else self._size.another_exam
         if size is None:
             return None
-        return Draws(np.atleast_2d(size.max_size_mm), "mm", self._interval, size.replicates)
+        return Draws(np.atleast_2d(size.max_size_mm), "mm", self.probability, size.replicates)
 
     def _columns(self) -> dict[str, Draws]:
         found = {name: self._of_size(name) for name in SIZES}
@@ -152,7 +152,7 @@ class Sized(Record, eq=False, dict=True):
             return
         leads = leading_size(self._size)
         for name in EXTREMES:
-            draws = Draws(np.atleast_2d(getattr(leads, name)), "mm", self._interval, leads.replicates)
+            draws = Draws(np.atleast_2d(getattr(leads, name)), "mm", self.probability, leads.replicates)
             yield f"{'largest' if name == 'max_size_mm' else 'smallest'} size", repr(draws)
         if leads is not self._size:
             yield f"largest size {exams_label(self._size.figures.get('between_map_sd'))}", repr(self.max_size_mm)
@@ -178,10 +178,6 @@ class MassEstimate(Sized, eq=False, dict=True):
     """Of the intervals shown by default."""
     reason: str
     """Why it has no size; empty where it has one."""
-
-    @property
-    def _interval(self) -> float:
-        return self.probability
 
     @property
     def _size(self) -> SizePosterior | None:
@@ -253,8 +249,18 @@ class Answer(Record):
         return None if self.report is None else self.report.document
 
 
-class SizedExam(Sized, eq=False, dict=True):
+class SizedExam(Sized, eq=False, dict=True, kw_only=True):
     """Base of the estimates of a whole exam, from one map or from several."""
+
+    provenance: Provenance
+    settings: Settings
+    name: str = ""
+    """For figures."""
+
+    @property
+    def probability(self) -> float:
+        """Of the intervals that are shown where none is asked for."""
+        return self.settings.interval
 
     def exam(self) -> Exam:
         """What a page of the exam shows."""
@@ -277,27 +283,14 @@ class SizedExam(Sized, eq=False, dict=True):
         page.write(given.on(self.exam()))
 
 
-class SizeEstimate(SizedExam, eq=False, dict=True):
+class SizeEstimate(SizedExam, eq=False, dict=True, kw_only=True):
     """The estimate of one map."""
 
     tactile_map: TactileMap
     estimate: Estimate
     """Posterior and size, or why there is none."""
-    provenance: Provenance
-    settings: Settings
     calibration: Calibration | None = None
     """The one that sized the lump, at its depth."""
-    name: str = ""
-    """Of the map, for figures."""
-
-    @property
-    def probability(self) -> float:
-        """Probability of the intervals shown by default."""
-        return self.settings.interval
-
-    @property
-    def _interval(self) -> float:
-        return self.settings.interval
 
     @property
     def _size(self) -> SizePosterior | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -12,7 +13,14 @@ from tactile_bayes.api.arguments import check_keywords, door, plain
 from tactile_bayes.api.maps import PathLike, output_path, path_of, required_path
 from tactile_bayes.api.repeatability import exams_in, learn_from_exams
 from tactile_bayes.api.site_correction import correct_size
-from tactile_bayes.api.size_calibration import FORMS, is_population, learn_eq6, learn_population
+from tactile_bayes.api.size_calibration import (
+    FORMS,
+    EqSixFit,
+    PopulationForm,
+    is_population,
+    learn_eq6,
+    learn_population,
+)
 from tactile_bayes.declarations import Record, as_dict, names_of, replace, to_plain
 from tactile_bayes.errors import NotConvergedError, UsageError, check_choice, check_number
 from tactile_bayes.files.atomic import write_text
@@ -20,15 +28,18 @@ from tactile_bayes.files.column_map import read_mapping, read_wide, read_wide_ex
 from tactile_bayes.files.documents import dump_json
 from tactile_bayes.files.estimate_json import fill_from_posteriors
 from tactile_bayes.files.provenance import Provenance, hash_inputs
-from tactile_bayes.files.size_json import write_size_calibration
-from tactile_bayes.files.tables import Sheet, check_references, read_table
+from tactile_bayes.files.tables import Sheet, Table, check_references, read_table
+from tactile_bayes.geometry import FloatArray
+from tactile_bayes.inference.draws import ParameterDraws
 from tactile_bayes.inference.ensemble import ensemble
 from tactile_bayes.inference.importance import importance, importance_options
-from tactile_bayes.inference.modes import mode_and_covariance
+from tactile_bayes.inference.modes import LogDensity, mode_and_covariance
 from tactile_bayes.options import TrialSettings
 from tactile_bayes.presets import INTERVAL, RESEARCH_USE
+from tactile_bayes.report.compare import Growth
 from tactile_bayes.report.trial import DIGITS, trial_text
 from tactile_bayes.report.trial_html import trial_html
+from tactile_bayes.size.pooling import Calibration, Repeatability
 from tactile_bayes.trial.figures import Intervals
 from tactile_bayes.trial.next_mass import next_mass
 from tactile_bayes.trial.planning import check_all
@@ -36,17 +47,7 @@ from tactile_bayes.trial.readings import Trial, at_excision, readings_from_colum
 from tactile_bayes.trial.summary import TrialReport, summarise
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     import pandas
-
-    from tactile_bayes.api.size_calibration import EqSixFit, PopulationForm
-    from tactile_bayes.files.tables import Table
-    from tactile_bayes.geometry import FloatArray
-    from tactile_bayes.inference.draws import ParameterDraws
-    from tactile_bayes.inference.modes import LogDensity
-    from tactile_bayes.report.compare import Growth
-    from tactile_bayes.size.pooling import Calibration, Repeatability
 
 
 # --- Sampler for the next mass's model: importance sampling about the mode, or MCMC where it cannot be trusted.
@@ -295,26 +296,17 @@ def calibrate_size(
     if correct is not None:
         if form != "eq6" or fit != "joint" or least_stiffness_ratio:
             raise UsageError("form, fit and least_stiffness_ratio are for learning a calibration; leave them out")
-        corrected = correct_size(source, str(correct), given, seed=seed)
-        if target is not None:
-            corrected.write(target, force=force)
-        return corrected.calibration
-    inputs = hash_inputs(table=source) if isinstance(source, Path) else {}
-    if over_bodies_alone:
+        learned = correct_size(source, str(correct), given, seed=seed)
+    elif over_bodies_alone:
         if fit != "joint":
             raise UsageError(f"fit={fit!r} is for tables of lumps; a table of `population` has one fit")
-        over_bodies, settings = learn_population(
-            read_table(source, "population.table.json"), cast("PopulationForm", form), declared.get("normalise")
+        learned = learn_population(source, cast("PopulationForm", form), declared.get("normalise"))
+    else:
+        learned = learn_eq6(
+            source, given, fit=cast("EqSixFit", fit), least_stiffness_ratio=least_stiffness_ratio, seed=seed
         )
-        if target is not None:
-            provenance = Provenance("calibrate size", settings, inputs)
-            write_size_calibration(target, over_bodies, provenance=provenance, force=force)
-        return over_bodies
-    rows = read_table(source, "size_table.table.json")
-    learned = learn_eq6(rows, given, fit=cast("EqSixFit", fit), least_stiffness_ratio=least_stiffness_ratio, seed=seed)
     if target is not None:
-        provenance = Provenance("calibrate size", learned.settings, inputs, seed=seed)
-        write_size_calibration(target, learned.calibration, provenance=provenance, force=force)
+        learned.write(target, force=force)
     return learned.calibration
 
 

@@ -95,8 +95,7 @@ def command() -> None:
 )
 @takes(Settings, "seed")
 @FORCE
-@click.pass_context
-def size(ctx: click.Context, /, **given: Any) -> None:
+def size(**given: Any) -> None:
     """Learn Eq 6, d = m sigma / (e a^f) + b, from a study or a set of phantoms, or over a population of bodies.
 
     TABLE.csv has a row for each lump: d_mm, amplitude, sigma_x_mm, and optionally sigma_y_mm, depth_ratio,
@@ -129,7 +128,7 @@ def size(ctx: click.Context, /, **given: Any) -> None:
     """
     from tactile_bayes.actions.calibrate import calibrate_size_action
 
-    calibrate_size_action(ctx, **given)
+    calibrate_size_action(**given)
 
 
 @command.command("repeatability")

@@ -257,8 +257,7 @@ def compare_command(ctx: click.Context, /, **given: Any) -> None:
 )
 @takes(Settings, "seed", "interval")
 @FORCE
-@click.pass_context
-def report_command(ctx: click.Context, /, **given: Any) -> None:
+def report_command(**given: Any) -> None:
     """Write one page of an exam: the map, the size with its intervals, the place, and how good the exam was.
 
     The page is one HTML file that loads nothing and prints to one side of A4. Several maps are repeats of one mass:
@@ -270,4 +269,4 @@ def report_command(ctx: click.Context, /, **given: Any) -> None:
     """
     from tactile_bayes.actions.estimate import report_action
 
-    report_action(ctx, **given)
+    report_action(**given)

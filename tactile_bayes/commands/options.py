@@ -82,6 +82,13 @@ def also_read(*paths: Path | None) -> None:
     refuse_same([path for path, written in seen if written], [path for path in paths if path is not None])
 
 
+def typed_options() -> set[str]:
+    """Options given on the command line, not by default."""
+    context = click.get_current_context()
+    typed = click.core.ParameterSource.COMMANDLINE
+    return {name for name in context.params if context.get_parameter_source(name) is typed}
+
+
 def refuse_same(
     outputs: Iterable[Path | None], inputs: Iterable[Path], *, what: str = "an input of this command"
 ) -> None:
@@ -144,8 +151,10 @@ def settings_of(*, settings_file: Path | None = None, repeatability: Path | None
         When the checkpoint that the file names is another file of the call.
     """
     from tactile_bayes.api.settings import read_settings
-    from tactile_bayes.files.size_json import read_repeatability
+    from tactile_bayes.files.size_json import read_repeatability, size_calibration_path
 
+    if (calibration := options.get("size_calibration")) is not None:
+        also_read(size_calibration_path(calibration))
     if repeatability is not None:
         options["repeatability"] = read_repeatability(repeatability)
     if settings_file is None:

@@ -17,8 +17,6 @@ from tactile_bayes.mapping.plane import FramePoses
 from tactile_bayes.presets import PRESSURE_RANGE_KPA
 from tactile_bayes.scan import CountArray, ElementCalibration, HeadGeometry
 
-# --- Cells of a map, frames projected on them, readings collocated in them.
-
 # --- Sums of readings in square cells that are the same to the bit in any order and any parts.
 
 # Values are counted in steps of 2^-12 and clipped to +-64, so 2^16 squares of a call sum exactly in float64 (2^53).

@@ -15,8 +15,6 @@ from tactile_bayes.size.learn.eq6 import OtherFit, is_two_stage
 from tactile_bayes.size.pooling import Calibration
 from tactile_bayes.size.terms import SiteShift
 
-# --- Calibrations in words.
-
 # --- A site's correction of a size calibration as text for people.
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Final, Literal
+from typing import Final, Literal
 
 import numpy as np
 
@@ -30,12 +30,8 @@ from tactile_bayes.findings import verdict as verdict_of
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.inference.points import normal_quantile
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.size.visits import VOLUME, Trend, doubling_days, straight_line
-
-if TYPE_CHECKING:
-    from tactile_bayes.size.pooling import Repeatability
-    from tactile_bayes.size.visits import Apart, Change, Compared, JointSizes
-
+from tactile_bayes.size.pooling import Repeatability
+from tactile_bayes.size.visits import VOLUME, Apart, Change, Compared, JointSizes, Trend, doubling_days, straight_line
 
 # --- Growth of masses between visits, as `compare` told it: rows of a table and a section of a page.
 

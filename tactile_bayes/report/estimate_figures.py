@@ -16,24 +16,20 @@ from tactile_bayes.findings import Finding
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.mapping.places import PATIENT_WORDS, PLANE_WORDS, Orientation
-from tactile_bayes.posterior.result import FittedCells, fitted_cells
+from tactile_bayes.posterior.result import Estimate, FittedCells, Mass, fitted_cells
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.compare import compare_summary
 from tactile_bayes.report.estimate_text import exams_label, no_estimate_line
 from tactile_bayes.report.figure_file import figure_file, named_exam
 from tactile_bayes.report.map_figure import FitContour, NumberedMass, Place, draw_edges, draw_panel, map_figure
 from tactile_bayes.report.quantities import leading_size
+from tactile_bayes.size.draws import SizePosterior
+from tactile_bayes.size.visits import Compared
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from tactile_bayes.posterior.result import Estimate, Mass
-    from tactile_bayes.size.draws import SizePosterior
-    from tactile_bayes.size.visits import Compared
-
-
-# --- Figures of an estimate: fit, size, map.
 
 # --- Picture of a fit: the window's data, the fitted values and what is left, side by side.
 

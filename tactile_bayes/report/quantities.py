@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from itertools import combinations
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
@@ -15,12 +15,9 @@ from tactile_bayes.geometry import FloatArray, apply
 from tactile_bayes.inference.draws import Quantity, summarise
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.mapping.places import SIDES, ClockPosition, clock_position, clock_text
+from tactile_bayes.posterior.draw import MapPosterior
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.size.draws import EXTREMES, SIZES, SizePosterior
-
-if TYPE_CHECKING:
-    from tactile_bayes.posterior.draw import MapPosterior
-
 
 # --- Summaries of an estimate's draws, by name.
 

@@ -16,8 +16,6 @@ import numpy.typing as npt
 from tactile_bayes.declarations import Record, field, settle
 from tactile_bayes.errors import BadDataError
 
-# --- A trial's readings, a mass at a time.
-
 # --- Readings of masses by several modalities, checked for consistency and grouped by mass.
 
 FloatArray = npt.NDArray[np.float64]
