@@ -64,6 +64,11 @@ def repeatability_text(document: Mapping[str, Any]) -> str:
     """Report of what repeated exams say of a site, see data_schema/repeatability.schema.json."""
     calibration = document["calibration"]
     median, low, high = (100 * document[name] for name in ("median", "low", "high"))
+    half_width = []
+    if (half := document.get("half_width")) is not None:
+        after, before = 100 * half["with_it"], 100 * half["as_estimated"]
+        ends = f"about +-{after:.0f} % of the size with it, +-{before:.0f} % as estimated"
+        half_width.append(f"The 95 % interval of one exam: {ends}.")
     lines = [
         *_cautions(document),
         f"Exams of one mass differ by {median:.1f} % at this site (95 %: {low:.1f} to {high:.1f}): SD of ln d beyond "
@@ -71,7 +76,7 @@ def repeatability_text(document: Mapping[str, Any]) -> str:
         f"Learned from {document['masses']} masses and {document['maps']} exams, sized by {calibration['name']} "
         f"(frames normalised by {calibration['normalise']}). Maps of one mass in the paper differed by "
         f"{100 * PAPER_SPREAD:.0f} %.",
-        *_half_width(document),
+        *half_width,
         *_names("Took no part", document["left_out"]),
         "Use it: tactile-bayes estimate MAP.nc --repeatability SITE.json",
     ]
@@ -94,14 +99,6 @@ def _cautions(document: Mapping[str, Any]) -> list[str]:
 
 def _chance(probability: float) -> str:
     return "below 0.0001" if probability < 1e-4 else f"{probability:.2g}"
-
-
-def _half_width(document: Mapping[str, Any]) -> list[str]:
-    found = document.get("half_width")
-    if found is None:
-        return []
-    before, after = 100 * found["as_estimated"], 100 * found["with_it"]
-    return [f"The 95 % interval of one exam: about +-{after:.0f} % of the size with it, +-{before:.0f} % as estimated."]
 
 
 def _names(lead: str, texts: Sequence[str]) -> list[str]:
@@ -135,28 +132,27 @@ BODY_NAMES = {
 
 def body_calibration_text(calibration: BodyCalibration) -> str:
     """Constants, spreads, what the unknowns cost, and the errors on masses left out."""
-    fit = calibration.fit
+    fit, held = calibration.fit, ""
+    if "left_out_held_percent" in fit:
+        held = f", {fit['left_out_held_percent']:.0f} % in their {100 * HELD:g} % interval"
     lines = [
         *_eq6_lines(calibration),
         f"between bodies, SD of ln d {fit.get('body_sd', float('nan')):.3f} (median; it changes with amplitude, width "
         f"and depth), between exams of a body {fit.get('exam_sd', float('nan')):.3f}",
         *_other_lines(calibration),
         unknowns_text(calibration.unknowns),
-        f"{fit.get('bodies', 0):.0f} bodies, {fit.get('maps', 0):.0f} maps; {_left_out_text(fit)}",
+        f"{fit.get('bodies', 0):.0f} bodies, {fit.get('maps', 0):.0f} maps; cross-validated by body: mean absolute "
+        f"error {fit.get('left_out_mae_percent', float('nan')):.1f} %, "
+        f"bias {fit.get('left_out_bias_percent', float('nan')):+.1f} %{held}",
     ]
     for name, unit in (("amplitude", ""), ("sigma_mm", " mm"), ("d_mm", " mm")):
         low, high = calibration.domain[name]
         lines.append(f"range of {name.removesuffix('_mm')}: {low:.3g} to {high:.3g}{unit}")
-    lines += _bodies_lines(calibration.bodies)
+    bodies = [f"{BODY_NAMES.get(name, name)} {a:.3g} to {b:.3g}" for name, (a, b) in calibration.bodies.items()]
+    lines += [f"bodies: {', '.join(bodies)}"] if bodies else []
     lines.append(f"recipe: {calibration.recipe}")
     lines.append(f"for maps made with {calibration.recipe.map_command}")
     return "\n".join([*lines, RESEARCH_USE]) + "\n"
-
-
-def _bodies_lines(bodies: Mapping[str, tuple[float, float]]) -> list[str]:
-    """Ranges of the bodies in one line; none where nobody named them."""
-    parts = [f"{BODY_NAMES.get(name, name)} {low:.3g} to {high:.3g}" for name, (low, high) in bodies.items()]
-    return [f"bodies: {', '.join(parts)}"] if parts else []
 
 
 def _eq6_lines(calibration: BodyCalibration) -> list[str]:
@@ -195,17 +191,6 @@ def _other_lines(calibration: BodyCalibration) -> list[str]:
 def constants_text(constants: Mapping[str, float]) -> str:
     """m, b, e and f in words."""
     return "m {m:.2f}, b {b_mm:+.2f} mm, e {e:.3f}, f {f:.3f}".format(**constants)
-
-
-def _left_out_text(fit: Mapping[str, float]) -> str:
-    held = ""
-    if "left_out_held_percent" in fit:
-        held = f", {fit['left_out_held_percent']:.0f} % in their {100 * HELD:g} % interval"
-    return (
-        "cross-validated by body: "
-        f"mean absolute error {fit.get('left_out_mae_percent', float('nan')):.1f} %, "
-        f"bias {fit.get('left_out_bias_percent', float('nan')):+.1f} %{held}"
-    )
 
 
 def calibration_line(name: str, calibration: Calibration, *, sigma_mm: float) -> str:
@@ -272,7 +257,10 @@ def calibration_text(
     if not calibration.x.fit.get("e_identified"):
         lines.append("the table has no depths: only m/e is determined, e is 1 by convention")
     if other_fit is not None:
-        lines.append(_other_fit(other_fit))
+        words = {"two-stage": "two-stage fit as printed", "joint": "joint fit of all rows"}[other_fit.name]
+        fits = [f"m {m:.2f}, b {b:.2f} mm, e {e:.3f}, f {f:.3f}" for m, b, e, f in other_fit.coefficients]
+        differences = " and ".join(f"{100 * share:.0f} %" for share in other_fit.difference)
+        lines.append(f"{words}: {'; along '.join(fits)}; sizes differ by {differences} of d on average")
     if calibration.left_out is not None:
         lines += _left_out(calibration.left_out)
     elif not_left_out:
@@ -283,14 +271,6 @@ def calibration_text(
     lines.append(f"for maps made with {recipe.map_command}, on which `estimate` fits by this recipe itself")
     lines += [f"CAUTION: {text}" for text in calibration.cautions]
     return "\n".join([*lines, RESEARCH_USE]) + "\n"
-
-
-def _other_fit(other: OtherFit) -> str:
-    """How far the other fit lies, in one line."""
-    words = {"two-stage": "two-stage fit as printed", "joint": "joint fit of all rows"}[other.name]
-    fits = [f"m {m:.2f}, b {b:.2f} mm, e {e:.3f}, f {f:.3f}" for m, b, e, f in other.coefficients]
-    differences = " and ".join(f"{100 * share:.0f} %" for share in other.difference)
-    return f"{words}: {'; along '.join(fits)}; sizes differ by {differences} of d on average"
 
 
 def _left_out(errors: LeftOutErrors) -> list[str]:

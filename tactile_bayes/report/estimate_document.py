@@ -74,7 +74,8 @@ def scene_lines(choice: SceneChoice) -> list[str]:
     window = f"the fit window of {choice.fit.target.problem.radius_mm:g} mm about the lump"
     lines = [f"Scene in {window}: {' and '.join(names)}, the simplest that the map supports."]
     for one in used:
-        lines.append(f"{_sentence(ASKED[one.name])} is in the model (odds {odds_text(one)}){_change(one, 'without')}.")
+        name = ASKED[one.name]
+        lines.append(f"{name[0].upper()}{name[1:]} is in the model (odds {odds_text(one)}){_change(one, 'without')}.")
     kept = [one for one in choice.structures if one.used and not one.supported and not one.place]
     lines += [f"Also in the model: {ASKED[one.name]} (odds {odds_text(one)}){_change(one, 'without')}." for one in kept]
     out = [
@@ -95,10 +96,6 @@ def scene_line(choice: SceneChoice) -> str:
 def _named(choice: SceneChoice) -> list[Structure]:
     """Structures to name beside the bump: in the model because the map supports them."""
     return [one for one in choice.structures if one.used and (one.place or (one.name == "tilt" and one.supported))]
-
-
-def _sentence(text: str) -> str:
-    return text[:1].upper() + text[1:]
 
 
 def odds_text(one: Structure) -> str:
@@ -160,20 +157,19 @@ def scene_report(choice: SceneChoice) -> SceneReport:
         shape=cast("Shape", scene.shape),
         tilt=scene.tilt,
         beside=scene.extra or None,
-        structures=tuple(_structure(one) for one in choice.structures),
-    )
-
-
-def _structure(one: Structure) -> StructureReport:
-    return StructureReport(
-        name=one.name,
-        odds=_six_digits(one.odds),
-        odds_are_a_bound=one.bound,
-        supported=one.supported,
-        used=one.used,
-        change_sigma_x_sd=_six_digits(one.change_x_sd),
-        change_sigma_y_sd=_six_digits(one.change_y_sd),
-        place=one.place,
+        structures=tuple(
+            StructureReport(
+                name=one.name,
+                odds=_six_digits(one.odds),
+                odds_are_a_bound=one.bound,
+                supported=one.supported,
+                used=one.used,
+                change_sigma_x_sd=_six_digits(one.change_x_sd),
+                change_sigma_y_sd=_six_digits(one.change_y_sd),
+                place=one.place,
+            )
+            for one in choice.structures
+        ),
     )
 
 
@@ -359,7 +355,7 @@ def estimate_report(
         x, y = f"{name}.x", f"{name}.y"
         return Point(quantities[x].rounded, quantities[y].rounded) if x in quantities else None
 
-    about, size = estimate.about_mm, estimate.size
+    about, size, moved = estimate.about_mm, estimate.size, estimate.sensitivity
     masses = mass_reports(
         estimate.masses,
         tactile_map,
@@ -388,7 +384,7 @@ def estimate_report(
         detected_probability=rounded(estimate.probability),
         variance_share=None if size is None else rounded(dict(size.variance_share)),
         scene=None if estimate.scene is None else scene_report(estimate.scene),
-        prior_sensitivity=None if estimate.sensitivity is None else _sensitivity(estimate.sensitivity),
+        prior_sensitivity=None if moved is None else rounded(PriorSensitivity(WIDER, {**moved.median}, {**moved.ends})),
         diagnostics=_diagnostics(estimate),
         candidates=tuple(PassedOver(*rounded(one.centre_mm), one.fault) for one in estimate.candidates),
         other_rises=tuple(rounded(OtherRise(**as_dict(one)), 6) for one in estimate.other_rises),
@@ -414,10 +410,6 @@ def smallest_lump(found: SmallestLumps) -> SmallestLump:
     depths: Any = tuple(round(float(depth), 1) for depth in found.depths_mm)
     best, worst = row(found.d_mm.min(axis=0)), row(found.d_mm.max(axis=0))
     return SmallestLump(PROBABILITY, depths, best, worst, round(found.spacing_mm, 3), tuple(places))
-
-
-def _sensitivity(found: Sensitivity) -> PriorSensitivity:
-    return rounded(PriorSensitivity(WIDER, dict(found.median), dict(found.ends)))
 
 
 def _diagnostics(estimate: Estimate) -> dict[str, Any]:

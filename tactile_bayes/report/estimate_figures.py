@@ -16,7 +16,7 @@ from tactile_bayes.findings import Finding
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.mapping.places import PATIENT_WORDS, PLANE_WORDS, Orientation
-from tactile_bayes.posterior.result import Estimate, FittedCells, Mass, fitted_cells
+from tactile_bayes.posterior.result import Estimate, FittedCells, fitted_cells
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.compare import compare_summary
 from tactile_bayes.report.estimate_text import exams_label, no_estimate_line
@@ -142,7 +142,12 @@ def size_figure(
             _draw_interval(axes, intervals["alike"], size=_SIZES["max"], row=len(rows), colour=_ALIKE_COLOUR)
         axes.set_title(title or "Size of the lump", loc="left", fontsize=11)
         axes.set_xlim(_span((draws_max_mm, draws_min_mm), intervals))
-        _finish_size(axes)
+        axes.set_xlabel("size (mm)", fontsize=9)
+        axes.set_ylabel("posterior density (1/mm)", fontsize=9)
+        axes.set_ylim(bottom=0)
+        axes.tick_params(labelsize=8)
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.legend(fontsize=8, frameon=False)
         figure.text(0.01, 0.01, RESEARCH_USE, fontsize=7.5, color="0.3")
     return figure
 
@@ -200,40 +205,14 @@ def _draw_interval(axes: Axes, interval: SizeInterval, *, size: str, row: int, c
     # in inches below the axes: the layout makes room for what does not grow with them
     below = ScaledTranslation(0.0, -0.52 - 0.32 * row, axes.figure.dpi_scale_trans)
     across = blended_transform_factory(axes.transData, axes.transAxes) + below
-    axes.plot(
-        [interval.low_mm, interval.high_mm],
-        [0.0, 0.0],
-        transform=across,
-        color=colour,
-        linewidth=3,
-        solid_capstyle="butt",
-        marker="|",
-        markersize=10,
-        clip_on=False,
-    )
+    bar: dict[str, Any] = {"linewidth": 3, "solid_capstyle": "butt", "marker": "|", "markersize": 10}
+    axes.plot([interval.low_mm, interval.high_mm], [0.0, 0.0], transform=across, color=colour, clip_on=False, **bar)
     kind = _KINDS.get(interval.kind, interval.kind)
     ends = f"{interval.low_mm:.1f} to {interval.high_mm:.1f} mm"
     text = f"{size}, {ends}: {100 * interval.probability:g} % interval ({kind})"
     text = f"{text} {interval.supposes}".rstrip()
-    axes.text(
-        (interval.low_mm + interval.high_mm) / 2,
-        -0.02,
-        text,
-        transform=across,
-        ha="center",
-        va="top",
-        fontsize=8,
-        color=colour,
-    )
-
-
-def _finish_size(axes: Axes) -> None:
-    axes.set_xlabel("size (mm)", fontsize=9)
-    axes.set_ylabel("posterior density (1/mm)", fontsize=9)
-    axes.set_ylim(bottom=0)
-    axes.tick_params(labelsize=8)
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.legend(fontsize=8, frameon=False)
+    middle = (interval.low_mm + interval.high_mm) / 2
+    axes.text(middle, -0.02, text, transform=across, ha="center", va="top", fontsize=8, color=colour)
 
 
 # --- The figures of `estimate`: the size posterior, and the map with the lump or the places looked at.
@@ -284,15 +263,8 @@ def draw_size(
         q = size.summarise("max_size_mm", probability=probability)
         supposes = exams_label(size.figures.get("between_map_sd"))
         intervals["alike"] = SizeInterval(q.low, q.high, q.probability, q.kind, supposes)
-    return size_figure(
-        leads.max_size_mm.ravel(),
-        leads.min_size_mm.ravel(),
-        path,
-        intervals=intervals,
-        title=f"Size of the lump: {name}",
-        findings=findings,
-        force=force,
-    )
+    draws, title = (leads.max_size_mm.ravel(), leads.min_size_mm.ravel()), f"Size of the lump: {name}"
+    return size_figure(*draws, path, intervals=intervals, title=title, findings=findings, force=force)
 
 
 def draw_fit(tactile_map: TactileMap, estimate: Estimate, path: Path | None, *, name: str, force: bool) -> Figure:
@@ -305,7 +277,13 @@ def draw_fit(tactile_map: TactileMap, estimate: Estimate, path: Path | None, *, 
 def draw_map(tactile_map: TactileMap, estimate: Estimate, path: Path | None, *, name: str, force: bool) -> Figure:
     """Draw the map with the lump's ellipse and size, or with the places looked at and the reason for no number."""
     places = [Place(one.centre_mm, one.fault) for one in estimate.candidates if one.fault]
-    note = ""
+    masses, note = [], ""
+    for number, mass in enumerate(estimate.masses, start=1):
+        contour = _contour(mass.estimate)
+        if contour is None:
+            masses.append(NumberedMass(number, (mass.x_mm, mass.y_mm)))
+        else:
+            masses.append(NumberedMass(number, contour.centre_mm, contour.size_mm, contour.angle_deg))
     if estimate.reason and estimate.size is None:
         gone = estimate.status == "no_estimate"
         note = no_estimate_line(estimate.reason) if gone else f"No size: {estimate.reason}."
@@ -313,7 +291,7 @@ def draw_map(tactile_map: TactileMap, estimate: Estimate, path: Path | None, *, 
         tactile_map,
         path,
         fit=_contour(estimate),
-        masses=[_numbered(number, mass) for number, mass in enumerate(estimate.masses, start=1)],
+        masses=masses,
         looked_at=places,
         title=f"Tactile map: {name}",
         note=note,
@@ -331,14 +309,6 @@ def _contour(estimate: Estimate) -> FitContour | None:
     x, y, sigma_x, sigma_y, angle, level, amplitude = (float(np.median(getattr(found, name))) for name in names)
     sizes = None if size is None else (float(np.nanmedian(size.d_x_mm)), float(np.nanmedian(size.d_y_mm)))
     return FitContour((x, y), sigma_x, sigma_y, float(np.degrees(angle)), sizes, level, amplitude)
-
-
-def _numbered(number: int, mass: Mass) -> NumberedMass:
-    """A mass for the picture, its size at the medians."""
-    contour = _contour(mass.estimate)
-    if contour is None:
-        return NumberedMass(number, (mass.x_mm, mass.y_mm))
-    return NumberedMass(number, contour.centre_mm, contour.size_mm, contour.angle_deg)
 
 
 # --- Picture of a comparison: the visits' maps on common axes and colours, their difference, and the change of size.
@@ -385,21 +355,23 @@ def draw_comparison(
     laid = [_averaged(maps, in_patient=in_patient) for maps in visits]
     shown = [0, *range(max(1, len(laid) - _MOST_VISITS + 1), len(laid))]
     with figure_file(path, size_in=(4.0 * (len(shown) + 1), 7.4), force=force) as figure:
-        figure.suptitle(_title(report), x=0.01, ha="left", fontsize=11)
+        exam = named_exam("", report.provenance.get("scans", ()))
+        figure.suptitle(f"Comparison: {exam}" if exam else "Comparison", x=0.01, ha="left", fontsize=11)
         grid = figure.add_gridspec(2, len(shown) + 1, height_ratios=(1.35, 1.0))
         panels = [figure.add_subplot(grid[0, i]) for i in range(len(shown) + 1)]
         words = visits[0][0].tactile_map.recipe.value_words
         _draw_maps(panels, [(i + 1, laid[i]) for i in shown], label=words, in_patient=in_patient)
         _draw_change(figure.add_subplot(grid[1, 0]), compared)
-        _write_words(figure.add_subplot(grid[1, 1:]), report)
-        figure.text(0.01, 0.01, _caption(in_patient=in_patient), fontsize=7.5, color="0.3")
+        words_axes = figure.add_subplot(grid[1, 1:])
+        words_axes.set_axis_off()
+        lines = [part for line in compare_summary(report).splitlines()[:-1] for part in textwrap.wrap(line, 96)]
+        text = "\n".join(line for line in lines if not line.startswith("More ("))
+        words_axes.text(0.0, 1.0, text, va="top", fontsize=8.5, transform=words_axes.transAxes)
+        seen = "patient's axes, seen facing the patient: head up, patient's left on the right"
+        seen = seen if in_patient else "no landmarks on every map: the plane's axes, y (along the head) up"
+        moved = "later visits are moved so that the mass lies on itself; maps of a visit are averaged"
+        figure.text(0.01, 0.01, f"{seen}; {moved}.  {RESEARCH_USE}", fontsize=7.5, color="0.3")
     return figure
-
-
-def _title(report: CompareReport) -> str:
-    """Title with the subject's code and the scans' digests."""
-    exam = named_exam("", report.provenance.get("scans", ()))
-    return f"Comparison: {exam}" if exam else "Comparison"
 
 
 def _averaged(maps: Sequence[DrawnMap], *, in_patient: bool) -> _Laid:
@@ -504,18 +476,3 @@ def _draw_change(axes: Axes, compared: Compared) -> None:
     axes.axvline(0.0, color="black", linewidth=1.2)
     axes.set_xlabel("change of the diameter (%)", fontsize=9)
     axes.set_title("Posterior of the change", loc="left", fontsize=11)
-
-
-def _write_words(axes: Axes, report: CompareReport) -> None:
-    """The short report."""
-    axes.set_axis_off()
-    lines = [part for line in compare_summary(report).splitlines()[:-1] for part in textwrap.wrap(line, 96)]
-    lines = [line for line in lines if not line.startswith("More (")]
-    axes.text(0.0, 1.0, "\n".join(lines), va="top", fontsize=8.5, transform=axes.transAxes)
-
-
-def _caption(*, in_patient: bool) -> str:
-    frame = "patient's axes, seen facing the patient: head up, patient's left on the right"
-    words = frame if in_patient else "no landmarks on every map: the plane's axes, y (along the head) up"
-    moved = "later visits are moved so that the mass lies on itself; maps of a visit are averaged"
-    return f"{words}; {moved}.  {RESEARCH_USE}"

@@ -12,7 +12,6 @@ from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.mapping.places import ClockPosition
 from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior.abstention import chance_text
-from tactile_bayes.posterior.draw import Diagnostics
 from tactile_bayes.posterior.lump_probability import SHARE_WITH_LUMP
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.presets import RESEARCH_USE
@@ -46,18 +45,17 @@ from tactile_bayes.size.draws import EXTREMES, SIZES
 def smallest_text(smallest: SmallestLump) -> str:
     """What would have shown, by depth, where the map is best and where it is worst; without a full stop."""
     ends = zip(smallest.depths_mm, smallest.best_mm, smallest.worst_mm, strict=True)
-    told = [f"{_smallest_range(best, worst)} at a depth of {depth:g} mm" for depth, best, worst in ends]
+    told = []
+    for depth, best, worst in ends:
+        if best is None:
+            across = "more than 30 mm"
+        elif worst is None:
+            across = f"{best:.3g} to more than 30 mm"
+        else:
+            across = f"{best:.3g} mm" if best == worst else f"{best:.3g} to {worst:.3g} mm"
+        told.append(f"{across} at a depth of {depth:g} mm")
     share = f"{100 * smallest.probability:g} %"
     return f"A ball would have shown with {share} from a diameter on of {'; '.join(told)} (of its middle), by its place"
-
-
-def _smallest_range(best: float | None, worst: float | None) -> str:
-    """Diameters at the best place and at the worst."""
-    if best is None:
-        return "more than 30 mm"
-    if worst is None:
-        return f"{best:.3g} to more than 30 mm"
-    return f"{best:.3g} mm" if best == worst else f"{best:.3g} to {worst:.3g} mm"
 
 
 # --- Sentences about a size, shared by the reports of one map and of several.
@@ -231,11 +229,15 @@ def estimate_text(
     lines += [] if place is None else [place_line(place, probability)]
     lines += [
         *_findings(estimate, quantities, masses),
-        *_scene(estimate, masses),
-        *finding_lines(estimate.findings, "check"),
-        *passed_over(estimate),
-        *_left_out(estimate),
+        *([] if estimate.scene is None else scene_lines(estimate.scene)),
     ]
+    beside = " and ".join(str(one.number) for one in others(masses))
+    if estimate.scene is not None and beside:
+        lines.append(f"These odds are of this window alone: mass {beside} of the map is above.")
+    if estimate.sensitivity is not None and (by_prior := sensitivity_line(estimate.sensitivity)):
+        lines.append(by_prior)
+    lines += [*finding_lines(estimate.findings, "check"), *passed_over(estimate)]
+    lines += [f"Left out: {'; '.join(estimate.left_out)}."] if estimate.left_out else []
     lines += [] if prior is None else [prior_line(prior, field=estimate.scene is not None)]
     return "\n".join([*lines, RESEARCH_USE]) + "\n"
 
@@ -307,7 +309,15 @@ def _findings(estimate: Estimate, quantities: Mapping[str, Quantity], masses: Se
     lines += [f"Passed over: {text}." for text in (() if found is None else found.noise.passed_over)]
     if estimate.draws is None:
         return lines
-    return [*lines, method_line(estimate.draws, quantities), *_chains_of_sizes(found)]
+    lines.append(method_line(estimate.draws, quantities))
+    for name, label in (("max_size_mm", "largest size"), ("min_size_mm", "smallest size")):
+        if one := {} if found is None else found.convergence.get(name, {}):
+            ess = min(one["ess_bulk"], one["ess_tail"])
+            lines.append(
+                f"Chains of the {label}: R-hat {one['rhat']:.3f}, {ess:.0f} effective draws, "
+                f"Monte-Carlo error of the median {one['mcse_median']:.2g} mm."
+            )
+    return lines
 
 
 def tracker_share(estimate: Estimate) -> str:
@@ -318,24 +328,13 @@ def tracker_share(estimate: Estimate) -> str:
     return f"{100 * share:.0f} % of the width variance is tracker position error"
 
 
-def _chains_of_sizes(found: Diagnostics | None) -> list[str]:
-    """Of chains: R-hat, effective draws and Monte-Carlo error of each size's median."""
-    lines = []
-    for name, label in (("max_size_mm", "largest size"), ("min_size_mm", "smallest size")):
-        one = {} if found is None else found.convergence.get(name, {})
-        if one:
-            ess = min(one["ess_bulk"], one["ess_tail"])
-            lines.append(
-                f"Chains of the {label}: R-hat {one['rhat']:.3f}, {ess:.0f} effective draws, "
-                f"Monte-Carlo error of the median {one['mcse_median']:.2g} mm."
-            )
-    return lines
-
-
 def method_line(draws: ParameterDraws, quantities: Mapping[str, Quantity]) -> str:
     """Method, Monte-Carlo error of the printed interval ends, and the method's diagnostics."""
-    parts = [_ends("sizes", EXTREMES, quantities)] if "max_size_mm" in quantities else []
-    parts.append(_ends("widths", ("sigma_x_mm", "sigma_y_mm"), quantities))
+    parts = []
+    for what, names in (("sizes", EXTREMES), ("widths", WIDTHS)):
+        if names[0] in quantities:
+            worst = max((quantities[name] for name in names), key=lambda one: one.mc_error)
+            parts.append(ends_text(what, worst.mc_error, worst.sd))
     ends = "Monte-Carlo error of the interval ends: " + ", ".join(parts)
     measure = convergence_text(draws) or f"{len(draws.flat)} independent draws"
     if draws.method == "ensemble":
@@ -350,34 +349,12 @@ def convergence_text(draws: ParameterDraws) -> str:
     return f"Pareto shape {draws.diagnostics['pareto_k']:.2f}" if draws.method == "importance" else ""
 
 
-def _ends(what: str, names: tuple[str, ...], quantities: Mapping[str, Quantity]) -> str:
-    worst = max((quantities[name] for name in names), key=lambda one: one.mc_error)
-    return ends_text(what, worst.mc_error, worst.sd)
-
-
-def _scene(estimate: Estimate, masses: Sequence[MassReport]) -> list[str]:
-    """Lines on the structures in the window, and on the influence of the prior."""
-    lines = [] if estimate.scene is None else [*scene_lines(estimate.scene), *_elsewhere(masses)]
-    prior = "" if estimate.sensitivity is None else sensitivity_line(estimate.sensitivity)
-    return [*lines, prior] if prior else lines
-
-
-def _elsewhere(masses: Sequence[MassReport]) -> list[str]:
-    """A line on what the odds of a second lump do not speak of; empty where there is one mass."""
-    numbers = " and ".join(str(one.number) for one in others(masses))
-    return [f"These odds are of this window alone: mass {numbers} of the map is above."] if numbers else []
-
-
 def passed_over(estimate: Estimate) -> list[str]:
     """Places passed over, with reasons; long lists are shortened."""
     faulty = [candidate for candidate in estimate.candidates if candidate.fault]
     lines = [f"Passed over near ({c.centre_mm[0]:.0f}, {c.centre_mm[1]:.0f}) mm: {c.fault}." for c in faulty]
     more = len(lines) - MOST_PASSED_OVER
     return [*lines[:MOST_PASSED_OVER], f"Passed over {more} lower bumps."] if more > 0 else lines
-
-
-def _left_out(estimate: Estimate) -> list[str]:
-    return [f"Left out: {'; '.join(estimate.left_out)}."] if estimate.left_out else []
 
 
 # --- An estimate in at most 12 lines: the size, what makes its interval wide, what would narrow it, its quality.
@@ -408,7 +385,11 @@ def estimate_summary(
         body += [*_masses(masses, room=MOST_MASSES), *finding_summary(estimate.findings, "check", most=MOST_CHECKS)]
     else:
         body = _something(estimate, quantities, probability, masses, place)
-    return "\n".join([*body, f"{_model(estimate)}{MORE}", RESEARCH_USE]) + "\n"
+    if estimate.scene is not None:
+        model = [scene_line(estimate.scene)]
+    else:
+        model = joined(estimate.left_out, most=2, lead="Left out: ")
+    return "\n".join([*body, " ".join([*model, MORE]), RESEARCH_USE]) + "\n"
 
 
 def _something(
@@ -431,16 +412,11 @@ def _something(
     beside = _masses(masses, room=min(MOST_MASSES, room))
     widths = [] if estimate.size is None else width_lines(leading_size(estimate.size).variance_share)
     lines = [*lines, *beside, *after, *widths[: max(room - len(beside), 0)], *last]
-    return [*lines, *_supposed(estimate, quantities)] if len(lines) < MOST_LINES - 2 else lines
-
-
-def _supposed(estimate: Estimate, quantities: Mapping[str, Quantity]) -> list[str]:
-    """How large a soft lump and a hard one would be, where that matters."""
     largest = quantities.get("max_size_mm")
-    if largest is None:
-        return []
+    if largest is None or len(lines) >= MOST_LINES - 2:
+        return lines
     supposed = suppositions(estimate.size, largest)
-    return supposed_line(supposed, largest.median, places=size_decimals([largest]))
+    return [*lines, *supposed_line(supposed, largest.median, places=size_decimals([largest]))]
 
 
 def _lump(
@@ -467,13 +443,6 @@ def _masses(masses: Sequence[MassReport], *, room: int) -> list[str]:
     if left := len(lines) - len(shown):
         shown[-1] = f"{shown[-1].rstrip('.')}; and {left} more {'mass' if left == 1 else 'masses'}."
     return shown
-
-
-def _model(estimate: Estimate) -> str:
-    """Model and omissions, as the beginning of a line."""
-    if estimate.scene is not None:
-        return f"{scene_line(estimate.scene)} "
-    return "".join(f"{line} " for line in joined(estimate.left_out, most=2, lead="Left out: "))
 
 
 def _quality(estimate: Estimate, shown: Mapping[str, Quantity]) -> list[str]:

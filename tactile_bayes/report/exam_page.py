@@ -165,6 +165,7 @@ def exam_page(exam: Exam) -> str:
     crowded = len(exam.maps) > 1 and len(exam.main.masses) > 1
     most, longest = _FINDINGS[crowded]
     size, several = largest(exam), len(exam.maps) > 1
+    drawn, least = exam.main.tactile_map, exam.main.report.smallest_lump
     masses = sorted(exam.main.masses, key=lambda one: one.number)
     shown = exam.maps[:MOST_REPEATS] if several else ()
     return page(
@@ -178,7 +179,7 @@ def exam_page(exam: Exam) -> str:
         longest_finding=longest,
         picture=_picture(exam, crowded=crowded),
         no_map=NO_MAP,
-        smallest=_smallest(exam),
+        smallest=[] if least is None or drawn is None else list(smallest_pictures(drawn, least)),
         of_mass=f" of mass {exam.main.masses[0].number}" if len(masses) > 1 else "",
         place=_place(exam) if masses else None,
         size=size and {"ruler": size_ruler(_intervals(exam, size)), "sentences": list(size_sentences(exam))},
@@ -218,12 +219,6 @@ def _picture(exam: Exam, *, crowded: bool) -> dict[str, str] | None:
     lines.append(f"{size} when printed at 100 %.")
     drawn = exam_picture(exam.drawn, frame, label=f"Map: {headline(exam)}")
     return {"drawn": drawn, "colours": colour_bar(exam.main), "words": " ".join(lines)}
-
-
-def _smallest(exam: Exam) -> list[str]:
-    """What the map would have shown, by place and depth."""
-    smallest, tactile_map = exam.main.report.smallest_lump, exam.main.tactile_map
-    return [] if smallest is None or tactile_map is None else list(smallest_pictures(tactile_map, smallest))
 
 
 def _place(exam: Exam) -> dict[str, Any]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from datetime import date
 from typing import Any, Final
 
@@ -132,19 +133,15 @@ class Given(Record):
             if not value.isprintable() or len(value) > longest:
                 what = f"{option} is of {len(value)} letters or not printable"
                 raise UsageError(f"{what}; give up to {longest} letters")
-        if self.day and not _is_date(str(self.day)):
-            raise UsageError(f"date {str(self.day)[:40]!r} is no date; give it as YEAR-MONTH-DAY, such as 2026-03-01")
+        day, is_date = str(self.day), False
+        with suppress(ValueError):
+            is_date = bool(_DATE.fullmatch(day) and date.fromisoformat(day))
+        if self.day and not is_date:
+            raise UsageError(f"date {day[:40]!r} is no date; give it as YEAR-MONTH-DAY, such as 2026-03-01")
 
     def on(self, exam: Exam) -> Exam:
         """The exam with them."""
         return replace(exam, title=self.title, name=self.name, day=self.day)
-
-
-def _is_date(text: str) -> bool:
-    try:
-        return bool(_DATE.fullmatch(text)) and bool(date.fromisoformat(text))
-    except ValueError:
-        return False
 
 
 def exam_map(tactile_map: TactileMap | None, report: EstimateReport, *, side: str) -> ExamMap:
@@ -349,7 +346,10 @@ def quality_rows(exam: Exam) -> Iterator[tuple[str, str]]:
     """Rows of the table on how good the exam was."""
     if exam.main.tactile_map is not None:
         yield from _scan_rows(exam.main.tactile_map)
-    yield "array calibration", _age(exam)
+    days = [scan["array_calibration_days"] for scan in exam.scans if "array_calibration_days" in scan]
+    known = [int(text) for text in days if re.fullmatch(r"-?[0-9]{1,6}", text)]
+    age = f"{max(known)} day{'s' if max(known) != 1 else ''} old at the exam" if known else "age not stated in the scan"
+    yield "array calibration", age
     calibration = exam.main.report.origin.settings.get("size_calibration")
     if calibration:
         yield "size calibration", str(calibration)[:60]
@@ -372,7 +372,12 @@ def _scan_rows(tactile_map: TactileMap) -> Iterator[tuple[str, str]]:
         yield "frames", f"{used}{'; left out: ' if out else ''}{', '.join(out)}"
     if tactile_map.masked_taxels:
         yield "taxels", f"{len(tactile_map.masked_taxels)} left out as faulty"
-    yield "landmarks", _landmarks(tactile_map)
+    named = "none touched"
+    if tactile_map.patient_from_plane is not None:
+        named = "sternal notch, xiphoid" + (", nipple" if tactile_map.nipple_mm is not None else "; no nipple")
+        repeats = quality.get("landmark_spread_mm")
+        named += "" if repeats is None else f"; repeats within {repeats:.1f} mm"
+    yield "landmarks", named
 
 
 def covered_text(tactile_map: TactileMap) -> str:
@@ -382,17 +387,13 @@ def covered_text(tactile_map: TactileMap) -> str:
         return f"{tactile_map.covered.sum() * cell2:.0f} cm² (readings per cell unknown)"
     well = tactile_map.covered & (tactile_map.count >= FEW_READINGS)
     text = f"{well.sum() * cell2:.0f} cm² with {FEW_READINGS} readings a cell or more"
-    holes = _holes(well)
+    # cells not covered that have covered ones on all four sides
+    sides = [np.logical_or.accumulate(well, axis=axis) for axis in (0, 1)]
+    sides += [np.flip(np.logical_or.accumulate(np.flip(well, axis), axis=axis), axis) for axis in (0, 1)]
+    holes = int((np.logical_and.reduce(sides) & ~well).sum())
     text += f"; {holes * cell2:.1f} cm² of gaps inside it" if holes * cell2 >= 0.05 else "; no gaps inside it"
     median = float(np.median(tactile_map.count[well])) if well.any() else 0.0
     return f"{text}; typically {median:.0f} readings"
-
-
-def _holes(well: Any) -> int:
-    """Cells not covered that have covered ones on all four sides."""
-    sides = [np.logical_or.accumulate(well, axis=axis) for axis in (0, 1)]
-    sides += [np.flip(np.logical_or.accumulate(np.flip(well, axis), axis=axis), axis) for axis in (0, 1)]
-    return int((np.logical_and.reduce(sides) & ~well).sum())
 
 
 def reach_text(tactile_map: TactileMap) -> str:
@@ -415,23 +416,6 @@ def _between(low: float, high: float, words: tuple[str, str]) -> str:
     if high <= 0:
         return f"{-high:.0f} to {-low:.0f} mm {words[0]}"
     return f"{-low:.0f} mm {words[0]} to {high:.0f} mm {words[1]}"
-
-
-def _landmarks(tactile_map: TactileMap) -> str:
-    if tactile_map.patient_from_plane is None:
-        return "none touched"
-    named = "sternal notch, xiphoid" + (", nipple" if tactile_map.nipple_mm is not None else "; no nipple")
-    repeats = tactile_map.quality.get("landmark_spread_mm")
-    return named if repeats is None else f"{named}; repeats within {repeats:.1f} mm"
-
-
-def _age(exam: Exam) -> str:
-    """Age of the array calibration at the exam; the oldest of several scans."""
-    days = [scan["array_calibration_days"] for scan in exam.scans if "array_calibration_days" in scan]
-    known = [int(text) for text in days if re.fullmatch(r"-?[0-9]{1,6}", text)]
-    if not known:
-        return "age not stated in the scan"
-    return f"{max(known)} day{'s' if max(known) != 1 else ''} old at the exam"
 
 
 def mass_row(mass: ExamMass) -> tuple[str, str, str]:

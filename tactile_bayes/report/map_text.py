@@ -123,15 +123,11 @@ def _picture(state: LiveState, columns: int, lines: int, *, colour: bool) -> lis
     rows = _blocks(small) if colour else _shades(small)
     if state.lump_mm is not None:
         across, down = view.place(state.tactile_map, state.lump_mm)
-        _mark(rows, int(down / step / 2), int(across / step), colour=colour)
+        row, column = int(down / step / 2), int(across / step)
+        if 0 <= row < len(rows) and 0 <= column < len(rows[row]):
+            rows[row][column] = f"\x1b[0;1;97m{_MARK}" if colour else _MARK
     legend = _legend(state.tactile_map, view, step, marked=state.lump_mm is not None)[:legend_lines]
     return [*_framed(rows, view, columns, colour=colour), *(line[:columns] for line in legend)]
-
-
-def _mark(rows: list[list[str]], row: int, column: int, *, colour: bool) -> None:
-    """Mark the lump's centre."""
-    if 0 <= row < len(rows) and 0 <= column < len(rows[row]):
-        rows[row][column] = f"\x1b[0;1;97m{_MARK}" if colour else _MARK
 
 
 def _framed(rows: list[list[str]], view: Orientation, columns: int, *, colour: bool) -> list[str]:
@@ -170,7 +166,8 @@ def _blocks(values: FloatArray) -> list[list[str]]:
     """Half blocks, one string per character: the upper cell is the foreground, the lower the background."""
     if len(values) % 2:
         values = np.vstack([values, np.full((1, values.shape[1]), np.nan)])
-    colours, shown = _colours(values), np.isfinite(values)
+    shown = np.isfinite(values)
+    colours = _palette()[np.rint(np.nan_to_num(values) * (_STEPS - 1)).astype(int)]
     pairs = zip(colours[::2], colours[1::2], shown[::2], shown[1::2], strict=True)
     return [list(map(_cell, *(one.tolist() for one in pair))) for pair in pairs]
 
@@ -181,11 +178,6 @@ def _cell(top: str, bottom: str, shown_top: bool, shown_bottom: bool) -> str:
     if shown_top:
         return f"\x1b[0;38;2;{top}m▀"
     return f"\x1b[0;38;2;{bottom}m▄" if shown_bottom else "\x1b[0m "
-
-
-def _colours(values: FloatArray) -> NDArray[np.object_]:
-    """Terminal colours of values from 0 to 1."""
-    return np.asarray(_palette()[np.rint(np.nan_to_num(values) * (_STEPS - 1)).astype(int)])
 
 
 @cache

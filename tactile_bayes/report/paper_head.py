@@ -10,6 +10,7 @@ import numpy as np
 
 from tactile_bayes.forward.contact import Head
 from tactile_bayes.geometry import FloatArray
+from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.white import BumpFit
 from tactile_bayes.presets import RESEARCH_USE, SHOULDERS_INSIDE
 from tactile_bayes.report.figure_file import figure_file
@@ -127,15 +128,10 @@ def _grid(kind: str, found: Sequence[Uniformity], *, limit: float) -> list[str]:
     ]
     for radius in sorted({one.head.radius_mm for one in found}):
         name = "flat" if np.isinf(radius) else f"{radius:g}"
-        row = [_marked(cells.get((radius, shoulder)), limit) for shoulder in shoulders]
-        lines.append(f"{name:>8}" + "".join(f"{cell:>8}" for cell in row))
+        row = [cells.get((radius, shoulder)) for shoulder in shoulders]
+        marked = ["-" if one is None else f"{100 * one:.1f}{'*' if one <= limit else ' '}" for one in row]
+        lines.append(f"{name:>8}" + "".join(f"{cell:>8}" for cell in marked))
     return lines
-
-
-def _marked(value: float | None, limit: float) -> str:
-    if value is None:
-        return "-"
-    return f"{100 * value:.1f}{'*' if value <= limit else ' '}"
 
 
 def _tissue_document(tissue: HomogeneousTissue, limit: float) -> dict[str, object]:
@@ -262,7 +258,8 @@ def comparison_text(measured: MeasuredFrames, found: Sequence[ModelComparison]) 
     for name, words in _ROWS.items():
         cells = "".join(f"{100 * getattr(one, name):>20.2f}" for one in found)
         lines.append(f"{words:<42}{_PRINTED.get(name, ''):>11}{cells}")
-    lines.append(f"{'taxel, root mean square difference, kPa':<42}{'':>11}" + _cells(found, "rms_kpa"))
+    rms = "".join(f"{one.rms_kpa:>20.3f}" for one in found)
+    lines.append(f"{'taxel, root mean square difference, kPa':<42}{'':>11}{rms}")
     slopes = [residual_slope(measured, one) for one in found]
     for k, words in enumerate(("map: slope of the residual in x, per 10 mm", "the same in y", "RMS beside the slope")):
         lines.append(f"{words:<42}{'':>11}" + "".join(f"{slope[k]:>20.4f}" for slope in slopes))
@@ -298,26 +295,18 @@ def comparison_document(
         "inputs": inputs,
         "frames": len(measured.level_kpa),
         "place_mm": list(measured.place_mm),
-        "measured": {
-            **_shape_document(measured.lump),
-            **_line_document(line_bump(measured, measured.tactile_map)),
-        },
+        "measured": _bumps(measured, measured.lump, measured.tactile_map),
         "models": [
             {
                 "fidelity": one.fidelity,
                 **{name: _number(getattr(one, name)) for name in (*_ROWS, "rms_kpa")},
-                **_shape_document(one.lump),
-                **_line_document(line_bump(measured, one.tactile_map)),
+                **_bumps(measured, one.lump, one.tactile_map),
                 **dict(zip(_SLOPE, residual_slope(measured, one), strict=True)),
             }
             for one in found
         ],
         "research_use": RESEARCH_USE,
     }
-
-
-def _cells(found: Sequence[ModelComparison], name: str) -> str:
-    return "".join(f"{getattr(one, name):>20.3f}" for one in found)
 
 
 def _shape(lump: BumpFit | None) -> tuple[float, float, float]:
@@ -327,13 +316,11 @@ def _shape(lump: BumpFit | None) -> tuple[float, float, float]:
     return float(lump.theta[0]), sigma_x, sigma_y
 
 
-def _shape_document(lump: BumpFit | None) -> dict[str, float | None]:
-    names = ("amplitude", "sigma_x_mm", "sigma_y_mm")
-    return {name: _number(value) for name, value in zip(names, _shape(lump), strict=True)}
-
-
-def _line_document(bump: tuple[float, float]) -> dict[str, float]:
-    return {"line_amplitude": bump[0], "line_sigma_mm": bump[1]}
+def _bumps(measured: MeasuredFrames, lump: BumpFit | None, tactile_map: TactileMap) -> dict[str, float | None]:
+    """Eq 7 of a map, null without, and Eq 5 of its centre line."""
+    amplitude, sigma_x, sigma_y = map(_number, _shape(lump))
+    line = dict(zip(("line_amplitude", "line_sigma_mm"), line_bump(measured, tactile_map), strict=True))
+    return {"amplitude": amplitude, "sigma_x_mm": sigma_x, "sigma_y_mm": sigma_y, **line}
 
 
 def _number(value: float) -> float | None:

@@ -54,6 +54,7 @@ def pooled_report(
     patient; None where that cannot be told.
     """
     size, used = pooled.size, pooled.calibration or calibration
+    head = unknown_head(used.recipe.head)
     found: dict[str, Quantity] = {}
     if size is not None:
         found = {name: size.summarise(name, probability=probability) for name in EXTREMES}
@@ -76,7 +77,7 @@ def pooled_report(
         one_place_probability=rounded(pooled.one_place),
         variance_share=None if size is None else rounded(dict(size.variance_share)),
         figures={} if size is None else rounded(dict(size.figures)),
-        left_out=tuple(_omitted(used, reports)),
+        left_out=(*([head] if any(head in one.left_out for one in reports) else []), *used.omissions()),
         fat_mm=rounded(used.fat_mm),
         unknowns=rounded(dict(used.unknowns)),
         site=None if used.site is None else site_words(used.site),
@@ -86,31 +87,17 @@ def pooled_report(
     )
 
 
-def _omitted(used: BodyCalibration, reports: Sequence[EstimateReport]) -> list[str]:
-    """What the pooled size does not contain, in words."""
-    head = unknown_head(used.recipe.head)
-    unknown = any(head in one.left_out for one in reports)
-    return [*([head] if unknown else []), *used.omissions()]
-
-
 def _map(index: int, name: str, report: EstimateReport, pooled: PooledEstimate) -> PooledMap:
-    size = report.max_size_mm
+    size, reported = report.max_size_mm, [one.number for one in report.masses if one.reported]
     return PooledMap(
         map=name,
-        mass=_reported(report),
+        mass=(*reported, len(report.masses)) if len(report.masses) > 1 and reported else (),
         status=report.status,
         reason=report.reason,
         detected_probability=report.detected_probability,
         max_size_mm=None if size is None else Interval(size.median, size.low, size.high, size.probability),
         outlying=index in pooled.outlying,
     )
-
-
-def _reported(report: EstimateReport) -> tuple[int, ...]:
-    """Number of the mass that was sized and how many its map has; empty where it is the only one."""
-    masses = report.masses
-    numbers = [one.number for one in masses if one.reported]
-    return (*numbers, len(masses)) if len(masses) > 1 and numbers else ()
 
 
 def _findings(
@@ -121,8 +108,10 @@ def _findings(
     one_place: bool | None,
 ) -> Iterator[Finding]:
     """What speaks against the size: of the maps in which a lump was found, and of the maps together."""
-    if pooled.status == DISAGREE:
-        yield disagreement(pooled.reason, *_chances(pooled))
+    if pooled.status == DISAGREE and pooled.one_place is not None and pooled.one_place < LEAST_PROBABILITY:
+        yield disagreement(pooled.reason, pooled.one_place)
+    elif pooled.status == DISAGREE and pooled.one_size is not None:
+        yield disagreement(pooled.reason, pooled.one_size, pooled.one_size_apart)
     sized = [i for i, report in enumerate(reports) if report.status == "estimate"]
     for index in sized if pooled.status == DISAGREE else sorted(pooled.centres):
         for one in reports[index].findings:
@@ -144,14 +133,6 @@ def _findings(
             text = f"another rise stands at ({rise.x_mm:.1f}, {rise.y_mm:.1f}) mm"
             same = "check that every map was sized at the same mass"
             yield Finding("several_masses", text, same, same, _number(index))
-
-
-def _chances(pooled: PooledEstimate) -> tuple[float, float | None]:
-    """Probability of the maps of one mass being so far apart, in place or in size, and that by the paper's spread."""
-    if pooled.one_place is not None and pooled.one_place < LEAST_PROBABILITY:
-        return pooled.one_place, None
-    assert pooled.one_size is not None
-    return pooled.one_size, pooled.one_size_apart
 
 
 def disagreement(what: str, probability: float, if_exams_differ: float | None = None) -> Finding:
@@ -242,7 +223,8 @@ def pooled_text(report: PooledReport) -> str:
         lines.append(site_interval_text(report.site_words))
     lines.append(shape_text(figures))
     lines.append(f"Monte-Carlo error of the interval ends: {ends_text('sizes', worst.mc_error, worst.sd)}.")
-    lines.append(_unknowns(report))
+    unknowns = fat_text(report.fat_mm) + unknowns_text(report.unknowns)
+    lines.append(f"{unknowns[0].upper()}{unknowns[1:]}.")
     if report.site:
         lines.append(f"Sizes by {report.site}.")
     if report.left_out:
@@ -274,8 +256,3 @@ def _map_line(one: PooledMap) -> str:
         return f"{one.map}: no estimate ({one.reason})"
     mass = "  (mass {} of {} on this map)".format(*one.mass) if one.mass else ""
     return f"{one.map}: {_size_words(one.max_size_mm, with_ends=True)} mm alone{mass}"
-
-
-def _unknowns(report: PooledReport) -> str:
-    text = fat_text(report.fat_mm) + unknowns_text(report.unknowns)
-    return text[0].upper() + text[1:] + "."

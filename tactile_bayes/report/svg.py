@@ -175,17 +175,23 @@ def _draw_ring(
     """Draw the ellipse of the estimated size at the estimated place."""
     if report.d_x_mm is None or report.d_y_mm is None or report.centre_mm is None:
         return
-    x, y = report.centre_mm.median
-    angle = 0.0 if report.angle_deg is None else np.radians(report.angle_deg.median)
-    half_x, half_y = report.d_x_mm.median / 2, report.d_y_mm.median / 2
-    t = np.linspace(0.0, 2 * np.pi, 720)
-    along, across = half_x * np.cos(t), half_y * np.sin(t)
-    xs = x + along * np.cos(angle) - across * np.sin(angle)
-    ys = y + along * np.sin(angle) + across * np.cos(angle)
-    places = np.array([view.place(tactile_map, (float(a), float(b))) for a, b in zip(xs, ys, strict=True)])
+    angle_deg = 0.0 if report.angle_deg is None else report.angle_deg.median
+    axes_mm = report.d_x_mm.median, report.d_y_mm.median
+    outline = _outline(report.centre_mm.median, axes_mm, angle_deg, np.linspace(0.0, 2 * np.pi, 720))
+    places = np.array([view.place(tactile_map, place) for place in outline])
     columns, rows = np.floor(places * px_per_cell).astype(int).T
     inside = (rows >= 0) & (rows < pixels.shape[0]) & (columns >= 0) & (columns < pixels.shape[1])
     pixels[rows[inside], columns[inside]] = _RING
+
+
+def _outline(
+    centre_mm: tuple[float, float], axes_mm: tuple[float, float], angle_deg: float, t: FloatArray
+) -> list[tuple[float, float]]:
+    """Points of an ellipse of these diameters, at angles `t` from its first axis."""
+    angle, (u, v) = np.radians(angle_deg), (axes_mm[0] / 2 * np.cos(t), axes_mm[1] / 2 * np.sin(t))
+    xs = centre_mm[0] + u * np.cos(angle) - v * np.sin(angle)
+    ys = centre_mm[1] + u * np.sin(angle) + v * np.cos(angle)
+    return list(zip(xs.tolist(), ys.tolist(), strict=True))
 
 
 # --- A map as inline SVG: its values, the size ellipse and its interval to scale, sides, nipple, scale bar.
@@ -380,12 +386,9 @@ def _mass(mass: ExamMass, exam: ExamMap, frame: Frame, *, small: bool) -> Iterat
 def _ellipse(mass: ExamMass, times: float, frame: Frame) -> str:
     """Path of the mass's ellipse, its diameters multiplied."""
     assert mass.axes_mm is not None
-    t, angle = np.linspace(0.0, 2 * np.pi, _POINTS, endpoint=False), np.radians(mass.angle_deg)
-    along, across = (0.5 * times * axis for axis in mass.axes_mm)
-    u, v = along * np.cos(t), across * np.sin(t)
-    xs = mass.centre_mm[0] + u * np.cos(angle) - v * np.sin(angle)
-    ys = mass.centre_mm[1] + u * np.sin(angle) + v * np.cos(angle)
-    places = [frame.at((float(a), float(b))) for a, b in zip(xs, ys, strict=True)]
+    t = np.linspace(0.0, 2 * np.pi, _POINTS, endpoint=False)
+    along, across = (times * axis for axis in mass.axes_mm)
+    places = [frame.at(place) for place in _outline(mass.centre_mm, (along, across), mass.angle_deg, t)]
     return "M" + "L".join(f"{a:.2f} {b:.2f}" for a, b in places) + "Z"
 
 

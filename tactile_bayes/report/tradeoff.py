@@ -26,13 +26,20 @@ def advice(ladder: Ladder) -> list[str]:
     """What to choose, why more buys nothing, and what moves the answer more than any arithmetic."""
     if ladder.reference.answer is None:
         return [_without_number(ladder)]
-    lines = [f"Advice: {_enough(ladder)}", *_moving(ladder), *_disagreeing(ladder), *_pooling_advice(ladder)]
-    return list(lines)
+    lines = [f"Advice: {_enough(ladder)}"]
+    far = [f"{one.label} {one.off.ends:.1f} mm" for one in ladder.rows if one.off.ends > ladder.tolerance_mm]
+    if far:
+        lines.append(f"What moves the ends more than {ladder.tolerance_mm:g} mm: {'; '.join(far)}.")
+    silent = [one.label for one in ladder.rows if one.answer.reported is None]
+    if silent:
+        lines.append(f"No size by {', '.join(silent)}.")
+    return [*lines, *_pooling_advice(ladder)]
 
 
 def _enough(ladder: Ladder) -> str:
     best, default = ladder.enough(), ladder.default
-    half = f"the interval's half width is {_reference_half(ladder):.1f} mm"
+    half_mm = float("nan") if ladder.reference.answer is None else ladder.reference.answer.half_width_mm
+    half = f"the interval's half width is {half_mm:.1f} mm"
     if best is None:
         return (
             f"no setting has its interval ends within {ladder.tolerance_mm:g} mm of the reference; the default's are "
@@ -50,40 +57,18 @@ def _enough(ladder: Ladder) -> str:
     return f"{text}, and {rest:.0f} % of its variance is no error of the map ({share:.0f} % is {SOURCES[source]})."
 
 
-def _reference_half(ladder: Ladder) -> float:
-    return float("nan") if ladder.reference.answer is None else ladder.reference.answer.half_width_mm
-
-
-def _moving(ladder: Ladder) -> Iterator[str]:
-    """The settings whose ends lie further off than the tolerance."""
-    found = [one for one in ladder.rows if one.off.ends > ladder.tolerance_mm]
-    if found:
-        moved = "; ".join(f"{one.label} {one.off.ends:.1f} mm" for one in found)
-        yield f"What moves the ends more than {ladder.tolerance_mm:g} mm: {moved}."
-
-
-def _disagreeing(ladder: Ladder) -> Iterator[str]:
-    """Settings that find nothing on a map that has a size by default."""
-    silent = [one.label for one in ladder.rows if one.answer.reported is None]
-    if silent:
-        yield f"No size by {', '.join(silent)}."
-
-
 def _pooling_advice(ladder: Ladder) -> Iterator[str]:
     sized = [one for one in ladder.pooled if one.answer.reported is not None]
     if len(sized) > 1:
         first, last = sized[0], sized[-1]
+        ends, another = (first.another_half_mm, last.another_half_mm), ""
+        if all(map(math.isfinite, ends)):
+            another = ", and from {:.1f} to {:.1f} mm if exams differ as in the paper".format(*ends)
         yield (
             f"{last.maps} maps pooled instead of {first.maps} change the half width from "
             f"{first.answer.half_width_mm:.1f} to {last.answer.half_width_mm:.1f} mm for "
-            f"{last.cpu_s - first.cpu_s:.2f} s of CPU{_another(first, last)}."
+            f"{last.cpu_s - first.cpu_s:.2f} s of CPU{another}."
         )
-
-
-def _another(first: PooledRow, last: PooledRow) -> str:
-    if not math.isfinite(first.another_half_mm + last.another_half_mm):
-        return ""
-    return f", and from {first.another_half_mm:.1f} to {last.another_half_mm:.1f} mm if exams differ as in the paper"
 
 
 def _without_number(ladder: Ladder) -> str:
@@ -452,10 +437,7 @@ def _free_place(x: float, y: float, wide: float, taken: list[Box], *, right: flo
     for step in (0, 1, -1, 2, -2, 3, -3, 4, -4, 5, -5, 6, -6):
         low = y - 4.5 + step * _LINE
         box = (begin, low, begin + wide, low + _LINE)
-        if not any(_cover(box, other) for other in taken):
+        covers = ((x0 < box[2] and box[0] < x1 and y0 < box[3] and low < y1) for x0, y0, x1, y1 in taken)
+        if not any(covers):
             break
     return box
-
-
-def _cover(one: Box, other: Box) -> bool:
-    return one[0] < other[2] and other[0] < one[2] and one[1] < other[3] and other[1] < one[3]
