@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tactile_bayes.forward.axisymmetric import LayeredBody
-from tactile_bayes.forward.line import LineFrames, build_line, fit_empirical, press, press_layers
+from tactile_bayes.forward.line import LineFrames, build_line
 from tactile_bayes.forward.solid import PlacedLump, SolidHead, face_of, solid_head
 from tactile_bayes.forward.tissue import Body, Layers
 from tactile_bayes.geometry import FloatArray
@@ -213,7 +213,7 @@ def _frames_of_lumps(
         cases = [] if found is None else [(one.d_mm, one.depth_ratio) for one in (found.small, found.large)]
         for colour, line, (d, h) in zip(COLOURS[1:], ("-", "--", "-"), [*cases, _OTHER], strict=False):
             surface = settings.surface(settings.body(d, h, seat=seat))
-            elastic = press(surface, HARD_RATIO, np.zeros(1), head=settings.head, mean_kpa=settings.mean_kpa)
+            elastic = settings.over(surface)
             right.plot(elastic.s_mm, elastic.at(0.0), line, color=colour, label=f"d {d:g} mm, h/d {h:.3g}")
         title = (
             "no two visible lumps" if found is None else f"two differ by {100 * found.difference:.1f} % of their rise"
@@ -229,11 +229,10 @@ def _plain_layers(settings: CaseSettings, fat_mm: float) -> Layers:
 def _draw_far(axes: Axes, settings: StudySettings, fat_mm: float, colour: str) -> None:
     """P1 on one thickness of fat; on one of them, Eq 1 fitted to what the taxels see."""
     layers = _plain_layers(settings, fat_mm)
-    frame = press_layers(layers, head=settings.head, mean_kpa=settings.mean_kpa, cell_mm=settings.cell_mm)
+    frame = settings.far(layers)
     axes.plot(frame.s_mm, frame.pressure_kpa[0], color=colour, label=f"fat {fat_mm:g} mm")
     if fat_mm == _FITTED_FAT_MM:
-        seen, half = frame.as_taxels(HEAD_PITCH_MM), settings.head.half_width_mm
-        model = fit_empirical(seen.s_mm, seen.at(0.0), seen.at(0.0), d_mm=1.0, half_width_mm=half)
+        model = settings.empirical(1.0, layers, frame)
         text = f"Eq 1 fitted to taxels, fat {fat_mm:g} mm"
         axes.plot(frame.s_mm, model.homogeneous(frame.s_mm), "k:", label=text)
 

@@ -24,7 +24,7 @@ from tactile_bayes.mapping.select import SelectedFrames, select_frames
 from tactile_bayes.posterior.options import SamplerSettings
 from tactile_bayes.posterior.white import BumpFit, fit_bump, fitted_candidates
 from tactile_bayes.presets import CELL_MM, FIT_RADIUS_MM, PRESSURE_WINDOW_KPA
-from tactile_bayes.scan import CountArray, ElementCalibration, PressureFrames, Scan
+from tactile_bayes.scan import ElementCalibration, PressureFrames, Scan
 from tactile_bayes.studies.paper_tables import mean_squared_difference
 
 Progress = Callable[[int, int], None]
@@ -96,7 +96,7 @@ def measured_frames(
     """
     selected = select_frames(scan, pressure_window_kpa=pressure_window_kpa, latency_ms=latency_ms)
     used = np.flatnonzero(selected.used)[::every]
-    part = _frames_of(scan, scan.frames.counts, used, scan.element_calibration)
+    part = replace(scan, frames=PressureFrames(scan.frames.time_s[used], scan.frames.counts[used]))
     made = build_map(
         part, cell_mm=cell_mm, pressure_window_kpa=pressure_window_kpa, latency_ms=latency_ms, normalise="mean"
     )
@@ -105,10 +105,11 @@ def measured_frames(
     pressure = scan.element_calibration.to_kpa(scan.frames.counts[used])
     pressure[:, ~selected.good_taxels] = np.nan
     lump = _bump(made, place_mm)
-    if lump is None and place_mm is None:
-        raise BadDataError("no lump is found on the scan's map", way_out="say where it is: --at X Y")
-    place = place_mm if place_mm is not None else _centre(lump)
-    return MeasuredFrames(part, pressure, rotation, origin, selected.level_kpa[used], made, place, lump)
+    if place_mm is None:
+        if lump is None:
+            raise BadDataError("no lump is found on the scan's map", way_out="say where it is: --at X Y")
+        place_mm = float(lump.theta[1]), float(lump.theta[2])
+    return MeasuredFrames(part, pressure, rotation, origin, selected.level_kpa[used], made, place_mm, lump)
 
 
 def compare_model(
@@ -202,11 +203,6 @@ def residual_slope(measured: MeasuredFrames, comparison: ModelComparison) -> tup
     return float(found[1]), float(found[2]), float(np.sqrt(np.mean((residual - design @ found) ** 2)))
 
 
-def _frames_of(scan: Scan, counts: CountArray, used: NDArray[np.intp], gains: ElementCalibration) -> Scan:
-    """The scan with some of its frames alone."""
-    return replace(scan, frames=PressureFrames(scan.frames.time_s[used], counts[used]), element_calibration=gains)
-
-
 def _poses_in_plane(
     selected: SelectedFrames, used: NDArray[np.intp], plane_from_base: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
@@ -266,11 +262,6 @@ def _bump(made: TactileMap, place_mm: tuple[float, float] | None) -> BumpFit | N
     if place_mm is not None:
         return fit_bump(made, place_mm, options=options)[0]
     return next((one.fit for one in fitted_candidates(made, options) if one.fit is not None and not one.fault), None)
-
-
-def _centre(fit: BumpFit | None) -> tuple[float, float]:
-    assert fit is not None
-    return float(fit.theta[1]), float(fit.theta[2])
 
 
 def _check_array(scan: Scan, scene: Scene) -> None:

@@ -15,9 +15,11 @@ from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.contact import Head
 from tactile_bayes.forward.line import (
     POSITIONS_MM,
+    EmpiricalModel,
     LineFrames,
     TactileLine,
     build_line,
+    fit_empirical,
     press,
     press_layers,
     slide,
@@ -74,6 +76,20 @@ class StudySettings(CaseSettings, kw_only=True):
     def frames(self, surface: SurfaceCompliance, stiffness_ratio: float | None) -> LineFrames:
         """Frames of the head at all its positions."""
         return slide(surface, stiffness_ratio, head=self.head, mean_kpa=self.mean_kpa, positions_mm=self.positions_mm)
+
+    def over(self, surface: SurfaceCompliance, stiffness_ratio: float = HARD_RATIO) -> LineFrames:
+        """The frame with the head's centre over the lump."""
+        return press(surface, stiffness_ratio, np.zeros(1), head=self.head, mean_kpa=self.mean_kpa)
+
+    def far(self, layers: Layers) -> LineFrames:
+        """The frame far from any lump."""
+        return press_layers(layers, head=self.head, mean_kpa=self.mean_kpa, cell_mm=self.cell_mm)
+
+    def empirical(self, d_mm: float, layers: Layers, over: LineFrames) -> EmpiricalModel:
+        """The empirical model, fitted to what taxels see far from a lump and `over` it."""
+        seen, far = over.as_taxels(HEAD_PITCH_MM), self.far(layers).as_taxels(HEAD_PITCH_MM)
+        half_width = self.head.half_width_mm
+        return fit_empirical(seen.s_mm, far.at(0.0), seen.at(0.0), d_mm=d_mm, half_width_mm=half_width)
 
 
 class Geometry(Record):
@@ -315,12 +331,10 @@ class Lookalikes(Record, eq=False):
 def centred_frame(d_mm: float, depth_ratio: float, *, settings: StudySettings, seat: float) -> CentredFrame:
     """The frame over a hard lump of one size and depth."""
     body = settings.body(d_mm, depth_ratio, seat=seat)
-    head: Head = settings.head
-    reach = 0.5 * settings.cell_mm * len(head.sensing_cells(settings.cell_mm))
+    reach = 0.5 * settings.cell_mm * len(settings.head.sensing_cells(settings.cell_mm))
     surface = condense(body, reach_mm=reach, cell_mm=settings.cell_mm, fineness=settings.fineness)
-    over = press(surface, HARD_RATIO, np.zeros(1), head=head, mean_kpa=settings.mean_kpa).as_taxels(HEAD_PITCH_MM)
-    far = press_layers(body.layers, head=head, mean_kpa=settings.mean_kpa, cell_mm=settings.cell_mm)
-    share, plain = _share(over.at(0.0)), _share(far.as_taxels(HEAD_PITCH_MM).at(0.0))
+    over, far = (one.as_taxels(HEAD_PITCH_MM) for one in (settings.over(surface), settings.far(body.layers)))
+    share, plain = (np.asarray(one.at(0.0) / one.at(0.0).mean()) for one in (over, far))
     return CentredFrame(d_mm, depth_ratio, over.s_mm, share, share - plain)
 
 
@@ -343,7 +357,10 @@ def find_lookalikes(
     shares, added = {}, {}
     for d in diameters_mm:
         frames = [centred_frame(d, h, settings=coarse, seat=seat) for h in depth_ratios]
-        shares[d], added[d] = _interpolated(frames, depth_ratios, tried)
+        shares[d], added[d] = (
+            CubicSpline(depth_ratios, np.stack(values))(tried)
+            for values in ([one.share for one in frames], [one.added for one in frames])
+        )
     best: tuple[float, float, float, float, float] | None = None
     for d, e in itertools.combinations(sorted(diameters_mm), 2):
         if LEAST_SIZE_RATIO * d > e:
@@ -368,21 +385,8 @@ def find_lookalikes(
     return Lookalikes(small, large_frame, _difference(small, large_frame))
 
 
-def _interpolated(
-    frames: Sequence[CentredFrame], depth_ratios: Sequence[float], tried: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Frames (k, n) of one size of lump at the depths tried, and what the lump adds to them."""
-    knots = np.asarray(depth_ratios)
-    shares = CubicSpline(knots, np.stack([frame.share for frame in frames]))(tried)
-    return shares, CubicSpline(knots, np.stack([frame.added for frame in frames]))(tried)
-
-
 def _difference(small: CentredFrame, large: CentredFrame) -> float:
     return _rms(large.share - small.share) / _rms(small.added)
-
-
-def _share(frame_kpa: FloatArray) -> FloatArray:
-    return np.asarray(frame_kpa / frame_kpa.mean())
 
 
 def _middle(across: FloatArray) -> FloatArray:

@@ -14,9 +14,7 @@ from tactile_bayes.forward.line import (
     LineFrames,
     TactileLine,
     build_line,
-    fit_empirical,
     press,
-    press_layers,
 )
 from tactile_bayes.forward.plane_strain import SurfaceCompliance
 from tactile_bayes.geometry import FloatArray
@@ -137,15 +135,7 @@ def scene_curves(scene: Scene, settings: StudySettings, *, surface: SurfaceCompl
     if surface is None:
         surface = settings.surface(settings.body(scene.d_mm, scene.depth_ratio, seat=scene.seat))
     elastic = settings.frames(surface, scene.stiffness_ratio)
-    far = press_layers(surface.body.layers, head=settings.head, mean_kpa=settings.mean_kpa, cell_mm=settings.cell_mm)
-    seen = elastic.as_taxels(HEAD_PITCH_MM)
-    model = fit_empirical(
-        seen.s_mm,
-        far.as_taxels(HEAD_PITCH_MM).at(0.0),
-        seen.at(0.0),
-        d_mm=scene.d_mm,
-        half_width_mm=settings.head.half_width_mm,
-    )
+    model = settings.empirical(scene.d_mm, surface.body.layers, elastic)
     empirical = model.frames(elastic.x_c_mm, elastic.s_mm)
     return Curves(elastic, empirical, build_line(elastic), build_line(empirical), model)
 
@@ -255,9 +245,7 @@ def compare_frames(
             )
     surface = settings.surface(settings.body(d_mm, depth_ratio, seat=seat))
     head, nominal = settings.head, settings.mean_kpa
-    far = press_layers(surface.body.layers, head=head, mean_kpa=nominal, cell_mm=settings.cell_mm)
-    over = press(surface, HARD_RATIO, np.zeros(1), head=head, mean_kpa=nominal).as_taxels(HEAD_PITCH_MM)
-    model = fit_empirical(over.s_mm, far.as_taxels(HEAD_PITCH_MM).at(0.0), over.at(0.0), d_mm=d_mm, half_width_mm=half)
+    model = settings.empirical(d_mm, surface.body.layers, settings.over(surface))
     places = np.array([frame.x_c_mm for frame in frames])
     means = np.array([frame.pressure_kpa.mean() for frame in frames])
     solved = press(surface, HARD_RATIO, places, head=head, mean_kpa=means).as_taxels(HEAD_PITCH_MM)

@@ -27,8 +27,7 @@ from tactile_bayes.size.pooling import SizePriors, pooled_size
 # References
 # ----------
 # Talts, Betancourt, Simpson, Vehtari & Gelman (2018), arXiv:1804.06788; Saeilynoja, Buerkner & Vehtari (2022),
-#   Statistics
-# and Computing 32:32 (simultaneous bands of the ECDF).
+# Statistics and Computing 32:32 (simultaneous bands of the ECDF).
 
 PROBABILITIES = (0.5, 0.9)
 BAND = 0.95
@@ -154,10 +153,8 @@ def ecdf_band(n: int, draws: int) -> tuple[FloatArray, FloatArray]:
 #   normal of `BumpPrior.tilt_sd`. For such parameters of location and scale ranks are uniform at every value.
 # - centre (uniform in a window that follows the map): uniform within `CENTRE_MM` of the map's middle;
 # - field: the exponential correlation itself. The posterior writes it in cosines on a rectangle that follows its
-#   window:
-#   what that approximation costs is part of what the ranks judge. (Cosines mirror a field at their rectangle's edge.
-#     Maps
-#   made of them had folds where they reached beyond, which other windows took for lumps.)
+#   window: what that approximation costs is part of what the ranks judge. (Cosines mirror a field at their rectangle's
+#   edge. Maps made of them had folds where they reached beyond, which other windows took for lumps.)
 #
 # Maps that give no estimate have no ranks: ranks are conditional on detection. Whether a map gives one depends on
 # the map alone, so that exact ranks stay uniform. Under a field much stronger than the bump another rise may be
@@ -166,12 +163,6 @@ def ecdf_band(n: int, draws: int) -> tuple[FloatArray, FloatArray]:
 #
 # The size is that of a round lump: the true one is a draw of the size calibration's own law at the true amplitude
 # and widths.
-#
-# References
-# ----------
-# Talts, Betancourt, Simpson, Vehtari & Gelman (2018), arXiv:1804.06788; Saeilynoja, Buerkner & Vehtari (2022),
-#   Statistics
-# and Computing 32:32 (simultaneous bands of the ECDF).
 
 HALF_MM = 25.0
 CELL_MM = 1.0

@@ -9,7 +9,7 @@ import numpy as np
 
 from tactile_bayes.declarations import Record, field, replace
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.forward.line import build_line, fit_empirical, head_positions, press, press_layers
+from tactile_bayes.forward.line import build_line, head_positions
 from tactile_bayes.forward.mesh import lump_mesh
 from tactile_bayes.forward.plane_strain import rim_nodes
 from tactile_bayes.forward.scene import Scene
@@ -19,7 +19,7 @@ from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.mapping.select import first_seconds
 from tactile_bayes.posterior.options import SamplerSettings
-from tactile_bayes.presets import CELL_MM, DEFAULT_NORMALISE, HEAD_PITCH_MM, NORMALISE, SHOULDERS_INSIDE, THICKNESS_MM
+from tactile_bayes.presets import CELL_MM, DEFAULT_NORMALISE, NORMALISE, SHOULDERS_INSIDE, THICKNESS_MM
 from tactile_bayes.scan import Scan
 from tactile_bayes.size.bodies import BodyCalibration, mean_width_mm
 from tactile_bayes.size.eq6 import SizeCalibration
@@ -214,11 +214,8 @@ _Prepared = Callable[[Fit, RasterFitter], _Shown]
 def _empirical(case: LumpCase, setting: Setting) -> _Prepared:
     settings = setting.settings
     assert isinstance(settings, StudySettings)
-    head, mean, cell = settings.head, settings.mean_kpa, settings.cell_mm
-    far = press_layers(case.body.layers, head=head, mean_kpa=mean, cell_mm=cell).as_taxels(HEAD_PITCH_MM)
-    over = press(settings.surface(case.body), case.stiffness_ratio, np.zeros(1), head=head, mean_kpa=mean)
-    seen = over.as_taxels(HEAD_PITCH_MM)
-    model = fit_empirical(seen.s_mm, far.at(0.0), seen.at(0.0), d_mm=case.d_mm, half_width_mm=head.half_width_mm)
+    over = settings.over(settings.surface(case.body), case.stiffness_ratio)
+    model = settings.empirical(case.d_mm, case.body.layers, over)
 
     def shown(fit: Fit, _: RasterFitter) -> _Shown:
         frames = model.frames(head_positions(settings.positions_mm), over.s_mm)
@@ -441,7 +438,8 @@ def measure_map(scan: Scan, *, inputs: Inputs, work: Work) -> Ladder:
         def once(number: int) -> tuple[dict[str, float], SizeAnswer]:
             begun = clock()
             try:
-                tactile_map = _build(scan, one)
+                used = scan if one.duration_s is None else first_seconds(scan, one.duration_s)
+                tactile_map = build_map(used, **one.options)
                 built_s = clock() - begun
                 calibration, options = inputs(tactile_map)
                 estimator = Estimator(tactile_map, calibration, work.seed, clock, work.probability)
@@ -456,11 +454,6 @@ def measure_map(scan: Scan, *, inputs: Inputs, work: Work) -> Ladder:
 
     seconds, _ = default_run(run_of(settings[0].how))
     return climbed(settings, run_of, lambda: _reference(scan, inputs, work), default_s=seconds, work=work)
-
-
-def _build(scan: Scan, one: Built) -> TactileMap:
-    used = scan if one.duration_s is None else first_seconds(scan, one.duration_s)
-    return build_map(used, **one.options)
 
 
 def _reference(scan: Scan, inputs: Inputs, work: Work) -> Reference:
