@@ -146,16 +146,8 @@ def mape_figure(sizes: ModalitySizes, *, confidence: float) -> Figure:
     )
 
 
-def _percent_errors(sizes: ModalitySizes) -> FloatArray:
-    return columns(np.abs(sizes.size_mm / some(sizes.ex_vivo_mm) - 1), 1.0)
-
-
 def _mm_errors(sizes: ModalitySizes) -> FloatArray:
     return columns(np.abs(sizes.size_mm - some(sizes.ex_vivo_mm)), 1.0, sizes.ex_vivo_mm)
-
-
-def _log_ratios(sizes: ModalitySizes) -> FloatArray:
-    return columns(np.log(sizes.size_mm) - np.log(some(sizes.ex_vivo_mm)), 1.0)
 
 
 def _mean(sums: FloatArray) -> FloatArray:
@@ -164,7 +156,11 @@ def _mean(sums: FloatArray) -> FloatArray:
 
 # Mean absolute error in percent of the ex-vivo size, each mass alike; a mass not found has size 0, an error of 100 %:
 # 100/n sum |y - e| / e. Wellman & Howe (1999), section 3, call it "percent mean absolute error (MAE)".
-mape_percent = SumStatistic(_percent_errors, lambda sums: 100 * _mean(sums), "no mass to average over")
+mape_percent = SumStatistic(
+    lambda sizes: columns(np.abs(sizes.size_mm / some(sizes.ex_vivo_mm) - 1), 1.0),
+    lambda sums: 100 * _mean(sums),
+    "no mass to average over",
+)
 
 # The same weighted by ex-vivo size: the sum of absolute errors over the sum of the sizes, in percent.
 weighted_mape_percent = SumStatistic(
@@ -175,7 +171,11 @@ weighted_mape_percent = SumStatistic(
 mae_mm = SumStatistic(_mm_errors, _mean, "no mass to average over")
 
 # Geometric mean of size over ex-vivo size; 1 without bias, and twofold up cancels twofold down.
-geometric_ratio = SumStatistic(_log_ratios, lambda sums: np.exp(_mean(sums)), "no mass to average over")
+geometric_ratio = SumStatistic(
+    lambda sizes: columns(np.log(sizes.size_mm) - np.log(some(sizes.ex_vivo_mm)), 1.0),
+    lambda sums: np.exp(_mean(sums)),
+    "no mass to average over",
+)
 
 
 def median_percent(sizes: ModalitySizes) -> float:
@@ -212,7 +212,8 @@ def origin_line_figures(sizes: ModalitySizes, *, confidence: float) -> dict[str,
 
 def _terms(sizes: ModalitySizes) -> FloatArray:
     """Products of sizes, then of sizes about their means: e e, e y, y y, 1, e', y', e'e', e'y', y'y'."""
-    e, y = _scaled(sizes)
+    unit = some(sizes.ex_vivo_mm).max()  # so that squares neither overflow nor vanish
+    e, y = sizes.ex_vivo_mm / unit, sizes.size_mm / unit
     de, dy = e - e.mean(), y - y.mean()
     return columns(e * e, e * y, y * y, 1.0, de, dy, de * de, de * dy, dy * dy)
 
@@ -263,12 +264,6 @@ pearson_r = SumStatistic(_terms_of_varied_pairs, _pearson)
 
 # Squared correlation coefficient; blind to scale and offset.
 r2_pearson = SumStatistic(_terms_of_varied_pairs, lambda sums: _pearson(sums) ** 2)
-
-
-def _scaled(sizes: ModalitySizes) -> tuple[FloatArray, FloatArray]:
-    """Sizes over the largest ex-vivo size, so that squares neither overflow nor vanish."""
-    unit = some(sizes.ex_vivo_mm).max()
-    return sizes.ex_vivo_mm / unit, sizes.size_mm / unit
 
 
 def _need_spread(values: FloatArray, reason: str) -> None:
@@ -328,7 +323,7 @@ def mape_ratio(sizes: ModalitySizes, reference: ModalitySizes, *, confidence: fl
 
     The interval leaves each patient out of both at once, so that patients hard for both do not widen it.
     """
-    return resampled(Pair(sizes, reference, _quotient), scale="log", confidence=confidence)
+    return resampled(Pair(sizes, reference, ratio), scale="log", confidence=confidence)
 
 
 class Pair(Record):
@@ -367,10 +362,6 @@ class Pair(Record):
         if np.any(np.isnan(values)):
             raise UndefinedError(f"the error of {self.reference.name} is 0")
         return values
-
-
-def _quotient(one: FloatArray, other: FloatArray) -> FloatArray:
-    return ratio(one, other)
 
 
 # --- Paired comparison of two modalities: difference and ratio of errors, and a permutation test.
@@ -457,7 +448,7 @@ def sign_flip(by_patient: FloatArray, *, seed: int, flips: int = FLIPS) -> float
 
 def _compare(one: ModalitySizes, other: ModalitySizes, *, confidence: float, seed: int) -> PairedComparison:
     first, second = on_common_masses(one, other)
-    difference = resampled(Pair(first, second, _difference), scale="linear", confidence=confidence)
+    difference = resampled(Pair(first, second, np.subtract), scale="linear", confidence=confidence)
     quotient = resampled(Pair(first, second, ratio), scale="log", confidence=confidence)
     patients = first.patients
     with np.errstate(all="ignore"):
@@ -475,7 +466,3 @@ def _compare(one: ModalitySizes, other: ModalitySizes, *, confidence: float, see
         p_holm=None,
         **fields_of({"difference_percent": difference, "ratio": quotient}),
     )
-
-
-def _difference(one: FloatArray, other: FloatArray) -> FloatArray:
-    return np.asarray(one - other)

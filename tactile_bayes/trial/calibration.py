@@ -41,23 +41,13 @@ def coverage(intervals: Sequence[IntervalReading], *, confidence: float) -> list
     share covered as found on m trials: exact where each mass has one interval, on the wide side where it has more.
     """
     ordered = sorted(intervals, key=lambda one: one.interval.probability)
-    return [
-        _coverage(probability, list(group), confidence=confidence)
-        for probability, group in groupby(ordered, key=lambda one: one.interval.probability)
-    ]
-
-
-def _coverage(probability: float, group: Sequence[IntervalReading], *, confidence: float) -> Coverage:
-    covered = sum(one.covered for one in group)
-    masses = len({one.key for one in group})
-    return Coverage(
-        probability=probability,
-        n=len(group),
-        covered=covered,
-        masses=masses,
-        fraction=covered / len(group),
-        fraction_interval=clopper_pearson(covered * masses / len(group), masses, confidence=confidence),
-    )
+    found = []
+    for probability, same in groupby(ordered, key=lambda one: one.interval.probability):
+        group = list(same)
+        n, covered, masses = len(group), sum(one.covered for one in group), len({one.key for one in group})
+        ends = clopper_pearson(covered * masses / n, masses, confidence=confidence)
+        found.append(Coverage(probability, n, covered, masses, covered / n, ends))
+    return found
 
 
 # --- Calibration of stated uncertainties: probability integral transforms, scores, and the implied correction.
@@ -143,11 +133,16 @@ def calibration(prediction: Prediction, *, confidence: float) -> Calibration | N
     distance = float(max(np.max(steps[1:] - ordered), np.max(ordered - steps[:-1])))
     scale, ends = _scale(z, prediction.mass, confidence=confidence)
     shift = 100 * math.expm1(float(np.median(prediction.found_log - prediction.median_log)))
+    levels = []
+    for level in LEVELS:
+        covered = int(np.sum(np.abs(z) <= float(ndtri(0.5 + 0.5 * level))))
+        share = clopper_pearson(covered * masses / len(z), masses, confidence=confidence)
+        levels.append(LevelCoverage(level, covered, len(z), share))
     band = float(kolmogi(1 - confidence)) / math.sqrt(masses)
     return Calibration(
         n=len(prediction),
         masses=masses,
-        levels=tuple(_level(z, masses, level, confidence=confidence) for level in LEVELS),
+        levels=tuple(levels),
         pit=tuple(int(count) for count in np.histogram(pit, bins=BINS, range=(0, 1))[0]),
         ecdf_band=band,
         ecdf_distance=distance,
@@ -224,12 +219,6 @@ def predictions(
         mass=np.array(masses, dtype=np.float64),
         patient=np.array(patients, dtype=np.float64),
     )
-
-
-def _level(z: FloatArray, masses: int, level: float, *, confidence: float) -> LevelCoverage:
-    covered = int(np.sum(np.abs(z) <= float(ndtri(0.5 + 0.5 * level))))
-    share = clopper_pearson(covered * masses / len(z), masses, confidence=confidence)
-    return LevelCoverage(level, covered, len(z), share)
 
 
 def _scale(z: FloatArray, mass: FloatArray, *, confidence: float) -> tuple[float, Ends]:

@@ -238,7 +238,10 @@ def bca_interval(value: float, drawn: FloatArray, left_out: FloatArray, *, confi
     Efron (1987), J. Am. Stat. Assoc. 82, 171: bias from the share of draws below the figure (ties by half),
     acceleration from the skewness of the values with one patient left out.
     """
-    drawn = _defined(drawn)
+    undefined = int(np.sum(~np.isfinite(drawn)))
+    if undefined > (1 - _LEAST_DEFINED) * len(drawn):
+        raise UndefinedError(f"of {len(drawn)} redrawn trials {undefined} leave the figure undefined")
+    drawn = drawn[np.isfinite(drawn)]
     share = (np.sum(drawn < value) + 0.5 * np.sum(drawn == value)) / len(drawn)
     bias = float(ndtri(np.clip(share, 0.5 / len(drawn), 1 - 0.5 / len(drawn))))
     off = left_out.mean() - left_out
@@ -249,13 +252,6 @@ def bca_interval(value: float, drawn: FloatArray, left_out: FloatArray, *, confi
     z = bias + np.array([-1, 1]) * float(ndtri(0.5 + 0.5 * confidence))
     low, high = np.quantile(drawn, ndtr(bias + z / (1 - acceleration * z)))
     return float(low), float(high)
-
-
-def _defined(drawn: FloatArray) -> FloatArray:
-    defined = drawn[np.isfinite(drawn)]
-    if len(defined) < _LEAST_DEFINED * len(drawn):
-        raise UndefinedError(f"of {len(drawn)} redrawn trials {len(drawn) - len(defined)} leave the figure undefined")
-    return defined
 
 
 # --- A figure of a trial: a number, its interval, and the reason where one of them is missing.
@@ -399,14 +395,12 @@ class Sample(Record):
         if isinstance(self.statistic, SumStatistic):
             with np.errstate(all="ignore"):
                 return self.statistic.redrawn(self.sizes, self.patients, draws)
-        return np.array([self._redrawn_once(row) for row in draws])
-
-    def _redrawn_once(self, counts: FloatArray) -> float:
-        of_mass = counts[np.searchsorted(self.patients, self.sizes.patient)].astype(np.int64)
-        try:
-            return finite(self.statistic, self.sizes.take(np.repeat(np.arange(len(of_mass)), of_mass)))
-        except UndefinedError:
-            return math.nan
+        values = np.full(len(draws), np.nan)
+        times = draws[:, np.searchsorted(self.patients, self.sizes.patient)].astype(np.int64)
+        for i, of_mass in enumerate(times):
+            with contextlib.suppress(UndefinedError):
+                values[i] = finite(self.statistic, self.sizes.take(np.repeat(np.arange(len(of_mass)), of_mass)))
+        return values
 
 
 def resampled(sample: Resampled, *, scale: Scale, confidence: float, freedom: float | None = None) -> Figure:

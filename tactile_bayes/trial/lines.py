@@ -191,8 +191,7 @@ def passing_bablok(
     :math:`z\\sqrt{n(n-1)(2n+5)/18}/2`, intercept ends the medians for the two slope ends. When either slope end lies
     beyond the ordered slopes, both ends of both intervals are infinite.
     """
-    if len(x) < 2:
-        raise UndefinedError(f"a line needs at least 2 masses (found {len(x)})")
+    _need_two(x)
     rising = kendall_sign(x, y) >= 0
     angles = PairAngles(x, y, vertical=math.pi / 2 if rising else -math.pi / 2)
     if angles.number == 0:
@@ -207,7 +206,9 @@ def passing_bablok(
     return PassingBablok(
         intercept=float(np.median(y - slope * x)),
         slope=slope,
-        intercept_interval=_intercept_ends(x, y, ends),
+        intercept_interval=(float(np.median(y - ends[1] * x)), float(np.median(y - ends[0] * x)))
+        if all(abs(end) < 1e15 for end in ends)
+        else (-math.inf, math.inf),
         slope_interval=ends,
         n=len(x),
     )
@@ -224,12 +225,6 @@ def _slope_ends(
     if (low + 1) // 2 < least or (high + 1) // 2 > angles.number - (high % 2 == 0):
         return -math.inf, math.inf
     return _at(angles, low, measure), _at(angles, high, measure)
-
-
-def _intercept_ends(x: FloatArray, y: FloatArray, slopes: tuple[float, float]) -> tuple[float, float]:
-    if not all(math.isfinite(slope) and abs(slope) < 1e15 for slope in slopes):
-        return -math.inf, math.inf
-    return float(np.median(y - slopes[1] * x)), float(np.median(y - slopes[0] * x))
 
 
 def _at(angles: PairAngles, twice: int, measure: Measure) -> float:
@@ -273,7 +268,11 @@ class Line(Record):
         if self.intercept_se is None or self.slope_se is None:
             return None
         t = student(self.n - 2, confidence=confidence)
-        return _about(self.intercept, t * self.intercept_se), _about(self.slope, t * self.slope_se)
+        of_intercept, of_slope = t * self.intercept_se, t * self.slope_se
+        return (
+            (self.intercept - of_intercept, self.intercept + of_intercept),
+            (self.slope - of_slope, self.slope + of_slope),
+        )
 
 
 def least_squares(x: FloatArray, y: FloatArray, *, weights: FloatArray | None = None) -> Line:
@@ -281,7 +280,7 @@ def least_squares(x: FloatArray, y: FloatArray, *, weights: FloatArray | None = 
 
     Undefined with fewer than two different x.
     """
-    _need_pairs(x, 2)
+    _need_two(x)
     w = np.ones_like(x) if weights is None else weights
     mean_x, mean_y, u, _, p = _moments(x, y, w)
     if u == 0:
@@ -309,8 +308,9 @@ def deming(x: FloatArray, y: FloatArray, *, error_ratio: float = 1.0) -> Line:
     Linnet (1990), Stat. Med. 9, 1463. The analytic standard error of the slope,
     :math:`b \sqrt{(1 - r^2)/r^2/(n - 2)}`, is that of Strike (1991), Statistical Methods in Laboratory Medicine.
     """
-    _need_ratio(error_ratio)
-    _need_pairs(x, 2)
+    if not 0 < error_ratio < math.inf:
+        raise ValueError(f"error_ratio is {error_ratio}; give a variance of x over that of y, above 0")
+    _need_two(x)
     mean_x, mean_y, u, q, p = _moments(x, y, np.ones_like(x))
     slope = deming_slope(u, q, p, error_ratio)
     intercept = mean_y - slope * mean_x
@@ -418,18 +418,9 @@ def _moments(x: FloatArray, y: FloatArray, w: FloatArray) -> tuple[float, float,
     return mean_x, mean_y, float(w @ dx**2), float(w @ dy**2), float(w @ (dx * dy))
 
 
-def _need_pairs(x: FloatArray, least: int) -> None:
-    if len(x) < least:
-        raise UndefinedError(f"a line needs at least {least} masses (found {len(x)})")
-
-
-def _need_ratio(error_ratio: float) -> None:
-    if not 0 < error_ratio < math.inf:
-        raise ValueError(f"error_ratio is {error_ratio}; give a variance of x over that of y, above 0")
-
-
-def _about(value: float, reach: float) -> tuple[float, float]:
-    return value - reach, value + reach
+def _need_two(x: FloatArray) -> None:
+    if len(x) < 2:
+        raise UndefinedError(f"a line needs at least 2 masses (found {len(x)})")
 
 
 # --- Lin's concordance correlation: precision and accuracy about the line of identity.

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from typing import Annotated, Literal, TypeVar
 
 import numpy as np
 
-from tactile_bayes.declarations import UNSET, Meta, UnsetType
+from tactile_bayes.declarations import UNSET, Meta, UnsetType, replace
 from tactile_bayes.trial import limits as bland_altman
-from tactile_bayes.trial import limits as patient_limits
 from tactile_bayes.trial.figures import (
     Count,
     Ends,
@@ -140,10 +140,11 @@ def _figures(found: ModalitySizes, *, confidence: float, error_ratio: float, rob
     slope: Scale = "slope" if method_of(confidence) == "corrected" else "linear"
     for name, statistic, scale in _statistics(error_ratio, robust, slope):
         wanted = scale if isinstance(statistic, SumStatistic) or len(found.size_mm) <= MOST_REFITTED else None
-        figures[name] = figure(
-            _guarded(statistic), found, scale=wanted, confidence=confidence, leverage=_squared_distance
-        )
-    return figures | patient_limits.figures(found, confidence=confidence)
+        guarded: Statistic = partial(_checked, statistic)
+        if isinstance(statistic, SumStatistic):
+            guarded = replace(statistic, terms=partial(_checked, statistic.terms))
+        figures[name] = figure(guarded, found, scale=wanted, confidence=confidence, leverage=_squared_distance)
+    return figures | bland_altman.figures(found, confidence=confidence)
 
 
 def _squared_distance(sizes: ModalitySizes) -> FloatArray:
@@ -244,17 +245,11 @@ class _Fit:
         return lambda sizes: float(getattr(self(sizes), name))
 
 
-def _guarded(statistic: Statistic) -> Statistic:
-    """Wrap a statistic to be undefined where the sums of squares vanish."""
-    if isinstance(statistic, SumStatistic):
-        return SumStatistic(lambda sizes: statistic.terms(_checked(sizes)), statistic.finish, statistic.undefined)
-    return lambda sizes: statistic(_checked(sizes))
-
-
-def _checked(sizes: ModalitySizes) -> ModalitySizes:
+def _checked(function: Callable[[ModalitySizes], _T], sizes: ModalitySizes) -> _T:
+    """Value of a function of sizes; undefined where their sums of squares vanish."""
     if len(sizes.size_mm) and not _squarable(sizes.ex_vivo_mm, sizes.size_mm):
         raise UndefinedError("the sizes are too large or too small for double precision")
-    return sizes
+    return function(sizes)
 
 
 def _squarable(x: FloatArray, y: FloatArray) -> bool:
@@ -294,14 +289,13 @@ def _jackknifed(
 
 
 def _limits(found: ModalitySizes, *, confidence: float) -> dict[Unit, Limits]:
+    if all(len(group) == 1 for group in found.replicates_mm):
+        return {
+            "mm": bland_altman.limits(found.size_mm - found.ex_vivo_mm, confidence=confidence),
+            "log_ratio": bland_altman.limits(np.log(found.size_mm / found.ex_vivo_mm), confidence=confidence),
+        }
     x, y = [np.array([e]) for e in found.ex_vivo_mm], list(found.replicates_mm)
     logs = [np.log(e) for e in x], [np.log(group) for group in y]
-    if all(len(group) == 1 for group in y):
-        plain: dict[Unit, FloatArray] = {
-            "mm": found.size_mm - found.ex_vivo_mm,
-            "log_ratio": np.log(found.size_mm / found.ex_vivo_mm),
-        }
-        return {name: bland_altman.limits(off, confidence=confidence) for name, off in plain.items()}
     return {
         "mm": bland_altman.limits_unlinked(x, y, confidence=confidence),
         "log_ratio": bland_altman.limits_unlinked(*logs, confidence=confidence),
@@ -309,12 +303,12 @@ def _limits(found: ModalitySizes, *, confidence: float) -> dict[Unit, Limits]:
 
 
 def _trends(x: FloatArray, y: FloatArray, *, confidence: float) -> dict[Against, Trend]:
-    against: dict[Against, FloatArray] = {"on_ex_vivo": x, "on_mean": (x + y) / 2}
-    trends = {
-        name: _or_none(partial(bland_altman.trend, y - x, size, confidence=confidence))
-        for name, size in against.items()
-    }
-    return {name: one for name, one in trends.items() if one is not None}
+    trends: dict[Against, Trend] = {}
+    with suppress(UndefinedError):
+        trends["on_ex_vivo"] = bland_altman.trend(y - x, x, confidence=confidence)
+    with suppress(UndefinedError):
+        trends["on_mean"] = bland_altman.trend(y - x, (x + y) / 2, confidence=confidence)
+    return trends
 
 
 def _or_none(compute: Callable[[], _T]) -> _T | None:

@@ -22,12 +22,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from itertools import combinations
 from typing import Annotated, Any, Literal, Protocol
 
 import numpy as np
 from scipy.special import erf, expit, log_expit
 
-from tactile_bayes.declarations import Meta, Record
+from tactile_bayes.declarations import Meta, Record, rounded
 from tactile_bayes.trial.figures import MIN_PATIENTS, Count
 from tactile_bayes.trial.readings import FloatArray, ModalitySizes, Trial, mass_numbers
 
@@ -128,7 +129,7 @@ def next_mass(trial: Trial, *, sample: Sampler, rng: np.random.Generator, probab
     return NextMass(
         {name: one.summary for name, one in posteriors.items()},
         IntervalKind("eti", probability),
-        {name: _round(p) for name, p in _compared(posteriors).items()},
+        {name: rounded(p) for name, p in _compared(posteriors).items()},
         left_out,
         {name: one.diagnostics for name, one in posteriors.items()},
     )
@@ -154,17 +155,11 @@ def posteriors_of(
 
 
 def _compared(posteriors: Mapping[str, Posterior]) -> dict[str, float]:
-    names = list(posteriors)
-    pairs = [(one, other) for i, one in enumerate(names) for other in names[i + 1 :]]
-    return {
-        f"{one} errs less than {other}": _below(posteriors[one].mape_percent, posteriors[other].mape_percent)
-        for one, other in pairs
-    }
-
-
-def _below(a: FloatArray, b: FloatArray) -> float:
-    """P(A < B) for independent draws, over all pairs of them."""
-    return float(np.mean(np.searchsorted(np.sort(a), b, side="left")) / len(a))
+    found = {}
+    for one, other in combinations(posteriors, 2):  # P(A < B) for independent draws, over all pairs of them
+        a, b = posteriors[one].mape_percent, posteriors[other].mape_percent
+        found[f"{one} errs less than {other}"] = float(np.mean(np.searchsorted(np.sort(a), b)) / len(a))
+    return found
 
 
 def _fit(
@@ -197,12 +192,12 @@ def _fit(
         "replicate_sd": sds[2],
         "miss_share": misses,
     }
-    middles = {name: Middle(*map(_round, np.quantile(values, tails))) for name, values in figures.items()}
+    middles = {name: Middle(*map(rounded, np.quantile(values, tails).tolist())) for name, values in figures.items()}
     return Posterior(
         NextOfModality(masses=len(found.size_mm), patients=len(found.patients), **middles),
         mape_percent=error,
         mape_detected_percent=of_found,
-        diagnostics={name: _round(value) for name, value in drawn.diagnostics.items()},
+        diagnostics={name: rounded(float(value)) for name, value in drawn.diagnostics.items()},
     )
 
 
@@ -319,10 +314,6 @@ def _total_variance(log_sd: FloatArray) -> FloatArray:
 
 def _erf(values: FloatArray) -> FloatArray:
     return np.asarray(erf(values))
-
-
-def _round(value: float) -> float:
-    return float(f"{value:.9g}")
 
 
 def _shown(one: Middle, spec: str) -> str:

@@ -6,7 +6,7 @@ import re
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from datetime import date
-from itertools import compress, groupby, pairwise
+from itertools import groupby, pairwise
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -111,14 +111,7 @@ class ModalitySizes(Record, eq=False):
 
     def only(self, keep: npt.NDArray[np.bool_]) -> ModalitySizes:
         """Copy with only the masses where `keep` is true; counts of readings and of masses left out become 0."""
-        return ModalitySizes(
-            name=self.name,
-            patient=self.patient[keep],
-            ex_vivo_mm=self.ex_vivo_mm[keep],
-            size_mm=self.size_mm[keep],
-            replicates_mm=tuple(compress(self.replicates_mm, keep.tolist())),
-            mass=self.mass[keep],
-        )
+        return self.take(np.flatnonzero(keep))
 
     def take(self, masses: npt.NDArray[np.int64]) -> ModalitySizes:
         """Copy with the masses at these indices, repeated as given; for resampling."""
@@ -215,18 +208,14 @@ def gather(readings: Iterable[Reading], ex_vivo_mm: Mapping[MassKey, float]) -> 
 
     Readings come in any order; each mass must be in `ex_vivo_mm`.
     """
-    with np.errstate(over="ignore"):  # a figure of an overflown mean is refused where it is formed
-        return _gather(readings, ex_vivo_mm)
-
-
-def _gather(readings: Iterable[Reading], ex_vivo_mm: Mapping[MassKey, float]) -> dict[str, ModalitySizes]:
     ordered = sorted(readings, key=lambda r: (r.modality != "tactile", r.modality, r.key, r.replicate))
     number = patient_numbers(ex_vivo_mm)
     masses = mass_numbers(ex_vivo_mm)
-    return {
-        name: _gather_modality(name, list(group), ex_vivo_mm=ex_vivo_mm, number=number, masses=masses)
-        for name, group in groupby(ordered, key=lambda r: r.modality)
-    }
+    with np.errstate(over="ignore"):  # a figure of an overflown mean is refused where it is formed
+        return {
+            name: _gather_modality(name, list(group), ex_vivo_mm=ex_vivo_mm, number=number, masses=masses)
+            for name, group in groupby(ordered, key=lambda r: r.modality)
+        }
 
 
 def patient_numbers(masses: Iterable[MassKey]) -> dict[str, int]:
@@ -440,7 +429,10 @@ def _visit(reading: Reading) -> str | None:
 def _of_mass(rows: Sequence[Row], excised: date | None, *, fault: CellFault) -> tuple[list[str], set[str]]:
     """Visits of a mass up to its excision, in order, and those after it."""
     first = {name: i for i, one in reversed(rows) if (name := _visit(one)) is not None}
-    days = {name: _latest(rows, name) for name in first}
+    days = {}
+    for name in first:
+        known = [one.day for _, one in rows if _visit(one) == name and one.day is not None]
+        days[name] = max(known, default=day_of(name))
     after = {name for name, day in days.items() if excised is not None and day is not None and day > excised}
     before = {name: day for name, day in days.items() if name not in after}
     if after and not before:
@@ -457,12 +449,6 @@ def _of_mass(rows: Sequence[Row], excised: date | None, *, fault: CellFault) -> 
         raise fault(max(first[name] for name in before), "visit", what, way_out=way_out)
     _check_dates(order, before, first, fault=fault)
     return order, after
-
-
-def _latest(rows: Sequence[Row], visit: str) -> date | None:
-    """Latest date of a visit's readings; None where none has one."""
-    days = [one.day for _, one in rows if _visit(one) == visit and one.day is not None]
-    return max(days, default=day_of(visit))
 
 
 def _check_said(rows: Sequence[Row], *, fault: CellFault) -> None:

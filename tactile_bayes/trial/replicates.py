@@ -244,17 +244,15 @@ def replicate_figures(sizes: ModalitySizes, *, confidence: float) -> dict[str, F
     """
     replicated = sizes.only_replicated()
     log_sd = figure(log_sd_within, replicated, scale="log", confidence=confidence)
+    low = log_sd.mapped(lambda sd: 100 * math.expm1(-_PAIR * sd))
+    if low.interval is not None:  # it falls as its source rises
+        low = replace(low, interval=low.interval[::-1])
     return {
         "within_mass_log_sd": log_sd,
-        "repeatability_low_percent": _swapped(log_sd.mapped(lambda sd: 100 * math.expm1(-_PAIR * sd))),
+        "repeatability_low_percent": low,
         "repeatability_high_percent": log_sd.mapped(lambda sd: 100 * math.expm1(_PAIR * sd)),
         "icc": figure(icc, replicated, scale="fisher", confidence=confidence),
     }
-
-
-def _swapped(one: Figure) -> Figure:
-    """Figure whose ends are swapped, because it falls as its source rises."""
-    return one if one.interval is None else replace(one, interval=(one.interval[1], one.interval[0]))
 
 
 def _logs(sizes: ModalitySizes) -> tuple[FloatArray, FloatArray, FloatArray]:
