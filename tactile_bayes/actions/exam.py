@@ -157,17 +157,17 @@ def show_action(file: Path, as_json: bool) -> None:
     if as_json:
         click.echo(dump_json(found), nl=False)
         return
-    for line in (*_lines(found), RESEARCH_USE):
+    for line in (*shown(found), RESEARCH_USE):
         click.echo(line)
 
 
-def _lines(found: dict[str, Any], indent: str = "") -> Iterator[str]:
-    """Nested facts as lines."""
+def shown(found: dict[str, Any], indent: str = "") -> Iterator[str]:
+    """Description of a file, one fact per line."""
     width = max((len(name) for name in found), default=0)
     for name, value in found.items():
         if isinstance(value, dict) and value:
             yield f"{indent}{name}"
-            yield from _lines(value, indent + "  ")
+            yield from shown(value, indent + "  ")
         else:
             yield f"{indent}{name.ljust(width)}  {_plain(value)}"
 

@@ -148,8 +148,7 @@ def population_action(
             progress=progress,
         )
     rows = [row for outcome in outcomes for row in outcome.value or []]
-    lines = (as_dict(row).values() for row in rows)
-    write_text(output, csv_text(names_of(MassRow), lines, digits=8), force=force)
+    write_text(output, table_text(rows), force=force)
     failed = [outcome for outcome in outcomes if not outcome.ok]
     for line in fault_lines(failed):
         click.echo(f"could not be simulated: mass {line}", err=True)
@@ -185,6 +184,11 @@ def rows_of_mass(
         scan=lambda scene: simulate(scene, rng=np.random.default_rng(scene.seed)).scan,
         normalise=normalise,
     )
+
+
+def table_text(rows: list[MassRow]) -> str:
+    """CSV of the rows, with the header of `data_schema/population.table.json`."""
+    return csv_text(names_of(MassRow), (as_dict(row).values() for row in rows), digits=8)
 
 
 # --- `sbc`: simulation-based calibration of a map's posterior.

@@ -240,7 +240,7 @@ def _describe(path: Path) -> object:
     from tactile_bayes.files.identify import describe
 
     found = describe(path)
-    return dump_json(found), shown(found)
+    return dump_json(found), list(shown(found))
 
 
 def _read_arrays(path: Path) -> object:
