@@ -41,8 +41,6 @@ from tactile_bayes.report.map_figure import map_figure
 from tactile_bayes.report.map_text import map_text
 from tactile_bayes.report.pooled import pooled_summary, pooled_text
 
-# --- Scans made maps, and exams made pages.
-
 # --- `map`: from scans to a tactile map.
 
 
@@ -125,8 +123,6 @@ def report_action(
     click.echo(f"{output}: {headline(exam)}")
     click.echo(RESEARCH_USE)
 
-
-# --- Maps estimated, pooled and compared, printed and written.
 
 # --- `estimate --pool`: one size from several maps of one mass.
 

@@ -128,8 +128,6 @@ def _refuse_checkpoint(settings: Settings) -> None:
         raise UsageError("a checkpoint is of one estimate, and this command makes many; leave checkpoint out")
 
 
-# --- Trade-offs measured, printed and drawn.
-
 # --- CPU time of this program in a process of its own: what a user who types one command waits for.
 
 TIMES = 2

@@ -30,8 +30,6 @@ if TYPE_CHECKING:
     from tactile_bayes.campaigns.exams import Found
 
 
-# --- A trial validated or planned, printed and written.
-
 # --- `validate`: compare each modality with excision.
 
 

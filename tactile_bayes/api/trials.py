@@ -160,8 +160,6 @@ def _provenance(trial: Trial, settings: TrialSettings, protocol: Path | None) ->
     ).as_dict()
 
 
-# --- A trial's tables to its report, and tables of scans to a calibration.
-
 # --- Input of `validate` and `plan`: the tables of a trial, tidy or wide, and the estimates that they name.
 
 

@@ -101,8 +101,6 @@ def estimate_command(ctx: click.Context, /, **given: Any) -> None:
     estimate_action(ctx, **given)
 
 
-# --- `compare`: the maps of two visits and more.
-
 # --- A command with groups of files: what follows ``--with`` up to the next option is one group.
 
 WITH: Final = "--with"

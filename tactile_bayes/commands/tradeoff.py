@@ -18,8 +18,6 @@ from tactile_bayes.commands.options import (
     takes,
 )
 
-# --- Options of the trade-offs, and the CPU time of a command in a process of its own.
-
 # --- What `tradeoff estimate` and `tradeoff map` share: options, the forecast on stderr, and the output.
 
 TOLERANCE = click.option(

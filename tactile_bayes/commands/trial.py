@@ -19,8 +19,6 @@ from tactile_bayes.commands.options import (
 from tactile_bayes.declarations import names_of
 from tactile_bayes.options import MOST_ITEMS, MapOptions, PlanErrors, TrialSettings
 
-# --- Options of the commands on trials: `validate`, `plan`.
-
 # --- `validate`: compare each modality with excision.
 
 _FILE = FilePath()

@@ -29,8 +29,6 @@ if TYPE_CHECKING:
     from tactile_bayes.mapping.map import TactileMap
 
 
-# --- Codes and identifiers of the standards.
-
 # --- Unique identifiers that follow from content: equal content, equal identifier, on every machine.
 
 _ROOT: Final = uuid.UUID("5d0f8a6c-54d1-5c0e-9a2b-3f5a3c1c9d47")
@@ -102,8 +100,6 @@ NOT_DETECTED: Final = Code("no-lump-shown", OWN_SCHEME, "The map shows no lump t
 NOT_SIZED: Final = Code("not-sized", OWN_SCHEME, "A lump may be there, without a size")
 SIZED: Final = Code("sized", OWN_SCHEME, "Lump with a size")
 
-
-# --- What of an exam goes into an export.
 
 # --- Packages that only exports need, each imported when its format is asked for.
 

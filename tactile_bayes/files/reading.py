@@ -15,8 +15,6 @@ from typing import Any, Final
 
 from tactile_bayes.errors import BadDataError, TactileBayesError, UsageError
 
-# --- The kind of a file, and reading it within limits.
-
 # --- Safe reading of files: regular files only, up to a size limit; a decoder's errors become one line.
 #
 # Limits are judged before memory is taken. Each is multiplied by the environment variable ``TACTILE_BAYES_LIMITS``

@@ -12,8 +12,6 @@ from tactile_bayes.errors import check_number
 from tactile_bayes.geometry import FloatArray, IndexArray
 from tactile_bayes.presets import INTERVAL
 
-# --- Draws of a posterior: their summary and a cache.
-
 # --- Draws of a model's parameters, the result of every method.
 
 END_ERROR = 2.67

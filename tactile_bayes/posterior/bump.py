@@ -72,8 +72,6 @@ def principal_widths(p: FloatArray, q: FloatArray, r: FloatArray) -> tuple[Float
     return np.exp(p + signed), np.exp(p - signed), angle
 
 
-# --- The bump of a lump on a map, and the window that it is fitted in.
-
 # --- Cells to be fitted: candidates for a lump, and the window about one of them.
 
 SMOOTHING_MM = 3.0

@@ -105,8 +105,6 @@ def _rms(values: Sequence[float]) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-# --- The trade-off ladder, and that of an estimate.
-
 # --- Settings with what each costs and answers, against one reference; the frontier, and which setting is enough.
 
 Clock = Callable[[], float]
