@@ -260,14 +260,10 @@ def demo_action(ctx: click.Context, output: Path, method: str, force: bool) -> N
 class Steps(Record):
     """Steps of the demo, run in the folder with its inputs."""
 
-    ctx: click.Context
-    """Of the demo itself; every step is invoked from it."""
-    folder: Path
-    """Holds the embedded files and takes what is made of them."""
-    method: str
-    """Of the default road's estimate."""
-    force: bool
-    """Whether files of an earlier demo are overwritten."""
+    ctx: click.Context  #: Of the demo itself; every step is invoked from it.
+    folder: Path  #: Holds the embedded files and takes what is made of them.
+    method: str  #: Of the default road's estimate.
+    force: bool  #: Whether files of an earlier demo are overwritten.
 
     def default_road(self) -> StatedSize:
         """Map and estimate with default options; returns the size."""

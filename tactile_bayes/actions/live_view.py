@@ -96,10 +96,8 @@ _calibration_of = cache(read_size_calibration)
 class LiveAnswer(NamedTuple):
     """Result of one live estimate; empty where the previous one stays."""
 
-    text: str = ""
-    """The size in a line, or why there is none."""
-    lump_base_mm: FloatArray | None = None
-    """Centre of the lump in `base`."""
+    text: str = ""  #: The size in a line, or why there is none.
+    lump_base_mm: FloatArray | None = None  #: Centre of the lump in `base`.
 
 
 class Estimator:

@@ -182,11 +182,9 @@ def place_of(report: EstimateReport | None) -> PatientPlace | None:
 class PooledSize(SizedExam, eq=False, dict=True, kw_only=True):
     """One size from several maps of one mass."""
 
-    pooled: PooledEstimate
-    """The size with what the maps together say of it, or why there is none."""
+    pooled: PooledEstimate  #: The size with what the maps together say of it, or why there is none.
     pooled_report: PooledReport
-    maps: tuple[SizeEstimate, ...] = ()
-    """The estimates of the maps alone, where they are at hand."""
+    maps: tuple[SizeEstimate, ...] = ()  #: The estimates of the maps alone, where they are at hand.
 
     @property
     def _size(self) -> SizePosterior | None:

@@ -43,13 +43,11 @@ _LEARN: Final = "learn one from exams that were sized so: `calibrate repeatabili
 class ExamFolder(Record):
     """An exam that was estimated, of a mass at a visit."""
 
-    name: str
-    """Of the exam."""
+    name: str  #: Of the exam.
     of_mass: str
     mass: str
     """`of_mass`, `mass`: Names of the mass at this visit, and at any."""
-    folder: Path
-    """Which holds what its estimate left."""
+    folder: Path  #: Which holds what its estimate left.
 
 
 class LearnedRepeatability(Record, eq=False):
@@ -72,12 +70,9 @@ class _Repeat(Record, eq=False):
     """`calibration`, `calibration_sha256`: That sized it, as its estimate names it."""
     scans: tuple[str, ...]
     """Recordings that it came from, as `recordings` names them; empty where its estimate does not say."""
-    digest: str
-    """Of the draws that pooling keeps."""
-    size: Quantity
-    """The largest, with its interval."""
-    spread: float
-    """Between exams, that the size was estimated with."""
+    digest: str  #: Of the draws that pooling keeps.
+    size: Quantity  #: The largest, with its interval.
+    spread: float  #: Between exams, that the size was estimated with.
 
     @property
     def shape_path(self) -> Path:

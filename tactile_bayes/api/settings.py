@@ -150,8 +150,7 @@ class Comparing(Record):
     """Shares of the diameter by which it may have grown or more."""
     same_mass: bool = False
     """Whether somebody says that the visits are of one mass, where their places do not show it."""
-    registration_mm: float = REGISTRATION_MM
-    """SD each way of a mass's place between two visits."""
+    registration_mm: float = REGISTRATION_MM  #: SD each way of a mass's place between two visits.
 
     def __post_init__(self) -> None:
         for share in self.grown_by:

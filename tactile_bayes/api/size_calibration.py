@@ -48,16 +48,11 @@ class Learned(Record, eq=False):
     """A learned or corrected size calibration, with what its file holds besides."""
 
     calibration: Calibration
-    settings: dict[str, Any]
-    """For the provenance."""
-    inputs: dict[str, Path]
-    """Files by role, for the provenance."""
-    seed: int | None = None
-    """Of the random numbers; None where it used none."""
-    base: dict[str, Any] | None = None
-    """Document of the calibration that was corrected."""
-    lumps: SizeTable | None = None
-    """The table as Eq 6 takes it, where that was learned."""
+    settings: dict[str, Any]  #: For the provenance.
+    inputs: dict[str, Path]  #: Files by role, for the provenance.
+    seed: int | None = None  #: Of the random numbers; None where it used none.
+    base: dict[str, Any] | None = None  #: Document of the calibration that was corrected.
+    lumps: SizeTable | None = None  #: The table as Eq 6 takes it, where that was learned.
     not_left_out: str = ""
     """Why no geometry could be left out; empty where they were, or the table is no study."""
     other_fit: OtherFit | None = None

@@ -168,16 +168,12 @@ class Sized(Record, eq=False, dict=True):
 class MassEstimate(Sized, eq=False, dict=True):
     """One of the masses on a map."""
 
-    number: int
-    """By evidence, the surest first; those without a size come last."""
-    mass: Mass
-    """Its place and its own estimate."""
+    number: int  #: By evidence, the surest first; those without a size come last.
+    mass: Mass  #: Its place and its own estimate.
     patient_mm: tuple[float, float] | None
     """x and y from the xiphoid, to the patient's right and up; None where the map has no landmarks."""
-    probability: float
-    """Of the intervals shown by default."""
-    reason: str
-    """Why it has no size; empty where it has one."""
+    probability: float  #: Of the intervals shown by default.
+    reason: str  #: Why it has no size; empty where it has one.
 
     @property
     def _size(self) -> SizePosterior | None:
@@ -224,19 +220,13 @@ class Answer(Record):
     """Answer for one map: its report and its text, or an error with its exit code; without map and draws."""
 
     report: EstimateReport | None
-    text: str
-    """The report in at most 12 lines, or the error."""
+    text: str  #: The report in at most 12 lines, or the error.
     exit_code: int
-    shape: ShapeDraws | None = None
-    """What pooling needs of a map on which a lump was found."""
-    normalise: str = ""
-    """How the map's frames were normalised."""
-    fingerprint: int = 0
-    """What the map's values seed random numbers with."""
-    full_text: str = ""
-    """All of the report."""
-    head: HeadShape | None = None
-    """What the map was made with."""
+    shape: ShapeDraws | None = None  #: What pooling needs of a map on which a lump was found.
+    normalise: str = ""  #: How the map's frames were normalised.
+    fingerprint: int = 0  #: What the map's values seed random numbers with.
+    full_text: str = ""  #: All of the report.
+    head: HeadShape | None = None  #: What the map was made with.
 
     @property
     def findings(self) -> tuple[Finding, ...]:
@@ -254,8 +244,7 @@ class SizedExam(Sized, eq=False, dict=True, kw_only=True):
 
     provenance: Provenance
     settings: Settings
-    name: str = ""
-    """For figures."""
+    name: str = ""  #: For figures.
 
     @property
     def probability(self) -> float:
@@ -287,10 +276,8 @@ class SizeEstimate(SizedExam, eq=False, dict=True, kw_only=True):
     """The estimate of one map."""
 
     tactile_map: TactileMap
-    estimate: Estimate
-    """Posterior and size, or why there is none."""
-    calibration: Calibration | None = None
-    """The one that sized the lump, at its depth."""
+    estimate: Estimate  #: Posterior and size, or why there is none.
+    calibration: Calibration | None = None  #: The one that sized the lump, at its depth.
 
     @property
     def _size(self) -> SizePosterior | None:

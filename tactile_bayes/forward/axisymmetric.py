@@ -50,12 +50,10 @@ _LEAST: Final = 1e-3
 class LayeredBody(Record):
     """Flat isotropic layers from the skin down."""
 
-    modulus_kpa: tuple[float, ...]
-    """Young's modulus of each layer."""
+    modulus_kpa: tuple[float, ...]  #: Young's modulus of each layer.
     thickness_mm: tuple[float, ...]
     """Of each layer on a rigid base; one entry fewer than `modulus_kpa` when the last is a half-space."""
-    nu: float = POISSON
-    """Poisson's ratio of all, above -1 and up to 0.5 (incompressible)."""
+    nu: float = POISSON  #: Poisson's ratio of all, above -1 and up to 0.5 (incompressible).
 
     def __post_init__(self) -> None:
         if len(self.modulus_kpa) - len(self.thickness_mm) not in (0, 1) or not self.modulus_kpa:
@@ -281,8 +279,7 @@ class Tissue(Record):
 class ModePerturbation(Record, eq=False):
     """Perturbation of Fourier order m."""
 
-    order: int
-    """m."""
+    order: int  #: m.
     matrix: FloatArray
     """(s, s) array: Symmetric: sinking in mm at skin node i for a unit force in kPa mm^2 at skin node j, per cos(m
     dtheta).
@@ -292,16 +289,13 @@ class ModePerturbation(Record, eq=False):
 class CondensedMode(Record, eq=False):
     """One Fourier order of the body around the lump, condensed onto the lump's boundary."""
 
-    order: int
-    """m."""
+    order: int  #: m.
     flexibility: FloatArray
     """(b, b) array: Displacements on the boundary for unit forces there, with nothing inside; mm per kPa mm^2."""
-    skin: FloatArray
-    """(s, b) array: Sinking of the skin for the same forces."""
+    skin: FloatArray  #: (s, b) array: Sinking of the skin for the same forces.
     unit_stiffness: FloatArray
     """(b, b) array: The lump, condensed on its boundary, for a modulus of 1 kPa."""
-    original_stiffness: FloatArray
-    """(b, b) array: The tissue that the lump replaces."""
+    original_stiffness: FloatArray  #: (b, b) array: The tissue that the lump replaces.
 
     def perturbation(self, lump_kpa: float) -> ModePerturbation:
         """Change of the skin's compliance when tissue is replaced by a lump of modulus `lump_kpa`.
@@ -326,8 +320,7 @@ class CondensedLump(Record, eq=False):
 
     radius_mm: FloatArray
     """(s,) array: Skin nodes, by increasing distance from the lump's axis, the axis itself left out."""
-    modes: tuple[CondensedMode, ...]
-    """Orders 0, 1, ..."""
+    modes: tuple[CondensedMode, ...]  #: Orders 0, 1, ...
 
     def perturbation(self, lump_kpa: float) -> tuple[ModePerturbation, ...]:
         """Perturbations of all orders, for a lump of modulus `lump_kpa`."""

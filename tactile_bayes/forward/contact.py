@@ -34,10 +34,8 @@ class Head(Record):
     Where the shoulders lie decides how many faint lumps show: decision record 0075.
     """
 
-    width_mm: float = HEAD_ROWS * HEAD_PITCH_MM
-    """Of the sensing part."""
-    radius_mm: float = HEAD_RADIUS_MM
-    """Of the arc; infinity for a flat head."""
+    width_mm: float = HEAD_ROWS * HEAD_PITCH_MM  #: Of the sensing part.
+    radius_mm: float = HEAD_RADIUS_MM  #: Of the arc; infinity for a flat head.
     shoulder_mm: float = SHOULDER_MM
     """Radius of the round between arc and side, tangent to both; 0 for a sharp edge."""
     shoulders: str = SHOULDERS_INSIDE
@@ -122,8 +120,7 @@ class Contact(Record, eq=False):
     pressure_kpa: FloatArray
     gap_mm: FloatArray
     """`pressure_kpa`, `gap_mm` (m, n) arrays: At each cell one is 0 and the other is not negative."""
-    depth_mm: FloatArray
-    """(m,) array: How deep the head's lowest point is pushed."""
+    depth_mm: FloatArray  #: (m,) array: How deep the head's lowest point is pushed.
     rounds: int
     """In which cells changed between touching and not touching, the last (without a change) included."""
 
@@ -233,25 +230,18 @@ _PATIENCE: Final = 4
 class SolidContact(Record, eq=False):
     """The solved contact of a head."""
 
-    pressure_kpa: FloatArray
-    """(n,) array: Of each taxel; 0 where it does not touch."""
-    gap_mm: FloatArray
-    """(n,) array: Between each taxel and the skin; 0 where it touches."""
-    depth_mm: float
-    """Of the head's highest point of `height_mm` 0 below the undisturbed skin."""
-    touching: BoolArray
-    """(n,) array of bool."""
+    pressure_kpa: FloatArray  #: (n,) array: Of each taxel; 0 where it does not touch.
+    gap_mm: FloatArray  #: (n,) array: Between each taxel and the skin; 0 where it touches.
+    depth_mm: float  #: Of the head's highest point of `height_mm` 0 below the undisturbed skin.
+    touching: BoolArray  #: (n,) array of bool.
 
 
 class ContactStiffness(Record, eq=False):
     r"""Inverse of a compliance that is a fixed matrix less a low-rank change."""
 
-    plain: FloatArray
-    """(n, n) array: Inverse of the compliance without the change, kPa / mm."""
-    factor: FloatArray
-    """(n, k) array."""
-    core: FloatArray
-    """(k, k) array: The stiffness is ``plain + factor @ core @ factor.T``."""
+    plain: FloatArray  #: (n, n) array: Inverse of the compliance without the change, kPa / mm.
+    factor: FloatArray  #: (n, k) array.
+    core: FloatArray  #: (k, k) array: The stiffness is ``plain + factor @ core @ factor.T``.
 
     @classmethod
     def of(cls, compliance: FloatArray) -> ContactStiffness:

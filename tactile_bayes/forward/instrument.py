@@ -39,8 +39,7 @@ Depth = Callable[[FloatArray], FloatArray]
 class SimulatedScan(Record, eq=False):
     """A simulated scan with its truth."""
 
-    scan: Scan
-    """As an instrument would have recorded it."""
+    scan: Scan  #: As an instrument would have recorded it.
     truth: Mapping[str, Any]
     """Plain data for JSON: the lumps in the scene's `plane`, in `patient` and in `base`, the transforms, the latency
     and the level.

@@ -29,12 +29,9 @@ _NOMINAL_HEAD = Head()
 class LineFrames(Record, eq=False):
     """Pressure across the head at each of its positions."""
 
-    x_c_mm: FloatArray
-    """(m,) array: Centre of the head, from the lump's axis."""
-    s_mm: FloatArray
-    """(n,) array: Centres of the cells from the head's centre."""
-    pressure_kpa: FloatArray
-    """(m, n) array."""
+    x_c_mm: FloatArray  #: (m,) array: Centre of the head, from the lump's axis.
+    s_mm: FloatArray  #: (n,) array: Centres of the cells from the head's centre.
+    pressure_kpa: FloatArray  #: (m, n) array.
 
     def __post_init__(self) -> None:
         shape = (len(self.x_c_mm), len(self.s_mm))
@@ -67,14 +64,10 @@ class LineFrames(Record, eq=False):
 class TactileLine(Record, eq=False):
     """A one-dimensional tactile map: the counterpart of `TactileMap` for a line."""
 
-    x_mm: FloatArray
-    """(k,) array: Centres of the map's cells."""
-    mean: FloatArray
-    """(k,) array: Mean of the readings in a cell; NaN without any."""
-    count: np.ndarray[tuple[int, ...], np.dtype[np.int64]]
-    """(k,) int array."""
-    cell_mm: float
-    """Width of the map's cells."""
+    x_mm: FloatArray  #: (k,) array: Centres of the map's cells.
+    mean: FloatArray  #: (k,) array: Mean of the readings in a cell; NaN without any.
+    count: np.ndarray[tuple[int, ...], np.dtype[np.int64]]  #: (k,) int array.
+    cell_mm: float  #: Width of the map's cells.
 
 
 def head_positions(positions_mm: tuple[float, float, float] = POSITIONS_MM) -> FloatArray:
@@ -207,8 +200,7 @@ SHARE = 0.5
 DEEPEST_RATIO, LEAST_D_MM = 1.0, 10.0
 """h/d up to which, and diameter in mm from which, the map of Eqs 1 to 4 has a lump about as high and wide as plane
 strain: amplitude -33 to +56 %, width -31 to +59 %, by record 0098."""
-LOST_RATIO = 1.5
-"""h/d from which the map of Eqs 1 to 4 has lost most lumps (record 0098)."""
+LOST_RATIO = 1.5  #: h/d from which the map of Eqs 1 to 4 has lost most lumps (record 0098).
 RANGE = f"it holds for cylinders of {LEAST_D_MM:g} mm and more down to h/d {DEEPEST_RATIO:g}"
 
 
@@ -273,10 +265,8 @@ class EmpiricalModel(Record):
     height_kpa: float
     width_mm: float
     """`height_kpa`, `width_mm`: g and sigma of Eq 2."""
-    d_mm: float
-    """Diameter of the lump."""
-    half_width_mm: float
-    """Of the head."""
+    d_mm: float  #: Diameter of the lump.
+    half_width_mm: float  #: Of the head.
 
     def homogeneous(self, s_mm: FloatArray) -> FloatArray:
         """P1 of this case."""

@@ -42,8 +42,7 @@ _GROWTH = 2.2
 class QuadMesh(Record, eq=False):
     """Nine-node quadrilaterals."""
 
-    nodes: FloatArray
-    """(n, 2) array: x and depth z in mm."""
+    nodes: FloatArray  #: (n, 2) array: x and depth z in mm.
     elements: IndexArray
     """(m, 9) int array: Node numbers in tensor order: ``elements[:, 3 * i + j]`` is the node at step i of the first
     local direction and step j of the second.
@@ -260,12 +259,9 @@ class LumpGeometry(Record):
     radius_mm: float
     half_height_mm: float
     """`radius_mm`, `half_height_mm`: Half axes of the spheroid, across and along the vertical."""
-    depth_mm: float
-    """Of its centre below the skin."""
-    fat_mm: float
-    """Depth of the boundary between fat and gland."""
-    thickness_mm: float
-    """Depth of the rigid base."""
+    depth_mm: float  #: Of its centre below the skin.
+    fat_mm: float  #: Depth of the boundary between fat and gland.
+    thickness_mm: float  #: Depth of the rigid base.
 
     def __post_init__(self) -> None:
         for name in ("radius_mm", "half_height_mm", "depth_mm", "fat_mm"):
@@ -301,30 +297,24 @@ class LumpGeometry(Record):
 class MeshSize(Record):
     """How fine a mesh is."""
 
-    arc: int = 18
-    """Elements along the half circle of the lump."""
+    arc: int = 18  #: Elements along the half circle of the lump.
     rings: int = 6
     core: int = 3
     """`rings`, `core`: Rings of elements outside and inside it."""
-    grade: float = 1.45
-    """Ratio of neighbouring elements beyond the box."""
-    reach_mm: float = 300.0
-    """Least radius of the mesh."""
+    grade: float = 1.45  #: Ratio of neighbouring elements beyond the box.
+    reach_mm: float = 300.0  #: Least radius of the mesh.
 
 
 class LumpMesh(Record, eq=False):
     """Nodes and elements of a mesh."""
 
-    node_mm: FloatArray
-    """(n, 2) array: (r, z) of each node."""
+    node_mm: FloatArray  #: (n, 2) array: (r, z) of each node.
     element: IntArray
     """(e, 9) int array: Nodes of each element, row by row of its three by three lattice."""
-    region: IntArray
-    """(e,) int array: `EXTERIOR_FAT` and so on."""
+    region: IntArray  #: (e,) int array: `EXTERIOR_FAT` and so on.
     arc: IntArray
     """(a,) int array: Nodes on the lump's boundary from the top pole to the bottom pole."""
-    surface: IntArray
-    """(s,) int array: Nodes on the skin by increasing r."""
+    surface: IntArray  #: (s,) int array: Nodes on the skin by increasing r.
 
 
 def lump_mesh(geometry: LumpGeometry, size: MeshSize | None = None) -> LumpMesh:

@@ -27,8 +27,7 @@ from tactile_bayes.presets import (
 # `patient` frame follows from them as for a real scan.
 
 Degrees = Annotated[float, Meta(ge=-360, le=360)]
-Rotation = tuple[Degrees, Degrees, Degrees]
-"""Rotation vector."""
+Rotation = tuple[Degrees, Degrees, Degrees]  #: Rotation vector.
 Coordinate = Annotated[float, Meta(ge=-2000, le=2000)]
 Point = tuple[Coordinate, Coordinate, Coordinate]
 LeverMm = Annotated[float, Meta(ge=-1000, le=1000)]

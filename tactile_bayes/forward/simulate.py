@@ -179,17 +179,13 @@ class PlaneSection(Record, eq=False):
 
     head: Head
     """Section of the head: shoulders of the scene's `shoulder_mm`, or its `rim_mm` where that is 0."""
-    layers: Layers
-    """The body without the lump."""
-    lump: tuple[Body, float] | None
-    """Below the skin; None for nothing."""
-    x_mm: float
-    """Place of the lump's axis."""
+    layers: Layers  #: The body without the lump.
+    lump: tuple[Body, float] | None  #: Below the skin; None for nothing.
+    x_mm: float  #: Place of the lump's axis.
     mean_kpa: float
     cell_mm: float
     """`mean_kpa`, `cell_mm`: The nominal pressure; width of the contact's cells, of which a taxel has six."""
-    reach_mm: float
-    """How far from the lump's axis the head's edges get."""
+    reach_mm: float  #: How far from the lump's axis the head's edges get.
 
     def surface(self) -> SurfaceCompliance:
         """Compliance of the skin over the lump."""

@@ -52,10 +52,8 @@ class SkinPerturbation(Record, eq=False):
 
     table: FloatArray
     """(t, k) array: functions of the distance from the lump's axis, every 0.05 mm, in mm (kPa mm^2)^(-1/2)."""
-    order: NDArray[np.int64]
-    """(k,) array: angular order of each."""
-    sign: FloatArray
-    """(k,) array: -1 where the lump stiffens."""
+    order: NDArray[np.int64]  #: (k,) array: angular order of each.
+    sign: FloatArray  #: (k,) array: -1 where the lump stiffens.
 
     @property
     def reach_mm(self) -> float:
@@ -135,21 +133,17 @@ class PlacedLump(Record, eq=False):
 class SolidFrame(Record, eq=False):
     """The solved frame of a head at one pose."""
 
-    pressure_kpa: FloatArray
-    """(rows, columns) array: Mean pressure on each taxel."""
+    pressure_kpa: FloatArray  #: (rows, columns) array: Mean pressure on each taxel.
     depth_mm: float
     """z of the head's origin in the scene's `plane`, whose z = 0 is the undisturbed skin."""
-    contact: Contact
-    """Of the whole face, rim included."""
+    contact: Contact  #: Of the whole face, rim included.
 
 
 class SolidHead(Record, eq=False):
     """A rigid head on a layered body; made by `solid_head`."""
 
-    face: HeadFace
-    """Squares that can touch."""
-    plain: ContactStiffness
-    """Stiffness of the skin under the face, without lumps."""
+    face: HeadFace  #: Squares that can touch.
+    plain: ContactStiffness  #: Stiffness of the skin under the face, without lumps.
 
     def frame(
         self,

@@ -33,15 +33,12 @@ SEATS = {"centred": 0.0, "resting": 1.0}
 class Layers:
     """The layered body without a lump."""
 
-    fat_mm: float
-    """Depth of the fat-gland boundary."""
+    fat_mm: float  #: Depth of the fat-gland boundary.
     thickness_mm: float = THICKNESS_MM
     """Depth of the rigid chest wall, to which the gland is bonded."""
     fat_kpa: float = FAT_KPA
-    gland_ratio: float = GLAND_RATIO
-    """Young's modulus of gland over that of fat."""
-    poisson: float = POISSON
-    """Of all tissues, at least 0 and below 0.5."""
+    gland_ratio: float = GLAND_RATIO  #: Young's modulus of gland over that of fat.
+    poisson: float = POISSON  #: Of all tissues, at least 0 and below 0.5.
 
     def __post_init__(self) -> None:
         _require(0 < self.fat_mm < self.thickness_mm, "fat_mm", self.fat_mm, f"above 0 and below {self.thickness_mm:g}")
@@ -136,8 +133,7 @@ class HeadFace:
 
     surface_mm: FloatArray
     """(rows, columns, 3) array: centres in `scanhead`: origin at the apex of the face, z into the tissue."""
-    sensing: NDArray[np.bool_]
-    """(rows, columns) bool array: true for taxels, False for the rim."""
+    sensing: NDArray[np.bool_]  #: (rows, columns) bool array: true for taxels, False for the rim.
     pitch_mm: float
 
     @property

@@ -31,10 +31,8 @@ def even_replicates(number: int) -> Labels:
 class ParameterDraws(Record, eq=False):
     """Draws of a parameter vector."""
 
-    theta: FloatArray
-    """(chain, draw, p) array."""
-    method: str
-    """One of `presets.METHODS`."""
+    theta: FloatArray  #: (chain, draw, p) array.
+    method: str  #: One of `presets.METHODS`.
     diagnostics: Mapping[str, float] = field(default_factory=dict)
     """Figures of the method (R-hat, effective draws, evaluations...), for the report."""
     labels: Labels | None = None

@@ -87,12 +87,9 @@ def inference_data(
 class ChainState(Record, eq=False):
     """State of all ensembles after the same number of steps."""
 
-    chain: FloatArray
-    """(ensemble, step, walker, p) array: In standardised coordinates."""
-    log_density: FloatArray
-    """(ensemble, walker) array: At the last step."""
-    accepted: FloatArray
-    """(ensemble,) array: Mean accepted proposals of a walker so far."""
+    chain: FloatArray  #: (ensemble, step, walker, p) array: In standardised coordinates.
+    log_density: FloatArray  #: (ensemble, walker) array: At the last step.
+    accepted: FloatArray  #: (ensemble,) array: Mean accepted proposals of a walker so far.
     twister: np.ndarray[tuple[int, ...], np.dtype[np.uint32]]
     """(ensemble, 624) uint32 array: The random generators' keys."""
     cursor: FloatArray
@@ -115,8 +112,7 @@ class ChainStore(Protocol):
 
 # --- Markov chain Monte Carlo by several independent emcee ensembles, which must agree before they stop.
 
-WALKERS_PER_PARAMETER = 4
-"""Walkers of each ensemble."""
+WALKERS_PER_PARAMETER = 4  #: Walkers of each ensemble.
 
 
 class EnsembleOptions(Record):
@@ -124,15 +120,12 @@ class EnsembleOptions(Record):
 
     ensembles: int = 4
     """Independent ensembles; walkers of one ensemble share their history, so R-hat compares ensembles."""
-    block: int = 150
-    """Steps between two looks at the diagnostics."""
-    max_steps: int = 6000
-    """Give up after this many."""
+    block: int = 150  #: Steps between two looks at the diagnostics.
+    max_steps: int = 6000  #: Give up after this many.
     least_ess: float = 800.0
     most_rhat: float = 1.01
     """`least_ess`, `most_rhat`: Bulk and tail effective draws, and R-hat, that every parameter must reach."""
-    keep: int = 8000
-    """Draws kept, thinned evenly over all ensembles."""
+    keep: int = 8000  #: Draws kept, thinned evenly over all ensembles.
 
     def identity(self) -> str:
         """Settings that a checkpoint belongs to: all but the number of steps."""

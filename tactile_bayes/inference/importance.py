@@ -79,8 +79,7 @@ def _pareto_quantile(probability: FloatArray, shape: float, scale: float) -> Flo
 class Gaussians(Record, eq=False):
     """A mixture of Gaussians."""
 
-    weight: FloatArray
-    """(h,) array: Sum 1."""
+    weight: FloatArray  #: (h,) array: Sum 1.
     mean: FloatArray
     covariance: FloatArray
     """`mean`, `covariance` (h, p), (h, p, p) arrays."""
@@ -181,13 +180,11 @@ class Proposal:
 # ----------
 # Raftery & Bao (2010), Biometrics 66:1162, section 3; Hesterberg (1995), Technometrics 37:185 (defensive mixtures).
 
-ADDED = 256
-"""Points of each Gaussian added, and points that its width is taken from."""
+ADDED = 256  #: Points of each Gaussian added, and points that its width is taken from.
 MOST_ADDED = 32
 ENOUGH = 0.75
 """Share of effective points at which no more Gaussians are added, if the weights' tail is light as well."""
-LIGHT_TAIL = 0.3
-"""Pareto shape of weights that more points will hardly show to be heavier."""
+LIGHT_TAIL = 0.3  #: Pareto shape of weights that more points will hardly show to be heavier.
 LEAST_VARIANCE = 1e-6
 """Least variance of a Gaussian in any direction, over that of all the points: points may lie in a plane."""
 
@@ -259,8 +256,7 @@ NEAR_ENOUGH = 3.0
 """Points whose weights can be trusted stand at so many times the wanted error, where a fitted proposal is worse: chains
 are asked for five times it."""
 MOST_MOVES = 4
-LEAST_KEPT = 8192
-"""Equal-weight draws returned, at least: twice the points where those are more."""
+LEAST_KEPT = 8192  #: Equal-weight draws returned, at least: twice the points where those are more.
 HEAVY_POINTS, HEAVY = 2048, 0.1
 """With as many points a replicate and a tail heavier than trusted by this, more points do not help."""
 

@@ -65,16 +65,11 @@ SETTLED = 0.01
 class LeastSquaresFit(Record, eq=False):
     """The minimum of a weighted sum of squares."""
 
-    theta: FloatArray
-    """(p,) array: Parameters at the minimum."""
-    jacobian: FloatArray
-    """(k, p) array: Derivatives of the predictions there."""
-    residual: FloatArray
-    """(k,) array: Data minus prediction."""
-    sse: float
-    """Weighted sum of squared residuals."""
-    converged: bool
-    """The relative step fell below the tolerance."""
+    theta: FloatArray  #: (p,) array: Parameters at the minimum.
+    jacobian: FloatArray  #: (k, p) array: Derivatives of the predictions there.
+    residual: FloatArray  #: (k,) array: Data minus prediction.
+    sse: float  #: Weighted sum of squared residuals.
+    converged: bool  #: The relative step fell below the tolerance.
     iterations: int
 
     def covariance(self, weight: FloatArray) -> FloatArray:

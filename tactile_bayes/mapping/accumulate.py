@@ -29,8 +29,7 @@ class Source(Record, eq=False):
     selection: SelectedFrames
     readout: Readout
     """`selection`, `readout`: The scan with its used frames, and the taxels that are read."""
-    projection: Projection
-    """The used frames only, in their order."""
+    projection: Projection  #: The used frames only, in their order.
 
     @classmethod
     def of(cls, selection: SelectedFrames, *, plane_from_base: FloatArray, cell_mm: float) -> Source:
@@ -182,8 +181,7 @@ class FlatField(Record, eq=False):
 
     response: FloatArray
     """(rows, columns) array: 1 where the taxel reads as much as its frame's mean; 1 for taxels left out."""
-    frames: int
-    """Lump-free frames it was taken from."""
+    frames: int  #: Lump-free frames it was taken from.
 
     @property
     def spread(self) -> float:
@@ -242,14 +240,11 @@ GAIN_TOLERANCE = 1e-4
 class Accumulated(Record, eq=False):
     """Sums over all frames, and how the gains were solved."""
 
-    sums: CellSums
-    """The cells."""
-    levels: list[FloatArray]
-    """Divisors of the frames, one array per scan."""
+    sums: CellSums  #: The cells.
+    levels: list[FloatArray]  #: Divisors of the frames, one array per scan.
     scale: float = 1.0
     """Divisor of the sums' values (1 but for ``gain``, whose level is set afterwards)."""
-    passes: int = 1
-    """Passes over the scan."""
+    passes: int = 1  #: Passes over the scan.
     last_change: float = 0.0
     """Largest relative change of a frame's gain in the last pass; 0 unless the gains are solved for."""
 
@@ -305,8 +300,7 @@ class MapGrid(Record, eq=False):
 
     plane_from_base: FloatArray
     """(4, 4) array: Cells are centred on whole multiples of their side in this `plane`."""
-    cell_mm: float = CELL_MM
-    """Side of the square cells."""
+    cell_mm: float = CELL_MM  #: Side of the square cells.
 
     def __post_init__(self) -> None:
         check_rigid(self.plane_from_base, name="plane_from_base")
@@ -329,8 +323,7 @@ class Instrument(Record, eq=False, dict=True):
     head: HeadGeometry
     element_calibration: ElementCalibration
     """`head`, `element_calibration`: Of the scan head."""
-    faults: Sequence[TaxelFault] = ()
-    """Taxels left out of every frame."""
+    faults: Sequence[TaxelFault] = ()  #: Taxels left out of every frame.
     pressure_window_kpa: tuple[float, float] = PRESSURE_WINDOW_KPA
     """Frames whose mean lies outside are left out."""
     normalise: str = "mean"

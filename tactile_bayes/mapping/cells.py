@@ -52,8 +52,7 @@ class CellSums:
     square: IntArray = field(default_factory=_no_cells)
     """`count`, `total`, `square`: (ny, nx) int64 arrays of readings, their sum in `VALUE_STEP` and the sum of their
     squares in `VALUE_STEP` squared."""
-    clipped: int = 0
-    """Readings beyond `VALUE_LIMIT` that were added at the limit."""
+    clipped: int = 0  #: Readings beyond `VALUE_LIMIT` that were added at the limit.
     negative: int = 0
     """Readings below 0, which noise about nothing gives. They are added as they are: cut off at 0, they would lift the
     mean."""
@@ -229,8 +228,7 @@ _WHOLE = 2.0**52
 class ProjectedTaxels(Record, eq=False, dict=True):
     """The taxels of a head to be projected."""
 
-    place_mm: FloatArray
-    """(3, k) array: Their centres in the tracker's axes, about their middle."""
+    place_mm: FloatArray  #: (3, k) array: Their centres in the tracker's axes, about their middle.
 
     @cached_property
     def place_and_one(self) -> FloatArray:
@@ -250,13 +248,11 @@ class Projection(Record, eq=False):
     coordinates of each taxel.
     """
 
-    taxels: ProjectedTaxels
-    """The taxels that are projected."""
+    taxels: ProjectedTaxels  #: The taxels that are projected.
     matrix: FloatArray
     """(n, 2, 4) array: First two rows of the rotation from the tracker to the plane, in cells a mm; and beside them
     where the taxels' middle lies on the lattice, in cells. Half a cell is added, so that cell k is centred on k."""
-    cell_mm: float
-    """Side of a cell."""
+    cell_mm: float  #: Side of a cell.
 
     def __len__(self) -> int:
         return len(self.matrix)
@@ -398,15 +394,12 @@ PRESSURE_STEP_KPA = 2.0**-34
 class Readout(Record, eq=False, dict=True):
     """The taxels used, and the conversion of their counts to pressures."""
 
-    taxels: IndexArray
-    """(k,) int array: Flat indices of the used taxels, rising."""
-    size: int
-    """Taxels of the whole array."""
+    taxels: IndexArray  #: (k,) int array: Flat indices of the used taxels, rising.
+    size: int  #: Taxels of the whole array.
     gain_kpa: FloatArray
     offset_kpa: FloatArray
     """`gain_kpa`, `offset_kpa` (k,) arrays: On the grid of `PRESSURE_STEP_KPA`."""
-    full_count: int
-    """Readings at or above it carry no pressure."""
+    full_count: int  #: Readings at or above it carry no pressure.
 
     @cached_property
     def plain_count(self) -> int:

@@ -55,10 +55,8 @@ class CoarseFrames(Record, eq=False):
 
     pressure: FloatArray
     """(m, k) array: Mean over a block of frames and a block of taxels, each frame over its own mean."""
-    frames: IndexArray
-    """(n,) int array: The scan's frames that were averaged."""
-    first: IndexArray
-    """(m,) int array: Where each block of frames begins among them."""
+    frames: IndexArray  #: (n,) int array: The scan's frames that were averaged.
+    first: IndexArray  #: (m,) int array: Where each block of frames begins among them.
     weight: FloatArray
     """(t, k) array: Share of each good taxel in each block of taxels; columns add up to 1."""
     row: IndexArray

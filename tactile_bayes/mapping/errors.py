@@ -52,10 +52,8 @@ def pose_noise_figures(selections: Sequence[SelectedFrames], plane: Plane, *, ce
 class _Places(Record, eq=False):
     """Position errors of a scan's used frames."""
 
-    variance: FloatArray
-    """(2,) array: Of a frame's place along the plane's axes, mm^2."""
-    frames: int
-    """Used ones."""
+    variance: FloatArray  #: (2,) array: Of a frame's place along the plane's axes, mm^2.
+    frames: int  #: Used ones.
     independent: float
     """Frames with errors of their own whose mean would be known as well: those between two poses share theirs."""
 
@@ -175,16 +173,14 @@ def _sampled(source: Source, of_frames: int) -> list[slice]:
 class _Run(Record, eq=False):
     """Errors of one run of frames; (f, k) arrays, 0 where not known."""
 
-    source: Source
-    """Which of the sources."""
+    source: Source  #: Which of the sources.
     cell: NDArray[np.int64]
     cells: int
     """`cell`, `cells`: Where each reading lies in the block of cells that the run covers, and how many those are."""
     whole: FloatArray
     others: FloatArray
     """`whole`, `others`: Errors about the map, and about the map without this run."""
-    known: BoolArray
-    """Valid readings in cells that enough readings of other frames fell into."""
+    known: BoolArray  #: Valid readings in cells that enough readings of other frames fell into.
 
     @classmethod
     def of(cls, source: Source, level: FloatArray, sums: CellSums, run: slice) -> _Run:

@@ -40,16 +40,12 @@ _PROJECTION_ROUNDS, _PROJECTION_TOLERANCE = 40, 1e-4
 class ShiftFit(Record, eq=False):
     """Readings of one or several scans at supposed places, ready for a regression on shifts."""
 
-    cells: Cells
-    """Where the readings lie."""
+    cells: Cells  #: Where the readings lie.
     levelled: FloatArray
     """(n,) array: Readings without what frames and taxels add to one common map."""
-    gradient: FloatArray
-    """(n, 2) array: Of the map at each reading, 1/mm along x and y."""
-    data: FloatArray
-    """(n,) array: Readings with the nuisances taken off."""
-    nuisance: Nuisance
-    """The nuisances that were taken off."""
+    gradient: FloatArray  #: (n, 2) array: Of the map at each reading, 1/mm along x and y.
+    data: FloatArray  #: (n,) array: Readings with the nuisances taken off.
+    nuisance: Nuisance  #: The nuisances that were taken off.
 
     @classmethod
     def of(cls, parts: Sequence[CoarseFrames], places_mm: Sequence[FloatArray]) -> ShiftFit:
@@ -88,12 +84,9 @@ class ShiftFit(Record, eq=False):
 class Cells(Record, eq=False):
     """The cells of the map that readings fall in."""
 
-    number: IndexArray
-    """(n,) int array: Cell of each reading, row by row of a block of `shape`."""
-    offset_mm: FloatArray
-    """(n, 2) array: From the cell's centre."""
-    shape: tuple[int, int]
-    """Rows and columns."""
+    number: IndexArray  #: (n,) int array: Cell of each reading, row by row of a block of `shape`.
+    offset_mm: FloatArray  #: (n, 2) array: From the cell's centre.
+    shape: tuple[int, int]  #: Rows and columns.
 
     @classmethod
     def of(cls, places_mm: Sequence[FloatArray]) -> Cells:
@@ -127,10 +120,8 @@ class Cells(Record, eq=False):
 class Nuisance(Record, eq=False):
     """Variation besides the map: in each frame, in each block of taxels, and from row to row of the head."""
 
-    bases: tuple[FloatArray, ...]
-    """(k, 6) arrays: Of each scan."""
-    shapes: tuple[tuple[int, int], ...]
-    """Frames and blocks of taxels of each scan."""
+    bases: tuple[FloatArray, ...]  #: (k, 6) arrays: Of each scan.
+    shapes: tuple[tuple[int, int], ...]  #: Frames and blocks of taxels of each scan.
     frame: IndexArray
     taxel: IndexArray
     row_cell: IndexArray
@@ -211,8 +202,7 @@ class LatencyEstimate(Record):
     """`latency_ms`, `sd_ms`: The delay at which strokes both ways agree, and its standard error."""
     bound_ms: float
     """Standard error that independent errors of the readings and the tracker's noise alone would leave."""
-    frames: int
-    """Frames it was found from."""
+    frames: int  #: Frames it was found from.
     crossings: tuple[int, int]
     """Strokes that cross a lump, towards +x of the plane (or along +y) and back."""
 
@@ -334,19 +324,16 @@ def _strokes(parts: Sequence[_Part], latency_ms: float) -> tuple[IndexArray, Flo
 class _Regression(Record, eq=False):
     """The regression at the latency found, and the groups that its errors are shared in."""
 
-    fit: ShiftFit
-    """Source of the readings and their gradient."""
+    fit: ShiftFit  #: Source of the readings and their gradient.
     design: FloatArray
     halves: FloatArray
     """`design`, `halves` (n,), (2, n) arrays: Design of the latency with the whole gradient, and with those of two
     halves of the strokes."""
-    raw: FloatArray
-    """(n,) array: Design within frames, with the map left in."""
+    raw: FloatArray  #: (n,) array: Design within frames, with the map left in.
     stroke: IndexArray
     block: IndexArray
     """`stroke`, `block` (frames,) int arrays: Of each averaged frame."""
-    ways: FloatArray
-    """(strokes,) array."""
+    ways: FloatArray  #: (strokes,) array.
 
     @classmethod
     def of(

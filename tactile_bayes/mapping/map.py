@@ -39,20 +39,15 @@ FEW_READINGS = 10
 class MapRecipe(Record):
     """How a map was built; a size calibration fits only maps of its own recipe."""
 
-    source: str
-    """``"scan"`` or ``"grid"`` (a map imported as it is)."""
+    source: str  #: ``"scan"`` or ``"grid"`` (a map imported as it is).
     normalise: str
     """``"mean"``, ``"gain"`` or ``"none"``."""
-    cell_mm: float
-    """Side of the square cells."""
+    cell_mm: float  #: Side of the square cells.
     pressure_window_kpa: tuple[float, float] | None = None
     """The gate on the frame's mean; None for an imported grid."""
-    latency_ms: float = 0.0
-    """By how much a pose's stamp is late against the frames."""
-    flat_field: bool = False
-    """True where the head's own response was taken off."""
-    registered: bool = False
-    """True where the strokes were shifted onto each other."""
+    latency_ms: float = 0.0  #: By how much a pose's stamp is late against the frames.
+    flat_field: bool = False  #: True where the head's own response was taken off.
+    registered: bool = False  #: True where the strokes were shifted onto each other.
     units: str = ""
     """Units of an imported grid's values, as the user named them; empty where unknown. A scan's are kPa."""
 
@@ -90,12 +85,9 @@ class TactileMap(Record, eq=False):
     x_mm: FloatArray
     y_mm: FloatArray
     """`x_mm`, `y_mm` (nx,), (ny,) arrays: Cell centres in `plane`; x runs across the head, y along it."""
-    recipe: MapRecipe
-    """How the map was built."""
-    plane_from_base: FloatArray | None = None
-    """(4, 4) array or None: None for an imported grid."""
-    patient_from_plane: FloatArray | None = None
-    """(4, 4) array or None: None without landmarks."""
+    recipe: MapRecipe  #: How the map was built.
+    plane_from_base: FloatArray | None = None  #: (4, 4) array or None: None for an imported grid.
+    patient_from_plane: FloatArray | None = None  #: (4, 4) array or None: None without landmarks.
     background: float | None = 1.0
     """Level far from the lump that normalising defines (1 in the paper's Eqs 5 and 7); None when it is not known."""
     frame_count: int = 0
@@ -108,8 +100,7 @@ class TactileMap(Record, eq=False):
     """Shape of the head that made the scan; None for an imported grid."""
     nipple_mm: FloatArray | None = None
     """(3,) array or None: The nipple in `plane`; None where it was not touched."""
-    findings: tuple[Finding, ...] = ()
-    """Findings against sizes from it."""
+    findings: tuple[Finding, ...] = ()  #: Findings against sizes from it.
 
     def __post_init__(self) -> None:
         shape = (len(self.y_mm), len(self.x_mm))
@@ -204,16 +195,13 @@ MOST_SKEW = 0.01
 """First order of the head profile, to one side along strokes: a friction coefficient of 0.1 gives 0.011 to 0.035."""
 MOST_CURVATURE_PER_M = 4.0
 """Curvature of the head's path, a radius of 250 mm: rocking by 4 deg imitates up to 1.5 per m."""
-MOST_LAG_MM = 1.2
-"""A latency of 12 ms left in the poses makes up to 0.75 mm at a hand's 60 mm/s."""
+MOST_LAG_MM = 1.2  #: A latency of 12 ms left in the poses makes up to 0.75 mm at a hand's 60 mm/s.
 LEAST_STROKES = 4
 """As in the exams that sizes were learned from: 3 strokes, 8 mm apart, made sizes 6 % larger (record 0123)."""
-LEAST_COVERAGE = 0.5
-"""A strip of the plane narrower than the head itself shows no lump's flanks."""
+LEAST_COVERAGE = 0.5  #: A strip of the plane narrower than the head itself shows no lump's flanks.
 MOST_TILT_DEG = 10.0
 MOST_YAW_DEG = 15.0
-_ERRORS = 2.5
-"""Standard errors by which a figure must exceed 0, besides its limit."""
+_ERRORS = 2.5  #: Standard errors by which a figure must exceed 0, besides its limit.
 
 
 def broken_assumptions(quality: Mapping[str, float]) -> tuple[Finding, ...]:
@@ -339,14 +327,11 @@ _LEAST_RISE = 4.0
 class CellAdvice(Record):
     """Advice on the size of the cells."""
 
-    sigma_mm: float
-    """Width of the narrower side of the map's highest bump, from its half height."""
+    sigma_mm: float  #: Width of the narrower side of the map's highest bump, from its half height.
     coarsest_mm: float
     """Largest cell that leaves its widths within one posterior SD of those by cells of 1 mm."""
-    cell_mm: float
-    """The map's own."""
-    readings: float
-    """Median readings a cell."""
+    cell_mm: float  #: The map's own.
+    readings: float  #: Median readings a cell.
 
     def text(self) -> str:
         """One line: which cells measure the bump, and what cells of half the present size would cost."""

@@ -34,8 +34,7 @@ class Orientation(Record):
     up: str
     """`right`, `up`: ``"+x"``, ``"-x"``, ``"+y"`` or ``"-y"``. Of the eight pairs only four are used: z, into the
     tissue, always points away from the viewer."""
-    words: str
-    """The orientation in a phrase, for captions."""
+    words: str  #: The orientation in a phrase, for captions.
     notch: tuple[float, float] | None = None
     """(2,) tuple or None: Unit vector to the sternal notch on the screen (to the right, upwards); None without
     landmarks."""
@@ -122,8 +121,7 @@ LEAST_KNOWN_HOURS: Final = 1.5
 _SURE: Final = 0.95
 _ON_AXIS_DEG: Final = 15.0
 _DEGREES_PER_HOUR: Final = 30.0
-_DIGITS: Final = 6
-"""Significant digits of a place in files."""
+_DIGITS: Final = 6  #: Significant digits of a place in files.
 
 
 class Placed(Record):
@@ -148,16 +146,11 @@ class Position(Record):
 class ClockPosition(Record):
     """Place of a point about the nipple, as the examiner sees it who faces the patient: 12 is towards the head."""
 
-    side: Side
-    """Which breast."""
-    distance_mm: float
-    """From the nipple, along the map's plane."""
-    distance_sd_mm: float
-    """Its SD, from the lump's centre and the touch of the nipple."""
-    angle_deg: float
-    """From the head's direction, clockwise as the examiner sees it, 0 to 360."""
-    angle_sd_deg: float
-    """Its SD."""
+    side: Side  #: Which breast.
+    distance_mm: float  #: From the nipple, along the map's plane.
+    distance_sd_mm: float  #: Its SD, from the lump's centre and the touch of the nipple.
+    angle_deg: float  #: From the head's direction, clockwise as the examiner sees it, 0 to 360.
+    angle_sd_deg: float  #: Its SD.
 
     @classmethod
     def of(cls, told: Position | None) -> ClockPosition | None:

@@ -33,10 +33,8 @@ MAX_POSE_GAP_MS = 50.0
 class FramePoses(Record, eq=False):
     """The pose of the tracker's sensor at each frame."""
 
-    position_mm: FloatArray
-    """(n, 3) array: Tracker sensor in `base`."""
-    rotation: FloatArray
-    """(n, 3, 3) array: ``p_base = position + rotation @ p_tracker``."""
+    position_mm: FloatArray  #: (n, 3) array: Tracker sensor in `base`.
+    rotation: FloatArray  #: (n, 3, 3) array: ``p_base = position + rotation @ p_tracker``.
     known: BoolArray
     """(n,) bool array: False where the tracker said nothing close enough; position and rotation are then meaningless
     but finite."""

@@ -70,8 +70,7 @@ LEAST_FRAMES = 50
 # Orders across and along the head, those of `HEAD_PROFILE` first. Odd and mixed ones take up how the head was tilted.
 # The fourth across hangs on the head's very rim: two simulations with one body differ in it by half its range.
 _ORDERS = ((2, 0), (0, 2), (0, 4), (0, 0), (4, 0), (1, 0), (0, 1), (1, 1), (2, 2))
-SKEW = _ORDERS.index((1, 0))
-"""Which of `ProfileReader.whole` is the first order across the head."""
+SKEW = _ORDERS.index((1, 0))  #: Which of `ProfileReader.whole` is the first order across the head.
 _HIGHEST = 4
 _COLUMNS = len(HEAD_PROFILE) + 1
 
@@ -236,8 +235,7 @@ class ProfileReader(Record, eq=False):
     solve: FloatArray
     """(9, taxels) array: Takes readings to coefficients of Legendre polynomials at the good taxels, by least squares;
     no taxel where too few rows or columns have one to tell the polynomials apart."""
-    gram: FloatArray
-    """(9, 9) array: Inner products of the polynomials."""
+    gram: FloatArray  #: (9, 9) array: Inner products of the polynomials.
 
     @classmethod
     def of(cls, good: BoolArray) -> ProfileReader:
@@ -284,8 +282,7 @@ class ProfileReader(Record, eq=False):
 # dragged along. How the head's normal turns as it moves is the curvature of the skin, to which an examiner keeps
 # the head square.
 
-SPAN_MM = 30.0
-"""Distance over which a change of the profile is stated."""
+SPAN_MM = 30.0  #: Distance over which a change of the profile is stated.
 # Neighbouring frames share errors: standard errors come from leaving out every tenth stretch of this many seconds.
 _STRETCH_S = 0.5
 _GROUPS = 10

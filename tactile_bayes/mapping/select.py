@@ -213,8 +213,7 @@ _LONG_INTERVALS: Final = 5.0
 class Span:
     """Range of the times at which a device's records were measured."""
 
-    number: int = 0
-    """Records so far."""
+    number: int = 0  #: Records so far.
     first_s: float = 0.0
     last_s: float = 0.0
     gap_s: float = 0.0
@@ -296,22 +295,17 @@ VALID_SHARE = 0.9
 class SelectedFrames(Record, eq=False, dict=True):
     """A scan with the selection of its frames."""
 
-    scan: Scan
-    """As recorded."""
-    faults: tuple[TaxelFault, ...]
-    """Taxels left out of every frame."""
-    poses: FramePoses
-    """Pose of the tracker at each frame."""
-    level_kpa: FloatArray
-    """(n,) array: Mean over the valid taxels; NaN where there is none."""
+    scan: Scan  #: As recorded.
+    faults: tuple[TaxelFault, ...]  #: Taxels left out of every frame.
+    poses: FramePoses  #: Pose of the tracker at each frame.
+    level_kpa: FloatArray  #: (n,) array: Mean over the valid taxels; NaN where there is none.
     valid_share: FloatArray
     """(n,) array: Share of the taxels of the array that are good and not saturated."""
     low: BoolArray
     high: BoolArray
     """`low`, `high` (n,) bool arrays: Frames whose level is below or above the window, among those with a pose and
     enough valid taxels."""
-    used: BoolArray
-    """(n,) bool array: Frames that go into the map."""
+    used: BoolArray  #: (n,) bool array: Frames that go into the map.
 
     @property
     def dropped_no_pose(self) -> int:

@@ -41,10 +41,8 @@ class StrokeShift(Record):
     start: int
     stop: int
     """`start`, `stop`: Among the used frames of its scan."""
-    scan: int
-    """Number of the scan, from 0."""
-    direction: int
-    """+1 where the head moved along +x of the plane, else -1."""
+    scan: int  #: Number of the scan, from 0.
+    direction: int  #: +1 where the head moved along +x of the plane, else -1.
     shift_mm: float = 0.0
     sd_mm: float = np.inf
     """`shift_mm`, `sd_mm`: Along x of the plane, and its standard error."""
@@ -135,10 +133,8 @@ def mobility(strokes: Sequence[StrokeShift]) -> tuple[float, float]:
 class _Part(Record, eq=False):
     """One scan's averaged frames."""
 
-    coarse: CoarseFrames
-    """Thinned out where there are many strokes."""
-    places_mm: FloatArray
-    """(m, k, 2) array."""
+    coarse: CoarseFrames  #: Thinned out where there are many strokes.
+    places_mm: FloatArray  #: (m, k, 2) array.
     stroke: IndexArray
     block: IndexArray
     """`stroke`, `block` (m,) int arrays: Among the strokes of all scans, and which frames share errors."""
@@ -167,8 +163,7 @@ class _Round(Record, eq=False):
 
     normal: FloatArray
     """(K, K) array: Product of the strokes' designs over the variance of what is left."""
-    score: FloatArray
-    """(K,) array: Their product with what is left, over the same."""
+    score: FloatArray  #: (K,) array: Their product with what is left, over the same.
     widened: FloatArray
     """(K,) array: By how much standard errors exceed those of independent errors and exact slopes."""
 

@@ -78,8 +78,7 @@ SMOOTHING_MM = 3.0
 """Width of the Gaussian that smooths a map before candidates are sought: about that of a small lump's bump."""
 RIM_MM, RIM_SHARE = 6.0, 0.6
 """A place is at the map's rim where less than the share of the disc of this radius about it is covered."""
-FEW_READINGS = 0.1
-"""A cell with a smaller share of the median count is left out of the fit."""
+FEW_READINGS = 0.1  #: A cell with a smaller share of the median count is left out of the fit.
 MAPS_AT_HAND = 4
 """Maps of which what was worked out once is kept: the map, its levelled one, and both without the measured lump."""
 
@@ -117,8 +116,7 @@ class FitCells(Record, eq=False):
     row: IndexArray
     column: IndexArray
     """`row`, `column` (k,) int arrays: Where the cells lie in the map's grid."""
-    cell_mm: float
-    """Side of a cell."""
+    cell_mm: float  #: Side of a cell.
     pose_noise: PoseNoise | None = None
     """Tracker position error of the frames; None where the map does not give it."""
 
@@ -307,12 +305,9 @@ class Bump(Record):
     of `covariance_from_log_widths`.
     """
 
-    rotated: bool = False
-    """The axes of the ellipse may turn (adds r)."""
-    background: float | None = 1.0
-    """Fixed level (1 in Eq 7), or None to fit it."""
-    scale: float = 1.0
-    """Unit of amplitude for priors and steps, see `bump.value_scale`."""
+    rotated: bool = False  #: The axes of the ellipse may turn (adds r).
+    background: float | None = 1.0  #: Fixed level (1 in Eq 7), or None to fit it.
+    scale: float = 1.0  #: Unit of amplitude for priors and steps, see `bump.value_scale`.
 
     @property
     def names(self) -> tuple[str, ...]:

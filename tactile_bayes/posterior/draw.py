@@ -67,8 +67,7 @@ class ModalBump(Record):
 class NoiseFigures(Record):
     """Figures of the errors, and the decisions made under them."""
 
-    noise: str
-    """``"independent"`` or ``"field"``."""
+    noise: str  #: ``"independent"`` or ``"field"``.
     rotated: bool
     rotation_odds: float | None
     """Odds of a rotated ellipse; None where that was decided beforehand."""
@@ -78,8 +77,7 @@ class NoiseFigures(Record):
     """Offset of the cells about the bump from the background, under independent errors; else None."""
     places_share: float | None = None
     """Share of the width variance from tracker position error; None where a map does not give it."""
-    passed_over: tuple[str, ...] = ()
-    """Methods that could not be trusted, and why."""
+    passed_over: tuple[str, ...] = ()  #: Methods that could not be trusted, and why.
 
     def as_dict(self) -> dict[str, object]:
         """The figures as plain data."""
@@ -96,14 +94,12 @@ class Diagnostics(Record):
     cells: int
     covered_share: float
     """`cells`, `covered_share`: Cells in the fit window, and the share of it that they cover."""
-    fat_mm: float | None
-    """Depth of fat that the size is for; None where the map does not give it."""
+    fat_mm: float | None  #: Depth of fat that the size is for; None where the map does not give it.
     method: str
     sampler: Mapping[str, float]
     """`method`, `sampler`: The method that drew, and its own figures."""
     noise: NoiseFigures
-    calibration: str = ""
-    """Name of the calibration that gave the size, in words; not in the JSON."""
+    calibration: str = ""  #: Name of the calibration that gave the size, in words; not in the JSON.
     size_calibration: str = ""
     """Which calibration gave the size and what it cannot know, in words."""
     repeatability: str = ""
@@ -144,8 +140,7 @@ class Sampled(Record, eq=False):
     added afterwards, as large as the Gaussians have it.
     """
 
-    log_density: LogDensity
-    """(m,) of (m, k) parameters of the bump."""
+    log_density: LogDensity  #: (m,) of (m, k) parameters of the bump.
     mean: FloatArray
     covariance: FloatArray
     """`mean`, `covariance` (k,), (k, k) arrays: About, for the density."""

@@ -48,8 +48,7 @@ _IRREGULAR = Finding(
     "irregular outline, unlike a ball's or an ellipsoid's: two lumps that touch, or an upright, tilted or rough one "
     "look so, and the interval is wider",
 )
-_NEAR_LEVEL = 0.02
-"""An offset of the background of this size and more is mentioned."""
+_NEAR_LEVEL = 0.02  #: An offset of the background of this size and more is mentioned.
 
 
 def estimate_map(

@@ -37,13 +37,11 @@ TOUCHED = 1e-2
 class Whitening(Record, eq=False):
     """The noise field of one correlation length, prepared for every share."""
 
-    length_mm: float
-    """Correlation length."""
+    length_mm: float  #: Correlation length.
     turn: FloatArray
     """(cosines^2, k) array: Takes inner products with the cosines, ``D^-1 Phi``, to directions in which the field's
     precision is diagonal."""
-    eigenvalues: FloatArray
-    """(k,) array: Of ``S^1/2 Phi' D^-1 Phi S^1/2``."""
+    eigenvalues: FloatArray  #: (k,) array: Of ``S^1/2 Phi' D^-1 Phi S^1/2``.
 
     def shrinkage(self, share: float | FloatArray) -> FloatArray:
         """(..., k) weights of the squared projections that the field absorbs: ``rho / (1 + rho lambda)``."""
@@ -126,19 +124,15 @@ def whitening(gram: FloatArray, frequency2: FloatArray, *, length_mm: float) -> 
 # A Gaussian along the grid's axes is a product of two profiles, and so are the cosines: an inner product costs the
 # work of the grid's rows, not of its cells times the cosines. Cells that the map does not cover have weight 0.
 
-RESOLVED = 3.0
-"""Widths above as many cells need no more than a cell's variance."""
+RESOLVED = 3.0  #: Widths above as many cells need no more than a cell's variance.
 
 
 class Projected(Record, eq=False):
     """Inner products of m templates, with cells weighted by their inverse independent variance."""
 
-    low: FloatArray
-    """(m, cosines^2) array: With the cosines."""
-    plain: FloatArray
-    """(m, c) array: With the fixed vectors."""
-    square: FloatArray
-    """(m,) array: With themselves."""
+    low: FloatArray  #: (m, cosines^2) array: With the cosines.
+    plain: FloatArray  #: (m, c) array: With the fixed vectors.
+    square: FloatArray  #: (m,) array: With themselves.
 
 
 class Profiles(Record, eq=False):
@@ -319,41 +313,32 @@ LEAST_POWER = 1e-9
 class LinearSolution(Record, eq=False):
     """Conditional posterior of the linear parameters for m shapes and h fields: a multivariate t."""
 
-    amplitude: FloatArray
-    """(m, h, v) array: Conditional means under a flat prior."""
-    power: FloatArray
-    """(m, h, v, v) array: Their precision times tau^2."""
+    amplitude: FloatArray  #: (m, h, v) array: Conditional means under a flat prior.
+    power: FloatArray  #: (m, h, v, v) array: Their precision times tau^2.
     level: FloatArray
     level_covariance: FloatArray
     """`level`, `level_covariance` (h, c), (h, c, c) arrays: Level and tilt at amplitudes of 0, and their covariance
     over tau^2 given the amplitudes."""
     level_slope: FloatArray
     """(m, h, v, c) array: By how much level and tilt fall as an amplitude rises."""
-    sum_of_squares: FloatArray
-    """(m, h) array."""
+    sum_of_squares: FloatArray  #: (m, h) array.
 
 
 class FieldColumns(Record, eq=False):
     """Fixed columns and data under the noise fields of one length: the part that does not depend on the shape."""
 
-    field: Whitening
-    """The length."""
-    shares: FloatArray
-    """(h,) array."""
-    log_prior: float
-    """Log prior probability of each share."""
+    field: Whitening  #: The length.
+    shares: FloatArray  #: (h,) array.
+    log_prior: float  #: Log prior probability of each share.
     weight: FloatArray
     """(k, h) array: Of the squared projections that the field takes away, a column a share."""
     plain: FloatArray
     """(k, h * (c + 1)) array: Projections of the fixed columns and the data, so weighted."""
-    gram: FloatArray
-    """(h, c + 1, c + 1) array: Columns and data with each other."""
-    inverse: FloatArray
-    """(h, c, c) array: Of the columns' part."""
+    gram: FloatArray  #: (h, c + 1, c + 1) array: Columns and data with each other.
+    inverse: FloatArray  #: (h, c, c) array: Of the columns' part.
     log_det: FloatArray
     """(h,) array: Log determinant of the covariance (over that of D) and of the columns' part."""
-    floor: float
-    """Sum of squares that is noise in any case."""
+    floor: float  #: Sum of squares that is noise in any case.
 
     @classmethod
     def of(
@@ -387,10 +372,8 @@ class FieldColumns(Record, eq=False):
 class Inner(Record, eq=False):
     """Inner products of m templates under the noise fields of one length with h shares."""
 
-    plain: FloatArray
-    """(m, h, c + 1) array: With the fixed columns and the data."""
-    square: FloatArray
-    """(m, h) array: With themselves."""
+    plain: FloatArray  #: (m, h, c + 1) array: With the fixed columns and the data.
+    square: FloatArray  #: (m, h) array: With themselves.
     low: FloatArray
     """(m, k) array: Projections on the field's directions; none where templates are never held against others."""
 
@@ -500,10 +483,8 @@ def _two(
 
 DROPPED = 1e-8
 """Norm of what is dropped of all the bumps together, over that of the least of them."""
-LEAST_BUMPS = 256
-"""Fewer have no basis that pays."""
-MOST_PRODUCTS = 200
-"""More cost as much as each bump by itself."""
+LEAST_BUMPS = 256  #: Fewer have no basis that pays.
+MOST_PRODUCTS = 200  #: More cost as much as each bump by itself.
 
 
 class Spanned:

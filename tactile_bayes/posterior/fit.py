@@ -34,28 +34,24 @@ LEAST_SHARE = 1e-2
 LADDER: tuple[Method, ...] = ("laplace", "importance", "ensemble")
 STEPS_UP = 1
 """Methods tried after the requested one: a user who wants a quick one does not wait minutes for chains."""
-CHECKED = 512
-"""Draws of the Gaussians that are weighed to judge them."""
+CHECKED = 512  #: Draws of the Gaussians that are weighed to judge them.
 
 
 class Mixture(Gaussians, eq=False):
     """One Gaussian for each noise field that matters: the mixture that `laplace` draws from."""
 
-    log_evidence: float
-    """Log of the integral of the density that the mixture stands for."""
+    log_evidence: float  #: Log of the integral of the density that the mixture stands for.
 
 
 class FieldFit(Record, eq=False):
     """A scene fitted at the mode of its marginal posterior."""
 
-    target: CollapsedTarget
-    """Its density, with the noise fields that matter there."""
+    target: CollapsedTarget  #: Its density, with the noise fields that matter there.
     mode: FloatArray
     covariance: FloatArray
     """`mode`, `covariance` (p,), (p, p) arrays: Of the scene's parameters; the covariance is the mixture's, not the
     curvature at the mode."""
-    mixture: Mixture
-    """One Gaussian per noise field."""
+    mixture: Mixture  #: One Gaussian per noise field.
 
     @property
     def scene(self) -> Scene:

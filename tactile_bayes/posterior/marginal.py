@@ -44,8 +44,7 @@ BLOCK = 128
 NEGLIGIBLE = 1e-3
 """Fields with a smaller share of the evidence are left out of the mixture; what they add at the mode is made up for.
 Once a length has as little, and less than the one before it, shorter ones are not looked at."""
-SPANNED = 2048
-"""As many share a basis where they can, see `field.Spanned`."""
+SPANNED = 2048  #: As many share a basis where they can, see `field.Spanned`.
 WithEvidence = tuple[FloatArray, LinearSolution]
 """Log of the fields' prior times the evidence (m, h), and what is linear."""
 

@@ -35,8 +35,7 @@ class Sensitivity(Record):
     median: Mapping[str, float]
     ends: Mapping[str, float]
     """`median`, `ends`: By quantity: shift of the median, and the larger shift of the two ends of the 95 % interval."""
-    pareto_k: float
-    """Shape of the weights; above 0.7 the shifts are not to be trusted."""
+    pareto_k: float  #: Shape of the weights; above 0.7 the shifts are not to be trusted.
 
 
 def prior_sensitivity(
@@ -76,14 +75,12 @@ class Rise(Record):
     x_mm: float
     y_mm: float
     """`x_mm`, `y_mm`: Its centre in `plane`."""
-    distance_mm: float | None
-    """From the lump that was measured; None where there is none."""
+    distance_mm: float | None  #: From the lump that was measured; None where there is none.
     amplitude: float
     sigma_x_mm: float
     sigma_y_mm: float
     """`amplitude`, `sigma_x_mm`, `sigma_y_mm`: Of its bump at the mode; widths along the axes of its ellipse."""
-    probability: float
-    """That it is a lump, as `Detection` has it."""
+    probability: float  #: That it is a lump, as `Detection` has it.
 
 
 class Estimate(Record, eq=False):
@@ -93,16 +90,14 @@ class Estimate(Record, eq=False):
     reason: str
     """`status`, `reason`: ``"estimate"``, or ``"no_estimate"`` and why. With an estimate the reason says what is
     missing from it, if anything."""
-    detection: Detection | None = None
-    """None when no bump could be tested."""
+    detection: Detection | None = None  #: None when no bump could be tested.
     fit: BumpFit | None = None
     draws: ParameterDraws | None = None
     map_posterior: MapPosterior | None = None
     size: SizePosterior | None = None
     """`fit`, `draws`, `map_posterior`, `size`: None without an estimate; `size` is None also without a size
     calibration."""
-    candidates: tuple[Candidate, ...] = ()
-    """Every place that was looked at."""
+    candidates: tuple[Candidate, ...] = ()  #: Every place that was looked at.
     diagnostics: Diagnostics | None = None
     """Figures and flags for the report; None where nothing was drawn."""
     left_out: tuple[str, ...] = ()
@@ -119,16 +114,14 @@ class Estimate(Record, eq=False):
     """On a map without a lump: the smallest that it would have shown; None where nobody has asked."""
     scene: SceneChoice | None = None
     """Under a noise field: what the window holds, and what was asked about it."""
-    sensitivity: Sensitivity | None = None
-    """How far the answer leans on the prior of the widths."""
+    sensitivity: Sensitivity | None = None  #: How far the answer leans on the prior of the widths.
     other_rises: tuple[Rise, ...] = ()
     """Other rises that are lumps by the evidence, see `masses.other_rises`; empty where nobody has looked."""
     bump: ModalBump | None = None
     """The bump at the mode of the lump that the answer is about, sized or not; None where there is no lump."""
     masses: tuple[Mass, ...] = ()
     """All masses of the map, see `masses.with_masses`; empty where nobody has looked."""
-    findings: tuple[Finding, ...] = ()
-    """Findings against the answer, cautions first."""
+    findings: tuple[Finding, ...] = ()  #: Findings against the answer, cautions first.
 
     @property
     def probability(self) -> float | None:
@@ -142,12 +135,9 @@ class Mass(Record, eq=False):
     x_mm: float
     y_mm: float
     """`x_mm`, `y_mm`: Its centre in `plane`: the posterior median, or where the fit has it."""
-    probability: float
-    """That it is a lump; of a second lump in another's window, by its odds."""
-    estimate: Estimate
-    """Its own: draws and size, or why there is none."""
-    reported: bool = False
-    """The map's `Estimate` is this mass's."""
+    probability: float  #: That it is a lump; of a second lump in another's window, by its odds.
+    estimate: Estimate  #: Its own: draws and size, or why there is none.
+    reported: bool = False  #: The map's `Estimate` is this mass's.
 
     @property
     def largest_mm(self) -> float | None:
@@ -201,17 +191,14 @@ def fitted_cells(estimate: Estimate) -> FittedCells | None:
 PRIOR_DRAWS = 2000
 LIKELIHOOD_DRAWS = 400
 """Evenly thinned: a value for each cell and draw takes a second and 4 MB for 400 of them."""
-LEAST_SIZED = 100
-"""Fewer prior draws within the calibration's range say nothing of a size."""
+LEAST_SIZED = 100  #: Fewer prior draws within the calibration's range say nothing of a size.
 
 
 class DrawGroup(Record, eq=False):
     """Arrays of one group with the names of their axes, and what is to be said of it."""
 
-    arrays: Mapping[str, tuple[tuple[str, ...], FloatArray]]
-    """Names of the axes, and values."""
-    notes: Mapping[str, str] = field(default_factory=dict)
-    """Text by name."""
+    arrays: Mapping[str, tuple[tuple[str, ...], FloatArray]]  #: Names of the axes, and values.
+    notes: Mapping[str, str] = field(default_factory=dict)  #: Text by name.
 
 
 def inference_groups(

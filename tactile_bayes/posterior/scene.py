@@ -19,14 +19,10 @@ from tactile_bayes.posterior.white import WIDEST_IN_RADII
 class Problem(Record, eq=False):
     """A window with its cells, and the assumptions about a bump in it."""
 
-    window: Window
-    """The cells; scenes share one, and with it the noise fields."""
-    prior: BumpPrior
-    """On widths and amplitudes."""
-    radius_mm: float
-    """Radius of the window; bounds the centre about the window's middle."""
-    amplitude_scale: float = 1.0
-    """Unit of the amplitudes' prior, see `bump.value_scale`."""
+    window: Window  #: The cells; scenes share one, and with it the noise fields.
+    prior: BumpPrior  #: On widths and amplitudes.
+    radius_mm: float  #: Radius of the window; bounds the centre about the window's middle.
+    amplitude_scale: float = 1.0  #: Unit of the amplitudes' prior, see `bump.value_scale`.
     departure: FloatArray | None = None
     """(k, n) array: Further fixed columns, see `selection.ask_departure`; None for none."""
 
@@ -85,12 +81,9 @@ class Scene(Record):
     ``angle, offset, w2`` (a ridge). A ridge in the bump's place has ``u, along, across``: log width, angle, offset.
     """
 
-    shape: Shape = "ellipse"
-    """Shape of the bump."""
-    tilt: bool = True
-    """The level may slope."""
-    extra: Extra = ""
-    """Structure beside the bump."""
+    shape: Shape = "ellipse"  #: Shape of the bump.
+    tilt: bool = True  #: The level may slope.
+    extra: Extra = ""  #: Structure beside the bump.
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -37,8 +37,7 @@ from tactile_bayes.presets import SceneAsked
 # ----------
 # Buerkner, Gabry & Vehtari (2021), Computational Statistics 36:1243 (non-factorised models).
 
-LEAST_SHARE = 1e-6
-"""Fields with a smaller share of the evidence at a draw add nothing there."""
+LEAST_SHARE = 1e-6  #: Fields with a smaller share of the evidence at a draw add nothing there.
 
 
 def pointwise_log_likelihood(target: CollapsedTarget, theta: FloatArray) -> FloatArray:
@@ -126,8 +125,7 @@ def _without_each(precision: _Precision, regressors: FloatArray, value: FloatArr
 
 # --- Model selection: the simplest scene that a window's evidence supports, and what it leaves out.
 
-LEAST_ODDS = 3.0
-"""A structure is used when the map favours the scene with it by this factor."""
+LEAST_ODDS = 3.0  #: A structure is used when the map favours the scene with it by this factor.
 ASKING = ("auto", "second-lump", "rib")
 
 
@@ -139,12 +137,9 @@ class Structure(Record):
     Gaussian)."""
     odds: float
     """Bayes factor of the scene with it against the scene without; an upper bound where `bound`."""
-    supported: bool
-    """The odds exceed a threshold."""
-    used: bool
-    """The draws have it."""
-    bound: bool = False
-    """The odds are a bound from the best of a grid of templates."""
+    supported: bool  #: The odds exceed a threshold.
+    used: bool  #: The draws have it.
+    bound: bool = False  #: The odds are a bound from the best of a grid of templates.
     change_x_sd: float | None = None
     change_y_sd: float | None = None
     """`change_x_sd`, `change_y_sd`: By how many posterior SDs the median of ln sigma_x and ln sigma_y would change, had
@@ -156,14 +151,11 @@ class Structure(Record):
 class SceneChoice(Record, eq=False):
     """The scene chosen for the draws, and the evidence for it."""
 
-    fit: FieldFit
-    """Its mode."""
-    plain: FieldFit
-    """The fit without a second structure, by which a lump is detected."""
+    fit: FieldFit  #: Its mode.
+    plain: FieldFit  #: The fit without a second structure, by which a lump is detected.
     supported: str
     """The simplest shape that the map supports: ``"round"``, ``"ellipse"`` or ``"rotated"``."""
-    structures: tuple[Structure, ...] = field(default_factory=tuple)
-    """Every question asked."""
+    structures: tuple[Structure, ...] = field(default_factory=tuple)  #: Every question asked.
 
 
 def choose_shape(problem: Problem, start: FloatArray, *, scene: SceneAsked = "auto") -> SceneChoice:
@@ -305,8 +297,7 @@ def odds(log_odds: float) -> float:
 # hold too often. Which Gaussian is nearest depends on the noise field, so that the widths are as uncertain as it is
 # (record 0066).
 
-EXPONENT_SD = 0.25
-"""Prior SD of e - 1, about 0."""
+EXPONENT_SD = 0.25  #: Prior SD of e - 1, about 0.
 SETTLINGS = 2
 """Fits with the column: the first still has the column as orthogonal under the noise that held the misfit."""
 

@@ -65,17 +65,13 @@ class Target(Record, eq=False):
     the former for c = 1 and nu = k - p.
     """
 
-    predict: ModelFunction
-    """(m, p) parameter vectors to (m, k) predictions."""
+    predict: ModelFunction  #: (m, p) parameter vectors to (m, k) predictions.
     data: FloatArray
     weight: FloatArray
     """`data`, `weight` (k,) arrays: Weights are inverse variances up to a common factor."""
-    log_prior: LogPrior
-    """(m, p) to (m,)."""
-    errors: ErrorModel
-    """Size, correlation and degrees of freedom of the noise."""
-    sse_min: float
-    """Weighted sum of squares at the least-squares estimate."""
+    log_prior: LogPrior  #: (m, p) to (m,).
+    errors: ErrorModel  #: Size, correlation and degrees of freedom of the noise.
+    sse_min: float  #: Weighted sum of squares at the least-squares estimate.
     dimension: int
 
     def excess(self, theta: FloatArray) -> FloatArray:
@@ -125,15 +121,13 @@ WIDEST_IN_RADII = 0.75
 MOST_AXIS_RATIO = 4.0
 CLOSE_IN_RADII = 0.6
 """Beside a rib 16 mm away a window of 12 mm holds more of the lump than of the rib."""
-PATIENCE = 16
-"""Iterations: a clear lump takes 4 to 15."""
+PATIENCE = 16  #: Iterations: a clear lump takes 4 to 15.
 OUTGROWN, AT_RIM = "wider than the window", "at the rim of the map"
 FIT_TOLERANCE = 1e-8
 """Tolerance of the least squares, in units of `Bump.step_scale`: far below any error that a map has."""
 PLACE_TOLERANCE = 1e-2
 """The same where least squares only finds the place: the posterior's mode is sought from there."""
-JOINED = 0.05
-"""So near to a minimum, in the same units, a fit ends in it."""
+JOINED = 0.05  #: So near to a minimum, in the same units, a fit ends in it.
 
 
 class BumpFit(Record, eq=False):
@@ -149,8 +143,7 @@ class BumpFit(Record, eq=False):
     covariance: FloatArray
     """(p, p) array: Of the parameters, correlated errors included; under a noise field, which has them in the model,
     not."""
-    covered_share: float
-    """Share of the disc of 1.5 widths about the centre that the map covers."""
+    covered_share: float  #: Share of the disc of 1.5 widths about the centre that the map covers.
 
     @property
     def theta(self) -> FloatArray:
@@ -205,14 +198,10 @@ class BumpFit(Record, eq=False):
 class Candidate(Record, eq=False):
     """A candidate place."""
 
-    centre_mm: tuple[float, float]
-    """Where the search began."""
-    fit: BumpFit | None
-    """None where least squares found no minimum."""
-    fault: str
-    """Why the place cannot be a lump; empty when it can."""
-    detection: Detection | None = None
-    """Odds of a lump there; None where nobody has weighed them."""
+    centre_mm: tuple[float, float]  #: Where the search began.
+    fit: BumpFit | None  #: None where least squares found no minimum.
+    fault: str  #: Why the place cannot be a lump; empty when it can.
+    detection: Detection | None = None  #: Odds of a lump there; None where nobody has weighed them.
 
 
 def fitted_candidates(tactile_map: TactileMap, options: SamplerSettings) -> Iterator[Candidate]:
@@ -403,16 +392,11 @@ def rotation_odds(
 class MapDraws(Record, eq=False):
     """Posterior draws of one lump under a noise model."""
 
-    detection: Detection
-    """The odds of a lump, as the draws left them."""
-    fit: BumpFit
-    """The least-squares fit that the draws started from."""
-    draws: ParameterDraws
-    """Draws of the model's own parameters."""
-    posterior: MapPosterior
-    """The joint draws by name."""
-    figures: NoiseFigures
-    """Figures of the fit and the noise, for the report."""
+    detection: Detection  #: The odds of a lump, as the draws left them.
+    fit: BumpFit  #: The least-squares fit that the draws started from.
+    draws: ParameterDraws  #: Draws of the model's own parameters.
+    posterior: MapPosterior  #: The joint draws by name.
+    figures: NoiseFigures  #: Figures of the fit and the noise, for the report.
 
 
 class White(Record, eq=False):

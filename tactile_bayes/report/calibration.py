@@ -56,8 +56,7 @@ def site_calibration_text(calibration: BodyCalibration) -> str:
 # --- A site's repeatability as text for people.
 
 _MOST_NAMED: Final = 5
-FEW: Final = 5
-"""Masses below which the report says that they are few."""
+FEW: Final = 5  #: Masses below which the report says that they are few.
 
 
 def repeatability_text(document: Mapping[str, Any]) -> str:

@@ -49,18 +49,13 @@ class Growth(Record, eq=False):
     status: str
     reason: str = ""
     """`status`, `reason`: As `compare` has them, or ``failed``."""
-    days: float | None = None
-    """Between the visits; None where it is not known."""
-    sizes_mm: tuple[Quantity, ...] = ()
-    """Largest size at both visits; empty without a comparison."""
-    percent: Quantity | None = None
-    """Change of the diameter, likewise; None without one."""
+    days: float | None = None  #: Between the visits; None where it is not known.
+    sizes_mm: tuple[Quantity, ...] = ()  #: Largest size at both visits; empty without a comparison.
+    percent: Quantity | None = None  #: Change of the diameter, likewise; None without one.
     verdict: str = ""
     """``grown``, ``shrunk`` or ``no_change_shown``; empty without one."""
-    findings: tuple[Finding, ...] = ()
-    """What speaks against the comparison."""
-    link: str = ""
-    """File of the comparison from the page's folder; empty for none."""
+    findings: tuple[Finding, ...] = ()  #: What speaks against the comparison.
+    link: str = ""  #: File of the comparison from the page's folder; empty for none.
 
     @property
     def words(self) -> str:
@@ -244,8 +239,7 @@ def _trend(joint: JointSizes, days: Sequence[float], probability: float) -> Tren
 # --- A comparison of visits as text: the change of size in words that its odds carry.
 
 MORE: Final = "More (maps, every visit, growth rates, omissions): compare -v."
-_MOST_VISITS: Final = 3
-"""Visits that a short report names one by one."""
+_MOST_VISITS: Final = 3  #: Visits that a short report names one by one.
 
 
 def compare_summary(report: CompareReport) -> str:

@@ -61,10 +61,8 @@ ASKED = {
     "departure": "a departure from a Gaussian",
 }
 BUMP = {"round": "a round bump", "ellipse": "an ellipse along the head's axes", "rotated": "a rotated ellipse"}
-LEAST_SHIFT_SD = 0.005
-"""A shift by a wider prior below this is not given in figures."""
-LEAST_CHANGE_SD = 0.05
-"""A change of a width by one more structure below this rounds to none."""
+LEAST_SHIFT_SD = 0.005  #: A shift by a wider prior below this is not given in figures.
+LEAST_CHANGE_SD = 0.05  #: A change of a width by one more structure below this rounds to none.
 
 
 def scene_lines(choice: SceneChoice) -> list[str]:
@@ -179,8 +177,7 @@ def _six_digits(value: float | None) -> float | None:
 
 # --- How large a lump would be if it were soft, hard, centred on the gland's surface or resting on it: data and text.
 
-LEAST_CHANGE = 0.02
-"""Of the size, from which a pair of suppositions is worth a line."""
+LEAST_CHANGE = 0.02  #: Of the size, from which a pair of suppositions is worth a line.
 PAIRS = (
     ("the lump soft", "soft", "hard", " ({:g} times as stiff as fat)", " ({:g} times)"),
     ("it centred on the gland's surface", "centred", "resting", "", " on the gland"),

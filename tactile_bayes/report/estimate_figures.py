@@ -313,8 +313,7 @@ def _contour(estimate: Estimate) -> FitContour | None:
 
 # --- Picture of a comparison: the visits' maps on common axes and colours, their difference, and the change of size.
 
-HALF_MM: Final = 30.0
-"""Half the side of the square about the mass that is drawn."""
+HALF_MM: Final = 30.0  #: Half the side of the square about the mass that is drawn.
 _STEP_MM: Final = 1.0
 _LEAST_COLOURS: Final = (0.9, 1.3)
 _MOST_VISITS: Final = 4

@@ -132,8 +132,7 @@ def shape_text(figures: Mapping[str, float]) -> str:
 
 # --- Sources of a size interval's width, remedies, and the pieces of short reports.
 
-MOST_LINES = 12
-"""Of a short report."""
+MOST_LINES = 12  #: Of a short report.
 MORE = "More (all quantities, places looked at, odds, priors, omissions): estimate -v."
 """The end of a short report's last line but one."""
 NARROWED_BY = {
@@ -144,8 +143,7 @@ NARROWED_BY = {
     "site": "more phantoms of known size, depth, seat and stiffness (calibrate size --correct)",
     "body": "knowing the lump's depth, seat or stiffness (estimate --known)",
 }
-WORTH_NARROWING = 10.0
-"""Percent of the variance from which a source is worth a way to narrow it."""
+WORTH_NARROWING = 10.0  #: Percent of the variance from which a source is worth a way to narrow it.
 
 
 def width_lines(variance_share: Mapping[str, float]) -> list[str]:
@@ -189,8 +187,7 @@ ROWS = (
     ("centre_patient_mm.y", "centre above the xiphoid, y", "mm"),
 )
 MOST_PASSED_OVER = 4
-LEAST_SHARE = 0.005
-"""Of the width variance, below which the tracker's share is not worth a line."""
+LEAST_SHARE = 0.005  #: Of the width variance, below which the tracker's share is not worth a line.
 
 
 def size_decimals(sizes: Iterable[Quantity]) -> int:
@@ -362,8 +359,7 @@ def passed_over(estimate: Estimate) -> list[str]:
 WIDTHS = ("sigma_x_mm", "sigma_y_mm")
 MOST_CAUTIONS = 3
 MOST_CHECKS = 2
-MOST_MASSES = 3
-"""Masses besides the reported one that have a line."""
+MOST_MASSES = 3  #: Masses besides the reported one that have a line.
 
 
 def estimate_summary(

@@ -57,8 +57,7 @@ class PageFiles(Record):
     html: Path
     pdf: Path | None = None
     """`html`, `pdf`: Files to write; no PDF where it is None."""
-    force: bool = False
-    """Overwrite them."""
+    force: bool = False  #: Overwrite them.
 
     def check(self) -> None:
         """Refuse, before any work is done, what could not be written."""
@@ -152,8 +151,7 @@ NO_MAP: Final = (
 )
 MOST_REPEATS: Final = 5
 MOST_MASSES: Final = 4
-_FINDINGS: Final = ((2, 320), (1, 220))
-"""Findings and letters of each, and on a crowded page."""
+_FINDINGS: Final = ((2, 320), (1, 220))  #: Findings and letters of each, and on a crowded page.
 _PICTURE_MM: Final = (108.0, 96.0)
 _LOWER_MM: Final = 54.0
 """Height of the picture on a crowded page: one that has both repeats and several masses below it."""

@@ -33,10 +33,8 @@ _DATE: Final = re.compile(r"\d{4}-\d{2}-\d{2}", re.ASCII)
 class ExamMass(Record, eq=False):
     """One mass on a map."""
 
-    number: int
-    """On the map, from 1."""
-    centre_mm: tuple[float, float]
-    """x and y in `plane`."""
+    number: int  #: On the map, from 1.
+    centre_mm: tuple[float, float]  #: x and y in `plane`.
     axes_mm: tuple[float, float] | None = None
     angle_deg: float = 0.0
     """`axes_mm`, `angle_deg`: Diameters of the ellipse along its own axes, and the angle from x to the first; None
@@ -45,14 +43,11 @@ class ExamMass(Record, eq=False):
     largest: Quantity | None = None
     smallest: Quantity | None = None
     """`largest`, `smallest`: Largest and smallest size with the intervals that lead; None without."""
-    probability: float | None = None
-    """That it is a lump; None where it is not told."""
-    place: ClockPosition | None = None
-    """About the nipple; None where that is not known."""
+    probability: float | None = None  #: That it is a lump; None where it is not told.
+    place: ClockPosition | None = None  #: About the nipple; None where that is not known.
     patient_mm: tuple[float, float] | None = None
     """From the xiphoid to the patient's right and up; None without landmarks."""
-    why: str = ""
-    """Why there is no size; empty where there is one."""
+    why: str = ""  #: Why there is no size; empty where there is one.
 
 
 class ExamMap(Record, eq=False):
@@ -69,10 +64,8 @@ class ExamMap(Record, eq=False):
 class Exam(Record, eq=False):
     """What one page shows."""
 
-    maps: tuple[ExamMap, ...]
-    """Several are repeats of one mass."""
-    pooled: PooledReport | None = None
-    """The size from all maps; None with one map."""
+    maps: tuple[ExamMap, ...]  #: Several are repeats of one mass.
+    pooled: PooledReport | None = None  #: The size from all maps; None with one map.
     scans: Sequence[Mapping[str, str]] = ()
     """The scans at the beginning, as `Provenance.scans` has them."""
     title: str = ""

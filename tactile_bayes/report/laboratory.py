@@ -332,14 +332,11 @@ _NAME = 52
 class TradeoffReport(Record, eq=False):
     """All measurements of a trade-off."""
 
-    case: LumpCase
-    """The lump."""
-    found: tuple[Measured, ...]
-    """Every setting."""
+    case: LumpCase  #: The lump.
+    found: tuple[Measured, ...]  #: Every setting.
     rules: Mapping[str, SizeRule]
     """From widths to sizes, for plane strain and for the solid model."""
-    tolerance: float
-    """Error in size, as a share, below which nothing is gained."""
+    tolerance: float  #: Error in size, as a share, below which nothing is gained.
 
     def of(self, model: str) -> list[Measured]:
         """Measurements of one model."""

@@ -44,13 +44,11 @@ _EXPLAINED_PLACES: Final = 4
 class FitContour(Record):
     """Place and size of a fitted lump on the map."""
 
-    centre_mm: tuple[float, float]
-    """x and y on the plane."""
+    centre_mm: tuple[float, float]  #: x and y on the plane.
     sigma_x_mm: float
     sigma_y_mm: float
     """`sigma_x_mm`, `sigma_y_mm`: Widths along the fit's own axes."""
-    angle_deg: float = 0.0
-    """From the plane's x axis to the fit's, positive from x towards y."""
+    angle_deg: float = 0.0  #: From the plane's x axis to the fit's, positive from x towards y.
     size_mm: tuple[float, float] | None = None
     """The lump's size along the same axes; None where the fit gave no size."""
     level: float = 1.0

@@ -70,14 +70,10 @@ class Card(Record, eq=False):
     name: str
     status: str
     """`FAILED`, `UNSIZED` or `SIZED`."""
-    facts: tuple[str, ...] = ()
-    """What else the table says of the exam."""
-    reason: str = ""
-    """Why there is no size; empty where there is one."""
-    size: Quantity | None = None
-    """Largest size, mm; None without one."""
-    findings: tuple[Finding, ...] = ()
-    """What speaks against the exam."""
+    facts: tuple[str, ...] = ()  #: What else the table says of the exam.
+    reason: str = ""  #: Why there is no size; empty where there is one.
+    size: Quantity | None = None  #: Largest size, mm; None without one.
+    findings: tuple[Finding, ...] = ()  #: What speaks against the exam.
     thumbnail: bytes | str | None = None
     """PNG of the map, or the name of its file from the page's folder; None without one."""
     links: Mapping[str, str] = field(default_factory=dict)

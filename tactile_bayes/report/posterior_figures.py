@@ -30,8 +30,7 @@ LABELS: Final = {
 _COLOURS: Final = ("#1f3b73", "#c8641e", "#4f8f5b", "#8a5aa3")
 _RANK_BINS: Final = 20
 _BAND_SD: Final = 3.0
-_TRACED: Final = 2000
-"""Points of a trace, at most: more are not told apart."""
+_TRACED: Final = 2000  #: Points of a trace, at most: more are not told apart.
 _SHOWN: Final = (0.002, 0.998)
 
 

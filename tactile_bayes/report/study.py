@@ -93,10 +93,8 @@ _SIZE_IN = (10.0, 4.3)
 _AXES = {"x": "across the head", "y": "along it"}
 _ON_HEAD, _ON_SKIN, _SHARE = "position on the head (mm)", "place on the skin (mm)", "pressure / mean of its frame"
 
-Build = Callable[[RasterFrames], TactileMap]
-"""Builds the map of a raster."""
-Curve = tuple[FloatArray, FloatArray, str]
-"""Places, values and the name of a line."""
+Build = Callable[[RasterFrames], TactileMap]  #: Builds the map of a raster.
+Curve = tuple[FloatArray, FloatArray, str]  #: Places, values and the name of a line.
 
 
 def study_figures(

@@ -196,8 +196,7 @@ def _outline(
 
 # --- A map as inline SVG: its values, the size ellipse and its interval to scale, sides, nipple, scale bar.
 
-MARGIN_MM: Final = 5.0
-"""Round the map, for the names of its sides."""
+MARGIN_MM: Final = 5.0  #: Round the map, for the names of its sides.
 _MOST_PIXELS: Final = 1200
 _CELL_PX: Final = 4
 _STRIPES_PX: Final = 8
@@ -217,10 +216,8 @@ _BARBS: Final = ((0.87, 0.5), (0.87, -0.5))
 class Frame(Record, eq=False):
     """Where the map's points lie on the page, in mm from the picture's upper left corner without its margin."""
 
-    tactile_map: TactileMap
-    """The map that is drawn."""
-    scale: float
-    """Of life size."""
+    tactile_map: TactileMap  #: The map that is drawn.
+    scale: float  #: Of life size.
 
     @classmethod
     def within(cls, tactile_map: TactileMap, *, width_mm: float, height_mm: float) -> Frame:

@@ -323,11 +323,9 @@ def _notes(ladder: Ladder) -> Iterator[str]:
 _SIZE_IN = (10.0, 6.0)
 _MARKS = ("o", "^", "s", "D", "v", "P")
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
-_LETTER, _LINE = 3.95, 9.0
-"""Width of a letter and height of a line of a name, points."""
+_LETTER, _LINE = 3.95, 9.0  #: Width of a letter and height of a line of a name, points.
 Box = tuple[float, float, float, float]
-_LEAST_MM = 1e-3
-"""Smaller distances are drawn here: below rounding of what anybody reads."""
+_LEAST_MM = 1e-3  #: Smaller distances are drawn here: below rounding of what anybody reads.
 
 
 def draw_ladder(ladder: Ladder, path: Path, *, title: str, force: bool = False) -> None:

@@ -26,16 +26,13 @@ WIDTHS = ("sigma_x_mm", "sigma_y_mm")
 class SizeAnswer(Record):
     """Reported numbers of one estimate."""
 
-    reason: str
-    """Why there is no number; empty where there is one."""
-    probability: float | None = None
-    """Of a lump; None where nothing could be tested."""
+    reason: str  #: Why there is no number; empty where there is one.
+    probability: float | None = None  #: Of a lump; None where nothing could be tested.
     quantities: dict[str, Quantity] = field(default_factory=dict)
     """The largest size and the two widths by name, mm: the size is missing without a calibration, all are without an
     estimate.
     """
-    method: str = ""
-    """The method that drew; empty where none did."""
+    method: str = ""  #: The method that drew; empty where none did.
     shares: dict[str, float] = field(default_factory=dict)
     """Percent of the variance of ln(largest size) by source, see `SizePosterior.variance_share`."""
     code: str = ""
@@ -75,8 +72,7 @@ class Deviation(Record):
     median: float
     ends: float
     """`median`, `ends`: Of the reported quantity: its median, and both ends of its interval."""
-    width_ends: float
-    """Of both widths: the ends of their intervals."""
+    width_ends: float  #: Of both widths: the ends of their intervals.
 
 
 UNKNOWN = Deviation(float("nan"), float("nan"), float("nan"))
@@ -118,20 +114,15 @@ MOST_S = 4.0
 class Work(Record):
     """How a study is run."""
 
-    clock: Clock
-    """CPU seconds so far."""
-    tolerance_mm: float
-    """See `Ladder`."""
+    clock: Clock  #: CPU seconds so far.
+    tolerance_mm: float  #: See `Ladder`.
     runs: int = 3
     """Of each setting: times are the least of them, distances their root mean square."""
     announce: Callable[[float], None] = lambda _seconds: None
     """Called once, when the default has been timed, with about how many CPU seconds the rest will take."""
-    progress: Progress | None = None
-    """Called with settings done and in all."""
-    seed: int = 1
-    """Of the random numbers."""
-    probability: float = INTERVAL
-    """Of the intervals."""
+    progress: Progress | None = None  #: Called with settings done and in all.
+    seed: int = 1  #: Of the random numbers.
+    probability: float = INTERVAL  #: Of the intervals.
 
 
 How = TypeVar("How")
@@ -140,16 +131,11 @@ How = TypeVar("How")
 class Choice(Record, Generic[How]):
     """A setting to be tried."""
 
-    axis: str
-    """What is varied."""
-    label: str
-    """The setting in a few words; an option of the command line where there is one."""
-    how: How
-    """Options of the estimate, or of the map."""
-    weight: float = 1.0
-    """About how many times the default's CPU time it takes, for a forecast."""
-    default: bool = False
-    """Whether this is what the program does by itself."""
+    axis: str  #: What is varied.
+    label: str  #: The setting in a few words; an option of the command line where there is one.
+    how: How  #: Options of the estimate, or of the map.
+    weight: float = 1.0  #: About how many times the default's CPU time it takes, for a forecast.
+    default: bool = False  #: Whether this is what the program does by itself.
     usable: bool = True
     """Whether a user can choose it to save or to spend time; other rows show what the answer depends on."""
 
@@ -161,10 +147,8 @@ class Priced(Record):
     label: str
     cpu_s: dict[str, float]
     """Least CPU time of the runs, each part by name ("map", "estimate"); their sum is the setting's cost."""
-    answers: tuple[SizeAnswer, ...]
-    """One for each run."""
-    off: Deviation
-    """From the reference."""
+    answers: tuple[SizeAnswer, ...]  #: One for each run.
+    off: Deviation  #: From the reference.
     default: bool = False
     usable: bool = True
 
@@ -182,12 +166,9 @@ class Priced(Record):
 class Reference(Record):
     """What the settings are compared with."""
 
-    words: str
-    """How it was made."""
-    answer: SizeAnswer | None
-    """None where there is none."""
-    cpu_s: float
-    """What it took."""
+    words: str  #: How it was made.
+    answer: SizeAnswer | None  #: None where there is none.
+    cpu_s: float  #: What it took.
 
     @property
     def error_mm(self) -> float:
@@ -199,12 +180,9 @@ class Reference(Record):
 class PooledRow(Record):
     """The size by the first few of several maps of one mass."""
 
-    maps: int
-    """How many."""
-    cpu_s: float
-    """Of their estimates and of pooling."""
-    answer: SizeAnswer
-    """The reported size; a reason where there is none."""
+    maps: int  #: How many.
+    cpu_s: float  #: Of their estimates and of pooling.
+    answer: SizeAnswer  #: The reported size; a reason where there is none.
     another_half_mm: float = float("nan")
     """Half width of the second interval, of another exam that may differ as in the paper; NaN where there is none."""
 
@@ -212,12 +190,9 @@ class PooledRow(Record):
 class Ladder(Record):
     """All settings of a study."""
 
-    rows: tuple[Priced, ...]
-    """In the order of the table."""
-    reference: Reference
-    """What they are compared with."""
-    tolerance_mm: float
-    """Distance of interval ends below which more is not worth its cost."""
+    rows: tuple[Priced, ...]  #: In the order of the table.
+    reference: Reference  #: What they are compared with.
+    tolerance_mm: float  #: Distance of interval ends below which more is not worth its cost.
     shared_cpu_s: dict[str, float] = field(default_factory=dict)
     """What every setting needs besides, by name, such as reading the file or starting the program."""
     pooled: tuple[PooledRow, ...] = ()
@@ -391,14 +366,10 @@ class Estimator(Record):
     """Estimates of one map, seeded by the map and the number of the run."""
 
     tactile_map: TactileMap
-    calibration: Calibration | None
-    """From widths to sizes; None stops at widths."""
-    seed: int
-    """Of the random numbers."""
-    clock: Clock
-    """CPU seconds so far."""
-    probability: float = INTERVAL
-    """Of the intervals."""
+    calibration: Calibration | None  #: From widths to sizes; None stops at widths.
+    seed: int  #: Of the random numbers.
+    clock: Clock  #: CPU seconds so far.
+    probability: float = INTERVAL  #: Of the intervals.
 
     def run(self, options: SamplerSettings) -> Run:
         """A whole estimate, from the map to the size, as a function of the number of the run."""

@@ -28,8 +28,7 @@ from tactile_bayes.scan import ElementCalibration, PressureFrames, Scan
 from tactile_bayes.studies.paper_tables import mean_squared_difference
 
 Progress = Callable[[int, int], None]
-NEAR_MM = 40.0
-"""Maps are compared within this distance of the lump."""
+NEAR_MM = 40.0  #: Maps are compared within this distance of the lump.
 # Readings of a model travel as whole numbers, this many a kPa: up to the 34 kPa at which a taxel saturates.
 _COUNTS_PER_KPA = 1900.0
 
@@ -37,48 +36,37 @@ _COUNTS_PER_KPA = 1900.0
 class MeasuredFrames(Record, eq=False):
     """The frames of a scan that are compared."""
 
-    scan: Scan
-    """These frames alone, at one pose a frame as before."""
-    pressure_kpa: FloatArray
-    """(n, rows, columns) array: NaN for taxels that are left out."""
+    scan: Scan  #: These frames alone, at one pose a frame as before.
+    pressure_kpa: FloatArray  #: (n, rows, columns) array: NaN for taxels that are left out.
     rotation: FloatArray
     origin_mm: FloatArray
     """`rotation`, `origin_mm` (n, 3, 3), (n, 3) arrays: Of the head in the map's plane."""
-    level_kpa: FloatArray
-    """(n,) array: Mean over the valid taxels."""
-    tactile_map: TactileMap
-    """Of these frames."""
-    place_mm: tuple[float, float]
-    """The lump on the map: where the scene's first lump is put."""
-    lump: BumpFit | None
-    """The bump of Eq 7 there; None where none was fitted."""
+    level_kpa: FloatArray  #: (n,) array: Mean over the valid taxels.
+    tactile_map: TactileMap  #: Of these frames.
+    place_mm: tuple[float, float]  #: The lump on the map: where the scene's first lump is put.
+    lump: BumpFit | None  #: The bump of Eq 7 there; None where none was fitted.
 
 
 class ModelComparison(Record, eq=False):
     """How far one model is from the measured frames and map; differences as shares of the model's sum of squares."""
 
-    fidelity: str
-    """Which of `forward.simulate.FIDELITIES`."""
-    pressure_kpa: FloatArray
-    """(n, rows, columns) array: The model's frames."""
-    tactile_map: TactileMap
-    """Of the model's frames, on the cells of the measured map."""
+    fidelity: str  #: Which of `forward.simulate.FIDELITIES`.
+    pressure_kpa: FloatArray  #: (n, rows, columns) array: The model's frames.
+    tactile_map: TactileMap  #: Of the model's frames, on the cells of the measured map.
     frames_all: float
     frames_centre: float
     frames_near: float
     """`frames_all`, `frames_centre`, `frames_near`: Mean over the frames of each frame's difference: of all taxels;
     along the head's centre line; and the latter in frames whose centre lies within 12 mm of the lump.
     """
-    rms_kpa: float
-    """Root mean square difference of a taxel."""
+    rms_kpa: float  #: Root mean square difference of a taxel.
     map_all: float
     map_centre: float
     map_strict: float
     """`map_all`, `map_centre`, `map_strict`: Of the map within 40 mm of the lump, of its centre line across the lump,
     and of the map relative to map - 1.
     """
-    lump: BumpFit | None
-    """The bump of Eq 7 on the model's map; None where none was fitted."""
+    lump: BumpFit | None  #: The bump of Eq 7 on the model's map; None where none was fitted.
 
 
 def measured_frames(

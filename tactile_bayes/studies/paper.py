@@ -54,12 +54,10 @@ class CaseSettings(CaseOptions, kw_only=True):
 class StudySettings(CaseSettings, kw_only=True):
     """Settings of a study: everything but its cases that the table depends on."""
 
-    head: Head = field(default_factory=Head)
-    """Cross-section of the head."""
+    head: Head = field(default_factory=Head)  #: Cross-section of the head.
     positions_mm: tuple[float, float, float] = POSITIONS_MM
     """First and last position of the head and the step between them."""
-    fit_radius_mm: float = FIT_RADIUS_MM
-    """Eq 5 is fitted where abs(x) is at most this."""
+    fit_radius_mm: float = FIT_RADIUS_MM  #: Eq 5 is fitted where abs(x) is at most this.
     cell_mm: float = CELL_MM
     """Of the contact, see `plane_strain.condense`."""
 
@@ -99,8 +97,7 @@ class Geometry(Record):
     d_mm: float
     depth_ratio: float
     """`seat`, `d_mm`, `depth_ratio`: As in `tissue.Body`."""
-    stiffness_ratios: tuple[float, ...]
-    """E2/E1, the lump's modulus over that of fat."""
+    stiffness_ratios: tuple[float, ...]  #: E2/E1, the lump's modulus over that of fat.
 
     @property
     def key(self) -> str:
@@ -115,14 +112,12 @@ class LineFit(Record):
     amplitude: float
     sigma_mm: float
     """`amplitude`, `sigma_mm`: a and sigma of Eq 5."""
-    rms: float
-    """Root mean square of what the Gaussian leaves, in units of the background."""
+    rms: float  #: Root mean square of what the Gaussian leaves, in units of the background.
     resolved: bool = True
     """True when the width lies within what the fit looks at, and not at an end of it."""
 
 
-Fit = Callable[[TactileLine, float], LineFit]
-"""Fits Eq 5 to a line within a radius in mm."""
+Fit = Callable[[TactileLine, float], LineFit]  #: Fits Eq 5 to a line within a radius in mm.
 
 
 class StudyRow(Record):
@@ -218,8 +213,7 @@ class PrintedEq6(Record):
     e: float
     f: float
     """`e`, `f`: Power law of the width change on the amplitude."""
-    cases: int
-    """Hard, detectable cases that e and f were learned from."""
+    cases: int  #: Hard, detectable cases that e and f were learned from.
 
 
 def hard_cases(rows: Sequence[StudyRow]) -> list[StudyRow]:
@@ -286,8 +280,7 @@ DIAMETERS_MM = (5.0, 10.0, 15.0, 20.0, 25.0)
 DEPTH_RATIOS = (0.6, 0.7, 0.8, 0.9, 1.0, 1.2, 1.5)
 LEAST_RISE = 0.1
 """A lump takes part when it raises the middle of the head by this share of the frame's mean: five times the noise."""
-LEAST_SIZE_RATIO = 1.5
-"""Of the larger lump's diameter to the smaller one's."""
+LEAST_SIZE_RATIO = 1.5  #: Of the larger lump's diameter to the smaller one's.
 ALIKE = 0.05
 """Frames that differ by less than this share of what the lump adds are called indistinguishable."""
 # Of the depths in diameters that are tried by interpolation between those solved.
@@ -300,12 +293,9 @@ class CentredFrame(Record, eq=False):
     d_mm: float
     depth_ratio: float
     """`d_mm`, `depth_ratio`: Size and depth of the lump."""
-    s_mm: FloatArray
-    """(n,) array: Taxel positions across the head."""
-    share: FloatArray
-    """(n,) array: Pressure over the frame's mean."""
-    added: FloatArray
-    """(n,) array: `share` less that of the same layers without the lump."""
+    s_mm: FloatArray  #: (n,) array: Taxel positions across the head.
+    share: FloatArray  #: (n,) array: Pressure over the frame's mean.
+    added: FloatArray  #: (n,) array: `share` less that of the same layers without the lump.
 
     @property
     def rise(self) -> float:
@@ -446,10 +436,8 @@ class HomogeneousTissue(TissueOptions):
 class Uniformity(Record, eq=False):
     """How evenly one head presses."""
 
-    head: Head
-    """Its section."""
-    s_mm: FloatArray
-    """(n,) array: Taxel positions across the head."""
+    head: Head  #: Its section.
+    s_mm: FloatArray  #: (n,) array: Taxel positions across the head.
     share: FloatArray
     """(3, 3, n) array: Pressure over the frame's mean, for each modulus and each mean pressure."""
 

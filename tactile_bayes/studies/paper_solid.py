@@ -156,8 +156,7 @@ _LEVEL = np.eye(3)
 class SolidSettings(CaseSettings, kw_only=True):
     """Settings of a solid study: everything but its cases that the table depends on."""
 
-    head: Head = field(default_factory=Head)
-    """The array and the rim around it."""
+    head: Head = field(default_factory=Head)  #: The array and the rim around it.
     reach_mm: float = REACH_MM
     lines_mm: tuple[float, ...] = LINES_MM
     """`reach_mm`, `lines_mm`: The head stands at steps of the taxels' pitch out to `reach_mm` either side across it, on
@@ -169,8 +168,7 @@ class SolidSettings(CaseSettings, kw_only=True):
     """See `solid.skin_perturbation`."""
     mesh_reach_mm: float = MeshSize().reach_mm
     """Radius at which the mesh ends, on a rim that does not move."""
-    background: str = "free"
-    """``"free"``: Eq 7's level is fitted; ``"fixed"``: it is 1."""
+    background: str = "free"  #: ``"free"``: Eq 7's level is fitted; ``"fixed"``: it is 1.
     flat_field: bool = True
     """True when each taxel is divided by what it reads of the same body without the lump."""
 
@@ -241,10 +239,8 @@ class RasterFrames(Record, eq=False):
     """`x_mm`, `y_mm`, `depth_mm` (n,) arrays: Where the apex of the head's face is, from the lump's axis and from the
     undisturbed skin.
     """
-    pressure_kpa: FloatArray
-    """(n, rows, columns) array."""
-    head: Head
-    """The head that was pressed."""
+    pressure_kpa: FloatArray  #: (n, rows, columns) array.
+    head: Head  #: The head that was pressed.
     plain_kpa: FloatArray | None = None
     """(rows, columns) array: The head's frame over the same body without the lump, where the map is to be divided by
     it.
@@ -260,10 +256,8 @@ class RasterFit(Record):
     """`amplitude`, `sigma_x_mm`, `sigma_y_mm`: a (height above the level, in units of the map) and the widths of Eq 7,
     across and along the head.
     """
-    rms: float
-    """Root mean square of what the Gaussian leaves, in units of the background."""
-    resolved: bool
-    """True when both widths are ones that array and window can tell."""
+    rms: float  #: Root mean square of what the Gaussian leaves, in units of the background.
+    resolved: bool  #: True when both widths are ones that array and window can tell.
 
 
 RasterFitter = Callable[[RasterFrames, SolidSettings], RasterFit]

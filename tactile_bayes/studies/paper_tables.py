@@ -72,14 +72,12 @@ NEAREST_HEADS = {
 class Scene(Record):
     """A lump for which both models are compared."""
 
-    name: str
-    """For people."""
+    name: str  #: For people.
     d_mm: float
     depth_ratio: float
     seat: float
     """`d_mm`, `depth_ratio`, `seat`: As in `body.Body`."""
-    stiffness_ratio: float = HARD_RATIO
-    """E2/E1."""
+    stiffness_ratio: float = HARD_RATIO  #: E2/E1.
 
 
 class Curves(Record, eq=False):
@@ -91,15 +89,13 @@ class Curves(Record, eq=False):
     elastic_map: TactileLine
     empirical_map: TactileLine
     """`elastic_map`, `empirical_map`: What they average to."""
-    model: EmpiricalModel
-    """The fitted empirical model."""
+    model: EmpiricalModel  #: The fitted empirical model.
 
 
 class Agreement(Record):
     """How far the empirical model is from the elastic one; differences as shares, not percent."""
 
-    scene: Scene
-    """The lump compared."""
+    scene: Scene  #: The lump compared.
     centred_frame: float
     all_frames: float
     map: float
@@ -111,8 +107,7 @@ class Agreement(Record):
     elastic: LineFit
     empirical: LineFit
     """`elastic`, `empirical`: Eq 5 fitted to both maps."""
-    normalised_frame: float
-    """As `centred_frame`, of frames divided by their means."""
+    normalised_frame: float  #: As `centred_frame`, of frames divided by their means.
     others: tuple[tuple[float, float, float], ...]
     """By each of `OTHER_DEFINITIONS`: of the frame centred on the lump, of the same divided by its mean, of the map."""
 
@@ -192,12 +187,9 @@ LEAST_TAXELS = 4
 class MeasuredFrame(Record, eq=False):
     """One frame along the centre line of the head."""
 
-    x_c_mm: float
-    """Where the head's centre stands, from the lump's axis."""
-    s_mm: FloatArray
-    """(n,) array: Taxel positions from the head's centre."""
-    pressure_kpa: FloatArray
-    """(n,) array: What the taxels read."""
+    x_c_mm: float  #: Where the head's centre stands, from the lump's axis.
+    s_mm: FloatArray  #: (n,) array: Taxel positions from the head's centre.
+    pressure_kpa: FloatArray  #: (n,) array: What the taxels read.
 
     def __post_init__(self) -> None:
         if len(self.s_mm) < LEAST_TAXELS or not self.pressure_kpa.mean() > 0:
@@ -211,8 +203,7 @@ class MeasuredFrame(Record, eq=False):
 class FrameAgreement(Record, eq=False):
     """A measured frame and both models at its place and mean pressure."""
 
-    measured: MeasuredFrame
-    """As given."""
+    measured: MeasuredFrame  #: As given.
     elastic_kpa: FloatArray
     empirical_kpa: FloatArray
     """`elastic_kpa`, `empirical_kpa` (n,) arrays: The models at the same taxels."""

@@ -240,8 +240,7 @@ def measuring_options() -> SamplerSettings:
 class MassRow(Record):
     """One exam of one mass: true properties and measurements; the fields are the table's columns."""
 
-    body: int
-    """Number of the mass: exams of one share it."""
+    body: int  #: Number of the mass: exams of one share it.
     exam: int
     d_mm: float
     depth_ratio: float
@@ -250,12 +249,10 @@ class MassRow(Record):
     fat_kpa: float
     gland_ratio: float
     thickness_mm: float
-    mean_kpa: float | None = None
-    """Mean pressure of the frames used."""
+    mean_kpa: float | None = None  #: Mean pressure of the frames used.
     detected: bool = False
     """True when a patient's path would give an estimate; if not, what follows is None."""
-    amplitude: float | None = None
-    """Median, as those of the widths."""
+    amplitude: float | None = None  #: Median, as those of the widths.
     sigma_x_mm: float | None = None
     sigma_y_mm: float | None = None
     var_log_a: float | None = None
@@ -273,14 +270,11 @@ class MassRow(Record):
     """
     head_profile_y2: float | None = None
     head_profile_y4: float | None = None
-    normalise: str = "mean"
-    """How the map's frames were, see `MapRecipe`."""
-    head_rows: int | None = None
-    """These and the next as in `forward.scene.Head`."""
+    normalise: str = "mean"  #: How the map's frames were, see `MapRecipe`.
+    head_rows: int | None = None  #: These and the next as in `forward.scene.Head`.
     head_columns: int | None = None
     head_pitch_mm: float | None = None
-    head_radius_mm: float | None = None
-    """None for a flat head."""
+    head_radius_mm: float | None = None  #: None for a flat head.
     head_shoulder_mm: float | None = None
     head_rim_mm: float | None = None
 

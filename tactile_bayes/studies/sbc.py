@@ -47,21 +47,16 @@ class Coverage(Record):
 class RankTest(Record):
     """Results of the tests on one parameter's ranks."""
 
-    name: str
-    """Of the parameter."""
-    n: int
-    """Ranks."""
-    chi2_p: float
-    """P value of equal numbers in bins of ranks."""
-    ecdf_p: float
-    """Share of uniform samples whose ECDF strays at least as far, anywhere."""
+    name: str  #: Of the parameter.
+    n: int  #: Ranks.
+    chi2_p: float  #: P value of equal numbers in bins of ranks.
+    ecdf_p: float  #: Share of uniform samples whose ECDF strays at least as far, anywhere.
     mean_rank: float
     spread: float
     """`mean_rank`, `spread`: Mean of (rank + 1/2) / (draws + 1), 0.5 when calibrated; and its SD over that of a uniform
     one: above 1 the posterior is too narrow, below 1 too wide.
     """
-    coverage: tuple[Coverage, ...]
-    """Of central intervals."""
+    coverage: tuple[Coverage, ...]  #: Of central intervals.
 
     @property
     def inside(self) -> bool:
@@ -196,17 +191,14 @@ class Truth(Record):
     """`length_mm`, `share`: Of the noise field: correlation length, and its variance over the mean independent variance
     of a cell.
     """
-    noise_sd: float
-    """Root of that variance."""
+    noise_sd: float  #: Root of that variance.
 
 
 class MapRanks(Record):
     """Ranks of one simulated map's true parameters in its posterior."""
 
-    index: int
-    """The map's number."""
-    truth: Truth
-    """True values."""
+    index: int  #: The map's number.
+    truth: Truth  #: True values.
     ranks: tuple[int, ...] | None
     """Of `RANKED`: how many of `DRAWS` draws lie below the truth; None without an estimate of this bump."""
     outcome: str
@@ -274,12 +266,9 @@ def elsewhere(posterior: MapPosterior, truth: Truth) -> bool:
 class OtherRises(Record):
     """Maps whose estimate measured another rise than the true lump."""
 
-    number: int
-    """Of them."""
-    announced: float
-    """How many the probabilities of all estimates lead one to expect."""
-    chance: float
-    """Of so many or more, were the probabilities right."""
+    number: int  #: Of them.
+    announced: float  #: How many the probabilities of all estimates lead one to expect.
+    chance: float  #: Of so many or more, were the probabilities right.
 
     @property
     def too_many(self) -> bool:

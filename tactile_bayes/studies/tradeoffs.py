@@ -62,8 +62,7 @@ _REACHES_MM = (110.0,)
 _TAUGHT_MM = (10.0, 15.0, 20.0, 25.0)
 _TAUGHT_DEPTHS = (0.8, 1.0, 1.2)
 
-Clock = Callable[[], float]
-"""Seconds of CPU."""
+Clock = Callable[[], float]  #: Seconds of CPU.
 
 
 class LumpCase(Record):
@@ -96,8 +95,7 @@ class Setting(Record):
 
     model: str
     """``"empirical"``, ``"plane-strain"`` or ``"solid"``."""
-    label: str
-    """For people."""
+    label: str  #: For people.
     settings: StudySettings | SolidSettings
     """Of the model; the empirical one is fitted to plane-strain frames of these."""
     kind: str
@@ -109,14 +107,10 @@ class Setting(Record):
 class Measured(Record):
     """Cost and map of one setting."""
 
-    setting: Setting
-    """What was measured."""
-    element_mm: float
-    """Mean length of an element on the lump's surface."""
-    lump_s: float
-    """CPU for a lump: mesh, factorisation, condensing, the head on the body."""
-    map_s: float
-    """CPU for another stiffness of it: its frames and their map."""
+    setting: Setting  #: What was measured.
+    element_mm: float  #: Mean length of an element on the lump's surface.
+    lump_s: float  #: CPU for a lump: mesh, factorisation, condensing, the head on the body.
+    map_s: float  #: CPU for another stiffness of it: its frames and their map.
     amplitude: float
     sigma_x_mm: float
     sigma_y_mm: float | None
@@ -301,14 +295,11 @@ Outside = Callable[[float, float, float | None], list[str]]
 class SizeRule(Record, eq=False):
     """Rule that converts amplitude and widths to a size."""
 
-    sizes: Sizes
-    """Diameters; the largest is the size."""
+    sizes: Sizes  #: Diameters; the largest is the size.
     scatter: float
     """Standard deviation of ln d that it leaves: of what Eq 6 was learned from, or of bodies left out."""
-    source: str
-    """In words."""
-    outside_of: Outside | None = None
-    """What of a map is none of the calibration's."""
+    source: str  #: In words.
+    outside_of: Outside | None = None  #: What of a map is none of the calibration's.
 
     def size_mm(self, one: Measured) -> float:
         """Size of a measured map; NaN where its amplitude allows none."""
@@ -399,10 +390,8 @@ Inputs = Callable[[TactileMap], tuple[Calibration | None, SamplerSettings]]
 class Built(Record):
     """One way to build a map."""
 
-    options: dict[str, Any] = field(default_factory=dict)
-    """Of `build_map`."""
-    duration_s: float | None = None
-    """Use the first so many seconds only; None uses all."""
+    options: dict[str, Any] = field(default_factory=dict)  #: Of `build_map`.
+    duration_s: float | None = None  #: Use the first so many seconds only; None uses all.
 
 
 def map_settings(scan: Scan) -> list[Choice[Built]]:

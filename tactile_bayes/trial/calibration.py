@@ -67,8 +67,7 @@ class Prediction(Record, eq=False):
     """`median_log`, `sd_log`: (n,) arrays of each prediction: the logarithm of its median in mm and its SD, caliper
     error included.
     """
-    found_log: FloatArray
-    """(n,) array: logarithm of the ex-vivo size in mm."""
+    found_log: FloatArray  #: (n,) array: logarithm of the ex-vivo size in mm.
     mass: FloatArray
     patient: FloatArray
     """`mass`, `patient`: (n,) arrays of numbers."""

@@ -128,8 +128,7 @@ class SumStatistic(Record):
     """(n, k) array of what each mass adds; raises `UndefinedError` where the masses leave the figure undefined."""
     finish: Callable[[FloatArray], FloatArray]
     """The figure from the (..., k) sums, for all leading axes at once; NaN where it does not exist."""
-    undefined: str = "the masses do not determine it"
-    """The reason when `finish` gives NaN."""
+    undefined: str = "the masses do not determine it"  #: The reason when `finish` gives NaN.
 
     def __call__(self, sizes: ModalitySizes) -> float:
         """Compute the statistic of these masses."""
@@ -266,14 +265,12 @@ Leverage = Callable[[ModalitySizes], FloatArray]
 class Figure(Record):
     """A number about one modality, never NaN or infinite."""
 
-    value: float | None
-    """None where the data leave it undefined; `reason` then says why."""
+    value: float | None  #: None where the data leave it undefined; `reason` then says why.
     reason: str = ""
     interval: tuple[float, float] | None = None
     """Low and high end, None where none is given; `interval_reason` says why when one was asked for."""
     interval_reason: str = ""
-    has_interval: bool = False
-    """Whether an interval belongs to this figure at all."""
+    has_interval: bool = False  #: Whether an interval belongs to this figure at all.
 
     def mapped(self, function: Callable[[float], float]) -> Figure:
         """Convert the figure by an increasing function; ends beyond double precision drop the interval."""

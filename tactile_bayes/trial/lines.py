@@ -429,13 +429,10 @@ def _need_two(x: FloatArray) -> None:
 class Concordance(Record):
     """Concordance coefficient and its parts."""
 
-    coefficient: float
-    """Lin's, -1 to 1: `pearson_r` times `bias_correction`."""
+    coefficient: float  #: Lin's, -1 to 1: `pearson_r` times `bias_correction`.
     pearson_r: float
-    bias_correction: float
-    """C_b, above 0 to 1: 1 when means and standard deviations agree."""
-    scale_shift: float
-    """SD of y over that of x."""
+    bias_correction: float  #: C_b, above 0 to 1: 1 when means and standard deviations agree.
+    scale_shift: float  #: SD of y over that of x.
     location_shift: float
     """Mean of y less that of x, over the geometric mean of the SDs (divisor n)."""
     interval: tuple[float, float] | None

@@ -69,16 +69,12 @@ class ModalitySizes(Record, eq=False):
     """Sizes of n masses by one modality, ordered by patient and mass whatever the order of the rows."""
 
     name: str
-    patient: npt.NDArray[np.int64]
-    """(n,) array, the patient of each mass by number."""
-    ex_vivo_mm: FloatArray
-    """(n,) array, above 0."""
+    patient: npt.NDArray[np.int64]  #: (n,) array, the patient of each mass by number.
+    ex_vivo_mm: FloatArray  #: (n,) array, above 0.
     size_mm: FloatArray
     """(n,) array: mean over the detected replicates; 0 where none was detected."""
-    replicates_mm: tuple[FloatArray, ...]
-    """n arrays: the detected replicates of each mass."""
-    intervals: tuple[IntervalReading, ...] = ()
-    """The credible intervals that the readings state."""
+    replicates_mm: tuple[FloatArray, ...]  #: n arrays: the detected replicates of each mass.
+    intervals: tuple[IntervalReading, ...] = ()  #: The credible intervals that the readings state.
     readings: int = 0
     masses_not_done: int = 0
     masses_without_reading: int = 0
@@ -311,8 +307,7 @@ Row = tuple[int, Reading]
 class OtherVisits(Record):
     """Readings that a trial's analysis leaves out because they are of other visits than the excision's."""
 
-    masses: int = 0
-    """How many masses were read at several visits."""
+    masses: int = 0  #: How many masses were read at several visits.
     earlier: int = 0
     later: int = 0
     """`earlier`, `later`: Readings at visits before the last one, and after the excision."""
@@ -337,14 +332,11 @@ class OtherVisits(Record):
 class Trial(Record, eq=False):
     """Readings and sizes after excision, as a trial's report is made from them."""
 
-    readings: Sequence[Reading]
-    """Those of each mass's last visit before excision, in any order."""
-    ex_vivo_mm: Mapping[MassKey, float]
-    """Size after excision, of every mass of the readings."""
+    readings: Sequence[Reading]  #: Those of each mass's last visit before excision, in any order.
+    ex_vivo_mm: Mapping[MassKey, float]  #: Size after excision, of every mass of the readings.
     ex_vivo_sd_mm: Mapping[MassKey, float | None] = field(default_factory=dict)
     """Standard deviation of each ex-vivo size where it is known; enters the calibration in quadrature."""
-    other_visits: OtherVisits = field(default_factory=OtherVisits)
-    """What the readings leave out."""
+    other_visits: OtherVisits = field(default_factory=OtherVisits)  #: What the readings leave out.
     files: Mapping[str, Path] = field(default_factory=dict)
     """Files that they were read from, by role."""
 
