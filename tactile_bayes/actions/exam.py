@@ -29,14 +29,10 @@ from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.files.provenance import Provenance, hash_inputs
 from tactile_bayes.files.scan_mcap import read_scan_report, read_truth, write_scan
 from tactile_bayes.files.size_json import SHIPPED, size_calibration_path
+from tactile_bayes.geometry import FloatArray
+from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.presets import RESEARCH_USE
-
-if TYPE_CHECKING:
-    from tactile_bayes.files.estimate_json import StatedSize
-    from tactile_bayes.geometry import FloatArray
-    from tactile_bayes.mapping.map import TactileMap
-    from tactile_bayes.scan import Scan
-
+from tactile_bayes.scan import Scan
 
 # --- `import`: import scans, grids and images from other programs.
 

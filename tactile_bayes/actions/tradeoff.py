@@ -33,6 +33,7 @@ from tactile_bayes.files.size_json import read_size_calibration, size_calibratio
 from tactile_bayes.forward.scene import Scene
 from tactile_bayes.forward.tissue import SceneBody, SolidLump
 from tactile_bayes.mapping.map import TactileMap
+from tactile_bayes.posterior.options import SamplerSettings
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.laboratory import TradeoffReport, draw_tradeoff, tradeoff_document, tradeoff_text
 from tactile_bayes.report.tradeoff import DIGITS, draw_ladder, ladder_file, ladder_text
@@ -54,15 +55,6 @@ from tactile_bayes.studies.tradeoffs import (
     measure_map,
     teach,
 )
-
-if TYPE_CHECKING:
-    from tactile_bayes.mapping.map import TactileMap
-    from tactile_bayes.posterior.options import SamplerSettings
-    from tactile_bayes.scan import Scan
-    from tactile_bayes.size.pooling import Calibration, PooledEstimate
-    from tactile_bayes.studies.estimate_tradeoff import Clock, Ladder
-    from tactile_bayes.studies.tradeoffs import LumpCase, Measured, SizeRule
-
 
 # --- The trade of time for accuracy on a user's own maps and scans: calibration and options as `estimate` takes them.
 

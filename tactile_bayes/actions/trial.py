@@ -13,9 +13,9 @@ import click
 from tactile_bayes.api.planning import planned, read_pilot
 from tactile_bayes.api.trials import analyse, load_trial
 from tactile_bayes.campaigns.campaign import names_line, run_campaign
-from tactile_bayes.campaigns.exams import find_exams
+from tactile_bayes.campaigns.exams import Found, find_exams
 from tactile_bayes.campaigns.settings import CampaignSettings
-from tactile_bayes.commands.options import also_read, settings_of
+from tactile_bayes.commands.options import also_read, settings_of, typed_options
 from tactile_bayes.commands.progress import progress_bar
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.atomic import refuse_existing
@@ -25,10 +25,6 @@ from tactile_bayes.files.reading import check_address
 from tactile_bayes.files.size_json import NONE
 from tactile_bayes.options import TrialSettings
 from tactile_bayes.presets import RESEARCH_USE
-
-if TYPE_CHECKING:
-    from tactile_bayes.campaigns.exams import Found
-
 
 # --- `validate`: compare each modality with excision.
 
@@ -98,7 +94,7 @@ def plan_action(
     """Plan a trial: power, widths of intervals and the worth of more maps, by simulation."""
     if output:
         refuse_existing(output, force=force)
-    typed = _typed()
+    typed = typed_options()
     compared = against if "against" in typed else None
     read = read_pilot(pilot, excision, compared)
     if read is not None:
@@ -116,18 +112,9 @@ def plan_action(
         click.echo(dump_json(found.document) if as_json else found.text, nl=False)
 
 
-def _typed() -> set[str]:
-    """Options given on the command line."""
-    context = click.get_current_context()
-    return {
-        name for name in context.params if context.get_parameter_source(name) is click.core.ParameterSource.COMMANDLINE
-    }
-
-
 # --- `campaign`: from a folder of exams to the trial's report.
 
-_LOG_EVERY_S = 60.0
-"""Where stderr is no terminal, progress is a line so often."""
+_LOG_EVERY_S = 60.0  #: Where stderr is no terminal, progress is a line so often.
 
 
 def campaign_init_action(folder: Path | str, output: Path, add: bool, force: bool) -> None:

@@ -30,8 +30,7 @@ class Diagnosis(Record, eq=False):
     """How far the draws of a posterior can be trusted."""
 
     posterior: PosteriorDraws
-    path: Path
-    """Of its file."""
+    path: Path  #: Of its file.
     quantities: dict[str, dict[str, float]]
     """Median of each size and width, and of chains R-hat, effective draws and Monte-Carlo errors."""
 

@@ -30,8 +30,7 @@ from tactile_bayes.trial.readings import Trial, unit_doubts
 if TYPE_CHECKING:
     import pandas
 
-PATIENTS, MAPS, TRIALS, SEED = (16, 24, 32, 48), (1, 3, 5), 1000, 1999
-"""Defaults of a plan."""
+PATIENTS, MAPS, TRIALS, SEED = (16, 24, 32, 48), (1, 3, 5), 1000, 1999  #: Defaults of a plan.
 _AGAINST = "ultrasound"
 _ERRORS = names_of(PlanErrors)
 
@@ -40,8 +39,7 @@ class TrialPlan(Record, eq=False):
     """Power and widths of intervals of planned trials; `report` is what the file of ``plan -o`` holds."""
 
     report: PlanReport
-    doubts: tuple[str, ...] = ()
-    """What speaks against the pilot's tables."""
+    doubts: tuple[str, ...] = ()  #: What speaks against the pilot's tables.
 
     @property
     def document(self) -> dict[str, Any]:
@@ -70,8 +68,7 @@ class Pilot(Record, eq=False):
     """An earlier trial that errors are taken from."""
 
     trial: Trial
-    path: Path
-    """Of its readings, for errors; the name of a DataFrame."""
+    path: Path  #: Of its readings, for errors; the name of a DataFrame.
 
     def doubts(self) -> Iterator[str]:
         """What speaks against its tables, a line each."""

@@ -20,8 +20,7 @@ else:
 
 # --- Settings of `estimate`, shared by the command line, Python and batches.
 
-GIVEN: Final = "given in Python"
-"""Name of a calibration that is in no file."""
+GIVEN: Final = "given in Python"  #: Name of a calibration that is in no file.
 _SITE: Final = {"metavar": "SITE.json", "path": True}
 
 
