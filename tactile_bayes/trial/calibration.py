@@ -12,7 +12,7 @@ from scipy.special import chdtri, kolmogi, ndtr, ndtri
 
 from tactile_bayes.declarations import Meta, Record
 from tactile_bayes.trial.figures import MIN_PATIENTS, Count, Ends, Share, clopper_pearson
-from tactile_bayes.trial.readings import FloatArray, IntervalReading
+from tactile_bayes.trial.readings import FloatArray, IntervalReading, Reading
 
 # --- Coverage of stated intervals against the size after excision.
 
@@ -187,15 +187,15 @@ def interval_score(prediction: Prediction, *, probability: float) -> FloatArray:
     return score
 
 
-def log_normal(
-    low_mm: float | None, high_mm: float | None, probability: float | None, size_mm: float, sd_mm: float | None
-) -> tuple[float, float] | None:
+def log_normal(reading: Reading) -> tuple[float, float] | None:
     """Median (log of mm) and SD of the log of a reading: from its interval, else from size and SD."""
-    if low_mm is not None and high_mm is not None and probability is not None and 0 < low_mm < high_mm:
-        reach = float(ndtri(0.5 + 0.5 * probability))
-        return (math.log(low_mm) + math.log(high_mm)) / 2, (math.log(high_mm) - math.log(low_mm)) / (2 * reach)
-    if sd_mm:
-        return math.log(size_mm) - math.log1p((sd_mm / size_mm) ** 2) / 2, math.sqrt(math.log1p((sd_mm / size_mm) ** 2))
+    ends = reading.interval
+    if ends is not None and 0 < ends.low_mm < ends.high_mm:
+        low, high, reach = math.log(ends.low_mm), math.log(ends.high_mm), float(ndtri(0.5 + 0.5 * ends.probability))
+        return (low + high) / 2, (high - low) / (2 * reach)
+    if reading.sd_mm and reading.size_mm is not None:
+        variance = math.log1p((reading.sd_mm / reading.size_mm) ** 2)
+        return math.log(reading.size_mm) - variance / 2, math.sqrt(variance)
     return None
 
 

@@ -160,7 +160,7 @@ def limits(differences: FloatArray, *, confidence: float = 0.95) -> Limits:
     if n < 2:
         raise UndefinedError(f"limits of agreement need at least 2 masses (found {n})")
     bias, sd = float(differences.mean()), float(differences.std(ddof=1))
-    z, tail = _normal(0.5 + 0.5 * SHARE), 0.5 + 0.5 * confidence
+    z, tail = float(ndtri(0.5 + 0.5 * SHARE)), 0.5 + 0.5 * confidence
     t = student(n - 1, confidence=confidence)
     inner = percentile_factor(n, percentile=0.5 + 0.5 * SHARE, confidence=1 - tail)
     outer = percentile_factor(n, percentile=0.5 + 0.5 * SHARE, confidence=tail)
@@ -199,8 +199,35 @@ def limits_unlinked(x: Sequence[FloatArray], y: Sequence[FloatArray], *, confide
     (2013), Stat. Methods Med. Res. 22, 630.
     """
     means = np.array([b.mean() - a.mean() for a, b in zip(x, y, strict=True)])
-    parts = [_within(x), _within(y)]
-    return _from_means(means, parts, names=("reference_within", "within"), confidence=confidence)
+    n = len(means)
+    if n < 2:
+        raise UndefinedError(f"limits of agreement need at least 2 masses (found {n})")
+    between = float(means.var(ddof=1))
+    parts = {"means": (between, n - 1), "reference_within": _averaged_out(x), "within": _averaged_out(y)}
+    total = sum(variance for variance, _ in parts.values())
+    bias, z = float(means.mean()), float(ndtri(0.5 + 0.5 * SHARE))
+    low, high = bias - z * math.sqrt(total), bias + z * math.sqrt(total)
+    wide, narrow = _recovered(list(parts.values()), total, z=z, bias_variance=between / n, confidence=confidence)
+    t = student(n - 1, confidence=confidence) * math.sqrt(between / n)
+    return Limits(
+        n=n,
+        bias=bias,
+        bias_interval=(bias - t, bias + t),
+        sd=math.sqrt(total),
+        low=low,
+        high=high,
+        low_interval=(low - wide, low + narrow),
+        high_interval=(high - narrow, high + wide),
+        components={name: variance for name, (variance, _) in parts.items()},
+    )
+
+
+def _averaged_out(groups: Sequence[FloatArray]) -> tuple[float, int]:
+    """Variance of one reading that averaging over a mass's replicates removed, and its degrees of freedom."""
+    numbers = np.array([len(group) for group in groups])
+    freedom = int(numbers.sum()) - len(groups)
+    squares = sum(float(np.sum((group - group.mean()) ** 2)) for group in groups if len(group) > 1)
+    return (1 - float(np.mean(1 / numbers))) * squares / max(freedom, 1), freedom
 
 
 class Trend(Record):
@@ -245,50 +272,6 @@ def errors_are_proportional(x: FloatArray, y: FloatArray) -> bool:
     return bool(np.isfinite(gain) and gain > np.log(LIKELIER))
 
 
-class _Within(Record):
-    """Pooled within-mass variance, its degrees of freedom and the harmonic mean number of replicates."""
-
-    variance: float
-    freedom: int
-    harmonic: float
-
-    @property
-    def restored(self) -> float:
-        """Variance of one reading that averaging over replicates removed."""
-        return (1 - 1 / self.harmonic) * self.variance
-
-
-def _within(groups: Sequence[FloatArray]) -> _Within:
-    numbers = np.array([len(group) for group in groups])
-    freedom = int(numbers.sum()) - len(groups)
-    squares = sum(float(np.sum((group - group.mean()) ** 2)) for group in groups if len(group) > 1)
-    return _Within(squares / freedom if freedom else 0.0, freedom, len(groups) / float(np.sum(1 / numbers)))
-
-
-def _from_means(means: FloatArray, within: Sequence[_Within], *, names: Sequence[str], confidence: float) -> Limits:
-    n = len(means)
-    if n < 2:
-        raise UndefinedError(f"limits of agreement need at least 2 masses (found {n})")
-    between = float(means.var(ddof=1))
-    total = between + sum(one.restored for one in within)
-    bias, z = float(means.mean()), _normal(0.5 + 0.5 * SHARE)
-    low, high = bias - z * math.sqrt(total), bias + z * math.sqrt(total)
-    parts = [(between, n - 1), *((one.restored, one.freedom) for one in within)]
-    wide, narrow = _recovered(parts, total, z=z, bias_variance=between / n, confidence=confidence)
-    t = student(n - 1, confidence=confidence) * math.sqrt(between / n)
-    return Limits(
-        n=n,
-        bias=bias,
-        bias_interval=(bias - t, bias + t),
-        sd=math.sqrt(total),
-        low=low,
-        high=high,
-        low_interval=(low - wide, low + narrow),
-        high_interval=(high - narrow, high + wide),
-        components={"means": between} | {name: one.restored for name, one in zip(names, within, strict=True)},
-    )
-
-
 def _recovered(
     parts: Sequence[tuple[float, int]], total: float, *, z: float, bias_variance: float, confidence: float
 ) -> Ends:
@@ -301,14 +284,10 @@ def _recovered(
         below += (variance * (1 - freedom / float(chdtri(freedom, tail)))) ** 2
         above += (variance * (1 - freedom / float(chdtri(freedom, 1 - tail)))) ** 2
     low, high = math.sqrt(max(0.0, total - math.sqrt(below))), math.sqrt(total + math.sqrt(above))
-    of_bias = _normal(1 - tail) ** 2 * bias_variance
+    of_bias = float(ndtri(1 - tail)) ** 2 * bias_variance
     wide = math.sqrt(of_bias + (z * (high - math.sqrt(total))) ** 2)
     narrow = math.sqrt(of_bias + (z * (math.sqrt(total) - low)) ** 2)
     return wide, narrow
-
-
-def _normal(probability: float) -> float:
-    return float(ndtri(probability))
 
 
 # --- Limits of agreement with intervals over patients, for differences of any distribution and any masses per patient.
@@ -323,11 +302,11 @@ _ONE = "one mass has no spread"
 
 def figures(found: ModalitySizes, *, confidence: float) -> dict[str, Figure]:
     """Lower and upper limit in mm and as the logarithm of the ratio, for single readings of detected masses."""
-    made: dict[str, Figure] = {}
-    for unit, terms in (("mm", _mm_terms), ("log_ratio", _log_terms)):
-        for side, sign in (("low", -1), ("high", 1)):
-            made[f"limit_{side}_{unit}"] = _limit(terms, sign, found, confidence=confidence)
-    return made
+    return {
+        f"limit_{side}_{unit}": _limit(terms, sign, found, confidence=confidence)
+        for unit, terms in (("mm", _mm_terms), ("log_ratio", _log_terms))
+        for side, sign in (("low", -1), ("high", 1))
+    }
 
 
 def _limit(

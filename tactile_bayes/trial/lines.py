@@ -11,7 +11,7 @@ import numpy.typing as npt
 from scipy.special import ndtri, stdtrit
 
 from tactile_bayes.declarations import Record
-from tactile_bayes.trial.figures import UndefinedError
+from tactile_bayes.trial.figures import UndefinedError, ratio
 from tactile_bayes.trial.readings import FloatArray
 
 # --- Ordered angles of the lines through all pairs of points: listed, or counted when there are many.
@@ -312,7 +312,7 @@ def deming(x: FloatArray, y: FloatArray, *, error_ratio: float = 1.0) -> Line:
         raise ValueError(f"error_ratio is {error_ratio}; give a variance of x over that of y, above 0")
     _need_two(x)
     mean_x, mean_y, u, q, p = _moments(x, y, np.ones_like(x))
-    slope = deming_slope(u, q, p, error_ratio)
+    slope = _deming_slope(u, q, p, error_ratio)
     intercept = mean_y - slope * mean_x
     if len(x) < 3 or slope == 0:
         return Line(intercept, slope, len(x))
@@ -347,7 +347,7 @@ def weighted_deming(
         weights = _by_size(x, y, intercept, slope, error_ratio)
         mean_x, mean_y, u, q, p = _moments(x, y, weights)
         before = intercept, slope
-        slope = deming_slope(u, q, p, error_ratio)
+        slope = _deming_slope(u, q, p, error_ratio)
         intercept = mean_y - slope * mean_x
         if abs(slope - before[1]) < threshold and abs(intercept - before[0]) < threshold:
             break
@@ -368,20 +368,22 @@ def jackknife_errors(
     return scale * float(intercepts.std(ddof=1)), scale * float(slopes.std(ddof=1))
 
 
-def deming_slope(u: float, q: float, p: float, error_ratio: float) -> float:
+def deming_slopes(u: FloatArray, q: FloatArray, p: FloatArray, *, error_ratio: float) -> FloatArray:
     """Deming's slope from sums of squares and products of x and y, by the formula without cancellation.
 
-    Undefined where the products are 0 up to rounding and y varies at least as much as x, so that the line is vertical.
+    NaN where the products are 0 up to rounding and y varies at least as much as x, so that the line is vertical.
     """
-    if abs(p) <= EQUAL * math.sqrt(u * q):
-        p = 0.0
+    p = np.where(np.abs(p) <= EQUAL * np.sqrt(u * q), 0.0, p)
     d = error_ratio * q - u
-    root = math.hypot(d, 2 * math.sqrt(error_ratio) * p)
-    if d < 0:
-        return 2 * p / (root - d)
-    if p == 0:
+    root = np.hypot(d, 2 * np.sqrt(error_ratio) * p)
+    return np.where(d < 0, ratio(2 * p, root - d), ratio(d + root, 2 * error_ratio * p))
+
+
+def _deming_slope(u: float, q: float, p: float, error_ratio: float) -> float:
+    slope = float(deming_slopes(*map(np.asarray, (u, q, p)), error_ratio=error_ratio))
+    if math.isnan(slope):
         raise UndefinedError("the line is vertical or every direction fits equally well")
-    return (d + root) / (2 * error_ratio * p)
+    return slope
 
 
 def all_equal(values: FloatArray) -> bool:

@@ -29,13 +29,13 @@ from tactile_bayes.trial.figures import (
 )
 from tactile_bayes.trial.limits import Limits, Trend
 from tactile_bayes.trial.lines import (
-    EQUAL,
     Concordance,
     Line,
     PassingBablok,
     centred,
     concordance,
     deming,
+    deming_slopes,
     jackknife_errors,
     least_squares,
     passing_bablok,
@@ -197,11 +197,7 @@ def _ols_slope(sums: FloatArray) -> FloatArray:
 
 
 def _deming_slope(sums: FloatArray, *, error_ratio: float) -> FloatArray:
-    u, q, p = _squares(sums)
-    p = np.where(np.abs(p) <= EQUAL * np.sqrt(u * q), 0.0, p)
-    d = error_ratio * q - u
-    root = np.hypot(d, 2 * np.sqrt(error_ratio) * p)
-    return np.where(d < 0, ratio(2 * p, root - d), ratio(d + root, 2 * error_ratio * p))
+    return deming_slopes(*_squares(sums), error_ratio=error_ratio)
 
 
 def _intercept_with(slope: Callable[[FloatArray], FloatArray]) -> Callable[[FloatArray], FloatArray]:
@@ -289,25 +285,24 @@ def _jackknifed(
 
 
 def _limits(found: ModalitySizes, *, confidence: float) -> dict[Unit, Limits]:
-    if all(len(group) == 1 for group in found.replicates_mm):
-        return {
-            "mm": bland_altman.limits(found.size_mm - found.ex_vivo_mm, confidence=confidence),
-            "log_ratio": bland_altman.limits(np.log(found.size_mm / found.ex_vivo_mm), confidence=confidence),
-        }
-    x, y = [np.array([e]) for e in found.ex_vivo_mm], list(found.replicates_mm)
-    logs = [np.log(e) for e in x], [np.log(group) for group in y]
-    return {
-        "mm": bland_altman.limits_unlinked(x, y, confidence=confidence),
-        "log_ratio": bland_altman.limits_unlinked(*logs, confidence=confidence),
+    x, y, groups = found.ex_vivo_mm, found.size_mm, found.replicates_mm
+    if all(len(group) == 1 for group in groups):
+        differences: dict[Unit, FloatArray] = {"mm": y - x, "log_ratio": np.log(y / x)}
+        return {unit: bland_altman.limits(one, confidence=confidence) for unit, one in differences.items()}
+    of_x, of_y = [np.array([e]) for e in x], list(groups)
+    pairs: dict[Unit, tuple[list[FloatArray], list[FloatArray]]] = {
+        "mm": (of_x, of_y),
+        "log_ratio": ([np.log(one) for one in of_x], [np.log(one) for one in of_y]),
     }
+    return {unit: bland_altman.limits_unlinked(*both, confidence=confidence) for unit, both in pairs.items()}
 
 
 def _trends(x: FloatArray, y: FloatArray, *, confidence: float) -> dict[Against, Trend]:
     trends: dict[Against, Trend] = {}
-    with suppress(UndefinedError):
-        trends["on_ex_vivo"] = bland_altman.trend(y - x, x, confidence=confidence)
-    with suppress(UndefinedError):
-        trends["on_mean"] = bland_altman.trend(y - x, (x + y) / 2, confidence=confidence)
+    against: dict[Against, FloatArray] = {"on_ex_vivo": x, "on_mean": (x + y) / 2}
+    for name, sizes in against.items():
+        with suppress(UndefinedError):
+            trends[name] = bland_altman.trend(y - x, sizes, confidence=confidence)
     return trends
 
 

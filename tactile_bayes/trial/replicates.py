@@ -273,10 +273,6 @@ def _log_terms(sizes: ModalitySizes) -> FloatArray:
     return columns(1.0, number, number**2, number * centred, number * centred**2, squares)
 
 
-def _log_sd(sums: FloatArray) -> FloatArray:
-    return np.sqrt(ratio(sums[..., 5], sums[..., 1] - sums[..., 0]))
-
-
 def _icc(sums: FloatArray) -> FloatArray:
     masses, number, number2, first, second, within = np.moveaxis(sums, -1, 0)
     mean_within = ratio(within, number - masses)
@@ -285,7 +281,7 @@ def _icc(sums: FloatArray) -> FloatArray:
     return ratio(mean_between - mean_within, mean_between + (usual - 1) * mean_within)
 
 
-log_sd_within = SumStatistic(_log_terms, _log_sd)
+log_sd_within = SumStatistic(_log_terms, lambda sums: np.sqrt(ratio(sums[..., 5], sums[..., 1] - sums[..., 0])))
 icc = SumStatistic(_log_terms, _icc, undefined="one mass, or no scatter at all, has no correlation within masses")
 
 

@@ -46,7 +46,7 @@ from tactile_bayes.trial.figures import (
 from tactile_bayes.trial.method_comparison import MethodComparison, compare_methods
 from tactile_bayes.trial.next_mass import NextMass
 from tactile_bayes.trial.planning import IntervalCheck
-from tactile_bayes.trial.readings import ModalitySizes, Reading, Trial, mass_numbers, patient_numbers, unit_doubts
+from tactile_bayes.trial.readings import ModalitySizes, Trial, mass_numbers, patient_numbers, unit_doubts
 from tactile_bayes.trial.replicates import (
     Components,
     ReplicateFigures,
@@ -282,8 +282,7 @@ def _components(trial: Trial, modality: str) -> Components | None:
 
 def prediction_of(trial: Trial, modality: str) -> Prediction | None:
     """Stated uncertainties of a modality's readings as predictive distributions; None where no reading states one."""
-    stated = [(one, _stated(one)) for one in trial.found(modality)]
-    kept = [(one, distribution) for one, distribution in stated if distribution is not None]
+    kept = [(one, stated) for one in trial.found(modality) if (stated := log_normal(one)) is not None]
     if not kept:
         return None
     masses, patients = mass_numbers(trial.ex_vivo_mm), patient_numbers(trial.ex_vivo_mm)
@@ -295,14 +294,6 @@ def prediction_of(trial: Trial, modality: str) -> Prediction | None:
         masses=[masses[key] for key in keys],
         patients=[patients[patient] for patient, _ in keys],
     )
-
-
-def _stated(reading: Reading) -> tuple[float, float] | None:
-    assert reading.size_mm is not None
-    ends = reading.interval
-    if ends is None:
-        return log_normal(None, None, None, reading.size_mm, reading.sd_mm)
-    return log_normal(ends.low_mm, ends.high_mm, ends.probability, reading.size_mm, reading.sd_mm)
 
 
 def _detected_interval(sizes: ModalitySizes, *, confidence: float) -> tuple[float, float] | None:

@@ -51,8 +51,8 @@ def png_size(path: Path) -> tuple[int, int]:
 
 
 def _keeping(draw, kept: list):
-    def keep(axes, *more):
-        draw(axes, *more)
+    def keep(axes, *more, **how):
+        draw(axes, *more, **how)
         kept.append(axes)
 
     return keep
@@ -62,7 +62,7 @@ def _keeping(draw, kept: list):
 def axes(monkeypatch):
     """The figure that was written last, for looking at what is on it."""
     kept = []
-    for module, name in ((sizes, "_finish_size"), (maps, "_draw_values")):
+    for module, name in ((sizes, "_draw_density"), (maps, "_draw_values")):
         monkeypatch.setattr(module, name, _keeping(getattr(module, name), kept))
     return kept
 
