@@ -58,8 +58,7 @@ class StudySettings(CaseSettings, kw_only=True):
     positions_mm: tuple[float, float, float] = POSITIONS_MM
     """First and last position of the head and the step between them."""
     fit_radius_mm: float = FIT_RADIUS_MM  #: Eq 5 is fitted where abs(x) is at most this.
-    cell_mm: float = CELL_MM
-    """Of the contact, see `plane_strain.condense`."""
+    cell_mm: float = CELL_MM  #: Of the contact, see `plane_strain.condense`.
 
     def as_dict(self) -> dict[str, object]:
         """Plain data for a store's header and for a report."""

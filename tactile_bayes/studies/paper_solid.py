@@ -162,10 +162,8 @@ class SolidSettings(CaseSettings, kw_only=True):
     """`reach_mm`, `lines_mm`: The head stands at steps of the taxels' pitch out to `reach_mm` either side across it, on
     lines at these distances either side along it, which must be whole steps.
     """
-    fit_radius_mm: float = FIT_RADIUS_MM
-    """Eq 7 is fitted within this distance of the lump's axis."""
-    rank_tolerance: float = RANK_TOLERANCE
-    """See `solid.skin_perturbation`."""
+    fit_radius_mm: float = FIT_RADIUS_MM  #: Eq 7 is fitted within this distance of the lump's axis.
+    rank_tolerance: float = RANK_TOLERANCE  #: See `solid.skin_perturbation`.
     mesh_reach_mm: float = MeshSize().reach_mm
     """Radius at which the mesh ends, on a rim that does not move."""
     background: str = "free"  #: ``"free"``: Eq 7's level is fitted; ``"fixed"``: it is 1.
