@@ -312,7 +312,7 @@ def deming(x: FloatArray, y: FloatArray, *, error_ratio: float = 1.0) -> Line:
         raise ValueError(f"error_ratio is {error_ratio}; give a variance of x over that of y, above 0")
     _need_two(x)
     mean_x, mean_y, u, q, p = _moments(x, y, np.ones_like(x))
-    slope = _deming_slope(u, q, p, error_ratio)
+    slope = deming_slope(u, q, p, error_ratio)
     intercept = mean_y - slope * mean_x
     if len(x) < 3 or slope == 0:
         return Line(intercept, slope, len(x))
@@ -347,7 +347,7 @@ def weighted_deming(
         weights = _by_size(x, y, intercept, slope, error_ratio)
         mean_x, mean_y, u, q, p = _moments(x, y, weights)
         before = intercept, slope
-        slope = _deming_slope(u, q, p, error_ratio)
+        slope = deming_slope(u, q, p, error_ratio)
         intercept = mean_y - slope * mean_x
         if abs(slope - before[1]) < threshold and abs(intercept - before[0]) < threshold:
             break
@@ -379,7 +379,8 @@ def deming_slopes(u: FloatArray, q: FloatArray, p: FloatArray, *, error_ratio: f
     return np.where(d < 0, ratio(2 * p, root - d), ratio(d + root, 2 * error_ratio * p))
 
 
-def _deming_slope(u: float, q: float, p: float, error_ratio: float) -> float:
+def deming_slope(u: float, q: float, p: float, error_ratio: float) -> float:
+    """One slope; undefined where it is NaN."""
     slope = float(deming_slopes(*map(np.asarray, (u, q, p)), error_ratio=error_ratio))
     if math.isnan(slope):
         raise UndefinedError("the line is vertical or every direction fits equally well")
