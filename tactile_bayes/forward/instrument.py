@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 import numpy as np
 
 from tactile_bayes.declarations import Record, as_dict
-from tactile_bayes.forward.scene import Background, Scene, Strokes, Taxels, rotation_from_vector
+from tactile_bayes.forward.scene import Background, Scene, Strokes, rotation_from_vector
 from tactile_bayes.geometry import FloatArray, apply, inverse, patient_from_base, quaternion_from_rotation
 from tactile_bayes.presets import PRESSURE_RANGE_KPA
 from tactile_bayes.scan import (
-    CountArray,
     ElementCalibration,
     HeadGeometry,
     Landmarks,
@@ -131,14 +130,10 @@ def _frames(scene: Scene, felt: Felt, true_gain: FloatArray, *, rng: np.random.G
         pressure = pressure + scene.noise.element_kpa * rng.standard_normal(pressure.shape)
         chunks.append(np.clip(np.rint(pressure / true_gain), 0, FULL_SCALE_COUNT).astype(np.uint16))
     counts = np.concatenate(chunks)
-    _break(counts, scene.taxels)
-    return PressureFrames(time, counts)
-
-
-def _break(counts: CountArray, taxels: Taxels) -> None:
-    for faulty, reading in ((taxels.dead, 0), (taxels.saturated, FULL_SCALE_COUNT)):
+    for faulty, reading in ((scene.taxels.dead, 0), (scene.taxels.saturated, FULL_SCALE_COUNT)):
         for row, column in faulty:
             counts[:, row, column] = reading
+    return PressureFrames(time, counts)
 
 
 def _calibration(scene: Scene, *, rng: np.random.Generator) -> tuple[FloatArray, ElementCalibration]:
@@ -188,11 +183,10 @@ def _truth(scene: Scene, model: Mapping[str, Any]) -> dict[str, Any]:
         normal = base_from_plane[:3, 2]
         patient = patient_from_base(landmarks.sternal_notch_mm, landmarks.xiphoid_mm, normal=normal)
         patient_from_plane = patient @ base_from_plane
-    lumps: Sequence[Mapping[str, Any]] = model["lumps"]
     return {
         "schema": TRUTH_SCHEMA,
         **model,
-        "lumps": [_lump_truth(lump, base_from_plane, patient_from_plane) for lump in lumps],
+        "lumps": [_lump_truth(lump, base_from_plane, patient_from_plane) for lump in model["lumps"]],
         "background": as_dict(scene.background),
         "noise": as_dict(scene.noise),
         "latency_ms": scene.tracker.latency_ms,
@@ -206,8 +200,6 @@ def _truth(scene: Scene, model: Mapping[str, Any]) -> dict[str, Any]:
 def _lump_truth(
     given: Mapping[str, Any], base_from_plane: FloatArray, patient_from_plane: FloatArray | None
 ) -> dict[str, Any]:
-    lump = dict(given)
-    point = np.array([lump["x_mm"], lump["y_mm"], 0.0])
-    lump["base_mm"] = apply(base_from_plane, point).tolist()
-    lump["patient_mm"] = None if patient_from_plane is None else apply(patient_from_plane, point).tolist()
-    return lump
+    point = np.array([given["x_mm"], given["y_mm"], 0.0])
+    patient = None if patient_from_plane is None else apply(patient_from_plane, point).tolist()
+    return {**given, "base_mm": apply(base_from_plane, point).tolist(), "patient_mm": patient}

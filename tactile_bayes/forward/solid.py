@@ -276,11 +276,7 @@ def condensed_lump(lump: SolidLump, body: SceneBody, fat_mm: float) -> Condensed
 
 # Exams of one body, and lumps of one size and depth in it, share these; a scene has few.
 _BODIES_KEPT = 8
-
-
-@lru_cache(maxsize=_BODIES_KEPT)
-def _condensed(geometry: LumpGeometry, tissue: Tissue) -> CondensedLump:
-    return condense_lump(geometry, tissue)
+_condensed = lru_cache(maxsize=_BODIES_KEPT)(condense_lump)
 
 
 @lru_cache(maxsize=_BODIES_KEPT)

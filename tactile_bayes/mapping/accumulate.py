@@ -212,7 +212,9 @@ def flat_field(selection: SelectedFrames) -> FlatField:
     readout = selection.readout
     pressure, valid = readout.pressure_kpa(readout.counts(scan.frames.counts[frames]))
     ratio = pressure / selection.level_kpa[frames, None]
-    calm = _calm(ratio if valid is None else np.where(valid, ratio, 1.0))
+    profile = ratio if valid is None else np.where(valid, ratio, 1.0)
+    departure = np.sqrt(np.square(profile - np.median(profile, axis=0)).mean(axis=1))
+    calm = departure <= CALM_FACTOR * float(np.quantile(departure, 0.1))
     if valid is not None:
         calm &= valid.all(axis=1)
     if np.count_nonzero(calm) < LEAST_FRAMES:
@@ -223,13 +225,6 @@ def flat_field(selection: SelectedFrames) -> FlatField:
     response = np.ones(good.shape)
     response[good] = np.clip(ratio[calm].mean(axis=0), 0.05, None)
     return FlatField(response, int(np.count_nonzero(calm)))
-
-
-def _calm(ratio: FloatArray) -> BoolArray:
-    """(f,) True where the departure from the median profile is at most `CALM_FACTOR` times its quantile 0.1."""
-    departure = np.sqrt(np.square(ratio - np.median(ratio, axis=0)).mean(axis=1))
-    calm: BoolArray = departure <= CALM_FACTOR * float(np.quantile(departure, 0.1))
-    return calm
 
 
 # --- Normalise the frames and average them in cells (paper steps ii and iii).

@@ -209,16 +209,49 @@ def broken_assumptions(quality: Mapping[str, float]) -> tuple[Finding, ...]:
 
     Missing figures say nothing.
     """
-    findings = (_lag(quality), _uneven(quality), _curved(quality), _few_strokes(quality))
-    return tuple(one for one in findings if one is not None)
+    return tuple(_broken(quality))
 
 
-def handling_findings(quality: Mapping[str, float]) -> tuple[Finding, ...]:
+def _broken(quality: Mapping[str, float]) -> Iterator[Finding]:
+    if lag := _beyond(quality, "stroke_lag_mm", "stroke_lag_sd_mm", MOST_LAG_MM):
+        cause = "each dragged it along" if lag > 0 else "poses came late against the frames"
+        text = (
+            f"strokes in opposite directions see the lump some {2 * abs(lag):.0f} mm apart, as if {cause}: the size "
+            "may be off by more than its interval"
+        )
+        if lag > 0:
+            remedy, again = "--register-strokes", "with its strokes aligned to each other"
+        else:
+            remedy, again = "--latency-ms auto", "with the tracker's delay estimated"
+        kind = "lump_dragged" if lag > 0 else "late_poses"
+        yield Finding(kind, text, f"map again with {remedy}", f"map the scan again {again}")
+    if change := _beyond(quality, "profile_change", "profile_change_sd", MOST_PROFILE_CHANGE):
+        far = change > BROKEN_PROFILE_CHANGE  # so far that sizes fail
+        end = "the size may be off by more than its interval" if far else "the size is for even fat"
+        text = (
+            f"the head's pressure profile changes over the map (by {change:.3f} in 30 mm): the fat is of uneven depth, "
+            f"or a rib or another lump lies near; {end}"
+        )
+        yield Finding("uneven_fat" if far else "slightly_uneven_fat", text)
+    curvature = quality.get("skin_curvature_per_m", 0.0)
+    if abs(curvature) > MOST_CURVATURE_PER_M:
+        text = (
+            f"the head turned as on {'convex' if curvature > 0 else 'hollow'} skin of radius "
+            f"{1000 / abs(curvature):.0f} mm, and sizes are for flat skin (on radii of 75 and 150 mm simulated ones "
+            "moved by 7 %)"
+        )
+        yield Finding("curved_skin", text)
+    strokes = quality.get("stroke_count", LEAST_STROKES)
+    if strokes < LEAST_STROKES:
+        text = (
+            f"the scan has {strokes:.0f} stroke{'' if strokes == 1 else 's'} only, and sizes were learned from 4 to 7 "
+            "(simulated ones from 3 came out 6 % large)"
+        )
+        yield Finding("few_strokes", text)
+
+
+def handling_findings(quality: Mapping[str, float]) -> Iterator[Finding]:
     """Findings from a map's `quality` figures against how the head was held and the array read."""
-    return tuple(_handling(quality))
-
-
-def _handling(quality: Mapping[str, float]) -> Iterator[Finding]:
     if quality.get("saturated_readings"):
         text = f"{quality['saturated_readings']:.0f} readings at full scale were left out: the map is too low there"
         yield Finding("saturated_readings", text)
@@ -239,65 +272,6 @@ def _handling(quality: Mapping[str, float]) -> Iterator[Finding]:
     if quality.get("yaw_sd_deg", 0.0) > MOST_YAW_DEG:
         text = f"the head was turned by {quality['yaw_sd_deg']:.0f} degrees (SD): widths across and along it are mixed"
         yield Finding("turned_head", text)
-
-
-def _few_strokes(quality: Mapping[str, float]) -> Finding | None:
-    strokes = quality.get("stroke_count", LEAST_STROKES)
-    if strokes >= LEAST_STROKES:
-        return None
-    text = (
-        f"the scan has {strokes:.0f} stroke{'' if strokes == 1 else 's'} only, and sizes were learned from 4 to 7 "
-        "(simulated ones from 3 came out 6 % large)"
-    )
-    return Finding("few_strokes", text)
-
-
-def _lag(quality: Mapping[str, float]) -> Finding | None:
-    lag = _beyond(quality, "stroke_lag_mm", "stroke_lag_sd_mm", MOST_LAG_MM)
-    if lag is None:
-        return None
-    ahead = lag > 0
-    cause = "each dragged it along" if ahead else "poses came late against the frames"
-    text = (
-        f"strokes in opposite directions see the lump some {2 * abs(lag):.0f} mm apart, as if {cause}: the size may be "
-        "off by more than its interval"
-    )
-    if ahead:
-        return Finding(
-            "lump_dragged",
-            text,
-            "map again with --register-strokes",
-            "map the scan again with its strokes aligned to each other",
-        )
-    return Finding(
-        "late_poses", text, "map again with --latency-ms auto", "map the scan again with the tracker's delay estimated"
-    )
-
-
-def _curved(quality: Mapping[str, float]) -> Finding | None:
-    curvature = quality.get("skin_curvature_per_m", 0.0)
-    if not abs(curvature) > MOST_CURVATURE_PER_M:
-        return None
-    shape = "convex" if curvature > 0 else "hollow"
-    text = (
-        f"the head turned as on {shape} skin of radius {1000 / abs(curvature):.0f} mm, and sizes are for flat skin "
-        "(on radii of 75 and 150 mm simulated ones moved by 7 %)"
-    )
-    return Finding("curved_skin", text)
-
-
-def _uneven(quality: Mapping[str, float]) -> Finding | None:
-    """Finding of a profile that changes so far that sizes fail, or of one that changes less."""
-    change = _beyond(quality, "profile_change", "profile_change_sd", MOST_PROFILE_CHANGE)
-    if change is None:
-        return None
-    far = change > BROKEN_PROFILE_CHANGE
-    end = "the size may be off by more than its interval" if far else "the size is for even fat"
-    text = (
-        f"the head's pressure profile changes over the map (by {change:.3f} in 30 mm): the fat is of uneven depth, or "
-        f"a rib or another lump lies near; {end}"
-    )
-    return Finding("uneven_fat" if far else "slightly_uneven_fat", text)
 
 
 def skewed(quality: Mapping[str, float]) -> str:

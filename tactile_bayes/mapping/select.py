@@ -181,9 +181,7 @@ def every_nth(scan: Scan, every: int) -> Scan:
     """The scan with one frame of every `every` (a whole number from 1 on), the first one included; all poses stay."""
     if isinstance(every, bool) or not isinstance(every, int) or every < 1:
         raise BadDataError(f"every is {every}", way_out="give a whole number from 1 on: 4 uses every fourth frame")
-    if every == 1:
-        return scan
-    return _with_frames(scan, slice(None, None, every))
+    return scan if every == 1 else _with_frames(scan, slice(None, None, every))
 
 
 def first_seconds(scan: Scan, duration_s: float) -> Scan:
@@ -251,7 +249,9 @@ def overlap_cautions(frames: Span, poses: Span) -> list[str]:
 
     A scan without frames, or without poses, has no times to compare.
     """
-    cautions = _frame_gaps(frames)
+    cautions, usual_s = [], (frames.last_s - frames.first_s) / max(1, frames.number - 1)
+    if frames.gap_s > max(TOLERATED_S, _LONG_INTERVALS * usual_s):
+        cautions.append(f"no frame for {frames.gap_s:.2f} s from {frames.gap_at_s:.2f} s on (longest gap)")
     if not frames.number or not poses.number:
         return cautions
     if apart(frames, poses):
@@ -277,13 +277,6 @@ def with_times(findings: Sequence[Finding], frames: Span, poses: Span) -> tuple[
     cautions = overlap_cautions(frames, poses)
     told = [one for one in findings if one.text not in cautions]
     return (*told, *(Finding("times_apart", text) for text in cautions))
-
-
-def _frame_gaps(frames: Span) -> list[str]:
-    usual_s = (frames.last_s - frames.first_s) / max(1, frames.number - 1)
-    if frames.gap_s <= max(TOLERATED_S, _LONG_INTERVALS * usual_s):
-        return []
-    return [f"no frame for {frames.gap_s:.2f} s from {frames.gap_at_s:.2f} s on (longest gap)"]
 
 
 # --- Selection of the frames that go into a map, and the reasons for leaving others out (paper step ii, the gate).
