@@ -142,9 +142,8 @@ class Estimator:
 
 
 def _prepare() -> None:
+    """Prepare the process; it stands here because its process then loads this module before the first map comes."""
     prepare_worker()
-    import tactile_bayes.files.size_json
-    import tactile_bayes.posterior.estimate  # noqa: F401
 
 
 class Turn:

@@ -1,36 +1,33 @@
-"""Scans and populations simulated, and the posterior checked on them."""
+"""Scans and populations simulated."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from functools import cache, partial
+from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
-from time import monotonic
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 import numpy as np
 
 from tactile_bayes.actions.exam import describe_scan
-from tactile_bayes.batch import BatchInterrupted, Outcome, fault_lines, open_executor, run_batch
+from tactile_bayes.batch import fault_lines, open_executor, run_batch
 from tactile_bayes.batch_store import open_unfinished, unfinished
 from tactile_bayes.commands.progress import progress_bar
 from tactile_bayes.declarations import as_dict, names_of
 from tactile_bayes.errors import TactileBayesError
 from tactile_bayes.files.atomic import refuse_existing, write_text
-from tactile_bayes.files.documents import dump_json, read_toml_record, with_session
+from tactile_bayes.files.documents import read_toml_record, with_session
 from tactile_bayes.files.instrument_json import read_simulated_head
 from tactile_bayes.files.provenance import Provenance, hash_inputs
 from tactile_bayes.files.scan_mcap import write_scan
 from tactile_bayes.files.scene_toml import read_scene
-from tactile_bayes.files.size_json import DEFAULT, read_size_calibration, size_calibration_path
 from tactile_bayes.files.tables import csv_text
 from tactile_bayes.forward.line import outside_range
 from tactile_bayes.forward.scene import Head, Scene
 from tactile_bayes.forward.simulate import simulate
-from tactile_bayes.options import FieldCosines, PopulationOptions, SbcOptions
-from tactile_bayes.presets import DEFAULT_NORMALISE, RESEARCH_USE, Method
-from tactile_bayes.size.bodies import BodyCalibration
+from tactile_bayes.options import PopulationOptions
+from tactile_bayes.presets import DEFAULT_NORMALISE, RESEARCH_USE
 from tactile_bayes.studies.population import (
     BodiesFile,
     BodyPrior,
@@ -41,10 +38,6 @@ from tactile_bayes.studies.population import (
     measure_mass,
 )
 from tactile_bayes.studies.population import centred as on_the_boundary
-
-if TYPE_CHECKING:
-    from tactile_bayes.studies.sbc import MapRanks
-
 
 # --- `simulate`: make a scan with known truth from a scene.
 
@@ -189,95 +182,3 @@ def rows_of_mass(
 def table_text(rows: list[MassRow]) -> str:
     """CSV of the rows, with the header of `data_schema/population.table.json`."""
     return csv_text(names_of(MassRow), (as_dict(row).values() for row in rows), digits=8)
-
-
-# --- `sbc`: simulation-based calibration of a map's posterior.
-
-
-def sbc_action(
-    workers: int,
-    scheduler: str | None,
-    output: Path | None,
-    figure: Path | None,
-    as_json: bool,
-    force: bool,
-    **options: Any,
-) -> None:
-    """Check the posterior against itself: simulation-based calibration and coverage."""
-    from tactile_bayes.report.laboratory import sbc_document, sbc_figure, sbc_text, table_text
-
-    for path in (output, figure):
-        if path is not None:
-            refuse_existing(path, force=force)
-    asked, begun = SbcOptions(**options), monotonic()
-    how: dict[str, Any] = {"method": asked.method, "seed": asked.seed, "cosines": asked.field_cosines}
-
-    def report(found: list[MapRanks], speed: float | None) -> None:
-        document = sbc_document(found, maps_per_s=speed, **how)
-        click.echo(dump_json(document) if as_json else sbc_text(document), nl=False)
-
-    try:
-        outcomes, made = _run_sbc(asked.maps, how, workers=workers, scheduler=scheduler, output=output)
-    except BatchInterrupted as stop:
-        if output is None:  # else the next run goes on
-            report([one.value for one in stop.outcomes if one.value is not None], None)
-        raise
-    speed = made / (monotonic() - begun) if made else None
-    found = [outcome.value for outcome in outcomes if outcome.value is not None]
-    if output is not None:
-        write_text(output, table_text(found), force=force)
-    failed = [outcome for outcome in outcomes if not outcome.ok]
-    for line in fault_lines(failed):
-        click.echo(f"could not be estimated: map {line}", err=True)
-    if output is not None and not failed:
-        unfinished(output).unlink(missing_ok=True)
-    try:
-        if figure is not None:
-            sbc_figure(found, figure, force=force)
-    finally:  # what was computed is not lost with the figure
-        report(found, speed)
-    if failed:
-        raise TactileBayesError(f"{len(failed)} of {len(outcomes)} maps are missing from this report")
-
-
-def _run_sbc(
-    maps: int,
-    how: Mapping[str, Any],
-    *,
-    workers: int,
-    scheduler: str | None,
-    output: Path | None,
-) -> tuple[list[Outcome[MapRanks]], int]:
-    """Outcomes of all maps, and the number that this run made."""
-    from tactile_bayes.studies.sbc import MapRanks, settings
-
-    with (
-        open_executor(workers=workers, cluster=scheduler) as executor,
-        open_unfinished(output, MapRanks, settings=settings(size=DEFAULT, **how)) as store,
-        progress_bar("maps") as progress,
-    ):
-        had = 0 if store is None else len(store.values)
-        outcomes = run_batch(
-            partial(ranks_of_map, **how),
-            range(maps),
-            key=str,
-            executor=executor,
-            store=store,
-            progress=progress,
-        )
-    return outcomes, max(maps - had, 0)
-
-
-def ranks_of_map(index: int, *, method: Method, seed: int, cosines: FieldCosines) -> MapRanks:
-    """Ranks of one map, in any process."""
-    from tactile_bayes.studies import sbc
-
-    return sbc.ranks_of_map(index, method=method, seed=seed, calibration=_shipped(), cosines=cosines)
-
-
-@cache
-def _shipped() -> BodyCalibration:
-    path = size_calibration_path(DEFAULT)
-    calibration = None if path is None else read_size_calibration(path)
-    assert isinstance(calibration, BodyCalibration)
-    return calibration

@@ -1,19 +1,20 @@
-"""The paper's forward study and its tables, a head's pressure, a scan beside its model: run, printed, drawn."""
+"""The paper's study and tables, a head's pressure, a scan beside its model, the posterior checked: run and printed."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Executor
-from functools import partial
+from functools import cache, partial
 from operator import attrgetter
 from pathlib import Path
+from time import monotonic
 from typing import Any
 
 import click
 import numpy as np
 
-from tactile_bayes.batch import BatchInterrupted, Outcome, open_executor, run_batch
+from tactile_bayes.batch import BatchInterrupted, Outcome, fault_lines, open_executor, run_batch
 from tactile_bayes.batch_store import open_unfinished, unfinished
 from tactile_bayes.commands.progress import progress_bar
 from tactile_bayes.declarations import names_of
@@ -23,6 +24,7 @@ from tactile_bayes.files.documents import dump_json
 from tactile_bayes.files.provenance import hash_inputs
 from tactile_bayes.files.scan_mcap import read_scan
 from tactile_bayes.files.scene_toml import read_scene
+from tactile_bayes.files.size_json import DEFAULT, read_size_calibration, size_calibration_path
 from tactile_bayes.files.tables import csv_text, read_table
 from tactile_bayes.findings import finding_lines
 from tactile_bayes.forward.contact import Head
@@ -31,11 +33,12 @@ from tactile_bayes.forward.scene import Head as Array
 from tactile_bayes.forward.tissue import parse_seat
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.select import scan_findings
-from tactile_bayes.options import CaseOptions, SectionOptions, StudyOptions
+from tactile_bayes.options import CaseOptions, FieldCosines, SbcOptions, SectionOptions, StudyOptions
 from tactile_bayes.posterior.bump import cell_mean_gaussian
 from tactile_bayes.posterior.white import LEAST_WIDTH_IN_CELLS, WIDEST_IN_RADII
-from tactile_bayes.presets import HEADS, RESEARCH_USE, SHOULDERS_INSIDE, SHOULDERS_OUTSIDE
-from tactile_bayes.report.laboratory import heads_text, tables_document, tables_text
+from tactile_bayes.presets import HEADS, RESEARCH_USE, SHOULDERS_INSIDE, SHOULDERS_OUTSIDE, Method
+from tactile_bayes.report.laboratory import heads_text, sbc_document, sbc_figure, sbc_text, tables_document, tables_text
+from tactile_bayes.report.laboratory import table_text as ranks_table
 from tactile_bayes.report.paper_head import (
     comparison_document,
     comparison_figure,
@@ -48,6 +51,8 @@ from tactile_bayes.report.paper_head import (
     uniformity_text,
 )
 from tactile_bayes.report.study import frames_text, lookalikes_text, solid_figures, study_figures, study_text
+from tactile_bayes.size.bodies import BodyCalibration
+from tactile_bayes.studies import sbc
 from tactile_bayes.studies.model_comparison import compare_model, measured_frames
 from tactile_bayes.studies.paper import (
     Fit,
@@ -419,3 +424,89 @@ def compare_model_action(
         click.echo(line, err=True)
     click.echo(comparison_text(measured, found))
     click.echo(RESEARCH_USE)
+
+
+# --- `sbc`: simulation-based calibration of a map's posterior.
+
+
+def sbc_action(
+    workers: int,
+    scheduler: str | None,
+    output: Path | None,
+    figure: Path | None,
+    as_json: bool,
+    force: bool,
+    **options: Any,
+) -> None:
+    """Check the posterior against itself: simulation-based calibration and coverage."""
+    for path in (output, figure):
+        if path is not None:
+            refuse_existing(path, force=force)
+    asked, begun = SbcOptions(**options), monotonic()
+    how: dict[str, Any] = {"method": asked.method, "seed": asked.seed, "cosines": asked.field_cosines}
+
+    def report(found: list[sbc.MapRanks], speed: float | None) -> None:
+        document = sbc_document(found, maps_per_s=speed, **how)
+        click.echo(dump_json(document) if as_json else sbc_text(document), nl=False)
+
+    try:
+        outcomes, made = _run_sbc(asked.maps, how, workers=workers, scheduler=scheduler, output=output)
+    except BatchInterrupted as stop:
+        if output is None:  # else the next run goes on
+            report([one.value for one in stop.outcomes if one.value is not None], None)
+        raise
+    speed = made / (monotonic() - begun) if made else None
+    found = [outcome.value for outcome in outcomes if outcome.value is not None]
+    if output is not None:
+        write_text(output, ranks_table(found), force=force)
+    failed = [outcome for outcome in outcomes if not outcome.ok]
+    for line in fault_lines(failed):
+        click.echo(f"could not be estimated: map {line}", err=True)
+    if output is not None and not failed:
+        unfinished(output).unlink(missing_ok=True)
+    try:
+        if figure is not None:
+            sbc_figure(found, figure, force=force)
+    finally:  # what was computed is not lost with the figure
+        report(found, speed)
+    if failed:
+        raise TactileBayesError(f"{len(failed)} of {len(outcomes)} maps are missing from this report")
+
+
+def _run_sbc(
+    maps: int,
+    how: Mapping[str, Any],
+    *,
+    workers: int,
+    scheduler: str | None,
+    output: Path | None,
+) -> tuple[list[Outcome[sbc.MapRanks]], int]:
+    """Outcomes of all maps, and the number that this run made."""
+    with (
+        open_executor(workers=workers, cluster=scheduler) as executor,
+        open_unfinished(output, sbc.MapRanks, settings=sbc.settings(size=DEFAULT, **how)) as store,
+        progress_bar("maps") as progress,
+    ):
+        had = 0 if store is None else len(store.values)
+        outcomes = run_batch(
+            partial(ranks_of_map, **how),
+            range(maps),
+            key=str,
+            executor=executor,
+            store=store,
+            progress=progress,
+        )
+    return outcomes, max(maps - had, 0)
+
+
+def ranks_of_map(index: int, *, method: Method, seed: int, cosines: FieldCosines) -> sbc.MapRanks:
+    """Ranks of one map, in any process."""
+    return sbc.ranks_of_map(index, method=method, seed=seed, calibration=_shipped(), cosines=cosines)
+
+
+@cache
+def _shipped() -> BodyCalibration:
+    path = size_calibration_path(DEFAULT)
+    calibration = None if path is None else read_size_calibration(path)
+    assert isinstance(calibration, BodyCalibration)
+    return calibration

@@ -6,7 +6,7 @@ import os
 from collections.abc import Iterable, Iterator, Sequence
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from tactile_bayes.api.arguments import door, plain
 from tactile_bayes.api.estimates import settings_of
@@ -28,15 +28,12 @@ from tactile_bayes.campaigns.settings import CampaignSettings
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import UsageError, check_number
 from tactile_bayes.files.atomic import same_file
-from tactile_bayes.files.manifest_csv import read_manifest
+from tactile_bayes.files.manifest_csv import Exam, read_manifest
 from tactile_bayes.files.reading import check_address
 from tactile_bayes.files.size_json import NONE, size_calibration_path
 from tactile_bayes.options import MapOptions
 from tactile_bayes.presets import DEFAULT_NORMALISE, MATCH_MM, RESEARCH_USE
-
-if TYPE_CHECKING:
-    from tactile_bayes.files.manifest_csv import Exam
-    from tactile_bayes.size.pooling import Repeatability
+from tactile_bayes.size.pooling import Repeatability
 
 MOST_NAMED: Final = 5
 """So many exams or masses are named in a line."""

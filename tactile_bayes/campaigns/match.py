@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from tactile_bayes.api.estimating import estimate_file
+from tactile_bayes.api.settings import Settings
+from tactile_bayes.api.sized import SizeEstimate
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.comparison import CompareReport
@@ -19,16 +21,14 @@ from tactile_bayes.files.manifest_csv import COMPARED, GROWTH, Exam, natural, ta
 from tactile_bayes.files.map_nc import read_map
 from tactile_bayes.files.reports import EstimateReport, Place
 from tactile_bayes.findings import Finding, finding_lines
+from tactile_bayes.geometry import FloatArray
+from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.report.compare import Growth, growths
 from tactile_bayes.trial.readings import day_of, in_order
 
 if TYPE_CHECKING:
-    from tactile_bayes.api.settings import Settings
-    from tactile_bayes.api.sized import SizeEstimate
     from tactile_bayes.campaigns.run import Campaign
-    from tactile_bayes.geometry import FloatArray
-    from tactile_bayes.mapping.map import TactileMap
 
 
 # --- Matching of a campaign's exams to masses that the table names by place in another exam of the same breast.

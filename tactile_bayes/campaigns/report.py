@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from tactile_bayes import __version__
 from tactile_bayes.api.trials import analyse, load_trial, read_excision
@@ -30,17 +30,15 @@ from tactile_bayes.files.manifest_csv import (
     SIZED_FIGURE,
     THUMBNAIL,
     TRIAL,
+    Exam,
 )
 from tactile_bayes.files.reading import IMAGE_BYTES, put, read_bytes
+from tactile_bayes.files.tables import Table
 from tactile_bayes.options import TrialSettings
 from tactile_bayes.report import pages as sheet
 from tactile_bayes.report.compare import Growth, growth_line
 from tactile_bayes.report.pages import Card, campaign_html, worst
 from tactile_bayes.trial.readings import at_excision
-
-if TYPE_CHECKING:
-    from tactile_bayes.files.manifest_csv import Exam
-    from tactile_bayes.files.tables import Table
 
 REPORT, PAGE, INDEX = "report.json", "report.html", "index.html"
 WRITTEN: Final = (DONE, FAILURES, TRIAL, GROWN, REPORT, PAGE, INDEX, REPEATABILITY)

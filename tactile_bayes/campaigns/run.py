@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import Any, Final, TypeVar
 
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.batch import CLUSTER_LOST, BatchInterrupted, Outcome, run_batch
@@ -46,10 +46,7 @@ from tactile_bayes.files.provenance import recordings
 from tactile_bayes.files.size_json import default_for, read_repeatability, read_size_calibration, size_calibration_path
 from tactile_bayes.progress import Progress, untold
 from tactile_bayes.size.bodies import BodyCalibration
-
-if TYPE_CHECKING:
-    from tactile_bayes.size.pooling import Repeatability
-
+from tactile_bayes.size.pooling import Repeatability
 
 # --- Stages of a campaign: one step for many exams or masses, from the journal where it is done, otherwise run.
 

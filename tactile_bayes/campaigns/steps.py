@@ -6,7 +6,7 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from tactile_bayes.api.repeatability import ExamFolder, learn_from_exams, repeat
 from tactile_bayes.api.settings import Comparing, Settings
 from tactile_bayes.api.sized import Answer, SizeEstimate, size_priors
 from tactile_bayes.campaigns.match import OWN_AXES, NamedPlace, in_own_axes, matched
-from tactile_bayes.campaigns.settings import Writes, digest_of, write_staged
+from tactile_bayes.campaigns.settings import CampaignSettings, Writes, digest_of, write_staged
 from tactile_bayes.declarations import EXACT, Record, field, from_plain, replace, rounded, to_plain
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.atomic import sha256, write_bytes, write_text
@@ -50,20 +50,15 @@ from tactile_bayes.files.reports import EstimateReport, json_text
 from tactile_bayes.files.scan_mcap import read_scan, write_scan
 from tactile_bayes.findings import by_weight
 from tactile_bayes.mapping.build import build_map
+from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.options import MapOptions
 from tactile_bayes.report.estimate_document import size_diagnostics
 from tactile_bayes.report.estimate_figures import draw_comparison, draw_map, draw_size
 from tactile_bayes.report.svg import thumbnail_png
+from tactile_bayes.scan import Scan
 from tactile_bayes.size.bodies import BodyCalibration
-from tactile_bayes.size.draws import SIZES
+from tactile_bayes.size.draws import SIZES, SizePosterior
 from tactile_bayes.size.pooling import size_alone
-
-if TYPE_CHECKING:
-    from tactile_bayes.campaigns.settings import CampaignSettings
-    from tactile_bayes.mapping.map import TactileMap
-    from tactile_bayes.scan import Scan
-    from tactile_bayes.size.draws import SizePosterior
-
 
 # --- Steps of a campaign: map, estimate, figures and size of an exam, repeatability, pooled size and growth of a mass.
 #

@@ -139,7 +139,7 @@ def sbc_command(**given: Any) -> None:
 
     Example: tactile-bayes sbc --maps 300 --workers 2 -o sbc.csv --figure sbc.png
     """
-    from tactile_bayes.actions.simulation import sbc_action
+    from tactile_bayes.actions.study import sbc_action
 
     sbc_action(**given)
 

@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING, Any, Final, Literal, get_args, get_origin
 
 import click
 
-from tactile_bayes.api.settings import Settings
+from tactile_bayes.api.settings import Settings, read_settings
 from tactile_bayes.declarations import Record, default_of, extra_of, kinds, meaning_of, range_of, value_kind
 from tactile_bayes.errors import UsageError, number_words
 from tactile_bayes.files.atomic import Format, check_suffix, same_file
 from tactile_bayes.presets import HEADS
+from tactile_bayes.report import figure_file
 
 # --- Paths on the command line: an output may be neither an input nor another output of the same command.
 
@@ -117,10 +118,8 @@ class FigurePath(FilePath):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """Check the suffix and return the path."""
-        from tactile_bayes.report.figure_file import check_suffix
-
         path = super().convert(value, param, ctx)
-        check_suffix(path)
+        figure_file.check_suffix(path)
         return path
 
 
@@ -150,7 +149,6 @@ def settings_of(*, settings_file: Path | None = None, repeatability: Path | None
     UsageError
         When the checkpoint that the file names is another file of the call.
     """
-    from tactile_bayes.api.settings import read_settings
     from tactile_bayes.files.size_json import read_repeatability, size_calibration_path
 
     if (calibration := options.get("size_calibration")) is not None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import warnings
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,11 +32,8 @@ from tactile_bayes.files.reports import EstimateReport, centre_of
 from tactile_bayes.findings import finding_lines
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.estimate_text import no_estimate_line
+from tactile_bayes.report.figure_file import plain_matplotlib
 from tactile_bayes.report.map_figure import FitContour, Place, map_figure
-
-if TYPE_CHECKING:
-    from tactile_bayes.report.map_figure import FitContour, Place
-
 
 # --- What the DICOM objects of one export share: patient, study, equipment, identifiers, and their bytes.
 
@@ -189,14 +186,10 @@ def map_picture(source: MapFile, estimate: EstimateFile | None) -> NDArray[np.ui
 
     No file name is in it, because those may hold patients' names.
     """
-    from matplotlib import rc_context, rcdefaults
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-
     report = None if estimate is None or estimate.kind != "estimate" else estimate.report
     alone = report if isinstance(report, EstimateReport) else None
     side = source.facts.get("side")
-    with rc_context():
-        rcdefaults()
+    with plain_matplotlib() as library:
         figure = map_figure(
             source.tactile_map,
             None,
@@ -206,7 +199,7 @@ def map_picture(source: MapFile, estimate: EstimateFile | None) -> NDArray[np.ui
             note="" if estimate is None else _note(estimate),
             findings=None if estimate is None else estimate.findings,
         )
-        canvas: Any = FigureCanvasAgg(figure)
+        canvas = library.backends.backend_agg.FigureCanvasAgg(figure)
         canvas.draw()
         pixels = np.asarray(canvas.buffer_rgba())
     return np.ascontiguousarray(pixels[:, :, :3])

@@ -9,7 +9,7 @@ import json
 import uuid
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import NO_LUMP, BadDataError, UsageError
@@ -23,11 +23,8 @@ from tactile_bayes.files.reading import HDF5_MAGIC, kind_of, open_input, schema_
 from tactile_bayes.files.reports import EstimateReport, MassReport, PooledReport, centre_of
 from tactile_bayes.findings import Finding, Verdict, finding_lines, verdict
 from tactile_bayes.inference.draws import Quantity
+from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.report.estimate_text import exams_label
-
-if TYPE_CHECKING:
-    from tactile_bayes.mapping.map import TactileMap
-
 
 # --- Unique identifiers that follow from content: equal content, equal identifier, on every machine.
 

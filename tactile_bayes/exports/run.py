@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Literal, get_args
+from typing import Final, Literal, get_args
 
 from tactile_bayes.declarations import Record, names_of, replace
 from tactile_bayes.errors import UsageError
@@ -14,11 +14,7 @@ from tactile_bayes.exports.fhir import bundle_json
 from tactile_bayes.exports.identity import Identity
 from tactile_bayes.exports.nrrd import nrrd_bytes
 from tactile_bayes.exports.redcap import dictionary_csv, records_csv
-from tactile_bayes.files.atomic import check_suffix, refuse_existing, same_file, unwritable, write_all
-
-if TYPE_CHECKING:
-    from tactile_bayes.files.atomic import Format
-
+from tactile_bayes.files.atomic import Format, check_suffix, refuse_existing, same_file, unwritable, write_all
 
 # --- Writing the files of an export: one file, or a folder that holds those of no other export.
 

@@ -109,7 +109,7 @@ class LiveServer:
 
     def __init__(self, host: str, port: int, *, token: str | None = None) -> None:
         try:
-            from websockets.sync.server import serve
+            import websockets.sync.server
         except ImportError:
             raise UsageError("--serve needs the package websockets; pip install 'tactile-bayes[live]'") from None
         self._token = token or secrets.token_urlsafe(24)
@@ -117,7 +117,8 @@ class LiveServer:
         self._text, self._number, self._over = "", 0, False
         self._pages: set[Any] = set()
         try:
-            self._server = serve(
+            self._closed = websockets.exceptions.ConnectionClosed
+            self._server = websockets.sync.server.serve(
                 self._talk,
                 sock=_Door(host, port, self._sockets),
                 process_request=self._admit,
@@ -200,8 +201,6 @@ class LiveServer:
                 self._pages.discard(connection)
 
     def _send_news(self, connection: Any) -> None:
-        from websockets.exceptions import ConnectionClosed
-
         seen = 0
         while True:
             with self._news:
@@ -212,7 +211,7 @@ class LiveServer:
                 return
             try:
                 connection.send(text)
-            except ConnectionClosed:
+            except self._closed:
                 return
 
 

@@ -20,7 +20,7 @@ from tactile_bayes.posterior.result import Estimate, FittedCells, fitted_cells
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.compare import compare_summary
 from tactile_bayes.report.estimate_text import exams_label, no_estimate_line
-from tactile_bayes.report.figure_file import figure_file, named_exam
+from tactile_bayes.report.figure_file import figure_file, load_matplotlib, named_exam
 from tactile_bayes.report.map_figure import FitContour, NumberedMass, Place, draw_edges, draw_panel, map_figure
 from tactile_bayes.report.quantities import leading_size
 from tactile_bayes.size.draws import SizePosterior
@@ -200,11 +200,10 @@ def _draw_density(axes: Axes, name: str, draws_mm: FloatArray, *, colour: str, d
 
 def _draw_interval(axes: Axes, interval: SizeInterval, *, size: str, row: int, colour: str) -> None:
     """Draw a bar below the densities, labelled with the size that it is of, its ends, probability and kind."""
-    from matplotlib.transforms import ScaledTranslation, blended_transform_factory
-
+    transforms = load_matplotlib().transforms
     # in inches below the axes: the layout makes room for what does not grow with them
-    below = ScaledTranslation(0.0, -0.52 - 0.32 * row, axes.figure.dpi_scale_trans)
-    across = blended_transform_factory(axes.transData, axes.transAxes) + below
+    below = transforms.ScaledTranslation(0.0, -0.52 - 0.32 * row, axes.figure.dpi_scale_trans)
+    across = transforms.blended_transform_factory(axes.transData, axes.transAxes) + below
     bar: dict[str, Any] = {"linewidth": 3, "solid_capstyle": "butt", "marker": "|", "markersize": 10}
     axes.plot([interval.low_mm, interval.high_mm], [0.0, 0.0], transform=across, color=colour, clip_on=False, **bar)
     kind = _KINDS.get(interval.kind, interval.kind)

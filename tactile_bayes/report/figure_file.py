@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from textwrap import wrap
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from tactile_bayes.errors import UsageError
 from tactile_bayes.files.atomic import refuse_existing, write_bytes
@@ -72,6 +72,24 @@ def check_suffix(path: Path) -> None:
         raise UsageError(f"{path} has the suffix {path.suffix!r}; a figure is written as one of {known}")
 
 
+def load_matplotlib() -> Any:
+    """Matplotlib with the parts that figures are made of; loaded here alone, for it takes long."""
+    import matplotlib.backends.backend_agg
+    import matplotlib.figure
+    import matplotlib.patheffects
+
+    return matplotlib
+
+
+@contextmanager
+def plain_matplotlib() -> Iterator[Any]:
+    """Matplotlib without the user's own settings."""
+    library = load_matplotlib()
+    with library.rc_context():
+        library.rcdefaults()
+        yield library
+
+
 @contextmanager
 def figure_file(
     path: Path | None, *, size_in: tuple[float, float], force: bool, findings: Sequence[Finding] = ()
@@ -94,19 +112,15 @@ def figure_file(
     UsageError
         When the suffix is unknown, or `path` exists and `force` is false.
     """
-    import matplotlib
-    from matplotlib.figure import Figure
-
     if path is not None:
         check_suffix(path)
         refuse_existing(path, force=force)
-    with matplotlib.rc_context():
-        matplotlib.rcdefaults()
-        matplotlib.rcParams["svg.hashsalt"] = "tactile-bayes"  # else the names inside an SVG are random
+    with plain_matplotlib() as library:
+        library.rcParams["svg.hashsalt"] = "tactile-bayes"  # else the names inside an SVG are random
         width_in, height_in = size_in
         told = [part for line in finding_lines(findings, paper=True) for part in wrap(line, round(13 * width_in))]
-        figure = Figure(figsize=(width_in, height_in + 0.17 * len(told)), dpi=DPI, layout="constrained")
-        figure.get_layout_engine().set(rect=(0.0, 0.04, 1.0, 0.96))  # type: ignore[union-attr,call-arg]
+        figure = library.figure.Figure(figsize=(width_in, height_in + 0.17 * len(told)), dpi=DPI, layout="constrained")
+        figure.get_layout_engine().set(rect=(0.0, 0.04, 1.0, 0.96))
         yield figure
         if told:
             title = figure.get_suptitle()

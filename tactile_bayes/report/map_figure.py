@@ -15,7 +15,7 @@ from tactile_bayes.findings import Finding
 from tactile_bayes.mapping.map import FEW_READINGS, TactileMap
 from tactile_bayes.mapping.places import Orientation, orientation_of
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.report.figure_file import figure_file
+from tactile_bayes.report.figure_file import figure_file, load_matplotlib
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -186,19 +186,17 @@ def _hatch_few(axes: Axes, tactile_map: TactileMap, view: Orientation) -> None:
     """Hatch the cells with few readings in white with black edges, visible on every colour."""
     if not tactile_map.few.any():
         return
-    from matplotlib.collections import LineCollection
-    from matplotlib.path import Path as Outline
-
+    outline = load_matplotlib().path.Path
     half = tactile_map.recipe.cell_mm / 2
     rows, columns = np.nonzero(tactile_map.few)
     middle = np.stack(_pair(view, tactile_map.x_mm[columns], tactile_map.y_mm[rows]), axis=1)
     corners = half * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0]])
-    codes = [Outline.MOVETO, Outline.LINETO, Outline.LINETO, Outline.LINETO, Outline.CLOSEPOLY]
-    cells = Outline((middle[:, None] + corners).reshape(-1, 2), np.tile(codes, len(middle)))
+    codes = [outline.MOVETO, outline.LINETO, outline.LINETO, outline.LINETO, outline.CLOSEPOLY]
+    cells = outline((middle[:, None] + corners).reshape(-1, 2), np.tile(codes, len(middle)))
     left, right, bottom, top = _extent(tactile_map, view)
     height = top - bottom
     starts = np.arange(left - height, right, max(right - left, height) / _HATCHES)
-    lines = LineCollection(
+    lines = load_matplotlib().collections.LineCollection(
         [[(start, bottom), (start + height, top)] for start in starts],
         colors="white",
         linewidths=0.7,
@@ -227,9 +225,7 @@ def _explain(axes: Axes, tactile_map: TactileMap, places: Sequence[Place]) -> No
         )
     if not tactile_map.few.any():
         return
-    from matplotlib.patches import Patch
-
-    sample = Patch(facecolor="0.35", edgecolor="white", hatch="////", linewidth=0)
+    sample = load_matplotlib().patches.Patch(facecolor="0.35", edgecolor="white", hatch="////", linewidth=0)
     label = f"fewer than {FEW_READINGS} readings: noisy"
     axes.legend([sample], [label], loc="upper center", bbox_to_anchor=(0.5, -0.2), fontsize=8, frameon=False)
 
@@ -260,9 +256,7 @@ def _orient(axes: Axes, view: Orientation, tactile_map: TactileMap) -> None:
 
 def _outlined(width: float) -> list[Any]:
     """Black outline, so that white is visible on every colour."""
-    from matplotlib import patheffects
-
-    return [patheffects.withStroke(linewidth=width, foreground="black")]
+    return [load_matplotlib().patheffects.withStroke(linewidth=width, foreground="black")]
 
 
 def draw_edges(axes: Axes, view: Orientation) -> None:
@@ -301,10 +295,10 @@ def _draw_ellipse(
     axes: Axes, centre: Any, size_mm: tuple[float, float], angle_deg: float, view: Orientation, **line: Any
 ) -> None:
     """Draw an ellipse of the given diameters, outlined in black."""
-    from matplotlib.patches import Ellipse
-
     angle = -angle_deg if view.swapped else angle_deg
-    ellipse = Ellipse(centre, *_pair(view, *size_mm), angle=angle, fill=False, edgecolor="white", **line)
+    ellipse = load_matplotlib().patches.Ellipse(
+        centre, *_pair(view, *size_mm), angle=angle, fill=False, edgecolor="white", **line
+    )
     ellipse.set_path_effects(_outlined(line["linewidth"] + 1.6))
     axes.add_patch(ellipse)
 

@@ -14,6 +14,7 @@ from scipy.special import ndtr
 
 from tactile_bayes.declarations import UNSET
 from tactile_bayes.report.compare import Growth
+from tactile_bayes.report.figure_file import plain_matplotlib
 from tactile_bayes.report.pages import page
 from tactile_bayes.report.trial import found_share, growing_line, limit_rows, number, ratio_line, shown
 from tactile_bayes.trial.calibration import BINS, Calibration, Prediction
@@ -89,12 +90,8 @@ def calibration_figure(prediction: Prediction, found: Calibration) -> bytes:
 
 def _png(draw: Callable[[Sequence[Axes]], None], panels: int) -> bytes:
     """Render a figure as PNG bytes, independent of the user's matplotlib settings."""
-    import matplotlib
-    from matplotlib.figure import Figure
-
-    with matplotlib.rc_context():
-        matplotlib.rcdefaults()
-        figure = Figure(figsize=(_PANEL_IN * panels, _PANEL_IN), dpi=_DPI, layout="constrained")
+    with plain_matplotlib() as library:
+        figure = library.figure.Figure(figsize=(_PANEL_IN * panels, _PANEL_IN), dpi=_DPI, layout="constrained")
         draw(np.atleast_1d(np.asarray(figure.subplots(1, panels))).tolist())
         buffer = io.BytesIO()
         figure.savefig(buffer, format="png", dpi=_DPI, metadata={"Software": None})

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from in_process import run_here
 
-from tactile_bayes.actions import simulation as command
+from tactile_bayes.actions import study as command
 from tactile_bayes.studies.sbc import PARAMETERS, MapRanks, Truth
 
 TRUTH = Truth(1.2, 6.0, 4.5, 1.3, -0.8, 6.0, 3.0, 0.02)

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from tactile_bayes.actions.simulation import _shipped
+from tactile_bayes.actions.study import _shipped
 from tactile_bayes.declarations import as_dict, replace
 from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior import draw
