@@ -16,7 +16,15 @@ from tactile_bayes.posterior.detection import Detection, detection_from_odds
 from tactile_bayes.posterior.draw import MapPosterior, ModalBump, NoiseFigures, draw_parameters
 from tactile_bayes.posterior.field import FLOOR, Window, cosines_for
 from tactile_bayes.posterior.fit import FieldFit, field_window, modal_widths, shape_draws, start_vector, tangent_columns
-from tactile_bayes.posterior.neighbours import WANTED, Surroundings, add_beside, ridge_instead, ridge_text, rising_ribs
+from tactile_bayes.posterior.neighbours import (
+    WANTED,
+    Surroundings,
+    add_beside,
+    beside_ridge,
+    ridge_instead,
+    ridge_text,
+    rising_ribs,
+)
 from tactile_bayes.posterior.options import DETECTED, SamplerSettings, scene_asked
 from tactile_bayes.posterior.scene import Problem, Scene
 from tactile_bayes.posterior.selection import (
@@ -266,8 +274,11 @@ def with_neighbours(
     ridge = ridge_instead(choice, ridges)
     if ridge is None or ridge.log_evidence < choice.plain.target.null_log_evidence():
         return ask_departure(choice), detection
-    log_factor = choice.fit.log_evidence - ridge.log_evidence - _searched(choice.plain, tactile_map)
-    return ask_departure(choice), detection_from_odds(log_factor, ridge=ridge_text(ridge))
+    against = ridge.log_evidence + _searched(choice.plain, tactile_map)
+    detection = detection_from_odds(choice.fit.log_evidence - against, ridge=ridge_text(ridge))
+    if detection.probability < DETECTED and (both := beside_ridge(choice, ridge)) is not None:
+        detection = detection_from_odds(both.log_evidence - against, ridge=detection.ridge)
+    return ask_departure(choice), detection
 
 
 def _posterior(

@@ -310,7 +310,31 @@ def ridge_instead(choice: SceneChoice, ridges: FloatArray) -> FieldFit | None:
     problem = choice.plain.target.problem
     starts = _ridge_starts(choice, problem, ridges)
     fits = [fit for scene, start in starts if (fit := fit_or_none(problem, scene, start)) is not None]
+    fits = [fit for fit in fits if not _holds_the_bump(fit, choice.plain)]
     return max(fits, key=lambda fit: fit.log_evidence) if fits else None
+
+
+def _holds_the_bump(ridge: FieldFit, plain: FieldFit) -> bool:
+    """True where the second lump of a ridge's scene has moved onto the bump: that scene is not without the lump."""
+    if ridge.scene.extra != "second lump":
+        return False
+    away = [float(ridge.scene.column(ridge.mode, f"{name}2") - plain.scene.column(plain.mode, name)) for name in "xy"]
+    return bool(np.hypot(*away) < APART * np.exp(float(plain.scene.widths(plain.mode)[0])))
+
+
+def beside_ridge(choice: SceneChoice, ridge: FieldFit) -> FieldFit | None:
+    """The bump with a ridge of `ridge_instead` beside it; None where the ridge touches the bump, or is not alone.
+
+    A ridge that runs clear of the bump does not stand in its place, and a map may show both.
+    """
+    plain = choice.plain
+    if ridge.scene.extra:
+        return None
+    scene, start = replace(plain.scene, extra="rib"), np.concatenate([plain.mode, ridge.mode[[1, 2, 0]]])
+    if not scene.rib_clear(start, plain.target.window.middle):
+        return None
+    fit = fit_or_none(plain.target.problem, scene, start)
+    return fit if fit is not None and scene.rib_clear(fit.mode, plain.target.window.middle) else None
 
 
 def _ridge_starts(choice: SceneChoice, problem: Problem, places: FloatArray) -> Iterator[tuple[Scene, FloatArray]]:

@@ -180,12 +180,16 @@ class Scene(Record):
         return total - np.log(np.pi * reach**2), allowed
 
     def rib_apart(self, theta: FloatArray, middle: tuple[float, float]) -> BoolArray:
-        """(m,) whether a rib lies `APART` widths from the bump's centre, or is at most `APART` times as wide."""
+        """(m,) whether a rib is clear of the bump, or at most `APART` times as wide."""
+        p, _, _ = self.widths(theta)
+        return np.asarray(self.rib_clear(theta, middle) | (self.column(theta, "w2") - p <= np.log(APART)))
+
+    def rib_clear(self, theta: FloatArray, middle: tuple[float, float]) -> BoolArray:
+        """(m,) whether a rib lies `APART` widths, of it or the bump, from the bump's centre."""
         angle, (p, _, _) = self.column(theta, "angle"), self.widths(theta)
         x, y = self.column(theta, "x") - middle[0], self.column(theta, "y") - middle[1]
         away = np.abs(self.column(theta, "offset") - x * np.cos(angle) - y * np.sin(angle))
-        w = self.column(theta, "w2")
-        return np.asarray((away >= APART * np.exp(np.maximum(p, w))) | (w - p <= np.log(APART)))
+        return np.asarray(away >= APART * np.exp(np.maximum(p, self.column(theta, "w2"))))
 
 
 def neighbour_templates(
