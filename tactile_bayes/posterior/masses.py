@@ -126,22 +126,16 @@ def _clear_of_lump(x: float, y: float, rest: TactileMap, estimate: Estimate) -> 
 
 
 def _belongs_to_scene(x: float, y: float, rest: TactileMap, estimate: Estimate) -> bool:
-    """True for a place that belongs to the second lump or the rib of the lump's scene.
+    """True for a place that belongs to the second lump of the lump's scene.
 
-    A second lump whose centre lies off the map stands for what rises at the rim, which is looked at as elsewhere.
+    One whose centre lies off the map stands for what rises at the rim, which is looked at as elsewhere. A rise beside a
+    rib is held against a ridge there.
     """
-    if estimate.scene is None or not estimate.scene.fit.scene.extra:
+    if estimate.scene is None or estimate.scene.fit.scene.extra != "second lump":
         return False
-    fit = estimate.scene.fit
-    one, two, log_width = (float(value) for value in fit.mode[-3:])
-    if fit.scene.extra == "second lump":
-        if not on_map(rest, one, two):
-            return False
-        away = np.hypot(x - one, y - two)
-    else:
-        middle = fit.target.window.middle
-        away = abs((x - middle[0]) * np.cos(one) + (y - middle[1]) * np.sin(one) - two)
-    return bool(away < BESIDE_IN_WIDTHS * np.exp(log_width))
+    one, two, log_width = (float(value) for value in estimate.scene.fit.mode[-3:])
+    away = np.hypot(x - one, y - two)
+    return on_map(rest, one, two) and bool(away < BESIDE_IN_WIDTHS * np.exp(log_width))
 
 
 def _rise_assessed(seen: Assessment, estimate: Estimate) -> Rise:
