@@ -22,6 +22,7 @@ FEEL_A_RIB = "feel whether it is a rib; if a lump is felt, name its place with -
 FEEL_A_RIB_ON_PAPER = "feel at the cross on the picture whether it is a rib; if a lump is felt, scan its place again"
 SMALLER_CELLS_ON_PAPER = "have the scan mapped again with smaller cells"
 LARGER_WINDOW = "fit a larger window (fit_radius_mm in --settings FILE.toml) with a calibration learned so"
+BEYOND_IT = "extend the strokes beyond it"
 LARGER_WINDOW_ON_PAPER = "nothing by this exam: the rise is wider than the program measures"
 MORE_LINES = "scan again, more slowly or with more lines, and map all scans together"
 MORE_LINES_ON_PAPER = "scan the place again, more slowly or with more strokes"
@@ -121,6 +122,8 @@ def _for_fault(tactile_map: TactileMap, candidate: Candidate, reason: str) -> Ab
         return _coarse(reason, narrow, at)
     centre = (float(fit.theta[1]), float(fit.theta[2]))
     extend = extend_advice(missing_strokes(tactile_map, centre, reach_mm=NEEDED_IN_WIDTHS * wide))
+    if not extend and candidate.fault.startswith(AT_RIM):
+        extend = BEYOND_IT  # under correlated errors the rise is wider than least squares made it
     if extend:
         return Abstention("window", reason, extend, extend, at)
     return Abstention("window", reason, LARGER_WINDOW, LARGER_WINDOW_ON_PAPER, at)

@@ -9,6 +9,7 @@ import numpy as np
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import NO_LUMP, NotConvergedError
 from tactile_bayes.mapping.map import TactileMap
+from tactile_bayes.posterior.abstention import BEYOND_IT
 from tactile_bayes.posterior.bump import (
     SMOOTHING_MM,
     candidate_centres,
@@ -355,8 +356,8 @@ def _unresolved(rise: Rise) -> Estimate:
 
 def _off_map(rise: Rise) -> Estimate:
     """A rise at the rim whose fit has its centre off the map."""
-    advice, reason = "extend the strokes beyond it", "its centre lies off the map"
-    return Estimate("no_estimate", reason, code="window", advice=advice, on_paper=advice, bump=_bump_of(rise))
+    reason = "its centre lies off the map"
+    return Estimate("no_estimate", reason, code="window", advice=BEYOND_IT, on_paper=BEYOND_IT, bump=_bump_of(rise))
 
 
 def _bump_of(rise: Rise) -> ModalBump:

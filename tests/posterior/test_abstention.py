@@ -17,7 +17,7 @@ from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.lump_probability import Weighed
 from tactile_bayes.posterior.options import SamplerSettings
 from tactile_bayes.posterior.result import Estimate
-from tactile_bayes.posterior.white import Candidate, fit_bump
+from tactile_bayes.posterior.white import AT_RIM, Candidate, fit_bump
 from tactile_bayes.report.estimate_text import estimate_text
 
 FIELD = SamplerSettings(background="free", noise="field")
@@ -89,6 +89,17 @@ def test_a_bump_that_cannot_be_measured_has_its_code(
     assert advice in answer.advice
     assert answer.about_mm == (0.0, 0.0)
     assert "--" not in answer.on_paper
+
+
+def test_a_wide_rise_at_the_rim_asks_for_strokes_and_not_for_a_larger_window() -> None:
+    """On an empty scan a fault of the field's bump, sigma 13 mm, stood beside the least-squares one of 4 mm."""
+    tactile_map = grid_map(bump_values(half_mm=45.0, x=0.0, y=0.0, sigma_x=4.0, sigma_y=4.0))
+    fit, _ = fit_bump(tactile_map, (0.0, 0.0), options=SamplerSettings())
+    candidate = Candidate((0.0, 0.0), fit, f"{AT_RIM} (with a sigma of 13.3 mm its flank to +y is 9 mm short)")
+    lump = Weighed(Detection(1.0, 50.0), (0.0, 0.0), (4.0, 0.0, 0.0, 0.0, 0.0), candidate)
+    answer = no_bump(tactile_map, [candidate], lump, where="here")
+    assert answer.code == "window"
+    assert answer.advice == answer.on_paper == "extend the strokes beyond it"
 
 
 @pytest.mark.parametrize("centre", [None, (3.0, 2.0)])

@@ -6,11 +6,15 @@ import numpy as np
 import pytest
 from posterior_maps import grid_map
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.posterior import correlated as field_estimate
 from tactile_bayes.posterior.estimate import estimate_map
+from tactile_bayes.posterior.fit import fit_scene
+from tactile_bayes.posterior.neighbours import beside_ridge, ridge_instead
 from tactile_bayes.posterior.options import SamplerSettings
 from tactile_bayes.posterior.result import Estimate
-from tests.posterior.correlated.test_selection import AXIS, bump, errors
+from tactile_bayes.posterior.scene import Scene
+from tests.posterior.correlated.test_selection import AXIS, bump, choose, errors, rib
 
 
 def ridge(seed: int) -> np.ndarray:
@@ -57,3 +61,30 @@ def test_a_lump_beside_two_ridges_is_found() -> None:
     ribs = 0.15 * (np.exp(-0.5 * ((rows - 20.0) / 4.0) ** 2) + np.exp(-0.5 * ((rows + 22.0) / 4.0) ** 2))
     found = estimate(bump() + ribs * np.ones((1, len(AXIS))) + errors(6))
     assert found.status == "estimate", found.reason
+
+
+def test_a_ridge_clear_of_a_lump_does_not_stand_in_its_place() -> None:
+    """A stripe that the strokes left, 18 mm from a faint lump, has more evidence than the lump: the map shows both."""
+    choice = choose(bump(amplitude=0.15) + rib(y=17.0, amplitude=0.15, width=1.0) + errors(7))
+    alone = replace(choice, fit=choice.plain)
+    problem = choice.plain.target.problem
+    stripe, through = (
+        fit_scene(problem, Scene("ridge"), np.array([width, np.pi / 2.0, offset]))
+        for width, offset in ((0.0, 18.0), (1.6, 0.0))
+    )
+    assert stripe.log_evidence > choice.plain.log_evidence + 3.0
+    both = beside_ridge(alone, stripe)
+    assert both is not None
+    assert both.log_evidence > stripe.log_evidence + 10.0
+    assert beside_ridge(alone, through) is None
+
+
+def test_a_lump_is_not_held_against_itself_with_a_ridge() -> None:
+    """The second lump of a ridge's scene once moved onto the lump that was asked about."""
+    choice = choose(bump(amplitude=0.3) + rib(y=17.0, amplitude=0.15) + errors(7))
+    problem, at = choice.plain.target.problem, np.array([[np.pi / 2.0, 18.0, np.log(5.0)]])
+    moved = fit_scene(problem, Scene("ridge", extra="second lump"), np.array([1.6, np.pi / 2.0, 18.0, 2.0, 0.0, 1.6]))
+    assert np.hypot(moved.mode[3] - 1.0, moved.mode[4] + 1.0) < 1.0
+    found = ridge_instead(replace(choice, fit=moved), at)
+    assert found is not None
+    assert found.log_evidence < moved.log_evidence - 20.0
