@@ -318,8 +318,8 @@ def _holds_the_bump(ridge: FieldFit, plain: FieldFit) -> bool:
     """True where the second lump of a ridge's scene has moved onto the bump: that scene is not without the lump."""
     if ridge.scene.extra != "second lump":
         return False
-    away = [float(ridge.scene.column(ridge.mode, f"{name}2") - plain.scene.column(plain.mode, name)) for name in "xy"]
-    return bool(np.hypot(*away) < APART * np.exp(float(plain.scene.widths(plain.mode)[0])))
+    x, y = (float(ridge.scene.column(ridge.mode, f"{name}2") - plain.scene.column(plain.mode, name)) for name in "xy")
+    return bool(np.hypot(x, y) < APART * np.exp(float(plain.scene.widths(plain.mode)[0])))
 
 
 def beside_ridge(choice: SceneChoice, ridge: FieldFit) -> FieldFit | None:
