@@ -74,10 +74,6 @@ class _Repeat(Record, eq=False):
     size: Quantity  #: The largest, with its interval.
     spread: float  #: Between exams, that the size was estimated with.
 
-    @property
-    def shape_path(self) -> Path:
-        return self.exam.folder / SHAPE
-
 
 def exams_in(folder: Path) -> list[ExamFolder]:
     """Exams that a campaign estimated, by its ``exams_done.csv``."""
@@ -220,7 +216,7 @@ def _calibration(name: str, digest: str, given: str | None) -> BodyCalibration:
 
 def _repeated(group: Sequence[_Repeat], calibration: BodyCalibration) -> RepeatedExams:
     first = group[0].exam
-    values = np.array([log_size_alone(calibration, read_shape(repeat.shape_path)) for repeat in group])
+    values = np.array([log_size_alone(calibration, read_shape(repeat.exam.folder / SHAPE)) for repeat in group])
     return RepeatedExams(first.of_mass, first.mass, values[:, 0], values[:, 1])
 
 

@@ -129,7 +129,8 @@ class CheckpointFile:
 
     def save(self, key: str, state: ChainState) -> None:
         """Write the state atomically."""
-        arrays = {"schema": np.array(SCHEMA), "key": np.array(self._bound(key)), **state.as_arrays()}
+        arrays: dict[str, Any] = {"schema": np.array(SCHEMA), "key": np.array(self._bound(key))}
+        arrays |= {name: getattr(state, name) for name in SHAPES}
         buffer = io.BytesIO()
         np.savez(buffer, sha256=np.array(_digest(arrays)), **arrays)
         write_bytes(self.path, buffer.getvalue(), force=True)

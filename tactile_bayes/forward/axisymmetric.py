@@ -282,8 +282,7 @@ class ModePerturbation(Record, eq=False):
     order: int  #: m.
     matrix: FloatArray
     """(s, s) array: Symmetric: sinking in mm at skin node i for a unit force in kPa mm^2 at skin node j, per cos(m
-    dtheta).
-    """
+    dtheta)."""
 
 
 class CondensedMode(Record, eq=False):

@@ -40,8 +40,7 @@ class Head(Record):
     """Radius of the round between arc and side, tangent to both; 0 for a sharp edge."""
     shoulders: str = SHOULDERS_INSIDE
     """``"shoulders-inside"``: the rounds are cut into the sensing width, which is the whole face.
-    ``"shoulders-outside"``: the arc spans the sensing width, and the rounds lie around it, press and sense nothing.
-    """
+    ``"shoulders-outside"``: the arc spans the sensing width, and the rounds lie around it, press and sense nothing."""
 
     def __post_init__(self) -> None:
         if not 0 < self.width_mm < np.inf:

@@ -41,8 +41,7 @@ class SimulatedScan(Record, eq=False):
     scan: Scan  #: As an instrument would have recorded it.
     truth: Mapping[str, Any]
     """Plain data for JSON: the lumps in the scene's `plane`, in `patient` and in `base`, the transforms, the latency
-    and the level.
-    """
+    and the level."""
 
     def __repr__(self) -> str:
         return f"<SimulatedScan of {self.scan!r}, with its truth>"
@@ -84,8 +83,7 @@ def _times(duration_s: float, rate_hz: float) -> FloatArray:
 
 def head_positions(scene: Scene, time_s: FloatArray) -> tuple[FloatArray, FloatArray]:
     """True pose of the head in the scene's `plane` at times from 0: ``p_plane = rotation @ p_scanhead + origin`` with
-    (n, 3, 3) rotations and (n, 3) origins in mm.
-    """
+    (n, 3, 3) rotations and (n, 3) origins in mm."""
     x, y = _stroke(scene.strokes, time_s / scene.duration_s)
     phase = {name: 2 * np.pi * hz * time_s for name, hz in _WOBBLE_HZ.items()}
     wander, tilt = scene.strokes.wander_mm, np.radians(scene.strokes.tilt_deg)

@@ -45,8 +45,7 @@ class QuadMesh(Record, eq=False):
     nodes: FloatArray  #: (n, 2) array: x and depth z in mm.
     elements: IndexArray
     """(m, 9) int array: Node numbers in tensor order: ``elements[:, 3 * i + j]`` is the node at step i of the first
-    local direction and step j of the second.
-    """
+    local direction and step j of the second."""
     gland: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
     """(m,) bool array: Whether the element lies below the fat-gland boundary."""
 

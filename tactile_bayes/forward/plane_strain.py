@@ -191,8 +191,7 @@ def condense(
     body: Body, *, reach_mm: float = 72.0, cell_mm: float = CELL_MM, fineness: int = FINENESS
 ) -> SurfaceCompliance:
     """Condense a body onto cells of its skin from ``-reach_mm`` to ``reach_mm``, rounded up to a whole number
-    of cells.
-    """
+    of cells."""
     count = int(np.ceil(reach_mm / cell_mm - 1e-9))
     half: FloatArray = cell_mm * np.arange(count + 1.0)
     row = surface_compliance(2 * half[-1] * np.arange(2 * count) / (2 * count), cell_mm=cell_mm, layers=body.layers)

@@ -150,8 +150,7 @@ class Head(Record):
 
     def section(self, shoulders: str) -> Section:
         """Section across the head, with shoulders of this head's radius placed as `shoulders`, one of `presets.HEADS`,
-        says.
-        """
+        says."""
         edge = self.shoulder_mm if self.shoulder_mm > 0 else self.rim_mm
         return Section(self.rows * self.pitch_mm, self.radius_mm, edge, shoulders)
 

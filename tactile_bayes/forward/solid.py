@@ -219,8 +219,7 @@ def solid_frames(
     scene: Scene, time_s: FloatArray, *, progress: Progress | None = None
 ) -> tuple[FloatArray, FloatArray]:
     """Pressures in kPa, (n, rows, columns), on the head at (n,) times, without noise, and z in mm of its apex in the
-    scene's `plane`.
-    """
+    scene's `plane`."""
     rotation, origin = head_positions(scene, time_s)
     level = level_kpa(scene.background, time_s)
     return frames_at_poses(scene, rotation, origin, mean_kpa=level, progress=progress)
@@ -235,8 +234,7 @@ def frames_at_poses(
     progress: Progress | None = None,
 ) -> tuple[FloatArray, FloatArray]:
     """As `solid_frames`, at given poses from `scanhead` to the scene's `plane` and mean pressures, which decide the
-    depth.
-    """
+    depth."""
     body = scene.body or SceneBody()
     head, lumps = _head(scene.head, body, fat_thickness(body, scene.solid_lumps)), _placed(scene)
     count = len(mean_kpa)

@@ -61,8 +61,7 @@ class Body:
     seat: float = 0.0
     """How far the lump stands out of the gland, 0 to 2. The fat-gland boundary lies at depth ``h + seat d/2``: through
     the lump's centre at 0 (centred), under its lowest point at 1 (resting, the lump wholly in the fat), below it from
-    there on. From 1e-4 below 1 to 0.01 above it, it is 1.
-    """
+    there on. From 1e-4 below 1 to 0.01 above it, it is 1."""
     thickness_mm: float | None = None
     """Depth of the chest wall; None takes 70 mm, or 2 mm below ``h + 0.6 d`` and below the fat where that is deeper."""
     fat_kpa: float = FAT_KPA

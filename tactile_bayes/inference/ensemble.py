@@ -9,7 +9,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from tactile_bayes.declarations import Record, names_of
+from tactile_bayes.declarations import Record
 from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.draws import ParameterDraws, student_draws
@@ -94,10 +94,6 @@ class ChainState(Record, eq=False):
     """(ensemble, 624) uint32 array: The random generators' keys."""
     cursor: FloatArray
     """(ensemble, 3) array: Their positions, whether a normal draw is kept, and that draw."""
-
-    def as_arrays(self) -> Mapping[str, Any]:
-        """The state as arrays by name."""
-        return {name: getattr(self, name) for name in names_of(self)}
 
 
 class ChainStore(Protocol):

@@ -26,7 +26,7 @@ from tactile_bayes.posterior.lump_probability import LIKELY, Weighed, weigh
 from tactile_bayes.posterior.options import DETECTED, ROTATION_ODDS, SamplerSettings, check_options
 from tactile_bayes.posterior.result import Estimate, Sensitivity, prior_sensitivity
 from tactile_bayes.posterior.search import Assessment, SizedDraws, best_chance, draw_until_accurate, search
-from tactile_bayes.posterior.white import Candidate, MapDraws, check_background
+from tactile_bayes.posterior.white import Candidate, check_background
 from tactile_bayes.presets import CELL_PER_SIGMA
 from tactile_bayes.progress import Progress
 from tactile_bayes.scan import DEFAULT_HEAD, HeadShape
@@ -249,6 +249,10 @@ def _way_to(recipe: Recipe, tactile_map: TactileMap) -> str:
     return "leave the fit's options to the calibration, or learn a calibration for these"
 
 
+_SIZES = ("max_size_mm", "min_size_mm", "d_x_mm", "d_y_mm")
+_BUMP = ("amplitude", "sigma_x_mm", "sigma_y_mm")
+
+
 def _diagnostics(sized: SizedDraws) -> Diagnostics:
     made, calibration = sized.made, sized.calibration
     return Diagnostics(
@@ -258,7 +262,12 @@ def _diagnostics(sized: SizedDraws) -> Diagnostics:
         method=made.draws.method,
         sampler=made.draws.diagnostics,
         noise=made.figures,
-        convergence=_convergence(made, sized.size) if made.draws.method == "ensemble" else {},
+        convergence={
+            name: convergence(getattr(source, name))
+            for source, names in ((sized.size, _SIZES), (made.posterior, _BUMP))
+            if source is not None and made.draws.method == "ensemble"
+            for name in names
+        },
     )
 
 
@@ -282,15 +291,6 @@ def _findings(sized: SizedDraws, *, cell_mm: float) -> Iterator[Finding]:
             "rib, a second mass), or the lump is large for it; the size is less certain than the interval says"
         )
         yield Finding("uneven_level", text)
-
-
-def _convergence(made: MapDraws, size: SizePosterior | None) -> dict[str, dict[str, float]]:
-    """How far the chains of each size and width agree."""
-    sizes = () if size is None else ("max_size_mm", "min_size_mm", "d_x_mm", "d_y_mm")
-    figures = {name: convergence(getattr(size, name)) for name in sizes}
-    return figures | {
-        name: convergence(getattr(made.posterior, name)) for name in ("amplitude", "sigma_x_mm", "sigma_y_mm")
-    }
 
 
 def _left_out(

@@ -312,13 +312,12 @@ def _best_fit(
     radius_mm, place_only = options.fit_radius_mm, options.correlated
     fits: list[LeastSquaresFit] = []
 
-    def joins(theta: FloatArray, other: LeastSquaresFit) -> bool:
-        return other.converged and bool((np.abs(theta - other.theta) < JOINED * bump.step_scale).all())
-
     def lost(theta: FloatArray) -> bool:
         away = np.hypot(theta[1] - centre[0], theta[2] - centre[1]) > radius_mm
         outgrown = max(bump.widths(theta)[:2]) > 4.0 * radius_mm
-        return bool(away or outgrown or any(joins(theta, other) for other in fits))
+        reached = [other.theta for other in fits if other.converged]
+        joins = any((np.abs(theta - other) < JOINED * bump.step_scale).all() for other in reached)
+        return bool(away or outgrown or joins)
 
     mean = float(weight @ cells.value) / float(weight.sum())
     about_mean = float(weight @ (cells.value - mean) ** 2)

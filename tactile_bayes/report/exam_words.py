@@ -38,8 +38,7 @@ class ExamMass(Record, eq=False):
     axes_mm: tuple[float, float] | None = None
     angle_deg: float = 0.0
     """`axes_mm`, `angle_deg`: Diameters of the ellipse along its own axes, and the angle from x to the first; None
-    without a size.
-    """
+    without a size."""
     largest: Quantity | None = None
     smallest: Quantity | None = None
     """`largest`, `smallest`: Largest and smallest size with the intervals that lead; None without."""

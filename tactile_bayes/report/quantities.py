@@ -147,8 +147,6 @@ class SizedPlace(Record):
 def touching_masses(masses: Sequence[MassReport | SizedPlace]) -> tuple[Touching, ...]:
     """Pairs of sized masses whose outlines may touch.
 
-    Notes
-    -----
     Both lie in one body, so their errors go together: ends of the length are made of the same ends of both sizes. A
     pair touches where the upper ends of its radii reach over the distance of the centres.
     """

@@ -30,8 +30,7 @@ class SizeAnswer(Record):
     probability: float | None = None  #: Of a lump; None where nothing could be tested.
     quantities: dict[str, Quantity] = field(default_factory=dict)
     """The largest size and the two widths by name, mm: the size is missing without a calibration, all are without an
-    estimate.
-    """
+    estimate."""
     method: str = ""  #: The method that drew; empty where none did.
     shares: dict[str, float] = field(default_factory=dict)
     """Percent of the variance of ln(largest size) by source, see `SizePosterior.variance_share`."""

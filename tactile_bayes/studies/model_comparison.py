@@ -57,15 +57,13 @@ class ModelComparison(Record, eq=False):
     frames_centre: float
     frames_near: float
     """`frames_all`, `frames_centre`, `frames_near`: Mean over the frames of each frame's difference: of all taxels;
-    along the head's centre line; and the latter in frames whose centre lies within 12 mm of the lump.
-    """
+    along the head's centre line; and the latter in frames whose centre lies within 12 mm of the lump."""
     rms_kpa: float  #: Root mean square difference of a taxel.
     map_all: float
     map_centre: float
     map_strict: float
     """`map_all`, `map_centre`, `map_strict`: Of the map within 40 mm of the lump, of its centre line across the lump,
-    and of the map relative to map - 1.
-    """
+    and of the map relative to map - 1."""
     lump: BumpFit | None  #: The bump of Eq 7 on the model's map; None where none was fitted.
 
 

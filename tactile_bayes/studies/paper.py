@@ -160,8 +160,7 @@ def paper_grid(seat: float) -> list[Geometry]:
 
 def group_cases(cases: Iterable[tuple[float, float, float, float]]) -> list[Geometry]:
     """Geometries of cases (seat, d_mm, depth_ratio, stiffness_ratio), in the order in which they first appear; a case
-    that appears twice is an error.
-    """
+    that appears twice is an error."""
     ratios: dict[tuple[float, float, float], list[float]] = {}
     for seat, d, h, ratio in cases:
         known = ratios.setdefault((seat, d, h), [])
@@ -479,8 +478,7 @@ def search_heads(
     shoulders_mm: Sequence[float] = SHOULDERS_MM,
 ) -> list[Uniformity]:
     """Uniformity of every head of a grid of places (`presets.HEADS`) and radii of arc and shoulders; sections that
-    cannot be are left out.
-    """
+    cannot be are left out."""
     found = []
     for kind in kinds:
         for radius in radii_mm:

@@ -160,8 +160,7 @@ class SolidSettings(CaseSettings, kw_only=True):
     reach_mm: float = REACH_MM
     lines_mm: tuple[float, ...] = LINES_MM
     """`reach_mm`, `lines_mm`: The head stands at steps of the taxels' pitch out to `reach_mm` either side across it, on
-    lines at these distances either side along it, which must be whole steps.
-    """
+    lines at these distances either side along it, which must be whole steps."""
     fit_radius_mm: float = FIT_RADIUS_MM  #: Eq 7 is fitted within this distance of the lump's axis.
     rank_tolerance: float = RANK_TOLERANCE  #: See `solid.skin_perturbation`.
     mesh_reach_mm: float = MeshSize().reach_mm
@@ -235,14 +234,12 @@ class RasterFrames(Record, eq=False):
     y_mm: FloatArray
     depth_mm: FloatArray
     """`x_mm`, `y_mm`, `depth_mm` (n,) arrays: Where the apex of the head's face is, from the lump's axis and from the
-    undisturbed skin.
-    """
+    undisturbed skin."""
     pressure_kpa: FloatArray  #: (n, rows, columns) array.
     head: Head  #: The head that was pressed.
     plain_kpa: FloatArray | None = None
     """(rows, columns) array: The head's frame over the same body without the lump, where the map is to be divided by
-    it.
-    """
+    it."""
 
 
 class RasterFit(Record):
@@ -252,8 +249,7 @@ class RasterFit(Record):
     sigma_x_mm: float
     sigma_y_mm: float
     """`amplitude`, `sigma_x_mm`, `sigma_y_mm`: a (height above the level, in units of the map) and the widths of Eq 7,
-    across and along the head.
-    """
+    across and along the head."""
     rms: float  #: Root mean square of what the Gaussian leaves, in units of the background.
     resolved: bool  #: True when both widths are ones that array and window can tell.
 

@@ -102,8 +102,7 @@ class Agreement(Record):
     map_strict: float
     """`centred_frame`, `all_frames`, `map`, `map_strict`: Mean squared differences: of the frame centred on the lump
     (Table 1), of all frames of the map, of the map within the fit's radius (Table 2), and of the map relative to map -
-    1.
-    """
+    1."""
     elastic: LineFit
     empirical: LineFit
     """`elastic`, `empirical`: Eq 5 fitted to both maps."""

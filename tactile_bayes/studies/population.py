@@ -194,8 +194,7 @@ def draw_mass(
     head: Head | None = None,
 ) -> list[Scene]:
     """Draw the scenes of one mass, examined several times; they depend only on index, seed, priors and head, by default
-    the paper's.
-    """
+    the paper's."""
     rng = np.random.default_rng([seed, index])
     body, lump = draw_body(bodies or BodyPrior(), rng)
     exam_prior = exams or ExamPrior()
@@ -257,8 +256,7 @@ class MassRow(Record):
     sigma_y_mm: float | None = None
     var_log_a: float | None = None
     """Posterior covariance of ln a, p and q (p and q: half sum and half difference of the logs of the widths), to
-    `var_q`.
-    """
+    `var_q`."""
     cov_log_a_p: float | None = None
     cov_log_a_q: float | None = None
     var_p: float | None = None
@@ -266,8 +264,7 @@ class MassRow(Record):
     var_q: float | None = None
     head_profile_x2: float | None = None
     """How pressure was spread over the head where it felt no lump, see `mapping.profile`; None where it always felt
-    one.
-    """
+    one."""
     head_profile_y2: float | None = None
     head_profile_y4: float | None = None
     normalise: str = "mean"  #: How the map's frames were, see `MapRecipe`.
@@ -287,8 +284,7 @@ def measure_mass(
     normalise: Sequence[str] = (DEFAULT_NORMALISE,),
 ) -> list[MassRow]:
     """Scan each scene of a mass, map and fit it; returns a row for each scene and normalisation (a map by each from one
-    scan).
-    """
+    scan)."""
     rows = []
     for i, scene in enumerate(scenes):
         made = scan(scene)

@@ -54,8 +54,7 @@ class RankTest(Record):
     mean_rank: float
     spread: float
     """`mean_rank`, `spread`: Mean of (rank + 1/2) / (draws + 1), 0.5 when calibrated; and its SD over that of a uniform
-    one: above 1 the posterior is too narrow, below 1 too wide.
-    """
+    one: above 1 the posterior is too narrow, below 1 too wide."""
     coverage: tuple[Coverage, ...]  #: Of central intervals.
 
     @property
@@ -66,8 +65,7 @@ class RankTest(Record):
 
 def rank_test(name: str, ranks: IntArray, *, draws: int, strays: FloatArray | None = None) -> RankTest:
     """Run all tests on one parameter's (n,) ranks from 0 to `draws`; `strays` are from `uniform_strays`,
-    where at hand.
-    """
+    where at hand."""
     known = uniform_strays(len(ranks), draws) if strays is None else strays
     # equally likely strays of discrete counts differ by rounding
     as_far = float(np.mean(known <= stray(ecdf_counts(ranks[None], draws), len(ranks))[0] * (1.0 + 1e-9)))
@@ -96,8 +94,7 @@ def chi2_p(ranks: IntArray, draws: int) -> float:
 
 def coverage(ranks: IntArray, draws: int, probability: float) -> Coverage:
     """Share of truths in the central interval between two draws that holds exactly the nominal share of ranks. A
-    probability that no interval between draws has is a ValueError.
-    """
+    probability that no interval between draws has is a ValueError."""
     tail = (1.0 - probability) / 2.0 * (draws + 1)
     if abs(tail - round(tail)) > 1e-9:
         raise ValueError(f"{draws} draws have no central interval of probability {probability:g}")
@@ -189,8 +186,7 @@ class Truth(Record):
     length_mm: float
     share: float
     """`length_mm`, `share`: Of the noise field: correlation length, and its variance over the mean independent variance
-    of a cell.
-    """
+    of a cell."""
     noise_sd: float  #: Root of that variance.
 
 

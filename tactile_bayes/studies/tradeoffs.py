@@ -76,8 +76,7 @@ class LumpCase(Record):
     plane: StudySettings
     solid: SolidSettings
     """`plane`, `solid`: The default settings of both models for its body and head. All maps are as they are and fitted
-    with a level of 1, as those in two dimensions are.
-    """
+    with a level of 1, as those in two dimensions are."""
 
     @property
     def body(self) -> Body:
@@ -100,8 +99,7 @@ class Setting(Record):
     """Of the model; the empirical one is fitted to plane-strain frames of these."""
     kind: str
     """``"mesh"`` where only the elements differ from the default, ``"default"``, ``"reference"`` for the finest mesh,
-    else what differs.
-    """
+    else what differs."""
 
 
 class Measured(Record):
@@ -361,8 +359,6 @@ def _eq6_rule(calibration: SizeCalibration, name: str) -> SizeRule:
 def _body_rule(calibration: BodyCalibration, name: str) -> SizeRule:
     """A calibration over a population with its mean coefficients, for a round lump in a body of which nothing is known.
 
-    Notes
-    -----
     It is the median of what `pooled_size` draws where the map says a and the widths exactly. A map in two dimensions
     has one width, which stands for both.
     """

@@ -72,8 +72,6 @@ def figure_with_misses(
 
     `weight` gives the (n,) weights of the mean, `missed` what the mean would be if every mass were missed.
 
-    Notes
-    -----
     The mean is :math:`(1 - p) a + p b` with the missed share p of the weights, a over masses found and b if all were
     missed. The corrected interval recovers the variances of a and p from their own intervals (Zou & Donner 2008, Stat.
     Med. 27, 1693): a's is the jackknife's, p's that of Jeffreys' prior for the effective number of patients. Other
@@ -424,8 +422,6 @@ def sign_flip(by_patient: FloatArray, *, seed: int, flips: int = FLIPS) -> float
 
     `by_patient` is the (g,) sum over each patient's masses of the difference of absolute errors.
 
-    Notes
-    -----
     Exact when all patterns are tried; with random ones the observed pattern is counted in (Phipson & Smyth 2010, Stat.
     Appl. Genet. Mol. Biol. 9, 39). Valid when, under the null hypothesis, exchanging the two modalities of a patient
     changes no probability.

@@ -35,8 +35,6 @@ class Coverage(Record):
 def coverage(intervals: Sequence[IntervalReading], *, confidence: float) -> list[Coverage]:
     """Coverage at each nominal probability, with an exact interval.
 
-    Notes
-    -----
     Replicates of a mass share its ex-vivo size, so n intervals on m masses are not n trials. The interval takes the
     share covered as found on m trials: exact where each mass has one interval, on the wide side where it has more.
     """
@@ -65,8 +63,7 @@ class Prediction(Record, eq=False):
     median_log: FloatArray
     sd_log: FloatArray
     """`median_log`, `sd_log`: (n,) arrays of each prediction: the logarithm of its median in mm and its SD, caliper
-    error included.
-    """
+    error included."""
     found_log: FloatArray  #: (n,) array: logarithm of the ex-vivo size in mm.
     mass: FloatArray
     patient: FloatArray
@@ -118,8 +115,6 @@ class Calibration(Record):
 def calibration(prediction: Prediction, *, confidence: float) -> Calibration | None:
     """Judge predictions; None when there are none.
 
-    Notes
-    -----
     Readings of one mass share its ex-vivo size, so n readings on m masses count as m trials wherever chance is judged.
     """
     if len(prediction) == 0:
@@ -163,8 +158,6 @@ def _finite_mean(values: FloatArray) -> float | None:
 def crps_log_normal(prediction: Prediction) -> FloatArray:
     r"""(n,) continuous ranked probability scores in mm of log-normal predictions.
 
-    Notes
-    -----
     With :math:`\omega = (\ln y - \mu)/\sigma`,
 
     .. math:: y(2\Phi(\omega) - 1) - 2e^{\mu + \sigma^2/2}(\Phi(\omega - \sigma) + \Phi(\sigma/\sqrt 2) - 1)

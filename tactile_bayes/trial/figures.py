@@ -52,8 +52,6 @@ def interval_from_values(
     where the figure is above 0 with every patient left out, else as ``linear``. With fewer than `MIN_PATIENTS`
     patients, or where the values do not exist or do not differ, it is undefined.
 
-    Notes
-    -----
     .. math:: \hat\theta \pm t_{G-1}\sqrt{\tfrac{G-1}{G}\sum_g (\hat\theta_{(g)} - \bar\theta_{(\cdot)})^2}
 
     for G patients: Tukey (1958), Ann. Math. Statist. 29, 614; Efron & Tibshirani (1993), ch. 11.
@@ -174,8 +172,6 @@ def clopper_pearson(k: float, n: float, *, confidence: float) -> tuple[float, fl
 
     Fractions of successes and trials are allowed, for effective numbers of trials.
 
-    Notes
-    -----
     The ends are quantiles of Beta(k, n-k+1) and Beta(k+1, n-k). Clopper & Pearson (1934), Biometrika 26, 404.
     """
     if not 0 <= k <= n or n <= 0:
@@ -232,8 +228,6 @@ def draw_patients(patients: int, *, resamples: int, seed: int) -> FloatArray:
 def bca_interval(value: float, drawn: FloatArray, left_out: FloatArray, *, confidence: float) -> tuple[float, float]:
     r"""BCa interval: quantiles corrected for bias and acceleration.
 
-    Notes
-    -----
     Efron (1987), J. Am. Stat. Assoc. 82, 171: bias from the share of draws below the figure (ties by half),
     acceleration from the skewness of the values with one patient left out.
     """

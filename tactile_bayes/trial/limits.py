@@ -135,8 +135,7 @@ class Limits(Record):
     low_interval: Ends | None = None
     high_interval: Ends | None = None
     """`low_interval`, `high_interval`: Each limit on its own: exact for single readings (Carkeet 2015), by variance
-    recovery with replicates.
-    """
+    recovery with replicates."""
     pair_intervals: tuple[Ends, Ends] | None = None
     """Of both limits taken together, exact (Carkeet 2015); None with replicates."""
     approximate_intervals: tuple[Ends, Ends] | None = None
@@ -150,8 +149,6 @@ def limits(differences: FloatArray, *, confidence: float = 0.95) -> Limits:
 
     Differences are y - x; fewer than two leave the limits undefined.
 
-    Notes
-    -----
     Bland & Altman (1986), Lancet i, 307: limits :math:`\bar d \mp z s`, their standard error
     :math:`s\sqrt{1/n + z^2/(2(n-1))}` for the approximate intervals. The exact ones are tolerance factors: Carkeet
     (2015), Optom. Vis. Sci. 92, e71.
@@ -188,8 +185,6 @@ def limits_unlinked(x: Sequence[FloatArray], y: Sequence[FloatArray], *, confide
 
     Each mass has one or more replicates x by the reference and y by the method under test.
 
-    Notes
-    -----
     The variance of the differences of means, plus what averaging took out of it:
 
     .. math:: s^2 = s_{\bar d}^2 + (1 - 1/m_x) s_{xw}^2 + (1 - 1/m_y) s_{yw}^2
@@ -258,8 +253,6 @@ def errors_are_proportional(x: FloatArray, y: FloatArray) -> bool:
 
     False for fewer than `LEAST_MASSES` masses.
 
-    Notes
-    -----
     Likelihoods of y, profiled over mean and SD as in Box & Cox (1964), J. R. Stat. Soc. B 26, 211: the logarithm's
     carries the Jacobian :math:`\prod 1/y`.
     """

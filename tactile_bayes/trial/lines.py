@@ -184,8 +184,6 @@ def passing_bablok(
     Undefined with fewer than two different points, when the middle slope is vertical, or when so many slopes are beyond
     45 degrees against the line that the shifted median lies beyond the last.
 
-    Notes
-    -----
     Passing & Bablok (1983), J. Clin. Chem. Clin. Biochem. 21, 709, for a line that rises; the mirror image for one that
     falls. The intercept is the median of y - slope x. Slope ends are order statistics at the shifted median -+
     :math:`z\\sqrt{n(n-1)(2n+5)/18}/2`, intercept ends the medians for the two slope ends. When either slope end lies
@@ -260,8 +258,7 @@ class Line(Record):
     intercept_se: float | None = None
     slope_se: float | None = None
     """`intercept_se`, `slope_se`: Analytic standard errors, as if the pairs were independent; None where there is no
-    formula.
-    """
+    formula."""
 
     def intervals(self, *, confidence: float) -> tuple[tuple[float, float], tuple[float, float]] | None:
         """Analytic intervals of intercept and slope, by Student's t with n - 2 degrees of freedom."""
@@ -299,8 +296,6 @@ def deming(x: FloatArray, y: FloatArray, *, error_ratio: float = 1.0) -> Line:
 
     Undefined without spread, or where every direction fits equally well.
 
-    Notes
-    -----
     With sums of squares u, q of x, y and of products p, and the error ratio :math:`\lambda`,
 
     .. math:: b = \frac{\lambda q - u + \sqrt{(u - \lambda q)^2 + 4 \lambda p^2}}{2 \lambda p}
@@ -334,8 +329,6 @@ def weighted_deming(
     Iterated from the unweighted line until intercept and slope both change by less than `threshold`, in their own
     units, or for `max_iterations`; undefined when a size is not above 0.
 
-    Notes
-    -----
     The fitted size is the mean of the two coordinates of the foot, :math:`(\hat x + \lambda \hat y) / (1 + \lambda)`:
     Linnet (1990), and (1993) Clin. Chem. 39, 424. There is no analytic standard error; the jackknife is customary.
     """
@@ -447,8 +440,6 @@ def concordance(x: FloatArray, y: FloatArray, *, confidence: float = 0.95) -> Co
 
     Undefined when x or y does not vary.
 
-    Notes
-    -----
     .. math:: \rho_c = \frac{2 s_{xy}}{s_x^2 + s_y^2 + (\bar y - \bar x)^2}
 
     with divisor n throughout: Lin (1989), Biometrics 45, 255; the variance as corrected in Lin (2000), Biometrics 56,

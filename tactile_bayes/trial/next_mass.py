@@ -88,8 +88,7 @@ class Posterior(Record, eq=False):
     mape_percent: FloatArray
     mape_detected_percent: FloatArray
     """`mape_percent`, `mape_detected_percent`: (n,) draws of the expected percent error of the next mass, misses
-    included, and of one that is found.
-    """
+    included, and of one that is found."""
     diagnostics: dict[str, float]
 
 
@@ -120,8 +119,6 @@ def next_mass(trial: Trial, *, sample: Sampler, rng: np.random.Generator, probab
 
     `sample` draws from a log density: by importance sampling or MCMC in the program.
 
-    Notes
-    -----
     The expected error is that of one reading of a mass drawn from the sizes of this trial, of a new patient. Modalities
     are fitted one by one, so that the probability that one errs less takes their errors as independent.
     """
@@ -278,8 +275,6 @@ def log_prior(theta: FloatArray, *, spread: float, caliper: float) -> FloatArray
     For `theta` see `variances`. `spread` is the SD of ln ex-vivo size over the masses, `caliper` the root mean square
     of the calipers' relative SDs.
 
-    Notes
-    -----
     :math:`(r^2 + c^2)^{-3/2}` in bias, slope error and total SD, which is uniform in ln r for r well above the
     caliper's c: given the SD, bias and slope error are bivariate Cauchy with the SD as scale (Zellner & Siow 1980), and
     the SD has Jeffreys' prior. Both shares of the variance are uniform. Normal priors keep bias and slope finite.
@@ -302,7 +297,7 @@ def expected_error_percent(model: LogModel, theta: FloatArray, misses: FloatArra
     at, weight = np.polynomial.hermite_e.hermegauss(15)
     sd = np.exp(theta[:, 2])[:, None]
     mean = theta[:, :1] + (theta[:, 1:2] - 1) * model.spread * at[None, :]
-    folded = np.exp(mean + sd**2 / 2) * _erf((mean / sd + sd) / math.sqrt(2)) - _erf(mean / sd / math.sqrt(2))
+    folded = np.exp(mean + sd**2 / 2) * erf((mean / sd + sd) / math.sqrt(2)) - erf(mean / sd / math.sqrt(2))
     error: FloatArray = 100 * ((1 - misses) * (folded @ weight / weight.sum()) + misses)
     return error
 
@@ -310,10 +305,6 @@ def expected_error_percent(model: LogModel, theta: FloatArray, misses: FloatArra
 def _total_variance(log_sd: FloatArray) -> FloatArray:
     """Variance of ln size, clipped against overflow where the prior excludes it anyway."""
     return np.asarray(np.exp(2 * np.clip(log_sd, -14, 5)))
-
-
-def _erf(values: FloatArray) -> FloatArray:
-    return np.asarray(erf(values))
 
 
 def _shown(one: Middle, spec: str) -> str:

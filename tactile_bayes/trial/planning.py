@@ -154,14 +154,12 @@ class PlanCase(Record):
     mass_sd: float
     map_sd: float
     """`tactile_bias`, `mass_sd`, `map_sd`: Of ln(size / ex vivo): mean, SD shared by all maps of a mass, SD of single
-    maps.
-    """
+    maps."""
     other_bias: float
     other_sd: float
     other_miss: float
     """`other_bias`, `other_sd`, `other_miss`: The same for the modality compared with, read once, and its probability
-    of missing a mass.
-    """
+    of missing a mass."""
     trials: int
     seed: int
     confidence: float = 0.95

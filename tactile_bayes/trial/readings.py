@@ -79,8 +79,7 @@ class ModalitySizes(Record, eq=False):
     masses_not_done: int = 0
     masses_without_reading: int = 0
     """`masses_not_done`, `masses_without_reading`: Excised masses left out: looked for in no replicate, or not in the
-    table.
-    """
+    table."""
     mass: npt.NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     """(n,) array, the number of each mass among the excised ones; counted from 0 when not given."""
 

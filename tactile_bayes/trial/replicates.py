@@ -68,8 +68,6 @@ def components(y: FloatArray, mass: Index, reader: Index) -> Components:
 
     Masses and readers are numbered from 0 without gaps.
 
-    Notes
-    -----
     Patterson & Thompson (1971), Biometrika 58, 545. The criterion is profiled over the residual variance and searched
     in the ratios of SDs to the residual SD, in which it is even, so that a variance of 0 is no edge (Bates et al.
     2015, J. Stat. Softw. 67(1)). Masses are eliminated one by one, which leaves a system of the readers' size.
