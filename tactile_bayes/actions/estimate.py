@@ -45,12 +45,7 @@ from tactile_bayes.report.pooled import pooled_summary, pooled_text
 
 
 def map_action(
-    scans: tuple[Path, ...],
-    output: Path,
-    figure: Path | None,
-    force: bool,
-    verbose: bool,
-    **options: Any,
+    scans: tuple[Path, ...], output: Path, figure: Path | None, force: bool, verbose: bool, **options: Any
 ) -> None:
     """Build a tactile map from one scan, or one common map from several scans of the same examination."""
     from tactile_bayes.files.scan_mcap import read_scan

@@ -241,10 +241,7 @@ def demo_action(ctx: click.Context, output: Path, method: str, force: bool) -> N
     truth = _truth(output / "scan.mcap")
     click.echo(f"The scan is simulated: a ball of {truth:g} mm in a breast of fat and gland ({output / 'scene.toml'}).")
     click.echo(f"Each step is printed as the command that repeats it by hand.{_how_to_type()}")
-    results = {
-        "estimate, the default": steps.default_road(),
-        "the paper's Eq 6": steps.paper_road(),
-    }
+    results = {"estimate, the default": steps.default_road(), "the paper's Eq 6": steps.paper_road()}
     steps.trial()
     click.echo(_summary(truth, results))
     click.echo(_apart(*results.values()))

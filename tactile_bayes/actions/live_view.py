@@ -52,12 +52,7 @@ _SHOW, _HIDE = "\x1b[?25h\x1b[?1049l", "\x1b[?1049h\x1b[?25l"
 
 @contextlib.contextmanager
 def live_view(
-    head: HeadGeometry,
-    calibration: ElementCalibration,
-    *,
-    terminal: bool,
-    serve: str | None,
-    size_calibration: str,
+    head: HeadGeometry, calibration: ElementCalibration, *, terminal: bool, serve: str | None, size_calibration: str
 ) -> Iterator[Any]:
     """Start the view's process; returns an observer for the recorder."""
     if serve:

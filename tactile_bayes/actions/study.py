@@ -474,12 +474,7 @@ def sbc_action(
 
 
 def _run_sbc(
-    maps: int,
-    how: Mapping[str, Any],
-    *,
-    workers: int,
-    scheduler: str | None,
-    output: Path | None,
+    maps: int, how: Mapping[str, Any], *, workers: int, scheduler: str | None, output: Path | None
 ) -> tuple[list[Outcome[sbc.MapRanks]], int]:
     """Outcomes of all maps, and the number that this run made."""
     with (
@@ -489,12 +484,7 @@ def _run_sbc(
     ):
         had = 0 if store is None else len(store.values)
         outcomes = run_batch(
-            partial(ranks_of_map, **how),
-            range(maps),
-            key=str,
-            executor=executor,
-            store=store,
-            progress=progress,
+            partial(ranks_of_map, **how), range(maps), key=str, executor=executor, store=store, progress=progress
         )
     return outcomes, max(maps - had, 0)
 

@@ -135,11 +135,7 @@ def estimate_one(
         diagnostics = replace(estimate.diagnostics, calibration=by, size_calibration=words, repeatability=site)
         estimate = replace(estimate, diagnostics=diagnostics)
     named = settings.calibration_name or (f"{shipped} (shipped)" if calibration is not None else "none")
-    used_fit = {
-        "background": options.background,
-        "fit_radius_mm": options.fit_radius_mm,
-        "noise": options.noise,
-    }
+    used_fit = {"background": options.background, "fit_radius_mm": options.fit_radius_mm, "noise": options.noise}
     recorded = settings.recorded(size_calibration=named, **used_fit)
     recorded = {name: value for name, value in recorded.items() if name not in _UNRECORDED}
     provenance = Provenance("estimate", recorded, digests, seed=settings.seed, scans=scans)

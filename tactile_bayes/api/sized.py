@@ -424,12 +424,7 @@ class SizeEstimate(SizedExam, eq=False, dict=True, kw_only=True):
         if size is None:
             return self.plot_map(path, force=force)
         return draw_size(
-            size,
-            path_of(path),
-            name=self._titled,
-            probability=self.probability,
-            findings=self.findings,
-            force=force,
+            size, path_of(path), name=self._titled, probability=self.probability, findings=self.findings, force=force
         )
 
     @door

@@ -271,10 +271,7 @@ class EmpiricalModel(Record):
     def homogeneous(self, s_mm: FloatArray) -> FloatArray:
         """P1 of this case."""
         return homogeneous_pressure(
-            s_mm,
-            peak_kpa=self.peak_kpa,
-            curvature_per_mm2=self.curvature_per_mm2,
-            half_width_mm=self.half_width_mm,
+            s_mm, peak_kpa=self.peak_kpa, curvature_per_mm2=self.curvature_per_mm2, half_width_mm=self.half_width_mm
         )
 
     def surface_pressure(self, s_mm: FloatArray, x_c_mm: FloatArray) -> FloatArray:

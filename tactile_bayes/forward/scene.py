@@ -59,11 +59,7 @@ SigmaX = Annotated[float, Meta(ge=0.1, le=200, description="Standard deviation a
 SigmaY = Annotated[float, Meta(ge=0.1, le=200, description="Standard deviation along its second axis, mm.")]
 Angle = Annotated[
     float,
-    Meta(
-        ge=-360,
-        le=360,
-        description="From the plane's x axis to the lump's first axis, positive towards y, degrees.",
-    ),
+    Meta(ge=-360, le=360, description="From the plane's x axis to the lump's first axis, positive towards y, degrees."),
 ]
 
 
@@ -93,11 +89,7 @@ class Strokes(Record):
     tilt_deg: Annotated[float, Meta(ge=0, le=30, description="Amplitude of the head's rocking, degrees.")] = 2.0
     yaw_deg: Annotated[
         float,
-        Meta(
-            ge=-90,
-            le=90,
-            description="Turn of the head about the normal, away from square to the strokes, degrees.",
-        ),
+        Meta(ge=-90, le=90, description="Turn of the head about the normal, away from square to the strokes, degrees."),
     ] = 0.0
 
 
@@ -163,11 +155,7 @@ class Noise(Record):
     tracker_deg: Annotated[float, Meta(ge=0, le=30, description="Of each rotation, per axis, degrees.")] = 0.2
     gain_spread: Annotated[
         float,
-        Meta(
-            ge=0,
-            le=0.2,
-            description="Between the true gains of the taxels, as a share; the calibration knows it.",
-        ),
+        Meta(ge=0, le=0.2, description="Between the true gains of the taxels, as a share; the calibration knows it."),
     ] = 0.03
     gain_share: Annotated[
         float, Meta(ge=0, le=0.2, description="Error of the calibration, as a share of the gain.")

@@ -79,11 +79,7 @@ class SkinPerturbation(Record, eq=False):
 
 
 def skin_perturbation(
-    condensed: CondensedLump,
-    lump_kpa: float,
-    *,
-    square_mm: float = HEAD_PITCH_MM,
-    tolerance: float = RANK_TOLERANCE,
+    condensed: CondensedLump, lump_kpa: float, *, square_mm: float = HEAD_PITCH_MM, tolerance: float = RANK_TOLERANCE
 ) -> SkinPerturbation:
     """Condense a lump's perturbation to its leading functions, those above a share `tolerance` of the largest
     eigenvalue.
@@ -226,12 +222,7 @@ def solid_frames(
 
 
 def frames_at_poses(
-    scene: Scene,
-    rotation: FloatArray,
-    origin_mm: FloatArray,
-    *,
-    mean_kpa: FloatArray,
-    progress: Progress | None = None,
+    scene: Scene, rotation: FloatArray, origin_mm: FloatArray, *, mean_kpa: FloatArray, progress: Progress | None = None
 ) -> tuple[FloatArray, FloatArray]:
     """As `solid_frames`, at given poses from `scanhead` to the scene's `plane` and mean pressures, which decide the
     depth."""

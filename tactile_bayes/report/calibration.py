@@ -230,12 +230,7 @@ LABELS = {
 }
 
 
-def calibration_text(
-    calibration: SizeCalibration,
-    *,
-    not_left_out: str = "",
-    other_fit: OtherFit | None = None,
-) -> str:
+def calibration_text(calibration: SizeCalibration, *, not_left_out: str = "", other_fit: OtherFit | None = None) -> str:
     """Text of a size calibration: fit, domain and r2 of each axis, and recipe.
 
     `not_left_out`: why the table's geometries could not be left out in turn, where that is so; `other_fit`: what the

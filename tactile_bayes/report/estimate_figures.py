@@ -246,13 +246,7 @@ def draw_figures(
 
 
 def draw_size(
-    size: SizePosterior,
-    path: Path | None,
-    *,
-    name: str,
-    probability: float,
-    findings: Sequence[Finding],
-    force: bool,
+    size: SizePosterior, path: Path | None, *, name: str, probability: float, findings: Sequence[Finding], force: bool
 ) -> Figure:
     """Draw the posterior of the largest and smallest size with their intervals, and what speaks against them."""
     leads = leading_size(size)

@@ -373,12 +373,7 @@ def _draw_notch(axes: Axes, view: Orientation) -> None:
         arrowprops={"arrowstyle": "-|>", "color": "white", "linewidth": 1.8, "path_effects": _outlined(3)},
     )
     axes.annotate(
-        "to sternal\nnotch",
-        tip,
-        xycoords="axes fraction",
-        xytext=(0, 3),
-        path_effects=_outlined(2),
-        **_ABOVE,
+        "to sternal\nnotch", tip, xycoords="axes fraction", xytext=(0, 3), path_effects=_outlined(2), **_ABOVE
     )
 
 

@@ -101,11 +101,7 @@ def _map(index: int, name: str, report: EstimateReport, pooled: PooledEstimate) 
 
 
 def _findings(
-    pooled: PooledEstimate,
-    reports: Sequence[EstimateReport],
-    apart: Mapping[int, str],
-    *,
-    one_place: bool | None,
+    pooled: PooledEstimate, reports: Sequence[EstimateReport], apart: Mapping[int, str], *, one_place: bool | None
 ) -> Iterator[Finding]:
     """What speaks against the size: of the maps in which a lump was found, and of the maps together."""
     if pooled.status == DISAGREE and pooled.one_place is not None and pooled.one_place < LEAST_PROBABILITY:

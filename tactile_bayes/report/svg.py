@@ -165,12 +165,7 @@ def thumbnail_png(tactile_map: TactileMap, report: EstimateReport) -> bytes | No
 
 
 def _draw_ring(
-    pixels: NDArray[np.uint8],
-    tactile_map: TactileMap,
-    view: Orientation,
-    report: EstimateReport,
-    *,
-    px_per_cell: float,
+    pixels: NDArray[np.uint8], tactile_map: TactileMap, view: Orientation, report: EstimateReport, *, px_per_cell: float
 ) -> None:
     """Draw the ellipse of the estimated size at the estimated place."""
     if report.d_x_mm is None or report.d_y_mm is None or report.centre_mm is None:

@@ -137,8 +137,7 @@ class SettingFile(Record):
     setting: str
     default: bool
     usable: Annotated[
-        bool,
-        Meta(description="Whether it may be chosen to save time; other settings are another model or less data."),
+        bool, Meta(description="Whether it may be chosen to save time; other settings are another model or less data.")
     ]
     runs: Annotated[int, Meta(ge=1)]
     cpu_s: Seconds

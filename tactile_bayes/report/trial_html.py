@@ -178,15 +178,7 @@ def _draw_coverage(axes: Axes, found: Calibration) -> None:
     _label(axes, "Coverage", "nominal probability of the interval", "share covered", where="lower right")
 
 
-def _label(
-    axes: Axes,
-    title: str,
-    across: str,
-    up: str,
-    *,
-    legend: bool = True,
-    where: Corner = "upper left",
-) -> None:
+def _label(axes: Axes, title: str, across: str, up: str, *, legend: bool = True, where: Corner = "upper left") -> None:
     axes.set_title(title, loc="left", fontsize=10.5)
     axes.set_xlabel(across, fontsize=9)
     axes.set_ylabel(up, fontsize=9)

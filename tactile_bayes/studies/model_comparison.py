@@ -99,12 +99,7 @@ def measured_frames(
 
 
 def compare_model(
-    measured: MeasuredFrames,
-    scene: Scene,
-    *,
-    fidelity: str,
-    head: str | None = None,
-    progress: Progress | None = None,
+    measured: MeasuredFrames, scene: Scene, *, fidelity: str, head: str | None = None, progress: Progress | None = None
 ) -> ModelComparison:
     """One model of a scene, with its first lump put where the measured one is, against measured frames."""
     _check_array(measured.scan, scene)
@@ -113,13 +108,7 @@ def compare_model(
     origin = measured.origin_mm.copy()
     origin[:, :2] += np.subtract(at, measured.place_mm)
     pressure = felt_at_poses(
-        scene,
-        measured.rotation,
-        origin,
-        mean_kpa=measured.level_kpa,
-        fidelity=fidelity,
-        head=head,
-        progress=progress,
+        scene, measured.rotation, origin, mean_kpa=measured.level_kpa, fidelity=fidelity, head=head, progress=progress
     )
     made = _model_map(measured, pressure)
     model, seen = pressure.reshape(len(pressure), -1), measured.pressure_kpa.reshape(len(pressure), -1)

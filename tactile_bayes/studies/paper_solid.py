@@ -206,10 +206,7 @@ class SolidSettings(CaseSettings, kw_only=True):
     def placed(self, condensed: CondensedLump, stiffness_ratio: float) -> PlacedLump:
         """The lump under the middle of the raster."""
         change = skin_perturbation(
-            condensed,
-            stiffness_ratio * self.fat_kpa,
-            square_mm=self.head.pitch_mm,
-            tolerance=self.rank_tolerance,
+            condensed, stiffness_ratio * self.fat_kpa, square_mm=self.head.pitch_mm, tolerance=self.rank_tolerance
         )
         return PlacedLump(change, 0.0, 0.0)
 

@@ -135,8 +135,7 @@ class BodiesFile(Record):
         ),
     ] = field(default_factory=BodyPrior)
     exams: Annotated[
-        ExamPrior,
-        Meta(description="Technique of the examiner and errors of the instrument, drawn anew for each exam."),
+        ExamPrior, Meta(description="Technique of the examiner and errors of the instrument, drawn anew for each exam.")
     ] = field(default_factory=ExamPrior)
 
 

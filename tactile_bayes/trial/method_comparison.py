@@ -106,13 +106,11 @@ class MethodComparison(Figures, kw_only=True):
         Meta(description="Of differences and of logarithms of ratios; of single readings, replicates allowed for."),
     ]
     trends: Annotated[
-        dict[Against, Trend],
-        Meta(description="Slope of the differences on the ex-vivo size, and on the mean of both."),
+        dict[Against, Trend], Meta(description="Slope of the differences on the ex-vivo size, and on the mean of both.")
     ]
     concordance_parts: Concordance | None
     errors_grow_with_size: Annotated[
-        bool,
-        Meta(description="Errors are likelier proportional to size than constant: limits in mm suit no one size."),
+        bool, Meta(description="Errors are likelier proportional to size than constant: limits in mm suit no one size.")
     ]
 
 
@@ -156,10 +154,7 @@ def _squared_distance(sizes: ModalitySizes) -> FloatArray:
 def _statistics(error_ratio: float, robust: _Fit, slope: Scale) -> list[tuple[str, Statistic, Scale]]:
     """All figures with their names and the scales of their intervals."""
     demings = partial(_deming_slope, error_ratio=error_ratio)
-    fits = (
-        ("weighted_deming", _Fit(partial(weighted_deming, error_ratio=error_ratio))),
-        ("passing_bablok", robust),
-    )
+    fits = (("weighted_deming", _Fit(partial(weighted_deming, error_ratio=error_ratio))), ("passing_bablok", robust))
     return [
         ("ols_intercept_mm", SumStatistic(_terms, _intercept_with(_ols_slope), _NO_LINE), "linear"),
         ("ols_slope", SumStatistic(_terms, _ols_slope, _NO_LINE), slope),

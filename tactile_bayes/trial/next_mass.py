@@ -160,12 +160,7 @@ def _compared(posteriors: Mapping[str, Posterior]) -> dict[str, float]:
 
 
 def _fit(
-    sizes: ModalitySizes,
-    caliper: Mapping[int, float],
-    *,
-    sample: Sampler,
-    rng: np.random.Generator,
-    probability: float,
+    sizes: ModalitySizes, caliper: Mapping[int, float], *, sample: Sampler, rng: np.random.Generator, probability: float
 ) -> Posterior:
     found = sizes.only_detected()
     model = LogModel(found, np.array([caliper[int(mass)] for mass in found.mass]))

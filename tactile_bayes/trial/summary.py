@@ -55,11 +55,7 @@ from tactile_bayes.trial.replicates import (
     spread_figures,
 )
 
-FAMILIES: tuple[Callable[..., dict[str, Figure]], ...] = (
-    accuracy_figures,
-    origin_line_figures,
-    spread_figures,
-)
+FAMILIES: tuple[Callable[..., dict[str, Figure]], ...] = (accuracy_figures, origin_line_figures, spread_figures)
 
 
 CONVENTIONS: dict[str, str] = {
@@ -214,8 +210,7 @@ class TrialReport(Record, kw_only=True):
         ),
     ]
     paired_comparisons: Annotated[
-        tuple[PairedComparison, ...],
-        Meta(description="Every pair of modalities on the masses that both looked for."),
+        tuple[PairedComparison, ...], Meta(description="Every pair of modalities on the masses that both looked for.")
     ]
     doubts: Annotated[tuple[str, ...], Meta(description="What looks like another unit than mm.")]
     conventions: dict[str, str]
