@@ -17,6 +17,14 @@ from tactile_bayes.trial.calibration import (
     log_normal,
     predictions,
 )
+from tactile_bayes.trial.readings import Interval, Reading
+
+
+def stated_by(
+    low: float | None, high: float | None, probability: float | None, size: float, sd: float | None
+) -> tuple[float, float] | None:
+    ends = None if low is None or high is None or probability is None else Interval(low, high, probability)
+    return log_normal(Reading(("p", "m"), "tactile", 1, "detected", size, ends, sd_mm=sd))
 
 
 def drawn(n: int, *, stated: float = 1.0, shift: float = 0.0, seed: int = 1, replicates: int = 1) -> Prediction:
@@ -94,20 +102,20 @@ def test_crps_of_a_sure_prediction_is_its_absolute_error() -> None:
 
 def test_interval_score_by_hand() -> None:
     """90 % interval 10 to 20 mm: found 15 costs its width, found 23 costs 3 x 2 / 0.1 more."""
-    median, sd = log_normal(10, 20, 0.9, 14, None)
+    median, sd = stated_by(10, 20, 0.9, 14, None)
     found = np.log(np.array([15.0, 23.0]))
     prediction = Prediction(np.full(2, median), np.full(2, sd), found, np.arange(2.0), np.arange(2.0))
     assert interval_score(prediction, probability=0.9) == pytest.approx([10, 10 + 60])
 
 
 def test_what_a_reading_states() -> None:
-    median, sd = log_normal(8, 18, 0.95, 12, None)
+    median, sd = stated_by(8, 18, 0.95, 12, None)
     assert stats.lognorm(sd, scale=math.exp(median)).ppf([0.025, 0.975]) == pytest.approx([8, 18])
-    median, sd = log_normal(None, None, None, 12, 3)
+    median, sd = stated_by(None, None, None, 12, 3)
     stated = stats.lognorm(sd, scale=math.exp(median))
     assert (stated.mean(), stated.std()) == pytest.approx((12, 3))
-    assert log_normal(0, 18, 0.95, 12, None) is None
-    assert log_normal(None, None, None, 12, 0) is None
+    assert stated_by(0, 18, 0.95, 12, None) is None
+    assert stated_by(None, None, None, 12, 0) is None
 
 
 def test_the_calipers_error_is_added_in_quadrature() -> None:
