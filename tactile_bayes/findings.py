@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Final, Literal, get_args
 
-from tactile_bayes.declarations import Record, as_dict, replace
+from tactile_bayes.declarations import Record, as_dict, from_plain, replace
 from tactile_bayes.errors import BadDataError
 
 Severity = Literal["caution", "check"]
@@ -54,7 +54,6 @@ KINDS: Final[Mapping[str, Severity]] = {
 SEVERITIES: Final[tuple[Severity, ...]] = get_args(Severity)
 LEADS: Final[Mapping[Severity, str]] = {"caution": "CAUTION: ", "check": "To check: "}
 """How a line with a finding begins, in every output."""
-_WAY_OUT: Final = "give the file as this program wrote it"
 
 
 class Finding(Record):
@@ -143,19 +142,5 @@ def finding_summary(findings: Iterable[Finding], severity: Severity, *, most: in
 
 
 def findings_in(listed: object) -> tuple[Finding, ...]:
-    """Findings as `Finding.as_dict` wrote them into a file.
-
-    Raises
-    ------
-    BadDataError
-        When it is no list of findings, or one is of a kind that this version does not know.
-    """
-    names = ("kind", "text", "remedy", "on_paper", "about")
-    if not isinstance(listed, list):
-        raise BadDataError(f"findings are a {type(listed).__name__}", way_out=_WAY_OUT)
-    found = []
-    for one in listed:
-        if not isinstance(one, dict) or not all(isinstance(one.get(name), str) for name in names):
-            raise BadDataError(f"a finding is {str(one)[:60]!r}", way_out=_WAY_OUT)
-        found.append(Finding(*(one[name] for name in names)))
-    return tuple(found)
+    """Findings as `Finding.as_dict` wrote them into a file; anything else is a `BadDataError`."""
+    return tuple(one.finding for one in from_plain(tuple[FindingEntry, ...], listed, where="findings"))

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_bayes.declarations import Meta, Record, field, from_plain, settle, to_plain
+from tactile_bayes.declarations import Meta, Record, field, settle, to_plain
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.findings import Finding
 from tactile_bayes.geometry import FloatArray, check_rigid
@@ -119,14 +119,6 @@ class HeadShape(Record):
     def as_dict(self) -> dict[str, Any]:
         """Plain data for files."""
         return dict(to_plain(self, digits=17))
-
-    @classmethod
-    def from_document(cls, document: Mapping[str, Any]) -> HeadShape:
-        """Undo `as_dict`; a value that cannot be that of a head is a `BadDataError`."""
-        try:
-            return from_plain(cls, dict(document))
-        except BadDataError as error:
-            raise BadDataError(f"head.{error.what}", way_out=error.way_out) from None
 
 
 DEFAULT_HEAD: Final = HeadShape(HEAD_ROWS, HEAD_COLUMNS, HEAD_PITCH_MM, HEAD_RADIUS_MM)

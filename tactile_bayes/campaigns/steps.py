@@ -316,10 +316,6 @@ def _compare(task: Task) -> tuple[Result, Writes]:
     return {}, writes
 
 
-def _copy(task: Task) -> tuple[Result, Writes]:
-    return copy_step(task)
-
-
 def _answer(folder: Path) -> Answer:
     """An exam's answer for pooling, from its folder."""
     tactile_map: TactileMap = read_map(folder / MAP)
@@ -332,27 +328,6 @@ def _answer(folder: Path) -> Answer:
         fingerprint=tactile_map.fingerprint,
         head=tactile_map.head,
     )
-
-
-def _repeatability(task: Task) -> tuple[Result, Writes]:
-    return learn_step(task)
-
-
-def _size(task: Task) -> tuple[Result, Writes]:
-    return size_step(task)
-
-
-RUN: Final[dict[str, Callable[[Task], tuple[Result, Writes]]]] = {
-    "map": _map,
-    "estimate": _estimate,
-    "figures": _figures,
-    "repeatability": _repeatability,
-    "size": _size,
-    "pool": _pool,
-    "compare": _compare,
-    "copy": _copy,
-}
-"""What makes each step's files: what it found, and how to write each file."""
 
 
 # --- Copies of a campaign's files in an object store: a step for each exam and mass, after those that make its files.
@@ -483,3 +458,16 @@ def _resized(report: EstimateReport, size: SizePosterior, settings: Settings) ->
         diagnostics=diagnostics,
         provenance=provenance,
     )
+
+
+RUN: Final[dict[str, Callable[[Task], tuple[Result, Writes]]]] = {
+    "map": _map,
+    "estimate": _estimate,
+    "figures": _figures,
+    "repeatability": learn_step,
+    "size": size_step,
+    "pool": _pool,
+    "compare": _compare,
+    "copy": copy_step,
+}
+"""What makes each step's files: what it found, and how to write each file."""

@@ -10,7 +10,7 @@ from typing import Any
 from tactile_bayes.declarations import as_dict
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.documents import load_json, load_schema, parse_json
-from tactile_bayes.files.map_nc import read_map, read_map_header
+from tactile_bayes.files.map_nc import read_map_and_header
 from tactile_bayes.files.netcdf import Group, open_netcdf
 from tactile_bayes.files.reading import HDF5_MAGIC, MCAP_MAGIC, open_input
 from tactile_bayes.files.scan_mcap import summarise_scan
@@ -80,11 +80,10 @@ def _value_unit(tactile_map: TactileMap) -> str:
 
 
 def _map(path: Path) -> dict[str, Any]:
-    header = read_map_header(path)
-    tactile_map = read_map(path)
+    tactile_map, header = read_map_and_header(path)
     ny, nx = tactile_map.mean.shape
     return {
-        "schema": header["schema"],
+        "schema": header.schema,
         "kind": "map",
         "shape": {"ny": ny, "nx": nx},
         "extent_mm": {"x": nx * tactile_map.recipe.cell_mm, "y": ny * tactile_map.recipe.cell_mm},
@@ -99,7 +98,7 @@ def _map(path: Path) -> dict[str, Any]:
         **({} if tactile_map.head is None else {"head": tactile_map.head.as_dict()}),
         "quality": dict(tactile_map.quality),
         "masked_taxels": list(tactile_map.masked_taxels),
-        "provenance": header["provenance"],
+        "provenance": header.provenance,
     }
 
 

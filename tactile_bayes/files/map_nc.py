@@ -6,11 +6,11 @@ import json
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Final, Literal
 
 import numpy as np
 
-from tactile_bayes.declarations import Record, as_dict
+from tactile_bayes.declarations import EXACT, UNSET, Record, UnsetType, from_plain, names_of, to_plain
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.atomic import write_bytes
 from tactile_bayes.files.documents import parse_json
@@ -19,11 +19,11 @@ from tactile_bayes.files.netcdf import Contents, Group, Variable, grouped_netcdf
 from tactile_bayes.files.provenance import Provenance, scans_of
 from tactile_bayes.files.reading import CELLS, check_limit
 from tactile_bayes.files.reports import EstimateReport, PooledReport
-from tactile_bayes.findings import Finding, findings_in
+from tactile_bayes.findings import Finding, FindingEntry, findings_in
 from tactile_bayes.geometry import FloatArray, check_rigid
 from tactile_bayes.mapping.map import MapRecipe, TactileMap
 from tactile_bayes.posterior.result import DrawGroup, Estimate
-from tactile_bayes.presets import NORMALISE, RESEARCH_USE
+from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.scan import HeadShape
 from tactile_bayes.size.draws import SizePosterior
 
@@ -31,7 +31,7 @@ from tactile_bayes.size.draws import SizePosterior
 #
 # The cells' centres are the coordinate variables ``x`` and ``y`` (record 0089).
 
-SCHEMA = "tactile-bayes/map/2"
+SCHEMA: Final = "tactile-bayes/map/2"
 _WAY_OUT = "give a map this program wrote, or make it again with `tactile-bayes map`"
 
 _VARIABLES = {"y_mm": "y", "x_mm": "x"}
@@ -65,6 +65,21 @@ _TRANSFORMS = {
 }
 
 
+class MapHeader(Record, kw_only=True):
+    """What the attributes of a map's file say of it: the schema as a text, the others as JSON."""
+
+    schema: Literal["tactile-bayes/map/2"]
+    recipe: MapRecipe
+    background: float | None
+    frame_count: int
+    quality: dict[str, float | None]  #: Null where a figure is not finite.
+    masked_taxels: tuple[str, ...]
+    head: HeadShape | UnsetType = UNSET
+    nipple_mm: tuple[float, float, float] | UnsetType = UNSET
+    findings: tuple[FindingEntry, ...]
+    provenance: dict[str, Any]
+
+
 def write_map(path: Path, tactile_map: TactileMap, *, provenance: Provenance, force: bool = False) -> None:
     """Write a map atomically, readable by its owner only; `provenance` holds no clock time, so equal maps give equal
     bytes.
@@ -92,40 +107,37 @@ def _variables(tactile_map: TactileMap) -> dict[str, Variable]:
 
 def read_map(path: Path) -> TactileMap:
     """Read a map and check all of it."""
-    return read_map_and_scans(path)[0]
+    return read_map_and_header(path)[0]
 
 
 def read_map_and_scans(path: Path) -> tuple[TactileMap, tuple[dict[str, str], ...]]:
     """Read a map, and the scans it was made from, as `Provenance.scans` has them; for the errors see `read_map`."""
+    tactile_map, header = read_map_and_header(path)
+    return tactile_map, scans_of(header.provenance)
+
+
+def read_map_and_header(path: Path) -> tuple[TactileMap, MapHeader]:
+    """Read a map, and what its file says of it; for the errors see `read_map`."""
     with open_netcdf(path, way_out=_WAY_OUT) as file:
         header = _header(file)
         check_limit(_dimension(file, "y") * _dimension(file, "x"), CELLS, what="it has {} cells")
         names = {field: _VARIABLES.get(field, field) for field in _FIELDS}
         arrays = {field: _read_variable(file, name, field=field) for field, name in names.items()}
         transforms = {name: _read_transform(file, name) for name in _TRANSFORMS}
-        _check_lattice({names[field]: arrays[field] for field in ("x_mm", "y_mm")}, header["recipe"].cell_mm)
+        _check_lattice({names[field]: arrays[field] for field in ("x_mm", "y_mm")}, header.recipe.cell_mm)
         tactile_map = TactileMap(
             **arrays,
             **transforms,
-            recipe=header["recipe"],
-            background=header["background"],
-            frame_count=header["frame_count"],
-            quality=header["quality"],
-            masked_taxels=tuple(header["masked_taxels"]),
-            head=header["head"],
-            nipple_mm=header["nipple_mm"],
-            findings=header["findings"],
+            recipe=header.recipe,
+            background=header.background,
+            frame_count=header.frame_count,
+            quality={name: math.nan if value is None else value for name, value in header.quality.items()},
+            masked_taxels=header.masked_taxels,
+            head=None if isinstance(header.head, UnsetType) else header.head,
+            nipple_mm=None if isinstance(header.nipple_mm, UnsetType) else np.array(header.nipple_mm),
+            findings=tuple(one.finding for one in header.findings),
         )
-        return tactile_map, scans_of(header["provenance"])
-
-
-def read_map_header(path: Path) -> dict[str, Any]:
-    """Read a map without its arrays: ``schema``, ``recipe`` (`MapRecipe`), ``quality``, ``masked_taxels``, ``head``,
-    ``nipple_mm``, ``findings``, ``provenance``, ``background``, ``frame_count`` and ``shape`` (ny, nx).
-    """
-    with open_netcdf(path, way_out=_WAY_OUT) as file:
-        shape = tuple(_dimension(file, name) for name in ("y", "x"))
-        return _header(file) | {"shape": shape}
+        return tactile_map, header
 
 
 def _units(tactile_map: TactileMap) -> dict[str, str]:
@@ -139,135 +151,39 @@ def _attributes(tactile_map: TactileMap, provenance: Provenance) -> dict[str, st
 
     CF wants a unit that UDUNITS reads for every quantity that has one: a map without such a unit does not claim CF.
     """
+    header = MapHeader(
+        schema=SCHEMA,
+        recipe=tactile_map.recipe,
+        background=tactile_map.background,
+        frame_count=int(tactile_map.frame_count),
+        quality={name: float(v) if np.isfinite(v) else None for name, v in tactile_map.quality.items()},
+        masked_taxels=tactile_map.masked_taxels,
+        head=UNSET if tactile_map.head is None else tactile_map.head,
+        nipple_mm=UNSET if tactile_map.nipple_mm is None else tuple(tactile_map.nipple_mm.tolist()),
+        findings=tuple(one.entry for one in tactile_map.findings),
+        provenance=provenance.as_dict(),
+    )
+    plain = to_plain(header, digits=EXACT)
+    del plain["schema"]
     return ({"Conventions": "CF-1.11"} if tactile_map.recipe.value_unit in _CF_UNITS else {}) | {
         "title": "Tactile map: mean normalised pressure on the best-fit plane",
         "schema": SCHEMA,
-        "recipe": _json(as_dict(tactile_map.recipe)),
-        "background": _json(tactile_map.background),
-        "frame_count": _json(int(tactile_map.frame_count)),
-        "quality": _json({name: _finite(value) for name, value in tactile_map.quality.items()}),
-        "masked_taxels": _json(list(tactile_map.masked_taxels)),
-        **({} if tactile_map.head is None else {"head": _json(tactile_map.head.as_dict())}),
-        **({} if tactile_map.nipple_mm is None else {"nipple_mm": _json(tactile_map.nipple_mm.tolist())}),
-        "findings": _json([one.as_dict() for one in tactile_map.findings]),
-        "provenance": _json(provenance.as_dict()),
+        **{name: json.dumps(value, allow_nan=False) for name, value in plain.items()},
     }
 
 
-def _json(value: object) -> str:
-    return json.dumps(value, allow_nan=False)
-
-
-def _finite(value: float) -> float | None:
-    """A figure for JSON: null where it is not finite."""
-    return float(value) if np.isfinite(value) else None
-
-
-def _header(file: Group) -> dict[str, Any]:
+def _header(file: Group) -> MapHeader:
     if file.group("posterior") is not None:
         raise BadDataError("is a posterior, not a map", way_out="give the map that it was estimated from")
-    texts = file.attributes()
-    schema = _attribute(texts, "schema")
-    if schema != SCHEMA:
-        raise BadDataError(f"schema is {schema!r}, not {SCHEMA!r}", way_out=_WAY_OUT)
-    return {
-        "schema": schema,
-        "recipe": _recipe(_decoded(texts, "recipe", dict)),
-        "background": _number(_decoded(texts, "background", (float, int, type(None))), name="background"),
-        "frame_count": _decoded(texts, "frame_count", int),
-        "quality": _quality(_decoded(texts, "quality", dict)),
-        "masked_taxels": [str(line) for line in _decoded(texts, "masked_taxels", list)],
-        "head": _head(texts),
-        "nipple_mm": _nipple(texts),
-        "findings": findings_in(_decoded(texts, "findings", list)),
-        "provenance": _decoded(texts, "provenance", dict),
+    texts = {name: text for name, text in file.attributes().items() if name in names_of(MapHeader)}
+    document: dict[str, Any] = {
+        name: text if name == "schema" else parse_json(text, name=f"attribute {name}", way_out=_WAY_OUT)
+        for name, text in texts.items()
     }
-
-
-def _attribute(texts: Mapping[str, str], name: str) -> str:
-    if name not in texts:
-        raise BadDataError(f"attribute {name} is missing", way_out=_WAY_OUT)
-    return texts[name]
-
-
-def _decoded(texts: Mapping[str, str], name: str, kind: type | tuple[type, ...]) -> Any:
-    text = _attribute(texts, name)
-    value = parse_json(text, name=f"attribute {name}", way_out=_WAY_OUT)
-    if not isinstance(value, kind) or isinstance(value, bool):
-        raise BadDataError(f"attribute {name} holds {_short(text)}", way_out=_WAY_OUT)
-    return value
-
-
-def _number(value: float | int | None, *, name: str) -> float | None:
-    if value is not None and not np.isfinite(value):
-        raise BadDataError(f"attribute {name} holds {value}", way_out=_WAY_OUT)
-    return None if value is None else float(value)
-
-
-def _quality(values: dict[str, Any]) -> dict[str, float]:
-    for name, value in values.items():
-        if value is not None and not isinstance(value, int | float):
-            raise BadDataError(f"quality.{name} is {_short(value)}, not a number", way_out=_WAY_OUT)
-    return {name: float("nan") if value is None else float(value) for name, value in values.items()}
-
-
-def _recipe(fields: dict[str, Any]) -> MapRecipe:
-    """Read the recipe from its JSON, checking each field."""
-    window = fields.get("pressure_window_kpa")
-    checks = {
-        "source": isinstance(fields.get("source"), str),
-        "normalise": fields.get("normalise") in NORMALISE,
-        "cell_mm": _is_number(fields.get("cell_mm")) and fields["cell_mm"] > 0,
-        "pressure_window_kpa": window is None
-        or (isinstance(window, list) and len(window) == 2 and all(_is_number(end) for end in window)),
-        "latency_ms": _is_number(fields.get("latency_ms")),
-        "flat_field": isinstance(fields.get("flat_field"), bool),
-        "registered": isinstance(fields.get("registered"), bool),
-        "units": isinstance(fields.get("units"), str) and fields["units"].isprintable(),
-    }
-    for name, good in checks.items():
-        if not good:
-            raise BadDataError(f"recipe.{name} is {_short(fields.get(name))}", way_out=_WAY_OUT)
-    ends = None if window is None else (float(window[0]), float(window[1]))
-    return MapRecipe(
-        fields["source"],
-        fields["normalise"],
-        float(fields["cell_mm"]),
-        ends,
-        float(fields["latency_ms"]),
-        fields["flat_field"],
-        fields["registered"],
-        fields["units"],
-    )
-
-
-def _head(texts: Mapping[str, str]) -> HeadShape | None:
-    """The head's shape; None in an imported grid."""
-    if "head" not in texts:
-        return None
     try:
-        return HeadShape.from_document(_decoded(texts, "head", dict))
+        return from_plain(MapHeader, document, where="header")
     except BadDataError as error:
-        raise BadDataError(f"attribute head: {error.what}", way_out=_WAY_OUT) from None
-
-
-def _nipple(texts: Mapping[str, str]) -> FloatArray | None:
-    """The nipple in the plane; None where it was not touched."""
-    if "nipple_mm" not in texts:
-        return None
-    values = _decoded(texts, "nipple_mm", list)
-    if len(values) != 3 or not all(_is_number(one) for one in values):
-        raise BadDataError(f"attribute nipple_mm holds {_short(values)}", way_out=_WAY_OUT)
-    return np.array(values, dtype=np.float64)
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and bool(np.isfinite(value))
-
-
-def _short(value: object) -> str:
-    text = repr(value)
-    return text if len(text) <= 60 else text[:57] + "..."
+        raise BadDataError(error.what, way_out=_WAY_OUT) from None
 
 
 def _dimension(file: Group, name: str) -> int:
@@ -311,6 +227,8 @@ def _check_lattice(axes: Mapping[str, Any], cell_mm: float) -> None:
 # --- Posteriors as netCDF that arviz opens: every draw of a map's parameters and of the sizes, and what goes with them.
 
 POSTERIOR_SCHEMA = "tactile-bayes/posterior/1"
+_OF_A_MAP: Final = ("amplitude", "sigma_x_mm", "sigma_y_mm", "x_mm", "y_mm", "angle_rad", "background", "noise_sd")
+_OF_A_SIZE: Final = ("d_x_mm", "d_y_mm", "max_size_mm", "min_size_mm")
 
 
 def write_posterior(
@@ -330,32 +248,11 @@ def write_posterior(
     if estimate.map_posterior is None or estimate.draws is None:
         raise ValueError("no estimate, so no posterior to write")
     posterior = estimate.map_posterior
-    variables = {
-        "amplitude": posterior.amplitude,
-        "sigma_x_mm": posterior.sigma_x_mm,
-        "sigma_y_mm": posterior.sigma_y_mm,
-        "x_mm": posterior.x_mm,
-        "y_mm": posterior.y_mm,
-        "angle_rad": posterior.angle_rad,
-        "background": posterior.background,
-        "noise_sd": posterior.noise_sd,
-    }
+    variables = {name: getattr(posterior, name) for name in _OF_A_MAP}
     if estimate.size is not None:
-        variables |= {
-            "d_x_mm": estimate.size.d_x_mm,
-            "d_y_mm": estimate.size.d_y_mm,
-            "max_size_mm": estimate.size.max_size_mm,
-            "min_size_mm": estimate.size.min_size_mm,
-        }
+        variables |= {name: getattr(estimate.size, name) for name in _OF_A_SIZE}
     figures = {} if estimate.diagnostics is None else estimate.diagnostics.as_dict()
-    attributes = {
-        "schema": POSTERIOR_SCHEMA,
-        "research_use": RESEARCH_USE,
-        "method": estimate.draws.method,
-        "provenance": json.dumps(provenance.as_dict()),
-        "diagnostics": json.dumps({k: v for k, v in figures.items() if _plain(v)}),
-        "estimate": json.dumps(report.document),
-    }
+    attributes = _posterior_attributes(estimate.draws.method, figures, provenance, report)
     write_bytes(path, _posterior_bytes(variables, attributes, groups), force=force)
 
 
@@ -363,17 +260,23 @@ def write_pooled(
     path: Path, size: SizePosterior, *, provenance: Provenance, report: PooledReport, force: bool = False
 ) -> None:
     """Write the draws of a mass's size from several maps, with its report, atomically."""
-    names = ("d_x_mm", "d_y_mm", "max_size_mm", "min_size_mm")
-    variables = {name: np.atleast_2d(getattr(size, name)) for name in names}
-    attributes = {
+    variables = {name: np.atleast_2d(getattr(size, name)) for name in _OF_A_SIZE}
+    attributes = _posterior_attributes("pooled", size.figures, provenance, report)
+    write_bytes(path, _posterior_bytes(variables, attributes, {}), force=force)
+
+
+def _posterior_attributes(
+    method: str, figures: Mapping[str, Any], provenance: Provenance, report: EstimateReport | PooledReport
+) -> dict[str, str]:
+    finite = {name: v for name, v in figures.items() if not isinstance(v, float) or math.isfinite(v)}
+    return {
         "schema": POSTERIOR_SCHEMA,
         "research_use": RESEARCH_USE,
-        "method": "pooled",
+        "method": method,
         "provenance": json.dumps(provenance.as_dict()),
-        "diagnostics": json.dumps({k: v for k, v in size.figures.items() if _plain(v)}),
+        "diagnostics": json.dumps(finite),
         "estimate": json.dumps(report.document),
     }
-    write_bytes(path, _posterior_bytes(variables, attributes, {}), force=force)
 
 
 def _posterior_bytes(
@@ -453,7 +356,3 @@ def is_posterior(path: Path) -> bool:
     """True when a netCDF file holds a posterior, of this program or another, and no map."""
     with open_netcdf(path, way_out="give a map, or what `estimate` wrote with -o") as file:
         return file.group("posterior") is not None
-
-
-def _plain(value: object) -> bool:
-    return not isinstance(value, float) or math.isfinite(value)

@@ -5,12 +5,12 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Iterator, Mapping
-from typing import Final
+from typing import Annotated, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_bayes.declarations import Record, field, settle
+from tactile_bayes.declarations import Meta, Record, field, settle
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.findings import Finding
 from tactile_bayes.geometry import BoolArray, FloatArray
@@ -40,9 +40,8 @@ class MapRecipe(Record):
     """How a map was built; a size calibration fits only maps of its own recipe."""
 
     source: str  #: ``"scan"`` or ``"grid"`` (a map imported as it is).
-    normalise: str
-    """``"mean"``, ``"gain"`` or ``"none"``."""
-    cell_mm: float  #: Side of the square cells.
+    normalise: Annotated[str, Meta(pattern="^(mean|gain|none)$", extra={"words": "mean, gain or none"})]
+    cell_mm: Annotated[float, Meta(gt=0)]  #: Side of the square cells.
     pressure_window_kpa: tuple[float, float] | None = None
     """The gate on the frame's mean; None for an imported grid."""
     latency_ms: float = 0.0  #: By how much a pose's stamp is late against the frames.

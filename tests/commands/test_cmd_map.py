@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from in_process import run_here
 
-from tactile_bayes.files.map_nc import read_map, read_map_header
+from tactile_bayes.files.map_nc import read_map, read_map_and_header
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.scan_mcap import write_scan
 from tactile_bayes.mapping.build import build_map
@@ -46,8 +46,8 @@ def test_scans_become_the_map_the_function_builds(folder, run_cli):
     written, built = read_map(folder / "map.nc"), build_map(small_scan())
     assert np.array_equal(written.mean, built.mean, equal_nan=True)
     assert np.array_equal(written.count, built.count)
-    header = read_map_header(folder / "map.nc")
-    assert header["provenance"]["settings"] == {
+    _, header = read_map_and_header(folder / "map.nc")
+    assert header.provenance["settings"] == {
         "cell_mm": 1.0,
         "pressure_window_kpa": [5.0, 14.0],
         "normalise": "gain",
@@ -57,7 +57,7 @@ def test_scans_become_the_map_the_function_builds(folder, run_cli):
         "register_strokes": False,
         "every": 1,
     }
-    assert [one["role"] for one in header["provenance"]["inputs"]] == ["scan_1", "scan_2"]
+    assert [one["role"] for one in header.provenance["inputs"]] == ["scan_1", "scan_2"]
     for name in ("map.nc", "map.png"):
         assert stat.S_IMODE((folder / name).stat().st_mode) == 0o600
 

@@ -173,7 +173,7 @@ FORMS: dict[str, tuple[Callable[[Any], None], str]] = {
     "without an axis": (_renamed(x="across"), "variable x is missing"),
     "cells on another axis": (_longer, r"variable count has dimensions \('y', 'z'\), not \('y', 'x'\)"),
     "off its lattice": (lambda file: file["x"].__setitem__(0, -9.5), "variable x steps by 0.5 to 8.5 mm"),
-    "without findings": (lambda file: file.delncattr("findings"), "attribute findings is missing"),
+    "without findings": (lambda file: file.delncattr("findings"), "header has no findings"),
     "of another schema": (
         lambda file: file.setncattr("schema", "tactile-bayes/map/1"),
         "schema is 'tactile-bayes/map/1'",

@@ -90,7 +90,7 @@ def test_a_map_file_keeps_the_nipple_and_refuses_a_damaged_one(tmp_path: Path) -
     assert read_map(path).nipple_mm is None
     assert b"nipple" not in path.read_bytes()
     write_map(path, replace(plain, nipple_mm=NIPPLE[:2]), provenance=PROVENANCE, force=True)
-    with pytest.raises(BadDataError, match=r"attribute nipple_mm holds \[-80.0, 60.0\]"):
+    with pytest.raises(BadDataError, match=r"header.nipple_mm is \[-80.0, 60.0\]"):
         read_map(path)
 
 
