@@ -6,12 +6,12 @@ import re
 import struct
 import time
 from collections.abc import Callable
-from typing import Final, Protocol
+from typing import Final
 
 import numpy as np
 
 from tactile_bayes.declarations import Record
-from tactile_bayes.geometry import rotation_from_quaternion
+from tactile_bayes.geometry import FloatArray, rotation_from_quaternion
 from tactile_bayes.hardware import head
 from tactile_bayes.hardware.head import PacketParser
 from tactile_bayes.hardware.readings import MM_PER_INCH, HelloReading, PoseReading
@@ -57,48 +57,19 @@ class Faults(Record):
         return bytes(changed)
 
 
-class Device(Protocol):
-    """Interface of an emulated device: it answers commands and sends records at their times."""
+class Device:
+    """An emulated device: it answers commands and sends records at their times; most wait for a command."""
 
-    @property
-    def times_s(self) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
-        """Times of the records after the start, never falling."""
-
-    @property
-    def streaming(self) -> bool:
-        """True when the device sends, or will when the scan begins."""
-
-    @property
-    def starts(self) -> int:
-        """Number of START commands so far; each begins the scan anew."""
-
-    @property
-    def stopped(self) -> bool:
-        """True when the host's last command about sending was STOP."""
-
-    @property
-    def said_end(self) -> bool:
-        """True when the device has told the host that everything was sent, as some protocols do."""
-
-    def greet(self) -> None:
-        """React to a new connection."""
-
-    def hear(self, data: bytes) -> bytes:
-        """Process commands and return the answer."""
-
-    def record(self, index: int) -> bytes:
-        """Bytes of one record; empty for a record left out."""
-
-    def end(self, sent: int, dropped: int) -> bytes:
-        """Last message, after which the device no longer streams."""
-
-
-class _Sender:
-    """State of a streaming device: started or stopped."""
-
-    def __init__(self) -> None:
-        self.starts = 0
-        self.streaming = self.stopped = self.said_end = False
+    times_s: FloatArray
+    """Times of the records after the start, never falling."""
+    starts = 0
+    """Number of START commands so far; each begins the scan anew."""
+    streaming = False
+    """True when the device sends, or will when the scan begins."""
+    stopped = False
+    """True when the host's last command about sending was STOP."""
+    said_end = False
+    """True when the device has told the host that everything was sent, as some protocols do."""
 
     def start(self) -> None:
         """Begin to send."""
@@ -110,14 +81,27 @@ class _Sender:
         self.streaming, self.stopped = False, True
 
     def greet(self) -> None:
-        """Do nothing: most devices wait for a command."""
+        """React to a new connection."""
+
+    def hear(self, data: bytes) -> bytes:
+        """Process commands and return the answer."""
+        raise NotImplementedError
+
+    def record(self, index: int) -> bytes:
+        """Bytes of one record; empty for a record left out, and where records are sent on request only."""
+        del index
+        return b""
+
+    def end(self, sent: int, dropped: int) -> bytes:
+        """Last message, after which the device no longer streams; empty where there is none."""
+        del sent, dropped
+        return b""
 
 
-class EmulatedHead(_Sender):
+class EmulatedHead(Device):
     """An emulated head in the open framing that sends a scan's frames at their own times."""
 
     def __init__(self, scan: Scan) -> None:
-        super().__init__()
         self.times_s = scan.frames.time_s
         self._scan = scan
         self._every = 1
@@ -132,39 +116,34 @@ class EmulatedHead(_Sender):
         return HelloReading(name, *self._scan.head.shape, saturation, rate)
 
     def hear(self, data: bytes) -> bytes:
-        """Process ASK, START and STOP."""
         answer = b""
         for packet in self._commands.feed(data):
-            if packet.kind == head.ASK:
-                answer += head.encode_hello(self.hello())
-            elif packet.kind == head.START:
+            if packet.kind == head.START:
                 self._every = max(1, packet.payload[0] if packet.payload else 1)
                 self.start()
-                answer += head.encode_hello(self.hello())
             elif packet.kind == head.STOP:
                 self.stop()
+            if packet.kind in (head.ASK, head.START):
+                answer += head.encode_hello(self.hello())
         return answer
 
     def record(self, index: int) -> bytes:
-        """Encode a FRAME."""
         if index % self._every:
             return b""
         device_us = round(self.times_s[index] * 1e6)
         return head.encode_frame(self._scan.frames.counts[index], sequence=index, device_us=device_us)
 
     def end(self, sent: int, dropped: int) -> bytes:
-        """Encode an END."""
         self.streaming, self.said_end = False, True
         return head.encode_end(sent, dropped)
 
 
-class EmulatedTracker(_Sender):
+class EmulatedTracker(Device):
     """An emulated tracker of one of `PROTOCOLS`, or in the open framing; of the poses only every `hold`-th is measured
     anew.
     """
 
     def __init__(self, poses: TrackerPoses, *, protocol: str, hold: int = 1) -> None:
-        super().__init__()
         self.times_s = poses.time_s
         self._poses = poses
         self._protocol = protocol
@@ -187,7 +166,6 @@ class EmulatedTracker(_Sender):
             self.start()
 
     def hear(self, data: bytes) -> bytes:
-        """Process start, stop and requests for one record; settings are ignored."""
         if self._protocol == "open":
             return self._hear_open(data)
         answer = b""
@@ -213,7 +191,6 @@ class EmulatedTracker(_Sender):
         return answer
 
     def record(self, index: int) -> bytes:
-        """Encode one record of the protocol."""
         return self._encode(self.pose(index), index)
 
     def end(self, sent: int, dropped: int) -> bytes:
@@ -251,26 +228,14 @@ def _liberty_ascii(pose: PoseReading, _: int) -> bytes:
     return f"01  {' '.join(numbers)} {_time_ms(pose)} 0\r\n".encode()
 
 
-def _bird(pose: PoseReading, _: int) -> bytes:
-    return record_bytes(_inches(pose), pose.quaternion_wxyz, scale_inch=SCALE_INCH)
-
-
-def _open(pose: PoseReading, sequence: int) -> bytes:
-    return head.encode_pose(pose, sequence=sequence)
-
-
-def _igtlink(pose: PoseReading, _: int) -> bytes:
-    return encode_transform(pose, rotation_from_quaternion(np.array(pose.quaternion_wxyz)))
-
-
 PROTOCOLS: Final[dict[str, Callable[[PoseReading, int], bytes]]] = {
     "fastrak": _fastrak,
     "fastrak-ascii": _fastrak_ascii,
     "liberty": _liberty,
     "liberty-ascii": _liberty_ascii,
-    "bird": _bird,
-    "open": _open,
-    "igtlink": _igtlink,
+    "bird": lambda pose, _: record_bytes(_inches(pose), pose.quaternion_wxyz, scale_inch=SCALE_INCH),
+    "open": lambda pose, number: head.encode_pose(pose, sequence=number),
+    "igtlink": lambda pose, _: encode_transform(pose, rotation_from_quaternion(np.array(pose.quaternion_wxyz))),
 }
 
 
@@ -298,16 +263,13 @@ def crc16(data: bytes) -> int:
     return crc
 
 
-class EmulatedNdi:
+class EmulatedNdi(Device):
     """NDI tracker that answers with the pose of the present time, counted from TSTART; it never sends unasked.
 
     Only every `hold`-th pose is measured anew. A `wireless` tool has to be described by the host first. `clock` gives
     seconds from anywhere; `elapsed` the seconds of the scan that other devices play too, None while it waits: by
     default the scan begins with TSTART.
     """
-
-    starts = 0
-    streaming = stopped = said_end = False
 
     def __init__(
         self,
@@ -327,23 +289,9 @@ class EmulatedNdi:
         self._rest = b""
 
     def hear(self, data: bytes) -> bytes:
-        """Process commands and return the answers."""
         *lines, rest = (self._rest + data).split(b"\r")
         self._rest = rest[-_LONGEST:]
         return b"".join(self._answer(line) for line in lines)
-
-    def greet(self) -> None:
-        """Do nothing on a connection."""
-
-    def record(self, index: int) -> bytes:
-        """Return nothing: records are sent on request only."""
-        del index
-        return b""
-
-    def end(self, sent: int, dropped: int) -> bytes:
-        """Return nothing: there is no last message."""
-        del sent, dropped
-        return b""
 
     def _answer(self, line: bytes) -> bytes:
         name, colon, rest = line.partition(b":")

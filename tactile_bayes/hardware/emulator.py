@@ -35,9 +35,8 @@ LINGER_S: Final = 5.0
 class Link(Protocol):
     """Interface of the device's end of a connection."""
 
-    @property
-    def url(self) -> str:
-        """URL for the host to open."""
+    url: str
+    """For the host to open."""
 
     def fileno(self) -> int:
         """File descriptor to wait on; ready for reading when a command or a connection has come."""
@@ -58,7 +57,7 @@ class Link(Protocol):
         """Close the connection at once."""
 
 
-class PtyLink:
+class PtyLink(Link):
     """A pseudo-terminal: the host opens it like a serial device."""
 
     def __init__(self) -> None:
@@ -68,7 +67,6 @@ class PtyLink:
         self.url = os.ttyname(self._far)
 
     def fileno(self) -> int:
-        """File descriptor of the device's end."""
         return self._near
 
     def connected(self) -> bool:
@@ -76,14 +74,12 @@ class PtyLink:
         return True
 
     def read(self) -> bytes:
-        """Read bytes from the host."""
         try:
             return os.read(self._near, _READ)
         except BlockingIOError:
             return b""
 
     def write(self, data: bytes) -> int:
-        """Write into the terminal's buffer as much as fits."""
         try:
             return os.write(self._near, data)
         except BlockingIOError:
@@ -107,7 +103,7 @@ class PtyLink:
         os.close(self._far)
 
 
-class TcpLink:
+class TcpLink(Link):
     """A listening socket that accepts one host at a time."""
 
     def __init__(self, host: str, port: int) -> None:
@@ -125,7 +121,6 @@ class TcpLink:
         return (self._host or self._listener).fileno()
 
     def connected(self) -> bool:
-        """True when a host is connected."""
         return self._host is not None
 
     def read(self) -> bytes:
@@ -147,7 +142,6 @@ class TcpLink:
         return data
 
     def write(self, data: bytes) -> int:
-        """Write into the socket's buffer as much as fits."""
         if self._host is None:
             return len(data)
         try:
@@ -168,7 +162,6 @@ class TcpLink:
         self.close()
 
     def close(self) -> None:
-        """Close both sockets."""
         if self._host is not None:
             self._host.close()
         self._listener.close()
