@@ -466,3 +466,34 @@ class PlanErrors(Options):
     other_miss: Annotated[
         float, Meta(ge=0, le=1, description="Share of masses that the modality compared with misses.")
     ] = 0.04
+
+
+def _text(longest: int, metavar: str, meaning: str) -> Meta:
+    return Meta(max_length=longest, description=meaning, extra={"metavar": metavar})
+
+
+class IdentityOptions(Options):
+    """Patient and study of an export.
+
+    Who was examined and when, as options or in the file of `export --worklist`; what is left out stays empty. The file
+    may also be a modality worklist item of DICOM.
+    """
+
+    patient_id: Annotated[str, _text(64, "ID", "Patient ID; in csv files the beginning of the record ID.")] = ""
+    patient_name: Annotated[str, _text(194, "FAMILY^GIVEN", "Patient's name: FAMILY^GIVEN^MIDDLE^PREFIX^SUFFIX.")] = ""
+    birth_date: Annotated[str, _text(10, "YYYY-MM-DD", "Patient's date of birth: YYYY-MM-DD.")] = ""
+    sex: Annotated[
+        Literal["F", "M", "O", ""], Meta(description="Patient's sex: F, M or O.", extra={"metavar": "F|M|O"})
+    ] = ""
+    issuer: Annotated[str, _text(64, "NAME", "Who issued the patient ID.")] = ""
+    accession: Annotated[str, _text(16, "NUMBER", "Accession number.")] = ""
+    referring_physician: Annotated[str, _text(194, "FAMILY^GIVEN", "Referring physician's name, likewise.")] = ""
+    study_id: Annotated[str, _text(16, "ID", "Study ID.")] = ""
+    study_description: Annotated[str, _text(64, "TEXT", "Study description.")] = ""
+    study_uid: Annotated[
+        str, _text(64, "UID", "Study Instance UID. Default: one that follows from the content of the maps.")
+    ] = ""
+    study_date: Annotated[
+        str, _text(25, "DATE", "Date of the exam: YYYY-MM-DD or YYYY-MM-DDTHH:MM, with +HH:MM for the zone.")
+    ] = ""
+    content_date: Annotated[str, _text(25, "DATE", "Date at which the content was made. Default: the exam's.")] = ""

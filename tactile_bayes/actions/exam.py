@@ -195,7 +195,7 @@ def export_action(
     **identity: str | None,
 ) -> None:
     """Export maps and estimates as DICOM, FHIR, NRRD (3D Slicer) or CSV (REDCap)."""
-    given = {name: value for name, value in identity.items() if value is not None}
+    given = {name: value for name, value in identity.items() if value}
     refuse_untaken(to, given)
     outputs = Outputs(output, dictionary, to=to, force=force)
     outputs.check(files=bool(files))

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from inspect import cleandoc
 from pathlib import Path
 from typing import Any, Final
 
 import click
 
-from tactile_bayes.commands.options import FORCE, JSON, METAVAR, SESSION, FigurePath, FilePath
+from tactile_bayes.commands.options import FORCE, JSON, METAVAR, SESSION, FigurePath, FilePath, takes
+from tactile_bayes.declarations import names_of
 from tactile_bayes.files.arrays_layout import layout_lines
+from tactile_bayes.options import IdentityOptions
 from tactile_bayes.presets import METHODS, NORMALISE
 
 # --- `demo`: the main steps on data that comes with the program.
@@ -111,28 +112,6 @@ def show_command(**given: Any) -> None:
 # --- `export`: write maps and estimates as the files that other systems take.
 
 _FORMATS: Final = ("dicom", "fhir", "nrrd", "csv")
-# Name of the part of an identity, metavar, help.
-_IDENTITY: Final = (
-    ("patient_id", "ID", "Patient ID; in csv files the beginning of the record ID."),
-    ("patient_name", "FAMILY^GIVEN", "Patient's name."),
-    ("birth_date", "YYYY-MM-DD", "Patient's date of birth."),
-    ("sex", "F|M|O", "Patient's sex."),
-    ("issuer", "NAME", "Who issued the patient ID."),
-    ("accession", "NUMBER", "Accession number."),
-    ("referring_physician", "FAMILY^GIVEN", "Referring physician's name."),
-    ("study_id", "ID", "Study ID."),
-    ("study_description", "TEXT", "Study description."),
-    ("study_uid", "UID", "Study Instance UID. Default: one that follows from the maps."),
-    ("study_date", "DATE", "Date of the exam: YYYY-MM-DD or YYYY-MM-DDTHH:MM, with +HH:MM for the zone."),
-    ("content_date", "DATE", "Date at which the content was made. Default: the exam's."),
-)
-
-
-def _identity_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """One option for each part of an identity."""
-    for name, metavar, text in reversed(_IDENTITY):
-        command = click.option(f"--{name.replace('_', '-')}", metavar=metavar, help=text)(command)
-    return command
 
 
 @click.command("export")
@@ -148,7 +127,7 @@ def _identity_options(command: Callable[..., Any]) -> Callable[..., Any]:
     help="Patient and study from a modality worklist item (.dcm or DICOM JSON), or from JSON of plain keys.",
 )
 @click.option("--patient-id-from-scan", is_flag=True, help="Use the scan's subject code as the patient ID.")
-@_identity_options
+@takes(IdentityOptions, *names_of(IdentityOptions))
 @click.option(
     "--dictionary", metavar="DICT.csv", type=FilePath(), help="With csv: write the data dictionary of the REDCap form."
 )

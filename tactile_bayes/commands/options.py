@@ -249,7 +249,7 @@ def _option(record: type[Record], name: str, attributes: Mapping[str, Any]) -> D
     else:
         bare = value_kind(kind)
         pairs = get_origin(bare) is tuple and get_args(bare)[1:] == (...,)
-        shown = default is not None and default != ()
+        shown = default not in (None, (), "")
         of_field |= {"type": FilePath() if extra.get("path") else _click_type(get_args(bare)[0] if pairs else kind)}
         of_field |= {"multiple": True} if pairs else {}
         of_field |= {"default": default, "show_default": True} if shown else {}
@@ -264,7 +264,7 @@ def _click_type(kind: Any) -> Any:
     if words := [word for one in get_args(bare) if get_origin(one) is Literal for word in get_args(one)]:
         return NumberOr(*words, number=int if int in map(value_kind, get_args(bare)) else float)
     if get_origin(bare) is Literal:
-        return click.Choice(get_args(bare))
+        return click.Choice([one for one in get_args(bare) if one])
     if get_origin(bare) is tuple:
         return tuple(map(_click_type, get_args(bare)))
     if bare not in (int, float):

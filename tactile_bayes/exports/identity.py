@@ -9,23 +9,21 @@ import re
 import warnings
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal
+from typing import Any, Final
 
-from tactile_bayes.declarations import Meta, Record, as_dict, names_of, replace
+from tactile_bayes.declarations import Record, as_dict, names_of, replace
 from tactile_bayes.errors import BadDataError, TactileBayesError, UsageError
 from tactile_bayes.exports.exam import required
 from tactile_bayes.files.documents import load_json, parse_record
 from tactile_bayes.files.reading import read_bytes
+from tactile_bayes.options import IdentityOptions
 
 # --- Who was examined, and when: only what the user or a worklist says, checked against what the formats can hold.
 
-SEXES: Final = ("F", "M", "O")
 _MOMENT: Final = re.compile(
     r"(\d{4})-(\d{2})-(\d{2})(?:[T ](\d{2}):(\d{2})(?::(\d{2}))?(Z|[+-]\d{2}:\d{2})?)?", re.ASCII
 )
 _UID: Final = re.compile(r"(0|[1-9]\d*)(\.(0|[1-9]\d*))+", re.ASCII)
-# Most characters of a value (PS3.5 6.2: LO, SH); a name's is of each of its groups.
-_LONGEST: Final = {"patient_id": 64, "issuer": 64, "accession": 16, "study_id": 16, "study_description": 64}
 _NAMES: Final = ("patient_name", "referring_physician")
 
 
@@ -70,38 +68,16 @@ class Moment(Record):
         return f"{self.iso_date}T{self.time[:2]}:{self.time[2:4]}:{seconds}{self.zone[:3]}:{self.zone[3:]}"
 
 
-class Identity(Record):
-    """Identity of patient and study; empty where nobody gave it."""
-
-    patient_id: str = ""
-    patient_name: str = ""
-    birth_date: str = ""
-    """``YYYY-MM-DD``."""
-    sex: str = ""
-    """``F``, ``M`` or ``O``."""
-    issuer: str = ""
-    """`patient_id`, `issuer`: Patient ID and who issued it."""
-    accession: str = ""
-    referring_physician: str = ""
-    """`patient_name`, `referring_physician`: As ``FAMILY^GIVEN^MIDDLE^PREFIX^SUFFIX``."""
-    study_id: str = ""
-    study_description: str = ""
-    study_uid: str = ""
-    """`accession`, `study_id`, `study_description`, `study_uid`: Of the study."""
-    study_date: str = ""
-    content_date: str = ""
-    """`study_date`, `content_date`: When the exam was, and when its content was made (as the exam where it is not
-    given); see `Moment.of`.
-    """
+class Identity(IdentityOptions):
+    """Identity of patient and study that the formats can hold; empty where nobody gave it."""
 
     def __post_init__(self) -> None:
         for name in names_of(self):
             _check_text(name, getattr(self, name))
         for name in _NAMES:
             _check_name(name, getattr(self, name))
-        if self.sex not in ("", *SEXES):
-            raise UsageError(f"sex is {_short(self.sex)}; give one of {', '.join(SEXES)}, or nothing")
-        if self.study_uid and (len(self.study_uid) > 64 or not _UID.fullmatch(self.study_uid)):
+        super().__post_init__()
+        if self.study_uid and not _UID.fullmatch(self.study_uid):
             raise UsageError(
                 f"study_uid is {_short(self.study_uid)}; give numbers with points between, at most 64 characters"
             )
@@ -144,9 +120,6 @@ def _check_text(name: str, value: str) -> None:
         )
     if value != value.strip():
         raise UsageError(f"{name} is {_short(value)}; leave out the blanks around it")
-    longest = _LONGEST.get(name)
-    if longest is not None and len(value) > longest:
-        raise UsageError(f"{name} has {len(value)} characters; at most {longest} fit")
 
 
 def _check_name(name: str, value: str) -> None:
@@ -178,39 +151,7 @@ _ATTRIBUTES: Final = {
 _TAG: Final = re.compile(r"[0-9A-Fa-f]{8}")
 
 
-class Worklist(Record):
-    """Worklist of an export.
-
-    Who was examined and when, for `export --worklist`; what is left out stays empty. The file may also be a modality
-    worklist item of DICOM.
-    """
-
-    patient_id: Annotated[str, Meta(max_length=64, description="Patient ID.")] = ""
-    patient_name: Annotated[str, Meta(max_length=194, description="FAMILY^GIVEN^MIDDLE^PREFIX^SUFFIX.")] = ""
-    birth_date: Annotated[str, Meta(max_length=10, description="YYYY-MM-DD.")] = ""
-    sex: Annotated[Literal["F", "M", "O", ""], Meta(description="F, M or O.")] = ""
-    issuer: Annotated[str, Meta(max_length=64, description="Who issued the patient ID.")] = ""
-    accession: Annotated[str, Meta(max_length=16, description="Accession number.")] = ""
-    referring_physician: Annotated[str, Meta(max_length=194, description="FAMILY^GIVEN.")] = ""
-    study_id: Annotated[str, Meta(max_length=16, description="Study ID.")] = ""
-    study_description: Annotated[str, Meta(max_length=64, description="Study description.")] = ""
-    study_uid: Annotated[
-        str, Meta(max_length=64, description="Study Instance UID. Without it, one that follows from the content.")
-    ] = ""
-    study_date: Annotated[
-        str,
-        Meta(
-            max_length=25,
-            description="When the exam was: YYYY-MM-DD or YYYY-MM-DDTHH:MM, with +HH:MM for the time zone if it is "
-            "known.",
-        ),
-    ] = ""
-    content_date: Annotated[
-        str, Meta(max_length=25, description="When the content was made, in the same form. Without it, `study_date`.")
-    ] = ""
-
-
-def identity_of(worklist: Path | None, given: Mapping[str, str]) -> Identity:
+def identity_of(worklist: Path | None, given: Mapping[str, Any]) -> Identity:
     """The identity that a worklist gives, where there is one, with what is given besides."""
     return Identity(**given) if worklist is None else read_worklist(worklist).with_options(given)
 
@@ -229,11 +170,11 @@ def read_worklist(path: Path) -> Identity:
         raise BadDataError("is no worklist item", way_out=_WAY_OUT, path=str(path))
     if document and all(_TAG.fullmatch(key) for key in document):
         return _identity(_of_dicom(_from_dicom_json(document, path), path), path)
-    found = as_dict(parse_record(document, Worklist, path=path))
+    found = as_dict(parse_record(document, IdentityOptions, path=path))
     return _identity({name: value for name, value in found.items() if value}, path)
 
 
-def _identity(given: dict[str, str], path: Path) -> Identity:
+def _identity(given: dict[str, Any], path: Path) -> Identity:
     try:
         return Identity(**given)
     except UsageError as error:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Final, Literal, get_args
+from typing import Any, Final, Literal, get_args
 
 from tactile_bayes.declarations import Record, names_of, replace
 from tactile_bayes.errors import UsageError
@@ -136,7 +136,7 @@ def export(
     """
     maps, estimates = _sorted(files)
     check_pairs(maps, estimates)
-    given = {name: value for name, value in identity.given.items() if name in TAKES[to]}
+    given: dict[str, Any] = {name: value for name, value in identity.given.items() if name in TAKES[to]}
     if to == "csv":
         return _csv(maps, estimates, Identity(**given), id_from_scan=id_from_scan)
     if to == "nrrd":

@@ -132,10 +132,12 @@ def test_a_missing_extra_is_named_with_its_command(
 
 def test_the_command_offers_every_format() -> None:
     from tactile_bayes.commands import exam as export
+    from tactile_bayes.declarations import names_of
     from tactile_bayes.exports import run
+    from tactile_bayes.options import IdentityOptions
 
     assert export._FORMATS == run.FORMATS
-    assert tuple(name for name, _, _ in export._IDENTITY) == run.TAKES["dicom"]
+    assert names_of(IdentityOptions) == run.TAKES["dicom"]
 
 
 def test_the_guide_lists_the_codes_of_the_own_scheme() -> None:
