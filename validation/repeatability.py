@@ -172,7 +172,7 @@ def _site(row: Row, rng: np.random.Generator) -> dict[str, float]:
         ("one map (default, if exams differ by 15 %)", new, PAPER),
     ):
         noise = float(exam.noise[0])
-        half = half_width(by.grid, by.density(np.zeros(1), exam.noise[:1]), noise)
+        half = half_width(by.grid, by.density(), noise)
         held |= {name: _holds(float(exam.centre[0]), half), f"{name} half": half}
     held["three maps of a new mass (site's file)"] = _pooled_holds(prior, new)
     held["three maps of a mass of the file (site's file)"] = _pooled_holds(prior, exams[-1])
@@ -207,7 +207,7 @@ def _holds(centre: float, half: float) -> float:
 
 def _pooled_holds(between: BetweenMaps, exams: RepeatedExams) -> float:
     """The same of the maps of a mass pooled, as `size.pooling` weighs them, over fixed draws of the body."""
-    weights, tau2 = between.density(exams.centre, exams.noise), between.grid**2
+    weights, tau2 = between.density((exams.centre, exams.noise)), between.grid**2
     share_of = 1.0 / (exams.noise[:, None] + tau2)
     share_of /= share_of.sum(axis=0)
     mean = share_of.T @ exams.centre

@@ -242,7 +242,7 @@ def _another(
 ) -> SizePosterior:
     """The sizes with a spread between exams beside what one exam has, a factor that both axes share."""
     points = paired_points(size.max_size_mm, size.replicates, 2, rng)
-    tau = between.at(points[:, 0], np.zeros(1), np.zeros(1))
+    tau = between.at(points[:, 0])
     factor = np.exp(tau * normal_quantile(points[:, 1]))
     return replace(
         size,

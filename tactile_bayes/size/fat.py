@@ -222,19 +222,19 @@ class BetweenMaps(Record):
         """Grid of tau values."""
         return np.array([self.sd]) if self.sd <= 0 or self.log_sd <= 0 else _GRID
 
-    def density(self, centre: FloatArray, noise: FloatArray) -> FloatArray:
-        """Posterior weights on `grid`, from (k,) means and variances of the maps' log sizes."""
+    def density(self, *visits: tuple[FloatArray, FloatArray]) -> FloatArray:
+        """Posterior weights on `grid`, from (k,) means and variances of the log sizes by the maps of each visit."""
         grid = self.grid
         if len(grid) == 1:
             return np.ones(1)
-        log = restricted_log_likelihood(centre, noise, grid)
-        log -= 0.5 * (np.log(grid / self.median) / self.log_sd) ** 2
+        log = -0.5 * (np.log(grid / self.median) / self.log_sd) ** 2
+        log += sum(restricted_log_likelihood(centre, noise, grid) for centre, noise in visits)
         density = np.exp(log - log.max())  # even steps in ln tau, in which the prior is normal
         return np.asarray(density / density.sum())
 
-    def at(self, points: FloatArray, centre: FloatArray, noise: FloatArray) -> FloatArray:
+    def at(self, points: FloatArray, *visits: tuple[FloatArray, FloatArray]) -> FloatArray:
         """(n,) draws of tau from its posterior by uniform points."""
-        edges = np.cumsum(self.density(centre, noise))
+        edges = np.cumsum(self.density(*visits))
         return np.asarray(self.grid[np.minimum(np.searchsorted(edges, points), len(self.grid) - 1)])
 
 
@@ -257,7 +257,7 @@ def outlying_maps(centre: FloatArray, noise: FloatArray, prior: BetweenMaps) -> 
     outlying = []
     for i in range(len(centre)):
         others = np.delete(centre, i), np.delete(noise, i)
-        tau2 = float(prior.density(*others) @ prior.grid**2)
+        tau2 = float(prior.density(others) @ prior.grid**2)
         weight = 1.0 / (others[1] + tau2)
         expected, variance = float(weight @ others[0] / weight.sum()), float(1.0 / weight.sum() + noise[i] + tau2)
         if abs(centre[i] - expected) > OUTLYING * np.sqrt(variance):
@@ -277,8 +277,7 @@ def one_size_probability(centre: FloatArray, noise: FloatArray, between: Between
     """
     if len(centre) < 2:
         return 1.0
-    prior = between.density(np.zeros(1), np.zeros(1))
-    return float(prior @ apart_by_chance(centre, noise, between.grid))
+    return float(between.density() @ apart_by_chance(centre, noise, between.grid))
 
 
 def one_size_of(log_sizes: Sequence[FloatArray], known: BetweenMaps | None) -> float:

@@ -224,7 +224,7 @@ class _Pool(Record, eq=False, dict=True):
 
     def size(self, between: BetweenMaps) -> SizePosterior:
         """Sizes under a prior of the spread between maps."""
-        tau = between.at(self.points[:, 1], self.drawn.centre, self.drawn.noise)
+        tau = between.at(self.points[:, 1], (self.drawn.centre, self.drawn.noise))
         maps = self.drawn.weighted(tau)
         known, variances = self._left_open(maps)
         longer = np.hypot(self.half[:, 0], self.half[:, 1])

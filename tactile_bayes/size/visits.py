@@ -321,7 +321,7 @@ def joint_sizes(
     parts = [MassMaps.of(used[end - len(maps) : end], at) for maps, end, at in zip(visits, ends, fitted, strict=True)]
     middle = np.mean([one.by_map.mean(axis=0) for one in parts], axis=0)
     points = paired_points(middle, replicates, DIMENSIONS, rng)
-    tau = _shared_tau(between, parts, points[:, 0])
+    tau = between.at(points[:, 0], *[(one.centre, one.noise) for one in parts])  # one for all visits
     sizes = [one for maps, at in zip(visits, fitted, strict=True) for one in log_sizes(at, maps)]
     oval, _ = lump_shape(fitted[0], flat, sizes, priors.shape)
     half = oval.at(points[:, 2:5])
@@ -349,16 +349,6 @@ def visit_calibrations(visits: Sequence[Sequence[ShapeDraws]], calibration: Body
     fitted = [calibration.for_maps(maps) for maps in visits]
     without = [one for one in fitted if one.fat_mm is None]
     return [without[0]] * len(fitted) if without else fitted
-
-
-def _shared_tau(between: BetweenMaps, parts: Sequence[MassMaps], points: FloatArray) -> FloatArray:
-    """(n,) draws of the spread between exams of a visit, which the maps of all visits tell together."""
-    prior = between.density(np.zeros(1), np.zeros(1))
-    density = prior.copy()
-    for one in parts:
-        density *= between.density(one.centre, one.noise) / np.maximum(prior, 1e-300)
-    edges = np.cumsum(density / density.sum())
-    return np.asarray(between.grid[np.minimum(np.searchsorted(edges, points), len(edges) - 1)])
 
 
 def _covariance(
