@@ -159,16 +159,8 @@ def _too_soft(rows: Table, i: int) -> str | None:
 
 def _check_recipe(rows: Table, calibration: BodyCalibration, declared: Mapping[str, Any]) -> None:
     """Refuse a table of maps that were made or fitted otherwise than the calibration's."""
-    recipe, ours = table_recipe(rows, declared), calibration.recipe
-    differs = ours.differences(
-        normalise=recipe.normalise,
-        background=recipe.background,
-        radius_mm=recipe.radius_mm,
-        noise=recipe.noise,
-        flat_field=recipe.flat_field,
-        head=recipe.head,
-    )
-    if differs:
+    ours = calibration.recipe
+    if differs := ours.differences(table_recipe(rows, declared)):
         raise BadDataError(
             f"its maps were made by another recipe: {'; '.join(differs)}",
             way_out=f"a correction needs maps made with {ours.map_command}, fitted by `estimate` with the calibration "

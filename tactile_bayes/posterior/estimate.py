@@ -210,14 +210,17 @@ def calibration_for(tactile_map: TactileMap, calibration: Calibration) -> Calibr
 
 def recipe_differences(tactile_map: TactileMap, calibration: Calibration, fit: SamplerSettings) -> list[str]:
     """Differences of a map and its fit options from the calibration's recipe, in words; empty without any."""
-    return calibration.recipe.differences(
-        normalise=tactile_map.recipe.normalise,
+    ours, made = calibration.recipe, tactile_map.recipe
+    theirs = replace(
+        ours,
+        normalise=made.normalise,
         background=fit.background,
         radius_mm=fit.fit_radius_mm,
         noise=fit.noise,
-        flat_field=tactile_map.recipe.flat_field_known,
+        flat_field=made.flat_field_known,
         head=tactile_map.head,
     )
+    return ours.differences(theirs)
 
 
 def check_recipe(tactile_map: TactileMap, calibration: Calibration, fit: SamplerSettings) -> None:

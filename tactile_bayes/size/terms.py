@@ -100,27 +100,21 @@ class Recipe(Record):
         HeadShape | None, Meta(description="Head that the maps were made with; null where nobody says.")
     ] = None
 
-    def differences(
-        self,
-        *,
-        normalise: str,
-        background: str,
-        radius_mm: float,
-        noise: str,
-        flat_field: bool | None = None,
-        head: HeadShape | None = None,
-    ) -> list[str]:
+    @property
+    def _settings(self) -> dict[str, str]:
+        """What is known of it, in words."""
+        radius = f"{self.radius_mm:g} mm"
+        known = {
+            "normalise": self.normalise, "background": self.background, "fit radius": radius, "noise": self.noise
+        }  # fmt: skip
+        return known if self.flat_field is None else known | {"flat field": "on" if self.flat_field else "off"}
+
+    def differences(self, other: Recipe) -> list[str]:
         """Differences from another recipe in words; empty without any. Unknown settings do not differ."""
-        pairs = [
-            ("normalise", self.normalise, normalise),
-            ("background", self.background, background),
-            ("fit radius", f"{self.radius_mm:g} mm", f"{radius_mm:g} mm"),
-            ("noise", self.noise, noise),
-        ]
-        if self.flat_field is not None and flat_field is not None:
-            pairs.append(("flat field", _ON[self.flat_field], _ON[flat_field]))
-        texts = [f"{name} {theirs} (the calibration: {ours})" for name, ours, theirs in pairs if ours != theirs]
-        return texts + self.head_differences(head)
+        theirs = other._settings
+        pairs = [(name, ours, theirs.get(name, ours)) for name, ours in self._settings.items()]
+        texts = [f"{name} {that} (the calibration: {ours})" for name, ours, that in pairs if that != ours]
+        return texts + self.head_differences(other.head)
 
     def head_differences(self, head: HeadShape | None) -> list[str]:
         """In what a map's head departs from the calibration's; empty where one of them is unknown."""
@@ -133,13 +127,8 @@ class Recipe(Record):
 
     def __str__(self) -> str:
         """The recipe in one line."""
-        parts = [f"normalise {self.normalise}", f"background {self.background}", f"fit radius {self.radius_mm:g} mm"]
-        parts += [f"noise {self.noise}"]
-        parts += [] if self.flat_field is None else [f"flat field {_ON[self.flat_field]}"]
+        parts = [f"{name} {value}" for name, value in self._settings.items()]
         return ", ".join(parts if self.head is None else [*parts, f"head {self.head}"])
-
-
-_ON: Final = {True: "on", False: "off"}
 
 
 class RoundLumps(Record, eq=False):

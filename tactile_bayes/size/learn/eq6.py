@@ -228,7 +228,7 @@ class OtherFit(Record):
     """The same rows by the other of the two fits, joint or two-stage."""
 
     name: str
-    coefficients: tuple[tuple[float, float, float, float], ...]
+    coefficients: tuple[tuple[float, ...], ...]
     """m, b (mm), e, f of each axis."""
     difference: tuple[float, ...]
     """Mean absolute difference of the two fits' sizes over the rows, as a share of the true size, of each axis."""
@@ -268,11 +268,7 @@ def other_fit(calibration: SizeCalibration, table: SizeTable) -> OtherFit | None
     for (axis, data), other in zip(pairs, others, strict=True):
         ours, theirs = (one.size_mm(data.sigma_mm, data.amplitude) for one in (axis, other))
         differences.append(float(np.mean(np.abs(ours - theirs) / data.d_mm)))
-    coefficients = []
-    for one in others:
-        m, b, e, f = (float(value) for value in one.draws[0, :4])
-        coefficients.append((m, b, e, f))
-    return OtherFit(name, tuple(coefficients), tuple(differences))
+    return OtherFit(name, tuple(tuple(one.draws[0, :4].tolist()) for one in others), tuple(differences))
 
 
 def is_two_stage(calibration: SizeCalibration) -> bool:
