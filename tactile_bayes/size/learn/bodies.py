@@ -14,7 +14,6 @@ from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
-from scipy.optimize import least_squares
 from scipy.special import ndtri
 
 from tactile_bayes.declarations import Record, replace
@@ -61,19 +60,18 @@ def learn_population(
     """
     check_population(table)
     rows = TableRows.of(table)
-    maps = rows.maps
-    eq6 = fit_eq6(maps, rows.eq6)
+    eq6 = fit_eq6(rows)
     left = eq6.data.mean_log_d - eq6.data.mean_terms @ eq6.mean
     left = left / (1.0 - leverages(eq6.data.mean_terms)[1])  # each body left out of the fit
-    size, slope = eq6.rows.log_size(eq6.mean), eq6.rows.map_slopes(eq6.mean)
-    exam, noise = _exams(maps, eq6, size, slope)
+    size, slope = rows.log_size(eq6.mean), rows.map_slopes(eq6.mean)
+    exam, noise = _exams(rows, eq6, size, slope)
     fitted = None
     if residual and rows.depth is not None:
         fitted = fit_residual(BodiesLeft(rows.of_bodies(eq6.data), rows.spread_terms(eq6.data), left, noise))
         steps = np.eye(3)[:2] * _STEP  # along u and v
         slopes = [(fitted.at(rows.values + h) - fitted.at(rows.values - h)) / (2 * _STEP) for h in steps]
         size, slope = size + fitted.at(rows.values), slope + np.stack(slopes)
-        exam, noise = _exams(maps, eq6, size, slope)
+        exam, noise = _exams(rows, eq6, size, slope)
         left, noise = left - fitted.predicted, noise + fitted.variance
     return _calibration(rows, eq6, fitted, exam, left=left, noise=noise, recipe=recipe, source=source)
 
@@ -92,30 +90,25 @@ class TableRows(Record, eq=False):
     @classmethod
     def of(cls, table: PopulationTable) -> TableRows:
         """The rows with a profile, or all where too few bodies have one."""
-        known = None
+        maps, depth, log_depth = table, None, np.zeros(len(table))
         if table.profile is not None and table.log_fat is not None:
-            known = table.rows(np.isfinite(table.profile.sum(axis=1)))
-            known = known if len(np.unique(known.body)) >= LEAST_BODIES else None
-        if known is None or known.profile is None or known.log_fat is None:
-            centre = Centre(_rounded_mean(table.log_amplitude), _rounded_mean(table.log_width), 0.0)
-            u, v = table.log_amplitude - centre.log_amplitude, table.log_width - centre.log_width
-            return cls(table, None, centre, np.column_stack([u, v, np.zeros(len(table))]))
-        depth = learn_depth(known.profile, known.log_fat)
-        log_depth = depth.log_depth(known.profile)
-        means = (_rounded_mean(one) for one in (known.log_amplitude, known.log_width, log_depth))
-        centre = Centre(*means)
-        u, v = known.log_amplitude - centre.log_amplitude, known.log_width - centre.log_width
-        w = log_depth - centre.log_fat
-        x = monomials((u, v), powers(2))  # what amplitude and width lead one to expect of w
-        expected = np.asarray(np.linalg.lstsq(x, w, rcond=None)[0])
-        depth = replace(depth, expected=expected, expected_sd=float(np.std(w - x @ expected)))
-        return cls(known, depth, centre, np.column_stack([u, v, w]))
+            told = np.isfinite(table.profile.sum(axis=1))
+            if len(np.unique(table.body[told])) >= LEAST_BODIES:
+                maps, depth = table.rows(told), learn_depth(table.profile[told], table.log_fat[told])
+                log_depth = depth.log_depth(table.profile[told])
+        rows = np.column_stack([maps.log_amplitude, maps.log_width, log_depth])
+        centre = [round(float(column.mean()), 3) for column in rows.T]
+        values = rows - centre
+        if depth is not None:
+            x = monomials(list(values.T[:2]), powers(2))  # what amplitude and width lead one to expect of w
+            expected = np.asarray(np.linalg.lstsq(x, values[:, 2], rcond=None)[0])
+            depth = replace(depth, expected=expected, expected_sd=float(np.std(values[:, 2] - x @ expected)))
+        return cls(maps, depth, Centre(*centre), values)
 
     @property
-    def eq6(self) -> Eq6Rows:
-        """As Eq 6 takes them."""
-        u, v, w = self.values.T
-        return Eq6Rows(u, v, w, PLAIN if self.depth is None else BY_DEPTH)
+    def eq6_powers(self) -> Powers:
+        """Those of `Eq6Law`."""
+        return PLAIN if self.depth is None else BY_DEPTH
 
     @property
     def feature_powers(self) -> Powers:
@@ -134,6 +127,25 @@ class TableRows(Record, eq=False):
     def spread_terms(self, data: BodyRegression) -> FloatArray:
         """(b, s) terms of ln SD(B) at these."""
         return monomials(list(self.of_bodies(data).T), self.spread_powers)
+
+    def log_size(self, theta: FloatArray, *, du: float = 0.0, dv: float = 0.0) -> FloatArray:
+        """(n,) ln d by Eq 6 of the maps, moved by `du` and `dv`."""
+        u, v, w = self.values.T
+        return eq6_log_size(u + du, v + dv, w, theta, self.eq6_powers)
+
+    def map_slopes(self, theta: FloatArray) -> FloatArray:
+        """(2, n) derivatives of the same by ln a and p, by central differences."""
+        h = _STEP
+        by_u = self.log_size(theta, du=h) - self.log_size(theta, du=-h)
+        by_v = self.log_size(theta, dv=h) - self.log_size(theta, dv=-h)
+        return np.stack([by_u, by_v]) / (2 * h)
+
+    def tangent(self, theta: FloatArray) -> BodyRegression:
+        """The regression of ln d on the tangent of Eq 6 at these coefficients."""
+        u, v, w = self.values.T
+        terms = eq6_terms(u, v, w, theta, self.eq6_powers)
+        constant = self.log_size(theta) - terms @ theta
+        return BodyRegression.linear(self.maps, terms, u=u, constant=constant, slope=self.map_slopes(theta))
 
 
 def learn_depth(profile: FloatArray, log_fat: FloatArray) -> FatDepth:
@@ -158,13 +170,10 @@ def learn_depth(profile: FloatArray, log_fat: FloatArray) -> FatDepth:
     )
 
 
-def _rounded_mean(values: FloatArray) -> float:
-    return round(float(values.mean()), 3)
-
-
-def _exams(maps: PopulationTable, eq6: Eq6Fit, size: FloatArray, slope: FloatArray) -> tuple[ExamSpread, FloatArray]:
+def _exams(rows: TableRows, eq6: Eq6Fit, size: FloatArray, slope: FloatArray) -> tuple[ExamSpread, FloatArray]:
     """Spread between exams, and (b,) variance of each body's ln d by its exams and the coefficients of Eq 6."""
-    data = BodyRegression.linear(maps, eq6.data.terms, u=eq6.rows.u, constant=eq6.data.constant, slope=slope)
+    u = rows.values[:, 0]
+    data = BodyRegression.linear(rows.maps, eq6.data.terms, u=u, constant=eq6.data.constant, slope=slope)
     exam = data.exam_spread(size)
     coefficients = np.sum(data.mean_terms @ eq6.covariance * data.mean_terms, axis=1)
     return exam, (exam.sd**2 + data.mean(data.map_variance)) / data.exams + coefficients
@@ -190,7 +199,7 @@ def _calibration(
     spreads = {"body_sd": float(np.median(body_sd)), "exam_sd": exam.sd}
     calibration = BodyCalibration(
         centre=rows.centre,
-        eq6=Eq6Law(eq6.rows.powers, eq6.mean, eq6.covariance, _log_amplitude_one_deep(maps)),
+        eq6=Eq6Law(rows.eq6_powers, eq6.mean, eq6.covariance, _log_amplitude_one_deep(maps)),
         residual=None if fitted is None else fitted.residual,
         spread=Spread(rows.spread_powers, spread, of_spread, exam.log_sd, exam.variance, 0.0, ""),
         round_lumps=learn_round(maps, monomials(list(rows.values.T), rows.spread_powers)),
@@ -224,72 +233,48 @@ def _log_amplitude_one_deep(table: PopulationTable) -> float:
     return float(np.linalg.lstsq(design, table.log_amplitude, rcond=None)[0][0])
 
 
-class Eq6Rows(Record, eq=False):
-    """Maps of a table as Eq 6 takes them: (n,) u, v and w, which is 0 where the depth of fat plays no part."""
-
-    u: FloatArray
-    v: FloatArray
-    w: FloatArray
-    powers: Powers
-
-    def tangent(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(n, k) slopes of ln d by the coefficients, and (n,) what the tangent has at zero coefficients."""
-        terms = eq6_terms(self.u, self.v, self.w, theta, self.powers)
-        return terms, self.log_size(theta) - terms @ theta
-
-    def log_size(self, theta: FloatArray, *, du: float = 0.0, dv: float = 0.0) -> FloatArray:
-        """(n,) ln d of the maps, moved by `du` and `dv`."""
-        return eq6_log_size(self.u + du, self.v + dv, self.w, theta, self.powers)
-
-    def map_slopes(self, theta: FloatArray) -> FloatArray:
-        """(2, n) derivatives of ln d by ln a and p, by central differences."""
-        h = _STEP
-        by_u = self.log_size(theta, du=h) - self.log_size(theta, du=-h)
-        by_v = self.log_size(theta, dv=h) - self.log_size(theta, dv=-h)
-        return np.stack([by_u, by_v]) / (2 * h)
-
-
 class Eq6Fit(Record, eq=False):
     """Posterior of Eq 6's k coefficients, taken as normal, and the regression on the tangent at its mean."""
 
-    rows: Eq6Rows
     mean: FloatArray
     covariance: FloatArray
     data: BodyRegression
 
 
-def fit_eq6(table: PopulationTable, rows: Eq6Rows) -> Eq6Fit:
+def fit_eq6(rows: TableRows) -> Eq6Fit:
     """The regression on the tangent at the mode, and the posterior's mean and covariance."""
-    theta = _least_squares(table, rows)
+    theta = _least_squares(rows)
     for _ in range(_MOST_TANGENTS):
-        data = _regression(table, rows, theta)
+        data = rows.tangent(theta)
         mean, covariance = data.posterior()
         step = mean - theta
         theta = mean
         if np.abs(data.mean_terms @ step).max() < _CLOSE:
-            return Eq6Fit(rows, mean, covariance, data)
+            return Eq6Fit(mean, covariance, data)
     raise NotConvergedError("the coefficients of Eq 6 have no mode in this table")
 
 
-def _least_squares(table: PopulationTable, rows: Eq6Rows) -> FloatArray:
-    """(k,) coefficients by least squares of the bodies' means, for the tangents to begin at."""
+def _least_squares(rows: TableRows) -> FloatArray:
+    """(k,) coefficients by least squares of the bodies' means: Gauss-Newton steps, halved while they lead uphill."""
+    theta = np.zeros(len(rows.eq6_powers))
+    theta[rows.eq6_powers.index((MU, 0, 0))] = np.log(rows.maps.d_mm).mean()
+    theta[rows.eq6_powers.index((F, 0, 0))] = -0.3
+    for _ in range(_MOST_TANGENTS):
+        data = rows.tangent(theta)
+        step = data.least_squares() - theta
+        if np.abs(data.mean_terms @ step).max() < _CLOSE:
+            return theta
+        most = _misfit(data, theta) * (1.0 + 1e-12)
+        while _misfit(rows.tangent(theta + step), theta + step) > most:
+            step = step / 2.0
+        theta = theta + step
+    raise NotConvergedError("Eq 6 does not fit this table")
 
-    def left(theta: FloatArray) -> FloatArray:
-        data = _regression(table, rows, theta)
-        return data.mean_log_d - data.mean_terms @ theta
 
-    start = np.zeros(len(rows.powers))
-    start[rows.powers.index((MU, 0, 0))] = np.log(table.d_mm).mean()
-    start[rows.powers.index((F, 0, 0))] = -0.3
-    found = least_squares(left, start, x_scale="jac")
-    if not found.success:
-        raise NotConvergedError("Eq 6 does not fit this table")
-    return np.asarray(found.x)
-
-
-def _regression(table: PopulationTable, rows: Eq6Rows, theta: FloatArray) -> BodyRegression:
-    terms, constant = rows.tangent(theta)
-    return BodyRegression.linear(table, terms, u=rows.u, constant=constant, slope=rows.map_slopes(theta))
+def _misfit(data: BodyRegression, theta: FloatArray) -> float:
+    """Sum of squares where the tangent touches; infinite where a row has no size."""
+    total = float(np.sum((data.mean_log_d - data.mean_terms @ theta) ** 2))
+    return total if np.isfinite(total) else float("inf")
 
 
 class Sized(Record):

@@ -77,7 +77,7 @@ def test_the_log_normal_gives_single_maps_the_intervals_of_the_whole_posterior()
         z = rng.standard_normal(400_000)
         whole = GRID[rng.choice(len(GRID), z.size, p=learned.density)]
         prior = learned.repeatability.between_maps
-        fitted = prior.at(rng.uniform(size=z.size), np.zeros(1), np.ones(1))
+        fitted = prior.at(rng.uniform(size=z.size))
         ends = [np.quantile(np.abs(np.hypot(0.07, tau) * z), 0.95) for tau in (whole, fitted)]
         assert ends[1] == pytest.approx(ends[0], rel=0.01)
 
