@@ -3,8 +3,9 @@
     python -m validation own_trial make DIR [--seed N]    # scans of 24 masses, three exams each, and truth.csv
     python -m validation own_trial run DIR     # map, estimate each map and all (--pool), validate, by the command line
 
-Making it takes 6 to 15 min. The trials of the seeds 20261121 (default) and 20261122 were looked at while the program
-was made; that of 20261205 was made and looked at once, when all was fixed (record 0068); another seed's was not.
+Making it takes 6 to 15 min of CPU. The trials of the seeds 20261121 (default) and 20261122 were looked at while the
+program was made; those of 20261205 (record 0068) and 20261123 (docs/accuracy.md) once, when all was fixed; another
+seed's was not.
 
 What differs from `forward.population`: seats are centred or resting, seldom between; fat, gland and thickness follow
 normal distributions about other means; Poisson's ratio is 0.49; some lumps are spheroids, some bodies hold a second
@@ -19,6 +20,7 @@ from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -28,6 +30,8 @@ from tactile_bayes.forward.tissue import SceneBody, SolidLump
 from validation.common import errors_of, keep_scan, parser, program, run
 
 MASSES, EMPTY, EXAMS, SEED = 22, 2, 3, 20261121
+Size = tuple[float, float, float, float]
+"""True size, median and interval, mm."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,7 +139,8 @@ def make(folder: Path, workers: int, seed: int) -> None:
 def run_trial(folder: Path, options: list[str]) -> None:
     """Size every mass by the command line and print the trial's report."""
     truth = {row["mass"]: row for row in csv.DictReader((folder / "truth.csv").open())}
-    rows, alone, false_sizes = [], [], 0
+    rows, false_sizes = [], 0
+    sizes: dict[str, list[Size]] = {}
     for name, what in truth.items():
         maps = []
         for i in range(EXAMS):
@@ -152,11 +157,21 @@ def run_trial(folder: Path, options: list[str]) -> None:
             continue
         true = max(float(what["d_mm"]), float(what["height_mm"]))
         rows.append((name, true, size, what["note"], document["reason"]))
-        for one in maps:
-            exam = json.loads(run("estimate", one, "--json", *options, codes=(0, 6)))["max_size_mm"]
-            alone += [] if exam is None else [(true, exam["median"], exam["low"], exam["high"])]
+        alone = [json.loads(run("estimate", one, "--json", *options, codes=(0, 6))) for one in maps]
+        for label, answers in (("pooled", [document]), ("each map alone", alone)):
+            _add_sizes(sizes, label, true, answers)
     _report(rows, false_sizes, folder)
-    print(f"each map alone: {errors_of(alone)}")
+    for label, found in sizes.items():
+        print(f"{label}: {errors_of(found)}")
+
+
+def _add_sizes(sizes: dict[str, list[Size]], label: str, true: float, answers: Sequence[dict[str, Any]]) -> None:
+    """Add the sizes of answers with both of their intervals, where they have them."""
+    for one in answers:
+        another = (one.get("another_exam") or {}).get("max_size_mm")
+        for name, size in ((label, one["max_size_mm"]), (f"{label}, if exams differ more", another)):
+            if size:
+                sizes.setdefault(name, []).append((true, size["median"], size["low"], size["high"]))
 
 
 def _report(rows: list[tuple[str, float, dict[str, float] | None, str, str]], false_sizes: int, folder: Path) -> None:
