@@ -265,25 +265,22 @@ def outlying_maps(centre: FloatArray, noise: FloatArray, prior: BetweenMaps) -> 
     return tuple(outlying)
 
 
-def spread_tested(known: BetweenMaps | None) -> BetweenMaps:
-    """The spread between exams that a test supposes: the site's or a stated one, else `EXAM_SD`."""
-    return BetweenMaps(EXAM_SD, 0.0) if known is None else known
-
-
-def one_size_probability(centre: FloatArray, noise: FloatArray, between: BetweenMaps) -> float:
+def one_size_probability(centre: FloatArray, noise: FloatArray, known: BetweenMaps | None) -> float:
     """Probability that maps of one mass come out as far apart in size or farther, from their (k,) means and variances.
 
+    By the site's spread between exams or a stated one, else by `EXAM_SD`.
     Cochran (1954), Biometrics 10, 101; DerSimonian and Laird (1986), Controlled Clinical Trials 7, 177.
     """
     if len(centre) < 2:
         return 1.0
+    between = BetweenMaps(EXAM_SD, 0.0) if known is None else known
     return float(between.density() @ apart_by_chance(centre, noise, between.grid))
 
 
 def one_size_of(log_sizes: Sequence[FloatArray], known: BetweenMaps | None) -> float:
     """`one_size_probability` of maps by the draws of each one's log size."""
     centre, noise = (np.array([of(one) for one in log_sizes]) for of in (np.nanmean, np.nanvar))
-    return one_size_probability(centre, noise, spread_tested(known))
+    return one_size_probability(centre, noise, known)
 
 
 def apart_by_chance(centre: FloatArray, noise: FloatArray, grid: FloatArray) -> FloatArray:

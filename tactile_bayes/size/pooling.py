@@ -28,7 +28,7 @@ from tactile_bayes.size.draws import (
     turn_matrix,
 )
 from tactile_bayes.size.eq6 import SizeCalibration, push_sizes
-from tactile_bayes.size.fat import LEAST_PROBABILITY, BetweenMaps, one_size_probability, outlying_maps, spread_tested
+from tactile_bayes.size.fat import LEAST_PROBABILITY, BetweenMaps, one_size_probability, outlying_maps
 from tactile_bayes.size.terms import extrapolated
 
 # --- Sizes from the maps of one mass, one or several.
@@ -299,8 +299,8 @@ class PooledEstimate(Record, eq=False):
     """Least and largest depth of fat by single maps, where they can hardly be of one body; None otherwise."""
     one_size: float | None = None
     one_size_apart: float | None = None
-    """Probability that maps of one mass come out as far apart in size or farther, by the spread that `spread_tested`
-    gives and, where a second interval is told, by the paper's maps; None without several maps."""
+    """Probability that maps of one mass come out as far apart in size or farther, by the spread of
+    `one_size_probability` and, where a second interval is told, by the paper's maps; None without several maps."""
     one_place: float | None = None
     """Likewise for the places of their masses in the patient; None without landmarks."""
 
@@ -358,7 +358,7 @@ def _one_size(centre: FloatArray, noise: FloatArray, priors: SizePriors) -> dict
         return {"one_size": None, "one_size_apart": None}
     another = None if priors.between_maps is not None else priors.another_exam
     return {
-        "one_size": one_size_probability(centre, noise, spread_tested(priors.between_maps)),
+        "one_size": one_size_probability(centre, noise, priors.between_maps),
         "one_size_apart": None if another is None else one_size_probability(centre, noise, another),
     }
 
