@@ -49,7 +49,7 @@ def estimates(
         for name, sizes in truths(data / "scans" / "truth.csv").items():
             scan, tactile_map = work / f"{name}.mcap", work / f"{name}.nc"
             run("import", data / "scans" / f"{name}.npz", "-o", scan)
-            run("map", scan, "-o", tactile_map)
+            run("map", scan, "-o", tactile_map, *(("--normalise", "mean") if phantoms else ()))  # as theirs were
             known = ("--known", "seat", sat[name]) if known_seat else ()
             words = ("estimate", tactile_map, *size, *known, "--method", method, "--json")
             yield name, sizes, json.loads(run(*words, codes=(0, 6)))
