@@ -15,10 +15,6 @@ from tactile_bayes.errors import UsageError
 from tactile_bayes.files.atomic import write_bytes
 from tactile_bayes.files.netcdf import Contents, Variable, grouped_netcdf_bytes
 
-with warnings.catch_warnings():  # its notice of the next major version, once a day
-    warnings.simplefilter("ignore", FutureWarning)
-    import arviz
-
 MAGIC = {".png": b"\x89PNG", ".pdf": b"%PDF", ".svg": b"<?xml"}
 
 
@@ -76,6 +72,9 @@ def test_one_chain_has_a_pareto_shape_and_no_ranks(tmp_path: Path) -> None:
 
 
 def test_convergence_is_arvizs_own(tmp_path: Path) -> None:
+    with warnings.catch_warnings():  # its notice of the next major version, once a day
+        warnings.simplefilter("ignore", FutureWarning)
+        arviz = pytest.importorskip("arviz")
     draws = write(tmp_path / "post.nc", 4)
     found = json.loads(run_here("diagnose", tmp_path / "post.nc", "--json", cwd=tmp_path).stdout)["quantities"][
         "max_size_mm"

@@ -90,26 +90,26 @@ def test_a_users_matplotlib_settings_do_not_change_the_picture(tmp_path):
 @pytest.mark.parametrize(
     ("notch", "x_to_the_left", "y_up"), [((0.0, 1.0), True, True), ((0.0, -1.0), False, False), (None, True, True)]
 )
-def test_the_viewer_looks_into_the_tissue_with_the_notch_above(tmp_path, axes, notch, x_to_the_left, y_up):
+def test_the_viewer_looks_into_the_tissue_with_the_notch_above(axes, notch, x_to_the_left, y_up):
     to_patient = None
     if notch is not None:
         y_axis = np.array([*notch, 0.0])
         to_patient = rigid(np.stack([np.cross(y_axis, [0, 0, 1.0]), y_axis, [0, 0, 1.0]]), np.zeros(3))
-    map_figure(replace(bump_map(), patient_from_plane=to_patient), tmp_path / "map.png")
+    map_figure(replace(bump_map(), patient_from_plane=to_patient), None)
     assert axes[0].xaxis_inverted() == x_to_the_left
     assert axes[0].yaxis_inverted() != y_up
     # One axis turned, never both or none: two would show the breast from within.
     assert axes[0].xaxis_inverted() != axes[0].yaxis_inverted()
 
 
-def test_an_imported_grid_is_drawn_as_its_file_reads(tmp_path, axes):
-    map_figure(replace(bump_map(), plane_from_base=None), tmp_path / "map.png")
+def test_an_imported_grid_is_drawn_as_its_file_reads(axes):
+    map_figure(replace(bump_map(), plane_from_base=None), None)
     assert not axes[0].xaxis_inverted()
     assert axes[0].yaxis_inverted()
 
 
-def test_the_size_is_drawn_and_one_sigma_of_the_bump_is_named_as_no_lump(tmp_path, axes):
-    map_figure(bump_map(), tmp_path / "map.png", fit=replace(FIT, size_mm=(14.0, 10.0)))
+def test_the_size_is_drawn_and_one_sigma_of_the_bump_is_named_as_no_lump(axes):
+    map_figure(bump_map(), None, fit=replace(FIT, size_mm=(14.0, 10.0)))
     ellipses = axes[0].patches
     assert [(one.width, one.height, one.angle) for one in ellipses] == [(14.0, 10.0, 20.0), (12.0, 8.0, 20.0)]
     assert {one.center for one in ellipses} == {(3.0, -2.0)}
@@ -117,29 +117,29 @@ def test_the_size_is_drawn_and_one_sigma_of_the_bump_is_named_as_no_lump(tmp_pat
     assert labels == ["size, median 14.0 by 10.0 mm", "fitted bump, 1 sigma (not the lump's edge)"]
 
 
-def test_an_ellipse_turns_with_a_plane_that_is_shown_by_a_quarter_turn(tmp_path, axes):
+def test_an_ellipse_turns_with_a_plane_that_is_shown_by_a_quarter_turn(axes):
     """With the notch along x the picture has y across: the ellipse's long axis keeps its cells."""
     to_patient = rigid(np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), np.zeros(3))
-    map_figure(replace(bump_map(), patient_from_plane=to_patient), tmp_path / "map.png", fit=FIT)
+    map_figure(replace(bump_map(), patient_from_plane=to_patient), None, fit=FIT)
     (ellipse,) = axes[0].patches
     assert (ellipse.center, ellipse.width, ellipse.height, ellipse.angle) == ((-2.0, 3.0), 8.0, 12.0, -20.0)
     (image,) = axes[0].images
     np.testing.assert_array_equal(np.asarray(image.get_array().filled(np.nan)), bump_map().mean.T)
 
 
-def test_a_rib_beside_the_lump_does_not_take_all_colours(tmp_path, axes):
+def test_a_rib_beside_the_lump_does_not_take_all_colours(axes):
     ribbed = bump_map()
     mean = ribbed.mean.copy()
     mean[-6:] = 4.0
-    map_figure(replace(ribbed, mean=mean), tmp_path / "map.png", fit=replace(FIT, amplitude=0.5))
+    map_figure(replace(ribbed, mean=mean), None, fit=replace(FIT, amplitude=0.5))
     assert axes[0].images[0].get_clim()[1] == pytest.approx(1 + 1.25 * 0.5)
-    map_figure(replace(ribbed, mean=mean), tmp_path / "all.png")
+    map_figure(replace(ribbed, mean=mean), None)
     assert axes[1].images[0].get_clim()[1] == 4.0
 
 
-def test_places_that_were_looked_at_are_marked_with_their_reasons(tmp_path, axes):
+def test_places_that_were_looked_at_are_marked_with_their_reasons(axes):
     places = [Place((float(i), 0.0), f"reason {i}") for i in range(6)]
-    map_figure(bump_map(), tmp_path / "map.png", looked_at=places, note="No estimate: nothing there.")
+    map_figure(bump_map(), None, looked_at=places, note="No estimate: nothing there.")
     crosses = [line for line in axes[0].lines if line.get_marker() == "x"]
     assert [line.get_xdata()[0] for line in crosses] == [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]
     words = "\n".join(text.get_text() for text in axes[0].figure.axes[1].texts)
@@ -147,15 +147,15 @@ def test_places_that_were_looked_at_are_marked_with_their_reasons(tmp_path, axes
     assert axes[0].figure.get_suptitle() == "No estimate: nothing there."
 
 
-def test_a_grid_without_counts_is_not_hatched_and_its_unit_is_unknown(tmp_path, axes):
+def test_a_grid_without_counts_is_not_hatched_and_its_unit_is_unknown(axes):
     whole = bump_map()
     recipe = MapRecipe("grid", "none", 1.0)
     grid = replace(whole, count=(whole.count > 0).astype(int), recipe=recipe, plane_from_base=None, background=None)
-    map_figure(grid, tmp_path / "grid.png")
+    map_figure(grid, None)
     left, right, *_ = axes[0].figure.axes
     assert not hatching(left) + hatching(right)
     assert left.child_axes[0].get_ylabel() == "value (unit unknown)"
-    map_figure(replace(grid, recipe=replace(recipe, units="counts")), tmp_path / "counts.png")
+    map_figure(replace(grid, recipe=replace(recipe, units="counts")), None)
     assert axes[1].child_axes[0].get_ylabel() == "value (counts)"
     known = replace(grid, count=np.where(whole.count > 0, 3, 0))
     assert known.few.sum() == known.covered.sum()
@@ -208,8 +208,8 @@ def test_cells_with_few_readings_are_hatched_and_no_others(tmp_path, axes):
     assert [text.get_text() for text in right.get_legend().get_texts()] == ["fewer than 10 readings: noisy"]
 
 
-def test_a_map_read_well_everywhere_has_no_hatching(tmp_path, axes):
-    map_figure(bump_map(), tmp_path / "well.png")
+def test_a_map_read_well_everywhere_has_no_hatching(axes):
+    map_figure(bump_map(), None)
     left, right, *_ = axes[0].figure.axes
     assert not hatching(left) + hatching(right)
     assert right.get_legend() is None
@@ -230,20 +230,20 @@ def test_hatching_shows_without_colour(tmp_path, axes):
             assert (both > 0.05) == hatched, (x_mm, both)
 
 
-def test_noise_alone_does_not_fill_the_colours(tmp_path, axes):
+def test_noise_alone_does_not_fill_the_colours(axes):
     flat = bump_map()
     noise = np.random.default_rng(0).normal(1, 0.01, flat.mean.shape)
-    map_figure(replace(flat, mean=np.where(flat.count > 0, noise, np.nan)), tmp_path / "map.png")
+    map_figure(replace(flat, mean=np.where(flat.count > 0, noise, np.nan)), None)
     low, high = axes[0].images[0].get_clim()
     assert low < 0.91
     assert high > 1.29
 
 
-def test_a_cell_with_few_readings_does_not_set_the_colours(tmp_path, axes):
+def test_a_cell_with_few_readings_does_not_set_the_colours(axes):
     edge = bump_map()
     mean, count = edge.mean.copy(), edge.count.copy()
     mean[20, 20], count[20, 20] = 40.0, 1
-    map_figure(replace(edge, mean=mean, count=count), tmp_path / "map.png")
+    map_figure(replace(edge, mean=mean, count=count), None)
     assert axes[0].images[0].get_clim()[1] < 2
 
 
@@ -277,9 +277,9 @@ def test_a_size_is_drawn_with_its_intervals_named(tmp_path, axes):
     ]
 
 
-def test_the_axis_of_sizes_ends_near_its_intervals_and_medians_are_marked(tmp_path, axes):
+def test_the_axis_of_sizes_ends_near_its_intervals_and_medians_are_marked(axes):
     heavy = np.concatenate([draws(0, 15), [90.0, 120.0]])
-    size_figure(heavy, draws(1, 12), tmp_path / "a.png", intervals=INTERVALS, title="Size of the lump: s01")
+    size_figure(heavy, draws(1, 12), None, intervals=INTERVALS, title="Size of the lump: s01")
     low, high = axes[0].get_xlim()
     assert 5 < low < 9
     assert 18 < high < 22
@@ -288,16 +288,16 @@ def test_the_axis_of_sizes_ends_near_its_intervals_and_medians_are_marked(tmp_pa
     assert sorted(marks) == pytest.approx(sorted([np.median(heavy), np.median(draws(1, 12))]))
 
 
-def test_densities_have_area_one_and_their_draws_mean(tmp_path, axes):
-    size_figure(draws(0, 15), draws(1, 12), tmp_path / "size.png", intervals={})
+def test_densities_have_area_one_and_their_draws_mean(axes):
+    size_figure(draws(0, 15), draws(1, 12), None, intervals={})
     for line, centre in zip(axes[0].lines, (15, 12), strict=True):
         x, y = line.get_data()
         assert integral(y, x) == pytest.approx(1, abs=0.01)
         assert integral(x * y, x) == pytest.approx(centre, abs=0.2)
 
 
-def test_a_density_of_sizes_stays_above_zero(tmp_path, axes):
-    size_figure(np.abs(draws(0, 0)), np.abs(draws(1, 0)) / 2, tmp_path / "size.png", intervals={})
+def test_a_density_of_sizes_stays_above_zero(axes):
+    size_figure(np.abs(draws(0, 0)), np.abs(draws(1, 0)) / 2, None, intervals={})
     for line in axes[0].lines:
         x, y = line.get_data()
         assert x.min() >= 0

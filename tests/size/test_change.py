@@ -281,6 +281,7 @@ def seen(rng: np.random.Generator, growth: float, exponent: float, exam_factor: 
     return visits
 
 
+@pytest.mark.slow
 def test_intervals_by_amplitudes_hold_wherever_the_lump_grew_to():
     """Nominal 95 and 5 % over 200 pairs each; the control has no posture and a fifth of the exams' spread in ln a."""
     rng, law = np.random.default_rng(29), replace(AMPLITUDE_LAW, exam_factor=3.0)

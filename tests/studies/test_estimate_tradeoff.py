@@ -70,7 +70,7 @@ def ladder_of(tactile_map: TactileMap, **chosen: object) -> Ladder:
     calibration, options = inputs_of(tactile_map)
     with pytest.MonkeyPatch.context() as patch:
         few = {"FIELDS": (8, 24), "RADII_MM": (8.0,), "ACCURACIES_SD": (0.01,), "CHAIN_ACCURACIES_SD": ()} | chosen
-        few |= {"LONG_RUNS": (("importance", 0.01),), "LAPLACE_DRAWS": (400,)}
+        few |= {"LONG_RUNS": (("importance", 0.02),), "LAPLACE_DRAWS": (400,)}
         for name, value in few.items():
             patch.setattr(study, name, value)
         return measure(
@@ -124,7 +124,7 @@ def test_the_reference_agrees_with_markov_chains():
     assert found.answer.method == "ensemble"
     assert ladder().reference.answer.method == "importance"
     size = found.answer.quantities[SIZE]
-    assert ladder().reference.error_mm < 0.01 * size.sd  # what it was asked for
+    assert ladder().reference.error_mm < 0.02 * size.sd  # what it was asked for
     assert found.off.ends < max(4 * np.hypot(size.mc_error, ladder().reference.error_mm), 0.02 * size.sd)
 
 

@@ -191,9 +191,10 @@ def size_ranks(n: int, *, wider: float = 1.0) -> np.ndarray:
     return np.array(ranks)
 
 
-def test_a_size_drawn_from_the_law_of_its_draws_ranks_uniformly() -> None:
-    assert rank_test("size_mm", size_ranks(150), draws=DRAWS).inside
-    assert not rank_test("size_mm", size_ranks(150, wider=1.3), draws=DRAWS).inside
+@pytest.mark.parametrize(("maps", "wider"), [(30, 2.0), pytest.param(150, 1.3, marks=pytest.mark.slow)])
+def test_a_size_drawn_from_the_law_of_its_draws_ranks_uniformly(maps: int, wider: float) -> None:
+    assert rank_test("size_mm", size_ranks(maps), draws=DRAWS).inside
+    assert not rank_test("size_mm", size_ranks(maps, wider=wider), draws=DRAWS).inside
 
 
 def test_a_map_is_the_same_wherever_it_is_made() -> None:

@@ -156,6 +156,7 @@ def test_the_next_error_is_neither_over_nor_underestimated() -> None:
     assert abs(float(scores(FEW, 30).mean())) < 3 / math.sqrt(30)
 
 
+@pytest.mark.slow
 def test_separate_priors_on_the_sds_fail_the_same_check(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(model_of, "log_prior", half_normal_log_prior)
     assert float(scores(FEW, 30).mean()) < -3 / math.sqrt(30)

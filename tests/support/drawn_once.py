@@ -1,0 +1,27 @@
+"""The pictures of a trial's page, drawn once for a number of panels: for tests of what leads to the page."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from tactile_bayes.report import trial_html
+
+_drawn: dict[int, bytes] = {}
+_draw = trial_html._png
+
+
+def _png(draw: Any, panels: int) -> bytes:
+    if panels not in _drawn:
+        _drawn[panels] = _draw(draw, panels)
+    return _drawn[panels]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def drawn_once() -> Iterator[None]:
+    """Give back a picture that was drawn before, whatever it shows."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(trial_html, "_png", _png)
+        yield
