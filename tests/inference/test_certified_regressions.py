@@ -56,7 +56,8 @@ def test_deviations_are_the_certified_ones(shared_data: Path, name: str, method:
     assert np.abs((found.flat.mean(axis=0) - nist.theta) / nist.sd).max() < 4 / np.sqrt(4000)
 
 
-@pytest.mark.parametrize("name", ["Gauss1", pytest.param("Gauss2", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["Gauss1", "Gauss2"])
 def test_the_ensemble_finds_the_certified_deviations(shared_data: Path, name: str) -> None:
     nist = read(shared_data, name)
     assert worst_in_errors(draws("ensemble", nist), nist) < 4

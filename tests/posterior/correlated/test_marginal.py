@@ -247,9 +247,8 @@ def coverage(maps: int, **errors: float) -> np.ndarray:
     return inside / maps
 
 
-@pytest.mark.parametrize(
-    "errors", [pytest.param({"white": 0.01}, marks=pytest.mark.slow), {"white": 0.01, "field": 0.01, "length": 6.0}]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("errors", [{"white": 0.01}, {"white": 0.01, "field": 0.01, "length": 6.0}])
 def test_intervals_cover(errors: dict[str, float]) -> None:
     # 30 maps: 0.73 is 3.1 binomial SDs below 0.90
     assert coverage(30, **errors).min() >= 0.73

@@ -227,6 +227,7 @@ def test_a_map_that_does_not_tell_adds_nothing() -> None:
     assert PoseNoise.of(with_figures(plain)) is not None
 
 
+@pytest.mark.slow
 def test_widths_of_scans_with_only_the_trackers_errors_scatter_as_told() -> None:
     """Twelve scans, two widths each: the sum of squares over the predicted variance is a chi-squared of about 24."""
     found = [estimated(build_map(scan(0.6, seed=seed), normalise="gain")) for seed in range(12)]

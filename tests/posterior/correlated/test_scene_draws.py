@@ -54,9 +54,8 @@ def ends(draws: np.ndarray) -> np.ndarray:
     return np.quantile(draws, [0.025, 0.975], axis=0)
 
 
-@pytest.mark.parametrize(
-    "name", ["weak", *(pytest.param(name, marks=pytest.mark.slow) for name in ("beside", "strong", "half covered"))]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["weak", "beside", "strong", "half covered"])
 def test_importance_ends_are_as_good_as_they_say(name: str) -> None:
     """Against one long run by other points: six runs, each end within four of its stated errors."""
     density = FITS[name]().sampled()
@@ -164,6 +163,7 @@ def whole_run() -> ParameterDraws:
     return run(None, max_steps=6000)
 
 
+@pytest.mark.slow
 def test_a_resumed_run_is_the_run_that_was_never_stopped(tmp_path: Path) -> None:
     path = tmp_path / "chain.npz"
     with pytest.raises(NotConvergedError, match="not converged after 150 steps"):
@@ -207,6 +207,7 @@ def test_a_pickle_is_not_opened(tmp_path: Path) -> None:
         run(path, max_steps=6000)
 
 
+@pytest.mark.slow
 def test_ensemble_and_importance_check_each_other(monkeypatch: pytest.MonkeyPatch) -> None:
     assert whole_run().diagnostics["disagreement"] < methods.DISAGREEMENT
 

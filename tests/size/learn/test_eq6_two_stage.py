@@ -102,6 +102,7 @@ def test_draws_are_about_the_fit_of_the_study() -> None:
     assert (exact.std(axis=0)[:4] < 1e-3 * draws.std(axis=0)[:4]).all()
 
 
+@pytest.mark.slow
 def test_intervals_of_the_two_stage_fit_hold_as_few_diameters_allow(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nominal 90 % over 80 tables of a known Eq 6 with 17 % of scatter, m, b, e and f together.
 

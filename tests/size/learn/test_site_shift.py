@@ -143,7 +143,8 @@ def sites(n: int, number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return np.array(scores), rank[:, 0], rank[:, 1]
 
 
-@pytest.mark.parametrize("n", [5, *(pytest.param(n, marks=pytest.mark.slow) for n in (10, 20))])
+@pytest.mark.slow
+@pytest.mark.parametrize("n", [5, 10, 20])
 def test_intervals_of_the_shift_and_of_new_sizes_cover_as_they_say(n: int) -> None:
     number = 200
     scores, corrected, plain = sites(n, number)
