@@ -45,8 +45,7 @@ from tactile_bayes.report.map_text import colours_wanted, live_line, live_text
 from tactile_bayes.scan import ElementCalibration, HeadGeometry
 
 DRAWINGS_PER_S = 10.0
-TAKEN_EVERY_S = 1 / DRAWINGS_PER_S / 2
-"""Frames are added to the map some at a time, twice a drawing."""
+TAKEN_EVERY_S = 1 / DRAWINGS_PER_S / 2  #: Frames are added to the map some at a time, twice a drawing.
 _SHOW, _HIDE = "\x1b[?25h\x1b[?1049l", "\x1b[?1049h\x1b[?25l"
 
 

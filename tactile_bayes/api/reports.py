@@ -181,8 +181,7 @@ def _exam(given: Sequence[Any], words: Given, settings: dict[str, Any]) -> Exam:
 
 # --- Export of maps and estimates to the files that other systems take.
 
-_IN_PYTHON = Path("what was given in Python")
-"""What messages call a map or an estimate that is in no file."""
+_IN_PYTHON = Path("what was given in Python")  #: What messages call a map or an estimate that is in no file.
 
 
 class ExportedFiles(Record):

@@ -145,8 +145,7 @@ class Comparing(Record):
 
     days: tuple[float, ...] | None = None
     """Time of each visit in days, the first at 0; None where it is not known."""
-    grown_by: tuple[float, ...] = GROWN_BY
-    """Shares of the diameter by which it may have grown or more."""
+    grown_by: tuple[float, ...] = GROWN_BY  #: Shares of the diameter by which it may have grown or more.
     same_mass: bool = False
     """Whether somebody says that the visits are of one mass, where their places do not show it."""
     registration_mm: float = REGISTRATION_MM  #: SD each way of a mass's place between two visits.

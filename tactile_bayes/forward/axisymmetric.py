@@ -292,8 +292,7 @@ class CondensedMode(Record, eq=False):
     flexibility: FloatArray
     """(b, b) array: Displacements on the boundary for unit forces there, with nothing inside; mm per kPa mm^2."""
     skin: FloatArray  #: (s, b) array: Sinking of the skin for the same forces.
-    unit_stiffness: FloatArray
-    """(b, b) array: The lump, condensed on its boundary, for a modulus of 1 kPa."""
+    unit_stiffness: FloatArray  #: (b, b) array: The lump, condensed on its boundary, for a modulus of 1 kPa.
     original_stiffness: FloatArray  #: (b, b) array: The tissue that the lump replaces.
 
     def perturbation(self, lump_kpa: float) -> ModePerturbation:

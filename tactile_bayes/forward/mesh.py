@@ -308,11 +308,9 @@ class LumpMesh(Record, eq=False):
     """Nodes and elements of a mesh."""
 
     node_mm: FloatArray  #: (n, 2) array: (r, z) of each node.
-    element: IntArray
-    """(e, 9) int array: Nodes of each element, row by row of its three by three lattice."""
+    element: IntArray  #: (e, 9) int array: Nodes of each element, row by row of its three by three lattice.
     region: IntArray  #: (e,) int array: `EXTERIOR_FAT` and so on.
-    arc: IntArray
-    """(a,) int array: Nodes on the lump's boundary from the top pole to the bottom pole."""
+    arc: IntArray  #: (a,) int array: Nodes on the lump's boundary from the top pole to the bottom pole.
     surface: IntArray  #: (s,) int array: Nodes on the skin by increasing r.
 
 

@@ -156,8 +156,7 @@ class SurfaceCompliance(Record, eq=False):
     edges_mm: FloatArray  #: (n + 1,) array, symmetric about the lump's axis.
     row: FloatArray
     """(n,) array: first row of the (Toeplitz) matrix of the body without the lump, mm per kPa."""
-    own: FloatArray
-    """(n, j) array: shapes on the skin by which the layers' own tissue fills the hole."""
+    own: FloatArray  #: (n, j) array: shapes on the skin by which the layers' own tissue fills the hole.
     own_stiffness: FloatArray  #: (j,) array: each one's compliance relative to the hole.
     lump: FloatArray  #: (n, i) array: as `own`, of a lump of unit modulus.
     lump_stiffness: FloatArray  #: (i,) array.

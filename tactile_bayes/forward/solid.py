@@ -130,8 +130,7 @@ class SolidFrame(Record, eq=False):
     """The solved frame of a head at one pose."""
 
     pressure_kpa: FloatArray  #: (rows, columns) array: Mean pressure on each taxel.
-    depth_mm: float
-    """z of the head's origin in the scene's `plane`, whose z = 0 is the undisturbed skin."""
+    depth_mm: float  #: z of the head's origin in the scene's `plane`, whose z = 0 is the undisturbed skin.
     contact: Contact  #: Of the whole face, rim included.
 
 

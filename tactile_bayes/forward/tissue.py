@@ -34,8 +34,7 @@ class Layers:
     """The layered body without a lump."""
 
     fat_mm: float  #: Depth of the fat-gland boundary.
-    thickness_mm: float = THICKNESS_MM
-    """Depth of the rigid chest wall, to which the gland is bonded."""
+    thickness_mm: float = THICKNESS_MM  #: Depth of the rigid chest wall, to which the gland is bonded.
     fat_kpa: float = FAT_KPA
     gland_ratio: float = GLAND_RATIO  #: Young's modulus of gland over that of fat.
     poisson: float = POISSON  #: Of all tissues, at least 0 and below 0.5.

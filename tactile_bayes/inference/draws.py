@@ -184,8 +184,7 @@ def weighted_quantiles_of(ordered: FloatArray, weights: FloatArray, probabilitie
 
 # --- Cache of conditional (linear) solutions by parameter vector, reused when those points become draws.
 
-Solution = tuple[FloatArray, ...]
-"""Arrays with a row a parameter vector; see `CollapsedTarget.conditional`."""
+Solution = tuple[FloatArray, ...]  #: Arrays with a row a parameter vector; see `CollapsedTarget.conditional`.
 
 
 class Solved:

@@ -92,8 +92,7 @@ class ChainState(Record, eq=False):
     accepted: FloatArray  #: (ensemble,) array: Mean accepted proposals of a walker so far.
     twister: np.ndarray[tuple[int, ...], np.dtype[np.uint32]]
     """(ensemble, 624) uint32 array: The random generators' keys."""
-    cursor: FloatArray
-    """(ensemble, 3) array: Their positions, whether a normal draw is kept, and that draw."""
+    cursor: FloatArray  #: (ensemble, 3) array: Their positions, whether a normal draw is kept, and that draw.
 
 
 class ChainStore(Protocol):

@@ -240,8 +240,7 @@ def _covariance_about(theta: FloatArray, weight: FloatArray, centre: FloatArray,
 STRETCH, WIDE_STRETCH = 0.45, 0.8
 """Bend of the proposal's tails, see `Proposal`. The wide one is for densities with tails like a t: from a few thousand
 points it needs a quarter of the narrow one's."""
-HEAVY_TAIL = 0.3
-"""Pareto shape of the first points' weights above which the wide proposal is taken."""
+HEAVY_TAIL = 0.3  #: Pareto shape of the first points' weights above which the wide proposal is taken.
 TOO_WIDE = 2.0
 """A part of the density with this many times the variance of one Gaussian gives weights of infinite variance under it:
 then the proposal has a Gaussian for each part."""

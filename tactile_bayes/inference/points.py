@@ -118,8 +118,7 @@ MERGED, LEAST_MERGED = 8, 512
 """Neighbouring normals of a mixture that are taken as one, where there are as many."""
 _NODES = np.sinh(np.linspace(-3.0, 3.0, 81))
 """Where a mixture's distribution function is computed, in SDs from its mean; dense in the middle."""
-LEAST_SD = 1e-2
-"""Least SD of a component, as a share of the mixture's: a narrower one is widened to this."""
+LEAST_SD = 1e-2  #: Least SD of a component, as a share of the mixture's: a narrower one is widened to this.
 
 
 def paired_points(key: FloatArray, replicates: Labels, dimension: int, rng: np.random.Generator) -> FloatArray:

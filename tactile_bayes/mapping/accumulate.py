@@ -237,8 +237,7 @@ class Accumulated(Record, eq=False):
 
     sums: CellSums  #: The cells.
     levels: list[FloatArray]  #: Divisors of the frames, one array per scan.
-    scale: float = 1.0
-    """Divisor of the sums' values (1 but for ``gain``, whose level is set afterwards)."""
+    scale: float = 1.0  #: Divisor of the sums' values (1 but for ``gain``, whose level is set afterwards).
     passes: int = 1  #: Passes over the scan.
     last_change: float = 0.0
     """Largest relative change of a frame's gain in the last pass; 0 unless the gains are solved for."""

@@ -45,8 +45,7 @@ class CellSums:
     """Count, sum and sum of squares of the readings in each cell, in whole steps."""
 
     cell_mm: float
-    first: tuple[int, int] = (0, 0)
-    """Row (y) and column (x) index of ``count[0, 0]`` on the lattice."""
+    first: tuple[int, int] = (0, 0)  #: Row (y) and column (x) index of ``count[0, 0]`` on the lattice.
     count: IntArray = field(default_factory=_no_cells)
     total: IntArray = field(default_factory=_no_cells)
     square: IntArray = field(default_factory=_no_cells)

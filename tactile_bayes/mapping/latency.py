@@ -41,8 +41,7 @@ class ShiftFit(Record, eq=False):
     """Readings of one or several scans at supposed places, ready for a regression on shifts."""
 
     cells: Cells  #: Where the readings lie.
-    levelled: FloatArray
-    """(n,) array: Readings without what frames and taxels add to one common map."""
+    levelled: FloatArray  #: (n,) array: Readings without what frames and taxels add to one common map.
     gradient: FloatArray  #: (n, 2) array: Of the map at each reading, 1/mm along x and y.
     data: FloatArray  #: (n,) array: Readings with the nuisances taken off.
     nuisance: Nuisance  #: The nuisances that were taken off.
@@ -203,8 +202,7 @@ class LatencyEstimate(Record):
     bound_ms: float
     """Standard error that independent errors of the readings and the tracker's noise alone would leave."""
     frames: int  #: Frames it was found from.
-    crossings: tuple[int, int]
-    """Strokes that cross a lump, towards +x of the plane (or along +y) and back."""
+    crossings: tuple[int, int]  #: Strokes that cross a lump, towards +x of the plane (or along +y) and back.
 
 
 def estimate_latency(

@@ -79,8 +79,7 @@ class TactileMap(Record, eq=False):
     variance: FloatArray
     """`mean`, `variance` (ny, nx) arrays: Mean and within-cell variance of the readings; NaN where `count` is 0.
     Without unit after normalising, kPa with ``normalise="none"``."""
-    count: np.ndarray[tuple[int, ...], np.dtype[np.int64]]
-    """(ny, nx) int64 array: Readings per cell."""
+    count: np.ndarray[tuple[int, ...], np.dtype[np.int64]]  #: (ny, nx) int64 array: Readings per cell.
     x_mm: FloatArray
     y_mm: FloatArray
     """`x_mm`, `y_mm` (nx,), (ny,) arrays: Cell centres in `plane`; x runs across the head, y along it."""
@@ -95,8 +94,7 @@ class TactileMap(Record, eq=False):
     """Counts and figures for the report (frames dropped low/high, tilt, rms...)."""
     masked_taxels: tuple[str, ...] = ()
     """Taxels that were left out, one line each: ``"row 3 column 7 dead"``."""
-    head: HeadShape | None = None
-    """Shape of the head that made the scan; None for an imported grid."""
+    head: HeadShape | None = None  #: Shape of the head that made the scan; None for an imported grid.
     nipple_mm: FloatArray | None = None
     """(3,) array or None: The nipple in `plane`; None where it was not touched."""
     findings: tuple[Finding, ...] = ()  #: Findings against sizes from it.

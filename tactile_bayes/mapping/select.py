@@ -292,8 +292,7 @@ class SelectedFrames(Record, eq=False, dict=True):
     faults: tuple[TaxelFault, ...]  #: Taxels left out of every frame.
     poses: FramePoses  #: Pose of the tracker at each frame.
     level_kpa: FloatArray  #: (n,) array: Mean over the valid taxels; NaN where there is none.
-    valid_share: FloatArray
-    """(n,) array: Share of the taxels of the array that are good and not saturated."""
+    valid_share: FloatArray  #: (n,) array: Share of the taxels of the array that are good and not saturated.
     low: BoolArray
     high: BoolArray
     """`low`, `high` (n,) bool arrays: Frames whose level is below or above the window, among those with a pose and

@@ -161,8 +161,7 @@ class _Part(Record, eq=False):
 class _Round(Record, eq=False):
     """The regression at some shifts."""
 
-    normal: FloatArray
-    """(K, K) array: Product of the strokes' designs over the variance of what is left."""
+    normal: FloatArray  #: (K, K) array: Product of the strokes' designs over the variance of what is left.
     score: FloatArray  #: (K,) array: Their product with what is left, over the same.
     widened: FloatArray
     """(K,) array: By how much standard errors exceed those of independent errors and exact slopes."""

@@ -86,12 +86,10 @@ MAPS_AT_HAND = 4
 class PoseNoise(Record):
     """Tracker position error of a map, one error per frame: the figures `presets.POSE_NOISE`."""
 
-    sd_mm: tuple[float, float]
-    """SD of a frame's place along x and y: bumps are that much wider on the map."""
+    sd_mm: tuple[float, float]  #: SD of a frame's place along x and y: bumps are that much wider on the map.
     side_mm: tuple[float, float]
     """Sides of the array along x and y: cells closer together than these share frames, and with them errors."""
-    frames_per_reading: float
-    """Frames with an error of their own that felt a cell, over the readings in it."""
+    frames_per_reading: float  #: Frames with an error of their own that felt a cell, over the readings in it.
 
     @classmethod
     def of(cls, tactile_map: TactileMap) -> PoseNoise | None:

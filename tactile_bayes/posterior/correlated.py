@@ -50,8 +50,7 @@ BALLS_SD = (0.008, 0.01)
 """SDs of skewness and change of balls' maps beyond their noise, over the amplitude (record 0107)."""
 NOISE_FACTOR = 2.5
 """Variance of both over that by the residuals: deep and faint lumps are off by more than they say."""
-MOST_SDS = 2.5
-"""Length of either beyond which a ball is unlikely: of two components, in the SD of one."""
+MOST_SDS = 2.5  #: Length of either beyond which a ball is unlikely: of two components, in the SD of one.
 
 
 def irregular(fit: FieldFit) -> bool:
@@ -109,8 +108,7 @@ def _columns(fit: FieldFit) -> tuple[FloatArray, FloatArray]:
 # each axis, as its correlation. Such errors look like another shape of the bump, so no noise found beside it tells
 # of them; what they do to the estimate is added to its draws.
 
-LEAST_EIGENVALUE = 3e-3
-"""Least eigenvalue of the overlap of two arrays, over its largest: less is left out."""
+LEAST_EIGENVALUE = 3e-3  #: Least eigenvalue of the overlap of two arrays, over its largest: less is left out.
 
 
 def pose_covariance(fit: FieldFit) -> FloatArray:

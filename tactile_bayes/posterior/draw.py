@@ -36,8 +36,7 @@ class MapPosterior(Record, eq=False):
     oblique: tuple[float, float] | None = None
     """Mean and SD of r, the half log axis ratio 45 degrees from the map's x axis, where the draws have none and it was
     measured beside them; None otherwise."""
-    irregular: bool = False
-    """True where the bump is less regular than a ball's, see `correlated.outline`."""
+    irregular: bool = False  #: True where the bump is less regular than a ball's, see `correlated.outline`.
 
     @property
     def medians(self) -> tuple[float, float, float]:
@@ -69,8 +68,7 @@ class NoiseFigures(Record):
 
     noise: str  #: ``"independent"`` or ``"field"``.
     rotated: bool
-    rotation_odds: float | None
-    """Odds of a rotated ellipse; None where that was decided beforehand."""
+    rotation_odds: float | None  #: Odds of a rotated ellipse; None where that was decided beforehand.
     figures: Mapping[str, float]
     """Inflation and degrees of freedom, or the noise field's cosines, length and share."""
     level_offset: float | None = None
@@ -100,8 +98,7 @@ class Diagnostics(Record):
     """`method`, `sampler`: The method that drew, and its own figures."""
     noise: NoiseFigures
     calibration: str = ""  #: Name of the calibration that gave the size, in words; not in the JSON.
-    size_calibration: str = ""
-    """Which calibration gave the size and what it cannot know, in words."""
+    size_calibration: str = ""  #: Which calibration gave the size and what it cannot know, in words.
     repeatability: str = ""
     """How far exams of one mass lie apart at the site, in words; empty where nobody learned it."""
     convergence: Mapping[str, Mapping[str, float]] = field(default_factory=dict)

@@ -319,8 +319,7 @@ class LinearSolution(Record, eq=False):
     level_covariance: FloatArray
     """`level`, `level_covariance` (h, c), (h, c, c) arrays: Level and tilt at amplitudes of 0, and their covariance
     over tau^2 given the amplitudes."""
-    level_slope: FloatArray
-    """(m, h, v, c) array: By how much level and tilt fall as an amplitude rises."""
+    level_slope: FloatArray  #: (m, h, v, c) array: By how much level and tilt fall as an amplitude rises.
     sum_of_squares: FloatArray  #: (m, h) array.
 
 
@@ -332,8 +331,7 @@ class FieldColumns(Record, eq=False):
     log_prior: float  #: Log prior probability of each share.
     weight: FloatArray
     """(k, h) array: Of the squared projections that the field takes away, a column a share."""
-    plain: FloatArray
-    """(k, h * (c + 1)) array: Projections of the fixed columns and the data, so weighted."""
+    plain: FloatArray  #: (k, h * (c + 1)) array: Projections of the fixed columns and the data, so weighted.
     gram: FloatArray  #: (h, c + 1, c + 1) array: Columns and data with each other.
     inverse: FloatArray  #: (h, c, c) array: Of the columns' part.
     log_det: FloatArray
@@ -481,8 +479,7 @@ def _two(
 # needs of a bump is linear or quadratic in it: it is worked out once for the products that span, and for a point
 # only its coefficients are left.
 
-DROPPED = 1e-8
-"""Norm of what is dropped of all the bumps together, over that of the least of them."""
+DROPPED = 1e-8  #: Norm of what is dropped of all the bumps together, over that of the least of them.
 LEAST_BUMPS = 256  #: Fewer have no basis that pays.
 MOST_PRODUCTS = 200  #: More cost as much as each bump by itself.
 

@@ -39,8 +39,7 @@ from tactile_bayes.posterior.field import (
 )
 from tactile_bayes.posterior.scene import Problem, Scene
 
-BLOCK = 128
-"""Shapes solved at a time: fewer spend their time on calls, more leave the processor's cache."""
+BLOCK = 128  #: Shapes solved at a time: fewer spend their time on calls, more leave the processor's cache.
 NEGLIGIBLE = 1e-3
 """Fields with a smaller share of the evidence are left out of the mixture; what they add at the mode is made up for.
 Once a length has as little, and less than the one before it, shorter ones are not looked at."""

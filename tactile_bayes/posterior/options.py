@@ -13,8 +13,7 @@ from tactile_bayes.size.pooling import SizePriors
 
 DETECTED = 0.95
 """Evidence for a bump against smooth errors, as a probability at even odds, below which there is no estimate."""
-ROTATION_ODDS = 3.0
-"""Odds above which a rotated ellipse is used instead of one along the head's axes."""
+ROTATION_ODDS = 3.0  #: Odds above which a rotated ellipse is used instead of one along the head's axes.
 
 
 class SamplerSettings(FitSettings, kw_only=True):
@@ -27,8 +26,7 @@ class SamplerSettings(FitSettings, kw_only=True):
     """About how wide the bump is, where a fit of the same place has told; None starts from `START_WIDTHS_MM`."""
     size_priors: SizePriors = field(default_factory=SizePriors)
     """Spread between maps and shape of the lump; only a calibration over bodies uses them."""
-    store: Any = None
-    """`ChainStore` where an ensemble keeps its state between runs, under a noise field."""
+    store: Any = None  #: `ChainStore` where an ensemble keeps its state between runs, under a noise field.
     draws: int = INDEPENDENT_DRAWS
     """Of ``laplace`` under a noise field; 400 know the ends of an interval to a tenth of an SD."""
     step_up: bool = True

@@ -98,10 +98,8 @@ class Estimate(Record, eq=False):
     """`fit`, `draws`, `map_posterior`, `size`: None without an estimate; `size` is None also without a size
     calibration."""
     candidates: tuple[Candidate, ...] = ()  #: Every place that was looked at.
-    diagnostics: Diagnostics | None = None
-    """Figures and flags for the report; None where nothing was drawn."""
-    left_out: tuple[str, ...] = ()
-    """Sources of error that the estimate does not contain, in words."""
+    diagnostics: Diagnostics | None = None  #: Figures and flags for the report; None where nothing was drawn.
+    left_out: tuple[str, ...] = ()  #: Sources of error that the estimate does not contain, in words.
     code: str = ""
     advice: str = ""
     on_paper: str = ""

@@ -135,8 +135,7 @@ class Structure(Record):
     name: str
     """``"ellipse"`` (against round), ``"rotated"``, ``"tilt"``, ``"second lump"``, ``"rib"``, ``"departure"`` (from a
     Gaussian)."""
-    odds: float
-    """Bayes factor of the scene with it against the scene without; an upper bound where `bound`."""
+    odds: float  #: Bayes factor of the scene with it against the scene without; an upper bound where `bound`.
     supported: bool  #: The odds exceed a threshold.
     used: bool  #: The draws have it.
     bound: bool = False  #: The odds are a bound from the best of a grid of templates.
@@ -144,8 +143,7 @@ class Structure(Record):
     change_y_sd: float | None = None
     """`change_x_sd`, `change_y_sd`: By how many posterior SDs the median of ln sigma_x and ln sigma_y would change, had
     it been decided the other way; None where that was not fitted."""
-    place: str = ""
-    """Where it lies or what it is like, in words; empty when there is nothing to say."""
+    place: str = ""  #: Where it lies or what it is like, in words; empty when there is nothing to say.
 
 
 class SceneChoice(Record, eq=False):
@@ -153,8 +151,7 @@ class SceneChoice(Record, eq=False):
 
     fit: FieldFit  #: Its mode.
     plain: FieldFit  #: The fit without a second structure, by which a lump is detected.
-    supported: str
-    """The simplest shape that the map supports: ``"round"``, ``"ellipse"`` or ``"rotated"``."""
+    supported: str  #: The simplest shape that the map supports: ``"round"``, ``"ellipse"`` or ``"rotated"``.
     structures: tuple[Structure, ...] = field(default_factory=tuple)  #: Every question asked.
 
 

@@ -119,8 +119,7 @@ LEAST_COVERED_SHARE = 0.6
 LEAST_WIDTH_IN_CELLS = 0.5
 WIDEST_IN_RADII = 0.75
 MOST_AXIS_RATIO = 4.0
-CLOSE_IN_RADII = 0.6
-"""Beside a rib 16 mm away a window of 12 mm holds more of the lump than of the rib."""
+CLOSE_IN_RADII = 0.6  #: Beside a rib 16 mm away a window of 12 mm holds more of the lump than of the rib.
 PATIENCE = 16  #: Iterations: a clear lump takes 4 to 15.
 OUTGROWN, AT_RIM = "wider than the window", "at the rim of the map"
 FIT_TOLERANCE = 1e-8

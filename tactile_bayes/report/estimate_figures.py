@@ -322,8 +322,7 @@ class DrawnMap(Record, eq=False):
 class _Laid(Record, eq=False):
     """A visit's maps averaged on a common grid about its mass."""
 
-    values: FloatArray
-    """(n, n) array: Rows upwards, columns to the right on the screen; NaN without data."""
+    values: FloatArray  #: (n, n) array: Rows upwards, columns to the right on the screen; NaN without data.
     origin_mm: FloatArray
     """(2,) array: Left of and above the xiphoid, where the mass lies; (0, 0) without landmarks."""
 

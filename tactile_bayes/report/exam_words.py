@@ -65,8 +65,7 @@ class Exam(Record, eq=False):
 
     maps: tuple[ExamMap, ...]  #: Several are repeats of one mass.
     pooled: PooledReport | None = None  #: The size from all maps; None with one map.
-    scans: Sequence[Mapping[str, str]] = ()
-    """The scans at the beginning, as `Provenance.scans` has them."""
+    scans: Sequence[Mapping[str, str]] = ()  #: The scans at the beginning, as `Provenance.scans` has them.
     title: str = ""
     name: str = ""
     day: str = ""

@@ -50,8 +50,7 @@ SCHEMA = "tactile-bayes/sbc/1"
 _COLOURS = ("#1f3b73", "#c8641e")
 NARROW = 1.05
 """A larger spread of the ranks is called too narrow a posterior, and too wide below its inverse."""
-SHIFT = 3.0
-"""Standard errors of the mean rank beyond which a posterior is called too low or too high."""
+SHIFT = 3.0  #: Standard errors of the mean rank beyond which a posterior is called too low or too high.
 
 
 def sbc_document(
@@ -334,8 +333,7 @@ class TradeoffReport(Record, eq=False):
 
     case: LumpCase  #: The lump.
     found: tuple[Measured, ...]  #: Every setting.
-    rules: Mapping[str, SizeRule]
-    """From widths to sizes, for plane strain and for the solid model."""
+    rules: Mapping[str, SizeRule]  #: From widths to sizes, for plane strain and for the solid model.
     tolerance: float  #: Error in size, as a share, below which nothing is gained.
 
     def of(self, model: str) -> list[Measured]:

@@ -23,8 +23,7 @@ from tactile_bayes.report.exam_words import ExamMap, ExamMass
 # --- A clock face of the breast with the masses on it, as inline SVG: what charts of a breast exam show.
 
 _RADIUS: Final = 13.0
-_LEAST_MM: Final = 60.0
-"""The face's rim is this far from the nipple, or as far as the farthest mass lies."""
+_LEAST_MM: Final = 60.0  #: The face's rim is this far from the nipple, or as far as the farthest mass lies.
 
 
 def breast_dial(masses: Sequence[ExamMass]) -> str:

@@ -14,8 +14,7 @@ from tactile_bayes.trial.method_comparison import Unit
 from tactile_bayes.trial.planning import Design, IntervalCheck, PlanReport
 from tactile_bayes.trial.summary import Counts, ModalityReport, TrialReport
 
-DIGITS: Final = 12
-"""Of the numbers of `validate`'s file, so that the order of summation changes no byte."""
+DIGITS: Final = 12  #: Of the numbers of `validate`'s file, so that the order of summation changes no byte.
 
 # --- Text of a trial plan: one line per design, then the benefit of more maps.
 

@@ -34,8 +34,7 @@ class SizeAnswer(Record):
     method: str = ""  #: The method that drew; empty where none did.
     shares: dict[str, float] = field(default_factory=dict)
     """Percent of the variance of ln(largest size) by source, see `SizePosterior.variance_share`."""
-    code: str = ""
-    """Of the reason, see `posterior.abstention`; ``"method"`` where no method converged."""
+    code: str = ""  #: Of the reason, see `posterior.abstention`; ``"method"`` where no method converged.
 
     @property
     def reported(self) -> Quantity | None:
@@ -104,10 +103,8 @@ def _rms(values: Sequence[float]) -> float:
 
 Clock = Callable[[], float]
 Progress = Callable[[int, int], None]
-WORTH = 0.8
-"""A setting that takes more than this share of the default's time is not worth a choice."""
-MOST_S = 4.0
-"""CPU seconds after which a setting is not run again: its least time is known well enough."""
+WORTH = 0.8  #: A setting that takes more than this share of the default's time is not worth a choice.
+MOST_S = 4.0  #: CPU seconds after which a setting is not run again: its least time is known well enough.
 
 
 class Work(Record):
@@ -115,8 +112,7 @@ class Work(Record):
 
     clock: Clock  #: CPU seconds so far.
     tolerance_mm: float  #: See `Ladder`.
-    runs: int = 3
-    """Of each setting: times are the least of them, distances their root mean square."""
+    runs: int = 3  #: Of each setting: times are the least of them, distances their root mean square.
     announce: Callable[[float], None] = lambda _seconds: None
     """Called once, when the default has been timed, with about how many CPU seconds the rest will take."""
     progress: Progress | None = None  #: Called with settings done and in all.

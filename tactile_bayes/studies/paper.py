@@ -112,8 +112,7 @@ class LineFit(Record):
     sigma_mm: float
     """`amplitude`, `sigma_mm`: a and sigma of Eq 5."""
     rms: float  #: Root mean square of what the Gaussian leaves, in units of the background.
-    resolved: bool = True
-    """True when the width lies within what the fit looks at, and not at an end of it."""
+    resolved: bool = True  #: True when the width lies within what the fit looks at, and not at an end of it.
 
 
 Fit = Callable[[TactileLine, float], LineFit]  #: Fits Eq 5 to a line within a radius in mm.

@@ -163,8 +163,7 @@ class SolidSettings(CaseSettings, kw_only=True):
     lines at these distances either side along it, which must be whole steps."""
     fit_radius_mm: float = FIT_RADIUS_MM  #: Eq 7 is fitted within this distance of the lump's axis.
     rank_tolerance: float = RANK_TOLERANCE  #: See `solid.skin_perturbation`.
-    mesh_reach_mm: float = MeshSize().reach_mm
-    """Radius at which the mesh ends, on a rim that does not move."""
+    mesh_reach_mm: float = MeshSize().reach_mm  #: Radius at which the mesh ends, on a rim that does not move.
     background: str = "free"  #: ``"free"``: Eq 7's level is fitted; ``"fixed"``: it is 1.
     flat_field: bool = True
     """True when each taxel is divided by what it reads of the same body without the lump."""

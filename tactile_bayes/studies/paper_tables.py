@@ -28,8 +28,7 @@ TABLE_DIAMETERS_MM = (5.0, 10.0, 15.0, 20.0, 25.0)
 TABLE_DEPTH_RATIOS = (0.6, 1.8)
 PRINTED_FRAMES = {0.6: (4.1, 4.3, 4.1, 4.1, 4.2), 1.8: (4.1, 4.2, 4.2, 4.0, 4.1)}
 """Table 1 in percent, by h/d, over the diameters."""
-PRINTED_MAPS = {0.6: (2.4, 2.7, 2.5, 2.3, 2.2), 1.8: (2.3, 2.5, 2.4, 2.5, 2.6)}
-"""Table 2 in percent."""
+PRINTED_MAPS = {0.6: (2.4, 2.7, 2.5, 2.3, 2.2), 1.8: (2.3, 2.5, 2.4, 2.5, 2.6)}  #: Table 2 in percent.
 DEFINITION = (
     "MSD = sum of squared differences over the sum of squares of the elastic model; the paper does not define its own. "
     "Strict: the same over the sum of squares of (map - 1), what the lump adds."

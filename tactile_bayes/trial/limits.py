@@ -127,8 +127,7 @@ class Limits(Record):
     n: Count
     bias: float
     bias_interval: Ends | None
-    sd: float
-    """Standard deviation that the limits are built on: of one difference, for single readings."""
+    sd: float  #: Standard deviation that the limits are built on: of one difference, for single readings.
     low: float
     high: float
     """`low`, `high`: bias -+ z sd, between which the stated share of differences lies."""

@@ -429,8 +429,7 @@ class Concordance(Record):
     pearson_r: float
     bias_correction: float  #: C_b, above 0 to 1: 1 when means and standard deviations agree.
     scale_shift: float  #: SD of y over that of x.
-    location_shift: float
-    """Mean of y less that of x, over the geometric mean of the SDs (divisor n)."""
+    location_shift: float  #: Mean of y less that of x, over the geometric mean of the SDs (divisor n).
     interval: tuple[float, float] | None
     """By Fisher's z; None for fewer than 4 pairs or a perfect or uncorrelated sample."""
 

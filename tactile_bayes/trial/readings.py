@@ -71,8 +71,7 @@ class ModalitySizes(Record, eq=False):
     name: str
     patient: npt.NDArray[np.int64]  #: (n,) array, the patient of each mass by number.
     ex_vivo_mm: FloatArray  #: (n,) array, above 0.
-    size_mm: FloatArray
-    """(n,) array: mean over the detected replicates; 0 where none was detected."""
+    size_mm: FloatArray  #: (n,) array: mean over the detected replicates; 0 where none was detected.
     replicates_mm: tuple[FloatArray, ...]  #: n arrays: the detected replicates of each mass.
     intervals: tuple[IntervalReading, ...] = ()  #: The credible intervals that the readings state.
     readings: int = 0
@@ -336,8 +335,7 @@ class Trial(Record, eq=False):
     ex_vivo_sd_mm: Mapping[MassKey, float | None] = field(default_factory=dict)
     """Standard deviation of each ex-vivo size where it is known; enters the calibration in quadrature."""
     other_visits: OtherVisits = field(default_factory=OtherVisits)  #: What the readings leave out.
-    files: Mapping[str, Path] = field(default_factory=dict)
-    """Files that they were read from, by role."""
+    files: Mapping[str, Path] = field(default_factory=dict)  #: Files that they were read from, by role.
 
     def sizes(self) -> dict[str, ModalitySizes]:
         """The sizes by each modality."""
