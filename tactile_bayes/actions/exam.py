@@ -30,7 +30,6 @@ from tactile_bayes.files.provenance import Provenance, hash_inputs
 from tactile_bayes.files.scan_mcap import read_scan_report, read_truth, write_scan
 from tactile_bayes.files.size_json import SHIPPED, size_calibration_path
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.scan import Scan
 
@@ -95,10 +94,6 @@ def _import_map(
     settings = {"as": "map", "spacing_mm": tactile_map.recipe.cell_mm, "normalise": normalise, "units": units}
     provenance = Provenance("import", settings, inputs=hash_inputs(source=source))
     write_map(output, tactile_map, provenance=provenance, force=force)
-    return _describe_map(tactile_map)
-
-
-def _describe_map(tactile_map: TactileMap) -> list[str]:
     ny, nx = tactile_map.mean.shape
     covered = int(tactile_map.covered.sum())
     low, high = np.nanmin(tactile_map.mean), np.nanmax(tactile_map.mean)

@@ -28,12 +28,6 @@ from tactile_bayes.geometry import FloatArray
 _POINTS, _WEIGHTS = np.polynomial.legendre.leggauss(3)
 
 
-def lame(young: FloatArray | float, poisson: float) -> tuple[FloatArray, FloatArray]:
-    """Lame's lambda and the shear modulus mu, in the unit of `young`."""
-    young = np.asarray(young, dtype=np.float64)
-    return young * poisson / ((1 + poisson) * (1 - 2 * poisson)), young / (2 * (1 + poisson))
-
-
 def assemble(mesh: QuadMesh, *, young_kpa: FloatArray, poisson: float) -> csc_array:
     """Assemble the stiffness matrix (kPa, (2n, 2n)) of a mesh of unit thickness from each element's Young's modulus.
 

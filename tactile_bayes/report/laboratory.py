@@ -234,15 +234,15 @@ def heads_text(found: ByHead) -> str:
         f"{'head':<38}{'Table 1 (4.1)':>20}{'all (4.3)':>11}{'Table 2 (2.4)':>20}{'distance':>10}",
     ]
     for head, rows in sorted(found.items(), key=lambda item: table_distance(item[1])):
-        frames, maps = _span(rows, "centred_frame"), _span(rows, "map")
+        frames, maps = _span([one.centred_frame for one in rows]), _span([one.map for one in rows])
         every = f"{100 * sum(one.all_frames for one in rows) / len(rows):.1f}"
         lines.append(f"{named(head):<38}{frames:>20}{every:>11}{maps:>20}{table_distance(rows):>10.2f}")
     return "\n".join(lines)
 
 
-def _span(rows: Sequence[Agreement], name: str) -> str:
-    shares = [100 * getattr(one, name) for one in rows]
-    return f"{sum(shares) / len(shares):.1f} ({min(shares):.1f} to {max(shares):.1f})"
+def _span(shares: Sequence[float]) -> str:
+    percent = [100 * share for share in shares]
+    return f"{sum(percent) / len(percent):.1f} ({min(percent):.1f} to {max(percent):.1f})"
 
 
 def _others(found: Sequence[Agreement]) -> list[str]:
@@ -252,10 +252,7 @@ def _others(found: Sequence[Agreement]) -> list[str]:
         f"{'':<37}{'frame':>21}{'frame over its mean':>21}{'map':>21}",
     ]
     for i, name in enumerate(OTHER_DEFINITIONS):
-        cells = []
-        for of in range(3):
-            shares = [100 * one.others[i][of] for one in found]
-            cells.append(f"{sum(shares) / len(shares):.1f} ({min(shares):.1f} to {max(shares):.1f})")
+        cells = [_span([one.others[i][of] for one in found]) for of in range(3)]
         lines.append(f"{name:<37}" + "".join(f"{cell:>21}" for cell in cells))
     return [*lines, ""]
 

@@ -29,7 +29,6 @@ from tactile_bayes.forward.plane_strain import (
     SurfaceCompliance,
     assemble,
     condense,
-    lame,
     skin_average,
     surface_compliance,
     surface_transfer,
@@ -37,6 +36,11 @@ from tactile_bayes.forward.plane_strain import (
 from tactile_bayes.forward.tissue import Body, Layers, parse_seat
 
 NEARLY_INCOMPRESSIBLE = pytest.mark.parametrize("poisson", [0.3, 0.495, 0.4999])
+
+
+def lame(young, poisson: float) -> tuple:
+    """Lame's lambda and the shear modulus mu, in the unit of `young`."""
+    return young * poisson / ((1 + poisson) * (1 - 2 * poisson)), young / (2 * (1 + poisson))
 
 
 def on_the_edge(mesh: QuadMesh) -> np.ndarray:
