@@ -112,8 +112,7 @@ def calibrate_size_action(
     force: bool,
 ) -> None:
     """Learn Eq 6, d = m sigma / (e a^f) + b, from a study or a set of phantoms, or over a population of bodies."""
-    for path in filter(None, (output, figure)):
-        refuse_existing(path, force=force)
+    refuse_existing(output, figure, force=force)
     declared = {"normalise": normalise, "background": background, "fit_radius_mm": fit_radius_mm, "noise": noise}
     if correct is not None:
         why = "is for learning a calibration; leave it out with --correct"

@@ -176,8 +176,7 @@ def replay_action(
     force: bool,
 ) -> None:
     """Replay a scan through emulated devices, recorder and live view, as if it were being recorded by `record`."""
-    if output is not None:
-        refuse_existing(output, force=force)
+    refuse_existing(output, force=force)
     found = read_scan(scan)
     with tempfile.TemporaryDirectory() as folder, _emulated(scan, speed, poses=bool(len(found.poses))) as urls:
         options = {"like": scan, "clock": "shared", "at_once": True, "live": live, "serve": serve, "force": force}
@@ -216,8 +215,7 @@ def _emulated(scan: Path, speed: float, *, poses: bool) -> Iterator[dict[str, st
 
 def repair_action(*, scan: Path, output: Path | None, force: bool) -> None:
     """Repair a scan that was cut off or damaged: keep what is intact, report what is lost."""
-    if output is not None:
-        refuse_existing(output, force=force)
+    refuse_existing(output, force=force)
     if output is None:
         refuse_recording(scan)
     file = read_scan_report(scan)

@@ -52,8 +52,7 @@ def map_action(
 
     if twice := given_twice(scans):
         raise UsageError(f"{twice} is given twice; its frames would count twice: give each scan once")
-    for path in filter(None, (output, figure)):
-        refuse_existing(path, force=force)
+    refuse_existing(output, figure, force=force)
     settings = to_plain(MapOptions(**options), digits=EXACT)
     clock = _Clock(verbose)
     loaded = [read_scan(path) for path in scans]
@@ -199,8 +198,7 @@ def estimate_action(
         raise UsageError(f"{twice} is given twice; give each map once")
     if any(outputs) and len(maps) > 1 and not pool:
         raise UsageError("--output and the figures take one map at a time; use --json for several")
-    for path in filter(None, outputs):
-        refuse_existing(path, force=force)
+    refuse_existing(*outputs, force=force)
     begun = time.perf_counter()
     if pool:
         if map_figure or fit_figure:
@@ -322,8 +320,7 @@ def compare_action(
         raise UsageError(f"{twice} is given twice; give each map once, at its own visit")
     refuse_checkpoint(settings)
     comparing.check_visits(len(visits))
-    if figure is not None:
-        refuse_existing(figure, force=force)
+    refuse_existing(figure, force=force)
     found = _compare(visits, settings, comparing)
     report = found.report.checked()
     text_of = json_text if as_json else compare_text if verbose else compare_summary

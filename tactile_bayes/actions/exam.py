@@ -215,8 +215,7 @@ def diagnose_action(
     """Check the draws of a posterior: R-hat, effective draws and Monte-Carlo errors of every size and width."""
     figures = {"rank": rank, "trace": trace, "corner": corner}  # ranks first: they may be refused
     asked = {kind: path for kind, path in figures.items() if path is not None}
-    for path in asked.values():
-        refuse_existing(path, force=force)
+    refuse_existing(*asked.values(), force=force)
     found = diagnosed(posterior)
     for kind, path in asked.items():
         found.draw(kind, path, force=force)

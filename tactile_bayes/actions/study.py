@@ -110,8 +110,7 @@ def prepare_figures(folder: Path, *, model: str, force: bool) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UsageError(f"{folder} cannot be made a directory ({error.strerror}); choose another name") from None
-    for path in figure_paths(folder, model=model):
-        refuse_existing(path, force=force)
+    refuse_existing(*figure_paths(folder, model=model), force=force)
 
 
 def draw_figures(
@@ -170,8 +169,7 @@ def study_action(
         raise UsageError(f"{named} is for --figures of the plane-strain model; give --figures DIR")
     frames = [] if measured_frames is None else read_frames(measured_frames)
     geometries = paper_grid(chosen) if asked.grid == "paper" else read_grid(Path(asked.grid), seat=chosen)
-    if output is not None:
-        refuse_existing(output, force=force)
+    refuse_existing(output, force=force)
     if figures is not None:
         prepare_figures(figures, model=model, force=force)
     with open_executor(workers=workers, cluster=scheduler) as executor:
@@ -354,8 +352,7 @@ def head_design_action(*, head: str | None, figure: Path | None, as_json: bool, 
     """Find the head that presses evenly on homogeneous tissue (section 2.1 of the paper)."""
     body = HomogeneousTissue(**tissue)
     limit = body.limit_percent / 100
-    if figure is not None:
-        refuse_existing(figure, force=force)
+    refuse_existing(figure, force=force)
     found = search_heads(body, kinds=HEADS if head is None else (head,))
     if figure is not None:
         design_figure(found, body, limit=limit, path=figure, force=force)
@@ -392,8 +389,7 @@ def compare_model_action(
     force: bool,
 ) -> None:
     """Compare a scan's frames and map with a forward model of SCENE (section 2.3 of the paper)."""
-    if figure is not None:
-        refuse_existing(figure, force=force)
+    refuse_existing(figure, force=force)
     body = read_scene(scene)
     loaded = read_scan(scan)
     if at is None and not (body.solid_lumps or body.lumps):
@@ -439,9 +435,7 @@ def sbc_action(
     **options: Any,
 ) -> None:
     """Check the posterior against itself: simulation-based calibration and coverage."""
-    for path in (output, figure):
-        if path is not None:
-            refuse_existing(path, force=force)
+    refuse_existing(output, figure, force=force)
     asked, begun = SbcOptions(**options), monotonic()
     how: dict[str, Any] = {"method": asked.method, "seed": asked.seed, "cosines": asked.field_cosines}
 

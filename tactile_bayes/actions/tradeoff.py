@@ -188,8 +188,7 @@ def tradeoff_forward_action(
     force: bool,
 ) -> None:
     """Measure error in amplitude, width and size against CPU time, for the lump of a scene."""
-    if figure is not None:
-        refuse_existing(figure, force=force)
+    refuse_existing(figure, force=force)
     if size_calibration not in (None, "learned"):
         also_read(size_calibration_path(size_calibration))
     report = run_tradeoff(_case(scene, head), size_calibration, tolerance=tolerance_percent / 100, runs=runs)
@@ -260,8 +259,7 @@ def tradeoff_estimate_action(
     force: bool,
 ) -> None:
     """Measure what each setting of `estimate` costs on a map, and how far its size interval is off."""
-    if figure is not None:
-        refuse_existing(figure, force=force)
+    refuse_existing(figure, force=force)
     if twice := given_twice(maps):
         raise UsageError(f"{twice} is given twice; give each map once")
     settings = settings_of(
@@ -309,8 +307,7 @@ def tradeoff_map_action(
     force: bool,
 ) -> None:
     """Measure what each setting of `map` costs on a scan, and how far it moves the size interval."""
-    if figure is not None:
-        refuse_existing(figure, force=force)
+    refuse_existing(figure, force=force)
     read_scan(scan)  # imports and first calls cost nothing afterwards
     begun = time.process_time()
     loaded = read_scan(scan)

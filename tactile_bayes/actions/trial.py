@@ -42,9 +42,7 @@ def validate_action(
     **settings: Any,
 ) -> None:
     """Compare sizes with excision: errors, lines, agreement, repeatability and calibration of each modality."""
-    for target in (output, html):
-        if target:
-            refuse_existing(target, force=force)
+    refuse_existing(output, html, force=force)
     title, chosen = _settings(settings, protocol)
     inputs = load_trial(trial, excision, columns)
     also_read(*inputs.files.values())
@@ -92,8 +90,7 @@ def plan_action(
     **errors: float,
 ) -> None:
     """Plan a trial: power, widths of intervals and the worth of more maps, by simulation."""
-    if output:
-        refuse_existing(output, force=force)
+    refuse_existing(output, force=force)
     typed = typed_options()
     compared = against if "against" in typed else None
     read = read_pilot(pilot, excision, compared)

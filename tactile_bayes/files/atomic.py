@@ -81,10 +81,17 @@ _WAYS_OUT = {
 }
 
 
-def refuse_existing(path: Path, *, force: bool) -> None:
-    """Raise an error, before any work is done, when `path` exists and --force was not given, is a directory or a device
-    (with or without --force), or lies in a directory that does not exist or may not be written.
+def refuse_existing(*paths: Path | None, force: bool) -> None:
+    """Raise an error, before any work is done, when one of `paths` (None is no file) exists and --force was not given,
+    is a directory or a device (with or without --force), or lies in a directory that does not exist or may not be
+    written.
     """
+    for path in paths:
+        if path is not None:
+            _refuse_existing(path, force=force)
+
+
+def _refuse_existing(path: Path, *, force: bool) -> None:
     try:
         kind = special_kind(path.stat().st_mode)
     except FileNotFoundError:
