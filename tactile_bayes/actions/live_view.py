@@ -23,13 +23,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tactile_bayes.batch import prepare_worker
-from tactile_bayes.declarations import replace
+from tactile_bayes.declarations import from_plain, replace
 from tactile_bayes.errors import TactileBayesError
 from tactile_bayes.files.instrument_json import (
     calibration_document,
-    calibration_from_document,
     head_document,
-    head_from_document,
 )
 from tactile_bayes.files.size_json import read_size_calibration, size_calibration_path
 from tactile_bayes.findings import finding_summary
@@ -230,7 +228,7 @@ def run(pipe: int, setup: dict[str, Any]) -> None:
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)  # it ends the recording, and that ends the view
     reader = FeedReader(pipe)
-    live = LiveMap(head_from_document(setup["head"]), calibration_from_document(setup["calibration"]))
+    live = LiveMap(from_plain(HeadGeometry, setup["head"]), from_plain(ElementCalibration, setup["calibration"]))
     estimator = Estimator(setup["size_calibration"])
     estimator.warm_up()
     with contextlib.ExitStack() as stack:

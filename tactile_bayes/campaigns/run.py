@@ -169,17 +169,7 @@ def _key(task: Task) -> str:
     return task.key
 
 
-# --- A campaign: from a table of exams to maps, estimates, pooled sizes and growth, step by step, resumable.
-#
-# Layout of the output folder: ``exams/EXAM/`` (map.nc, estimate.json, posterior.nc, shape.npz, thumbnail.png...),
-# ``masses/MASS/`` (pooled.json, pooled.nc) and ``growth/MASS/`` (compare.json), the tables and pages beside them
-# (`campaigns.report`), repeatability.json where it was learned (the sizes by it are ``exams/EXAM/sized.json``), and
-# the journal, which holds for each step its key, the digests of its files and how long it took. The key is the
-# step, the exam or mass, and a digest of the program's version, the settings and the content of the inputs. A step
-# whose key is in the journal and whose files are what it made is not run again.
-#
-# Exams go through the steps in blocks, in the order of the table, and the results stay in the journal: memory holds
-# the table of exams, a few hundred bytes for each step, and one block.
+# --- The campaign.
 
 Bar = Callable[[str], AbstractContextManager[Progress]]
 _Any = TypeVar("_Any")
@@ -210,10 +200,8 @@ class Campaign:
         self.exams, self.folder, self.settings = exams, folder, settings
         self._stages = Stages(store=store, executor=executor, dry=dry)
         self.found: CampaignState = self._stages.found
-        self.not_pooled, self.not_compared = (
-            "",
-            "",
-        )  # why no mass is; empty where masses are, or none has several visits
+        self.not_pooled = ""  # why no mass is; empty where masses are
+        self.not_compared = ""  # the same of visits; empty too where no mass has several
         self.unread: set[str] = set()  # names of the exams whose file could not be read
         self.repeatability: Repeatability | None = None  # learned from the repeats
         self.not_learned = ""  # why it was not, where masses have repeats

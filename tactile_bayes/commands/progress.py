@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 import time
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TextIO
@@ -44,40 +43,29 @@ def progress_bar(
         Whether the time left is told, for work whose parts take equally long.
     """
     out = raw_stream(sys.stderr) if stream is None else stream
-    if not out.isatty():
-        yield untold if log_every_s is None else _Log(label, out, clock, log_every_s, time_left=time_left).update
+    if not out.isatty() and log_every_s is None:
+        yield untold
         return
-    bar = _Bar(label, out, clock, time_left=time_left)
+    teller = _Teller(label, out, clock, log_every_s=None if out.isatty() else log_every_s, time_left=time_left)
     try:
-        yield bar.update
+        yield teller.update
     finally:
-        bar.erase()
+        teller.erase()
 
 
-class _Teller(ABC):
-    """What is told of work, and how often.
-
-    Parameters
-    ----------
-    quiet_s, every_s
-        Until the first is told, and from one to the next.
-    """
+class _Teller:
+    """Tells of work: a line of a log every so often, or else a bar that is redrawn."""
 
     def __init__(
-        self,
-        label: str,
-        out: TextIO,
-        clock: Callable[[], float],
-        *,
-        quiet_s: float,
-        every_s: float,
-        time_left: bool,
+        self, label: str, out: TextIO, clock: Callable[[], float], *, log_every_s: float | None, time_left: bool
     ) -> None:
-        self._label, self._out, self._clock, self._every_s = label, out, clock, every_s
-        self._time_left = time_left
+        self._label, self._out, self._clock, self._time_left = label, out, clock, time_left
+        self._bar = log_every_s is None
+        quiet_s, self._every_s = (QUIET_S, REDRAW_S) if log_every_s is None else (log_every_s, log_every_s)
         self._begun = clock()
         self._next = self._begun + quiet_s
         self._first: int | None = None  # what a resumed run had before it began
+        self._drawn = 0
 
     def update(self, done: int, total: int) -> None:
         """Tell `done` of `total`, at most every so often."""
@@ -86,45 +74,25 @@ class _Teller(ABC):
         if now < self._next or total <= 0:
             return
         self._next = now + self._every_s
-        self._tell(done, total, self._left(now, done, total))
+        left = self._left(now, done, total)
+        if self._bar:
+            filled = _WIDTH * done // total
+            line = f"{self._label} [{'#' * filled}{'-' * (_WIDTH - filled)}] {done}/{total}{left}"
+            self._out.write("\r" + line.ljust(self._drawn))
+            self._drawn = len(line)
+        else:
+            self._out.write(f"{self._label}: {done} of {total} done{',' if left else ''}{left}\n")
         self._out.flush()
 
-    @abstractmethod
-    def _tell(self, done: int, total: int, left: str) -> None:
-        """Write what is done of how much, and the time left where it is known, which begins with a blank."""
-
     def _left(self, now: float, done: int, total: int) -> str:
+        """The time left, after a blank; empty where it is not known."""
         new = done - (self._first or 0)
         if not self._time_left or new <= 0 or done >= total:
             return ""
         return f" {duration(round((now - self._begun) * (total - done) / new))} left"
 
-
-class _Log(_Teller):
-    """Lines in a file or a pipe, for work of hours."""
-
-    def __init__(self, label: str, out: TextIO, clock: Callable[[], float], every_s: float, *, time_left: bool) -> None:
-        super().__init__(label, out, clock, quiet_s=every_s, every_s=every_s, time_left=time_left)
-
-    def _tell(self, done: int, total: int, left: str) -> None:
-        self._out.write(f"{self._label}: {done} of {total} done{',' if left else ''}{left}\n")
-
-
-class _Bar(_Teller):
-    """A line that is redrawn."""
-
-    def __init__(self, label: str, out: TextIO, clock: Callable[[], float], *, time_left: bool) -> None:
-        super().__init__(label, out, clock, quiet_s=QUIET_S, every_s=REDRAW_S, time_left=time_left)
-        self._drawn = 0
-
-    def _tell(self, done: int, total: int, left: str) -> None:
-        filled = _WIDTH * done // total
-        line = f"{self._label} [{'#' * filled}{'-' * (_WIDTH - filled)}] {done}/{total}{left}"
-        self._out.write("\r" + line.ljust(self._drawn))
-        self._drawn = len(line)
-
     def erase(self) -> None:
-        """Erase the line."""
+        """Erase the bar."""
         if self._drawn:
             self._out.write("\r" + " " * self._drawn + "\r")
             self._out.flush()

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import re
 from collections.abc import Sequence
 from typing import Final, NamedTuple
@@ -11,6 +9,7 @@ from typing import Final, NamedTuple
 from tactile_bayes.errors import UsageError
 from tactile_bayes.exports.exam import NOT_DETECTED, NOT_SIZED, SIZED, EstimateFile, SizedMass, content_uuid
 from tactile_bayes.exports.identity import Identity
+from tactile_bayes.files.tables import csv_text
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.presets import RESEARCH_USE
 
@@ -100,7 +99,7 @@ COMPLETE: Final = f"{FORM}_complete"
 def dictionary_csv() -> str:
     """The data dictionary of the form, for a new project or to append to one."""
     rows = [_dictionary_row(one) for one in FIELDS]
-    return _csv([DICTIONARY_HEADER, *([row.get(name, "") for name in DICTIONARY_HEADER] for row in rows)])
+    return csv_text(DICTIONARY_HEADER, ([row.get(name) for name in DICTIONARY_HEADER] for row in rows))
 
 
 def _dictionary_row(one: Field) -> dict[str, str]:
@@ -136,7 +135,7 @@ def records_csv(estimates: Sequence[EstimateFile], identity: Identity, *, id_fro
             seen[name] = estimate
             rows.append({"record_id": name, COMPLETE: "1"} | _row(estimate, finding, identity))
     header = [*(one.name for one in FIELDS), COMPLETE]
-    return _csv([header, *([row.get(name, "") for name in header] for row in rows)])
+    return csv_text(header, ([row.get(name) for name in header] for row in rows))
 
 
 def _record_id(estimate: EstimateFile, finding: SizedMass, identity: Identity, *, id_from_scan: bool) -> str:
@@ -219,9 +218,3 @@ def _is_number(text: str) -> bool:
     except ValueError:
         return False
     return True
-
-
-def _csv(rows: Sequence[Sequence[str]]) -> str:
-    buffer = io.StringIO()
-    csv.writer(buffer, lineterminator="\n").writerows(rows)
-    return buffer.getvalue()

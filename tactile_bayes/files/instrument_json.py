@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
 from datetime import date
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal, TypeVar
+from typing import Annotated, Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_bayes.declarations import Meta, Record, field, to_plain
+from tactile_bayes.declarations import EXACT, Meta, Record, field, to_plain
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.atomic import write_text
 from tactile_bayes.files.documents import dump_json, load_json, parse_record, read_record
@@ -22,11 +21,9 @@ from tactile_bayes.scan import ElementCalibration, HeadGeometry, HeadShape, Land
 # --- Parts of a scan file besides MCAP: head and calibration documents, times in ns, the reader's report.
 
 _NS = 1_000_000_000
-_T = TypeVar("_T")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ScanFile:
+class ScanFile(Record, eq=False):
     """A scan and the report on its file."""
 
     scan: Scan
@@ -63,65 +60,12 @@ def s_from_ns(time_ns: NDArray[np.int64]) -> FloatArray:
 
 def head_document(head: HeadGeometry) -> dict[str, Any]:
     """Head geometry as plain data; JSON keeps every bit of a double."""
-    return {
-        "pitch_mm": float(head.pitch_mm),
-        "scanhead_from_tracker": head.scanhead_from_tracker.tolist(),
-        "surface_mm": head.surface_mm.tolist(),
-    }
-
-
-def head_from_document(document: Mapping[str, Any]) -> HeadGeometry:
-    """Undo `head_document`, checking everything."""
-    return _build(
-        "head.json",
-        lambda: HeadGeometry(
-            surface_mm=_array(document, "surface_mm", ndim=3),
-            pitch_mm=float(document["pitch_mm"]),
-            scanhead_from_tracker=_array(document, "scanhead_from_tracker", ndim=2),
-        ),
-    )
+    return dict(sorted(to_plain(head, digits=EXACT).items()))
 
 
 def calibration_document(calibration: ElementCalibration) -> dict[str, Any]:
     """Element calibration as plain data."""
-    return {
-        "saturation_count": int(calibration.saturation_count),
-        "gain_kpa_per_count": calibration.gain_kpa_per_count.tolist(),
-        "offset_kpa": calibration.offset_kpa.tolist(),
-    }
-
-
-def calibration_from_document(document: Mapping[str, Any]) -> ElementCalibration:
-    """Undo `calibration_document`, checking everything."""
-    return _build(
-        "element_calibration.json",
-        lambda: ElementCalibration(
-            gain_kpa_per_count=_array(document, "gain_kpa_per_count", ndim=2),
-            offset_kpa=_array(document, "offset_kpa", ndim=2),
-            saturation_count=int(document["saturation_count"]),
-        ),
-    )
-
-
-def _array(document: Mapping[str, Any], key: str, *, ndim: int) -> FloatArray:
-    array: FloatArray = np.array(document[key], dtype=np.float64)
-    if array.ndim != ndim:
-        raise BadDataError(f"{key} has {array.ndim} dimensions", way_out=f"it must have {ndim}")
-    return array
-
-
-def _build(name: str, make: Callable[[], _T]) -> _T:
-    """Call `make`, and turn an error in a foreign document into one line."""
-    try:
-        return make()
-    except BadDataError as error:
-        raise BadDataError(f"{name}: {error.what}", way_out=error.way_out) from None
-    except KeyError as error:
-        raise BadDataError(f"{name} lacks {error}", way_out="write the scan again with this program") from None
-    except (TypeError, ValueError) as error:
-        raise BadDataError(
-            f"{name} holds what is not numbers ({error})", way_out="write the scan again with this program"
-        ) from None
+    return {"saturation_count": int(calibration.saturation_count), **to_plain(calibration, digits=EXACT)}
 
 
 # --- Heads as JSON: places of the taxels, or their grid and arc, for `record` and for simulated bodies.

@@ -16,7 +16,7 @@ from tactile_bayes.files.atomic import write_text
 from tactile_bayes.files.documents import load_schema
 from tactile_bayes.files.reading import TABLE_BYTES, check_address, is_address, read_bytes
 from tactile_bayes.files.size_json import NONE, SHIPPED
-from tactile_bayes.files.tables import RawTable, Table, read_raw, read_table
+from tactile_bayes.files.tables import RawTable, Table, csv_cell, csv_text, read_raw, read_table
 from tactile_bayes.trial.readings import Reading, at_excision
 
 # --- Names of exams and masses of a campaign, and of the files in its output folder.
@@ -240,7 +240,7 @@ def add_rows(table: RawTable, rows: Sequence[Mapping[str, object]]) -> None:
     writer = csv.writer(out, delimiter=table.separator, lineterminator="\n")
     writer.writerow(header)
     writer.writerows([row.get(name, "") for name in header] for row in table.rows)
-    writer.writerows([_cell(row.get(name)) for name in header] for row in rows)
+    writer.writerows([csv_cell(row.get(name)) for name in header] for row in rows)
     mark = "\ufeff" if read_bytes(table.path, most=TABLE_BYTES).startswith(b"\xef\xbb\xbf") else ""
     write_text(table.path, mark + out.getvalue(), force=True)
 
@@ -250,22 +250,5 @@ def _columns() -> list[str]:
 
 
 def table_text(rows: Sequence[Mapping[str, object]], columns: Sequence[str]) -> str:
-    """CSV text of rows; None is a blank cell, numbers keep every digit."""
-    out = io.StringIO(newline="")
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(columns)
-    writer.writerows([_cell(row.get(name)) for name in columns] for row in rows)
-    return out.getvalue()
-
-
-def _cell(value: object) -> str:
-    if value is None:
-        return ""
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    return repr(value) if isinstance(value, float) else _plain(str(value))
-
-
-def _plain(text: str) -> str:
-    """Text as `read_table` takes it: without blanks around it, each unprintable character escaped."""
-    return "".join(one if one.isprintable() else ascii(one)[1:-1] for one in text.strip())
+    """CSV text of rows."""
+    return csv_text(columns, ([row.get(name) for name in columns] for row in rows))

@@ -77,8 +77,6 @@ class Variable(Record):
     """Text by name: units, a long name."""
     fill: float | None = None
     """Stands for "no value" in a variable that may have none: its ``_FillValue``. Not for coordinates."""
-    scale: float | None = None
-    """Factor on the stored numbers: the ``scale_factor`` of the CF conventions."""
 
 
 class Contents(Record):
@@ -139,8 +137,6 @@ def _write_values(place: Any, name: str, variable: Variable) -> Any:
     written = place.create_dataset(name, data=variable.values, fillvalue=variable.fill, track_order=True, **_PACKING)
     if variable.fill is not None:
         written.attrs["_FillValue"] = np.array([variable.fill], written.dtype)
-    if variable.scale is not None:
-        written.attrs["scale_factor"] = np.float64(variable.scale)
     for key, text in variable.attributes.items():
         written.attrs[key] = text
     written.flush()  # else its chunks get their place when its last reference goes, and a profiler may hold one

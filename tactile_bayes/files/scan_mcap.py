@@ -17,15 +17,14 @@ from mcap_protobuf.schema import build_file_descriptor_set
 from numpy.typing import NDArray
 
 from tactile_bayes import __version__
+from tactile_bayes.declarations import from_plain
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.atomic import atomic_path, refuse_existing
 from tactile_bayes.files.documents import check_session, parse_json
 from tactile_bayes.files.instrument_json import (
     ScanFile,
     calibration_document,
-    calibration_from_document,
     head_document,
-    head_from_document,
     ns_from_s,
     s_from_ns,
 )
@@ -71,6 +70,7 @@ NIPPLE: Final = "nipple"
 """A landmark that a scan may do without; a file has a channel for it only where it was touched."""
 TOPICS: Final = ("/pressure", "/pose", "/landmark")
 _NS: Final = 1_000_000_000
+_CALIBRATION: Final = "element_calibration.json"
 _LATEST_NS: Final = 2**63 - 1
 
 
@@ -107,7 +107,7 @@ class ScanWriter:
         if findings:
             self._writer.add_metadata("findings", {"json": _compact([one.as_dict() for one in findings])})
         self._attach("head.json", head_document(head))
-        self._attach("element_calibration.json", calibration_document(element_calibration))
+        self._attach(_CALIBRATION, calibration_document(element_calibration))
         self._register()
         self._grid = _grid_of(head).SerializeToString(deterministic=True)
 
@@ -312,8 +312,8 @@ def scan_records(path: Path, *, keep: Collection[str]) -> McapRecords:
 
 
 def _assemble(records: McapRecords, *, path: Path) -> ScanFile:
-    head = head_from_document(json_attachment(records, "head.json"))
-    calibration = calibration_from_document(json_attachment(records, "element_calibration.json"))
+    head = from_plain(HeadGeometry, json_attachment(records, "head.json"), where="head.json")
+    calibration = from_plain(ElementCalibration, json_attachment(records, _CALIBRATION), where=_CALIBRATION)
     session = records.metadata.get("session", {})
     check_session(session, path=path)
     frames = _frames(records, head)
@@ -444,7 +444,7 @@ def summarise_scan(path: Path) -> dict[str, Any]:
 
 
 def _summary(records: McapRecords) -> dict[str, Any]:
-    head = head_from_document(json_attachment(records, "head.json"))
+    head = from_plain(HeadGeometry, json_attachment(records, "head.json"), where="head.json")
     time_s = message_times(records.messages("/pressure", schema="foxglove.Grid"), topic="/pressure")
     pose_s = message_times(records.messages("/pose", schema="foxglove.PoseInFrame"), topic="/pose")
     account = records.metadata.get("recording", {})

@@ -233,17 +233,26 @@ def read_raw(path: Path) -> RawTable:
     return RawTable(path, header, [line for line, _ in body], rows, cells.decimal_comma, cells.separator)
 
 
-def csv_text(names: Sequence[str], rows: Iterable[Iterable[object]], *, digits: int) -> str:
-    """CSV text of rows below their names; None is a blank cell, and numbers have so many significant digits."""
+def csv_text(
+    names: Sequence[str], rows: Iterable[Iterable[object]], *, digits: int | None = None, separator: str = ","
+) -> str:
+    """CSV text of rows below their names, with cells of `csv_cell`."""
+    out = io.StringIO(newline="")
+    writer = csv.writer(out, delimiter=separator, lineterminator="\n")
+    writer.writerow(names)
+    writer.writerows([csv_cell(value, digits) for value in row] for row in rows)
+    return out.getvalue()
 
-    def cell(value: object) -> str:
-        if value is None:
-            return ""
-        if isinstance(value, bool):
-            return "true" if value else "false"
-        return f"{value:.{digits}g}" if isinstance(value, float) else str(value)
 
-    return "".join(f"{','.join(line)}\n" for line in (names, *(map(cell, row) for row in rows)))
+def csv_cell(value: object, digits: int | None = None) -> str:
+    """Text of a cell as `read_table` takes it: None is blank, numbers have all their digits, or so many significant."""
+    if value is None:
+        return ""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, float):
+        return repr(value) if digits is None else f"{value:.{digits}g}"
+    return "".join(one if one.isprintable() else ascii(one)[1:-1] for one in str(value).strip())
 
 
 def check_references(table: Table, schema_name: str, *, targets: Mapping[str, Table]) -> None:
