@@ -134,8 +134,7 @@ def _half_space_stiffness(k: FloatArray, modulus_kpa: float, nu: float) -> Float
     """(n, 2, 2) tractions on the face of a half-space for unit displacements of it."""
     displacement, traction = _waves(np.zeros_like(k), nu)
     scale = (modulus_kpa / (1.0 + nu)) * k
-    stiffness: FloatArray = -scale[:, None, None] * traction @ np.linalg.inv(displacement)
-    return stiffness
+    return np.asarray(-scale[:, None, None] * traction @ np.linalg.inv(displacement))
 
 
 def _layer_stiffness(k: FloatArray, modulus_kpa: float, thickness_mm: float, nu: float) -> FloatArray:

@@ -275,13 +275,11 @@ class ContactStiffness(Record, eq=False):
 
     def times(self, right: FloatArray) -> FloatArray:
         """Product of the stiffness with an (n, c) array."""
-        product: FloatArray = self.plain @ right + self.factor @ (self.core @ (self.factor.T @ right))
-        return product
+        return np.asarray(self.plain @ right + self.factor @ (self.core @ (self.factor.T @ right)))
 
     def columns(self, chosen: NDArray[np.intp]) -> FloatArray:
         """(n, c) columns of the stiffness."""
-        picked: FloatArray = self.plain[:, chosen] + self.factor @ (self.core @ self.factor[chosen].T)
-        return picked
+        return np.asarray(self.plain[:, chosen] + self.factor @ (self.core @ self.factor[chosen].T))
 
 
 def press(

@@ -114,8 +114,7 @@ def square_mean(
     y = np.broadcast_to(square_mm * np.sqrt(7.0 / 30.0) * np.sin(angle), x.shape)
     value = function(np.minimum(np.hypot(x, y), last_mm))
     ring = np.einsum("rdk,rd->rk", value, np.cos(order * np.arctan2(y, x))) / _DIRECTIONS
-    mean: FloatArray = (2.0 * function(np.minimum(r_mm, last_mm)) + 5.0 * ring) / 7.0
-    return mean
+    return np.asarray((2.0 * function(np.minimum(r_mm, last_mm)) + 5.0 * ring) / 7.0)
 
 
 class PlacedLump(Record, eq=False):

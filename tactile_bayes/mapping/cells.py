@@ -36,8 +36,7 @@ def _no_cells() -> IntArray:
 
 def cell_index(position_mm: FloatArray, cell_mm: float) -> IntArray:
     """Index of the nearest cell; cell k is centred on k x cell_mm, so maps of one cell size share a lattice."""
-    index: IntArray = np.floor(position_mm / cell_mm + 0.5).astype(np.int64)
-    return index
+    return np.asarray(np.floor(position_mm / cell_mm + 0.5).astype(np.int64))
 
 
 @dataclass(slots=True, eq=False)
@@ -319,8 +318,7 @@ class Projection(Record, eq=False):
     def _coordinate(self, axis: int, first: int) -> FloatArray:
         rows = self.matrix[:, axis].copy()
         rows[:, 3] -= first
-        position: FloatArray = rows @ self.taxels.place_and_one
-        return position
+        return np.asarray(rows @ self.taxels.place_and_one)
 
 
 class Projector:
@@ -379,8 +377,7 @@ def yaw_deg(head: HeadGeometry, rotation: FloatArray, *, plane_from_base: FloatA
     """(n,) angle of the head's x axis on the plane from the plane's x axis, degrees."""
     axis = inverse(head.scanhead_from_tracker)[:3, 0]
     on_plane = (rotation * axis).sum(axis=2) @ plane_from_base[:2, :3].T
-    yaw: FloatArray = np.degrees(np.arctan2(on_plane[:, 1], on_plane[:, 0]))
-    return yaw
+    return np.asarray(np.degrees(np.arctan2(on_plane[:, 1], on_plane[:, 0])))
 
 
 # --- Conversion of counts to pressures in whole multiples of a tiny step, so that sums have no rounding error.

@@ -114,8 +114,7 @@ def numbered_on(blocks: Sequence[IndexArray]) -> IndexArray:
 def block_means(values: FloatArray, first: IndexArray) -> FloatArray:
     """(m, k) means of the rows of (n, k) values from each `first` up to the next."""
     counts = np.diff(np.append(first, len(values)))
-    means: FloatArray = np.add.reduceat(values, first, axis=0) / counts[:, None]
-    return means
+    return np.asarray(np.add.reduceat(values, first, axis=0) / counts[:, None])
 
 
 def stroke_starts(x_mm: FloatArray) -> list[int]:

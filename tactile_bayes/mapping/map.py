@@ -137,8 +137,7 @@ class TactileMap(Record, eq=False):
     @property
     def covered(self) -> BoolArray:
         """(ny, nx) True where the map has data."""
-        covered: BoolArray = (self.count > 0) & np.isfinite(self.mean)
-        return covered
+        return np.asarray((self.count > 0) & np.isfinite(self.mean))
 
     @property
     def counts_known(self) -> bool:
@@ -345,8 +344,7 @@ def _smoothed(tactile_map: TactileMap) -> FloatArray:
     weight = smooth(count)
     total = smooth(np.where(tactile_map.covered, tactile_map.mean, 0.0) * count)
     enough = tactile_map.covered & ~tactile_map.few
-    mean: FloatArray = np.divide(total, weight, out=np.full(weight.shape, np.nan), where=enough & (weight > 0))
-    return mean
+    return np.asarray(np.divide(total, weight, out=np.full(weight.shape, np.nan), where=enough & (weight > 0)))
 
 
 def _extent(excess: FloatArray, at: int) -> float:

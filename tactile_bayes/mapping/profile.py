@@ -88,8 +88,7 @@ def head_profile_figures(selections: Sequence[SelectedFrames]) -> dict[str, floa
 
 def _whole(level_kpa: FloatArray, valid_share: FloatArray, good: BoolArray) -> BoolArray:
     """Which frames can be read: those with all good taxels valid and a mean above 0."""
-    whole: BoolArray = (valid_share == np.count_nonzero(good) / good.size) & (level_kpa > 0)
-    return whole
+    return np.asarray((valid_share == np.count_nonzero(good) / good.size) & (level_kpa > 0))
 
 
 def profile_figures(rows: FloatArray) -> dict[str, float]:
@@ -113,8 +112,7 @@ def profile_figures(rows: FloatArray) -> dict[str, float]:
 
 def lump_free(left: FloatArray) -> BoolArray:
     """(f,) which of at least two frames feel no lump, by the (f,) residuals of their smooth profiles."""
-    free: BoolArray = left <= SMOOTH_FACTOR * _tenth(left)
-    return free
+    return np.asarray(left <= SMOOTH_FACTOR * _tenth(left))
 
 
 def profile_frames(part: SelectedFrames) -> IndexArray:

@@ -185,8 +185,7 @@ def _density(draws_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 def _smoothed(at_mm: FloatArray, middle_mm: FloatArray, weights: FloatArray, width_mm: float) -> FloatArray:
     kernel = np.exp(-0.5 * ((at_mm[:, None] - middle_mm[None, :]) / width_mm) ** 2)
-    density: FloatArray = kernel @ weights / (width_mm * np.sqrt(2 * np.pi))
-    return density
+    return np.asarray(kernel @ weights / (width_mm * np.sqrt(2 * np.pi)))
 
 
 def _draw_density(axes: Axes, name: str, draws_mm: FloatArray, *, colour: str, dash: str) -> None:

@@ -158,8 +158,7 @@ def _shrunk(values: FloatArray, step: int) -> FloatArray:
     known = np.isfinite(squares)
     number = known.sum(axis=(1, 3))
     total = np.where(known, squares, 0.0).sum(axis=(1, 3))
-    small: FloatArray = np.where(number > 0, total / np.maximum(number, 1), np.nan)
-    return small
+    return np.asarray(np.where(number > 0, total / np.maximum(number, 1), np.nan))
 
 
 def _blocks(values: FloatArray) -> list[list[str]]:

@@ -166,8 +166,7 @@ def crps_log_normal(prediction: Prediction) -> FloatArray:
     """
     w, sd, found = prediction.z, prediction.sd_log, np.exp(prediction.found_log)
     mean = np.exp(prediction.median_log + sd**2 / 2)
-    score: FloatArray = found * (2 * ndtr(w) - 1) - 2 * mean * (ndtr(w - sd) + ndtr(sd / math.sqrt(2)) - 1)
-    return score
+    return np.asarray(found * (2 * ndtr(w) - 1) - 2 * mean * (ndtr(w - sd) + ndtr(sd / math.sqrt(2)) - 1))
 
 
 def interval_score(prediction: Prediction, *, probability: float) -> FloatArray:
@@ -176,8 +175,7 @@ def interval_score(prediction: Prediction, *, probability: float) -> FloatArray:
     low, high = np.exp(prediction.median_log - reach), np.exp(prediction.median_log + reach)
     found = np.exp(prediction.found_log)
     outside = np.maximum(low - found, 0) + np.maximum(found - high, 0)
-    score: FloatArray = high - low + 2 / (1 - probability) * outside
-    return score
+    return np.asarray(high - low + 2 / (1 - probability) * outside)
 
 
 def log_normal(reading: Reading) -> tuple[float, float] | None:

@@ -198,8 +198,7 @@ def _deming_slope(sums: FloatArray, *, error_ratio: float) -> FloatArray:
 def _intercept_with(slope: Callable[[FloatArray], FloatArray]) -> Callable[[FloatArray], FloatArray]:
     def intercept(sums: FloatArray) -> FloatArray:
         n = sums[..., 0]
-        found: FloatArray = ratio(sums[..., 2], n) - slope(sums) * ratio(sums[..., 1], n)
-        return found
+        return np.asarray(ratio(sums[..., 2], n) - slope(sums) * ratio(sums[..., 1], n))
 
     return intercept
 

@@ -247,8 +247,7 @@ class LogModel:
         for row, values in enumerate((off, precision)):
             np.add.at(sums[row].T, self._patient, values.T)
         within = 1 + rho2[:, None] * sums[1]
-        part: FloatArray = 0.5 * np.sum(rho2[:, None] * sums[0] ** 2 / within - np.log(within), axis=1)
-        return part
+        return np.asarray(0.5 * np.sum(rho2[:, None] * sums[0] ** 2 / within - np.log(within), axis=1))
 
 
 def variances(theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -293,8 +292,7 @@ def expected_error_percent(model: LogModel, theta: FloatArray, misses: FloatArra
     sd = np.exp(theta[:, 2])[:, None]
     mean = theta[:, :1] + (theta[:, 1:2] - 1) * model.spread * at[None, :]
     folded = np.exp(mean + sd**2 / 2) * erf((mean / sd + sd) / math.sqrt(2)) - erf(mean / sd / math.sqrt(2))
-    error: FloatArray = 100 * ((1 - misses) * (folded @ weight / weight.sum()) + misses)
-    return error
+    return np.asarray(100 * ((1 - misses) * (folded @ weight / weight.sum()) + misses))
 
 
 def _total_variance(log_sd: FloatArray) -> FloatArray:
