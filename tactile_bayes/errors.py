@@ -42,6 +42,12 @@ def check_choice(name: str, value: object, choices: Collection[str]) -> None:
         raise UsageError(f"{name} is {value!r}; give one of {', '.join(choices)}")
 
 
+def require(holds: bool, name: str, value: float, rule: str) -> None:
+    """Refuse a number that breaks a rule, such as ``be above 0``."""
+    if not holds:
+        raise BadDataError(f"{name} is {value:g}", way_out=f"it must {rule}")
+
+
 def check_number(
     name: str,
     value: object,

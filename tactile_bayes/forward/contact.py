@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_bayes.declarations import Record
-from tactile_bayes.errors import BadDataError, NotConvergedError
+from tactile_bayes.errors import BadDataError, NotConvergedError, require
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.presets import HEAD_PITCH_MM, HEAD_RADIUS_MM, HEAD_ROWS, HEADS, SHOULDER_MM, SHOULDERS_INSIDE
 
@@ -43,31 +43,18 @@ class Head(Record):
     ``"shoulders-outside"``: the arc spans the sensing width, and the rounds lie around it, press and sense nothing."""
 
     def __post_init__(self) -> None:
-        if not 0 < self.width_mm < np.inf:
-            raise BadDataError(f"width_mm of the head is {self.width_mm:g}", way_out="it must be above 0, in mm")
-        if not self.radius_mm > self.half_width_mm:
-            raise BadDataError(
-                f"radius_mm of the head is {self.radius_mm:g}",
-                way_out=f"it must be above {self.half_width_mm:g} mm, half the head's width",
-            )
-        self._check_shoulders()
-
-    def _check_shoulders(self) -> None:
+        require(0 < self.width_mm < np.inf, "width_mm of the head", self.width_mm, "be above 0, in mm")
+        half = f"{self.half_width_mm:g} mm, half the head's width"
+        require(self.radius_mm > self.half_width_mm, "radius_mm of the head", self.radius_mm, f"be above {half}")
         if self.shoulders not in HEADS:
             raise BadDataError(
                 f"shoulders of the head is {self.shoulders!r}", way_out=f"it must be {' or '.join(HEADS)}"
             )
-        inside = self.shoulders == SHOULDERS_INSIDE
-        if inside and not 0 <= self.shoulder_mm <= self.half_width_mm:
-            raise BadDataError(
-                f"shoulder_mm of the head is {self.shoulder_mm:g}",
-                way_out=f"it must be between 0 and {self.half_width_mm:g} mm, half the head's width",
-            )
-        if not 0 <= self.shoulder_mm < self.radius_mm:
-            raise BadDataError(
-                f"shoulder_mm of the head is {self.shoulder_mm:g}",
-                way_out=f"it must be between 0 and below radius_mm, {self.radius_mm:g} mm",
-            )
+        shoulder, name = self.shoulder_mm, "shoulder_mm of the head"
+        fits = self.shoulders != SHOULDERS_INSIDE or 0 <= shoulder <= self.half_width_mm
+        require(fits, name, shoulder, f"be between 0 and {half}")
+        rule = f"be between 0 and below radius_mm, {self.radius_mm:g} mm"
+        require(0 <= shoulder < self.radius_mm, name, shoulder, rule)
 
     @property
     def half_width_mm(self) -> float:

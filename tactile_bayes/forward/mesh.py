@@ -12,7 +12,7 @@ from scipy.sparse import coo_array, csc_array
 from scipy.sparse.linalg import splu
 
 from tactile_bayes.declarations import Record
-from tactile_bayes.errors import BadDataError
+from tactile_bayes.errors import BadDataError, require
 from tactile_bayes.forward.tissue import Body
 from tactile_bayes.geometry import FloatArray
 
@@ -278,10 +278,8 @@ class LumpGeometry(Record):
                 f"the lump reaches {bottom:.4g} mm deep, the base lies at {self.thickness_mm:g} mm",
                 way_out="give a thicker body or a shallower lump",
             )
-        if not self.fat_mm < self.thickness_mm:
-            raise BadDataError(
-                f"fat_mm is {self.fat_mm:g}", way_out=f"it must stay below thickness_mm, {self.thickness_mm:g} mm"
-            )
+        rule = f"stay below thickness_mm, {self.thickness_mm:g} mm"
+        require(self.fat_mm < self.thickness_mm, "fat_mm", self.fat_mm, rule)
 
     def boundary_mm(self) -> float:
         """Depth of the layer boundary, moved by up to 4 % of the half height where it nearly touches the lump."""

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Final
 import numpy as np
 
 from tactile_bayes.declarations import Meta, Record, as_dict, check, field, replace
-from tactile_bayes.errors import BadDataError
+from tactile_bayes.errors import BadDataError, require
 from tactile_bayes.forward.contact import Head as Section
 from tactile_bayes.forward.tissue import Diameter, Place, Rib, SceneBody, SolidLump, check_solid, fat_thickness
 from tactile_bayes.geometry import FloatArray, rigid, rotation_from_quaternion
@@ -269,34 +269,22 @@ class Scene(Timing):
         return (*self.solid_lumps, *(ball for rib in self.ribs for ball in rib.balls()))
 
     def _check_head(self) -> None:
-        half = self.head.rows * self.head.pitch_mm / 2
-        if not self.head.radius_mm > half:
-            raise BadDataError(
-                f"head.radius_mm is {self.head.radius_mm:g}", way_out=f"it must exceed the half width of {half:g} mm"
-            )
-        if not self.head.shoulder_mm <= half:
-            raise BadDataError(
-                f"head.shoulder_mm is {self.head.shoulder_mm:g}", way_out=f"it must lie in 0 to {half:g} mm"
-            )
-        if not self.head.rim_mm < self.head.radius_mm:
-            raise BadDataError(
-                f"head.rim_mm is {self.head.rim_mm:g}",
-                way_out=f"it must lie in 0 to below radius_mm, {self.head.radius_mm:g} mm",
-            )
+        head, half = self.head, self.head.rows * self.head.pitch_mm / 2
+        require(head.radius_mm > half, "head.radius_mm", head.radius_mm, f"exceed the half width of {half:g} mm")
+        require(head.shoulder_mm <= half, "head.shoulder_mm", head.shoulder_mm, f"lie in 0 to {half:g} mm")
+        rule = f"lie in 0 to below radius_mm, {head.radius_mm:g} mm"
+        require(head.rim_mm < head.radius_mm, "head.rim_mm", head.rim_mm, rule)
         for kind in ("dead", "saturated"):
             for row, column in getattr(self.taxels, kind):
-                if not (row < self.head.rows and column < self.head.columns):
+                if not (row < head.rows and column < head.columns):
                     raise BadDataError(
                         f"taxels.{kind} names [{row}, {column}]",
-                        way_out=f"rows are 0 to {self.head.rows - 1}, columns 0 to {self.head.columns - 1}",
+                        way_out=f"rows are 0 to {head.rows - 1}, columns 0 to {head.columns - 1}",
                     )
 
     def _check_level(self) -> None:
-        if self.background.drift_kpa >= self.background.mean_kpa:
-            raise BadDataError(
-                f"background.drift_kpa is {self.background.drift_kpa:g}",
-                way_out=f"it must stay below mean_kpa, {self.background.mean_kpa:g} kPa",
-            )
+        drift, mean = self.background.drift_kpa, self.background.mean_kpa
+        require(drift < mean, "background.drift_kpa", drift, f"stay below mean_kpa, {mean:g} kPa")
         touched = self.landmarks.touched
         if touched and np.allclose(self.landmarks.xiphoid_mm, self.landmarks.sternal_notch_mm, atol=1.0):
             raise BadDataError(

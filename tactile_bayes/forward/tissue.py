@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_bayes.declarations import Meta, Record, check
-from tactile_bayes.errors import BadDataError
+from tactile_bayes.errors import BadDataError, require
 from tactile_bayes.forward.contact import Head
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.presets import FAT_KPA, GLAND_RATIO, POISSON, SHOULDERS_OUTSIDE, THICKNESS_MM
@@ -40,11 +40,13 @@ class Layers:
     poisson: float = POISSON  #: Of all tissues, at least 0 and below 0.5.
 
     def __post_init__(self) -> None:
-        _require(0 < self.fat_mm < self.thickness_mm, "fat_mm", self.fat_mm, f"above 0 and below {self.thickness_mm:g}")
-        _require(self.thickness_mm < MOST_MM, "thickness_mm", self.thickness_mm, f"below {MOST_MM:g}")
-        _require(self.fat_kpa > 0, "fat_kpa", self.fat_kpa, "above 0")
-        _require(self.gland_ratio > 0, "gland_ratio", self.gland_ratio, "above 0")
-        _require(0 <= self.poisson < 0.5, "poisson", self.poisson, "at least 0 and below 0.5")
+        require(
+            0 < self.fat_mm < self.thickness_mm, "fat_mm", self.fat_mm, f"be above 0 and below {self.thickness_mm:g}"
+        )
+        require(self.thickness_mm < MOST_MM, "thickness_mm", self.thickness_mm, f"be below {MOST_MM:g}")
+        require(self.fat_kpa > 0, "fat_kpa", self.fat_kpa, "be above 0")
+        require(self.gland_ratio > 0, "gland_ratio", self.gland_ratio, "be above 0")
+        require(0 <= self.poisson < 0.5, "poisson", self.poisson, "be at least 0 and below 0.5")
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,21 +70,25 @@ class Body:
     poisson: float = POISSON
 
     def __post_init__(self) -> None:
-        _require(LEAST_MM <= self.d_mm < MOST_MM, "d_mm", self.d_mm, f"at least {LEAST_MM:g} and below {MOST_MM:g}")
-        limit = f"at least {LEAST_DEPTH_RATIO:g}: the skin over the lump is too thin to be resolved, or there is none"
-        _require(LEAST_DEPTH_RATIO <= self.depth_ratio < 1e4, "depth_ratio", self.depth_ratio, limit)
-        _require(0 <= self.seat <= MOST_SEAT, "seat", self.seat, f"between 0 (centred) and {MOST_SEAT:g}; 1 is resting")
+        require(LEAST_MM <= self.d_mm < MOST_MM, "d_mm", self.d_mm, f"be at least {LEAST_MM:g} and below {MOST_MM:g}")
+        limit = (
+            f"be at least {LEAST_DEPTH_RATIO:g}: the skin over the lump is too thin to be resolved, or there is none"
+        )
+        require(LEAST_DEPTH_RATIO <= self.depth_ratio < 1e4, "depth_ratio", self.depth_ratio, limit)
+        require(
+            0 <= self.seat <= MOST_SEAT, "seat", self.seat, f"be between 0 (centred) and {MOST_SEAT:g}; 1 is resting"
+        )
         if 1.0 - _RESTS < self.seat < 1.0 + _THINNEST_FILM:
             object.__setattr__(self, "seat", 1.0)
         if self.thickness_mm is None:
             deep = self.centre_mm + max(0.6, 0.5 * self.seat) * self.d_mm + 2.0
             object.__setattr__(self, "thickness_mm", max(THICKNESS_MM, deep))
         bottom = self.centre_mm + self.radius_mm
-        _require(
+        require(
             self.layers.thickness_mm > 1.0001 * bottom,
             "thickness_mm",
             self.layers.thickness_mm,
-            f"above {bottom:g} mm, the depth of the lump's lowest point",
+            f"be above {bottom:g} mm, the depth of the lump's lowest point",
         )
 
     @property
@@ -112,11 +118,6 @@ def parse_seat(text: str) -> float:
     if not 0 <= seat <= MOST_SEAT:
         raise BadDataError(f"seat is {text!r}", way_out=f"give centred, resting or a number from 0 to {MOST_SEAT:g}")
     return seat
-
-
-def _require(holds: bool, name: str, value: float, rule: str) -> None:
-    if not holds:
-        raise BadDataError(f"{name} is {value:g}", way_out=f"it must be {rule}")
 
 
 # --- The face of a rigid head that can touch the skin: the taxels and the rounded rim around them.

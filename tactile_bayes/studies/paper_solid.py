@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from tactile_bayes.declarations import Record, as_dict, field, replace
-from tactile_bayes.errors import BadDataError
+from tactile_bayes.errors import BadDataError, require
 from tactile_bayes.forward.axisymmetric import CondensedLump, LayeredBody, Tissue, condense_lump
 from tactile_bayes.forward.mesh import LumpGeometry, MeshSize
 from tactile_bayes.forward.plane_strain import FINENESS
@@ -171,11 +171,8 @@ class SolidSettings(CaseSettings, kw_only=True):
     def __post_init__(self) -> None:
         super().__post_init__()
         half = self.head.rows * self.head.pitch_mm / 2
-        if not self.head.radius_mm > half:
-            raise BadDataError(
-                f"radius_mm of the head is {self.head.radius_mm:g}",
-                way_out=f"it must be above {half:g} mm, half the head's width",
-            )
+        rule = f"be above {half:g} mm, half the head's width"
+        require(self.head.radius_mm > half, "radius_mm of the head", self.head.radius_mm, rule)
         if self.background not in BACKGROUNDS:
             raise BadDataError(f"background is {self.background!r}", way_out=f"it must be {' or '.join(BACKGROUNDS)}")
 
