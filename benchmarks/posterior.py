@@ -77,8 +77,7 @@ def laplace(fit: Any) -> Draw:
 
 def ensemble(fit: Any) -> Draw:
     """The program's MCMC with its own stopping rule."""
-    from tactile_bayes.posterior.draw import ensemble_draws
-    from tactile_bayes.posterior.options import SamplerSettings
+    from tactile_bayes.posterior.draw import SamplerSettings, ensemble_draws
 
     return lambda rng: ensemble_draws(fit.sampled(), rng=rng, options=SamplerSettings(method="ensemble")).flat
 

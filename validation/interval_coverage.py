@@ -38,8 +38,8 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import MapRecipe, TactileMap
 from tactile_bayes.posterior.bump import cell_mean_gaussian
+from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map
-from tactile_bayes.posterior.options import SamplerSettings
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.posterior.white import default_errors, fit_bump
 from tactile_bayes.presets import FIELD_COSINES, POSE_NOISE

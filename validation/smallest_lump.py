@@ -30,7 +30,7 @@ from tactile_bayes.forward.tissue import SolidLump
 from tactile_bayes.geometry import FloatArray, apply
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior import lump_probability as model
-from tactile_bayes.posterior.options import DETECTED
+from tactile_bayes.posterior.draw import DETECTED
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.posterior.search import search
 from tactile_bayes.studies.population import BodyPrior, ExamPrior, draw_body, draw_exam

@@ -25,10 +25,7 @@ import numpy as np
 from tactile_bayes.batch import prepare_worker
 from tactile_bayes.declarations import from_plain, replace
 from tactile_bayes.errors import TactileBayesError
-from tactile_bayes.files.instrument_json import (
-    calibration_document,
-    head_document,
-)
+from tactile_bayes.files.instrument_json import calibration_document, head_document
 from tactile_bayes.files.size_json import read_size_calibration, size_calibration_path
 from tactile_bayes.findings import finding_summary
 from tactile_bayes.geometry import FloatArray, apply, inverse
@@ -36,8 +33,8 @@ from tactile_bayes.hardware.live import Feed, FeedReader, LiveMap, LiveState
 from tactile_bayes.hardware.serve import LiveServer, address_of
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.bump import candidate_centres
+from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map
-from tactile_bayes.posterior.options import SamplerSettings
 from tactile_bayes.presets import FIELD_COSINES, INTERVAL
 from tactile_bayes.report.map_text import colours_wanted, live_line, live_text
 from tactile_bayes.scan import ElementCalibration, HeadGeometry

@@ -33,7 +33,7 @@ from tactile_bayes.files.size_json import read_size_calibration, size_calibratio
 from tactile_bayes.forward.scene import Scene
 from tactile_bayes.forward.tissue import SceneBody, SolidLump
 from tactile_bayes.mapping.map import TactileMap
-from tactile_bayes.posterior.options import SamplerSettings
+from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.laboratory import TradeoffReport, draw_tradeoff, tradeoff_document, tradeoff_text
 from tactile_bayes.report.tradeoff import DIGITS, draw_ladder, ladder_file, ladder_text

@@ -7,16 +7,7 @@ from typing import Any
 import click
 
 from tactile_bayes.api.settings import Settings
-from tactile_bayes.commands.options import (
-    FORCE,
-    JSON,
-    METAVAR,
-    FigurePath,
-    FilePath,
-    FiniteRange,
-    head_option,
-    takes,
-)
+from tactile_bayes.commands.options import FORCE, JSON, METAVAR, FigurePath, FilePath, FiniteRange, head_option, takes
 
 # --- What `tradeoff estimate` and `tradeoff map` share: options, the forecast on stderr, and the output.
 

@@ -7,15 +7,7 @@ from typing import Any
 import click
 
 from tactile_bayes.api.settings import Settings
-from tactile_bayes.commands.options import (
-    FORCE,
-    JSON,
-    WORKERS,
-    FilePath,
-    FiniteRange,
-    scheduler_option,
-    takes,
-)
+from tactile_bayes.commands.options import FORCE, JSON, WORKERS, FilePath, FiniteRange, scheduler_option, takes
 from tactile_bayes.declarations import names_of
 from tactile_bayes.options import MOST_ITEMS, MapOptions, PlanErrors, TrialSettings
 

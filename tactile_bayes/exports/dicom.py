@@ -11,7 +11,9 @@ import numpy as np
 from tactile_bayes import __version__
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.exports import exam as codes
-from tactile_bayes.exports.dicom_map import (
+from tactile_bayes.exports.exam import Code, EstimateFile, MapFile, SizedMass, content_uid, required, verdict_words
+from tactile_bayes.exports.identity import Identity
+from tactile_bayes.exports.images import (
     MANUFACTURER,
     MODEL,
     PARAMETRIC_MAP,
@@ -21,13 +23,12 @@ from tactile_bayes.exports.dicom_map import (
     declare_scheme,
     dicom_bytes,
     frame_of_reference,
+    lps_from_plane,
+    on_plane,
     parametric_map,
     secondary_capture,
     study_of,
 )
-from tactile_bayes.exports.exam import Code, EstimateFile, MapFile, SizedMass, content_uid, required, verdict_words
-from tactile_bayes.exports.identity import Identity
-from tactile_bayes.exports.nrrd import lps_from_plane, on_plane
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.presets import RESEARCH_USE
 

@@ -21,13 +21,7 @@ from tactile_bayes.declarations import from_plain
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.atomic import atomic_path, refuse_existing
 from tactile_bayes.files.documents import check_session, parse_json
-from tactile_bayes.files.instrument_json import (
-    ScanFile,
-    calibration_document,
-    head_document,
-    ns_from_s,
-    s_from_ns,
-)
+from tactile_bayes.files.instrument_json import ScanFile, calibration_document, head_document, ns_from_s, s_from_ns
 from tactile_bayes.files.mcap_records import McapRecords, Messages, read_records
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.findings import Finding, finding_lines, findings_in

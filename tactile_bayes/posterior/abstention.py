@@ -12,8 +12,8 @@ from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.mapping.places import orientation_of
 from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior.bump import covered_share, map_ends, on_map, trusted, window_cells
+from tactile_bayes.posterior.draw import DETECTED
 from tactile_bayes.posterior.lump_probability import LIKELY, Weighed
-from tactile_bayes.posterior.options import DETECTED
 from tactile_bayes.posterior.white import AT_RIM, LEAST_COVERED_SHARE, LEAST_WIDTH_IN_CELLS, MOST_AXIS_RATIO, Candidate
 
 FEEL_AGAIN = "if a lump is felt, go over the place again, more slowly or with more lines, and map all scans together"

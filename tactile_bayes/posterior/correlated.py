@@ -13,7 +13,15 @@ from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.abstention import rim_fault
 from tactile_bayes.posterior.bump import PoseNoise, covariance_from_log_widths, overlap, trusted
 from tactile_bayes.posterior.detection import Detection, detection_from_odds
-from tactile_bayes.posterior.draw import MapPosterior, ModalBump, NoiseFigures, draw_parameters
+from tactile_bayes.posterior.draw import (
+    DETECTED,
+    MapPosterior,
+    ModalBump,
+    NoiseFigures,
+    SamplerSettings,
+    draw_parameters,
+    scene_asked,
+)
 from tactile_bayes.posterior.field import FLOOR, Window, cosines_for
 from tactile_bayes.posterior.fit import FieldFit, field_window, modal_widths, shape_draws, start_vector, tangent_columns
 from tactile_bayes.posterior.neighbours import (
@@ -25,7 +33,6 @@ from tactile_bayes.posterior.neighbours import (
     ridge_text,
     rising_ribs,
 )
-from tactile_bayes.posterior.options import DETECTED, SamplerSettings, scene_asked
 from tactile_bayes.posterior.scene import Problem, Scene
 from tactile_bayes.posterior.selection import (
     ASKING,

@@ -21,9 +21,17 @@ from tactile_bayes.posterior.abstention import (
     undetected,
 )
 from tactile_bayes.posterior.detection import Detection
-from tactile_bayes.posterior.draw import Diagnostics, MapPosterior, ModalBump, NoiseFigures
+from tactile_bayes.posterior.draw import (
+    DETECTED,
+    ROTATION_ODDS,
+    Diagnostics,
+    MapPosterior,
+    ModalBump,
+    NoiseFigures,
+    SamplerSettings,
+    check_options,
+)
 from tactile_bayes.posterior.lump_probability import LIKELY, Weighed, weigh
-from tactile_bayes.posterior.options import DETECTED, ROTATION_ODDS, SamplerSettings, check_options
 from tactile_bayes.posterior.result import Estimate, Sensitivity, prior_sensitivity
 from tactile_bayes.posterior.search import Assessment, SizedDraws, best_chance, draw_until_accurate, search
 from tactile_bayes.posterior.white import Candidate, check_background

@@ -16,10 +16,9 @@ from tactile_bayes.inference.draws import INDEPENDENT_DRAWS, ParameterDraws, Sol
 from tactile_bayes.inference.importance import Gaussians, smooth_weights
 from tactile_bayes.inference.modes import find_mode, finite_differences, mode_and_covariance, stencil
 from tactile_bayes.posterior.bump import principal_widths
-from tactile_bayes.posterior.draw import Sampled, with_beside
+from tactile_bayes.posterior.draw import Sampled, SamplerSettings, with_beside
 from tactile_bayes.posterior.field import Window
 from tactile_bayes.posterior.marginal import NEGLIGIBLE, CollapsedTarget, independent_variance, linear_columns
-from tactile_bayes.posterior.options import SamplerSettings
 from tactile_bayes.posterior.scene import Problem, Scene
 from tactile_bayes.posterior.white import BumpFit
 from tactile_bayes.presets import FIELD_COSINES, Method

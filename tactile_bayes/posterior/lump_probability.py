@@ -13,9 +13,9 @@ from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior.bump import covered_share, trusted, value_scale, window_cells
 from tactile_bayes.posterior.detection import Detection
+from tactile_bayes.posterior.draw import DETECTED
 from tactile_bayes.posterior.field import Window
 from tactile_bayes.posterior.marginal import CollapsedTarget, independent_variance
-from tactile_bayes.posterior.options import DETECTED
 from tactile_bayes.posterior.scene import Problem, Scene
 from tactile_bayes.posterior.white import Candidate
 from tactile_bayes.presets import FIELD_COSINES, FIT_RADIUS_MM

@@ -15,9 +15,8 @@ from tactile_bayes.posterior.abstention import shape_fault
 from tactile_bayes.posterior.bump import levelled, window_cells
 from tactile_bayes.posterior.correlated import Correlated
 from tactile_bayes.posterior.detection import Detection
-from tactile_bayes.posterior.draw import ModalBump
+from tactile_bayes.posterior.draw import DETECTED, ModalBump, SamplerSettings
 from tactile_bayes.posterior.lump_probability import NO_EVIDENCE, Weighed, weigh_candidate
-from tactile_bayes.posterior.options import DETECTED, SamplerSettings
 from tactile_bayes.posterior.selection import SceneChoice
 from tactile_bayes.posterior.white import (
     LEAST_WIDTH_IN_CELLS,

@@ -14,10 +14,10 @@ from tactile_bayes.declarations import Record, field, replace
 from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.posterior.bump import covariance_from_log_widths
+from tactile_bayes.posterior.draw import ROTATION_ODDS
 from tactile_bayes.posterior.field import FLOOR, FieldColumns, Profiles
 from tactile_bayes.posterior.fit import FieldFit, Mixture, fit_scene, newton_mixture, tangent_columns
 from tactile_bayes.posterior.marginal import CollapsedTarget, linear_columns
-from tactile_bayes.posterior.options import ROTATION_ODDS
 from tactile_bayes.posterior.scene import Problem, Scene, Shape
 from tactile_bayes.presets import SceneAsked
 

@@ -41,8 +41,15 @@ from tactile_bayes.posterior.detection import (
     independent_errors,
     level_offset,
 )
-from tactile_bayes.posterior.draw import MapPosterior, ModalBump, NoiseFigures, Sampled, draw_parameters
-from tactile_bayes.posterior.options import ROTATION_ODDS, SamplerSettings
+from tactile_bayes.posterior.draw import (
+    ROTATION_ODDS,
+    MapPosterior,
+    ModalBump,
+    NoiseFigures,
+    Sampled,
+    SamplerSettings,
+    draw_parameters,
+)
 from tactile_bayes.presets import Background, Method, Noise
 from tactile_bayes.progress import Progress
 

@@ -11,8 +11,8 @@ from tactile_bayes.declarations import Record, field, replace
 from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.inference.draws import Quantity, summarise
 from tactile_bayes.mapping.map import TactileMap
+from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map
-from tactile_bayes.posterior.options import SamplerSettings
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.presets import INTERVAL, MOST_FIELD_COSINES, Background
 from tactile_bayes.size.pooling import Calibration

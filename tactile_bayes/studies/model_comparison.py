@@ -21,7 +21,7 @@ from tactile_bayes.geometry import FloatArray, inverse
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.mapping.select import SelectedFrames, select_frames
-from tactile_bayes.posterior.options import SamplerSettings
+from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.white import BumpFit, fit_bump, fitted_candidates
 from tactile_bayes.presets import CELL_MM, FIT_RADIUS_MM, PRESSURE_WINDOW_KPA
 from tactile_bayes.scan import ElementCalibration, PressureFrames, Scan

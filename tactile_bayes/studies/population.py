@@ -14,8 +14,8 @@ from tactile_bayes.forward.tissue import SceneBody, SolidLump
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import TactileMap
+from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map
-from tactile_bayes.posterior.options import SamplerSettings
 from tactile_bayes.presets import DEFAULT_NORMALISE, HEAD_PROFILE
 from tactile_bayes.scan import FLAT_RADIUS_MM, HeadShape, Scan
 from tactile_bayes.size.draws import ShapeDraws

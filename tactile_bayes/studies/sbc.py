@@ -12,10 +12,9 @@ from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.map import MapRecipe, TactileMap
 from tactile_bayes.options import BumpPrior, FieldCosines
-from tactile_bayes.posterior.draw import MapPosterior
+from tactile_bayes.posterior.draw import MapPosterior, SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.field import LENGTHS_MM, SHARES, cell_mean_profile
-from tactile_bayes.posterior.options import SamplerSettings
 from tactile_bayes.posterior.white import WIDEST_IN_RADII
 from tactile_bayes.presets import Method
 from tactile_bayes.size.bodies import BodyCalibration

@@ -18,7 +18,7 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.mapping.select import first_seconds
-from tactile_bayes.posterior.options import SamplerSettings
+from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.presets import CELL_MM, DEFAULT_NORMALISE, NORMALISE, SHOULDERS_INSIDE, THICKNESS_MM
 from tactile_bayes.scan import Scan
 from tactile_bayes.size.bodies import BodyCalibration, mean_width_mm

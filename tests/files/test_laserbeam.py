@@ -16,8 +16,8 @@ from scipy.optimize import curve_fit
 
 from tactile_bayes.files.imports import read_grid
 from tactile_bayes.mapping.map import TactileMap
+from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map
-from tactile_bayes.posterior.options import SamplerSettings
 from tactile_bayes.posterior.result import Estimate
 
 PIXEL_MM = 0.1

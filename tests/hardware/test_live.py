@@ -315,8 +315,8 @@ def test_the_next_fit_of_a_lump_begins_with_its_width_and_a_glance_does_not():
 
 
 def test_the_live_estimate_is_the_estimate(state):
+    from tactile_bayes.posterior.draw import SamplerSettings
     from tactile_bayes.posterior.estimate import estimate_map
-    from tactile_bayes.posterior.options import SamplerSettings
 
     text, lump_base_mm = live_estimate(state.tactile_map, None, Turn())
     options = SamplerSettings(method="laplace", rotation="off")

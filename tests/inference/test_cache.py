@@ -10,9 +10,8 @@ from tactile_bayes.declarations import replace
 from tactile_bayes.inference.draws import Solution, Solved
 from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior.bump import Bump, cell_mean_gaussian, covariance_from_log_widths, window_cells
-from tactile_bayes.posterior.draw import draw_parameters
+from tactile_bayes.posterior.draw import SamplerSettings, draw_parameters
 from tactile_bayes.posterior.fit import FieldFit
-from tactile_bayes.posterior.options import SamplerSettings
 from tests.posterior.correlated.test_marginal import cells_of, fitted, noise
 
 

@@ -15,7 +15,7 @@ from tactile_bayes.mapping.accumulate import Instrument, MapAccumulator, MapGrid
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.mapping.plane import FramePoses
-from tactile_bayes.posterior.options import SamplerSettings
+from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.white import fit_bump
 from tactile_bayes.scan import Scan
 

@@ -32,8 +32,8 @@ from tactile_bayes.mapping.profile import (
     marks_limit,
     profile_figures,
 )
+from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map
-from tactile_bayes.posterior.options import SamplerSettings
 from tactile_bayes.presets import HEAD_PROFILE
 from tactile_bayes.scan import ElementCalibration, Scan
 from tactile_bayes.size.bodies import BodyCalibration

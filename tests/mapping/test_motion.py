@@ -13,7 +13,7 @@ from tactile_bayes.forward.simulate import head_positions, simulate
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.convention import stroke_starts
 from tactile_bayes.mapping.map import TactileMap
-from tactile_bayes.posterior.options import SamplerSettings
+from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.white import fit_bump
 from tactile_bayes.scan import HeadGeometry, Landmarks, PressureFrames, Scan, TrackerPoses
 

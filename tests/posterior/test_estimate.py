@@ -11,8 +11,8 @@ from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, NotConvergedError, UsageError
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.options import BumpPrior
+from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map
-from tactile_bayes.posterior.options import SamplerSettings
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.report.estimate_document import estimate_report
 from tactile_bayes.report.estimate_text import estimate_text

@@ -9,8 +9,8 @@ from posterior_maps import TRUTH, bump_map, bump_values, correlated_field, grid_
 
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, UsageError
+from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map
-from tactile_bayes.posterior.options import SamplerSettings
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.size.eq6 import AxisCalibration, SizeCalibration
 

@@ -8,8 +8,8 @@ from posterior_maps import bump_values, grid_map
 
 from tactile_bayes.declarations import names_of, replace
 from tactile_bayes.mapping.map import TactileMap
+from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map
-from tactile_bayes.posterior.options import SamplerSettings
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.presets import METHODS
 from tactile_bayes.report.estimate_text import estimate_text

@@ -13,8 +13,8 @@ from tactile_bayes.declarations import names_of, replace
 from tactile_bayes.errors import UsageError
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import TactileMap
+from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map
-from tactile_bayes.posterior.options import SamplerSettings
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.report.estimate_text import estimate_text
 from tactile_bayes.scan import Scan

@@ -17,8 +17,8 @@ from tactile_bayes.errors import UsageError
 from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.mapping.map import TactileMap
+from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map
-from tactile_bayes.posterior.options import SamplerSettings
 from tactile_bayes.posterior.white import default_errors, fit_bump
 
 UNIT = 37.0

@@ -26,10 +26,9 @@ from tactile_bayes.findings import Finding
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior import masses as masses_module
 from tactile_bayes.posterior.detection import Detection
-from tactile_bayes.posterior.draw import ModalBump
+from tactile_bayes.posterior.draw import ModalBump, SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.masses import by_evidence, with_masses
-from tactile_bayes.posterior.options import SamplerSettings
 from tactile_bayes.posterior.result import Estimate, Mass, Rise
 from tactile_bayes.size.draws import SizePosterior
 

@@ -13,9 +13,9 @@ from posterior_maps import bump_values, correlated_field, grid_map
 from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.files.provenance import Provenance
+from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.masses import _stands_out, other_rises
-from tactile_bayes.posterior.options import SamplerSettings
 from tactile_bayes.posterior.result import Estimate, Rise
 
 HALF_MM = 35.0

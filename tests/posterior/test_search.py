@@ -11,8 +11,8 @@ from tactile_bayes.declarations import replace
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior import search
 from tactile_bayes.posterior.bump import levelled
+from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map
-from tactile_bayes.posterior.options import SamplerSettings
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.posterior.white import BumpFit
 

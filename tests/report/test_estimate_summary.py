@@ -18,8 +18,8 @@ from tactile_bayes.files.reports import Supposed
 from tactile_bayes.findings import Finding
 from tactile_bayes.inference.draws import summarise
 from tactile_bayes.mapping.map import TactileMap, broken_assumptions
+from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map
-from tactile_bayes.posterior.options import SamplerSettings
 from tactile_bayes.posterior.result import Estimate, Mass, Sensitivity
 from tactile_bayes.posterior.selection import Structure
 from tactile_bayes.presets import RESEARCH_USE

@@ -24,7 +24,7 @@ from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.inference import importance as importance_module
 from tactile_bayes.mapping.map import TactileMap
-from tactile_bayes.posterior.options import SamplerSettings
+from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.report.tradeoff import advice, draw_ladder, ladder_file, ladder_text
 from tactile_bayes.size.eq6 import AxisCalibration, SizeCalibration
 from tactile_bayes.size.pooling import Calibration

@@ -8,7 +8,7 @@ import numpy as np
 
 from tactile_bayes.mapping.map import MapRecipe, TactileMap
 from tactile_bayes.posterior.bump import cell_mean_gaussian
-from tactile_bayes.posterior.options import SamplerSettings
+from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.white import Candidate, fitted_candidates
 
 TRUTH = {"amplitude": 0.3, "x": 1.3, "y": -0.8, "sigma_x": 6.0, "sigma_y": 4.5}

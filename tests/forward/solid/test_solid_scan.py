@@ -39,7 +39,7 @@ from tactile_bayes.geometry import (
     unroll_quaternion_signs,
 )
 from tactile_bayes.mapping.build import build_map
-from tactile_bayes.posterior.options import SamplerSettings
+from tactile_bayes.posterior.draw import SamplerSettings
 
 Run = Callable[..., "CompletedProcess[str]"]
 SILENT = Noise(0.0, 0.0, 0.0, 0.0, 0.0)

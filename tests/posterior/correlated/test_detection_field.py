@@ -11,8 +11,8 @@ from posterior_maps import bump_map, correlated_field, grid_map
 
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import TactileMap
+from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map
-from tactile_bayes.posterior.options import SamplerSettings
 from tactile_bayes.posterior.result import Estimate
 
 SIZE, NOISE = 51, 0.02

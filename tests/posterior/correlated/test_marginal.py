@@ -11,11 +11,10 @@ from posterior_maps import TRUTH, bump_map, correlated_field
 from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior import marginal as collapsed
 from tactile_bayes.posterior.bump import FitCells, cell_mean_gaussian, covariance_from_log_widths, window_cells
-from tactile_bayes.posterior.draw import draw_parameters
+from tactile_bayes.posterior.draw import SamplerSettings, draw_parameters
 from tactile_bayes.posterior.field import Window, _one, cosine_profiles, gram_of_cosines, spectrum
 from tactile_bayes.posterior.fit import FieldFit, fit_scene, shape_draws
 from tactile_bayes.posterior.marginal import CollapsedTarget, independent_variance
-from tactile_bayes.posterior.options import SamplerSettings
 from tactile_bayes.posterior.scene import Problem, Scene
 
 RADIUS = 20.0

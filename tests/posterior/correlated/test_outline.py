@@ -12,8 +12,8 @@ import pytest
 from posterior_maps import correlated_field, grid_map
 
 from tactile_bayes.posterior.correlated import outline
+from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map
-from tactile_bayes.posterior.options import SamplerSettings
 from tactile_bayes.posterior.result import Estimate
 
 AXIS = np.arange(-26.0, 27.0)

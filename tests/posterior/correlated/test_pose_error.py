@@ -21,11 +21,11 @@ from tactile_bayes.mapping.errors import MOST_MM, _departures, _interpolation
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.bump import PoseNoise, cell_mean_gaussian, window_cells
 from tactile_bayes.posterior.correlated import pose_covariance
+from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.field import Window
 from tactile_bayes.posterior.fit import FieldFit, tangent_columns
 from tactile_bayes.posterior.marginal import independent_variance
-from tactile_bayes.posterior.options import SamplerSettings
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.presets import POSE_NOISE
 from tactile_bayes.report.estimate_text import estimate_text

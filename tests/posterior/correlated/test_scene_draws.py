@@ -16,9 +16,8 @@ from tactile_bayes.inference.draws import ParameterDraws
 from tactile_bayes.inference.importance import ImportanceOptions, importance
 from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior import draw as methods
-from tactile_bayes.posterior.draw import Sampled, disagreement, draw_parameters, importance_draws
+from tactile_bayes.posterior.draw import Sampled, SamplerSettings, disagreement, draw_parameters, importance_draws
 from tactile_bayes.posterior.fit import FieldFit, fit_scene
-from tactile_bayes.posterior.options import SamplerSettings
 from tactile_bayes.posterior.scene import Problem, Scene
 from tests.posterior.correlated.test_marginal import cells_of, fitted, noise
 from tests.posterior.correlated.test_selection import bump, choose, errors, rib, second

@@ -12,7 +12,7 @@ from scipy.special import erf
 from tactile_bayes.declarations import replace
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior import white as fit_module
-from tactile_bayes.posterior.options import SamplerSettings
+from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.white import BumpFit, fit_bump, rotation_odds
 
 OFF = SamplerSettings(rotation="off")
