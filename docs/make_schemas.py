@@ -21,8 +21,6 @@ from tactile_bayes.studies.population import BodiesFile
 from tactile_bayes.trial.planning import PlanReport
 from tactile_bayes.trial.summary import TrialReport
 
-REPORTS = ("compare.schema.json", "estimate.schema.json", "pooled.schema.json")
-"""Of these each record that stands in several places is described once."""
 OPEN_TABLES: dict[str, dict[str, type[Record]]] = {
     "estimate.schema.json": {"diagnostics": Figures, "provenance": Origin, "variance_share": Shares},
     "pooled.schema.json": {"figures": PooledFigures},
@@ -54,7 +52,7 @@ OF_TOML: dict[str, type[Record]] = {
 
 def schemas() -> dict[Path, str]:
     """What each generated schema has to hold."""
-    found = {name: schema_of(kind, shared=name in REPORTS) for name, kind in OF_JSON.items()}
+    found = {name: schema_of(kind, shared=True) for name, kind in OF_JSON.items()}
     found |= {name: schema_of(kind, nulls=False) for name, kind in OF_TOML.items()}
     found["scan_session.schema.json"] = _session()
     for name, tables in OPEN_TABLES.items():
