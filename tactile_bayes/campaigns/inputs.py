@@ -9,6 +9,7 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, Final
 
@@ -49,16 +50,12 @@ def open_campaign(folder: Path, *, dry: bool = False) -> Iterator[BatchStore | N
         if dry:
             yield None
             return
-        _make(folder)
+        try:
+            folder.mkdir(mode=0o700, exist_ok=True)
+        except OSError as error:
+            raise unwritable(folder, error) from None
     with open_store(journal, settings=_HEADER, encode=_taken, read_only=dry) as store:
         yield store
-
-
-def _make(folder: Path) -> None:
-    try:
-        folder.mkdir(mode=0o700, exist_ok=True)
-    except OSError as error:
-        raise unwritable(folder, error) from None
 
 
 def _taken(result: Result) -> Result:
@@ -207,7 +204,7 @@ def read_sources(
     found = Sources({one.path: values[one.key]["sha256"] for one in settled if one.key in values}, {})
     for sources, kept in ((settled, store if keep else None), (fresh, None)):
         waiting = [one for one in sources if one.path not in found.digests and (keep or not one.address)]
-        outcomes = run_batch(_read, waiting, key=_key, executor=executor, store=kept, progress=progress)
+        outcomes = run_batch(_read, waiting, key=attrgetter("key"), executor=executor, store=kept, progress=progress)
         for one, outcome in zip(waiting, outcomes, strict=True):
             if outcome.value is not None:
                 found.digests[one.path] = outcome.value["sha256"]
@@ -241,10 +238,6 @@ def _version(exam: Exam) -> tuple[str, float]:
         return version_of(exam.address), 0.0
     known = exam.path.stat()
     return stamp(exam.path), max(known.st_mtime, known.st_ctime)
-
-
-def _key(source: _Source) -> str:
-    return source.key
 
 
 def _read(source: _Source) -> dict[str, Any]:

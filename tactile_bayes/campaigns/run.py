@@ -17,6 +17,7 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
 from contextlib import AbstractContextManager, nullcontext
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
@@ -132,7 +133,9 @@ class Stages:
             self.tell(before + done, total)
 
         try:
-            outcomes = run_batch(run_step, tasks, key=_key, executor=self._executor, store=self._store, progress=tell)
+            outcomes = run_batch(
+                run_step, tasks, key=attrgetter("key"), executor=self._executor, store=self._store, progress=tell
+            )
         except BatchInterrupted as stop:
             path = None if self._store is None else self._store.path
             raise BatchInterrupted(stop.outcomes, total=total, store=path, before=before) from None
@@ -163,10 +166,6 @@ def steps_needed(
     needed = {"map": exams, "estimate": exams, "figures": exams * settings.figures, "pool": masses, "compare": compared}
     needed |= {"repeatability": 1, "size": exams} if learns else {}
     return {**needed, "copy": (exams + masses + compared) * bool(settings.copy_to)}
-
-
-def _key(task: Task) -> str:
-    return task.key
 
 
 # --- The campaign.

@@ -155,8 +155,9 @@ def run_step(task: Task) -> Result:
 
 def _map(task: Task) -> tuple[Result, Writes]:
     """Make the exam's map from its scan or arrays, or take the map that it is; refuse what belongs to another exam."""
-    if task.address:
-        return _fetched_map(task)
+    if task.address:  # fetched for as long as the map is made
+        with fetched(task.address) as path:
+            return _map(replace(task, source=path, address=""))
     if sha256(task.source) != task.source_sha256:
         raise BadDataError("changed while the campaign ran", way_out="run the campaign again")
     kind = _KINDS.get(kind_of(task.source), "")
@@ -165,12 +166,6 @@ def _map(task: Task) -> tuple[Result, Writes]:
     if kind == "npz":
         return _imported_map(task)
     return _scanned_map(task)
-
-
-def _fetched_map(task: Task) -> tuple[Result, Writes]:
-    """Fetch the exam's file from its object store for as long as the map is made."""
-    with fetched(task.address) as path:
-        return _map(replace(task, source=path, address=""))
 
 
 def _scanned_map(task: Task) -> tuple[Result, Writes]:

@@ -96,7 +96,9 @@ def _group(estimate: EstimateFile, finding: SizedMass, maps: Sequence[MapFile], 
         ),
         "finding_type": None if finding.largest is None else coded(codes.BREAST_LUMP),
         "method": coded(codes.METHOD),
-        "algorithm_id": _algorithm(estimate),
+        "algorithm_id": sr.AlgorithmIdentification(
+            name=MODEL, version=estimate.version or __version__, parameters=[estimate.method_words]
+        ),
         "finding_sites": _sites(estimate, maps),
         "measurements": list(_measurements(finding, _images(evidence))),
         "qualitative_evaluations": [sr.QualitativeEvaluation(coded(codes.OUTCOME), coded(finding.outcome))],
@@ -110,12 +112,6 @@ def _group(estimate: EstimateFile, finding: SizedMass, maps: Sequence[MapFile], 
         if text:
             group[0].ContentSequence.append(_text(codes.COMMENT, text))
     return group
-
-
-def _algorithm(estimate: EstimateFile) -> Any:
-    return required("highdicom").sr.AlgorithmIdentification(
-        name=MODEL, version=estimate.version or __version__, parameters=[estimate.method_words]
-    )
 
 
 def _sites(estimate: EstimateFile, maps: Sequence[MapFile]) -> list[Any] | None:

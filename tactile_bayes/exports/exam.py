@@ -236,7 +236,10 @@ def read_exam(path: Path) -> MapFile | list[EstimateFile]:
         with open_netcdf(path, way_out=_WAY_OUT) as file:
             group = file.group("posterior")
             attributes = None if group is None else group.attributes()
-        return _read_map(path) if attributes is None else [_read_posterior(path, attributes)]
+        if attributes is not None:
+            return [_read_posterior(path, attributes)]
+        tactile_map, scans = read_map_and_scans(path)
+        return MapFile(path, sha256(path), tactile_map, shared_facts(scans))
     if not head.removeprefix(codecs.BOM_UTF8).lstrip().startswith((b"{", b"[")):
         kind = kind_of(path) or ("none of these" if head else "empty")
         raise BadDataError(f"is {kind}", way_out=_WAY_OUT, path=str(path))
@@ -245,11 +248,6 @@ def read_exam(path: Path) -> MapFile | list[EstimateFile]:
     if not listed:
         raise BadDataError("is an empty list", way_out=_WAY_OUT, path=str(path))
     return [estimate_of(one, path) for one in listed]
-
-
-def _read_map(path: Path) -> MapFile:
-    tactile_map, scans = read_map_and_scans(path)
-    return MapFile(path, sha256(path), tactile_map, shared_facts(scans))
 
 
 def shared_facts(scans: Iterable[Mapping[str, str]]) -> dict[str, str]:
@@ -298,7 +296,8 @@ def _mass(mass: EstimateReport | PooledReport | MassReport, alike: float | None)
     if size is None:
         code = (not isinstance(mass, PooledReport) and mass.reason_code) or "no size"
     elif leads is not mass:
-        narrow = f"{_capital(exams_label(alike))}: largest size {size_words(size)}"
+        label = exams_label(alike)
+        narrow = f"{label[0].upper()}{label[1:]}: largest size {size_words(size)}"
     placed = None if isinstance(mass, PooledReport) else mass
     return SizedMass(
         mass.number if isinstance(mass, MassReport) else 1,
@@ -311,10 +310,6 @@ def _mass(mass: EstimateReport | PooledReport | MassReport, alike: float | None)
         None if placed is None else centre_of(placed.centre_patient_mm),
         narrow,
     )
-
-
-def _capital(text: str) -> str:
-    return f"{text[0].upper()}{text[1:]}"
 
 
 def size_words(size: Quantity) -> str:

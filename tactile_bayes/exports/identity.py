@@ -160,7 +160,10 @@ def read_worklist(path: Path) -> Identity:
     """Read the identity that a worklist file gives."""
     data = read_bytes(path, most=_MOST_BYTES)
     if not data.lstrip().startswith((b"{", b"[")):
-        return _identity(_of_dicom(_read_dicom(path), path), path)
+        pydicom = required("pydicom")
+        with _decoding(path, "is neither JSON nor a DICOM file"):
+            item = pydicom.dcmread(path, stop_before_pixels=True)
+        return _identity(_of_dicom(item, path), path)
     document = load_json(path, way_out=_WAY_OUT)
     if isinstance(document, list):
         if len(document) != 1:
@@ -169,7 +172,10 @@ def read_worklist(path: Path) -> Identity:
     if not isinstance(document, dict):
         raise BadDataError("is no worklist item", way_out=_WAY_OUT, path=str(path))
     if document and all(_TAG.fullmatch(key) for key in document):
-        return _identity(_of_dicom(_from_dicom_json(document, path), path), path)
+        pydicom = required("pydicom")
+        with _decoding(path, "is no DICOM JSON"):
+            item = pydicom.Dataset.from_json(document)
+        return _identity(_of_dicom(item, path), path)
     found = as_dict(parse_record(document, IdentityOptions, path=path))
     return _identity({name: value for name, value in found.items() if value}, path)
 
@@ -179,18 +185,6 @@ def _identity(given: dict[str, Any], path: Path) -> Identity:
         return Identity(**given)
     except UsageError as error:
         raise BadDataError(str(error), path=str(path)) from None
-
-
-def _read_dicom(path: Path) -> Any:
-    pydicom = required("pydicom")
-    with _decoding(path, "is neither JSON nor a DICOM file"):
-        return pydicom.dcmread(path, stop_before_pixels=True)
-
-
-def _from_dicom_json(document: dict[str, Any], path: Path) -> Any:
-    pydicom = required("pydicom")
-    with _decoding(path, "is no DICOM JSON"):
-        return pydicom.Dataset.from_json(document)
 
 
 @contextlib.contextmanager

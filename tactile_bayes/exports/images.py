@@ -292,13 +292,14 @@ def map_picture(source: MapFile, estimate: EstimateFile | None) -> NDArray[np.ui
     """
     report = None if estimate is None or estimate.kind != "estimate" else estimate.report
     alone = report if isinstance(report, EstimateReport) else None
+    candidates = () if alone is None else alone.candidates
     side = source.facts.get("side")
     with plain_matplotlib() as library:
         figure = map_figure(
             source.tactile_map,
             None,
             fit=None if alone is None else _contour(alone),
-            looked_at=() if alone is None else _places(alone),
+            looked_at=[Place((one.x_mm, one.y_mm), one.fault) for one in candidates if one.fault],
             title="Tactile map" + (f" of the {side} breast" if side in ("left", "right") else ""),
             note="" if estimate is None else _note(estimate),
             findings=None if estimate is None else estimate.findings,
@@ -312,10 +313,6 @@ def map_picture(source: MapFile, estimate: EstimateFile | None) -> NDArray[np.ui
 def _note(estimate: EstimateFile) -> str:
     reasons = [one.reason for one in estimate.masses if one.largest is None]
     return no_estimate_line(reasons[0][:_MOST_NOTE]) if reasons and not estimate.sized else ""
-
-
-def _places(report: EstimateReport) -> list[Place]:
-    return [Place((one.x_mm, one.y_mm), one.fault) for one in report.candidates if one.fault]
 
 
 def _contour(report: EstimateReport) -> FitContour | None:

@@ -17,7 +17,6 @@ from tactile_bayes.files.scan_mcap import summarise_scan
 from tactile_bayes.files.size_json import read_repeatability, read_size_calibration
 from tactile_bayes.files.tables import read_table, separator_in
 from tactile_bayes.findings import finding_lines, findings_in
-from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.pooling import Calibration
 
@@ -74,20 +73,16 @@ def _told(document: Any) -> dict[str, Any]:
     return {"verdict": document.get("verdict"), "findings": finding_lines(findings_in(document["findings"]))}
 
 
-def _value_unit(tactile_map: TactileMap) -> str:
-    unit = tactile_map.recipe.value_unit
-    return "1 is the background" if unit == "1" else unit or "unknown"
-
-
 def _map(path: Path) -> dict[str, Any]:
     tactile_map, header = read_map_and_header(path)
     ny, nx = tactile_map.mean.shape
+    unit = tactile_map.recipe.value_unit
     return {
         "schema": header.schema,
         "kind": "map",
         "shape": {"ny": ny, "nx": nx},
         "extent_mm": {"x": nx * tactile_map.recipe.cell_mm, "y": ny * tactile_map.recipe.cell_mm},
-        "units": {"x": "mm", "y": "mm", "mean": _value_unit(tactile_map)},
+        "units": {"x": "mm", "y": "mm", "mean": "1 is the background" if unit == "1" else unit or "unknown"},
         "covered_cells": int(tactile_map.covered.sum()),
         "background": tactile_map.background,
         "frames": tactile_map.frame_count,

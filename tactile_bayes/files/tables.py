@@ -345,11 +345,6 @@ class _CellError(Exception):
         self.way_out = way_out
 
 
-def _parse_string(text: str, field: Mapping[str, Any]) -> str:
-    del field
-    return text
-
-
 def _parse_number(text: str, field: Mapping[str, Any]) -> float:
     if _NUMBER.fullmatch(text):
         value = float(text)
@@ -411,7 +406,7 @@ def _parse_boolean(text: str, field: Mapping[str, Any]) -> bool:
 
 
 _PARSERS = {
-    "string": _parse_string,
+    "string": lambda text, _: text,
     "number": _parse_number,
     "integer": _parse_integer,
     "boolean": _parse_boolean,
