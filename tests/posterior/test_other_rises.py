@@ -72,6 +72,22 @@ def test_a_larger_lump_far_away_is_no_rib_under_a_small_one() -> None:
     assert found.scene.fit.scene.extra != "rib"
 
 
+@pytest.mark.parametrize(("second", "places"), [(0.15, [(24, 14)]), (0.0, [])])
+def test_a_lump_on_the_rib_beside_another_lump_is_named_and_the_rib_is_not(
+    second: float, places: list[tuple[int, int]]
+) -> None:
+    """A rib of the first lump's scene once hid all that lies along it."""
+    rng, half = np.random.default_rng(1), 45.0
+    first = bump_values(half_mm=half, x=-12.0, y=-4.0, sigma_x=5.0, sigma_y=5.0, amplitude=0.3)
+    other = bump_values(half_mm=half, x=24.0, y=14.0, sigma_x=4.0, sigma_y=4.0, amplitude=second, level=0.0)
+    rib = 0.1 * np.exp(-0.5 * ((np.arange(-half, half + 1)[:, None] - 14.0) / 5.0) ** 2)
+    noise = 0.01 * rng.standard_normal(first.shape) + 0.005 * correlated_field(rng, len(first), length_cells=3.0)
+    found, rises = looked(first + other + rib + noise)
+    assert found.scene is not None
+    assert found.scene.fit.scene.extra == "rib"
+    assert [(round(rise.x_mm), round(rise.y_mm)) for rise in rises] == places
+
+
 def test_a_place_without_a_mode_is_no_rise(monkeypatch: pytest.MonkeyPatch) -> None:
     tactile_map = grid_map(values(second=0.1))
     options = SamplerSettings(method="laplace", draws=400, background="free", noise="field")
