@@ -3,6 +3,7 @@
 ``import tactile_bayes as tb`` offers what the command line does; each name is loaded when it is first used:
 
 - `read_scan`, `read_map`, `simulate`, `demo_scan`, `demo_map`: scans and maps
+- `check`: whether array, lever arm and quaternions of a scan are as they are stated
 - `build_map`: from scans to a map
 - `estimate`, `pool`: from a map, or from several maps of one mass, to a size
 - `compare`: from the maps of two visits to the change of a mass's size
@@ -39,6 +40,7 @@ __all__ = [
     "calibrate_repeatability",
     "calibrate_size",
     "campaign",
+    "check",
     "compare",
     "demo_map",
     "demo_scan",
@@ -71,6 +73,7 @@ _HOME = {
     "calibrate_repeatability": "api.trials",
     "calibrate_size": "api.trials",
     "campaign": "campaigns.campaign",
+    "check": "api.maps",
     "compare": "api.comparing",
     "demo_map": "api.maps",
     "demo_scan": "api.maps",

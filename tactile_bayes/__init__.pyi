@@ -7,6 +7,7 @@ from tactile_bayes.api.estimates import estimate as estimate
 from tactile_bayes.api.estimates import pool as pool
 from tactile_bayes.api.maps import Map as Map
 from tactile_bayes.api.maps import build_map as build_map
+from tactile_bayes.api.maps import check as check
 from tactile_bayes.api.maps import demo_map as demo_map
 from tactile_bayes.api.maps import demo_scan as demo_scan
 from tactile_bayes.api.maps import read_map as read_map

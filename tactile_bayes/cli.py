@@ -18,6 +18,7 @@ from tactile_bayes.shell import ReaderGoneError, ended_in_order, protect_streams
 COMMANDS: dict[str, tuple[str, str]] = {
     "demo": ("exam.demo_command", "Run the main job on an embedded scan: map, estimate, the report of a trial."),
     "import": ("exam.import_command", "Bring other people's arrays, grids and images in."),
+    "check": ("exam.check_command", "Check that array, lever arm and quaternions of scans are as they are stated."),
     "map": ("estimate.map_command", "Build a tactile map from one or more scans (paper steps i-iii)."),
     "calibrate": ("calibrate.command", "Learn a calibration: `calibrate size`, `calibrate array`."),
     "estimate": ("estimate.estimate_command", "Lump size with a credible interval from tactile maps."),

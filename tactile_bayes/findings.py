@@ -16,6 +16,9 @@ KINDS: Final[Mapping[str, Severity]] = {
     "data_lost": "check",
     "recorder_noted": "check",
     "times_apart": "check",
+    "wrong_arrangement": "caution",
+    "frames_contradict": "caution",
+    "arrangement_unknown": "check",
     # of a map
     "wrong_rotations": "caution",
     "rotations_unknown": "check",

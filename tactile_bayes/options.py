@@ -192,6 +192,12 @@ class MapOptions(Options):
     register_strokes: Annotated[
         bool, Meta(description="Align the strokes with each other, for a lump that moves with the head.")
     ] = False
+    as_stated: Annotated[
+        bool,
+        Meta(
+            description="Take array, lever arm and quaternions as stated; else frames that contradict them are refused."
+        ),
+    ] = False
     every: Annotated[
         int,
         Meta(

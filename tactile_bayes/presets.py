@@ -72,3 +72,16 @@ REGISTRATION_MM: Final = 5.0
 
 MATCH_MM: Final = 15.0
 """Default distance for matching a mass by its place: half of what lies between two masses that are told apart."""
+CORRECTIONS: Final = {
+    "rows-reversed": "the array's rows run backwards",
+    "columns-reversed": "the array's columns run backwards",
+    "half-turn": "the array is turned by 180 degrees",
+    "quarter-turn": "the array is turned by 90 degrees against the tracker, as if its lever arm were left out",
+    "quarter-turn-back": "the array is turned by -90 degrees against the tracker, as if its lever arm were left out",
+    "transposed": "frames were reshaped where they should be transposed",
+    "lever-inverse": "the lever arm is that from the head to the tracker",
+    "lever-none": "the poses are those of the head already",
+    "scalar-last": "the quaternions are scalar last",
+    "inverse-rotation": "the quaternions are of the inverse rotation",
+}
+"""What of a scan's arrangement can be corrected at its import, and what is wrong where it has to be, in words."""

@@ -16,7 +16,7 @@ from tactile_bayes.api.diagnosing import diagnosed
 from tactile_bayes.commands import estimate
 from tactile_bayes.commands import trial as validate
 from tactile_bayes.declarations import Record
-from tactile_bayes.errors import UsageError
+from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.exports.exam import read_exam
 from tactile_bayes.exports.identity import identity_of
 from tactile_bayes.exports.run import Outputs, export, refuse_untaken
@@ -27,9 +27,11 @@ from tactile_bayes.files.identify import describe
 from tactile_bayes.files.imports import read_arrays, read_grid
 from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.files.provenance import Provenance, hash_inputs
-from tactile_bayes.files.scan_mcap import read_scan_report, read_truth, write_scan
+from tactile_bayes.files.scan_mcap import read_scan, read_scan_report, read_truth, write_scan
 from tactile_bayes.files.size_json import SHIPPED, size_calibration_path
+from tactile_bayes.findings import finding_lines
 from tactile_bayes.geometry import FloatArray
+from tactile_bayes.mapping.arrangement import TOO_SHORT, check_scan, corrected
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.scan import Scan
 
@@ -46,6 +48,7 @@ def import_action(
     spacing_mm: float | None,
     normalise: str | None,
     units: str | None,
+    corrections: tuple[str, ...],
     session_file: Path | None,
     force: bool,
 ) -> None:
@@ -57,14 +60,14 @@ def import_action(
     check_suffix(output, "MCAP" if kind == "scan" else "netCDF")
     if kind == "scan" and (spacing_mm is not None or normalise is not None or units is not None):
         raise UsageError("--spacing-mm, --normalise and --units are for maps; leave them out or give --as map")
-    if kind == "map" and session_file is not None:
-        raise UsageError("--session is for scans; leave it out or give --as scan")
+    if kind == "map" and (session_file is not None or corrections):
+        raise UsageError("--session and --correct are for scans; leave them out or give --as scan")
     if units is not None and normalise not in (None, "none"):
         raise UsageError(f"--units is for values that were not divided; leave it out or --normalise {normalise}")
     if units is not None and not (units.isprintable() and 0 < len(units.strip()) <= _LONGEST_UNITS):
         raise UsageError(f"--units {units[:30]!r} is not a unit; give up to {_LONGEST_UNITS} letters, such as kPa")
     if kind == "scan":
-        lines = _import_scan(source, output, session_file, force=force)
+        lines = _import_scan(source, output, corrections, session_file, force=force)
     else:
         lines = _import_map(
             source, output, spacing_mm=spacing_mm, normalise=normalise or "none", units=units or "", force=force
@@ -73,7 +76,9 @@ def import_action(
         click.echo(line)
 
 
-def _import_scan(source: Path, output: Path, session_file: Path | None, *, force: bool) -> list[str]:
+def _import_scan(
+    source: Path, output: Path, corrections: tuple[str, ...], session_file: Path | None, *, force: bool
+) -> list[str]:
     lost: tuple[str, ...] = ()
     truth = None
     if source.suffix.lower() == ".mcap":
@@ -82,9 +87,35 @@ def _import_scan(source: Path, output: Path, session_file: Path | None, *, force
     else:
         scan = read_arrays(source)
     files = {"source": source} | ({"session": session_file} if session_file else {})
-    provenance = Provenance("import", {"as": "scan", "lost": list(lost)}, inputs=hash_inputs(**files))
-    write_scan(output, with_session(scan, session_file), provenance=provenance, truth=truth, force=force)
-    return [*describe_scan(scan), *(f"lost: {line}" for line in lost)]
+    settings = {"as": "scan", "lost": list(lost), "correct": list(corrections)}
+    provenance = Provenance("import", settings, inputs=hash_inputs(**files))
+    scan = corrected(with_session(scan, session_file), corrections)
+    write_scan(output, scan, provenance=provenance, truth=truth, force=force)
+    return [*describe_scan(scan), *(f"lost: {line}" for line in lost), *_arrangement_lines(scan)]
+
+
+def _arrangement_lines(scan: Scan) -> list[str]:
+    check = check_scan(scan, thorough=False)
+    return [] if check is None else finding_lines(check.findings) or [check.words]
+
+
+# --- `check`: is a scan arranged as it is stated?
+
+
+def check_action(*, scans: tuple[Path, ...], pressure_window_kpa: tuple[float, float]) -> None:
+    """Check that array, lever arm and quaternions of scans are as they are stated."""
+    wrong = 0
+    for path in scans:
+        check = check_scan(read_scan(path), pressure_window_kpa=pressure_window_kpa)
+        click.echo(f"{path}:")
+        for line in [TOO_SHORT] if check is None else check.lines():
+            click.echo(f"  {line}")
+        wrong += check is not None and check.refused
+    click.echo(RESEARCH_USE)
+    if wrong:
+        raise BadDataError(
+            f"{wrong} of {len(scans)} scans are not arranged as they are stated", way_out="import them again, corrected"
+        )
 
 
 def _import_map(

@@ -20,10 +20,11 @@ from tactile_bayes.files.scene_toml import read_scene
 from tactile_bayes.findings import Finding, finding_lines
 from tactile_bayes.forward.instrument import SimulatedScan
 from tactile_bayes.geometry import FloatArray
+from tactile_bayes.mapping.arrangement import ArrangementCheck, check_scan
 from tactile_bayes.mapping.build import build_map as build
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.options import MapOptions
-from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.presets import PRESSURE_WINDOW_KPA, RESEARCH_USE
 from tactile_bayes.report.map_figure import map_figure
 from tactile_bayes.scan import Scan
 
@@ -246,10 +247,7 @@ def build_map(scans: Any, **options: Any) -> Map:
             loaded.append(read_scan(one))
             facts += exam_facts([path_of(one)], loaded[-1:])
             continue
-        scan = getattr(one, "scan", one)
-        if not isinstance(scan, Scan):
-            way_out = "read one with read_scan, or bring arrays in with `import`"
-            raise UsageError(f"a scan is wanted, not {type(one).__name__}; {way_out}")
+        scan = _scan_of(one)
         loaded.append(scan)
         facts.append(scan_facts(scan.session, frames=scan.frames.sha256))
     for later, earlier in repeated_scans([[one] for one in facts]).items():
@@ -258,6 +256,35 @@ def build_map(scans: Any, **options: Any) -> Map:
         )
     made = build(loaded, **{name: plain(value) for name, value in options.items()})
     return Map(made, scans=tuple(facts))
+
+
+@door
+def check(scan: Any, *, pressure_window_kpa: tuple[float, float] = PRESSURE_WINDOW_KPA) -> ArrangementCheck | None:
+    """Compare what is stated of a scan's array, lever arm and quaternions with other arrangements.
+
+    Parameters
+    ----------
+    scan
+        A scan, a simulated scan, or a path.
+    pressure_window_kpa
+        Frames whose mean pressure lies outside are left out.
+
+    Returns
+    -------
+    ArrangementCheck or None
+        `words` says what its frames agree with, `lines()` in full; None where it is too short.
+    """
+    return check_scan(
+        read_scan(scan) if isinstance(scan, str | Path) else _scan_of(scan), pressure_window_kpa=pressure_window_kpa
+    )
+
+
+def _scan_of(given: Any) -> Scan:
+    scan = getattr(given, "scan", given)
+    if not isinstance(scan, Scan):
+        kind = type(given).__name__
+        raise UsageError(f"a scan is wanted, not {kind}; read one with read_scan, or bring arrays in with `import`")
+    return scan
 
 
 @door

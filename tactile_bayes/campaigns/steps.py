@@ -180,7 +180,7 @@ def _scanned_map(task: Task) -> tuple[Result, Writes]:
 def _imported_map(task: Task) -> tuple[Result, Writes]:
     """Bring in arrays as `import` does, and map the scan that they are."""
     scan = read_arrays(task.source)
-    made = Provenance("import", {"as": "scan", "lost": []}, inputs={"source": task.source_sha256})
+    made = Provenance("import", {"as": "scan", "lost": [], "correct": []}, inputs={"source": task.source_sha256})
     facts = scan_facts(scan.session, frames=scan.frames.sha256, file=task.source_sha256)
     inputs = {"scan_1": task.source_sha256}
     provenance = Provenance("map", map_settings(task.normalise), inputs, scans=[facts])

@@ -11,8 +11,8 @@ import click
 from tactile_bayes.commands.options import FORCE, JSON, METAVAR, SESSION, FigurePath, FilePath, takes
 from tactile_bayes.declarations import names_of
 from tactile_bayes.files.arrays_layout import layout_lines
-from tactile_bayes.options import IdentityOptions
-from tactile_bayes.presets import METHODS, NORMALISE
+from tactile_bayes.options import IdentityOptions, MapOptions
+from tactile_bayes.presets import CORRECTIONS, METHODS, NORMALISE
 
 # --- `demo`: the main steps on data that comes with the program.
 
@@ -70,6 +70,13 @@ def demo_command(ctx: click.Context, /, **given: Any) -> None:
 @click.option(
     "--units", metavar="TEXT", help="Map: unit of values that are not normalised, such as kPa. Default: unknown."
 )
+@click.option(
+    "--correct",
+    "corrections",
+    type=click.Choice(tuple(CORRECTIONS)),
+    multiple=True,
+    help="Scan: correct what is stated of array, lever arm or quaternions; `check` says what is to be corrected.",
+)
 @SESSION
 @FORCE
 def import_command(**given: Any) -> None:
@@ -88,6 +95,26 @@ def import_command(**given: Any) -> None:
 _HEADING = "Arrays of a scan in an .npz file, in mm, kPa and s, for n frames and m poses:"
 _ARRAYS = "\n".join([_HEADING, "", "\b", *layout_lines()])
 import_command.help = f"{cleandoc(import_command.help or '')}\n\n{_ARRAYS}"
+
+
+# --- `check`: is a scan arranged as it is stated?
+
+
+@click.command("check")
+@click.argument("scans", nargs=-1, required=True, metavar="SCAN...", type=FilePath())
+@takes(MapOptions, "pressure_window_kpa")
+def check_command(**given: Any) -> None:
+    """Check that array, lever arm and quaternions of scans are as they are stated.
+
+    Where frames overlap, they feel one breast. Other arrangements are tried (rows or columns reversed, an array turned
+    or transposed, a lever arm inverted or left out, other orders of the quaternions), and that in which frames agree
+    best is named with its odds. An empty breast shows nothing: check a scan of a phantom with a lump once.
+
+    Example: tactile-bayes check scan.mcap
+    """
+    from tactile_bayes.actions.exam import check_action
+
+    check_action(**given)
 
 
 # --- `show`: describe a file.

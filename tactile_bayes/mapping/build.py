@@ -13,6 +13,7 @@ from tactile_bayes.findings import Finding, by_weight
 from tactile_bayes.geometry import FloatArray, Plane, apply, inverse, patient_from_plane
 from tactile_bayes.mapping.accumulate import Accumulated, accumulate, add_all, sources_of
 from tactile_bayes.mapping.accumulate import flat_field as find_flat_field
+from tactile_bayes.mapping.arrangement import check_briefly
 from tactile_bayes.mapping.cells import CellSums, yaw_deg
 from tactile_bayes.mapping.convention import check_convention, convention_findings, hint
 from tactile_bayes.mapping.errors import pose_noise_figures, shared_frame_figures
@@ -210,6 +211,7 @@ def build_map(
     figures: dict[str, float] = {} if how.every == 1 else {"frames_every": float(how.every)}
     late_ms = 0.0 if isinstance(how.latency_ms, str) else float(how.latency_ms)
     selections = rules.select(parts, late_ms)
+    findings = _of_scans(given) + (() if how.as_stated else _of_arrangement(selections, late_ms))
     figures |= head_profile_figures(selections)
     if how.flat_field:
         selections = _flattened(selections, rules, late_ms, figures)
@@ -233,17 +235,32 @@ def build_map(
     recipe = MapRecipe(
         "scan", how.normalise, float(how.cell_mm), rules.window_kpa, late_ms, how.flat_field, how.register_strokes
     )
-    return _as_map(done, selections, plane, recipe, figures, findings=_of_scans(given))
+    return _as_map(done, selections, plane, recipe, figures, findings=findings)
 
 
 def _of_scans(scans: list[Scan]) -> tuple[Finding, ...]:
-    """Findings against each scan, by its number where there are several."""
-    several = len(scans) > 1
-    return tuple(
-        one.at(f"scan {number}") if several else one
-        for number, scan in enumerate(scans, start=1)
-        for one in scan_findings(scan)
-    )
+    """Findings against each scan."""
+    return _numbered([scan_findings(scan) for scan in scans])
+
+
+def _of_arrangement(selections: list[SelectedFrames], late_ms: float) -> tuple[Finding, ...]:
+    """Findings on how each scan is arranged; a `BadDataError` where another arrangement than the one stated is sure."""
+    findings = []
+    for number, one in enumerate(selections, start=1):
+        check = check_briefly(one, latency_ms=late_ms)
+        if check is not None and check.refused:
+            which = f"scan {number}: " if len(selections) > 1 else ""
+            way_out = f"import the scan again with {check.remedy}, or map it with --as-stated"
+            raise BadDataError(f"{which}{check.words}", way_out=way_out)
+        findings.append(() if check is None else check.findings)
+    return findings[0] if all(one == findings[0] for one in findings) else _numbered(findings)
+
+
+def _numbered(findings: list[tuple[Finding, ...]]) -> tuple[Finding, ...]:
+    """Findings of each scan, by its number where there are several."""
+    if len(findings) == 1:
+        return findings[0]
+    return tuple(one.at(f"scan {number}") for number, some in enumerate(findings, start=1) for one in some)
 
 
 class _Rules(Record, eq=False):

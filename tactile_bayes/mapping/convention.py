@@ -145,6 +145,12 @@ CONVENTIONS = {
     "scalar last, of the inverse rotation": ((3, 0, 1, 2), -1.0),
 }
 DECLARED = "scalar first"
+# Options of `import` that turn each into ours.
+CORRECT = {
+    "scalar last": ("--correct scalar-last",),
+    "scalar first, of the inverse rotation": ("--correct inverse-rotation",),
+    "scalar last, of the inverse rotation": ("--correct scalar-last", "--correct inverse-rotation"),
+}
 # A head slides along its face: the mean normal of the face and the normal of the motion agree at least so well.
 AGREEMENT = 0.9
 # Strokes far round a curved breast turn the face by 45 degrees either way, which leaves this much of its mean normal.
@@ -209,8 +215,8 @@ def convention_findings(quality: Mapping[str, float]) -> tuple[Finding, ...]:
             f"the quaternions seem to be {other}: the head's face would follow its motion to {agreement:.3f} of 1, "
             f"against {quality['normal_agreement']:.3f} as they are told; size and place may be wrong"
         )
-        check = "check the tracker's quaternions"
-        return (Finding("wrong_rotations", text, f"{check} and import the scan again", check),)
+        remedy = f"check them; to change them, import the scan again with {' '.join(CORRECT[other])}"
+        return (Finding("wrong_rotations", text, remedy, "check the tracker's quaternions"),)
     if "normal_agreement" not in quality and "plane_rms_mm" in quality:
         text = "the motion does not tell whether the quaternions are scalar first and from sensor to base"
         return (Finding("rotations_unknown", text, "check them", "check them"),)
@@ -230,7 +236,8 @@ def _best(agreement: dict[str, float]) -> str:
 def _way_out(agreement: dict[str, float], best: str) -> str:
     if best == DECLARED or agreement[best] < AGREEMENT:
         return "check the quaternion order (scalar first) and scanhead_from_tracker"
-    return f"the quaternions seem to be {best} (agreement {agreement[best]:.2f} of 1); convert them to scalar first"
+    way_out = f"import the scan again with {' '.join(CORRECT[best])}"
+    return f"the quaternions seem to be {best} (agreement {agreement[best]:.2f} of 1); {way_out}"
 
 
 def _near_used(part: SelectedFrames) -> TrackerPoses:

@@ -205,6 +205,7 @@ def _model_map(measured: MeasuredFrames, pressure_kpa: FloatArray) -> TactileMap
         pressure_window_kpa=(0.99 * low, 1.01 * high),
         latency_ms=recipe.latency_ms,
         normalise="mean",
+        as_stated=True,
     )
 
 

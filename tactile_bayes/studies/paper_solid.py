@@ -69,7 +69,9 @@ def raster_map(frames: RasterFrames) -> TactileMap:
     if frames.plain_kpa is not None:
         plain = _readings(frames.plain_kpa)
         scan = FlatField(plain / plain.mean(), frames=1).applied(scan)
-    return build_map(scan, cell_mm=frames.head.pitch_mm / 2, pressure_window_kpa=_WINDOW, normalise="mean")
+    return build_map(
+        scan, cell_mm=frames.head.pitch_mm / 2, pressure_window_kpa=_WINDOW, normalise="mean", as_stated=True
+    )
 
 
 def _readings(pressure_kpa: FloatArray) -> CountArray:

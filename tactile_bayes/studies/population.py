@@ -309,7 +309,7 @@ def measure_exam(scene: Scene, scan: Scan, *, body: int, exam: int, normalise: s
         **head_columns(scene.head),
     )
     try:
-        tactile_map = build_map(scan, normalise=normalise)
+        tactile_map = build_map(scan, normalise=normalise, as_stated=True)
         quality = tactile_map.quality
         profile: dict[str, Any] = {name: quality.get(name) for name in HEAD_PROFILE}
         row = replace(row, mean_kpa=quality["mean_pressure_kpa"], **profile)

@@ -59,6 +59,7 @@ def test_the_interval_covers_the_truth_and_says_so(shown: CompletedProcess[str],
     assert line.endswith("covers the true size")
 
 
+@pytest.mark.usefixtures("shown")
 def test_the_scan_is_of_a_body_that_the_calibration_has_seen(run_cli: Run, place: Path) -> None:
     """The README's two commands on the packaged scan: within 20 % of the truth, and nothing outside the range."""
     scene = read_scene(place / "my demo" / "scene.toml")

@@ -55,6 +55,7 @@ def test_scans_become_the_map_the_function_builds(folder, run_cli):
         "plane_radius_mm": "all",
         "flat_field": False,
         "register_strokes": False,
+        "as_stated": False,
         "every": 1,
     }
     assert [one["role"] for one in header.provenance["inputs"]] == ["scan_1", "scan_2"]

@@ -74,7 +74,7 @@ def test_quaternions_told_scalar_last_are_named_as_such():
     q = scan.poses.quaternion_wxyz
     wrong = replace(scan, poses=TrackerPoses(scan.poses.time_s, scan.poses.position_mm, np.roll(q, -1, axis=1)))
     with pytest.raises(BadDataError, match=r"degrees apart; the quaternions seem to be scalar last \(agreement 1\.00"):
-        build_map(wrong)
+        build_map(wrong, as_stated=True)
     build_map(scan)  # the control: told as they should be, they pass
 
 

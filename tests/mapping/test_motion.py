@@ -126,7 +126,7 @@ def test_a_mirrored_head_gives_the_same_latency(axis):
     assert turned.recipe.latency_ms == pytest.approx(plain.recipe.latency_ms, abs=1e-6)
     assert mirror.recipe.latency_ms == pytest.approx(plain.recipe.latency_ms, abs=plain.quality["latency_sd_ms"])
     with pytest.raises(BadDataError, match="does not determine the tracker's latency"):
-        build_map(flipped(late, axis, geometry=False), latency_ms="auto")
+        build_map(flipped(late, axis, geometry=False), latency_ms="auto", as_stated=True)
 
 
 def test_strokes_one_way_do_not_tell_the_latency():

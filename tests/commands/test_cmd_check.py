@@ -1,0 +1,71 @@
+"""`check`, and `import --correct` and `map --as-stated` after it, as a user runs them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from in_process import run_here
+
+import tactile_bayes as tb
+
+
+@pytest.fixture(scope="module")
+def backwards(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with arrays of the packaged scan, whose columns run backwards."""
+    folder, scan = tmp_path_factory.mktemp("backwards"), tb.demo_scan()
+    np.savez(
+        folder / "exam.npz",
+        counts=scan.frames.counts[:, :, ::-1],
+        frame_time_s=scan.frames.time_s,
+        position_mm=scan.poses.position_mm,
+        quaternion_wxyz=scan.poses.quaternion_wxyz,
+        pose_time_s=scan.poses.time_s,
+        gain_kpa_per_count=scan.element_calibration.gain_kpa_per_count[:, ::-1],
+        offset_kpa=scan.element_calibration.offset_kpa[:, ::-1],
+        pitch_mm=scan.head.pitch_mm,
+        array_from_tracker=scan.head.scanhead_from_tracker,
+        head_surface_mm=scan.head.surface_mm,
+    )
+    return folder
+
+
+def test_the_first_scan_says_what_is_wrong_and_how_to_mend_it(backwards):
+    said = run_here("import", "exam.npz", "-o", "exam.mcap", cwd=backwards)
+    assert said.returncode == 0
+    assert "CAUTION: the array's columns run backwards (odds" in said.stdout
+
+    refused = run_here("map", "exam.mcap", "-o", "exam.nc", cwd=backwards)
+    assert refused.returncode == 3
+    assert "--correct columns-reversed, or map it with --as-stated" in refused.stderr
+    assert not (backwards / "exam.nc").exists()
+
+    checked = run_here("check", "exam.mcap", cwd=backwards)
+    assert checked.returncode == 3
+    assert "import the scan again with --correct columns-reversed" in checked.stdout
+
+    mended = run_here("import", "exam.npz", "-o", "right.mcap", "--correct", "columns-reversed", cwd=backwards)
+    assert "array, lever arm and quaternions are as stated" in mended.stdout
+    assert np.array_equal(tb.read_scan(backwards / "right.mcap").frames.counts, tb.demo_scan().frames.counts)
+
+
+def test_a_scan_can_be_mapped_as_it_is_stated(backwards):
+    run_here("import", "exam.npz", "-o", "again.mcap", cwd=backwards)
+    assert run_here("map", "again.mcap", "-o", "again.nc", "--as-stated", cwd=backwards).returncode == 0
+
+
+def test_check_lists_what_is_excluded(tmp_path):
+    demo = Path(tb.__file__).parent / "demo" / "scan.mcap"
+    checked = run_here("check", demo, cwd=tmp_path)
+    assert checked.returncode == 0
+    assert "excluded (odds above 10^6): scalar-last" in checked.stdout
+    assert "Research use only" in checked.stdout
+
+
+def test_a_map_has_nothing_to_correct(tmp_path):
+    (tmp_path / "g.csv").write_text("1,1.1\n1,1.2\n")
+    words = ("g.csv", "-o", "g.nc", "--spacing-mm", "1", "--correct", "transposed")
+    refused = run_here("import", *words, cwd=tmp_path)
+    assert refused.returncode == 2
+    assert "--session and --correct are for scans" in refused.stderr

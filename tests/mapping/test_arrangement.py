@@ -1,0 +1,153 @@
+"""A scan that is not arranged as it is stated is refused by name; an empty one says that it shows nothing."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import tactile_bayes as tb
+from tactile_bayes.declarations import replace
+from tactile_bayes.errors import BadDataError
+from tactile_bayes.geometry import inverse, quaternion_from_rotation, rigid, rotation_from_quaternion
+from tactile_bayes.mapping.arrangement import ArrangementCheck, check_arrangement, check_scan, corrected
+from tactile_bayes.mapping.select import select_frames
+from tactile_bayes.presets import CORRECTIONS
+from tactile_bayes.scan import ElementCalibration, HeadGeometry, PressureFrames, Scan, TrackerPoses
+
+# What undoes a mistake; most are their own inverses.
+UNDONE_BY = {
+    **{name: name for name in CORRECTIONS},
+    "quarter-turn": "quarter-turn-back",
+    "quarter-turn-back": "quarter-turn",
+}
+SEEN = [name for name in CORRECTIONS if name not in ("inverse-rotation", "lever-none")]
+"""An inverse rotation hardly moves the frames of a head that is hardly turned; a lever arm left out stands below."""
+
+
+@cache
+def lump() -> Scan:
+    """The packaged scan with its tracker on a handle, a quarter turned, so that no mistake is the identity."""
+    scan = tb.demo_scan()
+    mount = rigid(np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), np.array([3.0, 10.0, -55.0]))
+    lever, pose = scan.head.scanhead_from_tracker, scan.poses
+    poses = [
+        rigid(rotation_from_quaternion(wxyz), place) @ inverse(lever) @ mount
+        for wxyz, place in zip(pose.quaternion_wxyz, pose.position_mm, strict=True)
+    ]
+    quaternion = np.array([quaternion_from_rotation(one[:3, :3]) for one in poses])
+    place = np.array([one[:3, 3] for one in poses])
+    return replace(
+        scan,
+        head=HeadGeometry(scan.head.surface_mm, scan.head.pitch_mm, mount),
+        poses=TrackerPoses(pose.time_s, place, quaternion),
+    )
+
+
+def mistaken(scan: Scan, name: str) -> Scan:
+    """The scan as one gives it who makes a mistake."""
+    if name == "scalar-last":
+        wxyz = np.roll(scan.poses.quaternion_wxyz, -1, axis=1)
+        return replace(scan, poses=TrackerPoses(scan.poses.time_s, scan.poses.position_mm, wxyz))
+    if name == "transposed":
+        held = scan.element_calibration
+        return replace(
+            scan,
+            frames=PressureFrames(scan.frames.time_s, reshaped(scan.frames.counts)),
+            element_calibration=ElementCalibration(reshaped(held.gain_kpa_per_count), reshaped(held.offset_kpa)),
+        )
+    return corrected(scan, [name])
+
+
+def reshaped(array: np.ndarray) -> np.ndarray:
+    """An array that was stored column by column and reshaped to (rows, columns)."""
+    return np.ascontiguousarray(array.swapaxes(-1, -2)).reshape(array.shape)
+
+
+def checked(scan: Scan, *, most_changes: int = 1) -> ArrangementCheck:
+    check = check_arrangement(select_frames(scan, pressure_window_kpa=(5.0, 14.0)), most_changes=most_changes)
+    assert check is not None
+    return check
+
+
+@pytest.mark.parametrize("name", SEEN)
+def test_a_mistake_is_refused_and_named(name):
+    scan = mistaken(lump(), name)
+    check = checked(scan)
+    assert check.refused
+    assert check.best.corrections == (UNDONE_BY[name],)
+    right = corrected(scan, check.best.corrections)
+    assert np.array_equal(right.frames.counts, lump().frames.counts)
+    assert np.allclose(right.head.scanhead_from_tracker, lump().head.scanhead_from_tracker)
+    assert np.array_equal(right.poses.quaternion_wxyz, lump().poses.quaternion_wxyz)
+
+
+def test_a_scan_that_is_right_is_left_alone():
+    check = checked(lump())
+    assert check.best is check.stated
+    assert not check.findings
+    assert not set(check.not_shown) & set(SEEN)
+
+
+def test_a_lever_arm_left_out_shows_by_the_turn_of_the_mount():
+    check = checked(corrected(lump(), ["lever-none"]))
+    assert check.refused
+    assert set(check.best.corrections) <= {"quarter-turn", "quarter-turn-back"}
+    assert "lever arm" in check.words
+
+
+def test_two_mistakes_at_once_are_named_both():
+    check = check_scan(mistaken(mistaken(lump(), "columns-reversed"), "scalar-last"), thorough=False)
+    assert check is not None
+    assert check.refused
+    assert set(check.best.corrections) == {"columns-reversed", "scalar-last"}
+
+
+def test_the_base_of_the_tracker_may_lie_anyhow():
+    rng = np.random.default_rng(3)
+    turn = rotation_from_quaternion(rng.standard_normal(4))
+    scan = mistaken(lump(), "rows-reversed")
+    rotation = rotation_from_quaternion(scan.poses.quaternion_wxyz)
+    quaternion = np.array([quaternion_from_rotation(turn @ one) for one in rotation])
+    place = scan.poses.position_mm @ turn.T + rng.normal(0, 300, 3)
+    moved = replace(scan, poses=TrackerPoses(scan.poses.time_s, place, quaternion))
+    assert checked(moved).best.corrections == ("rows-reversed",)
+    assert checked(moved).best.spread == pytest.approx(checked(scan).best.spread, rel=0.05)
+
+
+def test_frames_of_another_clock_contradict_each_other():
+    """Control: places of other frames fit in no arrangement."""
+    scan = lump()
+    place = np.roll(scan.poses.position_mm, len(scan.poses) // 3, axis=0)
+    check = checked(replace(scan, poses=TrackerPoses(scan.poses.time_s, place, scan.poses.quaternion_wxyz)))
+    assert check.contradicting
+    assert not check.refused
+    assert [one.kind for one in check.findings] == ["frames_contradict"]
+
+
+def test_an_empty_breast_says_that_it_shows_nothing():
+    check = checked(tb.simulate(Path(tb.__file__).parent / "demo" / "empty.toml").scan)
+    assert check.says_nothing
+    assert not check.refused
+    assert [one.kind for one in check.findings] == ["arrangement_unknown"]
+
+
+def test_a_scan_of_a_second_is_too_short():
+    scan = lump()
+    short = replace(scan, frames=PressureFrames(scan.frames.time_s[:100], scan.frames.counts[:100]))
+    assert check_scan(short) is None
+
+
+def test_a_map_refuses_and_takes_the_scan_where_it_is_told_to():
+    scan = mistaken(lump(), "columns-reversed")
+    with pytest.raises(BadDataError, match="columns run backwards") as refused:
+        tb.build_map(scan)
+    assert "columns-reversed" in refused.value.way_out
+    assert tb.build_map(scan, as_stated=True).findings == ()
+
+
+def test_each_scan_of_a_map_is_checked():
+    with pytest.raises(BadDataError, match="scan 2: the array's rows run backwards"):
+        tb.build_map([lump(), mistaken(lump(), "rows-reversed")])
