@@ -15,6 +15,7 @@ from tactile_bayes.presets import (
     CELL_MM,
     DEFAULT_NORMALISE,
     FAT_KPA,
+    FIT_RADIUS_MM,
     GLAND_RATIO,
     HEAD_RADIUS_MM,
     MEAN_KPA,
@@ -456,6 +457,61 @@ class SbcOptions(Options, kw_only=True):
             extra={"metavar": "N|auto"},
         ),
     ] = "auto"
+    seed: Seed = 1
+
+
+class LearnOptions(Options, kw_only=True):
+    """How a size calibration is learned from a table."""
+
+    form: Annotated[
+        Literal["eq6", "eq6-residual"],
+        Meta(
+            description="eq6: as printed, from a table of lumps, or of bodies made by `population`; eq6-residual: with "
+            "what Eq 6 leaves of the sizes, of bodies only."
+        ),
+    ] = "eq6"
+    fit: Annotated[
+        Literal["joint", "two-stage"],
+        Meta(
+            description="eq6: joint posterior of m, b, e, f from all rows, or the paper's two stages (needs "
+            "depth_ratio)."
+        ),
+    ] = "joint"
+    normalise: Annotated[
+        Normalise | None,
+        Meta(
+            description="Normalisation of the table's maps, if the table does not state it; of a table of `population` "
+            "with rows by several, which to learn from. Default: mean."
+        ),
+    ] = None
+    background: Annotated[
+        Background | None,
+        Meta(
+            description="Background in the table's fits, if the table does not state it. Default: fixed, or free with "
+            "--normalise none."
+        ),
+    ] = None
+    fit_radius_mm: Annotated[
+        Annotated[float, Meta(gt=0)] | None,
+        Meta(
+            description="Radius of the table's fit windows, mm, if the table does not state it. Default: "
+            f"{FIT_RADIUS_MM:g}."
+        ),
+    ] = None
+    noise: Annotated[
+        Noise | None,
+        Meta(
+            description="Noise model of the table's fits, if the table does not state it; least squares is "
+            "independent. Default: independent."
+        ),
+    ] = None
+    least_stiffness_ratio: Annotated[
+        float,
+        Meta(
+            ge=0,
+            description="Leave out lumps softer than this: above 8 the paper's widths change by less than 5 %.",
+        ),
+    ] = 0.0
     seed: Seed = 1
 
 

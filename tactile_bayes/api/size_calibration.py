@@ -39,7 +39,6 @@ from tactile_bayes.studies.population import measuring_options, population_table
 
 EqSixFit = Literal["joint", "two-stage"]
 PopulationForm = Literal["eq6", "eq6-residual"]
-FORMS: Final[tuple[PopulationForm, ...]] = ("eq6", "eq6-residual")
 """What can be learned from a table of `population`; only the first from a table of lumps."""
 _SOURCE: Final = "balls in a population of bodies, scanned by the solid model"
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,15 +14,12 @@ from tactile_bayes.api.maps import PathLike, output_path, path_of, required_path
 from tactile_bayes.api.repeatability import exams_in, learn_from_exams
 from tactile_bayes.api.site_correction import correct_size
 from tactile_bayes.api.size_calibration import (
-    FORMS,
-    EqSixFit,
-    PopulationForm,
     is_population,
     learn_eq6,
     learn_population,
 )
 from tactile_bayes.declarations import Record, as_dict, names_of, replace, to_plain
-from tactile_bayes.errors import NotConvergedError, UsageError, check_choice, check_number
+from tactile_bayes.errors import NotConvergedError, UsageError
 from tactile_bayes.files.atomic import write_text
 from tactile_bayes.files.column_map import read_mapping, read_wide, read_wide_excision
 from tactile_bayes.files.documents import dump_json
@@ -34,7 +31,7 @@ from tactile_bayes.inference.draws import ParameterDraws
 from tactile_bayes.inference.ensemble import ensemble
 from tactile_bayes.inference.importance import importance, importance_options
 from tactile_bayes.inference.modes import LogDensity, mode_and_covariance
-from tactile_bayes.options import TrialSettings
+from tactile_bayes.options import LearnOptions, TrialSettings
 from tactile_bayes.presets import INTERVAL, RESEARCH_USE
 from tactile_bayes.report.compare import Growth
 from tactile_bayes.report.trial import DIGITS, trial_text
@@ -281,10 +278,8 @@ def calibrate_size(
     UsageError
         When a keyword's value cannot be one, or goes with another form.
     """
-    check_choice("form", form, FORMS)
-    check_choice("fit", fit, ("joint", "two-stage"))
-    check_number("seed", seed, 0, whole=True)
-    check_number("least_stiffness_ratio", least_stiffness_ratio, 0)
+    chosen: dict[str, Any] = {"form": form, "fit": fit, "seed": seed, "least_stiffness_ratio": least_stiffness_ratio}
+    asked = LearnOptions(**chosen)  # refuses what none of them can be
     target = None if path is None else output_path(path, "JSON")
     source = table_of(table, "table")
     over_bodies_alone = form != "eq6" or (correct is None and is_population(source))
@@ -298,11 +293,9 @@ def calibrate_size(
     elif over_bodies_alone:
         if fit != "joint":
             raise UsageError(f"fit={fit!r} is for tables of lumps; a table of `population` has one fit")
-        learned = learn_population(source, cast("PopulationForm", form), declared.get("normalise"))
+        learned = learn_population(source, asked.form, declared.get("normalise"))
     else:
-        learned = learn_eq6(
-            source, given, fit=cast("EqSixFit", fit), least_stiffness_ratio=least_stiffness_ratio, seed=seed
-        )
+        learned = learn_eq6(source, given, fit=asked.fit, least_stiffness_ratio=asked.least_stiffness_ratio, seed=seed)
     if target is not None:
         learned.write(target, force=force)
     return learned.calibration

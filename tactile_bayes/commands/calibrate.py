@@ -6,9 +6,8 @@ from typing import Any
 
 import click
 
-from tactile_bayes.api.settings import Settings
-from tactile_bayes.commands.options import FORCE, METAVAR, FigurePath, FilePath, FiniteRange, takes
-from tactile_bayes.presets import FIT_RADIUS_MM, NOISE, NORMALISE
+from tactile_bayes.commands.options import FORCE, METAVAR, FigurePath, FilePath, takes
+from tactile_bayes.options import LearnOptions
 
 # --- `calibrate`: learn a calibration from known objects, and a site's repeatability from its own exams.
 
@@ -30,14 +29,7 @@ def command() -> None:
     type=FilePath(writes="JSON"),
     help="Where to write the calibration.",
 )
-@click.option(
-    "--form",
-    type=click.Choice(["eq6", "eq6-residual"]),
-    default="eq6",
-    show_default=True,
-    help="eq6: as printed, from a table of lumps, or of bodies made by `population`; eq6-residual: with what Eq 6 "
-    "leaves of the sizes, of bodies only.",
-)
+@takes(LearnOptions, "form")
 @click.option(
     "--correct",
     metavar="CALIBRATION",
@@ -50,50 +42,14 @@ def command() -> None:
     type=_FILE,
     help="Lumps of another origin, with the columns of `population`: how far their sizes are off goes into intervals.",
 )
-@click.option(
-    "--fit",
-    type=click.Choice(["joint", "two-stage"]),
-    default="joint",
-    show_default=True,
-    help="eq6: joint posterior of m, b, e, f from all rows, or the paper's two stages (needs depth_ratio).",
-)
-@click.option(
-    "--normalise",
-    type=click.Choice(NORMALISE),
-    help="Normalisation of the table's maps, if the table does not state it; of a table of `population` with rows by "
-    "several, which to learn from. Default: mean.",
-)
-@click.option(
-    "--background",
-    type=click.Choice(["fixed", "free"]),
-    help="Background in the table's fits, if the table does not state it. Default: fixed, or free with "
-    "--normalise none.",
-)
-@click.option(
-    "--fit-radius-mm",
-    type=FiniteRange(min=0.0, min_open=True),
-    help=f"Radius of the table's fit windows, mm, if the table does not state it. Default: {FIT_RADIUS_MM:g}.",
-)
-@click.option(
-    "--noise",
-    type=click.Choice(NOISE),
-    help="Noise model of the table's fits, if the table does not state it; least squares is independent. "
-    "Default: independent.",
-)
-@click.option(
-    "--least-stiffness-ratio",
-    type=FiniteRange(min=0.0),
-    default=0.0,
-    show_default=True,
-    help="Leave out lumps softer than this: above 8 the paper's widths change by less than 5 %.",
-)
+@takes(LearnOptions, "fit", "normalise", "background", "fit_radius_mm", "noise", "least_stiffness_ratio")
 @click.option(
     "--figure",
     metavar=METAVAR,
     type=FigurePath(),
     help="Draw Fig 8 of the paper from the table's lumps (eq6 only).",
 )
-@takes(Settings, "seed")
+@takes(LearnOptions, "seed")
 @FORCE
 def size(**given: Any) -> None:
     """Learn Eq 6, d = m sigma / (e a^f) + b, from a study or a set of phantoms, or over a population of bodies.

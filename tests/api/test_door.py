@@ -197,7 +197,7 @@ BAD: dict[str, tuple[Any, type[Exception], str]] = {
     "a form that is none": (
         lambda _: tb.calibrate_size(DEMO / "phantoms.csv", form="eq7"),
         UsageError,
-        "give one of eq6",
+        "did you mean eq6",
     ),
     "an option of no recording": (
         lambda f: tb.record(f / "s.mcap", head="/dev/nothing", duration_s=1, sid="left"),
