@@ -75,7 +75,7 @@ def listed_near(estimate: Estimate, at: tuple[float, float]) -> bool:
 
 def shown(tactile_map: TactileMap, at: tuple[float, float]) -> bool:
     """Whether the search of `estimate` takes a rise at a place for a lump."""
-    _, options, _ = estimate_inputs(Settings(), tactile_map)
+    _, options = estimate_inputs(Settings(), tactile_map)
     _, seen = search(tactile_map, options)
     if seen is None or seen.detection.probability < DETECTED:
         return False

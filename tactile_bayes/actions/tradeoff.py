@@ -32,13 +32,11 @@ from tactile_bayes.files.scene_toml import read_scene
 from tactile_bayes.files.size_json import read_size_calibration, size_calibration_path
 from tactile_bayes.forward.scene import Scene
 from tactile_bayes.forward.tissue import SceneBody, SolidLump
-from tactile_bayes.mapping.map import TactileMap
-from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.laboratory import TradeoffReport, draw_tradeoff, tradeoff_document, tradeoff_text
 from tactile_bayes.report.tradeoff import DIGITS, draw_ladder, ladder_file, ladder_text
 from tactile_bayes.scan import Scan
-from tactile_bayes.size.pooling import Calibration, PooledEstimate
+from tactile_bayes.size.pooling import PooledEstimate
 from tactile_bayes.studies.estimate_tradeoff import SIZE, Clock, Ladder, PooledRow, SizeAnswer, Work, measure
 from tactile_bayes.studies.paper_solid import fit_raster
 from tactile_bayes.studies.tradeoffs import (
@@ -59,20 +57,18 @@ from tactile_bayes.studies.tradeoffs import (
 # --- The trade of time for accuracy on a user's own maps and scans: calibration and options as `estimate` takes them.
 
 
-def tradeoff_of_map(path: Path, settings: Settings, work: Work) -> tuple[TactileMap, Ladder]:
-    """Every setting of `estimate` on a map that need not be built again; the map too."""
-    _refuse_checkpoint(settings)
-    tactile_map = read_map(path)
+def tradeoff_of_map(path: Path, settings: Settings, work: Work) -> Ladder:
+    """Every setting of `estimate` on a map that need not be built again."""
+    used, tactile_map = _of(settings, work), read_map(path)
     try:
-        calibration, options, _ = estimate_inputs(settings, tactile_map)
-        return tactile_map, measure(tactile_map, calibration=calibration, options=options, work=_of(settings, work))
+        calibration, options = estimate_inputs(settings, tactile_map)
+        return measure(tactile_map, calibration=calibration, options=options, work=used)
     except BadDataError as error:
         raise error.at(path) from None
 
 
 def pooled_rows(paths: Sequence[Path], settings: Settings, *, clock: Clock) -> tuple[PooledRow, ...]:
     """The size by the first map of one mass, by the first two, and so on."""
-
     rows, found, spent = [], list[SizeEstimate](), 0.0
     for number, path in enumerate(paths, start=1):
         begun = clock()
@@ -101,23 +97,14 @@ def _pooled_answer(pooled: PooledEstimate, settings: Settings) -> tuple[SizeAnsw
 
 def tradeoff_of_scan(scan: Scan, settings: Settings, work: Work) -> Ladder:
     """Every setting of `map` on a scan, each with an estimate by default of the map that it makes."""
-    _refuse_checkpoint(settings)
-
-    def inputs(tactile_map: TactileMap) -> tuple[Calibration | None, SamplerSettings]:
-        calibration, options, _ = estimate_inputs(settings, tactile_map)
-        return calibration, options
-
-    return measure_map(scan, inputs=inputs, work=_of(settings, work))
+    return measure_map(scan, inputs=partial(estimate_inputs, settings), work=_of(settings, work))
 
 
 def _of(settings: Settings, work: Work) -> Work:
-    """The work with the settings' seed and interval."""
-    return replace(work, seed=settings.seed, probability=settings.interval)
-
-
-def _refuse_checkpoint(settings: Settings) -> None:
+    """The work with the settings' seed and interval; refuses a checkpoint."""
     if settings.checkpoint is not None:
         raise UsageError("a checkpoint is of one estimate, and this command makes many; leave checkpoint out")
+    return replace(work, seed=settings.seed, probability=settings.interval)
 
 
 # --- CPU time of this program in a process of its own: what a user who types one command waits for.
@@ -269,7 +256,7 @@ def tradeoff_estimate_action(
         raise UsageError("--centre-mm is a place on one map; give one map")
     with progress_bar("settings") as progress:
         work = Work(time.process_time, tolerance_mm, runs, forecast, progress)
-        _, ladder = tradeoff_of_map(maps[0], settings, work)
+        ladder = tradeoff_of_map(maps[0], settings, work)
         if len(maps) > 1:
             ladder = replace(ladder, pooled=pooled_rows(maps, settings, clock=time.process_time))
     cold = fresh_cpu_s(["estimate", str(maps[0]), *_said(size_calibration, centre_mm, settings_file)])

@@ -242,9 +242,7 @@ def estimated_at(found: SizeEstimate, place: tuple[float, float]) -> SizeEstimat
     return replace(there, provenance=replace(there.provenance, inputs=found.provenance.inputs), name=found.name)
 
 
-def estimate_inputs(
-    settings: Settings, tactile_map: TactileMap
-) -> tuple[Calibration | None, SamplerSettings, NoSize | None]:
-    """What `estimate_one` takes for a map: calibration and options, and why there is no calibration."""
-    _, calibration, why_none = choose_calibration(settings, tactile_map)
-    return calibration, _options(settings, calibration, tactile_map), why_none
+def estimate_inputs(settings: Settings, tactile_map: TactileMap) -> tuple[Calibration | None, SamplerSettings]:
+    """What `estimate_one` takes for a map: calibration and options."""
+    _, calibration, _ = choose_calibration(settings, tactile_map)
+    return calibration, _options(settings, calibration, tactile_map)

@@ -56,7 +56,7 @@ def field_map(*, seed: int = 3, half_mm: float = 25.0, **bump: float) -> Tactile
 
 
 def inputs_of(tactile_map: TactileMap) -> tuple[Calibration | None, SamplerSettings]:
-    calibration, options, _ = estimate_inputs(Settings(), tactile_map)
+    calibration, options = estimate_inputs(Settings(), tactile_map)
     return calibration, options
 
 
