@@ -65,16 +65,11 @@ def differences_figure(report: TrialReport, trial: Trial) -> bytes:
     def draw(axes: Sequence[Axes]) -> None:
         for sizes, panel in zip(found, axes, strict=True):
             _draw_differences(panel, report.modalities[sizes.name].method_comparison, sizes)
-        _share_limits(axes)
+        across, up = (np.array(ends) for ends in zip(*((one.get_xlim(), one.get_ylim()) for one in axes), strict=True))
+        for panel in axes:  # the widest range of any
+            panel.set(xlim=(across[:, 0].min(), across[:, 1].max()), ylim=(up[:, 0].min(), up[:, 1].max()))
 
     return _png(draw, len(found))
-
-
-def _share_limits(axes: Sequence[Axes]) -> None:
-    """Give all panels the widest range of any."""
-    across, up = (np.array([get(panel) for panel in axes]) for get in (type(axes[0]).get_xlim, type(axes[0]).get_ylim))
-    for panel in axes:
-        panel.set(xlim=(across[:, 0].min(), across[:, 1].max()), ylim=(up[:, 0].min(), up[:, 1].max()))
 
 
 def calibration_figure(prediction: Prediction, found: Calibration) -> bytes:
@@ -241,19 +236,25 @@ def trial_html(report: TrialReport, trial: Trial, *, text: str, growth: Sequence
     `growth` is of masses with several visits, beside the trial.
     """
     ratio = next((one.method_comparison.error_ratio for one in report.modalities.values()), 1.0)
-    trends = itertools.starmap(_trend, report.modalities.items())
+    counts, percent = report.counts, f"{100 * report.interval_probability:g} %"
+    opening = f"{counts.masses} masses of {counts.patients} patients, {counts.readings} readings."
+    modalities = report.modalities.items()
+    trends = itertools.starmap(_trend, modalities)
     checks = {} if report.interval_check is UNSET else report.interval_check
     return page(
         "trial",
         title="Sizes against excision",
         protocol="" if report.title is UNSET else report.title,
-        opening=_opening(report),
+        opening=f"{opening} In brackets: {percent} intervals over patients.",
         marks=_marks(report, trial),
-        errors=_errors(report),
+        errors=(
+            ["", "found", *_heads(_MAIN)],
+            [[name, found_share(one), *_cells(one, _MAIN)] for name, one in modalities],
+        ),
         ratios=[ratio_line(name, one) for name, one in report.mape_ratio_to_tactile.items()],
-        cautions=[f"{name}: {caution}" for name, one in report.modalities.items() for caution in one.cautions],
+        cautions=[f"{name}: {caution}" for name, one in modalities for caution in one.cautions],
         sizes_png=_base64(sizes_figure(report, trial)),
-        lines=_lines(report),
+        lines=(["", *_heads(_METHODS)], [[name, *_cells(one.method_comparison, _METHODS)] for name, one in modalities]),
         error_ratio=f"{ratio:g}",
         limits=_limits(report),
         growing=[line for line in (growing_line(report), *trends) if line],
@@ -271,14 +272,6 @@ def trial_html(report: TrialReport, trial: Trial, *, text: str, growth: Sequence
     )
 
 
-def _opening(report: TrialReport) -> str:
-    counts, percent = report.counts, f"{100 * report.interval_probability:g} %"
-    return (
-        f"{counts.masses} masses of {counts.patients} patients, {counts.readings} readings. In brackets: {percent} "
-        "intervals over patients."
-    )
-
-
 def _marks(report: TrialReport, trial: Trial) -> list[str]:
     """What has to be known before the tables are read."""
     counts = report.counts
@@ -287,16 +280,6 @@ def _marks(report: TrialReport, trial: Trial) -> list[str]:
         share = "All" if counts.synthetic_readings == counts.readings else str(counts.synthetic_readings)
         marks.append(f"{share} readings are synthetic: made by a generator, not measured.")
     return marks
-
-
-def _errors(report: TrialReport) -> Table:
-    rows = [[name, found_share(one), *_cells(one, _MAIN)] for name, one in report.modalities.items()]
-    return ["", "found", *_heads(_MAIN)], rows
-
-
-def _lines(report: TrialReport) -> Table:
-    rows = [[name, *_cells(one.method_comparison, _METHODS)] for name, one in report.modalities.items()]
-    return ["", *_heads(_METHODS)], rows
 
 
 def _limits(report: TrialReport) -> Table:
