@@ -1,1 +1,1 @@
-"""What the commands do, once their options are read: the printing half of the command line."""
+"""What the commands do once their options are read: files in, calls of the API, lines out."""

@@ -1,3 +1,1 @@
-"""Estimation from map files: choice of calibration and options, estimate and report, shared by all callers."""
-
-from __future__ import annotations
+"""Campaigns: from a table of exams to their maps, sizes and pages, and to the trial's report."""

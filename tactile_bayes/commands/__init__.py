@@ -1,1 +1,1 @@
-"""One module per command: parse options, load files, call one function, write results."""
+"""One module for each group of commands: options, and one call of what they do."""

@@ -1,1 +1,1 @@
-"""Reading and writing of files, one format per module."""
+"""Reading and writing of files, by subject."""
