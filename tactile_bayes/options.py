@@ -196,7 +196,8 @@ class MapOptions(Options):
     as_stated: Annotated[
         bool,
         Meta(
-            description="Take array, lever arm and quaternions as stated; else frames that contradict them are refused."
+            description="Take array, lever arm and quaternions as stated, with a caution where frames contradict them; "
+            "else such a scan is refused."
         ),
     ] = False
     every: Annotated[

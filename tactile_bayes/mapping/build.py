@@ -211,7 +211,7 @@ def build_map(
     figures: dict[str, float] = {} if how.every == 1 else {"frames_every": float(how.every)}
     late_ms = 0.0 if isinstance(how.latency_ms, str) else float(how.latency_ms)
     selections = rules.select(parts, late_ms)
-    findings = _of_scans(given) + (() if how.as_stated else _of_arrangement(selections, late_ms))
+    findings = _of_scans(given) + _of_arrangement(selections, late_ms, refuse=not how.as_stated)
     figures |= head_profile_figures(selections)
     if how.flat_field:
         selections = _flattened(selections, rules, late_ms, figures)
@@ -243,12 +243,12 @@ def _of_scans(scans: list[Scan]) -> tuple[Finding, ...]:
     return _numbered([scan_findings(scan) for scan in scans])
 
 
-def _of_arrangement(selections: list[SelectedFrames], late_ms: float) -> tuple[Finding, ...]:
-    """Findings on how each scan is arranged; a `BadDataError` where another arrangement than the one stated is sure."""
+def _of_arrangement(selections: list[SelectedFrames], late_ms: float, *, refuse: bool) -> tuple[Finding, ...]:
+    """Findings on how each scan is arranged; where another arrangement than the one stated is sure, it is refused."""
     findings = []
     for number, one in enumerate(selections, start=1):
         check = check_briefly(one, latency_ms=late_ms)
-        if check is not None and check.refused:
+        if refuse and check is not None and check.refused:
             which = f"scan {number}: " if len(selections) > 1 else ""
             way_out = f"import the scan again with {check.remedy}, or map it with --as-stated"
             raise BadDataError(f"{which}{check.words}", way_out=way_out)
