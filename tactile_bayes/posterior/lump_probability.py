@@ -87,12 +87,12 @@ def weigh(
 
 
 def weigh_candidate(tactile_map: TactileMap, candidate: Candidate, detection: Detection) -> Weighed | None:
-    """The same of a candidate, by its least-squares bump; None without one."""
-    fit = candidate.fit
-    if fit is None:
+    """The same of a candidate, by the bump that the odds are of; None without one."""
+    if candidate.fit is None:
         return None
-    centre, widths = (float(fit.theta[1]), float(fit.theta[2])), fit.widths()[:2]
-    return weigh(tactile_map, detection, centre_mm=centre, widths_mm=widths, fault=candidate.fault)
+    bump = candidate.assessed or candidate.fit.modal()
+    at, widths = (bump.x_mm, bump.y_mm), (bump.sigma_x_mm, bump.sigma_y_mm)
+    return weigh(tactile_map, detection, centre_mm=at, widths_mm=widths, fault=candidate.fault)
 
 
 # --- Smallest lump that a map without one would have shown, by place and depth.

@@ -175,7 +175,7 @@ def search(tactile_map: TactileMap, options: SamplerSettings) -> tuple[tuple[Can
         seen = assess(tactile_map, candidate.fit, options)
         detection = seen.detection
         if seen.fault:
-            tried[-1] = replace(candidate, fault=seen.fault, detection=detection)
+            tried[-1] = replace(candidate, fault=seen.fault, detection=detection, assessed=seen.bump())
             continue
         if detection.probability >= DETECTED:
             return tuple(tried), seen

@@ -208,6 +208,8 @@ class Candidate(Record, eq=False):
     fit: BumpFit | None  #: None where least squares found no minimum.
     fault: str  #: Why the place cannot be a lump; empty when it can.
     detection: Detection | None = None  #: Odds of a lump there; None where nobody has weighed them.
+    assessed: ModalBump | None = None
+    """The bump that the odds are of; None where it is the fit's."""
 
 
 def fitted_candidates(tactile_map: TactileMap, options: SamplerSettings) -> Iterator[Candidate]:

@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 from posterior_maps import bump_values, grid_map
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.posterior.detection import detection_from_odds
-from tactile_bayes.posterior.lump_probability import LIKELY, Weighed, weigh
+from tactile_bayes.posterior.draw import ModalBump, SamplerSettings
+from tactile_bayes.posterior.lump_probability import LIKELY, Weighed, weigh, weigh_candidate
+from tactile_bayes.posterior.white import Candidate, fit_bump
 
 CLEAR = {"log_bayes_factor": 60.0, "centre_mm": (0.0, 0.0), "widths_mm": (5.0, 4.5), "fault": ""}
 
@@ -33,6 +36,18 @@ def test_a_clear_round_rise_is_a_lump() -> None:
 )
 def test_ridges_rims_ribs_and_errors_are_none(changes: dict[str, object]) -> None:
     assert weighed(**changes).probability < LIKELY
+
+
+def test_a_rise_has_the_width_of_the_bump_that_has_the_evidence() -> None:
+    """At the rim of the packaged empty scan: sigma 13 mm under correlated errors, 4 mm by least squares."""
+    tactile_map = grid_map(bump_values(x=-10.0, y=5.0, sigma_x=3.9, sigma_y=2.2))
+    fit, _ = fit_bump(tactile_map, (-10.0, 5.0), options=SamplerSettings())
+    narrow = Candidate((-10.0, 5.0), fit, "at the rim of the map (with a sigma of 13.3 mm its flank is 9 mm short)")
+    wide = replace(narrow, assessed=ModalBump(0.05, -10.0, 5.0, 13.3, 11.0))
+    told = [weigh_candidate(tactile_map, one, detection_from_odds(35.0)) for one in (narrow, wide)]
+    assert told[0] is not None
+    assert told[1] is not None
+    assert told[0].probability > LIKELY > 0.3 > told[1].probability
 
 
 def test_more_evidence_never_lowers_it() -> None:
