@@ -301,7 +301,7 @@ def test_a_camera_image_can_be_estimated(shared_data: Path, tmp_path: Path) -> N
 
 def field(folder: Path, *words: object, **more: object) -> CompletedProcess[str]:
     """`estimate a.nc` under correlated errors, without a calibration."""
-    given = settings(folder, noise="field", background="free", **more)
+    given = settings(folder, noise="field", background="free", field_cosines=8, **more)
     return run_here("estimate", "a.nc", *given, "--size-calibration", "none", *words, cwd=folder)
 
 

@@ -69,7 +69,7 @@ def ladder_of(tactile_map: TactileMap, **chosen: object) -> Ladder:
     ticks = itertools.count()
     calibration, options = inputs_of(tactile_map)
     with pytest.MonkeyPatch.context() as patch:
-        few = {"FIELDS": (8, 24), "RADII_MM": (8.0,), "ACCURACIES_SD": (0.01,), "CHAIN_ACCURACIES_SD": ()} | chosen
+        few = {"FIELDS": (8, 20), "RADII_MM": (8.0,), "ACCURACIES_SD": (0.01,), "CHAIN_ACCURACIES_SD": ()} | chosen
         few |= {"LONG_RUNS": (("importance", 0.02),), "LAPLACE_DRAWS": (400,)}
         for name, value in few.items():
             patch.setattr(study, name, value)
@@ -273,7 +273,8 @@ def test_a_large_map_costs_what_its_window_costs():
 
 
 @pytest.mark.parametrize("case", [pytest.param("cells without data", marks=pytest.mark.slow), "one reading a cell"])
-def test_poor_maps_are_measured_too(case: str):
+def test_poor_maps_are_measured_too(case: str, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(study, "LONG_RUNS", (("importance", 0.02),))
     given = field_map(half_mm=20.0)
     if case == "cells without data":
         hidden = np.random.default_rng(0).random(given.mean.shape) < 0.2
@@ -285,7 +286,8 @@ def test_poor_maps_are_measured_too(case: str):
     assert reference.answer.quantities[SIZE].median == pytest.approx(13.6, rel=0.15)
 
 
-def test_the_command_says_how_long_it_takes_and_pools(tmp_path: Path, run_cli: Run):
+def test_the_command_says_how_long_it_takes_and_pools(tmp_path: Path, run_cli: Run, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(study, "FIELDS", (8, 12))
     write_map(tmp_path / "empty.nc", grid_map(np.ones((15, 15)), normalise="gain"), provenance=Provenance("map", {}))
     done = run_cli("tradeoff", "estimate", "empty.nc", "--runs", "1", "--figure", "f.png", cwd=tmp_path)
     assert done.returncode == 6
@@ -309,9 +311,10 @@ def test_more_maps_of_one_mass_narrow_the_interval(tmp_path: Path):
     for seed in (1, 2, 3):
         paths.append(tmp_path / f"{seed}.nc")
         write_map(paths[-1], field_map(seed=seed, half_mm=20.0), provenance=Provenance("map", {}))
-    rows = pooled_rows(paths, Settings(method="laplace"), clock=time.process_time)
+    quick = Settings(method="laplace", field_cosines=8)
+    rows = pooled_rows(paths, quick, clock=time.process_time)
     assert [one.maps for one in rows] == [1, 2, 3]
-    spread = pooled_rows(paths, Settings(method="laplace", between_map_sd=0.15), clock=time.process_time)
+    spread = pooled_rows(paths, replace(quick, between_map_sd=0.15), clock=time.process_time)
     one, three = (found.answer.half_width_mm / found.answer.reported.median for found in (spread[0], spread[2]))
     assert three < 0.9 * one
     assert rows[2].another_half_mm < 0.85 * rows[0].another_half_mm
