@@ -176,15 +176,15 @@ def run(folder: Path, names: tuple[str, ...], commands: dict[str, tuple[str, ...
 
 
 def test_a_damaged_estimate_is_refused_in_one_line_or_told_without_nan(folder: Path) -> None:
-    run(folder, ("one.json", "pool.json", "none.json"), COMMANDS, count=45, seed=20261125)
+    run(folder, ("one.json", "pool.json", "none.json"), COMMANDS, count=30, seed=20261125)
 
 
 def test_a_damaged_posterior_is_refused_in_one_line_or_told_without_nan(folder: Path) -> None:
-    run(folder, ("post.nc",), OF_DRAWS, count=10, seed=20261126)
+    run(folder, ("post.nc",), OF_DRAWS, count=6, seed=20261126)
 
 
 def test_a_damaged_map_is_refused_in_one_line_or_told_without_nan(folder: Path) -> None:
-    run(folder, ("map.nc",), OF_MAPS, count=12, seed=20261127)
+    run(folder, ("map.nc",), OF_MAPS, count=8, seed=20261127)
 
 
 @pytest.mark.slow
