@@ -311,7 +311,7 @@ def test_more_maps_of_one_mass_narrow_the_interval(tmp_path: Path):
     for seed in (1, 2, 3):
         paths.append(tmp_path / f"{seed}.nc")
         write_map(paths[-1], field_map(seed=seed, half_mm=20.0), provenance=Provenance("map", {}))
-    quick = Settings(method="laplace", field_cosines=8)
+    quick = Settings(method="laplace")
     rows = pooled_rows(paths, quick, clock=time.process_time)
     assert [one.maps for one in rows] == [1, 2, 3]
     spread = pooled_rows(paths, replace(quick, between_map_sd=0.15), clock=time.process_time)
