@@ -52,7 +52,11 @@ def _estimate_map(tactile_map: Any, *, options: Any, progress: Any = None, **nam
 
 @pytest.fixture(scope="module", autouse=True)
 def searched_once() -> Iterator[None]:
-    """Give back what was found before on the same map with the same options."""
+    """Give back what this module found before on the same map with the same options.
+
+    Another module's tests may have had other functions below in place.
+    """
+    _made.clear()
     with pytest.MonkeyPatch.context() as patch:
         for module in (estimate, masses):
             patch.setattr(module, "search", _search)
