@@ -38,8 +38,7 @@ class BumpPrior(Options):
     """Proper, weak priors, all of them printed with the estimate."""
 
     amplitude_sd: Annotated[
-        float,
-        Meta(gt=0, le=1000, description="Normal about 0, in units of the map's scale (1 for a normalised map)"),
+        float, Meta(gt=0, le=1000, description="Normal about 0, in units of the map's scale (1 for a normalised map)")
     ] = 2.0
     width_median_mm: Annotated[
         float, Meta(gt=0, le=100, description="Median of the geometric mean of the two widths, log-normal")
@@ -138,8 +137,7 @@ class FitSettings(BumpPrior, kw_only=True):
         ),
     ] = None
     scene: Annotated[
-        SceneAsked,
-        Meta(description="Structures in the fit window; auto: the simplest scene that the map supports."),
+        SceneAsked, Meta(description="Structures in the fit window; auto: the simplest scene that the map supports.")
     ] = "auto"
     max_steps: Annotated[
         Annotated[int, Meta(ge=150)] | None,
@@ -336,8 +334,7 @@ class TrialSettings(Options):
         ),
     ] = 0
     bayes: Annotated[
-        bool,
-        Meta(description="Predict the error of the next mass, by an errors-in-variables model and MCMC."),
+        bool, Meta(description="Predict the error of the next mass, by an errors-in-variables model and MCMC.")
     ] = False
 
 
@@ -403,15 +400,13 @@ class TissueOptions(Options, kw_only=True):
     """Homogeneous tissue under a head, the pressures on it, and how unevenly the head may press."""
 
     modulus_kpa: Annotated[
-        KpaRange,
-        Meta(description="Young's moduli of the tissue (paper: 15 to 25).", extra={"metavar": "LOW HIGH"}),
+        KpaRange, Meta(description="Young's moduli of the tissue (paper: 15 to 25).", extra={"metavar": "LOW HIGH"})
     ] = (15.0, 25.0)
     pressure_kpa: Annotated[
         KpaRange, Meta(description="Mean pressures under the head (paper: 5 to 14).", extra={"metavar": "LOW HIGH"})
     ] = PRESSURE_WINDOW_KPA
     thickness_mm: Annotated[
-        float,
-        Meta(gt=0, description="Thickness of the tissue on its rigid base, mm. The paper gives none."),
+        float, Meta(gt=0, description="Thickness of the tissue on its rigid base, mm. The paper gives none.")
     ] = THICKNESS_MM
     poisson: Annotated[float, Meta(ge=0, lt=0.5, description="Poisson's ratio of the tissue.")] = POISSON
     limit_percent: Annotated[
@@ -508,10 +503,7 @@ class LearnOptions(Options, kw_only=True):
     ] = None
     least_stiffness_ratio: Annotated[
         float,
-        Meta(
-            ge=0,
-            description="Leave out lumps softer than this: above 8 the paper's widths change by less than 5 %.",
-        ),
+        Meta(ge=0, description="Leave out lumps softer than this: above 8 the paper's widths change by less than 5 %."),
     ] = 0.0
     seed: Seed = 1
 

@@ -13,11 +13,7 @@ from tactile_bayes.api.arguments import check_keywords, door, plain
 from tactile_bayes.api.maps import PathLike, output_path, path_of, required_path
 from tactile_bayes.api.repeatability import exams_in, learn_from_exams
 from tactile_bayes.api.site_correction import correct_size
-from tactile_bayes.api.size_calibration import (
-    is_population,
-    learn_eq6,
-    learn_population,
-)
+from tactile_bayes.api.size_calibration import is_population, learn_eq6, learn_population
 from tactile_bayes.declarations import Record, as_dict, names_of, replace, to_plain
 from tactile_bayes.errors import NotConvergedError, UsageError
 from tactile_bayes.files.atomic import write_text

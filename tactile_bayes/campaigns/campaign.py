@@ -35,8 +35,7 @@ from tactile_bayes.options import MapOptions
 from tactile_bayes.presets import DEFAULT_NORMALISE, MATCH_MM, RESEARCH_USE
 from tactile_bayes.size.pooling import Repeatability
 
-MOST_NAMED: Final = 5
-"""So many exams or masses are named in a line."""
+MOST_NAMED: Final = 5  #: So many exams or masses are named in a line.
 
 
 class CampaignResult(Record, eq=False):
@@ -44,10 +43,8 @@ class CampaignResult(Record, eq=False):
 
     campaign: Campaign
     folder: Path
-    written: Written | None
-    """What was written; None where nothing was run."""
-    unlisted: tuple[str, ...] = ()
-    """Folders of exams that the table does not list."""
+    written: Written | None  #: What was written; None where nothing was run.
+    unlisted: tuple[str, ...] = ()  #: Folders of exams that the table does not list.
 
     @property
     def text(self) -> str:

@@ -27,10 +27,8 @@ _FACTS: Final = {"patient": "subject", "visit": "visit", "mass": "mass", "side":
 class Said(Record):
     """What a file says of its exam."""
 
-    facts: Mapping[str, str] = field(default_factory=dict)
-    """By the columns of the table of exams."""
-    sources: frozenset[str] = frozenset()
-    """SHA-256 of the files that it was made from."""
+    facts: Mapping[str, str] = field(default_factory=dict)  #: By the columns of the table of exams.
+    sources: frozenset[str] = frozenset()  #: SHA-256 of the files that it was made from.
 
 
 def said_by(path: Path, name: str) -> Said:
@@ -69,8 +67,7 @@ def _facts(sessions: Sequence[Mapping[str, Any]]) -> dict[str, str]:
 # --- Files of a folder that may be exams, and which of them are the same exam twice.
 
 _ENDINGS: Final = (*SCANS, MAP)
-_ASIDE: Final = (".", "~$")
-"""Names of what systems and spreadsheets leave beside files begin so."""
+_ASIDE: Final = (".", "~$")  #: Names of what systems and spreadsheets leave beside files begin so.
 
 
 class FolderFiles:
@@ -176,8 +173,7 @@ class Found(Record):
 
     rows: list[dict[str, Any]] = field(default_factory=list)
     """Of files that the table does not list yet."""
-    skipped: list[str] = field(default_factory=list)
-    """Files that give none, with the reason."""
+    skipped: list[str] = field(default_factory=list)  #: Files that give none, with the reason.
     spelled: list[str] = field(default_factory=list)
     """Codes that a file writes in other capitals than the table, in words."""
     gone: list[str] = field(default_factory=list)

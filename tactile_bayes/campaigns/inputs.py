@@ -27,10 +27,8 @@ from tactile_bayes.files.reading import sha256_of, version_of
 # --- The output folder of a campaign: its journal, and the files that belong to its steps.
 
 _HEADER: Final = {"campaign": 1}
-_BESIDE: Final = ("repeatability",)
-"""Steps whose files lie beside the exams."""
-_OTHERS: Final = ("pool", "compare", *_BESIDE)
-"""Steps that are of no single exam."""
+_BESIDE: Final = ("repeatability",)  #: Steps whose files lie beside the exams.
+_OTHERS: Final = ("pool", "compare", *_BESIDE)  #: Steps that are of no single exam.
 
 
 @contextlib.contextmanager
@@ -165,8 +163,7 @@ def _remove_if_empty(folder: Path) -> None:
 # change of the inode cannot be set by a program, so a file that was written to or replaced is read again. Files
 # changed within the last seconds are always read, for their times may not yet tell two writes apart.
 
-READ: Final = "read"
-"""Step of the journal that holds a file's digest."""
+READ: Final = "read"  #: Step of the journal that holds a file's digest.
 _SETTLED_S: Final = 10.0
 """A file that was last changed so long ago has times that tell this content from a later one."""
 
@@ -174,10 +171,8 @@ _SETTLED_S: Final = 10.0
 class Sources(Record):
     """What the files of the exams are."""
 
-    digests: dict[Path, str]
-    """SHA-256 by path."""
-    faults: dict[Path, str]
-    """Why a file cannot be read, by path."""
+    digests: dict[Path, str]  #: SHA-256 by path.
+    faults: dict[Path, str]  #: Why a file cannot be read, by path.
 
 
 class _Source(Record):

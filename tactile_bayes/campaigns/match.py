@@ -50,10 +50,8 @@ class NamedPlace(Record):
     mass: str
     exam: str
     """`mass`, `exam`: Their codes and names."""
-    path: Path
-    """Of that exam's map."""
-    centre_mm: tuple[float, float]
-    """On that map."""
+    path: Path  #: Of that exam's map.
+    centre_mm: tuple[float, float]  #: On that map.
 
 
 def named_exams(exam: Exam, exams: Sequence[Exam]) -> list[Exam]:
@@ -185,8 +183,7 @@ def unnamed(reports: Sequence[EstimateReport]) -> list[Finding]:
 
 # --- Growth between the visits of a campaign's masses: who is compared, and the table of what came of it.
 
-Visits = dict[str, list[Exam]]
-"""Exams of one mass by the code of the visit, in order of time."""
+Visits = dict[str, list[Exam]]  #: Exams of one mass by the code of the visit, in order of time.
 
 
 def grown_masses(exams: Sequence[Exam]) -> dict[str, Visits]:

@@ -45,18 +45,15 @@ WRITTEN: Final = (DONE, FAILURES, TRIAL, GROWN, REPORT, PAGE, INDEX, REPEATABILI
 """Files beside the exams."""
 _MOST_INLINE: Final = 300
 """With more exams the contact sheet names its thumbnails' files instead of holding them."""
-_MOST_CARDS: Final = 10_000
-"""More exams than a browser shows at ease."""
+_MOST_CARDS: Final = 10_000  #: More exams than a browser shows at ease.
 _LINKS: Final = (MAP_FIGURE, SIZE_FIGURE, SIZED_FIGURE, ESTIMATE, SIZED, MAP)
 
 
 class Excision(Record):
     """Where the sizes after excision are."""
 
-    path: Path
-    """Of the table."""
-    columns: Path | None = None
-    """The mapping of a wide table; None for a tidy one."""
+    path: Path  #: Of the table.
+    columns: Path | None = None  #: The mapping of a wide table; None for a tidy one.
 
     def table(self) -> Table:
         """Read and check the table."""
@@ -75,16 +72,11 @@ class Written(Record):
     unsized: int
     failed: int
     """`sized`, `unsized`, `failed`: Exams by how they ended."""
-    pooled: int
-    """Masses at a visit that were pooled."""
-    left_out: tuple[str, ...] = ()
-    """Masses without a size after excision, as ``patient mass``."""
-    report: str = ""
-    """The trial report as text; empty where there is none."""
-    no_report: str = field(default="")
-    """Why there is none, where excision sizes were given."""
-    unnamed: tuple[str, ...] = ()
-    """Exams whose map shows a mass that no row names."""
+    pooled: int  #: Masses at a visit that were pooled.
+    left_out: tuple[str, ...] = ()  #: Masses without a size after excision, as ``patient mass``.
+    report: str = ""  #: The trial report as text; empty where there is none.
+    no_report: str = field(default="")  #: Why there is none, where excision sizes were given.
+    unnamed: tuple[str, ...] = ()  #: Exams whose map shows a mass that no row names.
     growth: str = ""
     """What became of masses with several visits, in a sentence; empty where there are none."""
     disagreeing: tuple[str, ...] = ()

@@ -51,8 +51,7 @@ from tactile_bayes.size.pooling import Repeatability
 
 # --- Stages of a campaign: one step for many exams or masses, from the journal where it is done, otherwise run.
 
-FEW: Final = 5
-"""So many exams are named in a line."""
+FEW: Final = 5  #: So many exams are named in a line.
 
 
 class Fault(Record):
@@ -65,10 +64,8 @@ class Fault(Record):
 class CampaignState(Record, eq=False):
     """How far a campaign is: results by step and name, faults by name, counts of steps."""
 
-    results: dict[str, StepResults]
-    """By step, then by the name of the exam or mass."""
-    faults: dict[str, Fault] = field(default_factory=dict)
-    """By the name of the exam or mass."""
+    results: dict[str, StepResults]  #: By step, then by the name of the exam or mass.
+    faults: dict[str, Fault] = field(default_factory=dict)  #: By the name of the exam or mass.
     kept: dict[str, int] = field(default_factory=lambda: defaultdict(int))
     todo: dict[str, int] = field(default_factory=lambda: defaultdict(int))
     """`kept`, `todo`: Steps done by earlier runs, and steps of this run, by step; for a plan those that it would do."""
@@ -87,13 +84,7 @@ class Stages:
     steps of this run that are done, and those it does altogether.
     """
 
-    def __init__(
-        self,
-        *,
-        store: BatchStore | None,
-        executor: Executor | None = None,
-        dry: bool = False,
-    ) -> None:
+    def __init__(self, *, store: BatchStore | None, executor: Executor | None = None, dry: bool = False) -> None:
         values = {} if store is None else store.values
         results = {step: StepResults(values) for step in FILES}
         self.found = CampaignState(results)
@@ -174,8 +165,7 @@ Bar = Callable[[str], AbstractContextManager[Progress]]
 _Any = TypeVar("_Any")
 _BLOCK: Final = 64
 """Exams that go through the steps together at least; workers wait for the slowest of a block."""
-_AHEAD_IN_BLOCK: Final = 8
-"""Blocks hold so many times what an executor takes ahead."""
+_AHEAD_IN_BLOCK: Final = 8  #: Blocks hold so many times what an executor takes ahead.
 
 
 class Campaign:
@@ -517,8 +507,7 @@ class Campaign:
         return None if result is None else result["files"].get(file)
 
 
-SITE: Final = "site"
-"""Name of the one step that is of no exam or mass."""
+SITE: Final = "site"  #: Name of the one step that is of no exam or mass.
 _POOLED_FROM: Final = (("map", MAP), ("estimate", ESTIMATE), ("estimate", SHAPE))
 
 

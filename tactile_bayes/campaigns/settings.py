@@ -39,10 +39,8 @@ class CampaignSettings(Record):
 
     estimate: Settings = field(default_factory=Settings)
     """As of `estimate`; a row of the table may replace place, known values and calibration."""
-    normalise: str = DEFAULT_NORMALISE
-    """As of `map`."""
-    figures: bool = False
-    """Whether the figures of `estimate` are drawn for each exam."""
+    normalise: str = DEFAULT_NORMALISE  #: As of `map`.
+    figures: bool = False  #: Whether the figures of `estimate` are drawn for each exam.
     match_mm: float = MATCH_MM
     """Within this distance a mass is that which another exam of the breast names by its place."""
     own_repeatability: bool = True

@@ -89,41 +89,33 @@ Result = dict[str, Any]
 class Task(Record):
     """One step of one exam or mass."""
 
-    step: str
-    """One of `RUN`."""
+    step: str  #: One of `RUN`.
     name: str
     folder: Path
     """`name`, `folder`: Of the exam or mass."""
-    digest: str
-    """Of all that the step's files depend on."""
+    digest: str  #: Of all that the step's files depend on.
     source: Path = Path()
     source_sha256: str = ""
     """`source`, `source_sha256`: Of a map: the exam's file."""
     expected: Mapping[str, str] = field(default_factory=dict)
     """Of a map: what the table says of the exam, by its columns."""
-    normalise: str = ""
-    """Of a map: as the option of `map`."""
-    settings: Settings | None = None
-    """Of all steps after the map: of the estimate."""
+    normalise: str = ""  #: Of a map: as the option of `map`.
+    settings: Settings | None = None  #: Of all steps after the map: of the estimate.
     mass: str = ""
     places: tuple[NamedPlace, ...] = ()
     match_mm: float = 0.0
     """`mass`, `places`, `match_mm`: Of estimates and figures: where other exams of the breast have the mass; no places
     where the exam is not matched.
     """
-    members: tuple[tuple[str, Path], ...] = ()
-    """Of a pooled mass: names and folders of the exams."""
+    members: tuple[tuple[str, Path], ...] = ()  #: Of a pooled mass: names and folders of the exams.
     visits: tuple[tuple[tuple[str, Path], ...], ...] = ()
     days: tuple[float, ...] | None = None
     """`visits`, `days`: Of a comparison: the exams of each visit in order of time, and its day from the first."""
-    address: str = ""
-    """Of a map: the exam's file in an object store."""
+    address: str = ""  #: Of a map: the exam's file in an object store.
     copies: Mapping[str, str] = field(default_factory=dict)
     """Of a copy: addresses in an object store, by the names of the files."""
-    repeats: tuple[ExamFolder, ...] = ()
-    """Of the repeatability: the exams."""
-    figures: bool = False
-    """Of sizes and comparisons: whether to draw them."""
+    repeats: tuple[ExamFolder, ...] = ()  #: Of the repeatability: the exams.
+    figures: bool = False  #: Of sizes and comparisons: whether to draw them.
 
     @property
     def key(self) -> str:
@@ -358,10 +350,8 @@ def copy_step(task: Task) -> tuple[Result, Writes]:
 #
 # Neither fits a map: both start from the draws that each estimate left for pooling.
 
-FEWEST_MASSES: Final = 5
-"""Masses with repeats from which a campaign learns by itself."""
-NOT_LEARNED: Final = "not_learned"
-"""Key of the reason in the result of a step that did not learn."""
+FEWEST_MASSES: Final = 5  #: Masses with repeats from which a campaign learns by itself.
+NOT_LEARNED: Final = "not_learned"  #: Key of the reason in the result of a step that did not learn.
 _ANOTHER_STREAM: Final = 1
 """Of random numbers: the sizes' points must not be those that drew the map's posterior."""
 

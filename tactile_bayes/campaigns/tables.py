@@ -47,8 +47,7 @@ _OF_A_MASS: Final = ("amplitude", "max_size_mm", "min_size_mm", "d_x_mm", "d_y_m
 class Row(Record, eq=False):
     """One exam as the tables and the contact sheet show it."""
 
-    exam: Exam
-    """Of exams.csv."""
+    exam: Exam  #: Of exams.csv.
     report: EstimateReport | None
     """The estimate, by the campaign's repeatability where it has one; None where a step failed."""
     step: str = ""

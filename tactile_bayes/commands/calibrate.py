@@ -44,10 +44,7 @@ def command() -> None:
 )
 @takes(LearnOptions, "fit", "normalise", "background", "fit_radius_mm", "noise", "least_stiffness_ratio")
 @click.option(
-    "--figure",
-    metavar=METAVAR,
-    type=FigurePath(),
-    help="Draw Fig 8 of the paper from the table's lumps (eq6 only).",
+    "--figure", metavar=METAVAR, type=FigurePath(), help="Draw Fig 8 of the paper from the table's lumps (eq6 only)."
 )
 @takes(LearnOptions, "seed")
 @FORCE

@@ -63,9 +63,7 @@ def demo_command(ctx: click.Context, /, **given: Any) -> None:
 )
 @click.option("--spacing-mm", type=float, metavar="H", help="Map: side of the square cells, in mm.")
 @click.option(
-    "--normalise",
-    type=click.Choice(NORMALISE),
-    help="Map: how the values are already normalised. Default: none.",
+    "--normalise", type=click.Choice(NORMALISE), help="Map: how the values are already normalised. Default: none."
 )
 @click.option(
     "--units", metavar="TEXT", help="Map: unit of values that are not normalised, such as kPa. Default: unknown."

@@ -285,11 +285,7 @@ SESSION = click.option(
 )
 JSON = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 SPEED = click.option(
-    "--speed",
-    type=FiniteRange(0.01, 100.0),
-    default=1.0,
-    show_default=True,
-    help="Playback speed; 1 is real time.",
+    "--speed", type=FiniteRange(0.01, 100.0), default=1.0, show_default=True, help="Playback speed; 1 is real time."
 )
 WORKERS = click.option(
     "--workers", type=click.IntRange(min=0), default=1, show_default=True, help="Number of worker processes."

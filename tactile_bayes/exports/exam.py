@@ -127,27 +127,21 @@ class MapFile(Record, eq=False):
     """A map with its file's digest and the facts of its scans."""
 
     path: Path
-    digest: str
-    """SHA-256 of the file."""
+    digest: str  #: SHA-256 of the file.
     tactile_map: TactileMap
-    facts: Facts
-    """What all of its scans say alike of the exam; see `EXAM_FACTS`."""
+    facts: Facts  #: What all of its scans say alike of the exam; see `EXAM_FACTS`.
 
 
 class SizedMass(Record, eq=False):
     """One mass of an estimate, or why it has no size."""
 
-    number: int
-    """From 1, in the order of the estimate."""
+    number: int  #: From 1, in the order of the estimate.
     largest: Quantity | None
     smallest: Quantity | None
     """`largest`, `smallest`: Sizes in mm with the intervals that lead; None without a size."""
-    code: str = ""
-    """Reason code of the estimate where there is no number; empty with a size."""
-    reason: str = ""
-    """Why there is no number, or no size."""
-    probability: float | None = None
-    """That there is a lump; None where the file does not tell."""
+    code: str = ""  #: Reason code of the estimate where there is no number; empty with a size.
+    reason: str = ""  #: Why there is no number, or no size.
+    probability: float | None = None  #: That there is a lump; None where the file does not tell.
     centre_mm: tuple[float, float] | None = None
     centre_patient_mm: tuple[float, float] | None = None
     """`centre_mm`, `centre_patient_mm`: Medians of x and y in `plane` and in `patient`; None where the file does not
@@ -170,8 +164,7 @@ class EstimateFile(Record, eq=False):
     path: Path
     kind: str
     """``"estimate"``, ``"pooled"`` or ``"posterior"``."""
-    digest: str
-    """SHA-256 of the estimate's content."""
+    digest: str  #: SHA-256 of the estimate's content.
     report: EstimateReport | PooledReport
     masses: tuple[SizedMass, ...]
     maps: tuple[str, ...]

@@ -29,8 +29,7 @@ CONFIDENCE_INTERVAL: Final = "http://hl7.org/fhir/StructureDefinition/quantity-c
 ABSENT: Final = "http://terminology.hl7.org/CodeSystem/data-absent-reason"
 _CATEGORY: Final = "http://terminology.hl7.org/CodeSystem/observation-category"
 _GENDERS: Final = {"F": "female", "M": "male", "O": "other"}
-_STATUS: Final = "preliminary"
-"""Nobody has verified what the program found."""
+_STATUS: Final = "preliminary"  #: Nobody has verified what the program found.
 _XHTML: Final = "http://www.w3.org/1999/xhtml"
 
 
@@ -199,11 +198,7 @@ def _size(size: Quantity) -> dict[str, Any]:
     ]
     extension = [{"url": CONFIDENCE_INTERVAL, "extension": parts}]
     probability = _quantity(percent, "%", "%")
-    components = (
-        (codes.INTERVAL_LOW, low),
-        (codes.INTERVAL_HIGH, high),
-        (codes.INTERVAL_PROBABILITY, probability),
-    )
+    components = ((codes.INTERVAL_LOW, low), (codes.INTERVAL_HIGH, high), (codes.INTERVAL_PROBABILITY, probability))
     return {
         "valueQuantity": {"extension": extension, **_quantity(size.median, "mm", "mm")},
         "component": [{"code": _concept(code), "valueQuantity": value} for code, value in components],

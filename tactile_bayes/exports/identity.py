@@ -30,12 +30,9 @@ _NAMES: Final = ("patient_name", "referring_physician")
 class Moment(Record):
     """A date, with the time of day and its zone where they are known."""
 
-    date: str
-    """``YYYYMMDD``."""
-    time: str = ""
-    """``HHMM`` or ``HHMMSS``; empty where unknown."""
-    zone: str = ""
-    """``+HHMM`` or ``-HHMM``; empty where unknown."""
+    date: str  #: ``YYYYMMDD``.
+    time: str = ""  #: ``HHMM`` or ``HHMMSS``; empty where unknown.
+    zone: str = ""  #: ``+HHMM`` or ``-HHMM``; empty where unknown.
 
     @classmethod
     def of(cls, text: str, *, name: str) -> Moment:

@@ -67,13 +67,11 @@ def on_plane(transform: FloatArray, point_mm: tuple[float, float]) -> FloatArray
 class ImagePlane(Record, eq=False):
     """A map's values as the rows of an image that faces the viewer as every picture of the program does."""
 
-    values: FloatArray
-    """(rows, columns) array: Row 0 on top; NaN without data."""
+    values: FloatArray  #: (rows, columns) array: Row 0 on top; NaN without data.
     row_direction: FloatArray
     column_direction: FloatArray
     """`row_direction`, `column_direction` (3,) arrays: Unit vectors in L, P, S: along a row, and down a column."""
-    corner_mm: FloatArray
-    """(3,) array: Centre of the first value of the first row."""
+    corner_mm: FloatArray  #: (3,) array: Centre of the first value of the first row.
 
 
 def image_plane(tactile_map: TactileMap, transform: FloatArray) -> ImagePlane:
@@ -160,15 +158,12 @@ NO_SERIAL_NUMBER: Final = "unknown"
 class Study(Record, eq=False):
     """Patient and study of one export."""
 
-    identity: Identity
-    """As given; its `patient_id` may come from the scan."""
+    identity: Identity  #: As given; its `patient_id` may come from the scan.
     moment: Moment
     content: Moment
     """`moment`, `content`: When the exam was and when the content was made, with the time of day."""
-    study_uid: str
-    """As given, or by the content of the maps."""
-    key: tuple[str, ...]
-    """What identifiers of the objects follow from, besides their own content."""
+    study_uid: str  #: As given, or by the content of the maps.
+    key: tuple[str, ...]  #: What identifiers of the objects follow from, besides their own content.
 
     def uid(self, role: str, *parts: str) -> str:
         """Identifier of an object, or of its series, by the study and the object's content."""
@@ -281,8 +276,7 @@ def dicom_bytes(dataset: Any) -> bytes:
 
 # --- The map's figure as pixels, drawn from what an estimate's file says.
 
-_MOST_NOTE: Final = 400
-"""Characters that have a place above the figure."""
+_MOST_NOTE: Final = 400  #: Characters that have a place above the figure.
 
 
 def map_picture(source: MapFile, estimate: EstimateFile | None) -> NDArray[np.uint8]:

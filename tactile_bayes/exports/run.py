@@ -25,14 +25,10 @@ _WRITTEN: Final[dict[str, Format]] = {"csv": "CSV", "fhir": "JSON", "nrrd": "NRR
 class Outputs(Record):
     """What an export writes."""
 
-    path: Path | None
-    """File, or the folder of several; None where only a dictionary is wanted."""
-    dictionary: Path | None = None
-    """File of the data dictionary of REDCap's form; None for none."""
-    to: str = "csv"
-    """Format of the export."""
-    force: bool = False
-    """Overwrite files."""
+    path: Path | None  #: File, or the folder of several; None where only a dictionary is wanted.
+    dictionary: Path | None = None  #: File of the data dictionary of REDCap's form; None for none.
+    to: str = "csv"  #: Format of the export.
+    force: bool = False  #: Overwrite files.
 
     def check(self, *, files: bool) -> None:
         """Refuse, before any work is done, what could not be written; `files` says whether something is exported."""
@@ -103,10 +99,8 @@ TAKES: Final[dict[ExportFormat, tuple[str, ...]]] = {
 class Exported(Record, eq=False):
     """Files of an export."""
 
-    files: dict[str, bytes]
-    """Bytes by file name, for a folder; one file has the empty name."""
-    notes: tuple[str, ...] = ()
-    """What a user should know of them, one line each."""
+    files: dict[str, bytes]  #: Bytes by file name, for a folder; one file has the empty name.
+    notes: tuple[str, ...] = ()  #: What a user should know of them, one line each.
 
 
 def refuse_untaken(to: ExportFormat, options: Iterable[str]) -> None:

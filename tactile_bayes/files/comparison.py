@@ -26,8 +26,7 @@ class Visit(Record):
     visit: Number1
     day: Annotated[float | None, Meta(description="Days from the first visit; null where not given.")]
     max_size_mm: Annotated[
-        Quantity | None,
-        Meta(description="Largest diameter; the joint posterior's, in which the lump keeps its form."),
+        Quantity | None, Meta(description="Largest diameter; the joint posterior's, in which the lump keeps its form.")
     ]
     fat_mm: Annotated[
         float | None,
@@ -49,8 +48,7 @@ class VisitPlace(Record):
         Meta(description="SD by which one mass comes out apart between the visits, in the direction of the shift."),
     ]
     shift_mm: Annotated[
-        tuple[float, float] | None,
-        Meta(description="x and y in the patient's frame, from the first visit's place."),
+        tuple[float, float] | None, Meta(description="x and y in the patient's frame, from the first visit's place.")
     ]
     probability: Annotated[
         Chance | None,

@@ -245,8 +245,7 @@ class Session(Record, forbid_unknown_fields=False):
     ) = None
     mass: (
         Annotated[
-            Code,
-            Meta(description="Code of the mass within the subject; `campaign init` takes 1 where it is left out."),
+            Code, Meta(description="Code of the mass within the subject; `campaign init` takes 1 where it is left out.")
         ]
         | None
     ) = None

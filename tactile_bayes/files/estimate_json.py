@@ -147,8 +147,7 @@ def _from_netcdf(path: Path) -> StatedSize:
 
 REPORTS: Final[Mapping[str, type[EstimateReport | PooledReport]]] = {ESTIMATE: EstimateReport, POOLED: PooledReport}
 """What ``estimate`` prints as JSON, by the ids of its schemas."""
-MOST_MM: Final = 500.0
-"""Sizes above it are no lump's."""
+MOST_MM: Final = 500.0  #: Sizes above it are no lump's.
 _SIZES: Final = ("max_size_mm", "min_size_mm", "d_x_mm", "d_y_mm")
 _WAY_OUT: Final = "give the JSON as `estimate --json` printed it"
 R = TypeVar("R", bound=EstimateReport | PooledReport)

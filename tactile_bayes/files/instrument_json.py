@@ -27,18 +27,13 @@ class ScanFile(Record, eq=False):
     """A scan and the report on its file."""
 
     scan: Scan
-    complete: bool
-    """The file was closed properly and nothing was lost."""
+    complete: bool  #: The file was closed properly and nothing was lost.
     damaged: bool
     """A checksum failed: bytes changed after they were written. An unfinished file is not damaged."""
-    lost: tuple[str, ...]
-    """One line a loss, for people."""
-    topics: Mapping[str, int]
-    """Messages read, by topic."""
-    provenance: Mapping[str, Any]
-    """As `Provenance.as_dict` wrote it."""
-    schema: str
-    """Schema id of the file."""
+    lost: tuple[str, ...]  #: One line a loss, for people.
+    topics: Mapping[str, int]  #: Messages read, by topic.
+    provenance: Mapping[str, Any]  #: As `Provenance.as_dict` wrote it.
+    schema: str  #: Schema id of the file.
 
 
 def ns_from_s(time_s: FloatArray) -> NDArray[np.int64]:

@@ -29,14 +29,10 @@ DONE, FAILURES, TRIAL, GROWN = "exams_done.csv", "failures.csv", "trial.csv", "g
 
 SCAN, MAP, ESTIMATE, POSTERIOR = "scan.mcap", "map.nc", "estimate.json", "posterior.nc"
 SHAPE, THUMBNAIL, MAP_FIGURE, SIZE_FIGURE = "shape.npz", "thumbnail.png", "map.png", "size.png"
-SIZED, SIZED_FIGURE = "sized.json", "sized.png"
-"""Files of an exam."""
-POOLED, POOLED_DRAWS = "pooled.json", "pooled.nc"
-"""Files of a mass at a visit."""
-COMPARED, COMPARED_FIGURE = "compare.json", "compare.png"
-"""Files of a mass over its visits."""
-REPEATABILITY: Final = "repeatability.json"
-"""Beside the folders, as the tables are."""
+SIZED, SIZED_FIGURE = "sized.json", "sized.png"  #: Files of an exam.
+POOLED, POOLED_DRAWS = "pooled.json", "pooled.nc"  #: Files of a mass at a visit.
+COMPARED, COMPARED_FIGURE = "compare.json", "compare.png"  #: Files of a mass over its visits.
+REPEATABILITY: Final = "repeatability.json"  #: Beside the folders, as the tables are.
 
 
 def mass_name(*, patient: str, visit: str, mass: str) -> str:
@@ -76,12 +72,10 @@ class Exam(Record):
     """`day`, `side`, `reader`: None where the table leaves them blank."""
     centre_mm: tuple[float, float] | None = None
     """Place of the mass on the map; None takes the highest bump that can be a lump."""
-    known: tuple[tuple[str, float], ...] = ()
-    """Properties of the body, by the names of `KNOWN`."""
+    known: tuple[tuple[str, float], ...] = ()  #: Properties of the body, by the names of `KNOWN`.
     calibration: str | None = None
     """Name or path of a size calibration; None takes the campaign's."""
-    line: int = field(default=0)
-    """Of the table."""
+    line: int = field(default=0)  #: Of the table.
 
     @property
     def address(self) -> str:

@@ -302,16 +302,12 @@ def _with_coordinates(arrays: Mapping[str, tuple[tuple[str, ...], FloatArray]]) 
 class PosteriorDraws(Record, eq=False):
     """Contents of a posterior file."""
 
-    method: str
-    """That gave the draws."""
-    draws: dict[str, FloatArray]
-    """(chain, draw) arrays by name."""
-    diagnostics: dict[str, Any]
-    """As the estimate's JSON has them."""
+    method: str  #: That gave the draws.
+    draws: dict[str, FloatArray]  #: (chain, draw) arrays by name.
+    diagnostics: dict[str, Any]  #: As the estimate's JSON has them.
     scans: tuple[dict[str, str], ...] = ()
     """The scans at the beginning, as `Provenance.scans` has them."""
-    findings: tuple[Finding, ...] = ()
-    """They speak against the estimate."""
+    findings: tuple[Finding, ...] = ()  #: They speak against the estimate.
 
 
 def read_posterior(path: Path) -> PosteriorDraws:

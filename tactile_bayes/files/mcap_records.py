@@ -147,20 +147,13 @@ class McapRecords:
     attachments: dict[str, bytes] = field(default_factory=dict)
     schemas: dict[int, str] = field(default_factory=dict)
     channels: dict[int, Any] = field(default_factory=dict)
-    by_channel: dict[int, Messages] = field(default_factory=dict)
-    """Messages by channel id."""
-    chunks: int = 0
-    """Chunks met."""
-    last_ns: int = 0
-    """Host time at which the last intact chunk ends."""
-    all_data: bool = False
-    """Every message was met, whatever follows."""
-    finished: bool = False
-    """The file was closed properly."""
-    damaged: bool = False
-    """A checksum failed or a record made no sense before the end."""
-    lost: list[str] = field(default_factory=list)
-    """One line a loss."""
+    by_channel: dict[int, Messages] = field(default_factory=dict)  #: Messages by channel id.
+    chunks: int = 0  #: Chunks met.
+    last_ns: int = 0  #: Host time at which the last intact chunk ends.
+    all_data: bool = False  #: Every message was met, whatever follows.
+    finished: bool = False  #: The file was closed properly.
+    damaged: bool = False  #: A checksum failed or a record made no sense before the end.
+    lost: list[str] = field(default_factory=list)  #: One line a loss.
 
     def messages(self, topic: str, *, schema: str, name: str | None = None) -> Messages:
         """Messages of a topic (and of channels with that `name` in their metadata). A channel of another type is an

@@ -69,12 +69,9 @@ _DAMAGED: Final = "not a readable netCDF file"
 class Variable(Record):
     """One array of a netCDF file."""
 
-    values: Any
-    """Numbers; their type is the variable's."""
-    dimensions: tuple[str, ...]
-    """The name of each axis."""
-    attributes: Mapping[str, str]
-    """Text by name: units, a long name."""
+    values: Any  #: Numbers; their type is the variable's.
+    dimensions: tuple[str, ...]  #: The name of each axis.
+    attributes: Mapping[str, str]  #: Text by name: units, a long name.
     fill: float | None = None
     """Stands for "no value" in a variable that may have none: its ``_FillValue``. Not for coordinates."""
 
@@ -84,8 +81,7 @@ class Contents(Record):
 
     variables: Mapping[str, Variable]
     """By name; one that is called as its only dimension becomes that dimension's coordinate."""
-    attributes: Mapping[str, str]
-    """Text by name."""
+    attributes: Mapping[str, str]  #: Text by name.
 
 
 def grouped_netcdf_bytes(groups: Mapping[str, Contents]) -> bytes:
@@ -143,8 +139,7 @@ def _write_values(place: Any, name: str, variable: Variable) -> Any:
     return written
 
 
-MOST: Final = 1e12
-"""Largest finite number in an array."""
+MOST: Final = 1e12  #: Largest finite number in an array.
 
 
 class Group:

@@ -25,10 +25,7 @@ Arrays = dict[str, np.ndarray[Any, np.dtype[Any]]]
 
 _COPY_AGAIN: Final = "copy the file again"
 _ENCRYPTED: Final = 0x1
-_HEADERS: Final = {
-    (1, 0): np.lib.format.read_array_header_1_0,
-    (2, 0): np.lib.format.read_array_header_2_0,
-}
+_HEADERS: Final = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
 
 def load_npz(

@@ -28,8 +28,7 @@ TABLE_BYTES: Final = 32 * 10**6
 IMAGE_BYTES: Final = 128 * 10**6
 NETCDF_BYTES: Final = 256 * 10**6
 CELLS: Final = 2**24
-UTF_16: Final = (b"\xff\xfe", b"\xfe\xff")
-"""Marks that text of this encoding begins with."""
+UTF_16: Final = (b"\xff\xfe", b"\xfe\xff")  #: Marks that text of this encoding begins with.
 _UNPACKED_BYTES: Final = 64 * 10**6
 _UNPACKED_TIMES: Final = 32
 

@@ -24,8 +24,7 @@ ReasonCode = Literal[
 ]
 Shape = Literal["round", "ellipse", "rotated"]
 Entries = Annotated[
-    tuple[FindingEntry, ...],
-    Meta(description="What speaks against the result, cautions first; see docs/formats.md"),
+    tuple[FindingEntry, ...], Meta(description="What speaks against the result, cautions first; see docs/formats.md")
 ]
 Judgement = Annotated[Verdict, Meta(description="no_answer: there is no size; doubtful: a caution stands")]
 
@@ -152,9 +151,7 @@ class SmallestLump(Record):
 
     probability: Chance
     depths_mm: tuple[
-        Annotated[float, Meta(gt=0, le=500)],
-        Annotated[float, Meta(gt=0, le=500)],
-        Annotated[float, Meta(gt=0, le=500)],
+        Annotated[float, Meta(gt=0, le=500)], Annotated[float, Meta(gt=0, le=500)], Annotated[float, Meta(gt=0, le=500)]
     ]
     best_mm: Three
     worst_mm: Three

@@ -172,11 +172,7 @@ class ScanWriter:
         sequence = self._sequence.get(channel, 0)
         self._sequence[channel] = sequence + 1
         self._writer.add_message(
-            channel_id=channel,
-            log_time=host_ns,
-            publish_time=device_ns,
-            data=body,
-            sequence=sequence,
+            channel_id=channel, log_time=host_ns, publish_time=device_ns, data=body, sequence=sequence
         )
 
     def finish(self) -> None:
@@ -213,12 +209,7 @@ def _pose_message(position_mm: FloatArray, quaternion_wxyz: FloatArray) -> Any:
 
 
 def write_scan(
-    path: Path,
-    scan: Scan,
-    *,
-    provenance: Provenance,
-    truth: Mapping[str, Any] | None = None,
-    force: bool = False,
+    path: Path, scan: Scan, *, provenance: Provenance, truth: Mapping[str, Any] | None = None, force: bool = False
 ) -> None:
     """Write a scan; equal scans give equal bytes under one version of zstd and protobuf.
 

@@ -201,8 +201,7 @@ class UsedCalibration(Record):
 
     name: str
     sha256: Annotated[
-        Sha256,
-        Meta(description="Of the calibration's file: sizes by another one have another spread, and are refused"),
+        Sha256, Meta(description="Of the calibration's file: sizes by another one have another spread, and are refused")
     ]
     normalise: Annotated[str, Meta(description="How the maps' frames were normalised, as the option of `map`")]
 

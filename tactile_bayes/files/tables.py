@@ -40,14 +40,10 @@ _NOT_TEXT: Final = (
 class Cells(Record):
     """A CSV file's rows that are not blank."""
 
-    header: list[str]
-    """Cells of the first of them; none where there is none."""
-    body: list[tuple[int, list[str]]]
-    """The others, each with the line on which it begins."""
-    separator: str = ","
-    """Between the cells."""
-    decimal_comma: bool = False
-    """True when numbers are written as 12,5."""
+    header: list[str]  #: Cells of the first of them; none where there is none.
+    body: list[tuple[int, list[str]]]  #: The others, each with the line on which it begins.
+    separator: str = ","  #: Between the cells.
+    decimal_comma: bool = False  #: True when numbers are written as 12,5.
 
 
 def read_text(path: Path) -> str:
@@ -148,14 +144,12 @@ class Sheet(Record):
 class Table(Record):
     """A validated table, column by column."""
 
-    path: Path
-    """Where it was read."""
+    path: Path  #: Where it was read.
     columns: dict[str, list[Any]]
     """A list for each column of the schema, in the schema's order and of the schema's type: str, float, int, bool or
     date. A blank cell is None, and so is each cell of an optional column that the file leaves out.
     """
-    line_numbers: list[int]
-    """The line of the file at which each row begins; the header is line 1."""
+    line_numbers: list[int]  #: The line of the file at which each row begins; the header is line 1.
 
     def __len__(self) -> int:
         return len(self.line_numbers)
@@ -197,18 +191,12 @@ def read_table(source: Path | Sheet, schema_name: str) -> Table:
 class RawTable(Record):
     """A CSV table under no schema."""
 
-    path: Path
-    """Where it was read."""
-    header: list[str]
-    """Names of its columns."""
-    line_numbers: list[int]
-    """The line at which each row begins."""
-    rows: list[dict[str, str]]
-    """Cells as text, without blanks around them, by their columns."""
-    decimal_comma: bool = False
-    """True when its numbers are written as 12,5."""
-    separator: str = ","
-    """Between its cells."""
+    path: Path  #: Where it was read.
+    header: list[str]  #: Names of its columns.
+    line_numbers: list[int]  #: The line at which each row begins.
+    rows: list[dict[str, str]]  #: Cells as text, without blanks around them, by their columns.
+    decimal_comma: bool = False  #: True when its numbers are written as 12,5.
+    separator: str = ","  #: Between its cells.
 
     def number(self, line: int, column: str, text: str) -> float:
         """Parse a finite number; an error names its cell."""

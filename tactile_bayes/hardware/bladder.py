@@ -27,10 +27,8 @@ STEPS_FOR_CURVATURE: Final = 4
 class BladderStep(Record, eq=False):
     """Mean counts of the array under one known pressure."""
 
-    pressure_kpa: float
-    """Of the bladder."""
-    counts: FloatArray
-    """(rows, columns) array: Mean over the frames."""
+    pressure_kpa: float  #: Of the bladder.
+    counts: FloatArray  #: (rows, columns) array: Mean over the frames.
     saturated: NDArray[np.bool_]
     """(rows, columns) bool array: Taxels that reached full scale in any frame."""
 
@@ -63,10 +61,8 @@ class ArrayFit(Record, eq=False):
     """(steps,) array: Standard deviation over the good taxels of the calibrated pressure, as a share of the step's (NaN
     at 0).
     """
-    curved_nonuniformity: FloatArray
-    """(steps,) array: The same with the parabolas."""
-    pressure_kpa: FloatArray
-    """(steps,) array: Rising."""
+    curved_nonuniformity: FloatArray  #: (steps,) array: The same with the parabolas.
+    pressure_kpa: FloatArray  #: (steps,) array: Rising.
 
 
 def fit_array(steps: Sequence[BladderStep], *, saturation_count: int) -> ArrayFit:
@@ -160,8 +156,7 @@ class RotationSense(Record):
     as_given_mm: float
     inverted_mm: float
     """`as_given_mm`, `inverted_mm`: Root mean square distance of the point from its mean."""
-    turn_deg: float
-    """Largest rotation between two poses."""
+    turn_deg: float  #: Largest rotation between two poses.
 
     def __str__(self) -> str:
         figures = f"the point stays within {self.as_given_mm:.2f} mm as given, {self.inverted_mm:.2f} mm inverted"

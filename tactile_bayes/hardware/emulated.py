@@ -36,10 +36,8 @@ class Faults(Record):
     """`drop`, `corrupt`: Share of the records that are not sent, or sent with one bit changed."""
     stall: tuple[float, float] | None = None
     """From this time of the scan on, for this long, nothing is sent; what was measured then is lost. In s."""
-    disconnect_s: float | None = None
-    """The cable is pulled at this time of the scan."""
-    hold: int = 1
-    """Only every n-th pose is measured anew, those between repeat it."""
+    disconnect_s: float | None = None  #: The cable is pulled at this time of the scan.
+    hold: int = 1  #: Only every n-th pose is measured anew, those between repeat it.
 
     def stalls(self, time_s: float) -> bool:
         """True when the device sends nothing at a time of the scan."""
@@ -60,14 +58,10 @@ class Faults(Record):
 class Device:
     """An emulated device: it answers commands and sends records at their times; most wait for a command."""
 
-    times_s: FloatArray
-    """Times of the records after the start, never falling."""
-    starts = 0
-    """Number of START commands so far; each begins the scan anew."""
-    streaming = False
-    """True when the device sends, or will when the scan begins."""
-    stopped = False
-    """True when the host's last command about sending was STOP."""
+    times_s: FloatArray  #: Times of the records after the start, never falling.
+    starts = 0  #: Number of START commands so far; each begins the scan anew.
+    streaming = False  #: True when the device sends, or will when the scan begins.
+    stopped = False  #: True when the host's last command about sending was STOP.
     said_end = False
     """True when the device has told the host that everything was sent, as some protocols do."""
 

@@ -35,8 +35,7 @@ LINGER_S: Final = 5.0
 class Link(Protocol):
     """Interface of the device's end of a connection."""
 
-    url: str
-    """For the host to open."""
+    url: str  #: For the host to open.
 
     def fileno(self) -> int:
         """File descriptor to wait on; ready for reading when a command or a connection has come."""

@@ -40,10 +40,8 @@ class Packet(NamedTuple):
     """One valid packet."""
 
     kind: int
-    sequence: int
-    """Counts the packets of this kind, modulo 2^32."""
-    device_us: int
-    """The device's clock in microseconds, modulo 2^64."""
+    sequence: int  #: Counts the packets of this kind, modulo 2^32.
+    device_us: int  #: The device's clock in microseconds, modulo 2^64.
     payload: bytes
 
 
@@ -103,14 +101,11 @@ def encode_packet(kind: int, payload: bytes, *, sequence: int = 0, device_us: in
 class FramingCounts:
     """Counts of a stream's packets and bytes."""
 
-    packets: int = 0
-    """With a checksum that held."""
+    packets: int = 0  #: With a checksum that held.
     damaged: int = 0
     """Stretches between zero bytes that are no packet: a checksum that fails, codes that make no sense, noise."""
-    damaged_bytes: int = 0
-    """Their length."""
-    foreign: int = 0
-    """Packets of another version of the framing."""
+    damaged_bytes: int = 0  #: Their length.
+    foreign: int = 0  #: Packets of another version of the framing.
 
 
 class PacketParser:

@@ -174,22 +174,16 @@ class LiveState(Record, eq=False):
 
     tactile_map: TactileMap | None = None
     """So far, with the patient's axes once both landmarks are known; None before there is one."""
-    pressure_kpa: float = float("nan")
-    """Mean of the last frame; NaN before the first."""
-    window_kpa: tuple[float, float] = PRESSURE_WINDOW_KPA
-    """Where frames count."""
+    pressure_kpa: float = float("nan")  #: Mean of the last frame; NaN before the first.
+    window_kpa: tuple[float, float] = PRESSURE_WINDOW_KPA  #: Where frames count.
     frames: int = 0
     frames_lost: int = 0
     poses: int = 0
     """`frames`, `frames_lost`, `poses`: By the recorder's account."""
-    duration_s: float = 0.0
-    """Recorded so far."""
-    used_share: float = 0.0
-    """Of the frames that the map has used."""
-    latency_ms: float = 0.0
-    """From the recorder to this state, of its youngest frame."""
-    size: str = ""
-    """The current estimate in words."""
+    duration_s: float = 0.0  #: Recorded so far.
+    used_share: float = 0.0  #: Of the frames that the map has used.
+    latency_ms: float = 0.0  #: From the recorder to this state, of its youngest frame.
+    size: str = ""  #: The current estimate in words.
     lump_base_mm: FloatArray | None = None
     """(3,) array or None: Where the estimate's lump lies, in `base`: the plane changes while the map grows."""
 

@@ -192,14 +192,10 @@ class Stream:
     """A device read by a process of its own."""
 
     process: subprocess.Popen[bytes]
-    pipe: int
-    """Where its records come out; not blocking."""
-    overrun_bytes: int = 0
-    """Bytes that the reader had to drop because the pipe was full."""
-    ready: bool = False
-    """The reader has begun to read."""
-    ended: bool = False
-    """The device has gone, or the reader has."""
+    pipe: int  #: Where its records come out; not blocking.
+    overrun_bytes: int = 0  #: Bytes that the reader had to drop because the pipe was full.
+    ready: bool = False  #: The reader has begun to read.
+    ended: bool = False  #: The device has gone, or the reader has.
     cpu_s: float = 0.0
     _rest: bytes = field(default=b"", repr=False)
 

@@ -18,12 +18,9 @@ MM_PER_INCH: Final = 25.4
 class FrameReading(NamedTuple):
     """One frame of the array."""
 
-    counts: CountArray
-    """(rows, columns) uint16 array."""
-    device_ns: int
-    """The head's clock."""
-    lost: int = 0
-    """Frames missing just before this one, by the sequence numbers."""
+    counts: CountArray  #: (rows, columns) uint16 array.
+    device_ns: int  #: The head's clock.
+    lost: int = 0  #: Frames missing just before this one, by the sequence numbers.
     restarted: bool = False
     """The sequence numbers do not go on from the frame before: the device has restarted, or its counter is damaged."""
 
@@ -34,12 +31,10 @@ class PoseReading(NamedTuple):
     position_mm: tuple[float, float, float]
     quaternion_wxyz: tuple[float, float, float, float]
     """Scalar first, as the device gave it: not normalised, sign free."""
-    device_ns: int | None = None
-    """The tracker's clock; None when the protocol carries none."""
+    device_ns: int | None = None  #: The tracker's clock; None when the protocol carries none.
     flags: tuple[str, ...] = ()
     """The device's objections to this pose, for example ``"error W"`` or ``"distortion 12"``."""
-    station: int = 1
-    """Number of the sensor."""
+    station: int = 1  #: Number of the sensor.
 
 
 class HelloReading(NamedTuple):
@@ -199,8 +194,7 @@ class Moment(NamedTuple):
 
     time_ns: int
     """On the device's clock made continuous: 0 or more, never below the time before, below 2^63."""
-    event: str = ""
-    """Step of the clock just now in words; empty when it went on as it should."""
+    event: str = ""  #: Step of the clock just now in words; empty when it went on as it should.
 
 
 class DeviceClock:

@@ -106,12 +106,9 @@ class Touch(Record, eq=False):
 
     name: str
     """``sternal_notch``, ``xiphoid`` or ``nipple``."""
-    position_mm: FloatArray
-    """(3,) array: Mean in `base`."""
-    spread_mm: float
-    """Standard deviation of the samples about it (root of the sum over axes)."""
-    samples: int
-    """How many there were."""
+    position_mm: FloatArray  #: (3,) array: Mean in `base`.
+    spread_mm: float  #: Standard deviation of the samples about it (root of the sum over axes).
+    samples: int  #: How many there were.
 
     @property
     def steady(self) -> bool:

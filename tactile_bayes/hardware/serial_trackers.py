@@ -277,20 +277,15 @@ _ASK_AGAIN_S: Final = 0.5
 class TrackerDriver(Record):
     """Commands of one tracker protocol."""
 
-    title: str
-    """The makers' name, for messages."""
-    baud: int
-    """Line rate it runs at unless told."""
-    parser: Callable[[], Parser]
-    """Makes a fresh parser."""
-    configure: tuple[bytes, ...] = ()
-    """Commands that set records and units, sent one by one."""
+    title: str  #: The makers' name, for messages.
+    baud: int  #: Line rate it runs at unless told.
+    parser: Callable[[], Parser]  #: Makes a fresh parser.
+    configure: tuple[bytes, ...] = ()  #: Commands that set records and units, sent one by one.
     single: bytes = b""
     start: bytes = b""
     stop: bytes = b""
     """`single`, `start`, `stop`: Commands for one record, for a stream of them, and for its end."""
-    has_clock: bool = False
-    """Its records carry the tracker's own time."""
+    has_clock: bool = False  #: Its records carry the tracker's own time.
     hint: str = "check its power, cable and line rate, or give another --tracker-protocol"
     """Advice when nothing comes."""
 

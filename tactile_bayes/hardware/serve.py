@@ -32,8 +32,7 @@ _PAGE: Final = Path(__file__).with_name("live_page.html")
 # How long a page may take to ask, and to say goodbye: the view's process waits for all of them.
 OPEN_S: Final = 4.0
 CLOSE_S: Final = 0.5
-MOST_OPEN: Final = 24
-"""Connections at a time; nobody has as many pages open."""
+MOST_OPEN: Final = 24  #: Connections at a time; nobody has as many pages open.
 WAIT_S: Final = 0.1
 SHED_S: Final = 0.01
 _SECURITY: Final = (

@@ -55,8 +55,7 @@ UNLIKE: Final = "is unlike the bodies of the table"
 NO_PROFILE: Final = "the phantoms that correct the calibration have no pressure profile of the head"
 MOST_LEVERAGE: Final = 1.0
 """A map is outside the table where its leverage exceeds this multiple of the table's largest."""
-FARTHEST_LEVERAGE: Final = 3.0
-"""Beyond this multiple there is no size."""
+FARTHEST_LEVERAGE: Final = 3.0  #: Beyond this multiple there is no size.
 UNLIKE_SD: Final = 0.1
 """SD of ln d by which a body may differ because its map or its head profile is unlike the table's (record 0123)."""
 QUADRATIC: Final[Powers] = tuple((i, j, k) for k in range(3) for i, j in powers(2 - k))
@@ -141,10 +140,8 @@ class BodyCalibration(BodyLaw, eq=False, kw_only=True):
 
     fat_mm: float | None = None
     """Depth F of the mass that this calibration is for; None where it is not known."""
-    fat_note: str = ""
-    """Why the depth is not used though the calibration could; empty otherwise."""
-    site: SiteShift | None = None
-    """Correction by a site's own phantoms."""
+    fat_note: str = ""  #: Why the depth is not used though the calibration could; empty otherwise.
+    site: SiteShift | None = None  #: Correction by a site's own phantoms.
 
     def at_fat(self, profiles: Sequence[tuple[float, ...] | None]) -> BodyCalibration:
         """The calibration for a mass whose maps have these `presets.HEAD_PROFILE`, None for a map without one.

@@ -17,8 +17,7 @@ SIZES: Final = (*EXTREMES, "d_x_mm", "d_y_mm")
 """Names of the sizes that a posterior has, in the order of reports."""
 SHOWN, SHOWN_POWER = 0.083, 1.5
 """Share of a lump's half log axis ratio that its map shows: factor, and power of d in map widths (record 0107)."""
-SHOWN_CV: Final = 0.2
-"""Coefficient of variation of that between lumps."""
+SHOWN_CV: Final = 0.2  #: Coefficient of variation of that between lumps.
 OVAL_SD: Final = 0.4
 """SD of the log mean diameter by which an oval lump is off the calibration for balls, over its half log axis ratio."""
 
@@ -34,8 +33,7 @@ class BumpDraws(Record, eq=False):
     """(n,) labels of the draws' independent replicates, as `ParameterDraws.labels`."""
     oblique: tuple[float, float] | None = None
     """Mean and SD of r where the draws have none, as `MapPosterior`'s."""
-    irregular: bool = False
-    """The map is that of an irregular lump."""
+    irregular: bool = False  #: The map is that of an irregular lump.
 
     def flat(self) -> BumpDraws:
         """The same draws in one row."""
@@ -60,8 +58,7 @@ class ShapeDraws(Record, eq=False):
     log_width: FloatArray
     q: FloatArray
     r: FloatArray
-    turn_rad: float = 0.0
-    """From the axes that the maps of a mass share to this map's."""
+    turn_rad: float = 0.0  #: From the axes that the maps of a mass share to this map's.
     profile: tuple[float, ...] | None = None
     """`presets.HEAD_PROFILE` of the map; None where it has none."""
     labels: Labels | None = None
@@ -183,10 +180,8 @@ class Supposition(Record):
 
     name: str
     value: float
-    log_shift: float
-    """By which the median of ln d moves."""
-    sds: tuple[float, float]
-    """SDs of ln d without and with it."""
+    log_shift: float  #: By which the median of ln d moves.
+    sds: tuple[float, float]  #: SDs of ln d without and with it.
 
     @property
     def sd_ratio(self) -> float:

@@ -44,11 +44,9 @@ Calibration = SizeCalibration | BodyCalibration
 POOLED_DRAWS = 8192
 DIMENSIONS = 6
 """Coordinates of the points: ln d given all else, tau, the spread of B, oval or round, and an oval's two components."""
-_SCORE = 2
-"""Coordinate of the spread of B."""
+_SCORE = 2  #: Coordinate of the spread of B.
 MOST_INVALID = 0.05
-DISAGREE: Final = "maps_disagree"
-"""Status of maps that are not of one size, or not of one mass."""
+DISAGREE: Final = "maps_disagree"  #: Status of maps that are not of one size, or not of one mass.
 IRREGULAR_SD = 0.15
 """SD of ln d by which the mean diameter of a lump with an irregular outline is off (record 0107)."""
 
@@ -95,8 +93,7 @@ class Weighted(Record, eq=False):
 
     weight: FloatArray
     mean: FloatArray
-    variance: FloatArray
-    """By the spread between maps."""
+    variance: FloatArray  #: By the spread between maps.
     terms: FloatArray
     log_amplitude: FloatArray
     log_width: FloatArray
@@ -289,10 +286,8 @@ class PooledEstimate(Record, eq=False):
     size: SizePosterior | None = None
     centres: Mapping[int, float] = field(default_factory=dict)
     """ln d by each map alone, by its place in the list; maps without a lump are missing."""
-    outlying: tuple[int, ...] = ()
-    """Places of the maps that lie apart from the rest."""
-    outside: tuple[str, ...] = ()
-    """How maps lie outside the calibration's table, in words."""
+    outlying: tuple[int, ...] = ()  #: Places of the maps that lie apart from the rest.
+    outside: tuple[str, ...] = ()  #: How maps lie outside the calibration's table, in words.
     calibration: BodyCalibration | None = None
     """The one used: for the depth of fat that the maps tell, where they do."""
     fat_apart_mm: tuple[float, float] | None = None
@@ -365,8 +360,7 @@ def _one_size(centre: FloatArray, noise: FloatArray, priors: SizePriors) -> dict
 
 # --- A site's repeatability: how far sizes of one mass lie apart between its exams, learned from repeated exams there.
 
-PROBABILITY: Final = 0.95
-"""Probability of the interval of a learned spread."""
+PROBABILITY: Final = 0.95  #: Probability of the interval of a learned spread.
 
 
 class Repeatability(Record):

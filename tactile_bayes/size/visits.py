@@ -38,12 +38,10 @@ MOST_VISITS: Final = 10
 DIMENSIONS: Final = 6
 """Coordinates of the points: the spread between exams, that of B, three for the lump's shape, and the exponent of
 `AmplitudeLaw`."""
-LEAST_SAME: Final = 0.02
-"""One mass in fifty is refused though it is the same."""
+LEAST_SAME: Final = 0.02  #: One mass in fifty is refused though it is the same.
 CODES: Final = {"subject": "patients", "side": "sides", "mass": "masses"}
 """Facts of which one mass has only one, and their names for people."""
-VOLUME: Final = 3.0
-"""d ln V / d ln d of a lump that keeps its form."""
+VOLUME: Final = 3.0  #: d ln V / d ln d of a lump that keeps its form.
 
 
 class Place(Record, eq=False):
@@ -68,12 +66,9 @@ class Place(Record, eq=False):
 class Apart(Record):
     """How far apart the masses of two visits lie."""
 
-    shift_mm: tuple[float, float]
-    """From the earlier visit's place to the later one's."""
-    sd_mm: float
-    """SD of the distance of one mass between visits, in the direction of the shift."""
-    probability: float
-    """That one mass comes out as far apart or farther."""
+    shift_mm: tuple[float, float]  #: From the earlier visit's place to the later one's.
+    sd_mm: float  #: SD of the distance of one mass between visits, in the direction of the shift.
+    probability: float  #: That one mass comes out as far apart or farther.
 
     @property
     def distance_mm(self) -> float:
@@ -142,10 +137,8 @@ class SharedBody(Record):
     is the same; the rest of a change in B grows with the square of the growth, as of any smooth function.
     """
 
-    redrawn: float
-    """f, 0 to 1."""
-    length: float
-    """Lambda."""
+    redrawn: float  #: f, 0 to 1.
+    length: float  #: Lambda.
 
     def __post_init__(self) -> None:
         if not (0.0 <= self.redrawn <= 1.0 and self.length > 0.0):
@@ -183,14 +176,10 @@ class AmplitudeLaw(Record):
 
     least: float
     most: float
-    posture: float
-    """Beta."""
-    posture_sd: float
-    """Of ln s."""
-    fat_sd: float
-    """Of ln F between exams of one posture."""
-    exam_factor: float
-    """SD of ln a between exams, beside the maps' noise, over that of ln d."""
+    posture: float  #: Beta.
+    posture_sd: float  #: Of ln s.
+    fat_sd: float  #: Of ln F between exams of one posture.
+    exam_factor: float  #: SD of ln a between exams, beside the maps' noise, over that of ln d.
     otherwise: float
     """Probability that something else changes the amplitude, with an SD of 1 in ln a."""
 
@@ -221,13 +210,10 @@ AMPLITUDE_LAW: Final = AmplitudeLaw(1.0, 6.2, 3.5, 0.04, 0.02, 3.6, 0.1)
 class Change(Record, eq=False):
     """Change of a mass between two visits."""
 
-    log_ratio: FloatArray
-    """(n,) draws of ln of the later size over the earlier one."""
+    log_ratio: FloatArray  #: (n,) draws of ln of the later size over the earlier one.
     mean: FloatArray
-    sd: FloatArray
-    """(n,) of the normal that each draw comes from."""
-    replicates: Labels
-    """(n,) label of the independent replicate of each draw."""
+    sd: FloatArray  #: (n,) of the normal that each draw comes from.
+    replicates: Labels  #: (n,) label of the independent replicate of each draw.
 
     def probability_above(self, share: float) -> float:
         """Probability that the size grew by more than this share of it (0.2: by more than 20 %)."""
@@ -259,16 +245,12 @@ class Change(Record, eq=False):
 class JointSizes(Record, eq=False):
     """Joint posterior of the sizes of one mass at v visits."""
 
-    log_size: FloatArray
-    """(v, n) draws of ln of the largest size in mm."""
+    log_size: FloatArray  #: (v, n) draws of ln of the largest size in mm.
     mean: FloatArray
-    covariance: FloatArray
-    """(v, n) and (n, v, v) of the normals that the draws come from."""
+    covariance: FloatArray  #: (v, n) and (n, v, v) of the normals that the draws come from.
     replicates: Labels
-    between_map_sd: float
-    """Spread between exams of a visit, root mean square."""
-    correlation: FloatArray
-    """(v, v) of B between the visits."""
+    between_map_sd: float  #: Spread between exams of a visit, root mean square.
+    correlation: FloatArray  #: (v, v) of B between the visits.
     calibrations: tuple[BodyCalibration, ...]
     """One per visit: at the depth of fat that its maps give."""
 
@@ -457,12 +439,10 @@ class Compared(Record, eq=False):
 
     status: Literal["compared", "not_one_mass", "no_estimate"]
     reason: str = ""
-    advice: str = ""
-    """Why there is no comparison, and what would help; empty where there is one."""
+    advice: str = ""  #: Why there is no comparison, and what would help; empty where there is one.
     apart: tuple[Apart | None, ...] = ()
     """How far the mass of each later visit lies from the first's; None where landmarks do not show it."""
-    findings: tuple[Finding, ...] = ()
-    """Findings against the comparison."""
+    findings: tuple[Finding, ...] = ()  #: Findings against the comparison.
     joint: JointSizes | None = None
     another: JointSizes | None = None
     """Sizes with the calibration's or the site's spread between exams, and with the paper's."""

@@ -46,8 +46,7 @@ LEAST_BODIES: Final = 80
 INSIDE: Final = 0.99
 """Share of the table's maps that count as inside it: its largest leverage is an outlier's, ten times what is left."""
 _MOST_TANGENTS, _CLOSE, _STEP, _MAP_STEP = 50, 1e-7, 1e-4, 1e-3
-_OTHER_SDS = np.linspace(0.0, 0.3, 301)
-"""Grid of tau."""
+_OTHER_SDS = np.linspace(0.0, 0.3, 301)  #: Grid of tau.
 
 
 def learn_population(

@@ -60,10 +60,8 @@ class SizeTable(Record, eq=False):
     width_change_x: FloatArray | None = None
     width_change_y: FloatArray | None = None
     """Width over the width of the same lump at one diameter depth; NaN where the table has no such row."""
-    cases: StudyCases | None = None
-    """Cases of a study; None for other tables."""
-    depth_ratio: FloatArray | None = None
-    """h/d; None where the table does not say."""
+    cases: StudyCases | None = None  #: Cases of a study; None for other tables.
+    depth_ratio: FloatArray | None = None  #: h/d; None where the table does not say.
 
 
 class AxisRows(Record, eq=False):
@@ -218,8 +216,7 @@ def _coefficients(theta: FloatArray, data: AxisRows) -> FloatArray:
     return np.stack([m, theta[:, 1], e, f, np.exp(theta[:, 3]), theta[:, 4]], axis=1)
 
 
-LEAST_DIAMETERS = 3
-"""Two diameters always lie on a line, and leave nothing to resample."""
+LEAST_DIAMETERS = 3  #: Two diameters always lie on a line, and leave nothing to resample.
 _SLOPES = np.linspace(-1.0, 2.0, 301)
 _WAY_OUT = "give depth_ratio and at least 3 diameters at depth_ratio 1, or use --fit joint"
 
@@ -228,8 +225,7 @@ class OtherFit(Record):
     """The same rows by the other of the two fits, joint or two-stage."""
 
     name: str
-    coefficients: tuple[tuple[float, ...], ...]
-    """m, b (mm), e, f of each axis."""
+    coefficients: tuple[tuple[float, ...], ...]  #: m, b (mm), e, f of each axis.
     difference: tuple[float, ...]
     """Mean absolute difference of the two fits' sizes over the rows, as a share of the true size, of each axis."""
 

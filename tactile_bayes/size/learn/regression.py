@@ -34,8 +34,7 @@ EXPLAINED: Final = 0.75
 """Share of the table's bodies, by SD(B), of which known properties tell as much as they do of all, in that SD."""
 _ROUND_START = (np.log(0.01), np.log(2.0))
 """ln s and ln kappa where the search for the spread of balls' maps begins."""
-_ROUND_PRIOR_SD = 1.5
-"""Prior SD of either about these: with a dozen bodies they stay near."""
+_ROUND_PRIOR_SD = 1.5  #: Prior SD of either about these: with a dozen bodies they stay near.
 # Centre and width of the priors on ln(sd between bodies), its slope with ln a, ln(sd between exams).
 _PRIOR = np.array([[np.log(0.1), 1.0], [0.0, 0.3], [np.log(0.03), 1.0]])
 
@@ -49,8 +48,7 @@ class PopulationTable(Record, eq=False):
     log_amplitude: FloatArray
     log_width: FloatArray
     half_log_ratio: FloatArray
-    covariance: FloatArray
-    """(n, 3, 3) posterior covariance of the latter three."""
+    covariance: FloatArray  #: (n, 3, 3) posterior covariance of the latter three.
     unknowns: Mapping[str, FloatArray] = field(default_factory=dict)
     """(n,) arrays of what was varied and no map shows, by name; logarithms of those in `LOGGED`."""
     profile: FloatArray | None = None
@@ -95,20 +93,14 @@ class ExamSpread(Record):
 class BodyRegression(Record, eq=False):
     """Data of the likelihood: maps as rows, and their means over each body's exams."""
 
-    terms: FloatArray
-    """(n, k) in which ln d is linear."""
-    constant: FloatArray
-    """(n,) that ln d has beside the terms."""
-    map_variance: FloatArray
-    """(n,) of the predicted ln d by the map's own posterior."""
-    group: IndexArray
-    """(n,) number of the body."""
+    terms: FloatArray  #: (n, k) in which ln d is linear.
+    constant: FloatArray  #: (n,) that ln d has beside the terms.
+    map_variance: FloatArray  #: (n,) of the predicted ln d by the map's own posterior.
+    group: IndexArray  #: (n,) number of the body.
     exams: FloatArray
     mean_terms: FloatArray
-    mean_log_d: FloatArray
-    """Mean of ln d less the constant, over each body's exams."""
-    mean_u: FloatArray
-    """Mean of the centred ln a."""
+    mean_log_d: FloatArray  #: Mean of ln d less the constant, over each body's exams.
+    mean_u: FloatArray  #: Mean of the centred ln a.
 
     @classmethod
     def linear(
@@ -293,31 +285,24 @@ def _weighted(terms: FloatArray, values: FloatArray, variance: FloatArray) -> Fl
 # body's size as the others predict it. Kernel and spread are those by which bodies left out are most probable, with
 # weak priors (Rasmussen & Williams 2006, sec. 5.4.2), so that intervals hold on bodies never seen.
 
-POINTS: Final = 100
-"""Points of the kernel; with fewer bodies a quarter of their number."""
+POINTS: Final = 100  #: Points of the kernel; with fewer bodies a quarter of their number.
 BODIES_PER_POINT: Final = 4
-SEED: Final = 1
-"""Seed of the choice of bodies that are the points."""
+SEED: Final = 1  #: Seed of the choice of bodies that are the points.
 _LENGTH, _SCALE, _BODY_SD = (np.log(2.0), 1.0), (np.log(0.3), 1.0), (np.log(0.1), 1.0)
 """Centre and width of the normal priors on the logs of lengths, scale and SD(B) at the centre."""
-_SLOPE_SD = 0.3
-"""Width of the prior on the other coefficients of ln SD(B)."""
+_SLOPE_SD = 0.3  #: Width of the prior on the other coefficients of ln SD(B).
 _START_LENGTHS = (2.0, 0.7)
 """There are modes where what is smooth is taken for scatter, and the other way round."""
 _MOST_ITERATIONS = 200
-_DIFFERENCE = 1e-4
-"""Step of the gradient: below it the rounding of the solutions shows."""
+_DIFFERENCE = 1e-4  #: Step of the gradient: below it the rounding of the solutions shows.
 
 
 class BodiesLeft(Record, eq=False):
     """Residuals of b bodies under Eq 6."""
 
-    x: FloatArray
-    """(b, 3) means of u, v and w over each body's exams: they differ little."""
-    features: FloatArray
-    """(b, s) of ln SD(B)."""
-    left: FloatArray
-    """(b,) ln d less Eq 6's, each body left out of its fit."""
+    x: FloatArray  #: (b, 3) means of u, v and w over each body's exams: they differ little.
+    features: FloatArray  #: (b, s) of ln SD(B).
+    left: FloatArray  #: (b,) ln d less Eq 6's, each body left out of its fit.
     noise: FloatArray
     """(b,) variance of `left` by the body's exams and by the error of Eq 6's coefficients."""
 

@@ -40,8 +40,7 @@ LACK = 0.5
 """Share of what all properties leave of B that phantoms of a set have in common: B is not linear in its properties, and
 two sets of the same sizes in two seats differ by 7 % (record 0102)."""
 _GRID = np.geomspace(0.1, 10.0, 81)
-FAR = 3.0
-"""Standard deviations of the prior beyond which a shift is named."""
+FAR = 3.0  #: Standard deviations of the prior beyond which a shift is named.
 APART = 3.5
 """The same of the prediction for a phantom; one of 20 phantoms is named by chance in 1 site of 30 (record 0102)."""
 SLOPE_OPEN, ALIKE = 0.8, 0.2
@@ -52,12 +51,9 @@ MOST_SPREAD = 2.0
 class SitePrior(Record):
     """Prior of a site's shift, as standard deviations; see docs/decisions/0102 for the figures."""
 
-    shift_sd: float = 0.15
-    """SD of c_0: how far off all sizes of a site may be, in ln d."""
-    slope_sd: float = 0.10
-    """SD of c_1: how much more wide maps than narrow ones."""
-    spread_log_sd: float = 0.5
-    """SD of ln k, about 0."""
+    shift_sd: float = 0.15  #: SD of c_0: how far off all sizes of a site may be, in ln d.
+    slope_sd: float = 0.10  #: SD of c_1: how much more wide maps than narrow ones.
+    spread_log_sd: float = 0.5  #: SD of ln k, about 0.
 
     @property
     def sd(self) -> FloatArray:
@@ -71,23 +67,17 @@ class PhantomMap(Record, eq=False):
     phantom: str
     d_mm: float
     shape: ShapeDraws
-    known: Mapping[str, float]
-    """The phantom's properties, by the names of `HiddenTerms`."""
+    known: Mapping[str, float]  #: The phantom's properties, by the names of `HiddenTerms`.
 
 
 class Residuals(Record, eq=False):
     """Residuals of n phantoms under a calibration, each (n,)."""
 
-    residual: FloatArray
-    """y."""
-    width: FloatArray
-    """p - p_0, mean over the maps."""
-    spread_variance: FloatArray
-    """Variance of B and E, before the factor k^2."""
-    map_variance: FloatArray
-    """Variance of the maps' own noise."""
-    common: FloatArray
-    """s: loading of what the phantoms share."""
+    residual: FloatArray  #: y.
+    width: FloatArray  #: p - p_0, mean over the maps.
+    spread_variance: FloatArray  #: Variance of B and E, before the factor k^2.
+    map_variance: FloatArray  #: Variance of the maps' own noise.
+    common: FloatArray  #: s: loading of what the phantoms share.
 
     def without(self, index: int) -> Residuals:
         """All phantoms but one."""
@@ -181,8 +171,7 @@ def correct_calibration(
 
 
 class _Phantom(Record):
-    left: tuple[float, ...]
-    """As the columns of `Residuals`."""
+    left: tuple[float, ...]  #: As the columns of `Residuals`.
     maps: int
     uses_fat: bool
 
@@ -296,8 +285,7 @@ def _apart(names: Sequence[str], data: Residuals, prior: SitePrior) -> list[str]
 FEWEST_MASSES: Final = 3
 PRIOR_MEDIAN: Final = 0.08
 """Prior median of tau: between the spread of simulated exams (5 %) and that of the paper's maps (15 %)."""
-PRIOR_LOG_SD: Final = 1.0
-"""95 % of the prior lies between 1.1 and 57 %."""
+PRIOR_LOG_SD: Final = 1.0  #: 95 % of the prior lies between 1.1 and 57 %.
 FALSE_ALARMS: Final = 0.05
 """Share of sites with nothing wrong at which some mass is named as outlying."""
 GRID: Final = np.geomspace(1e-3, 1.5, 600)
@@ -306,10 +294,8 @@ GRID: Final = np.geomspace(1e-3, 1.5, 600)
 class RepeatedExams(Record, eq=False):
     """Exams of one mass at one visit: (k,) mean and variance of ln d by each map alone."""
 
-    name: str
-    """Name of the mass at this visit."""
-    mass: str
-    """Name of the mass at any visit."""
+    name: str  #: Name of the mass at this visit.
+    mass: str  #: Name of the mass at any visit.
     centre: FloatArray
     noise: FloatArray
 
