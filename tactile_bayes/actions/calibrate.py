@@ -12,7 +12,6 @@ from tactile_bayes.api.repeatability import exams_in, learn_from_exams
 from tactile_bayes.api.site_correction import correct_size
 from tactile_bayes.api.size_calibration import EqSixFit, PopulationForm, is_population, learn_eq6, learn_population
 from tactile_bayes.commands.options import also_read, typed_options
-from tactile_bayes.commands.progress import progress_bar
 from tactile_bayes.declarations import as_dict
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.atomic import refuse_existing
@@ -30,6 +29,7 @@ from tactile_bayes.report.calibration import (
 )
 from tactile_bayes.report.study import eq6_figure
 from tactile_bayes.scan import Scan
+from tactile_bayes.shell import progress_bar
 from tactile_bayes.size.bodies import BodyCalibration
 
 # --- `calibrate array`: learn an array's calibration from recorded bladder steps, for `record` to attach.

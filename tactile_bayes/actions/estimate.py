@@ -21,7 +21,6 @@ from tactile_bayes.api.settings import Comparing, Settings, refuse_checkpoint, t
 from tactile_bayes.api.sized import Answer, SizeEstimate
 from tactile_bayes.batch import BatchInterrupted, Outcome, cluster_executor, fault_lines, local_executor, run_batch
 from tactile_bayes.commands.options import settings_of, typed_options
-from tactile_bayes.commands.progress import progress_bar
 from tactile_bayes.declarations import EXACT, replace, to_plain
 from tactile_bayes.errors import EXIT_DONE, EXIT_FAULT, EXIT_NO_ESTIMATE, UsageError
 from tactile_bayes.files.atomic import given_twice, refuse_existing
@@ -40,6 +39,7 @@ from tactile_bayes.report.figure_file import named_exam
 from tactile_bayes.report.map_figure import map_figure
 from tactile_bayes.report.map_text import map_text
 from tactile_bayes.report.pooled import pooled_summary, pooled_text
+from tactile_bayes.shell import progress_bar
 
 # --- `map`: from scans to a tactile map.
 

@@ -13,7 +13,6 @@ import numpy as np
 from tactile_bayes.actions.exam import describe_scan
 from tactile_bayes.batch import fault_lines, open_executor, run_batch
 from tactile_bayes.batch_store import open_unfinished, unfinished
-from tactile_bayes.commands.progress import progress_bar
 from tactile_bayes.declarations import as_dict, names_of
 from tactile_bayes.errors import TactileBayesError
 from tactile_bayes.files.atomic import refuse_existing, write_text
@@ -28,6 +27,7 @@ from tactile_bayes.forward.scene import Head, Scene
 from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.options import PopulationOptions
 from tactile_bayes.presets import DEFAULT_NORMALISE, RESEARCH_USE
+from tactile_bayes.shell import progress_bar
 from tactile_bayes.studies.population import (
     BodiesFile,
     BodyPrior,

@@ -16,7 +16,6 @@ import numpy as np
 
 from tactile_bayes.batch import BatchInterrupted, Outcome, fault_lines, open_executor, run_batch
 from tactile_bayes.batch_store import open_unfinished, unfinished
-from tactile_bayes.commands.progress import progress_bar
 from tactile_bayes.declarations import names_of
 from tactile_bayes.errors import BadDataError, TactileBayesError, UsageError
 from tactile_bayes.files.atomic import refuse_existing, write_text
@@ -51,6 +50,7 @@ from tactile_bayes.report.paper_head import (
     uniformity_text,
 )
 from tactile_bayes.report.study import frames_text, lookalikes_text, solid_figures, study_figures, study_text
+from tactile_bayes.shell import progress_bar
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.studies import sbc
 from tactile_bayes.studies.model_comparison import compare_model, measured_frames

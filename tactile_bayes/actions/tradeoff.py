@@ -20,7 +20,6 @@ from tactile_bayes.api.pooled import pool_estimates
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.api.sized import SizeEstimate
 from tactile_bayes.commands.options import also_read, settings_of
-from tactile_bayes.commands.progress import progress_bar
 from tactile_bayes.declarations import replace, to_plain
 from tactile_bayes.errors import EXIT_DONE, EXIT_NO_ESTIMATE, BadDataError, UsageError
 from tactile_bayes.files.atomic import given_twice, refuse_existing
@@ -36,6 +35,7 @@ from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.laboratory import TradeoffReport, draw_tradeoff, tradeoff_document, tradeoff_text
 from tactile_bayes.report.tradeoff import DIGITS, draw_ladder, ladder_file, ladder_text
 from tactile_bayes.scan import Scan
+from tactile_bayes.shell import progress_bar
 from tactile_bayes.size.pooling import PooledEstimate
 from tactile_bayes.studies.estimate_tradeoff import SIZE, Clock, Ladder, PooledRow, SizeAnswer, Work, measure
 from tactile_bayes.studies.paper_solid import fit_raster

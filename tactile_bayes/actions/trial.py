@@ -16,7 +16,6 @@ from tactile_bayes.campaigns.campaign import names_line, run_campaign
 from tactile_bayes.campaigns.exams import Found, find_exams
 from tactile_bayes.campaigns.settings import CampaignSettings
 from tactile_bayes.commands.options import also_read, settings_of, typed_options
-from tactile_bayes.commands.progress import progress_bar
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.atomic import refuse_existing
 from tactile_bayes.files.documents import dump_json, read_protocol
@@ -25,6 +24,7 @@ from tactile_bayes.files.reading import check_address
 from tactile_bayes.files.size_json import NONE
 from tactile_bayes.options import TrialSettings
 from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.shell import progress_bar
 
 # --- `validate`: compare each modality with excision.
 

@@ -7,7 +7,7 @@ import io
 import pytest
 
 from tactile_bayes.batch import run_batch
-from tactile_bayes.commands.progress import QUIET_S, progress_bar
+from tactile_bayes.shell import QUIET_S, progress_bar
 
 
 class Terminal(io.StringIO):
