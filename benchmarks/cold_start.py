@@ -65,6 +65,7 @@ CASES: tuple[Case, ...] = (
     Case("plan", ("plan", "--patients", "24", "--maps", "3", "--trials", "50"), "numpy"),
     Case("validate", ("validate", str(DEMO / "trial.csv"), "--excision", str(DEMO / "excision.csv")), "numpy"),
     Case("show", ("show", "map.nc"), "numpy", ("map",)),
+    Case("check", ("check", str(DEMO / "scan.mcap")), "numpy"),
     Case("demo", ("demo", "-o", "demo", "--force"), "emcee and arviz"),
 )
 

@@ -95,7 +95,11 @@ def _import_scan(
 
 
 def _arrangement_lines(scan: Scan) -> list[str]:
-    check = check_scan(scan, thorough=False)
+    """What its frames say of the scan's arrangement; a scan that no map could be made of is imported without."""
+    try:
+        check = check_scan(scan, thorough=False)
+    except BadDataError as error:
+        return [f"arrangement not checked: {error.what}"]
     return [] if check is None else finding_lines(check.findings) or [check.words]
 
 

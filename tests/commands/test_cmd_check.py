@@ -69,3 +69,24 @@ def test_a_map_has_nothing_to_correct(tmp_path):
     refused = run_here("import", *words, cwd=tmp_path)
     assert refused.returncode == 2
     assert "--session and --correct are for scans" in refused.stderr
+
+
+def test_a_scan_of_which_no_map_can_be_made_is_imported(tmp_path):
+    scan = tb.demo_scan()
+    counts = np.full_like(scan.frames.counts, 4095)
+    np.savez(
+        tmp_path / "full.npz",
+        counts=counts,
+        frame_time_s=scan.frames.time_s,
+        position_mm=scan.poses.position_mm,
+        quaternion_wxyz=scan.poses.quaternion_wxyz,
+        pose_time_s=scan.poses.time_s,
+        gain_kpa_per_count=scan.element_calibration.gain_kpa_per_count,
+        offset_kpa=scan.element_calibration.offset_kpa,
+        pitch_mm=scan.head.pitch_mm,
+        array_from_tracker=scan.head.scanhead_from_tracker,
+        head_surface_mm=scan.head.surface_mm,
+    )
+    said = run_here("import", "full.npz", "-o", "full.mcap", cwd=tmp_path)
+    assert said.returncode == 0
+    assert "arrangement not checked: none of the 416 taxels works" in said.stdout
