@@ -41,7 +41,7 @@ def scan_of(scene: Scene) -> Scan:
 
 def map_of(scene: Scene) -> TactileMap:
     """Its map."""
-    return build_map(scan_of(scene))
+    return build_map(scan_of(scene), as_stated=True)
 
 
 def keep_scan(path: Path, scene: Scene) -> str:

@@ -283,7 +283,9 @@ def _head_map(index: int, kind: str) -> tuple[TactileMap, tuple[float, float]]:
     clean = replace(scene, noise=Noise(0.0, 0.0, 0.0, 0.0, 0.0), tracker=Tracker())
 
     def mapped(scene: Scene, normalise: str) -> TactileMap:
-        return build_map(simulate(scene, rng=np.random.default_rng([SEED, index, 2])).scan, normalise=normalise)
+        return build_map(
+            simulate(scene, rng=np.random.default_rng([SEED, index, 2])).scan, normalise=normalise, as_stated=True
+        )
 
     if kind != MEANS:
         found = mapped(scene, "none" if kind == HEAD_LEVELLESS else "gain")
@@ -375,7 +377,7 @@ def _estimates(scenes: Sequence[Scene], calibration: Any) -> Iterator[tuple[Tact
     for scene in scenes:
         rng = np.random.default_rng([SEED, scene.seed])
         try:
-            tactile_map = build_map(simulate(scene, rng=rng).scan)
+            tactile_map = build_map(simulate(scene, rng=rng).scan, as_stated=True)
             yield tactile_map, estimate_map(tactile_map, calibration=calibration, options=options, rng=rng)
         except TactileBayesError:
             yield None, None

@@ -62,7 +62,7 @@ def make(folder: Path, *, judge: bool) -> None:
 
 
 def _with_map(exam: Exam) -> tuple[Exam, TactileMap]:
-    return exam, build_map(exam.scan())
+    return exam, build_map(exam.scan(), as_stated=True)
 
 
 def rows(folder: Path) -> Iterator[Row]:

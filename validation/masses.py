@@ -105,12 +105,12 @@ def run(folder: Path, kinds: Sequence[Any]) -> None:
     for exam in exams("single") if "shouldered" in kinds else ():
         scan, name = folder / f"{exam.name}.mcap", f"shouldered-{exam.index:03d}"
         if name not in done and scan.exists():
-            row = listed(exam, shouldered(exam, build_map(read_scan(scan))))
+            row = listed(exam, shouldered(exam, build_map(read_scan(scan), as_stated=True)))
             add_row(path, row | {"name": name, "kind": "shouldered"})
     for exam in exams(*(kind for kind in kinds if kind in KINDS)):
         scan = folder / f"{exam.name}.mcap"
         if exam.name not in done and scan.exists():
-            add_row(path, listed(exam, build_map(read_scan(scan))))
+            add_row(path, listed(exam, build_map(read_scan(scan), as_stated=True)))
 
 
 def matched(row: Row) -> tuple[list[int | None], list[Row]]:

@@ -145,7 +145,7 @@ def scan_of(name: str, body: int) -> tuple[Scene, Scan]:
 
 def document_of(scan: Scan) -> dict[str, Any]:
     """What `map` and `estimate` make of a scan, as `estimate --json` prints it, with the map's figures."""
-    tactile_map = build_map(scan)
+    tactile_map = build_map(scan, as_stated=True)
     outcome = estimate_one(tactile_map, Settings())
     return {**(outcome.answer.document or {}), "quality": dict(tactile_map.quality)}
 

@@ -57,7 +57,7 @@ def answers_of(scans: list[Scan]) -> list[Answer]:
     found = []
     for scan in scans:
         try:
-            found.append(estimate_one(build_map(scan), Settings()).answer)
+            found.append(estimate_one(build_map(scan, as_stated=True), Settings()).answer)
         except TactileBayesError as error:
             print(f"    no map: {error}")
     return found
