@@ -17,7 +17,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from campaign_files import FAST, JOURNAL, ROWS, contents, rows_of, steps, thinned, write, write_study, write_table
+from campaign_files import (
+    FAST,
+    JOURNAL,
+    ROWS,
+    arrays_of,
+    contents,
+    rows_of,
+    steps,
+    thinned,
+    write,
+    write_study,
+    write_table,
+)
 from in_process import run_here
 from plain_reports import estimate_report
 
@@ -429,19 +441,7 @@ def test_masses_that_were_not_excised_are_left_out_of_the_trial_by_name(finished
 
 def test_arrays_and_maps_are_exams_too(undisturbed: Path, own: Path) -> None:
     scan = thinned(1, 4)
-    np.savez(
-        own / "arrays.npz",
-        counts=scan.frames.counts,
-        frame_time_s=scan.frames.time_s,
-        position_mm=scan.poses.position_mm,
-        quaternion_wxyz=scan.poses.quaternion_wxyz,
-        pose_time_s=scan.poses.time_s,
-        gain_kpa_per_count=scan.element_calibration.gain_kpa_per_count,
-        offset_kpa=scan.element_calibration.offset_kpa,
-        pitch_mm=scan.head.pitch_mm,
-        array_from_tracker=scan.head.scanhead_from_tracker,
-        head_surface_mm=scan.head.surface_mm,
-    )
+    np.savez(own / "arrays.npz", **arrays_of(scan))
     shutil.copy(undisturbed / "exams" / "09.v1.m1.r1" / "map.nc", own / "map.nc")
     shutil.copy(own / "map.nc", own / "map2.nc")
     rows = [("arrays.npz", "20", 1, "left"), ("map.nc", "09", 1, "right")]

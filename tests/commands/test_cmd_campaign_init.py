@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from campaign_files import rows_of, thinned, write
+from campaign_files import arrays_of, rows_of, thinned, write
 from in_process import run_here
 
 
@@ -108,19 +108,7 @@ def test_a_map_without_its_scan_is_an_exam_and_arrays_without_what_was_imported(
     (site / "Studie 1" / "Köhler, M." / "P01 links – 1.mcap").unlink()
     (site / "Studie 1" / "Köhler, M." / "P01 links – 1 - Kopie.mcap").unlink()
     scan = thinned(4, 20)
-    np.savez_compressed(
-        site / "Studie 1" / "p3.npz",
-        counts=scan.frames.counts,
-        frame_time_s=scan.frames.time_s,
-        position_mm=scan.poses.position_mm,
-        quaternion_wxyz=scan.poses.quaternion_wxyz,
-        pose_time_s=scan.poses.time_s,
-        gain_kpa_per_count=scan.element_calibration.gain_kpa_per_count,
-        offset_kpa=scan.element_calibration.offset_kpa,
-        pitch_mm=scan.head.pitch_mm,
-        array_from_tracker=scan.head.scanhead_from_tracker,
-        head_surface_mm=scan.head.surface_mm,
-    )
+    np.savez(site / "Studie 1" / "p3.npz", **arrays_of(scan))
     alone = init(site)
     assert "Studie 1/p3.npz" in (site / "exams.csv").read_text()
     assert run_here("import", "Studie 1/p3.npz", "-o", "Studie 1/p3.mcap", cwd=site).returncode == 0

@@ -6,28 +6,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from campaign_files import arrays_of
 from in_process import run_here
 
 import tactile_bayes as tb
+from tactile_bayes.mapping.arrangement import corrected
 
 
 @pytest.fixture(scope="module")
 def backwards(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with arrays of the packaged scan, whose columns run backwards."""
     folder, scan = tmp_path_factory.mktemp("backwards"), tb.demo_scan()
-    np.savez(
-        folder / "exam.npz",
-        counts=scan.frames.counts[:, :, ::-1],
-        frame_time_s=scan.frames.time_s,
-        position_mm=scan.poses.position_mm,
-        quaternion_wxyz=scan.poses.quaternion_wxyz,
-        pose_time_s=scan.poses.time_s,
-        gain_kpa_per_count=scan.element_calibration.gain_kpa_per_count[:, ::-1],
-        offset_kpa=scan.element_calibration.offset_kpa[:, ::-1],
-        pitch_mm=scan.head.pitch_mm,
-        array_from_tracker=scan.head.scanhead_from_tracker,
-        head_surface_mm=scan.head.surface_mm,
-    )
+    np.savez(folder / "exam.npz", **arrays_of(corrected(scan, ["columns-reversed"])))
     return folder
 
 
@@ -74,19 +64,7 @@ def test_a_map_has_nothing_to_correct(tmp_path):
 def test_a_scan_of_which_no_map_can_be_made_is_imported(tmp_path):
     scan = tb.demo_scan()
     counts = np.full_like(scan.frames.counts, 4095)
-    np.savez(
-        tmp_path / "full.npz",
-        counts=counts,
-        frame_time_s=scan.frames.time_s,
-        position_mm=scan.poses.position_mm,
-        quaternion_wxyz=scan.poses.quaternion_wxyz,
-        pose_time_s=scan.poses.time_s,
-        gain_kpa_per_count=scan.element_calibration.gain_kpa_per_count,
-        offset_kpa=scan.element_calibration.offset_kpa,
-        pitch_mm=scan.head.pitch_mm,
-        array_from_tracker=scan.head.scanhead_from_tracker,
-        head_surface_mm=scan.head.surface_mm,
-    )
+    np.savez(tmp_path / "full.npz", **arrays_of(scan) | {"counts": counts})
     said = run_here("import", "full.npz", "-o", "full.mcap", cwd=tmp_path)
     assert said.returncode == 0
     assert "arrangement not checked: none of the 416 taxels works" in said.stdout

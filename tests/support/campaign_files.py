@@ -93,3 +93,19 @@ def rows_of(path: Path) -> list[dict[str, str]]:
     """Rows of a CSV file."""
     with path.open(newline="", encoding="utf-8") as file:
         return list(csv.DictReader(file))
+
+
+def arrays_of(scan: Scan) -> dict[str, np.ndarray | float]:
+    """A scan as the arrays that `import` takes, without landmarks."""
+    return {
+        "counts": scan.frames.counts,
+        "frame_time_s": scan.frames.time_s,
+        "position_mm": scan.poses.position_mm,
+        "quaternion_wxyz": scan.poses.quaternion_wxyz,
+        "pose_time_s": scan.poses.time_s,
+        "gain_kpa_per_count": scan.element_calibration.gain_kpa_per_count,
+        "offset_kpa": scan.element_calibration.offset_kpa,
+        "pitch_mm": scan.head.pitch_mm,
+        "array_from_tracker": scan.head.scanhead_from_tracker,
+        "head_surface_mm": scan.head.surface_mm,
+    }
