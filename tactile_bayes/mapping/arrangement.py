@@ -18,7 +18,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from tactile_bayes.declarations import Record, replace
+from tactile_bayes.declarations import Record, field, replace
 from tactile_bayes.findings import Finding
 from tactile_bayes.geometry import FloatArray, IndexArray, apply, inverse
 from tactile_bayes.mapping.convention import CoarseFrames, block_means, every_stretch, thinning
@@ -180,7 +180,7 @@ class ArrangementCheck(Record, eq=False):
     @property
     def says_nothing(self) -> bool:
         """True where the frames do not exclude each other order of the array."""
-        return self.best is self.stated and any(name in self.not_shown for name in tuple(CORRECTIONS)[:5])
+        return self.best is self.stated and any(name in self.not_shown for (name,) in _ARRAY[1:])
 
     @property
     def words(self) -> str:
@@ -301,6 +301,8 @@ class _Overlap(Record, eq=False):
     """Flat indices of the good ones, for each of `coarse`."""
     block: IndexArray
     """(m,) stretch of 0.2 s that each averaged frame lies in."""
+    paths: dict[Corrections, tuple[FloatArray, FloatArray]] = field(default_factory=dict)
+    """Mean rotation and place of the tracker at each averaged frame, for the corrections of rotations asked so far."""
 
     @classmethod
     def of(cls, stated: SelectedFrames, latency_ms: float) -> _Overlap | None:
@@ -347,18 +349,23 @@ class _Overlap(Record, eq=False):
     def _places_mm(self, corrections: Corrections) -> tuple[FloatArray, float]:
         """(m, k, 2) places of the averaged readings on the plane in which they lie, and how the face agrees with it."""
         transposed = "transposed" in corrections
-        coarse, head = self.coarse[transposed], self.scan.head
-        surface = head.surface_mm
+        coarse, surface = self.coarse[transposed], self.scan.head.surface_mm
         for name in set(corrections) & {"rows-reversed", "columns-reversed", "half-turn"}:
             surface = np.stack([_rearranged(surface[..., i], name) for i in range(3)], axis=-1)
-        others = [name for name in corrections if name.startswith(("lever", "quarter", "scalar", "inverse"))]
-        scan = corrected(self.scan, others)
-        tracker_from_head = inverse(scan.head.scanhead_from_tracker)
+        mounted = corrected(self.scan, (name for name in corrections if name.startswith(("lever", "quarter"))))
+        tracker_from_head = inverse(mounted.head.scanhead_from_tracker)
         on_tracker = apply(tracker_from_head, surface.reshape(-1, 3)[self.taxels[transposed]])
-        poses = poses_at(scan.poses, scan.frames.time_s[self.frames], latency_ms=self.latency_ms)
-        rotation = block_means(poses.rotation.reshape(-1, 9), coarse.first).reshape(-1, 3, 3)
-        centre = block_means(poses.position_mm, coarse.first)
+        rotation, centre = self._path(tuple(name for name in corrections if name in _ROTATIONS[-1]))
         place = centre[:, None] + (rotation @ (coarse.weight.T @ on_tracker).T).transpose(0, 2, 1)
         axes = np.linalg.eigh(np.cov(place.reshape(-1, 3).T))[1]
         agreement = abs(float(axes[:, 0] @ (rotation @ tracker_from_head[:3, 2]).mean(axis=0)))
         return np.asarray(place @ axes[:, [2, 1]]), agreement
+
+    def _path(self, rotations: Corrections) -> tuple[FloatArray, FloatArray]:
+        """(m, 3, 3) mean rotations and (m, 3) mean places of the tracker at the averaged frames."""
+        if rotations not in self.paths:
+            scan, first = corrected(self.scan, rotations), self.coarse[0].first
+            poses = poses_at(scan.poses, scan.frames.time_s[self.frames], latency_ms=self.latency_ms)
+            means = block_means(poses.rotation.reshape(-1, 9), first).reshape(-1, 3, 3)
+            self.paths[rotations] = means, block_means(poses.position_mm, first)
+        return self.paths[rotations]

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from campaign_files import arrays_of
 from in_process import run_here
 from map_files import PROVENANCE, plain_map
 from mapping_scans import make_scan, strokes
@@ -40,25 +41,9 @@ def test_a_scan_file_keeps_the_nipple(tmp_path: Path, nipple: bool) -> None:
     assert (b"nipple" in path.read_bytes()) is nipple  # no channel without a touch: old scans keep their bytes
 
 
-def arrays_of(**more: np.ndarray) -> dict[str, np.ndarray]:
-    scan = scan_of(nipple=False)
-    return {
-        "counts": scan.frames.counts,
-        "frame_time_s": scan.frames.time_s,
-        "position_mm": scan.poses.position_mm,
-        "quaternion_wxyz": scan.poses.quaternion_wxyz,
-        "pose_time_s": scan.poses.time_s,
-        "gain_kpa_per_count": scan.element_calibration.gain_kpa_per_count,
-        "offset_kpa": scan.element_calibration.offset_kpa,
-        "pitch_mm": np.array(scan.head.pitch_mm),
-        "array_from_tracker": scan.head.scanhead_from_tracker,
-        "head_surface_mm": scan.head.surface_mm,
-    } | more
-
-
 def test_import_takes_the_nipple_and_says_so(tmp_path: Path) -> None:
     marks = np.stack([NOTCH, XIPHOID])
-    np.savez(tmp_path / "scan.npz", **arrays_of(landmarks_mm=marks, nipple_mm=NIPPLE))
+    np.savez(tmp_path / "scan.npz", **arrays_of(scan_of(nipple=False)), landmarks_mm=marks, nipple_mm=NIPPLE)
     done = run_here("import", "scan.npz", "-o", "scan.mcap", cwd=tmp_path)
     assert "landmarks: sternal notch, xiphoid and nipple" in done.stdout
     np.testing.assert_array_equal(read_scan(tmp_path / "scan.mcap").landmarks.nipple_mm, NIPPLE)
@@ -75,7 +60,7 @@ def test_import_takes_the_nipple_and_says_so(tmp_path: Path) -> None:
     ],
 )
 def test_a_nipple_that_cannot_be_one_is_refused(tmp_path: Path, more: dict[str, np.ndarray], message: str) -> None:
-    np.savez(tmp_path / "scan.npz", **arrays_of(**more))
+    np.savez(tmp_path / "scan.npz", **arrays_of(scan_of(nipple=False)) | more)
     done = run_here("import", "scan.npz", "-o", "scan.mcap", cwd=tmp_path)
     assert done.returncode == 3
     assert message in done.stderr
