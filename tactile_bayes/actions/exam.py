@@ -23,8 +23,9 @@ from tactile_bayes.exports.run import Outputs, export, refuse_untaken
 from tactile_bayes.files.atomic import check_suffix, refuse_existing, unwritable, write_bytes
 from tactile_bayes.files.documents import dump_json, with_session
 from tactile_bayes.files.estimate_json import StatedSize, read_stated_size
+from tactile_bayes.files.grids import read_grid
 from tactile_bayes.files.identify import describe
-from tactile_bayes.files.imports import read_arrays, read_grid
+from tactile_bayes.files.imports import read_arrays
 from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.files.provenance import Provenance, hash_inputs
 from tactile_bayes.files.scan_mcap import read_scan, read_scan_report, read_truth, write_scan

@@ -20,8 +20,9 @@ from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.column_map import read_mapping, read_wide
 from tactile_bayes.files.documents import parse_toml, read_protocol
 from tactile_bayes.files.estimate_json import read_stated_size
+from tactile_bayes.files.grids import read_grid
 from tactile_bayes.files.identify import describe
-from tactile_bayes.files.imports import read_arrays, read_grid
+from tactile_bayes.files.imports import read_arrays
 from tactile_bayes.files.instrument_json import read_landmarks
 from tactile_bayes.files.map_nc import read_map, write_map
 from tactile_bayes.files.npz import CheckpointFile

@@ -182,7 +182,7 @@ def _jsons(folder: Path) -> list[bytes]:
 
 
 def _map(folder: Path) -> bytes:
-    from tactile_bayes.files.imports import read_grid
+    from tactile_bayes.files.grids import read_grid
     from tactile_bayes.files.map_nc import write_map
     from tactile_bayes.files.provenance import Provenance
 
@@ -250,7 +250,7 @@ def _read_arrays(path: Path) -> object:
 
 
 def _read_grid(path: Path) -> object:
-    from tactile_bayes.files.imports import read_grid
+    from tactile_bayes.files.grids import read_grid
 
     return read_grid(path, spacing_mm=None if path.suffix == ".npz" else 1.0)
 
