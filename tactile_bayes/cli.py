@@ -14,57 +14,45 @@ from tactile_bayes import __version__
 from tactile_bayes.errors import EXIT_FAULT, EXIT_INTERRUPTED, EXIT_READER_GONE, EXIT_USAGE, TactileBayesError
 from tactile_bayes.shell import ReaderGoneError, ended_in_order, protect_streams, release_streams
 
-# name -> (function in a module under tactile_bayes.commands, one line of help); imported when its command runs.
-COMMANDS: dict[str, tuple[str, str]] = {
-    "demo": ("exam.demo_command", "Run the main job on an embedded scan: map, estimate, the report of a trial."),
-    "import": ("exam.import_command", "Bring other people's arrays, grids and images in."),
-    "check": ("exam.check_command", "Check that array, lever arm and quaternions of scans are as they are stated."),
-    "map": ("estimate.map_command", "Build a tactile map from one or more scans (paper steps i-iii)."),
-    "calibrate": ("calibrate.command", "Learn a calibration: `calibrate size`, `calibrate array`."),
-    "estimate": ("estimate.estimate_command", "Lump size with a credible interval from tactile maps."),
-    "compare": ("estimate.compare_command", "Compare a mass's size at two visits and more: has it grown?"),
-    "report": ("estimate.report_command", "Write one page of an exam to read and to print."),
-    "diagnose": (
-        "exam.diagnose_command",
-        "Check a posterior's draws: R-hat, effective draws, trace, rank and corner figures.",
-    ),
-    "validate": ("trial.validate_command", "Compare sizes with excision: accuracy of each modality."),
-    "campaign": (
-        "trial.campaign_command",
-        "From a folder of exams to the trial's report: `campaign init`, `campaign run`.",
-    ),
-    "export": ("exam.export_command", "Write maps and estimates as DICOM, FHIR, NRRD (3D Slicer) or CSV (REDCap)."),
-    "plan": ("trial.plan_command", "Plan a trial: power and the worth of more maps, by simulation."),
-    "study": (
-        "laboratory.study_command",
-        "Run the forward study: amplitude and width over sizes, depths, stiffnesses.",
-    ),
-    "tables": ("laboratory.tables_command", "Compute Tables 1 and 2 of the paper again."),
-    "head": ("laboratory.head_command", "How evenly a scan head presses, and the head that does best."),
-    "compare-model": (
-        "laboratory.compare_model_command",
-        "Compare a scan's frames and map with a forward model of a scene.",
-    ),
-    "tradeoff": (
-        "tradeoff.tradeoff_command",
-        "Measure what more accuracy costs, here and now: `tradeoff estimate`, `map`, `forward`.",
-    ),
-    "population": (
-        "laboratory.population_command",
-        "Simulate and fit exams of varied bodies: what a calibration is learned from.",
-    ),
-    "sbc": (
-        "laboratory.sbc_command",
-        "Check the posterior of a map against itself: ranks and coverage on simulated maps.",
-    ),
-    "simulate": ("laboratory.simulate_command", "Make a scan with known truth from a scene."),
-    "record": ("devices.record_command", "Record a scan head and a tracker into a scan file."),
-    "repair": ("devices.repair_command", "Close a scan file that was cut off: what is intact is kept."),
-    "replay": ("devices.replay_command", "Play a scan through the path of a recording, with the live view."),
-    "devices": ("devices.devices_command", "List the serial ports with a guess at what is on them."),
-    "emulate": ("devices.emulate_command", "Serve a scan as a scan head or a tracker would send it."),
-    "show": ("exam.show_command", "Say what any of our files is and how good it is."),
+# group -> name -> (function in a module under tactile_bayes.commands, imported when it runs; one line of help)
+GROUPS: dict[str, dict[str, tuple[str, str]]] = {
+    "An exam, from scan to size": {
+        "demo": ("exam.demo_command", "Run the main job on an embedded scan, and a trial's report."),
+        "import": ("exam.import_command", "Bring other people's arrays, grids and images in."),
+        "check": ("exam.check_command", "Check how the array, sensor and rotations of a scan lie."),
+        "map": ("estimate.map_command", "Build a tactile map from one or more scans."),
+        "estimate": ("estimate.estimate_command", "Lump size with a credible interval from tactile maps."),
+        "report": ("estimate.report_command", "Write one page of an exam to read and to print."),
+        "compare": ("estimate.compare_command", "Compare a mass's size at two visits and more: has it grown?"),
+        "show": ("exam.show_command", "Say what any of our files is and how good it is."),
+        "export": ("exam.export_command", "Write DICOM, FHIR, NRRD (3D Slicer) or CSV (REDCap)."),
+    },
+    "A trial": {
+        "campaign": ("trial.campaign_command", "From a folder of exams to the trial's report."),
+        "validate": ("trial.validate_command", "Compare sizes with excision: accuracy of each modality."),
+        "plan": ("trial.plan_command", "Plan a trial: how many patients, how many maps of a mass."),
+    },
+    "Devices": {
+        "record": ("devices.record_command", "Record a scan head and a tracker into a scan file."),
+        "repair": ("devices.repair_command", "Close a scan file that was cut off: what is intact is kept."),
+        "replay": ("devices.replay_command", "Play a scan as if it were recorded, with the live view."),
+        "devices": ("devices.devices_command", "List the serial ports with a guess at what is on them."),
+        "emulate": ("devices.emulate_command", "Serve a scan as a scan head or a tracker would send it."),
+    },
+    "The laboratory": {
+        "calibrate": ("calibrate.command", "Learn a calibration of sizes or of an array."),
+        "diagnose": ("exam.diagnose_command", "Check a posterior's draws: convergence and figures."),
+        "simulate": ("laboratory.simulate_command", "Make a scan with known truth from a scene."),
+        "study": ("laboratory.study_command", "Amplitude and width over sizes, depths and stiffnesses."),
+        "tables": ("laboratory.tables_command", "Compute Tables 1 and 2 of the paper again."),
+        "head": ("laboratory.head_command", "How evenly a scan head presses, and the best head."),
+        "population": ("laboratory.population_command", "Simulate exams of varied bodies, to calibrate with."),
+        "sbc": ("laboratory.sbc_command", "Check the posterior of a map against simulated maps."),
+        "compare-model": ("laboratory.compare_model_command", "Compare a scan and its map with a forward model."),
+        "tradeoff": ("tradeoff.tradeoff_command", "Measure what more accuracy costs, here and now."),
+    },
 }
+COMMANDS = {name: found for group in GROUPS.values() for name, found in group.items()}
 
 
 class LazyGroup(click.Group):
@@ -96,8 +84,10 @@ class LazyGroup(click.Group):
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         del ctx
-        with formatter.section("Commands"):
-            formatter.write_dl([(name, text) for name, (_, text) in COMMANDS.items()])
+        width = max(map(len, COMMANDS))
+        for title, group in GROUPS.items():
+            with formatter.section(title):
+                formatter.write_dl([(name.ljust(width), text) for name, (_, text) in group.items()])
 
 
 @click.group(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
@@ -105,8 +95,7 @@ class LazyGroup(click.Group):
 def cli() -> None:
     """Lump size with an honest credible interval from tactile maps. Research use only.
 
-    The way through: import (or simulate) -> map -> estimate -> validate.
-    Start with `tactile-bayes demo`.
+    Start with `tactile-bayes demo`; the way through is import, map, estimate, report.
     """
 
 

@@ -15,6 +15,7 @@ from typing import Any, TextIO
 
 from tactile_bayes.errors import UsageError
 from tactile_bayes.progress import Progress, untold
+from tactile_bayes.terminal import columns_of, dressed, has_styles
 
 # --- All printing: control characters are escaped, and a full disk is one error line.
 
@@ -36,7 +37,7 @@ def printable(text: str) -> str:
 
 
 class PrintableStream:
-    """A text stream that escapes control characters; all else goes to the stream underneath.
+    """A text stream that escapes control characters and, on a terminal, fits its width; else as the one underneath.
 
     A failed write is an error where `required` (standard output), else let go (standard error: no one could be told).
     """
@@ -56,7 +57,10 @@ class PrintableStream:
 
     def write(self, text: str) -> int:
         """Write the text, made printable."""
-        self._try(self._stream.write, printable(text))
+        shown = printable(text)
+        if columns := columns_of(self._stream):
+            shown = dressed(shown, columns=columns, styles=has_styles())
+        self._try(self._stream.write, shown)
         return len(text)
 
     def flush(self) -> None:

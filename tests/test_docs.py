@@ -89,7 +89,7 @@ def test_examples_in_the_help_parse():
                 pytest.fail(f"help of {' '.join(words)}: {text!r}: {error.format_message()}")
 
 
-@pytest.mark.parametrize("words", ["nothing", "map --no-such-option", "map scan.mcap", "map a -o b --normalise twice"])
+@pytest.mark.parametrize("words", ["nothing", "map --no-such-option", "report map.nc", "map a -o b --normalise twice"])
 def test_a_wrong_example_would_be_found(words):
     with pytest.raises(click.UsageError):
         check_words(tuple(words.split()))

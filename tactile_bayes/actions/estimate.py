@@ -37,7 +37,7 @@ from tactile_bayes.report.exam_page import PageFiles
 from tactile_bayes.report.exam_words import Given, headline
 from tactile_bayes.report.figure_file import named_exam
 from tactile_bayes.report.map_figure import map_figure
-from tactile_bayes.report.map_text import map_text
+from tactile_bayes.report.map_text import map_summary, map_text
 from tactile_bayes.report.pooled import pooled_summary, pooled_text
 from tactile_bayes.shell import progress_bar
 
@@ -45,13 +45,17 @@ from tactile_bayes.shell import progress_bar
 
 
 def map_action(
-    scans: tuple[Path, ...], output: Path, figure: Path | None, force: bool, verbose: bool, **options: Any
+    scans: tuple[Path, ...], output: Path | None, figure: Path | None, force: bool, verbose: bool, **options: Any
 ) -> None:
     """Build a tactile map from one scan, or one common map from several scans of the same examination."""
     from tactile_bayes.files.scan_mcap import read_scan
 
     if twice := given_twice(scans):
         raise UsageError(f"{twice} is given twice; its frames would count twice: give each scan once")
+    if output is None:
+        output = beside(scans[0])
+        if output.exists() and not force:
+            raise UsageError(f"{output} exists; name another with -o, or give --force")
     refuse_existing(output, figure, force=force)
     settings = to_plain(MapOptions(**options), digits=EXACT)
     clock = _Clock(verbose)
@@ -70,7 +74,13 @@ def map_action(
             map_figure(tactile_map, figure, title=title, force=force)
         clock.tell("write")
     finally:  # the map is written, whatever becomes of the figure
-        click.echo(map_text(tactile_map), nl=False)
+        text = map_text(tactile_map) if verbose else map_summary(tactile_map, written=str(output))
+        click.echo(text, nl=False)
+
+
+def beside(scan: Path) -> Path:
+    """Where the map of a scan is written if no one says so: in its folder, and named after it."""
+    return scan.with_name("map.nc" if scan.stem == "scan" else f"{scan.stem}.nc")
 
 
 class _Clock:

@@ -319,7 +319,7 @@ class Steps(Record):
 
     def _run(self, command: click.Command, name: str, **parameters: Any) -> None:
         # typed again, it meets what the demo made
-        click.secho(f"$ {PROGRAM} {name} {_as_typed(command, parameters | {'force': True})}", bold=True)
+        click.echo(f"$ {PROGRAM} {name} {_as_typed(command, parameters | {'force': True})}")
         try:
             self.ctx.invoke(command, **parameters, force=self.force)
         except click.exceptions.Exit as end:  # a step that says its exit code; anything but 0 ends the demo with it

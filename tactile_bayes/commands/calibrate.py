@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from tactile_bayes.commands.options import FORCE, METAVAR, FigurePath, FilePath, takes
+from tactile_bayes.commands.options import FORCE, METAVAR, CommandGroup, FigurePath, FilePath, takes
 from tactile_bayes.options import LearnOptions
 
 # --- `calibrate`: learn a calibration from known objects, and a site's repeatability from its own exams.
@@ -14,7 +14,7 @@ from tactile_bayes.options import LearnOptions
 _FILE = FilePath()
 
 
-@click.group("calibrate")
+@click.group("calibrate", cls=CommandGroup)
 def command() -> None:
     """Learn a calibration from known objects."""
 

@@ -22,18 +22,23 @@ _FILE = FilePath()
 @click.command("map")
 @click.argument("scans", metavar="SCAN.mcap...", nargs=-1, required=True, type=_FILE)
 @click.option(
-    "-o", "--output", required=True, metavar="MAP.nc", type=FilePath(writes="netCDF"), help="Where to write the map."
+    "-o",
+    "--output",
+    metavar="MAP.nc",
+    type=FilePath(writes="netCDF"),
+    help="Where to write the map. Default: beside the first scan; map.nc for scan.mcap, s01.nc for s01.mcap.",
 )
 @takes(MapOptions, *names_of(MapOptions))
 @click.option("--figure", metavar=METAVAR, type=FigurePath(), help="Draw the map and its coverage.")
 @FORCE
-@click.option("-v", "--verbose", is_flag=True, help="Print the time of each step on stderr.")
+@click.option("-v", "--verbose", is_flag=True, help="Print all figures of the map; times on stderr.")
 def map_command(**given: Any) -> None:
     """Build a tactile map from one scan, or one common map from several scans of the same examination.
 
     The plane of the motion is fitted, frames outside the pressure window are left out, the rest are normalised,
-    projected on the plane and averaged in cells. What was left out is printed with its reason. From frames that feel
-    no lump it takes how the pressure is spread over the head, which tells `estimate` how deep the fat is.
+    projected on the plane and averaged in cells. Printed are whether the map is sound, and what was left out and why.
+    From frames that feel no lump it takes how the pressure is spread over the head, which tells `estimate` how deep the
+    fat is.
 
     Example: tactile-bayes map scan.mcap -o map.nc --figure map.png
     """

@@ -12,6 +12,7 @@ from tactile_bayes.commands.options import (
     METAVAR,
     SESSION,
     WORKERS,
+    CommandGroup,
     FigurePath,
     FilePath,
     FiniteRange,
@@ -226,7 +227,7 @@ def tables_command(**given: Any) -> None:
 # --- `head`: how evenly a scan head presses, and the head that presses most evenly (section 2.1 of the paper).
 
 
-@click.group("head")
+@click.group("head", cls=CommandGroup)
 def head_command() -> None:
     """How evenly a scan head presses on tissue without a lump: the homogeneous-pressure condition of section 2.1."""
 

@@ -108,6 +108,20 @@ def refuse_same(
             raise UsageError(f"{path} is {what}; choose another name for the output")
 
 
+# --- A command of commands.
+
+
+class CommandGroup(click.Group):
+    """A group whose help has the first sentence of each of its commands, whole."""
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """List the commands."""
+        commands = {name: self.get_command(ctx, name) for name in self.list_commands(ctx)}
+        whole = [(name, found.get_short_help_str(limit=1000)) for name, found in commands.items() if found is not None]
+        with formatter.section("Commands"):
+            formatter.write_dl(whole)
+
+
 # --- Options that name a figure to write.
 
 METAVAR: Final = "FIG.png|.pdf|.svg"

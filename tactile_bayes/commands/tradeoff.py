@@ -7,7 +7,17 @@ from typing import Any
 import click
 
 from tactile_bayes.api.settings import Settings
-from tactile_bayes.commands.options import FORCE, JSON, METAVAR, FigurePath, FilePath, FiniteRange, head_option, takes
+from tactile_bayes.commands.options import (
+    FORCE,
+    JSON,
+    METAVAR,
+    CommandGroup,
+    FigurePath,
+    FilePath,
+    FiniteRange,
+    head_option,
+    takes,
+)
 
 # --- What `tradeoff estimate` and `tradeoff map` share: options, the forecast on stderr, and the output.
 
@@ -32,7 +42,7 @@ CALIBRATION = click.option(
 )
 
 
-@click.group("tradeoff")
+@click.group("tradeoff", cls=CommandGroup)
 def tradeoff_command() -> None:
     """Measure what more accuracy costs on this machine, and which of it a case does not need."""
 

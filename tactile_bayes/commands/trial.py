@@ -7,7 +7,16 @@ from typing import Any
 import click
 
 from tactile_bayes.api.settings import Settings
-from tactile_bayes.commands.options import FORCE, JSON, WORKERS, FilePath, FiniteRange, scheduler_option, takes
+from tactile_bayes.commands.options import (
+    FORCE,
+    JSON,
+    WORKERS,
+    CommandGroup,
+    FilePath,
+    FiniteRange,
+    scheduler_option,
+    takes,
+)
 from tactile_bayes.declarations import names_of
 from tactile_bayes.options import MOST_ITEMS, MapOptions, PlanErrors, TrialSettings
 
@@ -113,7 +122,7 @@ def plan_command(**given: Any) -> None:
 # --- `campaign`: from a folder of exams to the trial's report.
 
 
-@click.group("campaign")
+@click.group("campaign", cls=CommandGroup)
 def campaign_command() -> None:
     """From a folder of exams to the trial's report, in one resumable run."""
 

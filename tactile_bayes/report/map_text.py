@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_bayes.findings import finding_lines
+from tactile_bayes.findings import finding_lines, verdict
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.hardware.live import LiveState, colour_limits, grey_levels
 from tactile_bayes.hardware.recorder import Report
@@ -193,7 +193,7 @@ def _shades(values: FloatArray) -> list[list[str]]:
     return [[_SHADES[i] for i in row] for row in index]
 
 
-# --- Text report of a tactile map: a table with units, then what was left out.
+# --- Text report of a tactile map: its verdict in a few lines, or a table with units, then what was left out.
 
 _LISTED_TAXELS = 8
 # Leaving out more frames than this share for their pressure is worth a word about the window.
@@ -203,11 +203,36 @@ _UNITS = {
     "gain": "times the level beside a lump (normalise gain)",
 }
 _DROPPED = (
-    ("dropped_low", "mean pressure below the window"),
-    ("dropped_high", "mean pressure above the window"),
+    ("dropped_low", "pressed below the window"),
+    ("dropped_high", "pressed above the window"),
     ("dropped_no_pose", "without a tracker pose"),
     ("dropped_elements", "with too few valid taxels"),
 )
+
+
+def map_summary(tactile_map: TactileMap, *, written: str) -> str:
+    """Short report of a map: its verdict with the figures that lead to it, and the names of the files written."""
+    findings, quality = tactile_map.findings, tactile_map.quality
+    rows, columns = tactile_map.mean.shape
+    cell = tactile_map.recipe.cell_mm
+    used = dict(_frames(tactile_map)).get("frames used", "")
+    number, *more = used.split(", ")
+    figures = [f"{number} frames", *more] if used else []
+    if "coverage" in quality:
+        figures.append(f"{100 * quality['coverage']:.0f} % covered")
+    if "stroke_lag_mm" in quality:
+        figures.append(f"stroke lag {quality['stroke_lag_mm']:+.1f} +- {quality['stroke_lag_sd_mm']:.1f} mm")
+    dropped = "; ".join(_dropped(tactile_map))
+    lines = [
+        *finding_lines(findings, "caution"),
+        f"{verdict(findings, answered=True)}: {', '.join(figures)}",
+        *([f"left out: {dropped}"] if dropped else []),
+        f"written: {written}, {columns * cell:g} x {rows * cell:g} mm in cells of {cell:g} mm",
+        *finding_lines(findings, "check"),
+        *_advice(quality),
+        "More (timing, plane, pressure, noise): map -v.",
+    ]
+    return "\n".join([*lines, RESEARCH_USE]) + "\n"
 
 
 def map_text(tactile_map: TactileMap) -> str:
@@ -243,12 +268,17 @@ def _frames(tactile_map: TactileMap) -> Iterator[tuple[str, str]]:
     scans = f", {quality['scans']:.0f} scans" if quality.get("scans", 1) > 1 else ""
     every = f", one of every {quality['frames_every']:.0f} of the scan" if "frames_every" in quality else ""
     yield "frames used", f"{quality['frames_used']:.0f} of {quality['frames_total']:.0f}{scans}{every}"
-    window = tactile_map.recipe.pressure_window_kpa
+    yield from (("  left out", text) for text in _dropped(tactile_map))
+    yield "mean pressure", f"{quality['mean_pressure_kpa']:.1f} kPa"
+
+
+def _dropped(tactile_map: TactileMap) -> Iterator[str]:
+    """How many frames were left out for each reason."""
+    quality, window = tactile_map.quality, tactile_map.recipe.pressure_window_kpa
     for name, reason in _DROPPED:
         if quality.get(name):
             limits = f" of {window[0]:g} to {window[1]:g} kPa" if window and "window" in reason else ""
-            yield "  left out", f"{quality[name]:.0f} {reason}{limits}"
-    yield "mean pressure", f"{quality['mean_pressure_kpa']:.1f} kPa"
+            yield f"{quality[name]:.0f} {reason}{limits}"
 
 
 def _timing(tactile_map: TactileMap) -> Iterator[tuple[str, str]]:
@@ -376,6 +406,11 @@ def _notes(tactile_map: TactileMap) -> Iterator[str]:
         yield f"{quality['few_cells']:.0f} cells have fewer than {FEW_READINGS} readings: noisy, mostly at the rim"
     if quality.get("negative_readings"):
         yield f"{quality['negative_readings']:.0f} readings below 0 kPa were kept as they are"
+    yield from _advice(quality)
+
+
+def _advice(quality: Mapping[str, float]) -> Iterator[str]:
+    """What could be done better, or would bend a size."""
     gated = quality.get("dropped_low", 0.0) + quality.get("dropped_high", 0.0)
     if gated > _MUCH_GATED * quality.get("frames_total", np.inf):
         ends = f"{quality['level_p05_kpa']:.1f} to {quality['level_p95_kpa']:.1f} kPa"

@@ -12,11 +12,14 @@ import numpy as np
 import pytest
 from in_process import run_here
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.files.map_nc import read_map, read_map_and_header
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.scan_mcap import write_scan
+from tactile_bayes.findings import Finding
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.report.map_text import map_summary
 from tactile_bayes.scan import Landmarks, Scan
 
 
@@ -64,14 +67,46 @@ def test_scans_become_the_map_the_function_builds(folder, run_cli):
 
 
 def test_the_table_says_what_was_used_and_what_was_left_out(folder, run_cli):
-    lines = run_cli("map", "one.mcap", "two.mcap", "-o", "map.nc", cwd=folder).stdout.splitlines()
+    lines = run_cli("map", "one.mcap", "two.mcap", "-o", "map.nc", "-v", cwd=folder).stdout.splitlines()
     table = {line[:15].strip(): line[15:].strip() for line in lines if line}
     assert table["frames used"] == "115 of 120, 2 scans"
-    assert table["left out"] == "5 mean pressure below the window of 5 to 14 kPa"
+    assert table["left out"] == "5 pressed below the window of 5 to 14 kPa"
     assert re.fullmatch(r"rms 0\.0 mm, 0\.0 deg from the head's face", table["plane"])
     assert table["resolves"] == "lumps of map width sigma 1.3 mm or more"
     assert table["patient axes"] == "from the landmarks, repeats within 0.0 mm"
     assert lines[-1] == RESEARCH_USE
+
+
+def test_a_verdict_leads_and_laboratory_figures_are_for_v(folder, run_cli):
+    done = run_cli("map", "one.mcap", "two.mcap", "-o", "map.nc", cwd=folder)
+    lines = [line for line in done.stdout.splitlines() if not line.startswith("To check: ")]
+    written = read_map(folder / "map.nc")
+    assert re.fullmatch(r"sound: 115 of 120 frames, 2 scans, \d+ % covered.*", lines[0]), lines[0]
+    assert f"{100 * written.quality['coverage']:.0f} % covered" in lines[0]
+    assert lines[1] == "left out: 5 pressed below the window of 5 to 14 kPa"
+    assert lines[2].startswith("written: map.nc, ")
+    assert (len(lines), lines[-1]) == (5, RESEARCH_USE)
+
+
+def test_a_caution_makes_the_verdict_doubtful():
+    sound = build_map(small_scan())
+    late = replace(sound, findings=(*sound.findings, Finding("late_poses", "poses came late")))
+    assert [map_summary(one, written="a.nc").split(":")[0] for one in (sound, late)] == ["sound", "CAUTION"]
+    assert "\ndoubtful: 115 of 120" in map_summary(late, written="a.nc")
+
+
+def test_a_map_without_a_name_is_beside_its_scan_and_named(folder, run_cli):
+    (folder / "exams").mkdir()
+    (folder / "one.mcap").rename(folder / "exams" / "one.mcap")
+    (folder / "two.mcap").rename(folder / "exams" / "scan.mcap")
+    for scan, name in (("one", "one"), ("scan", "map")):
+        done = run_cli("map", f"exams/{scan}.mcap", cwd=folder)
+        assert done.returncode == 0, done.stderr
+        assert f"written: exams/{name}.nc," in done.stdout
+        read_map(folder / "exams" / f"{name}.nc")
+    done = run_cli("map", "exams/one.mcap", cwd=folder)
+    assert (done.returncode, done.stderr) == (2, "error: exams/one.nc exists; name another with -o, or give --force\n")
+    assert run_cli("map", "exams/one.mcap", "--force", cwd=folder).returncode == 0
 
 
 def test_equal_inputs_give_equal_bytes_and_no_names(folder, run_cli):
@@ -83,7 +118,7 @@ def test_equal_inputs_give_equal_bytes_and_no_names(folder, run_cli):
 
 
 def test_options_reach_the_map(folder, run_cli):
-    options = ["--cell-mm", 2, "--pressure-window-kpa", 6, 12, "--normalise", "none", "--latency-ms", 4.5]
+    options = ["--cell-mm", 2, "--pressure-window-kpa", 6, 12, "--normalise", "none", "--latency-ms", 4.5, "-v"]
     done = run_cli("map", "one.mcap", "-o", "map.nc", *options, cwd=folder)
     assert done.returncode == 0, done.stderr
     recipe = read_map(folder / "map.nc").recipe
@@ -97,7 +132,7 @@ def test_options_reach_the_map(folder, run_cli):
 
 
 def test_gain_says_how_it_settled(folder, run_cli):
-    done = run_cli("map", "two.mcap", "-o", "map.nc", "--normalise", "gain", cwd=folder)
+    done = run_cli("map", "two.mcap", "-o", "map.nc", "--normalise", "gain", "-v", cwd=folder)
     assert re.search(r"gain solve +\d+ passes, last change \d\.\de-\d+", done.stdout)
 
 

@@ -52,7 +52,7 @@ from tactile_bayes.report.compare import Growth, compare_summary, compare_text, 
 from tactile_bayes.report.estimate_figures import draw_comparison
 from tactile_bayes.report.exam_page import exam_page
 from tactile_bayes.report.map_figure import map_figure
-from tactile_bayes.report.map_text import map_text
+from tactile_bayes.report.map_text import map_summary, map_text
 from tactile_bayes.report.pages import SIZED, Card, campaign_html
 from tactile_bayes.report.pooled import pooled_summary, pooled_text
 
@@ -228,7 +228,8 @@ def fhir(file: Any) -> str:
 
 OUTPUTS: dict[str, Output] = {
     "scan: show": Output(stored_scan, paper=False),
-    "map: text": Output(lambda made: map_text(made.map), paper=False),
+    "map: text": Output(lambda made: map_summary(made.map, written="a.nc"), paper=False, verdict="{}: "),
+    "map: text -v": Output(lambda made: map_text(made.map), paper=False),
     "map: file, show": Output(stored_map, paper=False),
     "map: figure": Output(lambda made: figure_words(map_figure(made.map, None)), paper=True),
     "map: Python": Output(lambda made: words_of(Map(made.map)._repr_html_()) and repr(Map(made.map)), paper=True),
