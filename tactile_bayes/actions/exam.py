@@ -23,7 +23,8 @@ from tactile_bayes.exports.run import Outputs, export, refuse_untaken
 from tactile_bayes.files.atomic import check_suffix, refuse_existing, unwritable, write_bytes
 from tactile_bayes.files.documents import dump_json, with_session
 from tactile_bayes.files.estimate_json import StatedSize, read_stated_size
-from tactile_bayes.files.grids import read_grid
+from tactile_bayes.files.grid_files import open_grid
+from tactile_bayes.files.grids import grid_map
 from tactile_bayes.files.identify import describe
 from tactile_bayes.files.imports import read_arrays
 from tactile_bayes.files.map_nc import write_map
@@ -49,6 +50,7 @@ def import_action(
     spacing_mm: float | None,
     normalise: str | None,
     units: str | None,
+    no_value: tuple[str, ...],
     corrections: tuple[str, ...],
     session_file: Path | None,
     force: bool,
@@ -59,8 +61,8 @@ def import_action(
         as_map = output.suffix.lower() == ".nc" and source.suffix.lower() != ".mcap"
         kind = "scan" if source.suffix.lower() in (".npz", ".mcap") and not as_map else "map"
     check_suffix(output, "MCAP" if kind == "scan" else "netCDF")
-    if kind == "scan" and (spacing_mm is not None or normalise is not None or units is not None):
-        raise UsageError("--spacing-mm, --normalise and --units are for maps; leave them out or give --as map")
+    if kind == "scan" and (spacing_mm is not None or normalise is not None or units is not None or no_value):
+        raise UsageError("--spacing-mm, --normalise, --units and --no-value are for maps: leave out, or give --as map")
     if kind == "map" and (session_file is not None or corrections):
         raise UsageError("--session and --correct are for scans; leave them out or give --as scan")
     if units is not None and normalise not in (None, "none"):
@@ -70,9 +72,8 @@ def import_action(
     if kind == "scan":
         lines = _import_scan(source, output, corrections, session_file, force=force)
     else:
-        lines = _import_map(
-            source, output, spacing_mm=spacing_mm, normalise=normalise or "none", units=units or "", force=force
-        )
+        asked = {"normalise": normalise or "none", "units": units or "", "no_value": no_value}
+        lines = _import_map(source, output, spacing_mm, asked, force=force)
     for line in (f"{output}: {kind}", *lines, RESEARCH_USE):
         click.echo(line)
 
@@ -124,10 +125,14 @@ def check_action(*, scans: tuple[Path, ...], pressure_window_kpa: tuple[float, f
 
 
 def _import_map(
-    source: Path, output: Path, *, spacing_mm: float | None, normalise: str, units: str, force: bool
+    source: Path, output: Path, spacing_mm: float | None, asked: dict[str, Any], *, force: bool
 ) -> list[str]:
-    tactile_map = read_grid(source, spacing_mm=spacing_mm, normalise=normalise, units=units)
-    settings = {"as": "map", "spacing_mm": tactile_map.recipe.cell_mm, "normalise": normalise, "units": units}
+    try:
+        grid = open_grid(source, no_value=asked["no_value"])
+        tactile_map, notes = grid_map(grid, spacing_mm=spacing_mm, **asked)
+    except BadDataError as error:
+        raise error.at(source) from None
+    settings = {"as": "map", "spacing_mm": tactile_map.recipe.cell_mm, **asked, "notes": notes}
     provenance = Provenance("import", settings, inputs=hash_inputs(source=source))
     write_map(output, tactile_map, provenance=provenance, force=force)
     ny, nx = tactile_map.mean.shape
@@ -139,6 +144,7 @@ def _import_map(
     return [
         f"{ny} x {nx} cells of {tactile_map.recipe.cell_mm:g} mm, {covered} with data",
         f"values {low:.4g} to {high:.4g}{unit}, background level {level} (normalise {tactile_map.recipe.normalise})",
+        *notes,
     ]
 
 

@@ -69,6 +69,12 @@ def demo_command(ctx: click.Context, /, **given: Any) -> None:
     "--units", metavar="TEXT", help="Map: unit of values that are not normalised, such as kPa. Default: unknown."
 )
 @click.option(
+    "--no-value",
+    multiple=True,
+    metavar="V",
+    help="Map: a number or text that stands for no value, such as -9999; none: every number is a value.",
+)
+@click.option(
     "--correct",
     "corrections",
     type=click.Choice(tuple(CORRECTIONS)),

@@ -1,123 +1,130 @@
-"""Maps from grids that other programs wrote: tables of text, arrays and images."""
+"""Maps from grids that other programs wrote: cells without a value, the spacing, and what was divided."""
 
 from __future__ import annotations
 
-import csv
-import io
-import re
-import warnings
 from collections.abc import Sequence
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
 from tactile_bayes.errors import BadDataError, UsageError
-from tactile_bayes.files.npz import load_npz
-from tactile_bayes.files.reading import CELLS, IMAGE_BYTES, TABLE_BYTES, check_limit, decoding, read_bytes
-from tactile_bayes.geometry import FloatArray
+from tactile_bayes.files.grid_files import Grid, is_number, open_grid
+from tactile_bayes.geometry import BoolArray, FloatArray
 from tactile_bayes.mapping.map import MapRecipe, TactileMap
 
-# --- A grid of numbers in a text table, as programs and spreadsheets write it.
-#
-# Fields are separated by semicolons where the file has one, else by tabs where it has one, else by commas. With
-# semicolons or tabs a comma is a decimal comma, as a spreadsheet writes it under the settings of many countries.
+# --- Cells without a value: what stands for "no value" is declared by the file or by the caller, or stands apart.
 
-_WAY_OUT: Final = "give a table of numbers, such as .csv"
-_UTF_16: Final = (b"\xff\xfe", b"\xfe\xff")
-_THOUSANDS: Final = re.compile(r"[+-]?[1-9][0-9]{0,2}(,[0-9]{3})+")
-_MOST_COUNTED: Final = 8
-"""A first row or column of so many numbers that counts 0, 1, 2... or 1, 2, 3... holds labels, whatever its corner."""
-
-
-def read_table(path: Path) -> FloatArray:
-    """Read a table as an (ny, nx) array, NaN where a field is empty."""
-    text = _text(path)
-    separator = next((one for one in ";\t" if one in text), ",")
-    with decoding("is not a table of text", way_out=_WAY_OUT):
-        rows = list(csv.reader(io.StringIO(text, newline=""), delimiter=separator))
-    rows = _one_block(rows)
-    if separator != ",":
-        rows = _with_points(rows)
-    values = [[_number(field, i, j) for j, field in enumerate(row, 1)] for i, row in enumerate(rows, 1)]
-    for number, row in enumerate(values, start=1):
-        if len(row) != len(values[0]):
-            what = f"row {number} has {len(row)} fields, row 1 has {len(values[0])}"
-            raise BadDataError(what, way_out="give every row one length")
-    table: FloatArray = np.array(values)
-    _refuse_labels(table)
-    return table
+ALL_ARE_VALUES: Final = "none"
+"""Given as ``--no-value`` where every number is a value."""
+_BEYOND: Final = 1e12  #: No value of a map is larger.
+_FEWEST_STEPS: Final = 20
+_TIMES: Final = 3.0
+_TIMES_OF_ONE: Final = 6.0
+"""What stands apart differs from its neighbours by so many times the largest other step; a single cell by more."""
+_MOST_CONSTANT: Final = 8
+_FEWEST_LINES: Final = 8
+_TIMES_OF_LINES: Final = 10.0
+"""A line stands apart where its median step to both sides is so many times the largest of the other lines."""
 
 
-def _text(path: Path) -> str:
-    data = read_bytes(path, most=TABLE_BYTES)
-    encoding = "utf-16" if data[:2] in _UTF_16 else "utf-8-sig"
-    try:
-        return data.decode(encoding)
-    except UnicodeDecodeError as error:
-        line = data.count(b"\n", 0, error.start) + 1
-        what = f"line {line}: byte 0x{data[error.start]:02x} is not {encoding[:6].upper().rstrip('-')} text"
-        raise BadDataError(what, way_out=_WAY_OUT) from None
+def without_values(values: FloatArray, no_value: Sequence[str]) -> tuple[FloatArray, list[str]]:
+    """The values with NaN where they are one of `no_value`, and how many there were of each."""
+    notes = []
+    for number in [float(text) for text in no_value if is_number(text)]:
+        same = (values == number) | (values == np.float64(np.float32(number)))
+        values = np.where(same, np.nan, values)
+        notes.append(f"{int(same.sum()):,} cells hold {number:g}, stated to be no value")
+    return values, notes
 
 
-def _one_block(rows: Sequence[list[str]]) -> list[list[str]]:
-    """The rows without blank lines before and after them; blank lines between them separate tables, not rows."""
-    held = [number for number, row in enumerate(rows) if len(row) > 1 or any(field.strip() for field in row)]
-    if not held:
-        raise BadDataError("is empty", way_out=_WAY_OUT)
-    gap = next((one for one, after in pairwise(held) if after > one + 1), None)
-    if gap is not None:
-        raise BadDataError(
-            f"has a blank line after row {gap - held[0] + 1}",
-            way_out="give one grid, such as one frame or a mean of frames, in a file",
-        )
-    return list(rows[held[0] : held[-1] + 1])
+def _refuse_apart(values: FloatArray) -> None:
+    """Refuse undeclared numbers that stand apart from all others, as fill values and dead lines do."""
+    values = np.where(np.isfinite(values), values, np.nan)
+    found = _apart(values)
+    if found is None:
+        for axis, name in ((1, "column"), (0, "row")):
+            if line := _line_apart(values, axis):
+                what = f"{name} {line[0]} differs from those beside it by {line[1]:.3g}, others by up to {line[2]:.3g}"
+                way_out = f"leave its cells empty if that line is dead; if all are values, --no-value {ALL_ARE_VALUES}"
+                raise BadDataError(what, way_out=way_out)
+        return
+    number, where, rest = found
+    what = f"{number:g} in {where} stands apart from all other values"
+    if rest.size:
+        what += f", {rest.min():.4g} to {rest.max():.4g}"
+    way_out = f"if it means no value, give --no-value {number:.12g}"
+    way_out += "" if abs(number) > _BEYOND else f"; if all are values, --no-value {ALL_ARE_VALUES}"
+    raise BadDataError(what, way_out=way_out)
 
 
-def _with_points(rows: Sequence[list[str]]) -> list[list[str]]:
-    """The rows with decimal points in place of decimal commas."""
-    commas = [field.strip() for row in rows for field in row if "," in field]
-    if commas and all(_THOUSANDS.fullmatch(field) for field in commas):
-        digits = commas[0].replace(",", "")
-        what = f"holds {commas[0]!r}, which is {digits} or {commas[0].replace(',', '.', 1)}"
-        raise BadDataError(what, way_out="write numbers without commas")
-    return [[field.replace(",", ".") if field.count(",") == 1 else field for field in row] for row in rows]
+def _apart(values: FloatArray) -> tuple[float, str, FloatArray] | None:
+    """A number that no smooth map holds: the lowest, the highest, or that of a line that is constant.
+
+    Its cells differ from their neighbours by several times the largest step between any other neighbours.
+    """
+    known = np.isfinite(values)
+    if not known.any():
+        return None
+    low, high = float(values[known].min()), float(values[known].max())
+    lines = [line for table in (values, values.T) for line in table if np.isfinite(line).sum() > 4]
+    constant = {float(line[np.isfinite(line)][0]) for line in lines if np.ptp(line[np.isfinite(line)]) == 0}
+    constant = constant if len(constant) <= _MOST_CONSTANT else set()
+    numbers = sorted({low, high} | constant, key=lambda one: -abs(one - float(np.median(values[known]))))
+    special = np.isin(values, numbers)
+    rest = values[known & ~special]
+    largest = _steps(values, known & ~special)
+    for number in numbers:
+        cells = values == number
+        if abs(number) > _BEYOND:
+            return number, _places(cells), rest
+        border = _border_steps(values, cells)
+        times = _TIMES if cells.sum() > 1 else _TIMES_OF_ONE
+        if len(largest) >= _FEWEST_STEPS and len(border) and np.median(border) > times * largest.max():
+            return number, _places(cells), rest
+    return None
 
 
-def _number(text: str, row: int, column: int) -> float:
-    try:
-        return float(text) if text.strip() else np.nan
-    except ValueError:
-        what = f"row {row}, column {column} holds {text.strip()[:30]!r}"
-        raise BadDataError(what, way_out="give numbers only, without a header") from None
+def _line_apart(values: FloatArray, axis: int) -> tuple[int, float, float] | None:
+    """A row or column that is dead or stuck and noisy: its number, its step to both sides, and the largest other."""
+    steps = np.abs(np.diff(values, axis=axis))
+    steps = steps if axis else steps.T
+    lines = [line[np.isfinite(line)] for line in steps.T]
+    medians = np.array([np.median(line) if len(line) > 4 else np.nan for line in lines])
+    if np.isfinite(medians).sum() < _FEWEST_LINES:
+        return None
+    for line in range(len(medians) + 1):
+        beside = medians[max(line - 1, 0) : line + 1]
+        others = np.delete(medians, range(max(line - 1, 0), min(line + 1, len(medians))))
+        if np.isfinite(beside).all() and beside.min() > _TIMES_OF_LINES * np.nanmax(others):
+            return line + 1, float(beside.min()), float(np.nanmax(others))
+    return None
 
 
-def _refuse_labels(table: FloatArray) -> None:
-    """Refuse numbers of rows and columns, or their places, in the first row and column: they are no readings."""
-    row, column = table[0], table[:, 0]
-    both = np.isnan(table[0, 0]) and _evenly(row[1:]) and _evenly(column[1:])
-    for found, line, where in ((both, row[1:], "row 1 and column 1"), (_counts(row), row, "row 1")):
-        if found:
-            _refuse(line, where)
-    if _counts(column):
-        _refuse(column, "column 1")
+def _steps(values: FloatArray, of: BoolArray) -> FloatArray:
+    """Absolute differences between neighbours that are both among the given cells."""
+    across = np.abs(np.diff(values, axis=1))[of[:, 1:] & of[:, :-1]]
+    along = np.abs(np.diff(values, axis=0))[of[1:] & of[:-1]]
+    return np.concatenate([across, along])
 
 
-def _refuse(line: FloatArray, where: str) -> None:
-    told = ", ".join(f"{value:g}" for value in line[:3])
-    way_out = "save the grid without them (pandas: to_csv(..., header=False, index=False))"
-    raise BadDataError(f"{where} count {told}... as labels do", way_out=way_out)
+def _border_steps(values: FloatArray, cells: BoolArray) -> FloatArray:
+    """Absolute differences between the given cells and those beside them."""
+    across = np.abs(np.diff(values, axis=1))[cells[:, 1:] ^ cells[:, :-1]]
+    along = np.abs(np.diff(values, axis=0))[cells[1:] ^ cells[:-1]]
+    steps: FloatArray = np.concatenate([across, along])
+    return steps[np.isfinite(steps)]
 
 
-def _evenly(line: FloatArray) -> bool:
-    """True when three numbers or more run in equal steps."""
-    steps = np.diff(line)
-    return len(line) > 2 and bool(steps[0] != 0.0) and bool(np.allclose(steps, steps[0], rtol=1e-6, atol=0.0))
-
-
-def _counts(line: FloatArray) -> bool:
-    return len(line) >= _MOST_COUNTED and line[0] in (0.0, 1.0) and bool((np.diff(line) == 1.0).all())
+def _places(cells: BoolArray) -> str:
+    """Where cells are, in a few words: whole rows or columns, or how many and the first."""
+    number = int(cells.sum())
+    for axis, name in ((0, "column"), (1, "row")):
+        whole = np.flatnonzero(cells.all(axis=axis)) + 1
+        if number and len(whole) * cells.shape[axis] == number:
+            return f"{name} {whole[0]}" if len(whole) == 1 else f"{len(whole)} {name}s ({whole[0]} to {whole[-1]})"
+    row, column = (int(i) + 1 for i in np.argwhere(cells)[0])
+    return f"{number:,} cells (row {row}, column {column}...)" if number > 1 else f"row {row}, column {column}"
 
 
 # --- Import of a grid or an image as a map.
@@ -127,72 +134,90 @@ def _counts(line: FloatArray) -> bool:
 # map show it as the file reads, first row on top and first column on the left (see `mapping.convention`). Cell
 # centres are placed about the centre of the grid, so x and y run from -(n-1)/2 to (n-1)/2 cells.
 
-IMAGE_SUFFIXES: Final = (".tif", ".tiff", ".pgm", ".png")
-TABLE_SUFFIXES: Final = (".csv", ".txt", ".tsv")
 # A map divided by its level has a median near 1; farther off than this, it was not divided.
 _NORMALISED_MEDIAN: Final = (0.2, 5.0)
 _LEAST_SPACING_MM: Final = 0.01
 _MOST_KPA: Final = 1000.0
 """Median of a grid in kPa: no examination presses with more, and as Pa it is a light touch."""
+_LONGEST_MM: Final = 500.0
+"""No examined breast is longer; frames that stand one in a row, or one below the other, are."""
 
 
-def read_grid(path: Path, *, spacing_mm: float | None = None, normalise: str = "none", units: str = "") -> TactileMap:
-    """Read a grid of values as a map: an ``.npz`` with ``mean (ny, nx)`` and, if known, ``count``, ``variance`` (NaN
-    where count is 1) and ``spacing_mm``; a table of numbers (see `read_table`), an empty field for a cell without data;
-    or a grey ``.tif``, ``.pgm`` or ``.png`` image.
-
-    `spacing_mm` is the side of the square cells and may be left out when the ``.npz`` holds it. `normalise` says what
-    was done to the values already: ``"mean"`` or ``"gain"`` when 1 is the level far from a lump, ``"none"`` when the
-    level is not known. Nothing is divided here. `units` labels values that were not divided.
-    """
-    suffix = path.suffix.lower()
+def read_grid(
+    path: Path,
+    *,
+    spacing_mm: float | None = None,
+    normalise: str = "none",
+    units: str = "",
+    no_value: Sequence[str] = (),
+) -> TactileMap:
+    """Read a grid of values as a map; see `open_grid` and `grid_map`."""
     try:
-        if suffix == ".npz":
-            arrays = load_npz(path, required=["mean"], optional=("count", "variance", "spacing_mm"))
-            spacing = _spacing(arrays.get("spacing_mm"), given=spacing_mm)
-            return _map(arrays, spacing_mm=spacing, normalise=normalise, units=units)
-        if suffix in IMAGE_SUFFIXES:
-            mean = _image(path)
-        elif suffix in TABLE_SUFFIXES:
-            mean = read_table(path)
-        else:
-            known = ", ".join((".npz", *TABLE_SUFFIXES, *IMAGE_SUFFIXES))
-            way_out = _CONVERT.get(suffix, f"grids are read from {known}; scans from .npz and .mcap")
-            raise BadDataError(f"has the suffix {suffix or 'none'!r}", way_out=way_out)
-        return _map({"mean": mean}, spacing_mm=_spacing(None, given=spacing_mm), normalise=normalise, units=units)
+        grid = open_grid(path, no_value=no_value)
+        return grid_map(grid, spacing_mm=spacing_mm, normalise=normalise, units=units, no_value=no_value)[0]
     except BadDataError as error:
         raise error.at(path) from None
 
 
-_FROM_ARRAYS = "`tactile-bayes import --help` says which arrays a scan has; a grid has one, mean"
-_CONVERT = {
-    ".mat": f"read it with scipy.io.loadmat and save its arrays with numpy.savez_compressed as .npz; {_FROM_ARRAYS}",
-    **dict.fromkeys(
-        (".h5", ".hdf5"), f"read it with h5py and save its arrays with numpy.savez_compressed as .npz; {_FROM_ARRAYS}"
-    ),
-    ".npy": f"save it with numpy.savez_compressed as .npz; {_FROM_ARRAYS}",
-    **dict.fromkeys((".xlsx", ".xls", ".ods", ".dat"), "save the grid as .csv"),
-}
+def grid_map(
+    grid: Grid,
+    *,
+    spacing_mm: float | None = None,
+    normalise: str = "none",
+    units: str = "",
+    no_value: Sequence[str] = (),
+) -> tuple[TactileMap, list[str]]:
+    """The map of a grid, and what was found on the way.
+
+    `spacing_mm` is the side of the square cells and may be left out where the grid has it. `normalise` says what was
+    done to the values already: ``"mean"`` or ``"gain"`` when 1 is the level far from a lump, ``"none"`` when the level
+    is not known. Nothing is divided here. `units` labels values that were not divided. `no_value` are numbers that
+    stand for none, or "none" where every number is a value.
+    """
+    spacing, notes = _spacing(grid, given=spacing_mm)
+    mean = _real(grid.arrays["mean"], name="mean")
+    if mean.ndim != 2 or 0 in mean.shape:
+        raise BadDataError(f"mean has shape {mean.shape}", way_out="it must be (ny, nx)")
+    longest = max(mean.shape) * spacing
+    if longest > _LONGEST_MM:
+        what = f"{mean.shape[0]} x {mean.shape[1]} cells of {spacing:g} mm are {longest / 1000:.3g} m long"
+        way_out = "one frame a row, or frames below each other? import them as a scan; otherwise check the spacing"
+        raise BadDataError(what, way_out=way_out)
+    values, marked = without_values(mean, no_value)
+    arrays = {**grid.arrays, "mean": values}
+    if "count" in arrays and arrays["count"].shape == mean.shape:
+        arrays["count"] = np.where(np.isnan(values) & ~np.isnan(mean), 0, arrays["count"])
+        values = np.where(arrays["count"] > 0, values, np.nan)
+    if ALL_ARE_VALUES not in no_value or (np.abs(values) > _BEYOND).any():
+        _refuse_apart(values)
+    made = _map(arrays, spacing_mm=spacing, normalise=normalise, units=units or grid.units)
+    return made, [*grid.notes, *notes, *marked]
 
 
-def _spacing(held: np.ndarray[Any, Any] | None, *, given: float | None) -> float:
-    if held is None:
-        if given is None:
-            raise UsageError("a grid needs --spacing-mm, the side of its square cells in mm")
-        value = float(given)
-    else:
-        values = np.atleast_1d(held)
-        if values.dtype.kind not in "iuf" or values.ndim != 1 or len(values) not in (1, 2):
-            raise BadDataError(f"spacing_mm is {values.dtype} of shape {values.shape}", way_out="it must be one number")
-        if len(values) == 2 and values[0] != values[1]:
-            raise BadDataError(
-                f"spacing_mm is {values[0]:g} by {values[1]:g}", way_out="resample to square cells first"
-            )
-        value = float(values[0])
+def _spacing(grid: Grid, *, given: float | None) -> tuple[float, list[str]]:
+    """Side of the cells, and what an image's resolution says otherwise."""
+    for sides in (grid.spacing_mm, grid.resolution_mm):
+        if sides is not None and not np.isclose(*sides, rtol=1e-3, atol=0.0):
+            what = f"its cells are {sides[0]:g} by {sides[1]:g} mm"
+            raise BadDataError(what, way_out="resample to square cells first")
+    if grid.spacing_mm is not None:
+        value = grid.spacing_mm[0]
         if given is not None and not np.isclose(given, value, rtol=1e-9, atol=0.0):
-            raise UsageError(
-                f"--spacing-mm is {given:g}, but the file says spacing_mm = {value:g}; leave the option out"
-            )
+            raise UsageError(f"--spacing-mm is {given:g}, but the file says {value:g}; leave the option out")
+        return _checked(value), []
+    told = "" if grid.resolution_mm is None else _resolution(grid.resolution_mm[0])
+    if given is None:
+        told = told and f"; {told}"
+        raise UsageError(f"a grid needs --spacing-mm, the side of its square cells in mm{told}")
+    agrees = grid.resolution_mm is None or np.isclose(given, grid.resolution_mm[0], rtol=1e-2, atol=0.0)
+    return _checked(float(given)), [] if agrees else [f"{told}; {given:g} mm was taken, as stated"]
+
+
+def _resolution(mm: float) -> str:
+    return f"its resolution says {mm:.4g} mm a pixel ({25.4 / mm:.4g} dpi, often of a print)"
+
+
+def _checked(value: float) -> float:
     if not 0 < value < 1000:
         raise BadDataError(f"the spacing is {value:g} mm", way_out="it must be positive, in mm")
     if value < _LEAST_SPACING_MM:
@@ -202,8 +227,6 @@ def _spacing(held: np.ndarray[Any, Any] | None, *, given: float | None) -> float
 
 def _map(arrays: dict[str, np.ndarray[Any, Any]], *, spacing_mm: float, normalise: str, units: str) -> TactileMap:
     mean = _numbers(arrays["mean"], name="mean")
-    if mean.ndim != 2 or 0 in mean.shape:
-        raise BadDataError(f"mean has shape {mean.shape}", way_out="it must be (ny, nx)")
     count = _count(arrays.get("count"), mean)
     variance = _variance(arrays.get("variance"), count)
     _check_level(mean[count > 0], normalise=normalise, units=units)
@@ -223,10 +246,14 @@ def _centres(n: int, spacing_mm: float) -> FloatArray:
     return np.asarray((np.arange(n) - (n - 1) / 2) * spacing_mm, dtype=np.float64)
 
 
-def _numbers(array: np.ndarray[Any, Any], *, name: str) -> FloatArray:
+def _real(array: np.ndarray[Any, Any], *, name: str) -> FloatArray:
     if array.dtype.kind not in "iuf":
         raise BadDataError(f"{name} is {array.dtype}", way_out="give real numbers")
-    values: FloatArray = np.asarray(array, dtype=np.float64)
+    return np.asarray(array, dtype=np.float64)
+
+
+def _numbers(array: np.ndarray[Any, Any], *, name: str) -> FloatArray:
+    values = _real(array, name=name)
     if np.isinf(values).any():
         index = tuple(int(i) for i in np.argwhere(np.isinf(values))[0])
         raise BadDataError(f"{name} is infinite at {index}", way_out="mark cells without data by NaN")
@@ -291,28 +318,3 @@ def _check_level(values: FloatArray, *, normalise: str, units: str) -> None:
             f"the median value is {median:.4g}, not near 1 as --normalise {normalise} says",
             way_out="divide by the level first, or give --normalise none",
         )
-
-
-def _image(path: Path) -> FloatArray:
-    from PIL import Image, UnidentifiedImageError
-
-    data = read_bytes(path, most=IMAGE_BYTES)  # from memory: a chunk cannot claim more than there is
-    with (
-        decoding("cannot be decoded", way_out="save it again as TIFF, PGM or PNG"),
-        warnings.catch_warnings(action="ignore"),  # damage is told by the errors
-    ):
-        Image.MAX_IMAGE_PIXELS = None  # the limit below is the one that can be raised
-        try:
-            image = Image.open(io.BytesIO(data), formats=("TIFF", "PPM", "PNG"))
-        except UnidentifiedImageError:
-            raise BadDataError("is not an image", way_out="give a grey TIFF, PGM or PNG") from None
-        check_limit(image.width * image.height, CELLS, what="it has {} pixels")
-        pages, mode = getattr(image, "n_frames", 1), image.mode
-        pixels = np.asarray(image)
-    if pages > 1:
-        raise BadDataError(f"holds {pages} images", way_out="give one")
-    if pixels.ndim == 3 and (pixels[..., :3] == pixels[..., :1]).all():
-        pixels = pixels[..., 0]  # grey, saved as colour
-    if pixels.ndim != 2 or mode in ("P", "1"):
-        raise BadDataError(f"is a colour image (mode {mode})", way_out="save one channel of intensities")
-    return pixels.astype(np.float64)

@@ -10,12 +10,18 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from PIL import Image
+from scipy.ndimage import gaussian_filter
 
+import tactile_bayes
 from tactile_bayes.errors import BadDataError, UsageError
+from tactile_bayes.files.grid_files import open_grid
 from tactile_bayes.files.grids import read_grid
+from tactile_bayes.files.scan_mcap import read_scan
+from tactile_bayes.mapping.build import build_map
 from tactile_bayes.posterior.bump import window_cells
 
 Arrays = dict[str, Any]
+DEMO = Path(tactile_bayes.__file__).parent / "demo" / "scan.mcap"
 
 
 @given(ny=st.integers(1, 6), nx=st.integers(1, 6), h=st.floats(0.01, 10), seed=st.integers(0, 99))
@@ -139,11 +145,14 @@ def test_every_fault_of_a_grid_is_one_line(
     ("name", "content", "words"),
     [
         ("g.csv", b"1,2\n3\n", "row 2 has 1 fields"),
-        ("g.csv", b"x,y\n1,2\n", "row 1, column 1 holds 'x'"),
+        ("g.csv", b"x,y\n1,a\n", "row 2, column 2 holds 'a'; if it means no value, give --no-value a"),
+        ("g.csv", b"top,1,2\nend,3,4\n", "column 1 holds 'top'; leave out the column of names"),
+        ("g.csv", b"a,b\nc,d\n", "holds 'a' and no number"),
         ("g.csv", b"", "is empty"),
         ("g.csv", b"\xff\xfe\x00", "not UTF-16 text"),
         ("g.csv", b"1,2\n\xb5,4\n", "line 2: byte 0xb5 is not UTF-8 text"),
-        ("g.csv", b"Pressure mat,,,\nUnits,kPa\n1,2,3,4\n", "row 1, column 1 holds 'Pressure mat'"),
+        ("g.csv", b"Frame 1\n1,2\n3,4\nFrame 2\n1,2\n3,4\n", "has 'Frame 2' after row 3; give one grid.*are a scan"),
+        ("g.csv", b"1,2\nB,4\n5,B\n", r"row 2, column 1 holds 'B' \(and 1 more do\); if it means no value"),
         ("g.csv", b"1,2\n3,4\n\n5,6\n7,8\n", "blank line after row 2; give one grid"),
         ("g.csv", b",0,1,2\n0,9,9,9\n1,9,9,9\n2,9,9,9\n", r"row 1 and column 1 count 0, 1, 2.*header=False"),
         ("g.csv", b",-1.5,0,1.5\n4,9,9,9\n2,9,9,9\n0,9,9,9\n", "row 1 and column 1 count -1.5, 0, 1.5"),
@@ -177,3 +186,162 @@ def test_the_laser_beam_images_become_maps(shared_data: Path) -> None:
         grid = read_grid(path, spacing_mm=0.01)
         assert grid.mean.size > 10_000
         assert np.nanmax(grid.mean) > 5 * np.nanmedian(grid.mean)
+
+
+# --- Tables as instruments and programs write them.
+
+TEKSCAN = """\
+DATA_TYPE FRAME
+VERSION Hugemat 7.60
+FILENAME C:\\Data\\exam 1.fsx
+SENSOR_TYPE 5051
+ROWS 2
+COLS 3
+ROW_SPACING 1.27 mm
+COL_SPACING 1.27 mm
+SENSEL_AREA 1.6129 mm2
+NOISE_THRESHOLD 3
+SECONDS_PER_FRAME 0.01
+TIME 12/03/2024 10:21:44.120
+UNITS kPa
+START_FRAME 1
+END_FRAME 1
+ASCII_DATA @@
+
+Frame 1
+1.5,B,3
+4,5,6
+
+@@
+"""
+"""Tekscan's ASCII export as its readers on the web expect it: ``KEY value`` lines, ``ASCII_DATA @@``, frames."""
+
+
+def test_an_export_of_tekscan_is_a_map_with_its_spacing_and_unit(tmp_path: Path) -> None:
+    (tmp_path / "exam.asf").write_text(TEKSCAN)
+    grid = read_grid(tmp_path / "exam.asf")
+    np.testing.assert_array_equal(grid.mean, [[1.5, np.nan, 3.0], [4.0, 5.0, 6.0]])
+    assert (grid.recipe.cell_mm, grid.recipe.units) == (1.27, "kPa")
+    (tmp_path / "exam.asf").write_text(TEKSCAN.replace("COL_SPACING 1.27 mm", "COL_SPACING 0.1 in"))
+    with pytest.raises(BadDataError, match=r"its cells are 2\.54 by 1\.27 mm; resample"):
+        read_grid(tmp_path / "exam.asf")
+    (tmp_path / "exam.asf").write_text(TEKSCAN.replace("\n\n@@", "\nFrame 2\n1,2,3\n4,5,6\n@@"))
+    with pytest.raises(BadDataError, match="has 'Frame 2' after row 20; give one grid"):
+        read_grid(tmp_path / "exam.asf")
+
+
+@pytest.mark.parametrize(
+    ("content", "note"),
+    [
+        ("0.9 2 1.234\n1 2 3\n", ""),
+        ("  0.9   2   1.234  \n  1.0   2   3\n", ""),
+        ("0,9 2,0 1,234\n1,0 2,0 3,0\n", ""),
+        ("0.9,2,1.234,\n1,2,3,\n", "every row ends with a separator"),
+        ("0.9;2;1.234;\r\n1;2;3;\r\n", "every row ends with a separator"),
+        ("left,middle,right\n0.9,2,1.234\n1,2,3\n", "text before the numbers was left out: 'left middle right'"),
+        ("# made by mat 3\n# kPa\n0.9 2 1.234\n1 2 3\n", "'# made by mat 3' and 1 more"),
+        ("Mat,3,\nUnits,kPa\n\n0.9,2,1.234\n1,2,3\n\nmean,1.6\n", ""),
+        ('"0,9";"2";"1,234"\n"1";"2";"3"\n', ""),
+        ('"0.9","2","1.234"\n"1","2","3"\n', ""),
+    ],
+)
+def test_one_table_in_many_dresses_is_one_grid(tmp_path: Path, content: str, note: str) -> None:
+    (tmp_path / "g.csv").write_text(content)
+    grid = open_grid(tmp_path / "g.csv")
+    np.testing.assert_array_equal(grid.arrays["mean"], [[0.9, 2.0, 1.234], [1.0, 2.0, 3.0]])
+    assert note in " ".join(grid.notes)
+
+
+def test_frames_in_rows_are_no_map(tmp_path: Path) -> None:
+    """They became a map of 3 by 51 m, or so."""
+    np.savetxt(tmp_path / "frames.csv", np.ones((200, 416)), delimiter=",")
+    with pytest.raises(BadDataError, match=r"200 x 416 cells of 1\.5 mm are 0\.624 m long; one frame a row.*as a scan"):
+        read_grid(tmp_path / "frames.csv", spacing_mm=1.5)
+
+
+def test_a_list_of_places_and_values_is_no_map(tmp_path: Path) -> None:
+    y, x = np.mgrid[:4, :5]
+    table = np.stack([x.ravel(), y.ravel(), np.ones(20)], axis=1)
+    np.savetxt(tmp_path / "list.csv", table, delimiter=",", header="x_mm,y_mm,kPa", comments="")
+    with pytest.raises(BadDataError, match=r"a list of 20 values with their places, on 5 by 4.*pivot"):
+        read_grid(tmp_path / "list.csv", spacing_mm=1.0)
+
+
+# --- Cells without a value.
+
+
+def lump() -> Any:
+    """A map of 61 by 71 cells about 1, with a bump of 0.35 and smooth noise."""
+    rng = np.random.default_rng(0)
+    y, x = np.mgrid[:61, :71]
+    noise = gaussian_filter(rng.normal(size=(61, 71)), 1.0)
+    return 1 + 0.35 * np.exp(-((x - 35) ** 2 + (y - 30) ** 2) / (2 * 5.2**2)) + 0.01 * noise / noise.std()
+
+
+MARKS: list[tuple[str, Any, float, str]] = [
+    ("dead column", np.s_[:, 33], 0.0, "0 in column 34 stands apart"),
+    ("zeros after a crop", np.s_[:3], 0.0, r"0 in 3 rows \(1 to 3\)"),
+    ("fill value", np.s_[5:8, 5:8], 1e20, r"1e\+20 in 9 cells \(row 6, column 6"),
+    ("fill value of float32", np.s_[5:8, 5:8], float(np.float32(1e20)), r"1e\+20 in 9 cells"),
+    ("-9999", np.s_[5, 5:8], -9999.0, "-9999 in 3 cells"),
+    ("9999", np.s_[50:, 60:], 9999.0, "9999 in 121 cells"),
+    ("-1", np.s_[:, :2], -1.0, r"-1 in 2 columns \(1 to 2\)"),
+    ("no sensel", np.s_[:, 70], 2.55, "2.55 in column 71"),
+    ("one cell", np.s_[20, 60], 255.0, "255 in row 21, column 61"),
+    ("stuck column", np.s_[:, 50], 1.3, "1.3 in column 51"),
+]
+
+
+@pytest.mark.parametrize(("cells", "number", "words"), [row[1:] for row in MARKS], ids=[row[0] for row in MARKS])
+def test_numbers_that_stand_for_no_value_are_asked_about_and_then_left_out(
+    tmp_path: Path, cells: Any, number: float, words: str
+) -> None:
+    whole = lump()
+    spoiled = whole.copy()
+    spoiled[cells] = number
+    np.savez(tmp_path / "g.npz", mean=spoiled, spacing_mm=1.0)
+    with pytest.raises(BadDataError, match=words) as caught:
+        read_grid(tmp_path / "g.npz", normalise="gain")
+    assert f"give --no-value {number:.12g}" in caught.value.way_out
+    stated = read_grid(tmp_path / "g.npz", normalise="gain", no_value=[f"{number:.12g}"])
+    without = np.zeros_like(whole, dtype=bool)
+    without[cells] = True
+    np.testing.assert_array_equal(stated.mean, np.where(without, np.nan, whole))
+    assert not stated.count[without].any()
+    if abs(number) < 1e12:
+        assert read_grid(tmp_path / "g.npz", normalise="gain", no_value=["none"]).covered.all()
+
+
+def test_a_dead_line_that_is_noisy_is_named(tmp_path: Path) -> None:
+    spoiled = lump()
+    spoiled[:, 20] = np.random.default_rng(1).normal(0, 0.003, 61)
+    np.savez(tmp_path / "g.npz", mean=spoiled, spacing_mm=1.0)
+    with pytest.raises(BadDataError, match=r"column 21 differs from those beside it by .*leave its cells empty"):
+        read_grid(tmp_path / "g.npz", normalise="gain")
+    spoiled[:, 20] = np.nan
+    np.savez(tmp_path / "g.npz", mean=spoiled, spacing_mm=1.0)
+    read_grid(tmp_path / "g.npz", normalise="gain")
+
+
+@pytest.mark.parametrize("cell_mm", [0.5, 1.0, 2.0])
+@pytest.mark.parametrize("normalise", ["gain", "none"])
+def test_nothing_stands_apart_in_a_map_of_a_scan(tmp_path: Path, cell_mm: float, normalise: str) -> None:
+    made = build_map([read_scan(DEMO)], cell_mm=cell_mm, normalise=normalise)
+    np.savez(tmp_path / "g.npz", mean=np.where(made.covered, made.mean, np.nan), spacing_mm=cell_mm)
+    read_grid(tmp_path / "g.npz", normalise=normalise)
+
+
+def test_counts_and_marks_go_together(tmp_path: Path) -> None:
+    spoiled = lump()
+    spoiled[0, :9] = -9999
+    np.savez(tmp_path / "g.npz", mean=spoiled, count=np.full(spoiled.shape, 40), spacing_mm=1.0)
+    grid = read_grid(tmp_path / "g.npz", normalise="gain", no_value=["-9999"])
+    assert grid.count.sum() == 40 * (spoiled.size - 9)
+
+
+def test_a_word_for_no_value_is_stated(tmp_path: Path) -> None:
+    (tmp_path / "g.csv").write_text("1,2,n/a\n-,4,NaN\n5,6,7\n")
+    with pytest.raises(BadDataError, match="row 1, column 3 holds 'n/a'; if it means no value, give --no-value n/a"):
+        read_grid(tmp_path / "g.csv", spacing_mm=1.0)
+    grid = read_grid(tmp_path / "g.csv", spacing_mm=1.0, no_value=["n/a", "-"])
+    np.testing.assert_array_equal(grid.mean, [[1, 2, np.nan], [np.nan, 4, np.nan], [5, 6, 7]])

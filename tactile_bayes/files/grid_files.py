@@ -1,0 +1,279 @@
+"""Grids in files of other programs, before they are maps: tables of text, arrays and images."""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from tactile_bayes.declarations import Record
+from tactile_bayes.errors import BadDataError
+from tactile_bayes.files.images import read_image
+from tactile_bayes.files.npz import load_npz
+from tactile_bayes.files.reading import TABLE_BYTES, decoding, read_bytes
+from tactile_bayes.geometry import FloatArray
+
+# --- What a file or a caller gives before it is a map.
+
+
+class Grid(Record, eq=False):
+    """Values in rows and columns, and what their file says of them."""
+
+    arrays: dict[str, np.ndarray[Any, Any]]  #: ``mean (ny, nx)`` and, where known, ``count`` and ``variance``.
+    spacing_mm: tuple[float, float] | None = None  #: Width and height of a cell, where the file states it.
+    resolution_mm: tuple[float, float] | None = None  #: The same by an image's resolution, often of its printing.
+    units: str = ""  #: Where the file states it.
+    notes: tuple[str, ...] = ()  #: What was done on reading it.
+
+
+# --- A grid of numbers in a text table, as programs and spreadsheets write it.
+#
+# Fields are separated by semicolons where the file has one, else by tabs where it has one, else by commas or by blanks.
+# With semicolons, tabs or blanks a comma is a decimal comma, as a spreadsheet writes it under the settings of many
+# countries. Lines of text before and after the numbers are left out, and said to be. Tekscan's ASCII export (``.asf``,
+# ``.csv``) is such a table: ``KEY value`` lines, ``ASCII_DATA @@``, ``Frame 1``, rows, ``@@``; ``B`` is no sensel.
+
+_WAY_OUT: Final = "give a table of numbers, such as .csv"
+_UTF_16: Final = (b"\xff\xfe", b"\xfe\xff")
+_THOUSANDS: Final = re.compile(r"[+-]?[1-9][0-9]{0,2}(,[0-9]{3})+")
+_MOST_COUNTED: Final = 8
+"""A first row or column of so many numbers that counts 0, 1, 2... or 1, 2, 3... holds labels, whatever its corner."""
+_NOT_A_SENSEL: Final = "B"
+_SPACING_LINE: Final = re.compile(r"^(ROW|COL)_SPACING[\s,;:=]+([0-9.]+)\s*(mm|cm|m|in|inch)?\s*$", re.MULTILINE)
+_UNITS_LINE: Final = re.compile(r"^UNITS[\s,;:=]+(\S+)\s*$", re.MULTILINE)
+_MM: Final = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4, "inch": 25.4, None: 1.0}
+
+
+def read_table(path: Path, *, no_value: Sequence[str] = ()) -> Grid:
+    """Read a table of text, NaN where a field is empty or one of the texts of `no_value`."""
+    text = _text(path)
+    rows = _fields(text)
+    first, last = _numbers_within(rows, no_value)
+    before, after = (_said(part) for part in (rows[:first], rows[last:]))
+    tekscan = "ASCII_DATA" in text
+    words = [one for one in no_value if not is_number(one)]  # numbers are looked for among the values
+    marks = (*words, _NOT_A_SENSEL) if tekscan else tuple(words)
+    rows, notes = _one_block(rows[first:last], first), []
+    for lines, where in ((before, "before"), (after, "after")):
+        if lines:
+            more = f" and {len(lines) - 1} more" if len(lines) > 1 else ""
+            notes.append(f"text {where} the numbers was left out: {lines[0][:40]!r}{more}")
+    if len(rows[0]) > 2 and all(row[-1] == "" for row in rows):
+        rows = [row[:-1] for row in rows]
+        notes.append("every row ends with a separator: it begins no column")
+    values = _values(rows, marks, first)
+    for mark in dict.fromkeys(marks):
+        if alike := sum(field == mark for row in rows for field in row):
+            notes.append(f"{alike:,} cells hold {mark!r}, which is no value")
+    _refuse_labels(values)
+    _refuse_list(values)
+    units = _UNITS_LINE.search(text) if tekscan else None
+    sides = {side: float(number) * _MM[unit or None] for side, number, unit in _SPACING_LINE.findall(text)}
+    spacing = (sides["COL"], sides["ROW"]) if len(sides) == 2 else None
+    return Grid({"mean": values}, spacing, None, units[1] if units else "", tuple(notes))
+
+
+def _text(path: Path) -> str:
+    data = read_bytes(path, most=TABLE_BYTES)
+    encoding = "utf-16" if data[:2] in _UTF_16 else "utf-8-sig"
+    try:
+        return data.decode(encoding)
+    except UnicodeDecodeError as error:
+        line = data.count(b"\n", 0, error.start) + 1
+        what = f"line {line}: byte 0x{data[error.start]:02x} is not {encoding[:6].upper().rstrip('-')} text"
+        raise BadDataError(what, way_out=_WAY_OUT) from None
+
+
+def _fields(text: str) -> list[list[str]]:
+    """Fields of each line, without blanks around them; numbers with decimal commas have points."""
+    separator = next((one for one in ";\t" if one in text), ",")
+    with decoding("is not a table of text", way_out=_WAY_OUT):
+        rows = [[field.strip() for field in row] for row in csv.reader(io.StringIO(text), delimiter=separator)]
+    apart = [line.split() for line in text.splitlines()]
+    if separator == "," and _lines_of_numbers(_points(apart)) <= _lines_of_numbers(rows):
+        return rows
+    return _with_points(apart if separator == "," else rows)
+
+
+def _lines_of_numbers(rows: Iterable[list[str]]) -> int:
+    return sum(len(row) > 1 and all(map(is_number, filter(None, row))) for row in rows)
+
+
+def is_number(field: str) -> bool:
+    """True for a text that is a number, NaN and infinity included."""
+    try:
+        float(field)
+    except ValueError:
+        return False
+    return True
+
+
+def _numbers_within(rows: Sequence[list[str]], no_value: Sequence[str]) -> tuple[int, int]:
+    """Where lines of numbers begin and end: there every field is one, or empty, or a mark for no value."""
+    marks = {"", _NOT_A_SENSEL, *no_value}
+    plain = [
+        i
+        for i, row in enumerate(rows)
+        if any(map(is_number, row)) and all(field in marks or is_number(field) for field in row)
+    ]
+    if not plain:
+        faulty = next((row for row in rows if any(map(is_number, row))), None)
+        if faulty is None:
+            held = next((field for row in rows for field in row if field), "")
+            what = f"holds {held[:30]!r} and no number" if held else "is empty"
+            raise BadDataError(what, way_out=_WAY_OUT)
+        return rows.index(faulty), len(rows)
+    first, last = plain[0], plain[-1] + 1
+    while last < len(rows) and any(map(is_number, rows[last])):  # a faulty row is told, not left out
+        last += 1
+    while first > 0 and len(rows[first - 1]) == len(rows[first]) and any(map(is_number, rows[first - 1])):
+        first -= 1
+    # rows of empty fields belong to the grid, blank lines do not
+    while first > 0 and len(rows[first - 1]) > 1 and not any(rows[first - 1]):
+        first -= 1
+    while last < len(rows) and len(rows[last]) > 1 and not any(rows[last]):
+        last += 1
+    return first, last
+
+
+def _said(rows: Iterable[Sequence[str]]) -> list[str]:
+    return [text for row in rows if (text := " ".join(field for field in row if field))]
+
+
+def _one_block(rows: Sequence[list[str]], before: int) -> list[list[str]]:
+    """The rows, between which nothing else may stand; blank lines and titles of frames separate tables, not rows."""
+    for number, row in enumerate(rows, start=before):
+        blank = len(row) <= 1 and not any(row)
+        if blank or (row[0][:5].lower() == "frame" and not any(map(is_number, row))):
+            what = f"has {'a blank line' if blank else repr(row[0][:20])} after row {number}"
+            way_out = "give one grid, such as one frame or a mean of frames, in a file; frames with poses are a scan"
+            raise BadDataError(what, way_out=way_out)
+    return list(rows)
+
+
+def _with_points(rows: Sequence[list[str]]) -> list[list[str]]:
+    """The rows with decimal points in place of decimal commas."""
+    commas = [field for row in rows for field in row if "," in field and field[:1] in "+-0123456789"]
+    if commas and all(_THOUSANDS.fullmatch(field) for field in commas):
+        digits = commas[0].replace(",", "")
+        what = f"holds {commas[0]!r}, which is {digits} or {commas[0].replace(',', '.', 1)}"
+        raise BadDataError(what, way_out="write numbers without commas")
+    return _points(rows)
+
+
+def _points(rows: Iterable[list[str]]) -> list[list[str]]:
+    return [[field.replace(",", ".") if field.count(",") == 1 else field for field in row] for row in rows]
+
+
+def _values(rows: Sequence[list[str]], marks: Sequence[str], before: int) -> FloatArray:
+    for number, row in enumerate(rows, start=before + 1):
+        if len(row) != len(rows[0]):
+            what = f"row {number} has {len(row)} fields, row {before + 1} has {len(rows[0])}"
+            raise BadDataError(what, way_out="give every row one length")
+    none = {"", *marks}
+    try:
+        return np.array([[np.nan if field in none else float(field) for field in row] for row in rows])
+    except ValueError:
+        raise _no_number(rows, none, before) from None
+
+
+def _no_number(rows: Sequence[list[str]], marks: set[str], before: int) -> BadDataError:
+    """The fault of the first field that is no number, with the way out for what it is."""
+    fields = ((i, j, field) for i, row in enumerate(rows, before + 1) for j, field in enumerate(row, 1))
+    faults = [one for one in fields if one[2] not in marks and not is_number(one[2])]
+    row, column, field = faults[0]
+    alike = sum(one[2] == field for one in faults) - 1
+    what = f"row {row}, column {column} holds {field[:30]!r}" + (f" (and {alike} more do)" if alike else "")
+    way_out = f"if it means no value, give --no-value {field[:30]}"
+    if len(rows) > 1 and all(one[1] == 1 for one in faults) and len(faults) >= len(rows) - 1:
+        way_out = "leave out the column of names"
+    elif re.search(r"\d", field):
+        way_out = "write numbers as 1.5"
+    return BadDataError(what, way_out=way_out)
+
+
+def _refuse_labels(table: FloatArray) -> None:
+    """Refuse numbers of rows and columns, or their places, in the first row and column: they are no readings."""
+    row, column = table[0], table[:, 0]
+    both = np.isnan(table[0, 0]) and _evenly(row[1:]) and _evenly(column[1:])
+    for found, line, where in ((both, row[1:], "row 1 and column 1"), (_counts(row), row, "row 1")):
+        if found:
+            _refuse(line, where)
+    if _counts(column):
+        _refuse(column, "column 1")
+
+
+def _refuse(line: FloatArray, where: str) -> None:
+    told = ", ".join(f"{value:g}" for value in line[:3])
+    way_out = "save the grid without them (pandas: to_csv(..., header=False, index=False))"
+    raise BadDataError(f"{where} count {told}... as labels do", way_out=way_out)
+
+
+def _refuse_list(table: FloatArray) -> None:
+    """Refuse a list of x, y and value, whose first two columns name each place of a lattice once."""
+    if table.shape[1] != 3 or len(table) < 9:
+        return
+    nx, ny = (len(np.unique(table[:, column])) for column in (0, 1))
+    places = len(np.unique(table[:, :2], axis=0))
+    if nx > 2 and ny > 2 and nx * ny == places == len(table):
+        what = f"is a list of {len(table)} values with their places, on {nx} by {ny} of them"
+        raise BadDataError(what, way_out="give the values as rows and columns (pandas: pivot)")
+
+
+def _evenly(line: FloatArray) -> bool:
+    """True when three numbers or more run in equal steps."""
+    steps = np.diff(line)
+    return len(line) > 2 and bool(steps[0] != 0.0) and bool(np.allclose(steps, steps[0], rtol=1e-6, atol=0.0))
+
+
+def _counts(line: FloatArray) -> bool:
+    return len(line) >= _MOST_COUNTED and line[0] in (0.0, 1.0) and bool((np.diff(line) == 1.0).all())
+
+
+# --- A grid by its file's suffix.
+
+IMAGE_SUFFIXES: Final = (".tif", ".tiff", ".pgm", ".png")
+TABLE_SUFFIXES: Final = (".csv", ".txt", ".tsv", ".asf", ".asc", ".dat")
+
+
+def open_grid(path: Path, *, no_value: Sequence[str] = ()) -> Grid:
+    """Read a grid's file: an ``.npz`` with ``mean (ny, nx)`` and, if known, ``count``, ``variance`` (NaN where count is
+    1) and ``spacing_mm``; a table of numbers (see `read_table`); or a grey ``.tif``, ``.pgm`` or ``.png`` image.
+    """
+    suffix = path.suffix.lower()
+    if suffix == ".npz":
+        arrays = load_npz(path, required=["mean"], optional=("count", "variance", "spacing_mm"))
+        return Grid(arrays, _stated_spacing(arrays.pop("spacing_mm", None)))
+    if suffix in IMAGE_SUFFIXES:
+        picture = read_image(path)
+        return Grid({"mean": picture.values}, None, picture.spacing_mm, "", picture.notes)
+    if suffix in TABLE_SUFFIXES:
+        return read_table(path, no_value=no_value)
+    known = ", ".join((".npz", *TABLE_SUFFIXES, *IMAGE_SUFFIXES))
+    way_out = _CONVERT.get(suffix, f"grids are read from {known}; scans from .npz and .mcap")
+    raise BadDataError(f"has the suffix {suffix or 'none'!r}", way_out=way_out)
+
+
+_FROM_ARRAYS = "`tactile-bayes import --help` says which arrays a scan has; a grid has one, mean"
+_CONVERT = {
+    ".mat": f"read it with scipy.io.loadmat and save its arrays with numpy.savez_compressed as .npz; {_FROM_ARRAYS}",
+    **dict.fromkeys(
+        (".h5", ".hdf5"), f"read it with h5py and save its arrays with numpy.savez_compressed as .npz; {_FROM_ARRAYS}"
+    ),
+    ".npy": f"save it with numpy.savez_compressed as .npz; {_FROM_ARRAYS}",
+    **dict.fromkeys((".xlsx", ".xls", ".ods"), "save the grid as .csv"),
+}
+
+
+def _stated_spacing(held: np.ndarray[Any, Any] | None) -> tuple[float, float] | None:
+    if held is None:
+        return None
+    values = np.atleast_1d(held)
+    if values.dtype.kind not in "iuf" or values.ndim != 1 or len(values) not in (1, 2):
+        raise BadDataError(f"spacing_mm is {values.dtype} of shape {values.shape}", way_out="it must be one number")
+    return float(values[0]), float(values[-1])
