@@ -18,6 +18,7 @@ STYLES: Final = {
     "note: ": CYAN,
     "$ ": BOLD,
     "sound: ": BOLD,
+    "tactile errs ": BOLD,
     "largest size ": BOLD,
     "No estimate: ": BOLD,
     "No lump found": BOLD,

@@ -34,7 +34,14 @@ _FILE = FilePath()
 @takes(TrialSettings, "intervals", "resamples", "seed", "error_ratio")
 @takes(TrialSettings, "check_intervals", show_default=False)
 @takes(TrialSettings, "bayes")
-@click.option("--methods", is_flag=True, help="Also print lines, limits of agreement, repeatability and pairs.")
+@click.option(
+    "-v",
+    "--methods",
+    "--verbose",
+    "methods",
+    is_flag=True,
+    help="Also print lines, limits of agreement, repeatability, pairs and r squared.",
+)
 @JSON
 @click.option(
     "-o", "--output", metavar="REPORT.json", type=FilePath(writes="JSON"), help="Write the report as JSON to this file."

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Final
 
-from tactile_bayes.declarations import UNSET, Record
-from tactile_bayes.trial.accuracy import ModalityRatio, PairedComparison, least_p
+from tactile_bayes.declarations import UNSET, Record, replace
+from tactile_bayes.trial.accuracy import REFERENCE, ModalityRatio, PairedComparison, least_p
 from tactile_bayes.trial.figures import Ends, Figure
 from tactile_bayes.trial.method_comparison import Unit
 from tactile_bayes.trial.planning import Design, IntervalCheck, PlanReport
@@ -81,9 +81,6 @@ def method_lines(report: TrialReport) -> Iterator[str]:
         yield growing
     for pair in report.paired_comparisons:
         yield _pair_line(pair)
-    if report.paired_comparisons:
-        yield "p: sign-flip test by patient on the masses both looked for; p Holm: corrected for all pairs."
-        yield from _least_p_lines(report.paired_comparisons)
 
 
 def _modality_lines(name: str, report: ModalityReport) -> Iterator[str]:
@@ -192,13 +189,28 @@ def _ends(interval: Ends | None, spec: str) -> str:
     return "" if interval is None else f" [{interval[0]:{spec}}, {interval[1]:{spec}}]"
 
 
-# --- Text report of a trial: one table with units, then its omissions.
+# --- Text report of a trial: a sentence for each comparison, a table that fits 80 columns; then methods.
 
-_HEADINGS = ("", "found", "MAPE %", "MAPE % found", "MAE mm", "bias % found", "slope", "r2", "r2 found")
+_FIRST = {
+    "mape_percent": ("error %", ".1f"),
+    "mae_mm": ("error mm", ".1f"),
+    "bias_percent": ("bias %", "+.1f"),
+    "slope_through_origin": ("slope", ".2f"),
+}
+_FOUND = {
+    "mape_detected_percent": ("error % found", ".1f"),
+    "slope_through_origin_detected": ("slope found", ".2f"),
+    "r2_centred": ("r2", ".2f"),
+    "r2_centred_detected": ("r2 found", ".2f"),
+}
+SPELLED: Final = {"cbe": "clinical breast examination (cbe)"}
+"""Modalities that tables abbreviate, in words."""
+MOST_LABEL: Final = 11  #: Letters of a modality's name up to which its figures stand beside it.
+MORE: Final = "More (lines, limits of agreement, repeatability, pairs, r2): validate -v."
 
 
 def trial_text(report: TrialReport, *, left_out: Sequence[str] = (), methods: bool = False) -> str:
-    """Full report, with the second table when `methods`; the research-use line comes last.
+    """The report in a screen, or the full one where `methods`; the research-use line comes last.
 
     `left_out` says in words which readings of other visits take no part.
     """
@@ -208,52 +220,121 @@ def trial_text(report: TrialReport, *, left_out: Sequence[str] = (), methods: bo
         f"{_plural(counts.readings, 'reading')}{_synthetic(counts)}",
         *left_out,
         *(f"Doubtful: {doubt}" for doubt in report.doubts),
+        *comparison_sentences(report),
         "",
-        *_aligned([_HEADINGS, *(_row(name, one) for name, one in report.modalities.items())]),
+        *figure_table(report, _FIRST),
         "",
         *_notes(report),
-        *(["", *method_lines(report)] if methods else []),
+        *(["", *_methods(report)] if methods else []),
         *([] if report.interval_check is UNSET else itertools.starmap(_check_line, report.interval_check.items())),
         *([] if report.next_mass is UNSET else report.next_mass.lines()),
+        *([] if methods else [MORE]),
         report.research_use,
     ]
     return "\n".join(lines) + "\n"
+
+
+def comparison_sentences(report: TrialReport) -> list[str]:
+    """A sentence for each modality that the tactile one is compared with; for every pair where it has no reading."""
+    pairs = report.paired_comparisons
+    led = [pair for pair in pairs if REFERENCE in (pair.first, pair.second)] or pairs
+    percent = f"{100 * report.interval_probability:g} %"
+    return [_comparison_sentence(pair, percent) for pair in led]
+
+
+def _comparison_sentence(pair: PairedComparison, percent: str) -> str:
+    quotient, first, second = pair.figure("ratio"), pair.first, pair.second
+    if second == REFERENCE:
+        quotient, first, second = _inverse(quotient), second, first
+    other, masses = SPELLED.get(second, second), _plural(pair.masses, "mass")
+    if quotient.value is None:
+        return f"{first} and {other} are not compared on {masses}: {quotient.reason or 'an error is 0'}"
+    ends = quotient.interval
+    told = f"no interval: {quotient.interval_reason}" if ends is None else f"{percent} {ends[0]:.2f} to {ends[1]:.2f}"
+    p = "" if pair.p_holm is None else f", p {_short_p(pair.p_holm)}"
+    return f"{first} errs {quotient.value:.2f} times as much as {other}, {told}{p}, {masses}"
+
+
+def _inverse(quotient: Figure) -> Figure:
+    """The quotient of the second over the first."""
+    if not quotient.value:
+        return replace(quotient, value=None)
+    ends = quotient.interval
+    return replace(quotient, value=1 / quotient.value, interval=None if ends is None else (1 / ends[1], 1 / ends[0]))
+
+
+def _short_p(p: float) -> str:
+    return "< .001" if p < 0.001 else f"{p:.2f}".lstrip("0") if p >= 0.0995 else f"{p:.2g}".lstrip("0")
+
+
+def figure_table(report: TrialReport, wanted: Mapping[str, tuple[str, str]]) -> list[str]:
+    """A table of figures by modality, each above its interval, in up to 80 columns."""
+    rows: list[tuple[str, ...]] = [("", "found", *(words for words, _ in wanted.values()))]
+    for name, one in report.modalities.items():
+        label = name if len(name) <= MOST_LABEL else ""
+        if not label:
+            rows.append((name,))
+        figures = [(one.figure(key), spec) for key, (_, spec) in wanted.items()]
+        rows.append((label, f"{one.detected} of {one.n}", *(number(figure.value, spec) for figure, spec in figures)))
+        share = (
+            ""
+            if one.detected_interval is None
+            else "{:.0f} to {:.0f} %".format(*(100 * end for end in one.detected_interval))
+        )
+        rows.append(("", share, *(_between(figure.interval, spec) for figure, spec in figures)))
+    return _aligned(rows)
+
+
+def _between(ends: Ends | None, spec: str) -> str:
+    return "" if ends is None else f"{ends[0]:{spec}} to {ends[1]:{spec}}"
+
+
+def _methods(report: TrialReport) -> Iterator[str]:
+    """What `validate -v` adds."""
+    yield from figure_table(report, _FOUND)
+    yield ""
+    for name, one in report.modalities.items():
+        if one.within_mass_sd_mm is not None:
+            sd, cv, rms = (
+                shown(one.figure(f"within_mass_{key}"), spec)
+                for key, spec in (("sd_mm", ".2g"), ("cv_percent", ".1f"), ("cv_rms_percent", ".1f"))
+            )
+            yield f"{name}: within one mass, mean SD {sd} mm, {cv} % (root mean square {rms} %)"
+        yield from _reasons(name, one, [key for key in one.reasons if key.removesuffix("_interval") not in _FIRST])
+    for name, quotient in report.mape_ratio_to_tactile.items():
+        yield ratio_line(name, quotient)
+    yield from method_lines(report)
+    percent = f"{100 * report.interval_probability:g} %"
+    yield f"In brackets: {percent} intervals. MAPE: mean absolute percentage error. ICC: intraclass correlation."
+    yield (
+        "CRPS: continuous ranked probability score. r2: centred, 1 - SSE0/SST (sums of squares about the line through "
+        "0 and about the mean), below 0 where the line fails."
+    )
 
 
 def _check_line(name: str, check: IntervalCheck) -> str:
     low, high = check.share_interval
     return (
         f"{name}: in {check.trials} simulated trials of this size {check.share:.1%} [{low:.1%}, {high:.1%}] of the "
-        f"MAPE intervals covered the true one; {check.above} were above it, {check.below} below"
+        f"intervals of the error in percent covered the true one; {check.above} were above it, {check.below} below"
     )
-
-
-_COLUMNS = {
-    "mape_percent": ".1f",
-    "mape_detected_percent": ".1f",
-    "mae_mm": ".3g",
-    "bias_percent": "+.1f",
-    "slope_through_origin": ".2f",
-    "r2_centred": ".2f",
-    "r2_centred_detected": ".2f",
-}
-
-
-def _row(name: str, report: ModalityReport) -> tuple[str, ...]:
-    return name, found_share(report), *(shown(report.figure(key), spec) for key, spec in _COLUMNS.items())
 
 
 def _notes(report: TrialReport) -> Iterator[str]:
     percent = f"{100 * report.interval_probability:g} %"
     for name, one in report.modalities.items():
         yield from _modality_notes(name, one, percent=percent)
-    for name, quotient in report.mape_ratio_to_tactile.items():
-        yield ratio_line(name, quotient)
     if report.counts.masses_without_any_reading:
         yield f"{_plural(report.counts.masses_without_any_reading, 'excised mass')} without any reading, left out"
-    yield f"In brackets: {percent} intervals. MAPE: mean absolute error in percent of the ex-vivo size."
-    yield "A mass not found counts as size 0 (100 % error), except in columns that say 'found'."
-    yield "slope: line through 0 of sizes on ex-vivo sizes. r2: centred, 1 - SSE0/SST, below 0 where it fails."
+    yield (
+        f"Errors: mean absolute error, in percent of the size after excision and in mm, with its {percent} interval "
+        "below; a mass not found counts as size 0, an error of 100 %."
+    )
+    yield "Bias: geometric mean over the masses found. Slope: of the line through 0 of sizes on those after excision."
+    if tested := sum(pair.p_holm is not None for pair in report.paired_comparisons):
+        pairs = f", corrected for {tested} pairs by Holm" if tested > 1 else ""
+        yield f"p: sign-flip test by patient on the masses that both looked for{pairs}."
+        yield from _least_p_lines(report.paired_comparisons)
 
 
 def ratio_line(name: str, one: ModalityRatio) -> str:
@@ -274,12 +355,6 @@ def _modality_notes(name: str, report: ModalityReport, *, percent: str) -> Itera
     if report.masses_not_done or report.masses_without_reading:
         left_out = f"{report.masses_not_done} not done, {report.masses_without_reading} without a row"
         yield f"{name}: masses left out: {left_out}"
-    if report.within_mass_sd_mm is not None:
-        sd, cv, rms = (
-            shown(report.figure(f"within_mass_{key}"), spec)
-            for key, spec in (("sd_mm", ".2g"), ("cv_percent", ".1f"), ("cv_rms_percent", ".1f"))
-        )
-        yield f"{name}: within one mass, mean SD {sd} mm, {cv} % (root mean square {rms} %)"
     for caution in report.cautions:
         yield f"{name}: {caution}"
     for one in report.coverage:
@@ -288,15 +363,16 @@ def _modality_notes(name: str, report: ModalityReport, *, percent: str) -> Itera
             f"{name}: {100 * one.probability:g} % intervals cover {one.covered} of {one.n} "
             f"({one.fraction:.0%}, {percent} interval {low:.0%} to {high:.0%}) on {_plural(one.masses, 'mass')}"
         )
-    yield from _reasons(name, report)
+    yield from _reasons(name, report, [key for key in report.reasons if key.removesuffix("_interval") in _FIRST])
 
 
-def _reasons(name: str, report: ModalityReport) -> Iterator[str]:
-    """Reasons for missing figures and intervals; missing replicates are named in the JSON only."""
-    owed = {key: why for key, why in report.reasons.items() if not key.startswith(("within_mass", "calibration"))}
+def _reasons(name: str, report: ModalityReport, keys: Sequence[str]) -> Iterator[str]:
+    """Why figures or their intervals are missing; missing replicates are named in the JSON only."""
+    owed = {key: report.reasons[key] for key in keys if not key.startswith(("within_mass", "calibration"))}
     figures = {key: why for key, why in owed.items() if not key.endswith("_interval")}
+    words = {key: text for key, (text, _) in (_FIRST | _FOUND).items()}
     for reason in dict.fromkeys(figures.values()):
-        affected = ", ".join(key for key, why in figures.items() if why == reason)
+        affected = ", ".join(words.get(key, key) for key, why in figures.items() if why == reason)
         yield f"{name}: no {affected}: {reason}"
     intervals = [key.removesuffix("_interval") for key in owed if key.endswith("_interval")]
     for reason in dict.fromkeys(owed[f"{key}_interval"] for key in intervals if key not in figures):
@@ -313,8 +389,9 @@ def found_share(report: ModalityReport) -> str:
 
 
 def _aligned(rows: list[tuple[str, ...]]) -> list[str]:
-    widths = [max(len(cell) for cell in column) for column in zip(*rows, strict=True)]
-    return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+    widths = [max(len(cell) for cell in column) for column in zip(*(row for row in rows if row[1:]), strict=True)]
+    lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=False)).rstrip() for row in rows]
+    return [line for line in lines if line]
 
 
 def _synthetic(counts: Counts) -> str:

@@ -14,9 +14,18 @@ from scipy.special import ndtr
 
 from tactile_bayes.declarations import UNSET
 from tactile_bayes.report.compare import Growth
-from tactile_bayes.report.figure_file import plain_matplotlib
+from tactile_bayes.report.figure_file import FORMATS, plain_matplotlib
 from tactile_bayes.report.pages import page
-from tactile_bayes.report.trial import found_share, growing_line, limit_rows, number, ratio_line, shown
+from tactile_bayes.report.trial import (
+    SPELLED,
+    comparison_sentences,
+    found_share,
+    growing_line,
+    limit_rows,
+    number,
+    ratio_line,
+    shown,
+)
 from tactile_bayes.trial.calibration import BINS, Calibration, Prediction
 from tactile_bayes.trial.figures import Ends, Figures
 from tactile_bayes.trial.method_comparison import MethodComparison
@@ -29,9 +38,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
-# --- Figures of a trial as PNG bytes, equal for equal input: sizes, differences, integral transforms, coverage.
+# --- Figures of a trial as SVG, equal for equal input: sizes, differences, integral transforms, coverage.
 
-_DPI = 160
 _DOTS, _LINE, _SECOND, _GREY = "#1f3b73", "#c8641e", "#2a7f62", "0.45"
 _PANEL_IN = 4.1
 Corner = Literal["upper left", "lower right"]
@@ -52,7 +60,7 @@ def sizes_figure(report: TrialReport, trial: Trial) -> bytes:
         for one, panel in zip(modalities, axes, strict=True):
             _draw_sizes(panel, one, sds, report.modalities[one.name].slope_through_origin, reach)
 
-    return _png(draw, len(modalities))
+    return _svg(draw, len(modalities))
 
 
 def differences_figure(report: TrialReport, trial: Trial) -> bytes:
@@ -69,7 +77,7 @@ def differences_figure(report: TrialReport, trial: Trial) -> bytes:
         for panel in axes:  # the widest range of any
             panel.set(xlim=(across[:, 0].min(), across[:, 1].max()), ylim=(up[:, 0].min(), up[:, 1].max()))
 
-    return _png(draw, len(found))
+    return _svg(draw, len(found))
 
 
 def calibration_figure(prediction: Prediction, found: Calibration) -> bytes:
@@ -80,16 +88,17 @@ def calibration_figure(prediction: Prediction, found: Calibration) -> bytes:
         _draw_ecdf(axes[1], prediction, found)
         _draw_coverage(axes[2], found)
 
-    return _png(draw, 3)
+    return _svg(draw, 3)
 
 
-def _png(draw: Callable[[Sequence[Axes]], None], panels: int) -> bytes:
-    """Render a figure as PNG bytes, independent of the user's matplotlib settings."""
+def _svg(draw: Callable[[Sequence[Axes]], None], panels: int) -> bytes:
+    """Render a figure as SVG, independent of the user's matplotlib settings."""
     with plain_matplotlib() as library:
-        figure = library.figure.Figure(figsize=(_PANEL_IN * panels, _PANEL_IN), dpi=_DPI, layout="constrained")
+        library.rcParams["svg.hashsalt"] = "tactile-bayes"  # else the names inside are random
+        figure = library.figure.Figure(figsize=(_PANEL_IN * panels, _PANEL_IN), layout="constrained")
         draw(np.atleast_1d(np.asarray(figure.subplots(1, panels))).tolist())
         buffer = io.BytesIO()
-        figure.savefig(buffer, format="png", dpi=_DPI, metadata={"Software": None})
+        figure.savefig(buffer, format="svg", metadata=FORMATS[".svg"])
     return buffer.getvalue()
 
 
@@ -187,14 +196,16 @@ def _label(axes: Axes, title: str, across: str, up: str, *, legend: bool = True,
 
 Table = tuple[Sequence[str], Sequence[Sequence[str]]]
 """Heads and rows; an interval in brackets is set in small type below its number."""
-_MAIN = {
-    "mape_percent": ("MAPE %", ".1f"),
-    "mape_detected_percent": ("MAPE % found", ".1f"),
-    "weighted_mape_percent": ("weighted %", ".1f"),
-    "median_error_percent": ("median %", ".1f"),
-    "mae_mm": ("MAE mm", ".2f"),
-    "bias_percent": ("bias % found", "+.1f"),
-    "slope_through_origin": ("slope through 0", ".2f"),
+_FIRST = {
+    "mape_percent": ("mean error, %", ".1f"),
+    "mae_mm": ("mean error, mm", ".1f"),
+    "bias_percent": ("bias of masses found, %", "+.1f"),
+    "slope_through_origin": ("slope of the line through 0", ".2f"),
+}
+_MORE = {
+    "mape_detected_percent": ("mean error of masses found, %", ".1f"),
+    "weighted_mape_percent": ("weighted by size, %", ".1f"),
+    "median_error_percent": ("median error, %", ".1f"),
     "r2_centred": ("r2 centred", ".2f"),
     "r2_uncentred": ("r2 uncentred", ".2f"),
     "r2_pearson": ("r2 Pearson", ".2f"),
@@ -211,13 +222,13 @@ _METHODS = {
     "concordance": ("concordance", ".2f"),
 }
 _SPREAD = {
-    "within_mass_cv_rms_percent": ("wCV % (RMS)", ".1f"),
-    "within_mass_cv_percent": ("wCV % (mean of SDs)", ".1f"),
+    "within_mass_cv_rms_percent": ("SD within a mass, % (root mean square)", ".1f"),
+    "within_mass_cv_percent": ("% (mean of SDs)", ".1f"),
 }
 _REPEATS = {
     "repeatability_low_percent": ("repeatability down %", ".0f"),
     "repeatability_high_percent": ("up %", "+.0f"),
-    "icc": ("ICC", ".2f"),
+    "icc": ("intraclass correlation (ICC)", ".2f"),
 }
 _NEXT = {
     "mape_percent": "expected error %",
@@ -247,18 +258,21 @@ def trial_html(report: TrialReport, trial: Trial, *, text: str, growth: Sequence
         protocol="" if report.title is UNSET else report.title,
         opening=f"{opening} In brackets: {percent} intervals over patients.",
         marks=_marks(report, trial),
+        comparisons=comparison_sentences(report),
         errors=(
-            ["", "found", *_heads(_MAIN)],
-            [[name, found_share(one), *_cells(one, _MAIN)] for name, one in modalities],
+            ["", "masses found", *_heads(_FIRST)],
+            [[SPELLED.get(name, name), found_share(one), *_cells(one, _FIRST)] for name, one in modalities],
         ),
+        masses=_masses(trial),
+        more=(["", *_heads(_MORE)], [[name, *_cells(one, _MORE)] for name, one in modalities]),
         ratios=[ratio_line(name, one) for name, one in report.mape_ratio_to_tactile.items()],
         cautions=[f"{name}: {caution}" for name, one in modalities for caution in one.cautions],
-        sizes_png=_base64(sizes_figure(report, trial)),
+        sizes_svg=_base64(sizes_figure(report, trial)),
         lines=(["", *_heads(_METHODS)], [[name, *_cells(one.method_comparison, _METHODS)] for name, one in modalities]),
         error_ratio=f"{ratio:g}",
         limits=_limits(report),
         growing=[line for line in (growing_line(report), *trends) if line],
-        differences_png=_base64(differences_figure(report, trial)),
+        differences_svg=_base64(differences_figure(report, trial)),
         replicates=_replicates(report),
         calibrations=list(_calibrations(report, trial)),
         pairs=_pairs(report),
@@ -280,6 +294,21 @@ def _marks(report: TrialReport, trial: Trial) -> list[str]:
         share = "All" if counts.synthetic_readings == counts.readings else str(counts.synthetic_readings)
         marks.append(f"{share} readings are synthetic: made by a generator, not measured.")
     return marks
+
+
+def _masses(trial: Trial) -> Table:
+    """Size and residual of each mass by each modality, in the order of the excision table."""
+    sizes, numbers = trial.sizes(), mass_numbers(trial.ex_vivo_mm)
+    cells: dict[tuple[int, str], str] = {}
+    for name, one in sizes.items():
+        for mass, ex_vivo, size, found in zip(one.mass, one.ex_vivo_mm, one.size_mm, one.detected, strict=True):
+            residual = f"{size:.1f} [{size - ex_vivo:+.1f} mm, {100 * (size / ex_vivo - 1):+.0f} %]"
+            cells[int(mass), name] = residual if found else "not found"
+    rows = [
+        [str(place), f"{ex_vivo:.1f}", *(cells.get((numbers[key], name), "-") for name in sizes)]
+        for place, (key, ex_vivo) in enumerate(trial.ex_vivo_mm.items(), start=1)
+    ]
+    return ["mass", "after excision, mm", *(f"{name}, mm" for name in sizes)], rows
 
 
 def _limits(report: TrialReport) -> Table:
@@ -339,7 +368,7 @@ def _pairs(report: TrialReport) -> Table | None:
         ]
         for one in report.paired_comparisons
     ]
-    heads = ["", "masses", "difference of MAPE, points", "ratio", "p", "p Holm"]
+    heads = ["", "masses", "difference of mean errors, points", "ratio", "p", "p Holm"]
     return (heads, rows) if rows else None
 
 
@@ -356,7 +385,7 @@ def _next_mass(found: NextMass) -> dict[str, Any]:
 
 
 def _checks(found: Mapping[str, IntervalCheck]) -> Table:
-    heads = ["", "simulated trials", "true MAPE %", "covered", "interval above it", "interval below it"]
+    heads = ["", "simulated trials", "true mean error, %", "covered", "interval above it", "interval below it"]
     rows = [
         [
             name,

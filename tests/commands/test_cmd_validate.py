@@ -63,10 +63,56 @@ def test_text_names_units_ratios_and_ends_with_the_research_line() -> None:
     text = "\n".join(lines)
     assert "25 masses of 24 patients" in lines[0]
     assert "synthetic" in lines[0]
-    for words in ("MAPE %", "MAE mm", "times the tactile one's", "intervals cover", "r2: centred"):
+    for words in ("error %", "error mm", "intervals cover", "clinical breast examination (cbe)"):
         assert words in text
     assert lines[-1] == RESEARCH_USE
-    assert max(map(len, lines)) < 160
+    assert "MAPE" not in text
+
+
+def test_a_sentence_compares_the_tactile_error_with_each_other_one() -> None:
+    """The paired comparison's ratio, interval and Holm's p, whichever of the two the table names first."""
+    text = validate(TRIAL, "--excision", EXCISION).stdout
+    assert "tactile errs 0.45 times as much as ultrasound, 95 % 0.26 to 0.78, p .028, 25 masses\n" in text
+    pairs = json.loads(validate(TRIAL, "--excision", EXCISION, "--json").stdout)["paired_comparisons"]
+    one = next(pair for pair in pairs if {pair["first"], pair["second"]} == {"tactile", "ultrasound"})
+    assert (round(one["ratio"], 2), [round(end, 2) for end in one["ratio_interval"]]) == (0.45, [0.26, 0.78])
+    assert round(one["p_holm"], 3) == 0.028
+
+
+def test_the_comparison_is_the_inverse_where_the_other_modality_comes_first(tmp_path: Path) -> None:
+    """Errors of 10 % against 40 % in every one of eight masses: a quarter; then masses that differ, in both orders."""
+    keys = [f"P{i},1" for i in range(8)]
+    for spread, told in ((0, "no interval: the figure is the same"), (0.02, "95 % 0.")):
+        sentences = set()
+        for order in (("mri", "tactile"), ("tactile", "mri")):
+            errors = {name: 0.4 if name == "mri" else 0.1 for name in order}
+            rows = [
+                f"{key},{name},1,{10 * (1 + errors[name] + spread * (i % 3)):g},detected\n"
+                for name in order
+                for i, key in enumerate(keys)
+            ]
+            text = validate(*split(*small(tmp_path, "".join(rows), "".join(f"{key},10\n" for key in keys)))).stdout
+            sentences |= {line for line in text.splitlines() if line.startswith("tactile errs")}
+        (sentence,) = sentences
+        assert sentence.startswith(f"tactile errs {0.25 if not spread else 0.28} times as much as mri, {told}")
+        assert sentence.endswith(", p .0078, 8 masses")
+
+
+def test_without_a_tactile_reading_every_pair_is_compared(tmp_path: Path) -> None:
+    rows = "P1,1,mri,1,12,detected\nP1,1,us,1,11,detected\nP2,1,mri,1,22,detected\nP2,1,us,1,25,detected\n"
+    text = validate(*split(*small(tmp_path, rows))).stdout
+    assert "mri errs 0.86 times as much as us, no interval: an interval needs at least 8 patients (found 2)" in text
+
+
+@pytest.mark.parametrize("name", ["us", "clinical_breast_examination"])
+def test_the_table_fits_80_columns(name: str, tmp_path: Path) -> None:
+    text = validate(TRIAL, "--excision", EXCISION).stdout
+    trial, ex = tmp_path / "t.csv", EXCISION
+    trial.write_text(TRIAL.read_text().replace(",cbe,", f",{name},"))
+    for one in (text, validate(trial, "--excision", ex).stdout):
+        table = one.split("\n\n")[1]
+        assert "25 of 25" in table
+        assert max(map(len, table.splitlines())) <= 80
 
 
 def small(folder: Path, rows: str, excision: str = "P1,1,10\nP2,1,20\n") -> tuple[Path, Path]:
@@ -74,6 +120,10 @@ def small(folder: Path, rows: str, excision: str = "P1,1,10\nP2,1,20\n") -> tupl
     trial.write_text("patient,mass,modality,replicate,size_mm,status\n" + rows)
     ex.write_text("patient,mass,ex_vivo_mm\n" + excision)
     return trial, ex
+
+
+def split(trial: Path, ex: Path) -> tuple[object, ...]:
+    return trial, "--excision", ex
 
 
 def test_few_patients_get_no_interval_and_are_told_why(tmp_path: Path) -> None:

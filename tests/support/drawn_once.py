@@ -10,10 +10,10 @@ import pytest
 from tactile_bayes.report import trial_html
 
 _drawn: dict[int, bytes] = {}
-_draw = trial_html._png
+_draw = trial_html._svg
 
 
-def _png(draw: Any, panels: int) -> bytes:
+def _svg(draw: Any, panels: int) -> bytes:
     if panels not in _drawn:
         _drawn[panels] = _draw(draw, panels)
     return _drawn[panels]
@@ -23,5 +23,5 @@ def _png(draw: Any, panels: int) -> bytes:
 def drawn_once() -> Iterator[None]:
     """Give back a picture that was drawn before, whatever it shows."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(trial_html, "_png", _png)
+        patch.setattr(trial_html, "_svg", _svg)
         yield

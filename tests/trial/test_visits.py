@@ -115,7 +115,7 @@ def written(folder: Path, trial: str = TRIAL, excision: str = EXCISION) -> tuple
 
 def test_validate_says_on_its_second_line_what_it_left_out_and_holds_no_growth(tmp_path: Path) -> None:
     """Both visits pooled would differ by 22 % within the mass; the control leaves the visits blank."""
-    done = run_here(*written(tmp_path), cwd=tmp_path)
+    done = run_here(*written(tmp_path), "-v", cwd=tmp_path)
     first = done.stdout.splitlines()[:2]
     assert "5 readings" in first[0]
     assert first[1] == (
@@ -126,7 +126,7 @@ def test_validate_says_on_its_second_line_what_it_left_out_and_holds_no_growth(t
     blind = "\n".join(
         ",".join(cell for i, cell in enumerate(line.split(",")) if i not in (4, 5)) for line in TRIAL.split()
     )
-    control = run_here(*written(tmp_path, blind), cwd=tmp_path)
+    control = run_here(*written(tmp_path, blind), "-v", cwd=tmp_path)
     assert "left out: 2 of earlier visits" not in control.stdout
     assert "tactile: within one mass, mean SD 1.8 mm" in control.stdout
 
