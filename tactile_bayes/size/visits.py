@@ -155,7 +155,7 @@ class SharedBody(Record):
 
 
 SHARED_BODY: Final = SharedBody(0.11, 0.48)
-"""Learned from simulated visits, see record 0132: ``python -m benchmarks.visits law``."""
+"""Learned from simulated visits, see record 0132: ``python -m validation visits law``."""
 SHARED_WITHOUT_DEPTH: Final = SharedBody(0.19, 0.39)
 """Where maps tell no depth of fat: most of what they hide is that depth, which stays as the lump grows."""
 STRANGERS: Final = SharedBody(1.0, 1.0)
@@ -204,7 +204,7 @@ class AmplitudeLaw(Record):
 
 
 AMPLITUDE_LAW: Final = AmplitudeLaw(1.0, 6.2, 3.5, 0.04, 0.02, 3.6, 0.1)
-"""From the bodies of the calibration's table, see record 0134: ``python -m benchmarks.visits amplitude``."""
+"""From the bodies of the calibration's table, see record 0134: ``python -m validation visits amplitude``."""
 
 
 class Change(Record, eq=False):

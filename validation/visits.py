@@ -1,9 +1,9 @@
-"""Simulated visits of lumps that grow, shrink or stay: what `compare` says of them.
+"""What `compare` says of lumps that grow, shrink or stay: ``python -m validation visits``.
 
-    python -m benchmarks.visits make DIR --bodies 50 [--seed N]   # exams, resumable: a file a body
-    python -m benchmarks.visits law DIR                           # `SHARED_BODY` of `size.visits`
-    python -m benchmarks.visits judge DIR                         # false alarms, power, coverage, widths, same mass
-    python -m benchmarks.visits amplitude benchmarks/population.csv.gz  # `AMPLITUDE_LAW` of `size.visits`
+    python -m validation visits make DIR --bodies 50 [--seed N]  # exams, resumable: a file a body
+    python -m validation visits law DIR                          # `SHARED_BODY` of `size.visits`
+    python -m validation visits judge DIR                        # false alarms, power, coverage, widths, same mass
+    python -m validation visits amplitude validation/population.csv.gz  # `AMPLITUDE_LAW` of `size.visits`
 
 A body has three visits of two exams each: two with a lump of the same size, one with a lump 10, 20 or 35 % larger or
 20 % smaller. Its fat, gland and stiffness stay; the lump keeps its centre or the gap to the skin (drawn), so its seat
@@ -13,7 +13,7 @@ sternum by 3 mm (SD, each way). Each exam has another technique and landmarks to
 
 from __future__ import annotations
 
-import argparse
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -27,11 +27,10 @@ from tactile_bayes.api.sized import pooling_shape
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import TactileBayesError
 from tactile_bayes.forward.scene import Scene, SceneLandmarks
-from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.forward.tissue import SceneBody, SolidLump
 from tactile_bayes.geometry import FloatArray, apply
-from tactile_bayes.mapping.build import build_map
 from tactile_bayes.studies.population import BodyPrior, ExamPrior, draw_body, draw_exam
+from validation.common import map_of, parser
 
 GROWTHS = (1.10, 1.20, 1.35, 0.80)
 VISITS, EXAMS = 3, 2
@@ -106,7 +105,7 @@ def make_body(index: int, *, folder: Path, seed: int) -> str:
 def _measured(scene: Scene) -> dict[str, Any]:
     """Draws of the shape and place of the lump on an exam's map; nothing where none was found."""
     try:
-        tactile_map = build_map(simulate(scene, rng=np.random.default_rng(scene.seed)).scan)
+        tactile_map = map_of(scene)
         estimate = estimate_one(tactile_map, Settings()).estimate
         shape = pooling_shape(tactile_map, estimate)
     except TactileBayesError:
@@ -142,19 +141,19 @@ def make(folder: Path, *, bodies: int, seed: int, workers: int) -> None:
             print(done, flush=True)
 
 
-if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("step", choices=["make", "law", "judge", "amplitude"])
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--bodies", type=int, default=50)
-    parser.add_argument(
-        "--seed", type=int, default=20271115, help="make: 20271115 was learned from, 20271116 judged on"
-    )
-    parser.add_argument("--workers", type=int, default=1)
-    given = parser.parse_args()
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Make the exams, or print figures of those that are made."""
+    words = parser(__name__, __doc__)
+    words.add_argument("step", choices=["make", "law", "judge", "amplitude"])
+    words.add_argument("folder", type=Path)
+    words.add_argument("--bodies", type=int, default=50)
+    words.add_argument("--seed", type=int, default=20271115, help="make: 20271115 was learned from, 20271116 judged on")
+    words.add_argument("--workers", type=int, default=1)
+    given = words.parse_args(arguments)
     if given.step == "make":
         make(given.folder, bodies=given.bodies, seed=given.seed, workers=given.workers)
     else:
-        from benchmarks import visits_figures
+        # it draws the bodies of this module
+        from validation import visits_figures
 
         getattr(visits_figures, given.step)(given.folder)

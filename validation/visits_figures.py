@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.visits import draw_visits
 from tactile_bayes.files.size_json import read_size_calibration, size_calibration_path
 from tactile_bayes.forward.scene import Scene
 from tactile_bayes.geometry import FloatArray, apply, patient_from_base
@@ -31,6 +30,7 @@ from tactile_bayes.size.visits import (
     apart,
     joint_sizes,
 )
+from validation.visits import draw_visits
 
 WHOLE = SharedBody(0.0, 1e6)
 """Everything shared: the body is the same whatever the growth."""
