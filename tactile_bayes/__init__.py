@@ -3,6 +3,7 @@
 ``import tactile_bayes as tb`` offers what the command line does; each name is loaded when it is first used:
 
 - `read_scan`, `read_map`, `simulate`, `demo_scan`, `demo_map`: scans and maps
+- `scan_of`: from arrays, or a file of them, to a scan
 - `check`: whether array, lever arm and quaternions of a scan are as they are stated
 - `build_map`: from scans to a map
 - `estimate`, `pool`: from a map, or from several maps of one mass, to a size
@@ -54,6 +55,7 @@ __all__ = [
     "read_map",
     "read_scan",
     "record",
+    "scan_of",
     "simulate",
     "validate",
 ]
@@ -86,6 +88,7 @@ _HOME = {
     "read_map": "api.maps",
     "read_scan": "api.maps",
     "record": "api.recording",
+    "scan_of": "api.arrays",
     "simulate": "api.maps",
     "validate": "api.trials",
 }

@@ -1,4 +1,4 @@
-"""Demonstration, imports, exports and draws, as their commands do them."""
+"""Demonstration, checks, exports and draws, as their commands do them."""
 
 from __future__ import annotations
 
@@ -20,90 +20,16 @@ from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.exports.exam import read_exam
 from tactile_bayes.exports.identity import identity_of
 from tactile_bayes.exports.run import Outputs, export, refuse_untaken
-from tactile_bayes.files.atomic import check_suffix, refuse_existing, unwritable, write_bytes
-from tactile_bayes.files.documents import dump_json, with_session
+from tactile_bayes.files.atomic import refuse_existing, unwritable, write_bytes
+from tactile_bayes.files.documents import dump_json
 from tactile_bayes.files.estimate_json import StatedSize, read_stated_size
-from tactile_bayes.files.grid_files import open_grid
-from tactile_bayes.files.grids import grid_map
 from tactile_bayes.files.identify import describe
-from tactile_bayes.files.imports import read_arrays
-from tactile_bayes.files.map_nc import write_map
-from tactile_bayes.files.provenance import Provenance, hash_inputs
-from tactile_bayes.files.scan_mcap import read_scan, read_scan_report, read_truth, write_scan
+from tactile_bayes.files.scan_mcap import read_scan, read_truth
 from tactile_bayes.files.size_json import SHIPPED, size_calibration_path
-from tactile_bayes.findings import finding_lines
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.mapping.arrangement import TOO_SHORT, check_scan, corrected
+from tactile_bayes.mapping.arrangement import TOO_SHORT, check_scan
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.scan import Scan
-
-# --- `import`: import scans, grids and images from other programs.
-
-_LONGEST_UNITS = 20
-
-
-def import_action(
-    *,
-    source: Path,
-    output: Path,
-    kind: str | None,
-    spacing_mm: float | None,
-    normalise: str | None,
-    units: str | None,
-    no_value: tuple[str, ...],
-    corrections: tuple[str, ...],
-    session_file: Path | None,
-    force: bool,
-) -> None:
-    """Import scans, grids and images from other programs."""
-    refuse_existing(output, force=force)
-    if kind is None:  # a map where the output is .nc, or the source can only be a grid
-        as_map = output.suffix.lower() == ".nc" and source.suffix.lower() != ".mcap"
-        kind = "scan" if source.suffix.lower() in (".npz", ".mcap") and not as_map else "map"
-    check_suffix(output, "MCAP" if kind == "scan" else "netCDF")
-    if kind == "scan" and (spacing_mm is not None or normalise is not None or units is not None or no_value):
-        raise UsageError("--spacing-mm, --normalise, --units and --no-value are for maps: leave out, or give --as map")
-    if kind == "map" and (session_file is not None or corrections):
-        raise UsageError("--session and --correct are for scans; leave them out or give --as scan")
-    if units is not None and normalise not in (None, "none"):
-        raise UsageError(f"--units is for values that were not divided; leave it out or --normalise {normalise}")
-    if units is not None and not (units.isprintable() and 0 < len(units.strip()) <= _LONGEST_UNITS):
-        raise UsageError(f"--units {units[:30]!r} is not a unit; give up to {_LONGEST_UNITS} letters, such as kPa")
-    if kind == "scan":
-        lines = _import_scan(source, output, corrections, session_file, force=force)
-    else:
-        asked = {"normalise": normalise or "none", "units": units or "", "no_value": no_value}
-        lines = _import_map(source, output, spacing_mm, asked, force=force)
-    for line in (f"{output}: {kind}", *lines, RESEARCH_USE):
-        click.echo(line)
-
-
-def _import_scan(
-    source: Path, output: Path, corrections: tuple[str, ...], session_file: Path | None, *, force: bool
-) -> list[str]:
-    lost: tuple[str, ...] = ()
-    truth = None
-    if source.suffix.lower() == ".mcap":
-        file = read_scan_report(source)
-        scan, lost, truth = file.scan, file.lost, read_truth(source)
-    else:
-        scan = read_arrays(source)
-    files = {"source": source} | ({"session": session_file} if session_file else {})
-    settings = {"as": "scan", "lost": list(lost), "correct": list(corrections)}
-    provenance = Provenance("import", settings, inputs=hash_inputs(**files))
-    scan = corrected(with_session(scan, session_file), corrections)
-    write_scan(output, scan, provenance=provenance, truth=truth, force=force)
-    return [*describe_scan(scan), *(f"lost: {line}" for line in lost), *_arrangement_lines(scan)]
-
-
-def _arrangement_lines(scan: Scan) -> list[str]:
-    """What its frames say of the scan's arrangement; a scan that no map could be made of is imported without."""
-    try:
-        check = check_scan(scan, thorough=False)
-    except BadDataError as error:
-        return [f"arrangement not checked: {error.what}"]
-    return [] if check is None else finding_lines(check.findings) or [check.words]
-
 
 # --- `check`: is a scan arranged as it is stated?
 
@@ -122,30 +48,6 @@ def check_action(*, scans: tuple[Path, ...], pressure_window_kpa: tuple[float, f
         raise BadDataError(
             f"{wrong} of {len(scans)} scans are not arranged as they are stated", way_out="import them again, corrected"
         )
-
-
-def _import_map(
-    source: Path, output: Path, spacing_mm: float | None, asked: dict[str, Any], *, force: bool
-) -> list[str]:
-    try:
-        grid = open_grid(source, no_value=asked["no_value"])
-        tactile_map, notes = grid_map(grid, spacing_mm=spacing_mm, **asked)
-    except BadDataError as error:
-        raise error.at(source) from None
-    settings = {"as": "map", "spacing_mm": tactile_map.recipe.cell_mm, **asked, "notes": notes}
-    provenance = Provenance("import", settings, inputs=hash_inputs(source=source))
-    write_map(output, tactile_map, provenance=provenance, force=force)
-    ny, nx = tactile_map.mean.shape
-    covered = int(tactile_map.covered.sum())
-    low, high = np.nanmin(tactile_map.mean), np.nanmax(tactile_map.mean)
-    unit = tactile_map.recipe.value_unit
-    unit = "" if unit == "1" else f" {unit or '(unit unknown: give --units)'}"
-    level = "unknown" if tactile_map.background is None else f"{tactile_map.background:g}"
-    return [
-        f"{ny} x {nx} cells of {tactile_map.recipe.cell_mm:g} mm, {covered} with data",
-        f"values {low:.4g} to {high:.4g}{unit}, background level {level} (normalise {tactile_map.recipe.normalise})",
-        *notes,
-    ]
 
 
 def describe_scan(scan: Scan) -> list[str]:

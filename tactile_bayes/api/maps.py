@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any, overload
 import numpy as np
 
 from tactile_bayes.api.arguments import check_keywords, door, plain
-from tactile_bayes.declarations import Record, as_dict, names_of
+from tactile_bayes.declarations import EXACT, Record, as_dict, names_of, to_plain
 from tactile_bayes.errors import UsageError, check_number
 from tactile_bayes.files.atomic import Format, check_suffix, sha256
 from tactile_bayes.files.map_nc import read_map_and_scans, write_map
 from tactile_bayes.files.provenance import Provenance, repeated_scans, scan_facts
-from tactile_bayes.files.scene_toml import read_scene
+from tactile_bayes.files.scene_toml import read_scene, scene_of
 from tactile_bayes.findings import Finding, finding_lines
 from tactile_bayes.forward.instrument import SimulatedScan
 from tactile_bayes.geometry import FloatArray
@@ -247,7 +247,7 @@ def build_map(scans: Any, **options: Any) -> Map:
             loaded.append(read_scan(one))
             facts += exam_facts([path_of(one)], loaded[-1:])
             continue
-        scan = _scan_of(one)
+        scan = scan_given(one)
         loaded.append(scan)
         facts.append(scan_facts(scan.session, frames=scan.frames.sha256))
     for later, earlier in repeated_scans([[one] for one in facts]).items():
@@ -275,28 +275,39 @@ def check(scan: Any, *, pressure_window_kpa: tuple[float, float] = PRESSURE_WIND
         `words` says what its frames agree with, `lines()` in full; None where it is too short.
     """
     return check_scan(
-        read_scan(scan) if isinstance(scan, str | Path) else _scan_of(scan), pressure_window_kpa=pressure_window_kpa
+        read_scan(scan) if isinstance(scan, str | Path) else scan_given(scan), pressure_window_kpa=pressure_window_kpa
     )
 
 
-def _scan_of(given: Any) -> Scan:
+def scan_given(given: Any) -> Scan:
+    """Return the scan given as a `Scan` or a simulated one.
+
+    Raises
+    ------
+    UsageError
+        When it is neither.
+    """
     scan = getattr(given, "scan", given)
     if not isinstance(scan, Scan):
         kind = type(given).__name__
-        raise UsageError(f"a scan is wanted, not {kind}; read one with read_scan, or bring arrays in with `import`")
+        raise UsageError(f"a scan is wanted, not {kind}; read one with read_scan, or make one of arrays with scan_of")
     return scan
 
 
 @door
 def simulate(
-    scene: PathLike, *, seed: int | None = None, fidelity: str | None = None, head: str | None = None
+    scene: PathLike | Mapping[str, Any],
+    *,
+    seed: int | None = None,
+    fidelity: str | None = None,
+    head: str | None = None,
 ) -> SimulatedScan:
     """Make a scan with known truth from a scene.
 
     Parameters
     ----------
     scene
-        Path of a TOML file.
+        Path of a TOML file, or what stands in it: ``{"scene": {"duration_s": 7}, "lump": [{"d_mm": 15}]}``.
     seed
         Of the random numbers. Default: the scene's.
     fidelity, head
@@ -309,7 +320,11 @@ def simulate(
     """
     from tactile_bayes.forward.simulate import simulate as run
 
-    read = read_scene(required_path(scene, "scene"))
+    read = (
+        scene_of(to_plain(dict(scene), digits=EXACT))
+        if isinstance(scene, Mapping)
+        else read_scene(required_path(scene, "scene"))
+    )
     used = read.seed if seed is None else seed
     check_number("seed", used, 0, whole=True)
     return run(read, rng=np.random.default_rng(used), fidelity=fidelity, head=head)

@@ -10,8 +10,8 @@ import click
 
 from tactile_bayes.commands.options import FORCE, JSON, METAVAR, SESSION, FigurePath, FilePath, takes
 from tactile_bayes.declarations import names_of
-from tactile_bayes.files.arrays_layout import layout_lines
-from tactile_bayes.options import IdentityOptions, MapOptions
+from tactile_bayes.files.arrays_layout import Stated, layout_lines
+from tactile_bayes.options import IdentityOptions, MapOptions, RecordOptions
 from tactile_bayes.presets import CORRECTIONS, METHODS, NORMALISE
 
 # --- `demo`: the main steps on data that comes with the program.
@@ -53,8 +53,8 @@ def demo_command(ctx: click.Context, /, **given: Any) -> None:
 
 
 @click.command("import")
-@click.argument("source", metavar="SRC", type=FilePath())
-@click.option("-o", "--output", required=True, type=FilePath(), help="File to write: .mcap or .nc.")
+@click.argument("sources", metavar="SRC...", nargs=-1, type=FilePath())
+@click.option("-o", "--output", type=FilePath(), help="File to write: .mcap or .nc; of several SRC, the folder.")
 @click.option(
     "--as",
     "kind",
@@ -81,23 +81,37 @@ def demo_command(ctx: click.Context, /, **given: Any) -> None:
     multiple=True,
     help="Scan: correct what is stated of array, lever arm or quaternions; `check` says what is to be corrected.",
 )
+@click.option("--template", is_flag=True, help="Print a MAP.toml for --columns: of SRC, with what its shapes tell.")
+@click.option("--columns", metavar="MAP.toml", type=FilePath(), help="Scan: what SRC calls its arrays.")
+@takes(RecordOptions, "head_geometry", "array_calibration", "landmarks")
+@takes(Stated, *names_of(Stated))
 @SESSION
 @FORCE
-def import_command(**given: Any) -> None:
+@click.pass_context
+def import_command(ctx: click.Context, /, **given: Any) -> None:
     """Import scans, grids and images from other programs.
 
-    SRC is an .npz of raw counts and poses (a scan), a scan file to repair (what is intact is kept), or a grid of
-    values (a map): .npz with `mean`, .csv (commas, semicolons or tabs), or a grey .tif, .pgm or .png image. The first
-    row of a grid has the lowest y and the first column the lowest x; pictures of the map show the first row on top,
-    as the file reads.
+    SRC is a file of arrays (a scan): .npz, .npy, MATLAB's .mat or HDF5; a scan file to repair (what is intact is kept);
+    or a grid of values (a map): .npz with `mean`, .csv (commas, semicolons or tabs), or a grey .tif, .pgm or .png
+    image. The first row of a grid has the lowest y and the first column the lowest x; pictures of the map show the
+    first row on top, as the file reads.
+
+    Frames are raw counts with a calibration, or pressures with --unit. What of a scan is the same for all files of a
+    laboratory stands in files beside it: --head-geometry, --array-calibration. What is guessed is printed.
+
+    Example: tactile-bayes import exam.mat --columns map.toml --unit kPa -o exam.mcap
     """
-    from tactile_bayes.actions.exam import import_action
+    from tactile_bayes.actions.bring_in import import_action
 
-    import_action(**given)
+    import_action(ctx, **given)
 
 
-_HEADING = "Arrays of a scan in an .npz file, in mm, kPa and s, for n frames and m poses:"
-_ARRAYS = "\n".join([_HEADING, "", "\b", *layout_lines()])
+_HEADING = "Arrays of a scan, in mm, kPa and s, for n frames and m poses:"
+_MORE = (
+    "Frames may also be called `frames`, and poses be homogeneous matrices, `pose_matrix` (m, 4, 4). Other names stand "
+    "in MAP.toml."
+)
+_ARRAYS = "\n".join([_HEADING, "", "\b", *layout_lines(), "", _MORE])
 import_command.help = f"{cleandoc(import_command.help or '')}\n\n{_ARRAYS}"
 
 

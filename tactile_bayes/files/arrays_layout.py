@@ -1,14 +1,16 @@
-"""Layout of a scan's arrays in an .npz file, for the help of `import`, its errors and docs/formats.md."""
+"""Layout of a scan's arrays in other programs' files, and what can be stated of them."""
 
 from __future__ import annotations
 
-from typing import Final, NamedTuple
+from typing import Annotated, Any, Final, Literal, NamedTuple
+
+from tactile_bayes.declarations import Meta, Options, field
 
 Shape = tuple[str | int, ...]
 
 
 class ArrayLayout(NamedTuple):
-    """One array of a scan in an .npz file."""
+    """One array of a scan."""
 
     shape: Shape
     """Lengths of its axes; n frames, m poses. Letters are lengths that must agree between arrays."""
@@ -48,6 +50,8 @@ LAYOUT: Final[dict[str, ArrayLayout]] = {
     "saturation_count": ArrayLayout((), "readings at or above it carry no pressure; 4095 if left out"),
 }
 """Each array by its name."""
+KNOWN: Final = (*LAYOUT, "frames", "pose_matrix")
+"""Names of arrays that are read: the layout's, ``frames`` for counts, ``pose_matrix`` for places and rotations."""
 OPTIONAL: Final = ("landmarks_mm", "nipple_mm", "saturation_count")
 
 
@@ -60,3 +64,71 @@ def layout_lines() -> list[str]:
     """A line for each array."""
     left_out = dict.fromkeys(OPTIONAL, ", may be left out")
     return [f"- {name} ({in_words(one.shape)}{left_out.get(name, '')}): {one.meaning}" for name, one in LAYOUT.items()]
+
+
+# --- What can be stated of the arrays, on the command line, in MAP.toml and in Python.
+
+Unit = Literal["counts", "kPa", "Pa", "psi", "mmHg", "N/cm2"]
+TimeUnit = Literal["s", "ms", "us", "min"]
+PoseLayout = Literal["wxyz", "xyzw", "euler", "matrix"]
+Rate = Annotated[float, Meta(gt=0, le=100_000)]
+
+
+class Stated(Options, kw_only=True):
+    """What is stated of a scan's arrays; the rest is taken from their file, or guessed and printed."""
+
+    unit: Annotated[
+        Unit | None,
+        Meta(description="Scan: unit of the frames; counts are raw, the others need no calibration. Default: counts."),
+    ] = None
+    saturation: Annotated[
+        Annotated[float, Meta(gt=0)] | None,
+        Meta(description="Scan: reading from which on a taxel carries no pressure, in the frames' unit."),
+    ] = None
+    frame_shape: Annotated[
+        tuple[Annotated[int, Meta(ge=1)], Annotated[int, Meta(ge=1)]] | None,
+        Meta(
+            description="Scan: rows (across the head) and columns of frames that are one row of numbers. Default: the "
+            "head's.",
+            extra={"metavar": "ROWS COLUMNS"},
+        ),
+    ] = None
+    frame_order: Annotated[
+        Literal["rows", "columns"] | None,
+        Meta(description="Scan: whether such a row runs along the array's rows or columns. Default: rows."),
+    ] = None
+    rate_hz: Annotated[
+        Rate | None, Meta(description="Scan: frames a second, where they have no times.", extra={"metavar": "HZ"})
+    ] = None
+    time_unit: Annotated[TimeUnit | None, Meta(description="Scan: unit of the frames' times. Default: s.")] = None
+    pose_layout: Annotated[
+        PoseLayout | None,
+        Meta(
+            description="Scan: rotations of the poses: quaternions with the scalar first or last, azimuth, elevation "
+            "and roll, or rows of a 4 x 4 matrix. Default: wxyz."
+        ),
+    ] = None
+    length_unit: Annotated[
+        Literal["mm", "cm", "m", "inch"] | None,
+        Meta(description="Scan: unit of the poses' positions. Default: mm."),
+    ] = None
+    pose_time_unit: Annotated[TimeUnit | None, Meta(description="Scan: unit of the poses' times. Default: s.")] = None
+    pose_rate_hz: Annotated[
+        Rate | None,
+        Meta(description="Scan: poses a second, where they have frame numbers or no times.", extra={"metavar": "HZ"}),
+    ] = None
+    pose_offset_s: Annotated[
+        Annotated[float, Meta(ge=-1e10, le=1e10)] | None,
+        Meta(description="Scan: added to the poses' times, for the frames' clock. Default: 0.", extra={"metavar": "S"}),
+    ] = None
+
+
+class ArrayMap(Stated, kw_only=True):
+    """What a file calls the arrays of a scan, and what is stated of them: the TOML of `import --columns`."""
+
+    arrays: Annotated[dict[str, str], Meta(description='Name in the file by the name here: counts = "P".')] = field(
+        default_factory=dict
+    )
+    values: Annotated[dict[str, Any], Meta(description="Arrays that the file lacks, such as pitch_mm = 1.5.")] = field(
+        default_factory=dict
+    )

@@ -1,39 +1,361 @@
-"""Other people's arrays as scans."""
+"""Scans from the arrays of other programs: what is missing, in other units or of another shape is said.
+
+Arrays in mm, kPa and s, read without pickle; `arrays_layout.LAYOUT` says what each is.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from tactile_bayes.errors import BadDataError
-from tactile_bayes.files.arrays_layout import LAYOUT, OPTIONAL, Shape, in_words
-from tactile_bayes.files.npz import Arrays, load_npz
-from tactile_bayes.geometry import check_rigid
+from tactile_bayes.declarations import Record, names_of
+from tactile_bayes.errors import BadDataError, meant
+from tactile_bayes.files.arrays_layout import KNOWN, LAYOUT, OPTIONAL, ArrayMap, Shape, Stated, in_words
+from tactile_bayes.files.instrument_json import read_array_calibration, read_head_geometry, read_landmarks
+from tactile_bayes.files.named_arrays import read_named
+from tactile_bayes.files.npz import Arrays
+from tactile_bayes.files.scan_mcap import read_scan
+from tactile_bayes.geometry import FloatArray, check_rigid
+from tactile_bayes.mapping.select import other_units
+from tactile_bayes.presets import KPA_PER_UNIT, PRESSURE_RANGE_KPA, PRESSURE_WINDOW_KPA
 from tactile_bayes.scan import ElementCalibration, HeadGeometry, Landmarks, PressureFrames, Scan, TrackerPoses
-
-# --- Import of arrays from other programs: an .npz of raw counts, poses and calibration becomes a scan.
-#
-# Arrays in mm, kPa and s, read without pickle; `arrays_layout.LAYOUT` says what each is.
 
 # No value of a scan is larger, seconds since 1970 included; the squares of damaged ones would overflow.
 _LARGEST: Final = 1e12
+_STEP_KPA: Final = 0.001
+"""To which pressures are kept: a tenth of what the best arrays resolve."""
+_MOST_COUNTS: Final = 65535
+_SECONDS: Final = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "min": 60.0}
+_MM: Final = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "inch": 25.4}
+_NOT_RIGID: Final = 1e-3  # of matrices that were written with few digits
+_BESIDE: Final = {
+    "--head-geometry HEAD.json": ("pitch_mm", "array_from_tracker", "head_surface_mm"),
+    "--unit or --array-calibration CAL.json": ("gain_kpa_per_count", "offset_kpa"),
+    "--rate-hz": ("frame_time_s",),
+}
+"""Options that give what a file of arrays may lack."""
+
+
+class Source(Record, eq=False):
+    """Arrays that a file holds, by names of the layout, with what it says of them and what was guessed."""
+
+    arrays: Arrays
+    stated: Stated = Stated()
+    notes: tuple[str, ...] = ()
+
+
+class Imported(Record, eq=False):
+    """A scan, and a line for each thing that was guessed or left out."""
+
+    scan: Scan
+    notes: tuple[str, ...] = ()
 
 
 def read_arrays(path: Path) -> Scan:
-    """Read a scan from an .npz file of the layout above."""
+    """Read a scan from a file of arrays that are called as in the layout."""
+    return import_arrays(path).scan
+
+
+def import_arrays(path: Path, given: ArrayMap | None = None, beside: Sequence[Source] = ()) -> Imported:
+    """Read a scan from a file of arrays, and from what stands beside it.
+
+    Parameters
+    ----------
+    given
+        What the file calls its arrays, and what is stated of them.
+
+    Raises
+    ------
+    BadDataError
+        Naming the file, the array, its value and the way out.
+    """
+    given = given or ArrayMap()
     try:
-        required = [name for name in LAYOUT if name not in OPTIONAL]
-        shapes = {name: in_words(layout.shape) for name, layout in LAYOUT.items()}
-        arrays = load_npz(path, required=required, optional=OPTIONAL, shapes=shapes)
-        _check_shapes(arrays)
-        _check_numbers(arrays)
-        _check_units(arrays)
-        return _scan(arrays)
+        return combined([_read(path, given), *beside], given)
     except BadDataError as error:
         raise error.at(path) from None
+
+
+def over(given: Stated, said: Stated) -> Stated:
+    """What is stated by the caller, and otherwise by a file."""
+    both = {name: getattr(given, name) for name in names_of(Stated)}
+    return Stated(**{name: getattr(said, name) if value is None else value for name, value in both.items()})
+
+
+def _read(path: Path, given: ArrayMap) -> Source:
+    there = {name: name for name in KNOWN} | _checked_names(given)
+
+    def choose(names: Sequence[str]) -> list[str]:
+        for here, name in given.arrays.items():
+            if name not in names:
+                held = ", ".join(sorted(names)[:12]) or "nothing"
+                raise BadDataError(f"has no array {name!r} for {here}", way_out=f"it has {held}")
+        found = [name for name in there.values() if name in names]
+        if not found:
+            held = ", ".join(sorted(names)[:12]) or "nothing"
+            raise _unknown(held, grid="mean" in names)
+        return list(dict.fromkeys(found))
+
+    held = read_named(path, choose)
+    arrays = {here: held[name] for here, name in there.items() if name in held}
+    return Source(arrays | {name: np.asarray(value) for name, value in given.values.items()})
+
+
+def _checked_names(given: ArrayMap) -> dict[str, str]:
+    for name in (*given.arrays, *given.values):
+        if name not in KNOWN:
+            raise BadDataError(f"--columns: {name!r} is no array of a scan", way_out=meant(name, KNOWN))
+    return given.arrays
+
+
+def _unknown(held: str, *, grid: bool) -> BadDataError:
+    needed = ", ".join(f"{name} ({in_words(one.shape)})" for name, one in LAYOUT.items() if name not in OPTIONAL)
+    names = "`tactile-bayes import SRC --template` prints a MAP.toml for --columns, which says what is what"
+    more = " (for a grid of values give --as map)" if grid else ""
+    return BadDataError(f"lacks {needed} (it has {held})", way_out=f"{names}{more}; {_HELP}")
+
+
+_HELP: Final = "`tactile-bayes import --help` says what they are"
+
+
+def of_head(given: Path | HeadGeometry) -> Source:
+    """Arrays of a scan that are the head's."""
+    head = given if isinstance(given, HeadGeometry) else read_head_geometry(given)
+    return Source(
+        {
+            "pitch_mm": np.asarray(head.pitch_mm),
+            "array_from_tracker": head.scanhead_from_tracker,
+            "head_surface_mm": head.surface_mm,
+        }
+    )
+
+
+def of_calibration(given: Path | ElementCalibration) -> Source:
+    """Arrays of a scan that are the calibration of its array."""
+    found = given if isinstance(given, ElementCalibration) else read_array_calibration(given).calibration
+    return Source(
+        {
+            "gain_kpa_per_count": found.gain_kpa_per_count,
+            "offset_kpa": found.offset_kpa,
+            "saturation_count": np.asarray(found.saturation_count),
+        }
+    )
+
+
+def of_landmarks(given: Path | Landmarks) -> Source:
+    """Arrays of a scan that are its landmarks: of a JSON file or another scan."""
+    found: Landmarks | None
+    if isinstance(given, Landmarks):
+        found = given
+    else:
+        found = read_scan(given).landmarks if given.suffix.lower() == ".mcap" else read_landmarks(given)
+    if found is None:
+        raise BadDataError("holds no landmarks", way_out="give another scan, or a JSON file", path=str(given))
+    nipple = {} if found.nipple_mm is None else {"nipple_mm": found.nipple_mm}
+    return Source({"landmarks_mm": np.stack([found.sternal_notch_mm, found.xiphoid_mm]), **nipple})
+
+
+# --- From arrays as people have them to those of the layout: axes, clocks, units.
+
+
+def combined(sources: Sequence[Source], given: Stated) -> Imported:
+    """A scan of arrays by the names in `KNOWN`; those of a later source stand in place of an earlier's."""
+    stated = given
+    told: list[str] = []
+    held: Arrays = {}
+    for source in sources:
+        stated = over(stated, source.stated)
+        told += source.notes
+        held |= {name: np.asarray(one) for name, one in source.arrays.items()}
+    _check_numbers(held)
+    if "frames" in held:
+        held["counts"] = held.pop("frames")
+    _poses(held, stated, told)
+    _frames(held, stated, told)
+    _clocks(held, stated)
+    pressure = stated.unit not in (None, "counts")
+    if pressure:
+        _as_counts(held, stated, told)
+    elif stated.saturation is not None:
+        held["saturation_count"] = np.asarray(int(np.ceil(stated.saturation)))
+    held = {name: _squeezed(held[name], LAYOUT[name].shape) for name in LAYOUT if name in held}
+    _spread(held)
+    _refuse_missing(held)
+    _check_shapes(held)
+    _check_counts(held)
+    _check_units(held, calibrated=pressure)
+    scan = _scan(held, {"frames_unit": str(stated.unit)} if pressure else {})
+    return Imported(scan, tuple(told))
+
+
+def _refuse_missing(held: Arrays) -> None:
+    missing = [name for name in LAYOUT if name not in held and name not in OPTIONAL]
+    if not missing:
+        return
+    lacks = ", ".join(f"{name} ({in_words(LAYOUT[name].shape)})" for name in missing)
+    options = [option for option, gives in _BESIDE.items() if set(gives) & set(missing)]
+    way_out = f"add them, or give {', '.join(options)}" if options else "add them"
+    raise BadDataError(f"lacks {lacks} (it has {', '.join(sorted(held))})", way_out=f"{way_out}; {_HELP}")
+
+
+def _squeezed(array: np.ndarray[Any, Any], want: Shape) -> np.ndarray[Any, Any]:
+    """The array without axes of length 1 that MATLAB adds."""
+    if array.ndim > len(want) and (len(want) < 2) and array.size == max(array.shape, default=1):
+        return array.reshape(-1) if want else array.reshape(())
+    return array
+
+
+def _spread(held: Arrays) -> None:
+    """One gain or offset for all taxels."""
+    for name in ("gain_kpa_per_count", "offset_kpa"):
+        if name in held and held[name].size == 1 and held.get("counts", np.empty(0)).ndim == 3:
+            held[name] = np.full(held["counts"].shape[1:], float(held[name].item()))
+
+
+def _poses(held: Arrays, stated: Stated, told: list[str]) -> None:
+    """Places in mm and quaternions with the scalar first, whatever they are given as."""
+    if "pose_matrix" in held:
+        if "position_mm" in held or "quaternion_wxyz" in held:
+            raise BadDataError("pose_matrix is given beside position_mm or quaternion_wxyz", way_out="leave one out")
+        held["position_mm"], held["quaternion_wxyz"] = _of_matrices(held.pop("pose_matrix"))
+    number = held["pose_time_s"].size if "pose_time_s" in held else 0
+    for name, width in (("position_mm", 3), ("quaternion_wxyz", 4)):
+        if name in held and held[name].shape == (width, number) and number != width:
+            held[name] = held[name].T
+            told.append(f"{name} of shape {(width, number)} read along its columns")
+    if "quaternion_wxyz" in held and stated.pose_layout in ("xyzw", "euler"):
+        held["quaternion_wxyz"] = quaternions(held["quaternion_wxyz"], stated.pose_layout)
+    if "position_mm" in held:
+        held["position_mm"] = held["position_mm"] * _MM[stated.length_unit or "mm"]
+
+
+def quaternions(rotations: FloatArray, layout: str) -> FloatArray:
+    """(m, 4) quaternions, scalar first, of quaternions with the scalar last (``xyzw``) or of (m, 3) azimuth, elevation
+    and roll in degrees: about z, then about the new y, then about the new x.
+    """
+    width = 3 if layout == "euler" else 4
+    if rotations.ndim != 2 or rotations.shape[1] != width:
+        raise BadDataError(f"rotations have shape {rotations.shape}", way_out=f"as {layout} they must be (m, {width})")
+    if layout == "euler":
+        return np.asarray(Rotation.from_euler("ZYX", rotations, degrees=True).as_quat(scalar_first=True))
+    return rotations[:, [3, 0, 1, 2]] if layout == "xyzw" else rotations
+
+
+def _of_matrices(given: np.ndarray[Any, Any]) -> tuple[FloatArray, FloatArray]:
+    """Places and quaternions of homogeneous matrices, of which each is (4, 4), (3, 4) or one row."""
+    if given.ndim == 3 and given.shape[:2] in ((4, 4), (3, 4)) and given.shape[1:] != given.shape[:2]:
+        given = np.moveaxis(given, 2, 0)
+    if given.ndim == 2 and given.shape[1] in (12, 16):
+        given = given.reshape(len(given), -1, 4)
+    if given.ndim != 3 or given.shape[1:] not in ((4, 4), (3, 4)):
+        raise BadDataError(f"pose_matrix has shape {given.shape}", way_out="it must be (m, 4, 4)")
+    matrices = given.astype(np.float64)
+    turned = matrices[:, :3, :3]
+    departure = np.abs(turned @ turned.swapaxes(1, 2) - np.eye(3)).max(axis=(1, 2))
+    wrong = (departure > _NOT_RIGID) | (np.linalg.det(turned) < 0)
+    if wrong.any() or (matrices[:, 3:] != [0, 0, 0, 1]).any():
+        first = int(wrong.argmax())
+        raise BadDataError(
+            f"pose_matrix is not rigid at index {first} (R R^T departs from 1 by {departure[first]:.1e})",
+            way_out="give the 16 numbers row by row, translation last in each row",
+        )
+    return matrices[:, :3, 3], np.asarray(Rotation.from_matrix(turned).as_quat(scalar_first=True))
+
+
+def _frames(held: Arrays, stated: Stated, told: list[str]) -> None:
+    """Counts as (n, rows, columns)."""
+    if "counts" not in held:
+        return
+    counts = held["counts"]
+    n = held["frame_time_s"].size if "frame_time_s" in held else counts.shape[0]
+    if counts.ndim in (2, 3) and counts.shape[0] != n and counts.shape[-1] == n:
+        told.append(f"frames of shape {counts.shape} read along the last axis, which is as long as their times")
+        counts = np.moveaxis(counts, -1, 0)
+    if counts.ndim == 2:
+        counts = _unfolded(counts, held, stated, told)
+    elif stated.frame_shape is not None and counts.shape[1:] != stated.frame_shape:
+        raise BadDataError(
+            f"frames have {' x '.join(map(str, counts.shape[1:]))} taxels, not {stated.frame_shape[0]} x "
+            f"{stated.frame_shape[1]}",
+            way_out="leave --frame-shape out",
+        )
+    held["counts"] = counts
+
+
+def _unfolded(counts: np.ndarray[Any, Any], held: Arrays, stated: Stated, told: list[str]) -> np.ndarray[Any, Any]:
+    """Frames of one row each, folded into rows and columns."""
+    shapes = {"head_surface_mm": 2, "gain_kpa_per_count": 2}
+    known = [held[name].shape[:axes] for name, axes in shapes.items() if name in held and held[name].ndim >= axes]
+    shape = stated.frame_shape or next(iter(known), None)
+    each = f"frames of {counts.shape[1]} numbers (counts has shape {counts.shape})"
+    if shape is None:
+        raise BadDataError(each, way_out="give --frame-shape ROWS COLUMNS, or --head-geometry HEAD.json")
+    if shape[0] * shape[1] != counts.shape[1]:
+        raise BadDataError(
+            f"{each}, and {shape[0]} x {shape[1]} taxels are {shape[0] * shape[1]}",
+            way_out="give --frame-shape ROWS COLUMNS",
+        )
+    by_columns = stated.frame_order == "columns"
+    if stated.frame_order is None or stated.frame_shape is None:
+        along = "columns" if by_columns else "rows"
+        told.append(f"each {counts.shape[1]} numbers read as {shape[0]} x {shape[1]}, along the array's {along}")
+    if by_columns:
+        return counts.reshape(len(counts), shape[1], shape[0]).swapaxes(1, 2)
+    return counts.reshape(len(counts), *shape)
+
+
+def _clocks(held: Arrays, stated: Stated) -> None:
+    """Times in s, on the frames' clock."""
+    if "frame_time_s" in held:
+        held["frame_time_s"] = held["frame_time_s"] * _SECONDS[stated.time_unit or "s"]
+    elif stated.rate_hz is not None and "counts" in held:
+        held["frame_time_s"] = np.arange(len(held["counts"])) / stated.rate_hz
+    if "pose_time_s" in held:
+        held["pose_time_s"] = held["pose_time_s"] * _SECONDS[stated.pose_time_unit or stated.time_unit or "s"]
+    elif stated.pose_rate_hz is not None and "position_mm" in held:
+        held["pose_time_s"] = np.arange(len(held["position_mm"])) / stated.pose_rate_hz
+    if "pose_time_s" in held and stated.pose_offset_s:
+        held["pose_time_s"] = held["pose_time_s"] + stated.pose_offset_s
+
+
+def _as_counts(held: Arrays, stated: Stated, told: list[str]) -> None:
+    """Frames of pressures as counts, with the gain and offset that give the pressures back."""
+    unit = str(stated.unit)
+    for name in ("gain_kpa_per_count", "offset_kpa"):
+        if name in held:
+            raise BadDataError(f"{name} is for counts, and frames are in {unit}", way_out="leave it or --unit out")
+    if "counts" not in held:
+        return
+    frames, factor = held["counts"], KPA_PER_UNIT[unit]
+    whole = frames.dtype.kind in "iu" and frames.min() >= 0 and frames.max() <= _MOST_COUNTS
+    kpa = frames * factor
+    gain, offset = (factor, 0.0) if whole else (_STEP_KPA, min(0.0, float(np.floor(kpa.min() / _STEP_KPA)) * _STEP_KPA))
+    held["counts"] = np.clip(np.rint((kpa - offset) / gain), 0, _MOST_COUNTS).astype(np.uint16)
+    full = _MOST_COUNTS if stated.saturation is None else round((stated.saturation * factor - offset) / gain)
+    held |= {"gain_kpa_per_count": np.asarray(gain), "offset_kpa": np.asarray(offset)}
+    held["saturation_count"] = np.asarray(min(max(full, 1), _MOST_COUNTS))
+    told.append(_told_pressure(kpa, unit, kept="" if whole else f", kept to {1000 * _STEP_KPA:g} Pa"))
+
+
+def _told_pressure(kpa: FloatArray, unit: str, *, kept: str) -> str:
+    """What the frames' means are, with a question for their unit where no examination presses so."""
+    means = kpa.reshape(len(kpa), -1).mean(axis=1)
+    pressed = means[means >= means.max() / 2]
+    low, high = np.quantile(pressed, [0.05, 0.95]) / KPA_PER_UNIT[unit]
+    middle = float(np.median(pressed))
+    asked = other_units(middle, unit, PRESSURE_WINDOW_KPA)
+    means_of = f"pressed ones have means of {low:.3g} to {high:.3g} {unit}"
+    if middle >= PRESSURE_RANGE_KPA[1]:
+        what = f"frames in {unit}: {means_of}, and an array's range ends at {PRESSURE_RANGE_KPA[1]:g} kPa"
+        raise BadDataError(what, way_out=asked or "give their unit, --unit")
+    return f"{'CAUTION: ' if asked else ''}frames in {unit}{kept}; {means_of}{f': {asked}' if asked else ''}"
+
+
+# --- Checks of arrays in the layout.
 
 
 def _check_shapes(arrays: Arrays) -> None:
@@ -46,8 +368,6 @@ def _check_shapes(arrays: Arrays) -> None:
             fits = fits and length == have
         if not fits:
             raise BadDataError(f"{name} has shape {array.shape}", way_out=f"it must be {_spoken(want, lengths)}")
-        if 0 in array.shape:
-            raise BadDataError(f"{name} is empty (shape {array.shape})", way_out="give at least one frame and one pose")
 
 
 def _spoken(want: Shape, lengths: Mapping[str, tuple[int, str]]) -> str:
@@ -58,15 +378,12 @@ def _spoken(want: Shape, lengths: Mapping[str, tuple[int, str]]) -> str:
 
 
 def _check_numbers(arrays: Arrays) -> None:
-    counts = arrays["counts"]
-    if counts.dtype.kind not in "iu":
-        raise BadDataError(f"counts is {counts.dtype}", way_out="give raw integer readings, not pressures")
-    low, high = int(counts.min()), int(counts.max())
-    if low < 0 or high > 65535:
-        raise BadDataError(f"counts holds {low if low < 0 else high}", way_out="raw readings lie in 0 to 65535")
     for name, array in arrays.items():
         if array.dtype.kind not in "iuf":
-            raise BadDataError(f"{name} is {array.dtype}", way_out="give real numbers")
+            what = "not an array of numbers (a cell, a table or text?)" if array.dtype.kind in "OV" else array.dtype
+            raise BadDataError(f"{name} is {what}", way_out="give real numbers")
+        if 0 in array.shape:
+            raise BadDataError(f"{name} is empty (shape {array.shape})", way_out="give at least one frame and one pose")
         finite = np.isfinite(array)
         if not finite.all():
             index = tuple(int(i) for i in np.unravel_index(int(finite.argmin()), finite.shape))
@@ -80,7 +397,21 @@ def _check_numbers(arrays: Arrays) -> None:
             raise BadDataError(f"{name} holds {largest:.3g}", way_out="give mm, kPa and s; the file may be damaged")
 
 
-def _check_units(arrays: Arrays) -> None:
+def _check_counts(arrays: Arrays) -> None:
+    counts = arrays["counts"]
+    whole = counts.dtype.kind in "iu" or bool((counts == np.rint(counts)).all())
+    if not whole:
+        odd = float(counts[counts != np.rint(counts)][0])
+        raise BadDataError(
+            f"counts holds {odd:.6g}, which is no raw reading",
+            way_out="for pressures give their unit: --unit kPa",
+        )
+    low, high = int(counts.min()), int(counts.max())
+    if low < 0 or high > _MOST_COUNTS:
+        raise BadDataError(f"counts holds {low if low < 0 else high}", way_out="raw readings lie in 0 to 65535")
+
+
+def _check_units(arrays: Arrays, *, calibrated: bool) -> None:
     """Raise an error for numbers in other units: a factor of 25 or 1000 would pass every later check."""
     surface, position = arrays["head_surface_mm"], arrays["position_mm"]
     metres = "looks like metres or inches, give mm"
@@ -97,7 +428,7 @@ def _check_units(arrays: Arrays) -> None:
     if "nipple_mm" in arrays:
         _check_nipple(arrays, metres)
     full_scale = float(np.median(arrays["gain_kpa_per_count"])) * 4095
-    if full_scale > 1000.0 or 0 < full_scale < 0.5:
+    if not calibrated and (full_scale > 1000.0 or 0 < full_scale < 0.5):
         raise BadDataError(
             f"gain_kpa_per_count gives {full_scale:.4g} kPa at 4095 counts", way_out="looks like Pa or MPa, give kPa"
         )
@@ -116,15 +447,18 @@ def _check_nipple(arrays: Arrays, metres: str) -> None:
 
 
 def _check_clock(frame_time_s: np.ndarray[Any, Any], pose_time_s: np.ndarray[Any, Any]) -> None:
-    for name, times in (("frame_time_s", frame_time_s), ("pose_time_s", pose_time_s)):
+    for name, times, unit in (
+        ("frame_time_s", frame_time_s, "time-unit"),
+        ("pose_time_s", pose_time_s, "pose-time-unit"),
+    ):
         step = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
         if step > 0.5:
-            raise BadDataError(f"{name} steps by {step:.4g}", way_out="looks like milliseconds, give s")
+            raise BadDataError(f"{name} steps by {step:.4g}", way_out=f"looks like milliseconds, give s or --{unit} ms")
     (a, b), (c, d) = ((float(times.min()), float(times.max())) for times in (frame_time_s, pose_time_s))
     if b < c or d < a:
         raise BadDataError(
             f"frame_time_s ({a:.3f} to {b:.3f}) and pose_time_s ({c:.3f} to {d:.3f}) do not overlap",
-            way_out="give both on one clock",
+            way_out="give both on one clock: --pose-offset-s is added to the poses' times",
         )
 
 
@@ -140,7 +474,7 @@ def _check_pitch(surface: np.ndarray[Any, Any], pitch_mm: float) -> None:
             )
 
 
-def _scan(arrays: Arrays) -> Scan:
+def _scan(arrays: Arrays, facts: Mapping[str, str]) -> Scan:
     values = {name: np.asarray(array, dtype=np.float64) for name, array in arrays.items() if name != "counts"}
     check_rigid(values["array_from_tracker"], name="array_from_tracker")
     landmarks = values.get("landmarks_mm")
@@ -154,5 +488,5 @@ def _scan(arrays: Arrays) -> Scan:
         landmarks=None
         if landmarks is None
         else Landmarks(landmarks[0], landmarks[1], nipple_mm=values.get("nipple_mm")),
-        session={"source": "imported"},
+        session={"source": "imported", **facts},
     )

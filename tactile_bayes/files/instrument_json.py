@@ -140,7 +140,12 @@ class HeadFile(Record, kw_only=True):
 
 def read_head_geometry(path: Path) -> HeadGeometry:
     """Read the places of the taxels and the mounting of the tracker."""
-    file = _read_head(path)
+    return head_geometry(load_json(path, way_out=_WAY_OUT), path=path)
+
+
+def head_geometry(document: object, *, path: Path) -> HeadGeometry:
+    """The same of a document that was read from `path`."""
+    file = _head_file(document, path)
     try:
         if file.scanhead_from_tracker is None:
             raise BadDataError("lacks scanhead_from_tracker", way_out="add the transform from the sensor to the head")
@@ -152,15 +157,14 @@ def read_head_geometry(path: Path) -> HeadGeometry:
 
 def read_simulated_head(path: Path) -> Head:
     """Read a head for the solid model, in which taxels form a regular grid on an arc, or on a plane."""
-    file = _read_head(path)
+    file = _head_file(load_json(path, way_out=_WAY_OUT), path)
     try:
         return _arc(file) if file.surface_mm is None else _fitted(file, np.array(file.surface_mm))
     except BadDataError as error:
         raise error.at(path) from None
 
 
-def _read_head(path: Path) -> HeadFile:
-    document = load_json(path, way_out=_WAY_OUT)
+def _head_file(document: object, path: Path) -> HeadFile:
     file = parse_record(document, HeadFile, path=path)
     given = [name for name in ("rows", "columns", "radius_mm") if isinstance(document, dict) and name in document]
     if file.surface_mm is not None and given:

@@ -191,13 +191,25 @@ class Group:
         has = _dimensions(found)
         if has != dimensions:
             raise BadDataError(f"variable {name} has dimensions {has}, not {dimensions}", way_out=self._way_out)
-        check_limit(found.size * found.dtype.itemsize, self._most_bytes, what=f"variable {name} unpacks to {{}} bytes")
-        self._check_chunks(name, found)
-        values = np.asarray(found[...], dtype=np.dtype(kind))
+        values = np.asarray(self._values(name, found), dtype=np.dtype(kind))
         # beyond any quantity here, and sums overflow; whoever reads a variable judges its infinities
         if values.dtype.kind == "f" and (np.abs(values[np.isfinite(values)]) > MOST).any():
             raise BadDataError(f"variable {name} holds values beyond {MOST:g}", way_out=self._way_out)
         return values
+
+    def numbers(self, name: str) -> Any:
+        """The values of an array of real numbers, of whatever type and dimensions; None for one of anything else."""
+        found = self._dataset(name)
+        return self._values(name, found) if found.dtype.kind in "iuf" else None
+
+    def groups(self) -> list[str]:
+        """Names of the groups in this one."""
+        return sorted(name for name in map(str, self._place) if isinstance(self._own(name), h5py.Group))
+
+    def _values(self, name: str, found: Any) -> Any:
+        check_limit(found.size * found.dtype.itemsize, self._most_bytes, what=f"variable {name} unpacks to {{}} bytes")
+        self._check_chunks(name, found)
+        return found[...]
 
     def _own(self, name: str) -> Any:
         """Member of this file by name; links to other places and files are not followed."""
@@ -286,10 +298,12 @@ def _has_scales(dataset: Any) -> bool:
 
 
 @contextlib.contextmanager
-def open_netcdf(path: Path, *, way_out: str) -> Iterator[Group]:
-    """The root group of a netCDF-4 file; every fault in the block becomes a `BadDataError` that names `path`."""
+def open_netcdf(path: Path, *, way_out: str, begins_at: int = 0) -> Iterator[Group]:
+    """The root group of a netCDF-4 or HDF5 file, whose first byte is at `begins_at`; every fault in the block becomes a
+    `BadDataError` that names `path`."""
     try:
         with open_input(path) as stream, decoding(_DAMAGED, way_out=way_out):
+            stream.seek(begins_at)
             if stream.read(len(HDF5_MAGIC)) != HDF5_MAGIC:
                 raise not_a(path, "a map or posterior (netCDF)", what=_DAMAGED, way_out=way_out)
             check_limit(stream.seek(0, io.SEEK_END), NETCDF_BYTES, what="it has {} bytes")

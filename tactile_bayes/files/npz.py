@@ -7,7 +7,7 @@ import io
 import math
 import os
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any, Final
 
@@ -15,7 +15,15 @@ import numpy as np
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.atomic import write_bytes
-from tactile_bayes.files.reading import ZIP_MAGIC, check_limit, decoding, open_input, unpacked_limit
+from tactile_bayes.files.reading import (
+    NETCDF_BYTES,
+    ZIP_MAGIC,
+    check_limit,
+    decoding,
+    open_input,
+    read_bytes,
+    unpacked_limit,
+)
 from tactile_bayes.inference.ensemble import ChainState
 from tactile_bayes.size.draws import ShapeDraws
 
@@ -28,26 +36,42 @@ _ENCRYPTED: Final = 0x1
 _HEADERS: Final = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
 
-def load_npz(
-    path: Path, *, required: Sequence[str], optional: Sequence[str], shapes: Mapping[str, str] | None = None
-) -> Arrays:
-    """Read the named arrays of an .npz file; `shapes` says in words what a missing one should be.
+def load_npz(path: Path, *, required: Sequence[str], optional: Sequence[str]) -> Arrays:
+    """Read the named arrays of an .npz file.
 
     An encrypted file, one that unpacks to more than its limit and an array that only pickle could read are errors. They
     name no path.
     """
+
+    def wanted(names: Sequence[str]) -> Sequence[str]:
+        if missing := [name for name in required if name not in names]:
+            has = ", ".join(sorted(names)[:12]) or "nothing"
+            raise BadDataError(f"lacks {', '.join(missing)} (it has {has})", way_out="add the missing arrays")
+        return [name for name in (*required, *optional) if name in names]
+
+    return choose_npz(path, wanted)
+
+
+def choose_npz(path: Path, choose: Callable[[Sequence[str]], Iterable[str]]) -> Arrays:
+    """Read the arrays that `choose` takes from the names in an .npz file; for the errors see `load_npz`."""
     with open_input(path) as stream:
         _check_zip(stream)
         with decoding("is not a whole .npz file", way_out="copy it again"), zipfile.ZipFile(stream) as archive:
             members = {name.removesuffix(".npy"): archive.getinfo(name) for name in archive.namelist()}
-            missing = [name for name in required if name not in members]
-            if missing:
-                raise _missing(missing, found=list(members), shapes=shapes or {})
-            wanted = {name: members[name] for name in (*required, *optional) if name in members}
+            wanted = {name: members[name] for name in choose(list(members))}
             unpacked = sum(member.file_size for member in wanted.values())
             most = unpacked_limit(os.fstat(stream.fileno()).st_size)
             check_limit(unpacked, most, what="its arrays unpack to {} bytes")
             return {name: _member(archive, member, name) for name, member in wanted.items()}
+
+
+def load_npy(path: Path) -> Arrays:
+    """Read an .npy file: one array, called ``frames``, or the fields of a structured one; see `load_npz`."""
+    data = read_bytes(path, most=NETCDF_BYTES)
+    array = _array(io.BytesIO(data), len(data), "its array")
+    if array.dtype.names is None:
+        return {"frames": array}
+    return {name: array[name] for name in array.dtype.names}
 
 
 def _check_zip(stream: IO[bytes]) -> None:
@@ -61,23 +85,20 @@ def _check_zip(stream: IO[bytes]) -> None:
     raise BadDataError(f"is not an .npz file (it starts with {start!r})", way_out="save it with numpy.savez_compressed")
 
 
-def _missing(missing: Sequence[str], *, found: Sequence[str], shapes: Mapping[str, str]) -> BadDataError:
-    lacks = ", ".join(f"{name} ({shapes[name]})" if name in shapes else name for name in missing)
-    see = "; `tactile-bayes import --help` says what they are" if shapes else ""
-    has = ", ".join(sorted(found)[:12]) or "nothing"
-    grid = " (for a grid of values give --as map)" if "mean" in found else ""
-    return BadDataError(f"lacks {lacks} (it has {has})", way_out=f"add the missing arrays{grid}{see}")
-
-
 def _member(archive: zipfile.ZipFile, member: zipfile.ZipInfo, name: str) -> np.ndarray[Any, np.dtype[Any]]:
     if member.flag_bits & _ENCRYPTED:
         raise BadDataError(f"{name} is encrypted", way_out="save the file without a password")
-    with decoding(f"{name} is damaged", way_out=_COPY_AGAIN), archive.open(member) as stream:
+    with archive.open(member) as stream:
+        return _array(stream, member.file_size, name)
+
+
+def _array(stream: IO[bytes], length: int, name: str) -> np.ndarray[Any, np.dtype[Any]]:
+    with decoding(f"{name} is damaged", way_out=_COPY_AGAIN):
         shape, in_columns, dtype = _HEADERS[np.lib.format.read_magic(stream)](stream)
         if dtype.hasobject:
             what = f"{name} holds Python objects, which are never unpickled"
             raise BadDataError(what, way_out="save it as an array of plain numbers")
-        size, held = math.prod(shape) * dtype.itemsize, member.file_size - stream.tell()
+        size, held = math.prod(shape) * dtype.itemsize, length - stream.tell()
         if held != size:
             what = f"{name} declares {size:,} bytes (shape {shape}, {dtype}) and holds {held:,}"
             raise BadDataError(what, way_out=_COPY_AGAIN)

@@ -104,7 +104,11 @@ def read_scene(path: Path) -> Scene:
 
 def scene_from_toml(text: str) -> Scene:
     """Parse a scene from a TOML text; for the errors see `read_scene`."""
-    document = parse_toml(text, way_out="see the scene in the documentation")
+    return scene_of(parse_toml(text, way_out="see the scene in the documentation"))
+
+
+def scene_of(document: Mapping[str, Any]) -> Scene:
+    """A scene from plain data as its TOML holds; for the errors see `read_scene`."""
     file = from_plain(SceneFile, document)
     given = {name: getattr(file, name) for name in names_of(file)}
     bumps, tissue = _lumps(given.pop("lump"), document.get("lump", ()))

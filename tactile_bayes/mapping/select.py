@@ -16,6 +16,7 @@ from tactile_bayes.findings import Finding
 from tactile_bayes.geometry import BoolArray, FloatArray
 from tactile_bayes.mapping.cells import Projector, Readout, chunk_frames
 from tactile_bayes.mapping.plane import MAX_POSE_GAP_MS, FramePoses, distinct_poses, poses_at
+from tactile_bayes.presets import KPA_PER_UNIT
 from tactile_bayes.scan import PressureFrames, Scan
 
 # --- Detection of faulty taxels over a whole scan.
@@ -428,8 +429,21 @@ def _without_poses(selections: list[SelectedFrames]) -> BadDataError:
 def _outside_window(selections: list[SelectedFrames], window: tuple[float, float]) -> BadDataError:
     levels = np.concatenate([part.level_kpa[part.low | part.high] for part in selections])
     low, middle, high = np.quantile(levels, [0.05, 0.5, 0.95])
+    session = selections[0].scan.session
+    imported = session.get("source") == "imported"  # a recorder knows its unit
+    asked = other_units(float(middle), session.get("frames_unit", "kPa"), window) if imported else ""
     return BadDataError(
         f"no frame's mean lies within {window[0]:g} to {window[1]:g} kPa ({len(levels)} frames, means "
-        f"{levels.min():.2f} to {levels.max():.2f} kPa, median {middle:.2f})",
-        way_out=f"a window of {np.floor(low * 10) / 10:g} to {np.ceil(high * 10) / 10:g} kPa would keep nine in ten",
+        f"{levels.min():.2f} to {levels.max():.2f} kPa, median {middle:.2f}{f': {asked}' if asked else ''})",
+        way_out=("import it again with the right --unit; " if asked else "")
+        + f"a window of {np.floor(low * 10) / 10:g} to {np.ceil(high * 10) / 10:g} kPa would keep nine in ten",
     )
+
+
+def other_units(mean_kpa: float, stated: str, window: tuple[float, float]) -> str:
+    """Ask for the unit where frames are outside the window, and the same numbers in another unit would be in it."""
+    if window[0] <= mean_kpa <= window[1]:
+        return ""
+    number = mean_kpa / KPA_PER_UNIT.get(stated, 1.0)
+    fitting = [unit for unit, kpa in KPA_PER_UNIT.items() if window[0] <= number * kpa <= window[1]]
+    return f"are these {' or '.join(fitting)}?" if fitting else ""

@@ -287,7 +287,7 @@ def test_scans_are_short_to_look_at() -> None:
         (lambda: tb.build_map(np.ones((5, 16, 26))), "a scan is wanted, not ndarray; read one with read_scan"),
         (lambda: tb.build_map(None), "a scan is wanted, not NoneType"),
         (lambda: tb.read_scan(3), "a path is wanted, not int"),  # type: ignore[arg-type]
-        (lambda: tb.simulate({"lump": []}), "a path is wanted, not dict"),  # type: ignore[arg-type]
+        (lambda: tb.simulate(3), "a path is wanted, not int"),  # type: ignore[arg-type]
         (lambda: tb.estimate([tb.demo_map()]), "a map is wanted, not list; give one map after the other, or pool"),
     ],
 )

@@ -58,7 +58,7 @@ def test_a_map_has_nothing_to_correct(tmp_path):
     words = ("g.csv", "-o", "g.nc", "--spacing-mm", "1", "--correct", "transposed")
     refused = run_here("import", *words, cwd=tmp_path)
     assert refused.returncode == 2
-    assert "--session and --correct are for scans" in refused.stderr
+    assert "--correct: for scans only; leave out or give --as scan" in refused.stderr
 
 
 def test_a_scan_of_which_no_map_can_be_made_is_imported(tmp_path):

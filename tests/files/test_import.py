@@ -74,7 +74,7 @@ FAULTS: list[tuple[str, Callable[[Arrays], object], str]] = [
     ("shape", put("counts", lambda c: c[:, 0]), r"counts has shape \(20, 26\)"),
     ("length", put("frame_time_s", lambda t: t[:-1]), r"frame_time_s has shape \(19,\).*n = 20 as in counts"),
     ("empty", lambda a: a.update(position_mm=a["position_mm"][:0]), r"position_mm is empty"),
-    ("float counts", put("counts", lambda c: c.astype(float)), "counts is float64"),
+    ("fractions", put("counts", lambda c: c + 0.5), "counts holds .*which is no raw reading.*--unit kPa"),
     ("counts high", put("counts", lambda c: c.astype(np.int64) + 65535), "counts holds"),
     ("counts low", put("counts", lambda c: c.astype(np.int64) - 5000), "counts holds -"),
     ("text", put("offset_kpa", lambda o: o.astype(str)), "offset_kpa is <U"),
@@ -140,7 +140,7 @@ def test_a_cut_or_changed_archive_is_refused(good: Arrays, tmp_path: Path) -> No
     with pytest.raises(BadDataError, match=r"damaged|whole"):
         read_arrays(path)
     np.save(tmp_path / "one.npy", good["counts"])
-    with pytest.raises(BadDataError, match=r"single \.npy"):
+    with pytest.raises(BadDataError, match=r"lacks frame_time_s .*--rate-hz"):
         read_arrays(tmp_path / "one.npy")
     with pytest.raises(BadDataError, match="cannot be read"):
         read_arrays(tmp_path / "none.npz")

@@ -277,7 +277,7 @@ PRINTERS = {
     "report/posterior_figures", "actions/estimate",
     # of trials, calibrations, devices and studies
     "api/trials", "actions/calibrate", "actions/devices", "api/diagnosing", "api/planning",
-    "campaigns/campaign", "actions/exam",
+    "campaigns/campaign", "actions/bring_in", "actions/exam",
     "actions/simulation", "actions/study",
     "actions/tradeoff", "actions/trial", "files/size_json", "presets", "report/calibration",
     "report/paper_head", "report/laboratory",

@@ -1,0 +1,202 @@
+"""Scans, grids and images of other programs, as `import` brings them in."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import click
+import numpy as np
+
+from tactile_bayes.actions.exam import describe_scan
+from tactile_bayes.commands.options import refuse_same
+from tactile_bayes.declarations import Record, names_of, replace
+from tactile_bayes.errors import BadDataError, TactileBayesError, UsageError, one_line
+from tactile_bayes.files.array_map import array_template, read_array_map
+from tactile_bayes.files.arrays_layout import ArrayMap, Stated
+from tactile_bayes.files.atomic import check_suffix, refuse_existing
+from tactile_bayes.files.documents import with_session
+from tactile_bayes.files.grid_files import open_grid
+from tactile_bayes.files.grids import grid_map
+from tactile_bayes.files.imports import import_arrays, of_calibration, of_head, of_landmarks
+from tactile_bayes.files.map_nc import write_map
+from tactile_bayes.files.named_arrays import ARRAY_SUFFIXES
+from tactile_bayes.files.provenance import Provenance, hash_inputs
+from tactile_bayes.files.scan_mcap import read_scan_report, read_truth, write_scan
+from tactile_bayes.findings import finding_lines
+from tactile_bayes.mapping.arrangement import check_scan, corrected
+from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.scan import Scan
+
+_LONGEST_UNITS: Final = 20
+_BESIDE: Final = {"head_geometry": of_head, "array_calibration": of_calibration, "landmarks": of_landmarks}
+
+
+class Wanted(Record):
+    """What the call asks for, besides its files."""
+
+    kind: str | None
+    spacing_mm: float | None
+    normalise: str | None
+    units: str | None
+    no_value: tuple[str, ...]
+    corrections: tuple[str, ...]
+    session_file: Path | None
+    arrays: ArrayMap
+    beside: dict[str, Path]  #: Files that complete a scan, by the option that names them.
+    force: bool
+
+    @property
+    def of_a_scan(self) -> list[str]:
+        """Options that were given and that only scans have."""
+        given = {"session": self.session_file, "correct": self.corrections, **self.beside, **_stated(self.arrays)}
+        return [f"--{name.replace('_', '-')}" for name, value in given.items() if value]
+
+
+def import_action(
+    ctx: click.Context,
+    *,
+    sources: tuple[Path, ...],
+    output: Path | None,
+    template: bool,
+    columns: Path | None,
+    head_geometry: Path | None,
+    array_calibration: Path | None,
+    landmarks: Path | None,
+    **given: Any,
+) -> None:
+    """Import scans, grids and images from other programs."""
+    if template:
+        for source in sources or (None,):
+            click.echo(array_template(source), nl=False)
+        return
+    if not sources or output is None:
+        raise UsageError(f"Missing {'option -o' if sources else 'argument SRC'}; `import --help` has examples")
+    stated = {name: given.pop(name) for name in names_of(Stated)}
+    arrays = ArrayMap() if columns is None else read_array_map(columns)
+    arrays = replace(arrays, **{name: value for name, value in stated.items() if value is not None})
+    paths = {"head_geometry": head_geometry, "array_calibration": array_calibration, "landmarks": landmarks}
+    beside = {name: path for name, path in paths.items() if path is not None}
+    wanted = Wanted(**given, arrays=arrays, beside=beside)
+    if len(sources) == 1 and not output.is_dir():
+        lines = _import(sources[0], output, wanted)
+    else:
+        lines, failed = _import_each(sources, output, wanted)
+        if failed:
+            _tell(lines)
+            ctx.exit(failed)
+    _tell(lines)
+
+
+def _tell(lines: list[str]) -> None:
+    for line in (*lines, RESEARCH_USE):
+        click.echo(line)
+
+
+def _import_each(sources: tuple[Path, ...], folder: Path, wanted: Wanted) -> tuple[list[str], int]:
+    """Bring each in by itself: what was done, and the code of the first that failed."""
+    suffix = {source: ".mcap" if _kind(source, None, wanted) == "scan" else ".nc" for source in sources}
+    targets = {source: folder / f"{source.name.partition('.')[0]}{suffix[source]}" for source in sources}
+    if len(set(targets.values())) < len(sources):
+        raise UsageError(f"two of the files would become one in {folder}; import them into different folders")
+    refuse_same(targets.values(), sources)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(f"{folder} is no folder and cannot be made ({error.strerror})") from None
+    lines, failed = [], 0
+    for source, target in targets.items():
+        try:
+            lines += _import(source, target, wanted)
+        except TactileBayesError as error:
+            line = one_line(error)
+            click.echo(line if str(source) in line else f"{source}: {line}", err=True)
+            failed = failed or error.exit_code
+    return lines, failed
+
+
+def _kind(source: Path, output: Path | None, wanted: Wanted) -> str:
+    """Scan or map: as asked, by the output's suffix, by options that only scans have, else by the source's."""
+    suffix = "" if output is None else output.suffix.lower()
+    if wanted.kind is not None:
+        return wanted.kind
+    if source.suffix.lower() == ".mcap" or suffix == ".mcap" or (suffix != ".nc" and wanted.of_a_scan):
+        return "scan"
+    return "scan" if suffix != ".nc" and source.suffix.lower() in ARRAY_SUFFIXES else "map"
+
+
+def _import(source: Path, output: Path, wanted: Wanted) -> list[str]:
+    refuse_existing(output, force=wanted.force)
+    kind = _kind(source, output, wanted)
+    check_suffix(output, "MCAP" if kind == "scan" else "netCDF")
+    of_a_map = (wanted.spacing_mm, wanted.normalise, wanted.units, wanted.no_value or None)
+    if kind == "scan" and any(one is not None for one in of_a_map):
+        raise UsageError("--spacing-mm, --normalise, --units and --no-value are for maps: leave out, or give --as map")
+    if kind == "map" and wanted.of_a_scan:
+        given = " and ".join(wanted.of_a_scan)
+        raise UsageError(f"{given}: for scans only; leave out or give --as scan")
+    lines = _import_scan(source, output, wanted) if kind == "scan" else _import_map(source, output, wanted)
+    return [f"{output}: {kind}", *lines]
+
+
+def _import_scan(source: Path, output: Path, wanted: Wanted) -> list[str]:
+    lost: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+    truth = None
+    if source.suffix.lower() == ".mcap":
+        file = read_scan_report(source)
+        scan, lost, truth = file.scan, file.lost, read_truth(source)
+    else:
+        made = import_arrays(source, wanted.arrays, [_BESIDE[name](path) for name, path in wanted.beside.items()])
+        scan, notes = made.scan, made.notes
+    session = {} if wanted.session_file is None else {"session": wanted.session_file}
+    inputs = hash_inputs(source=source, **session, **wanted.beside)
+    settings = {"as": "scan", "lost": list(lost), "correct": list(wanted.corrections), **_stated(wanted.arrays)}
+    scan = corrected(with_session(scan, wanted.session_file), wanted.corrections)
+    provenance = Provenance("import", settings, inputs=inputs)
+    write_scan(output, scan, provenance=provenance, truth=truth, force=wanted.force)
+    return [*describe_scan(scan), *notes, *(f"lost: {line}" for line in lost), *_arrangement_lines(scan)]
+
+
+def _stated(arrays: ArrayMap) -> Mapping[str, Any]:
+    """What was stated of the arrays, for the provenance; nothing where nothing was."""
+    held = {name: getattr(arrays, name) for name in names_of(ArrayMap)}
+    return {name: value for name, value in held.items() if value not in (None, {})}
+
+
+def _arrangement_lines(scan: Scan) -> list[str]:
+    """What its frames say of the scan's arrangement; a scan that no map could be made of is imported without."""
+    try:
+        check = check_scan(scan, thorough=False)
+    except BadDataError as error:
+        return [f"arrangement not checked: {error.what}"]
+    return [] if check is None else finding_lines(check.findings) or [check.words]
+
+
+def _import_map(source: Path, output: Path, wanted: Wanted) -> list[str]:
+    normalise, units = wanted.normalise or "none", wanted.units or ""
+    if wanted.units is not None and normalise != "none":
+        raise UsageError(f"--units is for values that were not divided; leave it out or --normalise {normalise}")
+    if wanted.units is not None and not (units.isprintable() and 0 < len(units.strip()) <= _LONGEST_UNITS):
+        raise UsageError(f"--units {units[:30]!r} is not a unit; give up to {_LONGEST_UNITS} letters, such as kPa")
+    asked: dict[str, Any] = {"normalise": normalise, "units": units, "no_value": wanted.no_value}
+    try:
+        grid = open_grid(source, no_value=wanted.no_value)
+        tactile_map, notes = grid_map(grid, spacing_mm=wanted.spacing_mm, **asked)
+    except BadDataError as error:
+        raise error.at(source) from None
+    settings = {"as": "map", "spacing_mm": tactile_map.recipe.cell_mm, **asked, "notes": notes}
+    provenance = Provenance("import", settings, inputs=hash_inputs(source=source))
+    write_map(output, tactile_map, provenance=provenance, force=wanted.force)
+    ny, nx = tactile_map.mean.shape
+    covered = int(tactile_map.covered.sum())
+    low, high = np.nanmin(tactile_map.mean), np.nanmax(tactile_map.mean)
+    unit = tactile_map.recipe.value_unit
+    unit = "" if unit == "1" else f" {unit or '(unit unknown: give --units)'}"
+    level = "unknown" if tactile_map.background is None else f"{tactile_map.background:g}"
+    return [
+        f"{ny} x {nx} cells of {tactile_map.recipe.cell_mm:g} mm, {covered} with data",
+        f"values {low:.4g} to {high:.4g}{unit}, background level {level} (normalise {tactile_map.recipe.normalise})",
+        *notes,
+    ]

@@ -1,0 +1,153 @@
+"""A scan of arrays that Python holds, as `import` makes one of a file."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tactile_bayes.api.arguments import check_keywords, door, plain
+from tactile_bayes.api.maps import PathLike, path_of, scan_given
+from tactile_bayes.declarations import EXACT, names_of, replace, to_plain
+from tactile_bayes.errors import UsageError
+from tactile_bayes.files.array_map import read_array_map
+from tactile_bayes.files.arrays_layout import ArrayMap, Stated
+from tactile_bayes.files.documents import with_session
+from tactile_bayes.files.imports import Source, combined, import_arrays, of_calibration, of_head, of_landmarks
+from tactile_bayes.files.instrument_json import head_geometry
+from tactile_bayes.files.npz import Arrays
+from tactile_bayes.mapping.arrangement import corrected
+from tactile_bayes.scan import ElementCalibration, HeadGeometry, Landmarks, Scan, TrackerPoses
+
+_HEAD_SCHEMA = "tactile-bayes/head/1"
+
+
+@door
+def scan_of(
+    frames: Any,
+    time: Any = None,
+    poses: Any = None,
+    *,
+    head: Any = None,
+    calibration: Any = None,
+    landmarks: Any = None,
+    columns: PathLike | Mapping[str, Any] | None = None,
+    correct: tuple[str, ...] = (),
+    session: PathLike | None = None,
+    **stated: Any,
+) -> Scan:
+    """Make a scan of arrays, or of a file of arrays, for `build_map`.
+
+    Parameters
+    ----------
+    frames
+        (n, rows, columns) readings, rows across the head; (n, rows x columns) is folded as the head is. Or the path of
+        a file that `tactile-bayes import` reads; `time` and `poses` may then stand in it.
+    time
+        (n,) times of the frames, s, or `rate_hz` in its place.
+    poses
+        Of the tracker's sensor in its base: ``(time, matrices)`` with (m, 4, 4) homogeneous matrices, ``(time,
+        position, quaternion)`` with mm and the scalar first, or (m, 8) numbers in that order.
+    head
+        Path of a HEAD.json, what stands in it, or the head of another scan: ``pitch_mm``, ``surface_mm`` or ``rows``,
+        ``columns`` and ``radius_mm``, and ``scanhead_from_tracker``.
+    calibration
+        Of raw counts: a path, the calibration of another scan, or gain (kPa a count) and offset (kPa).
+    landmarks
+        A path, the landmarks of another scan, or (2, 3) sternal notch and xiphoid in mm, with the nipple (3, 3).
+    columns, correct, session
+        As `--columns`, `--correct` and `--session` of `tactile-bayes import`.
+    **stated
+        As of `tactile_bayes.files.arrays_layout.Stated`: unit, saturation, rate_hz, frame_shape, time_unit...
+
+    Returns
+    -------
+    Scan
+        ``session["imported_as"]`` says what was guessed.
+
+    Raises
+    ------
+    BadDataError
+        Naming the array, its value and the way out.
+    UsageError
+        When an argument cannot be so.
+    """
+    check_keywords("scan_of", stated, names_of(Stated))
+    given = _stated(columns, stated)
+    beside = [_poses(poses), _head(head), _calibration(calibration), _landmarks(landmarks)]
+    if isinstance(frames, str | Path):
+        made = import_arrays(path_of(frames), given, beside)
+    else:
+        times = {} if time is None else {"frame_time_s": np.asarray(time)}
+        made = combined([Source({"frames": np.asarray(frames), **times}), *beside], given)
+    for note in made.notes:
+        if note.startswith("CAUTION"):
+            warnings.warn(note, stacklevel=3)
+    found = made.scan
+    if made.notes:
+        found = replace(found, session={**found.session, "imported_as": "; ".join(made.notes)[:2000]})
+    return corrected(with_session(found, path_of(session)), correct)
+
+
+def _stated(columns: PathLike | Mapping[str, Any] | None, stated: Mapping[str, Any]) -> ArrayMap:
+    values = {name: plain(value) for name, value in stated.items() if value is not None}
+    if columns is None:
+        return ArrayMap(**values)
+    named = ArrayMap(**columns) if isinstance(columns, Mapping) else read_array_map(path_of(columns))
+    return replace(named, **values)
+
+
+def _poses(given: Any) -> Source:
+    """Times, places and rotations, in the forms that `scan_of` takes."""
+    if given is None:
+        return Source({})
+    if isinstance(given, TrackerPoses):
+        return Source(_named(given.time_s, given.position_mm, given.quaternion_wxyz))
+    if isinstance(given, tuple | list) and len(given) == 3:
+        return Source(_named(*given))
+    if isinstance(given, tuple | list) and len(given) == 2:
+        return Source({"pose_time_s": np.asarray(given[0]), "pose_matrix": np.asarray(given[1])})
+    numbers = np.asarray(given)
+    if numbers.ndim != 2 or numbers.shape[1] != 8:
+        raise UsageError(
+            f"poses is {type(given).__name__} of shape {numbers.shape}; give (time, matrices), (time, position, "
+            "quaternion) or (m, 8) numbers"
+        )
+    return Source(_named(numbers[:, 0], numbers[:, 1:4], numbers[:, 4:]))
+
+
+def _named(time: Any, position: Any, quaternion: Any) -> Arrays:
+    values = {"pose_time_s": time, "position_mm": position, "quaternion_wxyz": quaternion}
+    return {name: np.asarray(value) for name, value in values.items()}
+
+
+def _head(given: Any) -> Source:
+    if isinstance(given, Mapping):
+        document = {"schema": _HEAD_SCHEMA, **to_plain(dict(given), digits=EXACT)}
+        return of_head(head_geometry(document, path=Path("head")))
+    return _beside(given, HeadGeometry, of_head, lambda other: other.head)
+
+
+def _calibration(given: Any) -> Source:
+    if isinstance(given, tuple | list) and len(given) == 2:
+        return Source({"gain_kpa_per_count": np.asarray(given[0]), "offset_kpa": np.asarray(given[1])})
+    return _beside(given, ElementCalibration, of_calibration, lambda other: other.element_calibration)
+
+
+def _landmarks(given: Any) -> Source:
+    points = None if given is None or isinstance(given, str | Path | Landmarks | Scan) else np.asarray(given)
+    if points is not None and points.shape in ((2, 3), (3, 3)):
+        return Source({"landmarks_mm": points[:2], **({"nipple_mm": points[2]} if len(points) == 3 else {})})
+    return _beside(given, Landmarks, of_landmarks, lambda other: other.landmarks)
+
+
+def _beside(given: Any, kind: type, made: Callable[[Any], Source], part: Callable[[Scan], Any]) -> Source:
+    """What stands beside the frames: nothing, a path, a record, or that of another scan."""
+    if given is None:
+        return Source({})
+    if isinstance(given, str | Path):
+        return made(path_of(given))
+    return made(given if isinstance(given, kind) else part(scan_given(given)))

@@ -1,0 +1,150 @@
+"""Arrays by their names from the files of other programs: .npz, .npy, MATLAB's .mat and HDF5."""
+
+from __future__ import annotations
+
+import io
+import warnings
+import zlib
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import scipy.io
+
+from tactile_bayes.errors import BadDataError
+from tactile_bayes.files.netcdf import Group, open_netcdf
+from tactile_bayes.files.npz import Arrays, choose_npz, load_npy
+from tactile_bayes.files.reading import (
+    HDF5_MAGIC,
+    MCAP_MAGIC,
+    NETCDF_BYTES,
+    ZIP_MAGIC,
+    check_limit,
+    decoding,
+    open_input,
+    read_bytes,
+    unpacked_limit,
+)
+
+Choose = Callable[[Sequence[str]], Iterable[str]]
+"""Takes the names in a file and returns those to read."""
+ARRAY_SUFFIXES: Final = (".npz", ".npy", ".mat", ".h5", ".hdf5")
+_MAT_5: Final = b"MATLAB 5.0 MAT-file"
+_MAT_73: Final = b"MATLAB 7.3 MAT-file"
+_USER_BLOCK: Final = 512  # bytes before the HDF5 file in a .mat of version 7.3
+_COMPRESSED: Final = 15  # miCOMPRESSED
+_COPY_AGAIN: Final = "copy the file again"
+_MOST_LEVELS: Final = 8
+
+
+def read_named(path: Path, choose: Choose) -> Arrays:
+    """Read the arrays that `choose` takes from the names in a file, which is known by its first bytes.
+
+    Fields of a structure and members of a group are called ``exam.frames``. Arrays of a .mat have the axes that they
+    have in MATLAB.
+
+    Raises
+    ------
+    BadDataError
+        For a file of another kind, a damaged one, one that unpacks to more than its limit, and objects.
+    """
+    with open_input(path) as stream:
+        start = stream.read(_USER_BLOCK + len(HDF5_MAGIC))
+    try:
+        if start.startswith(ZIP_MAGIC[:2]):
+            return choose_npz(path, choose)
+        if start.startswith(np.lib.format.MAGIC_PREFIX):
+            return _chosen(load_npy(path), choose)
+        if start.startswith(_MAT_5):
+            return _chosen(_mat_5(path), choose)
+        if start.startswith(_MAT_73):
+            return {name: array.T for name, array in _hdf5(path, choose, begins_at=_USER_BLOCK).items()}
+        if start.startswith(HDF5_MAGIC):
+            return _hdf5(path, choose)
+    except BadDataError as error:
+        raise error.at(path) from None
+    raise _of_another_kind(path, start)
+
+
+def _of_another_kind(path: Path, start: bytes) -> BadDataError:
+    if start.startswith(MCAP_MAGIC):
+        return BadDataError("is a scan", way_out="give it as it is", path=str(path))
+    if path.suffix.lower() == ".mat":
+        what, way_out = "is not a .mat of version 5 to 7.3", "save it with save(..., '-v7')"
+    else:
+        what = f"is not an .npz, .npy, .mat or HDF5 file (it starts with {start[:6]!r})"
+        way_out = "save the arrays with numpy.savez_compressed"
+    return BadDataError(what, way_out=way_out, path=str(path))
+
+
+def _chosen(arrays: Arrays, choose: Choose) -> Arrays:
+    return {name: arrays[name] for name in choose(list(arrays))}
+
+
+# --- MATLAB's files up to version 7, by scipy.
+
+
+def _mat_5(path: Path) -> Arrays:
+    data = read_bytes(path, most=NETCDF_BYTES)
+    with (
+        decoding("is not a whole .mat file", way_out=_COPY_AGAIN),
+        warnings.catch_warnings(action="ignore"),
+    ):
+        most = unpacked_limit(len(data))
+        check_limit(_unpacked_bytes(data, most), most, what="its arrays unpack to {} bytes or more")
+        held = scipy.io.loadmat(io.BytesIO(data))  # type: ignore[arg-type]
+    return {
+        name: array
+        for key, value in held.items()
+        if not key.startswith("__")
+        for name, array in _fields(key, value, levels=_MOST_LEVELS)
+    }
+
+
+def _unpacked_bytes(data: bytes, most: int) -> int:
+    """Bytes that the elements of a .mat unpack to; no more than a little over `most` are unpacked to see it.
+
+    MAT-File Format (MathWorks), "Level 5 MAT-File Format": a header of 128 bytes, then elements, each with its type and
+    length before it.
+    """
+    order = "little" if data[126:128] == b"IM" else "big"
+    total, at = 0, 128
+    while at + 8 <= len(data) and total <= most:
+        kind, length = (int.from_bytes(data[i : i + 4], order) for i in (at, at + 4))  # type: ignore[arg-type]
+        packed = data[at + 8 : at + 8 + length]
+        if kind == _COMPRESSED:
+            total += len(zlib.decompressobj().decompress(packed, most - total + 1))
+        else:
+            total += len(packed)
+        at += 8 + length
+    return total
+
+
+def _fields(name: str, value: Any, *, levels: int) -> Iterator[tuple[str, Any]]:
+    """An array, or those in a structure's fields; cells, tables and objects of MATLAB have no numbers."""
+    if not isinstance(value, np.ndarray) or levels == 0:
+        return
+    if value.dtype.names is None:
+        yield name, value
+    elif value.size == 1:
+        for field in value.dtype.names:
+            yield from _fields(f"{name}.{field}", value.flat[0][field], levels=levels - 1)
+
+
+# --- HDF5, which MATLAB's version 7.3 is.
+
+
+def _hdf5(path: Path, choose: Choose, *, begins_at: int = 0) -> Arrays:
+    with open_netcdf(path, way_out=_COPY_AGAIN, begins_at=begins_at) as root:
+        held = dict(_members(root, "", levels=_MOST_LEVELS))
+        return {name: np.asarray(held[name].numbers(name.rpartition(".")[2])) for name in choose(list(held))}
+
+
+def _members(group: Group, prefix: str, *, levels: int) -> Iterator[tuple[str, Group]]:
+    """Each array's name with its group; MATLAB's own groups (``#refs#``) are left out."""
+    yield from ((f"{prefix}{name}", group) for name in group.variables())
+    for name in group.groups() if levels else ():
+        inner = group.group(name)
+        if inner is not None and not name.startswith("#"):
+            yield from _members(inner, f"{prefix}{name}.", levels=levels - 1)

@@ -1,0 +1,449 @@
+"""Arrays as engineers hold them: every container, axis and unit gives the one scan, or a line that says why not."""
+
+from __future__ import annotations
+
+import json
+import struct
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+import scipy.io
+from in_process import run_here
+from scipy.spatial.transform import Rotation
+
+import tactile_bayes as tb
+from tactile_bayes.errors import BadDataError, UsageError
+from tactile_bayes.files.array_map import array_template
+from tactile_bayes.files.arrays_layout import ArrayMap
+from tactile_bayes.files.documents import parse_toml
+from tactile_bayes.files.imports import import_arrays, read_arrays
+from tactile_bayes.files.scan_mcap import read_scan
+from tactile_bayes.forward.scene import Scene
+from tactile_bayes.forward.simulate import simulate
+from tactile_bayes.scan import Scan
+
+Arrays = dict[str, Any]
+
+
+@pytest.fixture(scope="module")
+def scan() -> Scan:
+    return simulate(Scene(duration_s=0.3), rng=np.random.default_rng(0)).scan
+
+
+@pytest.fixture
+def good(scan: Scan) -> Arrays:
+    return {
+        "counts": scan.frames.counts.copy(),
+        "frame_time_s": scan.frames.time_s.copy(),
+        "position_mm": scan.poses.position_mm.copy(),
+        "quaternion_wxyz": scan.poses.quaternion_wxyz.copy(),
+        "pose_time_s": scan.poses.time_s.copy(),
+        "gain_kpa_per_count": scan.element_calibration.gain_kpa_per_count.copy(),
+        "offset_kpa": scan.element_calibration.offset_kpa.copy(),
+        "pitch_mm": 1.5,
+        "array_from_tracker": scan.head.scanhead_from_tracker.copy(),
+        "head_surface_mm": scan.head.surface_mm.copy(),
+    }
+
+
+@pytest.fixture
+def pressed(good: Arrays) -> Arrays:
+    """The same with pressures in place of counts, gain and offset."""
+    kpa = good["counts"] * good["gain_kpa_per_count"] + good["offset_kpa"]
+    rest = {name: one for name, one in good.items() if name not in ("counts", "gain_kpa_per_count", "offset_kpa")}
+    return {"frames": kpa, **rest}
+
+
+@pytest.fixture
+def head(scan: Scan, tmp_path: Path) -> Path:
+    path = tmp_path / "head.json"
+    document = {
+        "schema": "tactile-bayes/head/1",
+        "pitch_mm": 1.5,
+        "surface_mm": scan.head.surface_mm.tolist(),
+        "scanhead_from_tracker": scan.head.scanhead_from_tracker.tolist(),
+    }
+    path.write_text(json.dumps(document))
+    return path
+
+
+def as_mat(path: Path, arrays: Arrays) -> None:
+    """As MATLAB keeps them: all doubles, vectors with two axes."""
+    doubles = {name: np.asarray(one, dtype=np.float64) for name, one in arrays.items()}
+    scipy.io.savemat(path, doubles, do_compression=True, oned_as="column")
+
+
+def as_struct(path: Path, arrays: Arrays) -> None:
+    scipy.io.savemat(path, {"exam": {name: np.asarray(one, dtype=np.float64) for name, one in arrays.items()}})
+
+
+def as_mat_73(path: Path, arrays: Arrays) -> None:
+    """Version 7.3 is HDF5 behind a block of 512 bytes, in which MATLAB's axes run backwards.
+
+    MathWorks, "MAT-File Versions"; HDF5 is written in C order and MATLAB's arrays are in Fortran's.
+    """
+    with h5py.File(path, "w", userblock_size=512) as file:
+        for name, one in arrays.items():
+            file[name] = np.atleast_2d(np.asarray(one, dtype=np.float64)).T
+    with path.open("r+b") as stream:
+        stream.write(b"MATLAB 7.3 MAT-file, Platform: GLNXA64, HDF5 schema 1.00 .".ljust(124))
+        stream.write(b"\x00\x02IM")
+
+
+def as_hdf5(path: Path, arrays: Arrays) -> None:
+    with h5py.File(path, "w") as file:
+        for name, one in arrays.items():
+            file.create_dataset(name, data=one, **({"compression": "gzip"} if np.ndim(one) > 1 else {}))
+        file["operator's note"] = "no array"
+
+
+def as_npz(path: Path, arrays: Arrays) -> None:
+    np.savez(path, **arrays)
+
+
+CONTAINERS = {".npz": as_npz, ".mat": as_mat, ".v73.mat": as_mat_73, ".h5": as_hdf5}
+
+
+@pytest.mark.parametrize("suffix", CONTAINERS)
+def test_every_container_gives_the_same_scan(good: Arrays, scan: Scan, tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"exam{suffix}"
+    CONTAINERS[suffix](path, good)
+    same(read_arrays(path), scan)
+
+
+def test_fields_of_a_structure_and_members_of_a_group_are_named(good: Arrays, scan: Scan, tmp_path: Path) -> None:
+    as_struct(tmp_path / "exam.mat", good)
+    with h5py.File(tmp_path / "exam.hdf5", "w") as file:
+        for name, one in good.items():
+            file[f"exam/{name}"] = one
+    names = ArrayMap(arrays={name: f"exam.{name}" for name in good})
+    for path in (tmp_path / "exam.mat", tmp_path / "exam.hdf5"):
+        same(import_arrays(path, names).scan, scan)
+
+
+def test_npy_holds_the_frames_alone_or_named_fields(pressed: Arrays, scan: Scan, head: Path, tmp_path: Path) -> None:
+    np.save(tmp_path / "frames.npy", pressed["frames"])
+    poses = (pressed["pose_time_s"], pressed["position_mm"], pressed["quaternion_wxyz"])
+    found = tb.scan_of(tmp_path / "frames.npy", None, poses, head=head, unit="kPa", rate_hz=200.0)
+    np.testing.assert_allclose(found.frames.time_s, np.arange(len(found.frames)) / 200.0)
+    named = np.array(list(zip(pressed["frames"], pressed["frame_time_s"], strict=True)), dtype=fields_of(pressed))
+    np.save(tmp_path / "named.npy", named)
+    found = tb.scan_of(tmp_path / "named.npy", None, poses, head=head, unit="kPa")
+    np.testing.assert_array_equal(found.frames.time_s, scan.frames.time_s)
+
+
+def fields_of(pressed: Arrays) -> list[Any]:
+    return [("frames", "f8", pressed["frames"].shape[1:]), ("frame_time_s", "f8")]
+
+
+def same(found: Scan, scan: Scan) -> None:
+    np.testing.assert_array_equal(found.frames.counts, scan.frames.counts)
+    np.testing.assert_array_equal(found.frames.time_s, scan.frames.time_s)
+    np.testing.assert_allclose(found.poses.position_mm, scan.poses.position_mm, atol=1e-9)
+    np.testing.assert_array_equal(found.head.surface_mm, scan.head.surface_mm)
+    np.testing.assert_array_equal(
+        found.element_calibration.gain_kpa_per_count, scan.element_calibration.gain_kpa_per_count
+    )
+
+
+# kPa in one of each: BIPM, The International System of Units, 9th ed., and NIST SP 811 appendix B.
+IN_KPA = {"kPa": 1.0, "Pa": 1e-3, "psi": 6.894757, "mmHg": 101.325 / 760, "N/cm2": 10.0}
+
+
+@pytest.mark.parametrize("unit", IN_KPA)
+def test_pressures_in_every_unit_are_the_same_scan(pressed: Arrays, tmp_path: Path, unit: str) -> None:
+    kpa = pressed["frames"]
+    as_npz(tmp_path / "exam.npz", pressed | {"frames": kpa / IN_KPA[unit]})
+    found = import_arrays(tmp_path / "exam.npz", ArrayMap(unit=unit))  # type: ignore[arg-type]
+    np.testing.assert_allclose(found.scan.element_calibration.to_kpa(found.scan.frames.counts), kpa, atol=6e-4)
+    assert found.scan.session["frames_unit"] == unit
+    assert any(f"frames in {unit}, kept to 1 Pa" in note for note in found.notes)
+    assert not any(note.startswith("CAUTION") for note in found.notes)
+
+
+def test_whole_pressures_keep_their_numbers_and_the_unit_is_the_gain(pressed: Arrays) -> None:
+    mmhg = np.rint(np.clip(pressed["frames"], 0, None) / IN_KPA["mmHg"]).astype(np.uint16)
+    found = scan_of(pressed | {"frames": mmhg}, unit="mmHg")
+    np.testing.assert_array_equal(found.frames.counts, mmhg)
+    assert found.element_calibration.gain_kpa_per_count[0, 0] == pytest.approx(IN_KPA["mmHg"], rel=1e-6)
+
+
+def test_pressures_below_zero_are_kept_and_a_saturation_is_in_the_unit(pressed: Arrays) -> None:
+    frames = pressed["frames"] - 3.0
+    found = scan_of(pressed | {"frames": frames}, unit="kPa", saturation=12.0)
+    kpa = found.element_calibration.to_kpa(found.frames.counts)
+    np.testing.assert_array_equal(np.isnan(kpa), frames > 11.9995)
+    np.testing.assert_allclose(kpa[~np.isnan(kpa)], frames[~np.isnan(kpa)], atol=6e-4)
+
+
+def scan_of(arrays: Arrays, **stated: Any) -> Scan:
+    poses = (arrays["pose_time_s"], arrays["position_mm"], arrays["quaternion_wxyz"])
+    head = {
+        "pitch_mm": arrays["pitch_mm"],
+        "surface_mm": arrays["head_surface_mm"],
+        "scanhead_from_tracker": arrays["array_from_tracker"],
+    }
+    return tb.scan_of(arrays["frames"], arrays["frame_time_s"], poses, head=head, **stated)
+
+
+def test_pressures_that_are_too_small_are_asked_about_by_import_and_map(pressed: Arrays) -> None:
+    with pytest.warns(UserWarning, match=r"CAUTION: frames in kPa.* kPa: are these psi"):
+        found = scan_of(pressed | {"frames": pressed["frames"] / IN_KPA["psi"]}, unit="kPa")
+    with pytest.raises(BadDataError, match=r"median .*: are these psi.*right unit"):
+        tb.build_map(found)
+
+
+@pytest.mark.parametrize(("true", "stated"), [("kPa", "psi"), ("mmHg", "kPa"), ("Pa", "mmHg"), ("Pa", "kPa")])
+def test_pressures_beyond_every_array_are_refused_with_the_question(pressed: Arrays, true: str, stated: str) -> None:
+    with pytest.raises(BadDataError, match=rf"frames in {stated}: .* ends at 34 kPa; are these {true}"):
+        scan_of(pressed | {"frames": pressed["frames"] / IN_KPA[true]}, unit=stated)
+
+
+def test_axes_of_frames_and_poses_are_found_by_the_times(pressed: Arrays, scan: Scan, tmp_path: Path) -> None:
+    turned = pressed | {
+        "frames": np.moveaxis(pressed["frames"], 0, -1),
+        "position_mm": pressed["position_mm"].T,
+        "quaternion_wxyz": pressed["quaternion_wxyz"].T,
+        "frame_time_s": pressed["frame_time_s"][None] * 1000,
+    }
+    as_mat(tmp_path / "exam.mat", turned)
+    found = import_arrays(tmp_path / "exam.mat", ArrayMap(unit="kPa", time_unit="ms", pose_time_unit="s"))
+    np.testing.assert_allclose(found.scan.frames.time_s, scan.frames.time_s)
+    np.testing.assert_array_equal(found.scan.poses.position_mm, scan.poses.position_mm)
+    kpa = found.scan.element_calibration.to_kpa(found.scan.frames.counts)
+    np.testing.assert_allclose(kpa, pressed["frames"], atol=6e-4)
+    assert "read along the last axis" in " ".join(found.notes)
+
+
+def test_frames_of_one_row_are_folded_and_it_is_said(pressed: Arrays) -> None:
+    kpa = pressed["frames"]
+    by_rows = scan_of(pressed | {"frames": kpa.reshape(len(kpa), -1)}, unit="kPa")
+    by_columns = scan_of(
+        pressed | {"frames": kpa.swapaxes(1, 2).reshape(len(kpa), -1)}, unit="kPa", frame_order="columns"
+    )
+    for found in (by_rows, by_columns):
+        np.testing.assert_allclose(found.element_calibration.to_kpa(found.frames.counts), kpa, atol=6e-4)
+    assert "each 416 numbers read as 16 x 26, along the array's rows" in by_rows.session["imported_as"]
+    with pytest.raises(BadDataError, match=r"frames of 400 numbers .*16 x 26 taxels are 416"):
+        scan_of(pressed | {"frames": kpa.reshape(len(kpa), -1)[:, :400]}, unit="kPa")
+
+
+def test_matrices_euler_angles_and_scalar_last_are_the_same_poses(pressed: Arrays, scan: Scan) -> None:
+    turned = Rotation.from_quat(pressed["quaternion_wxyz"], scalar_first=True)
+    matrices = np.tile(np.eye(4), (len(turned), 1, 1))
+    matrices[:, :3, :3], matrices[:, :3, 3] = turned.as_matrix(), pressed["position_mm"]
+    time, place = pressed["pose_time_s"], pressed["position_mm"]
+    head = scan.head
+    frames, frame_time = pressed["frames"], pressed["frame_time_s"]
+    given: list[tuple[Any, Arrays]] = [
+        ((time, matrices), {}),
+        ((time, matrices[:, :3].reshape(len(time), 12)), {}),
+        ((time, np.moveaxis(matrices, 0, -1)), {}),
+        ((time, place, turned.as_quat()), {"pose_layout": "xyzw"}),
+        ((time, place / 25.4, turned.as_euler("ZYX", degrees=True)), {"pose_layout": "euler", "length_unit": "inch"}),
+        (np.column_stack([time, place, pressed["quaternion_wxyz"]]), {}),
+    ]
+    for poses, stated in given:
+        found = tb.scan_of(frames, frame_time, poses, head=head, unit="kPa", **stated).poses
+        np.testing.assert_allclose(found.position_mm, place, atol=1e-9)
+        apart = turned.inv() * Rotation.from_quat(found.quaternion_wxyz, scalar_first=True)
+        assert apart.magnitude().max() < 1e-6
+    with pytest.raises(BadDataError, match="pose_matrix is not rigid at index 0"):
+        tb.scan_of(frames, frame_time, (time, matrices.swapaxes(1, 2)), head=head, unit="kPa")
+
+
+def test_azimuth_elevation_and_roll_turn_about_z_y_and_x() -> None:
+    """Polhemus, FASTRAK 3SPACE User's Manual, appendix on Euler angles: azimuth of 90 degrees takes x to y."""
+    from tactile_bayes.files.imports import quaternions
+
+    angles = np.array([[90.0, 0, 0], [0, 90.0, 0], [0, 0, 90.0], [90.0, 90.0, 0]])
+    turned = Rotation.from_quat(quaternions(angles, "euler"), scalar_first=True).as_matrix()
+    np.testing.assert_allclose(turned[0] @ [1, 0, 0], [0, 1, 0], atol=1e-12)
+    np.testing.assert_allclose(turned[1] @ [1, 0, 0], [0, 0, -1], atol=1e-12)
+    np.testing.assert_allclose(turned[2] @ [0, 1, 0], [0, 0, 1], atol=1e-12)
+    np.testing.assert_allclose(turned[3] @ [1, 0, 0], [0, 0, -1], atol=1e-12)  # azimuth outermost
+
+
+def nan(name: str) -> Callable[[Arrays], None]:
+    return lambda a: a[name].__setitem__((3, 4), np.nan)
+
+
+FAULTS: list[tuple[str, Callable[[Arrays], Any], dict[str, Any], str]] = [
+    ("NaN", nan("frames"), {"unit": "kPa"}, r"frames holds 26 values that are not finite \(first at \(3, 4, 0\)\)"),
+    ("no unit", dict.copy, {}, "lacks gain_kpa_per_count .*--unit or --array-calibration"),
+    ("gain and unit", lambda a: a.update(offset_kpa=0.0), {"unit": "kPa"}, "offset_kpa is for counts.*in kPa"),
+    ("no head", lambda a: a.pop("head_surface_mm"), {"unit": "kPa"}, "lacks head_surface_mm.*--head-geometry HEAD"),
+    ("no times", lambda a: a.pop("frame_time_s"), {"unit": "kPa"}, r"lacks frame_time_s \(n\).*--rate-hz"),
+    ("ms", lambda a: a.update(frame_time_s=a["frame_time_s"] * 1000), {"unit": "kPa"}, "milliseconds.*--time-unit ms"),
+    ("clocks", lambda a: a.update(pose_time_s=a["pose_time_s"] + 1e6), {"unit": "kPa"}, "overlap.*--pose-offset-s"),
+    ("shape", dict.copy, {"unit": "kPa", "frame_shape": (26, 16)}, "16 x 26 taxels, not 26 x 16"),
+    ("unknown", dict.copy, {"unit": "kPa", "arrays": {"count": "frames"}}, "'count' is no array.*mean counts"),
+    ("not there", dict.copy, {"unit": "kPa", "arrays": {"counts": "P"}}, "has no array 'P' for counts; it has "),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("fault", "spoil", "stated", "words"), FAULTS, ids=[row[0] for row in FAULTS])
+def test_what_is_missing_or_wrong_is_one_line_with_its_way_out(
+    pressed: Arrays, tmp_path: Path, fault: str, spoil: Callable[[Arrays], Any], stated: dict[str, Any], words: str
+) -> None:
+    del fault
+    spoil(pressed)
+    path = tmp_path / "exam.npz"
+    as_npz(path, pressed)
+    with pytest.raises(BadDataError, match=words) as caught:
+        import_arrays(path, ArrayMap(**stated))
+    assert str(caught.value).startswith(str(path))
+    assert "\n" not in str(caught.value)
+
+
+def test_objects_of_every_container_are_refused_and_never_unpickled(tmp_path: Path) -> None:
+    cells = np.array([[1.0, "x"]], dtype=object)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["frames"] = "text"
+    scipy.io.savemat(tmp_path / "a.mat", {"frames": cells})
+    np.savez(tmp_path / "a.npz", frames=cells)
+    np.save(tmp_path / "a.npy", cells, allow_pickle=True)
+    for path in sorted(tmp_path.iterdir()):
+        with pytest.raises(BadDataError, match=r"never unpickled|not an array of numbers"):
+            import_arrays(path, ArrayMap(unit="kPa"))
+
+
+def test_a_mat_that_unpacks_to_more_than_its_limit_is_not_unpacked(tmp_path: Path) -> None:
+    """A variable that says it has 4 GB of zeros; MAT-File Format, "Level 5": type 15 is a compressed element."""
+    packed = zlib.compress(bytes(2**28), 9)
+    header = b"MATLAB 5.0 MAT-file".ljust(124) + struct.pack("<H", 0x0100) + b"IM"
+    (tmp_path / "bomb.mat").write_bytes(header + struct.pack("<II", 15, len(packed)) + packed)
+    with pytest.raises(BadDataError, match=r"its arrays unpack to 64,000,001 bytes or more, over the limit"):
+        read_arrays(tmp_path / "bomb.mat")
+
+
+@pytest.mark.parametrize("suffix", [".mat", ".v73.mat", ".h5", ".npy"])
+def test_damaged_files_end_in_one_line(good: Arrays, tmp_path: Path, suffix: str) -> None:
+    whole = tmp_path / f"whole{suffix}"
+    if suffix == ".npy":
+        np.save(whole, good["counts"])
+    else:
+        CONTAINERS[suffix](whole, good)
+    data, path = whole.read_bytes(), tmp_path / f"bad{suffix}"
+    rng = np.random.default_rng(1)
+    for share in (0.001, 0.01, 0.1, 0.5, 0.9, 0.999):
+        path.write_bytes(data[: int(share * len(data))])
+        with pytest.raises(BadDataError):
+            read_arrays(path)
+    for _ in range(40):
+        changed = bytearray(data)
+        for place in rng.integers(0, min(4096, len(data)), 3):
+            changed[place] ^= int(rng.integers(1, 256))
+        path.write_bytes(changed)
+        try:
+            read_arrays(path)
+        except BadDataError as error:
+            assert "\n" not in str(error)  # noqa: PT017
+
+
+def test_other_files_are_named_for_what_they_are(tmp_path: Path) -> None:
+    (tmp_path / "old.mat").write_bytes(b"\x00" * 600)
+    with pytest.raises(BadDataError, match=r"is not a \.mat of version 5 to 7\.3; save it with save\(\.\.\., '-v7'\)"):
+        read_arrays(tmp_path / "old.mat")
+    (tmp_path / "x.h5").write_bytes(b"hello")
+    with pytest.raises(BadDataError, match=r"is not an \.npz, \.npy, \.mat or HDF5 file"):
+        read_arrays(tmp_path / "x.h5")
+
+
+def test_the_template_names_what_shapes_tell_and_is_read_back(pressed: Arrays, tmp_path: Path) -> None:
+    names = {"frames": "P", "frame_time_s": "t", "position_mm": "xyz", "quaternion_wxyz": "q", "pose_time_s": "tt"}
+    renamed = {names.get(name, name): one for name, one in pressed.items()}
+    as_mat(tmp_path / "exam.mat", renamed)
+    text = array_template(tmp_path / "exam.mat")
+    assert parse_toml(text, way_out="")["arrays"] == {
+        "counts": "P",
+        "frame_time_s": "t",
+        "position_mm": "xyz",
+        "quaternion_wxyz": "q",
+        "pose_time_s": "tt",
+    }
+    assert f"#   P: {len(pressed['frames'])} x 16 x 26" in text
+    assert "pitch_mm is called so" in text
+    (tmp_path / "map.toml").write_text(text.replace('# unit = "kPa"', 'unit = "kPa"'))
+    done = run_here("import", "exam.mat", "--columns", "map.toml", "-o", "exam.mcap", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "frames in kPa" in done.stdout
+    assert len(read_scan(tmp_path / "exam.mcap").frames) == len(pressed["frames"])
+    empty = run_here("import", "--template", cwd=tmp_path)
+    assert parse_toml(empty.stdout, way_out="") == {"arrays": {}, "values": {}}
+
+
+def test_values_of_the_map_stand_for_arrays_that_no_file_has(pressed: Arrays, tmp_path: Path) -> None:
+    pitch = pressed.pop("pitch_mm")
+    as_npz(tmp_path / "exam.npz", pressed)
+    (tmp_path / "map.toml").write_text(f'unit = "kPa"\n[values]\npitch_mm = {pitch}\n')
+    done = run_here("import", "exam.npz", "--columns", "map.toml", "-o", "exam.mcap", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    (tmp_path / "map.toml").write_text('units = "kPa"\n')
+    done = run_here("import", "exam.npz", "--columns", "map.toml", "-o", "b.mcap", cwd=tmp_path)
+    assert done.returncode == 3
+    assert "map.toml: units is not known; did you mean unit?" in done.stderr
+
+
+def test_many_files_fail_one_by_one(pressed: Arrays, head: Path, tmp_path: Path) -> None:
+    """The head stands beside them once; the code is that of the first that failed."""
+    for name in ("head_surface_mm", "pitch_mm", "array_from_tracker"):
+        del pressed[name]
+    as_mat(tmp_path / "a.mat", pressed)
+    as_npz(tmp_path / "b.npz", pressed | {"frames": pressed["frames"][:, :8]})
+    as_hdf5(tmp_path / "c.h5", pressed)
+    files = ("a.mat", "b.npz", "c.h5")
+    done = run_here("import", *files, "-o", "scans", "--unit", "kPa", "--head-geometry", head, cwd=tmp_path)
+    assert done.returncode == 3
+    assert done.stderr.count("\n") == 1
+    assert "b.npz: " in done.stderr
+    assert sorted(path.name for path in (tmp_path / "scans").iterdir()) == ["a.mcap", "c.mcap"]
+    assert "a.mcap: scan" in done.stdout
+    again = run_here("import", *files, "-o", "scans", "--unit", "kPa", "--head-geometry", head, cwd=tmp_path)
+    assert again.returncode == 2
+    assert again.stderr.count("\n") == 3
+    (tmp_path / "a.npz").write_bytes(b"")
+    clash = run_here("import", "a.mat", "a.npz", "-o", "more", cwd=tmp_path)
+    assert clash.returncode == 2
+    assert not (tmp_path / "more").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("a.npz",), "Missing option -o"),
+        ((), "Missing argument SRC"),
+        (("a.npz", "-o", "a.nc", "--unit", "kPa"), "--unit: for scans only"),
+        (("a.npz", "-o", "a.mcap", "--unit", "bar"), "'bar' is not one of"),
+    ],
+)
+def test_a_call_that_cannot_be_is_a_usage_error(tmp_path: Path, words: tuple[str, ...], told: str) -> None:
+    np.savez(tmp_path / "a.npz", mean=np.ones((2, 2)))
+    done = run_here("import", *words, cwd=tmp_path)
+    assert done.returncode == 2
+    assert told in done.stderr
+
+
+def test_python_takes_records_of_another_scan_and_says_what_it_cannot_take(scan: Scan) -> None:
+    counts, time = scan.frames.counts, scan.frames.time_s
+    found = tb.scan_of(counts, time, scan.poses, head=scan, calibration=scan, landmarks=scan.landmarks)
+    same(found, scan)
+    assert found.landmarks is not None
+    with pytest.raises(UsageError, match=r"poses is int of shape \(\)"):
+        tb.scan_of(counts, time, 3, head=scan)
+    with pytest.raises(TypeError, match="no keyword 'units'; did you mean unit"):
+        tb.scan_of(counts, time, scan.poses, head=scan, units="kPa")
+    with pytest.raises(BadDataError, match="head: pitch is not known; did you mean pitch_mm"):
+        tb.scan_of(counts, time, scan.poses, head={"pitch": 1.5})
+
+
+def test_a_scene_needs_no_file() -> None:
+    made = tb.simulate({"scene": {"duration_s": 0.2}, "lump": [{"amplitude": np.float64(0.3)}]})
+    assert len(made.scan.frames) == 40
+    with pytest.raises(BadDataError, match=r"scene\.duration is not known; did you mean"):
+        tb.simulate({"scene": {"duration": 0.2}})
