@@ -274,13 +274,10 @@ def _prior(
     values |= {"x_mm": middle[0] + away * np.cos(direction), "y_mm": middle[1] + away * np.sin(direction)}
     notes = {"left_out": "level, tilt and noise scale have improper priors"}
     if calibration is not None:
-        inside = [
-            not calibration.extrapolation_faults(a, x, y) if a > 0 else False
-            for a, x, y in zip(amplitude.tolist(), sigma_x.tolist(), sigma_y.tolist(), strict=True)
-        ]
+        inside = calibration.within_reach(amplitude, sigma_x, sigma_y)
         share = float(np.mean(inside))
         notes["sizes"] = f"of the {100 * share:.0f} % of draws within the calibration's range, at evenly spaced ranks"
-        if sum(inside) >= LEAST_SIZED:
+        if inside.sum() >= LEAST_SIZED:
             a, x, y, turn = (one[inside][None] for one in (amplitude, sigma_x, sigma_y, angle))
             size = draw_sizes(BumpDraws(a, x, y, turn), calibration=calibration, priors=size_priors, rng=rng)
             ranks = (np.arange(len(kept)) + 0.5) / len(kept)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -11,9 +11,11 @@ from tactile_bayes.presets import HELD, INTERVAL, RESEARCH_USE
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.eq6 import COEFFICIENTS, AxisCalibration, LeftOutErrors, SizeCalibration
 from tactile_bayes.size.fat import PAPER_SPREAD
-from tactile_bayes.size.learn.eq6 import OtherFit, is_two_stage
 from tactile_bayes.size.pooling import Calibration
 from tactile_bayes.size.terms import SiteShift
+
+if TYPE_CHECKING:
+    from tactile_bayes.size.learn.eq6 import OtherFit
 
 # --- A site's correction of a size calibration as text for people.
 
@@ -236,7 +238,7 @@ def calibration_text(calibration: SizeCalibration, *, not_left_out: str = "", ot
     `not_left_out`: why the table's geometries could not be left out in turn, where that is so; `other_fit`: what the
     other of the two fits makes of the same rows.
     """
-    how = "two-stage fit as printed +- SD of a bootstrap" if is_two_stage(calibration) else "posterior mean +- SD"
+    how = "two-stage fit as printed +- SD of a bootstrap" if calibration.in_two_stages else "posterior mean +- SD"
     lines = [f"Eq 6: d = m sigma / (e a^f) + b, {how}"]
     both = calibration.axes == ("both",)
     axes = [("both axes", calibration.x)] if both else [("across, x", calibration.x), ("along, y", calibration.y)]

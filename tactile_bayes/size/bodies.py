@@ -28,7 +28,7 @@ import numpy as np
 
 from tactile_bayes.declarations import Meta, Record, replace
 from tactile_bayes.errors import BadDataError, UsageError, check_number, meant
-from tactile_bayes.geometry import FloatArray, Matrix, Vector
+from tactile_bayes.geometry import BoolArray, FloatArray, Matrix, Vector
 from tactile_bayes.size.draws import ShapeDraws, Supposition
 from tactile_bayes.size.eq6 import Eq6Law, Power, Powers, eq6_coefficients, eq6_log_size, eq6_terms
 from tactile_bayes.size.fat import WEIGHTS, BetweenMaps, FatDepth, Residual
@@ -49,6 +49,7 @@ from tactile_bayes.size.terms import (
     powers,
     unknown_fat,
     unlike_bodies,
+    within_reach,
 )
 
 UNLIKE: Final = "is unlike the bodies of the table"
@@ -280,8 +281,11 @@ class BodyCalibration(BodyLaw, eq=False, kw_only=True):
         """Leverage of a map over the largest in the table; infinite without a rise."""
         if not (amplitude > 0 and sigma_mm > 0):
             return float("inf")
-        x = self.features(np.log(np.array(amplitude)), np.log(np.array(sigma_mm)))
-        return float(x @ self.information_inverse @ x) / self.most_leverage
+        return float(self._leverages(np.array(amplitude), np.array(sigma_mm)))
+
+    def _leverages(self, amplitude: FloatArray, sigma_mm: FloatArray) -> FloatArray:
+        x = self.features(np.log(amplitude), np.log(sigma_mm))
+        return np.asarray(np.einsum("...i,ij,...j->...", x, self.information_inverse, x) / self.most_leverage)
 
     def outside(self, amplitude: float, sigma_x_mm: float, sigma_y_mm: float | None = None) -> list[str]:
         """In what a map lies outside the table, in words; empty when it lies inside."""
@@ -291,6 +295,13 @@ class BodyCalibration(BodyLaw, eq=False, kw_only=True):
     def extrapolation_faults(self, amplitude: float, sigma_x_mm: float, sigma_y_mm: float | None = None) -> list[str]:
         """In what a map lies so far outside the table that there is no size, in words."""
         return self._outside(amplitude, mean_width_mm(sigma_x_mm, sigma_y_mm), far=True)
+
+    def within_reach(self, amplitude: FloatArray, sigma_x_mm: FloatArray, sigma_y_mm: FloatArray) -> BoolArray:
+        """(n,) True for maps without `extrapolation_faults`."""
+        sigma_mm = np.sqrt(sigma_x_mm * sigma_y_mm)
+        inside = within_reach(self.domain, amplitude, sigma_mm)
+        inside[inside] = self._leverages(amplitude[inside], sigma_mm[inside]) <= FARTHEST_LEVERAGE
+        return inside
 
     def beyond_lumps(self, largest_mm: float) -> list[str]:
         """In what a size lies beyond the table's lumps, in words; empty when it lies within."""

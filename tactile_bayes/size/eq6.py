@@ -23,7 +23,7 @@ import numpy as np
 
 from tactile_bayes.declarations import Meta, Record, field, replace
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.geometry import FloatArray, Matrix, Vector
+from tactile_bayes.geometry import BoolArray, FloatArray, Matrix, Vector
 from tactile_bayes.inference.draws import even_replicates
 from tactile_bayes.inference.points import normal_quantile, paired_points
 from tactile_bayes.size.draws import BumpDraws, SizePosterior, shares
@@ -39,6 +39,7 @@ from tactile_bayes.size.terms import (
     check_domain,
     check_shapes,
     outside_domain,
+    within_reach,
 )
 
 MU, F, B = range(3)
@@ -193,6 +194,11 @@ class SizeCalibration(Record, eq=False):
         """Quantities of a map so far outside the tables that no size is given, in words."""
         return self._by_axes(amplitude, sigma_x_mm, sigma_y_mm, far=True)
 
+    def within_reach(self, amplitude: FloatArray, sigma_x_mm: FloatArray, sigma_y_mm: FloatArray) -> BoolArray:
+        """(n,) True for maps without `extrapolation_faults`."""
+        by_x = within_reach(self.x.domain, amplitude, sigma_x_mm)
+        return np.asarray(by_x & within_reach(self.y.domain, amplitude, sigma_y_mm))
+
     def _by_axes(self, amplitude: float, x_mm: float, y_mm: float, *, far: bool = False) -> list[str]:
         axes = (("x", self.x.domain, x_mm), ("y", self.y.domain, y_mm))
         return [f"{name}: {text}" for name, own, mm in axes for text in outside_domain(own, amplitude, mm, far=far)]
@@ -204,6 +210,11 @@ class SizeCalibration(Record, eq=False):
     def omissions(self) -> list[str]:
         """Sources of error that a size does not contain, in words."""
         return [ONE_WIDTH] if self.axes == ("both",) else []
+
+    @property
+    def in_two_stages(self) -> bool:
+        """True where it was learned in the two stages of the paper's section 2.4."""
+        return self.x.fit.get("two_stage", 0.0) == 1.0
 
 
 def push_sizes(

@@ -13,7 +13,7 @@ import numpy as np
 
 from tactile_bayes.declarations import Meta, Record, field
 from tactile_bayes.errors import Abstention, BadDataError
-from tactile_bayes.geometry import FloatArray, Matrix, Vector
+from tactile_bayes.geometry import BoolArray, FloatArray, Matrix, Vector
 from tactile_bayes.inference.points import normal_quantile
 from tactile_bayes.presets import INTERVAL, Background, Noise
 from tactile_bayes.scan import HeadShape
@@ -258,6 +258,15 @@ def outside_domain(domain: Domain, amplitude: float, sigma_mm: float, *, far: bo
         if not low / factor <= value <= high * factor:
             texts.append(f"{name.removesuffix('_mm')} {value:.3g}{unit} (table: {low:.3g} to {high:.3g}{unit})")
     return texts
+
+
+def within_reach(domain: Domain, amplitude: FloatArray, sigma_mm: FloatArray) -> BoolArray:
+    """(...) True where amplitude and width are not so far outside their ranges that no size is given."""
+    inside = np.ones(np.shape(amplitude), dtype=np.bool_)
+    for name, values in (("amplitude", amplitude), ("sigma_mm", sigma_mm)):
+        (low, high), factor = domain[name], FARTHEST[name]
+        inside &= (low / factor <= values) & (values <= high * factor)
+    return inside
 
 
 def beyond_lumps(domain: Domain, largest_mm: float) -> list[str]:

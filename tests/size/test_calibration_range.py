@@ -71,6 +71,21 @@ def test_how_far_decides(shipped: BodyCalibration, amplitude: float, sigma_mm: f
         assert bool(texts) == bool(words)
 
 
+@pytest.mark.parametrize("name", ["solid", "eq6", "plane-strain"])
+def test_many_maps_at_once_are_within_reach_as_one_by_one(name: str) -> None:
+    path = size_calibration_path(name)
+    assert path is not None
+    calibration = read_size_calibration(path)
+    rng = np.random.default_rng(3)
+    amplitude, x, y = rng.normal(0.0, 2.0, 400), np.exp(rng.normal(1.7, 0.6, 400)), np.exp(rng.normal(1.7, 0.6, 400))
+    told = [
+        a > 0 and not calibration.extrapolation_faults(a, one, other)
+        for a, one, other in zip(amplitude.tolist(), x.tolist(), y.tolist(), strict=True)
+    ]
+    assert calibration.within_reach(amplitude, x, y).tolist() == told
+    assert 20 < sum(told) < 380
+
+
 def gain_map(*, profile: tuple[float, ...] | None = None, **bump: float) -> TactileMap:
     noise = 0.01 * np.random.default_rng(2).standard_normal((51, 51))
     plain = bump_map(noise=noise, x=0.0, y=0.0, **bump)

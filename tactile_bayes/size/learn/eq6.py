@@ -253,7 +253,7 @@ def axis_in_two_stages(data: AxisRows) -> AxisCalibration:
 
 def other_fit(calibration: SizeCalibration, table: SizeTable) -> OtherFit | None:
     """Fit the same table the other way; None where that fit does not exist, as without depths."""
-    name = "joint" if is_two_stage(calibration) else "two-stage"
+    name = "joint" if calibration.in_two_stages else "two-stage"
     fit = axis_at_mode if name == "joint" else axis_in_two_stages
     pairs = [(axis, data) for axis, data in zip((calibration.x, calibration.y), axis_rows(table), strict=True) if data]
     try:
@@ -265,11 +265,6 @@ def other_fit(calibration: SizeCalibration, table: SizeTable) -> OtherFit | None
         ours, theirs = (one.size_mm(data.sigma_mm, data.amplitude) for one in (axis, other))
         differences.append(float(np.mean(np.abs(ours - theirs) / data.d_mm)))
     return OtherFit(name, tuple(tuple(one.draws[0, :4].tolist()) for one in others), tuple(differences))
-
-
-def is_two_stage(calibration: SizeCalibration) -> bool:
-    """True for a calibration that was learned in two stages."""
-    return calibration.x.fit.get("two_stage", 0.0) == 1.0
 
 
 def _learn_in_two_stages(data: AxisRows, rng: np.random.Generator) -> AxisCalibration:
