@@ -7,7 +7,8 @@ import datetime
 import logging
 import re
 import warnings
-from collections.abc import Iterator, Mapping
+from codecs import BOM_UTF8
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -15,7 +16,7 @@ from tactile_bayes.declarations import Record, as_dict, names_of, replace
 from tactile_bayes.errors import BadDataError, TactileBayesError, UsageError
 from tactile_bayes.exports.exam import required
 from tactile_bayes.files.documents import load_json, parse_record
-from tactile_bayes.files.reading import read_bytes
+from tactile_bayes.files.reading import other_encoding, read_bytes
 from tactile_bayes.options import IdentityOptions
 
 # --- Who was examined, and when: only what the user or a worklist says, checked against what the formats can hold.
@@ -25,6 +26,8 @@ _MOMENT: Final = re.compile(
 )
 _UID: Final = re.compile(r"(0|[1-9]\d*)(\.(0|[1-9]\d*))+", re.ASCII)
 _NAMES: Final = ("patient_name", "referring_physician")
+_REPLACED: Final = "\ufffd"
+"""Stands where a program could not read a letter: no name or code holds it."""
 
 
 class Moment(Record):
@@ -111,6 +114,8 @@ class Identity(IdentityOptions):
 
 
 def _check_text(name: str, value: str) -> None:
+    if _REPLACED in value:
+        raise UsageError(f"{name} is {_short(value)}: a letter was lost on its way (U+FFFD); give it as it is written")
     if not value.isprintable() or "\\" in value:
         raise UsageError(
             f"{name} is {_short(value)}; leave out backslashes, line ends and other characters that cannot be printed"
@@ -156,10 +161,11 @@ def identity_of(worklist: Path | None, given: Mapping[str, Any]) -> Identity:
 def read_worklist(path: Path) -> Identity:
     """Read the identity that a worklist file gives."""
     data = read_bytes(path, most=_MOST_BYTES)
-    if not data.lstrip().startswith((b"{", b"[")):
+    if not other_encoding(data) and not data.removeprefix(BOM_UTF8).lstrip().startswith((b"{", b"[")):
         pydicom = required("pydicom")
         with _decoding(path, "is neither JSON nor a DICOM file"):
             item = pydicom.dcmread(path, stop_before_pixels=True)
+            _check_letters(item, pydicom.charset.python_encoding, path)
         return _identity(_of_dicom(item, path), path)
     document = load_json(path, way_out=_WAY_OUT)
     if isinstance(document, list):
@@ -200,6 +206,22 @@ def _decoding(path: Path, what: str) -> Iterator[None]:
             raise BadDataError(f"{what} ({type(error).__name__})", way_out=_WAY_OUT, path=str(path)) from None
         finally:
             log.setLevel(level)
+
+
+def _check_letters(item: Any, known: Collection[str], path: Path) -> None:
+    """Refuse letters beyond ASCII where no known character set is declared (PS3.5, 6.1): any guess is another name."""
+    declared = item.get("SpecificCharacterSet")
+    names = [declared] if isinstance(declared, str) else list(declared or [])
+    if names and all(name in known for name in names):
+        return
+    for keyword in (*_ATTRIBUTES.values(), "PatientBirthDate"):
+        value = getattr(item.get_item(keyword), "value", b"")
+        if isinstance(value, bytes) and not value.isascii():
+            byte = next(one for one in value if one > 127)
+            said = f"the character set {_short(str(names[0]))}, which is none" if names else "no character set"
+            what = f"{keyword} holds the byte 0x{byte:02x}, and the item declares {said}"
+            way_out = "declare SpecificCharacterSet in it (ISO_IR 192 for UTF-8), or give the name by options"
+            raise BadDataError(what, way_out=way_out, path=str(path))
 
 
 def _of_dicom(dataset: Any, path: Path) -> dict[str, str]:

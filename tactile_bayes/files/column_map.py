@@ -11,10 +11,10 @@ from datetime import date
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from tactile_bayes.declarations import Meta, Record
+from tactile_bayes.declarations import Meta, Record, replace
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.files.documents import read_toml_record
-from tactile_bayes.files.tables import RawTable, Table, parse_date, read_raw
+from tactile_bayes.files.documents import load_toml, parse_record
+from tactile_bayes.files.tables import RawTable, Table, composed, parse_date, read_raw
 
 _EXCISION = ("patient", "mass", "ex_vivo_mm", "ex_vivo_second_mm", "sd_mm", "date")
 _FACTOR = {"mm": 1.0, "cm": 10.0, "in": 25.4}
@@ -91,7 +91,7 @@ def read_wide(path: Path, mapping_path: Path) -> Table:
     if mapping.reading is None:
         way_out = "add one for each modality, or give a table of readings that is tidy"
         raise BadDataError("has no [[reading]]", way_out=way_out, path=str(mapping_path))
-    raw = read_raw(path)
+    raw = _composed(read_raw(path))
     _check_columns(raw, [*mapping.key_columns(), *_reading_columns(mapping.reading)])
     columns: dict[str, list[Any]] = {}
     line_numbers = []
@@ -113,7 +113,7 @@ def read_wide_excision(path: Path, mapping_path: Path) -> Table:
     if mapping.excision is None:
         way_out = "add it, with size as the column of the sizes"
         raise BadDataError("has no table [excision]", way_out=way_out, path=str(mapping_path))
-    raw = read_raw(path)
+    raw = _composed(read_raw(path))
     excision = mapping.excision
     _check_columns(raw, [*mapping.key_columns(), *excision.names()])
     columns: dict[str, list[Any]] = {name: [] for name in _EXCISION}
@@ -139,7 +139,23 @@ def read_wide_excision(path: Path, mapping_path: Path) -> Table:
 
 def read_mapping(path: Path) -> ColumnMap:
     """Read the mapping; for the errors see `files.documents.read_record`."""
-    return read_toml_record(path, ColumnMap, way_out="see the column mapping in the tutorial")
+    document = load_toml(path, way_out="see the column mapping in the tutorial")
+    return parse_record(_composed_texts(document), ColumnMap, path=path)
+
+
+def _composed_texts(item: Any) -> Any:
+    """What stands in a document, with every text in one spelling."""
+    if isinstance(item, dict):
+        return {composed(key): _composed_texts(value) for key, value in item.items()}
+    if isinstance(item, list):
+        return [_composed_texts(value) for value in item]
+    return composed(item) if isinstance(item, str) else item
+
+
+def _composed(table: RawTable) -> RawTable:
+    """The table with names of its columns and cells in one spelling, so that they are those of the mapping."""
+    rows = [{composed(name): composed(cell) for name, cell in row.items()} for row in table.rows]
+    return replace(table, header=[composed(name) for name in table.header], rows=rows)
 
 
 def _reading_columns(readings: Sequence[ReadingColumns]) -> list[str]:

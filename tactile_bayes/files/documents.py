@@ -113,7 +113,7 @@ def load_toml(path: Path, *, way_out: str) -> dict[str, Any]:
     """Read a TOML file. Too large, too deep or a number that no double holds is an error."""
     try:
         text = read_text(path, most=TOML_BYTES, way_out=way_out)
-        return parse_toml(text.removeprefix("\ufeff"), way_out=way_out)  # the mark that some editors begin a file with
+        return parse_toml(text, way_out=way_out)
     except BadDataError as error:
         raise error.at(path) from None
 

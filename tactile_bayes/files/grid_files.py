@@ -15,7 +15,7 @@ from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.images import read_image
 from tactile_bayes.files.npz import load_npz
-from tactile_bayes.files.reading import TABLE_BYTES, decoding, read_bytes
+from tactile_bayes.files.reading import TABLE_BYTES, decoded, decoding, other_encoding, read_bytes
 from tactile_bayes.geometry import FloatArray
 
 # --- What a file or a caller gives before it is a map.
@@ -39,7 +39,6 @@ class Grid(Record, eq=False):
 # ``.csv``) is such a table: ``KEY value`` lines, ``ASCII_DATA @@``, ``Frame 1``, rows, ``@@``; ``B`` is no sensel.
 
 _WAY_OUT: Final = "give a table of numbers, such as .csv"
-_UTF_16: Final = (b"\xff\xfe", b"\xfe\xff")
 _THOUSANDS: Final = re.compile(r"[+-]?[1-9][0-9]{0,2}(,[0-9]{3})+")
 _MOST_COUNTED: Final = 8
 """A first row or column of so many numbers that counts 0, 1, 2... or 1, 2, 3... holds labels, whatever its corner."""
@@ -51,7 +50,11 @@ _MM: Final = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4, "inch": 25.4, None
 
 def read_table(path: Path, *, no_value: Sequence[str] = ()) -> Grid:
     """Read a table of text, NaN where a field is empty or one of the texts of `no_value`."""
-    text = _text(path)
+    data = read_bytes(path, most=TABLE_BYTES)
+    other = other_encoding(data)
+    if other not in ("", "UTF-16"):
+        raise BadDataError(f"is {other} text", way_out="save it as UTF-8")
+    text = decoded(data, path=path, way_out=_WAY_OUT, encoding=other.lower() or "utf-8-sig")
     rows = _fields(text)
     first, last = _numbers_within(rows, no_value)
     before, after = (_said(part) for part in (rows[:first], rows[last:]))
@@ -76,17 +79,6 @@ def read_table(path: Path, *, no_value: Sequence[str] = ()) -> Grid:
     sides = {side: float(number) * _MM[unit or None] for side, number, unit in _SPACING_LINE.findall(text)}
     spacing = (sides["COL"], sides["ROW"]) if len(sides) == 2 else None
     return Grid({"mean": values}, spacing, None, units[1] if units else "", tuple(notes))
-
-
-def _text(path: Path) -> str:
-    data = read_bytes(path, most=TABLE_BYTES)
-    encoding = "utf-16" if data[:2] in _UTF_16 else "utf-8-sig"
-    try:
-        return data.decode(encoding)
-    except UnicodeDecodeError as error:
-        line = data.count(b"\n", 0, error.start) + 1
-        what = f"line {line}: byte 0x{data[error.start]:02x} is not {encoding[:6].upper().rstrip('-')} text"
-        raise BadDataError(what, way_out=_WAY_OUT) from None
 
 
 def _fields(text: str) -> list[list[str]]:

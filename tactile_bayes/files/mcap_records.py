@@ -98,10 +98,15 @@ _KINDS: Final = {
 
 
 class Messages:
-    """Times of messages in file order, and bodies if `keep`, without a Python object per message."""
+    """Times of messages, and bodies if `keep`, without a Python object per message.
+
+    Where a file has them in another order than that of time, which the MCAP specification allows, they are given by
+    their log times.
+    """
 
     def __init__(self, *, keep: bool = True) -> None:
         self._times = array("Q")
+        self._logged = array("Q")
         self._ends = array("Q")
         self._data = bytearray()
         self.keep = keep
@@ -109,9 +114,10 @@ class Messages:
     def __len__(self) -> int:
         return len(self._times)
 
-    def add(self, time_ns: int, body: memoryview) -> None:
-        """Add one message."""
+    def add(self, time_ns: int, logged_ns: int, body: memoryview) -> None:
+        """Add one message with its publish and log times."""
         self._times.append(time_ns)
+        self._logged.append(logged_ns)
         if self.keep:
             self._data += body
             self._ends.append(len(self._data))
@@ -120,21 +126,32 @@ class Messages:
         """Add all messages of another channel."""
         start = len(self._data)
         self._times += other._times
+        self._logged += other._logged
         self._data += other._data
         self._ends.extend(start + end for end in other._ends)
 
     @property
+    def span_ns(self) -> tuple[int, int]:
+        """First and last log time."""
+        return min(self._logged), max(self._logged)
+
+    @property
     def times_ns(self) -> NDArray[np.uint64]:
-        """Publish times in ns, as the file has them."""
-        return np.array(self._times, dtype=np.uint64)
+        """Publish times in ns."""
+        return np.array(self._times, dtype=np.uint64)[self._order()]
 
     def bodies(self) -> Iterator[bytes]:
         """The messages' bytes, one by one."""
-        start = 0
+        starts = [0, *self._ends[:-1]]
         with memoryview(self._data) as data:
-            for end in self._ends:
-                yield bytes(data[start:end])
-                start = end
+            for i in self._order().tolist() if self._ends else ():
+                yield bytes(data[starts[i] : self._ends[i]])
+
+    def _order(self) -> NDArray[np.intp]:
+        times = np.array(self._times, dtype=np.uint64)
+        if (times[1:] >= times[:-1]).all():
+            return np.arange(len(times))
+        return np.argsort(np.array(self._logged, dtype=np.uint64), kind="stable")
 
 
 @dataclass(slots=True)
@@ -149,7 +166,7 @@ class McapRecords:
     channels: dict[int, Any] = field(default_factory=dict)
     by_channel: dict[int, Messages] = field(default_factory=dict)  #: Messages by channel id.
     chunks: int = 0  #: Chunks met.
-    last_ns: int = 0  #: Host time at which the last intact chunk ends.
+    last_ns: int = 0  #: Host time at which the last intact chunk, or message outside chunks, ends.
     all_data: bool = False  #: Every message was met, whatever follows.
     finished: bool = False  #: The file was closed properly.
     damaged: bool = False  #: A checksum failed or a record made no sense before the end.
@@ -163,13 +180,14 @@ class McapRecords:
         for number, channel in self.channels.items():
             if channel.topic != topic or (name is not None and channel.metadata.get("name") != name):
                 continue
-            kind = self.schemas.get(channel.schema_id, "no schema")
+            kind = self.schemas.get(channel.schema_id, "messages without a schema")
             if kind != schema:
-                raise BadDataError(f"{topic} holds {kind}", way_out=f"it must hold {schema}")
-            held = self.by_channel.get(number)
-            if held is not None and not len(found):
+                raise BadDataError(f"{topic} holds {kind}", way_out=f"its channel must have the schema {schema}")
+            held = self.by_channel.get(number, Messages())
+            if not len(found):
                 found = held
-            elif held is not None:
+            elif len(held):
+                _refuse_overlap(topic, found.span_ns, held.span_ns, named=name is not None)
                 found.extend(held)
         return found
 
@@ -188,6 +206,13 @@ class McapRecords:
             keep = self.keep is None or channel is None or channel.topic in self.keep
             found = self.by_channel[number] = Messages(keep=keep)
         return found
+
+
+def _refuse_overlap(topic: str, one: tuple[int, int], other: tuple[int, int], *, named: bool) -> None:
+    """Refuse two channels of one topic at the same time: one after the other are one recording."""
+    if not named and one[0] <= other[1] and other[0] <= one[1]:
+        what = f"{topic} has messages on two channels at the same time, as of two heads or two trackers"
+        raise BadDataError(what, way_out="keep one of the channels, or one topic for each")
 
 
 def read_records(path: Path, *, keep: Collection[str] | None = None) -> McapRecords:
@@ -243,7 +268,9 @@ def _collect(records: McapRecords, stream: IO[bytes], *, size: int) -> None:
             return
         if not records.all_data:
             checksum = zlib.crc32(body, zlib.crc32(head, checksum))
-        if opcode in _KINDS:
+        if opcode == Opcode.MESSAGE:
+            _take_message(records, body, start=start)
+        elif opcode in _KINDS:
             _take(records, opcode, body, start=start, unpacker=unpacker)
 
 
@@ -287,6 +314,18 @@ def _take(records: McapRecords, opcode: int, body: bytes, *, start: int, unpacke
         _describe(records, record)
 
 
+def _take_message(records: McapRecords, body: bytes, *, start: int) -> None:
+    """Keep a message that is in no chunk, as writers leave it that do not index their files."""
+    if len(body) < _MESSAGE.size:
+        records.damaged = True
+        records.lost.append(f"the record at byte {start} makes no sense (a message is shorter than its head)")
+        return
+    channel, _, logged_ns, publish_ns = _MESSAGE.unpack_from(body)
+    records.last_ns = max(records.last_ns, logged_ns)
+    with memoryview(body) as view:
+        records.channel_messages(channel).add(publish_ns, logged_ns, view[_MESSAGE.size :])
+
+
 def _describe(records: McapRecords, record: Any) -> None:
     match record:
         case Metadata():
@@ -315,12 +354,12 @@ def _take_chunk(records: McapRecords, chunk: Any, unpacker: Unpacker) -> None:
     for record in descriptions:
         _describe(records, record)
     with memoryview(data) as view:
-        for channel, time_ns, start, end in spans:
-            records.channel_messages(channel).add(time_ns, view[start:end])
+        for channel, time_ns, logged_ns, start, end in spans:
+            records.channel_messages(channel).add(time_ns, logged_ns, view[start:end])
 
 
-def _split(data: bytes, unpacker: Unpacker) -> tuple[list[Any], list[tuple[int, int, int, int]]]:
-    """Schemas and channels of a chunk, and the places of its messages: channel, publish time, start, end."""
+def _split(data: bytes, unpacker: Unpacker) -> tuple[list[Any], list[tuple[int, int, int, int, int]]]:
+    """Schemas and channels of a chunk, and its messages: channel, publish and log time, start, end."""
     descriptions, spans = [], []
     offset = 0
     while offset < len(data):
@@ -332,8 +371,8 @@ def _split(data: bytes, unpacker: Unpacker) -> tuple[list[Any], list[tuple[int, 
         if opcode == Opcode.MESSAGE:
             if size < _MESSAGE.size:
                 raise ValueError("a message is shorter than its head")
-            channel, _, _, publish_ns = _MESSAGE.unpack_from(data, start)
-            spans.append((channel, publish_ns, start + _MESSAGE.size, offset))
+            channel, _, logged_ns, publish_ns = _MESSAGE.unpack_from(data, start)
+            spans.append((channel, publish_ns, logged_ns, start + _MESSAGE.size, offset))
         elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
             unpacker.count(_DESCRIPTION_BYTES)
             descriptions.append(_KINDS[Opcode(opcode)].read(ReadDataStream(io.BytesIO(data[start:offset]))))

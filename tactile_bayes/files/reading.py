@@ -28,7 +28,8 @@ TABLE_BYTES: Final = 32 * 10**6
 IMAGE_BYTES: Final = 128 * 10**6
 NETCDF_BYTES: Final = 256 * 10**6
 CELLS: Final = 2**24
-UTF_16: Final = (b"\xff\xfe", b"\xfe\xff")  #: Marks that text of this encoding begins with.
+_UTF_32: Final = (b"\xff\xfe\x00\x00", b"\x00\x00\xfe\xff")
+_UTF_16: Final = (b"\xff\xfe", b"\xfe\xff")
 _UNPACKED_BYTES: Final = 64 * 10**6
 _UNPACKED_TIMES: Final = 32
 
@@ -72,20 +73,33 @@ def read_bytes(path: Path, *, most: int) -> bytes:
 
 
 def read_text(path: Path, *, most: int, way_out: str) -> str:
-    """A file's UTF-8 text; see `read_bytes` for limits and errors."""
+    """A file's UTF-8 text; see `read_bytes` for limits and errors, and `decoded`."""
     data = read_bytes(path, most=most)
-    if data[:2] in UTF_16:
-        raise BadDataError("is UTF-16 text", way_out="save it as UTF-8", path=str(path))
+    if other := other_encoding(data):
+        raise BadDataError(f"is {other} text", way_out="save it as UTF-8", path=str(path))
     return decoded(data, path=path, way_out=way_out)
 
 
-def decoded(data: bytes, *, path: Path, way_out: str, encoding: str = "utf-8") -> str:
-    """Text of bytes in UTF-8; other bytes are named with their line."""
+def other_encoding(data: bytes) -> str:
+    """Encoding of text that is not UTF-8, by its mark or, in UTF-16 without one, by the zeros in it; else empty."""
+    if data.startswith(_UTF_32):
+        return "UTF-32"
+    if data.startswith(_UTF_16):
+        return "UTF-16"
+    start = data[:64]
+    half = len(start) // 2
+    zeros = max(start[0::2].count(0), start[1::2].count(0))
+    return "UTF-16 (without a byte order mark)" if half and zeros > half / 2 and start.count(0) == zeros else ""
+
+
+def decoded(data: bytes, *, path: Path, way_out: str, encoding: str = "utf-8-sig") -> str:
+    """Text of bytes in UTF-8, with or without a byte order mark; other bytes are named with their line."""
     try:
         return data.decode(encoding)
     except UnicodeDecodeError as error:
         line = data.count(b"\n", 0, error.start) + 1
-        what = f"line {line}: byte 0x{data[error.start]:02x} is not UTF-8 text"
+        name = "UTF-8" if encoding == "utf-8-sig" else encoding.upper()
+        what = f"line {line}: byte 0x{data[error.start]:02x} is not {name} text"
         raise BadDataError(what, way_out=way_out, path=str(path)) from None
 
 
@@ -155,6 +169,9 @@ _BEGINNINGS = {
     b"MM\x00*": "an image",
     b"P5": "an image",
     b"%PDF": "a PDF",
+    b"CDF\x01": "a netCDF-3 file",
+    b"CDF\x02": "a netCDF-3 file",
+    b"CDF\x05": "a netCDF-3 file",
 }
 _SCHEMA = re.compile(rb'"schema"\s*:\s*"tactile-bayes/([a-z0-9-]+)/')
 _DOCUMENTS = {
@@ -174,6 +191,10 @@ _WAYS = {
         "a map or posterior (netCDF)",
     ): "bring it in first: `tactile-bayes import --help` says how",
     ("an image", "a map or posterior (netCDF)"): "bring it in first: `tactile-bayes import {path} --as map -o MAP.nc`",
+    (
+        "a netCDF-3 file",
+        "a map or posterior (netCDF)",
+    ): "convert it to netCDF-4, for example `nccopy -k nc4 {path} NEW.nc`",
     ("a map or posterior (netCDF)", "a scan"): "give the scan that the map was built from",
 }
 _LOOKED_AT = 4096

@@ -303,7 +303,8 @@ def _assemble(records: McapRecords, *, path: Path) -> ScanFile:
     check_session(session, path=path)
     frames = _frames(records, head)
     if not len(frames) and not records.finished:
-        raise BadDataError("was cut off before its first complete chunk", way_out="nothing can be kept; scan again")
+        way_out = "copy it again from where it was recorded: this copy holds no frame"
+        raise BadDataError("was cut off before its first complete frame", way_out=way_out)
     scan = Scan(
         frames,
         _poses(records),

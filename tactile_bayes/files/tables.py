@@ -8,6 +8,7 @@ import io
 import math
 import operator
 import re
+import unicodedata
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from datetime import date
 from pathlib import Path
@@ -16,7 +17,7 @@ from typing import Any, Final
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.documents import load_schema
-from tactile_bayes.files.reading import TABLE_BYTES, ZIP_MAGIC, decoded, read_bytes
+from tactile_bayes.files.reading import TABLE_BYTES, ZIP_MAGIC, decoded, other_encoding, read_bytes
 
 # --- Cells of a CSV file as text: its encoding, its separator, its quotes, and the decimal commas of spreadsheets.
 #
@@ -25,11 +26,9 @@ from tactile_bayes.files.reading import TABLE_BYTES, ZIP_MAGIC, decoded, read_by
 
 DECIMAL_COMMA: Final = re.compile(r"[+-]?[0-9]+,[0-9]+")
 _QUOTED: Final = re.compile(r'"[^"]*"')
-_BYTE_ORDER_MARKS: Final = (b"\xff\xfe", b"\xfe\xff")
 _AS_UTF8: Final = "save it as CSV UTF-8"
 _EXPORT: Final = "export the sheet as CSV UTF-8"
 _NOT_TEXT: Final = (
-    (_BYTE_ORDER_MARKS, "is UTF-16 text", _AS_UTF8),
     ((ZIP_MAGIC,), "is a spreadsheet or another zip archive (xlsx, ods), not CSV", _EXPORT),
     ((b"\xd0\xcf\x11\xe0",), "is an old Office file (xls), not CSV", _EXPORT),
     ((b"\x1f\x8b",), "is compressed with gzip", "decompress it first"),
@@ -52,7 +51,9 @@ def read_text(path: Path) -> str:
     for marks, what, way_out in _NOT_TEXT:
         if data.startswith(marks):
             raise BadDataError(what, way_out=way_out, path=str(path))
-    return decoded(data, path=path, way_out=_AS_UTF8, encoding="utf-8-sig")
+    if other := other_encoding(data):
+        raise BadDataError(f"is {other} text", way_out=_AS_UTF8, path=str(path))
+    return decoded(data, path=path, way_out=_AS_UTF8)
 
 
 def cells_of(path: Path, text: str) -> Cells:
@@ -78,6 +79,11 @@ def separator_in(text: str) -> str:
         return 0 < count == second.count(separator), count
 
     return max(",;\t", key=trust)
+
+
+def composed(text: str) -> str:
+    """A name or code in one spelling (NFC): programs write an accented letter as one character or as two."""
+    return unicodedata.normalize("NFC", text)
 
 
 def may_be_thousands(number: str) -> bool:
@@ -177,14 +183,16 @@ def read_table(source: Path | Sheet, schema_name: str) -> Table:
     if not body:
         raise BadDataError("holds a header and no rows", way_out="add at least one row", path=str(path))
     columns: dict[str, list[Any]] = {name: [] for name in fields}
+    keys = schema.get("primaryKey", [])
     for line, cells in body:
         _check_length(path, line, cells, header)
         row = dict(zip(header, cells, strict=True))
+        row |= {name: composed(row.get(name, "")) for name in keys}
         for name, field in fields.items():
             cell = row.get(name, "")
             columns[name].append(_parse_cell(path, line, cell, field=field, decimal_comma=cells_in.decimal_comma))
     table = Table(path=path, columns=columns, line_numbers=[line for line, _ in body])
-    _check_primary_key(table, schema.get("primaryKey", []))
+    _check_primary_key(table, keys)
     return table
 
 

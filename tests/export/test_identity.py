@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 from pathlib import Path
 
 import pytest
@@ -143,3 +144,54 @@ def test_a_broken_file_is_one_line(data: bytes, tmp_path: Path) -> None:
     with pytest.raises(BadDataError, match=r"item\.dcm") as caught:
         read_worklist(path)
     assert len(str(caught.value).splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("declared", "written", "name"),
+    [
+        ("ISO_IR 192", "Müller".encode(), "Müller"),
+        ("ISO_IR 100", "Müller".encode("latin-1"), "Müller"),
+        ("ISO_IR 144", "Иван".encode("iso8859-5"), "Иван"),
+        ("", b"Muller", "Muller"),
+        ("", "Müller".encode(), "PatientName holds the byte 0xc3, and the item declares no character set"),
+        ("", "Müller".encode("latin-1"), "PatientName holds the byte 0xfc, and the item declares no character set"),
+        ("", "Иван".encode("iso8859-5"), "declares no character set; declare SpecificCharacterSet"),
+        ("ISO_IR 999", "Müller".encode("latin-1"), "the character set 'ISO_IR 999', which is none"),
+        ("ISO_IR 192", "Müller".encode("latin-1"), "a letter was lost on its way"),
+    ],
+)
+def test_a_name_is_of_the_declared_character_set_or_refused(
+    declared: str, written: bytes, name: str, tmp_path: Path
+) -> None:
+    """Bytes of an undeclared set were read as Latin-1, and another name was exported."""
+    pydicom = pytest.importorskip("pydicom")
+    one = pydicom.Dataset()
+    if declared:
+        one.SpecificCharacterSet = declared
+    one.PatientID, one.PatientName = "W-1", "XXXXXXXX"
+    one.file_meta = pydicom.dataset.FileMetaDataset()
+    one.file_meta.TransferSyntaxUID = "1.2.840.10008.1.2.1"
+    one.file_meta.MediaStorageSOPClassUID = "1.2.840.10008.5.1.4.31"
+    one.file_meta.MediaStorageSOPInstanceUID = "1.2.3"
+    path = tmp_path / "item.dcm"
+    with warnings.catch_warnings(action="ignore"):
+        one.save_as(path, enforce_file_format=True)
+    path.write_bytes(path.read_bytes().replace(b"XXXXXXXX", written.ljust(8)))
+    if " " not in name:
+        assert read_worklist(path).patient_name == name
+        return
+    with pytest.raises(BadDataError, match=name):
+        read_worklist(path)
+
+
+def test_json_of_a_worklist_is_utf_8_or_named(tmp_path: Path) -> None:
+    path = tmp_path / "item.json"
+    text = json.dumps({"patient_id": "W-1", "patient_name": "Müller"}, ensure_ascii=False)
+    path.write_bytes(b"\xef\xbb\xbf" + text.encode())
+    assert read_worklist(path).patient_name == "Müller"
+    path.write_bytes(text.encode("utf-16"))
+    with pytest.raises(BadDataError, match="is UTF-16 text; save it as UTF-8"):
+        read_worklist(path)
+    path.write_text(text.replace("ü", "\ufffd"))
+    with pytest.raises(BadDataError, match=r"a letter was lost on its way \(U\+FFFD\)"):
+        read_worklist(path)
