@@ -508,6 +508,9 @@ class LearnOptions(Options, kw_only=True):
     seed: Seed = 1
 
 
+Aim = Literal["power", "precision"]
+
+
 class PlanErrors(Options):
     """Errors of ln size that a plan assumes; an SD of 0.15 is about 15 %."""
 
@@ -521,6 +524,31 @@ class PlanErrors(Options):
     other_miss: Annotated[
         float, Meta(ge=0, le=1, description="Share of masses that the modality compared with misses.")
     ] = 0.04
+
+
+class PlanAims(Options):
+    """What the number of patients of a trial is to reach, instead of a number that is given."""
+
+    power: Annotated[
+        Annotated[float, Meta(ge=0.5, le=0.99)] | None,
+        Meta(
+            description="Find the number of patients that reaches this power, such as 0.9.", extra={"metavar": "SHARE"}
+        ),
+    ] = None
+    precision: Annotated[
+        Annotated[float, Meta(ge=1.05, le=10)] | None,
+        Meta(
+            description="Find the number of patients whose interval of the tactile error spans this factor from end to "
+            "end, such as 2.",
+            extra={"metavar": "FACTOR"},
+        ),
+    ] = None
+
+    @property
+    def wanted(self) -> dict[Aim, float]:
+        """What was given."""
+        each: dict[Aim, float | None] = {"power": self.power, "precision": self.precision}
+        return {aim: target for aim, target in each.items() if target is not None}
 
 
 def _text(longest: int, metavar: str, meaning: str) -> Meta:

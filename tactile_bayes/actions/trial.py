@@ -22,7 +22,7 @@ from tactile_bayes.files.documents import dump_json, read_protocol
 from tactile_bayes.files.manifest_csv import add_rows, read_manifest, read_rows, write_manifest
 from tactile_bayes.files.reading import check_address
 from tactile_bayes.files.size_json import NONE
-from tactile_bayes.options import TrialSettings
+from tactile_bayes.options import PlanAims, TrialSettings
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.shell import progress_bar
 
@@ -78,6 +78,8 @@ def _settings(given: dict[str, Any], protocol: Path | None) -> tuple[str | None,
 def plan_action(
     patients: tuple[int, ...],
     maps: tuple[int, ...],
+    power: float | None,
+    precision: float | None,
     pilot: Path | None,
     excision: Path | None,
     against: str,
@@ -86,11 +88,12 @@ def plan_action(
     workers: int,
     as_json: bool,
     output: Path | None,
+    figure: Path | None,
     force: bool,
     **errors: float,
 ) -> None:
     """Plan a trial: power, widths of intervals and the worth of more maps, by simulation."""
-    refuse_existing(output, force=force)
+    refuse_existing(output, figure, force=force)
     typed = typed_options()
     compared = against if "against" in typed else None
     read = read_pilot(pilot, excision, compared)
@@ -99,12 +102,24 @@ def plan_action(
         for doubt in read.doubts():
             click.echo(f"{pilot}: {doubt}", err=True)
     given = {name: value for name, value in errors.items() if name in typed}
-    numbers = {"trials": trials, "seed": seed, "workers": workers}
     with progress_bar("designs") as progress:
-        found = planned(patients, maps, given, pilot=read, against=compared, progress=progress, **numbers)
+        found = planned(
+            patients if "patients" in typed else None,
+            maps if "maps" in typed else None,
+            given,
+            aims=PlanAims(power, precision),
+            pilot=read,
+            against=compared,
+            trials=trials,
+            seed=seed,
+            workers=workers,
+            progress=progress,
+        )
     try:
         if output:
             found.write_json(output, force=force)
+        if figure:
+            found.draw(figure, force=force)
     finally:  # what was computed is not lost with the file
         click.echo(dump_json(found.document) if as_json else found.text, nl=False)
 

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+import itertools
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor
+from functools import partial
 from html import escape
 from operator import attrgetter
 from pathlib import Path
@@ -20,17 +23,35 @@ from tactile_bayes.files.atomic import write_text
 from tactile_bayes.files.documents import dump_json
 from tactile_bayes.files.provenance import Provenance, hash_inputs
 from tactile_bayes.files.tables import Sheet
-from tactile_bayes.options import PlanErrors
+from tactile_bayes.options import Aim, PlanAims, PlanErrors
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.progress import Progress, untold
 from tactile_bayes.report.trial import plan_text
-from tactile_bayes.trial.planning import ErrorSource, PlanReport, assumptions_from, designs, map_gains, run_case
+from tactile_bayes.report.trial_html import plan_figure
+from tactile_bayes.trial.figures import MIN_PATIENTS, UndefinedError
+from tactile_bayes.trial.planning import (
+    MOST_PATIENTS,
+    ROUNDS,
+    Design,
+    ErrorSource,
+    Needed,
+    PlanCase,
+    PlanReport,
+    assumptions_from,
+    designs,
+    first_guess,
+    map_gains,
+    patients_needed,
+    run_case,
+    sizes_about,
+)
 from tactile_bayes.trial.readings import Trial, unit_doubts
 
 if TYPE_CHECKING:
     import pandas
 
 PATIENTS, MAPS, TRIALS, SEED = (16, 24, 32, 48), (1, 3, 5), 1000, 1999  #: Defaults of a plan.
+MAPS_OF_AIMS = 3  #: Maps of a mass where the number of patients is asked for, by default.
 _AGAINST = "ultrasound"
 _ERRORS = names_of(PlanErrors)
 
@@ -55,6 +76,10 @@ class TrialPlan(Record, eq=False):
     def write_json(self, path: Path, *, force: bool = False) -> None:
         """Write what ``plan -o`` writes."""
         write_text(path, dump_json(self.document), force=force)
+
+    def draw(self, path: Path, *, force: bool = False) -> None:
+        """Draw what ``plan --figure`` draws."""
+        plan_figure(self.report, path, force=force)
 
     def __repr__(self) -> str:
         first, last = self.report.designs[0], self.report.designs[-1]
@@ -116,8 +141,10 @@ def read_pilot(pilot: Path | Sheet | None, excision: Path | Sheet | None, agains
 @door
 def plan(
     *,
-    patients: Sequence[int] = PATIENTS,
-    maps: Sequence[int] = MAPS,
+    patients: Sequence[int] | None = None,
+    maps: Sequence[int] | None = None,
+    power: float | None = None,
+    precision: float | None = None,
     pilot: PathLike | pandas.DataFrame | None = None,
     excision: PathLike | pandas.DataFrame | None = None,
     against: str | None = None,
@@ -132,7 +159,11 @@ def plan(
     Parameters
     ----------
     patients, maps
-        Numbers of patients, one mass each, and of tactile maps per mass; every pair is a design.
+        Numbers of patients, one mass each, and of tactile maps per mass; every pair is a design. By default 16, 24, 32
+        and 48 patients with 1, 3 and 5 maps.
+    power, precision
+        Instead of `patients`: a power to reach, or a factor from the lower to the upper end of the tactile error's
+        interval. `report.needed` says how many patients do, with 3 maps by default.
     pilot, excision
         Tables of an earlier trial, files or DataFrames: the errors that no keyword gives are taken from it.
     against
@@ -160,8 +191,8 @@ def plan(
     24
     """
     check_keywords("plan", errors, _ERRORS)
-    for name, numbers, least, most in (("patients", patients, 8, 10_000), ("maps", maps, 1, 1000)):
-        for one in sequence_of(name, numbers, "whole numbers"):
+    for name, numbers, least, most in (("patients", patients, 8, MOST_PATIENTS), ("maps", maps, 1, 1000)):
+        for one in () if numbers is None else sequence_of(name, numbers, "whole numbers"):
             check_number(name, one, least, most, whole=True)
     check_number("trials", trials, 50, whole=True)
     check_number("seed", seed, 0, whole=True)
@@ -170,6 +201,7 @@ def plan(
         patients,
         maps,
         {name: plain(value) for name, value in errors.items()},
+        aims=PlanAims(power, precision),
         pilot=found,
         against=against,
         trials=trials,
@@ -184,10 +216,11 @@ def _table(given: PathLike | pandas.DataFrame | None, name: str) -> Path | Sheet
 
 
 def planned(
-    patients: Sequence[int],
-    maps: Sequence[int],
+    patients: Sequence[int] | None,
+    maps: Sequence[int] | None,
     given: Mapping[str, float],
     *,
+    aims: PlanAims,
     pilot: Pilot | None,
     against: str | None,
     trials: int,
@@ -196,27 +229,70 @@ def planned(
     progress: Progress,
 ) -> TrialPlan:
     """Plan with the errors that are given, those of the pilot, and the defaults, in this order."""
+    wanted = aims.wanted
+    if wanted and patients is not None:
+        raise UsageError("--power and --precision find the number of patients; leave out --patients")
     by_default = as_dict(PlanErrors(**given))
     errors = by_default if pilot is None else pilot.errors(against or _AGAINST, given)
     rest: ErrorSource = "default" if pilot is None else "pilot"
-    cases = list(designs(sorted(set(patients)), sorted(set(maps)), **errors, trials=trials, seed=seed))
+    assumptions = {**errors, "trials": trials, "seed": seed}
+    each_maps = sorted(set(maps or ((MAPS_OF_AIMS,) if wanted else MAPS)))
     with open_executor(workers=workers) as executor:
-        outcomes = run_batch(run_case, cases, key=attrgetter("key"), executor=executor, progress=progress)
-    for outcome in outcomes:
-        if outcome.value is None:
-            raise BadDataError(f"{outcome.key}: {outcome.error}", way_out="change the errors assumed")
-    found = tuple(outcome.value for outcome in outcomes if outcome.value is not None)
+        run = partial(_simulated, executor=executor, progress=progress)
+        if wanted:
+            found, needed = _needed(each_maps, wanted, assumptions, run)
+        else:
+            found, needed = run(list(designs(sorted(set(patients or PATIENTS)), each_maps, **assumptions))), ()
     assumed = {name: float(f"{errors[name]:.9g}") for name in _ERRORS}
     sources: dict[str, ErrorSource] = {name: "option" if name in given else rest for name in _ERRORS}
     inputs = hash_inputs(**({} if pilot is None else pilot.files))
-    settings = {"trials": trials, "errors": assumed, "errors_from": sources}
+    settings: dict[str, Any] = {"trials": trials, "errors": assumed, "errors_from": sources}
+    settings |= {str(aim): target for aim, target in wanted.items()}
     report = PlanReport(
         schema="tactile-bayes/plan/1",
         errors=assumed,
         errors_from=sources,
         designs=found,
-        gains=map_gains(found),
+        gains=() if wanted else map_gains(found),
+        needed=needed,
         provenance=Provenance("plan", settings, inputs, seed=seed).as_dict(),
         research_use=RESEARCH_USE,
     )
     return TrialPlan(report, () if pilot is None else tuple(pilot.doubts()))
+
+
+def _simulated(cases: Sequence[PlanCase], *, executor: Executor, progress: Progress) -> tuple[Design, ...]:
+    outcomes = run_batch(run_case, cases, key=attrgetter("key"), executor=executor, progress=progress)
+    for outcome in outcomes:
+        if outcome.value is None:
+            raise BadDataError(f"{outcome.key}: {outcome.error}", way_out="change the errors assumed")
+    return tuple(outcome.value for outcome in outcomes if outcome.value is not None)
+
+
+def _needed(
+    maps: Sequence[int],
+    aims: Mapping[Aim, float],
+    assumptions: Mapping[str, Any],
+    run: Callable[[Sequence[PlanCase]], tuple[Design, ...]],
+) -> tuple[tuple[Design, ...], tuple[Needed, ...]]:
+    """Designs about the numbers of patients that reach the aims, and these numbers."""
+    found: dict[tuple[int, int], Design] = {}
+    needed = []
+    for number, (aim, target) in itertools.product(maps, aims.items()):
+        try:
+            guess = first_guess(PlanCase(patients=MIN_PATIENTS, maps=number, **assumptions), aim, target)
+        except UndefinedError as undefined:
+            raise BadDataError(str(undefined), way_out="change the errors assumed") from None
+        for _ in range(ROUNDS):
+            about = sizes_about(guess)
+            cases = [one for one in designs(about, [number], **assumptions) if (number, one.patients) not in found]
+            found |= {(number, one.patients): one for one in run(cases)}
+            answer = patients_needed([found[number, one] for one in about], aim, target, trials=assumptions["trials"])
+            if answer is None or about[0] <= answer.patients <= about[-1] or answer.patients == guess:
+                break
+            guess = answer.patients
+        if answer is None or answer.patients >= MOST_PATIENTS:
+            what = f"{MOST_PATIENTS} patients do not reach {aim} {target:g} (maps of each mass: {number})"
+            raise BadDataError(what, way_out="ask for less, or change the errors assumed")
+        needed.append(answer)
+    return tuple(found[key] for key in sorted(found)), tuple(needed)

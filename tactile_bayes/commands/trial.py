@@ -10,15 +10,17 @@ from tactile_bayes.api.settings import Settings
 from tactile_bayes.commands.options import (
     FORCE,
     JSON,
+    METAVAR,
     WORKERS,
     CommandGroup,
+    FigurePath,
     FilePath,
     FiniteRange,
     scheduler_option,
     takes,
 )
 from tactile_bayes.declarations import names_of
-from tactile_bayes.options import MOST_ITEMS, MapOptions, PlanErrors, TrialSettings
+from tactile_bayes.options import MOST_ITEMS, MapOptions, PlanAims, PlanErrors, TrialSettings
 
 # --- `validate`: compare each modality with excision.
 
@@ -88,8 +90,9 @@ def validate_command(**given: Any) -> None:
     multiple=True,
     default=(1, 3, 5),
     show_default=True,
-    help="Number of tactile maps per mass.",
+    help="Number of tactile maps per mass; 3 with --power or --precision.",
 )
+@takes(PlanAims, *names_of(PlanAims))
 @takes(PlanErrors, *names_of(PlanErrors))
 @click.option(
     "--pilot",
@@ -112,14 +115,16 @@ def validate_command(**given: Any) -> None:
 @click.option(
     "-o", "--output", metavar="PLAN.json", type=FilePath(writes="JSON"), help="Write the plan as JSON to this file."
 )
+@click.option("--figure", metavar=METAVAR, type=FigurePath(), help="Draw power against the number of patients.")
 @FORCE
 def plan_command(**given: Any) -> None:
-    """Plan a trial: power, widths of intervals and the worth of more maps, by simulation.
+    """Plan a trial: how many patients, how many maps of a mass, by simulation.
 
-    Each design is simulated with log-normal errors. Power is the share of trials in which the tactile percent error is
-    the smaller one and a sign-flip test by patient finds p < 0.05. SDs are of ln size: 0.15 is about 15 %.
+    With --power or --precision the answer is a number of patients, by simulated designs about it. Each design is
+    simulated with log-normal errors. Power is the share of trials in which the tactile percent error is the smaller one
+    and a sign-flip test by patient finds p < 0.05. SDs are of ln size: 0.15 is about 15 %.
 
-    Example: tactile-bayes plan --patients 24 --patients 40 --maps 3 --maps 5 -o plan.json
+    Example: tactile-bayes plan --power 0.9 --maps 3 --figure plan.png
     """
     from tactile_bayes.actions.trial import plan_action
 

@@ -9,9 +9,9 @@ from typing import Final
 
 from tactile_bayes.declarations import UNSET, Record, replace
 from tactile_bayes.trial.accuracy import REFERENCE, ModalityRatio, PairedComparison, least_p
-from tactile_bayes.trial.figures import Ends, Figure
+from tactile_bayes.trial.figures import MIN_PATIENTS, Ends, Figure
 from tactile_bayes.trial.method_comparison import Unit
-from tactile_bayes.trial.planning import Design, IntervalCheck, PlanReport
+from tactile_bayes.trial.planning import Design, IntervalCheck, Needed, PlanReport
 from tactile_bayes.trial.summary import Counts, ModalityReport, TrialReport
 
 DIGITS: Final = 12  #: Of the numbers of `validate`'s file, so that the order of summation changes no byte.
@@ -22,22 +22,34 @@ DIGITS: Final = 12  #: Of the numbers of `validate`'s file, so that the order of
 def plan_text(plan: PlanReport) -> str:
     """Full text of a plan, ending with the research-use line."""
     lines = [
+        *map(needed_sentence, plan.needed),
         f"Assumed errors of ln size: {_errors(plan, plan.errors)}",
         *_origins(plan),
         "",
-        "patients  maps  power                tactile MAPE %  other MAPE %  tactile interval  ratio interval",
+        "                                     mean error, %     interval, factor",
+        "patients  maps  power                 tactile  other   tactile   ratio",
         *(_design_line(one) for one in plan.designs),
         "",
         *(
             f"{one.patients} patients, from {one.from_maps} to {one.to_maps} maps: power {one.power_gain:+.3f}, "
-            f"tactile MAPE {one.tactile_percent_change:+.1f} points"
+            f"tactile error {one.tactile_percent_change:+.1f} points"
             for one in plan.gains
         ),
-        "power: tactile error smaller and p < 0.05, in brackets the simulation's own 95 % interval.",
-        "intervals: median factor from lower to upper end.",
+        "Power: tactile error smaller and p < 0.05, in brackets the simulation's own 95 % interval.",
+        "Intervals of the tactile error and of the ratio of errors: median factor from lower to upper end.",
         plan.research_use,
     ]
     return "\n".join(lines) + "\n"
+
+
+def needed_sentence(one: Needed) -> str:
+    """How many patients reach what was asked for."""
+    aim = "power" if one.aim == "power" else "an interval of the tactile error of factor"
+    maps = f"{one.maps} map{'s' if one.maps > 1 else ''} of each mass"
+    ends = one.patients_interval
+    told = "" if ends is None else f" (by the simulation's own error {ends[0]:.0f} to {ends[1]:.0f})"
+    least = " (the least that a plan may have)" if one.patients == MIN_PATIENTS else told
+    return f"{one.patients} patients with {maps} reach {aim} {one.target:g}{least}."
 
 
 def _errors(plan: PlanReport, names: Iterable[str]) -> str:
@@ -55,8 +67,8 @@ def _design_line(one: Design) -> str:
     power = f"{one.power:.3f} [{one.power_interval[0]:.3f}, {one.power_interval[1]:.3f}]"
     widths = [f"x {width:.2f}" if width else "-" for width in (one.tactile_width_ratio, one.ratio_width_ratio)]
     return (
-        f"{one.patients:>8}  {one.maps:>4}  {power:<19}  {one.tactile_percent:>14.1f}  "
-        f"{one.other_percent:>12.1f}  {widths[0]:>16}  {widths[1]:>14}"
+        f"{one.patients:>8}  {one.maps:>4}  {power:<20}  {one.tactile_percent:>7.1f}  {one.other_percent:>5.1f}  "
+        f"{widths[0]:>8}  {widths[1]:>6}"
     )
 
 

@@ -7,14 +7,17 @@ import io
 import itertools
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import cycle
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from scipy.special import ndtr
 
 from tactile_bayes.declarations import UNSET
+from tactile_bayes.options import Aim
 from tactile_bayes.report.compare import Growth
-from tactile_bayes.report.figure_file import FORMATS, plain_matplotlib
+from tactile_bayes.report.figure_file import FORMATS, figure_file, plain_matplotlib
 from tactile_bayes.report.pages import page
 from tactile_bayes.report.trial import (
     SPELLED,
@@ -30,7 +33,7 @@ from tactile_bayes.trial.calibration import BINS, Calibration, Prediction
 from tactile_bayes.trial.figures import Ends, Figures
 from tactile_bayes.trial.method_comparison import MethodComparison
 from tactile_bayes.trial.next_mass import NextMass
-from tactile_bayes.trial.planning import IntervalCheck
+from tactile_bayes.trial.planning import IntervalCheck, PlanReport
 from tactile_bayes.trial.readings import FloatArray, ModalitySizes, Trial, mass_numbers
 from tactile_bayes.trial.summary import ModalityReport, TrialReport, prediction_of
 
@@ -41,8 +44,9 @@ if TYPE_CHECKING:
 # --- Figures of a trial as SVG, equal for equal input: sizes, differences, integral transforms, coverage.
 
 _DOTS, _LINE, _SECOND, _GREY = "#1f3b73", "#c8641e", "#2a7f62", "0.45"
+_COLOURS = (_DOTS, _LINE, _SECOND)
 _PANEL_IN = 4.1
-Corner = Literal["upper left", "lower right"]
+Corner = Literal["upper left", "lower right", "upper right"]
 
 
 def sizes_figure(report: TrialReport, trial: Trial) -> bytes:
@@ -190,6 +194,38 @@ def _label(axes: Axes, title: str, across: str, up: str, *, legend: bool = True,
     axes.spines[["top", "right"]].set_visible(False)
     if legend:
         axes.legend(fontsize=7.5, loc=where, framealpha=0.85)
+
+
+# --- Figure of a plan: power against the number of patients, or the width of the interval.
+
+
+def plan_figure(plan: PlanReport, path: Path, *, force: bool = False) -> None:
+    """Draw the designs of a plan by their number of maps, and what reaches what was asked for."""
+    aims: list[Aim] = list(dict.fromkeys(one.aim for one in plan.needed)) or ["power"]
+    with figure_file(path, size_in=(_PANEL_IN * 1.4 * len(aims), _PANEL_IN), force=force) as figure:
+        for aim, axes in zip(aims, np.atleast_1d(np.asarray(figure.subplots(1, len(aims)))).tolist(), strict=True):
+            _draw_plan(axes, plan, aim)
+
+
+def _draw_plan(axes: Axes, plan: PlanReport, aim: Aim) -> None:
+    for maps, mark, colour in zip(sorted({one.maps for one in plan.designs}), cycle("os^Dv"), cycle(_COLOURS)):
+        found = [one for one in plan.designs if one.maps == maps]
+        at, label = [one.patients for one in found], f"{maps} map{'s' if maps > 1 else ''} of each mass"
+        if aim == "power":
+            level = np.array([one.power for one in found])
+            ends = np.array([one.power_interval for one in found])
+            reach = np.abs(ends - level[:, None]).T
+            axes.errorbar(at, level, yerr=reach, marker=mark, color=colour, markersize=4, capsize=2, label=label)
+        else:
+            widths = [one.tactile_width_ratio or np.nan for one in found]
+            axes.plot(at, widths, marker=mark, color=colour, markersize=4, label=label)
+    for one in (one for one in plan.needed if one.aim == aim):
+        axes.axhline(one.target, color=_GREY, linestyle="--", linewidth=1)
+        axes.annotate(f"{one.patients}", (one.patients, one.target), xytext=(4, -12), textcoords="offset points")
+        axes.plot([one.patients], [one.target], marker="x", color="black", markersize=8)
+    up = "power" if aim == "power" else "interval of the tactile error, upper over lower end"
+    where: Corner = "lower right" if aim == "power" else "upper right"
+    _label(axes, "", "patients, one mass each", up, where=where)
 
 
 # --- Trial report as one self-contained page: tables, figures, settings, hashes; no script, no network.

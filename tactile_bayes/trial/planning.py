@@ -8,10 +8,20 @@ from itertools import pairwise
 from typing import Annotated, Any, Literal
 
 import numpy as np
+from scipy.special import ndtri
 
 from tactile_bayes.declarations import Meta, Record
+from tactile_bayes.options import Aim
 from tactile_bayes.trial.accuracy import mape_figure, mape_percent, mape_ratio, sign_flip
-from tactile_bayes.trial.figures import MIN_PATIENTS, Ends, Intervals, Share, clopper_pearson, figure
+from tactile_bayes.trial.figures import (
+    MIN_PATIENTS,
+    Ends,
+    Intervals,
+    Share,
+    UndefinedError,
+    clopper_pearson,
+    figure,
+)
 from tactile_bayes.trial.readings import FloatArray, ModalitySizes
 from tactile_bayes.trial.replicates import log_sd_within
 
@@ -203,7 +213,24 @@ class Gain(Record):
     tactile_percent_change: float
 
 
-class PlanReport(Record):
+class Needed(Record):
+    """How many patients reach an aim."""
+
+    aim: Aim
+    target: Annotated[
+        float,
+        Meta(
+            description="Power, or the median factor from the lower to the upper end of the tactile error's interval."
+        ),
+    ]
+    maps: int
+    patients: Annotated[int, Meta(ge=MIN_PATIENTS, description="The least that reach it, one mass each.")]
+    patients_interval: Annotated[
+        Ends | None, Meta(description="95 % interval of that number: the simulation's own error; null where too few.")
+    ]
+
+
+class PlanReport(Record, kw_only=True):
     """Power and widths of planned trials."""
 
     schema: Literal["tactile-bayes/plan/1"]
@@ -211,6 +238,9 @@ class PlanReport(Record):
     errors_from: Annotated[dict[str, ErrorSource], Meta(description="Where each assumed error comes from.")]
     designs: Annotated[tuple[Design, ...], Meta(min_length=1)]
     gains: tuple[Gain, ...]
+    needed: Annotated[
+        tuple[Needed, ...], Meta(description="By the designs above, where --power or --precision asked for it.")
+    ] = ()
     provenance: dict[str, Any]
     research_use: Annotated[str, Meta(min_length=1)]
 
@@ -246,6 +276,98 @@ def map_gains(found: Iterable[Design]) -> tuple[Gain, ...]:
         for old, new in pairwise(ordered)
         if old.patients == new.patients
     )
+
+
+# --- The number of patients that reaches a power, or a width of the interval: a line through simulated designs.
+
+MOST_PATIENTS = 10_000
+# Designs simulated about the first guess, in shares of it; the guess is moved up to so many times.
+AROUND = (0.6, 0.8, 1.0, 1.25, 1.6)
+ROUNDS = 4
+_GUESSED_WITH = 40_000  #: Masses.
+
+
+def first_guess(case: PlanCase, aim: Aim, target: float) -> int:
+    r"""Patients by the normal approximation, from the errors of many simulated masses.
+
+    For power :math:`((z_{1-\alpha/2} + z_\text{power}) / \delta)^2` with :math:`\delta` the mean of the differences of
+    percent errors over their SD; for the interval of a mean error, whose ends lie :math:`z` standard errors of its
+    logarithm away, :math:`(2 z\,\text{cv} / \ln \text{factor})^2`.
+
+    Raises
+    ------
+    UndefinedError
+        When the tactile errors are not the smaller ones.
+    """
+    rng, n = np.random.default_rng(case.seed), _GUESSED_WITH
+    shared = rng.normal(case.tactile_bias, case.mass_sd, n)
+    tactile = np.abs(np.exp(shared + rng.normal(0, case.map_sd, (case.maps, n))).mean(axis=0) - 1)
+    other = np.abs(np.expm1(rng.normal(case.other_bias, case.other_sd, n)))
+    other[rng.random(n) < case.other_miss] = 1.0
+    z = float(ndtri(1 - LEVEL / 2))
+    if aim == "precision":
+        root = 2 * z * float(tactile.std() / tactile.mean()) / math.log(target)
+    else:
+        gain = float((other - tactile).mean())
+        if gain <= 0:
+            raise UndefinedError(
+                f"the tactile errors assumed are not the smaller ones ({100 * tactile.mean():.1f} % against "
+                f"{100 * other.mean():.1f} %), so no number of patients has that power"
+            )
+        root = (z + float(ndtri(target))) * float((other - tactile).std()) / gain
+    return round(min(max(root**2, MIN_PATIENTS), MOST_PATIENTS))
+
+
+def sizes_about(patients: int) -> list[int]:
+    """Numbers of patients to simulate about a guess."""
+    return sorted({min(max(round(share * patients), MIN_PATIENTS), MOST_PATIENTS) for share in AROUND})
+
+
+def patients_needed(found: Sequence[Design], aim: Aim, target: float, *, trials: int) -> Needed | None:
+    r"""Solve a line through simulated designs of one number of maps for the number of patients.
+
+    The power's normal quantile is linear in :math:`\sqrt N`, the logarithm of an interval's width in
+    :math:`1/\sqrt N`. None where the designs have no such line; the least and the most patients that a plan may have
+    stand for fewer and more.
+    """
+    least = min(found, key=lambda one: one.patients)
+    width = least.tactile_width_ratio or math.inf
+    if least.patients == MIN_PATIENTS and (least.power >= target if aim == "power" else width <= target):
+        return Needed(aim=aim, target=target, maps=least.maps, patients=MIN_PATIENTS, patients_interval=None)
+    exponent = 0.5 if aim == "power" else -0.5
+    at, level, weight = [], [], []
+    for one in found:
+        if aim == "power":
+            share = min(max(one.power, 0.5 / trials), 1 - 0.5 / trials)
+            y, slope = float(ndtri(share)), math.sqrt(2 * math.pi) * math.exp(float(ndtri(share)) ** 2 / 2)
+            sd = slope * math.sqrt(share * (1 - share) / trials)
+        elif one.tactile_width_ratio is None:
+            continue
+        else:
+            y, sd = math.log(one.tactile_width_ratio), 1.0
+        at.append(one.patients**exponent)
+        level.append(y)
+        weight.append(1 / sd)
+    if len(at) < 2:
+        return None
+    (slope, start), covariance = _line(np.array(at), np.array(level), np.array(weight))
+    wanted = float(ndtri(target)) if aim == "power" else math.log(target)
+    x = (wanted - start) / slope
+    if slope <= 0 or x <= 0:
+        return None
+    patients = min(max(math.ceil(x ** (1 / exponent) - 1e-9), MIN_PATIENTS), MOST_PATIENTS)
+    ends = None
+    if aim == "power":
+        sd = math.sqrt(float(np.array([x, 1.0]) @ covariance @ np.array([x, 1.0]))) / slope
+        ends = (max(x - 1.96 * sd, 0.0) ** 2, (x + 1.96 * sd) ** 2)
+    return Needed(aim=aim, target=target, maps=found[0].maps, patients=patients, patients_interval=ends)
+
+
+def _line(x: FloatArray, y: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Slope and intercept by weighted least squares, and their covariance for weights of 1 over the SD."""
+    design = np.stack([x, np.ones_like(x)], axis=1) * weight[:, None]
+    covariance: FloatArray = np.linalg.pinv(design.T @ design).astype(np.float64)
+    return covariance @ design.T @ (weight * y), covariance
 
 
 class _Found(Record):

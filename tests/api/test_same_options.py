@@ -59,7 +59,7 @@ def test_every_option_of_report_is_a_keyword() -> None:
 def test_every_option_of_campaign_plan_and_diagnose_is_a_keyword_or_a_member() -> None:
     run = cli.get_command(click.Context(cli), "campaign").get_command(click.Context(cli), "run")  # type: ignore[union-attr]
     assert {str(one.name) for one in run.params} - {"settings_file"} <= keywords(tb.campaign) | keywords(tb.estimate)
-    assert options("plan") - keywords(tb.plan) - set(names_of(PlanErrors)) == {"as_json", "output", "force"}
+    assert options("plan") - keywords(tb.plan) - set(names_of(PlanErrors)) == {"as_json", "output", "figure", "force"}
     assert hasattr(tb.TrialPlan, "document")
     assert hasattr(tb.TrialPlan, "write_json")
     assert options("diagnose") - keywords(tb.diagnose) - keywords(tb.Diagnosis.plot) == {"as_json", *FIGURES}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -10,11 +11,13 @@ import pandas
 import pytest
 from click.testing import CliRunner, Result
 from published_schemas import check_document
+from scipy.stats import t
 
 import tactile_bayes as tb
 from tactile_bayes.commands.trial import plan_command as command
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.trial.planning import ErrorModel
 
 DEMO = Path(tb.__file__).parent / "demo"
 SMALL = ("--patients", 12, "--maps", 1, "--maps", 3, "--trials", 50)
@@ -40,7 +43,62 @@ def test_the_text_names_designs_and_gains() -> None:
     lines = plan(*SMALL).stdout.splitlines()
     assert any("12 patients, from 1 to 3 maps" in line for line in lines)
     assert lines[-1] == RESEARCH_USE
-    assert max(map(len, lines)) < 150
+    table = [line for line in lines if line.startswith(" ")]
+    assert len(table) == 3
+    assert max(map(len, table)) <= 80
+
+
+def moments(bias: float, sd: float, miss: float = 0.0) -> tuple[float, float]:
+    """Mean and SD of |e^X - 1| for a normal X, in closed form; a miss counts as 1."""
+    mean = ErrorModel(bias, sd, miss=miss).true_mape_percent / 100
+    square = math.exp(2 * bias + 2 * sd**2) - 2 * math.exp(bias + sd**2 / 2) + 1
+    return mean, math.sqrt((1 - miss) * square + miss - mean**2)
+
+
+def test_power_answers_with_the_patients_of_the_normal_approximation() -> None:
+    """N = ((z_0.975 + z_0.9) / delta)^2, the paired test's sample size, from closed moments (1.960 + 1.282)."""
+    (tactile, sd), (other, other_sd) = moments(0.02, math.hypot(0.18, 0.15)), moments(-0.08, 0.40, miss=0.04)
+    delta = (other - tactile) / math.hypot(sd, other_sd)
+    approximate = ((1.95996 + 1.28155) / delta) ** 2
+    result = plan("--power", 0.9, "--maps", 1, "--trials", 400)
+    (found,) = json.loads(plan("--power", 0.9, "--maps", 1, "--trials", 400, "--json").stdout)["needed"]
+    assert found["patients"] == pytest.approx(approximate, rel=0.1)
+    low, high = found["patients_interval"]
+    assert low < found["patients"] < high < 1.2 * low
+    assert result.stdout.startswith(f"{found['patients']} patients with 1 map of each mass reach power 0.9 (by the")
+
+
+def test_precision_answers_with_the_patients_of_the_delta_method() -> None:
+    """The ends lie t standard errors of the logarithm apart: factor = exp(2 t cv / sqrt(N)) at the answer."""
+    mean, sd = moments(0.02, math.hypot(0.18, 0.15))
+    given = ("--precision", 1.6, "--maps", 1, "--trials", 200, "--json")
+    (found,) = json.loads(plan(*given).stdout)["needed"]
+    n = found["patients"]
+    assert math.exp(2 * t.ppf(0.975, n - 1) * sd / mean / math.sqrt(n)) == pytest.approx(1.6, rel=0.05)
+    assert found["patients_interval"] is None
+
+
+def test_more_maps_need_fewer_patients_and_a_figure_draws_it(tmp_path: Path) -> None:
+    words = ("--power", 0.8, "--maps", 1, "--maps", 5, "--trials", 200)
+    result = plan(*words, "--json", "--figure", tmp_path / "a.svg", "-o", tmp_path / "a.json")
+    document = json.loads(result.stdout)
+    check_document(document, "plan.schema.json")
+    one, five = document["needed"]
+    assert (one["maps"], five["maps"]) == (1, 5)
+    assert one["patients"] > five["patients"] >= 8
+    assert document["provenance"]["settings"]["power"] == 0.8
+    assert "<svg" in (tmp_path / "a.svg").read_text()
+    found = tb.plan(power=0.8, maps=[1, 5], trials=200)
+    assert found.document == document
+
+
+def test_few_patients_suffice_and_none_do() -> None:
+    easy = plan("--power", 0.9, "--mass-sd", 0.01, "--map-sd", 0.01, "--trials", 50).stdout
+    assert easy.startswith("8 patients with 3 maps of each mass reach power 0.9 (the least that a plan may have).")
+    hard = plan("--power", 0.9, "--mass-sd", 0.5, "--trials", 50).exception
+    assert "the tactile errors assumed are not the smaller ones" in str(hard)
+    far = plan("--power", 0.9, "--mass-sd", 0.33, "--maps", 1, "--other-miss", 0, "--trials", 50).exception
+    assert "10000 patients do not reach power 0.9 (maps of each mass: 1)" in str(far)
 
 
 def test_a_pilot_gives_the_errors() -> None:
@@ -57,6 +115,8 @@ def test_refusals_name_the_way_out() -> None:
     assert isinstance(error, BadDataError)
     assert "choose one with --against" in str(error)
     assert plan("--patients", 7).exit_code == 2
+    assert "leave out --patients" in str(plan("--patients", 12, "--power", 0.9).exception)
+    assert "90" in plan("--power", 90).output
 
 
 def test_python_plans_as_the_command_does(tmp_path: Path) -> None:
@@ -79,6 +139,8 @@ def test_python_plans_as_the_command_does(tmp_path: Path) -> None:
         ({"patients": [7]}, "patients is 7; give a whole number from 8"),
         ({"maps": 3}, "maps is 3; give a list of whole numbers"),
         ({"trials": 49}, "trials is 49"),
+        ({"power": 90}, "power is 90; give a number from 0.5 to 0.99"),
+        ({"patients": [12], "precision": 2.0}, "leave out patients"),
         ({"map_sd": -1.0}, "map_sd is -1"),
         ({"against": "mri"}, "against says how a pilot is read"),
         ({"pilot": DEMO / "trial.csv"}, "pilot needs excision"),

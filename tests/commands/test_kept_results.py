@@ -42,7 +42,7 @@ CASES = {
     "pooled": (("estimate", "map.nc", *FAST, "--pool", "--figure", "out.png"), "largest size"),
     "validate": (("validate", "trial.csv", "--excision", "excision.csv", "-o", "out.json"), "Sizes against excision"),
     "a page": (("validate", "trial.csv", "--excision", "excision.csv", "--html", "out.html"), "Sizes against excision"),
-    "map": (("map", "scan.mcap", "--every", "4", "-o", "map2.nc", "--figure", "out.png"), "frames used"),
+    "map": (("map", "scan.mcap", "--every", "4", "-o", "map2.nc", "--figure", "out.png"), "written: map2.nc"),
     "sbc": (("sbc", "--maps", "1", "--method", "laplace", "--figure", "out.png"), "1 map"),
 }
 
