@@ -16,6 +16,7 @@ KINDS: Final[Mapping[str, Severity]] = {
     "data_lost": "check",
     "recorder_noted": "check",
     "times_apart": "check",
+    "poses_jump": "caution",
     "wrong_arrangement": "caution",
     "frames_contradict": "caution",
     "arrangement_unknown": "check",

@@ -244,6 +244,22 @@ class RecordOptions(Options, kw_only=True):
         Path | None,
         Meta(description="ndi: description of a wireless tool.", extra={"metavar": "TOOL.rom", "path": True}),
     ] = None
+    tool: Annotated[
+        str | None,
+        Meta(
+            description="Which of the tracker's tools is on the head: name, or number of the station. Needed where it "
+            "sends several.",
+            extra={"metavar": "NAME", "also": "station"},
+        ),
+    ] = None
+    reference: Annotated[
+        str | None,
+        Meta(
+            description="Tool or station that is fixed to the body: poses are relative to it, which takes breathing "
+            "out.",
+            extra={"metavar": "NAME"},
+        ),
+    ] = None
     every: Annotated[int, Meta(ge=1, le=255, description="Record every n-th frame only.")] = 1
     duration_s: Annotated[
         Annotated[float, Meta(gt=0.0)] | None,

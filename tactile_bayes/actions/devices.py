@@ -25,9 +25,10 @@ from tactile_bayes.files.scan_recording import refuse_recording
 from tactile_bayes.hardware.bladder import rotation_sense
 from tactile_bayes.hardware.emulated import Device, EmulatedHead, EmulatedNdi, EmulatedTracker, Faults
 from tactile_bayes.hardware.emulator import Emulator, Link, PtyLink, Stage, TcpLink
+from tactile_bayes.hardware.ports import list_ports
 from tactile_bayes.hardware.reading import ask_for_priority
-from tactile_bayes.hardware.readings import PoseReading
-from tactile_bayes.hardware.serial_trackers import TRACKERS, list_ports, open_tracker, probe
+from tactile_bayes.hardware.readings import Follower, PoseReading, ToolReading
+from tactile_bayes.hardware.serial_trackers import TRACKERS, open_tracker, probe
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.scan import Scan
 
@@ -47,11 +48,14 @@ def emulate_action(
     stall: tuple[float, float] | None,
     disconnect: float | None,
     hold: int,
+    hide: tuple[float, float] | None,
+    breathe: float,
     seed: int,
 ) -> None:
     """Serve a scan as a scan head or a tracker would send it, or as both, at its own rate, with faults on request."""
     roles = ("head", "tracker") if kind == "both" else (kind,)
-    faults, stage, data = Faults(drop, corrupt, stall, disconnect, hold), Stage(speed=speed), read_scan(scan)
+    faults = Faults(drop, corrupt, stall, disconnect, hold, hide, breathe)
+    stage, data = Stage(speed=speed), read_scan(scan)
     spoilt = faults.drop or faults.corrupt or faults.stall or faults.disconnect_s is not None
     if protocol == "ndi" and "tracker" in roles and (spoilt or once):
         raise UsageError(
@@ -105,9 +109,9 @@ def _device(kind: str, scan: Scan, protocol: str, faults: Faults, *, path: Path,
         return EmulatedHead(scan)
     if kind == "tracker" and len(scan.poses) and protocol == "ndi":
         elapsed: Callable[[], float | None] | None = None if held is None else lambda: held.now()[1]
-        return EmulatedNdi(scan.poses, hold=faults.hold, elapsed=elapsed)
+        return EmulatedNdi(scan.poses, hold=faults.hold, hide=faults.hide, elapsed=elapsed)
     if kind == "tracker" and len(scan.poses):
-        return EmulatedTracker(scan.poses, protocol=protocol, hold=faults.hold)
+        return EmulatedTracker(scan.poses, protocol=protocol, faults=faults)
     what = "frames" if kind == "head" else "poses"
     raise BadDataError(f"holds no {what}", way_out="give another scan", path=str(path))
 
@@ -126,12 +130,14 @@ def _link(tcp: str | None, *, after: int) -> Link:
 # --- `devices`: list serial ports and check which way a tracker's rotations go.
 
 
-def devices_action(*, url: str | None, pivot_url: str | None, tracker_protocol: str, duration: float) -> None:
+def devices_action(
+    *, url: str | None, pivot_url: str | None, tracker_protocol: str, tool: str | None, duration: float
+) -> None:
     """List the serial ports and the devices that are probably on them."""
     if url:
         click.echo(f"{url}: {probe(url)}")
     elif pivot_url:
-        _pivot(pivot_url, tracker_protocol, duration)
+        _pivot(pivot_url, tracker_protocol, tool, duration)
     else:
         ports = list_ports()
         for port in ports:
@@ -140,17 +146,19 @@ def devices_action(*, url: str | None, pivot_url: str | None, tracker_protocol: 
             click.echo("no serial ports; other URLs: socket://HOST:PORT, rfc2217://HOST:PORT, a pseudo-terminal's path")
 
 
-def _pivot(url: str, protocol: str, duration_s: float) -> None:
+def _pivot(url: str, protocol: str, tool: str | None, duration_s: float) -> None:
     driver = TRACKERS[protocol]
     port = open_tracker(protocol, url)
     try:
-        driver.check(port)
+        answer = driver.check(port, tool=tool)
         click.echo("turn it", err=True)
         port.write(driver.start)
-        parser, poses, end = driver.parser(), [], time.monotonic() + duration_s
+        parser, follower, end = answer.parser(), Follower(answer.tool), time.monotonic() + duration_s
+        poses = []
         while time.monotonic() < end:
-            found = parser.feed(port.read_some(0.1))
-            poses += [one for one in found if isinstance(one, PoseReading) and not one.flags]
+            found = [one for one in parser.feed(port.read_some(0.1)) if isinstance(one, ToolReading)]
+            followed = [one for reading in found for one, _ in follower.take(reading, 0)]
+            poses += [one for one in followed if isinstance(one, PoseReading) and not one.flags]
         port.write(driver.stop)
     finally:
         port.close()

@@ -33,7 +33,7 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.hardware import head
 from tactile_bayes.hardware.head import HeadParser
 from tactile_bayes.hardware.ports import Port, read_in_process
-from tactile_bayes.hardware.readings import HelloReading
+from tactile_bayes.hardware.readings import Follower, HelloReading
 from tactile_bayes.hardware.recorder import LandmarkTouch, Line, Observer, Recorder, Report
 from tactile_bayes.hardware.serial_trackers import TRACKERS, check_head, open_tracker
 from tactile_bayes.options import RecordOptions
@@ -55,16 +55,20 @@ class Request(RecordOptions, kw_only=True):
         check_session(facts, path=self.output)
         return facts
 
-    def session(self, hello: HelloReading, facts: dict[str, str]) -> dict[str, str]:
+    def session(self, hello: HelloReading, follower: Follower, facts: dict[str, str]) -> dict[str, str]:
         """Session as the file stores it: devices, clock and facts."""
         tracker = self.tracker_protocol if self.tracker_url else "none"
         devices = {"source": "recorded", "head_id": hello.device_id[:64], "tracker_id": tracker, "clock": self.clock}
+        tools = {"tool": follower.tool, "reference": follower.reference}
+        devices |= {name: value for name, value in tools.items() if value}
         return devices | ({"rotation": "inverted"} if self.invert_rotation else {}) | facts
 
     def settings(self, hello: HelloReading) -> dict[str, Any]:
         """Settings for the provenance."""
         return {
             "tracker_protocol": self.tracker_protocol if self.tracker_url else None,
+            "tool": self.tool,
+            "reference": self.reference,
             "rate_hz": hello.rate_hz / self.every,
             "every": self.every,
             "clock": self.clock,
@@ -252,13 +256,15 @@ def make_recording(request: Request) -> tuple[Report, bool]:
         fault = "not a file" if ndi else f"not for {request.tracker_protocol}"
         way_out = "give a wireless NDI tool's .rom file with --tracker-protocol ndi"
         raise UsageError(f"--tracker-rom {rom} is {fault}; {way_out}")
+    if not request.tracker_url and (request.tool or request.reference):
+        raise UsageError("--tool and --reference are of a tracker; give its port with --tracker")
     refuse_existing(request.output, force=request.force)
     head, calibration, landmarks = instrument_of(request)
     facts = request.facts()
     with ExitStack() as stack:
-        hello, lines = _connect(request, stack)
+        hello, lines, follower = _connect(request, stack)
         _check_fit(hello, head, request)
-        session = request.session(hello, facts) | calibration_age(request, today=date.today())
+        session = request.session(hello, follower, facts) | calibration_age(request, today=date.today())
         check_session(session, path=request.output)
         refuse_calibration(request, head_id=hello.device_id, today=date.today())
         observer: Observer | None = None
@@ -283,7 +289,7 @@ def make_recording(request: Request) -> tuple[Report, bool]:
             *lines,
             writer,
             shared_clock=request.clock == "shared",
-            invert_rotation=request.invert_rotation,
+            follower=follower,
             duration_s=request.duration_s,
             rate_hz=hello.rate_hz / request.every,
             observer=observer,
@@ -304,8 +310,8 @@ def make_recording(request: Request) -> tuple[Report, bool]:
     return report, stopper.interrupted
 
 
-def _connect(request: Request, stack: ExitStack) -> tuple[HelloReading, tuple[Line, Line | None]]:
-    """Open the ports, identify the devices and start the reading processes."""
+def _connect(request: Request, stack: ExitStack) -> tuple[HelloReading, tuple[Line, Line | None], Follower]:
+    """Open the ports, identify the devices, choose the tool, and start the reading processes."""
     port = Port(request.head_url, baud=request.head_baud, role="head")
     stack.callback(port.close)
     hello = check_head(port, every=request.every)
@@ -320,18 +326,24 @@ def _connect(request: Request, stack: ExitStack) -> tuple[HelloReading, tuple[Li
             request.tracker_protocol, request.tracker_url, baud=request.tracker_baud, rom=request.tracker_rom
         )
         stack.callback(tracker_port.close)
-        driver.check(tracker_port)
+        answer = driver.check(tracker_port, tool=request.tool, reference=request.reference)
+        for words in (f"no pose yet of {answer.unseen}" if answer.unseen else "", answer.remark):
+            if words:
+                click.echo(f"{tracker_port.name}: {words}", err=True)
     head_stream = read_in_process(port)
     stack.callback(head_stream.close)
     line = Line("head", port, head_stream, parser, start, stop)
     if tracker_port is None:
         head_stream.wait_until_ready()
-        return hello, (line, None)
+        return hello, (line, None), Follower()
     tracker_stream = read_in_process(tracker_port)
     stack.callback(tracker_stream.close)
     for stream in (head_stream, tracker_stream):
         stream.wait_until_ready()
-    return hello, (line, Line("tracker", tracker_port, tracker_stream, driver.parser(), driver.start, driver.stop))
+    tracker = Line(
+        "tracker", tracker_port, tracker_stream, answer.parser(), driver.start, driver.stop, silent_s=driver.silent_s
+    )
+    return hello, (line, tracker), Follower(answer.tool, answer.reference, inverse=request.invert_rotation)
 
 
 def _check_fit(hello: HelloReading, head: HeadGeometry, request: Request) -> None:

@@ -75,6 +75,20 @@ _SHARE = FiniteRange(0.0, 1.0)
 @click.option(
     "--hold", type=click.IntRange(min=1), default=1, show_default=True, help="Tracker: measure only every n-th pose."
 )
+@click.option(
+    "--hide",
+    type=(FiniteRange(min=0.0), FiniteRange(min=0.0)),
+    metavar="AT FOR",
+    help="Tracker: its tool is out of sight for FOR s from AT s on.",
+)
+@click.option(
+    "--breathe",
+    type=FiniteRange(0.0, 100.0),
+    default=0.0,
+    metavar="MM",
+    help="Tracker: a second tool, Reference (or station 2), fixed to a body that breathes by MM; the first is Probe "
+    "(or 1).",
+)
 @click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Random seed of the faults.")
 def emulate_command(**given: Any) -> None:
     """Serve a scan as a scan head or a tracker would send it, or as both, at its own rate, with faults on request.
@@ -113,6 +127,7 @@ def emulate_command(**given: Any) -> None:
     show_default=True,
     help="Protocol of the tracker to rotate.",
 )
+@takes(RecordOptions, "tool")
 @click.option(
     "--duration",
     type=FiniteRange(min=0.2),

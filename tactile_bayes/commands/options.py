@@ -255,6 +255,7 @@ def _option(record: type[Record], name: str, attributes: Mapping[str, Any]) -> D
     kind, default = kinds(record)[name], default_of(record, name)
     extra = extra_of(kind)
     flag = f"--{extra.get('option', name).replace('_', '-')}"
+    also = [f"--{extra['also']}"] if "also" in extra else []
     of_field: dict[str, Any] = {"help": meaning_of(kind), "metavar": extra.get("metavar")}
     if default is False:
         of_field["is_flag"] = True
@@ -269,7 +270,7 @@ def _option(record: type[Record], name: str, attributes: Mapping[str, Any]) -> D
         of_field |= {"default": default, "show_default": True} if shown else {}
         if isinstance(of_field["type"], NumberOr):
             of_field["default"] = default if isinstance(default, str) else f"{default:g}"
-    return click.option(flag, name, **{**of_field, **attributes})
+    return click.option(flag, *also, name, **{**of_field, **attributes})
 
 
 def _click_type(kind: Any) -> Any:

@@ -464,6 +464,7 @@ def _recording(account: Mapping[str, str], topics: Mapping[str, int], time_s: Fl
     steps = np.diff(time_s)
     period = float(np.median(steps)) if len(steps) else 0.0
     missing = int(np.clip(np.rint(steps / period) - 1, 0, None).sum()) if period > 0 else 0
-    names = ("frames_lost", "head_dropped", "poses_repeated", "poses_flagged", "overrun_bytes", "ended_by", "fault")
+    losses = ("frames_lost", "head_dropped", "poses_repeated", "poses_flagged", "flagged_why", "poses_missing")
+    names = (*losses, "missing_why", "other_tools", "overrun_bytes", "ended_by", "fault")
     told = {name: account[name] for name in names if account.get(name)}
     return {"frames_missing": missing, "notes": topics.get("/log", 0)} | ({"recording": told} if told else {})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import struct
 import time
@@ -14,7 +15,14 @@ from tactile_bayes.declarations import Record
 from tactile_bayes.geometry import FloatArray, rotation_from_quaternion
 from tactile_bayes.hardware import head
 from tactile_bayes.hardware.head import PacketParser
-from tactile_bayes.hardware.readings import MM_PER_INCH, HelloReading, PoseReading
+from tactile_bayes.hardware.readings import (
+    MM_PER_INCH,
+    HelloReading,
+    MissingReading,
+    PoseReading,
+    ToolReading,
+    pose_from_relative,
+)
 from tactile_bayes.hardware.serial_trackers import SCALE_INCH, record_bytes
 from tactile_bayes.hardware.trackers import encode_transform
 from tactile_bayes.scan import Scan, TrackerPoses
@@ -38,6 +46,10 @@ class Faults(Record):
     """From this time of the scan on, for this long, nothing is sent; what was measured then is lost. In s."""
     disconnect_s: float | None = None  #: The cable is pulled at this time of the scan.
     hold: int = 1  #: Only every n-th pose is measured anew, those between repeat it.
+    hide: tuple[float, float] | None = None
+    """From this time of the scan on, for this long, the tracker does not see its tool. In s."""
+    breathe_mm: float = 0.0
+    """A second tool is fixed to the body, which breathes by so much; both move with it."""
 
     def stalls(self, time_s: float) -> bool:
         """True when the device sends nothing at a time of the scan."""
@@ -132,18 +144,38 @@ class EmulatedHead(Device):
         return head.encode_end(sent, dropped)
 
 
-class EmulatedTracker(Device):
-    """An emulated tracker of one of `PROTOCOLS`, or in the open framing; of the poses only every `hold`-th is measured
-    anew.
-    """
+_BREATH_S: Final = 4.0
+# Where the second tool is, turned against the tracker so that its frame is another one.
+_REFERENCE_MM: Final = (250.0, -40.0, 30.0)
+_REFERENCE_TURN: Final = (0.8, 0.0, 0.6, 0.0)
 
-    def __init__(self, poses: TrackerPoses, *, protocol: str, hold: int = 1) -> None:
+
+class EmulatedTracker(Device):
+    """An emulated tracker of one of `PROTOCOLS`, or in the open framing, with a tracker's faults."""
+
+    def __init__(self, poses: TrackerPoses, *, protocol: str, faults: Faults | None = None) -> None:
         self.times_s = poses.time_s
         self._poses = poses
         self._protocol = protocol
         self._commands = PacketParser()
-        self._hold = max(1, hold)
+        self._faults = faults or Faults()
+        self._hold = max(1, self._faults.hold)
         self._encode = PROTOCOLS[protocol]
+
+    def readings(self, index: int) -> list[ToolReading]:
+        """What the tracker knows at the n-th time, of one tool or two."""
+        pose, hidden, breath_mm = self.pose(index), self._faults.hide, self._faults.breathe_mm
+        time_s = float(self.times_s[index] - self.times_s[0])
+        numbers = self._protocol not in ("open", "igtlink")
+        if breath_mm:
+            x, y, z = _REFERENCE_MM
+            y += breath_mm / 2 * math.sin(2 * math.pi * time_s / _BREATH_S)
+            base = PoseReading((x, y, z), _REFERENCE_TURN, pose.device_ns, tool="2" if numbers else "Reference")
+            pose = pose_from_relative(pose, base)._replace(tool="1" if numbers else "Probe")
+        seen: ToolReading = pose
+        if hidden is not None and hidden[0] <= time_s < hidden[0] + hidden[1]:
+            seen = MissingReading("out of sight", pose.tool)
+        return [base, seen] if breath_mm else [seen]
 
     def pose(self, index: int) -> PoseReading:
         """The n-th pose sent: at its own time, with the values of the latest measurement."""
@@ -178,6 +210,7 @@ class EmulatedTracker(Device):
         for packet in self._commands.feed(data):
             if packet.kind == head.ASK:
                 answer += head.encode_hello(HelloReading("emulated tracker", 0, 0, 0, 0.0))
+                answer += self.record(0) if self._faults.breathe_mm else b""
             elif packet.kind == head.START:
                 self.start()
             elif packet.kind == head.STOP:
@@ -185,12 +218,19 @@ class EmulatedTracker(Device):
         return answer
 
     def record(self, index: int) -> bytes:
-        return self._encode(self.pose(index), index)
+        return b"".join(self._encode(one, index) for one in self.readings(index))
 
     def end(self, sent: int, dropped: int) -> bytes:
         """Encode an END in the open framing; other protocols have none."""
         self.streaming, self.said_end = False, self._protocol == "open"
         return head.encode_end(sent, dropped) if self.said_end else b""
+
+
+Encoder = Callable[[PoseReading, int], bytes]
+
+
+def _station(pose: PoseReading) -> int:
+    return int(pose.tool or 1)
 
 
 def _inches(pose: PoseReading) -> tuple[float, float, float]:
@@ -203,33 +243,48 @@ def _time_ms(pose: PoseReading) -> int:
 
 
 def _fastrak(pose: PoseReading, _: int) -> bytes:
-    return b"01 " + struct.pack("<7f", *_inches(pose), *pose.quaternion_wxyz) + b" "
+    return b"0%d " % _station(pose) + struct.pack("<7f", *_inches(pose), *pose.quaternion_wxyz) + b" "
 
 
 def _fastrak_ascii(pose: PoseReading, _: int) -> bytes:
     place = "".join(f"{value:7.2f}" for value in _inches(pose))
     turn = "".join(f"{value:7.4f}" for value in pose.quaternion_wxyz)
-    return f"01 {place}{turn}\r\n".encode()
+    return f"0{_station(pose)} {place}{turn}\r\n".encode()
 
 
 def _liberty(pose: PoseReading, _: int) -> bytes:
     body = struct.pack("<7fIi", *_inches(pose), *pose.quaternion_wxyz, _time_ms(pose), 0)
-    return struct.pack("<2sBBBBH", b"LY", 1, ord("C"), ord(" "), 0, len(body) + 1) + body + b" "
+    return struct.pack("<2sBBBBH", b"LY", _station(pose), ord("C"), ord(" "), 0, len(body) + 1) + body + b" "
 
 
 def _liberty_ascii(pose: PoseReading, _: int) -> bytes:
     numbers = [f"{value:.5f}" for value in (*_inches(pose), *pose.quaternion_wxyz)]
-    return f"01  {' '.join(numbers)} {_time_ms(pose)} 0\r\n".encode()
+    return f"{_station(pose):02}  {' '.join(numbers)} {_time_ms(pose)} 0\r\n".encode()
 
 
-PROTOCOLS: Final[dict[str, Callable[[PoseReading, int], bytes]]] = {
-    "fastrak": _fastrak,
-    "fastrak-ascii": _fastrak_ascii,
-    "liberty": _liberty,
-    "liberty-ascii": _liberty_ascii,
-    "bird": lambda pose, _: record_bytes(_inches(pose), pose.quaternion_wxyz, scale_inch=SCALE_INCH),
+def _bird(pose: PoseReading, _: int) -> bytes:
+    address = bytes([int(pose.tool)]) if pose.tool else b""  # of group mode
+    return record_bytes(_inches(pose), pose.quaternion_wxyz, scale_inch=SCALE_INCH) + address
+
+
+def _no_word(encode: Encoder) -> Callable[[ToolReading, int], bytes]:
+    """Encoder of a protocol that has no word for a tool that is not seen: it then sends nothing."""
+    return lambda pose, number: encode(pose, number) if isinstance(pose, PoseReading) else b""
+
+
+def _igtlink(pose: ToolReading, _: int) -> bytes:
+    turn = rotation_from_quaternion(np.array(pose.quaternion_wxyz)) if isinstance(pose, PoseReading) else None
+    return encode_transform(pose, turn)
+
+
+PROTOCOLS: Final[dict[str, Callable[[ToolReading, int], bytes]]] = {
+    "fastrak": _no_word(_fastrak),
+    "fastrak-ascii": _no_word(_fastrak_ascii),
+    "liberty": _no_word(_liberty),
+    "liberty-ascii": _no_word(_liberty_ascii),
+    "bird": _no_word(_bird),
     "open": lambda pose, number: head.encode_pose(pose, sequence=number),
-    "igtlink": lambda pose, _: encode_transform(pose, rotation_from_quaternion(np.array(pose.quaternion_wxyz))),
+    "igtlink": _igtlink,
 }
 
 
@@ -241,6 +296,7 @@ PROTOCOLS: Final[dict[str, Callable[[PoseReading, int], bytes]]] = {
 HANDLE: Final = 0x0A
 _VALID, _MISSING = 0x01, 0x02
 _PORT_STATUS: Final = 0x31  # a tool in the port, initialised and enabled
+_OUT_OF_VOLUME: Final = 0x40
 _START: Final = 0xA5C4
 _BAD_CRC, _UNKNOWN, _NOT_NOW = 0x04, 0x01, 0x0C
 _POLYNOMIAL: Final = 0xA001
@@ -270,6 +326,7 @@ class EmulatedNdi(Device):
         poses: TrackerPoses,
         *,
         hold: int = 1,
+        hide: tuple[float, float] | None = None,
         wireless: bool = False,
         clock: Callable[[], float] = time.monotonic,
         elapsed: Callable[[], float | None] | None = None,
@@ -278,6 +335,7 @@ class EmulatedNdi(Device):
         self._elapsed = elapsed
         self.described = b""
         self._poses, self._hold, self._clock = poses, max(1, hold), clock
+        self._hide = (math.inf, 0.0) if hide is None else hide
         self._begun: float | None = None
         self._port = "none" if wireless else "plugged in"
         self._rest = b""
@@ -339,8 +397,10 @@ class EmulatedNdi(Device):
         elapsed = self._clock() - self._begun if self._elapsed is None else self._elapsed() or 0.0
         index = int(np.searchsorted(self.times_s - self.times_s[0], elapsed, side="right")) - 1
         index -= index % self._hold
-        if elapsed > self.times_s[-1] - self.times_s[0] + 0.1:  # the tool is put away
-            body = struct.pack("<BBBII", 1, HANDLE, _MISSING, _PORT_STATUS, len(self.times_s) + 1)
+        put_away = elapsed > self.times_s[-1] - self.times_s[0] + 0.1
+        if put_away or self._hide[0] <= elapsed < sum(self._hide):
+            status = _PORT_STATUS | (0 if put_away else _OUT_OF_VOLUME)
+            body = struct.pack("<BBBII", 1, HANDLE, _MISSING, status, len(self.times_s) + 1 + round(1000 * elapsed))
         else:
             numbers = (*self._poses.quaternion_wxyz[index], *self._poses.position_mm[index], 0.1)
             body = struct.pack("<BBB8fII", 1, HANDLE, _VALID, *map(float, numbers), _PORT_STATUS, index + 1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import struct
 import zlib
 from dataclasses import dataclass
@@ -15,10 +16,13 @@ from tactile_bayes.hardware.readings import (
     EndReading,
     FrameReading,
     HelloReading,
+    MissingReading,
     PoseReading,
     Reading,
     SequenceCheck,
+    ToolReading,
     plausible,
+    printable,
 )
 
 # --- The open framing of scan heads: COBS between zero bytes, version, type, sequence, device time, checksum.
@@ -106,6 +110,7 @@ class FramingCounts:
     """Stretches between zero bytes that are no packet: a checksum that fails, codes that make no sense, noise."""
     damaged_bytes: int = 0  #: Their length.
     foreign: int = 0  #: Packets of another version of the framing.
+    foreign_version: int = 0  #: That of the last of them.
 
 
 class PacketParser:
@@ -140,7 +145,7 @@ class PacketParser:
             return None
         version, kind, sequence, device_us = HEADER.unpack_from(body)
         if version != VERSION:
-            self.counts.foreign += 1
+            self.counts.foreign, self.counts.foreign_version = self.counts.foreign + 1, version
             return None
         self.counts.packets += 1
         return Packet(kind, sequence, device_us, body[HEADER.size : -CRC_BYTES])
@@ -192,10 +197,17 @@ def encode_end(sent: int, dropped: int) -> bytes:
     return encode_packet(END, _END.pack(sent, dropped))
 
 
-def encode_pose(pose: PoseReading, *, sequence: int) -> bytes:
-    """Encode a pose without rounding: doubles in mm, and the nanoseconds that the header's microseconds leave out."""
-    device_us, rest_ns = divmod(pose.device_ns or 0, 1000)
-    payload = _POSE.pack(rest_ns, *pose.position_mm, *pose.quaternion_wxyz)
+def encode_pose(pose: ToolReading, *, sequence: int) -> bytes:
+    """Encode a pose without rounding: doubles in mm, and the nanoseconds that the header's microseconds leave out.
+
+    The tool's name follows, and a zero byte and why there is no pose, or what speaks against it.
+    """
+    if isinstance(pose, PoseReading):
+        device_us, rest_ns = divmod(pose.device_ns or 0, 1000)
+        payload, why = _POSE.pack(rest_ns, *pose.position_mm, *pose.quaternion_wxyz), ", ".join(pose.flags)
+    else:
+        device_us, payload, why = 0, _POSE.pack(0, *(7 * [math.nan])), pose.why
+    payload += pose.tool.encode()[:_MAX_ID] + (b"\0" + why.encode()[:_MAX_ID] if why else b"")
     return encode_packet(POSE, payload, sequence=sequence, device_us=device_us)
 
 
@@ -213,12 +225,22 @@ class HeadParser:
         self.sequence = SequenceCheck()
         self.hello: HelloReading | None = None
         self.misfits = 0
+        self.remark = ""
+        self._misfit_words = ""
         self._every = every
 
     @property
     def garbage_bytes(self) -> int:
         """Number of bytes that belong to no valid packet."""
         return self.packets.counts.damaged_bytes
+
+    @property
+    def fault(self) -> str:
+        """What is wrong with packets that could not be read."""
+        counts = self.packets.counts
+        if counts.foreign:
+            return f"it sent packets of version {counts.foreign_version} of the framing, this program reads {VERSION}"
+        return self._misfit_words
 
     def feed(self, data: bytes) -> list[Reading]:
         """Parse `data`; return the completed readings; counts packets with invalid payloads."""
@@ -240,36 +262,47 @@ class HeadParser:
             case 3 if len(packet.payload) >= _END.size:
                 return EndReading(*_END.unpack_from(packet.payload))
             case _:
-                self.misfits += 1
+                self._misfit(f"a packet of kind {packet.kind} with {len(packet.payload)} bytes")
                 return None
 
     def _frame(self, packet: Packet) -> FrameReading | None:
         shape = (self.hello.rows, self.hello.columns) if self.hello else None
         if shape is None or len(packet.payload) != 2 * shape[0] * shape[1]:
-            self.misfits += 1
+            self._misfit(f"a FRAME of {len(packet.payload)} bytes" + ("" if shape else " before its HELLO"))
             return None
         restarts = self.sequence.restarts
         lost = self.sequence.missing_before(packet.sequence // self._every)
         counts = np.frombuffer(packet.payload, dtype="<u2").reshape(shape)
         return FrameReading(counts, packet.device_us * 1000, lost, self.sequence.restarts > restarts)
 
-    def _pose(self, packet: Packet) -> PoseReading | None:
-        if len(packet.payload) != _POSE.size:
-            self.misfits += 1
+    def _misfit(self, what: str) -> None:
+        self.misfits += 1
+        self._misfit_words = f"it sent {what}"
+
+    def _pose(self, packet: Packet) -> ToolReading | None:
+        tool, _, why = printable(packet.payload[_POSE.size :]).partition("\0")
+        if len(packet.payload) < _POSE.size or max(len(tool), len(why)) > _MAX_ID:
+            self._misfit(f"a POSE of {len(packet.payload)} bytes")
             return None
-        rest_ns, x, y, z, qw, qx, qy, qz = _POSE.unpack(packet.payload)
+        rest_ns, x, y, z, qw, qx, qy, qz = _POSE.unpack_from(packet.payload)
+        if why and math.isnan(x):
+            return MissingReading(why, tool)
         if not plausible((x, y, z), (qw, qx, qy, qz)) or rest_ns > 999:
-            self.misfits += 1
+            self._misfit(f"a POSE that can be none, {x:g} {y:g} {z:g} mm, {qw:g} {qx:g} {qy:g} {qz:g}")
             return None
         self.sequence.missing_before(packet.sequence)
-        return PoseReading((x, y, z), (qw, qx, qy, qz), packet.device_us * 1000 + rest_ns)
+        flags = (why,) if why else ()
+        return PoseReading((x, y, z), (qw, qx, qy, qz), packet.device_us * 1000 + rest_ns, flags, tool)
 
     def _hello(self, packet: Packet) -> HelloReading | None:
         if len(packet.payload) < _HELLO.size:
-            self.misfits += 1
+            self._misfit(f"a HELLO of {len(packet.payload)} bytes")
             return None
         rows, columns, saturation, millihertz = _HELLO.unpack_from(packet.payload)
-        name = packet.payload[_HELLO.size :].decode("utf-8", "replace")
+        name = printable(packet.payload[_HELLO.size :])
+        if self.hello is not None and (name, rows, columns) != self.hello[:3]:
+            self._misfit(f"a HELLO of {name!r} with {rows} x {columns} taxels beside that of {self.hello.device_id!r}")
+            return None
         self.hello = HelloReading(name, rows, columns, saturation, millihertz / 1000)
         return self.hello
 

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import serial
+from serial.tools.list_ports import comports
 
 from tactile_bayes.errors import DeviceError
 from tactile_bayes.hardware import reading
@@ -29,7 +30,11 @@ from tactile_bayes.hardware import reading
 
 # How long a device may take to answer.
 ANSWER_S = 2.5
+# Without a byte for so long a device has gone.
+SILENT_S: Final = 3.0
 _SHOWN_BYTES: Final = 12
+_SOCKET_BYTES: Final = 65536
+_MOST_DRAINED: Final = 4096
 # One read waits so long at most. It is never changed: with rfc2217 that would be negotiated anew each time.
 _READ_S: Final = 0.01
 # What a device that vanishes ends a call with; a terminal's own error is no OSError.
@@ -52,6 +57,7 @@ class Port:
         self.baud = baud
         self.role = role
         self._serial = _open(url, baud, role)
+        self._is_socket = url.startswith("socket://")
         self._relayed: socket.socket | None = None
 
     @property
@@ -64,13 +70,18 @@ class Port:
         """True when the line has a baud rate: sockets have none."""
         return not self.url.startswith(("socket://", "rfc2217://", "loop://"))
 
+    @property
+    def remedy(self) -> str:
+        """What to look at when it has gone."""
+        return "check its cable" if self.has_line_rate else "check that its program runs"
+
     def write(self, data: bytes) -> None:
         """Send bytes; a device that has gone is one error line."""
         try:
             self._serial.write(data)
             self._serial.flush()
         except GONE as error:
-            raise DeviceError(f"{self.name}: cannot be written to ({_reason(error)}); check its cable") from None
+            raise DeviceError(f"{self.name}: cannot be written to ({_reason(error)}); {self.remedy}") from None
 
     def read_some(self, timeout_s: float) -> bytes:
         """Read what comes within the time, returning with the first bytes; empty when nothing came."""
@@ -79,17 +90,25 @@ class Port:
             while True:
                 data: bytes = self._serial.read(1)
                 if data:
-                    return data + bytes(self._serial.read(self._serial.in_waiting))
+                    return data + self._waiting()
                 if time.monotonic() >= end:
                     return b""
         except GONE as error:
-            raise DeviceError(f"{self.name}: cannot be read ({_reason(error)}); check its cable") from None
+            raise DeviceError(f"{self.name}: cannot be read ({_reason(error)}); {self.remedy}") from None
 
-    def drain(self) -> None:
-        """Discard input until the line is quiet, at most 2 s."""
-        end = time.monotonic() + 2.0
-        while time.monotonic() < end and self.read_some(0.05):
-            pass
+    def _waiting(self) -> bytes:
+        """Bytes that have come already."""
+        if not self._is_socket:
+            return bytes(self._serial.read(self._serial.in_waiting))
+        number = self._serial.fileno()  # pyserial knows only whether there are any, and loses those before an end
+        return os.read(number, _SOCKET_BYTES) if select.select([number], [], [], 0)[0] else b""
+
+    def drain(self) -> bytes:
+        """Take input until the line is quiet, at most 2 s; returns its beginning."""
+        end, came = time.monotonic() + 2.0, b""
+        while time.monotonic() < end and (data := self.read_some(0.05)):
+            came += data[: _MOST_DRAINED - len(came)]
+        return came
 
     @contextlib.contextmanager
     def descriptor(self) -> Iterator[int]:
@@ -172,6 +191,47 @@ def shown(data: bytes) -> str:
     return part.hex(" ") + more
 
 
+# --- The system's serial ports, and a guess at the devices on them.
+
+# USB vendors, by what they make.
+_TRACKER_MAKERS: Final = {0x0F44: "Polhemus"}
+_CONTROLLERS: Final = {
+    0x2341: "Arduino",
+    0x16C0: "Teensy",
+    0x2E8A: "Raspberry Pi Pico",
+    0x0483: "ST",
+    0x303A: "Espressif",
+    0x1366: "SEGGER",
+    0x239A: "Adafruit",
+}
+_ADAPTERS: Final = {0x0403: "FTDI", 0x10C4: "Silicon Labs", 0x067B: "Prolific", 0x1A86: "WCH"}
+
+
+class FoundPort(NamedTuple):
+    """A port: its URL, the system's description, the device probably on it."""
+
+    url: str
+    description: str
+    guess: str
+
+
+def list_ports() -> list[FoundPort]:
+    """List the system's ports, in order, with a guess from their USB ids; opens none of them."""
+    found = [FoundPort(port.device, port.description or "", guess(port.vid, port.product or "")) for port in comports()]
+    return sorted(found)
+
+
+def guess(vendor: int | None, product: str) -> str:
+    """Guess the device on a port from its USB vendor and product name."""
+    if vendor in _TRACKER_MAKERS:
+        return f"tracker ({_TRACKER_MAKERS[vendor]})"
+    if vendor in _CONTROLLERS or "head" in product.lower():
+        return f"scan head, perhaps ({_CONTROLLERS.get(vendor or 0, product)})"
+    if vendor in _ADAPTERS:
+        return f"tracker on a serial adapter, perhaps ({_ADAPTERS[vendor]})"
+    return "unknown"
+
+
 # --- The recorder's end of a reading process: pipe, bytes with arrival times, losses.
 
 # Room for six seconds of a head at 200 Hz while the writer waits for the disk.
@@ -214,10 +274,10 @@ class Stream:
             if select.select([self], [], [], left)[0]:
                 self.read()
 
-    def read(self) -> list[Piece]:
-        """Read the pieces that have come; sets `ended` after the last."""
+    def read(self, most: int = PIPE_BYTES) -> list[Piece]:
+        """Read the pieces that have come, up to so many bytes; sets `ended` after the last."""
         try:
-            data = os.read(self.pipe, PIPE_BYTES)
+            data = os.read(self.pipe, most)
         except BlockingIOError:
             return []
         if not data:

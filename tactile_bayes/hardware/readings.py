@@ -1,9 +1,10 @@
-"""Readings of devices, and their clocks."""
+"""Readings of devices, the tool that is followed, and clocks."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from typing import Final, NamedTuple, Protocol
 
 import numpy as np
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 # --- Device readings, independent of the protocol: frames, poses, identity and end of transmission.
 
 CountArray = NDArray[np.uint16]
+Quaternion = tuple[float, float, float, float]
 MM_PER_INCH: Final = 25.4
 
 
@@ -29,12 +31,23 @@ class PoseReading(NamedTuple):
     """One pose of the tracker's sensor in `base`."""
 
     position_mm: tuple[float, float, float]
-    quaternion_wxyz: tuple[float, float, float, float]
+    quaternion_wxyz: Quaternion
     """Scalar first, as the device gave it: not normalised, sign free."""
     device_ns: int | None = None  #: The tracker's clock; None when the protocol carries none.
     flags: tuple[str, ...] = ()
     """The device's objections to this pose, for example ``"error W"`` or ``"distortion 12"``."""
-    station: int = 1  #: Number of the sensor.
+    tool: str = ""  #: Which of the tracker's tools or stations; empty where it names none.
+
+
+NO_ROTATION: Final = "no rotation"
+"""Why there is no pose where a record's numbers are none of a place and a rotation."""
+
+
+class MissingReading(NamedTuple):
+    """The tracker's word that it has no pose of a tool now."""
+
+    why: str  #: In the tracker's words, for example ``"out of volume"``.
+    tool: str = ""
 
 
 class HelloReading(NamedTuple):
@@ -54,7 +67,7 @@ class EndReading(NamedTuple):
     dropped: int
 
 
-Reading = FrameReading | PoseReading | HelloReading | EndReading
+Reading = FrameReading | PoseReading | MissingReading | HelloReading | EndReading
 
 
 class Parser(Protocol):
@@ -63,6 +76,14 @@ class Parser(Protocol):
     @property
     def garbage_bytes(self) -> int:
         """Number of bytes so far that belong to no valid record."""
+
+    @property
+    def fault(self) -> str:
+        """What is wrong with the last record that could not be read; empty where nothing looked like one."""
+
+    @property
+    def remark(self) -> str:
+        """What is to be known of the records that were read; empty where they are as they should be."""
 
     def feed(self, data: bytes) -> list[Reading]:
         """Parse `data`; return the completed readings."""
@@ -75,6 +96,7 @@ class RecordParser:
     """
 
     record_bytes: int
+    fault = remark = ""
 
     def __init__(self) -> None:
         self.garbage_bytes = 0
@@ -105,6 +127,116 @@ def plausible(position_mm: Sequence[float], quaternion_wxyz: Sequence[float]) ->
     if not all(map(math.isfinite, (*position_mm, *quaternion_wxyz))):
         return False
     return max(map(abs, position_mm)) < 25_000 and abs(math.hypot(*quaternion_wxyz) - 1) < 0.009
+
+
+def printable(data: bytes) -> str:
+    """Text of a device's bytes, in which what no terminal should get, but for zeros, is a question mark."""
+    text = data.decode("utf-8", "replace").strip()
+    return "".join(letter if letter.isprintable() or letter == "\0" else "?" for letter in text)
+
+
+# --- The tool that is followed, relative to a reference tool where there is one.
+
+# Between a tool's pose and the reference's; a patient breathes 1 mm in this time at most.
+REFERENCE_NS: Final = 50_000_000
+# Names of tools that are told apart; a server may make up more.
+_MOST_OTHERS: Final = 16
+ToolReading = PoseReading | MissingReading
+
+
+class Follower:
+    """Follows one tool of a tracker: of what all of its tools send, the readings of that one.
+
+    Without a `tool` that is the first one seen. With a `reference`, poses are relative to that tool's: fixed to the
+    body, it takes breathing out. Its pose of the same moment is used, whichever of the two is sent first; where records
+    carry no time, each of the reference's poses serves the one pose of the tool beside it.
+    """
+
+    def __init__(self, tool: str | None = None, reference: str | None = None, *, inverse: bool = False) -> None:
+        self.tool, self.reference = tool, reference
+        self.others: Counter[str] = Counter()
+        """Number of readings of tools that are not followed."""
+        self._inverse = inverse
+        self._held: tuple[PoseReading, int] | None = None
+        self._base: tuple[PoseReading, int] | None = None
+        self._fresh = False
+
+    def take(self, reading: ToolReading, host_ns: int) -> Iterator[tuple[ToolReading, int]]:
+        """Readings of the tool that this one completes, with the times at which they came."""
+        if self.tool is None:
+            self.tool = reading.tool
+        if isinstance(reading, PoseReading) and self._inverse:
+            reading = reading._replace(quaternion_wxyz=_conjugate(reading.quaternion_wxyz))
+        if reading.tool == self.tool:
+            yield from self._followed(reading, host_ns)
+        elif reading.tool == self.reference:
+            yield from self._referred(reading, host_ns)
+        else:
+            self.others[reading.tool if len(self.others) < _MOST_OTHERS else "others"] += 1
+
+    def _followed(self, reading: ToolReading, host_ns: int) -> Iterator[tuple[ToolReading, int]]:
+        yield from self._release()
+        if self.reference is None or isinstance(reading, MissingReading):
+            yield reading, host_ns
+            return
+        self._held = reading, host_ns
+        base = self._base
+        if base is not None and (self._fresh or base[0].device_ns == reading.device_ns is not None):
+            yield from self._release()
+            self._fresh = False
+
+    def _referred(self, reading: ToolReading, host_ns: int) -> Iterator[tuple[ToolReading, int]]:
+        held = self._held
+        self._base, self._fresh = None, False
+        if isinstance(reading, PoseReading):
+            self._base = reading, host_ns
+            self._fresh = held is None or held[0].device_ns != reading.device_ns
+        yield from self._release()
+
+    def _release(self) -> Iterator[tuple[ToolReading, int]]:
+        if self._held is None:
+            return
+        (pose, host_ns), base = self._held, self._base
+        self._held = None
+        if base is None or abs(host_ns - base[1]) > REFERENCE_NS:
+            yield MissingReading(f"no pose of {self.reference}", pose.tool), host_ns
+        else:
+            yield relative_pose(pose, base[0]), host_ns
+
+
+def pose_from_relative(pose: PoseReading, base: PoseReading) -> PoseReading:
+    """The pose in the tracker's frame of one that is given in the frame of another tool."""
+    back = _conjugate(base.quaternion_wxyz)
+    _, x, y, z = _product(_product(base.quaternion_wxyz, (0.0, *pose.position_mm)), back)
+    a, b, c = base.position_mm
+    turn = _product(base.quaternion_wxyz, pose.quaternion_wxyz)
+    return pose._replace(position_mm=(a + x, b + y, c + z), quaternion_wxyz=turn)
+
+
+def relative_pose(pose: PoseReading, base: PoseReading) -> PoseReading:
+    """The pose in the frame of another tool, whose flags it takes over."""
+    size = math.hypot(*base.quaternion_wxyz)
+    w, i, j, k = (part / size for part in _conjugate(base.quaternion_wxyz))
+    x, y, z = (a - b for a, b in zip(pose.position_mm, base.position_mm, strict=True))
+    _, *place = _product(_product((w, i, j, k), (0.0, x, y, z)), (w, -i, -j, -k))
+    turn = _product((w, i, j, k), pose.quaternion_wxyz)
+    return pose._replace(
+        position_mm=(place[0], place[1], place[2]), quaternion_wxyz=turn, flags=(*pose.flags, *base.flags)
+    )
+
+
+def _conjugate(quaternion_wxyz: Quaternion) -> Quaternion:
+    w, i, j, k = quaternion_wxyz
+    return w, -i, -j, -k
+
+
+def _product(a: Quaternion, b: Quaternion) -> Quaternion:
+    return (
+        a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],
+        a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2],
+        a[0] * b[2] - a[1] * b[3] + a[2] * b[0] + a[3] * b[1],
+        a[0] * b[3] + a[1] * b[2] - a[2] * b[1] + a[3] * b[0],
+    )
 
 
 # More missing records than this are no loss: a silent device ends a recording long before.

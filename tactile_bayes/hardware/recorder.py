@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import select
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Final, Protocol
@@ -14,9 +15,18 @@ import numpy as np
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import DeviceError
 from tactile_bayes.geometry import FloatArray, inverse, rotation_from_quaternion
-from tactile_bayes.hardware.ports import Port, Stream
-from tactile_bayes.hardware.readings import CountArray, EndReading, FrameReading, Parser, PoseClock, PoseReading
-from tactile_bayes.mapping.select import Span, apart, overlap_cautions
+from tactile_bayes.hardware.ports import SILENT_S, Port, Stream
+from tactile_bayes.hardware.readings import (
+    CountArray,
+    EndReading,
+    Follower,
+    FrameReading,
+    MissingReading,
+    Parser,
+    PoseClock,
+    PoseReading,
+)
+from tactile_bayes.mapping.select import Jumps, Span, apart, overlap_cautions
 
 # --- Summary of a recording: what arrived, what was lost, and what makes it unfit for use.
 
@@ -24,6 +34,8 @@ from tactile_bayes.mapping.select import Span, apart, overlap_cautions
 _RATE_SHARE: Final = 0.02
 _RATE_LEAST_S: Final = 0.5
 _STUCK_POSES: Final = 10
+# Of missing or flagged poses: fewer are those of any exam.
+_TOLD_SHARE: Final = 0.01
 
 
 @dataclass(slots=True)
@@ -41,6 +53,13 @@ class Report:
     poses: int = 0
     poses_repeated: int = 0
     poses_flagged: int = 0
+    poses_missing: int = 0
+    missing_why: str = ""
+    flagged_why: str = ""
+    """`missing_why`, `flagged_why`: The tracker's reasons, each with its number."""
+    other_tools: str = ""
+    """Tools that were not followed, each with the number of its records."""
+    tracker_remark: str = ""
     poses_without_time: int = 0
     head_garbage_bytes: int = 0
     tracker_garbage_bytes: int = 0
@@ -66,6 +85,15 @@ def recording_cautions(report: Report, frames: Span, poses: Span, *, passed_s: f
     last by the host's. The head promised `rate_hz`, or nothing when that is 0.
     """
     found = [*overlap_cautions(frames, poses), *_rates(report, passed_s, rate_hz), *_counters(report)]
+    asked = report.poses + report.poses_missing
+    for number, what, why in (
+        (report.poses_missing, "missing", report.missing_why),
+        (report.poses_flagged, "flagged by the tracker", report.flagged_why),
+    ):
+        if number > _TOLD_SHARE * asked:
+            found.append(f"{number:,} of {asked:,} poses {what}: {why}")
+    if report.tracker_remark:
+        found.append(f"the tracker's {report.tracker_remark}")
     if report.poses > _STUCK_POSES and report.poses_repeated >= report.poses - 1:
         found.append("every pose is the same: the tracker does not follow the head")
     return found
@@ -152,10 +180,14 @@ class LandmarkTouch:
 
 FLUSH_S: Final = 0.2
 DRAIN_S: Final = 0.25
-SILENT_S: Final = 3.0
 # A recording with a duration goes on for so long at most when the head's clock is behind.
 OVERTIME_S: Final = 1.0
+# Kinds of reasons that are told apart: a damaged record may hold any words.
+_MOST_WHYS: Final = 12
+_MOST_TOLD: Final = 5
 _TICK_S: Final = 0.05
+# Of a tracker that sends without end, so much is read before the head's turn comes again.
+_TRACKER_BYTES: Final = 32768
 
 
 class Sink(Protocol):
@@ -203,6 +235,7 @@ class Line:
     parser: Parser
     start: bytes
     stop: bytes
+    silent_s: float = SILENT_S  #: After so long without a byte it has gone.
     heard_ns: int = 0
     finished: bool = False
 
@@ -210,10 +243,10 @@ class Line:
 class Recorder:
     """Runs one recording of devices that were checked and do not stream yet; without a tracker it has no poses.
 
-    The sink gets everything in order of arrival. `invert_rotation` turns round what a tracker gives as the rotation
-    from base to sensor. `duration_s` is by the head's clock made continuous, and at most `OVERTIME_S` longer by the
-    host's; None goes on until it is stopped. The head promised `rate_hz`, or nothing when that is 0. `clock_ns` is the
-    host time that the reading processes stamp with.
+    The sink gets everything in order of arrival, of the tracker's tools the one that `follower` follows. `duration_s`
+    is by the head's clock made continuous, and at most `OVERTIME_S` longer by the host's; None goes on until it is
+    stopped. The head promised `rate_hz`, or nothing when that is 0. `clock_ns` is the host time that the reading
+    processes stamp with.
     """
 
     def __init__(
@@ -223,7 +256,7 @@ class Recorder:
         sink: Sink,
         *,
         shared_clock: bool = False,
-        invert_rotation: bool = False,
+        follower: Follower | None = None,
         duration_s: float | None = None,
         rate_hz: float = 0.0,
         observer: Observer | None = None,
@@ -233,7 +266,11 @@ class Recorder:
         self._head, self._tracker, self._sink = head, tracker, sink
         self._lines = [line for line in (head, tracker) if line is not None]
         self._clock = PoseClock(shared=shared_clock)
-        self._invert = invert_rotation
+        self._follower = follower or Follower()
+        self._why_missing: Counter[str] = Counter()
+        self._why_flagged: Counter[str] = Counter()
+        self._unseen: MissingReading | None = None
+        self._jumps = Jumps()
         self._duration_ns = None if duration_s is None else round(duration_s * 1e9)
         self._rate_hz = rate_hz
         self._frame_span, self._pose_span = Span(), Span()
@@ -301,7 +338,7 @@ class Recorder:
         for line in self._lines:
             if line.stream not in ready:
                 continue
-            for host_ns, data in line.stream.read():
+            for host_ns, data in line.stream.read() if line is self._head else line.stream.read(_TRACKER_BYTES):
                 line.heard_ns = host_ns
                 for reading in line.parser.feed(data):
                     self._read(line, reading, host_ns)
@@ -312,8 +349,12 @@ class Recorder:
         match reading:
             case FrameReading():
                 self._frame(reading, host_ns)
-            case PoseReading():
-                self._pose(reading, host_ns)
+            case PoseReading() | MissingReading():
+                for one, came_ns in self._follower.take(reading, host_ns):
+                    if isinstance(one, PoseReading):
+                        self._pose(one, came_ns)
+                    elif self.recording:
+                        self._missing(one, came_ns)
             case EndReading():
                 self._ended(line, reading)
             case _:
@@ -342,9 +383,6 @@ class Recorder:
             self._observer.frame(reading.counts, device_ns)
 
     def _pose(self, reading: PoseReading, host_ns: int) -> None:
-        if self._invert:
-            w, i, j, k = reading.quaternion_wxyz
-            reading = reading._replace(quaternion_wxyz=(w, -i, -j, -k))
         host_ns -= self._zero_ns
         self._touched(reading, host_ns)
         if not self.recording:
@@ -360,6 +398,10 @@ class Recorder:
         self.report.poses += 1
         self._pose_ns = device_ns
         self._pose_span.add(device_ns / 1e9)
+        self._jumps.add(device_ns / 1e9, reading.position_mm)
+        if self._unseen is not None:
+            self._unseen = None
+            self._note(f"{reading.tool or 'the tool'} is seen again", "tracker", device_ns, host_ns)
         if event:
             self._note(event, "tracker", device_ns, host_ns)
         if flags:
@@ -368,9 +410,21 @@ class Recorder:
         if self._observer is not None:
             self._observer.pose(reading, device_ns)
 
+    def _missing(self, reading: MissingReading, host_ns: int) -> None:
+        """Count a pose that the tracker does not have; the file's log has where such a gap begins and ends."""
+        self.report.poses_missing += 1
+        self._why_missing[reading.why if len(self._why_missing) < _MOST_WHYS else "other"] += 1
+        if self._unseen is None:
+            text = f"no pose of {reading.tool or 'the tool'} from here on: {reading.why}"
+            self._note(text, "tracker", max(0, self._pose_ns), host_ns - self._zero_ns)
+        self._unseen = reading
+
     def _flags(self, reading: PoseReading) -> tuple[str, ...]:
         """Flags that the device set on a pose, and whether it repeats the last one."""
         self.report.poses_flagged += bool(reading.flags)
+        for flag in reading.flags:
+            kind = flag.rstrip("-0123456789 ")
+            self._why_flagged[kind if len(self._why_flagged) < _MOST_WHYS else "other"] += 1
         last, self._last_pose = self._last_pose, reading
         if last is None or (last.position_mm, last.quaternion_wxyz) != (reading.position_mm, reading.quaternion_wxyz):
             return reading.flags
@@ -406,8 +460,9 @@ class Recorder:
         if self.report.ended_by:
             return
         lost = f"after {self.report.duration_s:.2f} s" if self.report.frames else "before the first frame"
+        kept = "; what came before is in the file" if self.report.frames else ""
         self.report.fault = (
-            f"{line.port.name}: more data was expected, the device has gone {lost}; check its cable and record again"
+            f"{line.port.name}: more data was expected, the device has gone {lost}{kept}; {line.port.remedy}"
         )
         self.stop(f"the {line.role} has gone")
 
@@ -416,10 +471,11 @@ class Recorder:
             return
         for line in self._lines:
             silent_s = (now_ns - line.heard_ns) / 1e9
-            if silent_s > SILENT_S and not line.finished:
+            if silent_s > line.silent_s and not line.finished and not select.select([line.stream], [], [], 0)[0]:
+                kept = "; what came before is in the file" if self.report.frames else ""
                 self.report.fault = (
-                    f"{line.port.name}: more data was expected, nothing has come for {silent_s:.1f} s; check that the "
-                    "device runs and record again"
+                    f"{line.port.name}: more data was expected, nothing has come for {silent_s:.1f} s{kept}; check "
+                    "that the device runs"
                 )
                 self.stop(f"the {line.role} fell silent")
 
@@ -436,13 +492,19 @@ class Recorder:
         report, clock = self.report, self._clock
         report.head_clock_steps, report.head_clock_wraps = clock.head.steps, clock.head.wraps
         report.tracker_clock_steps, report.tracker_clock_wraps = clock.tracker.steps, clock.tracker.wraps
+        report.missing_why, report.flagged_why = _numbers(self._why_missing), _numbers(self._why_flagged)
+        report.other_tools = _numbers(self._follower.others)
+        report.tracker_remark = self._tracker.parser.remark if self._tracker else ""
         passed_s = (self._heard_ns - self._begun_ns) / 1e9
         spans = self._frame_span, self._pose_span
         report.cautions = recording_cautions(report, *spans, passed_s=passed_s, rate_hz=self._rate_hz)
+        report.cautions += self._jumps.cautions()
+        if self._head.parser.fault:
+            report.cautions.append(f"the head's line: {self._head.parser.fault}")
         if self._tracker is not None and report.frames and not report.fault and apart(*spans):
             report.fault = (
-                f"{self._tracker.port.name}: none of its {report.poses} poses was measured while frames came; check "
-                "that it runs, and record again"
+                f"{self._tracker.port.name}: none of its {report.poses} poses was measured while frames came"
+                + (f" ({report.poses_missing:,} missing: {report.missing_why})" if report.poses_missing else "")
             )
 
     def _done(self) -> bool:
@@ -467,6 +529,13 @@ class Recorder:
             with contextlib.suppress(DeviceError):
                 line.port.write(line.stop)
             line.stream.stop()
+
+
+def _numbers(counted: Counter[str]) -> str:
+    """Words with their numbers, the most frequent first."""
+    told = [f"{word or 'one without a name'} {number:,}" for word, number in counted.most_common(_MOST_TOLD)]
+    more = [f"and {len(counted) - _MOST_TOLD} more"] if len(counted) > _MOST_TOLD else []
+    return ", ".join(told + more)
 
 
 def _oddities(reading: FrameReading, event: str) -> Iterator[str]:

@@ -6,20 +6,20 @@ import math
 import re
 import struct
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from serial.tools.list_ports import comports
-
 from tactile_bayes.declarations import Record
-from tactile_bayes.errors import DeviceError
+from tactile_bayes.errors import DeviceError, UsageError
 from tactile_bayes.hardware import head
 from tactile_bayes.hardware.head import DEFAULT_BAUD, HeadParser, encode_command
-from tactile_bayes.hardware.ports import ANSWER_S, Port, shown
+from tactile_bayes.hardware.ports import ANSWER_S, SILENT_S, Port, shown
 from tactile_bayes.hardware.readings import (
     MM_PER_INCH,
+    NO_ROTATION,
     HelloReading,
+    MissingReading,
     Parser,
     PoseReading,
     Reading,
@@ -58,7 +58,7 @@ class BirdParser(RecordParser):
         step = self._scale / 32768 * MM_PER_INCH
         if not plausible((x * step, y * step, z * step), (w, i, j, k)):
             return None
-        return PoseReading((x * step, y * step, z * step), (w, i, j, k), station=record[-1] if self._group else 1)
+        return PoseReading((x * step, y * step, z * step), (w, i, j, k), tool=str(record[-1]) if self._group else "")
 
 
 def word(low: int, high: int) -> int:
@@ -136,7 +136,7 @@ class FastrakParser(RecordParser):
         if values is None:
             return None
         flags = () if error == b" " else (f"error {error.decode()}",)
-        return pose_from_items(values, flags=flags, station=station)
+        return pose_from_items(values, flags=flags, tool=str(station))
 
     def _values(self, record: bytes) -> dict[str, tuple[float, ...]] | None:
         values, place = {}, 3
@@ -198,11 +198,13 @@ class LibertyParser(RecordParser):
         for kind in self._kinds:
             values[kind] = tuple(next(raw) for _ in range(_NUMBERS.get(kind, 1)))
         flags = () if error == 0x20 else (f"error {chr(error) if 0x20 < error < 0x7F else error}",)
-        return pose_from_items(values, flags=flags, station=station)
+        return pose_from_items(values, flags=flags, tool=str(station))
 
 
 class LibertyAsciiParser:
     """Parser of LIBERTY and PATRIOT text records: station, error, then numbers between spaces."""
+
+    fault = remark = ""
 
     def __init__(self, items: Sequence[int] = LIBERTY_ASCII) -> None:
         self.garbage_bytes = 0
@@ -235,11 +237,11 @@ class LibertyAsciiParser:
         numbers = iter(float(word) for word in words)
         values = {kind: tuple(next(numbers) for _ in range(_NUMBERS.get(kind, 1))) for kind in self._kinds}
         flags = () if error == b" " else (f"error {error.decode()}",)
-        return pose_from_items(values, flags=flags, station=int(station))
+        return pose_from_items(values, flags=flags, tool=str(int(station)))
 
 
 def pose_from_items(
-    values: Mapping[str, tuple[float, ...]], *, flags: tuple[str, ...], station: int
+    values: Mapping[str, tuple[float, ...]], *, flags: tuple[str, ...], tool: str
 ) -> PoseReading | None:
     """Pose from a record's items in inches; None for items that cannot be a pose."""
     position = [number * MM_PER_INCH for number in values["position"]]
@@ -251,9 +253,7 @@ def pose_from_items(
     x, y, z = position
     w, i, j, k = quaternion
     time_ms = values.get("time_ms")
-    return PoseReading(
-        (x, y, z), (w, i, j, k), None if time_ms is None else int(time_ms[0]) * 1_000_000, flags, station
-    )
+    return PoseReading((x, y, z), (w, i, j, k), None if time_ms is None else int(time_ms[0]) * 1_000_000, flags, tool)
 
 
 def quaternion_from_euler(azimuth_deg: float, elevation_deg: float, roll_deg: float) -> tuple[float, ...]:
@@ -272,6 +272,31 @@ def quaternion_from_euler(azimuth_deg: float, elevation_deg: float, roll_deg: fl
 
 _BETWEEN_COMMANDS_S: Final = 0.02
 _ASK_AGAIN_S: Final = 0.5
+# After the first record, for those of other tools.
+_LISTEN_S: Final = 0.25
+_MOST_TOOLS: Final = 64
+_MOST_KEPT: Final = 65536
+# A board may restart when its port is opened: so long it is waited for, and so long while it says things.
+_RESTART_S: Final = 4.0
+_BOOT_S: Final = 12.0
+
+
+class Answer(NamedTuple):
+    """What a tracker answered before a recording."""
+
+    parser: Callable[[], Parser]  #: Makes the parser that its records need.
+    hello: HelloReading | None
+    tools: Mapping[str, str]  #: Why a tool has no pose just now, by its name; empty where it has one.
+    remark: str  #: What is to be known of its records.
+    tool: str
+    """`tool`, `reference`: Names of the tools to follow, in full."""
+    reference: str | None
+
+    @property
+    def unseen(self) -> str:
+        """The tools followed that are not seen just now, in words; empty where all are."""
+        followed = [name for name in (self.tool, self.reference) if name is not None and self.tools.get(name)]
+        return ", ".join(f"{name} ({self.tools[name]})" for name in followed)
 
 
 class TrackerDriver(Record):
@@ -285,71 +310,185 @@ class TrackerDriver(Record):
     start: bytes = b""
     stop: bytes = b""
     """`single`, `start`, `stop`: Commands for one record, for a stream of them, and for its end."""
+    several: tuple[bytes, ...] = ()  #: Commands after which records say whose they are, where a tool is named.
+    other_parser: Callable[[], Parser] | None = None  #: Of records in the other form that the device may be set to.
     has_clock: bool = False  #: Its records carry the tracker's own time.
-    hint: str = "check its power, cable and line rate, or give another --tracker-protocol"
+    silent_s: float = SILENT_S  #: After so long without a byte it has gone; a server may send nothing of a hidden tool.
+    hint: str = "check its power, cable and line rate"
     """Advice when nothing comes."""
 
-    def check(self, port: Port) -> PoseReading | HelloReading:
-        """Set the tracker up and ask for one record; one that does not fit the protocol is a DeviceError."""
+    def check(self, port: Port, *, tool: str | None = None, reference: str | None = None) -> Answer:
+        """Set the tracker up, ask for records and choose the tools to follow.
+
+        Raises
+        ------
+        DeviceError
+            When no record comes that fits the protocol, or none of a tool that is asked for.
+        UsageError
+            When it sends several tools and none was chosen.
+        """
+        before = self._prepare(port, several=bool(tool or reference))
+        best, came = self._listen(port, tool, reference)
+        if not best.answered or (best.tools and set(best.tools.values()) == {NO_ROTATION}):
+            raise DeviceError(f"{port.name}: {self._unfit(best.parser, before, came, rate=port.has_line_rate)}")
+        followed = _chosen(best.tools, tool, reference, port)
+        return Answer(best.maker, best.hello, best.tools, best.parser.remark, *followed)
+
+    def _prepare(self, port: Port, *, several: bool) -> bytes:
+        """Set the tracker up; returns what came before it was asked for records."""
+        came = b""
         if self.stop:
             port.write(self.stop)
-            port.drain()
-        for command in self.configure:
+            came = port.drain()
+        for command in (*self.configure, *(self.several if several else ())):
             port.write(command)
             time.sleep(_BETWEEN_COMMANDS_S)
-        if self.configure:
-            port.drain()
-        if self.single:
-            port.write(self.single)
-        parser, came = self.parser(), b""
-        end = time.monotonic() + ANSWER_S
-        while time.monotonic() < end:
-            data = port.read_some(0.1)
-            came += data
-            for reading in parser.feed(data):
-                if isinstance(reading, PoseReading | HelloReading):
-                    return reading
-        raise DeviceError(
-            f"{port.name}: a record of a {self.title} was expected, {shown(came)} came ({len(came)} bytes); {self.hint}"
+        return came + port.drain() if self.configure else came
+
+    def _listen(self, port: Port, *wanted: str | None) -> tuple[_Try, bytes]:
+        """Ask for records and read them in the form that fits best, for a while after the first of the tools wanted."""
+        port.write(self.single)
+        makers = [self.parser, *([self.other_parser] if self.other_parser else [])]
+        tries, came, heard, end = [_Try(maker, maker()) for maker in makers], b"", 0.0, time.monotonic() + ANSWER_S
+        while (now := time.monotonic()) < end:
+            if heard and now - heard > _LISTEN_S and all(map(tries[0].has, wanted)):
+                break
+            data = port.read_some(_LISTEN_S / 2)
+            came += data[: _MOST_KEPT - len(came)]
+            for one in tries:
+                one.feed(data)
+            tries.sort(key=lambda one: (not one.answered, one.parser.garbage_bytes))
+            heard = heard or (time.monotonic() if tries[0].answered else 0.0)
+        return tries[0], came
+
+    def _unfit(self, parser: Parser, before: bytes, came: bytes, *, rate: bool) -> str:
+        """What came in place of a record."""
+        wanted = f"a record of {self.title} was expected"
+        if parser.fault:
+            return f"{wanted}; {parser.fault}"
+        if not came:
+            before_words = f" (before it was asked: {shown(before)})" if before else ""
+            return f"{wanted}, nothing came{before_words}; {self.hint}"
+        what = f"{wanted}, {shown(came)} came ({len(came)} bytes)"
+        for name, driver in TRACKERS.items():
+            if sum(isinstance(one, PoseReading | HelloReading) for one in driver.parser().feed(before + came)) > 1:
+                return f"{what}: these are records of {driver.title}; give --tracker-protocol {name}"
+        return f"{what}; give another --tracker-protocol{', or its line rate' if rate else ''}"
+
+
+class _Try:
+    """One form of a protocol's records, tried on what comes."""
+
+    def __init__(self, maker: Callable[[], Parser], parser: Parser) -> None:
+        self.maker, self.parser = maker, parser
+        self.hello: HelloReading | None = None
+        self.tools: dict[str, str] = {}
+
+    @property
+    def answered(self) -> bool:
+        """True when a record came."""
+        return bool(self.tools or self.hello)
+
+    def has(self, name: str | None) -> bool:
+        """True when a tool has come, or none is asked for."""
+        return name is None or bool(_called(self.tools, name))
+
+    def feed(self, data: bytes) -> None:
+        """Parse `data`."""
+        for reading in self.parser.feed(data):
+            if isinstance(reading, HelloReading):
+                self.hello = reading
+            elif isinstance(reading, PoseReading | MissingReading) and len(self.tools) < _MOST_TOOLS:
+                why = reading.why if isinstance(reading, MissingReading) else ""
+                self.tools[reading.tool] = self.tools.get(reading.tool, why) and why
+
+
+def _called(tools: Iterable[str], name: str) -> list[str]:
+    """Tools by a name: in full, or without the frame they are given in (ProbeToTracker) or the part number."""
+    return [name] if name in tools else [one for one in tools if re.match(rf"{re.escape(name)}(To[A-Z]|-)", one)]
+
+
+def _chosen(tools: Mapping[str, str], tool: str | None, reference: str | None, port: Port) -> tuple[str, str | None]:
+    """Full names of the tool to follow and of the reference."""
+    listed = ", ".join(f"{name!r}{f' (no pose: {why})' if why else ''}" for name, why in sorted(tools.items()))
+    full: list[str | None] = []
+    for name, option in ((tool, "--tool"), (reference, "--reference")):
+        found = [] if name is None else _called(tools, name)
+        if name is not None and len(found) != 1:
+            what = f"{len(found)} tools are called {name!r}" if found else f"no pose of a tool {name!r} comes"
+            raise DeviceError(
+                f"{port.name}: {what}; it sends {listed or 'one without a name'}: give {option} one of them"
+            )
+        full.append(found[0] if found else None)
+    left = [name for name in tools if name != full[1]]
+    if full[0] is None and len(left) > 1:
+        raise UsageError(
+            f"{port.name} sends several tools: {listed}; name the one on the head with --tool, and one that is fixed "
+            "to the body with --reference"
         )
+    followed = full[0] if full[0] is not None else (left[0] if left else "")
+    if followed == full[1] or (reference is not None and not left):
+        raise UsageError(f"{port.name}: the tool and its reference are both {full[1]!r}; give two tools")
+    return followed, full[1]
+
+
+def _fastrak_items(items: bytes) -> tuple[bytes, ...]:
+    """Commands that set the items of each station's records: the command knows no station for all."""
+    return tuple(b"O%d,%b\r" % (station, items) for station in range(1, 5))
 
 
 TRACKERS: Final[dict[str, TrackerDriver]] = {
     "fastrak": TrackerDriver(
-        "Polhemus FASTRAK (binary)", 115_200, FastrakParser, (b"U", b"O1,2,11,0\r", b"f"), b"P", b"C", b"c"
+        "a Polhemus FASTRAK (binary)",
+        115_200,
+        FastrakParser,
+        (b"U", *_fastrak_items(b"2,11,0"), b"f"),
+        b"P",
+        b"C",
+        b"c",
     ),
     "fastrak-ascii": TrackerDriver(
-        "Polhemus FASTRAK (ASCII)",
+        "a Polhemus FASTRAK (ASCII)",
         115_200,
         lambda: FastrakParser(FASTRAK_ASCII, binary=False),
-        (b"U", b"O1,2,11,1\r", b"F"),
+        (b"U", *_fastrak_items(b"2,11,1"), b"F"),
         b"P",
         b"C",
         b"c",
     ),
     "liberty": TrackerDriver(
-        "Polhemus LIBERTY or PATRIOT (binary)",
+        "a Polhemus LIBERTY or PATRIOT (binary)",
         115_200,
         LibertyParser,
-        (b"U0\r", b"F1\r", b"O1,2,7,8,11,0\r", b"Q0\r"),
+        (b"U0\r", b"F1\r", b"O*,2,7,8,11,0\r", b"Q0\r"),
         b"P",
         b"C\r",
         b"P",
         has_clock=True,
     ),
     "liberty-ascii": TrackerDriver(
-        "Polhemus LIBERTY or PATRIOT (ASCII)",
+        "a Polhemus LIBERTY or PATRIOT (ASCII)",
         115_200,
         LibertyAsciiParser,
-        (b"U0\r", b"F0\r", b"O1,2,7,8,11,1\r", b"Q0\r"),
+        (b"U0\r", b"F0\r", b"O*,2,7,8,11,1\r", b"Q0\r"),
         b"P",
         b"C\r",
         b"P",
         has_clock=True,
     ),
-    "bird": TrackerDriver("Ascension Flock of Birds", 115_200, BirdParser, (b"]",), b"B", b"@", b"B"),
+    "bird": TrackerDriver(
+        "an Ascension Flock of Birds",
+        115_200,
+        BirdParser,
+        (b"]",),
+        b"BB",  # two: only the second shows whether an address ended the first
+        b"@",
+        b"B",
+        several=(b"P\x23\x01",),  # group mode
+        other_parser=lambda: BirdParser(group=True),
+    ),
     "open": TrackerDriver(
-        "tracker in the open framing",
+        "a tracker in the open framing",
         head.DEFAULT_BAUD,
         HeadParser,
         (),
@@ -359,14 +498,15 @@ TRACKERS: Final[dict[str, TrackerDriver]] = {
         has_clock=True,
     ),
     "igtlink": TrackerDriver(
-        "OpenIGTLink server (PLUS, 3D Slicer)",
+        "an OpenIGTLink server (PLUS, 3D Slicer)",
         0,
         IgtlinkParser,
         has_clock=True,
-        hint="give socket://HOST:18944 and start its stream",
+        silent_s=30.0,
+        hint="start its stream, with a tool in sight",
     ),
     "ndi": TrackerDriver(
-        "NDI Polaris, Vega or Aurora",
+        "an NDI Polaris, Vega or Aurora",
         0,
         HeadParser,
         (),
@@ -390,62 +530,31 @@ def open_tracker(protocol: str, url: str, *, baud: int | None = None, rom: Path 
 def check_head(port: Port, *, every: int = 1) -> HelloReading:
     """Ask a head for its identity, and refuse a line too slow for its frames."""
     port.write(encode_command(head.STOP))
-    port.drain()
-    parser, came, end = HeadParser(), b"", time.monotonic() + ANSWER_S
-    while time.monotonic() < end and parser.hello is None:
-        port.write(encode_command(head.ASK))  # again and again: one may get lost
+    came, parser, begun = port.drain(), HeadParser(), time.monotonic()
+    heard = begun
+    while parser.hello is None and time.monotonic() < min(heard + _RESTART_S, begun + _BOOT_S):
+        port.write(encode_command(head.ASK))  # again and again: one may get lost, and a board may restart meanwhile
         data = port.read_some(_ASK_AGAIN_S)
-        came += data
+        heard = time.monotonic() if data else heard
+        came += data[: _MOST_KEPT - len(came)]
         parser.feed(data)
     if parser.hello is None:
-        raise DeviceError(
-            f"{port.name}: a HELLO packet was expected, {shown(came)} came ({len(came)} bytes); check its power and "
-            "cable, and the layout in docs/scan-head-protocol.md"
-        )
+        raise DeviceError(f"{port.name}: a HELLO packet was expected, {_no_hello(parser, came, port)}")
     if port.has_line_rate:
         head.check_link_rate(parser.hello, baud=port.baud, every=every, port=port.name)
     return parser.hello
 
 
-# --- Detection of serial ports and of the devices on them.
-
-# USB vendors, by what they make.
-_TRACKER_MAKERS: Final = {0x0F44: "Polhemus"}
-_CONTROLLERS: Final = {
-    0x2341: "Arduino",
-    0x16C0: "Teensy",
-    0x2E8A: "Raspberry Pi Pico",
-    0x0483: "ST",
-    0x303A: "Espressif",
-    0x1366: "SEGGER",
-    0x239A: "Adafruit",
-}
-_ADAPTERS: Final = {0x0403: "FTDI", 0x10C4: "Silicon Labs", 0x067B: "Prolific", 0x1A86: "WCH"}
-
-
-class FoundPort(NamedTuple):
-    """A port: its URL, the system's description, the device probably on it."""
-
-    url: str
-    description: str
-    guess: str
-
-
-def list_ports() -> list[FoundPort]:
-    """List the system's ports, in order, with a guess from their USB ids; opens none of them."""
-    found = [FoundPort(port.device, port.description or "", guess(port.vid, port.product or "")) for port in comports()]
-    return sorted(found)
-
-
-def guess(vendor: int | None, product: str) -> str:
-    """Guess the device on a port from its USB vendor and product name."""
-    if vendor in _TRACKER_MAKERS:
-        return f"tracker ({_TRACKER_MAKERS[vendor]})"
-    if vendor in _CONTROLLERS or "head" in product.lower():
-        return f"scan head, perhaps ({_CONTROLLERS.get(vendor or 0, product)})"
-    if vendor in _ADAPTERS:
-        return f"tracker on a serial adapter, perhaps ({_ADAPTERS[vendor]})"
-    return "unknown"
+def _no_hello(parser: HeadParser, came: bytes, port: Port) -> str:
+    """What came in place of a HELLO."""
+    if parser.fault:
+        return f"but {parser.fault}; the layout is in docs/scan-head-protocol.md"
+    if not came:
+        return f"nothing came; check its power and {'cable' if port.has_line_rate else 'its server'}"
+    for driver in TRACKERS.values():
+        if any(isinstance(one, PoseReading) for one in driver.parser().feed(came)):
+            return f"records of {driver.title} came; give the port of the head"
+    return f"{shown(came)} came ({len(came)} bytes); give its line rate with --head-baud, or the head's port"
 
 
 def probe(url: str) -> str:
@@ -467,6 +576,8 @@ def probe(url: str) -> str:
             driver.check(port)
         except DeviceError:
             continue
+        except UsageError as error:  # several tools
+            return f"{driver.title}: --tracker-protocol {name}; {error}"
         else:
             return f"{driver.title}: --tracker-protocol {name}"
         finally:

@@ -4,39 +4,41 @@ from __future__ import annotations
 
 import importlib
 import os
+import re
 import select
 import socket
 import struct
 import subprocess
 import sys
 import time
-from functools import cache
+from collections.abc import Mapping
+from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tactile_bayes.errors import DeviceError
-from tactile_bayes.geometry import quaternion_from_rotation
+from tactile_bayes.geometry import FloatArray, quaternion_from_rotation
 from tactile_bayes.hardware import head
 from tactile_bayes.hardware.head import PacketParser
 from tactile_bayes.hardware.ports import Port
-from tactile_bayes.hardware.readings import HelloReading, PoseReading, Reading, plausible
+from tactile_bayes.hardware.readings import (
+    NO_ROTATION,
+    HelloReading,
+    MissingReading,
+    PoseReading,
+    Reading,
+    ToolReading,
+    plausible,
+    printable,
+)
 
 # --- CRC-64 as OpenIGTLink uses it: polynomial of ECMA-182, initial value 0, nothing inverted or reflected.
-#
-# The CRC of a message is the message as a polynomial over GF(2), times x^64, modulo the polynomial. That is linear:
-# a long message is folded in halves, all pairs of 64-bit words at once, with tables for the multiplication by x^(64
-# k).
-
-Words = NDArray[np.uint64]
 
 POLYNOMIAL: Final = 0x42F0E1EBA9EA3693
 _BITS: Final = 0xFFFF_FFFF_FFFF_FFFF
-# Shorter messages cost less byte by byte than numpy's calls do.
-_SHORT: Final = 2048
 
 
 def _byte_table() -> tuple[int, ...]:
@@ -55,136 +57,259 @@ _TABLE: Final = _byte_table()
 
 def crc64(data: bytes) -> int:
     """CRC-64/ECMA-182; of ``123456789`` it is 0x6C40DF5F0B497347."""
-    return _bytewise(data) if len(data) < _SHORT else _folded(data)
-
-
-def _bytewise(data: bytes) -> int:
     crc = 0
     for byte in data:
         crc = (crc << 8 ^ _TABLE[crc >> 56 ^ byte]) & _BITS
     return crc
 
 
-def _folded(data: bytes) -> int:
-    """As `crc64`, in numpy; leading zeros do not change a CRC."""
-    levels = max(0, (-(-len(data) // 8) - 1).bit_length())
-    whole = data.rjust(8 << levels, b"\0")
-    words = np.frombuffer(whole, dtype=">u8").astype(np.uint64)
-    for level in range(levels):
-        words = _times_power(words[0::2], level) ^ words[1::2]
-    return int(_times_power(words, 0)[0])
-
-
-def _times_power(words: Words, level: int) -> Words:
-    """Each word times x^(64 2^level), modulo the polynomial."""
-    tables, places = _tables(level), np.ascontiguousarray(words, dtype="<u8").view(np.uint8).reshape(-1, 8)
-    product: Words = tables[0][places[:, 0]]
-    for number in range(1, 8):
-        product ^= tables[number][places[:, number]]
-    return product.reshape(words.shape)
-
-
-@cache
-def _tables(level: int) -> Words:
-    """(8, 256) products of a byte, in each of its eight places in a word, and x^(64 2^level)."""
-    if level:
-        return _times_power(_tables(level - 1), level - 1)
-    single = [[(byte << 8 * place).to_bytes(8, "big") for byte in range(256)] for place in range(8)]
-    return np.array([[_bytewise(word) for word in row] for row in single], dtype=np.uint64)
-
-
-# --- Parser for OpenIGTLink TRANSFORM messages, as PlusServer and 3D Slicer send them over TCP.
+# --- Parser for the poses that OpenIGTLink servers (PLUS, 3D Slicer) send over TCP.
 #
-# A message is a header of 58 bytes and a body, big-endian, with a CRC-64 of the body. A transform's body is the 3 x
-# 4 matrix column by column, float32, in mm.
+# A message is a header of 58 bytes and a body, big-endian, with a CRC-64 of the body. From header version 2 on
+# (protocol version 3) the body is an extended header, the content, and metadata: pairs of key and value, of which
+# TransformValid and TransformStatus (PLUS, 3D Slicer) say whether the tool is seen. Lengths are in mm.
+#
+# References
+# ----------
+# OpenIGTLink protocol, version 3.0 (2017): header, TRANSFORM, POSITION (QTRANS), TDATA, QTDATA; igtl_qtdata.h for the
+# names of the last, which have 20 bytes there and in use, and 32 in the text.
 
 _HEADER: Final = struct.Struct(">H12s20sIIQQ")  # version, type, device, s, fraction, body size, CRC
-_BODY: Final = struct.Struct(">12f")
-_KIND_AT: Final = 2
-_TRANSFORM: Final = b"TRANSFORM\0\0\0"
-_LONGEST: Final = 1 << 20
+_EXTENDED: Final = struct.Struct(">HHII")  # its own size, sizes of the metadata's header and body, message number
+_PAIR: Final = struct.Struct(">HHI")  # key size, encoding, value size
+_MATRIX: Final = struct.Struct(">12f")  # columns of the rotation, position
+_QUATERNION: Final = struct.Struct(">7f")  # position, quaternion with its scalar last
+_NAME_BYTES: Final = 20
+_NAMED: Final = _NAME_BYTES + 2  # name, kind and a spare byte before the numbers of a tool
+# Bytes before the numbers of each tool, and the numbers, by type.
+_POSES: Final[dict[bytes, tuple[int, struct.Struct]]] = {
+    b"TRANSFORM": (0, _MATRIX),
+    b"POSITION": (0, _QUATERNION),
+    b"QTRANS": (0, _QUATERNION),
+    b"TDATA": (_NAMED, _MATRIX),
+    b"QTDATA": (_NAMED, _QUATERNION),
+}
+_KINDS: Final = tuple(kind + b"\0" for kind in _POSES)
+_POSE_HEADER: Final = re.compile(rb"\0[\x01-\x03](?:%b)\0" % b"|".join(_POSES))
+_ANY_HEADER: Final = re.compile(rb"\0[\x01-\x03][A-Z][A-Z0-9_]{1,11}\0")
+_TURNED_HEADER: Final = re.compile(rb"[\x01-\x03]\0(?:%b)\0" % b"|".join(_POSES))
+_LONGEST: Final = 1 << 14  # body of a message with poses
+_MOST_LOOKS: Final = 8
+# Bytes whose checksums are computed for the bytes that come: sound messages need each once.
+_FEWEST_CHECKED: Final = 1 << 15
+_CHECKED_SHARE: Final = 4
+_MOST_KINDS: Final = 5
 _RIGID_SLACK: Final = 0.02
+# TransformStatus of a tool in sight; 3D Slicer's UNKNOWN is of a transform of which nobody stated one.
+_IN_SIGHT: Final = ("OK", "UNKNOWN")
 
 
 class IgtlinkParser:
-    """Parser of one device name's TRANSFORM messages (any device's, when empty); skips other messages.
+    """Parser of messages with poses; it passes over others, whatever their size.
 
-    The header has no checksum: a spoilt size may claim a megabyte of what follows. While a message waits for its end, a
-    whole transform inside it shows that the size was wrong.
+    The header has no checksum, so a spoilt size may claim much of what follows: wherever a message is passed over or
+    waited for, a whole one with poses inside shows that the size was wrong. A checksum of 0 counts as none. An exact
+    identity is what servers send of a tool out of sight.
     """
 
-    def __init__(self, *, device: str = "") -> None:
+    def __init__(self) -> None:
         self.garbage_bytes = 0
-        self._device = device.encode()
+        self.fault = self.remark = ""
         self._rest = b""
+        self._checks = 0
+        self._over = 0  # bytes still to come of a message without poses
+        self._others: set[str] = set()
 
     def feed(self, data: bytes) -> list[Reading]:
-        """Parse `data`; return the completed poses."""
+        """Parse `data`; return the completed readings."""
         buffer, place = self._rest + data, 0
         found: list[Reading] = []
+        self._checks = _FEWEST_CHECKED + _CHECKED_SHARE * len(data)
         while len(buffer) - place >= _HEADER.size:
-            version, kind, device, seconds, fraction, size, crc = _HEADER.unpack_from(buffer, place)
-            if not 1 <= version <= 3 or size > _LONGEST or not kind.rstrip(b"\0").isalnum():
-                place += 1
-                self.garbage_bytes += 1
-                continue
-            end = place + _HEADER.size + size
-            if end > len(buffer):
-                inside = _whole_transform(buffer, place + 1)
-                if inside < 0:
+            if self._checks < 0:  # headers after headers: somebody wants this program to be busy
+                self.garbage_bytes, self._over, place = self.garbage_bytes + len(buffer) - place, 0, len(buffer)
+                break
+            readings: list[Reading] = []
+            used = self._message(buffer, place, readings) if _POSE_HEADER.match(buffer, place) else -1
+            if used < 0:
+                used = self._pass_over(buffer, place)
+            elif used:
+                self._over = 0
+            else:  # it waits for its end
+                used = self._whole_inside(buffer, place) - place
+                self.garbage_bytes += used
+                if not used:
                     break
-                self.garbage_bytes += inside - place
-                place = inside
-                continue
-            body = buffer[place + _HEADER.size : end]
-            if crc64(body) != crc:
-                place += 1
-                self.garbage_bytes += 1
-                continue
-            place = end
-            wanted = not self._device or device.rstrip(b"\0") == self._device
-            if kind == _TRANSFORM and size == _BODY.size and wanted:
-                found += _pose(body, seconds, fraction)
+            place += used
+            found += readings
         self._rest = buffer[place:]
         return found
 
-
-def _whole_transform(buffer: bytes, start: int) -> int:
-    """Index of the first valid transform from `start` on; -1 without one."""
-    place = buffer.find(_TRANSFORM, start + _KIND_AT)
-    while place >= 0:
-        begin = place - _KIND_AT
-        end = begin + _HEADER.size + _BODY.size
-        if end > len(buffer):
+    def _message(self, buffer: bytes, place: int, found: list[Reading]) -> int:
+        """Size of a message with poses, whose readings go to `found`; 0 while its end is missing, -1 for none."""
+        size: int
+        version, kind, device, seconds, fraction, size, crc = _HEADER.unpack_from(buffer, place)
+        kind, tool, end = kind.rstrip(b"\0"), _name(device), place + _HEADER.size + size
+        if kind not in _POSES:
+            return -1  # something stands in the padding
+        if size > _LONGEST or (version == 1 and not _fits(kind, size)):
+            self.fault = f"{kind.decode()} of {tool!r} has a body of {size} bytes"
             return -1
-        version, _, _, _, _, size, crc = _HEADER.unpack_from(buffer, begin)
-        if 1 <= version <= 3 and size == _BODY.size and crc64(buffer[end - size : end]) == crc:
-            return begin
-        place = buffer.find(_TRANSFORM, place + 1)
-    return -1
+        if end > len(buffer):
+            return 0
+        body = buffer[place + _HEADER.size : end]
+        self._checks -= size
+        if crc and (right := crc64(body)) != crc:
+            self.fault = f"{kind.decode()} of {tool!r} has the checksum {crc:016x}, its body gives {right:016x}"
+            return -1
+        content, facts = _parts(body, version, kind)
+        if content is None:
+            self.fault = f"{kind.decode()} of {tool!r}, header version {version}, has a body of {size} bytes"
+            return -1
+        if not crc:
+            self.remark = "records carry no checksum (CRC 0), so damaged ones pass for poses"
+        device_ns = seconds * 1_000_000_000 + (fraction * 1_000_000_000 >> 32) or None
+        head, numbers = _POSES[kind]
+        for start in range(0, len(content), head + numbers.size):
+            name = _name(content[start : start + _NAME_BYTES]) if head else tool
+            values = numbers.unpack_from(content, start + head)
+            found.append(self._reading(values, tool=name, unseen=_unseen(facts), device_ns=device_ns))
+        return end - place
+
+    def _reading(self, values: tuple[float, ...], *, tool: str, unseen: str, device_ns: int | None) -> Reading:
+        x, y, z = values[-3:] if len(values) == _COLUMNS else values[:3]
+        turn = _turn_of_matrix(values[:-3]) if len(values) == _COLUMNS else (values[6], *values[3:6])
+        if unseen:
+            return MissingReading(unseen, tool)
+        if turn is None or not plausible((x, y, z), turn):
+            self.fault = f"what {tool!r} sends is no rotation and place in mm: {' '.join(f'{v:g}' for v in values)}"
+            return MissingReading(NO_ROTATION, tool)
+        if (x, y, z, *map(abs, turn)) == (0, 0, 0, 1, 0, 0, 0):
+            return MissingReading("identity sent", tool)
+        return PoseReading((x, y, z), (turn[0], turn[1], turn[2], turn[3]), device_ns, tool=tool)
+
+    def _whole_inside(self, buffer: bytes, place: int) -> int:
+        """Index of the first whole message with poses behind a place; the place itself without one."""
+        inside = place
+        for _ in range(_MOST_LOOKS):
+            inside = _find_header(buffer, inside + 1)
+            if inside < 0 or inside + _HEADER.size > len(buffer):
+                break
+            if self._message(buffer, inside, []) > 0:
+                return inside
+        return place
+
+    def _pass_over(self, buffer: bytes, place: int) -> int:
+        """Bytes to leave out before the next place where a message with poses may begin; counts those of no message."""
+        if not self._over and (header := _ANY_HEADER.match(buffer, place)):
+            kind, size = header[0][2:-1], _HEADER.unpack_from(buffer, place)[5]
+            if kind not in _POSES:
+                self._over = _HEADER.size + size
+                self._note_other(kind.decode())
+        if self._over:
+            begin = _find_header(buffer, place + 1)
+        else:
+            found = _ANY_HEADER.search(buffer, place + 1)
+            begin = found.start() if found else -1
+        used = (begin if begin >= 0 else max(place + 1, len(buffer) - _HEADER.size + 1)) - place
+        if self._over:
+            used = min(used, self._over)
+            self._over -= used
+        else:
+            self.garbage_bytes += used
+            if _TURNED_HEADER.match(buffer, place):
+                self.fault = "its numbers are little-endian; OpenIGTLink is big-endian"
+        return used
+
+    def _note_other(self, kind: str) -> None:
+        if kind not in self._others and len(self._others) < _MOST_KINDS:
+            self._others.add(kind)
+            self.fault = f"{', '.join(sorted(self._others))} came, but no {', '.join(one.decode() for one in _POSES)}"
 
 
-def _pose(body: bytes, seconds: int, fraction: int) -> list[Reading]:
-    columns = np.array(_BODY.unpack(body), dtype=np.float64).reshape(4, 3)
-    rotation, position = columns[:3].T, columns[3]
-    if (
-        not np.isfinite(columns).all()
-        or np.abs(position).max() > 25_000
-        or np.abs(rotation @ rotation.T - np.eye(3)).max() > _RIGID_SLACK
-    ):
-        return []
-    w, i, j, k = (float(value) for value in quaternion_from_rotation(rotation))
-    x, y, z = (float(value) for value in position)
-    device_ns = seconds * 1_000_000_000 + (fraction * 1_000_000_000 >> 32)
-    return [PoseReading((x, y, z), (w, i, j, k), device_ns)]
+def _find_header(buffer: bytes, start: int) -> int:
+    """Index of the first header of a message with poses from `start` on; -1 without one. Images are searched so."""
+    found = -1
+    for kind in _KINDS:
+        at = buffer.find(kind, start + 2, None if found < 0 else found + _HEADER.size)
+        while at >= 0 and not _POSE_HEADER.match(buffer, at - 2):
+            at = buffer.find(kind, at + 1, None if found < 0 else found + _HEADER.size)
+        if at >= 0 and (found < 0 or at - 2 < found):
+            found = at - 2
+    return found
 
 
-def encode_transform(pose: PoseReading, rotation: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> bytes:
-    """Encode a pose with its rotation matrix as a message."""
-    body = _BODY.pack(*rotation.T.ravel(), *pose.position_mm)
-    seconds, rest_ns = divmod(pose.device_ns or 0, 1_000_000_000)
+_COLUMNS: Final = 12  # numbers of a matrix with its position
+
+
+def _name(data: bytes) -> str:
+    """Text of a padded name."""
+    return printable(data.partition(b"\0")[0])
+
+
+def _fits(kind: bytes, size: int) -> bool:
+    head, numbers = _POSES[kind]
+    return size % (head + numbers.size) == 0 if head else size == numbers.size
+
+
+def _parts(body: bytes, version: int, kind: bytes) -> tuple[bytes | None, dict[str, str]]:
+    """Content and metadata of a body; no content where its size is not one of its kind."""
+    if version > 1 and len(body) >= _EXTENDED.size:
+        size, header_bytes, data_bytes, _ = _EXTENDED.unpack_from(body)
+        end = len(body) - header_bytes - data_bytes
+        if size >= _EXTENDED.size and end >= size and _fits(kind, end - size):
+            return body[size:end], _metadata(body[end : end + header_bytes], body[end + header_bytes :])
+    return (body if _fits(kind, len(body)) else None), {}
+
+
+def _metadata(header: bytes, data: bytes) -> dict[str, str]:
+    """Pairs of key and value; those cut off are left out."""
+    found, place = {}, 0
+    for key_bytes, _, value_bytes in _PAIR.iter_unpack(header[2 : 2 + (len(header) - 2) // _PAIR.size * _PAIR.size]):
+        value_at = place + key_bytes
+        found[data[place:value_at].decode("latin-1")] = data[value_at : value_at + value_bytes].decode("latin-1")
+        place = value_at + value_bytes
+    return found
+
+
+def _unseen(facts: Mapping[str, str]) -> str:
+    """Why a tool has no pose, by a message's metadata; empty where it has one."""
+    status = facts.get("TransformStatus", "OK").strip("\0 ").upper().removeprefix("TOOL_")
+    if re.fullmatch("SWITCH[0-9]_IS_ON", status):
+        return ""  # of the tool's own button; PLUS then says that the transform is not valid
+    if status not in _IN_SIGHT:
+        return status.lower().replace("_", " ") if status.replace("_", "").isalpha() else "unknown status"
+    return "invalid" if facts.get("TransformValid", "").strip("\0 ").lower() in ("false", "0", "no") else ""
+
+
+def _turn_of_matrix(columns: tuple[float, ...]) -> tuple[float, ...] | None:
+    """Quaternion, scalar first, of a rotation matrix given by columns; None for another matrix."""
+    rotation = np.array(columns, dtype=np.float64).reshape(3, 3).T
+    if not np.isfinite(rotation).all() or np.abs(rotation @ rotation.T - np.eye(3)).max() > _RIGID_SLACK:
+        return None
+    return tuple(map(float, quaternion_from_rotation(rotation))) if np.linalg.det(rotation) > 0 else None
+
+
+def encode_transform(
+    pose: PoseReading | MissingReading, rotation: FloatArray | None = None, *, version: int = 1
+) -> bytes:
+    """Encode a pose with its rotation matrix as a message; of a missing one an identity with its status."""
+    if isinstance(pose, PoseReading) and rotation is not None:
+        body, device_ns, status = _MATRIX.pack(*rotation.T.ravel(), *pose.position_mm), pose.device_ns or 0, b"OK"
+    else:
+        body, device_ns, status = _MATRIX.pack(*np.eye(3).ravel(), 0, 0, 0), 0, b"MISSING"
+    if version > 1:
+        key = b"TransformStatus"
+        header = struct.pack(">H", 1) + _PAIR.pack(len(key), _US_ASCII, len(status))
+        sizes = _EXTENDED.pack(_EXTENDED.size, len(header), len(key + status), 0)
+        body = sizes + body + header + key + status
+    seconds, rest_ns = divmod(device_ns, 1_000_000_000)
     fraction = -(-(rest_ns << 32) // 1_000_000_000)  # rounded up, so that whole nanoseconds come back
-    return _HEADER.pack(1, b"TRANSFORM", b"Tracker", seconds, fraction, len(body), crc64(body)) + body
+    name = (pose.tool or "Tracker").encode()
+    return _HEADER.pack(version, b"TRANSFORM", name, seconds, fraction, len(body), crc64(body)) + body
+
+
+_US_ASCII: Final = 3
 
 
 # --- NDI Polaris, Vega and Aurora trackers, through the combined API library `ndicapi` (extra ``[ndi]``).
@@ -204,13 +329,17 @@ _LOOK_S: Final = 0.01
 _PATIENCE: Final = 5
 _WIRELESS: Final = "PHRQ:*********1****"
 _TRANSFORMS: Final = 0x0001  # without 0x0800: a tool outside the volume that was characterised is missing
+_PART_NUMBER: Final = 0x0004
+# Of a port's status.
+_OUT_OF_VOLUME: Final = 0x40
+_PARTLY_OUT: Final = 0x80
 
 
 class NdiTracker:
-    """A connected NDI tracker that follows one tool, through the module ``ndicapy`` or one that does the same.
+    """A connected NDI tracker with its tools, through the module ``ndicapy`` or one that does the same.
 
     `url` is a serial device or ``socket://HOST:PORT``. `rom` describes a wireless tool; tools on a wire bring their
-    own.
+    own. A tool is named by its port handle and part number, such as ``0A-8700339``.
     """
 
     def __init__(self, api: Any, url: str, *, rom: Path | None = None) -> None:
@@ -218,7 +347,7 @@ class NdiTracker:
         self._device = self._open()
         self._begin()
         self.name = self._command("VER:4").splitlines()[0].strip()[:48] or "NDI tracker"
-        self.handle = self._tool(rom)
+        self.tools = {handle: self._tool_name(handle) for handle in self._enable(rom)}
         self._command("TSTART:")
         self._frame: int | None = None
         self._failures = 0
@@ -247,11 +376,15 @@ class NdiTracker:
             self._command("COMM:%d%03d%d", self._api.NDI_115200, self._api.NDI_8N1, self._api.NDI_NOHANDSHAKE)
 
     def _command(self, text: str, *values: object) -> str:
-        reply = self._api.ndiCommand(self._device, text, *values)
+        name = text.partition(":")[0]
+        try:
+            reply = self._api.ndiCommand(self._device, text, *values)
+        except OSError as error:  # the library's way to say so for some of its own errors
+            raise DeviceError(f"{name} failed ({error}); check its power, cable and tool") from None
         number = self._api.ndiGetError(self._device)
         if number != self._api.NDI_OKAY:
             words = self._api.ndiErrorString(number)
-            raise DeviceError(f"{text.partition(':')[0]} failed ({words}); check its power, cable and tool")
+            raise DeviceError(f"{name} failed ({words}); check its power, cable and tool")
         return reply if isinstance(reply, str) else ""
 
     def _handles(self, kind: int) -> list[int]:
@@ -260,8 +393,8 @@ class NdiTracker:
         number = self._api.ndiGetPHSRNumberOfHandles(self._device)
         return [self._api.ndiGetPHSRHandle(self._device, one) for one in range(number)]
 
-    def _tool(self, rom: Path | None) -> int:
-        """Initialise and enable the tools; return the handle of the one to follow."""
+    def _enable(self, rom: Path | None) -> list[int]:
+        """Initialise and enable the tools; return their handles."""
         for handle in self._handles(1):
             self._command("PHF:%02X", handle)
         if rom is not None:
@@ -278,55 +411,77 @@ class NdiTracker:
         enabled = self._handles(4)
         if not enabled:
             raise DeviceError("it has no tool; plug one in, or give --tracker-rom TOOL.rom for a wireless one")
-        return enabled[0]
+        return enabled
 
-    def pose(self) -> PoseReading | None:
-        """Next pose; None while there is no new one, or the tool is out of sight. Several silences in a row are a
-        DeviceError.
-        """
+    def _tool_name(self, handle: int) -> str:
+        part = ""
+        with suppress(DeviceError):  # a tracker of before this command
+            part = re.sub(r"[^A-Za-z0-9.]", "", self._command(f"PHINF:{handle:02X}{_PART_NUMBER:04X}"))
+        return f"{handle:02X}-{part}" if part else f"{handle:02X}"
+
+    def readings(self) -> list[ToolReading]:
+        """Next reading of each tool; none while there is no new frame. Several silences in a row are a DeviceError."""
         try:
             self._command(f"BX:{_TRANSFORMS:04X}")
         except DeviceError:
             self._failures += 1
             if self._failures >= _PATIENCE:
                 raise
-            return None
+            return []
         self._failures = 0
-        port = bytes([self.handle])
-        frame = self._api.ndiGetBXFrame(self._device, port)
-        found = self._api.ndiGetBXTransform(self._device, port)
-        if frame == self._frame or isinstance(found, str):
-            return None
+        frame = max(self._api.ndiGetBXFrame(self._device, bytes([handle])) for handle in self.tools)
+        if frame == self._frame:
+            return []
         self._frame = frame
+        return [self._reading(handle) for handle in self.tools]
+
+    def _reading(self, handle: int) -> ToolReading:
+        port, tool = bytes([handle]), self.tools[handle]
+        found = self._api.ndiGetBXTransform(self._device, port)
+        status = self._api.ndiGetBXPortStatus(self._device, port)
+        if isinstance(found, str):
+            out = found == "MISSING" and status & _OUT_OF_VOLUME
+            return MissingReading("out of volume" if out else found.lower(), tool)
         w, i, j, k, x, y, z = (float(value) for value in found[:7])
-        return PoseReading((x, y, z), (w, i, j, k)) if plausible((x, y, z), (w, i, j, k)) else None
+        if not plausible((x, y, z), (w, i, j, k)):
+            return MissingReading(NO_ROTATION, tool)
+        return PoseReading((x, y, z), (w, i, j, k), None, ("partly out of volume",) * bool(status & _PARTLY_OUT), tool)
 
 
 def serve(tracker: NdiTracker, line: socket.socket) -> None:
     """Serve the tracker in the open framing until the other end closes."""
     commands, sending, number = PacketParser(), False, 0
+    latest: dict[str, ToolReading] = {tool: MissingReading("not measured yet", tool) for tool in tracker.tools.values()}
     line.setblocking(False)
     while True:
+        wire = b""
         if select.select([line], [], [], _ASK_EVERY_S)[0]:
             data = line.recv(4096)
             if not data:
                 return
             for packet in commands.feed(data):
                 if packet.kind == head.ASK:
-                    line.sendall(head.encode_hello(HelloReading(tracker.name, 0, 0, 0, 0.0)))
+                    wire = head.encode_hello(HelloReading(tracker.name, 0, 0, 0, 0.0))
+                    wire += b"".join(head.encode_pose(one, sequence=0) for one in latest.values())
                 elif packet.kind in (head.START, head.STOP):
                     sending = packet.kind == head.START
-        pose = tracker.pose()
-        if pose is not None and sending:
-            line.sendall(head.encode_pose(pose._replace(device_ns=time.monotonic_ns()), sequence=number))
-            number += 1
+        for reading in tracker.readings():
+            latest[reading.tool] = reading
+            if sending:
+                timed = reading
+                if isinstance(reading, PoseReading):
+                    timed = reading._replace(device_ns=time.monotonic_ns())
+                wire += head.encode_pose(timed, sequence=number)
+                number += 1
+        if wire:
+            line.sendall(wire)
 
 
 class NdiPort(Port):
     """An NDI tracker in a process of its own, as a port in the open framing."""
 
     def __init__(self, url: str, *, rom: Path | None = None) -> None:
-        self.url, self.baud, self.role = url, 0, "tracker"
+        self.url, self.baud, self.role, self._is_socket = url, 0, "tracker", False
         self._relayed = None
         if find_spec(MODULE) is None:
             raise DeviceError(f"{self.name}: needs the package ndicapi; pip install 'tactile-bayes[ndi]'")

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,7 @@ from tactile_bayes.mapping.map import FEW_READINGS, MapRecipe, TactileMap, broke
 from tactile_bayes.mapping.plane import MAX_POSE_GAP_MS, FramePoses, HeadMoments, head_moments
 from tactile_bayes.mapping.profile import evenness_figures, head_profile_figures
 from tactile_bayes.mapping.select import (
+    Jumps,
     SelectedFrames,
     every_nth,
     refuse_without_frames,
@@ -211,15 +213,16 @@ def build_map(
     figures: dict[str, float] = {} if how.every == 1 else {"frames_every": float(how.every)}
     late_ms = 0.0 if isinstance(how.latency_ms, str) else float(how.latency_ms)
     selections = rules.select(parts, late_ms)
-    findings = _of_scans(given) + _of_arrangement(selections, late_ms, refuse=not how.as_stated)
-    figures |= head_profile_figures(selections)
-    if how.flat_field:
-        selections = _flattened(selections, rules, late_ms, figures)
-    if how.latency_ms == "auto":
-        late_ms = _latency(selections, rules, how.cell_mm, figures)
-        selections = rules.select([part.scan for part in selections], late_ms)
-    figures |= check_convention(selections)
-    plane = _plane(selections)
+    with _jumps_named(given):
+        findings = _of_scans(given) + _of_arrangement(selections, late_ms, refuse=not how.as_stated)
+        figures |= head_profile_figures(selections)
+        if how.flat_field:
+            selections = _flattened(selections, rules, late_ms, figures)
+        if how.latency_ms == "auto":
+            late_ms = _latency(selections, rules, how.cell_mm, figures)
+            selections = rules.select([part.scan for part in selections], late_ms)
+        figures |= check_convention(selections)
+        plane = _plane(selections)
     if how.plane_radius_mm != "all":
         radius = None if how.plane_radius_mm == "auto" else how.plane_radius_mm
         plane, near = local_plane(selections, plane, radius_mm=radius)
@@ -315,6 +318,18 @@ def _plane(selections: list[SelectedFrames]) -> Plane:
         if "quaternion order" not in error.way_out:
             raise
         raise BadDataError(error.what, way_out=hint(selections)) from None
+
+
+@contextmanager
+def _jumps_named(scans: Sequence[Scan]) -> Iterator[None]:
+    """Name jumping poses as the cause of what would otherwise be put down to how a scan is arranged."""
+    try:
+        yield
+    except BadDataError as error:
+        for text in (text for scan in scans for text in Jumps.of(scan.poses).cautions()):
+            way_out = "record one tool of the tracker (docs/trackers.md), or leave these poses out"
+            raise BadDataError(f"{error.what}, where {text}", way_out=way_out) from None
+        raise
 
 
 def _check_same_examination(scans: list[Scan]) -> None:

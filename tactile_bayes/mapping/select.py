@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -17,7 +18,7 @@ from tactile_bayes.geometry import BoolArray, FloatArray
 from tactile_bayes.mapping.cells import Projector, Readout, chunk_frames
 from tactile_bayes.mapping.plane import MAX_POSE_GAP_MS, FramePoses, distinct_poses, poses_at
 from tactile_bayes.presets import KPA_PER_UNIT
-from tactile_bayes.scan import PressureFrames, Scan
+from tactile_bayes.scan import PressureFrames, Scan, TrackerPoses
 
 # --- Detection of faulty taxels over a whole scan.
 
@@ -238,6 +239,54 @@ class Span:
         return cls(len(time_s), float(time_s[0]), float(time_s[-1]), gap_s, float(time_s[longest]))
 
 
+# A hand moves slower than this between two poses, beside what a tracker's noise adds.
+_HAND_MM_PER_S: Final = 5_000.0
+_NOISE_MM: Final = 30.0
+# Of a step, what the two poses are apart from being opposite to each other.
+_OPPOSITE_SHARE: Final = 0.2
+
+
+@dataclass(slots=True)
+class Jumps:
+    """Steps between successive poses that no hand makes."""
+
+    number: int = 0
+    longest_mm: float = 0.0
+    opposite: int = 0  #: Those to the opposite side of the tracker's origin.
+    _last_s: float = 0.0
+    _last_mm: tuple[float, float, float] | None = None
+
+    def add(self, time_s: float, position_mm: tuple[float, float, float]) -> None:
+        """Add the next pose."""
+        last, passed_s = self._last_mm, time_s - self._last_s
+        self._last_s, self._last_mm = time_s, position_mm
+        if last is None:
+            return
+        step_mm = math.dist(last, position_mm)
+        if step_mm > _NOISE_MM + _HAND_MM_PER_S * passed_s:
+            self.number, self.longest_mm = self.number + 1, max(self.longest_mm, step_mm)
+            middle_mm = math.hypot(*(a + b for a, b in zip(last, position_mm, strict=True)))
+            self.opposite += middle_mm < _OPPOSITE_SHARE * step_mm
+
+    @classmethod
+    def of(cls, poses: TrackerPoses) -> Jumps:
+        """Jumps of a scan's poses."""
+        found = cls()
+        for time_s, place_mm in zip(poses.time_s.tolist(), poses.position_mm.tolist(), strict=True):
+            found.add(time_s, place_mm)
+        return found
+
+    def cautions(self) -> list[str]:
+        """A line about them; none without any."""
+        if not self.number:
+            return []
+        cause = "two tools in one stream, damaged records, or metal near an electromagnetic tracker"
+        if 2 * self.opposite > self.number:
+            cause = "the sensor crossed into the hemisphere that the tracker is not set to"
+        times = "once" if self.number == 1 else f"{self.number:,} times"
+        return [f"the poses jump {times}, by up to {self.longest_mm:.0f} mm, faster than a hand: {cause}"]
+
+
 def apart(frames: Span, poses: Span) -> bool:
     """True where no frame was measured between the first pose and the last."""
     if not frames.number or not poses.number:
@@ -270,7 +319,10 @@ def overlap_cautions(frames: Span, poses: Span) -> list[str]:
 
 def scan_findings(scan: Scan) -> tuple[Finding, ...]:
     """Findings of a scan's file and recorder, and on its times."""
-    return with_times(scan.findings, Span.of(scan.frames.time_s), Span.of(scan.poses.time_s))
+    found = with_times(scan.findings, Span.of(scan.frames.time_s), Span.of(scan.poses.time_s))
+    jumps = Jumps.of(scan.poses).cautions()  # the recorder noted them too
+    kept = [one for one in found if one.text not in jumps]
+    return (*kept, *(Finding("poses_jump", text) for text in jumps))
 
 
 def with_times(findings: Sequence[Finding], frames: Span, poses: Span) -> tuple[Finding, ...]:

@@ -30,7 +30,9 @@ def record_text(report: Report, *, output: str) -> str:
         f"{output}: scan, ended by {report.ended_by}",
         f"{report.frames} frames in {report.duration_s:.3f} s, {rate:.1f} Hz; {report.poses} poses",
         f"frames lost {report.frames_lost}{dropped}",
-        f"poses repeated {report.poses_repeated}, flagged {report.poses_flagged}",
+        f"poses repeated {report.poses_repeated}, flagged {report.poses_flagged}, missing {report.poses_missing}"
+        + (f" ({report.missing_why})" if report.missing_why else ""),
+        *([f"records of other tools left out: {report.other_tools}"] if report.other_tools else []),
         *report.landmarks,
     ]
     odd = {

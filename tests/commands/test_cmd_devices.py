@@ -19,7 +19,7 @@ from tactile_bayes.geometry import quaternion_from_rotation
 from tactile_bayes.hardware.bladder import rotation_sense
 from tactile_bayes.hardware.emulated import EmulatedHead, EmulatedTracker
 from tactile_bayes.hardware.emulator import PtyLink
-from tactile_bayes.hardware.serial_trackers import guess
+from tactile_bayes.hardware.ports import guess
 from tactile_bayes.scan import TrackerPoses
 
 

@@ -44,7 +44,7 @@ def test_a_nearly_full_disk_never_takes_half_a_result_in_silence(
         done = subprocess.run(
             words,
             cwd=folder,
-            env=child_environment | {"PYTHONUNBUFFERED": unbuffered},
+            env=child_environment | {"PYTHONUNBUFFERED": unbuffered, "PYTHONDONTWRITEBYTECODE": "1"},
             stdout=out,
             stderr=subprocess.PIPE,
             text=True,

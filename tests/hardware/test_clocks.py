@@ -45,6 +45,7 @@ class FakePort:
 
 class FakeParser:
     garbage_bytes = 0
+    fault = remark = ""
 
 
 class FakeStream:

@@ -14,11 +14,12 @@ from tactile_bayes.errors import DeviceError
 from tactile_bayes.hardware import trackers as ndi
 from tactile_bayes.hardware.emulated import EmulatedHead, EmulatedNdi, crc16
 from tactile_bayes.hardware.emulator import PtyLink, TcpLink
-from tactile_bayes.hardware.readings import HelloReading, PoseReading
+from tactile_bayes.hardware.readings import HelloReading, MissingReading, PoseReading
 from tactile_bayes.hardware.serial_trackers import TRACKERS, open_tracker
 from tactile_bayes.hardware.trackers import NdiTracker
 
 TURN = (0.5, 0.5, -0.5, 0.5)
+TOOL = "0A-870030A"
 
 
 class FakeLibrary:
@@ -27,19 +28,22 @@ class FakeLibrary:
     Parameters
     ----------
     frames
-        What each BX shows: (frame number, transform or ``"MISSING"``), or an error number.
+        What each BX shows: (frame number, transform or ``"MISSING"``, by handle where there are several), or an error
+        number; an exception is raised.
+    status
+        Of a handle's port.
     """
 
     NDI_OKAY, NDI_115200, NDI_8N1, NDI_NOHANDSHAKE = 0, 5, 0, 0
 
     def __init__(
-        self, frames=(), *, refuse: dict[str, int] | None = None, enabled=(10,), device: object = "it"
+        self, frames=(), *, refuse: dict[str, int] | None = None, enabled=(10,), device: object = "it", status=0
     ) -> None:
         self.told: list[str] = []
         self.opened: tuple = ()
         self._frames, self._refuse = list(frames), dict(refuse or {})
         self._handles, self._enabled, self._device = [], list(enabled), device
-        self._error, self._now = 0, (0, "MISSING")
+        self._error, self._now, self._status = 0, (0, "MISSING"), status
 
     def ndiOpen(self, name):
         self.opened = (name,)
@@ -62,7 +66,11 @@ class FakeLibrary:
             self._handles = self._enabled if line.endswith("04") else []
         if name == "BX" and self._frames:
             found = self._frames.pop(0)
+            if isinstance(found, Exception):
+                raise found
             self._error, self._now = (found, self._now) if isinstance(found, int) else (0, found)
+        if name == "PHINF":
+            return f"  87003{line[6:8]}".ljust(20)
         return "Polaris\nNDI S/N:P6-00057" if name == "VER" else "OKAY"
 
     def ndiGetError(self, device):
@@ -85,11 +93,14 @@ class FakeLibrary:
         return 0 if path.endswith(".rom") else -1
 
     def ndiGetBXFrame(self, device, port):
-        assert port == b"\n"
+        assert port[0] in self._enabled
         return self._now[0]
 
     def ndiGetBXTransform(self, device, port):
-        return self._now[1]
+        return self._now[1][port[0]] if isinstance(self._now[1], dict) else self._now[1]
+
+    def ndiGetBXPortStatus(self, device, port):
+        return self._status
 
 
 def test_a_tracker_is_set_up_in_the_order_of_the_guide(tmp_path):
@@ -97,9 +108,9 @@ def test_a_tracker_is_set_up_in_the_order_of_the_guide(tmp_path):
     tracker = NdiTracker(library, "/dev/ttyUSB0", rom=tmp_path / "tool.rom")
     assert library.opened == ("/dev/ttyUSB0",)
     words = [line.partition(":")[0] for line in library.told]
-    assert words == ["INIT", "COMM", "VER", "PHSR", "PHRQ", "description of 10", *["PHSR"] * 3, "TSTART"]
+    assert words == ["INIT", "COMM", "VER", "PHSR", "PHRQ", "description of 10", *["PHSR"] * 3, "PHINF", "TSTART"]
     assert library.told[1] == "COMM:50000"  # 115200, 8N1, no handshake
-    assert (tracker.name, tracker.handle) == ("Polaris", 10)
+    assert (tracker.name, tracker.tools) == ("Polaris", {10: "0A-870030A"})
     over_network = FakeLibrary()
     NdiTracker(over_network, "socket://169.254.60.146:8765")
     assert over_network.opened == ("169.254.60.146", 8765)
@@ -114,19 +125,44 @@ def test_a_tracker_left_at_another_rate_is_reset():
 
 def test_new_frames_with_a_tool_in_sight_are_poses():
     seen = (*TURN, 254.0, -127.0, 25.4, 0.2)
-    frames = [(1, seen), (1, seen), (2, "MISSING"), (3, seen), 4, (4, (9.0,) * 8), (5, seen)]
+    spoilt = OSError("POLARIS 0x04: Invalid CRC")
+    frames = [(1, seen), (1, seen), (2, "MISSING"), (3, seen), 4, spoilt, (4, (9.0,) * 8), (5, seen)]
     tracker = NdiTracker(FakeLibrary(frames), "/dev/ttyUSB0")
-    found = [tracker.pose() for _ in frames]
-    pose = PoseReading((254.0, -127.0, 25.4), TURN)
-    assert found == [pose, None, None, pose, None, None, pose]  # again, unseen, spoilt and impossible ones are none
+    found = [tracker.readings() for _ in frames]
+    pose, unseen = [PoseReading((254.0, -127.0, 25.4), TURN, tool=TOOL)], [MissingReading("missing", TOOL)]
+    none = [MissingReading("no rotation", TOOL)]
+    assert found == [pose, [], unseen, pose, [], [], none, pose]  # again, unseen, twice spoilt, impossible
+
+
+@pytest.mark.parametrize(
+    ("status", "seen", "found"),
+    [
+        (0x31, "MISSING", MissingReading("missing", TOOL)),
+        (0x71, "MISSING", MissingReading("out of volume", TOOL)),
+        (0x01, "DISABLED", MissingReading("disabled", TOOL)),
+        (0xB1, (*TURN, 1.0, 2.0, 3.0, 0.1), PoseReading((1, 2, 3), TURN, None, ("partly out of volume",), TOOL)),
+    ],
+)
+def test_a_ports_status_says_why_there_is_no_pose(status, seen, found):
+    assert NdiTracker(FakeLibrary([(1, seen)], status=status), "/dev/ttyUSB0").readings() == [found]
+
+
+def test_each_enabled_tool_is_read_and_named_by_handle_and_part():
+    seen = (*TURN, 1.0, 2.0, 3.0, 0.2)
+    library = FakeLibrary([(1, {10: seen, 11: "MISSING"})], enabled=(10, 11))
+    tracker = NdiTracker(library, "/dev/ttyUSB0")
+    assert tracker.readings() == [
+        PoseReading((1, 2, 3), TURN, tool="0A-870030A"),
+        MissingReading("missing", "0B-870030B"),
+    ]
 
 
 def test_a_tracker_that_stops_answering_is_told():
     tracker = NdiTracker(FakeLibrary([7] * 10), "/dev/ttyUSB0")
     for _ in range(4):
-        assert tracker.pose() is None
+        assert tracker.readings() == []
     with pytest.raises(DeviceError, match=r"BX failed \(error 7\)"):
-        tracker.pose()
+        tracker.readings()
 
 
 @pytest.mark.parametrize(
@@ -199,12 +235,13 @@ def test_the_library_reads_the_emulated_tracker(link, tmp_path):
     rom.write_bytes(bytes(range(256)) * 4)
     with serving(device, line):
         port = open_tracker("ndi", line.url, rom=rom if wireless else None)
-        hello = TRACKERS["ndi"].check(port)
-        assert hello == HelloReading("Emulated NDI tracker", 0, 0, 0, 0.0)
+        answer = TRACKERS["ndi"].check(port)
+        assert answer.hello == HelloReading("Emulated NDI tracker", 0, 0, 0, 0.0)
+        assert [*answer.tools] == [answer.tool] == ["0A"]  # this one does not know the command for the part number
         port.write(TRACKERS["ndi"].start)
         parser, found, end = TRACKERS["ndi"].parser(), [], time.monotonic() + 20.0
         while len(found) < 40 and time.monotonic() < end:
-            found += parser.feed(port.read_some(0.1))
+            found += [one for one in parser.feed(port.read_some(0.1)) if isinstance(one, PoseReading)]
         port.close()
     assert device.described == (rom.read_bytes() if wireless else b"")
     assert len(found) >= 40

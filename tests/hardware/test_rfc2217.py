@@ -46,7 +46,7 @@ def test_bytes_that_telnet_would_take_for_its_own_come_through():
     line = PtyLink()
     with serving(EmulatedTracker(scan.poses, protocol="fastrak"), line), rfc2217(line.url) as url:
         port = open_tracker("fastrak", url)
-        assert TRACKERS["fastrak"].check(port).station == 1
+        assert TRACKERS["fastrak"].check(port).tools == {"1": ""}
         port.write(TRACKERS["fastrak"].start)
         parser, found, end = TRACKERS["fastrak"].parser(), [], time.monotonic() + 20.0
         while len(found) < len(scan.poses) and time.monotonic() < end:

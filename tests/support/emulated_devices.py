@@ -56,7 +56,7 @@ def head_and_tracker(
     """Both devices of a scan; the words that tell `record` about them."""
     links: list[Link] = [TcpLink("127.0.0.1", 0), TcpLink("127.0.0.1", 0)] if tcp else [PtyLink(), PtyLink()]
     stage = Stage(speed=speed)
-    tracker = EmulatedTracker(scan.poses, protocol=protocol, hold=tracker_faults.hold if tracker_faults else 1)
+    tracker = EmulatedTracker(scan.poses, protocol=protocol, faults=tracker_faults)
     with (
         serving(EmulatedHead(scan), links[0], head_faults, stage=stage),
         serving(tracker, links[1], tracker_faults, stage=stage, leads=False),
