@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import textwrap
 from typing import Final, TextIO
 
@@ -12,6 +13,7 @@ STYLES: Final = {
     "error: ": RED,
     "failed: ": RED,
     "CAUTION: ": YELLOW,
+    "caution: ": YELLOW,
     "doubtful: ": f"{BOLD};{YELLOW}",
     "Doubtful: ": YELLOW,
     "To check: ": CYAN,
@@ -19,6 +21,10 @@ STYLES: Final = {
     "$ ": BOLD,
     "sound: ": BOLD,
     "tactile errs ": BOLD,
+    "The mass has ": BOLD,
+    "No change shown": BOLD,
+    "Not compared": BOLD,
+    "No common size": BOLD,
     "largest size ": BOLD,
     "No estimate: ": BOLD,
     "No lump found": BOLD,
@@ -27,6 +33,8 @@ STYLES: Final = {
 LEAST_COLUMNS: Final = 20  #: Below it nothing is wrapped: a terminal without a size says 0.
 MOST_NAME: Final = 40  #: Columns of a row's name up to which the text beside it stays in its own column.
 COMMAND_END: Final = " \\"  #: Of a line of a command that goes on in the next one, as shells read it.
+_UNIT: Final = r"(?<=\d) (?=(?:%|mm|cm2?|kPa|ms|s|Hz|deg)(?![\w-]))"  #: The blank before it, where no line breaks.
+_JOINED: Final = "\x1f"  #: Stands for that blank, as it is printable in no text here.
 _HANGING: Final = 2  #: Columns by which the further lines of a sentence are indented.
 
 
@@ -68,7 +76,8 @@ def _dressed_line(line: str, columns: int, *, styles: bool) -> str:
             replace_whitespace=False,
             expand_tabs=False,
         )
-        line = f"{end}\n".join(wrapper.wrap(line))
+        whole = wrapper.wrap(re.sub(_UNIT, _JOINED, line))
+        line = f"{end}\n".join(whole).replace(_JOINED, " ")
     style = next((style for lead, style in STYLES.items() if line.startswith(lead)), "") if styles else ""
     return "\n".join(f"\x1b[{style}m{part}\x1b[0m" for part in line.split("\n")) if style else line
 

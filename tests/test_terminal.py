@@ -66,6 +66,14 @@ def test_the_text_of_a_row_stays_in_its_column():
     assert re.match(r" {16}\S", second)
 
 
+def test_a_number_keeps_its_unit():
+    line = "overlapping frames agree to within " + "1.4 % and 3 mm, " * 12
+    for columns in range(40, 60):
+        shown = dressed(line, columns=columns, styles=False)
+        assert not re.search(r"\d\n *(%|mm)", shown)
+        assert "\x1f" not in shown
+
+
 @pytest.mark.parametrize(
     "text",
     ["a" * 200, '{"caution": "' + "a word " * 30 + '"}\n', '[\n  {"a": "' + "b c " * 40 + '"}\n]\n', "short\n\n", ""],

@@ -125,7 +125,8 @@ def emulate_command(**given: Any) -> None:
     type=click.Choice(PROTOCOLS),
     default="fastrak",
     show_default=True,
-    help="Protocol of the tracker to rotate.",
+    metavar="PROTOCOL",
+    help=f"Protocol of the tracker to rotate: {', '.join(PROTOCOLS)}.",
 )
 @takes(RecordOptions, "tool")
 @click.option(

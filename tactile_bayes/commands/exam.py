@@ -78,8 +78,10 @@ def demo_command(ctx: click.Context, /, **given: Any) -> None:
     "--correct",
     "corrections",
     type=click.Choice(tuple(CORRECTIONS)),
+    metavar="CORRECTION",
     multiple=True,
-    help="Scan: correct what is stated of array, lever arm or quaternions; `check` says what is to be corrected.",
+    help="Scan: correct what is stated of array, lever arm or quaternions; `check` says what is to be corrected. "
+    f"One of {', '.join(CORRECTIONS)}.",
 )
 @click.option("--template", is_flag=True, help="Print a MAP.toml for --columns: of SRC, with what its shapes tell.")
 @click.option("--columns", metavar="MAP.toml", type=FilePath(), help="Scan: what SRC calls its arrays.")

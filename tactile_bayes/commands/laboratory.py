@@ -243,7 +243,7 @@ def head_uniformity_command(**given: Any) -> None:
     For three moduli and three mean pressures: the largest departure of a taxel from the mean of its frame, and the root
     mean square departure. Only the ratio of pressure to modulus matters.
 
-    Example: tactile-bayes head uniformity --head-radius-mm 35 --head shoulders-outside
+    Example: tactile-bayes head uniformity --head-radius-mm 35
     """
     from tactile_bayes.actions.study import head_uniformity_action
 
@@ -307,7 +307,7 @@ def compare_model_command(**given: Any) -> None:
     first kind hides a bump under the level it stands on. The empirical model holds for lumps of 10 mm and more down to
     h/d 1, and warns outside.
 
-    Example: tactile-bayes compare-model scan.mcap scene.toml --fidelity plane-strain --fidelity empirical
+    Example: tactile-bayes compare-model scan.mcap scene.toml --fidelity empirical
     """
     from tactile_bayes.actions.study import compare_model_action
 

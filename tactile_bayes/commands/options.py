@@ -270,7 +270,19 @@ def _option(record: type[Record], name: str, attributes: Mapping[str, Any]) -> D
         of_field |= {"default": default, "show_default": True} if shown else {}
         if isinstance(of_field["type"], NumberOr):
             of_field["default"] = default if isinstance(default, str) else f"{default:g}"
-    return click.option(flag, *also, name, **{**of_field, **attributes})
+    return click.option(flag, *also, name, **_fitting(name, {**of_field, **attributes}))
+
+
+MOST_CHOICES: Final = 50  #: Letters of all the choices of an option up to which its help has them beside its name.
+
+
+def _fitting(name: str, of_field: dict[str, Any]) -> dict[str, Any]:
+    """An option whose choices are too many for the column of names has them in its help."""
+    kind = of_field.get("type")
+    if not isinstance(kind, click.Choice) or of_field["metavar"] or len("|".join(kind.choices)) <= MOST_CHOICES:
+        return of_field
+    told = f"{of_field['help']} One of {', '.join(kind.choices)}."
+    return {**of_field, "help": told, "metavar": name.rpartition("_")[2].upper()}
 
 
 def _click_type(kind: Any) -> Any:

@@ -205,8 +205,8 @@ _UNITS = {
     "gain": "times the level beside a lump (normalise gain)",
 }
 _DROPPED = (
-    ("dropped_low", "pressed below the window"),
-    ("dropped_high", "pressed above the window"),
+    ("dropped_low", "pressed below {0:g} kPa"),
+    ("dropped_high", "pressed above {1:g} kPa"),
     ("dropped_no_pose", "without a tracker pose"),
     ("dropped_elements", "with too few valid taxels"),
 )
@@ -276,11 +276,9 @@ def _frames(tactile_map: TactileMap) -> Iterator[tuple[str, str]]:
 
 def _dropped(tactile_map: TactileMap) -> Iterator[str]:
     """How many frames were left out for each reason."""
-    quality, window = tactile_map.quality, tactile_map.recipe.pressure_window_kpa
-    for name, reason in _DROPPED:
-        if quality.get(name):
-            limits = f" of {window[0]:g} to {window[1]:g} kPa" if window and "window" in reason else ""
-            yield f"{quality[name]:.0f} {reason}{limits}"
+    quality = tactile_map.quality
+    window = tactile_map.recipe.pressure_window_kpa or (np.nan, np.nan)
+    yield from (f"{quality[name]:.0f} {reason.format(*window)}" for name, reason in _DROPPED if quality.get(name))
 
 
 def _timing(tactile_map: TactileMap) -> Iterator[tuple[str, str]]:
