@@ -19,9 +19,9 @@ from tactile_bayes.files.atomic import check_suffix, refuse_existing
 from tactile_bayes.files.documents import with_session
 from tactile_bayes.files.grid_files import open_grid
 from tactile_bayes.files.grids import grid_map
-from tactile_bayes.files.imports import import_arrays, of_calibration, of_head, of_landmarks
+from tactile_bayes.files.imports import import_arrays, of_calibration, of_head, of_landmarks, of_poses
 from tactile_bayes.files.map_nc import write_map
-from tactile_bayes.files.named_arrays import ARRAY_SUFFIXES
+from tactile_bayes.files.named_arrays import ARRAY_SUFFIXES, Source
 from tactile_bayes.files.provenance import Provenance, hash_inputs
 from tactile_bayes.files.scan_mcap import read_scan_report, read_truth, write_scan
 from tactile_bayes.findings import finding_lines
@@ -61,6 +61,7 @@ def import_action(
     output: Path | None,
     template: bool,
     columns: Path | None,
+    poses: Path | None,
     head_geometry: Path | None,
     array_calibration: Path | None,
     landmarks: Path | None,
@@ -76,7 +77,12 @@ def import_action(
     stated = {name: given.pop(name) for name in names_of(Stated)}
     arrays = ArrayMap() if columns is None else read_array_map(columns)
     arrays = replace(arrays, **{name: value for name, value in stated.items() if value is not None})
-    paths = {"head_geometry": head_geometry, "array_calibration": array_calibration, "landmarks": landmarks}
+    paths = {
+        "poses": poses,
+        "head_geometry": head_geometry,
+        "array_calibration": array_calibration,
+        "landmarks": landmarks,
+    }
     beside = {name: path for name, path in paths.items() if path is not None}
     wanted = Wanted(**given, arrays=arrays, beside=beside)
     if len(sources) == 1 and not output.is_dir():
@@ -148,7 +154,8 @@ def _import_scan(source: Path, output: Path, wanted: Wanted) -> list[str]:
         file = read_scan_report(source)
         scan, lost, truth = file.scan, file.lost, read_truth(source)
     else:
-        made = import_arrays(source, wanted.arrays, [_BESIDE[name](path) for name, path in wanted.beside.items()])
+        beside = [_of_file(name, path, wanted.arrays) for name, path in wanted.beside.items()]
+        made = import_arrays(source, wanted.arrays, beside)
         scan, notes = made.scan, made.notes
     session = {} if wanted.session_file is None else {"session": wanted.session_file}
     inputs = hash_inputs(source=source, **session, **wanted.beside)
@@ -157,6 +164,10 @@ def _import_scan(source: Path, output: Path, wanted: Wanted) -> list[str]:
     provenance = Provenance("import", settings, inputs=inputs)
     write_scan(output, scan, provenance=provenance, truth=truth, force=wanted.force)
     return [*describe_scan(scan), *notes, *(f"lost: {line}" for line in lost), *_arrangement_lines(scan)]
+
+
+def _of_file(option: str, path: Path, arrays: ArrayMap) -> Source:
+    return of_poses(path, arrays) if option == "poses" else _BESIDE[option](path)
 
 
 def _stated(arrays: ArrayMap) -> Mapping[str, Any]:

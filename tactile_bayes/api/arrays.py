@@ -16,8 +16,9 @@ from tactile_bayes.errors import UsageError
 from tactile_bayes.files.array_map import read_array_map
 from tactile_bayes.files.arrays_layout import ArrayMap, Stated
 from tactile_bayes.files.documents import with_session
-from tactile_bayes.files.imports import Source, combined, import_arrays, of_calibration, of_head, of_landmarks
+from tactile_bayes.files.imports import combined, import_arrays, of_calibration, of_head, of_landmarks, of_poses
 from tactile_bayes.files.instrument_json import head_geometry
+from tactile_bayes.files.named_arrays import Source
 from tactile_bayes.files.npz import Arrays
 from tactile_bayes.mapping.arrangement import corrected
 from tactile_bayes.scan import ElementCalibration, HeadGeometry, Landmarks, Scan, TrackerPoses
@@ -50,7 +51,8 @@ def scan_of(
         (n,) times of the frames, s, or `rate_hz` in its place.
     poses
         Of the tracker's sensor in its base: ``(time, matrices)`` with (m, 4, 4) homogeneous matrices, ``(time,
-        position, quaternion)`` with mm and the scalar first, or (m, 8) numbers in that order.
+        position, quaternion)`` with mm and the scalar first, or (m, 8) numbers in that order. Or the path of a table of
+        the tracker's, as `--poses` takes.
     head
         Path of a HEAD.json, what stands in it, or the head of another scan: ``pitch_mm``, ``surface_mm`` or ``rows``,
         ``columns`` and ``radius_mm``, and ``scanhead_from_tracker``.
@@ -77,7 +79,7 @@ def scan_of(
     """
     check_keywords("scan_of", stated, names_of(Stated))
     given = _stated(columns, stated)
-    beside = [_poses(poses), _head(head), _calibration(calibration), _landmarks(landmarks)]
+    beside = [_poses(poses, given), _head(head), _calibration(calibration), _landmarks(landmarks)]
     if isinstance(frames, str | Path):
         made = import_arrays(path_of(frames), given, beside)
     else:
@@ -100,10 +102,12 @@ def _stated(columns: PathLike | Mapping[str, Any] | None, stated: Mapping[str, A
     return replace(named, **values)
 
 
-def _poses(given: Any) -> Source:
+def _poses(given: Any, stated: ArrayMap) -> Source:
     """Times, places and rotations, in the forms that `scan_of` takes."""
     if given is None:
         return Source({})
+    if isinstance(given, str | Path):
+        return of_poses(path_of(given), stated)
     if isinstance(given, TrackerPoses):
         return Source(_named(given.time_s, given.position_mm, given.quaternion_wxyz))
     if isinstance(given, tuple | list) and len(given) == 3:

@@ -85,6 +85,7 @@ def demo_command(ctx: click.Context, /, **given: Any) -> None:
 )
 @click.option("--template", is_flag=True, help="Print a MAP.toml for --columns: of SRC, with what its shapes tell.")
 @click.option("--columns", metavar="MAP.toml", type=FilePath(), help="Scan: what SRC calls its arrays.")
+@click.option("--poses", metavar="FILE", type=FilePath(), help="Scan: the tracker's poses, in a table of their own.")
 @takes(RecordOptions, "head_geometry", "array_calibration", "landmarks")
 @takes(Stated, *names_of(Stated))
 @SESSION

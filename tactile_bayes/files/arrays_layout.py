@@ -79,7 +79,10 @@ class Stated(Options, kw_only=True):
 
     unit: Annotated[
         Unit | None,
-        Meta(description="Scan: unit of the frames; counts are raw, the others need no calibration. Default: counts."),
+        Meta(
+            description="Scan: unit of the frames; counts are raw, others need no calibration. Default: the file's, "
+            "else counts."
+        ),
     ] = None
     saturation: Annotated[
         Annotated[float, Meta(gt=0)] | None,
@@ -97,22 +100,30 @@ class Stated(Options, kw_only=True):
         Literal["rows", "columns"] | None,
         Meta(description="Scan: whether such a row runs along the array's rows or columns. Default: rows."),
     ] = None
+    skip_columns: Annotated[
+        Annotated[int, Meta(ge=0)] | None,
+        Meta(description="Scan: columns of a table of frames before its readings. Default: told by the header."),
+    ] = None
     rate_hz: Annotated[
         Rate | None, Meta(description="Scan: frames a second, where they have no times.", extra={"metavar": "HZ"})
     ] = None
-    time_unit: Annotated[TimeUnit | None, Meta(description="Scan: unit of the frames' times. Default: s.")] = None
+    time_unit: Annotated[
+        TimeUnit | None, Meta(description="Scan: unit of the frames' times. Default: the file's, else s.")
+    ] = None
     pose_layout: Annotated[
         PoseLayout | None,
         Meta(
             description="Scan: rotations of the poses: quaternions with the scalar first or last, azimuth, elevation "
-            "and roll, or rows of a 4 x 4 matrix. Default: wxyz."
+            "and roll, or rows of a 4 x 4 matrix. Default: by the names of the columns, else wxyz."
         ),
     ] = None
     length_unit: Annotated[
         Literal["mm", "cm", "m", "inch"] | None,
-        Meta(description="Scan: unit of the poses' positions. Default: mm."),
+        Meta(description="Scan: unit of the poses' positions. Default: the file's, else mm."),
     ] = None
-    pose_time_unit: Annotated[TimeUnit | None, Meta(description="Scan: unit of the poses' times. Default: s.")] = None
+    pose_time_unit: Annotated[
+        TimeUnit | None, Meta(description="Scan: unit of the poses' times. Default: the file's, else s.")
+    ] = None
     pose_rate_hz: Annotated[
         Rate | None,
         Meta(description="Scan: poses a second, where they have frame numbers or no times.", extra={"metavar": "HZ"}),
@@ -120,6 +131,13 @@ class Stated(Options, kw_only=True):
     pose_offset_s: Annotated[
         Annotated[float, Meta(ge=-1e10, le=1e10)] | None,
         Meta(description="Scan: added to the poses' times, for the frames' clock. Default: 0.", extra={"metavar": "S"}),
+    ] = None
+    pose_good: Annotated[
+        str | None,
+        Meta(description="Scan: value of the poses' status where the tool is seen. Default: OK, Enabled and the like."),
+    ] = None
+    tool: Annotated[
+        str | None, Meta(description="Scan: which tool or station of the poses' file.", extra={"metavar": "NAME"})
     ] = None
 
 

@@ -12,13 +12,16 @@ from typing import Any, Final
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from tactile_bayes.declarations import Record, names_of
+from tactile_bayes.declarations import Record, names_of, replace
 from tactile_bayes.errors import BadDataError, meant
 from tactile_bayes.files.arrays_layout import KNOWN, LAYOUT, OPTIONAL, ArrayMap, Shape, Stated, in_words
+from tactile_bayes.files.frames_text import read_frames
 from tactile_bayes.files.instrument_json import read_array_calibration, read_head_geometry, read_landmarks
-from tactile_bayes.files.named_arrays import read_named
+from tactile_bayes.files.named_arrays import Source, is_text, read_named
 from tactile_bayes.files.npz import Arrays
+from tactile_bayes.files.poses_text import read_poses
 from tactile_bayes.files.scan_mcap import read_scan
+from tactile_bayes.files.sequence_mha import is_sequence, read_sequence
 from tactile_bayes.geometry import FloatArray, check_rigid
 from tactile_bayes.mapping.select import other_units
 from tactile_bayes.presets import KPA_PER_UNIT, PRESSURE_RANGE_KPA, PRESSURE_WINDOW_KPA
@@ -33,19 +36,12 @@ _SECONDS: Final = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "min": 60.0}
 _MM: Final = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "inch": 25.4}
 _NOT_RIGID: Final = 1e-3  # of matrices that were written with few digits
 _BESIDE: Final = {
+    "--poses FILE": ("position_mm", "quaternion_wxyz", "pose_time_s"),
     "--head-geometry HEAD.json": ("pitch_mm", "array_from_tracker", "head_surface_mm"),
     "--unit or --array-calibration CAL.json": ("gain_kpa_per_count", "offset_kpa"),
     "--rate-hz": ("frame_time_s",),
 }
 """Options that give what a file of arrays may lack."""
-
-
-class Source(Record, eq=False):
-    """Arrays that a file holds, by names of the layout, with what it says of them and what was guessed."""
-
-    arrays: Arrays
-    stated: Stated = Stated()
-    notes: tuple[str, ...] = ()
 
 
 class Imported(Record, eq=False):
@@ -75,18 +71,35 @@ def import_arrays(path: Path, given: ArrayMap | None = None, beside: Sequence[So
     """
     given = given or ArrayMap()
     try:
-        return combined([_read(path, given), *beside], given)
+        return combined([_read(path, given, beside), *beside], given)
     except BadDataError as error:
         raise error.at(path) from None
 
 
-def over(given: Stated, said: Stated) -> Stated:
+def _over(given: Stated, said: Stated) -> Stated:
     """What is stated by the caller, and otherwise by a file."""
     both = {name: getattr(given, name) for name in names_of(Stated)}
+    if given.unit not in (None, said.unit):
+        said = replace(said, saturation=None)  # in the file's unit
     return Stated(**{name: getattr(said, name) if value is None else value for name, value in both.items()})
 
 
-def _read(path: Path, given: ArrayMap) -> Source:
+def _overridden(given: Stated, said: Stated) -> list[str]:
+    """A line for each thing that the caller states and a file says otherwise."""
+    pairs = {name: (getattr(given, name), getattr(said, name)) for name in names_of(Stated)}
+    return [
+        f"{name.replace('_', '-')} {ours} as stated, where the file says {theirs}"
+        for name, (ours, theirs) in pairs.items()
+        if None not in (ours, theirs) and ours != theirs
+    ]
+
+
+def _read(path: Path, given: ArrayMap, beside: Sequence[Source]) -> Source:
+    if is_sequence(path):
+        return read_sequence(path, given, frames=True)
+    if is_text(path):
+        heads = [one.arrays["head_surface_mm"] for one in beside if "head_surface_mm" in one.arrays]
+        return read_frames(path, given, shape=heads[-1].shape[:2] if heads else None)
     there = {name: name for name in KNOWN} | _checked_names(given)
 
     def choose(names: Sequence[str]) -> list[str]:
@@ -103,6 +116,11 @@ def _read(path: Path, given: ArrayMap) -> Source:
     held = read_named(path, choose)
     arrays = {here: held[name] for here, name in there.items() if name in held}
     return Source(arrays | {name: np.asarray(value) for name, value in given.values.items()})
+
+
+def of_poses(path: Path, given: Stated) -> Source:
+    """Poses of a file of their own: a table, or a sequence metafile."""
+    return read_sequence(path, given, frames=False) if is_sequence(path) else read_poses(path, given)
 
 
 def _checked_names(given: ArrayMap) -> dict[str, str]:
@@ -168,8 +186,8 @@ def combined(sources: Sequence[Source], given: Stated) -> Imported:
     told: list[str] = []
     held: Arrays = {}
     for source in sources:
-        stated = over(stated, source.stated)
-        told += source.notes
+        told += [*_overridden(given, source.stated), *source.notes]
+        stated = _over(stated, source.stated)
         held |= {name: np.asarray(one) for name, one in source.arrays.items()}
     _check_numbers(held)
     if "frames" in held:
@@ -297,7 +315,7 @@ def _unfolded(counts: np.ndarray[Any, Any], held: Arrays, stated: Stated, told: 
     if shape[0] * shape[1] != counts.shape[1]:
         raise BadDataError(
             f"{each}, and {shape[0]} x {shape[1]} taxels are {shape[0] * shape[1]}",
-            way_out="give --frame-shape ROWS COLUMNS",
+            way_out="give --frame-shape ROWS COLUMNS, or --skip-columns for those before the readings",
         )
     by_columns = stated.frame_order == "columns"
     if stated.frame_order is None or stated.frame_shape is None:
@@ -315,7 +333,7 @@ def _clocks(held: Arrays, stated: Stated) -> None:
     elif stated.rate_hz is not None and "counts" in held:
         held["frame_time_s"] = np.arange(len(held["counts"])) / stated.rate_hz
     if "pose_time_s" in held:
-        held["pose_time_s"] = held["pose_time_s"] * _SECONDS[stated.pose_time_unit or stated.time_unit or "s"]
+        held["pose_time_s"] = held["pose_time_s"] * _SECONDS[stated.pose_time_unit or "s"]
     elif stated.pose_rate_hz is not None and "position_mm" in held:
         held["pose_time_s"] = np.arange(len(held["position_mm"])) / stated.pose_rate_hz
     if "pose_time_s" in held and stated.pose_offset_s:

@@ -12,7 +12,9 @@ from typing import Any, Final
 import numpy as np
 import scipy.io
 
+from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError
+from tactile_bayes.files.arrays_layout import Stated
 from tactile_bayes.files.netcdf import Group, open_netcdf
 from tactile_bayes.files.npz import Arrays, choose_npz, load_npy
 from tactile_bayes.files.reading import (
@@ -26,6 +28,15 @@ from tactile_bayes.files.reading import (
     read_bytes,
     unpacked_limit,
 )
+
+
+class Source(Record, eq=False):
+    """Arrays of a scan by names of the layout, with what their file says of them and what was guessed."""
+
+    arrays: Arrays
+    stated: Stated = Stated()
+    notes: tuple[str, ...] = ()
+
 
 Choose = Callable[[Sequence[str]], Iterable[str]]
 """Takes the names in a file and returns those to read."""
@@ -49,8 +60,7 @@ def read_named(path: Path, choose: Choose) -> Arrays:
     BadDataError
         For a file of another kind, a damaged one, one that unpacks to more than its limit, and objects.
     """
-    with open_input(path) as stream:
-        start = stream.read(_USER_BLOCK + len(HDF5_MAGIC))
+    start = _start(path)
     try:
         if start.startswith(ZIP_MAGIC[:2]):
             return choose_npz(path, choose)
@@ -65,6 +75,18 @@ def read_named(path: Path, choose: Choose) -> Arrays:
     except BadDataError as error:
         raise error.at(path) from None
     raise _of_another_kind(path, start)
+
+
+def is_text(path: Path) -> bool:
+    """True for a file that is none of arrays by its first bytes and its suffix, and may be a text."""
+    start = _start(path)
+    known = (ZIP_MAGIC[:2], np.lib.format.MAGIC_PREFIX, _MAT_5, _MAT_73, HDF5_MAGIC, MCAP_MAGIC)
+    return path.suffix.lower() not in ARRAY_SUFFIXES and not start.startswith(known)
+
+
+def _start(path: Path) -> bytes:
+    with open_input(path) as stream:
+        return stream.read(_USER_BLOCK + len(HDF5_MAGIC))
 
 
 def _of_another_kind(path: Path, start: bytes) -> BadDataError:

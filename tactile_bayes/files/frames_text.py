@@ -1,0 +1,252 @@
+"""Frames of a pressure array in a text: one row a frame, or blocks of rows, behind what their program writes first.
+
+Layouts that are known by what stands in them:
+
+- one row a frame: numbers alone, or below a header that names times and counters (pedar and pliance of novel:
+  ``time[secs]``, then a column a sensor)
+- one block of rows a frame, with a line such as ``Frame 12`` or a blank one between (Tekscan's ASCII movie with
+  ``ROWS``, ``SECONDS_PER_FRAME`` and ``UNITS``; XSENSOR's CSV with ``Time`` and ``Units``)
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from tactile_bayes.errors import BadDataError
+from tactile_bayes.files.arrays_layout import Stated
+from tactile_bayes.files.named_arrays import Source
+from tactile_bayes.files.text_lines import Line, TextTable, number, read_text_table
+from tactile_bayes.geometry import FloatArray
+
+_UNITS: Final = {
+    **{unit.lower(): unit for unit in ("kPa", "Pa", "psi", "mmHg", "N/cm2", "counts")},
+    "n/cm²": "N/cm2",
+    "n/cm^2": "N/cm2",
+    "raw": "counts",
+}
+"""Units by what programs call them, in small letters."""
+_UNIT_LINE: Final = re.compile(r"^\W*(pressure[ _])?units?\b[^\w]*([\w/^²]+)", re.IGNORECASE)
+_UNIT_WORD: Final = re.compile(r"[\[(]\s*(kpa|psi|mmhg|n/cm2|n/cm²|n/cm\^2)\s*[\])]", re.IGNORECASE)
+_PERIOD_LINE: Final = re.compile(r"\b(seconds_per_frame|time per pic)\b\D*([\d.,]+)", re.IGNORECASE)
+_RATE_LINE: Final = re.compile(
+    r"\b((?:sampl\w*|scan\w*|frame|record\w*)[ _]?(?:rate|frequency)|frames per second|fps)\b\D*([\d.,]+)",
+    re.IGNORECASE,
+)
+_TIME_LINE: Final = re.compile(r"\btime\b[^\d\n]*(\d[\d:.,]*)\s*(ms|s|secs?|seconds)?\b", re.IGNORECASE)
+_SATURATION_LINE: Final = re.compile(r"^\W*saturation[_ ]pressure\b\D*([\d.,]+)", re.IGNORECASE)
+_TIME_NAME: Final = re.compile(r"(time|t|timestamp|elapsed|elapsed time|secs?|seconds|clock|zeit)", re.IGNORECASE)
+_OTHER_NAME: Final = re.compile(
+    r"^(no|nr|#|n|i|id)\W*$|\b(frame|index|idx|sample|number|counter|date|sum|total|mean|average|avg|max|min|peak|force|"
+    r"load|area|cof|cop)(?![a-z])",
+    re.IGNORECASE,
+)
+"""Names of columns that hold no reading of one taxel, nor a time."""
+_UNIT_OF_TIME: Final = re.compile(r"(?:[\[(_ ]|(?<=time))(ms|msec|us|µs|s|secs?|seconds|min)[\])]?$", re.IGNORECASE)
+_PLAIN: Final = re.compile(r"[\[(].*?[\])]|_?(ms|us|secs?|s)$", re.IGNORECASE)  # what is no part of a name
+_SECONDS: Final = {"ms": "ms", "msec": "ms", "us": "us", "µs": "us", "min": "min"}
+_MOST_LABELS: Final = 8
+
+
+def read_frames(path: Path, given: Stated, *, shape: tuple[int, int] | None) -> Source:
+    """Read frames and, where the text has them, their times, unit and rate.
+
+    Parameters
+    ----------
+    shape
+        Rows and columns of the head, where it is known.
+    """
+    table = read_text_table(path)
+    shape = given.frame_shape or shape
+    blocks = _blocks(table, None if shape is None else shape[0] * shape[1])
+    before = [line for line in table.lines if line.number < blocks[0][0].number]
+    stated, notes = _said(before)
+    notes = [f"frames: {table.words}", *notes]
+    if len(blocks) > 1 and len(blocks[0]) > 1:
+        return _of_blocks(table, blocks, stated, notes)
+    rows = [line for block in blocks for line in block]
+    names = before[-1].fields if before and len(before[-1].fields) == len(rows[0].fields) else []
+    return _of_rows(table, rows, names, shape, given, stated, notes)
+
+
+def _blocks(table: TextTable, taxels: int | None) -> list[list[Line]]:
+    """Runs of lines of numbers, of which each has as many as the last: the longest of the text's widths.
+
+    Lines of numbers of another width that come first belong to what stands before.
+    """
+    several = [line.fields for line in table.lines if len(line.fields) > 1]
+    widths = [len(fields) for fields in several if table.numbers(fields) is not None]
+    if not widths:
+        raise BadDataError("holds no row of numbers", way_out="give one row a frame, or blocks of rows")
+    width = max(set(widths), key=lambda one: (widths.count(one) * one, one))
+    blocks: list[list[Line]] = []
+    open_block = False
+    for line in table.lines:
+        held = len(line.fields) == width and table.numbers(line.fields) is not None
+        if held and open_block and not line.after_blank:
+            blocks[-1].append(line)
+        elif held:
+            blocks.append([line])
+        elif blocks and len(line.fields) > 1 and not _title(line) and _of_numbers(table, line, width):
+            what = f"line {line.number} holds {_first_odd(table, line)}, the others {width} numbers"
+            raise BadDataError(what, way_out="give every row one length, numbers alone")
+        open_block = held
+    if taxels is not None and width >= taxels:  # rows of one table, whatever stands between
+        return [[line for block in blocks for line in block]]
+    lengths = {len(block) for block in blocks}
+    if len(lengths) > 1 and min(lengths) > 1:
+        odd = next(block for block in blocks if len(block) != len(blocks[0]))
+        what = f"has frames of {len(blocks[0])} rows and, at line {odd[0].number}, one of {len(odd)}"
+        raise BadDataError(what, way_out="leave out a frame that is cut off")
+    return blocks if len(lengths) == 1 else [[line for block in blocks for line in block]]
+
+
+def _of_numbers(table: TextTable, line: Line, width: int) -> bool:
+    """True for a line that looks like one of the table, and is not."""
+    return table.numbers(line.fields) is not None or len(line.fields) >= width - 1
+
+
+def _title(line: Line) -> bool:
+    return line.text.lstrip('" ').lower().startswith(("frame", "time", "@@"))
+
+
+def _first_odd(table: TextTable, line: Line) -> str:
+    odd = [one for one in line.fields if table.numbers([one]) is None]
+    return repr(odd[0][:30]) if odd else f"{len(line.fields)} numbers"
+
+
+def _said(before: Iterable[Line]) -> tuple[Stated, list[str]]:
+    """What the lines before the numbers say of unit, rate and saturation, and a note for each."""
+    found: dict[str, Any] = {}
+    notes = []
+    for line in before:
+        for option, value in _said_in(line.text):
+            if option not in found:
+                found[option] = value
+                said = f"{value:g}" if isinstance(value, float) else value
+                notes.append(f"{option.replace('_', '-')} {said} by line {line.number}, {line.text.strip()[:40]!r}")
+    if found.get("unit", "counts") == "counts":
+        found.pop("saturation", None)  # of a pressure, where there are none
+    return Stated(**found), notes
+
+
+def _said_in(text: str) -> Iterable[tuple[str, Any]]:
+    unit = _UNIT_LINE.search(text)
+    word = unit[2] if unit else (named[1] if (named := _UNIT_WORD.search(text)) else "")
+    if word.lower() in _UNITS:
+        yield "unit", _UNITS[word.lower()]
+    for pattern, option, made in (
+        (_PERIOD_LINE, "rate_hz", lambda value: 1 / value),
+        (_RATE_LINE, "rate_hz", float),
+        (_SATURATION_LINE, "saturation", float),
+    ):
+        if (found := pattern.search(text)) and (value := float(found[found.lastindex or 1].replace(",", "."))) > 0:
+            yield option, made(value)
+
+
+def _of_blocks(table: TextTable, blocks: Sequence[Sequence[Line]], stated: Stated, notes: list[str]) -> Source:
+    frames = np.array([[table.numbers(line.fields) for line in block] for block in blocks])
+    arrays = {"frames": frames}
+    first = blocks[0][0].number
+    titles = [line for line in table.lines if line.fields and table.numbers(line.fields) is None]
+    times = _times_between(titles, [block[0].number for block in blocks])
+    if times is not None:
+        arrays["frame_time_s"] = times
+        notes.append("times of the frames by the lines above them")
+    notes.append(f"{len(frames)} frames, each a block of {frames.shape[1]} rows (the first at line {first})")
+    return Source(arrays, stated, tuple(notes))
+
+
+def _times_between(titles: Sequence[Line], starts: Sequence[int]) -> FloatArray | None:
+    """A time above each block, in s; None where one has none."""
+    found, before = [], 0
+    for start in starts:
+        texts = [line.text for line in titles if before < line.number < start]
+        match = next((one for text in reversed(texts) if (one := _TIME_LINE.search(text))), None)
+        if match is None:
+            return None
+        try:
+            found.append(number(match[1], decimal_comma=True) * (0.001 if (match[2] or "").lower() == "ms" else 1.0))
+        except ValueError:
+            return None
+        before = start
+    return np.array(found)
+
+
+def _of_rows(
+    table: TextTable,
+    rows: Sequence[Line],
+    names: Sequence[str],
+    shape: tuple[int, int] | None,
+    given: Stated,
+    stated: Stated,
+    notes: list[str],
+) -> Source:
+    values = np.array([table.numbers(line.fields) for line in rows])
+    if _counts(values[0][np.isfinite(values[0])]) and len(rows) > 1:
+        notes.append(f"line {rows[0].number} counts {values[0, -2]:g}, {values[0, -1]:g}: taken for labels")
+        values = values[1:]
+    taxels = None if shape is None else shape[0] * shape[1]
+    time, readings = _columns(values, list(names), taxels, given)
+    arrays = {"frames": values[:, readings]}
+    if len(readings) < values.shape[1]:
+        notes.append(f"{len(readings)} of {values.shape[1]} columns are readings, from column {readings[0] + 1} on")
+    if time is not None:
+        arrays["frame_time_s"] = values[:, time]
+        named = repr(names[time]) if names else "rising"
+        unit = _unit_of_time(names[time]) if names else ""
+        notes.append(f"times in column {time + 1} ({named})" + (f", in {unit}" if unit else ""))
+        if unit and stated.time_unit is None:
+            stated = Stated(**{**_given(stated), "time_unit": unit})
+    return Source(arrays, stated, tuple(notes))
+
+
+def _given(stated: Stated) -> dict[str, Any]:
+    return {name: getattr(stated, name) for name in Stated.__struct_fields__}
+
+
+def _counts(line: FloatArray) -> bool:
+    return len(line) >= _MOST_LABELS and line[0] in (0.0, 1.0) and bool((np.diff(line) == 1.0).all())
+
+
+def _unit_of_time(name: str) -> str:
+    found = _UNIT_OF_TIME.search(name.strip())
+    return _SECONDS.get(found[1].lower(), "s") if found else ""
+
+
+def _columns(values: FloatArray, names: list[str], taxels: int | None, given: Stated) -> tuple[int | None, list[int]]:
+    """Columns of times (None without) and of readings: as stated, by their names, else by how many there are."""
+    width = values.shape[1]
+    plain = [_PLAIN.sub("", name.strip()).strip(" _") for name in names]
+    timed = [i for i, name in enumerate(plain) if _TIME_NAME.fullmatch(name) or _TIME_NAME.fullmatch(names[i])]
+    others = [i for i, name in enumerate(plain) if _OTHER_NAME.search(name)]
+    first = given.skip_columns
+    if first is None and names and (timed or others):
+        readings = [i for i in range(width) if i not in (*timed, *others)]
+        if taxels is None or len(readings) == taxels:
+            return (timed[0] if timed else None), readings
+        told = ", ".join(repr(names[i]) for i in (*range(min(3, width)), width - 1))
+        what = f"names {width} columns ({told}), {len(readings)} of which may be readings, for {taxels} taxels"
+        raise BadDataError(what, way_out="give --skip-columns, the number of those before the readings")
+    if first is None:
+        first = 0 if taxels is None else width - taxels
+    if not 0 <= first < width or (taxels is not None and first + taxels > width):
+        raise BadDataError(
+            f"has {width} columns, and the head {taxels} taxels", way_out="give --skip-columns, or another head"
+        )
+    readings = list(range(first, width if taxels is None else first + taxels))
+    if timed and timed[0] < first:
+        return timed[0], readings
+    return _rising(values[:, :first]), readings
+
+
+def _rising(columns: FloatArray) -> int | None:
+    """The column that rises and does not count by ones, else one that rises; None without."""
+    steps = np.diff(columns, axis=0)
+    rising = [i for i in range(columns.shape[1]) if len(steps) and (steps[:, i] >= 0).all() and steps[:, i].any()]
+    counting = [i for i in rising if (steps[:, i] == 1).all()]
+    return next((i for i in rising if i not in counting), next(iter(rising), None))

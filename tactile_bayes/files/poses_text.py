@@ -1,0 +1,299 @@
+"""Poses of a tracker in a text of their own: columns by their names, or numbers in a stated layout.
+
+Layouts that are known by their columns:
+
+- NDI's (ToolBox, and the examples of the Combined API): ``Frame#, PortHandle, Face#, TransformStatus, Q0, Qx, Qy, Qz,
+  Tx, Ty, Tz, Error``, mm, scalar first, a row without numbers where the tool is not seen
+- azimuth, elevation and roll in degrees, as Polhemus trackers send them: ``x, y, z, az, el, roll``, in cm or inches
+- homogeneous matrices: 12 or 16 numbers a row, with a time before them
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from tactile_bayes.declarations import replace
+from tactile_bayes.errors import BadDataError
+from tactile_bayes.files.arrays_layout import Stated
+from tactile_bayes.files.named_arrays import Source
+from tactile_bayes.files.text_lines import Line, TextTable, read_text_table
+from tactile_bayes.geometry import FloatArray
+
+_NAMES: Final[Mapping[str, str]] = {
+    **dict.fromkeys(("tx", "x", "px", "posx", "positionx"), "x"),
+    **dict.fromkeys(("ty", "y", "py", "posy", "positiony"), "y"),
+    **dict.fromkeys(("tz", "z", "pz", "posz", "positionz"), "z"),
+    **dict.fromkeys(("q0", "qw", "w", "rotw", "orientationw"), "qw"),
+    **dict.fromkeys(("qx", "q1", "orientationx"), "qx"),
+    **dict.fromkeys(("qy", "q2", "orientationy"), "qy"),
+    **dict.fromkeys(("qz", "q3", "orientationz"), "qz"),
+    **dict.fromkeys(("az", "azimuth", "azi"), "azimuth"),
+    **dict.fromkeys(("el", "elevation", "elev"), "elevation"),
+    **dict.fromkeys(("roll", "ro", "rl"), "roll"),
+    **dict.fromkeys(("time", "t", "timestamp", "times", "timems", "timestampms", "timeus", "secs", "seconds"), "time"),
+    **dict.fromkeys(("timespecs",), "seconds"),
+    **dict.fromkeys(("timespecns",), "nanoseconds"),
+    **dict.fromkeys(("frame", "framenumber", "frameno"), "frame"),
+    **dict.fromkeys(("state", "status", "transformstatus", "trackingstatus"), "status"),
+    **dict.fromkeys(("tool", "toolid", "toolinfo", "port", "porthandle", "toolhandle", "station", "sensor"), "tool"),
+}
+"""What a column is, by its name in small letters and digits."""
+_ROTATIONS: Final = {"wxyz": ("qw", "qx", "qy", "qz"), "euler": ("azimuth", "elevation", "roll")}
+_PLACE: Final = ("x", "y", "z")
+_SEEN: Final = ("ok", "enabled", "valid", "tracked", "good", "true", "visible")
+"""Status of a tool that is seen, in small letters."""
+_UNIT: Final = re.compile(r"[\[(_ ](mm|cm|m|in|inch|inches)[\])]?$", re.IGNORECASE)
+_TIME_UNIT: Final = re.compile(r"[\[(_ ](ms|us|s|sec|min)[\])]?$", re.IGNORECASE)
+_LENGTHS: Final = {"in": "inch", "inches": "inch"}
+_BARE: Final = {"wxyz": 7, "xyzw": 7, "euler": 6, "matrix": 16}
+"""Numbers of a pose in a text without names, by its layout; a time and a station may stand before them."""
+_MOST_STATIONS: Final = 16
+_LARGEST_MM: Final = 1e7  # NDI writes -3.697314e28 where a tool is not seen
+
+
+def read_poses(path: Path, given: Stated) -> Source:
+    """Read times, places and rotations; rows in which the tool is not seen are left out and counted.
+
+    Raises
+    ------
+    BadDataError
+        Where it has several tools and none is stated, no times, or columns that are none of a known layout.
+    """
+    try:
+        table = read_text_table(path)
+        header = next((line for line in table.lines if _is_header(line)), None)
+        found = _bare(table, given) if header is None else _named(table, header, given)
+        return replace(found, notes=(f"poses: {table.words}", *found.notes))
+    except BadDataError as error:
+        raise error.at(path) from None
+
+
+def _plain(name: str) -> str:
+    return re.sub(r"[^a-z0-9]", "", re.sub(r"[\[(].*?[\])]", "", name.lower()))
+
+
+def _kind(name: str) -> str:
+    plain = _plain(name)
+    return _NAMES.get(plain) or _NAMES.get(re.sub(r"(mm|cm|inch|in|deg|ms|us|s)$", "", plain), "")
+
+
+def _is_header(line: Line) -> bool:
+    kinds = {_kind(name) for name in line.fields}
+    return kinds.issuperset(_PLACE) or len(kinds & {"qw", "qx", "azimuth", "elevation"}) > 1
+
+
+def seen(
+    time: FloatArray, numbers: FloatArray, why: Sequence[str], *, layout: str, stated: Mapping[str, Any] | None = None
+) -> Source:
+    """Poses of the rows in which the tool is seen; the others are counted by their reasons.
+
+    Parameters
+    ----------
+    time
+        (m,) times; in the unit that `stated` has as ``pose_time_unit``.
+    numbers
+        (m, k) places and then rotations in the layout, or (m, 16) matrices.
+    why
+        Why a row has no pose, by its status; empty where it has one.
+    """
+    reasons = [reason or _without(row, layout) for reason, row in zip(why, numbers, strict=True)]
+    keep = np.array([not reason for reason in reasons], dtype=bool)
+    counted = ", ".join(f"{number} {reason}" for reason, number in Counter(filter(None, reasons)).most_common())
+    if not keep.any():
+        raise BadDataError(f"has no pose in which the tool is seen ({counted})", way_out="give another file")
+    notes = [f"{(~keep).sum()} of {len(keep)} poses left out as gaps: {counted}"] if counted else []
+    arrays = {"pose_time_s": time[keep]}
+    if layout == "matrix":
+        arrays["pose_matrix"] = numbers[keep]
+    else:
+        arrays |= {"position_mm": numbers[keep, :3], "quaternion_wxyz": numbers[keep, 3:]}
+    return Source(arrays, Stated(**{"pose_layout": layout, **(stated or {})}), tuple(notes))
+
+
+def _without(row: FloatArray, layout: str) -> str:
+    """Why the numbers of a row are no pose; empty where they are one."""
+    if not np.isfinite(row).all():
+        return "without numbers"
+    if (np.abs(row) > _LARGEST_MM).any():
+        return "with numbers that mean none"
+    if layout == "matrix":
+        return "with the identity matrix" if np.array_equal(row[:12], np.eye(4).ravel()[:12]) else ""
+    return "without a rotation" if layout != "euler" and not row[3:].any() else "" if row.any() else "of zeros"
+
+
+def chosen(names: Sequence[str], given: Stated, *, what: str) -> str:
+    """The tool that is stated, or the only one."""
+    if given.tool is not None:
+        alike = [name for name in names if given.tool in (name, name.split()[0])]
+        if len(alike) == 1:
+            return alike[0]
+        raise BadDataError(f"has no one tool {given.tool!r} in {what}", way_out=f"--tool is one of {', '.join(names)}")
+    if len(names) > 1:
+        raise BadDataError(f"has {len(names)} tools in {what}: {', '.join(names)}", way_out="choose one, --tool NAME")
+    return names[0]
+
+
+# --- Columns by their names.
+
+
+def _named(table: TextTable, header: Line, given: Stated) -> Source:
+    kinds = [_kind(name) for name in header.fields]
+    layout = "wxyz" if "qw" in kinds else "euler"
+    names = (*_PLACE, *_ROTATIONS[layout])
+    if not set(names) <= set(kinds):
+        raise BadDataError(
+            f"line {header.number} names no {', '.join(sorted(set(names) - set(kinds)))}",
+            way_out="name columns Tx, Ty, Tz and Q0, Qx, Qy, Qz, or x, y, z and azimuth, elevation, roll",
+        )
+    if given.pose_layout not in (None, layout):
+        raise BadDataError(f"line {header.number} names its rotations ({layout})", way_out="leave --pose-layout out")
+    rows = [line for line in table.lines if line.number > header.number]
+    columns, rows = _of_one_tool(kinds, rows, names, given)
+    numbers = np.column_stack([_values(table, rows, columns[name]) for name in names])
+    status = [_field(line, columns["status"]) for line in rows] if "status" in columns else [""] * len(rows)
+    time, unit = _times(table, rows, columns, header, given)
+    stated: dict[str, Any] = {"pose_time_unit": unit} if unit else {}
+    length = _unit_of(header.fields[columns["x"]], _UNIT)
+    if length:
+        stated["length_unit"] = _LENGTHS.get(length, length)
+    elif layout == "euler" and given.length_unit is None:
+        raise BadDataError("does not say the unit of x, y and z", way_out="give --length-unit cm, inch or mm")
+    why = _unseen(status, given) if "status" in columns else status
+    found = seen(time, numbers, why, layout=layout, stated=stated)
+    named = f"poses by the names of line {header.number}: {', '.join(header.fields[columns[one]] for one in names)}"
+    return replace(found, notes=(named, *found.notes))
+
+
+def _of_one_tool(
+    kinds: Sequence[str], rows: Sequence[Line], names: Sequence[str], given: Stated
+) -> tuple[dict[str, int], list[Line]]:
+    """Columns of one tool, which may stand beside others (as NDI writes them) or in rows between theirs."""
+    first = names[3]
+    sets = [i for i, kind in enumerate(kinds) if kind == first]
+    if len(sets) > 1:
+        numbered = [str(i + 1) for i in range(len(sets))]
+        what = f"{len(sets)} groups of columns"
+        at = sets[int(chosen(numbered, given, what=what)) - 1]
+    else:
+        at = sets[0]
+    columns = {kind: _nearest(kinds, kind, at, pose=kind in names) for kind in set(kinds) if kind}
+    held = list(rows)
+    if len(sets) == 1 and "tool" in columns:
+        tools = dict.fromkeys(_field(line, columns["tool"]) for line in rows)
+        tool = chosen(list(tools), given, what="its rows")
+        held = [line for line in rows if _field(line, columns["tool"]) == tool]
+    return columns, held
+
+
+def _nearest(kinds: Sequence[str], kind: str, at: int, *, pose: bool) -> int:
+    """The column of a kind beside another; what is said of a tool stands before its pose."""
+    places = [i for i, one in enumerate(kinds) if one == kind]
+    before = [i for i in places if i < at]
+    return min(places, key=lambda i: abs(i - at)) if pose or not before else before[-1]
+
+
+def _field(line: Line, column: int) -> str:
+    return line.fields[column] if column < len(line.fields) else ""
+
+
+def _values(table: TextTable, rows: Sequence[Line], column: int) -> FloatArray:
+    """Numbers of a column, NaN where there is none."""
+    found = (table.numbers([_field(line, column)]) for line in rows)
+    return np.array([np.nan if one is None else one[0] for one in found])
+
+
+def _unseen(status: Sequence[str], given: Stated) -> list[str]:
+    """Why a row has no pose, by its status; empty where the tool is seen."""
+    values = Counter(status)
+    good = _SEEN if given.pose_good is None else (given.pose_good.lower(),)
+    if not any(value.lower() in good for value in values):
+        if given.pose_good is None and len(values) == 1:
+            return [""] * len(status)
+        told = ", ".join(f"{value or 'blank'} ({number} rows)" for value, number in values.most_common(6))
+        raise BadDataError(f"its status is {told}", way_out="give the one in which the tool is seen, --pose-good VALUE")
+    return ["" if value.lower() in good else f"with status {value or 'blank'}" for value in status]
+
+
+def _times(
+    table: TextTable, rows: Sequence[Line], columns: Mapping[str, int], header: Line, given: Stated
+) -> tuple[FloatArray, str]:
+    """Times of all rows and their unit where the header says it."""
+    held = {name: _values(table, rows, column) for name, column in columns.items() if name in _TIMES}
+    if "time" in held:
+        return _settled(held["time"]), _unit_of(header.fields[columns["time"]], _TIME_UNIT).replace("sec", "s")
+    if "seconds" in held:
+        return _settled(held["seconds"] + 1e-9 * held.get("nanoseconds", 0.0)), "s"
+    if given.pose_rate_hz is None:
+        counted = "frame numbers but no times" if "frame" in held else "no column of times"
+        raise BadDataError(f"has {counted}", way_out="give the tracker's rate, --pose-rate-hz HZ")
+    number = _settled(held["frame"]) if "frame" in held else np.arange(len(rows), dtype=np.float64)
+    return (number - number[0]) / given.pose_rate_hz, "s"
+
+
+_TIMES: Final = ("time", "seconds", "nanoseconds", "frame")
+
+
+def _settled(values: FloatArray) -> FloatArray:
+    """Times of which those of rows without one lie between their neighbours'; such a row has no pose either."""
+    known = np.isfinite(values)
+    if not known.any():
+        raise BadDataError("its column of times has no number", way_out="give --pose-rate-hz in its place")
+    index = np.arange(len(values))
+    return np.asarray(np.interp(index, index[known], values[known]))
+
+
+def _unit_of(name: str, pattern: re.Pattern[str]) -> str:
+    found = pattern.search(name.strip())
+    return found[1].lower() if found else ""
+
+
+# --- Numbers without names.
+
+
+def _bare(table: TextTable, given: Stated) -> Source:
+    rows = [line for line in table.lines if table.numbers(line.fields) is not None and len(line.fields) > 1]
+    width = max(Counter(len(line.fields) for line in rows).items(), key=lambda one: one[1])[0] if rows else 0
+    values = np.array([table.numbers(line.fields) for line in rows if len(line.fields) == width])
+    layout = given.pose_layout
+    of_matrix = next((n for n in (16, 12) if width - n in (0, 1)), 0)
+    if layout is None and not of_matrix:
+        raise BadDataError(
+            f"has {width} numbers a row and no names", way_out="give --pose-layout wxyz, xyzw, euler or matrix"
+        )
+    layout = layout or "matrix"
+    size = of_matrix or 16 if layout == "matrix" else _BARE[layout]
+    if not 0 <= width - size <= 3:
+        raise BadDataError(f"has {width} numbers a row, and a pose as {layout} has {size}", way_out="correct one")
+    if layout == "euler" and given.length_unit is None:
+        raise BadDataError("does not say the unit of x, y and z", way_out="give --length-unit cm, inch or mm")
+    before, numbers = values[:, : width - size], values[:, width - size :]
+    keep = np.ones(len(values), dtype=bool)
+    for column in before.T:
+        stations = [f"{one:g}" for one in np.unique(column)]
+        if len(stations) <= _MOST_STATIONS < len(values):
+            keep &= column == float(chosen(stations, given, what="its rows (stations)"))
+    time = _rising(before[keep])
+    if time is None and given.pose_rate_hz is None:
+        raise BadDataError(f"has {width} numbers a row, of which none is a time", way_out="give --pose-rate-hz HZ")
+    when = np.arange(keep.sum()) / (given.pose_rate_hz or 1.0) if time is None else before[keep][:, time]
+    found = seen(
+        when,
+        numbers[keep],
+        [""] * int(keep.sum()),
+        layout=layout,
+        stated={} if time is not None else {"pose_time_unit": "s"},
+    )
+    at = "counted" if time is None else f"in column {time + 1}"
+    return replace(found, notes=(f"poses as {layout} from column {width - size + 1} on, times {at}", *found.notes))
+
+
+def _rising(columns: FloatArray) -> int | None:
+    """The last column that only rises; None without one."""
+    steps = np.diff(columns, axis=0)
+    return next((i for i in reversed(range(columns.shape[1])) if (steps[:, i] >= 0).all() and steps[:, i].any()), None)
