@@ -140,8 +140,8 @@ def _import(source: Path, output: Path, wanted: Wanted) -> list[str]:
     if kind == "scan" and any(one is not None for one in of_a_map):
         raise UsageError("--spacing-mm, --normalise, --units and --no-value are for maps: leave out, or give --as map")
     if kind == "map" and wanted.of_a_scan:
-        given = " and ".join(wanted.of_a_scan)
-        raise UsageError(f"{given}: for scans only; leave out or give --as scan")
+        unit = " (a map's unit is --units)" if wanted.arrays.unit else ""
+        raise UsageError(f"{' and '.join(wanted.of_a_scan)}: for scans only; leave out or give --as scan{unit}")
     lines = _import_scan(source, output, wanted) if kind == "scan" else _import_map(source, output, wanted)
     return [f"{output}: {kind}", *lines]
 

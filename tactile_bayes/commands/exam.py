@@ -59,7 +59,7 @@ def demo_command(ctx: click.Context, /, **given: Any) -> None:
     "--as",
     "kind",
     type=click.Choice(["scan", "map"]),
-    help="What SRC holds. Default: a map if the output ends in .nc or SRC is a table or an image, otherwise a scan.",
+    help="What SRC holds. Default: as the output's suffix says; a table or image without a scan's options is a map.",
 )
 @click.option("--spacing-mm", type=float, metavar="H", help="Map: side of the square cells, in mm.")
 @click.option(
@@ -94,15 +94,16 @@ def demo_command(ctx: click.Context, /, **given: Any) -> None:
 def import_command(ctx: click.Context, /, **given: Any) -> None:
     """Import scans, grids and images from other programs.
 
-    SRC is a file of arrays (a scan): .npz, .npy, MATLAB's .mat or HDF5; a scan file to repair (what is intact is kept);
-    or a grid of values (a map): .npz with `mean`, .csv (commas, semicolons or tabs), or a grey .tif, .pgm or .png
-    image. The first row of a grid has the lowest y and the first column the lowest x; pictures of the map show the
-    first row on top, as the file reads.
+    SRC holds frames (a scan): a file of arrays (.npz, .npy, MATLAB's .mat, HDF5), a text table with one row or one
+    block of rows a frame, or a sequence metafile (.mha); a scan file to repair (what is intact is kept); or a grid of
+    values (a map): .npz with `mean`, a table, or a grey .tif, .pgm or .png image. The first row of a grid has the
+    lowest y and the first column the lowest x; pictures of the map show the first row on top, as the file reads.
 
-    Frames are raw counts with a calibration, or pressures with --unit. What of a scan is the same for all files of a
-    laboratory stands in files beside it: --head-geometry, --array-calibration. What is guessed is printed.
+    Frames are raw counts with a calibration, or pressures with --unit. What SRC does not hold stands in files beside
+    it: --poses, --head-geometry, --array-calibration. A table becomes a scan where one of these is given or the output
+    ends in .mcap. What is guessed is printed, and an option states it.
 
-    Example: tactile-bayes import exam.mat --columns map.toml --unit kPa -o exam.mcap
+    Example: tactile-bayes import frames.csv --poses poses.csv --head-geometry head.json --unit kPa -o exam.mcap
     """
     from tactile_bayes.actions.bring_in import import_action
 

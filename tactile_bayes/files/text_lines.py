@@ -12,12 +12,13 @@ from typing import Final
 
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.files.reading import TABLE_BYTES, UTF_16, decoded, read_bytes
+from tactile_bayes.files.reading import TABLE_BYTES, decoded, other_encoding, read_bytes
 from tactile_bayes.files.tables import DECIMAL_COMMA, may_be_thousands
 
 _SEPARATORS: Final = {"\t": "tabs", ";": "semicolons", ",": "commas", " ": "blanks"}
 _SAMPLED: Final = 300  # lines by which the separator is told
 _LEAST_NUMBERS: Final = 0.6  # share of a line's fields that are numbers where it is one of the table
+_AS_UTF8: Final = "save it as UTF-8 text"
 _CLOCK: Final = re.compile(r"(?:(\d{1,2}):)?(\d{1,2}):(\d{1,2}(?:\.\d+)?)")
 _DATED: Final = re.compile(r"\d{4}-\d{2}-\d{2}[T ]\d{1,2}:\d{2}:\d{2}(\.\d+)?(Z|[+-]\d{2}:?\d{2})?")
 _NO_VALUE: Final = ("", "nan", "na", "n/a", "-", "--", "b", "null")
@@ -78,8 +79,10 @@ def read_text_table(path: Path) -> TextTable:
         When it is no text, or has no table of numbers, or commas that may separate thousands or decimals.
     """
     data = read_bytes(path, most=TABLE_BYTES)
-    encoding = "utf-16" if data[:2] in UTF_16 else "utf-8-sig"
-    text = decoded(data, path=path, way_out="save it as UTF-8 text", encoding=encoding)
+    other = other_encoding(data)
+    if other not in ("", "UTF-16"):
+        raise BadDataError(f"is {other} text", way_out=_AS_UTF8, path=str(path))
+    text = decoded(data, path=path, way_out=_AS_UTF8, encoding=other.lower() or "utf-8-sig")
     if "\0" in text:
         raise BadDataError("is not text", way_out="give frames as .npz, .npy, .mat, HDF5 or a table", path=str(path))
     texts = [(i, one) for i, one in enumerate(text.splitlines(), start=1) if one.strip()]

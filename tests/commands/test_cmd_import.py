@@ -95,7 +95,7 @@ def test_an_unfinished_scan_is_mended_and_the_loss_told(run_cli: Run, tmp_path: 
         (["g.csv", "-o", "g.csv", "--spacing-mm", "1"], 2, "is an input"),
         (["g.csv", "-o", "no/g.nc", "--spacing-mm", "1"], 2, "not a directory"),
         (["none.npz", "-o", "a.mcap"], 3, "cannot be read"),
-        (["g.csv", "-o", "a.mcap", "--as", "scan"], 3, "not an .npz, .npy, .mat or HDF5 file"),
+        (["g.csv", "-o", "a.mcap", "--as", "scan"], 3, "frames of 2 numbers"),
         (["g.npz", "-o", "a.mcap"], 3, "give --as map"),
         (["g.npz", "-o", "a.mcap"], 3, "position_mm (m, 3), quaternion_wxyz (m, 4)"),
         (["g.npz", "-o", "a.mcap"], 3, "`tactile-bayes import --help` says what they are"),
