@@ -129,7 +129,7 @@ def plan_action(
 _LOG_EVERY_S = 60.0  #: Where stderr is no terminal, progress is a line so often.
 
 
-def campaign_init_action(folder: Path | str, output: Path, add: bool, force: bool) -> None:
+def campaign_init_action(folder: Path | str, output: Path, names: str | None, add: bool, force: bool) -> None:
     """Write the table of exams from a folder of scans and what they carry."""
     if add and force:
         raise UsageError("--add keeps the rows of a table, --force writes it anew; give one of them")
@@ -137,14 +137,15 @@ def campaign_init_action(folder: Path | str, output: Path, add: bool, force: boo
     if output.exists() and not (add or force):
         raise UsageError(f"{output} exists; --add keeps its rows and adds other files, --force writes it anew")
     refuse_existing(output, force=force or add)
-    found = find_exams(folder, output, listed=before.rows if before else ())
+    found = find_exams(folder, output, listed=before.rows if before else (), names=names)
     for line in found.skipped:
         click.echo(f"left out: {line}", err=True)
     if before is None:
         if not found.rows:
-            raise BadDataError(
-                "holds no scan (.mcap, .npz) and no map (.nc)", way_out="give the folder of the scans", path=str(folder)
-            )
+            what, way_out = "holds no scan (.mcap, .npz) and no map (.nc)", "give the folder of the scans"
+            if found.skipped:
+                what, way_out = "holds no file that can be an exam", "see why each was left out"
+            raise BadDataError(what, way_out=way_out, path=str(folder))
         write_manifest(output, found.rows, force=force)
     elif found.rows:
         add_rows(before, found.rows)

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import os
+import re
 from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from datetime import date
 from pathlib import Path
 from typing import Any, Final
 
-from tactile_bayes.declarations import Record, field
+from tactile_bayes.declarations import Record, field, replace
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.atomic import sha256
 from tactile_bayes.files.manifest_csv import JOURNAL, natural
@@ -20,6 +22,7 @@ from tactile_bayes.files.scan_mcap import json_object, scan_records
 
 SCANS: Final = (".mcap", ".npz")
 MAP: Final = ".nc"
+_ENDINGS: Final = (*SCANS, MAP)
 _FACTS: Final = {"patient": "subject", "visit": "visit", "mass": "mass", "side": "side", "reader": "examiner"}
 """Columns of the table of exams, and what a scan calls the same."""
 
@@ -64,9 +67,83 @@ def _facts(sessions: Sequence[Mapping[str, Any]]) -> dict[str, str]:
     return {column: min(values) for column, values in told.items() if len(values) == 1 and values != {""}}
 
 
+# --- What a file's name says of its exam, by a pattern such as ``{patient}_{visit}_{exam}.npz``.
+
+_NAMED: Final = ("patient", "visit", "mass", "exam", "side", "reader", "date")
+_SIDES: Final = {"l": "left", "r": "right", "left": "left", "right": "right"}
+
+
+class NamePattern:
+    """A pattern of file names; with a ``/`` in it of the last folders too, without an ending of any file's.
+
+    A word in braces is one of `_NAMED` and stands for letters without those that part it from its neighbours; ``*``
+    stands for anything within a name.
+    """
+
+    def __init__(self, pattern: str) -> None:
+        self.pattern = pattern
+        words = re.findall(r"\{(.*?)\}", pattern)
+        unknown = [word for word in words if word not in _NAMED]
+        stray = re.search(r"[{}]", re.sub(r"\{\w+\}", "", pattern))
+        if unknown or stray or not words or len(set(words)) < len(words):
+            known = ", ".join(f"{{{name}}}" for name in _NAMED)
+            raise UsageError(f"{pattern!r} is no pattern of names; write each of {known} at most once, and one of them")
+        if touching := re.search(r"\}(\{|\*)|\*\{", pattern):
+            raise UsageError(f"{pattern!r} has nothing between two words ({touching[0]}); say what parts them")
+        self._parts = 1 + pattern.count("/")
+        self._whole = pattern.lower().endswith(_ENDINGS)
+        found = re.split(r"(\{\w+\}|\*)", pattern)
+        self._names = re.compile("".join(map(self._part, ["", *found], found, [*found[1:], ""])))
+
+    def _part(self, before: str, part: str, following: str) -> str:
+        if part == "{date}":
+            return r"(?P<date>\d{4}-\d\d-\d\d|\d{8})"
+        if part.startswith("{"):
+            return f"(?P<{part[1:-1]}>[^/{re.escape(before[-1:] + following[:1])}]+)"
+        return "[^/]*" if part == "*" else re.escape(part)
+
+    def facts(self, name: str) -> dict[str, str]:
+        """What a file's name says, by the columns of the table.
+
+        Raises
+        ------
+        BadDataError
+            When the name does not follow the pattern, or a word in it is no side, date or number.
+        """
+        parts = name.replace(os.sep, "/").split("/")
+        known = "/".join(parts[-self._parts :])
+        found = self._names.fullmatch(known if self._whole else known.rpartition(".")[0])
+        if found is None:
+            raise BadDataError(f"its name does not follow {self.pattern}")
+        told = found.groupdict()
+        if "side" in told:
+            told["side"] = _SIDES.get(told["side"].lower(), "")
+            if not told["side"]:
+                raise BadDataError(f"its name has {found['side']!r} for the side; name it left, right, L or R")
+        if "date" in told:
+            try:
+                told["date"] = date.fromisoformat(told["date"]).isoformat()
+            except ValueError:
+                raise BadDataError(f"its name has {told['date']!r} for the date; name it 2026-03-01") from None
+        if "exam" in told:
+            number = told.pop("exam")
+            if not (number.isascii() and number.isdigit() and 0 < int(number) < 10**6):
+                raise BadDataError(f"its name has {number!r} for the exam; name it with a number from 1")
+            told["replicate"] = str(int(number))
+        return told
+
+    def add_to(self, said: Said, name: str) -> Said:
+        """What a file and its name say; where they contradict each other that is an error."""
+        told = self.facts(name)
+        for column, value in told.items():
+            inside = said.facts.get(column, value)
+            if inside.casefold() != value.casefold():
+                raise BadDataError(f"its name says {column} {value}, the file says {inside}")
+        return replace(said, facts={**told, **said.facts})
+
+
 # --- Files of a folder that may be exams, and which of them are the same exam twice.
 
-_ENDINGS: Final = (*SCANS, MAP)
 _ASIDE: Final = (".", "~$")  #: Names of what systems and spreadsheets leave beside files begin so.
 
 
@@ -182,14 +259,17 @@ class Found(Record):
     """How many files are no exams by their names, by the ends of these."""
 
 
-def find_exams(folder: Path | str, table: Path, *, listed: Sequence[Mapping[str, str]] = ()) -> Found:
+def find_exams(
+    folder: Path | str, table: Path, *, listed: Sequence[Mapping[str, str]] = (), names: str | None = None
+) -> Found:
     """Look through a folder and those below it for scans (.mcap), arrays of scans (.npz) and maps (.nc).
 
     The folder may be an address in an object store, whose maps are passed over. `listed` are rows that the table has
-    already; paths are written from the table's folder.
+    already; paths are written from the table's folder; `names`: see `NamePattern`.
     """
     known = {_normal(row["file"]): row for row in listed}
-    found = _stored(folder, known) if isinstance(folder, str) else _local(folder, table, known)
+    pattern = None if names is None else NamePattern(names)
+    found = _stored(folder, known, pattern) if isinstance(folder, str) else _local(folder, table, known, pattern)
     found.spelled.extend(_spell_as(listed, found.rows))
     found.rows.sort(key=_order)
     _number(found.rows, listed)
@@ -201,13 +281,15 @@ def _order(row: Mapping[str, str]) -> tuple[Any, ...]:
     return natural(row["patient"].casefold()), natural(row["visit"]), row["mass"], row["file"]
 
 
-def _local(folder: Path, table: Path, known: Mapping[str, Mapping[str, str]]) -> Found:
+def _local(folder: Path, table: Path, known: Mapping[str, Mapping[str, str]], pattern: NamePattern | None) -> Found:
     files = FolderFiles(folder, table)
     said: dict[str, Said] = {}
     found = Found(skipped=files.closed, others=files.others)
     for name, path in files.paths.items():
         try:
             said[name] = said_by(path, name)
+            if pattern is not None and name not in known:
+                said[name] = pattern.add_to(said.pop(name), name)
         except BadDataError as error:
             if name not in known:
                 found.skipped.append(f"{name}: {error.what}")
@@ -218,7 +300,7 @@ def _local(folder: Path, table: Path, known: Mapping[str, Mapping[str, str]]) ->
     return found
 
 
-def _stored(address: str, known: Mapping[str, Mapping[str, str]]) -> Found:
+def _stored(address: str, known: Mapping[str, Mapping[str, str]], pattern: NamePattern | None) -> Found:
     """Scans in an object store, each named by its address."""
     found = Found()
     for one in files_below(check_address(address), *SCANS):
@@ -227,7 +309,8 @@ def _stored(address: str, known: Mapping[str, Mapping[str, str]]) -> Found:
         try:
             check_name(one)
             with fetched(one) as copy:
-                facts = said_by(copy, one).facts
+                said = said_by(copy, one)
+            facts = (said if pattern is None else pattern.add_to(said, one)).facts
         except BadDataError as error:
             found.skipped.append(f"{one}: {error.what}")
         else:
@@ -263,11 +346,12 @@ def _code_key(row: Mapping[str, str], column: str) -> tuple[str, str, str]:
 
 
 def _number(rows: Sequence[dict[str, Any]], listed: Iterable[Mapping[str, str]]) -> None:
-    """Number the exams of each mass at each visit, in the order of their files, after those listed."""
+    """Number the exams of each mass at each visit that have no number, in the order of their files, after others."""
     last: dict[tuple[str, ...], int] = {}
-    for row in listed:
+    for row in (*listed, *(new for new in rows if "replicate" in new)):
         key = tuple(row[name] for name in _CODES)
         last[key] = max(last.get(key, 0), int(row["replicate"]) if row["replicate"].isdigit() else 0)
     for new in rows:
         key = tuple(new[name] for name in _CODES)
-        new["replicate"] = last[key] = last.get(key, 0) + 1
+        if "replicate" not in new:
+            new["replicate"] = last[key] = last.get(key, 0) + 1

@@ -144,6 +144,12 @@ def campaign_command() -> None:
 @click.option(
     "-o", "--output", required=True, metavar="EXAMS.csv", type=FilePath(writes="CSV"), help="Where to write the table."
 )
+@click.option(
+    "--names",
+    metavar="PATTERN",
+    help="What the files' names say: '{patient}_{visit}_{exam}.npz', also with {mass}, {side}, {reader} and {date}, "
+    "* for anything, and / for folders.",
+)
 @click.option("--add", is_flag=True, help="Keep the rows of an EXAMS.csv that is there, and add those of other files.")
 @FORCE
 def campaign_init_command(**given: Any) -> None:
@@ -153,7 +159,8 @@ def campaign_init_command(**given: Any) -> None:
 
     Patient, side and reader are the `subject`, `side` and `examiner` that `record` wrote into each scan; visit and mass
     are its `visit` and `mass`, or 1. Exams of a mass are numbered in the order of their file names. Cells that no scan
-    fills stay blank. Copies, and maps of scans that are listed, are left out and named.
+    fills stay blank. Copies, and maps of scans that are listed, are left out and named. With --names the files' names
+    say it too; files that are named otherwise, or say otherwise than their name, are left out and named.
 
     Example: tactile-bayes campaign init scans -o exams.csv
     """
@@ -205,10 +212,11 @@ def campaign_run_command(**given: Any) -> None:
     """Map, estimate and pool the exams of a table, and report the trial.
 
     DIR gets a folder for each exam and each pooled mass, exams_done.csv, failures.csv, trial.csv (which `validate`
-    takes), index.html (all exams, worst first) and, with --excision, report.html and report.json. Masses with several
-    visits are compared (growth.csv), and the report is of the last visit before excision. Where 5 masses have
-    several exams at one visit, the spread between exams is learned from them and every size is by it. An exam's fault
-    is its row in failures.csv; the others go on. The same call again goes on where it was interrupted, and does again
+    takes), index.html (a row for each mass, with its visits, size, change and exams) and, with --excision,
+    report.html and report.json. Every exam has a page, exam.html. Masses with several visits are compared
+    (growth.csv, a page each), and the report is of the last visit before excision. Where 5 masses have several
+    exams at one visit, the spread between exams is learned from them and every size is by it. An exam's fault is
+    its row in failures.csv; the others go on. The same call again goes on where it was interrupted, and does again
     what depends on a file or setting that changed, and what failed.
 
     Example: tactile-bayes campaign run exams.csv --excision excision.csv -o out

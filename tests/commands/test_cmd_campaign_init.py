@@ -165,3 +165,84 @@ def test_add_refuses_a_table_of_something_else(site: Path) -> None:
     assert (done.returncode, done.stderr.count("\n")) == (3, 1)
     assert "exams.csv: line 1, column file: is missing; add it" in done.stderr
     assert (site / "exams.csv").read_text() == "patient,mass\nP1,1\n"
+
+
+# --- Names by pattern.
+
+
+def named(folder: Path, *names: str) -> None:
+    """Arrays of scans that say nothing of whose they are."""
+    for number, name in enumerate(names):
+        path = folder / "Studie 1" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        np.savez(path, **arrays_of(thinned(number, 40)))
+
+
+def told(folder: Path, *columns: str) -> list[tuple[str, ...]]:
+    return [tuple(row.get(name, "") for name in columns) for row in rows_of(folder / "exams.csv")]
+
+
+@pytest.mark.parametrize(
+    ("pattern", "names", "expected"),
+    [
+        ("{patient}_{visit}_{exam}.npz", ("P01_2_02.npz", "P01_2_1.npz"), [("P01", "2", "2"), ("P01", "2", "1")]),
+        ("{patient}_{visit}_{exam}", ("P-1_a_7.npz",), [("P-1", "a", "7")]),
+        ("{patient}/visit{visit}-{exam}.npz", ("P01/visit2-1.npz", "P02/visit1-1.npz"),
+         [("P01", "2", "1"), ("P02", "1", "1")]),
+        ("scan*_{patient}_{visit}", ("scan 17 neu_P01_3.npz",), [("P01", "3", "1")]),
+        ("{patient}.{visit}", ("P1.2.npz",), [("P1", "2", "1")]),
+    ],
+)  # fmt: skip
+def test_files_are_told_by_their_names(
+    pattern: str, names: tuple[str, ...], expected: list[tuple[str, str, str]], tmp_path: Path
+) -> None:
+    named(tmp_path, *names)
+    done = init(tmp_path, "--names", pattern)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    assert told(tmp_path, "patient", "visit", "replicate") == expected
+
+
+def test_side_date_and_reader_are_told_too_and_exams_without_a_number_are_counted(tmp_path: Path) -> None:
+    named(tmp_path, "P01 L 2026-03-01 Mo.npz", "P01 L 2026-03-02 Jo.npz", "P02 rechts 2026-03-01 Mo.npz")
+    done = init(tmp_path, "--names", "{patient} {side} {date} {reader}")
+    columns = ("patient", "side", "date", "reader", "replicate")
+    assert told(tmp_path, *columns) == [
+        ("P01", "left", "2026-03-01", "Mo", "1"),
+        ("P01", "left", "2026-03-02", "Jo", "2"),
+    ]
+    assert "has 'rechts' for the side; name it left, right, L or R" in done.stderr
+
+
+def test_a_name_that_does_not_follow_the_pattern_or_contradicts_its_file_is_left_out(tmp_path: Path) -> None:
+    named(tmp_path, "P01_1_1.npz", "P01_x_1_1.npz", "P01_2_links.npz")
+    scans = tmp_path / "Studie 1"
+    write(scans / "P01_3_1.mcap", thinned(5, 20, subject="P02", side="left"))
+    write(scans / "p03_1_1.mcap", thinned(6, 20, subject="P03", side="left"))
+    done = init(tmp_path, "--names", "{patient}_{visit}_{exam}")
+    assert told(tmp_path, "patient", "visit", "side") == [("P01", "1", ""), ("P03", "1", "left")]
+    assert done.stderr.splitlines() == [
+        "left out: Studie 1/P01_2_links.npz: its name has 'links' for the exam; name it with a number from 1",
+        "left out: Studie 1/P01_3_1.mcap: its name says patient P01, the file says P02",
+        "left out: Studie 1/P01_x_1_1.npz: its name does not follow {patient}_{visit}_{exam}",
+    ]
+
+
+@pytest.mark.parametrize(
+    "pattern",
+    ["", "x", "{pat}_{visit}", "{patient}{visit}", "{patient}_{patient}", "{patient", "*{patient}", "{}_{visit}"],
+)
+def test_a_pattern_that_cannot_be_read_is_refused(pattern: str, tmp_path: Path) -> None:
+    named(tmp_path, "P01_1_1.npz")
+    done = init(tmp_path, "--names", pattern)
+    assert done.returncode == 2
+    assert repr(pattern) in done.stderr
+    assert not (tmp_path / "exams.csv").exists()
+
+
+def test_a_folder_where_no_name_follows_the_pattern_gives_no_table(tmp_path: Path) -> None:
+    named(tmp_path, "P01-1.npz")
+    done = init(tmp_path, "--names", "{patient}_{visit}")
+    assert done.returncode == 3
+    assert "holds no file that can be an exam; see why each was left out" in done.stderr
+    assert not (tmp_path / "exams.csv").exists()
