@@ -17,7 +17,7 @@ from tactile_bayes.api.estimating import answer_file, estimate_file
 from tactile_bayes.api.maps import map_provenance
 from tactile_bayes.api.pooled import of_one_mass, pool_answers
 from tactile_bayes.api.reports import ExamFiles, exam_of_files
-from tactile_bayes.api.settings import Comparing, Settings, refuse_checkpoint, times_of
+from tactile_bayes.api.settings import Comparing, Settings, dates_of, refuse_checkpoint, times_of
 from tactile_bayes.api.sized import Answer, SizeEstimate
 from tactile_bayes.batch import BatchInterrupted, Outcome, cluster_executor, fault_lines, local_executor, run_batch
 from tactile_bayes.commands.options import settings_of, typed_options
@@ -33,11 +33,12 @@ from tactile_bayes.options import MapOptions
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.compare import compare_summary, compare_text
 from tactile_bayes.report.estimate_figures import draw_figures, draw_size
-from tactile_bayes.report.exam_page import PageFiles
+from tactile_bayes.report.exam_page import exam_page
 from tactile_bayes.report.exam_words import Given, headline
 from tactile_bayes.report.figure_file import named_exam
 from tactile_bayes.report.map_figure import map_figure
 from tactile_bayes.report.map_text import map_summary, map_text
+from tactile_bayes.report.pages import PageFiles
 from tactile_bayes.report.pooled import pooled_summary, pooled_text
 from tactile_bayes.shell import progress_bar
 
@@ -121,7 +122,7 @@ def report_action(
             raise UsageError(f"an estimate has settings of its own; leave out {option}, or give the map alone")
     settings = settings_of(**asked)
     exam = exam_of_files(sorted_files, settings, given, notice=lambda line: click.echo(line, err=True))
-    page.write(exam)
+    page.write(exam_page(exam))
     if exam.main.tactile_map is None:
         click.echo("note: without its map the page has no picture and no coverage; give MAP.nc too", err=True)
     click.echo(f"{output}: {headline(exam)}")
@@ -312,6 +313,10 @@ def compare_action(
     same_mass: bool,
     registration_mm: float,
     as_json: bool,
+    output: Path | None,
+    pdf: Path | None,
+    title: str,
+    name: str,
     figure: Path | None,
     force: bool,
     verbose: bool,
@@ -319,7 +324,7 @@ def compare_action(
 ) -> None:
     """Compare the size of a mass at two visits and more."""
     comparing = Comparing(
-        days=times_of(days or None, None if dates is None else dates.split(",")),
+        days=times_of(days or None, dates_of(dates) or None),
         grown_by=tuple(percent / 100 for percent in grown_by),
         same_mass=same_mass,
         registration_mm=registration_mm,
@@ -330,11 +335,19 @@ def compare_action(
         raise UsageError(f"{twice} is given twice; give each map once, at its own visit")
     refuse_checkpoint(settings)
     comparing.check_visits(len(visits))
+    if pdf is not None and output is None:
+        raise UsageError("--pdf prints the page that --output names; give -o GROWTH.html too")
+    Given(title, name)
+    page = None if output is None else PageFiles(output, pdf, force)
+    if page is not None:
+        page.check()
     refuse_existing(figure, force=force)
-    found = _compare(visits, settings, comparing)
+    found = replace(_compare(visits, settings, comparing), dates=dates_of(dates))
     report = found.report.checked()
     text_of = json_text if as_json else compare_text if verbose else compare_summary
     try:
+        if page is not None:
+            page.write(found.page_text(title=title, name=name))
         if figure is not None:
             found.draw(figure, force=force)
     finally:  # what was computed is not lost with the figure

@@ -27,7 +27,10 @@ from tactile_bayes.inference.draws import Draws
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.presets import REGISTRATION_MM, RESEARCH_USE
 from tactile_bayes.report.compare import compare_report, compare_summary, compare_text
-from tactile_bayes.report.estimate_figures import DrawnMap, draw_comparison
+from tactile_bayes.report.estimate_figures import draw_comparison
+from tactile_bayes.report.exam_words import Given
+from tactile_bayes.report.growth_page import Course, DrawnMap, growth_page
+from tactile_bayes.report.pages import PageFiles
 from tactile_bayes.report.pooled import disagreement, fat_apart
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.draws import ShapeDraws
@@ -50,6 +53,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
+Scans = Sequence[Mapping[str, str]]
+
+
 # --- Two visits and more compared: whether they are of one mass, and the change of its size.
 
 
@@ -61,6 +67,7 @@ class Comparison(Record, eq=False):
     settings: Settings
     visits: tuple[tuple[SizeEstimate, ...], ...] = ()
     """The estimates of each visit's maps alone, where they are at hand."""
+    dates: tuple[str, ...] = ()  #: Of the visits; empty where they were not given.
 
     @property
     def probability(self) -> float:
@@ -142,15 +149,33 @@ class Comparison(Record, eq=False):
         return compare_text(self.report)
 
     @door
+    def page(
+        self, path: PathLike, *, pdf: PathLike | None = None, title: str = "", name: str = "", force: bool = False
+    ) -> None:
+        """Write one page of the mass over time as HTML, as ``compare -o`` does, and with `pdf` also print it."""
+        files = PageFiles(path_of(path), path_of(pdf), force)
+        files.check()
+        Given(title, name)
+        files.write(self.page_text(title=title, name=name))
+
+    def page_text(self, *, title: str, name: str) -> str:
+        """The page's HTML."""
+        scans = [[one.provenance.scans for one in visit] for visit in self.visits]
+        course = course_of(scans, title=title, name=name, dates=self.dates)
+        return growth_page(self.compared, self.report, self._drawn(), course)
+
+    @door
     def plot(self, path: PathLike | None = None, *, force: bool = False) -> Figure:
         """Draw the visits' maps, their difference and the change; with a path also write it."""
         return self.draw(path_of(path), force=force)
 
     def draw(self, path: Path | None, *, force: bool) -> Figure:
         """The same for the command line, whose errors name options."""
+        return draw_comparison(self.compared, self.report, self._drawn(), path, force=force)
+
+    def _drawn(self) -> list[list[DrawnMap]]:
         maps = [[one.tactile_map for one in visit] for visit in self.visits]
-        drawn = drawn_maps(maps, [[one.answer for one in visit] for visit in self.visits])
-        return draw_comparison(self.compared, self.report, drawn, path, force=force)
+        return drawn_maps(maps, [[one.answer for one in visit] for visit in self.visits])
 
     def __repr__(self) -> str:
         cautions = finding_lines(self.findings, "caution", paper=True)
@@ -220,15 +245,34 @@ def compare_estimates(
 
 
 def drawn_maps(maps: Sequence[Sequence[TactileMap]], visits: Sequence[Sequence[Answer]]) -> list[list[DrawnMap]]:
-    """The maps of each visit with the places of their lumps, for the figure."""
+    """The maps of each visit with their lumps, for the page and the figure."""
 
-    def place(answer: Answer) -> tuple[float, float] | None:
-        return None if answer.report is None or answer.shape is None else centre_of(answer.report.centre_mm)
+    def drawn(one: TactileMap, answer: Answer) -> DrawnMap:
+        report = answer.report
+        if report is None or answer.shape is None:
+            return DrawnMap(one, None)
+        along, across, angle = report.d_x_mm, report.d_y_mm, report.angle_deg
+        axes = None if along is None or across is None else (along.median, across.median)
+        return DrawnMap(one, centre_of(report.centre_mm), axes, 0.0 if angle is None else angle.median)
 
-    return [
-        [DrawnMap(one, place(answer)) for one, answer in zip(some, answers, strict=True)]
-        for some, answers in zip(maps, visits, strict=True)
-    ]
+    return [list(map(drawn, some, answers)) for some, answers in zip(maps, visits, strict=True)]
+
+
+def course_of(scans: Sequence[Sequence[Scans]], *, title: str, name: str, dates: Sequence[str]) -> Course:
+    """What the scans of each visit's maps say of the patient, the mass and the visits."""
+    of_visits = [[scan for some in visit for scan in some] for visit in scans]
+
+    def agreed(fact: str, among: Sequence[Mapping[str, str]]) -> str:
+        values = {scan[fact] for scan in among if scan.get(fact)}
+        return values.pop() if len(values) == 1 else ""
+
+    every = list(chain.from_iterable(of_visits))
+    codes = tuple(agreed("visit", visit) for visit in of_visits)
+    told = {
+        ours: agreed(theirs, every) for ours, theirs in (("patient", "subject"), ("side", "side"), ("mass", "mass"))
+    }
+    visits = codes if all(codes) and len(set(codes)) == len(codes) else ()
+    return Course(title, name, visits=visits, dates=tuple(dates), **told)
 
 
 def _compared(
@@ -421,7 +465,8 @@ def compare(
     if len(set(prints)) < len(prints):
         raise UsageError("a map is given twice; give each map once, at its own visit")
     names = [[one.name or f"visit {v} map {i}" for i, one in enumerate(visit, 1)] for v, visit in enumerate(visits, 1)]
-    return compare_estimates(visits, used, comparing=comparing, names=names, inputs={})
+    found = compare_estimates(visits, used, comparing=comparing, names=names, inputs={})
+    return replace(found, dates=() if dates is None else tuple(str(one) for one in dates))
 
 
 def _visit(given: Any, settings: dict[str, Any]) -> tuple[SizeEstimate, ...]:

@@ -28,8 +28,9 @@ from tactile_bayes.files.map_nc import is_posterior, read_estimate, read_map_and
 from tactile_bayes.files.provenance import scans_of
 from tactile_bayes.files.reading import HDF5_MAGIC, open_input
 from tactile_bayes.files.reports import EstimateReport
-from tactile_bayes.report.exam_page import PageFiles
+from tactile_bayes.report.exam_page import exam_page
 from tactile_bayes.report.exam_words import Exam, Given, exam_map, headline
+from tactile_bayes.report.pages import PageFiles
 from tactile_bayes.report.quantities import side_of
 
 # --- The page of an exam from files: maps are estimated, an estimate is taken as it is, repeats are pooled.
@@ -160,7 +161,7 @@ def exam_report(
     if not given:
         raise UsageError("nothing was given to report; give maps, or an estimate")
     exam = _exam(given, Given(title, name, day), settings)
-    page.write(exam)
+    page.write(exam_page(exam))
     return headline(exam)
 
 

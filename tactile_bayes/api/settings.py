@@ -178,6 +178,11 @@ def times_of(days: Sequence[float] | None, dates: Sequence[str] | None) -> tuple
     return None if days is None else (0.0, *days)
 
 
+def dates_of(text: str | None) -> tuple[str, ...]:
+    """Dates from a list with commas, such as 2026-01-15,2026-04-20; none of no text."""
+    return () if text is None else tuple(one.strip() for one in text.split(","))
+
+
 def days_of_dates(dates: Sequence[str]) -> tuple[float, ...]:
     """Days from the first of some dates, such as 2026-03-01."""
     found = []

@@ -28,9 +28,10 @@ from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.estimate_document import estimate_report, patient_mm
 from tactile_bayes.report.estimate_figures import draw_fit, draw_map, draw_size
 from tactile_bayes.report.estimate_text import estimate_summary, estimate_text, exams_label
-from tactile_bayes.report.exam_page import PageFiles
+from tactile_bayes.report.exam_page import exam_page
 from tactile_bayes.report.exam_words import Exam, ExamMap, Given, exam_map
 from tactile_bayes.report.figure_file import named_exam
+from tactile_bayes.report.pages import PageFiles
 from tactile_bayes.report.quantities import estimate_quantities, leading_size, lump_place, side_of
 from tactile_bayes.scan import HeadShape
 from tactile_bayes.size.draws import EXTREMES, SIZES, ShapeDraws, SizePosterior
@@ -269,7 +270,7 @@ class SizedExam(Sized, eq=False, dict=True, kw_only=True):
         """Write one page of the exam as HTML, repeat maps on it, and with `pdf` also print it; see `exam_report`."""
         page, given = PageFiles(path_of(path), path_of(pdf), force), Given(title, name, day)
         page.check()
-        page.write(given.on(self.exam()))
+        page.write(exam_page(given.on(self.exam())))
 
 
 class SizeEstimate(SizedExam, eq=False, dict=True, kw_only=True):
@@ -447,7 +448,7 @@ class SizeEstimate(SizedExam, eq=False, dict=True, kw_only=True):
 
     @property
     def _titled(self) -> str:
-        """Name for the titles of figures, with the subject's code and the scan's digest."""
+        """Name for the titles of figures: what the scans say of the exam, and the map's own."""
         return named_exam(self.name, self.provenance.scans)
 
     @door

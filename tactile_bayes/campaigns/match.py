@@ -17,7 +17,7 @@ from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.comparison import CompareReport
 from tactile_bayes.files.documents import load_schema, read_record
-from tactile_bayes.files.manifest_csv import COMPARED, GROWTH, Exam, natural, table_text
+from tactile_bayes.files.manifest_csv import COMPARED, GROWTH, GROWTH_PAGE, Exam, natural, table_text
 from tactile_bayes.files.map_nc import read_map
 from tactile_bayes.files.reports import EstimateReport, Place
 from tactile_bayes.findings import Finding, finding_lines
@@ -219,12 +219,12 @@ def growth_rows(campaign: Campaign) -> list[Growth]:
     compared, rows = campaign.found.results["compare"], []
     for name, visits in grown_masses(campaign.exams).items():
         codes, exam = [*visits], next(iter(visits.values()))[0]
-        link = f"{GROWTH}/{name}/{COMPARED}"
+        place = f"{GROWTH}/{name}"
         if name in compared:
-            report = read_record(campaign.folder / link, CompareReport)
+            report = read_record(campaign.folder / place / COMPARED, CompareReport)
             of = {one.map for visit in report.visits for one in visit.maps}
             sized = [code for code, exams in visits.items() if any(one.name in of for one in exams)]
-            rows += growths(exam.patient, exam.mass, sized, report, link)
+            rows += growths(exam.patient, exam.mass, sized, report, f"{place}/{GROWTH_PAGE}")
         else:
             fault = campaign.found.faults.get(name)
             reason = "exams of fewer than two visits came through" if fault is None else fault.reason

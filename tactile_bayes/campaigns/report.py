@@ -1,52 +1,61 @@
-"""What a campaign writes beside the exams: tables, the contact sheet, and the trial's report."""
+"""What a campaign writes beside the exams: tables, the index, and the trial's report."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from datetime import date
 from pathlib import Path
 from typing import Final
 
 from tactile_bayes import __version__
 from tactile_bayes.api.trials import analyse, load_trial, read_excision
-from tactile_bayes.campaigns.match import growth_rows, growth_text
+from tactile_bayes.campaigns.match import growth_rows, growth_text, visit_dates
 from tactile_bayes.campaigns.run import Campaign
-from tactile_bayes.campaigns.tables import Row, exam_rows, write_tables
-from tactile_bayes.declarations import Record, field, replace
+from tactile_bayes.campaigns.tables import Row, exam_rows, pooled_reports, write_tables
+from tactile_bayes.declarations import Record, field
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.atomic import write_text
 from tactile_bayes.files.documents import read_protocol
 from tactile_bayes.files.manifest_csv import (
     DONE,
-    ESTIMATE,
+    EXAM_PAGE,
     EXAMS,
     FAILURES,
     GROWN,
     JOURNAL,
-    MAP,
     MAP_FIGURE,
     REPEATABILITY,
     SIZE_FIGURE,
-    SIZED,
     SIZED_FIGURE,
     THUMBNAIL,
     TRIAL,
     Exam,
 )
 from tactile_bayes.files.reading import IMAGE_BYTES, put, read_bytes
+from tactile_bayes.files.reports import PooledReport
 from tactile_bayes.files.tables import Table
 from tactile_bayes.options import TrialSettings
-from tactile_bayes.report import pages as sheet
+from tactile_bayes.report.campaign_page import (
+    FAILED,
+    SIZED,
+    UNSIZED,
+    ExamEntry,
+    MassRow,
+    VisitEntry,
+    campaign_html,
+    worst,
+)
 from tactile_bayes.report.compare import Growth, growth_line
-from tactile_bayes.report.pages import Card, campaign_html, worst
-from tactile_bayes.trial.readings import at_excision
+from tactile_bayes.trial.readings import at_excision, in_order
 
 REPORT, PAGE, INDEX = "report.json", "report.html", "index.html"
 WRITTEN: Final = (DONE, FAILURES, TRIAL, GROWN, REPORT, PAGE, INDEX, REPEATABILITY)
 """Files beside the exams."""
 _MOST_INLINE: Final = 300
-"""With more exams the contact sheet names its thumbnails' files instead of holding them."""
-_MOST_CARDS: Final = 10_000  #: More exams than a browser shows at ease.
-_LINKS: Final = (MAP_FIGURE, SIZE_FIGURE, SIZED_FIGURE, ESTIMATE, SIZED, MAP)
+"""With more exams the index names its thumbnails' files instead of holding them."""
+_MOST_ROWS: Final = 5_000  #: More masses than a browser shows at ease.
+_LINKS: Final = (MAP_FIGURE, SIZE_FIGURE, SIZED_FIGURE)
 
 
 class Excision(Record):
@@ -84,7 +93,7 @@ class Written(Record):
 
 
 def write_outputs(campaign: Campaign, excision: Excision | None, protocol: Path | None = None) -> Written:
-    """Write tables, contact sheet and, where excision sizes are given, the trial's report."""
+    """Write tables, the index and, where excision sizes are given, the trial's report."""
     rows = exam_rows(campaign)
     masses = None if excision is None else excision.masses()
     write_tables(campaign, rows, masses, campaign.folder)
@@ -203,23 +212,82 @@ def _page(
     links: Mapping[str, str],
     growth: Sequence[Growth],
 ) -> str:
-    cards = worst((_card(campaign, row) for row in rows), _MOST_CARDS)
-    if len(cards) <= _MOST_INLINE:
-        cards = [_self_contained(card, campaign.folder) for card in cards]
-    masses = len(campaign.found.results["pool"])
-    lines = [f"{len(rows)} exams: {counts_words(*counts)}."]
-    lines += [f"{masses} masses pooled, each at one visit."] if masses else []
-    if len(cards) < len(rows):
-        lines.append(f"Here are the {len(cards)} to be looked at first; all are in {DONE} and {FAILURES}.")
+    inline = len(rows) <= _MOST_INLINE
+    masses = list(_masses(campaign, rows, growth, inline=inline))
+    shown = worst(masses, _MOST_ROWS)
+    patients = len({row.patient for row in masses})
+    lines = [f"{len(masses)} masses of {patients} patients; {len(rows)} exams: {counts_words(*counts)}."]
+    if len(shown) < len(masses):
+        lines.append(f"Here are the {len(shown)} to be looked at first; all are in {DONE} and {FAILURES}.")
     lines += [repeatability_words(campaign)] if campaign.repeatability else []
-    return campaign_html(cards, lines=lines, links=links, version=__version__, growth=growth)
+    return campaign_html(shown, lines=lines, links=links, version=__version__)
 
 
-def _self_contained(card: Card, folder: Path) -> Card:
-    """The card with its picture instead of the picture's name."""
-    if not isinstance(card.thumbnail, str):
-        return card
-    return replace(card, thumbnail=read_bytes(folder / card.thumbnail, most=IMAGE_BYTES))
+def _masses(campaign: Campaign, rows: Sequence[Row], growth: Sequence[Growth], *, inline: bool) -> Iterator[MassRow]:
+    """A row of the index for each mass, in the order of the table."""
+    pooled = pooled_reports(campaign)
+    changes = {(one.patient, one.mass): one for one in growth}  # the last one of each mass: to its last visit
+    masses: dict[str, dict[str, list[Row]]] = defaultdict(lambda: defaultdict(list))
+    for row in rows:
+        masses[row.exam.of_visits][row.exam.visit].append(row)
+    for visits in masses.values():
+        dates = visit_dates({code: [row.exam for row in some] for code, some in visits.items()})
+        ordered = in_order(dates) or list(visits)
+        first = visits[ordered[0]][0].exam
+        yield MassRow(
+            first.patient,
+            first.mass,
+            tuple(_visit(campaign, code, dates[code], visits[code], pooled, inline=inline) for code in ordered),
+            first.side or "",
+            changes.get((first.patient, first.mass)),
+        )
+
+
+def _visit(
+    campaign: Campaign,
+    code: str,
+    day: date | None,
+    rows: Sequence[Row],
+    pooled: Mapping[str, PooledReport],
+    *,
+    inline: bool,
+) -> VisitEntry:
+    """A visit with its size: the pooled one where there is one, else that of its one exam."""
+    exams = tuple(_exam(campaign, row, inline=inline) for row in rows)
+    words = code if day is None or day.isoformat() == code else f"{code}, {day.isoformat()}"
+    report = pooled.get(rows[0].exam.of_mass)
+    if report is not None:
+        size = report.leading.max_size_mm
+        used = sum(one.status == "estimate" for one in report.maps)
+        return VisitEntry(words, exams, size, used if len(rows) > 1 else 0, "" if size else report.reason)
+    size = exams[0].size if len(exams) == 1 else None
+    reasons = dict.fromkeys(row.reason for row in rows)
+    return VisitEntry(words, exams, size, why="" if size else "; ".join(filter(None, reasons)) or "not pooled")
+
+
+def _exam(campaign: Campaign, row: Row, *, inline: bool) -> ExamEntry:
+    exam, folder = row.exam, f"{EXAMS}/{row.exam.name}"
+    made = {
+        name
+        for step in ("map", "estimate", "figures", "size", "page")
+        for name in (campaign.found.of(step, exam.name) or {"files": ()})["files"]
+        if row.report is not None
+    }
+    picture: bytes | str | None = f"{folder}/{THUMBNAIL}" if THUMBNAIL in made else None
+    if inline and isinstance(picture, str):
+        picture = read_bytes(campaign.folder / picture, most=IMAGE_BYTES)
+    size = None if row.report is None else row.report.leading.max_size_mm
+    reader = f", {exam.reader}" if exam.reader else ""
+    return ExamEntry(
+        f"visit {exam.visit}, exam {exam.replicate}{reader}",
+        FAILED if row.report is None else UNSIZED if size is None else SIZED,
+        row.reason,
+        size,
+        row.findings,
+        picture,
+        f"{folder}/{EXAM_PAGE}" if EXAM_PAGE in made else "",
+        {name: f"{folder}/{name}" for name in _LINKS if name in made},
+    )
 
 
 def repeatability_words(campaign: Campaign) -> str:
@@ -234,25 +302,3 @@ def repeatability_words(campaign: Campaign) -> str:
 def counts_words(sized: int, unsized: int, failed: int) -> str:
     """How the exams ended, in words."""
     return f"{sized} sized, {unsized} without a size, {failed} failed"
-
-
-def _card(campaign: Campaign, row: Row) -> Card:
-    exam = row.exam
-    made = {
-        name
-        for step in ("map", "estimate", "figures", "size")
-        for name in (campaign.found.of(step, exam.name) or {"files": ()})["files"]
-        if row.report is not None
-    }
-    facts = [f"patient {exam.patient}", f"visit {exam.visit}", f"mass {exam.mass}", f"exam {exam.replicate}"]
-    facts += [fact for fact in (exam.side, exam.reader and f"reader {exam.reader}", exam.file) if fact]
-    return Card(
-        name=exam.name,
-        status=sheet.FAILED if row.report is None else sheet.UNSIZED if row.size is None else sheet.SIZED,
-        facts=tuple(facts),
-        reason=row.reason,
-        size=row.size,
-        findings=row.findings,
-        thumbnail=f"{EXAMS}/{exam.name}/{THUMBNAIL}" if THUMBNAIL in made else None,
-        links={name: f"{EXAMS}/{exam.name}/{name}" for name in _LINKS if name in made},
-    )

@@ -1,10 +1,10 @@
 """A campaign: from a table of exams to maps, estimates, pooled sizes and growth, step by step, resumable.
 
-Layout of the output folder: ``exams/EXAM/`` (map.nc, estimate.json, posterior.nc, shape.npz, thumbnail.png...),
-``masses/MASS/`` (pooled.json, pooled.nc) and ``growth/MASS/`` (compare.json), the tables and pages beside them
-(`campaigns.report`), repeatability.json where it was learned (the sizes by it are ``exams/EXAM/sized.json``), and the
-journal, which holds for each step its key, the digests of its files and how long it took. The key is the step, the exam
-or mass, and a digest of the program's version, the settings and the content of the inputs. A step whose
+Layout of the output folder: ``exams/EXAM/`` (map.nc, estimate.json, posterior.nc, shape.npz, exam.html...),
+``masses/MASS/`` (pooled.json, pooled.nc) and ``growth/MASS/`` (compare.json, growth.html), the tables and pages beside
+them (`campaigns.report`), repeatability.json where it was learned (the sizes by it are ``exams/EXAM/sized.json``), and
+the journal, which holds for each step its key, the digests of its files and how long it took. The key is the step, the
+exam or mass, and a digest of the program's version, the settings and the content of the inputs. A step whose
 key is in the journal and whose files are what it made is not run again.
 
 Exams go through the steps in blocks, in the order of the table, and the results stay in the journal: memory holds the
@@ -25,7 +25,7 @@ from tactile_bayes.api.settings import Settings
 from tactile_bayes.batch import CLUSTER_LOST, BatchInterrupted, Outcome, run_batch
 from tactile_bayes.batch_store import BatchStore
 from tactile_bayes.campaigns.inputs import READ, Alike, StepResults, read_sources, unchanged
-from tactile_bayes.campaigns.match import Breasts, NamedPlace, Visits, days_of, grown_masses
+from tactile_bayes.campaigns.match import Breasts, NamedPlace, Visits, days_of, grown_masses, visit_dates
 from tactile_bayes.campaigns.settings import CampaignSettings, digest_of
 from tactile_bayes.campaigns.steps import (
     FEWEST_MASSES,
@@ -42,10 +42,11 @@ from tactile_bayes.campaigns.steps import (
 from tactile_bayes.declarations import Record, field, names_of, replace
 from tactile_bayes.errors import TactileBayesError
 from tactile_bayes.files.atomic import sha256
-from tactile_bayes.files.manifest_csv import ESTIMATE, EXAMS, GROWTH, MAP, MASSES, REPEATABILITY, SHAPE, Exam
+from tactile_bayes.files.manifest_csv import ESTIMATE, EXAMS, GROWTH, MAP, MASSES, REPEATABILITY, SHAPE, SIZED, Exam
 from tactile_bayes.files.provenance import recordings
 from tactile_bayes.files.size_json import default_for, read_repeatability, read_size_calibration, size_calibration_path
 from tactile_bayes.progress import Progress, untold
+from tactile_bayes.report.growth_page import Course
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.pooling import Repeatability
 
@@ -154,9 +155,16 @@ def steps_needed(
     `masses` are to be pooled, `compared` between visits; where the repeats may teach the spread between exams
     (`learns`), every exam gets its size by it.
     """
-    needed = {"map": exams, "estimate": exams, "figures": exams * settings.figures, "pool": masses, "compare": compared}
+    needed = {
+        "map": exams,
+        "estimate": exams,
+        "figures": exams * settings.figures,
+        "page": exams,
+        "pool": masses,
+        "compare": compared,
+    }
     needed |= {"repeatability": 1, "size": exams} if learns else {}
-    return {**needed, "copy": (exams + masses + compared) * bool(settings.copy_to)}
+    return {**needed, "copy": (2 * exams + masses + compared) * bool(settings.copy_to)}
 
 
 # --- The campaign.
@@ -205,7 +213,7 @@ class Campaign:
         self._calibrations: dict[str, str] = {}
 
     def run(self) -> CampaignState:
-        """Run what is missing: maps, estimates and figures by blocks, repeatability, sizes by it, pools, growth.
+        """Run what is missing: maps, estimates and figures by blocks, repeatability, sizes by it, pages, pools, growth.
 
         Where the disk does not take a result (`UsageError`), the cluster is lost (`TactileBayesError`) or on Ctrl-C
         (`BatchInterrupted`), all that is done is kept.
@@ -225,6 +233,7 @@ class Campaign:
                 self._size(block)
             sound = [exam for exam in sound if exam.name not in self._repeated]
             self._learn_repeatability(sound)
+            self._make_pages(sound)
             if masses:
                 spared = masses - len({exam.of_mass for exam in sound})
                 self._stages.needed.subtract(steps_needed(0, spared, settings=self.settings, learns=False))
@@ -285,8 +294,7 @@ class Campaign:
 
     def _map_task(self, exam: Exam) -> Task:
         digest = self._digests[exam.path]
-        columns = ("patient", "side", "reader", "visit", "mass")
-        expected = {name: value for name in columns if (value := getattr(exam, name)) is not None}
+        expected = self._expected(exam)
         key = {"scan": digest, "expected": expected, "normalise": self.settings.normalise}
         return Task(
             step="map",
@@ -393,11 +401,30 @@ class Campaign:
     def _size_again(self, estimated: Sequence[Exam]) -> None:
         """Size exams by the repeatability."""
         self._stages.needed["size"] = len(estimated)
-        self._stages.needed["copy"] += len(estimated) * bool(self.settings.copy_to)
         for block in _blocks(estimated, self._block):
             tasks = [task for exam in block if (task := self._size_task(exam)) is not None]
             self._stages.run("size", tasks, without=0 if self._dry else len(block) - len(tasks))
-            self._copy(EXAMS, [exam.name for exam in block], steps=("size",))
+
+    def _make_pages(self, sound: Sequence[Exam]) -> None:
+        """The page of every exam that was estimated, with its size by the repeatability where it has one."""
+        for block in _blocks(sound, self._block):
+            known = [exam for exam in block if exam.name in self.found.results["estimate"] and not self._sizes_unknown]
+            self._stages.run("page", [self._page_task(exam) for exam in known], without=len(block) - len(known))
+            self._copy(EXAMS, [exam.name for exam in block], steps=("size", "page"))
+
+    def _page_task(self, exam: Exam) -> Task:
+        sized = self._file("size", exam, SIZED)
+        report = ESTIMATE if sized is None else SIZED
+        told = {"replicate": str(exam.replicate), "date": "" if exam.day is None else exam.day.isoformat()}
+        expected = self._expected(exam) | told
+        key = {"map": self._file("map", exam, MAP), "size": sized or self._file("estimate", exam, ESTIMATE)}
+        folder, digest = self.folder / EXAMS / exam.name, digest_of({**key, "told": expected})
+        return Task("page", exam.name, folder, digest, expected=expected, report=report)
+
+    def _expected(self, exam: Exam) -> dict[str, str]:
+        """What the table says of the exam, as far as it does."""
+        columns = ("patient", "side", "reader", "visit", "mass")
+        return {name: value for name in columns if (value := getattr(exam, name)) is not None}
 
     def _repeatability_task(self, exams: Sequence[Exam]) -> Task:
         files = [[exam.name, *(self._file("estimate", exam, file) for file in (ESTIMATE, SHAPE))] for exam in exams]
@@ -490,14 +517,19 @@ class Campaign:
         settings, key = self._of_one_mass([exam for exams in visits.values() for exam in exams])
         days, figures = days_of(visits), self.settings.figures
         counts = [len(exams) for exams in visits.values()]
+        first = next(iter(visits.values()))[0]
+        days_known = ["" if day is None else day.isoformat() for day in visit_dates(visits).values()]
+        of_visits = tuple(visits), tuple(days_known) if any(days_known) else ()
+        course = Course("", "", first.patient, first.side or "", first.mass, *of_visits)
         members = tuple(self._members(exams) for exams in visits.values())
         return Task(
             "compare",
             name,
             self.folder / GROWTH / name,
-            digest_of({**key, "visits": counts, "days": days, "figures": figures}),
+            digest_of({**key, "visits": counts, "days": days, "figures": figures, "course": repr(course)}),
             settings=settings,
             visits=members,
+            course=course,
             days=days,
             figures=figures,
         )

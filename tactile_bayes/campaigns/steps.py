@@ -28,6 +28,8 @@ from tactile_bayes.files.manifest_csv import (
     COMPARED,
     COMPARED_FIGURE,
     ESTIMATE,
+    EXAM_PAGE,
+    GROWTH_PAGE,
     MAP,
     MAP_FIGURE,
     POOLED,
@@ -54,7 +56,12 @@ from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.options import MapOptions
 from tactile_bayes.report.estimate_document import size_diagnostics
 from tactile_bayes.report.estimate_figures import draw_comparison, draw_map, draw_size
-from tactile_bayes.report.svg import thumbnail_png
+from tactile_bayes.report.exam_page import exam_page
+from tactile_bayes.report.exam_words import Exam as ShownExam
+from tactile_bayes.report.exam_words import exam_map
+from tactile_bayes.report.growth_page import Course, growth_page
+from tactile_bayes.report.quantities import side_of
+from tactile_bayes.report.svg import thumbnail_svg
 from tactile_bayes.scan import Scan
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.draws import SIZES, SizePosterior
@@ -67,12 +74,13 @@ from tactile_bayes.size.pooling import size_alone
 
 FILES: Final = {
     "map": (SCAN, MAP),
-    "estimate": (ESTIMATE, POSTERIOR, SHAPE, THUMBNAIL),
+    "estimate": (ESTIMATE, POSTERIOR, SHAPE),
     "figures": (MAP_FIGURE, SIZE_FIGURE),
     "repeatability": (REPEATABILITY,),
     "size": (SIZED, SIZED_FIGURE),
+    "page": (EXAM_PAGE, THUMBNAIL),
     "pool": (POOLED, POOLED_DRAWS),
-    "compare": (COMPARED, COMPARED_FIGURE),
+    "compare": (COMPARED, GROWTH_PAGE, COMPARED_FIGURE),
     "copy": (),
 }
 """The files that each step may write."""
@@ -98,7 +106,7 @@ class Task(Record):
     source_sha256: str = ""
     """`source`, `source_sha256`: Of a map: the exam's file."""
     expected: Mapping[str, str] = field(default_factory=dict)
-    """Of a map: what the table says of the exam, by its columns."""
+    """Of a map and a page: what the table says of the exam, by its columns."""
     normalise: str = ""  #: Of a map: as the option of `map`.
     settings: Settings | None = None  #: Of all steps after the map: of the estimate.
     mass: str = ""
@@ -116,6 +124,8 @@ class Task(Record):
     """Of a copy: addresses in an object store, by the names of the files."""
     repeats: tuple[ExamFolder, ...] = ()  #: Of the repeatability: the exams.
     figures: bool = False  #: Of sizes and comparisons: whether to draw them.
+    report: str = ESTIMATE  #: Of a page: the file that holds the exam's size.
+    course: Course = field(default_factory=Course)  #: Of a comparison: what the table says of the visits.
 
     @property
     def key(self) -> str:
@@ -232,9 +242,6 @@ def _estimate(task: Task) -> tuple[Result, Writes]:
     shape = answer.shape
     if shape is not None:
         writes[SHAPE] = lambda path: write_shape(path, shape, force=True)
-    picture = thumbnail_png(found.tactile_map, report)
-    if picture is not None:
-        writes[THUMBNAIL] = lambda path: write_bytes(path, picture, force=True)
     return {"exit_code": answer.exit_code}, writes
 
 
@@ -263,6 +270,22 @@ def _figures(task: Task) -> tuple[Result, Writes]:
         writes[SIZE_FIGURE] = lambda path: draw_size(
             size, path, name=task.name, probability=probability, findings=findings, force=True
         )
+    return {}, writes
+
+
+def _page(task: Task) -> tuple[Result, Writes]:
+    """Make the exam's page and its thumbnail from what its steps left; the table tells what the scans do not."""
+    tactile_map, scans = read_map_and_scans(task.folder / MAP)
+    told = {_SAME[name]: text for name, text in task.expected.items() if name in _SAME}
+    facts = [told | scan for scan in scans or [{}]]
+    report = read_record(task.folder / task.report, EstimateReport)
+    shown = exam_map(tactile_map, report, side=side_of(facts))
+    title = f"Tactile exam {task.expected['replicate']}"
+    page = exam_page(ShownExam((shown,), None, facts, title=title, day=task.expected.get("date", "")))
+    writes: Writes = {EXAM_PAGE: lambda path: write_text(path, page, force=True)}
+    if tactile_map.covered.any():
+        picture = thumbnail_svg(shown, label=f"Map of {task.name}")
+        writes[THUMBNAIL] = lambda path: write_text(path, picture, force=True)
     return {}, writes
 
 
@@ -296,9 +319,11 @@ def _compare(task: Task) -> tuple[Result, Writes]:
     )
     report = compared.report.checked()
     writes: Writes = {COMPARED: lambda path: write_text(path, json_text(report), force=True)}
+    maps = [[read_map(folder / MAP) for _, folder in exams] for exams in task.visits]
+    drawn = drawn_maps(maps, answers)
+    page = growth_page(compared.compared, report, drawn, task.course)
+    writes[GROWTH_PAGE] = lambda path: write_text(path, page, force=True)
     if task.figures and compared.compared.joint is not None:
-        maps = [[read_map(folder / MAP) for _, folder in exams] for exams in task.visits]
-        drawn = drawn_maps(maps, answers)
         writes[COMPARED_FIGURE] = lambda path: draw_comparison(compared.compared, report, drawn, path, force=True)
     return {}, writes
 
@@ -451,6 +476,7 @@ RUN: Final[dict[str, Callable[[Task], tuple[Result, Writes]]]] = {
     "figures": _figures,
     "repeatability": learn_step,
     "size": size_step,
+    "page": _page,
     "pool": _pool,
     "compare": _compare,
     "copy": copy_step,

@@ -37,7 +37,7 @@ _TRIAL_COLUMNS: Final = (
 
 _OF_AN_ESTIMATE: Final = (
     "smallest_lump", "d_x_mm", "d_y_mm", "amplitude", "sigma_x_mm", "sigma_y_mm", "background", "noise_sd",
-    "another_exam", "supposing", "centre_patient_mm", "position", "angle_deg", "variance_share", "scene",
+    "supposing", "centre_patient_mm", "position", "angle_deg", "variance_share", "scene",
     "prior_sensitivity",
 )  # fmt: skip
 _OF_A_MASS: Final = ("amplitude", "max_size_mm", "min_size_mm", "d_x_mm", "d_y_mm", "angle_deg", "another_exam")
@@ -45,7 +45,7 @@ _OF_A_MASS: Final = ("amplitude", "max_size_mm", "min_size_mm", "d_x_mm", "d_y_m
 
 
 class Row(Record, eq=False):
-    """One exam as the tables and the contact sheet show it."""
+    """One exam as the tables and the index show it."""
 
     exam: Exam  #: Of exams.csv.
     report: EstimateReport | None
@@ -61,7 +61,7 @@ class Row(Record, eq=False):
 
     @property
     def size(self) -> Quantity | None:
-        """Largest size with its interval; None without one."""
+        """Largest size with the interval of the tables; None without one."""
         return None if self.report is None else self.report.max_size_mm
 
     @property
@@ -125,7 +125,7 @@ def _row(campaign: Campaign, exam: Exam, together: tuple[Finding, ...]) -> Row:
     fault = campaign.found.faults.get(exam.name)
     mapped = campaign.found.of("map", exam.name) or {}
     facts: dict[str, Any] = {"scans": tuple(mapped.get("scans", ())), "synthetic": mapped.get("synthetic")}
-    if fault is not None and fault.step != "figures":
+    if fault is not None and fault.step not in ("figures", "page"):
         return Row(exam, None, fault.step, fault.reason, **facts)
     by_site = SIZED in (campaign.found.of("size", exam.name) or {"files": ()})["files"]
     report = read_record(campaign.folder / EXAMS / exam.name / (SIZED if by_site else ESTIMATE), EstimateReport)

@@ -214,6 +214,18 @@ _PERCENT = tuple(100 * share for share in GROWN_BY)
 )  # fmt: skip
 @takes(Settings, "seed", "interval")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+@click.option(
+    "-o",
+    "--output",
+    metavar="GROWTH.html",
+    type=FilePath(writes="HTML"),
+    help="Write one page: the maps on common axes, the size at each visit, and the change.",
+)
+@click.option(
+    "--pdf", metavar="GROWTH.pdf", type=_FILE, help="Also print it to PDF, by an installed Chromium or WeasyPrint."
+)
+@click.option("--title", default="", help="Title of the page. Default: Tactile exams over time.")
+@click.option("--name", default="", help="Name to print on the page. Default: none.")
 @click.option("--figure", metavar=METAVAR, type=FigurePath(), help="Draw the maps, their difference and the change.")
 @FORCE
 @click.option("-v", "--verbose", is_flag=True, help="Print the full report instead of 12 lines.")
@@ -227,7 +239,7 @@ def compare_command(ctx: click.Context, /, **given: Any) -> None:
     A mass has grown, or shrunk, where the 95 % interval of the change leaves out none; else the least growth and
     shrinkage that would have been seen are told.
 
-    Example: tactile-bayes compare jan1.nc jan2.nc --with apr1.nc apr2.nc --days 92
+    Example: tactile-bayes compare jan1.nc jan2.nc --with apr1.nc apr2.nc --days 92 -o growth.html
     """
     from tactile_bayes.actions.estimate import compare_action
 

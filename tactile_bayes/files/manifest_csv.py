@@ -28,10 +28,15 @@ DONE, FAILURES, TRIAL, GROWN = "exams_done.csv", "failures.csv", "trial.csv", "g
 """Tables beside them."""
 
 SCAN, MAP, ESTIMATE, POSTERIOR = "scan.mcap", "map.nc", "estimate.json", "posterior.nc"
-SHAPE, THUMBNAIL, MAP_FIGURE, SIZE_FIGURE = "shape.npz", "thumbnail.png", "map.png", "size.png"
+SHAPE, MAP_FIGURE, SIZE_FIGURE = "shape.npz", "map.png", "size.png"
+EXAM_PAGE, THUMBNAIL = "exam.html", "thumbnail.svg"
 SIZED, SIZED_FIGURE = "sized.json", "sized.png"  #: Files of an exam.
 POOLED, POOLED_DRAWS = "pooled.json", "pooled.nc"  #: Files of a mass at a visit.
-COMPARED, COMPARED_FIGURE = "compare.json", "compare.png"  #: Files of a mass over its visits.
+COMPARED, COMPARED_FIGURE, GROWTH_PAGE = (
+    "compare.json",
+    "compare.png",
+    "growth.html",
+)  #: Files of a mass over its visits.
 REPEATABILITY: Final = "repeatability.json"  #: Beside the folders, as the tables are.
 
 

@@ -57,8 +57,11 @@ def pointwise_log_likelihood(target: CollapsedTarget, theta: FloatArray) -> Floa
     return -inverse
 
 
-def fitted_values(target: CollapsedTarget, theta: FloatArray) -> FloatArray:
-    """(n,) values of the model without noise at a (p,) shape, by generalised least squares in the likeliest field."""
+def fitted_values(target: CollapsedTarget, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """(n,) values of the model without noise at a (p,) shape, by generalised least squares in the likeliest field.
+
+    And the (n,) field's expectation given the data: the part of what is left that neighbouring cells share.
+    """
     window, at = target.window, theta[None]
     likeliest = int(np.argmax(target.by_field(at)[0]))
     templates = [window.of_cells(one.full())[0] for one in target.scene.templates(at, window)]
@@ -67,7 +70,9 @@ def fitted_values(target: CollapsedTarget, theta: FloatArray) -> FloatArray:
     middle = window.cells.value.mean()
     across = precision.times(regressors)
     solved = np.linalg.solve(across @ regressors.T, across @ (window.cells.value - middle))
-    return np.asarray(middle + solved @ regressors)
+    fit = np.asarray(middle + solved @ regressors)
+    left = window.cells.value - fit
+    return fit, left - precision.times(left[None])[0] * window.variance
 
 
 def _fields(target: CollapsedTarget) -> Iterator[Callable[[], _Precision]]:

@@ -280,6 +280,29 @@ def compare_text(report: CompareReport) -> str:
     return "\n".join([*lines, RESEARCH_USE]) + "\n"
 
 
+# --- The same in sentences, for the page.
+
+
+def verdict_sentence(report: CompareReport) -> str:
+    """Whether the mass has grown, or why nothing is compared."""
+    return _verdict_line(report.changes[-1]) if report.status == "compared" else _refusal(report)[0]
+
+
+def change_sentences(report: CompareReport) -> list[str]:
+    """The change to the last visit with its odds, and what it supposes."""
+    if report.status != "compared":
+        return []
+    last = report.changes[-1]
+    return [_change_line(last), _odds_line(last), *_site_line(report), *_another_line(last)]
+
+
+def rate_sentences(report: CompareReport) -> list[str]:
+    """The trend over three visits and more, or the growth rate between two; empty without days."""
+    if report.trend is not None:
+        return _trend_lines(report.trend)
+    return _rate_lines(report.changes[-1]) if report.changes else []
+
+
 def _refusal(report: CompareReport) -> list[str]:
     """Why nothing is compared, and what would help."""
     head = "Not compared: not shown to be one mass" if report.status == "not_one_mass" else "Not compared"

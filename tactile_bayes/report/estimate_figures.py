@@ -21,6 +21,7 @@ from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.compare import compare_summary
 from tactile_bayes.report.estimate_text import exams_label, no_estimate_line
 from tactile_bayes.report.figure_file import figure_file, load_matplotlib, named_exam
+from tactile_bayes.report.growth_page import HALF_MM, STEP_MM, Course, DrawnMap, LaidMap, common_limits, on_common_axes
 from tactile_bayes.report.map_figure import FitContour, NumberedMass, Place, draw_edges, draw_panel, map_figure
 from tactile_bayes.report.quantities import leading_size
 from tactile_bayes.size.draws import SizePosterior
@@ -35,10 +36,11 @@ if TYPE_CHECKING:
 
 # The colours' ends leave these shares of the cells outside, so that one cell at the rim does not take them all.
 _ENDS: Final = (0.005, 0.995)
-_CAPTION: Final = (
-    "Fit: level, slope, bump and what is modelled beside it. Residual: noise that neighbouring cells share, "
-    "and what the model lacks."
+_SHARED: Final = (
+    "Shared: what neighbouring cells have in common beside the fit, which the model takes for smooth noise. "
+    "Rest: noise of single cells."
 )
+_ALONE: Final = "Fit: level, slope and bump. Rest: noise, and what the model lacks."
 
 
 def fit_figure(
@@ -50,29 +52,38 @@ def fit_figure(
     findings: Sequence[Finding] = (),
     force: bool = False,
 ) -> Figure:
-    """Draw data, fit and residual of a fit window, data and fit in the same colours; see `figure_file` for the file.
+    """Draw data, fit and what is left of a fit window, data and fit in the same colours; see `figure_file`.
 
     `tactile_map`: the map that the window is of; `fitted`: the window's cells, see `fitted_cells`; `title`: above the
-    figure; nothing that identifies a person; `findings`: what speaks against the fit, told above it.
+    figure; nothing that identifies a person; `findings`: what speaks against the fit, told above it. What is left is
+    drawn in two parts where the noise is a field: what neighbouring cells share of it, and the rest.
     """
-    window, (value, fit, residual) = _window(tactile_map, fitted)
+    given = [fitted.value, fitted.fit, *([] if fitted.shared is None else [fitted.shared]), fitted.residual]
+    window, (value, fit, *left) = _window(tactile_map, fitted, given)
     low, high = (float(end) for end in np.nanquantile(np.stack([value, fit]), _ENDS))
-    most = max(float(np.nanquantile(np.abs(residual), _ENDS[1])), 1e-12)
-    words = tactile_map.recipe.value_words
-    with figure_file(path, size_in=(12.8, 4.1), force=force, findings=findings) as figure:
-        data_axes, fit_axes, residual_axes = figure.subplots(1, 3)
-        for axes, values, name in ((data_axes, value, "Data"), (fit_axes, fit, "Fit")):
+    most = max(float(np.nanquantile(np.abs(left), _ENDS[1])), 1e-12)
+    words, rest = tactile_map.recipe.value_words, left[-1]
+    known = rest[np.isfinite(rest)]
+    with figure_file(
+        path, size_in=(10.0, 7.9) if len(left) > 1 else (12.8, 4.1), force=force, findings=findings
+    ) as figure:
+        panels = figure.subplots(*((2, 2) if len(left) > 1 else (1, 3))).ravel()
+        for axes, values, name in ((panels[0], value, "Data"), (panels[1], fit, "Fit")):
             draw_panel(axes, values, window, label=words, title=name, cmap="viridis", vmin=low, vmax=high)
-        left = f"Residual, SD {float(np.nanstd(residual)):.2g}"
-        scale = {"vmin": -most, "vmax": most}
-        draw_panel(residual_axes, residual, window, label="data less fit", title=left, cmap="RdBu_r", **scale)
+        titles = [*(["Shared by neighbours"] if len(left) > 1 else []), f"Rest, SD {known.std():.2g}, "
+                  f"{100 * np.mean(known > 0):.0f} % of cells above 0"]  # fmt: skip
+        for axes, values, name in zip(panels[2:], left, titles, strict=True):
+            draw_panel(axes, values, window, label="data less fit", title=name, cmap="RdBu_r", vmin=-most, vmax=most)
         figure.suptitle(title or "Fit", x=0.01, ha="left", fontsize=11)
-        figure.text(0.01, 0.01, f"{_CAPTION}  {RESEARCH_USE}", fontsize=7.5, color="0.3")
+        caption = _SHARED if len(left) > 1 else _ALONE
+        figure.text(0.01, 0.01, f"{caption}  {RESEARCH_USE}", fontsize=7.5, color="0.3")
     return figure
 
 
-def _window(tactile_map: TactileMap, fitted: FittedCells) -> tuple[TactileMap, list[FloatArray]]:
-    """The map cut to the window, and value, fit and residual on its grid, NaN outside the window."""
+def _window(
+    tactile_map: TactileMap, fitted: FittedCells, given: Sequence[FloatArray]
+) -> tuple[TactileMap, list[FloatArray]]:
+    """The map cut to the window, and values of the window's cells on its grid, NaN outside the window."""
     cell = tactile_map.recipe.cell_mm
     columns = np.rint((fitted.x_mm - tactile_map.x_mm[0]) / cell).astype(int)
     rows = np.rint((fitted.y_mm - tactile_map.y_mm[0]) / cell).astype(int)
@@ -86,7 +97,7 @@ def _window(tactile_map: TactileMap, fitted: FittedCells) -> tuple[TactileMap, l
         y_mm=tactile_map.y_mm[part[0]],
     )
     grids = []
-    for values in (fitted.value, fitted.fit, fitted.residual):
+    for values in given:
         grid = np.full(tactile_map.mean.shape, np.nan)
         grid[rows, columns] = values
         grids.append(grid[part])
@@ -99,7 +110,8 @@ _MAX_COLOUR, _MIN_COLOUR = "#1f3b73", "#c8641e"  # tell apart in greyscale too
 _ALIKE_COLOUR = "0.4"
 # The axis ends at these quantiles of the draws, or at an interval's end where that lies farther out.
 _SHOWN: Final = (0.005, 0.985)
-_SIZES: Final = {"max": "largest", "min": "smallest"}
+_ROUND: Final = 0.9
+"""Where largest and smallest size are one in so many of the draws, the two densities are one to the eye."""
 _KINDS: Final = {"eti": "equal-tailed", "hdi": "highest-density"}
 
 
@@ -130,16 +142,20 @@ def size_figure(
     largest size if exams differ less; `title`: above the figure; nothing that identifies a person; `findings`: what
     speaks against the size, told above it.
     """
-    size_in = (7.0, 4.0 + 0.4 * ("alike" in intervals))
-    with figure_file(path, size_in=size_in, force=force, findings=findings) as figure:
+    alike = float(np.mean(np.isclose(draws_max_mm, draws_min_mm))) if len(draws_max_mm) == len(draws_min_mm) else 0.0
+    rows = [("largest", draws_max_mm, _MAX_COLOUR, "-", "max"), ("smallest", draws_min_mm, _MIN_COLOUR, "--", "min")]
+    more = ""
+    if alike >= _ROUND:
+        rows, more = rows[:1], f"\n(the smallest is the same in {100 * alike:.0f} % of the draws)"
+    bars = len(rows) + ("alike" in intervals)
+    with figure_file(path, size_in=(7.0, 3.2 + 0.4 * bars), force=force, findings=findings) as figure:
         axes = figure.subplots()
-        rows = (("max", draws_max_mm, _MAX_COLOUR, "-"), ("min", draws_min_mm, _MIN_COLOUR, "--"))
-        for row, (name, draws, colour, dash) in enumerate(rows):
-            _draw_density(axes, name, draws, colour=colour, dash=dash)
-            if name in intervals:
-                _draw_interval(axes, intervals[name], size=_SIZES[name], row=row, colour=colour)
+        for row, (size, draws, colour, dash, key) in enumerate(rows):
+            _draw_density(axes, size, draws, colour=colour, dash=dash, more=more)
+            if key in intervals:
+                _draw_interval(axes, intervals[key], size=size, row=row, colour=colour)
         if "alike" in intervals:
-            _draw_interval(axes, intervals["alike"], size=_SIZES["max"], row=len(rows), colour=_ALIKE_COLOUR)
+            _draw_interval(axes, intervals["alike"], size="largest", row=len(rows), colour=_ALIKE_COLOUR)
         axes.set_title(title or "Size of the lump", loc="left", fontsize=11)
         axes.set_xlim(_span((draws_max_mm, draws_min_mm), intervals))
         axes.set_xlabel("size (mm)", fontsize=9)
@@ -188,10 +204,10 @@ def _smoothed(at_mm: FloatArray, middle_mm: FloatArray, weights: FloatArray, wid
     return np.asarray(kernel @ weights / (width_mm * np.sqrt(2 * np.pi)))
 
 
-def _draw_density(axes: Axes, name: str, draws_mm: FloatArray, *, colour: str, dash: str) -> None:
+def _draw_density(axes: Axes, size: str, draws_mm: FloatArray, *, colour: str, dash: str, more: str) -> None:
     sizes, density = _density(draws_mm)
     median = float(np.median(draws_mm[np.isfinite(draws_mm)]))
-    label = f"{_SIZES[name]} size, median {median:.1f} mm"
+    label = f"{size} size, median {median:.1f} mm{more}"
     axes.plot(sizes, density, color=colour, linestyle=dash, linewidth=1.8, label=label)
     axes.fill_between(sizes, density, color=colour, alpha=0.15, linewidth=0)
     axes.vlines(median, 0.0, float(np.interp(median, sizes, density)), color=colour, linestyle=dash, linewidth=1.2)
@@ -305,25 +321,7 @@ def _contour(estimate: Estimate) -> FitContour | None:
 
 # --- Picture of a comparison: the visits' maps on common axes and colours, their difference, and the change of size.
 
-HALF_MM: Final = 30.0  #: Half the side of the square about the mass that is drawn.
-_STEP_MM: Final = 1.0
-_LEAST_COLOURS: Final = (0.9, 1.3)
 _MOST_VISITS: Final = 4
-
-
-class DrawnMap(Record, eq=False):
-    """A map and the place of its lump on the plane; None where none was found."""
-
-    tactile_map: TactileMap
-    centre_mm: tuple[float, float] | None
-
-
-class _Laid(Record, eq=False):
-    """A visit's maps averaged on a common grid about its mass."""
-
-    values: FloatArray  #: (n, n) array: Rows upwards, columns to the right on the screen; NaN without data.
-    origin_mm: FloatArray
-    """(2,) array: Left of and above the xiphoid, where the mass lies; (0, 0) without landmarks."""
 
 
 def draw_comparison(
@@ -341,8 +339,7 @@ def draw_comparison(
 
     `visits`: maps of each visit; `path`: written as PNG, PDF or SVG; None writes nothing.
     """
-    in_patient = all(one.tactile_map.patient_from_plane is not None for maps in visits for one in maps)
-    laid = [_averaged(maps, in_patient=in_patient) for maps in visits]
+    laid, in_patient = on_common_axes(report, visits)
     shown = [0, *range(max(1, len(laid) - _MOST_VISITS + 1), len(laid))]
     with figure_file(path, size_in=(4.0 * (len(shown) + 1), 7.4), force=force) as figure:
         exam = named_exam("", report.provenance.get("scans", ()))
@@ -350,7 +347,9 @@ def draw_comparison(
         grid = figure.add_gridspec(2, len(shown) + 1, height_ratios=(1.35, 1.0))
         panels = [figure.add_subplot(grid[0, i]) for i in range(len(shown) + 1)]
         words = visits[0][0].tactile_map.recipe.value_words
-        _draw_maps(panels, [(i + 1, laid[i]) for i in shown], label=words, in_patient=in_patient)
+        _draw_maps(
+            panels, [(Course().of(report.visits[i]), laid[i]) for i in shown], label=words, in_patient=in_patient
+        )
         _draw_change(figure.add_subplot(grid[1, 0]), compared)
         words_axes = figure.add_subplot(grid[1, 1:])
         words_axes.set_axis_off()
@@ -364,62 +363,24 @@ def draw_comparison(
     return figure
 
 
-def _averaged(maps: Sequence[DrawnMap], *, in_patient: bool) -> _Laid:
-    """Mean of a visit's maps about its mass, on the screen's axes."""
-    along = np.arange(-HALF_MM, HALF_MM + _STEP_MM / 2, _STEP_MM)
-    right, up = np.meshgrid(along, along)
-    about = np.stack([-right, up])  # x, the patient's and the plane's, runs to the viewer's left, as in every picture
-    values, places = [], []
-    for drawn in maps:
-        one, centre = drawn.tactile_map, drawn.centre_mm
-        if centre is None:
-            continue
-        rotation = np.eye(2)
-        if in_patient:
-            assert one.patient_from_plane is not None
-            rotation = one.patient_from_plane[:2, :2]
-            places.append((rotation @ centre + one.patient_from_plane[:2, 3]) * [-1.0, 1.0])
-        x, y = np.tensordot(np.linalg.inv(rotation), about, axes=1) + np.reshape(centre, (2, 1, 1))
-        values.append(_nearest(one, x, y))
-    if not values:
-        return _Laid(np.full(right.shape, np.nan), np.zeros(2))
-    stack = np.stack(values)
-    known = np.isfinite(stack)
-    total, count = np.where(known, stack, 0.0).sum(axis=0), known.sum(axis=0)
-    mean = np.divide(total, count, out=np.full(right.shape, np.nan), where=count > 0)
-    return _Laid(mean, np.mean(places, axis=0) if places else np.zeros(2))
-
-
-def _nearest(tactile_map: TactileMap, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
-    """Values of the nearest cells; NaN outside and in cells without data."""
-    cell = tactile_map.recipe.cell_mm
-    column = np.rint((x_mm - tactile_map.x_mm[0]) / cell).astype(int)
-    row = np.rint((y_mm - tactile_map.y_mm[0]) / cell).astype(int)
-    ny, nx = tactile_map.mean.shape
-    inside = (column >= 0) & (column < nx) & (row >= 0) & (row < ny)
-    filled = np.where(tactile_map.covered, tactile_map.mean, np.nan)
-    found = filled[np.clip(row, 0, ny - 1), np.clip(column, 0, nx - 1)]
-    return np.where(inside, found, np.nan)
-
-
-def _draw_maps(panels: Sequence[Axes], visits: Sequence[tuple[int, _Laid]], *, label: str, in_patient: bool) -> None:
-    """Draw the visits, by their numbers, with one colour bar, and the difference of the last and the first."""
-    (earlier, first), (later, last) = visits[0], visits[-1]
-    every = np.concatenate([one.values[np.isfinite(one.values)] for _, one in visits])
-    every = every if len(every) else np.ones(1)
-    level = float(np.median(every))
-    low, high = min(_LEAST_COLOURS[0] * level, float(every.min())), max(_LEAST_COLOURS[1] * level, float(every.max()))
-    for axes, (number, one) in zip(panels, visits, strict=False):
+def _draw_maps(panels: Sequence[Axes], visits: Sequence[tuple[str, LaidMap]], *, label: str, in_patient: bool) -> None:
+    """Draw the visits, by their names, with one colour bar, and the difference of the last and the first."""
+    first, last = visits[0][1], visits[-1][1]
+    low, high = common_limits([one for _, one in visits])
+    for axes, (name, one) in zip(panels, visits, strict=False):
         image = _draw_cells(axes, one.values, first.origin_mm, cmap="viridis", vmin=low, vmax=high)
-        axes.set_title(f"Visit {number}", loc="left", fontsize=11)
+        if one.ring_mm is not None:
+            for colour, width in (("black", 3.0), ("white", 1.4)):
+                axes.plot(*(one.ring_mm + first.origin_mm[:, None]), color=colour, linewidth=width)
+        axes.set_title(name, loc="left", fontsize=11)
         _name_axes(axes, first.origin_mm, in_patient=in_patient)
     figure = panels[0].figure
     bar = figure.colorbar(image, ax=list(panels[:-1]), shrink=0.8, pad=0.01)
     bar.set_label(label, fontsize=8)
     difference = last.values - first.values
-    most = max(0.1 * level, float(np.nanmax(np.abs(difference), initial=0.0)))
+    most = max(0.3 * (high - low), float(np.nanmax(np.abs(difference), initial=0.0)))
     image = _draw_cells(panels[-1], difference, first.origin_mm, cmap="RdBu_r", vmin=-most, vmax=most)
-    panels[-1].set_title(f"Visit {later} minus visit {earlier}", loc="left", fontsize=11)
+    panels[-1].set_title("Last minus first", loc="left", fontsize=11)
     _name_axes(panels[-1], first.origin_mm, in_patient=in_patient)
     bars = [bar, figure.colorbar(image, ax=panels[-1], shrink=0.8, pad=0.01)]
     bars[1].set_label(f"difference of {label}", fontsize=8)
@@ -430,7 +391,7 @@ def _draw_maps(panels: Sequence[Axes], visits: Sequence[tuple[int, _Laid]], *, l
 def _draw_cells(axes: Axes, values: FloatArray, origin_mm: FloatArray, **how: Any) -> Any:
     """Draw values about the mass; places without data stay grey."""
     axes.set_facecolor("0.85")
-    half = HALF_MM + _STEP_MM / 2
+    half = HALF_MM + STEP_MM / 2
     extent = (origin_mm[0] - half, origin_mm[0] + half, origin_mm[1] - half, origin_mm[1] + half)
     shown = np.ma.masked_invalid(values)
     return axes.imshow(shown, origin="lower", extent=extent, interpolation="nearest", **how)

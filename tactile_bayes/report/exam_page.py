@@ -2,20 +2,9 @@
 
 from __future__ import annotations
 
-import os
-import re
-import shutil
-import subprocess
-import tempfile
-from collections.abc import Callable
-from importlib.util import find_spec
-from pathlib import Path
 from typing import Any, Final
 
 from tactile_bayes import __version__
-from tactile_bayes.declarations import Record
-from tactile_bayes.errors import UsageError
-from tactile_bayes.files.atomic import check_suffix, refuse_existing, same_file, write_all
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.mapping.places import orientation_of
 from tactile_bayes.posterior.abstention import chance_text
@@ -47,100 +36,6 @@ from tactile_bayes.report.svg import (
     small_pictures,
     smallest_pictures,
 )
-
-# --- The page of an exam as files: HTML, and printed to PDF.
-
-
-class PageFiles(Record):
-    """Where the page of an exam goes."""
-
-    html: Path
-    pdf: Path | None = None
-    """`html`, `pdf`: Files to write; no PDF where it is None."""
-    force: bool = False  #: Overwrite them.
-
-    def check(self) -> None:
-        """Refuse, before any work is done, what could not be written."""
-        check_suffix(self.html, "HTML")
-        refuse_existing(self.html, force=self.force)
-        if self.pdf is not None:
-            if same_file(self.pdf, self.html):
-                raise UsageError(f"{self.pdf} is page and PDF at once; choose another name for one of them")
-            check_suffix(self.pdf, "PDF")
-            refuse_existing(self.pdf, force=self.force)
-            find_printer()
-
-    def write(self, exam: Exam) -> None:
-        """Write the page and its print: both of them, or none."""
-        text = exam_page(exam)
-        files = {self.html: text.encode()}
-        if self.pdf is not None:
-            files[self.pdf] = find_printer()(text)
-        write_all(files, force=self.force)
-
-
-# --- Printing of a page to PDF, by an installed Chromium or by WeasyPrint.
-
-Printer = Callable[[str], bytes]
-BROWSERS: Final = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
-PATIENCE_S: Final = 120
-# What a browser writes of the time, and what stands there instead, of the same length.
-_TIMES: Final = re.compile(rb"/(CreationDate|ModDate) ?\(D:[0-9+Z'-]*\)")
-
-
-def find_printer() -> Printer:
-    """What prints a page here."""
-    browser = next((found for name in BROWSERS if (found := shutil.which(name))), None)
-    if browser is not None:
-        return lambda text: _by_browser(browser, text)
-    if find_spec("weasyprint") is not None:
-        return _by_weasyprint
-    raise UsageError(
-        "--pdf needs Chromium or WeasyPrint and finds neither; install Chromium or `pip install 'tactile-bayes[pdf]'`, "
-        "or print the page from your browser"
-    )
-
-
-def _by_browser(browser: str, text: str) -> bytes:
-    """PDF by a headless browser with a profile of its own and no network."""
-    with tempfile.TemporaryDirectory() as folder:
-        source, target = Path(folder) / "page.html", Path(folder) / "page.pdf"
-        source.write_text(text, encoding="utf-8")
-        words = [
-            browser,
-            "--headless",
-            "--disable-gpu",
-            "--disable-background-networking",
-            "--disable-dev-shm-usage",
-            "--no-first-run",
-            "--no-pdf-header-footer",
-            f"--user-data-dir={Path(folder) / 'profile'}",
-            f"--print-to-pdf={target}",
-            *(["--no-sandbox"] if os.geteuid() == 0 else []),  # Chromium refuses root with its sandbox
-            source.as_uri(),
-        ]
-        try:
-            done = subprocess.run(words, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
-        except (OSError, subprocess.TimeoutExpired) as error:
-            raise UsageError(f"{browser} did not print the page ({error}); print it from your browser") from None
-        if not target.exists():
-            last = (done.stderr.strip().splitlines() or ["it said nothing"])[-1][:200]
-            raise UsageError(f"{browser} did not print the page ({last}); print it from your browser")
-        return _TIMES.sub(_timeless, target.read_bytes())
-
-
-def _timeless(found: re.Match[bytes]) -> bytes:
-    """The same entry with a fixed time, as long as it was: places in a PDF are counted in bytes."""
-    start, time = found[0].split(b"(D:")
-    return start + b"(D:" + re.sub(rb"[0-9]", b"0", time)
-
-
-def _by_weasyprint(text: str) -> bytes:
-    from weasyprint import HTML
-
-    document: bytes = HTML(string=text).write_pdf()
-    return document
-
 
 # --- An exam as one self-contained page that prints to one side of A4: no script, nothing loaded, every text escaped.
 

@@ -18,37 +18,37 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-# --- Names for the titles of figures: a map's, with the subject's code and the scan's digest.
+# --- Names for the titles of figures: what the scans say of the exam, else the file's name; never digests.
 
-_CODE: Final = re.compile(r"[A-Za-z0-9_-]{1,32}")
-_DIGEST_LETTERS: Final = 8
-_MOST: Final = 3
+_CODE: Final = re.compile(r"[A-Za-z0-9_.-]{1,32}")
+_TITLED: Final = ("subject", "side", "mass", "visit")
 
 
 def named_exam(name: str, scans: Sequence[Mapping[str, str]]) -> str:
-    """Such as ``"exam (P07, scan 3dbf3ce1)"``; what is no code is left out, and `$` starts no formula.
+    """Such as ``"P07, left, mass 1, visit 2 (exam)"``; what is no code is left out, and `$` starts no formula.
 
     Parameters
     ----------
     name
         Of the map; may be empty.
     scans
-        As `Provenance.scans` has them.
+        As `Provenance.scans` has them. Of a fact on which they differ, each value is named.
     """
-    subjects = dict.fromkeys(scan.get("subject", "") for scan in scans)
-    codes = [code for code in subjects if _CODE.fullmatch(code)]
-    digests = [one for one in (scan.get("sha256", "")[:_DIGEST_LETTERS] for scan in scans) if _CODE.fullmatch(one)]
-    more = f" and {len(digests) - _MOST} more" if len(digests) > _MOST else ""
-    codes += [f"scan{'s' if len(digests) > 1 else ''} {', '.join(digests[:_MOST])}{more}"] if digests else []
+    told = []
+    for fact in _TITLED:
+        codes = dict.fromkeys(code for one in scans if _CODE.fullmatch(code := one.get(fact, "")))
+        words = f"{fact}{'s' * (len(codes) > 1)} " if fact in ("mass", "visit") else ""
+        told += [words + " and ".join(codes)] if codes else []
     plain = name.replace("$", r"\$")
-    if not codes:
+    if not told:
         return plain
-    return f"{plain} ({', '.join(codes)})" if plain else ", ".join(codes)
+    return f"{', '.join(told)} ({plain})" if plain else ", ".join(told)
 
 
 # --- Figure files: PNG, PDF or SVG by suffix; with the same libraries, equal input gives equal bytes.
 
 DPI: Final = 150
+_FOOT_IN: Final = 0.4  #: Room for a caption below what is drawn.
 # Suffix -> what would be written about the program and the time, each None: left out.
 FORMATS: Final[dict[str, dict[str, None]]] = {
     ".png": {"Software": None},
@@ -92,7 +92,12 @@ def plain_matplotlib() -> Iterator[Any]:
 
 @contextmanager
 def figure_file(
-    path: Path | None, *, size_in: tuple[float, float], force: bool, findings: Sequence[Finding] = ()
+    path: Path | None,
+    *,
+    size_in: tuple[float, float],
+    force: bool,
+    findings: Sequence[Finding] = (),
+    trim: bool = False,
 ) -> Iterator[Figure]:
     """Give a figure that is written when the block ends, independent of the user's matplotlib settings.
 
@@ -106,6 +111,8 @@ def figure_file(
         Overwrite an existing file.
     findings
         What speaks against what is shown, told above it.
+    trim
+        Let the figure end below what is drawn, where that needs less than its height.
 
     Raises
     ------
@@ -125,6 +132,10 @@ def figure_file(
         if told:
             title = figure.get_suptitle()
             figure.suptitle("\n".join([*told, *([title] if title else [])]), x=0.01, ha="left", fontsize=9.5)
+        if trim:
+            figure.draw_without_rendering()
+            lowest = min(axes.get_tightbbox().y0 for axes in figure.axes) / figure.dpi
+            figure.set_figheight(figure.get_figheight() - max(0.0, lowest - _FOOT_IN))
         if path is None:
             return
         suffix = path.suffix.lower()

@@ -37,6 +37,10 @@ _ABOVE: Final[dict[str, Any]] = {
     "color": "white",
     "fontsize": 8,
 }
+# Of a legend below a picture, where it hides no cell.
+_BELOW: Final[dict[str, Any]] = {"loc": "upper left", "bbox_to_anchor": (0.0, 0.0), "borderaxespad": 4.0}
+# Width of a figure and its height at most: it ends where its panels do.
+_MOST_IN: Final = (10.0, 9.0)
 # Places that were looked at in vain: so many are explained, the others are only marked.
 _EXPLAINED_PLACES: Final = 4
 
@@ -98,9 +102,8 @@ def map_figure(
     if not tactile_map.covered.any():
         raise BadDataError("the map holds no data to draw", way_out="make it from a scan with frames in the window")
     view = orientation_of(tactile_map)
-    height_in = 5.4 if looked_at else 4.5
     told = tactile_map.findings if findings is None else findings
-    with figure_file(path, size_in=(10.0, height_in), force=force, findings=told) as figure:
+    with figure_file(path, size_in=_MOST_IN, trim=True, force=force, findings=told) as figure:
         left, right = figure.subplots(1, 2, width_ratios=(1.55, 1.0))
         _draw_values(left, tactile_map, view, fit)
         _draw_coverage(right, tactile_map, view)
@@ -218,7 +221,7 @@ def _explain(axes: Axes, tactile_map: TactileMap, places: Sequence[Place]) -> No
             "\n".join(shown),
             (0.0, 0.0),
             xycoords="axes fraction",
-            xytext=(0, -54),
+            xytext=(0, -54),  # below the legend
             textcoords="offset points",
             va="top",
             fontsize=7,
@@ -227,7 +230,7 @@ def _explain(axes: Axes, tactile_map: TactileMap, places: Sequence[Place]) -> No
         return
     sample = load_matplotlib().patches.Patch(facecolor="0.35", edgecolor="white", hatch="////", linewidth=0)
     label = f"fewer than {FEW_READINGS} readings: noisy"
-    axes.legend([sample], [label], loc="upper center", bbox_to_anchor=(0.5, -0.2), fontsize=8, frameon=False)
+    axes.legend([sample], [label], fontsize=8, frameon=False, **_BELOW)
 
 
 def _at(place: Place) -> str:
@@ -245,8 +248,13 @@ def _orient(axes: Axes, view: Orientation, tactile_map: TactileMap) -> None:
     """Label the plane's axes and orient them."""
     axes.set_anchor("N")
     words = _AXIS_WORDS if tactile_map.recipe.source == "scan" else {"x": "x (mm)", "y": "y (mm)"}
-    axes.set_xlabel(words[view.right[1]], fontsize=9)
-    axes.set_ylabel(words[view.up[1]], fontsize=9)
+    back = {view.right: "larger to the left", view.up: "larger downwards"}
+    across, up = (
+        words[axis[1]] if axis[0] == "+" else f"{words[axis[1]].removesuffix(')')}, {how})"
+        for axis, how in back.items()
+    )
+    axes.set_xlabel(across, fontsize=9)
+    axes.set_ylabel(up, fontsize=9)
     axes.tick_params(labelsize=8)
     if view.right[0] == "-":
         axes.invert_xaxis()
@@ -287,8 +295,7 @@ def _draw_fit(axes: Axes, fit: FitContour, view: Orientation) -> None:
     for size_mm, dash, width, label in ellipses:
         _draw_ellipse(axes, centre, size_mm, fit.angle_deg, view, linewidth=width, linestyle=dash, label=label)
     axes.plot(*centre, "+", color="white", markersize=9, markeredgewidth=1.6, path_effects=_outlined(3.2))
-    place = (0.0, -0.13)  # below the picture, where it hides no cell
-    axes.legend(loc="upper left", bbox_to_anchor=place, ncols=2, fontsize=8, facecolor="0.5", labelcolor="white")
+    axes.legend(fontsize=8, facecolor="0.5", labelcolor="white", **_BELOW)
 
 
 def _draw_ellipse(

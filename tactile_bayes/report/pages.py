@@ -1,21 +1,21 @@
-"""Pages from templates, and the contact sheet of a campaign."""
+"""Pages from templates, and their files."""
 
 from __future__ import annotations
 
-import base64
-import hashlib
-import heapq
-from collections.abc import Iterable, Mapping, Sequence
+import os
+import re
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Callable
 from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
-from urllib.parse import quote
 
-from tactile_bayes.declarations import Record, field
-from tactile_bayes.findings import SEVERITIES, Finding, finding_lines
-from tactile_bayes.inference.draws import Quantity
-from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.report.compare import Growth
+from tactile_bayes.declarations import Record
+from tactile_bayes.errors import UsageError
+from tactile_bayes.files.atomic import check_suffix, refuse_existing, same_file, write_all
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -27,7 +27,7 @@ TEMPLATES: Final = Path(__file__).with_name("templates")
 
 
 def page(kind: str, *, title: str, images: str = "data:", script_sha256: str = "", **values: Any) -> str:
-    """A page of the kind "exam", "trial" or "campaign".
+    """A page of the kind "exam", "growth", "trial" or "campaign".
 
     `images` is where its pictures may come from; `script_sha256` is of the one script that may run, in base 64.
     """
@@ -58,93 +58,94 @@ def _environment() -> Environment:
     return made
 
 
-# --- Contact sheet of a campaign: every exam on one self-contained page, worst first, with filters that need no server.
-
-FAILED, UNSIZED, SIZED = "failed", "without a size", "sized"
-_CLASSES: Final = {FAILED: "failed", UNSIZED: "without", SIZED: "sized"}
+# --- A page as files: HTML, and printed to PDF.
 
 
-class Card(Record, eq=False):
-    """One exam on the page."""
+class PageFiles(Record):
+    """Where a page goes."""
 
-    name: str
-    status: str
-    """`FAILED`, `UNSIZED` or `SIZED`."""
-    facts: tuple[str, ...] = ()  #: What else the table says of the exam.
-    reason: str = ""  #: Why there is no size; empty where there is one.
-    size: Quantity | None = None  #: Largest size, mm; None without one.
-    findings: tuple[Finding, ...] = ()  #: What speaks against the exam.
-    thumbnail: bytes | str | None = None
-    """PNG of the map, or the name of its file from the page's folder; None without one."""
-    links: Mapping[str, str] = field(default_factory=dict)
-    """Files in the exam's folder, by the words of their links."""
+    html: Path
+    pdf: Path | None = None
+    """`html`, `pdf`: Files to write; no PDF where it is None."""
+    force: bool = False  #: Overwrite them.
 
-    @property
-    def kind(self) -> str:
-        """Class of the card in the style sheet."""
-        return _CLASSES[self.status]
+    def check(self) -> None:
+        """Refuse, before any work is done, what could not be written."""
+        check_suffix(self.html, "HTML")
+        refuse_existing(self.html, force=self.force)
+        if self.pdf is not None:
+            if same_file(self.pdf, self.html):
+                raise UsageError(f"{self.pdf} is page and PDF at once; choose another name for one of them")
+            check_suffix(self.pdf, "PDF")
+            refuse_existing(self.pdf, force=self.force)
+            find_printer()
 
-    @property
-    def why(self) -> str:
-        """Why there is no size; a failure's reason says so itself."""
-        return self.reason if self.status == FAILED else f"{self.status}: {self.reason}"
-
-    @property
-    def told(self) -> list[tuple[str, str]]:
-        """Severity and text of each finding."""
-        return [(one, text) for one in SEVERITIES for text in finding_lines(self.findings, one, paper=True)]
-
-    @property
-    def alt(self) -> str:
-        """What the picture shows, for those who do not see it."""
-        ring = "no lump ringed" if self.size is None else f"a ring around the lump of {self.size.median:.1f} mm"
-        return f"Map of {self.name}, {ring}"
-
-    @property
-    def source(self) -> str:
-        """Address of the picture; empty without one."""
-        if self.thumbnail is None or isinstance(self.thumbnail, str):
-            return quote(self.thumbnail or "")
-        return f"data:image/png;base64,{base64.b64encode(self.thumbnail).decode('ascii')}"
-
-    @property
-    def badness(self) -> tuple[int, int, float]:
-        """Sort key: failures, exams without a size, cautions, checks, and wide intervals come first."""
-        wide = 0.0 if self.size is None else (self.size.high - self.size.low) / self.size.median
-        order = (FAILED, UNSIZED, SIZED).index(self.status)
-        return order, -sum(10 if one.severity == "caution" else 1 for one in self.findings), -wide
+    def write(self, text: str) -> None:
+        """Write the page and its print: both of them, or none."""
+        files = {self.html: text.encode()}
+        if self.pdf is not None:
+            files[self.pdf] = find_printer()(text)
+        write_all(files, force=self.force)
 
 
-def worst(cards: Iterable[Card], most: int) -> list[Card]:
-    """Up to `most` cards, those to be looked at first before the others."""
-    return heapq.nsmallest(most, cards, key=lambda card: (card.badness, card.name))
+# --- Printing of a page to PDF, by an installed Chromium or by WeasyPrint.
+
+Printer = Callable[[str], bytes]
+BROWSERS: Final = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
+PATIENCE_S: Final = 120
+# What a browser writes of the time, and what stands there instead, of the same length.
+_TIMES: Final = re.compile(rb"/(CreationDate|ModDate) ?\(D:[0-9+Z'-]*\)")
 
 
-def campaign_html(
-    cards: Sequence[Card],
-    *,
-    lines: Sequence[str],
-    links: Mapping[str, str],
-    version: str,
-    growth: Sequence[Growth] = (),
-) -> str:
-    """Full page; nothing is loaded but thumbnails beside it, and the only script is its filter.
-
-    `cards` are in the order in which they are shown, `lines` the summary in sentences, `links` the files beside the
-    page by the words of their links, `growth` that of masses with several visits.
-    """
-    script = "\n" + (TEMPLATES / "campaign.js").read_text(encoding="utf-8")
-    return page(
-        "campaign",
-        title="Exams of a campaign",
-        images="'self' file:" if any(isinstance(card.thumbnail, str) for card in cards) else "data:",
-        script_sha256=base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
-        script=script,
-        research_use=RESEARCH_USE,
-        lines=lines,
-        beside=links,
-        growth=growth,
-        counts={status: sum(card.status == status for card in cards) for status in _CLASSES},
-        cards=cards,
-        version=version,
+def find_printer() -> Printer:
+    """What prints a page here."""
+    browser = next((found for name in BROWSERS if (found := shutil.which(name))), None)
+    if browser is not None:
+        return lambda text: _by_browser(browser, text)
+    if find_spec("weasyprint") is not None:
+        return _by_weasyprint
+    raise UsageError(
+        "--pdf needs Chromium or WeasyPrint and finds neither; install Chromium or `pip install 'tactile-bayes[pdf]'`, "
+        "or print the page from your browser"
     )
+
+
+def _by_browser(browser: str, text: str) -> bytes:
+    """PDF by a headless browser with a profile of its own and no network."""
+    with tempfile.TemporaryDirectory() as folder:
+        source, target = Path(folder) / "page.html", Path(folder) / "page.pdf"
+        source.write_text(text, encoding="utf-8")
+        words = [
+            browser,
+            "--headless",
+            "--disable-gpu",
+            "--disable-background-networking",
+            "--disable-dev-shm-usage",
+            "--no-first-run",
+            "--no-pdf-header-footer",
+            f"--user-data-dir={Path(folder) / 'profile'}",
+            f"--print-to-pdf={target}",
+            *(["--no-sandbox"] if os.geteuid() == 0 else []),  # Chromium refuses root with its sandbox
+            source.as_uri(),
+        ]
+        try:
+            done = subprocess.run(words, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
+        except (OSError, subprocess.TimeoutExpired) as error:
+            raise UsageError(f"{browser} did not print the page ({error}); print it from your browser") from None
+        if not target.exists():
+            last = (done.stderr.strip().splitlines() or ["it said nothing"])[-1][:200]
+            raise UsageError(f"{browser} did not print the page ({last}); print it from your browser")
+        return _TIMES.sub(_timeless, target.read_bytes())
+
+
+def _timeless(found: re.Match[bytes]) -> bytes:
+    """The same entry with a fixed time, as long as it was: places in a PDF are counted in bytes."""
+    start, time = found[0].split(b"(D:")
+    return start + b"(D:" + re.sub(rb"[0-9]", b"0", time)
+
+
+def _by_weasyprint(text: str) -> bytes:
+    from weasyprint import HTML
+
+    document: bytes = HTML(string=text).write_pdf()
+    return document

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_bayes.declarations import Record
-from tactile_bayes.files.reports import EstimateReport, SmallestLump, centre_of
+from tactile_bayes.files.reports import SmallestLump, centre_of
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.mapping.map import TactileMap
@@ -62,51 +62,59 @@ def _on(angle_deg: float, radius: float) -> tuple[float, float]:
     return radius * math.sin(angle), -radius * math.cos(angle)
 
 
-# --- Intervals of a size on a scale in mm, as inline SVG.
+# --- Intervals on a scale, as inline SVG.
 
 _LENGTH_MM: Final = 70.0
 _ROW_MM: Final = 7.5
 _MOST_TICKS: Final = 8
-_STEPS_MM: Final = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
+_STEPS: Final = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 
 
-def size_ruler(rows: Sequence[tuple[str, Quantity]]) -> str:
-    """A bar for each interval with its median, the first the thickest, above a scale from 0 mm.
+def size_ruler(
+    rows: Sequence[tuple[str, Quantity]], *, unit: str = "mm", label: str = "Intervals of the largest diameter"
+) -> str:
+    """A bar for each interval with its median, the first the thickest, above a scale that holds 0; empty without rows.
 
     A row is what an interval supposes, and the interval.
     """
-    end = max(q.high for _, q in rows) * 1.08
-    bottom = _ROW_MM * len(rows) + 1.5
+    if not rows:
+        return ""
+    start, end = min(0.0, *(1.08 * q.low for _, q in rows)), max(0.0, *(1.08 * q.high for _, q in rows))
+    scale, bottom = _LENGTH_MM / (end - start), _ROW_MM * len(rows) + 1.5
+    zero = [f'<path d="M{-scale * start:.2f} 0V{bottom:g}" stroke="#111" stroke-width="0.25"/>'] if start < 0.0 else []
     parts = [
-        *(part for i, (words, q) in enumerate(rows) for part in _bar(i, words, q, _LENGTH_MM / end)),
-        *_scale(end, bottom),
+        *zero,
+        *(part for i, (words, q) in enumerate(rows) for part in _bar(i, words, q, start, scale)),
+        *_scale(start, end, bottom, unit),
     ]
-    box = f'viewBox="-2 -1 {_LENGTH_MM + 4:g} {bottom + 6:g}" width="{_LENGTH_MM + 4:g}mm" height="{bottom + 6:g}mm"'
-    label = "Intervals of the largest diameter"
-    return f'<svg class="ruler" role="img" aria-label="{label}" {box}>{"".join(parts)}</svg>'
+    box = f'viewBox="-4 -1 {_LENGTH_MM + 8:g} {bottom + 6:g}" width="{_LENGTH_MM + 8:g}mm" height="{bottom + 6:g}mm"'
+    return f'<svg class="ruler" role="img" aria-label="{html.escape(label)}" {box}>{"".join(parts)}</svg>'
 
 
-def _bar(row: int, words: str, q: Quantity, scale: float) -> Iterator[str]:
-    y, left, right = 4.0 + _ROW_MM * row, scale * q.low, scale * q.high
-    middle = min(max((left + right) / 2, 12.0), _LENGTH_MM - 12.0)
-    yield _ruler_text(middle, y - 1.7, words)
+def _bar(row: int, words: str, q: Quantity, start: float, scale: float) -> Iterator[str]:
+    y, left, right = 4.0 + _ROW_MM * row, scale * (q.low - start), scale * (q.high - start)
+    half = 0.65 * len(words)
+    middle = min(max((left + right) / 2, half), _LENGTH_MM - half)
+    yield _ruler_text(middle, y - 1.7, words, halo=True)
     yield f'<path d="M{left:.2f} {y:g}H{right:.2f}" stroke="#111" stroke-width="{1.6 / (1 + 0.6 * row):.2f}"/>'
-    yield f'<path d="M{scale * q.median:.2f} {y - 1:g}v2" stroke="#111" stroke-width="0.7"/>'
+    yield f'<path d="M{scale * (q.median - start):.2f} {y - 1:g}v2" stroke="#111" stroke-width="0.7"/>'
 
 
-def _scale(end_mm: float, y: float) -> Iterator[str]:
-    longest = int(10 ** math.ceil(math.log10(end_mm / _MOST_TICKS))) if end_mm > _MOST_TICKS else 1
-    step = next((one for one in _STEPS_MM if end_mm / one <= _MOST_TICKS), longest)
+def _scale(start: float, end: float, y: float, unit: str) -> Iterator[str]:
+    span = end - start
+    longest = int(10 ** math.ceil(math.log10(span / _MOST_TICKS))) if span > _MOST_TICKS else 1
+    step = next((one for one in _STEPS if span / one <= _MOST_TICKS), longest)
     yield f'<path d="M0 {y:g}H{_LENGTH_MM:g}" stroke="#111" stroke-width="0.25"/>'
-    for tick in range(0, int(end_mm) + 1, step):
-        x = _LENGTH_MM * tick / end_mm
+    for tick in range(math.ceil(start / step) * step, int(end) + 1, step):
+        x = _LENGTH_MM * (tick - start) / span
         yield f'<path d="M{x:.2f} {y:g}v1" stroke="#111" stroke-width="0.25"/>'
-        yield _ruler_text(x, y + 4, f"{tick}")
-    yield _ruler_text(_LENGTH_MM - 1.5, y - 0.8, "mm")
+        yield _ruler_text(x, y + 4, f"{tick:+d}" if start < 0 and tick else f"{tick}")
+    yield _ruler_text(_LENGTH_MM - 1.5, y - 0.8, unit)
 
 
-def _ruler_text(x: float, y: float, text: str) -> str:
-    return f'<text x="{x:.2f}" y="{y:g}" text-anchor="middle" font-size="2.7">{html.escape(text)}</text>'
+def _ruler_text(x: float, y: float, text: str, *, halo: bool = False) -> str:
+    edge = ' stroke="#fff" stroke-width="0.8" paint-order="stroke"' if halo else ""
+    return f'<text x="{x:.2f}" y="{y:g}" text-anchor="middle" font-size="2.7"{edge}>{html.escape(text)}</text>'
 
 
 # --- Colours of a map, and pixels as PNG.
@@ -133,51 +141,6 @@ def _png(pixels: NDArray[np.uint8], *, colours: int) -> bytes:
     return out.getvalue()
 
 
-# --- A map as a small picture for a page of many: its values, and a ring where the lump was sized.
-
-LONGEST_PX: Final = 300
-_WIDEST_CELL_PX: Final = 3
-_THUMB_NO_DATA: Final = (235, 235, 235)
-_RING: Final = (255, 255, 255)
-# Shares of the cells that the colours' ends leave outside, and the least span between the ends, of the middle value.
-_ENDS: Final = (0.01, 0.995)
-_THUMB_LEAST_SPAN: Final = 0.2
-
-
-def thumbnail_png(tactile_map: TactileMap, report: EstimateReport) -> bytes | None:
-    """PNG of a map of up to `LONGEST_PX` pixels a side, oriented as every picture of a map; None without data.
-
-    Where its estimate has a size, an ellipse of that size is drawn.
-    """
-    if not tactile_map.covered.any():
-        return None
-    view = orientation_of(tactile_map)
-    values = view.screen(np.where(tactile_map.covered, tactile_map.mean, np.nan))
-    step = -(-max(values.shape) // LONGEST_PX)
-    values = values[::step, ::step]
-    scale = min(_WIDEST_CELL_PX, max(1, LONGEST_PX // max(values.shape)))
-    low, high = np.quantile(values[np.isfinite(values)], _ENDS) if np.isfinite(values).any() else (0.0, 1.0)
-    high = max(high, low + _THUMB_LEAST_SPAN * abs(low), low + 1e-12)
-    pixels = _coloured(values, (low, high), _THUMB_NO_DATA).repeat(scale, axis=0).repeat(scale, axis=1)
-    _draw_ring(pixels, tactile_map, view, report, px_per_cell=scale / step)
-    return _png(pixels, colours=64)
-
-
-def _draw_ring(
-    pixels: NDArray[np.uint8], tactile_map: TactileMap, view: Orientation, report: EstimateReport, *, px_per_cell: float
-) -> None:
-    """Draw the ellipse of the estimated size at the estimated place."""
-    if report.d_x_mm is None or report.d_y_mm is None or report.centre_mm is None:
-        return
-    angle_deg = 0.0 if report.angle_deg is None else report.angle_deg.median
-    axes_mm = report.d_x_mm.median, report.d_y_mm.median
-    outline = _outline(report.centre_mm.median, axes_mm, angle_deg, np.linspace(0.0, 2 * np.pi, 720))
-    places = np.array([view.place(tactile_map, place) for place in outline])
-    columns, rows = np.floor(places * px_per_cell).astype(int).T
-    inside = (rows >= 0) & (rows < pixels.shape[0]) & (columns >= 0) & (columns < pixels.shape[1])
-    pixels[rows[inside], columns[inside]] = _RING
-
-
 def _outline(
     centre_mm: tuple[float, float], axes_mm: tuple[float, float], angle_deg: float, t: FloatArray
 ) -> list[tuple[float, float]]:
@@ -188,7 +151,7 @@ def _outline(
     return list(zip(xs.tolist(), ys.tolist(), strict=True))
 
 
-# --- A map as inline SVG: its values, the size ellipse and its interval to scale, sides, nipple, scale bar.
+# --- A map as SVG: its values, the size ellipse and its interval to scale, sides, nipple, scale bar.
 
 MARGIN_MM: Final = 5.0  #: Round the map, for the names of its sides.
 _MOST_PIXELS: Final = 1200
@@ -196,7 +159,7 @@ _CELL_PX: Final = 4
 _STRIPES_PX: Final = 8
 _NO_DATA: Final = (222, 222, 222)
 # The colours' ends: shares of the well-read cells outside, the least span of the level, amplitudes shown of a lump.
-
+_ENDS: Final = (0.01, 0.995)
 _LEAST_SPAN: Final = 0.35
 _AMPLITUDES_SHOWN: Final = 1.25
 _POINTS: Final = 72
@@ -205,6 +168,11 @@ _LEAST_BAR_MM: Final = 8.0
 _BAR_MM: Final = 40.0
 _BAR_STEPS: Final = 40
 _BARBS: Final = ((0.87, 0.5), (0.87, -0.5))
+
+
+THUMB_SCALE: Final = 0.4  #: Of life size, of thumbnails.
+THUMB_ENDS: Final = (0.85, 1.45)  #: Values at the ends of their colours, in parts of the level beside the lump.
+_THUMB_ROOM_MM: Final = 48.0
 
 
 class Frame(Record, eq=False):
@@ -264,23 +232,49 @@ def colour_limits(exam: ExamMap) -> tuple[float, float]:
     return low, max(high, low + _LEAST_SPAN * abs(float(np.median(values))), low + 1e-9)
 
 
-def exam_picture(exam: ExamMap, frame: Frame, *, label: str, small: bool = False) -> str:
-    """Inline SVG of a map, one unit a mm on the page.
+def exam_picture(
+    exam: ExamMap, frame: Frame, *, label: str, small: bool = False, limits: tuple[float, float] | None = None
+) -> str:
+    """SVG of a map, one unit a mm on the page.
 
-    `label` is for those who cannot see it; a `small` one has only the values, the ellipse and the sides.
+    `label` is for those who cannot see it; a `small` one has only the values, the ellipse, the sides and a scale bar;
+    `limits`: values at the ends of the colours, by default those of `colour_limits`.
     """
     (width, height), margin = frame.size_mm, 0.5 if small else MARGIN_MM
     whole = f"{width + 2 * margin:.2f}", f"{height + 2 * margin:.2f}"
     parts = [
         f'<svg class="map" role="img" aria-label="{html.escape(label)}" viewBox="{-margin:g} {-margin:g} {whole[0]} '
         f'{whole[1]}" width="{whole[0]}mm" height="{whole[1]}mm">',
-        _cells(exam, frame),
+        _cells(frame, limits or colour_limits(exam), small=small),
         *_edges(frame, small=small),
         *(part for mass in exam.masses for part in _mass(mass, exam, frame, small=small)),
-        *(() if small else _marks(exam, frame)),
+        *_marks(exam, frame, small=small),
         "</svg>",
     ]
     return "".join(parts)
+
+
+def thumbnail_svg(exam: ExamMap, *, label: str) -> str:
+    """A map as a small SVG file, for a page of many: all to one scale, and in one range of colours.
+
+    A map that has no room at that scale is drawn smaller, as its scale bar shows.
+    """
+    width, height = Frame(_map_of(exam), 1.0).size_mm
+    scale = min(THUMB_SCALE, _THUMB_ROOM_MM / max(width, height))
+    drawn = exam_picture(exam, Frame(_map_of(exam), scale), label=label, small=True, limits=_shared_limits(exam))
+    first = '<svg xmlns="http://www.w3.org/2000/svg" font-family="sans-serif"'
+    return drawn.replace("<svg", first, 1).replace("<image ", '<image style="image-rendering:pixelated" ')
+
+
+def _shared_limits(exam: ExamMap) -> tuple[float, float]:
+    """Values at the ends of the colours of thumbnails: the same shares of the level beside the lump for every map."""
+    tactile_map, report = _map_of(exam), exam.report
+    values = tactile_map.mean[tactile_map.covered]
+    level = float(np.median(values)) if values.size else 1.0
+    if report.background is not None and report.max_size_mm is not None:
+        level = report.background.median
+    low, high = sorted(level * end for end in THUMB_ENDS)
+    return low, max(high, low + 1e-9)
 
 
 def small_pictures(maps: Sequence[ExamMap], *, room_mm: tuple[float, float]) -> list[str]:
@@ -296,23 +290,26 @@ def small_pictures(maps: Sequence[ExamMap], *, room_mm: tuple[float, float]) -> 
 
 def colour_bar(exam: ExamMap) -> str:
     """Inline SVG of the colours with the values at their ends."""
-    low, high = colour_limits(exam)
-    tactile_map = _map_of(exam)
+    limits, tactile_map = colour_limits(exam), _map_of(exam)
     covered = tactile_map.covered
-    more = " or more" if covered.any() and float(tactile_map.mean[covered].max()) > high else ""
+    more = covered.any() and float(tactile_map.mean[covered].max()) > limits[1]
+    return colour_steps(limits, tactile_map.recipe.value_words, more=bool(more))
+
+
+def colour_steps(limits: tuple[float, float], words: str, *, more: bool) -> str:
+    """Inline SVG of the colours, with the values at their ends and what they are of; `more`: some lie above."""
     steps = _coloured(np.linspace(0.0, 1.0, _BAR_STEPS)[None], (0.0, 1.0), _NO_DATA)[0]
     width = _BAR_MM / _BAR_STEPS  # plain boxes: not every printer of SVG knows gradients
     boxes = "".join(
         f'<rect x="{14 + width * i:g}" y="0.5" width="{width + 0.05:g}" height="3" fill="#{bytes(colour).hex()}"/>'
         for i, colour in enumerate(steps)
     )
-    words = html.escape(tactile_map.recipe.value_words)
     return (
         '<svg class="bar" role="img" aria-label="Colours of the map" viewBox="0 0 80 8.5" width="80mm" height="8.5mm">'
         f'{boxes}<rect x="14" y="0.5" width="{_BAR_MM:g}" height="3" fill="none" stroke="#333" stroke-width="0.15"/>'
-        f'<text x="13" y="3.2" text-anchor="end" font-size="3">{_value(low)}</text>'
-        f'<text x="55" y="3.2" font-size="3">{_value(high)}{more}</text>'
-        f'<text x="14" y="7.4" font-size="3">{words}</text></svg>'
+        f'<text x="13" y="3.2" text-anchor="end" font-size="3">{_value(limits[0])}</text>'
+        f'<text x="55" y="3.2" font-size="3">{_value(limits[1])}{" or more" if more else ""}</text>'
+        f'<text x="14" y="7.4" font-size="3">{html.escape(words)}</text></svg>'
     )
 
 
@@ -320,19 +317,32 @@ def _value(value: float) -> str:
     return f"{value:.2f}" if abs(value) < 100 else f"{value:.0f}"
 
 
-def _cells(exam: ExamMap, frame: Frame) -> str:
-    """The map's values as an embedded PNG; cells with few readings are striped, those without any are grey."""
+def _cells(frame: Frame, limits: tuple[float, float], *, small: bool) -> str:
+    """The map's values as an embedded PNG; cells without readings are grey, those with few striped, or grey too."""
     tactile_map, (width, height) = frame.tactile_map, frame.size_mm
-    values = frame.view.screen(np.where(tactile_map.covered, tactile_map.mean, np.nan))
+    shown = tactile_map.covered & ~tactile_map.few if small else tactile_map.covered
+    values = frame.view.screen(np.where(shown, tactile_map.mean, np.nan))
     step = -(-max(values.shape) // _MOST_PIXELS)
-    pixels = _coloured(values[::step, ::step], colour_limits(exam), _NO_DATA)
+    pixels = _coloured(values[::step, ::step], limits, _NO_DATA)
+    if small:
+        return _image(pixels, (width, height))
     times = max(1, min(_CELL_PX, _MOST_PIXELS // max(pixels.shape[:2])))
     pixels = pixels.repeat(times, axis=0).repeat(times, axis=1)
     few = frame.view.screen(tactile_map.few)[::step, ::step].repeat(times, axis=0).repeat(times, axis=1)
     rows, columns = np.indices(few.shape)
     pixels[few & ((rows + columns) % _STRIPES_PX < _STRIPES_PX // 4)] = 255
+    return _image(pixels, (width, height))
+
+
+def picture_of(values: FloatArray, limits: tuple[float, float], size_mm: tuple[float, float]) -> str:
+    """Values, as the rows of a picture, in colours; places without data are grey."""
+    return _image(_coloured(values, limits, _NO_DATA).repeat(_CELL_PX, axis=0).repeat(_CELL_PX, axis=1), size_mm)
+
+
+def _image(pixels: NDArray[np.uint8], size_mm: tuple[float, float]) -> str:
+    """Pixels as an embedded PNG with a frame."""
     data = base64.b64encode(_png(pixels, colours=128)).decode("ascii")
-    box = f'x="0" y="0" width="{width:.2f}" height="{height:.2f}"'
+    box = f'x="0" y="0" width="{size_mm[0]:.2f}" height="{size_mm[1]:.2f}"'
     return (
         f'<image {box} preserveAspectRatio="none" href="data:image/png;base64,{data}"/>'
         f'<rect {box} fill="none" stroke="#333" stroke-width="0.3"/>'
@@ -351,7 +361,7 @@ def _edges(frame: Frame, *, small: bool) -> Iterator[str]:
     for side, name in frame.view.edges.items():
         x, y = places[side]
         if small:
-            yield _text(x, y + 0.9, name, size=2.5)
+            yield outlined_text(x, y + 0.9, name, size=2.5)
             continue
         yield (
             f'<text class="edge" data-side="{side}" x="{x:.2f}" y="{y + 1.5:.2f}" text-anchor="middle" '
@@ -366,12 +376,12 @@ def _mass(mass: ExamMass, exam: ExamMap, frame: Frame, *, small: bool) -> Iterat
         ends = {"low": mass.largest.low, "high": mass.largest.high}
         for end, size in () if small else ends.items():
             outline = _ellipse(mass, size / mass.largest.median, frame)
-            yield _stroked(outline, 0.3, kind=f"size-{end}", dash="1.2 0.9")
-        yield _stroked(_ellipse(mass, 1.0, frame), 0.3 if small else 0.55, kind="size")
-    yield _stroked(f"M{x - arm:.2f} {y:.2f}h{2 * arm:g}M{x:.2f} {y - arm:.2f}v{2 * arm:g}", 0.25 * arm, kind="centre")
+            yield stroked(outline, 0.3, kind=f"size-{end}", dash="1.2 0.9")
+        yield stroked(_ellipse(mass, 1.0, frame), 0.3 if small else 0.55, kind="size")
+    yield stroked(f"M{x - arm:.2f} {y:.2f}h{2 * arm:g}M{x:.2f} {y - arm:.2f}v{2 * arm:g}", 0.25 * arm, kind="centre")
     if not small and len(exam.masses) > 1:
         above = 0.0 if mass.largest is None else frame.scale * mass.largest.high / 2
-        yield _text(x, y - above - 1.5, f"{mass.number}", size=4.2)
+        yield outlined_text(x, y - above - 1.5, f"{mass.number}", size=4.2)
 
 
 def _ellipse(mass: ExamMass, times: float, frame: Frame) -> str:
@@ -383,14 +393,14 @@ def _ellipse(mass: ExamMass, times: float, frame: Frame) -> str:
     return "M" + "L".join(f"{a:.2f} {b:.2f}" for a, b in places) + "Z"
 
 
-def _stroked(path: str, width: float, *, kind: str, dash: str = "") -> str:
+def stroked(path: str, width: float, *, kind: str, dash: str = "") -> str:
     """A white line with a black edge, visible on every colour and in grey."""
     dashed = f' stroke-dasharray="{dash}"' if dash else ""
     under = f'<path d="{path}" fill="none" stroke="#000" stroke-width="{width + min(0.5, width):g}"/>'
     return f'{under}<path class="{kind}" d="{path}" fill="none" stroke="#fff" stroke-width="{width:g}"{dashed}/>'
 
 
-def _text(x: float, y: float, text: str, *, size: float, anchor: str = "middle") -> str:
+def outlined_text(x: float, y: float, text: str, *, size: float, anchor: str = "middle") -> str:
     """White text with a black edge."""
     place = f'x="{x:.2f}" y="{y:.2f}" text-anchor="{anchor}" font-size="{size:g}" font-weight="600"'
     words = html.escape(text)
@@ -398,16 +408,23 @@ def _text(x: float, y: float, text: str, *, size: float, anchor: str = "middle")
     return f'{under}<text {place} fill="#fff">{words}</text>'
 
 
-def _marks(exam: ExamMap, frame: Frame) -> Iterator[str]:
-    """Scale bar, nipple, direction of the sternal notch, and the place that a reason for no size is about."""
+def _marks(exam: ExamMap, frame: Frame, *, small: bool) -> Iterator[str]:
+    """Scale bar, nipple, direction of the sternal notch, and the place that a reason for no size is about.
+
+    A small picture has the bar alone.
+    """
     width, height = frame.size_mm
-    length = next((one for one in _SCALE_BARS_MM if frame.scale * one >= _LEAST_BAR_MM), _SCALE_BARS_MM[-1])
-    yield _stroked(f"M4 {height - 4:.2f}h{frame.scale * length:.2f}", 0.9, kind="scale")
-    yield _text(4 + frame.scale * length / 2, height - 5.6, f"{length:g} mm", size=3.2)
+    least, inset, size = (3.0, 1.5, 2.2) if small else (_LEAST_BAR_MM, 4.0, 3.2)
+    length = next((one for one in _SCALE_BARS_MM if frame.scale * one >= least), _SCALE_BARS_MM[-1])
+    yield stroked(f"M{inset:g} {height - inset:.2f}h{frame.scale * length:.2f}", 0.28 * size, kind="scale")
+    middle = inset + frame.scale * length / 2
+    yield outlined_text(max(middle, 1.6 * size), height - inset - 0.5 * size, f"{length:g} mm", size=size)
+    if small:
+        return
     place = marked(exam)
     if place is not None:
         x, y = frame.at(place)
-        yield _stroked(f"M{x - 1.5:.2f} {y - 1.5:.2f}l3 3m0 -3l-3 3", 0.4, kind="meant")
+        yield stroked(f"M{x - 1.5:.2f} {y - 1.5:.2f}l3 3m0 -3l-3 3", 0.4, kind="meant")
     nipple = frame.tactile_map.nipple_mm
     if nipple is not None:
         yield from _nipple((float(nipple[0]), float(nipple[1])), frame)
@@ -417,16 +434,16 @@ def _marks(exam: ExamMap, frame: Frame) -> Iterator[str]:
         tip = (x + 7 * right, y - 7 * up)
         head = [(tip[0] - 2.2 * (right * c - up * s), tip[1] + 2.2 * (up * c + right * s)) for c, s in _BARBS]
         barbs = "".join(f"M{tip[0]:.2f} {tip[1]:.2f}L{a:.2f} {b:.2f}" for a, b in head)
-        yield _stroked(f"M{x:.2f} {y:.2f}L{tip[0]:.2f} {tip[1]:.2f}{barbs}", 0.5, kind="notch")
-        yield _text(x, y - 9.0, "to notch", size=3.0)
+        yield stroked(f"M{x:.2f} {y:.2f}L{tip[0]:.2f} {tip[1]:.2f}{barbs}", 0.5, kind="notch")
+        yield outlined_text(x, y - 9.0, "to notch", size=3.0)
 
 
 def _nipple(centre_mm: tuple[float, float], frame: Frame) -> Iterator[str]:
     """A ring at the nipple; where it lies off the map, a wedge at the edge that points to it."""
     (x, y), (width, height) = frame.at(centre_mm), frame.size_mm
     if 0 <= x <= width and 0 <= y <= height:
-        yield _stroked(_ring(x, y, 2.6) + _ring(x, y, 0.7), 0.45, kind="nipple")
-        yield _text(x, y + 6.2, "nipple", size=3.0)
+        yield stroked(_ring(x, y, 2.6) + _ring(x, y, 0.7), 0.45, kind="nipple")
+        yield outlined_text(x, y + 6.2, "nipple", size=3.0)
         return
     edge = (min(max(x, 2.5), width - 2.5), min(max(y, 2.5), height - 2.5))
     away = float(np.hypot(x - edge[0], y - edge[1]))
@@ -434,10 +451,10 @@ def _nipple(centre_mm: tuple[float, float], frame: Frame) -> Iterator[str]:
     tip = (edge[0] + 2 * right, edge[1] + 2 * down)
     base = [(edge[0] - 1.4 * s * down, edge[1] + 1.4 * s * right) for s in (1, -1)]
     corners = "L".join(f"{a:.2f} {b:.2f}" for a, b in (tip, *base))
-    yield _stroked(f"M{corners}Z", 0.45, kind="nipple-off")
+    yield stroked(f"M{corners}Z", 0.45, kind="nipple-off")
     anchor = "start" if right < -0.5 else "end" if right > 0.5 else "middle"
     words = f"nipple, {away / frame.scale:.0f} mm"
-    yield _text(edge[0] - 3.2 * right, edge[1] - 4.2 * down + 1.0, words, size=3.0, anchor=anchor)
+    yield outlined_text(edge[0] - 3.2 * right, edge[1] - 4.2 * down + 1.0, words, size=3.0, anchor=anchor)
 
 
 def _ring(x: float, y: float, radius: float) -> str:

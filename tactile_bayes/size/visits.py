@@ -406,8 +406,9 @@ def _drawn(mean: FloatArray, covariance: FloatArray, z: FloatArray, replicates: 
 
 
 class Trend(Record):
-    """Straight line of ln d over time: its slope and the slope's posterior SD."""
+    """Straight line of ln d over time: its level at the middle of the times, its slope and the slope's SD."""
 
+    level: float
     per_day: float
     sd: float
     departure: float | None
@@ -426,7 +427,7 @@ def straight_line(log_size: FloatArray, covariance: FloatArray, days: Sequence[f
     left = log_size - columns @ line
     square, dof = left @ np.linalg.solve(covariance, left), len(days) - 2
     departure = float(above_chi_square(square, dof)) if dof > 0 else None
-    return Trend(float(line[1]), float(np.sqrt(spread[1, 1])), departure)
+    return Trend(float(line[0]), float(line[1]), float(np.sqrt(spread[1, 1])), departure)
 
 
 def doubling_days(rate_per_day: float) -> float | None:

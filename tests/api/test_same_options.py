@@ -19,11 +19,11 @@ from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.exports.run import TAKES
 from tactile_bayes.options import PlanErrors
 from tactile_bayes.report import exam_page as exam_files
-from tactile_bayes.report import exam_page as printed
+from tactile_bayes.report import pages as printed
 
 DEMO = Path(tb.__file__).parent / "demo"
 FAST = {"method": "laplace"}
-BY_PYTHON = {"as_json": "document", "verbose": "full_text", "figure": "plot"}
+BY_PYTHON = {"as_json": "document", "verbose": "full_text", "figure": "plot", "output": "page"}
 """Options of the command line that are members of what Python returns."""
 FIGURES = ("trace", "rank", "corner")
 """Options of `diagnose` that are kinds of its plots."""
@@ -44,7 +44,7 @@ def test_every_option_of_export_is_a_keyword() -> None:
 
 
 def test_every_option_of_compare_is_a_keyword_or_a_member() -> None:
-    missing = options("compare") - keywords(tb.compare) - keywords(tb.estimate)
+    missing = options("compare") - keywords(tb.compare) - keywords(tb.estimate) - keywords(tb.Comparison.page)
     assert missing - {"later", "force"} == set(BY_PYTHON)
     for member in BY_PYTHON.values():
         assert hasattr(tb.Comparison, member)

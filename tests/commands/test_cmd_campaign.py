@@ -44,7 +44,7 @@ from tactile_bayes.files.tables import read_table
 
 Run = Callable[..., "subprocess.CompletedProcess[str]"]
 SIZED = ("07.v1.m1.r1", "07.v1.m1.r2", "09.v1.m1.r1")
-STEPS_OF_ALL = 4 + 4 + 3
+STEPS_OF_ALL = 4 + 4 + 4 + 3
 """Maps and estimates of the exams that are sound, and masses."""
 
 
@@ -186,7 +186,7 @@ def test_a_table_from_windows_is_read(finished: Path) -> None:
     before = contents(finished / "out")
     table = finished / "exams.csv"
     table.write_bytes(b"\xef\xbb\xbf" + table.read_bytes().replace(b"\n", b"\r\n") + b",,,,,\r\n\r\n")
-    assert "2 steps run, 11 kept" in campaign(finished).stdout
+    assert f"2 steps run, {STEPS_OF_ALL} kept" in campaign(finished).stdout
     assert contents(finished / "out") == before
 
 
@@ -250,7 +250,7 @@ def test_python_runs_what_the_command_runs(own: Path, monkeypatch: pytest.Monkey
     tb.campaign("exams.csv", "out", method="laplace")
     done = run_here(*words, "--excision", "excision.csv", cwd=own)
     found = tb.campaign("exams.csv", Path("out"), excision="excision.csv", method="laplace")
-    assert "1 steps run, 2 kept" in found.text
+    assert "1 steps run, 3 kept" in found.text
     assert found.text == done.stdout
     assert [f"failed: {line}" for line in found.failed] == done.stderr.splitlines()
     assert repr(found) == "<CampaignResult of 2 exams: 1 sized, 0 without a size, 1 failed>"
@@ -487,14 +487,20 @@ def test_a_changed_scan_redoes_what_depends_on_it(finished: Path) -> None:
     count = len(steps(finished / "out"))
     write(finished / "scans" / "09-a.mcap", thinned(1, 4, subject="09", side="right"))
     campaign(finished)
-    assert steps(finished / "out")[count:] == ["map 09.v1.m1.r1", "estimate 09.v1.m1.r1", "pool 09.v1.m1"]
+    assert steps(finished / "out")[count:] == [
+        "map 09.v1.m1.r1",
+        "estimate 09.v1.m1.r1",
+        "page 09.v1.m1.r1",
+        "pool 09.v1.m1",
+    ]
 
 
 def test_a_changed_setting_redoes_estimates_and_no_map(finished: Path) -> None:
     write_table(finished / "exams.csv", ROWS[:2])
     count = len(steps(finished / "out"))
     campaign(finished, "--seed", 2)
-    assert steps(finished / "out")[count:] == ["estimate 07.v1.m1.r1", "estimate 07.v1.m1.r2", "pool 07.v1.m1"]
+    redone = [f"{step} 07.v1.m1.r{exam}" for step in ("estimate", "page") for exam in (1, 2)]
+    assert steps(finished / "out")[count:] == [*redone, "pool 07.v1.m1"]
     run_here("campaign", "run", "exams.csv", "-o", "fresh", *FAST, "--seed", 2, cwd=finished)
     there = {
         name: data for name, data in contents(finished / "out").items() if "/09." not in name and "/11." not in name
@@ -539,7 +545,7 @@ def test_a_dry_run_says_what_it_would_do_and_writes_nothing(finished: Path) -> N
     before = contents(finished / "out")
     done = campaign(finished, "--seed", 2, "--dry-run")
     failed = "(07.v1.m1.r3, 12.v1.m1.r1)"
-    assert f"map: 2 to do {failed}, 4 done\nestimate: 6 to do, 0 done\npool: 4 to do, 0 done\n" in done.stdout
+    assert f"map: 2 to do {failed}, 4 done\nestimate: 6 to do, 0 done\npage: 6 to do, 0 done\npool: 4" in done.stdout
     assert contents(finished / "out") == before
     fresh = run_here("campaign", "run", "exams.csv", "-o", "new", "--dry-run", cwd=finished)
     assert "map: 6 to do, 0 done" in fresh.stdout

@@ -95,7 +95,7 @@ def test_a_size_by_it_is_that_of_an_estimate_from_the_map(study: Path) -> None:
 
 def test_a_second_run_does_nothing_again(own: Path) -> None:
     before = contents(own / "out")
-    assert "0 steps run, 36 kept from earlier runs" in campaign(own).stdout
+    assert "0 steps run, 46 kept from earlier runs" in campaign(own).stdout
     assert contents(own / "out") == before
 
 
@@ -129,10 +129,11 @@ def test_a_changed_exam_redoes_sizes_and_fits_no_other_map(own: Path, monkeypatc
         "estimate 03.v1.m1.r2",
         "repeatability site",
         *sizes,
+        *(one.replace("size", "page") for one in sizes),
         *(f"pool {mass}.v1.m1" for mass in MASSES),
     ]
-    assert told[-1] == (18, 18)
-    assert (2, 18) in told  # sizes are counted before the spread is learned
+    assert told[-1] == (28, 28)
+    assert (2, 28) in told  # sizes are counted before the spread is learned
 
 
 @pytest.mark.slow
@@ -172,10 +173,16 @@ def test_fewer_than_five_masses_with_repeats_do_not_teach_it(own: Path) -> None:
 def test_a_dry_run_knows_the_steps(own: Path) -> None:
     words = ("campaign", "run", "exams.csv", "-o", "out", *FAST, "--dry-run")
     told = run_here(*words, cwd=own).stdout
-    assert "repeatability: 0 to do, 1 done\nsize: 0 to do, 10 done\npool: 0 to do, 5 done\n" in told
+    assert (
+        "repeatability: 0 to do, 1 done\nsize: 0 to do, 10 done\npage: 0 to do, 10 done\npool: 0 to do, 5 done\n"
+        in told
+    )
     write(own / "scans" / "03-2.mcap", thinned(2, 6, subject="03", side="left"))
     told = run_here(*words, cwd=own).stdout
-    assert "repeatability: 1 to do, 0 done\nsize: 10 to do, 0 done\npool: 5 to do, 0 done\n" in told
+    assert (
+        "repeatability: 1 to do, 0 done\nsize: 10 to do, 0 done\npage: 10 to do, 0 done\npool: 5 to do, 0 done\n"
+        in told
+    )
 
 
 def first_alone(draw: Callable[..., object]) -> Callable[..., None]:

@@ -90,8 +90,11 @@ def test_growth_is_compared_by_itself_and_stands_beside_the_report(done: tuple[P
     assert [*table[0]] == [one["name"] for one in load_schema("growth.table.json")["fields"]]
     for page in ("index.html", "report.html"):
         text = (out / page).read_text()
-        assert "<h2>Growth between visits</h2>" in text
-        assert 'href="growth/P1.m1/compare.json"' in text
+        assert "no change shown" in text
+        assert 'href="growth/P1.m1/growth.html"' in text
+    growth = (out / "growth" / "P1.m1" / "growth.html").read_text()
+    assert '<p class="finding">The mass has grown.</p>' in growth
+    assert "Visit 2, 2026-04-10" in growth
 
 
 def test_growth_is_what_compare_gives_of_the_maps(done: tuple[Path, str], maps: Path) -> None:
@@ -109,7 +112,7 @@ def test_a_second_run_does_nothing_and_another_date_compares_again(done: tuple[P
     again = campaign(maps, rows(), "--excision", "ex.csv").stdout
     assert "0 steps run" in again
     later = campaign(maps, rows(dates=("2026-01-10", "2026-04-11")), "--excision", "ex.csv").stdout
-    assert "2 steps run" in later
+    assert "6 steps run" in later  # the pages of the exams at that date too
     assert "compare run: P1.m1, P2.m1" in later
 
 

@@ -18,7 +18,7 @@ from tactile_bayes.commands import estimate as command
 from tactile_bayes.declarations import replace
 from tactile_bayes.files.map_nc import read_map, write_map
 from tactile_bayes.files.provenance import Provenance
-from tactile_bayes.report import exam_page as printed
+from tactile_bayes.report import pages as printed
 
 DEMO = Path(__file__).resolve().parents[2] / "tactile_bayes" / "demo" / "scan.mcap"
 
@@ -191,9 +191,7 @@ def test_a_browser_that_fails_is_one_line(folder: Path, monkeypatch: pytest.Monk
 
 
 def test_the_printed_file_is_private_too(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        "tactile_bayes.report.exam_page.find_printer", lambda: lambda page: b"%PDF-" + page[:9].encode()
-    )
+    monkeypatch.setattr("tactile_bayes.report.pages.find_printer", lambda: lambda page: b"%PDF-" + page[:9].encode())
     assert run_here("report", "a.nc", "-o", "p.html", "--pdf", "p.pdf", cwd=folder).returncode == 0
     assert (folder / "p.pdf").read_bytes() == b"%PDF-<!doctype"
     assert (folder / "p.pdf").stat().st_mode & 0o777 == 0o600

@@ -66,6 +66,7 @@ def client(out: Path, exams: int) -> None:
             (campaigns, "unchanged", lambda *_: True),
             (campaign_tables, "read_record", lambda _path, kind: read_record(estimate, kind)),
             (campaign_tables, "pooled_reports", lambda _campaign: {}),
+            (campaign_report, "pooled_reports", lambda _campaign: {}),
         ):
             stack.enter_context(mock.patch.object(module, name, fake))
         folder = Path(place) / "out"
@@ -75,7 +76,7 @@ def client(out: Path, exams: int) -> None:
                 run.run()
         size = (folder / JOURNAL).stat().st_size
         print(f"journal: {size / 1e6:.1f} MB, {size / exams:.0f} bytes each")
-        with measured("tables and contact sheet", exams), open_campaign(folder) as store:
+        with measured("tables and index", exams), open_campaign(folder) as store:
             run = campaigns.Campaign(table, folder, CampaignSettings(own_repeatability=False), store=store)
             run.run()
             stack.enter_context(mock.patch.object(campaign_report, "_MOST_INLINE", 0))

@@ -59,7 +59,7 @@ def test_a_full_disk_leaves_the_old_files_and_no_new_one(tmp_path: Path, full_di
 def test_a_command_of_two_files_writes_both_or_none(
     tmp_path: Path, full_disk: list[str], monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...], refused: str
 ) -> None:
-    monkeypatch.setattr("tactile_bayes.report.exam_page.find_printer", lambda: str.encode)
+    monkeypatch.setattr("tactile_bayes.report.pages.find_printer", lambda: str.encode)
     (tmp_path / "exam.json").write_text(json.dumps(estimate_document()))
     full_disk.append(refused)
     done = run_here(*words, cwd=tmp_path)

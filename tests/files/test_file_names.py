@@ -14,7 +14,7 @@ import tactile_bayes as tb
 from tactile_bayes.errors import UsageError
 from tactile_bayes.exports.run import Outputs
 from tactile_bayes.files.atomic import Format, check_suffix, given_twice, same_file
-from tactile_bayes.report.exam_page import PageFiles
+from tactile_bayes.report.pages import PageFiles
 
 NAMES: dict[str, Callable[[Path, Path], object]] = {
     "a symbolic link": lambda name, file: name.symlink_to(file),
@@ -47,7 +47,7 @@ def test_a_file_that_does_not_exist_is_known_by_its_name(tmp_path: Path, monkeyp
 def test_two_outputs_of_one_file_are_refused_in_every_command(
     kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("tactile_bayes.report.exam_page.find_printer", lambda: str.encode)
+    monkeypatch.setattr("tactile_bayes.report.pages.find_printer", lambda: str.encode)
     (tmp_path / "one").write_text("old")
     NAMES[kind](tmp_path / "two", tmp_path / "one")
     with pytest.raises(UsageError, match="records and dictionary"):

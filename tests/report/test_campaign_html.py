@@ -1,25 +1,42 @@
-"""The contact sheet: self-contained, every text escaped, worst first, with a script that may run and no other."""
+"""The index of a campaign: self-contained, every text escaped, worst first, with a script that may run and no other."""
 
 from __future__ import annotations
 
 import base64
 import hashlib
+import io
 import re
+import xml.etree.ElementTree as ET
 from html.parser import HTMLParser
 
 import numpy as np
 import pytest
+from PIL import Image
 from plain_reports import estimate_report
 from posterior_maps import bump_map
 
 from tactile_bayes.declarations import replace
-from tactile_bayes.files.reports import Point
-from tactile_bayes.findings import Finding
+from tactile_bayes.files.reports import EstimateReport, Point
+from tactile_bayes.findings import Finding, finding_lines
 from tactile_bayes.inference.draws import Quantity
+from tactile_bayes.mapping.map import MapRecipe, TactileMap
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.report.pages import FAILED, SIZED, UNSIZED, Card, campaign_html, worst
-from tactile_bayes.report.svg import LONGEST_PX, thumbnail_png
+from tactile_bayes.report.campaign_page import (
+    FAILED,
+    SIZED,
+    UNSIZED,
+    WORST_FIRST,
+    ExamEntry,
+    MassRow,
+    VisitEntry,
+    campaign_html,
+    worst,
+)
+from tactile_bayes.report.compare import Growth
+from tactile_bayes.report.exam_words import exam_map
+from tactile_bayes.report.svg import THUMB_SCALE, thumbnail_svg
 
+SVG = "{http://www.w3.org/2000/svg}"
 HOSTILE = "\"><img src=x onerror=alert(1)><script>alert(2)</script>'&lt; </p></article></main>"
 SIZE = Quantity(median=14.0, mean=14.0, sd=1.4, low=12.0, high=17.5, probability=0.95, kind="eti")
 NO_SIZE = estimate_report()
@@ -44,20 +61,30 @@ class Tags(HTMLParser):
         return sum(tag == name for tag, _ in self.tags)
 
 
-def page_of(*cards: Card) -> str:
-    return campaign_html(cards, lines=["3 exams."], links={"trial.csv": "trial.csv"}, version="1")
+def page_of(*rows: MassRow) -> str:
+    return campaign_html(rows, lines=["3 exams."], links={"trial.csv": "trial.csv"}, version="1")
 
 
 def told(text: str) -> tuple[Finding, ...]:
     return (Finding("side", text, about=text), Finding("few_strokes", text, on_paper=text))
 
 
-def card_of(text: str) -> Card:
-    return Card(text, UNSIZED, (text,), text, None, told(text), b"png", {text: text})
+def row_of(text: str) -> MassRow:
+    exam = ExamEntry(text, UNSIZED, text, None, told(text), b"<svg/>", text, {text: text})
+    grown = Growth(text, text, text, text, "failed", text, link=text)
+    return MassRow(text, text, (VisitEntry(text, (exam,), why=text),), text, grown)
+
+
+def mass(name: str, *exams: ExamEntry, size: Quantity | None = None) -> MassRow:
+    return MassRow(name, "1", (VisitEntry("1", exams, size),))
+
+
+def sized(size: Quantity, *findings: Finding) -> ExamEntry:
+    return ExamEntry("visit 1, exam 1", SIZED, size=size, findings=findings)
 
 
 def test_hostile_texts_add_no_tag_and_no_attribute() -> None:
-    plain, hostile = Tags(page_of(card_of("plain"))), Tags(page_of(card_of(HOSTILE)))
+    plain, hostile = Tags(page_of(row_of("plain"))), Tags(page_of(row_of(HOSTILE)))
     assert [tag for tag, _ in hostile.tags] == [tag for tag, _ in plain.tags]
     assert [set(attrs) for _, attrs in hostile.tags] == [set(attrs) for _, attrs in plain.tags]
     assert hostile.ends == plain.ends
@@ -65,12 +92,12 @@ def test_hostile_texts_add_no_tag_and_no_attribute() -> None:
 
 
 def test_a_text_that_is_not_escaped_would_be_found() -> None:
-    page = page_of(card_of("plain")).replace("plain", HOSTILE, 1)
-    assert [tag for tag, _ in Tags(page).tags] != [tag for tag, _ in Tags(page_of(card_of("plain"))).tags]
+    page = page_of(row_of("plain")).replace("plain", HOSTILE, 1)
+    assert [tag for tag, _ in Tags(page).tags] != [tag for tag, _ in Tags(page_of(row_of("plain"))).tags]
 
 
 def test_the_page_loads_nothing_and_runs_its_own_script_alone() -> None:
-    page = page_of(card_of("one"))
+    page = page_of(row_of("one"))
     found = Tags(page)
     policy = next(attrs["content"] for tag, attrs in found.tags if attrs.get("http-equiv") == "Content-Security-Policy")
     assert policy is not None
@@ -85,71 +112,97 @@ def test_the_page_loads_nothing_and_runs_its_own_script_alone() -> None:
     assert RESEARCH_USE in page
 
 
-def test_the_worst_come_first() -> None:
-    cards = [
-        Card("narrow", SIZED, size=replace(SIZE, low=13.5, high=14.5)),
-        Card("wide", SIZED, size=SIZE),
-        Card("checked", SIZED, size=SIZE, findings=(Finding("few_strokes", "a"), Finding("curved_skin", "b"))),
-        Card("doubtful", SIZED, size=SIZE, findings=(Finding("side", "a"),)),
-        Card("empty", UNSIZED, reason="no lump"),
-        Card("lost", FAILED, reason="map failed: damaged"),
+def test_the_worst_come_first_as_the_page_says() -> None:
+    failed, narrow = ExamEntry("visit 1, exam 2", FAILED, "map failed"), replace(SIZE, low=13.5, high=14.5)
+    rows = [
+        mass("narrow", sized(narrow), size=narrow),
+        mass("wide", sized(SIZE), size=SIZE),
+        mass("checked", sized(SIZE, Finding("few_strokes", "a"), Finding("curved_skin", "b")), size=SIZE),
+        mass("doubtful", sized(SIZE, Finding("side", "a")), size=SIZE),
+        mass("one lost", sized(narrow), failed, size=narrow),
+        mass("empty", ExamEntry("visit 1, exam 1", UNSIZED, "no lump")),
+        mass("lost", failed),
     ]
-    names = [card.name for card in worst(cards, 10)]
-    assert names == ["lost", "empty", "doubtful", "checked", "wide", "narrow"]
+    names = [row.patient for row in worst(rows, 10)]
+    assert names == ["lost", "empty", "one lost", "doubtful", "checked", "wide", "narrow"]
+    assert WORST_FIRST in page_of(*rows)
 
 
-def test_each_exam_can_be_filtered_by_its_status_and_its_flags() -> None:
+def test_a_mass_is_of_its_last_visit_and_names_the_exams_that_a_finding_is_of() -> None:
+    doubt = Finding("side", "words")
+    visits = (
+        VisitEntry("1", (sized(SIZE, doubt),), SIZE),
+        VisitEntry("2", (ExamEntry("visit 2, exam 1", UNSIZED, "no lump"),), why="no lump"),
+    )
+    row = MassRow("P", "1", visits)
+    assert (row.status, row.last.size) == (UNSIZED, None)
+    assert [text for _, text in row.told] == [f"{finding_lines((doubt,), paper=True)[0]} (visit 1, exam 1)"]
+
+
+def test_each_mass_can_be_filtered_and_put_in_order() -> None:
     page = page_of(
-        Card("a", FAILED, reason="x"), Card("b", SIZED, size=SIZE, findings=(Finding("few_strokes", "look"),))
+        mass("a", ExamEntry("visit 1, exam 1", UNSIZED, "x")),
+        mass("b", sized(SIZE, Finding("few_strokes", "look")), size=SIZE),
     )
-    found = {attrs["data-status"]: attrs["data-flagged"] for tag, attrs in Tags(page).tags if tag == "article"}
-    assert found == {FAILED: "no", SIZED: "yes"}
+    found = {attrs["data-status"]: attrs["data-flagged"] for tag, attrs in Tags(page).tags if "data-status" in attrs}
+    assert found == {UNSIZED: "no", SIZED: "yes"}
     options = [attrs["value"] for tag, attrs in Tags(page).tags if tag == "option"]
-    assert options == ["", FAILED, UNSIZED, SIZED]
-    assert "<form hidden>" in page  # shown by the script: without one every exam is shown
+    assert options == ["", FAILED, UNSIZED, SIZED, "worst", "patient", "size", "width"]  # no change with one visit
+    keys = [key for key in options[4:] if f"data-{key}=" not in page]
+    assert keys == []
+    assert "<form hidden>" in page  # shown by the script: without one every mass is shown
 
 
-@pytest.mark.parametrize("shape", [(40, 60), (900, 300)])
-def test_a_thumbnail_is_small_whatever_the_map(shape: tuple[int, int]) -> None:
-    import io
+def shown(tactile_map: TactileMap, report: EstimateReport = NO_SIZE) -> ET.Element:
+    text = thumbnail_svg(exam_map(tactile_map, report, side=""), label="Map")
+    assert text == thumbnail_svg(exam_map(tactile_map, report, side=""), label="Map")
+    return ET.fromstring(text)
 
-    from PIL import Image
 
-    from tactile_bayes.mapping.map import MapRecipe, TactileMap
-
+def grid(shape: tuple[int, int], values: np.ndarray | float = 1.0) -> TactileMap:
     ny, nx = shape
-    values = 1.0 + 0.01 * np.random.default_rng(1).standard_normal(shape)
-    tactile_map = TactileMap(
-        values,
-        np.ones(shape),
-        np.full(shape, 9),
-        np.arange(nx, dtype=float),
-        np.arange(ny, dtype=float),
-        MapRecipe("grid", "gain", 1.0),
-    )
-    png = thumbnail_png(tactile_map, NO_SIZE)
-    assert png is not None
-    width, height = Image.open(io.BytesIO(png)).size
-    assert LONGEST_PX / 2 < max(width, height) <= LONGEST_PX
-    assert png == thumbnail_png(tactile_map, NO_SIZE)
+    x, y = np.arange(nx, dtype=float), np.arange(ny, dtype=float)
+    ones = np.ones(shape)
+    return TactileMap(values * ones, ones, np.full(shape, 99), x, y, MapRecipe("grid", "gain", 1.0))
+
+
+@pytest.mark.parametrize(("shape", "scale"), [((40, 60), THUMB_SCALE), ((900, 300), 48 / 900)])
+def test_thumbnails_are_to_one_scale_where_there_is_room_and_have_a_bar(shape: tuple[int, int], scale: float) -> None:
+    picture = shown(grid(shape))
+    width, height = (float(one) for one in picture.get("viewBox", "").split()[2:])
+    assert (width - 1, height - 1) == pytest.approx((scale * shape[1], scale * shape[0]), abs=0.02)
+    bar = next(one.get("d", "") for one in picture.iter(f"{SVG}path") if one.get("class") == "scale")
+    label = next(one.text for one in picture.iter(f"{SVG}text") if (one.text or "").endswith(" mm"))
+    assert float(bar.split("h")[1]) == pytest.approx(scale * float(label.split()[0]), rel=0.01)
+
+
+def pixels_of(picture: ET.Element) -> np.ndarray:
+    data = next(picture.iter(f"{SVG}image")).get("href", "").split(",", 1)[1]
+    return np.asarray(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB")).astype(int)
+
+
+def test_a_value_has_one_colour_on_every_thumbnail() -> None:
+    """A cell 20 % above the level, on a map that is else flat and on one with a cell four times as high."""
+    values = np.ones((20, 20))
+    values[4, 4] = 1.2
+    high = values.copy()
+    high[15, 15] = 4.0
+    one, other = (pixels_of(shown(grid((20, 20), v)))[4, 4] for v in (values, high))
+    assert one == pytest.approx(other, abs=3)
+    flat = pixels_of(shown(grid((20, 20), 1.0)))[4, 4]
+    assert np.abs(one - flat).max() > 20
 
 
 def test_the_ring_lies_about_the_lump() -> None:
-    """The lump of `bump_map` is the brightest cell; the ring is white and its middle is there."""
-    import io
-
-    from PIL import Image
-
+    """The lump of `bump_map` is the brightest cell; the ring's middle is there, and it is as large as the size."""
     tactile_map = bump_map(noise=np.zeros((51, 51)), amplitude=0.3, sigma_x=4.0, sigma_y=4.0)
     row, column = np.unravel_index(np.nanargmax(tactile_map.mean), tactile_map.mean.shape)
-    centre = [replace(SIZE, median=float(at)) for at in (tactile_map.x_mm[column], tactile_map.y_mm[row])]
+    centre = [replace(SIZE, median=float(at), sd=0.1) for at in (tactile_map.x_mm[column], tactile_map.y_mm[row])]
     across, along = (replace(SIZE, median=value) for value in (12.0, 8.0))
-    png = thumbnail_png(tactile_map, replace(NO_SIZE, centre_mm=Point(*centre), d_x_mm=across, d_y_mm=along))
-    assert png is not None
-    pixels = np.asarray(Image.open(io.BytesIO(png)).convert("RGB")).astype(int)
-    scale = pixels.shape[0] / tactile_map.mean.shape[0]
-    ring = np.argwhere((pixels == 255).all(axis=-1))
-    brightest = np.argwhere((pixels[..., 0] > 240) & (pixels[..., 2] < 60)).mean(axis=0)
-    assert np.abs(ring.mean(axis=0) - brightest).max() < scale
-    assert np.ptp(ring[:, 1]) / scale == pytest.approx(12.0 / tactile_map.recipe.cell_mm, abs=1.0)
-    assert np.ptp(ring[:, 0]) / scale == pytest.approx(8.0 / tactile_map.recipe.cell_mm, abs=1.0)
+    report = replace(NO_SIZE, centre_mm=Point(*centre), d_x_mm=across, d_y_mm=along, max_size_mm=SIZE, min_size_mm=SIZE)
+    picture = shown(tactile_map, report)
+    path = next(one.get("d", "") for one in picture.iter(f"{SVG}path") if one.get("class") == "size")
+    points = np.array([[float(n) for n in pair.split()] for pair in path.strip("MZ").split("L")])
+    assert np.ptp(points, axis=0) == pytest.approx(THUMB_SCALE * np.array([12.0, 8.0]), rel=0.02)
+    bright = np.argwhere(pixels_of(picture)[..., 0] == pixels_of(picture)[..., 0].max()).mean(axis=0)[::-1]
+    assert points.mean(axis=0) == pytest.approx(THUMB_SCALE * (bright + 0.5), abs=THUMB_SCALE)

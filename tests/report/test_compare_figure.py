@@ -1,21 +1,35 @@
-"""The figure of a comparison shows every visit on the patient's axes, however the head was held."""
+"""The figure and the page of a comparison show every visit on the patient's axes, however the head was held."""
 
 from __future__ import annotations
 
+import base64
+import html
+import io
+import re
+from pathlib import Path
+
 import numpy as np
 import pytest
+from PIL import Image
 from plain_reports import compare_report
-from posterior_maps import bump_values, grid_map
+from posterior_maps import bump_map, bump_values, grid_map
 
+import tactile_bayes as tb
+from tactile_bayes.api.maps import Map
+from tactile_bayes.api.sized import SizeEstimate
 from tactile_bayes.declarations import replace
+from tactile_bayes.files.comparison import Visit
 from tactile_bayes.geometry import rigid
-from tactile_bayes.report.estimate_figures import DrawnMap, draw_comparison
+from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.report.estimate_figures import draw_comparison
+from tactile_bayes.report.growth_page import Course, DrawnMap, growth_page
 from tactile_bayes.size.visits import Compared
 
 PLACE = np.array([60.0, 90.0])
 BESIDE = np.array([12.0, 6.0])
 """From the mass to a second bump, in the patient's frame: to the patient's right, and up."""
-REFUSED = compare_report(reason="a test")
+VISITS = tuple(Visit(number, day, None, None, ()) for number, day in ((1, None), (2, 90.0)))
+REFUSED = compare_report(reason="a test", visits=VISITS)
 
 
 def visit(angle_rad: float, *, height: float, landmarks: bool = True) -> DrawnMap:
@@ -96,10 +110,107 @@ def test_every_panel_names_the_patients_sides_and_counts_mm_from_the_xiphoid() -
     assert [text.get_text() for text in plane.texts] == ["+x", "-x", "+y", "-y"]
 
 
-def test_the_figure_is_titled_by_its_scans_and_both_colour_bars_say_what_they_are_of() -> None:
-    scans = [{"sha256": "ab" * 32, "subject": "P07"}, {"sha256": "cd" * 32, "subject": "P07"}]
-    figure, _ = panels(visit(0.0, height=0.4), visit(0.5, height=0.6), provenance={"scans": scans})
-    assert figure.get_suptitle() == "Comparison: P07, scans abababab, cdcdcdcd"
+def test_the_figure_is_titled_by_what_its_scans_say_and_both_colour_bars_say_what_they_are_of() -> None:
+    scans = [
+        {"sha256": "ab" * 32, "subject": "P07", "visit": "a"},
+        {"sha256": "cd" * 32, "subject": "P07", "visit": "b"},
+    ]
+    figure, found = panels(visit(0.0, height=0.4), visit(0.5, height=0.6), provenance={"scans": scans})
+    assert figure.get_suptitle() == "Comparison: P07, visits a and b"
+    assert [axes.get_title(loc="left") for axes in found] == ["Visit 1", "Visit 2, day 90", "Last minus first"]
     bars = [axes.get_ylabel() for axes in figure.axes if axes.get_label() == "<colorbar>"]
     words = visit(0.0, height=0.4).tactile_map.recipe.value_words
     assert bars == [words, f"difference of {words}"]
+
+
+# --- The page.
+
+
+def grown(times: float) -> tuple[SizeEstimate, SizeEstimate, SizeEstimate]:
+    """Estimates of three visits of a lump that grows so much each time, the head turned at the later ones."""
+    found = []
+    for number, angle in enumerate((0.0, 0.6, -0.4)):
+        c, s = np.cos(angle), np.sin(angle)
+        frame = np.eye(3)
+        frame[:2, :2] = [[c, -s], [s, c]]
+        noise = 0.01 * np.random.default_rng(number).standard_normal((51, 51))
+        sigma = 3.5 * times**number
+        made = bump_map(noise=noise, amplitude=0.3, x=0.0, y=0.0, sigma_x=sigma, sigma_y=sigma)
+        there = replace(made, patient_from_plane=rigid(frame, np.array([*PLACE, 0.0])))
+        scans = ({"subject": "P07", "side": "right", "visit": f"v{number + 1}", "sha256": f"{number:064x}"},)
+        found.append(tb.estimate(Map(there, scans=scans), method="laplace"))
+    return found[0], found[1], found[2]
+
+
+@pytest.fixture(scope="module")
+def three() -> tb.Comparison:
+    return tb.compare(*grown(1.25), dates=["2026-01-10", "2026-04-12", "2026-07-20"], method="laplace")
+
+
+def paths_of(page: str, kind: str) -> list[np.ndarray]:
+    found = re.findall(rf'<path class="{kind}" d="M([^"]*?)Z?"', page)
+    return [np.array([[float(n) for n in pair.split()] for pair in one.split("L")]) for one in found]
+
+
+def test_the_page_has_a_ring_as_large_as_each_size_and_the_texts_verdict(three: tb.Comparison, tmp_path: Path) -> None:
+    three.page(tmp_path / "growth.html")
+    page = (tmp_path / "growth.html").read_text()
+    words = html.unescape(re.sub(r"<style>.*?</style>|<[^>]*>", " ", page, flags=re.DOTALL))
+    words = " ".join(words.split())
+    assert three.growth == "grown"
+    assert "The mass has grown." in three.text
+    assert "The mass has grown." in words
+    for told in ("Patient P07", "Side right", "Visit v1, 2026-01-10", "Visit v3, 2026-07-20", RESEARCH_USE):
+        assert told in words
+    for line in three.text.splitlines():
+        if line.startswith(("Change", "Probability", "Trend", "If exams")):
+            assert line in words
+    rings = [2.0 * float(np.hypot(*(one - one.mean(axis=0)).T).max()) for one in paths_of(page, "size")]
+    sizes = [one.max_size_mm.median for one in three.report.visits]
+    assert rings == pytest.approx([0.7 * size for size in sizes], rel=0.03)
+    assert len(re.findall("<image ", page)) == 3
+    digests = [one["sha256"] for one in three.report.provenance["scans"]]
+    assert not any(digest[:8] in page.partition("<h2>")[0] for digest in digests)
+
+
+def test_the_trend_is_drawn_through_the_sizes(three: tb.Comparison) -> None:
+    page = three.page_text(title="", name="")
+    (line,) = paths_of(page, "trend")
+    dots = np.array([[float(x), float(y)] for x, y in re.findall(r'<circle cx="([\d.]+)" cy="([\d.]+)"', page)])
+    assert line[:, 0] == pytest.approx(dots[:, 0])
+    assert np.abs(line[:, 1] - dots[:, 1]).max() < 2.0  # of 46 mm: the three sizes grow evenly
+    assert line[0, 1] > line[-1, 1]
+
+
+def test_one_value_has_one_colour_at_all_visits_of_the_page() -> None:
+    """Two visits alike but for the lump's height: what lies beside it has the same pixels."""
+    report = replace(REFUSED, visits=VISITS)
+    maps = [[visit(0.0, height=0.4)], [visit(0.0, height=0.8)]]
+    page = growth_page(Compared("not_one_mass"), report, maps, Course())
+    pixels = [
+        np.asarray(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB")).astype(int)
+        for data in re.findall(r'<image [^>]*base64,([^"]*)"', page)
+    ]
+    first, second = (one[20, 20] for one in pixels)
+    assert first == pytest.approx(second, abs=3)
+
+
+def test_hostile_texts_stay_texts_on_the_page() -> None:
+    hostile = '"><script>alert(1)</script>'
+    course = Course(hostile, hostile, hostile, hostile, hostile, (hostile, hostile), (hostile, hostile))
+    page = growth_page(Compared("not_one_mass"), REFUSED, [[visit(0.0, height=0.4)]] * 2, course)
+    assert "<script" not in page
+    assert "&lt;script&gt;" in page
+
+
+def test_visits_that_are_not_compared_have_a_page_that_says_so(tmp_path: Path) -> None:
+    first, second, _ = grown(1.0)
+    off = second.tactile_map.patient_from_plane.copy()
+    off[0, 3] -= 120.0
+    other = Map(replace(second.tactile_map, patient_from_plane=off), scans=second.provenance.scans)
+    refused = tb.compare(first, tb.estimate(other, method="laplace"), method="laplace")
+    refused.page(tmp_path / "growth.html")
+    page = (tmp_path / "growth.html").read_text()
+    assert "Not compared: not shown to be one mass" in page
+    assert len(re.findall("<image ", page)) == 2
+    assert 'class="trend"' not in page

@@ -48,12 +48,12 @@ from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import MapRecipe, TactileMap
 from tactile_bayes.mapping.select import scan_findings
+from tactile_bayes.report.campaign_page import SIZED, ExamEntry, MassRow, VisitEntry, campaign_html
 from tactile_bayes.report.compare import Growth, compare_summary, compare_text, growths
 from tactile_bayes.report.estimate_figures import draw_comparison
 from tactile_bayes.report.exam_page import exam_page
 from tactile_bayes.report.map_figure import map_figure
 from tactile_bayes.report.map_text import map_summary, map_text
-from tactile_bayes.report.pages import SIZED, Card, campaign_html
 from tactile_bayes.report.pooled import pooled_summary, pooled_text
 
 FAST = Settings(method="laplace")
@@ -203,8 +203,9 @@ def growth_table(made: Made) -> str:
 
 def campaign_card(made: Made) -> str:
     size = Quantity(median=15.0, mean=15.0, sd=1.0, low=13.0, high=17.0, probability=0.95, kind="eti")
-    cards = [Card("a", SIZED, size=size, findings=made.findings)]
-    return words_of(campaign_html(cards, lines=(), links={}, version="1"))
+    exam = ExamEntry("visit 1, exam 1", SIZED, size=size, findings=made.findings)
+    rows = [MassRow("a", "1", (VisitEntry("1", (exam,), size),))]
+    return words_of(campaign_html(rows, lines=(), links={}, version="1"))
 
 
 def drawn(made: Made) -> Any:
@@ -260,6 +261,7 @@ OUTPUTS: dict[str, Output] = {
     "compare: text -v": Output(lambda made: compare_text(made.compared.report), paper=False),
     "compare: JSON": Output(lambda made: told_in(made.compared.document), paper=False, verdict="{}"),
     "compare: figure": Output(lambda made: figure_words(drawn(made)), paper=False, shortens=True),
+    "compare: page": Output(lambda made: words_of(made.compared.page_text(title="", name="")), paper=True),
     "compare: notebook": Output(lambda made: words_of(made.compared._repr_html_()), paper=False, shortens=True),
     "campaign: growth, table": Output(growth_table, paper=False),
     "campaign: growth, page": Output(lambda made: growth_of(made).words, paper=True),
@@ -270,7 +272,7 @@ PRINTERS = {
     # behind the outputs above
     "api/comparing", "api/maps", "api/sized", "exports/dicom",
     "exports/fhir", "exports/images", "exports/redcap", "files/map_nc",
-    "report/pages", "report/compare", "report/estimate_document",
+    "report/campaign_page", "report/growth_page", "report/compare", "report/estimate_document",
     "report/estimate_figures", "report/estimate_text", "report/exam_page", "report/map_figure", "report/map_text",
     "report/pooled",
     # of draws, not of a size; names of files that were written

@@ -33,8 +33,9 @@ from tactile_bayes.findings import Finding
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.report.exam_page import BROWSERS, exam_page, find_printer
+from tactile_bayes.report.exam_page import exam_page
 from tactile_bayes.report.exam_words import Exam, exam_map, headline, reach_text
+from tactile_bayes.report.pages import BROWSERS, find_printer
 from tactile_bayes.scan import Landmarks
 
 HOSTILE = "\"><img src=x onerror=alert(1)><script>alert(2)</script>'&lt; </p></svg></body>"

@@ -73,8 +73,23 @@ def test_a_map_is_drawn_in_the_same_bytes_each_time(tmp_path, fit, normalise):
         map_figure(bump_map(normalise=normalise), tmp_path / name, fit=fit, title="Map 1")
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
     assert b"Matplotlib" not in (tmp_path / "a.png").read_bytes()
-    assert png_size(tmp_path / "a.png") == (1500, 675)
+    assert png_size(tmp_path / "a.png")[0] == 1500
     assert stat.S_IMODE((tmp_path / "a.png").stat().st_mode) == 0o600
+
+
+@pytest.mark.parametrize("shape", [(31, 41), (31, 20), (12, 41)])
+@pytest.mark.parametrize("fit", [None, FIT])
+@pytest.mark.parametrize("places", [0, 6])
+def test_a_map_of_any_form_leaves_no_band_of_its_figure_empty(tmp_path, shape, fit, places):
+    whole, (ny, nx) = bump_map(), shape
+    part = {name: getattr(whole, name)[:ny, :nx] for name in ("mean", "variance", "count")}
+    looked_at = [Place((0.0, float(n)), "no bump that the window holds: the fit ran away") for n in range(places)]
+    cut = replace(whole, **part, x_mm=whole.x_mm[:nx], y_mm=whole.y_mm[:ny])
+    map_figure(cut, tmp_path / "map.png", fit=fit, looked_at=looked_at)
+    from PIL import Image
+
+    dark = np.asarray(Image.open(tmp_path / "map.png").convert("L")) < 250
+    assert np.diff(np.flatnonzero(dark.any(axis=1))).max() < max(60, 0.11 * len(dark))
 
 
 def test_a_users_matplotlib_settings_do_not_change_the_picture(tmp_path):
@@ -310,6 +325,15 @@ def test_too_few_draws_are_refused(tmp_path, bad):
     with pytest.raises(BadDataError, match="finite draws cannot be drawn"):
         size_figure(bad, draws(0, 12), tmp_path / "size.png", intervals={})
     assert not list(tmp_path.iterdir())
+
+
+def test_one_density_is_drawn_where_largest_and_smallest_are_the_same(axes):
+    size = draws(0, 15)
+    nearly = np.where(np.arange(len(size)) % 20 == 0, 0.9 * size, size)
+    size_figure(size, nearly, None, intervals=INTERVALS)
+    assert len(axes[0].lines) == 2  # its density and the bar of its interval
+    assert "the same in 95 % of the draws" in axes[0].get_legend().get_texts()[0].get_text()
+    assert [text.get_text()[:8] for text in axes[0].texts] == ["largest,"]
 
 
 def test_equal_draws_are_drawn(tmp_path):

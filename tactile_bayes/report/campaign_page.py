@@ -1,0 +1,171 @@
+"""The index of a campaign: a row for each mass of a patient, over all its visits."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import heapq
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Final
+from urllib.parse import quote
+
+from tactile_bayes.declarations import Record, field
+from tactile_bayes.findings import SEVERITIES, Finding, finding_lines
+from tactile_bayes.inference.draws import Quantity
+from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.report.compare import Growth
+from tactile_bayes.report.pages import TEMPLATES, page
+from tactile_bayes.report.svg import THUMB_ENDS, THUMB_SCALE, colour_steps
+
+FAILED, UNSIZED, SIZED = "failed", "without a size", "sized"
+_CLASSES: Final = {FAILED: "failed", UNSIZED: "without", SIZED: "sized"}
+
+
+class ExamEntry(Record, eq=False):
+    """One exam of a visit."""
+
+    words: str  #: Such as ``visit 1, exam 2``.
+    status: str
+    """`FAILED`, `UNSIZED` or `SIZED`."""
+    reason: str = ""  #: Why there is no size; empty where there is one.
+    size: Quantity | None = None  #: Largest size, mm, with the interval that leads; None without one.
+    findings: tuple[Finding, ...] = ()  #: What speaks against the exam.
+    thumbnail: bytes | str | None = None
+    """SVG of the map, or the name of its file from the page's folder; None without one."""
+    page: str = ""  #: The exam's page from the index's folder; empty without one.
+    links: Mapping[str, str] = field(default_factory=dict)
+    """Other files of the exam, by the words of their links."""
+
+    @property
+    def alt(self) -> str:
+        """What the picture shows, for those who do not see it."""
+        ring = "no lump ringed" if self.size is None else f"a ring around the lump of {self.size.median:.1f} mm"
+        return f"Map of {self.words}, {ring}"
+
+    @property
+    def source(self) -> str:
+        """Address of the picture; empty without one."""
+        if self.thumbnail is None or isinstance(self.thumbnail, str):
+            return quote(self.thumbnail or "")
+        return f"data:image/svg+xml;base64,{base64.b64encode(self.thumbnail).decode('ascii')}"
+
+
+class VisitEntry(Record, eq=False):
+    """One visit of a mass with its exams."""
+
+    words: str  #: Code and date.
+    exams: tuple[ExamEntry, ...]
+    size: Quantity | None = None
+    """Largest size, mm, with the interval that leads, of all exams together where they were pooled; None without."""
+    pooled: int = 0  #: How many exams the size is pooled from; 0 where it is one exam's.
+    why: str = ""  #: Why there is no size; empty where there is one.
+
+
+class MassRow(Record, eq=False):
+    """One mass of a patient."""
+
+    patient: str
+    mass: str
+    visits: tuple[VisitEntry, ...]  #: In order of time.
+    side: str = ""
+    growth: Growth | None = None  #: From the first visit to the last; None with one visit.
+
+    @property
+    def name(self) -> str:
+        """Patient and mass."""
+        return f"{self.patient} {self.mass}"
+
+    @property
+    def last(self) -> VisitEntry:
+        """The last visit."""
+        return self.visits[-1]
+
+    @property
+    def exams(self) -> list[ExamEntry]:
+        """Those of all visits."""
+        return [exam for visit in self.visits for exam in visit.exams]
+
+    @property
+    def status(self) -> str:
+        """Of the last visit; a mass is failed where all its exams there are."""
+        if self.last.size is not None:
+            return SIZED
+        return FAILED if all(exam.status == FAILED for exam in self.last.exams) else UNSIZED
+
+    @property
+    def kind(self) -> str:
+        """Class of the row in the style sheet."""
+        return _CLASSES[self.status]
+
+    @property
+    def told(self) -> Iterator[tuple[str, str]]:
+        """Severity and text of each finding, once, with the exams that it is of where it is not of all."""
+        every = self.exams
+        for severity in SEVERITIES:
+            of: dict[str, list[str]] = {}
+            for exam in every:
+                for text in finding_lines(exam.findings, severity, paper=True):
+                    of.setdefault(text, []).append(exam.words)
+            for text, exams in of.items():
+                yield severity, text if len(exams) == len(every) else f"{text} ({'; '.join(exams)})"
+        for exam in every:
+            if exam.status == FAILED:
+                yield "caution", f"{exam.words}: {exam.reason}"
+
+    @property
+    def badness(self) -> tuple[int, int, int, float]:
+        """Sort key of what is to be looked at first."""
+        size, findings = self.last.size, [one for exam in self.exams for one in exam.findings]
+        failed = sum(exam.status == FAILED for exam in self.exams)
+        doubts = sum(10 if one.severity == "caution" else 1 for one in findings)
+        order = (FAILED, UNSIZED, SIZED).index(self.status)
+        return order, -failed, -doubts, 0.0 if size is None else -self.width
+
+    @property
+    def width(self) -> float:
+        """Width of the last size's interval in parts of the size; 0 without one."""
+        size = self.last.size
+        return 0.0 if size is None else (size.high - size.low) / size.median
+
+    @property
+    def change(self) -> Quantity | None:
+        """Change of the diameter in percent; None where it is not known."""
+        return None if self.growth is None else self.growth.percent
+
+
+WORST_FIRST: Final = (
+    "First come masses whose exams failed, then those without a size at the last visit, then those with failed exams, "
+    "then those with most cautions and checks, then those with the widest interval for their size."
+)
+
+
+def worst(rows: Iterable[MassRow], most: int) -> list[MassRow]:
+    """Up to `most` rows, those to be looked at first before the others; see `WORST_FIRST`."""
+    return heapq.nsmallest(most, rows, key=lambda row: (row.badness, row.name))
+
+
+def campaign_html(rows: Sequence[MassRow], *, lines: Sequence[str], links: Mapping[str, str], version: str) -> str:
+    """Full page; nothing is loaded but thumbnails beside it, and the only script is its filter and its order.
+
+    `rows` are in the order in which they are shown, `lines` the summary in sentences, `links` the files beside the page
+    by the words of their links.
+    """
+    script = "\n" + (TEMPLATES / "campaign.js").read_text(encoding="utf-8")
+    apart = any(isinstance(exam.thumbnail, str) for row in rows for exam in row.exams)
+    return page(
+        "campaign",
+        title="Masses of a campaign",
+        images="'self' file:" if apart else "data:",
+        script_sha256=base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
+        script=script,
+        research_use=RESEARCH_USE,
+        lines=lines,
+        order=WORST_FIRST,
+        beside=links,
+        counts={status: sum(row.status == status for row in rows) for status in _CLASSES},
+        rows=rows,
+        growing=any(row.growth is not None for row in rows),
+        scale=THUMB_SCALE,
+        colours=colour_steps(THUMB_ENDS, "of the level beside the lump; all maps", more=True),
+        version=version,
+    )

@@ -1,0 +1,316 @@
+"""The page of a mass over time: its maps on common axes, its size at each visit, and the change."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Iterator, Sequence
+from typing import Final
+
+import numpy as np
+
+from tactile_bayes import __version__
+from tactile_bayes.declarations import Record
+from tactile_bayes.files.comparison import CompareReport, Visit
+from tactile_bayes.findings import finding_lines
+from tactile_bayes.geometry import FloatArray
+from tactile_bayes.inference.draws import Quantity
+from tactile_bayes.mapping.map import TactileMap
+from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.report.compare import change_sentences, rate_sentences, verdict_sentence
+from tactile_bayes.report.pages import cut, page
+from tactile_bayes.report.svg import colour_steps, outlined_text, picture_of, size_ruler, stroked
+from tactile_bayes.size.visits import Compared, straight_line
+
+# --- The maps of each visit, averaged on common axes about the mass.
+
+HALF_MM: Final = 30.0  #: Half the side of the square about the mass that is drawn.
+STEP_MM: Final = 1.0
+_ENDS: Final = (0.01, 0.995)
+_LEAST_SPAN: Final = 0.35
+"""Shares of the cells that the colours' ends leave outside, and the least span between them, of the level."""
+
+
+class DrawnMap(Record, eq=False):
+    """A map and its lump: its place, diameters along its own axes, and the angle from x to the first."""
+
+    tactile_map: TactileMap
+    centre_mm: tuple[float, float] | None  #: On the plane; None where none was found.
+    axes_mm: tuple[float, float] | None = None  #: None without a size.
+    angle_deg: float = 0.0
+
+    @property
+    def rotation(self) -> FloatArray:
+        """(2, 2) from the plane's x and y to the patient's; the plane's own without landmarks."""
+        there = self.tactile_map.patient_from_plane
+        return np.eye(2) if there is None else there[:2, :2]
+
+
+class LaidMap(Record, eq=False):
+    """A visit's maps averaged on a common grid about its mass."""
+
+    values: FloatArray  #: (n, n) array: Rows upwards, columns to the right on the screen; NaN without data.
+    origin_mm: FloatArray
+    """(2,) array: Left of and above the xiphoid, where the mass lies; (0, 0) without landmarks."""
+    ring_mm: FloatArray | None
+    """(2, m) array: Right of and above the mass, the ellipse of its size at the visit; None without one."""
+
+
+def on_common_axes(
+    report: CompareReport, visits: Sequence[Sequence[DrawnMap]], *, middle: bool = False
+) -> tuple[list[LaidMap], bool]:
+    """The maps of each visit, and whether the axes are the patient's: where all maps have landmarks.
+
+    Of a visit without a lump nothing is shown, or with `middle` its first map about its own middle.
+    """
+    in_patient = all(one.tactile_map.patient_from_plane is not None for maps in visits for one in maps)
+    sizes = [visit.max_size_mm for visit in report.visits]
+    shown = [_about_middle(maps) if middle else maps for maps in visits]
+    return [_laid(maps, size, in_patient=in_patient) for maps, size in zip(shown, sizes, strict=True)], in_patient
+
+
+def _about_middle(maps: Sequence[DrawnMap]) -> Sequence[DrawnMap]:
+    """The maps, or where none has a lump the first about its own middle."""
+    if any(one.centre_mm is not None for one in maps):
+        return maps
+    axes = maps[0].tactile_map.x_mm, maps[0].tactile_map.y_mm
+    x, y = (float(axis[0] + axis[-1]) / 2 for axis in axes)
+    return [DrawnMap(maps[0].tactile_map, (x, y))]
+
+
+def _laid(maps: Sequence[DrawnMap], size: Quantity | None, *, in_patient: bool) -> LaidMap:
+    """Mean of a visit's maps about its mass, on the screen's axes."""
+    along = np.arange(-HALF_MM, HALF_MM + STEP_MM / 2, STEP_MM)
+    right, up = np.meshgrid(along, along)
+    about = np.stack([-right, up])  # x, the patient's and the plane's, runs to the viewer's left, as in every picture
+    values, places, ring = [], [], None
+    for drawn in maps:
+        one, centre = drawn.tactile_map, drawn.centre_mm
+        if centre is None:
+            continue
+        rotation = drawn.rotation if in_patient else np.eye(2)
+        if in_patient:
+            assert one.patient_from_plane is not None
+            places.append((rotation @ centre + one.patient_from_plane[:2, 3]) * [-1.0, 1.0])
+        x, y = np.tensordot(np.linalg.inv(rotation), about, axes=1) + np.reshape(centre, (2, 1, 1))
+        values.append(_nearest(one, x, y))
+        if ring is None and size is not None and drawn.axes_mm is not None:
+            ring = _ring(drawn, rotation, size.median)
+    if not values:
+        return LaidMap(np.full(right.shape, np.nan), np.zeros(2), None)
+    stack = np.stack(values)
+    known = np.isfinite(stack)
+    total, count = np.where(known, stack, 0.0).sum(axis=0), known.sum(axis=0)
+    mean = np.divide(total, count, out=np.full(right.shape, np.nan), where=count > 0)
+    return LaidMap(mean, np.mean(places, axis=0) if places else np.zeros(2), ring)
+
+
+def _ring(drawn: DrawnMap, rotation: FloatArray, largest_mm: float) -> FloatArray:
+    """(2, m) outline of the lump in the shape that its map gives, as large as its size is."""
+    assert drawn.axes_mm is not None
+    t, angle = np.linspace(0.0, 2 * np.pi, 73), np.radians(drawn.angle_deg)
+    half = np.array(drawn.axes_mm) * largest_mm / max(drawn.axes_mm) / 2
+    own = half[:, None] * np.stack([np.cos(t), np.sin(t)])
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    x, y = rotation @ turn @ own
+    return np.stack([-x, y])
+
+
+def _nearest(tactile_map: TactileMap, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
+    """Values of the nearest cells; NaN outside and in cells without data or with few readings."""
+    cell = tactile_map.recipe.cell_mm
+    column = np.rint((x_mm - tactile_map.x_mm[0]) / cell).astype(int)
+    row = np.rint((y_mm - tactile_map.y_mm[0]) / cell).astype(int)
+    ny, nx = tactile_map.mean.shape
+    inside = (column >= 0) & (column < nx) & (row >= 0) & (row < ny)
+    filled = np.where(tactile_map.covered & ~tactile_map.few, tactile_map.mean, np.nan)
+    found = filled[np.clip(row, 0, ny - 1), np.clip(column, 0, nx - 1)]
+    return np.where(inside, found, np.nan)
+
+
+def common_limits(maps: Sequence[LaidMap]) -> tuple[float, float]:
+    """Values at the ends of the colours, one range for all maps; noise alone does not look like a lump."""
+    every = np.concatenate([one.values[np.isfinite(one.values)] for one in maps])
+    if not len(every):
+        return 0.0, 1.0
+    low, high = (float(end) for end in np.quantile(every, _ENDS))
+    return low, max(high, low + _LEAST_SPAN * abs(float(np.median(every))), low + 1e-9)
+
+
+# --- The page.
+
+TITLE: Final = "Tactile exams over time"
+_SCALE: Final = 0.7  #: Of life size, of the maps.
+_MOST_MAPS: Final = 4
+
+
+class Course(Record):
+    """What is known of the visits besides their maps; empty where it is not."""
+
+    title: str = ""
+    name: str = ""
+    patient: str = ""
+    side: str = ""
+    mass: str = ""
+    visits: tuple[str, ...] = ()
+    dates: tuple[str, ...] = ()
+    """`visits`, `dates`: A code and a date for each visit."""
+
+    def of(self, visit: Visit) -> str:
+        """A visit in words, with its date or its day."""
+        number = visit.visit - 1
+        code = self.visits[number] if self.visits else f"{visit.visit}"
+        day = "" if visit.day is None or not number else f"day {visit.day:g}"
+        when = self.dates[number] if self.dates else day
+        return f"Visit {code}, {when}" if when else f"Visit {code}"
+
+
+def growth_page(compared: Compared, report: CompareReport, visits: Sequence[Sequence[DrawnMap]], course: Course) -> str:
+    """Full HTML page of a comparison; equal comparisons give equal text."""
+    laid, in_patient = on_common_axes(report, visits, middle=True)
+    limits, words = common_limits(laid), visits[0][0].tactile_map.recipe.value_words
+    shown = [0, *range(max(1, len(laid) - _MOST_MAPS + 1), len(laid))]
+    facts = (("Name", course.name), ("Patient", course.patient), ("Side", course.side), ("Mass", course.mass))
+    return page(
+        "growth",
+        title=cut(course.title, 60) or TITLE,
+        facts=[(name, text) for name, text in facts if text],
+        research_use=RESEARCH_USE,
+        headline=verdict_sentence(report),
+        findings=finding_lines(report.findings, paper=True),
+        maps=[(_picture(laid[i], limits, course.of(report.visits[i])), *_captions(report, course, i)) for i in shown],
+        left_out=len(laid) - len(shown),
+        colours=colour_steps(limits, words, more=any(bool((one.values > limits[1]).any()) for one in laid)),
+        seen=_seen(in_patient),
+        chart=_chart(compared, report, course),
+        change=size_ruler(list(_changes(report, course)), unit="%", label="Change of the largest diameter in percent"),
+        sentences=change_sentences(report),
+        rates=rate_sentences(report),
+        rows=[_row(report, course, visit) for visit in report.visits],
+        foot=_foot(report),
+    )
+
+
+def _seen(in_patient: bool) -> str:
+    axes = (
+        "Seen facing the patient; R, L: the patient's right and left; H: head, F: feet."
+        if in_patient
+        else "No landmarks on every map: the head's own axes, y up, x to the left."
+    )
+    return (
+        f"{axes} Every map shows {2 * HALF_MM:g} mm about the mass, without one about its own middle, all in the same "
+        "colours; ring: its estimated size at that visit; grey: no or few readings. Later visits are moved so that the "
+        "mass lies on itself."
+    )
+
+
+def _captions(report: CompareReport, course: Course, number: int) -> tuple[str, str]:
+    visit = report.visits[number]
+    q = visit.max_size_mm
+    if q is not None:
+        return course.of(visit), f"{q.median:.1f} mm"
+    found = any(one.status == "estimate" for one in visit.maps)
+    return course.of(visit), "not sized" if found else "no lump found"
+
+
+def _picture(laid: LaidMap, limits: tuple[float, float], label: str) -> str:
+    """Inline SVG of a visit's map with its ring, sides and scale bar."""
+    side = _SCALE * (2 * HALF_MM + STEP_MM)
+    sides = {"R": (2.2, side / 2), "L": (side - 2.2, side / 2), "H": (side / 2, 3.0), "F": (side / 2, side - 2.2)}
+    plain = laid.origin_mm.any()
+    names = sides if plain else {"+x": sides["R"], "-x": sides["L"], "+y": sides["H"], "-y": sides["F"]}
+    parts = [picture_of(laid.values[::-1], limits, (side, side))]
+    if laid.ring_mm is not None:
+        points = side / 2 + _SCALE * laid.ring_mm * [[1.0], [-1.0]]
+        parts += [stroked("M" + "L".join(f"{x:.2f} {y:.2f}" for x, y in points.T) + "Z", 0.5, kind="size")]
+    parts += [outlined_text(x, y + 0.9, name, size=2.8) for name, (x, y) in names.items()]
+    parts += [stroked(f"M2 {side - 2:.2f}h{10 * _SCALE:g}", 0.6, kind="scale")]
+    parts += [outlined_text(2 + 5 * _SCALE, side - 3.4, "10 mm", size=2.4)]
+    return (
+        f'<svg class="map" role="img" aria-label="{html.escape(f"Map of {label}")}" '
+        f'viewBox="0 0 {side:.2f} {side:.2f}" width="{side:.2f}mm" height="{side:.2f}mm">{"".join(parts)}</svg>'
+    )
+
+
+def _changes(report: CompareReport, course: Course) -> Iterator[tuple[str, Quantity]]:
+    """The change to the last visit, the same if exams differ as patients' do, and those to earlier ones."""
+    for change in reversed(report.changes):
+        yield course.of(report.visits[change.later - 1]), change.percent
+        another = change.another_exam if change is report.changes[-1] else None
+        if another is not None:
+            yield f"the same if exams of one mass differ by {100 * another.between_map_sd:.0f} %", another.percent
+
+
+def _row(report: CompareReport, course: Course, visit: Visit) -> tuple[str, ...]:
+    """Cells of the table: the visit, its maps, size, change and place."""
+    q, number = visit.max_size_mm, visit.visit - 2
+    size = "" if q is None else f"{q.median:.1f} ({q.low:.1f} to {q.high:.1f})"
+    c = report.changes[number].percent if report.changes and number >= 0 else None
+    change = "" if c is None else f"{c.median:+.0f} ({c.low:+.0f} to {c.high:+.0f})"
+    away = report.places[number].distance_mm if number >= 0 and report.places else None
+    found = sum(one.status == "estimate" for one in visit.maps)
+    return course.of(visit), f"{found} of {len(visit.maps)}", size, change, "" if away is None else f"{away:.0f}"
+
+
+def _foot(report: CompareReport) -> str:
+    digests = [one["sha256"][:12] for one in report.provenance.get("scans", ()) if "sha256" in one][:6]
+    scans = f"; scans {', '.join(digests)}" if digests else ""
+    return (
+        f"tactile-bayes {__version__}{scans}. Sizes come from simulated bodies; no scan of a person has been used. "
+        f"{RESEARCH_USE}"
+    )
+
+
+# --- The size at each visit over time, as inline SVG.
+
+_BOX_MM: Final = (82.0, 46.0)
+_MARGINS_MM: Final = (9.0, 2.0, 3.0, 9.0)  #: Left, right, above, below.
+
+
+def _chart(compared: Compared, report: CompareReport, course: Course) -> str:
+    """Largest diameter with its interval at each visit, and the trend where there is one; empty without sizes."""
+    sized = [(visit, visit.max_size_mm) for visit in report.visits if visit.max_size_mm is not None]
+    if compared.joint is None or not sized:
+        return ""
+    timed = all(visit.day is not None for visit, _ in sized)
+    times = [float(visit.day or 0.0) if timed else float(i) for i, (visit, _) in enumerate(sized)]
+    (width, height), (left, right, above, below) = _BOX_MM, _MARGINS_MM
+    top = 1.1 * max(q.high for _, q in sized)
+
+    def at(time: float, size_mm: float) -> tuple[float, float]:
+        share = (time - times[0]) / (times[-1] - times[0])
+        inset = 6.0
+        across = left + inset + share * (width - left - right - 2 * inset)
+        return across, above + (1.0 - size_mm / top) * (height - above - below)
+
+    floor = at(times[0], 0.0)[1]
+    parts = [f'<path d="M{left} {above}V{floor:.2f}H{width - right}" fill="none" stroke="#111" stroke-width="0.25"/>']
+    step = next(one for one in (1, 2, 5, 10, 20, 50, 100) if top / one <= 6)
+    for tick in range(0, int(top) + 1, step):
+        y = at(times[0], tick)[1]
+        parts.append(f'<path d="M{left} {y:.2f}h-1" stroke="#111" stroke-width="0.25"/>')
+        parts.append(f'<text x="{left - 1.6}" y="{y + 0.9:.2f}" text-anchor="end" font-size="2.7">{tick}</text>')
+    parts.append(f'<text x="{left + 1}" y="{above + 1:.2f}" font-size="2.7">mm</text>')
+    if report.trend is not None:
+        line = straight_line(*compared.joint.moments, times)
+        ends = [at(time, float(np.exp(line.level + line.per_day * (time - np.mean(times))))) for time in times]
+        path = "M" + "L".join(f"{x:.2f} {y:.2f}" for x, y in ends)
+        parts.append(f'<path class="trend" d="{path}" fill="none" stroke="#555" stroke-width="0.4" '
+                     'stroke-dasharray="1.5 1"/>')  # fmt: skip
+    for i, (time, (visit, q)) in enumerate(zip(times, sized, strict=True)):
+        x, y = at(time, q.median)
+        low, high = at(time, q.low)[1], at(time, q.high)[1]
+        parts.append(f'<path d="M{x:.2f} {low:.2f}V{high:.2f}" stroke="#111" stroke-width="0.8"/>')
+        parts.append(f'<circle cx="{x:.2f}" cy="{y:.2f}" r="1.1" fill="#111"/>')
+        parts.append(f'<text x="{x + 1.4:.2f}" y="{y - 1.2:.2f}" font-size="2.7">{q.median:.1f}</text>')
+        words = course.of(visit).removeprefix("Visit ")
+        code, _, when = words.partition(", ")
+        stagger = 2.6 * (i % 2) if len(sized) > 4 else 0.0
+        parts.append(f'<text x="{x:.2f}" y="{floor + 3.4:.2f}" text-anchor="middle" font-size="2.7">'
+                     f"{html.escape(code[:14])}</text>")  # fmt: skip
+        parts.append(f'<text x="{x:.2f}" y="{floor + 6.4 + stagger:.2f}" text-anchor="middle" font-size="2.5">'
+                     f"{html.escape(when[:14])}</text>")  # fmt: skip
+    label = "Largest diameter at each visit with its interval"
+    return (
+        f'<svg class="ruler" role="img" aria-label="{label}" viewBox="0 0 {width:g} {height + 2:g}" '
+        f'width="{width:g}mm" height="{height + 2:g}mm">{"".join(parts)}</svg>'
+    )
