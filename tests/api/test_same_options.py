@@ -18,7 +18,6 @@ from tactile_bayes.declarations import names_of
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.exports.run import TAKES
 from tactile_bayes.options import PlanErrors
-from tactile_bayes.report import exam_page as exam_files
 from tactile_bayes.report import pages as printed
 
 DEMO = Path(tb.__file__).parent / "demo"
@@ -140,7 +139,7 @@ def test_a_page_that_cannot_be_printed_leaves_neither_file(
     monkeypatch.setattr(printed, "find_printer", lambda: lambda page: page.encode()[:9])
     tb.exam_report(folder / "post.nc", tmp_path / "page.html", pdf=tmp_path / "page.pdf")
     assert (tmp_path / "page.pdf").read_bytes() == b"<!doctype"
-    assert exam_files.PageFiles(tmp_path / "new.html").check() is None
+    assert printed.PageFiles(tmp_path / "new.html").check() is None
 
 
 def test_dates_of_a_comparison_are_days_and_the_full_text_is_the_command_lines(folder: Path) -> None:

@@ -380,7 +380,7 @@ def test_every_command_that_draws_refuses_another_suffix_before_any_work():
             ]
     # map, calibrate size, two of estimate, compare, three of diagnose, head design, compare-model, sbc, three of
     # tradeoff
-    assert len(found) == 14
+    assert len(found) == 15
     assert all(isinstance(one, FigurePath) for one in found)
 
 
