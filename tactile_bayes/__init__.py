@@ -4,6 +4,7 @@
 
 - `read_scan`, `read_map`, `simulate`, `demo_scan`, `demo_map`: scans and maps
 - `scan_of`: from arrays, or a file of them, to a scan
+- `map_of`: from values in rows and columns, or a file of them, to a map
 - `check`: whether array, lever arm and quaternions of a scan are as they are stated
 - `build_map`: from scans to a map
 - `estimate`, `pool`: from a map, or from several maps of one mass, to a size
@@ -50,6 +51,7 @@ __all__ = [
     "estimate",
     "exam_report",
     "export",
+    "map_of",
     "plan",
     "pool",
     "read_map",
@@ -83,6 +85,7 @@ _HOME = {
     "estimate": "api.estimates",
     "exam_report": "api.reports",
     "export": "api.reports",
+    "map_of": "api.maps",
     "plan": "api.planning",
     "pool": "api.estimates",
     "read_map": "api.maps",

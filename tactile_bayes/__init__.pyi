@@ -11,6 +11,7 @@ from tactile_bayes.api.maps import build_map as build_map
 from tactile_bayes.api.maps import check as check
 from tactile_bayes.api.maps import demo_map as demo_map
 from tactile_bayes.api.maps import demo_scan as demo_scan
+from tactile_bayes.api.maps import map_of as map_of
 from tactile_bayes.api.maps import read_map as read_map
 from tactile_bayes.api.maps import read_scan as read_scan
 from tactile_bayes.api.maps import simulate as simulate

@@ -35,6 +35,7 @@ KINDS: Final[Mapping[str, Severity]] = {
     "slightly_uneven_fat": "check",
     "curved_skin": "check",
     "few_strokes": "check",
+    "level_fitted": "check",
     # of a mass
     "side": "caution",
     "outside_calibration": "caution",

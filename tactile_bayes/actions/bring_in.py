@@ -11,14 +11,13 @@ import numpy as np
 
 from tactile_bayes.actions.exam import describe_scan
 from tactile_bayes.commands.options import refuse_same
-from tactile_bayes.declarations import Record, names_of, replace
+from tactile_bayes.declarations import Record, as_dict, names_of, replace
 from tactile_bayes.errors import BadDataError, TactileBayesError, UsageError, one_line
 from tactile_bayes.files.array_map import array_template, read_array_map
 from tactile_bayes.files.arrays_layout import ArrayMap, Stated
 from tactile_bayes.files.atomic import check_suffix, refuse_existing
 from tactile_bayes.files.documents import with_session
-from tactile_bayes.files.grid_files import open_grid
-from tactile_bayes.files.grids import grid_map
+from tactile_bayes.files.grids import import_grid
 from tactile_bayes.files.imports import import_arrays, of_calibration, of_head, of_landmarks, of_poses
 from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.files.named_arrays import ARRAY_SUFFIXES, Source
@@ -26,10 +25,10 @@ from tactile_bayes.files.provenance import Provenance, hash_inputs
 from tactile_bayes.files.scan_mcap import read_scan_report, read_truth, write_scan
 from tactile_bayes.findings import finding_lines
 from tactile_bayes.mapping.arrangement import check_scan, corrected
+from tactile_bayes.options import GridOptions
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.scan import Scan
 
-_LONGEST_UNITS: Final = 20
 _BESIDE: Final = {"head_geometry": of_head, "array_calibration": of_calibration, "landmarks": of_landmarks}
 
 
@@ -37,10 +36,7 @@ class Wanted(Record):
     """What the call asks for, besides its files."""
 
     kind: str | None
-    spacing_mm: float | None
-    normalise: str | None
-    units: str | None
-    no_value: tuple[str, ...]
+    grid: GridOptions
     corrections: tuple[str, ...]
     session_file: Path | None
     arrays: ArrayMap
@@ -84,7 +80,8 @@ def import_action(
         "landmarks": landmarks,
     }
     beside = {name: path for name, path in paths.items() if path is not None}
-    wanted = Wanted(**given, arrays=arrays, beside=beside)
+    grid = GridOptions(**{name: given.pop(name) for name in names_of(GridOptions)})
+    wanted = Wanted(**given, grid=grid, arrays=arrays, beside=beside)
     if len(sources) == 1 and not output.is_dir():
         lines = _import(sources[0], output, wanted)
     else:
@@ -136,9 +133,9 @@ def _import(source: Path, output: Path, wanted: Wanted) -> list[str]:
     refuse_existing(output, force=wanted.force)
     kind = _kind(source, output, wanted)
     check_suffix(output, "MCAP" if kind == "scan" else "netCDF")
-    of_a_map = (wanted.spacing_mm, wanted.normalise, wanted.units, wanted.no_value or None)
-    if kind == "scan" and any(one is not None for one in of_a_map):
-        raise UsageError("--spacing-mm, --normalise, --units and --no-value are for maps: leave out, or give --as map")
+    if kind == "scan" and wanted.grid != GridOptions():
+        given = " and ".join(f"--{name.replace('_', '-')}" for name in _changed(wanted.grid))
+        raise UsageError(f"{given}: for maps only; leave out or give --as map")
     if kind == "map" and wanted.of_a_scan:
         unit = " (a map's unit is --units)" if wanted.arrays.unit else ""
         raise UsageError(f"{' and '.join(wanted.of_a_scan)}: for scans only; leave out or give --as scan{unit}")
@@ -170,6 +167,11 @@ def _of_file(option: str, path: Path, arrays: ArrayMap) -> Source:
     return of_poses(path, arrays) if option == "poses" else _BESIDE[option](path)
 
 
+def _changed(asked: GridOptions) -> list[str]:
+    """Names of the options that are not as they are by default."""
+    return [name for name, value in as_dict(asked).items() if value != getattr(GridOptions(), name)]
+
+
 def _stated(arrays: ArrayMap) -> Mapping[str, Any]:
     """What was stated of the arrays, for the provenance; nothing where nothing was."""
     held = {name: getattr(arrays, name) for name in names_of(ArrayMap)}
@@ -186,19 +188,9 @@ def _arrangement_lines(scan: Scan) -> list[str]:
 
 
 def _import_map(source: Path, output: Path, wanted: Wanted) -> list[str]:
-    normalise, units = wanted.normalise or "none", wanted.units or ""
-    if wanted.units is not None and normalise != "none":
-        raise UsageError(f"--units is for values that were not divided; leave it out or --normalise {normalise}")
-    if wanted.units is not None and not (units.isprintable() and 0 < len(units.strip()) <= _LONGEST_UNITS):
-        raise UsageError(f"--units {units[:30]!r} is not a unit; give up to {_LONGEST_UNITS} letters, such as kPa")
-    asked: dict[str, Any] = {"normalise": normalise, "units": units, "no_value": wanted.no_value}
-    try:
-        grid = open_grid(source, no_value=wanted.no_value)
-        tactile_map, notes = grid_map(grid, spacing_mm=wanted.spacing_mm, **asked)
-    except BadDataError as error:
-        raise error.at(source) from None
-    settings = {"as": "map", "spacing_mm": tactile_map.recipe.cell_mm, **asked, "notes": notes}
-    provenance = Provenance("import", settings, inputs=hash_inputs(source=source))
+    tactile_map, notes = import_grid(source, wanted.grid)
+    asked = {**as_dict(wanted.grid), "spacing_mm": tactile_map.recipe.cell_mm}
+    provenance = Provenance("import", {"as": "map", **asked, "notes": notes}, inputs=hash_inputs(source=source))
     write_map(output, tactile_map, provenance=provenance, force=wanted.force)
     ny, nx = tactile_map.mean.shape
     covered = int(tactile_map.covered.sum())
@@ -210,4 +202,5 @@ def _import_map(source: Path, output: Path, wanted: Wanted) -> list[str]:
         f"{ny} x {nx} cells of {tactile_map.recipe.cell_mm:g} mm, {covered} with data",
         f"values {low:.4g} to {high:.4g}{unit}, background level {level} (normalise {tactile_map.recipe.normalise})",
         *notes,
+        *finding_lines(tactile_map.findings),
     ]

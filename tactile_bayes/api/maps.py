@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, overload
@@ -14,6 +14,8 @@ from tactile_bayes.api.arguments import check_keywords, door, plain
 from tactile_bayes.declarations import EXACT, Record, as_dict, names_of, to_plain
 from tactile_bayes.errors import UsageError, check_number
 from tactile_bayes.files.atomic import Format, check_suffix, sha256
+from tactile_bayes.files.grid_files import Grid
+from tactile_bayes.files.grids import grid_map, import_grid
 from tactile_bayes.files.map_nc import read_map_and_scans, write_map
 from tactile_bayes.files.provenance import Provenance, repeated_scans, scan_facts
 from tactile_bayes.files.scene_toml import read_scene, scene_of
@@ -23,7 +25,7 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.arrangement import ArrangementCheck, check_scan
 from tactile_bayes.mapping.build import build_map as build
 from tactile_bayes.mapping.map import TactileMap
-from tactile_bayes.options import MapOptions
+from tactile_bayes.options import GridOptions, MapOptions
 from tactile_bayes.presets import PRESSURE_WINDOW_KPA, RESEARCH_USE
 from tactile_bayes.report.map_figure import map_figure
 from tactile_bayes.scan import Scan
@@ -340,21 +342,49 @@ def demo_map() -> Map:
     return build_map(_DEMO)
 
 
-def map_of(given: Any) -> Map:
-    """Return the map given as a `Map`, a path or a `TactileMap`.
+@door
+def map_of(given: Any, **stated: Any) -> Map:
+    """Make a map of values in rows and columns, for `estimate`.
+
+    Parameters
+    ----------
+    given
+        (ny, nx) values, the lowest y and x first, NaN where there is none; or the path of a file that `tactile-bayes
+        import` takes as a map. Without `stated` also a map as it is: a `Map`, a `TactileMap`, or the path of a map.
+    **stated
+        As of `tactile_bayes.options.GridOptions`: spacing_mm, normalise, level, units, no_value, array.
+
+    Returns
+    -------
+    Map
+        For `estimate`; its `findings` hold what was fitted.
 
     Raises
     ------
+    BadDataError
+        When values cannot be so: numbers that stand for no value, another level than stated, a damaged file.
     UsageError
-        When it is none of them.
+        When it is none of these, or an argument cannot be so.
     """
+    check_keywords("map_of", stated, names_of(GridOptions))
     if isinstance(given, Map):
         return given
-    if isinstance(given, str | Path):
-        return read_map(given)
     if isinstance(given, TactileMap):
         return Map(given)
-    way_out = "build one with build_map, or give a path"
-    if isinstance(given, list | tuple):
-        way_out = "give one map after the other, or pool the maps of one mass with pool"
-    raise UsageError(f"a map is wanted, not {type(given).__name__}; {way_out}")
+    if isinstance(given, str | Path) and not stated:
+        return read_map(given)
+    path = path_of(given) if isinstance(given, str | Path) else None
+    if path is None and (not stated or isinstance(given, list | tuple) or not hasattr(given, "__array__")):
+        way_out = "build one with build_map, give a path, or map_of(numpy.array(...), spacing_mm=...)"
+        if isinstance(given, list | tuple) and not stated:
+            way_out = "give one map after the other, or pool the maps of one mass with pool"
+        raise UsageError(f"a map is wanted, not {type(given).__name__}; {way_out}")
+    marks = stated.get("no_value", ())
+    marks = [marks] if isinstance(marks, str) or not isinstance(marks, Iterable) else marks
+    asked = {name: plain(value) for name, value in stated.items()}
+    asked["no_value"] = tuple(one if isinstance(one, str) else repr(plain(one)) for one in marks)
+    options = GridOptions(**asked)
+    if path is not None:
+        return Map(import_grid(path, options)[0])
+    values = given.filled(np.nan) if isinstance(given, np.ma.MaskedArray) else np.asarray(given)
+    return Map(grid_map(Grid({"mean": values}), options)[0])

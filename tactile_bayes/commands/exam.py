@@ -11,8 +11,8 @@ import click
 from tactile_bayes.commands.options import FORCE, JSON, METAVAR, SESSION, FigurePath, FilePath, takes
 from tactile_bayes.declarations import names_of
 from tactile_bayes.files.arrays_layout import Stated, layout_lines
-from tactile_bayes.options import IdentityOptions, MapOptions, RecordOptions
-from tactile_bayes.presets import CORRECTIONS, METHODS, NORMALISE
+from tactile_bayes.options import GridOptions, IdentityOptions, MapOptions, RecordOptions
+from tactile_bayes.presets import CORRECTIONS, METHODS
 
 # --- `demo`: the main steps on data that comes with the program.
 
@@ -61,19 +61,7 @@ def demo_command(ctx: click.Context, /, **given: Any) -> None:
     type=click.Choice(["scan", "map"]),
     help="What SRC holds. Default: as the output's suffix says; a table or image without a scan's options is a map.",
 )
-@click.option("--spacing-mm", type=float, metavar="H", help="Map: side of the square cells, in mm.")
-@click.option(
-    "--normalise", type=click.Choice(NORMALISE), help="Map: how the values are already normalised. Default: none."
-)
-@click.option(
-    "--units", metavar="TEXT", help="Map: unit of values that are not normalised, such as kPa. Default: unknown."
-)
-@click.option(
-    "--no-value",
-    multiple=True,
-    metavar="V",
-    help="Map: a number or text that stands for no value, such as -9999; none: every number is a value.",
-)
+@takes(GridOptions, *names_of(GridOptions))
 @click.option(
     "--correct",
     "corrections",
@@ -96,8 +84,9 @@ def import_command(ctx: click.Context, /, **given: Any) -> None:
 
     SRC holds frames (a scan): a file of arrays (.npz, .npy, MATLAB's .mat, HDF5), a text table with one row or one
     block of rows a frame, or a sequence metafile (.mha); a scan file to repair (what is intact is kept); or a grid of
-    values (a map): .npz with `mean`, a table, or a grey .tif, .pgm or .png image. The first row of a grid has the
-    lowest y and the first column the lowest x; pictures of the map show the first row on top, as the file reads.
+    values (a map): a table, a grey .tif, .pgm or .png image, or with -o MAP.nc one array of .npz, .npy, .mat, HDF5 or
+    netCDF. The first row of a grid has the lowest y and the first column the lowest x; pictures of the map show the
+    first row on top, as the file reads.
 
     Frames are raw counts with a calibration, or pressures with --unit. What SRC does not hold stands in files beside
     it: --poses, --head-geometry, --array-calibration. A table becomes a scan where one of these is given or the output

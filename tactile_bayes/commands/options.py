@@ -268,7 +268,7 @@ def _option(record: type[Record], name: str, attributes: Mapping[str, Any]) -> D
         of_field |= {"type": FilePath() if extra.get("path") else _click_type(get_args(bare)[0] if pairs else kind)}
         of_field |= {"multiple": True} if pairs else {}
         of_field |= {"default": default, "show_default": True} if shown else {}
-        if isinstance(of_field["type"], NumberOr):
+        if isinstance(of_field["type"], NumberOr) and default is not None:
             of_field["default"] = default if isinstance(default, str) else f"{default:g}"
     return click.option(flag, *also, name, **_fitting(name, {**of_field, **attributes}))
 

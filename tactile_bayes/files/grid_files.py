@@ -12,9 +12,9 @@ from typing import Any, Final
 import numpy as np
 
 from tactile_bayes.declarations import Record
-from tactile_bayes.errors import BadDataError
+from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.images import read_image
-from tactile_bayes.files.npz import load_npz
+from tactile_bayes.files.named_arrays import ARRAY_SUFFIXES, read_named
 from tactile_bayes.files.reading import TABLE_BYTES, decoded, decoding, other_encoding, read_bytes
 from tactile_bayes.geometry import FloatArray
 
@@ -230,36 +230,55 @@ def _counts(line: FloatArray) -> bool:
 # --- A grid by its file's suffix.
 
 IMAGE_SUFFIXES: Final = (".tif", ".tiff", ".pgm", ".png")
+_ARRAY_SUFFIXES: Final = (*ARRAY_SUFFIXES, ".nc", ".cdf")
+_BESIDE: Final = ("mean", "count", "variance", "spacing_mm")
 TABLE_SUFFIXES: Final = (".csv", ".txt", ".tsv", ".asf", ".asc", ".dat")
 
 
-def open_grid(path: Path, *, no_value: Sequence[str] = ()) -> Grid:
-    """Read a grid's file: an ``.npz`` with ``mean (ny, nx)`` and, if known, ``count``, ``variance`` (NaN where count is
-    1) and ``spacing_mm``; a table of numbers (see `read_table`); or a grey ``.tif``, ``.pgm`` or ``.png`` image.
+def open_grid(path: Path, *, no_value: Sequence[str] = (), array: str = "") -> Grid:
+    """Read a grid's file by its suffix: a table (see `read_table`), an image (see `read_image`), or arrays, of which
+    ``mean (ny, nx)`` may have ``count``, ``variance`` (NaN where count is 1) and ``spacing_mm`` beside it.
     """
     suffix = path.suffix.lower()
-    if suffix == ".npz":
-        arrays = load_npz(path, required=["mean"], optional=("count", "variance", "spacing_mm"))
-        return Grid(arrays, _stated_spacing(arrays.pop("spacing_mm", None)))
+    if suffix in _ARRAY_SUFFIXES:
+        return _of_arrays(path, array)
+    if array:
+        raise UsageError(f"--array is for files of arrays; {path} has none")
     if suffix in IMAGE_SUFFIXES:
         picture = read_image(path)
         return Grid({"mean": picture.values}, None, picture.spacing_mm, "", picture.notes)
     if suffix in TABLE_SUFFIXES:
         return read_table(path, no_value=no_value)
-    known = ", ".join((".npz", *TABLE_SUFFIXES, *IMAGE_SUFFIXES))
-    way_out = _CONVERT.get(suffix, f"grids are read from {known}; scans from .npz and .mcap")
+    known = ", ".join((*TABLE_SUFFIXES, *IMAGE_SUFFIXES, *_ARRAY_SUFFIXES))
+    sheets = suffix in (".xlsx", ".xls", ".ods")
+    way_out = "save the grid as .csv" if sheets else f"grids are read from {known}"
     raise BadDataError(f"has the suffix {suffix or 'none'!r}", way_out=way_out)
 
 
-_FROM_ARRAYS = "`tactile-bayes import --help` says which arrays a scan has; a grid has one, mean"
-_CONVERT = {
-    ".mat": f"read it with scipy.io.loadmat and save its arrays with numpy.savez_compressed as .npz; {_FROM_ARRAYS}",
-    **dict.fromkeys(
-        (".h5", ".hdf5"), f"read it with h5py and save its arrays with numpy.savez_compressed as .npz; {_FROM_ARRAYS}"
-    ),
-    ".npy": f"save it with numpy.savez_compressed as .npz; {_FROM_ARRAYS}",
-    **dict.fromkeys((".xlsx", ".xls", ".ods"), "save the grid as .csv"),
-}
+def _of_arrays(path: Path, array: str) -> Grid:
+    """The array that is named, else ``mean``, else the only one of rows and columns."""
+
+    def wanted(names: Sequence[str]) -> Sequence[str]:
+        return [name for name in _BESIDE if name in names] if "mean" in names and not array else names
+
+    arrays = read_named(path, wanted)
+    if not array and "mean" in arrays:
+        return Grid(arrays, _stated_spacing(arrays.pop("spacing_mm", None)))
+    flat = {name: held for name, held in arrays.items() if held.ndim == 2 and min(held.shape) > 1}
+    if array:
+        flat = {name: held for name, held in flat.items() if name == array}
+    if len(flat) == 1:
+        ((name, values),) = flat.items()
+        return Grid({"mean": values}, notes=() if array or len(arrays) == 1 else (f"the array {name!r} was taken",))
+    has = ", ".join(f"{name} {held.shape}" for name, held in sorted(arrays.items())[:12]) or "nothing"
+    if len(flat) > 1:
+        raise BadDataError(f"holds several arrays of rows and columns ({has})", way_out="name one with --array NAME")
+    if array:
+        raise BadDataError(
+            f"holds no array of rows and columns called {array!r} (it has {has})", way_out="name another"
+        )
+    way_out = "frames with poses are a scan; of frames alone give one, or their mean"
+    raise BadDataError(f"holds no array of rows and columns (it has {has})", way_out=way_out)
 
 
 def _stated_spacing(held: np.ndarray[Any, Any] | None) -> tuple[float, float] | None:

@@ -8,10 +8,15 @@ from typing import Any, Final
 
 import numpy as np
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.grid_files import Grid, is_number, open_grid
+from tactile_bayes.findings import Finding
 from tactile_bayes.geometry import BoolArray, FloatArray
 from tactile_bayes.mapping.map import MapRecipe, TactileMap
+from tactile_bayes.options import GridOptions
+from tactile_bayes.posterior.draw import SamplerSettings
+from tactile_bayes.posterior.estimate import estimate_map
 
 # --- Cells without a value: what stands for "no value" is declared by the file or by the caller, or stands apart.
 
@@ -143,38 +148,26 @@ _LONGEST_MM: Final = 500.0
 """No examined breast is longer; frames that stand one in a row, or one below the other, are."""
 
 
-def read_grid(
-    path: Path,
-    *,
-    spacing_mm: float | None = None,
-    normalise: str = "none",
-    units: str = "",
-    no_value: Sequence[str] = (),
-) -> TactileMap:
-    """Read a grid of values as a map; see `open_grid` and `grid_map`."""
+def read_grid(path: Path, **asked: Any) -> TactileMap:
+    """Read a grid of values as a map; `asked` are fields of `GridOptions`."""
+    return import_grid(path, GridOptions(**asked))[0]
+
+
+def import_grid(path: Path, asked: GridOptions) -> tuple[TactileMap, list[str]]:
+    """The map of a file, and what was found on reading it; see `open_grid` and `grid_map`."""
     try:
-        grid = open_grid(path, no_value=no_value)
-        return grid_map(grid, spacing_mm=spacing_mm, normalise=normalise, units=units, no_value=no_value)[0]
+        return grid_map(open_grid(path, no_value=asked.no_value, array=asked.array or ""), asked)
     except BadDataError as error:
         raise error.at(path) from None
 
 
-def grid_map(
-    grid: Grid,
-    *,
-    spacing_mm: float | None = None,
-    normalise: str = "none",
-    units: str = "",
-    no_value: Sequence[str] = (),
-) -> tuple[TactileMap, list[str]]:
+def grid_map(grid: Grid, asked: GridOptions) -> tuple[TactileMap, list[str]]:
     """The map of a grid, and what was found on the way.
 
-    `spacing_mm` is the side of the square cells and may be left out where the grid has it. `normalise` says what was
-    done to the values already: ``"mean"`` or ``"gain"`` when 1 is the level far from a lump, ``"none"`` when the level
-    is not known. Nothing is divided here. `units` labels values that were not divided. `no_value` are numbers that
-    stand for none, or "none" where every number is a value.
+    The spacing may be left out where the grid has it. With ``normalise="none"`` values are divided only where a `level`
+    is given, which makes it ``"gain"``.
     """
-    spacing, notes = _spacing(grid, given=spacing_mm)
+    spacing, notes = _spacing(grid, given=asked.spacing_mm)
     mean = _real(grid.arrays["mean"], name="mean")
     if mean.ndim != 2 or 0 in mean.shape:
         raise BadDataError(f"mean has shape {mean.shape}", way_out="it must be (ny, nx)")
@@ -183,15 +176,48 @@ def grid_map(
         what = f"{mean.shape[0]} x {mean.shape[1]} cells of {spacing:g} mm are {longest / 1000:.3g} m long"
         way_out = "one frame a row, or frames below each other? import them as a scan; otherwise check the spacing"
         raise BadDataError(what, way_out=way_out)
-    values, marked = without_values(mean, no_value)
+    values, marked = without_values(mean, asked.no_value)
     arrays = {**grid.arrays, "mean": values}
     if "count" in arrays and arrays["count"].shape == mean.shape:
         arrays["count"] = np.where(np.isnan(values) & ~np.isnan(mean), 0, arrays["count"])
         values = np.where(arrays["count"] > 0, values, np.nan)
-    if ALL_ARE_VALUES not in no_value or (np.abs(values) > _BEYOND).any():
+    if ALL_ARE_VALUES not in asked.no_value or (np.abs(values) > _BEYOND).any():
         _refuse_apart(values)
-    made = _map(arrays, spacing_mm=spacing, normalise=normalise, units=units or grid.units)
+    units = asked.units or (grid.units if asked.normalise == "none" else "")
+    made = _map(arrays, spacing_mm=spacing, normalise=asked.normalise, units=units)
+    if asked.level is not None:
+        made = _divided(made, asked.level)
     return made, [*grid.notes, *notes, *marked]
+
+
+# --- Values that are divided by their level here: by a number that is stated, or by what is fitted about the bump.
+
+
+def _divided(made: TactileMap, level: float | str) -> TactileMap:
+    """The map divided by its level, which makes it one by gains; a level that was fitted is a finding."""
+    by = _fitted_level(made) if isinstance(level, str) else level
+    if not by > 0:
+        raise BadDataError(f"the level is {by:.4g}", way_out="subtract the offset of the readings first")
+    unit = made.recipe.units
+    text = f"values were divided by {by:.4g}{f' {unit}' if unit else ''}, the level beside the highest bump of the map"
+    found = Finding("level_fitted", f"{text}; what the hand's pressure changed between frames is still in them")
+    divided = replace(
+        made,
+        mean=made.mean / by,
+        variance=made.variance / by**2,
+        recipe=replace(made.recipe, normalise="gain", units=""),
+        background=1.0,
+        findings=(*made.findings, *([found] if isinstance(level, str) else [])),
+    )
+    _check_level(divided.mean[divided.covered], normalise="gain", units="")
+    return divided
+
+
+def _fitted_level(made: TactileMap) -> float:
+    """Level of a least-squares fit about the highest bump; the median where nothing rises."""
+    options = SamplerSettings(method="optimise", background="free")
+    fit = estimate_map(made, calibration=None, options=options, rng=np.random.default_rng(1)).fit
+    return float(np.median(made.mean[made.covered]) if fit is None else fit.bump.level(fit.theta))
 
 
 def _spacing(grid: Grid, *, given: float | None) -> tuple[float, list[str]]:
@@ -316,5 +342,5 @@ def _check_level(values: FloatArray, *, normalise: str, units: str) -> None:
     if normalise != "none" and not low <= median <= high:
         raise BadDataError(
             f"the median value is {median:.4g}, not near 1 as --normalise {normalise} says",
-            way_out="divide by the level first, or give --normalise none",
+            way_out="divide by the level first, or give its unit and --level fit",
         )

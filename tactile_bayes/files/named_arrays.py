@@ -1,4 +1,4 @@
-"""Arrays by their names from the files of other programs: .npz, .npy, MATLAB's .mat and HDF5."""
+"""Arrays by their names from the files of other programs: .npz, .npy, MATLAB's .mat, HDF5 and netCDF."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import scipy.io
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.arrays_layout import Stated
-from tactile_bayes.files.netcdf import Group, open_netcdf
+from tactile_bayes.files.netcdf import Group, as_declared, open_netcdf
 from tactile_bayes.files.npz import Arrays, choose_npz, load_npy
 from tactile_bayes.files.reading import (
     HDF5_MAGIC,
@@ -72,6 +72,8 @@ def read_named(path: Path, choose: Choose) -> Arrays:
             return {name: array.T for name, array in _hdf5(path, choose, begins_at=_USER_BLOCK).items()}
         if start.startswith(HDF5_MAGIC):
             return _hdf5(path, choose)
+        if start.startswith(b"CDF"):
+            return _chosen(_netcdf_3(path), choose)
     except BadDataError as error:
         raise error.at(path) from None
     raise _of_another_kind(path, start)
@@ -152,6 +154,20 @@ def _fields(name: str, value: Any, *, levels: int) -> Iterator[tuple[str, Any]]:
     elif value.size == 1:
         for field in value.dtype.names:
             yield from _fields(f"{name}.{field}", value.flat[0][field], levels=levels - 1)
+
+
+# --- netCDF-3, by scipy.
+
+
+def _netcdf_3(path: Path) -> Arrays:
+    data = read_bytes(path, most=NETCDF_BYTES)
+    with (
+        decoding("is not a whole netCDF-3 file", way_out=_COPY_AGAIN),
+        warnings.catch_warnings(action="ignore"),
+        scipy.io.netcdf_file(io.BytesIO(data), "r", mmap=False) as file,
+    ):
+        real = {name: one for name, one in file.variables.items() if one.data.dtype.kind in "iuf"}
+        return {name: as_declared(np.array(one.data), vars(one)["_attributes"]) for name, one in real.items()}
 
 
 # --- HDF5, which MATLAB's version 7.3 is.

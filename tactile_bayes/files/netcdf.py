@@ -198,9 +198,12 @@ class Group:
         return values
 
     def numbers(self, name: str) -> Any:
-        """The values of an array of real numbers, of whatever type and dimensions; None for one of anything else."""
+        """The values of an array of real numbers, of whatever type and dimensions; None for one of anything else.
+
+        See `as_declared`.
+        """
         found = self._dataset(name)
-        return self._values(name, found) if found.dtype.kind in "iuf" else None
+        return as_declared(self._values(name, found), found.attrs) if found.dtype.kind in "iuf" else None
 
     def groups(self) -> list[str]:
         """Names of the groups in this one."""
@@ -260,6 +263,22 @@ def _unpacked_bytes(found: Any, stored: Any, filters: list[int], *, most: int) -
         packed = packed[:-_CHECKSUM_BYTES]
     room = _CHECKSUM_BYTES * (_CHECKSUM in before)
     return len(zlib.decompressobj().decompress(packed, most + room)) - room
+
+
+def as_declared(values: Any, attributes: Mapping[str, Any]) -> Any:
+    """Values as their attributes declare them: NaN for ``_FillValue`` and ``missing_value``, then unpacked by
+    ``scale_factor`` and ``add_offset`` (CF conventions 1.11, sections 2.5.1 and 8.1).
+    """
+    names = ("_FillValue", "missing_value", "scale_factor", "add_offset")
+    given = {name: np.atleast_1d(np.asarray(attributes[name])) for name in names if name in attributes}
+    held = {name: array for name, array in given.items() if array.dtype.kind in "iuf" and array.size}
+    missing = np.zeros(np.shape(values), dtype=bool)
+    for name in names[:2]:
+        missing |= np.isin(values, held.get(name, np.array([], values.dtype)))
+    scale, offset = (float(held.get(name, [plain])[0]) for name, plain in (("scale_factor", 1), ("add_offset", 0)))
+    if not missing.any() and (scale, offset) == (1, 0):
+        return values
+    return np.where(missing, np.nan, values * scale + offset)
 
 
 def _text(value: Any) -> str | None:

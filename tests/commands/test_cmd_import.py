@@ -65,7 +65,7 @@ def test_the_unit_of_a_grid_is_unknown_unless_told(tmp_path: Path) -> None:
         (("--units", "kPa", "--normalise", "mean"), "--units is for values that were not divided"),
         (("--units", "\x1b[2J"), "is not a unit"),
         (("--units", ""), "is not a unit"),
-        (("--units", "kPa", "--as", "scan"), "are for maps"),
+        (("--units", "kPa", "--as", "scan"), "for maps only"),
     ],
 )
 def test_a_unit_that_is_none_is_a_usage_error(tmp_path: Path, more: tuple[str, ...], words: str) -> None:
@@ -90,7 +90,7 @@ def test_an_unfinished_scan_is_mended_and_the_loss_told(run_cli: Run, tmp_path: 
 @pytest.mark.parametrize(
     ("arguments", "code", "words"),
     [
-        (["x.npz", "-o", "a.mcap", "--spacing-mm", "1"], 2, "are for maps"),
+        (["x.npz", "-o", "a.mcap", "--spacing-mm", "1"], 2, "for maps only"),
         (["g.csv", "-o", "g.nc"], 2, "--spacing-mm"),
         (["g.csv", "-o", "g.csv", "--spacing-mm", "1"], 2, "is an input"),
         (["g.csv", "-o", "no/g.nc", "--spacing-mm", "1"], 2, "not a directory"),
@@ -99,8 +99,8 @@ def test_an_unfinished_scan_is_mended_and_the_loss_told(run_cli: Run, tmp_path: 
         (["g.npz", "-o", "a.mcap"], 3, "give --as map"),
         (["g.npz", "-o", "a.mcap"], 3, "position_mm (m, 3), quaternion_wxyz (m, 4)"),
         (["g.npz", "-o", "a.mcap"], 3, "`tactile-bayes import --help` says what they are"),
-        (["x.mat", "-o", "a.nc"], 3, "scipy.io.loadmat"),
-        (["x.h5", "-o", "a.nc"], 3, "h5py"),
+        (["x.mat", "-o", "a.nc"], 3, "cannot be read"),
+        (["g.csv", "-o", "a.nc", "--spacing-mm", "1", "--array", "P"], 2, "--array is for files of arrays"),
         (["x.xlsx", "-o", "a.nc"], 3, "save the grid as .csv"),
     ],
 )

@@ -1,0 +1,90 @@
+"""A map from values that Python holds: what `import` makes of a file, without a file."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import tactile_bayes as tb
+from tactile_bayes.errors import BadDataError, UsageError
+
+
+def values() -> Any:
+    y, x = np.mgrid[:41, :45]
+    noise = 0.01 * np.random.default_rng(0).normal(size=x.shape)
+    return 1 + 0.35 * np.exp(-((x - 22) ** 2 + (y - 20) ** 2) / (2 * 5.0**2)) + noise
+
+
+@pytest.fixture(scope="module")
+def size() -> Any:
+    return tb.estimate(tb.map_of(values(), spacing_mm=1.0, normalise="gain"), method="laplace").max_size_mm
+
+
+def test_an_array_is_sized_without_a_file(size: Any) -> None:
+    assert 8 < size.median < 20
+    low, high = size.interval(0.95)
+    assert low < size.median < high
+
+
+def test_pressures_with_their_level_fitted_have_that_size(size: Any) -> None:
+    made = tb.map_of(8.4 * values(), spacing_mm=1.0, units="kPa", level="fit")
+    assert [one.kind for one in made.findings] == ["level_fitted"]
+    found = tb.estimate(made, method="laplace")
+    assert found.max_size_mm.median == pytest.approx(size.median, rel=0.01)
+    assert "level_fitted" in [one.kind for one in found.findings]
+
+
+def test_masks_frames_of_pandas_and_files_are_taken(tmp_path: Path) -> None:
+    held = values()
+    hidden = np.zeros(held.shape, dtype=bool)
+    hidden[0] = True
+    np.savetxt(tmp_path / "a.csv", np.where(hidden, -9, held), delimiter=",")
+    with warnings.catch_warnings(action="ignore"):
+        import pandas as pd
+        import xarray as xr
+    forms = [
+        (np.ma.masked_array(held, hidden), {}),
+        (np.where(hidden, np.nan, held), {}),
+        (np.where(hidden, -9, held), {"no_value": -9}),
+        (np.where(hidden, -9, held), {"no_value": [-9.0, "-1"]}),
+        (pd.DataFrame(np.where(hidden, np.nan, held)), {}),
+        (xr.DataArray(np.where(hidden, np.nan, held)), {}),
+        (tmp_path / "a.csv", {"no_value": "-9"}),
+        (str(tmp_path / "a.csv"), {"no_value": np.float64(-9)}),
+    ]
+    for given, more in forms:
+        made = tb.map_of(given, spacing_mm=np.float64(1.0), normalise="gain", **more).tactile_map
+        np.testing.assert_allclose(made.mean, np.where(hidden, np.nan, held))
+
+
+@pytest.mark.parametrize(
+    ("given", "stated", "error", "words"),
+    [
+        (np.ones((3, 3)), {}, UsageError, r"a map is wanted, not ndarray.*spacing_mm="),
+        (np.ones((3, 3)), {"units": "kPa"}, UsageError, "a grid needs spacing_mm"),
+        (np.ones((3, 3, 3)), {"spacing_mm": 1}, BadDataError, r"mean has shape \(3, 3, 3\)"),
+        (np.ones(3), {"spacing_mm": 1}, BadDataError, r"mean has shape \(3,\)"),
+        (np.array([["a"]]), {"spacing_mm": 1}, BadDataError, "mean is <U1; give real numbers"),
+        ([[1.0, 2.0]], {"spacing_mm": 1}, UsageError, "a map is wanted, not list.*numpy.array"),
+        (np.ones((3, 3)), {"spacing": 1}, TypeError, "has no keyword 'spacing'; did you mean spacing_mm"),
+        (np.ones((3, 3)), {"spacing_mm": "1"}, UsageError, "spacing_mm is '1'"),
+        (np.ones((3, 3)), {"spacing_mm": 1, "level": "auto"}, UsageError, "level is 'auto'"),
+        (np.ones((3, 3)), {"spacing_mm": 1, "normalise": "gain", "units": "kPa"}, UsageError, "^units is for values"),
+        (np.where(values() > 1.3, 0, values()), {"spacing_mm": 1}, BadDataError, "give no_value=0; if all are values"),
+    ],
+)
+def test_what_cannot_be_a_map_is_told_in_the_words_of_python(
+    given: Any, stated: dict[str, Any], error: type[Exception], words: str
+) -> None:
+    with pytest.raises(error, match=words):
+        tb.map_of(given, **stated)
+
+
+def test_a_map_is_given_as_before() -> None:
+    made = tb.map_of(values(), spacing_mm=1, normalise="gain")
+    assert tb.map_of(made) is made
+    assert tb.map_of(made.tactile_map).tactile_map is made.tactile_map
