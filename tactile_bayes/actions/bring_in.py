@@ -14,7 +14,7 @@ from tactile_bayes.commands.options import refuse_same
 from tactile_bayes.declarations import Record, as_dict, names_of, replace
 from tactile_bayes.errors import BadDataError, TactileBayesError, UsageError, one_line
 from tactile_bayes.files.array_map import array_template, read_array_map
-from tactile_bayes.files.arrays_layout import ArrayMap, Stated
+from tactile_bayes.files.arrays_layout import ArrayMap, GridOptions, Stated
 from tactile_bayes.files.atomic import check_suffix, refuse_existing
 from tactile_bayes.files.documents import with_session
 from tactile_bayes.files.grids import import_grid
@@ -25,7 +25,6 @@ from tactile_bayes.files.provenance import Provenance, hash_inputs
 from tactile_bayes.files.scan_mcap import read_scan_report, read_truth, write_scan
 from tactile_bayes.findings import finding_lines
 from tactile_bayes.mapping.arrangement import check_scan, corrected
-from tactile_bayes.options import GridOptions
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.scan import Scan
 

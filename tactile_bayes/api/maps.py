@@ -13,6 +13,7 @@ import numpy as np
 from tactile_bayes.api.arguments import check_keywords, door, plain
 from tactile_bayes.declarations import EXACT, Record, as_dict, names_of, to_plain
 from tactile_bayes.errors import UsageError, check_number
+from tactile_bayes.files.arrays_layout import GridOptions
 from tactile_bayes.files.atomic import Format, check_suffix, sha256
 from tactile_bayes.files.grid_files import Grid
 from tactile_bayes.files.grids import grid_map, import_grid
@@ -25,7 +26,7 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.arrangement import ArrangementCheck, check_scan
 from tactile_bayes.mapping.build import build_map as build
 from tactile_bayes.mapping.map import TactileMap
-from tactile_bayes.options import GridOptions, MapOptions
+from tactile_bayes.options import MapOptions
 from tactile_bayes.presets import PRESSURE_WINDOW_KPA, RESEARCH_USE
 from tactile_bayes.report.map_figure import map_figure
 from tactile_bayes.scan import Scan
@@ -352,7 +353,7 @@ def map_of(given: Any, **stated: Any) -> Map:
         (ny, nx) values, the lowest y and x first, NaN where there is none; or the path of a file that `tactile-bayes
         import` takes as a map. Without `stated` also a map as it is: a `Map`, a `TactileMap`, or the path of a map.
     **stated
-        As of `tactile_bayes.options.GridOptions`: spacing_mm, normalise, level, units, no_value, array.
+        As of `tactile_bayes.files.arrays_layout.GridOptions`: spacing_mm, normalise, level, units, no_value, array.
 
     Returns
     -------

@@ -10,8 +10,8 @@ import click
 
 from tactile_bayes.commands.options import FORCE, JSON, METAVAR, SESSION, FigurePath, FilePath, takes
 from tactile_bayes.declarations import names_of
-from tactile_bayes.files.arrays_layout import Stated, layout_lines
-from tactile_bayes.options import GridOptions, IdentityOptions, MapOptions, RecordOptions
+from tactile_bayes.files.arrays_layout import GridOptions, Stated, layout_lines
+from tactile_bayes.options import IdentityOptions, MapOptions, RecordOptions
 from tactile_bayes.presets import CORRECTIONS, METHODS
 
 # --- `demo`: the main steps on data that comes with the program.

@@ -1,10 +1,12 @@
-"""Layout of a scan's arrays in other programs' files, and what can be stated of them."""
+"""Layout of a scan's arrays in other programs' files, and what can be stated of them and of a grid."""
 
 from __future__ import annotations
 
 from typing import Annotated, Any, Final, Literal, NamedTuple
 
 from tactile_bayes.declarations import Meta, Options, field
+from tactile_bayes.errors import UsageError
+from tactile_bayes.presets import Normalise
 
 Shape = tuple[str | int, ...]
 
@@ -150,3 +152,54 @@ class ArrayMap(Stated, kw_only=True):
     values: Annotated[dict[str, Any], Meta(description="Arrays that the file lacks, such as pitch_mm = 1.5.")] = field(
         default_factory=dict
     )
+
+
+# --- What can be stated of a grid.
+
+_LONGEST_UNITS: Final = 20
+
+
+class GridOptions(Options, kw_only=True):
+    """What is stated of a grid of values that becomes a map."""
+
+    spacing_mm: Annotated[
+        float | None, Meta(description="Map: side of the square cells, in mm.", extra={"metavar": "H"})
+    ] = None
+    normalise: Annotated[Normalise, Meta(description="Map: how the values are already normalised.")] = "none"
+    level: Annotated[
+        Annotated[float, Meta(gt=0)] | Literal["fit"] | None,
+        Meta(
+            description="Map: divide values such as kPa by their level beside the lump: a number, or fit, to take it "
+            "from the map.",
+            extra={"metavar": "L|fit"},
+        ),
+    ] = None
+    units: Annotated[
+        str | None,
+        Meta(
+            description="Map: unit of values that are not normalised, such as kPa. Default: unknown.",
+            extra={"metavar": "TEXT"},
+        ),
+    ] = None
+    no_value: Annotated[
+        tuple[str, ...],
+        Meta(
+            description="Map: a number or text that stands for no value, such as -9999; none: every number is a value.",
+            extra={"metavar": "V"},
+        ),
+    ] = ()
+    array: Annotated[
+        str | None,
+        Meta(description="Map: which array of SRC, where it holds several.", extra={"metavar": "NAME"}),
+    ] = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name, value in (("units", self.units), ("level", self.level)):
+            if value is not None and self.normalise != "none":
+                raise UsageError(
+                    f"--{name} is for values that were not divided; leave it out or --normalise {self.normalise}"
+                )
+        if self.units is not None and not (self.units.isprintable() and 0 < len(self.units.strip()) <= _LONGEST_UNITS):
+            what = f"--units {self.units[:30]!r} is not a unit"
+            raise UsageError(f"{what}; give up to {_LONGEST_UNITS} letters, such as kPa")

@@ -10,11 +10,11 @@ import numpy as np
 
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, UsageError
+from tactile_bayes.files.arrays_layout import GridOptions
 from tactile_bayes.files.grid_files import Grid, is_number, open_grid
 from tactile_bayes.findings import Finding
 from tactile_bayes.geometry import BoolArray, FloatArray
 from tactile_bayes.mapping.map import MapRecipe, TactileMap
-from tactile_bayes.options import GridOptions
 from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map
 
