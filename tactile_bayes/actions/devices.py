@@ -109,7 +109,7 @@ def _device(kind: str, scan: Scan, protocol: str, faults: Faults, *, path: Path,
         return EmulatedHead(scan)
     if kind == "tracker" and len(scan.poses) and protocol == "ndi":
         elapsed: Callable[[], float | None] | None = None if held is None else lambda: held.now()[1]
-        return EmulatedNdi(scan.poses, hold=faults.hold, hide=faults.hide, elapsed=elapsed)
+        return EmulatedNdi(scan.poses, faults=faults, elapsed=elapsed)
     if kind == "tracker" and len(scan.poses):
         return EmulatedTracker(scan.poses, protocol=protocol, faults=faults)
     what = "frames" if kind == "head" else "poses"

@@ -337,7 +337,7 @@ def file_findings(records: McapRecords) -> tuple[Finding, ...]:
 def json_attachment(records: McapRecords, name: str) -> dict[str, Any]:
     """Read an attached JSON object."""
     if name not in records.attachments:
-        raise BadDataError(f"holds no {name}", way_out="the recording was cut off in its header; scan again")
+        raise BadDataError(f"holds no {name}", way_out="a scan of `record`, `import` or `simulate` begins with it")
     return json_object(records.attachments[name].decode("utf-8", "replace"), name=name)
 
 
@@ -355,7 +355,8 @@ def message_times(messages: Messages, *, topic: str) -> FloatArray:
     latest = int(times.max()) if len(times) else 0
     if latest > _LATEST_NS:
         raise BadDataError(
-            f"{topic} holds a time of {latest} ns", way_out=f"times must be {_LATEST_NS} ns or less; record it again"
+            f"{topic} holds a time of {latest} ns",
+            way_out=f"times must be {_LATEST_NS} ns or less; import it with times from 0",
         )
     return s_from_ns(times.astype(np.int64))
 

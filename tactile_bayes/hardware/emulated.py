@@ -23,7 +23,7 @@ from tactile_bayes.hardware.readings import (
     ToolReading,
     pose_from_relative,
 )
-from tactile_bayes.hardware.serial_trackers import SCALE_INCH, record_bytes
+from tactile_bayes.hardware.serial_trackers import record_bytes
 from tactile_bayes.hardware.trackers import encode_transform
 from tactile_bayes.scan import Scan, TrackerPoses
 
@@ -150,41 +150,50 @@ _REFERENCE_MM: Final = (250.0, -40.0, 30.0)
 _REFERENCE_TURN: Final = (0.8, 0.0, 0.6, 0.0)
 
 
+class PlayedTools:
+    """What a tracker knows while it plays a scan's poses, with the faults that are a tracker's.
+
+    `names` are those of the tool and of a second one, which is fixed to the body and there where that breathes.
+    """
+
+    def __init__(self, poses: TrackerPoses, faults: Faults, *, names: tuple[str, str]) -> None:
+        self._poses, self._faults, self._names = poses, faults, names
+
+    def readings(self, index: int) -> list[ToolReading]:
+        """Readings at the n-th time, of the second tool first."""
+        pose, hidden, breath_mm = self._pose(index), self._faults.hide, self._faults.breathe_mm
+        time_s = float(self._poses.time_s[index] - self._poses.time_s[0])
+        bases = []
+        if breath_mm:
+            x, y, z = _REFERENCE_MM
+            y += breath_mm / 2 * math.sin(2 * math.pi * time_s / _BREATH_S)
+            bases = [PoseReading((x, y, z), _REFERENCE_TURN, pose.device_ns, tool=self._names[1])]
+            pose = pose_from_relative(pose, bases[0])._replace(tool=self._names[0])
+        if hidden is not None and hidden[0] <= time_s < hidden[0] + hidden[1]:
+            return [*bases, MissingReading("out of sight", pose.tool)]
+        return [*bases, pose]
+
+    def _pose(self, index: int) -> PoseReading:
+        """The n-th pose: at its own time, with the values of the latest measurement."""
+        measured = index - index % max(1, self._faults.hold)
+        x, y, z = (float(value) for value in self._poses.position_mm[measured])
+        w, i, j, k = (float(value) for value in self._poses.quaternion_wxyz[measured])
+        time_s = float(self._poses.time_s[index])
+        whole = int(time_s)
+        return PoseReading((x, y, z), (w, i, j, k), whole * _NS + round((time_s - whole) * _NS))
+
+
 class EmulatedTracker(Device):
     """An emulated tracker of one of `PROTOCOLS`, or in the open framing, with a tracker's faults."""
 
     def __init__(self, poses: TrackerPoses, *, protocol: str, faults: Faults | None = None) -> None:
         self.times_s = poses.time_s
-        self._poses = poses
         self._protocol = protocol
         self._commands = PacketParser()
         self._faults = faults or Faults()
-        self._hold = max(1, self._faults.hold)
+        names = ("Probe", "Reference") if protocol in ("open", "igtlink") else ("1", "2")
+        self._tools = PlayedTools(poses, self._faults, names=names)
         self._encode = PROTOCOLS[protocol]
-
-    def readings(self, index: int) -> list[ToolReading]:
-        """What the tracker knows at the n-th time, of one tool or two."""
-        pose, hidden, breath_mm = self.pose(index), self._faults.hide, self._faults.breathe_mm
-        time_s = float(self.times_s[index] - self.times_s[0])
-        numbers = self._protocol not in ("open", "igtlink")
-        if breath_mm:
-            x, y, z = _REFERENCE_MM
-            y += breath_mm / 2 * math.sin(2 * math.pi * time_s / _BREATH_S)
-            base = PoseReading((x, y, z), _REFERENCE_TURN, pose.device_ns, tool="2" if numbers else "Reference")
-            pose = pose_from_relative(pose, base)._replace(tool="1" if numbers else "Probe")
-        seen: ToolReading = pose
-        if hidden is not None and hidden[0] <= time_s < hidden[0] + hidden[1]:
-            seen = MissingReading("out of sight", pose.tool)
-        return [base, seen] if breath_mm else [seen]
-
-    def pose(self, index: int) -> PoseReading:
-        """The n-th pose sent: at its own time, with the values of the latest measurement."""
-        measured = index - index % self._hold
-        x, y, z = (float(value) for value in self._poses.position_mm[measured])
-        w, i, j, k = (float(value) for value in self._poses.quaternion_wxyz[measured])
-        time_s = float(self.times_s[index])
-        whole = int(time_s)
-        return PoseReading((x, y, z), (w, i, j, k), whole * _NS + round((time_s - whole) * _NS))
 
     def greet(self) -> None:
         """Start sending in OpenIGTLink, whose servers send to whoever connects."""
@@ -218,7 +227,7 @@ class EmulatedTracker(Device):
         return answer
 
     def record(self, index: int) -> bytes:
-        return b"".join(self._encode(one, index) for one in self.readings(index))
+        return b"".join(self._encode(one, index) for one in self._tools.readings(index))
 
     def end(self, sent: int, dropped: int) -> bytes:
         """Encode an END in the open framing; other protocols have none."""
@@ -264,7 +273,7 @@ def _liberty_ascii(pose: PoseReading, _: int) -> bytes:
 
 def _bird(pose: PoseReading, _: int) -> bytes:
     address = bytes([int(pose.tool)]) if pose.tool else b""  # of group mode
-    return record_bytes(_inches(pose), pose.quaternion_wxyz, scale_inch=SCALE_INCH) + address
+    return record_bytes(_inches(pose), pose.quaternion_wxyz) + address
 
 
 def _no_word(encode: Encoder) -> Callable[[ToolReading, int], bytes]:
@@ -314,10 +323,10 @@ def crc16(data: bytes) -> int:
 
 
 class EmulatedNdi(Device):
-    """NDI tracker that answers with the pose of the present time, counted from TSTART; it never sends unasked.
+    """NDI tracker that answers with the poses of the present time, counted from TSTART; it never sends unasked.
 
-    Only every `hold`-th pose is measured anew. A `wireless` tool has to be described by the host first. `clock` gives
-    seconds from anywhere; `elapsed` the seconds of the scan that other devices play too, None while it waits: by
+    Of the faults it has those that are a tracker's. A `wireless` tool has to be described by the host first. `clock`
+    gives seconds from anywhere; `elapsed` the seconds of the scan that other devices play too, None while it waits: by
     default the scan begins with TSTART.
     """
 
@@ -325,8 +334,7 @@ class EmulatedNdi(Device):
         self,
         poses: TrackerPoses,
         *,
-        hold: int = 1,
-        hide: tuple[float, float] | None = None,
+        faults: Faults | None = None,
         wireless: bool = False,
         clock: Callable[[], float] = time.monotonic,
         elapsed: Callable[[], float | None] | None = None,
@@ -334,8 +342,9 @@ class EmulatedNdi(Device):
         self.times_s = poses.time_s
         self._elapsed = elapsed
         self.described = b""
-        self._poses, self._hold, self._clock = poses, max(1, hold), clock
-        self._hide = (math.inf, 0.0) if hide is None else hide
+        self._clock, faults = clock, faults or Faults()
+        self._tools = PlayedTools(poses, faults, names=("", ""))
+        self._handles = (HANDLE + 1, HANDLE) if faults.breathe_mm else (HANDLE,)
         self._begun: float | None = None
         self._port = "none" if wireless else "plugged in"
         self._rest = b""
@@ -369,7 +378,7 @@ class EmulatedNdi(Device):
             case "VER":
                 return "Emulated NDI tracker\nfor tests"
             case "PHSR":
-                return self._handles(int(rest or "0", 16))
+                return self._listed(int(rest or "0", 16))
             case "PHRQ":
                 self._port = "asked for"
                 return f"{HANDLE:02X}"
@@ -386,24 +395,28 @@ class EmulatedNdi(Device):
                 return None
         return "OKAY"
 
-    def _handles(self, kind: int) -> str:
+    def _listed(self, kind: int) -> str:
         wanted = {0: None, 1: "to be freed", 2: "plugged in", 3: "initialised", 4: "enabled"}.get(kind)
-        listed = self._port != "none" if wanted is None else self._port == wanted
-        return f"01{HANDLE:02X}{_PORT_STATUS:03X}" if listed else "00"
+        if self._port != "none" if wanted is None else self._port == wanted:
+            ports = "".join(f"{handle:02X}{_PORT_STATUS:03X}" for handle in sorted(self._handles))
+            return f"{len(self._handles):02X}{ports}"
+        return "00"
 
     def _poses_now(self) -> bytes:
         if self._begun is None or self._port != "enabled":
             return _text(f"ERROR{_NOT_NOW:02X}")
         elapsed = self._clock() - self._begun if self._elapsed is None else self._elapsed() or 0.0
         index = int(np.searchsorted(self.times_s - self.times_s[0], elapsed, side="right")) - 1
-        index -= index % self._hold
         put_away = elapsed > self.times_s[-1] - self.times_s[0] + 0.1
-        if put_away or self._hide[0] <= elapsed < sum(self._hide):
-            status = _PORT_STATUS | (0 if put_away else _OUT_OF_VOLUME)
-            body = struct.pack("<BBBII", 1, HANDLE, _MISSING, status, len(self.times_s) + 1 + round(1000 * elapsed))
-        else:
-            numbers = (*self._poses.quaternion_wxyz[index], *self._poses.position_mm[index], 0.1)
-            body = struct.pack("<BBB8fII", 1, HANDLE, _VALID, *map(float, numbers), _PORT_STATUS, index + 1)
+        frame = index + 1 + (round(1000 * elapsed) if put_away else 0)
+        body = bytes([len(self._handles)])
+        for handle, one in zip(self._handles, self._tools.readings(index), strict=True):
+            if put_away or isinstance(one, MissingReading):
+                status = _PORT_STATUS | (0 if put_away else _OUT_OF_VOLUME)
+                body += struct.pack("<BBII", handle, _MISSING, status, frame)
+            else:
+                numbers = (*one.quaternion_wxyz, *one.position_mm, 0.1)
+                body += struct.pack("<BB8fII", handle, _VALID, *numbers, _PORT_STATUS, frame)
         header = struct.pack("<HH", _START, len(body))
         return header + crc16(header).to_bytes(2, "little") + body + crc16(body).to_bytes(2, "little")
 

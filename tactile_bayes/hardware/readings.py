@@ -186,11 +186,8 @@ class Follower:
             self._fresh = False
 
     def _referred(self, reading: ToolReading, host_ns: int) -> Iterator[tuple[ToolReading, int]]:
-        held = self._held
-        self._base, self._fresh = None, False
-        if isinstance(reading, PoseReading):
-            self._base = reading, host_ns
-            self._fresh = held is None or held[0].device_ns != reading.device_ns
+        self._base = (reading, host_ns) if isinstance(reading, PoseReading) else None
+        self._fresh = self._base is not None and self._held is None
         yield from self._release()
 
     def _release(self) -> Iterator[tuple[ToolReading, int]]:
@@ -277,8 +274,7 @@ AHEAD_NS: Final = 2 * _S
 _SLIP_NS: Final = _S // 4
 # After so many steps a clock is not believed any more.
 MOST_STEPS: Final = 20
-HEAD_STILL_NS: Final = _S // 10
-TRACKER_STILL_NS: Final = _S
+STILL_NS: Final = _S // 10
 # Counters that start again: 2^16 ms, 2^31 and 2^32 of ns, us and ms, 2^24 us, and clocks of a minute to a day.
 WRAPS_NS: Final = tuple(
     sorted(
@@ -334,14 +330,13 @@ class DeviceClock:
 
     A counter that wraps is unwrapped when its period is one of `WRAPS_NS` and agrees with the host's clock. Any other
     step, back or forward, is replaced by the time that passed on the host since, by `ArrivalClock`; from there the
-    device's clock goes on. A clock that stands still for `still_ns`, or steps again and again, is replaced by the
+    device's clock goes on. A clock that stands still for `STILL_NS`, or steps again and again, is replaced by the
     host's for good. Devices whose clocks count from one zero share an `arrival`.
     """
 
-    def __init__(self, *, still_ns: int, arrival: ArrivalClock | None = None) -> None:
+    def __init__(self, *, arrival: ArrivalClock | None = None) -> None:
         self.arrival = ArrivalClock() if arrival is None else arrival
         self.wraps = self.steps = 0
-        self._still_ns = still_ns
         self._trusted = True
         self._shift_ns = 0
         self._raw_ns: int | None = None
@@ -370,7 +365,7 @@ class DeviceClock:
             return Moment(self._by_host(host_ns))
         if time_ns < self._last_ns:
             return self._back(raw_ns, host_ns, before_ns)
-        if time_ns == self._last_ns and host_ns - self._moved_ns > self._still_ns:
+        if time_ns == self._last_ns and host_ns - self._moved_ns > STILL_NS:
             self._trusted = False
             return self._step(raw_ns, host_ns, "stood still")
         ahead_ns = time_ns + self.arrival.offset_ns - host_ns
@@ -415,8 +410,8 @@ class PoseClock:
     """
 
     def __init__(self, *, shared: bool) -> None:
-        self.head = DeviceClock(still_ns=HEAD_STILL_NS)
-        self.tracker = DeviceClock(still_ns=TRACKER_STILL_NS, arrival=self.head.arrival if shared else None)
+        self.head = DeviceClock()
+        self.tracker = DeviceClock(arrival=self.head.arrival if shared else None)
         self._shared = shared
         self._last_ns = 0
 

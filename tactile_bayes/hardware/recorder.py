@@ -387,6 +387,9 @@ class Recorder:
         self._touched(reading, host_ns)
         if not self.recording:
             return
+        if reading.device_ns is not None and self._last_pose is not None and reading[:3] == self._last_pose[:3]:
+            self._missing(MissingReading("an old record sent again", reading.tool), host_ns + self._zero_ns)
+            return
         moment = self._clock.place(reading.device_ns, host_ns)
         if moment is None:
             self.report.poses_without_time += 1

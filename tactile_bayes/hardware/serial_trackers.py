@@ -26,28 +26,23 @@ from tactile_bayes.hardware.readings import (
     RecordParser,
     plausible,
 )
-from tactile_bayes.hardware.trackers import IgtlinkParser, NdiPort
+from tactile_bayes.hardware.trackers import IgtlinkParser, NdiPort, ask_for_tdata
 
 # --- Parser for Ascension Flock of Birds and miniBIRD trackers, position and quaternion.
 #
 # A record is seven words of 14 bits, each sent as two bytes of seven; bit 7 marks the first byte of a record and no
 # other, so that a lost byte costs one record.
 
-SCALE_INCH: Final = 36.0
+_SCALE_INCH: Final = 36.0
 _WORDS: Final = 7
 
 
 class BirdParser(RecordParser):
-    """Parser of Flock of Birds records.
+    """Parser of Flock of Birds records of the standard transmitter; in group mode the bird's address follows each."""
 
-    A position's full scale is 36 inches, or 72 with the long scaling, 144 with the extended range transmitter. In group
-    mode the bird's address follows each record.
-    """
-
-    def __init__(self, *, scale_inch: float = SCALE_INCH, group: bool = False) -> None:
+    def __init__(self, *, group: bool = False) -> None:
         super().__init__()
         self.record_bytes = 2 * _WORDS + group
-        self._scale = scale_inch
         self._group = group
 
     def _record(self, record: bytes) -> PoseReading | None:
@@ -55,7 +50,7 @@ class BirdParser(RecordParser):
             return None
         x, y, z, *turn = (word(record[i], record[i + 1]) for i in range(0, 2 * _WORDS, 2))
         w, i, j, k = (number / 32768 for number in turn)
-        step = self._scale / 32768 * MM_PER_INCH
+        step = _SCALE_INCH / 32768 * MM_PER_INCH
         if not plausible((x * step, y * step, z * step), (w, i, j, k)):
             return None
         return PoseReading((x * step, y * step, z * step), (w, i, j, k), tool=str(record[-1]) if self._group else "")
@@ -67,11 +62,9 @@ def word(low: int, high: int) -> int:
     return number - 65536 if number & 0x8000 else number
 
 
-def record_bytes(
-    position_inch: Sequence[float], quaternion_wxyz: Sequence[float], *, scale_inch: float = SCALE_INCH
-) -> bytes:
+def record_bytes(position_inch: Sequence[float], quaternion_wxyz: Sequence[float]) -> bytes:
     """Encode a pose as the device would: truncated to 14 bits."""
-    scaled = [value / scale_inch * 32768 for value in position_inch] + [value * 32768 for value in quaternion_wxyz]
+    scaled = [value / _SCALE_INCH * 32768 for value in position_inch] + [value * 32768 for value in quaternion_wxyz]
     out = bytearray()
     for value in scaled:
         number = max(-32768, min(32767, math.floor(value))) & 0xFFFF
@@ -80,7 +73,7 @@ def record_bytes(
     return bytes(out)
 
 
-# --- Parsers for Polhemus FASTRAK, LIBERTY and PATRIOT trackers.
+# --- Parsers for Polhemus FASTRAK, LIBERTY and PATRIOT trackers, in the layouts that the drivers below ask for.
 #
 # FASTRAK numbers its output items otherwise than LIBERTY and PATRIOT: 11 is a quaternion there, the distortion
 # here. Positions are asked for in inches, because that is what both give after a reset; quaternions are scalar
@@ -90,27 +83,15 @@ def record_bytes(
 # ----------
 # Polhemus, 3SPACE FASTRAK User's Manual, revision G (2012); PATRIOT and LIBERTY user manuals.
 
-FASTRAK_BINARY: Final = (2, 11, 0)
-FASTRAK_ASCII: Final = (2, 11, 1)
-LIBERTY_BINARY: Final = (2, 7, 8, 11, 0)
-LIBERTY_ASCII: Final = (2, 7, 8, 11, 1)
-
-_FASTRAK_KIND: Final = {2: "position", 4: "euler", 11: "quaternion"}
-_LIBERTY_KIND: Final = {
-    2: "position",
-    3: "position",
-    4: "euler",
-    5: "euler",
-    7: "quaternion",
-    8: "time_ms",
-    9: "count",
-    10: "stylus",
-    11: "distortion",
-}
-_NUMBERS: Final = {"position": 3, "euler": 3, "quaternion": 4}  # others: 1
+_SEVEN: Final = struct.Struct("<7f")  # position, quaternion
+_DECIMALS: Final = (2, 2, 2, 4, 4, 4, 4)
+_COLUMN: Final = 7
+# Tag, station, command, error, spare, size; then position, quaternion, ms, distortion.
+_LIBERTY: Final = struct.Struct("<2sBBBBH7fIi")
+_LIBERTY_HEADER_BYTES: Final = 8
 _TAGS: Final = (b"LY", b"PA", b"LU")
-_LIBERTY_HEADER: Final = struct.Struct("<2sBBBBH")
 _LONGEST_LINE: Final = 512
+_WORDS_LIBERTY: Final = 9
 
 
 class FastrakParser(RecordParser):
@@ -120,85 +101,45 @@ class FastrakParser(RecordParser):
     tell a record from noise.
     """
 
-    def __init__(self, items: Sequence[int] = FASTRAK_BINARY, *, binary: bool = True) -> None:
+    def __init__(self, *, binary: bool = True) -> None:
         super().__init__()
-        self._items = tuple(items)
         self._binary = binary
-        numbers = sum(_NUMBERS[_FASTRAK_KIND[item]] for item in items if item in _FASTRAK_KIND)
-        ends = {0: 1, 1: 2}
-        self.record_bytes = 3 + numbers * (4 if binary else 7) + sum(ends.get(item, 0) for item in items)
+        self.record_bytes = 3 + _SEVEN.size + 1 if binary else 3 + 7 * _COLUMN + 2
 
     def _record(self, record: bytes) -> PoseReading | None:
         station, error = record[1] - 48, record[2:3]
         if record[:1] != b"0" or not 1 <= station <= 4 or not (error.isalpha() or error == b" "):
             return None
-        values = self._values(record)
-        if values is None:
-            return None
-        flags = () if error == b" " else (f"error {error.decode()}",)
-        return pose_from_items(values, flags=flags, tool=str(station))
-
-    def _values(self, record: bytes) -> dict[str, tuple[float, ...]] | None:
-        values, place = {}, 3
-        for item in self._items:
-            kind = _FASTRAK_KIND.get(item)
-            if kind is None:
-                end = b" " if item == 0 else b"\r\n"
-                if record[place : place + len(end)] != end:
-                    return None
-                place += len(end)
-                continue
-            numbers, width = _NUMBERS[kind], 4 if self._binary else 7
-            part = record[place : place + numbers * width]
-            parsed = struct.unpack(f"<{numbers}f", part) if self._binary else _columns(part, decimals=_DECIMALS[kind])
-            if parsed is None:
-                return None
-            values[kind] = parsed
-            place += numbers * width
-        return values
+        if self._binary:
+            values = _SEVEN.unpack_from(record, 3) if record[-1:] == b" " else None
+        else:
+            values = _columns(record[3:-2]) if record[-2:] == b"\r\n" else None
+        return None if values is None else _polhemus_pose(values, error, station)
 
 
-_DECIMALS: Final = {"position": 2, "euler": 2, "quaternion": 4}
-
-
-def _columns(text: bytes, *, decimals: int) -> tuple[float, ...] | None:
+def _columns(text: bytes) -> tuple[float, ...] | None:
     """Parse numbers in columns of seven characters, which may touch."""
-    pattern = rb" *[+-]? *\d*\.\d{%d}" % decimals
-    cells = [text[i : i + 7] for i in range(0, len(text), 7)]
-    if not all(re.fullmatch(pattern, cell) for cell in cells):
-        return None
-    try:
-        return tuple(float(cell.replace(b" ", b"")) for cell in cells)
-    except ValueError:
-        return None
+    cells = [text[i : i + _COLUMN] for i in range(0, len(text), _COLUMN)]
+    for cell, decimals in zip(cells, _DECIMALS, strict=True):
+        if not re.fullmatch(rb" *[+-]? *\d*\.\d{%d}" % decimals, cell):
+            return None
+    return tuple(float(cell.replace(b" ", b"")) for cell in cells)
 
 
 class LibertyParser(RecordParser):
-    """Parser of LIBERTY, PATRIOT and Latus binary records, by their list of items.
+    """Parser of LIBERTY, PATRIOT and Latus binary records.
 
     The header's size is a check with a tolerance of the closing space, which firmware may or may not count.
     """
 
-    def __init__(self, items: Sequence[int] = LIBERTY_BINARY) -> None:
-        super().__init__()
-        self._kinds = [_LIBERTY_KIND[item] for item in items if item in _LIBERTY_KIND]
-        letters = {"time_ms": "I", "count": "I", "stylus": "I", "distortion": "i"}
-        self._body = struct.Struct("<" + "".join(letters.get(k, f"{_NUMBERS.get(k, 1)}f") for k in self._kinds))
-        self._tail = b"".join({0: b" ", 1: b"\r\n"}.get(item, b"") for item in items)
-        self.record_bytes = _LIBERTY_HEADER.size + self._body.size + len(self._tail)
+    record_bytes = _LIBERTY.size + 1
 
     def _record(self, record: bytes) -> PoseReading | None:
-        tag, station, command, error, _, size = _LIBERTY_HEADER.unpack_from(record)
-        fits = abs(size - self._body.size) <= max(2, len(self._tail))
-        if tag not in _TAGS or not 1 <= station <= 16 or command not in b"CP" or not fits:
+        tag, station, command, error, _, size, *values, time_ms, distortion = _LIBERTY.unpack_from(record)
+        fits = abs(size - _LIBERTY.size + _LIBERTY_HEADER_BYTES) <= 2
+        if tag not in _TAGS or not 1 <= station <= 16 or command not in b"CP" or not fits or record[-1:] != b" ":
             return None
-        if not record.endswith(self._tail):
-            return None
-        raw, values = iter(self._body.unpack_from(record, _LIBERTY_HEADER.size)), {}
-        for kind in self._kinds:
-            values[kind] = tuple(next(raw) for _ in range(_NUMBERS.get(kind, 1)))
-        flags = () if error == 0x20 else (f"error {chr(error) if 0x20 < error < 0x7F else error}",)
-        return pose_from_items(values, flags=flags, tool=str(station))
+        return _polhemus_pose(values, bytes([error]), station, time_ms, distortion)
 
 
 class LibertyAsciiParser:
@@ -206,9 +147,8 @@ class LibertyAsciiParser:
 
     fault = remark = ""
 
-    def __init__(self, items: Sequence[int] = LIBERTY_ASCII) -> None:
+    def __init__(self) -> None:
         self.garbage_bytes = 0
-        self._kinds = [_LIBERTY_KIND[item] for item in items if item in _LIBERTY_KIND]
         self._rest = b""
 
     def feed(self, data: bytes) -> list[Reading]:
@@ -230,42 +170,28 @@ class LibertyAsciiParser:
         station, error, words = line[:2], line[2:3], line[3:].split()
         if not re.fullmatch(rb"[ 0]\d|1[0-6]", station) or not (error.isalpha() or error == b" "):
             return None
-        if len(words) != sum(_NUMBERS.get(kind, 1) for kind in self._kinds):
+        if len(words) != _WORDS_LIBERTY or not all(
+            re.fullmatch(rb"[+-]?\d+(\.\d*)?([eE][+-]?\d+)?", word) for word in words
+        ):
             return None
-        if not all(re.fullmatch(rb"[+-]?\d+(\.\d*)?([eE][+-]?\d+)?", word) for word in words):
+        *values, time_ms, distortion = (float(word) for word in words)
+        if not math.isfinite(time_ms + distortion):
             return None
-        numbers = iter(float(word) for word in words)
-        values = {kind: tuple(next(numbers) for _ in range(_NUMBERS.get(kind, 1))) for kind in self._kinds}
-        flags = () if error == b" " else (f"error {error.decode()}",)
-        return pose_from_items(values, flags=flags, tool=str(int(station)))
+        return _polhemus_pose(values, error, int(station), int(time_ms), int(distortion))
 
 
-def pose_from_items(
-    values: Mapping[str, tuple[float, ...]], *, flags: tuple[str, ...], tool: str
+def _polhemus_pose(
+    values: Sequence[float], error: bytes, station: int, time_ms: int | None = None, distortion: int = 0
 ) -> PoseReading | None:
-    """Pose from a record's items in inches; None for items that cannot be a pose."""
-    position = [number * MM_PER_INCH for number in values["position"]]
-    quaternion = values.get("quaternion") or quaternion_from_euler(*values["euler"])
-    if not plausible(position, quaternion):
+    """Pose from a place in inches and a quaternion; None for numbers that cannot be one. A space is no error."""
+    x, y, z = (number * MM_PER_INCH for number in values[:3])
+    w, i, j, k = values[3:]
+    if not plausible((x, y, z), (w, i, j, k)):
         return None
-    distortion = int(values.get("distortion", (0,))[0])
-    flags += (f"distortion {distortion}",) if distortion else ()
-    x, y, z = position
-    w, i, j, k = quaternion
-    time_ms = values.get("time_ms")
-    return PoseReading((x, y, z), (w, i, j, k), None if time_ms is None else int(time_ms[0]) * 1_000_000, flags, tool)
-
-
-def quaternion_from_euler(azimuth_deg: float, elevation_deg: float, roll_deg: float) -> tuple[float, ...]:
-    """Scalar-first quaternion of azimuth about z, then elevation about the new y, then roll about the new x."""
-    half = [math.radians(angle) / 2 for angle in (azimuth_deg, elevation_deg, roll_deg)]
-    (ca, ce, cr), (sa, se, sr) = map(math.cos, half), map(math.sin, half)
-    return (
-        ca * ce * cr + sa * se * sr,
-        ca * ce * sr - sa * se * cr,
-        ca * se * cr + sa * ce * sr,
-        sa * ce * cr - ca * se * sr,
-    )
+    told: tuple[str, ...] = ("" if error == b" " else f"error {error.decode() if error.isalpha() else error[0]}",)
+    told += (f"distortion {distortion}" if distortion else "",)
+    device_ns = None if time_ms is None else time_ms * 1_000_000
+    return PoseReading((x, y, z), (w, i, j, k), device_ns, tuple(filter(None, told)), str(station))
 
 
 # --- Drivers of the devices: setup, start, stop and identification.
@@ -310,9 +236,9 @@ class TrackerDriver(Record):
     start: bytes = b""
     stop: bytes = b""
     """`single`, `start`, `stop`: Commands for one record, for a stream of them, and for its end."""
+    late: bytes = b""  #: What to ask for where nothing comes by itself.
     several: tuple[bytes, ...] = ()  #: Commands after which records say whose they are, where a tool is named.
     other_parser: Callable[[], Parser] | None = None  #: Of records in the other form that the device may be set to.
-    has_clock: bool = False  #: Its records carry the tracker's own time.
     silent_s: float = SILENT_S  #: After so long without a byte it has gone; a server may send nothing of a hidden tool.
     hint: str = "check its power, cable and line rate"
     """Advice when nothing comes."""
@@ -349,8 +275,12 @@ class TrackerDriver(Record):
         """Ask for records and read them in the form that fits best, for a while after the first of the tools wanted."""
         port.write(self.single)
         makers = [self.parser, *([self.other_parser] if self.other_parser else [])]
-        tries, came, heard, end = [_Try(maker, maker()) for maker in makers], b"", 0.0, time.monotonic() + ANSWER_S
-        while (now := time.monotonic()) < end:
+        tries, came, heard, begun = [_Try(maker, maker()) for maker in makers], b"", 0.0, time.monotonic()
+        late = self.late
+        while (now := time.monotonic()) < begun + ANSWER_S:
+            if late and not heard and now > begun + ANSWER_S / 3:
+                port.write(late)
+                late = b""
             if heard and now - heard > _LISTEN_S and all(map(tries[0].has, wanted)):
                 break
             data = port.read_some(_LISTEN_S / 2)
@@ -450,7 +380,7 @@ TRACKERS: Final[dict[str, TrackerDriver]] = {
     "fastrak-ascii": TrackerDriver(
         "a Polhemus FASTRAK (ASCII)",
         115_200,
-        lambda: FastrakParser(FASTRAK_ASCII, binary=False),
+        lambda: FastrakParser(binary=False),
         (b"U", *_fastrak_items(b"2,11,1"), b"F"),
         b"P",
         b"C",
@@ -464,7 +394,6 @@ TRACKERS: Final[dict[str, TrackerDriver]] = {
         b"P",
         b"C\r",
         b"P",
-        has_clock=True,
     ),
     "liberty-ascii": TrackerDriver(
         "a Polhemus LIBERTY or PATRIOT (ASCII)",
@@ -474,7 +403,6 @@ TRACKERS: Final[dict[str, TrackerDriver]] = {
         b"P",
         b"C\r",
         b"P",
-        has_clock=True,
     ),
     "bird": TrackerDriver(
         "an Ascension Flock of Birds",
@@ -495,13 +423,12 @@ TRACKERS: Final[dict[str, TrackerDriver]] = {
         encode_command(head.ASK),
         encode_command(head.START),
         encode_command(head.STOP),
-        has_clock=True,
     ),
     "igtlink": TrackerDriver(
         "an OpenIGTLink server (PLUS, 3D Slicer)",
         0,
         IgtlinkParser,
-        has_clock=True,
+        late=ask_for_tdata(),
         silent_s=30.0,
         hint="start its stream, with a tool in sight",
     ),
@@ -513,7 +440,6 @@ TRACKERS: Final[dict[str, TrackerDriver]] = {
         encode_command(head.ASK),
         encode_command(head.START),
         encode_command(head.STOP),
-        has_clock=True,
     ),
 }
 

@@ -309,7 +309,14 @@ def encode_transform(
     return _HEADER.pack(version, b"TRANSFORM", name, seconds, fraction, len(body), crc64(body)) + body
 
 
+def ask_for_tdata() -> bytes:
+    """Encode STT_TDATA, after which a server sends TDATA: as fast as it can, in its own frame."""
+    body = bytes(_ASK_BYTES)
+    return _HEADER.pack(1, b"STT_TDATA", b"", 0, 0, len(body), crc64(body)) + body
+
+
 _US_ASCII: Final = 3
+_ASK_BYTES: Final = 36  # least time between two in ms, and the name of a frame
 
 
 # --- NDI Polaris, Vega and Aurora trackers, through the combined API library `ndicapi` (extra ``[ndi]``).
@@ -344,6 +351,7 @@ class NdiTracker:
 
     def __init__(self, api: Any, url: str, *, rom: Path | None = None) -> None:
         self._api, self._url = api, url
+        self._line = "address" if url.startswith("socket://") else "cable"
         self._device = self._open()
         self._begin()
         self.name = self._command("VER:4").splitlines()[0].strip()[:48] or "NDI tracker"
@@ -359,7 +367,7 @@ class NdiTracker:
         else:
             device = self._api.ndiOpen(self._url)
         if device is None:
-            raise DeviceError("cannot be opened; check its cable, or whether another program has it")
+            raise DeviceError(f"cannot be opened; check its {self._line}, or whether another program has it")
         return device
 
     def _begin(self) -> None:
@@ -380,11 +388,11 @@ class NdiTracker:
         try:
             reply = self._api.ndiCommand(self._device, text, *values)
         except OSError as error:  # the library's way to say so for some of its own errors
-            raise DeviceError(f"{name} failed ({error}); check its power, cable and tool") from None
+            raise DeviceError(f"{name} failed ({error}); check its power, {self._line} and tool") from None
         number = self._api.ndiGetError(self._device)
         if number != self._api.NDI_OKAY:
             words = self._api.ndiErrorString(number)
-            raise DeviceError(f"{name} failed ({words}); check its power, cable and tool")
+            raise DeviceError(f"{name} failed ({words}); check its power, {self._line} and tool")
         return reply if isinstance(reply, str) else ""
 
     def _handles(self, kind: int) -> list[int]:
@@ -465,14 +473,12 @@ def serve(tracker: NdiTracker, line: socket.socket) -> None:
                     wire += b"".join(head.encode_pose(one, sequence=0) for one in latest.values())
                 elif packet.kind in (head.START, head.STOP):
                     sending = packet.kind == head.START
-        for reading in tracker.readings():
-            latest[reading.tool] = reading
-            if sending:
-                timed = reading
-                if isinstance(reading, PoseReading):
-                    timed = reading._replace(device_ns=time.monotonic_ns())
-                wire += head.encode_pose(timed, sequence=number)
-                number += 1
+        readings, now_ns = tracker.readings(), time.monotonic_ns()
+        latest |= {reading.tool: reading for reading in readings}
+        for reading in readings if sending else ():
+            timed = reading._replace(device_ns=now_ns) if isinstance(reading, PoseReading) else reading
+            wire += head.encode_pose(timed, sequence=number)
+            number += 1
         if wire:
             line.sendall(wire)
 
@@ -510,7 +516,7 @@ class NdiPort(Port):
         assert pipe is not None
         told = pipe.readline().decode().strip() if select.select([pipe], [], [], READY_S)[0] else ""
         if told != "ready":
-            raise DeviceError(f"{self.name}: {told or 'the tracker said nothing; check its power and cable'}")
+            raise DeviceError(f"{self.name}: {told or 'the tracker said nothing; check its power'}")
 
     def close(self) -> None:
         """Close the line, on which the process ends."""

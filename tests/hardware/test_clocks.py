@@ -12,11 +12,10 @@ from tactile_bayes.errors import BadDataError, DeviceError
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.scan_mcap import ScanWriter, read_scan
 from tactile_bayes.hardware.readings import (
-    HEAD_STILL_NS,
     LATEST_NS,
     MOST_LOST,
     MOST_STEPS,
-    TRACKER_STILL_NS,
+    STILL_NS,
     WRAPS_NS,
     DeviceClock,
     EndReading,
@@ -159,7 +158,7 @@ def test_a_clock_that_stands_still_is_replaced(value):
     assert np.diff(session.sink.frames).min() >= 0
     late = np.array(session.sink.frames) - session.sink.frames[0] - FRAME_NS * np.arange(400)
     assert abs(late[-1]) < 1e6
-    assert (np.abs(late) > 1e6).sum() * FRAME_NS <= HEAD_STILL_NS + FRAME_NS
+    assert (np.abs(late) > 1e6).sum() * FRAME_NS <= STILL_NS + FRAME_NS
     assert any("stood still" in text for _, text in session.sink.notes)
     assert len(session.sink.notes) <= 2
 
@@ -192,7 +191,7 @@ def test_times_that_no_file_can_hold_are_brought_into_range(start):
     gaps=st.lists(st.integers(0, S), min_size=60, max_size=60),
 )
 def test_whatever_a_clock_says_times_rise_and_fit_a_file(raws, gaps):
-    clock, host, before = DeviceClock(still_ns=HEAD_STILL_NS), 0, 0
+    clock, host, before = DeviceClock(), 0, 0
     for raw, gap in zip(raws, gaps, strict=False):
         host += gap
         time_ns = clock.read(raw, host).time_ns
@@ -247,7 +246,7 @@ def test_a_trackers_clock_may_do_all_that_too(shared, name, raw_of, steps, wraps
     assert (report.frames, report.poses) == (600, 600), name
     assert (report.tracker_clock_steps, report.tracker_clock_wraps) == (steps, wraps)
     apart_ns = np.abs(np.array(session.sink.poses) - np.array(session.sink.frames))
-    settled = slice(round(1.1 * TRACKER_STILL_NS / FRAME_NS), None) if name == "constant" else slice(None)
+    settled = slice(round(1.1 * STILL_NS / FRAME_NS), None) if name == "constant" else slice(None)
     assert apart_ns[settled].max() < 1e6
     assert len([1 for device, _ in session.sink.notes if device == "tracker"]) == steps + wraps
 
@@ -310,6 +309,19 @@ def test_poses_that_do_not_cover_the_frames_are_told(frames, poses, said):
     report = mismatch(frames, poses)
     assert report.cautions == said
     assert ("none of its" in report.fault) == any("no frame has a pose" in text for text in said)
+
+
+def test_an_old_record_sent_again_is_a_gap_and_spoils_no_clock():
+    """As servers do while a tool is hidden: the last pose with its own time, again and again."""
+    session = Session()
+    for i in range(200):
+        session.now_ns = i * FRAME_NS
+        session.frame(session.now_ns)
+        shown = min(i, 60) if i < 140 else i
+        session.pose(shown * FRAME_NS, x_mm=float(shown))
+    report = session.end()
+    assert (report.poses, report.poses_missing, report.missing_why) == (121, 79, "an old record sent again 79")
+    assert report.tracker_clock_steps == 0
 
 
 def test_no_pose_at_all_is_a_fault():

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from emulated_devices import serving, short_scan
 
-from tactile_bayes.errors import DeviceError
+from tactile_bayes.errors import DeviceError, UsageError
 from tactile_bayes.hardware import trackers as ndi
-from tactile_bayes.hardware.emulated import EmulatedHead, EmulatedNdi, crc16
+from tactile_bayes.hardware.emulated import EmulatedHead, EmulatedNdi, Faults, crc16
 from tactile_bayes.hardware.emulator import PtyLink, TcpLink
-from tactile_bayes.hardware.readings import HelloReading, MissingReading, PoseReading
+from tactile_bayes.hardware.readings import Follower, HelloReading, MissingReading, PoseReading
 from tactile_bayes.hardware.serial_trackers import TRACKERS, open_tracker
 from tactile_bayes.hardware.trackers import NdiTracker
 
@@ -250,6 +250,54 @@ def test_the_library_reads_the_emulated_tracker(link, tmp_path):
     assert len(set(places)) == len(places)  # each frame once
     times = [one.device_ns for one in found]
     assert times == sorted(times)
+
+
+def test_two_tools_on_ports_are_told_apart_by_the_library_and_combined():
+    pytest.importorskip(ndi.MODULE)
+    scan, line = short_scan(6.0), TcpLink("127.0.0.1", 0)
+    with serving(EmulatedNdi(scan.poses, faults=Faults(breathe_mm=20.0)), line):
+        port, driver = open_tracker("ndi", line.url), TRACKERS["ndi"]
+        with pytest.raises(UsageError, match="sends several tools: '0A', '0B'"):
+            driver.check(port)
+        answer = driver.check(port, tool="0A", reference="0B")
+        port.write(driver.start)
+        parser, follower, found = answer.parser(), Follower(answer.tool, answer.reference), []
+        end = time.monotonic() + 20.0
+        while len(found) < 40 and time.monotonic() < end:
+            for reading in parser.feed(port.read_some(0.1)):
+                if isinstance(reading, PoseReading):
+                    found += [one for one, _ in follower.take(reading, time.monotonic_ns())]
+        port.close()
+    places = np.array([one.position_mm for one in found if isinstance(one, PoseReading)])
+    assert len(places) >= 40
+    nearest = np.abs(places[:, None] - scan.poses.position_mm).max(axis=2).min(axis=1)
+    assert nearest.max() < 1e-3  # breathing has gone
+
+
+class SpoiltNdi(EmulatedNdi):
+    """One reply in ten has a byte changed on the line."""
+
+    replies = 0
+
+    def _poses_now(self) -> bytes:
+        self.replies += 1
+        good = super()._poses_now()
+        return good if self.replies % 10 else good[:9] + bytes([good[9] ^ 4]) + good[10:]
+
+
+def test_a_spoilt_reply_costs_that_pose_and_not_the_recording():
+    pytest.importorskip(ndi.MODULE)
+    device, line = SpoiltNdi(short_scan(3.0).poses), TcpLink("127.0.0.1", 0)
+    with serving(device, line):
+        port = open_tracker("ndi", line.url)
+        answer = TRACKERS["ndi"].check(port)
+        port.write(TRACKERS["ndi"].start)
+        parser, found, end = answer.parser(), [], time.monotonic() + 20.0
+        while len(found) < 60 and time.monotonic() < end:
+            found += [one for one in parser.feed(port.read_some(0.1)) if isinstance(one, PoseReading)]
+        port.close()
+    assert len(found) >= 60
+    assert device.replies > 60
 
 
 def test_a_port_where_nobody_answers_is_told():

@@ -219,10 +219,17 @@ def test_only_the_chosen_tool_is_followed_and_others_are_counted():
     assert followed(Follower(), pose(1, "a"), pose(2, "b"), pose(3, "a")) == [1, 3]  # by default that seen first
 
 
-@pytest.mark.parametrize("times", [(1, 2, 3), (None, None, None)], ids=["stamped", "unstamped"])
+STAMPS = {
+    "one stamp": [(1, 1), (2, 2), (3, 3)],
+    "none": [(None, None)] * 3,
+    "each its own": [(1, 11), (101, 111), (201, 211)],
+}
+
+
+@pytest.mark.parametrize("times", STAMPS.values(), ids=STAMPS)
 @pytest.mark.parametrize("reference_first", [True, False])
 def test_a_tool_is_placed_by_the_reference_of_its_own_moment(times, reference_first):
-    pairs = [(pose(10.0 * i, "ref", t), pose(10.0 * i + 5 + i, "tool", t)) for i, t in enumerate(times)]
+    pairs = [(pose(10.0 * i, "ref", a), pose(10.0 * i + 5 + i, "tool", b)) for i, (a, b) in enumerate(times)]
     stream = [one for pair in pairs for one in (pair if reference_first else pair[::-1])]
     assert followed(Follower("tool", "ref"), *stream) == [5, 6, 7]
 
@@ -232,6 +239,8 @@ def test_without_the_reference_there_is_no_pose():
     hidden = MissingReading("hidden", "ref")
     stream = [pose(0, "ref", 1), pose(5, "tool", 1), hidden, pose(6, "tool", 2), hidden, pose(7, "tool", 3)]
     assert followed(follower, *stream, pose(1, "ref", 3)) == [5, "no pose of ref", 6]
+    lost = [pose(0, "ref", 1), pose(5, "tool", 1), pose(16, "tool", 2), pose(20, "ref", 3), pose(27, "tool", 3)]
+    assert followed(Follower("tool", "ref"), *lost) == [5, -4, 7]  # a lost one costs that pose 10 ms, no other
     late = [pose(0, "ref", 1), pose(5, "tool", 1), pose(6, "tool", 2), pose(7, "tool", 3)]
     assert followed(Follower("tool", "ref"), *late, step_ns=40_000_000) == [5, "no pose of ref"]
 
@@ -333,6 +342,29 @@ def test_records_of_another_tracker_are_named():
         port.close()
 
 
+def test_a_server_that_sends_only_on_request_is_asked():
+    listener = socket.create_server(("127.0.0.1", 0))
+
+    def answer() -> None:
+        peer, _ = listener.accept()
+        with peer, contextlib.suppress(OSError):
+            asked = b""
+            while len(asked) < 58 + 36:
+                asked += peer.recv(4096)
+            assert struct.unpack(">H12s", asked[:14]) == (1, b"STT_TDATA".ljust(12, b"\0"))
+            assert asked[50:58] == checksum(asked[58:]).to_bytes(8, "big")
+            peer.sendall(message(b"RTS_TDATA", b"\0") + message(b"TDATA", named(b"Probe", MATRIX)) * 3)
+            peer.recv(1)  # until the other end closes
+
+    thread = threading.Thread(target=answer, daemon=True)
+    thread.start()
+    port = open_tracker("igtlink", f"socket://127.0.0.1:{listener.getsockname()[1]}")
+    assert TRACKERS["igtlink"].check(port).tools == {"Probe": ""}
+    port.close()
+    thread.join(5.0)
+    listener.close()
+
+
 # --- Whole recordings.
 
 
@@ -363,7 +395,7 @@ def test_a_hidden_tool_leaves_a_gap_that_show_and_map_tell(tmp_path, protocol):
     given = {"like": tmp_path / "like.mcap", "duration_s": 1.9, "tracker_protocol": protocol}
     if protocol == "ndi":
         lines = [PtyLink(), PtyLink()]
-        tracker = EmulatedNdi(short_scan(9.0).poses, hide=(1.5, 0.5))
+        tracker = EmulatedNdi(short_scan(9.0).poses, faults=Faults(hide=(1.5, 0.5)))
         with serving(EmulatedHead(scan), lines[0]), serving(tracker, lines[1]):
             report = tb.record(tmp_path / "a.mcap", head=lines[0].url, tracker=lines[1].url, **given)
     else:
