@@ -15,7 +15,7 @@ from tactile_bayes.files.comparison import CompareReport
 from tactile_bayes.findings import Finding
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.map import TactileMap
-from tactile_bayes.mapping.places import PATIENT_WORDS, PLANE_WORDS, Orientation
+from tactile_bayes.mapping.places import Orientation
 from tactile_bayes.posterior.result import Estimate, FittedCells, fitted_cells
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.compare import compare_summary
@@ -339,7 +339,7 @@ def draw_comparison(
 
     `visits`: maps of each visit; `path`: written as PNG, PDF or SVG; None writes nothing.
     """
-    laid, in_patient = on_common_axes(report, visits)
+    laid, view = on_common_axes(report, visits)
     shown = [0, *range(max(1, len(laid) - _MOST_VISITS + 1), len(laid))]
     with figure_file(path, size_in=(4.0 * (len(shown) + 1), 7.4), force=force) as figure:
         exam = named_exam("", report.provenance.get("scans", ()))
@@ -347,23 +347,19 @@ def draw_comparison(
         grid = figure.add_gridspec(2, len(shown) + 1, height_ratios=(1.35, 1.0))
         panels = [figure.add_subplot(grid[0, i]) for i in range(len(shown) + 1)]
         words = visits[0][0].tactile_map.recipe.value_words
-        _draw_maps(
-            panels, [(Course().of(report.visits[i]), laid[i]) for i in shown], label=words, in_patient=in_patient
-        )
+        _draw_maps(panels, [(Course().of(report.visits[i]), laid[i]) for i in shown], label=words, view=view)
         _draw_change(figure.add_subplot(grid[1, 0]), compared)
         words_axes = figure.add_subplot(grid[1, 1:])
         words_axes.set_axis_off()
         lines = [part for line in compare_summary(report).splitlines()[:-1] for part in textwrap.wrap(line, 96)]
         text = "\n".join(line for line in lines if not line.startswith("More ("))
         words_axes.text(0.0, 1.0, text, va="top", fontsize=8.5, transform=words_axes.transAxes)
-        seen = "patient's axes, seen facing the patient: head up, patient's left on the right"
-        seen = seen if in_patient else "no landmarks on every map: the plane's axes, y (along the head) up"
         moved = "later visits are moved so that the mass lies on itself; maps of a visit are averaged"
-        figure.text(0.01, 0.01, f"{seen}; {moved}.  {RESEARCH_USE}", fontsize=7.5, color="0.3")
+        figure.text(0.01, 0.01, f"{view.words}; {moved}.  {RESEARCH_USE}", fontsize=7.5, color="0.3")
     return figure
 
 
-def _draw_maps(panels: Sequence[Axes], visits: Sequence[tuple[str, LaidMap]], *, label: str, in_patient: bool) -> None:
+def _draw_maps(panels: Sequence[Axes], visits: Sequence[tuple[str, LaidMap]], *, label: str, view: Orientation) -> None:
     """Draw the visits, by their names, with one colour bar, and the difference of the last and the first."""
     first, last = visits[0][1], visits[-1][1]
     low, high = common_limits([one for _, one in visits])
@@ -373,7 +369,7 @@ def _draw_maps(panels: Sequence[Axes], visits: Sequence[tuple[str, LaidMap]], *,
             for colour, width in (("black", 3.0), ("white", 1.4)):
                 axes.plot(*(one.ring_mm + first.origin_mm[:, None]), color=colour, linewidth=width)
         axes.set_title(name, loc="left", fontsize=11)
-        _name_axes(axes, first.origin_mm, in_patient=in_patient)
+        _name_axes(axes, first.origin_mm, view)
     figure = panels[0].figure
     bar = figure.colorbar(image, ax=list(panels[:-1]), shrink=0.8, pad=0.01)
     bar.set_label(label, fontsize=8)
@@ -381,7 +377,7 @@ def _draw_maps(panels: Sequence[Axes], visits: Sequence[tuple[str, LaidMap]], *,
     most = max(0.3 * (high - low), float(np.nanmax(np.abs(difference), initial=0.0)))
     image = _draw_cells(panels[-1], difference, first.origin_mm, cmap="RdBu_r", vmin=-most, vmax=most)
     panels[-1].set_title("Last minus first", loc="left", fontsize=11)
-    _name_axes(panels[-1], first.origin_mm, in_patient=in_patient)
+    _name_axes(panels[-1], first.origin_mm, view)
     bars = [bar, figure.colorbar(image, ax=panels[-1], shrink=0.8, pad=0.01)]
     bars[1].set_label(f"difference of {label}", fontsize=8)
     for each in bars:
@@ -397,10 +393,10 @@ def _draw_cells(axes: Axes, values: FloatArray, origin_mm: FloatArray, **how: An
     return axes.imshow(shown, origin="lower", extent=extent, interpolation="nearest", **how)
 
 
-def _name_axes(axes: Axes, origin_mm: FloatArray, *, in_patient: bool) -> None:
+def _name_axes(axes: Axes, origin_mm: FloatArray, view: Orientation) -> None:
     """Name the axes and the edges; of a mass right of the xiphoid the mm are told to the patient's right."""
-    words = ("-x (mm)", "y (mm)")
-    if in_patient:
+    words = (f"{view.right} from the mass (mm)", f"{view.up} from the mass (mm)")
+    if view.notch is not None:
         side = "left"
         if origin_mm[0] < 0:
             side = "right"
@@ -409,9 +405,7 @@ def _name_axes(axes: Axes, origin_mm: FloatArray, *, in_patient: bool) -> None:
     axes.set_xlabel(words[0], fontsize=8)
     axes.set_ylabel(words[1], fontsize=8)
     axes.tick_params(labelsize=7)
-    draw_edges(
-        axes, Orientation("-x", "+y", PATIENT_WORDS, (0.0, 1.0)) if in_patient else Orientation("-x", "+y", PLANE_WORDS)
-    )
+    draw_edges(axes, view)
 
 
 def _draw_change(axes: Axes, compared: Compared) -> None:

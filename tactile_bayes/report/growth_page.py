@@ -9,12 +9,13 @@ from typing import Final
 import numpy as np
 
 from tactile_bayes import __version__
-from tactile_bayes.declarations import Record
+from tactile_bayes.declarations import Record, replace
 from tactile_bayes.files.comparison import CompareReport, Visit
 from tactile_bayes.findings import finding_lines
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.mapping.map import TactileMap
+from tactile_bayes.mapping.places import PATIENT_WORDS, Orientation, orientation_of
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.compare import change_sentences, rate_sentences, verdict_sentence
 from tactile_bayes.report.pages import cut, page
@@ -23,6 +24,7 @@ from tactile_bayes.size.visits import Compared, straight_line
 
 # --- The maps of each visit, averaged on common axes about the mass.
 
+_PATIENT: Final = Orientation("-x", "+y", PATIENT_WORDS, (0.0, 1.0))
 HALF_MM: Final = 30.0  #: Half the side of the square about the mass that is drawn.
 STEP_MM: Final = 1.0
 _ENDS: Final = (0.01, 0.995)
@@ -57,15 +59,18 @@ class LaidMap(Record, eq=False):
 
 def on_common_axes(
     report: CompareReport, visits: Sequence[Sequence[DrawnMap]], *, middle: bool = False
-) -> tuple[list[LaidMap], bool]:
-    """The maps of each visit, and whether the axes are the patient's: where all maps have landmarks.
+) -> tuple[list[LaidMap], Orientation]:
+    """The maps of each visit, and their axes: the patient's where all maps have landmarks, else the maps' own.
 
     Of a visit without a lump nothing is shown, or with `middle` its first map about its own middle.
     """
-    in_patient = all(one.tactile_map.patient_from_plane is not None for maps in visits for one in maps)
+    every = [one.tactile_map for maps in visits for one in maps]
+    view = _PATIENT
+    if any(one.patient_from_plane is None for one in every):
+        view = orientation_of(replace(every[0], patient_from_plane=None))
     sizes = [visit.max_size_mm for visit in report.visits]
     shown = [_about_middle(maps) if middle else maps for maps in visits]
-    return [_laid(maps, size, in_patient=in_patient) for maps, size in zip(shown, sizes, strict=True)], in_patient
+    return [_laid(maps, size, view) for maps, size in zip(shown, sizes, strict=True)], view
 
 
 def _about_middle(maps: Sequence[DrawnMap]) -> Sequence[DrawnMap]:
@@ -77,11 +82,12 @@ def _about_middle(maps: Sequence[DrawnMap]) -> Sequence[DrawnMap]:
     return [DrawnMap(maps[0].tactile_map, (x, y))]
 
 
-def _laid(maps: Sequence[DrawnMap], size: Quantity | None, *, in_patient: bool) -> LaidMap:
+def _laid(maps: Sequence[DrawnMap], size: Quantity | None, view: Orientation) -> LaidMap:
     """Mean of a visit's maps about its mass, on the screen's axes."""
     along = np.arange(-HALF_MM, HALF_MM + STEP_MM / 2, STEP_MM)
     right, up = np.meshgrid(along, along)
-    about = np.stack([-right, up])  # x, the patient's and the plane's, runs to the viewer's left, as in every picture
+    signs = np.array([1.0 if axis[0] == "+" else -1.0 for axis in (view.right, view.up)])
+    about, in_patient = np.stack([signs[0] * right, signs[1] * up]), view is _PATIENT
     values, places, ring = [], [], None
     for drawn in maps:
         one, centre = drawn.tactile_map, drawn.centre_mm
@@ -94,7 +100,7 @@ def _laid(maps: Sequence[DrawnMap], size: Quantity | None, *, in_patient: bool) 
         x, y = np.tensordot(np.linalg.inv(rotation), about, axes=1) + np.reshape(centre, (2, 1, 1))
         values.append(_nearest(one, x, y))
         if ring is None and size is not None and drawn.axes_mm is not None:
-            ring = _ring(drawn, rotation, size.median)
+            ring = signs[:, None] * _ring(drawn, rotation, size.median)
     if not values:
         return LaidMap(np.full(right.shape, np.nan), np.zeros(2), None)
     stack = np.stack(values)
@@ -105,14 +111,13 @@ def _laid(maps: Sequence[DrawnMap], size: Quantity | None, *, in_patient: bool) 
 
 
 def _ring(drawn: DrawnMap, rotation: FloatArray, largest_mm: float) -> FloatArray:
-    """(2, m) outline of the lump in the shape that its map gives, as large as its size is."""
+    """(2, m) x and y of the lump's outline in the shape that its map gives, as large as its size is."""
     assert drawn.axes_mm is not None
     t, angle = np.linspace(0.0, 2 * np.pi, 73), np.radians(drawn.angle_deg)
     half = np.array(drawn.axes_mm) * largest_mm / max(drawn.axes_mm) / 2
     own = half[:, None] * np.stack([np.cos(t), np.sin(t)])
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    x, y = rotation @ turn @ own
-    return np.stack([-x, y])
+    return np.asarray(rotation @ turn @ own)
 
 
 def _nearest(tactile_map: TactileMap, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
@@ -166,7 +171,7 @@ class Course(Record):
 
 def growth_page(compared: Compared, report: CompareReport, visits: Sequence[Sequence[DrawnMap]], course: Course) -> str:
     """Full HTML page of a comparison; equal comparisons give equal text."""
-    laid, in_patient = on_common_axes(report, visits, middle=True)
+    laid, view = on_common_axes(report, visits, middle=True)
     limits, words = common_limits(laid), visits[0][0].tactile_map.recipe.value_words
     shown = [0, *range(max(1, len(laid) - _MOST_MAPS + 1), len(laid))]
     facts = (("Name", course.name), ("Patient", course.patient), ("Side", course.side), ("Mass", course.mass))
@@ -177,10 +182,12 @@ def growth_page(compared: Compared, report: CompareReport, visits: Sequence[Sequ
         research_use=RESEARCH_USE,
         headline=verdict_sentence(report),
         findings=finding_lines(report.findings, paper=True),
-        maps=[(_picture(laid[i], limits, course.of(report.visits[i])), *_captions(report, course, i)) for i in shown],
+        maps=[
+            (_picture(laid[i], view, limits, course.of(report.visits[i])), *_captions(report, course, i)) for i in shown
+        ],
         left_out=len(laid) - len(shown),
         colours=colour_steps(limits, words, more=any(bool((one.values > limits[1]).any()) for one in laid)),
-        seen=_seen(in_patient),
+        seen=_seen(view),
         chart=_chart(compared, report, course),
         change=size_ruler(list(_changes(report, course)), unit="%", label="Change of the largest diameter in percent"),
         sentences=change_sentences(report),
@@ -190,12 +197,9 @@ def growth_page(compared: Compared, report: CompareReport, visits: Sequence[Sequ
     )
 
 
-def _seen(in_patient: bool) -> str:
-    axes = (
-        "Seen facing the patient; R, L: the patient's right and left; H: head, F: feet."
-        if in_patient
-        else "No landmarks on every map: the head's own axes, y up, x to the left."
-    )
+def _seen(view: Orientation) -> str:
+    sides = "; R, L: the patient's right and left; H: head, F: feet" if view is _PATIENT else ""
+    axes = f"{view.words[0].upper()}{view.words[1:]}{sides}."
     return (
         f"{axes} Every map shows {2 * HALF_MM:g} mm about the mass, without one about its own middle, all in the same "
         "colours; ring: its estimated size at that visit; grey: no or few readings. Later visits are moved so that the "
@@ -212,17 +216,18 @@ def _captions(report: CompareReport, course: Course, number: int) -> tuple[str, 
     return course.of(visit), "not sized" if found else "no lump found"
 
 
-def _picture(laid: LaidMap, limits: tuple[float, float], label: str) -> str:
+def _picture(laid: LaidMap, view: Orientation, limits: tuple[float, float], label: str) -> str:
     """Inline SVG of a visit's map with its ring, sides and scale bar."""
     side = _SCALE * (2 * HALF_MM + STEP_MM)
-    sides = {"R": (2.2, side / 2), "L": (side - 2.2, side / 2), "H": (side / 2, 3.0), "F": (side / 2, side - 2.2)}
-    plain = laid.origin_mm.any()
-    names = sides if plain else {"+x": sides["R"], "-x": sides["L"], "+y": sides["H"], "-y": sides["F"]}
+    places = {"left": (2.4, side / 2), "right": (side - 2.4, side / 2), "top": (side / 2, 3.0),
+              "bottom": (side / 2, side - 2.2)}  # fmt: skip
     parts = [picture_of(laid.values[::-1], limits, (side, side))]
     if laid.ring_mm is not None:
         points = side / 2 + _SCALE * laid.ring_mm * [[1.0], [-1.0]]
         parts += [stroked("M" + "L".join(f"{x:.2f} {y:.2f}" for x, y in points.T) + "Z", 0.5, kind="size")]
-    parts += [outlined_text(x, y + 0.9, name, size=2.8) for name, (x, y) in names.items()]
+    for at, name in view.edges.items():
+        x, y = places[at]
+        parts.append(outlined_text(x, y + 0.9, name, size=2.8))
     parts += [stroked(f"M2 {side - 2:.2f}h{10 * _SCALE:g}", 0.6, kind="scale")]
     parts += [outlined_text(2 + 5 * _SCALE, side - 3.4, "10 mm", size=2.4)]
     return (

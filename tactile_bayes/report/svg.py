@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_bayes.declarations import Record
+from tactile_bayes.declarations import Record, replace
 from tactile_bayes.files.reports import SmallestLump, centre_of
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.draws import Quantity
@@ -257,8 +257,10 @@ def exam_picture(
 def thumbnail_svg(exam: ExamMap, *, label: str) -> str:
     """A map as a small SVG file, for a page of many: all to one scale, and in one range of colours.
 
-    A map that has no room at that scale is drawn smaller, as its scale bar shows.
+    A map that has no room at that scale is drawn smaller, as its scale bar shows. Of several masses the reported one
+    alone has its ellipse.
     """
+    exam = replace(exam, masses=exam.masses[:1])
     width, height = Frame(_map_of(exam), 1.0).size_mm
     scale = min(THUMB_SCALE, _THUMB_ROOM_MM / max(width, height))
     drawn = exam_picture(exam, Frame(_map_of(exam), scale), label=label, small=True, limits=_shared_limits(exam))

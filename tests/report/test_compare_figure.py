@@ -20,6 +20,7 @@ from tactile_bayes.api.sized import SizeEstimate
 from tactile_bayes.declarations import replace
 from tactile_bayes.files.comparison import Visit
 from tactile_bayes.geometry import rigid
+from tactile_bayes.mapping.map import MapRecipe
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.estimate_figures import draw_comparison
 from tactile_bayes.report.growth_page import Course, DrawnMap, growth_page
@@ -43,7 +44,7 @@ def visit(angle_rad: float, *, height: float, landmarks: bool = True) -> DrawnMa
     frame = np.eye(3)
     frame[:2, :2] = patient_from_plane
     transform = rigid(frame, np.array([*PLACE, 0.0])) if landmarks else None
-    return DrawnMap(replace(made, patient_from_plane=transform), (0.0, 0.0))
+    return DrawnMap(replace(made, patient_from_plane=transform, plane_from_base=np.eye(4)), (0.0, 0.0))
 
 
 def images(*visits: DrawnMap):
@@ -193,6 +194,24 @@ def test_one_value_has_one_colour_at_all_visits_of_the_page() -> None:
     ]
     first, second = (one[20, 20] for one in pixels)
     assert first == pytest.approx(second, abs=3)
+
+
+def test_grids_lie_as_their_files_read_and_scans_without_landmarks_as_every_picture_of_them() -> None:
+    """A second bump 10 mm along x and 6 along y from the mass: right below it of a grid, left above it of a scan."""
+    away = (10.0, 6.0)
+    values = bump_values(amplitude=0.4, x=0.0, y=0.0, sigma_x=3.0, sigma_y=3.0) - 1.0
+    made = grid_map(bump_values(amplitude=0.3, x=away[0], y=away[1], sigma_x=2.0, sigma_y=2.0) + values)
+    scan = DrawnMap(replace(made, recipe=MapRecipe("scan", "gain", 1.0), plane_from_base=np.eye(4)), (0.0, 0.0))
+    grid = DrawnMap(replace(made, recipe=MapRecipe("grid", "gain", 1.0), plane_from_base=None), (0.0, 0.0))
+    for drawn, place, edges in (
+        (scan, (-10.0, 6.0), ["+x", "-x", "+y", "-y"]),
+        (grid, (10.0, -6.0), ["-x", "+x", "-y", "+y"]),
+    ):
+        first, *_ = images(drawn, drawn)
+        assert value_at(first, *place) == pytest.approx(1.3, abs=0.03)
+        page = growth_page(Compared("not_one_mass"), REFUSED, [[drawn]] * 2, Course())
+        told = re.findall(r'fill="#fff">([+-][xy])<', page)
+        assert told[:4] == edges
 
 
 def test_hostile_texts_stay_texts_on_the_page() -> None:
