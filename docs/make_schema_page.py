@@ -28,6 +28,7 @@ SECTIONS = {
     "Protocol (TOML)": "protocol.schema.json",
     "Worklist (JSON)": "worklist.schema.json",
     "Mapping of columns (TOML)": "column_map.schema.json",
+    "Mapping of arrays (TOML)": "array_map.schema.json",
 }
 """Heading of each schema of what users write themselves, or read in tables."""
 HEAD = """\

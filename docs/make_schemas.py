@@ -8,6 +8,7 @@ from typing import Any
 
 from tactile_bayes.api.settings import SettingsFile
 from tactile_bayes.declarations import Record, schema_of
+from tactile_bayes.files.arrays_layout import ArrayMap
 from tactile_bayes.files.column_map import ColumnMap
 from tactile_bayes.files.comparison import CompareReport
 from tactile_bayes.files.documents import OF_A_PERSON, Fact, FactName, Protocol, Session
@@ -43,6 +44,7 @@ OF_JSON: dict[str, type[Record]] = {
 }
 OF_TOML: dict[str, type[Record]] = {
     "bodies.schema.json": BodiesFile,
+    "array_map.schema.json": ArrayMap,
     "column_map.schema.json": ColumnMap,
     "protocol.schema.json": Protocol,
     "scene.schema.json": SceneFile,

@@ -71,7 +71,7 @@ def layout_lines() -> list[str]:
 # --- What can be stated of the arrays, on the command line, in MAP.toml and in Python.
 
 Unit = Literal["counts", "kPa", "Pa", "psi", "mmHg", "N/cm2"]
-TimeUnit = Literal["s", "ms", "us", "min"]
+TimeUnit = Literal["s", "ms", "us", "ns", "min"]
 PoseLayout = Literal["wxyz", "xyzw", "euler", "matrix"]
 Rate = Annotated[float, Meta(gt=0, le=100_000)]
 
@@ -105,6 +105,10 @@ class Stated(Options, kw_only=True):
     skip_columns: Annotated[
         Annotated[int, Meta(ge=0)] | None,
         Meta(description="Scan: columns of a table of frames before its readings. Default: told by the header."),
+    ] = None
+    decimal: Annotated[
+        Literal["point", "comma"] | None,
+        Meta(description="Scan: decimal sign of tables. Default: told by their numbers, where these can tell."),
     ] = None
     rate_hz: Annotated[
         Rate | None, Meta(description="Scan: frames a second, where they have no times.", extra={"metavar": "HZ"})

@@ -11,15 +11,18 @@ Layouts that are known by what stands in them:
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.arrays_layout import Stated
 from tactile_bayes.files.named_arrays import Source
+from tactile_bayes.files.poses_text import kind_of_column
 from tactile_bayes.files.text_lines import Line, TextTable, number, read_text_table
 from tactile_bayes.geometry import FloatArray
 
@@ -46,9 +49,11 @@ _OTHER_NAME: Final = re.compile(
     re.IGNORECASE,
 )
 """Names of columns that hold no reading of one taxel, nor a time."""
-_UNIT_OF_TIME: Final = re.compile(r"(?:[\[(_ ]|(?<=time))(ms|msec|us|µs|s|secs?|seconds|min)[\])]?$", re.IGNORECASE)
-_PLAIN: Final = re.compile(r"[\[(].*?[\])]|_?(ms|us|secs?|s)$", re.IGNORECASE)  # what is no part of a name
-_SECONDS: Final = {"ms": "ms", "msec": "ms", "us": "us", "µs": "us", "min": "min"}
+_UNIT_OF_TIME: Final = re.compile(r"(?:[\[(_ ]|(?<=time))(ms|msec|us|µs|ns|s|secs?|seconds|min)[\])]?$", re.IGNORECASE)
+_PLAIN: Final = re.compile(r"[\[(].*?[\])]|_?(ms|us|ns|secs?|s)$", re.IGNORECASE)  # what is no part of a name
+_SECONDS: Final = {"ms": "ms", "msec": "ms", "us": "us", "ns": "ns", "µs": "us", "min": "min"}
+_LAYOUTS: Final = "give one row a frame, or blocks of rows; --skip-columns says how many stand before the readings"
+_SAMPLED: Final = 50
 _MOST_LABELS: Final = 8
 
 
@@ -60,7 +65,7 @@ def read_frames(path: Path, given: Stated, *, shape: tuple[int, int] | None) -> 
     shape
         Rows and columns of the head, where it is known.
     """
-    table = read_text_table(path)
+    table = _without_words(read_text_table(path, given.decimal))
     shape = given.frame_shape or shape
     blocks = _blocks(table, None if shape is None else shape[0] * shape[1])
     before = [line for line in table.lines if line.number < blocks[0][0].number]
@@ -71,6 +76,28 @@ def read_frames(path: Path, given: Stated, *, shape: tuple[int, int] | None) -> 
     rows = [line for block in blocks for line in block]
     names = before[-1].fields if before and len(before[-1].fields) == len(rows[0].fields) else []
     return _of_rows(table, rows, names, shape, given, stated, notes)
+
+
+def _without_words(table: TextTable) -> TextTable:
+    """The table without the words in its columns of words, such as a status beside the readings."""
+    lines = [line for line in table.lines if len(line.fields) > 1]
+    width = max(Counter(len(line.fields) for line in lines).items(), key=lambda one: one[0] * one[1], default=(0, 0))[0]
+    held = [line for line in lines if len(line.fields) == width]
+    sample = held[:: max(1, len(held) // _SAMPLED)]
+    words = [i for i in range(width) if 2 * sum(table.numbers([one.fields[i]]) is None for one in sample) > len(sample)]
+    if not words or 2 * len(words) > width:
+        return table
+
+    def blanked(line: Line) -> Line:
+        if len(line.fields) != width or any(table.numbers([one]) is None for one in _beside(line.fields, words)):
+            return line
+        return replace(line, fields=["" if i in words else one for i, one in enumerate(line.fields)])
+
+    return replace(table, lines=[blanked(line) for line in table.lines])
+
+
+def _beside(fields: Sequence[str], words: Sequence[int]) -> list[str]:
+    return [one for i, one in enumerate(fields) if i not in words]
 
 
 def _blocks(table: TextTable, taxels: int | None) -> list[list[Line]]:
@@ -191,22 +218,24 @@ def _of_rows(
         notes.append(f"line {rows[0].number} counts {values[0, -2]:g}, {values[0, -1]:g}: taken for labels")
         values = values[1:]
     taxels = None if shape is None else shape[0] * shape[1]
+    if taxels is not None and len(values) == taxels and values.shape[1] < taxels:
+        notes.append(f"{taxels} rows of {values.shape[1]} numbers: rows are read as taxels, columns as frames")
+        return Source({"frames": values.T}, stated, tuple(notes))
+    if shape is not None and values.shape[1] - (given.skip_columns or 0) == shape[1] and len(values) % shape[0] == 0:
+        notes.append(f"{len(values)} rows of {shape[1]} numbers: each {shape[0]} are read as a frame")
+        return Source({"frames": values[:, -shape[1] :].reshape(-1, *shape)}, stated, tuple(notes))
     time, readings = _columns(values, list(names), taxels, given)
     arrays = {"frames": values[:, readings]}
     if len(readings) < values.shape[1]:
         notes.append(f"{len(readings)} of {values.shape[1]} columns are readings, from column {readings[0] + 1} on")
     if time is not None:
         arrays["frame_time_s"] = values[:, time]
-        named = repr(names[time]) if names else "rising"
         unit = _unit_of_time(names[time]) if names else ""
-        notes.append(f"times in column {time + 1} ({named})" + (f", in {unit}" if unit else ""))
+        named = f" ({names[time]!r})" if names else ""
+        notes.append(f"times in column {time + 1}{named}" + (f", in {unit}" if unit else ""))
         if unit and stated.time_unit is None:
-            stated = Stated(**{**_given(stated), "time_unit": unit})
+            stated = replace(stated, time_unit=unit)
     return Source(arrays, stated, tuple(notes))
-
-
-def _given(stated: Stated) -> dict[str, Any]:
-    return {name: getattr(stated, name) for name in Stated.__struct_fields__}
 
 
 def _counts(line: FloatArray) -> bool:
@@ -223,30 +252,37 @@ def _columns(values: FloatArray, names: list[str], taxels: int | None, given: St
     width = values.shape[1]
     plain = [_PLAIN.sub("", name.strip()).strip(" _") for name in names]
     timed = [i for i, name in enumerate(plain) if _TIME_NAME.fullmatch(name) or _TIME_NAME.fullmatch(names[i])]
-    others = [i for i, name in enumerate(plain) if _OTHER_NAME.search(name)]
+    others = [i for i, name in enumerate(plain) if _OTHER_NAME.search(name) or kind_of_column(names[i])]
+    others += [i for i in range(width) if i not in others and np.isnan(values[:, i]).all()]
     first = given.skip_columns
-    if first is None and names and (timed or others):
+    if first is None and (timed or others):
         readings = [i for i in range(width) if i not in (*timed, *others)]
         if taxels is None or len(readings) == taxels:
             return (timed[0] if timed else None), readings
-        told = ", ".join(repr(names[i]) for i in (*range(min(3, width)), width - 1))
+        told = ", ".join(repr(one) for one in (*names[:3], *names[-1:]))
         what = f"names {width} columns ({told}), {len(readings)} of which may be readings, for {taxels} taxels"
-        raise BadDataError(what, way_out="give --skip-columns, the number of those before the readings")
+        raise BadDataError(what, way_out=_LAYOUTS)
     if first is None:
         first = 0 if taxels is None else width - taxels
     if not 0 <= first < width or (taxels is not None and first + taxels > width):
-        raise BadDataError(
-            f"has {width} columns, and the head {taxels} taxels", way_out="give --skip-columns, or another head"
-        )
+        raise BadDataError(f"has {width} columns, and the head {taxels} taxels", way_out=_LAYOUTS)
     readings = list(range(first, width if taxels is None else first + taxels))
     if timed and timed[0] < first:
         return timed[0], readings
-    return _rising(values[:, :first]), readings
+    return _time_column(values[:, :first], given), readings
 
 
-def _rising(columns: FloatArray) -> int | None:
-    """The column that rises and does not count by ones, else one that rises; None without."""
+def _time_column(columns: FloatArray, given: Stated) -> int | None:
+    """The column of times among those before the readings: the last that rises, or the last; none that only counts.
+
+    A column that falls is told as such when times are checked.
+    """
     steps = np.diff(columns, axis=0)
-    rising = [i for i in range(columns.shape[1]) if len(steps) and (steps[:, i] >= 0).all() and steps[:, i].any()]
-    counting = [i for i in rising if (steps[:, i] == 1).all()]
-    return next((i for i in rising if i not in counting), next(iter(rising), None))
+    counting = (
+        [] if given.time_unit else [i for i in range(columns.shape[1]) if len(steps) and (steps[:, i] == 1).all()]
+    )
+    rising = [
+        i for i in range(columns.shape[1]) if (steps[:, i] >= 0).all() and steps[:, i].any() and i not in counting
+    ]
+    others = [i for i in range(columns.shape[1]) if i not in counting]
+    return next(reversed(rising), None if given.rate_hz else next(reversed(others), None))

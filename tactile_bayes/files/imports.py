@@ -32,9 +32,10 @@ _LARGEST: Final = 1e12
 _STEP_KPA: Final = 0.001
 """To which pressures are kept: a tenth of what the best arrays resolve."""
 _MOST_COUNTS: Final = 65535
-_SECONDS: Final = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "min": 60.0}
+_SECONDS: Final = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0}
 _MM: Final = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "inch": 25.4}
 _NOT_RIGID: Final = 1e-3  # of matrices that were written with few digits
+_TIME_OPTIONS: Final = {"frame_time_s": "time-unit", "pose_time_s": "pose-time-unit"}
 _BESIDE: Final = {
     "--poses FILE": ("position_mm", "quaternion_wxyz", "pose_time_s"),
     "--head-geometry HEAD.json": ("pitch_mm", "array_from_tracker", "head_surface_mm"),
@@ -195,6 +196,7 @@ def combined(sources: Sequence[Source], given: Stated) -> Imported:
     _poses(held, stated, told)
     _frames(held, stated, told)
     _clocks(held, stated)
+    _check_largest(held)
     pressure = stated.unit not in (None, "counts")
     if pressure:
         _as_counts(held, stated, told)
@@ -410,9 +412,15 @@ def _check_numbers(arrays: Arrays) -> None:
             raise BadDataError(
                 f"{name} holds {number} values that are not finite{where}", way_out="repair or leave them out"
             )
+
+
+def _check_largest(arrays: Arrays) -> None:
+    for name, array in arrays.items():
         largest = float(np.abs(array, dtype=np.float64).max(initial=0.0))
         if largest > _LARGEST:
-            raise BadDataError(f"{name} holds {largest:.3g}", way_out="give mm, kPa and s; the file may be damaged")
+            unit = f"; times in ms are stated, --{_TIME_OPTIONS[name]} ms" if name in _TIME_OPTIONS else ""
+            way_out = f"give mm, kPa and s; the file may be damaged{unit}"
+            raise BadDataError(f"{name} holds {largest:.3g}", way_out=way_out)
 
 
 def _check_counts(arrays: Arrays) -> None:
@@ -465,13 +473,14 @@ def _check_nipple(arrays: Arrays, metres: str) -> None:
 
 
 def _check_clock(frame_time_s: np.ndarray[Any, Any], pose_time_s: np.ndarray[Any, Any]) -> None:
-    for name, times, unit in (
-        ("frame_time_s", frame_time_s, "time-unit"),
-        ("pose_time_s", pose_time_s, "pose-time-unit"),
-    ):
+    for (name, option), times in zip(_TIME_OPTIONS.items(), (frame_time_s, pose_time_s), strict=True):
         step = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
+        if len(times) > 1 and times[0] == times.min() == times.max():
+            raise BadDataError(f"{name} is {times[0]:g} throughout", way_out="give its times, not a constant")
         if step > 0.5:
-            raise BadDataError(f"{name} steps by {step:.4g}", way_out=f"looks like milliseconds, give s or --{unit} ms")
+            raise BadDataError(
+                f"{name} steps by {step:.4g}", way_out=f"looks like milliseconds, give s or --{option} ms"
+            )
     (a, b), (c, d) = ((float(times.min()), float(times.max())) for times in (frame_time_s, pose_time_s))
     if b < c or d < a:
         raise BadDataError(

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import io
 import warnings
-import zlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import scipy.io
@@ -15,6 +14,7 @@ import scipy.io
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.arrays_layout import Stated
+from tactile_bayes.files.mat_5 import MAT_5, load_mat_5
 from tactile_bayes.files.netcdf import Group, as_declared, open_netcdf
 from tactile_bayes.files.npz import Arrays, choose_npz, load_npy
 from tactile_bayes.files.reading import (
@@ -22,11 +22,9 @@ from tactile_bayes.files.reading import (
     MCAP_MAGIC,
     NETCDF_BYTES,
     ZIP_MAGIC,
-    check_limit,
     decoding,
     open_input,
     read_bytes,
-    unpacked_limit,
 )
 
 
@@ -41,10 +39,8 @@ class Source(Record, eq=False):
 Choose = Callable[[Sequence[str]], Iterable[str]]
 """Takes the names in a file and returns those to read."""
 ARRAY_SUFFIXES: Final = (".npz", ".npy", ".mat", ".h5", ".hdf5")
-_MAT_5: Final = b"MATLAB 5.0 MAT-file"
 _MAT_73: Final = b"MATLAB 7.3 MAT-file"
 _USER_BLOCK: Final = 512  # bytes before the HDF5 file in a .mat of version 7.3
-_COMPRESSED: Final = 15  # miCOMPRESSED
 _COPY_AGAIN: Final = "copy the file again"
 _MOST_LEVELS: Final = 8
 
@@ -66,8 +62,8 @@ def read_named(path: Path, choose: Choose) -> Arrays:
             return choose_npz(path, choose)
         if start.startswith(np.lib.format.MAGIC_PREFIX):
             return _chosen(load_npy(path), choose)
-        if start.startswith(_MAT_5):
-            return _chosen(_mat_5(path), choose)
+        if start.startswith(MAT_5):
+            return _chosen(load_mat_5(path), choose)
         if start.startswith(_MAT_73):
             return {name: array.T for name, array in _hdf5(path, choose, begins_at=_USER_BLOCK).items()}
         if start.startswith(HDF5_MAGIC):
@@ -82,7 +78,7 @@ def read_named(path: Path, choose: Choose) -> Arrays:
 def is_text(path: Path) -> bool:
     """True for a file that is none of arrays by its first bytes and its suffix, and may be a text."""
     start = _start(path)
-    known = (ZIP_MAGIC[:2], np.lib.format.MAGIC_PREFIX, _MAT_5, _MAT_73, HDF5_MAGIC, MCAP_MAGIC)
+    known = (ZIP_MAGIC[:2], np.lib.format.MAGIC_PREFIX, MAT_5, _MAT_73, HDF5_MAGIC, MCAP_MAGIC, b"CDF")
     return path.suffix.lower() not in ARRAY_SUFFIXES and not start.startswith(known)
 
 
@@ -104,56 +100,6 @@ def _of_another_kind(path: Path, start: bytes) -> BadDataError:
 
 def _chosen(arrays: Arrays, choose: Choose) -> Arrays:
     return {name: arrays[name] for name in choose(list(arrays))}
-
-
-# --- MATLAB's files up to version 7, by scipy.
-
-
-def _mat_5(path: Path) -> Arrays:
-    data = read_bytes(path, most=NETCDF_BYTES)
-    with (
-        decoding("is not a whole .mat file", way_out=_COPY_AGAIN),
-        warnings.catch_warnings(action="ignore"),
-    ):
-        most = unpacked_limit(len(data))
-        check_limit(_unpacked_bytes(data, most), most, what="its arrays unpack to {} bytes or more")
-        held = scipy.io.loadmat(io.BytesIO(data))  # type: ignore[arg-type]
-    return {
-        name: array
-        for key, value in held.items()
-        if not key.startswith("__")
-        for name, array in _fields(key, value, levels=_MOST_LEVELS)
-    }
-
-
-def _unpacked_bytes(data: bytes, most: int) -> int:
-    """Bytes that the elements of a .mat unpack to; no more than a little over `most` are unpacked to see it.
-
-    MAT-File Format (MathWorks), "Level 5 MAT-File Format": a header of 128 bytes, then elements, each with its type and
-    length before it.
-    """
-    order = "little" if data[126:128] == b"IM" else "big"
-    total, at = 0, 128
-    while at + 8 <= len(data) and total <= most:
-        kind, length = (int.from_bytes(data[i : i + 4], order) for i in (at, at + 4))  # type: ignore[arg-type]
-        packed = data[at + 8 : at + 8 + length]
-        if kind == _COMPRESSED:
-            total += len(zlib.decompressobj().decompress(packed, most - total + 1))
-        else:
-            total += len(packed)
-        at += 8 + length
-    return total
-
-
-def _fields(name: str, value: Any, *, levels: int) -> Iterator[tuple[str, Any]]:
-    """An array, or those in a structure's fields; cells, tables and objects of MATLAB have no numbers."""
-    if not isinstance(value, np.ndarray) or levels == 0:
-        return
-    if value.dtype.names is None:
-        yield name, value
-    elif value.size == 1:
-        for field in value.dtype.names:
-            yield from _fields(f"{name}.{field}", value.flat[0][field], levels=levels - 1)
 
 
 # --- netCDF-3, by scipy.

@@ -49,7 +49,7 @@ _PLACE: Final = ("x", "y", "z")
 _SEEN: Final = ("ok", "enabled", "valid", "tracked", "good", "true", "visible")
 """Status of a tool that is seen, in small letters."""
 _UNIT: Final = re.compile(r"[\[(_ ](mm|cm|m|in|inch|inches)[\])]?$", re.IGNORECASE)
-_TIME_UNIT: Final = re.compile(r"[\[(_ ](ms|us|s|sec|min)[\])]?$", re.IGNORECASE)
+_TIME_UNIT: Final = re.compile(r"[\[(_ ](ms|us|ns|s|sec|min)[\])]?$", re.IGNORECASE)
 _LENGTHS: Final = {"in": "inch", "inches": "inch"}
 _BARE: Final = {"wxyz": 7, "xyzw": 7, "euler": 6, "matrix": 16}
 """Numbers of a pose in a text without names, by its layout; a time and a station may stand before them."""
@@ -66,7 +66,7 @@ def read_poses(path: Path, given: Stated) -> Source:
         Where it has several tools and none is stated, no times, or columns that are none of a known layout.
     """
     try:
-        table = read_text_table(path)
+        table = read_text_table(path, given.decimal)
         header = next((line for line in table.lines if _is_header(line)), None)
         found = _bare(table, given) if header is None else _named(table, header, given)
         return replace(found, notes=(f"poses: {table.words}", *found.notes))
@@ -78,13 +78,14 @@ def _plain(name: str) -> str:
     return re.sub(r"[^a-z0-9]", "", re.sub(r"[\[(].*?[\])]", "", name.lower()))
 
 
-def _kind(name: str) -> str:
+def kind_of_column(name: str) -> str:
+    """What a column of a tracker's table holds, by its name; empty for one of anything else."""
     plain = _plain(name)
     return _NAMES.get(plain) or _NAMES.get(re.sub(r"(mm|cm|inch|in|deg|ms|us|s)$", "", plain), "")
 
 
 def _is_header(line: Line) -> bool:
-    kinds = {_kind(name) for name in line.fields}
+    kinds = {kind_of_column(name) for name in line.fields}
     return kinds.issuperset(_PLACE) or len(kinds & {"qw", "qx", "azimuth", "elevation"}) > 1
 
 
@@ -143,7 +144,7 @@ def chosen(names: Sequence[str], given: Stated, *, what: str) -> str:
 
 
 def _named(table: TextTable, header: Line, given: Stated) -> Source:
-    kinds = [_kind(name) for name in header.fields]
+    kinds = [kind_of_column(name) for name in header.fields]
     layout = "wxyz" if "qw" in kinds else "euler"
     names = (*_PLACE, *_ROTATIONS[layout])
     if not set(names) <= set(kinds):

@@ -19,6 +19,7 @@ _SEPARATORS: Final = {"\t": "tabs", ";": "semicolons", ",": "commas", " ": "blan
 _SAMPLED: Final = 300  # lines by which the separator is told
 _LEAST_NUMBERS: Final = 0.6  # share of a line's fields that are numbers where it is one of the table
 _AS_UTF8: Final = "save it as UTF-8 text"
+_AROUND: Final = " \t\"'[](){}"  # of a field, as R and Python print numbers
 _CLOCK: Final = re.compile(r"(?:(\d{1,2}):)?(\d{1,2}):(\d{1,2}(?:\.\d+)?)")
 _DATED: Final = re.compile(r"\d{4}-\d{2}-\d{2}[T ]\d{1,2}:\d{2}:\d{2}(\.\d+)?(Z|[+-]\d{2}:?\d{2})?")
 _NO_VALUE: Final = ("", "nan", "na", "n/a", "-", "--", "b", "null")
@@ -56,7 +57,7 @@ class TextTable(Record):
 
 def number(text: str, *, decimal_comma: bool = False) -> float:
     """A number, a time of day in s, or a date and time in s since 1970; NaN for no value, else a ValueError."""
-    text = text.strip()
+    text = text.strip(_AROUND)
     try:
         return float(text.replace(",", ".") if decimal_comma and DECIMAL_COMMA.match(text) else text)
     except ValueError:
@@ -70,8 +71,13 @@ def number(text: str, *, decimal_comma: bool = False) -> float:
     raise ValueError(text)
 
 
-def read_text_table(path: Path) -> TextTable:
+def read_text_table(path: Path, decimal: str | None = None) -> TextTable:
     """Read the lines of a text, UTF-8 or with a byte order mark; the separator is the one that makes numbers of them.
+
+    Parameters
+    ----------
+    decimal
+        ``"point"`` or ``"comma"`` where it is stated.
 
     Raises
     ------
@@ -94,10 +100,10 @@ def read_text_table(path: Path) -> TextTable:
         lines.append(Line(i, one, _fields(one, separator), after_blank=i > before + 1))
         before = i
     commas = [f for line in lines for f in line.fields if DECIMAL_COMMA.fullmatch(f)] if separator != "," else []
-    if commas and all(map(may_be_thousands, commas)):
+    if decimal is None and commas and all(map(may_be_thousands, commas)):
         what = f"holds {commas[0]!r}, which is {commas[0].replace(',', '')} or {commas[0].replace(',', '.')}"
-        raise BadDataError(what, way_out="write numbers without commas", path=str(path))
-    return TextTable(lines, separator, bool(commas))
+        raise BadDataError(what, way_out="state which, --decimal comma", path=str(path))
+    return TextTable(lines, separator, decimal != "point" and bool(commas))
 
 
 def _numbers_by(separator: str, texts: Sequence[tuple[int, str]]) -> int:

@@ -43,6 +43,8 @@ def timed(scale: float, separator: str = ",") -> list[str]:
 NAMES = ",".join(f"S{i}" for i in range(416))
 NUMBERED = [f"{i},{row}" for i, row in enumerate(timed(1))]
 SUMMED = [f"{row},{i}" for i, row in enumerate(timed(1))]
+NAMED_ROWS = [f'"{row}'.replace(",", '" ', 1).replace(",", " ") for row in NUMBERED]
+PLAIN = [f"{t:.3f},{row}" for t, row in zip(TIME, rows(FLAT, digits=3), strict=True)]
 UTF_8, MARKED, UTF_16 = "utf-8", "utf-8-sig", "utf-16"
 PREAMBLE = ["Pressure mat 7", "Units: kPa", "Operator, code 12", ""]
 ONE_ROW_A_FRAME: dict[str, tuple[Sequence[str], str, dict[str, Any]]] = {
@@ -63,6 +65,15 @@ ONE_ROW_A_FRAME: dict[str, tuple[Sequence[str], str, dict[str, Any]]] = {
     "skipped": (SUMMED, UTF_8, {"skip_columns": 1}),
     "preamble": ([*PREAMBLE, "time," + NAMES, *timed(1)], UTF_8, {"unit": None}),
     "blank lines": ([*timed(1)[:20], "", *timed(1)[20:]], UTF_8, {}),
+    "lists of Python": (["[" + row + "]" for row in timed(1)], UTF_8, {}),
+    "rows named by R": (
+        ['"time" "V1"', *(f'"{row}'.replace(",", '" ', 1).replace(",", " ") for row in NUMBERED)],
+        UTF_8,
+        {},
+    ),
+    "taxels in rows": (rows(FLAT.T), UTF_8, {"rate_hz": 200.0}),
+    "rows without a break": (rows(KPA.reshape(-1, 26)), UTF_8, {"rate_hz": 200.0}),
+    "three decimals": ([row.replace(",", ";").replace(".", ",") for row in PLAIN], UTF_8, {"decimal": "comma"}),
     "clock": ([f"10:00:{t:06.3f},{row}" for t, row in zip(TIME, rows(FLAT), strict=True)], UTF_8, {}),
 }
 
@@ -79,7 +90,7 @@ def test_one_row_a_frame(tmp_path: Path, name: str) -> None:
         np.testing.assert_allclose(found.frames.time_s - 36000, TIME, atol=1e-3)
         return
     same(found)
-    assert "each 416 numbers read as 16 x 26" in found.session["imported_as"]
+    assert "read as" in found.session["imported_as"]
 
 
 def tekscan(frames: Any, unit: str) -> str:
@@ -155,6 +166,20 @@ def test_layouts_of_instruments(tmp_path: Path, vendor: str) -> None:
     assert told in found.session["imported_as"]
 
 
+def test_frames_and_poses_in_one_table(tmp_path: Path) -> None:
+    """A log with a row a frame: time, a word, the pose of that moment, and the readings."""
+    pose = SCAN.poses.position_mm[0], SCAN.poses.quaternion_wxyz[0]
+    told = ",".join(f"{one:.6f}" for one in np.concatenate(pose))
+    lines = [f"{row.partition(',')[0]},OK,{told},{row.partition(',')[2]}" for row in timed(1)]
+    lines[7] = lines[7].replace("OK", "Missing")
+    path = tmp_path / "log.csv"
+    path.write_text("\n".join(["time,status,x,y,z,qw,qx,qy,qz," + NAMES, *lines]))
+    found = tb.scan_of(path, None, path, head=SCAN.head, unit="kPa")
+    same(found)
+    assert len(found.poses) == len(found.frames) - 1
+    np.testing.assert_allclose(found.poses.position_mm[0], pose[0], atol=1e-5)
+
+
 def test_raw_counts_in_a_text_take_a_calibration(tmp_path: Path) -> None:
     (tmp_path / "raw.asf").write_text(tekscan(SCAN.frames.counts, "RAW"))
     found = brought_in(tmp_path / "raw.asf", calibration=SCAN)
@@ -185,6 +210,11 @@ FAULTS: dict[str, tuple[str | bytes, dict[str, Any], str]] = {
         {"rate_hz": 200.0},
         "100 columns, and the head 416 taxels",
     ),
+    "time falls": ("\n".join([*timed(1)[30:], *timed(1)[:30]]), {}, "frame_time_s runs backwards at index 30"),
+    "time stands": ("\n".join(f"1.5,{row}" for row in rows(FLAT)), {}, "frame_time_s is 1.5 throughout"),
+    "only counted": ("\n".join(f"{i},{row}" for i, row in enumerate(rows(FLAT))), {}, "lacks frame_time_s .*rate_hz"),
+    "epoch in ms": ("\n".join(f"{1.7e12 + 5 * i},{row}" for i, row in enumerate(rows(FLAT))), {}, "time_unit ms"),
+    "a list": ("frame,row,col,kPa\n" + "0,1,2,3.5\n" * 99, {}, "names 4 columns .*give one row a frame"),
     "other columns": ("\n".join(["time," + NAMES + ",b", *SUMMED]), {}, "418 columns .* 417 of which.*skip_columns"),
 }
 

@@ -17,6 +17,7 @@ import pytest
 from tactile_bayes.api.settings import read_settings
 from tactile_bayes.batch_store import open_store
 from tactile_bayes.errors import BadDataError, UsageError
+from tactile_bayes.files.arrays_layout import Stated
 from tactile_bayes.files.column_map import read_mapping, read_wide
 from tactile_bayes.files.documents import parse_toml, read_protocol
 from tactile_bayes.files.estimate_json import read_stated_size
@@ -26,6 +27,7 @@ from tactile_bayes.files.imports import read_arrays
 from tactile_bayes.files.instrument_json import read_landmarks
 from tactile_bayes.files.map_nc import read_map, write_map
 from tactile_bayes.files.npz import CheckpointFile
+from tactile_bayes.files.poses_text import read_poses
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.scan_mcap import read_scan, read_scan_report
 from tactile_bayes.files.scene_toml import read_scene
@@ -252,6 +254,11 @@ def _fifo(path: Path) -> None:
 READERS: tuple[tuple[str, Read], ...] = (
     (".mcap", read_scan),
     (".npz", read_arrays),
+    (".mat", read_arrays),
+    (".h5", read_arrays),
+    (".csv", read_arrays),
+    (".mha", read_arrays),
+    (".csv", lambda path: read_poses(path, Stated())),
     (".npz", _grid),
     (".csv", _grid),
     (".png", _grid),

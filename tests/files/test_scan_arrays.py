@@ -13,6 +13,7 @@ import h5py
 import numpy as np
 import pytest
 import scipy.io
+import scipy.sparse
 from in_process import run_here
 from scipy.spatial.transform import Rotation
 
@@ -22,6 +23,7 @@ from tactile_bayes.files.array_map import array_template
 from tactile_bayes.files.arrays_layout import ArrayMap
 from tactile_bayes.files.documents import parse_toml
 from tactile_bayes.files.imports import import_arrays, read_arrays
+from tactile_bayes.files.named_arrays import read_named
 from tactile_bayes.files.scan_mcap import read_scan
 from tactile_bayes.forward.scene import Scene
 from tactile_bayes.forward.simulate import simulate
@@ -320,6 +322,40 @@ def test_a_mat_that_unpacks_to_more_than_its_limit_is_not_unpacked(tmp_path: Pat
     (tmp_path / "bomb.mat").write_bytes(header + struct.pack("<II", 15, len(packed)) + packed)
     with pytest.raises(BadDataError, match=r"its arrays unpack to 64,000,001 bytes or more, over the limit"):
         read_arrays(tmp_path / "bomb.mat")
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_a_mat_is_read_as_scipy_reads_it(tmp_path: Path, packed: bool) -> None:
+    rng = np.random.default_rng(3)
+    kinds = ("f8", "f4", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8")
+    held: Arrays = {f"a_{kind}": rng.integers(0, 99, (2, 3, 4)).astype(kind) for kind in kinds}
+    held |= {"whole": np.arange(7.0), "flag": np.array([True, False]), "one": 2.5, "none": np.zeros((0, 3))}
+    inner = {"x": np.eye(3), "deeper": {"y": [1, 2]}, "text": "word"}
+    odd = {
+        "words": "some text",
+        "cell": np.array([1, "a"], dtype=object),
+        "z": 1j * np.eye(2),
+        "s": scipy.sparse.eye(3),
+    }
+    scipy.io.savemat(tmp_path / "a.mat", {**held, "exam": inner, **odd}, do_compression=packed)
+    found = read_named(tmp_path / "a.mat", list)
+    by_scipy = scipy.io.loadmat(tmp_path / "a.mat")
+    for name in held:
+        np.testing.assert_array_equal(found[name], by_scipy[name])
+    np.testing.assert_array_equal(found["exam.x"], np.eye(3))
+    np.testing.assert_array_equal(found["exam.deeper.y"], [[1, 2]])
+    assert {name for name, one in found.items() if one.dtype == object} == {"exam.text", *odd}
+
+
+def test_a_mat_of_the_other_byte_order_is_read(tmp_path: Path) -> None:
+    """As a workstation wrote it: the header ends in MI."""
+    flags = struct.pack(">IIII", 6, 8, 6, 0)
+    shape, name = struct.pack(">IIii", 5, 8, 2, 2), struct.pack(">II8s", 1, 1, b"a")
+    values = struct.pack(">II4d", 9, 32, 1, 2, 3, 4)
+    matrix = flags + shape + name + values
+    head = b"MATLAB 5.0 MAT-file".ljust(124) + struct.pack(">H", 0x0100) + b"MI"
+    (tmp_path / "a.mat").write_bytes(head + struct.pack(">II", 14, len(matrix)) + matrix)
+    np.testing.assert_array_equal(read_named(tmp_path / "a.mat", list)["a"], [[1, 3], [2, 4]])
 
 
 @pytest.mark.parametrize("suffix", [".mat", ".v73.mat", ".h5", ".npy"])

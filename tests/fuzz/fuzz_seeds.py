@@ -7,7 +7,7 @@ import json
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -249,6 +249,49 @@ def _read_arrays(path: Path) -> object:
     return read_arrays(path)
 
 
+def _read_frames(path: Path) -> object:
+    from tactile_bayes.files.arrays_layout import ArrayMap
+    from tactile_bayes.files.imports import import_arrays, of_head, of_poses
+    from tactile_bayes.scan import HeadGeometry
+
+    y, x = np.meshgrid(2.0 * np.arange(5), 2.0 * np.arange(4))
+    head = HeadGeometry(np.stack([x, y, 0 * x], axis=-1), 2.0, np.eye(4))
+    return import_arrays(path, ArrayMap(unit="kPa"), [of_head(head), of_poses(path, ArrayMap())])
+
+
+def _mat(arrays: Mapping[str, Any], *, packed: bool) -> bytes:
+    import scipy.io
+
+    stream = io.BytesIO()
+    scipy.io.savemat(stream, dict(arrays), do_compression=packed)  # type: ignore[arg-type]
+    return stream.getvalue()
+
+
+def _hdf5(arrays: Mapping[str, Any]) -> bytes:
+    import h5py
+
+    stream = io.BytesIO()
+    with h5py.File(stream, "w") as file:
+        for name, one in arrays.items():
+            file.create_dataset(name, data=one, **({"compression": "gzip"} if np.ndim(one) else {}))
+    return stream.getvalue()
+
+
+def _frames_and_poses() -> bytes:
+    """One table in which a reader of frames and one of poses find something each."""
+    names = "time (ms),status,x,y,z,qw,qx,qy,qz," + ",".join(f"S{i}" for i in range(20))
+    rows = [f"{5 * i}.0,OK,{i},2,3,1,0,0,0," + ",".join(f"{9 + i / 10}" for _ in range(20)) for i in range(9)]
+    return "\n".join(["Units: kPa", "", names, *rows, ""]).encode()
+
+
+def _metafile() -> bytes:
+    head = ["ObjectType = Image", "CompressedData = False", "DimSize = 5 4 3", "ElementType = MET_UCHAR"]
+    for i in range(3):
+        head += [f"Seq_Frame{i:04d}_ProbeToTrackerTransform = 1 0 0 {i} 0 1 0 0 0 0 1 0 0 0 0 1"]
+        head += [f"Seq_Frame{i:04d}_ProbeToTrackerTransformStatus = OK", f"Seq_Frame{i:04d}_Timestamp = 0.{i}"]
+    return "\n".join([*head, "ElementDataFile = LOCAL\n"]).encode() + bytes(9 + i % 3 for i in range(60))
+
+
 def _read_grid(path: Path) -> object:
     from tactile_bayes.files.grids import read_grid
 
@@ -339,6 +382,12 @@ def _read_store(path: Path) -> object:
 FORMATS = {
     "mcap scan": Format(".mcap", lambda folder: [_scan(folder, 40), _scan(folder, 7)], [_read_scan, _describe]),
     "npz scan": Format(".npz", lambda _: [_npz(_scan_arrays(5)), _npz(_scan_arrays(20), packed=True)], [_read_arrays]),
+    "mat scan": Format(
+        ".mat", lambda _: [_mat(_scan_arrays(5), packed=packed) for packed in (False, True)], [_read_arrays]
+    ),
+    "hdf5 scan": Format(".h5", lambda _: [_hdf5(_scan_arrays(5))], [_read_arrays]),
+    "frames and poses": Format(".csv", lambda _: [_frames_and_poses()], [_read_frames]),
+    "metafile": Format(".mha", lambda _: [_metafile()], [_read_frames]),
     "npz grid": Format(".npz", lambda _: [_npz({"mean": _grid(), "spacing_mm": np.array(1.0)})], [_read_grid]),
     "csv grid": Format(".csv", lambda _: [_csv_grid().encode()], [_read_grid]),
     "csv table": Format(".csv", lambda _: _tables(), [_read_tables, _describe]),
