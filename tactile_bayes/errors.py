@@ -175,9 +175,11 @@ def one_line(error: BaseException) -> str:
 
 # --- Reasons for giving no number: a sentence, a code for programs, and what would help.
 
-CODES = ("empty", "undetected", "ridge", "coarse", "unresolved", "window", "prior", "extrapolated", "method")
+CANNOT_SHOW = "cannot_show"
+"""Code of data that cannot show whether there is a lump."""
+CODES = ("empty", "undetected", "ridge", CANNOT_SHOW, "unresolved", "window", "prior", "extrapolated", "method")
 NO_LUMP = ("empty", "undetected", "ridge")
-"""Codes of maps that show no lump; the others show one that cannot be measured."""
+"""Codes of maps that show no lump where one would show; the others but `CANNOT_SHOW` show one without a size."""
 
 
 @dataclass(frozen=True, slots=True)

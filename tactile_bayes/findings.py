@@ -20,6 +20,8 @@ KINDS: Final[Mapping[str, Severity]] = {
     "wrong_arrangement": "caution",
     "frames_contradict": "caution",
     "arrangement_unknown": "check",
+    "unlike_an_exam": "caution",
+    "unusual_scan": "check",
     # of a map
     "wrong_rotations": "caution",
     "rotations_unknown": "check",

@@ -23,9 +23,10 @@ from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.files.named_arrays import ARRAY_SUFFIXES, Source
 from tactile_bayes.files.provenance import Provenance, hash_inputs
 from tactile_bayes.files.scan_mcap import read_scan_report, read_truth, write_scan
-from tactile_bayes.findings import finding_lines
+from tactile_bayes.findings import LEADS, finding_lines
 from tactile_bayes.mapping.arrangement import check_scan, corrected
-from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.mapping.plausibility import scan_doubts
+from tactile_bayes.presets import PRESSURE_WINDOW_KPA, RESEARCH_USE
 from tactile_bayes.scan import Scan
 
 _BESIDE: Final = {"head_geometry": of_head, "array_calibration": of_calibration, "landmarks": of_landmarks}
@@ -178,12 +179,14 @@ def _stated(arrays: ArrayMap) -> Mapping[str, Any]:
 
 
 def _arrangement_lines(scan: Scan) -> list[str]:
-    """What its frames say of the scan's arrangement; a scan that no map could be made of is imported without."""
+    """What its frames say of the scan; one that no map could be made of is imported all the same."""
     try:
+        doubts = scan_doubts(scan, pressure_window_kpa=PRESSURE_WINDOW_KPA)
         check = check_scan(scan, thorough=False)
     except BadDataError as error:
-        return [f"arrangement not checked: {error.what}"]
-    return [] if check is None else finding_lines(check.findings) or [check.words]
+        return [f"{LEADS['caution']}no map can be made of it: {error}"]
+    arrangement = [] if check is None else finding_lines(check.findings) or [check.words]
+    return [*finding_lines(doubts), *arrangement]
 
 
 def _import_map(source: Path, output: Path, wanted: Wanted) -> list[str]:

@@ -26,8 +26,10 @@ from tactile_bayes.files.estimate_json import StatedSize, read_stated_size
 from tactile_bayes.files.identify import describe
 from tactile_bayes.files.scan_mcap import read_scan, read_truth
 from tactile_bayes.files.size_json import SHIPPED, size_calibration_path
+from tactile_bayes.findings import finding_lines
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.arrangement import TOO_SHORT, check_scan
+from tactile_bayes.mapping.plausibility import scan_doubts
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.scan import Scan
 
@@ -35,12 +37,14 @@ from tactile_bayes.scan import Scan
 
 
 def check_action(*, scans: tuple[Path, ...], pressure_window_kpa: tuple[float, float]) -> None:
-    """Check that array, lever arm and quaternions of scans are as they are stated."""
+    """Check that scans are what an exam can be, and array, lever arm and quaternions as they are stated."""
     wrong = 0
     for path in scans:
-        check = check_scan(read_scan(path), pressure_window_kpa=pressure_window_kpa)
+        scan = read_scan(path)
+        check = check_scan(scan, pressure_window_kpa=pressure_window_kpa)
         click.echo(f"{path}:")
-        for line in [TOO_SHORT] if check is None else check.lines():
+        short = () if check else scan_doubts(scan, pressure_window_kpa=pressure_window_kpa)
+        for line in [*finding_lines(short), TOO_SHORT] if check is None else check.lines():
             click.echo(f"  {line}")
         wrong += check is not None and check.refused
     click.echo(RESEARCH_USE)

@@ -18,7 +18,7 @@ from tactile_bayes.api.repeatability import check_repeatability, repeatability_d
 from tactile_bayes.api.settings import GROWN_BY, Comparing, Settings, refuse_checkpoint, times_of
 from tactile_bayes.api.sized import Answer, SizeEstimate, size_priors
 from tactile_bayes.declarations import Record, as_dict, replace
-from tactile_bayes.errors import EXIT_DONE, EXIT_NO_ESTIMATE, UsageError
+from tactile_bayes.errors import CANNOT_SHOW, EXIT_DONE, EXIT_NO_ESTIMATE, UsageError
 from tactile_bayes.files.comparison import CompareReport
 from tactile_bayes.files.provenance import Provenance, hash_inputs, repeated_scans, scans_of
 from tactile_bayes.files.reports import centre_of
@@ -280,9 +280,7 @@ def _compared(
 ) -> Compared:
     found = [[answer for answer in maps if answer.shape is not None] for maps in visits]
     missing = [
-        f"a lump was found on {len(some)} of {len(maps)} maps of visit {number}"
-        for number, (some, maps) in enumerate(zip(found, visits, strict=True), start=1)
-        if not some or 2 * len(some) < len(maps)
+        words for number, maps in enumerate(visits, start=1) if (words := _missing(maps, f"visit {number}"))
     ]
     contradicted = contradictions([_scans(one) for one in visits])
     if contradicted:
@@ -294,6 +292,17 @@ def _compared(
     if refused is not None:
         return refused
     return _sized(found, calibration, settings, apart=apart, doubts=doubts)
+
+
+def _missing(maps: Sequence[Answer], visit: str) -> str:
+    """Why a visit has no size: too few of the maps that could show a lump show one; empty where enough do."""
+    found = sum(answer.shape is not None for answer in maps)
+    silent = [one.report for one in maps if one.report is not None and one.report.reason_code == CANNOT_SHOW]
+    if found and 2 * found >= len(maps) - len(silent):
+        return ""
+    if silent and len(silent) == len(maps):
+        return f"{visit}: {silent[0].reason}"
+    return f"a lump was found on {found} of {len(maps)} maps of {visit}"
 
 
 def _by_place(

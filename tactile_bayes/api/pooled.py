@@ -16,7 +16,7 @@ from tactile_bayes.api.repeatability import check_repeatability, repeatability_d
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.api.sized import Answer, SizedExam, SizeEstimate, check_one_mass, size_priors
 from tactile_bayes.declarations import Record, replace
-from tactile_bayes.errors import BadDataError, UsageError
+from tactile_bayes.errors import CANNOT_SHOW, BadDataError, UsageError
 from tactile_bayes.files.map_nc import write_pooled
 from tactile_bayes.files.provenance import Provenance, hash_inputs, scans_of
 from tactile_bayes.files.reports import EstimateReport, PooledReport
@@ -252,6 +252,7 @@ def pool_answers(
     chance = one_place_probability(places) if len(places) > 1 else None
     pooled = _no_size(answers, places, chance) or pool_maps(
         [answer.shape for answer in answers],
+        silent=sum(one.report is not None and one.report.reason_code == CANNOT_SHOW for one in answers),
         calibration=calibration,
         priors=size_priors(settings),
         rng=np.random.default_rng([settings.seed, *words]),
@@ -287,8 +288,9 @@ def _no_size(
     for i, answer in enumerate(answers, start=1):
         if answer.report is not None and answer.report.reason_code == "extrapolated":
             return PooledEstimate("no_estimate", f"map {i}: {answer.report.reason}")
-    if all(answer.report is None or answer.report.reason_code == "coarse" for answer in answers):
-        return PooledEstimate("no_estimate", "the maps cannot show whether there is a lump: their cells are too large")
+    if all(answer.report is None or answer.report.reason_code == CANNOT_SHOW for answer in answers):
+        why = next((one.report.reason for one in answers if one.report is not None), "")
+        return PooledEstimate("no_estimate", f"map 1: {why}" if len(answers) > 1 else why)
     if one_place is None or one_place >= LEAST_PROBABILITY:
         return None
     most = max(float(np.hypot(*(a.centre_mm - b.centre_mm))) for a, b in combinations(places, 2))

@@ -150,8 +150,8 @@ def _repeats(exams: Sequence[ExamFolder]) -> tuple[list[list[_Repeat]], list[str
         scans: dict[str, str] = {}
         for exam in same:
             repeat = _read(exam)
-            if repeat is None:
-                left_out.append(f"{exam.name}: it has no size")
+            if isinstance(repeat, str):
+                left_out.append(f"{exam.name}: it has no size ({repeat})")
                 continue
             if shared := [scan for scan in repeat.scans if scan in scans]:
                 left_out.append(f"{exam.name}: of the same scan as {scans[shared[0]]}")
@@ -163,12 +163,12 @@ def _repeats(exams: Sequence[ExamFolder]) -> tuple[list[list[_Repeat]], list[str
     return groups, left_out
 
 
-def _read(exam: ExamFolder) -> _Repeat | None:
-    """What an exam's estimate says of it; None where it has no size."""
+def _read(exam: ExamFolder) -> _Repeat | str:
+    """What an exam's estimate says of it, or why it has no size."""
     path = exam.folder / ESTIMATE
     report = read_record(path, EstimateReport, way_out=_AGAIN)
     if report.max_size_mm is None:
-        return None
+        return report.reason or "no calibration"
     made = report.origin
     if "size_calibration" not in made.settings or "inputs" not in report.provenance:
         raise BadDataError("does not say by which calibration", way_out=_AGAIN, path=str(path))

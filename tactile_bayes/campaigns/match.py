@@ -23,6 +23,7 @@ from tactile_bayes.files.reports import EstimateReport, Place
 from tactile_bayes.findings import Finding, finding_lines
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.map import TactileMap
+from tactile_bayes.posterior.abstention import no_verdict
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.report.compare import Growth, growths
 from tactile_bayes.trial.readings import day_of, in_order
@@ -123,11 +124,12 @@ def _not_there(outcome: SizeEstimate, mass: str, place: tuple[float, float], mos
     found = outcome.estimate
     reason = f"no lump found within {most_mm:g} mm of mass {mass}'s place, ({place[0]:.1f}, {place[1]:.1f}) mm"
     masses = tuple(replace(one, reported=False) for one in found.masses)
+    why = no_verdict(outcome.tactile_map)
     none = Estimate(
         "no_estimate",
-        reason,
+        reason if why is None else why.reason,
         candidates=found.candidates,
-        code="undetected",
+        code="undetected" if why is None else why.code,
         masses=masses,
         findings=outcome.tactile_map.findings,
     )

@@ -10,6 +10,7 @@ from typing import Any, Final
 from tactile_bayes.campaigns.match import unnamed
 from tactile_bayes.campaigns.run import Campaign
 from tactile_bayes.declarations import Record, replace
+from tactile_bayes.errors import CANNOT_SHOW
 from tactile_bayes.files.atomic import write_text
 from tactile_bayes.files.documents import load_schema, read_record
 from tactile_bayes.files.manifest_csv import (
@@ -87,8 +88,8 @@ def _status(report: EstimateReport | PooledReport | None) -> str:
         return "not_done"
     if report.max_size_mm is not None:
         return "detected"
-    coarse = isinstance(report, EstimateReport) and report.reason_code == "coarse"
-    return "not_detected" if report.status == "no_estimate" and not coarse else "not_done"
+    silent = isinstance(report, EstimateReport) and report.reason_code == CANNOT_SHOW
+    return "not_detected" if report.status == "no_estimate" and not silent else "not_done"
 
 
 def exam_rows(campaign: Campaign) -> list[Row]:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from tactile_bayes.declarations import Record, replace
-from tactile_bayes.errors import NO_LUMP, BadDataError, UsageError
+from tactile_bayes.errors import CANNOT_SHOW, NO_LUMP, BadDataError, UsageError
 from tactile_bayes.files.atomic import sha256
 from tactile_bayes.files.documents import load_json, parse_json
 from tactile_bayes.files.estimate_json import REPORTS, checked_report
@@ -94,6 +94,7 @@ INTERVAL_HIGH: Final = Code("interval-high", OWN_SCHEME, "Upper end of the credi
 INTERVAL_PROBABILITY: Final = Code("interval-prob", OWN_SCHEME, "Probability of the credible interval")
 OUTCOME: Final = Code("outcome", OWN_SCHEME, "Outcome of the estimate")
 NOT_DETECTED: Final = Code("no-lump-shown", OWN_SCHEME, "The map shows no lump that can be measured")
+NO_VERDICT: Final = Code("no-verdict", OWN_SCHEME, "The data cannot show whether there is a lump")
 NOT_SIZED: Final = Code("not-sized", OWN_SCHEME, "A lump may be there, without a size")
 SIZED: Final = Code("sized", OWN_SCHEME, "Lump with a size")
 
@@ -155,6 +156,8 @@ class SizedMass(Record, eq=False):
         """Whether the mass has a size, and if not, whether a lump was detected."""
         if self.largest is not None:
             return SIZED
+        if self.code == CANNOT_SHOW:
+            return NO_VERDICT
         return NOT_DETECTED if self.code in NO_LUMP else NOT_SIZED
 
 

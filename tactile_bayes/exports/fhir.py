@@ -207,7 +207,7 @@ def _size(size: Quantity) -> dict[str, Any]:
 
 def _absent(finding: SizedMass) -> dict[str, Any]:
     """Why there is no value."""
-    unknown = finding.outcome is codes.NOT_SIZED
+    unknown = finding.outcome is not codes.NOT_DETECTED
     code = ("unknown", "Unknown") if unknown else ("not-applicable", "Not Applicable")
     coding = {"system": ABSENT, "code": code[0], "display": code[1]}
     return {"dataAbsentReason": {"coding": [coding], "text": finding.reason or finding.outcome.meaning}}

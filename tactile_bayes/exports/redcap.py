@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 from tactile_bayes.errors import UsageError
-from tactile_bayes.exports.exam import NOT_DETECTED, NOT_SIZED, SIZED, EstimateFile, SizedMass, content_uuid
+from tactile_bayes.exports.exam import NO_VERDICT, NOT_DETECTED, NOT_SIZED, SIZED, EstimateFile, SizedMass, content_uuid
 from tactile_bayes.exports.identity import Identity
 from tactile_bayes.files.tables import csv_text
 from tactile_bayes.inference.draws import Quantity
@@ -37,7 +37,7 @@ DICTIONARY_HEADER: Final = (
 """The 18 columns of a data dictionary, as a REDCap project downloads its own."""
 _RECORD: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}", re.ASCII)
 _CHOICES: Final = {
-    "tb_status": {"1": "size", "2": "no size", "3": "no lump that can be measured"},
+    "tb_status": {"1": "size", "2": "no size", "3": "no lump that can be measured", "4": "the data cannot show one"},
     "tb_verdict": {"1": "sound", "2": "doubtful", "3": "no answer"},
     "tb_side": {"1": "left", "2": "right", "3": "phantom"},
     "tb_posture": {"1": "supine", "2": "oblique", "3": "sitting", "4": "phantom"},
@@ -162,7 +162,7 @@ def _record_id(estimate: EstimateFile, finding: SizedMass, identity: Identity, *
 
 def _row(estimate: EstimateFile, finding: SizedMass, identity: Identity) -> dict[str, str]:
     facts = estimate.facts
-    status = {SIZED: "1", NOT_SIZED: "2", NOT_DETECTED: "3"}[finding.outcome]
+    status = {SIZED: "1", NOT_SIZED: "2", NOT_DETECTED: "3", NO_VERDICT: "4"}[finding.outcome]
     row = {
         "tb_status": status,
         "tb_reason": finding.reason,

@@ -20,7 +20,7 @@ Number1 = Annotated[int, Meta(ge=1)]
 Diameter = Annotated[float, Meta(gt=0, le=500)] | None
 Three = tuple[Diameter, Diameter, Diameter]
 ReasonCode = Literal[
-    "", "empty", "undetected", "ridge", "coarse", "unresolved", "window", "prior", "extrapolated", "method"
+    "", "empty", "undetected", "ridge", "cannot_show", "unresolved", "window", "prior", "extrapolated", "method"
 ]
 Shape = Literal["round", "ellipse", "rotated"]
 Entries = Annotated[

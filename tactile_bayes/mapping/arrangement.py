@@ -19,11 +19,12 @@ from typing import Any, Final
 import numpy as np
 
 from tactile_bayes.declarations import Record, field, replace
-from tactile_bayes.findings import Finding
+from tactile_bayes.findings import Finding, finding_lines
 from tactile_bayes.geometry import FloatArray, IndexArray, apply, inverse
 from tactile_bayes.mapping.convention import CoarseFrames, block_means, every_stretch, thinning
 from tactile_bayes.mapping.latency import Cells, Nuisance
 from tactile_bayes.mapping.plane import poses_at
+from tactile_bayes.mapping.plausibility import scan_doubts
 from tactile_bayes.mapping.select import SelectedFrames, TaxelFault, select_frames
 from tactile_bayes.presets import CORRECTIONS, PRESSURE_WINDOW_KPA
 from tactile_bayes.scan import ElementCalibration, HeadGeometry, PressureFrames, Scan, TrackerPoses
@@ -166,6 +167,8 @@ class ArrangementCheck(Record, eq=False):
     """Log odds for what is stated against each correction alone."""
     contradicting: bool = False
     """True where frames contradict each other whatever is corrected."""
+    doubts: tuple[Finding, ...] = ()
+    """What in the scan is unlike an exam, where it was looked for; see `plausibility.scan_doubts`."""
 
     @property
     def refused(self) -> bool:
@@ -218,7 +221,7 @@ class ArrangementCheck(Record, eq=False):
 
     def lines(self) -> list[str]:
         """The answer in full: what the frames agree with, what they exclude, what they leave open, and what to do."""
-        lines = [self.words, *(one.remedy for one in self.findings)]
+        lines = [*finding_lines(self.doubts), self.words, *(one.remedy for one in self.findings)]
         if self.best is self.stated and not self.says_nothing:
             odds = {name: odds_words(self.excluded[name]) for name in self.excluded if name not in self.not_shown}
             for words in dict.fromkeys(odds.values()):
@@ -278,9 +281,14 @@ def check_briefly(selection: SelectedFrames, *, latency_ms: float = 0.0) -> Arra
 def check_scan(
     scan: Scan, *, pressure_window_kpa: tuple[float, float] = PRESSURE_WINDOW_KPA, thorough: bool = True
 ) -> ArrangementCheck | None:
-    """Check a scan as it is recorded, with its frames within the window: thoroughly or `check_briefly`."""
+    """Check a scan as it is recorded, with its frames within the window: thoroughly or `check_briefly`.
+
+    A scan without a frame that can be used is a `BadDataError`.
+    """
+    doubts = scan_doubts(scan, pressure_window_kpa=pressure_window_kpa)
     selection = select_frames(scan, pressure_window_kpa=pressure_window_kpa)
-    return check_arrangement(selection) if thorough else check_briefly(selection)
+    check = check_arrangement(selection) if thorough else check_briefly(selection)
+    return None if check is None else replace(check, doubts=doubts)
 
 
 def _arrangements(scan: Scan, most_changes: int) -> list[Corrections]:

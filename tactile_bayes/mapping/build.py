@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from tactile_bayes.declarations import Record
+from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError, check_number
 from tactile_bayes.findings import Finding, by_weight
 from tactile_bayes.geometry import FloatArray, Plane, apply, inverse, patient_from_plane
@@ -21,11 +21,12 @@ from tactile_bayes.mapping.errors import pose_noise_figures, shared_frame_figure
 from tactile_bayes.mapping.latency import estimate_latency
 from tactile_bayes.mapping.map import FEW_READINGS, MapRecipe, TactileMap, broken_assumptions, handling_findings, smooth
 from tactile_bayes.mapping.plane import MAX_POSE_GAP_MS, FramePoses, HeadMoments, head_moments
+from tactile_bayes.mapping.plausibility import exam_figures, exam_findings, map_findings, with_cause
 from tactile_bayes.mapping.profile import evenness_figures, head_profile_figures
 from tactile_bayes.mapping.select import (
-    Jumps,
     SelectedFrames,
     every_nth,
+    frame_figures,
     refuse_without_frames,
     scan_findings,
     select_frames,
@@ -92,37 +93,7 @@ def _plane_within(
     return moments.plane(), {"plane_radius_mm": float(radius), "plane_frames": float(moments.count)}
 
 
-# --- Figures of a map's report: frames used and left out, motion of the head, coverage of the cells.
-
-
-def frame_figures(selections: Sequence[SelectedFrames]) -> dict[str, float]:
-    """Frames used and left out, summed over the scans."""
-    figures = {
-        "scans": len(selections),
-        "frames_total": sum(len(part.used) for part in selections),
-        "frames_used": sum(int(part.used.sum()) for part in selections),
-        "dropped_no_pose": sum(part.dropped_no_pose for part in selections),
-        "dropped_elements": sum(part.dropped_elements for part in selections),
-        "dropped_low": sum(int(part.low.sum()) for part in selections),
-        "dropped_high": sum(int(part.high.sum()) for part in selections),
-        "masked_taxels": sum(len(part.faults) for part in selections),
-        "saturated_readings": sum(_saturated(part) for part in selections),
-    }
-    levels = np.concatenate([part.level_kpa[part.used] for part in selections])
-    felt = np.concatenate([part.level_kpa[part.used | part.low | part.high] for part in selections])
-    low, high = np.quantile(felt, [0.05, 0.95])
-    return {
-        **{name: float(value) for name, value in figures.items()},
-        "mean_pressure_kpa": float(levels.mean()),
-        "level_p05_kpa": float(low),
-        "level_p95_kpa": float(high),
-    }
-
-
-def _saturated(part: SelectedFrames) -> int:
-    """Number of full-scale readings of good taxels in used frames."""
-    good = int(part.good_taxels.sum())
-    return int(np.rint((good - part.valid_share[part.used] * part.good_taxels.size).sum()))
+# --- Figures of a map's report: motion of the head, coverage of the cells.
 
 
 def plane_figures(selections: Sequence[SelectedFrames], plane: Plane) -> dict[str, float]:
@@ -213,16 +184,34 @@ def build_map(
     figures: dict[str, float] = {} if how.every == 1 else {"frames_every": float(how.every)}
     late_ms = 0.0 if isinstance(how.latency_ms, str) else float(how.latency_ms)
     selections = rules.select(parts, late_ms)
-    with _jumps_named(given):
-        findings = _of_scans(given) + _of_arrangement(selections, late_ms, refuse=not how.as_stated)
-        figures |= head_profile_figures(selections)
-        if how.flat_field:
-            selections = _flattened(selections, rules, late_ms, figures)
-        if how.latency_ms == "auto":
-            late_ms = _latency(selections, rules, how.cell_mm, figures)
-            selections = rules.select([part.scan for part in selections], late_ms)
-        figures |= check_convention(selections)
-        plane = _plane(selections)
+    figures |= exam_figures(selections)
+    of_scans = _of_scans(given)
+    try:
+        return _built(of_scans, selections, how, rules, figures, late_ms=late_ms, progress=progress)
+    except BadDataError as error:
+        raise with_cause(error, (*of_scans, *exam_findings(figures))) from None
+
+
+def _built(
+    of_scans: tuple[Finding, ...],
+    selections: list[SelectedFrames],
+    how: MapOptions,
+    rules: _Rules,
+    figures: dict[str, float],
+    *,
+    late_ms: float,
+    progress: Progress,
+) -> TactileMap:
+    """The map from the frames that are used, whose `figures` it adds to."""
+    findings = of_scans + _of_arrangement(selections, late_ms, refuse=not how.as_stated)
+    figures |= head_profile_figures(selections)
+    if how.flat_field:
+        selections = _flattened(selections, rules, late_ms, figures)
+    if how.latency_ms == "auto":
+        late_ms = _latency(selections, rules, how.cell_mm, figures)
+        selections = rules.select([part.scan for part in selections], late_ms)
+    figures |= check_convention(selections)
+    plane = _plane(selections)
     if how.plane_radius_mm != "all":
         radius = None if how.plane_radius_mm == "auto" else how.plane_radius_mm
         plane, near = local_plane(selections, plane, radius_mm=radius)
@@ -320,18 +309,6 @@ def _plane(selections: list[SelectedFrames]) -> Plane:
         raise BadDataError(error.what, way_out=hint(selections)) from None
 
 
-@contextmanager
-def _jumps_named(scans: Sequence[Scan]) -> Iterator[None]:
-    """Name jumping poses as the cause of what would otherwise be put down to how a scan is arranged."""
-    try:
-        yield
-    except BadDataError as error:
-        for text in (text for scan in scans for text in Jumps.of(scan.poses).cautions()):
-            way_out = "record one tool of the tracker (docs/trackers.md), or leave these poses out"
-            raise BadDataError(f"{error.what}, where {text}", way_out=way_out) from None
-        raise
-
-
 def _check_same_examination(scans: list[Scan]) -> None:
     if not scans:
         raise BadDataError("no scan was given", way_out="give at least one")
@@ -366,7 +343,7 @@ def _as_map(
         "gain_last_change": done.last_change,
         "gain_unsettled": float(not done.settled),
     }
-    return TactileMap(
+    tactile_map = TactileMap(
         mean=sums.mean() / done.scale,
         variance=sums.variance() / done.scale**2,
         count=sums.count,
@@ -381,10 +358,9 @@ def _as_map(
         quality=quality,
         masked_taxels=_masked(selections),
         head=_head(scans),
-        findings=by_weight(
-            (*convention_findings(quality), *broken_assumptions(quality), *handling_findings(quality), *findings)
-        ),
     )
+    of_map = (*convention_findings(quality), *broken_assumptions(quality), *handling_findings(quality))
+    return replace(tactile_map, findings=by_weight((*map_findings(tactile_map), *of_map, *findings)))
 
 
 def _head(scans: list[Scan]) -> HeadShape:

@@ -17,7 +17,7 @@ from tactile_bayes.findings import Finding
 from tactile_bayes.geometry import BoolArray, FloatArray
 from tactile_bayes.mapping.cells import Projector, Readout, chunk_frames
 from tactile_bayes.mapping.plane import MAX_POSE_GAP_MS, FramePoses, distinct_poses, poses_at
-from tactile_bayes.presets import KPA_PER_UNIT
+from tactile_bayes.presets import KPA_PER_UNIT, PRESSURE_WINDOW_KPA
 from tactile_bayes.scan import PressureFrames, Scan, TrackerPoses
 
 # --- Detection of faulty taxels over a whole scan.
@@ -34,6 +34,9 @@ SATURATED_SHARE = 0.1
 MIN_FRAMES = 10
 # One that repeats its last count in a larger share of the frames, where most do so in less than half of that, is stuck.
 STILL_SHARE = 0.5
+# One that keeps a count through this share of the blocks of so many frames in which most taxels change dies on the way.
+LOST_SHARE = 0.05
+_BLOCK = 32
 # Below this level (kPa) the head is in the air, and a low reading is no fault.
 CONTACT_KPA = 1.0
 _CHUNK = 512
@@ -58,6 +61,7 @@ class _Levels(NamedTuple):
     mean_kpa: FloatArray
     flicker_kpa: FloatArray
     still_share: FloatArray
+    lost_share: FloatArray
     saturated_share: FloatArray
 
 
@@ -67,7 +71,8 @@ def find_faults(scan: Scan) -> tuple[TaxelFault, ...]:
     - dead: gain 0, or never anything but one count while the level is next to nothing, or a level below a tenth of
       both its row's and its column's median;
     - stuck: one count throughout, while most taxels change; or one that repeats its last count in over half of the
-      frames, while most hardly ever do (it sticks for a time and comes back);
+      frames, while most hardly ever do (it sticks for a time and comes back), or keeps it for long stretches, while
+      nine in ten change (it dies on the way);
     - hot: over twice the level of its row and column, or flickering over ten times as much as most;
     - saturated: full scale in over a tenth of the frames.
 
@@ -95,7 +100,8 @@ def _classify(scan: Scan, levels: _Levels) -> NDArray[np.str_]:
     flicker = (levels.flicker_kpa > FLICKER_RATIO * np.median(levels.flicker_kpa)) & (levels.flicker_kpa > FLICKER_KPA)
     faults = np.full(mean.shape, "", dtype="<U9")
     faults[((mean > HOT_RATIO * high) & (mean > usual + CONTACT_KPA)) | flicker] = "hot"
-    sticks = (levels.still_share > STILL_SHARE) & bool(np.median(levels.still_share) < STILL_SHARE / 2)
+    sticks = (levels.still_share > STILL_SHARE) | (levels.lost_share > LOST_SHARE)
+    sticks &= bool(np.median(levels.still_share) < STILL_SHARE / 2)
     faults[(constant & moving) | (sticks & (len(scan.frames) >= MIN_FRAMES))] = "stuck"
     faults[levels.saturated_share > SATURATED_SHARE] = "saturated"
     faults[(scan.element_calibration.gain_kpa_per_count == 0) | empty | weak] = "dead"
@@ -107,23 +113,31 @@ def _element_levels(scan: Scan) -> _Levels:
     counts, calibration = scan.frames.counts, scan.element_calibration
     total = np.zeros(counts.shape[1:])
     steps, still = np.zeros(counts.shape[1:]), np.zeros(counts.shape[1:])
-    saturated = np.zeros(counts.shape[1:], dtype=np.int64)
+    saturated, lost = np.zeros(counts.shape[1:], dtype=np.int64), np.zeros(counts.shape[1:])
+    moving, highest = 0, counts.max(axis=0)
     last = counts[:1].astype(np.float64)
     for start in range(0, len(counts), _CHUNK):
         chunk = counts[start : start + _CHUNK].astype(np.float64)
         total += chunk.sum(axis=0)
         change = np.abs(np.diff(chunk, axis=0, prepend=last))
         steps += change.sum(axis=0)  # not squared: one spike is no flicker
-        still += (change == 0).sum(axis=0)
+        unchanged = change == 0
+        still += unchanged.sum(axis=0)
+        whole = unchanged[: len(chunk) // _BLOCK * _BLOCK].reshape(-1, _BLOCK, *last.shape[1:]).all(axis=1)
+        most_move = whole.mean(axis=(1, 2)) < 0.1
+        kept = chunk[: len(whole) * _BLOCK : _BLOCK] < highest  # what stays at its highest count is saturated
+        lost += (whole & kept)[most_move].sum(axis=0)
+        moving += int(most_move.sum())
         saturated += (chunk >= calibration.saturation_count).sum(axis=0)
         last = chunk[-1:]
     n = len(counts)
     return _Levels(
         counts.min(axis=0),
-        counts.max(axis=0),
+        highest,
         calibration.gain_kpa_per_count * (total / n) + calibration.offset_kpa,
         calibration.gain_kpa_per_count * (steps / max(n - 1, 1)),
         (still - 1) / max(n - 1, 1),  # the first frame was compared with itself
+        lost / max(moving, 1),
         saturated / n,
     )
 
@@ -443,7 +457,7 @@ def _refuse_dead(scan: Scan, faults: tuple[TaxelFault, ...]) -> None:
     kinds = {fault.fault for fault in faults}
     raise BadDataError(
         f"none of the {taxels} taxels works ({', '.join(sorted(kinds))})",
-        way_out="check the array's cable and its calibration",
+        way_out=_counts_asked([scan]) or "check the array's cable and its calibration",
     )
 
 
@@ -462,7 +476,8 @@ def refuse_without_frames(selections: list[SelectedFrames], *, pressure_window_k
         share = max(float(selection.valid_share.max()) for selection in selections)
         raise BadDataError(
             f"no frame has {100 * VALID_SHARE:g} % of its taxels valid (the best has {100 * share:.1f} %)",
-            way_out="repair the array, or press less hard if taxels are saturated",
+            way_out=_counts_asked([part.scan for part in selections])
+            or "repair the array, or press less hard if taxels are saturated",
         )
     raise _outside_window(selections, pressure_window_kpa)
 
@@ -484,11 +499,13 @@ def _outside_window(selections: list[SelectedFrames], window: tuple[float, float
     session = selections[0].scan.session
     imported = session.get("source") == "imported"  # a recorder knows its unit
     asked = other_units(float(middle), session.get("frames_unit", "kPa"), window) if imported else ""
+    more = "" if asked else _counts_asked([part.scan for part in selections])
     return BadDataError(
         f"no frame's mean lies within {window[0]:g} to {window[1]:g} kPa ({len(levels)} frames, means "
         f"{levels.min():.2f} to {levels.max():.2f} kPa, median {middle:.2f}{f': {asked}' if asked else ''})",
         way_out=("import it again with the right --unit; " if asked else "")
-        + f"a window of {np.floor(low * 10) / 10:g} to {np.ceil(high * 10) / 10:g} kPa would keep nine in ten",
+        + f"a window of {np.floor(low * 10) / 10:g} to {np.ceil(high * 10) / 10:g} kPa would keep nine in ten"
+        + (f", but {more}" if more else ""),
     )
 
 
@@ -499,3 +516,61 @@ def other_units(mean_kpa: float, stated: str, window: tuple[float, float]) -> st
     number = mean_kpa / KPA_PER_UNIT.get(stated, 1.0)
     fitting = [unit for unit, kpa in KPA_PER_UNIT.items() if window[0] <= number * kpa <= window[1]]
     return f"are these {' or '.join(fitting)}?" if fitting else ""
+
+
+_SAMPLE_FRAMES = 200
+
+
+def _counts_asked(scans: Iterable[Scan], stated: str = "kPa") -> str:
+    """Ask whether counts are shifted, pressures already or in another unit, where they would fit an exam so."""
+    scan = max(scans, key=lambda one: len(one.frames))
+    counts, calibration = scan.frames.counts[:: max(1, len(scan.frames) // _SAMPLE_FRAMES)], scan.element_calibration
+    if not counts.size:
+        return ""
+    above, highest = float((counts >= calibration.saturation_count).mean()), int(counts.max())
+    step = int(np.gcd.reduce(counts.ravel()))
+    if above > SATURATED_SHARE and highest > calibration.saturation_count:
+        shifted = f", all of them multiples of {step}: fewer bits, left-aligned? divide them" if step > 1 else ""
+        return (
+            f"{100 * above:.0f} % of the counts are not below saturation_count {calibration.saturation_count} (highest "
+            f"{highest}{shifted}); give counts and saturation_count as the converter has them"
+        )
+    middle = float(np.median(counts))
+    if PRESSURE_WINDOW_KPA[0] <= middle <= PRESSURE_WINDOW_KPA[1]:
+        return f"are the counts kPa already (median {middle:g})? then gain_kpa_per_count is 1 and offset_kpa 0"
+    level = float(np.median(counts * calibration.gain_kpa_per_count + calibration.offset_kpa))
+    asked = other_units(level, stated, PRESSURE_WINDOW_KPA)
+    return f"{asked} gain_kpa_per_count and offset_kpa must give kPa (median {level:.4g})" if asked else ""
+
+
+# --- Figures of frames used and left out.
+
+
+def frame_figures(selections: Sequence[SelectedFrames]) -> dict[str, float]:
+    """Frames used and left out, summed over the scans."""
+    figures = {
+        "scans": len(selections),
+        "frames_total": sum(len(part.used) for part in selections),
+        "frames_used": sum(int(part.used.sum()) for part in selections),
+        "dropped_no_pose": sum(part.dropped_no_pose for part in selections),
+        "dropped_elements": sum(part.dropped_elements for part in selections),
+        "dropped_low": sum(int(part.low.sum()) for part in selections),
+        "dropped_high": sum(int(part.high.sum()) for part in selections),
+        "masked_taxels": sum(len(part.faults) for part in selections),
+        "saturated_readings": sum(_saturated(part) for part in selections),
+    }
+    levels = np.concatenate([part.level_kpa[part.used] for part in selections])
+    felt = np.concatenate([part.level_kpa[part.used | part.low | part.high] for part in selections])
+    low, high = np.quantile(felt, [0.05, 0.95])
+    return {
+        **{name: float(value) for name, value in figures.items()},
+        "mean_pressure_kpa": float(levels.mean()),
+        "level_p05_kpa": float(low),
+        "level_p95_kpa": float(high),
+    }
+
+
+def _saturated(part: SelectedFrames) -> int:
+    """Number of full-scale readings of good taxels in used frames."""
+    good = int(part.good_taxels.sum())
+    return int(np.rint((good - part.valid_share[part.used] * part.good_taxels.size).sum()))

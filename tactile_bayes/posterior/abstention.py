@@ -6,10 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from tactile_bayes.errors import Abstention, UsageError
+from tactile_bayes.errors import CANNOT_SHOW, Abstention, UsageError
 from tactile_bayes.geometry import BoolArray, FloatArray
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.mapping.places import orientation_of
+from tactile_bayes.mapping.plausibility import against_no_lump, map_findings
 from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior.bump import covered_share, map_ends, on_map, trusted, window_cells
 from tactile_bayes.posterior.draw import DETECTED
@@ -21,6 +22,7 @@ FEEL_AGAIN_ON_PAPER = "if a lump is felt, scan its place again, more slowly or w
 FEEL_A_RIB = "feel whether it is a rib; if a lump is felt, name its place with --centre-mm X Y"
 FEEL_A_RIB_ON_PAPER = "feel at the cross on the picture whether it is a rib; if a lump is felt, scan its place again"
 SMALLER_CELLS_ON_PAPER = "have the scan mapped again with smaller cells"
+SCAN_AGAIN = "scan again: nothing of the area was read"
 LARGER_WINDOW = "fit a larger window (fit_radius_mm in --settings FILE.toml) with a calibration learned so"
 BEYOND_IT = "extend the strokes beyond it"
 LARGER_WINDOW_ON_PAPER = "nothing by this exam: the rise is wider than the program measures"
@@ -64,13 +66,25 @@ def searched(tactile_map: TactileMap, centre_mm: tuple[float, float] | None) -> 
     return f"near ({centre_mm[0]:.1f}, {centre_mm[1]:.1f}) mm"
 
 
-def no_verdict(cell_mm: float) -> Abstention | None:
-    """Reason why a map that shows no lump does not say that there is none; None where its cells are fine enough."""
-    if cell_mm <= COARSEST_MM:
+def no_verdict(tactile_map: TactileMap) -> Abstention | None:
+    """Reason why a map that shows no lump does not say that there is none; None where one would show."""
+    cell = tactile_map.recipe.cell_mm
+    if not tactile_map.covered.any():
+        return cannot_show("the map has no covered cell", "map a scan that covers the place", SCAN_AGAIN)
+    if cell > COARSEST_MM:
+        advice = "map the scan again with smaller cells (they have 1 mm by default)"
+        return cannot_show(f"its cells of {cell:g} mm are too large", advice, SMALLER_CELLS_ON_PAPER)
+    against = against_no_lump((*map_findings(tactile_map), *tactile_map.findings))
+    if not against:
         return None
-    reason = f"the map cannot show whether there is a lump: its cells of {cell_mm:g} mm are too large"
-    advice = "map the scan again with smaller cells (they have 1 mm by default)"
-    return Abstention("coarse", reason, advice, SMALLER_CELLS_ON_PAPER)
+    first, remedies = against[0], dict.fromkeys(one.remedy for one in against if one.remedy)
+    on_paper = dict.fromkeys(one.on_paper for one in against if one.on_paper)
+    return cannot_show(first.text, "; ".join(remedies), "; ".join(on_paper))
+
+
+def cannot_show(why: str, advice: str = "", on_paper: str = "") -> Abstention:
+    """Data that cannot show whether there is a lump, and what would help."""
+    return Abstention(CANNOT_SHOW, f"the data cannot show whether there is a lump: {why}", advice, on_paper)
 
 
 def chance_text(probability: float) -> str:

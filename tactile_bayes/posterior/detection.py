@@ -283,6 +283,8 @@ def _log_occam_factor(
 ) -> float:
     """Log of the posterior volume of position and widths over their prior volume."""
     block = covariance[1:5, 1:5]
+    if not np.isfinite(block).all():
+        return -np.inf
     sign, log_det = np.linalg.slogdet(block)
     if sign <= 0 or not np.isfinite(log_det):
         return -np.inf

@@ -11,6 +11,7 @@ from tactile_bayes.errors import NO_LUMP, Abstention, BadDataError, NotConverged
 from tactile_bayes.findings import Finding, by_weight
 from tactile_bayes.inference.ensemble import convergence
 from tactile_bayes.mapping.map import TactileMap
+from tactile_bayes.mapping.plausibility import map_findings
 from tactile_bayes.posterior.abstention import (
     FEEL_AGAIN,
     FEEL_AGAIN_ON_PAPER,
@@ -44,7 +45,6 @@ from tactile_bayes.size.pooling import Calibration
 from tactile_bayes.size.terms import SPREAD, UNLIKE_ON_PAPER, Recipe, extrapolated, unknown_head
 
 MOST_INVALID = 0.05
-SCAN_AGAIN = "scan again: nothing of the area was read"
 OTHER_METHOD_ON_PAPER = "have the size estimated again by the slower method"
 OTHER_HEAD = (
     "learn one for this head: `tactile-bayes population --head HEAD.json -o population.csv`, then `tactile-bayes "
@@ -78,9 +78,10 @@ def estimate_map(
         check_recipe(tactile_map, calibration, options)
         calibration = calibration_for(tactile_map, calibration)
     estimate = _answer(tactile_map, calibration, options, rng=rng, progress=progress)
-    if estimate.code in ("undetected", "ridge") and (why := no_verdict(tactile_map.recipe.cell_mm)) is not None:
+    if estimate.code in NO_LUMP and options.scene != "none" and (why := no_verdict(tactile_map)) is not None:
         estimate = _none(why, estimate.candidates)
-    return replace(estimate, findings=by_weight((*tactile_map.findings, *estimate.findings)))
+    of_map = (*map_findings(tactile_map), *tactile_map.findings)
+    return replace(estimate, findings=by_weight((*of_map, *estimate.findings)))
 
 
 def _answer(
@@ -93,7 +94,7 @@ def _answer(
 ) -> Estimate:
     """The lump's size, or why there is none."""
     if not tactile_map.covered.any():
-        return _none(Abstention("empty", "the map has no covered cell", "map a scan that covers the place", SCAN_AGAIN))
+        return _none(Abstention("empty", "the map has no covered cell"))
     where = searched(tactile_map, options.centre_mm)
     candidates, seen = search(tactile_map, options)
     if not candidates:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 
 from tactile_bayes.declarations import replace
-from tactile_bayes.errors import NO_LUMP, NotConvergedError
+from tactile_bayes.errors import CANNOT_SHOW, NO_LUMP, NotConvergedError
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.abstention import BEYOND_IT
 from tactile_bayes.posterior.bump import (
@@ -306,7 +306,7 @@ def _sized_at(
     if first.map_posterior is not None and not _same_lump(estimate, rise, first):
         less = _estimated(without(tactile_map, first.map_posterior), given, estimator)
         estimate = less if less.size is None or _high_enough(less, first) else _in_the_flank(less)
-    if estimate.code in (*NO_LUMP, "coarse"):
+    if estimate.code in (*NO_LUMP, CANNOT_SHOW):
         return None
     if _same_lump(estimate, rise, first):
         return Mass(*_place(estimate), max(rise.probability, _probability(estimate)), estimate)

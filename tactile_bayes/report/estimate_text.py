@@ -241,7 +241,8 @@ def estimate_text(
 
 def no_estimate_line(reason: str) -> str:
     """First line of a report without an estimate."""
-    return f"{reason[0].upper()}{reason[1:]}." if reason.startswith("no lump found") else f"No estimate: {reason}."
+    told = reason.startswith(("no lump found", "the data cannot show"))
+    return f"{reason[0].upper()}{reason[1:]}." if told else f"No estimate: {reason}."
 
 
 def smallest_lines(estimate: Estimate) -> list[str]:

@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 
 from tactile_bayes.declarations import Record, replace
-from tactile_bayes.errors import NO_LUMP, UsageError
+from tactile_bayes.errors import CANNOT_SHOW, NO_LUMP, UsageError
 from tactile_bayes.files.reports import EstimateReport, Interval, MassReport, PooledReport, centre_of
 from tactile_bayes.findings import finding_lines
 from tactile_bayes.geometry import apply
@@ -206,6 +206,8 @@ def headline(exam: Exam) -> str:
         return _capital(exam.report.reason)
     if masses:
         return f"{'Lump' if len(masses) < 2 else f'{len(masses)} masses'} seen, no size"
+    if exam.main.report.reason_code == CANNOT_SHOW:
+        return "No answer: the data cannot show whether there is a lump"
     return "No lump found in the area covered" if exam.main.report.reason_code in NO_LUMP else "No size"
 
 

@@ -301,15 +301,20 @@ class PooledEstimate(Record, eq=False):
 
 
 def pool_maps(
-    shapes: Sequence[ShapeDraws | None], *, calibration: BodyCalibration, priors: SizePriors, rng: np.random.Generator
+    shapes: Sequence[ShapeDraws | None],
+    *,
+    calibration: BodyCalibration,
+    priors: SizePriors,
+    rng: np.random.Generator,
+    silent: int = 0,
 ) -> PooledEstimate:
     """Pool the maps of a mass to one size; None stands for a map on which no lump was found.
 
-    When fewer than half of the maps show the lump there is no size: those that do may be the noise's. Maps that are not
-    of one size have none in common.
+    When fewer than half of the maps show the lump, but for `silent` ones that cannot, there is no size: those that do
+    may be the noise's. Maps that are not of one size have none in common.
     """
     places = [i for i, shape in enumerate(shapes) if shape is not None]
-    if 2 * len(places) < len(shapes) or not places:
+    if 2 * len(places) < len(shapes) - silent or not places:
         return PooledEstimate("no_estimate", f"a lump was found on {len(places)} of {len(shapes)} maps")
     # one order whatever the caller's, so that the order leaves no trace in the draws
     in_order = sorted(((shape, i) for i, shape in enumerate(shapes) if shape is not None), key=lambda one: one[0].order)

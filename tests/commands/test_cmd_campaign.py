@@ -319,8 +319,8 @@ def test_half_a_place_is_refused(tmp_path: Path) -> None:
 # --- one run
 
 
-@pytest.mark.parametrize(("code", "status"), [("coarse", "not_done"), ("undetected", "not_detected")])
-def test_an_exam_on_cells_too_large_was_not_done(code: str, status: str) -> None:
+@pytest.mark.parametrize(("code", "status"), [("cannot_show", "not_done"), ("undetected", "not_detected")])
+def test_an_exam_that_cannot_show_a_lump_was_not_done(code: str, status: str) -> None:
     """Not held against the modality; the control is a map that could have shown a lump."""
     report = estimate_report(reason_code=code)
     assert Row(Listed("a.nc", Path("a.nc"), "P", "1", "1", 1), report).status == status

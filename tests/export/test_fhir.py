@@ -121,10 +121,10 @@ def test_no_lump_is_an_absent_value_with_the_reason(exam: Path, tmp_path: Path) 
 
 def test_cells_too_large_are_no_verdict_on_the_breast(exam: Path, tmp_path: Path) -> None:
     """The control is `test_no_lump_is_an_absent_value_with_the_reason`."""
-    coarse = json.loads((exam / "empty.json").read_text()) | {"reason_code": "coarse"}
+    coarse = json.loads((exam / "empty.json").read_text()) | {"reason_code": "cannot_show"}
     (exam / "coarse.json").write_text(json.dumps(coarse))
     (report,) = resources(bundle(exam, tmp_path / "b.json", "coarse.json"), "DiagnosticReport")
-    assert report["conclusionCode"][0]["coding"][0]["code"] == "not-sized"
+    assert report["conclusionCode"][0]["coding"][0]["code"] == "no-verdict"
 
 
 def test_markup_in_words_stays_words(estimate: dict[str, Any], tmp_path: Path) -> None:

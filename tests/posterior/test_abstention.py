@@ -38,7 +38,7 @@ def cut(*, right: int) -> np.ndarray:
 @pytest.mark.parametrize(
     ("values", "code", "advice"),
     [
-        (np.full((9, 9), np.nan), "empty", "map a scan"),
+        (np.full((9, 9), np.nan), "cannot_show", "map a scan"),
         (np.ones((51, 51)), "empty", "go over the place again"),
         (1 + WHITE, "undetected", "go over the place again"),
         (cut(right=1), "window", "mm to the picture's right (+x)"),
@@ -60,8 +60,8 @@ def test_cells_too_large_to_show_a_lump_are_no_verdict_on_the_breast() -> None:
     coarse = grid_map(1.0 + WHITE[:9, :9], cell_mm=10.0)
     settings = FIELD
     found = estimate_map(coarse, calibration=None, options=settings, rng=np.random.default_rng(1))
-    assert found.code == "coarse"
-    assert found.reason == "the map cannot show whether there is a lump: its cells of 10 mm are too large"
+    assert found.code == "cannot_show"
+    assert found.reason == "the data cannot show whether there is a lump: its cells of 10 mm are too large"
     assert "smaller cells" in found.advice
     assert found.detection is None  # no probability beside it
     assert run(1 + WHITE).code == "undetected"

@@ -143,5 +143,5 @@ def test_maps_that_cannot_show_a_lump_do_not_read_as_maps_without_one(tmp_path: 
         tactile_map = grid_map(values, cell_mm=side, normalise="gain")
         write_map(tmp_path / f"{name}.nc", tactile_map, provenance=Provenance("map", {}))
     coarse, fine = pooled(tmp_path, "c1.nc", "c2.nc"), pooled(tmp_path, "f1.nc", "f2.nc")
-    assert coarse["reason"] == "the maps cannot show whether there is a lump: their cells are too large"
+    assert coarse["reason"] == "map 1: the data cannot show whether there is a lump: its cells of 10 mm are too large"
     assert fine["reason"] == "a lump was found on 0 of 2 maps"

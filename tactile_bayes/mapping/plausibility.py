@@ -1,0 +1,354 @@
+"""What a scan is held against: what the data of an exam can be, and what a map needs to show a lump.
+
+A map without a lump says that there is none only where the data could have shown one. Figures of the readings, clocks,
+places and landmarks go into a map's quality, so that whoever has the map can judge them; see decision 0137 for the
+limits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_bayes.errors import BadDataError
+from tactile_bayes.findings import Finding
+from tactile_bayes.geometry import BoolArray, FloatArray, IndexArray
+from tactile_bayes.mapping.map import FEW_READINGS, TactileMap
+from tactile_bayes.mapping.plane import distinct_poses
+from tactile_bayes.mapping.select import (
+    SelectedFrames,
+    frame_figures,
+    refuse_without_frames,
+    select_frames,
+    timing_figures,
+)
+from tactile_bayes.scan import HeadShape, Landmarks, Scan
+
+RATE_HZ: Final = (5.0, 2000.0)
+"""Of frames."""
+LEAST_FRAMES, LEAST_USED_SHARE = 30, 0.05
+LEAST_AREA: Final = 1.5
+"""Of a map, in areas of the array: a head that stood still covers its own and its noise."""
+MOST_SPAN_MM: Final = 600.0
+"""Of the places along one axis: a chest is narrower."""
+IMPOSSIBLE_MM: Final = 3000.0
+SIDE_MM: Final = (5.0, 200.0)
+"""Of an array."""
+MOST_RATIO: Final = 1.5
+"""Of the distance between taxels to the pitch, or of the pitch to the distance."""
+MOST_ZIGZAG_MM: Final = 3.0
+"""Median distance of a pose from the middle of the two beside it."""
+FROZEN_S, MOST_FROZEN = 0.3, 0.1
+"""Frames that repeat each other for so long are the array's last one; their share among those used."""
+_STILL_TAXELS: Final = 0.01
+"""Share of the taxels that may change in a frame that repeats the last one."""
+MOST_REPEATED: Final = 0.5
+PLATEAU: Final = 30
+TAXEL_PLATEAU: Final = 10
+"""Readings at the highest count, of the array and of one taxel, that are a plateau if those of the three counts below
+it are fewer: 66 right scans have up to 5 of one taxel."""
+MOST_SATURATED: Final = 2e-3
+"""Share of the readings."""
+COARSEST_COUNT: Final = 0.1
+"""A count over the mean pressure: a lump's rise is a few tenths of it."""
+WRAPPED: Final = 2000
+"""So far below 65,536 a reading is one below 0, or stands for none."""
+LANDMARKS_MM: Final = (80.0, 350.0)
+"""From the sternal notch to the xiphoid."""
+MOST_REACH_MM: Final = 500.0
+"""From the xiphoid to the head."""
+LEAST_GAP, LEAST_RANGE = 0.4, 12.0
+"""Cells are far outside the rest where so large a share of the values' range is empty, in a range of so many quartile
+distances."""
+_CHUNK: Final = 4096
+_SAMPLE_FRAMES: Final = 500
+
+
+# --- Figures of scans.
+
+
+def exam_figures(selections: Sequence[SelectedFrames]) -> dict[str, float]:
+    """Figures of the readings, poses and landmarks of scans, by which `exam_findings` judges them."""
+    figures: dict[str, float] = {"plateau_readings": 0.0, "wrapped_readings": 0.0}
+    for part in selections:
+        _refuse_places(part)
+        still = _still(part)
+        readings, count = _plateau(part, np.flatnonzero(part.used & ~still))
+        figures["plateau_readings"] += readings
+        if readings:
+            figures["plateau_count"] = float(count)
+        figures["wrapped_readings"] += _wrapped(part)
+        for name, value in (*_stillness(part, still), *_motion(part), *_geometry(part), *_resolution(part)):
+            figures[name] = max(value, figures.get(name, 0.0))
+    return figures
+
+
+def _refuse_places(part: SelectedFrames) -> None:
+    """Raise `BadDataError` for places so far apart that no map of them can be held."""
+    places = part.poses.position_mm[part.used]
+    spread = float(np.ptp(places, axis=0).max()) if len(places) else 0.0
+    if spread > IMPOSSIBLE_MM:
+        way_out = "positions are in mm; leave out poses that stand for a tool out of sight"
+        raise BadDataError(f"the places of the head spread over {spread:,.0f} mm", way_out=way_out)
+
+
+def _wrapped(part: SelectedFrames) -> int:
+    """Number of readings just below 65,536 where none lies below them, down to half of it."""
+    counts = part.scan.frames.counts
+    number = int((counts >= 65536 - WRAPPED).sum())
+    return 0 if number and ((counts >= 32768) & (counts < 65536 - WRAPPED)).any() else number
+
+
+def _plateau(part: SelectedFrames, frames: IndexArray) -> tuple[int, int]:
+    """Readings of frames at the highest count of the array or of their taxel that are too many, and the count.
+
+    Looked for in a sample of the frames, and counted in all of them.
+    """
+    if not len(frames):
+        return 0, 0
+    good = np.flatnonzero(part.good_taxels)
+    counts = part.scan.frames.counts.reshape(len(part.used), -1)
+    end = part.scan.element_calibration.saturation_count
+    sample = counts[frames[:: max(1, len(frames) // _SAMPLE_FRAMES)]][:, good]
+    heap = np.bincount(sample.ravel(), minlength=4)
+    heap[end:] = 0
+    present = np.flatnonzero(heap)
+    if len(present) < 4:
+        return 0, 0
+    highest, step = int(present[-1]), int(np.gcd.reduce(np.diff(present)))
+    if heap[highest] >= PLATEAU and heap[highest] > heap[present[-4:-1]].sum():
+        return int((counts[np.ix_(frames, good)] == highest).sum()), highest
+    top = sample.max(axis=0)
+    at, near = (sample == top).sum(axis=0), (sample + np.uint16(3 * step) >= top).sum(axis=0)
+    piled = (at >= TAXEL_PLATEAU) & (2 * at > near) & (top < end)
+    if not piled.any():
+        return 0, 0
+    return int((counts[np.ix_(frames, good[piled])] == top[piled]).sum()), int(np.median(top[piled]))
+
+
+def _still(part: SelectedFrames) -> BoolArray:
+    """(n,) True for frames that repeat the one before."""
+    counts = part.scan.frames.counts
+    still = np.zeros(len(counts), dtype=bool)
+    for start in range(1, len(counts), _CHUNK):
+        here = slice(start, start + _CHUNK)
+        before = counts[start - 1 : start - 1 + _CHUNK][: len(counts[here])]
+        still[here] = (counts[here] != before).mean(axis=(1, 2)) <= _STILL_TAXELS
+    return still
+
+
+def _stillness(part: SelectedFrames, still: BoolArray) -> Iterator[tuple[str, float]]:
+    """Share of used frames that repeat the one before, and of those that do so for long."""
+    time_s, used = part.scan.frames.time_s, int(part.used.sum())
+    if len(time_s) < 2 or not used:
+        return
+    yield "repeated_share", float((still & part.used).sum()) / used
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(np.int8)))
+    frozen = np.zeros(len(time_s), dtype=bool)
+    for first, last in edges.reshape(-1, 2).tolist():
+        if time_s[last - 1] - time_s[first - 1] >= FROZEN_S:
+            frozen[first:last] = True
+    yield "frozen_share", float((frozen & part.used).sum()) / used
+
+
+def _motion(part: SelectedFrames) -> Iterator[tuple[str, float]]:
+    """How far poses zigzag."""
+    poses = distinct_poses(part.scan.poses)
+    if len(poses) < 3:
+        return
+    middle = (poses.position_mm[2:] + poses.position_mm[:-2]) / 2
+    yield "pose_zigzag_mm", float(np.median(np.linalg.norm(poses.position_mm[1:-1] - middle, axis=1)))
+
+
+def _geometry(part: SelectedFrames) -> Iterator[tuple[str, float]]:
+    """Length of the array over that by its pitch; distance of the landmarks, and of the head from the xiphoid."""
+    head = part.scan.head
+    if head.shape[1] > 1:
+        length = float(np.linalg.norm(np.diff(head.surface_mm, axis=1), axis=2).sum(axis=1).mean())
+        yield "surface_over_pitch", length / (head.pitch_mm * (head.shape[1] - 1))
+    marks: Landmarks | None = part.scan.landmarks
+    if marks is None or not part.used.any():
+        return
+    yield "landmark_distance_mm", float(np.linalg.norm(marks.sternal_notch_mm - marks.xiphoid_mm))
+    places = part.poses.position_mm[part.used]
+    yield "landmark_reach_mm", float(np.linalg.norm(places - marks.xiphoid_mm, axis=1).min())
+
+
+def _resolution(part: SelectedFrames) -> Iterator[tuple[str, float]]:
+    """A step of the counts over the mean pressure."""
+    level = part.level_kpa[part.used]
+    if not len(level):
+        return
+    present = np.unique(part.scan.frames.counts[np.flatnonzero(part.used)[:: max(1, len(level) // 50)]])
+    step = int(np.gcd.reduce(np.diff(present.astype(np.int64)))) if len(present) > 1 else 0
+    gain = float(np.median(part.scan.element_calibration.gain_kpa_per_count[part.good_taxels]))
+    yield "count_share", step * gain / float(np.median(level))
+
+
+def scan_doubts(scan: Scan, *, pressure_window_kpa: tuple[float, float]) -> tuple[Finding, ...]:
+    """Findings against a scan's readings, clocks, poses and landmarks, of which no map has to be made.
+
+    A scan without a frame that can be used is a `BadDataError`.
+    """
+    selections = [select_frames(scan, pressure_window_kpa=pressure_window_kpa)]
+    refuse_without_frames(selections, pressure_window_kpa=pressure_window_kpa)
+    figures = frame_figures(selections) | timing_figures([scan]) | exam_figures(selections)
+    return exam_findings(figures, HeadShape.of(scan.head.surface_mm, scan.head.pitch_mm))
+
+
+# --- Findings.
+
+
+def exam_findings(quality: Mapping[str, float], head: HeadShape | None = None) -> tuple[Finding, ...]:
+    """Findings from the figures of scans, or of a map, against what an exam can be; missing figures say nothing."""
+    unlike = [Finding("unlike_an_exam", text, remedy, remedy) for text, remedy in _unlike(quality, head)]
+    unusual = [Finding("unusual_scan", text, remedy, remedy) for text, remedy in _unusual(quality)]
+    return (*unlike, *unusual)
+
+
+def map_findings(tactile_map: TactileMap) -> tuple[Finding, ...]:
+    """The same with those of a map's cells, which hold for a grid from elsewhere as well."""
+    cells = [Finding("unlike_an_exam", text, remedy, remedy) for text, remedy in _of_cells(tactile_map)]
+    return (*exam_findings(tactile_map.quality, tactile_map.head), *cells)
+
+
+def _unlike(quality: Mapping[str, float], head: HeadShape | None) -> Iterator[tuple[str, str]]:
+    """Sentence and remedy for each condition under which a map without a lump says nothing."""
+    total, used = quality.get("frames_total", 0.0), quality.get("frames_used", 0.0)
+    if total and (used < LEAST_FRAMES or used < LEAST_USED_SHARE * total):
+        why = [f"{quality[name]:.0f} {words}" for name, words in _WHY_NOT if quality.get(name)]
+        yield f"only {used:.0f} of {total:.0f} frames are used{': ' if why else ''}{', '.join(why)}", ""
+    if "frame_rate_hz" in quality and not RATE_HZ[0] <= quality["frame_rate_hz"] <= RATE_HZ[1]:
+        yield _rate(quality["frame_rate_hz"])
+    elif total > 1 and "frame_rate_hz" not in quality:
+        yield "all frames have one time: the array's clock stands still", "record the frames' times"
+    if (zigzag := quality.get("pose_zigzag_mm", 0.0)) > MOST_ZIGZAG_MM:
+        yield f"the poses jump to and fro: they lie {zigzag:.1f} mm beside the middle of their neighbours", _ONE_TOOL
+    if quality.get("frozen_share", 0.0) > MOST_FROZEN:
+        share = 100 * quality["frozen_share"]
+        yield f"in {share:.0f} % of the frames the readings stand still while time goes on", "check the array's link"
+    if quality.get("plateau_readings"):
+        text = (
+            f"{quality['plateau_readings']:,.0f} readings stand at the highest count, {quality['plateau_count']:,.0f}, "
+            "and few just below it: the array saturates there, which the scan does not say"
+        )
+        yield text, f"state it: saturation_count {quality['plateau_count']:.0f} at its import"
+    if quality.get("count_share", 0.0) > COARSEST_COUNT:
+        text = f"one count is {100 * quality['count_share']:.0f} % of the mean pressure: readings are too coarse"
+        yield text, "check whether counts were rounded or are pressures already"
+    if head is not None and not SIDE_MM[0] <= min(head.sides_mm) <= max(head.sides_mm) <= SIDE_MM[1]:
+        sides = "{:.3g} x {:.3g}".format(*head.sides_mm)
+        yield f"the array is {sides} mm: no scan head is", "check that pitch and surface are in mm"
+    ratio = quality.get("surface_over_pitch", 1.0)
+    if not 1 / MOST_RATIO <= ratio <= MOST_RATIO:
+        text = f"the taxels lie {ratio:.3g} times as far apart as the pitch says"
+        yield text, "check that pitch and surface are in mm, and which axis is which"
+    spans = [quality[name] for name in ("span_x_mm", "span_y_mm") if name in quality]
+    if spans and max(spans) > MOST_SPAN_MM:
+        yield f"the places spread over {max(spans):,.0f} mm: no breast does", "check that positions are in mm"
+
+
+_ONE_TOOL: Final = "record one tool of the tracker (docs/trackers.md), or leave the other poses out"
+_WHY_NOT: Final = (
+    ("dropped_low", "pressed too lightly"),
+    ("dropped_high", "pressed too hard"),
+    ("dropped_no_pose", "without a tracker pose"),
+    ("dropped_elements", "with too few valid taxels"),
+)
+_CLOCKS: Final = ((1e3, "milliseconds"), (1e6, "microseconds"), (1e9, "nanoseconds"), (1 / 60, "minutes"))
+
+
+def _rate(rate_hz: float) -> tuple[str, str]:
+    low, high = RATE_HZ
+    units = [name for factor, name in _CLOCKS if low <= rate_hz * factor <= high]
+    remedy = f"are the times in {units[0]}? they must be in s" if units else "check the frames' times, which are in s"
+    return f"frames come at {rate_hz:.3g} Hz, and arrays give {low:g} to {high:g}", remedy
+
+
+def _unusual(quality: Mapping[str, float]) -> Iterator[tuple[str, str]]:
+    """Sentence and remedy for what is off, but hides no lump."""
+    if wrapped := quality.get("wrapped_readings"):
+        text = f"{wrapped:,.0f} readings stand just below 65,536 and count as saturated: they may be below 0, or no value"
+        yield text, "check the offset that was subtracted, and what stands for no reading"
+    if MOST_REPEATED < quality.get("repeated_share", 0.0) and quality.get("frozen_share", 0.0) <= MOST_FROZEN:
+        share = 100 * quality["repeated_share"]
+        yield f"{share:.0f} % of the frames repeat the one before: the array is slower than its clock says", ""
+    apart, reach = quality.get("landmark_distance_mm"), quality.get("landmark_reach_mm", 0.0)
+    if apart is not None and not LANDMARKS_MM[0] <= apart <= LANDMARKS_MM[1]:
+        text = f"sternal notch and xiphoid lie {apart:.0f} mm apart, {LANDMARKS_MM[0]:g} to {LANDMARKS_MM[1]:g} in adults"
+        yield f"{text}: places on the breast may be wrong", "check that landmarks are in the tracker's base frame, in mm"
+    elif reach > MOST_REACH_MM:
+        text = f"the head came no nearer to the xiphoid than {reach:.0f} mm: places on the breast may be wrong"
+        yield text, "check that landmarks are in the tracker's base frame, in mm"
+
+
+def _of_cells(tactile_map: TactileMap) -> Iterator[tuple[str, str]]:
+    """Sentence and remedy for a map's area and for cells that no tissue explains."""
+    covered, cell = tactile_map.covered, tactile_map.recipe.cell_mm
+    if not covered.any():
+        return
+    area, head = float(covered.sum()) * cell**2, tactile_map.head
+    if head is not None and area < LEAST_AREA * head.sides_mm[0] * head.sides_mm[1]:
+        array = "{:.0f} x {:.0f} mm".format(*head.sides_mm)
+        text = f"the map covers {area / 100:.2g} cm2, hardly more than the array itself ({array}): the head stood still"
+        yield text, "scan with strokes side by side; if it did move, check the poses and their unit"
+    saturated, frames = tactile_map.quality.get("saturated_readings", 0.0), tactile_map.frame_count
+    readings = frames * (1 if head is None else head.rows * head.columns)
+    if saturated > MOST_SATURATED * readings:
+        share = 100 * saturated / readings
+        yield f"{share:.1f} % of the readings were at full scale and left out, where a lump would press", "press less hard"
+    count = tactile_map.count[covered]
+    held = tactile_map.mean[covered][count >= FEW_READINGS * float(tactile_map.counts_known)]
+    yield from _of_values(held)
+
+
+def _of_values(values: FloatArray) -> Iterator[tuple[str, str]]:
+    """Values far outside the rest, and a plateau at the highest."""
+    if len(values) < 2:
+        return
+    ordered = np.sort(values)
+    steps, low, high = np.diff(ordered), *np.quantile(ordered, [0.25, 0.75])
+    span, widest = float(ordered[-1] - ordered[0]), int(np.argmax(steps))
+    if steps[widest] > LEAST_GAP * span and span > LEAST_RANGE * float(high - low):
+        below = widest + 1 <= len(ordered) // 2
+        number = widest + 1 if below else len(ordered) - widest - 1
+        ends = ordered[: widest + 1] if below else ordered[widest + 1 :]
+        rest = ordered[widest + 1 :] if below else ordered[: widest + 1]
+        told = f"{ends[0]:.4g}" if ends[0] == ends[-1] else f"{ends[0]:.4g} to {ends[-1]:.4g}"
+        text = (
+            f"{number} of {len(ordered)} cells lie far outside the rest ({told}; the others {rest[0]:.4g} to "
+            f"{rest[-1]:.4g}): dead lines, or values that stand for none"
+        )
+        yield text, "mark them as missing"
+    at_top, near = _top(ordered)
+    if PLATEAU <= at_top < len(ordered) / 2 and at_top > near > 0:
+        text = f"{at_top} cells stand at the highest value, {ordered[-1]:.4g}, and few just below it: it was clipped there"
+        yield text, "take it again without clipping"
+
+
+def _top(ordered: FloatArray) -> tuple[int, int]:
+    """Number of values at the highest, and at the three distinct ones below it."""
+    levels: NDArray[np.int64]
+    _, levels = np.unique(ordered, return_counts=True)
+    return int(levels[-1]), int(levels[-4:-1].sum())
+
+
+BLOCKING: Final = frozenset({"unlike_an_exam", "wrong_arrangement", "frames_contradict", "poses_jump"})
+"""Kinds of findings under which a map without a lump does not say that there is none. Rotations that seem to be of
+another convention are none of them: 2 of 60 right exams of our own have them."""
+
+
+def against_no_lump(findings: Iterable[Finding]) -> list[Finding]:
+    """Those findings that stand against "there is no lump"."""
+    return [one for one in findings if one.kind in BLOCKING]
+
+
+def with_cause(error: BadDataError, findings: Iterable[Finding]) -> BadDataError:
+    """The error of a map that cannot be made, with what is unlike an exam in its scans as the likelier cause."""
+    causes = [one for one in findings if one.kind in ("poses_jump", "unlike_an_exam")]
+    if not causes:
+        return error
+    return BadDataError(f"{error.what}, where {causes[0].text}", way_out=causes[0].remedy or _ONE_TOOL)

@@ -1,0 +1,253 @@
+"""Scans and maps that are unlike an exam's: each accident is told, and "no lump" is never said of it; right ones are not.
+
+The scans are `mapping_scans.make_scan` with noise, whose truth is known by construction.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import mapping_scans as scans
+import numpy as np
+import pytest
+from posterior_maps import grid_map
+
+from tactile_bayes.api.estimating import estimate_one
+from tactile_bayes.api.settings import Settings
+from tactile_bayes.declarations import replace
+from tactile_bayes.errors import CANNOT_SHOW, BadDataError
+from tactile_bayes.mapping.build import build_map
+from tactile_bayes.mapping.plausibility import map_findings, scan_doubts
+from tactile_bayes.mapping.select import find_faults
+from tactile_bayes.posterior.abstention import no_verdict
+from tactile_bayes.scan import ElementCalibration, HeadGeometry, Landmarks, PressureFrames, Scan, TrackerPoses
+
+WINDOW = (5.0, 14.0)
+KPA_PER_COUNT = 0.004
+
+
+def scan(amplitude: float = 0.6) -> Scan:
+    """Strokes of a noisy array over a lump, 0 for none, at 100 frames a second; the level wanders as a hand's does."""
+    rng = np.random.default_rng(7)
+    clean = scans.make_scan(
+        scans.strokes(reach_mm=30.0, lines=5, spacing_mm=5.0, per_line=100),
+        field=scans.gaussian(amplitude=amplitude, sigma_x=5.0, sigma_y=5.0),
+    )
+    level = 1.0 + 0.2 * np.sin(np.arange(len(clean.frames)) / 17.0)
+    kpa = clean.pressure_kpa() * level[:, None, None] + 0.1 * rng.standard_normal(clean.frames.counts.shape)
+    shape = clean.head.shape
+    calibration = ElementCalibration(np.full(shape, KPA_PER_COUNT), np.zeros(shape), 4095)
+    frames = PressureFrames(clean.frames.time_s, np.rint(kpa / KPA_PER_COUNT).astype(np.uint16))
+    return replace(clean, frames=frames, element_calibration=calibration)
+
+
+def counts(change: Callable[[np.ndarray], np.ndarray], **calibration: float) -> Callable[[Scan], Scan]:
+    """An accident to the counts, with what the file then says of gain and saturation."""
+
+    def made(one: Scan) -> Scan:
+        values = change(one.frames.counts.astype(np.int64)).astype(np.uint16)
+        held = one.element_calibration
+        gain = held.gain_kpa_per_count * calibration.get("gain", 1.0)
+        told = ElementCalibration(gain, held.offset_kpa, int(calibration.get("saturation", held.saturation_count)))
+        return replace(one, frames=PressureFrames(one.frames.time_s, values), element_calibration=told)
+
+    return made
+
+
+def frozen(values: np.ndarray) -> np.ndarray:
+    values[150:350] = values[150]
+    return values
+
+
+def light(values: np.ndarray) -> np.ndarray:
+    return np.where((np.arange(len(values)) % 170 == 60)[:, None, None], values, values // 8)
+
+
+def poses(change: Callable[[TrackerPoses], TrackerPoses]) -> Callable[[Scan], Scan]:
+    return lambda one: replace(one, poses=change(one.poses))
+
+
+def moved(scale: float = 1.0, *, other_mm: float = 0.0) -> Callable[[Scan], Scan]:
+    """Places in another unit, or every other one of a second tool."""
+
+    def made(given: TrackerPoses) -> TrackerPoses:
+        places = scale * given.position_mm
+        places[1::2] += other_mm
+        return TrackerPoses(given.time_s, places, given.quaternion_wxyz)
+
+    return poses(made)
+
+
+def timed(scale: float) -> Callable[[Scan], Scan]:
+    def made(one: Scan) -> Scan:
+        told = TrackerPoses(scale * one.poses.time_s, one.poses.position_mm, one.poses.quaternion_wxyz)
+        return replace(one, frames=PressureFrames(scale * one.frames.time_s, one.frames.counts), poses=told)
+
+    return made
+
+
+def in_inches(one: Scan) -> Scan:
+    head = HeadGeometry(one.head.surface_mm / 25.4, one.head.pitch_mm / 25.4, one.head.scanhead_from_tracker)
+    return replace(one, head=head)
+
+
+def pitch_in_inches(one: Scan) -> Scan:
+    return replace(one, head=HeadGeometry(one.head.surface_mm, one.head.pitch_mm / 25.4, np.eye(4)))
+
+
+UNLIKE: dict[str, tuple[Callable[[Scan], Scan], str]] = {
+    "10 bits, saturation left out": (counts(lambda c: np.minimum(c, 2400)), "highest count, 2,400"),
+    "8 bits, saturation left out": (counts(lambda c: np.minimum(c // 10, 240), gain=10.0), "highest count, 240"),
+    "12 bits left-aligned in 16": (
+        counts(lambda c: np.minimum(c, 2400) * 16, gain=1 / 16, saturation=65535),
+        "highest count, 38,400",
+    ),
+    "each taxel has an end": (
+        counts(lambda c: np.minimum(c, 2200 + 10 * np.arange(64).reshape(8, 8))),
+        "highest count",
+    ),
+    "full scale, declared": (counts(lambda c: np.minimum(c, 2900), saturation=2900), "were at full scale"),
+    "rounded to kPa": (counts(lambda c: np.rint(c * KPA_PER_COUNT), gain=1 / KPA_PER_COUNT), "one count is"),
+    "readings stand still": (counts(frozen), "readings stand still"),
+    "hardly a frame in the window": (counts(light), "frames are used: "),
+    "places in m": (moved(1e-3), "the head stood still"),
+    "places in inches": (moved(1 / 25.4), "the head stood still"),
+    "places in 10 um": (moved(20.0), "the poses jump: 100 %"),
+    "times in ms": (timed(1000.0), "frames come at 0.1 Hz"),
+    "times in ks": (timed(1e-3), "frames come at 1e+05 Hz"),
+    "array in inches": (in_inches, "no scan head is"),
+    "pitch in inches": (pitch_in_inches, "times as far apart as the pitch says"),
+}
+
+
+@pytest.mark.parametrize(("made", "told"), UNLIKE.values(), ids=UNLIKE)
+def test_an_accident_is_told_and_is_no_map_without_a_lump(made: Callable[[Scan], Scan], told: str) -> None:
+    tactile_map = build_map(made(scan()), as_stated=True, max_pose_gap_ms=1e6)
+    assert any(told in one.text for one in tactile_map.findings if one.kind == "unlike_an_exam")
+    why = no_verdict(tactile_map)
+    assert why is not None
+    assert why.code == CANNOT_SHOW
+
+
+@pytest.mark.parametrize("name", ["readings stand still", "hardly a frame in the window"])
+def test_an_estimate_from_it_says_that_it_cannot_show_a_lump(name: str) -> None:
+    one, told = UNLIKE[name]
+    found = estimate_one(build_map(one(scan(0.0)), as_stated=True), Settings(method="laplace")).estimate
+    assert found.code == CANNOT_SHOW
+    assert found.reason.startswith("the data cannot show whether there is a lump: ")
+    assert told in found.reason
+
+
+@pytest.mark.parametrize("amplitude", [0.0, 0.6])
+def test_a_right_scan_is_not_doubted(amplitude: float) -> None:
+    right = scan(amplitude)
+    assert scan_doubts(right, pressure_window_kpa=WINDOW) == ()
+    assert not [one for one in build_map(right).findings if one.kind in ("unlike_an_exam", "unusual_scan")]
+
+
+def test_a_map_without_a_lump_says_so_where_nothing_stands_against_it() -> None:
+    found = estimate_one(build_map(scan(0.0)), Settings(method="laplace")).estimate
+    assert found.code in ("empty", "undetected", "ridge")
+    assert found.reason.startswith("no lump found")
+
+
+UNUSUAL: dict[str, tuple[Callable[[Scan], Scan], str]] = {
+    "a slow array read often": (counts(lambda c: np.repeat(c[::5], 5, axis=0)), "repeat the one before"),
+    "wrapped below 0": (
+        counts(lambda c: np.where(c == c.min(), 65530, c), saturation=65535),
+        "stand just below 65,536",
+    ),
+    "landmarks of the head": (
+        lambda one: replace(one, landmarks=Landmarks(np.array([0.0, 5, 0]), np.array([0.0, -9, 0]))),
+        "14 mm apart",
+    ),
+    "landmarks of another base": (
+        lambda one: replace(one, landmarks=Landmarks(np.array([900.0, 200, 0]), np.array([900.0, 0, 0]))),
+        "no nearer to the xiphoid",
+    ),
+}
+
+
+@pytest.mark.parametrize(("made", "told"), UNUSUAL.values(), ids=UNUSUAL)
+def test_what_hides_no_lump_is_told_and_leaves_the_verdict(made: Callable[[Scan], Scan], told: str) -> None:
+    one = made(scan(0.0))
+    assert any(told in each.text for each in scan_doubts(one, pressure_window_kpa=WINDOW) if each.kind == "unusual_scan")
+    why = no_verdict(build_map(one))
+    assert why is None or told not in why.reason
+
+
+# --- a map's cells, of whatever source
+
+
+def grid(change: Callable[[np.ndarray], np.ndarray]) -> list[str]:
+    values = 1.0 + 0.02 * np.random.default_rng(3).standard_normal((51, 51))
+    y, x = np.mgrid[-25:26, -25:26]
+    lump = 0.4 * np.exp(-(x**2 + y**2) / 50.0)
+    return [one.text for one in map_findings(grid_map(change(values + lump), count=40))]
+
+
+def dead(values: np.ndarray) -> np.ndarray:
+    values[:, 40] = 0.0
+    return values
+
+
+def filled(value: float) -> Callable[[np.ndarray], np.ndarray]:
+    def made(values: np.ndarray) -> np.ndarray:
+        values[3:6, 3:9] = value
+        return values
+
+    return made
+
+
+@pytest.mark.parametrize("value", [1e20, -9999.0, 65535.0, 255.0, -1.0, 9999.0])
+def test_values_that_stand_for_none_are_told(value: float) -> None:
+    assert any("18 of 2601 cells lie far outside the rest" in text for text in grid(filled(value)))
+
+
+def test_a_dead_line_and_a_plateau_are_told_and_a_lump_is_not() -> None:
+    assert any("51 of 2601 cells lie far outside the rest" in text for text in grid(dead))
+    assert any("cells stand at the highest value" in text for text in grid(lambda v: np.minimum(v, 1.2)))
+    assert grid(lambda v: v) == []
+    assert grid(lambda v: np.rint(100 * v)) == []  # whole numbers, as an image has them
+
+
+# --- taxels and refusals
+
+
+@pytest.mark.parametrize(
+    ("made", "told"),
+    [
+        (moved(1000.0), "the places of the head spread over 60,000 mm"),
+        (moved(other_mm=60.0), "the poses jump to and fro"),
+    ],
+    ids=["places in um", "two tools"],
+)
+def test_poses_of_no_hand_are_refused_by_their_cause(made: Callable[[Scan], Scan], told: str) -> None:
+    with pytest.raises(BadDataError, match=told):
+        build_map(made(scan()), as_stated=True)
+
+
+@pytest.mark.parametrize("value", [0, 1700], ids=["dead", "stuck"])
+def test_a_line_that_dies_on_the_way_is_left_out(value: int) -> None:
+    def dies(values: np.ndarray) -> np.ndarray:
+        values[350:, 3, :6] = value
+        return values
+
+    assert {(one.row, one.fault) for one in find_faults(counts(dies)(scan()))} == {(3, "stuck")}
+    assert find_faults(scan()) == ()
+
+
+@pytest.mark.parametrize(
+    ("made", "asked"),
+    [
+        (counts(lambda c: c, gain=1 / 6.895), "are these psi"),
+        (counts(lambda c: c, gain=1 / 0.1333, saturation=65535), "are these mmHg"),
+        (counts(lambda c: c, gain=1000.0, saturation=65535), "or Pa"),
+        (counts(lambda c: np.rint(c * KPA_PER_COUNT)), "are the counts kPa already"),
+        (counts(lambda c: c * 16), "multiples of 16: fewer bits, left-aligned"),
+    ],
+    ids=["psi", "mmHg", "Pa", "counts are kPa", "left-aligned"],
+)
+def test_a_refusal_asks_about_the_unit_that_fits(made: Callable[[Scan], Scan], asked: str) -> None:
+    with pytest.raises(BadDataError, match=asked.removeprefix("or ")):
+        build_map(made(scan()))
