@@ -10,7 +10,7 @@ from pathlib import Path
 NAMES = (
     "known_scans", "held_out", "site_phantoms", "own_trial", "other_head", "stress", "stress_trial", "lump_probability",
     "smallest_lump", "masses", "scene_rates", "method_agreement", "interval_coverage", "repeatability", "coverage",
-    "arrangement", "agreement_coverage", "visits", "next_mass_coverage", "tables",
+    "arrangement", "plausibility", "agreement_coverage", "visits", "next_mass_coverage", "tables",
 )  # fmt: skip
 
 

@@ -279,9 +279,7 @@ def _compared(
     visits: Sequence[Sequence[Answer]], calibration: BodyCalibration, settings: Settings, comparing: Comparing
 ) -> Compared:
     found = [[answer for answer in maps if answer.shape is not None] for maps in visits]
-    missing = [
-        words for number, maps in enumerate(visits, start=1) if (words := _missing(maps, f"visit {number}"))
-    ]
+    missing = [words for number, maps in enumerate(visits, start=1) if (words := _missing(maps, f"visit {number}"))]
     contradicted = contradictions([_scans(one) for one in visits])
     if contradicted:
         advice = "compare exams of one mass; where a code is wrong, correct it in the scans' session and map them again"

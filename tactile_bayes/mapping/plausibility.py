@@ -271,18 +271,19 @@ def _rate(rate_hz: float) -> tuple[str, str]:
 def _unusual(quality: Mapping[str, float]) -> Iterator[tuple[str, str]]:
     """Sentence and remedy for what is off, but hides no lump."""
     if wrapped := quality.get("wrapped_readings"):
-        text = f"{wrapped:,.0f} readings stand just below 65,536 and count as saturated: they may be below 0, or no value"
+        text = f"{wrapped:,.0f} readings stand just below 65,536 and count as saturated: they are below 0 or no value"
         yield text, "check the offset that was subtracted, and what stands for no reading"
-    if MOST_REPEATED < quality.get("repeated_share", 0.0) and quality.get("frozen_share", 0.0) <= MOST_FROZEN:
+    if quality.get("repeated_share", 0.0) > MOST_REPEATED and quality.get("frozen_share", 0.0) <= MOST_FROZEN:
         share = 100 * quality["repeated_share"]
         yield f"{share:.0f} % of the frames repeat the one before: the array is slower than its clock says", ""
     apart, reach = quality.get("landmark_distance_mm"), quality.get("landmark_reach_mm", 0.0)
+    in_base = "check that landmarks are in the tracker's base frame, in mm"
     if apart is not None and not LANDMARKS_MM[0] <= apart <= LANDMARKS_MM[1]:
-        text = f"sternal notch and xiphoid lie {apart:.0f} mm apart, {LANDMARKS_MM[0]:g} to {LANDMARKS_MM[1]:g} in adults"
-        yield f"{text}: places on the breast may be wrong", "check that landmarks are in the tracker's base frame, in mm"
+        adults = "{:g} to {:g} in adults".format(*LANDMARKS_MM)
+        text = f"sternal notch and xiphoid lie {apart:.0f} mm apart, {adults}: places on the breast may be wrong"
+        yield text, in_base
     elif reach > MOST_REACH_MM:
-        text = f"the head came no nearer to the xiphoid than {reach:.0f} mm: places on the breast may be wrong"
-        yield text, "check that landmarks are in the tracker's base frame, in mm"
+        yield f"the head came no nearer to the xiphoid than {reach:.0f} mm: places on the breast may be wrong", in_base
 
 
 def _of_cells(tactile_map: TactileMap) -> Iterator[tuple[str, str]]:
@@ -299,7 +300,10 @@ def _of_cells(tactile_map: TactileMap) -> Iterator[tuple[str, str]]:
     readings = frames * (1 if head is None else head.rows * head.columns)
     if saturated > MOST_SATURATED * readings:
         share = 100 * saturated / readings
-        yield f"{share:.1f} % of the readings were at full scale and left out, where a lump would press", "press less hard"
+        yield (
+            f"{share:.1f} % of the readings were at full scale and left out, where a lump would press",
+            "press less hard",
+        )
     count = tactile_map.count[covered]
     held = tactile_map.mean[covered][count >= FEW_READINGS * float(tactile_map.counts_known)]
     yield from _of_values(held)
@@ -325,7 +329,9 @@ def _of_values(values: FloatArray) -> Iterator[tuple[str, str]]:
         yield text, "mark them as missing"
     at_top, near = _top(ordered)
     if PLATEAU <= at_top < len(ordered) / 2 and at_top > near > 0:
-        text = f"{at_top} cells stand at the highest value, {ordered[-1]:.4g}, and few just below it: it was clipped there"
+        text = (
+            f"{at_top} cells stand at the highest value, {ordered[-1]:.4g}, and few just below it: it was clipped there"
+        )
         yield text, "take it again without clipping"
 
 

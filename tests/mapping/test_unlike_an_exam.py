@@ -1,4 +1,4 @@
-"""Scans and maps that are unlike an exam's: each accident is told, and "no lump" is never said of it; right ones are not.
+"""Scans and maps that are unlike an exam's: each accident is told, and "no lump" is never said of it.
 
 The scans are `mapping_scans.make_scan` with noise, whose truth is known by construction.
 """
@@ -112,7 +112,7 @@ UNLIKE: dict[str, tuple[Callable[[Scan], Scan], str]] = {
     "hardly a frame in the window": (counts(light), "frames are used: "),
     "places in m": (moved(1e-3), "the head stood still"),
     "places in inches": (moved(1 / 25.4), "the head stood still"),
-    "places in 10 um": (moved(20.0), "the poses jump: 100 %"),
+    "places in twentieths": (moved(20.0), "the places spread over"),
     "times in ms": (timed(1000.0), "frames come at 0.1 Hz"),
     "times in ks": (timed(1e-3), "frames come at 1e+05 Hz"),
     "array in inches": (in_inches, "no scan head is"),
@@ -171,7 +171,9 @@ UNUSUAL: dict[str, tuple[Callable[[Scan], Scan], str]] = {
 @pytest.mark.parametrize(("made", "told"), UNUSUAL.values(), ids=UNUSUAL)
 def test_what_hides_no_lump_is_told_and_leaves_the_verdict(made: Callable[[Scan], Scan], told: str) -> None:
     one = made(scan(0.0))
-    assert any(told in each.text for each in scan_doubts(one, pressure_window_kpa=WINDOW) if each.kind == "unusual_scan")
+    assert any(
+        told in each.text for each in scan_doubts(one, pressure_window_kpa=WINDOW) if each.kind == "unusual_scan"
+    )
     why = no_verdict(build_map(one))
     assert why is None or told not in why.reason
 
