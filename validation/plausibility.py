@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from tactile_bayes.mapping.build import build_map
-from tactile_bayes.mapping.plausibility import BLOCKING
+from tactile_bayes.mapping.plausibility import against_no_lump
 from validation.arrangement import scans
 from validation.common import Table, parser
 
@@ -27,9 +27,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     told: Counter[str] = Counter()
     number = blocked = 0
     for scan in scans(given.scans, given.exams, given.seed):
-        found = build_map(scan, as_stated=True).findings
-        told.update({one.kind for one in found})
-        against = [one for one in found if one.kind in BLOCKING]
+        tactile_map = build_map(scan, as_stated=True)
+        told.update({one.kind for one in tactile_map.findings})
+        against = against_no_lump(tactile_map)
         number, blocked = number + 1, blocked + bool(against)
         for one in against:
             print(f"scan {number}: {one.kind}: {one.text}", flush=True)

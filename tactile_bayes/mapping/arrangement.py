@@ -24,7 +24,7 @@ from tactile_bayes.geometry import FloatArray, IndexArray, apply, inverse
 from tactile_bayes.mapping.convention import CoarseFrames, block_means, every_stretch, thinning
 from tactile_bayes.mapping.latency import Cells, Nuisance
 from tactile_bayes.mapping.plane import poses_at
-from tactile_bayes.mapping.plausibility import scan_doubts
+from tactile_bayes.mapping.plausibility import SURE_ODDS, scan_doubts
 from tactile_bayes.mapping.select import SelectedFrames, TaxelFault, select_frames
 from tactile_bayes.presets import CORRECTIONS, PRESSURE_WINDOW_KPA
 from tactile_bayes.scan import ElementCalibration, HeadGeometry, PressureFrames, Scan, TrackerPoses
@@ -46,8 +46,6 @@ Corrections = tuple[str, ...]
 MOST_CHANGES: Final = 3
 LIKELY_ODDS: Final = 10.0
 """From these odds on another arrangement is a caution, and the one stated counts as shown."""
-SURE_ODDS: Final = 1e4
-"""From these on the one stated is refused."""
 LEAST_EXPLAINED: Final = 0.7
 """Share of what varies over the skin that frames of other times predict in the right arrangement: 0.79 to 0.97 in 26
 scans by another simulator."""

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -203,7 +202,7 @@ def _built(
     progress: Progress,
 ) -> TactileMap:
     """The map from the frames that are used, whose `figures` it adds to."""
-    findings = of_scans + _of_arrangement(selections, late_ms, refuse=not how.as_stated)
+    findings = of_scans + _of_arrangement(selections, late_ms, figures, refuse=not how.as_stated)
     figures |= head_profile_figures(selections)
     if how.flat_field:
         selections = _flattened(selections, rules, late_ms, figures)
@@ -235,7 +234,9 @@ def _of_scans(scans: list[Scan]) -> tuple[Finding, ...]:
     return _numbered([scan_findings(scan) for scan in scans])
 
 
-def _of_arrangement(selections: list[SelectedFrames], late_ms: float, *, refuse: bool) -> tuple[Finding, ...]:
+def _of_arrangement(
+    selections: list[SelectedFrames], late_ms: float, figures: dict[str, float], *, refuse: bool
+) -> tuple[Finding, ...]:
     """Findings on how each scan is arranged; where another arrangement than the one stated is sure, it is refused."""
     findings = []
     for number, one in enumerate(selections, start=1):
@@ -244,6 +245,8 @@ def _of_arrangement(selections: list[SelectedFrames], late_ms: float, *, refuse:
             which = f"scan {number}: " if len(selections) > 1 else ""
             way_out = f"import the scan again with {check.remedy}, or map it with --as-stated"
             raise BadDataError(f"{which}{check.words}", way_out=way_out)
+        if check is not None:
+            figures["arrangement_log_odds"] = max(check.log_odds, figures.get("arrangement_log_odds", 0.0))
         findings.append(() if check is None else check.findings)
     return findings[0] if all(one == findings[0] for one in findings) else _numbered(findings)
 

@@ -8,6 +8,7 @@ limits.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from math import log
 from typing import Final
 
 import numpy as np
@@ -50,7 +51,7 @@ PLATEAU: Final = 30
 TAXEL_PLATEAU: Final = 10
 """Readings at the highest count, of the array and of one taxel, that are a plateau if those of the three counts below
 it are fewer: 66 right scans have up to 5 of one taxel."""
-MOST_SATURATED: Final = 2e-3
+MOST_SATURATED: Final = 0.02
 """Share of the readings."""
 COARSEST_COUNT: Final = 0.1
 """A count over the mean pressure: a lump's rise is a few tenths of it."""
@@ -342,14 +343,20 @@ def _top(ordered: FloatArray) -> tuple[int, int]:
     return int(levels[-1]), int(levels[-4:-1].sum())
 
 
-BLOCKING: Final = frozenset({"unlike_an_exam", "wrong_arrangement", "frames_contradict", "poses_jump"})
-"""Kinds of findings under which a map without a lump does not say that there is none. Rotations that seem to be of
-another convention are none of them: 2 of 60 right exams of our own have them."""
+BLOCKING: Final = frozenset({"unlike_an_exam", "frames_contradict", "poses_jump"})
+"""Kinds of findings under which a map without a lump does not say that there is none.
+
+Rotations that seem to be of another convention are none of them: 2 of 60 right exams of our own have them.
+"""
+SURE_ODDS: Final = 1e4
+"""From these odds on another arrangement than the one stated is refused, and stands against "no lump"."""
 
 
-def against_no_lump(findings: Iterable[Finding]) -> list[Finding]:
-    """Those findings that stand against "there is no lump"."""
-    return [one for one in findings if one.kind in BLOCKING]
+def against_no_lump(tactile_map: TactileMap) -> list[Finding]:
+    """Findings of a map, its own and those it was made with, that stand against "there is no lump"."""
+    sure = tactile_map.quality.get("arrangement_log_odds", 0.0) >= log(SURE_ODDS)
+    kinds = BLOCKING | {"wrong_arrangement"} if sure else BLOCKING
+    return [one for one in (*map_findings(tactile_map), *tactile_map.findings) if one.kind in kinds]
 
 
 def with_cause(error: BadDataError, findings: Iterable[Finding]) -> BadDataError:

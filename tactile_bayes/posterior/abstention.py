@@ -10,7 +10,7 @@ from tactile_bayes.errors import CANNOT_SHOW, Abstention, UsageError
 from tactile_bayes.geometry import BoolArray, FloatArray
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.mapping.places import orientation_of
-from tactile_bayes.mapping.plausibility import against_no_lump, map_findings
+from tactile_bayes.mapping.plausibility import against_no_lump
 from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior.bump import covered_share, map_ends, on_map, trusted, window_cells
 from tactile_bayes.posterior.draw import DETECTED
@@ -74,7 +74,7 @@ def no_verdict(tactile_map: TactileMap) -> Abstention | None:
     if cell > COARSEST_MM:
         advice = "map the scan again with smaller cells (they have 1 mm by default)"
         return cannot_show(f"its cells of {cell:g} mm are too large", advice, SMALLER_CELLS_ON_PAPER)
-    against = against_no_lump((*map_findings(tactile_map), *tactile_map.findings))
+    against = against_no_lump(tactile_map)
     if not against:
         return None
     first, remedies = against[0], dict.fromkeys(one.remedy for one in against if one.remedy)
