@@ -26,8 +26,8 @@ ROOT = Path(__file__).resolve().parent.parent
 DOCS = ROOT / "docs"
 PAGES = sorted([*DOCS.glob("*.md"), *(DOCS / "guides").glob("*.md"), *ROOT.glob("README.md")])
 DECISIONS = sorted((DOCS / "decisions").glob("*.md"))
-RUN_ELSEWHERE = (DOCS / "guides" / "python.md",)
-"""tests/api/test_pages.py runs it, and looks at what it finds."""
+RUN_ELSEWHERE = (DOCS / "guides" / "python.md", DOCS / "gallery.md")
+"""tests/api/test_pages.py and tests/test_gallery.py run them, and look at what they find."""
 
 _spec = importlib.util.spec_from_file_location("make_reference", DOCS / "make_reference.py")
 assert _spec is not None

@@ -81,7 +81,7 @@ def map_action(
 
 def beside(scan: Path) -> Path:
     """Where the map of a scan is written if no one says so: in its folder, and named after it."""
-    return scan.with_name("map.nc" if scan.stem == "scan" else f"{scan.stem}.nc")
+    return scan.parent / ("map.nc" if scan.stem == "scan" else f"{scan.stem}.nc")
 
 
 class _Clock:

@@ -24,6 +24,7 @@ from tactile_bayes.files.reading import check_address
 from tactile_bayes.files.size_json import NONE
 from tactile_bayes.options import PlanAims, TrialSettings
 from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.report.pages import PageFiles
 from tactile_bayes.shell import progress_bar
 
 # --- `validate`: compare each modality with excision.
@@ -37,12 +38,17 @@ def validate_action(
     as_json: bool,
     output: Path | None,
     html: Path | None,
+    pdf: Path | None,
     protocol: Path | None,
     force: bool,
     **settings: Any,
 ) -> None:
     """Compare sizes with excision: errors, lines, agreement, repeatability and calibration of each modality."""
-    refuse_existing(output, html, force=force)
+    if pdf is not None and html is None:
+        raise UsageError("--pdf prints the page that --html names; give --html REPORT.html too")
+    refuse_existing(output, force=force)
+    if html is not None:
+        PageFiles(html, pdf, force).check()
     title, chosen = _settings(settings, protocol)
     inputs = load_trial(trial, excision, columns)
     also_read(*inputs.files.values())
@@ -51,7 +57,7 @@ def validate_action(
         if output:
             found.write_json(output, force=force)
         if html:
-            found.write_html(html, force=force)
+            found.write_html(html, pdf=pdf, force=force)
     finally:  # what was computed is not lost with a file
         if as_json:
             for doubt in found.report.doubts:

@@ -30,6 +30,7 @@ from tactile_bayes.inference.modes import LogDensity, mode_and_covariance
 from tactile_bayes.options import LearnOptions, TrialSettings
 from tactile_bayes.presets import INTERVAL, RESEARCH_USE
 from tactile_bayes.report.compare import Growth
+from tactile_bayes.report.pages import PageFiles
 from tactile_bayes.report.trial import DIGITS, trial_text
 from tactile_bayes.report.trial_html import trial_html
 from tactile_bayes.size.pooling import Calibration, Repeatability
@@ -95,9 +96,12 @@ class TrialResult(Record, eq=False):
         """Write what ``validate -o`` writes."""
         write_text(path, dump_json(self.document), force=force)
 
-    def write_html(self, path: Path, *, growth: Sequence[Growth] = (), force: bool = False) -> None:
-        """Write what ``validate --html`` writes, with what became of masses with several visits."""
-        write_text(path, trial_html(self.report, self.trial, text=self.text, growth=growth), force=force)
+    def write_html(
+        self, path: Path, *, growth: Sequence[Growth] = (), pdf: Path | None = None, force: bool = False
+    ) -> None:
+        """Write what ``validate --html`` and ``--pdf`` write, with what became of masses with several visits."""
+        page = trial_html(self.report, self.trial, text=self.text, growth=growth)
+        PageFiles(path, pdf, force).write(page)
 
     def to_dataframe(self) -> pandas.DataFrame:
         """One row for each modality and figure: value, and the ends of its interval (NaN where it has none)."""

@@ -201,7 +201,7 @@ class FiniteRange(click.FloatRange):
         text, share = str(value), ""
         with contextlib.suppress(ValueError):
             part = float(text.removesuffix("%").strip()) / 100
-            if self.max == 1 and 0 < part < 1:
+            if self.max is not None and self.max <= 1 and self.min is not None and self.min <= part <= self.max:
                 share = f"; for {text.removesuffix('%').strip()} % give {part:g}"
         words = number_words(self.min, self.max, open_ends=self.min_open or self.max_open)
         return self.fail(f"{text!r} is not {words}{share}", param, ctx)

@@ -55,6 +55,9 @@ _FILE = FilePath()
     help="Write tables and figures as one self-contained page.",
 )
 @click.option(
+    "--pdf", metavar="REPORT.pdf", type=_FILE, help="Also print it to PDF, by an installed Chromium or WeasyPrint."
+)
+@click.option(
     "--protocol", metavar="FILE.toml", type=_FILE, help="Pre-specified analysis; the report records its hash."
 )
 @FORCE

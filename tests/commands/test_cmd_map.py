@@ -109,6 +109,16 @@ def test_a_map_without_a_name_is_beside_its_scan_and_named(folder, run_cli):
     assert run_cli("map", "exams/one.mcap", "--force", cwd=folder).returncode == 0
 
 
+@pytest.mark.parametrize("words", [".", "..", "/", "folder", "none.mcap"])
+def test_what_is_no_scan_has_no_map_beside_it(words, tmp_path):
+    (tmp_path / "folder").mkdir()
+    done = run_here("map", words, cwd=tmp_path)
+    assert done.returncode in (2, 3)
+    assert done.stderr.startswith("error: ")
+    assert done.stderr.count("\n") == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["folder"]
+
+
 def test_equal_inputs_give_equal_bytes_and_no_names(folder, run_cli):
     (folder / "Jane_Doe.mcap").write_bytes((folder / "one.mcap").read_bytes())
     for scan, out in (("one.mcap", "a.nc"), ("Jane_Doe.mcap", "b.nc")):

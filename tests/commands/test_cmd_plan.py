@@ -116,7 +116,7 @@ def test_refusals_name_the_way_out() -> None:
     assert "choose one with --against" in str(error)
     assert plan("--patients", 7).exit_code == 2
     assert "leave out --patients" in str(plan("--patients", 12, "--power", 0.9).exception)
-    assert "90" in plan("--power", 90).output
+    assert "for 90 % give 0.9" in plan("--power", "90%").output
 
 
 def test_python_plans_as_the_command_does(tmp_path: Path) -> None:

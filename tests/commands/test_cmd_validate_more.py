@@ -270,6 +270,17 @@ def test_the_page_has_every_mass_with_its_residuals_and_no_patient(tmp_path: Pat
     assert "Jane" not in page
 
 
+def test_a_print_needs_the_page_and_is_written_with_it_or_not_at_all(tmp_path: Path) -> None:
+    asked = (TRIAL, "--excision", EXCISION, "--pdf", tmp_path / "r.pdf")
+    assert "give --html REPORT.html too" in refusal(*asked)
+    assert "choose another name" in refusal(*asked[:-1], tmp_path / "r.html", "--html", tmp_path / "r.html")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("tactile_bayes.report.pages.find_printer", lambda: lambda text: b"%PDF of " + text[:9].encode())
+        assert validate(*asked, "--html", tmp_path / "r.html").exit_code == 0
+    assert (tmp_path / "r.pdf").read_bytes() == b"%PDF of <!doctype"
+    assert (tmp_path / "r.html").exists()
+
+
 def test_the_page_stands_what_has_almost_nothing(tmp_path: Path) -> None:
     (tmp_path / "t.csv").write_text(
         "patient,mass,modality,replicate,size_mm,status\nP1,1,cbe,1,,not_detected\nP1,1,<b>,1,9,detected\n".replace(

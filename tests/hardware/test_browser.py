@@ -4,92 +4,31 @@ from __future__ import annotations
 
 import base64
 import io
-import itertools
-import json
-import re
-import shutil
-import subprocess
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
+from browser import BROWSER, Page, opened
 from emulated_devices import short_scan
 from PIL import Image
 from test_live import seen_of
 from test_orientation import UPPER_RIGHT, corner, live_state, lump_in_base
-from websockets.sync.client import ClientConnection, connect
 
 from tactile_bayes.declarations import replace
 from tactile_bayes.hardware.live import LiveMap
 from tactile_bayes.hardware.serve import LiveServer, document
 
-BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
 pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(BROWSER is None, reason="no Chromium is installed"),
 ]
 
 
-class Page:
-    """One page of a browser, over its debugging protocol."""
-
-    def __init__(self, socket: ClientConnection) -> None:
-        self._socket = socket
-        self._numbers = itertools.count(1)
-
-    def call(self, method: str, **parameters):
-        number = next(self._numbers)
-        self._socket.send(json.dumps({"id": number, "method": method, "params": parameters}))
-        while True:
-            answer = json.loads(self._socket.recv(timeout=20))
-            if answer.get("id") == number:
-                assert "error" not in answer, answer
-                return answer["result"]
-
-    def value(self, code: str):
-        result = self.call("Runtime.evaluate", expression=code, returnByValue=True, userGesture=True)
-        return result["result"].get("value")
-
-    def until(self, code: str):
-        for _ in range(200):
-            found = self.value(code)
-            if found:
-                return found
-            time.sleep(0.05)
-        raise AssertionError(f"never true: {code}")
-
-
 @pytest.fixture
 def page(tmp_path: Path) -> Iterator[Page]:
-    process = subprocess.Popen(
-        [
-            str(BROWSER),
-            "--headless=new",
-            "--no-sandbox",
-            "--disable-gpu",
-            "--remote-debugging-port=0",
-            f"--user-data-dir={tmp_path / 'profile'}",
-            "--window-size=900,900",
-            "about:blank",
-        ],
-        stderr=subprocess.PIPE,
-        stdout=subprocess.DEVNULL,
-        text=True,
-    )
-    assert process.stderr is not None
-    found = None
-    while found is None:
-        found = re.search(r"ws://\S+", process.stderr.readline())
-    browser = found[0]
-    with connect(browser, max_size=None) as socket:
-        target = Page(socket).call("Target.createTarget", url="about:blank")["targetId"]
-        with connect(re.sub(r"/devtools/.*", f"/devtools/page/{target}", browser), max_size=None) as tab:
-            yield Page(tab)
-    process.terminate()
-    process.wait()
-    process.stderr.close()
+    with opened(tmp_path / "profile", width=900, height=900) as tab:
+        yield tab
 
 
 def test_the_page_shows_the_map_and_its_tone_tells_low_in_range_and_high(page, tmp_path):
