@@ -15,7 +15,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from tactile_bayes.declarations import Record, as_dict, replace
+from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import FloatArray, apply, patient_from_plane
 from tactile_bayes.hardware.ports import PIPE_BYTES
@@ -35,6 +35,7 @@ from tactile_bayes.scan import ElementCalibration, HeadGeometry, TrackerPoses
 FRAME: Final = 1
 POSE: Final = 2
 REPORT: Final = 3
+_TOLD: Final = ("frames", "frames_lost", "poses", "first_ns", "last_ns", "unseen")
 LANDMARK: Final = 4
 _HEADER: Final = struct.Struct("<BI")
 _TIMES: Final = struct.Struct("<qq")  # device ns, host ns (monotonic)
@@ -93,7 +94,7 @@ class Feed:
 
     def told(self, report: Report) -> None:
         """Send the account so far."""
-        self._send(REPORT, json.dumps(as_dict(report)).encode()[: select.PIPE_BUF - _HEADER.size])
+        self._send(REPORT, json.dumps({name: getattr(report, name) for name in _TOLD}).encode())
 
     def _send(self, kind: int, payload: bytes) -> None:
         message = _HEADER.pack(kind, len(payload)) + payload
@@ -179,7 +180,8 @@ class LiveState(Record, eq=False):
     frames: int = 0
     frames_lost: int = 0
     poses: int = 0
-    """`frames`, `frames_lost`, `poses`: By the recorder's account."""
+    unseen: str = ""
+    """`frames`, `frames_lost`, `poses`, `unseen`: By the recorder's account; `unseen` is why there is no pose now."""
     duration_s: float = 0.0  #: Recorded so far.
     used_share: float = 0.0  #: Of the frames that the map has used.
     latency_ms: float = 0.0  #: From the recorder to this state, of its youngest frame.
@@ -200,6 +202,15 @@ class LiveState(Record, eq=False):
             return "no size yet: the tracker has sent no pose"
         low, high = self.window_kpa
         return f"no size yet: no frame with a pose was pressed at {low:g} to {high:g} kPa"
+
+    @property
+    def account_words(self) -> str:
+        """Numbers so far; a tool that is not seen comes first."""
+        unseen = f"NO POSE ({self.unseen}); " if self.unseen else ""
+        return (
+            f"{unseen}{self.duration_s:.1f} s, {self.frames} frames, {self.frames_lost} lost, {self.poses} poses, "
+            f"{self.covered_mm2 / 100:.1f} cm² covered"
+        )
 
     @property
     def pressure_words(self) -> str:
@@ -327,6 +338,7 @@ class LiveMap:
             frames=report.get("frames", 0),
             frames_lost=report.get("frames_lost", 0),
             poses=report.get("poses", 0),
+            unseen=report.get("unseen", ""),
             duration_s=(report.get("last_ns", 0) - report.get("first_ns", 0)) / 1e9,
             used_share=figures["frames_used"] / max(1.0, figures["frames_total"]),
             latency_ms=(time.monotonic_ns() - self._host_ns) / 1e6 if self._host_ns else 0.0,

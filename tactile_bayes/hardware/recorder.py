@@ -54,6 +54,7 @@ class Report:
     poses_repeated: int = 0
     poses_flagged: int = 0
     poses_missing: int = 0
+    unseen: str = ""  #: Why there is no pose just now; empty while there are.
     missing_why: str = ""
     flagged_why: str = ""
     """`missing_why`, `flagged_why`: The tracker's reasons, each with its number."""
@@ -182,6 +183,8 @@ FLUSH_S: Final = 0.2
 DRAIN_S: Final = 0.25
 # A recording with a duration goes on for so long at most when the head's clock is behind.
 OVERTIME_S: Final = 1.0
+# After so long without a pose the examiner is told, also where the tracker says nothing.
+_HIDDEN_NS: Final = 300_000_000
 # Kinds of reasons that are told apart: a damaged record may hold any words.
 _MOST_WHYS: Final = 12
 _MOST_TOLD: Final = 5
@@ -269,7 +272,6 @@ class Recorder:
         self._follower = follower or Follower()
         self._why_missing: Counter[str] = Counter()
         self._why_flagged: Counter[str] = Counter()
-        self._unseen: MissingReading | None = None
         self._jumps = Jumps()
         self._duration_ns = None if duration_s is None else round(duration_s * 1e9)
         self._rate_hz = rate_hz
@@ -402,8 +404,8 @@ class Recorder:
         self._pose_ns = device_ns
         self._pose_span.add(device_ns / 1e9)
         self._jumps.add(device_ns / 1e9, reading.position_mm)
-        if self._unseen is not None:
-            self._unseen = None
+        if self.report.unseen:
+            self.report.unseen = ""
             self._note(f"{reading.tool or 'the tool'} is seen again", "tracker", device_ns, host_ns)
         if event:
             self._note(event, "tracker", device_ns, host_ns)
@@ -417,10 +419,14 @@ class Recorder:
         """Count a pose that the tracker does not have; the file's log has where such a gap begins and ends."""
         self.report.poses_missing += 1
         self._why_missing[reading.why if len(self._why_missing) < _MOST_WHYS else "other"] += 1
-        if self._unseen is None:
-            text = f"no pose of {reading.tool or 'the tool'} from here on: {reading.why}"
-            self._note(text, "tracker", max(0, self._pose_ns), host_ns - self._zero_ns)
-        self._unseen = reading
+        self._unseen(reading.why, host_ns - self._zero_ns)
+
+    def _unseen(self, why: str, host_ns: int) -> None:
+        """Keep why there is no pose now; the file's log has where that begins."""
+        if not self.report.unseen:
+            text = f"no pose of {self._follower.tool or 'the tool'} from here on: {why}"
+            self._note(text, "tracker", max(0, self._pose_ns), host_ns)
+        self.report.unseen = why
 
     def _flags(self, reading: PoseReading) -> tuple[str, ...]:
         """Flags that the device set on a pose, and whether it repeats the last one."""
@@ -523,6 +529,8 @@ class Recorder:
         report.head_garbage_bytes = self._head.parser.garbage_bytes
         report.tracker_garbage_bytes = self._tracker.parser.garbage_bytes if self._tracker else 0
         report.overrun_bytes = sum(line.stream.overrun_bytes for line in self._lines)
+        if self.recording and self._tracker is not None and report.last_ns - self._pose_ns > _HIDDEN_NS:
+            self._unseen(report.unseen or "nothing is sent", self._heard_ns)
         if self._observer is not None:
             self._observer.told(report)
 

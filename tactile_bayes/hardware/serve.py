@@ -221,10 +221,7 @@ def document(state: LiveState) -> dict[str, Any]:
         "tone": state.tone,
         "pressure_kpa": round(state.pressure_kpa, 2) if known else None,
         "window_kpa": list(state.window_kpa),
-        "figures": (
-            f"{state.duration_s:.1f} s, {state.frames} frames, {state.frames_lost} lost, {state.poses} poses, "
-            f"{state.covered_mm2 / 100:.1f} cm² covered"
-        ),
+        "figures": state.account_words,
         "size": state.size_words,
         "map": _map_document(state),
     }

@@ -105,10 +105,7 @@ def _pressure(state: LiveState, columns: int, *, colour: bool) -> str:
 
 
 def _figures(state: LiveState) -> str:
-    return (
-        f"{state.duration_s:.1f} s, {state.frames} frames, {state.frames_lost} lost, {state.poses} poses, "
-        f"{state.covered_mm2 / 100:.1f} cm2 covered, {100 * state.used_share:.0f} % used"
-    )
+    return f"{state.account_words.replace('²', '2')}, {100 * state.used_share:.0f} % used"
 
 
 def _picture(state: LiveState, columns: int, lines: int, *, colour: bool) -> list[str]:

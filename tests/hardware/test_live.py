@@ -80,13 +80,13 @@ def test_what_is_fed_is_seen(scan, pipe):
     feed.frame(scan.frames.counts[3], 15_000_000)
     feed.pose(pose_of(scan, 2), 16_666_667)
     feed.landmark("xiphoid", np.array([1.0, -2.5, 3.0]))
-    feed.told(Report(frames=4, landmarks=["xiphoid"]))
+    feed.told(Report(frames=4, unseen="out of volume", other_tools="x" * 9999))
     frame, pose, landmark, report = reader.read(0.0)
     assert landmark == SeenLandmark("xiphoid", (1.0, -2.5, 3.0))
     np.testing.assert_array_equal(frame.counts, scan.frames.counts[3])
     assert (frame.device_ns, pose.device_ns) == (15_000_000, 16_666_667)
     assert pose.position_mm == pose_of(scan, 2).position_mm
-    assert (report["frames"], report["landmarks"]) == (4, ["xiphoid"])
+    assert (report["frames"], report["unseen"]) == (4, "out of volume")
     feed.close()
     assert reader.read(0.0) == []
     assert reader.ended

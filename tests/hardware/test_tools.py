@@ -415,6 +415,7 @@ def test_a_hidden_tool_leaves_a_gap_that_show_and_map_tell(tmp_path, protocol):
     told = summarise_scan(tmp_path / "a.mcap")
     assert said in " ".join(told["findings"])
     assert told["recording"]["missing_why"] == f"{why} {report.poses_missing:,}"
+    assert told["notes"] >= 2  # where the gap begins and where it ends
     assert said in " ".join(one.text for one in scan_findings(found))
 
 
