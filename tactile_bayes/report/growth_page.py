@@ -19,7 +19,7 @@ from tactile_bayes.mapping.places import PATIENT_WORDS, Orientation, orientation
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.compare import change_sentences, rate_sentences, verdict_sentence
 from tactile_bayes.report.pages import cut, page
-from tactile_bayes.report.svg import colour_steps, outlined_text, picture_of, size_ruler, stroked
+from tactile_bayes.report.svg import STEPS, colour_steps, outlined_text, picture_of, size_ruler, stroked
 from tactile_bayes.size.visits import Compared, straight_line
 
 # --- The maps of each visit, averaged on common axes about the mass.
@@ -189,6 +189,7 @@ def growth_page(compared: Compared, report: CompareReport, visits: Sequence[Sequ
         colours=colour_steps(limits, words, more=any(bool((one.values > limits[1]).any()) for one in laid)),
         seen=_seen(view),
         chart=_chart(compared, report, course),
+        bars=_bars(compared, report),
         change=size_ruler(list(_changes(report, course)), unit="%", label="Change of the largest diameter in percent"),
         sentences=change_sentences(report),
         rates=rate_sentences(report),
@@ -205,6 +206,14 @@ def _seen(view: Orientation) -> str:
         "colours; ring: its estimated size at that visit; grey: no or few readings. Later visits are moved so that the "
         "mass lies on itself."
     )
+
+
+def _bars(compared: Compared, report: CompareReport) -> str:
+    """What the intervals of the sizes suppose."""
+    if compared.another is None or report.between_map_sd is None:
+        return "Bars: intervals."
+    narrow, wide = (100 * one for one in (report.between_map_sd, compared.another.between_map_sd))
+    return f"Bars: intervals if exams of one mass differ by {narrow:.0f} %; thin lines: by {wide:.0f} %."
 
 
 def _captions(report: CompareReport, course: Course, number: int) -> tuple[str, str]:
@@ -267,55 +276,87 @@ def _foot(report: CompareReport) -> str:
 
 # --- The size at each visit over time, as inline SVG.
 
-_BOX_MM: Final = (82.0, 46.0)
-_MARGINS_MM: Final = (9.0, 2.0, 3.0, 9.0)  #: Left, right, above, below.
+_BOX_MM: Final = (82.0, 50.0)
+_LEFT_MM, _RIGHT_MM, _ABOVE_MM, _BELOW_MM = 9.0, 2.0, 3.0, 12.0
+_INSET_MM: Final = 8.0  #: From the axis to the first visit.
+_ROOM_MM: Final = (17.0, 8.0)
+"""Visits nearer than the first have their dates in two rows, nearer than the second none, and no numbers."""
+
+
+class _Point(Record):
+    """One visit on the chart."""
+
+    x: float  #: mm from the left.
+    words: str
+    size: Quantity
+    wide: Quantity | None  #: The same if exams differ as patients' do; None where one spread is stated.
 
 
 def _chart(compared: Compared, report: CompareReport, course: Course) -> str:
     """Largest diameter with its interval at each visit, and the trend where there is one; empty without sizes."""
-    sized = [(visit, visit.max_size_mm) for visit in report.visits if visit.max_size_mm is not None]
-    if compared.joint is None or not sized:
+    joint, (width, height) = compared.joint, _BOX_MM
+    if joint is None:
         return ""
-    timed = all(visit.day is not None for visit, _ in sized)
-    times = [float(visit.day or 0.0) if timed else float(i) for i, (visit, _) in enumerate(sized)]
-    (width, height), (left, right, above, below) = _BOX_MM, _MARGINS_MM
-    top = 1.1 * max(q.high for _, q in sized)
-
-    def at(time: float, size_mm: float) -> tuple[float, float]:
-        share = (time - times[0]) / (times[-1] - times[0])
-        inset = 6.0
-        across = left + inset + share * (width - left - right - 2 * inset)
-        return across, above + (1.0 - size_mm / top) * (height - above - below)
-
-    floor = at(times[0], 0.0)[1]
-    parts = [f'<path d="M{left} {above}V{floor:.2f}H{width - right}" fill="none" stroke="#111" stroke-width="0.25"/>']
-    step = next(one for one in (1, 2, 5, 10, 20, 50, 100) if top / one <= 6)
-    for tick in range(0, int(top) + 1, step):
-        y = at(times[0], tick)[1]
-        parts.append(f'<path d="M{left} {y:.2f}h-1" stroke="#111" stroke-width="0.25"/>')
-        parts.append(f'<text x="{left - 1.6}" y="{y + 0.9:.2f}" text-anchor="end" font-size="2.7">{tick}</text>')
-    parts.append(f'<text x="{left + 1}" y="{above + 1:.2f}" font-size="2.7">mm</text>')
+    days = [visit.day for visit in report.visits]
+    times = [float(i if day is None or None in days else day) for i, day in enumerate(days)]
+    run = (width - _LEFT_MM - _RIGHT_MM - 2 * _INSET_MM) / (times[-1] - times[0])
+    points = []
+    for visit, time in zip(report.visits, times, strict=True):
+        size = visit.max_size_mm
+        assert size is not None
+        wide = None if compared.another is None else compared.another.size_mm(visit.visit - 1, size.probability)
+        points.append(_Point(_LEFT_MM + _INSET_MM + run * (time - times[0]), course.of(visit), size, wide))
+    top = 1.08 * max(q.high for one in points for q in (one.size, one.wide or one.size))
+    scale = (height - _ABOVE_MM - _BELOW_MM) / top
+    parts = [*_size_axis(top, scale)]
     if report.trend is not None:
-        line = straight_line(*compared.joint.moments, times)
-        ends = [at(time, float(np.exp(line.level + line.per_day * (time - np.mean(times))))) for time in times]
-        path = "M" + "L".join(f"{x:.2f} {y:.2f}" for x, y in ends)
-        parts.append(f'<path class="trend" d="{path}" fill="none" stroke="#555" stroke-width="0.4" '
-                     'stroke-dasharray="1.5 1"/>')  # fmt: skip
-    for i, (time, (visit, q)) in enumerate(zip(times, sized, strict=True)):
-        x, y = at(time, q.median)
-        low, high = at(time, q.low)[1], at(time, q.high)[1]
-        parts.append(f'<path d="M{x:.2f} {low:.2f}V{high:.2f}" stroke="#111" stroke-width="0.8"/>')
-        parts.append(f'<circle cx="{x:.2f}" cy="{y:.2f}" r="1.1" fill="#111"/>')
-        parts.append(f'<text x="{x + 1.4:.2f}" y="{y - 1.2:.2f}" font-size="2.7">{q.median:.1f}</text>')
-        words = course.of(visit).removeprefix("Visit ")
-        code, _, when = words.partition(", ")
-        stagger = 2.6 * (i % 2) if len(sized) > 4 else 0.0
-        parts.append(f'<text x="{x:.2f}" y="{floor + 3.4:.2f}" text-anchor="middle" font-size="2.7">'
-                     f"{html.escape(code[:14])}</text>")  # fmt: skip
-        parts.append(f'<text x="{x:.2f}" y="{floor + 6.4 + stagger:.2f}" text-anchor="middle" font-size="2.5">'
-                     f"{html.escape(when[:14])}</text>")  # fmt: skip
-    label = "Largest diameter at each visit with its interval"
+        line = straight_line(*joint.moments, times)
+        sizes = np.exp(line.level + line.per_day * (np.array(times) - np.mean(times)))
+        ends = "L".join(f"{one.x:.2f} {_up(size, scale):.2f}" for one, size in zip(points, sizes, strict=True))
+        dash = 'stroke-width="0.4" stroke-dasharray="1.5 1"'
+        parts.append(f'<path class="trend" d="M{ends}" fill="none" stroke="#555" {dash}/>')
+    gap = float(min(np.diff([one.x for one in points])))
+    for i, one in enumerate(points):
+        parts += _mark(one, scale, row=i % 2 if gap < _ROOM_MM[0] else 0, named=gap >= _ROOM_MM[1])
+    label = "Largest diameter at each visit with its intervals"
     return (
-        f'<svg class="ruler" role="img" aria-label="{label}" viewBox="0 0 {width:g} {height + 2:g}" '
-        f'width="{width:g}mm" height="{height + 2:g}mm">{"".join(parts)}</svg>'
+        f'<svg class="ruler" role="img" aria-label="{label}" viewBox="0 0 {width:g} {height:g}" '
+        f'width="{width:g}mm" height="{height:g}mm">{"".join(parts)}</svg>'
     )
+
+
+def _up(size_mm: float, scale: float) -> float:
+    """Place of a size on the chart, from its top."""
+    return _BOX_MM[1] - _BELOW_MM - scale * size_mm
+
+
+def _size_axis(top_mm: float, scale: float) -> Iterator[str]:
+    floor = _up(0.0, scale)
+    right = _BOX_MM[0] - _RIGHT_MM
+    yield f'<path d="M{_LEFT_MM} {_ABOVE_MM}V{floor:.2f}H{right}" fill="none" stroke="#111" stroke-width="0.25"/>'
+    step = next((one for one in STEPS if top_mm / one <= 6), STEPS[-1])
+    for tick in range(0, int(top_mm) + 1, step):
+        y = _up(tick, scale)
+        yield f'<path d="M{_LEFT_MM} {y:.2f}h-1" stroke="#111" stroke-width="0.25"/>'
+        yield _words(_LEFT_MM - 1.6, y + 0.9, f"{tick}", anchor="end")
+    yield _words(_LEFT_MM + 1, _ABOVE_MM + 1, "mm", anchor="start")
+
+
+def _mark(one: _Point, scale: float, *, row: int, named: bool) -> Iterator[str]:
+    """Median and intervals of a visit above its code and its date."""
+    for q, thick in ((one.wide, 0.25), (one.size, 0.9)):
+        if q is not None:
+            low, high = (_up(end, scale) for end in (q.low, q.high))
+            yield f'<path d="M{one.x:.2f} {low:.2f}V{high:.2f}" stroke="#111" stroke-width="{thick}"/>'
+    y, floor = _up(one.size.median, scale), _up(0.0, scale)
+    yield f'<circle cx="{one.x:.2f}" cy="{y:.2f}" r="1.1" fill="#111"/>'
+    code, _, when = one.words.removeprefix("Visit ").partition(", ")
+    if named:
+        yield _words(one.x + 1.4, y - 1.2, f"{one.size.median:.1f}", anchor="start")
+        yield _words(one.x, floor + 7 + 3 * row, when[:14], size=2.5)
+    yield _words(one.x, floor + 4, code[:14] if named else code[:4])
+
+
+def _words(x: float, y: float, text: str, *, anchor: str = "middle", size: float = 2.7) -> str:
+    place = f'x="{x:.2f}" y="{y:.2f}" text-anchor="{anchor}" font-size="{size}"'
+    return f"<text {place}>{html.escape(text)}</text>"

@@ -67,7 +67,7 @@ def _on(angle_deg: float, radius: float) -> tuple[float, float]:
 _LENGTH_MM: Final = 70.0
 _ROW_MM: Final = 7.5
 _MOST_TICKS: Final = 8
-_STEPS: Final = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
+STEPS: Final = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 
 
 def size_ruler(
@@ -103,7 +103,7 @@ def _bar(row: int, words: str, q: Quantity, start: float, scale: float) -> Itera
 def _scale(start: float, end: float, y: float, unit: str) -> Iterator[str]:
     span = end - start
     longest = int(10 ** math.ceil(math.log10(span / _MOST_TICKS))) if span > _MOST_TICKS else 1
-    step = next((one for one in _STEPS if span / one <= _MOST_TICKS), longest)
+    step = next((one for one in STEPS if span / one <= _MOST_TICKS), longest)
     yield f'<path d="M0 {y:g}H{_LENGTH_MM:g}" stroke="#111" stroke-width="0.25"/>'
     for tick in range(math.ceil(start / step) * step, int(end) + 1, step):
         x = _LENGTH_MM * (tick - start) / span

@@ -183,6 +183,23 @@ def test_the_trend_is_drawn_through_the_sizes(three: tb.Comparison) -> None:
     assert line[0, 1] > line[-1, 1]
 
 
+def test_both_spreads_between_exams_are_drawn_and_near_visits_write_nothing_over_another(three: tb.Comparison) -> None:
+    page = three.page_text(title="", name="")
+    chart = page[page.index('aria-label="Largest diameter at each visit') :].partition("</svg>")[0]
+    bars = re.findall(r'M([\d.]+) ([\d.]+)V([\d.]+)" stroke="#111" stroke-width="(0.25|0.9)"', chart)
+    wide, narrow = ([float(b) - float(a) for _, a, b, thick in bars if thick == one] for one in ("0.25", "0.9"))
+    assert len(wide) == len(narrow) == 3
+    assert all(length > -one > 0 for length, one in zip(map(abs, wide), narrow, strict=True))
+    assert "2026-04-12" in chart
+    near = replace(three, report=replace(three.report, visits=tuple(
+        replace(one, day=day) for one, day in zip(three.report.visits, (0.0, 3.0, 190.0), strict=True)
+    )))  # fmt: skip
+    page = near.page_text(title="", name="")
+    chart = page[page.index('aria-label="Largest diameter at each visit') :].partition("</svg>")[0]
+    assert "2026-04-12" not in chart
+    assert "2026-04-12" in page  # in the table and below its map
+
+
 def test_one_value_has_one_colour_at_all_visits_of_the_page() -> None:
     """Two visits alike but for the lump's height: what lies beside it has the same pixels."""
     report = replace(REFUSED, visits=VISITS)
