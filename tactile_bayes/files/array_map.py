@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -31,6 +31,51 @@ def array_template(path: Path | None) -> str:
     return "\n".join([_HEADING.format(path=path or "a file"), *_held(shapes), *_arrays(shapes), *_values()]) + "\n"
 
 
+_PLAIN: Final[Mapping[str, tuple[str, ...]]] = {
+    "counts": ("pressure", "pressures", "readings"),
+    "position_mm": ("position", "positions", "pos", "xyz", "translation"),
+    "quaternion_wxyz": ("quaternion", "quaternions", "quat", "quats"),
+    "pose_matrix": ("transforms", "matrices", "pose_matrices"),
+    "frame_time_s": ("frame_time", "frame_times", "time", "times", "t", "timestamps"),
+    "pose_time_s": ("pose_time", "pose_times", "tracker_time", "tracker_times", "time", "times", "t", "timestamps"),
+    "array_from_tracker": ("scanhead_from_tracker", "head_from_tracker", "lever_arm"),
+    "head_surface_mm": ("surface_mm", "head_surface"),
+    "pitch_mm": ("pitch",),
+}
+"""Plain words for arrays; times are told apart by the group that they stand in."""
+_BESIDE: Final = {"frame_time_s": ("counts", "frames"), "pose_time_s": ("position_mm", "pose_matrix")}
+
+
+def plain_names(
+    names: Sequence[str], known: Mapping[str, str], values: Mapping[str, Any] | None = None
+) -> dict[str, str]:
+    """Names in a file that are plain words for arrays which it has under no other name, by the names here.
+
+    Parameters
+    ----------
+    known
+        Names in the file of arrays that are known already, by the names here.
+    values
+        Arrays that are given elsewhere.
+    """
+    found: dict[str, str] = {}
+    for here, words in _PLAIN.items():
+        same = {here, "frames"} if here == "counts" else {here}
+        if same & {*known, *(values or {})}:
+            continue
+        taken = {*known.values(), *found.values()}
+        alike = [name for name in names if name.rpartition(".")[2].lower() in words and name not in taken]
+        if here in _BESIDE:
+            both = {**known, **found}
+            group = next((both[one].rpartition(".")[0] for one in _BESIDE[here] if one in both), "")
+            alike = [name for name in alike if name.rpartition(".")[0] == group] or alike
+            if here == "pose_time_s" and not group:  # beside the frames, `time` is theirs
+                alike = [name for name in alike if name.lower() not in _PLAIN["frame_time_s"]]
+        if len(alike) == 1:
+            found[here] = alike[0]
+    return found
+
+
 def _held(shapes: Mapping[str, Shape]) -> Iterator[str]:
     if shapes:
         yield "# The file has:"
@@ -51,7 +96,7 @@ def _line(name: str, guessed: Mapping[str, str], shapes: Mapping[str, Shape], to
     if name in shapes:
         return f"# {name} is called so  # {told}"
     if name in guessed:
-        return f"{name} = {_quoted(guessed[name])}  # guessed by its shape; {told}"
+        return f"{name} = {_quoted(guessed[name])}  # guessed; {told}"
     return f'# {name} = ""  # {told}'
 
 
@@ -60,7 +105,7 @@ def _values() -> Iterator[str]:
 
 
 def _guessed(shapes: Mapping[str, Shape]) -> dict[str, str]:
-    """Arrays that are the only ones of their shape, where the file has none of the layout's name."""
+    """Arrays that are the only ones of their shape, or called by a plain word, where none has the layout's name."""
     free = {name: tuple(one for one in shape if one != 1) for name, shape in shapes.items() if name not in KNOWN}
 
     def of(fits: Callable[[Shape], bool]) -> list[str]:
@@ -78,7 +123,8 @@ def _guessed(shapes: Mapping[str, Shape]) -> dict[str, str]:
     for here, places in timed.items():
         ends = {end for name in places if len(found[name]) == 1 for end in _ends(free[found[name][0]])}
         found[here] = of(lambda s, ends=ends: len(s) == 1 and s[0] in ends)  # type: ignore[misc]
-    return {here: names[0] for here, names in found.items() if here not in shapes and len(names) == 1}
+    by_shape = {here: names[0] for here, names in found.items() if here not in shapes and len(names) == 1}
+    return by_shape | plain_names(list(shapes), {name: name for name in KNOWN if name in shapes})
 
 
 def _ends(shape: Shape) -> set[Any]:

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from tactile_bayes.declarations import Record, names_of, replace
 from tactile_bayes.errors import BadDataError, meant
+from tactile_bayes.files.array_map import plain_names
 from tactile_bayes.files.arrays_layout import KNOWN, LAYOUT, OPTIONAL, ArrayMap, Shape, Stated, in_words
 from tactile_bayes.files.frames_text import read_frames
 from tactile_bayes.files.instrument_json import read_array_calibration, read_head_geometry, read_landmarks
@@ -72,9 +73,20 @@ def import_arrays(path: Path, given: ArrayMap | None = None, beside: Sequence[So
     """
     given = given or ArrayMap()
     try:
-        return combined([_read(path, given, beside), *beside], given)
+        own = replace(_read(path, given, beside), path=str(path))
     except BadDataError as error:
         raise error.at(path) from None
+    try:
+        return combined([own, *beside], given)
+    except BadDataError as error:
+        raise error.at(_source_of(error, [own, *beside])) from None
+
+
+def _source_of(error: BadDataError, sources: Sequence[Source]) -> str:
+    """Path of the file whose array an error begins with; the frames' file for all others."""
+    name = {"counts": "frames"}.get(error.what.split()[0], error.what.split()[0])
+    same = {name, "pose_matrix"} if name in ("position_mm", "quaternion_wxyz") else {name}
+    return next((one.path for one in reversed(sources) if one.path and same & set(one.arrays)), sources[0].path)
 
 
 def _over(given: Stated, said: Stated) -> Stated:
@@ -101,34 +113,37 @@ def _read(path: Path, given: ArrayMap, beside: Sequence[Source]) -> Source:
     if is_text(path):
         heads = [one.arrays["head_surface_mm"] for one in beside if "head_surface_mm" in one.arrays]
         return read_frames(path, given, shape=heads[-1].shape[:2] if heads else None)
-    there = {name: name for name in KNOWN} | _checked_names(given)
+    _check_names(given)
+    there: dict[str, str] = {}
 
     def choose(names: Sequence[str]) -> list[str]:
+        held = ", ".join(sorted(names)[:12]) or "nothing"
         for here, name in given.arrays.items():
             if name not in names:
-                held = ", ".join(sorted(names)[:12]) or "nothing"
                 raise BadDataError(f"has no array {name!r} for {here}", way_out=f"it has {held}")
-        found = [name for name in there.values() if name in names]
-        if not found:
-            held = ", ".join(sorted(names)[:12]) or "nothing"
+        there.update({name: name for name in KNOWN if name in names} | given.arrays)
+        there.update(plain_names(names, there, given.values))
+        if not there:
             raise _unknown(held, grid="mean" in names)
-        return list(dict.fromkeys(found))
+        return list(dict.fromkeys(there.values()))
 
     held = read_named(path, choose)
-    arrays = {here: held[name] for here, name in there.items() if name in held}
-    return Source(arrays | {name: np.asarray(value) for name, value in given.values.items()})
+    arrays = {here: held[name] for here, name in there.items()}
+    guessed = {here: name for here, name in there.items() if name not in (here, given.arrays.get(here))}
+    arrays |= {name: np.asarray(value) for name, value in given.values.items()}
+    return Source(arrays, notes=tuple(f"{name} is taken for {here}" for here, name in guessed.items()))
 
 
 def of_poses(path: Path, given: Stated) -> Source:
     """Poses of a file of their own: a table, or a sequence metafile."""
-    return read_sequence(path, given, frames=False) if is_sequence(path) else read_poses(path, given)
+    found = read_sequence(path, given, frames=False) if is_sequence(path) else read_poses(path, given)
+    return replace(found, path=str(path))
 
 
-def _checked_names(given: ArrayMap) -> dict[str, str]:
+def _check_names(given: ArrayMap) -> None:
     for name in (*given.arrays, *given.values):
         if name not in KNOWN:
             raise BadDataError(f"--columns: {name!r} is no array of a scan", way_out=meant(name, KNOWN))
-    return given.arrays
 
 
 def _unknown(held: str, *, grid: bool) -> BadDataError:

@@ -69,7 +69,7 @@ _DEFAULT_RIM_MM: Final = Head().rim_mm
 # Taxels further than this from a regular grid on an arc make a head that the models do not have.
 _REGULAR_MM: Final = 0.05
 _WAY_OUT: Final = (
-    "give pitch_mm, and surface_mm or rows, columns and radius_mm; `record` needs scanhead_from_tracker too"
+    "give pitch_mm, and surface_mm or rows, columns and radius_mm (null: flat); scans need scanhead_from_tracker too"
 )
 Triple = tuple[float, float, float]
 Row = tuple[float, float, float, float]

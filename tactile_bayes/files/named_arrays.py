@@ -34,6 +34,7 @@ class Source(Record, eq=False):
     arrays: Arrays
     stated: Stated = Stated()
     notes: tuple[str, ...] = ()
+    path: str = ""  #: Of a file beside the frames', for errors.
 
 
 Choose = Callable[[Sequence[str]], Iterable[str]]

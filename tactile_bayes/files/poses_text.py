@@ -279,22 +279,26 @@ def _bare(table: TextTable, given: Stated) -> Source:
         stations = [f"{one:g}" for one in np.unique(column)]
         if len(stations) <= _MOST_STATIONS < len(values):
             keep &= column == float(chosen(stations, given, what="its rows (stations)"))
-    time = _rising(before[keep])
-    if time is None and given.pose_rate_hz is None:
-        raise BadDataError(f"has {width} numbers a row, of which none is a time", way_out="give --pose-rate-hz HZ")
-    when = np.arange(keep.sum()) / (given.pose_rate_hz or 1.0) if time is None else before[keep][:, time]
-    found = seen(
-        when,
-        numbers[keep],
-        [""] * int(keep.sum()),
-        layout=layout,
-        stated={} if time is not None else {"pose_time_unit": "s"},
-    )
-    at = "counted" if time is None else f"in column {time + 1}"
-    return replace(found, notes=(f"poses as {layout} from column {width - size + 1} on, times {at}", *found.notes))
+    time, unit, told = _bare_times(before[keep], given, f"has {width} numbers a row")
+    found = seen(time, numbers[keep], [""] * len(time), layout=layout, stated=unit)
+    notes = [f"poses as {layout} from column {width - size + 1} on, times {told}"]
+    if lost := sum(line.number > rows[0].number for line in table.lines) + 1 - len(values):
+        notes.append(f"{lost} lines of other than {width} numbers left out as gaps")
+    return replace(found, notes=(*notes, *found.notes))
 
 
-def _rising(columns: FloatArray) -> int | None:
-    """The last column that only rises; None without one."""
-    steps = np.diff(columns, axis=0)
-    return next((i for i in reversed(range(columns.shape[1])) if (steps[:, i] >= 0).all() and steps[:, i].any()), None)
+def _bare_times(before: FloatArray, given: Stated, what: str) -> tuple[FloatArray, dict[str, Any], str]:
+    """Times by the columns before the poses, their unit where it is known, and where they stand.
+
+    With a rate stated, a column of whole numbers that rises counts the poses.
+    """
+    steps = np.diff(before, axis=0).T
+    rising = [i for i, one in enumerate(steps) if (one >= 0).all() and one.any()]
+    counting = [i for i in rising if given.pose_rate_hz and (before[:, i] == np.rint(before[:, i])).all()]
+    if given.pose_rate_hz and (counting or not rising):
+        number = before[:, counting[-1]] if counting else np.arange(len(before), dtype=np.float64)
+        told = f"counted in column {counting[-1] + 1}" if counting else "counted by rows"
+        return (number - number[0]) / given.pose_rate_hz, {"pose_time_unit": "s"}, told
+    if not rising:
+        raise BadDataError(f"{what}, of which none is a time", way_out="give --pose-rate-hz HZ")
+    return before[:, rising[-1]], {}, f"in column {rising[-1] + 1}"

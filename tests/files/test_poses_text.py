@@ -104,6 +104,11 @@ LAYOUTS: dict[str, tuple[list[str], dict[str, Any], list[int] | None]] = {
     ),
     "Polhemus, two receivers": ([EULER, *polhemus(2)], {"tool": "1"}, None),
     "Polhemus without names": (polhemus(2), {"pose_layout": "euler", "length_unit": "cm", "tool": "1"}, None),
+    "Polhemus, counted": (
+        [f"{i} {line.partition(',')[2].partition(',')[2].replace(',', ' ')}" for i, line in enumerate(polhemus())],
+        {"pose_layout": "euler", "length_unit": "cm", "pose_rate_hz": 120.0},
+        None,
+    ),
     "quaternions": (with_times(QUATERNIONS), {"pose_layout": "wxyz"}, None),
     "scalar last": (with_times(SCALAR_LAST), {"pose_layout": "xyzw"}, None),
     "scalar last by names": (["t,px,py,pz,qx,qy,qz,qw", *with_times(SCALAR_LAST)], {}, None),
@@ -188,6 +193,21 @@ def test_what_is_no_path_is_one_line(tmp_path: Path, fault: str) -> None:
     with pytest.raises(BadDataError, match=words) as caught:
         brought_in(path, **stated)
     assert "\n" not in str(caught.value)
+
+
+def test_an_error_names_the_file_that_it_is_about(tmp_path: Path) -> None:
+    (tmp_path / "frames.npz").write_bytes(b"")
+    np.savez(tmp_path / "frames.npz", frames=pressures(SCAN), frame_time_s=SCAN.frames.time_s)
+    path = tmp_path / "poses.csv"
+    path.write_text("\n".join(with_times(ROWS_OF_16, lambda t: f"{1000 * t:.2f}")))
+    with pytest.raises(BadDataError, match=r"poses\.csv: pose_time_s steps by 8.*pose_time_unit ms"):
+        tb.scan_of(tmp_path / "frames.npz", None, path, head=SCAN.head, unit="kPa")
+    lines = with_times(ROWS_OF_16)
+    lines[5] = lines[5].rpartition(",")[0]
+    path.write_text("\n".join(lines))
+    found = brought_in(path)
+    same(found, [i for i in range(len(TIME)) if i != 5])
+    assert "1 lines of other than 17 numbers left out as gaps" in found.session["imported_as"]
 
 
 def sequence(path: Path, *, packed: bool, tools: tuple[str, ...] = ("Probe",)) -> None:

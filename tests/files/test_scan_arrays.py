@@ -128,6 +128,31 @@ def test_fields_of_a_structure_and_members_of_a_group_are_named(good: Arrays, sc
         same(import_arrays(path, names).scan, scan)
 
 
+def test_plain_words_are_taken_for_arrays_and_said(pressed: Arrays, scan: Scan, tmp_path: Path) -> None:
+    """Times are told apart by the group that they stand in; two that fit are none."""
+    words = {"frames": "Pressure", "frame_time_s": "time", "position_mm": "position", "quaternion_wxyz": "quat"}
+    rest = {name: one for name, one in pressed.items() if name not in words}
+    as_mat_73(tmp_path / "a.mat", {**{word: pressed[name] for name, word in words.items()}, **rest})
+    found = import_arrays(tmp_path / "a.mat", ArrayMap(unit="kPa"))
+    np.testing.assert_array_equal(found.scan.frames.time_s, scan.frames.time_s)
+    assert "Pressure is taken for counts" in found.notes
+    assert "time is taken for frame_time_s" in found.notes
+    with h5py.File(tmp_path / "b.h5", "w") as file:
+        for name in ("frames", "frame_time_s"):
+            file[f"mat/{'pressure' if name == 'frames' else 'time'}"] = pressed[name]
+        for name, word in {"position_mm": "pos", "quaternion_wxyz": "quat", "pose_time_s": "time"}.items():
+            file[f"tracker/{word}"] = pressed[name]
+        for name in ("pitch_mm", "array_from_tracker", "head_surface_mm"):
+            file[name] = pressed[name]
+    found = import_arrays(tmp_path / "b.h5", ArrayMap(unit="kPa"))
+    np.testing.assert_array_equal(found.scan.poses.time_s, scan.poses.time_s)
+    np.testing.assert_array_equal(found.scan.frames.time_s, scan.frames.time_s)
+    with h5py.File(tmp_path / "b.h5", "a") as file:
+        file["mat/readings"] = pressed["frames"]
+    with pytest.raises(BadDataError, match="lacks counts"):
+        import_arrays(tmp_path / "b.h5", ArrayMap(unit="kPa"))
+
+
 def test_npy_holds_the_frames_alone_or_named_fields(pressed: Arrays, scan: Scan, head: Path, tmp_path: Path) -> None:
     np.save(tmp_path / "frames.npy", pressed["frames"])
     poses = (pressed["pose_time_s"], pressed["position_mm"], pressed["quaternion_wxyz"])
