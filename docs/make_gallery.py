@@ -31,6 +31,9 @@ PICTURES = {
     "gallery-trial.png": ("trial.html", 1000, 780),
 }
 
+FIGURES = {"demo_map.png": "demo/map.png", "demo_size.png": "demo/size.png"}
+"""Pictures of other pages -> the figures that the commands write."""
+
 
 def make(folder: Path) -> None:
     """Run the page's commands and write the pictures into a folder."""
@@ -40,6 +43,8 @@ def make(folder: Path) -> None:
         Reader(work, Path(scratch) / "demos").follow(PAGE)
         for name, (written, width, most) in PICTURES.items():
             (folder / name).write_bytes(_page(work / written, width, most, Path(scratch) / name))
+        for name, written in FIGURES.items():
+            (folder / name).write_bytes(_small((work / written).read_bytes()))
         (folder / LIVE[0]).write_bytes(_live(work, Path(scratch) / "live"))
 
 
@@ -66,10 +71,10 @@ def _live(work: Path, profile: Path) -> bytes:
 
 
 def _small(png: bytes) -> bytes:
-    """The picture in 64 colours."""
+    """The picture in 256 colours."""
     buffer = io.BytesIO()
     image = Image.open(io.BytesIO(png)).convert("RGB")
-    image.quantize(64, dither=Image.Dither.NONE).save(buffer, format="PNG", optimize=True)
+    image.quantize(256, dither=Image.Dither.NONE).save(buffer, format="PNG", optimize=True)
     return buffer.getvalue()
 
 

@@ -19,6 +19,7 @@ sys.path.insert(0, str(ROOT / "docs"))
 import make_gallery  # noqa: E402
 
 NAMES = [*make_gallery.PICTURES, make_gallery.LIVE[0]]
+"""Of the gallery's own; `FIGURES` are of other pages."""
 MOST_BYTES = 150_000
 
 
@@ -26,6 +27,10 @@ def grey(path: Path) -> np.ndarray:
     """The picture in 40 columns and 40 rows of grey."""
     small = Image.open(io.BytesIO(path.read_bytes())).convert("L").resize((40, 40))
     return np.asarray(small, dtype=np.float64).ravel()
+
+
+def test_figures_of_other_pages_are_small():
+    assert all((make_gallery.IMAGES / name).stat().st_size < MOST_BYTES for name in make_gallery.FIGURES)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -51,7 +56,7 @@ def test_the_pictures_are_of_what_the_commands_write(tmp_path):
         Reader(work, tmp_path / "demos").follow(make_gallery.PAGE)
         pytest.skip("the page runs; no Chromium is installed to photograph with")
     make_gallery.make(tmp_path)
-    for name in NAMES:
+    for name in [*NAMES, *make_gallery.FIGURES]:
         # fonts and the moment of the live view differ; another page or an empty one would not be alike
         alike = np.corrcoef(grey(tmp_path / name), grey(make_gallery.IMAGES / name))[0, 1]
         assert alike > 0.6, (name, alike)
