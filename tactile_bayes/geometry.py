@@ -162,14 +162,15 @@ def patient_from_base(sternal_notch_mm: FloatArray, xiphoid_mm: FloatArray, *, n
     length = float(np.linalg.norm(along))
     if not length > 1.0:
         raise BadDataError(
-            f"sternal notch and xiphoid are {length:.2f} mm apart", way_out="touch both landmarks before the scan"
+            f"sternal notch and xiphoid are {length:.2f} mm apart",
+            way_out="correct them, or touch both before the scan",
         )
     y_axis = along / length
     z_axis = normal - (normal @ y_axis) * y_axis
     size = float(np.linalg.norm(z_axis))
     if size < 0.1:
         raise BadDataError(
-            "the line of the landmarks runs along the plane's normal", way_out="touch both landmarks again"
+            "the line of the landmarks runs along the plane's normal", way_out="correct them, or touch both anew"
         )
     z_axis = z_axis / size
     rotation = np.stack([np.cross(y_axis, z_axis), y_axis, z_axis])

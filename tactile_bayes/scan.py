@@ -172,7 +172,7 @@ def _check_times(time_s: FloatArray, *, name: str) -> FloatArray:
         i = int(back[0]) + 1
         raise BadDataError(
             f"{name} runs backwards at index {i} ({values[i]:.6f} after {values[i - 1]:.6f})",
-            way_out="sort the records by time or cut the scan there",
+            way_out="sort by time; where a clock began anew, cut the scan there",
         )
     if len(values) and values[0] < 0:
         raise BadDataError(f"{name} starts at {values[0]:.6f} s", way_out="times must not be negative")
@@ -218,7 +218,8 @@ class ElementCalibration(Record, eq=False):
         if gain.size and not gain.min() >= 0:
             index = tuple(int(i) for i in np.argwhere(gain < 0)[0])
             raise BadDataError(
-                f"gain_kpa_per_count is negative at {index} ({gain[index]:.4g})", way_out="calibrate again"
+                f"gain_kpa_per_count is negative at {index} ({gain[index]:.4g})",
+                way_out="correct it, or calibrate anew",
             )
         settle(self, gain_kpa_per_count=gain, offset_kpa=offset)
 

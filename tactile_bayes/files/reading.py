@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import hashlib
 import io
 import os
@@ -150,9 +151,17 @@ def decoding(what: str, *, way_out: str) -> Iterator[None]:
         raise BadDataError(f"{what} ({why})", way_out=way_out) from None
 
 
+_WAYS_OUT: Final = {
+    **dict.fromkeys((errno.ENOENT, errno.ENOTDIR, errno.ENAMETOOLONG, errno.ELOOP), "check the path"),
+    **dict.fromkeys((errno.EACCES, errno.EPERM), "ask for the right to read it"),
+    **dict.fromkeys((errno.EMFILE, errno.ENFILE), "close other programs: too many files are open"),
+}
+
+
 def unreadable(path: Path, error: OSError) -> BadDataError:
     """Error for a file that cannot be opened."""
-    return BadDataError(f"cannot be read ({error.strerror or error})", way_out="check the path", path=str(path))
+    way_out = _WAYS_OUT.get(error.errno or 0, "copy it to another disk and read it there")
+    return BadDataError(f"cannot be read ({error.strerror or error})", way_out=way_out, path=str(path))
 
 
 # --- Kind of a file by its first bytes; a reader given another kind names the command to run instead.

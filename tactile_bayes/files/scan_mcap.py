@@ -337,7 +337,10 @@ def file_findings(records: McapRecords) -> tuple[Finding, ...]:
 def json_attachment(records: McapRecords, name: str) -> dict[str, Any]:
     """Read an attached JSON object."""
     if name not in records.attachments:
-        raise BadDataError(f"holds no {name}", way_out="a scan of `record`, `import` or `simulate` begins with it")
+        way_out = "copy it again: it was cut off in its header"
+        if records.finished:
+            way_out = "attach it again: the program that wrote this copy left it out"
+        raise BadDataError(f"holds no {name}", way_out=way_out)
     return json_object(records.attachments[name].decode("utf-8", "replace"), name=name)
 
 
@@ -411,7 +414,8 @@ def _decode(kind: Any, body: bytes) -> Any:
         return kind.FromString(body)
     except DecodeError:
         raise BadDataError(
-            f"a message is not a {kind.DESCRIPTOR.full_name}", way_out="the file was written by another program"
+            f"a message is not a {kind.DESCRIPTOR.full_name}",
+            way_out="copy it again, or write such messages",
         ) from None
 
 

@@ -467,7 +467,7 @@ def refuse_without_frames(selections: list[SelectedFrames], *, pressure_window_k
         return
     total = sum(len(selection.scan.frames) for selection in selections)
     if not total:
-        raise BadDataError("the scan holds no frame", way_out="record it again")
+        raise BadDataError("the scan holds no frame", way_out="give another; `tactile-bayes show` says what it holds")
     known = sum(int(selection.poses.known.sum()) for selection in selections)
     if not known:
         raise _without_poses(selections)
@@ -485,7 +485,7 @@ def refuse_without_frames(selections: list[SelectedFrames], *, pressure_window_k
 def _without_poses(selections: list[SelectedFrames]) -> BadDataError:
     frames, poses = selections[0].scan.frames.time_s, selections[0].scan.poses.time_s
     if not len(poses):
-        return BadDataError("the scan holds no tracker pose", way_out="check that the tracker was recorded")
+        return BadDataError("the scan holds no tracker pose", way_out="import it with poses, or check the tracker")
     return BadDataError(
         f"no frame has a tracker pose (frames {frames[0]:.3f} to {frames[-1]:.3f} s, {len(poses)} poses "
         f"{poses[0]:.3f} to {poses[-1]:.3f} s)",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import codecs
+import errno
 import random
 import warnings
 from pathlib import Path
@@ -193,3 +194,38 @@ def test_a_name_spelled_in_two_ways_is_one_column_and_one_patient(tmp_path: Path
     )
     with pytest.raises(BadDataError, match="stands on line 2 already"):
         read_table(tmp_path / "tidy.csv", "trial.table.json")
+
+
+# --- A way out is that of what was found.
+
+
+def test_a_copy_without_its_attachments_is_not_to_be_scanned_again(tmp_path: Path) -> None:
+    with DEMO.open("rb") as stream, (tmp_path / "a.mcap").open("wb") as out:
+        reader = make_reader(stream)
+        writer = Writer(out)
+        writer.start(profile="", library="another")
+        for kept in reader.iter_metadata():
+            writer.add_metadata(kept.name, kept.metadata)
+        writer.finish()
+    with pytest.raises(BadDataError, match=r"holds no head\.json; attach it again: the program that wrote this copy"):
+        read_scan(tmp_path / "a.mcap")
+
+
+@pytest.mark.parametrize(
+    ("number", "way_out"),
+    [
+        (errno.ENOENT, "check the path"),
+        (errno.EACCES, "ask for the right to read it"),
+        (errno.EMFILE, "close other programs"),
+        (errno.EIO, "copy it to another disk"),
+    ],
+)
+def test_a_file_that_cannot_be_opened_has_the_way_out_of_its_cause(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, way_out: str
+) -> None:
+    def refuse(*_: object, **__: object) -> int:
+        raise OSError(number, "no")
+
+    monkeypatch.setattr("tactile_bayes.files.reading.os.open", refuse)
+    with pytest.raises(BadDataError, match=way_out):
+        load_json(tmp_path / "a.json")
