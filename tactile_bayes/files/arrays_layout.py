@@ -169,6 +169,14 @@ class GridOptions(Options, kw_only=True):
     spacing_mm: Annotated[
         float | None, Meta(description="Map: side of the square cells, in mm.", extra={"metavar": "H"})
     ] = None
+    cell_mm: Annotated[
+        Annotated[float, Meta(gt=0)] | None,
+        Meta(
+            description="Map: average finer cells into cells of up to this side. Default: 1 where they are finer than "
+            "0.5.",
+            extra={"metavar": "H"},
+        ),
+    ] = None
     normalise: Annotated[Normalise, Meta(description="Map: how the values are already normalised.")] = "none"
     level: Annotated[
         Annotated[float, Meta(gt=0)] | Literal["fit"] | None,

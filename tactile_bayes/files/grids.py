@@ -17,6 +17,7 @@ from tactile_bayes.geometry import BoolArray, FloatArray
 from tactile_bayes.mapping.map import MapRecipe, TactileMap
 from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map
+from tactile_bayes.presets import CELL_MM
 
 # --- Cells without a value: what stands for "no value" is declared by the file or by the caller, or stands apart.
 
@@ -185,9 +186,57 @@ def grid_map(grid: Grid, asked: GridOptions) -> tuple[TactileMap, list[str]]:
         _refuse_apart(values)
     units = asked.units or (grid.units if asked.normalise == "none" else "")
     made = _map(arrays, spacing_mm=spacing, normalise=asked.normalise, units=units)
+    if (times := _cells_in_one(spacing, asked.cell_mm)) > 1:
+        made = _averaged(made, times)
+        notes.append(f"{times} x {times} cells of {spacing:g} mm were averaged into one of {times * spacing:g} mm")
     if asked.level is not None:
         made = _divided(made, asked.level)
     return made, [*grid.notes, *notes, *marked]
+
+
+# --- Cells much finer than any lump, as pixels are: they are averaged before anything is fitted to them.
+
+_FINEST_MM: Final = 0.5
+"""From finer cells with correlated errors the fit took the errors' own grain for lumps, and minutes for it."""
+
+
+def _cells_in_one(spacing_mm: float, cell_mm: float | None) -> int:
+    """How many cells along each axis make one."""
+    if cell_mm is None:
+        return int(CELL_MM / spacing_mm + 1e-6) if spacing_mm < _FINEST_MM * (1 - 1e-6) else 1
+    if cell_mm < spacing_mm * (1 - 1e-6):
+        raise UsageError(f"--cell-mm is {cell_mm:g}, and the grid's cells are {spacing_mm:g} mm; give that or more")
+    return int(cell_mm / spacing_mm + 1e-6)
+
+
+def _averaged(made: TactileMap, times: int) -> TactileMap:
+    """The map in cells of `times` by `times`, where half of them hold data or more; readings weigh by their number."""
+    weight = np.where(made.covered, made.count, 0).astype(np.float64)
+    total = _blocks(weight, times)
+    known = _blocks(made.covered.astype(np.float64), times) >= times**2 / 2
+    each = np.where(known, total, np.nan)
+    mean = _blocks(weight * np.nan_to_num(made.mean), times) / each
+    square = _blocks(weight * (np.nan_to_num(made.variance) + np.nan_to_num(made.mean) ** 2), times) / each
+    variance = np.maximum(square - mean**2, 0.0) if made.counts_known else np.where(known, 0.0, np.nan)
+    count = np.where(known, total if made.counts_known else 1.0, 0.0).astype(np.int64)
+    x_mm, y_mm = (_block_centres(axis, times) for axis in (made.x_mm, made.y_mm))
+    recipe = replace(made.recipe, cell_mm=times * made.recipe.cell_mm)
+    return replace(made, mean=mean, variance=variance, count=count, x_mm=x_mm, y_mm=y_mm, recipe=recipe)
+
+
+def _blocks(values: FloatArray, times: int) -> FloatArray:
+    """Sums over blocks; what is left at the ends is filled up with zeros."""
+    ny, nx = (-(-n // times) for n in values.shape)
+    padded = np.zeros((ny * times, nx * times))
+    padded[: values.shape[0], : values.shape[1]] = values
+    summed: FloatArray = padded.reshape(ny, times, nx, times).sum(axis=(1, 3))
+    return summed
+
+
+def _block_centres(axis_mm: FloatArray, times: int) -> FloatArray:
+    step = float(axis_mm[1] - axis_mm[0]) if len(axis_mm) > 1 else 0.0
+    first = float(axis_mm[0]) + (times - 1) / 2 * step
+    return np.asarray(first + times * step * np.arange(-(-len(axis_mm) // times)), dtype=np.float64)
 
 
 # --- Values that are divided by their level here: by a number that is stated, or by what is fitted about the bump.

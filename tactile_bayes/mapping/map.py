@@ -174,7 +174,7 @@ def many_cells(tactile_map: TactileMap, radius_mm: float) -> str | None:
         enough = f"cells of up to {math.floor(10 * advice.coarsest_mm) / 10:g} mm measure the highest bump as well"
     return (
         f"about {round(cells, -2):,} cells of {cell:g} mm are fitted, which takes a while (measured: 126,000 cells "
-        f"20 s of CPU, 1,260 cells 1.4 s); {enough}: give `map` a larger --cell-mm, or reduce the image before `import`"
+        f"20 s of CPU, 1,260 cells 1.4 s); {enough}: give `map` or `import` a larger --cell-mm"
     )
 
 

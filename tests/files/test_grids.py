@@ -17,11 +17,14 @@ from scipy.ndimage import gaussian_filter
 
 import tactile_bayes
 from tactile_bayes.errors import BadDataError, UsageError
+from tactile_bayes.files.arrays_layout import GridOptions
 from tactile_bayes.files.grid_files import open_grid
-from tactile_bayes.files.grids import read_grid
+from tactile_bayes.files.grids import import_grid, read_grid
 from tactile_bayes.files.scan_mcap import read_scan
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.posterior.bump import window_cells
+from tactile_bayes.posterior.draw import SamplerSettings
+from tactile_bayes.posterior.estimate import estimate_map
 
 Arrays = dict[str, Any]
 DEMO = Path(tactile_bayes.__file__).parent / "demo" / "scan.mcap"
@@ -35,7 +38,7 @@ def test_any_grid_keeps_its_values_and_is_centred(tmp_path: Path, ny: int, nx: i
     mean[rng.random((ny, nx)) < 0.2] = np.nan
     mean[0, 0] = 1.0
     np.savez(tmp_path / "g.npz", mean=mean, spacing_mm=h)
-    grid = read_grid(tmp_path / "g.npz", normalise="mean")
+    grid = read_grid(tmp_path / "g.npz", normalise="mean", cell_mm=h)
     np.testing.assert_array_equal(grid.mean, mean)
     np.testing.assert_array_equal(grid.count, np.isfinite(mean))
     assert (grid.variance[grid.count > 0] == 0).all()
@@ -190,7 +193,7 @@ def test_a_colour_image_is_refused_and_grey_saved_as_colour_is_not(tmp_path: Pat
 
 def test_the_laser_beam_images_become_maps(shared_data: Path) -> None:
     for path in sorted((shared_data / "laserbeam").iterdir()):
-        grid = read_grid(path, spacing_mm=0.01)
+        grid = read_grid(path, spacing_mm=0.01, cell_mm=0.01)
         assert grid.mean.size > 10_000
         assert np.nanmax(grid.mean) > 5 * np.nanmedian(grid.mean)
 
@@ -406,3 +409,60 @@ def test_where_nothing_rises_the_level_is_the_median(tmp_path: Path) -> None:
     values = 8.4 + 0.05 * np.random.default_rng(3).normal(size=(41, 41))
     np.save(tmp_path / "a.npy", values)
     assert read_grid(tmp_path / "a.npy", spacing_mm=1.0, level="fit").mean.mean() == pytest.approx(1.0, abs=0.01)
+
+
+# --- Pixels.
+
+
+def test_fine_cells_are_averaged_where_they_lie(tmp_path: Path) -> None:
+    """A plane stays the plane: 43 by 57 cells of 0.2 mm become 1 mm, the last ones where half of them are known."""
+    y, x = (np.arange(n) * 0.2 - (n - 1) * 0.1 for n in (43, 57))
+    values = 5 + 0.1 * x + 0.2 * y[:, None]
+    values[:3, :5] = np.nan
+    np.save(tmp_path / "a.npy", values)
+    grid, notes = import_grid(tmp_path / "a.npy", GridOptions(spacing_mm=0.2))
+    assert grid.mean.shape == (9, 12)
+    assert grid.recipe.cell_mm == 1.0
+    assert notes == ["5 x 5 cells of 0.2 mm were averaged into one of 1 mm"]
+    assert not grid.covered[0, 0]  # 10 of 25 cells
+    inner = grid.mean[1:8, 1:11]
+    np.testing.assert_allclose(inner, 5 + 0.1 * grid.x_mm[1:11] + 0.2 * grid.y_mm[1:8, None], atol=1e-12)
+    assert not grid.covered[:, 11].any()  # 2 of 5 columns
+    assert grid.covered[8, 1:11].all()  # 3 of 5 rows
+    kept = read_grid(tmp_path / "a.npy", spacing_mm=0.2, cell_mm=0.2)
+    np.testing.assert_array_equal(kept.mean, values)
+    assert read_grid(tmp_path / "a.npy", spacing_mm=0.5).mean.shape == values.shape
+    with pytest.raises(UsageError, match=r"--cell-mm is 0\.1, and the grid's cells are 0\.2 mm"):
+        read_grid(tmp_path / "a.npy", spacing_mm=0.2, cell_mm=0.1)
+
+
+def test_counts_and_variances_of_fine_cells_are_those_of_all_readings(tmp_path: Path) -> None:
+    rng = np.random.default_rng(5)
+    readings = [[rng.normal(1 + 0.1 * i, 0.2, 3 + i + j) for j in range(2)] for i in range(2)]
+    arrays = {
+        "mean": np.array([[one.mean() for one in row] for row in readings]),
+        "variance": np.array([[one.var() for one in row] for row in readings]),
+        "count": np.array([[len(one) for one in row] for row in readings]),
+    }
+    np.savez(tmp_path / "a.npz", **arrays, spacing_mm=0.4)
+    grid = read_grid(tmp_path / "a.npz", normalise="gain", cell_mm=0.8)
+    whole = np.concatenate([one for row in readings for one in row])
+    assert grid.count.tolist() == [[len(whole)]]
+    assert grid.mean[0, 0] == pytest.approx(whole.mean())
+    assert grid.variance[0, 0] == pytest.approx(whole.var())
+
+
+def test_an_image_of_a_million_pixels_is_sized_where_its_lump_is(tmp_path: Path) -> None:
+    """With errors that neighbouring pixels share its grain was taken for a lump, and 300 by 300 took minutes."""
+    y, x = np.mgrid[:1000, :1000] * 0.1 - 49.95
+    noise = gaussian_filter(np.random.default_rng(0).normal(size=x.shape), 5)
+    values = 1 + 0.35 * np.exp(-((x - 3) ** 2 + (y + 2) ** 2) / (2 * 5.2**2)) + 0.01 * noise / noise.std()
+    Image.fromarray((20_000 * values).astype(np.uint16)).save(tmp_path / "a.png")
+    grid = read_grid(tmp_path / "a.png", spacing_mm=0.1, level="fit")
+    assert grid.mean.size == 10_000
+    found = estimate_map(
+        grid, calibration=None, options=SamplerSettings(method="optimise"), rng=np.random.default_rng(1)
+    )
+    assert found.fit is not None
+    assert found.fit.theta[1:3] == pytest.approx([3, -2], abs=0.1)
+    assert found.fit.widths()[:2] == pytest.approx([5.2, 5.2], rel=0.05)

@@ -53,7 +53,7 @@ def shape(sigma_1: float, sigma_2: float, angle: float) -> np.ndarray:
 
 @pytest.mark.parametrize(("name", "radius"), BEAMS.items())
 def test_a_beam_is_measured_as_scipy_measures_it(shared_data: Path, name: str, radius: float) -> None:
-    tactile_map = read_grid(shared_data / "laserbeam" / name, spacing_mm=PIXEL_MM)
+    tactile_map = read_grid(shared_data / "laserbeam" / name, spacing_mm=PIXEL_MM, cell_mm=PIXEL_MM)
     found = fitted(tactile_map, radius)
     assert found.status == "estimate"
     assert found.fit is not None
@@ -69,7 +69,7 @@ def test_a_beam_is_measured_as_scipy_measures_it(shared_data: Path, name: str, r
 
 def test_a_finer_and_a_coarser_picture_show_the_same_beam(shared_data: Path) -> None:
     path = shared_data / "laserbeam" / "laserbeam_astigmatic.tif"
-    fine = read_grid(path, spacing_mm=PIXEL_MM)
+    fine = read_grid(path, spacing_mm=PIXEL_MM, cell_mm=PIXEL_MM)
     values = fine.mean.reshape(256, 4, 320, 4).mean(axis=(1, 3))
     coarse = TactileMap(
         mean=values,
