@@ -5,6 +5,7 @@ Layouts that are known by their columns:
 - NDI's (ToolBox, and the examples of the Combined API): ``Frame#, PortHandle, Face#, TransformStatus, Q0, Qx, Qy, Qz,
   Tx, Ty, Tz, Error``, mm, scalar first, a row without numbers where the tool is not seen
 - azimuth, elevation and roll in degrees, as Polhemus trackers send them: ``x, y, z, az, el, roll``, in cm or inches
+- OptiTrack's (Motive): ``Frame, Time (Seconds), X, Y, Z, W, X, Y, Z`` below ``Length Units,Meters``, rotation first
 - homogeneous matrices: 12 or 16 numbers a row, with a time before them
 """
 
@@ -50,7 +51,8 @@ _SEEN: Final = ("ok", "enabled", "valid", "tracked", "good", "true", "visible")
 """Status of a tool that is seen, in small letters."""
 _UNIT: Final = re.compile(r"[\[(_ ](mm|cm|m|in|inch|inches)[\])]?$", re.IGNORECASE)
 _TIME_UNIT: Final = re.compile(r"[\[(_ ](ms|us|ns|s|sec|min)[\])]?$", re.IGNORECASE)
-_LENGTHS: Final = {"in": "inch", "inches": "inch"}
+_LENGTH_LINE: Final = re.compile(r"\blength units?\W+(meters|millimeters|centimeters|mm|cm|m)\b", re.IGNORECASE)
+_LENGTHS: Final = {"in": "inch", "inches": "inch", "meters": "m", "millimeters": "mm", "centimeters": "cm"}
 _BARE: Final = {"wxyz": 7, "xyzw": 7, "euler": 6, "matrix": 16}
 """Numbers of a pose in a text without names, by its layout; a time and a station may stand before them."""
 _MOST_STATIONS: Final = 16
@@ -144,7 +146,7 @@ def chosen(names: Sequence[str], given: Stated, *, what: str) -> str:
 
 
 def _named(table: TextTable, header: Line, given: Stated) -> Source:
-    kinds = [kind_of_column(name) for name in header.fields]
+    kinds = _with_rotations([kind_of_column(name) for name in header.fields])
     layout = "wxyz" if "qw" in kinds else "euler"
     names = (*_PLACE, *_ROTATIONS[layout])
     if not set(names) <= set(kinds):
@@ -160,7 +162,7 @@ def _named(table: TextTable, header: Line, given: Stated) -> Source:
     status = [_field(line, columns["status"]) for line in rows] if "status" in columns else [""] * len(rows)
     time, unit = _times(table, rows, columns, header, given)
     stated: dict[str, Any] = {"pose_time_unit": unit} if unit else {}
-    length = _unit_of(header.fields[columns["x"]], _UNIT)
+    length = _unit_of(header.fields[columns["x"]], _UNIT) or _unit_before(table, header)
     if length:
         stated["length_unit"] = _LENGTHS.get(length, length)
     elif layout == "euler" and given.length_unit is None:
@@ -169,6 +171,21 @@ def _named(table: TextTable, header: Line, given: Stated) -> Source:
     found = seen(time, numbers, why, layout=layout, stated=stated)
     named = f"poses by the names of line {header.number}: {', '.join(header.fields[columns[one]] for one in names)}"
     return replace(found, notes=(named, *found.notes))
+
+
+def _with_rotations(kinds: Sequence[str]) -> list[str]:
+    """Kinds of columns where x, y and z before a w are those of a quaternion, not of a place."""
+    found = list(kinds)
+    for i, kind in enumerate(kinds):
+        if kind == "qw" and "qx" not in kinds and kinds[max(i - 3, 0) : i] == list(_PLACE):
+            found[i - 3 : i] = ["qx", "qy", "qz"]
+    return found
+
+
+def _unit_before(table: TextTable, header: Line) -> str:
+    """Unit of lengths by a line above the header; empty without."""
+    lines = (_LENGTH_LINE.search(line.text) for line in table.lines if line.number < header.number)
+    return next((found[1].lower() for found in lines if found), "")
 
 
 def _of_one_tool(
