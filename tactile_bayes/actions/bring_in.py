@@ -46,8 +46,13 @@ class Wanted(Record):
     @property
     def of_a_scan(self) -> list[str]:
         """Options that were given and that only scans have."""
-        given = {"session": self.session_file, "correct": self.corrections, **self.beside, **_stated(self.arrays)}
-        return [f"--{name.replace('_', '-')}" for name, value in given.items() if value]
+        given = {"session": self.session_file, "correct": self.corrections}
+        return [*(f"--{name}" for name, value in given.items() if value), *self.of_arrays]
+
+    @property
+    def of_arrays(self) -> list[str]:
+        """Options that were given and that only scans from arrays or tables have."""
+        return [f"--{name.replace('_', '-')}" for name in (*self.beside, *_stated(self.arrays))]
 
 
 def import_action(
@@ -104,6 +109,9 @@ def _import_each(sources: tuple[Path, ...], folder: Path, wanted: Wanted) -> tup
     if len(set(targets.values())) < len(sources):
         raise UsageError(f"two of the files would become one in {folder}; import them into different folders")
     refuse_same(targets.values(), sources)
+    if folder.suffix.lower() in (".mcap", ".nc") and not folder.exists():
+        raise UsageError(f"{len(sources)} files go into a folder, and {folder} names a file; give a folder")
+    made = not folder.exists()
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -116,6 +124,8 @@ def _import_each(sources: tuple[Path, ...], folder: Path, wanted: Wanted) -> tup
             line = one_line(error)
             click.echo(line if str(source) in line else f"{source}: {line}", err=True)
             failed = failed or error.exit_code
+    if made and not lines:
+        folder.rmdir()
     return lines, failed
 
 
@@ -133,6 +143,9 @@ def _import(source: Path, output: Path, wanted: Wanted) -> list[str]:
     refuse_existing(output, force=wanted.force)
     kind = _kind(source, output, wanted)
     check_suffix(output, "MCAP" if kind == "scan" else "netCDF")
+    if source.suffix.lower() == ".mcap" and wanted.of_arrays:
+        given = " and ".join(wanted.of_arrays)
+        raise UsageError(f"{given}: for arrays and tables; {source} is a scan already: leave out")
     if kind == "scan" and wanted.grid != GridOptions():
         given = " and ".join(f"--{name.replace('_', '-')}" for name in _changed(wanted.grid))
         raise UsageError(f"{given}: for maps only; leave out or give --as map")

@@ -22,7 +22,7 @@ from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.arrays_layout import Stated
 from tactile_bayes.files.named_arrays import Source
-from tactile_bayes.files.poses_text import kind_of_column
+from tactile_bayes.files.poses_text import is_header_of_poses, kind_of_column
 from tactile_bayes.files.text_lines import Line, TextTable, number, read_text_table
 from tactile_bayes.geometry import FloatArray
 
@@ -53,6 +53,7 @@ _UNIT_OF_TIME: Final = re.compile(r"(?:[\[(_ ]|(?<=time))(ms|msec|us|µs|ns|s|se
 _PLAIN: Final = re.compile(r"[\[(].*?[\])]|_?(ms|us|ns|secs?|s)$", re.IGNORECASE)  # what is no part of a name
 _SECONDS: Final = {"ms": "ms", "msec": "ms", "us": "us", "ns": "ns", "µs": "us", "min": "min"}
 _LAYOUTS: Final = "give one row a frame, or blocks of rows; --skip-columns says how many stand before the readings"
+_MOST_OF_POSES: Final = 24  # columns: a table of more holds readings, too
 _SAMPLED: Final = 50
 _MOST_LABELS: Final = 8
 
@@ -67,6 +68,11 @@ def read_frames(path: Path, given: Stated, *, shape: tuple[int, int] | None) -> 
     """
     table = _without_words(read_text_table(path, given.decimal))
     shape = given.frame_shape or shape
+    if header := next(
+        (line for line in table.lines if is_header_of_poses(line) and len(line.fields) < _MOST_OF_POSES), None
+    ):
+        what = f"is a table of poses by line {header.number}"
+        raise BadDataError(what, way_out="give the frames, and it as --poses")
     blocks = _blocks(table, None if shape is None else shape[0] * shape[1])
     before = [line for line in table.lines if line.number < blocks[0][0].number]
     stated, notes = _said(before)

@@ -55,6 +55,7 @@ _LENGTH_LINE: Final = re.compile(r"\blength units?\W+(meters|millimeters|centime
 _LENGTHS: Final = {"in": "inch", "inches": "inch", "meters": "m", "millimeters": "mm", "centimeters": "cm"}
 _BARE: Final = {"wxyz": 7, "xyzw": 7, "euler": 6, "matrix": 16}
 """Numbers of a pose in a text without names, by its layout; a time and a station may stand before them."""
+_MOST_NUMBERS: Final = 20  # of a pose with what stands before it
 _MOST_STATIONS: Final = 16
 _LARGEST_MM: Final = 1e7  # NDI writes -3.697314e28 where a tool is not seen
 
@@ -69,7 +70,7 @@ def read_poses(path: Path, given: Stated) -> Source:
     """
     try:
         table = read_text_table(path, given.decimal)
-        header = next((line for line in table.lines if _is_header(line)), None)
+        header = next((line for line in table.lines if is_header_of_poses(line)), None)
         found = _bare(table, given) if header is None else _named(table, header, given)
         return replace(found, notes=(f"poses: {table.words}", *found.notes))
     except BadDataError as error:
@@ -86,7 +87,8 @@ def kind_of_column(name: str) -> str:
     return _NAMES.get(plain) or _NAMES.get(re.sub(r"(mm|cm|inch|in|deg|ms|us|s)$", "", plain), "")
 
 
-def _is_header(line: Line) -> bool:
+def is_header_of_poses(line: Line) -> bool:
+    """True for a line that names columns of places or rotations."""
     kinds = {kind_of_column(name) for name in line.fields}
     return kinds.issuperset(_PLACE) or len(kinds & {"qw", "qx", "azimuth", "elevation"}) > 1
 
@@ -278,6 +280,8 @@ def _bare(table: TextTable, given: Stated) -> Source:
     rows = [line for line in table.lines if table.numbers(line.fields) is not None and len(line.fields) > 1]
     width = max(Counter(len(line.fields) for line in rows).items(), key=lambda one: one[1])[0] if rows else 0
     values = np.array([table.numbers(line.fields) for line in rows if len(line.fields) == width])
+    if width > _MOST_NUMBERS:
+        raise BadDataError(f"has {width} numbers a row, which is no pose", way_out="give a table of poses")
     layout = given.pose_layout
     of_matrix = next((n for n in (16, 12) if width - n in (0, 1)), 0)
     if layout is None and not of_matrix:

@@ -67,4 +67,4 @@ def test_a_scan_of_which_no_map_can_be_made_is_imported(tmp_path):
     np.savez(tmp_path / "full.npz", **arrays_of(scan) | {"counts": counts})
     said = run_here("import", "full.npz", "-o", "full.mcap", cwd=tmp_path)
     assert said.returncode == 0
-    assert "arrangement not checked: none of the 416 taxels works" in said.stdout
+    assert "no map can be made of it: none of the 416 taxels works" in said.stdout

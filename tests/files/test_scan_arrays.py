@@ -468,6 +468,15 @@ def test_many_files_fail_one_by_one(pressed: Arrays, head: Path, tmp_path: Path)
     again = run_here("import", *files, "-o", "scans", "--unit", "kPa", "--head-geometry", head, cwd=tmp_path)
     assert again.returncode == 2
     assert again.stderr.count("\n") == 3
+    single = run_here("import", *files, "-o", "all.mcap", cwd=tmp_path)
+    assert single.returncode == 2
+    assert "3 files go into a folder, and all.mcap names a file" in single.stderr
+    nothing = run_here("import", "b.npz", "none.mat", "-o", "more", "--unit", "kPa", cwd=tmp_path)
+    assert nothing.returncode == 3
+    mended = run_here("import", "scans/a.mcap", "-o", "b.mcap", "--unit", "kPa", cwd=tmp_path)
+    assert mended.returncode == 2
+    assert "--unit: for arrays and tables; scans/a.mcap is a scan already" in mended.stderr
+    assert sorted(path.name for path in tmp_path.glob("*") if path.is_dir()) == ["scans"]
     (tmp_path / "a.npz").write_bytes(b"")
     clash = run_here("import", "a.mat", "a.npz", "-o", "more", cwd=tmp_path)
     assert clash.returncode == 2
