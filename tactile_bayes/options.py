@@ -241,22 +241,20 @@ class RecordOptions(Options, kw_only=True):
         Meta(description="Baud rate of the tracker's port. Default: the protocol's."),
     ] = None
     tracker_rom: Annotated[
-        Path | None,
-        Meta(description="ndi: description of a wireless tool.", extra={"metavar": "TOOL.rom", "path": True}),
-    ] = None
+        tuple[Path, ...],
+        Meta(description="ndi: a wireless tool's description, one for each.", extra={"metavar": "ROM", "path": True}),
+    ] = ()
     tool: Annotated[
         str | None,
         Meta(
-            description="Which of the tracker's tools is on the head: name, or number of the station. Needed where it "
-            "sends several.",
+            description="Tool or station on the head, needed where the tracker has several.",
             extra={"metavar": "NAME", "also": "station"},
         ),
     ] = None
     reference: Annotated[
         str | None,
         Meta(
-            description="Tool or station that is fixed to the body: poses are relative to it, which takes breathing "
-            "out.",
+            description="Tool or station fixed to the body; poses relative to it are free of breathing.",
             extra={"metavar": "NAME"},
         ),
     ] = None

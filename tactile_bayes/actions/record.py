@@ -135,10 +135,14 @@ def _landmarks(request: Request) -> Landmarks | None:
         return None
     if request.landmarks.suffix.lower() != ".mcap":
         return read_landmarks(request.landmarks)
-    found = read_scan(request.landmarks).landmarks
-    if found is None:
+    scan = read_scan(request.landmarks)
+    if scan.landmarks is None:
         raise UsageError(f"{request.landmarks} holds no landmarks; give a scan whose landmarks were touched")
-    return found
+    theirs = scan.session.get("reference", "")
+    if bool(theirs) != bool(request.reference):
+        frame = f"relative to the tool {theirs!r}" if theirs else "of the tracker's own frame"
+        raise UsageError(f"the landmarks of {request.landmarks} are {frame}; record with the same --reference")
+    return scan.landmarks
 
 
 def provenance_of(request: Request, settings: dict[str, Any]) -> Provenance:
@@ -251,11 +255,12 @@ def record_action(ctx: click.Context, /, output: Path, **options: Any) -> None:
 
 def make_recording(request: Request) -> tuple[Report, bool]:
     """Check the devices, record and close the file; returns the account, and whether it was interrupted."""
-    rom, ndi = request.tracker_rom, request.tracker_protocol == "ndi"
-    if rom is not None and not (ndi and rom.is_file()):
-        fault = "not a file" if ndi else f"not for {request.tracker_protocol}"
-        way_out = "give a wireless NDI tool's .rom file with --tracker-protocol ndi"
-        raise UsageError(f"--tracker-rom {rom} is {fault}; {way_out}")
+    ndi = request.tracker_protocol == "ndi"
+    for rom in request.tracker_rom:
+        if not (ndi and rom.is_file()):
+            fault = "not a file" if ndi else f"not for {request.tracker_protocol}"
+            way_out = "give a wireless NDI tool's .rom file with --tracker-protocol ndi"
+            raise UsageError(f"--tracker-rom {rom} is {fault}; {way_out}")
     if not request.tracker_url and (request.tool or request.reference):
         raise UsageError("--tool and --reference are of a tracker; give its port with --tracker")
     refuse_existing(request.output, force=request.force)
@@ -323,7 +328,7 @@ def _connect(request: Request, stack: ExitStack) -> tuple[HelloReading, tuple[Li
     if request.tracker_url:
         driver = TRACKERS[request.tracker_protocol]
         tracker_port = open_tracker(
-            request.tracker_protocol, request.tracker_url, baud=request.tracker_baud, rom=request.tracker_rom
+            request.tracker_protocol, request.tracker_url, baud=request.tracker_baud, roms=request.tracker_rom
         )
         stack.callback(tracker_port.close)
         answer = driver.check(tracker_port, tool=request.tool, reference=request.reference)

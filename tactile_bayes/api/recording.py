@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 from tactile_bayes.actions.record import Request, make_recording
@@ -12,7 +13,7 @@ from tactile_bayes.errors import DeviceError, check_number
 from tactile_bayes.hardware.recorder import Report
 from tactile_bayes.options import RecordOptions
 
-_PATHS = ("like", "head_geometry", "array_calibration", "landmarks", "tracker_rom", "session_file")
+_PATHS = ("like", "head_geometry", "array_calibration", "landmarks", "session_file")
 _RENAMED = {"head": "head_url", "tracker": "tracker_url", "session": "session_file"}
 
 
@@ -50,6 +51,8 @@ def record(output: PathLike, *, head: str, duration_s: float, **options: Any) ->
     check_keywords("record", given, sorted({*names_of(RecordOptions)} - {"output", "head_url", "duration_s"}))
     check_number("duration_s", duration_s, 0, open_ends=True)
     given |= {name: path_of(given[name]) for name in _PATHS if name in given}
+    roms = given.get("tracker_rom", ())
+    given["tracker_rom"] = tuple(map(path_of, [roms] if isinstance(roms, str | Path) else roms))
     given |= {"output": path_of(output), "head_url": head, "duration_s": duration_s, "at_once": True}
     report, _ = make_recording(Request(**given))
     if report.fault:

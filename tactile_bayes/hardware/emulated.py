@@ -345,6 +345,7 @@ class EmulatedNdi(Device):
         self._clock, faults = clock, faults or Faults()
         self._tools = PlayedTools(poses, faults, names=("", ""))
         self._handles = (HANDLE + 1, HANDLE) if faults.breathe_mm else (HANDLE,)
+        self._asked = 0
         self._begun: float | None = None
         self._port = "none" if wireless else "plugged in"
         self._rest = b""
@@ -380,8 +381,8 @@ class EmulatedNdi(Device):
             case "PHSR":
                 return self._listed(int(rest or "0", 16))
             case "PHRQ":
-                self._port = "asked for"
-                return f"{HANDLE:02X}"
+                self._port, self._asked = "asked for", self._asked + 1
+                return f"{HANDLE + self._asked - 1:02X}"
             case "PVWR":
                 self.described += bytes.fromhex(rest[6:])
                 self._port = "plugged in"

@@ -26,7 +26,7 @@ from tactile_bayes.hardware.readings import (
     RecordParser,
     plausible,
 )
-from tactile_bayes.hardware.trackers import IgtlinkParser, NdiPort, ask_for_tdata
+from tactile_bayes.hardware.trackers import NAME_BYTES, IgtlinkParser, NdiPort, ask_for_tdata
 
 # --- Parser for Ascension Flock of Birds and miniBIRD trackers, position and quaternion.
 #
@@ -335,7 +335,10 @@ class _Try:
 
 def _called(tools: Iterable[str], name: str) -> list[str]:
     """Tools by a name: in full, or without the frame they are given in (ProbeToTracker) or the part number."""
-    return [name] if name in tools else [one for one in tools if re.match(rf"{re.escape(name)}(To[A-Z]|-)", one)]
+    for whole in (name, name[:NAME_BYTES]):  # servers cut names
+        if whole in tools:
+            return [whole]
+    return [one for one in tools if re.match(rf"{re.escape(name)}(To[A-Z]|-)", one)]
 
 
 def _chosen(tools: Mapping[str, str], tool: str | None, reference: str | None, port: Port) -> tuple[str, str | None]:
@@ -345,7 +348,11 @@ def _chosen(tools: Mapping[str, str], tool: str | None, reference: str | None, p
     for name, option in ((tool, "--tool"), (reference, "--reference")):
         found = [] if name is None else _called(tools, name)
         if name is not None and len(found) != 1:
-            what = f"{len(found)} tools are called {name!r}" if found else f"no pose of a tool {name!r} comes"
+            what = (
+                f"{len(found)} tools are called {name!r}"
+                if found
+                else f"no pose of a tool {name!r} comes (is it in sight?)"
+            )
             raise DeviceError(
                 f"{port.name}: {what}; it sends {listed or 'one without a name'}: give {option} one of them"
             )
@@ -356,8 +363,10 @@ def _chosen(tools: Mapping[str, str], tool: str | None, reference: str | None, p
             f"{port.name} sends several tools: {listed}; name the one on the head with --tool, and one that is fixed "
             "to the body with --reference"
         )
+    if full[0] is None and full[1] is not None and not left:
+        raise UsageError(f"{port.name} sends only the reference, {full[1]!r}; is the tool on the head in sight?")
     followed = full[0] if full[0] is not None else (left[0] if left else "")
-    if followed == full[1] or (reference is not None and not left):
+    if followed == full[1]:
         raise UsageError(f"{port.name}: the tool and its reference are both {full[1]!r}; give two tools")
     return followed, full[1]
 
@@ -444,12 +453,12 @@ TRACKERS: Final[dict[str, TrackerDriver]] = {
 }
 
 
-def open_tracker(protocol: str, url: str, *, baud: int | None = None, rom: Path | None = None) -> Port:
-    """Open the port of a tracker, at the protocol's own rate where none is given; `rom` describes a wireless
-    NDI tool.
+def open_tracker(protocol: str, url: str, *, baud: int | None = None, roms: Sequence[Path] = ()) -> Port:
+    """Open the port of a tracker, at the protocol's own rate where none is given; `roms` describe wireless NDI
+    tools.
     """
     if protocol == "ndi":
-        return NdiPort(url, rom=rom)
+        return NdiPort(url, roms=roms)
     return Port(url, baud=baud or TRACKERS[protocol].baud or 9600, role="tracker")
 
 

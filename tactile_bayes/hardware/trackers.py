@@ -11,7 +11,7 @@ import struct
 import subprocess
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
@@ -79,8 +79,8 @@ _EXTENDED: Final = struct.Struct(">HHII")  # its own size, sizes of the metadata
 _PAIR: Final = struct.Struct(">HHI")  # key size, encoding, value size
 _MATRIX: Final = struct.Struct(">12f")  # columns of the rotation, position
 _QUATERNION: Final = struct.Struct(">7f")  # position, quaternion with its scalar last
-_NAME_BYTES: Final = 20
-_NAMED: Final = _NAME_BYTES + 2  # name, kind and a spare byte before the numbers of a tool
+NAME_BYTES: Final = 20
+_NAMED: Final = NAME_BYTES + 2  # name, kind and a spare byte before the numbers of a tool
 # Bytes before the numbers of each tool, and the numbers, by type.
 _POSES: Final[dict[bytes, tuple[int, struct.Struct]]] = {
     b"TRANSFORM": (0, _MATRIX),
@@ -171,7 +171,7 @@ class IgtlinkParser:
         device_ns = seconds * 1_000_000_000 + (fraction * 1_000_000_000 >> 32) or None
         head, numbers = _POSES[kind]
         for start in range(0, len(content), head + numbers.size):
-            name = _name(content[start : start + _NAME_BYTES]) if head else tool
+            name = _name(content[start : start + NAME_BYTES]) if head else tool
             values = numbers.unpack_from(content, start + head)
             found.append(self._reading(values, tool=name, unseen=_unseen(facts), device_ns=device_ns))
         return end - place
@@ -345,17 +345,18 @@ _PARTLY_OUT: Final = 0x80
 class NdiTracker:
     """A connected NDI tracker with its tools, through the module ``ndicapy`` or one that does the same.
 
-    `url` is a serial device or ``socket://HOST:PORT``. `rom` describes a wireless tool; tools on a wire bring their
-    own. A tool is named by its port handle and part number, such as ``0A-8700339``.
+    `url` is a serial device or ``socket://HOST:PORT``. `roms` describe wireless tools, which are named by these files;
+    tools on a wire bring their own and are named by port handle and part number, such as ``0A-8700339``.
     """
 
-    def __init__(self, api: Any, url: str, *, rom: Path | None = None) -> None:
+    def __init__(self, api: Any, url: str, *, roms: Sequence[Path] = ()) -> None:
         self._api, self._url = api, url
         self._line = "address" if url.startswith("socket://") else "cable"
         self._device = self._open()
         self._begin()
         self.name = self._command("VER:4").splitlines()[0].strip()[:48] or "NDI tracker"
-        self.tools = {handle: self._tool_name(handle) for handle in self._enable(rom)}
+        described = {self._describe(rom): rom.stem for rom in self._freed(roms)}
+        self.tools = {handle: described.get(handle) or self._tool_name(handle) for handle in self._enable()}
         self._command("TSTART:")
         self._frame: int | None = None
         self._failures = 0
@@ -401,17 +402,24 @@ class NdiTracker:
         number = self._api.ndiGetPHSRNumberOfHandles(self._device)
         return [self._api.ndiGetPHSRHandle(self._device, one) for one in range(number)]
 
-    def _enable(self, rom: Path | None) -> list[int]:
-        """Initialise and enable the tools; return their handles."""
+    def _freed(self, roms: Sequence[Path]) -> Sequence[Path]:
+        """Free the handles of an earlier session before the first description is sent."""
         for handle in self._handles(1):
             self._command("PHF:%02X", handle)
-        if rom is not None:
-            self._command(_WIRELESS)
-            handle = self._api.ndiGetPHRQHandle(self._device)
-            if self._api.ndiPVWRFromFile(self._device, handle, str(rom)) != 0:
-                raise DeviceError(
-                    f"the tool's description {rom} was refused by the tracker; check that it is the tool's .rom file"
-                )
+        return roms
+
+    def _describe(self, rom: Path) -> int:
+        """Send the description of a wireless tool; return its handle."""
+        self._command(_WIRELESS)
+        handle: int = self._api.ndiGetPHRQHandle(self._device)
+        if self._api.ndiPVWRFromFile(self._device, handle, str(rom)) != 0:
+            raise DeviceError(
+                f"the tool's description {rom} was refused by the tracker; check that it is the tool's .rom file"
+            )
+        return handle
+
+    def _enable(self) -> list[int]:
+        """Initialise and enable the tools; return their handles."""
         for handle in self._handles(2):
             self._command("PINIT:%02X", handle)
         for handle in self._handles(3):
@@ -486,7 +494,7 @@ def serve(tracker: NdiTracker, line: socket.socket) -> None:
 class NdiPort(Port):
     """An NDI tracker in a process of its own, as a port in the open framing."""
 
-    def __init__(self, url: str, *, rom: Path | None = None) -> None:
+    def __init__(self, url: str, *, roms: Sequence[Path] = ()) -> None:
         self.url, self.baud, self.role, self._is_socket = url, 0, "tracker", False
         self._relayed = None
         if find_spec(MODULE) is None:
@@ -498,7 +506,7 @@ class NdiPort(Port):
             "tactile_bayes.hardware.trackers",
             str(theirs.fileno()),
             url,
-            *([str(rom)] if rom else []),
+            *map(str, roms),
         ]
         self._process = subprocess.Popen(
             words, pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, start_new_session=True
@@ -561,10 +569,10 @@ def _say(words: str) -> None:
 
 
 def main(words: list[str]) -> int:
-    """Run ``python -m tactile_bayes.hardware.trackers FD URL [ROM]``: prints ``ready``, or what is wrong."""
+    """Run ``python -m tactile_bayes.hardware.trackers FD URL [ROM...]``: prints ``ready``, or what is wrong."""
     line = socket.socket(fileno=int(words[0]))
     try:
-        tracker = NdiTracker(importlib.import_module(MODULE), words[1], rom=Path(words[2]) if len(words) > 2 else None)
+        tracker = NdiTracker(importlib.import_module(MODULE), words[1], roms=[*map(Path, words[2:])])
     except DeviceError as error:
         _say(str(error))
         return error.exit_code

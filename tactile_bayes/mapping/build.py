@@ -315,8 +315,10 @@ def _plane(selections: list[SelectedFrames]) -> Plane:
 def _check_same_examination(scans: list[Scan]) -> None:
     if not scans:
         raise BadDataError("no scan was given", way_out="give at least one")
-    for name in _SHARED_FACTS:
-        values = sorted({scan.session[name] for scan in scans if name in scan.session})
+    for name in (*_SHARED_FACTS, "reference"):
+        absent = {name: "the tracker's own frame"} if name == "reference" else {}  # poses are in another frame then
+        facts = [absent | dict(scan.session) for scan in scans]
+        values = sorted({one[name] for one in facts if name in one})
         if len(values) > 1:
             raise BadDataError(
                 f"the scans differ in {name} ({', '.join(values)})", way_out="build one map per examination"

@@ -105,12 +105,12 @@ class FakeLibrary:
 
 def test_a_tracker_is_set_up_in_the_order_of_the_guide(tmp_path):
     library = FakeLibrary()
-    tracker = NdiTracker(library, "/dev/ttyUSB0", rom=tmp_path / "tool.rom")
+    tracker = NdiTracker(library, "/dev/ttyUSB0", roms=[tmp_path / "probe.rom"])
     assert library.opened == ("/dev/ttyUSB0",)
     words = [line.partition(":")[0] for line in library.told]
-    assert words == ["INIT", "COMM", "VER", "PHSR", "PHRQ", "description of 10", *["PHSR"] * 3, "PHINF", "TSTART"]
+    assert words == ["INIT", "COMM", "VER", "PHSR", "PHRQ", "description of 10", *["PHSR"] * 3, "TSTART"]
     assert library.told[1] == "COMM:50000"  # 115200, 8N1, no handshake
-    assert (tracker.name, tracker.tools) == ("Polaris", {10: "0A-870030A"})
+    assert (tracker.name, tracker.tools) == ("Polaris", {10: "probe"})
     over_network = FakeLibrary()
     NdiTracker(over_network, "socket://169.254.60.146:8765")
     assert over_network.opened == ("169.254.60.146", 8765)
@@ -177,7 +177,7 @@ def test_a_tracker_that_stops_answering_is_told():
 )
 def test_what_cannot_be_set_up_is_told_in_one_line(tmp_path, library, rom, words):
     with pytest.raises(DeviceError, match=words) as error:
-        NdiTracker(library, "/dev/ttyUSB0", rom=rom and tmp_path / rom)
+        NdiTracker(library, "/dev/ttyUSB0", roms=[tmp_path / rom] if rom else [])
     assert "\n" not in str(error.value)
 
 
@@ -234,10 +234,11 @@ def test_the_library_reads_the_emulated_tracker(link, tmp_path):
     rom = tmp_path / "tool.rom"
     rom.write_bytes(bytes(range(256)) * 4)
     with serving(device, line):
-        port = open_tracker("ndi", line.url, rom=rom if wireless else None)
+        port = open_tracker("ndi", line.url, roms=[rom] if wireless else [])
         answer = TRACKERS["ndi"].check(port)
         assert answer.hello == HelloReading("Emulated NDI tracker", 0, 0, 0, 0.0)
-        assert [*answer.tools] == [answer.tool] == ["0A"]  # this one does not know the command for the part number
+        name = "tool" if wireless else "0A"  # this one does not know the command for the part number
+        assert [*answer.tools] == [answer.tool] == [name]
         port.write(TRACKERS["ndi"].start)
         parser, found, end = TRACKERS["ndi"].parser(), [], time.monotonic() + 20.0
         while len(found) < 40 and time.monotonic() < end:
@@ -252,14 +253,18 @@ def test_the_library_reads_the_emulated_tracker(link, tmp_path):
     assert times == sorted(times)
 
 
-def test_two_tools_on_ports_are_told_apart_by_the_library_and_combined():
+@pytest.mark.parametrize("names", [("0A", "0B"), ("probe", "sternum")], ids=["wired", "wireless"])
+def test_two_tools_are_told_apart_by_the_library_and_combined(tmp_path, names):
     pytest.importorskip(ndi.MODULE)
-    scan, line = short_scan(6.0), TcpLink("127.0.0.1", 0)
-    with serving(EmulatedNdi(scan.poses, faults=Faults(breathe_mm=20.0)), line):
-        port, driver = open_tracker("ndi", line.url), TRACKERS["ndi"]
-        with pytest.raises(UsageError, match="sends several tools: '0A', '0B'"):
+    scan, line, wireless = short_scan(6.0), TcpLink("127.0.0.1", 0), "probe" in names
+    roms = [tmp_path / f"{name}.rom" for name in names] if wireless else []
+    for rom in roms:
+        rom.write_bytes(bytes(752))
+    with serving(EmulatedNdi(scan.poses, faults=Faults(breathe_mm=20.0), wireless=wireless), line):
+        port, driver = open_tracker("ndi", line.url, roms=roms), TRACKERS["ndi"]
+        with pytest.raises(UsageError, match=f"sends several tools: '{names[0]}', '{names[1]}'"):
             driver.check(port)
-        answer = driver.check(port, tool="0A", reference="0B")
+        answer = driver.check(port, tool=names[0], reference=names[1])
         port.write(driver.start)
         parser, follower, found = answer.parser(), Follower(answer.tool, answer.reference), []
         end = time.monotonic() + 20.0

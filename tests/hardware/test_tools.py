@@ -306,7 +306,9 @@ def test_two_tools_are_refused_without_a_choice_and_followed_with_one(protocol):
             driver.check(port)
         with pytest.raises(UsageError, match=f"its reference are both {first!r}"):
             driver.check(port, tool=first, reference=first)
-        with pytest.raises(DeviceError, match=f"no pose of a tool 'Pen' comes; it sends {listed}"):
+        with pytest.raises(
+            DeviceError, match=rf"no pose of a tool 'Pen' comes \(is it in sight\?\); it sends {listed}"
+        ):
             driver.check(port, tool="Pen")
         answer = driver.check(port, tool=first, reference=second)
         assert (answer.tool, answer.reference, answer.unseen) == (first, second, "")
@@ -320,6 +322,7 @@ def test_a_name_may_leave_out_the_frame_but_not_part_of_the_name():
     assert called(tools, "Probe") == called(tools, "ProbeToTracker") == ["ProbeToTracker"]
     assert called(tools, "0A") == ["0A-8700339"]
     assert called(tools, "Pro") == called(tools, ".*") == []
+    assert called(("StylusTipToReference",), "StylusTipToReferenceOfTheTable") == ["StylusTipToReference"]
     assert called(("ProbeToTracker", "ProbeToReference"), "Probe") == ["ProbeToTracker", "ProbeToReference"]
 
 
@@ -363,6 +366,25 @@ def test_a_server_that_sends_only_on_request_is_asked():
     port.close()
     thread.join(5.0)
     listener.close()
+
+
+def test_a_reference_alone_is_no_tool():
+    with serving(EmulatedTracker(short_scan(0.5).poses, protocol="fastrak"), PtyLink()) as emulator:
+        port = open_tracker("fastrak", emulator._link.url)
+        with pytest.raises(UsageError, match=r"sends only the reference, '1'; is the tool on the head in sight\?"):
+            TRACKERS["fastrak"].check(port, reference="1")
+        port.close()
+
+
+def test_frames_of_poses_are_not_mixed(tmp_path):
+    scan = tb.demo_scan()
+    fixed = replace(scan, session={**scan.session, "reference": "Sternum"})
+    with pytest.raises(BadDataError, match=r"differ in reference \(Sternum, the tracker's own frame\)"):
+        build_map([scan, fixed], every=8)
+    write_scan(tmp_path / "fixed.mcap", fixed, provenance=Provenance("test", {}))
+    given = {"head": "loop://", "tracker": "loop://", "like": tmp_path / "fixed.mcap", "duration_s": 1.0}
+    with pytest.raises(UsageError, match="are relative to the tool 'Sternum'; record with the same reference"):
+        tb.record(tmp_path / "a.mcap", landmarks=tmp_path / "fixed.mcap", **given)
 
 
 # --- Whole recordings.
