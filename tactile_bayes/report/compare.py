@@ -335,7 +335,7 @@ def _place_line(place: VisitPlace, *, name: bool = False) -> list[str]:
 
 def _change_line(change: ChangeReport) -> str:
     q, pair = change.percent, f"Change of the diameter, visit {change.earlier} to {change.later}"
-    median, low, high = (_signed(one) for one in (q.median, q.low, q.high))
+    median, low, high = (signed(one) for one in (q.median, q.low, q.high))
     return f"{pair}: {median} % ({low} to {high} %, {_share(q)} interval)."
 
 
@@ -392,7 +392,7 @@ def _another_line(change: ChangeReport) -> list[str]:
         return []
     q, spread = another.percent, 100 * another.between_map_sd
     direction = _direction(another.probability_grown)
-    odds = f"{_signed(q.low)} to {_signed(q.high)} %, probability that it {direction}"
+    odds = f"{signed(q.low)} to {signed(q.high)} %, probability that it {direction}"
     return [f"If exams of one mass differ by {spread:.0f} %: {odds}."]
 
 
@@ -410,7 +410,7 @@ def _model_line(report: CompareReport) -> str:
     return f"Model: one body, whose hidden properties cancel in the change; {spread}{depth}."
 
 
-def _signed(percent: float) -> str:
+def signed(percent: float) -> str:
     """Whole percent with its sign; none has no sign."""
     return f"{round(percent):+d}" if round(percent) else "0"
 

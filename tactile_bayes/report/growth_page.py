@@ -17,7 +17,7 @@ from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.mapping.places import PATIENT_WORDS, Orientation, orientation_of
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.report.compare import change_sentences, rate_sentences, verdict_sentence
+from tactile_bayes.report.compare import change_sentences, rate_sentences, signed, verdict_sentence
 from tactile_bayes.report.pages import cut, page
 from tactile_bayes.report.svg import STEPS, colour_steps, outlined_text, picture_of, size_ruler, stroked
 from tactile_bayes.size.visits import Compared, straight_line
@@ -259,7 +259,7 @@ def _row(report: CompareReport, course: Course, visit: Visit) -> tuple[str, ...]
     q, number = visit.max_size_mm, visit.visit - 2
     size = "" if q is None else f"{q.median:.1f} ({q.low:.1f} to {q.high:.1f})"
     c = report.changes[number].percent if report.changes and number >= 0 else None
-    change = "" if c is None else f"{c.median:+.0f} ({c.low:+.0f} to {c.high:+.0f})"
+    change = "" if c is None else f"{signed(c.median)} ({signed(c.low)} to {signed(c.high)})"
     away = report.places[number].distance_mm if number >= 0 and report.places else None
     found = sum(one.status == "estimate" for one in visit.maps)
     return course.of(visit), f"{found} of {len(visit.maps)}", size, change, "" if away is None else f"{away:.0f}"

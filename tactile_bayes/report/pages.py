@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import UsageError
 from tactile_bayes.files.atomic import check_suffix, refuse_existing, same_file, write_all
+from tactile_bayes.report.compare import signed
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -54,7 +55,7 @@ def _environment() -> Environment:
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
-    made.filters["cut"] = cut
+    made.filters |= {"cut": cut, "signed": signed}
     return made
 
 

@@ -24,7 +24,7 @@ from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.geometry import rigid
 from tactile_bayes.inference.points import normal_quantile
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.report.compare import _signed, compare_summary, verdict
+from tactile_bayes.report.compare import compare_summary, signed, verdict
 from tactile_bayes.size.visits import Change
 
 FAST = ("--method", "laplace")
@@ -228,7 +228,7 @@ def test_a_scan_is_no_second_visit_and_no_second_exam(folder: Path) -> None:
 
 @pytest.mark.parametrize(("percent", "text"), [(-0.3, "0"), (0.4, "0"), (-1.2, "-1"), (12.6, "+13")])
 def test_a_change_of_nothing_has_no_sign(percent: float, text: str) -> None:
-    assert _signed(percent) == text
+    assert signed(percent) == text
 
 
 @pytest.mark.parametrize("later", ["grown0.nc", "bare0.nc"])
