@@ -20,6 +20,7 @@ STYLES: Final = {
     "note: ": CYAN,
     "$ ": BOLD,
     "sound: ": BOLD,
+    "needed: ": BOLD,
     "tactile errs ": BOLD,
     "The mass has ": BOLD,
     "No change shown": BOLD,

@@ -49,7 +49,7 @@ def needed_sentence(one: Needed) -> str:
     ends = one.patients_interval
     told = "" if ends is None else f" (by the simulation's own error {ends[0]:.0f} to {ends[1]:.0f})"
     least = " (the least that a plan may have)" if one.patients == MIN_PATIENTS else told
-    return f"{one.patients} patients with {maps} reach {aim} {one.target:g}{least}."
+    return f"needed: {one.patients} patients with {maps} for {aim} {one.target:g}{least}"
 
 
 def _errors(plan: PlanReport, names: Iterable[str]) -> str:

@@ -65,7 +65,9 @@ def test_power_answers_with_the_patients_of_the_normal_approximation() -> None:
     assert found["patients"] == pytest.approx(approximate, rel=0.1)
     low, high = found["patients_interval"]
     assert low < found["patients"] < high < 1.2 * low
-    assert result.stdout.startswith(f"{found['patients']} patients with 1 map of each mass reach power 0.9 (by the")
+    assert result.stdout.startswith(
+        f"needed: {found['patients']} patients with 1 map of each mass for power 0.9 (by the"
+    )
 
 
 def test_precision_answers_with_the_patients_of_the_delta_method() -> None:
@@ -94,7 +96,9 @@ def test_more_maps_need_fewer_patients_and_a_figure_draws_it(tmp_path: Path) -> 
 
 def test_few_patients_suffice_and_none_do() -> None:
     easy = plan("--power", 0.9, "--mass-sd", 0.01, "--map-sd", 0.01, "--trials", 50).stdout
-    assert easy.startswith("8 patients with 3 maps of each mass reach power 0.9 (the least that a plan may have).")
+    assert easy.startswith(
+        "needed: 8 patients with 3 maps of each mass for power 0.9 (the least that a plan may have)\n"
+    )
     hard = plan("--power", 0.9, "--mass-sd", 0.5, "--trials", 50).exception
     assert "the tactile errors assumed are not the smaller ones" in str(hard)
     far = plan("--power", 0.9, "--mass-sd", 0.33, "--maps", 1, "--other-miss", 0, "--trials", 50).exception
