@@ -83,8 +83,8 @@ def scan_of(
     if isinstance(frames, str | Path):
         made = import_arrays(path_of(frames), given, beside)
     else:
-        times = {} if time is None else {"frame_time_s": np.asarray(time)}
-        made = combined([Source({"frames": np.asarray(frames), **times}), *beside], given)
+        times = {} if time is None else {"frame_time_s": _array(time)}
+        made = combined([Source({"frames": _array(frames), **times}), *beside], given)
     for note in made.notes:
         if note.startswith("CAUTION"):
             warnings.warn(note, stacklevel=3)
@@ -92,6 +92,16 @@ def scan_of(
     if made.notes:
         found = replace(found, session={**found.session, "imported_as": "; ".join(made.notes)[:2000]})
     return corrected(with_session(found, path_of(session)), correct)
+
+
+def _array(given: Any) -> Any:
+    """An array in which masked values are NaN, and dates are s since 1970."""
+    if isinstance(given, np.ma.MaskedArray):
+        return np.ma.filled(given.astype(np.float64), np.nan)
+    array = np.asarray(given)
+    if array.dtype.kind in "Mm":
+        return array.astype(f"{array.dtype.kind}8[ns]").astype(np.int64) / 1e9
+    return array
 
 
 def _stated(columns: PathLike | Mapping[str, Any] | None, stated: Mapping[str, Any]) -> ArrayMap:
@@ -113,8 +123,8 @@ def _poses(given: Any, stated: ArrayMap) -> Source:
     if isinstance(given, tuple | list) and len(given) == 3:
         return Source(_named(*given))
     if isinstance(given, tuple | list) and len(given) == 2:
-        return Source({"pose_time_s": np.asarray(given[0]), "pose_matrix": np.asarray(given[1])})
-    numbers = np.asarray(given)
+        return Source({"pose_time_s": _array(given[0]), "pose_matrix": _array(given[1])})
+    numbers = _array(given)
     if numbers.ndim != 2 or numbers.shape[1] != 8:
         raise UsageError(
             f"poses is {type(given).__name__} of shape {numbers.shape}; give (time, matrices), (time, position, "
@@ -125,7 +135,7 @@ def _poses(given: Any, stated: ArrayMap) -> Source:
 
 def _named(time: Any, position: Any, quaternion: Any) -> Arrays:
     values = {"pose_time_s": time, "position_mm": position, "quaternion_wxyz": quaternion}
-    return {name: np.asarray(value) for name, value in values.items()}
+    return {name: _array(value) for name, value in values.items()}
 
 
 def _head(given: Any) -> Source:
@@ -137,12 +147,12 @@ def _head(given: Any) -> Source:
 
 def _calibration(given: Any) -> Source:
     if isinstance(given, tuple | list) and len(given) == 2:
-        return Source({"gain_kpa_per_count": np.asarray(given[0]), "offset_kpa": np.asarray(given[1])})
+        return Source({"gain_kpa_per_count": _array(given[0]), "offset_kpa": _array(given[1])})
     return _beside(given, ElementCalibration, of_calibration, lambda other: other.element_calibration)
 
 
 def _landmarks(given: Any) -> Source:
-    points = None if given is None or isinstance(given, str | Path | Landmarks | Scan) else np.asarray(given)
+    points = None if given is None or isinstance(given, str | Path | Landmarks | Scan) else _array(given)
     if points is not None and points.shape in ((2, 3), (3, 3)):
         return Source({"landmarks_mm": points[:2], **({"nipple_mm": points[2]} if len(points) == 3 else {})})
     return _beside(given, Landmarks, of_landmarks, lambda other: other.landmarks)

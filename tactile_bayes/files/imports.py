@@ -318,6 +318,12 @@ def _frames(held: Arrays, stated: Stated, told: list[str]) -> None:
             f"{stated.frame_shape[1]}",
             way_out="leave --frame-shape out",
         )
+    head = held["head_surface_mm"].shape[:2] if "head_surface_mm" in held else counts.shape[1:]
+    if counts.ndim == 3 and counts.shape[1:] != head:
+        ours, theirs = (" x ".join(map(str, shape)) for shape in (counts.shape[1:], head))
+        turned = counts.shape[1:] == head[::-1]
+        way_out = "swap their last two axes" if turned else "give the head of this array, or the frames of this head"
+        raise BadDataError(f"counts has frames of {ours} taxels, and the head {theirs}", way_out=way_out)
     held["counts"] = counts
 
 
@@ -367,7 +373,7 @@ def _as_counts(held: Arrays, stated: Stated, told: list[str]) -> None:
         return
     frames, factor = held["counts"], KPA_PER_UNIT[unit]
     whole = frames.dtype.kind in "iu" and frames.min() >= 0 and frames.max() <= _MOST_COUNTS
-    kpa = frames * factor
+    kpa = frames.astype(np.float64) * factor
     gain, offset = (factor, 0.0) if whole else (_STEP_KPA, min(0.0, float(np.floor(kpa.min() / _STEP_KPA)) * _STEP_KPA))
     held["counts"] = np.clip(np.rint((kpa - offset) / gain), 0, _MOST_COUNTS).astype(np.uint16)
     full = _MOST_COUNTS if stated.saturation is None else round((stated.saturation * factor - offset) / gain)

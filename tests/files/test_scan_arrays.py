@@ -11,6 +11,7 @@ from typing import Any
 
 import h5py
 import numpy as np
+import pandas as pd
 import pytest
 import scipy.io
 import scipy.sparse
@@ -510,6 +511,27 @@ def test_python_takes_records_of_another_scan_and_says_what_it_cannot_take(scan:
         tb.scan_of(counts, time, scan.poses, head=scan, units="kPa")
     with pytest.raises(BadDataError, match="head: pitch is not known; did you mean pitch_mm"):
         tb.scan_of(counts, time, scan.poses, head={"pitch": 1.5})
+
+
+def test_python_takes_lists_frames_dates_and_half_floats_and_no_masked_reading(pressed: Arrays, scan: Scan) -> None:
+    kpa, time, head = pressed["frames"], scan.frames.time_s, scan.head
+    table = pd.DataFrame(np.column_stack([pressed[name] for name in ("pose_time_s", "position_mm", "quaternion_wxyz")]))
+    same_as = tb.scan_of(kpa, time, scan.poses, head=head, unit="kPa").frames.counts
+    for frames in (kpa.tolist(), np.ma.masked_invalid(kpa)):
+        found = tb.scan_of(frames, pd.Series(time), table, head=head, unit="kPa")
+        np.testing.assert_array_equal(found.frames.counts, same_as)
+    half = tb.scan_of(kpa.astype(np.float16), time, scan.poses, head=head, unit="kPa")
+    np.testing.assert_allclose(half.frames.counts, same_as, atol=10)
+    start = np.datetime64("2026-11-26T10:00:00", "ns")
+    dated = start + (1e9 * time).astype("m8[ns]")
+    poses = (start + (1e9 * scan.poses.time_s).astype("m8[ns]"), scan.poses.position_mm, scan.poses.quaternion_wxyz)
+    found = tb.scan_of(kpa, dated, poses, head=head, unit="kPa")
+    np.testing.assert_allclose(np.diff(found.frames.time_s), np.diff(time), atol=1e-6)
+    masked = np.ma.masked_greater(kpa, 9.9)
+    with pytest.raises(BadDataError, match=r"frames holds .* values that are not finite"):
+        tb.scan_of(masked, time, scan.poses, head=head, unit="kPa")
+    with pytest.raises(BadDataError, match="frames of 26 x 16 taxels, and the head 16 x 26; swap their last two axes"):
+        tb.scan_of(kpa.swapaxes(1, 2), time, scan.poses, head=head, unit="kPa")
 
 
 def test_a_scene_needs_no_file() -> None:
