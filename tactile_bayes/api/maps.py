@@ -15,7 +15,7 @@ from tactile_bayes.declarations import EXACT, Record, as_dict, names_of, to_plai
 from tactile_bayes.errors import UsageError, check_number
 from tactile_bayes.files.arrays_layout import GridOptions
 from tactile_bayes.files.atomic import Format, check_suffix, sha256
-from tactile_bayes.files.grid_files import Grid
+from tactile_bayes.files.grid_files import GRID_SUFFIXES, Grid
 from tactile_bayes.files.grids import grid_map, import_grid
 from tactile_bayes.files.map_nc import read_map_and_scans, write_map
 from tactile_bayes.files.provenance import Provenance, repeated_scans, scan_facts
@@ -372,9 +372,9 @@ def map_of(given: Any, **stated: Any) -> Map:
         return given
     if isinstance(given, TactileMap):
         return Map(given)
-    if isinstance(given, str | Path) and not stated:
-        return read_map(given)
     path = path_of(given) if isinstance(given, str | Path) else None
+    if path is not None and not stated and path.suffix.lower() not in GRID_SUFFIXES:
+        return read_map(path)
     if path is None and (not stated or isinstance(given, list | tuple) or not hasattr(given, "__array__")):
         way_out = "build one with build_map, give a path, or map_of(numpy.array(...), spacing_mm=...)"
         if isinstance(given, list | tuple) and not stated:

@@ -42,9 +42,14 @@ _WAY_OUT: Final = "give a table of numbers, such as .csv"
 _THOUSANDS: Final = re.compile(r"[+-]?[1-9][0-9]{0,2}(,[0-9]{3})+")
 _MOST_COUNTED: Final = 8
 """A first row or column of so many numbers that counts 0, 1, 2... or 1, 2, 3... holds labels, whatever its corner."""
+_NUMBER: Final = re.compile(r"[+-]?(([0-9]+\.?[0-9]*|\.[0-9]+)(e[+-]?[0-9]+)?|nan|inf(inity)?)", re.IGNORECASE)
+_TIME: Final = re.compile(r"(t|time|times|timestamp|date|frame|sample|index|s|ms|sec|seconds)\b.*", re.IGNORECASE)
+"""A first column of this name stands before frames, one a row."""
 _NOT_A_SENSEL: Final = "B"
-_SPACING_LINE: Final = re.compile(r"^(ROW|COL)_SPACING[\s,;:=]+([0-9.]+)\s*(mm|cm|m|in|inch)?\s*$", re.MULTILINE)
-_UNITS_LINE: Final = re.compile(r"^UNITS[\s,;:=]+(\S+)\s*$", re.MULTILINE)
+_SPACING_LINE: Final = re.compile(
+    r"^(ROW|COL)_SPACING[\s,;:=]+([0-9.]+)[\s,;]*(mm|cm|m|in|inch)?[\s,;]*$", re.MULTILINE
+)
+_UNITS_LINE: Final = re.compile(r"^UNITS[\s,;:=]+([^\s,;]+)[\s,;]*$", re.MULTILINE)
 _MM: Final = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4, "inch": 25.4, None: 1.0}
 
 
@@ -55,9 +60,13 @@ def read_table(path: Path, *, no_value: Sequence[str] = ()) -> Grid:
     if other not in ("", "UTF-16"):
         raise BadDataError(f"is {other} text", way_out="save it as UTF-8")
     text = decoded(data, path=path, way_out=_WAY_OUT, encoding=other.lower() or "utf-8-sig")
+    text = text.replace("\r\n", "\n").replace("\r", "\n").replace("\u2212", "-")  # a minus sign that is no hyphen
     rows = _fields(text)
     first, last = _numbers_within(rows, no_value)
     before, after = (_said(part) for part in (rows[:first], rows[last:]))
+    if first and len(rows[first - 1]) == len(rows[first]) > 1 and _TIME.fullmatch(rows[first - 1][0]):
+        what = f"its first column is called {rows[first - 1][0][:20]!r}, as before frames that stand one a row"
+        raise BadDataError(what, way_out="import them as a scan, or give one frame as rows and columns")
     tekscan = "ASCII_DATA" in text
     words = [one for one in no_value if not is_number(one)]  # numbers are looked for among the values
     marks = (*words, _NOT_A_SENSEL) if tekscan else tuple(words)
@@ -75,10 +84,14 @@ def read_table(path: Path, *, no_value: Sequence[str] = ()) -> Grid:
             notes.append(f"{alike:,} cells hold {mark!r}, which is no value")
     _refuse_labels(values)
     _refuse_list(values)
-    units = _UNITS_LINE.search(text) if tekscan else None
+    units = _UNITS_LINE.search(text)
     sides = {side: float(number) * _MM[unit or None] for side, number, unit in _SPACING_LINE.findall(text)}
     spacing = (sides["COL"], sides["ROW"]) if len(sides) == 2 else None
-    return Grid({"mean": values}, spacing, None, units[1] if units else "", tuple(notes))
+    return Grid({"mean": values}, spacing, None, _unit(units[1]) if units else "", tuple(notes))
+
+
+def _unit(text: str) -> str:
+    return "kPa" if text.lower() == "kpa" else text
 
 
 def _fields(text: str) -> list[list[str]]:
@@ -87,9 +100,9 @@ def _fields(text: str) -> list[list[str]]:
     with decoding("is not a table of text", way_out=_WAY_OUT):
         rows = [[field.strip() for field in row] for row in csv.reader(io.StringIO(text), delimiter=separator)]
     apart = [line.split() for line in text.splitlines()]
-    if separator == "," and _lines_of_numbers(_points(apart)) <= _lines_of_numbers(rows):
-        return rows
-    return _with_points(apart if separator == "," else rows)
+    if separator == "," and _lines_of_numbers(_points(apart)) > _lines_of_numbers(_points(rows)):
+        rows = apart
+    return _with_points(rows)  # between commas they are in quotes
 
 
 def _lines_of_numbers(rows: Iterable[list[str]]) -> int:
@@ -98,11 +111,7 @@ def _lines_of_numbers(rows: Iterable[list[str]]) -> int:
 
 def is_number(field: str) -> bool:
     """True for a text that is a number, NaN and infinity included."""
-    try:
-        float(field)
-    except ValueError:
-        return False
-    return True
+    return _NUMBER.fullmatch(field) is not None
 
 
 def _numbers_within(rows: Sequence[list[str]], no_value: Sequence[str]) -> tuple[int, int]:
@@ -124,6 +133,8 @@ def _numbers_within(rows: Sequence[list[str]], no_value: Sequence[str]) -> tuple
     while last < len(rows) and any(map(is_number, rows[last])):  # a faulty row is told, not left out
         last += 1
     while first > 0 and len(rows[first - 1]) == len(rows[first]) and any(map(is_number, rows[first - 1])):
+        if _is_title(rows[first - 1]):
+            break
         first -= 1
     # rows of empty fields belong to the grid, blank lines do not
     while first > 0 and len(rows[first - 1]) > 1 and not any(rows[first - 1]):
@@ -131,6 +142,10 @@ def _numbers_within(rows: Sequence[list[str]], no_value: Sequence[str]) -> tuple
     while last < len(rows) and len(rows[last]) > 1 and not any(rows[last]):
         last += 1
     return first, last
+
+
+def _is_title(row: Sequence[str]) -> bool:
+    return row[0][:5].lower() == "frame"
 
 
 def _said(rows: Iterable[Sequence[str]]) -> list[str]:
@@ -141,7 +156,7 @@ def _one_block(rows: Sequence[list[str]], before: int) -> list[list[str]]:
     """The rows, between which nothing else may stand; blank lines and titles of frames separate tables, not rows."""
     for number, row in enumerate(rows, start=before):
         blank = len(row) <= 1 and not any(row)
-        if blank or (row[0][:5].lower() == "frame" and not any(map(is_number, row))):
+        if blank or _is_title(row):
             what = f"has {'a blank line' if blank else repr(row[0][:20])} after row {number}"
             way_out = "give one grid, such as one frame or a mean of frames, in a file; frames with poses are a scan"
             raise BadDataError(what, way_out=way_out)
@@ -169,9 +184,12 @@ def _values(rows: Sequence[list[str]], marks: Sequence[str], before: int) -> Flo
             raise BadDataError(what, way_out="give every row one length")
     none = {"", *marks}
     try:
-        return np.array([[np.nan if field in none else float(field) for field in row] for row in rows])
+        values = np.array([[np.nan if field in none else float(field) for field in row] for row in rows])
     except ValueError:
         raise _no_number(rows, none, before) from None
+    if any("_" in field for row in rows for field in row if field not in none):  # which float() passes over
+        raise _no_number(rows, none, before)
+    return values
 
 
 def _no_number(rows: Sequence[list[str]], marks: set[str], before: int) -> BadDataError:
@@ -182,8 +200,10 @@ def _no_number(rows: Sequence[list[str]], marks: set[str], before: int) -> BadDa
     alike = sum(one[2] == field for one in faults) - 1
     what = f"row {row}, column {column} holds {field[:30]!r}" + (f" (and {alike} more do)" if alike else "")
     way_out = f"if it means no value, give --no-value {field[:30]}"
-    if len(rows) > 1 and all(one[1] == 1 for one in faults) and len(faults) >= len(rows) - 1:
+    if len(faults) > 1 and all(one[1] == 1 for one in faults) and len(faults) >= len(rows) - 1:
         way_out = "leave out the column of names"
+    elif (row, column) == (before + 1, 1) and len(faults) == 1:
+        way_out = f"leave out the labels of rows and columns; {way_out}"
     elif re.search(r"\d", field):
         way_out = "write numbers as 1.5"
     return BadDataError(what, way_out=way_out)
@@ -198,6 +218,13 @@ def _refuse_labels(table: FloatArray) -> None:
             _refuse(line, where)
     if _counts(column):
         _refuse(column, "column 1")
+    for number, line in ((1, column), (2, row)):
+        beside = table[:, 1:] if number == 1 else table[1:].T
+        if len(line) >= _MOST_COUNTED and _evenly(line) and not any(_evenly(other) for other in beside.T):
+            what = (
+                f"{'column' if number == 1 else 'row'} 1 runs in equal steps ({line[0]:g}, {line[1]:g}, {line[2]:g}...)"
+            )
+            raise BadDataError(what, way_out="leave out times or places; frames that stand one a row are a scan")
 
 
 def _refuse(line: FloatArray, where: str) -> None:
@@ -233,6 +260,8 @@ IMAGE_SUFFIXES: Final = (".tif", ".tiff", ".pgm", ".png")
 _ARRAY_SUFFIXES: Final = (*ARRAY_SUFFIXES, ".nc", ".cdf")
 _BESIDE: Final = ("mean", "count", "variance", "spacing_mm")
 TABLE_SUFFIXES: Final = (".csv", ".txt", ".tsv", ".asf", ".asc", ".dat")
+GRID_SUFFIXES: Final = (*TABLE_SUFFIXES, *IMAGE_SUFFIXES, *ARRAY_SUFFIXES)
+"""Of files that hold no map of this program, whatever else."""
 
 
 def open_grid(path: Path, *, no_value: Sequence[str] = (), array: str = "") -> Grid:

@@ -84,6 +84,14 @@ def test_what_cannot_be_a_map_is_told_in_the_words_of_python(
         tb.map_of(given, **stated)
 
 
+def test_the_path_of_a_grid_says_what_it_lacks(tmp_path: Path) -> None:
+    np.savetxt(tmp_path / "a.csv", values(), delimiter=",")
+    with pytest.raises(UsageError, match="a grid needs spacing_mm"):
+        tb.map_of(tmp_path / "a.csv")
+    np.savez(tmp_path / "a.npz", mean=values(), spacing_mm=1.0)
+    assert tb.map_of(tmp_path / "a.npz").tactile_map.mean.shape == (41, 45)
+
+
 def test_a_map_is_given_as_before() -> None:
     made = tb.map_of(values(), spacing_mm=1, normalise="gain")
     assert tb.map_of(made) is made

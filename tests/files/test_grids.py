@@ -252,6 +252,8 @@ def test_an_export_of_tekscan_is_a_map_with_its_spacing_and_unit(tmp_path: Path)
         ("# made by mat 3\n# kPa\n0.9 2 1.234\n1 2 3\n", "'# made by mat 3' and 1 more"),
         ("Mat,3,\nUnits,kPa\n\n0.9,2,1.234\n1,2,3\n\nmean,1.6\n", ""),
         ('"0,9";"2";"1,234"\n"1";"2";"3"\n', ""),
+        ('"0,9","2","1,234"\n"1","2","3"\n', ""),
+        ("0.9,2,1.234\r1,2,3\r", ""),
         ('"0.9","2","1.234"\n"1","2","3"\n', ""),
     ],
 )
@@ -267,6 +269,30 @@ def test_frames_in_rows_are_no_map(tmp_path: Path) -> None:
     np.savetxt(tmp_path / "frames.csv", np.ones((200, 416)), delimiter=",")
     with pytest.raises(BadDataError, match=r"200 x 416 cells of 1\.5 mm are 0\.624 m long; one frame a row.*as a scan"):
         read_grid(tmp_path / "frames.csv", spacing_mm=1.5)
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ("time,P1,P2\n0.00,1,2\n0.01,1,2\n", "its first column is called 'time'.*import them as a scan"),
+        ("".join(f"{i / 100:.2f},{i % 3},{i % 2}\n" for i in range(10)), "column 1 runs in equal steps"),
+        (",".join(f"{1.5 * i}" for i in range(9)) + "\n1,2,3,1,2,3,1,2,2\n", "row 1 runs in equal steps"),
+        ("FRAME,1\n1,2\n3,4\nFRAME,2\n1,2\n3,4\n", "has 'FRAME' after row 3"),
+        ("row;1;2\n1;1,5;2\n2;4;5\n", "leave out the labels of rows and columns"),
+        ("1_0,2\n3,4\n", "row 1, column 1 holds '1_0'"),
+    ],
+)
+def test_frames_and_labels_in_a_table_are_named(tmp_path: Path, content: str, words: str) -> None:
+    (tmp_path / "g.csv").write_text(content)
+    with pytest.raises(BadDataError, match=words):
+        read_grid(tmp_path / "g.csv", spacing_mm=1.0)
+
+
+def test_a_plane_of_a_simulation_is_a_map(tmp_path: Path) -> None:
+    """Every row and column runs in equal steps, which labels alone do not."""
+    y, x = np.mgrid[:12, :14]
+    np.savetxt(tmp_path / "g.csv", 2 + 0.1 * x + 0.2 * y, delimiter=",", fmt="%.3f")
+    assert read_grid(tmp_path / "g.csv", spacing_mm=1.0).covered.all()
 
 
 def test_a_list_of_places_and_values_is_no_map(tmp_path: Path) -> None:
