@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import textwrap
+from collections.abc import Mapping
 from typing import Final, TextIO
 
 BOLD, RED, YELLOW, CYAN = "1", "31", "33", "36"
@@ -50,10 +51,10 @@ def columns_of(stream: TextIO) -> int:
         return 0
 
 
-def has_styles() -> bool:
+def has_styles(environment: Mapping[str, str] = os.environ) -> bool:
     """Whether terminals get bold and colours: not with NO_COLOR (no-color.org), nor on one that cannot."""
-    can = os.name == "posix" or "WT_SESSION" in os.environ
-    return can and not os.environ.get("NO_COLOR") and os.environ.get("TERM", "dumb") != "dumb"
+    can = os.name == "posix" or "WT_SESSION" in environment
+    return can and not environment.get("NO_COLOR") and environment.get("TERM", "dumb") not in ("dumb", "")
 
 
 def dressed(text: str, *, columns: int, styles: bool) -> str:

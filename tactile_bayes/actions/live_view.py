@@ -36,8 +36,9 @@ from tactile_bayes.posterior.bump import candidate_centres
 from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.presets import FIELD_COSINES, INTERVAL
-from tactile_bayes.report.map_text import colours_wanted, live_line, live_text
+from tactile_bayes.report.map_text import live_line, live_text
 from tactile_bayes.scan import ElementCalibration, HeadGeometry
+from tactile_bayes.terminal import has_styles
 
 DRAWINGS_PER_S = 10.0
 TAKEN_EVERY_S = 1 / DRAWINGS_PER_S / 2  #: Frames are added to the map some at a time, twice a drawing.
@@ -280,7 +281,7 @@ def terminal_view(*, keys: bool = False) -> Iterator[Callable[[LiveState], None]
 
         yield tell
         return
-    colour = colours_wanted(os.environ)
+    colour = has_styles()
 
     def draw(state: LiveState) -> None:
         columns, lines = shutil.get_terminal_size()

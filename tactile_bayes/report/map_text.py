@@ -67,11 +67,6 @@ _MARK: Final = "X"
 _STEPS: Final = 256
 
 
-def colours_wanted(environment: Mapping[str, str]) -> bool:
-    """True when to use colours: not when NO_COLOR is set, nor on a dumb terminal."""
-    return not environment.get("NO_COLOR") and environment.get("TERM", "dumb") not in ("dumb", "")
-
-
 def live_text(state: LiveState, *, columns: int, lines: int, colour: bool, keys: bool = False) -> str:
     """One screen, its lines joined by newlines, none longer than `columns`.
 

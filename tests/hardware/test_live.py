@@ -36,7 +36,8 @@ from tactile_bayes.hardware.recorder import Report
 from tactile_bayes.hardware.serve import LiveServer, address_of, document
 from tactile_bayes.mapping.accumulate import Instrument, MapAccumulator
 from tactile_bayes.mapping.plane import poses_at
-from tactile_bayes.report.map_text import colours_wanted, live_line, live_text
+from tactile_bayes.report.map_text import live_line, live_text
+from tactile_bayes.terminal import has_styles
 
 
 @pytest.fixture(scope="module")
@@ -191,7 +192,7 @@ def test_the_picture_is_brightest_at_the_lump(state):
     ],
 )
 def test_colours_are_left_out_where_they_are_not_wanted(environment, wanted):
-    assert colours_wanted(environment) is wanted
+    assert has_styles(environment) is wanted
 
 
 def test_record_shows_a_line_a_second_where_it_cannot_draw(run_cli, tmp_path, scan):
