@@ -149,7 +149,7 @@ def chosen(names: Sequence[str], given: Stated, *, what: str) -> str:
 
 def _named(table: TextTable, header: Line, given: Stated) -> Source:
     kinds = _with_rotations([kind_of_column(name) for name in header.fields])
-    layout = "wxyz" if "qw" in kinds else "euler"
+    layout = "wxyz" if {"qw", "qx", "qy"} & set(kinds) else "euler"
     names = (*_PLACE, *_ROTATIONS[layout])
     if not set(names) <= set(kinds):
         raise BadDataError(

@@ -196,6 +196,7 @@ FAULTS: dict[str, tuple[list[str], dict[str, Any], str]] = {
     "no unit": ([EULER.replace(" (cm)", ""), *polhemus()], {}, "does not say the unit of x, y and z.*length_unit"),
     "no layout": (with_times(QUATERNIONS), {}, "has 8 numbers a row and no names; give pose_layout"),
     "no qz": (["t,x,y,z,qw,qx,qy", *with_times(QUATERNIONS)], {}, "line 1 names no qz"),
+    "numbered from 1": (["t,x,y,z,q1,q2,q3,q4", *with_times(QUATERNIONS)], {}, "line 1 names no qw"),
     "both": (["t,x,y,z,qw,qx,qy,qz", *with_times(QUATERNIONS)], {"pose_layout": "xyzw"}, "leave pose_layout out"),
     "never seen": (
         [NDI, *(line.replace("Enabled", "Missing") for line in ndi())],
