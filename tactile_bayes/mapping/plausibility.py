@@ -51,8 +51,8 @@ PLATEAU: Final = 30
 TAXEL_PLATEAU: Final = 10
 """Readings at the highest count, of the array and of one taxel, that are a plateau if those of the three counts below
 it are fewer: 66 right scans have up to 5 of one taxel."""
-MOST_SATURATED: Final = 0.02
-"""Share of the readings."""
+MOST_SATURATED, MOST_DROPPED = 0.02, 0.2
+"""Share of the readings at full scale, and of the frames with too many taxels that are, or are faulty."""
 COARSEST_COUNT: Final = 0.1
 """A count over the mean pressure: a lump's rise is a few tenths of it."""
 WRAPPED: Final = 2000
@@ -226,6 +226,10 @@ def _unlike(quality: Mapping[str, float], head: HeadShape | None) -> Iterator[tu
         yield _rate(quality["frame_rate_hz"])
     elif total > 1 and "frame_rate_hz" not in quality:
         yield "all frames have one time: the array's clock stands still", "record the frames' times"
+    if total and quality.get("dropped_elements", 0.0) > MOST_DROPPED * total:
+        share = 100 * quality["dropped_elements"] / total
+        text = f"{share:.0f} % of the frames were left out for taxels at full scale, as over a lump, or faulty ones"
+        yield text, "press less hard, or repair the array"
     if (zigzag := quality.get("pose_zigzag_mm", 0.0)) > MOST_ZIGZAG_MM:
         yield f"the poses jump to and fro: they lie {zigzag:.1f} mm beside the middle of their neighbours", _ONE_TOOL
     if quality.get("frozen_share", 0.0) > MOST_FROZEN:

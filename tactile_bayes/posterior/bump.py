@@ -11,6 +11,7 @@ from tactile_bayes.geometry import BoolArray, FloatArray, IndexArray
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.options import BumpPrior
 from tactile_bayes.presets import POSE_NOISE
+from tactile_bayes.size.draws import first_axis
 
 # --- The Gaussian bump of the map (Eqs 5 and 7), averaged over the map's square cells.
 
@@ -70,6 +71,14 @@ def principal_widths(p: FloatArray, q: FloatArray, r: FloatArray) -> tuple[Float
     signed = np.where(q >= 0, ratio, -ratio)
     angle = np.where(ratio > 0, 0.5 * np.arctan2(np.where(q >= 0, r, -r), np.abs(q)), 0.0)
     return np.exp(p + signed), np.exp(p - signed), angle
+
+
+def drawn_widths(p: FloatArray, q: FloatArray, r: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """The same of draws of one ellipse: ``sigma_x_mm`` is along the axis within 45 degrees of their `first_axis`."""
+    axis = first_axis(q, r)
+    ratio, sign = np.hypot(q, r), np.where(q * axis[0] + r * axis[1] >= 0, 1.0, -1.0)
+    angle = np.where(ratio > 0, 0.5 * np.arctan2(sign * r, sign * q), 0.0)
+    return np.exp(p + sign * ratio), np.exp(p - sign * ratio), angle
 
 
 # --- Cells to be fitted: candidates for a lump, and the window about one of them.

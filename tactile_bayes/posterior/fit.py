@@ -15,7 +15,7 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.draws import INDEPENDENT_DRAWS, ParameterDraws, Solved, student_draws
 from tactile_bayes.inference.importance import Gaussians, smooth_weights
 from tactile_bayes.inference.modes import find_mode, finite_differences, mode_and_covariance, stencil
-from tactile_bayes.posterior.bump import principal_widths
+from tactile_bayes.posterior.bump import drawn_widths
 from tactile_bayes.posterior.draw import Sampled, SamplerSettings, with_beside
 from tactile_bayes.posterior.field import Window
 from tactile_bayes.posterior.marginal import NEGLIGIBLE, CollapsedTarget, independent_variance, linear_columns
@@ -253,7 +253,7 @@ def checkpoint_key(fit: FieldFit, settings: str, rng: np.random.Generator) -> st
 
 def shape_draws(fit: FieldFit, theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """sigma_x_mm, sigma_y_mm and angle_rad of (..., p) draws."""
-    return principal_widths(*fit.scene.widths(theta))
+    return drawn_widths(*fit.scene.widths(theta))
 
 
 def modal_widths(fit: FieldFit) -> tuple[float, float]:

@@ -28,6 +28,7 @@ from tactile_bayes.posterior.bump import (
     block_size,
     candidate_centres,
     covered_share,
+    drawn_widths,
     typical_level,
     value_scale,
     window_cells,
@@ -480,7 +481,7 @@ def draw_independent(
     solved = Solved(lambda theta: (target.excess(theta),))
     draws, _ = draw_parameters(_Independent(fit, target), options, rng=rng, progress=progress, solved=solved)
     theta = draws.theta
-    sigma_x, sigma_y, angle = fit.bump.widths(theta)
+    sigma_x, sigma_y, angle = drawn_widths(*fit.bump.shape_parameters(theta))
     # two of the methods are linear about the mode: for them the exact figure would cost more than all the rest
     exact = draws.method in ("ensemble", "importance")
     excess = solved(draws.flat)[0] if exact else fit.linear_excess(draws.flat)

@@ -98,6 +98,21 @@ class ShapeDraws(Record, eq=False):
         return replace(self, **drawn, labels=None)
 
 
+def first_axis(q: FloatArray, r: FloatArray) -> FloatArray:
+    """(2,) direction in (q, r) of the ellipse's axis that all draws call x.
+
+    Of the mean ellipse's axes it is the one nearer to x: near 45 degrees each draw's own nearest axis would be now the
+    longer and now the shorter. Where the draws do not tell the axes it is x itself.
+    """
+    both = np.stack([np.ravel(q), np.ravel(r)])
+    both = both[:, np.isfinite(both).all(axis=0)]
+    mean = both.mean(axis=1) if both.size else np.zeros(2)
+    length = float(np.hypot(*mean))
+    if not length**2 > float(both.var(axis=1).sum()):
+        return np.array([1.0, 0.0])
+    return mean / length if mean[0] >= 0 else -mean / length
+
+
 def matched_draws(
     maps: Sequence[ShapeDraws], number: int | None, rng: np.random.Generator
 ) -> tuple[Sequence[ShapeDraws], Labels]:

@@ -22,6 +22,7 @@ from tactile_bayes.size.draws import (
     ShapePrior,
     SizePosterior,
     elongation,
+    first_axis,
     matched_draws,
     shares,
     shown_share,
@@ -193,7 +194,9 @@ def pooled_size(
         "shown_share": shown,
         "irregular_outline": float(2 * sum(one.irregular for one in maps) >= len(maps)),
     }
-    pool = _Pool(drawn, points, oval.at(points[:, 3:]), replicates, calibration, priors.known, figures)
+    turned = np.concatenate([np.stack([one.q, one.r], axis=-1) @ turn_matrix(-one.turn_rad) for one in used])
+    axis = first_axis(*turned.T)
+    pool = _Pool(drawn, points, oval.at(points[:, 3:]), axis, replicates, calibration, priors.known, figures)
     size = pool.size(priors.between_maps or calibration.between_exams)
     middle = [float(np.mean([np.nanmean(getattr(m, n)) for m in used])) for n in ("log_amplitude", "log_width")]
     variance = float(np.nanvar(np.log(size.max_size_mm)))
@@ -208,12 +211,13 @@ def pooled_size(
 class _Pool(Record, eq=False, dict=True):
     """Draws of the maps of a mass before a spread between maps is added, with (n, `DIMENSIONS`) points.
 
-    `half` is (n, 2): half the log axis ratio of the lump, in two components.
+    `half` is (n, 2): half the log axis ratio of the lump, in two components; `first_axis` see there.
     """
 
     drawn: MassMaps
     points: FloatArray
     half: FloatArray
+    first_axis: FloatArray
     replicates: Labels
     calibration: BodyCalibration
     known: Mapping[str, float]
@@ -228,7 +232,7 @@ class _Pool(Record, eq=False, dict=True):
         mean = maps.mean + known + longer
         sd = np.sqrt(sum(variances.values()) + (OVAL_SD * longer) ** 2)
         log_largest, log_smallest = self._evened(mean, sd, longer)
-        wide = self.half[:, 0] >= 0
+        wide = self.half @ self.first_axis >= 0
         share = {"map": float(np.nanvar(maps.mean)), **{name: float(np.nanmean(v)) for name, v in variances.items()}}
         weights = {f"weight_{i + 1}": float(one.mean()) for i, one in enumerate(maps.weight)}
         return SizePosterior(
