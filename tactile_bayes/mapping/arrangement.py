@@ -53,6 +53,12 @@ LEAST_GAIN: Final = 0.3
 LEAST_GAINS: Final = {"inverse-rotation": 0.15, "quarter-turn": 0.45, "quarter-turn-back": 0.45}
 """Of a correction: a mistake's beside a clear lump gains 0.5 to 1.2, 0.15 to 0.5 where the rotation was the inverse.
 Over empty bodies, whose frames bend as the head rolls, a turn of the array gained up to 0.4."""
+CLOCK_MS: Final = (30, 60, 100, 150, 200, 300, 400, 500)
+"""Times by which poses are tried to be late, and early; the best is found to 10 ms."""
+LEAST_CLOCK_GAIN: Final = 0.15
+"""Of another clock: 26 right scans gain 0.02 at most, 100 ms gain 0.2 to 1.0 beside a clear lump."""
+CLOCK_EXPLAINED, CLOCK_LASTING = 0.9, 0.75
+"""Frames that explain less, or whose errors last longer, may have another clock; the others are not asked."""
 LEAST_AGREEMENT: Final = 0.9
 MOST_EXPLAINED: Final = 0.55
 MOST_LASTING: Final = 0.5
@@ -61,6 +67,7 @@ LEAST_LASTING: Final = 0.15
 """Below it there is nothing but noise to compare."""
 MOST_FRAMES: Final = 250
 _LEAST_BLOCKS: Final = 8
+_CLOCK_STEPS_MS: Final = (-40, -30, -20, -10, 10, 20, 30, 40)
 _LEAST_OTHERS: Final = 2
 """Readings of other times that predict one."""
 NOTHING_SHOWN: Final = "too little stands out to show that array, lever arm and quaternions are as stated"
@@ -127,10 +134,14 @@ class Arrangement(Record, eq=False):
     """Correlation of a taxel's errors from one frame to the next: noise has little, contradictions last."""
     agreement: float
     """Inner product of the mean normal of the face and the normal of all places: a head slides along its face."""
+    late_ms: float = 0.0  #: By how much poses are later than stated; below 0 earlier.
 
     @property
     def in_words(self) -> str:
         """What is wrong if this one is right."""
+        if self.late_ms:
+            way = "late" if self.late_ms > 0 else "early"
+            return f"the poses' times are {abs(self.late_ms):.0f} ms too {way} against the frames'"
         return " and ".join(CORRECTIONS[name] for name in self.corrections) or "all is as it is stated"
 
     @property
@@ -139,9 +150,15 @@ class Arrangement(Record, eq=False):
         return self.agreement >= LEAST_AGREEMENT and self.explained >= LEAST_EXPLAINED
 
     @property
+    def changes(self) -> int:
+        """How many things of the scan as it is stated are wrong if this one is right."""
+        return len(self.corrections) + bool(self.late_ms)
+
+    @property
     def least_gain(self) -> float:
         """What the corrections have to gain in each stretch."""
-        return sum(LEAST_GAINS.get(name, LEAST_GAIN) for name in self.corrections)
+        of_clock = LEAST_CLOCK_GAIN if self.late_ms else 0.0
+        return of_clock + sum(LEAST_GAINS.get(name, LEAST_GAIN) for name in self.corrections)
 
     def gain_over(self, other: Arrangement) -> float:
         """Natural log of the likelihood ratio to another one in each stretch.
@@ -165,13 +182,14 @@ class ArrangementCheck(Record, eq=False):
     """Log odds for what is stated against each correction alone."""
     contradicting: bool = False
     """True where frames contradict each other whatever is corrected."""
+    asked_ms: float = 0.0  #: Latency that the poses were stated to have.
     doubts: tuple[Finding, ...] = ()
     """What in the scan is unlike an exam, where it was looked for; see `plausibility.scan_doubts`."""
 
     @property
     def refused(self) -> bool:
-        """True where another arrangement wins clearly."""
-        return self.log_odds >= log(SURE_ODDS)
+        """True where another arrangement wins clearly; another clock can be stated to `map`."""
+        return self.log_odds >= log(SURE_ODDS) and not self.best.late_ms
 
     @property
     def not_shown(self) -> tuple[str, ...]:
@@ -205,6 +223,9 @@ class ArrangementCheck(Record, eq=False):
         if self.contradicting:
             check = "check the lever arm, both clocks, and that the breast lay still"
             return (Finding("frames_contradict", self.words, check, check),)
+        if self.best.late_ms:
+            way = f"map it with {self.remedy}"
+            return (Finding("late_poses", self.words, way, "have the scan mapped again with the tracker's delay"),)
         if self.best is not self.stated:
             remedy = f"import the scan again with {self.remedy}"
             return (Finding("wrong_arrangement", self.words, remedy, "check how array and tracker are mounted"),)
@@ -214,7 +235,9 @@ class ArrangementCheck(Record, eq=False):
 
     @property
     def remedy(self) -> str:
-        """Options of `import` that make the corrections."""
+        """Options of `import` that make the corrections, or the one of `map` that states the clock."""
+        if self.best.late_ms:
+            return f"--latency-ms {self.asked_ms + self.best.late_ms:.0f}"
         return " ".join(f"--correct {name}" for name in self.best.corrections)
 
     def lines(self) -> list[str]:
@@ -253,9 +276,14 @@ def check_arrangement(
     if stated.lasting < LEAST_LASTING:
         return ArrangementCheck(stated, stated, 0.0, {one[0]: 0.0 for one in others if len(one) == 1})
     tried = [stated, *map(overlap.judged, others)]
+    if stated.explained < CLOCK_EXPLAINED or stated.lasting > CLOCK_LASTING:
+        tried += [overlap.late(sign * ms) for ms in CLOCK_MS for sign in (1, -1)]
     stretches = int(overlap.block.max()) + 1
     likely = [one for one in tried if one is stated or (one.plausible and one.gain_over(stated) >= one.least_gain)]
-    best = max(likely, key=lambda one: stretches * one.gain_over(stated) - log(LIKELY_ODDS) * len(one.corrections))
+    best = max(likely, key=lambda one: stretches * one.gain_over(stated) - log(LIKELY_ODDS) * one.changes)
+    if best.late_ms:
+        near = [overlap.late(best.late_ms + step) for step in _CLOCK_STEPS_MS]
+        best = max([best, *near], key=lambda one: one.gain_over(stated))
     excluded = {
         one.corrections[0]: stretches * stated.gain_over(one) - log(len(tried))
         for one in tried
@@ -265,13 +293,13 @@ def check_arrangement(
     contradicting = best.explained < MOST_EXPLAINED and best.lasting > MOST_LASTING
     if best is stated or log_odds < log(LIKELY_ODDS):
         return ArrangementCheck(stated, stated, 0.0, excluded, contradicting)
-    return ArrangementCheck(stated, best, log_odds, excluded)
+    return ArrangementCheck(stated, best, log_odds, excluded, asked_ms=latency_ms)
 
 
 def check_briefly(selection: SelectedFrames, *, latency_ms: float = 0.0) -> ArrangementCheck | None:
     """As `check_arrangement`, which goes beyond single corrections only where one of them or none fits."""
     check = check_arrangement(selection, latency_ms=latency_ms, most_changes=1)
-    if check is None or (check.best is check.stated and not check.contradicting):
+    if check is None or check.best.late_ms or (check.best is check.stated and not check.contradicting):
         return check
     return check_arrangement(selection, latency_ms=latency_ms)
 
@@ -326,6 +354,10 @@ class _Overlap(Record, eq=False):
             return None
         taxels = (np.flatnonzero(stated.good_taxels), np.flatnonzero(other.good_taxels))
         return cls(scan, frames, latency_ms, coarse, taxels, block)
+
+    def late(self, late_ms: float) -> Arrangement:
+        """What is stated, with poses that are later by so much."""
+        return replace(replace(self, latency_ms=self.latency_ms + late_ms, paths={}).judged(()), late_ms=late_ms)
 
     def judged(self, corrections: Corrections) -> Arrangement:
         """Predict each averaged reading by those of other times in its cell of the plane."""

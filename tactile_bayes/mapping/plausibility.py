@@ -359,7 +359,7 @@ SURE_ODDS: Final = 1e4
 def against_no_lump(tactile_map: TactileMap) -> list[Finding]:
     """Findings of a map, its own and those it was made with, that stand against "there is no lump"."""
     sure = tactile_map.quality.get("arrangement_log_odds", 0.0) >= log(SURE_ODDS)
-    kinds = BLOCKING | {"wrong_arrangement"} if sure else BLOCKING
+    kinds = BLOCKING | {"wrong_arrangement", "late_poses"} if sure else BLOCKING
     return [one for one in (*map_findings(tactile_map), *tactile_map.findings) if one.kind in kinds]
 
 

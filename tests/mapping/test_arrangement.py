@@ -151,3 +151,34 @@ def test_a_map_refuses_and_takes_the_scan_where_it_is_told_to():
 def test_each_scan_of_a_map_is_checked():
     with pytest.raises(BadDataError, match="scan 2: the array's rows run backwards"):
         tb.build_map([lump(), mistaken(lump(), "rows-reversed")])
+
+
+# --- clocks
+
+
+def later(scan: Scan, late_ms: float) -> Scan:
+    """The scan with poses stamped so much later, and all times a second on so that none is below 0."""
+    poses, frames = scan.poses, scan.frames
+    told = TrackerPoses(poses.time_s + 1.0 + late_ms / 1000.0, poses.position_mm, poses.quaternion_wxyz)
+    return replace(scan, poses=told, frames=PressureFrames(frames.time_s + 1.0, frames.counts))
+
+
+@pytest.mark.parametrize("late_ms", [-400.0, -100.0, 100.0, 300.0])
+def test_another_clock_is_named_with_its_sign(late_ms):
+    check = checked(later(lump(), late_ms))
+    (found,) = check.findings
+    assert found.kind == "late_poses"
+    assert check.best.late_ms == pytest.approx(late_ms, abs=25.0)
+    assert f"--latency-ms {check.best.late_ms:.0f}" in found.remedy
+    assert ("too late" if late_ms > 0 else "too early") in found.text
+    assert not check.refused  # the map can be told
+
+
+def test_the_latency_that_is_stated_is_what_the_clock_is_held_against():
+    late = select_frames(later(lump(), 300.0), pressure_window_kpa=(5.0, 14.0), latency_ms=300.0)
+    right = check_arrangement(late, latency_ms=300.0)
+    assert right is not None
+    assert right.best is right.stated
+    wrong = check_arrangement(late, latency_ms=150.0)
+    assert wrong is not None
+    assert float(wrong.remedy.split()[-1]) == pytest.approx(300.0, abs=25.0)

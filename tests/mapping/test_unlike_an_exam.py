@@ -106,7 +106,10 @@ UNLIKE: dict[str, tuple[Callable[[Scan], Scan], str]] = {
         counts(lambda c: np.minimum(c, 2200 + 10 * np.arange(64).reshape(8, 8))),
         "highest count",
     ),
-    "full scale, declared": (counts(lambda c: np.minimum(c, 2950), saturation=2950), "left out for taxels at full scale"),
+    "full scale, declared": (
+        counts(lambda c: np.minimum(c, 2950), saturation=2950),
+        "left out for taxels at",
+    ),
     "rounded to kPa": (counts(lambda c: np.rint(c * KPA_PER_COUNT), gain=1 / KPA_PER_COUNT), "one count is"),
     "readings stand still": (counts(frozen), "readings stand still"),
     "hardly a frame in the window": (counts(light), "frames are used: "),
