@@ -64,8 +64,9 @@ def read_table(path: Path, *, no_value: Sequence[str] = ()) -> Grid:
     rows = _fields(text)
     first, last = _numbers_within(rows, no_value)
     before, after = (_said(part) for part in (rows[:first], rows[last:]))
-    if first and len(rows[first - 1]) == len(rows[first]) > 1 and _TIME.fullmatch(rows[first - 1][0]):
-        what = f"its first column is called {rows[first - 1][0][:20]!r}, as before frames that stand one a row"
+    names = rows[first - 1] if first else []
+    if len(names) == len(rows[first]) > 1 and _TIME.fullmatch(names[0]) and not any(map(is_number, names)):
+        what = f"its first column is called {names[0][:20]!r}, as before frames that stand one a row"
         raise BadDataError(what, way_out="import them as a scan, or give one frame as rows and columns")
     tekscan = "ASCII_DATA" in text
     words = [one for one in no_value if not is_number(one)]  # numbers are looked for among the values
