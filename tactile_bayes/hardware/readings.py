@@ -139,9 +139,14 @@ def printable(data: bytes) -> str:
 
 # Between a tool's pose and the reference's; a patient breathes 1 mm in this time at most.
 REFERENCE_NS: Final = 50_000_000
-# Names of tools that are told apart; a server may make up more.
-_MOST_OTHERS: Final = 16
+# Words that are told apart, of tools and of reasons; a device may make up more.
+_MOST_WORDS: Final = 16
 ToolReading = PoseReading | MissingReading
+
+
+def tally(counted: Counter[str], word: str) -> None:
+    """Count a word that a device sent."""
+    counted[word if word in counted or len(counted) < _MOST_WORDS else "others"] += 1
 
 
 class Follower:
@@ -172,7 +177,7 @@ class Follower:
         elif reading.tool == self.reference:
             yield from self._referred(reading, host_ns)
         else:
-            self.others[reading.tool if len(self.others) < _MOST_OTHERS else "others"] += 1
+            tally(self.others, reading.tool)
 
     def _followed(self, reading: ToolReading, host_ns: int) -> Iterator[tuple[ToolReading, int]]:
         yield from self._release()

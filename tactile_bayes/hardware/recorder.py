@@ -25,6 +25,7 @@ from tactile_bayes.hardware.readings import (
     Parser,
     PoseClock,
     PoseReading,
+    tally,
 )
 from tactile_bayes.mapping.select import Jumps, Span, apart, overlap_cautions
 
@@ -185,8 +186,6 @@ DRAIN_S: Final = 0.25
 OVERTIME_S: Final = 1.0
 # After so long without a pose the examiner is told, also where the tracker says nothing.
 _HIDDEN_NS: Final = 300_000_000
-# Kinds of reasons that are told apart: a damaged record may hold any words.
-_MOST_WHYS: Final = 12
 _MOST_TOLD: Final = 5
 _TICK_S: Final = 0.05
 # Of a tracker that sends without end, so much is read before the head's turn comes again.
@@ -355,7 +354,7 @@ class Recorder:
                 for one, came_ns in self._follower.take(reading, host_ns):
                     if isinstance(one, PoseReading):
                         self._pose(one, came_ns)
-                    elif self.recording:
+                    else:
                         self._missing(one, came_ns)
             case EndReading():
                 self._ended(line, reading)
@@ -416,9 +415,11 @@ class Recorder:
             self._observer.pose(reading, device_ns)
 
     def _missing(self, reading: MissingReading, host_ns: int) -> None:
-        """Count a pose that the tracker does not have; the file's log has where such a gap begins and ends."""
+        """Count a pose that the tracker does not have, once frames come; the log has where a gap begins and ends."""
+        if not (self.recording and self.report.frames):
+            return
         self.report.poses_missing += 1
-        self._why_missing[reading.why if len(self._why_missing) < _MOST_WHYS else "other"] += 1
+        tally(self._why_missing, reading.why)
         self._unseen(reading.why, host_ns - self._zero_ns)
 
     def _unseen(self, why: str, host_ns: int) -> None:
@@ -432,8 +433,7 @@ class Recorder:
         """Flags that the device set on a pose, and whether it repeats the last one."""
         self.report.poses_flagged += bool(reading.flags)
         for flag in reading.flags:
-            kind = flag.rstrip("-0123456789 ")
-            self._why_flagged[kind if len(self._why_flagged) < _MOST_WHYS else "other"] += 1
+            tally(self._why_flagged, flag.rstrip("-0123456789 "))
         last, self._last_pose = self._last_pose, reading
         if last is None or (last.position_mm, last.quaternion_wxyz) != (reading.position_mm, reading.quaternion_wxyz):
             return reading.flags
