@@ -189,6 +189,8 @@ class HeadGeometry(Record, eq=False):
     """Distance between neighbouring taxels."""
     scanhead_from_tracker: FloatArray
     """(4, 4) array: The lever arm: ``p_scanhead = scanhead_from_tracker @ p_tracker``."""
+    checked_on: str = ""
+    """Day on which a scan showed that this is right, as YEAR-MONTH-DAY; empty where none did."""
 
     def __post_init__(self) -> None:
         surface = _check_finite(self.surface_mm, name="surface_mm", shape=(None, None, 3))

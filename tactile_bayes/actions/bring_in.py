@@ -18,7 +18,7 @@ from tactile_bayes.files.arrays_layout import ArrayMap, GridOptions, Stated
 from tactile_bayes.files.atomic import check_suffix, refuse_existing
 from tactile_bayes.files.documents import with_session
 from tactile_bayes.files.grids import import_grid
-from tactile_bayes.files.imports import import_arrays, of_calibration, of_head, of_landmarks, of_poses
+from tactile_bayes.files.imports import import_arrays, of_calibration, of_head, of_landmarks, of_poses, with_checked
 from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.files.named_arrays import ARRAY_SUFFIXES, Source
 from tactile_bayes.files.provenance import Provenance, hash_inputs
@@ -166,7 +166,7 @@ def _import_scan(source: Path, output: Path, wanted: Wanted) -> list[str]:
     else:
         beside = [_of_file(name, path, wanted.arrays) for name, path in wanted.beside.items()]
         made = import_arrays(source, wanted.arrays, beside)
-        scan, notes = made.scan, made.notes
+        scan, notes = with_checked(made.scan, wanted.beside.get("head_geometry")), made.notes
     session = {} if wanted.session_file is None else {"session": wanted.session_file}
     inputs = hash_inputs(source=source, **session, **wanted.beside)
     settings = {"as": "scan", "lost": list(lost), "correct": list(wanted.corrections), **_stated(wanted.arrays)}
@@ -198,7 +198,7 @@ def _arrangement_lines(scan: Scan) -> list[str]:
         check = check_scan(scan, thorough=False)
     except BadDataError as error:
         return [f"{LEADS['caution']}no map can be made of it: {error}"]
-    arrangement = [] if check is None else finding_lines(check.findings) or [check.words]
+    arrangement = [] if check is None else finding_lines(check.findings_of(scan)) or [check.words]
     return [*finding_lines(doubts), *arrangement]
 
 

@@ -6,6 +6,7 @@ import shlex
 import shutil
 import sys
 from collections.abc import Callable, Iterator
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ import numpy as np
 from tactile_bayes.api.diagnosing import diagnosed
 from tactile_bayes.commands import estimate
 from tactile_bayes.commands import trial as validate
-from tactile_bayes.declarations import Record
+from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.exports.exam import read_exam
 from tactile_bayes.exports.identity import identity_of
@@ -24,6 +25,7 @@ from tactile_bayes.files.atomic import refuse_existing, unwritable, write_bytes
 from tactile_bayes.files.documents import dump_json
 from tactile_bayes.files.estimate_json import StatedSize, read_stated_size
 from tactile_bayes.files.identify import describe
+from tactile_bayes.files.instrument_json import write_head
 from tactile_bayes.files.scan_mcap import read_scan, read_truth
 from tactile_bayes.files.size_json import SHIPPED, size_calibration_path
 from tactile_bayes.findings import finding_lines
@@ -36,9 +38,15 @@ from tactile_bayes.scan import Scan
 # --- `check`: is a scan arranged as it is stated?
 
 
-def check_action(*, scans: tuple[Path, ...], pressure_window_kpa: tuple[float, float]) -> None:
+def check_action(
+    *, scans: tuple[Path, ...], pressure_window_kpa: tuple[float, float], output: Path | None, force: bool
+) -> None:
     """Check that scans are what an exam can be, and array, lever arm and quaternions as they are stated."""
     wrong = 0
+    if output is not None:
+        if len(scans) > 1:
+            raise UsageError("-o takes the head of one scan; check the phantom's alone")
+        refuse_existing(output, force=force)
     for path in scans:
         scan = read_scan(path)
         check = check_scan(scan, pressure_window_kpa=pressure_window_kpa)
@@ -47,6 +55,14 @@ def check_action(*, scans: tuple[Path, ...], pressure_window_kpa: tuple[float, f
         for line in [*finding_lines(short), TOO_SHORT] if check is None else check.lines():
             click.echo(f"  {line}")
         wrong += check is not None and check.refused
+        if output is not None:
+            if check is None or check.findings or check.doubts:
+                raise BadDataError(
+                    "the scan does not show that its head is right", way_out="scan a phantom with a lump"
+                )
+            day = datetime.now(tz=UTC).date().isoformat()
+            write_head(output, replace(scan.head, checked_on=day), force=force)
+            click.echo(f"{output}: the head, checked on {day}")
     click.echo(RESEARCH_USE)
     if wrong:
         raise BadDataError(

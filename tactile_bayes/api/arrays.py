@@ -16,7 +16,15 @@ from tactile_bayes.errors import UsageError
 from tactile_bayes.files.array_map import read_array_map
 from tactile_bayes.files.arrays_layout import ArrayMap, Stated
 from tactile_bayes.files.documents import with_session
-from tactile_bayes.files.imports import combined, import_arrays, of_calibration, of_head, of_landmarks, of_poses
+from tactile_bayes.files.imports import (
+    combined,
+    import_arrays,
+    of_calibration,
+    of_head,
+    of_landmarks,
+    of_poses,
+    with_checked,
+)
 from tactile_bayes.files.instrument_json import head_geometry
 from tactile_bayes.files.named_arrays import Source
 from tactile_bayes.files.npz import Arrays
@@ -88,7 +96,7 @@ def scan_of(
     for note in made.notes:
         if note.startswith("CAUTION"):
             warnings.warn(note, stacklevel=3)
-    found = made.scan
+    found = with_checked(made.scan, _checked_head(head))
     if made.notes:
         found = replace(found, session={**found.session, "imported_as": "; ".join(made.notes)[:2000]})
     return corrected(with_session(found, path_of(session)), correct)
@@ -143,6 +151,13 @@ def _head(given: Any) -> Source:
         document = {"schema": _HEAD_SCHEMA, **to_plain(dict(given), digits=EXACT)}
         return of_head(head_geometry(document, path=Path("head")))
     return _beside(given, HeadGeometry, of_head, lambda other: other.head)
+
+
+def _checked_head(given: Any) -> Path | HeadGeometry | None:
+    """The head that was given, where it may say when it was checked."""
+    if isinstance(given, str | Path):
+        return path_of(given)
+    return getattr(given, "head", given if isinstance(given, HeadGeometry) else None)
 
 
 def _calibration(given: Any) -> Source:

@@ -114,6 +114,14 @@ import_command.help = f"{cleandoc(import_command.help or '')}\n\n{_ARRAYS}"
 @click.command("check")
 @click.argument("scans", nargs=-1, required=True, metavar="SCAN...", type=FilePath())
 @takes(MapOptions, "pressure_window_kpa")
+@click.option(
+    "-o",
+    "--output",
+    type=FilePath(),
+    metavar="HEAD.json",
+    help="Head of the scan with the day of this check, where the scan shows that it is right; for --head-geometry.",
+)
+@FORCE
 def check_command(**given: Any) -> None:
     """Check that array, lever arm and quaternions of scans are as they are stated.
 

@@ -168,6 +168,12 @@ def of_head(given: Path | HeadGeometry) -> Source:
     )
 
 
+def with_checked(scan: Scan, given: Path | HeadGeometry | None) -> Scan:
+    """The scan, with the day on which the head that was given for it was checked."""
+    head = read_head_geometry(given) if isinstance(given, Path) else given
+    return scan if head is None else replace(scan, head=replace(scan.head, checked_on=head.checked_on))
+
+
 def of_calibration(given: Path | ElementCalibration) -> Source:
     """Arrays of a scan that are the calibration of its array."""
     found = given if isinstance(given, ElementCalibration) else read_array_calibration(given).calibration

@@ -55,7 +55,13 @@ def s_from_ns(time_ns: NDArray[np.int64]) -> FloatArray:
 
 def head_document(head: HeadGeometry) -> dict[str, Any]:
     """Head geometry as plain data; JSON keeps every bit of a double."""
-    return dict(sorted(to_plain(head, digits=EXACT).items()))
+    plain = to_plain(head, digits=EXACT)
+    return {name: plain[name] for name in sorted(plain) if name != "checked_on" or head.checked_on}
+
+
+def write_head(path: Path, head: HeadGeometry, *, force: bool = False) -> None:
+    """Write a head as `read_head_geometry` reads it."""
+    write_text(path, dump_json({"schema": "tactile-bayes/head/1", **head_document(head)}), force=force)
 
 
 def calibration_document(calibration: ElementCalibration) -> dict[str, Any]:
@@ -122,6 +128,7 @@ class HeadFile(Record, kw_only=True):
         ]
         | None
     ) = None
+    checked_on: Annotated[date, Meta(description="When `check` found it right on a scan.")] | None = None
     scanhead_from_tracker: (
         Annotated[
             tuple[Row, Row, Row, Row],
@@ -150,7 +157,8 @@ def head_geometry(document: object, *, path: Path) -> HeadGeometry:
         if file.scanhead_from_tracker is None:
             raise BadDataError("lacks scanhead_from_tracker", way_out="add the transform from the sensor to the head")
         surface = _arc(file).surface_mm() if file.surface_mm is None else np.array(file.surface_mm)
-        return HeadGeometry(surface, file.pitch_mm, np.array(file.scanhead_from_tracker))
+        day = "" if file.checked_on is None else file.checked_on.isoformat()
+        return HeadGeometry(surface, file.pitch_mm, np.array(file.scanhead_from_tracker), day)
     except BadDataError as error:
         raise error.at(path) from None
 

@@ -74,7 +74,8 @@ NOTHING_SHOWN: Final = "too little stands out to show that array, lever arm and 
 NOT_CHECKED: Final = Finding(
     "arrangement_unknown",
     NOTHING_SHOWN,
-    "scan a phantom with a lump once and run `tactile-bayes check` on it",
+    "scan a phantom with a lump once, run `tactile-bayes check PHANTOM.mcap -o HEAD.json`, and give --head-geometry "
+    "HEAD.json from then on",
     "scan a phantom with a lump once and have it checked",
 )
 TOO_SHORT: Final = "too few frames to compare arrangements"
@@ -232,6 +233,10 @@ class ArrangementCheck(Record, eq=False):
         if self.says_nothing:
             return (NOT_CHECKED,)
         return ()
+
+    def findings_of(self, scan: Scan) -> tuple[Finding, ...]:
+        """The same; that nothing is shown is no finding where the scan's head was checked by another scan."""
+        return tuple(one for one in self.findings if one is not NOT_CHECKED or not scan.head.checked_on)
 
     @property
     def remedy(self) -> str:

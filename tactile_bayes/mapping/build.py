@@ -247,7 +247,7 @@ def _of_arrangement(
             raise BadDataError(f"{which}{check.words}", way_out=way_out)
         if check is not None:
             figures["arrangement_log_odds"] = max(check.log_odds, figures.get("arrangement_log_odds", 0.0))
-        findings.append(() if check is None else check.findings)
+        findings.append(() if check is None else check.findings_of(one.scan))
     return findings[0] if all(one == findings[0] for one in findings) else _numbered(findings)
 
 

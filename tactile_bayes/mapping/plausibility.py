@@ -221,7 +221,8 @@ def _unlike(quality: Mapping[str, float], head: HeadShape | None) -> Iterator[tu
     total, used = quality.get("frames_total", 0.0), quality.get("frames_used", 0.0)
     if total and (used < LEAST_FRAMES or used < LEAST_USED_SHARE * total):
         why = [f"{quality[name]:.0f} {words}" for name, words in _WHY_NOT if quality.get(name)]
-        yield f"only {used:.0f} of {total:.0f} frames are used{': ' if why else ''}{', '.join(why)}", ""
+        left_out = f" ({', '.join(why)})" if why else ""
+        yield f"only {used:.0f} of {total:.0f} frames are used{left_out}", "press evenly, over the whole place"
     if "frame_rate_hz" in quality and not RATE_HZ[0] <= quality["frame_rate_hz"] <= RATE_HZ[1]:
         yield _rate(quality["frame_rate_hz"])
     elif total > 1 and "frame_rate_hz" not in quality:

@@ -112,7 +112,7 @@ UNLIKE: dict[str, tuple[Callable[[Scan], Scan], str]] = {
     ),
     "rounded to kPa": (counts(lambda c: np.rint(c * KPA_PER_COUNT), gain=1 / KPA_PER_COUNT), "one count is"),
     "readings stand still": (counts(frozen), "readings stand still"),
-    "hardly a frame in the window": (counts(light), "frames are used: "),
+    "hardly a frame in the window": (counts(light), "frames are used ("),
     "places in m": (moved(1e-3), "the head stood still"),
     "places in inches": (moved(1 / 25.4), "the head stood still"),
     "places in twentieths": (moved(20.0), "the places spread over"),
