@@ -225,7 +225,7 @@ def _unlike(quality: Mapping[str, float], head: HeadShape | None) -> Iterator[tu
         yield f"only {used:.0f} of {total:.0f} frames are used{left_out}", "press evenly, over the whole place"
     if "frame_rate_hz" in quality and not RATE_HZ[0] <= quality["frame_rate_hz"] <= RATE_HZ[1]:
         yield _rate(quality["frame_rate_hz"])
-    elif total > 1 and "frame_rate_hz" not in quality:
+    elif total > 1 and "frames_missing" in quality and "frame_rate_hz" not in quality:  # a live map tells no times
         yield "all frames have one time: the array's clock stands still", "record the frames' times"
     if total and quality.get("dropped_elements", 0.0) > MOST_DROPPED * total:
         share = 100 * quality["dropped_elements"] / total

@@ -17,7 +17,7 @@ from tactile_bayes.api.settings import Settings
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import CANNOT_SHOW, BadDataError
 from tactile_bayes.mapping.build import build_map
-from tactile_bayes.mapping.plausibility import map_findings, scan_doubts
+from tactile_bayes.mapping.plausibility import exam_findings, map_findings, scan_doubts
 from tactile_bayes.mapping.select import find_faults
 from tactile_bayes.posterior.abstention import no_verdict
 from tactile_bayes.scan import ElementCalibration, HeadGeometry, Landmarks, PressureFrames, Scan, TrackerPoses
@@ -179,6 +179,13 @@ def test_what_hides_no_lump_is_told_and_leaves_the_verdict(made: Callable[[Scan]
     )
     why = no_verdict(build_map(one))
     assert why is None or told not in why.reason
+
+
+def test_a_clock_that_stands_still_is_told_and_a_map_without_times_is_not_doubted() -> None:
+    """A live map counts frames and keeps no times."""
+    counted = {"frames_total": 500.0, "frames_used": 480.0}
+    assert exam_findings(counted) == ()
+    assert "clock stands still" in exam_findings({**counted, "frames_missing": 0.0})[0].text
 
 
 # --- a map's cells, of whatever source
