@@ -157,7 +157,7 @@ def test_exams_of_one_scan_and_without_a_size_are_no_repeats_and_visits_are_apar
     write_done(out, [*rows, "01,1,1,3", "02,1,1,3", "03,2,1,1"])
     done = run_here("calibrate", "repeatability", "out", "-o", "with.json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    left_out = ["01.v1.m1.r3: of the same scan as 01.v1.m1.r1", "02.v1.m1.r3: it has no size"]
+    left_out = ["01.v1.m1.r3: of the same scan as 01.v1.m1.r1", "02.v1.m1.r3: it has no size (no calibration)"]
     assert f"Took no part: {'; '.join(left_out)}." in done.stdout
     without, given = (json.loads((tmp_path / name).read_text()) for name in ("without.json", "with.json"))
     assert given["left_out"] == left_out
