@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.scan import CountArray
+from tactile_bayes.scans import CountArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)

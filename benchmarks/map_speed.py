@@ -39,7 +39,7 @@ from tactile_bayes.mapping.cells import (
 )
 from tactile_bayes.mapping.plane import FramePoses
 from tactile_bayes.mapping.select import chunks
-from tactile_bayes.scan import ElementCalibration, HeadGeometry
+from tactile_bayes.scans import ElementCalibration, HeadGeometry
 
 RATE_HZ = 200
 _POOL = 2000

@@ -24,7 +24,7 @@ from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.hardware.emulated import EmulatedHead
 from tactile_bayes.hardware.head import HeadParser, encode_hello
 from tactile_bayes.hardware.recorder import Line, Recorder
-from tactile_bayes.scan import Scan
+from tactile_bayes.scans import Scan
 
 RATE_HZ = 200.0
 

@@ -3,7 +3,7 @@
 ``import tactile_bayes as tb`` offers what the command line does; each name is loaded when it is first used:
 
 - `read_scan`, `read_map`, `simulate`, `demo_scan`, `demo_map`: scans and maps
-- `scan_of`: from arrays, or a file of them, to a scan
+- `scan`: from arrays, or a file of them, to a scan
 - `map_of`: from values in rows and columns, or a file of them, to a map
 - `check`: whether array, lever arm and quaternions of a scan are as they are stated
 - `build_map`: from scans to a map
@@ -57,7 +57,7 @@ __all__ = [
     "read_map",
     "read_scan",
     "record",
-    "scan_of",
+    "scan",
     "simulate",
     "validate",
 ]
@@ -91,7 +91,7 @@ _HOME = {
     "read_map": "api.maps",
     "read_scan": "api.maps",
     "record": "api.recording",
-    "scan_of": "api.arrays",
+    "scan": "api.arrays",
     "simulate": "api.maps",
     "validate": "api.trials",
 }

@@ -1,5 +1,5 @@
 from tactile_bayes import errors as errors
-from tactile_bayes.api.arrays import scan_of as scan_of
+from tactile_bayes.api.arrays import scan as scan
 from tactile_bayes.api.comparing import Comparison as Comparison
 from tactile_bayes.api.comparing import compare as compare
 from tactile_bayes.api.diagnosing import Diagnosis as Diagnosis

@@ -9,7 +9,7 @@ from tactile_bayes.declarations import from_plain
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.scene import Head
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.scan import DEFAULT_HEAD, HeadShape
+from tactile_bayes.scans import DEFAULT_HEAD, HeadShape
 
 
 def grid(rows: int = 16, columns: int = 26, pitch_mm: float = 1.5) -> tuple[FloatArray, FloatArray]:

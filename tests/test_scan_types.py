@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.scan import ElementCalibration, HeadGeometry, Landmarks, PressureFrames, Scan, TrackerPoses
+from tactile_bayes.scans import ElementCalibration, HeadGeometry, Landmarks, PressureFrames, Scan, TrackerPoses
 
 Q = np.array([[1.0, 0.0, 0.0, 0.0]] * 2)
 P = np.zeros((2, 3))

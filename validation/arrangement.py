@@ -16,7 +16,7 @@ from tactile_bayes.declarations import replace
 from tactile_bayes.files.imports import read_arrays
 from tactile_bayes.mapping.arrangement import check_scan, corrected
 from tactile_bayes.presets import CORRECTIONS
-from tactile_bayes.scan import ElementCalibration, PressureFrames, Scan, TrackerPoses
+from tactile_bayes.scans import ElementCalibration, PressureFrames, Scan, TrackerPoses
 from validation.common import Table, parser
 from validation.lump_probability_scenes import draw
 

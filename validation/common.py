@@ -22,7 +22,7 @@ from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.geometry import apply
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import TactileMap
-from tactile_bayes.scan import Scan
+from tactile_bayes.scans import Scan
 
 RESULTS = Path(__file__).with_name("results")
 Row = dict[str, Any]

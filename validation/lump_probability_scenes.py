@@ -16,7 +16,7 @@ from tactile_bayes.declarations import replace
 from tactile_bayes.forward.scene import Scene
 from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.forward.tissue import Rib, fat_thickness
-from tactile_bayes.scan import Scan
+from tactile_bayes.scans import Scan
 from tactile_bayes.studies.population import BodyPrior, ExamPrior, draw_body, draw_exam
 from validation.stress import STRESSES
 from validation.stress_frames import stressed_scan

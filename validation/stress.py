@@ -27,7 +27,7 @@ from tactile_bayes.forward.scene import Scene
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import broken_assumptions, skewed
-from tactile_bayes.scan import Scan
+from tactile_bayes.scans import Scan
 from tactile_bayes.studies.population import BodyPrior, draw_mass
 from validation.common import Row, parser, pickled
 from validation.stress_frames import Physics, VaryingLayers, stressed_scan

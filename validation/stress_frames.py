@@ -44,7 +44,7 @@ from tactile_bayes.forward.solid import (
 )
 from tactile_bayes.forward.tissue import SceneBody, fat_thickness
 from tactile_bayes.geometry import FloatArray, apply, inverse, quaternion_from_rotation, rotation_from_quaternion
-from tactile_bayes.scan import Scan, TrackerPoses
+from tactile_bayes.scans import Scan, TrackerPoses
 
 REFERENCE_KPA = 9.5
 FACTORS = (0.5, 2.0)

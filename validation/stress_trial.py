@@ -23,7 +23,7 @@ from tactile_bayes.api.sized import Answer
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import TactileBayesError
 from tactile_bayes.mapping.build import build_map
-from tactile_bayes.scan import Scan
+from tactile_bayes.scans import Scan
 from tactile_bayes.studies.population import draw_mass
 from validation.common import errors_of, parser, pickled
 from validation.stress import BODIES, CONTROL, FRAME_RATE_HZ, STRESSES

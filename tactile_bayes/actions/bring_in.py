@@ -27,7 +27,7 @@ from tactile_bayes.findings import LEADS, finding_lines
 from tactile_bayes.mapping.arrangement import check_scan, corrected
 from tactile_bayes.mapping.plausibility import scan_doubts
 from tactile_bayes.presets import PRESSURE_WINDOW_KPA, RESEARCH_USE
-from tactile_bayes.scan import Scan
+from tactile_bayes.scans import Scan
 
 _BESIDE: Final = {"head_geometry": of_head, "array_calibration": of_calibration, "landmarks": of_landmarks}
 

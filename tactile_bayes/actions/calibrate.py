@@ -28,7 +28,7 @@ from tactile_bayes.report.calibration import (
     site_calibration_text,
 )
 from tactile_bayes.report.study import eq6_figure
-from tactile_bayes.scan import Scan
+from tactile_bayes.scans import Scan
 from tactile_bayes.shell import progress_bar
 from tactile_bayes.size.bodies import BodyCalibration
 

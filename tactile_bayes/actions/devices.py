@@ -30,7 +30,7 @@ from tactile_bayes.hardware.reading import ask_for_priority
 from tactile_bayes.hardware.readings import Follower, PoseReading, ToolReading
 from tactile_bayes.hardware.serial_trackers import TRACKERS, open_tracker, probe
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.scan import Scan
+from tactile_bayes.scans import Scan
 
 # --- `emulate`: serve a scan as a device would send it.
 

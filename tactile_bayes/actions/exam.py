@@ -33,7 +33,7 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.arrangement import TOO_SHORT, check_scan
 from tactile_bayes.mapping.plausibility import scan_doubts
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.scan import Scan
+from tactile_bayes.scans import Scan
 
 # --- `check`: is a scan arranged as it is stated?
 

@@ -37,7 +37,7 @@ from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.presets import FIELD_COSINES, INTERVAL
 from tactile_bayes.report.map_text import live_line, live_text
-from tactile_bayes.scan import ElementCalibration, HeadGeometry
+from tactile_bayes.scans import ElementCalibration, HeadGeometry
 from tactile_bayes.terminal import has_styles
 
 DRAWINGS_PER_S = 10.0

@@ -39,7 +39,7 @@ from tactile_bayes.hardware.serial_trackers import TRACKERS, check_head, open_tr
 from tactile_bayes.options import RecordOptions
 from tactile_bayes.presets import PRESSURE_RANGE_KPA
 from tactile_bayes.report.map_text import record_text
-from tactile_bayes.scan import ElementCalibration, HeadGeometry, Landmarks
+from tactile_bayes.scans import ElementCalibration, HeadGeometry, Landmarks
 
 # --- Options of one recording, and the part of them that the file stores.
 

@@ -34,7 +34,7 @@ from tactile_bayes.forward.tissue import SceneBody, SolidLump
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.laboratory import TradeoffReport, draw_tradeoff, tradeoff_document, tradeoff_text
 from tactile_bayes.report.tradeoff import DIGITS, draw_ladder, ladder_file, ladder_text
-from tactile_bayes.scan import Scan
+from tactile_bayes.scans import Scan
 from tactile_bayes.shell import progress_bar
 from tactile_bayes.size.pooling import PooledEstimate
 from tactile_bayes.studies.estimate_tradeoff import SIZE, Clock, Ladder, PooledRow, SizeAnswer, Work, measure

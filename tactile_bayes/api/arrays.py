@@ -29,13 +29,13 @@ from tactile_bayes.files.instrument_json import head_geometry
 from tactile_bayes.files.named_arrays import Source
 from tactile_bayes.files.npz import Arrays
 from tactile_bayes.mapping.arrangement import corrected
-from tactile_bayes.scan import ElementCalibration, HeadGeometry, Landmarks, Scan, TrackerPoses
+from tactile_bayes.scans import ElementCalibration, HeadGeometry, Landmarks, Scan, TrackerPoses
 
 _HEAD_SCHEMA = "tactile-bayes/head/1"
 
 
 @door
-def scan_of(
+def scan(
     frames: Any,
     time: Any = None,
     poses: Any = None,
@@ -85,7 +85,7 @@ def scan_of(
     UsageError
         When an argument cannot be so.
     """
-    check_keywords("scan_of", stated, names_of(Stated))
+    check_keywords("scan", stated, names_of(Stated))
     given = _stated(columns, stated)
     beside = [_poses(poses, given), _head(head), _calibration(calibration), _landmarks(landmarks)]
     if isinstance(frames, str | Path):
@@ -121,7 +121,7 @@ def _stated(columns: PathLike | Mapping[str, Any] | None, stated: Mapping[str, A
 
 
 def _poses(given: Any, stated: ArrayMap) -> Source:
-    """Times, places and rotations, in the forms that `scan_of` takes."""
+    """Times, places and rotations, in the forms that `scan` takes."""
     if given is None:
         return Source({})
     if isinstance(given, str | Path):

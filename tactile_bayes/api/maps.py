@@ -29,7 +29,7 @@ from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.options import MapOptions
 from tactile_bayes.presets import PRESSURE_WINDOW_KPA, RESEARCH_USE
 from tactile_bayes.report.map_figure import map_figure
-from tactile_bayes.scan import Scan
+from tactile_bayes.scans import Scan
 
 if TYPE_CHECKING:
     import pandas
@@ -293,7 +293,7 @@ def scan_given(given: Any) -> Scan:
     scan = getattr(given, "scan", given)
     if not isinstance(scan, Scan):
         kind = type(given).__name__
-        raise UsageError(f"a scan is wanted, not {kind}; read one with read_scan, or make one of arrays with scan_of")
+        raise UsageError(f"a scan is wanted, not {kind}; read one with read_scan, or make one of arrays with tb.scan")
     return scan
 
 

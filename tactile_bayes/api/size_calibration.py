@@ -19,7 +19,7 @@ from tactile_bayes.files.tables import Sheet, Table, read_table
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.presets import FIT_RADIUS_MM, LEAST_HARD_RATIO, Background
 from tactile_bayes.progress import Progress
-from tactile_bayes.scan import HeadShape
+from tactile_bayes.scans import HeadShape
 from tactile_bayes.size.eq6 import LeftOutErrors
 from tactile_bayes.size.learn import bodies as learning
 from tactile_bayes.size.learn.eq6 import (

@@ -33,7 +33,7 @@ from tactile_bayes.report.exam_words import Exam, ExamMap, Given, exam_map
 from tactile_bayes.report.figure_file import named_exam
 from tactile_bayes.report.pages import PageFiles
 from tactile_bayes.report.quantities import estimate_quantities, leading_size, lump_place, side_of
-from tactile_bayes.scan import HeadShape
+from tactile_bayes.scans import HeadShape
 from tactile_bayes.size.draws import EXTREMES, SIZES, ShapeDraws, SizePosterior
 from tactile_bayes.size.fat import BetweenMaps, head_profile
 from tactile_bayes.size.pooling import Calibration, SizePriors

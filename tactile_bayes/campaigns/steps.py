@@ -62,7 +62,7 @@ from tactile_bayes.report.exam_words import exam_map
 from tactile_bayes.report.growth_page import Course, growth_page
 from tactile_bayes.report.quantities import side_of
 from tactile_bayes.report.svg import thumbnail_svg
-from tactile_bayes.scan import Scan
+from tactile_bayes.scans import Scan
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.draws import SIZES, SizePosterior
 from tactile_bayes.size.pooling import size_alone

@@ -16,7 +16,7 @@ from tactile_bayes.declarations import Meta, Record, field, from_plain, names_of
 from tactile_bayes.errors import BadDataError, meant
 from tactile_bayes.files.reading import JSON_BYTES, TOML_BYTES, decoding, kind_of, read_text, schema_kind
 from tactile_bayes.options import TrialSettings
-from tactile_bayes.scan import Scan
+from tactile_bayes.scans import Scan
 
 # --- The schemas in data_schema/, from a wheel or a checkout.
 

@@ -26,7 +26,7 @@ from tactile_bayes.files.sequence_mha import is_sequence, read_sequence
 from tactile_bayes.geometry import FloatArray, check_rigid
 from tactile_bayes.mapping.select import other_units
 from tactile_bayes.presets import KPA_PER_UNIT, PRESSURE_RANGE_KPA, PRESSURE_WINDOW_KPA
-from tactile_bayes.scan import ElementCalibration, HeadGeometry, Landmarks, PressureFrames, Scan, TrackerPoses
+from tactile_bayes.scans import ElementCalibration, HeadGeometry, Landmarks, PressureFrames, Scan, TrackerPoses
 
 # No value of a scan is larger, seconds since 1970 included; the squares of damaged ones would overflow.
 _LARGEST: Final = 1e12

@@ -16,7 +16,7 @@ from tactile_bayes.files.atomic import write_text
 from tactile_bayes.files.documents import dump_json, load_json, parse_record, read_record
 from tactile_bayes.forward.scene import FLAT_MM, Columns, Head, Pitch, Rows, Scene
 from tactile_bayes.geometry import FloatArray, Matrix
-from tactile_bayes.scan import ElementCalibration, HeadGeometry, HeadShape, Landmarks, Scan
+from tactile_bayes.scans import ElementCalibration, HeadGeometry, HeadShape, Landmarks, Scan
 
 # --- Parts of a scan file besides MCAP: head and calibration documents, times in ns, the reader's report.
 

@@ -24,7 +24,7 @@ from tactile_bayes.geometry import FloatArray, check_rigid
 from tactile_bayes.mapping.map import MapRecipe, TactileMap
 from tactile_bayes.posterior.result import DrawGroup, Estimate
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.scan import HeadShape
+from tactile_bayes.scans import HeadShape
 from tactile_bayes.size.draws import SizePosterior
 
 # --- Tactile maps as netCDF by the CF conventions; equal maps give equal bytes.

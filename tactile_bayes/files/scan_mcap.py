@@ -27,7 +27,7 @@ from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.findings import Finding, finding_lines, findings_in
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.select import Span, with_times
-from tactile_bayes.scan import (
+from tactile_bayes.scans import (
     CountArray,
     ElementCalibration,
     HeadGeometry,

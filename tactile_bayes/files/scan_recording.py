@@ -21,7 +21,7 @@ from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.atomic import refuse_existing
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.scan_mcap import ScanWriter
-from tactile_bayes.scan import ElementCalibration, HeadGeometry
+from tactile_bayes.scans import ElementCalibration, HeadGeometry
 
 LOG_TOPIC: Final = "/log"
 ACCOUNT: Final = "recording"

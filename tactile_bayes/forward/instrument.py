@@ -11,7 +11,7 @@ from tactile_bayes.declarations import Record, as_dict
 from tactile_bayes.forward.scene import Background, Scene, Strokes, rotation_from_vector
 from tactile_bayes.geometry import FloatArray, apply, inverse, patient_from_base, quaternion_from_rotation
 from tactile_bayes.presets import PRESSURE_RANGE_KPA
-from tactile_bayes.scan import ElementCalibration, HeadGeometry, Landmarks, PressureFrames, Scan, TrackerPoses
+from tactile_bayes.scans import ElementCalibration, HeadGeometry, Landmarks, PressureFrames, Scan, TrackerPoses
 
 FULL_SCALE_COUNT: Final = 4095  # 12-bit converter
 TRUTH_SCHEMA: Final = "tactile-bayes/truth/1"

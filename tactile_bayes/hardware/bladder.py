@@ -12,7 +12,7 @@ from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import FloatArray, rotation_from_quaternion
 from tactile_bayes.hardware.readings import CountArray
-from tactile_bayes.scan import ElementCalibration
+from tactile_bayes.scans import ElementCalibration
 
 # --- Calibration of an array by a pressure bladder: steps of uniform pressure give each taxel's gain and offset.
 

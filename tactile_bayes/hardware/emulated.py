@@ -25,7 +25,7 @@ from tactile_bayes.hardware.readings import (
 )
 from tactile_bayes.hardware.serial_trackers import record_bytes
 from tactile_bayes.hardware.trackers import encode_transform
-from tactile_bayes.scan import Scan, TrackerPoses
+from tactile_bayes.scans import Scan, TrackerPoses
 
 # --- Emulated devices: a scan's frames and poses as a head or a tracker sends them, with faults on request.
 #

@@ -25,7 +25,7 @@ from tactile_bayes.mapping.accumulate import Instrument, MapAccumulator, MapGrid
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.mapping.plane import poses_at
 from tactile_bayes.presets import PRESSURE_WINDOW_KPA
-from tactile_bayes.scan import ElementCalibration, HeadGeometry, TrackerPoses
+from tactile_bayes.scans import ElementCalibration, HeadGeometry, TrackerPoses
 
 # --- Feed of a recording to its live view, through a pipe on which the recorder never waits.
 #

@@ -18,7 +18,7 @@ from tactile_bayes.mapping.profile import GrowingProfile
 from tactile_bayes.mapping.select import SelectedFrames, TaxelFault, chunks, gate, good_taxels
 from tactile_bayes.presets import CELL_MM, PRESSURE_WINDOW_KPA
 from tactile_bayes.progress import Progress, untold
-from tactile_bayes.scan import CountArray, ElementCalibration, HeadGeometry, HeadShape, Scan
+from tactile_bayes.scans import CountArray, ElementCalibration, HeadGeometry, HeadShape, Scan
 
 # --- Used frames of a scan on the map's lattice, which can be read any number of times.
 

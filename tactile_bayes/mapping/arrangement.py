@@ -27,7 +27,7 @@ from tactile_bayes.mapping.plane import poses_at
 from tactile_bayes.mapping.plausibility import SURE_ODDS, scan_doubts
 from tactile_bayes.mapping.select import SelectedFrames, TaxelFault, select_frames
 from tactile_bayes.presets import CORRECTIONS, PRESSURE_WINDOW_KPA
-from tactile_bayes.scan import ElementCalibration, HeadGeometry, PressureFrames, Scan, TrackerPoses
+from tactile_bayes.scans import ElementCalibration, HeadGeometry, PressureFrames, Scan, TrackerPoses
 
 _ARRAY: Final = (
     (),

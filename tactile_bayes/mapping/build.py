@@ -35,7 +35,7 @@ from tactile_bayes.mapping.strokes import StrokeShift, mobility, stroke_count, s
 from tactile_bayes.mapping.strokes import register_strokes as find_shifts
 from tactile_bayes.options import MapOptions
 from tactile_bayes.progress import Progress, untold
-from tactile_bayes.scan import HeadShape, Scan
+from tactile_bayes.scans import HeadShape, Scan
 
 # --- Frames near the mass, to which the paper fits its plane.
 

@@ -15,7 +15,7 @@ from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import BoolArray, FloatArray, IndexArray, apply, inverse
 from tactile_bayes.mapping.plane import FramePoses
 from tactile_bayes.presets import PRESSURE_RANGE_KPA
-from tactile_bayes.scan import CountArray, ElementCalibration, HeadGeometry
+from tactile_bayes.scans import CountArray, ElementCalibration, HeadGeometry
 
 # --- Sums of readings in square cells that are the same to the bit in any order and any parts.
 

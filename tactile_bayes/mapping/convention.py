@@ -13,7 +13,7 @@ from tactile_bayes.geometry import BoolArray, FloatArray, IndexArray, inverse, r
 from tactile_bayes.mapping.cells import Projection
 from tactile_bayes.mapping.plane import MAX_POSE_GAP_MS, distinct_poses
 from tactile_bayes.mapping.select import SelectedFrames, chunks
-from tactile_bayes.scan import TrackerPoses
+from tactile_bayes.scans import TrackerPoses
 
 # --- Frames averaged over 20 ms and over 2 x 2 taxels: all that finding shifts of a millimetre needs, in a tenth of it.
 

@@ -14,7 +14,7 @@ from tactile_bayes.declarations import Meta, Record, field, settle
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.findings import Finding
 from tactile_bayes.geometry import BoolArray, FloatArray
-from tactile_bayes.scan import HeadShape
+from tactile_bayes.scans import HeadShape
 
 # --- Binomial smoothing of sums in cells.
 

@@ -23,7 +23,7 @@ from tactile_bayes.geometry import (
     rotation_from_quaternion,
     unroll_quaternion_signs,
 )
-from tactile_bayes.scan import HeadGeometry, TrackerPoses
+from tactile_bayes.scans import HeadGeometry, TrackerPoses
 
 # --- Poses of the head at the frames' times, interpolated from the tracker's.
 

@@ -26,7 +26,7 @@ from tactile_bayes.mapping.select import (
     select_frames,
     timing_figures,
 )
-from tactile_bayes.scan import HeadShape, Landmarks, Scan
+from tactile_bayes.scans import HeadShape, Landmarks, Scan
 
 RATE_HZ: Final = (5.0, 2000.0)
 """Of frames."""

@@ -15,7 +15,7 @@ from tactile_bayes.mapping.cells import Readout
 from tactile_bayes.mapping.convention import stroke_starts
 from tactile_bayes.mapping.select import SelectedFrames, chunks
 from tactile_bayes.presets import HEAD_PROFILE
-from tactile_bayes.scan import CountArray
+from tactile_bayes.scans import CountArray
 
 # --- Reproducible random choice of frames by a hash of their levels, independent of order and portions.
 #

@@ -18,7 +18,7 @@ from tactile_bayes.geometry import BoolArray, FloatArray
 from tactile_bayes.mapping.cells import Projector, Readout, chunk_frames
 from tactile_bayes.mapping.plane import MAX_POSE_GAP_MS, FramePoses, distinct_poses, poses_at
 from tactile_bayes.presets import KPA_PER_UNIT, PRESSURE_WINDOW_KPA
-from tactile_bayes.scan import PressureFrames, Scan, TrackerPoses
+from tactile_bayes.scans import PressureFrames, Scan, TrackerPoses
 
 # --- Detection of faulty taxels over a whole scan.
 

@@ -38,7 +38,7 @@ from tactile_bayes.posterior.search import Assessment, SizedDraws, best_chance, 
 from tactile_bayes.posterior.white import Candidate, check_background
 from tactile_bayes.presets import CELL_PER_SIGMA
 from tactile_bayes.progress import Progress
-from tactile_bayes.scan import DEFAULT_HEAD, HeadShape
+from tactile_bayes.scans import DEFAULT_HEAD, HeadShape
 from tactile_bayes.size.draws import SizePosterior
 from tactile_bayes.size.fat import head_profile
 from tactile_bayes.size.pooling import Calibration

@@ -16,7 +16,7 @@ from tactile_bayes.errors import Abstention, BadDataError
 from tactile_bayes.geometry import BoolArray, FloatArray, Matrix, Vector
 from tactile_bayes.inference.points import normal_quantile
 from tactile_bayes.presets import INTERVAL, Background, Noise
-from tactile_bayes.scan import HeadShape
+from tactile_bayes.scans import HeadShape
 
 LEARN_ANEW: Final = "learn the calibration anew"
 _RANGES: Final = ("amplitude", "sigma_mm", "d_mm")

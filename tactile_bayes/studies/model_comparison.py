@@ -24,7 +24,7 @@ from tactile_bayes.mapping.select import SelectedFrames, select_frames
 from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.white import BumpFit, fit_bump, fitted_candidates
 from tactile_bayes.presets import CELL_MM, FIT_RADIUS_MM, PRESSURE_WINDOW_KPA
-from tactile_bayes.scan import ElementCalibration, PressureFrames, Scan
+from tactile_bayes.scans import ElementCalibration, PressureFrames, Scan
 from tactile_bayes.studies.paper_tables import mean_squared_difference
 
 Progress = Callable[[int, int], None]

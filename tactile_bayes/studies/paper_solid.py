@@ -24,7 +24,7 @@ from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.bump import Bump, FitCells, window_cells
 from tactile_bayes.posterior.white import LEAST_WIDTH_IN_CELLS, MOST_AXIS_RATIO, WIDEST_IN_RADII
 from tactile_bayes.presets import FIT_RADIUS_MM
-from tactile_bayes.scan import CountArray, ElementCalibration, HeadGeometry, PressureFrames, Scan, TrackerPoses
+from tactile_bayes.scans import CountArray, ElementCalibration, HeadGeometry, PressureFrames, Scan, TrackerPoses
 from tactile_bayes.studies.paper import DETECTABLE, CaseSettings, Geometry, StudyRow, seat_name
 
 # --- Maps of a study's raster of frames, built and fitted like a patient's.

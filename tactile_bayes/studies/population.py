@@ -17,7 +17,7 @@ from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.presets import DEFAULT_NORMALISE, HEAD_PROFILE
-from tactile_bayes.scan import FLAT_RADIUS_MM, HeadShape, Scan
+from tactile_bayes.scans import FLAT_RADIUS_MM, HeadShape, Scan
 from tactile_bayes.size.draws import ShapeDraws
 from tactile_bayes.size.learn.regression import PopulationTable
 from tactile_bayes.size.terms import LOGGED

@@ -20,7 +20,7 @@ from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.mapping.select import first_seconds
 from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.presets import CELL_MM, DEFAULT_NORMALISE, NORMALISE, SHOULDERS_INSIDE, THICKNESS_MM
-from tactile_bayes.scan import Scan
+from tactile_bayes.scans import Scan
 from tactile_bayes.size.bodies import BodyCalibration, mean_width_mm
 from tactile_bayes.size.eq6 import SizeCalibration
 from tactile_bayes.size.pooling import Calibration

@@ -14,7 +14,7 @@ from tactile_bayes.files.instrument_json import read_head_geometry
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.scan_mcap import read_scan, write_scan
 from tactile_bayes.mapping.build import build_map
-from tactile_bayes.scan import PressureFrames, Scan
+from tactile_bayes.scans import PressureFrames, Scan
 
 
 def even(scan: Scan) -> Scan:

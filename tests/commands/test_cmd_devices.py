@@ -20,7 +20,7 @@ from tactile_bayes.hardware.bladder import rotation_sense
 from tactile_bayes.hardware.emulated import EmulatedHead, EmulatedTracker
 from tactile_bayes.hardware.emulator import PtyLink
 from tactile_bayes.hardware.ports import guess
-from tactile_bayes.scan import TrackerPoses
+from tactile_bayes.scans import TrackerPoses
 
 
 def pivoting(turn_deg: float = 40.0, *, count: int = 200, noise_mm: float = 0.3) -> TrackerPoses:

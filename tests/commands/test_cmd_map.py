@@ -20,7 +20,7 @@ from tactile_bayes.findings import Finding
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.map_text import map_summary
-from tactile_bayes.scan import Landmarks, Scan
+from tactile_bayes.scans import Landmarks, Scan
 
 
 def small_scan(*, level_kpa: float = 8.0) -> Scan:

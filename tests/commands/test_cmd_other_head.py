@@ -24,7 +24,7 @@ from tactile_bayes.files.tables import Sheet, Table, read_table
 from tactile_bayes.forward.scene import Head, Lump, Scene, Strokes
 from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.mapping.build import build_map
-from tactile_bayes.scan import DEFAULT_HEAD, HeadShape
+from tactile_bayes.scans import DEFAULT_HEAD, HeadShape
 from tactile_bayes.studies.population import MassRow, head_columns
 
 FLAT = Head(rows=12, columns=12, pitch_mm=2.0, radius_mm=100_000.0)

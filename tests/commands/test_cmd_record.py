@@ -27,7 +27,7 @@ from tactile_bayes.hardware.emulator import PtyLink
 from tactile_bayes.hardware.ports import Port
 from tactile_bayes.hardware.readings import MM_PER_INCH
 from tactile_bayes.mapping.build import build_map
-from tactile_bayes.scan import Scan
+from tactile_bayes.scans import Scan
 
 
 @pytest.fixture(scope="module")

@@ -19,7 +19,7 @@ from tactile_bayes.declarations import replace
 from tactile_bayes.errors import UsageError
 from tactile_bayes.files.map_nc import read_map_and_scans, write_map
 from tactile_bayes.files.provenance import Provenance, recordings
-from tactile_bayes.scan import PressureFrames
+from tactile_bayes.scans import PressureFrames
 
 FAST = ("--method", "laplace")
 TOLD = "a map of the same scan as {} is no repeat: the interval is too narrow."

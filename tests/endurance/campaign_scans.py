@@ -24,7 +24,7 @@ from tactile_bayes.forward.instrument import frame_times, record
 from tactile_bayes.forward.scene import Background, Noise, Scene, Strokes
 from tactile_bayes.forward.solid import solid_frames
 from tactile_bayes.forward.tissue import SceneBody, SolidLump
-from tactile_bayes.scan import Scan
+from tactile_bayes.scans import Scan
 
 EMPTY_EVERY, CUT_EVERY, DAMAGED_EVERY = 20, 250, 250
 SEED = 20261124

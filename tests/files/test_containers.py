@@ -23,7 +23,7 @@ from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.scan_mcap import read_scan, read_scan_report
 from tactile_bayes.files.tables import read_table
 from tactile_bayes.mapping.build import build_map
-from tactile_bayes.scan import Scan
+from tactile_bayes.scans import Scan
 
 DEMO = Path(tactile_bayes.__file__).parent / "demo" / "scan.mcap"
 

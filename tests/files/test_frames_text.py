@@ -14,7 +14,7 @@ from in_process import run_here
 import tactile_bayes as tb
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.scan_mcap import read_scan
-from tactile_bayes.scan import Scan
+from tactile_bayes.scans import Scan
 
 SCAN = short_scan()
 KPA = pressures(SCAN)
@@ -23,7 +23,7 @@ FLAT = KPA.reshape(len(KPA), -1)
 
 
 def brought_in(path: Path, **stated: Any) -> Scan:
-    return tb.scan_of(path, None, SCAN.poses, head=SCAN.head, **stated)
+    return tb.scan(path, None, SCAN.poses, head=SCAN.head, **stated)
 
 
 def same(found: Scan, *, atol: float = 1e-3) -> None:
@@ -174,7 +174,7 @@ def test_frames_and_poses_in_one_table(tmp_path: Path) -> None:
     lines[7] = lines[7].replace("OK", "Missing")
     path = tmp_path / "log.csv"
     path.write_text("\n".join(["time,status,x,y,z,qw,qx,qy,qz," + NAMES, *lines]))
-    found = tb.scan_of(path, None, path, head=SCAN.head, unit="kPa")
+    found = tb.scan(path, None, path, head=SCAN.head, unit="kPa")
     same(found)
     assert len(found.poses) == len(found.frames) - 1
     np.testing.assert_allclose(found.poses.position_mm[0], pose[0], atol=1e-5)

@@ -17,7 +17,7 @@ from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.instrument_json import read_landmarks
 from tactile_bayes.files.map_nc import read_map, write_map
 from tactile_bayes.files.scan_mcap import read_scan, summarise_scan, write_scan
-from tactile_bayes.scan import Landmarks, Scan
+from tactile_bayes.scans import Landmarks, Scan
 
 NOTCH, XIPHOID, NIPPLE = (np.array(p) for p in ([0.0, 200.0, 0.0], [0.0, 0.0, 0.0], [-80.0, 60.0, -3.0]))
 

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 import tactile_bayes as tb
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.scan import Scan
+from tactile_bayes.scans import Scan
 
 SCAN = short_scan()
 POSES = SCAN.poses
@@ -28,7 +28,7 @@ KEPT = [i for i in range(len(TIME)) if i not in LOST]
 
 
 def brought_in(path: Path, **stated: Any) -> Scan:
-    return tb.scan_of(pressures(SCAN), SCAN.frames.time_s, path, head=SCAN.head, unit="kPa", **stated)
+    return tb.scan(pressures(SCAN), SCAN.frames.time_s, path, head=SCAN.head, unit="kPa", **stated)
 
 
 def same(found: Scan, kept: list[int] | None = None) -> None:
@@ -223,7 +223,7 @@ def test_an_error_names_the_file_that_it_is_about(tmp_path: Path) -> None:
     path = tmp_path / "poses.csv"
     path.write_text("\n".join(with_times(ROWS_OF_16, lambda t: f"{1000 * t:.2f}")))
     with pytest.raises(BadDataError, match=r"poses\.csv: pose_time_s steps by 8.*pose_time_unit ms"):
-        tb.scan_of(tmp_path / "frames.npz", None, path, head=SCAN.head, unit="kPa")
+        tb.scan(tmp_path / "frames.npz", None, path, head=SCAN.head, unit="kPa")
     lines = with_times(ROWS_OF_16)
     lines[5] = lines[5].rpartition(",")[0]
     path.write_text("\n".join(lines))
@@ -256,7 +256,7 @@ def sequence(path: Path, *, packed: bool, tools: tuple[str, ...] = ("Probe",)) -
 @pytest.mark.parametrize("packed", [False, True])
 def test_a_sequence_metafile_has_frames_and_poses(tmp_path: Path, packed: bool) -> None:
     sequence(tmp_path / "exam.igs.mha", packed=packed)
-    found = tb.scan_of(tmp_path / "exam.igs.mha", head=SCAN.head, unit="kPa")
+    found = tb.scan(tmp_path / "exam.igs.mha", head=SCAN.head, unit="kPa")
     kpa = found.element_calibration.to_kpa(found.frames.counts)
     np.testing.assert_allclose(kpa, pressures(SCAN), atol=1e-3)
     assert len(found.poses) == len(found.frames) - 2
@@ -279,5 +279,5 @@ def test_a_sequence_metafile_with_two_tools_or_damage_is_one_line(tmp_path: Path
     ):
         path.write_bytes(bad)
         with pytest.raises(BadDataError) as caught:
-            tb.scan_of(path, head=SCAN.head, unit="kPa", tool="ProbeToTracker")
+            tb.scan(path, head=SCAN.head, unit="kPa", tool="ProbeToTracker")
         assert "\n" not in str(caught.value)

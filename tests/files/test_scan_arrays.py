@@ -28,7 +28,7 @@ from tactile_bayes.files.named_arrays import read_named
 from tactile_bayes.files.scan_mcap import read_scan
 from tactile_bayes.forward.scene import Scene
 from tactile_bayes.forward.simulate import simulate
-from tactile_bayes.scan import Scan
+from tactile_bayes.scans import Scan
 
 Arrays = dict[str, Any]
 
@@ -157,11 +157,11 @@ def test_plain_words_are_taken_for_arrays_and_said(pressed: Arrays, scan: Scan, 
 def test_npy_holds_the_frames_alone_or_named_fields(pressed: Arrays, scan: Scan, head: Path, tmp_path: Path) -> None:
     np.save(tmp_path / "frames.npy", pressed["frames"])
     poses = (pressed["pose_time_s"], pressed["position_mm"], pressed["quaternion_wxyz"])
-    found = tb.scan_of(tmp_path / "frames.npy", None, poses, head=head, unit="kPa", rate_hz=200.0)
+    found = tb.scan(tmp_path / "frames.npy", None, poses, head=head, unit="kPa", rate_hz=200.0)
     np.testing.assert_allclose(found.frames.time_s, np.arange(len(found.frames)) / 200.0)
     named = np.array(list(zip(pressed["frames"], pressed["frame_time_s"], strict=True)), dtype=fields_of(pressed))
     np.save(tmp_path / "named.npy", named)
-    found = tb.scan_of(tmp_path / "named.npy", None, poses, head=head, unit="kPa")
+    found = tb.scan(tmp_path / "named.npy", None, poses, head=head, unit="kPa")
     np.testing.assert_array_equal(found.frames.time_s, scan.frames.time_s)
 
 
@@ -216,7 +216,7 @@ def scan_of(arrays: Arrays, **stated: Any) -> Scan:
         "surface_mm": arrays["head_surface_mm"],
         "scanhead_from_tracker": arrays["array_from_tracker"],
     }
-    return tb.scan_of(arrays["frames"], arrays["frame_time_s"], poses, head=head, **stated)
+    return tb.scan(arrays["frames"], arrays["frame_time_s"], poses, head=head, **stated)
 
 
 def test_pressures_that_are_too_small_are_asked_about_by_import_and_map(pressed: Arrays) -> None:
@@ -277,12 +277,12 @@ def test_matrices_euler_angles_and_scalar_last_are_the_same_poses(pressed: Array
         (np.column_stack([time, place, pressed["quaternion_wxyz"]]), {}),
     ]
     for poses, stated in given:
-        found = tb.scan_of(frames, frame_time, poses, head=head, unit="kPa", **stated).poses
+        found = tb.scan(frames, frame_time, poses, head=head, unit="kPa", **stated).poses
         np.testing.assert_allclose(found.position_mm, place, atol=1e-9)
         apart = turned.inv() * Rotation.from_quat(found.quaternion_wxyz, scalar_first=True)
         assert apart.magnitude().max() < 1e-6
     with pytest.raises(BadDataError, match="pose_matrix is not rigid at index 0"):
-        tb.scan_of(frames, frame_time, (time, matrices.swapaxes(1, 2)), head=head, unit="kPa")
+        tb.scan(frames, frame_time, (time, matrices.swapaxes(1, 2)), head=head, unit="kPa")
 
 
 def test_azimuth_elevation_and_roll_turn_about_z_y_and_x() -> None:
@@ -502,36 +502,36 @@ def test_a_call_that_cannot_be_is_a_usage_error(tmp_path: Path, words: tuple[str
 
 def test_python_takes_records_of_another_scan_and_says_what_it_cannot_take(scan: Scan) -> None:
     counts, time = scan.frames.counts, scan.frames.time_s
-    found = tb.scan_of(counts, time, scan.poses, head=scan, calibration=scan, landmarks=scan.landmarks)
+    found = tb.scan(counts, time, scan.poses, head=scan, calibration=scan, landmarks=scan.landmarks)
     same(found, scan)
     assert found.landmarks is not None
     with pytest.raises(UsageError, match=r"poses is int of shape \(\)"):
-        tb.scan_of(counts, time, 3, head=scan)
+        tb.scan(counts, time, 3, head=scan)
     with pytest.raises(TypeError, match="no keyword 'units'; did you mean unit"):
-        tb.scan_of(counts, time, scan.poses, head=scan, units="kPa")
+        tb.scan(counts, time, scan.poses, head=scan, units="kPa")
     with pytest.raises(BadDataError, match="head: pitch is not known; did you mean pitch_mm"):
-        tb.scan_of(counts, time, scan.poses, head={"pitch": 1.5})
+        tb.scan(counts, time, scan.poses, head={"pitch": 1.5})
 
 
 def test_python_takes_lists_frames_dates_and_half_floats_and_no_masked_reading(pressed: Arrays, scan: Scan) -> None:
     kpa, time, head = pressed["frames"], scan.frames.time_s, scan.head
     table = pd.DataFrame(np.column_stack([pressed[name] for name in ("pose_time_s", "position_mm", "quaternion_wxyz")]))
-    same_as = tb.scan_of(kpa, time, scan.poses, head=head, unit="kPa").frames.counts
+    same_as = tb.scan(kpa, time, scan.poses, head=head, unit="kPa").frames.counts
     for frames in (kpa.tolist(), np.ma.masked_invalid(kpa)):
-        found = tb.scan_of(frames, pd.Series(time), table, head=head, unit="kPa")
+        found = tb.scan(frames, pd.Series(time), table, head=head, unit="kPa")
         np.testing.assert_array_equal(found.frames.counts, same_as)
-    half = tb.scan_of(kpa.astype(np.float16), time, scan.poses, head=head, unit="kPa")
+    half = tb.scan(kpa.astype(np.float16), time, scan.poses, head=head, unit="kPa")
     np.testing.assert_allclose(half.frames.counts, same_as, atol=10)
     start = np.datetime64("2026-11-26T10:00:00", "ns")
     dated = start + (1e9 * time).astype("m8[ns]")
     poses = (start + (1e9 * scan.poses.time_s).astype("m8[ns]"), scan.poses.position_mm, scan.poses.quaternion_wxyz)
-    found = tb.scan_of(kpa, dated, poses, head=head, unit="kPa")
+    found = tb.scan(kpa, dated, poses, head=head, unit="kPa")
     np.testing.assert_allclose(np.diff(found.frames.time_s), np.diff(time), atol=1e-6)
     masked = np.ma.masked_greater(kpa, 9.9)
     with pytest.raises(BadDataError, match=r"frames holds .* values that are not finite"):
-        tb.scan_of(masked, time, scan.poses, head=head, unit="kPa")
+        tb.scan(masked, time, scan.poses, head=head, unit="kPa")
     with pytest.raises(BadDataError, match="frames of 26 x 16 taxels, and the head 16 x 26; swap their last two axes"):
-        tb.scan_of(kpa.swapaxes(1, 2), time, scan.poses, head=head, unit="kPa")
+        tb.scan(kpa.swapaxes(1, 2), time, scan.poses, head=head, unit="kPa")
 
 
 def test_a_scene_needs_no_file() -> None:

@@ -20,7 +20,7 @@ from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.scan_mcap import CHUNK_BYTES, ScanWriter, read_scan, read_scan_report, read_truth, write_scan
 from tactile_bayes.forward.scene import Lump, Scene
 from tactile_bayes.forward.simulate import simulate
-from tactile_bayes.scan import ElementCalibration, HeadGeometry, Landmarks, PressureFrames, Scan, TrackerPoses
+from tactile_bayes.scans import ElementCalibration, HeadGeometry, Landmarks, PressureFrames, Scan, TrackerPoses
 
 MADE = Provenance("test", {"a": 1})
 SCENE = Scene(duration_s=1.0, lumps=(Lump(),))

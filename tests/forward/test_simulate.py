@@ -22,7 +22,7 @@ from tactile_bayes.forward.scene import Background, Lump, Noise, Scene, SceneLan
 from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.forward.tissue import SolidLump
 from tactile_bayes.geometry import apply, inverse, rotation_from_quaternion
-from tactile_bayes.scan import Scan
+from tactile_bayes.scans import Scan
 
 SILENT = Noise(0.0, 0.0, 0.0, 0.0, 0.0)
 LUMP = Lump(x_mm=4.0, y_mm=-3.0, amplitude=0.4, sigma_x_mm=6.0, sigma_y_mm=4.0, angle_deg=30.0)

@@ -17,7 +17,7 @@ from tactile_bayes.files.scan_mcap import read_scan, write_scan
 from tactile_bayes.hardware.bladder import BladderStep, fit_array
 from tactile_bayes.hardware.emulated import EmulatedHead
 from tactile_bayes.hardware.emulator import PtyLink
-from tactile_bayes.scan import PressureFrames, Scan, TrackerPoses
+from tactile_bayes.scans import PressureFrames, Scan, TrackerPoses
 
 RNG = np.random.default_rng(11)
 GAIN = 0.0083 * (1 + 0.08 * RNG.standard_normal((16, 26)))

@@ -18,7 +18,7 @@ from tactile_bayes.mapping.places import orientation_of
 from tactile_bayes.posterior.abstention import missing_strokes
 from tactile_bayes.report.map_figure import map_figure
 from tactile_bayes.report.map_text import live_text
-from tactile_bayes.scan import Landmarks, Scan
+from tactile_bayes.scans import Landmarks, Scan
 
 INTO_BODY = np.array([0.0, 0.0, 1.0])  # of `make_scan`: its head's z axis is the base's
 OUTWARDS_MM, UPWARDS_MM = 10.0, 8.0

@@ -23,7 +23,7 @@ from tactile_bayes.files.scan_mcap import read_scan, write_scan
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.mapping.select import scan_findings
-from tactile_bayes.scan import Scan, TrackerPoses
+from tactile_bayes.scans import Scan, TrackerPoses
 
 PAGE = Path(__file__).parents[2] / "docs" / "guides" / "record.md"
 DURATION_S = 3.0

@@ -42,7 +42,7 @@ from tactile_bayes.hardware.serial_trackers import TRACKERS, BirdParser, check_h
 from tactile_bayes.hardware.trackers import IgtlinkParser, encode_transform
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.select import Jumps, scan_findings
-from tactile_bayes.scan import TrackerPoses
+from tactile_bayes.scans import TrackerPoses
 
 PLACE, TURN = (254.0, -127.0, 25.5), (0.5, 0.5, -0.5, 0.5)
 MATRIX = struct.pack(">12f", *rotation_from_quaternion(np.array(TURN)).T.ravel(), *PLACE)

@@ -15,7 +15,7 @@ from tactile_bayes.mapping.accumulate import Instrument, MapAccumulator, MapGrid
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.plane import FramePoses, poses_at
 from tactile_bayes.mapping.select import TaxelFault, find_faults
-from tactile_bayes.scan import ElementCalibration, Scan
+from tactile_bayes.scans import ElementCalibration, Scan
 
 FRAMES = 90
 ARRAYS = ("mean", "variance", "count", "x_mm", "y_mm", "plane_from_base")

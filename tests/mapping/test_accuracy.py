@@ -17,7 +17,7 @@ from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.mapping.plane import FramePoses
 from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.white import fit_bump
-from tactile_bayes.scan import Scan
+from tactile_bayes.scans import Scan
 
 TRUE_POSES = Noise(tracker_mm=0.0, tracker_deg=0.0)
 MOST_BIAS = 0.005

@@ -15,7 +15,7 @@ from tactile_bayes.geometry import inverse, quaternion_from_rotation, rigid, rot
 from tactile_bayes.mapping.arrangement import ArrangementCheck, check_arrangement, check_scan, corrected
 from tactile_bayes.mapping.select import select_frames
 from tactile_bayes.presets import CORRECTIONS
-from tactile_bayes.scan import ElementCalibration, HeadGeometry, PressureFrames, Scan, TrackerPoses
+from tactile_bayes.scans import ElementCalibration, HeadGeometry, PressureFrames, Scan, TrackerPoses
 
 # What undoes a mistake; most are their own inverses.
 UNDONE_BY = {

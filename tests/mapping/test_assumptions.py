@@ -12,7 +12,7 @@ from tactile_bayes.forward.scene import Lump, Noise, Scene, Strokes, Tracker
 from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import broken_assumptions, skewed
-from tactile_bayes.scan import PressureFrames, Scan
+from tactile_bayes.scans import PressureFrames, Scan
 from validation.stress_frames import on_sphere
 
 TRUE_POSES = Noise(element_kpa=0.1, tracker_mm=0.0, tracker_deg=0.0)

@@ -15,7 +15,7 @@ from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.geometry import apply, rigid
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import TactileMap
-from tactile_bayes.scan import HeadGeometry, Landmarks, PressureFrames, Scan, TrackerPoses
+from tactile_bayes.scans import HeadGeometry, Landmarks, PressureFrames, Scan, TrackerPoses
 
 ALL = (0.0, 30.0)
 MARKS = Landmarks(np.array([60.0, 200.0, -40.0]), np.array([60.0, 20.0, -35.0]))

@@ -8,7 +8,7 @@ import pytest
 
 from tactile_bayes.declarations import replace
 from tactile_bayes.mapping.select import find_faults
-from tactile_bayes.scan import ElementCalibration, Scan
+from tactile_bayes.scans import ElementCalibration, Scan
 
 
 def noisy_scan(seed: int = 0) -> Scan:

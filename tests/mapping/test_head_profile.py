@@ -35,7 +35,7 @@ from tactile_bayes.mapping.profile import (
 from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.presets import HEAD_PROFILE
-from tactile_bayes.scan import ElementCalibration, Scan
+from tactile_bayes.scans import ElementCalibration, Scan
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.fat import head_profile
 

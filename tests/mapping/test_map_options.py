@@ -12,7 +12,7 @@ from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import advise_cell
 from tactile_bayes.mapping.select import timing_figures
 from tactile_bayes.report.map_text import map_text
-from tactile_bayes.scan import ElementCalibration, Landmarks, PressureFrames, Scan, TrackerPoses
+from tactile_bayes.scans import ElementCalibration, Landmarks, PressureFrames, Scan, TrackerPoses
 
 
 def curved_strokes(*, field=None, bend_mm: float = 0.0) -> Scan:

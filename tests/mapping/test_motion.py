@@ -15,7 +15,7 @@ from tactile_bayes.mapping.convention import stroke_starts
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.white import fit_bump
-from tactile_bayes.scan import HeadGeometry, Landmarks, PressureFrames, Scan, TrackerPoses
+from tactile_bayes.scans import HeadGeometry, Landmarks, PressureFrames, Scan, TrackerPoses
 
 TRUE_POSES = Noise(tracker_mm=0.0, tracker_deg=0.0)
 LUMP = Lump(amplitude=0.3, sigma_x_mm=5.0, sigma_y_mm=5.0)

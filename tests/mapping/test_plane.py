@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from tactile_bayes.geometry import apply, inverse
 from tactile_bayes.mapping.plane import FramePoses, HeadMoments, head_moments
-from tactile_bayes.scan import HeadGeometry
+from tactile_bayes.scans import HeadGeometry
 
 
 def curved_head() -> HeadGeometry:

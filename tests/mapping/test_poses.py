@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from tactile_bayes.geometry import quaternion_from_rotation
 from tactile_bayes.mapping.plane import distinct_poses, poses_at
-from tactile_bayes.scan import TrackerPoses
+from tactile_bayes.scans import TrackerPoses
 
 
 def turning(n: int = 50, *, step_s: float = 0.008, degrees: float = 0.3) -> TrackerPoses:

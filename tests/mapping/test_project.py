@@ -13,7 +13,7 @@ from tactile_bayes.forward.scene import Head
 from tactile_bayes.geometry import rigid
 from tactile_bayes.mapping.cells import Projector
 from tactile_bayes.mapping.plane import FramePoses
-from tactile_bayes.scan import HeadGeometry
+from tactile_bayes.scans import HeadGeometry
 
 # Curved, so that all three of a taxel's coordinates count.
 HEAD = HeadGeometry(Head(radius_mm=14.0).surface_mm(), 1.5, rigid(scans.rotation(25, about=(3, 1, 2)), np.full(3, 7.3)))

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from tactile_bayes.mapping.accumulate import Source, sources_of
 from tactile_bayes.mapping.cells import PRESSURE_STEP_KPA, CellSums, Readout, add_frames, chunk_frames
 from tactile_bayes.mapping.select import select_frames
-from tactile_bayes.scan import ElementCalibration, Scan
+from tactile_bayes.scans import ElementCalibration, Scan
 
 
 def rough_scan(seed: int, *, frames: int = 40) -> Scan:

@@ -15,7 +15,7 @@ from tactile_bayes.mapping.errors import LEAST_SHARE
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.mapping.plane import poses_at
 from tactile_bayes.report.map_text import map_text
-from tactile_bayes.scan import Scan
+from tactile_bayes.scans import Scan
 
 NAMES = {"shared_share", "shared_length_mm", "effective_readings", "shared_frames"}
 NOISE = 0.1  # of the level

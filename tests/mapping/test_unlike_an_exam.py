@@ -20,7 +20,7 @@ from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.plausibility import exam_findings, map_findings, scan_doubts
 from tactile_bayes.mapping.select import find_faults
 from tactile_bayes.posterior.abstention import no_verdict
-from tactile_bayes.scan import ElementCalibration, HeadGeometry, Landmarks, PressureFrames, Scan, TrackerPoses
+from tactile_bayes.scans import ElementCalibration, HeadGeometry, Landmarks, PressureFrames, Scan, TrackerPoses
 
 WINDOW = (5.0, 14.0)
 KPA_PER_COUNT = 0.004

@@ -17,7 +17,7 @@ from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.report.estimate_text import estimate_text
-from tactile_bayes.scan import Scan
+from tactile_bayes.scans import Scan
 from tests.posterior.test_extremes import NOISE, NOTHING, few, float32, unknown_level, without_a_quadrant
 
 FIELD = SamplerSettings(background="free", noise="field")

@@ -36,7 +36,7 @@ from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.exam_page import exam_page
 from tactile_bayes.report.exam_words import Exam, exam_map, headline, reach_text
 from tactile_bayes.report.pages import BROWSERS, find_printer
-from tactile_bayes.scan import Landmarks
+from tactile_bayes.scans import Landmarks
 
 HOSTILE = "\"><img src=x onerror=alert(1)><script>alert(2)</script>'&lt; </p></svg></body>"
 VOID = {"meta", "img", "br", "image", "rect", "circle", "path", "stop"}

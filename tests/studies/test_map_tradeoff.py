@@ -18,7 +18,7 @@ from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.scan_mcap import read_scan
 from tactile_bayes.mapping.select import first_seconds
 from tactile_bayes.report.tradeoff import ladder_file, ladder_text
-from tactile_bayes.scan import Scan
+from tactile_bayes.scans import Scan
 from tactile_bayes.studies import estimate_tradeoff
 from tactile_bayes.studies import tradeoffs as study
 from tactile_bayes.studies.estimate_tradeoff import SIZE, WIDTHS, Ladder, Priced, Work

@@ -12,7 +12,7 @@ import tactile_bayes as tb
 from tactile_bayes.declarations import replace
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.scan_mcap import write_scan
-from tactile_bayes.scan import PressureFrames, Scan
+from tactile_bayes.scans import PressureFrames, Scan
 
 DEMO = Path(__file__).resolve().parents[2] / "tactile_bayes" / "demo"
 EXCISION = "patient,mass,ex_vivo_mm\n07,1,15.0\n09,1,14\n11,1,9\n12,1,10\n"

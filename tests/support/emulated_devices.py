@@ -14,7 +14,7 @@ from tactile_bayes.forward.scene import Lump, Scene, Strokes
 from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.hardware.emulated import Device, EmulatedHead, EmulatedTracker, Faults
 from tactile_bayes.hardware.emulator import Emulator, Link, PtyLink, Stage, TcpLink
-from tactile_bayes.scan import Scan
+from tactile_bayes.scans import Scan
 
 
 def short_scan(duration_s: float = 1.0, *, seed: int = 3) -> Scan:

@@ -11,7 +11,7 @@ import numpy as np
 
 from tactile_bayes.forward.scene import Scene
 from tactile_bayes.forward.simulate import simulate
-from tactile_bayes.scan import Scan
+from tactile_bayes.scans import Scan
 
 
 @cache

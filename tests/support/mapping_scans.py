@@ -8,7 +8,7 @@ import numpy as np
 
 from tactile_bayes.declarations import replace
 from tactile_bayes.geometry import apply, quaternion_from_rotation, rigid
-from tactile_bayes.scan import ElementCalibration, HeadGeometry, Landmarks, PressureFrames, Scan, TrackerPoses
+from tactile_bayes.scans import ElementCalibration, HeadGeometry, Landmarks, PressureFrames, Scan, TrackerPoses
 
 GAIN_KPA = 2.0**-11  # 65536 counts reach 32 kPa: counts carry pressures to 0.0005 kPa
 LEVEL_KPA = 8.0

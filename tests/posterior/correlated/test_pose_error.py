@@ -30,7 +30,7 @@ from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.presets import POSE_NOISE
 from tactile_bayes.report.estimate_text import estimate_text
 from tactile_bayes.report.map_text import map_text
-from tactile_bayes.scan import Scan, TrackerPoses
+from tactile_bayes.scans import Scan, TrackerPoses
 
 SIGMA = (4.5, 5.5)
 TOLD = {"pose_noise_x_mm": 0.4, "pose_noise_y_mm": 0.3, "frame_side_x_mm": 24.0, "frame_side_y_mm": 39.0}
