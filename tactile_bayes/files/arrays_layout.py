@@ -201,8 +201,7 @@ class GridOptions(Options, kw_only=True):
         ),
     ] = ()
     array: Annotated[
-        str | None,
-        Meta(description="Map: which array of SRC, where it holds several.", extra={"metavar": "NAME"}),
+        str | None, Meta(description="Map: which array of SRC, where it holds several.", extra={"metavar": "NAME"})
     ] = None
 
     def __post_init__(self) -> None:

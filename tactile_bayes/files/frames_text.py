@@ -23,7 +23,7 @@ from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.arrays_layout import Stated
 from tactile_bayes.files.named_arrays import Source
 from tactile_bayes.files.poses_text import is_header_of_poses, kind_of_column
-from tactile_bayes.files.text_lines import Line, TextTable, number, read_text_table
+from tactile_bayes.files.text_lines import NO_SENSEL, Line, TextTable, number, read_text_table
 from tactile_bayes.geometry import FloatArray
 
 _UNITS: Final = {
@@ -74,6 +74,11 @@ def read_frames(path: Path, given: Stated, *, shape: tuple[int, int] | None) -> 
         what = f"is a table of poses by line {header.number}"
         raise BadDataError(what, way_out="give the frames, and it as --poses")
     blocks = _blocks(table, None if shape is None else shape[0] * shape[1])
+    if beside := sum(one == NO_SENSEL for line in blocks[0] for one in line.fields):
+        what = (
+            f"has {beside} cells {NO_SENSEL!r} from line {blocks[0][0].number} on, which Tekscan writes beside a sensor"
+        )
+        raise BadDataError(what, way_out="export the rows and columns without them, and give a head of these")
     before = [line for line in table.lines if line.number < blocks[0][0].number]
     stated, notes = _said(before)
     notes = [f"frames: {table.words}", *notes]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -15,7 +13,7 @@ from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.images import read_image
 from tactile_bayes.files.named_arrays import ARRAY_SUFFIXES, read_named
-from tactile_bayes.files.reading import TABLE_BYTES, decoded, decoding, other_encoding, read_bytes
+from tactile_bayes.files.text_lines import NO_SENSEL, fields_of, read_lines, refuse_thousands, separator_of, with_comma
 from tactile_bayes.geometry import FloatArray
 
 # --- What a file or a caller gives before it is a map.
@@ -33,19 +31,15 @@ class Grid(Record, eq=False):
 
 # --- A grid of numbers in a text table, as programs and spreadsheets write it.
 #
-# Fields are separated by semicolons where the file has one, else by tabs where it has one, else by commas or by blanks.
-# With semicolons, tabs or blanks a comma is a decimal comma, as a spreadsheet writes it under the settings of many
-# countries. Lines of text before and after the numbers are left out, and said to be. Tekscan's ASCII export (``.asf``,
+# Lines of text before and after the numbers are left out, and said to be. Tekscan's ASCII export (``.asf``,
 # ``.csv``) is such a table: ``KEY value`` lines, ``ASCII_DATA @@``, ``Frame 1``, rows, ``@@``; ``B`` is no sensel.
 
 _WAY_OUT: Final = "give a table of numbers, such as .csv"
-_THOUSANDS: Final = re.compile(r"[+-]?[1-9][0-9]{0,2}(,[0-9]{3})+")
 _MOST_COUNTED: Final = 8
 """A first row or column of so many numbers that counts 0, 1, 2... or 1, 2, 3... holds labels, whatever its corner."""
 _NUMBER: Final = re.compile(r"[+-]?(([0-9]+\.?[0-9]*|\.[0-9]+)(e[+-]?[0-9]+)?|nan|inf(inity)?)", re.IGNORECASE)
 _TIME: Final = re.compile(r"(t|time|times|timestamp|date|frame|sample|index|s|ms|sec|seconds)\b.*", re.IGNORECASE)
 """A first column of this name stands before frames, one a row."""
-_NOT_A_SENSEL: Final = "B"
 _SPACING_LINE: Final = re.compile(
     r"^(ROW|COL)_SPACING[\s,;:=]+([0-9.]+)[\s,;]*(mm|cm|m|in|inch)?[\s,;]*$", re.MULTILINE
 )
@@ -55,22 +49,18 @@ _MM: Final = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4, "inch": 25.4, None
 
 def read_table(path: Path, *, no_value: Sequence[str] = ()) -> Grid:
     """Read a table of text, NaN where a field is empty or one of the texts of `no_value`."""
-    data = read_bytes(path, most=TABLE_BYTES)
-    other = other_encoding(data)
-    if other not in ("", "UTF-16"):
-        raise BadDataError(f"is {other} text", way_out="save it as UTF-8")
-    text = decoded(data, path=path, way_out=_WAY_OUT, encoding=other.lower() or "utf-8-sig")
-    text = text.replace("\r\n", "\n").replace("\r", "\n").replace("\u2212", "-")  # a minus sign that is no hyphen
-    rows = _fields(text)
+    words = [one for one in no_value if not is_number(one)]  # numbers are looked for among the values
+    texts = read_lines(path)
+    separator = separator_of(texts, words) or ","
+    rows = _with_points([fields_of(one, separator) for one in texts], words)
     first, last = _numbers_within(rows, no_value)
     before, after = (_said(part) for part in (rows[:first], rows[last:]))
     names = rows[first - 1] if first else []
     if len(names) == len(rows[first]) > 1 and _TIME.fullmatch(names[0]) and not any(map(is_number, names)):
         what = f"its first column is called {names[0][:20]!r}, as before frames that stand one a row"
         raise BadDataError(what, way_out="import them as a scan, or give one frame as rows and columns")
-    tekscan = "ASCII_DATA" in text
-    words = [one for one in no_value if not is_number(one)]  # numbers are looked for among the values
-    marks = (*words, _NOT_A_SENSEL) if tekscan else tuple(words)
+    text = "\n".join(texts)
+    marks = (*words, NO_SENSEL) if "ASCII_DATA" in text else tuple(words)
     rows, notes = _one_block(rows[first:last], first), []
     for lines, where in ((before, "before"), (after, "after")):
         if lines:
@@ -95,21 +85,6 @@ def _unit(text: str) -> str:
     return "kPa" if text.lower() == "kpa" else text
 
 
-def _fields(text: str) -> list[list[str]]:
-    """Fields of each line, without blanks around them; numbers with decimal commas have points."""
-    separator = next((one for one in ";\t" if one in text), ",")
-    with decoding("is not a table of text", way_out=_WAY_OUT):
-        rows = [[field.strip() for field in row] for row in csv.reader(io.StringIO(text), delimiter=separator)]
-    apart = [line.split() for line in text.splitlines()]
-    if separator == "," and _lines_of_numbers(_points(apart)) > _lines_of_numbers(_points(rows)):
-        rows = apart
-    return _with_points(rows)  # between commas they are in quotes
-
-
-def _lines_of_numbers(rows: Iterable[list[str]]) -> int:
-    return sum(len(row) > 1 and all(map(is_number, filter(None, row))) for row in rows)
-
-
 def is_number(field: str) -> bool:
     """True for a text that is a number, NaN and infinity included."""
     return _NUMBER.fullmatch(field) is not None
@@ -117,7 +92,7 @@ def is_number(field: str) -> bool:
 
 def _numbers_within(rows: Sequence[list[str]], no_value: Sequence[str]) -> tuple[int, int]:
     """Where lines of numbers begin and end: there every field is one, or empty, or a mark for no value."""
-    marks = {"", _NOT_A_SENSEL, *no_value}
+    marks = {"", NO_SENSEL, *no_value}
     plain = [
         i
         for i, row in enumerate(rows)
@@ -164,18 +139,12 @@ def _one_block(rows: Sequence[list[str]], before: int) -> list[list[str]]:
     return list(rows)
 
 
-def _with_points(rows: Sequence[list[str]]) -> list[list[str]]:
+def _with_points(rows: Sequence[list[str]], marks: Sequence[str]) -> list[list[str]]:
     """The rows with decimal points in place of decimal commas."""
-    commas = [field for row in rows for field in row if "," in field and field[:1] in "+-0123456789"]
-    if commas and all(_THOUSANDS.fullmatch(field) for field in commas):
-        digits = commas[0].replace(",", "")
-        what = f"holds {commas[0]!r}, which is {digits} or {commas[0].replace(',', '.', 1)}"
-        raise BadDataError(what, way_out="write numbers without commas")
-    return _points(rows)
-
-
-def _points(rows: Iterable[list[str]]) -> list[list[str]]:
-    return [[field.replace(",", ".") if field.count(",") == 1 else field for field in row] for row in rows]
+    commas = with_comma(rows, marks)
+    refuse_thousands(commas, way_out="write numbers without commas")
+    decimal = set(commas)
+    return [[field.replace(",", ".") if field in decimal else field for field in row] for row in rows]
 
 
 def _values(rows: Sequence[list[str]], marks: Sequence[str], before: int) -> FloatArray:

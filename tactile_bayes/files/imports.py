@@ -456,8 +456,7 @@ def _check_counts(arrays: Arrays) -> None:
     if not whole:
         odd = float(counts[counts != np.rint(counts)][0])
         raise BadDataError(
-            f"counts holds {odd:.6g}, which is no raw reading",
-            way_out="for pressures give their unit: --unit kPa",
+            f"counts holds {odd:.6g}, which is no raw reading", way_out="for pressures give their unit: --unit kPa"
         )
     low, high = int(counts.min()), int(counts.max())
     if low < 0 or high > _MOST_COUNTS:

@@ -23,18 +23,7 @@ from tactile_bayes.files.reading import NETCDF_BYTES, check_limit, decoding, rea
 MAT_5: Final = b"MATLAB 5.0 MAT-file"
 _HEADER: Final = 128
 _MATRIX, _COMPRESSED = 14, 15
-_TYPES: Final = {
-    1: "i1",
-    2: "u1",
-    3: "i2",
-    4: "u2",
-    5: "i4",
-    6: "u4",
-    7: "f4",
-    9: "f8",
-    12: "i8",
-    13: "u8",
-}
+_TYPES: Final = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
 """Types of numbers in an element."""
 _STRUCT, _OPAQUE = 2, 17
 _NUMERIC: Final = range(6, 16)  # classes of matrices from double to uint64

@@ -25,6 +25,7 @@ from tactile_bayes.files.reading import TABLE_BYTES, ZIP_MAGIC, decoded, other_e
 # The first lines tell the separator; a comma inside a number is a decimal comma only where it separates no cells.
 
 DECIMAL_COMMA: Final = re.compile(r"[+-]?[0-9]+,[0-9]+")
+_THOUSANDS: Final = re.compile(r"[+-]?[1-9][0-9]{0,2}(,[0-9]{3})+")
 _QUOTED: Final = re.compile(r'"[^"]*"')
 _AS_UTF8: Final = "save it as CSV UTF-8"
 _EXPORT: Final = "export the sheet as CSV UTF-8"
@@ -87,9 +88,8 @@ def composed(text: str) -> str:
 
 
 def may_be_thousands(number: str) -> bool:
-    """True when the comma of a number may separate thousands as well as decimals: 1,234 but not 0,234 or 1,23."""
-    whole, _, rest = number.partition(",")
-    return len(rest) == 3 and not whole.lstrip("+-").startswith("0")
+    """True when the comma of a number may separate thousands as well as decimals: 1,234; not 0,234, 1,23, 1234,567."""
+    return _THOUSANDS.fullmatch(number) is not None
 
 
 def _rows(path: Path, text: str, separator: str) -> list[tuple[int, list[str]]]:

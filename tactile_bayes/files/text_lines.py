@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import csv
-import io
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.files.reading import TABLE_BYTES, decoded, other_encoding, read_bytes
+from tactile_bayes.files.reading import TABLE_BYTES, decoded, decoding, other_encoding, read_bytes
 from tactile_bayes.files.tables import DECIMAL_COMMA, may_be_thousands
 
 _SEPARATORS: Final = {"\t": "tabs", ";": "semicolons", ",": "commas", " ": "blanks"}
@@ -22,8 +21,11 @@ _AS_UTF8: Final = "save it as UTF-8 text"
 _AROUND: Final = " \t\"'[](){}"  # of a field, as R and Python print numbers
 _CLOCK: Final = re.compile(r"(?:(\d{1,2}):)?(\d{1,2}):(\d{1,2}(?:\.\d+)?)")
 _DATED: Final = re.compile(r"\d{4}-\d{2}-\d{2}[T ]\d{1,2}:\d{2}:\d{2}(\.\d+)?(Z|[+-]\d{2}:?\d{2})?")
-_NO_VALUE: Final = ("", "nan", "na", "n/a", "-", "--", "b", "null")
-"""Words for a reading that there is not; ``B`` is a cell beside the sensor in Tekscan's files."""
+_WITH_COMMA: Final = re.compile(r"[+-]?[0-9]*,[0-9]+(,[0-9]{3})*(e[+-]?[0-9]+)?", re.IGNORECASE)
+NO_SENSEL: Final = "B"
+"""A cell beside the sensor in Tekscan's files."""
+_NO_VALUE: Final = ("", "nan", "na", "n/a", "-", "--", NO_SENSEL.lower(), "null")
+"""Words for a reading that there is not."""
 
 
 class Line(Record):
@@ -71,8 +73,20 @@ def number(text: str, *, decimal_comma: bool = False) -> float:
     raise ValueError(text)
 
 
+def read_lines(path: Path) -> list[str]:
+    """Lines of a text, UTF-8 or with a byte order mark; a minus sign that is no hyphen is one."""
+    data = read_bytes(path, most=TABLE_BYTES)
+    other = other_encoding(data)
+    if other not in ("", "UTF-16"):
+        raise BadDataError(f"is {other} text", way_out=_AS_UTF8, path=str(path))
+    text = decoded(data, path=path, way_out=_AS_UTF8, encoding=other.lower() or "utf-8-sig")
+    if "\0" in text:
+        raise BadDataError("is not text", way_out="give numbers as .npz, .npy, .mat, HDF5 or a table", path=str(path))
+    return text.replace("\u2212", "-").splitlines()
+
+
 def read_text_table(path: Path, decimal: str | None = None) -> TextTable:
-    """Read the lines of a text, UTF-8 or with a byte order mark; the separator is the one that makes numbers of them.
+    """Read the lines of a text that are not blank; the separator is the one that makes numbers of them.
 
     Parameters
     ----------
@@ -84,50 +98,79 @@ def read_text_table(path: Path, decimal: str | None = None) -> TextTable:
     BadDataError
         When it is no text, or has no table of numbers, or commas that may separate thousands or decimals.
     """
-    data = read_bytes(path, most=TABLE_BYTES)
-    other = other_encoding(data)
-    if other not in ("", "UTF-16"):
-        raise BadDataError(f"is {other} text", way_out=_AS_UTF8, path=str(path))
-    text = decoded(data, path=path, way_out=_AS_UTF8, encoding=other.lower() or "utf-8-sig")
-    if "\0" in text:
-        raise BadDataError("is not text", way_out="give frames as .npz, .npy, .mat, HDF5 or a table", path=str(path))
-    texts = [(i, one) for i, one in enumerate(text.splitlines(), start=1) if one.strip()]
-    separator = max(_SEPARATORS, key=lambda one: _numbers_by(one, texts))
-    if not _numbers_by(separator, texts):
+    texts = read_lines(path)
+    separator = separator_of(texts)
+    if not separator:
         raise BadDataError("holds no table of numbers", way_out="give one frame or pose a line", path=str(path))
     lines, before = [], 0
-    for i, one in texts:
-        lines.append(Line(i, one, _fields(one, separator), after_blank=i > before + 1))
-        before = i
-    commas = [f for line in lines for f in line.fields if DECIMAL_COMMA.fullmatch(f)] if separator != "," else []
-    if decimal is None and commas and all(map(may_be_thousands, commas)):
-        what = f"holds {commas[0]!r}, which is {commas[0].replace(',', '')} or {commas[0].replace(',', '.')}"
-        raise BadDataError(what, way_out="state which, --decimal comma", path=str(path))
+    for i, one in enumerate(texts, start=1):
+        if one.strip():
+            lines.append(Line(i, one, _without_end(fields_of(one, separator)), after_blank=i > before + 1))
+            before = i
+    commas = with_comma(line.fields for line in lines)
+    if decimal is None:
+        refuse_thousands(commas, way_out="state which, --decimal comma")
     return TextTable(lines, separator, decimal != "point" and bool(commas))
 
 
-def _numbers_by(separator: str, texts: Sequence[tuple[int, str]]) -> int:
-    """Numbers in the lines that a separator makes lines of a table, of a sample of all."""
-    found = 0
-    for _, text in texts[:: max(1, len(texts) // _SAMPLED)]:
-        fields = _fields(text, separator)
-        good = sum(_is_number(one, decimal_comma=separator != ",") for one in fields)
-        found += good if good > 1 and good >= _LEAST_NUMBERS * len(fields) else 0
-    return found
+def separator_of(texts: Sequence[str], marks: Sequence[str] = ()) -> str:
+    """The separator that makes most numbers of lines and least else; empty where none makes two of any.
+
+    Parameters
+    ----------
+    marks
+        Words for no value, beside those that are known.
+    """
+    filled = [one for one in texts if one.strip()]
+    sample = filled[:: max(1, len(filled) // _SAMPLED)]
+    made = {separator: _made_by(separator, sample, marks) for separator in _SEPARATORS}
+    best = max(made, key=lambda one: made[one])
+    return best if made[best][0] else ""
 
 
-def _is_number(text: str, *, decimal_comma: bool) -> bool:
+def _made_by(separator: str, texts: Sequence[str], marks: Sequence[str]) -> tuple[int, int]:
+    """Numbers, and other fields as a negative number, in the lines that a separator makes lines of a table."""
+    rows = [row for text in texts if _of_numbers(row := fields_of(text, separator), marks)]
+    numbers = sum(_is_number(field, marks) for row in rows for field in row)
+    return numbers, numbers - sum(map(len, rows))
+
+
+def _of_numbers(fields: Sequence[str], marks: Sequence[str]) -> bool:
+    """True for a line of a table: two numbers or more, and little else."""
+    good = sum(_is_number(field, marks) for field in fields)
+    return good > 1 and good >= _LEAST_NUMBERS * len(fields)
+
+
+def _is_number(text: str, marks: Sequence[str]) -> bool:
     try:
-        return number(text, decimal_comma=decimal_comma) is not None
+        return text in marks or number(text, decimal_comma=True) is not None
     except ValueError:
         return False
 
 
-def _fields(text: str, separator: str) -> list[str]:
-    """Fields without the blanks around them, and without an empty one after a separator at the line's end."""
+def fields_of(text: str, separator: str) -> list[str]:
+    """Fields of a line without the blanks around them."""
     if separator == " ":
         return text.split()
-    fields = [one.strip() for one in next(csv.reader(io.StringIO(text, newline=""), delimiter=separator), [])]
+    with decoding("is not a table of text", way_out="give a table of numbers, such as .csv"):
+        return [one.strip() for one in next(csv.reader([text], delimiter=separator), [])]
+
+
+def _without_end(fields: list[str]) -> list[str]:
+    """Fields without the empty ones behind the last."""
     while len(fields) > 1 and not fields[-1]:
         fields.pop()
     return fields
+
+
+def with_comma(rows: Iterable[Sequence[str]], marks: Sequence[str] = ()) -> list[str]:
+    """Fields of the table's lines that are numbers with a decimal comma, or with commas between thousands."""
+    return [field for row in rows if _of_numbers(row, marks) for field in row if _WITH_COMMA.fullmatch(field)]
+
+
+def refuse_thousands(commas: Sequence[str], *, way_out: str) -> None:
+    """Refuse numbers with commas all of which may separate thousands."""
+    if commas and all(map(may_be_thousands, commas)):
+        first = commas[0]
+        what = f"holds {first!r}, which is {first.replace(',', '')} or {first.replace(',', '.', 1)}"
+        raise BadDataError(what, way_out=way_out)

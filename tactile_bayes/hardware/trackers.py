@@ -500,14 +500,7 @@ class NdiPort(Port):
         if find_spec(MODULE) is None:
             raise DeviceError(f"{self.name}: needs the package ndicapi; pip install 'tactile-bayes[ndi]'")
         ours, theirs = socket.socketpair()
-        words = [
-            sys.executable,
-            "-m",
-            "tactile_bayes.hardware.trackers",
-            str(theirs.fileno()),
-            url,
-            *map(str, roms),
-        ]
+        words = [sys.executable, "-m", "tactile_bayes.hardware.trackers", str(theirs.fileno()), url, *map(str, roms)]
         self._process = subprocess.Popen(
             words, pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, start_new_session=True
         )

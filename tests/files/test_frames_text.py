@@ -73,6 +73,9 @@ ONE_ROW_A_FRAME: dict[str, tuple[Sequence[str], str, dict[str, Any]]] = {
     ),
     "taxels in rows": (rows(FLAT.T), UTF_8, {"rate_hz": 200.0}),
     "rows without a break": (rows(KPA.reshape(-1, 26)), UTF_8, {"rate_hz": 200.0}),
+    "quoted": (['"' + row.replace(",", '","').replace(".", ",") + '"' for row in timed(1)], UTF_8, {}),
+    "minus signs": ([row.replace(",0.0000", ",\u22120.0000", 1) for row in timed(1)], UTF_8, {}),
+    "thousands before": (['Mat,"1,024"', *timed(1)], UTF_8, {}),
     "three decimals": ([row.replace(",", ";").replace(".", ",") for row in PLAIN], UTF_8, {"decimal": "comma"}),
     "clock": ([f"10:00:{t:06.3f},{row}" for t, row in zip(TIME, rows(FLAT), strict=True)], UTF_8, {}),
 }
@@ -199,6 +202,7 @@ FAULTS: dict[str, tuple[str | bytes, dict[str, Any], str]] = {
     "word": (changed(30, ROW.replace(CELL, "x12", 1)), {}, "line 31 holds 'x12'"),
     "no value": (changed(30, ROW.replace(CELL, "", 1)), {}, "frames holds 1 values that are not finite"),
     "cut frame": ("\n".join(tekscan(KPA, "KPA").splitlines()[:-6]), {}, "has frames of 16 rows and, at line .* one of"),
+    "beside": (tekscan(KPA, "KPA").replace("\n0.0000,", "\nB,"), {}, "has 10 cells 'B' from line 18 on, which Tekscan"),
     "no number": ("hello\nworld\n", {}, "holds no table of numbers"),
     "empty": ("", {}, "holds no table of numbers"),
     "bytes": (b"\x00\x01\x02" * 99, {}, "is not text|holds no table"),

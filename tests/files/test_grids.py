@@ -255,6 +255,9 @@ def test_an_export_of_tekscan_is_a_map_with_its_spacing_and_unit(tmp_path: Path)
         ('"0,9","2","1,234"\n"1","2","3"\n', ""),
         ("0.9,2,1.234\r1,2,3\r", ""),
         ('"0.9","2","1.234"\n"1","2","3"\n', ""),
+        ("Mat 3; kPa\n0.9,2,1.234\n1,2,3\n", "'Mat 3; kPa'"),
+        ("Mat\t3\n0.9,2,1.234\n1,2,3\n", "text before"),
+        ("seats 1,024\n0,9 2,0 1,234\n1,0 2,0 3,0\n", "'seats 1,024'"),
     ],
 )
 def test_one_table_in_many_dresses_is_one_grid(tmp_path: Path, content: str, note: str) -> None:
