@@ -21,7 +21,15 @@ import numpy as np
 from tactile_bayes.declarations import Record, field, replace
 from tactile_bayes.findings import Finding, finding_lines
 from tactile_bayes.geometry import FloatArray, IndexArray, apply, inverse
-from tactile_bayes.mapping.convention import CoarseFrames, block_means, every_stretch, thinning
+from tactile_bayes.mapping.convention import (
+    CONVENTIONS,
+    CoarseFrames,
+    block_means,
+    corrected_quaternions,
+    every_stretch,
+    import_again,
+    thinning,
+)
 from tactile_bayes.mapping.latency import Cells, Nuisance
 from tactile_bayes.mapping.plane import poses_at
 from tactile_bayes.mapping.plausibility import SURE_ODDS, scan_doubts
@@ -39,7 +47,7 @@ _ARRAY: Final = (
 )
 _FRAMES: Final = ((), ("transposed",))
 _LEVER: Final = ((), ("lever-inverse",), ("lever-none",))
-_ROTATIONS: Final = ((), ("scalar-last",), ("inverse-rotation",), ("scalar-last", "inverse-rotation"))
+_ROTATIONS: Final = tuple(CONVENTIONS.values())
 
 Corrections = tuple[str, ...]
 
@@ -100,9 +108,8 @@ def _corrected(scan: Scan, name: str) -> Scan:
     }
     if name in levers:
         return replace(scan, head=HeadGeometry(head.surface_mm, head.pitch_mm, levers[name]))
-    if name in ("scalar-last", "inverse-rotation"):
-        wxyz = poses.quaternion_wxyz
-        wxyz = wxyz[:, [3, 0, 1, 2]] if name == "scalar-last" else wxyz * [1.0, -1.0, -1.0, -1.0]
+    if name in _ROTATIONS[-1]:
+        wxyz = corrected_quaternions(poses.quaternion_wxyz, [name])
         return replace(scan, poses=TrackerPoses(poses.time_s, poses.position_mm, wxyz))
     calibration = scan.element_calibration
     gain, offset = (_rearranged(one, name) for one in (calibration.gain_kpa_per_count, calibration.offset_kpa))
@@ -225,11 +232,10 @@ class ArrangementCheck(Record, eq=False):
             check = "check the lever arm, both clocks, and that the breast lay still"
             return (Finding("frames_contradict", self.words, check, check),)
         if self.best.late_ms:
-            way = f"map it with {self.remedy}"
-            return (Finding("late_poses", self.words, way, "have the scan mapped again with the tracker's delay"),)
+            on_paper = "have the scan mapped again with the tracker's delay"
+            return (Finding("late_poses", self.words, self.remedy, on_paper),)
         if self.best is not self.stated:
-            remedy = f"import the scan again with {self.remedy}"
-            return (Finding("wrong_arrangement", self.words, remedy, "check how array and tracker are mounted"),)
+            return (Finding("wrong_arrangement", self.words, self.remedy, "check how array and tracker are mounted"),)
         if self.says_nothing:
             return (NOT_CHECKED,)
         return ()
@@ -240,10 +246,10 @@ class ArrangementCheck(Record, eq=False):
 
     @property
     def remedy(self) -> str:
-        """Options of `import` that make the corrections, or the one of `map` that states the clock."""
+        """Where another arrangement is better: the clock stated to `map`, or the rest corrected by `import`."""
         if self.best.late_ms:
-            return f"--latency-ms {self.asked_ms + self.best.late_ms:.0f}"
-        return " ".join(f"--correct {name}" for name in self.best.corrections)
+            return f"map it with --latency-ms {self.asked_ms + self.best.late_ms:.0f}"
+        return import_again(self.best.corrections)
 
     def lines(self) -> list[str]:
         """The answer in full: what the frames agree with, what they exclude, what they leave open, and what to do."""

@@ -243,8 +243,7 @@ def _of_arrangement(
         check = check_briefly(one, latency_ms=late_ms)
         if refuse and check is not None and check.refused:
             which = f"scan {number}: " if len(selections) > 1 else ""
-            way_out = f"import the scan again with {check.remedy}, or map it with --as-stated"
-            raise BadDataError(f"{which}{check.words}", way_out=way_out)
+            raise BadDataError(f"{which}{check.words}", way_out=f"{check.remedy}, or map it with --as-stated")
         if check is not None:
             figures["arrangement_log_odds"] = max(check.log_odds, figures.get("arrangement_log_odds", 0.0))
         findings.append(() if check is None else check.findings_of(one.scan))
@@ -364,7 +363,7 @@ def _as_map(
         masked_taxels=_masked(selections),
         head=_head(scans),
     )
-    of_map = (*convention_findings(quality), *broken_assumptions(quality), *handling_findings(quality))
+    of_map = (*convention_findings(quality, findings), *broken_assumptions(quality), *handling_findings(quality))
     return replace(tactile_map, findings=by_weight((*map_findings(tactile_map), *of_map, *findings)))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from typing import Final
 
 import numpy as np
 
@@ -137,19 +138,13 @@ def stroke_starts(x_mm: FloatArray) -> list[int]:
 
 # --- Check of a tracker's rotation convention (order and sense) against the motion of the head.
 
-# What a file may hold instead of (w, x, y, z) from the sensor to the base: how to read it.
-CONVENTIONS = {
-    "scalar first": ((0, 1, 2, 3), 1.0),
-    "scalar last": ((3, 0, 1, 2), 1.0),
-    "scalar first, of the inverse rotation": ((0, 1, 2, 3), -1.0),
-    "scalar last, of the inverse rotation": ((3, 0, 1, 2), -1.0),
-}
 DECLARED = "scalar first"
-# Options of `import` that turn each into ours.
-CORRECT = {
-    "scalar last": ("--correct scalar-last",),
-    "scalar first, of the inverse rotation": ("--correct inverse-rotation",),
-    "scalar last, of the inverse rotation": ("--correct scalar-last", "--correct inverse-rotation"),
+# What a file may hold instead of (w, x, y, z) from the sensor to the base: which of `CORRECTIONS` make it ours.
+CONVENTIONS: Final[Mapping[str, tuple[str, ...]]] = {
+    DECLARED: (),
+    "scalar last": ("scalar-last",),
+    "scalar first, of the inverse rotation": ("inverse-rotation",),
+    "scalar last, of the inverse rotation": ("scalar-last", "inverse-rotation"),
 }
 # A head slides along its face: the mean normal of the face and the normal of the motion agree at least so well.
 AGREEMENT = 0.9
@@ -160,6 +155,18 @@ BETTER_BY = 0.005
 NEARLY_WHOLE = 0.98
 # A motion narrower than this across its longest way (SD, mm) has no normal.
 LEAST_SPREAD_MM = 3.0
+
+
+def corrected_quaternions(wxyz: FloatArray, corrections: Iterable[str]) -> FloatArray:
+    """(n, 4) quaternions once the corrections of a convention are made."""
+    for name in corrections:
+        wxyz = wxyz[:, [3, 0, 1, 2]] if name == "scalar-last" else wxyz * [1.0, -1.0, -1.0, -1.0]
+    return wxyz
+
+
+def import_again(corrections: Iterable[str]) -> str:
+    """Way out: the options of `import` that make the corrections."""
+    return f"import the scan again with {' '.join(f'--correct {name}' for name in corrections)}"
 
 
 def convention_agreement(selections: Sequence[SelectedFrames]) -> dict[str, float]:
@@ -175,7 +182,7 @@ def convention_agreement(selections: Sequence[SelectedFrames]) -> dict[str, floa
     poses = [(part, _near_used(part)) for part in selections]
     if sum(len(one) for _, one in poses) < 3:
         return {}
-    agreement = {name: _agreement(poses, *how) for name, how in CONVENTIONS.items()}
+    agreement = {name: _agreement(poses, corrections) for name, corrections in CONVENTIONS.items()}
     return agreement if np.isfinite(agreement[DECLARED]) else {}
 
 
@@ -207,20 +214,29 @@ def check_convention(selections: Sequence[SelectedFrames]) -> dict[str, float]:
     return figures
 
 
-def convention_findings(quality: Mapping[str, float]) -> tuple[Finding, ...]:
-    """Findings on a map's rotations from its figures, see `check_convention`; none of a map without a plane."""
+def convention_findings(quality: Mapping[str, float], told: Iterable[Finding] = ()) -> tuple[Finding, ...]:
+    """Findings on a map's rotations from its figures, see `check_convention`; none of a map without a plane.
+
+    `told` is known already: where the frames ask for the same corrections, theirs is the finding.
+    """
     if "other_convention" in quality:
         other, agreement = list(CONVENTIONS)[int(quality["other_convention"])], quality["other_agreement"]
+        if any(one.kind == "wrong_arrangement" and _asks_for(one, CONVENTIONS[other]) for one in told):
+            return ()
         text = (
             f"the quaternions seem to be {other}: the head's face would follow its motion to {agreement:.3f} of 1, "
             f"against {quality['normal_agreement']:.3f} as they are told; size and place may be wrong"
         )
-        remedy = f"check them; to change them, import the scan again with {' '.join(CORRECT[other])}"
+        remedy = f"check them; to change them, {import_again(CONVENTIONS[other])}"
         return (Finding("wrong_rotations", text, remedy, "check the tracker's quaternions"),)
     if "normal_agreement" not in quality and "plane_rms_mm" in quality:
         text = "the motion does not tell whether the quaternions are scalar first and from sensor to base"
         return (Finding("rotations_unknown", text, "check them", "check them"),)
     return ()
+
+
+def _asks_for(finding: Finding, corrections: Iterable[str]) -> bool:
+    return all(f"--correct {name}" in finding.remedy for name in corrections)
 
 
 def hint(selections: Sequence[SelectedFrames]) -> str:
@@ -236,8 +252,8 @@ def _best(agreement: dict[str, float]) -> str:
 def _way_out(agreement: dict[str, float], best: str) -> str:
     if best == DECLARED or agreement[best] < AGREEMENT:
         return "check the quaternion order (scalar first) and scanhead_from_tracker"
-    way_out = f"import the scan again with {' '.join(CORRECT[best])}"
-    return f"the quaternions seem to be {best} (agreement {agreement[best]:.2f} of 1); {way_out}"
+    found = f"the quaternions seem to be {best} (agreement {agreement[best]:.2f} of 1)"
+    return f"{found}; {import_again(CONVENTIONS[best])}"
 
 
 def _near_used(part: SelectedFrames) -> TrackerPoses:
@@ -252,12 +268,11 @@ def _near_used(part: SelectedFrames) -> TrackerPoses:
     return TrackerPoses(poses.time_s[near], poses.position_mm[near], poses.quaternion_wxyz[near])
 
 
-def _agreement(parts: Sequence[tuple[SelectedFrames, TrackerPoses]], order: tuple[int, ...], sign: float) -> float:
+def _agreement(parts: Sequence[tuple[SelectedFrames, TrackerPoses]], corrections: Iterable[str]) -> float:
     """Absolute inner product of both normals; NaN where the apex hardly moves across its longest direction."""
     normals, places, levels = [], [], []
     for part, poses in parts:
-        quaternion = poses.quaternion_wxyz[:, list(order)] * [1.0, sign, sign, sign]
-        rotation = rotation_from_quaternion(quaternion)
+        rotation = rotation_from_quaternion(corrected_quaternions(poses.quaternion_wxyz, corrections))
         lever = inverse(part.scan.head.scanhead_from_tracker)
         normals.append(rotation @ lever[:3, 2])
         places.append(poses.position_mm + rotation @ lever[:3, 3])

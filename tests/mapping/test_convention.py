@@ -10,10 +10,11 @@ import pytest
 
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError
+from tactile_bayes.findings import Finding
 from tactile_bayes.geometry import inverse, quaternion_from_rotation, rigid, rotation_from_quaternion
 from tactile_bayes.mapping import convention
 from tactile_bayes.mapping.build import build_map
-from tactile_bayes.mapping.convention import CONVENTIONS, check_convention
+from tactile_bayes.mapping.convention import CONVENTIONS, check_convention, convention_findings, import_again
 from tactile_bayes.mapping.select import SelectedFrames, select_frames
 from tactile_bayes.report.map_text import map_text
 from tactile_bayes.scans import HeadGeometry, Scan, TrackerPoses
@@ -46,9 +47,9 @@ def scan_of(seed: int, *, lean_deg: float = 0.0) -> Scan:
 
 def told(scan: Scan, name: str) -> Scan:
     """The scan as a file would hold it that tells rotations in another convention."""
-    order, sign = CONVENTIONS[name]
-    stored = np.empty_like(scan.poses.quaternion_wxyz)
-    stored[:, list(order)] = scan.poses.quaternion_wxyz * [1.0, sign, sign, sign]
+    stored = scan.poses.quaternion_wxyz
+    stored = stored * [1.0, -1.0, -1.0, -1.0] if "inverse" in name else stored
+    stored = np.roll(stored, -1, axis=1) if "last" in name else stored
     return replace(scan, poses=TrackerPoses(scan.poses.time_s, scan.poses.position_mm, stored))
 
 
@@ -134,3 +135,12 @@ def test_the_way_to_the_skin_does_not_count():
         np.concatenate([scan.poses.quaternion_wxyz, scan.poses.quaternion_wxyz]),
     )
     assert check_convention(selected(replace(scan, poses=poses))) == check_convention(selected(scan))
+
+
+def test_rotations_that_the_frames_ask_for_too_are_told_once():
+    doubted = {"other_convention": 2.0, "other_agreement": 0.999, "normal_agreement": 0.95}
+    (alone,) = convention_findings(doubted)
+    assert "import the scan again with --correct inverse-rotation" in alone.remedy
+    asked = Finding("wrong_arrangement", "words", import_again(["rows-reversed", "inverse-rotation"]))
+    assert convention_findings(doubted, [asked]) == ()
+    assert convention_findings(doubted, [replace(asked, remedy=import_again(["rows-reversed"]))]) == (alone,)
