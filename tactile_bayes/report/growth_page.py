@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 from collections.abc import Iterator, Sequence
 from typing import Final
 
@@ -19,7 +18,21 @@ from tactile_bayes.mapping.places import PATIENT_WORDS, Orientation, orientation
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.compare import change_sentences, rate_sentences, signed, verdict_sentence
 from tactile_bayes.report.pages import cut, page
-from tactile_bayes.report.svg import STEPS, colour_steps, outlined_text, picture_of, size_ruler, stroked
+from tactile_bayes.report.svg import (
+    STEPS,
+    colour_steps,
+    drawing,
+    edge_names,
+    ellipse_mm,
+    line,
+    picture_of,
+    scale_bar,
+    size_ruler,
+    spread_limits,
+    stroked,
+    text,
+    through,
+)
 from tactile_bayes.size.visits import Compared, straight_line
 
 # --- The maps of each visit, averaged on common axes about the mass.
@@ -27,9 +40,6 @@ from tactile_bayes.size.visits import Compared, straight_line
 _PATIENT: Final = Orientation("-x", "+y", PATIENT_WORDS, (0.0, 1.0))
 HALF_MM: Final = 30.0  #: Half the side of the square about the mass that is drawn.
 STEP_MM: Final = 1.0
-_ENDS: Final = (0.01, 0.995)
-_LEAST_SPAN: Final = 0.35
-"""Shares of the cells that the colours' ends leave outside, and the least span between them, of the level."""
 
 
 class DrawnMap(Record, eq=False):
@@ -100,7 +110,9 @@ def _laid(maps: Sequence[DrawnMap], size: Quantity | None, view: Orientation) ->
         x, y = np.tensordot(np.linalg.inv(rotation), about, axes=1) + np.reshape(centre, (2, 1, 1))
         values.append(_nearest(one, x, y))
         if ring is None and size is not None and drawn.axes_mm is not None:
-            ring = signs[:, None] * _ring(drawn, rotation, size.median)
+            largest = max(drawn.axes_mm)
+            shape = ellipse_mm(drawn.axes_mm, drawn.angle_deg) * size.median / largest  # as its map has it
+            ring = signs[:, None] * (rotation @ shape)
     if not values:
         return LaidMap(np.full(right.shape, np.nan), np.zeros(2), None)
     stack = np.stack(values)
@@ -108,16 +120,6 @@ def _laid(maps: Sequence[DrawnMap], size: Quantity | None, view: Orientation) ->
     total, count = np.where(known, stack, 0.0).sum(axis=0), known.sum(axis=0)
     mean = np.divide(total, count, out=np.full(right.shape, np.nan), where=count > 0)
     return LaidMap(mean, np.mean(places, axis=0) if places else np.zeros(2), ring)
-
-
-def _ring(drawn: DrawnMap, rotation: FloatArray, largest_mm: float) -> FloatArray:
-    """(2, m) x and y of the lump's outline in the shape that its map gives, as large as its size is."""
-    assert drawn.axes_mm is not None
-    t, angle = np.linspace(0.0, 2 * np.pi, 73), np.radians(drawn.angle_deg)
-    half = np.array(drawn.axes_mm) * largest_mm / max(drawn.axes_mm) / 2
-    own = half[:, None] * np.stack([np.cos(t), np.sin(t)])
-    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    return np.asarray(rotation @ turn @ own)
 
 
 def _nearest(tactile_map: TactileMap, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
@@ -133,12 +135,8 @@ def _nearest(tactile_map: TactileMap, x_mm: FloatArray, y_mm: FloatArray) -> Flo
 
 
 def common_limits(maps: Sequence[LaidMap]) -> tuple[float, float]:
-    """Values at the ends of the colours, one range for all maps; noise alone does not look like a lump."""
-    every = np.concatenate([one.values[np.isfinite(one.values)] for one in maps])
-    if not len(every):
-        return 0.0, 1.0
-    low, high = (float(end) for end in np.quantile(every, _ENDS))
-    return low, max(high, low + _LEAST_SPAN * abs(float(np.median(every))), low + 1e-9)
+    """Values at the ends of the colours, one range for all maps."""
+    return spread_limits(np.concatenate([one.values[np.isfinite(one.values)] for one in maps]))
 
 
 # --- The page.
@@ -228,21 +226,13 @@ def _captions(report: CompareReport, course: Course, number: int) -> tuple[str, 
 def _picture(laid: LaidMap, view: Orientation, limits: tuple[float, float], label: str) -> str:
     """Inline SVG of a visit's map with its ring, sides and scale bar."""
     side = _SCALE * (2 * HALF_MM + STEP_MM)
-    places = {"left": (2.4, side / 2), "right": (side - 2.4, side / 2), "top": (side / 2, 3.0),
-              "bottom": (side / 2, side - 2.2)}  # fmt: skip
     parts = [picture_of(laid.values[::-1], limits, (side, side))]
     if laid.ring_mm is not None:
         points = side / 2 + _SCALE * laid.ring_mm * [[1.0], [-1.0]]
-        parts += [stroked("M" + "L".join(f"{x:.2f} {y:.2f}" for x, y in points.T) + "Z", 0.5, kind="size")]
-    for at, name in view.edges.items():
-        x, y = places[at]
-        parts.append(outlined_text(x, y + 0.9, name, size=2.8))
-    parts += [stroked(f"M2 {side - 2:.2f}h{10 * _SCALE:g}", 0.6, kind="scale")]
-    parts += [outlined_text(2 + 5 * _SCALE, side - 3.4, "10 mm", size=2.4)]
-    return (
-        f'<svg class="map" role="img" aria-label="{html.escape(f"Map of {label}")}" '
-        f'viewBox="0 0 {side:.2f} {side:.2f}" width="{side:.2f}mm" height="{side:.2f}mm">{"".join(parts)}</svg>'
-    )
+        parts.append(stroked(through(points.T.tolist()) + "Z", 0.5, kind="size"))
+    parts += edge_names(view, (side, side), small=True)
+    parts += scale_bar(side, _SCALE, least_mm=6.0, inset=2.0, size=2.4)
+    return drawing("map", f"Map of {label}", (0.0, 0.0, side, side), parts)
 
 
 def _changes(report: CompareReport, course: Course) -> Iterator[tuple[str, Quantity]]:
@@ -310,19 +300,15 @@ def _chart(compared: Compared, report: CompareReport, course: Course) -> str:
     scale = (height - _ABOVE_MM - _BELOW_MM) / top
     parts = [*_size_axis(top, scale)]
     if report.trend is not None:
-        line = straight_line(*joint.moments, times)
-        sizes = np.exp(line.level + line.per_day * (np.array(times) - np.mean(times)))
-        ends = "L".join(f"{one.x:.2f} {_up(size, scale):.2f}" for one, size in zip(points, sizes, strict=True))
+        trend = straight_line(*joint.moments, times)
+        sizes = np.exp(trend.level + trend.per_day * (np.array(times) - np.mean(times)))
+        path = through((one.x, _up(size, scale)) for one, size in zip(points, sizes, strict=True))
         dash = 'stroke-width="0.4" stroke-dasharray="1.5 1"'
-        parts.append(f'<path class="trend" d="M{ends}" fill="none" stroke="#555" {dash}/>')
+        parts.append(f'<path class="trend" d="{path}" fill="none" stroke="#555" {dash}/>')
     gap = float(min(np.diff([one.x for one in points])))
     for i, one in enumerate(points):
         parts += _mark(one, scale, row=i % 2 if gap < _ROOM_MM[0] else 0, named=gap >= _ROOM_MM[1])
-    label = "Largest diameter at each visit with its intervals"
-    return (
-        f'<svg class="ruler" role="img" aria-label="{label}" viewBox="0 0 {width:g} {height:g}" '
-        f'width="{width:g}mm" height="{height:g}mm">{"".join(parts)}</svg>'
-    )
+    return drawing("ruler", "Largest diameter at each visit with its intervals", (0.0, 0.0, width, height), parts)
 
 
 def _up(size_mm: float, scale: float) -> float:
@@ -333,13 +319,13 @@ def _up(size_mm: float, scale: float) -> float:
 def _size_axis(top_mm: float, scale: float) -> Iterator[str]:
     floor = _up(0.0, scale)
     right = _BOX_MM[0] - _RIGHT_MM
-    yield f'<path d="M{_LEFT_MM} {_ABOVE_MM}V{floor:.2f}H{right}" fill="none" stroke="#111" stroke-width="0.25"/>'
+    yield line(f"M{_LEFT_MM} {_ABOVE_MM}V{floor:.2f}H{right}", 0.25)
     step = next((one for one in STEPS if top_mm / one <= 6), STEPS[-1])
     for tick in range(0, int(top_mm) + 1, step):
         y = _up(tick, scale)
-        yield f'<path d="M{_LEFT_MM} {y:.2f}h-1" stroke="#111" stroke-width="0.25"/>'
-        yield _words(_LEFT_MM - 1.6, y + 0.9, f"{tick}", anchor="end")
-    yield _words(_LEFT_MM + 1, _ABOVE_MM + 1, "mm", anchor="start")
+        yield line(f"M{_LEFT_MM} {y:.2f}h-1", 0.25)
+        yield text(_LEFT_MM - 1.6, y + 0.9, f"{tick}", anchor="end")
+    yield text(_LEFT_MM + 1, _ABOVE_MM + 1, "mm", anchor="start")
 
 
 def _mark(one: _Point, scale: float, *, row: int, named: bool) -> Iterator[str]:
@@ -347,16 +333,11 @@ def _mark(one: _Point, scale: float, *, row: int, named: bool) -> Iterator[str]:
     for q, thick in ((one.wide, 0.25), (one.size, 0.9)):
         if q is not None:
             low, high = (_up(end, scale) for end in (q.low, q.high))
-            yield f'<path d="M{one.x:.2f} {low:.2f}V{high:.2f}" stroke="#111" stroke-width="{thick}"/>'
+            yield line(f"M{one.x:.2f} {low:.2f}V{high:.2f}", thick)
     y, floor = _up(one.size.median, scale), _up(0.0, scale)
     yield f'<circle cx="{one.x:.2f}" cy="{y:.2f}" r="1.1" fill="#111"/>'
     code, _, when = one.words.removeprefix("Visit ").partition(", ")
     if named:
-        yield _words(one.x + 1.4, y - 1.2, f"{one.size.median:.1f}", anchor="start")
-        yield _words(one.x, floor + 7 + 3 * row, when[:14], size=2.5)
-    yield _words(one.x, floor + 4, code[:14] if named else code[:4])
-
-
-def _words(x: float, y: float, text: str, *, anchor: str = "middle", size: float = 2.7) -> str:
-    place = f'x="{x:.2f}" y="{y:.2f}" text-anchor="{anchor}" font-size="{size}"'
-    return f"<text {place}>{html.escape(text)}</text>"
+        yield text(one.x + 1.4, y - 1.2, f"{one.size.median:.1f}", anchor="start")
+        yield text(one.x, floor + 7 + 3 * row, when[:14], size=2.5)
+    yield text(one.x, floor + 4, code[:14] if named else code[:4])

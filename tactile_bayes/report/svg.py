@@ -6,7 +6,7 @@ import base64
 import html
 import io
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Final
 
 import numpy as np
@@ -20,6 +20,48 @@ from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.mapping.places import Orientation, orientation_of
 from tactile_bayes.report.exam_words import ExamMap, ExamMass
 
+# --- Parts of all drawings: lengths are mm, x to the right and y downwards.
+
+
+def drawing(kind: str, label: str, box: tuple[float, float, float, float], parts: Iterable[str]) -> str:
+    """Inline SVG of a class; `label` is for those who cannot see it, `box` its left, top, width and height."""
+    left, top, width, height = (f"{one:.2f}" for one in box)
+    return (
+        f'<svg class="{kind}" role="img" aria-label="{html.escape(label)}" viewBox="{left} {top} {width} {height}" '
+        f'width="{width}mm" height="{height}mm">{"".join(parts)}</svg>'
+    )
+
+
+def line(path: str, width: float) -> str:
+    """A black line."""
+    return f'<path d="{path}" stroke="#111" stroke-width="{width:g}" fill="none"/>'
+
+
+def text(x: float, y: float, words: str, *, size: float = 2.7, anchor: str = "middle", more: str = "") -> str:
+    """Text, with more attributes."""
+    place = f'x="{x:.2f}" y="{y:.2f}" text-anchor="{anchor}" font-size="{size:g}"'
+    return f"<text {place}{more}>{html.escape(words)}</text>"
+
+
+def through(points: Iterable[tuple[float, float]]) -> str:
+    """Path through points."""
+    return "M" + "L".join(f"{x:.2f} {y:.2f}" for x, y in points)
+
+
+def stroked(path: str, width: float, *, kind: str, dash: str = "") -> str:
+    """A white line with a black edge, visible on every colour and in grey."""
+    dashed = f' stroke-dasharray="{dash}"' if dash else ""
+    under = f'<path d="{path}" fill="none" stroke="#000" stroke-width="{width + min(0.5, width):g}"/>'
+    return f'{under}<path class="{kind}" d="{path}" fill="none" stroke="#fff" stroke-width="{width:g}"{dashed}/>'
+
+
+def outlined_text(x: float, y: float, words: str, *, size: float, anchor: str = "middle") -> str:
+    """White text with a black edge."""
+    edge = f' font-weight="600" fill="none" stroke="#000" stroke-width="{0.2 * size:g}" aria-hidden="true"'
+    under = text(x, y, words, size=size, anchor=anchor, more=edge)
+    return under + text(x, y, words, size=size, anchor=anchor, more=' font-weight="600" fill="#fff"')
+
+
 # --- A clock face of the breast with the masses on it, as inline SVG: what charts of a breast exam show.
 
 _RADIUS: Final = 13.0
@@ -32,28 +74,24 @@ def breast_dial(masses: Sequence[ExamMass]) -> str:
     if not known:
         return ""
     side, rim_mm = known[0][1].side, max(_LEAST_MM, *(1.1 * place.distance_mm for _, place in known))
-    outer = ("R", "L")  # the patient's right is on the viewer's left
     parts = [f'<circle r="{_RADIUS}" fill="none" stroke="#111" stroke-width="0.4"/>', '<circle r="0.9" fill="#111"/>']
     for hour in range(1, 13):
         x, y = _on(hour * 30.0, _RADIUS)
         inner = _on(hour * 30.0, _RADIUS - (2.0 if hour % 3 == 0 else 1.0))
-        parts.append(f'<path d="M{x:.2f} {y:.2f}L{inner[0]:.2f} {inner[1]:.2f}" stroke="#111" stroke-width="0.3"/>')
+        parts.append(line(through([(x, y), inner]), 0.3))
         if hour % 3 == 0:
             a, b = _on(hour * 30.0, _RADIUS + 2.4)
-            parts.append(f'<text x="{a:.2f}" y="{b + 1:.2f}" text-anchor="middle" font-size="2.8">{hour}</text>')
+            parts.append(text(a, b + 1, f"{hour}", size=2.8))
     for number, place in known:
         x, y = _on(place.angle_deg, _RADIUS * place.distance_mm / rim_mm)
         parts.append(f'<circle class="lump" cx="{x:.2f}" cy="{y:.2f}" r="1.3" fill="#111"/>')
         if len(known) > 1:
-            parts.append(f'<text x="{x + 1.8:.2f}" y="{y + 1:.2f}" font-size="2.8">{number}</text>')
-    for letter, x in zip(outer, (-19.5, 19.5), strict=True):
-        parts.append(f'<text x="{x}" y="1" text-anchor="middle" font-size="3" font-weight="600">{letter}</text>')
+            parts.append(text(x + 1.8, y + 1, f"{number}", size=2.8, anchor="start"))
+    for letter, x in (("R", -19.5), ("L", 19.5)):  # the patient's right is on the viewer's left
+        parts.append(text(x, 1.0, letter, size=3, more=' font-weight="600"'))
+    parts.append(text(0.0, 20.6, f"{side} breast, rim at {rim_mm:.0f} mm", size=2.8))
     label = f"Clock face of the {side} breast, rim {rim_mm:.0f} mm from the nipple"
-    return (
-        f'<svg class="dial" role="img" aria-label="{html.escape(label)}" viewBox="-22 -17.5 44 39" width="44mm" '
-        f'height="39mm">{"".join(parts)}<text x="0" y="20.6" text-anchor="middle" font-size="2.8">'
-        f"{html.escape(side)} breast, rim at {rim_mm:.0f} mm</text></svg>"
-    )
+    return drawing("dial", label, (-22.0, -17.5, 44.0, 39.0), parts)
 
 
 def _on(angle_deg: float, radius: float) -> tuple[float, float]:
@@ -81,40 +119,32 @@ def size_ruler(
         return ""
     start, end = min(0.0, *(1.08 * q.low for _, q in rows)), max(0.0, *(1.08 * q.high for _, q in rows))
     scale, bottom = _LENGTH_MM / (end - start), _ROW_MM * len(rows) + 1.5
-    zero = [f'<path d="M{-scale * start:.2f} 0V{bottom:g}" stroke="#111" stroke-width="0.25"/>'] if start < 0.0 else []
-    parts = [
-        *zero,
-        *(part for i, (words, q) in enumerate(rows) for part in _bar(i, words, q, start, scale)),
-        *_scale(start, end, bottom, unit),
-    ]
-    box = f'viewBox="-4 -1 {_LENGTH_MM + 8:g} {bottom + 6:g}" width="{_LENGTH_MM + 8:g}mm" height="{bottom + 6:g}mm"'
-    return f'<svg class="ruler" role="img" aria-label="{html.escape(label)}" {box}>{"".join(parts)}</svg>'
+    parts = [line(f"M{-scale * start:.2f} 0V{bottom:g}", 0.25)] if start < 0.0 else []
+    for i, (words, q) in enumerate(rows):
+        parts += _bar(i, words, q, start, scale)
+    parts += _scale(start, end, bottom, unit)
+    return drawing("ruler", label, (-4.0, -1.0, _LENGTH_MM + 8, bottom + 6), parts)
 
 
 def _bar(row: int, words: str, q: Quantity, start: float, scale: float) -> Iterator[str]:
     y, left, right = 4.0 + _ROW_MM * row, scale * (q.low - start), scale * (q.high - start)
     half = 0.65 * len(words)
     middle = min(max((left + right) / 2, half), _LENGTH_MM - half)
-    yield _ruler_text(middle, y - 1.7, words, halo=True)
-    yield f'<path d="M{left:.2f} {y:g}H{right:.2f}" stroke="#111" stroke-width="{1.6 / (1 + 0.6 * row):.2f}"/>'
-    yield f'<path d="M{scale * (q.median - start):.2f} {y - 1:g}v2" stroke="#111" stroke-width="0.7"/>'
+    yield text(middle, y - 1.7, words, more=' stroke="#fff" stroke-width="0.8" paint-order="stroke"')
+    yield line(f"M{left:.2f} {y:g}H{right:.2f}", round(1.6 / (1 + 0.6 * row), 2))
+    yield line(f"M{scale * (q.median - start):.2f} {y - 1:g}v2", 0.7)
 
 
 def _scale(start: float, end: float, y: float, unit: str) -> Iterator[str]:
     span = end - start
     longest = int(10 ** math.ceil(math.log10(span / _MOST_TICKS))) if span > _MOST_TICKS else 1
     step = next((one for one in STEPS if span / one <= _MOST_TICKS), longest)
-    yield f'<path d="M0 {y:g}H{_LENGTH_MM:g}" stroke="#111" stroke-width="0.25"/>'
+    yield line(f"M0 {y:g}H{_LENGTH_MM:g}", 0.25)
     for tick in range(math.ceil(start / step) * step, int(end) + 1, step):
         x = _LENGTH_MM * (tick - start) / span
-        yield f'<path d="M{x:.2f} {y:g}v1" stroke="#111" stroke-width="0.25"/>'
-        yield _ruler_text(x, y + 4, f"{tick:+d}" if start < 0 and tick else f"{tick}")
-    yield _ruler_text(_LENGTH_MM - 1.5, y - 0.8, unit)
-
-
-def _ruler_text(x: float, y: float, text: str, *, halo: bool = False) -> str:
-    edge = ' stroke="#fff" stroke-width="0.8" paint-order="stroke"' if halo else ""
-    return f'<text x="{x:.2f}" y="{y:g}" text-anchor="middle" font-size="2.7"{edge}>{html.escape(text)}</text>'
+        yield line(f"M{x:.2f} {y:g}v1", 0.25)
+        yield text(x, y + 4, f"{tick:+d}" if start < 0 and tick else f"{tick}")
+    yield text(_LENGTH_MM - 1.5, y - 0.8, unit)
 
 
 # --- Colours of a map, and pixels as PNG.
@@ -141,14 +171,19 @@ def _png(pixels: NDArray[np.uint8], *, colours: int) -> bytes:
     return out.getvalue()
 
 
-def _outline(
-    centre_mm: tuple[float, float], axes_mm: tuple[float, float], angle_deg: float, t: FloatArray
-) -> list[tuple[float, float]]:
-    """Points of an ellipse of these diameters, at angles `t` from its first axis."""
-    angle, (u, v) = np.radians(angle_deg), (axes_mm[0] / 2 * np.cos(t), axes_mm[1] / 2 * np.sin(t))
-    xs = centre_mm[0] + u * np.cos(angle) - v * np.sin(angle)
-    ys = centre_mm[1] + u * np.sin(angle) + v * np.cos(angle)
-    return list(zip(xs.tolist(), ys.tolist(), strict=True))
+def ellipse_mm(axes_mm: tuple[float, float], angle_deg: float) -> FloatArray:
+    """(2, n) x and y about the centre of an ellipse of these diameters, its first axis at the angle from x to y."""
+    t, angle = np.linspace(0.0, 2 * np.pi, _POINTS), np.radians(angle_deg)
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    return np.asarray(turn @ (np.reshape(axes_mm, (2, 1)) / 2 * np.stack([np.cos(t), np.sin(t)])))
+
+
+def spread_limits(values: FloatArray, most: float = np.inf) -> tuple[float, float]:
+    """Values at the ends of the colours, the upper one `most` at most; noise alone does not look like a lump."""
+    if not values.size:
+        return 0.0, 1.0
+    low, high = (float(end) for end in np.quantile(values, _ENDS))
+    return low, max(min(high, most), low + _LEAST_SPAN * abs(float(np.median(values))), low + 1e-9)
 
 
 # --- A map as SVG: its values, the size ellipse and its interval to scale, sides, nipple, scale bar.
@@ -162,9 +197,8 @@ _NO_DATA: Final = (222, 222, 222)
 _ENDS: Final = (0.01, 0.995)
 _LEAST_SPAN: Final = 0.35
 _AMPLITUDES_SHOWN: Final = 1.25
-_POINTS: Final = 72
+_POINTS: Final = 73
 _SCALE_BARS_MM: Final = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0)
-_LEAST_BAR_MM: Final = 8.0
 _BAR_MM: Final = 40.0
 _BAR_STEPS: Final = 40
 _BARBS: Final = ((0.87, 0.5), (0.87, -0.5))
@@ -220,16 +254,13 @@ def marked(exam: ExamMap) -> tuple[float, float] | None:
 
 
 def colour_limits(exam: ExamMap) -> tuple[float, float]:
-    """Values at the ends of the colours: a rib beside the lump does not take them all, noise alone is no lump."""
+    """Values at the ends of a map's colours: a rib beside the lump does not take them all."""
     tactile_map, report = _map_of(exam), exam.report
     well = tactile_map.covered & ~tactile_map.few
     values = tactile_map.mean[well if well.any() else tactile_map.covered]
-    if not values.size:
-        return 0.0, 1.0
-    low, high = (float(end) for end in np.quantile(values, _ENDS))
-    if report.amplitude is not None and report.background is not None:
-        high = min(high, report.background.median + _AMPLITUDES_SHOWN * report.amplitude.median)
-    return low, max(high, low + _LEAST_SPAN * abs(float(np.median(values))), low + 1e-9)
+    if report.amplitude is None or report.background is None:
+        return spread_limits(values)
+    return spread_limits(values, report.background.median + _AMPLITUDES_SHOWN * report.amplitude.median)
 
 
 def exam_picture(
@@ -241,17 +272,15 @@ def exam_picture(
     `limits`: values at the ends of the colours, by default those of `colour_limits`.
     """
     (width, height), margin = frame.size_mm, 0.5 if small else MARGIN_MM
-    whole = f"{width + 2 * margin:.2f}", f"{height + 2 * margin:.2f}"
-    parts = [
-        f'<svg class="map" role="img" aria-label="{html.escape(label)}" viewBox="{-margin:g} {-margin:g} {whole[0]} '
-        f'{whole[1]}" width="{whole[0]}mm" height="{whole[1]}mm">',
-        _cells(frame, limits or colour_limits(exam), small=small),
-        *_edges(frame, small=small),
-        *(part for mass in exam.masses for part in _mass(mass, exam, frame, small=small)),
-        *_marks(exam, frame, small=small),
-        "</svg>",
-    ]
-    return "".join(parts)
+    parts = [_cells(frame, limits or colour_limits(exam), small=small)]
+    parts += edge_names(frame.view, frame.size_mm, small=small)
+    for mass in exam.masses:
+        parts += _mass(mass, exam, frame, small=small)
+    if small:
+        parts += scale_bar(height, frame.scale, least_mm=3.0, inset=1.5, size=2.2)
+    else:
+        parts += [*scale_bar(height, frame.scale, least_mm=8.0, inset=4.0, size=3.2), *_marks(exam, frame)]
+    return drawing("map", label, (-margin, -margin, width + 2 * margin, height + 2 * margin), parts)
 
 
 def thumbnail_svg(exam: ExamMap, *, label: str) -> str:
@@ -302,17 +331,17 @@ def colour_steps(limits: tuple[float, float], words: str, *, more: bool) -> str:
     """Inline SVG of the colours, with the values at their ends and what they are of; `more`: some lie above."""
     steps = _coloured(np.linspace(0.0, 1.0, _BAR_STEPS)[None], (0.0, 1.0), _NO_DATA)[0]
     width = _BAR_MM / _BAR_STEPS  # plain boxes: not every printer of SVG knows gradients
-    boxes = "".join(
+    parts = [
         f'<rect x="{14 + width * i:g}" y="0.5" width="{width + 0.05:g}" height="3" fill="#{bytes(colour).hex()}"/>'
         for i, colour in enumerate(steps)
-    )
-    return (
-        '<svg class="bar" role="img" aria-label="Colours of the map" viewBox="0 0 80 8.5" width="80mm" height="8.5mm">'
-        f'{boxes}<rect x="14" y="0.5" width="{_BAR_MM:g}" height="3" fill="none" stroke="#333" stroke-width="0.15"/>'
-        f'<text x="13" y="3.2" text-anchor="end" font-size="3">{_value(limits[0])}</text>'
-        f'<text x="55" y="3.2" font-size="3">{_value(limits[1])}{" or more" if more else ""}</text>'
-        f'<text x="14" y="7.4" font-size="3">{html.escape(words)}</text></svg>'
-    )
+    ]
+    parts += [
+        f'<rect x="14" y="0.5" width="{_BAR_MM:g}" height="3" fill="none" stroke="#333" stroke-width="0.15"/>',
+        text(13.0, 3.2, _value(limits[0]), size=3, anchor="end"),
+        text(55.0, 3.2, f"{_value(limits[1])}{' or more' if more else ''}", size=3, anchor="start"),
+        text(14.0, 7.4, words, size=3, anchor="start"),
+    ]
+    return drawing("bar", "Colours of the map", (0.0, 0.0, 80.0, 8.5), parts)
 
 
 def _value(value: float) -> str:
@@ -351,24 +380,29 @@ def _image(pixels: NDArray[np.uint8], size_mm: tuple[float, float]) -> str:
     )
 
 
-def _edges(frame: Frame, *, small: bool) -> Iterator[str]:
-    """Names of the picture's sides: the patient's, or the plane's axes; within it on a small picture."""
-    (width, height), out = frame.size_mm, -1.7 if small else MARGIN_MM / 2
+def edge_names(view: Orientation, size_mm: tuple[float, float], *, small: bool) -> Iterator[str]:
+    """Names of a picture's sides: the patient's, or the plane's axes; within it on a small picture."""
+    (width, height), out = size_mm, -1.7 if small else MARGIN_MM / 2
     places = {
         "left": (-out, height / 2),
         "right": (width + out, height / 2),
         "top": (width / 2, -out),
         "bottom": (width / 2, height + out),
     }
-    for side, name in frame.view.edges.items():
+    for side, name in view.edges.items():
         x, y = places[side]
         if small:
             yield outlined_text(x, y + 0.9, name, size=2.5)
-            continue
-        yield (
-            f'<text class="edge" data-side="{side}" x="{x:.2f}" y="{y + 1.5:.2f}" text-anchor="middle" '
-            f'font-size="4.2" font-weight="600">{html.escape(name)}</text>'
-        )
+        else:
+            yield text(x, y + 1.5, name, size=4.2, more=f' font-weight="600" class="edge" data-side="{side}"')
+
+
+def scale_bar(height: float, scale: float, *, least_mm: float, inset: float, size: float) -> Iterator[str]:
+    """A round length that is so long on the page at least, at the lower left corner of a picture, with its words."""
+    length = next((one for one in _SCALE_BARS_MM if scale * one >= least_mm), _SCALE_BARS_MM[-1])
+    yield stroked(f"M{inset:g} {height - inset:.2f}h{scale * length:.2f}", 0.28 * size, kind="scale")
+    middle = inset + scale * length / 2
+    yield outlined_text(max(middle, 1.6 * size), height - inset - 0.5 * size, f"{length:g} mm", size=size)
 
 
 def _mass(mass: ExamMass, exam: ExamMap, frame: Frame, *, small: bool) -> Iterator[str]:
@@ -389,40 +423,14 @@ def _mass(mass: ExamMass, exam: ExamMap, frame: Frame, *, small: bool) -> Iterat
 def _ellipse(mass: ExamMass, times: float, frame: Frame) -> str:
     """Path of the mass's ellipse, its diameters multiplied."""
     assert mass.axes_mm is not None
-    t = np.linspace(0.0, 2 * np.pi, _POINTS, endpoint=False)
-    along, across = (times * axis for axis in mass.axes_mm)
-    places = [frame.at(place) for place in _outline(mass.centre_mm, (along, across), mass.angle_deg, t)]
-    return "M" + "L".join(f"{a:.2f} {b:.2f}" for a, b in places) + "Z"
+    along, across = mass.axes_mm
+    around = ellipse_mm((times * along, times * across), mass.angle_deg) + np.reshape(mass.centre_mm, (2, 1))
+    return through(frame.at((x, y)) for x, y in around.T.tolist()) + "Z"
 
 
-def stroked(path: str, width: float, *, kind: str, dash: str = "") -> str:
-    """A white line with a black edge, visible on every colour and in grey."""
-    dashed = f' stroke-dasharray="{dash}"' if dash else ""
-    under = f'<path d="{path}" fill="none" stroke="#000" stroke-width="{width + min(0.5, width):g}"/>'
-    return f'{under}<path class="{kind}" d="{path}" fill="none" stroke="#fff" stroke-width="{width:g}"{dashed}/>'
-
-
-def outlined_text(x: float, y: float, text: str, *, size: float, anchor: str = "middle") -> str:
-    """White text with a black edge."""
-    place = f'x="{x:.2f}" y="{y:.2f}" text-anchor="{anchor}" font-size="{size:g}" font-weight="600"'
-    words = html.escape(text)
-    under = f'<text {place} fill="none" stroke="#000" stroke-width="{0.2 * size:g}" aria-hidden="true">{words}</text>'
-    return f'{under}<text {place} fill="#fff">{words}</text>'
-
-
-def _marks(exam: ExamMap, frame: Frame, *, small: bool) -> Iterator[str]:
-    """Scale bar, nipple, direction of the sternal notch, and the place that a reason for no size is about.
-
-    A small picture has the bar alone.
-    """
+def _marks(exam: ExamMap, frame: Frame) -> Iterator[str]:
+    """Nipple, direction of the sternal notch, and the place that a reason for no size is about."""
     width, height = frame.size_mm
-    least, inset, size = (3.0, 1.5, 2.2) if small else (_LEAST_BAR_MM, 4.0, 3.2)
-    length = next((one for one in _SCALE_BARS_MM if frame.scale * one >= least), _SCALE_BARS_MM[-1])
-    yield stroked(f"M{inset:g} {height - inset:.2f}h{frame.scale * length:.2f}", 0.28 * size, kind="scale")
-    middle = inset + frame.scale * length / 2
-    yield outlined_text(max(middle, 1.6 * size), height - inset - 0.5 * size, f"{length:g} mm", size=size)
-    if small:
-        return
     place = marked(exam)
     if place is not None:
         x, y = frame.at(place)
@@ -435,8 +443,8 @@ def _marks(exam: ExamMap, frame: Frame, *, small: bool) -> Iterator[str]:
         x, y = width - 8.0, height - 4.0
         tip = (x + 7 * right, y - 7 * up)
         head = [(tip[0] - 2.2 * (right * c - up * s), tip[1] + 2.2 * (up * c + right * s)) for c, s in _BARBS]
-        barbs = "".join(f"M{tip[0]:.2f} {tip[1]:.2f}L{a:.2f} {b:.2f}" for a, b in head)
-        yield stroked(f"M{x:.2f} {y:.2f}L{tip[0]:.2f} {tip[1]:.2f}{barbs}", 0.5, kind="notch")
+        ends = [(x, y), *head]
+        yield stroked("".join(through([end, tip]) for end in ends), 0.5, kind="notch")
         yield outlined_text(x, y - 9.0, "to notch", size=3.0)
 
 
@@ -452,8 +460,7 @@ def _nipple(centre_mm: tuple[float, float], frame: Frame) -> Iterator[str]:
     right, down = (x - edge[0]) / away, (y - edge[1]) / away
     tip = (edge[0] + 2 * right, edge[1] + 2 * down)
     base = [(edge[0] - 1.4 * s * down, edge[1] + 1.4 * s * right) for s in (1, -1)]
-    corners = "L".join(f"{a:.2f} {b:.2f}" for a, b in (tip, *base))
-    yield stroked(f"M{corners}Z", 0.45, kind="nipple-off")
+    yield stroked(through([tip, *base]) + "Z", 0.45, kind="nipple-off")
     anchor = "start" if right < -0.5 else "end" if right > 0.5 else "middle"
     words = f"nipple, {away / frame.scale:.0f} mm"
     yield outlined_text(edge[0] - 3.2 * right, edge[1] - 4.2 * down + 1.0, words, size=3.0, anchor=anchor)
@@ -481,17 +488,12 @@ def smallest_pictures(tactile_map: TactileMap, smallest: SmallestLump) -> Iterat
 
 def _picture(frame: Frame, smallest: SmallestLump, number: int, caption: str) -> str:
     (width, height), side = frame.size_mm, frame.scale * smallest.spacing_mm
-    label = html.escape(f"Smallest lump that would have shown, {caption}")
-    parts = [
-        f'<svg role="img" aria-label="{label}" viewBox="0 0 {width:.2f} {height:.2f}" width="{width:.2f}mm" '
-        f'height="{height:.2f}mm"><rect width="{width:.2f}" height="{height:.2f}" fill="#fff" stroke="#333" '
-        'stroke-width="0.3"/>'
-    ]
+    parts = [f'<rect width="{width:.2f}" height="{height:.2f}" fill="#fff" stroke="#333" stroke-width="0.3"/>']
     for one in smallest.places:
         (x, y), d = frame.at((one.x_mm, one.y_mm)), one.d_mm[number]
         shade = next(grey for most, grey in _SHADES if (np.inf if d is None else d) <= most)
         box = f'x="{x - side / 2:.2f}" y="{y - side / 2:.2f}" width="{side:.2f}" height="{side:.2f}"'
-        text = "–" if d is None else f"{np.ceil(d):.0f}"
         parts.append(f'<rect {box} fill="{shade}" stroke="#777" stroke-width="0.1"/>')
-        parts.append(f'<text x="{x:.2f}" y="{y + 0.9:.2f}" text-anchor="middle" font-size="2.6">{text}</text>')
-    return "".join([*parts, "</svg>"])
+        parts.append(text(x, y + 0.9, "–" if d is None else f"{np.ceil(d):.0f}", size=2.6))
+    label = f"Smallest lump that would have shown, {caption}"
+    return drawing("smallest", label, (0.0, 0.0, width, height), parts)
