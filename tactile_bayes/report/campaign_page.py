@@ -99,8 +99,13 @@ class MassRow(Record, eq=False):
 
     @property
     def told(self) -> Iterator[tuple[str, str]]:
-        """Severity and text of each finding, once, with the exams that it is of where it is not of all."""
+        """Severity and text of each finding, once, with the exams that it is of where it is not of all.
+
+        What speaks against the comparison of the visits comes after what speaks against exams, and not again.
+        """
         every = self.exams
+        known = {one.text for exam in every for one in exam.findings}
+        compared = [] if self.growth is None else [one for one in self.growth.findings if one.text not in known]
         for severity in SEVERITIES:
             of: dict[str, list[str]] = {}
             for exam in every:
@@ -108,6 +113,7 @@ class MassRow(Record, eq=False):
                     of.setdefault(text, []).append(exam.words)
             for text, exams in of.items():
                 yield severity, text if len(exams) == len(every) else f"{text} ({'; '.join(exams)})"
+            yield from ((severity, text) for text in finding_lines(compared, severity, paper=True))
         for exam in every:
             if exam.status == FAILED:
                 yield "caution", f"{exam.words}: {exam.reason}"

@@ -58,10 +58,14 @@ class Growth(Record, eq=False):
     link: str = ""  #: File of the comparison from the page's folder; empty for none.
 
     @property
-    def words(self) -> str:
+    def outcome(self) -> str:
         """What became of the mass, or why nothing is known of it."""
-        told = _VERDICTS.get(self.verdict, f"not compared: {self.reason}")
-        return ". ".join([told, *finding_lines(self.findings, paper=True)])
+        return _VERDICTS.get(self.verdict, f"not compared: {self.reason}")
+
+    @property
+    def words(self) -> str:
+        """The same with what speaks against it."""
+        return ". ".join([self.outcome, *finding_lines(self.findings, paper=True)])
 
 
 def growths(patient: str, mass: str, visits: Sequence[str], report: CompareReport, link: str) -> list[Growth]:
