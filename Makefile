@@ -13,6 +13,7 @@ $(VENV)/.installed: pyproject.toml
 demo: $(VENV)/.installed
 	$(BIN)/tactile-bayes demo -o demo-output --force
 
+# Three minutes on two cores. What takes more than a second a test is marked `long` and runs with `make check`.
 test: $(VENV)/.installed
 	$(BIN)/python -m pytest -n auto --dist worksteal
 
@@ -21,7 +22,8 @@ check: $(VENV)/.installed
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
-	$(BIN)/python -m pytest -n auto --dist worksteal
+	$(MAKE) test
+	$(BIN)/python -m pytest -m 'long and not slow' -n auto --dist worksteal
 
 # All of it: hours. `PART="--begin-at N --budget S"` takes S seconds of it, from a place that N decides.
 slow: $(VENV)/.installed
@@ -29,7 +31,7 @@ slow: $(VENV)/.installed
 
 # What a reader types from the pages, as printed: minutes.
 pages: $(VENV)/.installed
-	$(BIN)/python -m pytest -m 'slow or not slow' -n auto -k test_a_page_runs_as_printed tests/test_docs.py
+	$(BIN)/python -m pytest -m '' -n auto -k test_a_page_runs_as_printed tests/test_docs.py
 
 bench: $(VENV)/.installed
 	$(BIN)/python -m benchmarks.run

@@ -98,6 +98,7 @@ def choices(value: Any) -> Any:
     return "a number" if isinstance(value, float) else value
 
 
+@pytest.mark.long
 def test_another_processor_moves_figures_by_a_small_share_of_their_error(
     answer: Callable[..., Document], newer: str
 ) -> None:

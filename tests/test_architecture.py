@@ -115,6 +115,7 @@ def arrows_of_the_package() -> dict[str, set[str]]:
     return found
 
 
+@pytest.mark.long
 def test_no_file_imports_itself_by_way_of_others():
     assert set(circle({"a": {"b"}, "b": {"c"}, "c": {"a"}, "d": {"a"}})) == {"a", "b", "c"}  # the control
     arrows = arrows_of_the_package()

@@ -109,6 +109,7 @@ def test_the_laplace_estimate_imports_only_what_it_uses(run_python, estimate_inp
     assert not modules & {*NOT_FOR_LAPLACE, "scipy.optimize"}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "words",
     [

@@ -96,6 +96,7 @@ def test_a_page_is_followed_and_written_down(tmp_path):
     assert (tmp_path / "new" / "page" / "files" / "scene.toml.txt").exists()
 
 
+@pytest.mark.long
 def test_files_of_every_form_are_read(tmp_path):
     page = tmp_path / "page.md"
     page.write_text(f"""```sh

@@ -61,6 +61,7 @@ def check(command: str, folder: Path) -> None:
             assert missing(row, done.stdout + done.stderr) == [], command
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("command", [one for one in COMMANDS if one.split()[1] in QUICK])
 def test_a_quick_command_prints_what_the_page_says(command: str, tmp_path: Path) -> None:
     check(command, tmp_path)

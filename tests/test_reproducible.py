@@ -42,6 +42,7 @@ def outputs(run_cli: Run, folder: Path, place: Path, *options: object) -> dict[s
 SLOW_METHODS = [pytest.param(method, marks=pytest.mark.slow) for method in ("optimise", "ensemble")]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("method", ["laplace", *SLOW_METHODS])
 def test_one_seed_gives_the_same_bytes_and_another_does_not(
     run_cli: Run, folder: Path, tmp_path: Path, method: str
@@ -54,6 +55,7 @@ def test_one_seed_gives_the_same_bytes_and_another_does_not(
         assert first[name] != other[name], name
 
 
+@pytest.mark.long
 def test_calibrations_are_reproducible(tmp_path: Path) -> None:
     rows = [f"{d},{0.02 * d},{0.3 * d + 0.1 * (d % 3)}" for d in range(6, 22)]
     (tmp_path / "t.csv").write_text("\n".join(["d_mm,amplitude,sigma_x_mm", *rows]) + "\n")

@@ -101,6 +101,7 @@ def test_every_lead_of_a_finding_has_a_style():
     assert all(line.startswith("\x1b[33m") and line.endswith("\x1b[0m") for line in wrapped.split("\n"))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("columns", [80, 120])
 def test_an_estimate_fits_a_terminal_and_its_size_is_bold(columns, folder, child_environment):
     words = ("estimate", "map.nc", "--method", "laplace")

@@ -176,6 +176,7 @@ def _public(value: Any, depth: int = 5) -> Iterator[Any]:
         yield from _public(value[0], depth - 1)
 
 
+@pytest.mark.long
 def test_nothing_that_a_result_leads_to_prints_an_array(found: tb.SizeEstimate, made: tb.Map) -> None:
     """An estimate's parts once printed 589 lines, a comparison's 914."""
     scan = tb.simulate(DEMO / "scene.toml", seed=2)

@@ -107,6 +107,7 @@ def test_either_way_gives_the_same_numbers(folder: Path, found: tb.SizeEstimate)
     assert found.max_size_mm.interval(0.9)[1] == pytest.approx(ninety["max_size_mm"]["high"], rel=1e-8)
 
 
+@pytest.mark.long
 def test_a_result_has_its_draws_in_every_form(found: tb.SizeEstimate, tmp_path: Path) -> None:
     size = found.max_size_mm
     assert size is not None
@@ -135,6 +136,7 @@ def test_what_is_shown_is_short_and_says_research(found: tb.SizeEstimate, folder
     assert "<script>" not in replace(found, name="<script>")._repr_html_()
 
 
+@pytest.mark.long
 def test_no_lump_is_a_result(folder: Path) -> None:
     empty = tb.estimate(folder / "map.nc", centre_mm=(-25.0, 20.0), **FAST)
     assert (empty.status, empty.max_size_mm, empty.amplitude) == ("no_estimate", None, None)
@@ -238,6 +240,7 @@ def test_bad_input_is_one_error(case: str, folder: Path) -> None:
     assert sorted(folder.iterdir()) == before
 
 
+@pytest.mark.long
 def test_tables_come_as_files_or_frames(tmp_path: Path) -> None:
     files = [DEMO / "trial.csv", DEMO / "excision.csv"]
     one, other = tb.validate(*files), tb.validate(*map(pandas.read_csv, files))

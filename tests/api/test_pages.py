@@ -48,6 +48,7 @@ def test_the_first_block_is_ten_lines() -> None:
     assert len([line for line in blocks_of_page()[0].splitlines() if line]) <= 10
 
 
+@pytest.mark.long
 def test_the_notebook_runs_and_holds_no_output(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     names = run(cells_of_notebook(), tmp_path, monkeypatch)
     assert isinstance(names["found"], tb.SizeEstimate)

@@ -77,6 +77,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "files", [("map.nc",), ("map.nc", "two.nc"), ("map.nc", "map.json"), ("post.nc",), ("post.nc", "map.nc")]
 )
@@ -90,6 +91,7 @@ def test_a_page_from_files_is_the_command_lines(folder: Path, tmp_path: Path, fi
     assert f"cli.html: {line}\n" in done.stdout
 
 
+@pytest.mark.long
 def test_a_page_of_what_python_holds_is_that_of_its_files(folder: Path, tmp_path: Path) -> None:
     one, two = (tb.estimate(folder / name) for name in ("map.nc", "two.nc"))
     tb.exam_report([folder / "map.nc", folder / "two.nc"], tmp_path / "wanted.html")
@@ -102,6 +104,7 @@ def test_a_page_of_what_python_holds_is_that_of_its_files(folder: Path, tmp_path
         assert (tmp_path / f"{name}.html").read_text() == wanted
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("files", "given", "told"),
     [
@@ -126,6 +129,7 @@ def test_what_cannot_be_a_page_is_refused_and_nothing_is_written(
     assert sorted(folder.iterdir()) == before
 
 
+@pytest.mark.long
 def test_a_page_that_cannot_be_printed_leaves_neither_file(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -142,6 +146,7 @@ def test_a_page_that_cannot_be_printed_leaves_neither_file(
     assert printed.PageFiles(tmp_path / "new.html").check() is None
 
 
+@pytest.mark.long
 def test_dates_of_a_comparison_are_days_and_the_full_text_is_the_command_lines(folder: Path) -> None:
     first, later = (tb.estimate(folder / name, **FAST) for name in ("map.nc", "two.nc"))
     dated = tb.compare(first, later, dates=["2026-01-01", "2026-01-31"], **FAST)
@@ -157,6 +162,7 @@ def test_dates_of_a_comparison_are_days_and_the_full_text_is_the_command_lines(f
     assert told["changes"] == dated.document["changes"]
 
 
+@pytest.mark.long
 def test_days_that_do_not_fit_and_a_checkpoint_are_refused_before_maps_are_read(folder: Path) -> None:
     never = folder / "not-there.nc"
     for given, told in (

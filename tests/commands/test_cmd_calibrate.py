@@ -29,6 +29,7 @@ def rows(n: int = 12, *, header: str = "d_mm,amplitude,sigma_x_mm") -> str:
     return "\n".join([header, *(f"{x:.6g},{y:.6g},{z:.6g}" for x, y, z in zip(d, a, sigma, strict=True))]) + "\n"
 
 
+@pytest.mark.long
 def test_phantoms_become_a_calibration(run_cli: Run, tmp_path: Path) -> None:
     options = ("--normalise", "gain", "--background", "free", "--fit-radius-mm", 15, "--seed", 4)
     (tmp_path / "silent.csv").write_text(PHANTOMS.read_text().replace(",mean,fixed,20,independent", ",,,,"))
@@ -104,6 +105,7 @@ def test_an_existing_calibration_is_left_alone_without_force(tmp_path: Path) -> 
     assert (tmp_path / "size.json").read_text() == "mine"
 
 
+@pytest.mark.long
 def test_the_figure_is_drawn_from_the_tables_own_lumps_and_only_for_eq_6(tmp_path: Path) -> None:
     (tmp_path / "t.csv").write_text(rows(12))
     words = ("calibrate", "size", "t.csv", "-o", "size.json", "--figure", "fig.png")

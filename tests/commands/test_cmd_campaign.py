@@ -87,6 +87,7 @@ def campaign(folder: Path, *more: object) -> subprocess.CompletedProcess[str]:
 # --- the table
 
 
+@pytest.mark.long
 def test_init_writes_what_the_scans_carry_and_names_what_it_leaves_out(study: Path, tmp_path: Path) -> None:
     shutil.copytree(study / "scans", tmp_path / "scans")
     (tmp_path / "scans" / "cut.mcap").write_bytes(b"\x89MCAP0\r\n and no more")
@@ -161,18 +162,21 @@ def test_a_fault_of_the_table_is_one_line_and_no_work(case: str, tmp_path: Path)
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.long
 def test_a_file_whose_name_has_a_backslash_is_an_exam(own: Path) -> None:
     (own / "scans" / "07-a.mcap").rename(own / "scans" / "07\\a.mcap")
     write_table(own / "exams.csv", [("scans/07\\a.mcap", "07", 1, "left")])
     assert "1 exams: 1 sized" in campaign(own).stdout
 
 
+@pytest.mark.long
 def test_capitals_do_not_make_a_scan_another_patients(own: Path) -> None:
     write(own / "scans" / "07-a.mcap", thinned(0, 2, subject="p07", side="left"))
     write_table(own / "exams.csv", [("scans/07-a.mcap", "P07", 1, "left")])
     assert "1 exams: 1 sized" in campaign(own).stdout
 
 
+@pytest.mark.long
 def test_an_excision_table_that_writes_a_code_another_way_is_refused_before_any_work(own: Path) -> None:
     write_table(own / "exams.csv", [("scans/09-a.mcap", "P09", 1, "right")])
     (own / "excision.csv").write_text("patient,mass,ex_vivo_mm\nP10,1,12\np09,1,14\n")
@@ -182,6 +186,7 @@ def test_an_excision_table_that_writes_a_code_another_way_is_refused_before_any_
     assert not (own / "out").exists()
 
 
+@pytest.mark.long
 def test_a_table_from_windows_is_read(finished: Path) -> None:
     before = contents(finished / "out")
     table = finished / "exams.csv"
@@ -190,6 +195,7 @@ def test_a_table_from_windows_is_read(finished: Path) -> None:
     assert contents(finished / "out") == before
 
 
+@pytest.mark.long
 def test_an_excision_sheet_of_a_german_spreadsheet_is_read_by_its_mapping(finished: Path) -> None:
     """Semicolons, decimal commas, cm, other names and columns: the report is that of the tidy table in mm."""
     tidy = campaign(finished, "--excision", "excision.csv").stdout
@@ -206,6 +212,7 @@ def test_an_excision_sheet_of_a_german_spreadsheet_is_read_by_its_mapping(finish
     assert by_hand.stdout in done.stdout, by_hand.stderr
 
 
+@pytest.mark.long
 def test_an_excision_sheet_with_two_rows_of_one_mass_is_refused(finished: Path) -> None:
     (finished / "patho.csv").write_text("id;cm\n07;1,5\n09;1,4\n07;2,4\n")
     (finished / "patho.toml").write_text('patient = "id"\n[excision]\nsize = "cm"\nunit = "cm"\n')
@@ -214,6 +221,7 @@ def test_an_excision_sheet_with_two_rows_of_one_mass_is_refused(finished: Path) 
     assert "line 4, column patient: 07 + 1 stands on line 2 already; remove one, or name the column" in done.stderr
 
 
+@pytest.mark.long
 def test_a_mapping_needs_its_excision_table(finished: Path) -> None:
     (finished / "patho.toml").write_text('patient = "id"\n[excision]\nsize = "cm"\nunit = "cm"\n')
     alone = campaign(finished, "--columns", "patho.toml")
@@ -223,6 +231,7 @@ def test_a_mapping_needs_its_excision_table(finished: Path) -> None:
     assert "line 1, column id: is missing; correct the mapping; the table has 'patient', 'mass'" in missing.stderr
 
 
+@pytest.mark.long
 def test_a_step_that_ends_after_its_command_was_killed_changes_nothing_that_is_read(finished: Path) -> None:
     """On a cluster a worker goes on; here its step is run after the folder's last run, with another normalisation."""
     out, exam = finished / "out", "07.v1.m1.r1"
@@ -239,6 +248,7 @@ def test_a_step_that_ends_after_its_command_was_killed_changes_nothing_that_is_r
     assert steps(out) == done
 
 
+@pytest.mark.long
 def test_python_runs_what_the_command_runs(own: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The command has nothing left to do."""
     monkeypatch.chdir(own)
@@ -260,12 +270,14 @@ def test_python_runs_what_the_command_runs(own: Path, monkeypatch: pytest.Monkey
         tb.campaign("exams.csv", "out", normalise="twice")
 
 
+@pytest.mark.long
 def test_an_output_that_is_an_input_is_refused(finished: Path) -> None:
     shutil.copy(finished / "excision.csv", finished / "out" / "trial.csv")
     done = campaign(finished, "--excision", "out/trial.csv")
     assert "out/trial.csv is an input of this command; choose another name for the output" in done.stderr
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["exams_done", "failures"])
 def test_tables_have_every_column_of_their_schema_in_its_order(undisturbed: Path, name: str) -> None:
     """Also those that no exam fills: a script must not break on a trial without cautions."""
@@ -275,6 +287,7 @@ def test_tables_have_every_column_of_their_schema_in_its_order(undisturbed: Path
     assert header == ",".join(one["name"] for one in load_schema(f"{name}.table.json")["fields"])
 
 
+@pytest.mark.long
 def test_the_trial_table_has_its_columns_where_no_exam_has_a_size(own: Path) -> None:
     write_table(own / "exams.csv", [("scans/11-a.mcap", "11", 1, "left")])
     done = campaign(own, "--excision", "excision.csv")
@@ -284,11 +297,13 @@ def test_the_trial_table_has_its_columns_where_no_exam_has_a_size(own: Path) -> 
     assert "Sizes against excision" in done.stdout
 
 
+@pytest.mark.long
 def test_a_pooled_size_is_synthetic_also_where_the_last_exam_failed(undisturbed: Path) -> None:
     rows = [row for row in rows_of(undisturbed / "trial.csv") if row["modality"] == "tactile-pooled"]
     assert {row["patient"]: row["synthetic"] for row in rows} == {"07": "true", "09": "true", "11": "true", "12": ""}
 
 
+@pytest.mark.long
 def test_a_plan_and_a_run_name_the_few_exams_they_do_again(finished: Path) -> None:
     write(finished / "scans" / "09-a.mcap", thinned(1, 5, subject="09", side="right"))
     planned = campaign(finished, "--dry-run").stdout.splitlines()
@@ -326,6 +341,7 @@ def test_an_exam_that_cannot_show_a_lump_was_not_done(code: str, status: str) ->
     assert Row(Listed("a.nc", Path("a.nc"), "P", "1", "1", 1), report).status == status
 
 
+@pytest.mark.long
 def test_every_exam_has_its_row_and_its_status(undisturbed: Path) -> None:
     trial = {(row["patient"], row["modality"], row["replicate"]): row for row in rows_of(undisturbed / "trial.csv")}
     status = {key: row["status"] for key, row in trial.items() if key[1] == "tactile"}
@@ -344,6 +360,7 @@ def test_every_exam_has_its_row_and_its_status(undisturbed: Path) -> None:
     assert [row["patient"] for row in rows_of(undisturbed / "exams_done.csv")] == ["07", "07", "09", "11"]
 
 
+@pytest.mark.long
 def test_a_swapped_and_a_damaged_file_are_failures_that_say_why(undisturbed: Path) -> None:
     failures = {row["file"]: row for row in rows_of(undisturbed / "failures.csv")}
     assert set(failures) == {"scans/swapped.mcap", "scans/12-a.mcap"}
@@ -354,6 +371,7 @@ def test_a_swapped_and_a_damaged_file_are_failures_that_say_why(undisturbed: Pat
         assert not (undisturbed / "exams" / name).exists()
 
 
+@pytest.mark.long
 def test_an_exam_has_what_the_single_commands_give(undisturbed: Path, study: Path, tmp_path: Path) -> None:
     for name, scan in (("07.v1.m1.r1", "07-a"), ("07.v1.m1.r2", "07-b")):
         made = undisturbed / "exams" / name
@@ -367,6 +385,7 @@ def test_an_exam_has_what_the_single_commands_give(undisturbed: Path, study: Pat
     assert (undisturbed / "masses" / "07.v1.m1" / "pooled.json").read_text() == wanted
 
 
+@pytest.mark.long
 def test_an_estimate_names_the_scan_it_comes_from(undisturbed: Path, study: Path) -> None:
     from tactile_bayes.files.atomic import sha256
 
@@ -377,6 +396,7 @@ def test_an_estimate_names_the_scan_it_comes_from(undisturbed: Path, study: Path
     assert document["provenance"]["scans"] == [{"sha256": digest, **facts, "frames_sha256": frames}]
 
 
+@pytest.mark.long
 def test_validate_takes_the_trial_table_as_it_is(finished: Path) -> None:
     done = campaign(finished, "--excision", "excision.csv")
     assert done.returncode == 0, done.stderr
@@ -392,6 +412,7 @@ def test_validate_takes_the_trial_table_as_it_is(finished: Path) -> None:
     assert not (finished / "out" / "report.json").exists()
 
 
+@pytest.mark.long
 def test_a_protocol_fixes_the_analysis(finished: Path) -> None:
     (finished / "p.toml").write_text('title = "Agreed"\n[analysis]\nintervals = "jackknife"\nseed = 7\n')
     campaign(finished, "--excision", "excision.csv", "--protocol", "p.toml")
@@ -402,12 +423,14 @@ def test_a_protocol_fixes_the_analysis(finished: Path) -> None:
     assert "--protocol is for the trial's report; give --excision too" in alone.stderr
 
 
+@pytest.mark.long
 def test_files_are_for_their_owner_alone(undisturbed: Path) -> None:
     for path in (undisturbed, *undisturbed.rglob("*.*")):
         assert path.is_dir() or path.stat().st_mode & 0o777 == 0o600, path
     assert undisturbed.stat().st_mode & 0o777 == 0o700
 
 
+@pytest.mark.long
 def test_two_workers_give_the_same_bytes(undisturbed: Path, own: Path, run_cli: Run) -> None:
     words = ("campaign", "run", "exams.csv", "-o", "out", *FAST, "--workers", 2)
     done = run_cli(*words, cwd=own)
@@ -415,12 +438,14 @@ def test_two_workers_give_the_same_bytes(undisturbed: Path, own: Path, run_cli: 
     assert contents(own / "out") == contents(undisturbed)
 
 
+@pytest.mark.long
 def test_the_order_of_the_rows_changes_nothing(finished: Path, undisturbed: Path) -> None:
     write_table(finished / "exams.csv", reversed(ROWS))
     campaign(finished)
     assert contents(finished / "out") == contents(undisturbed)
 
 
+@pytest.mark.long
 def test_without_excision_sizes_there_is_a_trial_table_and_no_report(own: Path) -> None:
     write_table(own / "exams.csv", [ROWS[3]])
     done = run_here("campaign", "run", "exams.csv", "-o", "out", *FAST, cwd=own)
@@ -430,6 +455,7 @@ def test_without_excision_sizes_there_is_a_trial_table_and_no_report(own: Path) 
     assert [row["modality"] for row in rows_of(own / "out" / "trial.csv")] == ["tactile"]
 
 
+@pytest.mark.long
 def test_masses_that_were_not_excised_are_left_out_of_the_trial_by_name(finished: Path) -> None:
     own = finished
     (own / "excision.csv").write_text("patient,mass,ex_vivo_mm\n07,1,15\n")
@@ -439,6 +465,7 @@ def test_masses_that_were_not_excised_are_left_out_of_the_trial_by_name(finished
     assert (own / "out" / "report.html").exists()
 
 
+@pytest.mark.long
 def test_arrays_and_maps_are_exams_too(undisturbed: Path, own: Path) -> None:
     scan = thinned(1, 4)
     np.savez(own / "arrays.npz", **arrays_of(scan))
@@ -456,6 +483,7 @@ def test_arrays_and_maps_are_exams_too(undisturbed: Path, own: Path) -> None:
     assert "the file says patient 09" in rows_of(own / "out" / "failures.csv")[0]["reason"]
 
 
+@pytest.mark.long
 def test_a_file_in_two_rows_is_a_fault_unless_each_mass_has_its_place(own: Path) -> None:
     shutil.copy(own / "scans" / "07-a.mcap", own / "scans" / "copy.mcap")
     write_table(own / "exams.csv", [("scans/07-a.mcap", "07", 1, "left"), ("scans/copy.mcap", "07", 2, "left")])
@@ -475,6 +503,7 @@ def test_a_file_in_two_rows_is_a_fault_unless_each_mass_has_its_place(own: Path)
 # --- going on
 
 
+@pytest.mark.long
 def test_a_second_run_does_nothing_again_but_what_failed(undisturbed: Path, study: Path) -> None:
     before, done_before = contents(undisturbed), steps(undisturbed)
     done = campaign(study)
@@ -483,6 +512,7 @@ def test_a_second_run_does_nothing_again_but_what_failed(undisturbed: Path, stud
     assert steps(undisturbed) == done_before
 
 
+@pytest.mark.long
 def test_a_changed_scan_redoes_what_depends_on_it(finished: Path) -> None:
     count = len(steps(finished / "out"))
     write(finished / "scans" / "09-a.mcap", thinned(1, 4, subject="09", side="right"))
@@ -495,6 +525,7 @@ def test_a_changed_scan_redoes_what_depends_on_it(finished: Path) -> None:
     ]
 
 
+@pytest.mark.long
 def test_a_changed_setting_redoes_estimates_and_no_map(finished: Path) -> None:
     write_table(finished / "exams.csv", ROWS[:2])
     count = len(steps(finished / "out"))
@@ -508,6 +539,7 @@ def test_a_changed_setting_redoes_estimates_and_no_map(finished: Path) -> None:
     assert there == contents(finished / "fresh")
 
 
+@pytest.mark.long
 def test_a_file_that_was_changed_or_removed_is_made_again(undisturbed: Path, finished: Path) -> None:
     (finished / "out/exams/07.v1.m1.r1/map.nc").write_bytes(b"changed")
     (finished / "out/exams/09.v1.m1.r1/posterior.nc").unlink()
@@ -518,6 +550,7 @@ def test_a_file_that_was_changed_or_removed_is_made_again(undisturbed: Path, fin
     assert contents(finished / "out") == contents(undisturbed)
 
 
+@pytest.mark.long
 def test_files_of_an_exam_that_fails_now_are_removed_and_unlisted_exams_stay(finished: Path) -> None:
     scan = finished / "scans" / "07-a.mcap"
     scan.write_bytes(scan.read_bytes()[:1000])
@@ -530,6 +563,7 @@ def test_files_of_an_exam_that_fails_now_are_removed_and_unlisted_exams_stay(fin
     assert "09" not in {row["patient"] for row in rows_of(finished / "out/exams_done.csv")}
 
 
+@pytest.mark.long
 def test_figures_are_drawn_on_demand_and_estimates_stay(finished: Path) -> None:
     write_table(finished / "exams.csv", [ROWS[3], ROWS[4]])
     count = len(steps(finished / "out"))
@@ -541,6 +575,7 @@ def test_figures_are_drawn_on_demand_and_estimates_stay(finished: Path) -> None:
     assert 'href="exams/11.v1.m1.r1/map.png"' in (out / "index.html").read_text()
 
 
+@pytest.mark.long
 def test_a_dry_run_says_what_it_would_do_and_writes_nothing(finished: Path) -> None:
     before = contents(finished / "out")
     done = campaign(finished, "--seed", 2, "--dry-run")
@@ -616,6 +651,7 @@ def test_fifty_kills_at_any_moment_end_in_the_same_bytes(
         check_resumed(own, undisturbed)
 
 
+@pytest.mark.long
 def test_ctrl_c_keeps_what_is_done_and_says_so(undisturbed: Path, own: Path, child_environment: dict[str, str]) -> None:
     told, code = "", 0
     for _ in range(5):  # on a busy machine a run may come to its end before the signal does
@@ -659,6 +695,7 @@ def test_a_full_disk_is_one_line_and_loses_nothing(
     check_resumed(own, undisturbed)
 
 
+@pytest.mark.long
 def test_two_runs_at_once_are_refused(undisturbed: Path, study: Path) -> None:
     import fcntl
 
@@ -669,6 +706,7 @@ def test_two_runs_at_once_are_refused(undisturbed: Path, study: Path) -> None:
     assert "is in use by another run" in done.stderr
 
 
+@pytest.mark.long
 def test_an_output_that_holds_something_else_is_refused(own: Path) -> None:
     (own / "out").mkdir()
     (own / "out" / "thesis.tex").write_text("x")
@@ -678,6 +716,7 @@ def test_an_output_that_holds_something_else_is_refused(own: Path) -> None:
     assert os.listdir(own / "out") == ["thesis.tex"]  # noqa: PTH208
 
 
+@pytest.mark.long
 def test_exams_inside_the_output_are_refused(finished: Path) -> None:
     write_table(finished / "exams.csv", [("out/exams/07.v1.m1.r1/map.nc", "07", 1, "left")])
     done = campaign(finished)
@@ -685,6 +724,7 @@ def test_exams_inside_the_output_are_refused(finished: Path) -> None:
     assert "lies in the output folder out" in done.stderr
 
 
+@pytest.mark.long
 def test_a_missing_file_is_its_own_row(own: Path) -> None:
     write_table(own / "exams.csv", [("scans/gone.mcap", "07", 1, "left"), ROWS[1]])
     done = campaign(own)
@@ -693,6 +733,7 @@ def test_a_missing_file_is_its_own_row(own: Path) -> None:
     assert (row["step"], row["reason"]) == ("read", "cannot be read (No such file or directory); check the path")
 
 
+@pytest.mark.long
 def test_a_trial_without_a_reading_has_no_report_and_the_reason(finished: Path) -> None:
     (finished / "excision.csv").write_text("patient,mass,ex_vivo_mm\nother,1,15\n")
     done = campaign(finished, "--excision", "excision.csv")

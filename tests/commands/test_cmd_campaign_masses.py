@@ -61,6 +61,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
+@pytest.mark.long
 def test_replicates_and_visits_are_matched_by_place_in_patient_axes(folder: Path) -> None:
     told = campaign(folder, *TWO_PLACES, "b.nc,P1,1,1,2,left,,", "b.nc,P1,1,2,2,left,,")
     assert "4 exams: 4 sized" in told
@@ -101,6 +102,7 @@ def test_a_mass_that_is_not_within_the_distance_is_not_taken(folder: Path) -> No
     assert trial["2", "2"]["reason"] == "no lump found within 6 mm of mass 2's place, (16.0, 2.0) mm"
 
 
+@pytest.mark.long
 def test_exams_of_a_mass_that_lie_apart_are_told(folder: Path) -> None:
     """The second row's place is the other mass's; the control has both rows at one."""
     campaign(folder, "a.nc,P1,1,1,1,left,-17,2", "b.nc,P1,1,1,2,left,21,-6")

@@ -47,6 +47,7 @@ def own(study: Path, tmp_path: Path) -> Path:
     return tmp_path / "study"
 
 
+@pytest.mark.long
 def test_it_learns_says_so_and_its_file_is_what_the_command_writes(study: Path, tmp_path: Path) -> None:
     said = (study / "said.txt").read_text()
     assert SAYS in said
@@ -58,6 +59,7 @@ def test_it_learns_says_so_and_its_file_is_what_the_command_writes(study: Path, 
     assert 'href="repeatability.json"' in page
 
 
+@pytest.mark.long
 def test_the_tables_have_the_sizes_by_it(study: Path) -> None:
     rows = rows_of(study / "out" / "trial.csv")
     learned = json.loads((study / "out" / "repeatability.json").read_text())
@@ -77,6 +79,7 @@ def test_the_tables_have_the_sizes_by_it(study: Path) -> None:
     assert [row["low_mm"] for row in done] == [row["low_mm"] for row in rows if row["modality"] == "tactile"]
 
 
+@pytest.mark.long
 def test_a_size_by_it_is_that_of_an_estimate_from_the_map(study: Path) -> None:
     """Two ways: from the kept draws, and the whole estimate with --repeatability."""
     folder = study / "out" / "exams" / "01.v1.m1.r1"
@@ -93,12 +96,14 @@ def test_a_size_by_it_is_that_of_an_estimate_from_the_map(study: Path) -> None:
     assert sized["provenance"] == by_hand["provenance"]
 
 
+@pytest.mark.long
 def test_a_second_run_does_nothing_again(own: Path) -> None:
     before = contents(own / "out")
     assert "0 steps run, 46 kept from earlier runs" in campaign(own).stdout
     assert contents(own / "out") == before
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("done", [20, 26])
 def test_what_a_kill_leaves_while_it_learns_or_sizes_goes_on_to_the_same_bytes(done: int, own: Path) -> None:
     """Killed before the spread was in the journal, and between the sizes; files may be there before their lines."""
@@ -113,6 +118,7 @@ def test_what_a_kill_leaves_while_it_learns_or_sizes_goes_on_to_the_same_bytes(d
     assert steps(own / "out") == order
 
 
+@pytest.mark.long
 def test_a_changed_exam_redoes_sizes_and_fits_no_other_map(own: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     told: list[tuple[int, int]] = []
 
@@ -144,6 +150,7 @@ def test_after_a_changed_exam_all_is_as_if_it_had_been_so_from_the_beginning(own
     assert contents(own / "out") == contents(own / "fresh")
 
 
+@pytest.mark.long
 def test_none_leaves_it_out_and_a_file_or_a_stated_spread_takes_its_place(own: Path) -> None:
     shutil.copy(own / "out" / "repeatability.json", own / "site.json")
     done = campaign(own, "--repeatability", "none")
@@ -162,6 +169,7 @@ def test_none_leaves_it_out_and_a_file_or_a_stated_spread_takes_its_place(own: P
     assert "spread between exams" not in campaign(own, "--settings", "spread.toml", out="stated").stdout
 
 
+@pytest.mark.long
 def test_fewer_than_five_masses_with_repeats_do_not_teach_it(own: Path) -> None:
     write_table(own / "exams.csv", ROWS[:9])
     done = campaign(own)
@@ -170,6 +178,7 @@ def test_fewer_than_five_masses_with_repeats_do_not_teach_it(own: Path) -> None:
     assert not list((own / "out").glob("exams/0[1-4]*/sized.json"))
 
 
+@pytest.mark.long
 def test_a_dry_run_knows_the_steps(own: Path) -> None:
     words = ("campaign", "run", "exams.csv", "-o", "out", *FAST, "--dry-run")
     told = run_here(*words, cwd=own).stdout
@@ -200,6 +209,7 @@ def first_alone(draw: Callable[..., object]) -> Callable[..., None]:
     return again
 
 
+@pytest.mark.long
 def test_figures_have_the_size_by_it(own: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("draw_map", "draw_size"):
         monkeypatch.setattr(campaign_steps, name, first_alone(getattr(campaign_steps, name)))

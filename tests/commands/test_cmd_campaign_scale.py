@@ -45,6 +45,7 @@ def campaign(folder: Path, *more: object) -> subprocess.CompletedProcess[str]:
     return run_here("campaign", "run", "exams.csv", "-o", "out", *FAST, *more, cwd=folder)
 
 
+@pytest.mark.long
 def test_blocks_of_any_size_give_the_same_bytes_and_show_exams_whole(
     undisturbed: Path, own: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -61,6 +62,7 @@ def scans(read: list[Path]) -> list[str]:
     return [path.name for path in read if path.suffix == ".mcap"]
 
 
+@pytest.mark.long
 def test_a_file_is_read_again_only_when_it_was_written_to_or_replaced(
     own: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -82,6 +84,7 @@ def test_a_file_is_read_again_only_when_it_was_written_to_or_replaced(
     assert "failed: 07.v1.m1.r1: map: is damaged" in done.stderr
 
 
+@pytest.mark.long
 def test_files_changed_a_moment_ago_are_always_read(own: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     read: list[Path] = []
     digest_of = campaign_inputs.sha256
@@ -90,6 +93,7 @@ def test_files_changed_a_moment_ago_are_always_read(own: Path, monkeypatch: pyte
     assert len(scans(read)) == len(ROWS)
 
 
+@pytest.mark.long
 def test_a_disk_that_is_away_costs_nothing_that_is_done(own: Path) -> None:
     before = contents(own / "out")
     (own / "scans").rename(own / "away")
@@ -103,6 +107,7 @@ def test_a_disk_that_is_away_costs_nothing_that_is_done(own: Path) -> None:
     assert contents(own / "out") == before
 
 
+@pytest.mark.long
 def test_a_large_contact_sheet_shows_the_worst_and_names_its_pictures(
     own: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -120,6 +125,7 @@ def test_a_large_contact_sheet_shows_the_worst_and_names_its_pictures(
     assert "data:image" not in page
 
 
+@pytest.mark.long
 def test_interrupted_and_planned_counts_are_of_the_whole_campaign(own: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(campaigns, "_BLOCK", 2)
     done = campaign(own, "--seed", 2, "--dry-run")
@@ -159,6 +165,7 @@ def store(monkeypatch: pytest.MonkeyPatch) -> Any:
     return memory
 
 
+@pytest.mark.long
 def test_exams_in_a_store_give_what_local_ones_give_and_are_copied_there(
     undisturbed: Path, tmp_path: Path, store: Any
 ) -> None:

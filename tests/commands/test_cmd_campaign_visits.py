@@ -65,6 +65,7 @@ def done(maps: Path) -> tuple[Path, str]:
     return maps / "out", made.stdout
 
 
+@pytest.mark.long
 def test_the_report_is_of_the_last_visit_and_says_so(done: tuple[Path, str]) -> None:
     out, told = done
     assert "2 masses were read at several visits: the last one before excision is analysed" in told
@@ -79,6 +80,7 @@ def test_the_report_is_of_the_last_visit_and_says_so(done: tuple[Path, str]) -> 
     assert grown["2"] > 1.2 * grown["1"]  # the growth that would be in it
 
 
+@pytest.mark.long
 def test_growth_is_compared_by_itself_and_stands_beside_the_report(done: tuple[Path, str]) -> None:
     out, told = done
     assert "growth of 2 masses with several visits: 1 grown, 1 no change shown (growth.csv)" in told
@@ -97,6 +99,7 @@ def test_growth_is_compared_by_itself_and_stands_beside_the_report(done: tuple[P
     assert "Visit 2, 2026-04-10" in growth
 
 
+@pytest.mark.long
 def test_growth_is_what_compare_gives_of_the_maps(done: tuple[Path, str], maps: Path) -> None:
     out, _ = done
     exams = [f"out/exams/P1.v{v}.m1.r{r}/map.nc" for v in (1, 2) for r in (1, 2)]
@@ -107,6 +110,7 @@ def test_growth_is_what_compare_gives_of_the_maps(done: tuple[Path, str], maps: 
     assert ours["trend"] == told["trend"]
 
 
+@pytest.mark.long
 def test_a_second_run_does_nothing_and_another_date_compares_again(done: tuple[Path, str], maps: Path) -> None:
     assert done[0].exists()
     again = campaign(maps, rows(), "--excision", "ex.csv").stdout
@@ -116,6 +120,7 @@ def test_a_second_run_does_nothing_and_another_date_compares_again(done: tuple[P
     assert "compare run: P1.m1, P2.m1" in later
 
 
+@pytest.mark.long
 def test_visits_without_an_order_and_an_excision_before_all_are_refused_before_any_work(maps: Path) -> None:
     undated = [line.replace("2026-01-10", "").replace("2026-04-10", "") for line in rows(("pre", "post"))]
     named = campaign(maps, undated)

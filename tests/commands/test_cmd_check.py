@@ -21,6 +21,7 @@ def backwards(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.long
 def test_the_first_scan_says_what_is_wrong_and_how_to_mend_it(backwards):
     said = run_here("import", "exam.npz", "-o", "exam.mcap", cwd=backwards)
     assert said.returncode == 0
@@ -40,6 +41,7 @@ def test_the_first_scan_says_what_is_wrong_and_how_to_mend_it(backwards):
     assert np.array_equal(tb.read_scan(backwards / "right.mcap").frames.counts, tb.demo_scan().frames.counts)
 
 
+@pytest.mark.long
 def test_a_scan_can_be_mapped_as_it_is_stated(backwards):
     run_here("import", "exam.npz", "-o", "again.mcap", cwd=backwards)
     assert run_here("map", "again.mcap", "-o", "again.nc", "--as-stated", cwd=backwards).returncode == 0

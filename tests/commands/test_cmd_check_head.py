@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 import numpy as np
+import pytest
 from in_process import run_here
 
 import tactile_bayes as tb
@@ -24,6 +25,7 @@ def even(scan: Scan) -> Scan:
     return replace(scan, frames=PressureFrames(scan.frames.time_s, flat.astype(np.uint16)))
 
 
+@pytest.mark.long
 def test_a_checked_head_carries_its_day_to_the_maps_of_other_scans(tmp_path: Path) -> None:
     phantom = tb.demo_scan()
     write_scan(tmp_path / "phantom.mcap", phantom, provenance=Provenance("test", {}))

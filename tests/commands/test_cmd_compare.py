@@ -115,6 +115,7 @@ def test_the_same_bump_shows_no_change_and_says_what_would_not_have_been_seen(fo
     assert lines[-1] == RESEARCH_USE
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("later", "words"),
     [
@@ -207,6 +208,7 @@ def test_a_posterior_is_refused_and_its_map_is_asked_for(folder: Path) -> None:
     assert "post.nc: is a posterior, not a map; give the map that it was estimated from" in done.stderr
 
 
+@pytest.mark.long
 def test_a_scan_is_no_second_visit_and_no_second_exam(folder: Path) -> None:
     write(folder / "again.nc", sigma=4.0, seed=0, subject="p1", side="left")
     made = read_map(folder / "again.nc")
@@ -231,6 +233,7 @@ def test_a_change_of_nothing_has_no_sign(percent: float, text: str) -> None:
     assert signed(percent) == text
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("later", ["grown0.nc", "bare0.nc"])
 def test_the_figure_is_written_once_and_not_over_another(folder: Path, later: str) -> None:
     words = ("a0.nc", "--with", later, "--same-mass", "--figure", f"{later}.png")

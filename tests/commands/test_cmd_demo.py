@@ -36,6 +36,7 @@ def typed(shown: CompletedProcess[str]) -> list[list[str]]:
     return [shlex.split(line)[2:] for line in shown.stdout.splitlines() if line.startswith("$ tactile-bayes ")]
 
 
+@pytest.mark.long
 def test_it_shows_the_default_road_first_and_ends_with_truth_and_results(shown: CompletedProcess[str]) -> None:
     assert shown.returncode == 0, shown.stderr
     assert [words[0] for words in typed(shown)] == STEPS
@@ -50,6 +51,7 @@ def test_it_shows_the_default_road_first_and_ends_with_truth_and_results(shown: 
     assert shown.stderr == ""
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("road", ["estimate, the default", "the paper's Eq 6"])
 def test_the_interval_covers_the_truth_and_says_so(shown: CompletedProcess[str], road: str) -> None:
     (line,) = [line for line in shown.stdout.splitlines() if line.startswith(road)]
@@ -59,6 +61,7 @@ def test_the_interval_covers_the_truth_and_says_so(shown: CompletedProcess[str],
     assert line.endswith("covers the true size")
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("shown")
 def test_the_scan_is_of_a_body_that_the_calibration_has_seen(run_cli: Run, place: Path) -> None:
     """The README's two commands on the packaged scan: within 20 % of the truth, and nothing outside the range."""
@@ -72,6 +75,7 @@ def test_the_scan_is_of_a_body_that_the_calibration_has_seen(run_cli: Run, place
     assert (found["verdict"], found["findings"]) == ("sound", [])
 
 
+@pytest.mark.long
 def test_it_leaves_every_file_behind_for_its_owner_only(shown: CompletedProcess[str], place: Path) -> None:
     assert shown.returncode == 0
     files = {path.name: path for path in (place / "my demo").iterdir()}
@@ -107,6 +111,7 @@ def test_it_says_what_to_type_where_the_program_is_not_on_the_path(
     assert bool(said) == bool(words)
 
 
+@pytest.mark.long
 def test_another_demo_does_not_overwrite_the_first(run_cli: Run, shown: CompletedProcess[str], place: Path) -> None:
     assert shown.returncode == 0
     done = run_cli("demo", "-o", "my demo", cwd=place)

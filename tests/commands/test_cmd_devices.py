@@ -101,6 +101,7 @@ def test_a_pivot_is_measured_on_the_tracker_itself(run_cli):
     assert "record as it is" in done.stdout
 
 
+@pytest.mark.long
 def test_a_replay_goes_the_way_of_a_recording(run_cli, tmp_path):
     scan = short_scan(0.5)
     write_scan(tmp_path / "a.mcap", scan, provenance=Provenance("test", {}))
@@ -116,6 +117,7 @@ def test_a_replay_goes_the_way_of_a_recording(run_cli, tmp_path):
     assert "the head stopped" in shown.stdout
 
 
+@pytest.mark.long
 def test_a_signal_to_a_replay_and_its_devices_ends_it_in_order(tmp_path, child_environment):
     """With `timeout` the emulated devices died first: "the device has gone", exit code 4."""
     write_scan(tmp_path / "a.mcap", short_scan(20.0), provenance=Provenance("test", {}))

@@ -68,6 +68,7 @@ def test_json_has_every_documented_key_and_passes_its_schema(alone: dict[str, st
     assert "time" not in json.dumps(found["provenance"])
 
 
+@pytest.mark.long
 def test_a_document_out_of_order_would_not_pass(alone: dict[str, str]) -> None:
     document = json.loads(alone["a"])
     document["amplitude"].pop("kind")
@@ -91,6 +92,7 @@ def test_text_tells_the_size_its_interval_and_what_was_left_out(ensemble_run: Co
     assert re.fullmatch(r"estimate: [0-9.]+ s\n", ensemble_run.stderr)
 
 
+@pytest.mark.long
 def test_the_draws_open_in_arviz(ensemble_run: CompletedProcess[str], folder: Path) -> None:
     assert ensemble_run.returncode == 0
     with warnings.catch_warnings():
@@ -134,6 +136,7 @@ def kill_worker_of_b(path: Path, *, settings: Any) -> Any:
     return answer_file(path, settings=settings)
 
 
+@pytest.mark.long
 def test_a_killed_worker_loses_no_other_map(folder: Path, alone: dict[str, str], monkeypatch: Any) -> None:
     from tactile_bayes.actions import estimate
 
@@ -146,6 +149,7 @@ def test_a_killed_worker_loses_no_other_map(folder: Path, alone: dict[str, str],
     assert line.startswith("error: b.nc: its process ended twice without an answer")
 
 
+@pytest.mark.long
 def test_ctrl_c_prints_the_maps_that_are_done(folder: Path, alone: dict[str, str], monkeypatch: Any) -> None:
     from tactile_bayes.actions import estimate
 
@@ -166,6 +170,7 @@ def test_ctrl_c_prints_the_maps_that_are_done(folder: Path, alone: dict[str, str
     assert "b.nc" not in text.stdout
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("option", ["--figure", "--map-figure"])
 def test_without_an_estimate_the_figure_is_the_map_with_what_was_looked_at_and_why(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, option: str
@@ -186,6 +191,7 @@ def test_without_an_estimate_the_figure_is_the_map_with_what_was_looked_at_and_w
     assert ("Passed over near" in done.stdout) == bool(how["looked_at"])
 
 
+@pytest.mark.long
 def test_the_scan_without_a_mass_gives_no_estimate(run_cli: Run, shared_data: Path, tmp_path: Path) -> None:
     source = shared_data / "scans" / "s08_no_mass.npz"
     assert run_cli("import", source, "-o", "s.mcap", cwd=tmp_path).returncode == 0
@@ -199,6 +205,7 @@ def test_the_scan_without_a_mass_gives_no_estimate(run_cli: Run, shared_data: Pa
     assert document["max_size_mm"] is None
 
 
+@pytest.mark.long
 def test_several_maps_keep_their_order_and_answers(run_cli: Run, folder: Path, alone: dict[str, str]) -> None:
     names = ("b", "empty", "a")
     options = (*FAST, "--size-calibration", "size.json", "--json")
@@ -209,6 +216,7 @@ def test_several_maps_keep_their_order_and_answers(run_cli: Run, folder: Path, a
     assert one.stdout == two.stdout
 
 
+@pytest.mark.long
 def test_a_broken_map_is_named_and_the_rest_kept(folder: Path, alone: dict[str, str]) -> None:
     options = (*FAST, "--size-calibration", "size.json", "--json")
     done = run_here("estimate", "a.nc", "broken.nc", "b.nc", *options, cwd=folder)
@@ -218,6 +226,7 @@ def test_a_broken_map_is_named_and_the_rest_kept(folder: Path, alone: dict[str, 
     assert json.loads(done.stdout) == [json.loads(alone["a"]), json.loads(alone["b"])]
 
 
+@pytest.mark.long
 def test_the_narrower_interval_lies_within_the_wider(folder: Path, alone: dict[str, str]) -> None:
     options = (*FAST, "--size-calibration", "size.json", "--json", "--interval", 0.5)
     half: dict[str, Any] = json.loads(run_here("estimate", "a.nc", *options, cwd=folder).stdout)
@@ -228,6 +237,7 @@ def test_the_narrower_interval_lies_within_the_wider(folder: Path, alone: dict[s
         assert half[name]["median"] == wide[name]["median"]
 
 
+@pytest.mark.long
 def test_another_recipe_is_refused_with_the_difference(folder: Path) -> None:
     done = run_here("estimate", "a.nc", *FAST, "--size-calibration", "other.json", cwd=folder)
     assert (done.returncode, done.stdout) == (3, "")
@@ -238,6 +248,7 @@ def test_another_recipe_is_refused_with_the_difference(folder: Path) -> None:
     assert "fit radius" not in done.stderr
 
 
+@pytest.mark.long
 def test_not_converged_is_exit_5_with_advice(folder: Path) -> None:
     done = run_here("estimate", "a.nc", "--method", "ensemble", *settings(folder, max_steps=150), cwd=folder)
     assert (done.returncode, done.stdout) == (5, "")
@@ -245,6 +256,7 @@ def test_not_converged_is_exit_5_with_advice(folder: Path) -> None:
     assert "max_steps = " in done.stderr
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("arguments", "code", "words"),
     [
@@ -275,6 +287,7 @@ def test_mistakes_end_in_their_code_and_leave_nothing(
     assert {path: path.read_bytes() for path in folder.iterdir()} == before
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("option", ["-o", "--figure", "--map-figure"])
 def test_existing_outputs_are_left_alone_without_force(folder: Path, tmp_path: Path, option: str) -> None:
     output = tmp_path / ("mine.nc" if option == "-o" else "mine.png")
@@ -305,6 +318,7 @@ def field(folder: Path, *words: object, **more: object) -> CompletedProcess[str]
     return run_here("estimate", "a.nc", *given, "--size-calibration", "none", *words, cwd=folder)
 
 
+@pytest.mark.long
 def test_the_scene_is_told_and_can_be_given(folder: Path) -> None:
     told = json.loads(field(folder, "--json").stdout)
     assert told["scene"]["supported"] in ("round", "ellipse")
@@ -318,6 +332,7 @@ def test_the_scene_is_told_and_can_be_given(folder: Path) -> None:
     assert none.stdout.startswith("No estimate: no lump was assumed")
 
 
+@pytest.mark.long
 def test_priors_come_from_a_file_and_are_printed(folder: Path) -> None:
     assert "log-normal about 3.5 mm" in field(folder, "-v", width_median_mm=3.5).stdout
     document = json.loads(field(folder, "--json", width_median_mm=3.5).stdout)
@@ -329,6 +344,7 @@ def test_priors_come_from_a_file_and_are_printed(folder: Path) -> None:
     assert "width is not known" in wrong.stderr
 
 
+@pytest.mark.long
 def test_a_checkpoint_goes_on_where_it_stopped(folder: Path) -> None:
     words = ("--method", "ensemble", "--accuracy-sd", 0.1, "--json")
     stopped = field(folder, *words, checkpoint="chain.npz", max_steps=150)
@@ -342,6 +358,7 @@ def test_a_checkpoint_goes_on_where_it_stopped(folder: Path) -> None:
     assert "another map, calibration or setting" in other.stderr
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("words", "keys", "message"),
     [
@@ -358,6 +375,7 @@ def test_options_that_do_not_go_together_are_refused(
     assert message in done.stderr
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -374,6 +392,7 @@ def test_a_place_or_a_range_that_makes_no_sense_is_a_usage_error(
     assert (done.returncode, message in done.stderr) == (2, True), done.stderr
 
 
+@pytest.mark.long
 def test_a_map_of_far_too_many_cells_is_told_before_the_work(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     words = ("estimate", "a.nc", *FAST, "--size-calibration", "size.json", "--json")
     plain = run_here(*words, cwd=folder)

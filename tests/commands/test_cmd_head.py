@@ -58,6 +58,7 @@ def test_simulate_feels_another_head_and_its_default_by_name(fidelity: str, tmp_
     assert truths[other] != truths[None]
 
 
+@pytest.mark.long
 def test_the_tables_of_another_head_are_others(monkeypatch: pytest.MonkeyPatch) -> None:
     """One deep lump of the ten, and the deep one of the phantoms."""
     few = {"table_scenes": slice(7, 8), "phantom_scenes": slice(2, 3)}

@@ -55,6 +55,7 @@ def moments(bias: float, sd: float, miss: float = 0.0) -> tuple[float, float]:
     return mean, math.sqrt((1 - miss) * square + miss - mean**2)
 
 
+@pytest.mark.long
 def test_power_answers_with_the_patients_of_the_normal_approximation() -> None:
     """N = ((z_0.975 + z_0.9) / delta)^2, the paired test's sample size, from closed moments (1.960 + 1.282)."""
     (tactile, sd), (other, other_sd) = moments(0.02, math.hypot(0.18, 0.15)), moments(-0.08, 0.40, miss=0.04)
@@ -80,6 +81,7 @@ def test_precision_answers_with_the_patients_of_the_delta_method() -> None:
     assert found["patients_interval"] is None
 
 
+@pytest.mark.long
 def test_more_maps_need_fewer_patients_and_a_figure_draws_it(tmp_path: Path) -> None:
     words = ("--power", 0.8, "--maps", 1, "--maps", 5, "--trials", 200)
     result = plan(*words, "--json", "--figure", tmp_path / "a.svg", "-o", tmp_path / "a.json")
@@ -94,6 +96,7 @@ def test_more_maps_need_fewer_patients_and_a_figure_draws_it(tmp_path: Path) -> 
     assert found.document == document
 
 
+@pytest.mark.long
 def test_few_patients_suffice_and_none_do() -> None:
     easy = plan("--power", 0.9, "--mass-sd", 0.01, "--map-sd", 0.01, "--trials", 50).stdout
     assert easy.startswith(

@@ -88,6 +88,7 @@ def test_maps_normalised_each_way_have_a_calibration_and_are_not_pooled_together
     assert "normalised in several ways (gain, mean)" in mixed.stderr
 
 
+@pytest.mark.long
 def test_a_finer_noise_field_is_recorded_and_hardly_moves_a_clear_lump(folder: Path) -> None:
     """On a map whose noise has a field: where it is white, 18 and 24 cosines differ by a processor's rounding only."""
     noise = 0.02 * correlated_field(np.random.default_rng(5), 51, length_cells=2.0)
@@ -171,6 +172,7 @@ def test_a_map_of_another_mass_is_named_and_there_is_no_common_size(folder: Path
     assert "\n4. mass4.nc: " in whole.stdout
 
 
+@pytest.mark.long
 def test_a_mass_seen_on_too_few_maps_gets_no_size(folder: Path) -> None:
     done = run_here("estimate", "a.nc", "empty.nc", "plain.nc", "--pool", *FAST, cwd=folder)
     assert done.returncode in (3, 6)

@@ -173,6 +173,7 @@ def test_an_interrupted_run_goes_on_and_gives_the_same_table(tmp_path: Path, mon
     assert (tmp_path / "p.csv").read_bytes() == first
 
 
+@pytest.mark.long
 def test_a_scan_of_a_plain_lump_is_measured_as_a_patients() -> None:
     """With a cheap simulator in the solid model's place: bumps of the shape a lump of tissue might have."""
     from tactile_bayes.forward.scene import Lump

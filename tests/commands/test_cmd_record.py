@@ -195,6 +195,7 @@ def test_faults_are_counted_and_noted(record, tmp_path, scan):
     np.testing.assert_array_equal(frames.counts, scan.frames.counts[rows])
 
 
+@pytest.mark.long
 def test_a_kill_costs_the_last_fraction_of_a_second(tmp_path, start, run_cli, long_scan):
     with head_and_tracker(long_scan) as devices:
         process = start(devices)
@@ -233,6 +234,7 @@ def test_a_signal_ends_the_recording_in_order(tmp_path, start, long_scan, number
     assert f"{len(file.scan.frames)} frames" in out
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_to_all_processes_of_a_recording_ends_it_in_order(tmp_path, start, long_scan, number):
     """As of `timeout`, a service manager and a closed terminal: the readers died of it, and "the device has gone"."""
@@ -260,6 +262,7 @@ def test_a_pulled_cable_ends_it_with_one_line(record, tmp_path, scan, role):
     assert 0 < len(file.scan.frames) < 200
 
 
+@pytest.mark.long
 def test_a_full_disk_ends_it_with_one_line_and_keeps_what_was_written(tmp_path, start, long_scan):
     def little_room() -> None:
         signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
@@ -356,6 +359,7 @@ def test_a_port_in_use_is_refused(record, scan):
     assert "cannot be opened" in done.stderr
 
 
+@pytest.mark.long
 def test_another_device_on_the_port_is_told_by_what_it_says(record, scan, monkeypatch):
     monkeypatch.setattr("tactile_bayes.hardware.serial_trackers.ANSWER_S", 0.3)
     with serving(EmulatedTracker(scan.poses, protocol="bird"), PtyLink()) as emulator:
@@ -406,6 +410,7 @@ def test_a_session_file_is_checked_before_a_port_is_opened(record, tmp_path, tex
     assert [one.name for one in tmp_path.iterdir()] == ["s.toml"]
 
 
+@pytest.mark.long
 def test_keys_touch_landmarks_start_and_stop(child_environment, tmp_path, source, long_scan):
     near, far = pty.openpty()
     with head_and_tracker(long_scan) as devices:

@@ -90,6 +90,7 @@ def test_a_pooled_size_has_it_as_the_prior_of_its_maps(site: Path, tmp_path: Pat
     assert found.document["max_size_mm"] == document["max_size_mm"]
 
 
+@pytest.mark.long
 def test_a_comparison_is_at_the_sites_repeatability(site: Path, tmp_path: Path) -> None:
     """With one exam a visit the sizes' variance has twice that of an exam, which sites of 8 and 2 % give; the
     amplitudes' change, a second witness, takes a part of it away."""

@@ -22,6 +22,7 @@ def quick(index: int, *, method: str, seed: int, cosines: int) -> MapRanks:
     return MapRanks(index, TRUTH, tuple((index * 37 + k * 11 + seed) % 100 for k in range(5)), method)
 
 
+@pytest.mark.long
 def test_six_maps(tmp_path: Path) -> None:
     words = ("sbc", "--maps", 6, "--method", "laplace", "-o", "s.csv", "--figure", "s.png")
     done = run_here(*words, cwd=tmp_path)

@@ -196,6 +196,7 @@ def test_a_protocol_fixes_the_analysis_and_its_hash_is_reported(tmp_path: Path) 
     assert "protocol.toml" in refusal(TRIAL, "--excision", EXCISION, "--protocol", protocol)
 
 
+@pytest.mark.long
 def test_other_intervals_change_intervals_and_no_figure() -> None:
     plain = document(TRIAL, "--excision", EXCISION, "--intervals", "jackknife")["modalities"]["tactile"]
     options = ("--intervals", "bca", "--resamples", 300)

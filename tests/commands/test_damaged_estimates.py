@@ -175,14 +175,17 @@ def run(folder: Path, names: tuple[str, ...], commands: dict[str, tuple[str, ...
     assert 0 < taken < count * len(commands)  # some damage is none, and some is refused
 
 
+@pytest.mark.long
 def test_a_damaged_estimate_is_refused_in_one_line_or_told_without_nan(folder: Path) -> None:
     run(folder, ("one.json", "pool.json", "none.json"), COMMANDS, count=30, seed=20261125)
 
 
+@pytest.mark.long
 def test_a_damaged_posterior_is_refused_in_one_line_or_told_without_nan(folder: Path) -> None:
     run(folder, ("post.nc",), OF_DRAWS, count=6, seed=20261126)
 
 
+@pytest.mark.long
 def test_a_damaged_map_is_refused_in_one_line_or_told_without_nan(folder: Path) -> None:
     run(folder, ("map.nc",), OF_MAPS, count=8, seed=20261127)
 
@@ -203,6 +206,7 @@ def test_thousands_of_damaged_files(
     run(folder, names, commands, count=count, seed=count)
 
 
+@pytest.mark.long
 def test_a_map_whose_list_of_scales_is_of_another_type_is_one_line(folder: Path) -> None:
     """HDF5 ended the process over it."""
     shutil.copy(folder / "map.nc", folder / "scales.nc")

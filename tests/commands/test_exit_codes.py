@@ -32,6 +32,7 @@ def interrupt(output: Path, *, after: float, number: int = signal.SIGINT) -> sub
     return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, cwd=ROOT)
 
 
+@pytest.mark.long
 def test_ctrl_c_ends_with_130_one_line_and_nothing_left(tmp_path: Path) -> None:
     """A calibration takes seconds; Ctrl-C comes while it imports and while it samples."""
     for after in (0.3, 2.5, 3.5):

@@ -58,6 +58,7 @@ def folder(exam: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return place
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("case", REFUSED)
 def test_what_does_not_fit_is_told_in_one_line(case: str, folder: Path, tmp_path: Path) -> None:
     for package in ("highdicom", "nrrd", "fhir.resources"):
@@ -100,6 +101,7 @@ def test_findings_that_are_none_are_refused_and_not_dropped(value: Any, estimate
     assert "findings" in done.stderr
 
 
+@pytest.mark.long
 def test_an_estimate_of_no_file_is_refused_beside_a_map(estimate: dict[str, Any], folder: Path, tmp_path: Path) -> None:
     document = estimate | {"provenance": estimate["provenance"] | {"inputs": []}}
     (tmp_path / "e.json").write_text(json.dumps(document))
@@ -109,6 +111,7 @@ def test_an_estimate_of_no_file_is_refused_beside_a_map(estimate: dict[str, Any]
     assert "does not say which map it is of" in done.stderr
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("to", "package", "extra", "words"),
     [
@@ -150,6 +153,7 @@ def test_the_guide_lists_the_codes_of_the_own_scheme() -> None:
     assert [f"| `{one.value}` | {one.meaning} |" in guide for one in own] == [True] * len(own)
 
 
+@pytest.mark.long
 def test_a_csv_needs_no_extra(run_python: Run, folder: Path, tmp_path: Path) -> None:
     code = (
         "import sys\nfrom tactile_bayes.cli import cli\n"
@@ -160,6 +164,7 @@ def test_a_csv_needs_no_extra(run_python: Run, folder: Path, tmp_path: Path) -> 
     assert not {"pydicom", "highdicom", "nrrd", "matplotlib", "scipy.stats"} & set(done.stdout.split())
 
 
+@pytest.mark.long
 def test_files_are_their_owners_and_not_overwritten(folder: Path, tmp_path: Path) -> None:
     pytest.importorskip("highdicom")
     words = ("map.nc", "map.json", "--to", "dicom", *WHO, "-o", tmp_path / "out")
@@ -172,6 +177,7 @@ def test_files_are_their_owners_and_not_overwritten(folder: Path, tmp_path: Path
     exported(folder, *words, "--force")
 
 
+@pytest.mark.long
 def test_a_folder_with_another_exports_report_is_refused(folder: Path, tmp_path: Path) -> None:
     """Without its report the second exam must not lie beside the first one's."""
     pytest.importorskip("highdicom")
@@ -182,6 +188,7 @@ def test_a_folder_with_another_exports_report_is_refused(folder: Path, tmp_path:
     assert "holds report.dcm of another export" in done.stderr
 
 
+@pytest.mark.long
 def test_a_fresh_python_reads_each_back_without_this_program(run_python: Run, folder: Path, tmp_path: Path) -> None:
     for package in ("highdicom", "nrrd", "fhir.resources"):
         pytest.importorskip(package)

@@ -193,6 +193,7 @@ def test_a_posterior_gives_the_sizes_of_its_estimate(exam: Path, estimate: dict[
     }
 
 
+@pytest.mark.long
 def test_identifiers_and_bytes_follow_from_content_and_identity(exam: Path, tmp_path: Path) -> None:
     """Other content must not have the same identifier, and the same content must not have another."""
     folders = {"one": (), "two": (), "other": ("--patient-id", "B"), "told": ("--study-uid", "1.2.3")}

@@ -38,6 +38,7 @@ def test_the_door_stays_a_function_when_the_package_of_the_formats_is_loaded() -
     assert tactile_bayes.exports.run.FORMATS
 
 
+@pytest.mark.long
 def test_paths_and_objects_give_the_bytes_of_the_command_line(folder: Path) -> None:
     pytest.importorskip("highdicom")
     exported(folder, "map.nc", "map.json", "--to", "dicom", "--study-date", WHEN, "-o", "by_cli")
@@ -73,6 +74,7 @@ def test_csv_of_a_map_that_is_in_no_file(tmp_path: Path) -> None:
         tb.export(found, tmp_path / "records.csv", to="csv", patient_id="P1")
 
 
+@pytest.mark.long
 def test_a_map_in_memory_and_its_estimate_go_together_and_another_is_refused(folder: Path) -> None:
     pytest.importorskip("highdicom")
     made = tb.build_map(tb.demo_scan())

@@ -75,6 +75,7 @@ BOMBS: dict[str, tuple[str, Callable[[], bytes], Read, str]] = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("case", BOMBS)
 def test_a_bomb_is_refused_before_memory_is_taken(case: str, tmp_path: Path, request) -> None:
     suffix, make, read, message = BOMBS[case]
@@ -95,6 +96,7 @@ def test_an_image_chunk_that_claims_4_gb_takes_what_is_there(tmp_path: Path, req
     assert read_grid(path, spacing_mm=1.0).mean.shape == (8, 8)
 
 
+@pytest.mark.long
 def test_a_packed_chunk_of_a_map_gives_no_more_than_it_declares(plain: Path, request) -> None:
     hostile.deflate_bomb(plain, megabytes=500)
     request.getfixturevalue("little_memory")
@@ -179,6 +181,7 @@ TEXTS: dict[str, tuple[str, tuple[Read, ...], str]] = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("case", TEXTS)
 def test_text_that_breaks_parsers_is_one_line(case: str, tmp_path: Path) -> None:
     text, readers, message = TEXTS[case]

@@ -51,6 +51,7 @@ def shape(sigma_1: float, sigma_2: float, angle: float) -> np.ndarray:
     return np.asarray(turn @ np.diag([sigma_1**2, sigma_2**2]) @ turn.T)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("name", "radius"), BEAMS.items())
 def test_a_beam_is_measured_as_scipy_measures_it(shared_data: Path, name: str, radius: float) -> None:
     tactile_map = read_grid(shared_data / "laserbeam" / name, spacing_mm=PIXEL_MM, cell_mm=PIXEL_MM)
@@ -67,6 +68,7 @@ def test_a_beam_is_measured_as_scipy_measures_it(shared_data: Path, name: str, r
     assert found.fit.errors.inflation > 50
 
 
+@pytest.mark.long
 def test_a_finer_and_a_coarser_picture_show_the_same_beam(shared_data: Path) -> None:
     path = shared_data / "laserbeam" / "laserbeam_astigmatic.tif"
     fine = read_grid(path, spacing_mm=PIXEL_MM, cell_mm=PIXEL_MM)

@@ -37,6 +37,7 @@ def chains(tmp_path_factory: pytest.TempPathFactory) -> tuple[SizeEstimate, Path
     return made, path
 
 
+@pytest.mark.long
 def test_arviz_opens_all_groups_and_its_figures_and_summaries_work(chains: tuple[SizeEstimate, Path]) -> None:
     made, path = chains
     data = arviz.from_netcdf(path)
@@ -58,6 +59,7 @@ def test_arviz_opens_all_groups_and_its_figures_and_summaries_work(chains: tuple
     assert drawn.shape == (1, 2)
 
 
+@pytest.mark.long
 def test_statistics_are_of_the_draws(chains: tuple[SizeEstimate, Path]) -> None:
     made, path = chains
     estimate, data = made.estimate, arviz.from_netcdf(path)
@@ -71,6 +73,7 @@ def test_statistics_are_of_the_draws(chains: tuple[SizeEstimate, Path]) -> None:
     )
 
 
+@pytest.mark.long
 def test_python_gives_arviz_the_groups_of_the_file(chains: tuple[SizeEstimate, Path]) -> None:
     made, path = chains
     held, found = arviz.from_netcdf(path), made.to_arviz()
@@ -82,6 +85,7 @@ def test_python_gives_arviz_the_groups_of_the_file(chains: tuple[SizeEstimate, P
             assert found[group][name].dims == held[group][name].dims
 
 
+@pytest.mark.long
 def test_the_prior_is_the_models(chains: tuple[SizeEstimate, Path]) -> None:
     """ln of the mean width normal about ln 5 mm with SD 1, half the log ratio with SD 0.5, both below 15 mm."""
     prior = arviz.from_netcdf(chains[1]).prior
@@ -92,6 +96,7 @@ def test_the_prior_is_the_models(chains: tuple[SizeEstimate, Path]) -> None:
     assert prior["max_size_mm"].values.min() > 0
 
 
+@pytest.mark.long
 def test_the_netcdf_library_reads_every_group(chains: tuple[SizeEstimate, Path]) -> None:
     import netCDF4
 
@@ -112,11 +117,13 @@ def test_other_methods_write_the_groups_that_they_have(method: str, tmp_path: Pa
     assert np.isfinite(data.sample_stats["log_weight"]).all()
 
 
+@pytest.mark.long
 def test_equal_estimates_give_equal_bytes(chains: tuple[SizeEstimate, Path], tmp_path: Path) -> None:
     chains[0].write(tmp_path / "again.nc")
     assert (tmp_path / "again.nc").read_bytes() == chains[1].read_bytes()
 
 
+@pytest.mark.long
 def test_damage_and_other_files_are_refused(chains: tuple[SizeEstimate, Path], tmp_path: Path) -> None:
     whole = chains[1].read_bytes()
     (tmp_path / "cut.nc").write_bytes(whole[: len(whole) // 2])

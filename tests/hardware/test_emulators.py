@@ -130,6 +130,7 @@ def test_a_tracker_waits_for_the_head_with_its_first_pose(monkeypatch):
         frames.close()
 
 
+@pytest.mark.long
 def test_a_replay_in_a_terminal_starts_at_once(tmp_path, child_environment):
     write_scan(tmp_path / "scan.mcap", SCAN, provenance=Provenance("test", {}))
     near, far = pty.openpty()

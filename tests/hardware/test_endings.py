@@ -108,6 +108,7 @@ def test_devices_that_vanish_at_the_end_leave_a_finished_file(tmp_path, child_en
     assert read_scan_report(tmp_path / "a.mcap").complete
 
 
+@pytest.mark.long
 def test_a_closed_terminal_ends_the_recording_in_order(tmp_path, child_environment):
     write_scan(tmp_path / "scan.mcap", short_scan(0.3), provenance=Provenance("test", {}))
     near, far = pty.openpty()

@@ -195,6 +195,7 @@ def test_colours_are_left_out_where_they_are_not_wanted(environment, wanted):
     assert has_styles(environment) is wanted
 
 
+@pytest.mark.long
 def test_record_shows_a_line_a_second_where_it_cannot_draw(run_cli, tmp_path, scan):
     from tactile_bayes.files.provenance import Provenance
     from tactile_bayes.files.scan_mcap import write_scan
@@ -236,6 +237,7 @@ def test_the_page_is_for_those_who_know_the_address(server):
     assert get(server.url, Host="evil.example")[0] == 403
 
 
+@pytest.mark.long
 def test_connections_without_the_token_do_not_end_the_page(server):
     """Some 250 of them took all file descriptors, and the server never accepted another."""
     host, port = server.url.split("/")[2].split(":")

@@ -253,6 +253,7 @@ def test_the_library_reads_the_emulated_tracker(link, tmp_path):
     assert times == sorted(times)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("names", [("0A", "0B"), ("probe", "sternum")], ids=["wired", "wireless"])
 def test_two_tools_are_told_apart_by_the_library_and_combined(tmp_path, names):
     pytest.importorskip(ndi.MODULE)
@@ -312,6 +313,7 @@ def test_a_port_where_nobody_answers_is_told():
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.long
 def test_a_recording_with_an_ndi_tracker(run_cli, tmp_path):
     pytest.importorskip(ndi.MODULE)
     from tactile_bayes.files.provenance import Provenance

@@ -99,6 +99,7 @@ def later_poses(scan: Scan, late_s: float) -> Scan:
     return Scan(scan.frames, shifted, scan.head, scan.element_calibration, session=scan.session)
 
 
+@pytest.mark.long
 def test_the_page_followed_word_by_word_gives_a_true_map(folder, scan, child_environment):
     emulate, record, build = [words[1:] for words in commands()]
     with running(emulate, folder, child_environment) as devices:
@@ -119,6 +120,7 @@ def test_the_page_followed_word_by_word_gives_a_true_map(folder, scan, child_env
     assert not agrees(build_map([later_poses(scan, PAUSE_S)]), scan)  # what came of it before
 
 
+@pytest.mark.long
 def test_devices_emulated_one_by_one_play_together_too(folder, scan, child_environment):
     with ExitStack() as stack:
         words = [["emulate", "head", "scan.mcap"], ["emulate", "tracker", "scan.mcap", "--protocol", "liberty"]]

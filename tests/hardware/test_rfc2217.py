@@ -21,6 +21,7 @@ from tactile_bayes.hardware.serial_trackers import TRACKERS, open_tracker
 pytestmark = pytest.mark.filterwarnings("ignore:set(Daemon|Name):DeprecationWarning")
 
 
+@pytest.mark.long
 def test_a_scan_recorded_over_the_network_is_the_scan(run_cli, tmp_path):
     scan = short_scan(2.0)
     write_scan(tmp_path / "source.mcap", scan, provenance=Provenance("test", {}))
@@ -40,6 +41,7 @@ def test_a_scan_recorded_over_the_network_is_the_scan(run_cli, tmp_path):
     np.testing.assert_array_equal(found.poses.quaternion_wxyz, scan.poses.quaternion_wxyz)
 
 
+@pytest.mark.long
 def test_bytes_that_telnet_would_take_for_its_own_come_through():
     """255 begins a command of the protocol underneath: poses full of it must not."""
     scan = short_scan(0.5)
@@ -69,6 +71,7 @@ def test_settings_are_not_negotiated_again_for_every_read(monkeypatch):
 
 
 # pyserial 3.5 forgets the socket it gives up.
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_a_server_that_does_not_speak_it_is_told_in_one_line():
     with socket.create_server(("127.0.0.1", 0)) as listener:

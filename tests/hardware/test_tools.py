@@ -294,6 +294,7 @@ CASES = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("protocol", CASES)
 def test_two_tools_are_refused_without_a_choice_and_followed_with_one(protocol):
     first, second, listed = CASES[protocol]
@@ -336,6 +337,7 @@ def test_a_flock_in_group_mode_is_noticed_by_what_it_sends():
         port.close()
 
 
+@pytest.mark.long
 def test_records_of_another_tracker_are_named():
     with serving(EmulatedTracker(short_scan(0.5).poses, protocol="liberty"), PtyLink()) as emulator:
         port = Port(emulator._link.url, baud=115_200, role="tracker")
@@ -345,6 +347,7 @@ def test_records_of_another_tracker_are_named():
         port.close()
 
 
+@pytest.mark.long
 def test_a_server_that_sends_only_on_request_is_asked():
     listener = socket.create_server(("127.0.0.1", 0))
 
@@ -390,6 +393,7 @@ def test_frames_of_poses_are_not_mixed(tmp_path):
 # --- Whole recordings.
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("protocol", "step_mm"), [("liberty", 0.3), ("igtlink", 1e-4), ("open", 1e-9)])
 def test_breathing_goes_with_the_reference(tmp_path, protocol, step_mm):
     """To the rounding of the protocol; LIBERTY's clock has whole ms."""
@@ -408,6 +412,7 @@ def test_breathing_goes_with_the_reference(tmp_path, protocol, step_mm):
     assert off.max() < step_mm
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("protocol", ["igtlink", "open", "ndi"])
 def test_a_hidden_tool_leaves_a_gap_that_show_and_map_tell(tmp_path, protocol):
     if protocol == "ndi":
@@ -441,6 +446,7 @@ def test_a_hidden_tool_leaves_a_gap_that_show_and_map_tell(tmp_path, protocol):
     assert said in " ".join(one.text for one in scan_findings(found))
 
 
+@pytest.mark.long
 def test_a_tool_hidden_at_the_start_is_told_and_recorded_once_seen(tmp_path, capfd):
     scan = short_scan(1.0)
     write_scan(tmp_path / "like.mcap", scan, provenance=Provenance("test", {}))
@@ -473,6 +479,7 @@ def test_jumps_are_told_and_named_in_place_of_the_quaternions():
         build_map(replace(scan, poses=TrackerPoses(scan.poses.time_s, place, turned)), every=4)
 
 
+@pytest.mark.long
 def test_a_board_that_restarts_when_its_port_is_opened_is_waited_for(monkeypatch):
     monkeypatch.setattr(serial_trackers, "_RESTART_S", 1.2)
     near, far = os.openpty()
@@ -524,6 +531,7 @@ def test_a_second_head_on_the_line_is_told_and_its_frames_are_left_out():
     assert parser.fault == "it sent a HELLO of 'head-8' with 3 x 3 taxels beside that of 'head-7'"
 
 
+@pytest.mark.long
 def test_a_tracker_that_floods_costs_no_frame(tmp_path, monkeypatch):
     scan = short_scan(1.0)
     write_scan(tmp_path / "like.mcap", scan, provenance=Provenance("test", {}))

@@ -200,6 +200,7 @@ def summary(estimate: Estimate) -> tuple[np.ndarray, np.ndarray]:
     return np.median(draws, axis=1), draws.std(axis=1)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("errors", list(ERRORS))
 def test_methods_agree_on_a_strong_lump(errors: str) -> None:
     """Medians within 0.15 SD and deviations within 10 %; with correlated errors, where the t has fewer degrees of

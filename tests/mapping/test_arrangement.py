@@ -140,6 +140,7 @@ def test_a_scan_of_a_second_is_too_short():
     assert check_scan(short) is None
 
 
+@pytest.mark.long
 def test_a_map_refuses_and_takes_the_scan_where_it_is_told_to():
     scan = mistaken(lump(), "columns-reversed")
     with pytest.raises(BadDataError, match="columns run backwards") as refused:
@@ -174,6 +175,7 @@ def test_another_clock_is_named_with_its_sign(late_ms):
     assert not check.refused  # the map can be told
 
 
+@pytest.mark.long
 def test_the_latency_that_is_stated_is_what_the_clock_is_held_against():
     late = select_frames(later(lump(), 300.0), pressure_window_kpa=(5.0, 14.0), latency_ms=300.0)
     right = check_arrangement(late, latency_ms=300.0)

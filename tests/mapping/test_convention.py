@@ -64,6 +64,7 @@ def verdict(scan: Scan) -> str:
         return "refused"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", WRONG)
 def test_a_wrong_convention_hardly_ever_passes(name):
     verdicts = [verdict(told(scan_of(seed), name)) for seed in range(SCANS)]
@@ -75,6 +76,7 @@ def test_the_right_one_passes():
     assert [verdict(scan_of(seed)) for seed in range(SCANS)] == ["passed"] * SCANS
 
 
+@pytest.mark.long
 def test_a_face_that_leans_on_its_motion_is_not_refused():
     verdicts = [verdict(scan_of(seed, lean_deg=15.0)) for seed in range(SCANS)]
     assert "refused" not in verdicts

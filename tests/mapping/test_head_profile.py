@@ -229,6 +229,7 @@ def test_an_even_field_has_a_flat_profile() -> None:
     np.testing.assert_allclose([found[name] for name in HEAD_PROFILE], 0.0, atol=2e-3)
 
 
+@pytest.mark.long
 def test_the_simulated_bodys_fat_is_found() -> None:
     """Centred the boundary lies at 15 mm, clear of the gland at 15 + 1.2 * 7.5 = 24 mm."""
     assert fat_mm(scanned(0.0)) == pytest.approx(15.0, rel=0.05)

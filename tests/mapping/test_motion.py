@@ -169,6 +169,7 @@ def test_without_a_lump_every_latency_fits_and_none_is_given():
         build_map(plain, latency_ms="auto")
 
 
+@pytest.mark.long
 def test_a_lump_that_follows_the_head_is_measured_and_sharpened():
     scan = follows(2.0)
     blurred, sharp = build_map(scan), build_map(scan, register_strokes=True)
@@ -181,6 +182,7 @@ def test_a_lump_that_follows_the_head_is_measured_and_sharpened():
     assert sigma_x(blurred) > 1.03 * still  # the control: unregistered, it is too wide
 
 
+@pytest.mark.long
 def test_a_lump_that_stays_has_no_mobility():
     scan = follows(0.0)
     found = build_map(scan, register_strokes=True)
@@ -188,6 +190,7 @@ def test_a_lump_that_stays_has_no_mobility():
     assert found.count.sum() == build_map(scan).count.sum()
 
 
+@pytest.mark.long
 def test_a_latency_mimics_mobility():
     """Why the two are not found together: v tau is all that shows."""
     late = scanned(duration_s=14.0, lines=10, tracker=Tracker(latency_ms=20.0), noise=TRUE_POSES)

@@ -148,6 +148,7 @@ def test_a_right_scan_is_not_doubted(amplitude: float) -> None:
     assert not [one for one in build_map(right).findings if one.kind in ("unlike_an_exam", "unusual_scan")]
 
 
+@pytest.mark.long
 def test_a_map_without_a_lump_says_so_where_nothing_stands_against_it() -> None:
     found = estimate_one(build_map(scan(0.0)), Settings(method="laplace")).estimate
     assert found.code in ("empty", "undetected", "ridge")

@@ -55,6 +55,7 @@ def test_a_level_that_is_not_known_cannot_be_fixed() -> None:
         widths(in_other_units(), SamplerSettings(noise="field"))
 
 
+@pytest.mark.long
 def test_intervals_hold_without_a_level_and_not_at_the_median() -> None:
     """docs/coverage.md has 400 maps a row; a dozen tell the default from a level held at the map's median."""
     held, control = 0, 0

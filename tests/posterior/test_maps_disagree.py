@@ -136,6 +136,7 @@ def test_compare_warns_where_the_maps_of_one_visit_disagree(folder: Path) -> Non
     assert "its maps show different sizes" not in control.stdout
 
 
+@pytest.mark.long
 def test_maps_that_cannot_show_a_lump_do_not_read_as_maps_without_one(tmp_path: Path) -> None:
     """Cells of 10 mm; the control is the same level in cells of 1 mm."""
     rng = np.random.default_rng(4)

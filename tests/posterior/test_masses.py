@@ -123,6 +123,7 @@ def test_one_lump_is_one_mass(seed: int) -> None:
     assert estimate.masses[0].reported
 
 
+@pytest.mark.long
 def test_a_second_lump_in_the_window_is_listed_and_sized() -> None:
     masses = {round(one.x_mm): one for one in found_on(scene(narrow=0.25, away=18.0)).estimate.masses}
     assert sorted(masses) == [WIDE[0], 1]
@@ -143,6 +144,7 @@ def narrow_bumps(*, second: float, seed: int = 1) -> TactileMap:
     return grid_map(values + 0.005 * rng.standard_normal(values.shape), normalise="gain")
 
 
+@pytest.mark.long
 def test_two_narrow_bumps_close_to_each_other_are_two_masses_that_may_be_one_lump() -> None:
     document = found_on(narrow_bumps(second=0.7)).answer.document
     assert document is not None
@@ -159,6 +161,7 @@ def test_two_narrow_bumps_close_to_each_other_are_two_masses_that_may_be_one_lum
     assert alone["touching"] == []
 
 
+@pytest.mark.long
 def test_a_mass_has_the_size_that_its_place_alone_gives() -> None:
     two = scene(narrow=0.2)
     listed = found_on(two).estimate.masses[1]
@@ -211,6 +214,7 @@ def test_a_mass_that_the_whole_map_does_not_show_has_the_size_of_the_map_less_th
     assert places(with_masses(two, first, options, lambda *_: unseen).masses) == [WIDE]
 
 
+@pytest.mark.long
 def test_json_text_figure_and_python_list_them(tmp_path: Path) -> None:
     write_map(tmp_path / "two.nc", scene(narrow=0.6), provenance=Provenance("import", {}))
     words = ("estimate", "two.nc", "--method", "laplace")
@@ -239,6 +243,7 @@ def test_json_text_figure_and_python_list_them(tmp_path: Path) -> None:
     assert "mass 1" not in [text.get_text() for text in tb.estimate(tb.demo_map()).plot_map().axes[0].texts]
 
 
+@pytest.mark.long
 def test_a_mass_besides_the_reported_one_has_its_axes_their_angle_and_its_ellipse() -> None:
     """The second bump is 5.5 by 3.2 mm wide, its long axis 35 degrees from x towards y."""
     rng = np.random.default_rng(1)
@@ -271,6 +276,7 @@ def draw_map(outcome: SizeEstimate) -> Figure:
     return outcome.plot_map()
 
 
+@pytest.mark.long
 def test_both_masses_of_a_shared_scan_are_listed_and_hold(shared_data: Path, tmp_path: Path) -> None:
     """Spheres of 15 and 10 mm, 34 mm apart, by an independent model (truth.csv); a rib was once fitted there."""
     run_here("import", shared_data / "scans" / "s05_two_masses.npz", "-o", "s05.mcap", cwd=tmp_path)

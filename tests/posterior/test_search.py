@@ -80,6 +80,7 @@ def beside_a_rib(amplitude: float) -> TactileMap:
     return grid_map(lump + 0.25 * np.exp(-0.5 * (along / 5.0) ** 2) + noise(3))
 
 
+@pytest.mark.long
 def test_a_lump_beside_a_rib_is_found_from_close_by(monkeypatch: pytest.MonkeyPatch) -> None:
     found = look(beside_a_rib(0.3), rotation="auto")
     assert found.status == "estimate"

@@ -62,6 +62,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return place
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("words", "code", "first", "also"),
     [
@@ -218,6 +219,7 @@ def test_a_calibration_is_named_whole_whatever_its_name_holds() -> None:
     assert "sizes by" not in estimate_summary(full, quantities, probability=0.9)  # the control: no calibration
 
 
+@pytest.mark.long
 def test_no_report_says_that_something_changed_by_nothing(folder: Path) -> None:
     """The control is the number that was printed so: minus 0.04 SD."""
     assert f"{-0.04:+.1f}" == "-0.0"

@@ -176,6 +176,7 @@ def test_a_grid_without_counts_is_not_hatched_and_its_unit_is_unknown(axes):
     assert known.few.sum() == known.covered.sum()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("suffix", "begins"), [(".png", b"\x89PNG\r\n"), (".PDF", b"%PDF-1."), (".svg", b"<?xml version")]
 )

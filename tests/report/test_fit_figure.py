@@ -48,6 +48,7 @@ def test_the_fit_is_the_truth_to_within_its_noise_and_the_residual_is_the_noise(
     assert bool(flat.std() > 2 * NOISE_SD) is bool(slope)
 
 
+@pytest.mark.long
 def test_the_figure_is_what_its_name_says_and_the_map_stands_in_without_an_estimate(tmp_path: Path) -> None:
     found = estimated("independent", slope=0.0)
     for suffix, magic in ((".png", b"\x89PNG"), (".pdf", b"%PDF"), (".svg", b"<?xml")):

@@ -78,6 +78,7 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     return found | {"campaign": campaign_html(rows, lines=["1 mass."], links={"a": "a.csv"}, version="1")}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["exam", "negative", "growth", "campaign", "trial"])
 def test_a_page_is_read_from_its_elements(kind: str, pages: dict[str, str]) -> None:
     outline = Outline(pages[kind])

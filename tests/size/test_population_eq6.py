@@ -133,6 +133,7 @@ def test_the_depth_of_other_bodies_is_worth_nothing() -> None:
     assert shuffled.fit["left_out_sd"] > 0.95 * learn_eq6(replace(full, profile=None)).fit["left_out_sd"]
 
 
+@pytest.mark.long
 def test_what_eq6_leaves_is_learned_and_a_law_without_it_has_none() -> None:
     """A ripple in ln a that Eq 6 does not follow; the control has none."""
     full, new = table(300), table(150, seed=5)

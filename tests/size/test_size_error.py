@@ -201,6 +201,7 @@ def test_maps_of_equal_values_give_equal_draws_whatever_their_history(folder: Pa
     assert sizes(folder, "map0.nc", "--seed", "2") != one
 
 
+@pytest.mark.long
 def test_a_pool_is_of_values_in_any_order(folder: Path) -> None:
     one = sizes(folder, "map0.nc", "map1.nc", "map2.nc", "--pool")
     assert sizes(folder, "other2.nc", "map0.nc", "other1.nc", "--pool") == one

@@ -140,6 +140,7 @@ def test_chains_are_the_reference_where_weights_cannot_be_trusted(monkeypatch: p
     assert found.answer.method == "ensemble"
 
 
+@pytest.mark.long
 def test_wrong_settings_come_out_as_wrong():
     """The negative control: a noise field too coarse for the errors, and a window that holds nothing but the bump."""
     right = [row(label) for label in ("--method importance", "--method laplace", "--accuracy-sd 0.01")]
@@ -220,6 +221,7 @@ NO_SIZE = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("case", NO_SIZE)
 def test_without_a_size_it_says_what_each_setting_answers(case: str, tmp_path: Path):
     make, why = NO_SIZE[case]
@@ -286,6 +288,7 @@ def test_poor_maps_are_measured_too(case: str, monkeypatch: pytest.MonkeyPatch):
     assert reference.answer.quantities[SIZE].median == pytest.approx(13.6, rel=0.15)
 
 
+@pytest.mark.long
 def test_the_command_says_how_long_it_takes_and_pools(tmp_path: Path, run_cli: Run, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(study, "FIELDS", (8, 12))
     write_map(tmp_path / "empty.nc", grid_map(np.ones((15, 15)), normalise="gain"), provenance=Provenance("map", {}))
@@ -304,6 +307,7 @@ def test_the_command_says_how_long_it_takes_and_pools(tmp_path: Path, run_cli: R
     assert (kept.returncode, "leave checkpoint out" in kept.stderr) == (2, True)
 
 
+@pytest.mark.long
 def test_more_maps_of_one_mass_narrow_the_interval(tmp_path: Path):
     from tactile_bayes.actions.tradeoff import pooled_rows
 

@@ -47,6 +47,7 @@ def row(label: str) -> Priced:
     return found
 
 
+@pytest.mark.long
 def test_the_finest_map_is_the_reference():
     """The same map by the default's draws: what is left is their Monte-Carlo error."""
     finest = row("--cell-mm 0.5")

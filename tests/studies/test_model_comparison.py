@@ -129,6 +129,7 @@ def test_a_scene_with_another_array_is_refused(tmp_path: Path) -> None:
         compare_model(measured, other, fidelity="empirical-gaussian")
 
 
+@pytest.mark.long
 def test_the_command_prints_draws_and_gives_json(tmp_path: Path) -> None:
     (tmp_path / "scene.toml").write_text((BUMPS + QUIET).format(sigma=5, noise=0.2))
     assert run_here("simulate", "scene.toml", "-o", "scan.mcap", cwd=tmp_path).returncode == 0

@@ -210,6 +210,7 @@ def folder(run_cli: Run, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.long
 def test_the_command_writes_a_table_and_a_summary(folder: Path) -> None:
     found = list(csv.DictReader((folder / "study.csv").read_text().splitlines()))
     assert [(row["d_mm"], row["depth_ratio"]) for row in found[:2]] == [("10", "0.8"), ("10", "1")]
@@ -245,6 +246,7 @@ def test_a_calibration_is_learned_from_the_table_by_defaults(folder: Path, run_c
     assert "background free, fit radius 20 mm" in done.stdout
 
 
+@pytest.mark.long
 def test_a_table_says_how_its_maps_were_made(folder: Path, run_cli: Run, tmp_path: Path) -> None:
     """An option that contradicts the study is refused: sizes would be a third off by the wrong normalising."""
     text = (folder / "study.csv").read_text()
@@ -272,6 +274,7 @@ OPTIONS: dict[tuple[str, ...], tuple[str, bool]] = {
 }
 
 
+@pytest.mark.long
 def test_options_reach_the_map_and_the_fit(run_cli: Run, tmp_path: Path) -> None:
     (tmp_path / "grid.csv").write_text("d_mm,depth_ratio,stiffness_ratio\n15,1.2,100\n")
     amplitudes = []
@@ -318,6 +321,7 @@ def test_a_store_of_the_other_model_is_refused(run_cli: Run, tmp_path: Path) -> 
     assert "other settings" in done.stderr
 
 
+@pytest.mark.long
 def test_an_interrupted_study_goes_on_where_it_stopped(folder: Path, run_cli: Run, tmp_path: Path) -> None:
     from tactile_bayes.batch_store import open_store
 

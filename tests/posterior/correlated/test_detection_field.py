@@ -45,6 +45,7 @@ def false_lumps(kind: str, *, maps: int) -> int:
     return sum(probability(grid_map(1 + errors(kind, rng))) >= 0.95 for _ in range(maps))
 
 
+@pytest.mark.long
 def test_lump_free_maps_show_none() -> None:
     """10 maps: at a true rate of 2 % more than two come in 1 run of 1,000."""
     assert sum(false_lumps(kind, maps=2) for kind in KINDS) <= 2
@@ -83,6 +84,7 @@ def test_a_depression_is_no_lump() -> None:
     assert probability(bump_map(amplitude=-0.3, noise=errors("white", np.random.default_rng(34)))) < 0.95
 
 
+@pytest.mark.long
 def test_the_simulated_scans(shared_data: Path) -> None:
     found = {}
     for name in ("s08_no_mass", "s01_sphere15_hd1_clean", "s07_rib_edge"):

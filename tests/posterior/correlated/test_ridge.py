@@ -40,6 +40,7 @@ def test_a_ridge_alone_gets_no_number(seed: int) -> None:
     assert found.probability < 0.5
 
 
+@pytest.mark.long
 def test_it_would_get_one_if_only_noise_were_asked(monkeypatch: pytest.MonkeyPatch) -> None:
     """The control: on these maps nothing but the ridge's own evidence stands against a number."""
     monkeypatch.setattr(field_estimate, "ridge_instead", lambda *_: None)

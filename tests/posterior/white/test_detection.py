@@ -53,6 +53,7 @@ def false_lumps(kind: str, *, maps: int) -> int:
 KINDS = ("white", "tilt", "3 mm", "6 mm")
 
 
+@pytest.mark.long
 def test_lump_free_maps_show_none() -> None:
     """A map of each kind: a true rate of 2 % gives one in 1 run of 12. Hundreds are below."""
     assert sum(false_lumps(kind, maps=1) for kind in KINDS) == 0
@@ -75,6 +76,7 @@ def few_at_the_rim(rng: np.random.Generator) -> TactileMap:
     return replace(grid_map(1 + 0.003 * errors * np.sqrt(100 / count)), count=count)
 
 
+@pytest.mark.long
 def test_few_readings_at_the_rim_make_no_lump() -> None:
     """A negative control: the same maps, whose counts say that the rim was read as often, do show lumps."""
     rng = np.random.default_rng(31)
@@ -95,6 +97,7 @@ def test_few_readings_at_the_rim_make_no_lump() -> None:
     assert max(most(replace(one, count=np.full_like(one.count, 100))) for one in maps) >= 0.95
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("scan", ["empty.toml", "s08_no_mass.npz"])
 def test_an_empty_scan_gets_no_size_by_a_solid_study(scan: str, request: pytest.FixtureRequest) -> None:
     """With the recipe of `study --model solid`: a flat field, frame means, a free level and independent errors."""
@@ -166,6 +169,7 @@ def test_a_depression_is_no_lump() -> None:
     assert answer.probability == 0.0
 
 
+@pytest.mark.long
 def test_the_simulated_scan_without_a_mass_has_no_lump_and_those_with_one_do(shared_data: Path) -> None:
     statuses = {}
     for name in ("s08_no_mass", "s01_sphere15_hd1_clean", "s11_resting15_hd1"):

@@ -151,6 +151,7 @@ def test_a_left_out_geometry_is_no_reference_for_width_changes(monkeypatch: pyte
         np.testing.assert_array_equal(np.isnan(rows.width_change), without)
 
 
+@pytest.mark.long
 def test_the_report_and_the_file_tell_the_errors(tmp_path: Path) -> None:
     done = run_here("calibrate", "size", str(PHANTOMS), "-o", "size.json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
