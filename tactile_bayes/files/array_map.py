@@ -18,6 +18,10 @@ _HEADING: Final = """\
 # time_unit = "ms"    # of the frames' times, where it is not s (or us, min)
 # length_unit = "cm"  # of the places, where it is not mm (or m, inch)
 """
+_VALUES: Final = """
+[values]
+# pitch_mm = 1.5  # numbers that no file has
+"""
 
 
 def read_array_map(path: Path) -> ArrayMap:
@@ -28,7 +32,7 @@ def read_array_map(path: Path) -> ArrayMap:
 def array_template(path: Path | None) -> str:
     """TOML for `read_array_map` to fill in: of a file, with its arrays and those that their shapes tell."""
     shapes = {} if path is None else {name: one.shape for name, one in read_named(path, list).items()}
-    return "\n".join([_HEADING.format(path=path or "a file"), *_held(shapes), *_arrays(shapes), *_values()]) + "\n"
+    return "\n".join([_HEADING.format(path=path or "a file"), *_held(shapes), *_arrays(shapes), _VALUES])
 
 
 _PLAIN: Final[Mapping[str, tuple[str, ...]]] = {
@@ -96,12 +100,8 @@ def _line(name: str, guessed: Mapping[str, str], shapes: Mapping[str, Shape], to
     if name in shapes:
         return f"# {name} is called so  # {told}"
     if name in guessed:
-        return f"{name} = {_quoted(guessed[name])}  # guessed; {told}"
+        return f"{name} = {dump_json(guessed[name]).strip()}  # guessed; {told}"
     return f'# {name} = ""  # {told}'
-
-
-def _values() -> Iterator[str]:
-    yield from ("", "[values]", "# pitch_mm = 1.5  # numbers that no file has")
 
 
 def _guessed(shapes: Mapping[str, Shape]) -> dict[str, str]:
@@ -119,18 +119,9 @@ def _guessed(shapes: Mapping[str, Shape]) -> dict[str, str]:
         "position_mm": of(lambda s: len(s) == 2 and s[1] == 3),
         "quaternion_wxyz": of(lambda s: len(s) == 2 and s[1] == 4 and s[0] != 4),
     }
-    timed = {"frame_time_s": ("counts",), "pose_time_s": ("position_mm", "pose_matrix")}
-    for here, places in timed.items():
-        ends = {end for name in places if len(found[name]) == 1 for end in _ends(free[found[name][0]])}
+    for here, places in _BESIDE.items():
+        only = [free[found[name][0]] for name in places if len(found.get(name, ())) == 1]
+        ends = {max(shape[0], shape[-1], key=int) for shape in only}  # either may be that of time
         found[here] = of(lambda s, ends=ends: len(s) == 1 and s[0] in ends)  # type: ignore[misc]
     by_shape = {here: names[0] for here, names in found.items() if here not in shapes and len(names) == 1}
     return by_shape | plain_names(list(shapes), {name: name for name in KNOWN if name in shapes})
-
-
-def _ends(shape: Shape) -> set[Any]:
-    """The longer of an array's first and last axis, which may be that of time."""
-    return {max(shape[0], shape[-1], key=int)}
-
-
-def _quoted(name: str) -> str:
-    return dump_json(name).strip()

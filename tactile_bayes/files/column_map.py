@@ -167,14 +167,14 @@ def _check_columns(table: RawTable, names: Sequence[str]) -> None:
     for name in names:
         if name not in table.header:
             held = ", ".join(repr(one) for one in table.header)
-            raise _fault(table.path, 1, name, "is missing", f"correct the mapping; the table has {held}")
+            raise table.error(1, name, "is missing", way_out=f"correct the mapping; the table has {held}")
 
 
 def _key(table: RawTable, line: int, row: Mapping[str, str], mapping: ColumnMap) -> tuple[str, str]:
     """Patient and mass of a row."""
     for name in mapping.key_columns():
         if not row[name]:
-            raise _fault(table.path, line, name, "is blank", "every row needs its patient and mass")
+            raise table.error(line, name, "is blank", way_out="every row needs its patient and mass")
     return row[mapping.patient], "1" if mapping.mass is None else row[mapping.mass]
 
 
@@ -192,7 +192,8 @@ def _reading(
     sd, low, high = (_number(table, line, row, column, factor) for column in (reading.sd, reading.low, reading.high))
     probability = None if low is None else reading.probability
     if status == "detected" and reading.low and low is not None and probability is None:
-        raise _fault(table.path, line, reading.low, "is an interval's end without probability", "add it to the mapping")
+        what = "is an interval's end without probability"
+        raise table.error(line, reading.low, what, way_out="add it to the mapping")
     return {
         "patient": patient,
         "mass": mass,
@@ -221,16 +222,16 @@ def _date(table: RawTable, line: int, row: Mapping[str, str], column: str | None
     try:
         return parse_date(text) if text else None
     except ValueError:
-        raise _fault(table.path, line, str(column), f"{text!r} is no date", "write it as 2026-03-01") from None
+        raise table.error(line, str(column), f"{text!r} is no date", way_out="write it as 2026-03-01") from None
 
 
 def _positive(table: RawTable, line: int, column: str, text: str) -> float:
     value = table.number(line, column, text)
     if value == 0:
         ask = 'does 0 mean that the mass was not found? then add not_detected = ["0"] to the mapping'
-        raise _fault(table.path, line, column, "is 0", ask)
+        raise table.error(line, column, "is 0", way_out=ask)
     if value < 0:
-        raise _fault(table.path, line, column, f"is {value:g}", "a size is above 0")
+        raise table.error(line, column, f"is {value:g}", way_out="a size is above 0")
     return value
 
 
@@ -244,7 +245,3 @@ def _check_keys(table: Table, names: Sequence[str]) -> None:
                 row, "patient", f"{shown} stands on line {table.line_numbers[seen[key]]} already", way_out=way_out
             )
         seen[key] = row
-
-
-def _fault(path: Path, line: int, column: str, what: str, way_out: str) -> BadDataError:
-    return BadDataError(f"line {line}, column {column}: {what}", way_out=way_out, path=str(path))

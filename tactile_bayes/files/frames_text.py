@@ -23,7 +23,7 @@ from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.arrays_layout import Stated
 from tactile_bayes.files.named_arrays import Source
 from tactile_bayes.files.poses_text import is_header_of_poses, kind_of_column
-from tactile_bayes.files.text_lines import NO_SENSEL, Line, TextTable, number, read_text_table
+from tactile_bayes.files.text_lines import NO_SENSEL, Line, TextTable, counts_up, number, read_text_table
 from tactile_bayes.geometry import FloatArray
 
 _UNITS: Final = {
@@ -55,7 +55,6 @@ _SECONDS: Final = {"ms": "ms", "msec": "ms", "us": "us", "ns": "ns", "µs": "us"
 _LAYOUTS: Final = "give one row a frame, or blocks of rows; --skip-columns says how many stand before the readings"
 _MOST_OF_POSES: Final = 24  # columns: a table of more holds readings, too
 _SAMPLED: Final = 50
-_MOST_LABELS: Final = 8
 
 
 def read_frames(path: Path, given: Stated, *, shape: tuple[int, int] | None) -> Source:
@@ -100,15 +99,10 @@ def _without_words(table: TextTable) -> TextTable:
         return table
 
     def blanked(line: Line) -> Line:
-        if len(line.fields) != width or any(table.numbers([one]) is None for one in _beside(line.fields, words)):
-            return line
-        return replace(line, fields=["" if i in words else one for i, one in enumerate(line.fields)])
+        fields = ["" if i in words else one for i, one in enumerate(line.fields)]
+        return line if len(fields) != width or table.numbers(fields) is None else replace(line, fields=fields)
 
     return replace(table, lines=[blanked(line) for line in table.lines])
-
-
-def _beside(fields: Sequence[str], words: Sequence[int]) -> list[str]:
-    return [one for i, one in enumerate(fields) if i not in words]
 
 
 def _blocks(table: TextTable, taxels: int | None) -> list[list[Line]]:
@@ -225,7 +219,7 @@ def _of_rows(
     notes: list[str],
 ) -> Source:
     values = np.array([table.numbers(line.fields) for line in rows])
-    if _counts(values[0][np.isfinite(values[0])]) and len(rows) > 1:
+    if counts_up(values[0][np.isfinite(values[0])]) and len(rows) > 1:
         notes.append(f"line {rows[0].number} counts {values[0, -2]:g}, {values[0, -1]:g}: taken for labels")
         values = values[1:]
     taxels = None if shape is None else shape[0] * shape[1]
@@ -247,10 +241,6 @@ def _of_rows(
         if unit and stated.time_unit is None:
             stated = replace(stated, time_unit=unit)
     return Source(arrays, stated, tuple(notes))
-
-
-def _counts(line: FloatArray) -> bool:
-    return len(line) >= _MOST_LABELS and line[0] in (0.0, 1.0) and bool((np.diff(line) == 1.0).all())
 
 
 def _unit_of_time(name: str) -> str:
@@ -288,12 +278,8 @@ def _time_column(columns: FloatArray, given: Stated) -> int | None:
 
     A column that falls is told as such when times are checked.
     """
-    steps = np.diff(columns, axis=0)
-    counting = (
-        [] if given.time_unit else [i for i in range(columns.shape[1]) if len(steps) and (steps[:, i] == 1).all()]
-    )
-    rising = [
-        i for i in range(columns.shape[1]) if (steps[:, i] >= 0).all() and steps[:, i].any() and i not in counting
-    ]
-    others = [i for i in range(columns.shape[1]) if i not in counting]
+    steps = np.diff(columns, axis=0).T
+    counting = [i for i, one in enumerate(steps) if one.size and (one == 1).all() and not given.time_unit]
+    others = [i for i in range(len(steps)) if i not in counting]
+    rising = [i for i in others if (steps[i] >= 0).all() and steps[i].any()]
     return next(reversed(rising), None if given.rate_hz else next(reversed(others), None))

@@ -13,7 +13,16 @@ from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.images import read_image
 from tactile_bayes.files.named_arrays import ARRAY_SUFFIXES, read_named
-from tactile_bayes.files.text_lines import NO_SENSEL, fields_of, read_lines, refuse_thousands, separator_of, with_comma
+from tactile_bayes.files.text_lines import (
+    FEWEST_LABELS,
+    NO_SENSEL,
+    counts_up,
+    fields_of,
+    read_lines,
+    refuse_thousands,
+    separator_of,
+    with_comma,
+)
 from tactile_bayes.geometry import FloatArray
 
 # --- What a file or a caller gives before it is a map.
@@ -35,8 +44,6 @@ class Grid(Record, eq=False):
 # ``.csv``) is such a table: ``KEY value`` lines, ``ASCII_DATA @@``, ``Frame 1``, rows, ``@@``; ``B`` is no sensel.
 
 _WAY_OUT: Final = "give a table of numbers, such as .csv"
-_MOST_COUNTED: Final = 8
-"""A first row or column of so many numbers that counts 0, 1, 2... or 1, 2, 3... holds labels, whatever its corner."""
 _NUMBER: Final = re.compile(r"[+-]?(([0-9]+\.?[0-9]*|\.[0-9]+)(e[+-]?[0-9]+)?|nan|inf(inity)?)", re.IGNORECASE)
 _TIME: Final = re.compile(r"(t|time|times|timestamp|date|frame|sample|index|s|ms|sec|seconds)\b.*", re.IGNORECASE)
 """A first column of this name stands before frames, one a row."""
@@ -75,14 +82,11 @@ def read_table(path: Path, *, no_value: Sequence[str] = ()) -> Grid:
             notes.append(f"{alike:,} cells hold {mark!r}, which is no value")
     _refuse_labels(values)
     _refuse_list(values)
-    units = _UNITS_LINE.search(text)
+    named = _UNITS_LINE.search(text)
+    units = "" if named is None else "kPa" if named[1].lower() == "kpa" else named[1]
     sides = {side: float(number) * _MM[unit or None] for side, number, unit in _SPACING_LINE.findall(text)}
     spacing = (sides["COL"], sides["ROW"]) if len(sides) == 2 else None
-    return Grid({"mean": values}, spacing, None, _unit(units[1]) if units else "", tuple(notes))
-
-
-def _unit(text: str) -> str:
-    return "kPa" if text.lower() == "kpa" else text
+    return Grid({"mean": values}, spacing, None, units, tuple(notes))
 
 
 def is_number(field: str) -> bool:
@@ -183,24 +187,23 @@ def _refuse_labels(table: FloatArray) -> None:
     """Refuse numbers of rows and columns, or their places, in the first row and column: they are no readings."""
     row, column = table[0], table[:, 0]
     both = np.isnan(table[0, 0]) and _evenly(row[1:]) and _evenly(column[1:])
-    for found, line, where in ((both, row[1:], "row 1 and column 1"), (_counts(row), row, "row 1")):
+    counted = (
+        (both, row[1:], "row 1 and column 1"),
+        (counts_up(row), row, "row 1"),
+        (counts_up(column), column, "column 1"),
+    )
+    for found, line, where in counted:
         if found:
-            _refuse(line, where)
-    if _counts(column):
-        _refuse(column, "column 1")
-    for number, line in ((1, column), (2, row)):
-        beside = table[:, 1:] if number == 1 else table[1:].T
-        if len(line) >= _MOST_COUNTED and _evenly(line) and not any(_evenly(other) for other in beside.T):
-            what = (
-                f"{'column' if number == 1 else 'row'} 1 runs in equal steps ({line[0]:g}, {line[1]:g}, {line[2]:g}...)"
-            )
+            way_out = "save the grid without them (pandas: to_csv(..., header=False, index=False))"
+            raise BadDataError(f"{where} count {_first_three(line)}... as labels do", way_out=way_out)
+    for name, line, beside in (("column", column, table[:, 1:].T), ("row", row, table[1:])):
+        if len(line) >= FEWEST_LABELS and _evenly(line) and not any(map(_evenly, beside)):
+            what = f"{name} 1 runs in equal steps ({_first_three(line)}...)"
             raise BadDataError(what, way_out="leave out times or places; frames that stand one a row are a scan")
 
 
-def _refuse(line: FloatArray, where: str) -> None:
-    told = ", ".join(f"{value:g}" for value in line[:3])
-    way_out = "save the grid without them (pandas: to_csv(..., header=False, index=False))"
-    raise BadDataError(f"{where} count {told}... as labels do", way_out=way_out)
+def _first_three(line: FloatArray) -> str:
+    return ", ".join(f"{value:g}" for value in line[:3])
 
 
 def _refuse_list(table: FloatArray) -> None:
@@ -218,10 +221,6 @@ def _evenly(line: FloatArray) -> bool:
     """True when three numbers or more run in equal steps."""
     steps = np.diff(line)
     return len(line) > 2 and bool(steps[0] != 0.0) and bool(np.allclose(steps, steps[0], rtol=1e-6, atol=0.0))
-
-
-def _counts(line: FloatArray) -> bool:
-    return len(line) >= _MOST_COUNTED and line[0] in (0.0, 1.0) and bool((np.diff(line) == 1.0).all())
 
 
 # --- A grid by its file's suffix.
@@ -272,12 +271,9 @@ def _of_arrays(path: Path, array: str) -> Grid:
     has = ", ".join(f"{name} {held.shape}" for name, held in sorted(arrays.items())[:12]) or "nothing"
     if len(flat) > 1:
         raise BadDataError(f"holds several arrays of rows and columns ({has})", way_out="name one with --array NAME")
-    if array:
-        raise BadDataError(
-            f"holds no array of rows and columns called {array!r} (it has {has})", way_out="name another"
-        )
-    way_out = "frames with poses are a scan; of frames alone give one, or their mean"
-    raise BadDataError(f"holds no array of rows and columns (it has {has})", way_out=way_out)
+    called = f" called {array!r}" if array else ""
+    way_out = "name another" if array else "frames with poses are a scan; of frames alone give one, or their mean"
+    raise BadDataError(f"holds no array of rows and columns{called} (it has {has})", way_out=way_out)
 
 
 def _stated_spacing(held: np.ndarray[Any, Any] | None) -> tuple[float, float] | None:

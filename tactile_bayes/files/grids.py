@@ -79,12 +79,12 @@ def _apart(values: FloatArray) -> tuple[float, str, FloatArray] | None:
     numbers = sorted({low, high} | constant, key=lambda one: -abs(one - float(np.median(values[known]))))
     special = np.isin(values, numbers)
     rest = values[known & ~special]
-    largest = _steps(values, known & ~special)
+    largest = _steps(values, known & ~special, np.logical_and)
     for number in numbers:
         cells = values == number
         if abs(number) > _BEYOND:
             return number, _places(cells), rest
-        border = _border_steps(values, cells)
+        border = _steps(values, cells, np.logical_xor)
         times = _TIMES if cells.sum() > 1 else _TIMES_OF_ONE
         if len(largest) >= _FEWEST_STEPS and len(border) and np.median(border) > times * largest.max():
             return number, _places(cells), rest
@@ -107,17 +107,12 @@ def _line_apart(values: FloatArray, axis: int) -> tuple[int, float, float] | Non
     return None
 
 
-def _steps(values: FloatArray, of: BoolArray) -> FloatArray:
-    """Absolute differences between neighbours that are both among the given cells."""
-    across = np.abs(np.diff(values, axis=1))[of[:, 1:] & of[:, :-1]]
-    along = np.abs(np.diff(values, axis=0))[of[1:] & of[:-1]]
-    return np.concatenate([across, along])
-
-
-def _border_steps(values: FloatArray, cells: BoolArray) -> FloatArray:
-    """Absolute differences between the given cells and those beside them."""
-    across = np.abs(np.diff(values, axis=1))[cells[:, 1:] ^ cells[:, :-1]]
-    along = np.abs(np.diff(values, axis=0))[cells[1:] ^ cells[:-1]]
+def _steps(values: FloatArray, cells: BoolArray, which: np.ufunc) -> FloatArray:
+    """Absolute differences between neighbours: inside the given cells (`np.logical_and`), or across their border
+    (`np.logical_xor`).
+    """
+    across = np.abs(np.diff(values, axis=1))[which(cells[:, 1:], cells[:, :-1])]
+    along = np.abs(np.diff(values, axis=0))[which(cells[1:], cells[:-1])]
     steps: FloatArray = np.concatenate([across, along])
     return steps[np.isfinite(steps)]
 
@@ -280,16 +275,13 @@ def _spacing(grid: Grid, *, given: float | None) -> tuple[float, list[str]]:
         if given is not None and not np.isclose(given, value, rtol=1e-9, atol=0.0):
             raise UsageError(f"--spacing-mm is {given:g}, but the file says {value:g}; leave the option out")
         return _checked(value), []
-    told = "" if grid.resolution_mm is None else _resolution(grid.resolution_mm[0])
+    mm = grid.resolution_mm[0] if grid.resolution_mm else None
+    told = f"its resolution says {mm:.4g} mm a pixel ({25.4 / mm:.4g} dpi, often of a print)" if mm else ""
     if given is None:
         told = told and f"; {told}"
         raise UsageError(f"a grid needs --spacing-mm, the side of its square cells in mm{told}")
-    agrees = grid.resolution_mm is None or np.isclose(given, grid.resolution_mm[0], rtol=1e-2, atol=0.0)
+    agrees = mm is None or np.isclose(given, mm, rtol=1e-2, atol=0.0)
     return _checked(float(given)), [] if agrees else [f"{told}; {given:g} mm was taken, as stated"]
-
-
-def _resolution(mm: float) -> str:
-    return f"its resolution says {mm:.4g} mm a pixel ({25.4 / mm:.4g} dpi, often of a print)"
 
 
 def _checked(value: float) -> float:
@@ -329,10 +321,14 @@ def _real(array: np.ndarray[Any, Any], *, name: str) -> FloatArray:
 
 def _numbers(array: np.ndarray[Any, Any], *, name: str) -> FloatArray:
     values = _real(array, name=name)
-    if np.isinf(values).any():
-        index = tuple(int(i) for i in np.argwhere(np.isinf(values))[0])
+    if index := _first(np.isinf(values)):
         raise BadDataError(f"{name} is infinite at {index}", way_out="mark cells without data by NaN")
     return values
+
+
+def _first(wrong: BoolArray) -> tuple[int, ...]:
+    """Index of the first cell that is; empty without one."""
+    return tuple(int(i) for i in np.argwhere(wrong)[0]) if wrong.any() else ()
 
 
 def _count(held: np.ndarray[Any, Any] | None, mean: FloatArray) -> np.ndarray[tuple[int, ...], np.dtype[np.int64]]:
@@ -342,14 +338,10 @@ def _count(held: np.ndarray[Any, Any] | None, mean: FloatArray) -> np.ndarray[tu
     else:
         values = _numbers(held, name="count")
         _check_same_shape(values, mean, name="count")
-        bad = np.argwhere((values < 0) | (values != np.floor(values)) | np.isnan(values))
-        if len(bad):
-            index = tuple(int(i) for i in bad[0])
+        if index := _first((values < 0) | (values != np.floor(values)) | np.isnan(values)):
             raise BadDataError(f"count is {values[index]:g} at {index}", way_out="give whole numbers from 0 up")
         count = values.astype(np.int64)
-        gap = np.argwhere((count > 0) & np.isnan(mean))
-        if len(gap):
-            index = tuple(int(i) for i in gap[0])
+        if index := _first((count > 0) & np.isnan(mean)):
             raise BadDataError(f"mean is NaN at {index}, where count is {count[index]}", way_out="set count to 0 there")
     if not count.any():
         raise BadDataError("no cell holds data", way_out="give at least one finite value")
@@ -365,13 +357,9 @@ def _variance(held: np.ndarray[Any, Any] | None, count: np.ndarray[tuple[int, ..
         return np.where(count > 0, 0.0, np.nan)
     variance = _numbers(held, name="variance")
     _check_same_shape(variance, count, name="variance")
-    bad = np.argwhere((count > 0) & ~(variance >= 0) & ~((count == 1) & np.isnan(variance)))
-    if len(bad):
-        index = tuple(int(i) for i in bad[0])
-        raise BadDataError(
-            f"variance is {variance[index]:g} at {index}, where count is {count[index]}",
-            way_out="it must not be negative, and NaN (not known) only where count is 0 or 1",
-        )
+    if index := _first((count > 0) & ~(variance >= 0) & ~((count == 1) & np.isnan(variance))):
+        what = f"variance is {variance[index]:g} at {index}, where count is {count[index]}"
+        raise BadDataError(what, way_out="it must not be negative, and NaN (not known) only where count is 0 or 1")
     return np.where(count > 0, variance, np.nan)
 
 
@@ -384,12 +372,9 @@ def _check_level(values: FloatArray, *, normalise: str, units: str) -> None:
     """Refuse values that cannot be what the caller declares: divided by their level, or in kPa."""
     median = float(np.median(values))
     if units.strip().lower() == "kpa" and median > _MOST_KPA:
-        raise BadDataError(
-            f"the median value is {median:.4g} kPa", way_out="looks like Pa, give --units Pa, or divide by 1000"
-        )
+        what = f"the median value is {median:.4g} kPa"
+        raise BadDataError(what, way_out="looks like Pa, give --units Pa, or divide by 1000")
     low, high = _NORMALISED_MEDIAN
     if normalise != "none" and not low <= median <= high:
-        raise BadDataError(
-            f"the median value is {median:.4g}, not near 1 as --normalise {normalise} says",
-            way_out="divide by the level first, or give its unit and --level fit",
-        )
+        what = f"the median value is {median:.4g}, not near 1 as --normalise {normalise} says"
+        raise BadDataError(what, way_out="divide by the level first, or give its unit and --level fit")

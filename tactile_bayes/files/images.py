@@ -246,6 +246,5 @@ def _tiff_spacing(tags: Mapping[int, Any]) -> tuple[float, float] | None:
 
 def _check_square(width: float, height: float) -> None:
     if abs(width / height - 1) > 1e-3:
-        raise BadDataError(
-            f"its pixels are {width / height:.4g} times as wide as high", way_out="resample to square pixels"
-        )
+        what = f"its pixels are {width / height:.4g} times as wide as high"
+        raise BadDataError(what, way_out="resample to square pixels")

@@ -300,10 +300,8 @@ def _of_matrices(given: np.ndarray[Any, Any]) -> tuple[FloatArray, FloatArray]:
     wrong = (departure > _NOT_RIGID) | (np.linalg.det(turned) < 0)
     if wrong.any() or (matrices[:, 3:] != [0, 0, 0, 1]).any():
         first = int(wrong.argmax())
-        raise BadDataError(
-            f"pose_matrix is not rigid at index {first} (R R^T departs from 1 by {departure[first]:.1e})",
-            way_out="give the 16 numbers row by row, translation last in each row",
-        )
+        what = f"pose_matrix is not rigid at index {first} (R R^T departs from 1 by {departure[first]:.1e})"
+        raise BadDataError(what, way_out="give the 16 numbers row by row, translation last in each row")
     return matrices[:, :3, 3], np.asarray(Rotation.from_matrix(turned).as_quat(scalar_first=True))
 
 
@@ -436,9 +434,8 @@ def _check_numbers(arrays: Arrays) -> None:
             index = tuple(int(i) for i in np.unravel_index(int(finite.argmin()), finite.shape))
             where = f" (first at {index})" if index else ""
             number = finite.size - int(finite.sum())
-            raise BadDataError(
-                f"{name} holds {number} values that are not finite{where}", way_out="repair or leave them out"
-            )
+            what = f"{name} holds {number} values that are not finite{where}"
+            raise BadDataError(what, way_out="repair or leave them out")
 
 
 def _check_largest(arrays: Arrays) -> None:
@@ -455,9 +452,8 @@ def _check_counts(arrays: Arrays) -> None:
     whole = counts.dtype.kind in "iu" or bool((counts == np.rint(counts)).all())
     if not whole:
         odd = float(counts[counts != np.rint(counts)][0])
-        raise BadDataError(
-            f"counts holds {odd:.6g}, which is no raw reading", way_out="for pressures give their unit: --unit kPa"
-        )
+        what = f"counts holds {odd:.6g}, which is no raw reading"
+        raise BadDataError(what, way_out="for pressures give their unit: --unit kPa")
     low, high = int(counts.min()), int(counts.max())
     if low < 0 or high > _MOST_COUNTS:
         raise BadDataError(f"counts holds {low if low < 0 else high}", way_out="raw readings lie in 0 to 65535")
@@ -481,18 +477,16 @@ def _check_units(arrays: Arrays, *, calibrated: bool) -> None:
         _check_nipple(arrays, metres)
     full_scale = float(np.median(arrays["gain_kpa_per_count"])) * 4095
     if not calibrated and (full_scale > 1000.0 or 0 < full_scale < 0.5):
-        raise BadDataError(
-            f"gain_kpa_per_count gives {full_scale:.4g} kPa at 4095 counts", way_out="looks like Pa or MPa, give kPa"
-        )
+        what = f"gain_kpa_per_count gives {full_scale:.4g} kPa at 4095 counts"
+        raise BadDataError(what, way_out="looks like Pa or MPa, give kPa")
     _check_clock(arrays["frame_time_s"], arrays["pose_time_s"])
     _check_pitch(surface, float(arrays["pitch_mm"]))
 
 
 def _check_nipple(arrays: Arrays, metres: str) -> None:
     if "landmarks_mm" not in arrays:
-        raise BadDataError(
-            "nipple_mm is without landmarks_mm", way_out="give notch and xiphoid too: they say what is up"
-        )
+        what = "nipple_mm is without landmarks_mm"
+        raise BadDataError(what, way_out="give notch and xiphoid too: they say what is up")
     near = float(np.linalg.norm(arrays["landmarks_mm"] - arrays["nipple_mm"], axis=1).min())
     if near < 10.0:
         raise BadDataError(f"nipple_mm is {near:.4g} from a point of landmarks_mm", way_out=metres)
@@ -504,15 +498,12 @@ def _check_clock(frame_time_s: np.ndarray[Any, Any], pose_time_s: np.ndarray[Any
         if len(times) > 1 and times[0] == times.min() == times.max():
             raise BadDataError(f"{name} is {times[0]:g} throughout", way_out="give its times, not a constant")
         if step > 0.5:
-            raise BadDataError(
-                f"{name} steps by {step:.4g}", way_out=f"looks like milliseconds, give s or --{option} ms"
-            )
+            what = f"{name} steps by {step:.4g}"
+            raise BadDataError(what, way_out=f"looks like milliseconds, give s or --{option} ms")
     (a, b), (c, d) = ((float(times.min()), float(times.max())) for times in (frame_time_s, pose_time_s))
     if b < c or d < a:
-        raise BadDataError(
-            f"frame_time_s ({a:.3f} to {b:.3f}) and pose_time_s ({c:.3f} to {d:.3f}) do not overlap",
-            way_out="give both on one clock: --pose-offset-s is added to the poses' times",
-        )
+        what = f"frame_time_s ({a:.3f} to {b:.3f}) and pose_time_s ({c:.3f} to {d:.3f}) do not overlap"
+        raise BadDataError(what, way_out="give both on one clock: --pose-offset-s is added to the poses' times")
 
 
 def _check_pitch(surface: np.ndarray[Any, Any], pitch_mm: float) -> None:
@@ -521,10 +512,8 @@ def _check_pitch(surface: np.ndarray[Any, Any], pitch_mm: float) -> None:
             continue
         spacing = float(np.median(np.linalg.norm(np.diff(surface, axis=axis), axis=-1)))
         if not 0.8 * pitch_mm <= spacing <= 1.25 * pitch_mm:
-            raise BadDataError(
-                f"head_surface_mm has elements {spacing:.4g} mm apart along {along}, pitch_mm is {pitch_mm:.4g}",
-                way_out="give both in mm, for the same head",
-            )
+            what = f"head_surface_mm has elements {spacing:.4g} mm apart along {along}, pitch_mm is {pitch_mm:.4g}"
+            raise BadDataError(what, way_out="give both in mm, for the same head")
 
 
 def _scan(arrays: Arrays, facts: Mapping[str, str]) -> Scan:

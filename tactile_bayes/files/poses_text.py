@@ -285,9 +285,8 @@ def _bare(table: TextTable, given: Stated) -> Source:
     layout = given.pose_layout
     of_matrix = next((n for n in (16, 12) if width - n in (0, 1)), 0)
     if layout is None and not of_matrix:
-        raise BadDataError(
-            f"has {width} numbers a row and no names", way_out="give --pose-layout wxyz, xyzw, euler or matrix"
-        )
+        what = f"has {width} numbers a row and no names"
+        raise BadDataError(what, way_out="give --pose-layout wxyz, xyzw, euler or matrix")
     layout = layout or "matrix"
     size = of_matrix or 16 if layout == "matrix" else _BARE[layout]
     if not 0 <= width - size <= 3:

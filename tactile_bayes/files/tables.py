@@ -206,12 +206,16 @@ class RawTable(Record):
     decimal_comma: bool = False  #: True when its numbers are written as 12,5.
     separator: str = ","  #: Between its cells.
 
+    def error(self, line: int, column: str, what: str, *, way_out: str) -> BadDataError:
+        """Error for a cell; lines count from 1."""
+        return _fault(self.path, line, column, what, way_out=way_out)
+
     def number(self, line: int, column: str, text: str) -> float:
         """Parse a finite number; an error names its cell."""
         try:
             return _parse_number(_with_point(text) if self.decimal_comma else text, {"name": column})
         except _CellError as refusal:
-            raise _fault(self.path, line, column, refusal.what, way_out=refusal.way_out) from None
+            raise self.error(line, column, refusal.what, way_out=refusal.way_out) from None
 
 
 def read_raw(path: Path) -> RawTable:
@@ -349,7 +353,11 @@ def _parse_number(text: str, field: Mapping[str, Any]) -> float:
     if text.lstrip("+-").lower() in _NOT_FINITE or _NUMBER.fullmatch(text):
         raise _CellError(f"{_shown(text)} is not a finite number", _blank_advice(field))
     if DECIMAL_COMMA.fullmatch(text):
-        raise _CellError(*_comma_fault(text))
+        whole, _, rest = text.partition(",")
+        if may_be_thousands(text):
+            what = f"{_shown(text)} has a comma that may separate thousands or decimals"
+            raise _CellError(what, f"write {whole}{rest} or {whole}.{rest}, whichever is meant")
+        raise _CellError(f"{_shown(text)} has a decimal comma", f"write {whole}.{rest}")
     unit = " in mm" if field["name"].endswith("_mm") else ""
     raise _CellError(f"{_shown(text)} is not a number", f"write digits only{unit}; {_blank_advice(field)}")
 
@@ -360,18 +368,6 @@ def _with_point(text: str) -> str:
         what = f"{_shown(text)} has a point, and other numbers have decimal commas"
         raise _CellError(what, "write all numbers one way")
     return text.replace(",", ".") if DECIMAL_COMMA.fullmatch(text) else text
-
-
-def _comma_fault(text: str) -> tuple[str, str]:
-    """Explain a comma in a number: three digits after it may be thousands, otherwise it is a decimal comma."""
-    whole, _, rest = text.partition(",")
-    decimal = f"{whole}.{rest}"
-    if not may_be_thousands(text):
-        return f"{_shown(text)} has a decimal comma", f"write {decimal}"
-    return (
-        f"{_shown(text)} has a comma that may separate thousands or decimals",
-        f"write {whole}{rest} or {decimal}, whichever is meant",
-    )
 
 
 def _parse_integer(text: str, field: Mapping[str, Any]) -> int:

@@ -9,10 +9,13 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
+import numpy as np
+
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.reading import TABLE_BYTES, decoded, decoding, other_encoding, read_bytes
 from tactile_bayes.files.tables import DECIMAL_COMMA, may_be_thousands
+from tactile_bayes.geometry import FloatArray
 
 _SEPARATORS: Final = {"\t": "tabs", ";": "semicolons", ",": "commas", " ": "blanks"}
 _SAMPLED: Final = 300  # lines by which the separator is told
@@ -22,6 +25,8 @@ _AROUND: Final = " \t\"'[](){}"  # of a field, as R and Python print numbers
 _CLOCK: Final = re.compile(r"(?:(\d{1,2}):)?(\d{1,2}):(\d{1,2}(?:\.\d+)?)")
 _DATED: Final = re.compile(r"\d{4}-\d{2}-\d{2}[T ]\d{1,2}:\d{2}:\d{2}(\.\d+)?(Z|[+-]\d{2}:?\d{2})?")
 _WITH_COMMA: Final = re.compile(r"[+-]?[0-9]*,[0-9]+(,[0-9]{3})*(e[+-]?[0-9]+)?", re.IGNORECASE)
+FEWEST_LABELS: Final = 8
+"""So many numbers that count 0, 1, 2... or 1, 2, 3... are labels of rows or columns, not readings."""
 NO_SENSEL: Final = "B"
 """A cell beside the sensor in Tekscan's files."""
 _NO_VALUE: Final = ("", "nan", "na", "n/a", "-", "--", NO_SENSEL.lower(), "null")
@@ -174,3 +179,8 @@ def refuse_thousands(commas: Sequence[str], *, way_out: str) -> None:
         first = commas[0]
         what = f"holds {first!r}, which is {first.replace(',', '')} or {first.replace(',', '.', 1)}"
         raise BadDataError(what, way_out=way_out)
+
+
+def counts_up(line: FloatArray) -> bool:
+    """True for labels of rows or columns."""
+    return len(line) >= FEWEST_LABELS and line[0] in (0.0, 1.0) and bool((np.diff(line) == 1.0).all())
