@@ -103,10 +103,8 @@ class Feed:
             return
         try:
             os.write(self._pipe, message)
-        except BlockingIOError:
+        except (BlockingIOError, BrokenPipeError):  # it is full, or the view was closed; the recording goes on
             self.missed += 1
-        except BrokenPipeError:
-            self.missed += 1  # the view was closed; the recording goes on
 
     def close(self) -> None:
         """Close the feed; the view ends after reading the rest of the pipe."""
@@ -309,10 +307,8 @@ class LiveMap:
         if self._map.figures["frames_used"] < REFIT_AT[self._refits]:
             return
         self._refits += 1
-        try:
+        with suppress(BadDataError):  # still too nearly a line: the plane under the head will do until the next time
             self._map = self._map.rebuild()
-        except BadDataError:
-            return  # still too nearly a line: the plane under the head will do until the next time
 
     def _snapshot(self) -> TactileMap | None:
         """The map so far, with the patient's axes if known."""
@@ -362,7 +358,6 @@ def grey_levels(values: FloatArray) -> FloatArray:
     if limits is None:
         return np.full(values.shape, np.nan)
     low, high = limits
-    scaled: FloatArray = (
-        np.clip((values - low) / (high - low), 0.0, 1.0) if high > low else np.where(np.isfinite(values), 0.5, np.nan)
-    )
-    return scaled
+    if high == low:
+        return np.where(np.isfinite(values), 0.5, np.nan)
+    return np.asarray(np.clip((values - low) / (high - low), 0.0, 1.0))

@@ -469,11 +469,12 @@ class Recorder:
         if self.report.ended_by:
             return
         lost = f"after {self.report.duration_s:.2f} s" if self.report.frames else "before the first frame"
-        kept = "; what came before is in the file" if self.report.frames else ""
-        self.report.fault = (
-            f"{line.port.name}: more data was expected, the device has gone {lost}{kept}; {line.port.remedy}"
-        )
+        self._fail(line, f"the device has gone {lost}", line.port.remedy)
         self.stop(f"the {line.role} has gone")
+
+    def _fail(self, line: Line, what: str, remedy: str) -> None:
+        kept = "; what came before is in the file" if self.report.frames else ""
+        self.report.fault = f"{line.port.name}: more data was expected, {what}{kept}; {remedy}"
 
     def _look_for_silence(self, now_ns: int) -> None:
         if not self.recording or self.report.ended_by:
@@ -481,11 +482,7 @@ class Recorder:
         for line in self._lines:
             silent_s = (now_ns - line.heard_ns) / 1e9
             if silent_s > line.silent_s and not line.finished and not select.select([line.stream], [], [], 0)[0]:
-                kept = "; what came before is in the file" if self.report.frames else ""
-                self.report.fault = (
-                    f"{line.port.name}: more data was expected, nothing has come for {silent_s:.1f} s{kept}; check "
-                    "that the device runs"
-                )
+                self._fail(line, f"nothing has come for {silent_s:.1f} s", "check that the device runs")
                 self.stop(f"the {line.role} fell silent")
 
     def _look_at_host_time(self, now_ns: int) -> None:
@@ -511,10 +508,9 @@ class Recorder:
         if self._head.parser.fault:
             report.cautions.append(f"the head's line: {self._head.parser.fault}")
         if self._tracker is not None and report.frames and not report.fault and apart(*spans):
-            report.fault = (
-                f"{self._tracker.port.name}: none of its {report.poses} poses was measured while frames came"
-                + (f" ({report.poses_missing:,} missing: {report.missing_why})" if report.poses_missing else "")
-            )
+            missing = f" ({report.poses_missing:,} missing: {report.missing_why})" if report.poses_missing else ""
+            none = f"none of its {report.poses} poses was measured while frames came"
+            report.fault = f"{self._tracker.port.name}: {none}{missing}"
 
     def _done(self) -> bool:
         """True when all data of the recording have arrived."""

@@ -275,7 +275,7 @@ class TrackerDriver(Record):
         """Ask for records and read them in the form that fits best, for a while after the first of the tools wanted."""
         port.write(self.single)
         makers = [self.parser, *([self.other_parser] if self.other_parser else [])]
-        tries, came, heard, begun = [_Try(maker, maker()) for maker in makers], b"", 0.0, time.monotonic()
+        tries, came, heard, begun = [_Try(maker) for maker in makers], b"", 0.0, time.monotonic()
         late = self.late
         while (now := time.monotonic()) < begun + ANSWER_S:
             if late and not heard and now > begun + ANSWER_S / 3:
@@ -309,8 +309,8 @@ class TrackerDriver(Record):
 class _Try:
     """One form of a protocol's records, tried on what comes."""
 
-    def __init__(self, maker: Callable[[], Parser], parser: Parser) -> None:
-        self.maker, self.parser = maker, parser
+    def __init__(self, maker: Callable[[], Parser]) -> None:
+        self.maker, self.parser = maker, maker()
         self.hello: HelloReading | None = None
         self.tools: dict[str, str] = {}
 
@@ -348,14 +348,10 @@ def _chosen(tools: Mapping[str, str], tool: str | None, reference: str | None, p
     for name, option in ((tool, "--tool"), (reference, "--reference")):
         found = [] if name is None else _called(tools, name)
         if name is not None and len(found) != 1:
-            what = (
-                f"{len(found)} tools are called {name!r}"
-                if found
-                else f"no pose of a tool {name!r} comes (is it in sight?)"
-            )
-            raise DeviceError(
-                f"{port.name}: {what}; it sends {listed or 'one without a name'}: give {option} one of them"
-            )
+            none = f"no pose of a tool {name!r} comes (is it in sight?)"
+            what = f"{len(found)} tools are called {name!r}" if found else none
+            sent = listed or "one without a name"
+            raise DeviceError(f"{port.name}: {what}; it sends {sent}: give {option} one of them")
         full.append(found[0] if found else None)
     left = [name for name in tools if name != full[1]]
     if full[0] is None and len(left) > 1:
@@ -371,48 +367,29 @@ def _chosen(tools: Mapping[str, str], tool: str | None, reference: str | None, p
     return followed, full[1]
 
 
-def _fastrak_items(items: bytes) -> tuple[bytes, ...]:
-    """Commands that set the items of each station's records: the command knows no station for all."""
-    return tuple(b"O%d,%b\r" % (station, items) for station in range(1, 5))
+def _open_framing(title: str, baud: int) -> TrackerDriver:
+    ask, start, stop = (encode_command(one) for one in (head.ASK, head.START, head.STOP))
+    return TrackerDriver(title, baud, HeadParser, (), ask, start, stop)
+
+
+def _fastrak(words: str, form: bytes, closing: bytes, parser: Callable[[], Parser]) -> TrackerDriver:
+    """A FASTRAK in one form of records; the items are set for each station: the command knows none for all."""
+    items = [b"O%d,2,11,%b\r" % (station, closing) for station in range(1, 5)]
+    return TrackerDriver(f"a Polhemus FASTRAK ({words})", 115_200, parser, (b"U", *items, form), b"P", b"C", b"c")
+
+
+def _liberty(words: str, form: bytes, closing: bytes, parser: Callable[[], Parser]) -> TrackerDriver:
+    """A LIBERTY or PATRIOT in one form of records."""
+    title = f"a Polhemus LIBERTY or PATRIOT ({words})"
+    commands = (b"U0\r", form, b"O*,2,7,8,11,%b\r" % closing, b"Q0\r")
+    return TrackerDriver(title, 115_200, parser, commands, b"P", b"C\r", b"P")
 
 
 TRACKERS: Final[dict[str, TrackerDriver]] = {
-    "fastrak": TrackerDriver(
-        "a Polhemus FASTRAK (binary)",
-        115_200,
-        FastrakParser,
-        (b"U", *_fastrak_items(b"2,11,0"), b"f"),
-        b"P",
-        b"C",
-        b"c",
-    ),
-    "fastrak-ascii": TrackerDriver(
-        "a Polhemus FASTRAK (ASCII)",
-        115_200,
-        lambda: FastrakParser(binary=False),
-        (b"U", *_fastrak_items(b"2,11,1"), b"F"),
-        b"P",
-        b"C",
-        b"c",
-    ),
-    "liberty": TrackerDriver(
-        "a Polhemus LIBERTY or PATRIOT (binary)",
-        115_200,
-        LibertyParser,
-        (b"U0\r", b"F1\r", b"O*,2,7,8,11,0\r", b"Q0\r"),
-        b"P",
-        b"C\r",
-        b"P",
-    ),
-    "liberty-ascii": TrackerDriver(
-        "a Polhemus LIBERTY or PATRIOT (ASCII)",
-        115_200,
-        LibertyAsciiParser,
-        (b"U0\r", b"F0\r", b"O*,2,7,8,11,1\r", b"Q0\r"),
-        b"P",
-        b"C\r",
-        b"P",
-    ),
+    "fastrak": _fastrak("binary", b"f", b"0", FastrakParser),
+    "fastrak-ascii": _fastrak("ASCII", b"F", b"1", lambda: FastrakParser(binary=False)),
+    "liberty": _liberty("binary", b"F1\r", b"0", LibertyParser),
+    "liberty-ascii": _liberty("ASCII", b"F0\r", b"1", LibertyAsciiParser),
     "bird": TrackerDriver(
         "an Ascension Flock of Birds",
         115_200,
@@ -424,15 +401,7 @@ TRACKERS: Final[dict[str, TrackerDriver]] = {
         several=(b"P\x23\x01",),  # group mode
         other_parser=lambda: BirdParser(group=True),
     ),
-    "open": TrackerDriver(
-        "a tracker in the open framing",
-        head.DEFAULT_BAUD,
-        HeadParser,
-        (),
-        encode_command(head.ASK),
-        encode_command(head.START),
-        encode_command(head.STOP),
-    ),
+    "open": _open_framing("a tracker in the open framing", head.DEFAULT_BAUD),
     "igtlink": TrackerDriver(
         "an OpenIGTLink server (PLUS, 3D Slicer)",
         0,
@@ -441,15 +410,7 @@ TRACKERS: Final[dict[str, TrackerDriver]] = {
         silent_s=30.0,
         hint="start its stream, with a tool in sight",
     ),
-    "ndi": TrackerDriver(
-        "an NDI Polaris, Vega or Aurora",
-        0,
-        HeadParser,
-        (),
-        encode_command(head.ASK),
-        encode_command(head.START),
-        encode_command(head.STOP),
-    ),
+    "ndi": _open_framing("an NDI Polaris, Vega or Aurora", 0),
 }
 
 

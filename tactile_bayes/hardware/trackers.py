@@ -413,9 +413,8 @@ class NdiTracker:
         self._command(_WIRELESS)
         handle: int = self._api.ndiGetPHRQHandle(self._device)
         if self._api.ndiPVWRFromFile(self._device, handle, str(rom)) != 0:
-            raise DeviceError(
-                f"the tool's description {rom} was refused by the tracker; check that it is the tool's .rom file"
-            )
+            what = f"the tool's description {rom} was refused by the tracker"
+            raise DeviceError(f"{what}; check that it is the tool's .rom file")
         return handle
 
     def _enable(self) -> list[int]:
