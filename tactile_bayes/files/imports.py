@@ -507,12 +507,12 @@ def _check_clock(frame_time_s: np.ndarray[Any, Any], pose_time_s: np.ndarray[Any
 
 
 def _check_pitch(surface: np.ndarray[Any, Any], pitch_mm: float) -> None:
-    for axis, along in ((0, "axis 0"), (1, "axis 1")):
+    for axis in (0, 1):
         if surface.shape[axis] < 2:
             continue
         spacing = float(np.median(np.linalg.norm(np.diff(surface, axis=axis), axis=-1)))
         if not 0.8 * pitch_mm <= spacing <= 1.25 * pitch_mm:
-            what = f"head_surface_mm has elements {spacing:.4g} mm apart along {along}, pitch_mm is {pitch_mm:.4g}"
+            what = f"head_surface_mm has elements {spacing:.4g} mm apart along axis {axis}, pitch_mm is {pitch_mm:.4g}"
             raise BadDataError(what, way_out="give both in mm, for the same head")
 
 

@@ -196,12 +196,10 @@ def _of_one_tool(
     """Columns of one tool, which may stand beside others (as NDI writes them) or in rows between theirs."""
     first = names[3]
     sets = [i for i, kind in enumerate(kinds) if kind == first]
+    at = sets[0]
     if len(sets) > 1:
         numbered = [str(i + 1) for i in range(len(sets))]
-        what = f"{len(sets)} groups of columns"
-        at = sets[int(chosen(numbered, given, what=what)) - 1]
-    else:
-        at = sets[0]
+        at = sets[int(chosen(numbered, given, what=f"{len(sets)} groups of columns")) - 1]
     columns = {kind: _nearest(kinds, kind, at, pose=kind in names) for kind in set(kinds) if kind}
     held = list(rows)
     if len(sets) == 1 and "tool" in columns:

@@ -10,7 +10,7 @@ import os
 import re
 import stat
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any, Final
 
@@ -75,10 +75,7 @@ def read_bytes(path: Path, *, most: int) -> bytes:
 
 def read_text(path: Path, *, most: int, way_out: str) -> str:
     """A file's UTF-8 text; see `read_bytes` for limits and errors, and `decoded`."""
-    data = read_bytes(path, most=most)
-    if other := other_encoding(data):
-        raise BadDataError(f"is {other} text", way_out="save it as UTF-8", path=str(path))
-    return decoded(data, path=path, way_out=way_out)
+    return decoded(read_bytes(path, most=most), path=path, way_out=way_out)
 
 
 def other_encoding(data: bytes) -> str:
@@ -93,14 +90,20 @@ def other_encoding(data: bytes) -> str:
     return "UTF-16 (without a byte order mark)" if half and zeros > half / 2 and start.count(0) == zeros else ""
 
 
-def decoded(data: bytes, *, path: Path, way_out: str, encoding: str = "utf-8-sig") -> str:
-    """Text of bytes in UTF-8, with or without a byte order mark; other bytes are named with their line."""
+def decoded(
+    data: bytes, *, path: Path, way_out: str, as_utf8: str = "save it as UTF-8", may_be: Sequence[str] = ()
+) -> str:
+    """Text of bytes in UTF-8, with or without a byte order mark, or in another encoding of those that it `may_be`;
+    other bytes are named with their line.
+    """
+    other = other_encoding(data)
+    if other and other not in may_be:
+        raise BadDataError(f"is {other} text", way_out=as_utf8, path=str(path))
     try:
-        return data.decode(encoding)
+        return data.decode(other or "utf-8-sig")
     except UnicodeDecodeError as error:
         line = data.count(b"\n", 0, error.start) + 1
-        name = "UTF-8" if encoding == "utf-8-sig" else encoding.upper()
-        what = f"line {line}: byte 0x{data[error.start]:02x} is not {name} text"
+        what = f"line {line}: byte 0x{data[error.start]:02x} is not {other or 'UTF-8'} text"
         raise BadDataError(what, way_out=way_out, path=str(path)) from None
 
 

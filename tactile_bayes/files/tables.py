@@ -17,7 +17,7 @@ from typing import Any, Final
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.documents import load_schema
-from tactile_bayes.files.reading import TABLE_BYTES, ZIP_MAGIC, decoded, other_encoding, read_bytes
+from tactile_bayes.files.reading import TABLE_BYTES, ZIP_MAGIC, decoded, read_bytes
 
 # --- Cells of a CSV file as text: its encoding, its separator, its quotes, and the decimal commas of spreadsheets.
 #
@@ -52,9 +52,7 @@ def read_text(path: Path) -> str:
     for marks, what, way_out in _NOT_TEXT:
         if data.startswith(marks):
             raise BadDataError(what, way_out=way_out, path=str(path))
-    if other := other_encoding(data):
-        raise BadDataError(f"is {other} text", way_out=_AS_UTF8, path=str(path))
-    return decoded(data, path=path, way_out=_AS_UTF8)
+    return decoded(data, path=path, way_out=_AS_UTF8, as_utf8=_AS_UTF8)
 
 
 def cells_of(path: Path, text: str) -> Cells:

@@ -13,7 +13,7 @@ import numpy as np
 
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.files.reading import TABLE_BYTES, decoded, decoding, other_encoding, read_bytes
+from tactile_bayes.files.reading import TABLE_BYTES, decoded, decoding, read_bytes
 from tactile_bayes.files.tables import DECIMAL_COMMA, may_be_thousands
 from tactile_bayes.geometry import FloatArray
 
@@ -81,10 +81,7 @@ def number(text: str, *, decimal_comma: bool = False) -> float:
 def read_lines(path: Path) -> list[str]:
     """Lines of a text, UTF-8 or with a byte order mark; a minus sign that is no hyphen is one."""
     data = read_bytes(path, most=TABLE_BYTES)
-    other = other_encoding(data)
-    if other not in ("", "UTF-16"):
-        raise BadDataError(f"is {other} text", way_out=_AS_UTF8, path=str(path))
-    text = decoded(data, path=path, way_out=_AS_UTF8, encoding=other.lower() or "utf-8-sig")
+    text = decoded(data, path=path, way_out=_AS_UTF8, as_utf8=_AS_UTF8, may_be=("UTF-16",))
     if "\0" in text:
         raise BadDataError("is not text", way_out="give numbers as .npz, .npy, .mat, HDF5 or a table", path=str(path))
     return text.replace("\u2212", "-").splitlines()
