@@ -110,6 +110,7 @@ def test_another_processor_moves_figures_by_a_small_share_of_their_error(
     assert (new["status"], new["diagnostics"]["method"]) == ("estimate", "importance")
 
 
+@pytest.mark.long
 def test_another_seed_fails_the_same_check(answer: Callable[..., Document], newer: str) -> None:
     """The control: figures that are drawn anew differ by about their error, which the check would see."""
     machines = moves(answer("Prescott", seed=1), answer(newer, seed=1))

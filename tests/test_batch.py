@@ -157,6 +157,7 @@ def test_a_killed_worker_costs_no_result(tmp_path):
     assert [outcome.value for outcome in outcomes] == list(range(8))
 
 
+@pytest.mark.long
 def test_a_worker_killed_while_it_hands_over_its_result_holds_up_nobody(tmp_path, child_environment):
     """With one pipe for all workers the batch waited for the rest of the result for ever."""
     script = tmp_path / "run.py"

@@ -150,6 +150,7 @@ QUICK_PAGES = ("complete-with-tab.md", "import.md", "other-heads.md", "record.md
 """Those that take a second or two; the others run maps and estimates that have their own tests."""
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "page",
     [pytest.param(one, marks=() if one.name in QUICK_PAGES else pytest.mark.slow) for one in RUN_PAGES],
@@ -193,6 +194,7 @@ def test_the_formats_page_has_the_arrays_of_a_scan():
     assert rows == wanted
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("heading", "file", "group"),
     [

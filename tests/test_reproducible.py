@@ -136,6 +136,7 @@ def test_what_a_killed_writer_left_goes_with_the_next_write_and_nothing_else(
     assert {one.name for one in tmp_path.iterdir()} == {*others, "out.txt"}
 
 
+@pytest.mark.long
 def test_a_kill_at_any_moment_leaves_a_whole_file(tmp_path: Path, child_environment: dict[str, str]) -> None:
     chance = random.Random(96)
     seen = set()

@@ -56,6 +56,7 @@ def test_a_stress_changes_frames_and_keeps_the_force(physics: Physics, plain: np
     np.testing.assert_allclose(found.mean(axis=(1, 2)), plain.mean(axis=(1, 2)), rtol=1e-9)
 
 
+@pytest.mark.long
 def test_thinner_fat_presses_harder_on_its_side(plain: np.ndarray) -> None:
     """Fat that deepens along +x leaves the gland nearer, and the skin stiffer, on the side of -x."""
 

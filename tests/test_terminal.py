@@ -123,6 +123,7 @@ def test_an_estimate_fits_a_terminal_and_its_size_is_bold(columns, folder, child
     assert max(map(len, piped.splitlines())) > 120
 
 
+@pytest.mark.long
 def test_no_color_is_plain_and_errors_are_red(folder, child_environment):
     words, named = ("estimate", "none.nc"), {"environment": child_environment, "cwd": folder, "columns": 80}
     plain, code = on_a_terminal(*words, **named, NO_COLOR="1")

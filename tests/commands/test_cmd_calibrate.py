@@ -132,6 +132,7 @@ def study_rows() -> str:
     return "\n".join(lines) + "\n"
 
 
+@pytest.mark.long
 def test_either_fit_is_offered_and_tells_of_the_other(tmp_path: Path) -> None:
     (tmp_path / "t.csv").write_text(study_rows())
     said = {}

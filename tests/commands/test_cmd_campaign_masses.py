@@ -85,6 +85,7 @@ def test_without_a_place_the_largest_is_taken_and_the_other_is_told(folder: Path
     assert re.search(r"a mass at \((20.9|21.0), -6.0\) mm on the map is named by no row", row["findings"])
 
 
+@pytest.mark.long
 def test_without_landmarks_the_maps_own_axes_decide_and_it_is_said(folder: Path) -> None:
     written(folder / "bare.nc", shift=SHIFT, landmarks=False)
     campaign(folder, *TWO_PLACES, "bare.nc,P1,1,2,2,left,,")
@@ -93,6 +94,7 @@ def test_without_landmarks_the_maps_own_axes_decide_and_it_is_said(folder: Path)
     assert "matched by place in the maps' own axes, because a scan has no landmarks" in row["findings"]
 
 
+@pytest.mark.long
 def test_a_mass_that_is_not_within_the_distance_is_not_taken(folder: Path) -> None:
     written(folder / "bare.nc", shift=SHIFT, landmarks=False)
     campaign(folder, *TWO_PLACES, "bare.nc,P1,1,2,2,left,,", more=("--match-mm", "6"))

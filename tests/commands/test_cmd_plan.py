@@ -71,6 +71,7 @@ def test_power_answers_with_the_patients_of_the_normal_approximation() -> None:
     )
 
 
+@pytest.mark.long
 def test_precision_answers_with_the_patients_of_the_delta_method() -> None:
     """The ends lie t standard errors of the logarithm apart: factor = exp(2 t cv / sqrt(N)) at the answer."""
     mean, sd = moments(0.02, math.hypot(0.18, 0.15))

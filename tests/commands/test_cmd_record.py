@@ -168,6 +168,7 @@ def test_every_tracker_is_recorded_as_its_wire_carries_it(record, tmp_path, scan
     assert np.diff(poses.time_s).min() >= 0
 
 
+@pytest.mark.long
 def test_a_shared_clock_and_single_precision_give_the_map_of_the_scan_as_the_wire_carries_it(record, tmp_path, scan):
     with head_and_tracker(scan, protocol="liberty", speed=FAST) as devices:
         words = [*devices, "--clock", "shared"]
@@ -180,6 +181,7 @@ def test_a_shared_clock_and_single_precision_give_the_map_of_the_scan_as_the_wir
     np.testing.assert_array_equal(np.rint(got.time_s * 1000), np.floor(scan.poses.time_s * 1000 + 1e-6))
 
 
+@pytest.mark.long
 def test_faults_are_counted_and_noted(record, tmp_path, scan):
     spoilt, held = Faults(corrupt=0.1, stall=(0.3, 0.1)), Faults(hold=3)
     with head_and_tracker(scan, head_faults=spoilt, tracker_faults=held, speed=FAST) as devices:
@@ -278,6 +280,7 @@ def test_a_full_disk_ends_it_with_one_line_and_keeps_what_was_written(tmp_path, 
     assert len(read_scan_report(tmp_path / "a.mcap").scan.frames) > 50
 
 
+@pytest.mark.long
 def test_a_disk_that_was_full_before_it_is_one_line_and_no_file(tmp_path, start, long_scan):
     """It was: error: No space left on device, with exit code 1 and an empty file."""
 
@@ -303,6 +306,7 @@ def test_a_duration_is_by_the_heads_clock(record, tmp_path, scan):
     assert recorded.poses.time_s[-1] >= recorded.frames.time_s[-1] - 0.01
 
 
+@pytest.mark.long
 def test_one_frame_in_four_is_asked_for(record, tmp_path, scan):
     with head_and_tracker(scan, speed=FAST) as devices:
         done = record(*devices, "--every", 4)
@@ -312,6 +316,7 @@ def test_one_frame_in_four_is_asked_for(record, tmp_path, scan):
     np.testing.assert_array_equal(read_scan(tmp_path / "a.mcap").frames.counts, scan.frames.counts[::4])
 
 
+@pytest.mark.long
 def test_a_rotation_can_be_turned_round(record, tmp_path, scan):
     with head_and_tracker(scan, speed=FAST) as devices:
         words = [*devices, "--clock", "shared", "--invert-rotation"]

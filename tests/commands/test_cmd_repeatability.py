@@ -74,6 +74,7 @@ def test_an_estimate_by_it_has_one_interval_and_says_whose(site: Path) -> None:
     assert document["max_size_mm"]["median"] == pytest.approx(plain["max_size_mm"]["median"], rel=0.02)
 
 
+@pytest.mark.long
 def test_a_pooled_size_has_it_as_the_prior_of_its_maps(site: Path, tmp_path: Path) -> None:
     shutil.copy(site / "map.nc", tmp_path)
     shutil.copy(site / "site.json", tmp_path)

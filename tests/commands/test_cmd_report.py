@@ -101,6 +101,7 @@ def test_an_estimate_without_its_map_has_a_page_that_says_what_it_lacks(folder: 
         assert text in page
 
 
+@pytest.mark.long
 def test_the_page_says_whose_spread_between_exams_the_interval_supposes(folder: Path) -> None:
     (folder / "own.toml").write_text("between_map_sd = 0.07\n")
     run_here("report", "a.nc", "--settings", "own.toml", "-o", "stated.html", cwd=folder)

@@ -64,6 +64,7 @@ def test_a_map_keeps_the_digests_of_file_and_frames(folder: Path) -> None:
     assert first["frames_sha256"] != other["frames_sha256"]
 
 
+@pytest.mark.long
 def test_compare_refuses_it_and_pooling_and_the_page_caution(folder: Path, tmp_path: Path) -> None:
     done = run_here("compare", "a.nc", "--with", "again.nc", *FAST, cwd=folder)
     assert (done.returncode, done.stderr.count("\n")) == (2, 1)

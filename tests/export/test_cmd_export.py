@@ -71,6 +71,7 @@ def test_what_does_not_fit_is_told_in_one_line(case: str, folder: Path, tmp_path
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("key", ["settings", "inputs", "scans", "version"])
 @pytest.mark.parametrize("value", [None, 7, [1], {"a": {"b": 1}}, "\x01\u202e\\<b>" * 400])
 def test_an_odd_provenance_is_no_fault_or_one_line(key: str, value: Any, estimate: Any, tmp_path: Path) -> None:
@@ -92,6 +93,7 @@ def test_an_odd_provenance_is_no_fault_or_one_line(key: str, value: Any, estimat
         assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("value", [None, 7, [1], {"a": {"b": 1}}, "\x01\u202e\\<b>" * 400])
 def test_findings_that_are_none_are_refused_and_not_dropped(value: Any, estimate: Any, tmp_path: Path) -> None:
     odd = estimate | {"findings": value}

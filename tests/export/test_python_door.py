@@ -135,6 +135,7 @@ def test_a_dictionary_that_does_not_fit_is_refused_before_anything_is_written(
     assert files(folder) == before
 
 
+@pytest.mark.long
 def test_a_folder_of_files_is_written_whole_or_not_at_all(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("highdicom")
     write = Path.write_bytes

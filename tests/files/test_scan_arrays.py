@@ -341,6 +341,7 @@ def test_objects_of_every_container_are_refused_and_never_unpickled(tmp_path: Pa
             import_arrays(path, ArrayMap(unit="kPa"))
 
 
+@pytest.mark.long
 def test_a_mat_that_unpacks_to_more_than_its_limit_is_not_unpacked(tmp_path: Path) -> None:
     """A variable that says it has 4 GB of zeros; MAT-File Format, "Level 5": type 15 is a compressed element."""
     packed = zlib.compress(bytes(2**28), 9)

@@ -76,6 +76,7 @@ def test_a_tracker_plays_from_each_start(protocol):
         port.close()
 
 
+@pytest.mark.long
 def test_a_server_plays_for_each_host_that_connects():
     with serving(EmulatedTracker(SCAN.poses, protocol="igtlink"), TcpLink("127.0.0.1", 0)) as emulator:
         for _ in range(2):
@@ -87,6 +88,7 @@ def test_a_server_plays_for_each_host_that_connects():
             time.sleep(0.05)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("link_of", [PtyLink, lambda: TcpLink("127.0.0.1", 0)], ids=["pty", "tcp"])
 def test_once_ends_when_a_slow_host_has_read_the_last_frame(link_of):
     link = link_of()

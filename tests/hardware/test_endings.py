@@ -76,6 +76,7 @@ def test_a_device_that_vanishes_is_one_line_whatever_the_system_calls_it(monkeyp
     os.close(far)
 
 
+@pytest.mark.long
 def test_devices_that_vanish_at_the_end_leave_a_finished_file(tmp_path, child_environment):
     """A head that is unplugged just after its END: it can no longer be told to stop."""
     scan = short_scan(0.3)

@@ -226,6 +226,7 @@ def expected(poses) -> set[tuple]:
     return {tuple(one) for one in poses.position_mm.astype(np.float32).tolist()}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("link", [PtyLink, lambda: TcpLink("127.0.0.1", 0)], ids=["pty", "tcp"])
 def test_the_library_reads_the_emulated_tracker(link, tmp_path):
     pytest.importorskip(ndi.MODULE)
@@ -291,6 +292,7 @@ class SpoiltNdi(EmulatedNdi):
         return good if self.replies % 10 else good[:9] + bytes([good[9] ^ 4]) + good[10:]
 
 
+@pytest.mark.long
 def test_a_spoilt_reply_costs_that_pose_and_not_the_recording():
     pytest.importorskip(ndi.MODULE)
     device, line = SpoiltNdi(short_scan(3.0).poses), TcpLink("127.0.0.1", 0)

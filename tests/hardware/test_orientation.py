@@ -81,6 +81,7 @@ def test_the_rule_shows_the_lump_on_the_upper_right(head_deg):
     assert (view.edges["top"], view.edges["right"]) == named
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("head_deg", [*HEADS, None])
 def test_the_map_figure_shows_the_lump_on_the_upper_right(tmp_path, head_deg):
     from PIL import Image

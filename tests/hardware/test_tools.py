@@ -457,6 +457,7 @@ def test_a_tool_hidden_at_the_start_is_told_and_recorded_once_seen(tmp_path, cap
     assert report.poses > 20 < report.poses_missing
 
 
+@pytest.mark.long
 def test_jumps_are_told_and_named_in_place_of_the_quaternions():
     scan = tb.demo_scan()
     place = scan.poses.position_mm.copy()

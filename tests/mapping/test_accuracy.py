@@ -70,6 +70,7 @@ def test_a_model_at_points_or_a_division_by_the_mean_would_show():
     assert np.mean([bias(1.0, seed=seed, normalise="mean")[0] for seed in range(2)]) < -5 * MOST_BIAS
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("normalise", ["mean", "gain"])
 def test_moving_the_whole_scan_does_not_change_the_sizes(normalise):
     made = simulate(scene_of(Lump(sigma_x_mm=5.0, sigma_y_mm=4.0)), rng=np.random.default_rng(1))

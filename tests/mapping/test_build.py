@@ -82,6 +82,7 @@ def test_the_plane_and_the_patient_frame_are_right():
     assert build_map(replace(stroke_scan(), landmarks=None)).patient_from_plane is None
 
 
+@pytest.mark.long
 @given(
     angle=st.floats(-180, 180),
     about=st.sampled_from([(0, 0, 1), (1, 0, 0), (1, 2, 3), (-1, 0.2, 0.1)]),
@@ -97,6 +98,7 @@ def test_moving_the_whole_scan_leaves_the_map(angle, about, shift):
     assert moved.patient_from_plane == pytest.approx(still.patient_from_plane, abs=1e-3)
 
 
+@pytest.mark.long
 @given(
     cuts=st.lists(st.integers(0, 120), max_size=4), reverse=st.booleans(), normalise=st.sampled_from(["mean", "none"])
 )

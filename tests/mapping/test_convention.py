@@ -72,6 +72,7 @@ def test_a_wrong_convention_hardly_ever_passes(name):
     assert verdicts.count("passed") <= 0.1 * SCANS
 
 
+@pytest.mark.long
 def test_the_right_one_passes():
     assert [verdict(scan_of(seed)) for seed in range(SCANS)] == ["passed"] * SCANS
 

@@ -236,6 +236,7 @@ def test_the_simulated_bodys_fat_is_found() -> None:
     assert fat_mm(scanned(1.2)) == pytest.approx(24.0, rel=0.05)
 
 
+@pytest.mark.long
 def test_the_depth_tells_seats_apart_that_the_map_does_not() -> None:
     """With the profile both sizes are within 12 %; without it the two are told apart by none, and differ by a fifth."""
     calibration = shipped()

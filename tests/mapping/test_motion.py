@@ -55,6 +55,7 @@ def sigma_x(tactile_map: TactileMap) -> float:
     return fit.widths()[0]
 
 
+@pytest.mark.long
 def test_the_latency_is_found_and_used():
     late = scanned(duration_s=14.0, lines=10, tracker=Tracker(latency_ms=LATE_MS), noise=TRUE_POSES)
     found = build_map(late, latency_ms="auto")
@@ -78,6 +79,7 @@ def backwards(scan: Scan) -> Scan:
     return replace(scan, frames=frames, poses=poses)
 
 
+@pytest.mark.long
 def test_a_scan_played_backwards_is_as_early_as_it_was_late():
     """The sign of the latency: a control, since a wrong sign would be right about one of the two."""
     late = scanned(duration_s=10.0, lines=7, tracker=Tracker(latency_ms=LATE_MS))
@@ -201,6 +203,7 @@ def test_a_latency_mimics_mobility():
         build_map(late, register_strokes=True, latency_ms="auto")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("scan", "message"),
     [

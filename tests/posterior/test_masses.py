@@ -54,6 +54,7 @@ def places(masses: tuple[Mass, ...]) -> list[tuple[float, float]]:
     return [(round(one.x_mm), round(one.y_mm)) for one in masses]
 
 
+@pytest.mark.long
 def test_the_surest_is_reported_though_another_is_sized_larger() -> None:
     estimate = found_on(scene(narrow=0.6)).estimate
     assert places(estimate.masses) == [NARROW, WIDE]

@@ -125,6 +125,7 @@ def exams(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.long
 def test_estimate_pool_sizes_one_mass(exams: Path) -> None:
     alone = json.loads(run_here("estimate", "m3.nc", "--json", *FAST, cwd=exams).stdout)
     assert [one["reported"] for one in alone["masses"]] == [True, False]

@@ -67,6 +67,7 @@ def axes(monkeypatch):
     return kept
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("fit", "normalise"), [(None, "mean"), (FIT, "gain"), (None, "none")])
 def test_a_map_is_drawn_in_the_same_bytes_each_time(tmp_path, fit, normalise):
     for name in ("a.png", "b.png"):
@@ -92,6 +93,7 @@ def test_a_map_of_any_form_leaves_no_band_of_its_figure_empty(tmp_path, shape, f
     assert np.diff(np.flatnonzero(dark.any(axis=1))).max() < max(60, 0.11 * len(dark))
 
 
+@pytest.mark.long
 def test_a_users_matplotlib_settings_do_not_change_the_picture(tmp_path):
     import matplotlib
 

@@ -60,6 +60,7 @@ def standard_errors(calibration: SizeCalibration) -> np.ndarray:
     return np.asarray((draws.mean(axis=0) - truth) / draws.std(axis=0))
 
 
+@pytest.mark.long
 def test_coefficients_come_back(calibration: SizeCalibration) -> None:
     assert np.abs(standard_errors(calibration)).max() < 4
     # and the posterior is narrow enough to tell: 10 % of m, 5 % of e, 0.03 of f
@@ -76,12 +77,14 @@ def test_e_is_1_by_convention_without_depths(without_depths: SizeCalibration) ->
     assert "only m/e is determined, e is 1 by convention" in calibration_text(without_depths)
 
 
+@pytest.mark.long
 def test_a_table_with_one_width_calibrates_both_axes(calibration: SizeCalibration) -> None:
     assert calibration.axes == ("both",)
     assert calibration.y is calibration.x
     assert "both axes" in calibration_text(calibration)
 
 
+@pytest.mark.long
 def test_the_domain_is_the_tables_range(calibration: SizeCalibration) -> None:
     table = synthetic(1, lumps=6)
     assert calibration.x.domain["sigma_mm"] == (table.sigma_x_mm.min(), table.sigma_x_mm.max())

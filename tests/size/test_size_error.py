@@ -226,6 +226,7 @@ def test_the_fingerprint_is_of_values_and_cells_and_of_nothing_else() -> None:
     assert empty[0].fingerprint == empty[1].fingerprint
 
 
+@pytest.mark.long
 def test_the_report_says_how_exact_the_sizes_ends_are(folder: Path) -> None:
     text = run_here("estimate", "map0.nc", "--method", "laplace", "-v", cwd=folder).stdout
     (line,) = [one for one in text.splitlines() if one.startswith("Method laplace")]

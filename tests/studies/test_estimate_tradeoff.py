@@ -98,6 +98,7 @@ def exact_eq6() -> SizeCalibration:
     return SizeCalibration(axis, axis, 0.0, Recipe("mean", "fixed", 20.0, declared=True))
 
 
+@pytest.mark.long
 def test_the_reference_has_the_interval_that_theory_gives(monkeypatch: pytest.MonkeyPatch):
     """Least squares of a Gaussian in white noise: SD(ln sigma) = sqrt(2/pi) s h / (a sqrt(sigma_x sigma_y)), from the
     Fisher information integrated by hand; Eq 6 without uncertainty makes a size of 2 sigma + 1 of it."""
@@ -152,6 +153,7 @@ def test_wrong_settings_come_out_as_wrong():
     assert "No size by fit_radius_mm 8." in said
 
 
+@pytest.mark.long
 def test_an_answer_is_compared_with_one_of_its_kind_only():
     some = row("--method laplace").answer
     assert deviation([some], some).ends == 0.0
@@ -169,6 +171,7 @@ def made(label: str, seconds: float, off: float, *, default: bool = False, usabl
     )
 
 
+@pytest.mark.long
 def test_the_frontier_and_what_is_enough():
     rows = (
         made("default", 1.0, 0.05, default=True),

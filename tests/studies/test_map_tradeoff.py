@@ -57,10 +57,12 @@ def test_the_finest_map_is_the_reference():
     assert ladder().reference.error_mm < 0.02
 
 
+@pytest.mark.long
 def test_every_second_frame_changes_little():
     assert row("--every 2").off.ends < 1.0
 
 
+@pytest.mark.long
 def test_cells_too_large_come_out_as_wrong():
     """The negative control: the lump's sigma is 5 mm, cells of 8 mm do not resolve it."""
     wrong = row("--cell-mm 8")

@@ -91,6 +91,7 @@ def test_other_ratios_are_not_doubted(ratio: float) -> None:
     assert unit_doubts({"cbe": one}, one.ex_vivo_mm) == []
 
 
+@pytest.mark.long
 def test_a_doubt_and_a_protocols_title_reach_page_json_and_stderr(tmp_path: Path) -> None:
     rows = [line.split(",") for line in TRIAL.read_text().splitlines()]
     rows = [[*row[:4], str(float(row[4]) / 10), *row[5:]] if row[2] == "cbe" and row[4] else row for row in rows]

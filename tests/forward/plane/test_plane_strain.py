@@ -286,6 +286,7 @@ def test_seats_lead_smoothly_from_one_end_to_the_other() -> None:
     np.testing.assert_allclose(found[-2], found[-1], rtol=2e-3)
 
 
+@pytest.mark.long
 def test_a_lump_leaves_the_gland_smoothly() -> None:
     found = np.array([line_figures(Body(15, 1.0, seat)) for seat in (1.0, 1.011, 1.02, 1.05, 1.2, 1.5)])
     assert (np.diff(found[:, 0]) > 0).all()

@@ -114,6 +114,7 @@ def test_the_fit_is_the_least_squares_fit_of_eq_7(background: str) -> None:
     assert found.resolved
 
 
+@pytest.mark.long
 def test_a_lump_of_fat_does_not_show_and_a_harder_one_shows_higher() -> None:
     none, soft, hard = rows()
     plain = raster_frames(SETTINGS.on(SETTINGS.body(12.0, 1.0, seat=1.2)), None, SETTINGS)

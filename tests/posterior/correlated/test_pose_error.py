@@ -103,6 +103,7 @@ def test_frames_between_the_same_poses_share_their_errors() -> None:
     assert _interpolation(np.repeat(frames_s, 2), poses_s) == pytest.approx((factor, independent))
 
 
+@pytest.mark.long
 def test_a_head_that_jumps_or_few_poses_tell_nothing() -> None:
     whole = scan()
     poses = whole.poses
