@@ -13,7 +13,7 @@ from typing import Any, Final
 from tactile_bayes.declarations import Record, field, replace
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.atomic import sha256
-from tactile_bayes.files.manifest_csv import JOURNAL, natural
+from tactile_bayes.files.manifest_csv import JOURNAL, SAME_IN_SCANS, natural
 from tactile_bayes.files.map_nc import read_map_and_scans
 from tactile_bayes.files.reading import check_address, fetched, files_below, is_address
 from tactile_bayes.files.scan_mcap import json_object, scan_records
@@ -23,8 +23,6 @@ from tactile_bayes.files.scan_mcap import json_object, scan_records
 SCANS: Final = (".mcap", ".npz")
 MAP: Final = ".nc"
 _ENDINGS: Final = (*SCANS, MAP)
-_FACTS: Final = {"patient": "subject", "visit": "visit", "mass": "mass", "side": "side", "reader": "examiner"}
-"""Columns of the table of exams, and what a scan calls the same."""
 
 
 class Said(Record):
@@ -63,7 +61,7 @@ def _of_map(path: Path) -> Said:
 
 def _facts(sessions: Sequence[Mapping[str, Any]]) -> dict[str, str]:
     """Facts on which all scans of a file agree."""
-    told = {column: {session.get(key) or "" for session in sessions} for column, key in _FACTS.items()}
+    told = {column: {session.get(key) or "" for session in sessions} for column, key in SAME_IN_SCANS.items()}
     return {column: min(values) for column, values in told.items() if len(values) == 1 and values != {""}}
 
 

@@ -16,8 +16,8 @@ from tactile_bayes.api.sized import SizeEstimate
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.comparison import CompareReport
-from tactile_bayes.files.documents import load_schema, read_record
-from tactile_bayes.files.manifest_csv import COMPARED, GROWTH, GROWTH_PAGE, Exam, natural, table_text
+from tactile_bayes.files.documents import read_record
+from tactile_bayes.files.manifest_csv import COMPARED, GROWTH, GROWTH_PAGE, Exam, columns_of, natural, table_text
 from tactile_bayes.files.map_nc import read_map
 from tactile_bayes.files.reports import EstimateReport, Place
 from tactile_bayes.findings import Finding, finding_lines
@@ -55,21 +55,6 @@ class NamedPlace(Record):
     centre_mm: tuple[float, float]  #: On that map.
 
 
-def named_exams(exam: Exam, exams: Sequence[Exam]) -> list[Exam]:
-    """For an exam without a place the exams that name one: for each mass of the breast one, of its visit if possible.
-
-    Empty where the exam has a place, or no exam names one of its mass.
-    """
-    if exam.centre_mm is not None:
-        return []
-    found: dict[str, Exam] = {}
-    breast = [one for one in exams if (one.patient, one.side) == (exam.patient, exam.side)]
-    for one in sorted(breast, key=lambda one: (one.visit != exam.visit, natural(one.visit), one.replicate)):
-        if one.centre_mm is not None:
-            found.setdefault(one.mass, one)
-    return list(found.values()) if exam.mass in found else []
-
-
 class Breasts:
     """Exams of each breast, so that those of a large table are found without a walk through it."""
 
@@ -79,9 +64,18 @@ class Breasts:
             self._exams[exam.patient, exam.side].append(exam)
 
     def named(self, exam: Exam, of: Container[str] | None = None) -> list[Exam]:
-        """As `named_exams`, over the exams of this breast; `of` holds the names of those that count."""
-        breast = self._exams[exam.patient, exam.side]
-        return named_exams(exam, breast if of is None else [one for one in breast if one.name in of])
+        """For an exam without a place those that name one: for each mass of the breast one, of its visit if possible.
+
+        Empty where the exam has a place, or no exam names one of its mass; `of` holds the names of those that count.
+        """
+        if exam.centre_mm is not None:
+            return []
+        breast = [one for one in self._exams[exam.patient, exam.side] if of is None or one.name in of]
+        found: dict[str, Exam] = {}
+        for one in sorted(breast, key=lambda one: (one.visit != exam.visit, natural(one.visit), one.replicate)):
+            if one.centre_mm is not None:
+                found.setdefault(one.mass, one)
+        return list(found.values()) if exam.mass in found else []
 
 
 def matched(path: Path, settings: Settings, *, mass: str, places: Sequence[NamedPlace], most_mm: float) -> SizeEstimate:
@@ -236,7 +230,7 @@ def growth_rows(campaign: Campaign) -> list[Growth]:
 
 def growth_text(rows: Sequence[Growth]) -> str:
     """``growth.csv``: a row for each later visit of a mass."""
-    return table_text([_line(row) for row in rows], [one["name"] for one in load_schema("growth.table.json")["fields"]])
+    return table_text([_line(row) for row in rows], columns_of("growth"))
 
 
 def _line(row: Growth) -> dict[str, object]:

@@ -12,8 +12,8 @@ from tactile_bayes import __version__
 from tactile_bayes.api.trials import analyse, load_trial, read_excision
 from tactile_bayes.campaigns.match import growth_rows, growth_text, visit_dates
 from tactile_bayes.campaigns.run import Campaign
-from tactile_bayes.campaigns.tables import Row, exam_rows, pooled_reports, write_tables
-from tactile_bayes.declarations import Record, field
+from tactile_bayes.campaigns.tables import Row, done_text, exam_rows, failures_text, pooled_reports, trial_text
+from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.atomic import write_text
 from tactile_bayes.files.documents import read_protocol
@@ -84,7 +84,7 @@ class Written(Record):
     pooled: int  #: Masses at a visit that were pooled.
     left_out: tuple[str, ...] = ()  #: Masses without a size after excision, as ``patient mass``.
     report: str = ""  #: The trial report as text; empty where there is none.
-    no_report: str = field(default="")  #: Why there is none, where excision sizes were given.
+    no_report: str = ""  #: Why there is none, where excision sizes were given.
     unnamed: tuple[str, ...] = ()  #: Exams whose map shows a mass that no row names.
     growth: str = ""
     """What became of masses with several visits, in a sentence; empty where there are none."""
@@ -94,40 +94,30 @@ class Written(Record):
 
 def write_outputs(campaign: Campaign, excision: Excision | None, protocol: Path | None = None) -> Written:
     """Write tables, the index and, where excision sizes are given, the trial's report."""
-    rows = exam_rows(campaign)
+    folder, rows, growth = campaign.folder, exam_rows(campaign), growth_rows(campaign)
     masses = None if excision is None else excision.masses()
-    write_tables(campaign, rows, masses, campaign.folder)
-    counts = _counts(rows)
-    growth = growth_rows(campaign)
-    if growth:
-        write_text(campaign.folder / GROWN, growth_text(growth), force=True)
-    report, fault = "", ""
-    if excision is not None:
-        report, fault = _write_report(campaign.folder, excision, protocol, growth)
+    tables = {DONE: done_text(rows), FAILURES: failures_text(campaign, rows), TRIAL: trial_text(campaign, rows, masses)}
+    tables |= {GROWN: growth_text(growth)} if growth else {}
+    for name, text in tables.items():
+        write_text(folder / name, text, force=True)
+    report, fault = ("", "") if excision is None else _write_report(folder, excision, protocol, growth)
     for name in (*(() if report else (REPORT, PAGE)), *(() if growth else (GROWN,))):
-        (campaign.folder / name).unlink(missing_ok=True)
-    links = {name: name for name in (DONE, FAILURES, TRIAL, *([GROWN] if growth else []))} | (
-        {"trial report": PAGE} if report else {}
-    )
+        (folder / name).unlink(missing_ok=True)
+    links = {name: name for name in tables}
+    links |= {"trial report": PAGE} if report else {}
     links |= {REPEATABILITY: REPEATABILITY} if campaign.repeatability else {}
-    page = _page(campaign, rows, counts, links, growth)
-    write_text(campaign.folder / INDEX, page, force=True)
-    known = {(row.exam.patient, row.exam.mass) for row in rows}
-    left_out = sorted(known - masses) if masses is not None else []
-    names = tuple(f"{patient} {mass}" for patient, mass in left_out)
-    disagreeing = tuple(
-        dict.fromkeys(row.exam.of_mass for row in rows if any(one.kind == "maps_disagree" for one in row.findings))
-    )
-    unnamed = tuple(row.exam.name for row in rows if any(one.kind == "unnamed_mass" for one in row.findings))
+    counts = _counts(rows)
+    write_text(folder / INDEX, _page(campaign, rows, counts, links, growth), force=True)
+    left_out = set() if masses is None else {(row.exam.patient, row.exam.mass) for row in rows} - masses
     return Written(
         *counts,
-        len(campaign.found.results["pool"]),
-        names,
-        report,
-        fault,
-        unnamed,
-        growth_line(growth, GROWN),
-        disagreeing,
+        pooled=len(campaign.found.results["pool"]),
+        left_out=tuple(f"{patient} {mass}" for patient, mass in sorted(left_out)),
+        report=report,
+        no_report=fault,
+        unnamed=tuple(row.exam.name for row in rows if row.has("unnamed_mass")),
+        growth=growth_line(growth, GROWN),
+        disagreeing=tuple(dict.fromkeys(row.exam.of_mass for row in rows if row.has("maps_disagree"))),
     )
 
 

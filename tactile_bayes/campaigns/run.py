@@ -14,7 +14,7 @@ table of exams, a few hundred bytes for each step, and one block.
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import AbstractContextManager, nullcontext
 from operator import attrgetter
@@ -267,10 +267,13 @@ class Campaign:
         unmapped = len(exams) - len(mapped)
         self._stages.run("estimate", [self._estimate_task(exam, "estimate") for exam in mapped], without=unmapped)
         if self.settings.figures:
-            estimated = [exam for exam in mapped if exam.name in self.found.results["estimate"]]
-            tasks = [self._estimate_task(exam, "figures") for exam in estimated]
-            self._stages.run("figures", tasks, without=len(exams) - len(estimated))
+            tasks = [self._estimate_task(exam, "figures") for exam in self._estimated(mapped)]
+            self._stages.run("figures", tasks, without=len(exams) - len(tasks))
         self._copy(EXAMS, [exam.name for exam in exams], steps=("map", "estimate", "figures"))
+
+    def _estimated(self, exams: Sequence[Exam]) -> list[Exam]:
+        """Those that have an estimate."""
+        return [exam for exam in exams if exam.name in self.found.results["estimate"]]
 
     def _recorded_once(self, exams: Sequence[Exam]) -> list[Exam]:
         """The exams without those of a recording that another exam has, in whatever file: they are no repeats."""
@@ -375,7 +378,7 @@ class Campaign:
 
     def _learn_repeatability(self, sound: Sequence[Exam]) -> None:
         """Learn the spread between exams from the repeats, and size every exam by it from what its estimate left."""
-        estimated = [exam for exam in sound if exam.name in self.found.results["estimate"]]
+        estimated = self._estimated(sound)
         masses = taught_by(sound if self._dry else estimated, self.settings)
         if masses < FEWEST_MASSES:
             self.not_learned = too_few(masses) if masses else ""
@@ -408,7 +411,7 @@ class Campaign:
     def _make_pages(self, sound: Sequence[Exam]) -> None:
         """The page of every exam that was estimated, with its size by the repeatability where it has one."""
         for block in _blocks(sound, self._block):
-            known = [exam for exam in block if exam.name in self.found.results["estimate"] and not self._sizes_unknown]
+            known = [] if self._sizes_unknown else self._estimated(block)
             self._stages.run("page", [self._page_task(exam) for exam in known], without=len(block) - len(known))
             self._copy(EXAMS, [exam.name for exam in block], steps=("size", "page"))
 
@@ -457,18 +460,21 @@ class Campaign:
     def _pool(self, sound: Sequence[Exam]) -> None:
         """Pool every mass at every visit from the exams that were estimated."""
         groups: dict[str, list[Exam]] = defaultdict(list)
-        for exam in sound:
-            if exam.name in self.found.results["estimate"]:
-                groups[exam.of_mass].append(exam)
-        if self._sizes_unknown:
-            groups.clear()
-        unknown = len({exam.of_mass for exam in sound}) - len(groups)
-        for names in _blocks(list(groups), self._block):
-            self._stages.run("pool", [self._pool_task(name, groups[name]) for name in names])
-            self._copy(MASSES, names, steps=("pool",))
-        self._stages.run("pool", [], without=unknown)
+        for exam in self._estimated(sound):
+            groups[exam.of_mass].append(exam)
+        self._of_masses("pool", MASSES, groups, self._pool_task, masses=len({exam.of_mass for exam in sound}))
+
+    def _of_masses(
+        self, step: str, kind: str, found: Mapping[str, _Any], task_of: Callable[[str, _Any], Task], *, masses: int
+    ) -> None:
+        """Run a step for the masses that have what it needs, out of so many."""
+        known = {} if self._sizes_unknown else found
+        for names in _blocks(list(known), self._block):
+            self._stages.run(step, [task_of(name, known[name]) for name in names])
+            self._copy(kind, names, steps=(step,))
+        self._stages.run(step, [], without=masses - len(known))
         if self.settings.copy_to:
-            self._stages.run("copy", [], without=unknown)
+            self._stages.run("copy", [], without=masses - len(known))
 
     def _why_not_pooled(self) -> str:
         """Why no mass is pooled; empty where some mass has several exams and the calibration can pool them."""
@@ -503,15 +509,8 @@ class Campaign:
 
     def _compare(self, sound: Sequence[Exam]) -> None:
         """Compare the visits of every mass that has several with an estimate."""
-        estimated = [exam for exam in sound if exam.name in self.found.results["estimate"]]
-        masses = {} if self._sizes_unknown else grown_masses(estimated)
-        unknown = len(grown_masses(sound)) - len(masses)
-        for names in _blocks(list(masses), self._block):
-            self._stages.run("compare", [self._compare_task(name, masses[name]) for name in names])
-            self._copy(GROWTH, names, steps=("compare",))
-        self._stages.run("compare", [], without=unknown)
-        if self.settings.copy_to:
-            self._stages.run("copy", [], without=unknown)
+        masses = len(grown_masses(sound))
+        self._of_masses("compare", GROWTH, grown_masses(self._estimated(sound)), self._compare_task, masses=masses)
 
     def _compare_task(self, name: str, visits: Visits) -> Task:
         settings, key = self._of_one_mass([exam for exams in visits.values() for exam in exams])

@@ -36,6 +36,7 @@ from tactile_bayes.files.manifest_csv import (
     POOLED_DRAWS,
     POSTERIOR,
     REPEATABILITY,
+    SAME_IN_SCANS,
     SCAN,
     SHAPE,
     SIZE_FIGURE,
@@ -88,8 +89,6 @@ UNWRITTEN: Final = "unwritten"
 """Key of a result that the disk did not take: the campaign's fault, not the exam's."""
 _KINDS: Final = {"a map or posterior (netCDF)": "map", "an archive (.npz or a spreadsheet)": "npz"}
 """What `kind_of` calls the files that are no scans."""
-_SAME: Final = {"patient": "subject", "side": "side", "reader": "examiner", "visit": "visit", "mass": "mass"}
-"""Columns of the table of exams, and what a scan calls the same."""
 
 Result = dict[str, Any]
 
@@ -221,7 +220,7 @@ def check_facts(expected: Mapping[str, str], facts: Mapping[str, str]) -> None:
 
     What either leaves out is not compared, nor are capitals: the table has no two codes that differ by these alone.
     """
-    both = {ours: facts[theirs] for ours, theirs in _SAME.items() if facts.get(theirs) and expected.get(ours)}
+    both = {ours: facts[theirs] for ours, theirs in SAME_IN_SCANS.items() if facts.get(theirs) and expected.get(ours)}
     differs = [name for name, value in both.items() if value.casefold() != expected[name].casefold()]
     if not differs:
         return
@@ -276,7 +275,7 @@ def _figures(task: Task) -> tuple[Result, Writes]:
 def _page(task: Task) -> tuple[Result, Writes]:
     """Make the exam's page and its thumbnail from what its steps left; the table tells what the scans do not."""
     tactile_map, scans = read_map_and_scans(task.folder / MAP)
-    told = {_SAME[name]: text for name, text in task.expected.items() if name in _SAME}
+    told = {SAME_IN_SCANS[name]: text for name, text in task.expected.items() if name in SAME_IN_SCANS}
     facts = [told | scan for scan in scans or [{}]]
     report = read_record(task.folder / task.report, EstimateReport)
     shown = exam_map(tactile_map, report, side=side_of(facts))

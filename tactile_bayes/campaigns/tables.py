@@ -11,18 +11,15 @@ from tactile_bayes.campaigns.match import unnamed
 from tactile_bayes.campaigns.run import Campaign
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import CANNOT_SHOW
-from tactile_bayes.files.atomic import write_text
-from tactile_bayes.files.documents import load_schema, read_record
+from tactile_bayes.files.documents import read_record
 from tactile_bayes.files.manifest_csv import (
-    DONE,
     ESTIMATE,
     EXAMS,
-    FAILURES,
     MASSES,
     POOLED,
     SIZED,
-    TRIAL,
     Exam,
+    columns_of,
     table_text,
 )
 from tactile_bayes.files.reports import EstimateReport, PooledReport, centre_of
@@ -76,6 +73,10 @@ class Row(Record, eq=False):
     def status(self) -> str:
         """As the trial table has it: an exam without an estimate looked for the mass in vain, others were not done."""
         return _status(self.report)
+
+    def has(self, kind: str) -> bool:
+        """Whether a finding of the kind speaks against it."""
+        return any(one.kind == kind for one in self.findings)
 
     @property
     def verdict(self) -> Verdict:
@@ -148,11 +149,7 @@ def pooled_reports(campaign: Campaign) -> dict[str, PooledReport]:
 
 def done_text(rows: Sequence[Row]) -> str:
     """``exams_done.csv``: exams with an estimate, or with the reason for none."""
-    return table_text([_done(row) for row in rows if row.report is not None], _columns("exams_done"))
-
-
-def _columns(table: str) -> list[str]:
-    return [one["name"] for one in load_schema(f"{table}.table.json")["fields"]]
+    return table_text([_done(row) for row in rows if row.report is not None], columns_of("exams_done"))
 
 
 def _done(row: Row) -> dict[str, object]:
@@ -200,7 +197,7 @@ def failures_text(campaign: Campaign, rows: Sequence[Row]) -> str:
     lines = [
         failed[name] | {"step": found[name].step, "reason": found[name].reason} for name in failed if name in found
     ]
-    return table_text(lines, _columns("failures"))
+    return table_text(lines, columns_of("failures"))
 
 
 def trial_text(campaign: Campaign, rows: Sequence[Row], masses: Collection[tuple[str, str]] | None) -> str:
@@ -258,12 +255,3 @@ def _reading(
         "reason": (reason or None) if status != "detected" else None,
         "synthetic": None if of is None else of.synthetic,
     }
-
-
-def write_tables(
-    campaign: Campaign, rows: Sequence[Row], masses: Collection[tuple[str, str]] | None, folder: Path
-) -> None:
-    """Write the three tables."""
-    texts = {DONE: done_text(rows), FAILURES: failures_text(campaign, rows), TRIAL: trial_text(campaign, rows, masses)}
-    for name, text in texts.items():
-        write_text(folder / name, text, force=True)

@@ -55,6 +55,8 @@ def exam_name(of_mass: str, replicate: int | str) -> str:
 SCHEMA: Final = "exams.table.json"
 KNOWN: Final = ("seat", "depth_mm", "stiffness_ratio", "fat_kpa", "gland_ratio", "thickness_mm")
 """Properties of a body that columns ``known_...`` give, by the names of `Settings.known`."""
+SAME_IN_SCANS: Final = {"patient": "subject", "side": "side", "reader": "examiner", "visit": "visit", "mass": "mass"}
+"""Columns, and what a scan calls the same."""
 _WRITTEN: Final = ("file", "patient", "visit", "mass", "replicate", "side", "reader")
 
 
@@ -218,8 +220,8 @@ def _check_masses(table: Table, exams: Sequence[Exam]) -> None:
 def write_manifest(path: Path, rows: Iterable[Mapping[str, object]], *, force: bool = False) -> None:
     """Write a table of exams; keys of the rows are columns, those that no row has are left out."""
     held = list(rows)
-    filled = [name for name in _columns() if any(row.get(name) is not None for row in held)]
-    write_text(path, table_text(held, filled or _columns()), force=force)
+    filled = [name for name in columns_of("exams") if any(row.get(name) is not None for row in held)]
+    write_text(path, table_text(held, filled or columns_of("exams")), force=force)
 
 
 def read_rows(path: Path) -> RawTable:
@@ -233,7 +235,7 @@ def read_rows(path: Path) -> RawTable:
 
 def add_rows(table: RawTable, rows: Sequence[Mapping[str, object]]) -> None:
     """Write a table again with rows after those that it has, whose cells stay; its separator and columns stay too."""
-    more = [name for name in _columns() if name not in table.header and any(row.get(name) for row in rows)]
+    more = [name for name in columns_of("exams") if name not in table.header and any(row.get(name) for row in rows)]
     header = [*table.header, *more]
     out = io.StringIO(newline="")
     writer = csv.writer(out, delimiter=table.separator, lineterminator="\n")
@@ -244,8 +246,9 @@ def add_rows(table: RawTable, rows: Sequence[Mapping[str, object]]) -> None:
     write_text(table.path, mark + out.getvalue(), force=True)
 
 
-def _columns() -> list[str]:
-    return [one["name"] for one in load_schema(SCHEMA)["fields"]]
+def columns_of(table: str) -> list[str]:
+    """Columns of a table of a campaign, by its schema."""
+    return [one["name"] for one in load_schema(f"{table}.table.json")["fields"]]
 
 
 def table_text(rows: Sequence[Mapping[str, object]], columns: Sequence[str]) -> str:

@@ -252,7 +252,7 @@ def compare_summary(report: CompareReport) -> str:
     lines = finding_summary(findings, "caution", most=2)
     if report.status != "compared":
         checks = finding_summary(findings, "check", most=2)
-        return "\n".join([*lines, *_refusal(report), *checks, RESEARCH_USE]) + "\n"
+        return "\n".join([*lines, _refusal(report), *checks, RESEARCH_USE]) + "\n"
     last, visits = report.changes[-1], report.visits
     shown = visits if len(visits) <= _MOST_VISITS else (visits[0], visits[-1])
     lines += [_visit_line(one) for one in shown]
@@ -273,7 +273,7 @@ def compare_text(report: CompareReport) -> str:
         lines += _place_line(place, name=len(report.places) > 1)
     lines += finding_lines(report.findings, "check")
     if report.status != "compared":
-        return "\n".join([*lines, *_refusal(report), RESEARCH_USE]) + "\n"
+        return "\n".join([*lines, _refusal(report), RESEARCH_USE]) + "\n"
     for change in report.changes:
         lines += ["", _change_line(change), _odds_line(change), _verdict_line(change)]
         lines += _rate_lines(change) + _another_line(change)
@@ -289,7 +289,7 @@ def compare_text(report: CompareReport) -> str:
 
 def verdict_sentence(report: CompareReport) -> str:
     """Whether the mass has grown, or why nothing is compared."""
-    return _verdict_line(report.changes[-1]) if report.status == "compared" else _refusal(report)[0]
+    return _verdict_line(report.changes[-1]) if report.status == "compared" else _refusal(report)
 
 
 def change_sentences(report: CompareReport) -> list[str]:
@@ -307,11 +307,11 @@ def rate_sentences(report: CompareReport) -> list[str]:
     return _rate_lines(report.changes[-1]) if report.changes else []
 
 
-def _refusal(report: CompareReport) -> list[str]:
+def _refusal(report: CompareReport) -> str:
     """Why nothing is compared, and what would help."""
     head = "Not compared: not shown to be one mass" if report.status == "not_one_mass" else "Not compared"
     advice = f" {report.advice[0].upper()}{report.advice[1:]}." if report.advice else ""
-    return [f"{head}: {report.reason}.{advice}"]
+    return f"{head}: {report.reason}.{advice}"
 
 
 def _visit_line(visit: Visit) -> str:
