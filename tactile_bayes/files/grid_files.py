@@ -68,7 +68,8 @@ def read_table(path: Path, *, no_value: Sequence[str] = ()) -> Grid:
         raise BadDataError(what, way_out="import them as a scan, or give one frame as rows and columns")
     text = "\n".join(texts)
     marks = (*words, NO_SENSEL) if "ASCII_DATA" in text else tuple(words)
-    rows, notes = _one_block(rows[first:last], first), []
+    rows, notes = rows[first:last], []
+    _refuse_several(rows, first)
     for lines, where in ((before, "before"), (after, "after")):
         if lines:
             more = f" and {len(lines) - 1} more" if len(lines) > 1 else ""
@@ -132,22 +133,21 @@ def _said(rows: Iterable[Sequence[str]]) -> list[str]:
     return [text for row in rows if (text := " ".join(field for field in row if field))]
 
 
-def _one_block(rows: Sequence[list[str]], before: int) -> list[list[str]]:
-    """The rows, between which nothing else may stand; blank lines and titles of frames separate tables, not rows."""
+def _refuse_several(rows: Sequence[list[str]], before: int) -> None:
+    """Refuse several tables: blank lines and titles of frames separate tables, not rows."""
     for number, row in enumerate(rows, start=before):
         blank = len(row) <= 1 and not any(row)
         if blank or _is_title(row):
             what = f"has {'a blank line' if blank else repr(row[0][:20])} after row {number}"
             way_out = "give one grid, such as one frame or a mean of frames, in a file; frames with poses are a scan"
             raise BadDataError(what, way_out=way_out)
-    return list(rows)
 
 
 def _with_points(rows: Sequence[list[str]], marks: Sequence[str]) -> list[list[str]]:
     """The rows with decimal points in place of decimal commas."""
     commas = with_comma(rows, marks)
     refuse_thousands(commas, way_out="write numbers without commas")
-    decimal = set(commas)
+    decimal = {one for one in commas if one.count(",") == 1}
     return [[field.replace(",", ".") if field in decimal else field for field in row] for row in rows]
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.reading import TABLE_BYTES, decoded, decoding, read_bytes
-from tactile_bayes.files.tables import DECIMAL_COMMA, may_be_thousands
+from tactile_bayes.files.tables import may_be_thousands
 from tactile_bayes.geometry import FloatArray
 
 _SEPARATORS: Final = {"\t": "tabs", ";": "semicolons", ",": "commas", " ": "blanks"}
@@ -24,7 +24,7 @@ _AS_UTF8: Final = "save it as UTF-8 text"
 _AROUND: Final = " \t\"'[](){}"  # of a field, as R and Python print numbers
 _CLOCK: Final = re.compile(r"(?:(\d{1,2}):)?(\d{1,2}):(\d{1,2}(?:\.\d+)?)")
 _DATED: Final = re.compile(r"\d{4}-\d{2}-\d{2}[T ]\d{1,2}:\d{2}:\d{2}(\.\d+)?(Z|[+-]\d{2}:?\d{2})?")
-_WITH_COMMA: Final = re.compile(r"[+-]?[0-9]*,[0-9]+(,[0-9]{3})*(e[+-]?[0-9]+)?", re.IGNORECASE)
+_DECIMAL_COMMA: Final = re.compile(r"[+-]?[0-9]*,[0-9]+(e[+-]?[0-9]+)?", re.IGNORECASE)
 FEWEST_LABELS: Final = 8
 """So many numbers that count 0, 1, 2... or 1, 2, 3... are labels of rows or columns, not readings."""
 NO_SENSEL: Final = "B"
@@ -66,7 +66,7 @@ def number(text: str, *, decimal_comma: bool = False) -> float:
     """A number, a time of day in s, or a date and time in s since 1970; NaN for no value, else a ValueError."""
     text = text.strip(_AROUND)
     try:
-        return float(text.replace(",", ".") if decimal_comma and DECIMAL_COMMA.match(text) else text)
+        return float(text.replace(",", ".") if decimal_comma and _DECIMAL_COMMA.fullmatch(text) else text)
     except ValueError:
         if text.lower() in _NO_VALUE:
             return float("nan")
@@ -84,7 +84,8 @@ def read_lines(path: Path) -> list[str]:
     text = decoded(data, path=path, way_out=_AS_UTF8, as_utf8=_AS_UTF8, may_be=("UTF-16",))
     if "\0" in text:
         raise BadDataError("is not text", way_out="give numbers as .npz, .npy, .mat, HDF5 or a table", path=str(path))
-    return text.replace("\u2212", "-").splitlines()
+    text = text.replace("\r\n", "\n").replace("\r", "\n").replace("\u2212", "-")
+    return text.removesuffix("\n").split("\n")
 
 
 def read_text_table(path: Path, decimal: str | None = None) -> TextTable:
@@ -145,17 +146,16 @@ def _of_numbers(fields: Sequence[str], marks: Sequence[str]) -> bool:
 
 def _is_number(text: str, marks: Sequence[str]) -> bool:
     try:
-        return text in marks or number(text, decimal_comma=True) is not None
+        return text in marks or may_be_thousands(text) or number(text, decimal_comma=True) is not None
     except ValueError:
         return False
 
 
 def fields_of(text: str, separator: str) -> list[str]:
     """Fields of a line without the blanks around them."""
-    if separator == " ":
-        return text.split()
+    text = " ".join(text.split()) if separator == " " else text
     with decoding("is not a table of text", way_out="give a table of numbers, such as .csv"):
-        return [one.strip() for one in next(csv.reader([text], delimiter=separator), [])]
+        return [one.strip() for one in next(csv.reader([text], delimiter=separator, skipinitialspace=True), [])]
 
 
 def _without_end(fields: list[str]) -> list[str]:
@@ -167,7 +167,8 @@ def _without_end(fields: list[str]) -> list[str]:
 
 def with_comma(rows: Iterable[Sequence[str]], marks: Sequence[str] = ()) -> list[str]:
     """Fields of the table's lines that are numbers with a decimal comma, or with commas between thousands."""
-    return [field for row in rows if _of_numbers(row, marks) for field in row if _WITH_COMMA.fullmatch(field)]
+    fields = (field for row in rows if _of_numbers(row, marks) for field in row)
+    return [one for one in fields if _DECIMAL_COMMA.fullmatch(one) or may_be_thousands(one)]
 
 
 def refuse_thousands(commas: Sequence[str], *, way_out: str) -> None:
