@@ -75,6 +75,8 @@ REGISTRATION_MM: Final = 5.0
 
 MATCH_MM: Final = 15.0
 """Default distance for matching a mass by its place: half of what lies between two masses that are told apart."""
+VIRIDIS: Final = ((68, 1, 84), (59, 82, 139), (33, 145, 140), (94, 201, 98), (253, 231, 37))
+"""Colours from low to high: five of viridis (van der Walt & Smith 2015), which also read in grey."""
 CORRECTIONS: Final = {
     "rows-reversed": "the array's rows run backwards",
     "columns-reversed": "the array's columns run backwards",

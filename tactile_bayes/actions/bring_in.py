@@ -194,12 +194,12 @@ def _stated(arrays: ArrayMap) -> Mapping[str, Any]:
 def _arrangement_lines(scan: Scan) -> list[str]:
     """What its frames say of the scan; one that no map could be made of is imported all the same."""
     try:
-        doubts = scan_doubts(scan, pressure_window_kpa=PRESSURE_WINDOW_KPA)
         check = check_scan(scan, thorough=False)
+        if check is None:
+            return finding_lines(scan_doubts(scan, pressure_window_kpa=PRESSURE_WINDOW_KPA))
     except BadDataError as error:
         return [f"{LEADS['caution']}no map can be made of it: {error}"]
-    arrangement = [] if check is None else finding_lines(check.findings_of(scan)) or [check.words]
-    return [*finding_lines(doubts), *arrangement]
+    return [*finding_lines(check.doubts), *(finding_lines(check.findings_of(scan)) or [check.words])]
 
 
 def _import_map(source: Path, output: Path, wanted: Wanted) -> list[str]:

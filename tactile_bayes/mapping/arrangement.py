@@ -32,7 +32,7 @@ from tactile_bayes.mapping.convention import (
 )
 from tactile_bayes.mapping.latency import Cells, Nuisance
 from tactile_bayes.mapping.plane import poses_at
-from tactile_bayes.mapping.plausibility import SURE_ODDS, scan_doubts
+from tactile_bayes.mapping.plausibility import SURE_ODDS, selection_doubts
 from tactile_bayes.mapping.select import SelectedFrames, TaxelFault, select_frames
 from tactile_bayes.presets import CORRECTIONS, PRESSURE_WINDOW_KPA
 from tactile_bayes.scans import ElementCalibration, HeadGeometry, PressureFrames, Scan, TrackerPoses
@@ -322,8 +322,8 @@ def check_scan(
 
     A scan without a frame that can be used is a `BadDataError`.
     """
-    doubts = scan_doubts(scan, pressure_window_kpa=pressure_window_kpa)
     selection = select_frames(scan, pressure_window_kpa=pressure_window_kpa)
+    doubts = selection_doubts(selection, pressure_window_kpa=pressure_window_kpa)
     check = check_arrangement(selection) if thorough else check_briefly(selection)
     return None if check is None else replace(check, doubts=doubts)
 

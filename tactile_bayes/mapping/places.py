@@ -51,6 +51,12 @@ class Orientation(Record):
             return {"left": "R", "right": "L", "top": "H", "bottom": "F"}
         return {"left": _opposite(self.right), "right": self.right, "top": self.up, "bottom": _opposite(self.up)}
 
+    @property
+    def sentence(self) -> str:
+        """The orientation with what the letters at the edges stand for, for pages."""
+        sides = "; R, L: the patient's right and left; H: head, F: feet" if self.notch is not None else ""
+        return f"{self.words[0].upper()}{self.words[1:]}{sides}."
+
     def side_words(self, axis: str) -> str:
         """Name a side of the map ("+x", "-x", "+y", "-y"): the patient's with landmarks, else the picture's."""
         screen = {self.right: "right", _opposite(self.right): "left", self.up: "top", _opposite(self.up): "bottom"}

@@ -194,10 +194,16 @@ def scan_doubts(scan: Scan, *, pressure_window_kpa: tuple[float, float]) -> tupl
 
     A scan without a frame that can be used is a `BadDataError`.
     """
-    selections = [select_frames(scan, pressure_window_kpa=pressure_window_kpa)]
-    refuse_without_frames(selections, pressure_window_kpa=pressure_window_kpa)
-    figures = frame_figures(selections) | timing_figures([scan]) | exam_figures(selections)
-    return exam_findings(figures, HeadShape.of(scan.head.surface_mm, scan.head.pitch_mm))
+    selection = select_frames(scan, pressure_window_kpa=pressure_window_kpa)
+    return selection_doubts(selection, pressure_window_kpa=pressure_window_kpa)
+
+
+def selection_doubts(selection: SelectedFrames, *, pressure_window_kpa: tuple[float, float]) -> tuple[Finding, ...]:
+    """The same of a scan whose frames are selected."""
+    refuse_without_frames([selection], pressure_window_kpa=pressure_window_kpa)
+    figures = frame_figures([selection]) | timing_figures([selection.scan]) | exam_figures([selection])
+    head = selection.scan.head
+    return exam_findings(figures, HeadShape.of(head.surface_mm, head.pitch_mm))
 
 
 # --- Findings.

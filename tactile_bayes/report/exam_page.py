@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from typing import Any, Final
 
-from tactile_bayes import __version__
 from tactile_bayes.inference.draws import Quantity
-from tactile_bayes.mapping.places import orientation_of
 from tactile_bayes.posterior.abstention import chance_text
 from tactile_bayes.posterior.lump_probability import SHARE_WITH_LUMP
 from tactile_bayes.presets import INTERVAL, RESEARCH_USE
@@ -25,7 +23,7 @@ from tactile_bayes.report.exam_words import (
     size_sentences,
     why_no_clock,
 )
-from tactile_bayes.report.pages import cut, page
+from tactile_bayes.report.pages import cut, foot, page
 from tactile_bayes.report.svg import (
     Frame,
     breast_dial,
@@ -104,9 +102,7 @@ def _picture(exam: Exam, *, crowded: bool) -> dict[str, str] | None:
         lines.append("Full line: the size by this map alone; dashed: the ends of its interval.")
     if marked(exam.main) is not None:
         lines.append("Cross: the rise that the reason is about.")
-    view = orientation_of(tactile_map)
-    sides = "; R, L: the patient's right and left; H: head, F: feet" if view.notch is not None else ""
-    lines.append(f"{view.words[0].upper()}{view.words[1:]}{sides}.")
+    lines.append(frame.view.sentence)
     lines += ["Striped: few readings; grey: none."] if tactile_map.counts_known else []
     size = "Life size" if frame.scale == 1.0 else f"{frame.scale:.2f} of life size"
     lines.append(f"{size} when printed at 100 %.")
@@ -143,9 +139,6 @@ def _alone(one: ExamMap) -> str:
 
 
 def _foot(exam: Exam) -> str:
-    digests = [scan["sha256"][:12] for scan in exam.scans if scan.get("sha256")][:MOST_REPEATS]
     made = exam.main.report.provenance
-    parts = [f"tactile-bayes {__version__}", f"method {exam.main.report.origin.settings.get('method', 'unknown')}"]
-    parts += [f"seed {made['seed']}"] if made.get("seed") is not None else []
-    parts += [f"scan{'s' if len(digests) > 1 else ''} {', '.join(digests)}"] if digests else []
-    return f"{'; '.join(parts)}. Sizes come from simulated bodies; no scan of a person has been used. {RESEARCH_USE}"
+    seed = [f"seed {made['seed']}"] if made.get("seed") is not None else []
+    return foot(exam.scans, f"method {exam.main.report.origin.settings.get('method', 'unknown')}", *seed)

@@ -7,7 +7,6 @@ from typing import Final
 
 import numpy as np
 
-from tactile_bayes import __version__
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.files.comparison import CompareReport, Visit
 from tactile_bayes.findings import finding_lines
@@ -17,7 +16,7 @@ from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.mapping.places import PATIENT_WORDS, Orientation, orientation_of
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.compare import change_sentences, rate_sentences, signed, verdict_sentence
-from tactile_bayes.report.pages import cut, page
+from tactile_bayes.report.pages import cut, foot, page
 from tactile_bayes.report.svg import (
     STEPS,
     colour_steps,
@@ -192,17 +191,15 @@ def growth_page(compared: Compared, report: CompareReport, visits: Sequence[Sequ
         sentences=change_sentences(report),
         rates=rate_sentences(report),
         rows=[_row(report, course, visit) for visit in report.visits],
-        foot=_foot(report),
+        foot=foot(report.provenance.get("scans", ())),
     )
 
 
 def _seen(view: Orientation) -> str:
-    sides = "; R, L: the patient's right and left; H: head, F: feet" if view is _PATIENT else ""
-    axes = f"{view.words[0].upper()}{view.words[1:]}{sides}."
     return (
-        f"{axes} Every map shows {2 * HALF_MM:g} mm about the mass, without one about its own middle, all in the same "
-        "colours; ring: its estimated size at that visit; grey: no or few readings. Later visits are moved so that the "
-        "mass lies on itself."
+        f"{view.sentence} Every map shows {2 * HALF_MM:g} mm about the mass, without one about its own middle, all in "
+        "the same colours; ring: its estimated size at that visit; grey: no or few readings. Later visits are moved so "
+        "that the mass lies on itself."
     )
 
 
@@ -253,15 +250,6 @@ def _row(report: CompareReport, course: Course, visit: Visit) -> tuple[str, ...]
     away = report.places[number].distance_mm if number >= 0 and report.places else None
     found = sum(one.status == "estimate" for one in visit.maps)
     return course.of(visit), f"{found} of {len(visit.maps)}", size, change, "" if away is None else f"{away:.0f}"
-
-
-def _foot(report: CompareReport) -> str:
-    digests = [one["sha256"][:12] for one in report.provenance.get("scans", ()) if "sha256" in one][:6]
-    scans = f"; scans {', '.join(digests)}" if digests else ""
-    return (
-        f"tactile-bayes {__version__}{scans}. Sizes come from simulated bodies; no scan of a person has been used. "
-        f"{RESEARCH_USE}"
-    )
 
 
 # --- The size at each visit over time, as inline SVG.

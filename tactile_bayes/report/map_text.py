@@ -17,7 +17,7 @@ from tactile_bayes.mapping.errors import LEAST_SHARE
 from tactile_bayes.mapping.map import FEW_READINGS, TactileMap, advise_cell, skewed
 from tactile_bayes.mapping.places import Orientation, orientation_of
 from tactile_bayes.mapping.profile import SPAN_MM
-from tactile_bayes.presets import CELL_PER_SIGMA, POSE_NOISE, RESEARCH_USE
+from tactile_bayes.presets import CELL_PER_SIGMA, POSE_NOISE, RESEARCH_USE, VIRIDIS
 
 # --- Text of a recording's account.
 
@@ -50,10 +50,7 @@ def record_text(report: Report, *, output: str) -> str:
 
 # --- The live view as text: a heat map in half blocks, a pressure bar, and figures for the examiner.
 
-# Dark blue over green to yellow, even in lightness (viridis by five of its colours).
-_COLOURS: Final = np.array(
-    [[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [253, 231, 37]], dtype=np.float64
-)
+_COLOURS: Final = np.array(VIRIDIS, dtype=np.float64)
 _SHADES: Final = " .:-=+*#%@"
 _FULL_BAR_KPA: Final = 20.0
 _SAID: Final = {"low": "press harder", "in": "in range", "high": "press less", "off": "waiting for the head"}

@@ -7,15 +7,17 @@ import re
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from tactile_bayes import __version__
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import UsageError
 from tactile_bayes.files.atomic import check_suffix, refuse_existing, same_file, write_all
+from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.compare import signed
 
 if TYPE_CHECKING:
@@ -25,6 +27,7 @@ if TYPE_CHECKING:
 # --- Pages from templates: every text is escaped, and all have one style sheet and one content policy.
 
 TEMPLATES: Final = Path(__file__).with_name("templates")
+_MOST_SCANS: Final = 6
 
 
 def page(kind: str, *, title: str, images: str = "data:", script_sha256: str = "", **values: Any) -> str:
@@ -41,6 +44,14 @@ def cut(text: str, longest: int = 400) -> str:
     """A text in one line of at most so many letters."""
     line = " ".join(text.split())
     return line if len(line) <= longest else f"{line[: longest - 1]}…"
+
+
+def foot(scans: Iterable[Mapping[str, str]], *more: str) -> str:
+    """Last line of a page: the program, more of it, the first scans by their digests, and what sizes come from."""
+    digests = [one["sha256"][:12] for one in scans if one.get("sha256")][:_MOST_SCANS]
+    told = [f"scan{'s' if len(digests) > 1 else ''} {', '.join(digests)}"] if digests else []
+    made = "; ".join([f"tactile-bayes {__version__}", *more, *told])
+    return f"{made}. Sizes come from simulated bodies; no scan of a person has been used. {RESEARCH_USE}"
 
 
 @cache

@@ -18,6 +18,7 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.mapping.places import Orientation, orientation_of
+from tactile_bayes.presets import VIRIDIS
 from tactile_bayes.report.exam_words import ExamMap, ExamMass
 
 # --- Parts of all drawings: lengths are mm, x to the right and y downwards.
@@ -149,14 +150,11 @@ def _scale(start: float, end: float, y: float, unit: str) -> Iterator[str]:
 
 # --- Colours of a map, and pixels as PNG.
 
-# From low to high: five colours of viridis (van der Walt & Smith 2015), which also read in grey.
-COLOURS: Final = ((68, 1, 84), (59, 82, 139), (33, 145, 140), (94, 201, 98), (253, 231, 37))
-
 
 def _coloured(values: FloatArray, limits: tuple[float, float], no_data: tuple[int, int, int]) -> NDArray[np.uint8]:
     """(n, m, 3) colours of values; cells without data are grey."""
     low, high = limits
-    covered, colours = np.isfinite(values), np.array(COLOURS, dtype=float)
+    covered, colours = np.isfinite(values), np.array(VIRIDIS, dtype=float)
     at = np.clip((np.where(covered, values, low) - low) / (high - low), 0.0, 1.0) * (len(colours) - 1)
     mixed = np.stack([np.interp(at, np.arange(len(colours)), colours[:, i]) for i in range(3)], axis=-1)
     return np.where(covered[..., None], np.rint(mixed), np.array(no_data)).astype(np.uint8)

@@ -79,7 +79,6 @@ def simulate(
     model: ErrorModel,
     *,
     rng: np.random.Generator,
-    name: str = "tactile",
 ) -> ModalitySizes:
     """Simulate one trial of these patients and masses with errors from the model."""
     n = len(ex_vivo_mm)
@@ -87,8 +86,7 @@ def simulate(
     shared = rng.normal(0, model.patient_sd, index.max() + 1)[index] if model.patient_sd else 0.0
     size = ex_vivo_mm * np.exp(model.bias + shared + rng.normal(0, model.mass_sd, n))
     size[rng.random(n) < model.miss] = 0.0
-    none = np.zeros(0)
-    return ModalitySizes(name, patient, ex_vivo_mm, size, (none,) * n)
+    return ModalitySizes("tactile", patient, ex_vivo_mm, size, (np.zeros(0),) * n)
 
 
 def check_intervals(
