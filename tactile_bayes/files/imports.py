@@ -317,37 +317,36 @@ def _frames(held: Arrays, stated: Stated, told: list[str]) -> None:
     if counts.ndim == 2:
         counts = _unfolded(counts, held, stated, told)
     elif stated.frame_shape is not None and counts.shape[1:] != stated.frame_shape:
-        raise BadDataError(
-            f"frames have {' x '.join(map(str, counts.shape[1:]))} taxels, not {stated.frame_shape[0]} x "
-            f"{stated.frame_shape[1]}",
-            way_out="leave --frame-shape out",
-        )
+        what = f"frames have {_sides(counts.shape[1:])} taxels, not {_sides(stated.frame_shape)}"
+        raise BadDataError(what, way_out="leave --frame-shape out")
     head = held["head_surface_mm"].shape[:2] if "head_surface_mm" in held else counts.shape[1:]
     if counts.ndim == 3 and counts.shape[1:] != head:
-        ours, theirs = (" x ".join(map(str, shape)) for shape in (counts.shape[1:], head))
+        what = f"counts has frames of {_sides(counts.shape[1:])} taxels, and the head {_sides(head)}"
         turned = counts.shape[1:] == head[::-1]
         way_out = "swap their last two axes" if turned else "give the head of this array, or the frames of this head"
-        raise BadDataError(f"counts has frames of {ours} taxels, and the head {theirs}", way_out=way_out)
+        raise BadDataError(what, way_out=way_out)
     held["counts"] = counts
+
+
+def _sides(shape: Sequence[int]) -> str:
+    return " x ".join(map(str, shape))
 
 
 def _unfolded(counts: np.ndarray[Any, Any], held: Arrays, stated: Stated, told: list[str]) -> np.ndarray[Any, Any]:
     """Frames of one row each, folded into rows and columns."""
-    shapes = {"head_surface_mm": 2, "gain_kpa_per_count": 2}
-    known = [held[name].shape[:axes] for name, axes in shapes.items() if name in held and held[name].ndim >= axes]
-    shape = stated.frame_shape or next(iter(known), None)
+    beside = (held[name] for name in ("head_surface_mm", "gain_kpa_per_count") if name in held)
+    shape = stated.frame_shape or next((one.shape[:2] for one in beside if one.ndim > 1), None)
     each = f"frames of {counts.shape[1]} numbers (counts has shape {counts.shape})"
     if shape is None:
         raise BadDataError(each, way_out="give --frame-shape ROWS COLUMNS, or --head-geometry HEAD.json")
     if shape[0] * shape[1] != counts.shape[1]:
-        raise BadDataError(
-            f"{each}, and {shape[0]} x {shape[1]} taxels are {shape[0] * shape[1]}",
-            way_out="give --frame-shape ROWS COLUMNS, or --skip-columns for those before the readings",
-        )
+        what = f"{each}, and {_sides(shape)} taxels are {shape[0] * shape[1]}"
+        way_out = "give --frame-shape ROWS COLUMNS, or --skip-columns for those before the readings"
+        raise BadDataError(what, way_out=way_out)
     by_columns = stated.frame_order == "columns"
     if stated.frame_order is None or stated.frame_shape is None:
         along = "columns" if by_columns else "rows"
-        told.append(f"each {counts.shape[1]} numbers read as {shape[0]} x {shape[1]}, along the array's {along}")
+        told.append(f"each {counts.shape[1]} numbers read as {_sides(shape)}, along the array's {along}")
     if by_columns:
         return counts.reshape(len(counts), shape[1], shape[0]).swapaxes(1, 2)
     return counts.reshape(len(counts), *shape)
