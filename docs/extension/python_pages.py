@@ -15,7 +15,7 @@ from sphinx.application import Sphinx
 
 import tactile_bayes
 
-LIBRARY = ("scan", "geometry", "presets", "errors", "mapping", "forward", "inference", "size", "posterior", "trial")
+LIBRARY = ("scans", "geometry", "presets", "errors", "mapping", "forward", "inference", "size", "posterior", "trial")
 """What computes. Commands, devices, files and reports are described by the command reference and the guides."""
 
 
