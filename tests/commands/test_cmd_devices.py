@@ -93,6 +93,7 @@ def test_a_tracker_is_found_by_asking(run_cli, protocol):
     assert f"--tracker-protocol {protocol}" in done.stdout
 
 
+@pytest.mark.long
 def test_a_pivot_is_measured_on_the_tracker_itself(run_cli):
     with serving(EmulatedTracker(pivoting(), protocol="bird"), PtyLink()) as emulator:
         words = ["--pivot", emulator._link.url, "--tracker-protocol", "bird", "--duration", 0.5]

@@ -128,6 +128,7 @@ def test_a_recorded_scan_gives_the_bit_identical_map(record, tmp_path, source, s
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
 
 
+@pytest.mark.long
 def test_the_reference_reader_opens_a_recording(record, tmp_path, scan):
     with head_and_tracker(scan, head_faults=Faults(drop=0.05), speed=FAST) as devices:
         done = record(*devices)

@@ -50,6 +50,7 @@ def concept(one: Any) -> str:
     return str(one.ConceptNameCodeSequence[0].CodeValue)
 
 
+@pytest.mark.long
 def test_there_are_values_a_picture_and_a_report_of_one_study(files: dict[str, Any]) -> None:
     assert set(files) == {"map", "picture", "report"}
     assert len({one.StudyInstanceUID for one in files.values()}) == 1
@@ -62,6 +63,7 @@ def test_there_are_values_a_picture_and_a_report_of_one_study(files: dict[str, A
     ]
 
 
+@pytest.mark.long
 def test_identity_is_as_given_and_what_nobody_gave_is_empty(files: dict[str, Any], exam: Path, tmp_path: Path) -> None:
     for one in files.values():
         assert (one.PatientID, one.PatientName, one.PatientBirthDate) == ("P-77", "Doe^Jane", "19700203")
@@ -107,6 +109,7 @@ def test_values_lie_at_their_places_in_the_patient(degrees: float, tmp_path: Pat
     assert orientation[5] < -0.6, "rows run to the feet"
 
 
+@pytest.mark.long
 def test_all_values_are_read_back_and_gaps_are_padding(files: dict[str, Any], exam: Path) -> None:
     one = read_map(exam / "map.nc")
     values = files["map"].pixel_array
@@ -116,6 +119,7 @@ def test_all_values_are_read_back_and_gaps_are_padding(files: dict[str, Any], ex
     assert np.isnan(files["map"].FloatPixelPaddingValue)
 
 
+@pytest.mark.long
 def test_sizes_and_intervals_are_read_back_equal(files: dict[str, Any], estimate: dict[str, Any]) -> None:
     report = hd.sr.srread(pydicom.filebase.DicomBytesIO(written(files["report"])))
     (group,) = report.content.get_planar_roi_measurement_groups()
@@ -145,6 +149,7 @@ def written(dataset: Any) -> bytes:
     return bytes(buffer.getvalue())
 
 
+@pytest.mark.long
 def test_the_lump_is_a_point_in_the_maps_frame_of_reference(files: dict[str, Any], estimate: dict[str, Any]) -> None:
     (point,) = items(files["report"], "SCOORD3D")
     assert point.ReferencedFrameOfReferenceUID == files["map"].FrameOfReferenceUID
@@ -154,6 +159,7 @@ def test_the_lump_is_a_point_in_the_maps_frame_of_reference(files: dict[str, Any
     assert superior == pytest.approx(patient["y"]["median"], abs=0.02)
 
 
+@pytest.mark.long
 def test_own_codes_are_declared_and_research_use_is_said(files: dict[str, Any]) -> None:
     (scheme,) = files["report"].CodingSchemeIdentificationSequence
     assert scheme.CodingSchemeDesignator == "99TACTILEBAYES"

@@ -94,6 +94,7 @@ def sinking(scan: Scan, *, mm_per_kpa: float) -> Scan:
     return replace(scans.with_counts(scan, np.rint(counts).astype(np.uint16)), poses=poses)
 
 
+@pytest.mark.long
 def test_a_head_that_sinks_into_soft_tissue_is_not_refused(monkeypatch):
     """It sinks as far as it slides from line to line. The control: with the sinking left in, most are refused."""
     soft = [sinking(scan_of(seed), mm_per_kpa=3.0) for seed in range(SCANS)]

@@ -147,6 +147,7 @@ def test_estimate_pool_sizes_one_mass(exams: Path) -> None:
     assert kept["max_size_mm"]["median"] == pytest.approx(largest, rel=0.02)
 
 
+@pytest.mark.long
 def test_python_and_the_page_size_the_same_mass(exams: Path, tmp_path: Path) -> None:
     paths = [exams / f"m{i}.nc" for i in (1, 2, 3)]
     by_path = tb.pool(paths, method="laplace")

@@ -274,7 +274,7 @@ PRINTERS = {
     "exports/fhir", "exports/images", "exports/redcap", "files/map_nc",
     "report/campaign_page", "report/growth_page", "report/compare", "report/estimate_document",
     "report/estimate_figures", "report/estimate_text", "report/exam_page", "report/map_figure", "report/map_text",
-    "report/pooled",
+    "report/pages", "report/pooled",
     # of draws, not of a size; names of files that were written
     "report/posterior_figures", "actions/estimate",
     # of trials, calibrations, devices and studies

@@ -191,6 +191,7 @@ def test_the_frontier_and_what_is_enough():
     assert "no setting has its interval ends within 0.001 mm" in advice(strict)[0]
 
 
+@pytest.mark.long
 def test_least_time_counts_and_a_slow_setting_is_run_twice():
     spent = iter([5.0, 4.0, 1.0])
     some = row("--method laplace").answer

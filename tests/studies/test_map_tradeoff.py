@@ -70,6 +70,7 @@ def test_cells_too_large_come_out_as_wrong():
     assert ladder().enough() is not wrong
 
 
+@pytest.mark.long
 def test_what_cannot_be_built_or_sized_is_a_row_too():
     short = next(one for one in ladder().rows if one.axis == study.TIME)
     for one in (short, row("--every 1000")):

@@ -112,6 +112,7 @@ def test_the_order_of_rows_changes_nothing(rows: Rows, data: st.DataObject) -> N
     assert to_plain(shuffled, digits=12) == to_plain(report_of(rows), digits=12)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("scale", [1e-6, 2.0, 1e12])
 @given(rows=TRIALS)
 def test_other_units_change_millimetres_and_nothing_else(scale: float, rows: Rows) -> None:
