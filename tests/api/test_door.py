@@ -266,6 +266,7 @@ def test_simulate_keeps_the_truth(tmp_path: Path) -> None:
     )
 
 
+@pytest.mark.long
 def test_a_script_records(tmp_path: Path) -> None:
     scan = short_scan()
     write_scan(tmp_path / "last.mcap", scan, provenance=Provenance("test", {}))

@@ -61,6 +61,7 @@ def test_the_packaged_phantoms_say_how_their_maps_were_made(tmp_path: Path) -> N
     assert same == Recipe("mean", "fixed", 20.0, declared=False, noise="independent", flat_field=None)
 
 
+@pytest.mark.long
 def test_a_small_table_without_depths_teaches_the_ratio(tmp_path: Path) -> None:
     (tmp_path / "t.csv").write_text(rows(30))
     done = run_here("calibrate", "size", "t.csv", "-o", "size.json", cwd=tmp_path)

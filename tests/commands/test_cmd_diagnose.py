@@ -48,6 +48,7 @@ def test_chains_that_agree_are_told_from_those_that_do_not(tmp_path: Path) -> No
             assert found["mcse_median"] == pytest.approx(expected, rel=0.2)
 
 
+@pytest.mark.long
 def test_figures_are_what_their_names_say(tmp_path: Path) -> None:
     write(tmp_path / "post.nc", 4)
     figures = {"--trace": "t.png", "--rank": "r.pdf", "--corner": "c.svg"}

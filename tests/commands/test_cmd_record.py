@@ -251,6 +251,7 @@ def test_a_signal_to_all_processes_of_a_recording_ends_it_in_order(tmp_path, sta
     assert read_scan_report(tmp_path / "a.mcap").complete
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("role", ["head", "tracker"])
 def test_a_pulled_cable_ends_it_with_one_line(record, tmp_path, scan, role):
     pulled = {f"{role}_faults": Faults(disconnect_s=0.3)}
@@ -297,6 +298,7 @@ def test_a_disk_that_was_full_before_it_is_one_line_and_no_file(tmp_path, start,
     assert not (tmp_path / "a.mcap").exists()
 
 
+@pytest.mark.long
 def test_a_duration_is_by_the_heads_clock(record, tmp_path, scan):
     with head_and_tracker(scan, speed=FAST) as devices:
         words = [*devices, "--clock", "shared", "--duration", 0.5]

@@ -46,6 +46,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return place
 
 
+@pytest.mark.long
 def test_a_map_becomes_a_private_page_that_is_not_overwritten(folder: Path) -> None:
     done = run_here("report", "map.nc", "-o", "map.html", cwd=folder)
     assert done.returncode == 0, done.stderr
@@ -60,6 +61,7 @@ def test_a_map_becomes_a_private_page_that_is_not_overwritten(folder: Path) -> N
     assert page.read_bytes() == before
 
 
+@pytest.mark.long
 def test_the_json_of_an_estimate_gives_the_same_page_without_estimating(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -71,6 +73,7 @@ def test_the_json_of_an_estimate_gives_the_same_page_without_estimating(
     assert (folder / "both.html").read_bytes() == (folder / "alone.html").read_bytes()
 
 
+@pytest.mark.long
 def test_a_posterior_gives_the_page_of_its_estimate(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("tactile_bayes.api.reports.estimate_file", None)
     run_here("report", "a.json", "a.nc", "-o", "by_json.html", cwd=folder)
@@ -79,6 +82,7 @@ def test_a_posterior_gives_the_page_of_its_estimate(folder: Path, monkeypatch: p
     assert (folder / "by_posterior.html").read_bytes() == (folder / "by_json.html").read_bytes()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("estimate", ["post.nc", "a.json"])
 def test_an_estimate_without_its_map_has_a_page_that_says_what_it_lacks(folder: Path, estimate: str) -> None:
     words = ("report", estimate, "-o", "no_map.html", "--force")
@@ -124,6 +128,7 @@ def run_page(folder: Path) -> str:
     return (folder / "plain.html").read_text()
 
 
+@pytest.mark.long
 def test_repeats_are_pooled_and_shown_small(folder: Path) -> None:
     done = run_here("report", "a.nc", "b.nc", "-o", "two.html", cwd=folder)
     assert done.returncode == 0, done.stderr
@@ -136,6 +141,7 @@ def test_repeats_are_pooled_and_shown_small(folder: Path) -> None:
     assert f"{size['low']:.1f} to {size['high']:.1f} mm" in page
 
 
+@pytest.mark.long
 def test_a_session_in_a_file_that_was_made_by_hand_cannot_hurt_the_page(folder: Path) -> None:
     hostile = "</p><script>alert(1)</script>" + "x" * 10_000
     write_repeat(folder, "hostile.nc", seed=4, subject=hostile, side="left", posture=hostile, visit="<img src=x>")
@@ -165,6 +171,7 @@ REFUSED = [
 ]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("words", "code", "message"), REFUSED)
 def test_what_makes_no_page_is_one_clear_line(folder: Path, words: tuple[str, ...], code: int, message: str) -> None:
     done = run_here("report", *words, "-o", "bad.html", cwd=folder)
@@ -174,6 +181,7 @@ def test_what_makes_no_page_is_one_clear_line(folder: Path, words: tuple[str, ..
     assert not (folder / "bad.html").exists()
 
 
+@pytest.mark.long
 def test_without_a_printer_pdf_is_refused_before_any_work(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(printed.shutil, "which", lambda _: None)
     monkeypatch.setattr(printed, "find_spec", lambda _: None)
@@ -183,6 +191,7 @@ def test_without_a_printer_pdf_is_refused_before_any_work(folder: Path, monkeypa
     assert not (folder / "no.html").exists()
 
 
+@pytest.mark.long
 def test_a_browser_that_fails_is_one_line(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(printed.shutil, "which", lambda name: "/bin/false" if name == "chromium" else None)
     done = run_here("report", "a.nc", "-o", "failed.html", "--pdf", "failed.pdf", cwd=folder)
@@ -191,6 +200,7 @@ def test_a_browser_that_fails_is_one_line(folder: Path, monkeypatch: pytest.Monk
     assert not (folder / "failed.pdf").exists()
 
 
+@pytest.mark.long
 def test_the_printed_file_is_private_too(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("tactile_bayes.report.pages.find_printer", lambda: lambda page: b"%PDF-" + page[:9].encode())
     assert run_here("report", "a.nc", "-o", "p.html", "--pdf", "p.pdf", cwd=folder).returncode == 0

@@ -174,6 +174,7 @@ def test_four_figures_are_drawn(folder: Path, run_cli: Run) -> None:
     assert "figure_5.png exists" in again.stderr
 
 
+@pytest.mark.long
 def test_a_figure_is_the_same_bytes_each_time(tmp_path: Path) -> None:
     from tactile_bayes.report.study import figure_8
     from tactile_bayes.studies.paper import StudyRow

@@ -193,6 +193,7 @@ def test_exit_codes_and_single_lines_of_the_program(tmp_path: Path, run_cli: Run
     assert (good.returncode, good.stderr) == (0, "")
 
 
+@pytest.mark.long
 def test_validate_needs_no_slow_library(run_python: Run) -> None:
     code = (
         "import sys\nfrom tactile_bayes.commands.trial import validate_command\n"

@@ -223,6 +223,7 @@ def test_the_second_table_is_printed_when_asked_for() -> None:
         assert words not in plain.stdout
 
 
+@pytest.mark.long
 def test_the_check_of_intervals_is_reported(tmp_path: Path) -> None:
     found = document(TRIAL, "--excision", EXCISION, "--check-intervals", 200)["interval_check"]
     assert found["tactile"]["trials"] == 200

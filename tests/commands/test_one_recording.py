@@ -106,6 +106,7 @@ def test_exams_of_a_recording_share_it_and_others_do_not() -> None:
     assert list(recordings([{"side": "right"}])) == []
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("block", [1, 64])
 def test_a_campaign_takes_neither_exam_of_a_recording(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, block: int

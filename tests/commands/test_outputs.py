@@ -59,6 +59,7 @@ WRITERS = {
 SUFFIX = {"estimate -o": ".nc", "import a grid": ".nc", "import a scan": ".mcap", "map": ".nc", "validate": ".json"}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("case", WRITERS)
 def test_a_disk_that_is_full_leaves_what_was_there(case: str, plain: Path, run_python: Run) -> None:
     folder = plain / f"full {case}"

@@ -485,6 +485,7 @@ def test_counts_and_variances_of_fine_cells_are_those_of_all_readings(tmp_path: 
     assert grid.variance[0, 0] == pytest.approx(whole.var())
 
 
+@pytest.mark.long
 def test_an_image_of_a_million_pixels_is_sized_where_its_lump_is(tmp_path: Path) -> None:
     """With errors that neighbouring pixels share its grain was taken for a lump, and 300 by 300 took minutes."""
     y, x = np.mgrid[:1000, :1000] * 0.1 - 49.95

@@ -193,6 +193,7 @@ def test_the_scene_schema_is_draft_7() -> None:
     fastjsonschema.compile(load_schema("scene.schema.json"))
 
 
+@pytest.mark.long
 def test_the_shipped_scan_is_what_its_scene_gives() -> None:
     assert (DEMO / "scan.mcap").stat().st_size <= 2_000_000
     scene = read_scene(DEMO / "scene.toml")

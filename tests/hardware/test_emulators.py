@@ -51,6 +51,7 @@ def is_last(pose: PoseReading) -> bool:
     return bool(np.abs(np.array(pose.position_mm) - SCAN.poses.position_mm[-1]).max() < 1e-3)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("link_of", [PtyLink, lambda: TcpLink("127.0.0.1", 0)], ids=["pty", "tcp"])
 def test_a_head_that_has_sent_everything_can_be_started_again(link_of):
     with serving(EmulatedHead(SCAN), link_of()) as emulator:

@@ -188,6 +188,7 @@ def test_a_header_given_twice_is_refused(header):
     server.close()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("states", [0, 2], ids=["waiting", "full"])
 def test_pages_that_do_not_read_are_cut_off(states):
     server = LiveServer("127.0.0.1", 0)

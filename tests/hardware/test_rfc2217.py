@@ -58,6 +58,7 @@ def test_bytes_that_telnet_would_take_for_its_own_come_through():
     assert parser.garbage_bytes == 0
 
 
+@pytest.mark.long
 def test_settings_are_not_negotiated_again_for_every_read(monkeypatch):
     line = PtyLink()
     with serving(EmulatedTracker(short_scan(0.2).poses, protocol="fastrak"), line), rfc2217(line.url) as url:

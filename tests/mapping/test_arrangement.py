@@ -98,6 +98,7 @@ def test_a_lever_arm_left_out_shows_by_the_turn_of_the_mount():
     assert "lever arm" in check.words
 
 
+@pytest.mark.long
 def test_two_mistakes_at_once_are_named_both():
     check = check_scan(mistaken(mistaken(lump(), "columns-reversed"), "scalar-last"), thorough=False)
     assert check is not None
@@ -149,6 +150,7 @@ def test_a_map_refuses_and_takes_the_scan_where_it_is_told_to():
     assert [one.kind for one in tb.build_map(scan, as_stated=True).findings] == ["wrong_arrangement"]
 
 
+@pytest.mark.long
 def test_each_scan_of_a_map_is_checked():
     with pytest.raises(BadDataError, match="scan 2: the array's rows run backwards"):
         tb.build_map([lump(), mistaken(lump(), "rows-reversed")])

@@ -105,6 +105,7 @@ def test_a_head_that_sinks_into_soft_tissue_is_not_refused(monkeypatch):
     assert [verdict(scan) for scan in soft].count("refused") > 0.5 * SCANS
 
 
+@pytest.mark.long
 def test_a_doubt_is_told_with_the_convention_that_fits():
     doubted = [(name, told(scan_of(seed), name)) for seed in range(SCANS) for name in WRONG]
     doubted = [(name, scan) for name, scan in doubted if verdict(scan) == "doubted"]

@@ -214,6 +214,7 @@ def test_the_map_is_left_as_it_was() -> None:
     np.testing.assert_array_equal(tactile_map.mean, before)
 
 
+@pytest.mark.long
 def test_documents_say_null_where_there_is_nothing() -> None:
     nothing = run(noise=WHITE, amplitude=0.0)
     report = estimate_report(

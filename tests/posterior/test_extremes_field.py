@@ -118,6 +118,7 @@ def interval_widths(tactile_map: TactileMap, *, noise: str = "field") -> np.ndar
     return np.ptp(ends, axis=1)
 
 
+@pytest.mark.long
 def test_frames_that_are_there_twice_tell_nothing_new(shared_data: Path) -> None:
     scan = shared_scan(shared_data / "scans" / "s01_sphere15_hd1_clean.npz")
     once, doubled = build_map([scan]), build_map([twice(scan)])

@@ -182,6 +182,7 @@ def test_what_is_known_of_a_lump_is_used_for_the_first_alone() -> None:
     assert known.masses[1].largest_mm == pytest.approx(plain.masses[1].largest_mm, rel=0.01)
 
 
+@pytest.mark.long
 def test_a_fit_that_moves_to_the_first_lump_gives_no_size() -> None:
     two = scene(narrow=0.2)
     options = SamplerSettings(method="laplace", draws=400, background="free", noise="field")

@@ -23,6 +23,7 @@ def empty(sd: float = 0.01) -> TactileMap:
     return grid_map(1.0 + noise(sd))
 
 
+@pytest.mark.long
 def test_deeper_lumps_must_be_larger_and_noisier_maps_show_only_larger_ones() -> None:
     quiet, loud = (smallest_lumps(empty(sd), fat_mm=15.0) for sd in (0.01, 0.05))
     assert list(quiet.depths_mm) == [8.0, 11.0, 15.0]

@@ -344,6 +344,7 @@ def test_equal_draws_are_drawn(tmp_path):
     assert png_size(tmp_path / "size.png") == (1050, 600)
 
 
+@pytest.mark.long
 def test_no_window_system_is_asked_for(run_python, tmp_path):
     code = "\n".join(
         [

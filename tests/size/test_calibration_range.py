@@ -126,6 +126,7 @@ def test_too_far_is_no_number_with_the_way_out(folder: Path) -> None:
     assert widths.returncode == EXIT_DONE, widths.stderr
 
 
+@pytest.mark.long
 def test_one_map_too_far_stops_a_pool_and_a_caution_comes_first(folder: Path, shipped: BodyCalibration) -> None:
     done = run_here("estimate", "sound.nc", "far.nc", "--pool", "--method", "laplace", cwd=folder)
     assert done.returncode == EXIT_NO_ESTIMATE

@@ -68,6 +68,7 @@ def test_coefficients_come_back(calibration: SizeCalibration) -> None:
     assert relative.max() < 0.1
 
 
+@pytest.mark.long
 def test_e_is_1_by_convention_without_depths(without_depths: SizeCalibration) -> None:
     x = without_depths.x
     assert (x.draws[:, 2] == 1.0).all()
@@ -112,6 +113,7 @@ def test_intervals_of_the_coefficients_cover_the_truth() -> None:
     assert np.mean(narrow) <= 0.75
 
 
+@pytest.mark.long
 def test_faint_and_sunken_rows_are_left_out() -> None:
     table = synthetic(3, depths=False)
     sunken = table.amplitude.copy()
@@ -141,6 +143,7 @@ def test_a_table_that_cannot_teach_is_refused(table: SizeTable, words: str) -> N
         learn_size_calibration(table, recipe=RECIPE, rng=np.random.default_rng(1))
 
 
+@pytest.mark.long
 def test_one_amplitude_leaves_f_to_its_prior() -> None:
     table = synthetic(5, depths=False, lumps=4)
     flat = cut(table, slice(24), amplitude=np.full(24, 0.3))

@@ -34,6 +34,7 @@ def test_order_and_a_common_factor_change_nothing_and_one_map_agrees_with_itself
     assert one_size_probability(centre[:1], noise[:1], KNOWN) == 1.0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("prior", [KNOWN, BetweenMaps(), BetweenMaps(0.08, 0.3)], ids=["known", "paper", "site"])
 @pytest.mark.parametrize("k", [2, 4])
 def test_the_probability_is_uniform_over_maps_of_one_size(prior: BetweenMaps, k: int) -> None:

@@ -193,6 +193,7 @@ def sizes(folder: Path, *words: str) -> list[dict]:
     return [one["max_size_mm"] for one in (document if isinstance(document, list) else [document])]
 
 
+@pytest.mark.long
 def test_maps_of_equal_values_give_equal_draws_whatever_their_history(folder: Path) -> None:
     assert (folder / "map0.nc").read_bytes() != (folder / "other0.nc").read_bytes()
     one, other = sizes(folder, "map0.nc"), sizes(folder, "other0.nc")

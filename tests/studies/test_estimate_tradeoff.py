@@ -201,6 +201,7 @@ def test_least_time_counts_and_a_slow_setting_is_run_twice():
     assert (found.seconds, len(found.answers)) == (4.0, 2)
 
 
+@pytest.mark.long
 def test_it_can_be_read_printed_and_drawn(tmp_path: Path):
     pooled = (PooledRow(1, 0.2, row("--method laplace").answer, 5.0), PooledRow(2, 0.4, SizeAnswer("1 of 2")))
     found = replace(ladder(), pooled=pooled, shared_cpu_s={"start": 0.2})

@@ -64,6 +64,7 @@ def scan_of(scene, fidelity: str | None = None):
     return simulate(scene, rng=np.random.default_rng(2), fidelity=fidelity).scan
 
 
+@pytest.mark.long
 def test_a_model_agrees_with_its_own_noiseless_scan_and_not_with_another_size(tmp_path: Path) -> None:
     scene = scene_of(tmp_path, BUMPS + QUIET, sigma=5, noise=0)
     measured = measured_frames(scan_of(scene))
@@ -99,6 +100,7 @@ def test_noise_of_a_known_size_is_the_difference_that_is_found(tmp_path: Path) -
     assert found.frames_centre == pytest.approx(0.5 * found.frames_all, rel=0.1)
 
 
+@pytest.mark.long
 def test_the_solid_model_agrees_with_its_own_scan_and_the_models_in_two_dimensions_do_not(tmp_path: Path) -> None:
     scene = scene_of(tmp_path, BALL + QUIET, d=15, noise=0)
     measured = measured_frames(scan_of(scene), place_mm=None)
@@ -111,6 +113,7 @@ def test_the_solid_model_agrees_with_its_own_scan_and_the_models_in_two_dimensio
     assert plane.map_strict > 0.5
 
 
+@pytest.mark.long
 def test_the_poses_are_the_scans_and_a_latency_is_seen(tmp_path: Path) -> None:
     text = BUMPS + QUIET + "[tracker]\nlatency_ms = 60\n"
     scene = scene_of(tmp_path, text, sigma=5, noise=0)

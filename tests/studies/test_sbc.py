@@ -197,6 +197,7 @@ def test_a_size_drawn_from_the_law_of_its_draws_ranks_uniformly(maps: int, wider
     assert not rank_test("size_mm", size_ranks(maps, wider=wider), draws=DRAWS).inside
 
 
+@pytest.mark.long
 def test_a_map_is_the_same_wherever_it_is_made() -> None:
     one = sbc.ranks_of_map(2, method="laplace", seed=1)
     assert one == sbc.ranks_of_map(2, method="laplace", seed=1)

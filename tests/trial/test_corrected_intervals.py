@@ -112,6 +112,7 @@ def held(intervals: str, trials: int = 300) -> float:
     return hits / trials
 
 
+@pytest.mark.long
 def test_limits_over_patients_hold_where_masses_of_a_patient_err_together() -> None:
     assert held("patients") >= 0.91
 

@@ -184,6 +184,7 @@ def test_validate_takes_no_such_error_ratio(tmp_path: Path, value: str) -> None:
     assert "error_ratio" in str(error)
 
 
+@pytest.mark.long
 def test_a_whole_number_written_as_a_float_is_one(tmp_path: Path) -> None:
     (tmp_path / "p.toml").write_text('[analysis]\nintervals = "bca"\nresamples = 200.0\n')
     result = run(validate_command, TRIAL, "--excision", EXCISION, "--protocol", tmp_path / "p.toml", "--json")

@@ -106,6 +106,7 @@ def report_of(rows: Rows, *, scale: float = 1.0, shuffle: Any = None) -> TrialRe
     return summarise(Trial(shuffle(readings) if shuffle else readings, ex_vivo))
 
 
+@pytest.mark.long
 @given(rows=TRIALS, data=st.data())
 def test_the_order_of_rows_changes_nothing(rows: Rows, data: st.DataObject) -> None:
     shuffled = report_of(rows, shuffle=lambda readings: data.draw(st.permutations(readings)))

@@ -280,6 +280,7 @@ def test_the_limit_of_no_volume_change_is_approached_and_not_locked() -> None:
     assert steps[-1][1] < 1e-3 * maps[-1][1]
 
 
+@pytest.mark.long
 def test_seats_lead_smoothly_from_one_end_to_the_other() -> None:
     found = np.array([line_figures(Body(15, 1.0, seat)) for seat in (0.0, 0.25, 0.5, 0.75, 0.95, 0.999, 1.0)])
     assert (np.diff(found[:, 0]) > 0).all()

@@ -124,6 +124,7 @@ def test_a_lump_of_fat_does_not_show_and_a_harder_one_shows_higher() -> None:
     assert soft.sigma_x_mm == pytest.approx(hard.sigma_x_mm, rel=0.05)  # Fig 7b
 
 
+@pytest.mark.long
 def test_the_table_has_a_width_for_each_axis_of_the_head() -> None:
     head, *_, last = table_text(rows()).splitlines()
     names = "seat,d_mm,depth_ratio,stiffness_ratio,amplitude,sigma_x_mm,sigma_y_mm,fit_rms,detectable"
@@ -229,6 +230,7 @@ def test_four_figures_are_drawn(folder: Path, run_cli: Run) -> None:
     assert [(folder / "figures" / f"figure_{n}.png").read_bytes()[:4] for n in (5, 6, 7, 8)] == [b"\x89PNG"] * 4
 
 
+@pytest.mark.long
 def test_a_figure_of_balls_is_the_same_bytes_each_time(tmp_path: Path) -> None:
     from tactile_bayes.report.study import figure_8
 

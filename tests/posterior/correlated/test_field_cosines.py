@@ -42,6 +42,7 @@ def test_a_narrow_bump_or_a_wide_window_calls_for_more() -> None:
     assert cosines_for(0.1, WINDOW) == FINE_FIELD_COSINES
 
 
+@pytest.mark.long
 def test_only_a_narrow_bump_pays_for_them() -> None:
     wide, few = estimate(1, sigma=5.0), estimate(1, sigma=5.0, cosines=FIELD_COSINES)
     assert wide.diagnostics.noise.figures["field_cosines"] == FIELD_COSINES

@@ -175,6 +175,7 @@ def test_a_resumed_run_is_the_run_that_was_never_stopped(tmp_path: Path) -> None
     np.testing.assert_array_equal(again.theta, whole.theta)
 
 
+@pytest.mark.long
 def test_another_runs_checkpoint_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "chain.npz"
     with pytest.raises(NotConvergedError, match="not converged after 150 steps"):

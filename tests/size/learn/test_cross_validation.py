@@ -109,6 +109,7 @@ def test_tables_that_are_no_study_have_none() -> None:
     assert left_out_of_study(study(), least_stiffness_ratio=1000.0) is None
 
 
+@pytest.mark.long
 def test_where_eq_6_has_no_mode_the_report_says_without_which_geometry(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
