@@ -13,7 +13,7 @@ $(VENV)/.installed: pyproject.toml
 demo: $(VENV)/.installed
 	$(BIN)/tactile-bayes demo -o demo-output --force
 
-# Three minutes on two cores. What takes more than a second a test is marked `long` and runs with `make check`.
+# Three minutes on two cores. Tests that take longer than most are marked `long` and run with `make check`.
 test: $(VENV)/.installed
 	$(BIN)/python -m pytest -n auto --dist worksteal
 
