@@ -126,9 +126,10 @@ class Estimator:
     def close(self) -> None:
         """End the process, also during an estimate."""
         if self._pool is not None:
-            self._pool.shutdown(wait=False, cancel_futures=True)
             for child in multiprocessing.active_children():
                 child.terminate()
+            # waited for: the interpreter's own end would meet a pool that is half closed
+            self._pool.shutdown(wait=True, cancel_futures=True)
 
 
 def _prepare() -> None:
