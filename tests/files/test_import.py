@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from campaign_files import arrays_of
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.imports import read_arrays
@@ -22,19 +24,8 @@ Arrays = dict[str, Any]
 def good() -> Arrays:
     scan = simulate(Scene(duration_s=0.1), rng=np.random.default_rng(0)).scan
     assert scan.landmarks is not None
-    return {
-        "counts": scan.frames.counts.copy(),
-        "frame_time_s": scan.frames.time_s.copy(),
-        "position_mm": scan.poses.position_mm.copy(),
-        "quaternion_wxyz": scan.poses.quaternion_wxyz.copy(),
-        "pose_time_s": scan.poses.time_s.copy(),
-        "gain_kpa_per_count": scan.element_calibration.gain_kpa_per_count.copy(),
-        "offset_kpa": scan.element_calibration.offset_kpa.copy(),
-        "pitch_mm": 1.5,
-        "landmarks_mm": np.stack([scan.landmarks.sternal_notch_mm, scan.landmarks.xiphoid_mm]),
-        "array_from_tracker": scan.head.scanhead_from_tracker.copy(),
-        "head_surface_mm": scan.head.surface_mm.copy(),
-    }
+    marks = np.stack([scan.landmarks.sternal_notch_mm, scan.landmarks.xiphoid_mm])
+    return deepcopy(arrays_of(scan)) | {"landmarks_mm": marks}
 
 
 def test_good_arrays_become_the_scan(good: Arrays, tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ import json
 import struct
 import zlib
 from collections.abc import Callable
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ import pandas as pd
 import pytest
 import scipy.io
 import scipy.sparse
+from campaign_files import arrays_of
 from in_process import run_here
 from scipy.spatial.transform import Rotation
 
@@ -40,18 +42,7 @@ def scan() -> Scan:
 
 @pytest.fixture
 def good(scan: Scan) -> Arrays:
-    return {
-        "counts": scan.frames.counts.copy(),
-        "frame_time_s": scan.frames.time_s.copy(),
-        "position_mm": scan.poses.position_mm.copy(),
-        "quaternion_wxyz": scan.poses.quaternion_wxyz.copy(),
-        "pose_time_s": scan.poses.time_s.copy(),
-        "gain_kpa_per_count": scan.element_calibration.gain_kpa_per_count.copy(),
-        "offset_kpa": scan.element_calibration.offset_kpa.copy(),
-        "pitch_mm": 1.5,
-        "array_from_tracker": scan.head.scanhead_from_tracker.copy(),
-        "head_surface_mm": scan.head.surface_mm.copy(),
-    }
+    return deepcopy(arrays_of(scan))
 
 
 @pytest.fixture
