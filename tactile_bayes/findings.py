@@ -151,3 +151,8 @@ def finding_summary(findings: Iterable[Finding], severity: Severity, *, most: in
 def findings_in(listed: object) -> tuple[Finding, ...]:
     """Findings as `Finding.as_dict` wrote them into a file; anything else is a `BadDataError`."""
     return tuple(one.finding for one in from_plain(tuple[FindingEntry, ...], listed, where="findings"))
+
+
+def capital(text: str) -> str:
+    """A text that begins a sentence."""
+    return f"{text[0].upper()}{text[1:]}"

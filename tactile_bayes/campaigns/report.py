@@ -35,6 +35,7 @@ from tactile_bayes.files.manifest_csv import (
 from tactile_bayes.files.reading import IMAGE_BYTES, put, read_bytes
 from tactile_bayes.files.reports import PooledReport
 from tactile_bayes.files.tables import Table
+from tactile_bayes.findings import capital
 from tactile_bayes.options import TrialSettings
 from tactile_bayes.report.campaign_page import (
     FAILED,
@@ -286,7 +287,7 @@ def repeatability_words(campaign: Campaign) -> str:
     if found is None:
         return f"spread between exams not learned: {campaign.not_learned}" if campaign.not_learned else ""
     words = found.words()
-    return f"{words[0].upper()}{words[1:]}; every size is by this spread, learned from the repeats ({REPEATABILITY})."
+    return f"{capital(words)}; every size is by this spread, learned from the repeats ({REPEATABILITY})."
 
 
 def counts_words(sized: int, unsized: int, failed: int) -> str:

@@ -21,7 +21,7 @@ from tactile_bayes.files.netcdf import open_netcdf
 from tactile_bayes.files.provenance import EXAM_FACTS, scans_of
 from tactile_bayes.files.reading import HDF5_MAGIC, kind_of, open_input, schema_kind
 from tactile_bayes.files.reports import EstimateReport, MassReport, PooledReport, centre_of
-from tactile_bayes.findings import Finding, Verdict, finding_lines, verdict
+from tactile_bayes.findings import Finding, Verdict, capital, finding_lines, verdict
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.report.estimate_text import exams_label
@@ -293,7 +293,7 @@ def _mass(mass: EstimateReport | PooledReport | MassReport, alike: float | None)
         code = (not isinstance(mass, PooledReport) and mass.reason_code) or "no size"
     elif leads is not mass:
         label = exams_label(alike)
-        narrow = f"{label[0].upper()}{label[1:]}: largest size {size_words(size)}"
+        narrow = f"{capital(label)}: largest size {size_words(size)}"
     placed = None if isinstance(mass, PooledReport) else mass
     return SizedMass(
         mass.number if isinstance(mass, MassReport) else 1,

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_bayes.declarations import Record, rounded
+from tactile_bayes.findings import capital
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.map import TactileMap
 
@@ -55,7 +56,7 @@ class Orientation(Record):
     def sentence(self) -> str:
         """The orientation with what the letters at the edges stand for, for pages."""
         sides = "; R, L: the patient's right and left; H: head, F: feet" if self.notch is not None else ""
-        return f"{self.words[0].upper()}{self.words[1:]}{sides}."
+        return f"{capital(self.words)}{sides}."
 
     def side_words(self, axis: str) -> str:
         """Name a side of the map ("+x", "-x", "+y", "-y"): the patient's with landmarks, else the picture's."""

@@ -25,7 +25,7 @@ from tactile_bayes.files.comparison import (
 )
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.reports import EstimateReport
-from tactile_bayes.findings import Finding, finding_lines, finding_summary
+from tactile_bayes.findings import Finding, capital, finding_lines, finding_summary
 from tactile_bayes.findings import verdict as verdict_of
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.inference.points import normal_quantile
@@ -310,7 +310,7 @@ def rate_sentences(report: CompareReport) -> list[str]:
 def _refusal(report: CompareReport) -> str:
     """Why nothing is compared, and what would help."""
     head = "Not compared: not shown to be one mass" if report.status == "not_one_mass" else "Not compared"
-    advice = f" {report.advice[0].upper()}{report.advice[1:]}." if report.advice else ""
+    advice = f" {capital(report.advice)}." if report.advice else ""
     return f"{head}: {report.reason}.{advice}"
 
 
@@ -403,7 +403,7 @@ def _another_line(change: ChangeReport) -> list[str]:
 def _site_line(report: CompareReport) -> list[str]:
     """Whose spread between exams the intervals and the smallest detectable change suppose, where it was learned."""
     words = report.site_words
-    return [f"{words[0].upper()}{words[1:]}; the figures above are for such exams."] if words else []
+    return [f"{capital(words)}; the figures above are for such exams."] if words else []
 
 
 def _model_line(report: CompareReport) -> str:

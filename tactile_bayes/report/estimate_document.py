@@ -28,7 +28,7 @@ from tactile_bayes.files.reports import (
     StructureReport,
     Supposed,
 )
-from tactile_bayes.findings import verdict
+from tactile_bayes.findings import capital, verdict
 from tactile_bayes.geometry import FloatArray, apply
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.mapping.map import TactileMap
@@ -73,7 +73,7 @@ def scene_lines(choice: SceneChoice) -> list[str]:
     lines = [f"Scene in {window}: {' and '.join(names)}, the simplest that the map supports."]
     for one in used:
         name = ASKED[one.name]
-        lines.append(f"{name[0].upper()}{name[1:]} is in the model (odds {odds_text(one)}){_change(one, 'without')}.")
+        lines.append(f"{capital(name)} is in the model (odds {odds_text(one)}){_change(one, 'without')}.")
     kept = [one for one in choice.structures if one.used and not one.supported and not one.place]
     lines += [f"Also in the model: {ASKED[one.name]} (odds {odds_text(one)}){_change(one, 'without')}." for one in kept]
     out = [

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 
 from tactile_bayes.files.reports import MassReport, SmallestLump
-from tactile_bayes.findings import finding_lines, finding_summary
+from tactile_bayes.findings import capital, finding_lines, finding_summary
 from tactile_bayes.inference.draws import ParameterDraws, Quantity
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.mapping.places import ClockPosition
@@ -242,7 +242,7 @@ def estimate_text(
 def no_estimate_line(reason: str) -> str:
     """First line of a report without an estimate."""
     told = reason.startswith(("no lump found", "the data cannot show"))
-    return f"{reason[0].upper()}{reason[1:]}." if told else f"No estimate: {reason}."
+    return f"{capital(reason)}." if told else f"No estimate: {reason}."
 
 
 def smallest_lines(estimate: Estimate) -> list[str]:

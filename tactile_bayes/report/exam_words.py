@@ -13,7 +13,7 @@ import numpy as np
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import CANNOT_SHOW, NO_LUMP, UsageError
 from tactile_bayes.files.reports import EstimateReport, Interval, MassReport, PooledReport, centre_of
-from tactile_bayes.findings import finding_lines
+from tactile_bayes.findings import capital, finding_lines
 from tactile_bayes.geometry import apply
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.mapping.map import FEW_READINGS, TactileMap
@@ -203,7 +203,7 @@ def headline(exam: Exam) -> str:
         interval = f"{_percent(size)} interval {size.low:.1f} to {size.high:.1f} mm"
         return f"{what} about {size.median:.1f} mm, {interval}"
     if exam.disagrees:
-        return _capital(exam.report.reason)
+        return capital(exam.report.reason)
     if masses:
         return f"{'Lump' if len(masses) < 2 else f'{len(masses)} masses'} seen, no size"
     if exam.main.report.reason_code == CANNOT_SHOW:
@@ -275,7 +275,7 @@ def nothing_sentences(exam: Exam) -> Iterator[str]:
         return
     report, tactile_map = exam.main.report, exam.main.tactile_map
     if exam.pooled is not None:
-        yield f"{_capital(exam.pooled.reason)}."
+        yield f"{capital(exam.pooled.reason)}."
     if report.reason_code in NO_LUMP:
         area = "" if tactile_map is None else f": {covered_text(tactile_map)}"
         yield f"No lump was found in the area that was covered{area}."
@@ -285,7 +285,7 @@ def nothing_sentences(exam: Exam) -> Iterator[str]:
             yield f"{smallest_text(report.smallest_lump)}."
         yield "A lump may be smaller, deeper or softer than these, or lie outside the area that was covered."
     else:
-        yield f"{_capital(report.reason)}."
+        yield f"{capital(report.reason)}."
     if report.on_paper:
         yield f"What would help: {report.on_paper}."
 
@@ -302,9 +302,9 @@ def place_sentence(mass: ExamMass, probability: float) -> str:
 def short_place(mass: ExamMass) -> str:
     """Where a mass lies, without intervals."""
     if mass.place is not None:
-        return _capital(mass.place.text())
+        return capital(mass.place.text())
     if mass.patient_mm is not None:
-        return _capital(from_xiphoid(*mass.patient_mm))
+        return capital(from_xiphoid(*mass.patient_mm))
     return "At ({:.0f}, {:.0f}) mm on the map".format(*mass.centre_mm)
 
 
@@ -437,7 +437,3 @@ def facts(exam: Exam) -> Iterator[tuple[str, str]]:
 
 def _percent(quantity: Quantity | Interval) -> str:
     return f"{100 * quantity.probability:g} %"
-
-
-def _capital(text: str) -> str:
-    return f"{text[0].upper()}{text[1:]}"

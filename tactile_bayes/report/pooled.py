@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from tactile_bayes.declarations import UNSET, rounded
 from tactile_bayes.files.provenance import Provenance, repeated_scans, scans_of
 from tactile_bayes.files.reports import POOLED, EstimateReport, Interval, PooledMap, PooledReport
-from tactile_bayes.findings import Finding, by_weight, finding_lines, finding_summary, verdict
+from tactile_bayes.findings import Finding, by_weight, capital, finding_lines, finding_summary, verdict
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.calibration import fat_text, site_words, unknowns_text
@@ -220,7 +220,7 @@ def pooled_text(report: PooledReport) -> str:
     lines.append(shape_text(figures))
     lines.append(f"Monte-Carlo error of the interval ends: {ends_text('sizes', worst.mc_error, worst.sd)}.")
     unknowns = fat_text(report.fat_mm) + unknowns_text(report.unknowns)
-    lines.append(f"{unknowns[0].upper()}{unknowns[1:]}.")
+    lines.append(f"{capital(unknowns)}.")
     if report.site:
         lines.append(f"Sizes by {report.site}.")
     if report.left_out:
