@@ -5,7 +5,8 @@ from __future__ import annotations
 import difflib
 import math
 import numbers
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 # --- Every error the program can explain in one line, each with the exit code it ends in.
@@ -139,6 +140,15 @@ class BadDataError(TactileBayesError, ValueError):
     def at(self, path: object) -> BadDataError:
         """The same error, naming the file it was found in."""
         return type(self)(self.what, way_out=self.way_out, path=self.path or str(path))
+
+
+@contextmanager
+def in_file(path: object) -> Iterator[None]:
+    """Name a file in each `BadDataError` of the block that names none."""
+    try:
+        yield
+    except BadDataError as error:
+        raise error.at(path) from None
 
 
 class DeviceError(TactileBayesError):

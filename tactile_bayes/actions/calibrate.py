@@ -13,7 +13,7 @@ from tactile_bayes.api.site_correction import correct_size
 from tactile_bayes.api.size_calibration import EqSixFit, PopulationForm, is_population, learn_eq6, learn_population
 from tactile_bayes.commands.options import also_read, typed_options
 from tactile_bayes.declarations import as_dict
-from tactile_bayes.errors import BadDataError, UsageError
+from tactile_bayes.errors import BadDataError, UsageError, in_file
 from tactile_bayes.files.atomic import refuse_existing
 from tactile_bayes.files.instrument_json import ArrayCalibrationFile, write_array_calibration
 from tactile_bayes.files.provenance import Provenance, hash_inputs
@@ -44,10 +44,8 @@ def calibrate_array(
     full = scans[0].element_calibration.saturation_count
     levels = []
     for (kpa, path), scan in zip(steps, scans, strict=True):
-        try:
+        with in_file(path):
             levels.append(BladderStep.of(kpa, scan.frames.counts, saturation_count=full))
-        except BadDataError as error:
-            raise error.at(path) from None
     fit = fit_array(levels, saturation_count=full)
     inputs = hash_inputs(**{f"step_{number}": path for number, (_, path) in enumerate(steps, start=1)})
     made = Provenance("calibrate array", {"pressure_kpa": [kpa for kpa, _ in steps]}, inputs)

@@ -17,7 +17,7 @@ import numpy as np
 from tactile_bayes.batch import BatchInterrupted, Outcome, fault_lines, open_executor, run_batch
 from tactile_bayes.batch_store import open_unfinished, unfinished
 from tactile_bayes.declarations import names_of
-from tactile_bayes.errors import BadDataError, TactileBayesError, UsageError
+from tactile_bayes.errors import TactileBayesError, UsageError, in_file
 from tactile_bayes.files.atomic import refuse_existing, write_text
 from tactile_bayes.files.documents import dump_json
 from tactile_bayes.files.provenance import hash_inputs
@@ -92,10 +92,8 @@ def read_frames(path: Path) -> list[MeasuredFrame]:
     columns = read_table(path, _FRAMES_SCHEMA).columns
     place = np.array([0.0 if x is None else x for x in columns["x_c_mm"]])
     s, pressure = np.array(columns["s_mm"]), np.array(columns["pressure_kpa"])
-    try:
+    with in_file(path):
         return [MeasuredFrame(x, s[place == x], pressure[place == x]) for x in dict.fromkeys(place.tolist())]
-    except BadDataError as error:
-        raise error.at(path) from None
 
 
 def figure_paths(folder: Path, *, model: str) -> list[Path]:
@@ -214,10 +212,8 @@ def read_grid(path: Path, *, seat: float) -> list[Geometry]:
     table = read_table(path, _GRID_SCHEMA)
     seats = [seat if text is None else parse_seat(text) for text in table.columns["seat"]]
     names = ("d_mm", "depth_ratio", "stiffness_ratio")
-    try:
+    with in_file(path):
         return group_cases(zip(seats, *(table.columns[name] for name in names), strict=True))
-    except BadDataError as error:
-        raise error.at(path) from None
 
 
 def run_study(

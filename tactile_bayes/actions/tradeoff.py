@@ -21,7 +21,7 @@ from tactile_bayes.api.settings import Settings
 from tactile_bayes.api.sized import SizeEstimate
 from tactile_bayes.commands.options import also_read, settings_of
 from tactile_bayes.declarations import replace, to_plain
-from tactile_bayes.errors import EXIT_DONE, EXIT_NO_ESTIMATE, BadDataError, UsageError
+from tactile_bayes.errors import EXIT_DONE, EXIT_NO_ESTIMATE, UsageError, in_file
 from tactile_bayes.files.atomic import given_twice, refuse_existing
 from tactile_bayes.files.documents import dump_json
 from tactile_bayes.files.map_nc import read_map
@@ -60,11 +60,9 @@ from tactile_bayes.studies.tradeoffs import (
 def tradeoff_of_map(path: Path, settings: Settings, work: Work) -> Ladder:
     """Every setting of `estimate` on a map that need not be built again."""
     used, tactile_map = _of(settings, work), read_map(path)
-    try:
+    with in_file(path):
         calibration, options = estimate_inputs(settings, tactile_map)
         return measure(tactile_map, calibration=calibration, options=options, work=used)
-    except BadDataError as error:
-        raise error.at(path) from None
 
 
 def pooled_rows(paths: Sequence[Path], settings: Settings, *, clock: Clock) -> tuple[PooledRow, ...]:
@@ -194,10 +192,8 @@ def tradeoff_forward_action(
 def _case(path: Path | None, head: str | None) -> LumpCase:
     if path is None:
         return case_of(Scene(body=SceneBody(), solid_lumps=(SolidLump(seat=0.0),)), head=head)
-    try:
+    with in_file(path):
         return case_of(read_scene(path), head=head)
-    except BadDataError as error:
-        raise error.at(path) from None
 
 
 def run_tradeoff(case: LumpCase, calibration: str | None, *, tolerance: float, runs: int) -> TradeoffReport:

@@ -12,7 +12,7 @@ from tactile_bayes.api.repeatability import check_repeatability, repeatability_d
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.api.sized import Answer, SizeEstimate, size_priors
 from tactile_bayes.declarations import Record, names_of, replace
-from tactile_bayes.errors import NO_LUMP, BadDataError, TactileBayesError
+from tactile_bayes.errors import NO_LUMP, BadDataError, TactileBayesError, in_file
 from tactile_bayes.files.map_nc import read_map_and_scans
 from tactile_bayes.files.npz import CheckpointFile
 from tactile_bayes.files.provenance import Provenance, hash_inputs
@@ -70,10 +70,8 @@ def estimate_file(
 ) -> SizeEstimate:
     """Read a map and estimate it; see `estimate_one`."""
     tactile_map, scans = read_map_and_scans(path)
-    try:
+    with in_file(path):
         found = estimate_one(tactile_map, settings, inputs={"map": path}, scans=scans, progress=progress, notice=notice)
-    except BadDataError as error:
-        raise error.at(path) from None
     return replace(found, name=path.stem)
 
 

@@ -13,7 +13,7 @@ from tactile_bayes.api.settings import Settings
 from tactile_bayes.api.size_calibration import Learned, files_of, header_of, table_recipe
 from tactile_bayes.api.sized import pooling_shape
 from tactile_bayes.declarations import Record, replace
-from tactile_bayes.errors import BadDataError, UsageError
+from tactile_bayes.errors import BadDataError, UsageError, in_file
 from tactile_bayes.files.documents import load_json
 from tactile_bayes.files.size_json import SHIPPED, read_size_calibration, size_calibration_path
 from tactile_bayes.files.tables import Sheet, Table, read_table
@@ -52,7 +52,7 @@ def correct_size(
         )
     where = table if isinstance(table, Path) else table.name
     by_files = "file" in header_of(table)
-    try:
+    with in_file(where):
         if by_files:
             for name in (name for name, value in declared.items() if value is not None):
                 option = name.replace("_", "-")
@@ -63,8 +63,6 @@ def correct_size(
             found = _from_bumps(table, calibration, declared)
         name = base if base in SHIPPED else path.name
         corrected = correct_calibration(calibration, found.maps, base=name, left_out=found.left_out)
-    except BadDataError as error:
-        raise error.at(where) from None
     document: Any = load_json(path)
     settings = {"correct": name, "of": "maps" if by_files else "bumps", "seed": seed}
     inputs = {**files_of(table=table), "size_calibration": path, **found.inputs}

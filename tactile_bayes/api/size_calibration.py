@@ -11,7 +11,7 @@ from typing import Any, Final, Literal, cast
 import numpy as np
 
 from tactile_bayes.declarations import Record, replace
-from tactile_bayes.errors import BadDataError, NotConvergedError, UsageError
+from tactile_bayes.errors import BadDataError, NotConvergedError, UsageError, in_file
 from tactile_bayes.files.provenance import Provenance, hash_inputs
 from tactile_bayes.files.reading import open_input
 from tactile_bayes.files.size_json import write_size_calibration
@@ -83,7 +83,7 @@ def learn_eq6(
     """
     rows = read_table(table, "size_table.table.json")
     recipe = table_recipe(rows, declared)
-    try:
+    with in_file(rows.path):
         lumps = size_table(rows, least_stiffness_ratio=least_stiffness_ratio)
         rng = np.random.default_rng(seed)
         if fit == "two-stage":
@@ -92,8 +92,6 @@ def learn_eq6(
             calibration = learn_size_calibration(lumps, recipe=recipe, rng=rng, progress=progress)
         other = other_fit(calibration, lumps)
         left_out, silent = _left_out(lumps, fit, least_stiffness_ratio=least_stiffness_ratio)
-    except BadDataError as error:
-        raise error.at(rows.path) from None
     settings = {
         "normalise": recipe.normalise,
         "background": recipe.background,
@@ -135,7 +133,7 @@ def learn_population(
     rows, fit = read_table(table, "population.table.json"), measuring_options()
     way, columns = rows_of_one_way(rows, normalise)
     settings: dict[str, Any] = {"form": form, "masses": len(set(columns["body"])), "bodies": table_bodies(columns)}
-    try:
+    with in_file(rows.path):
         head = table_head(columns)
         recipe = Recipe(
             way, fit.background, fit.fit_radius_mm, declared=False, noise=fit.noise, flat_field=False, head=head
@@ -143,8 +141,6 @@ def learn_population(
         found = learning.learn_population(
             population_table(columns), recipe=recipe, source=_SOURCE, residual=form == "eq6-residual"
         )
-    except BadDataError as error:
-        raise error.at(rows.path) from None
     if form == "eq6-residual" and found.residual is None:
         raise BadDataError(
             f"fewer than {learning.LEAST_BODIES} bodies have a lump and a head profile: too few for a residual",

@@ -16,7 +16,7 @@ from tactile_bayes.files.atomic import sha256
 from tactile_bayes.files.manifest_csv import JOURNAL, SAME_IN_SCANS, natural
 from tactile_bayes.files.map_nc import read_map_and_scans
 from tactile_bayes.files.reading import check_address, fetched, files_below, is_address
-from tactile_bayes.files.scan_mcap import json_object, scan_records
+from tactile_bayes.files.scan_mcap import provenance_of, scan_records
 
 # --- What a file says of its exam: facts of the session, and the files that it was made from.
 
@@ -47,11 +47,11 @@ def check_name(name: str) -> None:
 
 
 def _of_scan(path: Path) -> Said:
-    metadata = scan_records(path, keep=()).metadata
-    made = json_object(metadata.get("provenance", {}).get("json", "{}"), name="provenance").get("inputs")
+    records = scan_records(path, keep=())
+    made = provenance_of(records).get("inputs")
     inputs = made if isinstance(made, list) else []
     sources = frozenset(str(one.get("sha256")) for one in inputs if isinstance(one, dict))
-    return Said(_facts([metadata.get("session", {})]), sources)
+    return Said(_facts([records.metadata.get("session", {})]), sources)
 
 
 def _of_map(path: Path) -> Said:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Annotated, Any, Final, Literal, TypeVar
 
 from tactile_bayes.declarations import Meta, Record, field, from_plain, names_of, replace, schema_name
-from tactile_bayes.errors import BadDataError, meant
+from tactile_bayes.errors import BadDataError, in_file, meant
 from tactile_bayes.files.reading import JSON_BYTES, TOML_BYTES, decoding, kind_of, read_text, schema_kind
 from tactile_bayes.options import TrialSettings
 from tactile_bayes.scans import Scan
@@ -75,10 +75,8 @@ def parse_record(document: object, kind: type[T], *, path: Path) -> T:
         raise BadDataError(f"is {found}, not {wanted}", way_out=f"give {wanted}", path=str(path))
     if schema and isinstance(document, dict) and document.get("schema", schema) != schema:
         raise BadDataError(f"schema is {_shown(document['schema'])}", way_out=f"give {schema!r}", path=str(path))
-    try:
+    with in_file(path):
         return from_plain(kind, document)
-    except BadDataError as error:
-        raise error.at(path) from None
 
 
 def load_json(path: Path, *, way_out: str = "give a file this program wrote") -> object:
@@ -111,11 +109,9 @@ def _object(pairs: list[tuple[str, Any]], *, way_out: str) -> dict[str, Any]:
 
 def load_toml(path: Path, *, way_out: str) -> dict[str, Any]:
     """Read a TOML file. Too large, too deep or a number that no double holds is an error."""
-    try:
+    with in_file(path):
         text = read_text(path, most=TOML_BYTES, way_out=way_out)
         return parse_toml(text, way_out=way_out)
-    except BadDataError as error:
-        raise error.at(path) from None
 
 
 def parse_toml(text: str, *, way_out: str) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from typing import Any, Final, TypeVar
 import numpy as np
 
 from tactile_bayes.declarations import Record
-from tactile_bayes.errors import BadDataError
+from tactile_bayes.errors import BadDataError, in_file
 from tactile_bayes.files.documents import load_json, parse_record
 from tactile_bayes.files.netcdf import open_netcdf
 from tactile_bayes.files.reading import open_input
@@ -157,11 +157,9 @@ Holder = EstimateReport | PooledReport | MassReport | AnotherExam
 def checked_report(document: object, kind: type[R], *, path: Path) -> R:
     """What ``estimate --json`` printed for one map, or for several: its fields, and its sizes against each other."""
     report = parse_record(document, kind, path=path)
-    try:
+    with in_file(path):
         _check_sizes(report)
         _check_verdict(report)
-    except BadDataError as error:
-        raise error.at(path) from None
     return report
 
 

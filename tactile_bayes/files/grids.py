@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 
 from tactile_bayes.declarations import replace
-from tactile_bayes.errors import BadDataError, UsageError
+from tactile_bayes.errors import BadDataError, UsageError, in_file
 from tactile_bayes.files.arrays_layout import GridOptions
 from tactile_bayes.files.grid_files import Grid, is_number, open_grid
 from tactile_bayes.findings import Finding
@@ -151,10 +151,8 @@ def read_grid(path: Path, **asked: Any) -> TactileMap:
 
 def import_grid(path: Path, asked: GridOptions) -> tuple[TactileMap, list[str]]:
     """The map of a file, and what was found on reading it; see `open_grid` and `grid_map`."""
-    try:
+    with in_file(path):
         return grid_map(open_grid(path, no_value=asked.no_value, array=asked.array or ""), asked)
-    except BadDataError as error:
-        raise error.at(path) from None
 
 
 def grid_map(grid: Grid, asked: GridOptions) -> tuple[TactileMap, list[str]]:

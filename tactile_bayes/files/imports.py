@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from tactile_bayes.declarations import Record, names_of, replace
-from tactile_bayes.errors import BadDataError, meant
+from tactile_bayes.errors import BadDataError, in_file, meant
 from tactile_bayes.files.array_map import plain_names
 from tactile_bayes.files.arrays_layout import KNOWN, LAYOUT, OPTIONAL, ArrayMap, Shape, Stated, in_words
 from tactile_bayes.files.frames_text import read_frames
@@ -72,10 +72,8 @@ def import_arrays(path: Path, given: ArrayMap | None = None, beside: Sequence[So
         Naming the file, the array, its value and the way out.
     """
     given = given or ArrayMap()
-    try:
+    with in_file(path):
         own = replace(_read(path, given, beside), path=str(path))
-    except BadDataError as error:
-        raise error.at(path) from None
     try:
         return combined([own, *beside], given)
     except BadDataError as error:

@@ -2,55 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from datetime import date
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tactile_bayes.declarations import EXACT, Meta, Record, field, to_plain
-from tactile_bayes.errors import BadDataError
+from tactile_bayes.errors import BadDataError, in_file
 from tactile_bayes.files.atomic import write_text
 from tactile_bayes.files.documents import dump_json, load_json, parse_record, read_record
 from tactile_bayes.forward.scene import FLAT_MM, Columns, Head, Pitch, Rows, Scene
 from tactile_bayes.geometry import FloatArray, Matrix
-from tactile_bayes.scans import ElementCalibration, HeadGeometry, HeadShape, Landmarks, Scan
+from tactile_bayes.scans import ElementCalibration, HeadGeometry, HeadShape, Landmarks
 
-# --- Parts of a scan file besides MCAP: head and calibration documents, times in ns, the reader's report.
-
-_NS = 1_000_000_000
-
-
-class ScanFile(Record, eq=False):
-    """A scan and the report on its file."""
-
-    scan: Scan
-    complete: bool  #: The file was closed properly and nothing was lost.
-    damaged: bool
-    """A checksum failed: bytes changed after they were written. An unfinished file is not damaged."""
-    lost: tuple[str, ...]  #: One line a loss, for people.
-    topics: Mapping[str, int]  #: Messages read, by topic.
-    provenance: Mapping[str, Any]  #: As `Provenance.as_dict` wrote it.
-    schema: str  #: Schema id of the file.
-
-
-def ns_from_s(time_s: FloatArray) -> NDArray[np.int64]:
-    """Convert times in s to whole ns.
-
-    Seconds and their fraction are converted apart: a time since 1970 times 1e9 does not fit a double's 53 bits.
-    """
-    seconds = np.floor(time_s)
-    nanos = np.rint((time_s - seconds) * _NS)
-    return seconds.astype(np.int64) * _NS + nanos.astype(np.int64)
-
-
-def s_from_ns(time_ns: NDArray[np.int64]) -> FloatArray:
-    """Convert whole ns to times in s; undoes `ns_from_s` to the bit."""
-    seconds, nanos = np.divmod(time_ns, _NS)
-    times: FloatArray = seconds + nanos / _NS
-    return times
+# --- Heads and calibrations as a scan file has them.
 
 
 def head_document(head: HeadGeometry) -> dict[str, Any]:
@@ -153,23 +119,19 @@ def read_head_geometry(path: Path) -> HeadGeometry:
 def head_geometry(document: object, *, path: Path) -> HeadGeometry:
     """The same of a document that was read from `path`."""
     file = _head_file(document, path)
-    try:
+    with in_file(path):
         if file.scanhead_from_tracker is None:
             raise BadDataError("lacks scanhead_from_tracker", way_out="add the transform from the sensor to the head")
         surface = _arc(file).surface_mm() if file.surface_mm is None else np.array(file.surface_mm)
         day = "" if file.checked_on is None else file.checked_on.isoformat()
         return HeadGeometry(surface, file.pitch_mm, np.array(file.scanhead_from_tracker), day)
-    except BadDataError as error:
-        raise error.at(path) from None
 
 
 def read_simulated_head(path: Path) -> Head:
     """Read a head for the solid model, in which taxels form a regular grid on an arc, or on a plane."""
     file = _head_file(load_json(path, way_out=_WAY_OUT), path)
-    try:
+    with in_file(path):
         return _arc(file) if file.surface_mm is None else _fitted(file, np.array(file.surface_mm))
-    except BadDataError as error:
-        raise error.at(path) from None
 
 
 def _head_file(document: object, path: Path) -> HeadFile:

@@ -19,7 +19,7 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Chunk, Metadata, Schema
 from numpy.typing import NDArray
 
-from tactile_bayes.errors import BadDataError
+from tactile_bayes.errors import BadDataError, in_file
 from tactile_bayes.files.reading import MCAP_MAGIC, check_limit, not_a, open_input, unpacked_limit, unreadable
 
 # --- Decompression of MCAP chunks within the declared and the total size limit.
@@ -41,35 +41,30 @@ class Unpacker:
 
     def unpack(self, chunk: Any) -> bytes:
         """The records of a chunk; a damaged one raises exceptions of many kinds, which `damage` says in words."""
-        data = self._decompress(chunk)
+        data = self._decompress(chunk.compression, bytes(chunk.data), chunk.uncompressed_size)
         if len(data) != chunk.uncompressed_size:
             raise ValueError(f"it holds {len(data)} bytes and declares {chunk.uncompressed_size}")
         if chunk.uncompressed_crc not in (0, zlib.crc32(data)):
             raise ValueError("its checksum does not match")
         return data
 
-    def _decompress(self, chunk: Any) -> bytes:
-        """The unpacked bytes, at most one more than the chunk declares."""
-        most = chunk.uncompressed_size
-        match chunk.compression:
-            case "":
-                return bytes(chunk.data)
-            case "zstd":
-                return self._zstd(chunk.data, most)
-            case "lz4":
-                import lz4.frame
+    def _decompress(self, packing: str, data: bytes, most: int) -> bytes:
+        """The unpacked bytes, at most one more than `most`, which the chunk declares."""
+        if packing == "":
+            return data
+        if packing == "zstd":
+            declared = zstandard.frame_content_size(data)  # -1 where the frame does not say
+            if declared not in (-1, most):
+                raise ValueError(f"its frame unpacks to {declared} bytes and it declares {most}")
+            self.count(most)
+            decompressor = zstandard.ZstdDecompressor(max_window_size=_MOST_WINDOW)
+            return decompressor.decompress(data, max_output_size=most) if most else b""
+        if packing == "lz4":
+            import lz4.frame
 
-                self.count(most)
-                return bytes(lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=most + 1))
-        raise ValueError(f"it is compressed by {chunk.compression[:20]!r}, which this program does not know")
-
-    def _zstd(self, data: bytes, most: int) -> bytes:
-        declared = zstandard.frame_content_size(data)  # -1 where the frame does not say
-        if declared not in (-1, most):
-            raise ValueError(f"its frame unpacks to {declared} bytes and it declares {most}")
-        self.count(most)
-        decompressor = zstandard.ZstdDecompressor(max_window_size=_MOST_WINDOW)
-        return decompressor.decompress(data, max_output_size=most) if most else b""
+            self.count(most)
+            return bytes(lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=most + 1))
+        raise ValueError(f"it is compressed by {packing[:20]!r}, which this program does not know")
 
 
 def damage(error: Exception) -> str:
@@ -88,13 +83,8 @@ _MESSAGE: Final = struct.Struct("<HIQQ")  # channel, sequence, log time, publish
 _CHECKSUM: Final = struct.Struct("<I")
 # a schema or channel is an object each: it counts so many bytes, however short it is written
 _DESCRIPTION_BYTES: Final = 1000
-_KINDS: Final = {
-    Opcode.CHUNK: Chunk,
-    Opcode.METADATA: Metadata,
-    Opcode.ATTACHMENT: Attachment,
-    Opcode.SCHEMA: Schema,
-    Opcode.CHANNEL: Channel,
-}
+_DESCRIPTIONS: Final = {Opcode.SCHEMA: Schema, Opcode.CHANNEL: Channel}
+_KINDS: Final = {Opcode.CHUNK: Chunk, Opcode.METADATA: Metadata, Opcode.ATTACHMENT: Attachment, **_DESCRIPTIONS}
 
 
 class Messages:
@@ -187,7 +177,10 @@ class McapRecords:
             if not len(found):
                 found = held
             elif len(held):
-                _refuse_overlap(topic, found.span_ns, held.span_ns, named=name is not None)
+                (a, b), (c, d) = found.span_ns, held.span_ns
+                if name is None and a <= d and c <= b:  # one after the other they are one recording
+                    what = f"{topic} has messages on two channels at the same time, as of two heads or two trackers"
+                    raise BadDataError(what, way_out="keep one of the channels, or one topic for each")
                 found.extend(held)
         return found
 
@@ -198,6 +191,11 @@ class McapRecords:
             counts[channel.topic] += len(self.by_channel.get(number, ()))
         return dict(sorted(counts.items()))
 
+    def lose(self, what: str, *, damaged: bool = True) -> None:
+        """Note a loss."""
+        self.lost.append(what)
+        self.damaged |= damaged
+
     def channel_messages(self, number: int) -> Messages:
         """Messages of a channel; bodies of unknown channels are kept until the channel is defined."""
         found = self.by_channel.get(number)
@@ -207,12 +205,19 @@ class McapRecords:
             found = self.by_channel[number] = Messages(keep=keep)
         return found
 
-
-def _refuse_overlap(topic: str, one: tuple[int, int], other: tuple[int, int], *, named: bool) -> None:
-    """Refuse two channels of one topic at the same time: one after the other are one recording."""
-    if not named and one[0] <= other[1] and other[0] <= one[1]:
-        what = f"{topic} has messages on two channels at the same time, as of two heads or two trackers"
-        raise BadDataError(what, way_out="keep one of the channels, or one topic for each")
+    def take(self, record: Any, data: memoryview) -> None:
+        """Keep a description, or a message whose place in the data `_parsed` gave."""
+        match record:
+            case channel, published_ns, logged_ns, start, end:
+                self.channel_messages(channel).add(published_ns, logged_ns, data[start:end])
+            case Metadata():
+                self.metadata[record.name] = dict(record.metadata)
+            case Attachment():
+                self.attachments[record.name] = record.data
+            case Schema():
+                self.schemas[record.id] = record.name
+            case Channel():
+                self.channels[record.id] = record
 
 
 def read_records(path: Path, *, keep: Collection[str] | None = None) -> McapRecords:
@@ -220,7 +225,7 @@ def read_records(path: Path, *, keep: Collection[str] | None = None) -> McapReco
     all.
     """
     records = McapRecords(keep=keep)
-    with open_input(path) as stream:
+    with open_input(path) as stream, in_file(path):
         try:
             _check_magic(stream, path)
             size = stream.seek(0, io.SEEK_END)
@@ -228,8 +233,6 @@ def read_records(path: Path, *, keep: Collection[str] | None = None) -> McapReco
             _collect(records, stream, size=size)
         except OSError as error:
             raise unreadable(path, error) from None
-        except BadDataError as error:
-            raise error.at(path) from None
     return records
 
 
@@ -253,25 +256,38 @@ def _collect(records: McapRecords, stream: IO[bytes], *, size: int) -> None:
         head = stream.read(_RECORD.size)
         opcode, length = _RECORD.unpack(head) if len(head) == _RECORD.size else (1, 0)
         if opcode == 0 or length > size:
-            _tell_damage(records, start, size=size)
+            if records.all_data:
+                records.lose("the end of the file is damaged; all messages are there", damaged=False)
+            else:
+                records.lose(f"unreadable from byte {start} of {size} on (no record begins there)")
             return
         body = stream.read(length)
-        if len(head) < _RECORD.size or len(body) < length:
-            _tell_cut(records, size=size)
-            return
-        if opcode == Opcode.DATA_END:
+        whole = len(head) == _RECORD.size and len(body) == length
+        if whole and opcode == Opcode.DATA_END:
             _end_data(records, body, checksum)
-        if opcode == Opcode.FOOTER:
-            records.finished = stream.read(len(MCAP_MAGIC)) == MCAP_MAGIC
-            if not records.finished:
-                _tell_cut(records, size=size)
+        if whole and opcode == Opcode.FOOTER:
+            whole = records.finished = stream.read(len(MCAP_MAGIC)) == MCAP_MAGIC
+            if whole:
+                return
+        if not whole:
+            cut = f"cut off at byte {size}: everything after {records.last_ns / 1e9:.3f} s is lost"
+            missing = "the end of the file is missing; all messages are there"
+            records.lose(missing if records.all_data else cut, damaged=False)
             return
         if not records.all_data:
             checksum = zlib.crc32(body, zlib.crc32(head, checksum))
-        if opcode == Opcode.MESSAGE:
-            _take_message(records, body, start=start)
-        elif opcode in _KINDS:
-            _take(records, opcode, body, start=start, unpacker=unpacker)
+        try:
+            record = _parsed(opcode, body)
+        except Exception as error:  # struct.error, EndOfFile, UnicodeDecodeError...
+            records.lose(f"the record at byte {start} makes no sense ({damage(error)})")
+            continue
+        if isinstance(record, Chunk):
+            records.chunks += 1
+            _take_chunk(records, record, unpacker)
+        elif record is not None:
+            if opcode == Opcode.MESSAGE:  # in no chunk, as writers leave it that do not index their files
+                records.last_ns = max(records.last_ns, record[2])
+            records.take(record, memoryview(body))
 
 
 def _end_data(records: McapRecords, body: bytes, checksum: int) -> None:
@@ -279,88 +295,40 @@ def _end_data(records: McapRecords, body: bytes, checksum: int) -> None:
     declared = _CHECKSUM.unpack_from(body)[0] if len(body) >= _CHECKSUM.size else 0
     if declared not in (0, checksum):
         if not records.damaged:  # a damaged chunk was told already; otherwise it is a description
-            records.lost.append("a record outside the chunks changed (the checksum of the whole does not match)")
+            records.lose("a record outside the chunks changed (the checksum of the whole does not match)")
         records.damaged = True
     records.all_data = True
 
 
-def _tell_cut(records: McapRecords, *, size: int) -> None:
-    if records.all_data:
-        records.lost.append("the end of the file is missing; all messages are there")
-    else:
-        records.lost.append(f"cut off at byte {size}: everything after {records.last_ns / 1e9:.3f} s is lost")
-
-
-def _tell_damage(records: McapRecords, position: int, *, size: int) -> None:
-    if records.all_data:
-        records.lost.append("the end of the file is damaged; all messages are there")
-        return
-    records.damaged = True
-    records.lost.append(f"unreadable from byte {position} of {size} on (no record begins there)")
-
-
-def _take(records: McapRecords, opcode: int, body: bytes, *, start: int, unpacker: Unpacker) -> None:
-    """Keep one record from outside the chunks, or note that it is invalid."""
-    try:
-        record = _KINDS[Opcode(opcode)].read(ReadDataStream(io.BytesIO(body)))
-    except Exception as error:  # struct.error, EndOfFile, UnicodeDecodeError...
-        records.damaged = True
-        records.lost.append(f"the record at byte {start} makes no sense ({damage(error)})")
-        return
-    if isinstance(record, Chunk):
-        records.chunks += 1
-        _take_chunk(records, record, unpacker)
-    else:
-        _describe(records, record)
-
-
-def _take_message(records: McapRecords, body: bytes, *, start: int) -> None:
-    """Keep a message that is in no chunk, as writers leave it that do not index their files."""
-    if len(body) < _MESSAGE.size:
-        records.damaged = True
-        records.lost.append(f"the record at byte {start} makes no sense (a message is shorter than its head)")
-        return
-    channel, _, logged_ns, publish_ns = _MESSAGE.unpack_from(body)
-    records.last_ns = max(records.last_ns, logged_ns)
-    with memoryview(body) as view:
-        records.channel_messages(channel).add(publish_ns, logged_ns, view[_MESSAGE.size :])
-
-
-def _describe(records: McapRecords, record: Any) -> None:
-    match record:
-        case Metadata():
-            records.metadata[record.name] = dict(record.metadata)
-        case Attachment():
-            records.attachments[record.name] = record.data
-        case Schema():
-            records.schemas[record.id] = record.name
-        case Channel():
-            records.channels[record.id] = record
+def _parsed(opcode: int, data: bytes, start: int = 0, end: int | None = None) -> Any:
+    """A record; of a message channel, publish and log time, and where its body starts and ends; None for others."""
+    end = len(data) if end is None else end
+    if opcode == Opcode.MESSAGE:
+        if end - start < _MESSAGE.size:
+            raise ValueError("a message is shorter than its head")
+        channel, _, logged_ns, published_ns = _MESSAGE.unpack_from(data, start)
+        return channel, published_ns, logged_ns, start + _MESSAGE.size, end
+    return _KINDS[Opcode(opcode)].read(ReadDataStream(io.BytesIO(data[start:end]))) if opcode in _KINDS else None
 
 
 def _take_chunk(records: McapRecords, chunk: Any, unpacker: Unpacker) -> None:
     """Keep all messages of a chunk; none when it is damaged."""
     try:
         data = unpacker.unpack(chunk)
-        descriptions, spans = _split(data, unpacker)
+        held = list(_split(data, unpacker))
     except BadDataError:  # over a limit
         raise
     except Exception as error:  # each decompressor has an error class of its own, and so have records
         start, end = chunk.message_start_time / 1e9, chunk.message_end_time / 1e9
-        records.lost.append(f"chunk {records.chunks}, {start:.3f} to {end:.3f} s: {damage(error)}")
-        records.damaged = True
+        records.lose(f"chunk {records.chunks}, {start:.3f} to {end:.3f} s: {damage(error)}")
         return
     records.last_ns = max(records.last_ns, chunk.message_end_time)
-    for record in descriptions:
-        _describe(records, record)
-    with memoryview(data) as view:
-        for channel, time_ns, logged_ns, start, end in spans:
-            records.channel_messages(channel).add(time_ns, logged_ns, view[start:end])
+    for record in held:
+        records.take(record, memoryview(data))
 
 
-def _split(data: bytes, unpacker: Unpacker) -> tuple[list[Any], list[tuple[int, int, int, int, int]]]:
-    """Schemas and channels of a chunk, and its messages: channel, publish and log time, start, end."""
-    descriptions, spans = [], []
+def _split(data: bytes, unpacker: Unpacker) -> Iterator[Any]:
+    """Schemas, channels and messages of a chunk, see `_parsed`."""
     offset = 0
     while offset < len(data):
         opcode, size = _RECORD.unpack_from(data, offset)
@@ -368,12 +336,7 @@ def _split(data: bytes, unpacker: Unpacker) -> tuple[list[Any], list[tuple[int, 
         offset = start + size
         if offset > len(data):
             raise ValueError("a record ends beyond it")
-        if opcode == Opcode.MESSAGE:
-            if size < _MESSAGE.size:
-                raise ValueError("a message is shorter than its head")
-            channel, _, logged_ns, publish_ns = _MESSAGE.unpack_from(data, start)
-            spans.append((channel, publish_ns, logged_ns, start + _MESSAGE.size, offset))
-        elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+        if opcode in _DESCRIPTIONS:
             unpacker.count(_DESCRIPTION_BYTES)
-            descriptions.append(_KINDS[Opcode(opcode)].read(ReadDataStream(io.BytesIO(data[start:offset]))))
-    return descriptions, spans
+        if opcode == Opcode.MESSAGE or opcode in _DESCRIPTIONS:
+            yield _parsed(opcode, data, start, offset)

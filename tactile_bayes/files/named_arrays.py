@@ -12,7 +12,7 @@ import numpy as np
 import scipy.io
 
 from tactile_bayes.declarations import Record
-from tactile_bayes.errors import BadDataError
+from tactile_bayes.errors import BadDataError, in_file
 from tactile_bayes.files.arrays_layout import Stated
 from tactile_bayes.files.mat_5 import MAT_5, load_mat_5
 from tactile_bayes.files.netcdf import Group, as_declared, open_netcdf
@@ -58,7 +58,7 @@ def read_named(path: Path, choose: Choose) -> Arrays:
         For a file of another kind, a damaged one, one that unpacks to more than its limit, and objects.
     """
     start = _start(path)
-    try:
+    with in_file(path):
         if start.startswith(ZIP_MAGIC[:2]):
             return choose_npz(path, choose)
         if start.startswith(np.lib.format.MAGIC_PREFIX):
@@ -71,8 +71,6 @@ def read_named(path: Path, choose: Choose) -> Arrays:
             return _hdf5(path, choose)
         if start.startswith(b"CDF"):
             return _chosen(_netcdf_3(path), choose)
-    except BadDataError as error:
-        raise error.at(path) from None
     raise _of_another_kind(path, start)
 
 

@@ -14,7 +14,7 @@ import h5py
 import numpy as np
 
 from tactile_bayes.declarations import Record
-from tactile_bayes.errors import BadDataError
+from tactile_bayes.errors import BadDataError, in_file
 from tactile_bayes.files.documents import check_text
 from tactile_bayes.files.reading import (
     HDF5_MAGIC,
@@ -320,16 +320,13 @@ def _has_scales(dataset: Any) -> bool:
 def open_netcdf(path: Path, *, way_out: str, begins_at: int = 0) -> Iterator[Group]:
     """The root group of a netCDF-4 or HDF5 file, whose first byte is at `begins_at`; every fault in the block becomes a
     `BadDataError` that names `path`."""
-    try:
-        with open_input(path) as stream, decoding(_DAMAGED, way_out=way_out):
-            stream.seek(begins_at)
-            if stream.read(len(HDF5_MAGIC)) != HDF5_MAGIC:
-                raise not_a(path, "a map or posterior (netCDF)", what=_DAMAGED, way_out=way_out)
-            check_limit(stream.seek(0, io.SEEK_END), NETCDF_BYTES, what="it has {} bytes")
-            stream.seek(0)
-            data = stream.read()
-            check_heaps(data, way_out=way_out)
-            with h5py.File(io.BytesIO(data), "r") as file:
-                yield Group(file, most_bytes=unpacked_limit(len(data)), way_out=way_out)
-    except BadDataError as error:
-        raise error.at(path) from None
+    with in_file(path), open_input(path) as stream, decoding(_DAMAGED, way_out=way_out):
+        stream.seek(begins_at)
+        if stream.read(len(HDF5_MAGIC)) != HDF5_MAGIC:
+            raise not_a(path, "a map or posterior (netCDF)", what=_DAMAGED, way_out=way_out)
+        check_limit(stream.seek(0, io.SEEK_END), NETCDF_BYTES, what="it has {} bytes")
+        stream.seek(0)
+        data = stream.read()
+        check_heaps(data, way_out=way_out)
+        with h5py.File(io.BytesIO(data), "r") as file:
+            yield Group(file, most_bytes=unpacked_limit(len(data)), way_out=way_out)

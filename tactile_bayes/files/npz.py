@@ -13,7 +13,7 @@ from typing import IO, Any, Final
 
 import numpy as np
 
-from tactile_bayes.errors import BadDataError
+from tactile_bayes.errors import BadDataError, in_file
 from tactile_bayes.files.atomic import write_bytes
 from tactile_bayes.files.reading import (
     NETCDF_BYTES,
@@ -182,14 +182,12 @@ def write_shape(path: Path, shape: ShapeDraws, *, force: bool = False) -> None:
 
 def read_shape(path: Path) -> ShapeDraws:
     """Read what `write_shape` wrote."""
-    try:
+    with in_file(path):
         optional = [name for name in ShapeDraws.__struct_fields__ if name not in _DRAWS]
         arrays = load_npz(path, required=_DRAWS, optional=optional)
         if len({arrays[name].shape for name in _DRAWS}) > 1:
             raise BadDataError("holds draws of several lengths", way_out="estimate the map again")
         return ShapeDraws(**{name: _value(name, array) for name, array in arrays.items()})
-    except BadDataError as error:
-        raise error.at(path) from None
 
 
 def _value(name: str, array: np.ndarray[Any, Any]) -> Any:

@@ -20,7 +20,7 @@ from typing import Any, Final
 import numpy as np
 
 from tactile_bayes.declarations import replace
-from tactile_bayes.errors import BadDataError
+from tactile_bayes.errors import BadDataError, in_file
 from tactile_bayes.files.arrays_layout import Stated
 from tactile_bayes.files.named_arrays import Source
 from tactile_bayes.files.text_lines import Line, TextTable, read_text_table
@@ -68,13 +68,11 @@ def read_poses(path: Path, given: Stated) -> Source:
     BadDataError
         Where it has several tools and none is stated, no times, or columns that are none of a known layout.
     """
-    try:
+    with in_file(path):
         table = read_text_table(path, given.decimal)
         header = next((line for line in table.lines if is_header_of_poses(line)), None)
         found = _bare(table, given) if header is None else _named(table, header, given)
         return replace(found, notes=(f"poses: {table.words}", *found.notes))
-    except BadDataError as error:
-        raise error.at(path) from None
 
 
 def _plain(name: str) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
-from typing import IO, Any, Final
+from typing import IO, Any, Final, TypeVar
 
 import numpy as np
 from foxglove_schemas_protobuf.Grid_pb2 import Grid
@@ -17,11 +17,11 @@ from mcap_protobuf.schema import build_file_descriptor_set
 from numpy.typing import NDArray
 
 from tactile_bayes import __version__
-from tactile_bayes.declarations import from_plain
-from tactile_bayes.errors import BadDataError
+from tactile_bayes.declarations import Record, from_plain
+from tactile_bayes.errors import BadDataError, in_file
 from tactile_bayes.files.atomic import atomic_path, refuse_existing
 from tactile_bayes.files.documents import check_session, parse_json
-from tactile_bayes.files.instrument_json import ScanFile, calibration_document, head_document, ns_from_s, s_from_ns
+from tactile_bayes.files.instrument_json import calibration_document, head_document
 from tactile_bayes.files.mcap_records import McapRecords, Messages, read_records
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.findings import Finding, finding_lines, findings_in
@@ -66,6 +66,7 @@ TOPICS: Final = ("/pressure", "/pose", "/landmark")
 _NS: Final = 1_000_000_000
 _CALIBRATION: Final = "element_calibration.json"
 _LATEST_NS: Final = 2**63 - 1
+T = TypeVar("T")
 
 
 class ScanWriter:
@@ -97,39 +98,30 @@ class ScanWriter:
             enable_data_crcs=True,
         )
         self._writer.start(profile="", library=f"tactile-bayes/{__version__}")
-        self._describe(session, provenance, truth)
+        told: dict[str, Any] = {"provenance": provenance.as_dict()}
+        if truth is not None:
+            told["truth"] = truth
         if findings:
-            self._writer.add_metadata("findings", {"json": _compact([one.as_dict() for one in findings])})
-        self._attach("head.json", head_document(head))
-        self._attach(_CALIBRATION, calibration_document(element_calibration))
-        self._register()
-        self._grid = _grid_of(head).SerializeToString(deterministic=True)
-
-    def _describe(self, session: Mapping[str, str], provenance: Provenance, truth: Mapping[str, Any] | None) -> None:
+            told["findings"] = [one.as_dict() for one in findings]
         units = {"length_unit": "mm", "time_unit": "ns", "pressure": "raw counts"}
         self._writer.add_metadata("tactile-bayes", {"schema": SCAN_SCHEMA, **units})
         self._writer.add_metadata("session", dict(sorted(session.items())))
-        self._writer.add_metadata("provenance", {"json": _compact(provenance.as_dict())})
-        if truth is not None:
-            self._writer.add_metadata("truth", {"json": _compact(truth)})
-
-    def _attach(self, name: str, document: object) -> None:
-        data = _compact(document).encode()
-        self._writer.add_attachment(create_time=0, log_time=0, name=name, media_type="application/json", data=data)
-
-    def _register(self) -> None:
-        self._schema_of = {
-            kind: self._writer.register_schema(
-                name=kind.DESCRIPTOR.full_name,
-                encoding="protobuf",
-                data=build_file_descriptor_set(kind).SerializeToString(deterministic=True),
-            )
-            for kind in (Grid, PoseInFrame)
-        }
-
+        for name, document in told.items():
+            self._writer.add_metadata(name, {"json": _compact(document)})
+        parts = {"head.json": head_document(head), _CALIBRATION: calibration_document(element_calibration)}
+        for name, document in parts.items():
+            data = _compact(document).encode()
+            self._writer.add_attachment(create_time=0, log_time=0, name=name, media_type="application/json", data=data)
+        self._schema_of = {kind: self._schema(kind) for kind in (Grid, PoseInFrame)}
         self._frame_channel = self._channel("/pressure", Grid)
         self._pose_channel = self._channel("/pose", PoseInFrame)
         self._landmark_channel = {name: self._channel("/landmark", PoseInFrame, name=name) for name in LANDMARK_NAMES}
+        self._grid = _grid_of(head).SerializeToString(deterministic=True)
+
+    def _schema(self, kind: Any) -> int:
+        data = build_file_descriptor_set(kind).SerializeToString(deterministic=True)
+        number: int = self._writer.register_schema(name=kind.DESCRIPTOR.full_name, encoding="protobuf", data=data)
+        return number
 
     def _channel(self, topic: str, kind: Any, **metadata: str) -> int:
         number: int = self._writer.register_channel(
@@ -208,6 +200,23 @@ def _pose_message(position_mm: FloatArray, quaternion_wxyz: FloatArray) -> Any:
     return message
 
 
+def ns_from_s(time_s: FloatArray) -> NDArray[np.int64]:
+    """Convert times in s to whole ns.
+
+    Seconds and their fraction are converted apart: a time since 1970 times 1e9 does not fit a double's 53 bits.
+    """
+    seconds = np.floor(time_s)
+    nanos = np.rint((time_s - seconds) * _NS)
+    return seconds.astype(np.int64) * _NS + nanos.astype(np.int64)
+
+
+def s_from_ns(time_ns: NDArray[np.int64]) -> FloatArray:
+    """Convert whole ns to times in s; undoes `ns_from_s` to the bit."""
+    seconds, nanos = np.divmod(time_ns, _NS)
+    times: FloatArray = seconds + nanos / _NS
+    return times
+
+
 def write_scan(
     path: Path, scan: Scan, *, provenance: Provenance, truth: Mapping[str, Any] | None = None, force: bool = False
 ) -> None:
@@ -263,15 +272,43 @@ def read_scan(path: Path) -> Scan:
     return file.scan
 
 
+class ScanFile(Record, eq=False):
+    """A scan and the report on its file."""
+
+    scan: Scan
+    complete: bool  #: The file was closed properly and nothing was lost.
+    damaged: bool
+    """A checksum failed: bytes changed after they were written. An unfinished file is not damaged."""
+    lost: tuple[str, ...]  #: One line a loss, for people.
+    topics: Mapping[str, int]  #: Messages read, by topic.
+    provenance: Mapping[str, Any]  #: As `Provenance.as_dict` wrote it.
+    schema: str  #: Schema id of the file.
+
+
 def read_scan_report(path: Path) -> ScanFile:
     """Read a scan, with a report of the file's content and losses. A file cut off before its first complete chunk is an
     error.
     """
     records = scan_records(path, keep=TOPICS)
-    try:
-        return _assemble(records, path=path)
-    except BadDataError as error:
-        raise error.at(path) from None
+    with in_file(path):
+        head = _attached(records, HeadGeometry, "head.json")
+        calibration = _attached(records, ElementCalibration, _CALIBRATION)
+        session = records.metadata.get("session", {})
+        check_session(session, path=path)
+        frames = _frames(records, head)
+        if not len(frames) and not records.finished:
+            way_out = "copy it again from where it was recorded: this copy holds no frame"
+            raise BadDataError("was cut off before its first complete frame", way_out=way_out)
+        landmarks, findings = _landmarks(records), file_findings(records)
+        return ScanFile(
+            scan=Scan(frames, _poses(records), head, calibration, landmarks, session, findings),
+            complete=records.finished and not records.lost,
+            damaged=records.damaged,
+            lost=tuple(records.lost),
+            topics=records.topic_counts(),
+            provenance=provenance_of(records),
+            schema=SCAN_SCHEMA,
+        )
 
 
 def read_truth(path: Path) -> dict[str, Any] | None:
@@ -296,36 +333,6 @@ def scan_records(path: Path, *, keep: Collection[str]) -> McapRecords:
     return records
 
 
-def _assemble(records: McapRecords, *, path: Path) -> ScanFile:
-    head = from_plain(HeadGeometry, json_attachment(records, "head.json"), where="head.json")
-    calibration = from_plain(ElementCalibration, json_attachment(records, _CALIBRATION), where=_CALIBRATION)
-    session = records.metadata.get("session", {})
-    check_session(session, path=path)
-    frames = _frames(records, head)
-    if not len(frames) and not records.finished:
-        way_out = "copy it again from where it was recorded: this copy holds no frame"
-        raise BadDataError("was cut off before its first complete frame", way_out=way_out)
-    scan = Scan(
-        frames,
-        _poses(records),
-        head,
-        calibration,
-        landmarks=_landmarks(records),
-        session=session,
-        findings=file_findings(records),
-    )
-    provenance = json_object(records.metadata.get("provenance", {}).get("json", "{}"), name="provenance")
-    return ScanFile(
-        scan=scan,
-        complete=records.finished and not records.lost,
-        damaged=records.damaged,
-        lost=tuple(records.lost),
-        topics=records.topic_counts(),
-        provenance=provenance,
-        schema=SCAN_SCHEMA,
-    )
-
-
 def file_findings(records: McapRecords) -> tuple[Finding, ...]:
     """Losses of a scan's file, notes of its recorder, and findings of the file that it is a copy of."""
     kept = parse_json(records.metadata.get("findings", {}).get("json", "[]"), name="findings")
@@ -334,14 +341,20 @@ def file_findings(records: McapRecords) -> tuple[Finding, ...]:
     return (*findings_in(kept), *lost, *(Finding("recorder_noted", text) for text in noted))
 
 
-def json_attachment(records: McapRecords, name: str) -> dict[str, Any]:
-    """Read an attached JSON object."""
+def provenance_of(records: McapRecords) -> dict[str, Any]:
+    """The provenance of a scan's file, as `Provenance.as_dict` wrote it."""
+    return json_object(records.metadata.get("provenance", {}).get("json", "{}"), name="provenance")
+
+
+def _attached(records: McapRecords, kind: type[T], name: str) -> T:
+    """A record from its JSON among the attachments."""
     if name not in records.attachments:
         way_out = "copy it again: it was cut off in its header"
         if records.finished:
             way_out = "attach it again: the program that wrote this copy left it out"
         raise BadDataError(f"holds no {name}", way_out=way_out)
-    return json_object(records.attachments[name].decode("utf-8", "replace"), name=name)
+    document = json_object(records.attachments[name].decode("utf-8", "replace"), name=name)
+    return from_plain(kind, document, where=name)
 
 
 def json_object(text: str, *, name: str) -> dict[str, Any]:
@@ -428,14 +441,12 @@ def summarise_scan(path: Path) -> dict[str, Any]:
     Nothing looks into the messages: those that hold what they must not are not met.
     """
     records = scan_records(path, keep=())
-    try:
+    with in_file(path):
         return _summary(records)
-    except BadDataError as error:
-        raise error.at(path) from None
 
 
 def _summary(records: McapRecords) -> dict[str, Any]:
-    head = from_plain(HeadGeometry, json_attachment(records, "head.json"), where="head.json")
+    head = _attached(records, HeadGeometry, "head.json")
     time_s = message_times(records.messages("/pressure", schema="foxglove.Grid"), topic="/pressure")
     pose_s = message_times(records.messages("/pose", schema="foxglove.PoseInFrame"), topic="/pose")
     account = records.metadata.get("recording", {})
@@ -456,7 +467,7 @@ def _summary(records: McapRecords) -> dict[str, Any]:
         "nipple": _touched(records, NIPPLE),
         "units": {"counts": "raw, 0 to saturation", "pressure": "kPa", "position": "mm", "time": "s"},
         "session": dict(records.metadata.get("session", {})),
-        "provenance": json_object(records.metadata.get("provenance", {}).get("json", "{}"), name="provenance"),
+        "provenance": provenance_of(records),
     }
 
 

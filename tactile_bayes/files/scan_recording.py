@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import IO, Any, Final
 
 from foxglove_schemas_protobuf.Log_pb2 import Log
-from mcap_protobuf.schema import build_file_descriptor_set
 
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.atomic import refuse_existing
@@ -99,14 +98,10 @@ class _Syncer:
                 continue
             self._dirty.clear()
             try:
-                _to_disk(self._descriptor)
+                getattr(os, "fdatasync", os.fsync)(self._descriptor)  # not every system has the first
             except OSError as error:
                 self._error = error
                 return
-
-
-def _to_disk(descriptor: int) -> None:
-    getattr(os, "fdatasync", os.fsync)(descriptor)  # not every system has it
 
 
 class RecordingWriter(ScanWriter):
@@ -128,10 +123,8 @@ class RecordingWriter(ScanWriter):
         )
         self._stream = stream
         self._syncer: _Syncer | None = None
-        schema = build_file_descriptor_set(Log).SerializeToString(deterministic=True)
-        number = self._writer.register_schema(name=Log.DESCRIPTOR.full_name, encoding="protobuf", data=schema)
         self._log_channel: int = self._writer.register_channel(
-            topic=LOG_TOPIC, message_encoding="protobuf", schema_id=number
+            topic=LOG_TOPIC, message_encoding="protobuf", schema_id=self._schema(Log)
         )
         self.flush()
 

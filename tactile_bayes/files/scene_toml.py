@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated, Any, Final
 
 from tactile_bayes.declarations import Meta, Record, as_dict, field, from_plain, names_of
-from tactile_bayes.errors import BadDataError
+from tactile_bayes.errors import BadDataError, in_file
 from tactile_bayes.files.documents import parse_toml
 from tactile_bayes.files.reading import TOML_BYTES, read_text
 from tactile_bayes.forward.scene import (
@@ -96,10 +96,8 @@ class SceneFile(Record):
 def read_scene(path: Path) -> Scene:
     """Read a scene; missing keys take their defaults."""
     text = read_text(path, most=TOML_BYTES, way_out="give a scene as TOML")
-    try:
+    with in_file(path):
         return scene_from_toml(text)
-    except BadDataError as error:
-        raise error.at(path) from None
 
 
 def scene_from_toml(text: str) -> Scene:

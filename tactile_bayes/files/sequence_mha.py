@@ -15,7 +15,7 @@ from typing import Final
 import numpy as np
 
 from tactile_bayes.declarations import replace
-from tactile_bayes.errors import BadDataError
+from tactile_bayes.errors import BadDataError, in_file
 from tactile_bayes.files.arrays_layout import Stated
 from tactile_bayes.files.named_arrays import Source
 from tactile_bayes.files.npz import Arrays
@@ -47,7 +47,7 @@ def is_sequence(path: Path) -> bool:
 def read_sequence(path: Path, given: Stated, *, frames: bool) -> Source:
     """Read the poses, and with `frames` the images and their times; see `files.poses_text.read_poses`."""
     data = read_bytes(path, most=NETCDF_BYTES)
-    try:
+    with in_file(path):
         last = _LAST_KEY.search(data)
         if last is None or last[1] != b"LOCAL":
             raise BadDataError("has no numbers behind a line ElementDataFile = LOCAL", way_out="save it as one .mha")
@@ -55,8 +55,6 @@ def read_sequence(path: Path, given: Stated, *, frames: bool) -> Source:
             keys = dict(_LINE.findall(data[: last.end()].decode("utf-8")))
         found = _poses(keys, given)
         return replace(found, arrays={**found.arrays, **_frames(keys, data[last.end() :])}) if frames else found
-    except BadDataError as error:
-        raise error.at(path) from None
 
 
 def _each(keys: dict[str, str], name: str, number: int) -> list[str]:
