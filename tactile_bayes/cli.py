@@ -40,7 +40,7 @@ GROUPS: dict[str, dict[str, tuple[str, str]]] = {
         "emulate": ("devices.emulate_command", "Serve a scan as a scan head or a tracker would send it."),
     },
     "The laboratory": {
-        "calibrate": ("calibrate.command", "Learn a calibration of sizes or of an array."),
+        "calibrate": ("calibrate.calibrate_command", "Learn a calibration of sizes or of an array."),
         "diagnose": ("exam.diagnose_command", "Check a posterior's draws: convergence and figures."),
         "simulate": ("laboratory.simulate_command", "Make a scan with known truth from a scene."),
         "study": ("laboratory.study_command", "Amplitude and width over sizes, depths and stiffnesses."),

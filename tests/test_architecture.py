@@ -18,7 +18,7 @@ MODULES = sorted(PACKAGE.rglob("*.py"))
 SHELL = {"cli.py", "__main__.py", "actions", "commands", "report"}
 CORE = [path for path in MODULES if path.relative_to(PACKAGE).parts[0] not in SHELL]
 MOST_LINES = 600
-MOST_INSIDE = 60
+MOST_INSIDE = 30
 
 
 def name_of(path: Path) -> str:

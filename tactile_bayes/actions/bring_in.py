@@ -12,7 +12,7 @@ import numpy as np
 from tactile_bayes.actions.exam import describe_scan
 from tactile_bayes.commands.options import refuse_same
 from tactile_bayes.declarations import Record, as_dict, names_of, replace
-from tactile_bayes.errors import BadDataError, TactileBayesError, UsageError, one_line
+from tactile_bayes.errors import EXIT_DONE, BadDataError, TactileBayesError, UsageError, one_line
 from tactile_bayes.files.array_map import array_template, read_array_map
 from tactile_bayes.files.arrays_layout import ArrayMap, GridOptions, Stated
 from tactile_bayes.files.atomic import check_suffix, refuse_existing
@@ -56,7 +56,6 @@ class Wanted(Record):
 
 
 def import_action(
-    ctx: click.Context,
     *,
     sources: tuple[Path, ...],
     output: Path | None,
@@ -67,12 +66,12 @@ def import_action(
     array_calibration: Path | None,
     landmarks: Path | None,
     **given: Any,
-) -> None:
+) -> int:
     """Import scans, grids and images from other programs."""
     if template:
         for source in sources or (None,):
             click.echo(array_template(source), nl=False)
-        return
+        return EXIT_DONE
     if not sources or output is None:
         raise UsageError(f"Missing {'option -o' if sources else 'argument SRC'}; `import --help` has examples")
     stated = {name: given.pop(name) for name in names_of(Stated)}
@@ -88,18 +87,12 @@ def import_action(
     grid = GridOptions(**{name: given.pop(name) for name in names_of(GridOptions)})
     wanted = Wanted(**given, grid=grid, arrays=arrays, beside=beside)
     if len(sources) == 1 and not output.is_dir():
-        lines = _import(sources[0], output, wanted)
+        lines, failed = _import(sources[0], output, wanted), EXIT_DONE
     else:
         lines, failed = _import_each(sources, output, wanted)
-        if failed:
-            _tell(lines)
-            ctx.exit(failed)
-    _tell(lines)
-
-
-def _tell(lines: list[str]) -> None:
     for line in (*lines, RESEARCH_USE):
         click.echo(line)
+    return failed
 
 
 def _import_each(sources: tuple[Path, ...], folder: Path, wanted: Wanted) -> tuple[list[str], int]:

@@ -14,7 +14,6 @@ from tactile_bayes.api.size_calibration import EqSixFit, PopulationForm, is_popu
 from tactile_bayes.commands.options import also_read, typed_options
 from tactile_bayes.declarations import as_dict
 from tactile_bayes.errors import BadDataError, UsageError, in_file
-from tactile_bayes.files.atomic import refuse_existing
 from tactile_bayes.files.instrument_json import ArrayCalibrationFile, write_array_calibration
 from tactile_bayes.files.provenance import Provenance, hash_inputs
 from tactile_bayes.files.scan_mcap import read_scan
@@ -110,7 +109,6 @@ def calibrate_size_action(
     force: bool,
 ) -> None:
     """Learn Eq 6, d = m sigma / (e a^f) + b, from a study or a set of phantoms, or over a population of bodies."""
-    refuse_existing(output, figure, force=force)
     declared = {"normalise": normalise, "background": background, "fit_radius_mm": fit_radius_mm, "noise": noise}
     if correct is not None:
         why = "is for learning a calibration; leave it out with --correct"
@@ -153,7 +151,6 @@ def calibrate_repeatability_action(folder: Path, output: Path, size_calibration:
     """Learn how far sizes of one mass lie apart between its exams at this site."""
     if size_calibration is not None:
         also_read(size_calibration_path(size_calibration))
-    refuse_existing(output, force=force)
     learned = learn_from_exams(exams_in(folder), size_calibration=size_calibration)
     learned.write(output, force=force)
     click.echo(repeatability_text(learned.document), nl=False)
@@ -163,6 +160,5 @@ def calibrate_array_action(
     steps: tuple[tuple[float, Path], ...], output: Path, head_id: str | None, day: datetime | None, force: bool
 ) -> None:
     """Learn the gain and offset of each taxel from a pressure bladder, and how uneven they stay."""
-    refuse_existing(output, force=force)
     measured = day.date() if day else date.today()
     click.echo(calibrate_array(steps, output, head_id=head_id, day=measured, force=force), nl=False)

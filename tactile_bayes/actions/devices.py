@@ -17,8 +17,8 @@ import click
 import numpy as np
 
 from tactile_bayes.actions.exam import describe_scan
+from tactile_bayes.actions.record import record_action
 from tactile_bayes.errors import BadDataError, DeviceError, UsageError
-from tactile_bayes.files.atomic import refuse_existing
 from tactile_bayes.files.provenance import Provenance, hash_inputs
 from tactile_bayes.files.scan_mcap import read_scan, read_scan_report, read_truth, write_scan
 from tactile_bayes.files.scan_recording import refuse_recording
@@ -173,7 +173,6 @@ def _pivot(url: str, protocol: str, tool: str | None, duration_s: float) -> None
 
 
 def replay_action(
-    record: Callable[..., object],
     *,
     scan: Path,
     output: Path | None,
@@ -182,17 +181,16 @@ def replay_action(
     size_calibration: str,
     speed: float,
     force: bool,
-) -> None:
-    """Replay a scan through emulated devices, recorder and live view, as if it were being recorded by `record`."""
-    refuse_existing(output, force=force)
+) -> int:
+    """Replay a scan through emulated devices, recorder and live view, as if it were being recorded."""
     found = read_scan(scan)
     with tempfile.TemporaryDirectory() as folder, _emulated(scan, speed, poses=bool(len(found.poses))) as urls:
         options = {"like": scan, "clock": "shared", "at_once": True, "live": live, "serve": serve, "force": force}
-        options |= {"output": output or Path(folder) / "replayed.mcap", "size_calibration": size_calibration}
+        options["size_calibration"] = size_calibration
         options |= {f"{role}_url": url for role, url in urls.items()} | {"tracker_protocol": "open"}
         if found.landmarks is not None:
             options["landmarks"] = scan
-        record(**options)
+        return record_action(output or Path(folder) / "replayed.mcap", **options)
 
 
 @contextmanager
@@ -223,7 +221,6 @@ def _emulated(scan: Path, speed: float, *, poses: bool) -> Iterator[dict[str, st
 
 def repair_action(*, scan: Path, output: Path | None, force: bool) -> None:
     """Repair a scan that was cut off or damaged: keep what is intact, report what is lost."""
-    refuse_existing(output, force=force)
     if output is None:
         refuse_recording(scan)
     file = read_scan_report(scan)

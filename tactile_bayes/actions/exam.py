@@ -179,7 +179,6 @@ def diagnose_action(
     """Check the draws of a posterior: R-hat, effective draws and Monte-Carlo errors of every size and width."""
     figures = {"rank": rank, "trace": trace, "corner": corner}  # ranks first: they may be refused
     asked = {kind: path for kind, path in figures.items() if path is not None}
-    refuse_existing(*asked.values(), force=force)
     found = diagnosed(posterior)
     for kind, path in asked.items():
         found.draw(kind, path, force=force)
@@ -192,10 +191,10 @@ EMBEDDED = ("scan.mcap", "phantoms.csv", "trial.csv", "excision.csv", "scene.tom
 PROGRAM = "tactile-bayes"
 
 
-def demo_action(ctx: click.Context, output: Path, method: str, force: bool) -> None:
+def demo_action(output: Path, method: str, force: bool) -> None:
     """Run the main job on an embedded scan: map, estimate, and the report of a trial."""
     _prepare(output, force=force)
-    steps = Steps(ctx, output, method=method, force=force)
+    steps = Steps(output, method=method, force=force)
     truth = _truth(output / "scan.mcap")
     click.echo(f"The scan is simulated: a ball of {truth:g} mm in a breast of fat and gland ({output / 'scene.toml'}).")
     click.echo(f"Each step is printed as the command that repeats it by hand.{_how_to_type()}")
@@ -211,7 +210,6 @@ def demo_action(ctx: click.Context, output: Path, method: str, force: bool) -> N
 class Steps(Record):
     """Steps of the demo, run in the folder with its inputs."""
 
-    ctx: click.Context  #: Of the demo itself; every step is invoked from it.
     folder: Path  #: Holds the embedded files and takes what is made of them.
     method: str  #: Of the default road's estimate.
     force: bool  #: Whether files of an earlier demo are overwritten.
@@ -249,7 +247,7 @@ class Steps(Record):
         # typed again, it meets what the demo made
         click.echo(f"$ {PROGRAM} {name} {_as_typed(command, parameters | {'force': True})}")
         try:
-            self.ctx.invoke(command, **parameters, force=self.force)
+            click.get_current_context().invoke(command, **parameters, force=self.force)
         except click.exceptions.Exit as end:  # a step that says its exit code; anything but 0 ends the demo with it
             if end.exit_code:
                 raise

@@ -21,7 +21,7 @@ import numpy as np
 from tactile_bayes.actions.live_view import live_view
 from tactile_bayes.commands.options import also_read
 from tactile_bayes.declarations import as_dict
-from tactile_bayes.errors import EXIT_INTERRUPTED, DeviceError, UsageError
+from tactile_bayes.errors import EXIT_DONE, EXIT_INTERRUPTED, DeviceError, UsageError
 from tactile_bayes.files.atomic import refuse_existing, unwritable
 from tactile_bayes.files.documents import check_session, read_session
 from tactile_bayes.files.instrument_json import read_array_calibration, read_head_geometry, read_landmarks
@@ -242,7 +242,7 @@ class Keys:
 # --- `record`: record a scan head and a tracker to a scan file without losing data.
 
 
-def record_action(ctx: click.Context, /, output: Path, **options: Any) -> None:
+def record_action(output: Path, **options: Any) -> int:
     """Record a scan head and a tracker."""
     request = Request(output=output, **options)
     also_read(size_calibration_path(request.size_calibration))
@@ -250,7 +250,7 @@ def record_action(ctx: click.Context, /, output: Path, **options: Any) -> None:
     click.echo(record_text(report, output=str(output)), nl=False)
     if report.fault:
         raise DeviceError(report.fault)
-    ctx.exit(EXIT_INTERRUPTED if interrupted and request.duration_s is not None else 0)
+    return EXIT_INTERRUPTED if interrupted and request.duration_s is not None else EXIT_DONE
 
 
 def make_recording(request: Request) -> tuple[Report, bool]:

@@ -15,7 +15,7 @@ from tactile_bayes.batch import fault_lines, open_executor, run_batch
 from tactile_bayes.batch_store import open_unfinished, unfinished
 from tactile_bayes.declarations import as_dict, names_of
 from tactile_bayes.errors import TactileBayesError
-from tactile_bayes.files.atomic import refuse_existing, write_text
+from tactile_bayes.files.atomic import write_text
 from tactile_bayes.files.documents import read_toml_record, with_session
 from tactile_bayes.files.instrument_json import read_simulated_head
 from tactile_bayes.files.provenance import Provenance, hash_inputs
@@ -53,7 +53,6 @@ def simulate_action(
     force: bool,
 ) -> None:
     """Make a scan with known truth from SCENE, a TOML file."""
-    refuse_existing(output, force=force)
     drawn = read_scene(scene)
     for lump in drawn.solid_lumps if fidelity == "empirical" else ():
         if warning := outside_range(lump.d_mm, lump.depth_ratio):
@@ -101,7 +100,6 @@ def population_action(
     **options: Any,
 ) -> None:
     """Simulate exams of varied bodies and fit their maps: the table that a size calibration is learned from."""
-    refuse_existing(output, force=force)
     simulated = read_simulated_head(head) if head else Head()
     drawn = BodiesFile()
     if bodies_file:

@@ -167,7 +167,6 @@ def study_action(
         raise UsageError(f"{named} is for --figures of the plane-strain model; give --figures DIR")
     frames = [] if measured_frames is None else read_frames(measured_frames)
     geometries = paper_grid(chosen) if asked.grid == "paper" else read_grid(Path(asked.grid), seat=chosen)
-    refuse_existing(output, force=force)
     if figures is not None:
         prepare_figures(figures, model=model, force=force)
     with open_executor(workers=workers, cluster=scheduler) as executor:
@@ -348,7 +347,6 @@ def head_design_action(*, head: str | None, figure: Path | None, as_json: bool, 
     """Find the head that presses evenly on homogeneous tissue (section 2.1 of the paper)."""
     body = HomogeneousTissue(**tissue)
     limit = body.limit_percent / 100
-    refuse_existing(figure, force=force)
     found = search_heads(body, kinds=HEADS if head is None else (head,))
     if figure is not None:
         design_figure(found, body, limit=limit, path=figure, force=force)
@@ -385,7 +383,6 @@ def compare_model_action(
     force: bool,
 ) -> None:
     """Compare a scan's frames and map with a forward model of SCENE (section 2.3 of the paper)."""
-    refuse_existing(figure, force=force)
     body = read_scene(scene)
     loaded = read_scan(scan)
     if at is None and not (body.solid_lumps or body.lumps):
@@ -431,7 +428,6 @@ def sbc_action(
     **options: Any,
 ) -> None:
     """Check the posterior against itself: simulation-based calibration and coverage."""
-    refuse_existing(output, figure, force=force)
     asked, begun = SbcOptions(**options), monotonic()
     how: dict[str, Any] = {"method": asked.method, "seed": asked.seed, "cosines": asked.field_cosines}
 

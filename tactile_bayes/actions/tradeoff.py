@@ -22,7 +22,7 @@ from tactile_bayes.api.sized import SizeEstimate
 from tactile_bayes.commands.options import also_read, settings_of
 from tactile_bayes.declarations import replace, to_plain
 from tactile_bayes.errors import EXIT_DONE, EXIT_NO_ESTIMATE, UsageError, in_file
-from tactile_bayes.files.atomic import given_twice, refuse_existing
+from tactile_bayes.files.atomic import given_twice
 from tactile_bayes.files.documents import dump_json
 from tactile_bayes.files.map_nc import read_map
 from tactile_bayes.files.provenance import Provenance, hash_inputs
@@ -173,7 +173,6 @@ def tradeoff_forward_action(
     force: bool,
 ) -> None:
     """Measure error in amplitude, width and size against CPU time, for the lump of a scene."""
-    refuse_existing(figure, force=force)
     if size_calibration not in (None, "learned"):
         also_read(size_calibration_path(size_calibration))
     report = run_tradeoff(_case(scene, head), size_calibration, tolerance=tolerance_percent / 100, runs=runs)
@@ -228,8 +227,6 @@ def _rule(case: LumpCase, model: str, name: str) -> SizeRule:
 
 
 def tradeoff_estimate_action(
-    ctx: click.Context,
-    /,
     maps: tuple[Path, ...],
     size_calibration: str | None,
     centre_mm: tuple[float, float] | None,
@@ -240,9 +237,8 @@ def tradeoff_estimate_action(
     seed: int,
     as_json: bool,
     force: bool,
-) -> None:
+) -> int:
     """Measure what each setting of `estimate` costs on a map, and how far its size interval is off."""
-    refuse_existing(figure, force=force)
     if twice := given_twice(maps):
         raise UsageError(f"{twice} is given twice; give each map once")
     settings = settings_of(
@@ -263,8 +259,8 @@ def tradeoff_estimate_action(
     kept = {"size_calibration": size_calibration, "tolerance_mm": tolerance_mm, "runs": runs}
     provenance = Provenance("tradeoff estimate", kept, inputs, seed=seed).as_dict()
     title = f"{maps[0].stem}: what more time for `estimate` buys"
-    ctx.exit(
-        show(ladder, varied="estimate", title=title, figure=figure, as_json=as_json, force=force, provenance=provenance)
+    return show(
+        ladder, varied="estimate", title=title, figure=figure, as_json=as_json, force=force, provenance=provenance
     )
 
 
@@ -279,8 +275,6 @@ def _said(calibration: str | None, centre_mm: tuple[float, float] | None, settin
 
 
 def tradeoff_map_action(
-    ctx: click.Context,
-    /,
     scan: Path,
     tolerance_mm: float,
     runs: int,
@@ -288,9 +282,8 @@ def tradeoff_map_action(
     seed: int,
     as_json: bool,
     force: bool,
-) -> None:
+) -> int:
     """Measure what each setting of `map` costs on a scan, and how far it moves the size interval."""
-    refuse_existing(figure, force=force)
     read_scan(scan)  # imports and first calls cost nothing afterwards
     begun = time.process_time()
     loaded = read_scan(scan)
@@ -302,6 +295,4 @@ def tradeoff_map_action(
     kept = {"tolerance_mm": tolerance_mm, "runs": runs}
     provenance = Provenance("tradeoff map", kept, hash_inputs(scan=scan), seed=seed).as_dict()
     title = f"{scan.stem}: what finer cells and more frames buy"
-    ctx.exit(
-        show(ladder, varied="map", title=title, figure=figure, as_json=as_json, force=force, provenance=provenance)
-    )
+    return show(ladder, varied="map", title=title, figure=figure, as_json=as_json, force=force, provenance=provenance)

@@ -46,7 +46,6 @@ def validate_action(
     """Compare sizes with excision: errors, lines, agreement, repeatability and calibration of each modality."""
     if pdf is not None and html is None:
         raise UsageError("--pdf prints the page that --html names; give --html REPORT.html too")
-    refuse_existing(output, force=force)
     if html is not None:
         PageFiles(html, pdf, force).check()
     title, chosen = _settings(settings, protocol)
@@ -99,7 +98,6 @@ def plan_action(
     **errors: float,
 ) -> None:
     """Plan a trial: power, widths of intervals and the worth of more maps, by simulation."""
-    refuse_existing(output, figure, force=force)
     typed = typed_options()
     compared = against if "against" in typed else None
     read = read_pilot(pilot, excision, compared)

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import click
 
-from tactile_bayes.commands.options import FORCE, METAVAR, CommandGroup, FigurePath, FilePath, takes
+from tactile_bayes.commands.options import FORCE, CommandGroup, FilePath, command, figure, output, path_option, takes
 from tactile_bayes.options import LearnOptions
 
 # --- `calibrate`: learn a calibration from known objects, and a site's repeatability from its own exams.
@@ -15,20 +13,13 @@ _FILE = FilePath()
 
 
 @click.group("calibrate", cls=CommandGroup)
-def command() -> None:
+def calibrate_command() -> None:
     """Learn a calibration from known objects."""
 
 
-@command.command("size")
+@command("size", "calibrate.calibrate_size_action", within=calibrate_command)
 @click.argument("table", metavar="TABLE.csv", type=_FILE)
-@click.option(
-    "-o",
-    "--output",
-    required=True,
-    metavar="SIZE.json",
-    type=FilePath(writes="JSON"),
-    help="Where to write the calibration.",
-)
+@output("SIZE.json", "JSON", "Where to write the calibration.", required=True)
 @takes(LearnOptions, "form")
 @click.option(
     "--correct",
@@ -36,19 +27,16 @@ def command() -> None:
     help="Correct this calibration (solid, solid-mean, eq6 or a file learned over bodies) by the table's lumps instead "
     "of learning one.",
 )
-@click.option(
+@path_option(
     "--against",
-    metavar="TABLE.csv",
-    type=_FILE,
-    help="Lumps of another origin, with the columns of `population`: how far their sizes are off goes into intervals.",
+    "TABLE.csv",
+    "Lumps of another origin, with the columns of `population`: how far their sizes are off goes into intervals.",
 )
 @takes(LearnOptions, "fit", "normalise", "background", "fit_radius_mm", "noise", "least_stiffness_ratio")
-@click.option(
-    "--figure", metavar=METAVAR, type=FigurePath(), help="Draw Fig 8 of the paper from the table's lumps (eq6 only)."
-)
+@figure("Draw Fig 8 of the paper from the table's lumps (eq6 only).")
 @takes(LearnOptions, "seed")
 @FORCE
-def size(**given: Any) -> None:
+def size() -> None:
     """Learn Eq 6, d = m sigma / (e a^f) + b, from a study or a set of phantoms, or over a population of bodies.
 
     TABLE.csv has a row for each lump: d_mm, amplitude, sigma_x_mm, and optionally sigma_y_mm, depth_ratio,
@@ -79,28 +67,18 @@ def size(**given: Any) -> None:
 
     Example: tactile-bayes calibrate size phantoms.csv -o size.json
     """
-    from tactile_bayes.actions.calibrate import calibrate_size_action
-
-    calibrate_size_action(**given)
 
 
-@command.command("repeatability")
+@command("repeatability", "calibrate.calibrate_repeatability_action", within=calibrate_command)
 @click.argument("folder", metavar="OUT", type=_FILE)
-@click.option(
-    "-o",
-    "--output",
-    required=True,
-    metavar="SITE.json",
-    type=FilePath(writes="JSON"),
-    help="Where to write the spread.",
-)
+@output("SITE.json", "JSON", "Where to write the spread.", required=True)
 @click.option(
     "--size-calibration",
     metavar="SIZE.json",
     help="Calibration that the exams were sized by, where the name in their estimates does not lead to its file.",
 )
 @FORCE
-def repeatability(**given: Any) -> None:
+def repeatability() -> None:
     """Learn how far sizes of one mass lie apart between its exams at this site.
 
     OUT is the folder of a `campaign run`. Masses with two exams or more at one visit take part, from 3 such masses on,
@@ -110,12 +88,9 @@ def repeatability(**given: Any) -> None:
 
     Example: tactile-bayes calibrate repeatability out -o site.json
     """
-    from tactile_bayes.actions.calibrate import calibrate_repeatability_action
-
-    calibrate_repeatability_action(**given)
 
 
-@command.command("array")
+@command("array", "calibrate.calibrate_array_action", within=calibrate_command)
 @click.option(
     "--step",
     "steps",
@@ -125,20 +100,13 @@ def repeatability(**given: Any) -> None:
     required=True,
     help="The bladder's pressure and what the head recorded under it.",
 )
-@click.option(
-    "-o",
-    "--output",
-    required=True,
-    metavar="ARRAY.json",
-    type=FilePath(writes="JSON"),
-    help="Where to write the calibration.",
-)
+@output("ARRAY.json", "JSON", "Where to write the calibration.", required=True)
 @click.option("--head-id", metavar="ID", help="Identifier of the head. Default: what the scans state.")
 @click.option(
     "--date", "day", type=click.DateTime(["%Y-%m-%d"]), metavar="DAY", help="Day of the measurement. Default: today."
 )
 @FORCE
-def array(**given: Any) -> None:
+def array() -> None:
     """Learn the gain and offset of each taxel from a pressure bladder, and how uneven they stay.
 
     Record each step with `record --uncalibrated`. Dead and hot taxels are found and get gain 0, which leaves them out
@@ -146,6 +114,3 @@ def array(**given: Any) -> None:
 
     Example: tactile-bayes calibrate array --step 0 p0.mcap --step 8 p8.mcap --step 16 p16.mcap -o array.json
     """
-    from tactile_bayes.actions.calibrate import calibrate_array_action
-
-    calibrate_array_action(**given)

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from functools import partial
-from typing import Any, get_args
+from typing import get_args
 
 import click
 
-from tactile_bayes.commands.options import FORCE, SPEED, FilePath, FiniteRange, live_options, takes
+from tactile_bayes.commands.options import FORCE, SPEED, FilePath, FiniteRange, command, live_options, output, takes
 from tactile_bayes.declarations import names_of
 from tactile_bayes.options import RecordOptions
 from tactile_bayes.presets import TrackerProtocol
@@ -18,16 +17,13 @@ _RECORDING = names_of(RecordOptions)[2:-4]
 """Between the output with the head's port and the options of the live view."""
 
 
-@click.command("record")
-@click.option(
-    "-o", "--output", required=True, metavar="SCAN.mcap", type=FilePath(writes="MCAP"), help="Scan file to write."
-)
+@command("record", "record.record_action")
+@output("SCAN.mcap", "MCAP", "Scan file to write.", required=True)
 @click.option("--head", "head_url", required=True, metavar="URL", help="Port of the scan head.")
 @takes(RecordOptions, *_RECORDING)
 @live_options
 @FORCE
-@click.pass_context
-def record_command(ctx: click.Context, /, **given: Any) -> None:
+def record_command() -> None:
     """Record a scan head and a tracker.
 
     On a terminal, `n` and `x` touch the sternal notch and the xiphoid, space starts, `q` or Ctrl-C stops; with
@@ -36,9 +32,6 @@ def record_command(ctx: click.Context, /, **given: Any) -> None:
 
     Example: tactile-bayes record -o scan.mcap --head /dev/ttyACM0 --tracker /dev/ttyUSB0 --like last.mcap
     """
-    from tactile_bayes.actions.record import record_action
-
-    record_action(ctx, **given)
 
 
 # --- `emulate`: serve a scan as a device would send it.
@@ -47,7 +40,7 @@ PROTOCOLS = get_args(TrackerProtocol)
 _SHARE = FiniteRange(0.0, 1.0)
 
 
-@click.command("emulate")
+@command("emulate", "devices.emulate_action")
 @click.argument("kind", metavar="head|tracker|both", type=click.Choice(["head", "tracker", "both"]))
 @click.argument("scan", metavar="SCAN.mcap", type=FilePath())
 @click.option(
@@ -90,7 +83,7 @@ _SHARE = FiniteRange(0.0, 1.0)
     "(or 1).",
 )
 @click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Random seed of the faults.")
-def emulate_command(**given: Any) -> None:
+def emulate_command() -> None:
     """Serve a scan as a scan head or a tracker would send it, or as both, at its own rate, with faults on request.
 
     Prints the URL for `record`; with both, a line "head URL" and a line "tracker URL". Each START plays the scan from
@@ -102,15 +95,12 @@ def emulate_command(**given: Any) -> None:
 
     Example: tactile-bayes emulate both scan.mcap
     """
-    from tactile_bayes.actions.devices import emulate_action
-
-    emulate_action(**given)
 
 
 # --- `devices`: list serial ports and check which way a tracker's rotations go.
 
 
-@click.command("devices")
+@command("devices", "devices.devices_action")
 @click.option(
     "--probe",
     "url",
@@ -137,7 +127,7 @@ def emulate_command(**given: Any) -> None:
     metavar="S",
     help="How long to rotate it, s.",
 )
-def devices_command(**given: Any) -> None:
+def devices_command() -> None:
     """List the serial ports and the devices that are probably on them.
 
     With --pivot, hold the head's apex on one point and turn the handle about it: the right sense of the rotations keeps
@@ -145,9 +135,6 @@ def devices_command(**given: Any) -> None:
 
     Example: tactile-bayes devices
     """
-    from tactile_bayes.actions.devices import devices_action
-
-    devices_action(**given)
 
 
 # --- `replay`: play a scan through emulated devices and the recorder.
@@ -155,43 +142,30 @@ def devices_command(**given: Any) -> None:
 _FILE = FilePath()
 
 
-@click.command("replay")
+@command("replay", "devices.replay_action")
 @click.argument("scan", metavar="SCAN.mcap", type=_FILE)
-@click.option("-o", "--output", metavar="OUT.mcap", type=FilePath(writes="MCAP"), help="Save what is recorded.")
+@output("OUT.mcap", "MCAP", "Save what is recorded.")
 @live_options
 @SPEED
 @FORCE
-@click.pass_context
-def replay_command(ctx: click.Context, /, **given: Any) -> None:
+def replay_command() -> None:
     """Replay a scan through emulated devices, recorder and live view, as if it were being recorded.
 
     Example: tactile-bayes replay scan.mcap --live
     """
-    from tactile_bayes.actions.devices import replay_action
-
-    replay_action(partial(ctx.invoke, record_command), **given)
 
 
 # --- `repair`: close a scan file that was cut off.
 
 
-@click.command("repair")
+@command("repair", "devices.repair_action")
 @click.argument("scan", metavar="SCAN.mcap", type=FilePath())
-@click.option(
-    "-o",
-    "--output",
-    metavar="OUT.mcap",
-    type=FilePath(writes="MCAP"),
-    help="Write to this file instead of replacing SCAN.mcap.",
-)
+@output("OUT.mcap", "MCAP", "Write to this file instead of replacing SCAN.mcap.")
 @FORCE
-def repair_command(**given: Any) -> None:
+def repair_command() -> None:
     """Repair a scan that was cut off or damaged: keep what is intact, report what is lost.
 
     The file is replaced when the new one is whole, unless -o is given. A file that is whole already is left alone.
 
     Example: tactile-bayes repair scan.mcap
     """
-    from tactile_bayes.actions.devices import repair_action
-
-    repair_action(**given)

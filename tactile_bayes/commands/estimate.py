@@ -8,7 +8,17 @@ from typing import Any, Final
 import click
 
 from tactile_bayes.api.settings import GROWN_BY, Settings
-from tactile_bayes.commands.options import FORCE, METAVAR, FigurePath, FilePath, FiniteRange, scheduler_option, takes
+from tactile_bayes.commands.options import (
+    FORCE,
+    FilePath,
+    FiniteRange,
+    command,
+    figure,
+    output,
+    page_options,
+    scheduler_option,
+    takes,
+)
 from tactile_bayes.declarations import names_of
 from tactile_bayes.errors import UsageError
 from tactile_bayes.options import MapOptions
@@ -19,20 +29,18 @@ from tactile_bayes.presets import REGISTRATION_MM
 _FILE = FilePath()
 
 
-@click.command("map")
+@command("map", "mapping.map_action")
 @click.argument("scans", metavar="SCAN.mcap...", nargs=-1, required=True, type=_FILE)
-@click.option(
-    "-o",
-    "--output",
-    metavar="MAP.nc",
-    type=FilePath(writes="netCDF"),
-    help="Where to write the map. Default: beside the first scan; map.nc for scan.mcap, s01.nc for s01.mcap.",
+@output(
+    "MAP.nc",
+    "netCDF",
+    "Where to write the map. Default: beside the first scan; map.nc for scan.mcap, s01.nc for s01.mcap.",
 )
 @takes(MapOptions, *names_of(MapOptions))
-@click.option("--figure", metavar=METAVAR, type=FigurePath(), help="Draw the map and its coverage.")
+@figure("Draw the map and its coverage.")
 @FORCE
 @click.option("-v", "--verbose", is_flag=True, help="Print all figures of the map; times on stderr.")
-def map_command(**given: Any) -> None:
+def map_command() -> None:
     """Build a tactile map from one scan, or one common map from several scans of the same examination.
 
     The plane of the motion is fitted, frames outside the pressure window are left out, the rest are normalised,
@@ -42,40 +50,19 @@ def map_command(**given: Any) -> None:
 
     Example: tactile-bayes map scan.mcap -o map.nc --figure map.png
     """
-    from tactile_bayes.actions.estimate import map_action
-
-    map_action(**given)
 
 
 # --- `estimate`: estimate sizes from tactile maps.
 
 
-@click.command("estimate")
+@command("estimate", "estimate.estimate_action")
 @click.argument("maps", metavar="MAP.nc...", nargs=-1, required=True, type=_FILE)
 @takes(Settings, "size_calibration", "method", "seed", "interval")
-@click.option(
-    "-o",
-    "--output",
-    metavar="POST.nc",
-    type=FilePath(writes="netCDF"),
-    help="Write all draws (netCDF that arviz opens).",
-)
+@output("POST.nc", "netCDF", "Write all draws (netCDF that arviz opens).")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON: one object, or a list for several maps.")
-@click.option(
-    "--figure", metavar=METAVAR, type=FigurePath(), help="Draw the size posterior, or the map where there is no size."
-)
-@click.option(
-    "--map-figure",
-    metavar=METAVAR,
-    type=FigurePath(),
-    help="Draw the map with the lump's size, or with the places looked at.",
-)
-@click.option(
-    "--fit-figure",
-    metavar=METAVAR,
-    type=FigurePath(),
-    help="Draw data, fit and residual of the fit window, or the map where there is no estimate.",
-)
+@figure("Draw the size posterior, or the map where there is no size.")
+@figure("Draw the map with the lump's size, or with the places looked at.", "--map-figure")
+@figure("Draw data, fit and residual of the fit window, or the map where there is no estimate.", "--fit-figure")
 @takes(Settings, "centre_mm", "scene", "settings_file", "accuracy_sd", "known", "repeatability")
 @click.option("--pool", is_flag=True, help="Pool the maps, all of one mass, into one size.")
 @click.option(
@@ -90,8 +77,7 @@ def map_command(**given: Any) -> None:
 @click.option(
     "-v", "--verbose", is_flag=True, help="Print the full report instead of 12 lines, and the time taken on stderr."
 )
-@click.pass_context
-def estimate_command(ctx: click.Context, /, **given: Any) -> None:
+def estimate_command() -> None:
     """Estimate a lump's size from tactile maps, with a credible interval.
 
     Every posterior draw of the map's Gaussian (Eq 7) goes through a size calibration with a draw of its coefficients
@@ -101,9 +87,6 @@ def estimate_command(ctx: click.Context, /, **given: Any) -> None:
 
     Example: tactile-bayes estimate map.nc --figure size.png
     """
-    from tactile_bayes.actions.estimate import estimate_action
-
-    estimate_action(ctx, **given)
 
 
 # --- A command with groups of files: what follows ``--with`` up to the next option is one group.
@@ -159,7 +142,7 @@ def numbered(args: Sequence[str], *, strict: bool = True) -> list[str]:
 _PERCENT = tuple(100 * share for share in GROWN_BY)
 
 
-@click.command("compare", cls=VisitsCommand)
+@command("compare", "compare.compare_action", kind=VisitsCommand)
 @click.argument("first", metavar="VISIT1.nc...", nargs=-1, required=True, type=_FILE)
 @click.option(
     "--with",
@@ -214,23 +197,12 @@ _PERCENT = tuple(100 * share for share in GROWN_BY)
 )  # fmt: skip
 @takes(Settings, "seed", "interval")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-@click.option(
-    "-o",
-    "--output",
-    metavar="GROWTH.html",
-    type=FilePath(writes="HTML"),
-    help="Write one page: the maps on common axes, the size at each visit, and the change.",
-)
-@click.option(
-    "--pdf", metavar="GROWTH.pdf", type=_FILE, help="Also print it to PDF, by an installed Chromium or WeasyPrint."
-)
-@click.option("--title", default="", help="Title of the page. Default: Tactile exams over time.")
-@click.option("--name", default="", help="Name to print on the page. Default: none.")
-@click.option("--figure", metavar=METAVAR, type=FigurePath(), help="Draw the maps, their difference and the change.")
+@output("GROWTH.html", "HTML", "Write one page: the maps on common axes, the size at each visit, and the change.")
+@page_options("GROWTH.pdf", "Tactile exams over time")
+@figure("Draw the maps, their difference and the change.")
 @FORCE
 @click.option("-v", "--verbose", is_flag=True, help="Print the full report instead of 12 lines.")
-@click.pass_context
-def compare_command(ctx: click.Context, /, **given: Any) -> None:
+def compare_command() -> None:
     """Compare the size of a mass at two visits and more.
 
     Each visit is one map or several. First the visits must be shown to be of one mass: by what their scans say
@@ -241,22 +213,15 @@ def compare_command(ctx: click.Context, /, **given: Any) -> None:
 
     Example: tactile-bayes compare jan1.nc jan2.nc --with apr1.nc apr2.nc --days 92 -o growth.html
     """
-    from tactile_bayes.actions.estimate import compare_action
-
-    compare_action(ctx, **given)
 
 
 # --- `report`: one page of an exam, to read and to print.
 
 
-@click.command("report")
+@command("report", "report.report_action")
 @click.argument("files", metavar="MAP.nc... [POST.nc|ESTIMATE.json]", nargs=-1, required=True, type=_FILE)
 @click.option("-o", "--output", metavar="EXAM.html", required=True, type=_FILE, help="Page to write.")
-@click.option(
-    "--pdf", metavar="EXAM.pdf", type=_FILE, help="Also print it to PDF, by an installed Chromium or WeasyPrint."
-)
-@click.option("--title", default="", help="Title of the page. Default: Tactile exam.")
-@click.option("--name", default="", help="Name to print on the page. Default: none.")
+@page_options("EXAM.pdf", "Tactile exam")
 @click.option("--date", "day", default="", metavar="YYYY-MM-DD", help="Date to print on the page. Default: none.")
 @takes(
     Settings,
@@ -272,7 +237,7 @@ def compare_command(ctx: click.Context, /, **given: Any) -> None:
 )
 @takes(Settings, "seed", "interval")
 @FORCE
-def report_command(**given: Any) -> None:
+def report_command() -> None:
     """Write one page of an exam: the map, the size with its intervals, the place, and how good the exam was.
 
     The page is one HTML file that loads nothing and prints to one side of A4. Several maps are repeats of one mass:
@@ -282,6 +247,3 @@ def report_command(**given: Any) -> None:
 
     Example: tactile-bayes report map.nc -o exam.html
     """
-    from tactile_bayes.actions.estimate import report_action
-
-    report_action(**given)

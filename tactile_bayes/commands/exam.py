@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from inspect import cleandoc
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import click
 
-from tactile_bayes.commands.options import FORCE, JSON, METAVAR, SESSION, FigurePath, FilePath, takes
+from tactile_bayes.commands.options import FORCE, JSON, SESSION, FilePath, command, figure, path_option, takes
 from tactile_bayes.declarations import names_of
 from tactile_bayes.files.arrays_layout import GridOptions, Stated, layout_lines
 from tactile_bayes.options import IdentityOptions, MapOptions, RecordOptions
@@ -17,7 +17,7 @@ from tactile_bayes.presets import CORRECTIONS, METHODS
 # --- `demo`: the main steps on data that comes with the program.
 
 
-@click.command("demo")
+@command("demo", "exam.demo_action")
 @click.option(
     "-o",
     "--output",
@@ -35,8 +35,7 @@ from tactile_bayes.presets import CORRECTIONS, METHODS
     help="Method of the first estimate; see `estimate --help`.",
 )
 @click.option("--force", is_flag=True, help="Overwrite the files of an earlier demo.")
-@click.pass_context
-def demo_command(ctx: click.Context, /, **given: Any) -> None:
+def demo_command() -> None:
     """Run the main job on an embedded scan: map, estimate, and the report of a trial.
 
     The scan is simulated: a hard ball of 15 mm, one diameter deep in a breast of fat and gland, with the noise and
@@ -44,15 +43,12 @@ def demo_command(ctx: click.Context, /, **given: Any) -> None:
     Markov chains through Eq 6, and both results are compared with the true size. The trial is synthetic. Each step is
     printed as the command that does it by hand.
     """
-    from tactile_bayes.actions.exam import demo_action
-
-    demo_action(ctx, **given)
 
 
 # --- `import`: import scans, grids and images from other programs.
 
 
-@click.command("import")
+@command("import", "bring_in.import_action")
 @click.argument("sources", metavar="SRC...", nargs=-1, type=FilePath())
 @click.option("-o", "--output", type=FilePath(), help="File to write: .mcap or .nc; of several SRC, the folder.")
 @click.option(
@@ -72,14 +68,13 @@ def demo_command(ctx: click.Context, /, **given: Any) -> None:
     f"One of {', '.join(CORRECTIONS)}.",
 )
 @click.option("--template", is_flag=True, help="Print a MAP.toml for --columns: of SRC, with what its shapes tell.")
-@click.option("--columns", metavar="MAP.toml", type=FilePath(), help="Scan: what SRC calls its arrays.")
-@click.option("--poses", metavar="FILE", type=FilePath(), help="Scan: the tracker's poses, in a table of their own.")
+@path_option("--columns", "MAP.toml", "Scan: what SRC calls its arrays.")
+@path_option("--poses", "FILE", "Scan: the tracker's poses, in a table of their own.")
 @takes(RecordOptions, "head_geometry", "array_calibration", "landmarks")
 @takes(Stated, *names_of(Stated))
 @SESSION
 @FORCE
-@click.pass_context
-def import_command(ctx: click.Context, /, **given: Any) -> None:
+def import_command() -> None:
     """Import scans, grids and images from other programs.
 
     SRC holds frames (a scan): a file of arrays (.npz, .npy, MATLAB's .mat, HDF5), a text table with one row or one
@@ -94,9 +89,6 @@ def import_command(ctx: click.Context, /, **given: Any) -> None:
 
     Example: tactile-bayes import frames.csv --poses poses.csv --head-geometry head.json --unit kPa -o exam.mcap
     """
-    from tactile_bayes.actions.bring_in import import_action
-
-    import_action(ctx, **given)
 
 
 _HEADING = "Arrays of a scan, in mm, kPa and s, for n frames and m poses:"
@@ -111,7 +103,7 @@ import_command.help = f"{cleandoc(import_command.help or '')}\n\n{_ARRAYS}"
 # --- `check`: is a scan arranged as it is stated?
 
 
-@click.command("check")
+@command("check", "exam.check_action")
 @click.argument("scans", nargs=-1, required=True, metavar="SCAN...", type=FilePath())
 @takes(MapOptions, "pressure_window_kpa")
 @click.option(
@@ -122,7 +114,7 @@ import_command.help = f"{cleandoc(import_command.help or '')}\n\n{_ARRAYS}"
     help="Head of the scan with the day of this check, where the scan shows that it is right; for --head-geometry.",
 )
 @FORCE
-def check_command(**given: Any) -> None:
+def check_command() -> None:
     """Check that array, lever arm and quaternions of scans are as they are stated.
 
     Where frames overlap, they feel one breast. Other arrangements are tried (rows or columns reversed, an array turned
@@ -131,18 +123,15 @@ def check_command(**given: Any) -> None:
 
     Example: tactile-bayes check scan.mcap
     """
-    from tactile_bayes.actions.exam import check_action
-
-    check_action(**given)
 
 
 # --- `show`: describe a file.
 
 
-@click.command("show")
+@command("show", "exam.show_action")
 @click.argument("file", type=FilePath())
 @JSON
-def show_command(**given: Any) -> None:
+def show_command() -> None:
     """Show what a file holds: schema, shape, units, quality, provenance.
 
     Knows scans, maps, posteriors, size calibrations, reports and the tables of trials and phantoms. Calibrations that
@@ -150,9 +139,6 @@ def show_command(**given: Any) -> None:
 
     Example: tactile-bayes show map.nc
     """
-    from tactile_bayes.actions.exam import show_action
-
-    show_action(**given)
 
 
 # --- `export`: write maps and estimates as the files that other systems take.
@@ -160,25 +146,22 @@ def show_command(**given: Any) -> None:
 _FORMATS: Final = ("dicom", "fhir", "nrrd", "csv")
 
 
-@click.command("export")
+@command("export", "exam.export_action")
 @click.argument("files", metavar="FILE...", nargs=-1, type=FilePath())
 @click.option("--to", required=True, type=click.Choice(_FORMATS), help="Format to write.")
 @click.option(
     "-o", "--output", metavar="OUT", type=FilePath(), help="File to write; for dicom the folder of the files."
 )
-@click.option(
+@path_option(
     "--worklist",
-    metavar="ITEM",
-    type=FilePath(),
-    help="Patient and study from a modality worklist item (.dcm or DICOM JSON), or from JSON of plain keys.",
+    "ITEM",
+    "Patient and study from a modality worklist item (.dcm or DICOM JSON), or from JSON of plain keys.",
 )
 @click.option("--patient-id-from-scan", is_flag=True, help="Use the scan's subject code as the patient ID.")
 @takes(IdentityOptions, *names_of(IdentityOptions))
-@click.option(
-    "--dictionary", metavar="DICT.csv", type=FilePath(), help="With csv: write the data dictionary of the REDCap form."
-)
+@path_option("--dictionary", "DICT.csv", "With csv: write the data dictionary of the REDCap form.")
 @FORCE
-def export_command(**given: Any) -> None:
+def export_command() -> None:
     """Export maps and estimates as DICOM, FHIR, NRRD (3D Slicer) or CSV (REDCap).
 
     dicom takes a map, or a map and its estimate: values, picture and report, into a folder. fhir takes an estimate
@@ -187,22 +170,19 @@ def export_command(**given: Any) -> None:
 
     Example: tactile-bayes export map.nc estimate.json --to dicom --study-date 2026-11-24T10:30 -o exam
     """
-    from tactile_bayes.actions.exam import export_action
-
-    export_action(**given)
 
 
 # --- `diagnose`: how far the draws of a posterior can be trusted, as a table and as pictures.
 
 
-@click.command("diagnose")
+@command("diagnose", "exam.diagnose_action")
 @click.argument("posterior", metavar="POST.nc", type=FilePath())
-@click.option("--trace", metavar=METAVAR, type=FigurePath(), help="Draw densities and traces.")
-@click.option("--rank", metavar=METAVAR, type=FigurePath(), help="Draw the ranks of each chain's draws among all.")
-@click.option("--corner", metavar=METAVAR, type=FigurePath(), help="Draw the pairs of sizes, amplitude and widths.")
+@figure("Draw densities and traces.", "--trace")
+@figure("Draw the ranks of each chain's draws among all.", "--rank")
+@figure("Draw the pairs of sizes, amplitude and widths.", "--corner")
 @JSON
 @FORCE
-def diagnose_command(**given: Any) -> None:
+def diagnose_command() -> None:
     """Check the draws of a posterior: R-hat, effective draws and Monte-Carlo errors of every size and width.
 
     POST.nc is what `estimate -o` wrote. R-hat and effective draws compare chains, so they are of `--method ensemble`;
@@ -210,6 +190,3 @@ def diagnose_command(**given: Any) -> None:
 
     Example: tactile-bayes diagnose post.nc --trace trace.png --rank rank.png --corner corner.png
     """
-    from tactile_bayes.actions.exam import diagnose_action
-
-    diagnose_action(**given)

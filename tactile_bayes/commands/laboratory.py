@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import click
 
 from tactile_bayes.commands.options import (
     FORCE,
     JSON,
-    METAVAR,
     SESSION,
     WORKERS,
     CommandGroup,
-    FigurePath,
     FilePath,
     FiniteRange,
+    command,
+    figure,
     head_option,
+    output,
+    path_option,
     scheduler_option,
     takes,
 )
@@ -34,7 +34,7 @@ from tactile_bayes.options import (
 # --- `simulate`: make a scan with known truth from a scene.
 
 
-@click.command("simulate")
+@command("simulate", "simulation.simulate_action")
 @click.argument("scene", type=FilePath())
 @click.option("-o", "--output", required=True, type=FilePath(writes="MCAP"), help="Scan file to write (.mcap).")
 @click.option("--seed", type=click.IntRange(min=0), help="Seed of the random numbers, in place of the scene's.")
@@ -49,7 +49,7 @@ from tactile_bayes.options import (
 )
 @SESSION
 @FORCE
-def simulate_command(**given: Any) -> None:
+def simulate_command() -> None:
     """Make a scan with known truth from SCENE, a TOML file.
 
     Lumps given as bumps (amplitude, sigma) take the empirical-gaussian model; lumps of tissue (d_mm, depth_ratio,
@@ -61,9 +61,6 @@ def simulate_command(**given: Any) -> None:
     The truth goes into the scan file beside the data; no other command reads it. On one machine and its libraries
     the same scene and seed give the same bytes.
     """
-    from tactile_bayes.actions.simulation import simulate_action
-
-    simulate_action(**given)
 
 
 # --- `population`: simulate, map and fit exams of varied bodies: the table for a size calibration.
@@ -71,17 +68,13 @@ def simulate_command(**given: Any) -> None:
 _FILE = FilePath()
 
 
-@click.command("population")
-@click.option(
-    "-o", "--output", required=True, metavar="TABLE.csv", type=FilePath(writes="CSV"), help="Where to write the table."
-)
+@command("population", "simulation.population_action")
+@output("TABLE.csv", "CSV", "Where to write the table.", required=True)
 @takes(PopulationOptions, "masses", "centred", "scans", "normalise")
-@click.option(
+@path_option(
     "--head",
-    metavar="HEAD.json",
-    type=_FILE,
-    help="The head, as for `record`: its taxels or their grid and arc. Default: 16 by 26 taxels 1.5 mm apart, arc of "
-    "35 mm.",
+    "HEAD.json",
+    "The head, as for `record`: its taxels or their grid and arc. Default: 16 by 26 taxels 1.5 mm apart, arc of 35 mm.",
 )
 @click.option(
     "--bodies",
@@ -95,7 +88,7 @@ _FILE = FilePath()
 @WORKERS
 @scheduler_option("the masses")
 @FORCE
-def population_command(**given: Any) -> None:
+def population_command() -> None:
     """Simulate exams of varied bodies and fit their maps: the table that a size calibration is learned from.
 
     Each body has a ball of its own size, depth, stiffness and seat, its own moduli and thickness; each exam its own
@@ -106,29 +99,20 @@ def population_command(**given: Any) -> None:
 
     Example: tactile-bayes population --head head.json --masses 100 --workers 4 -o population.csv
     """
-    from tactile_bayes.actions.simulation import population_action
-
-    population_action(**given)
 
 
 # --- `sbc`: simulation-based calibration of a map's posterior.
 
 
-@click.command("sbc")
+@command("sbc", "study.sbc_action")
 @takes(SbcOptions, *names_of(SbcOptions))
 @WORKERS
 @scheduler_option("the maps")
-@click.option(
-    "-o",
-    "--output",
-    metavar="TABLE.csv",
-    type=FilePath(writes="CSV"),
-    help="Write truths and ranks; an interrupted run resumes from it.",
-)
-@click.option("--figure", metavar=METAVAR, type=FigurePath(), help="Draw the ECDFs of the ranks with their bands.")
+@output("TABLE.csv", "CSV", "Write truths and ranks; an interrupted run resumes from it.")
+@figure("Draw the ECDFs of the ranks with their bands.")
 @JSON
 @FORCE
-def sbc_command(**given: Any) -> None:
+def sbc_command() -> None:
     """Check the posterior against itself: simulation-based calibration and coverage.
 
     Maps are drawn from the model's own prior (bump, level, slope, correlated errors) and estimated under correlated
@@ -140,31 +124,24 @@ def sbc_command(**given: Any) -> None:
 
     Example: tactile-bayes sbc --maps 300 --workers 2 -o sbc.csv --figure sbc.png
     """
-    from tactile_bayes.actions.study import sbc_action
-
-    sbc_action(**given)
 
 
 # --- `study`: amplitude and width of the maps of simulated lumps.
 
 
-@click.command("study")
+@command("study", "study.study_action")
 @takes(StudyOptions, "model", "grid", "seat")
-@click.option(
-    "-o", "--output", metavar="TABLE.csv", type=FilePath(writes="CSV"), help="Write the table. Default: print it."
-)
-@click.option(
+@output("TABLE.csv", "CSV", "Write the table. Default: print it.")
+@path_option(
     "--figures",
-    metavar="DIR",
-    type=_FILE,
-    help="Draw figures 5 to 8 of the paper into this directory, and in two dimensions the frames of four lumps. "
+    "DIR",
+    "Draw figures 5 to 8 of the paper into this directory, and in two dimensions the frames of four lumps. "
     "The empirical model in them holds for lumps of 10 mm and more down to h/d 1.",
 )
-@click.option(
+@path_option(
     "--measured-frames",
-    metavar="FRAMES.csv",
-    type=_FILE,
-    help="Your own frames, drawn into figure 6 beside both models: columns s_mm, pressure_kpa and optionally x_c_mm.",
+    "FRAMES.csv",
+    "Your own frames, drawn into figure 6 beside both models: columns s_mm, pressure_kpa and optionally x_c_mm.",
 )
 @click.option(
     "--phantom",
@@ -178,7 +155,7 @@ def sbc_command(**given: Any) -> None:
 @WORKERS
 @scheduler_option("the geometries")
 @FORCE
-def study_command(**given: Any) -> None:
+def study_command() -> None:
     """Run the forward study of section 2.4: amplitude and width of the map over sizes, depths and stiffnesses.
 
     A head slides over each lump in a layered body; its frames become a map, and a Gaussian is fitted to it: Eq 5 across
@@ -194,22 +171,19 @@ def study_command(**given: Any) -> None:
 
     Example: tactile-bayes study --model solid --seat resting -o study.csv
     """
-    from tactile_bayes.actions.study import study_action
-
-    study_action(**given)
 
 
 # --- `tables`: recompute Tables 1 and 2 of the paper.
 
 
-@click.command("tables")
+@command("tables", "study.tables_action")
 @takes(StudyOptions, "seat", help="How far the lump stands out of the gland.")
 @takes(SectionOptions, *names_of(SectionOptions))
 @head_option("Default: shoulders-inside.")
 @click.option("--heads", "search", is_flag=True, help="Compute the tables for many heads, and name the nearest one.")
 @WORKERS
 @JSON
-def tables_command(**given: Any) -> None:
+def tables_command() -> None:
     """Recompute Tables 1 and 2 of the paper beside the printed figures.
 
     The empirical model (Eqs 1 to 4) is fitted to frames of the elastic plane-strain model and compared with it: on the
@@ -219,9 +193,6 @@ def tables_command(**given: Any) -> None:
 
     Example: tactile-bayes tables --seat resting --heads
     """
-    from tactile_bayes.actions.study import tables_action
-
-    tables_action(**given)
 
 
 # --- `head`: how evenly a scan head presses, and the head that presses most evenly (section 2.1 of the paper).
@@ -232,12 +203,12 @@ def head_command() -> None:
     """How evenly a scan head presses on tissue without a lump: the homogeneous-pressure condition of section 2.1."""
 
 
-@head_command.command("uniformity")
+@command("uniformity", "study.head_uniformity_action", within=head_command)
 @takes(SectionOptions, *names_of(SectionOptions))
 @head_option("Default: shoulders-inside.")
 @takes(TissueOptions, *names_of(TissueOptions))
 @JSON
-def head_uniformity_command(**given: Any) -> None:
+def head_uniformity_command() -> None:
     """Compute how evenly one head presses on homogeneous tissue.
 
     For three moduli and three mean pressures: the largest departure of a taxel from the mean of its frame, and the root
@@ -245,18 +216,15 @@ def head_uniformity_command(**given: Any) -> None:
 
     Example: tactile-bayes head uniformity --head-radius-mm 35
     """
-    from tactile_bayes.actions.study import head_uniformity_action
-
-    head_uniformity_action(**given)
 
 
-@head_command.command("design")
+@command("design", "study.head_design_action", within=head_command)
 @head_option("Default: both are searched.")
 @takes(TissueOptions, *names_of(TissueOptions))
-@click.option("--figure", metavar=METAVAR, type=FigurePath(), help="Draw the non-uniformity over radius and shoulder.")
+@figure("Draw the non-uniformity over radius and shoulder.")
 @JSON
 @FORCE
-def head_design_command(**given: Any) -> None:
+def head_design_command() -> None:
     """Find the head that presses evenly on homogeneous tissue (section 2.1 of the paper).
 
     Radii of the arc from 13 mm to a flat face and shoulders of 0 to 15 mm are tried on a sensing width of 24 mm. The
@@ -265,9 +233,6 @@ def head_design_command(**given: Any) -> None:
 
     Example: tactile-bayes head design --figure head.png
     """
-    from tactile_bayes.actions.study import head_design_action
-
-    head_design_action(**given)
 
 
 # --- `compare-model`: a scan's frames and map against a forward model of a scene (section 2.3 of the paper).
@@ -275,7 +240,7 @@ def head_design_command(**given: Any) -> None:
 _FIDELITIES = ("solid", "plane-strain", "empirical", "empirical-gaussian")
 
 
-@click.command("compare-model")
+@command("compare-model", "study.compare_model_action")
 @click.argument("scan", metavar="SCAN.mcap", type=_FILE)
 @click.argument("scene", metavar="SCENE.toml", type=_FILE)
 @click.option(
@@ -295,10 +260,10 @@ _FIDELITIES = ("solid", "plane-strain", "empirical", "empirical-gaussian")
 @takes(MapOptions, "every", help="Compare one frame in so many.")
 @takes(MapOptions, "cell_mm", "pressure_window_kpa")
 @click.option("--latency-ms", type=float, default=0.0, show_default=True, help="Delay of the tracker's time stamps.")
-@click.option("--figure", metavar=METAVAR, type=FigurePath(), help="Draw frames, maps and what the model leaves.")
+@figure("Draw frames, maps and what the model leaves.")
 @JSON
 @FORCE
-def compare_model_command(**given: Any) -> None:
+def compare_model_command() -> None:
     """Compare a scan's frames and map with a forward model of SCENE (section 2.3 of the paper).
 
     The model's head stands where the scan's did and presses with the same mean, frame by frame; the scene's first lump
@@ -309,6 +274,3 @@ def compare_model_command(**given: Any) -> None:
 
     Example: tactile-bayes compare-model scan.mcap scene.toml --fidelity empirical
     """
-    from tactile_bayes.actions.study import compare_model_action
-
-    compare_model_action(**given)

@@ -6,6 +6,8 @@ import contextlib
 import math
 import os
 from collections.abc import Callable, Iterable, Mapping
+from functools import wraps
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal, get_args, get_origin
 
@@ -14,7 +16,7 @@ import click
 from tactile_bayes.api.settings import Settings, read_settings
 from tactile_bayes.declarations import Record, default_of, extra_of, kinds, meaning_of, range_of, value_kind
 from tactile_bayes.errors import UsageError, number_words
-from tactile_bayes.files.atomic import Format, check_suffix, same_file
+from tactile_bayes.files.atomic import Format, check_suffix, refuse_existing, same_file
 from tactile_bayes.presets import HEADS
 from tactile_bayes.report import figure_file
 
@@ -38,11 +40,14 @@ class FilePath(click.Path):
         Whether the address of an object store may stand instead; it stays a text.
     writes
         Format of the output that it names; a suffix of another one is refused.
+    guarded
+        Whether a file of this name is only overwritten with --force. Default: where it is an output.
     """
 
-    def __init__(self, *, addresses: bool = False, writes: Format | None = None) -> None:
+    def __init__(self, *, addresses: bool = False, writes: Format | None = None, guarded: bool | None = None) -> None:
         super().__init__(path_type=Path, readable=False)  # its reader says it in one line
         self._addresses, self._writes = addresses, writes
+        self.guarded = writes is not None if guarded is None else guarded
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """Record and return the path.
@@ -67,6 +72,19 @@ class FilePath(click.Path):
             seen.append((path, written))
         if self._writes is not None:
             check_suffix(path, self._writes)
+        return path
+
+
+class FigurePath(FilePath):
+    """Path of a figure; an unknown suffix is refused before any work."""
+
+    def __init__(self) -> None:
+        super().__init__(guarded=True)
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Check the suffix and return the path."""
+        path = super().convert(value, param, ctx)
+        figure_file.check_suffix(path)
         return path
 
 
@@ -108,7 +126,38 @@ def refuse_same(
             raise UsageError(f"{path} is {what}; choose another name for the output")
 
 
-# --- A command of commands.
+# --- A command: its options, its help, and the function that it calls.
+
+
+def command(
+    name: str, action: str, *, within: click.Group | None = None, kind: type[click.Command] = click.Command
+) -> Callable[[Callable[[], None]], click.Command]:
+    """Make a command of its options and of a function that says its help and does nothing.
+
+    Parameters
+    ----------
+    action
+        What it calls with its options by their names: a module of `tactile_bayes.actions`, imported when the command
+        runs, and a function there. A number that it returns is the exit code. No file of the call's outputs exists
+        then, unless --force is given.
+    within
+        Group that the command belongs to; by default it stands alone.
+    """
+    module, function = action.split(".")
+
+    def made(described: Callable[[], None]) -> click.Command:
+        @wraps(described)
+        def body(**given: Any) -> None:
+            context = click.get_current_context()
+            guarded = [one.name for one in context.command.params if getattr(one.type, "guarded", False)]
+            refuse_existing(*(given[str(one)] for one in guarded), force=given.get("force", False))
+            code = getattr(import_module(f"tactile_bayes.actions.{module}"), function)(**given)
+            if code:
+                context.exit(code)
+
+        return (within or click).command(name, cls=kind)(body)
+
+    return made
 
 
 class CommandGroup(click.Group):
@@ -120,21 +169,6 @@ class CommandGroup(click.Group):
         whole = [(name, found.get_short_help_str(limit=1000)) for name, found in commands.items() if found is not None]
         with formatter.section("Commands"):
             formatter.write_dl(whole)
-
-
-# --- Options that name a figure to write.
-
-METAVAR: Final = "FIG.png|.pdf|.svg"
-
-
-class FigurePath(FilePath):
-    """Path of a figure; an unknown suffix is refused before any work."""
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Check the suffix and return the path."""
-        path = super().convert(value, param, ctx)
-        figure_file.check_suffix(path)
-        return path
 
 
 # --- `--head`: where the shoulders of a simulated head lie.
@@ -303,6 +337,40 @@ def _click_type(kind: Any) -> Any:
 
 
 FORCE = click.option("--force", is_flag=True, help="Overwrite existing outputs.")
+
+
+def output(metavar: str, writes: Format, meaning: str, *, required: bool = False) -> Decorator:
+    """``-o``: the file that a command writes."""
+    kind = FilePath(writes=writes)
+    return click.option("-o", "--output", required=required, metavar=metavar, type=kind, help=meaning)
+
+
+def figure(meaning: str, name: str = "--figure") -> Decorator:
+    """``--figure``, or another option that names a figure to write."""
+    return click.option(name, metavar="FIG.png|.pdf|.svg", type=FigurePath(), help=meaning)
+
+
+def path_option(name: str, metavar: str, meaning: str, **attributes: Any) -> Decorator:
+    """An option that names a file or a folder."""
+    return click.option(name, metavar=metavar, type=FilePath(), help=meaning, **attributes)
+
+
+def page_options(metavar: str, title: str) -> Decorator:
+    """``--pdf``, ``--title`` and ``--name``: how a page is printed, and what is printed on it."""
+
+    def add(function: Callable[..., Any]) -> Callable[..., Any]:
+        for one in (
+            click.option("--name", default="", help="Name to print on the page. Default: none."),
+            click.option("--title", default="", help=f"Title of the page. Default: {title}."),
+            path_option("--pdf", metavar, PRINTED),
+        ):
+            function = one(function)
+        return function
+
+    return add
+
+
+PRINTED: Final = "Also print it to PDF, by an installed Chromium or WeasyPrint."
 SESSION = click.option(
     "--session",
     "session_file",

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import click
 
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.commands.options import (
     FORCE,
     JSON,
-    METAVAR,
     CommandGroup,
-    FigurePath,
     FilePath,
     FiniteRange,
+    command,
+    figure,
     head_option,
     takes,
 )
@@ -52,7 +50,7 @@ def tradeoff_command() -> None:
 _FILE = FilePath()
 
 
-@click.command("forward")
+@command("forward", "tradeoff.tradeoff_forward_action")
 @click.argument("scene", required=False, metavar="[SCENE.toml]", type=_FILE)
 @click.option(
     "--size-calibration",
@@ -63,7 +61,7 @@ _FILE = FilePath()
 @head_option(
     "Default: shoulders-inside for plane-strain and the empirical model, as the scene's [head] gives them for solid."
 )
-@click.option("--figure", metavar=METAVAR, type=FigurePath(), help="Draw error in size against time.")
+@figure("Draw error in size against time.")
 @click.option(
     "--tolerance-percent",
     type=FiniteRange(min=0.0, min_open=True),
@@ -80,7 +78,7 @@ _FILE = FilePath()
 )
 @JSON
 @FORCE
-def tradeoff_forward_command(**given: Any) -> None:
+def tradeoff_forward_command() -> None:
     """Measure error in amplitude, width and size against CPU time, for the lump of a scene.
 
     The empirical model (which holds for lumps of 10 mm and more down to h/d 1, and warns outside), plane strain at
@@ -95,27 +93,23 @@ def tradeoff_forward_command(**given: Any) -> None:
 
     Example: tactile-bayes tradeoff forward --figure tradeoff.png
     """
-    from tactile_bayes.actions.tradeoff import tradeoff_forward_action
-
-    tradeoff_forward_action(**given)
 
 
 # --- `tradeoff estimate`: every setting of `estimate` on the user's own map, against a long reference.
 
 
-@click.command("estimate")
+@command("estimate", "tradeoff.tradeoff_estimate_action")
 @click.argument("maps", metavar="MAP.nc...", nargs=-1, required=True, type=_FILE)
 @CALIBRATION
 @takes(Settings, "centre_mm")
 @takes(Settings, "settings_file", help="Settings, as in `estimate`.")
 @TOLERANCE
 @RUNS
-@click.option("--figure", metavar=METAVAR, type=FigurePath(), help="Draw error against time.")
+@figure("Draw error against time.")
 @takes(Settings, "seed")
 @JSON
 @FORCE
-@click.pass_context
-def tradeoff_estimate_command(ctx: click.Context, /, **given: Any) -> None:
+def tradeoff_estimate_command() -> None:
     """Measure what each setting of `estimate` costs on a map, and how far its size interval is off.
 
     Whole estimates, from the map to the size, by every method, at several accuracies, noise fields and fit windows, are
@@ -127,24 +121,20 @@ def tradeoff_estimate_command(ctx: click.Context, /, **given: Any) -> None:
 
     Example: tactile-bayes tradeoff estimate map.nc --figure methods.png
     """
-    from tactile_bayes.actions.tradeoff import tradeoff_estimate_action
-
-    tradeoff_estimate_action(ctx, **given)
 
 
 # --- `tradeoff map`: every setting of `map` on the user's own scan, up to the size.
 
 
-@click.command("map")
+@command("map", "tradeoff.tradeoff_map_action")
 @click.argument("scan", metavar="SCAN.mcap", type=_FILE)
 @TOLERANCE
 @RUNS
-@click.option("--figure", metavar=METAVAR, type=FigurePath(), help="Draw error against time.")
+@figure("Draw error against time.")
 @takes(Settings, "seed")
 @JSON
 @FORCE
-@click.pass_context
-def tradeoff_map_command(ctx: click.Context, /, **given: Any) -> None:
+def tradeoff_map_command() -> None:
     """Measure what each setting of `map` costs on a scan, and how far it moves the size interval.
 
     The map is built with several sizes of cells, from a part of the frames, from the first part of the scan, by every
@@ -155,9 +145,6 @@ def tradeoff_map_command(ctx: click.Context, /, **given: Any) -> None:
 
     Example: tactile-bayes tradeoff map scan.mcap --figure cells.png
     """
-    from tactile_bayes.actions.tradeoff import tradeoff_map_action
-
-    tradeoff_map_action(ctx, **given)
 
 
 for _one in (tradeoff_forward_command, tradeoff_estimate_command, tradeoff_map_command):

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import click
 
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.commands.options import (
     FORCE,
     JSON,
-    METAVAR,
+    PRINTED,
     WORKERS,
     CommandGroup,
-    FigurePath,
     FilePath,
     FiniteRange,
+    command,
+    figure,
+    output,
+    path_option,
     scheduler_option,
     takes,
 )
@@ -27,12 +28,10 @@ from tactile_bayes.options import MOST_ITEMS, MapOptions, PlanAims, PlanErrors, 
 _FILE = FilePath()
 
 
-@click.command("validate")
+@command("validate", "trial.validate_action")
 @click.argument("trial", metavar="TRIAL.csv", type=_FILE)
-@click.option("--excision", required=True, metavar="EX.csv", type=_FILE, help="Sizes measured after excision.")
-@click.option(
-    "--columns", metavar="MAP.toml", type=_FILE, help="Layout of a wide TRIAL.csv: which column holds which reading."
-)
+@path_option("--excision", "EX.csv", "Sizes measured after excision.", required=True)
+@path_option("--columns", "MAP.toml", "Layout of a wide TRIAL.csv: which column holds which reading.")
 @takes(TrialSettings, "intervals", "resamples", "seed", "error_ratio")
 @takes(TrialSettings, "check_intervals", show_default=False)
 @takes(TrialSettings, "bayes")
@@ -45,23 +44,17 @@ _FILE = FilePath()
     help="Also print lines, limits of agreement, repeatability, pairs and r squared.",
 )
 @JSON
-@click.option(
-    "-o", "--output", metavar="REPORT.json", type=FilePath(writes="JSON"), help="Write the report as JSON to this file."
-)
+@output("REPORT.json", "JSON", "Write the report as JSON to this file.")
 @click.option(
     "--html",
     metavar="REPORT.html",
     type=FilePath(writes="HTML"),
     help="Write tables and figures as one self-contained page.",
 )
-@click.option(
-    "--pdf", metavar="REPORT.pdf", type=_FILE, help="Also print it to PDF, by an installed Chromium or WeasyPrint."
-)
-@click.option(
-    "--protocol", metavar="FILE.toml", type=_FILE, help="Pre-specified analysis; the report records its hash."
-)
+@path_option("--pdf", "REPORT.pdf", PRINTED)
+@path_option("--protocol", "FILE.toml", "Pre-specified analysis; the report records its hash.")
 @FORCE
-def validate_command(**given: Any) -> None:
+def validate_command() -> None:
     """Compare sizes with excision: errors, lines, agreement, repeatability and calibration of each modality.
 
     TRIAL.csv has the columns patient, mass, modality, replicate, size_mm, status (detected, not_detected, not_done or
@@ -70,15 +63,12 @@ def validate_command(**given: Any) -> None:
 
     Example: tactile-bayes validate trial.csv --excision excision.csv -o report.json
     """
-    from tactile_bayes.actions.trial import validate_action
-
-    validate_action(**given)
 
 
 # --- `plan`: sample size of a trial, and the value of more maps per mass.
 
 
-@click.command("plan")
+@command("plan", "trial.plan_action")
 @click.option(
     "--patients",
     type=click.IntRange(8, 10_000),
@@ -97,13 +87,8 @@ def validate_command(**given: Any) -> None:
 )
 @takes(PlanAims, *names_of(PlanAims))
 @takes(PlanErrors, *names_of(PlanErrors))
-@click.option(
-    "--pilot",
-    metavar="TRIAL.csv",
-    type=_FILE,
-    help="Take the errors that no option gives from this trial; needs --excision.",
-)
-@click.option("--excision", metavar="EX.csv", type=_FILE, help="Sizes measured after excision in the pilot.")
+@path_option("--pilot", "TRIAL.csv", "Take the errors that no option gives from this trial; needs --excision.")
+@path_option("--excision", "EX.csv", "Sizes measured after excision in the pilot.")
 @click.option("--against", default="ultrasound", show_default=True, help="Modality of the pilot to compare with.")
 @click.option(
     "--trials",
@@ -115,12 +100,10 @@ def validate_command(**given: Any) -> None:
 @takes(TrialSettings, "seed")
 @WORKERS
 @JSON
-@click.option(
-    "-o", "--output", metavar="PLAN.json", type=FilePath(writes="JSON"), help="Write the plan as JSON to this file."
-)
-@click.option("--figure", metavar=METAVAR, type=FigurePath(), help="Draw power against the number of patients.")
+@output("PLAN.json", "JSON", "Write the plan as JSON to this file.")
+@figure("Draw power against the number of patients.")
 @FORCE
-def plan_command(**given: Any) -> None:
+def plan_command() -> None:
     """Plan a trial: how many patients, how many maps of a mass, by simulation.
 
     With --power or --precision the answer is a number of patients, by simulated designs about it. Each design is
@@ -129,9 +112,6 @@ def plan_command(**given: Any) -> None:
 
     Example: tactile-bayes plan --power 0.9 --maps 3 --figure plan.png
     """
-    from tactile_bayes.actions.trial import plan_action
-
-    plan_action(**given)
 
 
 # --- `campaign`: from a folder of exams to the trial's report.
@@ -142,10 +122,15 @@ def campaign_command() -> None:
     """From a folder of exams to the trial's report, in one resumable run."""
 
 
-@campaign_command.command("init")
+@command("init", "trial.campaign_init_action", within=campaign_command)
 @click.argument("folder", metavar="FOLDER", type=FilePath(addresses=True))
 @click.option(
-    "-o", "--output", required=True, metavar="EXAMS.csv", type=FilePath(writes="CSV"), help="Where to write the table."
+    "-o",
+    "--output",
+    required=True,
+    metavar="EXAMS.csv",
+    type=FilePath(writes="CSV", guarded=False),
+    help="Where to write the table.",
 )
 @click.option(
     "--names",
@@ -155,7 +140,7 @@ def campaign_command() -> None:
 )
 @click.option("--add", is_flag=True, help="Keep the rows of an EXAMS.csv that is there, and add those of other files.")
 @FORCE
-def campaign_init_command(**given: Any) -> None:
+def campaign_init_command() -> None:
     """Write the table of exams from a folder of scans and what they carry.
 
     FOLDER may be one in an object store, as s3://bucket/scans; the maps in it are passed over.
@@ -167,23 +152,14 @@ def campaign_init_command(**given: Any) -> None:
 
     Example: tactile-bayes campaign init scans -o exams.csv
     """
-    from tactile_bayes.actions.trial import campaign_init_action
-
-    campaign_init_action(**given)
 
 
-@campaign_command.command("run")
+@command("run", "trial.campaign_run_action", within=campaign_command)
 @click.argument("exams", metavar="EXAMS.csv", type=_FILE)
 @click.option("-o", "--output", required=True, metavar="DIR", type=_FILE, help="Folder for all files.")
-@click.option(
-    "--excision", metavar="EX.csv", type=_FILE, help="Sizes measured after excision: adds the trial's report."
-)
-@click.option(
-    "--columns", metavar="MAP.toml", type=_FILE, help="Layout of a wide EX.csv: which column holds what, in which unit."
-)
-@click.option(
-    "--protocol", metavar="FILE.toml", type=_FILE, help="Pre-specified analysis of the trial, as for `validate`."
-)
+@path_option("--excision", "EX.csv", "Sizes measured after excision: adds the trial's report.")
+@path_option("--columns", "MAP.toml", "Layout of a wide EX.csv: which column holds what, in which unit.")
+@path_option("--protocol", "FILE.toml", "Pre-specified analysis of the trial, as for `validate`.")
 @takes(Settings, "method", help="As `estimate`.")
 @takes(Settings, "size_calibration", metavar="NAME|SIZE.json", help="As `estimate`, unless a row names its own.")
 @takes(Settings, "settings_file", help="Priors and more, as `estimate`.")
@@ -211,7 +187,7 @@ def campaign_init_command(**given: Any) -> None:
 )
 @WORKERS
 @scheduler_option("the exams")
-def campaign_run_command(**given: Any) -> None:
+def campaign_run_command() -> None:
     """Map, estimate and pool the exams of a table, and report the trial.
 
     DIR gets a folder for each exam and each pooled mass, exams_done.csv, failures.csv, trial.csv (which `validate`
@@ -224,6 +200,3 @@ def campaign_run_command(**given: Any) -> None:
 
     Example: tactile-bayes campaign run exams.csv --excision excision.csv -o out
     """
-    from tactile_bayes.actions.trial import campaign_run_action
-
-    campaign_run_action(**given)

@@ -276,7 +276,7 @@ PRINTERS = {
     "report/estimate_figures", "report/estimate_text", "report/exam_page", "report/map_figure", "report/map_text",
     "report/pages", "report/pooled",
     # of draws, not of a size; names of files that were written
-    "report/posterior_figures", "actions/estimate",
+    "report/posterior_figures", "actions/report",
     # of trials, calibrations, devices and studies
     "api/trials", "actions/calibrate", "actions/devices", "api/diagnosing", "api/planning",
     "campaigns/campaign", "actions/bring_in", "actions/exam",

@@ -1,0 +1,93 @@
+"""`compare`: the maps of two visits and more."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import click
+
+from tactile_bayes.api.comparing import Comparison, compare_estimates
+from tactile_bayes.api.estimating import estimate_file
+from tactile_bayes.api.settings import Comparing, Settings, dates_of, refuse_checkpoint, times_of
+from tactile_bayes.api.sized import SizeEstimate
+from tactile_bayes.commands.options import settings_of
+from tactile_bayes.declarations import replace
+from tactile_bayes.errors import UsageError
+from tactile_bayes.files.atomic import given_twice
+from tactile_bayes.files.reports import json_text
+from tactile_bayes.report.compare import compare_summary, compare_text
+from tactile_bayes.report.exam_words import Given
+from tactile_bayes.report.pages import PageFiles
+from tactile_bayes.shell import progress_bar
+
+
+def groups_of(later: Sequence[tuple[int, Path]]) -> list[tuple[Path, ...]]:
+    """Files of each group, in the order of the groups."""
+    found: dict[int, list[Path]] = {}
+    for number, path in later:
+        found.setdefault(number, []).append(path)
+    return [tuple(found[number]) for number in sorted(found)]
+
+
+def compare_action(
+    first: tuple[Path, ...],
+    later: tuple[tuple[int, Path], ...],
+    days: tuple[float, ...],
+    dates: str | None,
+    grown_by: tuple[float, ...],
+    same_mass: bool,
+    registration_mm: float,
+    as_json: bool,
+    output: Path | None,
+    pdf: Path | None,
+    title: str,
+    name: str,
+    figure: Path | None,
+    force: bool,
+    verbose: bool,
+    **asked: Any,
+) -> int:
+    """Compare the size of a mass at two visits and more."""
+    comparing = Comparing(
+        days=times_of(days or None, dates_of(dates) or None),
+        grown_by=tuple(percent / 100 for percent in grown_by),
+        same_mass=same_mass,
+        registration_mm=registration_mm,
+    )
+    settings = settings_of(**asked)
+    visits = [first, *groups_of(later)]
+    if twice := given_twice(path for maps in visits for path in maps):
+        raise UsageError(f"{twice} is given twice; give each map once, at its own visit")
+    refuse_checkpoint(settings)
+    comparing.check_visits(len(visits))
+    if pdf is not None and output is None:
+        raise UsageError("--pdf prints the page that --output names; give -o GROWTH.html too")
+    Given(title, name)
+    page = None if output is None else PageFiles(output, pdf, force)
+    if page is not None:
+        page.check()
+    found = replace(_compare(visits, settings, comparing), dates=dates_of(dates))
+    report = found.report.checked()
+    text_of = json_text if as_json else compare_text if verbose else compare_summary
+    try:
+        if page is not None:
+            page.write(found.page_text(title=title, name=name))
+        if figure is not None:
+            found.draw(figure, force=force)
+    finally:  # what was computed is not lost with the figure
+        click.echo(text_of(report), nl=False)
+    return found.exit_code
+
+
+def _compare(visits: list[tuple[Path, ...]], settings: Settings, comparing: Comparing) -> Comparison:
+    """Estimate every map and compare. An error with one map stops it."""
+    total, found = sum(len(maps) for maps in visits), list[list[SizeEstimate]]()
+    with progress_bar("maps") as progress:
+        for maps in visits:
+            found.append([estimate_file(path, settings) for path in maps])
+            progress(sum(len(one) for one in found), total)
+    names = [[str(path) for path in maps] for maps in visits]
+    inputs = {f"visit_{v}_map_{i}": path for v, maps in enumerate(visits, 1) for i, path in enumerate(maps, 1)}
+    return compare_estimates(found, settings, comparing=comparing, names=names, inputs=inputs)

@@ -1,0 +1,75 @@
+"""`map`: from scans to a tactile map."""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import click
+
+from tactile_bayes.api.maps import map_provenance
+from tactile_bayes.declarations import EXACT, to_plain
+from tactile_bayes.errors import UsageError
+from tactile_bayes.files.atomic import given_twice, refuse_existing
+from tactile_bayes.files.map_nc import write_map
+from tactile_bayes.files.provenance import repeated_scans
+from tactile_bayes.files.scan_mcap import read_scan
+from tactile_bayes.mapping.build import build_map
+from tactile_bayes.options import MapOptions
+from tactile_bayes.report.figure_file import named_exam
+from tactile_bayes.report.map_figure import map_figure
+from tactile_bayes.report.map_text import map_summary, map_text
+from tactile_bayes.shell import progress_bar
+
+
+def map_action(
+    scans: tuple[Path, ...], output: Path | None, figure: Path | None, force: bool, verbose: bool, **options: Any
+) -> None:
+    """Build a tactile map from one scan, or one common map from several scans of the same examination."""
+    if twice := given_twice(scans):
+        raise UsageError(f"{twice} is given twice; its frames would count twice: give each scan once")
+    if output is None:
+        output = beside(scans[0])
+        if output.exists() and not force:
+            raise UsageError(f"{output} exists; name another with -o, or give --force")
+        refuse_existing(output, force=force)
+    settings = to_plain(MapOptions(**options), digits=EXACT)
+    clock = _Clock(verbose)
+    loaded = [read_scan(path) for path in scans]
+    provenance = map_provenance(scans, loaded, settings)
+    for later, earlier in repeated_scans([[facts] for facts in provenance.scans]).items():
+        raise UsageError(f"{scans[later]} holds the recording of {scans[earlier]}; give each recording once")
+    clock.tell("read")
+    with progress_bar("frames") as progress:
+        tactile_map = build_map(loaded, **options, progress=progress)
+    clock.tell("map")
+    write_map(output, tactile_map, provenance=provenance, force=force)
+    try:
+        if figure:
+            title = f"Tactile map: {named_exam(output.stem, provenance.scans)}"
+            map_figure(tactile_map, figure, title=title, force=force)
+        clock.tell("write")
+    finally:  # the map is written, whatever becomes of the figure
+        text = map_text(tactile_map) if verbose else map_summary(tactile_map, written=str(output))
+        click.echo(text, nl=False)
+
+
+def beside(scan: Path) -> Path:
+    """Where the map of a scan is written if no one says so: in its folder, and named after it."""
+    return scan.parent / ("map.nc" if scan.stem == "scan" else f"{scan.stem}.nc")
+
+
+class _Clock:
+    """Prints the time of each step, if requested."""
+
+    def __init__(self, verbose: bool) -> None:
+        self._verbose = verbose
+        self._last = time.perf_counter()
+
+    def tell(self, step: str) -> None:
+        now = time.perf_counter()
+        if self._verbose:
+            print(f"{step}: {now - self._last:.3f} s", file=sys.stderr)
+        self._last = now
