@@ -27,22 +27,24 @@ from benchmarks.map_peers import BINCOUNT_FRAMES, BOOST, BOOST_FRAMES, Job, binc
 from tactile_bayes.forward.scene import Head, Scene, Strokes
 from tactile_bayes.forward.simulate import head_positions
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.mapping.accumulate import Instrument, MapAccumulator, MapGrid
+from tactile_bayes.mapping.accumulate import MapAccumulator
 from tactile_bayes.mapping.cells import (
     CellSums,
-    ProjectedTaxels,
     Projection,
     Projector,
     Readout,
     add_frames,
     chunk_frames,
 )
-from tactile_bayes.mapping.plane import FramePoses
+from tactile_bayes.mapping.plane import FramePoses, head_moments
 from tactile_bayes.mapping.select import chunks
+from tactile_bayes.presets import CELL_MM
 from tactile_bayes.scans import ElementCalibration, HeadGeometry
 
 RATE_HZ = 200
 _POOL = 2000
+_STEP = 10
+"""Frames that the live view takes at once, 20 times a second."""
 
 
 class Frames:
@@ -68,16 +70,18 @@ class Frames:
             return self.pool[first : first + stop - start]
         return self.pool[np.arange(start, stop) % _POOL]
 
-    def accumulator(self, *, keep_frames: bool = False) -> MapAccumulator:
+    def plane(self) -> FloatArray:
+        """The plane under the strokes."""
+        return head_moments(self.head, self.poses(0, 1400)).plane().plane_from_base
+
+    def accumulator(self) -> MapAccumulator:
         """An empty map under the strokes."""
-        grid = MapGrid.under(self.head, self.poses(0, 1400))
-        return MapAccumulator(grid, Instrument(self.head, self.calibration), keep_frames=keep_frames)
+        return MapAccumulator(self.head, self.calibration, plane_from_base=self.plane())
 
     def job(self, frames: int) -> Job:
         """What the peers get: everything per frame prepared beforehand, which our own way does inside its time."""
-        grid = self.accumulator().grid
         good = np.ones(self.head.shape, dtype=bool)
-        projector = Projector(self.head, plane_from_base=grid.plane_from_base, taxels=good, cell_mm=grid.cell_mm)
+        projector = Projector(self.head, plane_from_base=self.plane(), taxels=good, cell_mm=CELL_MM)
         projection = projector.at(self.poses(0, frames))
         first, shape = projection.block()
         counts = np.concatenate([self.counts(a, min(a + 1000, frames)) for a in range(0, frames, 1000)])
@@ -87,7 +91,7 @@ class Frames:
             self.calibration.offset_kpa.ravel(),
             np.ascontiguousarray(projection.turn),
             projection.shift - np.array([first[1], first[0]]),
-            projection.taxels.place_mm,
+            projection.taxels[:3],
             shape,
         )
 
@@ -113,7 +117,7 @@ def same_work(source: Frames, job: Job) -> CellSums:
     good = np.ones(source.head.shape, dtype=bool)
     readout, sums = Readout.of(source.calibration, good), CellSums(1.0)
     matrix = np.concatenate([job.turn, job.shift[:, :, None]], axis=2)
-    projection = Projection(ProjectedTaxels(job.taxels), matrix, 1.0)
+    projection = Projection(np.vstack([job.taxels, np.ones(job.taxels.shape[1])]), matrix, 1.0)
     for part in chunks(len(job.counts), chunk_frames(readout.size)):
         pressure, valid = readout.pressure_kpa(job.counts[part])
         level, _ = readout.levels(pressure, valid)
@@ -173,24 +177,24 @@ def _peak_mb() -> float:
 
 
 def live_steps(seconds: float, *, every: int) -> dict[str, FloatArray]:
-    """Work of each frame in microseconds: one frame added, the plane, and a snapshot every so many frames."""
+    """Work of a frame in microseconds, in steps of the live view: `_STEP` frames added, a snapshot every so often."""
     source = Frames()
-    grown = source.accumulator(keep_frames=True)
-    grown.add(source.counts(0, 1), source.poses(0, 1))
+    grown = source.accumulator()
+    grown.add(source.counts(0, _STEP), source.poses(0, _STEP))
     gc.collect()
     gc.freeze()
     gc.disable()  # as a live reader does: one full collection took 613 ms
-    steps = np.zeros((int(seconds * RATE_HZ), 2))
-    for frame in range(len(steps)):
-        counts, poses = source.counts(frame, frame + 1), source.poses(frame, frame + 1)
+    steps = np.zeros((int(seconds * RATE_HZ / _STEP), 2))
+    for step in range(len(steps)):
+        start, stop = step * _STEP, (step + 1) * _STEP
+        counts, poses = source.counts(start, stop), source.poses(start, stop)
         wall, cpu = time.perf_counter(), time.thread_time()
         grown.add(counts, poses)
-        grown.plane()
-        if frame % every == 0:
+        if step % every == 0:
             grown.snapshot()
-        steps[frame] = time.perf_counter() - wall, time.thread_time() - cpu
+        steps[step] = time.perf_counter() - wall, time.thread_time() - cpu
     gc.enable()
-    return {"wall": 1e6 * steps[:, 0], "work": 1e6 * steps[:, 1]}
+    return {name: 1e6 / _STEP * values for name, values in zip(("wall", "work"), steps.T, strict=True)}
 
 
 def _bincount_us(frames: int = 1400) -> float:
@@ -218,7 +222,8 @@ def _live_report(seconds: float, *, every: int, last: Comparison) -> dict[str, A
             text = ""
             if kind == "work" and not busy:
                 ratio = float(p50) / peer_us
-                text = f"   p50 {ratio:.1f} x a frame of bincount{last.add('live p50, numpy, over bincount', ratio)}"
+                before = last.add("live p50, a frame of ten, over bincount", ratio)
+                text = f"   p50 {ratio:.1f} x a frame of bincount{before}"
             print(f"{beside} p50 {p50:6.0f} us   p99 {p99:6.0f} us{text}", flush=True)
     return rows
 
@@ -275,8 +280,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     document["peers"] = _compare(options.minutes, runs=options.runs, last=last)
     print("cost against length")
     document["growth"] = {"numpy": _growth(options.growth, last=last)}
-    print("live step: one frame added, the plane, a snapshot every 8th frame (25 Hz)")
-    document["live"] = _live_report(options.live_s, every=8, last=last)
+    print(f"live step, of a frame: {_STEP} frames added, a snapshot every second time (10 Hz)")
+    document["live"] = _live_report(options.live_s, every=2, last=last)
     print(last.report())
     if options.keep:
         last.keep()

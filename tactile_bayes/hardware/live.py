@@ -17,13 +17,13 @@ import numpy as np
 
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.geometry import FloatArray, apply, patient_from_plane
+from tactile_bayes.geometry import FloatArray, Plane, apply, patient_from_plane
 from tactile_bayes.hardware.ports import PIPE_BYTES
 from tactile_bayes.hardware.readings import CountArray, PoseReading
 from tactile_bayes.hardware.recorder import Report
-from tactile_bayes.mapping.accumulate import Instrument, MapAccumulator, MapGrid
+from tactile_bayes.mapping.accumulate import MapAccumulator
 from tactile_bayes.mapping.map import TactileMap
-from tactile_bayes.mapping.plane import poses_at
+from tactile_bayes.mapping.plane import FramePoses, head_moments, poses_at
 from tactile_bayes.presets import PRESSURE_WINDOW_KPA
 from tactile_bayes.scans import ElementCalibration, HeadGeometry, TrackerPoses
 
@@ -251,6 +251,8 @@ class LiveMap:
     _report: dict[str, Any] = field(default_factory=dict)
     _landmarks: dict[str, FloatArray] = field(default_factory=dict)
     _map: MapAccumulator | None = None
+    _fed: list[tuple[CountArray, FramePoses]] = field(default_factory=list)
+    """What the map was given, as long as its plane may change."""
     _refits: int = 0
     _pressure_kpa: float = float("nan")
     _host_ns: int = 0
@@ -295,20 +297,32 @@ class LiveMap:
         if self._map is None:
             if not found.known.any():
                 return
-            instrument = Instrument(self.head, self.calibration, pressure_window_kpa=self.window_kpa)
-            self._map = MapAccumulator(MapGrid.under(self.head, found), instrument)
-        self._map.add(np.stack([one.counts for one in ready]), found)
-        self._refit()
+            self._map = self._map_on(head_moments(self.head, found).plane())
+        counts = np.stack([one.counts for one in ready])
+        self._map.add(counts, found)
+        if self._refits < len(REFIT_AT):
+            self._fed.append((counts, found))
+            self._refit(self._map)
 
-    def _refit(self) -> None:
+    def _map_on(self, plane: Plane) -> MapAccumulator:
+        return MapAccumulator(
+            self.head,
+            self.calibration,
+            plane_from_base=plane.plane_from_base,
+            pressure_window_kpa=self.window_kpa,
+        )
+
+    def _refit(self, grown: MapAccumulator) -> None:
         """Move the map to the best-fit plane of the frames so far, from time to time."""
-        if self._map is None or self._refits >= len(REFIT_AT):
-            return
-        if self._map.figures["frames_used"] < REFIT_AT[self._refits]:
+        if grown.figures["frames_used"] < REFIT_AT[self._refits]:
             return
         self._refits += 1
         with suppress(BadDataError):  # still too nearly a line: the plane under the head will do until the next time
-            self._map = self._map.rebuild()
+            self._map = self._map_on(grown.plane())
+            for counts, poses in self._fed:
+                self._map.add(counts, poses)
+        if self._refits == len(REFIT_AT):
+            self._fed.clear()
 
     def _snapshot(self) -> TactileMap | None:
         """The map so far, with the patient's axes if known."""

@@ -46,7 +46,7 @@ _WIDER = 1.5
 
 def find_mass(selections: Sequence[SelectedFrames], plane: Plane) -> FloatArray:
     """(2,) place of the highest point of the smoothed map on `plane`, mm."""
-    sources = sources_of(list(selections), plane_from_base=plane.plane_from_base, cell_mm=_CELL_MM)
+    sources = sources_of(selections, plane_from_base=plane.plane_from_base, cell_mm=_CELL_MM)
     levels = [source.selection.level_kpa[source.selection.used] for source in sources]
     sums = add_all(sources, levels, cell_mm=_CELL_MM).trimmed()
     count, total = smooth(sums.count), smooth(sums.total)
@@ -79,7 +79,7 @@ def local_plane(
 def _plane_within(
     selections: Sequence[SelectedFrames], plane: Plane, mass: FloatArray, radius: float
 ) -> tuple[Plane, dict[str, float]]:
-    moments = HeadMoments.none()
+    moments = HeadMoments()
     for part in selections:
         lever = inverse(part.scan.head.scanhead_from_tracker)
         middle = apply(lever, part.scan.head.surface_mm.reshape(-1, 3).mean(axis=0))
@@ -282,7 +282,7 @@ def _flattened(
     used = [part for part in selections if part.used.any()]
     flats = [find_flat_field(part) for part in used]
     figures["flat_field_frames"] = float(sum(flat.frames for flat in flats))
-    figures["flat_field_sd"] = float(np.mean([flat.spread for flat in flats]))
+    figures["flat_field_sd"] = float(np.mean([flat.response.std() for flat in flats]))
     return rules.select([flat.applied(part.scan) for flat, part in zip(flats, used, strict=True)], late_ms)
 
 
@@ -300,7 +300,7 @@ def _latency(selections: list[SelectedFrames], rules: _Rules, cell_mm: float, fi
 
 def _plane(selections: list[SelectedFrames]) -> Plane:
     """Best-fit plane of all frames used; an error names the rotation convention that would fit."""
-    moments = HeadMoments.none()
+    moments = HeadMoments()
     for part in selections:
         moments = moments + head_moments(part.scan.head, part.used_poses)
     try:

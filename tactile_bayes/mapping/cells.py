@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from math import floor
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,11 +32,6 @@ def _no_cells() -> IntArray:
     return np.zeros((0, 0), dtype=np.int64)
 
 
-def cell_index(position_mm: FloatArray, cell_mm: float) -> IntArray:
-    """Index of the nearest cell; cell k is centred on k x cell_mm, so maps of one cell size share a lattice."""
-    return np.asarray(np.floor(position_mm / cell_mm + 0.5).astype(np.int64))
-
-
 @dataclass(slots=True, eq=False)
 class CellSums:
     """Count, sum and sum of squares of the readings in each cell, in whole steps."""
@@ -55,23 +48,6 @@ class CellSums:
     """Readings below 0, which noise about nothing gives. They are added as they are: cut off at 0, they would lift the
     mean."""
 
-    def add(self, x_mm: FloatArray, y_mm: FloatArray, value: FloatArray) -> None:
-        """Add readings at positions on the plane; arrays of one shape, all finite, of at most `READINGS_PER_CALL`.
-
-        Readings so far apart that the map would have over `MAX_CELLS` cells are a `BadDataError`.
-        """
-        if value.size > READINGS_PER_CALL:
-            raise ValueError(f"{value.size} readings in one call; sums are exact up to {READINGS_PER_CALL}")
-        if value.size:
-            self.add_cells(cell_index(y_mm, self.cell_mm), cell_index(x_mm, self.cell_mm), value)
-
-    def add_cells(self, row: IntArray, column: IntArray, value: FloatArray) -> None:
-        """Add readings whose cells are known already."""
-        first = (int(row.min()), int(column.min()))
-        shape = (int(row.max()) - first[0] + 1, int(column.max()) - first[1] + 1)
-        steps = np.rint(value * (1.0 / VALUE_STEP))
-        self.add_steps(first, shape, (row - first[0]) * shape[1] + (column - first[1]), steps)
-
     def add_steps(
         self,
         first: tuple[int, int],
@@ -87,19 +63,17 @@ class CellSums:
         `flat` is the cell of each in the block, row by row. Values beyond `LIMIT_STEPS` either way are clipped and
         counted, unless `bounded` says that all lie in 0 to `LIMIT_STEPS`.
         """
-        self.make_room(first, shape)
+        self._make_room(first, shape)
         if not bounded:
             self._count_and_clip(steps)
         cells, weights, index = shape[0] * shape[1], steps.ravel(), flat.ravel()
         square = np.bincount(index, weights * weights, cells).astype(np.int64)
-        if len(index) < cells:  # few readings are quicker counted than cells taken apart
-            count, total = np.bincount(index, None, cells), np.bincount(index, weights, cells).astype(np.int64)
-        else:
-            weights += 2.0**_PACK_BITS
-            packed = np.bincount(index, weights, cells).astype(np.int64)
-            count = (packed + (1 << (_PACK_BITS - 1))) >> _PACK_BITS
-            total = packed - (count << _PACK_BITS)
-        self._add_inside(first, count.reshape(shape), total.reshape(shape), square.reshape(shape))
+        weights += 2.0**_PACK_BITS
+        packed = np.bincount(index, weights, cells).astype(np.int64)
+        count = (packed + (1 << (_PACK_BITS - 1))) >> _PACK_BITS
+        window = self.window(first, shape)
+        for sums, block in ((self.count, count), (self.total, packed - (count << _PACK_BITS)), (self.square, square)):
+            sums[window] += block.reshape(shape)
 
     def _count_and_clip(self, steps: FloatArray) -> None:
         lowest = float(steps.min())
@@ -108,28 +82,6 @@ class CellSums:
         if max(float(steps.max()), -lowest) > LIMIT_STEPS:
             self.clipped += int((np.abs(steps) > LIMIT_STEPS).sum())
             np.clip(steps, -LIMIT_STEPS, LIMIT_STEPS, out=steps)
-
-    def add_block(self, first: tuple[int, int], count: IntArray, total: IntArray, square: IntArray) -> None:
-        """Add sums over a block of the lattice."""
-        self.make_room(first, _shape(count))
-        self._add_inside(first, count, total, square)
-
-    def _add_inside(self, first: tuple[int, int], count: IntArray, total: IntArray, square: IntArray) -> None:
-        """As `add_block`, for a block inside the arrays."""
-        window = self.window(first, _shape(count))
-        for sums, block in ((self.count, count), (self.total, total), (self.square, square)):
-            part = sums[window]
-            part += block
-
-    def merge(self, other: CellSums) -> None:
-        """Add all of another's sums."""
-        if other.cell_mm != self.cell_mm:
-            raise ValueError(f"cells of {other.cell_mm} mm cannot be merged into cells of {self.cell_mm} mm")
-        self.clipped += other.clipped
-        self.negative += other.negative
-        if not other.count.size:
-            return
-        self.add_block(other.first, other.count, other.total, other.square)
 
     def trimmed(self) -> CellSums:
         """A copy without the empty rows and columns around the data."""
@@ -146,10 +98,10 @@ class CellSums:
         """(ny, nx) mean of each cell; NaN without readings."""
         return self._per_reading(self.total, VALUE_STEP)
 
-    def variance(self, mean: FloatArray | None = None) -> FloatArray:
+    def variance(self) -> FloatArray:
         """(ny, nx) variance of the readings about their cell's mean (divided by n); NaN without readings."""
         spread = self._per_reading(self.square, VALUE_STEP**2)
-        spread -= np.square(self.mean() if mean is None else mean)
+        spread -= np.square(self.mean())
         return np.maximum(spread, 0.0, out=spread)
 
     def x_mm(self) -> FloatArray:
@@ -171,29 +123,23 @@ class CellSums:
         top, left = first[0] - self.first[0], first[1] - self.first[1]
         return slice(top, top + shape[0]), slice(left, left + shape[1])
 
-    def make_room(self, first: tuple[int, int], shape: tuple[int, int]) -> None:
+    def _make_room(self, first: tuple[int, int], shape: tuple[int, int]) -> None:
         """Grow the arrays, with a margin, to contain a block of the lattice."""
-        top, left, bottom, right = first[0], first[1], first[0] + shape[0], first[1] + shape[1]
+        (top, left), (bottom, right) = first, (first[0] + shape[0], first[1] + shape[1])
+        held, before = self.count.shape, self.first
         if self.count.size:
-            held_bottom, held_right = self.first[0] + self.count.shape[0], self.first[1] + self.count.shape[1]
-            if top >= self.first[0] and left >= self.first[1] and bottom <= held_bottom and right <= held_right:
+            held_bottom, held_right = before[0] + held[0], before[1] + held[1]
+            if top >= before[0] and left >= before[1] and bottom <= held_bottom and right <= held_right:
                 return
-            top, left = min(top, self.first[0]), min(left, self.first[1])
+            top, left = min(top, before[0]), min(left, before[1])
             bottom, right = max(bottom, held_bottom), max(right, held_right)
         refuse_vast(bottom - top, right - left, self.cell_mm)
-        roomy = CellSums(self.cell_mm, (top - _GROWTH, left - _GROWTH))
-        new_shape = (bottom - top + 2 * _GROWTH, right - left + 2 * _GROWTH)
-        window = roomy.window(self.first, _shape(self.count))
+        self.first = (top - _GROWTH, left - _GROWTH)
         for name in ("count", "total", "square"):
-            array = np.zeros(new_shape, dtype=np.int64)
-            if self.count.size:
-                array[window] = getattr(self, name)
-            setattr(self, name, array)
-        self.first = roomy.first
-
-
-def _shape(array: IntArray) -> tuple[int, int]:
-    return (array.shape[0], array.shape[1])
+            roomy = np.zeros((bottom - top + 2 * _GROWTH, right - left + 2 * _GROWTH), dtype=np.int64)
+            if held[0]:
+                roomy[self.window(before, (held[0], held[1]))] = getattr(self, name)
+            setattr(self, name, roomy)
 
 
 def refuse_vast(rows: int, columns: int, cell_mm: float, *, most: int = MAX_CELLS) -> None:
@@ -216,27 +162,7 @@ _TURN_STEP = 2.0**-22
 _TAXEL_STEP_MM = 2.0**-15
 _SHIFT_STEP = 2.0**-30
 _MATRIX_STEPS = np.array([_TURN_STEP, _TURN_STEP, _TURN_STEP, _SHIFT_STEP])[:, None]
-# The same for a frame's eight numbers, with what is added to them.
-_NUMBERS = 2 * (3 * ((_TURN_STEP, 0.0),) + ((_SHIFT_STEP, 0.5),))
 _MOST_CELLS = 2**15
-# Floats from here on are whole numbers.
-_WHOLE = 2.0**52
-
-
-class ProjectedTaxels(Record, eq=False, dict=True):
-    """The taxels of a head to be projected."""
-
-    place_mm: FloatArray  #: (3, k) array: Their centres in the tracker's axes, about their middle.
-
-    @cached_property
-    def place_and_one(self) -> FloatArray:
-        """(4, k) places over a row of ones, with which a shift is one more term of a product."""
-        return np.vstack([self.place_mm, np.ones(self.place_mm.shape[1])])
-
-    @cached_property
-    def reach_mm(self) -> FloatArray:
-        """(4,) how far they reach from their middle along each axis, and 0."""
-        return np.append(np.abs(self.place_mm).max(axis=1, initial=0.0), 0.0)
 
 
 class Projection(Record, eq=False):
@@ -246,7 +172,9 @@ class Projection(Record, eq=False):
     coordinates of each taxel.
     """
 
-    taxels: ProjectedTaxels  #: The taxels that are projected.
+    taxels: FloatArray
+    """(4, k) array: Centres of the taxels in the tracker's axes, mm about their middle, over a row of ones, by which a
+    shift is one more term of a product."""
     matrix: FloatArray
     """(n, 2, 4) array: First two rows of the rotation from the tracker to the plane, in cells a mm; and beside them
     where the taxels' middle lies on the lattice, in cells. Half a cell is added, so that cell k is centred on k."""
@@ -280,35 +208,18 @@ class Projection(Record, eq=False):
 
         A block so wide that cells could not be told exactly is a `BadDataError`.
         """
-        left, top, right, bottom = self._ends_of_one() if len(self) == 1 else self._ends()
+        reach = np.append(np.abs(self.taxels[:3]).max(axis=1, initial=0.0), 0.0)
+        # Of two dimensions, for which numpy has a fast product.
+        reach = (np.abs(self.matrix).reshape(-1, 4) @ reach).reshape(-1, 2)
+        left, top = np.floor((self.shift - reach).min(axis=0)).tolist()
+        right, bottom = np.floor((self.shift + reach).max(axis=0)).tolist()
         columns, rows = right - left + 1, bottom - top + 1
         if max(abs(left), abs(top), columns, rows) > _MOST_CELLS:
             refuse_vast(int(rows + abs(top)), int(columns + abs(left)), self.cell_mm, most=_MOST_CELLS)
         return (int(top), int(left)), (int(rows), int(columns))
 
-    def _ends(self) -> list[float]:
-        """First column and row, and last column and row, that a reading can fall in."""
-        # Of two dimensions, for which numpy has a fast product.
-        reach = (np.abs(self.matrix).reshape(-1, 4) @ self.taxels.reach_mm).reshape(-1, 2)
-        first = np.floor((self.shift - reach).min(axis=0)).tolist()
-        return [*first, *np.floor((self.shift + reach).max(axis=0)).tolist()]
-
-    def _ends_of_one(self) -> list[float]:
-        """As `_ends` for one frame, with plain numbers: sums and products of whole steps are exact either way."""
-        x, y, z, _ = self.taxels.reach_mm.tolist()
-        shifts = [(abs(a) * x + abs(b) * y + abs(c) * z, shift) for a, b, c, shift in self.matrix[0].tolist()]
-        return [*(floor(shift - reach) for reach, shift in shifts), *(floor(shift + reach) for reach, shift in shifts)]
-
     def flat(self, first: tuple[int, int], shape: tuple[int, int]) -> IntArray:
         """(n, k) indices of the readings' cells in a block given by its first row and column and its shape."""
-        if len(self) == 1:
-            matrix = self.matrix[0].copy()
-            matrix[0, 3] -= first[1]
-            matrix[1, 3] -= first[0]
-            column, row = (matrix @ self.taxels.place_and_one).astype(np.int64)
-            row *= shape[1]
-            row += column
-            return np.asarray(row[None])
         # Not negative inside the block: cutting off is floor. Blocks have at most 2^30 cells, so 32 bits hold an index.
         row = self._coordinate(1, first[0]).astype(np.int32)
         row *= np.int32(shape[1])
@@ -318,7 +229,7 @@ class Projection(Record, eq=False):
     def _coordinate(self, axis: int, first: int) -> FloatArray:
         rows = self.matrix[:, axis].copy()
         rows[:, 3] -= first
-        return np.asarray(rows @ self.taxels.place_and_one)
+        return np.asarray(rows @ self.taxels)
 
 
 class Projector:
@@ -328,49 +239,32 @@ class Projector:
     def __init__(self, head: HeadGeometry, *, plane_from_base: FloatArray, taxels: BoolArray, cell_mm: float) -> None:
         self._rows = plane_from_base[:2, :3].tolist()
         self._origin_mm = inverse(plane_from_base)[:3, 3]
-        self._origin = self._origin_mm.tolist()
         self._cell_mm = cell_mm
         tracker_from_head = inverse(head.scanhead_from_tracker)
         middle = apply(tracker_from_head, head.surface_mm.reshape(-1, 3).mean(axis=0))
         centres = apply(tracker_from_head, head.surface_mm[taxels]) - middle
         self._middle = middle.tolist()
         steps = np.rint(centres * (1.0 / _TAXEL_STEP_MM)).T
-        self._taxels = ProjectedTaxels(np.ascontiguousarray(steps * _TAXEL_STEP_MM))
+        self._taxels = np.vstack([steps * _TAXEL_STEP_MM, np.ones(len(centres))])
 
     def at(self, poses: FramePoses) -> Projection:
-        """Project the frames at `poses` onto the cells of the plane."""
-        if len(poses.position_mm) == 1:
-            return Projection(self._taxels, self._matrix_of_one(poses), self._cell_mm)
-        offset = poses.position_mm - self._origin_mm  # first of all: bases may lie far away
-        matrix = np.array(self._columns(poses.rotation.transpose(1, 2, 0).copy(), offset.T.copy())).reshape(2, 4, -1)
+        """Project the frames at `poses` onto the cells of the plane.
+
+        Term by term and not by matrix products: the bits of a frame do not depend on how many others there are.
+        """
+        r = poses.rotation.transpose(1, 2, 0).copy()
+        x, y, z = (poses.position_mm - self._origin_mm).T.copy()  # first of all: bases may lie far away
+        (m0, m1, m2), columns = self._middle, []
+        for a, b, c in self._rows:
+            t0, t1, t2 = (a * r[0][j] + b * r[1][j] + c * r[2][j] for j in range(3))
+            columns += [t0, t1, t2, a * x + b * y + c * z + (t0 * m0 + t1 * m1 + t2 * m2)]
+        matrix = np.array(columns).reshape(2, 4, -1)
         matrix /= self._cell_mm
         matrix[:, 3] += 0.5
         matrix *= 1.0 / _MATRIX_STEPS
         np.rint(matrix, out=matrix)
         matrix *= _MATRIX_STEPS
         return Projection(self._taxels, np.ascontiguousarray(matrix.transpose(2, 0, 1)), self._cell_mm)
-
-    def _matrix_of_one(self, poses: FramePoses) -> FloatArray:
-        """(1, 2, 4) matrix of one frame with plain numbers, quicker for one and equal to the bit."""
-        offset = [p - o for p, o in zip(poses.position_mm[0].tolist(), self._origin, strict=True)]
-        numbers, cell_mm = [], self._cell_mm
-        columns = self._columns(poses.rotation[0].tolist(), offset)
-        for value, (step, half) in zip(columns, _NUMBERS, strict=True):
-            steps = (value / cell_mm + half) / step
-            numbers.append((round(steps) if -_WHOLE < steps < _WHOLE else steps) * step)
-        return np.array(numbers).reshape(1, 2, 4)
-
-    def _columns(self, r: Any, offset: Any) -> list[Any]:
-        """The eight numbers, mm, of the matrix of one frame or of many, from 3 x 3 rotation `r` and 3 coordinates
-        `offset`.
-
-        Term by term and not by matrix products: the bits of a frame do not depend on how many others there are.
-        """
-        (x, y, z), (m0, m1, m2), columns = offset, self._middle, []
-        for a, b, c in self._rows:
-            t0, t1, t2 = (a * r[0][j] + b * r[1][j] + c * r[2][j] for j in range(3))
-            columns += [t0, t1, t2, a * x + b * y + c * z + (t0 * m0 + t1 * m1 + t2 * m2)]
-        return columns
 
 
 def yaw_deg(head: HeadGeometry, rotation: FloatArray, *, plane_from_base: FloatArray) -> FloatArray:

@@ -90,7 +90,7 @@ class CoarseFrames(Record, eq=False):
     def places_mm(self, projection: Projection) -> FloatArray:
         """(m, k, 2) mean places of the blocks on the plane, from the projection of `frames`."""
         matrix = block_means(projection.matrix.reshape(len(projection), -1), self.first).reshape(-1, 2, 4)
-        taxels = projection.taxels.place_and_one @ self.weight
+        taxels = projection.taxels @ self.weight
         return np.asarray(np.einsum("mij,jk->mki", matrix, taxels) * projection.cell_mm)
 
 

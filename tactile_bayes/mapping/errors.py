@@ -186,7 +186,7 @@ class _Run(Record, eq=False):
     def of(cls, source: Source, level: FloatArray, sums: CellSums, run: slice) -> _Run:
         """The errors of the frames `run` of a source."""
         counts = source.selection.scan.frames.counts[source.frames[run]]
-        pressure, valid = source.readout.pressure_kpa(source.readout.counts(counts))
+        pressure, valid = source.selection.readout.pressure_kpa(source.selection.readout.counts(counts))
         value = pressure / level[run, None]
         fine = np.ones(value.shape, dtype=bool) if valid is None else valid
         projection = source.projection.part(run)
@@ -212,7 +212,7 @@ def _correlations(
         mine = [run for run in runs if run.source is source]
         if not mine:
             continue
-        place = source.projection.taxels.place_mm
+        place = source.projection.taxels[:3]
         distance = np.sqrt(sum((axis[:, None] - axis) ** 2 for axis in place))
         bins = np.minimum(np.rint(distance / source.selection.scan.head.pitch_mm).astype(int), REACH_PITCHES + 1)
         # Every other frame will do: one has 86,000 pairs.

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from functools import reduce
 from math import sqrt
-from operator import add, mul
-from typing import Any
+from operator import add
 
 import numpy as np
 
@@ -96,35 +93,24 @@ _POSITION_STEP = 2.0**-16
 _SPREAD_STEP = 2.0**-24
 _AXIS_STEP = 2.0**-30
 _STEPS = np.repeat([_POSITION_STEP, _SPREAD_STEP, _AXIS_STEP], [3, 9, 6])[:, None]
-_PER_STEP: tuple[float, ...] = tuple((1.0 / _STEPS)[:, 0].tolist())
 # Steps from one place up to 2^26 (1 m), and 2^10 frames: squares stay below 2^62. Beyond 2^52 steps floats have gaps.
 _FAR_STEPS = 2**26
 _FRAMES_AT_ONCE = 2**10
 _FARTHEST_STEPS = 2.0**52
-# Fewer frames are quicker as plain numbers.
-_FEW_FRAMES = 8
 # Mean directions shorter than this (of 1) are no direction: the head was turned by over 90 degrees (SD).
 _LEAST_RESULTANT = 0.3
-
-# Python's integers, which never overflow.
-Whole = tuple[int, ...]
 
 
 class HeadMoments(Record, eq=False):
     """First two moments of all taxel centres over frames, in whole steps; add two with ``+``."""
 
-    sums: Whole
-    """28 whole numbers: Frames (1), and sums over them: of the mean taxel centre in `base` (3), of its outer products
-    (9, row by row), of the covariance of the taxels about their mean (9), of the head's x axis and of its normal (6).
-    """
+    sums: tuple[int, ...] = (0,) * 28
+    """28 whole numbers, Python's, which never overflow: frames (1), and sums over them: of the mean taxel centre in
+    `base` (3), of its outer products (9, row by row), of the covariance of the taxels about their mean (9), of the
+    head's x axis and of its normal (6)."""
 
     def __add__(self, other: HeadMoments) -> HeadMoments:
-        return HeadMoments(_sum(self.sums, other.sums))
-
-    @classmethod
-    def none(cls) -> HeadMoments:
-        """Moments of no frame."""
-        return cls((0,) * 28)
+        return HeadMoments(tuple(map(add, self.sums, other.sums)))
 
     @property
     def count(self) -> int:
@@ -159,100 +145,58 @@ class HeadMoments(Record, eq=False):
         )
 
 
-class MomentSums:
-    """Moments of one head, added frame by frame.
+def head_moments(head: HeadGeometry, poses: FramePoses) -> HeadMoments:
+    """Moments of the taxel centres at the known ones of `poses`.
 
-    Every taxel counts, working or not: where the head was does not depend on what it read.
+    Every taxel counts, working or not: where the head was does not depend on what it read. A head so far from the
+    tracker's base that steps would have gaps is a `BadDataError`.
     """
-
-    def __init__(self, head: HeadGeometry) -> None:
-        tracker_from_head = inverse(head.scanhead_from_tracker)
-        taxels = apply(tracker_from_head, head.surface_mm.reshape(-1, 3))
-        middle = taxels.mean(axis=0)
-        covariance = (taxels - middle).T @ (taxels - middle) / len(taxels)
-        self._middle, self._across = middle.tolist(), covariance.T.tolist()
-        self._axes = tracker_from_head[:3, [0, 2]].T.tolist()
-        self._sums = HeadMoments.none()
-
-    def add(self, poses: FramePoses) -> None:
-        """Add the frames whose pose is known.
-
-        A head so far from the tracker's base that steps would have gaps is a `BadDataError`.
-        """
-        rotation, position = poses.rotation, poses.position_mm
-        if not poses.known.all():
-            rotation, position = rotation[poses.known], position[poses.known]
-        if len(rotation) == 1:
-            self._sums += self._one(rotation[0].tolist(), position[0].tolist())
-            return
-        for start in range(0, len(rotation), _FRAMES_AT_ONCE):
-            part = slice(start, start + _FRAMES_AT_ONCE)
-            self._sums += self._of(rotation[part], position[part])
-
-    def moments(self) -> HeadMoments:
-        """Moments so far, about the tracker's base."""
-        return self._sums
-
-    def _of(self, rotation: FloatArray, position: FloatArray) -> HeadMoments:
-        if len(rotation) < _FEW_FRAMES:
-            return self._one_by_one(rotation, position)
-        steps = np.array(self._values(rotation.transpose(1, 2, 0).copy(), position.T.copy()))
-        steps *= 1.0 / _STEPS
-        np.rint(steps, out=steps)
-        _refuse_far(float(np.abs(steps[:3]).max()))
-        whole = steps.astype(np.int64)
-        reference = whole[:3, :1].copy()
-        whole[:3] -= reference
-        if np.abs(whole[:3]).max() >= _FAR_STEPS:
-            return self._one_by_one(rotation, position)
-        n, place, sums = len(rotation), reference[:, 0].tolist(), whole.sum(axis=1).tolist()
-        first, product = sums[:3], (whole[:3] @ whole[:3].T).tolist()
-        outer = (
-            product[i][j] + first[i] * place[j] + place[i] * first[j] + n * place[i] * place[j]
-            for i in range(3)
-            for j in range(3)
-        )
-        return HeadMoments((n, *_sum(first, [n * x for x in place]), *outer, *sums[3:]))
-
-    def _one_by_one(self, rotation: FloatArray, position: FloatArray) -> HeadMoments:
-        return reduce(add, map(self._one, rotation.tolist(), position.tolist()))
-
-    def _one(self, r: list[list[float]], p: list[float]) -> HeadMoments:
-        values = self._values(r, p)
-        _refuse_far(max(map(abs, values[:3])) / _POSITION_STEP)
-        x, y, z, *others = map(round, map(mul, values, _PER_STEP))
-        xy, xz, yz = x * y, x * z, y * z
-        return HeadMoments((1, x, y, z, x * x, xy, xz, xy, y * y, yz, xz, yz, z * z, *others))
-
-    def _values(self, r: Any, p: Any) -> list[Any]:
-        """Mean taxel centre (3), covariance of the taxels (9) and axes (6) in `base`, from rotation `r` and position
-        `p`.
-
-        Of one frame as numbers, or of many as arrays. Term by term and not by matrix products: the bits of a frame do
-        not depend on how many others there are.
-        """
-        m0, m1, m2 = self._middle
-        centre = [x + (a * m0 + b * m1 + c * m2) for x, (a, b, c) in zip(p, r, strict=True)]
-        turned = [[a * x + b * y + c * z for x, y, z in self._across] for a, b, c in r]
-        spread = [x * a + y * b + z * c for x, y, z in turned for a, b, c in r]
-        axes = [a * x + b * y + c * z for x, y, z in self._axes for a, b, c in r]
-        return centre + spread + axes
+    taxels = apply(inverse(head.scanhead_from_tracker), head.surface_mm.reshape(-1, 3))
+    moments = HeadMoments()
+    for start in range(0, len(poses.known), _FRAMES_AT_ONCE):
+        part = poses.part(slice(start, start + _FRAMES_AT_ONCE))
+        if part.known.any():
+            moments += _moments(head, taxels, part.part(part.known))
+    return moments
 
 
-def _refuse_far(steps: float) -> None:
-    if not steps <= _FARTHEST_STEPS:
+def _moments(head: HeadGeometry, taxels: FloatArray, poses: FramePoses) -> HeadMoments:
+    """Of at most `_FRAMES_AT_ONCE` frames."""
+    values = _values(head, taxels, poses.rotation.transpose(1, 2, 0).copy(), poses.position_mm.T.copy())
+    steps = np.array(values) * (1.0 / _STEPS)
+    np.rint(steps, out=steps)
+    farthest = float(np.abs(steps[:3]).max())
+    if not farthest <= _FARTHEST_STEPS:
         raise BadDataError(
-            f"the head was {steps * _POSITION_STEP:.3g} mm from the tracker's base",
+            f"the head was {farthest * _POSITION_STEP:.3g} mm from the tracker's base",
             way_out="check the unit of the positions (mm)",
         )
+    whole = steps.astype(np.int64)
+    reference = whole[:3, :1].copy()
+    place = whole[:3] - reference
+    if np.abs(place).max() >= _FAR_STEPS:
+        place = place.astype(object)  # Python's integers, slow, and without an end
+    n, at = len(poses.known), reference[:, 0].tolist()
+    first, product = place.sum(axis=1).tolist(), (place @ place.T).tolist()
+    outer = (
+        product[i][j] + first[i] * at[j] + at[i] * first[j] + n * at[i] * at[j] for i in range(3) for j in range(3)
+    )
+    centre = (one + n * x for one, x in zip(first, at, strict=True))
+    return HeadMoments((n, *centre, *outer, *whole[3:].sum(axis=1).tolist()))
 
 
-def _sum(one: Sequence[int], other: Sequence[int]) -> Whole:
-    return tuple(map(add, one, other))
+def _values(head: HeadGeometry, taxels: FloatArray, r: FloatArray, p: FloatArray) -> list[FloatArray]:
+    """Mean taxel centre (3), covariance of the taxels (9) and axes (6) in `base` at (3, 3, n) rotations `r` and (3, n)
+    positions `p`.
 
-
-def head_moments(head: HeadGeometry, poses: FramePoses) -> HeadMoments:
-    """Moments of the taxel centres at the known ones of `poses`."""
-    sums = MomentSums(head)
-    sums.add(poses)
-    return sums.moments()
+    Term by term and not by matrix products: the bits of a frame do not depend on how many others there are.
+    """
+    middle = taxels.mean(axis=0)
+    across = ((taxels - middle).T @ (taxels - middle) / len(taxels)).T.tolist()
+    m0, m1, m2 = middle.tolist()
+    centre = [x + (a * m0 + b * m1 + c * m2) for x, (a, b, c) in zip(p, r, strict=True)]
+    turned = [[a * x + b * y + c * z for x, y, z in across] for a, b, c in r]
+    spread = [x * a + y * b + z * c for x, y, z in turned for a, b, c in r]
+    directions = inverse(head.scanhead_from_tracker)[:3, [0, 2]].T.tolist()
+    axes = [a * x + b * y + c * z for x, y, z in directions for a, b, c in r]
+    return centre + spread + axes

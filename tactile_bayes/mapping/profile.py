@@ -11,16 +11,14 @@ from numpy.typing import NDArray
 
 from tactile_bayes.declarations import Record
 from tactile_bayes.geometry import BoolArray, FloatArray, IndexArray, Plane, apply, inverse
-from tactile_bayes.mapping.cells import Readout
 from tactile_bayes.mapping.convention import stroke_starts
 from tactile_bayes.mapping.select import SelectedFrames, chunks
 from tactile_bayes.presets import HEAD_PROFILE
-from tactile_bayes.scans import CountArray
 
 # --- Reproducible random choice of frames by a hash of their levels, independent of order and portions.
 #
 # A statistic that needs no more than some thousand frames is taken from those with the smallest marks. The choice
-# depends on the set of frames alone, and shards agree on it without knowing each other.
+# depends on the set of frames alone.
 
 NO_LIMIT = np.uint64(2**64 - 1)
 _ROUNDS = ((np.uint64(30), np.uint64(0xBF58476D1CE4E5B9)), (np.uint64(27), np.uint64(0x94D049BB133111EB)))
@@ -41,8 +39,7 @@ def frame_marks(level_kpa: FloatArray) -> NDArray[np.uint64]:
 def marks_limit(marks: NDArray[np.uint64], most: int) -> np.uint64:
     """Limit that at most `most` marks lie below; equal marks are chosen together or not at all.
 
-    The limit of a set can be found from the marks under the limits of its parts and those limits, of which the least
-    counts.
+    The limit of a growing set can be found from the marks under the limits before, of which the least counts.
     """
     if len(marks) <= most:
         return NO_LIMIT
@@ -56,10 +53,6 @@ def marks_limit(marks: NDArray[np.uint64], most: int) -> np.uint64:
 
 # Frames that are read, chosen by their marks; those of a scan of 10 s at 200 Hz are read all.
 MOST_FRAMES = 2048
-# Chosen frames that wait to be read: many at once cost less each, and most are overtaken by others before.
-_MOST_WAITING = 4096
-# Frames that came a few at a time wait until there are so many before their marks are compared.
-_FEW = 64
 _CHUNK = 128
 # The figures are means of whole multiples of this.
 _STEP = 2.0**-32
@@ -131,100 +124,40 @@ def _tenth(values: FloatArray) -> float:
 
 
 def _read(part: SelectedFrames, frames: IndexArray) -> FloatArray:
-    if not len(frames):
-        return np.zeros((0, _COLUMNS))
-    counts = part.readout.counts(part.scan.frames.counts[frames])
-    return _rows(ProfileReader.of(part.good_taxels), part.readout, counts, part.level_kpa[frames])
-
-
-def _rows(reader: ProfileReader, readout: Readout, counts: CountArray, level_kpa: FloatArray) -> FloatArray:
-    """(f, 4) rows from (f, k) counts, in portions that fit the processor's cache."""
-    rows = np.empty((len(counts), _COLUMNS))
-    for part in chunks(len(counts), _CHUNK):
-        rows[part] = reader.read(readout.pressure_kpa(counts[part])[0], level_kpa[part])
+    """(f, 4) rows of frames, read in portions that fit the processor's cache."""
+    reader, rows = ProfileReader.of(part.good_taxels), np.empty((len(frames), _COLUMNS))
+    for chosen in chunks(len(frames), _CHUNK):
+        some = frames[chosen]
+        counts = part.readout.counts(part.scan.frames.counts[some])
+        rows[chosen] = reader.read(part.readout.pressure_kpa(counts)[0], part.level_kpa[some])
     return rows
 
 
 class GrowingProfile:
     """Profiles of at most `MOST_FRAMES` frames of a growing scan, the same in any portions and order."""
 
-    def __init__(self, good: BoolArray, readout: Readout) -> None:
-        self._good, self._readout, self._reader = good, readout, ProfileReader.of(good)
-        self._limit = NO_LIMIT
+    def __init__(self, good: BoolArray) -> None:
+        self._good, self._reader, self._limit = good, ProfileReader.of(good), NO_LIMIT
         self._marks, self._rows = np.zeros(0, dtype=np.uint64), np.zeros((0, _COLUMNS))
-        self._waiting: list[tuple[NDArray[np.uint64], CountArray, FloatArray]] = []
-        self._number_waiting = 0
-        self._new: list[tuple[CountArray, FloatArray, FloatArray]] = []
-        self._number_new = 0
 
-    def add(self, counts: CountArray, level_kpa: FloatArray, valid_share: FloatArray) -> None:
-        """Add frames: (f, k) uint16 counts of the used taxels, (f,) means in kPa, (f,) valid shares of all taxels."""
-        if not self._reader.solve.size:
-            return
-        if len(counts) >= _FEW:
-            self._choose(counts, level_kpa, valid_share)
-            return
-        self._new.append((counts.copy(), level_kpa, valid_share))
-        self._number_new += len(counts)
-        if self._number_new >= _FEW:
-            self._choose_new()
-
-    def _choose_new(self) -> None:
-        """Choose among frames that came a few at a time."""
-        if self._new:
-            counts, level, share = (np.concatenate(part) for part in zip(*self._new, strict=True))
-            self._new, self._number_new = [], 0
-            self._choose(counts, level, share)
-
-    def _choose(self, counts: CountArray, level_kpa: FloatArray, valid_share: FloatArray) -> None:
-        """Queue the frames that are among the chosen ones so far."""
+    def add(self, pressure_kpa: FloatArray, level_kpa: FloatArray, valid_share: FloatArray) -> None:
+        """Add frames: (f, k) pressures of the used taxels, (f,) means in kPa, (f,) valid shares of all taxels."""
         marks = frame_marks(level_kpa)
-        if len(marks) >= MOST_FRAMES:  # so many that not all of them need be copied
-            whole = marks[_whole(level_kpa, valid_share, self._good)]
-            others = [waiting for waiting, _, _ in self._waiting]
-            limit = marks_limit(np.concatenate([self._marks, *others, whole]), MOST_FRAMES)
-            self._limit = min(self._limit, limit)
-        chosen = marks < self._limit
-        if chosen.any():
-            chosen &= _whole(level_kpa, valid_share, self._good)
-        number = int(np.count_nonzero(chosen))
-        if not number:
-            return
-        self._waiting.append((marks[chosen], counts[chosen], level_kpa[chosen]))
-        self._number_waiting += number
-        if self._number_waiting > _MOST_WAITING:
-            self._read_waiting()
-
-    def merge(self, other: GrowingProfile) -> None:
-        """Add the frames that another profile was given."""
-        self._read_waiting()
-        other._read_waiting()
-        limit = marks_limit(np.concatenate([self._marks, other._marks]), MOST_FRAMES)
-        self._limit = min(self._limit, other._limit, limit)
-        chosen = other._marks < self._limit
-        self._keep(other._marks[chosen], other._rows[chosen])
+        chosen = (marks < self._limit) & _whole(level_kpa, valid_share, self._good)
+        self._marks = np.concatenate([self._marks, marks[chosen]])
+        self._rows = np.concatenate([self._rows, self._reader.read(pressure_kpa[chosen], level_kpa[chosen])])
+        if len(self._marks) > 2 * MOST_FRAMES:
+            self._thin_out()
 
     def figures(self) -> dict[str, float]:
         """As `profile_figures`."""
-        self._read_waiting()
+        self._thin_out()
         return profile_figures(self._rows)
 
-    def _read_waiting(self) -> None:
-        """Read the queued frames that are still among the chosen ones."""
-        self._choose_new()
-        if not self._waiting:
-            return
-        marks, counts, level = (np.concatenate(part) for part in zip(*self._waiting, strict=True))
-        self._waiting, self._number_waiting = [], 0
-        self._limit = min(self._limit, marks_limit(np.concatenate([self._marks, marks]), MOST_FRAMES))
-        chosen = marks < self._limit
-        self._keep(marks[chosen], _rows(self._reader, self._readout, counts[chosen], level[chosen]))
-
-    def _keep(self, marks: NDArray[np.uint64], rows: FloatArray) -> None:
-        """Keep these rows, and the earlier ones still below the limit."""
+    def _thin_out(self) -> None:
+        self._limit = min(self._limit, marks_limit(self._marks, MOST_FRAMES))
         kept = self._marks < self._limit
-        before = (self._marks, self._rows) if kept.all() else (self._marks[kept], self._rows[kept])
-        self._marks, self._rows = np.concatenate([before[0], marks]), np.concatenate([before[1], rows])
+        self._marks, self._rows = self._marks[kept], self._rows[kept]
 
 
 class ProfileReader(Record, eq=False):

@@ -142,7 +142,7 @@ class _Part(Record, eq=False):
     @classmethod
     def of(cls, source: Source, number: int, strokes: Sequence[StrokeShift]) -> _Part:
         time_s = source.selection.scan.frames.time_s
-        readings = len(source.frames) * 5e-3 / POOL_S * source.readout.size / 4 if len(time_s) else 0.0
+        readings = len(source.frames) * 5e-3 / POOL_S * source.selection.readout.size / 4 if len(time_s) else 0.0
         every = int(np.ceil(len(strokes) * readings / _MOST_NUMBERS))
         kept = every_stretch(time_s[source.frames], max(every, 1))
         coarse = CoarseFrames.of(source.selection, source.frames[kept])

@@ -34,7 +34,7 @@ from tactile_bayes.hardware.live import (
 from tactile_bayes.hardware.readings import PoseReading
 from tactile_bayes.hardware.recorder import Report
 from tactile_bayes.hardware.serve import LiveServer, address_of, document
-from tactile_bayes.mapping.accumulate import Instrument, MapAccumulator
+from tactile_bayes.mapping.accumulate import MapAccumulator
 from tactile_bayes.mapping.plane import poses_at
 from tactile_bayes.report.map_text import live_line, live_text
 from tactile_bayes.terminal import has_styles
@@ -114,8 +114,8 @@ def test_the_live_map_is_the_map_of_all_frames_on_its_plane(scan, state):
     assert state.tactile_map is not None
     live = LiveMap(scan.head, scan.element_calibration)
     live.take(seen_of(scan))
-    grid = live._map.grid
-    whole = MapAccumulator(grid, Instrument(scan.head, scan.element_calibration))
+    plane = live.state().tactile_map.plane_from_base
+    whole = MapAccumulator(scan.head, scan.element_calibration, plane_from_base=plane)
     known = scan.frames.time_s <= scan.poses.time_s[-1]  # the rest is still waiting for the tracker
     whole.add(scan.frames.counts[known], poses_at(scan.poses, scan.frames.time_s[known]))
     np.testing.assert_array_equal(live.state().tactile_map.mean, whole.snapshot().mean)

@@ -11,10 +11,10 @@ from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.scene import Background, Lump, Noise, Scene, Strokes
 from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.geometry import apply, rigid
-from tactile_bayes.mapping.accumulate import Instrument, MapAccumulator, MapGrid
+from tactile_bayes.mapping.accumulate import MapAccumulator
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import TactileMap
-from tactile_bayes.mapping.plane import FramePoses
+from tactile_bayes.mapping.plane import FramePoses, head_moments
 from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.white import fit_bump
 from tactile_bayes.scans import Scan
@@ -158,9 +158,8 @@ def test_two_hours_do_not_overflow_or_grow():
     """1.44 million frames at the highest pressure in the window: sums stay exact, the map stays as large."""
     scan = stroke_scan(field=scans.uniform, levels_kpa=14.0, centres=scans.strokes(per_line=250))
     poses = FramePoses(scan.poses.position_mm, np.broadcast_to(np.eye(3), (1000, 3, 3)), np.ones(1000, dtype=bool))
-    instrument = Instrument(scan.head, scan.element_calibration, normalise="none")
-    once = MapAccumulator(MapGrid.under(scan.head, poses), instrument, keep_frames=False)
-    long = MapAccumulator(once.grid, instrument, keep_frames=False)
+    plane = head_moments(scan.head, poses).plane().plane_from_base
+    once, long = (MapAccumulator(scan.head, scan.element_calibration, plane_from_base=plane) for _ in range(2))
     once.add(scan.frames.counts, poses)
     for _ in range(1440):
         long.add(scan.frames.counts, poses)

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.mapping.cells import MAX_CELLS, READINGS_PER_CALL, VALUE_LIMIT, VALUE_STEP, CellSums, cell_index
+from tactile_bayes.mapping.cells import MAX_CELLS, READINGS_PER_CALL, VALUE_LIMIT, VALUE_STEP, CellSums
 
 
 def readings(seed: int, n: int = 500) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -16,10 +16,23 @@ def readings(seed: int, n: int = 500) -> tuple[np.ndarray, np.ndarray, np.ndarra
     return rng.normal(0, 9, n), rng.normal(3, 5, n), rng.lognormal(0, 0.7, n)
 
 
+def cell_index(position_mm: np.ndarray, cell_mm: float) -> np.ndarray:
+    return np.floor(position_mm / cell_mm + 0.5).astype(np.int64)
+
+
+def add(sums: CellSums, x: np.ndarray, y: np.ndarray, value: np.ndarray) -> None:
+    """Add readings at positions, all of which lie in one block of cells."""
+    row, column = cell_index(y, sums.cell_mm), cell_index(x, sums.cell_mm)
+    first = (int(row.min()), int(column.min()))
+    shape = (int(row.max()) - first[0] + 1, int(column.max()) - first[1] + 1)
+    sums.add_steps(first, shape, (row - first[0]) * shape[1] + column - first[1], np.rint(value / VALUE_STEP))
+
+
 def summed(x, y, value, *, cell_mm=1.0, parts=1) -> CellSums:
     sums = CellSums(cell_mm)
     for piece in np.array_split(np.arange(len(x)), parts):
-        sums.add(x[piece], y[piece], value[piece])
+        if len(piece):
+            add(sums, x[piece], y[piece], value[piece])
     return sums.trimmed()
 
 
@@ -46,16 +59,6 @@ def test_sums_of_floats_would_show_their_order():
     x, _, value = readings(0)
     cell, order = cell_index(x, 1.0) - int(np.floor(x.min())), np.random.default_rng(1).permutation(len(x))
     assert not np.array_equal(np.bincount(cell, value), np.bincount(cell[order], value[order]))
-
-
-@given(seed=st.integers(0, 999), cut=st.integers(0, 500))
-def test_merging_two_halves_either_way_gives_the_whole(seed, cut):
-    x, y, value = readings(seed)
-    whole = summed(x, y, value)
-    for first, second in ((slice(cut), slice(cut, None)), (slice(cut, None), slice(cut))):
-        merged = summed(x[first], y[first], value[first])
-        merged.merge(summed(x[second], y[second], value[second]))
-        assert same(merged.trimmed(), whole)
 
 
 def test_mean_and_variance_are_those_of_the_readings_to_the_step():
@@ -90,25 +93,11 @@ def test_a_full_call_of_extreme_values_sums_exactly():
     assert sums.variance()[0, 0] == 0.0
 
 
-def test_more_readings_than_sum_exactly_are_refused():
-    too_many = np.zeros(READINGS_PER_CALL + 1)
-    with pytest.raises(ValueError, match="exact up to"):
-        CellSums(1.0).add(too_many, too_many, too_many)
-
-
-def test_cells_of_another_size_do_not_merge():
-    with pytest.raises(ValueError, match=r"cells of 2\.0 mm"):
-        CellSums(1.0).merge(CellSums(2.0))
-
-
 def test_a_vast_map_is_refused_before_memory_is_asked_for():
     sums = CellSums(1.0)
     with pytest.raises(BadDataError, match=f"at most {MAX_CELLS} fit"):
-        sums.add(np.array([0.0, 1e9]), np.array([0.0, 1e9]), np.ones(2))
+        add(sums, np.array([0.0, 1e9]), np.array([0.0, 1e9]), np.ones(2))
 
 
 def test_nothing_added_is_an_empty_map():
-    sums = CellSums(1.0)
-    sums.add(np.zeros(0), np.zeros(0), np.zeros(0))
-    sums.merge(CellSums(1.0))
-    assert sums.trimmed().count.shape == (0, 0)
+    assert CellSums(1.0).trimmed().count.shape == (0, 0)

@@ -17,16 +17,14 @@ from tactile_bayes.files.size_json import DEFAULT, read_size_calibration, size_c
 from tactile_bayes.forward.scene import Background, Noise, Scene, Strokes
 from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.forward.tissue import SceneBody, SolidLump
-from tactile_bayes.mapping.accumulate import Instrument, MapAccumulator, MapGrid
+from tactile_bayes.mapping.accumulate import MapAccumulator
 from tactile_bayes.mapping.build import build_map
-from tactile_bayes.mapping.cells import Readout
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.mapping.plane import poses_at
 from tactile_bayes.mapping.profile import (
     LEAST_FRAMES,
     MOST_FRAMES,
     NO_LIMIT,
-    GrowingProfile,
     ProfileReader,
     frame_marks,
     marks_limit,
@@ -35,16 +33,12 @@ from tactile_bayes.mapping.profile import (
 from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.presets import HEAD_PROFILE
-from tactile_bayes.scans import ElementCalibration, Scan
+from tactile_bayes.scans import Scan
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.fat import head_profile
 
 TRUE_FAT_MM = {"s01": 15.0, "s03": 20.0, "s05": 12.0, "s07": 12.0, "s11": 24.0}
 """By truth.csv: depth of the centre where centred; a tenth of a diameter below the ball where resting."""
-
-READOUT = Readout.of(
-    ElementCalibration(np.full((16, 26), 34 / 4095), np.zeros((16, 26))), np.ones((16, 26), dtype=bool)
-)
 
 
 def response(coefficients: np.ndarray, *, rows: int = 16, columns: int = 26) -> np.ndarray:
@@ -151,7 +145,8 @@ def spread_scan(frames: int) -> Scan:
 
 def grown(scan: Scan, like: TactileMap, portions: Iterable[np.ndarray]) -> MapAccumulator:
     """A map that was given the frames in portions, a snapshot after each."""
-    found = MapAccumulator(MapGrid(like.plane_from_base), Instrument(scan.head, scan.element_calibration))
+    assert like.plane_from_base is not None
+    found = MapAccumulator(scan.head, scan.element_calibration, plane_from_base=like.plane_from_base)
     poses = poses_at(scan.poses, scan.frames.time_s)
     for portion in portions:
         found.add(scan.frames.counts[portion], poses.part(portion))
@@ -186,24 +181,6 @@ def test_a_live_map_has_the_profile_of_the_whole_scan(frames: int) -> None:
     order = np.random.default_rng(3).permutation(frames)
     for portions in ([np.arange(frames)], np.array_split(order, frames // 40)):
         assert profile_of(grown(scan, whole, portions).snapshot().quality) == expected
-    one_by_one, *others = (grown(scan, whole, part) for part in (order[:90, None], [order[90:150]], [order[150:]]))
-    for other in others:
-        one_by_one.merge(other)
-    assert profile_of(one_by_one.snapshot().quality) == expected
-
-
-def test_a_buffer_that_is_used_again_changes_no_frame_that_went_in() -> None:
-    """Frames one at a time wait for the next look at the profile, and their counts with them."""
-    counts = np.random.default_rng(4).integers(1000, 1300, (100, 16, 26)).astype(np.uint16)
-    kept, again = (GrowingProfile(np.ones((16, 26), dtype=bool), READOUT) for _ in range(2))
-    buffer = np.empty((1, 416), dtype=np.uint16)
-    for frame in counts.reshape(100, 1, 416):
-        level, share = READOUT.levels(*READOUT.pressure_kpa(frame))
-        kept.add(frame, level, share)
-        buffer[:] = frame
-        again.add(buffer, level, share)
-    assert kept.figures() == again.figures()
-    assert kept.figures()["head_profile_frames"] >= LEAST_FRAMES
 
 
 def test_the_marked_frames_are_a_random_choice() -> None:

@@ -81,4 +81,4 @@ def test_the_normal_follows_the_head_turned_upside_down():
 
 def test_no_frame_has_no_moments():
     nothing = FramePoses(np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0, dtype=bool))
-    assert same(head_moments(curved_head(), nothing), HeadMoments.none())
+    assert same(head_moments(curved_head(), nothing), HeadMoments())

@@ -1,4 +1,4 @@
-"""Where taxels fall on the plane: one frame as plain numbers, many as arrays, to the same bits."""
+"""Where taxels fall on the plane: the same bits for a frame alone and among others."""
 
 from __future__ import annotations
 
@@ -40,11 +40,10 @@ def test_a_frame_alone_falls_into_the_cells_it_falls_into_among_others(seed, cel
         alone, among = maker.at(poses.part(slice(i, i + 1))), together.part(slice(i, i + 1))
         np.testing.assert_array_equal(alone.matrix, among.matrix)
         first, shape = alone.block()
-        left, top, right, bottom = among._ends()
-        assert (first, shape) == ((top, left), (bottom - top + 1, right - left + 1))
+        assert (first, shape) == among.block()
         flat = together.part([i, (i + 1) % len(poses.known)]).flat(first, shape)[0]
         np.testing.assert_array_equal(alone.flat(first, shape)[0], flat)
-        uv = np.floor(among.turn[0] @ alone.taxels.place_mm + among.shift[0][:, None])
+        uv = np.floor(among.turn[0] @ alone.taxels[:3] + among.shift[0][:, None])
         np.testing.assert_array_equal(flat, (uv[1] - first[0]) * shape[1] + uv[0] - first[1])
 
 

@@ -38,8 +38,10 @@ def source_of(seed: int, cell_mm: float) -> Source:
 def summed(source: Source, level: np.ndarray, cell_mm: float, *, size: int) -> CellSums:
     sums = CellSums(cell_mm)
     for part, counts in source.parts(size):
-        pressure, valid = source.readout.pressure_kpa(counts)
-        add_frames(sums, source.readout, pressure, valid, projection=source.projection.part(part), level=level[part])
+        pressure, valid = source.selection.readout.pressure_kpa(counts)
+        add_frames(
+            sums, source.selection.readout, pressure, valid, projection=source.projection.part(part), level=level[part]
+        )
     return sums.trimmed()
 
 
@@ -48,12 +50,12 @@ def by_loop(source: Source, level: np.ndarray, limit: float) -> tuple[dict[tuple
     cells: dict[tuple[int, int], list[int]] = {}
     clipped = 0
     ((_, counts),) = source.parts(10_000)
-    place = source.projection.taxels.place_mm
+    place = source.projection.taxels[:3]
     for f, frame in enumerate(counts.tolist()):
         matrix = source.projection.matrix[f]
         for k, count in enumerate(frame):
-            pressure = count * source.readout.gain_kpa[k] + source.readout.offset_kpa[k]
-            if count >= source.readout.full_count or pressure >= 34.0:
+            pressure = count * source.selection.readout.gain_kpa[k] + source.selection.readout.offset_kpa[k]
+            if count >= source.selection.readout.full_count or pressure >= 34.0:
                 continue
             step = round(pressure * (4096 / level[f]))
             clipped += abs(step) > limit

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tactile_bayes.declarations import replace
-from tactile_bayes.mapping.accumulate import Instrument, MapAccumulator, MapGrid
+from tactile_bayes.mapping.accumulate import MapAccumulator
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.errors import LEAST_SHARE
 from tactile_bayes.mapping.map import TactileMap
@@ -138,7 +138,7 @@ def test_where_it_cannot_be_known_it_is_absent_and_the_text_says_so(make):
 def test_an_accumulator_does_not_know_it():
     scan = noisy_scan(share=0.5)
     poses = poses_at(scan.poses, scan.frames.time_s)
-    grown = MapAccumulator(MapGrid.under(scan.head, poses), Instrument(scan.head, scan.element_calibration))
+    grown = MapAccumulator(scan.head, scan.element_calibration, plane_from_base=np.eye(4))
     grown.add(scan.frames.counts, poses)
     assert not NAMES & set(grown.snapshot().quality)
 
