@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 from typing import Any, Final
 
@@ -54,8 +53,9 @@ def structured_report(estimate: EstimateFile, maps: Sequence[MapFile], *, eviden
         imaging_measurements=[_group(estimate, one, maps, evidence) for one in estimate.masses],
         title=coded(codes.REPORT_TITLE),
     )
-    for text in (RESEARCH_USE, verdict_words(estimate), *estimate.lines, *_sources(estimate)):
-        report[0].ContentSequence.append(_text(codes.COMMENT, text))
+    digests = [f"SHA-256 of the estimate: {estimate.digest}", *(f"SHA-256 of a map: {one}" for one in estimate.maps)]
+    for text in (RESEARCH_USE, verdict_words(estimate), *estimate.lines, *digests):
+        report[0].ContentSequence.append(_comment(text))
     dataset = sr.Comprehensive3DSR(
         evidence=evidence,
         content=report[0],
@@ -100,7 +100,7 @@ def _group(estimate: EstimateFile, finding: SizedMass, maps: Sequence[MapFile], 
             name=MODEL, version=estimate.version or __version__, parameters=[estimate.method_words]
         ),
         "finding_sites": _sites(estimate, maps),
-        "measurements": list(_measurements(finding, _images(evidence))),
+        "measurements": list(_measurements(finding, evidence)),
         "qualitative_evaluations": [sr.QualitativeEvaluation(coded(codes.OUTCOME), coded(finding.outcome))],
     }
     region = _region(finding, maps)
@@ -110,7 +110,7 @@ def _group(estimate: EstimateFile, finding: SizedMass, maps: Sequence[MapFile], 
         group = sr.PlanarROIMeasurementsAndQualitativeEvaluations(**what, referenced_region=region)
     for text in (finding.reason, finding.alike_exams):
         if text:
-            group[0].ContentSequence.append(_text(codes.COMMENT, text))
+            group[0].ContentSequence.append(_comment(text))
     return group
 
 
@@ -135,71 +135,51 @@ def _region(finding: SizedMass, maps: Sequence[MapFile]) -> Any | None:
     return required("highdicom").sr.ImageRegion3D("POINT", np.array([centre]), reference)
 
 
-def _images(evidence: Sequence[Any]) -> list[Any]:
-    """References to the maps' values, from which the sizes come; to their pictures where there are no values."""
-    source = required("highdicom").sr.SourceImageForMeasurement
+def _measurements(finding: SizedMass, evidence: Sequence[Any]) -> Iterator[Any]:
+    """Sizes and certainty, with references to the maps' values, or to their pictures where there are no values."""
+    sr = required("highdicom").sr
     values = [one for one in evidence if one.SOPClassUID == PARAMETRIC_MAP]
-    return [source(one.SOPClassUID, one.SOPInstanceUID) for one in values or evidence]
-
-
-def _measurements(finding: SizedMass, images: Sequence[Any]) -> Iterator[Any]:
+    images = [sr.SourceImageForMeasurement(one.SOPClassUID, one.SOPInstanceUID) for one in values or evidence]
     for name, size in ((codes.LONG_AXIS, finding.largest), (codes.SHORT_AXIS, finding.smallest)):
         if size is not None:
             yield _size(name, size, images)
     if finding.probability is not None:
         percent = float(f"{100 * finding.probability:.9g}")
-        measurement = required("highdicom").sr.Measurement
-        yield measurement(coded(codes.CERTAINTY), percent, coded(_PERCENT), referenced_images=images)
+        yield sr.Measurement(coded(codes.CERTAINTY), percent, coded(_PERCENT), referenced_images=images)
 
 
 def _size(name: Code, size: Quantity, images: Sequence[Any]) -> Any:
     """A size's median, with its interval as properties of the number."""
-    measurement = required("highdicom").sr.Measurement(
+    sr = required("highdicom").sr
+    measurement = sr.Measurement(
         coded(name), size.median, coded(_MM), derivation=coded(codes.MEDIAN), referenced_images=images
     )
-    properties = (
+    for concept, value, unit in (
         (codes.UPPER_RANGE, size.high - size.median, _MM),
         (codes.LOWER_RANGE, size.median - size.low, _MM),
         (codes.INTERVAL_LOW, size.low, _MM),
         (codes.INTERVAL_HIGH, size.high, _MM),
         (codes.INTERVAL_PROBABILITY, 100 * size.probability, _PERCENT),
-    )
-    for concept, value, unit in properties:
-        measurement[0].ContentSequence.append(_number(concept, float(f"{value:.9g}"), unit))
+    ):
+        number = sr.NumContentItem(
+            name=coded(concept),
+            value=float(f"{value:.9g}"),
+            unit=coded(unit),
+            relationship_type=sr.RelationshipTypeValues.HAS_PROPERTIES,
+        )
+        measurement[0].ContentSequence.append(number)
     return measurement
 
 
-def _number(concept: Code, value: float, unit: Code) -> Any:
-    if not math.isfinite(value):  # JSON has none, but a posterior's draws may
-        raise ValueError(f"{concept.meaning} is {value}")
+def _comment(text: str) -> Any:
     sr = required("highdicom").sr
-    return sr.NumContentItem(
-        name=coded(concept), value=value, unit=coded(unit), relationship_type=sr.RelationshipTypeValues.HAS_PROPERTIES
-    )
-
-
-def _text(concept: Code, text: str) -> Any:
-    sr = required("highdicom").sr
-    return sr.TextContentItem(name=coded(concept), value=text, relationship_type=sr.RelationshipTypeValues.CONTAINS)
-
-
-def _sources(estimate: EstimateFile) -> Iterator[str]:
-    """Digests, by which the report can be told to be of these files."""
-    yield f"SHA-256 of the estimate: {estimate.digest}"
-    for digest in estimate.maps:
-        yield f"SHA-256 of a map: {digest}"
+    relation = sr.RelationshipTypeValues.CONTAINS
+    return sr.TextContentItem(name=coded(codes.COMMENT), value=text, relationship_type=relation)
 
 
 # --- An exam as DICOM files: each map's values and picture, and the report of the estimate.
 
 VALUES, PICTURE, REPORT = "map", "picture", "report"
-
-
-def dicom_names(maps: int, *, estimated: bool) -> list[str]:
-    """File names that an export may write."""
-    numbers = [""] if maps == 1 else [f"_{i}" for i in range(1, maps + 1)]
-    names = [f"{stem}{number}.dcm" for stem in (VALUES, PICTURE) for number in numbers]
-    return [*names, *([f"{REPORT}.dcm"] if estimated else [])]
 
 
 def dicom_files(maps: Sequence[MapFile], estimate: EstimateFile | None, *, identity: Identity) -> dict[str, bytes]:
@@ -212,14 +192,15 @@ def dicom_files(maps: Sequence[MapFile], estimate: EstimateFile | None, *, ident
         if not one.tactile_map.covered.any():
             raise BadDataError("holds no data", way_out="map a scan with frames in the window", path=str(one.path))
     study = study_of(identity, maps)
-    names = iter(dicom_names(len(maps), estimated=estimate is not None))
-    objects = {}
-    for number, one in enumerate(maps, start=1):
-        name = next(names)
-        if frame_of_reference(one) is not None:
-            objects[name] = parametric_map(one, study=study, number=number)
-    for number, one in enumerate(maps, start=1):
-        objects[next(names)] = secondary_capture(one, estimate, study=study, number=number)
+    numbered = [(f"_{i}" if len(maps) > 1 else "", i, one) for i, one in enumerate(maps, start=1)]
+    objects = {
+        f"{VALUES}{suffix}.dcm": parametric_map(one, study=study, number=number)
+        for suffix, number, one in numbered
+        if frame_of_reference(one) is not None
+    }
+    for suffix, number, one in numbered:
+        objects[f"{PICTURE}{suffix}.dcm"] = secondary_capture(one, estimate, study=study, number=number)
     if estimate is not None:
-        objects[next(names)] = structured_report(estimate, maps, evidence=list(objects.values()), study=study)
+        evidence = list(objects.values())
+        objects[f"{REPORT}.dcm"] = structured_report(estimate, maps, evidence=evidence, study=study)
     return {name: dicom_bytes(dataset) for name, dataset in objects.items()}

@@ -21,7 +21,7 @@ from tactile_bayes.files.netcdf import open_netcdf
 from tactile_bayes.files.provenance import EXAM_FACTS, scans_of
 from tactile_bayes.files.reading import HDF5_MAGIC, kind_of, open_input, schema_kind
 from tactile_bayes.files.reports import EstimateReport, MassReport, PooledReport, centre_of
-from tactile_bayes.findings import Finding, Verdict, capital, finding_lines, verdict
+from tactile_bayes.findings import capital, finding_lines
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.report.estimate_text import exams_label
@@ -175,47 +175,31 @@ class EstimateFile(Record, eq=False):
     facts: Facts
 
     @property
-    def findings(self) -> tuple[Finding, ...]:
-        """What speaks against it, cautions first."""
-        return self.report.findings
-
-    @property
     def sized(self) -> bool:
         """Whether any mass has a size."""
         return any(one.largest is not None for one in self.masses)
 
     @property
-    def verdict(self) -> Verdict:
-        """Sound, doubtful or no answer."""
-        return verdict(self.findings, answered=self.report.max_size_mm is not None)
-
-    @property
     def lines(self) -> list[str]:
         """What speaks against it, in sentences for paper."""
-        return [plain_line(line) for line in finding_lines(self.findings, paper=True)]
-
-    @property
-    def provenance(self) -> Mapping[str, Any]:
-        """Origin of the estimate."""
-        return self.report.provenance
+        return [plain_line(line) for line in finding_lines(self.report.findings, paper=True)]
 
     @property
     def method_words(self) -> str:
         """Method and calibration in a phrase."""
-        settings = self.provenance.get("settings")
-        said = settings if isinstance(settings, Mapping) else {}
+        said = self.report.origin.settings
         calibration = said.get("size_calibration") or said.get("calibration") or "as shipped"
         return plain_line(f"method {said.get('method') or 'unknown'}, size calibration {calibration}")
 
     @property
     def version(self) -> str:
         """Version of the program that made it; empty where the file does not tell."""
-        return plain_line(str(self.provenance.get("version") or ""))
+        return plain_line(str(self.report.provenance.get("version") or ""))
 
 
 def verdict_words(estimate: EstimateFile) -> str:
     """The verdict, as a sentence."""
-    return f"Verdict: {estimate.verdict.replace('_', ' ')}."
+    return f"Verdict: {estimate.report.verdict.replace('_', ' ')}."
 
 
 def plain_line(text: str) -> str:
@@ -233,7 +217,11 @@ def read_exam(path: Path) -> MapFile | list[EstimateFile]:
             group = file.group("posterior")
             attributes = None if group is None else group.attributes()
         if attributes is not None:
-            return [_read_posterior(path, attributes)]
+            if "estimate" not in attributes:
+                what, way_out = "holds draws without their estimate", "write it again with `estimate -o`"
+                raise BadDataError(what, way_out=way_out, path=str(path))
+            estimate = estimate_of(parse_json(attributes["estimate"], name="estimate"), path)
+            return [replace(estimate, kind="posterior", digest=sha256(path))]
         tactile_map, scans = read_map_and_scans(path)
         return MapFile(path, sha256(path), tactile_map, shared_facts(scans))
     if not head.removeprefix(codecs.BOM_UTF8).lstrip().startswith((b"{", b"[")):
@@ -248,15 +236,9 @@ def read_exam(path: Path) -> MapFile | list[EstimateFile]:
 
 def shared_facts(scans: Iterable[Mapping[str, str]]) -> dict[str, str]:
     """What all scans say alike of the exam; where they differ or one is silent, nothing is said."""
-    listed = list(scans)
-    if not listed:
-        return {}
-    first = listed[0]
-    return {
-        name: first[name]
-        for name in EXAM_FACTS
-        if name in first and all(one.get(name) == first[name] for one in listed)
-    }
+    said = [{(name, one[name]) for name in EXAM_FACTS if name in one} for one in scans]
+    alike = dict(set.intersection(*said)) if said else {}
+    return {name: alike[name] for name in EXAM_FACTS if name in alike}
 
 
 def estimate_of(document: object, path: Path) -> EstimateFile:
@@ -272,7 +254,7 @@ def estimate_of(document: object, path: Path) -> EstimateFile:
         hashlib.sha256(text.encode()).hexdigest(),
         report,
         masses_of(report),
-        _map_digests(report.provenance),
+        tuple(one.sha256 for one in report.origin.inputs if one.role.startswith("map")),
         shared_facts(scans_of(report.provenance)),
     )
 
@@ -280,9 +262,7 @@ def estimate_of(document: object, path: Path) -> EstimateFile:
 def masses_of(report: EstimateReport | PooledReport) -> tuple[SizedMass, ...]:
     """The masses that an estimate lists, or the one that it is of."""
     alike = report.figures.get("between_map_sd")
-    listed: Sequence[EstimateReport | PooledReport | MassReport] = ()
-    if isinstance(report, EstimateReport):
-        listed = report.masses
+    listed = report.masses if isinstance(report, EstimateReport) else ()
     return tuple(_mass(one, alike) for one in listed or (report,))
 
 
@@ -314,38 +294,16 @@ def size_words(size: Quantity) -> str:
     return f"{size.median:.1f} mm, {100 * size.probability:g} % credible interval {ends}"
 
 
-def _map_digests(provenance: object) -> tuple[str, ...]:
-    inputs = provenance.get("inputs") if isinstance(provenance, dict) else None
-    if not isinstance(inputs, list):
-        return ()
-    known = [one for one in inputs if isinstance(one, dict) and isinstance(one.get("sha256"), str)]
-    return tuple(one["sha256"] for one in known if str(one.get("role", "")).startswith("map"))
-
-
-def _read_posterior(path: Path, attributes: Mapping[str, str]) -> EstimateFile:
-    """The estimate that a posterior's file holds."""
-    if "estimate" not in attributes:
-        raise BadDataError(
-            "holds draws without their estimate", way_out="write it again with `estimate -o`", path=str(path)
-        )
-    document = parse_json(attributes["estimate"], name="estimate")
-    return replace(estimate_of(document, path), kind="posterior", digest=sha256(path))
-
-
 def check_pairs(maps: Sequence[MapFile], estimates: Sequence[EstimateFile]) -> None:
     """Refuse maps and estimates of which one was not made from the other."""
     for estimate in estimates:
         for one in maps:
+            remedy = f"`tactile-bayes estimate {one.path} --json`"
             if not estimate.maps:
-                raise UsageError(
-                    f"{estimate.path} does not say which map it is of; estimate the file: "
-                    f"`tactile-bayes estimate {one.path} --json`"
-                )
+                raise UsageError(f"{estimate.path} does not say which map it is of; estimate the file: {remedy}")
             if one.digest not in estimate.maps:
-                raise UsageError(
-                    f"{estimate.path} is not an estimate of {one.path} (the SHA-256 of its map differs); "
-                    f"make it again: `tactile-bayes estimate {one.path} --json`"
-                )
+                what = f"{estimate.path} is not an estimate of {one.path} (the SHA-256 of its map differs)"
+                raise UsageError(f"{what}; make it again: {remedy}")
         missing = len(set(estimate.maps) - {one.digest for one in maps})
         if maps and missing:
             raise UsageError(

@@ -31,6 +31,7 @@ _CATEGORY: Final = "http://terminology.hl7.org/CodeSystem/observation-category"
 _GENDERS: Final = {"F": "female", "M": "male", "O": "other"}
 _STATUS: Final = "preliminary"  #: Nobody has verified what the program found.
 _XHTML: Final = "http://www.w3.org/1999/xhtml"
+_IDENTIFIERS: Final = "http://terminology.hl7.org/CodeSystem/v2-0203"
 
 
 def bundle_json(estimate: EstimateFile, identity: Identity) -> str:
@@ -51,7 +52,7 @@ def bundle_of(estimate: EstimateFile, identity: Identity) -> dict[str, Any]:
     observations = [one for finding in estimate.masses for one in exam.observations(finding)]
     patient = [exam.patient()] if exam.patient_url else []
     resources = [*patient, exam.device(), *observations, exam.report(observations)]
-    entries = [{"fullUrl": exam.url_of(one), "resource": one} for one in resources]
+    entries = [{"fullUrl": f"urn:uuid:{one['id']}", "resource": one} for one in resources]
     identifier = {"system": "urn:ietf:rfc:3986", "value": exam.url("bundle")}
     head = {"resourceType": "Bundle", "id": exam.id("bundle"), "identifier": identifier, "type": "collection"}
     return {**head, "entry": entries}
@@ -63,8 +64,8 @@ class _Exam:
     def __init__(self, estimate: EstimateFile, identity: Identity) -> None:
         self.estimate, self.identity = estimate, identity
         self.key = (__version__, estimate.digest, *(f"{k}={v}" for k, v in sorted(identity.given.items())))
-        person = ("patient_id", "issuer", "patient_name", "birth_date", "sex")
-        self.patient_url = self.url("patient") if any(name in identity.given for name in person) else ""
+        person = {"patient_id", "issuer", "patient_name", "birth_date", "sex"}
+        self.patient_url = self.url("patient") if person & identity.given.keys() else ""
 
     def id(self, role: str) -> str:
         """Logical identifier of a resource."""
@@ -73,11 +74,6 @@ class _Exam:
     def url(self, role: str) -> str:
         """Reference to a resource of the bundle."""
         return f"urn:uuid:{self.id(role)}"
-
-    @staticmethod
-    def url_of(resource: Mapping[str, Any]) -> str:
-        """The full URL of a resource."""
-        return f"urn:uuid:{resource['id']}"
 
     def patient(self) -> dict[str, Any]:
         """The patient, by what was given."""
@@ -147,17 +143,19 @@ class _Exam:
     def report(self, observations: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         """The report, with the same facts as text for people."""
         lines = list(_lines(self.estimate))
-        accession = self.identity.accession
+        number = self.identity.accession
+        kind = {"system": _IDENTIFIERS, "code": "ACSN", "display": "Accession ID"}
+        order = {"identifier": {"type": {"coding": [kind]}, "value": number}}
         division = "".join(f"<p>{escape(line)}</p>" for line in lines)
         return {
             "resourceType": "DiagnosticReport",
             "id": self.id("report"),
             "text": {"status": "generated", "div": f'<div xmlns="{_XHTML}">{division}</div>'},
             "identifier": [{"system": "urn:ietf:rfc:3986", "value": self.url("report")}],
-            **({"basedOn": [_accession(accession)]} if accession else {}),
+            **({"basedOn": [order]} if number else {}),
             **self._common(),
             "code": _concept(codes.EXAM),
-            "result": [{"reference": self.url_of(one)} for one in observations],
+            "result": [{"reference": f"urn:uuid:{one['id']}"} for one in observations],
             "conclusion": " ".join(lines),
             "conclusionCode": [_concept(one.outcome) for one in self.estimate.masses],
         }
@@ -211,12 +209,6 @@ def _absent(finding: SizedMass) -> dict[str, Any]:
     code = ("unknown", "Unknown") if unknown else ("not-applicable", "Not Applicable")
     coding = {"system": ABSENT, "code": code[0], "display": code[1]}
     return {"dataAbsentReason": {"coding": [coding], "text": finding.reason or finding.outcome.meaning}}
-
-
-def _accession(number: str) -> dict[str, Any]:
-    """Reference to the order by its accession number."""
-    coding = {"system": "http://terminology.hl7.org/CodeSystem/v2-0203", "code": "ACSN", "display": "Accession ID"}
-    return {"identifier": {"type": {"coding": [coding]}, "value": number}}
 
 
 def _human_name(name: str) -> dict[str, Any]:

@@ -75,7 +75,10 @@ class Identity(IdentityOptions):
         for name in names_of(self):
             _check_text(name, getattr(self, name))
         for name in _NAMES:
-            _check_name(name, getattr(self, name))
+            groups = getattr(self, name).split("=")
+            if len(groups) > 3 or any(len(group) > 64 or group.count("^") > 4 for group in groups):
+                way_out = "give FAMILY^GIVEN^MIDDLE^PREFIX^SUFFIX, at most 64 characters"
+                raise UsageError(f"{name} is {_short(getattr(self, name))}; {way_out}")
         super().__post_init__()
         if self.study_uid and not _UID.fullmatch(self.study_uid):
             raise UsageError(
@@ -124,12 +127,6 @@ def _check_text(name: str, value: str) -> None:
         raise UsageError(f"{name} is {_short(value)}; leave out the blanks around it")
 
 
-def _check_name(name: str, value: str) -> None:
-    groups = value.split("=")
-    if len(groups) > 3 or any(len(group) > 64 or group.count("^") > 4 for group in groups):
-        raise UsageError(f"{name} is {_short(value)}; give FAMILY^GIVEN^MIDDLE^PREFIX^SUFFIX, at most 64 characters")
-
-
 def _short(value: str) -> str:
     return repr(value if len(value) <= 60 else value[:57] + "...")
 
@@ -166,7 +163,7 @@ def read_worklist(path: Path) -> Identity:
         with _decoding(path, "is neither JSON nor a DICOM file"):
             item = pydicom.dcmread(path, stop_before_pixels=True)
             _check_letters(item, pydicom.charset.python_encoding, path)
-        return _identity(_of_dicom(item, path), path)
+        return _of_dicom(item, path)
     document = load_json(path, way_out=_WAY_OUT)
     if isinstance(document, list):
         if len(document) != 1:
@@ -175,17 +172,15 @@ def read_worklist(path: Path) -> Identity:
     if not isinstance(document, dict):
         raise BadDataError("is no worklist item", way_out=_WAY_OUT, path=str(path))
     if document and all(_TAG.fullmatch(key) for key in document):
-        pydicom = required("pydicom")
         with _decoding(path, "is no DICOM JSON"):
-            item = pydicom.Dataset.from_json(document)
-        return _identity(_of_dicom(item, path), path)
-    found = as_dict(parse_record(document, IdentityOptions, path=path))
-    return _identity({name: value for name, value in found.items() if value}, path)
+            item = required("pydicom").Dataset.from_json(document)
+        return _of_dicom(item, path)
+    return _identity(as_dict(parse_record(document, IdentityOptions, path=path)), path)
 
 
-def _identity(given: dict[str, Any], path: Path) -> Identity:
+def _identity(found: Mapping[str, Any], path: Path) -> Identity:
     try:
-        return Identity(**given)
+        return Identity(**{name: value for name, value in found.items() if value})
     except UsageError as error:
         raise BadDataError(str(error), path=str(path)) from None
 
@@ -224,14 +219,12 @@ def _check_letters(item: Any, known: Collection[str], path: Path) -> None:
             raise BadDataError(what, way_out=way_out, path=str(path))
 
 
-def _of_dicom(dataset: Any, path: Path) -> dict[str, str]:
-    """Identity by the names of `Identity`; attributes that are empty are left out."""
+def _of_dicom(dataset: Any, path: Path) -> Identity:
     with _decoding(path, "holds what cannot be read"):
         found = {name: str(dataset.get(keyword) or "").strip() for name, keyword in _ATTRIBUTES.items()}
         birth = str(dataset.get("PatientBirthDate") or "").strip()
     if birth:
         found["birth_date"] = f"{birth[:4]}-{birth[4:6]}-{birth[6:]}" if len(birth) == 8 else birth
-    found = {name: value for name, value in found.items() if value}
-    if not found:
+    if not any(found.values()):
         raise BadDataError("says nothing of a patient or study", way_out=_WAY_OUT, path=str(path))
-    return found
+    return _identity(found, path)

@@ -37,8 +37,6 @@ from tactile_bayes.report.estimate_text import no_estimate_line
 from tactile_bayes.report.figure_file import plain_matplotlib
 from tactile_bayes.report.map_figure import FitContour, Place, map_figure
 
-# --- A map as NRRD, in the patient's place (3D Slicer).
-
 # --- Place of a map in the coordinate system of DICOM and 3D Slicer: L, P, S in mm from the xiphoid.
 #
 # The program's `patient` frame has x to the patient's right, y from the xiphoid to the sternal notch and z into the
@@ -55,8 +53,7 @@ def lps_from_plane(tactile_map: TactileMap) -> FloatArray | None:
     """(4, 4) transform from the map's plane to L, P, S in mm; None without landmarks."""
     if tactile_map.patient_from_plane is None:
         return None
-    transform: FloatArray = LPS_FROM_PATIENT @ tactile_map.patient_from_plane
-    return transform
+    return np.asarray(LPS_FROM_PATIENT @ tactile_map.patient_from_plane)
 
 
 def on_plane(transform: FloatArray, point_mm: tuple[float, float]) -> FloatArray:
@@ -121,21 +118,14 @@ def nrrd_bytes(source: MapFile) -> bytes:
         "tactile_bayes_findings": " ".join(finding_lines(one.findings, paper=True)).encode("ascii", "replace").decode(),
         "tactile_bayes_research_use": RESEARCH_USE,
     }
-    return _written(nrrd, values, header)
-
-
-def _written(nrrd: Any, values: Any, header: dict[str, Any]) -> bytes:
-    """Bytes of the file without the comment lines of the library, one of which has the time of day."""
     buffer = io.BytesIO()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # the library asks for the time in an old way
         nrrd.write(buffer, values, header, index_order="F", compression_level=9)
     head, _, data = buffer.getvalue().partition(b"\n\n")
-    kept = [line for line in head.split(b"\n") if not line.startswith(b"#")]
+    kept = [line for line in head.split(b"\n") if not line.startswith(b"#")]  # one has the time of day
     return b"\n".join(kept) + b"\n\n" + data
 
-
-# --- A map as DICOM: a parametric map and a picture.
 
 # --- What the DICOM objects of one export share: patient, study, equipment, identifiers, and their bytes.
 
@@ -286,17 +276,18 @@ def map_picture(source: MapFile, estimate: EstimateFile | None) -> NDArray[np.ui
     """
     report = None if estimate is None or estimate.kind != "estimate" else estimate.report
     alone = report if isinstance(report, EstimateReport) else None
-    candidates = () if alone is None else alone.candidates
+    looked_at = () if alone is None else alone.candidates
+    unsized = [] if estimate is None or estimate.sized else [one.reason for one in estimate.masses]
     side = source.facts.get("side")
     with plain_matplotlib() as library:
         figure = map_figure(
             source.tactile_map,
             None,
             fit=None if alone is None else _contour(alone),
-            looked_at=[Place((one.x_mm, one.y_mm), one.fault) for one in candidates if one.fault],
+            looked_at=[Place((one.x_mm, one.y_mm), one.fault) for one in looked_at if one.fault],
             title="Tactile map" + (f" of the {side} breast" if side in ("left", "right") else ""),
-            note="" if estimate is None else _note(estimate),
-            findings=None if estimate is None else estimate.findings,
+            note=no_estimate_line(unsized[0][:_MOST_NOTE]) if unsized else "",
+            findings=None if estimate is None else estimate.report.findings,
         )
         canvas = library.backends.backend_agg.FigureCanvasAgg(figure)
         canvas.draw()
@@ -304,20 +295,14 @@ def map_picture(source: MapFile, estimate: EstimateFile | None) -> NDArray[np.ui
     return np.ascontiguousarray(pixels[:, :, :3])
 
 
-def _note(estimate: EstimateFile) -> str:
-    reasons = [one.reason for one in estimate.masses if one.largest is None]
-    return no_estimate_line(reasons[0][:_MOST_NOTE]) if reasons and not estimate.sized else ""
-
-
 def _contour(report: EstimateReport) -> FitContour | None:
     """Ellipse and size at the medians."""
     centre, across, along = centre_of(report.centre_mm), report.sigma_x_mm, report.sigma_y_mm
-    level, height, size, angle = report.background, report.amplitude, None, report.angle_deg
+    level, height, d_x, d_y = report.background, report.amplitude, report.d_x_mm, report.d_y_mm
     if centre is None or across is None or along is None or level is None or height is None:
         return None
-    if report.d_x_mm is not None and report.d_y_mm is not None:
-        size = (report.d_x_mm.median, report.d_y_mm.median)
-    turn = 0.0 if angle is None else angle.median
+    size = None if d_x is None or d_y is None else (d_x.median, d_y.median)
+    turn = 0.0 if report.angle_deg is None else report.angle_deg.median
     return FitContour(centre, across.median, along.median, turn, size, level.median, height.median)
 
 
@@ -405,15 +390,17 @@ def parametric_map(source: MapFile, *, study: Study, number: int) -> Any:
     dataset.SeriesDescription = f"Tactile map. {RESEARCH_USE}"
     dataset.FrameOfReferenceUID = reference
     dataset.PositionReferenceIndicator = "XIPHOID"
-    _add_pixels(dataset, plane)
-    _add_content(dataset, source)
+    _add_content(dataset, source, plane)
     _add_dimension(dataset, study, source)
     dataset.SharedFunctionalGroupsSequence = [_shared_groups(source, plane)]
-    dataset.PerFrameFunctionalGroupsSequence = [_frame_groups(plane)]
+    content = item(StackID="1", InStackPositionNumber=1, DimensionIndexValues=[1])
+    position = item(ImagePositionPatient=[_decimal(value) for value in plane.corner_mm])
+    frame = item(FrameContentSequence=[content], PlanePositionSequence=[position])
+    dataset.PerFrameFunctionalGroupsSequence = [frame]
     return dataset
 
 
-def _add_pixels(dataset: Any, plane: ImagePlane) -> None:
+def _add_content(dataset: Any, source: MapFile, plane: ImagePlane) -> None:
     values = plane.values.astype("<f4")
     dataset.SamplesPerPixel = 1
     dataset.PhotometricInterpretation = "MONOCHROME2"
@@ -422,9 +409,6 @@ def _add_pixels(dataset: Any, plane: ImagePlane) -> None:
     dataset.BitsAllocated = 32
     dataset.FloatPixelPaddingValue = dataset.FloatPixelPaddingRangeLimit = float("nan")
     dataset.FloatPixelData = values.tobytes()
-
-
-def _add_content(dataset: Any, source: MapFile) -> None:
     dataset.ImageType = _IMAGE_TYPE
     dataset.ContentLabel = "TACTILE_MAP"
     dataset.ContentDescription = source.tactile_map.recipe.value_words[:64]
@@ -456,26 +440,24 @@ def _add_dimension(dataset: Any, study: Study, source: MapFile) -> None:
 def _shared_groups(source: MapFile, plane: ImagePlane) -> Any:
     highdicom = required("highdicom")
     cell = source.tactile_map.recipe.cell_mm
-    cosines = [_cosine(value) for value in (*plane.row_direction, *plane.column_direction)]
+    cosines = np.concatenate([plane.row_direction, plane.column_direction])
+    low, high = float(np.nanmin(plane.values)), float(np.nanmax(plane.values))
+    window = {"WindowCenter": _decimal((low + high) / 2), "WindowWidth": _decimal(max(high - low, 1e-6))}
     groups = item(
         PixelMeasuresSequence=highdicom.PixelMeasuresSequence((cell, cell), cell),
         RealWorldValueMappingSequence=[_value_mapping(source)],
         ParametricMapFrameTypeSequence=[item(FrameType=_IMAGE_TYPE)],
         PixelValueTransformationSequence=[item(RescaleIntercept=0, RescaleSlope=1, RescaleType="US")],
-        FrameVOILUTSequence=[_window(plane)],
-        PlaneOrientationSequence=[item(ImageOrientationPatient=cosines)],
+        FrameVOILUTSequence=[item(**window, VOILUTFunction="LINEAR_EXACT")],
+        PlaneOrientationSequence=[
+            item(ImageOrientationPatient=[_decimal(0.0 if abs(one) < 1e-12 else one) for one in cosines])
+        ],
     )
     side = laterality(source.facts)
     if side:
         region = item(CodeValue=BREAST.value, CodingSchemeDesignator=BREAST.scheme, CodeMeaning=BREAST.meaning)
         groups.FrameAnatomySequence = [item(FrameLaterality=side, AnatomicRegionSequence=[region])]
     return groups
-
-
-def _frame_groups(plane: ImagePlane) -> Any:
-    content = item(StackID="1", InStackPositionNumber=1, DimensionIndexValues=[1])
-    position = item(ImagePositionPatient=[_decimal(value) for value in plane.corner_mm])
-    return item(FrameContentSequence=[content], PlanePositionSequence=[position])
 
 
 def _value_mapping(source: MapFile) -> Any:
@@ -497,13 +479,6 @@ def _value_mapping(source: MapFile) -> Any:
     )
 
 
-def _window(plane: ImagePlane) -> Any:
-    """Window over all values."""
-    low, high = float(np.nanmin(plane.values)), float(np.nanmax(plane.values))
-    width = max(high - low, 1e-6)
-    return item(WindowCenter=_decimal((low + high) / 2), WindowWidth=_decimal(width), VOILUTFunction="LINEAR_EXACT")
-
-
 def _decimal(value: float) -> str:
     """A number as DICOM's decimal string of at most 16 characters."""
     for digits in range(12, 5, -1):
@@ -511,8 +486,3 @@ def _decimal(value: float) -> str:
         if len(text) <= 16:
             return text
     return f"{value:.5g}"
-
-
-def _cosine(value: float) -> str:
-    """A direction cosine; what is rounding of zero is zero."""
-    return _decimal(0.0 if abs(value) < 1e-12 else value)

@@ -7,10 +7,9 @@ from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 from tactile_bayes.errors import UsageError
-from tactile_bayes.exports.exam import NO_VERDICT, NOT_DETECTED, NOT_SIZED, SIZED, EstimateFile, SizedMass, content_uuid
+from tactile_bayes.exports.exam import EstimateFile, SizedMass, content_uuid
 from tactile_bayes.exports.identity import Identity
 from tactile_bayes.files.tables import csv_text
-from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.presets import RESEARCH_USE
 
 FORM: Final = "tactile_exam"
@@ -37,15 +36,15 @@ DICTIONARY_HEADER: Final = (
 """The 18 columns of a data dictionary, as a REDCap project downloads its own."""
 _RECORD: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}", re.ASCII)
 _CHOICES: Final = {
-    "tb_status": {"1": "size", "2": "no size", "3": "no lump that can be measured", "4": "the data cannot show one"},
-    "tb_verdict": {"1": "sound", "2": "doubtful", "3": "no answer"},
-    "tb_side": {"1": "left", "2": "right", "3": "phantom"},
-    "tb_posture": {"1": "supine", "2": "oblique", "3": "sitting", "4": "phantom"},
-    "tb_source": {"1": "one map", "2": "several maps of one mass"},
+    "tb_status": ("size", "no size", "no lump that can be measured", "the data cannot show one"),
+    "tb_verdict": ("sound", "doubtful", "no answer"),
+    "tb_side": ("left", "right", "phantom"),
+    "tb_posture": ("supine", "oblique", "sitting", "phantom"),
+    "tb_source": ("one map", "several maps of one mass"),
 }
-
-
-_VERDICTS: Final = ("sound", "doubtful", "no_answer")
+"""Answers of the fields that have some; their codes are 1, 2, 3..."""
+_STATUSES: Final = ("sized", "not-sized", "no-lump-shown", "no-verdict")
+"""Values of `SizedMass.outcome`, in the order of those answers."""
 
 
 class Field(NamedTuple):
@@ -57,7 +56,6 @@ class Field(NamedTuple):
     validation: str = ""
     least: str = ""
     most: str = ""
-    identifier: bool = False
 
 
 _MM: Final = ("mm", "number", "0", "500")
@@ -98,23 +96,13 @@ COMPLETE: Final = f"{FORM}_complete"
 
 def dictionary_csv() -> str:
     """The data dictionary of the form, for a new project or to append to one."""
-    rows = [_dictionary_row(one) for one in FIELDS]
-    return csv_text(DICTIONARY_HEADER, ([row.get(name) for name in DICTIONARY_HEADER] for row in rows))
-
-
-def _dictionary_row(one: Field) -> dict[str, str]:
-    choices = _CHOICES.get(one.name)
-    return {
-        "Variable / Field Name": one.name,
-        "Form Name": FORM,
-        "Field Type": "radio" if choices else "notes" if one.name in ("tb_reason", "tb_findings") else "text",
-        "Field Label": one.label,
-        "Choices, Calculations, OR Slider Labels": " | ".join(f"{k}, {v}" for k, v in (choices or {}).items()),
-        "Field Note": one.note,
-        "Text Validation Type OR Show Slider Number": one.validation,
-        "Text Validation Min": one.least,
-        "Text Validation Max": one.most,
-    }
+    rows = []
+    for name, label, note, validation, least, most in FIELDS:
+        choices = " | ".join(f"{code}, {words}" for code, words in enumerate(_CHOICES.get(name, ()), start=1))
+        kind = "radio" if choices else "notes" if name in ("tb_reason", "tb_findings") else "text"
+        row = [name, FORM, "", kind, label, choices, note, validation, least, most]
+        rows.append(row + [""] * (len(DICTIONARY_HEADER) - len(row)))
+    return csv_text(DICTIONARY_HEADER, rows)
 
 
 def records_csv(estimates: Sequence[EstimateFile], identity: Identity, *, id_from_scan: bool) -> str:
@@ -162,9 +150,8 @@ def _record_id(estimate: EstimateFile, finding: SizedMass, identity: Identity, *
 
 def _row(estimate: EstimateFile, finding: SizedMass, identity: Identity) -> dict[str, str]:
     facts = estimate.facts
-    status = {SIZED: "1", NOT_SIZED: "2", NOT_DETECTED: "3", NO_VERDICT: "4"}[finding.outcome]
     row = {
-        "tb_status": status,
+        "tb_status": str(_STATUSES.index(finding.outcome.value) + 1),
         "tb_reason": finding.reason,
         "tb_exam_date": identity.study.iso_date if identity.study else "",
         "tb_side": _choice("tb_side", facts.get("side")),
@@ -176,7 +163,7 @@ def _row(estimate: EstimateFile, finding: SizedMass, identity: Identity) -> dict
         "tb_source": "2" if len(estimate.maps) > 1 else "1",
         "tb_maps": str(len(estimate.maps)),
         "tb_lump_prob": _number(finding.probability),
-        "tb_verdict": str(_VERDICTS.index(estimate.verdict) + 1),
+        "tb_verdict": _choice("tb_verdict", estimate.report.verdict.replace("_", " ")),
         "tb_findings": " ".join(estimate.lines),
         "tb_method": estimate.method_words,
         "tb_version": estimate.version,
@@ -185,21 +172,16 @@ def _row(estimate: EstimateFile, finding: SizedMass, identity: Identity) -> dict
         "tb_research_use": RESEARCH_USE,
     }
     for name, size in (("max", finding.largest), ("min", finding.smallest)):
-        row |= _size(name, size)
+        if size is not None:
+            row |= {f"tb_{name}_mm": _number(size.median), "tb_interval_prob": _number(size.probability)}
+            row |= {f"tb_{name}_low_mm": _number(size.low), f"tb_{name}_high_mm": _number(size.high)}
     if finding.centre_patient_mm is not None:
         row |= dict(zip(("tb_right_mm", "tb_up_mm"), map(_number, finding.centre_patient_mm), strict=True))
     return {name: _plain(value) for name, value in row.items()}
 
 
-def _size(name: str, size: Quantity | None) -> dict[str, str]:
-    if size is None:
-        return {}
-    told = {f"tb_{name}_mm": size.median, f"tb_{name}_low_mm": size.low, f"tb_{name}_high_mm": size.high}
-    return {key: _number(value) for key, value in (told | {"tb_interval_prob": size.probability}).items()}
-
-
 def _choice(name: str, word: str | None) -> str:
-    return next((code for code, text in _CHOICES[name].items() if text == word), "")
+    return str(_CHOICES[name].index(word) + 1) if word in _CHOICES[name] else ""
 
 
 def _number(value: float | None) -> str:
@@ -209,12 +191,5 @@ def _number(value: float | None) -> str:
 def _plain(text: str) -> str:
     """A cell in one line that no spreadsheet takes for a formula."""
     line = " ".join(text.split())
-    return f"'{line}" if line[:1] in ("=", "@", "+") or (line[:1] == "-" and not _is_number(line)) else line
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
+    number = re.fullmatch(r"-[0-9]*\.?[0-9]+(e[+-]?[0-9]+)?", line)
+    return f"'{line}" if line[:1] in ("=", "@", "+", "-") and not number else line

@@ -86,9 +86,8 @@ def _prepared_folder(folder: Path, names: set[str], *, force: bool) -> Path | No
 
 ExportFormat = Literal["dicom", "fhir", "nrrd", "csv"]
 FORMATS: Final[tuple[ExportFormat, ...]] = get_args(ExportFormat)
-_EVERYTHING: Final = names_of(Identity)
 TAKES: Final[dict[ExportFormat, tuple[str, ...]]] = {
-    "dicom": _EVERYTHING,
+    "dicom": names_of(Identity),
     "fhir": ("patient_id", "patient_name", "birth_date", "sex", "issuer", "accession", "study_date"),
     "nrrd": (),
     "csv": ("patient_id", "study_date"),
@@ -128,36 +127,35 @@ def export(
     and study; what the format does not hold is left out; `id_from_scan`: take the subject code of the scans for the
     patient ID where none is given.
     """
-    maps, estimates = _sorted(files)
-    check_pairs(maps, estimates)
-    given: dict[str, Any] = {name: value for name, value in identity.given.items() if name in TAKES[to]}
-    if to == "csv":
-        return _csv(maps, estimates, Identity(**given), id_from_scan=id_from_scan)
-    if to == "nrrd":
-        return _nrrd(maps, estimates, id_from_scan=id_from_scan)
-    who = Identity(**given)
-    who = _with_subject(who, [*maps, *estimates]) if id_from_scan else who
-    return _dicom(maps, estimates, who) if to == "dicom" else _fhir(maps, estimates, who)
-
-
-def _sorted(files: Iterable[MapFile | Sequence[EstimateFile]]) -> tuple[list[MapFile], list[EstimateFile]]:
     maps, estimates = list[MapFile](), list[EstimateFile]()
     for found in files:
         if isinstance(found, MapFile):
             maps.append(found)
         else:
             estimates.extend(found)
-    _refuse_twice([(one.path, one.digest) for one in maps])
-    _refuse_twice([(one.path, one.digest) for one in estimates])
-    return maps, estimates
+    _refuse_twice(maps)
+    _refuse_twice(estimates)
+    check_pairs(maps, estimates)
+    given: dict[str, Any] = {name: value for name, value in identity.given.items() if name in TAKES[to]}
+    who = Identity(**given)
+    if to == "nrrd":
+        return _nrrd(maps, estimates, id_from_scan=id_from_scan)
+    if to == "csv":
+        _refuse_maps(maps, estimates, to)
+        return Exported({"": records_csv(estimates, who, id_from_scan=id_from_scan).encode()})
+    who = _with_subject(who, [*maps, *estimates]) if id_from_scan else who
+    if to == "dicom":
+        return _dicom(maps, estimates, who)
+    _refuse_maps(maps, estimates, to)
+    return Exported({"": bundle_json(_one_estimate(estimates, to), who).encode()}, tuple(_no_patient(who)))
 
 
-def _refuse_twice(files: Sequence[tuple[Path, str]]) -> None:
+def _refuse_twice(files: Sequence[MapFile] | Sequence[EstimateFile]) -> None:
     seen = dict[str, Path]()
-    for path, digest in files:
-        if digest in seen:
-            raise UsageError(f"{path} holds what {seen[digest]} holds; give each once")
-        seen[digest] = path
+    for one in files:
+        if one.digest in seen:
+            raise UsageError(f"{one.path} holds what {seen[one.digest]} holds; give each once")
+        seen[one.digest] = one.path
 
 
 def _with_subject(identity: Identity, files: Sequence[MapFile | EstimateFile]) -> Identity:
@@ -199,12 +197,6 @@ def _dicom(maps: Sequence[MapFile], estimates: Sequence[EstimateFile], identity:
     return Exported(files, tuple(notes))
 
 
-def _fhir(maps: Sequence[MapFile], estimates: Sequence[EstimateFile], identity: Identity) -> Exported:
-    _refuse_maps(maps, estimates, "fhir")
-    text = bundle_json(_one_estimate(estimates, "fhir"), identity)
-    return Exported({"": text.encode()}, tuple(_no_patient(identity)))
-
-
 def _refuse_maps(maps: Sequence[MapFile], estimates: Sequence[EstimateFile], to: ExportFormat) -> None:
     if maps and not estimates:
         one = maps[0].path
@@ -223,10 +215,3 @@ def _nrrd(maps: Sequence[MapFile], estimates: Sequence[EstimateFile], *, id_from
     if len(maps) > 1:
         raise UsageError("a nrrd file holds one map; give one")
     return Exported({"": nrrd_bytes(maps[0])})
-
-
-def _csv(
-    maps: Sequence[MapFile], estimates: Sequence[EstimateFile], identity: Identity, *, id_from_scan: bool
-) -> Exported:
-    _refuse_maps(maps, estimates, "csv")
-    return Exported({"": records_csv(estimates, identity, id_from_scan=id_from_scan).encode()})

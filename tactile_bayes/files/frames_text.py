@@ -23,7 +23,7 @@ from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.arrays_layout import Stated
 from tactile_bayes.files.named_arrays import Source
 from tactile_bayes.files.poses_text import is_header_of_poses, kind_of_column
-from tactile_bayes.files.text_lines import NO_SENSEL, Line, TextTable, counts_up, number, read_text_table
+from tactile_bayes.files.text_lines import NO_SENSEL, Line, TextTable, counts_up, number, read_text_table, unit_of_time
 from tactile_bayes.geometry import FloatArray
 
 _UNITS: Final = {
@@ -49,9 +49,7 @@ _OTHER_NAME: Final = re.compile(
     re.IGNORECASE,
 )
 """Names of columns that hold no reading of one taxel, nor a time."""
-_UNIT_OF_TIME: Final = re.compile(r"(?:[\[(_ ]|(?<=time))(ms|msec|us|µs|ns|s|secs?|seconds|min)[\])]?$", re.IGNORECASE)
 _PLAIN: Final = re.compile(r"[\[(].*?[\])]|_?(ms|us|ns|secs?|s)$", re.IGNORECASE)  # what is no part of a name
-_SECONDS: Final = {"ms": "ms", "msec": "ms", "us": "us", "ns": "ns", "µs": "us", "min": "min"}
 _LAYOUTS: Final = "give one row a frame, or blocks of rows; --skip-columns says how many stand before the readings"
 _MOST_OF_POSES: Final = 24  # columns: a table of more holds readings, too
 _SAMPLED: Final = 50
@@ -74,13 +72,12 @@ def read_frames(path: Path, given: Stated, *, shape: tuple[int, int] | None) -> 
         raise BadDataError(what, way_out="give the frames, and it as --poses")
     blocks = _blocks(table, None if shape is None else shape[0] * shape[1])
     if beside := sum(one == NO_SENSEL for line in blocks[0] for one in line.fields):
-        what = (
-            f"has {beside} cells {NO_SENSEL!r} from line {blocks[0][0].number} on, which Tekscan writes beside a sensor"
-        )
+        cells = f"{beside} cells {NO_SENSEL!r} from line {blocks[0][0].number} on"
+        what = f"has {cells}, which Tekscan writes beside a sensor"
         raise BadDataError(what, way_out="export the rows and columns without them, and give a head of these")
     before = [line for line in table.lines if line.number < blocks[0][0].number]
-    stated, notes = _said(before)
-    notes = [f"frames: {table.words}", *notes]
+    stated, told = _said(before)
+    notes = [f"frames: {table.words}", *told]
     if len(blocks) > 1 and len(blocks[0]) > 1:
         return _of_blocks(table, blocks, stated, notes)
     rows = [line for block in blocks for line in block]
@@ -123,8 +120,8 @@ def _blocks(table: TextTable, taxels: int | None) -> list[list[Line]]:
             blocks[-1].append(line)
         elif held:
             blocks.append([line])
-        elif blocks and len(line.fields) > 1 and not _title(line) and _of_numbers(table, line, width):
-            what = f"line {line.number} holds {_first_odd(table, line)}, the others {width} numbers"
+        elif blocks and (held_too := _like_a_row(table, line, width)):
+            what = f"line {line.number} holds {held_too}, the others {width} numbers"
             raise BadDataError(what, way_out="give every row one length, numbers alone")
         open_block = held
     if taxels is not None and width >= taxels:  # rows of one table, whatever stands between
@@ -137,17 +134,13 @@ def _blocks(table: TextTable, taxels: int | None) -> list[list[Line]]:
     return blocks if len(lengths) == 1 else [[line for block in blocks for line in block]]
 
 
-def _of_numbers(table: TextTable, line: Line, width: int) -> bool:
-    """True for a line that looks like one of the table, and is not."""
-    return table.numbers(line.fields) is not None or len(line.fields) >= width - 1
-
-
-def _title(line: Line) -> bool:
-    return line.text.lstrip('" ').lower().startswith(("frame", "time", "@@"))
-
-
-def _first_odd(table: TextTable, line: Line) -> str:
+def _like_a_row(table: TextTable, line: Line, width: int) -> str:
+    """What a line holds that looks like one of the table, and is not; empty for a title and for other lines."""
+    if len(line.fields) < 2 or line.text.lstrip('" ').lower().startswith(("frame", "time", "@@")):
+        return ""
     odd = [one for one in line.fields if table.numbers([one]) is None]
+    if odd and len(line.fields) < width - 1:
+        return ""
     return repr(odd[0][:30]) if odd else f"{len(line.fields)} numbers"
 
 
@@ -235,17 +228,12 @@ def _of_rows(
         notes.append(f"{len(readings)} of {values.shape[1]} columns are readings, from column {readings[0] + 1} on")
     if time is not None:
         arrays["frame_time_s"] = values[:, time]
-        unit = _unit_of_time(names[time]) if names else ""
+        unit = unit_of_time(names[time]) if names else ""
         named = f" ({names[time]!r})" if names else ""
         notes.append(f"times in column {time + 1}{named}" + (f", in {unit}" if unit else ""))
         if unit and stated.time_unit is None:
             stated = replace(stated, time_unit=unit)
     return Source(arrays, stated, tuple(notes))
-
-
-def _unit_of_time(name: str) -> str:
-    found = _UNIT_OF_TIME.search(name.strip())
-    return _SECONDS.get(found[1].lower(), "s") if found else ""
 
 
 def _columns(values: FloatArray, names: list[str], taxels: int | None, given: Stated) -> tuple[int | None, list[int]]:
@@ -270,16 +258,9 @@ def _columns(values: FloatArray, names: list[str], taxels: int | None, given: St
     readings = list(range(first, width if taxels is None else first + taxels))
     if timed and timed[0] < first:
         return timed[0], readings
-    return _time_column(values[:, :first], given), readings
-
-
-def _time_column(columns: FloatArray, given: Stated) -> int | None:
-    """The column of times among those before the readings: the last that rises, or the last; none that only counts.
-
-    A column that falls is told as such when times are checked.
-    """
-    steps = np.diff(columns, axis=0).T
-    counting = [i for i, one in enumerate(steps) if one.size and (one == 1).all() and not given.time_unit]
-    others = [i for i in range(len(steps)) if i not in counting]
+    # of the columns before the readings the last that rises, or the last (one that falls is told when times are
+    # checked), and none that only counts
+    steps = np.diff(values[:, :first], axis=0).T
+    others = [i for i, one in enumerate(steps) if given.time_unit or not one.size or (one != 1).any()]
     rising = [i for i in others if (steps[i] >= 0).all() and steps[i].any()]
-    return next(reversed(rising), None if given.rate_hz else next(reversed(others), None))
+    return next(reversed(rising), None if given.rate_hz else next(reversed(others), None)), readings

@@ -23,7 +23,7 @@ from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, in_file
 from tactile_bayes.files.arrays_layout import Stated
 from tactile_bayes.files.named_arrays import Source
-from tactile_bayes.files.text_lines import Line, TextTable, read_text_table
+from tactile_bayes.files.text_lines import Line, TextTable, read_text_table, unit_of_time
 from tactile_bayes.geometry import FloatArray
 
 _NAMES: Final[Mapping[str, str]] = {
@@ -50,7 +50,6 @@ _PLACE: Final = ("x", "y", "z")
 _SEEN: Final = ("ok", "enabled", "valid", "tracked", "good", "true", "visible")
 """Status of a tool that is seen, in small letters."""
 _UNIT: Final = re.compile(r"[\[(_ ](mm|cm|m|in|inch|inches)[\])]?$", re.IGNORECASE)
-_TIME_UNIT: Final = re.compile(r"[\[(_ ](ms|us|ns|s|sec|min)[\])]?$", re.IGNORECASE)
 _LENGTH_LINE: Final = re.compile(r"\blength units?\W+(meters|millimeters|centimeters|mm|cm|m)\b", re.IGNORECASE)
 _LENGTHS: Final = {"in": "inch", "inches": "inch", "meters": "m", "millimeters": "mm", "centimeters": "cm"}
 _BARE: Final = {"wxyz": 7, "xyzw": 7, "euler": 6, "matrix": 16}
@@ -75,13 +74,9 @@ def read_poses(path: Path, given: Stated) -> Source:
         return replace(found, notes=(f"poses: {table.words}", *found.notes))
 
 
-def _plain(name: str) -> str:
-    return re.sub(r"[^a-z0-9]", "", re.sub(r"[\[(].*?[\])]", "", name.lower()))
-
-
 def kind_of_column(name: str) -> str:
     """What a column of a tracker's table holds, by its name; empty for one of anything else."""
-    plain = _plain(name)
+    plain = re.sub(r"[^a-z0-9]", "", re.sub(r"[\[(].*?[\])]", "", name.lower()))
     return _NAMES.get(plain) or _NAMES.get(re.sub(r"(mm|cm|inch|in|deg|ms|us|s)$", "", plain), "")
 
 
@@ -146,7 +141,11 @@ def chosen(names: Sequence[str], given: Stated, *, what: str) -> str:
 
 
 def _named(table: TextTable, header: Line, given: Stated) -> Source:
-    kinds = _with_rotations([kind_of_column(name) for name in header.fields])
+    kinds = [kind_of_column(name) for name in header.fields]
+    if "qx" not in kinds:
+        for i, kind in enumerate(kinds):
+            if kind == "qw" and kinds[max(i - 3, 0) : i] == list(_PLACE):  # of a quaternion, not of a place
+                kinds[i - 3 : i] = ["qx", "qy", "qz"]
     layout = "wxyz" if {"qw", "qx", "qy"} & set(kinds) else "euler"
     names = (*_PLACE, *_ROTATIONS[layout])
     if not set(names) <= set(kinds):
@@ -162,8 +161,9 @@ def _named(table: TextTable, header: Line, given: Stated) -> Source:
     status = [_field(line, columns["status"]) for line in rows] if "status" in columns else [""] * len(rows)
     time, unit = _times(table, rows, columns, header, given)
     stated: dict[str, Any] = {"pose_time_unit": unit} if unit else {}
-    length = _unit_of(header.fields[columns["x"]], _UNIT) or _unit_before(table, header)
-    if length:
+    above = [line.text for line in table.lines if line.number < header.number]
+    lengths = [_UNIT.search(header.fields[columns["x"]].strip()), *map(_LENGTH_LINE.search, above)]
+    if length := next((found[1].lower() for found in lengths if found), ""):
         stated["length_unit"] = _LENGTHS.get(length, length)
     elif layout == "euler" and given.length_unit is None:
         raise BadDataError("does not say the unit of x, y and z", way_out="give --length-unit cm, inch or mm")
@@ -171,21 +171,6 @@ def _named(table: TextTable, header: Line, given: Stated) -> Source:
     found = seen(time, numbers, why, layout=layout, stated=stated)
     named = f"poses by the names of line {header.number}: {', '.join(header.fields[columns[one]] for one in names)}"
     return replace(found, notes=(named, *found.notes))
-
-
-def _with_rotations(kinds: Sequence[str]) -> list[str]:
-    """Kinds of columns where x, y and z before a w are those of a quaternion, not of a place."""
-    found = list(kinds)
-    for i, kind in enumerate(kinds):
-        if kind == "qw" and "qx" not in kinds and kinds[max(i - 3, 0) : i] == list(_PLACE):
-            found[i - 3 : i] = ["qx", "qy", "qz"]
-    return found
-
-
-def _unit_before(table: TextTable, header: Line) -> str:
-    """Unit of lengths by a line above the header; empty without."""
-    lines = (_LENGTH_LINE.search(line.text) for line in table.lines if line.number < header.number)
-    return next((found[1].lower() for found in lines if found), "")
 
 
 def _of_one_tool(
@@ -242,7 +227,7 @@ def _times(
     """Times of all rows and their unit where the header says it."""
     held = {name: _values(table, rows, column) for name, column in columns.items() if name in _TIMES}
     if "time" in held:
-        return _settled(held["time"]), _unit_of(header.fields[columns["time"]], _TIME_UNIT).replace("sec", "s")
+        return _settled(held["time"]), unit_of_time(header.fields[columns["time"]])
     if "seconds" in held:
         return _settled(held["seconds"] + 1e-9 * held.get("nanoseconds", 0.0)), "s"
     if given.pose_rate_hz is None:
@@ -262,11 +247,6 @@ def _settled(values: FloatArray) -> FloatArray:
         raise BadDataError("its column of times has no number", way_out="give --pose-rate-hz in its place")
     index = np.arange(len(values))
     return np.asarray(np.interp(index, index[known], values[known]))
-
-
-def _unit_of(name: str, pattern: re.Pattern[str]) -> str:
-    found = pattern.search(name.strip())
-    return found[1].lower() if found else ""
 
 
 # --- Numbers without names.

@@ -24,6 +24,7 @@ _AS_UTF8: Final = "save it as UTF-8 text"
 _AROUND: Final = " \t\"'[](){}"  # of a field, as R and Python print numbers
 _CLOCK: Final = re.compile(r"(?:(\d{1,2}):)?(\d{1,2}):(\d{1,2}(?:\.\d+)?)")
 _DATED: Final = re.compile(r"\d{4}-\d{2}-\d{2}[T ]\d{1,2}:\d{2}:\d{2}(\.\d+)?(Z|[+-]\d{2}:?\d{2})?")
+_UNIT_OF_TIME: Final = re.compile(r"(?:[\[(_ ]|(?<=time))(ms|us|ns|s|min|msec|µs|secs?|seconds)[\])]?$", re.IGNORECASE)
 _DECIMAL_COMMA: Final = re.compile(r"[+-]?[0-9]*,[0-9]+(e[+-]?[0-9]+)?", re.IGNORECASE)
 FEWEST_LABELS: Final = 8
 """So many numbers that count 0, 1, 2... or 1, 2, 3... are labels of rows or columns, not readings."""
@@ -182,3 +183,10 @@ def refuse_thousands(commas: Sequence[str], *, way_out: str) -> None:
 def counts_up(line: FloatArray) -> bool:
     """True for labels of rows or columns."""
     return len(line) >= FEWEST_LABELS and line[0] in (0.0, 1.0) and bool((np.diff(line) == 1.0).all())
+
+
+def unit_of_time(name: str) -> str:
+    """Unit in the name of a column of times; empty where it says none."""
+    found = _UNIT_OF_TIME.search(name.strip())
+    unit = found[1].lower() if found else ""
+    return {"msec": "ms", "µs": "us", "sec": "s", "secs": "s", "seconds": "s"}.get(unit, unit)
