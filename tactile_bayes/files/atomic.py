@@ -127,43 +127,34 @@ def atomic_path(path: Path, *, force: bool = False) -> Iterator[Path]:
     refuse_existing(path, force=force)
     target = _target(path)
     try:
-        _sweep(target)
-        with _temporary(target) as partial:
+        stem = _stem(target)
+        _sweep(target, stem)
+        handle, name = tempfile.mkstemp(prefix=f"{stem}-{os.getpid()}-", suffix=_PART, dir=target.parent)
+        os.close(handle)
+        partial = Path(name)
+        try:
             yield partial
             partial.chmod(0o600)
             with partial.open("rb") as file:
                 os.fsync(file.fileno())
             _publish(partial, target, force=force)
+        finally:
+            partial.unlink(missing_ok=True)
     except OSError as error:
         raise unwritable(path, error) from None
-
-
-@contextlib.contextmanager
-def _temporary(target: Path) -> Iterator[Path]:
-    handle, name = tempfile.mkstemp(prefix=f"{_stem(target)}-{os.getpid()}-", suffix=_PART, dir=target.parent)
-    os.close(handle)
-    partial = Path(name)
-    try:
-        yield partial
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def _stem(target: Path) -> str:
     """Beginning of a target's temporary names on this computer; short, however long the target's name is."""
     name = os.fsencode(target.name)
     short = target.name if len(name) <= _LONGEST_STEM else f"{zlib.crc32(name):08x}"
-    return f".{short}.{_host()}"
+    host = zlib.crc32(socket.gethostname().encode())  # directories may be shared with other computers
+    return f".{short}.{host:08x}"
 
 
-def _host() -> str:
-    """Eight letters that stand for this computer, because directories may be shared with others."""
-    return f"{zlib.crc32(socket.gethostname().encode()):08x}"
-
-
-def _sweep(target: Path) -> None:
+def _sweep(target: Path, stem: str) -> None:
     """Remove temporary files of `target` that ended processes left behind."""
-    pattern = re.compile(rf"{re.escape(_stem(target))}-(\d+)-[^.]*{re.escape(_PART)}")
+    pattern = re.compile(rf"{re.escape(stem)}-(\d+)-[^.]*{re.escape(_PART)}")
     for name in os.listdir(target.parent):  # noqa: PTH208 (names only: the directory may be large)
         found = pattern.fullmatch(name)
         if found and not _alive(int(found[1])):
@@ -176,7 +167,7 @@ def _alive(process: int) -> bool:
     except ProcessLookupError:
         return False
     except (PermissionError, OverflowError):
-        return True
+        pass
     return True
 
 

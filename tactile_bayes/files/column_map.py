@@ -50,10 +50,6 @@ class ExcisionColumns(Record):
     unit: Unit | None = None
     date: Annotated[Column, Meta(description="Column of the date of excision.")] | None = None
 
-    def names(self) -> list[str]:
-        """Columns of the wide table that are named."""
-        return [name for name in (self.size, self.second, self.sd, self.date) if name is not None]
-
 
 class ColumnMap(Record):
     """Which column of a wide table holds which reading."""
@@ -92,7 +88,8 @@ def read_wide(path: Path, mapping_path: Path) -> Table:
         way_out = "add one for each modality, or give a table of readings that is tidy"
         raise BadDataError("has no [[reading]]", way_out=way_out, path=str(mapping_path))
     raw = _composed(read_raw(path))
-    _check_columns(raw, [*mapping.key_columns(), *_reading_columns(mapping.reading)])
+    named = [(one.size, one.sd, one.low, one.high, one.reader, one.date) for one in mapping.reading]
+    _check_columns(raw, [*mapping.key_columns(), *(name for names in named for name in names if name)])
     columns: dict[str, list[Any]] = {}
     line_numbers = []
     for line, row in zip(raw.line_numbers, raw.rows, strict=True):
@@ -115,7 +112,8 @@ def read_wide_excision(path: Path, mapping_path: Path) -> Table:
         raise BadDataError("has no table [excision]", way_out=way_out, path=str(mapping_path))
     raw = _composed(read_raw(path))
     excision = mapping.excision
-    _check_columns(raw, [*mapping.key_columns(), *excision.names()])
+    named = (excision.size, excision.second, excision.sd, excision.date)
+    _check_columns(raw, [*mapping.key_columns(), *filter(None, named)])
     columns: dict[str, list[Any]] = {name: [] for name in _EXCISION}
     factor = _FACTOR[excision.unit or mapping.unit]
     kept = []
@@ -156,11 +154,6 @@ def _composed(table: RawTable) -> RawTable:
     """The table with names of its columns and cells in one spelling, so that they are those of the mapping."""
     rows = [{composed(name): composed(cell) for name, cell in row.items()} for row in table.rows]
     return replace(table, header=[composed(name) for name in table.header], rows=rows)
-
-
-def _reading_columns(readings: Sequence[ReadingColumns]) -> list[str]:
-    columns = [(one.size, one.sd, one.low, one.high, one.reader, one.date) for one in readings]
-    return [name for names in columns for name in names if name is not None]
 
 
 def _check_columns(table: RawTable, names: Sequence[str]) -> None:
@@ -236,12 +229,9 @@ def _positive(table: RawTable, line: int, column: str, text: str) -> float:
 
 
 def _check_keys(table: Table, names: Sequence[str]) -> None:
-    seen: dict[tuple[Any, ...], int] = {}
+    first: dict[tuple[Any, ...], int] = {}
     for row, key in enumerate(zip(*(table.columns.get(name, []) for name in names), strict=True)):
-        if key in seen:
-            shown = " + ".join(map(str, key))
+        if (before := first.setdefault(key, row)) != row:
+            what = f"{' + '.join(map(str, key))} stands on line {table.line_numbers[before]} already"
             way_out = "remove one row" if "modality" in names else "remove one, or name the column of the mass"
-            raise table.error(
-                row, "patient", f"{shown} stands on line {table.line_numbers[seen[key]]} already", way_out=way_out
-            )
-        seen[key] = row
+            raise table.error(row, "patient", what, way_out=way_out)

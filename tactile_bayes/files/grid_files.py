@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -59,19 +59,22 @@ def read_table(path: Path, *, no_value: Sequence[str] = ()) -> Grid:
     words = [one for one in no_value if not is_number(one)]  # numbers are looked for among the values
     texts = read_lines(path)
     separator = separator_of(texts, words) or ","
-    rows = _with_points([fields_of(one, separator) for one in texts], words)
+    rows = [fields_of(one, separator) for one in texts]
+    commas = with_comma(rows, words)
+    refuse_thousands(commas, way_out="write numbers without commas")
+    decimal = {one for one in commas if one.count(",") == 1}
+    rows = [[field.replace(",", ".") if field in decimal else field for field in row] for row in rows]
     first, last = _numbers_within(rows, no_value)
-    before, after = (_said(part) for part in (rows[:first], rows[last:]))
     names = rows[first - 1] if first else []
     if len(names) == len(rows[first]) > 1 and _TIME.fullmatch(names[0]) and not any(map(is_number, names)):
         what = f"its first column is called {names[0][:20]!r}, as before frames that stand one a row"
         raise BadDataError(what, way_out="import them as a scan, or give one frame as rows and columns")
     text = "\n".join(texts)
     marks = (*words, NO_SENSEL) if "ASCII_DATA" in text else tuple(words)
-    rows, notes = rows[first:last], []
+    before, rows, after, notes = rows[:first], rows[first:last], rows[last:], list[str]()
     _refuse_several(rows, first)
-    for lines, where in ((before, "before"), (after, "after")):
-        if lines:
+    for part, where in ((before, "before"), (after, "after")):
+        if lines := [said for row in part if (said := " ".join(filter(None, row)))]:
             more = f" and {len(lines) - 1} more" if len(lines) > 1 else ""
             notes.append(f"text {where} the numbers was left out: {lines[0][:40]!r}{more}")
     if len(rows[0]) > 2 and all(row[-1] == "" for row in rows):
@@ -129,10 +132,6 @@ def _is_title(row: Sequence[str]) -> bool:
     return row[0][:5].lower() == "frame"
 
 
-def _said(rows: Iterable[Sequence[str]]) -> list[str]:
-    return [text for row in rows if (text := " ".join(field for field in row if field))]
-
-
 def _refuse_several(rows: Sequence[list[str]], before: int) -> None:
     """Refuse several tables: blank lines and titles of frames separate tables, not rows."""
     for number, row in enumerate(rows, start=before):
@@ -141,14 +140,6 @@ def _refuse_several(rows: Sequence[list[str]], before: int) -> None:
             what = f"has {'a blank line' if blank else repr(row[0][:20])} after row {number}"
             way_out = "give one grid, such as one frame or a mean of frames, in a file; frames with poses are a scan"
             raise BadDataError(what, way_out=way_out)
-
-
-def _with_points(rows: Sequence[list[str]], marks: Sequence[str]) -> list[list[str]]:
-    """The rows with decimal points in place of decimal commas."""
-    commas = with_comma(rows, marks)
-    refuse_thousands(commas, way_out="write numbers without commas")
-    decimal = {one for one in commas if one.count(",") == 1}
-    return [[field.replace(",", ".") if field in decimal else field for field in row] for row in rows]
 
 
 def _values(rows: Sequence[list[str]], marks: Sequence[str], before: int) -> FloatArray:
@@ -187,12 +178,11 @@ def _refuse_labels(table: FloatArray) -> None:
     """Refuse numbers of rows and columns, or their places, in the first row and column: they are no readings."""
     row, column = table[0], table[:, 0]
     both = np.isnan(table[0, 0]) and _evenly(row[1:]) and _evenly(column[1:])
-    counted = (
+    for found, line, where in (
         (both, row[1:], "row 1 and column 1"),
         (counts_up(row), row, "row 1"),
         (counts_up(column), column, "column 1"),
-    )
-    for found, line, where in counted:
+    ):
         if found:
             way_out = "save the grid without them (pandas: to_csv(..., header=False, index=False))"
             raise BadDataError(f"{where} count {_first_three(line)}... as labels do", way_out=way_out)
@@ -261,7 +251,13 @@ def _of_arrays(path: Path, array: str) -> Grid:
 
     arrays = read_named(path, wanted)
     if not array and "mean" in arrays:
-        return Grid(arrays, _stated_spacing(arrays.pop("spacing_mm", None)))
+        if "spacing_mm" not in arrays:
+            return Grid(arrays)
+        sides = np.atleast_1d(arrays.pop("spacing_mm"))
+        if sides.dtype.kind not in "iuf" or sides.ndim != 1 or len(sides) not in (1, 2):
+            what = f"spacing_mm is {sides.dtype} of shape {sides.shape}"
+            raise BadDataError(what, way_out="it must be one number")
+        return Grid(arrays, (float(sides[0]), float(sides[-1])))
     flat = {name: held for name, held in arrays.items() if held.ndim == 2 and min(held.shape) > 1}
     if array:
         flat = {name: held for name, held in flat.items() if name == array}
@@ -274,12 +270,3 @@ def _of_arrays(path: Path, array: str) -> Grid:
     called = f" called {array!r}" if array else ""
     way_out = "name another" if array else "frames with poses are a scan; of frames alone give one, or their mean"
     raise BadDataError(f"holds no array of rows and columns{called} (it has {has})", way_out=way_out)
-
-
-def _stated_spacing(held: np.ndarray[Any, Any] | None) -> tuple[float, float] | None:
-    if held is None:
-        return None
-    values = np.atleast_1d(held)
-    if values.dtype.kind not in "iuf" or values.ndim != 1 or len(values) not in (1, 2):
-        raise BadDataError(f"spacing_mm is {values.dtype} of shape {values.shape}", way_out="it must be one number")
-    return float(values[0]), float(values[-1])

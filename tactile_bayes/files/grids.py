@@ -179,7 +179,10 @@ def grid_map(grid: Grid, asked: GridOptions) -> tuple[TactileMap, list[str]]:
         _refuse_apart(values)
     units = asked.units or (grid.units if asked.normalise == "none" else "")
     made = _map(arrays, spacing_mm=spacing, normalise=asked.normalise, units=units)
-    if (times := _cells_in_one(spacing, asked.cell_mm)) > 1:
+    cell = asked.cell_mm or (CELL_MM if spacing < _FINEST_MM * (1 - 1e-6) else spacing)
+    if cell < spacing * (1 - 1e-6):
+        raise UsageError(f"--cell-mm is {cell:g}, and the grid's cells are {spacing:g} mm; give that or more")
+    if (times := int(cell / spacing + 1e-6)) > 1:
         made = _averaged(made, times)
         notes.append(f"{times} x {times} cells of {spacing:g} mm were averaged into one of {times * spacing:g} mm")
     if asked.level is not None:
@@ -191,15 +194,6 @@ def grid_map(grid: Grid, asked: GridOptions) -> tuple[TactileMap, list[str]]:
 
 _FINEST_MM: Final = 0.5
 """From finer cells with correlated errors the fit took the errors' own grain for lumps, and minutes for it."""
-
-
-def _cells_in_one(spacing_mm: float, cell_mm: float | None) -> int:
-    """How many cells along each axis make one."""
-    if cell_mm is None:
-        return int(CELL_MM / spacing_mm + 1e-6) if spacing_mm < _FINEST_MM * (1 - 1e-6) else 1
-    if cell_mm < spacing_mm * (1 - 1e-6):
-        raise UsageError(f"--cell-mm is {cell_mm:g}, and the grid's cells are {spacing_mm:g} mm; give that or more")
-    return int(cell_mm / spacing_mm + 1e-6)
 
 
 def _averaged(made: TactileMap, times: int) -> TactileMap:
@@ -237,7 +231,12 @@ def _block_centres(axis_mm: FloatArray, times: int) -> FloatArray:
 
 def _divided(made: TactileMap, level: float | str) -> TactileMap:
     """The map divided by its level, which makes it one by gains; a level that was fitted is a finding."""
-    by = _fitted_level(made) if isinstance(level, str) else level
+    if isinstance(level, str):  # of a fit about the highest bump; the median where nothing rises
+        options = SamplerSettings(method="optimise", background="free")
+        fit = estimate_map(made, calibration=None, options=options, rng=np.random.default_rng(1)).fit
+        by = float(np.median(made.mean[made.covered]) if fit is None else fit.bump.level(fit.theta))
+    else:
+        by = level
     if not by > 0:
         raise BadDataError(f"the level is {by:.4g}", way_out="subtract the offset of the readings first")
     unit = made.recipe.units
@@ -253,13 +252,6 @@ def _divided(made: TactileMap, level: float | str) -> TactileMap:
     )
     _check_level(divided.mean[divided.covered], normalise="gain", units="")
     return divided
-
-
-def _fitted_level(made: TactileMap) -> float:
-    """Level of a least-squares fit about the highest bump; the median where nothing rises."""
-    options = SamplerSettings(method="optimise", background="free")
-    fit = estimate_map(made, calibration=None, options=options, rng=np.random.default_rng(1)).fit
-    return float(np.median(made.mean[made.covered]) if fit is None else fit.bump.level(fit.theta))
 
 
 def _spacing(grid: Grid, *, given: float | None) -> tuple[float, list[str]]:
@@ -295,20 +287,17 @@ def _map(arrays: dict[str, np.ndarray[Any, Any]], *, spacing_mm: float, normalis
     count = _count(arrays.get("count"), mean)
     variance = _variance(arrays.get("variance"), count)
     _check_level(mean[count > 0], normalise=normalise, units=units)
+    y_mm, x_mm = ((np.arange(n) - (n - 1) / 2) * spacing_mm for n in mean.shape)
     return TactileMap(
         mean=np.where(count > 0, mean, np.nan),
         variance=variance,
         count=count,
-        x_mm=_centres(mean.shape[1], spacing_mm),
-        y_mm=_centres(mean.shape[0], spacing_mm),
+        x_mm=x_mm,
+        y_mm=y_mm,
         recipe=MapRecipe(source="grid", normalise=normalise, cell_mm=spacing_mm, units=units),
         background=None if normalise == "none" else 1.0,
         frame_count=0,
     )
-
-
-def _centres(n: int, spacing_mm: float) -> FloatArray:
-    return np.asarray((np.arange(n) - (n - 1) / 2) * spacing_mm, dtype=np.float64)
 
 
 def _real(array: np.ndarray[Any, Any], *, name: str) -> FloatArray:

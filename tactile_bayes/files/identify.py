@@ -20,6 +20,7 @@ from tactile_bayes.findings import finding_lines, findings_in
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.pooling import Calibration
 
+_UNITS = {"sigma": "mm", "d": "mm", "amplitude": "1 is the background"}
 _TABLES = (
     "trial.table.json",
     "excision.table.json",
@@ -36,18 +37,14 @@ def describe(path: Path) -> dict[str, Any]:
     if head.startswith(MCAP_MAGIC):
         return summarise_scan(path)
     if head.startswith(HDF5_MAGIC):
-        return _netcdf(path)
+        with open_netcdf(path, way_out="it may be cut short; make it again") as netcdf:
+            group = netcdf.group("posterior")
+            if group is not None and "schema" in group.attributes():
+                return _posterior(group)
+        return _map(path)
     if head.lstrip().startswith((b"{", b"[")):
         return _json(path)
     return _table(path, head)
-
-
-def _netcdf(path: Path) -> dict[str, Any]:
-    with open_netcdf(path, way_out="it may be cut short; make it again") as file:
-        group = file.group("posterior")
-        if group is not None and "schema" in group.attributes():
-            return _posterior(group)
-    return _map(path)
 
 
 def _posterior(group: Group) -> dict[str, Any]:
@@ -162,7 +159,7 @@ def _described(calibration: Calibration, document: dict[str, Any]) -> dict[str, 
             "schema": document["schema"],
             "kind": "size calibration",
             "head": str(calibration.recipe.head),
-            "units": {"sigma": "mm", "d": "mm", "amplitude": "1 is the background"},
+            "units": _UNITS,
             **{name: document[name] for name in kept},
             "variance_taken_away_by_knowing": calibration.unknowns,
             "residual_points": 0 if calibration.residual is None else len(calibration.residual.points),
@@ -170,6 +167,7 @@ def _described(calibration: Calibration, document: dict[str, Any]) -> dict[str, 
             "other_sd": calibration.other_sd,
             "other_source": calibration.spread.other_source,
         }
+    of_axis = ("mean", "domain", "fit", "reference_amplitude")
     return {
         "schema": document["schema"],
         "kind": "size calibration",
@@ -177,12 +175,9 @@ def _described(calibration: Calibration, document: dict[str, Any]) -> dict[str, 
         "axes": document["axes"],
         "recipe": document["recipe"],
         "draws": len(calibration.x.draws),
-        "units": {"sigma": "mm", "d": "mm", "amplitude": "1 is the background"},
+        "units": _UNITS,
         "residual_correlation": document["residual_correlation"],
-        **{
-            axis: {name: document[axis][name] for name in ("mean", "domain", "fit", "reference_amplitude")}
-            for axis in ("x", "y")
-        },
+        **{axis: {name: document[axis][name] for name in of_axis} for axis in ("x", "y")},
         "provenance": document["provenance"],
     }
 

@@ -89,19 +89,17 @@ def _source_of(error: BadDataError, sources: Sequence[Source]) -> str:
 
 def _over(given: Stated, said: Stated) -> Stated:
     """What is stated by the caller, and otherwise by a file."""
-    both = {name: getattr(given, name) for name in names_of(Stated)}
     if given.unit not in (None, said.unit):
         said = replace(said, saturation=None)  # in the file's unit
-    return Stated(**{name: getattr(said, name) if value is None else value for name, value in both.items()})
+    return replace(said, **{name: value for name in names_of(Stated) if (value := getattr(given, name)) is not None})
 
 
 def _overridden(given: Stated, said: Stated) -> list[str]:
     """A line for each thing that the caller states and a file says otherwise."""
-    pairs = {name: (getattr(given, name), getattr(said, name)) for name in names_of(Stated)}
     return [
         f"{name.replace('_', '-')} {ours} as stated, where the file says {theirs}"
-        for name, (ours, theirs) in pairs.items()
-        if None not in (ours, theirs) and ours != theirs
+        for name in names_of(Stated)
+        if None not in (ours := getattr(given, name), theirs := getattr(said, name)) and ours != theirs
     ]
 
 
@@ -111,7 +109,9 @@ def _read(path: Path, given: ArrayMap, beside: Sequence[Source]) -> Source:
     if is_text(path):
         heads = [one.arrays["head_surface_mm"] for one in beside if "head_surface_mm" in one.arrays]
         return read_frames(path, given, shape=heads[-1].shape[:2] if heads else None)
-    _check_names(given)
+    for name in (*given.arrays, *given.values):
+        if name not in KNOWN:
+            raise BadDataError(f"--columns: {name!r} is no array of a scan", way_out=meant(name, KNOWN))
     there: dict[str, str] = {}
 
     def choose(names: Sequence[str]) -> list[str]:
@@ -136,12 +136,6 @@ def of_poses(path: Path, given: Stated) -> Source:
     """Poses of a file of their own: a table, or a sequence metafile."""
     found = read_sequence(path, given, frames=False) if is_sequence(path) else read_poses(path, given)
     return replace(found, path=str(path))
-
-
-def _check_names(given: ArrayMap) -> None:
-    for name in (*given.arrays, *given.values):
-        if name not in KNOWN:
-            raise BadDataError(f"--columns: {name!r} is no array of a scan", way_out=meant(name, KNOWN))
 
 
 def _unknown(held: str, *, grid: bool) -> BadDataError:
@@ -186,10 +180,8 @@ def of_calibration(given: Path | ElementCalibration) -> Source:
 
 def of_landmarks(given: Path | Landmarks) -> Source:
     """Arrays of a scan that are its landmarks: of a JSON file or another scan."""
-    found: Landmarks | None
-    if isinstance(given, Landmarks):
-        found = given
-    else:
+    found: Landmarks | None = given if isinstance(given, Landmarks) else None
+    if isinstance(given, Path):
         found = read_scan(given).landmarks if given.suffix.lower() == ".mcap" else read_landmarks(given)
     if found is None:
         raise BadDataError("holds no landmarks", way_out="give another scan, or a JSON file", path=str(given))
@@ -222,7 +214,9 @@ def combined(sources: Sequence[Source], given: Stated) -> Imported:
     elif stated.saturation is not None:
         held["saturation_count"] = np.asarray(int(np.ceil(stated.saturation)))
     held = {name: _squeezed(held[name], LAYOUT[name].shape) for name in LAYOUT if name in held}
-    _spread(held)
+    for name in ("gain_kpa_per_count", "offset_kpa"):
+        if name in held and held[name].size == 1 and held.get("counts", np.empty(0)).ndim == 3:
+            held[name] = np.full(held["counts"].shape[1:], float(held[name].item()))  # one for all taxels
     _refuse_missing(held)
     _check_shapes(held)
     _check_counts(held)
@@ -246,13 +240,6 @@ def _squeezed(array: np.ndarray[Any, Any], want: Shape) -> np.ndarray[Any, Any]:
     if array.ndim > len(want) and (len(want) < 2) and array.size == max(array.shape, default=1):
         return array.reshape(-1) if want else array.reshape(())
     return array
-
-
-def _spread(held: Arrays) -> None:
-    """One gain or offset for all taxels."""
-    for name in ("gain_kpa_per_count", "offset_kpa"):
-        if name in held and held[name].size == 1 and held.get("counts", np.empty(0)).ndim == 3:
-            held[name] = np.full(held["counts"].shape[1:], float(held[name].item()))
 
 
 def _poses(held: Arrays, stated: Stated, told: list[str]) -> None:
@@ -409,14 +396,10 @@ def _check_shapes(arrays: Arrays) -> None:
             length = letter if isinstance(letter, int) else lengths.setdefault(letter, (have, name))[0]
             fits = fits and length == have
         if not fits:
-            raise BadDataError(f"{name} has shape {array.shape}", way_out=f"it must be {_spoken(want, lengths)}")
-
-
-def _spoken(want: Shape, lengths: Mapping[str, tuple[int, str]]) -> str:
-    letters = [item for item in want if isinstance(item, str) and item in lengths]
-    known = [f"{letter} = {lengths[letter][0]} as in {lengths[letter][1]}" for letter in letters]
-    shape = "(" + ", ".join(map(str, want)) + ("," if len(want) == 1 else "") + ")"
-    return shape + (f" with {', '.join(known)}" if known else "")
+            known = [f"{one} = {lengths[one][0]} as in {lengths[one][1]}" for one in want if one in lengths]
+            shape = "(" + ", ".join(map(str, want)) + ("," if len(want) == 1 else "") + ")"
+            way_out = f"it must be {shape}" + (f" with {', '.join(known)}" if known else "")
+            raise BadDataError(f"{name} has shape {array.shape}", way_out=way_out)
 
 
 def _check_numbers(arrays: Arrays) -> None:

@@ -90,7 +90,9 @@ def write_map(path: Path, tactile_map: TactileMap, *, provenance: Provenance, fo
 
 
 def _variables(tactile_map: TactileMap) -> dict[str, Variable]:
-    units = _units(tactile_map)
+    unit = tactile_map.recipe.value_unit  # empty where unknown
+    square = unit if unit in ("", "1") else f"{unit}2" if unit.isalpha() else f"({unit})2"
+    units = {"mean": unit, "variance": square}
     variables = {}
     for field, (kind, dimensions, attributes) in _FIELDS.items():
         more = {"units": units[field]} if units.get(field) else {}
@@ -138,12 +140,6 @@ def read_map_and_header(path: Path) -> tuple[TactileMap, MapHeader]:
             findings=tuple(one.finding for one in header.findings),
         )
         return tactile_map, header
-
-
-def _units(tactile_map: TactileMap) -> dict[str, str]:
-    """Units of the fields whose unit depends on the recipe; empty where unknown."""
-    unit = tactile_map.recipe.value_unit
-    return {"mean": unit, "variance": unit if unit in ("", "1") else f"{unit}2" if unit.isalpha() else f"({unit})2"}
 
 
 def _attributes(tactile_map: TactileMap, provenance: Provenance) -> dict[str, str]:

@@ -98,7 +98,9 @@ def grouped_netcdf_bytes(groups: Mapping[str, Contents]) -> bytes:
             written += len(scales)
             for name, variable in contents.variables.items():
                 if name not in scales:
-                    _write_variable(place, name, variable, scales)
+                    array = _write_values(place, name, variable)
+                    for axis, dimension in enumerate(variable.dimensions):
+                        array.dims[axis].attach_scale(scales[dimension])
         file.flush()
         image: bytes = file.id.get_file_image()
     return image
@@ -121,12 +123,6 @@ def _write_dimensions(place: Any, variables: Mapping[str, Variable], *, first: i
         scale.attrs["_Netcdf4Dimid"] = np.int32(number)
         scales[name] = scale
     return scales
-
-
-def _write_variable(place: Any, name: str, variable: Variable, scales: Mapping[str, Any]) -> None:
-    written = _write_values(place, name, variable)
-    for axis, dimension in enumerate(variable.dimensions):
-        written.dims[axis].attach_scale(scales[dimension])
 
 
 def _write_values(place: Any, name: str, variable: Variable) -> Any:

@@ -62,7 +62,13 @@ def choose_npz(path: Path, choose: Callable[[Sequence[str]], Iterable[str]]) -> 
             unpacked = sum(member.file_size for member in wanted.values())
             most = unpacked_limit(os.fstat(stream.fileno()).st_size)
             check_limit(unpacked, most, what="its arrays unpack to {} bytes")
-            return {name: _member(archive, member, name) for name, member in wanted.items()}
+            arrays = {}
+            for name, member in wanted.items():
+                if member.flag_bits & _ENCRYPTED:
+                    raise BadDataError(f"{name} is encrypted", way_out="save the file without a password")
+                with archive.open(member) as packed:
+                    arrays[name] = _array(packed, member.file_size, name)
+            return arrays
 
 
 def load_npy(path: Path) -> Arrays:
@@ -83,13 +89,6 @@ def _check_zip(stream: IO[bytes]) -> None:
     if start == np.lib.format.MAGIC_PREFIX:
         raise BadDataError("is a single .npy array", way_out="save all arrays in one file with numpy.savez_compressed")
     raise BadDataError(f"is not an .npz file (it starts with {start!r})", way_out="save it with numpy.savez_compressed")
-
-
-def _member(archive: zipfile.ZipFile, member: zipfile.ZipInfo, name: str) -> np.ndarray[Any, np.dtype[Any]]:
-    if member.flag_bits & _ENCRYPTED:
-        raise BadDataError(f"{name} is encrypted", way_out="save the file without a password")
-    with archive.open(member) as stream:
-        return _array(stream, member.file_size, name)
 
 
 def _array(stream: IO[bytes], length: int, name: str) -> np.ndarray[Any, np.dtype[Any]]:
@@ -126,23 +125,20 @@ class CheckpointFile:
         """Read the state; None when there is no file, an error when it is of another map, calibration or setting."""
         if not self.path.exists():
             return None
-        try:
-            found = load_npz(self.path, required=["schema", "key", "sha256", *SHAPES], optional=())
-        except BadDataError as error:
-            raise BadDataError(
-                f"is no checkpoint: {error.what}", way_out="name another file", path=str(self.path)
-            ) from None
-        shaped = all(found[name].ndim == n for name, n in SHAPES.items())
-        if str(found["schema"]) != SCHEMA or not shaped:
-            raise BadDataError(f"is no checkpoint of schema {SCHEMA}", way_out="name another file", path=str(self.path))
-        if str(found["sha256"]) != _digest(found):
-            raise BadDataError("is damaged: its checksum does not match", way_out="remove it", path=str(self.path))
-        if str(found["key"]) != self._bound(key):
-            raise BadDataError(
-                "is a checkpoint of another map, calibration or setting",
-                way_out="give the same map and options (only max_steps may differ), or name another file",
-                path=str(self.path),
-            )
+        with in_file(self.path):
+            try:
+                found = load_npz(self.path, required=["schema", "key", "sha256", *SHAPES], optional=())
+            except BadDataError as error:
+                raise BadDataError(f"is no checkpoint: {error.what}", way_out="name another file") from None
+            shaped = all(found[name].ndim == n for name, n in SHAPES.items())
+            if str(found["schema"]) != SCHEMA or not shaped:
+                raise BadDataError(f"is no checkpoint of schema {SCHEMA}", way_out="name another file")
+            if str(found["sha256"]) != _digest(found):
+                raise BadDataError("is damaged: its checksum does not match", way_out="remove it")
+            if str(found["key"]) != self._bound(key):
+                what = "is a checkpoint of another map, calibration or setting"
+                way_out = "give the same map and options (only max_steps may differ), or name another file"
+                raise BadDataError(what, way_out=way_out)
         return ChainState(**{name: found[name] for name in SHAPES})
 
     def save(self, key: str, state: ChainState) -> None:
@@ -187,11 +183,7 @@ def read_shape(path: Path) -> ShapeDraws:
         arrays = load_npz(path, required=_DRAWS, optional=optional)
         if len({arrays[name].shape for name in _DRAWS}) > 1:
             raise BadDataError("holds draws of several lengths", way_out="estimate the map again")
-        return ShapeDraws(**{name: _value(name, array) for name, array in arrays.items()})
-
-
-def _value(name: str, array: np.ndarray[Any, Any]) -> Any:
-    """An array of draws or labels as it is, a number as a float, a few numbers as a tuple."""
-    if name in (*_DRAWS, "labels"):
-        return array
-    return float(array) if array.ndim == 0 else tuple(array.tolist())
+        values: dict[str, Any] = dict(arrays)
+        for name in set(arrays) - {*_DRAWS, "labels"}:  # a number, or a few
+            values[name] = float(arrays[name]) if arrays[name].ndim == 0 else tuple(arrays[name].tolist())
+        return ShapeDraws(**values)

@@ -277,10 +277,8 @@ def check_address(address: str) -> str:
 
 def version_of(address: str) -> str:
     """Size, time and tag that the store gives of a file's content without reading it."""
-    try:
+    with _of_store(address):
         known = _store(address).info(address)
-    except Exception as error:
-        raise _unreadable(address, error) from None
     named = {key.lower(): known[key] for key in known}
     tag = named.get("etag") or named.get("md5hash") or named.get("content_md5")
     return f"{known.get('size')} {tag} {named.get('lastmodified') or named.get('updated')}"
@@ -289,12 +287,9 @@ def version_of(address: str) -> str:
 def sha256_of(address: str) -> str:
     """Hex digest of a file's bytes, read as a stream; see `version_of` for the errors."""
     digest = hashlib.sha256()
-    try:
-        with _store(address).open(address, "rb") as file:
-            while data := file.read(_READ_BYTES):
-                digest.update(data)
-    except Exception as error:
-        raise _unreadable(address, error) from None
+    with _of_store(address), _store(address).open(address, "rb") as file:
+        while data := file.read(_READ_BYTES):
+            digest.update(data)
     return digest.hexdigest()
 
 
@@ -303,10 +298,8 @@ def fetched(address: str) -> Iterator[Path]:
     """Copy of a file of a store on this computer, for as long as the block lasts; see `version_of` for the errors."""
     with tempfile.TemporaryDirectory(prefix="tactile-bayes-") as folder:
         path = Path(folder) / PurePosixPath(address).name
-        try:
+        with _of_store(address):
             _store(address).get_file(address, str(path))
-        except Exception as error:
-            raise _unreadable(address, error) from None
         yield path
 
 
@@ -321,10 +314,8 @@ def put(path: Path, address: str) -> None:
 def files_below(address: str, *endings: str) -> Iterator[str]:
     """Addresses of all files below a folder that end in one of some ways, sorted; see `version_of` for the errors."""
     scheme = address.split("://", 1)[0]
-    try:
+    with _of_store(address):
         names = sorted(_store(address).find(address))
-    except Exception as error:
-        raise _unreadable(address, error) from None
     for name in names:
         if name.lower().endswith(endings):
             yield f"{scheme}://{name.split('://')[-1]}"
@@ -345,13 +336,21 @@ def _store(address: str) -> Any:
         ) from None
 
 
-def _unreadable(address: str, error: Exception) -> Exception:
-    """A file's own fault where there is none or nobody may read it; otherwise the store's, which spares the exam."""
-    if isinstance(error, UsageError):
-        return error
-    if isinstance(error, (FileNotFoundError, PermissionError, IsADirectoryError)):
-        return BadDataError(f"cannot be read ({_why(error)})", way_out="check address and credentials", path=address)
-    return UsageError(f"{address} cannot be read ({_why(error)}); check network and credentials, then run again")
+@contextlib.contextmanager
+def _of_store(address: str) -> Iterator[None]:
+    """Faults of reading: a file's own where there is none or nobody may read it; otherwise the store's, which spares
+    the exam.
+    """
+    try:
+        yield
+    except UsageError:
+        raise
+    except (FileNotFoundError, PermissionError, IsADirectoryError) as error:
+        way_out = "check address and credentials"
+        raise BadDataError(f"cannot be read ({_why(error)})", way_out=way_out, path=address) from None
+    except Exception as error:
+        way_out = "check network and credentials, then run again"
+        raise UsageError(f"{address} cannot be read ({_why(error)}); {way_out}") from None
 
 
 def _why(error: Exception) -> str:

@@ -62,8 +62,13 @@ def cells_of(path: Path, text: str) -> Cells:
     if not rows:
         return Cells([], [], separator)
     (_, header), *body = rows
-    header, body = _without_blank_columns(header, body)
-    return Cells(header, body, separator, separator != "," and _has_decimal_commas(body))
+    end = len(header)
+    while end and not header[end - 1] and not any(cell for _, cells in body for cell in cells[end - 1 :]):
+        end -= 1
+    if end < len(header):
+        header, body = header[:end], [(line, cells[:end]) for line, cells in body]
+    commas = (cell for _, row in body for cell in map(str.strip, row) if DECIMAL_COMMA.fullmatch(cell))
+    return Cells(header, body, separator, separator != "," and not all(map(may_be_thousands, commas)))
 
 
 def separator_in(text: str) -> str:
@@ -104,24 +109,6 @@ def _rows(path: Path, text: str, separator: str) -> list[tuple[int, list[str]]]:
         way_out = "check the quotes and line ends around it"
         raise BadDataError(f"line {before + 1}: not CSV ({error})", way_out=way_out, path=str(path)) from None
     return rows
-
-
-def _without_blank_columns(
-    header: list[str], body: Sequence[tuple[int, list[str]]]
-) -> tuple[list[str], list[tuple[int, list[str]]]]:
-    """Header and rows without the blank columns that a spreadsheet writes to the right of its table."""
-    end = len(header)
-    while end and not header[end - 1] and not any(cell for _, cells in body for cell in cells[end - 1 :]):
-        end -= 1
-    if end == len(header):
-        return header, list(body)
-    return header[:end], [(line, cells[:end]) for line, cells in body]
-
-
-def _has_decimal_commas(body: Sequence[tuple[int, list[str]]]) -> bool:
-    """True when some cell can be read as a number with a decimal comma alone."""
-    cells = (cell.strip() for _, row in body for cell in row)
-    return any(DECIMAL_COMMA.fullmatch(cell) and not may_be_thousands(cell) for cell in cells)
 
 
 # --- Reading of comma-separated tables under a Table Schema, with each bad cell named in one line.
@@ -212,7 +199,7 @@ class RawTable(Record):
         """Parse a finite number; an error names its cell."""
         try:
             return _parse_number(_with_point(text) if self.decimal_comma else text, {"name": column})
-        except _CellError as refusal:
+        except BadDataError as refusal:
             raise self.error(line, column, refusal.what, way_out=refusal.way_out) from None
 
 
@@ -324,23 +311,15 @@ def _parse_cell(path: Path, line: int, text: str, *, field: Mapping[str, Any], d
         return None
     try:
         if text != text.strip() or not text.isprintable():
-            raise _CellError(f"{_shown(text)} has blanks or unprintable characters around or in it", "remove them")
+            what = f"{_shown(text)} has blanks or unprintable characters around or in it"
+            raise BadDataError(what, way_out="remove them")
         if decimal_comma and field["type"] == "number":
             text = _with_point(text)
         value = _PARSERS[field["type"]](text, field)
         _check_constraints(value, text, field)
-    except _CellError as refusal:
+    except BadDataError as refusal:
         raise _fault(path, line, name, refusal.what, way_out=refusal.way_out) from None
     return value
-
-
-class _CellError(Exception):
-    """Error of a cell whose place is added later."""
-
-    def __init__(self, what: str, way_out: str) -> None:
-        super().__init__(what)
-        self.what = what
-        self.way_out = way_out
 
 
 def _parse_number(text: str, field: Mapping[str, Any]) -> float:
@@ -349,28 +328,29 @@ def _parse_number(text: str, field: Mapping[str, Any]) -> float:
         if math.isfinite(value):
             return value
     if text.lstrip("+-").lower() in _NOT_FINITE or _NUMBER.fullmatch(text):
-        raise _CellError(f"{_shown(text)} is not a finite number", _blank_advice(field))
+        raise BadDataError(f"{_shown(text)} is not a finite number", way_out=_blank_advice(field))
     if DECIMAL_COMMA.fullmatch(text):
         whole, _, rest = text.partition(",")
         if may_be_thousands(text):
             what = f"{_shown(text)} has a comma that may separate thousands or decimals"
-            raise _CellError(what, f"write {whole}{rest} or {whole}.{rest}, whichever is meant")
-        raise _CellError(f"{_shown(text)} has a decimal comma", f"write {whole}.{rest}")
+            raise BadDataError(what, way_out=f"write {whole}{rest} or {whole}.{rest}, whichever is meant")
+        raise BadDataError(f"{_shown(text)} has a decimal comma", way_out=f"write {whole}.{rest}")
     unit = " in mm" if field["name"].endswith("_mm") else ""
-    raise _CellError(f"{_shown(text)} is not a number", f"write digits only{unit}; {_blank_advice(field)}")
+    raise BadDataError(f"{_shown(text)} is not a number", way_out=f"write digits only{unit}; {_blank_advice(field)}")
 
 
 def _with_point(text: str) -> str:
     """A number of a table with decimal commas, with a point; one that has a point may mean thousands by it."""
     if "." in text:
         what = f"{_shown(text)} has a point, and other numbers have decimal commas"
-        raise _CellError(what, "write all numbers one way")
+        raise BadDataError(what, way_out="write all numbers one way")
     return text.replace(",", ".") if DECIMAL_COMMA.fullmatch(text) else text
 
 
 def _parse_integer(text: str, field: Mapping[str, Any]) -> int:
     if not _INTEGER.fullmatch(text) or len(text) > 15:
-        raise _CellError(f"{_shown(text)} is not a whole number", f"write it as 1, 2, 3; {_blank_advice(field)}")
+        way_out = f"write it as 1, 2, 3; {_blank_advice(field)}"
+        raise BadDataError(f"{_shown(text)} is not a whole number", way_out=way_out)
     return int(text)
 
 
@@ -378,7 +358,8 @@ def _parse_date(text: str, field: Mapping[str, Any]) -> date:
     try:
         return parse_date(text)
     except ValueError:
-        raise _CellError(f"{_shown(text)} is no date", f"write it as 2026-03-01; {_blank_advice(field)}") from None
+        way_out = f"write it as 2026-03-01; {_blank_advice(field)}"
+        raise BadDataError(f"{_shown(text)} is no date", way_out=way_out) from None
 
 
 def parse_date(text: str) -> date:
@@ -392,7 +373,7 @@ def _parse_boolean(text: str, field: Mapping[str, Any]) -> bool:
     for value, words in ((True, field["trueValues"]), (False, field["falseValues"])):
         if text in words:
             return value
-    raise _CellError(f"{_shown(text)} is neither true nor false", "write true or false")
+    raise BadDataError(f"{_shown(text)} is neither true nor false", way_out="write true or false")
 
 
 _PARSERS = {
@@ -413,27 +394,25 @@ _LIMITS: dict[str, tuple[Callable[[Any, Any], bool], str]] = {
 def _check_constraints(value: Any, text: str, field: Mapping[str, Any]) -> None:
     rules = field.get("constraints", {})
     if value == 0 and "exclusiveMinimum" in rules and "ifZero" in field:
-        raise _CellError("is 0", field["ifZero"])
+        raise BadDataError("is 0", way_out=field["ifZero"])
     for rule, (holds, words) in _LIMITS.items():
         if rule in rules and not holds(value, rules[rule]):
-            raise _CellError(f"{_shown(text)} is not {words} {rules[rule]}", f"correct it: {field['description']}")
+            what = f"{_shown(text)} is not {words} {rules[rule]}"
+            raise BadDataError(what, way_out=f"correct it: {field['description']}")
     if "enum" in rules and value not in rules["enum"]:
         near = difflib.get_close_matches(text.lower(), rules["enum"], n=1)
         guess = f"did you mean {near[0]}? " if near else ""
-        raise _CellError(f"{_shown(text)} is not known", f"{guess}it must be {' or '.join(rules['enum'])}")
+        raise BadDataError(f"{_shown(text)} is not known", way_out=f"{guess}it must be {' or '.join(rules['enum'])}")
     if "pattern" in rules and not re.fullmatch(rules["pattern"], text):
-        raise _CellError(f"{_shown(text)} does not match {rules['pattern']}", field["description"])
+        raise BadDataError(f"{_shown(text)} does not match {rules['pattern']}", way_out=field["description"])
 
 
 def _check_primary_key(table: Table, fields: Sequence[str]) -> None:
-    if not fields:
-        return
     first: dict[tuple[Any, ...], int] = {}
     for row, key in enumerate(_keys(table, fields)):
-        if key in first:
+        if first.setdefault(key, row) != row:
             what = f"{_shown_key(key)} stands on line {table.line_numbers[first[key]]} already"
             raise table.error(row, " + ".join(fields), what, way_out="remove one row or correct its key")
-        first[key] = row
 
 
 def _keys(table: Table, fields: Sequence[str]) -> list[tuple[Any, ...]]:
