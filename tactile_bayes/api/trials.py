@@ -172,7 +172,7 @@ def load_trial(trial: Path | Sheet, excision: Path | Sheet, columns: Path | None
     else:
         table = read_wide(trial, columns)
     check_references(table, "trial.table.json", targets={"excision": sizes})
-    filled, posteriors = fill_from_posteriors(table.columns, table.path.parent, fault=table.error)
+    filled, posteriors = fill_from_posteriors(table)
     keys = list(zip(sizes.columns["patient"], sizes.columns["mass"], strict=True))
     readings = readings_from_columns(filled, fault=table.error)
     excised_on = dict(zip(keys, sizes.columns["date"], strict=True))

@@ -16,8 +16,7 @@ from tactile_bayes.errors import CANNOT_SHOW, NO_LUMP, BadDataError, UsageError
 from tactile_bayes.files.atomic import sha256
 from tactile_bayes.files.documents import load_json, parse_json
 from tactile_bayes.files.estimate_json import REPORTS, checked_report
-from tactile_bayes.files.map_nc import read_map_and_scans
-from tactile_bayes.files.netcdf import open_netcdf
+from tactile_bayes.files.map_nc import posterior_attributes, read_map_and_scans
 from tactile_bayes.files.provenance import EXAM_FACTS, scans_of
 from tactile_bayes.files.reading import HDF5_MAGIC, kind_of, open_input, schema_kind
 from tactile_bayes.files.reports import EstimateReport, MassReport, PooledReport, centre_of
@@ -213,9 +212,7 @@ def read_exam(path: Path) -> MapFile | list[EstimateFile]:
     with open_input(path) as file:
         head = file.read(8)
     if head.startswith(HDF5_MAGIC):
-        with open_netcdf(path, way_out=_WAY_OUT) as file:
-            group = file.group("posterior")
-            attributes = None if group is None else group.attributes()
+        attributes = posterior_attributes(path, way_out=_WAY_OUT)
         if attributes is not None:
             if "estimate" not in attributes:
                 what, way_out = "holds draws without their estimate", "write it again with `estimate -o`"

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
 import numpy as np
 
-from tactile_bayes.declarations import Record
+from tactile_bayes.declarations import Record, as_dict, names_of
 from tactile_bayes.errors import BadDataError, in_file
 from tactile_bayes.files.documents import load_json, parse_record
 from tactile_bayes.files.netcdf import open_netcdf
 from tactile_bayes.files.reading import open_input
 from tactile_bayes.files.reports import ESTIMATE, POOLED, AnotherExam, EstimateReport, MassReport, PooledReport
+from tactile_bayes.files.tables import Table
 from tactile_bayes.findings import verdict
 from tactile_bayes.inference.draws import Quantity
 
@@ -48,87 +49,60 @@ def read_stated_size(path: Path, number: int | None = None) -> StatedSize:
     raise BadDataError("is neither JSON nor netCDF", way_out=way_out, path=str(path))
 
 
-def fill_from_posteriors(
-    columns: Mapping[str, list[Any]], folder: Path, *, fault: Callable[..., BadDataError]
-) -> tuple[dict[str, list[Any]], list[Path]]:
-    """Fill sizes and intervals in a trial table from the files in its ``posterior`` column.
+def fill_from_posteriors(table: Table) -> tuple[dict[str, list[Any]], list[Path]]:
+    """Columns of a trial table with sizes and intervals from the files in its ``posterior`` column, and these files.
 
-    `folder`: relative paths start here: the folder of the table. ``batch.json#3`` is the third of a list; `fault`:
-    makes the error for a cell, as `Table.error` does.
-
-    Returns
-    -------
-    New columns, and the files that were read, in order.
+    Relative paths start at the table's folder; ``batch.json#3`` is the third of a list.
     """
-    filled = {name: list(values) for name, values in columns.items()}
-    paths = []
+    filled = {name: list(values) for name, values in table.columns.items()}
+    folder, paths = table.path.parent, []
     for row, name in enumerate(filled.get("posterior", [])):
         if not name:
             continue
-        path, number = _split_number(folder, name)
-        _check_blank(filled, row, fault=fault)
-        stated = read_stated_size(path, number)
-        _check_status(filled["status"][row], stated, row, fault=fault)
-        for column in ("size_mm", "low_mm", "high_mm", "probability"):
-            filled[column][row] = getattr(stated, column)
-        paths.append(path)
+        for column in (*names_of(StatedSize), "sd_mm"):
+            if (value := filled[column][row]) is not None:
+                what, way_out = f"is {value:g} beside a posterior", "leave it blank: the file says it"
+                raise table.error(row, column, what, way_out=way_out)
+        stem, mark, number = name.rpartition("#")
+        if not (mark and number.isascii() and number.isdigit() and len(number) < 10) or (folder / name).exists():
+            stem, number = name, ""
+        stated = read_stated_size(folder / stem, int(number) if number else None)
+        _check_status(table, row, stated)
+        for column, value in as_dict(stated).items():
+            filled[column][row] = value
+        paths.append(folder / stem)
     return filled, list(dict.fromkeys(paths))
 
 
-def _split_number(folder: Path, name: str) -> tuple[Path, int | None]:
-    """Split a cell that ends in #NUMBER into the file and the number of the estimate in it."""
-    stem, mark, number = name.rpartition("#")
-    if mark and number.isascii() and number.isdigit() and len(number) < 10 and not (folder / name).exists():
-        return folder / stem, int(number)
-    return folder / name, None
-
-
-def _check_blank(columns: Mapping[str, list[Any]], row: int, *, fault: Callable[..., BadDataError]) -> None:
-    for column in ("size_mm", "low_mm", "high_mm", "probability", "sd_mm"):
-        if columns[column][row] is not None:
-            raise fault(
-                row,
-                column,
-                f"is {columns[column][row]:g} beside a posterior",
-                way_out="leave it blank: the file says it",
-            )
-
-
-def _check_status(status: str | None, stated: StatedSize, row: int, *, fault: Callable[..., BadDataError]) -> None:
-    if status == "detected" and stated.size_mm is None:
-        way_out = "give status not_detected, or not_done"
-        raise fault(row, "posterior", "names an estimate without a size while status is detected", way_out=way_out)
-    if status is None and stated.size_mm is None:
+def _check_status(table: Table, row: int, stated: StatedSize) -> None:
+    status, sized = table.columns["status"][row], stated.size_mm is not None
+    if status == "detected" and not sized:
+        what = "names an estimate without a size while status is detected"
+        raise table.error(row, "posterior", what, way_out="give status not_detected, or not_done")
+    if status is None and not sized:
         what = "is blank beside a posterior that names an estimate without a size"
-        raise fault(row, "status", what, way_out="give status not_detected (the mass was looked for), or not_done")
-    if status != "detected" and stated.size_mm is not None:
-        way_out = "give status detected, or leave posterior blank"
-        raise fault(
-            row, "posterior", f"names an estimate with a size while status is {status or 'blank'}", way_out=way_out
-        )
+        way_out = "give status not_detected (the mass was looked for), or not_done"
+        raise table.error(row, "status", what, way_out=way_out)
+    if status != "detected" and sized:
+        what = f"names an estimate with a size while status is {status or 'blank'}"
+        raise table.error(row, "posterior", what, way_out="give status detected, or leave posterior blank")
 
 
 def _from_json(path: Path, number: int | None) -> StatedSize:
     document = load_json(path, way_out="give `estimate --json`")
     if isinstance(document, list):
-        document = document[_index(path, len(document), number)]
+        number = 1 if number is None and len(document) == 1 else number
+        if number is None or not 1 <= number <= len(document):
+            wanted = "" if number is None else f" and none with the number {number}"
+            way_out = f"name one as {path.name}#1 to {path.name}#{len(document)}, in the order of the maps"
+            raise BadDataError(f"holds {len(document)} estimates{wanted}", way_out=way_out, path=str(path))
+        document = document[number - 1]
     elif number is not None:
         raise BadDataError("holds one estimate, no list", way_out=f"leave out #{number}", path=str(path))
     pooled = isinstance(document, dict) and str(document.get("schema", "")).startswith("tactile-bayes/pooled/")
     kind: type[EstimateReport | PooledReport] = PooledReport if pooled else EstimateReport
     size = parse_record(document, kind, path=path).max_size_mm
     return StatedSize() if size is None else StatedSize(size.median, size.low, size.high, size.probability)
-
-
-def _index(path: Path, length: int, number: int | None) -> int:
-    """Index of the wanted estimate in a list of estimates."""
-    if number is None and length == 1:
-        return 0
-    if number is None or not 1 <= number <= length:
-        wanted = "" if number is None else f" and none with the number {number}"
-        way_out = f"name one as {path.name}#1 to {path.name}#{length}, in the order of the maps"
-        raise BadDataError(f"holds {length} estimates{wanted}", way_out=way_out, path=str(path))
-    return number - 1
 
 
 def _from_netcdf(path: Path) -> StatedSize:
@@ -159,7 +133,12 @@ def checked_report(document: object, kind: type[R], *, path: Path) -> R:
     report = parse_record(document, kind, path=path)
     with in_file(path):
         _check_sizes(report)
-        _check_verdict(report)
+        if isinstance(report, EstimateReport):
+            _check_masses(report)
+        made = verdict(report.findings, answered=report.max_size_mm is not None)
+        if report.verdict != made:
+            what = f"verdict is {report.verdict!r}, and its findings make it {made!r}"
+            raise BadDataError(what, way_out=_WAY_OUT)
     return report
 
 
@@ -176,22 +155,14 @@ def _check_sizes(report: EstimateReport | PooledReport) -> None:
         if largest is not None and smallest is not None and smallest.median > largest.median:
             what = f"{where}min_size_mm is {smallest.median:g} mm and max_size_mm {largest.median:g} mm"
             raise BadDataError(what, way_out=_WAY_OUT)
-    if isinstance(report, EstimateReport):
-        _check_masses(report)
-
-
-def _check_verdict(report: EstimateReport | PooledReport) -> None:
-    made = verdict(report.findings, answered=report.max_size_mm is not None)
-    if report.verdict != made:
-        what = f"verdict is {report.verdict!r}, and its findings make it {made!r}"
-        raise BadDataError(what, way_out=_WAY_OUT)
 
 
 def _holders(report: EstimateReport | PooledReport) -> Iterator[tuple[str, Holder]]:
     """Whatever holds sizes, with its place in the document."""
-    listed = report.masses if isinstance(report, EstimateReport) else ()
     found: list[tuple[str, EstimateReport | PooledReport | MassReport]] = [("", report)]
-    for where, one in [*found, *((f"masses[{i}].", mass) for i, mass in enumerate(listed))]:
+    if isinstance(report, EstimateReport):
+        found += [(f"masses[{i}].", mass) for i, mass in enumerate(report.masses)]
+    for where, one in found:
         yield where, one
         if one.another_exam is not None:
             yield f"{where}another_exam.", one.another_exam

@@ -34,9 +34,7 @@ from tactile_bayes.size.draws import SizePosterior
 SCHEMA: Final = "tactile-bayes/map/2"
 _WAY_OUT = "give a map this program wrote, or make it again with `tactile-bayes map`"
 
-_VARIABLES = {"y_mm": "y", "x_mm": "x"}
-"""Variables that are called otherwise than their field of the map."""
-# field of the map -> (type, dimensions, attributes); the attributes are for other programs.
+# field of the map, whose variable has no _mm -> (type, dimensions, attributes for other programs)
 _FIELDS: dict[str, tuple[str, tuple[str, ...], dict[str, str]]] = {
     "y_mm": ("f8", ("y",), {"units": "mm", "axis": "Y", "long_name": "cell centres along the head"}),
     "x_mm": ("f8", ("x",), {"units": "mm", "axis": "X", "long_name": "cell centres across the head"}),
@@ -56,7 +54,6 @@ _FIELDS: dict[str, tuple[str, tuple[str, ...], dict[str, str]]] = {
         {"units": "1", "long_name": "readings in the cell", "standard_name": "number_of_observations"},
     ),
 }
-_MAY_BE_MISSING = ("mean", "variance")  # NaN is no value there
 # Units of pressure, force and voltage that UDUNITS reads; what else a user calls a grid's values is not checked.
 _CF_UNITS = ("1", "Pa", "hPa", "kPa", "MPa", "bar", "mbar", "psi", "mmHg", "N", "mN", "V", "mV")
 _TRANSFORMS = {
@@ -84,7 +81,7 @@ def write_map(path: Path, tactile_map: TactileMap, *, provenance: Provenance, fo
     """Write a map atomically, readable by its owner only; `provenance` holds no clock time, so equal maps give equal
     bytes.
     """
-    _check_lattice({"x_mm": tactile_map.x_mm, "y_mm": tactile_map.y_mm}, tactile_map.recipe.cell_mm)
+    _check_lattice(tactile_map.x_mm, tactile_map.y_mm, tactile_map.recipe.cell_mm)
     groups = {"/": Contents(_variables(tactile_map), _attributes(tactile_map, provenance))}
     write_bytes(path, grouped_netcdf_bytes(groups), force=force)
 
@@ -97,8 +94,8 @@ def _variables(tactile_map: TactileMap) -> dict[str, Variable]:
     for field, (kind, dimensions, attributes) in _FIELDS.items():
         more = {"units": units[field]} if units.get(field) else {}
         values = np.asarray(getattr(tactile_map, field), kind)
-        fill = np.nan if field in _MAY_BE_MISSING else None
-        variables[_VARIABLES.get(field, field)] = Variable(values, dimensions, more | attributes, fill)
+        fill = np.nan if field in units else None
+        variables[field.removesuffix("_mm")] = Variable(values, dimensions, more | attributes, fill)
     for name, meaning in _TRANSFORMS.items():
         transform = getattr(tactile_map, name)
         if transform is not None:
@@ -123,10 +120,14 @@ def read_map_and_header(path: Path) -> tuple[TactileMap, MapHeader]:
     with open_netcdf(path, way_out=_WAY_OUT) as file:
         header = _header(file)
         check_limit(_dimension(file, "y") * _dimension(file, "x"), CELLS, what="it has {} cells")
-        names = {field: _VARIABLES.get(field, field) for field in _FIELDS}
-        arrays = {field: _read_variable(file, name, field=field) for field, name in names.items()}
+        arrays = {}
+        for field, (kind, dimensions, _) in _FIELDS.items():
+            name = field.removesuffix("_mm")
+            arrays[field] = file.array(name, kind=kind, dimensions=dimensions)
+            if arrays[field] is None:
+                raise BadDataError(f"variable {name} is missing", way_out=_WAY_OUT)
         transforms = {name: _read_transform(file, name) for name in _TRANSFORMS}
-        _check_lattice({names[field]: arrays[field] for field in ("x_mm", "y_mm")}, header.recipe.cell_mm)
+        _check_lattice(arrays["x_mm"], arrays["y_mm"], header.recipe.cell_mm)
         tactile_map = TactileMap(
             **arrays,
             **transforms,
@@ -189,35 +190,24 @@ def _dimension(file: Group, name: str) -> int:
     return length
 
 
-def _read_variable(file: Group, name: str, *, field: str) -> Any:
-    kind, dimensions, _ = _FIELDS[field]
-    values = file.array(name, kind=kind, dimensions=dimensions)
-    if values is None:
-        raise BadDataError(f"variable {name} is missing", way_out=_WAY_OUT)
-    return values
-
-
 def _read_transform(file: Group, name: str) -> Any:
     transform = file.array(name, kind="f8", dimensions=("row", "column"))
-    if transform is None:
-        return None
-    if transform.shape != (4, 4):
+    if transform is not None and transform.shape != (4, 4):
         raise BadDataError(f"variable {name} is not 4 by 4", way_out=_WAY_OUT)
-    check_rigid(transform, name=name)
+    if transform is not None:
+        check_rigid(transform, name=name)
     return transform
 
 
-def _check_lattice(axes: Mapping[str, Any], cell_mm: float) -> None:
+def _check_lattice(x_mm: FloatArray, y_mm: FloatArray, cell_mm: float) -> None:
     """Raise `BadDataError` unless both axes are finite and step by one cell."""
-    for name, axis in axes.items():
+    for name, axis in (("x", x_mm), ("y", y_mm)):
         if not np.isfinite(axis).all():
             raise BadDataError(f"variable {name} holds values that are not finite", way_out=_WAY_OUT)
         steps = np.diff(axis)
         if len(steps) and float(np.abs(steps - cell_mm).max()) > 1e-6 * max(cell_mm, float(np.abs(axis).max())):
-            raise BadDataError(
-                f"variable {name} steps by {steps.min():g} to {steps.max():g} mm, not by the cell of {cell_mm:g} mm",
-                way_out=_WAY_OUT,
-            )
+            what = f"variable {name} steps by {steps.min():g} to {steps.max():g} mm, not by the cell of {cell_mm:g} mm"
+            raise BadDataError(what, way_out=_WAY_OUT)
 
 
 # --- Posteriors as netCDF that arviz opens: every draw of a map's parameters and of the sizes, and what goes with them.
@@ -333,9 +323,7 @@ def read_estimate(path: Path) -> EstimateReport:
     """The estimate's report, as ``estimate --json`` prints it, from its posterior's file. A pooled posterior has none
     and is refused.
     """
-    with open_netcdf(path, way_out="give what `estimate` wrote with -o") as file:
-        group = file.group("posterior")
-        attributes = {} if group is None else group.attributes()
+    attributes = posterior_attributes(path, way_out="give what `estimate` wrote with -o") or {}
     if attributes.get("method") == "pooled":
         raise BadDataError("holds a size pooled from several maps", way_out="give the maps", path=str(path))
     if "estimate" not in attributes:
@@ -346,5 +334,11 @@ def read_estimate(path: Path) -> EstimateReport:
 
 def is_posterior(path: Path) -> bool:
     """True when a netCDF file holds a posterior, of this program or another, and no map."""
-    with open_netcdf(path, way_out="give a map, or what `estimate` wrote with -o") as file:
-        return file.group("posterior") is not None
+    return posterior_attributes(path, way_out="give a map, or what `estimate` wrote with -o") is not None
+
+
+def posterior_attributes(path: Path, *, way_out: str) -> dict[str, str] | None:
+    """Attributes of the posterior in a netCDF file; None where it holds none."""
+    with open_netcdf(path, way_out=way_out) as file:
+        group = file.group("posterior")
+        return None if group is None else group.attributes()

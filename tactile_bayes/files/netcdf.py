@@ -155,10 +155,12 @@ class Group:
 
     def attributes(self) -> dict[str, str]:
         """Text attributes by name."""
-        held = {str(name): _text(self._place.attrs[name]) for name in self._place.attrs}
-        texts = {name: text for name, text in held.items() if text is not None}
-        for name, text in texts.items():
-            check_text(f"attribute {name}", text, way_out=self._way_out)
+        texts = {}
+        for name, value in self._place.attrs.items():
+            one = value.item() if isinstance(value, np.ndarray) and value.size == 1 else value  # a list of one
+            if isinstance(one, bytes | str):  # of fixed or variable length
+                texts[str(name)] = text = one.decode("utf-8") if isinstance(one, bytes) else one
+                check_text(f"attribute {name}", text, way_out=self._way_out)
         return texts
 
     def dimension(self, name: str) -> int | None:
@@ -182,7 +184,7 @@ class Group:
         found = self._dataset(name)
         if found is None or _is_bare(found):
             return None
-        if found.dtype != np.dtype(kind) and found.dtype != np.dtype(kind).newbyteorder():
+        if found.dtype.newbyteorder("=") != np.dtype(kind):
             raise BadDataError(f"variable {name} is {found.dtype}, not {np.dtype(kind)}", way_out=self._way_out)
         has = _dimensions(found)
         if has != dimensions:
@@ -275,15 +277,6 @@ def as_declared(values: Any, attributes: Mapping[str, Any]) -> Any:
     if not missing.any() and (scale, offset) == (1, 0):
         return values
     return np.where(missing, np.nan, values * scale + offset)
-
-
-def _text(value: Any) -> str | None:
-    """Text of an attribute of fixed or variable length, single or in a list of one; else None."""
-    if isinstance(value, np.ndarray) and value.size == 1:
-        value = value.item()
-    if isinstance(value, bytes):
-        return value.decode("utf-8")
-    return str(value) if isinstance(value, str) else None
 
 
 def _is_bare(dataset: Any) -> bool:

@@ -126,12 +126,12 @@ def write_size_calibration(
     With a site's correction the whole calibration that it corrects, `base`, is kept in the file.
     """
     if isinstance(calibration, SizeCalibration):
-        header, body = ("tactile-bayes/size-calibration/1", "eq6"), _eq6_document(calibration)
+        schema, form, body = "size-calibration/1", "eq6", _eq6_document(calibration)
     elif calibration.site is None:
-        header, body = ("tactile-bayes/size-calibration/4", "population"), _population_document(calibration)
+        schema, form, body = "size-calibration/4", "population", _population_document(calibration)
     else:
-        header, body = ("tactile-bayes/site-calibration/1", "site"), {"site": to_plain(calibration.site), "base": base}
-    document = {"schema": header[0], "research_use": RESEARCH_USE, "form": header[1], **body}
+        schema, form, body = "site-calibration/1", "site", {"site": to_plain(calibration.site), "base": base}
+    document = {"schema": f"tactile-bayes/{schema}", "research_use": RESEARCH_USE, "form": form, **body}
     document |= {"provenance": provenance.as_dict()}
     parse_size_calibration(document, path=path)
     write_text(path, dump_json(document), force=force)
