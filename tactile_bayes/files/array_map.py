@@ -32,7 +32,9 @@ def read_array_map(path: Path) -> ArrayMap:
 def array_template(path: Path | None) -> str:
     """TOML for `read_array_map` to fill in: of a file, with its arrays and those that their shapes tell."""
     shapes = {} if path is None else {name: one.shape for name, one in read_named(path, list).items()}
-    return "\n".join([_HEADING.format(path=path or "a file"), *_held(shapes), *_arrays(shapes), _VALUES])
+    held = [f"#   {name}: {' x '.join(map(str, shape)) or 'one value'}" for name, shape in shapes.items()]
+    told = ["# The file has:", *held, ""] if held else []
+    return "\n".join([_HEADING.format(path=path or "a file"), *told, *_arrays(shapes), _VALUES])
 
 
 _PLAIN: Final[Mapping[str, tuple[str, ...]]] = {
@@ -53,14 +55,8 @@ _BESIDE: Final = {"frame_time_s": ("counts", "frames"), "pose_time_s": ("positio
 def plain_names(
     names: Sequence[str], known: Mapping[str, str], values: Mapping[str, Any] | None = None
 ) -> dict[str, str]:
-    """Names in a file that are plain words for arrays which it has under no other name, by the names here.
-
-    Parameters
-    ----------
-    known
-        Names in the file of arrays that are known already, by the names here.
-    values
-        Arrays that are given elsewhere.
+    """Names in a file that are plain words for arrays which are neither `known` in it nor `values` given elsewhere, by
+    the names here.
     """
     found: dict[str, str] = {}
     for here, words in _PLAIN.items():
@@ -78,13 +74,6 @@ def plain_names(
         if len(alike) == 1:
             found[here] = alike[0]
     return found
-
-
-def _held(shapes: Mapping[str, Shape]) -> Iterator[str]:
-    if shapes:
-        yield "# The file has:"
-        yield from (f"#   {name}: {' x '.join(map(str, shape)) or 'one value'}" for name, shape in shapes.items())
-        yield ""
 
 
 def _arrays(shapes: Mapping[str, Shape]) -> Iterator[str]:

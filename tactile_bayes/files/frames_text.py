@@ -56,13 +56,7 @@ _SAMPLED: Final = 50
 
 
 def read_frames(path: Path, given: Stated, *, shape: tuple[int, int] | None) -> Source:
-    """Read frames and, where the text has them, their times, unit and rate.
-
-    Parameters
-    ----------
-    shape
-        Rows and columns of the head, where it is known.
-    """
+    """Read frames and, where the text has them, times, unit and rate; `shape` is the head's, where it is known."""
     table = _without_words(read_text_table(path, given.decimal))
     shape = given.frame_shape or shape
     if header := next(

@@ -206,9 +206,13 @@ def _averaged(made: TactileMap, times: int) -> TactileMap:
     square = _blocks(weight * (np.nan_to_num(made.variance) + np.nan_to_num(made.mean) ** 2), times) / each
     variance = np.maximum(square - mean**2, 0.0) if made.counts_known else np.where(known, 0.0, np.nan)
     count = np.where(known, total if made.counts_known else 1.0, 0.0).astype(np.int64)
-    x_mm, y_mm = (_block_centres(axis, times) for axis in (made.x_mm, made.y_mm))
+    axes = {"x_mm": made.x_mm, "y_mm": made.y_mm}
+    for name, axis in axes.items():
+        step = float(axis[1] - axis[0]) if len(axis) > 1 else 0.0
+        first = float(axis[0]) + (times - 1) / 2 * step
+        axes[name] = np.asarray(first + times * step * np.arange(-(-len(axis) // times)), dtype=np.float64)
     recipe = replace(made.recipe, cell_mm=times * made.recipe.cell_mm)
-    return replace(made, mean=mean, variance=variance, count=count, x_mm=x_mm, y_mm=y_mm, recipe=recipe)
+    return replace(made, mean=mean, variance=variance, count=count, recipe=recipe, **axes)
 
 
 def _blocks(values: FloatArray, times: int) -> FloatArray:
@@ -218,12 +222,6 @@ def _blocks(values: FloatArray, times: int) -> FloatArray:
     padded[: values.shape[0], : values.shape[1]] = values
     summed: FloatArray = padded.reshape(ny, times, nx, times).sum(axis=(1, 3))
     return summed
-
-
-def _block_centres(axis_mm: FloatArray, times: int) -> FloatArray:
-    step = float(axis_mm[1] - axis_mm[0]) if len(axis_mm) > 1 else 0.0
-    first = float(axis_mm[0]) + (times - 1) / 2 * step
-    return np.asarray(first + times * step * np.arange(-(-len(axis_mm) // times)), dtype=np.float64)
 
 
 # --- Values that are divided by their level here: by a number that is stated, or by what is fitted about the bump.

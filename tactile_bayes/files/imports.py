@@ -59,18 +59,7 @@ def read_arrays(path: Path) -> Scan:
 
 
 def import_arrays(path: Path, given: ArrayMap | None = None, beside: Sequence[Source] = ()) -> Imported:
-    """Read a scan from a file of arrays, and from what stands beside it.
-
-    Parameters
-    ----------
-    given
-        What the file calls its arrays, and what is stated of them.
-
-    Raises
-    ------
-    BadDataError
-        Naming the file, the array, its value and the way out.
-    """
+    """Read a scan from a file of arrays, and from what stands beside it; errors name the file and the array."""
     given = given or ArrayMap()
     with in_file(path):
         own = replace(_read(path, given, beside), path=str(path))

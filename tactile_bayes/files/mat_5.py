@@ -80,7 +80,12 @@ def _arrays(matrix: bytes, order: str, name: str, levels: int) -> Iterator[tuple
     own = next(elements)[1].decode("ascii")
     name = name or own
     if kind == _STRUCT and math.prod(shape) == 1 and levels:
-        yield from _fields(elements, order, name, levels)
+        width = int(_numbers(next(elements), order)[0])
+        texts = next(elements)[1]
+        names = [texts[i : i + width].split(b"\0")[0].decode("ascii") for i in range(0, len(texts), max(width, 1))]
+        for field, (of_field, content) in zip(names, elements, strict=False):
+            if of_field == _MATRIX and content:
+                yield from _arrays(content, order, f"{name}.{field}", levels - 1)
     elif kind in _NUMERIC and not flags & _COMPLEX:
         values = _numbers(next(elements), order)
         if min(shape, default=0) < 0 or math.prod(shape) != len(values):
@@ -88,15 +93,6 @@ def _arrays(matrix: bytes, order: str, name: str, levels: int) -> Iterator[tuple
         yield name, values.reshape(shape, order="F")
     elif name:
         yield name, _NO_NUMBERS
-
-
-def _fields(elements: Iterator[Element], order: str, name: str, levels: int) -> Iterator[tuple[str, np.ndarray]]:
-    width = int(_numbers(next(elements), order)[0])
-    texts = next(elements)[1]
-    names = [texts[i : i + width].split(b"\0")[0].decode("ascii") for i in range(0, len(texts), max(width, 1))]
-    for field, (kind, content) in zip(names, elements, strict=False):
-        if kind == _MATRIX and content:
-            yield from _arrays(content, order, f"{name}.{field}", levels - 1)
 
 
 def _numbers(element: Element, order: str) -> np.ndarray:

@@ -41,6 +41,7 @@ Choose = Callable[[Sequence[str]], Iterable[str]]
 """Takes the names in a file and returns those to read."""
 ARRAY_SUFFIXES: Final = (".npz", ".npy", ".mat", ".h5", ".hdf5")
 _MAT_73: Final = b"MATLAB 7.3 MAT-file"
+_KNOWN: Final = (ZIP_MAGIC[:2], np.lib.format.MAGIC_PREFIX, MAT_5, _MAT_73, HDF5_MAGIC, MCAP_MAGIC, b"CDF")
 _USER_BLOCK: Final = 512  # bytes before the HDF5 file in a .mat of version 7.3
 _COPY_AGAIN: Final = "copy the file again"
 _MOST_LEVELS: Final = 8
@@ -51,34 +52,29 @@ def read_named(path: Path, choose: Choose) -> Arrays:
 
     Fields of a structure and members of a group are called ``exam.frames``. Arrays of a .mat have the axes that they
     have in MATLAB.
-
-    Raises
-    ------
-    BadDataError
-        For a file of another kind, a damaged one, one that unpacks to more than its limit, and objects.
     """
     start = _start(path)
     with in_file(path):
         if start.startswith(ZIP_MAGIC[:2]):
             return choose_npz(path, choose)
         if start.startswith(np.lib.format.MAGIC_PREFIX):
-            return _chosen(load_npy(path), choose)
-        if start.startswith(MAT_5):
-            return _chosen(load_mat_5(path), choose)
-        if start.startswith(_MAT_73):
+            arrays = load_npy(path)
+        elif start.startswith(MAT_5):
+            arrays = load_mat_5(path)
+        elif start.startswith(_MAT_73):
             return {name: array.T for name, array in _hdf5(path, choose, begins_at=_USER_BLOCK).items()}
-        if start.startswith(HDF5_MAGIC):
+        elif start.startswith(HDF5_MAGIC):
             return _hdf5(path, choose)
-        if start.startswith(b"CDF"):
-            return _chosen(_netcdf_3(path), choose)
-    raise _of_another_kind(path, start)
+        elif start.startswith(b"CDF"):
+            arrays = _netcdf_3(path)
+        else:
+            raise _of_another_kind(path, start)
+        return {name: arrays[name] for name in choose(list(arrays))}
 
 
 def is_text(path: Path) -> bool:
     """True for a file that is none of arrays by its first bytes and its suffix, and may be a text."""
-    start = _start(path)
-    known = (ZIP_MAGIC[:2], np.lib.format.MAGIC_PREFIX, MAT_5, _MAT_73, HDF5_MAGIC, MCAP_MAGIC, b"CDF")
-    return path.suffix.lower() not in ARRAY_SUFFIXES and not start.startswith(known)
+    return path.suffix.lower() not in ARRAY_SUFFIXES and not _start(path).startswith(_KNOWN)
 
 
 def _start(path: Path) -> bytes:
@@ -88,17 +84,11 @@ def _start(path: Path) -> bytes:
 
 def _of_another_kind(path: Path, start: bytes) -> BadDataError:
     if start.startswith(MCAP_MAGIC):
-        return BadDataError("is a scan", way_out="give it as it is", path=str(path))
+        return BadDataError("is a scan", way_out="give it as it is")
     if path.suffix.lower() == ".mat":
-        what, way_out = "is not a .mat of version 5 to 7.3", "save it with save(..., '-v7')"
-    else:
-        what = f"is not an .npz, .npy, .mat or HDF5 file (it starts with {start[:6]!r})"
-        way_out = "save the arrays with numpy.savez_compressed"
-    return BadDataError(what, way_out=way_out, path=str(path))
-
-
-def _chosen(arrays: Arrays, choose: Choose) -> Arrays:
-    return {name: arrays[name] for name in choose(list(arrays))}
+        return BadDataError("is not a .mat of version 5 to 7.3", way_out="save it with save(..., '-v7')")
+    what = f"is not an .npz, .npy, .mat or HDF5 file (it starts with {start[:6]!r})"
+    return BadDataError(what, way_out="save the arrays with numpy.savez_compressed")
 
 
 # --- netCDF-3, by scipy.

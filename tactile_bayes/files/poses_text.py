@@ -60,13 +60,7 @@ _LARGEST_MM: Final = 1e7  # NDI writes -3.697314e28 where a tool is not seen
 
 
 def read_poses(path: Path, given: Stated) -> Source:
-    """Read times, places and rotations; rows in which the tool is not seen are left out and counted.
-
-    Raises
-    ------
-    BadDataError
-        Where it has several tools and none is stated, no times, or columns that are none of a known layout.
-    """
+    """Read times, places and rotations; rows in which the tool is not seen are left out and counted."""
     with in_file(path):
         table = read_text_table(path, given.decimal)
         header = next((line for line in table.lines if is_header_of_poses(line)), None)
@@ -91,14 +85,8 @@ def seen(
 ) -> Source:
     """Poses of the rows in which the tool is seen; the others are counted by their reasons.
 
-    Parameters
-    ----------
-    time
-        (m,) times; in the unit that `stated` has as ``pose_time_unit``.
-    numbers
-        (m, k) places and then rotations in the layout, or (m, 16) matrices.
-    why
-        Why a row has no pose, by its status; empty where it has one.
+    `numbers` are (m, k) places and then rotations in the layout, or (m, 16) matrices; `why` says why a row has no pose,
+    by its status, and is empty where it has one.
     """
     reasons = [reason or _without(row, layout) for reason, row in zip(why, numbers, strict=True)]
     keep = np.array([not reason for reason in reasons], dtype=bool)

@@ -92,15 +92,8 @@ def read_lines(path: Path) -> list[str]:
 def read_text_table(path: Path, decimal: str | None = None) -> TextTable:
     """Read the lines of a text that are not blank; the separator is the one that makes numbers of them.
 
-    Parameters
-    ----------
-    decimal
-        ``"point"`` or ``"comma"`` where it is stated.
-
-    Raises
-    ------
-    BadDataError
-        When it is no text, or has no table of numbers, or commas that may separate thousands or decimals.
+    `decimal` is ``"point"`` or ``"comma"`` where it is stated, without which commas that may separate thousands are
+    refused.
     """
     texts = read_lines(path)
     separator = separator_of(texts)
@@ -109,7 +102,10 @@ def read_text_table(path: Path, decimal: str | None = None) -> TextTable:
     lines, before = [], 0
     for i, one in enumerate(texts, start=1):
         if one.strip():
-            lines.append(Line(i, one, _without_end(fields_of(one, separator)), after_blank=i > before + 1))
+            fields = fields_of(one, separator)
+            while len(fields) > 1 and not fields[-1]:
+                fields.pop()
+            lines.append(Line(i, one, fields, after_blank=i > before + 1))
             before = i
     commas = with_comma(line.fields for line in lines)
     if decimal is None:
@@ -120,23 +116,17 @@ def read_text_table(path: Path, decimal: str | None = None) -> TextTable:
 def separator_of(texts: Sequence[str], marks: Sequence[str] = ()) -> str:
     """The separator that makes most numbers of lines and least else; empty where none makes two of any.
 
-    Parameters
-    ----------
-    marks
-        Words for no value, beside those that are known.
+    `marks` are words for no value, beside those that are known.
     """
     filled = [one for one in texts if one.strip()]
     sample = filled[:: max(1, len(filled) // _SAMPLED)]
-    made = {separator: _made_by(separator, sample, marks) for separator in _SEPARATORS}
+    made = {}  # numbers, and other fields as a negative number, in the lines that it makes lines of a table
+    for separator in _SEPARATORS:
+        rows = [row for text in sample if _of_numbers(row := fields_of(text, separator), marks)]
+        numbers = sum(_is_number(field, marks) for row in rows for field in row)
+        made[separator] = numbers, numbers - sum(map(len, rows))
     best = max(made, key=lambda one: made[one])
     return best if made[best][0] else ""
-
-
-def _made_by(separator: str, texts: Sequence[str], marks: Sequence[str]) -> tuple[int, int]:
-    """Numbers, and other fields as a negative number, in the lines that a separator makes lines of a table."""
-    rows = [row for text in texts if _of_numbers(row := fields_of(text, separator), marks)]
-    numbers = sum(_is_number(field, marks) for row in rows for field in row)
-    return numbers, numbers - sum(map(len, rows))
 
 
 def _of_numbers(fields: Sequence[str], marks: Sequence[str]) -> bool:
@@ -157,13 +147,6 @@ def fields_of(text: str, separator: str) -> list[str]:
     text = " ".join(text.split()) if separator == " " else text
     with decoding("is not a table of text", way_out="give a table of numbers, such as .csv"):
         return [one.strip() for one in next(csv.reader([text], delimiter=separator, skipinitialspace=True), [])]
-
-
-def _without_end(fields: list[str]) -> list[str]:
-    """Fields without the empty ones behind the last."""
-    while len(fields) > 1 and not fields[-1]:
-        fields.pop()
-    return fields
 
 
 def with_comma(rows: Iterable[Sequence[str]], marks: Sequence[str] = ()) -> list[str]:
