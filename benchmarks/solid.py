@@ -17,11 +17,12 @@ from typing import Any
 
 import numpy as np
 
-from tactile_bayes.forward.axisymmetric import CondensedLump, LayeredBody, Tissue, condense_lump, taxel_compliance
+from tactile_bayes.forward.axisymmetric import CondensedLump, LayeredBody, condense_lump, taxel_compliance
 from tactile_bayes.forward.contact import ContactStiffness, press
 from tactile_bayes.forward.mesh import LumpGeometry, MeshSize, lump_mesh
 from tactile_bayes.forward.scene import Head
 from tactile_bayes.forward.solid import PlacedLump, SolidHead, face_of, skin_perturbation, solid_head
+from tactile_bayes.forward.tissue import SceneBody
 
 SCHEMA = "tactile-bayes/benchmarks/solid/1"
 LUMPS = {
@@ -68,8 +69,8 @@ def mesh_rows(name: str, geometry: LumpGeometry, runs: int) -> list[dict[str, An
     head, made = head_on(geometry), dict[str, CondensedLump]()
     rows = []
     for mesh, size in MESHES.items():
-        seconds = least_cpu(lambda size=size: condense_lump(geometry, Tissue(), size=size), runs)
-        made[mesh] = condense_lump(geometry, Tissue(), size=size)
+        seconds = least_cpu(lambda size=size: condense_lump(geometry, SceneBody(), size=size), runs)
+        made[mesh] = condense_lump(geometry, SceneBody(), size=size)
         nodes = len(lump_mesh(geometry, size).node_mm)
         rows.append({"lump": name, "mesh": mesh, "unknowns": 3 * nodes, "orders": len(made[mesh].modes), "s": seconds})
     plain = over(head, [])
@@ -89,7 +90,7 @@ def frame_rows(runs: int) -> list[dict[str, Any]]:
     """Milliseconds a frame without a lump, with one and with two, and for a plain inverse of the whole compliance."""
     geometry = LUMPS["centred, h/d 1"]
     head = head_on(geometry)
-    ball = skin_perturbation(condense_lump(geometry, Tissue()), 500.0)
+    ball = skin_perturbation(condense_lump(geometry, SceneBody()), 500.0)
     placed = [PlacedLump(ball, 0.0, 0.0), PlacedLump(ball, 30.0, 5.0)]
     rows = []
     for count in (0, 1, 2):
@@ -108,7 +109,7 @@ def frame_rows(runs: int) -> list[dict[str, Any]]:
 def other_rows(runs: int) -> list[dict[str, Any]]:
     """What is done once a body and once a stiffness."""
     geometry = LUMPS["centred, h/d 1"]
-    lump = condense_lump(geometry, Tissue())
+    lump = condense_lump(geometry, SceneBody())
     return [
         {"what": "body and head", "ms": 1000 * least_cpu(lambda: head_on(geometry), runs)},
         {"what": "another stiffness", "ms": 1000 * least_cpu(lambda: skin_perturbation(lump, 50.0), runs)},

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Executor
 from functools import cache, partial
 from operator import attrgetter
@@ -27,14 +27,11 @@ from tactile_bayes.files.size_json import DEFAULT, read_size_calibration, size_c
 from tactile_bayes.files.tables import csv_text, read_table
 from tactile_bayes.findings import finding_lines
 from tactile_bayes.forward.contact import Head
-from tactile_bayes.forward.line import TactileLine, fit_shape, outside_range
+from tactile_bayes.forward.line import outside_range
 from tactile_bayes.forward.scene import Head as Array
 from tactile_bayes.forward.tissue import parse_seat
-from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.select import scan_findings
 from tactile_bayes.options import CaseOptions, FieldCosines, SbcOptions, SectionOptions, StudyOptions
-from tactile_bayes.posterior.bump import cell_mean_gaussian
-from tactile_bayes.posterior.white import LEAST_WIDTH_IN_CELLS, WIDEST_IN_RADII
 from tactile_bayes.presets import HEADS, RESEARCH_USE, SHOULDERS_INSIDE, SHOULDERS_OUTSIDE, Method
 from tactile_bayes.report.laboratory import heads_text, sbc_document, sbc_figure, sbc_text, tables_document, tables_text
 from tactile_bayes.report.laboratory import table_text as ranks_table
@@ -55,21 +52,18 @@ from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.studies import sbc
 from tactile_bayes.studies.model_comparison import compare_model, measured_frames
 from tactile_bayes.studies.paper import (
-    Fit,
     Geometry,
     HomogeneousTissue,
-    LineFit,
     StudyRow,
     StudySettings,
     group_cases,
     most_even,
     narrowest,
     paper_grid,
-    run_geometry,
     search_heads,
     uniformity,
 )
-from tactile_bayes.studies.paper_solid import SolidSettings, fit_raster, raster_map, run_solid_geometry
+from tactile_bayes.studies.paper_solid import SolidSettings
 from tactile_bayes.studies.paper_tables import (
     NEAREST_HEADS,
     PHANTOMS,
@@ -117,7 +111,6 @@ def draw_figures(
     folder: Path,
     *,
     seat: float,
-    fit: Fit,
     phantom: tuple[float, float] | None,
     frames: list[MeasuredFrame],
     force: bool,
@@ -131,16 +124,14 @@ def draw_figures(
         paths = figure_paths(folder, model="plane-strain")
         d, h = phantom or PHANTOMS["phantom 12.5 mm"]
         compared = compare_frames(frames, d_mm=d, depth_ratio=h, seat=seat, settings=settings) if frames else []
-        found = study_figures(rows, settings, paths, seat=seat, fit=fit, phantom=(d, h), measured=compared, force=force)
+        found = study_figures(rows, settings, paths, seat=seat, phantom=(d, h), measured=compared, force=force)
         where = f"figures 5 to 8 and the frames of four lumps are in {folder}"
         return [lookalikes_text(found), *frames_text(compared), where]
     paths = figure_paths(folder, model="solid")
-    solid_figures(rows, settings, paths, seat=seat, fit=fit_raster, build=raster_map, force=force)
+    solid_figures(rows, settings, paths, seat=seat, force=force)
     return [f"figures 5 to 8 are in {folder}"]
 
 
-# The line is a map that does not change in y: a bump of this width there.
-_NO_CHANGE_MM = 1e6
 _GRID_SCHEMA = "study_grid.table.json"
 RECIPE = ("normalise", "background", "fit_radius_mm", "noise", "flat_field")
 """Columns that say how the maps of a table were made and fitted; `calibrate size` refuses what contradicts them."""
@@ -178,9 +169,7 @@ def study_action(
         unfinished(output).unlink(missing_ok=True)
     click.echo(study_text(rows), err=output is None)
     if figures is not None:
-        drawn = draw_figures(
-            rows, settings, figures, seat=chosen, fit=fit_line, phantom=phantom, frames=frames, force=force
-        )
+        drawn = draw_figures(rows, settings, figures, seat=chosen, phantom=phantom, frames=frames, force=force)
         for line in drawn:
             click.echo(line, err=output is None)
     click.echo(RESEARCH_USE, err=output is None)
@@ -225,18 +214,13 @@ def run_study(
     """Compute all rows, in order of the geometries; finished ones are stored beside `output`."""
     for geometry in geometries:
         settings.body(geometry.d_mm, geometry.depth_ratio, seat=geometry.seat)
-    work: Callable[[Geometry], list[StudyRow]] = (
-        partial(run_geometry, settings=settings, fit=fit_line)
-        if isinstance(settings, StudySettings)
-        else partial(run_solid_geometry, settings=settings, fit=fit_raster)
-    )
     with (
         open_unfinished(output, list[StudyRow], settings=settings.as_dict()) as store,
         progress_bar("geometries") as progress,
     ):
         try:
             outcomes = run_batch(
-                work, geometries, key=attrgetter("key"), executor=executor, store=store, progress=progress
+                settings.rows, geometries, key=attrgetter("key"), executor=executor, store=store, progress=progress
             )
         except BatchInterrupted as stop:
             if output is None:  # else the next run goes on
@@ -255,25 +239,6 @@ def run_study(
 def _rows(outcomes: Iterable[Outcome[list[StudyRow]]]) -> list[StudyRow]:
     """Rows of the finished geometries."""
     return [row for outcome in outcomes for row in outcome.value or []]
-
-
-def fit_line(line: TactileLine, radius_mm: float) -> LineFit:
-    """Fit Eq 5 with background 1 and the bump on the lump's axis, averaged over cells as for a patient's map.
-
-    Only widths from half a cell to three quarters of the radius count, also as for a patient's map. A bump that runs to
-    either end is reported there.
-    """
-    inside = (np.abs(line.x_mm) <= radius_mm) & (line.count > 0)
-    x, excess = line.x_mm[inside], line.mean[inside] - 1.0
-
-    def bump(log_width: float) -> FloatArray:
-        covariance = np.diag([np.exp(2 * log_width), _NO_CHANGE_MM**2])
-        return cell_mean_gaussian(x, np.zeros_like(x), covariance_mm2=covariance, cell_mm=line.cell_mm)
-
-    ends = np.log([LEAST_WIDTH_IN_CELLS * line.cell_mm, WIDEST_IN_RADII * radius_mm])
-    found = fit_shape(bump, excess, grid=np.linspace(ends[0], ends[1], 60))
-    resolved = bool(ends[0] + 1e-6 < found.parameter < ends[1] - 1e-6)
-    return LineFit(found.height, float(np.exp(found.parameter)), float(np.sqrt(found.sse / len(x))), resolved)
 
 
 def table_text(rows: list[StudyRow]) -> str:
@@ -311,7 +276,7 @@ def tables_action(*, seat: str, head: str | None, search: bool, workers: int, as
 def run_tables(seat: float, *, heads: Sequence[Head], workers: int) -> tuple[ByHead, ByHead]:
     """Agreement of both models over the cases of the tables, and over the phantoms, under each head."""
     scenes = table_scenes(seat) + phantom_scenes(seat)
-    work = partial(compare_heads, settings=StudySettings(), heads=heads, fit=fit_line)
+    work = partial(compare_heads, settings=StudySettings(), heads=heads)
     with open_executor(workers=workers) as executor, progress_bar("lumps") as progress:
         outcomes = run_batch(work, scenes, key=lambda scene: scene.name, executor=executor, progress=progress)
     for outcome in outcomes:

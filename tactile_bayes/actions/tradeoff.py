@@ -14,7 +14,6 @@ from typing import Any, Literal
 
 import click
 
-from tactile_bayes.actions.study import fit_line
 from tactile_bayes.api.estimating import estimate_file, estimate_inputs
 from tactile_bayes.api.pooled import pool_estimates
 from tactile_bayes.api.settings import Settings
@@ -38,7 +37,6 @@ from tactile_bayes.scans import Scan
 from tactile_bayes.shell import progress_bar
 from tactile_bayes.size.pooling import PooledEstimate
 from tactile_bayes.studies.estimate_tradeoff import SIZE, Clock, Ladder, PooledRow, SizeAnswer, Work, measure
-from tactile_bayes.studies.paper_solid import fit_raster
 from tactile_bayes.studies.tradeoffs import (
     PLANE,
     SOLID,
@@ -202,7 +200,7 @@ def run_tradeoff(case: LumpCase, calibration: str | None, *, tolerance: float, r
     rules = {model: _rule(case, model, calibration or own[model]) for model in (PLANE, SOLID)}
     found: list[Measured] = []
     settings = forward_settings(case)
-    measure = partial(measure_forward, case, fit=fit_line, raster_fit=fit_raster, clock=time.process_time)
+    measure = partial(measure_forward, case, clock=time.process_time)
     measure(settings[0])  # imports cost nothing afterwards
     measure(settings[-1])
     with progress_bar("settings") as progress:
@@ -216,7 +214,7 @@ def _rule(case: LumpCase, model: str, name: str) -> SizeRule:
     """Rule from a model's widths to sizes: a calibration by name or path, or one learned here."""
     if name == LEARNED:
         with progress_bar(f"lumps for Eq 6, {model}") as progress:
-            return learned_rule(teach(case, model, fit=fit_line, raster_fit=fit_raster, progress=progress))
+            return learned_rule(teach(case, model, progress=progress))
     path = size_calibration_path(name)
     if path is None:
         raise UsageError(f"--size-calibration {name} gives no sizes; name a calibration, or say {LEARNED}")

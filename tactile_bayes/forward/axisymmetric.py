@@ -29,9 +29,9 @@ from tactile_bayes.forward.mesh import (
     solved,
     stiffness_factor,
 )
-from tactile_bayes.forward.tissue import Layers
+from tactile_bayes.forward.tissue import Layers, SceneBody
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.presets import FAT_KPA, GLAND_RATIO, POISSON
+from tactile_bayes.presets import POISSON
 
 # --- Sinking of a layered body's skin under normal loads: its exact Green's function, and means over taxels.
 #
@@ -260,21 +260,6 @@ def _mean_over_two_squares(
 _LEAST_SHARE: Final = 1e-4
 
 
-class Tissue(Record):
-    """Moduli of the two layers, fat over gland, with one Poisson's ratio below 0.5 for both and the lump."""
-
-    fat_kpa: float = FAT_KPA
-    gland_ratio: float = GLAND_RATIO
-    nu: float = POISSON
-
-    def __post_init__(self) -> None:
-        for name in ("fat_kpa", "gland_ratio"):
-            if not getattr(self, name) > 0:
-                raise BadDataError(f"{name} is {getattr(self, name)}", way_out="it must be above 0")
-        if not 0 <= self.nu < 0.5:
-            raise BadDataError(f"nu is {self.nu}", way_out="it must lie in 0 to below 0.5")
-
-
 class ModePerturbation(Record, eq=False):
     """Perturbation of Fourier order m."""
 
@@ -327,16 +312,16 @@ class CondensedLump(Record, eq=False):
 
 
 def condense_lump(
-    geometry: LumpGeometry, tissue: Tissue, *, size: MeshSize | None = None, orders: int | None = None
+    geometry: LumpGeometry, body: SceneBody, *, size: MeshSize | None = None, orders: int | None = None
 ) -> CondensedLump:
     """Condense the body around a lump onto the lump's boundary and the skin.
 
     The default mesh is held by a test to 1 % in amplitude and 0.5 % in width; the lump's depth decides the number of
-    Fourier orders where none is given (`orders_needed`).
+    Fourier orders where none is given (`orders_needed`). Of the `body` the moduli and Poisson's ratio are used.
     """
     mesh = lump_mesh(geometry, size)
-    elements = element_stiffness(mesh, nu=tissue.nu)
-    fat, gland = tissue.fat_kpa, tissue.fat_kpa * tissue.gland_ratio
+    elements = element_stiffness(mesh, nu=body.nu)
+    fat, gland = body.fat_kpa, body.fat_kpa * body.gland_ratio
     modulus = np.where((mesh.region == EXTERIOR_GLAND) | (mesh.region == INTERIOR_GLAND), gland, fat)
     count = orders_needed(geometry) if orders is None else orders
     modes = [_condense(mesh, elements, modulus, order) for order in range(count)]

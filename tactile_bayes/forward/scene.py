@@ -337,15 +337,6 @@ def tissue_truth(scene: Scene) -> dict[str, Any]:
     }
 
 
-def refuse_bumps(scene: Scene, model: str) -> None:
-    """Raise BadDataError where a scene gives bumps to a `model` that needs tissue."""
-    if scene.lumps:
-        raise BadDataError(
-            "lump[0] gives no depth_ratio",
-            way_out=f"the {model} model needs d_mm and depth_ratio; or use --fidelity empirical-gaussian",
-        )
-
-
 def _lump_truth(lump: SolidLump, body: SceneBody, fat_mm: float) -> dict[str, Any]:
     seat = (fat_mm - lump.depth_mm) / (lump.vertical_mm / 2)
     return as_dict(lump) | {

@@ -11,10 +11,10 @@ from tactile_bayes.declarations import Record, as_dict, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.contact import Head
 from tactile_bayes.forward.instrument import SimulatedScan, frame_times, head_positions, level_kpa, record
-from tactile_bayes.forward.line import EmpiricalModel, fit_empirical, press, press_layers
+from tactile_bayes.forward.line import EmpiricalModel, LineFrames, fit_empirical, press, press_layers
 from tactile_bayes.forward.mesh import REACH_MM
 from tactile_bayes.forward.plane_strain import SurfaceCompliance, condense
-from tactile_bayes.forward.scene import Scene, normalised_pressure, refuse_bumps, tissue_truth
+from tactile_bayes.forward.scene import Scene, normalised_pressure, tissue_truth
 from tactile_bayes.forward.solid import frames_at_poses, simulate_solid
 from tactile_bayes.forward.tissue import MOST_SEAT, Body, Layers, SceneBody, SolidLump, fat_thickness
 from tactile_bayes.geometry import FloatArray
@@ -42,37 +42,48 @@ def simulate(
     in three dimensions, and inside the array in two. `progress` is called with frames done and frames in all; the bumps
     alone are too quick to call it.
     """
-    chosen = _chosen(scene, fidelity)
-    if head is not None:
-        if chosen == "empirical-gaussian":
-            raise BadDataError(
-                "--head is given for the empirical-gaussian model, whose bumps do not depend on the head's shoulders",
-                way_out="leave --head out, or choose another --fidelity",
-            )
-        # In two dimensions that is the section's default, and the scan has the scene's own head.
-        if chosen == "solid" or head != SHOULDERS_INSIDE:
-            scene = replace(scene, head=scene.head.with_shoulders(head))
+    chosen, scene = _prepared(scene, fidelity, head)
     if chosen == "solid":
         return simulate_solid(scene, rng=rng, progress=progress)
     if chosen in ("plane-strain", "empirical"):
         return simulate_plane(scene, rng=rng, fidelity=chosen, shoulders=head or SHOULDERS_INSIDE, progress=progress)
-    if scene.solid_lumps or scene.ribs:
-        raise _tissue_for_bumps(scene)
-    return _simulate_gaussian(scene, rng=rng)
+    if head is not None:
+        raise BadDataError(
+            "--head is given for the empirical-gaussian model, whose bumps do not depend on the head's shoulders",
+            way_out="leave --head out, or choose another --fidelity",
+        )
+
+    def felt(time_s: FloatArray) -> FloatArray:
+        poses, level = head_positions(scene, time_s), level_kpa(scene.background, time_s)
+        return _gaussian_frames(scene, *poses, level, share_load=scene.background.load_sharing)
+
+    lumps, background = [as_dict(lump) for lump in scene.lumps], as_dict(scene.background)
+    return record(scene, felt=felt, truth={"model": "gaussian", "lumps": lumps, "background": background}, rng=rng)
 
 
-def _chosen(scene: Scene, fidelity: str | None) -> str:
+def _prepared(scene: Scene, fidelity: str | None, head: str | None) -> tuple[str, Scene]:
+    """The model of a scene, which must give what the model needs, and the scene with the shoulders of its head placed.
+
+    In two dimensions shoulders inside the array are the section's default, and the scan has the scene's own head.
+    """
     chosen = scene.fidelity if fidelity is None else fidelity
     if chosen not in FIDELITIES:
         raise BadDataError(f"fidelity is {chosen!r}", way_out=f"choose {', '.join(FIDELITIES)}")
-    return chosen
-
-
-def _tissue_for_bumps(scene: Scene) -> BadDataError:
-    named = "lump[0] gives depth_ratio and no amplitude" if scene.solid_lumps else "rib[0] is of tissue"
-    return BadDataError(
-        named, way_out="use --fidelity solid, or describe the bump with amplitude, sigma_x_mm and sigma_y_mm"
-    )
+    if chosen == "empirical-gaussian":
+        if scene.solid_lumps or scene.ribs:
+            raise BadDataError(
+                "lump[0] gives depth_ratio and no amplitude" if scene.solid_lumps else "rib[0] is of tissue",
+                way_out="use --fidelity solid, or describe the bump with amplitude, sigma_x_mm and sigma_y_mm",
+            )
+        return chosen, scene
+    if scene.lumps:
+        raise BadDataError(
+            "lump[0] gives no depth_ratio",
+            way_out=f"the {chosen} model needs d_mm and depth_ratio; or use --fidelity empirical-gaussian",
+        )
+    if head is not None and (chosen == "solid" or head != SHOULDERS_INSIDE):
+        scene = replace(scene, head=scene.head.with_shoulders(head))
+    return chosen, scene
 
 
 def felt_at_poses(
@@ -89,36 +100,23 @@ def felt_at_poses(
     noise.
 
     Tissue and head of the scene are used; strokes, noise and tracker are not. Rotations (n, 3, 3) and origins (n, 3) of
-    the head's face lead from `scanhead` to the scene's `plane`; the rest is as in `simulate`.
+    the head's face lead from `scanhead` to the scene's `plane`; the rest is as in `simulate`. In two dimensions tilts
+    are not followed and depths not used, and a pose beyond the skin that can be solved for is an error.
     """
-    chosen = _chosen(scene, fidelity)
+    chosen, scene = _prepared(scene, fidelity, head)
     if chosen == "empirical-gaussian":
-        if scene.solid_lumps or scene.ribs:
-            raise _tissue_for_bumps(scene)
         return _gaussian_frames(scene, rotation, origin_mm, mean_kpa, share_load=True)
-    refuse_bumps(scene, chosen)
-    if head is not None and (chosen == "solid" or head != SHOULDERS_INSIDE):
-        scene = replace(scene, head=scene.head.with_shoulders(head))
     if chosen == "solid":
         return frames_at_poses(scene, rotation, origin_mm, mean_kpa=mean_kpa, progress=progress)[0]
-    return plane_frames_at_poses(
-        scene,
-        rotation,
-        origin_mm,
-        mean_kpa=mean_kpa,
-        fidelity=chosen,
-        shoulders=head or SHOULDERS_INSIDE,
-        progress=progress,
-    )
-
-
-def _simulate_gaussian(scene: Scene, *, rng: np.random.Generator) -> SimulatedScan:
-    def felt(time_s: FloatArray) -> FloatArray:
-        poses, level = head_positions(scene, time_s), level_kpa(scene.background, time_s)
-        return _gaussian_frames(scene, *poses, level, share_load=scene.background.load_sharing)
-
-    lumps, background = [as_dict(lump) for lump in scene.lumps], as_dict(scene.background)
-    return record(scene, felt=felt, truth={"model": "gaussian", "lumps": lumps, "background": background}, rng=rng)
+    section = plane_section(scene, chosen, shoulders=head or SHOULDERS_INSIDE)
+    place = _column_places(scene, rotation, origin_mm) - section.x_mm
+    reach, most = float(np.abs(place).max()) + section.half_face_mm + 1.0, section.most_reach_mm
+    if reach > most:
+        raise BadDataError(
+            f"the head gets {reach:.4g} mm from the lump", way_out=f"the {chosen} model reaches {most:g} mm"
+        )
+    sections = section.sections(chosen, reach_mm=reach)
+    return plane_frames(scene, rotation, origin_mm, mean_kpa, sections, lump_x_mm=section.x_mm, progress=progress)
 
 
 def _gaussian_frames(
@@ -166,10 +164,20 @@ def simulate_plane(
     `shoulders` is one of `presets.HEADS`. `rng` is the instrument's alone; `progress` is called with frames done and
     frames in all.
     """
-    section = plane_section(scene, fidelity, shoulders=shoulders)
-    sections = section.empirical if fidelity == "empirical" else section.solved
-    time = frame_times(scene)
-    pressure = plane_frames(scene, time, sections, lump_x_mm=section.x_mm, progress=progress)
+    section, time = plane_section(scene, fidelity, shoulders=shoulders), frame_times(scene)
+    half_mm, most = section.half_face_mm, section.most_reach_mm
+    stroke = scene.strokes.half_length_mm + scene.strokes.wander_mm + scene.head.columns * scene.head.pitch_mm / 2
+    reach = stroke + abs(section.x_mm) + half_mm + 1.0
+    if reach > most:
+        raise BadDataError(
+            f"the head gets {reach:.4g} mm from the lump (strokes.half_length_mm {scene.strokes.half_length_mm:g}, "
+            f"a head {2 * half_mm:g} mm wide)",
+            way_out=f"the mesh reaches {most:g} mm: shorten the strokes or narrow the head",
+        )
+    level, sections = level_kpa(scene.background, time), section.sections(fidelity, reach_mm=reach)
+    pressure = plane_frames(
+        scene, *head_positions(scene, time), level, sections, lump_x_mm=section.x_mm, progress=progress
+    )
     truth = {"model": fidelity, "shape": _SHAPE, "head": shoulders, **tissue_truth(scene)}
     return record(scene, felt=lambda at: pressure[np.searchsorted(time, at)], truth=truth, rng=rng)
 
@@ -179,69 +187,65 @@ class PlaneSection(Record, eq=False):
 
     head: Head
     """Section of the head: shoulders of the scene's `shoulder_mm`, or its `rim_mm` where that is 0."""
+    pitch_mm: float  #: Width of a taxel, of six of the contact's cells.
     layers: Layers  #: The body without the lump.
-    lump: tuple[Body, float] | None  #: Below the skin; None for nothing.
+    lump: tuple[Body, float] | None  #: Below the skin, with its stiffness ratio; None for nothing.
     x_mm: float  #: Place of the lump's axis.
-    mean_kpa: float
-    cell_mm: float
-    """`mean_kpa`, `cell_mm`: The nominal pressure; width of the contact's cells, of which a taxel has six."""
-    reach_mm: float  #: How far from the lump's axis the head's edges get.
-
-    def surface(self) -> SurfaceCompliance:
-        """Compliance of the skin over the lump."""
-        assert self.lump is not None
-        return condense(self.lump[0], reach_mm=self.reach_mm, cell_mm=self.cell_mm)
+    mean_kpa: float  #: The nominal pressure.
 
     @property
-    def solved(self) -> Sections:
-        """Sections from the contact problem."""
-        if self.lump is None:
-            return self._plain
-        surface, ratio, head = self.surface(), self.lump[1], self.head
-
-        def sections(x_mm: FloatArray, mean_kpa: FloatArray) -> FloatArray:
-            return _taxels(press(surface, ratio, x_mm, head=head, mean_kpa=mean_kpa).pressure_kpa)
-
-        return sections
+    def cell_mm(self) -> float:
+        """Width of the contact's cells."""
+        return self.pitch_mm / _CELLS_A_TAXEL
 
     @property
-    def empirical(self) -> Sections:
-        """Sections from Eqs 1 to 4."""
-        if self.lump is None:
-            return self._plain
-        model, s = self.empirical_model()
+    def half_face_mm(self) -> float:
+        """Half the width of the face, in whole cells."""
+        return 0.5 * self.cell_mm * len(self.head.sensing_cells(self.cell_mm))
 
-        def sections(x_mm: FloatArray, mean_kpa: FloatArray) -> FloatArray:
+    @property
+    def most_reach_mm(self) -> float:
+        """How far from the lump's axis the head's edges may get."""
+        return REACH_MM + self.layers.thickness_mm
+
+    def sections(self, fidelity: str, *, reach_mm: float) -> Sections:
+        """Sections from the contact problem or Eqs 1 to 4, of a head whose edges get so far from the lump's axis.
+
+        Without a lump the section is the same at every place.
+        """
+        if self.lump is None:
+            return lambda _, mean_kpa: self._far(mean_kpa).pressure_kpa
+        body, ratio = self.lump
+        surface = condense(body, reach_mm=reach_mm, cell_mm=self.cell_mm)
+        if fidelity == "plane-strain":
+            return lambda x_mm, mean_kpa: self._over(surface, ratio, x_mm, mean_kpa).pressure_kpa
+        model, s = self.empirical_model(surface)
+
+        def empirical(x_mm: FloatArray, mean_kpa: FloatArray) -> FloatArray:
             share = mean_kpa / self.mean_kpa
             return np.asarray(share[:, None] * model.surface_pressure(s[None, :], x_mm[:, None]))
 
-        return sections
+        return empirical
 
-    def empirical_model(self) -> tuple[EmpiricalModel, FloatArray]:
+    def empirical_model(self, surface: SurfaceCompliance) -> tuple[EmpiricalModel, FloatArray]:
         """Eqs 1 to 4 fitted to what taxels see far from and over the lump, and the taxels' places across the head."""
         assert self.lump is not None
-        far = press_layers(self.layers, head=self.head, mean_kpa=self.mean_kpa, cell_mm=self.cell_mm)
-        over = press(self.surface(), self.lump[1], np.zeros(1), head=self.head, mean_kpa=self.mean_kpa)
-        s = _taxels(over.s_mm[None])[0]
-        model = fit_empirical(
-            s,
-            _taxels(far.pressure_kpa)[0],
-            _taxels(over.pressure_kpa)[0],
-            d_mm=self.lump[0].d_mm,
-            half_width_mm=self.head.half_width_mm,
-        )
-        return model, s
+        far, over = self._far(self.mean_kpa), self._over(surface, self.lump[1], np.zeros(1), self.mean_kpa)
+        s, d, half = over.s_mm, surface.body.d_mm, self.head.half_width_mm
+        return fit_empirical(s, far.at(0.0), over.at(0.0), d_mm=d, half_width_mm=half), s
 
-    def _plain(self, x_mm: FloatArray, mean_kpa: FloatArray) -> FloatArray:
-        """Section over the body without a lump, which is the same at every place."""
-        del x_mm
-        found = press_layers(self.layers, head=self.head, mean_kpa=mean_kpa, cell_mm=self.cell_mm)
-        return _taxels(found.pressure_kpa)
+    def _far(self, mean_kpa: float | FloatArray) -> LineFrames:
+        far = press_layers(self.layers, head=self.head, mean_kpa=mean_kpa, cell_mm=self.cell_mm)
+        return far.as_taxels(self.pitch_mm)
+
+    def _over(
+        self, surface: SurfaceCompliance, ratio: float, x_mm: FloatArray, mean_kpa: float | FloatArray
+    ) -> LineFrames:
+        return press(surface, ratio, x_mm, head=self.head, mean_kpa=mean_kpa).as_taxels(self.pitch_mm)
 
 
 def plane_section(scene: Scene, fidelity: str, *, shoulders: str = SHOULDERS_INSIDE) -> PlaneSection:
     """Prepare the section of a scene; a key that two dimensions cannot follow is an error."""
-    refuse_bumps(scene, fidelity)
     many = "a rib" if scene.ribs else f"{len(scene.solid_lumps)} lumps" if len(scene.solid_lumps) > 1 else ""
     if many:
         raise BadDataError(
@@ -258,16 +262,8 @@ def plane_section(scene: Scene, fidelity: str, *, shoulders: str = SHOULDERS_INS
             f"head.rim_mm is {scene.head.rim_mm:g}",
             way_out=f"in two dimensions the rim is cut into the array: give at most {width / 2:g} mm",
         )
-    head, cell_mm = scene.head.section(shoulders), scene.head.pitch_mm / _CELLS_A_TAXEL
-    return PlaneSection(
-        head,
-        layers,
-        lump,
-        x_mm,
-        scene.background.mean_kpa,
-        cell_mm,
-        _reach(scene, x_mm, 0.5 * cell_mm * len(head.sensing_cells(cell_mm)), layers.thickness_mm),
-    )
+    head, level = scene.head.section(shoulders), scene.background.mean_kpa
+    return PlaneSection(head, scene.head.pitch_mm, layers, lump, x_mm, level)
 
 
 def _cylinder(lump: SolidLump, body: SceneBody, fat_mm: float, fidelity: str) -> tuple[Body, float]:
@@ -291,70 +287,13 @@ def _cylinder(lump: SolidLump, body: SceneBody, fat_mm: float, fidelity: str) ->
     return section, lump.stiffness_ratio
 
 
-def _reach(scene: Scene, lump_x_mm: float, half_width_mm: float, thickness_mm: float) -> float:
-    """Largest distance of the head's edges from the lump; an error where the mesh ends before."""
-    along = scene.head.columns * scene.head.pitch_mm / 2
-    wander = scene.strokes.half_length_mm + scene.strokes.wander_mm + along
-    reach = wander + abs(lump_x_mm) + half_width_mm + 1.0
-    most = REACH_MM + thickness_mm
-    if reach > most:
-        raise BadDataError(
-            f"the head gets {reach:.4g} mm from the lump (strokes.half_length_mm {scene.strokes.half_length_mm:g}, "
-            f"a head {2 * half_width_mm:g} mm wide)",
-            way_out=f"the mesh reaches {most:g} mm: shorten the strokes or narrow the head",
-        )
-    return reach
-
-
-def plane_frames(
-    scene: Scene, time_s: FloatArray, sections: Sections, *, lump_x_mm: float, progress: Progress | None = None
-) -> FloatArray:
-    """(n, rows, columns) kPa that the taxels feel at (n,) times, before any noise.
-
-    A head turned about the normal has its columns at different places across the lump. Sections are computed no more
-    than 0.25 mm apart and interpolated between.
-    """
-    rotation, origin = head_positions(scene, time_s)
-    level = level_kpa(scene.background, time_s)
-    return _frames_at(scene, rotation, origin, level, sections, lump_x_mm=lump_x_mm, progress=progress)
-
-
-def plane_frames_at_poses(
-    scene: Scene,
-    rotation: FloatArray,
-    origin_mm: FloatArray,
-    *,
-    mean_kpa: FloatArray,
-    fidelity: str,
-    shoulders: str = SHOULDERS_INSIDE,
-    progress: Progress | None = None,
-) -> FloatArray:
-    """Pressure in kPa, (n, rows, columns), that the scene's head feels at given poses and mean pressures, without
-    noise.
-
-    Rotations lead from `scanhead` to the scene's `plane`; tilts are not followed and depths not used. A pose beyond the
-    skin that can be solved for is an error.
-    """
-    section = plane_section(scene, fidelity, shoulders=shoulders)
-    half_face = 0.5 * section.cell_mm * len(section.head.sensing_cells(section.cell_mm))
-    place = _column_places(scene, rotation, origin_mm) - section.x_mm
-    reach, most = float(np.abs(place).max()) + half_face + 1.0, REACH_MM + section.layers.thickness_mm
-    if reach > most:
-        raise BadDataError(
-            f"the head gets {reach:.4g} mm from the lump", way_out=f"the {fidelity} model reaches {most:g} mm"
-        )
-    section = replace(section, reach_mm=reach)
-    sections = section.empirical if fidelity == "empirical" else section.solved
-    return _frames_at(scene, rotation, origin_mm, mean_kpa, sections, lump_x_mm=section.x_mm, progress=progress)
-
-
 def _column_places(scene: Scene, rotation: FloatArray, origin_mm: FloatArray) -> FloatArray:
     """(n, columns) place of each column of taxels across the scene's `plane`."""
     along = (np.arange(scene.head.columns) - (scene.head.columns - 1) / 2) * scene.head.pitch_mm
     return np.asarray(origin_mm[:, :1] + rotation[:, 0, 1, None] * along)
 
 
-def _frames_at(
+def plane_frames(
     scene: Scene,
     rotation: FloatArray,
     origin_mm: FloatArray,
@@ -362,42 +301,23 @@ def _frames_at(
     sections: Sections,
     *,
     lump_x_mm: float,
-    progress: Progress | None,
+    progress: Progress | None = None,
 ) -> FloatArray:
-    """(n, rows, columns) kPa from sections at the places of the head's columns."""
+    """(n, rows, columns) kPa that the taxels feel at (n,) poses and mean pressures, before any noise.
+
+    A head turned about the normal has its columns at different places across the lump. Sections are computed no more
+    than 0.25 mm apart and interpolated between.
+    """
     place = _column_places(scene, rotation, origin_mm) - lump_x_mm
-    count = len(level_kpa)
-    pressure = np.zeros((count, scene.head.rows, scene.head.columns))
+    pressure = np.zeros((len(level_kpa), scene.head.rows, scene.head.columns))
     pressed = np.flatnonzero(level_kpa > 0)
-    for chunk in np.array_split(pressed, max(1, len(pressed) // _FRAMES_AT_ONCE)):
-        across = [_places(place[i]) for i in chunk]
+    for chunk in np.array_split(pressed, len(pressed) // _FRAMES_AT_ONCE or 1) if len(pressed) else ():
+        ends = [(float(place[i].min()), float(place[i].max())) for i in chunk]
+        across = [np.linspace(low, high, 1 + int(np.ceil((high - low) / _APART_MM - 1e-9))) for low, high in ends]
         many = [len(x) for x in across]
-        profile = (
-            sections(np.concatenate(across), np.repeat(level_kpa[chunk], many)) if len(chunk) else np.zeros((0, 0))
-        )
-        for i, x, mine in zip(chunk, across, np.split(profile, np.cumsum(many)[:-1]), strict=bool(len(chunk))):
-            pressure[i] = _interpolated(x, mine, place[i]).T
-        if progress is not None and len(chunk):
-            progress(int(chunk[-1]) + 1, count)
+        profile = sections(np.concatenate(across), np.repeat(level_kpa[chunk], many))
+        for i, x, mine in zip(chunk, across, np.split(profile, np.cumsum(many)[:-1]), strict=True):
+            pressure[i] = [np.interp(place[i], x, taxel) for taxel in mine.T]
+        if progress is not None:
+            progress(int(chunk[-1]) + 1, len(level_kpa))
     return pressure
-
-
-def _places(place_mm: FloatArray) -> FloatArray:
-    """(m,) equally spaced places of sections that span those of the columns."""
-    low, high = float(place_mm.min()), float(place_mm.max())
-    return np.linspace(low, high, 1 + int(np.ceil((high - low) / _APART_MM - 1e-9)))
-
-
-def _interpolated(x_mm: FloatArray, profile: FloatArray, place_mm: FloatArray) -> FloatArray:
-    """(c, rows) profiles at `place_mm` between (m, rows) ones at equal steps."""
-    if len(x_mm) == 1:
-        return np.repeat(profile, len(place_mm), axis=0)
-    at = (place_mm - x_mm[0]) / (x_mm[1] - x_mm[0])
-    below = np.clip(at.astype(np.intp), 0, len(x_mm) - 2)
-    share = (at - below)[:, None]
-    return np.asarray((1 - share) * profile[below] + share * profile[below + 1])
-
-
-def _taxels(cells: FloatArray) -> FloatArray:
-    """(m, rows) means over whole taxels from (m, rows x cells) values."""
-    return np.asarray(cells.reshape(len(cells), -1, _CELLS_A_TAXEL).mean(axis=2))

@@ -13,7 +13,6 @@ from tactile_bayes.declarations import Record
 from tactile_bayes.forward.axisymmetric import (
     CondensedLump,
     LayeredBody,
-    Tissue,
     condense_lump,
     skin_spline,
     taxel_compliance,
@@ -22,7 +21,7 @@ from tactile_bayes.forward.contact import ContactStiffness, press
 from tactile_bayes.forward.contact import SolidContact as Contact
 from tactile_bayes.forward.instrument import SimulatedScan, frame_times, head_positions, level_kpa, record
 from tactile_bayes.forward.mesh import LumpGeometry
-from tactile_bayes.forward.scene import Head, Scene, refuse_bumps, tissue_truth
+from tactile_bayes.forward.scene import Head, Scene, tissue_truth
 from tactile_bayes.forward.tissue import HeadFace, SceneBody, SolidLump, fat_thickness, head_face
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.presets import HEAD_PITCH_MM
@@ -197,7 +196,6 @@ def simulate_solid(scene: Scene, *, rng: np.random.Generator, progress: Progress
     The mean over the taxels follows the scene's background, as an examiner holds it by the tone; where the head sinks
     less, over a lump, its pose says so. Tilts are the scene's. Each frame is at rest: nothing slides, creeps or lags.
     """
-    refuse_bumps(scene, "solid")
     time = frame_times(scene)
     pressure, depth = solid_frames(scene, time, progress=progress)
     return record(
@@ -258,7 +256,7 @@ def layers_of(body: SceneBody, fat_mm: float) -> LayeredBody:
 def condensed_lump(lump: SolidLump, body: SceneBody, fat_mm: float) -> CondensedLump:
     """Condense the body around a lump; the lump's stiffness and place do not matter here."""
     geometry = LumpGeometry(lump.d_mm / 2, lump.vertical_mm / 2, lump.depth_mm, fat_mm, body.thickness_mm)
-    return _condensed(geometry, Tissue(body.fat_kpa, body.gland_ratio, body.nu))
+    return _condensed(geometry, body)
 
 
 # Exams of one body, and lumps of one size and depth in it, share these; a scene has few.

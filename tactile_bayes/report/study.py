@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,11 +24,11 @@ from tactile_bayes.studies.paper import (
     DETECTABLE,
     HARD_RATIO,
     CaseSettings,
-    Fit,
     Lookalikes,
     StudyRow,
     StudySettings,
     find_lookalikes,
+    fit_line,
     hard_cases,
     learn_as_printed,
     seat_name,
@@ -36,7 +36,7 @@ from tactile_bayes.studies.paper import (
     width_changes,
     widths,
 )
-from tactile_bayes.studies.paper_solid import RasterFitter, RasterFrames, SolidSettings, raster_frames
+from tactile_bayes.studies.paper_solid import SolidSettings, fit_raster, raster_frames, raster_map
 from tactile_bayes.studies.paper_tables import PHANTOMS, FrameAgreement, Scene, mean_squared_difference, scene_curves
 
 if TYPE_CHECKING:
@@ -93,7 +93,6 @@ _SIZE_IN = (10.0, 4.3)
 _AXES = {"x": "across the head", "y": "along it"}
 _ON_HEAD, _ON_SKIN, _SHARE = "position on the head (mm)", "place on the skin (mm)", "pressure / mean of its frame"
 
-Build = Callable[[RasterFrames], TactileMap]  #: Builds the map of a raster.
 Curve = tuple[FloatArray, FloatArray, str]  #: Places, values and the name of a line.
 
 
@@ -103,7 +102,6 @@ def study_figures(
     paths: Sequence[Path],
     *,
     seat: float,
-    fit: Fit,
     phantom: tuple[float, float] = PHANTOMS[PHANTOM],
     measured: Sequence[FrameAgreement] = (),
     force: bool = False,
@@ -111,7 +109,7 @@ def study_figures(
     """Draw figures 5 to 8, and the frames of four lumps, as PNG files; returns the pair of lumps that figure 5b shows.
 
     Figures 7b and 8 show what the table holds of this seat, which is that of the lumps in figures 5b to 7a as well.
-    `fit` fits Eq 5 to a map. `phantom` is the diameter in mm and h/d of the lump of figure 6; `measured` are frames for
+    `phantom` is the diameter in mm and h/d of the lump of figure 6; `measured` are frames for
     figure 6a, in place of the places drawn without any.
     """
     of_seat = [row for row in rows if row.seat == seat_name(seat)]
@@ -119,7 +117,7 @@ def study_figures(
     _frames_of_lumps(settings, paths[0], seat=seat, found=found, force=force)
     _frames_and_maps(settings, paths[1], seat=seat, phantom=phantom, measured=measured, force=force)
     d, h = _SMALL
-    curves = _lines_by_stiffness(settings, settings.body(d, h, seat=seat), fit)
+    curves = _lines_by_stiffness(settings, settings.body(d, h, seat=seat))
     title, caption = f"(a) maps, d {d:g} mm, h/d {h:g}", _caption("Figure 7", settings, seat)
     _figure_7(of_seat, paths[2], curves=curves, title=title, caption=caption, force=force)
     figure_8(of_seat, paths[3], force=force)
@@ -133,16 +131,14 @@ def solid_figures(
     paths: Sequence[Path],
     *,
     seat: float,
-    fit: RasterFitter,
-    build: Build,
     force: bool = False,
 ) -> None:
     """Draw the four figures for balls as PNG files; rows and seat are as in `study_figures`."""
     of_seat = [row for row in rows if row.seat == seat_name(seat)]
     _frames_of_balls(settings, paths[0], seat=seat, force=force)
-    _map_of_ball(settings, paths[1], seat=seat, build=build, force=force)
+    _map_of_ball(settings, paths[1], seat=seat, force=force)
     d, h = _SMALL_BALL
-    curves = _sections_by_stiffness(settings, settings.body(d, h, seat=seat), fit, build)
+    curves = _sections_by_stiffness(settings, settings.body(d, h, seat=seat))
     title, caption = f"(a) across the head, d {d:g} mm, h/d {h:g}", _caption("Figure 7", settings, seat)
     _figure_7(of_seat, paths[2], curves=curves, title=title, caption=caption, force=force)
     figure_8(of_seat, paths[3], force=force)
@@ -311,12 +307,12 @@ def _four_lumps(settings: StudySettings, path: Path, *, seat: float, force: bool
         figure.text(0.01, 0.01, _caption("Dotted: Eq 3", settings, seat), fontsize=7.5, color="0.3")
 
 
-def _map_of_ball(settings: SolidSettings, path: Path, *, seat: float, build: Build, force: bool) -> None:
+def _map_of_ball(settings: SolidSettings, path: Path, *, seat: float, force: bool) -> None:
     """Fig 6: the map of the first phantom, and its sections along both axes of the head."""
     d, h = PHANTOMS[PHANTOM]
     body = settings.body(d, h, seat=seat)
     lump = settings.placed(settings.condensed(body), HARD_RATIO)
-    made = build(raster_frames(settings.on(body), lump, settings))
+    made = raster_map(raster_frames(settings.on(body), lump, settings))
     with _panels(path, _caption("Figure 6", settings, seat), force=force) as (left, right):
         read_x, read_y = made.covered.any(axis=0), made.covered.any(axis=1)
         x, y, mean = made.x_mm[read_x], made.y_mm[read_y], made.mean[np.ix_(read_y, read_x)]
@@ -341,23 +337,23 @@ def _section(made: TactileMap, axis: str) -> tuple[FloatArray, FloatArray]:
     return across[read], np.asarray(mean[np.ix_(chosen, read)].mean(axis=0))
 
 
-def _lines_by_stiffness(settings: StudySettings, body: Body, fit: Fit) -> Iterator[Curve]:
+def _lines_by_stiffness(settings: StudySettings, body: Body) -> Iterator[Curve]:
     """Maps of a lump of several stiffnesses, with Eq 5 fitted to them."""
     surface = settings.surface(body)
     for ratio in _RATIOS:
         line = build_line(settings.frames(surface, ratio))
-        found = fit(line, settings.fit_radius_mm)
+        found = fit_line(line, settings.fit_radius_mm)
         yield line.x_mm, line.mean, f"E2/E1 {ratio:g}: a {found.amplitude:.3f}, sigma {found.sigma_mm:.2f} mm"
 
 
-def _sections_by_stiffness(settings: SolidSettings, body: Body, fit: RasterFitter, build: Build) -> Iterator[Curve]:
+def _sections_by_stiffness(settings: SolidSettings, body: Body) -> Iterator[Curve]:
     """Sections across the head of maps of a ball of several stiffnesses, with Eq 7 fitted to the maps."""
     head, condensed = settings.on(body), settings.condensed(body)
     for ratio in _RATIOS:
         frames = raster_frames(head, settings.placed(condensed, ratio), settings)
-        found = fit(frames, settings)
+        found = fit_raster(frames, settings)
         sigma = f"{found.sigma_x_mm:.1f} x {found.sigma_y_mm:.1f} mm"
-        yield *_section(build(frames), "x"), f"E2/E1 {ratio:g}: a {found.amplitude:.3f}, sigma {sigma}"
+        yield *_section(raster_map(frames), "x"), f"E2/E1 {ratio:g}: a {found.amplitude:.3f}, sigma {sigma}"
 
 
 def _figure_7(

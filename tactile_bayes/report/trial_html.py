@@ -29,13 +29,13 @@ from tactile_bayes.report.trial import (
     ratio_line,
     shown,
 )
-from tactile_bayes.trial.calibration import BINS, Calibration, Prediction
+from tactile_bayes.trial.calibration import BINS, Calibration, Prediction, prediction_of
 from tactile_bayes.trial.figures import Ends, Figures
 from tactile_bayes.trial.method_comparison import MethodComparison
 from tactile_bayes.trial.next_mass import NextMass
 from tactile_bayes.trial.planning import IntervalCheck, PlanReport
 from tactile_bayes.trial.readings import FloatArray, ModalitySizes, Trial, mass_numbers
-from tactile_bayes.trial.summary import ModalityReport, TrialReport, prediction_of
+from tactile_bayes.trial.summary import ModalityReport, TrialReport
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

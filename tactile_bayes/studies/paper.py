@@ -20,6 +20,7 @@ from tactile_bayes.forward.line import (
     TactileLine,
     build_line,
     fit_empirical,
+    fit_shape,
     press,
     press_layers,
     slide,
@@ -28,6 +29,8 @@ from tactile_bayes.forward.plane_strain import CELL_MM, SurfaceCompliance, conde
 from tactile_bayes.forward.tissue import SEATS, Body, Layers
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.options import CaseOptions, TissueOptions
+from tactile_bayes.posterior.bump import cell_mean_gaussian
+from tactile_bayes.posterior.white import LEAST_WIDTH_IN_CELLS, WIDEST_IN_RADII
 from tactile_bayes.presets import HEAD_PITCH_MM, HEADS, SHOULDERS_INSIDE
 
 # --- The forward study of section 2.4: the Gaussian that each lump's map shows, over sizes, depths and stiffnesses.
@@ -39,6 +42,8 @@ FIT_RADIUS_MM = 48.0
 # A bump lower than this share of the background is not called detectable, nor one whose width is not resolved.
 DETECTABLE = 0.02
 HARD_RATIO = 100.0
+# The line is a map that does not change in y: a bump of this width there.
+_NO_CHANGE_MM = 1e6
 
 
 class CaseSettings(CaseOptions, kw_only=True):
@@ -49,6 +54,42 @@ class CaseSettings(CaseOptions, kw_only=True):
     def body(self, d_mm: float, depth_ratio: float, *, seat: float) -> Body:
         """The body of a case."""
         return Body(d_mm, depth_ratio, seat, self.thickness_mm, self.fat_kpa, self.gland_ratio, self.poisson)
+
+    def fitter(self, body: Body) -> Callable[[float], Any]:
+        """From a stiffness ratio of the body's lump to the fit of its map; what all ratios share is computed here."""
+        raise NotImplementedError
+
+    def recipe(self) -> dict[str, Any]:
+        """How maps are made and fitted, as columns of `StudyRow`."""
+        raise NotImplementedError
+
+    def rows(self, geometry: Geometry) -> list[StudyRow]:
+        """The rows of one geometry: the body is condensed once for all stiffnesses of its lump."""
+        body = self.body(geometry.d_mm, geometry.depth_ratio, seat=geometry.seat)
+        fitted, rows = self.fitter(body), []
+        for ratio in geometry.stiffness_ratios:
+            found = fitted(ratio)
+            sigma_x, sigma_y = found.widths_mm
+            rows.append(
+                StudyRow(
+                    seat_name(geometry.seat),
+                    geometry.d_mm,
+                    geometry.depth_ratio,
+                    ratio,
+                    found.amplitude,
+                    sigma_x,
+                    found.rms,
+                    bool(found.amplitude >= DETECTABLE and found.resolved),
+                    sigma_y,
+                    body.layers.thickness_mm,
+                    self.head.radius_mm,
+                    self.head.shoulders,
+                    normalise="mean",
+                    noise="independent",
+                    **self.recipe(),
+                )
+            )
+        return rows
 
 
 class StudySettings(CaseSettings, kw_only=True):
@@ -63,6 +104,13 @@ class StudySettings(CaseSettings, kw_only=True):
     def as_dict(self) -> dict[str, object]:
         """Plain data for a store's header and for a report."""
         return as_dict(self)
+
+    def recipe(self) -> dict[str, Any]:
+        return {"background": "fixed", "fit_radius_mm": self.fit_radius_mm}
+
+    def fitter(self, body: Body) -> Callable[[float], LineFit]:
+        surface = self.surface(body)
+        return lambda ratio: fit_line(build_line(self.frames(surface, ratio)), self.fit_radius_mm)
 
     def surface(self, body: Body) -> SurfaceCompliance:
         """The body condensed onto the surface that the head travels over."""
@@ -114,8 +162,29 @@ class LineFit(Record):
     rms: float  #: Root mean square of what the Gaussian leaves, in units of the background.
     resolved: bool = True  #: True when the width lies within what the fit looks at, and not at an end of it.
 
+    @property
+    def widths_mm(self) -> tuple[float, None]:
+        """Across the head; a line has no width along it."""
+        return self.sigma_mm, None
 
-Fit = Callable[[TactileLine, float], LineFit]  #: Fits Eq 5 to a line within a radius in mm.
+
+def fit_line(line: TactileLine, radius_mm: float) -> LineFit:
+    """Fit Eq 5 with background 1 and the bump on the lump's axis, averaged over cells as for a patient's map.
+
+    Only widths from half a cell to three quarters of the radius count, also as for a patient's map. A bump that runs to
+    either end is reported there.
+    """
+    inside = (np.abs(line.x_mm) <= radius_mm) & (line.count > 0)
+    x, excess = line.x_mm[inside], line.mean[inside] - 1.0
+
+    def bump(log_width: float) -> FloatArray:
+        covariance = np.diag([np.exp(2 * log_width), _NO_CHANGE_MM**2])
+        return cell_mean_gaussian(x, np.zeros_like(x), covariance_mm2=covariance, cell_mm=line.cell_mm)
+
+    ends = np.log([LEAST_WIDTH_IN_CELLS * line.cell_mm, WIDEST_IN_RADII * radius_mm])
+    found = fit_shape(bump, excess, grid=np.linspace(ends[0], ends[1], 60))
+    resolved = bool(ends[0] + 1e-6 < found.parameter < ends[1] - 1e-6)
+    return LineFit(found.height, float(np.exp(found.parameter)), float(np.sqrt(found.sse / len(x))), resolved)
 
 
 class StudyRow(Record):
@@ -170,35 +239,6 @@ def group_cases(cases: Iterable[tuple[float, float, float, float]]) -> list[Geom
             )
         known.append(ratio)
     return [Geometry(*geometry, tuple(found)) for geometry, found in ratios.items()]
-
-
-def run_geometry(geometry: Geometry, *, settings: StudySettings, fit: Fit) -> list[StudyRow]:
-    """The rows of one geometry; `fit` fits Eq 5 and is importable by name, as `batch` needs it."""
-    body = settings.body(geometry.d_mm, geometry.depth_ratio, seat=geometry.seat)
-    surface = settings.surface(body)
-    rows = []
-    for ratio in geometry.stiffness_ratios:
-        found = fit(build_line(settings.frames(surface, ratio)), settings.fit_radius_mm)
-        rows.append(
-            StudyRow(
-                seat_name(geometry.seat),
-                geometry.d_mm,
-                geometry.depth_ratio,
-                ratio,
-                found.amplitude,
-                found.sigma_mm,
-                found.rms,
-                bool(found.amplitude >= DETECTABLE and found.resolved),
-                thickness_mm=body.layers.thickness_mm,
-                head_radius_mm=settings.head.radius_mm,
-                head=settings.head.shoulders,
-                normalise="mean",
-                background="fixed",
-                fit_radius_mm=settings.fit_radius_mm,
-                noise="independent",
-            )
-        )
-    return rows
 
 
 class PrintedEq6(Record):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,12 +11,12 @@ from scipy.optimize import minimize
 
 from tactile_bayes.declarations import Record, as_dict, field, replace
 from tactile_bayes.errors import BadDataError, require
-from tactile_bayes.forward.axisymmetric import CondensedLump, LayeredBody, Tissue, condense_lump
+from tactile_bayes.forward.axisymmetric import CondensedLump, LayeredBody, condense_lump
 from tactile_bayes.forward.mesh import LumpGeometry, MeshSize
 from tactile_bayes.forward.plane_strain import FINENESS
 from tactile_bayes.forward.scene import Head
 from tactile_bayes.forward.solid import RANK_TOLERANCE, PlacedLump, SolidHead, face_of, skin_perturbation, solid_head
-from tactile_bayes.forward.tissue import Body
+from tactile_bayes.forward.tissue import Body, SceneBody
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.accumulate import FlatField
 from tactile_bayes.mapping.build import build_map
@@ -25,7 +25,7 @@ from tactile_bayes.posterior.bump import Bump, FitCells, window_cells
 from tactile_bayes.posterior.white import LEAST_WIDTH_IN_CELLS, MOST_AXIS_RATIO, WIDEST_IN_RADII
 from tactile_bayes.presets import FIT_RADIUS_MM
 from tactile_bayes.scans import CountArray, ElementCalibration, HeadGeometry, PressureFrames, Scan, TrackerPoses
-from tactile_bayes.studies.paper import DETECTABLE, CaseSettings, Geometry, StudyRow, seat_name
+from tactile_bayes.studies.paper import CaseSettings
 
 # --- Maps of a study's raster of frames, built and fitted like a patient's.
 
@@ -39,39 +39,29 @@ _LEAST_WIDTH_IN_PITCHES: Final = 0.8
 _TRIED: Final = 14
 
 
-def raster_scan(frames: RasterFrames) -> Scan:
-    """Convert a raster to a scan: level poses in the body's frame, readings over the frame's mean."""
-    head, count = frames.head, len(frames.x_mm)
-    time = np.arange(float(count)) / 100.0
-    readings = _readings(frames.pressure_kpa)
-    shape = (head.rows, head.columns)
-    return Scan(
-        frames=PressureFrames(time, readings),
-        poses=TrackerPoses(
-            time, np.stack([frames.x_mm, frames.y_mm, frames.depth_mm], axis=-1), np.tile([1.0, 0, 0, 0], (count, 1))
-        ),
-        head=HeadGeometry(head.surface_mm(), head.pitch_mm, np.eye(4)),
-        element_calibration=ElementCalibration(
-            np.full(shape, 1.0 / _COUNTS), np.zeros(shape), saturation_count=np.iinfo(np.uint16).max
-        ),
-        landmarks=None,
-        session={"source": "simulated"},
-    )
-
-
 def raster_map(frames: RasterFrames) -> TactileMap:
     """Build the map of a raster with cells of half a pitch, so that every reading lies in the middle of one.
 
-    Where the raster has a plain frame, the head's own response is taken off as `map --flat-field` takes off a
-    patient's. There it is found from the scan's own calm frames; here it is known.
+    Poses are level and in the body's frame, readings are over the frame's mean. Where the raster has a plain frame, the
+    head's own response is taken off as `map --flat-field` takes off a patient's. There it is found from the scan's own
+    calm frames; here it is known.
     """
-    scan = raster_scan(frames)
+    count, head = len(frames.x_mm), frames.head
+    time, shape = np.arange(float(count)) / 100.0, (head.rows, head.columns)
+    places = np.stack([frames.x_mm, frames.y_mm, frames.depth_mm], axis=-1)
+    gains = np.full(shape, 1.0 / _COUNTS)
+    scan = Scan(
+        frames=PressureFrames(time, _readings(frames.pressure_kpa)),
+        poses=TrackerPoses(time, places, np.tile([1.0, 0, 0, 0], (count, 1))),
+        head=HeadGeometry(head.surface_mm(), head.pitch_mm, np.eye(4)),
+        element_calibration=ElementCalibration(gains, np.zeros(shape), saturation_count=np.iinfo(np.uint16).max),
+        landmarks=None,
+        session={"source": "simulated"},
+    )
     if frames.plain_kpa is not None:
         plain = _readings(frames.plain_kpa)
         scan = FlatField(plain / plain.mean(), frames=1).applied(scan)
-    return build_map(
-        scan, cell_mm=frames.head.pitch_mm / 2, pressure_window_kpa=_WINDOW, normalise="mean", as_stated=True
-    )
+    return build_map(scan, cell_mm=head.pitch_mm / 2, pressure_window_kpa=_WINDOW, normalise="mean", as_stated=True)
 
 
 def _readings(pressure_kpa: FloatArray) -> CountArray:
@@ -88,7 +78,7 @@ def fit_raster(frames: RasterFrames, settings: SolidSettings) -> RasterFit:
     spread over their cells and the Gaussian is averaged there; what remains in both is the average over a taxel.
 
     The lowest minimum between widths of half a taxel and three quarters of the radius is sought with the amplitude, and
-    a free level, eliminated, as in `study.fit_line`: steps of Gauss and Newton do not settle on a faint bump in its
+    a free level, eliminated, as in `paper.fit_line`: steps of Gauss and Newton do not settle on a faint bump in its
     trough.
     """
     radius_mm, free = settings.fit_radius_mm, settings.background == "free"
@@ -182,6 +172,13 @@ class SolidSettings(CaseSettings, kw_only=True):
         """Plain data for a store's header."""
         return {"model": "solid", **as_dict(self)}
 
+    def recipe(self) -> dict[str, Any]:
+        return {name: getattr(self, name) for name in ("background", "fit_radius_mm", "flat_field")}
+
+    def fitter(self, body: Body) -> Callable[[float], RasterFit]:
+        head, condensed = self.on(body), self.condensed(body)
+        return lambda ratio: fit_raster(raster_frames(head, self.placed(condensed, ratio), self), self)
+
     def geometry(self, body: Body) -> LumpGeometry:
         """The ball in the body."""
         layers, radius = body.layers, body.radius_mm
@@ -189,7 +186,7 @@ class SolidSettings(CaseSettings, kw_only=True):
 
     def condensed(self, body: Body) -> CondensedLump:
         """The body around the ball, condensed."""
-        tissue = Tissue(body.fat_kpa, body.gland_ratio, body.poisson)
+        tissue = SceneBody(body.fat_kpa, body.gland_ratio, nu=body.poisson)
         return condense_lump(self.geometry(body), tissue, size=self.mesh_size)
 
     @property
@@ -248,9 +245,10 @@ class RasterFit(Record):
     rms: float  #: Root mean square of what the Gaussian leaves, in units of the background.
     resolved: bool  #: True when both widths are ones that array and window can tell.
 
-
-RasterFitter = Callable[[RasterFrames, SolidSettings], RasterFit]
-"""Builds the map of a raster and fits Eq 7 with the radius and the level of the settings."""
+    @property
+    def widths_mm(self) -> tuple[float, float]:
+        """Across and along the head."""
+        return self.sigma_x_mm, self.sigma_y_mm
 
 
 def raster_frames(head: SolidHead, lump: PlacedLump | None, settings: SolidSettings) -> RasterFrames:
@@ -286,37 +284,3 @@ def raster_frames(head: SolidHead, lump: PlacedLump | None, settings: SolidSetti
         plain = head.frame([], rotation=_LEVEL, x_mm=0.0, y_mm=0.0, mean_kpa=settings.mean_kpa).pressure_kpa
     place = np.array(places)
     return RasterFrames(place[:, 0], place[:, 1], np.array(depths), np.stack(frames), settings.head, plain)
-
-
-def run_solid_geometry(geometry: Geometry, *, settings: SolidSettings, fit: RasterFitter) -> list[StudyRow]:
-    """The rows of one geometry: the body is condensed once for all stiffnesses of its lump.
-
-    `fit` builds the map and fits Eq 7; it is importable by name, as `batch` needs it.
-    """
-    body = settings.body(geometry.d_mm, geometry.depth_ratio, seat=geometry.seat)
-    head, condensed = settings.on(body), settings.condensed(body)
-    rows = []
-    for ratio in geometry.stiffness_ratios:
-        found = fit(raster_frames(head, settings.placed(condensed, ratio), settings), settings)
-        rows.append(
-            StudyRow(
-                seat_name(geometry.seat),
-                geometry.d_mm,
-                geometry.depth_ratio,
-                ratio,
-                found.amplitude,
-                found.sigma_x_mm,
-                found.rms,
-                bool(found.amplitude >= DETECTABLE and found.resolved),
-                found.sigma_y_mm,
-                body.layers.thickness_mm,
-                settings.head.radius_mm,
-                settings.head.shoulders,
-                normalise="mean",
-                background=settings.background,
-                fit_radius_mm=settings.fit_radius_mm,
-                noise="independent",
-                flat_field=settings.flat_field,
-            )
-        )
-    return rows

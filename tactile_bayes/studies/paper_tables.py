@@ -13,7 +13,7 @@ from tactile_bayes.forward.line import EmpiricalModel, LineFrames, TactileLine, 
 from tactile_bayes.forward.plane_strain import SurfaceCompliance
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.presets import HEAD_PITCH_MM, SHOULDERS_INSIDE, SHOULDERS_OUTSIDE
-from tactile_bayes.studies.paper import HARD_RATIO, Fit, LineFit, StudySettings
+from tactile_bayes.studies.paper import HARD_RATIO, LineFit, StudySettings, fit_line
 
 # --- Tables 1 and 2 of the paper and the phantoms of its section 2.3: the empirical model against the elastic one.
 #
@@ -127,7 +127,7 @@ def scene_curves(scene: Scene, settings: StudySettings, *, surface: SurfaceCompl
     return Curves(elastic, empirical, build_line(elastic), build_line(empirical), model)
 
 
-def compare(scene: Scene, *, settings: StudySettings, fit: Fit, surface: SurfaceCompliance | None = None) -> Agreement:
+def compare(scene: Scene, *, settings: StudySettings, surface: SurfaceCompliance | None = None) -> Agreement:
     """One scene's figures; `surface` as in `scene_curves`."""
     curves = scene_curves(scene, settings, surface=surface)
     inside = np.abs(curves.elastic_map.x_mm) <= settings.fit_radius_mm
@@ -141,19 +141,19 @@ def compare(scene: Scene, *, settings: StudySettings, fit: Fit, surface: Surface
         mean_squared_difference(fitted.pressure_kpa, seen.pressure_kpa),
         mean_squared_difference(ours, theirs),
         float(np.sum((ours - theirs) ** 2) / np.sum((theirs - 1.0) ** 2)),
-        fit(curves.elastic_map, settings.fit_radius_mm),
-        fit(curves.empirical_map, settings.fit_radius_mm),
+        fit_line(curves.elastic_map, settings.fit_radius_mm),
+        fit_line(curves.empirical_map, settings.fit_radius_mm),
         mean_squared_difference(*shares),
         tuple((by(*frames), by(*shares), by(ours, theirs)) for by in OTHER_DEFINITIONS.values()),
     )
 
 
-def compare_heads(scene: Scene, *, settings: StudySettings, heads: Sequence[Head], fit: Fit) -> list[Agreement]:
+def compare_heads(scene: Scene, *, settings: StudySettings, heads: Sequence[Head]) -> list[Agreement]:
     """One scene's figures under each of several heads; the body is condensed once."""
     widest = max(heads, key=lambda head: head.half_face_mm)
     body = settings.body(scene.d_mm, scene.depth_ratio, seat=scene.seat)
     surface = replace(settings, head=widest).surface(body)
-    return [compare(scene, settings=replace(settings, head=head), fit=fit, surface=surface) for head in heads]
+    return [compare(scene, settings=replace(settings, head=head), surface=surface) for head in heads]
 
 
 def table_distance(found: Sequence[Agreement]) -> float:

@@ -38,14 +38,14 @@ from tactile_bayes.studies.estimate_tradeoff import (
 )
 from tactile_bayes.studies.paper import (
     HARD_RATIO,
-    Fit,
     Geometry,
+    LineFit,
     StudyRow,
     StudySettings,
+    fit_line,
     learn_as_printed,
-    run_geometry,
 )
-from tactile_bayes.studies.paper_solid import RasterFitter, SolidSettings, raster_frames, run_solid_geometry
+from tactile_bayes.studies.paper_solid import SolidSettings
 
 # --- Cost and error of each forward model and setting for one lump, measured on this machine.
 #
@@ -179,72 +179,39 @@ def _kind(default: bool, mesh_only: bool, reference: bool, other: str) -> str:
     return "default" if default else "mesh" if mesh_only else other
 
 
-def measure_forward(
-    case: LumpCase, setting: Setting, *, fit: Fit, raster_fit: RasterFitter, clock: Clock, runs: int = 1
-) -> Measured:
-    """Compute the map by one setting and measure the time.
+def measure_forward(case: LumpCase, setting: Setting, *, clock: Clock, runs: int = 1) -> Measured:
+    """Compute the map by one setting and measure the time, of so many `runs` the least.
 
-    `fit` is of Eq 5 to a line, `raster_fit` of Eq 7 to a raster; `clock` is called before and after each part, and the
-    least of so many `runs` is kept.
+    `clock` is called before and after each part.
     """
-    work = {EMPIRICAL: _empirical, PLANE: _plane, SOLID: _solid}[setting.model]
     times = []
     for _ in range(runs):
         begun = clock()
-        prepared = work(case, setting)
+        fitted = _empirical(case) if setting.model == EMPIRICAL else setting.settings.fitter(case.body)
         middle = clock()
-        found = prepared(fit, raster_fit)
+        found = fitted(case.stiffness_ratio)
         times.append((middle - begun, clock() - middle))
     lump, one_map = np.min(times, axis=0)
-    return Measured(setting, _element_mm(case, setting), float(lump), float(one_map), *found)
+    element = _element_mm(case, setting.settings)
+    return Measured(setting, element, float(lump), float(one_map), found.amplitude, *found.widths_mm)
 
 
-_Shown = tuple[float, float, float | None]
-_Prepared = Callable[[Fit, RasterFitter], _Shown]
-
-
-def _empirical(case: LumpCase, setting: Setting) -> _Prepared:
-    settings = setting.settings
-    assert isinstance(settings, StudySettings)
+def _empirical(case: LumpCase) -> Callable[[float], LineFit]:
+    """The fit of the map of Eqs 1 to 4, which are fitted to plane-strain frames."""
+    settings = case.plane
     over = settings.over(settings.surface(case.body), case.stiffness_ratio)
     model = settings.empirical(case.d_mm, case.body.layers, over)
 
-    def shown(fit: Fit, _: RasterFitter) -> _Shown:
-        frames = model.frames(head_positions(settings.positions_mm), over.s_mm)
-        found = fit(build_line(frames), settings.fit_radius_mm)
-        return found.amplitude, found.sigma_mm, None
+    def fitted(_: float) -> LineFit:
+        return fit_line(
+            build_line(model.frames(head_positions(settings.positions_mm), over.s_mm)), settings.fit_radius_mm
+        )
 
-    return shown
-
-
-def _plane(case: LumpCase, setting: Setting) -> _Prepared:
-    settings = setting.settings
-    assert isinstance(settings, StudySettings)
-    surface = settings.surface(case.body)
-
-    def shown(fit: Fit, _: RasterFitter) -> _Shown:
-        found = fit(build_line(settings.frames(surface, case.stiffness_ratio)), settings.fit_radius_mm)
-        return found.amplitude, found.sigma_mm, None
-
-    return shown
+    return fitted
 
 
-def _solid(case: LumpCase, setting: Setting) -> _Prepared:
-    settings = setting.settings
-    assert isinstance(settings, SolidSettings)
-    head, condensed = settings.on(case.body), settings.condensed(case.body)
-
-    def shown(_: Fit, raster_fit: RasterFitter) -> _Shown:
-        frames = raster_frames(head, settings.placed(condensed, case.stiffness_ratio), settings)
-        found = raster_fit(frames, settings)
-        return found.amplitude, found.sigma_x_mm, found.sigma_y_mm
-
-    return shown
-
-
-def _element_mm(case: LumpCase, setting: Setting) -> float:
+def _element_mm(case: LumpCase, settings: StudySettings | SolidSettings) -> float:
     """Half the lump's circumference over the elements on it."""
-    settings = setting.settings
     if isinstance(settings, SolidSettings):
         nodes = len(lump_mesh(settings.geometry(case.body), settings.mesh_size).arc)
     else:
@@ -252,19 +219,15 @@ def _element_mm(case: LumpCase, setting: Setting) -> float:
     return float(np.pi * case.body.radius_mm / ((nodes - 1) / 2))
 
 
-def teach(
-    case: LumpCase, model: str, *, fit: Fit, raster_fit: RasterFitter, progress: Callable[[int, int], None]
-) -> list[StudyRow]:
+def teach(case: LumpCase, model: str, *, progress: Callable[[int, int], None]) -> list[StudyRow]:
     """Simulate hard lumps of several sizes and depths in the case's body, to learn Eq 6 from."""
     geometries = [Geometry(case.seat, d, h, (HARD_RATIO,)) for d in _TAUGHT_MM for h in _TAUGHT_DEPTHS]
     deepest = max(d * (h + max(0.6, 0.5 * case.seat)) + 2.0 for d in _TAUGHT_MM for h in _TAUGHT_DEPTHS)
     thickness = max(case.solid.thickness_mm or THICKNESS_MM, deepest)
+    settings = replace(case.solid if model == SOLID else case.plane, thickness_mm=thickness)
     rows: list[StudyRow] = []
     for number, geometry in enumerate(geometries, start=1):
-        if model == SOLID:
-            rows += run_solid_geometry(geometry, settings=replace(case.solid, thickness_mm=thickness), fit=raster_fit)
-        else:
-            rows += run_geometry(geometry, settings=replace(case.plane, thickness_mm=thickness), fit=fit)
+        rows += settings.rows(geometry)
         progress(number, len(geometries))
     return rows
 

@@ -9,10 +9,9 @@ from itertools import combinations
 from typing import Annotated
 
 import numpy as np
-import numpy.typing as npt
 from scipy.special import betaincinv
 
-from tactile_bayes.declarations import Meta, Record, replace
+from tactile_bayes.declarations import Meta, replace
 from tactile_bayes.trial.figures import (
     Count,
     Ends,
@@ -321,45 +320,11 @@ def mape_ratio(sizes: ModalitySizes, reference: ModalitySizes, *, confidence: fl
 
     The interval leaves each patient out of both at once, so that patients hard for both do not widen it.
     """
-    return resampled(Pair(sizes, reference, ratio), scale="log", confidence=confidence)
+    return resampled(_pair(sizes, reference, ratio), scale="log", confidence=confidence)
 
 
-class Pair(Record):
-    """A statistic of two modalities' percent errors, which can be resampled by patients."""
-
-    sizes: ModalitySizes
-    reference: ModalitySizes
-    combine: Callable[[FloatArray, FloatArray], FloatArray]
-
-    @property
-    def patients(self) -> npt.NDArray[np.int64]:
-        """Patients with a mass in either modality."""
-        return np.union1d(self.sizes.patients, self.reference.patients)
-
-    def _samples(self) -> tuple[Sample, Sample]:
-        among = self.patients
-        return Sample(mape_percent, self.sizes, among), Sample(mape_percent, self.reference, among)
-
-    def value(self) -> float:
-        """The statistic from all patients."""
-        one, other = (sample.value() for sample in self._samples())
-        return self._combined(np.array(one), np.array(other)).item()
-
-    def left_out(self) -> FloatArray:
-        """(g,) statistic without each patient."""
-        one, other = (sample.left_out() for sample in self._samples())
-        return self._combined(one, other)
-
-    def redrawn(self, draws: FloatArray) -> FloatArray:
-        """(b,) statistic from patients drawn anew."""
-        one, other = (sample.redrawn(draws) for sample in self._samples())
-        return self.combine(one, other)
-
-    def _combined(self, one: FloatArray, other: FloatArray) -> FloatArray:
-        values = self.combine(one, other)
-        if np.any(np.isnan(values)):
-            raise UndefinedError(f"the error of {self.reference.name} is 0")
-        return values
+def _pair(sizes: ModalitySizes, reference: ModalitySizes, combine: Callable[..., FloatArray]) -> Sample:
+    return Sample(mape_percent, (sizes, reference), combine, f"the error of {reference.name} is 0")
 
 
 # --- Paired comparison of two modalities: difference and ratio of errors, and a permutation test.
@@ -444,8 +409,8 @@ def sign_flip(by_patient: FloatArray, *, seed: int, flips: int = FLIPS) -> float
 
 def _compare(one: ModalitySizes, other: ModalitySizes, *, confidence: float, seed: int) -> PairedComparison:
     first, second = on_common_masses(one, other)
-    difference = resampled(Pair(first, second, np.subtract), scale="linear", confidence=confidence)
-    quotient = resampled(Pair(first, second, ratio), scale="log", confidence=confidence)
+    difference = resampled(_pair(first, second, np.subtract), scale="linear", confidence=confidence)
+    quotient = resampled(_pair(first, second, ratio), scale="log", confidence=confidence)
     patients = first.patients
     with np.errstate(all="ignore"):
         off = np.abs(first.size_mm / first.ex_vivo_mm - 1) - np.abs(second.size_mm / second.ex_vivo_mm - 1)

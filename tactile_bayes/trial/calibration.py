@@ -8,11 +8,12 @@ from itertools import groupby
 from typing import Annotated
 
 import numpy as np
+import numpy.typing as npt
 from scipy.special import chdtri, kolmogi, ndtr, ndtri
 
 from tactile_bayes.declarations import Meta, Record
 from tactile_bayes.trial.figures import MIN_PATIENTS, Count, Ends, Share, clopper_pearson
-from tactile_bayes.trial.readings import FloatArray, IntervalReading, Reading
+from tactile_bayes.trial.readings import FloatArray, IntervalReading, Reading, Trial, mass_numbers
 
 # --- Coverage of stated intervals against the size after excision.
 
@@ -65,12 +66,7 @@ class Prediction(Record, eq=False):
     """`median_log`, `sd_log`: (n,) arrays of each prediction: the logarithm of its median in mm and its SD, caliper
     error included."""
     found_log: FloatArray  #: (n,) array: logarithm of the ex-vivo size in mm.
-    mass: FloatArray
-    patient: FloatArray
-    """`mass`, `patient`: (n,) arrays of numbers."""
-
-    def __len__(self) -> int:
-        return len(self.found_log)
+    mass: npt.NDArray[np.int64]  #: (n,) array of the masses' numbers.
 
     @property
     def z(self) -> FloatArray:
@@ -112,20 +108,18 @@ class Calibration(Record):
     advice: str
 
 
-def calibration(prediction: Prediction, *, confidence: float) -> Calibration | None:
-    """Judge predictions; None when there are none.
+def calibration(prediction: Prediction, *, confidence: float) -> Calibration:
+    """Judge predictions, of which there is one at least.
 
     Readings of one mass share its ex-vivo size, so n readings on m masses count as m trials wherever chance is judged.
     """
-    if len(prediction) == 0:
-        return None
     z = prediction.z
     pit = ndtr(z)
     masses = len(np.unique(prediction.mass))
     ordered = np.sort(pit)
     steps = np.arange(len(pit) + 1) / len(pit)
     distance = float(max(np.max(steps[1:] - ordered), np.max(ordered - steps[:-1])))
-    scale, ends = _scale(z, prediction.mass, confidence=confidence)
+    scale, ends = _scale(z, masses, confidence=confidence)
     shift = 100 * math.expm1(float(np.median(prediction.found_log - prediction.median_log)))
     levels = []
     for level in LEVELS:
@@ -134,7 +128,7 @@ def calibration(prediction: Prediction, *, confidence: float) -> Calibration | N
         levels.append(LevelCoverage(level, covered, len(z), share))
     band = float(kolmogi(1 - confidence)) / math.sqrt(masses)
     return Calibration(
-        n=len(prediction),
+        n=len(z),
         masses=masses,
         levels=tuple(levels),
         pit=tuple(int(count) for count in np.histogram(pit, bins=BINS, range=(0, 1))[0]),
@@ -190,30 +184,25 @@ def log_normal(reading: Reading) -> tuple[float, float] | None:
     return None
 
 
-def predictions(
-    stated: Sequence[tuple[float, float]],
-    ex_vivo_mm: Sequence[float],
-    ex_vivo_sd_mm: Sequence[float | None],
-    *,
-    masses: Sequence[int],
-    patients: Sequence[int],
-) -> Prediction:
-    """Stated medians and SDs, with the caliper's relative error added in quadrature."""
-    found = np.array(ex_vivo_mm, dtype=np.float64)
-    caliper = np.array([sd or 0.0 for sd in ex_vivo_sd_mm]) / (found if len(found) else 1.0)
-    medians, sds = (np.array([one[i] for one in stated], dtype=np.float64) for i in (0, 1))
+def prediction_of(trial: Trial, modality: str) -> Prediction | None:
+    """Stated uncertainties of a modality's readings as predictive distributions; None where no reading states one.
+
+    The caliper's relative error is added in quadrature.
+    """
+    kept = [(one.key, stated) for one in trial.found(modality) if (stated := log_normal(one)) is not None]
+    if not kept:
+        return None
+    masses = mass_numbers(trial.ex_vivo_mm)
+    found = np.array([trial.ex_vivo_mm[key] for key, _ in kept], dtype=np.float64)
+    caliper = np.array([trial.ex_vivo_sd_mm.get(key) or 0.0 for key, _ in kept]) / found
+    medians, sds = np.array([stated for _, stated in kept], dtype=np.float64).T
     return Prediction(
-        median_log=medians,
-        sd_log=np.sqrt(sds**2 + np.log1p(caliper**2)),
-        found_log=np.log(found),
-        mass=np.array(masses, dtype=np.float64),
-        patient=np.array(patients, dtype=np.float64),
+        medians, np.sqrt(sds**2 + np.log1p(caliper**2)), np.log(found), np.array([masses[key] for key, _ in kept])
     )
 
 
-def _scale(z: FloatArray, mass: FloatArray, *, confidence: float) -> tuple[float, Ends]:
+def _scale(z: FloatArray, masses: int, *, confidence: float) -> tuple[float, Ends]:
     """Root mean square of z, and its chi-squared interval with one degree of freedom per mass."""
-    masses = len(np.unique(mass))
     mean = float(np.mean(z**2))
     tail = 0.5 - 0.5 * confidence
     low, high = masses * mean / float(chdtri(masses, tail)), masses * mean / float(chdtri(masses, 1 - tail))

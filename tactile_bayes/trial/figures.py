@@ -5,8 +5,8 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Callable, Mapping, Sequence
-from functools import lru_cache, partial
-from typing import Annotated, Any, Literal, Protocol, TypeVar, assert_never
+from functools import lru_cache
+from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -332,100 +332,83 @@ def figure(
     28, 169).
     """
     if scale is None or confidence is None:
-        return _plain(partial(finite, statistic, sizes))
+        try:
+            return Figure(finite(statistic, sizes))
+        except UndefinedError as undefined:
+            return Figure(None, str(undefined))
     freedom = None
     if leverage is not None and method_of(confidence) == "corrected" and len(sizes.size_mm):
         freedom = effective_number(leverage(sizes), sizes.patient)
-    return resampled(Sample(statistic, sizes), scale=scale, confidence=confidence, freedom=freedom)
-
-
-class Resampled(Protocol):
-    """A statistic that can be computed without one patient, or from patients drawn anew."""
-
-    @property
-    def patients(self) -> npt.NDArray[np.int64]:
-        """Patients to leave out in turn."""
-        ...
-
-    def value(self) -> float:
-        """The statistic from all patients; raises `UndefinedError`."""
-        ...
-
-    def left_out(self) -> FloatArray:
-        """(g,) statistic without each patient; raises `UndefinedError`."""
-        ...
-
-    def redrawn(self, draws: FloatArray) -> FloatArray:
-        """(b,) statistic for each row of (b, g) counts of patients; NaN where undefined."""
-        ...
+    return resampled(Sample(statistic, (sizes,)), scale=scale, confidence=confidence, freedom=freedom)
 
 
 class Sample(Record):
-    """A statistic of one modality, which can be resampled."""
+    """A statistic of one modality, or of two combined, which can be computed again from other patients."""
 
     statistic: Statistic
-    sizes: ModalitySizes
-    among: npt.NDArray[np.int64] | None = None
+    sizes: tuple[ModalitySizes, ...]
+    combine: Callable[..., FloatArray] = lambda one: one  #: Of the statistics of all modalities.
+    undefined: str = ""  #: The reason when `combine` gives NaN.
 
     @property
     def patients(self) -> npt.NDArray[np.int64]:
-        return self.sizes.patients if self.among is None else self.among
+        """Patients with a mass in any modality."""
+        return np.unique(np.concatenate([one.patient for one in self.sizes]))
 
     def value(self) -> float:
-        return finite(self.statistic, self.sizes)
+        """The statistic from all patients."""
+        return self._combined([np.array(finite(self.statistic, one)) for one in self.sizes]).item()
 
     def left_out(self) -> FloatArray:
-        if isinstance(self.statistic, SumStatistic):
-            with np.errstate(all="ignore"):
-                values = self.statistic.left_out(self.sizes, self.patients)
-            if np.all(np.abs(values) < LARGEST):
-                return values
-        return np.array([finite(self.statistic, self.sizes.without(one)) for one in self.patients.tolist()])
+        """(g,) statistic without each patient."""
+        return self._combined([self._without_each(one, self.patients) for one in self.sizes])
 
     def redrawn(self, draws: FloatArray) -> FloatArray:
+        """(b,) statistic for each row of (b, g) counts of patients; NaN where undefined."""
+        return self.combine(*(self._drawn_anew(one, self.patients, draws) for one in self.sizes))
+
+    def _combined(self, values: Sequence[FloatArray]) -> FloatArray:
+        made = self.combine(*values)
+        if np.any(np.isnan(made)):
+            raise UndefinedError(self.undefined)
+        return made
+
+    def _without_each(self, sizes: ModalitySizes, patients: npt.NDArray[np.int64]) -> FloatArray:
         if isinstance(self.statistic, SumStatistic):
             with np.errstate(all="ignore"):
-                return self.statistic.redrawn(self.sizes, self.patients, draws)
+                values = self.statistic.left_out(sizes, patients)
+            if np.all(np.abs(values) < LARGEST):
+                return values
+        return np.array([finite(self.statistic, sizes.without(one)) for one in patients.tolist()])
+
+    def _drawn_anew(self, sizes: ModalitySizes, patients: npt.NDArray[np.int64], draws: FloatArray) -> FloatArray:
+        if isinstance(self.statistic, SumStatistic):
+            with np.errstate(all="ignore"):
+                return self.statistic.redrawn(sizes, patients, draws)
         values = np.full(len(draws), np.nan)
-        times = draws[:, np.searchsorted(self.patients, self.sizes.patient)].astype(np.int64)
+        times = draws[:, np.searchsorted(patients, sizes.patient)].astype(np.int64)
         for i, of_mass in enumerate(times):
             with contextlib.suppress(UndefinedError):
-                values[i] = finite(self.statistic, self.sizes.take(np.repeat(np.arange(len(of_mass)), of_mass)))
+                values[i] = finite(self.statistic, sizes.take(np.repeat(np.arange(len(of_mass)), of_mass)))
         return values
 
 
-def resampled(sample: Resampled, *, scale: Scale, confidence: float, freedom: float | None = None) -> Figure:
+def resampled(sample: Sample, *, scale: Scale, confidence: float, freedom: float | None = None) -> Figure:
     """Compute a figure with its interval over patients; `freedom` as in `interval_from_values`."""
-    plain = _plain(sample.value)
-    if plain.value is None:
-        return replace(plain, has_interval=True, interval_reason=plain.reason)
+    value: float | None = None
     try:
-        need_patients(len(sample.patients))
-        interval = _interval(sample, plain.value, scale=scale, confidence=confidence, freedom=freedom)
+        value, patients = sample.value(), len(sample.patients)
+        need_patients(patients)
+        left_out, level = sample.left_out(), float(confidence)
+        if isinstance(confidence, Intervals) and confidence.method == "bca":
+            draws = draw_patients(patients, resamples=confidence.resamples, seed=confidence.seed)
+            interval = bca_interval(value, sample.redrawn(draws), left_out, confidence=level)
+        else:
+            interval = interval_from_values(value, left_out, scale=scale, confidence=level, freedom=freedom)
     except UndefinedError as undefined:
-        return replace(plain, has_interval=True, interval_reason=str(undefined))
-    return replace(plain, has_interval=True, interval=interval)
-
-
-def _interval(
-    sample: Resampled, value: float, *, scale: Scale, confidence: float, freedom: float | None
-) -> tuple[float, float]:
-    chosen = confidence if isinstance(confidence, Intervals) else Intervals(confidence)
-    match chosen.method:
-        case "corrected" | "jackknife":
-            left_out = sample.left_out()
-            return interval_from_values(value, left_out, scale=scale, confidence=float(chosen), freedom=freedom)
-        case "bca":
-            draws = draw_patients(len(sample.patients), resamples=chosen.resamples, seed=chosen.seed)
-            return bca_interval(value, sample.redrawn(draws), sample.left_out(), confidence=float(chosen))
-    assert_never(chosen.method)
-
-
-def _plain(compute: Callable[[], float]) -> Figure:
-    try:
-        return Figure(compute())
-    except UndefinedError as undefined:
-        return Figure(None, reason=str(undefined))
+        reason = str(undefined)
+        return Figure(value, reason if value is None else "", None, reason, has_interval=True)
+    return Figure(value, interval=interval, has_interval=True)
 
 
 def finite(statistic: Statistic, sizes: ModalitySizes) -> float:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from functools import cache, partial
 
 import numpy as np
-from scipy.special import chdtri, gammaincc, gammaincinv, gammaln, ndtr, ndtri, stdtr
+from scipy.special import chdtri, chndtrix, gammaincc, nctdtrit, ndtri, stdtr
 
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.trial.figures import (
@@ -34,20 +34,13 @@ from tactile_bayes.trial.readings import FloatArray, ModalitySizes
 _NODES = 400
 
 
-@cache
 def percentile_factor(n: int, *, percentile: float, confidence: float) -> float:
     r"""k with :math:`P(\mu + z_p \sigma \le \bar x + k s) =` `confidence` for a sample of n.
 
     A quantile of the noncentral t distribution over root n: the one-sided tolerance factor (Odeh & Owen 1980).
     Carkeet (2015), Optom. Vis. Sci. 92, e71, uses it for limits of agreement taken one at a time.
     """
-    z = float(ndtri(percentile))
-    chi, weight = _chi_nodes(n - 1)
-
-    def reached(k: float) -> float:
-        return float(weight @ ndtr(math.sqrt(n) * (k * chi - z)))
-
-    return _root(reached, confidence)
+    return float(nctdtrit(n - 1, math.sqrt(n) * float(ndtri(percentile)), confidence)) / math.sqrt(n)
 
 
 @cache
@@ -61,52 +54,17 @@ def content_factor(n: int, *, content: float, confidence: float) -> float:
     reach = min(9.0, float(ndtri(1 - 1e-17)))
     off = (at + 1) / 2 * reach
     weight = normal / 2 * reach * 2 * np.exp(-(off**2) / 2) / math.sqrt(2 * math.pi)
-    radius = _radius(off / math.sqrt(n), content)
-    freedom = n - 1
+    radius2, freedom = chndtrix(content, 1, off**2 / n), n - 1  # Phi(shift + r) - Phi(shift - r) = content
 
     def reached(k: float) -> float:
-        if k <= 0:
-            return 0.0
-        return float(weight @ gammaincc(freedom / 2, freedom * (radius / k) ** 2 / 2))
+        return float(weight @ gammaincc(freedom / 2, freedom * radius2 / k**2 / 2))
 
-    return _root(reached, confidence)
-
-
-def _radius(shift: FloatArray, content: float) -> FloatArray:
-    """Solve Phi(shift + r) - Phi(shift - r) = content for r."""
-    low, high = np.zeros_like(shift), np.abs(shift) + float(ndtri(0.5 + 0.5 * content)) + 1e-9
-    for _ in range(80):
-        middle = (low + high) / 2
-        short = ndtr(shift + middle) - ndtr(shift - middle) < content
-        low, high = np.where(short, middle, low), np.where(short, high, middle)
-    return (low + high) / 2
-
-
-def _chi_nodes(freedom: int) -> tuple[FloatArray, FloatArray]:
-    """Values of s / sigma and their probabilities: Gauss-Legendre in the logarithm of s^2 / sigma^2."""
-    half = freedom / 2
-    low = max(float(gammaincinv(half, 1e-18)), 1e-300) / half
-    high = float(half + 12 * math.sqrt(half) + 80) / half
-    at, normal = np.polynomial.legendre.leggauss(_NODES)
-    a, b = math.log(low), math.log(high)
-    log_v = a + (at + 1) / 2 * (b - a)
-    v = np.exp(log_v)
-    weight = normal / 2 * (b - a) * np.exp(half * (log_v - v) + half * math.log(half) - float(gammaln(half)))
-    return np.sqrt(v), weight / weight.sum()
-
-
-def _root(function: Callable[[float], float], target: float) -> float:
-    """Solve an increasing function for a target by bisection, to 1e-12 of its size."""
-    low, high = -1.0, 1.0
-    while function(high) < target and high < 1e12:
+    low, high = 0.0, 1.0
+    while reached(high) < confidence and high < 1e12:
         low, high = high, 4 * high
-    while function(low) > target and low > -1e12:
-        low, high = 4 * low, low
-    for _ in range(200):
+    while high - low > 1e-13 * high:
         middle = (low + high) / 2
-        if middle in (low, high) or high - low < 1e-13 * max(1.0, abs(middle)):
-            break
-        low, high = (middle, high) if function(middle) < target else (low, middle)
+        low, high = (middle, high) if reached(middle) < confidence else (low, middle)
     return (low + high) / 2
 
 
@@ -329,7 +287,7 @@ def _jackknifed(
     statistic: SumStatistic, found: ModalitySizes, *, scale: Scale, confidence: float
 ) -> tuple[float, Ends]:
     """Value with its jackknife interval, and the degrees of freedom of its leave-one-out values."""
-    sample = Sample(statistic, found)
+    sample = Sample(statistic, (found,))
     value, left = sample.value(), sample.left_out()
     freedom = kurtosis_freedom(np.asarray(on_scale(left, scale)))
     return value, interval_from_values(value, left, scale=scale, confidence=float(confidence), freedom=freedom)

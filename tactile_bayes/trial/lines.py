@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -87,9 +86,6 @@ class PairAngles:
 
 def kendall_sign(x: FloatArray, y: FloatArray) -> int:
     """Sign of Kendall's tau: concordant less discordant pairs."""
-    if len(x) <= MOST_LISTED:
-        first, second = np.triu_indices(len(x), 1)
-        return int(np.sign(np.sum(np.sign(x[second] - x[first]) * np.sign(y[second] - y[first]))))
     order = np.lexsort((y, x))
     discordant = _inversions(x[order], y[order], ties=False)
     tied = _pairs_of_equals(x[order][:, None]) + _pairs_of_equals(np.sort(y)[:, None])
@@ -160,10 +156,7 @@ def _inversions_of_permutation(rank: npt.NDArray[np.int64]) -> int:
 #
 # Conventions, those that laboratories' programs share: the slope of a vertical pair is +90 degrees when Kendall's
 # tau is 0 or more and -90 degrees otherwise; coincident pairs are left out; a slope of exactly -1 (+1 for a falling
-# line) counts half in the shift; means of two middle slopes are taken between angles (``radian``) or between slopes
-# (``tangent``).
-
-Measure = Literal["radian", "tangent"]
+# line) counts half in the shift; means of two middle slopes are taken between angles.
 
 
 class PassingBablok(Record):
@@ -176,9 +169,7 @@ class PassingBablok(Record):
     n: int
 
 
-def passing_bablok(
-    x: FloatArray, y: FloatArray, *, confidence: float = 0.95, measure: Measure = "radian"
-) -> PassingBablok:
+def passing_bablok(x: FloatArray, y: FloatArray, *, confidence: float = 0.95) -> PassingBablok:
     """Fit y on x without assuming a distribution or knowing which method errs more.
 
     Undefined with fewer than two different points, when the middle slope is vertical, or when so many slopes are beyond
@@ -197,10 +188,10 @@ def passing_bablok(
     shift = angles.shift(rising=rising)
     if (angles.number + shift) // 2 + 1 > angles.number or angles.number + shift < 1:
         raise UndefinedError("the shifted median lies beyond the slopes: the points neither rise nor fall")
-    slope = _at(angles, angles.number + shift, measure)
+    slope = _at(angles, angles.number + shift)
     if not abs(slope) < 1e15:
         raise UndefinedError("the middle slope is vertical")
-    ends = _slope_ends(angles, shift, rising=rising, confidence=confidence, measure=measure, n=len(x))
+    ends = _slope_ends(angles, shift, rising=rising, confidence=confidence, n=len(x))
     return PassingBablok(
         intercept=float(np.median(y - slope * x)),
         slope=slope,
@@ -212,9 +203,7 @@ def passing_bablok(
     )
 
 
-def _slope_ends(
-    angles: PairAngles, shift: int, *, rising: bool, confidence: float, measure: Measure, n: int
-) -> tuple[float, float]:
+def _slope_ends(angles: PairAngles, shift: int, *, rising: bool, confidence: float, n: int) -> tuple[float, float]:
     sd = math.sqrt(n * (n - 1) * (2 * n + 5) / 18)
     reach = math.floor(float(ndtri(0.5 + 0.5 * confidence)) * sd + 0.5)
     low, high = angles.number - reach + shift, angles.number + reach + shift
@@ -222,19 +211,14 @@ def _slope_ends(
     least = 2 * angles.exactly_on_the_shift(rising=rising) + 1
     if (low + 1) // 2 < least or (high + 1) // 2 > angles.number - (high % 2 == 0):
         return -math.inf, math.inf
-    return _at(angles, low, measure), _at(angles, high, measure)
+    return _at(angles, low), _at(angles, high)
 
 
-def _at(angles: PairAngles, twice: int, measure: Measure) -> float:
+def _at(angles: PairAngles, twice: int) -> float:
     """The slope at rank (twice + 1) / 2: one ordered angle, or the middle of two."""
     rank = (twice + 1) // 2
     first = angles.ranked(rank)
-    if twice % 2:
-        return math.tan(first)
-    second = angles.ranked(rank + 1)
-    if measure == "tangent":
-        return (math.tan(first) + math.tan(second)) / 2
-    return math.tan((first + second) / 2)
+    return math.tan(first if twice % 2 else (first + angles.ranked(rank + 1)) / 2)
 
 
 # --- Straight lines between two methods: least squares, Deming and weighted Deming regression.

@@ -9,7 +9,7 @@ from typing import Annotated, Literal, TypeVar
 
 import numpy as np
 
-from tactile_bayes.declarations import UNSET, Meta, UnsetType, replace
+from tactile_bayes.declarations import UNSET, Meta, UnsetType
 from tactile_bayes.trial import limits as bland_altman
 from tactile_bayes.trial.figures import (
     Count,
@@ -138,10 +138,7 @@ def _figures(found: ModalitySizes, *, confidence: float, error_ratio: float, rob
     slope: Scale = "slope" if method_of(confidence) == "corrected" else "linear"
     for name, statistic, scale in _statistics(error_ratio, robust, slope):
         wanted = scale if isinstance(statistic, SumStatistic) or len(found.size_mm) <= MOST_REFITTED else None
-        guarded: Statistic = partial(_checked, statistic)
-        if isinstance(statistic, SumStatistic):
-            guarded = replace(statistic, terms=partial(_checked, statistic.terms))
-        figures[name] = figure(guarded, found, scale=wanted, confidence=confidence, leverage=_squared_distance)
+        figures[name] = figure(statistic, found, scale=wanted, confidence=confidence, leverage=_squared_distance)
     return figures | bland_altman.figures(found, confidence=confidence)
 
 
@@ -176,6 +173,7 @@ def _terms(sizes: ModalitySizes) -> FloatArray:
     x, y = sizes.ex_vivo_mm, sizes.size_mm
     if len(x) == 0:
         raise UndefinedError("no mass was detected")
+    _need_squares(x, y)
     dx, dy = centred(x, x.mean()), centred(y, y.mean())
     return columns(1.0, x, y, dx, dy, dx * dx, dx * dy, dy * dy)
 
@@ -227,6 +225,7 @@ class _Fit:
 
     def __call__(self, sizes: ModalitySizes) -> Line | PassingBablok:
         if self._last is None or self._last[0] is not sizes:
+            _need_squares(sizes.ex_vivo_mm, sizes.size_mm)
             self._last = sizes, self._fit(sizes.ex_vivo_mm, sizes.size_mm)
         return self._last[1]
 
@@ -235,11 +234,9 @@ class _Fit:
         return lambda sizes: float(getattr(self(sizes), name))
 
 
-def _checked(function: Callable[[ModalitySizes], _T], sizes: ModalitySizes) -> _T:
-    """Value of a function of sizes; undefined where their sums of squares vanish."""
-    if len(sizes.size_mm) and not _squarable(sizes.ex_vivo_mm, sizes.size_mm):
+def _need_squares(x: FloatArray, y: FloatArray) -> None:
+    if len(x) and not _squarable(x, y):
         raise UndefinedError("the sizes are too large or too small for double precision")
-    return function(sizes)
 
 
 def _squarable(x: FloatArray, y: FloatArray) -> bool:
@@ -249,14 +246,17 @@ def _squarable(x: FloatArray, y: FloatArray) -> bool:
 
 def _analytic(found: ModalitySizes, robust: _Fit, *, confidence: float, error_ratio: float) -> dict[str, Ends | None]:
     x, y = found.ex_vivo_mm, found.size_mm
+    weighted = partial(weighted_deming, error_ratio=error_ratio)
+    fits: dict[str, Callable[[], Line]] = {
+        "ols": lambda: least_squares(x, y),
+        "deming": lambda: deming(x, y, error_ratio=error_ratio),
+        "weighted_deming": lambda: _with_errors(weighted(x, y), weighted, x, y),
+    }
     ends: dict[str, Ends | None] = {}
-    for name, fit in (("ols", least_squares), ("deming", partial(deming, error_ratio=error_ratio))):
-        plain = _or_none(partial(fit, x, y))
+    for name, fit in fits.items():
+        plain = _or_none(fit)
         two = None if plain is None else plain.intervals(confidence=confidence)
         ends[f"{name}_intercept_mm"], ends[f"{name}_slope"] = two or (None, None)
-    weighted = partial(weighted_deming, error_ratio=error_ratio)
-    for name, both in _jackknifed(weighted, x, y, confidence=confidence).items():
-        ends[f"weighted_deming_{name}"] = both
     line = _or_none(lambda: robust(found))
     if isinstance(line, PassingBablok):
         for name, both in (("intercept_mm", line.intercept_interval), ("slope", line.slope_interval)):
@@ -266,16 +266,11 @@ def _analytic(found: ModalitySizes, robust: _Fit, *, confidence: float, error_ra
     return ends
 
 
-def _jackknifed(
-    fit: Callable[[FloatArray, FloatArray], Line], x: FloatArray, y: FloatArray, *, confidence: float
-) -> dict[str, Ends | None]:
-    """Intervals by leaving out one mass at a time, n - 2 degrees of freedom: usual where no formula exists."""
-    line = _or_none(partial(fit, x, y)) if 3 < len(x) <= MOST_REFITTED else None
-    errors = None if line is None else _or_none(partial(jackknife_errors, fit, x, y))
-    if line is None or errors is None:
-        return {"intercept_mm": None, "slope": None}
-    two = Line(line.intercept, line.slope, line.n, *errors).intervals(confidence=confidence) or (None, None)
-    return {"intercept_mm": two[0], "slope": two[1]}
+def _with_errors(line: Line, fit: Callable[[FloatArray, FloatArray], Line], x: FloatArray, y: FloatArray) -> Line:
+    """The line with errors from leaving out one mass at a time, which is usual where no formula exists."""
+    if not 3 < len(x) <= MOST_REFITTED:
+        return line
+    return Line(line.intercept, line.slope, line.n, *jackknife_errors(fit, x, y))
 
 
 def _limits(found: ModalitySizes, *, confidence: float) -> dict[Unit, Limits]:

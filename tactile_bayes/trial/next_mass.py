@@ -21,9 +21,9 @@ says (record 0078). It is uniform in ln r, as far as the caliper's own error let
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from itertools import combinations
-from typing import Annotated, Any, Literal, Protocol
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from scipy.special import erf, expit, log_expit
@@ -42,12 +42,8 @@ CALIPER = 0.05
 PRIOR_MISS = 1 / 3
 
 
-class Sampler(Protocol):
-    """Function that draws from a vectorised log density about its mode."""
-
-    def __call__(
-        self, log_density: Any, centre: FloatArray, covariance: FloatArray, /, *, rng: np.random.Generator
-    ) -> Any: ...
+# Draws from a vectorised log density about its mode: ``sample(log_density, centre, covariance, rng=rng)``.
+Sampler = Callable[..., Any]
 
 
 class Middle(Record):

@@ -22,7 +22,7 @@ from tactile_bayes.trial.figures import (
     figure,
     ratio,
 )
-from tactile_bayes.trial.readings import FloatArray, ModalitySizes
+from tactile_bayes.trial.readings import FloatArray, ModalitySizes, Reading
 
 # --- Variances of masses, readers and maps from unbalanced readings, by restricted maximum likelihood.
 
@@ -197,21 +197,24 @@ def spread_figures(sizes: ModalitySizes, *, confidence: float) -> dict[str, Figu
 
 def _terms(sizes: ModalitySizes) -> FloatArray:
     """SD, SD over mean, variance and squared SD over mean by degrees of freedom, those, and 1, of each mass."""
-    if not sizes.replicates_mm:
-        raise UndefinedError("no mass has two detected replicates")
-    sds, freedom = _moments(sizes)
+    number, _, squares = _moments(sizes, lambda size_mm: size_mm)
+    freedom = number - 1.0
+    sds = np.sqrt(squares / freedom)
     cvs = sds / sizes.size_mm
     return columns(sds, cvs, freedom * sds**2, freedom * cvs**2, freedom, 1.0)
 
 
-def _moments(sizes: ModalitySizes) -> tuple[FloatArray, FloatArray]:
-    """Standard deviation (divisor n - 1) and degrees of freedom of each mass's replicates."""
+def _moments(
+    sizes: ModalitySizes, scale: Callable[[FloatArray], FloatArray]
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Number, mean and sum of squares about the mean of each mass's replicates on a scale."""
+    if not sizes.replicates_mm:
+        raise UndefinedError("no mass has two detected replicates")
     number = np.array([len(group) for group in sizes.replicates_mm])
     start = np.concatenate([[0], np.cumsum(number)[:-1]])
-    values = np.concatenate(sizes.replicates_mm)
-    off = values - np.repeat(np.add.reduceat(values, start) / number, number)
-    freedom = number - 1.0
-    return np.sqrt(np.add.reduceat(off**2, start) / freedom), freedom
+    values = scale(np.concatenate(sizes.replicates_mm))
+    mean = np.add.reduceat(values, start) / number
+    return number.astype(np.float64), mean, np.add.reduceat((values - np.repeat(mean, number)) ** 2, start)
 
 
 # Mean over masses of the standard deviation of the replicates, in mm.
@@ -253,20 +256,8 @@ def replicate_figures(sizes: ModalitySizes, *, confidence: float) -> dict[str, F
     }
 
 
-def _logs(sizes: ModalitySizes) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Number, mean and sum of squares about the mean of each mass's log sizes."""
-    if not sizes.replicates_mm:
-        raise UndefinedError("no mass has two detected replicates")
-    number = np.array([len(group) for group in sizes.replicates_mm], dtype=np.float64)
-    logs = np.log(np.concatenate(sizes.replicates_mm))
-    start = np.concatenate([[0], np.cumsum(number)[:-1]]).astype(np.int64)
-    mean = np.add.reduceat(logs, start) / number
-    squares = np.add.reduceat((logs - np.repeat(mean, number.astype(np.int64))) ** 2, start)
-    return number, mean, squares
-
-
 def _log_terms(sizes: ModalitySizes) -> FloatArray:
-    number, mean, squares = _logs(sizes)
+    number, mean, squares = _moments(sizes, np.log)
     centred = mean - mean.mean()
     return columns(1.0, number, number**2, number * centred, number * centred**2, squares)
 
@@ -283,23 +274,20 @@ log_sd_within = SumStatistic(_log_terms, lambda sums: np.sqrt(ratio(sums[..., 5]
 icc = SumStatistic(_log_terms, _icc, undefined="one mass, or no scatter at all, has no correlation within masses")
 
 
-def reader_components(
-    log_sizes: Sequence[float], masses: Sequence[object], readers: Sequence[str | None]
-) -> Components | None:
-    """Variances of log size between masses, between readers and between maps, by REML.
+def reader_components(found: Sequence[Reading]) -> Components | None:
+    """Variances of log size between masses, between readers and between maps, by REML, from readings with a size.
 
     Readings without a reader are left out when any has one. None where nothing was replicated.
     """
-    known = [index for index, reader in enumerate(readers) if reader]
-    chosen = known if known else range(len(log_sizes))
-    values = np.array([log_sizes[i] for i in chosen])
-    mass = _numbered([masses[i] for i in chosen])
-    if len(values) - len(set(mass.tolist())) < 2 or len(set(mass.tolist())) < 2:
+    chosen = [one for one in found if one.reader] or found
+    mass, reader = _numbered([one.key for one in chosen]), _numbered([one.reader for one in chosen])
+    masses = len(set(mass.tolist()))
+    if len(chosen) - masses < 2 or masses < 2:
         return None
-    reader = _numbered([readers[i] for i in chosen]) if known else np.zeros(len(values), dtype=np.int64)
-    return components(values, mass, reader)
+    sizes = np.array([one.size_mm for one in chosen], dtype=np.float64)
+    return components(np.log(sizes), mass, reader)
 
 
-def _numbered(names: Sequence[object]) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
+def _numbered(names: Sequence[object]) -> Index:
     number = {name: index for index, name in enumerate(dict.fromkeys(names))}
     return np.array([number[name] for name in names], dtype=np.int64)

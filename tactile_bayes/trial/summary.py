@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from typing import Annotated, Any, Literal
 
@@ -22,11 +21,9 @@ from tactile_bayes.trial.accuracy import (
 from tactile_bayes.trial.calibration import (
     Calibration,
     Coverage,
-    Prediction,
     calibration,
     coverage,
-    log_normal,
-    predictions,
+    prediction_of,
 )
 from tactile_bayes.trial.figures import (
     SEED,
@@ -46,9 +43,8 @@ from tactile_bayes.trial.figures import (
 from tactile_bayes.trial.method_comparison import MethodComparison, compare_methods
 from tactile_bayes.trial.next_mass import NextMass
 from tactile_bayes.trial.planning import IntervalCheck
-from tactile_bayes.trial.readings import ModalitySizes, Trial, mass_numbers, patient_numbers, unit_doubts
+from tactile_bayes.trial.readings import ModalitySizes, Trial, unit_doubts
 from tactile_bayes.trial.replicates import (
-    Components,
     ReplicateFigures,
     reader_components,
     replicate_figures,
@@ -268,29 +264,6 @@ def summarise(
     )
 
 
-def _components(trial: Trial, modality: str) -> Components | None:
-    """Variances of log size between masses, readers and maps."""
-    found = trial.found(modality)
-    logs = [math.log(one.size_mm) for one in found if one.size_mm is not None]
-    return reader_components(logs, [one.key for one in found], [one.reader for one in found])
-
-
-def prediction_of(trial: Trial, modality: str) -> Prediction | None:
-    """Stated uncertainties of a modality's readings as predictive distributions; None where no reading states one."""
-    kept = [(one, stated) for one in trial.found(modality) if (stated := log_normal(one)) is not None]
-    if not kept:
-        return None
-    masses, patients = mass_numbers(trial.ex_vivo_mm), patient_numbers(trial.ex_vivo_mm)
-    keys = [one.key for one, _ in kept]
-    return predictions(
-        [distribution for _, distribution in kept],
-        [trial.ex_vivo_mm[key] for key in keys],
-        [trial.ex_vivo_sd_mm.get(key) for key in keys],
-        masses=[masses[key] for key in keys],
-        patients=[patients[patient] for patient, _ in keys],
-    )
-
-
 def _detected_interval(sizes: ModalitySizes, *, confidence: float) -> tuple[float, float] | None:
     """Interval of the share of masses found, for the effective number of patients: masses of one are no new trials."""
     n = len(sizes.size_mm)
@@ -322,7 +295,7 @@ def modality_report(
         method_comparison=compare_methods(sizes, confidence=confidence, error_ratio=error_ratio),
         replicates=ReplicateFigures(
             **fields_of(replicate_figures(sizes, confidence=confidence)),
-            variance_components=None if trial is None else _components(trial, sizes.name),
+            variance_components=None if trial is None else reader_components(trial.found(sizes.name)),
         ),
         calibration=None if prediction is None else calibration(prediction, confidence=float(confidence)),
         cautions=cautions(sizes, confidence=confidence),

@@ -14,7 +14,6 @@ import pytest
 from click.testing import CliRunner
 
 from tactile_bayes.actions import tradeoff as tradeoff_forward
-from tactile_bayes.actions.study import fit_line
 from tactile_bayes.commands.tradeoff import tradeoff_forward_command
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import EXIT_BAD_DATA, EXIT_USAGE, BadDataError
@@ -27,8 +26,7 @@ from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.draws import ShapeDraws, ShapePrior
 from tactile_bayes.size.eq6 import SizeCalibration
 from tactile_bayes.size.pooling import SizePriors, pooled_size
-from tactile_bayes.studies.paper import Geometry, StudyRow, StudySettings, run_geometry
-from tactile_bayes.studies.paper_solid import fit_raster
+from tactile_bayes.studies.paper import Geometry, StudyRow, StudySettings
 from tactile_bayes.studies.tradeoffs import (
     EMPIRICAL,
     PLANE,
@@ -74,8 +72,8 @@ def test_each_model_has_one_default_and_one_reference() -> None:
 def test_the_default_plane_setting_is_the_study() -> None:
     (setting,) = (one for one in SETTINGS if one.model == PLANE and one.kind == "default")
     ticks = count()
-    found = measure(CASE, setting, fit=fit_line, raster_fit=fit_raster, clock=lambda: float(next(ticks)), runs=2)
-    (row,) = run_geometry(Geometry(0.0, 15.0, 1.0, (100.0,)), settings=StudySettings(), fit=fit_line)
+    found = measure(CASE, setting, clock=lambda: float(next(ticks)), runs=2)
+    (row,) = StudySettings().rows(Geometry(0.0, 15.0, 1.0, (100.0,)))
     assert (found.amplitude, found.sigma_x_mm) == pytest.approx((row.amplitude, row.sigma_x_mm), rel=1e-9)
     assert (found.lump_s, found.map_s, found.sigma_y_mm) == (1.0, 1.0, None)
     assert found.element_mm == pytest.approx(0.74, abs=0.01)  # half of 47.1 mm over 32 elements
@@ -108,7 +106,7 @@ def test_the_head_is_that_of_both_models_and_moves_their_numbers() -> None:
     seen = []
     for case in (inside, outside):
         setting = next(one for one in settings_of(case) if one.model == PLANE)
-        seen.append(measure(case, setting, fit=fit_line, raster_fit=fit_raster, clock=lambda: 0.0).amplitude)
+        seen.append(measure(case, setting, clock=lambda: 0.0).amplitude)
     assert seen[1] > 1.2 * seen[0]
 
 

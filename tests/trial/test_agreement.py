@@ -11,7 +11,7 @@ from scipy import integrate, optimize, stats
 from tactile_bayes.trial.figures import UndefinedError
 from tactile_bayes.trial.limits import content_factor, limits, limits_unlinked, percentile_factor, trend
 from tactile_bayes.trial.lines import concordance, least_squares
-from tactile_bayes.trial.readings import ModalitySizes
+from tactile_bayes.trial.readings import ModalitySizes, Reading
 from tactile_bayes.trial.replicates import components, icc, log_sd_within, reader_components
 from tactile_bayes.trial.replicates import replicate_figures as figures
 
@@ -244,10 +244,19 @@ def test_a_variance_of_zero_is_reached() -> None:
 
 
 def test_readers_are_left_out_of_what_has_none() -> None:
-    sizes, keys = [1.0, 1.2, 2.0, 2.3, 1.5, 1.4], ["a", "a", "b", "b", "c", "c"]
-    assert reader_components(sizes, keys, [None] * 6).reader is None
-    assert reader_components(sizes, keys, ["A", "B"] * 3).readers == 2
-    assert reader_components(sizes[::2], keys[::2], [None] * 3) is None  # one replicate each
+    def read(readers: list[str | None]) -> list[Reading]:
+        sizes = [("a", 3.0), ("a", 3.5), ("b", 7.0), ("b", 10.0), ("c", 4.5), ("c", 4.0)]
+        return [
+            Reading(("p", mass), "tactile", 1, "detected", size, reader=reader)
+            for (mass, size), reader in zip(sizes, readers, strict=True)
+        ]
+
+    alone, two = reader_components(read([None] * 6)), reader_components(read(["A", "B"] * 3))
+    assert alone is not None
+    assert alone.reader is None
+    assert two is not None
+    assert two.readers == 2
+    assert reader_components(read([None] * 6)[::2]) is None  # one replicate each
 
 
 def test_one_replicate_leaves_repeatability_undefined() -> None:

@@ -73,15 +73,15 @@ def test_leaving_out_by_sums_is_leaving_out(name: str) -> None:
     one, statistic = trial(1), STATISTICS[name]
     assert isinstance(statistic, SumStatistic)
     expected = [statistic(one.without(patient)) for patient in one.patients.tolist()]
-    assert Sample(statistic, one).left_out() == pytest.approx(np.array(expected), rel=1e-10)
+    assert Sample(statistic, (one,)).left_out() == pytest.approx(np.array(expected), rel=1e-10)
 
 
 @pytest.mark.parametrize("name", STATISTICS)
 def test_redrawing_by_sums_is_redrawing(name: str) -> None:
     one, statistic = trial(2), STATISTICS[name]
     draws = draw_patients(len(one.patients), resamples=20, seed=3)
-    plain = Sample(lambda masses: statistic(masses), one)
-    assert Sample(statistic, one).redrawn(draws) == pytest.approx(plain.redrawn(draws), rel=1e-10)
+    plain = Sample(lambda masses: statistic(masses), (one,))
+    assert Sample(statistic, (one,)).redrawn(draws) == pytest.approx(plain.redrawn(draws), rel=1e-10)
 
 
 def test_bca_agrees_with_scipy() -> None:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.trial.calibration import (
     Calibration,
     Prediction,
@@ -15,9 +16,9 @@ from tactile_bayes.trial.calibration import (
     crps_log_normal,
     interval_score,
     log_normal,
-    predictions,
+    prediction_of,
 )
-from tactile_bayes.trial.readings import Interval, Reading
+from tactile_bayes.trial.readings import Interval, Reading, Trial
 
 
 def stated_by(
@@ -33,13 +34,11 @@ def drawn(n: int, *, stated: float = 1.0, shift: float = 0.0, seed: int = 1, rep
     found = rng.normal(2.8, 0.4, n)
     median = found - shift + rng.normal(0, 0.2, n)
     mass = np.arange(n, dtype=float)
-    return Prediction(*(np.repeat(one, replicates) for one in (median, np.full(n, 0.2 * stated), found, mass, mass)))
+    return Prediction(*(np.repeat(one, replicates) for one in (median, np.full(n, 0.2 * stated), found, mass)))
 
 
 def judged(prediction: Prediction) -> Calibration:
-    found = calibration(prediction, confidence=0.95)
-    assert found is not None
-    return found
+    return calibration(prediction, confidence=0.95)
 
 
 def test_honest_uncertainty_is_left_alone() -> None:
@@ -62,7 +61,6 @@ def test_halved_and_doubled_widths_are_found_out_and_mended(stated: float, word:
         prediction.sd_log * found.scale,
         prediction.found_log,
         prediction.mass,
-        prediction.patient,
     )
     assert judged(mended).advice.startswith("no change")
 
@@ -96,7 +94,7 @@ def test_crps_is_the_integral_that_defines_it() -> None:
 
 def test_crps_of_a_sure_prediction_is_its_absolute_error() -> None:
     one = np.ones(1)
-    sure = Prediction(np.log(12.0) * one, 1e-9 * one, np.log(15.0) * one, one, one)
+    sure = Prediction(np.log(12.0) * one, 1e-9 * one, np.log(15.0) * one, one)
     assert crps_log_normal(sure)[0] == pytest.approx(3.0, rel=1e-6)
 
 
@@ -104,7 +102,7 @@ def test_interval_score_by_hand() -> None:
     """90 % interval 10 to 20 mm: found 15 costs its width, found 23 costs 3 x 2 / 0.1 more."""
     median, sd = stated_by(10, 20, 0.9, 14, None)
     found = np.log(np.array([15.0, 23.0]))
-    prediction = Prediction(np.full(2, median), np.full(2, sd), found, np.arange(2.0), np.arange(2.0))
+    prediction = Prediction(np.full(2, median), np.full(2, sd), found, np.arange(2))
     assert interval_score(prediction, probability=0.9) == pytest.approx([10, 10 + 60])
 
 
@@ -119,12 +117,20 @@ def test_what_a_reading_states() -> None:
 
 
 def test_the_calipers_error_is_added_in_quadrature() -> None:
-    found = predictions([(2.5, 0.12)], [10.0], [0.5], masses=[0], patients=[0])
+    low, high = (math.exp(2.5 + sign * 0.12 * stats.norm.ppf(0.975)) for sign in (-1, 1))
+    trial = one_reading(Interval(low, high, 0.95))
+    found = prediction_of(replace(trial, ex_vivo_sd_mm={("p", "m"): 0.5}), "tactile")
+    without = prediction_of(trial, "tactile")
+    assert found is not None
+    assert without is not None
     assert found.sd_log[0] == pytest.approx(math.hypot(0.12, math.sqrt(math.log1p(0.05**2))))
-    without = predictions([(2.5, 0.12)], [10.0], [None], masses=[0], patients=[0])
-    assert without.sd_log[0] == 0.12
+    assert without.sd_log[0] == pytest.approx(0.12)
+
+
+def one_reading(stated: Interval | None) -> Trial:
+    return Trial([Reading(("p", "m"), "tactile", 1, "detected", 12.0, stated)], {("p", "m"): 10.0})
 
 
 def test_nothing_stated_and_few_masses_have_defined_answers() -> None:
-    assert calibration(predictions([], [], [], masses=[], patients=[]), confidence=0.95) is None
+    assert prediction_of(one_reading(None), "tactile") is None
     assert "too few masses (5)" in judged(drawn(5)).advice

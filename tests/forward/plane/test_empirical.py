@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tactile_bayes.actions.study import fit_line
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.line import (
     SHARE,
@@ -150,7 +149,7 @@ def test_where_the_paper_shows_agreement_there_is_some(quick: StudySettings) -> 
 
 def test_a_small_difference_of_squares_hides_a_wrong_bump(quick: StudySettings) -> None:
     """Decision 0007: the norm that the paper prints does not see what the strict one and the fit see."""
-    found = compare(Scene("deep", 15.5, 1.4, 0.0), settings=quick, fit=fit_line)
+    found = compare(Scene("deep", 15.5, 1.4, 0.0), settings=quick)
     assert found.map < 0.025
     assert found.map_strict > 0.5
     assert abs(found.empirical.amplitude / found.elastic.amplitude - 1) > 0.3
@@ -169,7 +168,7 @@ SEEN = {
 def test_where_the_empirical_map_loses_a_lump_it_warns(lump: tuple[float, float]) -> None:
     """Against the plane-strain model; a lump inside the range is the negative control."""
     d, h = lump
-    found = compare(Scene("", d, h, 0.0), settings=StudySettings(), fit=fit_line)
+    found = compare(Scene("", d, h, 0.0), settings=StudySettings())
     assert (found.elastic.amplitude, found.empirical.amplitude) == pytest.approx(SEEN[lump], abs=2e-3)
     lost = found.empirical.amplitude < 0.5 * found.elastic.amplitude
     assert lost == (outside_range(d, h) is not None)

@@ -33,11 +33,15 @@ SCENE = Scene(
 )
 
 
+def frames_of(scene: Scene, time_s: np.ndarray, fidelity: str = "plane-strain") -> np.ndarray:
+    section = plane_section(scene, fidelity)
+    sections, level = section.sections(fidelity, reach_mm=60.0), level_kpa(scene.background, time_s)
+    return plane_frames(scene, *head_positions(scene, time_s), level, sections, lump_x_mm=section.x_mm)
+
+
 @cache
 def frames(fidelity: str) -> np.ndarray:
-    section = plane_section(SCENE, fidelity)
-    chosen = section.empirical if fidelity == "empirical" else section.solved
-    return plane_frames(SCENE, frame_times(SCENE), chosen, lump_x_mm=section.x_mm)
+    return frames_of(SCENE, frame_times(SCENE), fidelity)
 
 
 def test_every_column_feels_the_frame_of_the_two_dimensional_body() -> None:
@@ -55,7 +59,7 @@ def test_the_empirical_frames_are_eqs_1_to_4() -> None:
     """Their parts by the printed formulas, from the fitted numbers; scaled with the level."""
     time = frame_times(SCENE)
     place, level = head_positions(SCENE, time)[1][:, 0] - 3.0, level_kpa(SCENE.background, time)
-    model, s = plane_section(SCENE, "empirical").empirical_model()
+    model, s = plane_section(SCENE, "empirical").empirical_model(condense(Body(15.0, 1.0, 0.0)))
     p1 = model.peak_kpa * np.sqrt(1 - model.curvature_per_mm2 * s**2)
     largest = max(model.peak_kpa, model.peak_kpa * np.sqrt(1 - model.curvature_per_mm2 * 12.0**2))
     for i in (12, 20, 33):
@@ -67,8 +71,7 @@ def test_the_empirical_frames_are_eqs_1_to_4() -> None:
 def test_a_turned_head_has_its_columns_at_different_places() -> None:
     turned = replace(SCENE, strokes=replace(SCENE.strokes, yaw_deg=20.0))
     time = frame_times(turned)[25:26]
-    section = plane_section(turned, "plane-strain")
-    found = plane_frames(turned, time, section.solved, lump_x_mm=3.0)[0]
+    found = frames_of(turned, time)[0]
     rotation, origin = head_positions(turned, time)
     level = float(level_kpa(turned.background, time)[0])
     surface = condense(Body(15.0, 1.0, 0.0))
@@ -81,8 +84,7 @@ def test_a_turned_head_has_its_columns_at_different_places() -> None:
 
 def test_without_a_lump_every_frame_is_that_of_the_layers() -> None:
     bare = replace(SCENE, solid_lumps=(), body=SceneBody(fat_mm=10.0))
-    section = plane_section(bare, "plane-strain")
-    found = plane_frames(bare, np.array([0.1, 0.15]), section.solved, lump_x_mm=0.0)
+    found = frames_of(bare, np.array([0.1, 0.15]))
     level = level_kpa(bare.background, np.array([0.15]))[0]
     plain = press_layers(Layers(10.0), head=Head(), mean_kpa=float(level)).as_taxels(1.5).pressure_kpa[0]
     np.testing.assert_allclose(found[1], np.repeat(plain[:, None], 26, axis=1), rtol=1e-9)

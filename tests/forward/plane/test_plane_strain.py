@@ -13,7 +13,6 @@ import pytest
 from scipy.linalg import expm
 from scipy.sparse.linalg import spsolve
 
-from tactile_bayes.actions.study import fit_line
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.line import build_line, slide
 from tactile_bayes.forward.mesh import (
@@ -34,6 +33,7 @@ from tactile_bayes.forward.plane_strain import (
     surface_transfer,
 )
 from tactile_bayes.forward.tissue import Body, Layers, parse_seat
+from tactile_bayes.studies.paper import fit_line
 
 NEARLY_INCOMPRESSIBLE = pytest.mark.parametrize("poisson", [0.3, 0.495, 0.4999])
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from tactile_bayes.actions.study import fit_line, table_text
+from tactile_bayes.actions.study import table_text
 from tactile_bayes.cli import cli
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError
@@ -21,10 +21,10 @@ from tactile_bayes.studies.paper import (
     Geometry,
     StudyRow,
     StudySettings,
+    fit_line,
     group_cases,
     learn_as_printed,
     paper_grid,
-    run_geometry,
     seat_name,
     stiffness_changes,
     width_changes,
@@ -125,7 +125,7 @@ def test_eq_6_in_two_stages_finds_its_own_coefficients() -> None:
 
 @pytest.fixture(scope="module")
 def rows() -> list[StudyRow]:
-    return run_geometry(Geometry(0.0, 10.0, 1.0, (2.0, 8.0, 100.0)), settings=StudySettings(), fit=fit_line)
+    return StudySettings().rows(Geometry(0.0, 10.0, 1.0, (2.0, 8.0, 100.0)))
 
 
 def test_a_harder_lump_shows_higher(rows: list[StudyRow]) -> None:
@@ -155,7 +155,7 @@ BEFORE = {0.0: (6.7, 0.58, -0.34), 1.0: (5.3, 0.74, -0.24)}
 @pytest.mark.parametrize("seat", [0.0, 1.0])
 def test_the_coefficients_of_the_papers_study(seat: float) -> None:
     hard = [Geometry(g.seat, g.d_mm, g.depth_ratio, (100.0,)) for g in paper_grid(seat)]
-    rows = [one for geometry in hard for one in run_geometry(geometry, settings=StudySettings(), fit=fit_line)]
+    rows = [one for geometry in hard for one in StudySettings().rows(geometry)]
     found = learn_as_printed(rows)
     assert found is not None
     assert (found.m, found.b_mm, found.e, found.f) == pytest.approx(FOUND[seat], rel=5e-3)
@@ -169,7 +169,7 @@ def test_shoulders_around_the_sensing_width_show_deep_lumps_higher() -> None:
     """Record 0075: they decide how many of the paper's cases cannot be seen."""
     deep = Geometry(0.0, 15.0, 1.5, (100.0,))
     settings = [StudySettings(head=Head(shoulders=where)) for where in HEADS]
-    (inside,), (outside,) = (run_geometry(deep, settings=replace(one, fineness=1), fit=fit_line) for one in settings)
+    (inside,), (outside,) = (replace(one, fineness=1).rows(deep) for one in settings)
     assert (inside.head, outside.head) == HEADS
     assert outside.amplitude / inside.amplitude == pytest.approx(1.33, abs=0.05)
     with pytest.raises(BadDataError, match="shoulders"):

@@ -11,12 +11,12 @@ import pytest
 from scipy.optimize import least_squares
 
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.forward.axisymmetric import LayeredBody, Tissue, condense_lump, taxel_compliance
+from tactile_bayes.forward.axisymmetric import LayeredBody, condense_lump, taxel_compliance
 from tactile_bayes.forward.contact import ContactStiffness, press
 from tactile_bayes.forward.mesh import LumpGeometry, MeshSize
 from tactile_bayes.forward.scene import Head, rotation_from_vector
 from tactile_bayes.forward.solid import PlacedLump, SkinPerturbation, SolidHead, skin_perturbation, solid_head
-from tactile_bayes.forward.tissue import HeadFace, head_face
+from tactile_bayes.forward.tissue import HeadFace, SceneBody, head_face
 
 LEVEL = np.eye(3)
 PITCH = 1.5
@@ -35,7 +35,7 @@ def on_fat(fat_mm: float, thickness_mm: float = 70.0) -> SolidHead:
 @cache
 def sphere(d: float, h: float, fat_mm: float, ratio: float = 100.0, thickness_mm: float = 70.0) -> SkinPerturbation:
     geometry = LumpGeometry(d / 2, d / 2, h, fat_mm, thickness_mm)
-    return skin_perturbation(condense_lump(geometry, Tissue()), 5.0 * ratio)
+    return skin_perturbation(condense_lump(geometry, SceneBody()), 5.0 * ratio)
 
 
 def frame(
@@ -120,7 +120,7 @@ def test_overlapping_lumps_that_leave_no_compliance_are_refused() -> None:
 
 def test_the_short_sum_is_the_perturbation() -> None:
     """The tables against the matrix they were cut from, for points without averaging."""
-    lump = condense_lump(LumpGeometry(7.5, 7.5, 15.0, 15.0, 70.0), Tissue())
+    lump = condense_lump(LumpGeometry(7.5, 7.5, 15.0, 15.0, 70.0), SceneBody())
     short = skin_perturbation(lump, 500.0, square_mm=0.0)
     r = lump.radius_mm[:7]
     values, signs = short.vectors(r * np.cos(0.7), r * np.sin(0.7))
@@ -129,7 +129,7 @@ def test_the_short_sum_is_the_perturbation() -> None:
 
 
 def test_averaging_over_a_square_is_averaging() -> None:
-    lump = condense_lump(LumpGeometry(2.5, 2.5, 5.0, 5.0, 70.0), Tissue())
+    lump = condense_lump(LumpGeometry(2.5, 2.5, 5.0, 5.0, 70.0), SceneBody())
     points = skin_perturbation(lump, 500.0, square_mm=0.0)
     means = skin_perturbation(lump, 500.0, square_mm=PITCH, tolerance=1e-9)
     node, weight = np.polynomial.legendre.leggauss(5)
@@ -149,7 +149,7 @@ def test_half_the_mesh_size_hardly_changes_a_frame(place: tuple[float, float, fl
     radius, depth, fat = place
     frames = []
     for size in (MeshSize(), MeshSize(arc=30, rings=10, core=5, grade=1.25)):
-        lump = condense_lump(LumpGeometry(radius, radius, depth, fat, 70.0), Tissue(), size=size)
+        lump = condense_lump(LumpGeometry(radius, radius, depth, fat, 70.0), SceneBody(), size=size)
         placed = PlacedLump(skin_perturbation(lump, 500.0), 0.0, 0.0)
         frames.append(on_fat(fat).frame([placed], rotation=LEVEL, x_mm=0.0, y_mm=0.0, mean_kpa=9.5).pressure_kpa)
     plain = on_fat(fat).frame([], rotation=LEVEL, x_mm=0.0, y_mm=0.0, mean_kpa=9.5).pressure_kpa

@@ -24,7 +24,6 @@ from tactile_bayes.studies.paper_solid import (
     mesh_size,
     raster_frames,
     raster_map,
-    run_solid_geometry,
 )
 
 Run = Callable[..., "CompletedProcess[str]"]
@@ -42,7 +41,7 @@ def ball() -> RasterFrames:
 
 @cache
 def rows() -> list[StudyRow]:
-    return run_solid_geometry(Geometry(1.2, 12.0, 1.0, (1.0, 8.0, 100.0)), settings=SETTINGS, fit=fit_raster)
+    return SETTINGS.rows(Geometry(1.2, 12.0, 1.0, (1.0, 8.0, 100.0)))
 
 
 def test_mirrored_frames_are_the_frames_there() -> None:
@@ -140,7 +139,7 @@ def test_the_table_has_a_width_for_each_axis_of_the_head() -> None:
 
 
 def test_a_ball_too_small_for_the_array_is_marked() -> None:
-    (row,) = run_solid_geometry(Geometry(0.0, 5.0, 0.6, (100.0,)), settings=SETTINGS, fit=fit_raster)
+    (row,) = SETTINGS.rows(Geometry(0.0, 5.0, 0.6, (100.0,)))
     assert row.amplitude > 0.02
     assert not row.detectable
 
@@ -160,8 +159,8 @@ def test_half_the_cell_gives_the_same_map(
 ) -> None:
     """A free level leans on the map's far parts, so the mesh moves wide bumps a little more."""
     geometry = Geometry(seat, d, depth_ratio, (100.0,))
-    (usual,) = run_solid_geometry(geometry, settings=settings, fit=fit_raster)
-    (fine,) = run_solid_geometry(geometry, settings=replace(settings, fineness=4), fit=fit_raster)
+    (usual,) = settings.rows(geometry)
+    (fine,) = replace(settings, fineness=4).rows(geometry)
     assert usual.amplitude == pytest.approx(fine.amplitude, rel=1e-2)
     assert usual.sigma_x_mm == pytest.approx(fine.sigma_x_mm, rel=width)
     assert usual.sigma_y_mm == pytest.approx(fine.sigma_y_mm, rel=width)
@@ -191,7 +190,7 @@ def test_an_independent_models_phantoms_are_met(shared_data: Path, name: str, d:
         table = [row for row in csv.DictReader(file) if row["seat"] == name]
     (known,) = (row for row in table if (float(row["d_mm"]), float(row["depth_ratio"])) == (d, depth_ratio))
     seat = 1.2 if name == "resting" else 0.0
-    (row,) = run_solid_geometry(Geometry(seat, d, depth_ratio, (100.0,)), settings=AS_IT_IS, fit=fit_raster)
+    (row,) = AS_IT_IS.rows(Geometry(seat, d, depth_ratio, (100.0,)))
     assert row.amplitude == pytest.approx(float(known["amplitude"]), rel=0.0125)
     assert row.sigma_x_mm == pytest.approx(float(known["sigma_x_mm"]), rel=0.01 if row.amplitude > 0.03 else 0.02)
     assert row.sigma_y_mm == pytest.approx(float(known["sigma_y_mm"]), rel=0.01)
@@ -288,7 +287,7 @@ def test_options_reach_the_map_and_the_fit(run_cli: Run, tmp_path: Path) -> None
         (found,) = csv.DictReader(done.stdout.splitlines())
         assert (found["background"], found["flat_field"]) == (background, str(flat_field).lower())
         settings = replace(SETTINGS, background=background, flat_field=flat_field)
-        (row,) = run_solid_geometry(Geometry(0.0, 15.0, 1.2, (100.0,)), settings=settings, fit=fit_raster)
+        (row,) = settings.rows(Geometry(0.0, 15.0, 1.2, (100.0,)))
         assert float(found["amplitude"]) == pytest.approx(row.amplitude, rel=1e-5)
         amplitudes.append(row.amplitude)
     assert np.diff(sorted(amplitudes)).min() > 1e-3  # all four are maps or fits of their own
