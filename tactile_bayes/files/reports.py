@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Annotated, Any, Final, Literal, Self
 
 from tactile_bayes.declarations import EXACT, UNSET, Meta, Record, UnsetType, field, from_plain, to_plain
+from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.documents import dump_json
 from tactile_bayes.findings import Finding, FindingEntry, Verdict
 from tactile_bayes.inference.draws import Quantity
@@ -256,6 +257,11 @@ class Figures(Record, forbid_unknown_fields=False):
     end_error_sd: Least0 | None = None
     effective_draws: Least0 | None = None
     size_calibration: str = ""
+
+    def __post_init__(self) -> None:
+        if (self.oval_probability is None) != (self.oval_half_log_ratio is None):
+            what = "has one of oval_probability and oval_half_log_ratio alone"
+            raise BadDataError(what, way_out="estimate the map again")
 
 
 class Input(Record, forbid_unknown_fields=False):

@@ -215,3 +215,13 @@ def test_a_map_whose_list_of_scales_is_of_another_type_is_one_line(folder: Path)
     done = run_here("estimate", "scales.nc", cwd=folder)
     assert (done.returncode, done.stderr.count("\n")) == (3, 1)
     assert "variable mean has dimensions" in done.stderr
+
+
+def test_an_estimate_with_half_of_its_outline_is_one_line(folder: Path) -> None:
+    """The page asked for the other half and ended in a traceback."""
+    document = json.loads((folder / "one.json").read_text())
+    del document["diagnostics"]["oval_half_log_ratio"]
+    (folder / "half.json").write_text(json.dumps(document))
+    done = run_here("report", "half.json", "-o", "half.html", cwd=folder)
+    assert (done.returncode, done.stderr.count("\n")) == (3, 1)
+    assert "oval_half_log_ratio" in done.stderr
