@@ -69,9 +69,9 @@ class Finding(Record):
     kind: str
     """A key of `KINDS`."""
     text: str
-    """One plain sentence with its figures, without capital and full stop, and without a name of an option."""
+    """One sentence in a clinician's words, without capital and full stop, and without a name of an option."""
     remedy: str = ""
-    """What to do about it at the command line; may name options and commands. Empty where nothing helps."""
+    """The laboratory's terms and figures, where `text` leaves them out, and what to do at the command line; or empty."""
     on_paper: str = ""
     """The same for a reader of the page, who has no command line."""
     about: str = ""

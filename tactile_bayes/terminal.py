@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import textwrap
+import unicodedata
 from collections.abc import Mapping
 from typing import Final, TextIO
 
@@ -37,7 +38,22 @@ MOST_NAME: Final = 40  #: Columns of a row's name up to which the text beside it
 COMMAND_END: Final = " \\"  #: Of a line of a command that goes on in the next one, as shells read it.
 _UNIT: Final = r"(?<=\d) (?=(?:%|mm|cm2?|kPa|ms|s|Hz|deg)(?![\w-]))"  #: The blank before it, where no line breaks.
 _JOINED: Final = "\x1f"  #: Stands for that blank, as it is printable in no text here.
+_WIDE: Final = "\x1e"  #: Stands behind a letter of two columns while a line is broken, and is printable in no text.
 _HANGING: Final = 2  #: Columns by which the further lines of a sentence are indented.
+
+
+def shown_columns(text: str) -> int:
+    """Columns that a text takes: two for each wide letter (East Asian), none for what stands on another."""
+    return sum(0 if unicodedata.combining(letter) else 1 + _is_wide(letter) for letter in text)
+
+
+def padded(text: str, columns: int) -> str:
+    """The text with blanks behind it to so many columns."""
+    return text + " " * (columns - shown_columns(text))
+
+
+def _is_wide(letter: str) -> bool:
+    return unicodedata.east_asian_width(letter) in ("W", "F")
 
 
 def columns_of(stream: TextIO) -> int:
@@ -68,7 +84,7 @@ def dressed(text: str, *, columns: int, styles: bool) -> str:
 
 
 def _dressed_line(line: str, columns: int, *, styles: bool) -> str:
-    if len(line) > columns:
+    if shown_columns(line) > columns:
         end = COMMAND_END if line.startswith("$ ") else ""
         wrapper = textwrap.TextWrapper(
             width=columns - len(end),
@@ -78,8 +94,9 @@ def _dressed_line(line: str, columns: int, *, styles: bool) -> str:
             replace_whitespace=False,
             expand_tabs=False,
         )
-        whole = wrapper.wrap(re.sub(_UNIT, _JOINED, line))
-        line = f"{end}\n".join(whole).replace(_JOINED, " ")
+        filled = "".join(letter + _WIDE * _is_wide(letter) for letter in line)
+        whole = wrapper.wrap(re.sub(_UNIT, _JOINED, filled))
+        line = f"{end}\n".join(whole).replace(_JOINED, " ").replace(_WIDE, "")
     style = next((style for lead, style in STYLES.items() if line.startswith(lead)), "") if styles else ""
     return "\n".join(f"\x1b[{style}m{part}\x1b[0m" for part in line.split("\n")) if style else line
 
@@ -88,5 +105,5 @@ def _indent(line: str) -> int:
     """Columns to the text of a row beside its name, or a little more than those before a sentence."""
     margin = len(line) - len(line.lstrip())
     name, gap, rest = line[margin:].partition("  ")
-    beside = margin + len(name) + len(gap) + len(rest) - len(rest.lstrip())
+    beside = margin + shown_columns(name) + len(gap) + len(rest) - len(rest.lstrip())
     return beside if gap and beside <= MOST_NAME else margin + _HANGING if margin <= _HANGING else margin

@@ -17,7 +17,7 @@ import pytest
 
 import tactile_bayes as tb
 from tactile_bayes.findings import LEADS
-from tactile_bayes.terminal import STYLES, dressed
+from tactile_bayes.terminal import STYLES, dressed, padded, shown_columns
 
 ESCAPES = re.compile(r"\x1b\[[0-9;]*m")
 SENTENCE = "What would narrow it: more exams of this mass, pooled (estimate --pool); the depth of the lump."
@@ -64,6 +64,16 @@ def test_the_text_of_a_row_stays_in_its_column():
     first, second = dressed(row, columns=80, styles=False).split("\n")
     assert first.startswith("skin            curved")
     assert re.match(r" {16}\S", second)
+
+
+def test_wide_letters_take_two_columns_and_those_on_others_none():
+    assert [shown_columns(text) for text in ("左乳", "gauche", "e\u0301", "")] == [4, 6, 1, 0]
+    assert padded("左乳", 6) == "左乳  "
+    row = f"左乳  {'左乳 ' * 20}"
+    lines = dressed(row, columns=40, styles=False).split("\n")
+    assert all(shown_columns(line) <= 40 for line in lines)
+    assert all(line.startswith(" " * 6) and line[6] == "左" for line in lines[1:])
+    assert "".join("".join(lines).split()) == "左乳" * 21
 
 
 def test_a_number_keeps_its_unit():

@@ -34,6 +34,7 @@ from tactile_bayes.mapping.arrangement import TOO_SHORT, check_scan
 from tactile_bayes.mapping.plausibility import scan_doubts
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.scans import Scan
+from tactile_bayes.terminal import padded, shown_columns
 
 # --- `check`: is a scan arranged as it is stated?
 
@@ -116,15 +117,18 @@ def show_action(file: Path, as_json: bool) -> None:
         click.echo(line)
 
 
+_MOST_NUMBERS = 30  #: Of a list that is shown whole.
+
+
 def shown(found: dict[str, Any], indent: str = "") -> Iterator[str]:
     """Description of a file, one fact per line."""
-    width = max((len(name) for name in found), default=0)
+    width = max(map(shown_columns, found), default=0)
     for name, value in found.items():
         if isinstance(value, dict) and value:
             yield f"{indent}{name}"
             yield from shown(value, indent + "  ")
         else:
-            yield f"{indent}{name.ljust(width)}  {_plain(value)}"
+            yield f"{indent}{padded(name, width)}  {_plain(value)}"
 
 
 def _plain(value: Any) -> str:
@@ -132,6 +136,8 @@ def _plain(value: Any) -> str:
         return "yes" if value else "no"
     if isinstance(value, float):
         return f"{value:.6g}"
+    if isinstance(value, list) and np.size(value) > _MOST_NUMBERS:
+        return f"{np.size(value)} numbers, {np.min(value):.6g} to {np.max(value):.6g}"
     if isinstance(value, list):
         return ", ".join(_plain(item) for item in value) if value else "none"
     if isinstance(value, dict):

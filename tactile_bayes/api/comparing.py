@@ -36,6 +36,7 @@ from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.draws import ShapeDraws
 from tactile_bayes.size.fat import LEAST_PROBABILITY, BetweenMaps, one_size_of
 from tactile_bayes.size.pooling import MOST_INVALID, SizePriors, log_sizes
+from tactile_bayes.size.terms import UNLIKE_LEARNED
 from tactile_bayes.size.visits import (
     Apart,
     Change,
@@ -351,7 +352,7 @@ def _sized(
     fitted = visit_calibrations(shapes, calibration)
     far = _by_visit(shapes, [one.extrapolation_faults for one in fitted])
     if far:
-        return Compared("no_estimate", f"outside the calibration's range: {'; '.join(far)}", "", apart)
+        return Compared("no_estimate", f"too {UNLIKE_LEARNED}: {'; '.join(far)}", "", apart)
     priors = size_priors(settings)
     words = sorted(answer.fingerprint for maps in visits for answer in maps)
 
@@ -367,7 +368,7 @@ def _sized(
     depths = None if fat is None else fat.apart([one.profile for maps in shapes for one in maps])
     findings = [
         *doubts,
-        *(Finding("outside_calibration", f"outside the calibration's range: {text}") for text in outside),
+        *(Finding("outside_calibration", f"{UNLIKE_LEARNED}: {text}") for text in outside),
         *([] if depths is None else [fat_apart(depths)]),
         *_sizes_apart(shapes, fitted, priors),
     ]

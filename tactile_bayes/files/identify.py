@@ -25,6 +25,7 @@ _TABLES = (
     "trial.table.json",
     "excision.table.json",
     "exams.table.json",
+    "population.table.json",
     "size_table.table.json",
     "phantom_maps.table.json",
 )

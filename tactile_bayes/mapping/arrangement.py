@@ -81,10 +81,15 @@ _LEAST_OTHERS: Final = 2
 NOTHING_SHOWN: Final = "too little stands out to show that array, lever arm and quaternions are as stated"
 NOT_CHECKED: Final = Finding(
     "arrangement_unknown",
-    NOTHING_SHOWN,
+    "how the sensor array and the tracker are mounted was never checked, and this scan does not show it",
     "scan a phantom with a lump once, run `tactile-bayes check PHANTOM.mcap -o HEAD.json`, and give --head-geometry "
     "HEAD.json from then on",
     "scan a phantom with a lump once and have it checked",
+)
+_CONTRADICTING: Final = "strokes over one place do not agree on what they felt there; size and place may be wrong"
+_LATE: Final = "the tracker's times do not fit those of the sensor array; size and place may be wrong"
+_MOUNTED: Final = (
+    "the sensor array or the tracker seems to be mounted otherwise than is stated; size and place may be wrong"
 )
 TOO_SHORT: Final = "too few frames to compare arrangements"
 _QUARTER: Final = np.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
@@ -229,13 +234,14 @@ class ArrangementCheck(Record, eq=False):
     def findings(self) -> tuple[Finding, ...]:
         """Findings against a map made of the scan as it is stated."""
         if self.contradicting:
-            check = "check the lever arm, both clocks, and that the breast lay still"
-            return (Finding("frames_contradict", self.words, check, check),)
+            on_paper = "make sure that the breast lies still, and have the tracker's mounting and its clock checked"
+            return (Finding("frames_contradict", _CONTRADICTING, f"{self.words}; {self.remedy}", on_paper),)
         if self.best.late_ms:
             on_paper = "have the scan mapped again with the tracker's delay"
-            return (Finding("late_poses", self.words, self.remedy, on_paper),)
+            return (Finding("late_poses", _LATE, f"{self.words}; {self.remedy}", on_paper),)
         if self.best is not self.stated:
-            return (Finding("wrong_arrangement", self.words, self.remedy, "check how array and tracker are mounted"),)
+            on_paper = "have it checked how the array and the tracker are mounted"
+            return (Finding("wrong_arrangement", _MOUNTED, f"{self.words}; {self.remedy}", on_paper),)
         if self.says_nothing:
             return (NOT_CHECKED,)
         return ()
@@ -246,14 +252,18 @@ class ArrangementCheck(Record, eq=False):
 
     @property
     def remedy(self) -> str:
-        """Where another arrangement is better: the clock stated to `map`, or the rest corrected by `import`."""
+        """What to check or, where another arrangement is better, to state to `map` or to correct by `import`."""
+        if self.contradicting:
+            return "check the lever arm, both clocks, and that the breast lay still"
+        if self.says_nothing:
+            return NOT_CHECKED.remedy
         if self.best.late_ms:
             return f"map it with --latency-ms {self.asked_ms + self.best.late_ms:.0f}"
         return import_again(self.best.corrections)
 
     def lines(self) -> list[str]:
         """The answer in full: what the frames agree with, what they exclude, what they leave open, and what to do."""
-        lines = [*finding_lines(self.doubts), self.words, *(one.remedy for one in self.findings)]
+        lines = [*finding_lines(self.doubts), self.words, *([self.remedy] if self.findings else [])]
         if self.best is self.stated and not self.says_nothing:
             odds = {name: odds_words(self.excluded[name]) for name in self.excluded if name not in self.not_shown}
             for words in dict.fromkeys(odds.values()):

@@ -223,15 +223,17 @@ def convention_findings(quality: Mapping[str, float], told: Iterable[Finding] = 
         other, agreement = list(CONVENTIONS)[int(quality["other_convention"])], quality["other_agreement"]
         if any(one.kind == "wrong_arrangement" and _asks_for(one, CONVENTIONS[other]) for one in told):
             return ()
-        text = (
+        text = "the tracker's rotations seem to be read the wrong way; size and place may be wrong"
+        remedy = (
             f"the quaternions seem to be {other}: the head's face would follow its motion to {agreement:.3f} of 1, "
-            f"against {quality['normal_agreement']:.3f} as they are told; size and place may be wrong"
+            f"against {quality['normal_agreement']:.3f} as they are told; check them; to change them, "
+            f"{import_again(CONVENTIONS[other])}"
         )
-        remedy = f"check them; to change them, {import_again(CONVENTIONS[other])}"
-        return (Finding("wrong_rotations", text, remedy, "check the tracker's quaternions"),)
+        return (Finding("wrong_rotations", text, remedy, "have the tracker's settings checked"),)
     if "normal_agreement" not in quality and "plane_rms_mm" in quality:
-        text = "the motion does not tell whether the quaternions are scalar first and from sensor to base"
-        return (Finding("rotations_unknown", text, "check them", "check them"),)
+        text = "whether the tracker's rotations are read rightly does not show in this scan"
+        remedy = "check that the quaternions are scalar first and from sensor to base"
+        return (Finding("rotations_unknown", text, remedy, "scan a phantom with a lump once and have it checked"),)
     return ()
 
 

@@ -210,7 +210,7 @@ def broken_assumptions(quality: Mapping[str, float]) -> tuple[Finding, ...]:
 
 def _broken(quality: Mapping[str, float]) -> Iterator[Finding]:
     if lag := _beyond(quality, "stroke_lag_mm", "stroke_lag_sd_mm", MOST_LAG_MM):
-        cause = "each dragged it along" if lag > 0 else "poses came late against the frames"
+        cause = "each dragged it along" if lag > 0 else "the tracker's positions came late"
         text = (
             f"strokes in opposite directions see the lump some {2 * abs(lag):.0f} mm apart, as if {cause}: the size "
             "may be off by more than its interval"
@@ -220,20 +220,21 @@ def _broken(quality: Mapping[str, float]) -> Iterator[Finding]:
         else:
             remedy, again = "--latency-ms auto", "with the tracker's delay estimated"
         kind = "lump_dragged" if lag > 0 else "late_poses"
-        yield Finding(kind, text, f"map again with {remedy}", f"map the scan again {again}")
+        yield Finding(kind, text, f"map again with {remedy}", f"have the scan mapped again {again}")
     if change := _beyond(quality, "profile_change", "profile_change_sd", MOST_PROFILE_CHANGE):
         far = change > BROKEN_PROFILE_CHANGE  # so far that sizes fail
         end = "the size may be off by more than its interval" if far else "the size is for even fat"
         text = (
-            f"the head's pressure profile changes over the map (by {change:.3f} in 30 mm): the fat is of uneven depth, "
+            f"the head presses otherwise in one part of the map than in another (by {change:.3f} in 30 mm, as the "
+            "pressure falls off from the head's middle): the fat is of uneven depth, "
             f"or a rib or another lump lies near; {end}"
         )
         yield Finding("uneven_fat" if far else "slightly_uneven_fat", text)
     curvature = quality.get("skin_curvature_per_m", 0.0)
     if abs(curvature) > MOST_CURVATURE_PER_M:
         text = (
-            f"the head turned as on {'convex' if curvature > 0 else 'hollow'} skin of radius "
-            f"{1000 / abs(curvature):.0f} mm, and sizes are for flat skin (on radii of 75 and 150 mm simulated ones "
+            f"the skin is {'curved outwards' if curvature > 0 else 'hollow'} here (radius "
+            f"{1000 / abs(curvature):.0f} mm), and sizes are for flat skin (on radii of 75 and 150 mm simulated ones "
             "moved by 7 %)"
         )
         yield Finding("curved_skin", text)
@@ -249,13 +250,14 @@ def _broken(quality: Mapping[str, float]) -> Iterator[Finding]:
 def handling_findings(quality: Mapping[str, float]) -> Iterator[Finding]:
     """Findings from a map's `quality` figures against how the head was held and the array read."""
     if quality.get("saturated_readings"):
-        text = f"{quality['saturated_readings']:.0f} readings at full scale were left out: the map is too low there"
+        number = f"{quality['saturated_readings']:.0f} readings"
+        text = f"{number} were pressed beyond the array's range and left out: the map is too low there"
         yield Finding("saturated_readings", text)
     if quality.get("clipped_values"):
         yield Finding("clipped_values", f"{quality['clipped_values']:.0f} values beyond the map's range were clipped")
     if quality.get("gain_unsettled"):
-        text = "the frames' gains had not settled when the solver stopped"
-        remedy = "use --normalise mean, or scan with overlapping strokes"
+        text = "how hard each frame was pressed could not be evened out: too few strokes overlap"
+        remedy = "the frames' gains had not settled: use --normalise mean, or scan with overlapping strokes"
         yield Finding("unsettled_gains", text, remedy, "scan with overlapping strokes")
     if quality.get("coverage", 1.0) < LEAST_COVERAGE:
         text = f"only {100 * quality['coverage']:.0f} % of the map's rectangle is covered"
@@ -264,9 +266,11 @@ def handling_findings(quality: Mapping[str, float]) -> Iterator[Finding]:
     if quality.get("tilt_deg", 0.0) > MOST_TILT_DEG:
         text = f"the head's face was tilted by {quality['tilt_deg']:.0f} degrees against its motion"
         check = "check the tracker's lever arm and quaternion order"
-        yield Finding("tilted_head", text, check, check)
+        yield Finding("tilted_head", text, check, "hold it flat; if it was, have the tracker's mounting checked")
     if quality.get("yaw_sd_deg", 0.0) > MOST_YAW_DEG:
-        text = f"the head was turned by {quality['yaw_sd_deg']:.0f} degrees (SD): widths across and along it are mixed"
+        text = (
+            f"the head was turned by {quality['yaw_sd_deg']:.0f} degrees (SD): the lump's length and breadth are mixed"
+        )
         yield Finding("turned_head", text)
 
 

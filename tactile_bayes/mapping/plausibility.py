@@ -211,15 +211,20 @@ def selection_doubts(selection: SelectedFrames, *, pressure_window_kpa: tuple[fl
 
 def exam_findings(quality: Mapping[str, float], head: HeadShape | None = None) -> tuple[Finding, ...]:
     """Findings from the figures of scans, or of a map, against what an exam can be; missing figures say nothing."""
-    unlike = [Finding("unlike_an_exam", text, remedy, remedy) for text, remedy in _unlike(quality, head)]
-    unusual = [Finding("unusual_scan", text, remedy, remedy) for text, remedy in _unusual(quality)]
-    return (*unlike, *unusual)
+    unlike = [_finding("unlike_an_exam", *told) for told in _unlike(quality, head)]
+    return (*unlike, *(_finding("unusual_scan", *told) for told in _unusual(quality)))
 
 
 def map_findings(tactile_map: TactileMap) -> tuple[Finding, ...]:
     """The same with those of a map's cells, which hold for a grid from elsewhere as well."""
-    cells = [Finding("unlike_an_exam", text, remedy, remedy) for text, remedy in _of_cells(tactile_map)]
+    cells = [_finding("unlike_an_exam", *told) for told in _of_cells(tactile_map)]
     return (*exam_findings(tactile_map.quality, tactile_map.head), *cells)
+
+
+def _finding(kind: str, text: str, remedy: str) -> Finding:
+    """A finding whose remedy is the examiner's, or for those who look after the devices."""
+    own = not remedy or remedy.startswith(("press ", "scan "))
+    return Finding(kind, text, remedy, remedy if own else "have the sensor, the tracker and the recording checked")
 
 
 def _unlike(quality: Mapping[str, float], head: HeadShape | None) -> Iterator[tuple[str, str]]:

@@ -239,8 +239,8 @@ def shape_fault(sigma_x: FloatArray, sigma_y: FloatArray, *, cell_mm: float, pri
     share = sd / float(np.hypot(prior.log_width_sd, prior.log_ratio_sd))
     if share > MOST_PRIOR_SHARE:
         reason = (
-            f"the map hardly narrows the widths: their posterior SD is {share:.2f} of the prior's "
-            f"(at most {MOST_PRIOR_SHARE:g})"
+            f"the map hardly shows how wide the lump is: the SD of its widths is {share:.2f} of what it is without a "
+            f"map (at most {MOST_PRIOR_SHARE:g})"
         )
         return Abstention("prior", reason, MORE_LINES, MORE_LINES_ON_PAPER)
     return None

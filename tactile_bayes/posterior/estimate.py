@@ -42,7 +42,7 @@ from tactile_bayes.scans import DEFAULT_HEAD, HeadShape
 from tactile_bayes.size.draws import SizePosterior
 from tactile_bayes.size.fat import head_profile
 from tactile_bayes.size.pooling import Calibration
-from tactile_bayes.size.terms import SPREAD, UNLIKE_ON_PAPER, Recipe, extrapolated, unknown_head
+from tactile_bayes.size.terms import SPREAD, UNLIKE_LEARNED, UNLIKE_ON_PAPER, Recipe, extrapolated, unknown_head
 
 MOST_INVALID = 0.05
 OTHER_METHOD_ON_PAPER = "have the size estimated again by the slower method"
@@ -289,18 +289,19 @@ def _findings(sized: SizedDraws, *, cell_mm: float) -> Iterator[Finding]:
     if calibration is not None:
         beyond = [] if sized.size is None else calibration.beyond_lumps(sized.size.median_mm)
         for text in (*calibration.outside(*posterior.medians), *beyond):
-            yield Finding("outside_calibration", f"outside the calibration's range: {text}")
+            yield Finding("outside_calibration", f"{UNLIKE_LEARNED}: {text}")
     if posterior.irregular:
         yield _IRREGULAR
     if cell_mm > CELL_PER_SIGMA * min(posterior.medians[1:]):
-        text = f"cells of {cell_mm:g} mm are coarse for this width"
-        remedy, on_paper = "map again with a smaller --cell-mm", "map the scan again with smaller cells"
+        text = f"the map's cells of {cell_mm:g} mm are coarse for so small a lump"
+        remedy, on_paper = "map again with a smaller --cell-mm", "have the scan mapped again with smaller cells"
         yield Finding("coarse_cells", text, remedy, on_paper)
     offset = sized.made.figures.level_offset
     if offset is not None and abs(offset) >= _NEAR_LEVEL:
         text = (
-            f"the level about the bump is {offset:+.3f} off the fixed background: something else bears on the head (a "
-            "rib, a second mass), or the lump is large for it; the size is less certain than the interval says"
+            f"the pressure round the lump is {100 * offset:+.1f} % off that of the rest of the map: something else "
+            "bears on the head (a rib, a second mass), or the lump is large for it; the size is less certain than the "
+            "interval says"
         )
         yield Finding("uneven_level", text)
 

@@ -239,7 +239,8 @@ def calibration_text(calibration: SizeCalibration, *, not_left_out: str = "", ot
     other of the two fits makes of the same rows.
     """
     how = "two-stage fit as printed +- SD of a bootstrap" if calibration.in_two_stages else "posterior mean +- SD"
-    lines = [f"Eq 6: d = m sigma / (e a^f) + b, {how}"]
+    lines = [] if calibration.left_out is None else _left_out(calibration.left_out)
+    lines.append(f"Eq 6: d = m sigma / (e a^f) + b, {how}")
     both = calibration.axes == ("both",)
     axes = [("both axes", calibration.x)] if both else [("across, x", calibration.x), ("along, y", calibration.y)]
     lines.append(f"{'':24}" + "".join(f"{name:>22}" for name, _ in axes))
@@ -257,9 +258,7 @@ def calibration_text(calibration: SizeCalibration, *, not_left_out: str = "", ot
         fits = [f"m {m:.2f}, b {b:.2f} mm, e {e:.3f}, f {f:.3f}" for m, b, e, f in other_fit.coefficients]
         differences = " and ".join(f"{100 * share:.0f} %" for share in other_fit.difference)
         lines.append(f"{words}: {'; along '.join(fits)}; sizes differ by {differences} of d on average")
-    if calibration.left_out is not None:
-        lines += _left_out(calibration.left_out)
-    elif not_left_out:
+    if calibration.left_out is None and not_left_out:
         lines.append(f"leave one geometry out: not known, {not_left_out}")
     recipe = calibration.recipe
     how = "declared" if recipe.declared else "as the maps were made here"

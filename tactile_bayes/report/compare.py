@@ -374,9 +374,7 @@ def _trend_lines(trend: TrendReport) -> list[str]:
     lines = [f"Trend over {trend.visits} visits in {trend.days:g} days: {_rate_words(trend)}."]
     chance = trend.straight_line_probability
     if chance is not None and chance < 0.05:
-        lines.append(
-            f"The sizes are no straight line of ln d over time (probability {_odds(chance)}): see the changes."
-        )
+        lines.append(f"The sizes do not follow one steady growth (probability {_odds(chance)}): see the changes.")
     return lines
 
 

@@ -54,8 +54,11 @@ def smallest_text(smallest: SmallestLump) -> str:
         else:
             across = f"{best:.3g} mm" if best == worst else f"{best:.3g} to {worst:.3g} mm"
         told.append(f"{across} at a depth of {depth:g} mm")
-    share = f"{100 * smallest.probability:g} %"
-    return f"A ball would have shown with {share} from a diameter on of {'; '.join(told)} (of its middle), by its place"
+    of_100 = f"{100 * smallest.probability:g} times of 100"
+    return (
+        f"In this map a round lump would have been seen ({of_100}) from these diameters on, by where it lies: "
+        f"{'; '.join(told)} (of its middle)"
+    )
 
 
 # --- Sentences about a size, shared by the reports of one map and of several.
@@ -146,14 +149,32 @@ NARROWED_BY = {
 WORTH_NARROWING = 10.0  #: Percent of the variance from which a source is worth a way to narrow it.
 
 
-def width_lines(variance_share: Mapping[str, float]) -> list[str]:
+ON_PAPER = {
+    "map": "how clearly this map shows the lump",
+    "between_maps": "differences between exams of one lump",
+    "calibration": "the number of lumps that sizes were learned from",
+    "residual": "differences between lumps of one size",
+    "body": "what no map shows of the body and the lump",
+    "site": "the number of phantoms measured here",
+    "shape": "whether the lump is round or oval",
+}
+"""`SOURCES` and `NARROWED_BY` for a reader who has no command line."""
+NARROWED_ON_PAPER = {
+    "between_maps": "more exams of this lump, taken together; repeat exams of some patients here",
+    "site": "more phantoms of known size measured here",
+    "body": "knowing how deep the lump lies or how stiff it is",
+}
+
+
+def width_lines(variance_share: Mapping[str, float], *, paper: bool = False) -> list[str]:
     """Sources of a size's variance, largest first, and ways to narrow the interval.
 
     `variance_share`: percent of the variance of the largest size, by source.
     """
+    sources, narrowed = (ON_PAPER, NARROWED_BY | NARROWED_ON_PAPER) if paper else (SOURCES, NARROWED_BY)
     ranked = sorted(variance_share.items(), key=lambda pair: -pair[1])
-    parts = [f"{share:.0f} % {SOURCES.get(name, name)}" for name, share in ranked if share >= 0.5]
-    ways = [NARROWED_BY[name] for name, share in ranked if share >= WORTH_NARROWING and name in NARROWED_BY]
+    parts = [f"{share:.0f} % {sources.get(name, name)}" for name, share in ranked if share >= 0.5]
+    ways = [narrowed[name] for name, share in ranked if share >= WORTH_NARROWING and name in narrowed]
     lines = [f"What makes the interval wide: {', '.join(parts)}."] if parts else []
     return [*lines, f"What would narrow it: {'; '.join(ways)}."] if ways else lines
 

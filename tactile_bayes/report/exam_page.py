@@ -101,7 +101,7 @@ def _picture(exam: Exam, *, crowded: bool) -> dict[str, str] | None:
     elif exam.disagrees:
         lines.append("Full line: the size by this map alone; dashed: the ends of its interval.")
     if marked(exam.main) is not None:
-        lines.append("Cross: the rise that the reason is about.")
+        lines.append("Cross: the place that is meant.")
     lines.append(frame.view.sentence)
     lines += ["Striped: few readings; grey: none."] if tactile_map.counts_known else []
     size = "Life size" if frame.scale == 1.0 else f"{frame.scale:.2f} of life size"
@@ -117,7 +117,7 @@ def _place(exam: Exam) -> dict[str, Any]:
     if mass.probability is not None:
         which = f"map {exam.main_number}" if len(exam.maps) > 1 else "this map"
         told = f"Probability that it is a lump, by {which}: {chance_text(mass.probability)}"
-        sentences.append(f"{told}, where one such exam in {1 / SHARE_WITH_LUMP:g} holds one.")
+        sentences.append(f"{told}, if one such exam in {1 / SHARE_WITH_LUMP:g} shows one.")
     return {"dial": breast_dial(exam.main.masses), "sentences": sentences, "no_clock": why_no_clock(exam)}
 
 

@@ -186,12 +186,11 @@ def _placed(
 
 # --- Sentences of an exam's page, in plain words: the size and its intervals, what was covered, how good the exam was.
 
-_OPTIONS: Final = re.compile(r" \((?:estimate|calibrate)[^)]*\)")
 _LEFT_OUT: Final = (
     ("dropped_low", "pressed too lightly"),
     ("dropped_high", "pressed too hard"),
-    ("dropped_no_pose", "without a tracker pose"),
-    ("dropped_elements", "with too few working taxels"),
+    ("dropped_no_pose", "without the tracker's position"),
+    ("dropped_elements", "with too few working sensor points"),
 )
 
 
@@ -226,11 +225,11 @@ def size_sentences(exam: Exam) -> Iterator[str]:
     yield f"With a probability of {share} it lies between {size.low:.1f} and {size.high:.1f} mm{_supposed(exam)}."
     alike, spread = report.max_size_mm, exam.figures.get("between_map_sd")
     if report.another_exam is not None and alike is not None:
-        told = "did not differ" if spread is None else f"differed by {100 * spread:.0f} % alone"
-        learned = "as is learned from these maps" if exam.pooled is not None else "as those of simulated bodies do"
+        told = "did not differ" if spread is None else f"differed by {100 * spread:.0f} % only"
+        learned = "as these maps suggest" if exam.pooled is not None else "as those of simulated bodies do"
         yield (
-            f"Were exams of a lump known to have {told}, {learned}, it would lie between {alike.low:.1f} and "
-            f"{alike.high:.1f} mm ({share}): repeat exams can show that."
+            f"If exams of one lump {told}, {learned}, it would lie between {alike.low:.1f} and {alike.high:.1f} mm "
+            f"({share}): repeat exams of patients here can show whether they do."
         )
     least = report.leading.min_size_mm
     if least is not None:
@@ -323,9 +322,9 @@ def why_no_clock(exam: Exam) -> str:
 
 
 def narrowing_sentences(exam: Exam) -> list[str]:
-    """What makes the interval wide and what would narrow it, without the program's options."""
+    """What makes the interval wide and what would narrow it."""
     share = exam.report.leading.variance_share
-    return [] if share is None else [_OPTIONS.sub("", line) for line in width_lines(share)]
+    return [] if share is None else width_lines(share, paper=True)
 
 
 def finding_sentences(exam: Exam, most: int) -> list[str]:
@@ -342,7 +341,7 @@ def quality_rows(exam: Exam) -> Iterator[tuple[str, str]]:
     days = [scan["array_calibration_days"] for scan in exam.scans if "array_calibration_days" in scan]
     known = [int(text) for text in days if re.fullmatch(r"-?[0-9]{1,6}", text)]
     age = f"{max(known)} day{'s' if max(known) != 1 else ''} old at the exam" if known else "age not stated in the scan"
-    yield "array calibration", age
+    yield "sensor calibration", age
     calibration = exam.main.report.origin.settings.get("size_calibration")
     if calibration:
         yield "size calibration", str(calibration)[:60]
@@ -362,9 +361,9 @@ def _scan_rows(tactile_map: TactileMap) -> Iterator[tuple[str, str]]:
     if "frames_total" in quality:
         used = f"{quality['frames_used']:.0f} of {quality['frames_total']:.0f} used"
         out = [f"{quality[name]:.0f} {words}" for name, words in _LEFT_OUT if quality.get(name)]
-        yield "frames", f"{used}{'; left out: ' if out else ''}{', '.join(out)}"
+        yield "sensor frames", f"{used}{'; left out: ' if out else ''}{', '.join(out)}"
     if tactile_map.masked_taxels:
-        yield "taxels", f"{len(tactile_map.masked_taxels)} left out as faulty"
+        yield "sensor points", f"{len(tactile_map.masked_taxels)} left out as faulty"
     named = "none touched"
     if tactile_map.patient_from_plane is not None:
         named = "sternal notch, xiphoid" + (", nipple" if tactile_map.nipple_mm is not None else "; no nipple")
@@ -377,16 +376,16 @@ def covered_text(tactile_map: TactileMap) -> str:
     """Area with enough readings, holes in it, and the typical number of readings."""
     cell2 = tactile_map.recipe.cell_mm**2 / 100.0
     if not tactile_map.counts_known:
-        return f"{tactile_map.covered.sum() * cell2:.0f} cm² (readings per cell unknown)"
+        return f"{tactile_map.covered.sum() * cell2:.0f} cm² (how often each place was read is not known)"
     well = tactile_map.covered & (tactile_map.count >= FEW_READINGS)
-    text = f"{well.sum() * cell2:.0f} cm² with {FEW_READINGS} readings a cell or more"
+    text = f"{well.sum() * cell2:.0f} cm² read {FEW_READINGS} times or more"
     # cells not covered that have covered ones on all four sides
     sides = [np.logical_or.accumulate(well, axis=axis) for axis in (0, 1)]
     sides += [np.flip(np.logical_or.accumulate(np.flip(well, axis), axis=axis), axis) for axis in (0, 1)]
     holes = int((np.logical_and.reduce(sides) & ~well).sum())
-    text += f"; {holes * cell2:.1f} cm² of gaps inside it" if holes * cell2 >= 0.05 else "; no gaps inside it"
+    text += f"; {holes * cell2:.1f} cm² of gaps inside" if holes * cell2 >= 0.05 else "; no gaps inside"
     median = float(np.median(tactile_map.count[well])) if well.any() else 0.0
-    return f"{text}; typically {median:.0f} readings"
+    return f"{text}; typically {median:.0f} times"
 
 
 def reach_text(tactile_map: TactileMap) -> str:

@@ -96,6 +96,10 @@ def sbc_text(document: dict[str, Any]) -> str:
 
 
 def _lines(document: dict[str, Any]) -> Iterator[str]:
+    if document["parameters"]:
+        yield from _conclusion(document["parameters"], document["p_together"])
+    else:
+        yield "No map gave an estimate: there is nothing to rank; give more --maps"
     speed = document["maps_per_s"]
     rate = "" if speed is None else f", {speed:.3g} maps/s"
     made = f"method {document['method']}, {document['field_cosines']} cosines, seed {document['seed']}"
@@ -108,27 +112,19 @@ def _lines(document: dict[str, Any]) -> Iterator[str]:
     sure = f"FAILS, the draws keep to one place (p = {others['chance']:.1g})" if others["too_many"] else "ok"
     yield f"{told}: {sure}; left out"
     drawn = ", ".join(f"{name} {number}" for name, number in document["drawn_by"].items())
-    if not document["parameters"]:
-        yield "No map gave an estimate: there is nothing to rank; give more --maps"
-        yield RESEARCH_USE
-        return
-    yield f"ranks among {DRAWS} draws, drawn by: {drawn}"
-    yield ""
-    yield f"{'parameter':<12}{'chi2 p':>8}{'ECDF p':>8}  {'in band':<8}{'50 % holds':<17}{'90 % holds':<17}verdict"
-    for one in document["parameters"]:
-        yield _row(one)
-    yield ""
-    yield from _conclusion(document["parameters"], document["p_together"])
+    if document["parameters"]:
+        yield f"ranks among {DRAWS} draws, drawn by: {drawn}"
+        yield ""
+        yield f"{'parameter':<11}{'chi2 p':>7}{'ECDF p':>8}  {'50 % holds':<16}{'90 % holds':<16}verdict"
+        yield from map(_row, document["parameters"])
+        yield "+- is one binomial standard error of a calibrated interval."
     yield RESEARCH_USE
 
 
 def _row(one: dict[str, Any]) -> str:
     held = [f"{100 * c['covered']:.1f} +- {100 * c['error']:.1f} %" for c in one["coverage"]]
-    inside = "yes" if one["inside_band"] else "NO"
-    return (
-        f"{one['name']:<12}{one['chi2_p']:>8.3f}{one['ecdf_p']:>8.3f}  {inside:<8}"
-        f"{held[0]:<17}{held[1]:<17}{one['verdict']}"
-    )
+    told = one["verdict"].removeprefix("FAILS: ").removeprefix("ranks are ")
+    return f"{one['name']:<11}{one['chi2_p']:>7.3f}{one['ecdf_p']:>8.3f}  {held[0]:<16}{held[1]:<16}{told}"
 
 
 def _conclusion(parameters: list[dict[str, Any]], together: float) -> Iterator[str]:
@@ -143,7 +139,6 @@ def _conclusion(parameters: list[dict[str, Any]], together: float) -> Iterator[s
         yield f"All {number} together: p = {together:.2g} ({seldom}); {advice}."
     else:
         yield f"All ranks stay in their simultaneous {band}s."
-    yield "+- is one binomial standard error of a calibrated interval."
 
 
 def table_text(maps: Sequence[MapRanks]) -> str:
@@ -203,7 +198,7 @@ def tables_text(
     `nearest` is the head nearest to the printed tables, `beside` its ten lumps; None where there is none, or it is
     `head`.
     """
-    lines = [DEFINITION, "", f"head: {named(head)}"]
+    lines = [f"mean MSD: {_answer(found, beside)}", "", DEFINITION, "", f"head: {named(head)}"]
     if nearest is not None and beside is not None:
         lines.append(f"after the slash the head nearest to the print: {named(nearest)}")
     lines += ["in brackets the printed figure", ""]
@@ -214,15 +209,15 @@ def tables_text(
     lines += _table("Map, strict MSD %", found, "map_strict", None, beside)
     lines += _others(found)
     lines += ["Eq 5 fitted to both maps (background 1); the elastic model first:"]
-    lines += [f"{'lump':<24}{'a':>16}{'sigma, mm':>18}{'frame %':>10}{'map %':>8}{'strict %':>10}"]
+    lines += [f"{'lump':<22}{'a':>13}{'sigma, mm':>14}{'frame %':>11}{'map %':>9}{'strict %':>11}"]
     for one in [*found, *phantoms]:
         amplitudes = f"{one.elastic.amplitude:.3f} {one.empirical.amplitude:.3f}"
         widths = f"{one.elastic.sigma_mm:.2f} {one.empirical.sigma_mm:.2f}"
-        shares = f"{100 * one.centred_frame:>10.1f}{100 * one.map:>8.1f}{100 * one.map_strict:>10.1f}"
-        lines.append(f"{one.scene.name:<24}{amplitudes:>16}{widths:>18}{shares}")
+        shares = f"{100 * one.centred_frame:>11.1f}{100 * one.map:>9.1f}{100 * one.map_strict:>11.1f}"
+        lines.append(f"{one.scene.name:<22}{amplitudes:>13}{widths:>14}{shares}")
     outside = [one.scene.name for one in [*found, *phantoms] if outside_range(one.scene.d_mm, one.scene.depth_ratio)]
     lines.append(f"the empirical model: {RANGE}; outside:")
-    lines += wrap("; ".join(outside), width=100)
+    lines += wrap("; ".join(outside), width=78, initial_indent="  ", subsequent_indent="  ")
     return "\n".join(lines)
 
 
@@ -230,30 +225,50 @@ def heads_text(found: ByHead) -> str:
     """The tables' means and ranges under each head, nearest first."""
     lines = [
         "",
-        "Tables under each head: mean (least to largest), %; distance from the 20 printed cells, percentage points",
-        f"{'head':<38}{'Table 1 (4.1)':>20}{'all (4.3)':>11}{'Table 2 (2.4)':>20}{'distance':>10}",
+        "Tables under each head: mean (least to largest), %, nearest to the print first",
+        "off: distance from the 20 printed cells, percentage points; shoulders outside or inside",
+        f"{'head':<26}{'Table 1 (4.1)':>18}{'all (4.3)':>11}{'Table 2 (2.4)':>18}{'off':>7}",
     ]
     for head, rows in sorted(found.items(), key=lambda item: table_distance(item[1])):
         frames, maps = _span([one.centred_frame for one in rows]), _span([one.map for one in rows])
         every = f"{100 * sum(one.all_frames for one in rows) / len(rows):.1f}"
-        lines.append(f"{named(head):<38}{frames:>20}{every:>11}{maps:>20}{table_distance(rows):>10.2f}")
+        name = named(head).replace("shoulders-", "")
+        lines.append(f"{name:<26}{frames:>18}{every:>11}{maps:>18}{table_distance(rows):>7.2f}")
     return "\n".join(lines)
 
 
-def _span(shares: Sequence[float]) -> str:
+def _span(shares: Sequence[float], to: str = " to ") -> str:
     percent = [100 * share for share in shares]
-    return f"{sum(percent) / len(percent):.1f} ({min(percent):.1f} to {max(percent):.1f})"
+    return f"{sum(percent) / len(percent):.1f} ({_brief(min(percent))}{to}{_brief(max(percent))})"
+
+
+def _brief(value: float) -> str:
+    return f"{value:.1f}" if value < 10 else f"{value:.0f}"
+
+
+def _answer(found: Sequence[Agreement], beside: Sequence[Agreement] | None) -> str:
+    """How near both tables come to the print."""
+    told = []
+    for words, name, printed in (("frames", "centred_frame", PRINTED_FRAMES), ("maps", "map", PRINTED_MAPS)):
+        nearest = "" if beside is None else f"nearest head {_mean(beside, name):.1f}, "
+        told.append(f"{words} {_mean(found, name):.1f} % ({nearest}printed {_printed_mean(printed):.1f})")
+    return ", ".join(told)
+
+
+def _printed_mean(printed: Mapping[float, Sequence[float]]) -> float:
+    values = [value for row in printed.values() for value in row]
+    return sum(values) / len(values)
 
 
 def _others(found: Sequence[Agreement]) -> list[str]:
     """Results of other definitions: means over the cases with the least and the largest."""
     lines = [
-        "Other definitions, %: mean over the cases (least to largest); printed 4.0 to 4.3 and 2.2 to 2.7",
-        f"{'':<37}{'frame':>21}{'frame over its mean':>21}{'map':>21}",
+        "Other definitions, %: mean (least-largest); printed 4.0-4.3, 2.2-2.7",
+        f"{'':<32}{'frame':>16}{'frame / mean':>16}{'map':>16}",
     ]
     for i, name in enumerate(OTHER_DEFINITIONS):
-        cells = [_span([one.others[i][of] for one in found]) for of in range(3)]
-        lines.append(f"{name:<37}" + "".join(f"{cell:>21}" for cell in cells))
+        cells = [_span([one.others[i][of] for one in found], "-") for of in range(3)]
+        lines.append(f"{name.replace('root mean square', 'RMS'):<32}" + "".join(f"{cell:>16}" for cell in cells))
     return [*lines, ""]
 
 
@@ -265,21 +280,20 @@ def _table(
     beside: Sequence[Agreement] | None,
 ) -> list[str]:
     """One table with diameters across: this head / the nearest head (printed)."""
-    lines = [title, f"{'h/d':>5}" + "".join(f"{f'd {d:g} mm':>18}" for d in TABLE_DIAMETERS_MM)]
+    lines = [title, f"{'h/d':>5}" + "".join(f"{f'd {d:g} mm':>15}" for d in TABLE_DIAMETERS_MM)]
     for depth in dict.fromkeys(one.scene.depth_ratio for one in found):
         cells = [f"{value:.1f}" for value in _row_of_tables(found, name, depth)]
         if beside is not None:
             cells = [
-                f"{cell} / {value:.1f}" for cell, value in zip(cells, _row_of_tables(beside, name, depth), strict=True)
+                f"{cell}/{value:.1f}" for cell, value in zip(cells, _row_of_tables(beside, name, depth), strict=True)
             ]
         if printed is not None:
             cells = [f"{cell} ({value:.1f})" for cell, value in zip(cells, printed[depth], strict=True)]
-        lines.append(f"{depth:>5g}" + "".join(f"{cell:>18}" for cell in cells))
+        lines.append(f"{depth:>5g}" + "".join(f"{cell:>15}" for cell in cells))
     mean = f"mean {_mean(found, name):.1f}" + ("" if beside is None else f" / {_mean(beside, name):.1f}")
     if printed is None:
         return [*lines, mean, ""]
-    values = [value for row in printed.values() for value in row]
-    return [*lines, f"{mean} (of the printed cells {sum(values) / len(values):.1f})", ""]
+    return [*lines, f"{mean} (of the printed cells {_printed_mean(printed):.1f})", ""]
 
 
 def _row_of_tables(found: Sequence[Agreement], name: str, depth_ratio: float) -> list[float]:
@@ -322,7 +336,7 @@ def tables_document(found: ByHead, phantoms: ByHead, *, seat: float) -> dict[str
 
 # Settings that differ in how finely the same thing is computed.
 _MESHES = ("mesh", "default", "contact cell", "reference")
-_NAME = 52
+_NAME = 36
 
 
 class TradeoffReport(Record, eq=False):
@@ -357,40 +371,46 @@ class TradeoffReport(Record, eq=False):
 
 
 def tradeoff_text(report: TradeoffReport) -> str:
-    """Table of all settings, and accuracy that the case does not need."""
+    """Accuracy that the case does not need, then two tables of all settings: cost and size, and the map."""
     case = report.case
     lines = [
         f"ball of {case.d_mm:g} mm, h/d {case.depth_ratio:g}, {case.stiffness_ratio:g} times as stiff as fat, "
         f"{seat_name(case.seat)}",
         f"head: {', '.join(f'{where} ({model})' for model, where in case.heads.items())}",
         "",
-        f"{'':<{_NAME}}{'element':>8}{'a lump':>8}{'a map':>8}{'':>8}{'sigma_x':>8}{'sigma_y':>8}{'size':>7}"
-        f"   off from the model's finest, %       mm",
-        f"{'model and setting':<{_NAME}}{'mm':>8}{'s CPU':>8}{'s CPU':>8}{'a':>8}{'mm':>8}{'mm':>8}{'mm':>7}"
-        f"{'a':>8}{'sigma_x':>8}{'sigma_y':>8}{'size':>7}{'size':>8}",
+        *advice(report),
+        "",
+        f"{'CPU seconds, and the size':<{_NAME}}{'element':>7}{'lump':>7}{'map':>7}{'size':>7}  off the finest",
+        f"{'':<{_NAME}}{'mm':>7}{'s':>7}{'s':>7}{'mm':>7}{'%':>7}{'mm':>8}",
     ]
-    lines += [_line(one, report) for one in report.found]
-    return "\n".join([*lines, "", *advice(report)])
+    for one in report.found:
+        cost = f"{one.element_mm:>7.2f}{one.lump_s:>7.2f}{one.map_s:>7.2f}{report.size_mm(one):>7.2f}"
+        in_mm = report.size_change_mm(one)
+        off = f"{_signed(report.size_error(one)):>7}{f'{in_mm:+.3f}' if np.isfinite(in_mm) else '':>8}"
+        lines += [_setting(one, cost + off)]
+    lines += [
+        "",
+        f"{'The map':<{_NAME}}{'a':>7}{'sigma_x':>8}{'sigma_y':>8}  off the finest, %",
+        f"{'':<{_NAME}}{'':>7}{'mm':>8}{'mm':>8}{'a':>7}{'x':>7}{'y':>7}",
+    ]
+    for one in report.found:
+        best = report.reference(one.setting.model)
+        along = "" if one.sigma_y_mm is None else f"{one.sigma_y_mm:.3f}"
+        pairs = ((getattr(one, name), getattr(best, name)) for name in ("amplitude", "sigma_x_mm", "sigma_y_mm"))
+        off = "".join(f"{_signed(change(*pair)):>7}" for pair in pairs)
+        lines.append(_setting(one, f"{one.amplitude:>7.4f}{one.sigma_x_mm:>8.3f}{along:>8}{off}"))
+    return "\n".join(lines)
 
 
-def _line(one: Measured, report: TradeoffReport) -> str:
-    best = report.reference(one.setting.model)
+def _setting(one: Measured, figures: str) -> str:
+    """A row: the setting's name with its figures, on a line of their own where the name is long."""
     mark = {"default": " (default)", "reference": " (finest)"}.get(one.setting.kind, "")
     name = f"{one.setting.model}, {one.setting.label}{mark}"
-    along = "" if one.sigma_y_mm is None else f"{one.sigma_y_mm:.3f}"
-    off = (
-        change(one.amplitude, best.amplitude),
-        change(one.sigma_x_mm, best.sigma_x_mm),
-        change(one.sigma_y_mm, best.sigma_y_mm),
-        report.size_error(one),
-    )
-    shares = [f"{100 * value:+.2f}" if np.isfinite(value) else "" for value in off]
-    in_mm = report.size_change_mm(one)
-    return (
-        f"{name:<{_NAME}}{one.element_mm:>8.2f}{one.lump_s:>8.2f}{one.map_s:>8.2f}{one.amplitude:>8.4f}"
-        f"{one.sigma_x_mm:>8.3f}{along:>8}{report.size_mm(one):>7.2f}"
-        f"{shares[0]:>8}{shares[1]:>8}{shares[2]:>8}{shares[3]:>7}{f'{in_mm:+.3f}' if np.isfinite(in_mm) else '':>8}"
-    )
+    return f"{name:<{_NAME}}{figures}" if len(name) <= _NAME else f"{name}\n{'':<{_NAME}}{figures}"
+
+
+def _signed(share: float) -> str:
+    return f"{100 * share:+.2f}" if np.isfinite(share) else ""
 
 
 def advice(report: TradeoffReport) -> list[str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -46,19 +46,17 @@ def uniformity_text(found: Uniformity, tissue: HomogeneousTissue, *, limit: floa
     words = "within" if found.worst <= limit else "beyond"
     return "\n".join(
         [
-            _tissue_line(tissue),
-            f"head: {named(found.head)}, face {found.face_mm:.1f} mm wide",
-            *_pressure_table(found, tissue),
             f"largest departure {100 * found.worst:.1f} %, {words} {100 * limit:g} %",
+            f"head: {named(found.head)}, face {found.face_mm:.1f} mm wide",
+            _tissue_line(tissue),
+            *_pressure_table(found, tissue),
         ]
     )
 
 
 def design_text(found: Sequence[Uniformity], tissue: HomogeneousTissue, *, limit: float) -> str:
-    """The whole search: a table for each place of the shoulders, and the answer with its own table."""
-    lines = [_tissue_line(tissue), ""]
-    for kind in dict.fromkeys(one.head.shoulders for one in found):
-        lines += [*_grid(kind, [one for one in found if one.head.shoulders == kind], limit=limit), ""]
+    """The whole search: the answer with its own table, then a table for each place of the shoulders."""
+    lines = [_tissue_line(tissue)]
     count = sum(one.worst <= limit for one in found)
     lines.append(f"{count} of {len(found)} heads stay within {100 * limit:g} % of the mean")
     best, answer = most_even(found), narrowest(found, limit=limit)
@@ -70,6 +68,8 @@ def design_text(found: Sequence[Uniformity], tissue: HomogeneousTissue, *, limit
     if by_rms is not None:
         words = f"{100 * by_rms.worst_rms:.1f} %, face {by_rms.face_mm:.1f} mm wide"
         lines.append(f"narrowest whose root mean square is within it: {named(by_rms.head)}, {words}")
+    for kind in dict.fromkeys(one.head.shoulders for one in found):
+        lines += ["", *_grid(kind, [one for one in found if one.head.shoulders == kind], limit=limit)]
     return "\n".join(lines)
 
 
@@ -124,13 +124,13 @@ def _grid(kind: str, found: Sequence[Uniformity], *, limit: float) -> list[str]:
     cells = {(one.head.radius_mm, one.head.shoulder_mm): one.worst for one in found}
     lines = [
         f"{kind} ({where}): largest departure over all moduli and pressures, %; * within {100 * limit:g} %",
-        f"{'R, mm':>8}" + "".join(f"{f'r {value:g}':>8}" for value in shoulders),
+        f"{'R, mm':>8}" + "".join(f"{f'r {value:g}':>6}" for value in shoulders),
     ]
     for radius in sorted({one.head.radius_mm for one in found}):
         name = "flat" if np.isinf(radius) else f"{radius:g}"
         row = [cells.get((radius, shoulder)) for shoulder in shoulders]
         marked = ["-" if one is None else f"{100 * one:.1f}{'*' if one <= limit else ' '}" for one in row]
-        lines.append(f"{name:>8}" + "".join(f"{cell:>8}" for cell in marked))
+        lines.append(f"{name:>8}" + "".join(f"{cell:>6}" for cell in marked))
     return lines
 
 
@@ -233,6 +233,7 @@ def _draw_shares(axes: Axes, one: Uniformity, tissue: HomogeneousTissue, limit: 
 
 # --- A scan against forward models, as text and as plain data.
 
+_BESIDE = 3  #: Models that stand side by side in 80 columns.
 DEFINITION = "MSD = sum of squared differences over the sum of squares of the model (docs/decisions/0007)"
 _SLOPE = ("slope_x_per_10mm", "slope_y_per_10mm", "rms_beside_slope")
 _PRINTED = {"frames_centre": "below 15", "map_centre": "below 2.6"}
@@ -247,42 +248,54 @@ _ROWS = {
 
 
 def comparison_text(measured: MeasuredFrames, found: Sequence[ModelComparison]) -> str:
-    """Differences of frames and maps, and the bumps on them, a column for each model."""
+    """How far each model is off, then frames, maps and the bumps on them, with a few models side by side."""
     place = measured.place_mm
     lines = [
-        DEFINITION,
+        *(
+            f"{one.fidelity}: frames differ by {100 * one.frames_all:.2f} % MSD, the map by {100 * one.map_all:.2f} %"
+            for one in found
+        ),
         f"{len(measured.level_kpa)} frames, mean pressure {measured.level_kpa.mean():.2f} kPa; "
         f"lump at {place[0]:.1f}, {place[1]:.1f} mm of the map",
-        f"{'':<42}{'paper':>11}" + "".join(f"{one.fidelity:>20}" for one in found),
+        DEFINITION,
+        "",
     ]
-    for name, words in _ROWS.items():
-        cells = "".join(f"{100 * getattr(one, name):>20.2f}" for one in found)
-        lines.append(f"{words:<42}{_PRINTED.get(name, ''):>11}{cells}")
-    rms = "".join(f"{one.rms_kpa:>20.3f}" for one in found)
-    lines.append(f"{'taxel, root mean square difference, kPa':<42}{'':>11}{rms}")
-    slopes = [residual_slope(measured, one) for one in found]
-    for k, words in enumerate(("map: slope of the residual in x, per 10 mm", "the same in y", "RMS beside the slope")):
-        lines.append(f"{words:<42}{'':>11}" + "".join(f"{slope[k]:>20.4f}" for slope in slopes))
-    heads = "".join(f"{'':>20}" for _ in found)
-    lines += ["", f"{'Eq 7 on the map, level 1':<42}{'measured':>11}{heads}"]
-    for k, words in enumerate(("amplitude", "sigma across the head, mm", "sigma along it, mm")):
-        lines.append(_row(words, _shape(measured.lump)[k], [_shape(one.lump)[k] for one in found]))
-    lines += ["Eq 5 on its centre line across the lump, level 1"]
-    ours = line_bump(measured, measured.tactile_map)
-    theirs = [line_bump(measured, one.tactile_map) for one in found]
-    for k, words in enumerate(("amplitude", "sigma, mm")):
-        lines.append(_row(words, ours[k], [pair[k] for pair in theirs]))
+    for first in range(0, len(found), _BESIDE):
+        lines += _columns(measured, found[first : first + _BESIDE])
     return "\n".join(line.rstrip() for line in lines)
 
 
-def _row(words: str, measured: float, models: Sequence[float]) -> str:
-    cells = "".join(f"{_plain(value):>20}" for value in models)
-    return f"{words:<42}{_plain(measured):>11}{cells}"
+def _columns(measured: MeasuredFrames, found: Sequence[ModelComparison]) -> Iterator[str]:
+    names = [one.fidelity.partition("-")[::2] for one in found]
+    yield _cells("", "paper", [first for first, _ in names])
+    if any(second for _, second in names):
+        yield _cells("", "", [second for _, second in names])
+    for name, words in _ROWS.items():
+        yield _cells(words, _PRINTED.get(name, ""), [f"{100 * getattr(one, name):.2f}" for one in found])
+    yield _cells("taxel, root mean square difference, kPa", "", [f"{one.rms_kpa:.3f}" for one in found])
+    slopes = zip(*(residual_slope(measured, one) for one in found), strict=True)
+    names = ("map: residual's slope in x, per 10 mm", "the same in y", "RMS beside the slope")
+    for words, values in zip(names, slopes, strict=True):
+        yield _cells(words, "", [f"{value:.4f}" for value in values])
+    yield ""
+    yield _cells("Eq 7 on the map, level 1", "measured", [])
+    shapes = zip(*(_shape(one) for one in (measured.lump, *(one.lump for one in found))), strict=True)
+    for words, values in zip(("amplitude", "sigma across the head, mm", "sigma along it, mm"), shapes, strict=True):
+        yield _cells(words, *_plain(values))
+    yield "Eq 5 on its centre line across the lump, level 1"
+    bumps = zip(*(line_bump(measured, one.tactile_map) for one in (measured, *found)), strict=True)
+    for words, values in zip(("amplitude", "sigma, mm"), bumps, strict=True):
+        yield _cells(words, *_plain(values))
 
 
-def _plain(value: float) -> str:
-    """A model without a bump in the map's plane, such as a cylinder, has none to show."""
-    return f"{value:.3f}" if np.isfinite(value) else "none"
+def _cells(words: str, beside: str, models: Sequence[str]) -> str:
+    return f"{words:<39}{beside:>10}{''.join(f'{cell:>10}' for cell in models)}"
+
+
+def _plain(values: Sequence[float]) -> tuple[str, list[str]]:
+    """What was measured, and the models: one without a bump in the map's plane, as a cylinder, has none to show."""
+    first, *models = (f"{value:.3f}" if np.isfinite(value) else "none" for value in values)
+    return first, models
 
 
 def comparison_document(

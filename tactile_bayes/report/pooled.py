@@ -30,7 +30,7 @@ from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.draws import EXTREMES
 from tactile_bayes.size.fat import LEAST_PROBABILITY
 from tactile_bayes.size.pooling import DISAGREE, PooledEstimate, Repeatability
-from tactile_bayes.size.terms import unknown_head
+from tactile_bayes.size.terms import UNLIKE_LEARNED, unknown_head
 
 MOST_NAMED = 4
 
@@ -121,7 +121,7 @@ def _findings(
     if pooled.fat_apart_mm is not None:
         yield fat_apart(pooled.fat_apart_mm)
     for text in pooled.outside:
-        yield Finding("outside_calibration", f"outside the calibration's range: {text}")
+        yield Finding("outside_calibration", f"{UNLIKE_LEARNED}: {text}")
     for index in pooled.outlying:
         yield Finding("outlying", "lies apart from the others: look at this map", about=_number(index))
     for index, report in enumerate(reports):

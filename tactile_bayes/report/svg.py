@@ -494,4 +494,4 @@ def _picture(frame: Frame, smallest: SmallestLump, number: int, caption: str) ->
         parts.append(f'<rect {box} fill="{shade}" stroke="#777" stroke-width="0.1"/>')
         parts.append(text(x, y + 0.9, "–" if d is None else f"{np.ceil(d):.0f}", size=2.6))
     label = f"Smallest lump that would have shown, {caption}"
-    return drawing("smallest", label, (0.0, 0.0, width, height), parts)
+    return drawing("smallest", label, (-0.2, -0.2, width + 0.4, height + 0.4), parts)

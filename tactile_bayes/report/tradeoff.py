@@ -237,23 +237,33 @@ def _finite(value: float) -> float | None:
 
 # --- Reports of `tradeoff estimate` and `tradeoff map` as text: the table of settings.
 
-_NAME, _REASON = 42, 100
+_COLUMNS, _REASON = 80, 100
+_COST = 7  #: Columns of a part's seconds.
+_SHORT = {"estimate": "est."}
+_NUMBERS = 36  #: Columns of a size with its interval and how far that is off.
 
 
 def ladder_text(ladder: Ladder) -> str:
-    """The whole report; advice and the research-use line come last."""
-    lines = [_head(ladder)]
+    """The whole report: what to choose, the table behind it, notes and the research-use line."""
+    lines = [*advice(ladder), "", *_head(ladder)]
     for axis, rows in groupby(ladder.rows, key=lambda one: one.axis):
-        lines += [axis, *(_row(one, ladder) for one in rows)]
+        lines += [axis, *(line for one in rows for line in _row(one, ladder))]
     if ladder.pooled:
-        lines += ["maps pooled", *map(_pooled, ladder.pooled)]
-    return "\n".join([*lines, "", *_notes(ladder), "", *advice(ladder), RESEARCH_USE])
+        lines += ["maps pooled", *(line for one in ladder.pooled for line in _pooled(one, ladder))]
+    return "\n".join([*lines, "", *_notes(ladder), RESEARCH_USE])
 
 
-def _head(ladder: Ladder) -> str:
-    parts = "".join(f"{f'{name} s':>12}" for name in ladder.default.cpu_s)
-    what = "size mm" if sized(ladder) else "sigma mm"
-    return f"{'':<{_NAME}}{parts}{what:>10}{'95 % interval':>18}{'ends off':>10}{'widths off':>12}"
+def _head(ladder: Ladder) -> Iterator[str]:
+    parts, width = [_SHORT.get(name, name) for name in ladder.default.cpu_s], _name(ladder)
+    what = "size" if sized(ladder) else "sigma"
+    costs, units = ("".join(f"{word:>{_COST}}" for word in words) for words in (parts, ["s"] * len(parts)))
+    yield f"{'':<{width}}{costs}{what:>7}{'95 % interval':>15}{'ends':>7}{'widths':>7}"
+    yield f"{'':<{width}}{units}{'mm':>7}{'mm':>15}{'off':>7}{'off':>7}"
+
+
+def _name(ladder: Ladder) -> int:
+    """Columns of a setting's name."""
+    return _COLUMNS - _NUMBERS - _COST * len(ladder.default.cpu_s)
 
 
 def sized(ladder: Ladder) -> bool:
@@ -261,22 +271,27 @@ def sized(ladder: Ladder) -> bool:
     return any(SIZE in one.answer.quantities for one in ladder.rows) or ladder.reference.answer is None
 
 
-def _row(one: Priced, ladder: Ladder) -> str:
-    name = f"{'*' if one.default else ' '} {one.label}"
-    cost = "".join(f"{seconds:>12.3f}" for seconds in one.cpu_s.values())
+def _row(one: Priced, ladder: Ladder) -> list[str]:
+    cost = "".join(f"{seconds:>{_COST}.3f}" for seconds in one.cpu_s.values())
     if one.answer.reported is None:
-        return f"{name:<{_NAME}}{cost}  {_no_number(one.answer)}"
-    off = f"{_mm(one.off.ends):>10}{_mm(one.off.width_ends):>12}"
-    note = "" if SIZE in one.answer.quantities or not sized(ladder) else "  (a width: this map has no size)"
+        return [*_named(one, ladder, f"{cost}  {_no_number(one.answer)}")]
+    notes = [] if SIZE in one.answer.quantities or not sized(ladder) else ["(a width: this map has no size)"]
     if one.answer.method == "ensemble" and "ensemble" not in one.label:
-        note += "  (by MCMC: importance sampling failed)"
-    return f"{name:<{_NAME}}{cost}{_number(one.answer)}{off}{note}"
+        notes.append("(by MCMC: importance sampling failed)")
+    numbers = f"{cost}{_number(one.answer)}{_mm(one.off.ends):>7}{_mm(one.off.width_ends):>7}"
+    return [*_named(one, ladder, numbers), *(f"    {note}" for note in notes)]
+
+
+def _named(one: Priced, ladder: Ladder, numbers: str) -> list[str]:
+    """The setting's name with its numbers beside it, or below where it is long."""
+    name, width = f"{'*' if one.default else ' '} {one.label}", _name(ladder)
+    return [f"{name:<{width}}{numbers}"] if len(name) <= width else [name, f"{'':<{width}}{numbers}"]
 
 
 def _number(answer: SizeAnswer) -> str:
     found = answer.reported
     assert found is not None
-    return f"{found.median:>10.2f}{f'{found.low:.2f} to {found.high:.2f}':>18}"
+    return f"{found.median:>7.2f}{f'{found.low:.2f} to {found.high:.2f}':>15}"
 
 
 def _no_number(answer: SizeAnswer) -> str:
@@ -291,14 +306,14 @@ def _mm(value: float) -> str:
     return f"{value:.3f}" if math.isfinite(value) else "-"
 
 
-def _pooled(one: PooledRow) -> str:
-    name = f"  {one.maps} map{'s' if one.maps > 1 else ''}"
+def _pooled(one: PooledRow, ladder: Ladder) -> list[str]:
+    name = f"{f'  {one.maps} map' + 's' * (one.maps > 1):<{_name(ladder)}}{one.cpu_s:>{_COST}.3f}"
     if one.answer.reported is None:
-        return f"{name:<{_NAME}}{one.cpu_s:>12.3f}  {_no_number(one.answer)}"
-    half = f"half width {one.answer.half_width_mm:.2f} mm"
+        return [f"{name}  {_no_number(one.answer)}"]
+    half = f"    half width {one.answer.half_width_mm:.2f} mm"
     if math.isfinite(one.another_half_mm):
         half += f", {one.another_half_mm:.2f} if exams differ as in the paper"
-    return f"{name:<{_NAME}}{one.cpu_s:>12.3f}{_number(one.answer)}  {half}"
+    return [f"{name}{_number(one.answer)}", half]
 
 
 def _notes(ladder: Ladder) -> Iterator[str]:
@@ -308,8 +323,9 @@ def _notes(ladder: Ladder) -> Iterator[str]:
     reference = ladder.reference
     if reference.answer is not None:
         yield (
-            f"Off: mm, root mean square over runs and both ends, from a reference: {reference.words}; its own "
-            f"Monte-Carlo error is {reference.error_mm:.2g} mm, its cost {reference.cpu_s:.1f} s."
+            "ends, widths: mm off, root mean square over runs and both ends, from a reference: "
+            f"{reference.words}; its own Monte-Carlo error is {reference.error_mm:.2g} mm, its cost "
+            f"{reference.cpu_s:.1f} s."
         )
     else:
         yield "There is no reference to compare with: what it would be made from has no size."

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Final
 
 from tactile_bayes.declarations import UNSET, Record, replace
+from tactile_bayes.terminal import padded, shown_columns
 from tactile_bayes.trial.accuracy import REFERENCE, ModalityRatio, PairedComparison, least_p
 from tactile_bayes.trial.figures import MIN_PATIENTS, Ends, Figure
 from tactile_bayes.trial.method_comparison import Unit
@@ -401,8 +402,8 @@ def found_share(report: ModalityReport) -> str:
 
 
 def _aligned(rows: list[tuple[str, ...]]) -> list[str]:
-    widths = [max(len(cell) for cell in column) for column in zip(*(row for row in rows if row[1:]), strict=True)]
-    lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=False)).rstrip() for row in rows]
+    widths = [max(map(shown_columns, column)) for column in zip(*(row for row in rows if row[1:]), strict=True)]
+    lines = ["  ".join(padded(cell, width) for cell, width in zip(row, widths, strict=False)).rstrip() for row in rows]
     return [line for line in lines if line]
 
 

@@ -30,7 +30,8 @@ Share = Annotated[float, Meta(ge=0)]
 Above0 = Annotated[float, Meta(gt=0)]
 FARTHEST: Final = {"amplitude": 2.0, "sigma_mm": 1.2}
 """Sizes are given up to this multiple of the largest value in the table, and down to its smallest over it."""
-UNLIKE_ON_PAPER: Final = "nothing by this exam: the lump is unlike those that sizes were learned from"
+UNLIKE_LEARNED: Final = "unlike the lumps that sizes were learned from"
+UNLIKE_ON_PAPER: Final = f"nothing by this exam: the lump is {UNLIKE_LEARNED}"
 ONE_WIDTH: Final = "a difference between the head's axes: the calibration has one width"
 SPREAD: Final = "spread between maps of one mass (15 % in the paper): this is one map"
 LOGGED: Final = ("depth_mm", "stiffness_ratio", "fat_kpa", "gland_ratio")
@@ -283,7 +284,7 @@ def extrapolated(far: Sequence[str]) -> Abstention:
         "learn a calibration whose table holds such lumps (`population`, `calibrate size`), or give "
         "--size-calibration none for amplitude and widths"
     )
-    reason = f"too far outside the calibration's range for a size: {'; '.join(far)}"
+    reason = f"too {UNLIKE_LEARNED} for a size: {'; '.join(far)}"
     return Abstention("extrapolated", reason, advice, UNLIKE_ON_PAPER)
 
 

@@ -75,7 +75,7 @@ def test_the_curvature_is_that_of_the_sphere_the_head_moved_on(radius_mm: float)
     one = scene(noise=TRUE_POSES, strokes=Strokes(tilt_deg=0.0, wander_mm=0.0))
     found = figures(on_sphere(one, scan_of(one), radius_mm) if np.isfinite(radius_mm) else scan_of(one))
     assert found["skin_curvature_per_m"] == pytest.approx(1000.0 / (radius_mm - 5.0), rel=0.05, abs=0.05)
-    assert any("convex skin" in text for text in told(found, "check")) == (radius_mm < 200)
+    assert any("skin is curved outwards" in text for text in told(found, "check")) == (radius_mm < 200)
 
 
 def dragged(lag_mm: float, **changes) -> Scan:

@@ -117,13 +117,13 @@ def test_a_doubt_is_told_with_the_convention_that_fits():
             texts.append((name, map_text(build_map(scan))))
         except BadDataError:  # the plane of the taxels is another one yet
             continue
-    assert any(f"CAUTION: the quaternions seem to be {name}: the head's face" in text for name, text in texts)
+    assert any(f"; the quaternions seem to be {name}: the head's face" in text for name, text in texts)
 
 
 def test_a_motion_along_a_line_tells_nothing_and_the_report_says_so():
     scan = scans.make_scan(scans.strokes(lines=1, per_line=60))
     assert check_convention(selected(scan)) == {}
-    assert "the motion does not tell whether the quaternions are scalar first" in map_text(build_map(scan))
+    assert "check that the quaternions are scalar first" in map_text(build_map(scan))
     crossed = map_text(build_map(scans.make_scan(scans.strokes(lines=5, per_line=60))))
     assert "does not tell" not in crossed  # the control
     assert "face and motion agree to 1.000 of 1" in crossed

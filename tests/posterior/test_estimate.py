@@ -139,10 +139,12 @@ def test_a_calibration_by_another_recipe_is_refused(recipe: Recipe, words: str) 
 
 def test_outside_the_calibration_is_flagged() -> None:
     flagged = run(use=calibration(), amplitude=1.2)
-    outside = [f"outside the calibration's range: {axis}: amplitude 1.2 (table: 0.05 to 0.8)" for axis in "xy"]
+    outside = [
+        f"unlike the lumps that sizes were learned from: {axis}: amplitude 1.2 (table: 0.05 to 0.8)" for axis in "xy"
+    ]
     assert [one.text for one in flagged.findings if one.kind == "outside_calibration"] == outside
     text = estimate_text(flagged, bump_map(), probability=0.95)
-    assert text.startswith("CAUTION: outside the calibration's range: x: amplitude 1.2")
+    assert text.startswith("CAUTION: unlike the lumps that sizes were learned from: x: amplitude 1.2")
     assert not any(one.kind == "outside_calibration" for one in run(use=calibration()).findings)
 
 

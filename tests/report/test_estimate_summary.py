@@ -69,7 +69,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (["clear.nc"], 0, " ", "What makes the interval wide: "),
         (["two.nc"], 0, " ", "Mass 2 at (2"),
         (["empty.nc"], 6, "No lump found", "What would help: "),
-        (["outside.nc"], 0, "CAUTION: outside the calibration's range: ", "What would narrow it: "),
+        (["outside.nc"], 0, "CAUTION: unlike the lumps that sizes were learned from: ", "What would narrow it: "),
         (["level.nc"], 0, " ", "No size: the "),
         (["clear.nc", "--size-calibration", "none"], 0, " ", "No size: no size calibration"),
         (["clear.nc", "again.nc", "--pool"], 0, "A lump was found on 2 of 2 maps", "the maps of this mass differ by"),

@@ -257,7 +257,7 @@ def test_no_lump_found_is_told_with_what_was_covered_and_what_would_have_shown()
     for text in (
         "No lump found in the area covered",
         "No lump was found in the area that was covered: ",
-        "cm² with 10 readings a cell or more",
+        "cm² read 10 times or more",
         "5.5 to 7 mm at a depth of 8 mm; 13 to more than 30 mm at a depth of 15 mm",
         "A lump may be smaller, deeper or softer than these, or lie outside the area that was covered.",
         "What would help: scan the place again.",
@@ -278,7 +278,7 @@ def test_one_cross_marks_the_rise_that_the_reason_is_about() -> None:
     page = Page(exam_page(without_lump("ridge", about_mm=Place(3.0, 2.0))))
     assert len(page.named("path", **{"class": "meant"})) == 1
     assert "What rises at the cross on the picture is long like a rib, not round like a lump." in page.words
-    assert "Cross: the rise that the reason is about." in page.words
+    assert "Cross: the place that is meant." in page.words
     assert "--" not in page.words
 
 

@@ -109,7 +109,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_caution_is_the_first_line(folder: Path) -> None:
     done = run_here("estimate", "bump.nc", "--method", "laplace", cwd=folder)
     assert done.returncode == EXIT_DONE, done.stderr
-    assert done.stdout.startswith("CAUTION: outside the calibration's range: amplitude 0.3")
+    assert done.stdout.startswith("CAUTION: unlike the lumps that sizes were learned from: amplitude 0.3")
     row = next(line for line in done.stdout.splitlines() if line.startswith("largest size"))
     assert float(row.split()[-4]) < 15.0 < float(row.split()[-2])
 
@@ -117,7 +117,9 @@ def test_the_caution_is_the_first_line(folder: Path) -> None:
 def test_too_far_is_no_number_with_the_way_out(folder: Path) -> None:
     done = run_here("estimate", "far.nc", "--method", "laplace", cwd=folder)
     assert done.returncode == EXIT_NO_ESTIMATE
-    assert done.stdout.startswith("No estimate: too far outside the calibration's range for a size: amplitude 15")
+    assert done.stdout.startswith(
+        "No estimate: too unlike the lumps that sizes were learned from for a size: amplitude 15"
+    )
     assert "--size-calibration none for amplitude and widths" in done.stdout
     found = json.loads(run_here("estimate", "far.nc", "--method", "laplace", "--json", cwd=folder).stdout)
     assert (found["status"], found["reason_code"], found["max_size_mm"]) == ("no_estimate", "extrapolated", None)
@@ -130,13 +132,13 @@ def test_too_far_is_no_number_with_the_way_out(folder: Path) -> None:
 def test_one_map_too_far_stops_a_pool_and_a_caution_comes_first(folder: Path, shipped: BodyCalibration) -> None:
     done = run_here("estimate", "sound.nc", "far.nc", "--pool", "--method", "laplace", cwd=folder)
     assert done.returncode == EXIT_NO_ESTIMATE
-    assert "No estimate: map 2: too far outside the calibration's range" in done.stdout
+    assert "No estimate: map 2: too unlike the lumps that sizes were learned from" in done.stdout
     ones = np.ones(200)
     far = ShapeDraws.of(BumpDraws(15.0 * ones, 5.0 * ones, 5.0 * ones, 0.0 * ones))
     pooled = pool_maps([far], calibration=shipped, priors=SizePriors(), rng=np.random.default_rng(1))
     assert (pooled.status, pooled.size) == ("no_estimate", None)
     cautioned = run_here("estimate", "bump.nc", "sound.nc", "--pool", "--method", "laplace", cwd=folder)
-    assert cautioned.stdout.startswith("CAUTION: outside the calibration's range: map 1: amplitude 0.3")
+    assert cautioned.stdout.startswith("CAUTION: unlike the lumps that sizes were learned from: map 1: amplitude 0.3")
 
 
 @pytest.mark.parametrize(("sigma_mm", "told"), [(16.0, True), (5.0, False)])
@@ -155,7 +157,7 @@ def test_a_size_beyond_the_tables_lumps_is_cautioned(shipped: BodyCalibration, s
 
 def test_the_live_view_says_it_first() -> None:
     said = live_estimate(gain_map(profile=EVEN, amplitude=0.348, sigma_x=6.1, sigma_y=5.2), str(SHIPPED), Turn()).text
-    assert said.startswith("CAUTION: outside the calibration's range: amplitude 0.3")
+    assert said.startswith("CAUTION: unlike the lumps that sizes were learned from: amplitude 0.3")
     assert ". largest size" in said
     far = live_estimate(gain_map(amplitude=15.0, sigma_x=5.0, sigma_y=5.0), str(SHIPPED), Turn()).text
-    assert far.startswith("no estimate: too far outside the calibration's range")
+    assert far.startswith("no estimate: too unlike the lumps that sizes were learned from")

@@ -184,7 +184,7 @@ def test_the_change_in_size_is_told_in_mm() -> None:
     assert made.size_change_mm(default) == pytest.approx(15.0 * 0.002)
     text = tradeoff_text(made)
     assert "the default mesh leaves +0.2 % (+0.030 mm)" in text
-    (line,) = (line for line in text.splitlines() if line.startswith("solid, fineness 2 (default)"))
+    line, _ = (line for line in text.splitlines() if line.startswith("solid, fineness 2 (default)"))
     assert line.endswith("+0.20  +0.030")
 
 

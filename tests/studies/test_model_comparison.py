@@ -140,7 +140,7 @@ def test_the_command_prints_draws_and_gives_json(tmp_path: Path) -> None:
     done = CliRunner().invoke(cli, [str(word) for word in words])
     assert done.exit_code == 0, done.output
     assert "200 frames" in done.stdout
-    assert "frames, centre line, MSD %                   below 15" in done.stdout
+    assert "frames, centre line, MSD %               below 15" in done.stdout
     assert "Research use only" in done.stdout
     assert (tmp_path / "f.png").stat().st_size > 30_000
     document = json.loads(run_here("compare-model", "scan.mcap", "scene.toml", "--json", cwd=tmp_path).stdout)
