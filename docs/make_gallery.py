@@ -22,6 +22,11 @@ from doc_pages import Reader, commands_of  # noqa: E402
 
 PAGE = ROOT / "docs" / "gallery.md"
 IMAGES = ROOT / "docs" / "images"
+SIZED = (
+    "parseFloat(document.getElementById('figures')?.textContent) > 6"
+    " && document.getElementById('size').textContent.includes('largest size')"
+)
+"""When the live view has a size near the end of its scan."""
 LIVE = ("gallery-live.png", 900, 710)
 # Picture -> the page that the commands write, and in pixels the width of the window and the height at which it is cut.
 PICTURES = {
@@ -65,7 +70,7 @@ def _live(work: Path, profile: Path) -> bytes:
     assert process.stderr is not None
     url = next(found[0] for line in process.stderr if (found := re.search(r"http://\S+", line)))
     with opened(profile, width=LIVE[1], height=LIVE[2]) as tab:
-        png = tab.photograph(url, until="parseFloat(document.getElementById('figures')?.textContent) > 6")
+        png = tab.photograph(url, until=SIZED)
     process.communicate()
     return _small(png)
 

@@ -71,7 +71,7 @@ class Finding(Record):
     text: str
     """One sentence in a clinician's words, without capital and full stop, and without a name of an option."""
     remedy: str = ""
-    """The laboratory's terms and figures, where `text` leaves them out, and what to do at the command line; or empty."""
+    """The laboratory's terms where `text` leaves them out, and what to do at the command line; may be empty."""
     on_paper: str = ""
     """The same for a reader of the page, who has no command line."""
     about: str = ""

@@ -197,9 +197,9 @@ def growth_page(compared: Compared, report: CompareReport, visits: Sequence[Sequ
 
 def _seen(view: Orientation) -> str:
     return (
-        f"{view.sentence} Every map shows {2 * HALF_MM:g} mm about the mass, without one about its own middle, all in "
-        "the same colours; ring: its estimated size at that visit; grey: no or few readings. Later visits are moved so "
-        "that the mass lies on itself."
+        f"{view.sentence} Every map shows {2 * HALF_MM:g} mm about the mass (one without a lump, about its middle), "
+        "all in the same colours; ring: the estimated size at that visit; grey: no or few readings. Later visits are "
+        "moved so that the mass lies at one place."
     )
 
 

@@ -266,16 +266,16 @@ def comparison_text(measured: MeasuredFrames, found: Sequence[ModelComparison]) 
 
 
 def _columns(measured: MeasuredFrames, found: Sequence[ModelComparison]) -> Iterator[str]:
-    names = [one.fidelity.partition("-")[::2] for one in found]
-    yield _cells("", "paper", [first for first, _ in names])
-    if any(second for _, second in names):
-        yield _cells("", "", [second for _, second in names])
+    names = [one.fidelity.partition("-") for one in found]
+    yield _cells("", "paper", [first for first, _, _ in names])
+    if any(second for _, _, second in names):
+        yield _cells("", "", [second for _, _, second in names])
     for name, words in _ROWS.items():
         yield _cells(words, _PRINTED.get(name, ""), [f"{100 * getattr(one, name):.2f}" for one in found])
     yield _cells("taxel, root mean square difference, kPa", "", [f"{one.rms_kpa:.3f}" for one in found])
     slopes = zip(*(residual_slope(measured, one) for one in found), strict=True)
-    names = ("map: residual's slope in x, per 10 mm", "the same in y", "RMS beside the slope")
-    for words, values in zip(names, slopes, strict=True):
+    slope_words = ("map: residual's slope in x, per 10 mm", "the same in y", "RMS beside the slope")
+    for words, values in zip(slope_words, slopes, strict=True):
         yield _cells(words, "", [f"{value:.4f}" for value in values])
     yield ""
     yield _cells("Eq 7 on the map, level 1", "measured", [])
@@ -283,7 +283,8 @@ def _columns(measured: MeasuredFrames, found: Sequence[ModelComparison]) -> Iter
     for words, values in zip(("amplitude", "sigma across the head, mm", "sigma along it, mm"), shapes, strict=True):
         yield _cells(words, *_plain(values))
     yield "Eq 5 on its centre line across the lump, level 1"
-    bumps = zip(*(line_bump(measured, one.tactile_map) for one in (measured, *found)), strict=True)
+    maps = [measured.tactile_map, *(one.tactile_map for one in found)]
+    bumps = zip(*(line_bump(measured, one) for one in maps), strict=True)
     for words, values in zip(("amplitude", "sigma, mm"), bumps, strict=True):
         yield _cells(words, *_plain(values))
 
