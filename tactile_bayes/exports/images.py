@@ -99,11 +99,9 @@ def nrrd_bytes(source: MapFile) -> bytes:
     one = source.tactile_map
     transform = lps_from_plane(one)
     if transform is None:
-        raise BadDataError(
-            "has no landmarks, so its place in the patient is not known",
-            way_out="3D Slicer takes maps of scans in which sternal notch and xiphoid were touched",
-            path=str(source.path),
-        )
+        what = "has no landmarks, so its place in the patient is not known"
+        way_out = "3D Slicer takes maps of scans in which sternal notch and xiphoid were touched"
+        raise BadDataError(what, way_out=way_out, path=str(source.path))
     values = np.where(one.covered, one.mean, np.nan).T[:, :, None].astype("<f4")
     header: dict[str, Any] = {
         "space": "left-posterior-superior",
@@ -164,9 +162,8 @@ def study_of(identity: Identity, maps: Sequence[MapFile]) -> Study:
     """The study that maps of one exam belong to."""
     moment, content = identity.study, identity.content
     if moment is None or content is None:
-        raise UsageError(
-            "DICOM needs to know when the exam was; give --study-date YYYY-MM-DDTHH:MM, or a --worklist with study_date"
-        )
+        way_out = "give --study-date YYYY-MM-DDTHH:MM, or a --worklist with study_date"
+        raise UsageError(f"DICOM needs to know when the exam was; {way_out}")
     for name, one in (("study-date", moment), ("content-date", content)):
         if not one.time:
             raise UsageError(f"DICOM needs the time of day; give --{name} {one.iso_date}THH:MM")

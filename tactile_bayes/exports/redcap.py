@@ -116,10 +116,9 @@ def records_csv(estimates: Sequence[EstimateFile], identity: Identity, *, id_fro
         for finding in estimate.masses:
             name = _record_id(estimate, finding, identity, id_from_scan=id_from_scan)
             if name in seen:
-                raise UsageError(
-                    f"{estimate.path} and {seen[name].path} would both be record {name}; give a scan's visit and mass "
-                    "in its session, or export them into two files"
-                )
+                both = f"{estimate.path} and {seen[name].path} would both be record {name}"
+                way_out = "give a scan's visit and mass in its session, or export them into two files"
+                raise UsageError(f"{both}; {way_out}")
             seen[name] = estimate
             rows.append({"record_id": name, COMPLETE: "1"} | _row(estimate, finding, identity))
     header = [*(one.name for one in FIELDS), COMPLETE]

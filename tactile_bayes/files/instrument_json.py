@@ -163,20 +163,13 @@ def _fitted(file: HeadFile, surface_mm: FloatArray) -> Head:
     """Head whose taxels are where `surface_mm` has them."""
     shape = HeadShape.of(surface_mm, file.pitch_mm)
     head = _checked(file, shape.rows, shape.columns, shape.radius_mm)
-    apart = float(np.abs(_centred(surface_mm) - _centred(head.surface_mm())).max())
+    away = (surface_mm - head.surface_mm()).reshape(-1, 3)
+    apart = float(np.abs(away - away.mean(axis=0)).max())  # wherever a site puts the origin
     if apart > _REGULAR_MM:
-        raise BadDataError(
-            f"surface_mm lies up to {apart:.2g} mm from a regular grid of {file.pitch_mm:g} mm on an arc across the "
-            "head",
-            way_out="the model has such heads only: give rows, columns and radius_mm of the nearest one (null: flat)",
-        )
+        grid = f"a regular grid of {file.pitch_mm:g} mm on an arc across the head"
+        way_out = "the model has such heads only: give rows, columns and radius_mm of the nearest one (null: flat)"
+        raise BadDataError(f"surface_mm lies up to {apart:.2g} mm from {grid}", way_out=way_out)
     return head
-
-
-def _centred(surface_mm: FloatArray) -> FloatArray:
-    """Places about the array's middle: where a site puts the origin does not change the head."""
-    places = surface_mm.reshape(-1, 3)
-    return np.asarray(places - places.mean(axis=0))
 
 
 # --- Instrument files of `record`, as JSON: array calibration and landmarks.

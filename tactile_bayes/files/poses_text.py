@@ -137,10 +137,9 @@ def _named(table: TextTable, header: Line, given: Stated) -> Source:
     layout = "wxyz" if {"qw", "qx", "qy"} & set(kinds) else "euler"
     names = (*_PLACE, *_ROTATIONS[layout])
     if not set(names) <= set(kinds):
-        raise BadDataError(
-            f"line {header.number} names no {', '.join(sorted(set(names) - set(kinds)))}",
-            way_out="name columns Tx, Ty, Tz and Q0, Qx, Qy, Qz, or x, y, z and azimuth, elevation, roll",
-        )
+        what = f"line {header.number} names no {', '.join(sorted(set(names) - set(kinds)))}"
+        way_out = "name columns Tx, Ty, Tz and Q0, Qx, Qy, Qz, or x, y, z and azimuth, elevation, roll"
+        raise BadDataError(what, way_out=way_out)
     if given.pose_layout not in (None, layout):
         raise BadDataError(f"line {header.number} names its rotations ({layout})", way_out="leave --pose-layout out")
     rows = [line for line in table.lines if line.number > header.number]

@@ -113,11 +113,8 @@ def check_limit(size: int, most: int, *, what: str) -> None:
     """
     allowed = most * limit_factor()
     if size > allowed:
-        times = -(-size // most)
-        raise BadDataError(
-            f"{what.format(f'{size:,}')}, over the limit of {int(allowed):,}",
-            way_out=f"if the file is sound, set {LIMITS_VARIABLE}={times}",
-        )
+        over = f"{what.format(f'{size:,}')}, over the limit of {int(allowed):,}"
+        raise BadDataError(over, way_out=f"if the file is sound, set {LIMITS_VARIABLE}={-(-size // most)}")
 
 
 def unpacked_limit(file_bytes: int) -> int:
@@ -269,9 +266,8 @@ def is_address(name: object) -> bool:
 def check_address(address: str) -> str:
     """Address without a slash at its end; it must have a bucket and no user or password."""
     if not _ADDRESS.fullmatch(address):
-        raise UsageError(
-            "the address of the object store is not as s3://bucket/folder; no user, port or password in it"
-        )
+        what = "the address of the object store is not as s3://bucket/folder"
+        raise UsageError(f"{what}; no user, port or password in it")
     return address.rstrip("/")
 
 

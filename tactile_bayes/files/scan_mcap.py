@@ -264,11 +264,8 @@ def read_scan(path: Path) -> Scan:
     """
     file = read_scan_report(path)
     if file.damaged:
-        raise BadDataError(
-            f"is damaged ({file.lost[0]})",
-            way_out="copy it again, or keep what is intact with `tactile-bayes import`",
-            path=str(path),
-        )
+        way_out = "copy it again, or keep what is intact with `tactile-bayes import`"
+        raise BadDataError(f"is damaged ({file.lost[0]})", way_out=way_out, path=str(path))
     return file.scan
 
 
@@ -314,7 +311,7 @@ def read_scan_report(path: Path) -> ScanFile:
 def read_truth(path: Path) -> dict[str, Any] | None:
     """Read the truth of a simulated scan; None for a scan without one."""
     truth = scan_records(path, keep=()).metadata.get("truth")
-    return None if truth is None else json_object(truth.get("json", ""), name="truth")
+    return None if truth is None else _json_object(truth.get("json", ""), name="truth")
 
 
 def scan_records(path: Path, *, keep: Collection[str]) -> McapRecords:
@@ -325,11 +322,8 @@ def scan_records(path: Path, *, keep: Collection[str]) -> McapRecords:
         what = "is cut off in its header" if records.lost else "is an MCAP file, but not a scan of this program"
         raise BadDataError(what, way_out="give a scan from `record`, `import` or `simulate`", path=str(path))
     if schema != SCAN_SCHEMA:
-        raise BadDataError(
-            f"is a scan of schema {schema!r}",
-            way_out=f"this version reads {SCAN_SCHEMA}; use the program that wrote it",
-            path=str(path),
-        )
+        way_out = f"this version reads {SCAN_SCHEMA}; use the program that wrote it"
+        raise BadDataError(f"is a scan of schema {schema!r}", way_out=way_out, path=str(path))
     return records
 
 
@@ -343,7 +337,7 @@ def file_findings(records: McapRecords) -> tuple[Finding, ...]:
 
 def provenance_of(records: McapRecords) -> dict[str, Any]:
     """The provenance of a scan's file, as `Provenance.as_dict` wrote it."""
-    return json_object(records.metadata.get("provenance", {}).get("json", "{}"), name="provenance")
+    return _json_object(records.metadata.get("provenance", {}).get("json", "{}"), name="provenance")
 
 
 def _attached(records: McapRecords, kind: type[T], name: str) -> T:
@@ -353,11 +347,11 @@ def _attached(records: McapRecords, kind: type[T], name: str) -> T:
         if records.finished:
             way_out = "attach it again: the program that wrote this copy left it out"
         raise BadDataError(f"holds no {name}", way_out=way_out)
-    document = json_object(records.attachments[name].decode("utf-8", "replace"), name=name)
+    document = _json_object(records.attachments[name].decode("utf-8", "replace"), name=name)
     return from_plain(kind, document, where=name)
 
 
-def json_object(text: str, *, name: str) -> dict[str, Any]:
+def _json_object(text: str, *, name: str) -> dict[str, Any]:
     """Parse a JSON object from a part of the file."""
     document = parse_json(text, name=name)
     if not isinstance(document, dict):
@@ -370,10 +364,8 @@ def message_times(messages: Messages, *, topic: str) -> FloatArray:
     times = messages.times_ns
     latest = int(times.max()) if len(times) else 0
     if latest > _LATEST_NS:
-        raise BadDataError(
-            f"{topic} holds a time of {latest} ns",
-            way_out=f"times must be {_LATEST_NS} ns or less; import it with times from 0",
-        )
+        way_out = f"times must be {_LATEST_NS} ns or less; import it with times from 0"
+        raise BadDataError(f"{topic} holds a time of {latest} ns", way_out=way_out)
     return s_from_ns(times.astype(np.int64))
 
 
@@ -384,9 +376,8 @@ def _frames(records: McapRecords, head: HeadGeometry) -> PressureFrames:
     for i, body in enumerate(messages.bodies()):
         data = _decode(Grid, body).data
         if len(data) != 2 * rows * columns:
-            raise BadDataError(
-                f"/pressure message {i} holds {len(data)} bytes", way_out=f"{rows} x {columns} uint16 counts are needed"
-            )
+            way_out = f"{rows} x {columns} uint16 counts are needed"
+            raise BadDataError(f"/pressure message {i} holds {len(data)} bytes", way_out=way_out)
         counts[i] = np.frombuffer(data, dtype="<u2").reshape(columns, rows).T
     return PressureFrames(message_times(messages, topic="/pressure"), counts)
 
@@ -426,10 +417,8 @@ def _decode(kind: Any, body: bytes) -> Any:
     try:
         return kind.FromString(body)
     except DecodeError:
-        raise BadDataError(
-            f"a message is not a {kind.DESCRIPTOR.full_name}",
-            way_out="copy it again, or write such messages",
-        ) from None
+        what = f"a message is not a {kind.DESCRIPTOR.full_name}"
+        raise BadDataError(what, way_out="copy it again, or write such messages") from None
 
 
 # --- Summary of a scan file, counted while reading it from front to back; no message is kept.

@@ -123,10 +123,8 @@ def _lumps(
         solid = [key for key in _OF_TISSUE if key in keys]
         both = [key for key in _OF_BUMPS if key in keys]
         if solid and both:
-            raise BadDataError(
-                f"lump[{i}] gives {both[0]}, of a bump, and {solid[0]}, of tissue",
-                way_out=f"leave out {', '.join(both)} or {', '.join(solid)}",
-            )
+            what = f"lump[{i}] gives {both[0]}, of a bump, and {solid[0]}, of tissue"
+            raise BadDataError(what, way_out=f"leave out {', '.join(both)} or {', '.join(solid)}")
         if not solid:
             bumps.append(Lump(**values))
             continue

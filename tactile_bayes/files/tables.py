@@ -249,12 +249,9 @@ def check_references(table: Table, schema_name: str, *, targets: Mapping[str, Ta
         known = set(_keys(target, key["reference"]["fields"]))
         for row, value in enumerate(_keys(table, key["fields"])):
             if value not in known:
-                raise table.error(
-                    row,
-                    " + ".join(key["fields"]),
-                    f"{_shown_key(value)} has no row in {target.path}",
-                    way_out="add its row there, correct the key, or leave its readings out",
-                )
+                what = f"{_shown_key(value)} has no row in {target.path}"
+                way_out = "add its row there, correct the key, or leave its readings out"
+                raise table.error(row, " + ".join(key["fields"]), what, way_out=way_out)
 
 
 def _check_header(path: Path, header: Sequence[str], fields: Mapping[str, Any], *, wide: str) -> None:
