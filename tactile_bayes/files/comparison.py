@@ -179,8 +179,3 @@ class CompareReport(Report, kw_only=True):
     left_out: tuple[str, ...]
     research_use: str
     provenance: dict[str, Any]
-
-    @property
-    def site_words(self) -> str:
-        """The site's spread between exams, in words; empty without one."""
-        return self.repeatability if isinstance(self.repeatability, str) else ""

@@ -81,8 +81,13 @@ def _decoded(data: bytes) -> Picture:
         try:
             image = Image.open(io.BytesIO(data), formats=("TIFF", "PNG"))
         except UnidentifiedImageError:
-            tags = _tags_of(data, TiffImagePlugin.ImageFileDirectory_v2)
-            what = "is not an image" if tags is None else f"holds {_samples(tags)}, which cannot be read"
+            what = "is not an image"
+            if data[:4] in (b"II*\x00", b"MM\x00*"):  # a TIFF that Pillow has no mode for
+                directory: Any = TiffImagePlugin.ImageFileDirectory_v2(data[:8])
+                stream = io.BytesIO(data)
+                stream.seek(directory.next)
+                directory.load(stream)
+                what = f"holds {_samples(directory)}, which cannot be read" if _BITS in directory else what
             raise BadDataError(what, way_out=_WAY_OUT) from None
         check_limit(image.width * image.height, CELLS, what="it has {} pixels")
         _choose_page(image)
@@ -127,12 +132,9 @@ def _grey(pixels: np.ndarray[Any, Any], mode: str) -> tuple[np.ndarray[Any, Any]
     elif mode in ("YCbCr", "CMYK", "LAB", "HSV") or not (colours == colours[..., :1]).all():
         raise BadDataError(f"is a colour image (mode {mode})", way_out="save one channel of intensities")
     if alpha is not None:
-        between = (alpha != 0) & (alpha != 255)
-        if between.any():
-            what = f"has {int(between.sum())} pixels that are transparent in part"
-            raise BadDataError(
-                what, way_out="save it without alpha, or with 0 where there is no value and 255 elsewhere"
-            )
+        if between := int(((alpha != 0) & (alpha != 255)).sum()):
+            way_out = "save it without alpha, or with 0 where there is no value and 255 elsewhere"
+            raise BadDataError(f"has {between} pixels that are transparent in part", way_out=way_out)
         without = alpha == 0
     return colours[..., 0], without
 
@@ -164,8 +166,8 @@ class _Facts(Record):
     @property
     def notes(self) -> tuple[str, ...]:
         """What of it the values no longer show."""
-        turned = ("its zero is white: values are turned round, so that more is brighter",) if self.white_is_zero else ()
-        marked = () if self.no_value is None else (f"{self.no_value:g} is no value in it, as the file says",)
+        turned = ["its zero is white: values are turned round, so that more is brighter"] if self.white_is_zero else []
+        marked = [] if self.no_value is None else [f"{self.no_value:g} is no value in it, as the file says"]
         return (*turned, *marked)
 
 
@@ -189,10 +191,9 @@ def _tiff_facts(tags: Mapping[int, Any]) -> _Facts:
     """Facts of a TIFF that can be read as it is; any other is refused with what it holds."""
     bits, kind, samples = _sample(tags)
     photometric = int(tags.get(_PHOTOMETRIC, _BLACK_IS_ZERO))
-    one = (samples, bits, kind) in _DECODED and photometric in (_WHITE_IS_ZERO, _BLACK_IS_ZERO, _PALETTE)
-    one = one and not (photometric == _WHITE_IS_ZERO and kind != 1)
-    many = (samples, bits, kind) in _DECODED_OF_MANY
-    if not (one or many) and (samples, bits) != (1, 1):
+    grey = (_BLACK_IS_ZERO, _PALETTE, *([_WHITE_IS_ZERO] if kind == 1 else []))
+    one = (samples, bits, kind) in _DECODED and photometric in grey
+    if not (one or (samples, bits, kind) in _DECODED_OF_MANY or (samples, bits) == (1, 1)):
         raise BadDataError(f"holds {_samples(tags)}, which cannot be read as they are", way_out=_WAY_OUT)
     try:
         no_value = float(str(tags[_NO_DATA]).strip("\x00 ")) if _NO_DATA in tags else None
@@ -218,26 +219,14 @@ def _samples(tags: Mapping[int, Any]) -> str:
     return words + (", white as zero" if int(tags.get(_PHOTOMETRIC, 1)) == _WHITE_IS_ZERO else "")
 
 
-def _tags_of(data: bytes, directory: Any) -> Mapping[int, Any] | None:
-    """Tags of the first image of a TIFF that Pillow has no mode for, by its `directory`; None where it is none."""
-    if data[:4] not in (b"II*\x00", b"MM\x00*"):
-        return None
-    tags: Any = directory(data[:8])
-    stream = io.BytesIO(data)
-    stream.seek(tags.next)
-    tags.load(stream)
-    return tags if _BITS in tags else None
-
-
 def _tiff_spacing(tags: Mapping[int, Any]) -> tuple[float, float] | None:
     """Sides of a pixel by the resolution: in inches, in cm, or in the unit that ImageJ writes into the description."""
     given = [float(tags.get(tag, 0) or 0) for tag in (_X_RESOLUTION, _Y_RESOLUTION)]
     if not all(np.isfinite(given)) or min(given) <= 0:
         return None
-    named = re.search(r"^unit=(\S+)", str(tags.get(_DESCRIPTION, "")), re.MULTILINE)
-    unit = (
-        named[1].replace("\\u00B5", "\u00b5") if named else {2: "inch", 3: "cm"}.get(int(tags.get(_RESOLUTION_UNIT, 2)))
-    )
+    unit = {2: "inch", 3: "cm"}.get(int(tags.get(_RESOLUTION_UNIT, 2)))
+    if named := re.search(r"^unit=(\S+)", str(tags.get(_DESCRIPTION, "")), re.MULTILINE):
+        unit = named[1].replace("\\u00B5", "\u00b5")
     if unit not in _MM:
         _check_square(1 / given[0], 1 / given[1])
         return None

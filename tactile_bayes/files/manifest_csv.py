@@ -32,11 +32,8 @@ SHAPE, MAP_FIGURE, SIZE_FIGURE = "shape.npz", "map.png", "size.png"
 EXAM_PAGE, THUMBNAIL = "exam.html", "thumbnail.svg"
 SIZED, SIZED_FIGURE = "sized.json", "sized.png"  #: Files of an exam.
 POOLED, POOLED_DRAWS = "pooled.json", "pooled.nc"  #: Files of a mass at a visit.
-COMPARED, COMPARED_FIGURE, GROWTH_PAGE = (
-    "compare.json",
-    "compare.png",
-    "growth.html",
-)  #: Files of a mass over its visits.
+COMPARED, COMPARED_FIGURE, GROWTH_PAGE = "compare.json", "compare.png", "growth.html"
+"""Files of a mass over its visits."""
 REPEATABILITY: Final = "repeatability.json"  #: Beside the folders, as the tables are.
 
 
@@ -189,11 +186,8 @@ def _check_spelling(table: Table, exams: Sequence[Exam]) -> None:
     """Refuse codes that differ by capitals alone: one may be mistyped, and on some disks their folders are one."""
     first: dict[tuple[str, str, str], tuple[str, int]] = {}
     for row, exam in enumerate(exams):
-        for column, code, patient in (
-            ("patient", exam.patient, ""),
-            ("visit", exam.visit, exam.patient),
-            ("mass", exam.mass, exam.patient),
-        ):
+        of = exam.patient
+        for column, code, patient in (("patient", of, ""), ("visit", exam.visit, of), ("mass", exam.mass, of)):
             spelled, line = first.setdefault((column, patient, code.casefold()), (code, exam.line))
             if code != spelled:
                 told = f"{code!r} differs from {spelled!r} on line {line} by capitals alone"

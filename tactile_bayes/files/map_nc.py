@@ -119,7 +119,12 @@ def read_map_and_header(path: Path) -> tuple[TactileMap, MapHeader]:
     """Read a map, and what its file says of it; for the errors see `read_map`."""
     with open_netcdf(path, way_out=_WAY_OUT) as file:
         header = _header(file)
-        check_limit(_dimension(file, "y") * _dimension(file, "x"), CELLS, what="it has {} cells")
+        cells = 1
+        for name in ("y", "x"):
+            if (length := file.dimension(name)) is None:
+                raise BadDataError(f"dimension {name} is missing", way_out=_WAY_OUT)
+            cells *= length
+        check_limit(cells, CELLS, what="it has {} cells")
         arrays = {}
         for field, (kind, dimensions, _) in _FIELDS.items():
             name = field.removesuffix("_mm")
@@ -181,13 +186,6 @@ def _header(file: Group) -> MapHeader:
         return from_plain(MapHeader, document, where="header")
     except BadDataError as error:
         raise BadDataError(error.what, way_out=_WAY_OUT) from None
-
-
-def _dimension(file: Group, name: str) -> int:
-    length = file.dimension(name)
-    if length is None:
-        raise BadDataError(f"dimension {name} is missing", way_out=_WAY_OUT)
-    return length
 
 
 def _read_transform(file: Group, name: str) -> Any:

@@ -149,9 +149,9 @@ class Group:
     def group(self, name: str) -> Group | None:
         """Subgroup by name; None where there is none."""
         found = self._own(name)
-        return (
-            Group(found, most_bytes=self._most_bytes, way_out=self._way_out) if isinstance(found, h5py.Group) else None
-        )
+        if not isinstance(found, h5py.Group):
+            return None
+        return Group(found, most_bytes=self._most_bytes, way_out=self._way_out)
 
     def attributes(self) -> dict[str, str]:
         """Text attributes by name."""
@@ -168,21 +168,16 @@ class Group:
         found = self._dataset(name)
         return None if found is None or len(found.shape) != 1 else int(found.shape[0])
 
-    def holds(self, name: str) -> bool:
-        """True when an array of this name exists; a dimension without values is not one."""
-        found = self._dataset(name)
-        return found is not None and not _is_bare(found)
-
     def variables(self) -> list[str]:
         """Names of the arrays in alphabetical order, without dimensions that have no values."""
-        return sorted(name for name in map(str, self._place) if self.holds(name))
+        return sorted(name for name in map(str, self._place) if self._array(name) is not None)
 
     def array(self, name: str, *, kind: str, dimensions: tuple[str, ...]) -> Any:
         """The values of a variable of the given type (``f8``, ``i8``, ``u2``) and dimensions; None where
         there is none.
         """
-        found = self._dataset(name)
-        if found is None or _is_bare(found):
+        found = self._array(name)
+        if found is None:
             return None
         if found.dtype.newbyteorder("=") != np.dtype(kind):
             raise BadDataError(f"variable {name} is {found.dtype}, not {np.dtype(kind)}", way_out=self._way_out)
@@ -226,6 +221,13 @@ class Group:
         if found.shape is None or found.external or found.is_virtual:
             raise BadDataError(f"variable {name} has its values in another file", way_out=self._way_out)
         return found
+
+    def _array(self, name: str) -> Any:
+        """Dataset that does not merely stand for a dimension without values; None where there is none."""
+        found = self._dataset(name)
+        scale = b"" if found is None else found.attrs.get("NAME", b"")
+        text = scale.decode("utf-8", "replace") if isinstance(scale, bytes) else str(scale)
+        return None if text.startswith(_NO_VARIABLE.partition("{")[0]) else found
 
     def _check_chunks(self, name: str, found: Any) -> None:
         """Refuse a chunk that does not unpack to its declared size.
@@ -277,13 +279,6 @@ def as_declared(values: Any, attributes: Mapping[str, Any]) -> Any:
     if not missing.any() and (scale, offset) == (1, 0):
         return values
     return np.where(missing, np.nan, values * scale + offset)
-
-
-def _is_bare(dataset: Any) -> bool:
-    """True when a dataset only represents a dimension without values."""
-    name = dataset.attrs.get("NAME", b"")
-    text = name.decode("utf-8", "replace") if isinstance(name, bytes) else str(name)
-    return text.startswith(_NO_VARIABLE.partition("{")[0])
 
 
 def _dimensions(dataset: Any) -> tuple[str, ...]:

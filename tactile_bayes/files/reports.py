@@ -48,6 +48,17 @@ class Report(Record, kw_only=True):
         found: dict[str, Any] = to_plain(self, digits=EXACT)
         return found
 
+    @property
+    def origin(self) -> Origin:
+        """Settings and inputs that it was made with."""
+        return from_plain(Origin, getattr(self, "provenance", {}))
+
+    @property
+    def site_words(self) -> str:
+        """The site's spread between exams, in words; empty without one."""
+        words = getattr(self, "repeatability", UNSET)
+        return words if isinstance(words, str) else ""
+
     def checked(self) -> Self:
         """Itself, held against its declaration as a file would be."""
         from_plain(type(self), self.document, where="the report")
@@ -378,11 +389,6 @@ class EstimateReport(Report, kw_only=True):
         """Figures of the size: spread between exams, whether the lump is oval."""
         return self.diagnostics
 
-    @property
-    def origin(self) -> Origin:
-        """Settings and inputs that it was made with."""
-        return from_plain(Origin, self.provenance)
-
 
 # --- One size from several maps of one mass.
 
@@ -465,13 +471,3 @@ class PooledReport(Report, kw_only=True):
     def leading(self) -> PooledReport | AnotherExam:
         """What holds the sizes that lead, see `EstimateReport.leading`."""
         return self if self.another_exam is None else self.another_exam
-
-    @property
-    def site_words(self) -> str:
-        """The site's spread between exams, in words; empty without one."""
-        return self.repeatability if isinstance(self.repeatability, str) else ""
-
-    @property
-    def origin(self) -> Origin:
-        """Settings and inputs that it was made with."""
-        return from_plain(Origin, self.provenance)
