@@ -1,5 +1,7 @@
 from tactile_bayes import errors as errors
 from tactile_bayes.api.arrays import scan as scan
+from tactile_bayes.api.calibrating import calibrate_repeatability as calibrate_repeatability
+from tactile_bayes.api.calibrating import calibrate_size as calibrate_size
 from tactile_bayes.api.comparing import Comparison as Comparison
 from tactile_bayes.api.comparing import compare as compare
 from tactile_bayes.api.diagnosing import Diagnosis as Diagnosis
@@ -24,8 +26,6 @@ from tactile_bayes.api.reports import exam_report as exam_report
 from tactile_bayes.api.reports import export as export
 from tactile_bayes.api.sized import SizeEstimate as SizeEstimate
 from tactile_bayes.api.trials import TrialResult as TrialResult
-from tactile_bayes.api.trials import calibrate_repeatability as calibrate_repeatability
-from tactile_bayes.api.trials import calibrate_size as calibrate_size
 from tactile_bayes.api.trials import validate as validate
 from tactile_bayes.campaigns.campaign import CampaignResult as CampaignResult
 from tactile_bayes.campaigns.campaign import campaign as campaign

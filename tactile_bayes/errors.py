@@ -7,6 +7,7 @@ import math
 import numbers
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 
 # --- Every error the program can explain in one line, each with the exit code it ends in.
@@ -23,6 +24,10 @@ EXIT_NOT_CONVERGED = 5
 EXIT_NO_ESTIMATE = 6
 EXIT_INTERRUPTED = 130
 EXIT_READER_GONE = 141
+
+
+BY_OPTIONS: ContextVar[bool] = ContextVar("by_options", default=False)
+"""Whether the command line called: its errors name options, those of Python's functions their keywords."""
 
 
 class TactileBayesError(Exception):

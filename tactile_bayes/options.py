@@ -14,23 +14,15 @@ from tactile_bayes.errors import UsageError
 from tactile_bayes.presets import (
     CELL_MM,
     DEFAULT_NORMALISE,
-    FAT_KPA,
-    FIT_RADIUS_MM,
-    GLAND_RATIO,
-    HEAD_RADIUS_MM,
-    MEAN_KPA,
+    MATCH_MM,
     MOST_FIELD_COSINES,
-    POISSON,
     PRESSURE_WINDOW_KPA,
-    SHOULDER_MM,
-    THICKNESS_MM,
     Background,
     Method,
     Noise,
     Normalise,
     Rotation,
     SceneAsked,
-    TrackerProtocol,
 )
 
 
@@ -60,6 +52,7 @@ class BumpPrior(Options):
 PRIORS: Final = BumpPrior.__struct_fields__
 
 
+MOST_PATIENTS: Final = 10_000  #: Of a plan.
 MOST_ITEMS: Final = 1_000_000
 """Of a batch: memory holds a name and an outcome for each."""
 IN_FILE: Final = {"file": True}
@@ -220,107 +213,9 @@ class MapOptions(Options):
             )
 
 
-class RecordOptions(Options, kw_only=True):
-    """Options of one recording, as given."""
-
-    output: Path
-    head_url: str
-    tracker_url: Annotated[
-        str | None,
-        Meta(
-            description="Port of the tracker; without, there are no poses.",
-            extra={"metavar": "URL", "option": "tracker"},
-        ),
-    ] = None
-    tracker_protocol: Annotated[
-        TrackerProtocol, Meta(description="Protocol of the tracker; a PATRIOT speaks liberty.")
-    ] = "fastrak"
-    head_baud: Annotated[int, Meta(ge=300, description="Baud rate of the head's port.")] = 2_000_000
-    tracker_baud: Annotated[
-        Annotated[int, Meta(ge=300)] | None,
-        Meta(description="Baud rate of the tracker's port. Default: the protocol's."),
-    ] = None
-    tracker_rom: Annotated[
-        tuple[Path, ...],
-        Meta(description="ndi: a wireless tool's description, one for each.", extra={"metavar": "ROM", "path": True}),
-    ] = ()
-    tool: Annotated[
-        str | None,
-        Meta(
-            description="Tool or station on the head, needed where the tracker has several.",
-            extra={"metavar": "NAME", "also": "station"},
-        ),
-    ] = None
-    reference: Annotated[
-        str | None,
-        Meta(
-            description="Tool or station fixed to the body; poses relative to it are free of breathing.",
-            extra={"metavar": "NAME"},
-        ),
-    ] = None
-    every: Annotated[int, Meta(ge=1, le=255, description="Record every n-th frame only.")] = 1
-    duration_s: Annotated[
-        Annotated[float, Meta(gt=0.0)] | None,
-        Meta(description="Stop after this time, s.", extra={"metavar": "S", "option": "duration"}),
-    ] = None
-    at_once: Annotated[
-        bool, Meta(description="Start at once, without waiting for space. Default: only with --duration.")
-    ] = False
-    clock: Annotated[
-        Literal["arrival", "shared"],
-        Meta(description="Time the poses by their arrival, or trust one clock of both devices."),
-    ] = "arrival"
-    invert_rotation: Annotated[bool, Meta(description="The tracker gives the inverse rotation.")] = False
-    like: Annotated[
-        Path | None,
-        Meta(description="Take geometry and calibration from this scan.", extra={"metavar": "SCAN.mcap", "path": True}),
-    ] = None
-    head_geometry: Annotated[
-        Path | None,
-        Meta(
-            description="Positions of the taxels and of the tracker's sensor.",
-            extra={"metavar": "HEAD.json", "path": True},
-        ),
-    ] = None
-    array_calibration: Annotated[
-        Path | None,
-        Meta(
-            description="Array calibration, made by `calibrate array`.", extra={"metavar": "ARRAY.json", "path": True}
-        ),
-    ] = None
-    uncalibrated: Annotated[bool, Meta(description="Record with the nominal gain: for bladder steps.")] = False
-    accept_calibration: Annotated[
-        bool, Meta(description="Accept an array calibration that is stale or of another head.")
-    ] = False
-    calibration_days: Annotated[
-        float, Meta(ge=0.0, description="Age from which an array calibration is stale, days.")
-    ] = 1.0
-    landmarks: Annotated[
-        Path | None,
-        Meta(description="Take landmarks from a JSON file or a scan.", extra={"metavar": "FILE", "path": True}),
-    ] = None
-    side: Annotated[Literal["left", "right", "phantom"] | None, Meta(description="Breast that is scanned.")] = None
-    posture: Annotated[
-        Literal["supine", "oblique", "sitting", "phantom"] | None, Meta(description="Posture during the scan.")
-    ] = None
-    lubricant: Annotated[str | None, Meta(description="Lubricant on the skin.", extra={"metavar": "TEXT"})] = None
-    examiner: Annotated[str | None, Meta(description="A code, not a name.", extra={"metavar": "CODE"})] = None
-    subject: Annotated[str | None, Meta(description="A code, not a name.", extra={"metavar": "CODE"})] = None
-    session_file: Annotated[
-        Path | None,
-        Meta(
-            description="Read these five, and other facts in plain text, from a file; an option overrides it.",
-            extra={"metavar": "SESSION.toml", "path": True, "option": "session"},
-        ),
-    ] = None
-    live: bool = False
-    serve: str | None = None
-    size_calibration: str = "solid-mean"
-    force: bool = False
-
-
 IntervalMethod = Literal["corrected", "jackknife", "bca"]
 Seed = Annotated[int, Meta(ge=0, description="Random seed.")]
+Workers = Annotated[int, Meta(ge=0, description="Number of worker processes.")]
 
 
 class TrialSettings(Options):
@@ -352,176 +247,6 @@ class TrialSettings(Options):
     ] = False
 
 
-SeatName = Annotated[
-    str,
-    Meta(
-        description="How far the lump stands out of the gland, if a grid does not state it.",
-        extra={"metavar": "centred|resting|0..2"},
-    ),
-]
-
-
-class SectionOptions(Options, kw_only=True):
-    """Cross-section of a simulated head."""
-
-    head_radius_mm: Annotated[float, Meta(gt=0, le=1e6, description="Radius of the head's arc, mm.")] = HEAD_RADIUS_MM
-    shoulder_mm: Annotated[float, Meta(ge=0, description="Radius of the head's shoulders, mm.")] = SHOULDER_MM
-
-
-class CaseOptions(Options, kw_only=True):
-    """Pressure, tissue and mesh of a forward study."""
-
-    mean_kpa: Annotated[float, Meta(gt=0, description="Mean pressure on the head.")] = MEAN_KPA
-    fat_kpa: Annotated[float, Meta(gt=0, description="Young's modulus of fat.")] = FAT_KPA
-    poisson: Annotated[float, Meta(description="Poisson's ratio of the tissues.")] = POISSON
-    gland_ratio: Annotated[float, Meta(gt=0, description="Modulus of gland over fat.")] = GLAND_RATIO
-    thickness_mm: Annotated[
-        Annotated[float, Meta(gt=0)] | None,
-        Meta(description="Depth of the chest wall, mm. Default: 70, or deeper for deep lumps."),
-    ] = None
-    fineness: Annotated[int, Meta(ge=1, le=8, description="Mesh fineness; doubling it halves the elements.")] = 2
-
-
-class StudyOptions(CaseOptions, kw_only=True):
-    """How the forward study is run."""
-
-    model: Annotated[
-        Literal["plane-strain", "solid"],
-        Meta(description="The paper's two-dimensional body, or balls under the whole head in three dimensions."),
-    ] = "plane-strain"
-    grid: Annotated[
-        str, Meta(description="The paper's 150 cases, or a table of cases.", extra={"metavar": "paper|FILE"})
-    ] = "paper"
-    seat: SeatName = "centred"
-    head: Literal["shoulders-inside", "shoulders-outside"] | None = None
-    background: Annotated[
-        Background | None,
-        Meta(
-            description="Background of Eq 7, solid only: free (default) is fitted, fixed is 1. In two dimensions it "
-            "is 1."
-        ),
-    ] = None
-    flat_field: Annotated[
-        bool | None,
-        Meta(description="Remove what the head reads of the same body without the lump, solid only. Default: on."),
-    ] = None
-
-
-KpaRange = tuple[Annotated[float, Meta(gt=0)], Annotated[float, Meta(gt=0)]]
-
-
-class TissueOptions(Options, kw_only=True):
-    """Homogeneous tissue under a head, the pressures on it, and how unevenly the head may press."""
-
-    modulus_kpa: Annotated[
-        KpaRange, Meta(description="Young's moduli of the tissue (paper: 15 to 25).", extra={"metavar": "LOW HIGH"})
-    ] = (15.0, 25.0)
-    pressure_kpa: Annotated[
-        KpaRange, Meta(description="Mean pressures under the head (paper: 5 to 14).", extra={"metavar": "LOW HIGH"})
-    ] = PRESSURE_WINDOW_KPA
-    thickness_mm: Annotated[
-        float, Meta(gt=0, description="Thickness of the tissue on its rigid base, mm. The paper gives none.")
-    ] = THICKNESS_MM
-    poisson: Annotated[float, Meta(ge=0, lt=0.5, description="Poisson's ratio of the tissue.")] = POISSON
-    limit_percent: Annotated[
-        float,
-        Meta(gt=0, description="Largest allowed departure of a taxel from the frame's mean, % of it (paper: 7.5)."),
-    ] = 7.5
-
-
-class PopulationOptions(Options, kw_only=True):
-    """How many bodies are simulated, and how their maps are made."""
-
-    masses: Annotated[int, Meta(ge=1, le=MOST_ITEMS, description="Number of bodies, one lump each.")] = 400
-    centred: Annotated[
-        int,
-        Meta(
-            ge=0,
-            le=MOST_ITEMS,
-            description="Further bodies whose lump is centred on the gland's surface, as the paper has it.",
-        ),
-    ] = 0
-    scans: Annotated[int, Meta(ge=1, le=1000, description="Number of exams per body.")] = 2
-    normalise: Annotated[
-        tuple[Literal["gain", "mean"], ...],
-        Meta(
-            description="Normalisation of the maps, as in `map`; the calibration is for maps made the same way. Give "
-            "it twice for a row by each from one scan."
-        ),
-    ] = ("gain",)
-    seed: Seed = 7
-
-
-class SbcOptions(Options, kw_only=True):
-    """How simulation-based calibration is run."""
-
-    maps: Annotated[int, Meta(ge=1, le=MOST_ITEMS, description="Maps to simulate.")] = 200
-    method: Annotated[
-        Literal["laplace", "importance", "ensemble"],
-        Meta(description="Method of the posterior draws, as in `estimate`; ensemble takes about 20 times as long."),
-    ] = "importance"
-    field_cosines: Annotated[
-        FieldCosines,
-        Meta(
-            description="Basis functions of the noise field, as field_cosines of `estimate`.",
-            extra={"metavar": "N|auto"},
-        ),
-    ] = "auto"
-    seed: Seed = 1
-
-
-class LearnOptions(Options, kw_only=True):
-    """How a size calibration is learned from a table."""
-
-    form: Annotated[
-        Literal["eq6", "eq6-residual"],
-        Meta(
-            description="eq6: as printed, from a table of lumps, or of bodies made by `population`; eq6-residual: with "
-            "what Eq 6 leaves of the sizes, of bodies only."
-        ),
-    ] = "eq6"
-    fit: Annotated[
-        Literal["joint", "two-stage"],
-        Meta(
-            description="eq6: joint posterior of m, b, e, f from all rows, or the paper's two stages (needs "
-            "depth_ratio)."
-        ),
-    ] = "joint"
-    normalise: Annotated[
-        Normalise | None,
-        Meta(
-            description="Normalisation of the table's maps, if the table does not state it; of a table of `population` "
-            "with rows by several, which to learn from. Default: mean."
-        ),
-    ] = None
-    background: Annotated[
-        Background | None,
-        Meta(
-            description="Background in the table's fits, if the table does not state it. Default: fixed, or free with "
-            "--normalise none."
-        ),
-    ] = None
-    fit_radius_mm: Annotated[
-        Annotated[float, Meta(gt=0)] | None,
-        Meta(
-            description="Radius of the table's fit windows, mm, if the table does not state it. Default: "
-            f"{FIT_RADIUS_MM:g}."
-        ),
-    ] = None
-    noise: Annotated[
-        Noise | None,
-        Meta(
-            description="Noise model of the table's fits, if the table does not state it; least squares is "
-            "independent. Default: independent."
-        ),
-    ] = None
-    least_stiffness_ratio: Annotated[
-        float,
-        Meta(ge=0, description="Leave out lumps softer than this: above 8 the paper's widths change by less than 5 %."),
-    ] = 0.0
-    seed: Seed = 1
-
-
 Aim = Literal["power", "precision"]
 
 
@@ -540,9 +265,17 @@ class PlanErrors(Options):
     ] = 0.04
 
 
-class PlanAims(Options):
-    """What the number of patients of a trial is to reach, instead of a number that is given."""
+class PlanOptions(Options, kw_only=True):
+    """Designs of a trial that are simulated, or what the number of patients is to reach instead of being given."""
 
+    patients: Annotated[
+        tuple[Annotated[int, Meta(ge=8, le=MOST_PATIENTS)], ...],
+        Meta(description="Number of patients, one mass each."),
+    ] = (16, 24, 32, 48)
+    maps: Annotated[
+        tuple[Annotated[int, Meta(ge=1, le=1000)], ...],
+        Meta(description="Number of tactile maps per mass; 3 with --power or --precision."),
+    ] = (1, 3, 5)
     power: Annotated[
         Annotated[float, Meta(ge=0.5, le=0.99)] | None,
         Meta(
@@ -557,12 +290,65 @@ class PlanAims(Options):
             extra={"metavar": "FACTOR"},
         ),
     ] = None
+    against: Annotated[str, Meta(description="Modality of the pilot to compare with.")] = "ultrasound"
+    trials: Annotated[int, Meta(ge=50, le=MOST_ITEMS, description="Number of simulated trials per design.")] = 1000
+    seed: Seed = 1999
+    workers: Workers = 1
 
     @property
     def wanted(self) -> dict[Aim, float]:
         """What was given."""
         each: dict[Aim, float | None] = {"power": self.power, "precision": self.precision}
         return {aim: target for aim, target in each.items() if target is not None}
+
+
+class CampaignOptions(Options, kw_only=True):
+    """How the exams of a table are mapped and matched, and what is done with them."""
+
+    excision: Annotated[
+        Path | None,
+        Meta(
+            description="Sizes measured after excision: adds the trial's report.",
+            extra={"metavar": "EX.csv", "path": True},
+        ),
+    ] = None
+    columns: Annotated[
+        Path | None,
+        Meta(
+            description="Layout of a wide EX.csv: which column holds what, in which unit.",
+            extra={"metavar": "MAP.toml", "path": True},
+        ),
+    ] = None
+    protocol: Annotated[
+        Path | None,
+        Meta(
+            description="Pre-specified analysis of the trial, as for `validate`.",
+            extra={"metavar": "FILE.toml", "path": True},
+        ),
+    ] = None
+    normalise: Annotated[Normalise, Meta(description="As `map`.")] = DEFAULT_NORMALISE
+    match_mm: Annotated[
+        float,
+        Meta(
+            gt=0,
+            description="Distance within which a mass is the one that another exam of the breast names by place.",
+            extra={"metavar": "MM"},
+        ),
+    ] = MATCH_MM
+    figures: Annotated[bool, Meta(description="Draw map and size posterior of each exam.")] = False
+    dry_run: Annotated[bool, Meta(description="Print what would be done, and do nothing.")] = False
+    copy_to: Annotated[
+        str | None,
+        Meta(
+            description="Copy every file into this folder of an object store, step by step.",
+            extra={"metavar": "s3://BUCKET/FOLDER"},
+        ),
+    ] = None
+    workers: Workers = 1
+    scheduler: Annotated[
+        str | None,
+        Meta(description="Send the exams to a dask scheduler (extra [cluster]).", extra={"metavar": "ADDRESS"}),
+    ] = None
 
 
 def _text(longest: int, metavar: str, meaning: str) -> Meta:

@@ -8,17 +8,17 @@ from typing import Any
 
 import click
 
+from tactile_bayes.api.calibrating import learn
 from tactile_bayes.api.repeatability import exams_in, learn_from_exams
-from tactile_bayes.api.site_correction import correct_size
-from tactile_bayes.api.size_calibration import EqSixFit, PopulationForm, is_population, learn_eq6, learn_population
 from tactile_bayes.commands.options import also_read, typed_options
 from tactile_bayes.declarations import as_dict
-from tactile_bayes.errors import BadDataError, UsageError, in_file
+from tactile_bayes.errors import BadDataError, in_file
 from tactile_bayes.files.instrument_json import ArrayCalibrationFile, write_array_calibration
 from tactile_bayes.files.provenance import Provenance, hash_inputs
 from tactile_bayes.files.scan_mcap import read_scan
 from tactile_bayes.files.size_json import size_calibration_path
 from tactile_bayes.hardware.bladder import ArrayFit, BladderStep, fit_array
+from tactile_bayes.laboratory_options import LearnOptions
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.calibration import (
     body_calibration_text,
@@ -95,38 +95,18 @@ def _text(fit: ArrayFit, head: str, output: Path) -> str:
 def calibrate_size_action(
     table: Path,
     output: Path,
-    form: PopulationForm,
     correct: str | None,
     against: Path | None,
-    fit: EqSixFit,
-    normalise: str | None,
-    background: str | None,
-    fit_radius_mm: float | None,
-    noise: str | None,
-    least_stiffness_ratio: float,
     figure: Path | None,
-    seed: int,
     force: bool,
+    **options: Any,
 ) -> None:
     """Learn Eq 6, d = m sigma / (e a^f) + b, from a study or a set of phantoms, or over a population of bodies."""
-    declared = {"normalise": normalise, "background": background, "fit_radius_mm": fit_radius_mm, "noise": noise}
+    typed = typed_options()
+    with progress_bar("maps" if correct is not None else "effective draws") as progress:
+        learned = learn(table, LearnOptions(**options), typed, correct=correct, against=against, progress=progress)
     if correct is not None:
-        why = "is for learning a calibration; leave it out with --correct"
-        _refuse(why, "form", "against", "fit", "least_stiffness_ratio", "figure")
-        with progress_bar("maps") as progress:
-            learned = correct_size(table, correct, declared, seed=seed, progress=progress)
         also_read(*learned.inputs.values())
-    elif form != "eq6" or is_population(table):
-        why = "is for tables of lumps: a table of `population` fixes how its maps were made"
-        _refuse(why, "fit", "background", "fit_radius_mm", "noise", "least_stiffness_ratio", "figure", "seed")
-        learned = learn_population(table, form, normalise, against=against)
-    else:
-        if against is not None:
-            raise UsageError("--against is for a table of `population`; leave it out")
-        with progress_bar("effective draws") as progress:
-            learned = learn_eq6(
-                table, declared, fit=fit, least_stiffness_ratio=least_stiffness_ratio, seed=seed, progress=progress
-            )
     learned.write(output, force=force)
     calibration = learned.calibration
     if isinstance(calibration, BodyCalibration):
@@ -137,14 +117,6 @@ def calibrate_size_action(
         eq6_figure(calibration, learned.lumps, figure, title=table.name, force=force)
     words = calibration_text(calibration, not_left_out=learned.not_left_out, other_fit=learned.other_fit)
     click.echo(words, nl=False)
-
-
-def _refuse(why: str, *others: str) -> None:
-    """Refuse an option that is for calibrations of another kind."""
-    typed = typed_options()
-    for name in others:
-        if name in typed:
-            raise UsageError(f"--{name.replace('_', '-')} {why}")
 
 
 def calibrate_repeatability_action(folder: Path, output: Path, size_calibration: str | None, force: bool) -> None:

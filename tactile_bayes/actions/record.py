@@ -36,7 +36,7 @@ from tactile_bayes.hardware.ports import Port, read_in_process
 from tactile_bayes.hardware.readings import Follower, HelloReading
 from tactile_bayes.hardware.recorder import LandmarkTouch, Line, Observer, Recorder, Report
 from tactile_bayes.hardware.serial_trackers import TRACKERS, check_head, open_tracker
-from tactile_bayes.options import RecordOptions
+from tactile_bayes.laboratory_options import RecordOptions
 from tactile_bayes.presets import PRESSURE_RANGE_KPA
 from tactile_bayes.report.map_text import record_text
 from tactile_bayes.scans import ElementCalibration, HeadGeometry, Landmarks

@@ -25,7 +25,7 @@ from tactile_bayes.files.tables import csv_text
 from tactile_bayes.forward.line import outside_range
 from tactile_bayes.forward.scene import Head, Scene
 from tactile_bayes.forward.simulate import simulate
-from tactile_bayes.options import PopulationOptions
+from tactile_bayes.laboratory_options import PopulationOptions
 from tactile_bayes.presets import DEFAULT_NORMALISE, RESEARCH_USE
 from tactile_bayes.shell import progress_bar
 from tactile_bayes.studies.population import (

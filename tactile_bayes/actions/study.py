@@ -30,8 +30,9 @@ from tactile_bayes.forward.contact import Head
 from tactile_bayes.forward.line import outside_range
 from tactile_bayes.forward.scene import Head as Array
 from tactile_bayes.forward.tissue import parse_seat
+from tactile_bayes.laboratory_options import CaseOptions, SbcOptions, SectionOptions, StudyOptions
 from tactile_bayes.mapping.select import scan_findings
-from tactile_bayes.options import CaseOptions, FieldCosines, SbcOptions, SectionOptions, StudyOptions
+from tactile_bayes.options import FieldCosines
 from tactile_bayes.presets import HEADS, RESEARCH_USE, SHOULDERS_INSIDE, SHOULDERS_OUTSIDE, Method
 from tactile_bayes.report.laboratory import heads_text, sbc_document, sbc_figure, sbc_text, tables_document, tables_text
 from tactile_bayes.report.laboratory import table_text as ranks_table

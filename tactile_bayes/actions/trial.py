@@ -14,15 +14,14 @@ from tactile_bayes.api.planning import planned, read_pilot
 from tactile_bayes.api.trials import analyse, load_trial
 from tactile_bayes.campaigns.campaign import names_line, run_campaign
 from tactile_bayes.campaigns.exams import Found, find_exams
-from tactile_bayes.campaigns.settings import CampaignSettings
 from tactile_bayes.commands.options import also_read, settings_of, typed_options
+from tactile_bayes.declarations import names_of
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.atomic import refuse_existing
 from tactile_bayes.files.documents import dump_json, read_protocol
 from tactile_bayes.files.manifest_csv import add_rows, read_manifest, read_rows, write_manifest
-from tactile_bayes.files.reading import check_address
 from tactile_bayes.files.size_json import NONE
-from tactile_bayes.options import PlanAims, TrialSettings
+from tactile_bayes.options import CampaignOptions, TrialSettings
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.pages import PageFiles
 from tactile_bayes.shell import progress_bar
@@ -81,44 +80,23 @@ def _settings(given: dict[str, Any], protocol: Path | None) -> tuple[str | None,
 
 
 def plan_action(
-    patients: tuple[int, ...],
-    maps: tuple[int, ...],
-    power: float | None,
-    precision: float | None,
     pilot: Path | None,
     excision: Path | None,
-    against: str,
-    trials: int,
-    seed: int,
-    workers: int,
     as_json: bool,
     output: Path | None,
     figure: Path | None,
     force: bool,
-    **errors: float,
+    **options: Any,
 ) -> None:
     """Plan a trial: power, widths of intervals and the worth of more maps, by simulation."""
-    typed = typed_options()
-    compared = against if "against" in typed else None
-    read = read_pilot(pilot, excision, compared)
+    given = {name: options[name] for name in options.keys() & typed_options()}
+    read = read_pilot(pilot, excision, given.get("against"))
     if read is not None:
         also_read(*read.trial.files.values())
         for doubt in read.doubts():
             click.echo(f"{pilot}: {doubt}", err=True)
-    given = {name: value for name, value in errors.items() if name in typed}
     with progress_bar("designs") as progress:
-        found = planned(
-            patients if "patients" in typed else None,
-            maps if "maps" in typed else None,
-            given,
-            aims=PlanAims(power, precision),
-            pilot=read,
-            against=compared,
-            trials=trials,
-            seed=seed,
-            workers=workers,
-            progress=progress,
-        )
+        found = planned(given, read, progress)
     try:
         if output:
             found.write_json(output, force=force)
@@ -183,45 +161,20 @@ def _say_found(found: Found, output: Path, before: Sequence[Mapping[str, str]] |
 
 
 def campaign_run_action(
-    exams: Path,
-    output: Path,
-    excision: Path | None,
-    columns: Path | None,
-    protocol: Path | None,
-    settings_file: Path | None,
-    normalise: str,
-    match_mm: float,
-    repeatability: str | None,
-    figures: bool,
-    dry_run: bool,
-    copy_to: str | None,
-    workers: int,
-    scheduler: str | None,
-    **asked: Any,
+    exams: Path, output: Path, settings_file: Path | None, repeatability: str | None, **options: Any
 ) -> None:
     """Map, estimate and pool the exams of a table, and report the trial."""
+    asked = CampaignOptions(**{name: options.pop(name) for name in names_of(CampaignOptions)})
     given = None if repeatability in (None, NONE) else Path(str(repeatability))
-    settings = CampaignSettings(
-        settings_of(settings_file=settings_file, repeatability=given, **asked),
-        normalise,
-        figures,
-        match_mm,
-        own_repeatability=repeatability is None,
-        copy_to="" if copy_to is None else check_address(copy_to),
-    )
     found = run_campaign(
         exams,
         output,
-        settings,
-        excision=excision,
-        columns=columns,
-        protocol=protocol,
+        asked,
+        settings_of(settings_file=settings_file, repeatability=given, **options),
+        own_repeatability=repeatability is None,
         read=[path for path in (settings_file, given) if path],
-        dry_run=dry_run,
-        workers=workers,
-        scheduler=scheduler,
         bar=partial(progress_bar, log_every_s=_LOG_EVERY_S, time_left=False),
     )
-    for line in () if dry_run else found.failed:
+    for line in () if asked.dry_run else found.failed:
         click.echo(f"failed: {line}", err=True)
     click.echo(found.text, nl=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import re
 from collections.abc import Callable, Collection, Iterable, Sequence
 from functools import wraps
@@ -9,7 +10,8 @@ from typing import Any, Final, ParamSpec, TypeVar
 
 import numpy as np
 
-from tactile_bayes.errors import BadDataError, TactileBayesError, UsageError, meant
+from tactile_bayes.declarations import Record, default_of, names_of
+from tactile_bayes.errors import BY_OPTIONS, BadDataError, TactileBayesError, UsageError, meant
 
 _Given = ParamSpec("_Given")
 _Returned = TypeVar("_Returned")
@@ -35,14 +37,20 @@ def _keyword(found: re.Match[str]) -> str:
         return name
     if value.lstrip("-")[0] in "0123456789.":
         return f"{name}={value}"
-    return f'{name}="{value}"' if name in (*_CHOICES, "size_calibration") and value != "or" else f"{name} {value}"
+    return (
+        f'{name}="{value}"'
+        if name in (*_CHOICES, "size_calibration") and value not in ("or", "is")
+        else f"{name} {value}"
+    )
 
 
 def door(function: Callable[_Given, _Returned]) -> Callable[_Given, _Returned]:
-    """A public function whose errors name keywords, not options of the command line."""
+    """A public function whose errors name keywords, but options where the command line calls it."""
 
     @wraps(function)
     def called(*args: _Given.args, **keywords: _Given.kwargs) -> _Returned:
+        if BY_OPTIONS.get():
+            return function(*args, **keywords)
         try:
             return function(*args, **keywords)
         except BadDataError as error:
@@ -55,11 +63,33 @@ def door(function: Callable[_Given, _Returned]) -> Callable[_Given, _Returned]:
     return called
 
 
-def check_keywords(function: str, given: Iterable[str], known: Collection[str]) -> None:
-    """Refuse a keyword that a function does not have."""
-    for name in given:
-        if name not in known:
-            raise TypeError(f"{function} has no keyword {name!r}; {meant(name, known)}")
+def takes(
+    *records: type[Record], without: Collection[str] = ()
+) -> Callable[[Callable[_Given, _Returned]], Callable[_Given, _Returned]]:
+    """A function whose further keywords are the fields of these records, and no others.
+
+    Help and completion show each with its default. A keyword that was left out is not handed on: the record that the
+    function makes of them has the default.
+    """
+    fields = {name: default_of(record, name) for record in records for name in names_of(record) if name not in without}
+
+    def made(function: Callable[_Given, _Returned]) -> Callable[_Given, _Returned]:
+        shown = inspect.signature(function).parameters
+        own = [one for one in shown.values() if one.kind is not one.VAR_KEYWORD]
+        known = [*(one.name for one in own), *fields]
+
+        @wraps(function)
+        def called(*args: _Given.args, **keywords: _Given.kwargs) -> _Returned:
+            for name in keywords:
+                if name not in known:
+                    raise TypeError(f"{function.__name__} has no keyword {name!r}; {meant(name, known)}")
+            return function(*args, **keywords)
+
+        more = (inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=fields[name]) for name in fields)
+        called.__signature__ = inspect.Signature([*own, *more])  # type: ignore[attr-defined]
+        return called
+
+    return made
 
 
 def sequence_of(name: str, given: Any, what: str) -> Sequence[Any]:

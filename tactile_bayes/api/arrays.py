@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from tactile_bayes.api.arguments import check_keywords, door, plain
+from tactile_bayes.api.arguments import door, plain, takes
 from tactile_bayes.api.maps import PathLike, path_of, scan_given
-from tactile_bayes.declarations import EXACT, names_of, replace, to_plain
+from tactile_bayes.declarations import EXACT, replace, to_plain
 from tactile_bayes.errors import UsageError
 from tactile_bayes.files.array_map import read_array_map
 from tactile_bayes.files.arrays_layout import ArrayMap, Stated
@@ -35,6 +35,7 @@ _HEAD_SCHEMA = "tactile-bayes/head/1"
 
 
 @door
+@takes(Stated)
 def scan(
     frames: Any,
     time: Any = None,
@@ -85,7 +86,6 @@ def scan(
     UsageError
         When an argument cannot be so.
     """
-    check_keywords("scan", stated, names_of(Stated))
     given = _stated(columns, stated)
     beside = [_poses(poses, given), _head(head), _calibration(calibration), _landmarks(landmarks)]
     if isinstance(frames, str | Path):

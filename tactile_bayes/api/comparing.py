@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tactile_bayes.api.arguments import door, plain, sequence_of
+from tactile_bayes.api.arguments import door, plain, sequence_of, takes
 from tactile_bayes.api.estimates import estimated, settings_of
 from tactile_bayes.api.maps import Map, PathLike, path_of
 from tactile_bayes.api.pooled import common_calibration, one_mass, place_of
@@ -420,6 +420,7 @@ _RECORDED = ("size_calibration", "method", "interval", "scene", "between_map_sd"
 
 
 @door
+@takes(Settings, without=["settings_file"])
 def compare(
     first: Any,
     second: Any,

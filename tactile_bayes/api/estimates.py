@@ -2,29 +2,25 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from tactile_bayes.api.arguments import check_keywords, door, plain, sequence_of
+from tactile_bayes.api.arguments import door, plain, sequence_of, takes
 from tactile_bayes.api.estimating import estimate_one
 from tactile_bayes.api.maps import Map, map_of, path_of
 from tactile_bayes.api.pooled import PooledSize, pool_estimates
 from tactile_bayes.api.settings import Settings, refuse_checkpoint
 from tactile_bayes.api.sized import SizeEstimate
-from tactile_bayes.declarations import default_of, names_of, replace
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import UsageError, check_number
 from tactile_bayes.files.size_json import read_repeatability
-
-_KEYWORDS = tuple(name for name in names_of(Settings) if name != "settings_file")
 
 
 def settings_of(options: Mapping[str, Any]) -> Settings:
     """Make settings from keywords; the defaults are the command line's."""
-    check_keywords("estimate", options, _KEYWORDS)
     given = {name: plain(value) for name, value in options.items()}
     calibration, repeatability = given.get("size_calibration"), given.get("repeatability")
     if not (calibration is None or isinstance(calibration, str) or hasattr(calibration, "recipe")):
@@ -51,6 +47,7 @@ def _properties(given: Any) -> tuple[tuple[str, float], ...]:
 
 
 @door
+@takes(Settings, without=["settings_file"])
 def estimate(tactile_map: Any, *, progress: Callable[[int, int], None] | None = None, **settings: Any) -> SizeEstimate:
     """Estimate a lump's size from one map.
 
@@ -94,6 +91,7 @@ def estimate(tactile_map: Any, *, progress: Callable[[int, int], None] | None = 
 
 
 @door
+@takes(Settings, without=["settings_file"])
 def pool(maps: Iterable[Any], **settings: Any) -> PooledSize:
     """Estimate one size from several maps of one mass, whose spread is learned.
 
@@ -135,12 +133,3 @@ def listed(given: Any) -> list[Any]:
     if isinstance(given, str | Path | Map | SizeEstimate | PooledSize):
         return [given]
     return list(sequence_of("files", given, "maps, estimates or paths"))
-
-
-# every setting and its default, for help and completion
-estimate.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
-    [
-        *(one for one in inspect.signature(estimate).parameters.values() if one.kind is not one.VAR_KEYWORD),
-        *(inspect.Parameter(n, inspect.Parameter.KEYWORD_ONLY, default=default_of(Settings, n)) for n in _KEYWORDS),
-    ]
-)

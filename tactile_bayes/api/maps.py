@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
-from tactile_bayes.api.arguments import check_keywords, door, plain
-from tactile_bayes.declarations import EXACT, Record, as_dict, names_of, to_plain
+from tactile_bayes.api.arguments import door, plain, takes
+from tactile_bayes.declarations import EXACT, Record, as_dict, to_plain
 from tactile_bayes.errors import UsageError, check_number
 from tactile_bayes.files.arrays_layout import GridOptions
 from tactile_bayes.files.atomic import Format, check_suffix, sha256
@@ -20,14 +20,17 @@ from tactile_bayes.files.grids import grid_map, import_grid
 from tactile_bayes.files.map_nc import read_map_and_scans, write_map
 from tactile_bayes.files.provenance import Provenance, repeated_scans, scan_facts
 from tactile_bayes.files.scene_toml import read_scene, scene_of
+from tactile_bayes.files.tables import Sheet
 from tactile_bayes.findings import Finding, finding_lines
 from tactile_bayes.forward.instrument import SimulatedScan
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.arrangement import ArrangementCheck, check_scan
 from tactile_bayes.mapping.build import build_map as build
 from tactile_bayes.mapping.map import TactileMap
+from tactile_bayes.mapping.plane import MAX_POSE_GAP_MS
 from tactile_bayes.options import MapOptions
 from tactile_bayes.presets import PRESSURE_WINDOW_KPA, RESEARCH_USE
+from tactile_bayes.progress import Progress, untold
 from tactile_bayes.report.map_figure import map_figure
 from tactile_bayes.scans import Scan
 
@@ -88,6 +91,13 @@ def output_path(given: PathLike, written: Format) -> Path:
     path = required_path(given, "the path")
     check_suffix(path, written)
     return path
+
+
+def table_of(given: PathLike | pandas.DataFrame, name: str) -> Path | Sheet:
+    """Return a path as it is, and a DataFrame as CSV text."""
+    if hasattr(given, "to_csv"):
+        return Sheet(Path(f"{name} (DataFrame)"), given.to_csv(index=False))
+    return required_path(given, name)
 
 
 # --- The provenance of a map of scan files.
@@ -224,13 +234,20 @@ def read_map(path: PathLike) -> Map:
 
 
 @door
-def build_map(scans: Any, **options: Any) -> Map:
+@takes(MapOptions)
+def build_map(
+    scans: Any, *, max_pose_gap_ms: float = MAX_POSE_GAP_MS, progress: Progress = untold, **options: Any
+) -> Map:
     """Build one map from a scan, or from several scans of one examination.
 
     Parameters
     ----------
     scans
         A scan, a simulated scan, a path, or a sequence of them.
+    max_pose_gap_ms
+        Frames between two distinct poses further apart are left out.
+    progress
+        Called with frames done and wanted.
     **options
         As of `tactile_bayes.options.MapOptions`: cell_mm, pressure_window_kpa, normalise...
 
@@ -241,7 +258,6 @@ def build_map(scans: Any, **options: Any) -> Map:
     UsageError
         When an option cannot be so, or a recording is given twice.
     """
-    check_keywords("build_map", options, (*names_of(MapOptions), "max_pose_gap_ms", "progress"))
     given = [scans] if isinstance(scans, str | Path) or not isinstance(scans, Sequence) else list(scans)
     loaded: list[Scan] = []
     facts: list[dict[str, str]] = []
@@ -257,7 +273,8 @@ def build_map(scans: Any, **options: Any) -> Map:
         raise UsageError(
             f"scan {later + 1} is the recording of scan {earlier + 1}, whose frames would count twice; give it once"
         )
-    made = build(loaded, **{name: plain(value) for name, value in options.items()})
+    asked = {name: plain(value) for name, value in options.items()}
+    made = build(loaded, max_pose_gap_ms=max_pose_gap_ms, progress=progress, **asked)
     return Map(made, scans=tuple(facts))
 
 
@@ -344,6 +361,7 @@ def demo_map() -> Map:
 
 
 @door
+@takes(GridOptions)
 def map_of(given: Any, **stated: Any) -> Map:
     """Make a map of values in rows and columns, for `estimate`.
 
@@ -367,7 +385,6 @@ def map_of(given: Any, **stated: Any) -> Map:
     UsageError
         When it is none of these, or an argument cannot be so.
     """
-    check_keywords("map_of", stated, names_of(GridOptions))
     if isinstance(given, Map):
         return given
     if isinstance(given, TactileMap):

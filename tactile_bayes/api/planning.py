@@ -13,24 +13,23 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tactile_bayes.api.arguments import check_keywords, door, plain, sequence_of
-from tactile_bayes.api.maps import PathLike
-from tactile_bayes.api.trials import load_trial, table_of
+from tactile_bayes.api.arguments import door, plain, sequence_of, takes
+from tactile_bayes.api.maps import PathLike, table_of
+from tactile_bayes.api.trials import load_trial
 from tactile_bayes.batch import open_executor, run_batch
 from tactile_bayes.declarations import EXACT, Record, as_dict, names_of, to_plain
-from tactile_bayes.errors import BadDataError, UsageError, check_number
+from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.atomic import write_text
 from tactile_bayes.files.documents import dump_json
 from tactile_bayes.files.provenance import Provenance, hash_inputs
 from tactile_bayes.files.tables import Sheet
-from tactile_bayes.options import Aim, PlanAims, PlanErrors
+from tactile_bayes.options import MOST_PATIENTS, Aim, PlanErrors, PlanOptions
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.progress import Progress, untold
 from tactile_bayes.report.trial import plan_text
 from tactile_bayes.report.trial_html import plan_figure
 from tactile_bayes.trial.figures import MIN_PATIENTS, UndefinedError
 from tactile_bayes.trial.planning import (
-    MOST_PATIENTS,
     ROUNDS,
     Design,
     ErrorSource,
@@ -50,9 +49,7 @@ from tactile_bayes.trial.readings import Trial, unit_doubts
 if TYPE_CHECKING:
     import pandas
 
-PATIENTS, MAPS, TRIALS, SEED = (16, 24, 32, 48), (1, 3, 5), 1000, 1999  #: Defaults of a plan.
 MAPS_OF_AIMS = 3  #: Maps of a mass where the number of patients is asked for, by default.
-_AGAINST = "ultrasound"
 _ERRORS = names_of(PlanErrors)
 
 
@@ -139,43 +136,26 @@ def read_pilot(pilot: Path | Sheet | None, excision: Path | Sheet | None, agains
 
 
 @door
+@takes(PlanOptions, PlanErrors)
 def plan(
     *,
-    patients: Sequence[int] | None = None,
-    maps: Sequence[int] | None = None,
-    power: float | None = None,
-    precision: float | None = None,
     pilot: PathLike | pandas.DataFrame | None = None,
     excision: PathLike | pandas.DataFrame | None = None,
-    against: str | None = None,
-    trials: int = TRIALS,
-    seed: int = SEED,
-    workers: int = 1,
     progress: Progress = untold,
-    **errors: float,
+    **options: Any,
 ) -> TrialPlan:
     """Plan a trial: power, widths of intervals and the worth of more maps, by simulation.
 
     Parameters
     ----------
-    patients, maps
-        Numbers of patients, one mass each, and of tactile maps per mass; every pair is a design. By default 16, 24, 32
-        and 48 patients with 1, 3 and 5 maps.
-    power, precision
-        Instead of `patients`: a power to reach, or a factor from the lower to the upper end of the tactile error's
-        interval. `report.needed` says how many patients do, with 3 maps by default.
     pilot, excision
         Tables of an earlier trial, files or DataFrames: the errors that no keyword gives are taken from it.
-    against
-        Modality of the pilot to compare with, by default ultrasound.
-    trials, seed
-        Simulated trials per design, and of their random numbers.
-    workers
-        Number of worker processes; 1 for none but this one.
     progress
         Called with designs done and wanted.
-    **errors
-        As of `tactile_bayes.options.PlanErrors`, by default as on the command line.
+    **options
+        As of `tactile_bayes.options.PlanOptions` and `PlanErrors`, by default as on the command line: patients, maps,
+        power, precision, against, trials, map_sd... Every pair of patients and maps is a design; with a power or a
+        precision `report.needed` says how many patients do.
 
     Raises
     ------
@@ -190,63 +170,36 @@ def plan(
     >>> tb.plan(patients=[24], maps=[3], trials=50).report.designs[0].patients
     24
     """
-    check_keywords("plan", errors, _ERRORS)
-    for name, numbers, least, most in (("patients", patients, 8, MOST_PATIENTS), ("maps", maps, 1, 1000)):
-        for one in () if numbers is None else sequence_of(name, numbers, "whole numbers"):
-            check_number(name, one, least, most, whole=True)
-    check_number("trials", trials, 50, whole=True)
-    check_number("seed", seed, 0, whole=True)
-    found = read_pilot(_table(pilot, "pilot"), _table(excision, "excision"), against)
-    return planned(
-        patients,
-        maps,
-        {name: plain(value) for name, value in errors.items()},
-        aims=PlanAims(power, precision),
-        pilot=found,
-        against=against,
-        trials=trials,
-        seed=seed,
-        workers=workers,
-        progress=progress,
-    )
+    given = {name: plain(value) for name, value in options.items() if value is not None}
+    for name in {"patients", "maps"} & set(given):
+        given[name] = tuple(map(plain, sequence_of(name, given[name], "whole numbers")))
+    readings = None if pilot is None else table_of(pilot, "pilot")
+    sizes = None if excision is None else table_of(excision, "excision")
+    return planned(given, read_pilot(readings, sizes, given.get("against")), progress)
 
 
-def _table(given: PathLike | pandas.DataFrame | None, name: str) -> Path | Sheet | None:
-    return None if given is None else table_of(given, name)
-
-
-def planned(
-    patients: Sequence[int] | None,
-    maps: Sequence[int] | None,
-    given: Mapping[str, float],
-    *,
-    aims: PlanAims,
-    pilot: Pilot | None,
-    against: str | None,
-    trials: int,
-    seed: int,
-    workers: int,
-    progress: Progress,
-) -> TrialPlan:
-    """Plan with the errors that are given, those of the pilot, and the defaults, in this order."""
-    wanted = aims.wanted
-    if wanted and patients is not None:
+def planned(given: Mapping[str, Any], pilot: Pilot | None, progress: Progress) -> TrialPlan:
+    """Plan with the options and errors that are given, then the errors of the pilot, then the defaults."""
+    asked = PlanOptions(**{name: value for name, value in given.items() if name not in _ERRORS})
+    stated = {name: value for name, value in given.items() if name in _ERRORS}
+    wanted = asked.wanted
+    if wanted and "patients" in given:
         raise UsageError("--power and --precision find the number of patients; leave out --patients")
-    by_default = as_dict(PlanErrors(**given))
-    errors = by_default if pilot is None else pilot.errors(against or _AGAINST, given)
+    by_default = as_dict(PlanErrors(**stated))
+    errors = by_default if pilot is None else pilot.errors(asked.against, stated)
     rest: ErrorSource = "default" if pilot is None else "pilot"
-    assumptions = {**errors, "trials": trials, "seed": seed}
-    each_maps = sorted(set(maps or ((MAPS_OF_AIMS,) if wanted else MAPS)))
-    with open_executor(workers=workers) as executor:
+    assumptions = {**errors, "trials": asked.trials, "seed": asked.seed}
+    each_maps = (MAPS_OF_AIMS,) if wanted and "maps" not in given else sorted(set(asked.maps))
+    with open_executor(workers=asked.workers) as executor:
         run = partial(_simulated, executor=executor, progress=progress)
         if wanted:
             found, needed = _needed(each_maps, wanted, assumptions, run)
         else:
-            found, needed = run(list(designs(sorted(set(patients or PATIENTS)), each_maps, **assumptions))), ()
+            found, needed = run(list(designs(sorted(set(asked.patients)), each_maps, **assumptions))), ()
     assumed = {name: float(f"{errors[name]:.9g}") for name in _ERRORS}
-    sources: dict[str, ErrorSource] = {name: "option" if name in given else rest for name in _ERRORS}
+    sources: dict[str, ErrorSource] = {name: "option" if name in stated else rest for name in _ERRORS}
     inputs = hash_inputs(**({} if pilot is None else pilot.files))
-    settings: dict[str, Any] = {"trials": trials, "errors": assumed, "errors_from": sources}
+    settings: dict[str, Any] = {"trials": asked.trials, "errors": assumed, "errors_from": sources}
     settings |= {str(aim): target for aim, target in wanted.items()}
     report = PlanReport(
         schema="tactile-bayes/plan/1",
@@ -255,7 +208,7 @@ def planned(
         designs=found,
         gains=() if wanted else map_gains(found),
         needed=needed,
-        provenance=Provenance("plan", settings, inputs, seed=seed).as_dict(),
+        provenance=Provenance("plan", settings, inputs, seed=asked.seed).as_dict(),
         research_use=RESEARCH_USE,
     )
     return TrialPlan(report, () if pilot is None else tuple(pilot.doubts()))

@@ -7,7 +7,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from tactile_bayes.api.arguments import check_keywords, door
+from tactile_bayes.api.arguments import door, takes
 from tactile_bayes.api.estimates import estimated, listed, settings_of
 from tactile_bayes.api.estimating import estimate_file
 from tactile_bayes.api.maps import Map, PathLike, path_of
@@ -18,7 +18,7 @@ from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError, UsageError, check_choice
 from tactile_bayes.exports.exam import EstimateFile, MapFile, estimate_of, read_exam, shared_facts
 from tactile_bayes.exports.identity import identity_of
-from tactile_bayes.exports.run import FORMATS, TAKES, Outputs, refuse_untaken
+from tactile_bayes.exports.run import FORMATS, Outputs, refuse_untaken
 from tactile_bayes.exports.run import ExportFormat as Format
 from tactile_bayes.exports.run import export as exported_files
 from tactile_bayes.files.atomic import given_twice, sha256
@@ -28,6 +28,7 @@ from tactile_bayes.files.map_nc import is_posterior, read_estimate, read_map_and
 from tactile_bayes.files.provenance import scans_of
 from tactile_bayes.files.reading import HDF5_MAGIC, open_input
 from tactile_bayes.files.reports import EstimateReport
+from tactile_bayes.options import IdentityOptions
 from tactile_bayes.report.exam_page import exam_page
 from tactile_bayes.report.exam_words import Exam, Given, exam_map, headline
 from tactile_bayes.report.pages import PageFiles
@@ -115,6 +116,7 @@ def _from_estimate(source: Path, path: Path | None, given: Given) -> Exam:
 
 
 @door
+@takes(Settings, without=["settings_file"])
 def exam_report(
     files: Any,
     path: PathLike,
@@ -201,6 +203,7 @@ class ExportedFiles(Record):
 
 
 @door
+@takes(IdentityOptions)
 def export(
     files: Any = (),
     path: PathLike | None = None,
@@ -210,7 +213,7 @@ def export(
     patient_id_from_scan: bool = False,
     dictionary: PathLike | None = None,
     force: bool = False,
-    **identity: str,
+    **identity: Any,
 ) -> ExportedFiles:
     """Write maps and estimates as the files that other systems take, as ``tactile-bayes export`` does.
 
@@ -248,7 +251,6 @@ def export(
     (PosixPath('records.csv'),)
     """
     check_choice("to", to, FORMATS)
-    check_keywords("export", identity, TAKES["dicom"])
     for name, value in identity.items():
         if not isinstance(value, str):
             raise UsageError(f"{name} is {value!r}; give a text")

@@ -1,4 +1,4 @@
-"""A trial's tables to its report, and tables of scans to a calibration."""
+"""A trial's tables to its report."""
 
 from __future__ import annotations
 
@@ -9,13 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tactile_bayes.api.arguments import check_keywords, door, plain
-from tactile_bayes.api.maps import PathLike, output_path, path_of, required_path
-from tactile_bayes.api.repeatability import exams_in, learn_from_exams
-from tactile_bayes.api.site_correction import correct_size
-from tactile_bayes.api.size_calibration import is_population, learn_eq6, learn_population
-from tactile_bayes.declarations import Record, as_dict, names_of, replace, to_plain
-from tactile_bayes.errors import NotConvergedError, UsageError
+from tactile_bayes.api.arguments import door, plain, takes
+from tactile_bayes.api.maps import PathLike, path_of, table_of
+from tactile_bayes.declarations import Record, as_dict, replace, to_plain
+from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.files.atomic import write_text
 from tactile_bayes.files.column_map import read_mapping, read_wide, read_wide_excision
 from tactile_bayes.files.documents import dump_json
@@ -27,13 +24,12 @@ from tactile_bayes.inference.draws import ParameterDraws
 from tactile_bayes.inference.ensemble import ensemble
 from tactile_bayes.inference.importance import importance, importance_options
 from tactile_bayes.inference.modes import LogDensity, mode_and_covariance
-from tactile_bayes.options import LearnOptions, TrialSettings
+from tactile_bayes.options import TrialSettings
 from tactile_bayes.presets import INTERVAL, RESEARCH_USE
 from tactile_bayes.report.compare import Growth
 from tactile_bayes.report.pages import PageFiles
 from tactile_bayes.report.trial import DIGITS, trial_text
 from tactile_bayes.report.trial_html import trial_html
-from tactile_bayes.size.pooling import Calibration, Repeatability
 from tactile_bayes.trial.figures import Intervals
 from tactile_bayes.trial.next_mass import next_mass
 from tactile_bayes.trial.planning import check_all
@@ -195,10 +191,8 @@ def read_excision(excision: Path | Sheet, columns: Path | None) -> Table:
     return read_wide_excision(excision, columns)
 
 
-# --- Size calibrations from lumps of known size, and reports of trials, from tables or DataFrames.
-
-
 @door
+@takes(TrialSettings)
 def validate(
     trial: PathLike | pandas.DataFrame,
     excision: PathLike | pandas.DataFrame,
@@ -224,120 +218,5 @@ def validate(
     BadDataError
         Naming the table, the line (1 is the header), the column, the value and the way out.
     """
-    check_keywords("validate", settings, names_of(TrialSettings))
     used = TrialSettings(**{name: plain(value) for name, value in settings.items()})
     return analyse(load_trial(table_of(trial, "trial"), table_of(excision, "excision"), path_of(columns)), used)
-
-
-@door
-def calibrate_size(
-    table: PathLike | pandas.DataFrame,
-    *,
-    form: str = "eq6",
-    correct: PathLike | None = None,
-    fit: str = "joint",
-    least_stiffness_ratio: float = 0.0,
-    seed: int = 1,
-    path: PathLike | None = None,
-    force: bool = False,
-    **declared: Any,
-) -> Calibration:
-    """Learn a size calibration from lumps of known size.
-
-    Parameters
-    ----------
-    table
-        A row for each lump: d_mm, amplitude, sigma_x_mm...; or a table of `population`, a row for each exam.
-    form
-        ``"eq6"`` as printed; ``"eq6-residual"`` for a table of `population`.
-    correct
-        Name or path of a calibration over bodies that the table's lumps correct; the table may also list map files.
-    fit
-        Eq 6 of lumps: ``"joint"``, the posterior from all rows, or ``"two-stage"``, the paper's.
-    least_stiffness_ratio
-        Eq 6: softer lumps take no part.
-    seed
-        Of the random numbers.
-    path
-        Also write the calibration there.
-    **declared
-        Eq 6: normalise, background, fit_radius_mm, noise of the table's maps, where it does not say. Of a table of
-        `population`, normalise: which rows to learn from.
-
-    Returns
-    -------
-    calibration
-        For ``estimate(..., size_calibration=...)``.
-
-    Raises
-    ------
-    BadDataError
-        Naming the table, the line, the column, the value and the way out.
-    TypeError
-        When a keyword is none of these.
-    UsageError
-        When a keyword's value cannot be one, or goes with another form.
-    """
-    chosen: dict[str, Any] = {"form": form, "fit": fit, "seed": seed, "least_stiffness_ratio": least_stiffness_ratio}
-    asked = LearnOptions(**chosen)  # refuses what none of them can be
-    target = None if path is None else output_path(path, "JSON")
-    source = table_of(table, "table")
-    over_bodies_alone = form != "eq6" or (correct is None and is_population(source))
-    names = ("normalise",) if over_bodies_alone else ("normalise", "background", "fit_radius_mm", "noise")
-    check_keywords(f"calibrate_size for form {form!r} and this table", declared, names)
-    given = {name: declared.get(name) for name in names}
-    if correct is not None:
-        if form != "eq6" or fit != "joint" or least_stiffness_ratio:
-            raise UsageError("form, fit and least_stiffness_ratio are for learning a calibration; leave them out")
-        learned = correct_size(source, str(correct), given, seed=seed)
-    elif over_bodies_alone:
-        if fit != "joint":
-            raise UsageError(f"fit={fit!r} is for tables of lumps; a table of `population` has one fit")
-        learned = learn_population(source, asked.form, declared.get("normalise"))
-    else:
-        learned = learn_eq6(source, given, fit=asked.fit, least_stiffness_ratio=asked.least_stiffness_ratio, seed=seed)
-    if target is not None:
-        learned.write(target, force=force)
-    return learned.calibration
-
-
-@door
-def calibrate_repeatability(
-    folder: PathLike, *, size_calibration: PathLike | None = None, path: PathLike | None = None, force: bool = False
-) -> Repeatability:
-    """Learn how far sizes of one mass lie apart between its exams at a site.
-
-    Parameters
-    ----------
-    folder
-        Of a ``campaign run`` with at least 3 masses that have repeated exams.
-    size_calibration
-        Calibration that the exams were sized by, where the name in their estimates does not lead to its file.
-    path
-        Also write it there.
-
-    Returns
-    -------
-    Repeatability
-        For ``estimate(..., repeatability=...)``: `median`, `low` and `high` of the spread, a share of the size.
-
-    Raises
-    ------
-    BadDataError
-        When there are too few masses with repeated exams, or the exams were sized by several calibrations.
-    UsageError
-        When the calibration's file is not found.
-    """
-    target = None if path is None else output_path(path, "JSON")
-    given = None if size_calibration is None else str(size_calibration)
-    learned = learn_from_exams(exams_in(required_path(folder, "folder")), size_calibration=given)
-    if target is not None:
-        learned.write(target, force=force)
-    return learned.repeatability
-
-
-def table_of(given: PathLike | pandas.DataFrame, name: str) -> Path | Sheet:
-    """Return a path as it is, and a DataFrame as CSV text."""
-    if hasattr(given, "to_csv"):
-        return Sheet(Path(f"{name} (DataFrame)"), given.to_csv(index=False))
-    return required_path(given, name)

@@ -8,9 +8,10 @@ from html import escape
 from pathlib import Path
 from typing import Any, Final
 
-from tactile_bayes.api.arguments import door, plain
+from tactile_bayes.api.arguments import door, plain, takes
 from tactile_bayes.api.estimates import settings_of
 from tactile_bayes.api.maps import PathLike, path_of, required_path
+from tactile_bayes.api.settings import Settings
 from tactile_bayes.batch import open_executor
 from tactile_bayes.campaigns.inputs import open_campaign, tidy
 from tactile_bayes.campaigns.report import (
@@ -25,14 +26,14 @@ from tactile_bayes.campaigns.report import (
 )
 from tactile_bayes.campaigns.run import Bar, Campaign, CampaignState
 from tactile_bayes.campaigns.settings import CampaignSettings
-from tactile_bayes.declarations import Record
-from tactile_bayes.errors import UsageError, check_number
+from tactile_bayes.declarations import Record, names_of
+from tactile_bayes.errors import UsageError
 from tactile_bayes.files.atomic import same_file
 from tactile_bayes.files.manifest_csv import Exam, read_manifest
 from tactile_bayes.files.reading import check_address
 from tactile_bayes.files.size_json import NONE, size_calibration_path
-from tactile_bayes.options import MapOptions
-from tactile_bayes.presets import DEFAULT_NORMALISE, MATCH_MM, RESEARCH_USE
+from tactile_bayes.options import CampaignOptions
+from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.size.pooling import Repeatability
 
 MOST_NAMED: Final = 5  #: So many exams or masses are named in a line.
@@ -104,23 +105,14 @@ class CampaignResult(Record, eq=False):
 
 
 @door
+@takes(CampaignOptions, Settings, without=["settings_file", "repeatability"])
 def campaign(
     exams: PathLike,
     output: PathLike,
     *,
-    excision: PathLike | None = None,
-    columns: PathLike | None = None,
-    protocol: PathLike | None = None,
-    normalise: str = DEFAULT_NORMALISE,
-    match_mm: float = MATCH_MM,
     repeatability: PathLike | Repeatability | None = None,
-    figures: bool = False,
-    dry_run: bool = False,
-    copy_to: str | None = None,
-    workers: int = 1,
-    scheduler: str | None = None,
     bar: Bar | None = None,
-    **settings: Any,
+    **options: Any,
 ) -> CampaignResult:
     """Map, estimate and pool the exams of a table, and report the trial; goes on where it was interrupted.
 
@@ -130,31 +122,14 @@ def campaign(
         The table, as ``campaign init`` writes it.
     output
         Folder for all files.
-    excision
-        Sizes measured after excision: adds the trial's report.
-    columns
-        Layout of a wide table of them.
-    protocol
-        Pre-specified analysis of the trial.
-    normalise
-        As of `build_map`.
-    match_mm
-        Distance within which a mass is the one that another exam of the breast names by place.
     repeatability
         Spread between exams of one mass: a file, what `calibrate_repeatability` returns, or ``"none"``. By default it
         is learned from the repeats, where 5 masses have them.
-    figures
-        Whether map and size posterior of each exam are drawn.
-    dry_run
-        Say what would be done, and do nothing.
-    copy_to
-        Folder of an object store that gets every file.
-    workers, scheduler
-        Number of worker processes, or the address of a dask scheduler.
     bar
         Gives, for what is counted, a context with a callback for those done and wanted.
-    **settings
-        As of `estimate`.
+    **options
+        As of `tactile_bayes.options.CampaignOptions` and of `estimate`: excision, columns, protocol, normalise,
+        match_mm, figures, dry_run, copy_to, workers, scheduler, method, size_calibration...
 
     Raises
     ------
@@ -163,27 +138,16 @@ def campaign(
     UsageError
         When settings contradict each other, or the folder is another's.
     """
+    given = {name: plain(options.pop(name)) for name in names_of(CampaignOptions) if name in options}
+    given |= {name: path_of(given[name]) for name in ("excision", "columns", "protocol") if name in given}
     spread = {} if repeatability in (None, NONE) else {"repeatability": repeatability}
-    check_number("match_mm", match_mm, 0, open_ends=True)
-    of_all = CampaignSettings(
-        settings_of({**settings, **spread}),
-        MapOptions(normalise=plain(normalise)).normalise,
-        figures,
-        match_mm,
-        own_repeatability=repeatability is None,
-        copy_to="" if copy_to is None else check_address(copy_to),
-    )
     return run_campaign(
         required_path(exams, "exams"),
         required_path(output, "output"),
-        of_all,
-        excision=path_of(excision),
-        columns=path_of(columns),
-        protocol=path_of(protocol),
-        read=(Path(str(one)) for one in spread.values() if isinstance(one, str | os.PathLike)),
-        dry_run=dry_run,
-        workers=workers,
-        scheduler=scheduler,
+        CampaignOptions(**given),
+        settings_of(options | spread),
+        own_repeatability=repeatability is None,
+        read=[Path(one) for one in spread.values() if isinstance(one, str | os.PathLike)],
         bar=bar,
     )
 
@@ -191,36 +155,34 @@ def campaign(
 def run_campaign(
     exams: Path,
     output: Path,
-    settings: CampaignSettings,
+    asked: CampaignOptions,
+    estimate: Settings,
     *,
-    excision: Path | None,
-    columns: Path | None,
-    protocol: Path | None,
+    own_repeatability: bool,
     read: Iterable[Path],
-    dry_run: bool,
-    workers: int,
-    scheduler: str | None,
     bar: Bar | None,
 ) -> CampaignResult:
     """Check all inputs, run what is missing, and write what is beside the exams; `read` are further inputs."""
+    copy_to = "" if asked.copy_to is None else check_address(asked.copy_to)
+    settings = CampaignSettings(estimate, asked.normalise, asked.figures, asked.match_mm, own_repeatability, copy_to)
     table = read_manifest(exams)
     _check_folder(table, output, settings)
-    _keep_inputs([exams, excision, columns, protocol, *read, *_calibrations(table, settings)], output)
-    if columns is not None and excision is None:
+    _keep_inputs([exams, asked.excision, asked.columns, asked.protocol, *read, *_calibrations(table, settings)], output)
+    if asked.columns is not None and asked.excision is None:
         raise UsageError("--columns is the layout of the excision table; give --excision too")
-    measured = None if excision is None else Excision(excision, columns)
-    check_inputs(table, measured, protocol)
+    measured = None if asked.excision is None else Excision(asked.excision, asked.columns)
+    check_inputs(table, measured, asked.protocol)
     with (
-        open_campaign(output, dry=dry_run) as store,
-        open_executor(workers=workers, cluster=None if dry_run else scheduler) as executor,
+        open_campaign(output, dry=asked.dry_run) as store,
+        open_executor(workers=asked.workers, cluster=None if asked.dry_run else asked.scheduler) as executor,
     ):
         place = Path(os.path.abspath(output))  # noqa: PTH100 (links stay links)
-        run = Campaign(table, place, settings, store=store, executor=executor, dry=dry_run, bar=bar)
+        run = Campaign(table, place, settings, store=store, executor=executor, dry=asked.dry_run, bar=bar)
         run.run()
-        if dry_run:
+        if asked.dry_run:
             return CampaignResult(run, output, None)
         left = tidy(place, table, run.found.results, unread=run.unread)
-        written = write_outputs(run, measured, protocol)
+        written = write_outputs(run, measured, asked.protocol)
         if settings.copy_to:
             copy_outputs(place, settings.copy_to)
     return CampaignResult(run, output, written, tuple(left))

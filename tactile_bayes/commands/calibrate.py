@@ -5,7 +5,7 @@ from __future__ import annotations
 import click
 
 from tactile_bayes.commands.options import FORCE, CommandGroup, FilePath, command, figure, output, path_option, takes
-from tactile_bayes.options import LearnOptions
+from tactile_bayes.laboratory_options import LearnOptions
 
 # --- `calibrate`: learn a calibration from known objects, and a site's repeatability from its own exams.
 

@@ -8,7 +8,7 @@ import click
 
 from tactile_bayes.commands.options import FORCE, SPEED, FilePath, FiniteRange, command, live_options, output, takes
 from tactile_bayes.declarations import names_of
-from tactile_bayes.options import RecordOptions
+from tactile_bayes.laboratory_options import RecordOptions
 from tactile_bayes.presets import TrackerProtocol
 
 # --- `record`: a scan head and a tracker into a scan file.

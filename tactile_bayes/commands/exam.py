@@ -11,7 +11,8 @@ import click
 from tactile_bayes.commands.options import FORCE, JSON, SESSION, FilePath, command, figure, path_option, takes
 from tactile_bayes.declarations import names_of
 from tactile_bayes.files.arrays_layout import GridOptions, Stated, layout_lines
-from tactile_bayes.options import IdentityOptions, MapOptions, RecordOptions
+from tactile_bayes.laboratory_options import RecordOptions
+from tactile_bayes.options import IdentityOptions, MapOptions
 from tactile_bayes.presets import CORRECTIONS, METHODS
 
 # --- `demo`: the main steps on data that comes with the program.

@@ -21,15 +21,15 @@ from tactile_bayes.commands.options import (
     takes,
 )
 from tactile_bayes.declarations import names_of
-from tactile_bayes.options import (
+from tactile_bayes.laboratory_options import (
     CaseOptions,
-    MapOptions,
     PopulationOptions,
     SbcOptions,
     SectionOptions,
     StudyOptions,
     TissueOptions,
 )
+from tactile_bayes.options import MapOptions
 
 # --- `simulate`: make a scan with known truth from a scene.
 

@@ -15,7 +15,7 @@ import click
 
 from tactile_bayes.api.settings import Settings, read_settings
 from tactile_bayes.declarations import Record, default_of, extra_of, kinds, meaning_of, range_of, value_kind
-from tactile_bayes.errors import UsageError, number_words
+from tactile_bayes.errors import BY_OPTIONS, UsageError, number_words
 from tactile_bayes.files.atomic import Format, check_suffix, refuse_existing, same_file
 from tactile_bayes.presets import HEADS
 from tactile_bayes.report import figure_file
@@ -151,7 +151,11 @@ def command(
             context = click.get_current_context()
             guarded = [one.name for one in context.command.params if getattr(one.type, "guarded", False)]
             refuse_existing(*(given[str(one)] for one in guarded), force=given.get("force", False))
-            code = getattr(import_module(f"tactile_bayes.actions.{module}"), function)(**given)
+            before = BY_OPTIONS.set(True)
+            try:
+                code = getattr(import_module(f"tactile_bayes.actions.{module}"), function)(**given)
+            finally:
+                BY_OPTIONS.reset(before)
             if code:
                 context.exit(code)
 

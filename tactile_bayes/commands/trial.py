@@ -9,19 +9,16 @@ from tactile_bayes.commands.options import (
     FORCE,
     JSON,
     PRINTED,
-    WORKERS,
     CommandGroup,
     FilePath,
-    FiniteRange,
     command,
     figure,
     output,
     path_option,
-    scheduler_option,
     takes,
 )
 from tactile_bayes.declarations import names_of
-from tactile_bayes.options import MOST_ITEMS, MapOptions, PlanAims, PlanErrors, TrialSettings
+from tactile_bayes.options import CampaignOptions, PlanErrors, PlanOptions, TrialSettings
 
 # --- `validate`: compare each modality with excision.
 
@@ -69,36 +66,11 @@ def validate_command() -> None:
 
 
 @command("plan", "trial.plan_action")
-@click.option(
-    "--patients",
-    type=click.IntRange(8, 10_000),
-    multiple=True,
-    default=(16, 24, 32, 48),
-    show_default=True,
-    help="Number of patients, one mass each.",
-)
-@click.option(
-    "--maps",
-    type=click.IntRange(1, 1000),
-    multiple=True,
-    default=(1, 3, 5),
-    show_default=True,
-    help="Number of tactile maps per mass; 3 with --power or --precision.",
-)
-@takes(PlanAims, *names_of(PlanAims))
+@takes(PlanOptions, "patients", "maps", "power", "precision")
 @takes(PlanErrors, *names_of(PlanErrors))
 @path_option("--pilot", "TRIAL.csv", "Take the errors that no option gives from this trial; needs --excision.")
 @path_option("--excision", "EX.csv", "Sizes measured after excision in the pilot.")
-@click.option("--against", default="ultrasound", show_default=True, help="Modality of the pilot to compare with.")
-@click.option(
-    "--trials",
-    type=click.IntRange(50, MOST_ITEMS),
-    default=1000,
-    show_default=True,
-    help="Number of simulated trials per design.",
-)
-@takes(TrialSettings, "seed")
-@WORKERS
+@takes(PlanOptions, "against", "trials", "seed", "workers")
 @JSON
 @output("PLAN.json", "JSON", "Write the plan as JSON to this file.")
 @figure("Draw power against the number of patients.")
@@ -157,21 +129,11 @@ def campaign_init_command() -> None:
 @command("run", "trial.campaign_run_action", within=campaign_command)
 @click.argument("exams", metavar="EXAMS.csv", type=_FILE)
 @click.option("-o", "--output", required=True, metavar="DIR", type=_FILE, help="Folder for all files.")
-@path_option("--excision", "EX.csv", "Sizes measured after excision: adds the trial's report.")
-@path_option("--columns", "MAP.toml", "Layout of a wide EX.csv: which column holds what, in which unit.")
-@path_option("--protocol", "FILE.toml", "Pre-specified analysis of the trial, as for `validate`.")
+@takes(CampaignOptions, "excision", "columns", "protocol")
 @takes(Settings, "method", help="As `estimate`.")
 @takes(Settings, "size_calibration", metavar="NAME|SIZE.json", help="As `estimate`, unless a row names its own.")
 @takes(Settings, "settings_file", help="Priors and more, as `estimate`.")
-@takes(MapOptions, "normalise", help="As `map`.")
-@click.option(
-    "--match-mm",
-    type=FiniteRange(min=0.0, min_open=True),
-    metavar="MM",
-    default=15.0,
-    show_default=True,
-    help="Distance within which a mass is the one that another exam of the breast names by place.",
-)
+@takes(CampaignOptions, "normalise", "match_mm")
 @click.option(
     "--repeatability",
     metavar="none|SITE.json",
@@ -180,13 +142,7 @@ def campaign_init_command() -> None:
     "have them.",
 )
 @takes(Settings, "seed")
-@click.option("--figures", is_flag=True, help="Draw map and size posterior of each exam.")
-@click.option("--dry-run", is_flag=True, help="Print what would be done, and do nothing.")
-@click.option(
-    "--copy-to", metavar="s3://BUCKET/FOLDER", help="Copy every file into this folder of an object store, step by step."
-)
-@WORKERS
-@scheduler_option("the exams")
+@takes(CampaignOptions, "figures", "dry_run", "copy_to", "workers", "scheduler")
 def campaign_run_command() -> None:
     """Map, estimate and pool the exams of a table, and report the trial.
 

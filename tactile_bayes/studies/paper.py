@@ -28,7 +28,7 @@ from tactile_bayes.forward.line import (
 from tactile_bayes.forward.plane_strain import CELL_MM, SurfaceCompliance, condense
 from tactile_bayes.forward.tissue import SEATS, Body, Layers
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.options import CaseOptions, TissueOptions
+from tactile_bayes.laboratory_options import CaseOptions, TissueOptions
 from tactile_bayes.posterior.bump import cell_mean_gaussian
 from tactile_bayes.posterior.white import LEAST_WIDTH_IN_CELLS, WIDEST_IN_RADII
 from tactile_bayes.presets import HEAD_PITCH_MM, HEADS, SHOULDERS_INSIDE

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.special import ndtri
 
 from tactile_bayes.declarations import Meta, Record
-from tactile_bayes.options import Aim
+from tactile_bayes.options import MOST_PATIENTS, Aim
 from tactile_bayes.trial.accuracy import mape_figure, mape_percent, mape_ratio, sign_flip
 from tactile_bayes.trial.figures import (
     MIN_PATIENTS,
@@ -278,7 +278,6 @@ def map_gains(found: Iterable[Design]) -> tuple[Gain, ...]:
 
 # --- The number of patients that reaches a power, or a width of the interval: a line through simulated designs.
 
-MOST_PATIENTS = 10_000
 # Designs simulated about the first guess, in shares of it; the guess is moved up to so many times.
 AROUND = (0.6, 0.8, 1.0, 1.25, 1.6)
 ROUNDS = 4

@@ -144,7 +144,7 @@ def test_python_plans_as_the_command_does(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("given", "fault"),
     [
-        ({"patients": [7]}, "patients is 7; give a whole number from 8"),
+        ({"patients": [7]}, r"patients\[0\] is 7; give a whole number from 8"),
         ({"maps": 3}, "maps is 3; give a list of whole numbers"),
         ({"trials": 49}, "trials is 49"),
         ({"power": 90}, "power is 90; give a number from 0.5 to 0.99"),
