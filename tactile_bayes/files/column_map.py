@@ -55,10 +55,9 @@ class ColumnMap(Record):
     """Which column of a wide table holds which reading."""
 
     patient: Annotated[Column, Meta(description="Column of the coded patient.")]
-    mass: (
-        Annotated[Column, Meta(description="Column of the mass within the patient; without it every patient has one.")]
-        | None
-    ) = None
+    mass: Annotated[
+        Column | None, Meta(description="Column of the mass within the patient; without it every patient has one.")
+    ] = None
     unit: Annotated[Unit, Meta(description="Of all sizes, unless a reading says otherwise.")] = "mm"
     not_detected: Annotated[
         tuple[str, ...], Meta(description="Words that the table writes for a mass looked for and not found.")
@@ -66,14 +65,11 @@ class ColumnMap(Record):
     not_done: Annotated[
         tuple[str, ...], Meta(description="Words for a mass not looked for; a blank is one already.")
     ] = ()
-    synthetic: Annotated[bool, Meta(description="Whether all readings were made by a generator.")] | None = None
-    reading: (
-        Annotated[
-            tuple[ReadingColumns, ...],
-            Meta(min_length=1, description="One for each modality and replicate of a wide table of readings."),
-        ]
-        | None
-    ) = None
+    synthetic: Annotated[bool | None, Meta(description="Whether all readings were made by a generator.")] = None
+    reading: Annotated[
+        Annotated[tuple[ReadingColumns, ...], Meta(min_length=1)] | None,
+        Meta(description="One for each modality and replicate of a wide table of readings."),
+    ] = None
     excision: ExcisionColumns | None = None
 
     def key_columns(self) -> list[str]:
