@@ -131,7 +131,12 @@ def read_map_and_header(path: Path) -> tuple[TactileMap, MapHeader]:
             arrays[field] = file.array(name, kind=kind, dimensions=dimensions)
             if arrays[field] is None:
                 raise BadDataError(f"variable {name} is missing", way_out=_WAY_OUT)
-        transforms = {name: _read_transform(file, name) for name in _TRANSFORMS}
+        transforms = {name: file.array(name, kind="f8", dimensions=("row", "column")) for name in _TRANSFORMS}
+        for name, transform in transforms.items():
+            if transform is not None and transform.shape != (4, 4):
+                raise BadDataError(f"variable {name} is not 4 by 4", way_out=_WAY_OUT)
+            if transform is not None:
+                check_rigid(transform, name=name)
         _check_lattice({"x": arrays["x_mm"], "y": arrays["y_mm"]}, header.recipe.cell_mm)
         tactile_map = TactileMap(
             **arrays,
@@ -186,15 +191,6 @@ def _header(file: Group) -> MapHeader:
         return from_plain(MapHeader, document, where="header")
     except BadDataError as error:
         raise BadDataError(error.what, way_out=_WAY_OUT) from None
-
-
-def _read_transform(file: Group, name: str) -> Any:
-    transform = file.array(name, kind="f8", dimensions=("row", "column"))
-    if transform is not None and transform.shape != (4, 4):
-        raise BadDataError(f"variable {name} is not 4 by 4", way_out=_WAY_OUT)
-    if transform is not None:
-        check_rigid(transform, name=name)
-    return transform
 
 
 def _check_lattice(axes: Mapping[str, FloatArray], cell_mm: float) -> None:

@@ -178,7 +178,11 @@ def read_table(source: Path | Sheet, schema_name: str) -> Table:
                 cell = row.get(name, "")
                 columns[name].append(_parse_cell(line, cell, field=field, decimal_comma=cells_in.decimal_comma))
     table = Table(path=path, columns=columns, line_numbers=[line for line, _ in body])
-    _check_primary_key(table, keys)
+    first: dict[tuple[Any, ...], int] = {}
+    for index, key in enumerate(_keys(table, keys)):
+        if (before := first.setdefault(key, index)) != index:
+            what = f"{_shown_key(key)} stands on line {table.line_numbers[before]} already"
+            raise table.error(index, " + ".join(keys), what, way_out="remove one row or correct its key")
     return table
 
 
@@ -403,14 +407,6 @@ def _check_constraints(value: Any, text: str, field: Mapping[str, Any]) -> None:
         raise BadDataError(f"{_shown(text)} is not known", way_out=f"{guess}it must be {' or '.join(rules['enum'])}")
     if "pattern" in rules and not re.fullmatch(rules["pattern"], text):
         raise BadDataError(f"{_shown(text)} does not match {rules['pattern']}", way_out=field["description"])
-
-
-def _check_primary_key(table: Table, fields: Sequence[str]) -> None:
-    first: dict[tuple[Any, ...], int] = {}
-    for row, key in enumerate(_keys(table, fields)):
-        if first.setdefault(key, row) != row:
-            what = f"{_shown_key(key)} stands on line {table.line_numbers[first[key]]} already"
-            raise table.error(row, " + ".join(fields), what, way_out="remove one row or correct its key")
 
 
 def _keys(table: Table, fields: Sequence[str]) -> list[tuple[Any, ...]]:
