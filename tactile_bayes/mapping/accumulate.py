@@ -225,11 +225,6 @@ class Accumulated(Record, eq=False):
     last_change: float = 0.0
     """Largest relative change of a frame's gain in the last pass; 0 unless the gains are solved for."""
 
-    @property
-    def settled(self) -> bool:
-        """True where the gains converged."""
-        return self.last_change <= GAIN_TOLERANCE
-
 
 def accumulate(sources: list[Source], *, cell_mm: float, normalise: str, progress: Progress = untold) -> Accumulated:
     """Average the normalised readings of all used frames in cells on the plane; progress starts anew in each pass.
