@@ -252,7 +252,6 @@ class SequenceCheck:
 
     def __init__(self) -> None:
         self._expected: int | None = None
-        self.lost = 0
         self.restarts = 0
 
     def missing_before(self, sequence: int) -> int:

@@ -256,20 +256,16 @@ def stroke_lag_figures(sources: Sequence[Source]) -> dict[str, float]:
     0.2 s.
     """
     every = thinning((source.selection.scan.frames.time_s[source.frames] for source in sources), most=MOST_FRAMES)
-    parts, places, moves, blocks = [], [], [], []
-    for source in sources:
-        if len(source.frames):
-            kept, coarse, place, block = _averaged(source, every)
-            move = np.zeros_like(place)
-            move[:, :, 0] = ways_along(_x_mm(source))[kept[coarse.first], None]
-            for some, one in zip((parts, places, moves, blocks), (coarse, place, move, block), strict=True):
-                some.append(one)
-    if not parts:
-        return {}
-    ways = np.concatenate([move[:, 0, 0] for move in moves])
+    averaged = [(source, *_averaged(source, every)) for source in sources if len(source.frames)]
+    moves = []
+    for source, kept, coarse, place_mm, _ in averaged:
+        moves.append(np.zeros_like(place_mm))
+        moves[-1][:, :, 0] = ways_along(_x_mm(source))[kept[coarse.first], None]
+    ways = np.concatenate([np.zeros(0), *(move[:, 0, 0] for move in moves)])
     if not (np.any(ways > 0) and np.any(ways < 0)):
         return {}
-    return _step(ShiftFit.of(parts, places), moves, blocks)
+    fit = ShiftFit.of([coarse for _, _, coarse, _, _ in averaged], [place_mm for *_, place_mm, _ in averaged])
+    return _step(fit, moves, [block for *_, block in averaged])
 
 
 def _step(fit: ShiftFit, moves: Sequence[FloatArray], blocks: Sequence[IndexArray]) -> dict[str, float]:
