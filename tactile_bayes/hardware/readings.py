@@ -262,7 +262,6 @@ class SequenceCheck:
         if gap > MOST_LOST:
             self.restarts += 1
             return 0
-        self.lost += gap
         return gap
 
 
