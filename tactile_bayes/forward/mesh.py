@@ -54,7 +54,12 @@ def body_mesh(body: Body, *, fineness: int) -> QuadMesh:
     """The body on x >= 0 with a hole where the lump is; twice the fineness is half the element size everywhere."""
     box = _Box.around(body, fineness)
     ring = _blend(_circle(body, box.angles_rad()), box.outline(), np.linspace(0.0, 1.0, 2 * _OUT * fineness + 1))
-    across = _graded(box.half_width_mm, REACH_MM + _BEYOND * body.layers.thickness_mm, box.row_mm, fineness)
+    across = _graded(
+        box.half_width_mm,
+        REACH_MM + _BEYOND * body.layers.thickness_mm,
+        2 * float(box.side_up_mm[1] - box.side_up_mm[0]),
+        fineness,
+    )
     rows = np.concatenate([box.above_mm[:-1], box.side_mm[:-1], box.below_mm])
     blocks = [ring, _grid(across, rows), _grid(box.bottom_x_mm, box.below_mm)]
     if len(box.above_mm) > 1:
@@ -101,50 +106,29 @@ class _Box(Record, eq=False):
 
     @classmethod
     def around(cls, body: Body, fineness: int) -> _Box:
-        h, d, layers = body.centre_mm, body.d_mm, body.layers
+        """The box of a lump; of one clear of the gland it ends on their boundary, so that its side lies in fat."""
+        h, d, layers, clear = body.centre_mm, body.d_mm, body.layers, body.seat > 1.0
         top = h - _BOX * d if h > (_BOX + _LEAST_ABOVE) * d else 0.0
-        if body.seat > 1.0:
-            return cls._above_gland(body, top, fineness)
-        bottom = h + 0.5 * d + min((_BOX - 0.5) * d, 0.5 * (layers.thickness_mm - h - 0.5 * d))
-        side_up = np.linspace(top, layers.fat_mm, 2 * _UP * fineness + 1)
-        row = 2 * float(side_up[1] - side_up[0])
+        under = h + 0.5 * d
+        bottom = layers.fat_mm if clear else under + min((_BOX - 0.5) * d, 0.5 * (layers.thickness_mm - under))
+        middle, down = (0.5 * (top + layers.fat_mm), _UP) if clear else (layers.fat_mm, _DOWN)
+        side_up = np.linspace(top, middle, 2 * _UP * fineness + 1)
+        floor = np.linspace(0.0, _BOX * d, 2 * _DOWN * fineness + 1)
         return cls(
             body,
             _BOX * d,
             _rows_above(top, d, fineness),
             side_up,
-            np.linspace(layers.fat_mm, bottom, 2 * _DOWN * fineness + 1),
-            _graded(bottom, layers.thickness_mm, row, fineness),
+            np.linspace(middle, bottom, 2 * down * fineness + 1),
+            _graded(bottom, layers.thickness_mm, 2 * float(side_up[1] - side_up[0]), fineness),
             _projected(_BOX * d, h - top, _TOP * fineness),
-            np.linspace(0.0, _BOX * d, 2 * _DOWN * fineness + 1),
-        )
-
-    @classmethod
-    def _above_gland(cls, body: Body, top: float, fineness: int) -> _Box:
-        """Box of a lump clear of the gland: it ends at the fat-gland boundary, so that its side lies in fat."""
-        h, d, layers = body.centre_mm, body.d_mm, body.layers
-        half = 0.5 * (top + layers.fat_mm)
-        side_up = np.linspace(top, half, 2 * _UP * fineness + 1)
-        return cls(
-            body,
-            _BOX * d,
-            _rows_above(top, d, fineness),
-            side_up,
-            np.linspace(half, layers.fat_mm, 2 * _UP * fineness + 1),
-            _graded(layers.fat_mm, layers.thickness_mm, 2 * float(side_up[1] - side_up[0]), fineness),
-            _projected(_BOX * d, h - top, _TOP * fineness),
-            _projected(_BOX * d, layers.fat_mm - h, _UP * fineness),
+            _projected(_BOX * d, bottom - h, _UP * fineness) if clear else floor,
         )
 
     @property
     def side_mm(self) -> FloatArray:
         """Depths along the whole side."""
         return np.concatenate([self.side_up_mm[:-1], self.side_down_mm])
-
-    @property
-    def row_mm(self) -> float:
-        """Height of an element beside the box."""
-        return 2 * float(self.side_up_mm[1] - self.side_up_mm[0])
 
     def outline(self) -> FloatArray:
         """(k, 2) points from above the lump along top, side and bottom to below it."""

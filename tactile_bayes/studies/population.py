@@ -10,6 +10,7 @@ import numpy as np
 from tactile_bayes.declarations import Meta, Record, as_dict, field, names_of, replace
 from tactile_bayes.errors import BadDataError, TactileBayesError
 from tactile_bayes.forward.scene import FLAT_MM, Background, Head, Noise, Scene, Strokes, Tracker
+from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.forward.tissue import SceneBody, SolidLump
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.build import build_map
@@ -207,16 +208,6 @@ def draw_mass(
     return scenes
 
 
-def centred(bodies: BodyPrior) -> BodyPrior:
-    """Copy the prior with every lump's centre on the fat-gland boundary, as in the paper."""
-    return replace(bodies, seat=(0.0, 0.0))
-
-
-def as_settings(bodies: BodyPrior, exams: ExamPrior) -> Mapping[str, object]:
-    """Plain data for a table's header and a calibration's provenance."""
-    return {"bodies": as_dict(bodies), "exams": as_dict(exams)}
-
-
 def _log_uniform(ends: Range, rng: np.random.Generator) -> float:
     return float(np.exp(rng.uniform(np.log(ends[0]), np.log(ends[1]))))
 
@@ -275,20 +266,36 @@ class MassRow(Record):
     head_rim_mm: float | None = None
 
 
-def measure_mass(
-    scenes: Sequence[Scene],
-    *,
-    body: int,
-    scan: Callable[[Scene], Scan],
-    normalise: Sequence[str] = (DEFAULT_NORMALISE,),
-) -> list[MassRow]:
-    """Scan each scene of a mass, map and fit it; returns a row for each scene and normalisation (a map by each from one
-    scan)."""
-    rows = []
-    for i, scene in enumerate(scenes):
-        made = scan(scene)
-        rows += [measure_exam(scene, made, body=body, exam=i, normalise=one) for one in normalise]
-    return rows
+class Population(Record):
+    """Masses to be drawn and examined: all that the rows of a table depend on."""
+
+    scans: int  #: Exams of each mass.
+    seed: int
+    first_centred: int | None = None
+    """From this mass on the lumps are centred on the gland's surface, as in the paper; None for no mass."""
+    normalise: tuple[str, ...] = (DEFAULT_NORMALISE,)  #: A map by each of these from one scan.
+    bodies: BodyPrior = field(default_factory=BodyPrior)
+    exams: ExamPrior = field(default_factory=ExamPrior)
+    head: Head = field(default_factory=Head)
+
+    def scenes(self, index: int) -> list[Scene]:
+        """The exams of one mass."""
+        centred = self.first_centred is not None and index >= self.first_centred
+        bodies = replace(self.bodies, seat=(0.0, 0.0)) if centred else self.bodies
+        return draw_mass(index, scans=self.scans, seed=self.seed, bodies=bodies, exams=self.exams, head=self.head)
+
+    def rows(self, index: int, scan: Callable[[Scene], Scan] | None = None) -> list[MassRow]:
+        """Scan each exam of a mass, by default with the scene's seed, map and fit it; a row for each normalisation."""
+        made = [(i, one, (scan or _scanned)(one)) for i, one in enumerate(self.scenes(index))]
+        return [
+            measure_exam(scene, scanned, body=index, exam=i, normalise=way)
+            for i, scene, scanned in made
+            for way in self.normalise
+        ]
+
+
+def _scanned(scene: Scene) -> Scan:
+    return simulate(scene, rng=np.random.default_rng(scene.seed)).scan
 
 
 def measure_exam(scene: Scene, scan: Scan, *, body: int, exam: int, normalise: str = DEFAULT_NORMALISE) -> MassRow:

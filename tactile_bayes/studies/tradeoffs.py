@@ -57,7 +57,7 @@ EMPIRICAL, PLANE, SOLID = "empirical", "plane-strain", "solid"
 _PLANE = ((1, 0.5), (1, 0.25), (2, 0.5), (2, 0.25), (3, 0.25), (4, 0.125))
 _RANKS = (1e-3, 1e-4)
 _FINENESSES = (1, 2, 3)
-_REACHES_MM = (110.0,)
+_REACH_MM = 110.0
 # What Eq 6 is learned from where no calibration is given.
 _TAUGHT_MM = (10.0, 15.0, 20.0, 25.0)
 _TAUGHT_DEPTHS = (0.8, 1.0, 1.2)
@@ -152,31 +152,28 @@ def case_of(scene: Scene, *, head: str | None = None) -> LumpCase:
 
 def forward_settings(case: LumpCase) -> list[Setting]:
     """All settings to compare: within a model the cheap ones first, its reference last."""
-    found = [Setting(EMPIRICAL, "Eqs 1 to 4", case.plane, "default")]
-    for fineness, cell in _PLANE:
-        chosen = replace(case.plane, fineness=fineness, cell_mm=cell)
-        kind = _kind(chosen == case.plane, cell == case.plane.cell_mm, (fineness, cell) == _PLANE[-1], "contact cell")
+    plane, solid = case.plane, case.solid
+    found = [Setting(EMPIRICAL, "Eqs 1 to 4", plane, "default")]
+    for fineness, cell in _PLANE[:-1]:
+        chosen = replace(plane, fineness=fineness, cell_mm=cell)
+        kind = "default" if chosen == plane else "mesh" if cell == plane.cell_mm else "contact cell"
         found.append(Setting(PLANE, f"fineness {fineness}, cell {cell:g} mm", chosen, kind))
-    for fineness in _FINENESSES:
-        chosen_solid = replace(case.solid, fineness=fineness)
-        kind = _kind(chosen_solid == case.solid, True, fineness == _FINENESSES[-1], "")
-        found.append(Setting(SOLID, f"fineness {fineness}", chosen_solid, kind))
+    for fineness in _FINENESSES[:-1]:
+        finer = replace(solid, fineness=fineness)
+        found.append(Setting(SOLID, f"fineness {fineness}", finer, "default" if finer == solid else "mesh"))
     for rank in _RANKS:
-        found.append(Setting(SOLID, f"rank tolerance {rank:g}", replace(case.solid, rank_tolerance=rank), "rank"))
-    for reach in _REACHES_MM:
-        found.append(Setting(SOLID, f"mesh ends at {reach:g} mm", replace(case.solid, mesh_reach_mm=reach), "reach"))
-    edge = "shoulders" if case.solid.head.shoulders == SHOULDERS_INSIDE else "rim"
-    bare = replace(case.solid, head=replace(case.solid.head, shoulder_mm=0.0, rim_mm=0.0))
-    found.append(Setting(SOLID, f"head without its {edge}", bare, "rim"))
-    return [setting for setting in found if setting.kind != "reference"] + [
-        setting for setting in found if setting.kind == "reference"
+        found.append(Setting(SOLID, f"rank tolerance {rank:g}", replace(solid, rank_tolerance=rank), "rank"))
+    edge = "shoulders" if solid.head.shoulders == SHOULDERS_INSIDE else "rim"
+    bare = replace(solid, head=replace(solid.head, shoulder_mm=0.0, rim_mm=0.0))
+    (fineness, cell), finest = _PLANE[-1], _FINENESSES[-1]
+    reference = replace(plane, fineness=fineness, cell_mm=cell)
+    return [
+        *found,
+        Setting(SOLID, f"mesh ends at {_REACH_MM:g} mm", replace(solid, mesh_reach_mm=_REACH_MM), "reach"),
+        Setting(SOLID, f"head without its {edge}", bare, "rim"),
+        Setting(PLANE, f"fineness {fineness}, cell {cell:g} mm", reference, "reference"),
+        Setting(SOLID, f"fineness {finest}", replace(solid, fineness=finest), "reference"),
     ]
-
-
-def _kind(default: bool, mesh_only: bool, reference: bool, other: str) -> str:
-    if reference:
-        return "reference"
-    return "default" if default else "mesh" if mesh_only else other
 
 
 def measure_forward(case: LumpCase, setting: Setting, *, clock: Clock, runs: int = 1) -> Measured:
