@@ -534,3 +534,27 @@ def condensed(matrix: csc_array, on: IndexArray, inner: IndexArray) -> FloatArra
     coupling = matrix[inner][:, on].toarray()
     kept = matrix[on][:, on].toarray() - coupling.T @ solved(matrix[inner][:, inner], coupling)
     return np.asarray(0.5 * (kept + kept.T))
+
+
+class CondensedHole(Record, eq=False):
+    r"""A body with a hole where the lump is, condensed onto the hole's boundary and the skin.
+
+    With the flexibility F of the surroundings and the stiffness S of what fills the hole, the boundary moves by
+    :math:`(I + F S)^{-1} F f`. The difference of two such answers is written as one product, so that it is exact to
+    rounding however small it is, and vanishes for equal stiffness:
+
+    .. math:: -F_s (I + S_1 F)^{-1} (S_1 - S_0) (I + F S_0)^{-1} F_s^T
+    """
+
+    flexibility: FloatArray  #: F, (b, b) array: displacements on the boundary for unit forces there, nothing inside.
+    skin: FloatArray  #: F_s, (s, b) array: Sinking of the skin for the same forces.
+    unit_stiffness: FloatArray  #: (b, b) array: The lump, condensed on its boundary, for a modulus of 1 kPa.
+    original_stiffness: FloatArray  #: S_0, (b, b) array: The tissue that the lump replaces.
+
+    def change(self, lump_kpa: float) -> FloatArray:
+        """(s, s) change of the skin's compliance when tissue is replaced by a lump of modulus `lump_kpa`; symmetric."""
+        inside, identity = lump_kpa * self.unit_stiffness, np.eye(len(self.flexibility))
+        before = np.linalg.solve(identity + self.flexibility @ self.original_stiffness, self.skin.T)
+        forces = np.linalg.solve(identity + inside @ self.flexibility, (inside - self.original_stiffness) @ before)
+        change = self.skin @ forces
+        return np.asarray(-0.5 * (change + change.T))
