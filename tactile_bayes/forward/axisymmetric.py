@@ -329,12 +329,8 @@ def element_stiffness(mesh: LumpMesh, *, nu: float) -> FloatArray:
     """
     gradient, point, area = quadrature(mesh.node_mm[mesh.element])
     strain = _strains(lagrange_points()[0], gradient, point[..., 0])
-    return _polynomial(stiffness_factor(strain, point, area * point[..., 0], normal=3, poisson=nu))
-
-
-def _polynomial(factor: FloatArray) -> FloatArray:
-    """(3, e, k, k) coefficients of ``(A + m B)^T (A + m B)`` for the (2, e, n, k) factors A and B."""
-    a, b = factor
+    # K = (A + m B)^T (A + m B)
+    a, b = stiffness_factor(strain, point, area * point[..., 0], normal=3, poisson=nu)
     cross = a.transpose(0, 2, 1) @ b
     return np.stack([a.transpose(0, 2, 1) @ a, cross + cross.transpose(0, 2, 1), b.transpose(0, 2, 1) @ b])
 
