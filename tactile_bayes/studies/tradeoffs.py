@@ -27,6 +27,7 @@ from tactile_bayes.size.pooling import Calibration
 from tactile_bayes.size.terms import outside_domain
 from tactile_bayes.studies.estimate_tradeoff import (
     Choice,
+    Clock,
     Estimator,
     Ladder,
     Reference,
@@ -61,8 +62,6 @@ _REACH_MM = 110.0
 # What Eq 6 is learned from where no calibration is given.
 _TAUGHT_MM = (10.0, 15.0, 20.0, 25.0)
 _TAUGHT_DEPTHS = (0.8, 1.0, 1.2)
-
-Clock = Callable[[], float]  #: Seconds of CPU.
 
 
 class LumpCase(Record):
@@ -387,8 +386,7 @@ def measure_map(scan: Scan, *, inputs: Inputs, work: Work) -> Ladder:
                 tactile_map = build_map(used, **one.options)
                 built_s = clock() - begun
                 calibration, options = inputs(tactile_map)
-                estimator = Estimator(tactile_map, calibration, work.seed, clock, work.probability)
-                seconds, answer = estimator.run(options)(number)
+                seconds, answer = Estimator(tactile_map, calibration, work).run(options)(number)
             except BadDataError as error:
                 if one == settings[0].how:
                     raise
@@ -406,6 +404,6 @@ def _reference(scan: Scan, inputs: Inputs, work: Work) -> Reference:
     begun = work.clock()
     finest = build_map(scan, cell_mm=FINEST_CELL_MM)
     calibration, options = inputs(finest)
-    found = Estimator(finest, calibration, work.seed, work.clock, work.probability).reference(options)
+    found = Estimator(finest, calibration, work).reference(options)
     words = found.words.replace("the default's posterior", f"the map of all frames in cells of {FINEST_CELL_MM:g} mm")
     return replace(found, words=words, cpu_s=work.clock() - begun)
