@@ -56,19 +56,6 @@ class LayeredBody(Record):
     """Of each layer on a rigid base; one entry fewer than `modulus_kpa` when the last is a half-space."""
     nu: float = POISSON  #: Poisson's ratio of all, above -1 and up to 0.5 (incompressible).
 
-    def __post_init__(self) -> None:
-        if len(self.modulus_kpa) - len(self.thickness_mm) not in (0, 1) or not self.modulus_kpa:
-            raise BadDataError(
-                f"{len(self.modulus_kpa)} moduli for {len(self.thickness_mm)} thicknesses",
-                way_out="give as many (rigid base), or one modulus more (half-space)",
-            )
-        for name in ("modulus_kpa", "thickness_mm"):
-            for i, value in enumerate(getattr(self, name)):
-                if not (value > 0 and np.isfinite(value)):
-                    raise BadDataError(f"{name}[{i}] is {value}", way_out="it must be above 0")
-        if not -1 < self.nu <= 0.5:
-            raise BadDataError(f"nu is {self.nu}", way_out="it must lie above -1 and at most 0.5")
-
     @classmethod
     def of(cls, layers: Layers) -> LayeredBody:
         """Fat over gland on a rigid chest wall."""

@@ -143,13 +143,11 @@ class ContactStiffness(Record, eq=False):
 
     def changed(self, vectors: FloatArray, signs: FloatArray) -> ContactStiffness:
         """Stiffness after ``vectors @ diag(signs) @ vectors.T`` is added to the compliance: (n, k) in mm^(1/2)
-        kPa^(-1/2), and signs of 1 or -1.
+        kPa^(-1/2), and signs of 1 or -1. All changes are made in one.
 
         :math:`(C + V s V^T)^{-1} = H - H V (s + V^T H V)^{-1} V^T H` (Woodbury). The sum is positive definite when the
         bracket has as many negative eigenvalues as s (Sylvester's law of inertia).
         """
-        if self.factor.shape[1]:
-            raise BadDataError("this stiffness was changed already", way_out="gather all changes in one")
         factor = self.plain @ vectors
         bracket = np.diag(signs) + vectors.T @ factor
         if np.count_nonzero(np.linalg.eigvalsh(bracket) < 0) != np.count_nonzero(signs < 0):

@@ -372,10 +372,10 @@ def population_table(columns: Mapping[str, Sequence[float | None]]) -> Populatio
 
     A row without a profile of the head has NaN for it.
     """
-    kept = [i for i, found in enumerate(columns["detected"]) if found]
+    kept = np.flatnonzero(np.array(columns["detected"], dtype=bool))
 
     def column(name: str) -> FloatArray:
-        return np.array([columns[name][i] for i in kept], dtype=np.float64)
+        return np.array(columns[name], dtype=np.float64)[kept]
 
     covariance = np.empty((len(kept), 3, 3))
     for (i, j), name in zip(zip(*np.triu_indices(3), strict=True), SHAPE_COVARIANCE, strict=True):
@@ -383,10 +383,15 @@ def population_table(columns: Mapping[str, Sequence[float | None]]) -> Populatio
     sigma_x, sigma_y = np.log(column("sigma_x_mm")), np.log(column("sigma_y_mm"))
     varied = {name: column(name) for name in UNKNOWNS if name in columns}
     varied = {"depth_mm": column("depth_ratio") * column("d_mm"), **varied}
-    profile = _figures(columns, kept, HEAD_PROFILE)
+    profile = None
+    if all(name in columns for name in HEAD_PROFILE):
+        found = np.stack([column(name) for name in HEAD_PROFILE], axis=1)
+        whole = np.isfinite(found).all(axis=1)
+        found[~whole] = np.nan
+        profile = found if whole.any() else None
     boundary = (column("depth_ratio") + column("seat") / 2) * column("d_mm")
     return PopulationTable(
-        body=np.array([columns["body"][i] for i in kept]),
+        body=np.array(columns["body"])[kept],
         d_mm=column("d_mm"),
         log_amplitude=np.log(column("amplitude")),
         log_width=(sigma_x + sigma_y) / 2,
@@ -396,15 +401,3 @@ def population_table(columns: Mapping[str, Sequence[float | None]]) -> Populatio
         profile=profile,
         log_fat=None if profile is None else np.log(boundary),
     )
-
-
-def _figures(
-    columns: Mapping[str, Sequence[float | None]], kept: Sequence[int], names: Sequence[str]
-) -> FloatArray | None:
-    """(n, k) named figures of the chosen rows, NaN where a row lacks one of them; None where all rows do."""
-    if not all(name in columns for name in names):
-        return None
-    found = np.array([[columns[name][i] for name in names] for i in kept], dtype=np.float64).reshape(-1, len(names))
-    whole = np.isfinite(found).all(axis=1)
-    found[~whole] = np.nan
-    return found if whole.any() else None

@@ -15,7 +15,7 @@ from scipy.optimize import least_squares
 
 from tactile_bayes.actions.study import table_text
 from tactile_bayes.declarations import replace
-from tactile_bayes.errors import EXIT_BAD_DATA, EXIT_USAGE, BadDataError
+from tactile_bayes.errors import EXIT_BAD_DATA, EXIT_USAGE, BadDataError, UsageError
 from tactile_bayes.studies.paper import Geometry, StudyRow
 from tactile_bayes.studies.paper_solid import (
     RasterFrames,
@@ -294,7 +294,7 @@ def test_options_reach_the_map_and_the_fit(run_cli: Run, tmp_path: Path) -> None
 
 
 def test_a_level_that_is_neither_is_refused() -> None:
-    with pytest.raises(BadDataError, match="background is 'open'; it must be fixed or free"):
+    with pytest.raises(UsageError, match="background is 'open'"):
         SolidSettings(background="open")
 
 
