@@ -181,8 +181,15 @@ class SolidSettings(CaseSettings, kw_only=True):
 
     @property
     def mesh_size(self) -> MeshSize:
-        """Mesh size for the fineness and the reach."""
-        return mesh_size(self.fineness, reach_mm=self.mesh_reach_mm)
+        """Mesh size for the fineness and the reach; 2 is the default, and doubling it halves every element."""
+        default, share = MeshSize(), self.fineness / FINENESS
+        return MeshSize(
+            arc=round(default.arc * share),
+            rings=round(default.rings * share),
+            core=int(np.ceil(default.core * share)),
+            grade=float(default.grade ** (1.0 / share)),
+            reach_mm=self.mesh_reach_mm,
+        )
 
     def on(self, body: Body) -> SolidHead:
         """The head on the body without a lump."""
@@ -194,19 +201,6 @@ class SolidSettings(CaseSettings, kw_only=True):
             condensed, stiffness_ratio * self.fat_kpa, square_mm=self.head.pitch_mm, tolerance=self.rank_tolerance
         )
         return PlacedLump(change, 0.0, 0.0)
-
-
-def mesh_size(fineness: int, *, reach_mm: float = MeshSize().reach_mm) -> MeshSize:
-    """Mesh size of a fineness; 2 is the default, and doubling it halves every element."""
-    default = MeshSize()
-    share = fineness / FINENESS
-    return MeshSize(
-        arc=round(default.arc * share),
-        rings=round(default.rings * share),
-        core=int(np.ceil(default.core * share)),
-        grade=float(default.grade ** (1.0 / share)),
-        reach_mm=reach_mm,
-    )
 
 
 class RasterFrames(Record, eq=False):

@@ -22,7 +22,6 @@ from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.presets import CELL_MM, DEFAULT_NORMALISE, NORMALISE, SHOULDERS_INSIDE, THICKNESS_MM
 from tactile_bayes.scans import Scan
 from tactile_bayes.size.bodies import BodyCalibration, mean_width_mm
-from tactile_bayes.size.eq6 import SizeCalibration
 from tactile_bayes.size.pooling import Calibration
 from tactile_bayes.size.terms import outside_domain
 from tactile_bayes.studies.estimate_tradeoff import (
@@ -292,44 +291,34 @@ def learned_rule(rows: Sequence[StudyRow]) -> SizeRule:
 
 
 def calibrated_rule(calibration: Calibration, *, name: str) -> SizeRule:
-    """The point estimate of a calibration of either form; `name` is for people."""
+    """The point estimate of a calibration of either form, with its mean coefficients; `name` is for people.
+
+    Over a population it is the median of what `pooled_size` draws for a round lump in a body of which nothing is known,
+    where the map says a and the widths exactly. A map in two dimensions has one width, which stands for both.
+    """
     if isinstance(calibration, BodyCalibration):
-        return _body_rule(calibration, name)
-    return _eq6_rule(calibration, name)
+        population = calibration
 
+        def size(amplitude: float, sigma_x_mm: float, sigma_y_mm: float | None) -> list[float]:
+            width = mean_width_mm(sigma_x_mm, sigma_y_mm)
+            return [float(np.exp(population.corrected_log_size(np.log(np.array(amplitude)), np.log(np.array(width)))))]
 
-def _eq6_rule(calibration: SizeCalibration, name: str) -> SizeRule:
-    """Eq 6 with its mean coefficients for each axis of the head."""
+        scatter = calibration.fit.get("left_out_sd", float(np.exp(calibration.spread.mean[0])))
+        form = "Eq 6" if calibration.residual is None else "Eq 6 and its residual"
+        return SizeRule(size, float(scatter), f"{form} of {name}", calibration.outside)
+    axes = (calibration.x, calibration.y)
 
-    def sizes(amplitude: float, sigma_x_mm: float, sigma_y_mm: float | None) -> list[float]:
-        a = np.array([amplitude])
-        found = [float(calibration.x.size_mm(np.array([sigma_x_mm]), a)[0])]
-        if sigma_y_mm is not None:
-            found.append(float(calibration.y.size_mm(np.array([sigma_y_mm]), a)[0]))
-        return found
+    def sizes(amplitude: float, *widths_mm: float | None) -> list[float]:
+        a, given = np.array([amplitude]), zip(axes, widths_mm, strict=True)
+        return [float(axis.size_mm(np.array([width]), a)[0]) for axis, width in given if width is not None]
 
-    def outside(amplitude: float, sigma_x_mm: float, sigma_y_mm: float | None) -> list[str]:
-        along = [] if sigma_y_mm is None else outside_domain(calibration.y.domain, amplitude, sigma_y_mm)
-        return list(dict.fromkeys([*outside_domain(calibration.x.domain, amplitude, sigma_x_mm), *along]))
+    def outside(amplitude: float, *widths_mm: float | None) -> list[str]:
+        given = [(axis, width) for axis, width in zip(axes, widths_mm, strict=True) if width is not None]
+        return list(
+            dict.fromkeys(one for axis, width in given for one in outside_domain(axis.domain, amplitude, width))
+        )
 
     return SizeRule(sizes, float(calibration.x.draws.mean(axis=0)[4]), f"Eq 6 of {name}", outside)
-
-
-def _body_rule(calibration: BodyCalibration, name: str) -> SizeRule:
-    """A calibration over a population with its mean coefficients, for a round lump in a body of which nothing is known.
-
-    It is the median of what `pooled_size` draws where the map says a and the widths exactly. A map in two dimensions
-    has one width, which stands for both.
-    """
-
-    def sizes(amplitude: float, sigma_x_mm: float, sigma_y_mm: float | None) -> list[float]:
-        width = mean_width_mm(sigma_x_mm, sigma_y_mm)
-        log_a, log_width = np.log(np.array(amplitude)), np.log(np.array(width))
-        return [float(np.exp(calibration.corrected_log_size(log_a, log_width)))]
-
-    scatter = calibration.fit.get("left_out_sd", float(np.exp(calibration.spread.mean[0])))
-    form = "Eq 6" if calibration.residual is None else "Eq 6 and its residual"
-    return SizeRule(sizes, float(scatter), f"{form} of {name}", calibration.outside)
 
 
 # --- Cost of accuracy before the map: cells, frames, time of strokes and normalising, each up to the size.

@@ -21,7 +21,6 @@ from tactile_bayes.studies.paper_solid import (
     RasterFrames,
     SolidSettings,
     fit_raster,
-    mesh_size,
     raster_frames,
     raster_map,
 )
@@ -145,7 +144,7 @@ def test_a_ball_too_small_for_the_array_is_marked() -> None:
 
 
 def test_twice_the_fineness_is_half_the_element() -> None:
-    one, two, four = (mesh_size(fineness) for fineness in (1, 2, 4))
+    one, two, four = (SolidSettings(fineness=fineness).mesh_size for fineness in (1, 2, 4))
     assert (two.arc, two.rings, two.core, two.grade) == (18, 6, 3, 1.45)  # what decision record 0024 measured
     assert (four.arc, one.arc) == (36, 9)
     assert four.grade**2 == pytest.approx(two.grade)
