@@ -142,7 +142,7 @@ def _repeatability(path: Path, document: dict[str, Any]) -> dict[str, Any]:
         "schema": document["schema"],
         "kind": "spread between exams of one mass at a site",
         "in_words": found.words(),
-        **{name: document[name] for name in (*kept, *(["half_width"] if "half_width" in document else []))},
+        **{name: document[name] for name in (*kept, "half_width") if name in document},
         "units": {"between_map_sd, median, low, high, half_width": "share of the size"},
         "repeats": {one["name"]: f"{len(one['exams'])} exams" for one in document["repeats"]},
         "outlying": document["outlying"],
