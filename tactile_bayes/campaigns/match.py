@@ -14,16 +14,16 @@ from tactile_bayes.api.estimating import estimate_file
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.api.sized import SizeEstimate
 from tactile_bayes.declarations import Record, replace
-from tactile_bayes.errors import BadDataError
+from tactile_bayes.errors import Abstention, BadDataError
 from tactile_bayes.files.comparison import CompareReport
 from tactile_bayes.files.documents import read_record
 from tactile_bayes.files.manifest_csv import COMPARED, GROWTH, GROWTH_PAGE, Exam, columns_of, natural, table_text
 from tactile_bayes.files.map_nc import read_map
 from tactile_bayes.files.reports import EstimateReport, Place
 from tactile_bayes.findings import Finding, finding_lines
-from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.abstention import no_verdict
+from tactile_bayes.posterior.bump import on_map
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.report.compare import Growth, growths
 from tactile_bayes.trial.readings import day_of, in_order
@@ -55,6 +55,14 @@ class NamedPlace(Record):
     centre_mm: tuple[float, float]  #: On that map.
 
 
+class Match(Record):
+    """Which mass of a map is an exam's, by where other exams have the breast's masses."""
+
+    mass: str  #: Code of the exam's mass, which one of the places is of.
+    places: tuple[NamedPlace, ...]
+    most_mm: float  #: Within this distance of its place a mass of the map is it.
+
+
 class Breasts:
     """Exams of each breast, so that those of a large table are found without a walk through it."""
 
@@ -78,16 +86,17 @@ class Breasts:
         return list(found.values()) if exam.mass in found else []
 
 
-def matched(path: Path, settings: Settings, *, mass: str, places: Sequence[NamedPlace], most_mm: float) -> SizeEstimate:
+def matched(path: Path, settings: Settings, match: Match) -> SizeEstimate:
     """Estimate the mass of a map that lies nearest to where another exam has it.
 
     Without a mass there the estimate is of the place, and says why it has no size.
 
     At fault (`BadDataError`) are several masses of the map that may be the one, and a place off the map.
     """
+    mass, most_mm = match.mass, match.most_mm
     outcome = estimate_file(path, settings)
     tactile_map, masses = outcome.tactile_map, outcome.estimate.masses
-    wanted = places_on(tactile_map, places)
+    wanted = places_on(tactile_map, match.places)
     near = [one for one in masses if nearest(wanted, (one.x_mm, one.y_mm), most_mm) == mass]
     if len(near) > 1:
         told = " and ".join(f"({one.x_mm:.1f}, {one.y_mm:.1f}) mm" for one in near)
@@ -98,54 +107,38 @@ def matched(path: Path, settings: Settings, *, mass: str, places: Sequence[Named
     if near:
         return estimate_file(path, replace(settings, centre_mm=(near[0].x_mm, near[0].y_mm)))
     place = wanted[mass]
-    if not _on_map(tactile_map, place):
+    if not on_map(tactile_map, *place):
         told = f"mass {mass} would lie at ({place[0]:.1f}, {place[1]:.1f}) mm, off the map"
         raise BadDataError(told, way_out="check the landmarks, or give the row its centre_x_mm and centre_y_mm")
     looked = estimate_file(path, replace(settings, centre_mm=place))
-    return looked if _within(looked, place, most_mm) else _not_there(looked, mass, place, most_mm)
-
-
-def _within(outcome: SizeEstimate, place: tuple[float, float], most_mm: float) -> bool:
-    """Whether an estimate is of a lump near a place, or of none."""
-    if outcome.estimate.status != "estimate":
-        return True
-    here = next(one for one in outcome.estimate.masses if one.reported)
-    return bool(np.hypot(here.x_mm - place[0], here.y_mm - place[1]) <= most_mm)
-
-
-def _not_there(outcome: SizeEstimate, mass: str, place: tuple[float, float], most_mm: float) -> SizeEstimate:
-    """The outcome without its estimate, which is of a lump elsewhere."""
-    found = outcome.estimate
+    found = looked.estimate
+    here = next((one for one in found.masses if one.reported), None)
+    if found.status != "estimate" or here is None or np.hypot(here.x_mm - place[0], here.y_mm - place[1]) <= most_mm:
+        return looked
     reason = f"no lump found within {most_mm:g} mm of mass {mass}'s place, ({place[0]:.1f}, {place[1]:.1f}) mm"
-    masses = tuple(replace(one, reported=False) for one in found.masses)
-    why = no_verdict(outcome.tactile_map)
+    why = no_verdict(tactile_map) or Abstention("undetected", reason)
     none = Estimate(
         "no_estimate",
-        reason if why is None else why.reason,
+        why.reason,
         candidates=found.candidates,
-        code="undetected" if why is None else why.code,
-        masses=masses,
-        findings=outcome.tactile_map.findings,
+        code=why.code,
+        masses=tuple(replace(one, reported=False) for one in found.masses),
+        findings=looked.tactile_map.findings,
     )
-    return replace(outcome, estimate=none)
+    return replace(looked, estimate=none)
 
 
 def places_on(tactile_map: TactileMap, places: Sequence[NamedPlace]) -> dict[str, tuple[float, float]]:
-    """Where masses lie on a map, by their code: through the landmarks, or as they are where a scan has none."""
-    found = {}
+    """Where masses lie on a map, by their code: x and y in patient axes are kept; as they are without landmarks."""
+    found, here = {}, tactile_map.patient_from_plane
     for one in places:
         there = read_map(one.path).patient_from_plane
-        found[one.mass] = _carried(one.centre_mm, there, tactile_map.patient_from_plane)
+        found[one.mass] = one.centre_mm
+        if there is not None and here is not None:
+            x_y = (there @ np.array([*one.centre_mm, 0.0, 1.0]))[:2]
+            x, y = np.linalg.solve(here[:2, :2], x_y - here[:2, 3])
+            found[one.mass] = (float(x), float(y))
     return found
-
-
-def _carried(place: tuple[float, float], there: FloatArray | None, here: FloatArray | None) -> tuple[float, float]:
-    """A place of one map's plane on another's: x and y in patient axes are kept."""
-    if there is None or here is None:
-        return place
-    x_y = (there @ np.array([*place, 0.0, 1.0]))[:2]
-    x, y = np.linalg.solve(here[:2, :2], x_y - here[:2, 3])
-    return float(x), float(y)
 
 
 def nearest(wanted: Mapping[str, tuple[float, float]], place: tuple[float, float], most_mm: float) -> str:
@@ -158,11 +151,6 @@ def nearest(wanted: Mapping[str, tuple[float, float]], place: tuple[float, float
 def in_own_axes(tactile_map: TactileMap, places: Sequence[NamedPlace]) -> bool:
     """Whether places are compared in the maps' own axes."""
     return any(one.patient_from_plane is None for one in (tactile_map, *(read_map(place.path) for place in places)))
-
-
-def _on_map(tactile_map: TactileMap, place: tuple[float, float]) -> bool:
-    axes = (tactile_map.x_mm, tactile_map.y_mm)
-    return all(float(axis[0]) <= at <= float(axis[-1]) for axis, at in zip(axes, place, strict=True))
 
 
 def unnamed(reports: Sequence[EstimateReport]) -> list[Finding]:

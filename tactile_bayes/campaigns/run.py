@@ -17,27 +17,36 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import AbstractContextManager, nullcontext
+from functools import partial
 from operator import attrgetter
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
+from tactile_bayes.api.repeatability import ExamFolder
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.batch import CLUSTER_LOST, BatchInterrupted, Outcome, run_batch
 from tactile_bayes.batch_store import BatchStore
 from tactile_bayes.campaigns.inputs import READ, Alike, StepResults, read_sources, unchanged
-from tactile_bayes.campaigns.match import Breasts, NamedPlace, Visits, days_of, grown_masses, visit_dates
+from tactile_bayes.campaigns.match import Breasts, Match, NamedPlace, Visits, days_of, grown_masses, visit_dates
 from tactile_bayes.campaigns.settings import CampaignSettings, digest_of
 from tactile_bayes.campaigns.steps import (
     FEWEST_MASSES,
     FILES,
     NOT_LEARNED,
+    Made,
     Result,
     Task,
     copy_tasks,
-    exam_folders,
+    learn_repeatability,
+    make_estimate,
+    make_figures,
+    make_growth,
+    make_map,
+    make_page,
+    make_pool,
+    make_size,
     run_step,
     taught_by,
-    too_few,
 )
 from tactile_bayes.declarations import Record, field, names_of, replace
 from tactile_bayes.errors import TactileBayesError
@@ -210,7 +219,6 @@ class Campaign:
         self._recordings = Alike(self._breasts, "recording")
         self._repeated: set[str] = set()
         self._digests: dict[Path, str] = {}
-        self._calibrations: dict[str, str] = {}
 
     def run(self) -> CampaignState:
         """Run what is missing: maps, estimates and figures by blocks, repeatability, sizes by it, pages, pools, growth.
@@ -295,42 +303,31 @@ class Campaign:
             tasks = copy_tasks(self.folder / kind, names, results, to=f"{self.settings.copy_to}/{kind}")
             self._stages.run("copy", tasks, without=len(names) - len(tasks))
 
+    def _folder_of(self, exam: Exam) -> Path:
+        return self.folder / EXAMS / exam.name
+
+    def _task(self, step: str, exam: Exam, key: object, make: Callable[[], Made]) -> Task:
+        """A step of an exam; `key` is all that its files depend on."""
+        return Task(step, exam.name, self._folder_of(exam), digest_of(key), make)
+
     def _map_task(self, exam: Exam) -> Task:
+        given: dict[str, Any] = {"expected": self._expected(exam), "normalise": self.settings.normalise}
         digest = self._digests[exam.path]
-        expected = self._expected(exam)
-        key = {"scan": digest, "expected": expected, "normalise": self.settings.normalise}
-        return Task(
-            step="map",
-            name=exam.name,
-            folder=self.folder / EXAMS / exam.name,
-            digest=digest_of(key),
-            source=exam.path,
-            source_sha256=digest,
-            address=exam.address,
-            expected=expected,
-            normalise=self.settings.normalise,
-        )
+        make = partial(make_map, exam.path, source_sha256=digest, address=exam.address, **given)
+        return self._task("map", exam, {"scan": digest, **given}, make)
 
     def _estimate_task(self, exam: Exam, step: str) -> Task:
         """Task of the estimate, or of its figures."""
-        made = self.found.of("map", exam.name)
-        assert made is not None
-        settings = self.settings.of(exam)
-        key = {"map": made["files"][MAP], **self._settings_key(settings, made["normalise"])}
-        folder = self.folder / EXAMS / exam.name
-        places = self._places(exam)
+        made = self.found.results["map"]
+        settings, normalise = self.settings.of(exam), made[exam.name]["normalise"]
+        key = {"map": made[exam.name]["files"][MAP], **self._settings_key(settings, normalise)}
+        places, match = self._places(exam), None
         if places:
-            key["match"] = {"mass": exam.mass, "most_mm": self.settings.match_mm, "places": self._places_key(places)}
-        return Task(
-            step=step,
-            name=exam.name,
-            folder=folder,
-            digest=digest_of(key),
-            settings=settings,
-            mass=exam.mass,
-            places=places,
-            match_mm=self.settings.match_mm,
-        )
+            match = Match(exam.mass, places, self.settings.match_mm)
+            told = [[one.mass, one.exam, made[one.exam]["files"][MAP], one.centre_mm] for one in places]
+            key["match"] = {"mass": exam.mass, "most_mm": match.most_mm, "places": told}
+        make = make_estimate if step == "estimate" else make_figures
+        return self._task(step, exam, key, partial(make, self._folder_of(exam), settings, match))
 
     def _placed(self, mapped: Sequence[Exam]) -> list[Exam]:
         """The exams without those whose mass is named by a place on a map that could not be made."""
@@ -344,14 +341,10 @@ class Campaign:
     def _places(self, exam: Exam) -> tuple[NamedPlace, ...]:
         """Places of the breast's masses that other exams name, where this one names none."""
         return tuple(
-            NamedPlace(one.mass, one.name, self.folder / EXAMS / one.name / MAP, one.centre_mm)
+            NamedPlace(one.mass, one.name, self._folder_of(one) / MAP, one.centre_mm)
             for one in self._breasts.named(exam, of=self.found.results["map"])
             if one.centre_mm is not None
         )
-
-    def _places_key(self, places: Sequence[NamedPlace]) -> list[Any]:
-        made = self.found.results["map"]
-        return [[one.mass, one.exam, made[one.exam]["files"][MAP], one.centre_mm] for one in places]
 
     def _settings_key(self, settings: Settings, normalise: str) -> dict[str, Any]:
         """All that an estimate depends on besides its map: settings, and the digests of the files that they name."""
@@ -365,10 +358,8 @@ class Campaign:
         return {**plain, **used, "calibration_sha256": self._calibration_digest(name)}
 
     def _calibration_digest(self, name: str) -> str:
-        if name not in self._calibrations:
-            path = size_calibration_path(name)
-            self._calibrations[name] = "" if path is None else self._file_digest(path)
-        return self._calibrations[name]
+        path = size_calibration_path(name)
+        return "" if path is None else self._file_digest(path)
 
     def _file_digest(self, path: Path) -> str:
         """Digest of a file that many exams use."""
@@ -378,17 +369,22 @@ class Campaign:
 
     def _learn_repeatability(self, sound: Sequence[Exam]) -> None:
         """Learn the spread between exams from the repeats, and size every exam by it from what its estimate left."""
-        estimated = self._estimated(sound)
+        estimated, needed = self._estimated(sound), self._stages.needed
         masses = taught_by(sound if self._dry else estimated, self.settings)
         if masses < FEWEST_MASSES:
-            self.not_learned = too_few(masses) if masses else ""
-            self._stages.needed.update({name: -self._stages.needed[name] for name in ("repeatability", "size")})
+            if masses:
+                have = "mass has" if masses == 1 else "masses have"
+                self.not_learned = f"{masses} {have} repeated exams, and it takes {FEWEST_MASSES}"
+            needed["repeatability"] = needed["size"] = 0
             return
         complete = not self._dry or len(estimated) == len(sound)
         tasks = [self._repeatability_task(estimated)] if complete else []
         self._stages.run("repeatability", tasks, without=int(not complete))
         result = self.found.of("repeatability", SITE)
-        self._sizes_unknown = result is None and self._dry
+        if result is None and self._dry:
+            self._sizes_unknown = True
+            self._stages.run("size", [], without=len(sound))
+            return
         if result is None:
             fault = self.found.faults.pop(SITE, None)
             self.not_learned = "" if fault is None else fault.reason
@@ -396,15 +392,9 @@ class Campaign:
             self.not_learned = result[NOT_LEARNED]
         else:
             self.repeatability = read_repeatability(self.folder / REPEATABILITY)
-        if self._sizes_unknown:
-            self._stages.run("size", [], without=len(sound))
-        else:
-            self._size_again(estimated if self.repeatability else [])
-
-    def _size_again(self, estimated: Sequence[Exam]) -> None:
-        """Size exams by the repeatability."""
-        self._stages.needed["size"] = len(estimated)
-        for block in _blocks(estimated, self._block):
+        again = estimated if self.repeatability else []
+        needed["size"] = len(again)
+        for block in _blocks(again, self._block):
             tasks = [task for exam in block if (task := self._size_task(exam)) is not None]
             self._stages.run("size", tasks, without=0 if self._dry else len(block) - len(tasks))
 
@@ -417,12 +407,11 @@ class Campaign:
 
     def _page_task(self, exam: Exam) -> Task:
         sized = self._file("size", exam, SIZED)
-        report = ESTIMATE if sized is None else SIZED
-        told = {"replicate": str(exam.replicate), "date": "" if exam.day is None else exam.day.isoformat()}
-        expected = self._expected(exam) | told
+        day = "" if exam.day is None else exam.day.isoformat()
+        told = self._expected(exam) | {"replicate": str(exam.replicate), "date": day}
         key = {"map": self._file("map", exam, MAP), "size": sized or self._file("estimate", exam, ESTIMATE)}
-        folder, digest = self.folder / EXAMS / exam.name, digest_of({**key, "told": expected})
-        return Task("page", exam.name, folder, digest, expected=expected, report=report)
+        make = partial(make_page, self._folder_of(exam), told, report=ESTIMATE if sized is None else SIZED)
+        return self._task("page", exam, {**key, "told": told}, make)
 
     def _expected(self, exam: Exam) -> dict[str, str]:
         """What the table says of the exam, as far as it does."""
@@ -431,22 +420,22 @@ class Campaign:
 
     def _repeatability_task(self, exams: Sequence[Exam]) -> Task:
         files = [[exam.name, *(self._file("estimate", exam, file) for file in (ESTIMATE, SHAPE))] for exam in exams]
-        repeats = tuple(exam_folders(exams, self.folder / EXAMS))
-        return Task("repeatability", SITE, self.folder, digest_of([FEWEST_MASSES, files]), repeats=repeats)
+        repeats = [
+            ExamFolder(exam.name, exam.of_mass, f"{exam.patient} {exam.mass}", self._folder_of(exam)) for exam in exams
+        ]
+        digest = digest_of([FEWEST_MASSES, files])
+        return Task("repeatability", SITE, self.folder, digest, partial(learn_repeatability, repeats))
 
     def _size_task(self, exam: Exam) -> Task | None:
         """Task of a size by the repeatability; None where the exam has no draws, or another calibration."""
-        made = self.found.of("map", exam.name)
-        assert made is not None
+        made = self.found.results["map"][exam.name]
         settings = self._by_repeatability(self.settings.of(exam), made["normalise"])
-        shape = self._file("estimate", exam, SHAPE)
+        shape, figures = self._file("estimate", exam, SHAPE), self.settings.figures
         if settings.repeatability is None or shape is None:
             return None
         files = [made["files"][MAP], self._file("estimate", exam, ESTIMATE), shape]
-        key = {"files": files, "figures": self.settings.figures, **self._settings_key(settings, made["normalise"])}
-        folder = self.folder / EXAMS / exam.name
-        figures = self.settings.figures
-        return Task("size", exam.name, folder, digest_of(key), settings=settings, figures=figures)
+        key = {"files": files, "figures": figures, **self._settings_key(settings, made["normalise"])}
+        return self._task("size", exam, key, partial(make_size, self._folder_of(exam), settings, figures=figures))
 
     def _by_repeatability(self, settings: Settings, normalise: str) -> Settings:
         """Settings with the learned repeatability, where it is for the calibration that they lead to."""
@@ -492,20 +481,16 @@ class Campaign:
 
     def _pool_task(self, name: str, exams: Sequence[Exam]) -> Task:
         settings, key = self._of_one_mass(exams)
-        folder, members = self.folder / MASSES / name, self._members(exams)
-        return Task(step="pool", name=name, folder=folder, digest=digest_of(key), settings=settings, members=members)
+        make = partial(make_pool, self.folder / EXAMS, [exam.name for exam in exams], settings)
+        return Task("pool", name, self.folder / MASSES / name, digest_of(key), make)
 
     def _of_one_mass(self, exams: Sequence[Exam]) -> tuple[Settings, dict[str, Any]]:
         """Settings by which exams are sized together, and all that the result depends on."""
-        first = self.found.of("map", exams[0].name)
-        assert first is not None
+        normalise = self.found.results["map"][exams[0].name]["normalise"]
         settings = replace(self.settings.of(exams[0]), centre_mm=self.settings.estimate.centre_mm)
-        settings = self._by_repeatability(settings, first["normalise"])
+        settings = self._by_repeatability(settings, normalise)
         files = [[exam.name, *(self._file(step, exam, file) for step, file in _POOLED_FROM)] for exam in exams]
-        return settings, {"exams": files, **self._settings_key(settings, first["normalise"])}
-
-    def _members(self, exams: Sequence[Exam]) -> tuple[tuple[str, Path], ...]:
-        return tuple((exam.name, self.folder / EXAMS / exam.name) for exam in exams)
+        return settings, {"exams": files, **self._settings_key(settings, normalise)}
 
     def _compare(self, sound: Sequence[Exam]) -> None:
         """Compare the visits of every mass that has several with an estimate."""
@@ -515,23 +500,14 @@ class Campaign:
     def _compare_task(self, name: str, visits: Visits) -> Task:
         settings, key = self._of_one_mass([exam for exams in visits.values() for exam in exams])
         days, figures = days_of(visits), self.settings.figures
-        counts = [len(exams) for exams in visits.values()]
+        dates = tuple("" if day is None else day.isoformat() for day in visit_dates(visits).values())
         first = next(iter(visits.values()))[0]
-        days_known = ["" if day is None else day.isoformat() for day in visit_dates(visits).values()]
-        of_visits = tuple(visits), tuple(days_known) if any(days_known) else ()
-        course = Course("", "", first.patient, first.side or "", first.mass, *of_visits)
-        members = tuple(self._members(exams) for exams in visits.values())
-        return Task(
-            "compare",
-            name,
-            self.folder / GROWTH / name,
-            digest_of({**key, "visits": counts, "days": days, "figures": figures, "course": repr(course)}),
-            settings=settings,
-            visits=members,
-            course=course,
-            days=days,
-            figures=figures,
-        )
+        course = Course("", "", first.patient, first.side or "", first.mass, tuple(visits), dates if any(dates) else ())
+        counts = [len(exams) for exams in visits.values()]
+        digest = digest_of({**key, "visits": counts, "days": days, "figures": figures, "course": repr(course)})
+        names = [[exam.name for exam in exams] for exams in visits.values()]
+        make = partial(make_growth, self.folder / EXAMS, names, settings, days=days, course=course, figures=figures)
+        return Task("compare", name, self.folder / GROWTH / name, digest, make)
 
     def _file(self, step: str, exam: Exam, file: str) -> str | None:
         result = self.found.of(step, exam.name)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -12,14 +13,13 @@ import numpy as np
 
 from tactile_bayes.api.comparing import compare_answers, drawn_maps
 from tactile_bayes.api.estimating import choose_calibration, estimate_file
-from tactile_bayes.api.maps import map_provenance
 from tactile_bayes.api.pooled import pool_answers
 from tactile_bayes.api.repeatability import ExamFolder, learn_from_exams, repeatability_setting
 from tactile_bayes.api.settings import Comparing, Settings
 from tactile_bayes.api.sized import Answer, SizeEstimate, size_priors
-from tactile_bayes.campaigns.match import OWN_AXES, NamedPlace, in_own_axes, matched
+from tactile_bayes.campaigns.match import OWN_AXES, Match, in_own_axes, matched
 from tactile_bayes.campaigns.settings import CampaignSettings, Writes, digest_of, write_staged
-from tactile_bayes.declarations import EXACT, Record, field, from_plain, replace, rounded, to_plain
+from tactile_bayes.declarations import EXACT, Record, from_plain, replace, rounded, to_plain
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.atomic import sha256, write_bytes, write_text
 from tactile_bayes.files.documents import read_record
@@ -63,7 +63,6 @@ from tactile_bayes.report.exam_words import exam_map
 from tactile_bayes.report.growth_page import Course, growth_page
 from tactile_bayes.report.quantities import side_of
 from tactile_bayes.report.svg import thumbnail_svg
-from tactile_bayes.scans import Scan
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.draws import SIZES, SizePosterior
 from tactile_bayes.size.pooling import size_alone
@@ -87,44 +86,23 @@ FILES: Final = {
 """The files that each step may write."""
 UNWRITTEN: Final = "unwritten"
 """Key of a result that the disk did not take: the campaign's fault, not the exam's."""
-_KINDS: Final = {"a map or posterior (netCDF)": "map", "an archive (.npz or a spreadsheet)": "npz"}
+_A_MAP, _ARRAYS = "a map or posterior (netCDF)", "an archive (.npz or a spreadsheet)"
 """What `kind_of` calls the files that are no scans."""
 
 Result = dict[str, Any]
+Made = tuple[Result, Writes]
+"""What a step found, and how to write each of its files."""
 
 
 class Task(Record):
     """One step of one exam or mass."""
 
-    step: str  #: One of `RUN`.
+    step: str  #: A key of `FILES`.
     name: str
     folder: Path
     """`name`, `folder`: Of the exam or mass."""
     digest: str  #: Of all that the step's files depend on.
-    source: Path = Path()
-    source_sha256: str = ""
-    """`source`, `source_sha256`: Of a map: the exam's file."""
-    expected: Mapping[str, str] = field(default_factory=dict)
-    """Of a map and a page: what the table says of the exam, by its columns."""
-    normalise: str = ""  #: Of a map: as the option of `map`.
-    settings: Settings | None = None  #: Of all steps after the map: of the estimate.
-    mass: str = ""
-    places: tuple[NamedPlace, ...] = ()
-    match_mm: float = 0.0
-    """`mass`, `places`, `match_mm`: Of estimates and figures: where other exams of the breast have the mass; no places
-    where the exam is not matched.
-    """
-    members: tuple[tuple[str, Path], ...] = ()  #: Of a pooled mass: names and folders of the exams.
-    visits: tuple[tuple[tuple[str, Path], ...], ...] = ()
-    days: tuple[float, ...] | None = None
-    """`visits`, `days`: Of a comparison: the exams of each visit in order of time, and its day from the first."""
-    address: str = ""  #: Of a map: the exam's file in an object store.
-    copies: Mapping[str, str] = field(default_factory=dict)
-    """Of a copy: addresses in an object store, by the names of the files."""
-    repeats: tuple[ExamFolder, ...] = ()  #: Of the repeatability: the exams.
-    figures: bool = False  #: Of sizes and comparisons: whether to draw them.
-    report: str = ESTIMATE  #: Of a page: the file that holds the exam's size.
-    course: Course = field(default_factory=Course)  #: Of a comparison: what the table says of the visits.
+    make: Callable[[], Made]  #: A partial of a function of this module: workers get it.
 
     @property
     def key(self) -> str:
@@ -141,7 +119,7 @@ def run_step(task: Task) -> Result:
     """
     begun, begun_cpu = time.perf_counter(), time.thread_time()
     try:
-        found, writes = RUN[task.step](task)
+        found, writes = task.make()
     except BadDataError as error:
         raise BadDataError(error.what, way_out=error.way_out) from None
     if UNWRITTEN in found:
@@ -154,65 +132,47 @@ def run_step(task: Task) -> Result:
     return {**made, **{name: round(one, 3) for name, one in spent.items()}, **found}
 
 
-def _map(task: Task) -> tuple[Result, Writes]:
-    """Make the exam's map from its scan or arrays, or take the map that it is; refuse what belongs to another exam."""
-    if task.address:  # fetched for as long as the map is made
-        with fetched(task.address) as path:
-            return _map(replace(task, source=path, address=""))
-    if sha256(task.source) != task.source_sha256:
+def make_map(
+    source: Path, *, source_sha256: str, expected: Mapping[str, str], normalise: str, address: str = ""
+) -> Made:
+    """The exam's map from its scan or its arrays (brought in as `import` does), or the map that its file is.
+
+    `expected` is what the table says of the exam, by its columns: what belongs to another exam is refused. `address` is
+    of a file in an object store, fetched for as long as the map is made.
+    """
+    if address:
+        with fetched(address) as path:
+            return make_map(path, source_sha256=source_sha256, expected=expected, normalise=normalise)
+    if sha256(source) != source_sha256:
         raise BadDataError("changed while the campaign ran", way_out="run the campaign again")
-    kind = _KINDS.get(kind_of(task.source), "")
-    if kind == "map":
-        return _given_map(task)
-    if kind == "npz":
-        return _imported_map(task)
-    return _scanned_map(task)
+    kind = kind_of(source)
+    if kind == _A_MAP:
+        return _given_map(source, expected)
+    writes: Writes = {}
+    if kind == _ARRAYS:
+        scan = read_arrays(source)
+        made = Provenance("import", {"as": "scan", "lost": [], "correct": []}, inputs={"source": source_sha256})
+        writes[SCAN] = lambda path: write_scan(path, scan, provenance=made, force=True)
+    else:
+        scan = read_scan(source)
+        check_facts(expected, scan.session)
+    facts = scan_facts(scan.session, frames=scan.frames.sha256, file=source_sha256)
+    settings = to_plain(from_plain(MapOptions, {"normalise": normalise}), digits=EXACT)
+    provenance = Provenance("map", settings, {"scan_1": source_sha256}, scans=[facts])
+    tactile_map = build_map(scan, normalise=normalise)
+    writes[MAP] = lambda path: write_map(path, tactile_map, provenance=provenance, force=True)
+    simulated = scan.session.get("source") == "simulated"
+    return {"scans": [facts], "synthetic": simulated, "normalise": normalise}, writes
 
 
-def _scanned_map(task: Task) -> tuple[Result, Writes]:
-    scan = read_scan(task.source)
-    check_facts(task.expected, scan.session)
-    settings = map_settings(task.normalise)
-    provenance: Provenance = map_provenance([task.source], [scan], settings)
-    facts = scan_facts(scan.session, frames=scan.frames.sha256, file=task.source_sha256)
-    return _built(task, scan, provenance, facts)
-
-
-def _imported_map(task: Task) -> tuple[Result, Writes]:
-    """Bring in arrays as `import` does, and map the scan that they are."""
-    scan = read_arrays(task.source)
-    made = Provenance("import", {"as": "scan", "lost": [], "correct": []}, inputs={"source": task.source_sha256})
-    facts = scan_facts(scan.session, frames=scan.frames.sha256, file=task.source_sha256)
-    inputs = {"scan_1": task.source_sha256}
-    provenance = Provenance("map", map_settings(task.normalise), inputs, scans=[facts])
-    found, writes = _built(task, scan, provenance, facts)
-    return found, {SCAN: lambda path: write_scan(path, scan, provenance=made, force=True), **writes}
-
-
-def _built(task: Task, scan: Scan, provenance: Any, facts: Mapping[str, str]) -> tuple[Result, Writes]:
-    tactile_map = build_map(scan, normalise=task.normalise)
-    found = {
-        "scans": [dict(facts)],
-        "synthetic": scan.session.get("source") == "simulated",
-        "normalise": task.normalise,
-    }
-    return found, {MAP: lambda path: write_map(path, tactile_map, provenance=provenance, force=True)}
-
-
-def _given_map(task: Task) -> tuple[Result, Writes]:
-    """Take a map that was made before, byte for byte."""
-    tactile_map, scans = read_map_and_scans(task.source)
+def _given_map(source: Path, expected: Mapping[str, str]) -> Made:
+    """A map that was made before, byte for byte."""
+    tactile_map, scans = read_map_and_scans(source)
     for facts in scans:
-        check_facts(task.expected, facts)
-    data = read_bytes(task.source, most=NETCDF_BYTES)
+        check_facts(expected, facts)
+    data = read_bytes(source, most=NETCDF_BYTES)
     found = {"scans": list(scans), "synthetic": None, "normalise": tactile_map.recipe.normalise}
     return found, {MAP: lambda path: write_bytes(path, data, force=True)}
-
-
-def map_settings(normalise: str) -> dict[str, Any]:
-    """Settings of `map` by its options: their defaults, but for the normalisation."""
-    settings: dict[str, Any] = to_plain(from_plain(MapOptions, {"normalise": normalise}), digits=EXACT)
-    return settings
 
 
 def check_facts(expected: Mapping[str, str], facts: Mapping[str, str]) -> None:
@@ -230,71 +190,67 @@ def check_facts(expected: Mapping[str, str], facts: Mapping[str, str]) -> None:
     raise BadDataError(f"the table says {here}; the file says {there}", way_out=way_out)
 
 
-def _estimate(task: Task) -> tuple[Result, Writes]:
-    found = _estimated(task)
+def make_estimate(folder: Path, settings: Settings, match: Match | None) -> Made:
+    """The estimate, the draws of its size and what pools and sizes by the site start from."""
+    found = _estimated(folder, settings, match)
     answer = found.answer
     assert answer.report is not None
-    report = answer.report.checked()
+    report, shape = answer.report.checked(), answer.shape
     writes: Writes = {ESTIMATE: lambda path: write_text(path, json_text(report), force=True)}
     if found.status == "estimate":
         writes[POSTERIOR] = lambda path: found.write(path, force=True)
-    shape = answer.shape
     if shape is not None:
         writes[SHAPE] = lambda path: write_shape(path, shape, force=True)
     return {"exit_code": answer.exit_code}, writes
 
 
-def _estimated(task: Task) -> SizeEstimate:
+def _estimated(folder: Path, settings: Settings, match: Match | None) -> SizeEstimate:
     """The exam's estimate: of the mass that its row names, where other exams have it."""
-    assert task.settings is not None
-    path = task.folder / MAP
-    if not task.places:
-        return estimate_file(path, task.settings)
-    found = matched(path, task.settings, mass=task.mass, places=task.places, most_mm=task.match_mm)
-    if not in_own_axes(found.tactile_map, task.places):
+    if match is None:
+        return estimate_file(folder / MAP, settings)
+    found = matched(folder / MAP, settings, match)
+    if not in_own_axes(found.tactile_map, match.places):
         return found
     findings = by_weight((*found.estimate.findings, OWN_AXES))
     return replace(found, estimate=replace(found.estimate, findings=findings))
 
 
-def _figures(task: Task) -> tuple[Result, Writes]:
-    """Draw the figures of `estimate`; the estimate is made again, for it is not stored whole."""
-    found = _estimated(task)
+def make_figures(folder: Path, settings: Settings, match: Match | None) -> Made:
+    """The figures of `estimate`; the estimate is made again, for it is not stored whole."""
+    found = _estimated(folder, settings, match)
     tactile_map, estimate = found.tactile_map, found.estimate
-    size, writes = estimate.size, Writes()
+    name, size, writes = folder.name, estimate.size, Writes()
     if tactile_map.covered.any():
-        writes[MAP_FIGURE] = lambda path: draw_map(tactile_map, estimate, path, name=task.name, force=True)
+        writes[MAP_FIGURE] = lambda path: draw_map(tactile_map, estimate, path, name=name, force=True)
     if size is not None:
-        probability, findings = found.probability, estimate.findings
-        writes[SIZE_FIGURE] = lambda path: draw_size(
-            size, path, name=task.name, probability=probability, findings=findings, force=True
-        )
+        given: dict[str, Any] = {"probability": found.probability, "findings": estimate.findings}
+        writes[SIZE_FIGURE] = lambda path: draw_size(size, path, name=name, force=True, **given)
     return {}, writes
 
 
-def _page(task: Task) -> tuple[Result, Writes]:
-    """Make the exam's page and its thumbnail from what its steps left; the table tells what the scans do not."""
-    tactile_map, scans = read_map_and_scans(task.folder / MAP)
-    told = {SAME_IN_SCANS[name]: text for name, text in task.expected.items() if name in SAME_IN_SCANS}
+def make_page(folder: Path, expected: Mapping[str, str], *, report: str) -> Made:
+    """The exam's page and its thumbnail from what its steps left, its size from the file `report`.
+
+    The table tells what the scans do not.
+    """
+    tactile_map, scans = read_map_and_scans(folder / MAP)
+    told = {SAME_IN_SCANS[name]: text for name, text in expected.items() if name in SAME_IN_SCANS}
     facts = [told | scan for scan in scans or [{}]]
-    report = read_record(task.folder / task.report, EstimateReport)
-    shown = exam_map(tactile_map, report, side=side_of(facts))
-    title = f"Tactile exam {task.expected['replicate']}"
-    page = exam_page(ShownExam((shown,), None, facts, title=title, day=task.expected.get("date", "")))
+    shown = exam_map(tactile_map, read_record(folder / report, EstimateReport), side=side_of(facts))
+    title = f"Tactile exam {expected['replicate']}"
+    page = exam_page(ShownExam((shown,), None, facts, title=title, day=expected.get("date", "")))
     writes: Writes = {EXAM_PAGE: lambda path: write_text(path, page, force=True)}
     if tactile_map.covered.any():
-        picture = thumbnail_svg(shown, label=f"Map of {task.name}")
+        picture = thumbnail_svg(shown, label=f"Map of {folder.name}")
         writes[THUMBNAIL] = lambda path: write_text(path, picture, force=True)
     return {}, writes
 
 
-def _pool(task: Task) -> tuple[Result, Writes]:
-    """Pool the exams of a mass as `estimate --pool` does, from what their estimates left in their folders."""
-    assert task.settings is not None
-    answers = [_answer(folder) for _, folder in task.members]
-    inputs = {f"map_{i}": folder / MAP for i, (_, folder) in enumerate(task.members, start=1)}
-    names = [name for name, _ in task.members]
-    found = pool_answers(answers, task.settings, names=names, inputs=inputs)
+def make_pool(folder: Path, names: Sequence[str], settings: Settings) -> Made:
+    """Pool exams of a mass as `estimate --pool` does, from what their estimates left in their folders below this."""
+    answers = [_answer(folder / name) for name in names]
+    inputs = {f"map_{i}": folder / name / MAP for i, name in enumerate(names, start=1)}
+    found = pool_answers(answers, settings, names=names, inputs=inputs)
     report = found.pooled_report.checked()
     writes: Writes = {POOLED: lambda path: write_text(path, json_text(report), force=True)}
     if found.pooled.size is not None:
@@ -302,27 +258,39 @@ def _pool(task: Task) -> tuple[Result, Writes]:
     return {}, writes
 
 
-def _compare(task: Task) -> tuple[Result, Writes]:
-    """Compare the visits of a mass as `compare` does; the table says that they are of one where landmarks do not."""
-    assert task.settings is not None
-    answers = [[_answer(folder) for _, folder in exams] for exams in task.visits]
+def make_growth(
+    folder: Path,
+    visits: Sequence[Sequence[str]],
+    settings: Settings,
+    *,
+    days: tuple[float, ...] | None,
+    course: Course,
+    figures: bool,
+) -> Made:
+    """Compare the visits of a mass as `compare` does; the table says that they are of one where landmarks do not.
+
+    `visits` names the exams of each in order of time, with folders below `folder`; `days` are from the first, and
+    `course` is what the table says of them.
+    """
+    answers = [[_answer(folder / name) for name in names] for names in visits]
     found = [one for maps in answers for one in maps if one.shape is not None]
     placed = all(one.report is not None and one.report.centre_patient_mm is not None for one in found)
-    numbered = [(v, i, folder) for v, exams in enumerate(task.visits, 1) for i, (_, folder) in enumerate(exams, 1)]
+    numbered = [(v, i, name) for v, names in enumerate(visits, 1) for i, name in enumerate(names, 1)]
     compared = compare_answers(
         answers,
-        task.settings,
-        comparing=Comparing(days=task.days, same_mass=not placed),
-        names=[[name for name, _ in exams] for exams in task.visits],
-        inputs={f"visit_{v}_map_{i}": folder / MAP for v, i, folder in numbered},
+        settings,
+        comparing=Comparing(days=days, same_mass=not placed),
+        names=visits,
+        inputs={f"visit_{v}_map_{i}": folder / name / MAP for v, i, name in numbered},
     )
     report = compared.report.checked()
-    writes: Writes = {COMPARED: lambda path: write_text(path, json_text(report), force=True)}
-    maps = [[read_map(folder / MAP) for _, folder in exams] for exams in task.visits]
-    drawn = drawn_maps(maps, answers)
-    page = growth_page(compared.compared, report, drawn, task.course)
-    writes[GROWTH_PAGE] = lambda path: write_text(path, page, force=True)
-    if task.figures and compared.compared.joint is not None:
+    drawn = drawn_maps([[read_map(folder / name / MAP) for name in names] for names in visits], answers)
+    page = growth_page(compared.compared, report, drawn, course)
+    writes: Writes = {
+        COMPARED: lambda path: write_text(path, json_text(report), force=True),
+        GROWTH_PAGE: lambda path: write_text(path, page, force=True),
+    }
+    if figures and compared.compared.joint is not None:
         writes[COMPARED_FIGURE] = lambda path: draw_comparison(compared.compared, report, drawn, path, force=True)
     return {}, writes
 
@@ -354,17 +322,17 @@ def copy_tasks(folder: Path, names: Sequence[str], results: Sequence[Mapping[str
         made = [found[name]["files"] for found in results if name in found]
         files = {file: digest for one in made for file, digest in one.items()}
         if files:
-            copies = {file: f"{to}/{name}/{file}" for file in files}
             digest = digest_of({"to": f"{to}/{name}", "files": files})
-            tasks.append(Task("copy", name, folder / name, digest, copies=copies))
+            make = partial(copy_files, folder / name, list(files), to=f"{to}/{name}")
+            tasks.append(Task("copy", name, folder / name, digest, make))
     return tasks
 
 
-def copy_step(task: Task) -> tuple[Result, Writes]:
+def copy_files(folder: Path, files: Sequence[str], *, to: str) -> Made:
     """Copy files into an object store."""
     try:
-        for name, address in task.copies.items():
-            put(task.folder / name, address)
+        for name in files:
+            put(folder / name, f"{to}/{name}")
     except UsageError as error:
         return {UNWRITTEN: str(error)}, {}
     return {}, {}
@@ -380,68 +348,44 @@ _ANOTHER_STREAM: Final = 1
 """Of random numbers: the sizes' points must not be those that drew the map's posterior."""
 
 
-def taught_by(exams: Sequence[Exam], settings: CampaignSettings) -> int:
-    """Count the masses that may teach the spread; 0 where one was given or is not wanted."""
+def taught_by(exams: Iterable[Exam], settings: CampaignSettings) -> int:
+    """Count the masses with several exams at one visit, which may teach the spread; 0 where none is wanted."""
     given = settings.estimate
     if not settings.own_repeatability or given.repeatability or given.between_map_sd is not None:
         return 0
-    return repeated_masses(exams)
+    count = Counter((exam.patient, exam.mass, exam.of_mass) for exam in exams)
+    return len({(patient, mass) for (patient, mass, _), number in count.items() if number > 1})
 
 
-def repeated_masses(exams: Sequence[Exam]) -> int:
-    """Masses that have several of these exams at one visit."""
-    count: dict[tuple[str, str], int] = defaultdict(int)
-    for exam in exams:
-        count[exam.patient, exam.of_mass] += 1
-    of_mass = {exam.of_mass: (exam.patient, exam.mass) for exam in exams}
-    return len({of_mass[name] for (_, name), n in count.items() if n > 1})
-
-
-def too_few(masses: int) -> str:
-    """Why nothing is learned from so few masses with repeats."""
-    return f"{masses} {'mass has' if masses == 1 else 'masses have'} repeated exams, and it takes {FEWEST_MASSES}"
-
-
-def exam_folders(exams: Sequence[Exam], folder: Path) -> list[ExamFolder]:
-    """Exams as `learn_from_exams` takes them; `folder` holds one folder for each."""
-    return [ExamFolder(one.name, one.of_mass, f"{one.patient} {one.mass}", folder / one.name) for one in exams]
-
-
-def learn_step(task: Task) -> tuple[Result, Writes]:
+def learn_repeatability(repeats: Sequence[ExamFolder]) -> Made:
     """Learn the spread between exams of one mass; where that cannot be, the reason is the result."""
     try:
-        learned = learn_from_exams(task.repeats, fewest=FEWEST_MASSES)
+        learned = learn_from_exams(repeats, fewest=FEWEST_MASSES)
     except BadDataError as error:
         return {NOT_LEARNED: f"{error.what}; {error.way_out}"}, {}
     return {}, {REPEATABILITY: lambda path: learned.write(path, force=True)}
 
 
-def size_step(task: Task) -> tuple[Result, Writes]:
-    """Size an exam by the site's repeatability: its estimate with other sizes. Nothing where it had no size."""
-    assert task.settings is not None
-    settings = task.settings
-    report = read_record(task.folder / ESTIMATE, EstimateReport)
+def make_size(folder: Path, settings: Settings, *, figures: bool) -> Made:
+    """Size an exam by the site's repeatability: its estimate with other sizes. Nothing where it had no size.
+
+    The size is from the draws of the exam, in the axes of its map as `estimate` has it.
+    """
+    report = read_record(folder / ESTIMATE, EstimateReport)
     if report.max_size_mm is None:
         return {}, {}
-    size = _exam_size(task.folder, settings)
-    sized = _resized(report, size, settings).checked()
-    writes: Writes = {SIZED: lambda path: write_text(path, json_text(sized), force=True)}
-    if task.figures:
-        findings = sized.findings
-        writes[SIZED_FIGURE] = lambda path: draw_size(
-            size, path, name=task.name, probability=settings.interval, findings=findings, force=True
-        )
-    return {}, writes
-
-
-def _exam_size(folder: Path, settings: Settings) -> SizePosterior:
-    """Size from the draws of an exam, in the axes of its map as `estimate` has it."""
     tactile_map = read_map(folder / MAP)
     _, calibration, _ = choose_calibration(settings, tactile_map)
     assert isinstance(calibration, BodyCalibration)
     shape = replace(read_shape(folder / SHAPE), turn_rad=0.0)
     rng = np.random.default_rng([settings.seed, tactile_map.fingerprint, _ANOTHER_STREAM])
-    return size_alone(shape, calibration=calibration, priors=size_priors(settings), rng=rng)
+    size = size_alone(shape, calibration=calibration, priors=size_priors(settings), rng=rng)
+    sized = _resized(report, size, settings).checked()
+    writes: Writes = {SIZED: lambda path: write_text(path, json_text(sized), force=True)}
+    if figures:
+        given: dict[str, Any] = {"probability": settings.interval, "findings": sized.findings}
+        writes[SIZED_FIGURE] = lambda path: draw_size(size, path, name=folder.name, force=True, **given)
+    return {}, writes
 
 
 def _resized(report: EstimateReport, size: SizePosterior, settings: Settings) -> EstimateReport:
@@ -467,17 +411,3 @@ def _resized(report: EstimateReport, size: SizePosterior, settings: Settings) ->
         diagnostics=diagnostics,
         provenance=provenance,
     )
-
-
-RUN: Final[dict[str, Callable[[Task], tuple[Result, Writes]]]] = {
-    "map": _map,
-    "estimate": _estimate,
-    "figures": _figures,
-    "repeatability": learn_step,
-    "size": size_step,
-    "page": _page,
-    "pool": _pool,
-    "compare": _compare,
-    "copy": copy_step,
-}
-"""What makes each step's files: what it found, and how to write each file."""

@@ -13,6 +13,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -35,7 +36,7 @@ from plain_reports import estimate_report
 
 import tactile_bayes as tb
 from tactile_bayes.campaigns.inputs import open_campaign
-from tactile_bayes.campaigns.steps import Task, run_step
+from tactile_bayes.campaigns.steps import Task, make_map, run_step
 from tactile_bayes.campaigns.tables import Row
 from tactile_bayes.errors import UsageError
 from tactile_bayes.files.documents import load_schema
@@ -238,8 +239,8 @@ def test_a_step_that_ends_after_its_command_was_killed_changes_nothing_that_is_r
     before, done = contents(out), steps(out)
     source = finished / "scans" / "07-a.mcap"
     digest = hashlib.sha256(source.read_bytes()).hexdigest()
-    task = Task("map", exam, out / "exams" / exam, "late", source=source, source_sha256=digest, normalise="mean")
-    late = run_step(task)
+    make = partial(make_map, source, source_sha256=digest, expected={}, normalise="mean")
+    late = run_step(Task("map", exam, out / "exams" / exam, "late", make))
     assert set(late["files"]) == {"map.nc"}
     now = contents(out)
     assert {name: now[name] for name in before} == before

@@ -25,8 +25,7 @@ import psutil
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.batch import LocalWorkers, open_executor, run_batch
 from tactile_bayes.campaigns.settings import put_in_place
-from tactile_bayes.campaigns.steps import Task, run_step
-from tactile_bayes.declarations import replace
+from tactile_bayes.campaigns.steps import Task, make_estimate, make_figures, make_map, run_step
 from tactile_bayes.errors import TactileBayesError
 from tactile_bayes.files.atomic import sha256
 
@@ -36,11 +35,15 @@ FIRST, SHOWN = 30, (1, 10, 30, 60, 100, 150, 200, 250, 300)
 def exam(path: str, *, out: str, steps: tuple[str, ...]) -> list[float]:
     """Run an exam's steps; returns the RSS of this process, MB, its CPU time, s, and how much its profiler holds."""
     source = Path(path)
-    task = Task("map", source.stem, Path(out), "0", source, sha256(source), normalise="gain")
+    folder, settings = Path(out), Settings(method="laplace")
+    make = {
+        "map": partial(make_map, source, source_sha256=sha256(source), expected={}, normalise="gain"),
+        "estimate": partial(make_estimate, folder, settings, None),
+        "figures": partial(make_figures, folder, settings, None),
+    }
     with contextlib.suppress(TactileBayesError):  # damaged on purpose
-        put_in_place(run_step(task))
-        for step in steps:
-            put_in_place(run_step(replace(task, step=step, settings=Settings(method="laplace"))))
+        for step in ("map", *steps):
+            put_in_place(run_step(Task(step, source.stem, folder, "0", make[step])))
     process = psutil.Process()
     return [process.memory_info().rss / 1e6, process.cpu_times().user, float(_profiled())]
 

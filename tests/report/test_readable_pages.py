@@ -142,6 +142,7 @@ def test_every_colour_of_a_text_has_a_contrast_of_four_and_a_half() -> None:
 def test_the_live_page_has_contrast() -> None:
     """White on black edges for the names on the map; its bar and its words against what lies behind them."""
     page = resources.files("tactile_bayes.hardware").joinpath("live_page.html").read_text(encoding="utf-8")
+    assert page.count("<h1>") == 1
     style = page.partition("<style")[2].partition("</style>")[0]
     rule = dict(re.findall(r"(\S[^{}\n]*?) \{ ([^}]*)\}", style))
     assert least_contrast({"#eee", *re.findall(r"color: (#\w+)", rule["footer"])}, "#111") >= 4.5
