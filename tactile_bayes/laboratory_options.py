@@ -123,6 +123,40 @@ class RecordOptions(Options, kw_only=True):
     force: bool = False
 
 
+Span = tuple[Annotated[float, Meta(ge=0.0)], Annotated[float, Meta(ge=0.0)]]  #: Begin and length, s.
+Share = Annotated[float, Meta(ge=0.0, le=1.0)]
+
+
+class FaultOptions(Options):
+    """Faults of an emulated device, at times of the scan."""
+
+    drop: Annotated[Share, Meta(description="Share of the records that are not sent.")] = 0.0
+    corrupt: Annotated[Share, Meta(description="Share of the records with one bit changed.")] = 0.0
+    stall: Annotated[
+        Span | None,
+        Meta(description="Send nothing for FOR s from AT s on; those records are lost.", extra={"metavar": "AT FOR"}),
+    ] = None
+    disconnect_s: Annotated[
+        Annotated[float, Meta(ge=0.0)] | None,
+        Meta(description="Disconnect at AT s.", extra={"metavar": "AT", "option": "disconnect"}),
+    ] = None
+    hold: Annotated[int, Meta(ge=1, description="Tracker: measure only every n-th pose.")] = 1
+    hide: Annotated[
+        Span | None,
+        Meta(description="Tracker: its tool is out of sight for FOR s from AT s on.", extra={"metavar": "AT FOR"}),
+    ] = None
+    breathe_mm: Annotated[
+        float,
+        Meta(
+            ge=0.0,
+            le=100.0,
+            description="Tracker: a second tool, Reference (or station 2), fixed to a body that breathes by MM; the "
+            "first is Probe (or 1).",
+            extra={"metavar": "MM", "option": "breathe"},
+        ),
+    ] = 0.0
+
+
 SeatName = Annotated[
     str,
     Meta(

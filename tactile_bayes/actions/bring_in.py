@@ -9,7 +9,7 @@ from typing import Any, Final
 import click
 import numpy as np
 
-from tactile_bayes.actions.exam import describe_scan
+from tactile_bayes.actions.show import describe_scan
 from tactile_bayes.commands.options import refuse_same
 from tactile_bayes.declarations import Record, as_dict, names_of, replace
 from tactile_bayes.errors import EXIT_DONE, BadDataError, TactileBayesError, UsageError, one_line

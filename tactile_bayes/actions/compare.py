@@ -75,7 +75,7 @@ def compare_action(
         if page is not None:
             page.write(found.page_text(title=title, name=name))
         if figure is not None:
-            found.draw(figure, force=force)
+            found.plot(figure, force=force)
     finally:  # what was computed is not lost with the figure
         click.echo(text_of(report), nl=False)
     return found.exit_code

@@ -12,12 +12,13 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from threading import Thread
+from typing import Any
 
 import click
 import numpy as np
 
-from tactile_bayes.actions.exam import describe_scan
 from tactile_bayes.actions.record import record_action
+from tactile_bayes.actions.show import describe_scan
 from tactile_bayes.errors import BadDataError, DeviceError, UsageError
 from tactile_bayes.files.provenance import Provenance, hash_inputs
 from tactile_bayes.files.scan_mcap import read_scan, read_scan_report, read_truth, write_scan
@@ -43,18 +44,12 @@ def emulate_action(
     tcp: str | None,
     once: bool,
     speed: float,
-    drop: float,
-    corrupt: float,
-    stall: tuple[float, float] | None,
-    disconnect: float | None,
-    hold: int,
-    hide: tuple[float, float] | None,
-    breathe: float,
     seed: int,
+    **given: Any,
 ) -> None:
     """Serve a scan as a scan head or a tracker would send it, or as both, at its own rate, with faults on request."""
     roles = ("head", "tracker") if kind == "both" else (kind,)
-    faults = Faults(drop, corrupt, stall, disconnect, hold, hide, breathe)
+    faults = Faults(**given)
     stage, data = Stage(speed=speed), read_scan(scan)
     spoilt = faults.drop or faults.corrupt or faults.stall or faults.disconnect_s is not None
     if protocol == "ndi" and "tracker" in roles and (spoilt or once):

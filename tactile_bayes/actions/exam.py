@@ -1,40 +1,31 @@
-"""Demonstration, checks, exports and draws, as their commands do them."""
+"""`check`, `diagnose` and `demo`: a scan's arrangement, a posterior's draws, and the main steps on embedded data."""
 
 from __future__ import annotations
 
 import shlex
 import shutil
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import click
-import numpy as np
 
-from tactile_bayes.api.diagnosing import diagnosed
+from tactile_bayes.api.diagnosing import diagnose
 from tactile_bayes.commands import estimate
 from tactile_bayes.commands import trial as validate
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError, UsageError
-from tactile_bayes.exports.exam import read_exam
-from tactile_bayes.exports.identity import identity_of
-from tactile_bayes.exports.run import Outputs, export, refuse_untaken
 from tactile_bayes.files.atomic import refuse_existing, unwritable, write_bytes
 from tactile_bayes.files.documents import dump_json
 from tactile_bayes.files.estimate_json import StatedSize, read_stated_size
-from tactile_bayes.files.identify import describe
 from tactile_bayes.files.instrument_json import write_head
 from tactile_bayes.files.scan_mcap import read_scan, read_truth
-from tactile_bayes.files.size_json import SHIPPED, size_calibration_path
 from tactile_bayes.findings import finding_lines
-from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.arrangement import TOO_SHORT, check_scan
 from tactile_bayes.mapping.plausibility import scan_doubts
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.scans import Scan
-from tactile_bayes.terminal import padded, shown_columns
 
 # --- `check`: is a scan arranged as it is stated?
 
@@ -71,111 +62,6 @@ def check_action(
         )
 
 
-def describe_scan(scan: Scan) -> list[str]:
-    """Summary of a scan in a few lines."""
-    times, poses = scan.frames.time_s, scan.poses
-    span = float(times[-1] - times[0]) if len(times) else 0.0
-    calibration = scan.element_calibration
-    saturated = int((scan.frames.counts >= calibration.saturation_count).sum())
-    duplicates = int((np.diff(poses.time_s) == 0).sum())
-    marks = [] if scan.landmarks is None else [name.replace("_", " ") for name in scan.landmarks.points()]
-    return [
-        f"{len(times)} frames of {scan.head.shape[0]} x {scan.head.shape[1]} taxels in {span:.3f} s, {_rate(times)}",
-        f"{len(poses)} poses, {_rate(poses.time_s)}",
-        f"dropped frames {_dropped(times)}, dropped poses {_dropped(poses.time_s)}, "
-        f"duplicate pose stamps {duplicates}, saturated readings {saturated}",
-        f"landmarks: {' and '.join(', '.join(marks).rsplit(', ', 1)) or 'not touched'}",
-    ]
-
-
-def _rate(times: FloatArray) -> str:
-    steps = np.diff(times)
-    steps = steps[steps > 0]
-    return f"{1 / np.median(steps):.1f} Hz" if len(steps) else "no rate"
-
-
-def _dropped(times: FloatArray) -> int:
-    """Number of records missing, by the median period."""
-    steps = np.diff(times)
-    if not (steps > 0).any():
-        return 0
-    periods = np.rint(steps / np.median(steps[steps > 0]))
-    return int(np.clip(periods - 1, 0, None).sum())
-
-
-# --- `show`: describe a file.
-
-
-def show_action(file: Path, as_json: bool) -> None:
-    """Show what a file holds: schema, shape, units, quality, provenance."""
-    shipped = size_calibration_path(file.name) if str(file) in SHIPPED and not file.exists() else None
-    found = describe(shipped or file)
-    if as_json:
-        click.echo(dump_json(found), nl=False)
-        return
-    for line in (*shown(found), RESEARCH_USE):
-        click.echo(line)
-
-
-_MOST_NUMBERS = 30  #: Of a list that is shown whole.
-
-
-def shown(found: dict[str, Any], indent: str = "") -> Iterator[str]:
-    """Description of a file, one fact per line."""
-    width = max(map(shown_columns, found), default=0)
-    for name, value in found.items():
-        if isinstance(value, dict) and value:
-            yield f"{indent}{name}"
-            yield from shown(value, indent + "  ")
-        else:
-            yield f"{indent}{padded(name, width)}  {_plain(value)}"
-
-
-def _plain(value: Any) -> str:
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    if isinstance(value, float):
-        return f"{value:.6g}"
-    if isinstance(value, list) and np.size(value) > _MOST_NUMBERS:
-        return f"{np.size(value)} numbers, {np.min(value):.6g} to {np.max(value):.6g}"
-    if isinstance(value, list):
-        return ", ".join(_plain(item) for item in value) if value else "none"
-    if isinstance(value, dict):
-        return "none" if not value else "; ".join(f"{k} {_plain(v)}" for k, v in value.items())
-    return "none" if value is None else str(value)
-
-
-# --- `export`: write maps and estimates as the files that other systems take.
-
-
-def export_action(
-    *,
-    files: tuple[Path, ...],
-    to: Any,
-    output: Path | None,
-    worklist: Path | None,
-    patient_id_from_scan: bool,
-    dictionary: Path | None,
-    force: bool,
-    **identity: str | None,
-) -> None:
-    """Export maps and estimates as DICOM, FHIR, NRRD (3D Slicer) or CSV (REDCap)."""
-    given = {name: value for name, value in identity.items() if value}
-    refuse_untaken(to, given)
-    outputs = Outputs(output, dictionary, to=to, force=force)
-    outputs.check(files=bool(files))
-    exported = None
-    if files:
-        who = identity_of(worklist, given)
-        exported = export(map(read_exam, files), to=to, identity=who, id_from_scan=patient_id_from_scan)
-    for path in outputs.write(exported):
-        is_dictionary = path == dictionary
-        click.echo(f"{path}: {'data dictionary for REDCap' if is_dictionary else f'{path.stat().st_size} bytes'}")
-    for note in () if exported is None else exported.notes:
-        click.echo(f"note: {note}", err=True)
-    click.echo(RESEARCH_USE)
-
-
 # --- `diagnose`: how far the draws of a posterior can be trusted, as a table and as pictures.
 
 
@@ -185,9 +71,9 @@ def diagnose_action(
     """Check the draws of a posterior: R-hat, effective draws and Monte-Carlo errors of every size and width."""
     figures = {"rank": rank, "trace": trace, "corner": corner}  # ranks first: they may be refused
     asked = {kind: path for kind, path in figures.items() if path is not None}
-    found = diagnosed(posterior)
+    found = diagnose(posterior)
     for kind, path in asked.items():
-        found.draw(kind, path, force=force)
+        found.plot(kind, path, force=force)
     click.echo(dump_json(found.document) if as_json else found.text, nl=False)
 
 

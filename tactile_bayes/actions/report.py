@@ -1,4 +1,4 @@
-"""`report`: one page of an exam, to read and to print."""
+"""`report` and `export`: one page of an exam, and its files for other systems."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from tactile_bayes.api.reports import ExamFiles, exam_of_files
+from tactile_bayes.api.reports import ExamFiles, exam_of_files, export
 from tactile_bayes.commands.options import settings_of, typed_options
 from tactile_bayes.errors import UsageError
 from tactile_bayes.presets import RESEARCH_USE
@@ -41,4 +41,37 @@ def report_action(
     if exam.main.tactile_map is None:
         click.echo("note: without its map the page has no picture and no coverage; give MAP.nc too", err=True)
     click.echo(f"{output}: {headline(exam)}")
+    click.echo(RESEARCH_USE)
+
+
+# --- `export`: write maps and estimates as the files that other systems take.
+
+
+def export_action(
+    *,
+    files: tuple[Path, ...],
+    to: Any,
+    output: Path | None,
+    worklist: Path | None,
+    patient_id_from_scan: bool,
+    dictionary: Path | None,
+    force: bool,
+    **identity: str | None,
+) -> None:
+    """Export maps and estimates as DICOM, FHIR, NRRD (3D Slicer) or CSV (REDCap)."""
+    written = export(
+        files,
+        output,
+        to=to,
+        worklist=worklist,
+        patient_id_from_scan=patient_id_from_scan,
+        dictionary=dictionary,
+        force=force,
+        **{name: value for name, value in identity.items() if value},
+    )
+    for path in written.paths:
+        is_dictionary = path == dictionary
+        click.echo(f"{path}: {'data dictionary for REDCap' if is_dictionary else f'{path.stat().st_size} bytes'}")
+    for note in written.notes:
+        click.echo(f"note: {note}", err=True)
     click.echo(RESEARCH_USE)

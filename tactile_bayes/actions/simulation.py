@@ -10,7 +10,7 @@ from typing import Any
 import click
 import numpy as np
 
-from tactile_bayes.actions.exam import describe_scan
+from tactile_bayes.actions.show import describe_scan
 from tactile_bayes.batch import fault_lines, open_executor, run_batch
 from tactile_bayes.batch_store import open_unfinished, unfinished
 from tactile_bayes.declarations import as_dict, names_of

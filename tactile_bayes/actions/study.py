@@ -340,27 +340,17 @@ def compare_model_action(
     fidelities: tuple[str, ...],
     head: str | None,
     at: tuple[float, float] | None,
-    every: int,
-    cell_mm: float,
-    pressure_window_kpa: tuple[float, float],
-    latency_ms: float,
     figure: Path | None,
     as_json: bool,
     force: bool,
+    **options: Any,
 ) -> None:
     """Compare a scan's frames and map with a forward model of SCENE (section 2.3 of the paper)."""
     body = read_scene(scene)
     loaded = read_scan(scan)
     if at is None and not (body.solid_lumps or body.lumps):
         at = (0.0, 0.0)  # no lump to look for: the middle of the strokes
-    measured = measured_frames(
-        loaded,
-        every=every,
-        cell_mm=cell_mm,
-        pressure_window_kpa=pressure_window_kpa,
-        latency_ms=latency_ms,
-        place_mm=at,
-    )
+    measured = measured_frames(loaded, place_mm=at, **options)
     found = []
     for fidelity in dict.fromkeys(fidelities or (body.fidelity,)):
         warnings = [outside_range(one.d_mm, one.depth_ratio) for one in body.solid_lumps if fidelity == "empirical"]

@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 import inspect
+import os
 import re
 from collections.abc import Callable, Collection, Iterable, Sequence
 from functools import wraps
-from typing import Any, Final, ParamSpec, TypeVar
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, ParamSpec, TypeVar, overload
 
 import numpy as np
 
 from tactile_bayes.declarations import Record, default_of, names_of
 from tactile_bayes.errors import BY_OPTIONS, BadDataError, TactileBayesError, UsageError, meant
+from tactile_bayes.files.atomic import Format, check_suffix
+from tactile_bayes.files.tables import Sheet
+
+if TYPE_CHECKING:
+    import pandas
 
 _Given = ParamSpec("_Given")
 _Returned = TypeVar("_Returned")
@@ -102,3 +109,64 @@ def sequence_of(name: str, given: Any, what: str) -> Sequence[Any]:
 def plain(value: Any) -> Any:
     """A number of numpy's as one of Python's, which files and reports hold; anything else as it is."""
     return value.item() if isinstance(value, np.generic) else value
+
+
+# --- Paths as texts or `Path`, tables as files or DataFrames.
+
+PathLike = str | os.PathLike[str]
+
+
+@overload
+def path_of(given: PathLike) -> Path: ...
+
+
+@overload
+def path_of(given: None) -> None: ...
+
+
+def path_of(given: PathLike | None) -> Path | None:
+    """Convert to a path, with ``~`` as the home folder; None stays None.
+
+    Raises
+    ------
+    UsageError
+        When it is neither text nor a path.
+    """
+    if given is None:
+        return None
+    if not isinstance(given, str | os.PathLike):
+        raise UsageError(f"a path is wanted, not {type(given).__name__}; give it as text or pathlib.Path")
+    return Path(given).expanduser()
+
+
+def required_path(given: PathLike, name: str) -> Path:
+    """Convert to the path of an input.
+
+    Raises
+    ------
+    UsageError
+        As `path_of`, and when it is None.
+    """
+    if given is None:
+        raise UsageError(f"{name} is None; give the path of a file")
+    return path_of(given)
+
+
+def output_path(given: PathLike, written: Format) -> Path:
+    """Convert to the path of an output.
+
+    Raises
+    ------
+    UsageError
+        As `path_of`, and when it has the suffix of another format than the one written.
+    """
+    path = required_path(given, "the path")
+    check_suffix(path, written)
+    return path
+
+
+def table_of(given: PathLike | pandas.DataFrame, name: str) -> Path | Sheet:
+    """Return a path as it is, and a DataFrame as CSV text."""
+    if hasattr(given, "to_csv"):
+        return Sheet(Path(f"{name} (DataFrame)"), given.to_csv(index=False))
+    return required_path(given, name)

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from tactile_bayes.api.arguments import door, plain, takes
-from tactile_bayes.api.maps import PathLike, path_of, scan_given
+from tactile_bayes.api.arguments import PathLike, door, path_of, plain, takes
+from tactile_bayes.api.maps import scan_given
 from tactile_bayes.declarations import EXACT, replace, to_plain
 from tactile_bayes.errors import UsageError
 from tactile_bayes.files.array_map import read_array_map

@@ -6,8 +6,7 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from tactile_bayes.api.arguments import door, plain, takes
-from tactile_bayes.api.maps import PathLike, output_path, required_path, table_of
+from tactile_bayes.api.arguments import PathLike, door, output_path, plain, required_path, table_of, takes
 from tactile_bayes.api.repeatability import exams_in, learn_from_exams
 from tactile_bayes.api.site_correction import correct_size
 from tactile_bayes.api.size_calibration import Learned, is_population, learn_eq6, learn_population

@@ -10,25 +10,25 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tactile_bayes.api.arguments import door, plain, sequence_of, takes
+from tactile_bayes.api.arguments import PathLike, door, path_of, plain, sequence_of, takes
 from tactile_bayes.api.estimates import estimated, settings_of
-from tactile_bayes.api.maps import Map, PathLike, path_of
+from tactile_bayes.api.estimating import input_digests
+from tactile_bayes.api.maps import Map
 from tactile_bayes.api.pooled import common_calibration, one_mass, place_of
-from tactile_bayes.api.repeatability import check_repeatability, repeatability_digest
 from tactile_bayes.api.settings import GROWN_BY, Comparing, Settings, refuse_checkpoint, times_of
 from tactile_bayes.api.sized import Answer, SizeEstimate, size_priors
 from tactile_bayes.declarations import Record, as_dict, replace
 from tactile_bayes.errors import CANNOT_SHOW, EXIT_DONE, EXIT_NO_ESTIMATE, UsageError
 from tactile_bayes.files.comparison import CompareReport
-from tactile_bayes.files.provenance import Provenance, hash_inputs, repeated_scans, scans_of
+from tactile_bayes.files.provenance import Provenance, repeated_scans, scans_of
 from tactile_bayes.files.reports import centre_of
 from tactile_bayes.findings import Finding, Verdict, by_weight, finding_lines, verdict
 from tactile_bayes.inference.draws import Draws
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.presets import REGISTRATION_MM, RESEARCH_USE
 from tactile_bayes.report.compare import compare_report, compare_summary, compare_text
-from tactile_bayes.report.estimate_figures import draw_comparison
 from tactile_bayes.report.exam_words import Given
+from tactile_bayes.report.growth_figure import draw_comparison
 from tactile_bayes.report.growth_page import Course, DrawnMap, growth_page
 from tactile_bayes.report.pages import PageFiles
 from tactile_bayes.report.pooled import disagreement, fat_apart
@@ -168,11 +168,7 @@ class Comparison(Record, eq=False):
     @door
     def plot(self, path: PathLike | None = None, *, force: bool = False) -> Figure:
         """Draw the visits' maps, their difference and the change; with a path also write it."""
-        return self.draw(path_of(path), force=force)
-
-    def draw(self, path: Path | None, *, force: bool) -> Figure:
-        """The same for the command line, whose errors name options."""
-        return draw_comparison(self.compared, self.report, self._drawn(), path, force=force)
+        return draw_comparison(self.compared, self.report, self._drawn(), path_of(path), force=force)
 
     def _drawn(self) -> list[list[DrawnMap]]:
         maps = [[one.tactile_map for one in visit] for visit in self.visits]
@@ -210,8 +206,8 @@ def compare_answers(
     path, calibration = common_calibration(every, settings, names=named)
     for index, earlier in repeated_scans([_scans([one]) for one in every]).items():  # they are no two exams
         raise UsageError(f"{named[index]} and {named[earlier]} are of one scan; give one map of each scan")
-    digests = hash_inputs(**inputs, **({"size_calibration": path} if path else {})) | repeatability_digest(settings)
-    check_repeatability(settings, calibration, digests)
+    files = {**inputs, **({"size_calibration": path} if path else {})}
+    digests = input_digests(files, settings, calibration)
     compared = _compared(visits, calibration, settings, comparing)
     compared = replace(compared, findings=by_weight((*compared.findings, *_of_visits(visits))))
     scans = [scan for one in visits for scan in _scans(one)]

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tactile_bayes.api.arguments import door
-from tactile_bayes.api.maps import PathLike, path_of, required_path
+from tactile_bayes.api.arguments import PathLike, door, path_of, required_path
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import UsageError, check_choice
 from tactile_bayes.files.map_nc import PosteriorDraws, read_posterior
@@ -75,18 +74,14 @@ class Diagnosis(Record, eq=False):
             )
         return lines
 
-    def draw(self, kind: str, path: Path | None, *, force: bool = False) -> Figure:
-        """Draw one of the pictures of ``diagnose``; that of ranks compares chains, and needs several."""
-        if kind == "rank" and self.chains < 2:
-            raise UsageError(f"--rank compares chains and {self.path} has one; estimate with --method ensemble")
-        title = f"{named_exam(self.path.stem, self.posterior.scans)}, method {self.posterior.method}"
-        return _FIGURES[kind](self.posterior.draws, path, title=title, force=force)
-
     @door
     def plot(self, kind: str = "trace", path: PathLike | None = None, *, force: bool = False) -> Figure:
         """Draw the ``"trace"`` of the draws, their ``"rank"`` among all chains or the ``"corner"`` of all pairs."""
         check_choice("kind", kind, tuple(_FIGURES))
-        return self.draw(kind, path_of(path), force=force)
+        if kind == "rank" and self.chains < 2:
+            raise UsageError(f"--rank compares chains and {self.path} has one; estimate with --method ensemble")
+        title = f"{named_exam(self.path.stem, self.posterior.scans)}, method {self.posterior.method}"
+        return _FIGURES[kind](self.posterior.draws, path_of(path), title=title, force=force)
 
     def __repr__(self) -> str:
         worst = max((one.get("rhat", np.nan) for one in self.quantities.values()), default=np.nan)
@@ -111,11 +106,7 @@ def diagnose(posterior: PathLike) -> Diagnosis:
     BadDataError
         When the file holds no draws of this program.
     """
-    return diagnosed(required_path(posterior, "posterior"))
-
-
-def diagnosed(path: Path) -> Diagnosis:
-    """Read a posterior's file, and say how far its draws can be trusted."""
+    path = required_path(posterior, "posterior")
     found = read_posterior(path)
     shown = {name: found.draws[name] for name in _QUANTITIES if name in found.draws}
     figures = {name: {"median": float(np.nanmedian(draws))} for name, draws in shown.items()}

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from tactile_bayes.api.arguments import door, plain, sequence_of, takes
+from tactile_bayes.api.arguments import door, path_of, plain, sequence_of, takes
 from tactile_bayes.api.estimating import estimate_one
-from tactile_bayes.api.maps import Map, map_of, path_of
+from tactile_bayes.api.maps import Map, map_of
 from tactile_bayes.api.pooled import PooledSize, pool_estimates
 from tactile_bayes.api.settings import Settings, refuse_checkpoint
 from tactile_bayes.api.sized import SizeEstimate

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 
-from tactile_bayes.api.repeatability import check_repeatability, repeatability_digest
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.api.sized import Answer, SizeEstimate, size_priors
 from tactile_bayes.declarations import Record, names_of, replace
@@ -75,6 +74,31 @@ def estimate_file(
     return replace(found, name=path.stem)
 
 
+def input_digests(files: Mapping[str, Path], settings: Settings, calibration: Calibration | None) -> dict[str, str]:
+    """Digests of an estimate's inputs by role, with that of the site's repeatability where there is one.
+
+    Raises
+    ------
+    BadDataError
+        When the repeatability is of sizes by another calibration: another form has another slope, so another spread.
+    """
+    digests, found = hash_inputs(**files), settings.repeatability
+    if found is None:
+        return digests
+    if found.sha256:
+        digests["repeatability"] = found.sha256
+    if calibration is None or digests.get("size_calibration") == found.calibration_sha256:
+        return digests
+    normalise = calibration.recipe.normalise
+    by = f"{found.calibration} (frames normalised by {found.normalise})"
+    this = f"{settings.calibration_name or default_for(normalise)} (frames normalised by {normalise})"
+    another = "another version of " if this == by else ""
+    raise BadDataError(
+        f"the repeatability is of sizes by {by}, and this size is by {another}{this}",
+        way_out="learn one from exams that were sized so: `calibrate repeatability`; or leave --repeatability out",
+    )
+
+
 def estimate_one(
     tactile_map: TactileMap,
     settings: Settings,
@@ -97,9 +121,8 @@ def estimate_one(
         notice(line)
     files = {**(inputs or {}), **({"size_calibration": source} if source else {})}
     files |= {"settings": settings.settings_file} if settings.settings_file else {}
-    digests = hash_inputs(**files) | repeatability_digest(settings)
+    digests = input_digests(files, settings, calibration)
     if calibration is not None:
-        check_repeatability(settings, calibration, digests)
         calibration = calibration_for(tactile_map, calibration)
     if settings.checkpoint is not None:
         context = digests.get("size_calibration", "no calibration")

@@ -2,25 +2,23 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, overload
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tactile_bayes.api.arguments import door, plain, takes
+from tactile_bayes.api.arguments import PathLike, door, output_path, path_of, plain, required_path, takes
 from tactile_bayes.declarations import EXACT, Record, as_dict, to_plain
 from tactile_bayes.errors import UsageError, check_number
 from tactile_bayes.files.arrays_layout import GridOptions
-from tactile_bayes.files.atomic import Format, check_suffix, sha256
+from tactile_bayes.files.atomic import sha256
 from tactile_bayes.files.grid_files import GRID_SUFFIXES, Grid
 from tactile_bayes.files.grids import grid_map, import_grid
 from tactile_bayes.files.map_nc import read_map_and_scans, write_map
 from tactile_bayes.files.provenance import Provenance, repeated_scans, scan_facts
 from tactile_bayes.files.scene_toml import read_scene, scene_of
-from tactile_bayes.files.tables import Sheet
 from tactile_bayes.findings import Finding, finding_lines
 from tactile_bayes.forward.instrument import SimulatedScan
 from tactile_bayes.geometry import FloatArray
@@ -37,67 +35,6 @@ from tactile_bayes.scans import Scan
 if TYPE_CHECKING:
     import pandas
     from matplotlib.figure import Figure
-
-
-# --- Conversion of paths that Python callers give as str or Path.
-
-PathLike = str | os.PathLike[str]
-
-
-@overload
-def path_of(given: PathLike) -> Path: ...
-
-
-@overload
-def path_of(given: None) -> None: ...
-
-
-def path_of(given: PathLike | None) -> Path | None:
-    """Convert to a path, with ``~`` as the home folder; None stays None.
-
-    Raises
-    ------
-    UsageError
-        When it is neither text nor a path.
-    """
-    if given is None:
-        return None
-    if not isinstance(given, str | os.PathLike):
-        raise UsageError(f"a path is wanted, not {type(given).__name__}; give it as text or pathlib.Path")
-    return Path(given).expanduser()
-
-
-def required_path(given: PathLike, name: str) -> Path:
-    """Convert to the path of an input.
-
-    Raises
-    ------
-    UsageError
-        As `path_of`, and when it is None.
-    """
-    if given is None:
-        raise UsageError(f"{name} is None; give the path of a file")
-    return path_of(given)
-
-
-def output_path(given: PathLike, written: Format) -> Path:
-    """Convert to the path of an output.
-
-    Raises
-    ------
-    UsageError
-        As `path_of`, and when it has the suffix of another format than the one written.
-    """
-    path = required_path(given, "the path")
-    check_suffix(path, written)
-    return path
-
-
-def table_of(given: PathLike | pandas.DataFrame, name: str) -> Path | Sheet:
-    """Return a path as it is, and a DataFrame as CSV text."""
-    if hasattr(given, "to_csv"):
-        return Sheet(Path(f"{name} (DataFrame)"), given.to_csv(index=False))
-    return required_path(given, name)
 
 
 # --- The provenance of a map of scan files.

@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tactile_bayes.api.arguments import door, plain, sequence_of, takes
-from tactile_bayes.api.maps import PathLike, table_of
+from tactile_bayes.api.arguments import PathLike, door, plain, sequence_of, table_of, takes
 from tactile_bayes.api.trials import load_trial
 from tactile_bayes.batch import open_executor, run_batch
 from tactile_bayes.declarations import EXACT, Record, as_dict, names_of, to_plain

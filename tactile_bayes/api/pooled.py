@@ -9,16 +9,14 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from tactile_bayes.api.arguments import door
-from tactile_bayes.api.estimating import estimated_at
-from tactile_bayes.api.maps import PathLike, path_of
-from tactile_bayes.api.repeatability import check_repeatability, repeatability_digest
+from tactile_bayes.api.arguments import PathLike, door, path_of
+from tactile_bayes.api.estimating import estimated_at, input_digests
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.api.sized import Answer, SizedExam, SizeEstimate, check_one_mass, size_priors
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import CANNOT_SHOW, BadDataError, UsageError
 from tactile_bayes.files.map_nc import write_pooled
-from tactile_bayes.files.provenance import Provenance, hash_inputs, scans_of
+from tactile_bayes.files.provenance import Provenance, scans_of
 from tactile_bayes.files.reports import EstimateReport, PooledReport
 from tactile_bayes.files.size_json import default_for, read_size_calibration, size_calibration_path
 from tactile_bayes.findings import Finding
@@ -244,8 +242,8 @@ def pool_answers(
     scans = [scan for report in reports for scan in scans_of(report.provenance)]
     check_one_mass(scans)
     path, calibration = common_calibration(answers, settings, names=names)
-    digests = hash_inputs(**inputs, **({"size_calibration": path} if path else {})) | repeatability_digest(settings)
-    check_repeatability(settings, calibration, digests)
+    files = {**inputs, **({"size_calibration": path} if path else {})}
+    digests = input_digests(files, settings, calibration)
     # the maps' values in sorted order are part of the seed: their order on the command line leaves no trace
     words = sorted(answer.fingerprint for answer in answers)
     places = [place for one in answers if one.shape is not None and (place := place_of(one.report)) is not None]

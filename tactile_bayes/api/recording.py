@@ -6,8 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from tactile_bayes.actions.record import Request, make_recording
-from tactile_bayes.api.arguments import door, plain, takes
-from tactile_bayes.api.maps import PathLike, path_of
+from tactile_bayes.api.arguments import PathLike, door, path_of, plain, takes
 from tactile_bayes.errors import DeviceError, check_number
 from tactile_bayes.hardware.recorder import Report
 from tactile_bayes.laboratory_options import RecordOptions

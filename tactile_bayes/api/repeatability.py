@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
-from tactile_bayes.api.settings import Settings
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.atomic import sha256
@@ -22,7 +21,6 @@ from tactile_bayes.files.size_json import (
     SHIPPED,
     HalfWidth,
     RepeatedMass,
-    default_for,
     read_size_calibration,
     repeatability_document,
     size_calibration_path,
@@ -33,11 +31,10 @@ from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.inference.points import normal_quantile
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.learn.site import FEWEST_MASSES, PRIOR_LOG_SD, PRIOR_MEDIAN, RepeatedExams, learn_repeatability
-from tactile_bayes.size.pooling import Calibration, Repeatability, log_size_alone
+from tactile_bayes.size.pooling import Repeatability, log_size_alone
 
 COMMAND: Final = "calibrate repeatability"
 _AGAIN: Final = "run the campaign again"
-_LEARN: Final = "learn one from exams that were sized so: `calibrate repeatability`; or leave --repeatability out"
 
 
 class ExamFolder(Record):
@@ -234,30 +231,3 @@ def _half_widths(repeats: Sequence[_Repeat], sd: float) -> dict[str, float]:
         after.append(max(variance - spread**2, 0.0) + sd**2)
     names = {"as_estimated": before, "with_it": after}
     return {name: math.expm1(1.96 * float(np.median(np.sqrt(values)))) for name, values in names.items()}
-
-
-def repeatability_digest(settings: Settings) -> dict[str, str]:
-    """Digest of the repeatability's file, as an input of the provenance; empty where there is none."""
-    found = settings.repeatability
-    return {} if found is None or not found.sha256 else {"repeatability": found.sha256}
-
-
-def repeatability_setting(settings: Settings) -> dict[str, Any]:
-    """The repeatability among the settings of a provenance; empty where there is none."""
-    found = settings.repeatability
-    return {} if found is None else {"repeatability": found.as_dict()}
-
-
-def check_repeatability(settings: Settings, calibration: Calibration, digests: Mapping[str, str]) -> None:
-    """Refuse a repeatability of sizes by another calibration: another form has another slope, so another spread.
-
-    `calibration`: the one that sizes; `digests`: of the inputs, by role.
-    """
-    found = settings.repeatability
-    if found is None or digests.get("size_calibration") == found.calibration_sha256:
-        return
-    normalise = calibration.recipe.normalise
-    by = f"{found.calibration} (frames normalised by {found.normalise})"
-    this = f"{settings.calibration_name or default_for(normalise)} (frames normalised by {normalise})"
-    another = "another version of " if this == by else ""
-    raise BadDataError(f"the repeatability is of sizes by {by}, and this size is by {another}{this}", way_out=_LEARN)

@@ -7,10 +7,10 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from tactile_bayes.api.arguments import door, takes
+from tactile_bayes.api.arguments import PathLike, door, path_of, takes
 from tactile_bayes.api.estimates import estimated, listed, settings_of
 from tactile_bayes.api.estimating import estimate_file
-from tactile_bayes.api.maps import Map, PathLike, path_of
+from tactile_bayes.api.maps import Map
 from tactile_bayes.api.pooled import PooledSize, pool_estimates
 from tactile_bayes.api.settings import Settings, refuse_checkpoint
 from tactile_bayes.api.sized import SizeEstimate

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tactile_bayes.api.arguments import door, in_keywords
-from tactile_bayes.api.maps import PathLike, output_path, path_of
+from tactile_bayes.api.arguments import PathLike, door, in_keywords, output_path, path_of
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import EXIT_DONE, EXIT_NO_ESTIMATE, BadDataError, UsageError
@@ -28,7 +27,6 @@ from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.estimate_document import estimate_report, patient_mm
 from tactile_bayes.report.estimate_figures import draw_fit, draw_map, draw_size
 from tactile_bayes.report.estimate_text import estimate_summary, estimate_text, exams_label
-from tactile_bayes.report.exam_page import exam_page
 from tactile_bayes.report.exam_words import Exam, ExamMap, Given, exam_map
 from tactile_bayes.report.figure_file import named_exam
 from tactile_bayes.report.pages import PageFiles
@@ -268,6 +266,8 @@ class SizedExam(Sized, eq=False, dict=True, kw_only=True):
         force: bool = False,
     ) -> None:
         """Write one page of the exam as HTML, repeat maps on it, and with `pdf` also print it; see `exam_report`."""
+        from tactile_bayes.report.exam_page import exam_page  # a plain estimate has no page
+
         page, given = PageFiles(path_of(path), path_of(pdf), force), Given(title, name, day)
         page.check()
         page.write(exam_page(given.on(self.exam())))

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tactile_bayes.api.arguments import door, plain, takes
-from tactile_bayes.api.maps import PathLike, path_of, table_of
+from tactile_bayes.api.arguments import PathLike, door, path_of, plain, table_of, takes
 from tactile_bayes.declarations import Record, as_dict, replace, to_plain
 from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.files.atomic import write_text

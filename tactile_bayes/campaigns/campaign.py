@@ -8,9 +8,8 @@ from html import escape
 from pathlib import Path
 from typing import Any, Final
 
-from tactile_bayes.api.arguments import door, plain, takes
+from tactile_bayes.api.arguments import PathLike, door, path_of, plain, required_path, takes
 from tactile_bayes.api.estimates import settings_of
-from tactile_bayes.api.maps import PathLike, path_of, required_path
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.batch import open_executor
 from tactile_bayes.campaigns.inputs import open_campaign, tidy

@@ -14,7 +14,7 @@ import numpy as np
 from tactile_bayes.api.comparing import compare_answers, drawn_maps
 from tactile_bayes.api.estimating import choose_calibration, estimate_file
 from tactile_bayes.api.pooled import pool_answers
-from tactile_bayes.api.repeatability import ExamFolder, learn_from_exams, repeatability_setting
+from tactile_bayes.api.repeatability import ExamFolder, learn_from_exams
 from tactile_bayes.api.settings import Comparing, Settings
 from tactile_bayes.api.sized import Answer, SizeEstimate, size_priors
 from tactile_bayes.campaigns.match import OWN_AXES, Match, in_own_axes, matched
@@ -56,10 +56,11 @@ from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.options import MapOptions
 from tactile_bayes.report.estimate_document import size_diagnostics
-from tactile_bayes.report.estimate_figures import draw_comparison, draw_map, draw_size
+from tactile_bayes.report.estimate_figures import draw_map, draw_size
 from tactile_bayes.report.exam_page import exam_page
 from tactile_bayes.report.exam_words import Exam as ShownExam
 from tactile_bayes.report.exam_words import exam_map
+from tactile_bayes.report.growth_figure import draw_comparison
 from tactile_bayes.report.growth_page import Course, growth_page
 from tactile_bayes.report.quantities import side_of
 from tactile_bayes.report.svg import thumbnail_svg
@@ -401,7 +402,8 @@ def _resized(report: EstimateReport, size: SizePosterior, settings: Settings) ->
     if not diagnostics["convergence"]:
         del diagnostics["convergence"]
     provenance = dict(report.provenance)
-    provenance["settings"] = {**provenance["settings"], **repeatability_setting(settings)}
+    if settings.repeatability is not None:
+        provenance["settings"] = {**provenance["settings"], "repeatability": settings.repeatability.as_dict()}
     provenance["inputs"] = [*provenance["inputs"], {"role": "repeatability", "sha256": found.sha256}]
     return replace(
         report,

@@ -8,7 +8,7 @@ import click
 
 from tactile_bayes.commands.options import FORCE, SPEED, FilePath, FiniteRange, command, live_options, output, takes
 from tactile_bayes.declarations import names_of
-from tactile_bayes.laboratory_options import RecordOptions
+from tactile_bayes.laboratory_options import FaultOptions, RecordOptions
 from tactile_bayes.presets import TrackerProtocol
 
 # --- `record`: a scan head and a tracker into a scan file.
@@ -37,7 +37,6 @@ def record_command() -> None:
 # --- `emulate`: serve a scan as a device would send it.
 
 PROTOCOLS = get_args(TrackerProtocol)
-_SHARE = FiniteRange(0.0, 1.0)
 
 
 @command("emulate", "devices.emulate_action")
@@ -56,32 +55,9 @@ _SHARE = FiniteRange(0.0, 1.0)
     "--once", is_flag=True, help="End when the scan has been sent and read. Default: wait for the next start."
 )
 @SPEED
-@click.option("--drop", type=_SHARE, default=0.0, help="Share of the records that are not sent.")
-@click.option("--corrupt", type=_SHARE, default=0.0, help="Share of the records with one bit changed.")
-@click.option(
-    "--stall",
-    type=(FiniteRange(min=0.0), FiniteRange(min=0.0)),
-    metavar="AT FOR",
-    help="Send nothing for FOR s from AT s on; those records are lost.",
-)
-@click.option("--disconnect", type=FiniteRange(min=0.0), metavar="AT", help="Disconnect at AT s.")
-@click.option(
-    "--hold", type=click.IntRange(min=1), default=1, show_default=True, help="Tracker: measure only every n-th pose."
-)
-@click.option(
-    "--hide",
-    type=(FiniteRange(min=0.0), FiniteRange(min=0.0)),
-    metavar="AT FOR",
-    help="Tracker: its tool is out of sight for FOR s from AT s on.",
-)
-@click.option(
-    "--breathe",
-    type=FiniteRange(0.0, 100.0),
-    default=0.0,
-    metavar="MM",
-    help="Tracker: a second tool, Reference (or station 2), fixed to a body that breathes by MM; the first is Probe "
-    "(or 1).",
-)
+@takes(FaultOptions, "drop", "corrupt", "stall", "disconnect_s", show_default=False)
+@takes(FaultOptions, "hold")
+@takes(FaultOptions, "hide", "breathe_mm", show_default=False)
 @click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Random seed of the faults.")
 def emulate_command() -> None:
     """Serve a scan as a scan head or a tracker would send it, or as both, at its own rate, with faults on request.

@@ -129,7 +129,7 @@ def check_command() -> None:
 # --- `show`: describe a file.
 
 
-@command("show", "exam.show_action")
+@command("show", "show.show_action")
 @click.argument("file", type=FilePath())
 @JSON
 def show_command() -> None:
@@ -147,7 +147,7 @@ def show_command() -> None:
 _FORMATS: Final = ("dicom", "fhir", "nrrd", "csv")
 
 
-@command("export", "exam.export_action")
+@command("export", "report.export_action")
 @click.argument("files", metavar="FILE...", nargs=-1, type=FilePath())
 @click.option("--to", required=True, type=click.Choice(_FORMATS), help="Format to write.")
 @click.option(

@@ -94,7 +94,7 @@ def campaign_command() -> None:
     """From a folder of exams to the trial's report, in one resumable run."""
 
 
-@command("init", "trial.campaign_init_action", within=campaign_command)
+@command("init", "campaign.campaign_init_action", within=campaign_command)
 @click.argument("folder", metavar="FOLDER", type=FilePath(addresses=True))
 @click.option(
     "-o",
@@ -126,7 +126,7 @@ def campaign_init_command() -> None:
     """
 
 
-@command("run", "trial.campaign_run_action", within=campaign_command)
+@command("run", "campaign.campaign_run_action", within=campaign_command)
 @click.argument("exams", metavar="EXAMS.csv", type=_FILE)
 @click.option("-o", "--output", required=True, metavar="DIR", type=_FILE, help="Folder for all files.")
 @takes(CampaignOptions, "excision", "columns", "protocol")

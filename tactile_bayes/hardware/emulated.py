@@ -11,7 +11,6 @@ from typing import Final
 
 import numpy as np
 
-from tactile_bayes.declarations import Record
 from tactile_bayes.geometry import FloatArray, rotation_from_quaternion
 from tactile_bayes.hardware import head
 from tactile_bayes.hardware.head import PacketParser
@@ -25,6 +24,7 @@ from tactile_bayes.hardware.readings import (
 )
 from tactile_bayes.hardware.serial_trackers import record_bytes
 from tactile_bayes.hardware.trackers import encode_transform
+from tactile_bayes.laboratory_options import FaultOptions
 from tactile_bayes.scans import Scan, TrackerPoses
 
 # --- Emulated devices: a scan's frames and poses as a head or a tracker sends them, with faults on request.
@@ -36,20 +36,8 @@ _NS: Final = 1_000_000_000
 _SETTING: Final = re.compile(rb"[A-Za-z][0-9*,][^\r]*\r")
 
 
-class Faults(Record):
-    """Faults of an emulated device."""
-
-    drop: float = 0.0
-    corrupt: float = 0.0
-    """`drop`, `corrupt`: Share of the records that are not sent, or sent with one bit changed."""
-    stall: tuple[float, float] | None = None
-    """From this time of the scan on, for this long, nothing is sent; what was measured then is lost. In s."""
-    disconnect_s: float | None = None  #: The cable is pulled at this time of the scan.
-    hold: int = 1  #: Only every n-th pose is measured anew, those between repeat it.
-    hide: tuple[float, float] | None = None
-    """From this time of the scan on, for this long, the tracker does not see its tool. In s."""
-    breathe_mm: float = 0.0
-    """A second tool is fixed to the body, which breathes by so much; both move with it."""
+class Faults(FaultOptions):
+    """Faults of an emulated device, and what they do to its records."""
 
     def stalls(self, time_s: float) -> bool:
         """True when the device sends nothing at a time of the scan."""

@@ -14,7 +14,7 @@ from campaign_files import FAST, JOURNAL, contents, rows_of, steps, thinned, wri
 from few_draws import few_draws  # noqa: F401 - all tests of this file use it
 from in_process import run_here
 
-from tactile_bayes.actions import trial as actions
+from tactile_bayes.actions import campaign as actions
 from tactile_bayes.campaigns import steps as campaign_steps
 
 MASSES, EXAMS = ("01", "02", "03", "04", "05"), (1, 2)

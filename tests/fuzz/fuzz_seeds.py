@@ -235,7 +235,7 @@ def _read_scan(path: Path) -> object:
 
 
 def _describe(path: Path) -> object:
-    from tactile_bayes.actions.exam import shown
+    from tactile_bayes.actions.show import shown
     from tactile_bayes.files.documents import dump_json
     from tactile_bayes.files.identify import describe
 
