@@ -48,7 +48,7 @@ def _plain(value: Any) -> str:
         return "yes" if value else "no"
     if isinstance(value, float):
         return f"{value:.6g}"
-    if isinstance(value, list) and np.size(value) > _MOST_NUMBERS:
+    if isinstance(value, list) and np.size(value) > _MOST_NUMBERS and np.asarray(value).dtype.kind in "if":
         return f"{np.size(value)} numbers, {np.min(value):.6g} to {np.max(value):.6g}"
     if isinstance(value, list):
         return ", ".join(_plain(item) for item in value) if value else "none"
