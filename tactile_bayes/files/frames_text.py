@@ -10,6 +10,7 @@ Layouts that are known by what stands in them:
 
 from __future__ import annotations
 
+import math
 import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -23,7 +24,7 @@ from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.arrays_layout import Stated
 from tactile_bayes.files.named_arrays import Source
 from tactile_bayes.files.poses_text import is_header_of_poses, kind_of_column
-from tactile_bayes.files.text_lines import NO_SENSEL, Line, TextTable, counts_up, number, read_text_table, unit_of_time
+from tactile_bayes.files.text_lines import NO_SENSEL, Line, counts_up, number, read_text_table, unit_of_time
 from tactile_bayes.geometry import FloatArray
 
 _UNITS: Final = {
@@ -57,64 +58,63 @@ _SAMPLED: Final = 50
 
 def read_frames(path: Path, given: Stated, *, shape: tuple[int, int] | None) -> Source:
     """Read frames and, where the text has them, times, unit and rate; `shape` is the head's, where it is known."""
-    table = _without_words(read_text_table(path, given.decimal))
+    table = read_text_table(path, given.decimal)
+    lines = _without_words(table.lines)
     shape = given.frame_shape or shape
-    if header := next(
-        (line for line in table.lines if is_header_of_poses(line) and len(line.fields) < _MOST_OF_POSES), None
-    ):
+    if header := next((line for line in lines if is_header_of_poses(line) and len(line.fields) < _MOST_OF_POSES), None):
         what = f"is a table of poses by line {header.number}"
         raise BadDataError(what, way_out="give the frames, and it as --poses")
-    blocks = _blocks(table, None if shape is None else shape[0] * shape[1])
+    blocks = _blocks(lines, None if shape is None else shape[0] * shape[1])
     if beside := sum(one == NO_SENSEL for line in blocks[0] for one in line.fields):
         cells = f"{beside} cells {NO_SENSEL!r} from line {blocks[0][0].number} on"
         what = f"has {cells}, which Tekscan writes beside a sensor"
         raise BadDataError(what, way_out="export the rows and columns without them, and give a head of these")
-    before = [line for line in table.lines if line.number < blocks[0][0].number]
+    before = [line for line in lines if line.number < blocks[0][0].number]
     stated, told = _said(before)
     notes = [f"frames: {table.words}", *told]
     if len(blocks) > 1 and len(blocks[0]) > 1:
-        return _of_blocks(table, blocks, stated, notes)
+        return _of_blocks(lines, blocks, stated, notes)
     rows = [line for block in blocks for line in block]
     names = before[-1].fields if before and len(before[-1].fields) == len(rows[0].fields) else []
-    return _of_rows(table, rows, names, shape, given, stated, notes)
+    return _of_rows(rows, names, shape, given, stated, notes)
 
 
-def _without_words(table: TextTable) -> TextTable:
-    """The table without the words in its columns of words, such as a status beside the readings."""
-    lines = [line for line in table.lines if len(line.fields) > 1]
-    width = max(Counter(len(line.fields) for line in lines).items(), key=lambda one: one[0] * one[1], default=(0, 0))[0]
-    held = [line for line in lines if len(line.fields) == width]
+def _without_words(lines: Sequence[Line]) -> Sequence[Line]:
+    """The lines without the words in their columns of words, such as a status beside the readings."""
+    several = [line for line in lines if len(line.fields) > 1]
+    widths = Counter(len(line.fields) for line in several)
+    width = max(widths.items(), key=lambda one: one[0] * one[1], default=(0, 0))[0]
+    held = [line for line in several if len(line.fields) == width]
     sample = held[:: max(1, len(held) // _SAMPLED)]
-    words = [i for i in range(width) if 2 * sum(table.numbers([one.fields[i]]) is None for one in sample) > len(sample)]
+    words = [i for i in range(width) if 2 * sum(one.values[i] is None for one in sample) > len(sample)]
     if not words or 2 * len(words) > width:
-        return table
+        return lines
 
     def blanked(line: Line) -> Line:
-        fields = ["" if i in words else one for i, one in enumerate(line.fields)]
-        return line if len(fields) != width or table.numbers(fields) is None else replace(line, fields=fields)
+        values = [math.nan if i in words else one for i, one in enumerate(line.values)]
+        return line if len(values) != width or None in values else replace(line, values=values)
 
-    return replace(table, lines=[blanked(line) for line in table.lines])
+    return [blanked(line) for line in lines]
 
 
-def _blocks(table: TextTable, taxels: int | None) -> list[list[Line]]:
+def _blocks(lines: Sequence[Line], taxels: int | None) -> list[list[Line]]:
     """Runs of lines of numbers, of which each has as many as the last: the longest of the text's widths.
 
     Lines of numbers of another width that come first belong to what stands before.
     """
-    several = [line.fields for line in table.lines if len(line.fields) > 1]
-    widths = [len(fields) for fields in several if table.numbers(fields) is not None]
+    widths = [len(line.fields) for line in lines if len(line.fields) > 1 and line.is_numbers]
     if not widths:
         raise BadDataError("holds no row of numbers", way_out="give one row a frame, or blocks of rows")
     width = max(set(widths), key=lambda one: (widths.count(one) * one, one))
     blocks: list[list[Line]] = []
     open_block = False
-    for line in table.lines:
-        held = len(line.fields) == width and table.numbers(line.fields) is not None
+    for line in lines:
+        held = len(line.fields) == width and line.is_numbers
         if held and open_block and not line.after_blank:
             blocks[-1].append(line)
         elif held:
             blocks.append([line])
-        elif blocks and (held_too := _like_a_row(table, line, width)):
+        elif blocks and (held_too := _like_a_row(line, width)):
             what = f"line {line.number} holds {held_too}, the others {width} numbers"
             raise BadDataError(what, way_out="give every row one length, numbers alone")
         open_block = held
@@ -128,11 +128,11 @@ def _blocks(table: TextTable, taxels: int | None) -> list[list[Line]]:
     return blocks if len(lengths) == 1 else [[line for block in blocks for line in block]]
 
 
-def _like_a_row(table: TextTable, line: Line, width: int) -> str:
+def _like_a_row(line: Line, width: int) -> str:
     """What a line holds that looks like one of the table, and is not; empty for a title and for other lines."""
     if len(line.fields) < 2 or line.text.lstrip('" ').lower().startswith(("frame", "time", "@@")):
         return ""
-    odd = [one for one in line.fields if table.numbers([one]) is None]
+    odd = [field for field, value in zip(line.fields, line.values, strict=True) if value is None]
     if odd and len(line.fields) < width - 1:
         return ""
     return repr(odd[0][:30]) if odd else f"{len(line.fields)} numbers"
@@ -167,11 +167,11 @@ def _said_in(text: str) -> Iterable[tuple[str, Any]]:
             yield option, made(value)
 
 
-def _of_blocks(table: TextTable, blocks: Sequence[Sequence[Line]], stated: Stated, notes: list[str]) -> Source:
-    frames = np.array([[table.numbers(line.fields) for line in block] for block in blocks])
+def _of_blocks(lines: Sequence[Line], blocks: Sequence[Sequence[Line]], stated: Stated, notes: list[str]) -> Source:
+    frames = np.array([[line.values for line in block] for block in blocks], dtype=np.float64)
     arrays = {"frames": frames}
     first = blocks[0][0].number
-    titles = [line for line in table.lines if line.fields and table.numbers(line.fields) is None]
+    titles = [line for line in lines if not line.is_numbers]
     times = _times_between(titles, [block[0].number for block in blocks])
     if times is not None:
         arrays["frame_time_s"] = times
@@ -197,7 +197,6 @@ def _times_between(titles: Sequence[Line], starts: Sequence[int]) -> FloatArray 
 
 
 def _of_rows(
-    table: TextTable,
     rows: Sequence[Line],
     names: Sequence[str],
     shape: tuple[int, int] | None,
@@ -205,7 +204,7 @@ def _of_rows(
     stated: Stated,
     notes: list[str],
 ) -> Source:
-    values = np.array([table.numbers(line.fields) for line in rows])
+    values = np.array([line.values for line in rows], dtype=np.float64)
     if counts_up(values[0][np.isfinite(values[0])]) and len(rows) > 1:
         notes.append(f"line {rows[0].number} counts {values[0, -2]:g}, {values[0, -1]:g}: taken for labels")
         values = values[1:]

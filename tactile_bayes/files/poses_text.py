@@ -144,9 +144,9 @@ def _named(table: TextTable, header: Line, given: Stated) -> Source:
         raise BadDataError(f"line {header.number} names its rotations ({layout})", way_out="leave --pose-layout out")
     rows = [line for line in table.lines if line.number > header.number]
     columns, rows = _of_one_tool(kinds, rows, names, given)
-    numbers = np.column_stack([_values(table, rows, columns[name]) for name in names])
+    numbers = np.column_stack([_values(rows, columns[name]) for name in names])
     status = [_field(line, columns["status"]) for line in rows] if "status" in columns else [""] * len(rows)
-    time, unit = _times(table, rows, columns, header, given)
+    time, unit = _times(rows, columns, header, given)
     stated: dict[str, Any] = {"pose_time_unit": unit} if unit else {}
     above = [line.text for line in table.lines if line.number < header.number]
     lengths = [_UNIT.search(header.fields[columns["x"]].strip()), *map(_LENGTH_LINE.search, above)]
@@ -190,10 +190,9 @@ def _field(line: Line, column: int) -> str:
     return line.fields[column] if column < len(line.fields) else ""
 
 
-def _values(table: TextTable, rows: Sequence[Line], column: int) -> FloatArray:
+def _values(rows: Sequence[Line], column: int) -> FloatArray:
     """Numbers of a column, NaN where there is none."""
-    found = (table.numbers([_field(line, column)]) for line in rows)
-    return np.array([np.nan if one is None else one[0] for one in found])
+    return np.array([line.values[column] if column < len(line.values) else None for line in rows], dtype=np.float64)
 
 
 def _unseen(status: Sequence[str], given: Stated) -> list[str]:
@@ -208,11 +207,9 @@ def _unseen(status: Sequence[str], given: Stated) -> list[str]:
     return ["" if value.lower() in good else f"with status {value or 'blank'}" for value in status]
 
 
-def _times(
-    table: TextTable, rows: Sequence[Line], columns: Mapping[str, int], header: Line, given: Stated
-) -> tuple[FloatArray, str]:
+def _times(rows: Sequence[Line], columns: Mapping[str, int], header: Line, given: Stated) -> tuple[FloatArray, str]:
     """Times of all rows and their unit where the header says it."""
-    held = {name: _values(table, rows, column) for name, column in columns.items() if name in _TIMES}
+    held = {name: _values(rows, column) for name, column in columns.items() if name in _TIMES}
     if "time" in held:
         return _settled(held["time"]), unit_of_time(header.fields[columns["time"]])
     if "seconds" in held:
@@ -240,9 +237,9 @@ def _settled(values: FloatArray) -> FloatArray:
 
 
 def _bare(table: TextTable, given: Stated) -> Source:
-    rows = [line for line in table.lines if table.numbers(line.fields) is not None and len(line.fields) > 1]
+    rows = [line for line in table.lines if line.is_numbers and len(line.fields) > 1]
     width = max(Counter(len(line.fields) for line in rows).items(), key=lambda one: one[1])[0] if rows else 0
-    values = np.array([table.numbers(line.fields) for line in rows if len(line.fields) == width])
+    values = np.array([line.values for line in rows if len(line.fields) == width], dtype=np.float64)
     if width > _MOST_NUMBERS:
         raise BadDataError(f"has {width} numbers a row, which is no pose", way_out="give a table of poses")
     layout = given.pose_layout

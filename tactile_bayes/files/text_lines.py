@@ -40,27 +40,20 @@ class Line(Record):
     number: int  #: From 1.
     text: str
     fields: list[str]
-    after_blank: bool = False  #: A blank line stands before it.
+    values: list[float | None]  #: The number of each field, NaN for no value; None where it is anything else.
+    after_blank: bool  #: A blank line stands before it.
+
+    @property
+    def is_numbers(self) -> bool:
+        """Whether each of its fields is a number or no value."""
+        return None not in self.values
 
 
 class TextTable(Record):
     """A text in lines and fields."""
 
     lines: list[Line]
-    separator: str
-    decimal_comma: bool
-
-    @property
-    def words(self) -> str:
-        """How its fields are separated, in words."""
-        return f"fields between {_SEPARATORS[self.separator]}{', decimal commas' if self.decimal_comma else ''}"
-
-    def numbers(self, fields: Sequence[str]) -> list[float] | None:
-        """Numbers of a line's fields, NaN where one has no value; None where one is anything else."""
-        try:
-            return [number(one, decimal_comma=self.decimal_comma) for one in fields]
-        except ValueError:
-            return None
+    words: str  #: How its fields are separated.
 
 
 def number(text: str, *, decimal_comma: bool = False) -> float:
@@ -99,18 +92,30 @@ def read_text_table(path: Path, decimal: str | None = None) -> TextTable:
     separator = separator_of(texts)
     if not separator:
         raise BadDataError("holds no table of numbers", way_out="give one frame or pose a line", path=str(path))
-    lines, before = [], 0
+    split, before = [], 0
     for i, one in enumerate(texts, start=1):
         if one.strip():
             fields = fields_of(one, separator)
             while len(fields) > 1 and not fields[-1]:
                 fields.pop()
-            lines.append(Line(i, one, fields, after_blank=i > before + 1))
+            split.append((i, one, fields, i > before + 1))
             before = i
-    commas = with_comma(line.fields for line in lines)
+    commas = with_comma(fields for _, _, fields, _ in split)
     if decimal is None:
         refuse_thousands(commas, way_out="state which, --decimal comma")
-    return TextTable(lines, separator, decimal != "point" and bool(commas))
+    comma = decimal != "point" and bool(commas)
+    lines = [
+        Line(i, text, fields, [_value(one, decimal_comma=comma) for one in fields], after)
+        for i, text, fields, after in split
+    ]
+    return TextTable(lines, f"fields between {_SEPARATORS[separator]}{', decimal commas' if comma else ''}")
+
+
+def _value(text: str, *, decimal_comma: bool) -> float | None:
+    try:
+        return number(text, decimal_comma=decimal_comma)
+    except ValueError:
+        return None
 
 
 def separator_of(texts: Sequence[str], marks: Sequence[str] = ()) -> str:
@@ -136,10 +141,7 @@ def _of_numbers(fields: Sequence[str], marks: Sequence[str]) -> bool:
 
 
 def _is_number(text: str, marks: Sequence[str]) -> bool:
-    try:
-        return text in marks or may_be_thousands(text) or number(text, decimal_comma=True) is not None
-    except ValueError:
-        return False
+    return text in marks or may_be_thousands(text) or _value(text, decimal_comma=True) is not None
 
 
 def fields_of(text: str, separator: str) -> list[str]:
