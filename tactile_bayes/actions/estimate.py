@@ -23,7 +23,7 @@ from tactile_bayes.errors import EXIT_DONE, EXIT_FAULT, EXIT_NO_ESTIMATE, UsageE
 from tactile_bayes.files.atomic import given_twice
 from tactile_bayes.files.documents import dump_json
 from tactile_bayes.files.reports import json_text
-from tactile_bayes.report.estimate_figures import draw_figures, draw_size
+from tactile_bayes.report.estimate_figures import draw_size
 from tactile_bayes.report.figure_file import named_exam
 from tactile_bayes.report.pooled import pooled_summary, pooled_text
 from tactile_bayes.shell import progress_bar
@@ -123,9 +123,10 @@ def estimate_action(
     try:
         if found is not None and output and found.status == "estimate":
             found.write(output, force=force)
-        if found is not None and any(outputs[1:]):
-            name, share = named_exam(found.name, found.provenance.scans), found.probability
-            draw_figures(found.tactile_map, found.estimate, *outputs[1:], name=name, probability=share, force=force)
+        if found is not None and found.tactile_map.covered.any():  # one without data cannot be drawn
+            for path, draw in zip(outputs[1:], (found.plot, found.plot_map, found.plot_fit), strict=True):
+                if path is not None:
+                    draw(path, force=force)
     finally:  # what was computed is not lost with a file
         if verbose:
             print(f"estimate: {time.perf_counter() - begun:.3f} s", file=sys.stderr)

@@ -30,7 +30,7 @@ from tactile_bayes.report.estimate_text import estimate_summary, estimate_text, 
 from tactile_bayes.report.exam_words import Exam, ExamMap, Given, exam_map
 from tactile_bayes.report.figure_file import named_exam
 from tactile_bayes.report.pages import PageFiles
-from tactile_bayes.report.quantities import estimate_quantities, leading_size, lump_place, side_of
+from tactile_bayes.report.quantities import leading_size, side_of
 from tactile_bayes.scans import HeadShape
 from tactile_bayes.size.draws import EXTREMES, SIZES, ShapeDraws, SizePosterior
 from tactile_bayes.size.fat import BetweenMaps, head_profile
@@ -379,26 +379,16 @@ class SizeEstimate(SizedExam, eq=False, dict=True, kw_only=True):
     def answer(self) -> Answer:
         """The report: `document` is what ``estimate --json`` prints, `text` what it prints for people."""
         tactile_map, estimate, settings = self.tactile_map, self.estimate, self.settings
-        quantities = estimate_quantities(estimate, tactile_map, probability=settings.interval)
-        place = lump_place(estimate.map_posterior, tactile_map, self.provenance.scans)
-        report = estimate_report(
-            estimate,
-            tactile_map,
-            probability=settings.interval,
-            prior=settings.prior,
-            provenance=self.provenance,
-            quantities=quantities,
-            place=place,
-        )
-        told: dict[str, Any] = {"probability": settings.interval, "masses": report.masses, "place": place}
+        prior, provenance, probability = settings.prior, self.provenance, settings.interval
+        report = estimate_report(estimate, tactile_map, probability=probability, prior=prior, provenance=provenance)
         return Answer(
             report,
-            text=estimate_summary(estimate, quantities, **told),
+            text=estimate_summary(estimate, report),
             exit_code=EXIT_DONE if self.status == "estimate" else EXIT_NO_ESTIMATE,
             shape=pooling_shape(tactile_map, estimate),
             normalise=tactile_map.recipe.normalise,
             fingerprint=tactile_map.fingerprint,
-            full_text=estimate_text(estimate, tactile_map, prior=settings.prior, quantities=quantities, **told),
+            full_text=estimate_text(estimate, report),
             head=tactile_map.head,
         )
 
@@ -431,7 +421,9 @@ class SizeEstimate(SizedExam, eq=False, dict=True, kw_only=True):
     @door
     def plot_map(self, path: PathLike | None = None, *, force: bool = False) -> Figure:
         """Draw the map with the lump's ellipse and size, or with the places looked at."""
-        return draw_map(self.tactile_map, self.estimate, path_of(path), name=self._titled, force=force)
+        report = self.answer.report
+        assert report is not None
+        return draw_map(self.tactile_map, report, path_of(path), name=self._titled, force=force)
 
     @door
     def plot_fit(self, path: PathLike | None = None, *, force: bool = False) -> Figure:

@@ -219,10 +219,10 @@ def _estimated(folder: Path, settings: Settings, match: Match | None) -> SizeEst
 def make_figures(folder: Path, settings: Settings, match: Match | None) -> Made:
     """The figures of `estimate`; the estimate is made again, for it is not stored whole."""
     found = _estimated(folder, settings, match)
-    tactile_map, estimate = found.tactile_map, found.estimate
+    tactile_map, estimate, report = found.tactile_map, found.estimate, found.answer.report
     name, size, writes = folder.name, estimate.size, Writes()
-    if tactile_map.covered.any():
-        writes[MAP_FIGURE] = lambda path: draw_map(tactile_map, estimate, path, name=name, force=True)
+    if tactile_map.covered.any() and report is not None:
+        writes[MAP_FIGURE] = lambda path: draw_map(tactile_map, report, path, name=name, force=True)
     if size is not None:
         given: dict[str, Any] = {"probability": found.probability, "findings": estimate.findings}
         writes[SIZE_FIGURE] = lambda path: draw_size(size, path, name=name, force=True, **given)

@@ -27,7 +27,7 @@ from tactile_bayes.exports.exam import (
     required,
 )
 from tactile_bayes.exports.identity import Identity, Moment
-from tactile_bayes.files.reports import EstimateReport, centre_of
+from tactile_bayes.files.reports import EstimateReport
 from tactile_bayes.findings import finding_lines
 from tactile_bayes.geometry import FloatArray, apply
 from tactile_bayes.mapping.map import TactileMap
@@ -35,7 +35,7 @@ from tactile_bayes.mapping.places import orientation_of
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.estimate_text import no_estimate_line
 from tactile_bayes.report.figure_file import plain_matplotlib
-from tactile_bayes.report.map_figure import FitContour, Place, map_figure
+from tactile_bayes.report.map_figure import contour_of, map_figure, places_of
 
 # --- Place of a map in the coordinate system of DICOM and 3D Slicer: L, P, S in mm from the xiphoid.
 #
@@ -273,15 +273,14 @@ def map_picture(source: MapFile, estimate: EstimateFile | None) -> NDArray[np.ui
     """
     report = None if estimate is None or estimate.kind != "estimate" else estimate.report
     alone = report if isinstance(report, EstimateReport) else None
-    looked_at = () if alone is None else alone.candidates
     unsized = [] if estimate is None or estimate.sized else [one.reason for one in estimate.masses]
     side = source.facts.get("side")
     with plain_matplotlib() as library:
         figure = map_figure(
             source.tactile_map,
             None,
-            fit=None if alone is None else _contour(alone),
-            looked_at=[Place((one.x_mm, one.y_mm), one.fault) for one in looked_at if one.fault],
+            fit=None if alone is None else contour_of(alone),
+            looked_at=() if alone is None else places_of(alone),
             title="Tactile map" + (f" of the {side} breast" if side in ("left", "right") else ""),
             note=no_estimate_line(unsized[0][:_MOST_NOTE]) if unsized else "",
             findings=None if estimate is None else estimate.report.findings,
@@ -290,17 +289,6 @@ def map_picture(source: MapFile, estimate: EstimateFile | None) -> NDArray[np.ui
         canvas.draw()
         pixels = np.asarray(canvas.buffer_rgba())
     return np.ascontiguousarray(pixels[:, :, :3])
-
-
-def _contour(report: EstimateReport) -> FitContour | None:
-    """Ellipse and size at the medians."""
-    centre, across, along = centre_of(report.centre_mm), report.sigma_x_mm, report.sigma_y_mm
-    level, height, d_x, d_y = report.background, report.amplitude, report.d_x_mm, report.d_y_mm
-    if centre is None or across is None or along is None or level is None or height is None:
-        return None
-    size = None if d_x is None or d_y is None else (d_x.median, d_y.median)
-    turn = 0.0 if report.angle_deg is None else report.angle_deg.median
-    return FitContour(centre, across.median, along.median, turn, size, level.median, height.median)
 
 
 # --- The map's figure as a DICOM Secondary Capture, which every viewer shows.

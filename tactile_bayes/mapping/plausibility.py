@@ -231,7 +231,7 @@ def _unlike(quality: Mapping[str, float], head: HeadShape | None) -> Iterator[tu
     """Sentence and remedy for each condition under which a map without a lump says nothing."""
     total, used = quality.get("frames_total", 0.0), quality.get("frames_used", 0.0)
     if total and (used < LEAST_FRAMES or used < LEAST_USED_SHARE * total):
-        why = [f"{quality[name]:.0f} {words}" for name, words in _WHY_NOT if quality.get(name)]
+        why = [f"{quality[name]:.0f} {words}" for name, words in WHY_NOT.items() if quality.get(name)]
         left_out = f" ({', '.join(why)})" if why else ""
         yield f"only {used:.0f} of {total:.0f} frames are used{left_out}", "press evenly, over the whole place"
     if "frame_rate_hz" in quality and not RATE_HZ[0] <= quality["frame_rate_hz"] <= RATE_HZ[1]:
@@ -269,12 +269,13 @@ def _unlike(quality: Mapping[str, float], head: HeadShape | None) -> Iterator[tu
 
 
 _ONE_TOOL: Final = "record one tool of the tracker (docs/trackers.md), or leave the other poses out"
-_WHY_NOT: Final = (
-    ("dropped_low", "pressed too lightly"),
-    ("dropped_high", "pressed too hard"),
-    ("dropped_no_pose", "without a tracker pose"),
-    ("dropped_elements", "with too few valid taxels"),
-)
+WHY_NOT: Final = {
+    "dropped_low": "pressed too lightly",
+    "dropped_high": "pressed too hard",
+    "dropped_no_pose": "without a tracker pose",
+    "dropped_elements": "with too few valid taxels",
+}
+"""Why frames are left out of a map, by the figure that counts them."""
 _CLOCKS: Final = ((1e3, "milliseconds"), (1e6, "microseconds"), (1e9, "nanoseconds"), (1 / 60, "minutes"))
 
 

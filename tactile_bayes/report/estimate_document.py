@@ -32,12 +32,11 @@ from tactile_bayes.findings import capital, verdict
 from tactile_bayes.geometry import FloatArray, apply
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.mapping.map import TactileMap
-from tactile_bayes.mapping.places import ClockPosition
 from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior.abstention import chance_text
 from tactile_bayes.posterior.field import LENGTHS_MM, SHARES
 from tactile_bayes.posterior.lump_probability import PROBABILITY, SmallestLumps
-from tactile_bayes.posterior.result import WIDER, Estimate, Mass, Sensitivity
+from tactile_bayes.posterior.result import WIDER, Estimate, Sensitivity
 from tactile_bayes.posterior.selection import SceneChoice, Structure
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.quantities import (
@@ -243,25 +242,21 @@ def _size(size: SizeInterval, places: int) -> str:
 # --- The masses of a map, and sentences on them.
 
 
-def mass_reports(
-    masses: Sequence[Mass],
+def _mass_reports(
+    estimate: Estimate,
     tactile_map: TactileMap,
+    quantities: Mapping[str, Quantity],
     *,
     probability: float,
-    quantities: Mapping[str, Quantity],
-    reason: str,
-    scans: Sequence[Mapping[str, str]] = (),
+    scans: Sequence[Mapping[str, str]],
 ) -> tuple[MassReport, ...]:
-    """A map's masses, numbered in their order.
-
-    `quantities` and `reason` are those of the reported mass; the `scans` at the beginning say which breast it is.
-    """
+    """A map's masses, numbered in their order; `quantities` are those of the reported mass."""
     found = []
-    for number, mass in enumerate(masses, start=1):
+    for number, mass in enumerate(estimate.masses, start=1):
         own = quantities if mass.reported else estimate_quantities(mass.estimate, tactile_map, probability=probability)
         place = lump_place(mass.estimate.map_posterior, tactile_map, scans)
         patient = patient_mm(tactile_map, mass.x_mm, mass.y_mm)
-        why = reason if mass.reported else mass.estimate.reason
+        why = estimate.reason if mass.reported else mass.estimate.reason
         found.append(
             MassReport(
                 number=number,
@@ -341,26 +336,17 @@ def estimate_report(
     probability: float,
     prior: BumpPrior,
     provenance: Provenance,
-    quantities: Mapping[str, Quantity] | None = None,
-    place: ClockPosition | None = None,
 ) -> EstimateReport:
-    """Report of one map; `quantities` if already summarised."""
-    if quantities is None:
-        quantities = estimate_quantities(estimate, tactile_map, probability=probability)
+    """Report of one map."""
+    quantities = estimate_quantities(estimate, tactile_map, probability=probability)
+    place = lump_place(estimate.map_posterior, tactile_map, provenance.scans)
 
     def point(name: str) -> Point | None:
         x, y = f"{name}.x", f"{name}.y"
         return Point(quantities[x].rounded, quantities[y].rounded) if x in quantities else None
 
     about, size, moved = estimate.about_mm, estimate.size, estimate.sensitivity
-    masses = mass_reports(
-        estimate.masses,
-        tactile_map,
-        probability=probability,
-        quantities=quantities,
-        reason=estimate.reason,
-        scans=provenance.scans,
-    )
+    masses = _mass_reports(estimate, tactile_map, quantities, probability=probability, scans=provenance.scans)
     return EstimateReport(
         schema=ESTIMATE,
         status=estimate.status,

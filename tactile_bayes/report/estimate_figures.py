@@ -8,16 +8,17 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from tactile_bayes.declarations import Record, replace
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError
+from tactile_bayes.files.reports import EstimateReport
 from tactile_bayes.findings import Finding
 from tactile_bayes.geometry import FloatArray
+from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.result import Estimate, FittedCells, fitted_cells
-from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.estimate_text import exams_label, no_estimate_line
-from tactile_bayes.report.figure_file import figure_file, load_matplotlib
-from tactile_bayes.report.map_figure import FitContour, NumberedMass, Place, draw_panel, map_figure
+from tactile_bayes.report.figure_file import figure_file, finish, load_matplotlib
+from tactile_bayes.report.map_figure import contour_of, draw_panel, map_figure, places_of
 from tactile_bayes.report.quantities import leading_size
 from tactile_bayes.size.draws import SizePosterior
 
@@ -37,40 +38,30 @@ _SHARED: Final = (
 _ALONE: Final = "Fit: level, slope and bump. Rest: noise, and what the model lacks."
 
 
-def fit_figure(
-    tactile_map: TactileMap,
-    fitted: FittedCells,
-    path: Path | None,
-    *,
-    title: str = "",
-    findings: Sequence[Finding] = (),
-    force: bool = False,
-) -> Figure:
-    """Draw data, fit and what is left of a fit window, data and fit in the same colours; see `figure_file`.
+def draw_fit(tactile_map: TactileMap, estimate: Estimate, path: Path | None, *, name: str, force: bool) -> Figure:
+    """Draw data, fit and what is left of the fit window, data and fit in the same colours; see `figure_file`.
 
-    `tactile_map`: the map that the window is of; `fitted`: the window's cells, see `fitted_cells`; `title`: above the
-    figure; nothing that identifies a person; `findings`: what speaks against the fit, told above it. What is left is
-    drawn in two parts where the noise is a field: what neighbouring cells share of it, and the rest.
+    What is left is drawn in two parts where the noise is a field: what neighbouring cells share of it, and the rest.
     """
+    fitted = fitted_cells(estimate)
+    assert fitted is not None
+    two = fitted.shared is not None
     given = [fitted.value, fitted.fit, *([] if fitted.shared is None else [fitted.shared]), fitted.residual]
     window, (value, fit, *left) = _window(tactile_map, fitted, given)
     low, high = (float(end) for end in np.nanquantile(np.stack([value, fit]), _ENDS))
     most = max(float(np.nanquantile(np.abs(left), _ENDS[1])), 1e-12)
-    words, rest = tactile_map.recipe.value_words, left[-1]
-    known = rest[np.isfinite(rest)]
-    with figure_file(
-        path, size_in=(10.0, 7.9) if len(left) > 1 else (12.8, 4.1), force=force, findings=findings
-    ) as figure:
-        panels = figure.subplots(*((2, 2) if len(left) > 1 else (1, 3))).ravel()
-        for axes, values, name in ((panels[0], value, "Data"), (panels[1], fit, "Fit")):
-            draw_panel(axes, values, window, label=words, title=name, cmap="viridis", vmin=low, vmax=high)
-        titles = [*(["Shared by neighbours"] if len(left) > 1 else []), f"Rest, SD {known.std():.2g}, "
-                  f"{100 * np.mean(known > 0):.0f} % of cells above 0"]  # fmt: skip
-        for axes, values, name in zip(panels[2:], left, titles, strict=True):
-            draw_panel(axes, values, window, label="data less fit", title=name, cmap="RdBu_r", vmin=-most, vmax=most)
-        figure.suptitle(title or "Fit", x=0.01, ha="left", fontsize=11)
-        caption = _SHARED if len(left) > 1 else _ALONE
-        figure.text(0.01, 0.01, f"{caption}  {RESEARCH_USE}", fontsize=7.5, color="0.3")
+    rest = fitted.residual
+    words = f"Rest, SD {rest.std():.2g}, {100 * np.mean(rest > 0):.0f} % of cells above 0"
+    size_in, foot = ((10.0, 7.9), _SHARED) if two else ((12.8, 4.1), _ALONE)
+    with figure_file(path, size_in=size_in, foot=foot, force=force, findings=estimate.findings) as figure:
+        panels = figure.subplots(*((2, 2) if two else (1, 3))).ravel()
+        for axes, values, title in ((panels[0], value, "Data"), (panels[1], fit, "Fit")):
+            looks = {"label": tactile_map.recipe.value_words, "title": title, "cmap": "viridis"}
+            draw_panel(axes, values, window, **looks, vmin=low, vmax=high)
+        titles = [*(["Shared by neighbours"] if two else []), words]
+        for axes, values, title in zip(panels[2:], left, titles, strict=True):
+            draw_panel(axes, values, window, label="data less fit", title=title, cmap="RdBu_r", vmin=-most, vmax=most)
+        figure.suptitle(f"Fit: {name}", x=0.01, ha="left", fontsize=11)
     return figure
 
 
@@ -109,22 +100,13 @@ _ROUND: Final = 0.9
 _KINDS: Final = {"eti": "equal-tailed", "hdi": "highest-density"}
 
 
-class SizeInterval(Record):
-    """A labelled credible interval: ``SizeInterval(12.1, 15.9, 0.95, "equal-tailed")``, with what it `supposes`."""
-
-    low_mm: float
-    high_mm: float
-    probability: float
-    kind: str
-    supposes: str = ""
-
-
 def size_figure(
     draws_max_mm: FloatArray,
     draws_min_mm: FloatArray,
     path: Path | None,
     *,
-    intervals: Mapping[str, SizeInterval],
+    intervals: Mapping[str, Quantity],
+    supposes: str = "",
     title: str = "",
     findings: Sequence[Finding] = (),
     force: bool = False,
@@ -133,8 +115,8 @@ def size_figure(
 
     `draws_max_mm`, `draws_min_mm` (n,) arrays: posterior draws; those that are not finite are left out; `intervals`:
     for ``"max"``, ``"min"`` and ``"alike"``, drawn as bars labelled with probability and kind; the last is of the
-    largest size if exams differ less; `title`: above the figure; nothing that identifies a person; `findings`: what
-    speaks against the size, told above it.
+    largest size if exams differ less, as it `supposes`; `title`: above the figure; nothing that identifies a person;
+    `findings`: what speaks against the size, told above it.
     """
     alike = float(np.mean(np.isclose(draws_max_mm, draws_min_mm))) if len(draws_max_mm) == len(draws_min_mm) else 0.0
     rows = [("largest", draws_max_mm, _MAX_COLOUR, "-", "max"), ("smallest", draws_min_mm, _MIN_COLOUR, "--", "min")]
@@ -149,23 +131,18 @@ def size_figure(
             if key in intervals:
                 _draw_interval(axes, intervals[key], size=size, row=row, colour=colour)
         if "alike" in intervals:
-            _draw_interval(axes, intervals["alike"], size="largest", row=len(rows), colour=_ALIKE_COLOUR)
-        axes.set_title(title or "Size of the lump", loc="left", fontsize=11)
+            alike_looks: dict[str, Any] = {"row": len(rows), "colour": _ALIKE_COLOUR, "supposes": supposes}
+            _draw_interval(axes, intervals["alike"], size="largest", **alike_looks)
         axes.set_xlim(_span((draws_max_mm, draws_min_mm), intervals))
-        axes.set_xlabel("size (mm)", fontsize=9)
-        axes.set_ylabel("posterior density (1/mm)", fontsize=9)
         axes.set_ylim(bottom=0)
-        axes.tick_params(labelsize=8)
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.legend(fontsize=8, frameon=False)
-        figure.text(0.01, 0.01, RESEARCH_USE, fontsize=7.5, color="0.3")
+        finish(axes, title or "Size of the lump", "size (mm)", "posterior density (1/mm)", fontsize=8)
     return figure
 
 
-def _span(draws_mm: Sequence[FloatArray], intervals: Mapping[str, SizeInterval]) -> tuple[float, float]:
+def _span(draws_mm: Sequence[FloatArray], intervals: Mapping[str, Quantity]) -> tuple[float, float]:
     """Ends of the axis: nearly all draws and all intervals, without a heavy tail's outermost draws."""
     ends = [float(end) for one in draws_mm for end in np.quantile(one[np.isfinite(one)], _SHOWN)]
-    ends += [end for one in intervals.values() for end in (one.low_mm, one.high_mm)]
+    ends += [end for one in intervals.values() for end in (one.low, one.high)]
     margin = 0.05 * (max(ends) - min(ends)) or 1.0
     return max(0.0, min(ends) - margin) if min(ends) >= 0 else min(ends) - margin, max(ends) + margin
 
@@ -207,107 +184,49 @@ def _draw_density(axes: Axes, size: str, draws_mm: FloatArray, *, colour: str, d
     axes.vlines(median, 0.0, float(np.interp(median, sizes, density)), color=colour, linestyle=dash, linewidth=1.2)
 
 
-def _draw_interval(axes: Axes, interval: SizeInterval, *, size: str, row: int, colour: str) -> None:
+def _draw_interval(axes: Axes, q: Quantity, *, size: str, row: int, colour: str, supposes: str = "") -> None:
     """Draw a bar below the densities, labelled with the size that it is of, its ends, probability and kind."""
     transforms = load_matplotlib().transforms
     # in inches below the axes: the layout makes room for what does not grow with them
     below = transforms.ScaledTranslation(0.0, -0.52 - 0.32 * row, axes.figure.dpi_scale_trans)
     across = transforms.blended_transform_factory(axes.transData, axes.transAxes) + below
     bar: dict[str, Any] = {"linewidth": 3, "solid_capstyle": "butt", "marker": "|", "markersize": 10}
-    axes.plot([interval.low_mm, interval.high_mm], [0.0, 0.0], transform=across, color=colour, clip_on=False, **bar)
-    kind = _KINDS.get(interval.kind, interval.kind)
-    ends = f"{interval.low_mm:.1f} to {interval.high_mm:.1f} mm"
-    text = f"{size}, {ends}: {100 * interval.probability:g} % interval ({kind})"
-    text = f"{text} {interval.supposes}".rstrip()
-    middle = (interval.low_mm + interval.high_mm) / 2
-    axes.text(middle, -0.02, text, transform=across, ha="center", va="top", fontsize=8, color=colour)
+    axes.plot([q.low, q.high], [0.0, 0.0], transform=across, color=colour, clip_on=False, **bar)
+    text = f"{size}, {q.low:.1f} to {q.high:.1f} mm: {100 * q.probability:g} % interval ({_KINDS[q.kind]}) {supposes}"
+    place = ((q.low + q.high) / 2, -0.02)
+    axes.text(*place, text.rstrip(), transform=across, ha="center", va="top", fontsize=8, color=colour)
 
 
 # --- The figures of `estimate`: the size posterior, and the map with the lump or the places looked at.
-
-
-def draw_figures(
-    tactile_map: TactileMap,
-    estimate: Estimate,
-    figure: Path | None,
-    map_figure: Path | None,
-    fit_figure: Path | None = None,
-    *,
-    name: str,
-    probability: float,
-    force: bool,
-) -> None:
-    """Draw the requested figures. Without a size, or a fit, they show the map, the places looked at and the reason.
-
-    `figure`, `map_figure`, `fit_figure`: where to; None draws nothing. A map without data cannot be drawn; `name`: of
-    the map, for the titles; `probability`: of the interval of the size.
-    """
-    if figure is not None and estimate.size is not None:
-        draw_size(estimate.size, figure, name=name, probability=probability, findings=estimate.findings, force=force)
-        figure = None
-    if fit_figure is not None and estimate.draws is not None:
-        draw_fit(tactile_map, estimate, fit_figure, name=name, force=force)
-        fit_figure = None
-    if tactile_map.covered.any():
-        for path in (figure, map_figure, fit_figure):
-            if path is not None:
-                draw_map(tactile_map, estimate, path, name=name, force=force)
 
 
 def draw_size(
     size: SizePosterior, path: Path | None, *, name: str, probability: float, findings: Sequence[Finding], force: bool
 ) -> Figure:
     """Draw the posterior of the largest and smallest size with their intervals, and what speaks against them."""
-    leads = leading_size(size)
-    quantities = {which: leads.summarise(f"{which}_size_mm", probability=probability) for which in ("max", "min")}
-    intervals = {which: SizeInterval(q.low, q.high, q.probability, q.kind) for which, q in quantities.items()}
+    leads, supposes = leading_size(size), ""
+    intervals = {which: leads.summarise(f"{which}_size_mm", probability=probability) for which in ("max", "min")}
     if size.another_exam is not None:
-        q = size.summarise("max_size_mm", probability=probability)
+        intervals["alike"] = size.summarise("max_size_mm", probability=probability)
         supposes = exams_label(size.figures.get("between_map_sd"))
-        intervals["alike"] = SizeInterval(q.low, q.high, q.probability, q.kind, supposes)
+    told: dict[str, Any] = {"intervals": intervals, "supposes": supposes, "findings": findings}
     draws, title = (leads.max_size_mm.ravel(), leads.min_size_mm.ravel()), f"Size of the lump: {name}"
-    return size_figure(*draws, path, intervals=intervals, title=title, findings=findings, force=force)
+    return size_figure(*draws, path, title=title, force=force, **told)
 
 
-def draw_fit(tactile_map: TactileMap, estimate: Estimate, path: Path | None, *, name: str, force: bool) -> Figure:
-    """Draw data, fit and residual of the fit window side by side."""
-    fitted = fitted_cells(estimate)
-    assert fitted is not None
-    return fit_figure(tactile_map, fitted, path, title=f"Fit: {name}", findings=estimate.findings, force=force)
-
-
-def draw_map(tactile_map: TactileMap, estimate: Estimate, path: Path | None, *, name: str, force: bool) -> Figure:
+def draw_map(tactile_map: TactileMap, report: EstimateReport, path: Path | None, *, name: str, force: bool) -> Figure:
     """Draw the map with the lump's ellipse and size, or with the places looked at and the reason for no number."""
-    places = [Place(one.centre_mm, one.fault) for one in estimate.candidates if one.fault]
-    masses, note = [], ""
-    for number, mass in enumerate(estimate.masses, start=1):
-        contour = _contour(mass.estimate)
-        if contour is None:
-            masses.append(NumberedMass(number, (mass.x_mm, mass.y_mm)))
-        else:
-            masses.append(NumberedMass(number, contour.centre_mm, contour.size_mm, contour.angle_deg))
-    if estimate.reason and estimate.size is None:
-        gone = estimate.status == "no_estimate"
-        note = no_estimate_line(estimate.reason) if gone else f"No size: {estimate.reason}."
+    note = ""
+    if report.reason and report.max_size_mm is None:
+        note = no_estimate_line(report.reason) if report.status == "no_estimate" else f"No size: {report.reason}."
     return map_figure(
         tactile_map,
         path,
-        fit=_contour(estimate),
-        masses=masses,
-        looked_at=places,
+        fit=contour_of(report),
+        masses=report.masses,
+        looked_at=places_of(report),
         title=f"Tactile map: {name}",
         note=note,
-        findings=estimate.findings,
+        findings=report.findings,
         force=force,
     )
-
-
-def _contour(estimate: Estimate) -> FitContour | None:
-    """Ellipse and size at the posterior medians."""
-    found, size = estimate.map_posterior, estimate.size
-    if found is None:
-        return None
-    names = ("x_mm", "y_mm", "sigma_x_mm", "sigma_y_mm", "angle_rad", "background", "amplitude")
-    x, y, sigma_x, sigma_y, angle, level, amplitude = (float(np.median(getattr(found, name))) for name in names)
-    sizes = None if size is None else (float(np.nanmedian(size.d_x_mm)), float(np.nanmedian(size.d_y_mm)))
-    return FitContour((x, y), sigma_x, sigma_y, float(np.degrees(angle)), sizes, level, amplitude)

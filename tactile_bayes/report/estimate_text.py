@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from typing import Any
 
-from tactile_bayes.files.reports import MassReport, SmallestLump
+from tactile_bayes.declarations import from_plain
+from tactile_bayes.files.reports import EstimateReport, MassReport, SmallestLump
 from tactile_bayes.findings import capital, finding_lines, finding_summary
 from tactile_bayes.inference.draws import ParameterDraws, Quantity
-from tactile_bayes.mapping.map import TactileMap
-from tactile_bayes.mapping.places import ClockPosition
 from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior.abstention import chance_text
 from tactile_bayes.posterior.lump_probability import SHARE_WITH_LUMP
@@ -17,26 +17,16 @@ from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.estimate_document import (
     mass_lines,
-    mass_reports,
     numbered,
     others,
     prior_line,
     scene_line,
     scene_lines,
     sensitivity_line,
-    smallest_lump,
     supposed_line,
     supposed_lines,
-    suppositions,
 )
-from tactile_bayes.report.quantities import (
-    ANOTHER_EXAM,
-    estimate_quantities,
-    from_xiphoid,
-    leading_size,
-    place_line,
-    xiphoid_mm,
-)
+from tactile_bayes.report.quantities import ANOTHER_EXAM, from_xiphoid, place_line
 from tactile_bayes.size.draws import EXTREMES, SIZES
 
 # --- The smallest lump that a map without one would have shown, in a sentence.
@@ -207,56 +197,29 @@ ROWS = (
     ("centre_patient_mm.x", "patient's right of xiphoid, x", "mm"),
     ("centre_patient_mm.y", "centre above the xiphoid, y", "mm"),
 )
+_NAMES = tuple(name for name, _, _ in ROWS)
 MOST_PASSED_OVER = 4
 LEAST_SHARE = 0.005  #: Of the width variance, below which the tracker's share is not worth a line.
 
 
-def size_decimals(sizes: Iterable[Quantity]) -> int:
-    """Decimal places for all sizes of a report, from the least certain one."""
-    return min((decimals(one.mc_error, most=SIZE_DECIMALS) for one in sizes), default=SIZE_DECIMALS)
-
-
-def estimate_text(
-    estimate: Estimate,
-    tactile_map: TactileMap,
-    *,
-    probability: float,
-    prior: BumpPrior | None = None,
-    quantities: Mapping[str, Quantity] | None = None,
-    masses: Sequence[MassReport] | None = None,
-    place: ClockPosition | None = None,
-) -> str:
-    """Full report of one map: sizes with intervals, sources of uncertainty, omissions.
-
-    `quantities`, `masses` (see `mass_reports`) and the lump's `place` about the nipple where they are at hand.
-    """
-    if quantities is None:
-        quantities = estimate_quantities(estimate, tactile_map, probability=probability)
-    if masses is None:
-        masses = mass_reports(
-            estimate.masses, tactile_map, probability=probability, quantities=quantities, reason=estimate.reason
-        )
+def estimate_text(estimate: Estimate, report: EstimateReport) -> str:
+    """Full report of one map: sizes with intervals, sources of uncertainty, omissions; `report` is the estimate's."""
     if estimate.status == "no_estimate":
-        first = [*finding_lines(estimate.findings), no_estimate_line(estimate.reason), *smallest_lines(estimate)]
-        first += advice_lines(estimate)
-        return "\n".join([*first, *mass_lines(masses), *passed_over(estimate), RESEARCH_USE]) + "\n"
-    table = size_table(quantities, probability, alike=alike_spread(estimate))
-    lines = [*finding_lines(estimate.findings, "caution"), *table, ""]
-    if estimate.reason:
-        lines += [f"No size: {estimate.reason}.", *advice_lines(estimate)]
-    lines += [] if place is None else [place_line(place, probability)]
-    lines += [
-        *_findings(estimate, quantities, masses),
-        *([] if estimate.scene is None else scene_lines(estimate.scene)),
-    ]
-    beside = " and ".join(str(one.number) for one in others(masses))
-    if estimate.scene is not None and beside:
-        lines.append(f"These odds are of this window alone: mass {beside} of the map is above.")
+        lines = [*finding_lines(report.findings), *_no_estimate(report), *mass_lines(report.masses)]
+        return "\n".join([*lines, *passed_over(estimate), RESEARCH_USE]) + "\n"
+    lines = [*finding_lines(report.findings, "caution"), *size_table(report), "", *_no_size(report)]
+    if report.position is not None:
+        lines.append(place_line(report.position))
+    lines += _findings(estimate, report)
+    if estimate.scene is not None:
+        lines += scene_lines(estimate.scene)
+        if beside := " and ".join(str(one.number) for one in others(report.masses)):
+            lines.append(f"These odds are of this window alone: mass {beside} of the map is above.")
     if estimate.sensitivity is not None and (by_prior := sensitivity_line(estimate.sensitivity)):
         lines.append(by_prior)
-    lines += [*finding_lines(estimate.findings, "check"), *passed_over(estimate)]
-    lines += [f"Left out: {'; '.join(estimate.left_out)}."] if estimate.left_out else []
-    lines += [] if prior is None else [prior_line(prior, field=estimate.scene is not None)]
+    lines += [*finding_lines(report.findings, "check"), *passed_over(estimate)]
+    lines += [f"Left out: {'; '.join(report.left_out)}."] if report.left_out else []
+    lines.append(prior_line(from_plain(BumpPrior, report.prior), field=estimate.scene is not None))
     return "\n".join([*lines, RESEARCH_USE]) + "\n"
 
 
@@ -266,69 +229,81 @@ def no_estimate_line(reason: str) -> str:
     return f"{capital(reason)}." if told else f"No estimate: {reason}."
 
 
-def smallest_lines(estimate: Estimate) -> list[str]:
-    """What a map without a lump would have shown, as one line; empty where nobody has asked."""
-    return [] if estimate.smallest is None else [f"{smallest_text(smallest_lump(estimate.smallest))}."]
+def _no_estimate(report: EstimateReport) -> list[str]:
+    """Why there is no estimate, what a map without a lump would have shown, and what would help."""
+    smallest = [] if report.smallest_lump is None else [f"{smallest_text(report.smallest_lump)}."]
+    return [no_estimate_line(report.reason), *smallest, *_advice(report)]
 
 
-def advice_lines(estimate: Estimate) -> list[str]:
-    """Advice towards an estimate or a size, as one line; empty without advice."""
-    return [f"What would help: {estimate.advice}."] if estimate.advice else []
+def _no_size(report: EstimateReport) -> list[str]:
+    """Why there is no size, and what would help; empty where there is one."""
+    return [f"No size: {report.reason}.", *_advice(report)] if report.reason else []
 
 
-def size_table(quantities: Mapping[str, Quantity], probability: float, *, alike: float | None = None) -> list[str]:
+def _advice(report: EstimateReport) -> list[str]:
+    return [f"What would help: {report.advice}."] if report.advice else []
+
+
+def _quantities(report: EstimateReport) -> dict[str, Quantity]:
+    """What the report has of `ROWS`, by name."""
+    found: dict[str, Any] = {}
+    for path, _, _ in ROWS:
+        holder, _, name = path.rpartition(".")
+        held = getattr(report, holder) if holder else report
+        found[path] = getattr(held, name, None)
+    return {name: quantity for name, quantity in found.items() if quantity is not None}
+
+
+def size_decimals(sizes: Iterable[Quantity]) -> int:
+    """Decimal places for all sizes of a report, from the least certain one."""
+    return min((decimals(one.mc_error, most=SIZE_DECIMALS) for one in sizes), default=SIZE_DECIMALS)
+
+
+def size_table(report: EstimateReport, shown: Collection[str] = _NAMES) -> list[str]:
     """Table with a row per quantity; all sizes have the digits that the least certain one supports.
 
     Where sizes have two intervals that for exams of patients leads, and the narrower one of the largest size follows,
-    for exams whose spread `alike` is, a share of the size.
+    with the spread of the exams that it is for.
     """
-    rows = [table_head(probability)]
-    of_sizes = size_decimals([quantities[name] for name in SIZES if name in quantities])
+    found = {name: quantity for name, quantity in _quantities(report).items() if name in shown}
+    rows = [table_head(next(iter(found.values())).probability)]
+    of_sizes = size_decimals([found[name] for name in SIZES if name in found])
     for name, label, unit in ROWS:
-        if name == "max_size_mm" and ANOTHER_LARGEST in quantities:
-            label = exams_label(alike)
-        if name in quantities and not (name == "min_size_mm" and ANOTHER_SMALLEST in quantities):
-            q = quantities[name]
-            sizes = (*SIZES, ANOTHER_LARGEST, ANOTHER_SMALLEST)
-            places = of_sizes if name in sizes else decimals(q.mc_error)
-            rows.append(table_row(label, q.median, (q.low, q.high), unit=unit, places=places))
+        if name not in found or (name == "min_size_mm" and ANOTHER_SMALLEST in found):
+            continue
+        if name == "max_size_mm" and ANOTHER_LARGEST in found:
+            label = exams_label(report.figures.get("between_map_sd"))
+        q = found[name]
+        places = of_sizes if name in (*SIZES, ANOTHER_LARGEST, ANOTHER_SMALLEST) else decimals(q.mc_error)
+        rows.append(table_row(label, q.median, (q.low, q.high), unit=unit, places=places))
     return rows
 
 
-def alike_spread(estimate: Estimate) -> float | None:
-    """The spread between exams of the narrower interval, a share of the size; None where it has none."""
-    return None if estimate.size is None else estimate.size.figures.get("between_map_sd")
-
-
-def _findings(estimate: Estimate, quantities: Mapping[str, Quantity], masses: Sequence[MassReport]) -> list[str]:
-    lines, found = [], estimate.diagnostics
-    if estimate.probability is not None:
-        which = f"{number}. " if (number := numbered(masses)) else ""
+def _findings(estimate: Estimate, report: EstimateReport) -> list[str]:
+    lines, found, figures, largest = [], estimate.diagnostics, report.figures, report.max_size_mm
+    if report.detected_probability is not None:
+        which = f"{number}. " if (number := numbered(report.masses)) else ""
         prior = f"where {100 * SHARE_WITH_LUMP:g} % of exams hold one"
-        lines.append(f"{which}Probability of a lump: {chance_text(estimate.probability)}, {prior}.")
-    lines += mass_lines(masses)
-    if estimate.size is not None:
-        another = estimate.size.another_exam
-        if another is not None:
-            lines.append(two_intervals_text(alike_spread(estimate), another.figures["between_map_sd"]))
-        lines += width_lines(leading_size(estimate.size).variance_share)
+        lines.append(f"{which}Probability of a lump: {chance_text(report.detected_probability)}, {prior}.")
+    lines += mass_lines(report.masses)
+    if largest is not None:
+        if report.another_exam is not None:
+            lines.append(two_intervals_text(figures.get("between_map_sd"), report.another_exam.between_map_sd))
+        lines += width_lines(report.leading.variance_share or {})
         if found is not None and found.repeatability:
             lines.append(site_interval_text(found.repeatability))
-        largest = quantities["max_size_mm"]
-        supposed, places = suppositions(estimate.size, largest), size_decimals([largest])
-        lines += supposed_lines(supposed, largest.median, places=places)
-        if "oval_probability" in estimate.size.figures:
-            lines.append(shape_text(estimate.size.figures))
+        lines += supposed_lines(report.supposing, largest.median, places=size_decimals([largest]))
+        if "oval_probability" in figures:
+            lines.append(shape_text(figures))
         if found is not None and found.size_calibration:
             lines.append(f"{found.size_calibration}.")
-        if estimate.size.invalid:
-            lines.append(f"{estimate.size.invalid} draws gave no size and were left out.")
+        lines += [f"{text}." for text in invalid_draws(report)]
     if share := tracker_share(estimate):
         lines.append(f"{share}.")
     lines += [f"Passed over: {text}." for text in (() if found is None else found.noise.passed_over)]
     if estimate.draws is None:
         return lines
-    lines.append(method_line(estimate.draws, quantities))
+    lines.append(method_line(estimate.draws, _quantities(report)))
     for name, label in (("max_size_mm", "largest size"), ("min_size_mm", "smallest size")):
         if one := {} if found is None else found.convergence.get(name, {}):
             ess = min(one["ess_bulk"], one["ess_tail"])
@@ -337,6 +312,12 @@ def _findings(estimate: Estimate, quantities: Mapping[str, Quantity], masses: Se
                 f"Monte-Carlo error of the median {one['mcse_median']:.2g} mm."
             )
     return lines
+
+
+def invalid_draws(report: EstimateReport) -> list[str]:
+    """How many draws gave no size; empty for none."""
+    number = report.figures.get("invalid_draws")
+    return [f"{number} draws gave no size and were left out"] if number else []
 
 
 def tracker_share(estimate: Estimate) -> str:
@@ -384,72 +365,50 @@ MOST_CHECKS = 2
 MOST_MASSES = 3  #: Masses besides the reported one that have a line.
 
 
-def estimate_summary(
-    estimate: Estimate,
-    quantities: Mapping[str, Quantity],
-    *,
-    probability: float,
-    masses: Sequence[MassReport] = (),
-    place: ClockPosition | None = None,
-) -> str:
-    """Report of one map in at most `MOST_LINES` lines; `estimate_text` gives the rest.
-
-    `quantities`: as `estimate_quantities` gives them; empty without an estimate; `probability`: of the intervals;
-    `masses`: as `mass_reports` gives them; `place`: of the lump about the nipple, where it is known.
-    """
+def estimate_summary(estimate: Estimate, report: EstimateReport) -> str:
+    """Report of one map in at most `MOST_LINES` lines; `estimate_text` gives the rest."""
+    body = finding_summary(report.findings, "caution", most=MOST_CAUTIONS)
+    checks = finding_summary(report.findings, "check", most=MOST_CHECKS)
     if estimate.status == "no_estimate":
-        body = finding_summary(estimate.findings, "caution", most=MOST_CAUTIONS)
-        body += [no_estimate_line(estimate.reason), *smallest_lines(estimate), *advice_lines(estimate)]
-        body += [*_masses(masses, room=MOST_MASSES), *finding_summary(estimate.findings, "check", most=MOST_CHECKS)]
+        body += [*_no_estimate(report), *_masses(report.masses, room=MOST_MASSES), *checks]
     else:
-        body = _something(estimate, quantities, probability, masses, place)
+        body = _something(estimate, report, body, checks)
     if estimate.scene is not None:
         model = [scene_line(estimate.scene)]
     else:
-        model = joined(estimate.left_out, most=2, lead="Left out: ")
+        model = joined(report.left_out, most=2, lead="Left out: ")
     return "\n".join([*body, " ".join([*model, MORE]), RESEARCH_USE]) + "\n"
 
 
-def _something(
-    estimate: Estimate,
-    quantities: Mapping[str, Quantity],
-    probability: float,
-    masses: Sequence[MassReport],
-    place: ClockPosition | None,
-) -> list[str]:
+def _something(estimate: Estimate, report: EstimateReport, cautions: list[str], checks: list[str]) -> list[str]:
     """The body of a report with an estimate; what makes the interval wide gives way to masses."""
-    lines = finding_summary(estimate.findings, "caution", most=MOST_CAUTIONS)
-    shown = [name for name in EXTREMES if name in quantities] or [name for name in WIDTHS if name in quantities]
-    table = shown if ANOTHER_LARGEST not in quantities else [*shown, ANOTHER_LARGEST, ANOTHER_SMALLEST]
-    lines += size_table({name: quantities[name] for name in table}, probability, alike=alike_spread(estimate))
-    lines += _lump(estimate, quantities, numbered(masses), place)
-    after = [f"No size: {estimate.reason}.", *advice_lines(estimate)] if estimate.reason else []
-    last = [*_quality(estimate, {name: quantities[name] for name in shown})]
-    last += finding_summary(estimate.findings, "check", most=MOST_CHECKS)
+    quantities, largest = _quantities(report), report.max_size_mm
+    shown = EXTREMES if largest is not None else WIDTHS
+    lines = cautions + size_table(report, (*shown, ANOTHER_LARGEST, ANOTHER_SMALLEST))
+    lines += _lump(report)
+    after = _no_size(report)
+    last = _quality(estimate, report, [quantities[name] for name in shown]) + checks
     room = MOST_LINES - 2 - len(lines) - len(after) - len(last)
-    beside = _masses(masses, room=min(MOST_MASSES, room))
-    widths = [] if estimate.size is None else width_lines(leading_size(estimate.size).variance_share)
+    beside = _masses(report.masses, room=min(MOST_MASSES, room))
+    widths = width_lines(report.leading.variance_share or {})
     lines = [*lines, *beside, *after, *widths[: max(room - len(beside), 0)], *last]
-    largest = quantities.get("max_size_mm")
     if largest is None or len(lines) >= MOST_LINES - 2:
         return lines
-    supposed = suppositions(estimate.size, largest)
-    return [*lines, *supposed_line(supposed, largest.median, places=size_decimals([largest]))]
+    return [*lines, *supposed_line(report.supposing, largest.median, places=size_decimals([largest]))]
 
 
-def _lump(
-    estimate: Estimate, quantities: Mapping[str, Quantity], number: str, place: ClockPosition | None
-) -> list[str]:
-    """Probability of a lump, and its place; `number` says which of several masses it is."""
-    parts = [] if estimate.probability is None else [f"Probability of a lump {chance_text(estimate.probability)}"]
-    if "amplitude" in quantities:
-        parts.append(f"amplitude {quantities['amplitude'].median:.2g}")
-    if place is not None:
-        parts.append(place.text())
-    elif (centre := xiphoid_mm(quantities)) is not None:
-        parts.append(from_xiphoid(*centre))
-    if "centre_mm.x" in quantities:
-        parts.append("at ({:.1f}, {:.1f}) mm on the map".format(*(quantities[f"centre_mm.{a}"].median for a in "xy")))
+def _lump(report: EstimateReport) -> list[str]:
+    """Probability of a lump, and its place; of several masses, which one it is."""
+    chance, number = report.detected_probability, numbered(report.masses)
+    parts = [] if chance is None else [f"Probability of a lump {chance_text(chance)}"]
+    if report.amplitude is not None:
+        parts.append(f"amplitude {report.amplitude.median:.2g}")
+    if report.position is not None:
+        parts.append(report.position.text)
+    elif report.centre_patient_mm is not None:
+        parts.append(from_xiphoid(*report.centre_patient_mm.median))
+    if report.centre_mm is not None:
+        parts.append("at ({:.1f}, {:.1f}) mm on the map".format(*report.centre_mm.median))
     text = ", ".join(parts)
     return [f"{number}: {text[0].lower()}{text[1:]}." if number else f"{text}."] if parts else []
 
@@ -463,21 +422,19 @@ def _masses(masses: Sequence[MassReport], *, room: int) -> list[str]:
     return shown
 
 
-def _quality(estimate: Estimate, shown: Mapping[str, Quantity]) -> list[str]:
+def _quality(estimate: Estimate, report: EstimateReport, shown: Sequence[Quantity]) -> list[str]:
     """Monte-Carlo error of the interval ends, convergence measure, tracker's share, draws without a size."""
-    if estimate.draws is None or not shown:
+    found = estimate.diagnostics
+    if estimate.draws is None:
         return []
-    worst = max(shown.values(), key=lambda one: one.mc_error / one.sd if one.sd > 0 else 0.0)
+    worst = max(shown, key=lambda one: one.mc_error / one.sd if one.sd > 0 else 0.0)
     ends = f"interval ends to {worst.mc_error / worst.sd:.3f} SD" if worst.sd > 0 else "interval ends exact"
-    parts = [f"method {estimate.draws.method}, {ends}"]
-    if estimate.diagnostics is not None and estimate.diagnostics.calibration:
-        parts.insert(0, f"sizes by the {estimate.diagnostics.calibration}")
-    if estimate.diagnostics is not None and estimate.diagnostics.repeatability:
-        parts.append(estimate.diagnostics.repeatability)
-    if measure := convergence_text(estimate.draws):
-        parts.append(measure)
-    if share := tracker_share(estimate):
-        parts.append(share)
-    if estimate.size is not None and estimate.size.invalid:
-        parts.append(f"{estimate.size.invalid} draws gave no size and were left out")
-    return [f"Quality: {'; '.join(parts)}."]
+    parts = [
+        f"sizes by the {found.calibration}" if found is not None and found.calibration else "",
+        f"method {estimate.draws.method}, {ends}",
+        "" if found is None else found.repeatability,
+        convergence_text(estimate.draws),
+        tracker_share(estimate),
+        *invalid_draws(report),
+    ]
+    return [f"Quality: {'; '.join(filter(None, parts))}."]

@@ -13,8 +13,10 @@ from typing import TYPE_CHECKING, Any, Final
 from tactile_bayes.errors import UsageError
 from tactile_bayes.files.atomic import refuse_existing, write_bytes
 from tactile_bayes.findings import Finding, finding_lines
+from tactile_bayes.presets import RESEARCH_USE
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 
@@ -87,6 +89,7 @@ def plain_matplotlib() -> Iterator[Any]:
     library = load_matplotlib()
     with library.rc_context():
         library.rcdefaults()
+        library.rcParams["svg.hashsalt"] = "tactile-bayes"  # else the names inside an SVG are random
         yield library
 
 
@@ -96,6 +99,7 @@ def figure_file(
     *,
     size_in: tuple[float, float],
     force: bool,
+    foot: str | None = "",
     findings: Sequence[Finding] = (),
     trim: bool = False,
 ) -> Iterator[Figure]:
@@ -109,6 +113,8 @@ def figure_file(
         Width and height in inches.
     force
         Overwrite an existing file.
+    foot
+        Words at its foot, before those on its use; None for neither.
     findings
         What speaks against what is shown, told above it.
     trim
@@ -123,12 +129,13 @@ def figure_file(
         check_suffix(path)
         refuse_existing(path, force=force)
     with plain_matplotlib() as library:
-        library.rcParams["svg.hashsalt"] = "tactile-bayes"  # else the names inside an SVG are random
         width_in, height_in = size_in
         told = [part for line in finding_lines(findings, paper=True) for part in wrap(line, round(13 * width_in))]
         figure = library.figure.Figure(figsize=(width_in, height_in + 0.17 * len(told)), dpi=DPI, layout="constrained")
         figure.get_layout_engine().set(rect=(0.0, 0.04, 1.0, 0.96))
         yield figure
+        if foot is not None:
+            figure.text(0.01, 0.01, f"{foot}  {RESEARCH_USE}".strip(), fontsize=7.5, color="0.3")
         if told:
             title = figure.get_suptitle()
             figure.suptitle("\n".join([*told, *([title] if title else [])]), x=0.01, ha="left", fontsize=9.5)
@@ -142,3 +149,22 @@ def figure_file(
         buffer = io.BytesIO()
         figure.savefig(buffer, format=suffix.removeprefix("."), dpi=DPI, metadata=FORMATS[suffix])
     write_bytes(path, buffer.getvalue(), force=force)
+
+
+def finish(
+    axes: Axes, title: str, across: str, up: str, *, legend: bool = True, headroom: float = 0.0, **looks: Any
+) -> None:
+    """Title, labels, and a legend where something is named.
+
+    `headroom`: space above the curves for the legend, as a share of their height; `looks`: of the legend.
+    """
+    if headroom:
+        low, high = axes.get_ylim()
+        axes.set_ylim(low, high + headroom * (high - low))
+    axes.set_title(title, loc="left", fontsize=10)
+    axes.set_xlabel(across, fontsize=9)
+    axes.set_ylabel(up, fontsize=9)
+    axes.tick_params(labelsize=8)
+    axes.spines[["top", "right"]].set_visible(False)
+    if legend and axes.get_legend_handles_labels()[0]:
+        axes.legend(**{"fontsize": 7.5, "frameon": False} | looks)

@@ -5,18 +5,17 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from tactile_bayes.files.comparison import CompareReport
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.places import Orientation
-from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.compare import compare_summary
 from tactile_bayes.report.figure_file import figure_file, named_exam
 from tactile_bayes.report.growth_page import HALF_MM, STEP_MM, Course, DrawnMap, LaidMap, common_limits, on_common_axes
-from tactile_bayes.report.map_figure import draw_edges
+from tactile_bayes.report.map_figure import draw_cells, draw_edges
 from tactile_bayes.size.visits import Compared
 
 if TYPE_CHECKING:
@@ -43,7 +42,8 @@ def draw_comparison(
     """
     laid, view = on_common_axes(report, visits)
     shown = [0, *range(max(1, len(laid) - _MOST_VISITS + 1), len(laid))]
-    with figure_file(path, size_in=(4.0 * (len(shown) + 1), 7.4), force=force) as figure:
+    foot = f"{view.words}; later visits are moved so that the mass lies on itself; maps of a visit are averaged."
+    with figure_file(path, size_in=(4.0 * (len(shown) + 1), 7.4), foot=foot, force=force) as figure:
         exam = named_exam("", report.provenance.get("scans", ()))
         figure.suptitle(f"Comparison: {exam}" if exam else "Comparison", x=0.01, ha="left", fontsize=11)
         grid = figure.add_gridspec(2, len(shown) + 1, height_ratios=(1.35, 1.0))
@@ -56,8 +56,6 @@ def draw_comparison(
         lines = [part for line in compare_summary(report).splitlines()[:-1] for part in textwrap.wrap(line, 96)]
         text = "\n".join(line for line in lines if not line.startswith("More ("))
         words_axes.text(0.0, 1.0, text, va="top", fontsize=8.5, transform=words_axes.transAxes)
-        moved = "later visits are moved so that the mass lies on itself; maps of a visit are averaged"
-        figure.text(0.01, 0.01, f"{view.words}; {moved}.  {RESEARCH_USE}", fontsize=7.5, color="0.3")
     return figure
 
 
@@ -65,34 +63,25 @@ def _draw_maps(panels: Sequence[Axes], visits: Sequence[tuple[str, LaidMap]], *,
     """Draw the visits, by their names, with one colour bar, and the difference of the last and the first."""
     first, last = visits[0][1], visits[-1][1]
     low, high = common_limits([one for _, one in visits])
-    for axes, (name, one) in zip(panels, visits, strict=False):
-        image = _draw_cells(axes, one.values, first.origin_mm, cmap="viridis", vmin=low, vmax=high)
+    difference = last.values - first.values
+    most = max(0.3 * (high - low), float(np.nanmax(np.abs(difference), initial=0.0)))
+    half = HALF_MM + STEP_MM / 2
+    extent = tuple(middle + side for middle in first.origin_mm for side in (-half, half))
+    pictures = [(name, one.values, {"cmap": "viridis", "vmin": low, "vmax": high}) for name, one in visits]
+    pictures.append(("Last minus first", difference, {"cmap": "RdBu_r", "vmin": -most, "vmax": most}))
+    drawn = []
+    for axes, (name, values, how) in zip(panels, pictures, strict=True):
+        drawn.append(draw_cells(axes, np.ma.masked_invalid(values), extent, **how))
+        axes.set_title(name, loc="left", fontsize=11)
+        _name_axes(axes, first.origin_mm, view)
+    for axes, (_, one) in zip(panels, visits, strict=False):
         if one.ring_mm is not None:
             for colour, width in (("black", 3.0), ("white", 1.4)):
                 axes.plot(*(one.ring_mm + first.origin_mm[:, None]), color=colour, linewidth=width)
-        axes.set_title(name, loc="left", fontsize=11)
-        _name_axes(axes, first.origin_mm, view)
-    figure = panels[0].figure
-    bar = figure.colorbar(image, ax=list(panels[:-1]), shrink=0.8, pad=0.01)
-    bar.set_label(label, fontsize=8)
-    difference = last.values - first.values
-    most = max(0.3 * (high - low), float(np.nanmax(np.abs(difference), initial=0.0)))
-    image = _draw_cells(panels[-1], difference, first.origin_mm, cmap="RdBu_r", vmin=-most, vmax=most)
-    panels[-1].set_title("Last minus first", loc="left", fontsize=11)
-    _name_axes(panels[-1], first.origin_mm, view)
-    bars = [bar, figure.colorbar(image, ax=panels[-1], shrink=0.8, pad=0.01)]
-    bars[1].set_label(f"difference of {label}", fontsize=8)
-    for each in bars:
-        each.ax.tick_params(labelsize=7)
-
-
-def _draw_cells(axes: Axes, values: FloatArray, origin_mm: FloatArray, **how: Any) -> Any:
-    """Draw values about the mass; places without data stay grey."""
-    axes.set_facecolor("0.85")
-    half = HALF_MM + STEP_MM / 2
-    extent = (origin_mm[0] - half, origin_mm[0] + half, origin_mm[1] - half, origin_mm[1] + half)
-    shown = np.ma.masked_invalid(values)
-    return axes.imshow(shown, origin="lower", extent=extent, interpolation="nearest", **how)
+    for image, beside, words in ((drawn[0], panels[:-1], label), (drawn[-1], panels[-1:], f"difference of {label}")):
+        bar = panels[0].figure.colorbar(image, ax=list(beside), shrink=0.8, pad=0.01)
+        bar.set_label(words, fontsize=8)
+        bar.ax.tick_params(labelsize=7)
 
 
 def _name_axes(axes: Axes, origin_mm: FloatArray, view: Orientation) -> None:

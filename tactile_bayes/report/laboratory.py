@@ -17,9 +17,9 @@ from tactile_bayes.forward.line import RANGE, outside_range
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.options import FieldCosines
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.report.figure_file import figure_file
+from tactile_bayes.report.figure_file import figure_file, finish
 from tactile_bayes.report.paper_head import named
-from tactile_bayes.report.study import COLOURS, MARKS, finish
+from tactile_bayes.report.study import COLOURS, MARKS
 from tactile_bayes.studies.paper import seat_name
 from tactile_bayes.studies.paper_tables import (
     DEFINITION,
@@ -47,7 +47,6 @@ from tactile_bayes.studies.tradeoffs import EMPIRICAL, PLANE, SOLID, LumpCase, M
 # --- Reports of simulation-based calibration: text, data, table and figure.
 
 SCHEMA = "tactile-bayes/sbc/1"
-_COLOURS = ("#1f3b73", "#c8641e")
 NARROW = 1.05
 """A larger spread of the ranks is called too narrow a posterior, and too wide below its inverse."""
 SHIFT = 3.0  #: Standard errors of the mean rank beyond which a posterior is called too low or too high.
@@ -57,7 +56,8 @@ def sbc_document(
     maps: Sequence[MapRanks], *, method: str, seed: int, maps_per_s: float | None, cosines: FieldCosines = "auto"
 ) -> dict[str, Any]:
     """All results as plain data; `maps_per_s` is of the maps that this run made, None where it made none."""
-    ranked = [one for one in maps if one.ranks is not None]
+    ranked = [one.outcome for one in maps if one.ranks is not None]
+    silent = [one.outcome for one in maps if one.ranks is None and one.probability is None]
     tests, others = rank_tests(list(maps)), other_rises(list(maps))
     return {
         "schema": SCHEMA,
@@ -66,10 +66,8 @@ def sbc_document(
         "seed": seed,
         "maps": len(maps),
         "ranked": len(ranked),
-        "abstained": dict(
-            sorted(Counter(one.outcome for one in maps if one.ranks is None and one.probability is None).items())
-        ),
-        "drawn_by": dict(sorted(Counter(one.outcome for one in ranked).items())),
+        "abstained": dict(sorted(Counter(silent).items())),
+        "drawn_by": dict(sorted(Counter(ranked).items())),
         "elsewhere": as_dict(others) | {"too_many": others.too_many},
         "draws": DRAWS,
         "maps_per_s": maps_per_s,
@@ -92,51 +90,44 @@ def verdict(test: RankTest) -> str:
 
 def sbc_text(document: dict[str, Any]) -> str:
     """Full text report, ending with the research-use line."""
-    return "\n".join(_lines(document)) + "\n"
+    return "\n".join([*_lines(document), RESEARCH_USE]) + "\n"
 
 
 def _lines(document: dict[str, Any]) -> Iterator[str]:
-    if document["parameters"]:
-        yield from _conclusion(document["parameters"], document["p_together"])
+    speed, others, tests = document["maps_per_s"], document["elsewhere"], document["parameters"]
+    if tests:
+        yield from _conclusion(tests, document["p_together"])
     else:
         yield "No map gave an estimate: there is nothing to rank; give more --maps"
-    speed = document["maps_per_s"]
-    rate = "" if speed is None else f", {speed:.3g} maps/s"
     made = f"method {document['method']}, {document['field_cosines']} cosines, seed {document['seed']}"
+    rate = "" if speed is None else f", {speed:.3g} maps/s"
     yield f"{document['maps']} maps from the model's own prior, {made}{rate}"
-    others = document["elsewhere"]
-    abstained = document["maps"] - document["ranked"] - others["number"]
     why = ", ".join(f"{code} {number}" for code, number in document["abstained"].items())
-    yield f"no estimate on {abstained}{f' ({why})' if why else ''}: left out, ranks are conditional on detection"
-    told = f"another rise was measured on {others['number']}, announced {others['announced']:.1f}"
+    abstained = f"{document['maps'] - document['ranked'] - others['number']}{f' ({why})' if why else ''}"
+    yield f"no estimate on {abstained}: left out, ranks are conditional on detection"
     sure = f"FAILS, the draws keep to one place (p = {others['chance']:.1g})" if others["too_many"] else "ok"
-    yield f"{told}: {sure}; left out"
+    yield f"another rise was measured on {others['number']}, announced {others['announced']:.1f}: {sure}; left out"
+    if not tests:
+        return
     drawn = ", ".join(f"{name} {number}" for name, number in document["drawn_by"].items())
-    if document["parameters"]:
-        yield f"ranks among {DRAWS} draws, drawn by: {drawn}"
-        yield ""
-        yield f"{'parameter':<11}{'chi2 p':>7}{'ECDF p':>8}  {'50 % holds':<16}{'90 % holds':<16}verdict"
-        yield from map(_row, document["parameters"])
-        yield "+- is one binomial standard error of a calibrated interval."
-    yield RESEARCH_USE
+    yield f"ranks among {DRAWS} draws, drawn by: {drawn}"
+    yield ""
+    yield f"{'parameter':<11}{'chi2 p':>7}{'ECDF p':>8}  {'50 % holds':<16}{'90 % holds':<16}verdict"
+    for one in tests:
+        held = "".join(f"{100 * c['covered']:.1f} +- {100 * c['error']:.1f} %".ljust(16) for c in one["coverage"])
+        told = one["verdict"].removeprefix("FAILS: ").removeprefix("ranks are ")
+        yield f"{one['name']:<11}{one['chi2_p']:>7.3f}{one['ecdf_p']:>8.3f}  {held}{told}"
+    yield "+- is one binomial standard error of a calibrated interval."
 
 
-def _row(one: dict[str, Any]) -> str:
-    held = [f"{100 * c['covered']:.1f} +- {100 * c['error']:.1f} %" for c in one["coverage"]]
-    told = one["verdict"].removeprefix("FAILS: ").removeprefix("ranks are ")
-    return f"{one['name']:<11}{one['chi2_p']:>7.3f}{one['ecdf_p']:>8.3f}  {held[0]:<16}{held[1]:<16}{told}"
-
-
-def _conclusion(parameters: list[dict[str, Any]], together: float) -> Iterator[str]:
-    failed = [one["name"] for one in parameters if not one["inside_band"]]
-    band, number = f"{100 * BAND:g} % band", len(parameters)
+def _conclusion(tests: Sequence[dict[str, Any]], together: float) -> Iterator[str]:
+    failed, band = [one["name"] for one in tests if not one["inside_band"]], f"{100 * BAND:g} % band"
     if failed:
         yield f"FAILS for {', '.join(failed)}: the ranks leave their simultaneous {band}."
-        seldom = (
-            f"of {number} calibrated parameters one or more leave theirs in {100 * (1 - BAND**number):.0f} % of runs"
-        )
+        chance = f"{100 * (1 - BAND ** len(tests)):.0f} % of runs"
+        seldom = f"of {len(tests)} calibrated parameters one or more leave theirs in {chance}"
         advice = "run again with another --seed" if together > 1 - BAND else "that is no chance"
-        yield f"All {number} together: p = {together:.2g} ({seldom}); {advice}."
+        yield f"All {len(tests)} together: p = {together:.2g} ({seldom}); {advice}."
     else:
         yield f"All ranks stay in their simultaneous {band}s."
 
@@ -146,9 +137,8 @@ def table_text(maps: Sequence[MapRanks]) -> str:
     header = ["map", *names_of(Truth), *(f"rank_{name}" for name in RANKED), "outcome", "probability"]
     rows = []
     for one in maps:
-        ranks = one.ranks or ()
-        blank = [None] * (len(RANKED) - len(ranks))
-        rows.append([one.index, *as_dict(one.truth).values(), *ranks, *blank, one.outcome, one.probability])
+        ranks = [*(one.ranks or ()), *[None] * len(RANKED)][: len(RANKED)]
+        rows.append([one.index, *as_dict(one.truth).values(), *ranks, one.outcome, one.probability])
     return csv_text(header, rows, digits=8)
 
 
@@ -159,25 +149,17 @@ def sbc_figure(maps: Sequence[MapRanks], path: Path, *, force: bool = False) -> 
     ranks = np.array(found).reshape(-1, len(names))
     n, at = len(ranks), np.arange(1, DRAWS + 1) / (DRAWS + 1)
     inside = {test.name: test.inside for test in rank_tests(list(maps))}
-    with figure_file(path, size_in=(2.2 * len(names), 2.9), force=force) as figure:
-        all_axes = figure.subplots(1, len(names), sharey=True)
-        for axes, name, column in zip(all_axes, names, ranks.T, strict=True):
+    foot = f"{n} maps with an estimate of {len(maps)}; grey: {100 * BAND:g} % band of the whole path."
+    with figure_file(path, size_in=(2.2 * len(names), 2.9), foot=foot, force=force) as figure:
+        for i, (axes, name) in enumerate(zip(figure.subplots(1, len(names), sharey=True), names, strict=True)):
             if n:
                 low, high = ecdf_band(n, DRAWS)
-                share = ecdf_counts(column[None], DRAWS)[0] / n
+                share = ecdf_counts(ranks[None, :, i], DRAWS)[0] / n
                 axes.fill_between(at, low - at, high - at, step="mid", color="0.85", linewidth=0)
-                axes.step(at, share - at, where="mid", color=_COLOURS[0 if inside[name] else 1], linewidth=1.2)
+                axes.step(at, share - at, where="mid", color=COLOURS[0 if inside[name] else 1], linewidth=1.2)
             axes.axhline(0.0, color="0.5", linewidth=0.6)
-            axes.set_title(name, loc="left", fontsize=10)
             axes.set_xticks([0.0, 0.5, 1.0])
-            axes.set_xlabel("rank / (draws + 1)", fontsize=9)
-            axes.tick_params(labelsize=8)
-            axes.spines[["top", "right"]].set_visible(False)
-        all_axes[0].set_ylabel("ECDF of ranks - uniform", fontsize=9)
-        caption = (
-            f"{n} maps with an estimate of {len(maps)}; grey: {100 * BAND:g} % band of the whole path. {RESEARCH_USE}"
-        )
-        figure.text(0.01, 0.01, caption, fontsize=7.5, color="0.3")
+            finish(axes, name, "rank / (draws + 1)", "" if i else "ECDF of ranks - uniform")
 
 
 # --- Tables 1 and 2 of the paper as text and as plain data: ours, the nearest head's and the printed figures.
@@ -202,11 +184,11 @@ def tables_text(
     if nearest is not None and beside is not None:
         lines.append(f"after the slash the head nearest to the print: {named(nearest)}")
     lines += ["in brackets the printed figure", ""]
-    lines += _table("Table 1: frame centred on the lump, MSD %", found, "centred_frame", PRINTED_FRAMES, beside)
-    lines += _table("The same of frames divided by their means, MSD %", found, "normalised_frame", None, beside)
-    lines += _table("All frames of the map, MSD % (printed average 4.3)", found, "all_frames", None, beside)
-    lines += _table("Table 2: map, MSD %", found, "map", PRINTED_MAPS, beside)
-    lines += _table("Map, strict MSD %", found, "map_strict", None, beside)
+    lines += _table("Table 1: frame centred on the lump, MSD %", "centred_frame", found, beside, PRINTED_FRAMES)
+    lines += _table("The same of frames divided by their means, MSD %", "normalised_frame", found, beside)
+    lines += _table("All frames of the map, MSD % (printed average 4.3)", "all_frames", found, beside)
+    lines += _table("Table 2: map, MSD %", "map", found, beside, PRINTED_MAPS)
+    lines += _table("Map, strict MSD %", "map_strict", found, beside)
     lines += _others(found)
     lines += ["Eq 5 fitted to both maps (background 1); the elastic model first:"]
     lines += [f"{'lump':<22}{'a':>13}{'sigma, mm':>14}{'frame %':>11}{'map %':>9}{'strict %':>11}"]
@@ -230,20 +212,21 @@ def heads_text(found: ByHead) -> str:
         f"{'head':<26}{'Table 1 (4.1)':>18}{'all (4.3)':>11}{'Table 2 (2.4)':>18}{'off':>7}",
     ]
     for head, rows in sorted(found.items(), key=lambda item: table_distance(item[1])):
-        frames, maps = _span([one.centred_frame for one in rows]), _span([one.map for one in rows])
-        every = f"{100 * sum(one.all_frames for one in rows) / len(rows):.1f}"
-        name = named(head).replace("shoulders-", "")
+        frames, maps = (_span([getattr(one, name) for one in rows]) for name in ("centred_frame", "map"))
+        every, name = f"{_mean(rows, 'all_frames'):.1f}", named(head).replace("shoulders-", "")
         lines.append(f"{name:<26}{frames:>18}{every:>11}{maps:>18}{table_distance(rows):>7.2f}")
     return "\n".join(lines)
 
 
 def _span(shares: Sequence[float], to: str = " to ") -> str:
     percent = [100 * share for share in shares]
-    return f"{sum(percent) / len(percent):.1f} ({_brief(min(percent))}{to}{_brief(max(percent))})"
+    low, high = (f"{one:.1f}" if one < 10 else f"{one:.0f}" for one in (min(percent), max(percent)))
+    return f"{sum(percent) / len(percent):.1f} ({low}{to}{high})"
 
 
-def _brief(value: float) -> str:
-    return f"{value:.1f}" if value < 10 else f"{value:.0f}"
+def _mean(found: Sequence[Agreement], name: str) -> float:
+    """In percent."""
+    return float(sum(100 * getattr(one, name) for one in found) / len(found))
 
 
 def _answer(found: Sequence[Agreement], beside: Sequence[Agreement] | None) -> str:
@@ -267,41 +250,29 @@ def _others(found: Sequence[Agreement]) -> list[str]:
         f"{'':<32}{'frame':>16}{'frame / mean':>16}{'map':>16}",
     ]
     for i, name in enumerate(OTHER_DEFINITIONS):
-        cells = [_span([one.others[i][of] for one in found], "-") for of in range(3)]
+        cells = (_span(shares, "-") for shares in zip(*(one.others[i] for one in found), strict=True))
         lines.append(f"{name.replace('root mean square', 'RMS'):<32}" + "".join(f"{cell:>16}" for cell in cells))
     return [*lines, ""]
 
 
 def _table(
     title: str,
-    found: Sequence[Agreement],
     name: str,
-    printed: Mapping[float, Sequence[float]] | None,
+    found: Sequence[Agreement],
     beside: Sequence[Agreement] | None,
+    printed: Mapping[float, Sequence[float]] | None = None,
 ) -> list[str]:
     """One table with diameters across: this head / the nearest head (printed)."""
     lines = [title, f"{'h/d':>5}" + "".join(f"{f'd {d:g} mm':>15}" for d in TABLE_DIAMETERS_MM)]
+    heads = [found] if beside is None else [found, beside]
     for depth in dict.fromkeys(one.scene.depth_ratio for one in found):
-        cells = [f"{value:.1f}" for value in _row_of_tables(found, name, depth)]
-        if beside is not None:
-            cells = [
-                f"{cell}/{value:.1f}" for cell, value in zip(cells, _row_of_tables(beside, name, depth), strict=True)
-            ]
+        of_depth = ([getattr(one, name) for one in rows if one.scene.depth_ratio == depth] for rows in heads)
+        cells = ["/".join(f"{100 * share:.1f}" for share in shares) for shares in zip(*of_depth, strict=True)]
         if printed is not None:
             cells = [f"{cell} ({value:.1f})" for cell, value in zip(cells, printed[depth], strict=True)]
         lines.append(f"{depth:>5g}" + "".join(f"{cell:>15}" for cell in cells))
-    mean = f"mean {_mean(found, name):.1f}" + ("" if beside is None else f" / {_mean(beside, name):.1f}")
-    if printed is None:
-        return [*lines, mean, ""]
-    return [*lines, f"{mean} (of the printed cells {_printed_mean(printed):.1f})", ""]
-
-
-def _row_of_tables(found: Sequence[Agreement], name: str, depth_ratio: float) -> list[float]:
-    return [100 * getattr(one, name) for one in found if one.scene.depth_ratio == depth_ratio]
-
-
-def _mean(found: Sequence[Agreement], name: str) -> float:
-    return float(sum(100 * getattr(one, name) for one in found) / len(found))
+    mean = "mean " + " / ".join(f"{_mean(rows, name):.1f}" for rows in heads)
+    return [*lines, mean + ("" if printed is None else f" (of the printed cells {_printed_mean(printed):.1f})"), ""]
 
 
 def tables_document(found: ByHead, phantoms: ByHead, *, seat: float) -> dict[str, object]:
@@ -369,6 +340,10 @@ class TradeoffReport(Record, eq=False):
         """Difference of the size from the model's reference, in mm."""
         return self.size_mm(one) - self.size_mm(self.reference(one.setting.model))
 
+    def default(self, model: str) -> Measured:
+        """What the program does by itself with the model."""
+        return next(one for one in self.of(model) if one.setting.kind == "default")
+
 
 def tradeoff_text(report: TradeoffReport) -> str:
     """Accuracy that the case does not need, then two tables of all settings: cost and size, and the map."""
@@ -430,8 +405,7 @@ def advice(report: TradeoffReport) -> list[str]:
     if warning := outside_range(report.case.d_mm, report.case.depth_ratio):
         lines.append(warning)
     for model in (SOLID, PLANE):
-        rule = report.rules[model]
-        default = _default(report, model)
+        rule, default = report.rules[model], report.default(model)
         lines.append(
             f"{model}: sizes by {rule.source}, which itself leaves {100 * rule.scatter:.0f} % (SD of ln d); "
             f"the default mesh leaves {_percent(report.size_error(default))} ({report.size_change_mm(default):+.3f} mm)"
@@ -449,17 +423,13 @@ def _enough(report: TradeoffReport, model: str) -> str:
     limit = f"{100 * report.tolerance:g} %"
     if least is None or least.setting.kind == "reference":
         return f"{model}: only the finest setting keeps the size within {limit}"
-    finest, default = report.reference(model), _default(report, model)
+    finest, default = report.reference(model), report.default(model)
     text = (
         f"{model}: {least.setting.label} (elements of {least.element_mm:.1f} mm) keeps the size within {limit} at "
         f"{least.seconds:.2f} s CPU; a mesh finer than {least.element_mm:.1f} mm is wasted below that, "
         f"the finest costs {finest.seconds / least.seconds:.0f} times as much"
     )
     return text if default is least else f"{text}, the default {default.seconds / least.seconds:.1f} times"
-
-
-def _default(report: TradeoffReport, model: str) -> Measured:
-    return next(one for one in report.of(model) if one.setting.kind == "default")
 
 
 def _percent(share: float) -> str:
@@ -471,12 +441,7 @@ def tradeoff_document(report: TradeoffReport) -> dict[str, Any]:
     case = report.case
     return {
         "schema": "tactile-bayes/tradeoff-forward/1",
-        "lump": {
-            "d_mm": case.d_mm,
-            "depth_ratio": case.depth_ratio,
-            "stiffness_ratio": case.stiffness_ratio,
-            "seat": case.seat,
-        },
+        "lump": {name: getattr(case, name) for name in ("d_mm", "depth_ratio", "stiffness_ratio", "seat")},
         "head": case.heads,
         "tolerance": report.tolerance,
         "sizes": {model: {"source": rule.source, "sd_ln_d": rule.scatter} for model, rule in report.rules.items()},
@@ -509,12 +474,11 @@ def _row_of_setting(one: Measured, report: TradeoffReport) -> dict[str, Any]:
 
 # Smaller errors are drawn here: below rounding of what anybody reads.
 _LEAST_PERCENT = 0.003
-_SIZE_IN = (8.5, 5.0)
 
 
 def draw_tradeoff(report: TradeoffReport, path: Path, *, force: bool = False) -> None:
     """Draw all settings except the references, whose error is 0 by definition."""
-    with figure_file(path, size_in=_SIZE_IN, force=force) as figure:
+    with figure_file(path, size_in=(8.5, 5.0), force=force) as figure:
         axes = figure.subplots()
         taken: Counter[tuple[int, int]] = Counter()
         for i, model in enumerate((EMPIRICAL, PLANE, SOLID)):
@@ -522,34 +486,24 @@ def draw_tradeoff(report: TradeoffReport, path: Path, *, force: bool = False) ->
             seconds = [one.seconds for one in shown]
             error = [max(100 * abs(report.size_error(one)), _LEAST_PERCENT) for one in shown]
             axes.plot(seconds, error, MARKS[i], color=COLOURS[i], label=model)
+            beside: dict[str, Any] = {"textcoords": "offset points", "fontsize": 7}
             for one, x, y in zip(shown, seconds, error, strict=True):
                 name = one.setting.label + (" (default)" if one.setting.kind == "default" else "")
                 place = (round(2 * np.log10(x)), round(4 * np.log10(y)))
-                axes.annotate(name, (x, y), xytext=(7, 3 + 9 * taken[place]), textcoords="offset points", fontsize=7)
+                axes.annotate(name, (x, y), xytext=(7, 3 + 9 * taken[place]), **beside)
                 taken[place] += 1
-            if model != EMPIRICAL:
-                finest = report.reference(model).seconds
-                axes.axvline(finest, color=COLOURS[i], lw=0.8, ls=":")
-                axes.annotate(
-                    f"{model}, finest",
-                    (finest, _LEAST_PERCENT),
-                    xytext=(2, 2),
-                    textcoords="offset points",
-                    fontsize=7,
-                    rotation=90,
-                )
-        axes.axhline(100 * report.tolerance, color="0.6", lw=0.8)
-        for model in (PLANE, SOLID):
-            scatter = 100 * report.rules[model].scatter
+            if model == EMPIRICAL:
+                continue
+            finest, scatter = report.reference(model).seconds, 100 * report.rules[model].scatter
+            axes.axvline(finest, color=COLOURS[i], lw=0.8, ls=":")
+            axes.annotate(f"{model}, finest", (finest, _LEAST_PERCENT), xytext=(2, 2), rotation=90, **beside)
             if np.isfinite(scatter):
-                axes.axhline(scatter, color=COLOURS[1 if model == PLANE else 2], lw=0.8, ls="--")
+                axes.axhline(scatter, color=COLOURS[i], lw=0.8, ls="--")
+        axes.axhline(100 * report.tolerance, color="0.6", lw=0.8)
         axes.set_xscale("log")
         axes.set_yscale("log")
         axes.margins(x=0.2, y=0.1)
         case = report.case
-        title = (
-            f"one lump, d {case.d_mm:g} mm, h/d {case.depth_ratio:g}; "
-            "grey: not worth paying for; dashed: the calibration itself"
-        )
+        title = f"one lump, d {case.d_mm:g} mm, h/d {case.depth_ratio:g}; "
+        title += "grey: not worth paying for; dashed: the calibration itself"
         finish(axes, title, "CPU for one map (s)", "error in size (%)")
-        figure.text(0.01, 0.01, RESEARCH_USE, fontsize=7.5, color="0.3")

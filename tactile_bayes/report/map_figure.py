@@ -11,10 +11,10 @@ import numpy as np
 
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError
+from tactile_bayes.files.reports import EstimateReport, MassReport
 from tactile_bayes.findings import Finding
 from tactile_bayes.mapping.map import FEW_READINGS, TactileMap
 from tactile_bayes.mapping.places import Orientation, orientation_of
-from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.figure_file import figure_file, load_matplotlib
 
 if TYPE_CHECKING:
@@ -67,13 +67,25 @@ class Place(Record):
     reason: str
 
 
-class NumberedMass(Record):
-    """One of several masses on the map; `size_mm` along its ellipse's axes, None without a size."""
+def contour_of(report: EstimateReport) -> FitContour | None:
+    """Ellipse and size of an estimate's lump, at the posterior medians; None without one."""
+    centre, across, along = report.centre_mm, report.sigma_x_mm, report.sigma_y_mm
+    level, height, angle = report.background, report.amplitude, report.angle_deg
+    if centre is None or across is None or along is None or level is None or height is None:
+        return None
+    turn = 0.0 if angle is None else angle.median
+    widths = across.median, along.median
+    return FitContour(centre.median, *widths, turn, _size_mm(report), level.median, height.median)
 
-    number: int
-    centre_mm: tuple[float, float]
-    size_mm: tuple[float, float] | None = None
-    angle_deg: float = 0.0
+
+def places_of(report: EstimateReport) -> list[Place]:
+    """The places of an estimate that were looked at in vain."""
+    return [Place((one.x_mm, one.y_mm), one.fault) for one in report.candidates if one.fault]
+
+
+def _size_mm(told: EstimateReport | MassReport) -> tuple[float, float] | None:
+    """Size of a mass along its ellipse's axes; None without one."""
+    return None if told.d_x_mm is None or told.d_y_mm is None else (told.d_x_mm.median, told.d_y_mm.median)
 
 
 def map_figure(
@@ -81,7 +93,7 @@ def map_figure(
     path: Path | None,
     *,
     fit: FitContour | None = None,
-    masses: Sequence[NumberedMass] = (),
+    masses: Sequence[MassReport] = (),
     looked_at: Sequence[Place] = (),
     title: str = "",
     note: str = "",
@@ -103,7 +115,8 @@ def map_figure(
         raise BadDataError("the map holds no data to draw", way_out="make it from a scan with frames in the window")
     view = orientation_of(tactile_map)
     told = tactile_map.findings if findings is None else findings
-    with figure_file(path, size_in=_MOST_IN, trim=True, force=force, findings=told) as figure:
+    foot = _caption(tactile_map, view)
+    with figure_file(path, size_in=_MOST_IN, trim=True, foot=foot, force=force, findings=told) as figure:
         left, right = figure.subplots(1, 2, width_ratios=(1.55, 1.0))
         _draw_values(left, tactile_map, view, fit)
         _draw_coverage(right, tactile_map, view)
@@ -113,7 +126,7 @@ def map_figure(
         if fit:
             _draw_fit(left, fit, view)
         if len(masses) > 1:
-            _draw_masses(left, masses, fit, view)
+            _draw_masses(left, masses, view)
         _draw_scale_bar(left)
         draw_edges(left, view)
         _draw_notch(left, view)
@@ -122,7 +135,6 @@ def map_figure(
         left.set_title(title or "Tactile map", loc="left", fontsize=11)
         if note:
             figure.suptitle(textwrap.fill(note, 130), x=0.01, ha="left", fontsize=9.5)
-        figure.text(0.01, 0.01, _caption(tactile_map, view), fontsize=7.5, color="0.3")
     return figure
 
 
@@ -138,17 +150,20 @@ def _extent(tactile_map: TactileMap, view: Orientation) -> tuple[float, float, f
     return (float(across[0]) - half, float(across[-1]) + half, float(up[0]) - half, float(up[-1]) + half)
 
 
-def _draw_cells(axes: Axes, values: Any, tactile_map: TactileMap, view: Orientation, **how: Any) -> Any:
-    """Draw cell values as an image; masked cells stay grey."""
+def draw_cells(axes: Axes, values: Any, extent: Any, **how: Any) -> Any:
+    """Draw values as an image between the ends of its axes; masked cells stay grey."""
     axes.set_facecolor("0.85")
-    across = values.T if view.swapped else values
-    return axes.imshow(across, origin="lower", extent=_extent(tactile_map, view), interpolation="nearest", **how)
+    return axes.imshow(values, origin="lower", extent=extent, interpolation="nearest", **how)
+
+
+def _draw_map(axes: Axes, values: Any, tactile_map: TactileMap, view: Orientation, **how: Any) -> Any:
+    return draw_cells(axes, values.T if view.swapped else values, _extent(tactile_map, view), **how)
 
 
 def draw_panel(axes: Axes, values: Any, tactile_map: TactileMap, *, label: str, title: str, **how: Any) -> None:
     """Draw cells in the map's orientation, with its sides and a colour bar; NaN stays grey."""
     view = orientation_of(tactile_map)
-    image = _draw_cells(axes, np.ma.masked_invalid(values), tactile_map, view, **how)
+    image = _draw_map(axes, np.ma.masked_invalid(values), tactile_map, view, **how)
     _colour_bar(axes, image, label)
     _orient(axes, view, tactile_map)
     draw_edges(axes, view)
@@ -162,7 +177,7 @@ def _draw_values(axes: Axes, tactile_map: TactileMap, view: Orientation, fit: Fi
     if fit is not None and fit.amplitude is not None:
         top = min(highest, max(_LEAST_COLOURS[1] * fit.level, fit.level + _AMPLITUDES_SHOWN * fit.amplitude))
     values = np.ma.masked_where(~tactile_map.covered, tactile_map.mean)
-    image = _draw_cells(axes, values, tactile_map, view, cmap="viridis", vmin=lowest, vmax=top)
+    image = _draw_map(axes, values, tactile_map, view, cmap="viridis", vmin=lowest, vmax=top)
     _colour_bar(axes, image, tactile_map.recipe.value_words, extend="max" if top < highest else "neither")
 
 
@@ -177,7 +192,7 @@ def _colour_range(tactile_map: TactileMap) -> tuple[float, float]:
 def _draw_coverage(axes: Axes, tactile_map: TactileMap, view: Orientation) -> None:
     """Draw the number of readings per cell."""
     counts = np.ma.masked_equal(tactile_map.count, 0)
-    image = _draw_cells(axes, counts, tactile_map, view, cmap="cividis", vmin=0)
+    image = _draw_map(axes, counts, tactile_map, view, cmap="cividis", vmin=0)
     if tactile_map.counts_known:
         _colour_bar(axes, image, "readings per cell")
         axes.set_title("Coverage", loc="left", fontsize=11)
@@ -199,42 +214,29 @@ def _hatch_few(axes: Axes, tactile_map: TactileMap, view: Orientation) -> None:
     left, right, bottom, top = _extent(tactile_map, view)
     height = top - bottom
     starts = np.arange(left - height, right, max(right - left, height) / _HATCHES)
-    lines = load_matplotlib().collections.LineCollection(
-        [[(start, bottom), (start + height, top)] for start in starts],
-        colors="white",
-        linewidths=0.7,
-        path_effects=_outlined(1.6),
-    )
+    slants = [[(start, bottom), (start + height, top)] for start in starts]
+    looks: dict[str, Any] = {"colors": "white", "linewidths": 0.7, "path_effects": _outlined(1.6)}
+    lines = load_matplotlib().collections.LineCollection(slants, **looks)
     axes.add_collection(lines, autolim=False)
     lines.set_clip_path(cells, axes.transData)
 
 
 def _explain(axes: Axes, tactile_map: TactileMap, places: Sequence[Place]) -> None:
     """Explain hatching and places below the coverage panel, where no cell is hidden."""
-    lines = [f"{number}  {_at(place)}: {place.reason}" for number, place in enumerate(places, start=1)]
+    at = "({:.0f}, {:.0f}) mm"
+    lines = [f"{i}  {at.format(*place.centre_mm)}: {place.reason}" for i, place in enumerate(places, start=1)]
     wrapped = [textwrap.wrap(line, 66, subsequent_indent="    ", max_lines=2) for line in lines[:_EXPLAINED_PLACES]]
     shown = ["\n".join(line) for line in wrapped]
     if len(lines) > len(shown):
         shown.append(f"and {len(lines) - len(shown)} lower ones")
     if shown:
-        axes.annotate(
-            "\n".join(shown),
-            (0.0, 0.0),
-            xycoords="axes fraction",
-            xytext=(0, -54),  # below the legend
-            textcoords="offset points",
-            va="top",
-            fontsize=7,
-        )
+        below_the_legend: dict[str, Any] = {"xytext": (0, -54), "textcoords": "offset points", "va": "top"}
+        axes.annotate("\n".join(shown), (0.0, 0.0), xycoords="axes fraction", fontsize=7, **below_the_legend)
     if not tactile_map.few.any():
         return
     sample = load_matplotlib().patches.Patch(facecolor="0.35", edgecolor="white", hatch="////", linewidth=0)
     label = f"fewer than {FEW_READINGS} readings: noisy"
     axes.legend([sample], [label], fontsize=8, frameon=False, **_BELOW)
-
-
-def _at(place: Place) -> str:
-    return "({:.0f}, {:.0f}) mm".format(*place.centre_mm)
 
 
 def _colour_bar(axes: Axes, image: Any, label: str, *, extend: Any = "neither") -> None:
@@ -273,16 +275,8 @@ def draw_edges(axes: Axes, view: Orientation) -> None:
     aligned = {"left": ("left", "center"), "right": ("right", "center"), "top": ("center", "top")}
     for side, name in view.edges.items():
         across, up = aligned.get(side, ("center", "bottom"))
-        axes.text(
-            *places[side],
-            name,
-            transform=axes.transAxes,
-            ha=across,
-            va=up,
-            color="white",
-            fontsize=10,
-            path_effects=_outlined(2.5),
-        )
+        looks: dict[str, Any] = {"ha": across, "va": up, "color": "white", "fontsize": 10}
+        axes.text(*places[side], name, transform=axes.transAxes, path_effects=_outlined(2.5), **looks)
 
 
 def _draw_fit(axes: Axes, fit: FitContour, view: Orientation) -> None:
@@ -310,23 +304,20 @@ def _draw_ellipse(
     axes.add_patch(ellipse)
 
 
-def _draw_masses(axes: Axes, masses: Sequence[NumberedMass], fit: FitContour | None, view: Orientation) -> None:
+def _draw_masses(axes: Axes, masses: Sequence[MassReport], view: Orientation) -> None:
     """Draw the number of each mass, and a cross and the size of those besides the fitted lump."""
     for mass in masses:
-        centre = _pair(view, *mass.centre_mm)
-        above = max(mass.size_mm or (0.0, 0.0)) / 2.0
-        axes.annotate(
-            f"mass {mass.number}",
-            (centre[0], centre[1] + (above if axes.get_ylim()[1] > axes.get_ylim()[0] else -above)),
-            xytext=(0, 4),
-            path_effects=_outlined(2.5),
-            **_ABOVE,
-        )
-        if fit is not None and mass.centre_mm == fit.centre_mm:
+        centre, size_mm = _pair(view, *mass.centre_mm.median), _size_mm(mass)
+        above = max(size_mm or (0.0, 0.0)) / 2.0
+        top = centre[1] + (above if axes.get_ylim()[1] > axes.get_ylim()[0] else -above)
+        words = f"mass {mass.number}"
+        axes.annotate(words, (centre[0], top), xytext=(0, 4), path_effects=_outlined(2.5), **_ABOVE)
+        if mass.reported:
             continue
         axes.plot(*centre, "+", color="white", markersize=7, markeredgewidth=1.4, path_effects=_outlined(3.0))
-        if mass.size_mm is not None:
-            _draw_ellipse(axes, centre, mass.size_mm, mass.angle_deg, view, linewidth=1.0)
+        if size_mm is not None:
+            angle = 0.0 if mass.angle_deg is None else mass.angle_deg.median
+            _draw_ellipse(axes, centre, size_mm, angle, view, linewidth=1.0)
 
 
 def _draw_places(axes: Axes, places: Sequence[Place], view: Orientation) -> None:
@@ -335,16 +326,8 @@ def _draw_places(axes: Axes, places: Sequence[Place], view: Orientation) -> None
         at = _pair(view, *place.centre_mm)
         axes.plot(*at, "x", color="white", markersize=6, markeredgewidth=1.4, path_effects=_outlined(3.0))
         if number <= _EXPLAINED_PLACES:
-            axes.annotate(
-                str(number),
-                at,
-                xytext=(6, 0),
-                textcoords="offset points",
-                va="center",
-                color="white",
-                fontsize=9,
-                path_effects=_outlined(2.5),
-            )
+            beside = _ABOVE | {"ha": "left", "va": "center", "fontsize": 9, "path_effects": _outlined(2.5)}
+            axes.annotate(f"{number}", at, xytext=(6, 0), **beside)
 
 
 def _draw_scale_bar(axes: Axes) -> None:
@@ -355,13 +338,8 @@ def _draw_scale_bar(axes: Axes) -> None:
     height = bottom + 0.06 * (top - bottom)
     ends = [start, start + sign * _SCALE_BAR_MM]
     axes.plot(ends, [height, height], color="white", linewidth=3, path_effects=_outlined(4))
-    axes.annotate(
-        f"{_SCALE_BAR_MM:g} mm",
-        (start + sign * _SCALE_BAR_MM / 2, height),
-        xytext=(0, 4),
-        path_effects=_outlined(2),
-        **_ABOVE,
-    )
+    middle = (start + sign * _SCALE_BAR_MM / 2, height)
+    axes.annotate(f"{_SCALE_BAR_MM:g} mm", middle, xytext=(0, 4), path_effects=_outlined(2), **_ABOVE)
 
 
 def _draw_notch(axes: Axes, view: Orientation) -> None:
@@ -372,16 +350,10 @@ def _draw_notch(axes: Axes, view: Orientation) -> None:
     tail, length = (0.86, 0.08), 0.16
     across, up = view.notch
     tip = (tail[0] + length * across * abs((top - bottom) / (right - left)), tail[1] + length * up)
-    axes.annotate(
-        "",
-        tip,
-        tail,
-        xycoords="axes fraction",
-        arrowprops={"arrowstyle": "-|>", "color": "white", "linewidth": 1.8, "path_effects": _outlined(3)},
-    )
-    axes.annotate(
-        "to sternal\nnotch", tip, xycoords="axes fraction", xytext=(0, 3), path_effects=_outlined(2), **_ABOVE
-    )
+    arrow = {"arrowstyle": "-|>", "color": "white", "linewidth": 1.8, "path_effects": _outlined(3)}
+    axes.annotate("", tip, tail, xycoords="axes fraction", arrowprops=arrow)
+    words: dict[str, Any] = {"xycoords": "axes fraction", "path_effects": _outlined(2)} | _ABOVE
+    axes.annotate("to sternal\nnotch", tip, xytext=(0, 3), **words)
 
 
 def _caption(tactile_map: TactileMap, view: Orientation) -> str:
@@ -391,4 +363,4 @@ def _caption(tactile_map: TactileMap, view: Orientation) -> str:
         facts.append("window {:g} to {:g} kPa".format(*recipe.pressure_window_kpa))
     if tactile_map.frame_count:
         facts.append(f"{tactile_map.frame_count} frames")
-    return f"{view.words}.  {', '.join(facts)}.  {RESEARCH_USE}"
+    return f"{view.words}.  {', '.join(facts)}."

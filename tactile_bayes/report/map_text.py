@@ -16,8 +16,9 @@ from tactile_bayes.hardware.recorder import Report
 from tactile_bayes.mapping.errors import LEAST_SHARE
 from tactile_bayes.mapping.map import FEW_READINGS, TactileMap, advise_cell, skewed
 from tactile_bayes.mapping.places import Orientation, orientation_of
+from tactile_bayes.mapping.plausibility import WHY_NOT
 from tactile_bayes.mapping.profile import SPAN_MM
-from tactile_bayes.presets import CELL_PER_SIGMA, POSE_NOISE, RESEARCH_USE, VIRIDIS
+from tactile_bayes.presets import CELL_PER_SIGMA, RESEARCH_USE, VIRIDIS
 
 # --- Text of a recording's account.
 
@@ -193,12 +194,37 @@ _UNITS = {
     "mean": "times the mean of their frames (normalise mean)",
     "gain": "times the level beside a lump (normalise gain)",
 }
-_DROPPED = (
-    ("dropped_low", "pressed below {0:g} kPa"),
-    ("dropped_high", "pressed above {1:g} kPa"),
-    ("dropped_no_pose", "without a tracker pose"),
-    ("dropped_elements", "with too few valid taxels"),
-)
+_DROPPED = WHY_NOT | {"dropped_low": "pressed below {0:g} kPa", "dropped_high": "pressed above {1:g} kPa"}
+# Rows of the full report: a name, the figure without which there is none, and the text; after "+" what is added to it.
+_ROWS: Final = """
+frames | frame_rate_hz | {frame_rate_hz:.1f} Hz, jitter {frame_jitter_ms:.2f} ms, {frames_missing:.0f} missing
+poses | pose_rate_hz | {pose_rate_hz:.1f} Hz, {pose_repeats:.0f} repeats dropped, longest gap {pose_gap_ms:.0f} ms
+latency | latency_sd_ms | {latency_ms:.2f} +- {latency_sd_ms:.2f} ms, from {latency_frames:.0f} frames
++ | latency_sd_ms |  (a mobile lump mimics one)
+ | latency_bound_ms | noise of readings and tracker alone would leave +-{latency_bound_ms:.2f} ms
+plane | plane_rms_mm | rms {plane_rms_mm:.1f} mm, {tilt_deg:.1f} deg from the head's face
+  fitted to | plane_condition | {fitted_to}
++ | plane_radius_mm |  within {plane_radius_mm:.0f} mm of the mass
++ | plane_condition | ; longest over second spread {plane_condition:.1f}
+rotations | normal_agreement | face and motion agree to {normal_agreement:.3f} of 1, as the quaternions are told
+head | plane_rms_mm | turned by {yaw_sd_deg:.1f} deg (SD), moved {span_x_mm:.0f} x {span_y_mm:.0f} mm
+patient axes | plane_rms_mm | {patient_axes}
+strokes | strokes | {strokes_known:.0f} of {strokes:.0f} shifted onto each other
+  shifts | strokes | along x, mm; {shifts}
+mobility | mobility_mm | {mobility_mm:.2f} +- {mobility_sd_mm:.2f} mm with the head
++ | mobility_mm |  (a latency left in the poses looks alike)
+frames' places | pose_noise_x_mm | known to {pose_noise_x_mm:.2f} by {pose_noise_y_mm:.2f} mm
++ | pose_noise_x_mm |  (SD a frame, by its neighbours)
+head profile | head_profile_frames | second order {head_profile_x2:+.3f} across, {head_profile_y2:+.3f} along,
++ | head_profile_frames |  from {head_profile_frames:.0f} frames without a lump
+  evenness | profile_change | changes by {profile_change:.3f} +- {profile_change_sd:.3f} over {span_mm:g} mm
++ | stroke_skew | ; skewed along the strokes by {stroke_skew:+.3f} +- {stroke_skew_sd:.3f}
+skin | skin_curvature_per_m | curved by {skin_curvature_per_m:+.1f} per m along the head's path (convex above 0)
+stroke lag | stroke_lag_mm | lump ahead by {stroke_lag_mm:+.2f} +- {stroke_lag_sd_mm:.2f} mm along the strokes
++ | stroke_lag_mm |  (below 0: a latency left in the poses)
+flat field | flat_field_frames | from {flat_field_frames:.0f} frames without a lump;
++ | flat_field_frames |  taxels differ by {flat_field_percent:.1f} % (SD)
+"""
 
 
 def map_summary(tactile_map: TactileMap, *, written: str) -> str:
@@ -228,7 +254,7 @@ def map_summary(tactile_map: TactileMap, *, written: str) -> str:
 
 def map_text(tactile_map: TactileMap) -> str:
     """Full report of a map: cautions, a table, what is to be checked, notes and the research-use line."""
-    parts = (_what, _frames, _timing, _plane, _strokes, _cells)
+    parts = (_what, _frames, _making, _cells)
     rows = [row for part in parts for row in part(tactile_map)]
     width = max(len(name) for name, _ in rows)
     lines = [f"{name.ljust(width)}  {text}" for name, text in rows]
@@ -267,121 +293,61 @@ def _dropped(tactile_map: TactileMap) -> Iterator[str]:
     """How many frames were left out for each reason."""
     quality = tactile_map.quality
     window = tactile_map.recipe.pressure_window_kpa or (np.nan, np.nan)
-    yield from (f"{quality[name]:.0f} {reason.format(*window)}" for name, reason in _DROPPED if quality.get(name))
+    yield from (f"{quality[name]:.0f} {why.format(*window)}" for name, why in _DROPPED.items() if quality.get(name))
 
 
-def _timing(tactile_map: TactileMap) -> Iterator[tuple[str, str]]:
-    """Regularity of frames and poses, and the latency."""
+def _making(tactile_map: TactileMap) -> Iterator[tuple[str, str]]:
+    """Timing, plane, and what the strokes tell: `_ROWS`, as far as the map has their figures."""
     quality = tactile_map.quality
-    if "frame_rate_hz" in quality:
-        jitter, missing = quality["frame_jitter_ms"], quality["frames_missing"]
-        yield "frames", f"{quality['frame_rate_hz']:.1f} Hz, jitter {jitter:.2f} ms, {missing:.0f} missing"
-    if "pose_rate_hz" in quality:
-        repeats, gap = quality["pose_repeats"], quality["pose_gap_ms"]
-        yield "poses", f"{quality['pose_rate_hz']:.1f} Hz, {repeats:.0f} repeats dropped, longest gap {gap:.0f} ms"
-    if "latency_sd_ms" in quality:
-        found = f"{tactile_map.recipe.latency_ms:.2f} +- {quality['latency_sd_ms']:.2f} ms"
-        yield "latency", f"{found}, from {quality['latency_frames']:.0f} frames (a mobile lump mimics one)"
-        if "latency_bound_ms" in quality:
-            yield "", f"noise of readings and tracker alone would leave +-{quality['latency_bound_ms']:.2f} ms"
-
-
-def _strokes(tactile_map: TactileMap) -> Iterator[tuple[str, str]]:
-    """Registration of strokes, the head's pressure profile and taxel response."""
-    quality = tactile_map.quality
-    if "strokes" in quality:
-        known = f"{quality['strokes_known']:.0f} of {quality['strokes']:.0f} shifted onto each other"
-        yield "strokes", known
-        shifts = [
-            f"{number}: {quality[f'stroke_{number}_shift_x_mm']:+.2f} +- {quality[f'stroke_{number}_sd_x_mm']:.2f}"
-            for number in range(1, int(quality["strokes"]) + 1)
-            if f"stroke_{number}_shift_x_mm" in quality
-        ]
-        yield "  shifts", f"along x, mm; {', '.join(shifts)}"
-    if "mobility_mm" in quality:
-        moved = f"{quality['mobility_mm']:.2f} +- {quality['mobility_sd_mm']:.2f} mm with the head"
-        yield "mobility", f"{moved} (a latency left in the poses looks alike)"
-    if POSE_NOISE[0] in quality:
-        across, along = (quality[name] for name in POSE_NOISE[:2])
-        yield "frames' places", f"known to {across:.2f} by {along:.2f} mm (SD a frame, by its neighbours)"
-    if "head_profile_frames" in quality:
-        across, along = (quality[f"head_profile_{axis}2"] for axis in "xy")
-        frames = f"from {quality['head_profile_frames']:.0f} frames without a lump"
-        yield "head profile", f"second order {across:+.3f} across, {along:+.3f} along, {frames}"
-    if "profile_change" in quality:
-        change, sd = quality["profile_change"], quality["profile_change_sd"]
-        skew = ""
-        if "stroke_skew" in quality:
-            skew = f"; skewed along the strokes by {quality['stroke_skew']:+.3f} +- {quality['stroke_skew_sd']:.3f}"
-        yield "  evenness", f"changes by {change:.3f} +- {sd:.3f} over {SPAN_MM:g} mm{skew}"
-    if "skin_curvature_per_m" in quality:
-        yield "skin", f"curved by {quality['skin_curvature_per_m']:+.1f} per m along the head's path (convex above 0)"
-    if "stroke_lag_mm" in quality:
-        lag = f"{quality['stroke_lag_mm']:+.2f} +- {quality['stroke_lag_sd_mm']:.2f} mm"
-        yield "stroke lag", f"lump ahead by {lag} along the strokes (below 0: a latency left in the poses)"
-    if "flat_field_frames" in quality:
-        spread = 100 * quality["flat_field_sd"]
-        yield (
-            "flat field",
-            f"from {quality['flat_field_frames']:.0f} frames without a lump; taxels differ by {spread:.1f} % (SD)",
-        )
-
-
-def _plane(tactile_map: TactileMap) -> Iterator[tuple[str, str]]:
-    """Fit of the plane, and the head's tilt and yaw."""
-    quality = tactile_map.quality
-    if "plane_rms_mm" not in quality:
-        return
-    yield "plane", f"rms {quality['plane_rms_mm']:.1f} mm, {quality['tilt_deg']:.1f} deg from the head's face"
-    if "plane_condition" in quality:
-        of = f"{quality['plane_frames']:.0f} frames" if "plane_frames" in quality else "all frames used"
-        near = f" within {quality['plane_radius_mm']:.0f} mm of the mass" if "plane_radius_mm" in quality else ""
-        yield "  fitted to", f"{of}{near}; longest over second spread {quality['plane_condition']:.1f}"
-    if "normal_agreement" in quality:
-        yield (
-            "rotations",
-            f"face and motion agree to {quality['normal_agreement']:.3f} of 1, as the quaternions are told",
-        )
-    moved = f"{quality['span_x_mm']:.0f} x {quality['span_y_mm']:.0f} mm"
-    yield "head", f"turned by {quality['yaw_sd_deg']:.1f} deg (SD), moved {moved}"
-    repeats = quality.get("landmark_spread_mm")
-    spread = "" if repeats is None else f", repeats within {repeats:.1f} mm"
-    axes = f"from the landmarks{spread}" if tactile_map.patient_from_plane is not None else "none: no landmarks"
-    yield "patient axes", axes
+    shifts = [
+        f"{number}: {quality[f'stroke_{number}_shift_x_mm']:+.2f} +- {quality[f'stroke_{number}_sd_x_mm']:.2f}"
+        for number in range(1, int(quality.get("strokes", 0)) + 1)
+        if f"stroke_{number}_shift_x_mm" in quality
+    ]
+    axes = "none: no landmarks"
+    if tactile_map.patient_from_plane is not None:
+        repeats = quality.get("landmark_spread_mm")
+        axes = "from the landmarks" + ("" if repeats is None else f", repeats within {repeats:.1f} mm")
+    values = {
+        **quality,
+        "latency_ms": tactile_map.recipe.latency_ms,
+        "fitted_to": f"{quality['plane_frames']:.0f} frames" if "plane_frames" in quality else "all frames used",
+        "patient_axes": axes,
+        "shifts": ", ".join(shifts),
+        "span_mm": SPAN_MM,
+        "flat_field_percent": 100 * quality.get("flat_field_sd", np.nan),
+    }
+    rows: list[tuple[str, str]] = []
+    for line in _ROWS.strip("\n").splitlines():
+        name, figure, text = line.split("|")
+        if figure.strip() in quality:
+            first, before = rows.pop() if name == "+ " else (name.rstrip(), "")
+            rows.append((first, before + text.removeprefix(" ").format_map(values)))
+    yield from rows
 
 
 def _cells(tactile_map: TactileMap) -> Iterator[tuple[str, str]]:
+    """Coverage, error correlation within a frame, and what the cells resolve."""
     quality = tactile_map.quality
     if "coverage" in quality:
-        yield (
-            "coverage",
-            f"{100 * quality['coverage']:.0f} % of the cells, {quality['median_count']:.0f} readings a cell",
-        )
-    yield from _shared(tactile_map)
+        covered = f"{100 * quality['coverage']:.0f} % of the cells"
+        yield "coverage", f"{covered}, {quality['median_count']:.0f} readings a cell"
+    if "effective_readings" in quality:
+        share = f"under {100 * LEAST_SHARE:.0f} %"
+        if quality["shared_share"] >= LEAST_SHARE:
+            share = f"{100 * quality['shared_share']:.0f} %"
+        length = f", over {quality['shared_length_mm']:.1f} mm" if "shared_length_mm" in quality else ""
+        readings = f"{quality['median_count']:.0f} readings a cell"
+        worth = f"{readings} are worth {quality['effective_readings']:.0f} independent ones"
+        yield "shared errors", f"{share} of a reading's variance is its neighbours' in the frame too{length}; {worth}"
+    elif "median_count" in quality:
+        yield "shared errors", "not known: too few frames that cross each other's cells, or readings without scatter"
     yield "resolves", f"lumps of map width sigma {tactile_map.recipe.cell_mm / CELL_PER_SIGMA:.2g} mm or more"
     advice = advise_cell(tactile_map)
     if advice is not None:
         yield "cell", advice.text()
     if tactile_map.recipe.normalise == "gain":
         yield "gain solve", f"{quality['gain_passes']:.0f} passes, last change {quality['gain_last_change']:.1e}"
-
-
-def _shared(tactile_map: TactileMap) -> Iterator[tuple[str, str]]:
-    """Error correlation within a frame, and the effective number of readings per cell."""
-    quality = tactile_map.quality
-    if "median_count" not in quality:
-        return
-    if "effective_readings" not in quality:
-        yield "shared errors", "not known: too few frames that cross each other's cells, or readings without scatter"
-        return
-    share = f"under {100 * LEAST_SHARE:.0f} %"
-    if quality["shared_share"] >= LEAST_SHARE:
-        share = f"{100 * quality['shared_share']:.0f} %"
-    length = f", over {quality['shared_length_mm']:.1f} mm" if "shared_length_mm" in quality else ""
-    worth = (
-        f"{quality['median_count']:.0f} readings a cell are worth {quality['effective_readings']:.0f} independent ones"
-    )
-    yield "shared errors", f"{share} of a reading's variance is its neighbours' in the frame too{length}; {worth}"
 
 
 def _notes(tactile_map: TactileMap) -> Iterator[str]:

@@ -13,8 +13,8 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.white import BumpFit
 from tactile_bayes.presets import RESEARCH_USE, SHOULDERS_INSIDE
-from tactile_bayes.report.figure_file import figure_file
-from tactile_bayes.report.study import finish
+from tactile_bayes.report.figure_file import figure_file, finish
+from tactile_bayes.report.study import COLOURS
 from tactile_bayes.studies.model_comparison import (
     NEAR_MM,
     MeasuredFrames,
@@ -37,8 +37,11 @@ if TYPE_CHECKING:
 
 def named(head: Head) -> str:
     """A head in a few words."""
-    arc = "flat" if np.isinf(head.radius_mm) else f"R {head.radius_mm:g} mm"
-    return f"{arc}, {head.shoulders} of {head.shoulder_mm:g} mm"
+    return f"{_arc(head)}, {head.shoulders} of {head.shoulder_mm:g} mm"
+
+
+def _arc(head: Head) -> str:
+    return "flat" if np.isinf(head.radius_mm) else f"R {head.radius_mm:g} mm"
 
 
 def uniformity_text(found: Uniformity, tissue: HomogeneousTissue, *, limit: float) -> str:
@@ -59,15 +62,16 @@ def design_text(found: Sequence[Uniformity], tissue: HomogeneousTissue, *, limit
     lines = [_tissue_line(tissue)]
     count = sum(one.worst <= limit for one in found)
     lines.append(f"{count} of {len(found)} heads stay within {100 * limit:g} % of the mean")
-    best, answer = most_even(found), narrowest(found, limit=limit)
-    lines.append(f"most even: {named(best.head)}, {100 * best.worst:.1f} %, face {best.face_mm:.1f} mm wide")
-    if answer is not None:
-        words = f"{100 * answer.worst:.1f} %, face {answer.face_mm:.1f} mm wide"
-        lines += [f"narrowest within the limit: {named(answer.head)}, {words}", *_pressure_table(answer, tissue)]
-    by_rms = narrowest(found, limit=limit, by_rms=True)
-    if by_rms is not None:
-        words = f"{100 * by_rms.worst_rms:.1f} %, face {by_rms.face_mm:.1f} mm wide"
-        lines.append(f"narrowest whose root mean square is within it: {named(by_rms.head)}, {words}")
+
+    def told(one: Uniformity, worst: float) -> str:
+        return f"{named(one.head)}, {100 * worst:.1f} %, face {one.face_mm:.1f} mm wide"
+
+    best = most_even(found)
+    lines.append(f"most even: {told(best, best.worst)}")
+    if (answer := narrowest(found, limit=limit)) is not None:
+        lines += [f"narrowest within the limit: {told(answer, answer.worst)}", *_pressure_table(answer, tissue)]
+    if (by_rms := narrowest(found, limit=limit, by_rms=True)) is not None:
+        lines.append(f"narrowest whose root mean square is within it: {told(by_rms, by_rms.worst_rms)}")
     for kind in dict.fromkeys(one.head.shoulders for one in found):
         lines += ["", *_grid(kind, [one for one in found if one.head.shoulders == kind], limit=limit)]
     return "\n".join(lines)
@@ -78,7 +82,7 @@ def uniformity_document(found: Uniformity, tissue: HomogeneousTissue, *, limit: 
     return {
         "schema": "tactile-bayes/head-uniformity/1",
         **_tissue_document(tissue, limit),
-        **_head_document(found),
+        **(_head_document(found) or {}),
         "largest": found.largest.tolist(),
         "rms": found.rms.tolist(),
         "within_limit": found.worst <= limit,
@@ -88,14 +92,13 @@ def uniformity_document(found: Uniformity, tissue: HomogeneousTissue, *, limit: 
 
 def design_document(found: Sequence[Uniformity], tissue: HomogeneousTissue, *, limit: float) -> dict[str, object]:
     """The whole search as plain data; `answer` is None where no head meets the limit."""
-    answer, by_rms = narrowest(found, limit=limit), narrowest(found, limit=limit, by_rms=True)
     return {
         "schema": "tactile-bayes/head-design/1",
         **_tissue_document(tissue, limit),
         "heads": [_head_document(one) for one in found],
         "most_even": _head_document(most_even(found)),
-        "answer": None if answer is None else _head_document(answer),
-        "answer_by_rms": None if by_rms is None else _head_document(by_rms),
+        "answer": _head_document(narrowest(found, limit=limit)),
+        "answer_by_rms": _head_document(narrowest(found, limit=limit, by_rms=True)),
         "research_use": RESEARCH_USE,
     }
 
@@ -144,8 +147,10 @@ def _tissue_document(tissue: HomogeneousTissue, limit: float) -> dict[str, objec
     }
 
 
-def _head_document(found: Uniformity) -> dict[str, Any]:
+def _head_document(found: Uniformity | None) -> dict[str, Any] | None:
     """JSON has no infinity: a flat head's radius is null."""
+    if found is None:
+        return None
     head = found.head
     return {
         "radius_mm": None if np.isinf(head.radius_mm) else head.radius_mm,
@@ -159,9 +164,8 @@ def _head_document(found: Uniformity) -> dict[str, Any]:
 
 # --- The homogeneous-pressure condition as a picture: non-uniformity over radius and shoulder, and the answer's frames.
 
-_HEAD_SIZE_IN = (12.0, 7.4)
 _LEAST, _MOST = 2.0, 200.0  # per cent, ends of the colours
-_MODULUS_COLOURS = ("#1f3b73", "#2a8c6e", "#c8641e")
+_MODULUS_COLOURS = (COLOURS[0], COLOURS[2], COLOURS[1])
 
 
 def design_figure(
@@ -170,37 +174,31 @@ def design_figure(
     """Draw the search, for the place of the shoulders that holds the answer; `limit` is a share of the mean."""
     answer = narrowest(found, limit=limit) or most_even(found)
     shown = [one for one in found if one.head.shoulders == answer.head.shoulders]
-    with figure_file(path, size_in=_HEAD_SIZE_IN, force=force) as figure:
-        axes = figure.subplots(2, 3)
-        pressures = tissue.pressures_kpa
-        for k, part in enumerate((axes[0, 0], axes[0, 1], axes[0, 2])):
-            worst = {_key(one): float(one.largest[:, k].max()) for one in shown}
-            _draw_grid(part, worst, f"({'abc'[k]}) {pressures[k]:g} kPa, any modulus", limit, answer)
-        worst = {_key(one): one.worst for one in shown}
-        mesh = _draw_grid(axes[1, 0], worst, "(d) any modulus and pressure", limit, answer)
-        figure.colorbar(mesh, ax=axes[0, 2], label="largest departure from the mean, %")
-        _draw_shares(axes[1, 1], answer, tissue, limit, "(e) cross")
+    text = (
+        f"Homogeneous tissue of {tissue.modulus_kpa[0]:g} to {tissue.modulus_kpa[1]:g} kPa, {tissue.thickness_mm:g} mm "
+        f"thick, {answer.head.shoulders}; black line and grey band: {100 * limit:g} %; cross: {named(answer.head)}."
+    )
+    with figure_file(path, size_in=(12.0, 7.4), foot=text, force=force) as figure:
+        upper, (every, cross, simulated) = figure.subplots(2, 3)
+        for k, (axes, pressure) in enumerate(zip(upper, tissue.pressures_kpa, strict=True)):
+            worst = [float(one.largest[:, k].max()) for one in shown]
+            _draw_grid(axes, shown, worst, f"({'abc'[k]}) {pressure:g} kPa, any modulus", limit, answer)
+        worst = [one.worst for one in shown]
+        mesh = _draw_grid(every, shown, worst, "(d) any modulus and pressure", limit, answer)
+        figure.colorbar(mesh, ax=upper[2], label="largest departure from the mean, %")
+        _draw_shares(cross, answer, tissue, limit, "(e) cross")
         plain = min(shown, key=lambda one: (abs(one.head.radius_mm - 35.0), abs(one.head.shoulder_mm - 3.0)))
-        _draw_shares(axes[1, 2], plain, tissue, limit, "(f) simulated head")
-        text = (
-            f"Homogeneous tissue of {tissue.modulus_kpa[0]:g} to {tissue.modulus_kpa[1]:g} kPa, "
-            f"{tissue.thickness_mm:g} mm thick, {answer.head.shoulders}; black line and grey band: {100 * limit:g} %; "
-            f"cross: {named(answer.head)}.  {RESEARCH_USE}"
-        )
-        figure.text(0.01, 0.01, text, fontsize=8, color="0.3")
-
-
-def _key(one: Uniformity) -> tuple[float, float]:
-    return one.head.radius_mm, one.head.shoulder_mm
+        _draw_shares(simulated, plain, tissue, limit, "(f) simulated head")
 
 
 def _draw_grid(
-    axes: Axes, worst: dict[tuple[float, float], float], title: str, limit: float, answer: Uniformity
+    axes: Axes, found: Sequence[Uniformity], worst: Sequence[float], title: str, limit: float, answer: Uniformity
 ) -> QuadMesh:
     """Radius across, shoulder up, colours on a logarithmic scale; the heads within the limit are outlined."""
-    radii = sorted({key[0] for key in worst})
-    shoulders = sorted({key[1] for key in worst})
-    cells: FloatArray = np.array([[100 * worst.get((r, s), np.nan) for r in radii] for s in shoulders])
+    radii, shoulders = (sorted({getattr(one.head, name) for one in found}) for name in ("radius_mm", "shoulder_mm"))
+    cells: FloatArray = np.full((len(shoulders), len(radii)), np.nan)
+    for one, value in zip(found, worst, strict=True):
+        cells[shoulders.index(one.head.shoulder_mm), radii.index(one.head.radius_mm)] = 100 * value
     places = np.arange(len(radii)), np.arange(len(shoulders))
     mesh = axes.pcolormesh(*places, cells, cmap="cividis", norm="log", vmin=_LEAST, vmax=_MOST)
     for i, j in zip(*np.nonzero(cells <= 100 * limit), strict=True):
@@ -209,10 +207,15 @@ def _draw_grid(
     axes.plot(*place, "x", color="white", markersize=9, markeredgewidth=2.5)
     axes.set_xticks(range(len(radii)), ["flat" if np.isinf(r) else f"{r:g}" for r in radii], fontsize=7, rotation=60)
     axes.set_yticks(range(len(shoulders)), [f"{s:g}" for s in shoulders], fontsize=7)
-    axes.set_title(title, loc="left", fontsize=10)
-    axes.set_xlabel("radius of the arc (mm)", fontsize=9)
-    axes.set_ylabel("radius of the shoulders (mm)", fontsize=9)
+    _label(axes, title, "radius of the arc (mm)", "radius of the shoulders (mm)")
     return mesh
+
+
+def _label(axes: Axes, title: str, across: str, up: str) -> None:
+    """Title and labels of a picture of cells, which has a frame."""
+    axes.set_title(title, loc="left", fontsize=10)
+    axes.set_xlabel(across, fontsize=9)
+    axes.set_ylabel(up, fontsize=9)
 
 
 def _draw_shares(axes: Axes, one: Uniformity, tissue: HomogeneousTissue, limit: float, title: str) -> None:
@@ -223,19 +226,20 @@ def _draw_shares(axes: Axes, one: Uniformity, tissue: HomogeneousTissue, limit: 
             axes.plot(one.s_mm, share, line, color=colour, label=text)
     axes.axhspan(1 - limit, 1 + limit, color="0.88", zorder=0)
     axes.set_ylim(0.0, 2.6)
-    arc = "flat" if np.isinf(one.head.radius_mm) else f"R {one.head.radius_mm:g} mm"
-    axes.set_title(f"{title}: {arc}, shoulders {one.head.shoulder_mm:g} mm", loc="left", fontsize=10)
-    axes.set_xlabel("position on the head (mm)", fontsize=9)
-    axes.set_ylabel("pressure / mean of its frame", fontsize=9)
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.legend(fontsize=6.5, frameon=False, ncols=2, loc="upper center")
+    title = f"{title}: {_arc(one.head)}, shoulders {one.head.shoulder_mm:g} mm"
+    across, up = "position on the head (mm)", "pressure / mean of its frame"
+    finish(axes, title, across, up, loc="upper center", fontsize=6.5, ncols=2)
 
 
 # --- A scan against forward models, as text and as plain data.
 
 _BESIDE = 3  #: Models that stand side by side in 80 columns.
 DEFINITION = "MSD = sum of squared differences over the sum of squares of the model (docs/decisions/0007)"
-_SLOPE = ("slope_x_per_10mm", "slope_y_per_10mm", "rms_beside_slope")
+_SLOPE = {
+    "slope_x_per_10mm": "map: residual's slope in x, per 10 mm",
+    "slope_y_per_10mm": "the same in y",
+    "rms_beside_slope": "RMS beside the slope",
+}
 _PRINTED = {"frames_centre": "below 15", "map_centre": "below 2.6"}
 _ROWS = {
     "frames_all": "frames, all taxels, MSD %",
@@ -267,36 +271,34 @@ def comparison_text(measured: MeasuredFrames, found: Sequence[ModelComparison]) 
 
 def _columns(measured: MeasuredFrames, found: Sequence[ModelComparison]) -> Iterator[str]:
     names = [one.fidelity.partition("-") for one in found]
-    yield _cells("", "paper", [first for first, _, _ in names])
+    yield _cells("", "paper", *(first for first, _, _ in names))
     if any(second for _, _, second in names):
-        yield _cells("", "", [second for _, _, second in names])
+        yield _cells("", "", *(second for _, _, second in names))
     for name, words in _ROWS.items():
-        yield _cells(words, _PRINTED.get(name, ""), [f"{100 * getattr(one, name):.2f}" for one in found])
-    yield _cells("taxel, root mean square difference, kPa", "", [f"{one.rms_kpa:.3f}" for one in found])
-    slopes = zip(*(residual_slope(measured, one) for one in found), strict=True)
-    slope_words = ("map: residual's slope in x, per 10 mm", "the same in y", "RMS beside the slope")
-    for words, values in zip(slope_words, slopes, strict=True):
-        yield _cells(words, "", [f"{value:.4f}" for value in values])
+        yield _cells(words, _PRINTED.get(name, ""), *(f"{100 * getattr(one, name):.2f}" for one in found))
+    yield _cells("taxel, root mean square difference, kPa", "", *(f"{one.rms_kpa:.3f}" for one in found))
+    slopes = np.transpose([residual_slope(measured, one) for one in found])
+    for words, values in zip(_SLOPE.values(), slopes, strict=True):
+        yield _cells(words, "", *(f"{value:.4f}" for value in values))
+    every: list[MeasuredFrames | ModelComparison] = [measured, *found]
+    bumps = np.transpose([_shape(one.lump) for one in every])
+    on_line = np.transpose([line_bump(measured, one.tactile_map) for one in every])
     yield ""
-    yield _cells("Eq 7 on the map, level 1", "measured", [])
-    shapes = zip(*(_shape(one) for one in (measured.lump, *(one.lump for one in found))), strict=True)
-    for words, values in zip(("amplitude", "sigma across the head, mm", "sigma along it, mm"), shapes, strict=True):
-        yield _cells(words, *_plain(values))
+    yield _cells("Eq 7 on the map, level 1", "measured")
+    for words, values in zip(("amplitude", "sigma across the head, mm", "sigma along it, mm"), bumps, strict=True):
+        yield _cells(words, *map(_plain, values))
     yield "Eq 5 on its centre line across the lump, level 1"
-    maps = [measured.tactile_map, *(one.tactile_map for one in found)]
-    bumps = zip(*(line_bump(measured, one) for one in maps), strict=True)
-    for words, values in zip(("amplitude", "sigma, mm"), bumps, strict=True):
-        yield _cells(words, *_plain(values))
+    for words, values in zip(("amplitude", "sigma, mm"), on_line, strict=True):
+        yield _cells(words, *map(_plain, values))
 
 
-def _cells(words: str, beside: str, models: Sequence[str]) -> str:
+def _cells(words: str, beside: str, *models: str) -> str:
     return f"{words:<39}{beside:>10}{''.join(f'{cell:>10}' for cell in models)}"
 
 
-def _plain(values: Sequence[float]) -> tuple[str, list[str]]:
-    """What was measured, and the models: one without a bump in the map's plane, as a cylinder, has none to show."""
-    first, *models = (f"{value:.3f}" if np.isfinite(value) else "none" for value in values)
-    return first, models
+def _plain(value: float) -> str:
+    """A model without a bump in the map's plane, such as a cylinder, has none to show."""
+    return f"{value:.3f}" if np.isfinite(value) else "none"
 
 
 def comparison_document(
@@ -343,8 +345,6 @@ def _number(value: float) -> float | None:
 
 # --- A scan against forward models, as Fig 6 of the paper: frames, the map's centre line, both maps and the residual.
 
-_MODEL_SIZE_IN = (12.0, 8.0)
-_MODEL_COLOURS = ("#1f3b73", "#c8641e", "#2a8c6e", "#8a4fa3")
 _LINES = ("-", ":", "--", "-.")
 _PLACES_MM = (0.0, 6.0)
 # Frames this near to a place, and this near to the lump along the head, are averaged.
@@ -356,7 +356,7 @@ def comparison_figure(
     measured: MeasuredFrames, found: Sequence[ModelComparison], path: Path, *, title: str, force: bool = False
 ) -> None:
     """Draw the comparison; maps and residual are those of the first model."""
-    with figure_file(path, size_in=_MODEL_SIZE_IN, force=force) as figure:
+    with figure_file(path, size_in=(12.0, 8.0), foot=f"{title}.", force=force) as figure:
         (frames, line, beside), (seen, model, left) = figure.subplots(2, 3)
         _draw_frames(frames, measured, found, _PLACES_MM[0], "(a)")
         _draw_frames(line, measured, found, _PLACES_MM[1], "(b)")
@@ -370,7 +370,6 @@ def comparison_figure(
         most = float(np.nanmax(np.abs(residual)))
         mesh = _draw_map(left, measured, residual, "(f) measured less modelled", (-most, most), "RdBu_r")
         figure.colorbar(mesh, ax=left, shrink=0.7, label="difference")
-        figure.text(0.01, 0.01, f"{title}.  {RESEARCH_USE}", fontsize=8, color="0.3")
 
 
 def _draw_frames(
@@ -384,7 +383,7 @@ def _draw_frames(
     s: FloatArray = pitch * (np.arange(count) - 0.5 * (count - 1))
     if near.any():
         axes.plot(s, centre_line(measured.pressure_kpa)[near].mean(axis=0), color="0.55", lw=3.5, label="measured")
-        for one, colour, style in zip(found, _MODEL_COLOURS, _LINES, strict=False):
+        for one, colour, style in zip(found, COLOURS, _LINES, strict=False):
             axes.plot(s, centre_line(one.pressure_kpa)[near].mean(axis=0), style, color=colour, label=one.fidelity)
     words = f"head {place_mm:g} mm from the lump, {near.sum()} frames"
     finish(axes, f"{letter} {words}", "position on the head (mm)", "pressure (kPa)")
@@ -395,13 +394,12 @@ def _draw_line(axes: Axes, measured: MeasuredFrames, found: Sequence[ModelCompar
     x, mean = centre_row(measured, measured.tactile_map)
     near = np.abs(x) <= NEAR_MM
     axes.plot(x[near], mean[near], "x", color="0.45", markersize=4, label="measured")
-    for one, colour, style in zip(found, _MODEL_COLOURS, _LINES, strict=False):
+    for one, colour, style in zip(found, COLOURS, _LINES, strict=False):
         x, mean = centre_row(measured, one.tactile_map)
         near = np.abs(x) <= NEAR_MM
         axes.plot(x[near], mean[near], style, color=colour, label=f"{one.fidelity} (MSD {100 * one.map_centre:.2f} %)")
-    low, high = axes.get_ylim()
-    axes.set_ylim(low, high + 0.35 * (high - low))
-    finish(axes, "(c) the map across the lump", "distance from the lump (mm)", "pressure / mean of its frame")
+    across, up = "distance from the lump (mm)", "pressure / mean of its frame"
+    finish(axes, "(c) the map across the lump", across, up, headroom=0.35)
 
 
 def _draw_map(
@@ -411,7 +409,5 @@ def _draw_map(
     mesh = axes.pcolormesh(made.x_mm, made.y_mm, values, cmap=colours, vmin=ends[0], vmax=ends[1], shading="nearest")
     axes.plot(*measured.place_mm, "+", color="black", markersize=10)
     axes.set_aspect("equal")
-    axes.set_title(title, loc="left", fontsize=10)
-    axes.set_xlabel("x of the map (mm)", fontsize=9)
-    axes.set_ylabel("y of the map (mm)", fontsize=9)
+    _label(axes, title, "x of the map (mm)", "y of the map (mm)")
     return mesh

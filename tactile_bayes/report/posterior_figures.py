@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.figure_file import figure_file
 
 if TYPE_CHECKING:
@@ -48,7 +46,8 @@ def trace_figure(draws: Mapping[str, FloatArray], path: Path | None, *, title: s
         (chain, draw) arrays by name; those of `LABELS` are drawn.
     """
     shown = drawn_quantities(draws)
-    with _page(path, (9.0, 1.25 * len(shown) + 1.0), title or "Traces", force=force) as figure:
+    with figure_file(path, size_in=(9.0, 1.25 * len(shown) + 1.0), force=force) as figure:
+        figure.suptitle(title or "Traces", fontsize=11)
         grid = figure.subplots(len(shown), 2, squeeze=False, width_ratios=(1, 2))
         for (density, trace), (label, chains) in zip(grid, shown.items(), strict=True):
             low, high = np.nanquantile(chains, _SHOWN)
@@ -63,9 +62,8 @@ def trace_figure(draws: Mapping[str, FloatArray], path: Path | None, *, title: s
             trace.margins(x=0.0)
             for axes in (density, trace):
                 _bare(axes)
-        grid[-1, 1].set_xlabel(
-            "draw" if len(next(iter(shown.values()))) == 1 else "draw of a chain, walker after walker"
-        )
+        several = len(next(iter(shown.values()))) > 1
+        grid[-1, 1].set_xlabel("draw of a chain, walker after walker" if several else "draw")
     return figure
 
 
@@ -76,12 +74,8 @@ def rank_figure(draws: Mapping[str, FloatArray], path: Path | None, *, title: st
     """
     shown = drawn_quantities(draws)
     chains = len(next(iter(shown.values())))
-    with _page(
-        path,
-        (1.9 * chains + 1.6, 1.05 * len(shown) + 1.0),
-        f"{title or 'Chains'}: ranks among all chains, grey: 3 SD of chance",
-        force=force,
-    ) as figure:
+    with figure_file(path, size_in=(1.9 * chains + 1.6, 1.05 * len(shown) + 1.0), force=force) as figure:
+        figure.suptitle(f"{title or 'Chains'}: ranks among all chains, grey: 3 SD of chance", fontsize=11)
         grid = figure.subplots(len(shown), chains, squeeze=False, sharex=True, sharey=True)
         for row, (label, values) in zip(grid, shown.items(), strict=True):
             ranks = np.argsort(np.argsort(values, axis=None)).reshape(values.shape) / values.size
@@ -107,11 +101,11 @@ def corner_figure(
     """Draw each quantity's density on the diagonal, and each pair's with the regions of 50 and 90 % below it."""
     shown = {label: values.ravel() for label, values in drawn_quantities(draws).items()}
     finite = np.all([np.isfinite(values) for values in shown.values()], axis=0)
-    labels, columns = list(shown), [values[finite] for values in shown.values()]
+    labels, columns = [label.replace(", ", ",\n") for label in shown], [values[finite] for values in shown.values()]
     ends = [tuple(np.quantile(values, _SHOWN)) for values in columns]
     number, side = len(labels), 1.35
-    named = f"{title or 'Corner'}: dark 50 %, light 90 % of the draws"
-    with _page(path, (side * number + 1.0, side * number + 1.0), named, force=force) as figure:
+    with figure_file(path, size_in=(side * number + 1.0, side * number + 1.0), force=force) as figure:
+        figure.suptitle(f"{title or 'Corner'}: dark 50 %, light 90 % of the draws", fontsize=11)
         grid: Any = figure.subplots(number, number, squeeze=False)
         for i, j in np.ndindex(number, number):
             axes = grid[i, j]
@@ -124,7 +118,16 @@ def corner_figure(
             else:
                 _pair(axes, columns[j], columns[i], ends[j], ends[i])
             axes.set_xlim(*ends[j])
-            _label_outer(axes, labels, i, j)
+            lowest, leftmost = i == number - 1, j == 0 < i
+            axes.tick_params(labelsize=7, labelbottom=lowest, labelleft=leftmost)
+            axes.locator_params(axis="x", nbins=3)
+            if i != j:
+                axes.locator_params(axis="y", nbins=3)
+            if lowest:
+                axes.set_xlabel(labels[j], fontsize=8)
+                axes.tick_params(axis="x", rotation=45)
+            if leftmost:
+                axes.set_ylabel(labels[i], fontsize=8)
     return figure
 
 
@@ -151,19 +154,6 @@ def _smoothed(density: FloatArray) -> FloatArray:
     return density
 
 
-def _label_outer(axes: Axes, labels: list[str], i: int, j: int) -> None:
-    last = len(labels) - 1
-    axes.tick_params(labelsize=7, labelbottom=i == last, labelleft=j == 0 and i > 0)
-    axes.locator_params(axis="x", nbins=3)
-    if i != j:
-        axes.locator_params(axis="y", nbins=3)
-    if i == last:
-        axes.set_xlabel(labels[j].replace(", ", ",\n"), fontsize=8)
-        axes.tick_params(axis="x", rotation=45)
-    if j == 0 and i > 0:
-        axes.set_ylabel(labels[i].replace(", ", ",\n"), fontsize=8)
-
-
 def _by_chain(chains: FloatArray) -> Iterator[tuple[FloatArray, str]]:
     for number, chain in enumerate(chains):
         yield chain, _COLOURS[number % len(_COLOURS)]
@@ -171,14 +161,4 @@ def _by_chain(chains: FloatArray) -> Iterator[tuple[FloatArray, str]]:
 
 def _bare(axes: Axes) -> None:
     axes.tick_params(labelsize=7)
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
-
-
-@contextmanager
-def _page(path: Path | None, size_in: tuple[float, float], title: str, *, force: bool) -> Iterator[Figure]:
-    """A figure with a title, and what it may be used for at its foot."""
-    with figure_file(path, size_in=size_in, force=force) as figure:
-        figure.suptitle(title, fontsize=11)
-        figure.text(0.01, 0.008, RESEARCH_USE, fontsize=7, color="0.35")
-        yield figure
+    axes.spines[["top", "right"]].set_visible(False)

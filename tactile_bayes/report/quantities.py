@@ -14,7 +14,7 @@ from tactile_bayes.findings import Finding
 from tactile_bayes.geometry import FloatArray, apply
 from tactile_bayes.inference.draws import Quantity, summarise
 from tactile_bayes.mapping.map import TactileMap
-from tactile_bayes.mapping.places import SIDES, ClockPosition, clock_position, clock_text
+from tactile_bayes.mapping.places import SIDES, ClockPosition, Position, clock_position, clock_text
 from tactile_bayes.posterior.draw import MapPosterior
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.size.draws import EXTREMES, SIZES, SizePosterior
@@ -58,13 +58,6 @@ def estimate_quantities(estimate: Estimate, tactile_map: TactileMap, *, probabil
     return found
 
 
-def xiphoid_mm(quantities: Mapping[str, Quantity]) -> tuple[float, float] | None:
-    """Place of the lump, mm from the xiphoid to the patient's right and up; None without landmarks or a lump."""
-    if "centre_patient_mm.x" not in quantities:
-        return None
-    return quantities["centre_patient_mm.x"].median, quantities["centre_patient_mm.y"].median
-
-
 def another_exam(size: SizePosterior | None, quantities: Mapping[str, Quantity]) -> AnotherExam | None:
     """The spread between exams of a mass as a share of its size, and both sizes with it; None where it is not told."""
     if size is None or size.another_exam is None:
@@ -105,11 +98,14 @@ def lump_place(
     )
 
 
-def place_line(place: ClockPosition, probability: float) -> str:
+def place_line(place: Position) -> str:
     """The place with its intervals, as a line of a full report."""
-    hours, (near, far) = place.hours_between(probability), place.distance_between(probability)
-    clock = "" if hours is None else f" {clock_text(hours[0])} to {clock_text(hours[1])} o'clock and"
-    return f"Place: {place.text()}; {100 * probability:g} % interval{clock} {near:.0f} to {far:.0f} mm."
+    hours, distance = place.clock_hours, place.distance_mm
+    clock = ""
+    if hours.low is not None and hours.high is not None:
+        clock = f" {clock_text(hours.low)} to {clock_text(hours.high)} o'clock and"
+    ends = f"{distance.low:.0f} to {distance.high:.0f} mm"
+    return f"Place: {place.text}; {100 * distance.probability:g} % interval{clock} {ends}."
 
 
 def from_xiphoid(x_mm: float, y_mm: float) -> str:

@@ -12,11 +12,11 @@ import numpy as np
 from tactile_bayes.forward.axisymmetric import LayeredBody
 from tactile_bayes.forward.line import LineFrames, build_line
 from tactile_bayes.forward.solid import PlacedLump, SolidHead, face_of, solid_head
-from tactile_bayes.forward.tissue import Body, Layers
+from tactile_bayes.forward.tissue import Layers
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.map import TactileMap
-from tactile_bayes.presets import HEAD_PITCH_MM, RESEARCH_USE, THICKNESS_MM
-from tactile_bayes.report.figure_file import figure_file
+from tactile_bayes.presets import HEAD_PITCH_MM, THICKNESS_MM
+from tactile_bayes.report.figure_file import figure_file, finish
 from tactile_bayes.size.eq6 import AxisCalibration, SizeCalibration
 from tactile_bayes.size.learn.eq6 import SizeTable
 from tactile_bayes.studies.paper import (
@@ -53,19 +53,17 @@ def study_text(rows: Sequence[StudyRow]) -> str:
     heads = dict.fromkeys(row.head for row in rows if row.head is not None)
     if heads:
         lines.append(f"head: {', '.join(heads)}")
-    axes = (
-        {"x": ", across the head", "y": ", along it"} if any(row.sigma_y_mm is not None for row in rows) else {"x": ""}
-    )
     for seat in dict.fromkeys(row.seat for row in rows):
-        for axis, words in axes.items():
-            learned = learn_as_printed([row for row in rows if row.seat == seat], axis=axis)
+        seated = [row for row in rows if row.seat == seat]
+        for axis, words in _axes_of(rows).items():
+            learned = learn_as_printed(seated, axis=axis)
             if learned is not None:
                 lines.append(
-                    f"{seat}, E2/E1 = 100{words}: d = {learned.m:.2f} (sigma / delta) {learned.b_mm:+.2f} mm, "
-                    f"delta = {learned.e:.3f} a^{learned.f:.3f} from {learned.cases} cases "
+                    f"{seat}, E2/E1 = 100{words and f', {words}'}: d = {learned.m:.2f} (sigma / delta) "
+                    f"{learned.b_mm:+.2f} mm, delta = {learned.e:.3f} a^{learned.f:.3f} from {learned.cases} cases "
                     "(Eq 6 in two stages, as printed)"
                 )
-        changes = stiffness_changes([row for row in rows if row.seat == seat])
+        changes = stiffness_changes(seated)
         if changes:
             cells = ", ".join(f"{100 * change:.1f} % at {d:g} mm" for d, change in changes.items())
             lines.append(f"{seat}, width at h/d 1 from E2/E1 = 8 on: within {cells}")
@@ -86,10 +84,8 @@ _OTHER = (15.0, 1.0)
 _BALLS = ((10.0, 0.8), (15.0, 1.0), (20.0, 1.2))
 PHANTOM = "phantom 12.5 mm"
 _FRAME_PLACES_MM = (0.0, 6.0, 12.0, 20.0)
-_FOUR_SIZE_IN = (10.0, 7.6)
 _SMALL, _SMALL_BALL = (5.0, 1.0), (10.0, 1.0)
 _RATIOS = (2.0, 5.0, 8.0, 10.0, 100.0)
-_SIZE_IN = (10.0, 4.3)
 _AXES = {"x": "across the head", "y": "along it"}
 _ON_HEAD, _ON_SKIN, _SHARE = "position on the head (mm)", "place on the skin (mm)", "pressure / mean of its frame"
 
@@ -109,19 +105,27 @@ def study_figures(
     """Draw figures 5 to 8, and the frames of four lumps, as PNG files; returns the pair of lumps that figure 5b shows.
 
     Figures 7b and 8 show what the table holds of this seat, which is that of the lumps in figures 5b to 7a as well.
-    `phantom` is the diameter in mm and h/d of the lump of figure 6; `measured` are frames for
-    figure 6a, in place of the places drawn without any.
+    `phantom` is the diameter in mm and h/d of the lump of figure 6; `measured` are frames for figure 6a, in place of
+    the places drawn without any.
     """
     of_seat = [row for row in rows if row.seat == seat_name(seat)]
     found = find_lookalikes(settings, seat=seat)
-    _frames_of_lumps(settings, paths[0], seat=seat, found=found, force=force)
-    _frames_and_maps(settings, paths[1], seat=seat, phantom=phantom, measured=measured, force=force)
-    d, h = _SMALL
-    curves = _lines_by_stiffness(settings, settings.body(d, h, seat=seat))
-    title, caption = f"(a) maps, d {d:g} mm, h/d {h:g}", _caption("Figure 7", settings, seat)
-    _figure_7(of_seat, paths[2], curves=curves, title=title, caption=caption, force=force)
+    with _panels(paths[0], _caption("Figure 5", settings, seat), force=force) as panels:
+        _frames_of_lumps(*panels, settings, seat, found)
+    with _panels(paths[1], _caption("Figure 6", settings, seat), force=force) as panels:
+        _frames_and_maps(*panels, settings, Scene(PHANTOM, *phantom, seat), measured)
+    with _panels(paths[2], _caption("Figure 7", settings, seat), force=force) as panels:
+        _figure_7(*panels, of_seat, _lines_by_stiffness(settings, seat), "(a) maps, d {:g} mm, h/d {:g}", _SMALL)
     figure_8(of_seat, paths[3], force=force)
-    _four_lumps(settings, paths[4], seat=seat, force=force)
+    with figure_file(paths[4], size_in=(10.0, 7.6), foot=_caption("Dotted: Eq 3", settings, seat), force=force) as four:
+        # frame by frame for the phantoms of section 2.3: its curves "for four lumps"
+        for axes, (d, h) in zip(four.subplots(2, 2).ravel(), PHANTOMS.values(), strict=True):
+            curves = scene_curves(Scene("", d, h, seat), settings)
+            ours, theirs = curves.empirical.as_taxels(HEAD_PITCH_MM), curves.elastic.as_taxels(HEAD_PITCH_MM)
+            share = 100 * mean_squared_difference(ours.pressure_kpa, theirs.pressure_kpa)
+            _draw_frames(axes, theirs, ours)
+            title = f"d {d:g} mm, h/d {h:g}; MSD of all frames {share:.1f} %"
+            finish(axes, title, _ON_HEAD, "pressure (kPa)", headroom=0.15)
     return found
 
 
@@ -135,12 +139,13 @@ def solid_figures(
 ) -> None:
     """Draw the four figures for balls as PNG files; rows and seat are as in `study_figures`."""
     of_seat = [row for row in rows if row.seat == seat_name(seat)]
-    _frames_of_balls(settings, paths[0], seat=seat, force=force)
-    _map_of_ball(settings, paths[1], seat=seat, force=force)
-    d, h = _SMALL_BALL
-    curves = _sections_by_stiffness(settings, settings.body(d, h, seat=seat))
-    title, caption = f"(a) across the head, d {d:g} mm, h/d {h:g}", _caption("Figure 7", settings, seat)
-    _figure_7(of_seat, paths[2], curves=curves, title=title, caption=caption, force=force)
+    with _panels(paths[0], _caption("Figure 5", settings, seat), force=force) as panels:
+        _frames_of_balls(*panels, settings, seat)
+    with _panels(paths[1], _caption("Figure 6", settings, seat), force=force) as panels:
+        _map_of_ball(*panels, settings, seat)
+    with _panels(paths[2], _caption("Figure 7", settings, seat), force=force) as panels:
+        curves = _sections_by_stiffness(settings, seat)
+        _figure_7(*panels, of_seat, curves, "(a) across the head, d {:g} mm, h/d {:g}", _SMALL_BALL)
     figure_8(of_seat, paths[3], force=force)
 
 
@@ -167,10 +172,9 @@ def frames_text(measured: Sequence[FrameAgreement]) -> list[str]:
 @contextmanager
 def _panels(path: Path, caption: str, *, force: bool) -> Iterator[tuple[Axes, Axes]]:
     """Two panels side by side over a caption, written when the block ends."""
-    with figure_file(path, size_in=_SIZE_IN, force=force) as figure:
+    with figure_file(path, size_in=(10.0, 4.3), foot=caption, force=force) as figure:
         left, right = figure.subplots(1, 2)
         yield left, right
-        figure.text(0.01, 0.01, caption, fontsize=7.5, color="0.3")
 
 
 def _caption(name: str, settings: StudySettings | SolidSettings, seat: float) -> str:
@@ -180,72 +184,48 @@ def _caption(name: str, settings: StudySettings | SolidSettings, seat: float) ->
         kind, rim, more = "balls", f"a {settings.head.rim_mm:g} mm rim", ", flat field" if settings.flat_field else ""
     return (
         f"{name}: {kind} {seat_name(seat)}, head R {settings.head.radius_mm:g} mm with {rim}, mean "
-        f"{settings.mean_kpa:g} kPa, nu {settings.poisson:g}, E2/E1 = {HARD_RATIO:g} unless said{more}.  {RESEARCH_USE}"
+        f"{settings.mean_kpa:g} kPa, nu {settings.poisson:g}, E2/E1 = {HARD_RATIO:g} unless said{more}."
     )
 
 
-def finish(axes: Axes, title: str, x_label: str, y_label: str, *, headroom: float = 0.0) -> None:
-    """Title, labels and a legend; `headroom` is space above the curves for it, as a share of their height."""
-    low, high = axes.get_ylim()
-    axes.set_ylim(low, high + headroom * (high - low))
-    axes.set_title(title, loc="left", fontsize=10)
-    axes.set_xlabel(x_label, fontsize=9)
-    axes.set_ylabel(y_label, fontsize=9)
-    axes.tick_params(labelsize=8)
-    axes.spines[["top", "right"]].set_visible(False)
-    if axes.get_legend_handles_labels()[0]:
-        axes.legend(fontsize=7.5, frameon=False)
-
-
-def _frames_of_lumps(
-    settings: StudySettings, path: Path, *, seat: float, found: Lookalikes | None, force: bool
-) -> None:
+def _frames_of_lumps(left: Axes, right: Axes, settings: StudySettings, seat: float, found: Lookalikes | None) -> None:
     """Fig 5: frames far from the lump on fat of six thicknesses with Eq 1, and over lumps, two of which look alike."""
-    with _panels(path, _caption("Figure 5", settings, seat), force=force) as (left, right):
-        for colour, fat in zip(COLOURS, _FAT_MM, strict=True):
-            _draw_far(left, settings, fat, colour)
-        cases = [] if found is None else [(one.d_mm, one.depth_ratio) for one in (found.small, found.large)]
-        for colour, line, (d, h) in zip(COLOURS[1:], ("-", "--", "-"), [*cases, _OTHER], strict=False):
-            surface = settings.surface(settings.body(d, h, seat=seat))
-            elastic = settings.over(surface)
-            right.plot(elastic.s_mm, elastic.at(0.0), line, color=colour, label=f"d {d:g} mm, h/d {h:.3g}")
-        title = (
-            "no two visible lumps" if found is None else f"two differ by {100 * found.difference:.1f} % of their rise"
-        )
-        finish(left, "(a) far from the lump, fat over gland, 70 mm in all", _ON_HEAD, "pressure (kPa)")
-        finish(right, f"(b) over the lump: {title}", _ON_HEAD, "pressure (kPa)", headroom=0.15)
+    for colour, fat in zip(COLOURS, _FAT_MM, strict=True):
+        layers = _plain_layers(settings, fat)
+        frame = settings.far(layers)
+        left.plot(frame.s_mm, frame.pressure_kpa[0], color=colour, label=f"fat {fat:g} mm")
+        if fat == _FITTED_FAT_MM:
+            model = settings.empirical(1.0, layers, frame)
+            text = f"Eq 1 fitted to taxels, fat {fat:g} mm"
+            left.plot(frame.s_mm, model.homogeneous(frame.s_mm), "k:", label=text)
+    cases, title = [_OTHER], "no two visible lumps"
+    if found is not None:
+        cases = [*((one.d_mm, one.depth_ratio) for one in (found.small, found.large)), _OTHER]
+        title = f"two differ by {100 * found.difference:.1f} % of their rise"
+    for colour, line, (d, h) in zip(COLOURS[1:], ("-", "--", "-"), cases, strict=False):
+        elastic = settings.over(settings.surface(settings.body(d, h, seat=seat)))
+        right.plot(elastic.s_mm, elastic.at(0.0), line, color=colour, label=f"d {d:g} mm, h/d {h:.3g}")
+    finish(left, "(a) far from the lump, fat over gland, 70 mm in all", _ON_HEAD, "pressure (kPa)")
+    finish(right, f"(b) over the lump: {title}", _ON_HEAD, "pressure (kPa)", headroom=0.15)
 
 
 def _plain_layers(settings: CaseSettings, fat_mm: float) -> Layers:
     return Layers(fat_mm, THICKNESS_MM, settings.fat_kpa, settings.gland_ratio, settings.poisson)
 
 
-def _draw_far(axes: Axes, settings: StudySettings, fat_mm: float, colour: str) -> None:
-    """P1 on one thickness of fat; on one of them, Eq 1 fitted to what the taxels see."""
-    layers = _plain_layers(settings, fat_mm)
-    frame = settings.far(layers)
-    axes.plot(frame.s_mm, frame.pressure_kpa[0], color=colour, label=f"fat {fat_mm:g} mm")
-    if fat_mm == _FITTED_FAT_MM:
-        model = settings.empirical(1.0, layers, frame)
-        text = f"Eq 1 fitted to taxels, fat {fat_mm:g} mm"
-        axes.plot(frame.s_mm, model.homogeneous(frame.s_mm), "k:", label=text)
-
-
-def _frames_of_balls(settings: SolidSettings, path: Path, *, seat: float, force: bool) -> None:
+def _frames_of_balls(left: Axes, right: Axes, settings: SolidSettings, seat: float) -> None:
     """Fig 5: frames through the middle of the head, far from the lump on fat of several thicknesses, and over balls."""
     s = settings.head.surface_mm()[:, 0, 0]
-    with _panels(path, _caption("Figure 5", settings, seat), force=force) as (left, right):
-        for colour, fat in zip(COLOURS, _FAT_MM, strict=False):
-            plain = solid_head(face_of(settings.head), LayeredBody.of(_plain_layers(settings, fat)))
-            left.plot(s, _middle_frame(plain, [], settings), color=colour, label=f"fat {fat:g} mm")
-        for colour, (d, h) in zip(COLOURS, _BALLS, strict=False):
-            body = settings.body(d, h, seat=seat)
-            lump = settings.placed(settings.condensed(body), HARD_RATIO)
-            frame = _middle_frame(settings.on(body), [lump], settings)
-            right.plot(s, frame, color=colour, label=f"d {d:g} mm, h/d {h:g}")
-        where = "position across the head (mm)"
-        finish(left, "(a) far from the lump, middle of the head", where, "pressure (kPa)")
-        finish(right, "(b) over the ball, middle of the head", where, "pressure (kPa)", headroom=0.15)
+    for colour, fat in zip(COLOURS, _FAT_MM, strict=False):
+        plain = solid_head(face_of(settings.head), LayeredBody.of(_plain_layers(settings, fat)))
+        left.plot(s, _middle_frame(plain, [], settings), color=colour, label=f"fat {fat:g} mm")
+    for colour, (d, h) in zip(COLOURS, _BALLS, strict=False):
+        body = settings.body(d, h, seat=seat)
+        lump = settings.placed(settings.condensed(body), HARD_RATIO)
+        right.plot(s, _middle_frame(settings.on(body), [lump], settings), color=colour, label=f"d {d:g} mm, h/d {h:g}")
+    where = "position across the head (mm)"
+    finish(left, "(a) far from the lump, middle of the head", where, "pressure (kPa)")
+    finish(right, "(b) over the ball, middle of the head", where, "pressure (kPa)", headroom=0.15)
 
 
 def _middle_frame(head: SolidHead, lumps: Sequence[PlacedLump], settings: SolidSettings) -> FloatArray:
@@ -256,35 +236,27 @@ def _middle_frame(head: SolidHead, lumps: Sequence[PlacedLump], settings: SolidS
 
 
 def _frames_and_maps(
-    settings: StudySettings,
-    path: Path,
-    *,
-    seat: float,
-    phantom: tuple[float, float],
-    measured: Sequence[FrameAgreement],
-    force: bool,
+    left: Axes, right: Axes, settings: StudySettings, scene: Scene, measured: Sequence[FrameAgreement]
 ) -> None:
     """Fig 6: frames and map of a phantom, elastic and empirical; measured frames, thick, where there are any."""
-    d, h = phantom
-    curves = scene_curves(Scene(PHANTOM, d, h, seat), settings)
-    with _panels(path, _caption("Figure 6", settings, seat), force=force) as (left, right):
-        for colour, one in zip(COLOURS, measured, strict=False):
-            s = one.measured.s_mm
-            text = f"measured, head at {one.measured.x_c_mm:g} mm"
-            left.plot(s, one.measured.pressure_kpa, color=colour, lw=3.5, alpha=0.4, label=text)
-            left.plot(s, one.elastic_kpa, color=colour)
-            left.plot(s, one.empirical_kpa, ":", color=colour)
-        if not measured:
-            _draw_frames(left, curves.elastic, curves.empirical)
-        near = np.abs(curves.elastic_map.x_mm) <= 40.0
-        x, elastic, empirical = (
-            a[near] for a in (curves.elastic_map.x_mm, curves.elastic_map.mean, curves.empirical_map.mean)
-        )
-        share = 100 * mean_squared_difference(empirical, elastic)
-        right.plot(x, elastic, color=COLOURS[0], label="elastic model")
-        right.plot(x, empirical, ":", color=COLOURS[1], label=f"empirical model (MSD {share:.1f} %)")
-        finish(left, f"(a) frames, d {d:g} mm, h/d {h:g}; dotted: Eq 3", _ON_HEAD, "pressure (kPa)")
-        finish(right, "(b) maps", _ON_SKIN, _SHARE, headroom=0.25)
+    curves = scene_curves(scene, settings)
+    for colour, one in zip(COLOURS, measured, strict=False):
+        s = one.measured.s_mm
+        text = f"measured, head at {one.measured.x_c_mm:g} mm"
+        left.plot(s, one.measured.pressure_kpa, color=colour, lw=3.5, alpha=0.4, label=text)
+        left.plot(s, one.elastic_kpa, color=colour)
+        left.plot(s, one.empirical_kpa, ":", color=colour)
+    if not measured:
+        _draw_frames(left, curves.elastic, curves.empirical)
+    x = curves.elastic_map.x_mm
+    near = np.abs(x) <= 40.0
+    elastic, empirical = curves.elastic_map.mean[near], curves.empirical_map.mean[near]
+    share = 100 * mean_squared_difference(empirical, elastic)
+    right.plot(x[near], elastic, color=COLOURS[0], label="elastic model")
+    right.plot(x[near], empirical, ":", color=COLOURS[1], label=f"empirical model (MSD {share:.1f} %)")
+    title = f"(a) frames, d {scene.d_mm:g} mm, h/d {scene.depth_ratio:g}; dotted: Eq 3"
+    finish(left, title, _ON_HEAD, "pressure (kPa)")
+    finish(right, "(b) maps", _ON_SKIN, _SHARE, headroom=0.25)
 
 
 def _draw_frames(axes: Axes, elastic: LineFrames, empirical: LineFrames) -> None:
@@ -294,37 +266,23 @@ def _draw_frames(axes: Axes, elastic: LineFrames, empirical: LineFrames) -> None
         axes.plot(empirical.s_mm, empirical.at(place), ":", color=colour)
 
 
-def _four_lumps(settings: StudySettings, path: Path, *, seat: float, force: bool) -> None:
-    """Frame by frame for the phantoms of section 2.3, elastic and empirical: its curves "for four lumps"."""
-    with figure_file(path, size_in=_FOUR_SIZE_IN, force=force) as figure:
-        for axes, (d, h) in zip(figure.subplots(2, 2).ravel(), PHANTOMS.values(), strict=True):
-            curves = scene_curves(Scene("", d, h, seat), settings)
-            ours, theirs = curves.empirical.as_taxels(HEAD_PITCH_MM), curves.elastic.as_taxels(HEAD_PITCH_MM)
-            share = 100 * mean_squared_difference(ours.pressure_kpa, theirs.pressure_kpa)
-            _draw_frames(axes, theirs, ours)
-            title = f"d {d:g} mm, h/d {h:g}; MSD of all frames {share:.1f} %"
-            finish(axes, title, _ON_HEAD, "pressure (kPa)", headroom=0.15)
-        figure.text(0.01, 0.01, _caption("Dotted: Eq 3", settings, seat), fontsize=7.5, color="0.3")
-
-
-def _map_of_ball(settings: SolidSettings, path: Path, *, seat: float, force: bool) -> None:
+def _map_of_ball(left: Axes, right: Axes, settings: SolidSettings, seat: float) -> None:
     """Fig 6: the map of the first phantom, and its sections along both axes of the head."""
     d, h = PHANTOMS[PHANTOM]
     body = settings.body(d, h, seat=seat)
     lump = settings.placed(settings.condensed(body), HARD_RATIO)
     made = raster_map(raster_frames(settings.on(body), lump, settings))
-    with _panels(path, _caption("Figure 6", settings, seat), force=force) as (left, right):
-        read_x, read_y = made.covered.any(axis=0), made.covered.any(axis=1)
-        x, y, mean = made.x_mm[read_x], made.y_mm[read_y], made.mean[np.ix_(read_y, read_x)]
-        picture = left.pcolormesh(x, y, mean, cmap="viridis", shading="nearest")
-        left.figure.colorbar(picture, ax=left, label=_SHARE)
-        left.set_aspect("equal")
-        for colour, (axis, name) in zip(COLOURS, _AXES.items(), strict=False):
-            place, value = _section(made, axis)
-            near = np.abs(place) <= 25.0
-            right.plot(place[near], value[near], color=colour, label=name)
-        finish(left, f"(a) map, d {d:g} mm, h/d {h:g}", "across the head (mm)", "along the head (mm)")
-        finish(right, "(b) sections", "distance from the ball's axis (mm)", _SHARE)
+    read_x, read_y = made.covered.any(axis=0), made.covered.any(axis=1)
+    x, y, mean = made.x_mm[read_x], made.y_mm[read_y], made.mean[np.ix_(read_y, read_x)]
+    picture = left.pcolormesh(x, y, mean, cmap="viridis", shading="nearest")
+    left.figure.colorbar(picture, ax=left, label=_SHARE)
+    left.set_aspect("equal")
+    for colour, (axis, name) in zip(COLOURS, _AXES.items(), strict=False):
+        place, value = _section(made, axis)
+        near = np.abs(place) <= 25.0
+        right.plot(place[near], value[near], color=colour, label=name)
+    finish(left, f"(a) map, d {d:g} mm, h/d {h:g}", "across the head (mm)", "along the head (mm)")
+    finish(right, "(b) sections", "distance from the ball's axis (mm)", _SHARE)
 
 
 def _section(made: TactileMap, axis: str) -> tuple[FloatArray, FloatArray]:
@@ -337,17 +295,18 @@ def _section(made: TactileMap, axis: str) -> tuple[FloatArray, FloatArray]:
     return across[read], np.asarray(mean[np.ix_(chosen, read)].mean(axis=0))
 
 
-def _lines_by_stiffness(settings: StudySettings, body: Body) -> Iterator[Curve]:
+def _lines_by_stiffness(settings: StudySettings, seat: float) -> Iterator[Curve]:
     """Maps of a lump of several stiffnesses, with Eq 5 fitted to them."""
-    surface = settings.surface(body)
+    surface = settings.surface(settings.body(*_SMALL, seat=seat))
     for ratio in _RATIOS:
         line = build_line(settings.frames(surface, ratio))
         found = fit_line(line, settings.fit_radius_mm)
         yield line.x_mm, line.mean, f"E2/E1 {ratio:g}: a {found.amplitude:.3f}, sigma {found.sigma_mm:.2f} mm"
 
 
-def _sections_by_stiffness(settings: SolidSettings, body: Body) -> Iterator[Curve]:
+def _sections_by_stiffness(settings: SolidSettings, seat: float) -> Iterator[Curve]:
     """Sections across the head of maps of a ball of several stiffnesses, with Eq 7 fitted to the maps."""
+    body = settings.body(*_SMALL_BALL, seat=seat)
     head, condensed = settings.on(body), settings.condensed(body)
     for ratio in _RATIOS:
         frames = raster_frames(head, settings.placed(condensed, ratio), settings)
@@ -357,25 +316,28 @@ def _sections_by_stiffness(settings: SolidSettings, body: Body) -> Iterator[Curv
 
 
 def _figure_7(
-    rows: Sequence[StudyRow], path: Path, *, curves: Iterable[Curve], title: str, caption: str, force: bool
+    left: Axes, right: Axes, rows: Sequence[StudyRow], curves: Iterable[Curve], title: str, lump: tuple[float, float]
 ) -> None:
     """Maps of a small lump of several stiffnesses, and how little the widths depend on stiffness."""
-    with _panels(path, caption, force=force) as (left, right):
-        for colour, (x, value, text) in zip(COLOURS, curves, strict=False):
-            near = np.abs(x) <= 20.0
-            left.plot(x[near], value[near], color=colour, label=text)
-        level = [row for row in rows if abs(row.depth_ratio - 1.0) < 1e-9 and row.detectable]
-        for i, diameter in enumerate(dict.fromkeys(row.d_mm for row in hard_cases(level))):
-            of_size = [row for row in level if row.d_mm == diameter]
-            for axis, line in zip(_axes_of(rows), ("-", "--"), strict=False):
-                _draw_stiffness(right, of_size, axis, line, i)
-        right.axhspan(0.95, 1.05, color="0.9", zorder=0)
-        right.set_xscale("log")
-        finish(left, title, _ON_SKIN, _SHARE, headroom=0.4)
-        which = "; full across, dashed along" if len(_axes_of(rows)) > 1 else ""
-        finish(
-            right, f"(b) width, h/d 1{which}; grey: 5 %", "stiffness ratio E2/E1", f"sigma / sigma at {HARD_RATIO:g}"
-        )
+    for colour, (x, value, text) in zip(COLOURS, curves, strict=False):
+        near = np.abs(x) <= 20.0
+        left.plot(x[near], value[near], color=colour, label=text)
+    level = [row for row in rows if abs(row.depth_ratio - 1.0) < 1e-9 and row.detectable]
+    for i, diameter in enumerate(dict.fromkeys(row.d_mm for row in hard_cases(level))):
+        of_size = [row for row in level if row.d_mm == diameter]
+        ratios = [row.stiffness_ratio for row in of_size]
+        for axis, line in zip(_axes_of(rows), ("-", "--"), strict=False):
+            sigma = widths(of_size, axis=axis)
+            points = sorted(zip(ratios, sigma / sigma[ratios.index(HARD_RATIO)], strict=True))
+            looks: dict[str, Any] = {"marker": MARKS[i % 6], "color": COLOURS[i % 6]}
+            label = f"d {diameter:g} mm" if axis == "x" else None
+            right.plot(*zip(*points, strict=True), line, label=label, **looks)
+    right.axhspan(0.95, 1.05, color="0.9", zorder=0)
+    right.set_xscale("log")
+    finish(left, title.format(*lump), _ON_SKIN, _SHARE, headroom=0.4)
+    which = "; full across, dashed along" if len(_axes_of(rows)) > 1 else ""
+    title = f"(b) width, h/d 1{which}; grey: 5 %"
+    finish(right, title, "stiffness ratio E2/E1", f"sigma / sigma at {HARD_RATIO:g}")
 
 
 def _axes_of(rows: Sequence[StudyRow]) -> dict[str, str]:
@@ -383,19 +345,10 @@ def _axes_of(rows: Sequence[StudyRow]) -> dict[str, str]:
     return _AXES if any(row.sigma_y_mm is not None for row in rows) else {"x": ""}
 
 
-def _draw_stiffness(axes: Axes, rows: Sequence[StudyRow], axis: str, line: str, i: int) -> None:
-    """Widths of one size of lump over that of the hardest."""
-    sigma = widths(rows, axis=axis)
-    hardest = next(width for row, width in zip(rows, sigma, strict=True) if row.stiffness_ratio == HARD_RATIO)
-    label = f"d {rows[0].d_mm:g} mm" if axis == "x" else None
-    points = sorted(zip((row.stiffness_ratio for row in rows), sigma / hardest, strict=True))
-    axes.plot(*zip(*points, strict=True), line, marker=MARKS[i % 6], color=COLOURS[i % 6], label=label)
-
-
 def figure_8(rows: Sequence[StudyRow], path: Path, *, force: bool = False) -> None:
     """Width change against amplitude and width against diameter, each with its line, for the axes that rows have."""
     seat, kind = rows[0].seat if rows else "no cases", ", balls" if len(_axes_of(rows)) > 1 else ""
-    text = f"Figure 8{kind}: {seat}, E2/E1 = {HARD_RATIO:g}, amplitude at least {DETECTABLE:g}.  {RESEARCH_USE}"
+    text = f"Figure 8{kind}: {seat}, E2/E1 = {HARD_RATIO:g}, amplitude at least {DETECTABLE:g}."
     with _panels(path, text, force=force) as (left, right):
         for i, (axis, words) in enumerate(_axes_of(rows).items()):
             _draw_printed_eq6(left, right, hard_cases(rows), axis, words, i)
@@ -429,9 +382,6 @@ def _draw_printed_eq6(left: Axes, right: Axes, hard: Sequence[StudyRow], axis: s
 
 # --- Fig 8 of the paper for any table of lumps: Eq 6 with the points that it was learned from.
 
-_EQ6_SIZE_IN = (13.0, 4.6)
-_COLOURS, _MARKS = dict(zip("xy", COLOURS, strict=False)), dict(zip("xy", MARKS, strict=False))
-_BAND = (0.05, 0.95)
 _DIAMETERS_MM = (5.0, 10.0, 15.0, 20.0, 25.0)
 
 
@@ -443,52 +393,42 @@ def eq6_figure(
     Rows of `lumps` without a positive amplitude take no part.
     """
     rising = lumps.amplitude > 0
-    axes = [("x", calibration.x, lumps.sigma_x_mm, lumps.width_change_x)]
+    d_mm, amplitude = lumps.d_mm[rising], lumps.amplitude[rising]
+    axes = [(calibration.x, lumps.sigma_x_mm, lumps.width_change_x)]
     if lumps.sigma_y_mm is not None:
-        axes.append(("y", calibration.y, lumps.sigma_y_mm, lumps.width_change_y))
-    with figure_file(path, size_in=_EQ6_SIZE_IN, force=force) as figure:
+        axes.append((calibration.y, lumps.sigma_y_mm, lumps.width_change_y))
+    foot = f"Eq 6 learned from {title or 'the table'}, {int(rising.sum())} lumps."
+    with figure_file(path, size_in=(13.0, 4.6), foot=foot, force=force) as figure:
         change, line, plane = figure.subplots(1, 3)
-        for name, axis, sigma, ratio in axes:
-            known = None if ratio is None else ratio[rising]
-            _draw_change(change, name, axis, lumps.amplitude[rising], known)
-            _draw_line(line, name, axis, lumps.d_mm[rising], lumps.amplitude[rising], sigma[rising])
-        _draw_plane(plane, calibration.x, lumps.d_mm[rising], lumps.amplitude[rising], lumps.sigma_x_mm[rising])
+        a = np.geomspace(amplitude.min(), amplitude.max(), 100)
+        for i, (axis, sigma, ratio) in enumerate(axes):
+            m, b, e, f = (axis.draws[:, k : k + 1] for k in range(4))
+            e_mean, f_mean, words = e.mean(), f.mean(), tuple(_AXES.values())[i]
+            label = f"{e_mean:.2f} a^{f_mean:.2f}, {words}"
+            _draw_banded(change, i, a, e_mean * a**f_mean, e * a**f, label)
+            if ratio is not None:
+                change.plot(amplitude, ratio[rising], MARKS[i], color=COLOURS[i], markersize=4)
+            # d on sigma / (e a^f): points by the posterior mean's e and f, the line with the band of m and b alone.
+            # m and e trade against each other: a draw's own width change at the mean amplitude brings it to the same
+            # abscissa.
+            corrected = sigma[rising] / (e_mean * amplitude**f_mean)
+            x, middle = np.linspace(0.0, 1.05 * corrected.max(), 100), np.exp(np.log(amplitude).mean())
+            lines = m * (e_mean * middle**f_mean) / (e * middle**f) * x + b
+            label = f"m {m.mean():.2f}, b {b.mean():+.2f} mm, {words}"
+            line.plot(corrected, d_mm, MARKS[i], color=COLOURS[i], markersize=4)
+            _draw_banded(line, i, x, np.mean(lines, axis=0), lines, label)
+        _draw_plane(plane, calibration.x, d_mm, amplitude, lumps.sigma_x_mm[rising])
         change.set_xscale("log")
+        line.set_ylim(bottom=0)
         finish(change, "(a) width change: posterior mean and 90 %", "amplitude a", "width change e a^f")
         finish(line, "(b) diameter, posterior mean and 90 %", "sigma / (e a^f) (mm)", "diameter d (mm)")
-        line.set_ylim(bottom=0)
         finish(plane, "(c) lines of equal d, across the head", "amplitude a", "sigma (mm)")
-        text = f"Eq 6 learned from {title or 'the table'}, {int(rising.sum())} lumps.  {RESEARCH_USE}"
-        figure.text(0.01, 0.01, text, fontsize=7.5, color="0.3")
 
 
-def _draw_change(axes: Axes, name: str, axis: AxisCalibration, amplitude: FloatArray, ratio: FloatArray | None) -> None:
-    """The power law, and the ratios of widths where the table has depths to take them from."""
-    a = np.geomspace(amplitude.min(), amplitude.max(), 100)
-    e, f = axis.draws[:, 2:3], axis.draws[:, 3:4]
-    words = f"{e.mean():.2f} a^{f.mean():.2f}, {_AXES[name]}"
-    low, high = np.quantile(e * a**f, _BAND, axis=0)
-    axes.plot(a, e.mean() * a ** f.mean(), color=_COLOURS[name], label=words)
-    axes.fill_between(a, low, high, color=_COLOURS[name], alpha=0.15, lw=0)
-    if ratio is not None:
-        axes.plot(amplitude, ratio, _MARKS[name], color=_COLOURS[name], markersize=4)
-
-
-def _draw_line(
-    axes: Axes, name: str, axis: AxisCalibration, d_mm: FloatArray, amplitude: FloatArray, sigma: FloatArray
-) -> None:
-    """d on sigma / (e a^f): the points by the posterior mean's e and f, the line with the band of m and b alone."""
-    m, b, e, f = (axis.draws[:, k : k + 1] for k in range(4))
-    corrected = sigma / (e.mean() * amplitude ** f.mean())
-    x = np.linspace(0.0, 1.05 * corrected.max(), 100)
-    # m and e trade against each other: a draw's own width change at the mean amplitude brings it to the same abscissa.
-    middle = np.exp(np.log(amplitude).mean())
-    scale = (e.mean() * middle ** f.mean()) / (e * middle**f)
-    low, high = np.quantile(m * scale * x + b, _BAND, axis=0)
-    mean = np.mean(m * scale * x + b, axis=0)
-    axes.plot(corrected, d_mm, _MARKS[name], color=_COLOURS[name], markersize=4)
-    axes.plot(x, mean, color=_COLOURS[name], label=f"m {m.mean():.2f}, b {b.mean():+.2f} mm, {_AXES[name]}")
-    axes.fill_between(x, low, high, color=_COLOURS[name], alpha=0.15, lw=0)
+def _draw_banded(axes: Axes, i: int, x: FloatArray, mean: FloatArray, draws: FloatArray, label: str) -> None:
+    """A line with the band that holds 90 % of the draws."""
+    axes.plot(x, mean, color=COLOURS[i], label=label)
+    axes.fill_between(x, *np.quantile(draws, (0.05, 0.95), axis=0), color=COLOURS[i], alpha=0.15, lw=0)
 
 
 def _draw_plane(axes: Axes, axis: AxisCalibration, d_mm: FloatArray, amplitude: FloatArray, sigma: FloatArray) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
@@ -24,22 +24,33 @@ if TYPE_CHECKING:
 
 def advice(ladder: Ladder) -> list[str]:
     """What to choose, why more buys nothing, and what moves the answer more than any arithmetic."""
-    if ladder.reference.answer is None:
+    answer, limit = ladder.reference.answer, ladder.tolerance_mm
+    if answer is None:
         return [_without_number(ladder)]
-    lines = [f"Advice: {_enough(ladder)}"]
-    far = [f"{one.label} {one.off.ends:.1f} mm" for one in ladder.rows if one.off.ends > ladder.tolerance_mm]
+    lines = [f"Advice: {_enough(ladder, answer)}"]
+    far = [f"{one.label} {one.off.ends:.1f} mm" for one in ladder.rows if one.off.ends > limit]
     if far:
-        lines.append(f"What moves the ends more than {ladder.tolerance_mm:g} mm: {'; '.join(far)}.")
+        lines.append(f"What moves the ends more than {limit:g} mm: {'; '.join(far)}.")
     silent = [one.label for one in ladder.rows if one.answer.reported is None]
     if silent:
         lines.append(f"No size by {', '.join(silent)}.")
-    return [*lines, *_pooling_advice(ladder)]
+    sized = [one for one in ladder.pooled if one.answer.reported is not None]
+    if len(sized) > 1:
+        first, last = sized[0], sized[-1]
+        ends, another = (first.another_half_mm, last.another_half_mm), ""
+        if all(map(math.isfinite, ends)):
+            another = ", and from {:.1f} to {:.1f} mm if exams differ as in the paper".format(*ends)
+        lines.append(
+            f"{last.maps} maps pooled instead of {first.maps} change the half width from "
+            f"{first.answer.half_width_mm:.1f} to {last.answer.half_width_mm:.1f} mm for "
+            f"{last.cpu_s - first.cpu_s:.2f} s of CPU{another}."
+        )
+    return lines
 
 
-def _enough(ladder: Ladder) -> str:
-    best, default = ladder.enough(), ladder.default
-    half_mm = float("nan") if ladder.reference.answer is None else ladder.reference.answer.half_width_mm
-    half = f"the interval's half width is {half_mm:.1f} mm"
+def _enough(ladder: Ladder, reference: SizeAnswer) -> str:
+    best, default, shares = ladder.enough(), ladder.default, reference.shares
+    half = f"the interval's half width is {reference.half_width_mm:.1f} mm"
     if best is None:
         return (
             f"no setting has its interval ends within {ladder.tolerance_mm:g} mm of the reference; the default's are "
@@ -47,7 +58,6 @@ def _enough(ladder: Ladder) -> str:
         )
     took = f"{best.label}{' (the default)' if best.default else ''}: {best.seconds:.2f} s"
     text = f"{took}, interval ends within {max(best.off.ends, 0.01):.2g} mm; more buys nothing: {half}"
-    shares = ladder.reference.answer.shares if ladder.reference.answer else {}
     if not shares:
         return f"{text}."
     source, share = max(shares.items(), key=lambda one: one[1])
@@ -57,37 +67,21 @@ def _enough(ladder: Ladder) -> str:
     return f"{text}, and {rest:.0f} % of its variance is no error of the map ({share:.0f} % is {SOURCES[source]})."
 
 
-def _pooling_advice(ladder: Ladder) -> Iterator[str]:
-    sized = [one for one in ladder.pooled if one.answer.reported is not None]
-    if len(sized) > 1:
-        first, last = sized[0], sized[-1]
-        ends, another = (first.another_half_mm, last.another_half_mm), ""
-        if all(map(math.isfinite, ends)):
-            another = ", and from {:.1f} to {:.1f} mm if exams differ as in the paper".format(*ends)
-        yield (
-            f"{last.maps} maps pooled instead of {first.maps} change the half width from "
-            f"{first.answer.half_width_mm:.1f} to {last.answer.half_width_mm:.1f} mm for "
-            f"{last.cpu_s - first.cpu_s:.2f} s of CPU{another}."
-        )
-
-
 def _without_number(ladder: Ladder) -> str:
     """Nothing to compare: what the settings say of a lump."""
-    sized = [one for one in ladder.rows if one.answer.reported is not None]
+    sized = [one.label for one in ladder.rows if one.answer.reported is not None]
     chances = [one.answer.probability for one in ladder.rows if one.answer.probability is not None]
-    span = f" (probability of one {_span(min(chances), max(chances))})" if chances else ""
+    span = ""
+    if chances:
+        ends = (f"{one:.2g}" if one >= 0.001 else "below 0.001" for one in (min(chances), max(chances)))
+        span = f" (probability of one {' to '.join(dict.fromkeys(ends))})"
     if not sized:
         return f"Advice: no setting gives a size{span}; more accuracy changes no answer, another scan may."
-    some = ", ".join(one.label for one in sized)
+    some = f"{len(sized)} of {len(ladder.rows)} settings do ({', '.join(sized)})"
     return (
-        f"Advice: the default gives no size, {len(sized)} of {len(ladder.rows)} settings do ({some}){span}: "
-        "the map is at the limit of what can be sized. Believe none of them; scan the place again."
+        f"Advice: the default gives no size, {some}{span}: the map is at the limit of what can be sized. "
+        "Believe none of them; scan the place again."
     )
-
-
-def _span(low: float, high: float) -> str:
-    one, other = (f"{value:.2g}" if value >= 0.001 else "below 0.001" for value in (low, high))
-    return one if one == other else f"{one} to {other}"
 
 
 # --- What `tradeoff estimate --json` and `tradeoff map --json` print.
@@ -177,7 +171,7 @@ class TradeoffFile(Record):
 
 def ladder_file(ladder: Ladder, *, varied: Literal["estimate", "map"], provenance: Mapping[str, Any]) -> TradeoffFile:
     """A ladder as its file."""
-    reference, frontier, enough = ladder.reference, ladder.frontier(), ladder.enough()
+    reference, enough, frontier = ladder.reference, ladder.enough(), set(map(id, ladder.frontier()))
     answer = reference.answer
     return TradeoffFile(
         schema="tactile-bayes/tradeoff/1",
@@ -190,7 +184,22 @@ def ladder_file(ladder: Ladder, *, varied: Literal["estimate", "map"], provenanc
             reference.cpu_s,
             None if answer is None else _answer(answer),
         ),
-        settings=tuple(_setting(one, frontier=any(one is other for other in frontier)) for one in ladder.rows),
+        settings=tuple(
+            SettingFile(
+                axis=one.axis,
+                setting=one.label,
+                default=one.default,
+                usable=one.usable,
+                runs=len(one.answers),
+                cpu_s=one.cpu_s,
+                median_off_mm=_finite(one.off.median),
+                ends_off_mm=_finite(one.off.ends),
+                width_ends_off_mm=_finite(one.off.width_ends),
+                answer=_answer(one.answer),
+                frontier=id(one) in frontier,
+            )
+            for one in ladder.rows
+        ),
         enough=None if enough is None else enough.label,
         pooled=tuple(
             PooledFile(one.maps, one.cpu_s, _answer(one.answer), _finite(one.another_half_mm)) for one in ladder.pooled
@@ -202,33 +211,12 @@ def ladder_file(ladder: Ladder, *, varied: Literal["estimate", "map"], provenanc
     )
 
 
-def _setting(one: Priced, *, frontier: bool) -> SettingFile:
-    return SettingFile(
-        axis=one.axis,
-        setting=one.label,
-        default=one.default,
-        usable=one.usable,
-        runs=len(one.answers),
-        cpu_s=one.cpu_s,
-        median_off_mm=_finite(one.off.median),
-        ends_off_mm=_finite(one.off.ends),
-        width_ends_off_mm=_finite(one.off.width_ends),
-        answer=_answer(one.answer),
-        frontier=frontier,
-    )
-
-
 def _answer(answer: SizeAnswer) -> AnswerFile:
-    return AnswerFile(
-        answer.reason,
-        answer.probability,
-        answer.method,
-        {
-            name: QuantityFile(*map(_finite, (one.median, one.low, one.high, one.mc_error)))
-            for name, one in answer.quantities.items()
-        },
-        answer.shares,
-    )
+    quantities = {
+        name: QuantityFile(*map(_finite, (one.median, one.low, one.high, one.mc_error)))
+        for name, one in answer.quantities.items()
+    }
+    return AnswerFile(answer.reason, answer.probability, answer.method, quantities, answer.shares)
 
 
 def _finite(value: float) -> float | None:
@@ -245,20 +233,20 @@ _NUMBERS = 36  #: Columns of a size with its interval and how far that is off.
 
 def ladder_text(ladder: Ladder) -> str:
     """The whole report: what to choose, the table behind it, notes and the research-use line."""
-    lines = [*advice(ladder), "", *_head(ladder)]
+    parts, width = [_SHORT.get(name, name) for name in ladder.default.cpu_s], _name(ladder)
+    costs, units = ("".join(f"{word:>{_COST}}" for word in words) for words in (parts, ["s"] * len(parts)))
+    what = "size" if sized(ladder) else "sigma"
+    lines = [
+        *advice(ladder),
+        "",
+        f"{'':<{width}}{costs}{what:>7}{'95 % interval':>15}{'ends':>7}{'widths':>7}",
+        f"{'':<{width}}{units}{'mm':>7}{'mm':>15}{'off':>7}{'off':>7}",
+    ]
     for axis, rows in groupby(ladder.rows, key=lambda one: one.axis):
         lines += [axis, *(line for one in rows for line in _row(one, ladder))]
     if ladder.pooled:
         lines += ["maps pooled", *(line for one in ladder.pooled for line in _pooled(one, ladder))]
     return "\n".join([*lines, "", *_notes(ladder), RESEARCH_USE])
-
-
-def _head(ladder: Ladder) -> Iterator[str]:
-    parts, width = [_SHORT.get(name, name) for name in ladder.default.cpu_s], _name(ladder)
-    what = "size" if sized(ladder) else "sigma"
-    costs, units = ("".join(f"{word:>{_COST}}" for word in words) for words in (parts, ["s"] * len(parts)))
-    yield f"{'':<{width}}{costs}{what:>7}{'95 % interval':>15}{'ends':>7}{'widths':>7}"
-    yield f"{'':<{width}}{units}{'mm':>7}{'mm':>15}{'off':>7}{'off':>7}"
 
 
 def _name(ladder: Ladder) -> int:
@@ -272,48 +260,41 @@ def sized(ladder: Ladder) -> bool:
 
 
 def _row(one: Priced, ladder: Ladder) -> list[str]:
-    cost = "".join(f"{seconds:>{_COST}.3f}" for seconds in one.cpu_s.values())
-    if one.answer.reported is None:
-        return [*_named(one, ladder, f"{cost}  {_no_number(one.answer)}")]
-    notes = [] if SIZE in one.answer.quantities or not sized(ladder) else ["(a width: this map has no size)"]
-    if one.answer.method == "ensemble" and "ensemble" not in one.label:
-        notes.append("(by MCMC: importance sampling failed)")
-    numbers = f"{cost}{_number(one.answer)}{_mm(one.off.ends):>7}{_mm(one.off.width_ends):>7}"
-    return [*_named(one, ladder, numbers), *(f"    {note}" for note in notes)]
-
-
-def _named(one: Priced, ladder: Ladder, numbers: str) -> list[str]:
-    """The setting's name with its numbers beside it, or below where it is long."""
+    """The setting's name with its numbers beside it, or below where it is long, and notes."""
     name, width = f"{'*' if one.default else ' '} {one.label}", _name(ladder)
-    return [f"{name:<{width}}{numbers}"] if len(name) <= width else [name, f"{'':<{width}}{numbers}"]
+    numbers = "".join(f"{seconds:>{_COST}.3f}" for seconds in one.cpu_s.values()) + _number(one.answer)
+    notes = []
+    if one.answer.reported is not None:
+        for off in (one.off.ends, one.off.width_ends):
+            numbers += f"{f'{off:.3f}' if math.isfinite(off) else '-':>7}"
+        if SIZE not in one.answer.quantities and sized(ladder):
+            notes.append("    (a width: this map has no size)")
+        if one.answer.method == "ensemble" and "ensemble" not in one.label:
+            notes.append("    (by MCMC: importance sampling failed)")
+    beside = [f"{name:<{width}}{numbers}"] if len(name) <= width else [name, f"{'':<{width}}{numbers}"]
+    return [*beside, *notes]
 
 
 def _number(answer: SizeAnswer) -> str:
-    found = answer.reported
-    assert found is not None
-    return f"{found.median:>7.2f}{f'{found.low:.2f} to {found.high:.2f}':>15}"
-
-
-def _no_number(answer: SizeAnswer) -> str:
-    """Why there is no number, with the probability of a lump where the reason does not name one."""
-    reason = answer.reason if len(answer.reason) <= _REASON else f"{answer.reason[: _REASON - 3]}..."
-    if answer.probability is None or "probability" in reason:
-        return reason
-    return f"probability of a lump {answer.probability:.2g}: {reason}"
-
-
-def _mm(value: float) -> str:
-    return f"{value:.3f}" if math.isfinite(value) else "-"
+    """The number, or why there is none, with the probability of a lump where the reason does not name one."""
+    found, reason = answer.reported, answer.reason
+    if found is not None:
+        return f"{found.median:>7.2f}{f'{found.low:.2f} to {found.high:.2f}':>15}"
+    if len(reason) > _REASON:
+        reason = f"{reason[: _REASON - 3]}..."
+    named = answer.probability is None or "probability" in reason
+    return f"  {reason}" if named else f"  probability of a lump {answer.probability:.2g}: {reason}"
 
 
 def _pooled(one: PooledRow, ladder: Ladder) -> list[str]:
-    name = f"{f'  {one.maps} map' + 's' * (one.maps > 1):<{_name(ladder)}}{one.cpu_s:>{_COST}.3f}"
+    name = f"  {one.maps} map{'s' if one.maps > 1 else ''}"
+    line = f"{name:<{_name(ladder)}}{one.cpu_s:>{_COST}.3f}{_number(one.answer)}"
     if one.answer.reported is None:
-        return [f"{name}  {_no_number(one.answer)}"]
+        return [line]
     half = f"    half width {one.answer.half_width_mm:.2f} mm"
     if math.isfinite(one.another_half_mm):
         half += f", {one.another_half_mm:.2f} if exams differ as in the paper"
-    return [f"{name}{_number(one.answer)}", half]
+    return [line, half]
 
 
 def _notes(ladder: Ladder) -> Iterator[str]:
@@ -335,7 +316,6 @@ def _notes(ladder: Ladder) -> Iterator[str]:
 
 # --- The Pareto picture of a trade-off: distance of interval ends against CPU time, both logarithmic.
 
-_SIZE_IN = (10.0, 6.0)
 _MARKS = ("o", "^", "s", "D", "v", "P")
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 _LETTER, _LINE = 3.95, 9.0  #: Width of a letter and height of a line of a name, points.
@@ -348,35 +328,37 @@ def draw_ladder(ladder: Ladder, path: Path, *, title: str, force: bool = False) 
 
     Without a reference there is no distance: then the probability of a lump is drawn.
     """
-    shown = [one for one in ladder.rows if math.isfinite(_height(one, ladder))]
-    with figure_file(path, size_in=_SIZE_IN, force=force) as figure:
+    with figure_file(path, size_in=(10.0, 6.0), force=force) as figure:
         axes = figure.subplots()
+        shown = [one for one in ladder.rows if math.isfinite(_height(one, ladder))]
         for i, axis in enumerate(dict.fromkeys(one.axis for one in shown)):
             rows = [one for one in shown if one.axis == axis]
             axes.plot(*_places(rows, ladder), _MARKS[i % 6], color=_COLOURS[i % 6], label=axis, zorder=3)
         default = [one for one in shown if one.default]
         axes.plot(*_places(default, ladder), "o", ms=15, mfc="none", mec="k", mew=1.5, label="the default", zorder=4)
-        if ladder.reference.answer is not None:
-            axes.step(
-                *_places(ladder.frontier(), ladder), where="post", color="0.3", lw=1.0, label="frontier", zorder=2
-            )
+        answer = ladder.reference.answer
+        if answer is not None:
+            frontier = _places(ladder.frontier(), ladder)
+            axes.step(*frontier, where="post", color="0.3", lw=1.0, label="frontier", zorder=2)
             axes.set_ylabel("distance of the interval's ends from the reference, mm (rms)")
             axes.set_yscale("log")
             axes.yaxis.set_major_formatter("{x:g}")
+            _draw_level(axes, answer.half_width_mm, "k", "-", "half width of the interval")
+            _draw_level(axes, ladder.tolerance_mm, "0.5", "--", "tolerance")
+            _draw_level(axes, ladder.reference.error_mm, "0.5", ":", "the reference's own error")
         else:
             axes.set_ylabel("probability of a lump (no size to compare)")
             axes.set_ylim(-0.05, 1.15)
-        _lines(axes, ladder)
+            axes.axhline(LIKELY, color="0.5", ls="--", lw=1.0, label=f"needed for a size, {LIKELY:g}")
         if shown:
             axes.set_xscale("log")
             axes.xaxis.set_major_formatter("{x:g}")
             axes.xaxis.set_minor_formatter(lambda x, _: f"{x:g}" if f"{x:e}"[0] in "235" else "")
             axes.margins(x=0.12, y=0.08)
-            _names(axes, shown, ladder)
+            _draw_names(axes, shown, ladder)
         axes.set_xlabel("CPU time, s")
         axes.set_title(title, fontsize=10)
         figure.legend(loc="outside right upper", fontsize=8, frameon=False)
-        figure.text(0.01, 0.01, RESEARCH_USE, fontsize=7, color="0.3")
 
 
 def _height(one: Priced, ladder: Ladder) -> float:
@@ -386,62 +368,34 @@ def _height(one: Priced, ladder: Ladder) -> float:
     return float("nan") if one.answer.probability is None else one.answer.probability
 
 
-def _places(rows: list[Priced], ladder: Ladder) -> tuple[list[float], list[float]]:
+def _places(rows: Sequence[Priced], ladder: Ladder) -> tuple[list[float], list[float]]:
     return [max(one.seconds, 1e-4) for one in rows], [_height(one, ladder) for one in rows]
 
 
-def _lines(axes: Axes, ladder: Ladder) -> None:
-    """The interval's half width, the tolerance and the reference's own error, each named at the right."""
-    answer = ladder.reference.answer
-    if answer is None:
-        axes.axhline(LIKELY, color="0.5", ls="--", lw=1.0, label=f"needed for a size, {LIKELY:g}")
-        return
-    named = (
-        (answer.half_width_mm, "k", "-", "half width of the interval"),
-        (ladder.tolerance_mm, "0.5", "--", "tolerance"),
-        (ladder.reference.error_mm, "0.5", ":", "the reference's own error"),
-    )
-    for value, colour, style, name in named:
-        if value > 0:
-            shown = max(value, _LEAST_MM)
-            axes.axhline(shown, color=colour, ls=style, lw=1.0, zorder=1)
-            axes.annotate(
-                f"{name}, {value:.2g} mm",
-                (1.0, shown),
-                xycoords=("axes fraction", "data"),
-                xytext=(-4, 3),
-                textcoords="offset points",
-                fontsize=8,
-                ha="right",
-                color=colour,
-            )
+def _draw_level(axes: Axes, value: float, colour: str, style: str, name: str) -> None:
+    """A level line, named at the right; none for 0."""
+    if value > 0:
+        place, text = (1.0, max(value, _LEAST_MM)), f"{name}, {value:.2g} mm"
+        axes.axhline(place[1], color=colour, ls=style, lw=1.0, zorder=1)
+        how: dict[str, Any] = {"xycoords": ("axes fraction", "data"), "textcoords": "offset points"}
+        axes.annotate(text, place, xytext=(-4, 3), fontsize=8, ha="right", color=colour, **how)
 
 
-def _names(axes: Axes, shown: list[Priced], ladder: Ladder) -> None:
+def _draw_names(axes: Axes, shown: Sequence[Priced], ladder: Ladder) -> None:
     """A name beside each point, moved up or down until it covers no other name and no point."""
     figure = axes.figure
     figure.draw_without_rendering()  # type: ignore[union-attr]
     scale = 72.0 / figure.dpi
     right = axes.get_window_extent().x1 * scale
-    places = [[float(v) * scale for v in axes.transData.transform(point)] for point in _points(shown, ladder)]
+    points = zip(*_places(shown, ladder), strict=True)
+    places = [[float(v) * scale for v in axes.transData.transform(point)] for point in points]
     taken: list[Box] = [(x - 4, y - 4, x + 4, y + 4) for x, y in places]
+    patch = {"facecolor": "w", "edgecolor": "none", "alpha": 0.7, "pad": 0.3}
     for one, (x, y) in sorted(zip(shown, places, strict=True), key=lambda pair: pair[1][1]):
-        text = one.label.removeprefix("--method ").removeprefix("--")
-        box = _free_place(x, y, _LETTER * len(text), taken, right=right)
-        taken.append(box)
-        axes.annotate(
-            text,
-            (one.seconds, _height(one, ladder)),
-            xytext=(box[0] - x, box[1] + 2 - y),
-            textcoords="offset points",
-            fontsize=7,
-            zorder=5,
-            bbox={"facecolor": "w", "edgecolor": "none", "alpha": 0.7, "pad": 0.3},
-        )
-
-
-def _points(shown: list[Priced], ladder: Ladder) -> list[tuple[float, float]]:
-    return list(zip(*_places(shown, ladder), strict=True))
+        text, point = one.label.removeprefix("--method ").removeprefix("--"), (one.seconds, _height(one, ladder))
+        taken.append(_free_place(x, y, _LETTER * len(text), taken, right=right))
+        at = (taken[-1][0] - x, taken[-1][1] + 2 - y)
+        axes.annotate(text, point, xytext=at, textcoords="offset points", fontsize=7, zorder=5, bbox=patch)
 
 
 def _free_place(x: float, y: float, wide: float, taken: list[Box], *, right: float) -> Box:

@@ -7,9 +7,10 @@ import io
 import itertools
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from itertools import cycle
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.special import ndtr
@@ -17,7 +18,7 @@ from scipy.special import ndtr
 from tactile_bayes.declarations import UNSET
 from tactile_bayes.options import Aim
 from tactile_bayes.report.compare import Growth
-from tactile_bayes.report.figure_file import FORMATS, figure_file, plain_matplotlib
+from tactile_bayes.report.figure_file import FORMATS, figure_file, finish, plain_matplotlib
 from tactile_bayes.report.pages import page
 from tactile_bayes.report.trial import (
     SPELLED,
@@ -33,7 +34,7 @@ from tactile_bayes.trial.calibration import BINS, Calibration, Prediction, predi
 from tactile_bayes.trial.figures import Ends, Figures
 from tactile_bayes.trial.method_comparison import MethodComparison
 from tactile_bayes.trial.next_mass import NextMass
-from tactile_bayes.trial.planning import IntervalCheck, PlanReport
+from tactile_bayes.trial.planning import PlanReport
 from tactile_bayes.trial.readings import FloatArray, ModalitySizes, Trial, mass_numbers
 from tactile_bayes.trial.summary import ModalityReport, TrialReport
 
@@ -46,7 +47,7 @@ if TYPE_CHECKING:
 _DOTS, _LINE, _SECOND, _GREY = "#1f3b73", "#c8641e", "#2a7f62", "0.45"
 _COLOURS = (_DOTS, _LINE, _SECOND)
 _PANEL_IN = 4.1
-Corner = Literal["upper left", "lower right", "upper right"]
+_LEGEND: dict[str, Any] = {"frameon": True, "framealpha": 0.85}
 
 
 def sizes_figure(report: TrialReport, trial: Trial) -> bytes:
@@ -55,16 +56,12 @@ def sizes_figure(report: TrialReport, trial: Trial) -> bytes:
     Error bars: +- 1 SD of the ex-vivo size where the table gives it, +- 1 SD of a mass's replicates. Dashed: identity;
     solid: line through zero. Hollow: not found, at size 0.
     """
-    modalities = list(trial.sizes().values())
+    modalities = trial.sizes().values()
     sds = {number: trial.ex_vivo_sd_mm.get(key) or 0.0 for key, number in mass_numbers(trial.ex_vivo_mm).items()}
-    found = [np.concatenate([one.ex_vivo_mm, one.size_mm + _spread(one)]) for one in modalities]
-    reach = 1.06 * float(max((values.max() for values in found if len(values)), default=1.0))
-
-    def draw(axes: Sequence[Axes]) -> None:
-        for one, panel in zip(modalities, axes, strict=True):
-            _draw_sizes(panel, one, sds, report.modalities[one.name].slope_through_origin, reach)
-
-    return _svg(draw, len(modalities))
+    ends = [end for one in modalities for end in (*one.ex_vivo_mm, *(one.size_mm + _spread(one)))]
+    reach = 1.06 * float(max(ends, default=1.0))
+    slopes = {name: one.slope_through_origin for name, one in report.modalities.items()}
+    return _svg([partial(_draw_sizes, one, sds, slopes[one.name], reach) for one in modalities])
 
 
 def differences_figure(report: TrialReport, trial: Trial) -> bytes:
@@ -73,34 +70,26 @@ def differences_figure(report: TrialReport, trial: Trial) -> bytes:
     All panels have the same axes, so that modalities can be compared by eye.
     """
     found = [one.only_detected() for one in trial.sizes().values()]
-
-    def draw(axes: Sequence[Axes]) -> None:
-        for sizes, panel in zip(found, axes, strict=True):
-            _draw_differences(panel, report.modalities[sizes.name].method_comparison, sizes)
-        across, up = (np.array(ends) for ends in zip(*((one.get_xlim(), one.get_ylim()) for one in axes), strict=True))
-        for panel in axes:  # the widest range of any
-            panel.set(xlim=(across[:, 0].min(), across[:, 1].max()), ylim=(up[:, 0].min(), up[:, 1].max()))
-
-    return _svg(draw, len(found))
+    methods = {name: one.method_comparison for name, one in report.modalities.items()}
+    return _svg([partial(_draw_differences, one, methods[one.name]) for one in found], alike=True)
 
 
 def calibration_figure(prediction: Prediction, found: Calibration) -> bytes:
     """Draw integral transforms as a histogram and a distribution function with its band, and coverage by level."""
-
-    def draw(axes: Sequence[Axes]) -> None:
-        _draw_pit(axes[0], found)
-        _draw_ecdf(axes[1], prediction, found)
-        _draw_coverage(axes[2], found)
-
-    return _svg(draw, 3)
+    return _svg([partial(_draw_pit, found), partial(_draw_ecdf, found, prediction), partial(_draw_coverage, found)])
 
 
-def _svg(draw: Callable[[Sequence[Axes]], None], panels: int) -> bytes:
-    """Render a figure as SVG, independent of the user's matplotlib settings."""
+def _svg(panels: Sequence[Callable[[Axes], None]], *, alike: bool = False) -> bytes:
+    """Draw panels side by side as SVG, independent of the user's matplotlib settings; `alike`: all with one range."""
     with plain_matplotlib() as library:
-        library.rcParams["svg.hashsalt"] = "tactile-bayes"  # else the names inside are random
-        figure = library.figure.Figure(figsize=(_PANEL_IN * panels, _PANEL_IN), layout="constrained")
-        draw(np.atleast_1d(np.asarray(figure.subplots(1, panels))).tolist())
+        figure = library.figure.Figure(figsize=(_PANEL_IN * len(panels), _PANEL_IN), layout="constrained")
+        every = figure.subplots(1, len(panels), squeeze=False)[0]
+        for axes, draw in zip(every, panels, strict=True):
+            draw(axes)
+        if alike:  # the widest range of any
+            across, up = (np.array(ends) for ends in zip(*((a.get_xlim(), a.get_ylim()) for a in every), strict=True))
+            for axes in every:
+                axes.set(xlim=(across[:, 0].min(), across[:, 1].max()), ylim=(up[:, 0].min(), up[:, 1].max()))
         buffer = io.BytesIO()
         figure.savefig(buffer, format="svg", metadata=FORMATS[".svg"])
     return buffer.getvalue()
@@ -110,34 +99,26 @@ def _spread(sizes: ModalitySizes) -> FloatArray:
     return np.array([group.std(ddof=1) if len(group) > 1 else 0.0 for group in sizes.replicates_mm])
 
 
-def _draw_sizes(axes: Axes, sizes: ModalitySizes, sds: Mapping[int, float], slope: float | None, reach: float) -> None:
+def _draw_sizes(sizes: ModalitySizes, sds: Mapping[int, float], slope: float | None, reach: float, axes: Axes) -> None:
     found = sizes.only_detected()
     axes.plot([0, reach], [0, reach], linestyle="--", color=_GREY, linewidth=1, label="identity")
     if slope is not None:
         end = min(reach, reach / slope) if slope > 0 else reach
         axes.plot([0, end], [0, slope * end], color=_LINE, linewidth=1.5, label=f"through zero, slope {slope:.2f}")
-    across = [sds[int(mass)] for mass in found.mass]
+    across, along = np.array([sds[int(mass)] for mass in found.mass]), _spread(found)
     bars: dict[str, Any] = {"elinewidth": 0.8, "capsize": 1.5, "ecolor": "0.6"}
-    axes.errorbar(
-        found.ex_vivo_mm,
-        found.size_mm,
-        xerr=across if any(across) else None,
-        yerr=_spread(found) if _spread(found).any() else None,
-        fmt="o",
-        markersize=4,
-        color=_DOTS,
-        label=f"{len(found.size_mm)} masses",
-        **bars,
-    )
+    bars |= {"xerr": across if across.any() else None, "yerr": along if along.any() else None}
+    points: dict[str, Any] = {"fmt": "o", "markersize": 4, "color": _DOTS, "label": f"{len(found.size_mm)} masses"}
+    axes.errorbar(found.ex_vivo_mm, found.size_mm, **points, **bars)
     missed = sizes.ex_vivo_mm[~sizes.detected]
     if len(missed):
         label = f"{len(missed)} not found"
         axes.plot(missed, np.zeros(len(missed)), "o", mfc="white", mec=_DOTS, markersize=5, clip_on=False, label=label)
     axes.set(xlim=(0, reach), ylim=(0, reach))
-    _label(axes, sizes.name, "ex-vivo size (mm)", "size (mm)", where="lower right")
+    finish(axes, sizes.name, "ex-vivo size (mm)", "size (mm)", loc="lower right", **_LEGEND)
 
 
-def _draw_differences(axes: Axes, methods: MethodComparison, found: ModalitySizes) -> None:
+def _draw_differences(found: ModalitySizes, methods: MethodComparison, axes: Axes) -> None:
     mean, off = (found.ex_vivo_mm + found.size_mm) / 2, found.size_mm - found.ex_vivo_mm
     axes.plot(mean, off, "o", markersize=4, color=_DOTS)
     axes.axhline(0, color=_GREY, linestyle="--", linewidth=1)
@@ -149,20 +130,19 @@ def _draw_differences(axes: Axes, methods: MethodComparison, found: ModalitySize
             axes.axhline(value, color=_SECOND, linewidth=1.2, label=f"limit {value:.1f}")
             if ends is not None:
                 axes.axhspan(*ends, color=_SECOND, alpha=0.13, linewidth=0)
-        axes.legend(fontsize=7.5, loc="upper left", framealpha=0.85)
-    axes.tick_params(labelsize=8)
-    _label(axes, found.name, "mean of both (mm)", "size - ex vivo (mm)", legend=False)
+    finish(axes, found.name, "mean of both (mm)", "size - ex vivo (mm)", loc="upper left", **_LEGEND)
 
 
-def _draw_pit(axes: Axes, found: Calibration) -> None:
+def _draw_pit(found: Calibration, axes: Axes) -> None:
     edges = np.linspace(0, 1, BINS + 1)
     axes.bar(edges[:-1], found.pit, width=1 / BINS, align="edge", color=_DOTS, edgecolor="white", alpha=0.85)
     axes.axhline(found.n / BINS, color=_LINE, linewidth=1.2, label="if calibrated")
     axes.set_xlim(0, 1)
-    _label(axes, "Integral transforms", "share of the stated distribution below excision", "readings")
+    across = "share of the stated distribution below excision"
+    finish(axes, "Integral transforms", across, "readings", loc="upper left", **_LEGEND)
 
 
-def _draw_ecdf(axes: Axes, prediction: Prediction, found: Calibration) -> None:
+def _draw_ecdf(found: Calibration, prediction: Prediction, axes: Axes) -> None:
     pit = np.sort(ndtr(prediction.z))
     share = np.arange(1, len(pit) + 1) / len(pit)
     line = np.array([0.0, 1.0])
@@ -170,30 +150,19 @@ def _draw_ecdf(axes: Axes, prediction: Prediction, found: Calibration) -> None:
     axes.plot(line, line, color=_LINE, linewidth=1.2, label=f"if calibrated, band for {found.masses} masses")
     axes.step(np.concatenate([[0], pit, [1]]), np.concatenate([[0], share, [1]]), where="post", color=_DOTS)
     axes.set(xlim=(0, 1), ylim=(0, 1))
-    _label(axes, "Their distribution", "integral transform", "share of readings")
+    finish(axes, "Their distribution", "integral transform", "share of readings", loc="upper left", **_LEGEND)
 
 
-def _draw_coverage(axes: Axes, found: Calibration) -> None:
+def _draw_coverage(found: Calibration, axes: Axes) -> None:
     nominal = np.array([one.probability for one in found.levels])
     share = np.array([one.covered / one.n for one in found.levels])
     low, high = (np.array([one.interval[i] for one in found.levels]) for i in (0, 1))
     axes.plot([0, 1], [0, 1], color=_LINE, linewidth=1.2, label="if calibrated")
     reach = np.stack([np.maximum(share - low, 0), np.maximum(high - share, 0)])
-    axes.errorbar(
-        nominal, share, yerr=reach, fmt="o", color=_DOTS, markersize=5, capsize=3, label="found, exact interval"
-    )
+    points: dict[str, Any] = {"fmt": "o", "color": _DOTS, "markersize": 5, "label": "found, exact interval"}
+    axes.errorbar(nominal, share, yerr=reach, capsize=3, **points)
     axes.set(xlim=(0.4, 1), ylim=(0, 1.02))
-    _label(axes, "Coverage", "nominal probability of the interval", "share covered", where="lower right")
-
-
-def _label(axes: Axes, title: str, across: str, up: str, *, legend: bool = True, where: Corner = "upper left") -> None:
-    axes.set_title(title, loc="left", fontsize=10.5)
-    axes.set_xlabel(across, fontsize=9)
-    axes.set_ylabel(up, fontsize=9)
-    axes.tick_params(labelsize=8)
-    axes.spines[["top", "right"]].set_visible(False)
-    if legend:
-        axes.legend(fontsize=7.5, loc=where, framealpha=0.85)
+    finish(axes, "Coverage", "nominal probability of the interval", "share covered", loc="lower right", **_LEGEND)
 
 
 # --- Figure of a plan: power against the number of patients, or the width of the interval.
@@ -202,8 +171,9 @@ def _label(axes: Axes, title: str, across: str, up: str, *, legend: bool = True,
 def plan_figure(plan: PlanReport, path: Path, *, force: bool = False) -> None:
     """Draw the designs of a plan by their number of maps, and what reaches what was asked for."""
     aims: list[Aim] = list(dict.fromkeys(one.aim for one in plan.needed)) or ["power"]
-    with figure_file(path, size_in=(_PANEL_IN * 1.4 * len(aims), _PANEL_IN), force=force) as figure:
-        for aim, axes in zip(aims, np.atleast_1d(np.asarray(figure.subplots(1, len(aims)))).tolist(), strict=True):
+    size_in = (_PANEL_IN * 1.4 * len(aims), _PANEL_IN)
+    with figure_file(path, size_in=size_in, foot=None, force=force) as figure:
+        for aim, axes in zip(aims, figure.subplots(1, len(aims), squeeze=False)[0], strict=True):
             _draw_plan(axes, plan, aim)
 
 
@@ -224,8 +194,8 @@ def _draw_plan(axes: Axes, plan: PlanReport, aim: Aim) -> None:
         axes.annotate(f"{one.patients}", (one.patients, one.target), xytext=(4, -12), textcoords="offset points")
         axes.plot([one.patients], [one.target], marker="x", color="black", markersize=8)
     up = "power" if aim == "power" else "interval of the tactile error, upper over lower end"
-    where: Corner = "lower right" if aim == "power" else "upper right"
-    _label(axes, "", "patients, one mass each", up, where=where)
+    where = "lower right" if aim == "power" else "upper right"
+    finish(axes, "", "patients, one mass each", up, loc=where, **_LEGEND)
 
 
 # --- Trial report as one self-contained page: tables, figures, settings, hashes; no script, no network.
@@ -287,7 +257,6 @@ def trial_html(report: TrialReport, trial: Trial, *, text: str, growth: Sequence
     opening = f"{counts.masses} masses of {counts.patients} patients, {counts.readings} readings."
     modalities = report.modalities.items()
     trends = itertools.starmap(_trend, modalities)
-    checks = {} if report.interval_check is UNSET else report.interval_check
     return page(
         "trial",
         title="Sizes against excision",
@@ -314,7 +283,7 @@ def trial_html(report: TrialReport, trial: Trial, *, text: str, growth: Sequence
         pairs=_pairs(report),
         growth=growth,
         next_mass=None if report.next_mass is UNSET else _next_mass(report.next_mass),
-        checks=_checks(checks) if checks else None,
+        checks=_checks(report),
         settings=_settings(report),
         inputs=report.provenance["inputs"],
         text=text,
@@ -420,30 +389,22 @@ def _next_mass(found: NextMass) -> dict[str, Any]:
     }
 
 
-def _checks(found: Mapping[str, IntervalCheck]) -> Table:
-    heads = ["", "simulated trials", "true mean error, %", "covered", "interval above it", "interval below it"]
+def _checks(report: TrialReport) -> Table | None:
+    if report.interval_check is UNSET or not report.interval_check:
+        return None
     rows = [
-        [
-            name,
-            str(one.trials),
-            f"{one.true_mape_percent:.1f}",
-            _with(one.share, one.share_interval),
-            str(one.above),
-            str(one.below),
-        ]
-        for name, one in found.items()
-    ]
-    return heads, rows
+        [name, str(one.trials), f"{one.true_mape_percent:.1f}", _with(one.share, one.share_interval), str(one.above),
+         str(one.below)]
+        for name, one in report.interval_check.items()
+    ]  # fmt: skip
+    return ["", "simulated trials", "true mean error, %", "covered", "interval above it", "interval below it"], rows
 
 
 def _settings(report: TrialReport) -> Table:
     made = report.provenance
     rows = [[key, json.dumps(value)] for key, value in made["settings"].items()]
-    return ["setting", "value"], [
-        *rows,
-        ["seed", str(made["seed"])],
-        ["program", f"{made['program']} {made['version']}"],
-    ]
+    rows += [["seed", str(made["seed"])], ["program", f"{made['program']} {made['version']}"]]
+    return ["setting", "value"], rows
 
 
 def _heads(wanted: Mapping[str, tuple[str, str]]) -> list[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from plain_reports import full_text
 from posterior_maps import bump_map, bump_values, grid_map
 
 from tactile_bayes.declarations import replace
@@ -18,7 +19,6 @@ from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.lump_probability import Weighed
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.posterior.white import AT_RIM, Candidate, fit_bump
-from tactile_bayes.report.estimate_text import estimate_text
 
 FIELD = SamplerSettings(background="free", noise="field")
 WHITE = 0.01 * np.random.default_rng(4).standard_normal((51, 51))
@@ -51,7 +51,7 @@ def test_the_reason_has_a_code_and_a_way_out(values: np.ndarray, code: str, advi
     assert advice in found.advice
     assert found.on_paper
     assert "--" not in found.on_paper  # a reader of the page has no command line
-    text = estimate_text(found, grid_map(values), probability=0.95)
+    text = full_text(found, grid_map(values))
     assert ("What would help" in text) == bool(found.advice)
 
 
@@ -107,7 +107,7 @@ def test_no_lump_is_said_first_with_the_place(centre: tuple[float, float] | None
     tactile_map = grid_map(1 + WHITE)
     fit = replace(FIELD, centre_mm=centre)
     found = estimate_map(tactile_map, calibration=None, options=fit, rng=np.random.default_rng(1))
-    first = estimate_text(found, tactile_map, probability=0.95).splitlines()[0]
+    first = full_text(found, tactile_map).splitlines()[0]
     assert first.startswith("No lump found ")
     assert ("on the 26 cm2 that the map covers" if centre is None else "near (3.0, 2.0) mm") in first
     assert "strokes" not in found.advice

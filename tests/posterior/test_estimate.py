@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from plain_calibration import RECIPE
+from plain_reports import full_text, report_of
 from posterior_maps import TRUTH, bump_map, correlated_field, grid_map
 
 from tactile_bayes.declarations import replace
@@ -15,7 +16,6 @@ from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.report.estimate_document import estimate_report
-from tactile_bayes.report.estimate_text import estimate_text
 from tactile_bayes.size.eq6 import AxisCalibration, SizeCalibration
 from tactile_bayes.size.terms import Recipe
 
@@ -143,7 +143,7 @@ def test_outside_the_calibration_is_flagged() -> None:
         f"unlike the lumps that sizes were learned from: {axis}: amplitude 1.2 (table: 0.05 to 0.8)" for axis in "xy"
     ]
     assert [one.text for one in flagged.findings if one.kind == "outside_calibration"] == outside
-    text = estimate_text(flagged, bump_map(), probability=0.95)
+    text = full_text(flagged, bump_map())
     assert text.startswith("CAUTION: unlike the lumps that sizes were learned from: x: amplitude 1.2")
     assert not any(one.kind == "outside_calibration" for one in run(use=calibration()).findings)
 
@@ -166,7 +166,7 @@ def test_without_a_calibration_there_are_widths_only() -> None:
     assert found.status == "estimate"
     assert found.size is None
     assert "widths only" in found.reason
-    assert "No size: no size calibration was given" in estimate_text(found, bump_map(), probability=0.9)
+    assert "No size: no size calibration was given" in full_text(found, bump_map())
 
 
 def test_rotation_is_spent_where_the_map_asks_for_it() -> None:
@@ -185,7 +185,7 @@ def test_coarse_cells_are_flagged() -> None:
         tactile_map, calibration=None, options=replace(OFF, method="optimise"), rng=np.random.default_rng(1)
     )
     assert "coarse_cells" in [one.kind for one in found.findings]
-    assert "smaller --cell-mm" in estimate_text(found, tactile_map, probability=0.95)
+    assert "smaller --cell-mm" in full_text(found, tactile_map)
 
 
 def test_a_level_off_the_background_is_reported() -> None:
@@ -219,14 +219,12 @@ def test_the_map_is_left_as_it_was() -> None:
 @pytest.mark.long
 def test_documents_say_null_where_there_is_nothing() -> None:
     nothing = run(noise=WHITE, amplitude=0.0)
-    report = estimate_report(
-        nothing, bump_map(), probability=0.95, prior=BumpPrior(), provenance=Provenance("estimate", {})
-    )
+    report = report_of(nothing, bump_map())
     assert report.status == "no_estimate"
     assert report.reason
     for name in ("max_size_mm", "d_x_mm", "amplitude", "sigma_x_mm", "centre_mm", "variance_share", "noise_sd"):
         assert getattr(report, name) is None
-    assert estimate_text(nothing, bump_map(), probability=0.95).startswith("No lump found on the ")
+    assert full_text(nothing, bump_map()).startswith("No lump found on the ")
 
 
 def test_the_centre_is_told_in_the_patients_frame() -> None:

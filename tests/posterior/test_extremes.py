@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from plain_reports import full_text
 from posterior_maps import bump_values, grid_map
 
 from tactile_bayes.declarations import names_of, replace
@@ -12,7 +13,6 @@ from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.presets import METHODS
-from tactile_bayes.report.estimate_text import estimate_text
 
 NOISE = 0.02 * np.random.default_rng(81).standard_normal((51, 51))
 FREE = SamplerSettings(background="free")
@@ -86,7 +86,7 @@ FOUND = {
 def answer(tactile_map: TactileMap, method: str, fit: SamplerSettings) -> Estimate:
     options = replace(fit, method=method)
     found = estimate_map(tactile_map, calibration=None, options=options, rng=np.random.default_rng(1))
-    assert "nan" not in estimate_text(found, tactile_map, probability=0.95).lower()
+    assert "nan" not in full_text(found, tactile_map).lower()
     return found
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mapping_scans import shared_scan
+from plain_reports import full_text
 from posterior_maps import bump_values, grid_map
 
 from tactile_bayes.declarations import names_of, replace
@@ -16,7 +17,6 @@ from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.result import Estimate
-from tactile_bayes.report.estimate_text import estimate_text
 from tactile_bayes.scans import Scan
 from tests.posterior.test_extremes import NOISE, NOTHING, few, float32, unknown_level, without_a_quadrant
 
@@ -54,7 +54,7 @@ FOUND = {
 def answer(tactile_map: TactileMap, method: str, fit: SamplerSettings = FIELD) -> Estimate:
     options = replace(fit, method=method)
     found = estimate_map(tactile_map, calibration=None, options=options, rng=np.random.default_rng(1))
-    assert "nan" not in estimate_text(found, tactile_map, probability=0.95).lower()
+    assert "nan" not in full_text(found, tactile_map).lower()
     return found
 
 

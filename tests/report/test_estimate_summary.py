@@ -9,12 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from in_process import run_here
+from plain_reports import report_of
 from posterior_maps import bump_values, correlated_field, grid_map
 
 from tactile_bayes.declarations import from_plain, replace
 from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.files.provenance import Provenance
-from tactile_bayes.files.reports import Supposed
+from tactile_bayes.files.reports import AnotherExam, EstimateReport, Supposed
 from tactile_bayes.findings import Finding
 from tactile_bayes.inference.draws import summarise
 from tactile_bayes.mapping.map import TactileMap, broken_assumptions
@@ -23,7 +24,7 @@ from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.result import Estimate, Mass, Sensitivity
 from tactile_bayes.posterior.selection import Structure
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.report.estimate_document import _change, mass_reports, sensitivity_line, supposed_line
+from tactile_bayes.report.estimate_document import _change, sensitivity_line, supposed_line
 from tactile_bayes.report.estimate_text import (
     MOST_LINES,
     decimals,
@@ -32,7 +33,6 @@ from tactile_bayes.report.estimate_text import (
     joined,
     width_lines,
 )
-from tactile_bayes.report.quantities import estimate_quantities
 
 
 def mass(seed: int, *, amplitude: float = 0.4, second: float = 0.0, **made) -> TactileMap:
@@ -139,8 +139,8 @@ def test_what_a_soft_lump_would_measure_is_what_it_does_where_it_is_known(folder
 CHECKS = tuple(Finding(kind, f"a reason for {kind}") for kind in ("coarse_cells", "uneven_level", "irregular"))
 
 
-def crowded() -> tuple[Estimate, dict]:
-    """An estimate with everything there is to say about it."""
+def crowded() -> tuple[Estimate, EstimateReport]:
+    """An estimate with everything there is to say about it, and its report."""
     options = SamplerSettings(method="laplace", draws=400, background="free", noise="field")
     found = estimate_map(MAPS["clear.nc"], calibration=None, options=options, rng=np.random.default_rng(1))
     mass = Mass(10.0, 1.0, 0.97, Estimate("no_estimate", "a reason"))
@@ -157,41 +157,39 @@ def crowded() -> tuple[Estimate, dict]:
         reason="of a reason",
         advice="advice",
     )
-    return full, estimate_quantities(full, MAPS["clear.nc"], probability=0.9)
+    return full, report_of(full, MAPS["clear.nc"], probability=0.9)
 
 
 def test_the_worst_case_takes_at_most_12_lines_and_counts_what_it_does_not_show() -> None:
-    full, quantities = crowded()
-    size = {name: summarise(np.linspace(10.0, 20.0, 99), probability=0.9) for name in ("max_size_mm", "min_size_mm")}
-    another = size | {f"another_exam.{name}": quantity for name, quantity in size.items()}
-    told = {"probability": 0.9, "quantities": quantities, "reason": full.reason}
-    masses = mass_reports(full.masses, MAPS["clear.nc"], **told)
-    sized = replace(full, reason="", advice="")
-    for one, shown in ((full, quantities), (full, quantities | size), (sized, quantities | another)):
-        text = estimate_summary(one, shown, probability=0.9, masses=masses)
+    full, report = crowded()
+    size = summarise(np.linspace(10.0, 20.0, 99), probability=0.9)
+    sized = replace(report, max_size_mm=size, min_size_mm=size)
+    another = replace(sized, another_exam=AnotherExam(0.15, size, size, {}), reason="", advice="")
+    for one in (report, sized, another):
+        text = estimate_summary(full, one)
         assert len(text.splitlines()) <= MOST_LINES
         assert "Mass 1 of 10: probability of a lump 0.9" in text
         listed = re.findall(r"^Mass \d+ at .*$", text, re.MULTILINE)
         assert f"; and {9 - len(listed)} more masses." in listed[-1]
         assert "40 % of the width variance is tracker position error" in text
-    whole = estimate_text(full, MAPS["clear.nc"], probability=0.9)
+    whole = estimate_text(full, report)
     assert whole.count("CAUTION") == 9  # the control: there is more than 12 lines can hold
     assert len(re.findall(r"^Mass \d+ at ", whole, re.MULTILINE)) == 9
 
 
 def test_a_broken_assumption_stands_first_and_one_to_check_after_the_size() -> None:
-    full, quantities = crowded()
+    full, report = crowded()
     told = (Finding("curved_skin", "the skin is curved"), Finding("lump_dragged", "the lump lags"))
-    marked = replace(full, findings=(*told, *full.findings))
-    short = estimate_summary(marked, quantities, probability=0.9).splitlines()
+    marked = replace(report, entries=tuple(one.entry for one in (*told, *full.findings)))
+    short = estimate_summary(full, marked).splitlines()
     assert short[0].startswith("CAUTION: the lump lags; reason 0; reason 1 (and 7 more).")
     assert len(short) <= MOST_LINES
     assert "To check: the skin is curved; a reason for coarse_cells (and 2 more)." in short
-    whole = estimate_text(marked, MAPS["clear.nc"], probability=0.9).splitlines()
+    whole = estimate_text(full, marked).splitlines()
     assert whole[0] == "CAUTION: the lump lags."
     assert "To check: the skin is curved." in whole[1:]
     # the control: an even scan's report has neither
-    for line in estimate_text(full, MAPS["clear.nc"], probability=0.9).splitlines():
+    for line in estimate_text(full, report).splitlines():
         assert not line.startswith(("CAUTION: the", "To check: the skin"))
 
 
@@ -209,14 +207,12 @@ def test_a_pool_names_the_map_whose_strokes_see_the_lump_apart(folder: Path) -> 
 
 def test_a_calibration_is_named_whole_whatever_its_name_holds() -> None:
     """A file "size (2).json" was called "size": the name was cut at the first bracket."""
-    full, quantities = crowded()
+    full, report = crowded()
     assert full.diagnostics is not None
     words = {"calibration": "calibration size (2).json", "size_calibration": "Sizes by the calibration size (2).json"}
     named = replace(full, diagnostics=replace(full.diagnostics, **words))
-    assert "Quality: sizes by the calibration size (2).json; method" in estimate_summary(
-        named, quantities, probability=0.9
-    )
-    assert "sizes by" not in estimate_summary(full, quantities, probability=0.9)  # the control: no calibration
+    assert "Quality: sizes by the calibration size (2).json; method" in estimate_summary(named, report)
+    assert "sizes by" not in estimate_summary(full, report)  # the control: no calibration
 
 
 @pytest.mark.long

@@ -1,7 +1,8 @@
 """Every kind of finding is followed through every output: its sentence stands in each of them, and the verdict with it.
 
 `OUTPUTS` is the one list of outputs. A module that prints the line "Research use only" prints a result; each such
-module is behind an output of the list or named among those that print no size, so that a new one cannot be forgotten.
+module, and each that draws a figure with that line at its foot, is behind an output of the list or named among those
+that print no size, so that a new one cannot be forgotten.
 """
 
 from __future__ import annotations
@@ -282,8 +283,8 @@ PRINTERS = {
     "campaigns/campaign", "actions/bring_in", "actions/exam",
     "actions/simulation", "actions/study",
     "actions/tradeoff", "files/size_json", "presets", "report/calibration",
-    "report/paper_head", "report/laboratory",
-    "report/study", "report/tradeoff", "trial/summary",
+    "report/figure_file", "report/paper_head", "report/laboratory",
+    "report/study", "report/tradeoff", "report/trial_html", "trial/summary",
 }  # fmt: skip
 
 
@@ -384,7 +385,8 @@ def test_the_live_view_says_a_caution_before_the_size() -> None:
 def test_every_module_that_prints_a_result_is_behind_an_output_or_prints_no_size() -> None:
     package = Path(tb.__file__).parent
     modules = {path.relative_to(package).with_suffix("").as_posix(): path for path in package.rglob("*.py")}
-    assert {name for name, path in modules.items() if "RESEARCH_USE" in path.read_text()} == PRINTERS
+    prints = re.compile(r"RESEARCH_USE|figure_file\(")
+    assert {name for name, path in modules.items() if prints.search(path.read_text())} == PRINTERS
 
 
 def test_every_kind_is_made_somewhere() -> None:

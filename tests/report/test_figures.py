@@ -12,16 +12,17 @@ import pytest
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.geometry import rigid
+from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.mapping.map import MapRecipe, TactileMap
 from tactile_bayes.report import estimate_figures as sizes
 from tactile_bayes.report import map_figure as maps
-from tactile_bayes.report.estimate_figures import SizeInterval, size_figure
+from tactile_bayes.report.estimate_figures import size_figure
 from tactile_bayes.report.map_figure import FitContour, Place, map_figure
 from tactile_bayes.report.posterior_figures import corner_figure
 
 INTERVALS = {
-    "max": SizeInterval(12.0, 18.0, 0.95, "equal-tailed"),
-    "min": SizeInterval(9.0, 15.0, 0.95, "equal-tailed"),
+    name: Quantity(median=low + 3.0, mean=low + 3.0, sd=1.5, low=low, high=low + 6.0, probability=0.95, kind="eti")
+    for name, low in (("max", 12.0), ("min", 9.0))
 }
 FIT = FitContour((3.0, -2.0), 6.0, 4.0, 20.0)
 

@@ -6,11 +6,28 @@ from typing import Any
 
 from tactile_bayes.declarations import names_of
 from tactile_bayes.files.comparison import COMPARE, CompareReport
+from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.reports import ESTIMATE, POOLED, EstimateReport, PooledReport
+from tactile_bayes.mapping.map import TactileMap
+from tactile_bayes.options import BumpPrior
+from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.report import estimate_document
+from tactile_bayes.report.estimate_text import estimate_text
 
 _HEAD: dict[str, Any] = {"status": "no_estimate", "verdict": "no_answer", "entries": (), "reason": "", "left_out": ()}
 _FOOT: dict[str, Any] = {"research_use": RESEARCH_USE, "provenance": {"settings": {}, "inputs": []}}
+
+
+def report_of(estimate: Estimate, tactile_map: TactileMap, *, probability: float = 0.95) -> EstimateReport:
+    """The report of an estimate, of no file."""
+    told: Any = {"probability": probability, "prior": BumpPrior(), "provenance": Provenance("estimate", {})}
+    return estimate_document.estimate_report(estimate, tactile_map, **told)
+
+
+def full_text(estimate: Estimate, tactile_map: TactileMap) -> str:
+    """All that the report of an estimate says."""
+    return estimate_text(estimate, report_of(estimate, tactile_map))
 
 
 def estimate_report(**more: Any) -> EstimateReport:

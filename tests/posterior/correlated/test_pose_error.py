@@ -9,6 +9,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from plain_reports import full_text
 from posterior_maps import bump_map
 from scipy.stats import chi2
 
@@ -28,7 +29,6 @@ from tactile_bayes.posterior.fit import FieldFit, tangent_columns
 from tactile_bayes.posterior.marginal import independent_variance
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.presets import POSE_NOISE
-from tactile_bayes.report.estimate_text import estimate_text
 from tactile_bayes.report.map_text import map_text
 from tactile_bayes.scans import Scan, TrackerPoses
 
@@ -209,12 +209,10 @@ def test_the_report_says_what_they_make_of_the_widths_or_that_they_are_left_out(
     spread = np.var([np.log(posterior.sigma_x_mm), np.log(posterior.sigma_y_mm)], axis=(1, 2)).sum()
     added = np.diag(pose_covariance(fit_of(found)))[:2].sum()
     assert share == pytest.approx(added / spread, rel=0.15)
-    assert f"{100 * share:.0f} % of the width variance is tracker position error" in estimate_text(
-        found, tactile_map, probability=0.95
-    )
+    assert f"{100 * share:.0f} % of the width variance is tracker position error" in full_text(found, tactile_map)
     untold = {name: value for name, value in tactile_map.quality.items() if name not in POSE_NOISE}
     without = replace(tactile_map, quality=untold)
-    text = estimate_text(estimated(without), without, probability=0.95)
+    text = full_text(estimated(without), without)
     assert "Left out: tracker position error and its blur" in text
     assert "variance of the widths" not in text
 
