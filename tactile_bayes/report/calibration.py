@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -65,27 +66,6 @@ def repeatability_text(document: Mapping[str, Any]) -> str:
     """Report of what repeated exams say of a site, see data_schema/repeatability.schema.json."""
     calibration = document["calibration"]
     median, low, high = (100 * document[name] for name in ("median", "low", "high"))
-    half_width = []
-    if (half := document.get("half_width")) is not None:
-        after, before = 100 * half["with_it"], 100 * half["as_estimated"]
-        ends = f"about +-{after:.0f} % of the size with it, +-{before:.0f} % as estimated"
-        half_width.append(f"The 95 % interval of one exam: {ends}.")
-    lines = [
-        *_cautions(document),
-        f"Exams of one mass differ by {median:.1f} % at this site (95 %: {low:.1f} to {high:.1f}): SD of ln d beyond "
-        "the errors that each map has anyway.",
-        f"Learned from {document['masses']} masses and {document['maps']} exams, sized by {calibration['name']} "
-        f"(frames normalised by {calibration['normalise']}). Maps of one mass in the paper differed by "
-        f"{100 * PAPER_SPREAD:.0f} %.",
-        *half_width,
-        *_names("Took no part", document["left_out"]),
-        "Use it: tactile-bayes estimate MAP.nc --repeatability SITE.json",
-    ]
-    return "\n".join([*lines, RESEARCH_USE]) + "\n"
-
-
-def _cautions(document: Mapping[str, Any]) -> list[str]:
-    """What to look at before the figure: masses that lie apart, and few masses."""
     apart = [
         f"{one['name']} (probability by chance {_chance(one['by_chance'])})"
         for one in document["repeats"]
@@ -95,7 +75,19 @@ def _cautions(document: Mapping[str, Any]) -> list[str]:
     lines = _names(lead, apart)
     if document["masses"] < FEW:
         lines.append(f"CAUTION: {document['masses']} masses are few; the interval of the spread is wide.")
-    return lines
+    lines += [
+        f"Exams of one mass differ by {median:.1f} % at this site (95 %: {low:.1f} to {high:.1f}): SD of ln d beyond "
+        "the errors that each map has anyway.",
+        f"Learned from {document['masses']} masses and {document['maps']} exams, sized by {calibration['name']} "
+        f"(frames normalised by {calibration['normalise']}). Maps of one mass in the paper differed by "
+        f"{100 * PAPER_SPREAD:.0f} %.",
+    ]
+    if (half := document.get("half_width")) is not None:
+        ends = f"about +-{100 * half['with_it']:.0f} % of the size with it, +-{100 * half['as_estimated']:.0f} %"
+        lines.append(f"The 95 % interval of one exam: {ends} as estimated.")
+    lines += _names("Took no part", document["left_out"])
+    lines.append("Use it: tactile-bayes estimate MAP.nc --repeatability SITE.json")
+    return "\n".join([*lines, RESEARCH_USE]) + "\n"
 
 
 def _chance(probability: float) -> str:
@@ -103,10 +95,8 @@ def _chance(probability: float) -> str:
 
 
 def _names(lead: str, texts: Sequence[str]) -> list[str]:
-    if not texts:
-        return []
     more = f" and {len(texts) - _MOST_NAMED} more" if len(texts) > _MOST_NAMED else ""
-    return [f"{lead}: {'; '.join(texts[:_MOST_NAMED])}{more}."]
+    return [f"{lead}: {'; '.join(texts[:_MOST_NAMED])}{more}."] if texts else []
 
 
 # --- A size calibration learned over a population of bodies as text for people.
@@ -133,22 +123,19 @@ BODY_NAMES = {
 
 def body_calibration_text(calibration: BodyCalibration) -> str:
     """Constants, spreads, what the unknowns cost, and the errors on masses left out."""
-    fit, held = calibration.fit, ""
+    fit, held = defaultdict(lambda: float("nan"), {"bodies": 0.0, "maps": 0.0} | dict(calibration.fit)), ""
     if "left_out_held_percent" in fit:
         held = f", {fit['left_out_held_percent']:.0f} % in their {100 * HELD:g} % interval"
     lines = [
         *_eq6_lines(calibration),
-        f"between bodies, SD of ln d {fit.get('body_sd', float('nan')):.3f} (median; it changes with amplitude, width "
-        f"and depth), between exams of a body {fit.get('exam_sd', float('nan')):.3f}",
+        f"between bodies, SD of ln d {fit['body_sd']:.3f} (median; it changes with amplitude, width and depth), "
+        f"between exams of a body {fit['exam_sd']:.3f}",
         *_other_lines(calibration),
         unknowns_text(calibration.unknowns),
-        f"{fit.get('bodies', 0):.0f} bodies, {fit.get('maps', 0):.0f} maps; cross-validated by body: mean absolute "
-        f"error {fit.get('left_out_mae_percent', float('nan')):.1f} %, "
-        f"bias {fit.get('left_out_bias_percent', float('nan')):+.1f} %{held}",
+        f"{fit['bodies']:.0f} bodies, {fit['maps']:.0f} maps; cross-validated by body: mean absolute error "
+        f"{fit['left_out_mae_percent']:.1f} %, bias {fit['left_out_bias_percent']:+.1f} %{held}",
+        *(f"{name}: {ends}" for name, ends in _ranges(calibration.domain)),
     ]
-    for name, unit in (("amplitude", ""), ("sigma_mm", " mm"), ("d_mm", " mm")):
-        low, high = calibration.domain[name]
-        lines.append(f"range of {name.removesuffix('_mm')}: {low:.3g} to {high:.3g}{unit}")
     bodies = [f"{BODY_NAMES.get(name, name)} {a:.3g} to {b:.3g}" for name, (a, b) in calibration.bodies.items()]
     lines += [f"bodies: {', '.join(bodies)}"] if bodies else []
     lines.append(f"recipe: {calibration.recipe}")
@@ -243,11 +230,11 @@ def calibration_text(calibration: SizeCalibration, *, not_left_out: str = "", ot
     lines.append(f"Eq 6: d = m sigma / (e a^f) + b, {how}")
     both = calibration.axes == ("both",)
     axes = [("both axes", calibration.x)] if both else [("across, x", calibration.x), ("along, y", calibration.y)]
-    lines.append(f"{'':24}" + "".join(f"{name:>22}" for name, _ in axes))
-    for index, name in enumerate(COEFFICIENTS):
-        cells = [f"{a.draws[:, index].mean():.3f} +- {a.draws[:, index].std():.3f}" for _, a in axes]
-        lines.append(f"{LABELS[name]:24}" + "".join(f"{cell:>22}" for cell in cells))
-    lines += _figures([axis for _, axis in axes])
+    columns = [[name, *_column(axis)] for name, axis in axes]
+    heads = ["", *(LABELS[name] for name in COEFFICIENTS), "r2 of ln d", "mean absolute error", "rows"]
+    heads += [name for name, _ in _ranges(calibration.x.domain)]
+    for head, *cells in zip(heads, *columns, strict=True):
+        lines.append(f"{head:24}" + "".join(f"{cell:>22}" for cell in cells))
     lines.append(f"residual SD is given at amplitude {calibration.x.reference_amplitude:.3g}; fainter maps tell less")
     if not both:
         lines.append(f"correlation of the two residuals {calibration.residual_correlation:.2f}")
@@ -280,13 +267,18 @@ def _left_out(errors: LeftOutErrors) -> list[str]:
     return [f"leave one geometry out: {said[0]} of d ({errors.geometries} geometries, {which})", *said[1:]]
 
 
-def _figures(axes: list[AxisCalibration]) -> list[str]:
-    rows = [
-        ("r2 of ln d", [f"{axis.fit.get('r2', float('nan')):.2f}" for axis in axes]),
-        ("mean absolute error", [f"{axis.fit.get('mae_percent', float('nan')):.0f} %" for axis in axes]),
-        ("rows", [f"{axis.fit.get('rows', 0):.0f}" for axis in axes]),
-    ]
+def _column(axis: AxisCalibration) -> Iterator[str]:
+    """Cells of one axis: coefficients, how well they fit, and ranges."""
+    for draws in axis.draws[:, : len(COEFFICIENTS)].T:
+        yield f"{draws.mean():.3f} +- {draws.std():.3f}"
+    yield f"{axis.fit.get('r2', float('nan')):.2f}"
+    yield f"{axis.fit.get('mae_percent', float('nan')):.0f} %"
+    yield f"{axis.fit.get('rows', 0):.0f}"
+    yield from (ends for _, ends in _ranges(axis.domain))
+
+
+def _ranges(domain: Mapping[str, tuple[float, float]]) -> Iterator[tuple[str, str]]:
+    """Names and ends of the ranges that a calibration holds for."""
     for name, unit in (("amplitude", ""), ("sigma_mm", " mm"), ("d_mm", " mm")):
-        cells = [f"{axis.domain[name][0]:.3g} to {axis.domain[name][1]:.3g}{unit}" for axis in axes]
-        rows.append((f"range of {name.removesuffix('_mm')}", cells))
-    return [f"{label:24}" + "".join(f"{cell:>22}" for cell in cells) for label, cells in rows]
+        low, high = domain[name]
+        yield f"range of {name.removesuffix('_mm')}", f"{low:.3g} to {high:.3g}{unit}"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 
@@ -31,7 +31,7 @@ from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.inference.points import normal_quantile
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.size.pooling import Repeatability
-from tactile_bayes.size.visits import VOLUME, Apart, Change, Compared, JointSizes, Trend, doubling_days, straight_line
+from tactile_bayes.size.visits import VOLUME, Change, Compared, JointSizes, doubling_days, straight_line
 
 # --- Growth of masses between visits, as `compare` told it: rows of a table and a section of a page.
 
@@ -116,14 +116,11 @@ def compare_report(
     `days`: time of each visit; None where it is not known; `grown_by`: shares of the diameter; `repeatability`: of the
     site, where the comparison used one.
     """
-    joint = compared.joint
+    joint, dated = compared.joint, [None] * len(visits) if days is None else days
     changes: list[ChangeReport] = []
     if joint is not None:
-        changes = [
-            _change(joint, compared.another, later, days=days, grown_by=grown_by, probability=probability)
-            for later in range(1, len(visits))
-        ]
-    used = None if joint is None else joint.calibrations[0]
+        asked: dict[str, Any] = {"days": days, "grown_by": grown_by, "probability": probability}
+        changes = [_change(joint, compared.another, later, **asked) for later in range(1, len(visits))]
     return CompareReport(
         schema=COMPARE,
         status=compared.status,
@@ -132,46 +129,32 @@ def compare_report(
         reason=compared.reason,
         advice=compared.advice,
         visits=tuple(
-            _visit(i, visits[i], names[i], joint, day=None if days is None else days[i], probability=probability)
-            for i in range(len(visits))
+            Visit(
+                visit=i + 1,
+                day=dated[i],
+                max_size_mm=None if joint is None else joint.size_mm(i, probability).rounded,
+                fat_mm=None if joint is None else rounded(joint.calibrations[i].fat_mm),
+                maps=tuple(
+                    VisitMap(name, one.status, one.reason, one.detected_probability)
+                    for name, one in zip(names[i], reports, strict=True)
+                ),
+            )
+            for i, reports in enumerate(visits)
         ),
-        places=tuple(_apart(number, one) for number, one in enumerate(compared.apart, start=2)),
+        places=tuple(
+            VisitPlace(visit, None, None, None, None)
+            if one is None
+            else rounded(VisitPlace(visit, one.distance_mm, one.sd_mm, one.shift_mm, one.probability))
+            for visit, one in enumerate(compared.apart, start=2)
+        ),
         changes=tuple(changes),
         trend=None if joint is None or days is None or len(visits) < 3 else _trend(joint, days, probability),
         between_map_sd=None if joint is None else rounded(joint.between_map_sd),
         repeatability=UNSET if repeatability is None else repeatability.words(),
-        left_out=() if used is None else tuple(used.omissions()),
+        left_out=() if joint is None else tuple(joint.calibrations[0].omissions()),
         research_use=RESEARCH_USE,
         provenance=provenance.as_dict(),
     )
-
-
-def _visit(
-    index: int,
-    reports: Sequence[EstimateReport],
-    names: Sequence[str],
-    joint: JointSizes | None,
-    *,
-    day: float | None,
-    probability: float,
-) -> Visit:
-    return Visit(
-        visit=index + 1,
-        day=day,
-        max_size_mm=None if joint is None else joint.size_mm(index, probability).rounded,
-        fat_mm=None if joint is None else rounded(joint.calibrations[index].fat_mm),
-        maps=tuple(
-            VisitMap(name, one.status, one.reason, one.detected_probability)
-            for name, one in zip(names, reports, strict=True)
-        ),
-    )
-
-
-def _apart(visit: int, found: Apart | None) -> VisitPlace:
-    """How far a visit's mass lies from the first's."""
-    if found is None:
-        return VisitPlace(visit, None, None, None, None)
-    return rounded(VisitPlace(visit, found.distance_mm, found.sd_mm, found.shift_mm, found.probability))
 
 
 def _change(
@@ -183,9 +166,16 @@ def _change(
     grown_by: Sequence[float],
     probability: float,
 ) -> ChangeReport:
-    """Change from the first visit to a later one."""
-    change = joint.change(0, later)
+    """Change from the first visit to a later one, and if exams of one mass differ as the paper's maps do."""
+    change, told, rate = joint.change(0, later), None, None
     growth, shrinkage = change.smallest_detectable(SHOWN)
+    if another is not None:
+        other = another.change(0, later)
+        grown = rounded(other.probability_above(0.0))
+        told = AnotherChange(rounded(another.between_map_sd), other.percent(probability).rounded, grown)
+    if days is not None:
+        q, apart = change.log_summary(probability), days[later] - days[0]
+        rate = GrowthRate(apart, *_rates([VOLUME * one / apart for one in (q.median, q.low, q.high)], probability))
     return ChangeReport(
         earlier=1,
         later=later + 1,
@@ -195,8 +185,8 @@ def _change(
         probability_grown=rounded(change.probability_above(0.0)),
         grown_by=tuple(rounded(GrownBy(100.0 * share, change.probability_above(share))) for share in grown_by),
         smallest_detectable_percent=rounded(Detectable(100.0 * growth, 100.0 * shrinkage)),
-        growth_rate=None if days is None else _rate(change, days[later] - days[0], probability),
-        another_exam=None if another is None else _another(another, later, probability),
+        growth_rate=rate,
+        another_exam=told,
     )
 
 
@@ -208,35 +198,18 @@ def verdict(change: Change) -> Literal["grown", "shrunk", "no_change_shown"]:
     return "shrunk" if q.high < 0.0 else "no_change_shown"
 
 
-def _another(another: JointSizes, later: int, probability: float) -> AnotherChange:
-    """The change if exams of one mass differ as the paper's maps do."""
-    change = another.change(0, later)
-    grown = rounded(change.probability_above(0.0))
-    return AnotherChange(rounded(another.between_map_sd), change.percent(probability).rounded, grown)
-
-
-def _rate(change: Change, days: float, probability: float) -> GrowthRate:
-    """Specific growth rate of the volume between two visits."""
-    q = change.log_summary(probability)
-    median, low, high = (VOLUME * one / days for one in (q.median, q.low, q.high))
-    return GrowthRate(days, *_rates(median, (low, high), probability=probability))
-
-
-def _rates(median: float, ends: tuple[float, float], *, probability: float) -> tuple[Rate, Doubling]:
-    """A growth rate in percent of the volume per day, and the doubling times at its median and its ends."""
-    low, high = ends
-    percent, least, most = (rounded(100.0 * one) for one in (median, low, high))
-    return Rate(percent, least, most, probability), rounded(
-        Doubling(doubling_days(median), doubling_days(high), doubling_days(low))
-    )
+def _rates(growth: Sequence[float], probability: float) -> tuple[Rate, Doubling]:
+    """A growth rate in percent of the volume per day, and the doubling times, at its median and its ends."""
+    median, low, high = (rounded(100.0 * one) for one in growth)
+    times = Doubling(*(doubling_days(growth[i]) for i in (0, 2, 1)))
+    return Rate(median, low, high, probability), rounded(times)
 
 
 def _trend(joint: JointSizes, days: Sequence[float], probability: float) -> TrendReport:
     """Straight line of ln d over all visits."""
-    line: Trend = straight_line(*joint.moments, days)
+    line = straight_line(*joint.moments, days)
     half = float(normal_quantile(np.array(0.5 + probability / 2))) * line.sd
-    ends = VOLUME * (line.per_day - half), VOLUME * (line.per_day + half)
-    rates = _rates(VOLUME * line.per_day, ends, probability=probability)
+    rates = _rates([VOLUME * (line.per_day + one) for one in (0.0, -half, half)], probability)
     return TrendReport(len(days), days[-1] - days[0], *rates, rounded(line.departure))
 
 

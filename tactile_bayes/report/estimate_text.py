@@ -26,7 +26,7 @@ from tactile_bayes.report.estimate_document import (
     supposed_line,
     supposed_lines,
 )
-from tactile_bayes.report.quantities import ANOTHER_EXAM, from_xiphoid, place_line
+from tactile_bayes.report.quantities import from_xiphoid, place_line
 from tactile_bayes.size.draws import EXTREMES, SIZES
 
 # --- The smallest lump that a map without one would have shown, in a sentence.
@@ -179,8 +179,8 @@ def joined(texts: Sequence[str], *, most: int, lead: str) -> list[str]:
 
 # --- An estimate as a short table a clinician can read.
 
-ANOTHER_LARGEST = f"{ANOTHER_EXAM}.max_size_mm"
-ANOTHER_SMALLEST = f"{ANOTHER_EXAM}.min_size_mm"
+ANOTHER_LARGEST = "another_exam.max_size_mm"
+ANOTHER_SMALLEST = "another_exam.min_size_mm"
 ROWS = (
     (ANOTHER_LARGEST, "largest size", "mm"),
     (ANOTHER_SMALLEST, "smallest size", "mm"),

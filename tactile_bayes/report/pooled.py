@@ -25,7 +25,7 @@ from tactile_bayes.report.estimate_text import (
     table_row,
     width_lines,
 )
-from tactile_bayes.report.quantities import ANOTHER_EXAM, another_exam
+from tactile_bayes.report.quantities import another_exam
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.draws import EXTREMES
 from tactile_bayes.size.fat import LEAST_PROBABILITY
@@ -55,12 +55,7 @@ def pooled_report(
     """
     size, used = pooled.size, pooled.calibration or calibration
     head = unknown_head(used.recipe.head)
-    found: dict[str, Quantity] = {}
-    if size is not None:
-        found = {name: size.summarise(name, probability=probability) for name in EXTREMES}
-        if size.another_exam is not None:
-            another = size.another_exam
-            found |= {f"{ANOTHER_EXAM}.{n}": another.summarise(n, probability=probability) for n in EXTREMES}
+    largest, smallest = (None if size is None else size.summarise(one, probability=probability) for one in EXTREMES)
     findings = by_weight(_findings(pooled, reports, apart or {}, one_place=one_place))
     return PooledReport(
         schema=POOLED,
@@ -68,10 +63,10 @@ def pooled_report(
         verdict=verdict(findings, answered=size is not None),
         entries=tuple(one.entry for one in findings),
         reason=pooled.reason,
-        max_size_mm=found["max_size_mm"].rounded if found else None,
-        min_size_mm=found["min_size_mm"].rounded if found else None,
-        another_exam=another_exam(size, found),
-        supposing=suppositions(size, found.get("max_size_mm")),
+        max_size_mm=None if largest is None else largest.rounded,
+        min_size_mm=None if smallest is None else smallest.rounded,
+        another_exam=another_exam(size, probability=probability),
+        supposing=suppositions(size, largest),
         maps=tuple(_map(i, name, reports[i], pooled) for i, name in enumerate(names)),
         one_size_probability=rounded(pooled.one_size),
         one_place_probability=rounded(pooled.one_place),
@@ -162,32 +157,29 @@ def fat_apart(depths_mm: tuple[float, float]) -> Finding:
 
 def pooled_summary(report: PooledReport) -> str:
     """Report of a mass in at most 12 lines; `pooled_text` gives the rest."""
-    findings, largest = report.findings, report.max_size_mm
-    apart = report.status == DISAGREE
-    lines = finding_summary(findings, "caution", most=2) + _maps_lines(report.maps, with_ends=apart)
+    findings, largest, figures = report.findings, report.max_size_mm, report.figures
+    lines = finding_summary(findings, "caution", most=2)
+    found = [one.max_size_mm for one in report.maps if one.max_size_mm is not None]
+    if found:
+        sizes = ", ".join(_size_words(one, with_ends=report.status == DISAGREE) for one in found[:MOST_NAMED])
+        more = f" and {len(found) - MOST_NAMED} more" if len(found) > MOST_NAMED else ""
+        lines.append(f"A lump was found on {len(found)} of {len(report.maps)} maps, alone sized at {sizes}{more} mm.")
     lines += finding_summary(findings, "check", most=2)
     if largest is None:
         lines.append(_no_size(report))
     else:
         lines += _table(report) + width_lines(report.leading.variance_share or {})
-        ends = f"interval ends to {largest.mc_error / largest.sd:.3f} SD; " if largest.sd > 0 else ""
-        by = f"sizes by {report.site}; " if report.site else ""
-        site = f"; {report.site_words}" if report.site_words else ""
-        form = "; irregular outline, with a wider interval" if report.figures.get("irregular_outline") else ""
-        spread = 100 * report.figures["between_map_sd"]
-        lines.append(f"Quality: {by}{ends}the maps of this mass differ by {spread:.0f} %{site}{form}.")
+        parts = [
+            f"sizes by {report.site}" if report.site else "",
+            f"interval ends to {largest.mc_error / largest.sd:.3f} SD" if largest.sd > 0 else "",
+            f"the maps of this mass differ by {100 * figures['between_map_sd']:.0f} %",
+            report.site_words,
+            "irregular outline, with a wider interval" if figures.get("irregular_outline") else "",
+        ]
+        lines.append(f"Quality: {'; '.join(filter(None, parts))}.")
         if len(lines) < MOST_LINES - 2:
-            places = decimals(_worst(report).mc_error, most=SIZE_DECIMALS)
-            lines += supposed_line(report.supposing, largest.median, places=places)
+            lines += supposed_line(report.supposing, largest.median, places=_places(report))
     return "\n".join([*lines, MORE, RESEARCH_USE]) + "\n"
-
-
-def _maps_lines(maps: Sequence[PooledMap], *, with_ends: bool) -> list[str]:
-    """Sizes of the maps in one line."""
-    found = [one.max_size_mm for one in maps if one.max_size_mm is not None]
-    sizes = ", ".join(_size_words(one, with_ends=with_ends) for one in found[:MOST_NAMED])
-    more = f" and {len(found) - MOST_NAMED} more" if len(found) > MOST_NAMED else ""
-    return [f"A lump was found on {len(found)} of {len(maps)} maps, alone sized at {sizes}{more} mm."] if found else []
 
 
 def _size_words(size: Interval, *, with_ends: bool) -> str:
@@ -202,15 +194,18 @@ def _no_size(report: PooledReport) -> str:
 def pooled_text(report: PooledReport) -> str:
     """Full report of a mass."""
     lines = finding_lines(report.findings, "caution")
-    lines += [f"{number}. {_map_line(one)}" for number, one in enumerate(report.maps, start=1)]
+    for number, one in enumerate(report.maps, start=1):
+        told = f"no estimate ({one.reason})"
+        if one.max_size_mm is not None:
+            mass = "  (mass {} of {} on this map)".format(*one.mass) if one.mass else ""
+            told = f"{_size_words(one.max_size_mm, with_ends=True)} mm alone{mass}"
+        lines.append(f"{number}. {one.map}: {told}")
     lines += finding_lines(report.findings, "check")
     if report.max_size_mm is None:
         return "\n".join([*lines, _no_size(report), RESEARCH_USE]) + "\n"
     worst, figures = _worst(report), report.figures
-    lines += ["", *_table(report)]
-    lines += ["", *width_lines(report.leading.variance_share or {})]
-    places = decimals(worst.mc_error, most=SIZE_DECIMALS)
-    lines += supposed_lines(report.supposing, report.max_size_mm.median, places=places)
+    lines += ["", *_table(report), "", *width_lines(report.leading.variance_share or {})]
+    lines += supposed_lines(report.supposing, report.max_size_mm.median, places=_places(report))
     lines.append(f"Spread between the maps of this mass: {100 * figures['between_map_sd']:.0f} %.")
     if report.one_size_probability is not None:
         chance = _chance(report.one_size_probability)
@@ -219,14 +214,10 @@ def pooled_text(report: PooledReport) -> str:
         lines.append(site_interval_text(report.site_words))
     lines.append(shape_text(figures))
     lines.append(f"Monte-Carlo error of the interval ends: {ends_text('sizes', worst.mc_error, worst.sd)}.")
-    unknowns = fat_text(report.fat_mm) + unknowns_text(report.unknowns)
-    lines.append(f"{capital(unknowns)}.")
-    if report.site:
-        lines.append(f"Sizes by {report.site}.")
-    if report.left_out:
-        lines.append(f"Left out: {'; '.join(report.left_out)}.")
-    if report.reason:
-        lines.append(f"{report.reason}.")
+    lines.append(f"{capital(fat_text(report.fat_mm) + unknowns_text(report.unknowns))}.")
+    lines += [f"Sizes by {report.site}."] if report.site else []
+    lines += [f"Left out: {'; '.join(report.left_out)}."] if report.left_out else []
+    lines += [f"{report.reason}."] if report.reason else []
     return "\n".join([*lines, RESEARCH_USE]) + "\n"
 
 
@@ -236,19 +227,16 @@ def _worst(report: PooledReport) -> Quantity:
     return max((one for one in sizes if one is not None), key=lambda q: q.mc_error)
 
 
+def _places(report: PooledReport) -> int:
+    """Decimal places of the sizes."""
+    return decimals(_worst(report).mc_error, most=SIZE_DECIMALS)
+
+
 def _table(report: PooledReport) -> list[str]:
     """Table of both sizes with their intervals."""
-    worst, leads = _worst(report), report.leading
+    leads, places = report.leading, _places(report)
     rows = [("largest size", leads.max_size_mm), ("smallest size", leads.min_size_mm)]
     if report.another_exam is not None:
         rows.append((exams_label(report.figures.get("between_map_sd")), report.max_size_mm))
-    places = decimals(worst.mc_error, most=SIZE_DECIMALS)
     told = (table_row(label, q.median, (q.low, q.high), unit="mm", places=places) for label, q in rows if q is not None)
-    return [table_head(worst.probability), *told]
-
-
-def _map_line(one: PooledMap) -> str:
-    if one.max_size_mm is None:
-        return f"{one.map}: no estimate ({one.reason})"
-    mass = "  (mass {} of {} on this map)".format(*one.mass) if one.mass else ""
-    return f"{one.map}: {_size_words(one.max_size_mm, with_ends=True)} mm alone{mass}"
+    return [table_head(_worst(report).probability), *told]

@@ -21,8 +21,6 @@ from tactile_bayes.size.draws import EXTREMES, SIZES, SizePosterior
 
 # --- Summaries of an estimate's draws, by name.
 
-ANOTHER_EXAM = "another_exam"
-"""Prefix of the sizes' quantities if another exam of the mass may come out apart, see `SizePosterior.another_exam`."""
 WIDTHS = ("amplitude", "sigma_x_mm", "sigma_y_mm", "background", "noise_sd")
 
 
@@ -51,24 +49,17 @@ def estimate_quantities(estimate: Estimate, tactile_map: TactileMap, *, probabil
     }
     if estimate.size is not None:
         found |= {name: estimate.size.summarise(name, probability=probability) for name in SIZES}
-        another = estimate.size.another_exam
-        if another is not None:
-            of_another = {name: another.summarise(name, probability=probability) for name in EXTREMES}
-            found |= {f"{ANOTHER_EXAM}.{name}": quantity for name, quantity in of_another.items()}
     return found
 
 
-def another_exam(size: SizePosterior | None, quantities: Mapping[str, Quantity]) -> AnotherExam | None:
+def another_exam(size: SizePosterior | None, *, probability: float) -> AnotherExam | None:
     """The spread between exams of a mass as a share of its size, and both sizes with it; None where it is not told."""
-    if size is None or size.another_exam is None:
+    another = None if size is None else size.another_exam
+    if another is None:
         return None
-    another = size.another_exam
-    return AnotherExam(
-        between_map_sd=rounded(another.figures["between_map_sd"]),
-        max_size_mm=quantities[f"{ANOTHER_EXAM}.max_size_mm"].rounded,
-        min_size_mm=quantities[f"{ANOTHER_EXAM}.min_size_mm"].rounded,
-        variance_share=rounded(dict(another.variance_share)),
-    )
+    largest, smallest = (another.summarise(name, probability=probability).rounded for name in EXTREMES)
+    shares = rounded(dict(another.variance_share))
+    return AnotherExam(rounded(another.figures["between_map_sd"]), largest, smallest, shares)
 
 
 # --- Place of a lump in the breast, by clock and distance from the nipple, of an estimate and in words.

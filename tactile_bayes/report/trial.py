@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Final
 
-from tactile_bayes.declarations import UNSET, Record, replace
+from tactile_bayes.declarations import UNSET, replace
 from tactile_bayes.terminal import padded, shown_columns
 from tactile_bayes.trial.accuracy import REFERENCE, ModalityRatio, PairedComparison, least_p
 from tactile_bayes.trial.figures import MIN_PATIENTS, Ends, Figure
 from tactile_bayes.trial.method_comparison import Unit
-from tactile_bayes.trial.planning import Design, IntervalCheck, Needed, PlanReport
+from tactile_bayes.trial.planning import Design, Needed, PlanReport
 from tactile_bayes.trial.summary import Counts, ModalityReport, TrialReport
 
 DIGITS: Final = 12  #: Of the numbers of `validate`'s file, so that the order of summation changes no byte.
@@ -22,10 +21,12 @@ DIGITS: Final = 12  #: Of the numbers of `validate`'s file, so that the order of
 
 def plan_text(plan: PlanReport) -> str:
     """Full text of a plan, ending with the research-use line."""
+    given = [name for name, source in plan.errors_from.items() if source == "option"]
+    piloted = "pilot" in plan.errors_from.values() and given
     lines = [
         *map(needed_sentence, plan.needed),
         f"Assumed errors of ln size: {_errors(plan, plan.errors)}",
-        *_origins(plan),
+        *([f"Given by options: {_errors(plan, given)}; the others are the pilot's."] if piloted else []),
         "",
         "                                     mean error, %     interval, factor",
         "patients  maps  power                 tactile  other   tactile   ratio",
@@ -55,13 +56,6 @@ def needed_sentence(one: Needed) -> str:
 
 def _errors(plan: PlanReport, names: Iterable[str]) -> str:
     return ", ".join(f"{name.replace('_', ' ')} {plan.errors[name]:.3g}" for name in names)
-
-
-def _origins(plan: PlanReport) -> Iterator[str]:
-    """Source of each assumed error when there is a pilot: the pilot or an option."""
-    given = [name for name, source in plan.errors_from.items() if source == "option"]
-    if "pilot" in plan.errors_from.values() and given:
-        yield f"Given by options: {_errors(plan, given)}; the others are the pilot's."
 
 
 def _design_line(one: Design) -> str:
@@ -105,8 +99,8 @@ def _modality_lines(name: str, report: ModalityReport) -> Iterator[str]:
             yield f"{name}: {words}{ratio}: slope {shown(slope, '.2f')}, intercept {shown(intercept, '.1f')} mm"
     if methods.concordance is not None:
         yield f"{name}: concordance {shown(methods.figure('concordance'), '.2f')}"
-    for row in limit_rows(report):
-        yield f"{name}: limits of agreement {row.words}: bias {row.bias}, {row.low} to {row.high}"
+    for words, bias, low, high in limit_rows(report):
+        yield f"{name}: limits of agreement {words}: bias {bias}, {low} to {high}"
     yield from _replicate_lines(name, report)
     if report.calibration is not None:
         found = report.calibration
@@ -116,17 +110,8 @@ def _modality_lines(name: str, report: ModalityReport) -> Iterator[str]:
         )
 
 
-class LimitRow(Record):
-    """Limits of agreement on one scale, formatted."""
-
-    words: str
-    bias: str
-    low: str
-    high: str
-
-
-def limit_rows(report: ModalityReport) -> Iterator[LimitRow]:
-    """Limits of the ratio, then in mm."""
+def limit_rows(report: ModalityReport) -> Iterator[tuple[str, str, str, str]]:
+    """Limits of agreement, of the ratio, then in mm: the scale in words, bias, lower and upper limit."""
     methods = report.method_comparison
     units: tuple[Unit, ...] = ("log_ratio", "mm")
     for unit in units:
@@ -135,10 +120,10 @@ def limit_rows(report: ModalityReport) -> Iterator[LimitRow]:
             continue
         low, high = methods.figure(f"limit_low_{unit}"), methods.figure(f"limit_high_{unit}")
         if unit == "mm":
-            yield LimitRow("in mm", f"{one.bias:.3g}", shown(low, ".3g"), shown(high, ".3g"))
-            continue
-        low, high = low.mapped(math.exp), high.mapped(math.exp)
-        yield LimitRow("of size / ex vivo", f"{math.exp(one.bias):.2f}", shown(low, ".2f"), shown(high, ".2f"))
+            yield "in mm", f"{one.bias:.3g}", shown(low, ".3g"), shown(high, ".3g")
+        else:
+            low, high = low.mapped(math.exp), high.mapped(math.exp)
+            yield "of size / ex vivo", f"{math.exp(one.bias):.2f}", shown(low, ".2f"), shown(high, ".2f")
 
 
 def growing_line(report: TrialReport) -> str | None:
@@ -178,28 +163,17 @@ def _pair_line(pair: PairedComparison) -> str:
     return head + f"MAPE {difference} points, ratio {ratio}{test}"
 
 
-def _least_p_lines(pairs: Sequence[PairedComparison]) -> Iterator[str]:
-    """A line where a pair has so few patients that no difference between modalities could give p < 0.05."""
-    tested = [pair.patients for pair in pairs if pair.p_value is not None]
-    if tested and (least := least_p(max(tested))) >= 0.05:
-        few = f"{max(tested)} patient{'' if max(tested) == 1 else 's'}"
-        yield f"With {few} p cannot be below {least:.2g}: the test says nothing here."
-
-
 def shown(figure: Figure, spec: str) -> str:
     """Value with its interval in brackets."""
-    if figure.value is None:
-        return "-"
-    return f"{figure.value:{spec}}{_ends(figure.interval, spec)}"
+    if figure.value is None or figure.interval is None:
+        return number(figure.value, spec)
+    low, high = figure.interval
+    return f"{figure.value:{spec}} [{low:{spec}}, {high:{spec}}]"
 
 
 def number(value: float | None, spec: str) -> str:
     """A number, or a dash for none."""
     return "-" if value is None else f"{value:{spec}}"
-
-
-def _ends(interval: Ends | None, spec: str) -> str:
-    return "" if interval is None else f" [{interval[0]:{spec}}, {interval[1]:{spec}}]"
 
 
 # --- Text report of a trial: a sentence for each comparison, a table that fits 80 columns; then methods.
@@ -239,7 +213,7 @@ def trial_text(report: TrialReport, *, left_out: Sequence[str] = (), methods: bo
         "",
         *_notes(report),
         *(["", *_methods(report)] if methods else []),
-        *([] if report.interval_check is UNSET else itertools.starmap(_check_line, report.interval_check.items())),
+        *_check_lines(report),
         *([] if report.next_mass is UNSET else report.next_mass.lines()),
         *([] if methods else [MORE]),
         report.research_use,
@@ -289,13 +263,12 @@ def figure_table(report: TrialReport, wanted: Mapping[str, tuple[str, str]]) -> 
             rows.append((name,))
         figures = [(one.figure(key), spec) for key, (_, spec) in wanted.items()]
         rows.append((label, f"{one.detected} of {one.n}", *(number(figure.value, spec) for figure, spec in figures)))
-        share = (
-            ""
-            if one.detected_interval is None
-            else "{:.0f} to {:.0f} %".format(*(100 * end for end in one.detected_interval))
-        )
+        found = one.detected_interval
+        share = "" if found is None else f"{_between((100 * found[0], 100 * found[1]), '.0f')} %"
         rows.append(("", share, *(_between(figure.interval, spec) for figure, spec in figures)))
-    return _aligned(rows)
+    widths = [max(map(shown_columns, column)) for column in zip(*(row for row in rows if len(row) > 1), strict=True)]
+    lines = ["  ".join(padded(cell, width) for cell, width in zip(row, widths, strict=False)).rstrip() for row in rows]
+    return [line for line in lines if line]
 
 
 def _between(ends: Ends | None, spec: str) -> str:
@@ -325,12 +298,13 @@ def _methods(report: TrialReport) -> Iterator[str]:
     )
 
 
-def _check_line(name: str, check: IntervalCheck) -> str:
-    low, high = check.share_interval
-    return (
-        f"{name}: in {check.trials} simulated trials of this size {check.share:.1%} [{low:.1%}, {high:.1%}] of the "
-        f"intervals of the error in percent covered the true one; {check.above} were above it, {check.below} below"
-    )
+def _check_lines(report: TrialReport) -> Iterator[str]:
+    for name, check in () if report.interval_check is UNSET else report.interval_check.items():
+        low, high = check.share_interval
+        yield (
+            f"{name}: in {check.trials} simulated trials of this size {check.share:.1%} [{low:.1%}, {high:.1%}] of the "
+            f"intervals of the error in percent covered the true one; {check.above} were above it, {check.below} below"
+        )
 
 
 def _notes(report: TrialReport) -> Iterator[str]:
@@ -347,7 +321,10 @@ def _notes(report: TrialReport) -> Iterator[str]:
     if tested := sum(pair.p_holm is not None for pair in report.paired_comparisons):
         pairs = f", corrected for {tested} pairs by Holm" if tested > 1 else ""
         yield f"p: sign-flip test by patient on the masses that both looked for{pairs}."
-        yield from _least_p_lines(report.paired_comparisons)
+        patients = max(pair.patients for pair in report.paired_comparisons if pair.p_value is not None)
+        if (least := least_p(patients)) >= 0.05:  # no difference between modalities could give less
+            few = f"{patients} patient{'' if patients == 1 else 's'}"
+            yield f"With {few} p cannot be below {least:.2g}: the test says nothing here."
 
 
 def ratio_line(name: str, one: ModalityRatio) -> str:
@@ -399,12 +376,6 @@ def found_share(report: ModalityReport) -> str:
         return share
     low, high = report.detected_interval
     return f"{share} [{100 * low:.0f}, {100 * high:.0f} %]"
-
-
-def _aligned(rows: list[tuple[str, ...]]) -> list[str]:
-    widths = [max(map(shown_columns, column)) for column in zip(*(row for row in rows if row[1:]), strict=True)]
-    lines = ["  ".join(padded(cell, width) for cell, width in zip(row, widths, strict=False)).rstrip() for row in rows]
-    return [line for line in lines if line]
 
 
 def _synthetic(counts: Counts) -> str:

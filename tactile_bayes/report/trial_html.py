@@ -317,11 +317,7 @@ def _masses(trial: Trial) -> Table:
 
 
 def _limits(report: TrialReport) -> Table:
-    rows = [
-        [name, row.words, row.bias, row.low, row.high]
-        for name, one in report.modalities.items()
-        for row in limit_rows(one)
-    ]
+    rows = [[name, *row] for name, one in report.modalities.items() for row in limit_rows(one)]
     return ["", "scale", "bias", "lower limit", "upper limit"], rows
 
 
