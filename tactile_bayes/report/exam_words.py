@@ -12,12 +12,13 @@ import numpy as np
 
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import CANNOT_SHOW, NO_LUMP, UsageError
-from tactile_bayes.files.reports import EstimateReport, Interval, MassReport, PooledReport, centre_of
+from tactile_bayes.files.reports import EstimateReport, Interval, MassReport, Place, Point, PooledReport, centre_of
 from tactile_bayes.findings import capital, finding_lines
 from tactile_bayes.geometry import apply
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.mapping.map import FEW_READINGS, TactileMap
 from tactile_bayes.mapping.places import ClockPosition, clock_position, clock_text
+from tactile_bayes.mapping.plausibility import WHY_NOT
 from tactile_bayes.posterior.abstention import chance_text
 from tactile_bayes.report.estimate_document import others, patient_mm
 from tactile_bayes.report.estimate_text import shape_text, smallest_text, width_lines
@@ -39,9 +40,7 @@ class ExamMass(Record, eq=False):
     angle_deg: float = 0.0
     """`axes_mm`, `angle_deg`: Diameters of the ellipse along its own axes, and the angle from x to the first; None
     without a size."""
-    largest: Quantity | None = None
-    smallest: Quantity | None = None
-    """`largest`, `smallest`: Largest and smallest size with the intervals that lead; None without."""
+    largest: Quantity | None = None  #: Largest size with the interval that leads; None without.
     probability: float | None = None  #: That it is a lump; None where it is not told.
     place: ClockPosition | None = None  #: About the nipple; None where that is not known.
     patient_mm: tuple[float, float] | None = None
@@ -72,14 +71,14 @@ class Exam(Record, eq=False):
     """`title`, `name`, `day`: Given for the page; empty where they were not."""
 
     @property
-    def main(self) -> ExamMap:
-        """The map that is drawn large: the first on which there is a mass, else the first."""
-        return next((one for one in self.maps if one.masses), self.maps[0])
+    def main_number(self) -> int:
+        """Number, from 1, of the map that is drawn large: the first on which there is a mass, else the first."""
+        return next((number for number, one in enumerate(self.maps, start=1) if one.masses), 1)
 
     @property
-    def main_number(self) -> int:
-        """Its number among the maps, from 1."""
-        return next(number for number, one in enumerate(self.maps, start=1) if one is self.main)
+    def main(self) -> ExamMap:
+        """The map that is drawn large."""
+        return self.maps[self.main_number - 1]
 
     @property
     def drawn(self) -> ExamMap:
@@ -137,61 +136,42 @@ class Given(Record):
 
 def exam_map(tactile_map: TactileMap | None, report: EstimateReport, *, side: str) -> ExamMap:
     """A map with its masses, from its estimate; `side` is the breast, as the scans have it."""
-    return ExamMap(tactile_map, report, tuple(_masses(tactile_map, report, side)))
+    number = next((one.number for one in report.masses if one.reported), 1)
+    masses = [] if report.centre_mm is None else [_mass(number, report, report.centre_mm, tactile_map, side)]
+    masses += [_mass(one.number, one, one.centre_mm, tactile_map, side) for one in others(report.masses)]
+    return ExamMap(tactile_map, report, tuple(masses))
 
 
-def _masses(tactile_map: TactileMap | None, report: EstimateReport, side: str) -> Iterator[ExamMass]:
-    """The reported mass first, then the others in their order."""
-    centre = report.centre_mm
-    if centre is not None:
-        number = next((one.number for one in report.masses if one.reported), 1)
-        why = "" if report.max_size_mm is not None else report.reason
-        sd_mm = (centre.x.sd, centre.y.sd)
-        yield _placed(number, centre.median, tactile_map, side, told=report, centre_sd_mm=sd_mm, why=why)
-    for one in others(report.masses):
-        yield _placed(one.number, one.centre_mm.median, tactile_map, side, told=one, why=one.reason)
-
-
-def _placed(
-    number: int,
-    centre_mm: tuple[float, float],
-    tactile_map: TactileMap | None,
-    side: str,
-    *,
-    told: EstimateReport | MassReport,
-    centre_sd_mm: tuple[float, float] = (0.0, 0.0),
-    why: str,
+def _mass(
+    number: int, told: EstimateReport | MassReport, centre: Point | Place, tactile_map: TactileMap | None, side: str
 ) -> ExamMass:
     """A mass with its place: by the map, or as its estimate has `told` it where that is all there is."""
     if tactile_map is None:
         place, patient = ClockPosition.of(told.position), centre_of(told.centre_patient_mm)
     else:
-        covariance = np.diag(np.square(centre_sd_mm))
-        place = clock_position(tactile_map, centre_mm, side=side, covariance_mm2=covariance)
-        patient = patient_mm(tactile_map, *centre_mm)
+        variances = (centre.x.sd**2, centre.y.sd**2) if isinstance(centre, Point) else (0.0, 0.0)
+        place = clock_position(tactile_map, centre.median, side=side, covariance_mm2=np.diag(variances))
+        patient = patient_mm(tactile_map, *centre.median)
     along, across = told.d_x_mm, told.d_y_mm
     return ExamMass(
         number,
-        centre_mm,
+        centre.median,
         axes_mm=None if along is None or across is None else (along.median, across.median),
         angle_deg=0.0 if told.angle_deg is None else told.angle_deg.median,
         largest=told.leading.max_size_mm,
-        smallest=told.leading.min_size_mm,
         probability=told.detected_probability,
         place=place,
         patient_mm=patient,
-        why=why,
+        why="" if told.max_size_mm is not None else told.reason,
     )
 
 
 # --- Sentences of an exam's page, in plain words: the size and its intervals, what was covered, how good the exam was.
 
-_LEFT_OUT: Final = (
-    ("dropped_low", "pressed too lightly"),
-    ("dropped_high", "pressed too hard"),
-    ("dropped_no_pose", "without the tracker's position"),
-    ("dropped_elements", "with too few working sensor points"),
-)
+_LEFT_OUT: Final = WHY_NOT | {
+    "dropped_no_pose": "without the tracker's position",
+    "dropped_elements": "with too few working sensor points",
+}
 
 
 def headline(exam: Exam) -> str:
@@ -360,7 +340,7 @@ def _scan_rows(tactile_map: TactileMap) -> Iterator[tuple[str, str]]:
         yield "pressure", f"mean {quality['mean_pressure_kpa']:.1f} kPa, nine frames in ten {ends}{asked}"
     if "frames_total" in quality:
         used = f"{quality['frames_used']:.0f} of {quality['frames_total']:.0f} used"
-        out = [f"{quality[name]:.0f} {words}" for name, words in _LEFT_OUT if quality.get(name)]
+        out = [f"{quality[name]:.0f} {words}" for name, words in _LEFT_OUT.items() if quality.get(name)]
         yield "sensor frames", f"{used}{'; left out: ' if out else ''}{', '.join(out)}"
     if tactile_map.masked_taxels:
         yield "sensor points", f"{len(tactile_map.masked_taxels)} left out as faulty"

@@ -78,17 +78,14 @@ def on_common_axes(
     if any(one.patient_from_plane is None for one in every):
         view = orientation_of(replace(every[0], patient_from_plane=None))
     sizes = [visit.max_size_mm for visit in report.visits]
-    shown = [_about_middle(maps) if middle else maps for maps in visits]
-    return [_laid(maps, size, view) for maps, size in zip(shown, sizes, strict=True)], view
-
-
-def _about_middle(maps: Sequence[DrawnMap]) -> Sequence[DrawnMap]:
-    """The maps, or where none has a lump the first about its own middle."""
-    if any(one.centre_mm is not None for one in maps):
-        return maps
-    axes = maps[0].tactile_map.x_mm, maps[0].tactile_map.y_mm
-    x, y = (float(axis[0] + axis[-1]) / 2 for axis in axes)
-    return [DrawnMap(maps[0].tactile_map, (x, y))]
+    laid = []
+    for maps, size in zip(visits, sizes, strict=True):
+        if middle and all(one.centre_mm is None for one in maps):
+            first = maps[0].tactile_map
+            x, y = (float(axis[0] + axis[-1]) / 2 for axis in (first.x_mm, first.y_mm))
+            maps = [DrawnMap(first, (x, y))]
+        laid.append(_laid(maps, size, view))
+    return laid, view
 
 
 def _laid(maps: Sequence[DrawnMap], size: Quantity | None, view: Orientation) -> LaidMap:
@@ -179,9 +176,7 @@ def growth_page(compared: Compared, report: CompareReport, visits: Sequence[Sequ
         research_use=RESEARCH_USE,
         headline=verdict_sentence(report),
         findings=finding_lines(report.findings, paper=True),
-        maps=[
-            (_picture(laid[i], view, limits, course.of(report.visits[i])), *_captions(report, course, i)) for i in shown
-        ],
+        maps=[_picture(laid[i], view, limits, course, report.visits[i]) for i in shown],
         left_out=len(laid) - len(shown),
         colours=colour_steps(limits, words, more=any(bool((one.values > limits[1]).any()) for one in laid)),
         seen=_seen(view),
@@ -211,25 +206,20 @@ def _bars(compared: Compared, report: CompareReport) -> str:
     return f"Bars: intervals if exams of one mass differ by {narrow:.0f} %; thin lines: by {wide:.0f} %."
 
 
-def _captions(report: CompareReport, course: Course, number: int) -> tuple[str, str]:
-    visit = report.visits[number]
-    q = visit.max_size_mm
-    if q is not None:
-        return course.of(visit), f"{q.median:.1f} mm"
-    found = any(one.status == "estimate" for one in visit.maps)
-    return course.of(visit), "not sized" if found else "no lump found"
-
-
-def _picture(laid: LaidMap, view: Orientation, limits: tuple[float, float], label: str) -> str:
-    """Inline SVG of a visit's map with its ring, sides and scale bar."""
-    side = _SCALE * (2 * HALF_MM + STEP_MM)
+def _picture(
+    laid: LaidMap, view: Orientation, limits: tuple[float, float], course: Course, visit: Visit
+) -> tuple[str, str, str]:
+    """Inline SVG of a visit's map with its ring, sides and scale bar, the visit in words, and its size."""
+    side, q = _SCALE * (2 * HALF_MM + STEP_MM), visit.max_size_mm
     parts = [picture_of(laid.values[::-1], limits, (side, side))]
     if laid.ring_mm is not None:
         points = side / 2 + _SCALE * laid.ring_mm * [[1.0], [-1.0]]
         parts.append(stroked(through(points.T.tolist()) + "Z", 0.5, kind="size"))
     parts += edge_names(view, (side, side), small=True)
     parts += scale_bar(side, _SCALE, least_mm=6.0, inset=2.0, size=2.4)
-    return drawing("map", f"Map of {label}", (0.0, 0.0, side, side), parts)
+    drawn = drawing("map", f"Map of {course.of(visit)}", (0.0, 0.0, side, side), parts)
+    unsized = "not sized" if any(one.status == "estimate" for one in visit.maps) else "no lump found"
+    return drawn, course.of(visit), unsized if q is None else f"{q.median:.1f} mm"
 
 
 def _changes(report: CompareReport, course: Course) -> Iterator[tuple[str, Quantity]]:
