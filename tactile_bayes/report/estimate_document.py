@@ -66,18 +66,18 @@ LEAST_CHANGE_SD = 0.05  #: A change of a width by one more structure below this 
 
 def scene_lines(choice: SceneChoice) -> list[str]:
     """Scene of the fit window with odds: structures supported, other structures kept, and those left out."""
+
+    def odds(one: Structure) -> str:
+        return f"(odds {odds_text(one)}){_change(one, 'without' if one.used else 'with')}"
+
     used = _named(choice)
     names = [BUMP[choice.supported], *(f"{ASKED[one.name]} {one.place}".rstrip() for one in used)]
     window = f"the fit window of {choice.fit.target.problem.radius_mm:g} mm about the lump"
     lines = [f"Scene in {window}: {' and '.join(names)}, the simplest that the map supports."]
-    for one in used:
-        name = ASKED[one.name]
-        lines.append(f"{capital(name)} is in the model (odds {odds_text(one)}){_change(one, 'without')}.")
+    lines += [f"{capital(ASKED[one.name])} is in the model {odds(one)}." for one in used]
     kept = [one for one in choice.structures if one.used and not one.supported and not one.place]
-    lines += [f"Also in the model: {ASKED[one.name]} (odds {odds_text(one)}){_change(one, 'without')}." for one in kept]
-    out = [
-        f"{ASKED[one.name]} (odds {odds_text(one)}){_change(one, 'with')}" for one in choice.structures if not one.used
-    ]
+    lines += [f"Also in the model: {ASKED[one.name]} {odds(one)}." for one in kept]
+    out = [f"{ASKED[one.name]} {odds(one)}" for one in choice.structures if not one.used]
     return [*lines, f"Not in the model: {'; '.join(out)}."] if out else lines
 
 

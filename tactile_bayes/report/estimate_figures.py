@@ -148,12 +148,7 @@ def _span(draws_mm: Sequence[FloatArray], intervals: Mapping[str, Quantity]) -> 
 
 
 def _density(draws_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Smoothed density of positive draws on 400 points: a histogram convolved with a Gaussian, mirrored at 0.
-
-    Returns
-    -------
-    sizes in mm and density per mm, each (400,).
-    """
+    """400 sizes in mm and their smoothed density per mm: a histogram convolved with a Gaussian, mirrored at 0."""
     draws = draws_mm[np.isfinite(draws_mm)]
     if len(draws) < 2:
         raise BadDataError(f"{len(draws)} finite draws cannot be drawn as a density", way_out="give two or more")

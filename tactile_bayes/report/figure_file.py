@@ -29,12 +29,8 @@ _TITLED: Final = ("subject", "side", "mass", "visit")
 def named_exam(name: str, scans: Sequence[Mapping[str, str]]) -> str:
     """Such as ``"P07, left, mass 1, visit 2 (exam)"``; what is no code is left out, and `$` starts no formula.
 
-    Parameters
-    ----------
-    name
-        Of the map; may be empty.
-    scans
-        As `Provenance.scans` has them. Of a fact on which they differ, each value is named.
+    `name`: of the map; may be empty; `scans`: as `Provenance.scans` has them. Of a fact on which they differ each value
+    is named.
     """
     told = []
     for fact in _TITLED:
@@ -60,13 +56,7 @@ FORMATS: Final[dict[str, dict[str, None]]] = {
 
 
 def check_suffix(path: Path) -> None:
-    """Refuse a file name without a known suffix: PNG, PDF or SVG.
-
-    Raises
-    ------
-    UsageError
-        Naming the suffix and those that are known.
-    """
+    """Refuse a file name without a known suffix: PNG, PDF or SVG."""
     if path.suffix.lower() not in FORMATS:
         known = ", ".join(FORMATS)
         if not path.suffix:
@@ -105,25 +95,10 @@ def figure_file(
 ) -> Iterator[Figure]:
     """Give a figure that is written when the block ends, independent of the user's matplotlib settings.
 
-    Parameters
-    ----------
-    path
-        Its suffix says the format; None writes nothing, the figure is for a notebook.
-    size_in
-        Width and height in inches.
-    force
-        Overwrite an existing file.
-    foot
-        Words at its foot, before those on its use; None for neither.
-    findings
-        What speaks against what is shown, told above it.
-    trim
-        Let the figure end below what is drawn, where that needs less than its height.
-
-    Raises
-    ------
-    UsageError
-        When the suffix is unknown, or `path` exists and `force` is false.
+    `path`: its suffix says the format; None writes nothing, the figure is for a notebook; an unknown suffix, and a file
+    that exists without `force`, are refused. `foot`: words at its foot, before those on its use; None for neither;
+    `findings`: what speaks against what is shown, told above it; `trim`: let the figure end below what is drawn, where
+    that needs less than its height.
     """
     if path is not None:
         check_suffix(path)

@@ -82,7 +82,7 @@ def uniformity_document(found: Uniformity, tissue: HomogeneousTissue, *, limit: 
     return {
         "schema": "tactile-bayes/head-uniformity/1",
         **_tissue_document(tissue, limit),
-        **(_head_document(found) or {}),
+        **_head_document(found),
         "largest": found.largest.tolist(),
         "rms": found.rms.tolist(),
         "within_limit": found.worst <= limit,
@@ -92,13 +92,14 @@ def uniformity_document(found: Uniformity, tissue: HomogeneousTissue, *, limit: 
 
 def design_document(found: Sequence[Uniformity], tissue: HomogeneousTissue, *, limit: float) -> dict[str, object]:
     """The whole search as plain data; `answer` is None where no head meets the limit."""
+    answer, by_rms = narrowest(found, limit=limit), narrowest(found, limit=limit, by_rms=True)
     return {
         "schema": "tactile-bayes/head-design/1",
         **_tissue_document(tissue, limit),
         "heads": [_head_document(one) for one in found],
         "most_even": _head_document(most_even(found)),
-        "answer": _head_document(narrowest(found, limit=limit)),
-        "answer_by_rms": _head_document(narrowest(found, limit=limit, by_rms=True)),
+        "answer": answer and _head_document(answer),
+        "answer_by_rms": by_rms and _head_document(by_rms),
         "research_use": RESEARCH_USE,
     }
 
@@ -147,10 +148,8 @@ def _tissue_document(tissue: HomogeneousTissue, limit: float) -> dict[str, objec
     }
 
 
-def _head_document(found: Uniformity | None) -> dict[str, Any] | None:
+def _head_document(found: Uniformity) -> dict[str, Any]:
     """JSON has no infinity: a flat head's radius is null."""
-    if found is None:
-        return None
     head = found.head
     return {
         "radius_mm": None if np.isinf(head.radius_mm) else head.radius_mm,

@@ -151,22 +151,13 @@ def _scale(start: float, end: float, y: float, unit: str) -> Iterator[str]:
 # --- Colours of a map, and pixels as PNG.
 
 
-def _coloured(values: FloatArray, limits: tuple[float, float], no_data: tuple[int, int, int]) -> NDArray[np.uint8]:
+def _coloured(values: FloatArray, limits: tuple[float, float]) -> NDArray[np.uint8]:
     """(n, m, 3) colours of values; cells without data are grey."""
     low, high = limits
     covered, colours = np.isfinite(values), np.array(VIRIDIS, dtype=float)
     at = np.clip((np.where(covered, values, low) - low) / (high - low), 0.0, 1.0) * (len(colours) - 1)
     mixed = np.stack([np.interp(at, np.arange(len(colours)), colours[:, i]) for i in range(3)], axis=-1)
-    return np.where(covered[..., None], np.rint(mixed), np.array(no_data)).astype(np.uint8)
-
-
-def _png(pixels: NDArray[np.uint8], *, colours: int) -> bytes:
-    """PNG of pixels in a palette of so many colours."""
-    from PIL import Image
-
-    out = io.BytesIO()
-    Image.fromarray(pixels).quantize(colours, dither=Image.Dither.NONE).save(out, "PNG", optimize=True)
-    return out.getvalue()
+    return np.where(covered[..., None], np.rint(mixed), np.array(_NO_DATA)).astype(np.uint8)
 
 
 def ellipse_mm(axes_mm: tuple[float, float], angle_deg: float) -> FloatArray:
@@ -216,10 +207,8 @@ class Frame(Record, eq=False):
     @classmethod
     def within(cls, tactile_map: TactileMap, *, width_mm: float, height_mm: float) -> Frame:
         """Life size, or the largest that fits with its margin."""
-        rows, columns = orientation_of(tactile_map).screen(tactile_map.count).shape
-        cell = tactile_map.recipe.cell_mm
-        room = (width_mm - 2 * MARGIN_MM) / (columns * cell), (height_mm - 2 * MARGIN_MM) / (rows * cell)
-        return cls(tactile_map, min(1.0, *room))
+        width, height = cls(tactile_map, 1.0).size_mm
+        return cls(tactile_map, min(1.0, (width_mm - 2 * MARGIN_MM) / width, (height_mm - 2 * MARGIN_MM) / height))
 
     @property
     def view(self) -> Orientation:
@@ -320,30 +309,25 @@ def small_pictures(maps: Sequence[ExamMap], *, room_mm: tuple[float, float]) -> 
 def colour_bar(exam: ExamMap) -> str:
     """Inline SVG of the colours with the values at their ends."""
     limits, tactile_map = colour_limits(exam), _map_of(exam)
-    covered = tactile_map.covered
-    more = covered.any() and float(tactile_map.mean[covered].max()) > limits[1]
-    return colour_steps(limits, tactile_map.recipe.value_words, more=bool(more))
+    more = bool((tactile_map.mean[tactile_map.covered] > limits[1]).any())
+    return colour_steps(limits, tactile_map.recipe.value_words, more=more)
 
 
 def colour_steps(limits: tuple[float, float], words: str, *, more: bool) -> str:
     """Inline SVG of the colours, with the values at their ends and what they are of; `more`: some lie above."""
-    steps = _coloured(np.linspace(0.0, 1.0, _BAR_STEPS)[None], (0.0, 1.0), _NO_DATA)[0]
+    low, high = (f"{one:.2f}" if abs(one) < 100 else f"{one:.0f}" for one in limits)
     width = _BAR_MM / _BAR_STEPS  # plain boxes: not every printer of SVG knows gradients
     parts = [
         f'<rect x="{14 + width * i:g}" y="0.5" width="{width + 0.05:g}" height="3" fill="#{bytes(colour).hex()}"/>'
-        for i, colour in enumerate(steps)
+        for i, colour in enumerate(_coloured(np.linspace(0.0, 1.0, _BAR_STEPS)[None], (0.0, 1.0))[0])
     ]
     parts += [
         f'<rect x="14" y="0.5" width="{_BAR_MM:g}" height="3" fill="none" stroke="#333" stroke-width="0.15"/>',
-        text(13.0, 3.2, _value(limits[0]), size=3, anchor="end"),
-        text(55.0, 3.2, f"{_value(limits[1])}{' or more' if more else ''}", size=3, anchor="start"),
+        text(13.0, 3.2, low, size=3, anchor="end"),
+        text(55.0, 3.2, f"{high}{' or more' if more else ''}", size=3, anchor="start"),
         text(14.0, 7.4, words, size=3, anchor="start"),
     ]
     return drawing("bar", "Colours of the map", (0.0, 0.0, 80.0, 8.5), parts)
-
-
-def _value(value: float) -> str:
-    return f"{value:.2f}" if abs(value) < 100 else f"{value:.0f}"
 
 
 def _cells(frame: Frame, limits: tuple[float, float], *, small: bool) -> str:
@@ -352,7 +336,7 @@ def _cells(frame: Frame, limits: tuple[float, float], *, small: bool) -> str:
     shown = tactile_map.covered & ~tactile_map.few if small else tactile_map.covered
     values = frame.view.screen(np.where(shown, tactile_map.mean, np.nan))
     step = -(-max(values.shape) // _MOST_PIXELS)
-    pixels = _coloured(values[::step, ::step], limits, _NO_DATA)
+    pixels = _coloured(values[::step, ::step], limits)
     if small:
         return _image(pixels, (width, height))
     times = max(1, min(_CELL_PX, _MOST_PIXELS // max(pixels.shape[:2])))
@@ -365,12 +349,16 @@ def _cells(frame: Frame, limits: tuple[float, float], *, small: bool) -> str:
 
 def picture_of(values: FloatArray, limits: tuple[float, float], size_mm: tuple[float, float]) -> str:
     """Values, as the rows of a picture, in colours; places without data are grey."""
-    return _image(_coloured(values, limits, _NO_DATA).repeat(_CELL_PX, axis=0).repeat(_CELL_PX, axis=1), size_mm)
+    return _image(_coloured(values, limits).repeat(_CELL_PX, axis=0).repeat(_CELL_PX, axis=1), size_mm)
 
 
 def _image(pixels: NDArray[np.uint8], size_mm: tuple[float, float]) -> str:
-    """Pixels as an embedded PNG with a frame."""
-    data = base64.b64encode(_png(pixels, colours=128)).decode("ascii")
+    """Pixels as an embedded PNG of a few colours, with a frame."""
+    from PIL import Image
+
+    out = io.BytesIO()
+    Image.fromarray(pixels).quantize(128, dither=Image.Dither.NONE).save(out, "PNG", optimize=True)
+    data = base64.b64encode(out.getvalue()).decode("ascii")
     box = f'x="0" y="0" width="{size_mm[0]:.2f}" height="{size_mm[1]:.2f}"'
     return (
         f'<image {box} preserveAspectRatio="none" href="data:image/png;base64,{data}"/>'
@@ -479,19 +467,16 @@ _SHADES: Final = ((10.0, "#ffffff"), (15.0, "#e0e0e0"), (20.0, "#bdbdbd"), (np.i
 def smallest_pictures(tactile_map: TactileMap, smallest: SmallestLump) -> Iterator[str]:
     """One picture a depth, with its caption."""
     frame = Frame.within(tactile_map, width_mm=_ROOM_MM[0], height_mm=_ROOM_MM[1])
-    for number, depth in enumerate(smallest.depths_mm):
-        caption = f"{depth:g} mm deep"
-        yield f"<figure>{_picture(frame, smallest, number, caption)}<figcaption>{caption}</figcaption></figure>"
-
-
-def _picture(frame: Frame, smallest: SmallestLump, number: int, caption: str) -> str:
     (width, height), side = frame.size_mm, frame.scale * smallest.spacing_mm
-    parts = [f'<rect width="{width:.2f}" height="{height:.2f}" fill="#fff" stroke="#333" stroke-width="0.3"/>']
-    for one in smallest.places:
-        (x, y), d = frame.at((one.x_mm, one.y_mm)), one.d_mm[number]
-        shade = next(grey for most, grey in _SHADES if (np.inf if d is None else d) <= most)
-        box = f'x="{x - side / 2:.2f}" y="{y - side / 2:.2f}" width="{side:.2f}" height="{side:.2f}"'
-        parts.append(f'<rect {box} fill="{shade}" stroke="#777" stroke-width="0.1"/>')
-        parts.append(text(x, y + 0.9, "–" if d is None else f"{np.ceil(d):.0f}", size=2.6))
-    label = f"Smallest lump that would have shown, {caption}"
-    return drawing("smallest", label, (-0.2, -0.2, width + 0.4, height + 0.4), parts)
+    for number, depth in enumerate(smallest.depths_mm):
+        parts = [f'<rect width="{width:.2f}" height="{height:.2f}" fill="#fff" stroke="#333" stroke-width="0.3"/>']
+        for one in smallest.places:
+            (x, y), d = frame.at((one.x_mm, one.y_mm)), one.d_mm[number]
+            shade = next(grey for most, grey in _SHADES if (np.inf if d is None else d) <= most)
+            box = f'x="{x - side / 2:.2f}" y="{y - side / 2:.2f}" width="{side:.2f}" height="{side:.2f}"'
+            parts.append(f'<rect {box} fill="{shade}" stroke="#777" stroke-width="0.1"/>')
+            parts.append(text(x, y + 0.9, "–" if d is None else f"{np.ceil(d):.0f}", size=2.6))
+        caption = f"{depth:g} mm deep"
+        label = f"Smallest lump that would have shown, {caption}"
+        drawn = drawing("smallest", label, (-0.2, -0.2, width + 0.4, height + 0.4), parts)
+        yield f"<figure>{drawn}<figcaption>{caption}</figcaption></figure>"
