@@ -126,7 +126,7 @@ def map_figure(
         if fit:
             _draw_fit(left, fit, view)
         if len(masses) > 1:
-            _draw_masses(left, masses, view)
+            _draw_masses(left, masses, fit, view)
         _draw_scale_bar(left)
         draw_edges(left, view)
         _draw_notch(left, view)
@@ -304,7 +304,7 @@ def _draw_ellipse(
     axes.add_patch(ellipse)
 
 
-def _draw_masses(axes: Axes, masses: Sequence[MassReport], view: Orientation) -> None:
+def _draw_masses(axes: Axes, masses: Sequence[MassReport], fit: FitContour | None, view: Orientation) -> None:
     """Draw the number of each mass, and a cross and the size of those besides the fitted lump."""
     for mass in masses:
         centre, size_mm = _pair(view, *mass.centre_mm.median), _size_mm(mass)
@@ -312,7 +312,7 @@ def _draw_masses(axes: Axes, masses: Sequence[MassReport], view: Orientation) ->
         top = centre[1] + (above if axes.get_ylim()[1] > axes.get_ylim()[0] else -above)
         words = f"mass {mass.number}"
         axes.annotate(words, (centre[0], top), xytext=(0, 4), path_effects=_outlined(2.5), **_ABOVE)
-        if mass.reported:
+        if fit is not None and mass.reported:
             continue
         axes.plot(*centre, "+", color="white", markersize=7, markeredgewidth=1.4, path_effects=_outlined(3.0))
         if size_mm is not None:
