@@ -241,7 +241,10 @@ def compare_text(report: CompareReport) -> str:
     """Full report."""
     lines = finding_lines(report.findings, "caution")
     for one in report.visits:
-        lines += [_visit_line(one), *(f"  {_map_line(found)}" for found in one.maps)]
+        lines.append(_visit_line(one))
+        for found in one.maps:
+            told = "lump found" if found.status == "estimate" else f"no estimate ({found.reason})"
+            lines.append(f"  {found.map}: {told}")
     for place in report.places:
         lines += _place_line(place, name=len(report.places) > 1)
     lines += finding_lines(report.findings, "check")
@@ -296,10 +299,6 @@ def _visit_line(visit: Visit) -> str:
     if q is None:
         return f"{head}: no size"
     return f"{head}: largest size {q.median:.1f} mm ({q.low:.1f} to {q.high:.1f}, {_share(q)} interval)"
-
-
-def _map_line(one: VisitMap) -> str:
-    return f"{one.map}: lump found" if one.status == "estimate" else f"{one.map}: no estimate ({one.reason})"
 
 
 def _place_line(place: VisitPlace, *, name: bool = False) -> list[str]:

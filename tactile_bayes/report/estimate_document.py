@@ -347,6 +347,9 @@ def estimate_report(
 
     about, size, moved = estimate.about_mm, estimate.size, estimate.sensitivity
     masses = _mass_reports(estimate, tactile_map, quantities, probability=probability, scans=provenance.scans)
+    diagnostics = {} if estimate.diagnostics is None else estimate.diagnostics.as_dict()
+    if estimate.detection is not None:
+        diagnostics["log_bayes_factor"] = estimate.detection.log_bayes_factor
     return EstimateReport(
         schema=ESTIMATE,
         status=estimate.status,
@@ -368,7 +371,7 @@ def estimate_report(
         variance_share=None if size is None else rounded(dict(size.variance_share)),
         scene=None if estimate.scene is None else scene_report(estimate.scene),
         prior_sensitivity=None if moved is None else rounded(PriorSensitivity(WIDER, {**moved.median}, {**moved.ends})),
-        diagnostics=_diagnostics(estimate),
+        diagnostics=_finite(diagnostics) | ({} if size is None else size_diagnostics(size)),
         candidates=tuple(PassedOver(*rounded(one.centre_mm), one.fault) for one in estimate.candidates),
         other_rises=tuple(rounded(OtherRise(**as_dict(one)), 6) for one in estimate.other_rises),
         masses=masses,
@@ -393,14 +396,6 @@ def smallest_lump(found: SmallestLumps) -> SmallestLump:
     depths: Any = tuple(round(float(depth), 1) for depth in found.depths_mm)
     best, worst = row(found.d_mm.min(axis=0)), row(found.d_mm.max(axis=0))
     return SmallestLump(PROBABILITY, depths, best, worst, round(found.spacing_mm, 3), tuple(places))
-
-
-def _diagnostics(estimate: Estimate) -> dict[str, Any]:
-    """Diagnostics for the JSON; a figure that is not finite is null."""
-    found: dict[str, Any] = {} if estimate.diagnostics is None else estimate.diagnostics.as_dict()
-    if estimate.detection is not None:
-        found["log_bayes_factor"] = estimate.detection.log_bayes_factor
-    return _finite(found) | ({} if estimate.size is None else size_diagnostics(estimate.size))
 
 
 def size_diagnostics(size: SizePosterior) -> dict[str, Any]:

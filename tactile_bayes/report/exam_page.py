@@ -56,7 +56,9 @@ def exam_page(exam: Exam) -> str:
     crowded = len(exam.maps) > 1 and len(exam.main.masses) > 1
     most, longest = _FINDINGS[crowded]
     size, several = largest(exam), len(exam.maps) > 1
-    drawn, least = exam.main.tactile_map, exam.main.report.smallest_lump
+    drawn, report, least = exam.main.tactile_map, exam.main.report, exam.main.report.smallest_lump
+    made = report.provenance.get("seed")
+    seed = [] if made is None else [f"seed {made}"]
     masses = sorted(exam.main.masses, key=lambda one: one.number)
     shown = exam.maps[:MOST_REPEATS] if several else ()
     return page(
@@ -83,7 +85,7 @@ def exam_page(exam: Exam) -> str:
         repeats=list(zip(small_pictures(shown, room_mm=_REPEAT_MM), map(_alone, shown), strict=True)) if shown else [],
         of_map=f" (map {exam.main_number})" if several else "",
         quality=list(quality_rows(exam)),
-        foot=_foot(exam),
+        foot=foot(exam.scans, f"method {report.origin.settings.get('method', 'unknown')}", *seed),
     )
 
 
@@ -136,9 +138,3 @@ def _alone(one: ExamMap) -> str:
     """The size that a repeat gives by itself."""
     size = one.report.max_size_mm
     return "no size" if size is None else f"{size.median:.1f} mm ({size.low:.1f} to {size.high:.1f})"
-
-
-def _foot(exam: Exam) -> str:
-    made = exam.main.report.provenance
-    seed = [f"seed {made['seed']}"] if made.get("seed") is not None else []
-    return foot(exam.scans, f"method {exam.main.report.origin.settings.get('method', 'unknown')}", *seed)

@@ -172,32 +172,27 @@ def draw_panel(axes: Axes, values: Any, tactile_map: TactileMap, *, label: str, 
 
 def _draw_values(axes: Axes, tactile_map: TactileMap, view: Orientation, fit: FitContour | None) -> None:
     """Draw the heat map."""
-    lowest, highest = _colour_range(tactile_map)
+    well = tactile_map.covered & (~tactile_map.few)  # one noisy edge cell would hide the lump
+    values = tactile_map.mean[well if well.any() else tactile_map.covered]
+    level = float(np.median(values))
+    lowest = min(float(values.min()), _LEAST_COLOURS[0] * level)
+    highest = max(float(values.max()), _LEAST_COLOURS[1] * level)
     top = highest
     if fit is not None and fit.amplitude is not None:
         top = min(highest, max(_LEAST_COLOURS[1] * fit.level, fit.level + _AMPLITUDES_SHOWN * fit.amplitude))
-    values = np.ma.masked_where(~tactile_map.covered, tactile_map.mean)
-    image = _draw_map(axes, values, tactile_map, view, cmap="viridis", vmin=lowest, vmax=top)
+    cells = np.ma.masked_where(~tactile_map.covered, tactile_map.mean)
+    image = _draw_map(axes, cells, tactile_map, view, cmap="viridis", vmin=lowest, vmax=top)
     _colour_bar(axes, image, tactile_map.recipe.value_words, extend="max" if top < highest else "neither")
-
-
-def _colour_range(tactile_map: TactileMap) -> tuple[float, float]:
-    """Colour range, ignoring cells with few readings: one noisy edge cell would hide the lump."""
-    well = tactile_map.covered & (~tactile_map.few)
-    values = tactile_map.mean[well if well.any() else tactile_map.covered]
-    level = float(np.median(values))
-    return min(float(values.min()), _LEAST_COLOURS[0] * level), max(float(values.max()), _LEAST_COLOURS[1] * level)
 
 
 def _draw_coverage(axes: Axes, tactile_map: TactileMap, view: Orientation) -> None:
     """Draw the number of readings per cell."""
     counts = np.ma.masked_equal(tactile_map.count, 0)
     image = _draw_map(axes, counts, tactile_map, view, cmap="cividis", vmin=0)
-    if tactile_map.counts_known:
+    known = tactile_map.counts_known
+    if known:
         _colour_bar(axes, image, "readings per cell")
-        axes.set_title("Coverage", loc="left", fontsize=11)
-    else:
-        axes.set_title("Coverage (readings per cell unknown)", loc="left", fontsize=11)
+    axes.set_title("Coverage" + ("" if known else " (readings per cell unknown)"), loc="left", fontsize=11)
 
 
 def _hatch_few(axes: Axes, tactile_map: TactileMap, view: Orientation) -> None:

@@ -269,12 +269,9 @@ def _what(tactile_map: TactileMap) -> Iterator[tuple[str, str]]:
     yield "map", f"{columns * cell:g} x {rows * cell:g} mm (across x along the head), cells of {cell:g} mm"
     values = tactile_map.mean[tactile_map.covered]
     if values.size:
-        yield "values", f"{values.min():.3g} to {values.max():.3g} {_units(tactile_map)}"
-
-
-def _units(tactile_map: TactileMap) -> str:
-    recipe = tactile_map.recipe
-    return _UNITS.get(recipe.normalise, f"{recipe.value_unit or 'of unknown unit'} (normalise none)")
+        recipe = tactile_map.recipe
+        units = _UNITS.get(recipe.normalise, f"{recipe.value_unit or 'of unknown unit'} (normalise none)")
+        yield "values", f"{values.min():.3g} to {values.max():.3g} {units}"
 
 
 def _frames(tactile_map: TactileMap) -> Iterator[tuple[str, str]]:

@@ -275,7 +275,10 @@ def trial_html(report: TrialReport, trial: Trial, *, text: str, growth: Sequence
         sizes_svg=_base64(sizes_figure(report, trial)),
         lines=(["", *_heads(_METHODS)], [[name, *_cells(one.method_comparison, _METHODS)] for name, one in modalities]),
         error_ratio=f"{ratio:g}",
-        limits=_limits(report),
+        limits=(
+            ["", "scale", "bias", "lower limit", "upper limit"],
+            [[name, *row] for name, one in modalities for row in limit_rows(one)],
+        ),
         growing=[line for line in (growing_line(report), *trends) if line],
         differences_svg=_base64(differences_figure(report, trial)),
         replicates=_replicates(report),
@@ -314,11 +317,6 @@ def _masses(trial: Trial) -> Table:
         for place, (key, ex_vivo) in enumerate(trial.ex_vivo_mm.items(), start=1)
     ]
     return ["mass", "after excision, mm", *(f"{name}, mm" for name in sizes)], rows
-
-
-def _limits(report: TrialReport) -> Table:
-    rows = [[name, *row] for name, one in report.modalities.items() for row in limit_rows(one)]
-    return ["", "scale", "bias", "lower limit", "upper limit"], rows
 
 
 def _trend(name: str, report: ModalityReport) -> str | None:
