@@ -33,7 +33,7 @@ import numpy as np
 from scipy.sparse.linalg import splu
 
 from benchmarks.measure import environment
-from tactile_bayes.forward.contact import Head, solve_contact
+from tactile_bayes.forward.contact import ContactStiffness, Head, solve_contact
 from tactile_bayes.forward.line import build_line, head_positions, press
 from tactile_bayes.forward.mesh import QuadMesh, body_mesh, disc_mesh, joined, rectangle_mesh
 from tactile_bayes.forward.plane_strain import assemble, condense, skin_average
@@ -216,8 +216,7 @@ class ReusedBody:
         load[self.skin] = REUSED_CELL_MM * mine.T
         compliance = mine @ self.factor.solve(load)[self.skin]
         compliance = 0.5 * (compliance + compliance.T)
-        found = solve_contact(compliance[None], profile, total_kpa=MEAN_KPA * len(profile))
-        return np.asarray(found.pressure_kpa[0])
+        return solve_contact(ContactStiffness.of(compliance), profile, mean_kpa=MEAN_KPA).pressure_kpa
 
 
 def reused_seconds() -> dict[str, float]:

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from tactile_bayes.forward.axisymmetric import CondensedLump, LayeredBody, condense_lump, taxel_compliance
-from tactile_bayes.forward.contact import ContactStiffness, press
+from tactile_bayes.forward.contact import ContactStiffness, solve_contact
 from tactile_bayes.forward.mesh import LumpGeometry, MeshSize, lump_mesh
 from tactile_bayes.forward.scene import Head
 from tactile_bayes.forward.solid import PlacedLump, SolidHead, face_of, skin_perturbation, solid_head
@@ -102,7 +102,7 @@ def frame_rows(runs: int) -> list[dict[str, Any]]:
     layers = (geometry.fat_mm, geometry.thickness_mm - geometry.fat_mm)
     compliance = taxel_compliance(LayeredBody((5.0, 50.0), layers), rows=rows_, columns=columns, pitch_mm=1.5)
     height = -face.surface_mm[..., 2].ravel()
-    plain = least_cpu(lambda: press(ContactStiffness.of(compliance), height, mean_kpa=9.5), runs)
+    plain = least_cpu(lambda: solve_contact(ContactStiffness.of(compliance), height, mean_kpa=9.5), runs)
     return [*rows, {"what": "frame, inverse anew", "ms": 1000 * plain}]
 
 

@@ -10,6 +10,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, ThreadPoolExecutor
+from contextlib import AbstractContextManager
 from pathlib import Path
 from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
@@ -137,26 +138,6 @@ def prepare_worker() -> None:
         threading.Thread(target=end_with_parent, daemon=True).start()
 
 
-class ClusterWorkers(Executor):
-    """Workers of a dask cluster.
-
-    `threads` is how many items the cluster runs at a time.
-    """
-
-    def __init__(self, cluster: Executor, threads: int) -> None:
-        self._cluster = cluster
-        self.ahead = max(16, 4 * threads)
-        """Number of items to submit ahead: no worker waits, and the scheduler holds few at any time."""
-
-    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """The future of ``fn(*args, **kwargs)`` on one of the workers."""
-        return self._cluster.submit(fn, *args, **kwargs)
-
-    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """Let the items end, or cancel them."""
-        self._cluster.shutdown(wait=wait and not cancel_futures)
-
-
 class InlineExecutor(Executor):
     """Runs each item in this process when it is submitted."""
 
@@ -170,12 +151,9 @@ class InlineExecutor(Executor):
         return future
 
 
-@contextlib.contextmanager
-def open_executor(*, workers: int = 1, cluster: str | None = None) -> Iterator[Executor]:
+def open_executor(*, workers: int = 1, cluster: str | None = None) -> AbstractContextManager[Executor]:
     """Open the executor that ``--workers`` and ``--cluster`` ask for: a cluster if an address is given, else local."""
-    chosen = local_executor(workers) if cluster is None else cluster_executor(cluster)
-    with chosen as executor:
-        yield executor
+    return cluster_executor(cluster) if cluster else local_executor(workers)
 
 
 def local_executor(workers: int) -> Executor:
@@ -200,7 +178,9 @@ def cluster_executor(address: str, *, timeout_s: float = 10.0) -> Iterator[Execu
         raise UsageError(
             "a cluster needs the package distributed; install it with pip install 'tactile-bayes[cluster]'"
         ) from None
-    _silence("distributed")
+    for name in list(logging.root.manager.loggerDict):  # its log on stderr; outcomes repeat what matters of it
+        if name.partition(".")[0] == "distributed":
+            logging.getLogger(name).setLevel(logging.CRITICAL + 1)
     with contextlib.ExitStack() as stack:
         try:
             client = stack.enter_context(Client(address, timeout=timeout_s, set_as_default=False))
@@ -210,15 +190,9 @@ def cluster_executor(address: str, *, timeout_s: float = 10.0) -> Iterator[Execu
                 "give the address it prints"
             ) from None
         _check_workers(client, address)
-        workers = stack.enter_context(client.get_executor(pure=False))
-        yield ClusterWorkers(workers, sum(client.nthreads().values()))
-
-
-def _silence(library: str) -> None:
-    """Stop a library's log on stderr; the outcomes repeat what matters of it in one line."""
-    for name in list(logging.root.manager.loggerDict):
-        if name == library or name.startswith(f"{library}."):
-            logging.getLogger(name).setLevel(logging.CRITICAL + 1)
+        executor = stack.enter_context(client.get_executor(pure=False))
+        executor.ahead = max(16, 4 * sum(client.nthreads().values()))  # none waits, and the scheduler holds few
+        yield executor
 
 
 def _check_workers(client: Any, address: str) -> None:

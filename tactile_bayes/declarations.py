@@ -412,9 +412,9 @@ def _fault(kind: Any, value: Any, where: str) -> BadDataError:
     why = _refused(kind, value)
     name = where or "the document"
     if isinstance(why, BadDataError):  # of a record's own rules, or of an array
-        what = _of_rule(where, why.what, record) if why.what else f"{name} is {_shown(value)}"
+        what = _of_rule(where, why.what, record) if why.what else f"{name} is {shown(value)}"
         return BadDataError(what, way_out=why.way_out)
-    return BadDataError(f"{name} is {_shown(value)}", way_out=_way_out(kind, value))
+    return BadDataError(f"{name} is {shown(value)}", way_out=_way_out(kind, value))
 
 
 def _of_rule(where: str, what: str, record: Any) -> str:
@@ -461,7 +461,7 @@ def _parts(kind: Any, value: Any, where: str) -> Iterator[tuple[str, Any, Any]]:
         for of_key, of_value in (
             get_args(one) for one in map(_bare, _members(kind)) if get_origin(one) in (dict, Mapping)
         ):
-            yield from ((_joined(where, f"key {_shown(key)}"), of_key, key) for key in value)
+            yield from ((_joined(where, f"key {shown(key)}"), of_key, key) for key in value)
             yield from ((_joined(where, _shown_key(key)), of_value, one) for key, one in value.items())
     if isinstance(value, list | tuple):
         for one in map(_bare, _members(kind)):
@@ -588,9 +588,10 @@ def _joined(where: str, key: object) -> str:
 
 def _shown_key(key: object) -> str:
     text = str(key)
-    return text if text.isidentifier() and len(text) <= 60 else _shown(key)
+    return text if text.isidentifier() and len(text) <= 60 else shown(key)
 
 
-def _shown(value: object) -> str:
+def shown(value: object) -> str:
+    """A value as an error shows it, in up to 60 characters."""
     text = repr(value)
     return text if len(text) <= 60 else f"{text[:57]}..."

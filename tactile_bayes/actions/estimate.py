@@ -16,7 +16,7 @@ from tactile_bayes.api.estimating import answer_file, estimate_file
 from tactile_bayes.api.pooled import of_one_mass, pool_answers
 from tactile_bayes.api.settings import Settings, refuse_checkpoint
 from tactile_bayes.api.sized import Answer, SizeEstimate
-from tactile_bayes.batch import BatchInterrupted, Outcome, cluster_executor, fault_lines, local_executor, run_batch
+from tactile_bayes.batch import BatchInterrupted, Outcome, fault_lines, open_executor, run_batch
 from tactile_bayes.commands.options import settings_of
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import EXIT_DONE, EXIT_FAULT, EXIT_NO_ESTIMATE, UsageError
@@ -143,7 +143,7 @@ def _one_map(path: Path, settings: Settings) -> SizeEstimate:
 
 
 def _many_maps(maps: tuple[Path, ...], settings: Settings, *, workers: int, scheduler: str | None) -> list[Answer]:
-    chosen = cluster_executor(scheduler) if scheduler else local_executor(min(workers, len(maps)))
+    chosen = open_executor(workers=min(workers, len(maps)), cluster=scheduler)
     with chosen as executor, progress_bar("maps") as progress:
         outcomes = run_batch(
             partial(answer_file, settings=settings), maps, key=str, executor=executor, progress=progress

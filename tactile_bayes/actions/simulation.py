@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -26,18 +26,9 @@ from tactile_bayes.forward.line import outside_range
 from tactile_bayes.forward.scene import Head, Scene
 from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.laboratory_options import PopulationOptions
-from tactile_bayes.presets import DEFAULT_NORMALISE, RESEARCH_USE
+from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.shell import progress_bar
-from tactile_bayes.studies.population import (
-    BodiesFile,
-    BodyPrior,
-    ExamPrior,
-    MassRow,
-    as_settings,
-    draw_mass,
-    measure_mass,
-)
-from tactile_bayes.studies.population import centred as on_the_boundary
+from tactile_bayes.studies.population import BodiesFile, MassRow, Population
 
 # --- `simulate`: make a scan with known truth from a scene.
 
@@ -100,44 +91,25 @@ def population_action(
     **options: Any,
 ) -> None:
     """Simulate exams of varied bodies and fit their maps: the table that a size calibration is learned from."""
-    simulated = read_simulated_head(head) if head else Head()
-    drawn = BodiesFile()
-    if bodies_file:
-        drawn = read_toml_record(bodies_file, BodiesFile, way_out="see bodies.schema.json")
-    bodies, exams = drawn.bodies, drawn.exams
+    drawn = read_toml_record(bodies_file, BodiesFile, way_out="see bodies.schema.json") if bodies_file else BodiesFile()
     asked = PopulationOptions(**options)
-    ways = tuple(dict.fromkeys(asked.normalise))
     # results are kept by number: where the centred ones begin decides what a number is
-    settings = {
-        "scans": asked.scans,
-        "seed": asked.seed,
-        "first_centred": asked.masses if asked.centred else None,
-        "normalise": list(ways),
-        **as_settings(bodies, exams),
-        "head": as_dict(simulated),
-    }
+    population = Population(
+        scans=asked.scans,
+        seed=asked.seed,
+        first_centred=asked.masses if asked.centred else None,
+        normalise=tuple(dict.fromkeys(asked.normalise)),
+        bodies=drawn.bodies,
+        exams=drawn.exams,
+        head=read_simulated_head(head) if head else Head(),
+    )
     with (
         open_executor(workers=workers, cluster=scheduler) as executor,
-        open_unfinished(output, list[MassRow], settings=settings) as store,
+        open_unfinished(output, list[MassRow], settings=as_dict(population)) as store,
         progress_bar("masses") as progress,
     ):
-        outcomes = run_batch(
-            partial(
-                rows_of_mass,
-                scans=asked.scans,
-                seed=asked.seed,
-                first_centred=asked.masses,
-                normalise=ways,
-                bodies=bodies,
-                exams=exams,
-                head=simulated,
-            ),
-            range(asked.masses + asked.centred),
-            key=str,
-            executor=executor,
-            store=store,
-            progress=progress,
-        )
+        work, masses = partial(rows_of_mass, population=population), range(asked.masses + asked.centred)
+        outcomes = run_batch(work, masses, key=str, executor=executor, store=store, progress=progress)
     rows = [row for outcome in outcomes for row in outcome.value or []]
     write_text(output, table_text(rows), force=force)
     failed = [outcome for outcome in outcomes if not outcome.ok]
@@ -154,27 +126,9 @@ def population_action(
         raise TactileBayesError(f"{missing}; {unfinished(output)} keeps the others: run again")
 
 
-def rows_of_mass(
-    index: int,
-    *,
-    scans: int,
-    seed: int,
-    first_centred: int,
-    normalise: Sequence[str] = (DEFAULT_NORMALISE,),
-    bodies: BodyPrior | None = None,
-    exams: ExamPrior | None = None,
-    head: Head | None = None,
-) -> list[MassRow]:
-    """Rows of one mass, in any process; from mass `first_centred` on the lumps are centred on the gland's surface."""
-    prior = bodies or BodyPrior()
-    prior = on_the_boundary(prior) if index >= first_centred else prior
-    scenes = draw_mass(index, scans=scans, seed=seed, bodies=prior, exams=exams, head=head)
-    return measure_mass(
-        scenes,
-        body=index,
-        scan=lambda scene: simulate(scene, rng=np.random.default_rng(scene.seed)).scan,
-        normalise=normalise,
-    )
+def rows_of_mass(index: int, *, population: Population) -> list[MassRow]:
+    """Rows of one mass, in any process."""
+    return population.rows(index)
 
 
 def table_text(rows: list[MassRow]) -> str:

@@ -91,25 +91,22 @@ def read_frames(path: Path) -> list[MeasuredFrame]:
         return [MeasuredFrame(x, s[place == x], pressure[place == x]) for x in dict.fromkeys(place.tolist())]
 
 
-def figure_paths(folder: Path, *, model: str) -> list[Path]:
-    """Where figures 5 to 8 go, and in two dimensions the frames of four lumps."""
-    paths = [folder / f"figure_{number}.png" for number in (5, 6, 7, 8)]
-    return [*paths, folder / "four_lumps.png"] if model == "plane-strain" else paths
-
-
-def prepare_figures(folder: Path, *, model: str, force: bool) -> None:
-    """Make the directory, and stop before any work where a figure is in the way."""
+def prepare_figures(folder: Path, *, model: str, force: bool) -> list[Path]:
+    """Paths of figures 5 to 8, and in two dimensions of the frames of four lumps; none of them may exist already."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UsageError(f"{folder} cannot be made a directory ({error.strerror}); choose another name") from None
-    refuse_existing(*figure_paths(folder, model=model), force=force)
+    names = [f"figure_{number}" for number in (5, 6, 7, 8)] + ["four_lumps"] * (model == "plane-strain")
+    paths = [folder / f"{name}.png" for name in names]
+    refuse_existing(*paths, force=force)
+    return paths
 
 
 def draw_figures(
     rows: list[StudyRow],
     settings: StudySettings | SolidSettings,
-    folder: Path,
+    paths: list[Path],
     *,
     seat: float,
     phantom: tuple[float, float] | None,
@@ -121,16 +118,15 @@ def draw_figures(
     The seat is of the lumps that are drawn and not in the table; without a phantom and its frames figure 6 shows the
     paper's.
     """
-    if isinstance(settings, StudySettings):
-        paths = figure_paths(folder, model="plane-strain")
-        d, h = phantom or PHANTOMS["phantom 12.5 mm"]
-        compared = compare_frames(frames, d_mm=d, depth_ratio=h, seat=seat, settings=settings) if frames else []
-        found = study_figures(rows, settings, paths, seat=seat, phantom=(d, h), measured=compared, force=force)
-        where = f"figures 5 to 8 and the frames of four lumps are in {folder}"
-        return [lookalikes_text(found), *frames_text(compared), where]
-    paths = figure_paths(folder, model="solid")
-    solid_figures(rows, settings, paths, seat=seat, force=force)
-    return [f"figures 5 to 8 are in {folder}"]
+    folder = paths[0].parent
+    if isinstance(settings, SolidSettings):
+        solid_figures(rows, settings, paths, seat=seat, force=force)
+        return [f"figures 5 to 8 are in {folder}"]
+    d, h = phantom or PHANTOMS["phantom 12.5 mm"]
+    compared = compare_frames(frames, d_mm=d, depth_ratio=h, seat=seat, settings=settings) if frames else []
+    found = study_figures(rows, settings, paths, seat=seat, phantom=(d, h), measured=compared, force=force)
+    where = f"figures 5 to 8 and the frames of four lumps are in {folder}"
+    return [lookalikes_text(found), *frames_text(compared), where]
 
 
 _GRID_SCHEMA = "study_grid.table.json"
@@ -159,8 +155,7 @@ def study_action(
         raise UsageError(f"{named} is for --figures of the plane-strain model; give --figures DIR")
     frames = [] if measured_frames is None else read_frames(measured_frames)
     geometries = paper_grid(chosen) if asked.grid == "paper" else read_grid(Path(asked.grid), seat=chosen)
-    if figures is not None:
-        prepare_figures(figures, model=model, force=force)
+    paths = [] if figures is None else prepare_figures(figures, model=model, force=force)
     with open_executor(workers=workers, cluster=scheduler) as executor:
         rows = run_study(geometries, settings=settings, executor=executor, output=output)
     if output is None:
@@ -169,9 +164,8 @@ def study_action(
         write_text(output, table_text(rows), force=force)
         unfinished(output).unlink(missing_ok=True)
     click.echo(study_text(rows), err=output is None)
-    if figures is not None:
-        drawn = draw_figures(rows, settings, figures, seat=chosen, phantom=phantom, frames=frames, force=force)
-        for line in drawn:
+    if paths:
+        for line in draw_figures(rows, settings, paths, seat=chosen, phantom=phantom, frames=frames, force=force):
             click.echo(line, err=output is None)
     click.echo(RESEARCH_USE, err=output is None)
 
@@ -283,13 +277,9 @@ def run_tables(seat: float, *, heads: Sequence[Head], workers: int) -> tuple[ByH
     for outcome in outcomes:
         if outcome.value is None:
             raise TactileBayesError(f"{outcome.key}: {outcome.error}")
-    found = [outcome.value for outcome in outcomes if outcome.value is not None]
-    count = len(table_scenes(seat))
-    by_head = {head: [per_scene[i] for per_scene in found] for i, head in enumerate(heads)}
-    return (
-        {head: rows[:count] for head, rows in by_head.items()},
-        {head: rows[count:] for head, rows in by_head.items()},
-    )
+    count, by_head = len(table_scenes(seat)), zip(*(outcome.value or [] for outcome in outcomes), strict=True)
+    found = dict(zip(heads, by_head, strict=True))
+    return {head: rows[:count] for head, rows in found.items()}, {head: rows[count:] for head, rows in found.items()}
 
 
 # --- `head`: how evenly a scan head presses, and the head that presses most evenly (section 2.1 of the paper).

@@ -33,7 +33,6 @@ from tactile_bayes.forward.tissue import SceneBody, SolidLump
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.laboratory import TradeoffReport, draw_tradeoff, tradeoff_document, tradeoff_text
 from tactile_bayes.report.tradeoff import DIGITS, draw_ladder, ladder_file, ladder_text
-from tactile_bayes.scans import Scan
 from tactile_bayes.shell import progress_bar
 from tactile_bayes.size.pooling import PooledEstimate
 from tactile_bayes.studies.estimate_tradeoff import SIZE, Clock, Ladder, PooledRow, SizeAnswer, Work, measure
@@ -52,15 +51,7 @@ from tactile_bayes.studies.tradeoffs import (
     teach,
 )
 
-# --- The trade of time for accuracy on a user's own maps and scans: calibration and options as `estimate` takes them.
-
-
-def tradeoff_of_map(path: Path, settings: Settings, work: Work) -> Ladder:
-    """Every setting of `estimate` on a map that need not be built again."""
-    used, tactile_map = _of(settings, work), read_map(path)
-    with in_file(path):
-        calibration, options = estimate_inputs(settings, tactile_map)
-        return measure(tactile_map, calibration=calibration, options=options, work=used)
+# --- The size by several maps of one mass.
 
 
 def pooled_rows(paths: Sequence[Path], settings: Settings, *, clock: Clock) -> tuple[PooledRow, ...]:
@@ -89,18 +80,6 @@ def _pooled_answer(pooled: PooledEstimate, settings: Settings) -> tuple[SizeAnsw
         return answer, float("nan")
     another = pooled.size.another_exam.summarise(SIZE, probability=settings.interval)
     return answer, 0.5 * (another.high - another.low)
-
-
-def tradeoff_of_scan(scan: Scan, settings: Settings, work: Work) -> Ladder:
-    """Every setting of `map` on a scan, each with an estimate by default of the map that it makes."""
-    return measure_map(scan, inputs=partial(estimate_inputs, settings), work=_of(settings, work))
-
-
-def _of(settings: Settings, work: Work) -> Work:
-    """The work with the settings' seed and interval; refuses a checkpoint."""
-    if settings.checkpoint is not None:
-        raise UsageError("a checkpoint is of one estimate, and this command makes many; leave checkpoint out")
-    return replace(work, seed=settings.seed, probability=settings.interval)
 
 
 # --- CPU time of this program in a process of its own: what a user who types one command waits for.
@@ -244,9 +223,14 @@ def tradeoff_estimate_action(
     )
     if len(maps) > 1 and centre_mm is not None:
         raise UsageError("--centre-mm is a place on one map; give one map")
+    if settings.checkpoint is not None:
+        raise UsageError("a checkpoint is of one estimate, and this command makes many; leave checkpoint out")
     with progress_bar("settings") as progress:
-        work = Work(time.process_time, tolerance_mm, runs, forecast, progress)
-        ladder = tradeoff_of_map(maps[0], settings, work)
+        work = Work(time.process_time, tolerance_mm, runs, forecast, progress, settings.seed, settings.interval)
+        tactile_map = read_map(maps[0])
+        with in_file(maps[0]):
+            calibration, options = estimate_inputs(settings, tactile_map)
+            ladder = measure(tactile_map, calibration=calibration, options=options, work=work)
         if len(maps) > 1:
             ladder = replace(ladder, pooled=pooled_rows(maps, settings, clock=time.process_time))
     cold = fresh_cpu_s(["estimate", str(maps[0]), *_said(size_calibration, centre_mm, settings_file)])
@@ -286,9 +270,10 @@ def tradeoff_map_action(
     begun = time.process_time()
     loaded = read_scan(scan)
     read_s = time.process_time() - begun
+    settings = Settings(seed=seed)
     with progress_bar("settings") as progress:
-        work = Work(time.process_time, tolerance_mm, runs, forecast, progress)
-        ladder = tradeoff_of_scan(loaded, Settings(seed=seed), work)
+        work = Work(time.process_time, tolerance_mm, runs, forecast, progress, seed, settings.interval)
+        ladder = measure_map(loaded, inputs=partial(estimate_inputs, settings), work=work)
     ladder = replace(ladder, shared_cpu_s={"reading the scan": read_s})
     kept = {"tolerance_mm": tolerance_mm, "runs": runs}
     provenance = Provenance("tradeoff map", kept, hash_inputs(scan=scan), seed=seed).as_dict()

@@ -26,7 +26,7 @@ from tactile_bayes.files.documents import load_json
 from tactile_bayes.files.estimate_json import checked_report
 from tactile_bayes.files.map_nc import is_posterior, read_estimate, read_map_and_scans
 from tactile_bayes.files.provenance import scans_of
-from tactile_bayes.files.reading import HDF5_MAGIC, open_input
+from tactile_bayes.files.reading import HDF5_MAGIC, first_bytes
 from tactile_bayes.files.reports import EstimateReport
 from tactile_bayes.options import IdentityOptions
 from tactile_bayes.report.exam_page import exam_page
@@ -61,9 +61,7 @@ class ExamFiles(Record):
 def _is_estimate(path: Path) -> bool:
     if path.suffix.lower() == ".json":
         return True
-    with open_input(path) as file:
-        netcdf = file.read(len(HDF5_MAGIC)) == HDF5_MAGIC
-    return netcdf and is_posterior(path)
+    return first_bytes(path, len(HDF5_MAGIC)) == HDF5_MAGIC and is_posterior(path)
 
 
 def exam_of_files(files: ExamFiles, settings: Settings, given: Given, *, notice: Notice | None = None) -> Exam:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import codecs
 import hashlib
 import importlib
 import json
@@ -18,7 +17,7 @@ from tactile_bayes.files.documents import load_json, parse_json
 from tactile_bayes.files.estimate_json import REPORTS, checked_report
 from tactile_bayes.files.map_nc import posterior_attributes, read_map_and_scans
 from tactile_bayes.files.provenance import EXAM_FACTS, scans_of
-from tactile_bayes.files.reading import HDF5_MAGIC, kind_of, open_input, schema_kind
+from tactile_bayes.files.reading import HDF5_MAGIC, first_bytes, is_json, kind_of, schema_kind
 from tactile_bayes.files.reports import EstimateReport, MassReport, PooledReport, centre_of
 from tactile_bayes.findings import capital, finding_lines
 from tactile_bayes.inference.draws import Quantity
@@ -209,8 +208,7 @@ def plain_line(text: str) -> str:
 
 def read_exam(path: Path) -> MapFile | list[EstimateFile]:
     """Read a file of this program, whichever kind it is; a list of estimates gives several."""
-    with open_input(path) as file:
-        head = file.read(8)
+    head = first_bytes(path, 8)
     if head.startswith(HDF5_MAGIC):
         attributes = posterior_attributes(path, way_out=_WAY_OUT)
         if attributes is not None:
@@ -221,7 +219,7 @@ def read_exam(path: Path) -> MapFile | list[EstimateFile]:
             return [replace(estimate, kind="posterior", digest=sha256(path))]
         tactile_map, scans = read_map_and_scans(path)
         return MapFile(path, sha256(path), tactile_map, shared_facts(scans))
-    if not head.removeprefix(codecs.BOM_UTF8).lstrip().startswith((b"{", b"[")):
+    if not is_json(head):
         kind = kind_of(path) or ("none of these" if head else "empty")
         raise BadDataError(f"is {kind}", way_out=_WAY_OUT, path=str(path))
     document = load_json(path, way_out=_WAY_OUT)

@@ -7,7 +7,6 @@ import datetime
 import logging
 import re
 import warnings
-from codecs import BOM_UTF8
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
@@ -16,7 +15,7 @@ from tactile_bayes.declarations import Record, as_dict, names_of, replace
 from tactile_bayes.errors import BadDataError, TactileBayesError, UsageError
 from tactile_bayes.exports.exam import required
 from tactile_bayes.files.documents import load_json, parse_record
-from tactile_bayes.files.reading import other_encoding, read_bytes
+from tactile_bayes.files.reading import is_json, other_encoding, read_bytes
 from tactile_bayes.options import IdentityOptions
 
 # --- Who was examined, and when: only what the user or a worklist says, checked against what the formats can hold.
@@ -158,7 +157,7 @@ def identity_of(worklist: Path | None, given: Mapping[str, Any]) -> Identity:
 def read_worklist(path: Path) -> Identity:
     """Read the identity that a worklist file gives."""
     data = read_bytes(path, most=_MOST_BYTES)
-    if not other_encoding(data) and not data.removeprefix(BOM_UTF8).lstrip().startswith((b"{", b"[")):
+    if not other_encoding(data) and not is_json(data):
         pydicom = required("pydicom")
         with _decoding(path, "is neither JSON nor a DICOM file"):
             item = pydicom.dcmread(path, stop_before_pixels=True)

@@ -139,11 +139,23 @@ def export(
     given: dict[str, Any] = {name: value for name, value in identity.given.items() if name in TAKES[to]}
     who = Identity(**given)
     if to == "nrrd":
-        return _nrrd(maps, estimates, id_from_scan=id_from_scan)
+        if id_from_scan:
+            raise UsageError("nrrd files hold no patient; leave out --patient-id-from-scan")
+        if estimates:
+            raise UsageError(f"nrrd files hold a map; {estimates[0].path} is none")
+        if len(maps) > 1:
+            raise UsageError("a nrrd file holds one map; give one")
+        return Exported({"": nrrd_bytes(maps[0])})
     if to == "csv":
         _refuse_maps(maps, estimates, to)
         return Exported({"": records_csv(estimates, who, id_from_scan=id_from_scan).encode()})
-    who = _with_subject(who, [*maps, *estimates]) if id_from_scan else who
+    if id_from_scan and not who.patient_id:
+        facts = [*(one.facts for one in maps), *(one.facts for one in estimates)]
+        subjects = {one.get("subject", "") for one in facts}
+        if len(subjects) != 1 or "" in subjects:
+            way_out = "give --patient-id instead of --patient-id-from-scan"
+            raise UsageError(f"the scans name no subject, or several; {way_out}")
+        who = replace(who, patient_id=subjects.pop())
     if to == "dicom":
         return _dicom(maps, estimates, who)
     _refuse_maps(maps, estimates, to)
@@ -156,15 +168,6 @@ def _refuse_twice(files: Sequence[MapFile] | Sequence[EstimateFile]) -> None:
         if one.digest in seen:
             raise UsageError(f"{one.path} holds what {seen[one.digest]} holds; give each once")
         seen[one.digest] = one.path
-
-
-def _with_subject(identity: Identity, files: Sequence[MapFile | EstimateFile]) -> Identity:
-    if identity.patient_id:
-        return identity
-    subjects = {one.facts.get("subject", "") for one in files}
-    if len(subjects) != 1 or "" in subjects:
-        raise UsageError("the scans name no subject, or several; give --patient-id instead of --patient-id-from-scan")
-    return replace(identity, patient_id=subjects.pop())
 
 
 def _no_patient(identity: Identity) -> list[str]:
@@ -205,13 +208,3 @@ def _refuse_maps(maps: Sequence[MapFile], estimates: Sequence[EstimateFile], to:
         )
     if maps:
         raise UsageError(f"{to} files hold no map; leave out {maps[0].path}")
-
-
-def _nrrd(maps: Sequence[MapFile], estimates: Sequence[EstimateFile], *, id_from_scan: bool) -> Exported:
-    if id_from_scan:
-        raise UsageError("nrrd files hold no patient; leave out --patient-id-from-scan")
-    if estimates:
-        raise UsageError(f"nrrd files hold a map; {estimates[0].path} is none")
-    if len(maps) > 1:
-        raise UsageError("a nrrd file holds one map; give one")
-    return Exported({"": nrrd_bytes(maps[0])})

@@ -86,28 +86,23 @@ def refuse_existing(*paths: Path | None, force: bool) -> None:
     is a directory or a device (with or without --force), or lies in a directory that does not exist or may not be
     written.
     """
-    for path in paths:
-        if path is not None:
-            _refuse_existing(path, force=force)
-
-
-def _refuse_existing(path: Path, *, force: bool) -> None:
-    try:
-        kind = special_kind(path.stat().st_mode)
-    except FileNotFoundError:
-        kind = ""
-    except OSError as error:
-        raise unwritable(path, error) from None
-    else:
-        if kind:
-            raise UsageError(f"{path} is {kind}; give the name of a regular file")
-        if not force:
-            raise UsageError(f"{path} exists; choose another name or give --force")
-    folder = _target(path).parent
-    if not folder.is_dir():
-        raise UsageError(f"{folder} is not a directory; create it first")
-    if not os.access(folder, os.W_OK | os.X_OK):
-        raise UsageError(f"{folder} may not be written; choose another place")
+    for path in filter(None, paths):
+        try:
+            kind = special_kind(path.stat().st_mode)
+        except FileNotFoundError:
+            pass
+        except OSError as error:
+            raise unwritable(path, error) from None
+        else:
+            if kind:
+                raise UsageError(f"{path} is {kind}; give the name of a regular file")
+            if not force:
+                raise UsageError(f"{path} exists; choose another name or give --force")
+        folder = _target(path).parent
+        if not folder.is_dir():
+            raise UsageError(f"{folder} is not a directory; create it first")
+        if not os.access(folder, os.W_OK | os.X_OK):
+            raise UsageError(f"{folder} may not be written; choose another place")
 
 
 def _target(path: Path) -> Path:

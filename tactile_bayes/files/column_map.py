@@ -55,10 +55,9 @@ class ColumnMap(Record):
     """Which column of a wide table holds which reading."""
 
     patient: Annotated[Column, Meta(description="Column of the coded patient.")]
-    mass: (
-        Annotated[Column, Meta(description="Column of the mass within the patient; without it every patient has one.")]
-        | None
-    ) = None
+    mass: Annotated[
+        Column | None, Meta(description="Column of the mass within the patient; without it every patient has one.")
+    ] = None
     unit: Annotated[Unit, Meta(description="Of all sizes, unless a reading says otherwise.")] = "mm"
     not_detected: Annotated[
         tuple[str, ...], Meta(description="Words that the table writes for a mass looked for and not found.")
@@ -66,14 +65,11 @@ class ColumnMap(Record):
     not_done: Annotated[
         tuple[str, ...], Meta(description="Words for a mass not looked for; a blank is one already.")
     ] = ()
-    synthetic: Annotated[bool, Meta(description="Whether all readings were made by a generator.")] | None = None
-    reading: (
-        Annotated[
-            tuple[ReadingColumns, ...],
-            Meta(min_length=1, description="One for each modality and replicate of a wide table of readings."),
-        ]
-        | None
-    ) = None
+    synthetic: Annotated[bool | None, Meta(description="Whether all readings were made by a generator.")] = None
+    reading: Annotated[
+        Annotated[tuple[ReadingColumns, ...], Meta(min_length=1)] | None,
+        Meta(description="One for each modality and replicate of a wide table of readings."),
+    ] = None
     excision: ExcisionColumns | None = None
 
     def key_columns(self) -> list[str]:
@@ -87,19 +83,14 @@ def read_wide(path: Path, mapping_path: Path) -> Table:
     if mapping.reading is None:
         way_out = "add one for each modality, or give a table of readings that is tidy"
         raise BadDataError("has no [[reading]]", way_out=way_out, path=str(mapping_path))
-    raw = _composed(read_raw(path))
     named = [(one.size, one.sd, one.low, one.high, one.reader, one.date) for one in mapping.reading]
-    _check_columns(raw, [*mapping.key_columns(), *(name for names in named for name in names if name)])
-    columns: dict[str, list[Any]] = {}
-    line_numbers = []
-    for line, row in zip(raw.line_numbers, raw.rows, strict=True):
-        for reading in mapping.reading:
-            for name, value in _reading(raw, line, row, reading, mapping).items():
-                columns.setdefault(name, []).append(value)
-            line_numbers.append(line)
-    table = Table(path=path, columns=columns, line_numbers=line_numbers)
-    _check_keys(table, ("patient", "mass", "modality", "replicate"))
-    return table
+    raw = _raw(path, mapping, [name for names in named for name in names])
+    rows = zip(raw.line_numbers, raw.rows, strict=True)
+    return _table(
+        path,
+        [(line, _reading(raw, line, row, reading, mapping)) for line, row in rows for reading in mapping.reading],
+        ("patient", "mass", "modality", "replicate"),
+    )
 
 
 def read_wide_excision(path: Path, mapping_path: Path) -> Table:
@@ -107,31 +98,36 @@ def read_wide_excision(path: Path, mapping_path: Path) -> Table:
     left out.
     """
     mapping = read_mapping(mapping_path)
-    if mapping.excision is None:
+    excision = mapping.excision
+    if excision is None:
         way_out = "add it, with size as the column of the sizes"
         raise BadDataError("has no table [excision]", way_out=way_out, path=str(mapping_path))
-    raw = _composed(read_raw(path))
-    excision = mapping.excision
-    named = (excision.size, excision.second, excision.sd, excision.date)
-    _check_columns(raw, [*mapping.key_columns(), *filter(None, named)])
-    columns: dict[str, list[Any]] = {name: [] for name in _EXCISION}
+    raw = _raw(path, mapping, (excision.size, excision.second, excision.sd, excision.date))
     factor = _FACTOR[excision.unit or mapping.unit]
-    kept = []
+    rows = []
     for line, row in zip(raw.line_numbers, raw.rows, strict=True):
-        if not row[excision.size]:
-            continue
-        kept.append(line)
-        patient, mass = _key(raw, line, row, mapping)
-        size = factor * _positive(raw, line, excision.size, row[excision.size])
-        second, sd = (_number(raw, line, row, column, factor) for column in (excision.second, excision.sd))
-        day = _date(raw, line, row, excision.date)
-        for name, value in zip(_EXCISION, (patient, mass, size, second, sd, day), strict=True):
-            columns[name].append(value)
-    if not kept:
+        if row[excision.size]:
+            patient, mass = _key(raw, line, row, mapping)
+            size = factor * _positive(raw, line, excision.size, row[excision.size])
+            second, sd = (_number(raw, line, row, column, factor) for column in (excision.second, excision.sd))
+            day = _date(raw, line, row, excision.date)
+            rows.append((line, dict(zip(_EXCISION, (patient, mass, size, second, sd, day), strict=True))))
+    if not rows:
         what = f"column {excision.size}: holds no size"
         raise BadDataError(what, way_out="correct the mapping or the table", path=str(path))
-    table = Table(path=path, columns=columns, line_numbers=kept)
-    _check_keys(table, ("patient", "mass"))
+    return _table(path, rows, ("patient", "mass"))
+
+
+def _table(path: Path, rows: Sequence[tuple[int, dict[str, Any]]], keys: Sequence[str]) -> Table:
+    """Rows with their line numbers as columns; no two may have the same keys."""
+    columns = {name: [row[name] for _, row in rows] for name in rows[0][1]}
+    table = Table(path=path, columns=columns, line_numbers=[line for line, _ in rows])
+    first: dict[tuple[Any, ...], int] = {}
+    for row, key in enumerate(zip(*(columns[name] for name in keys), strict=True)):
+        if (before := first.setdefault(key, row)) != row:
+            what = f"{' + '.join(map(str, key))} stands on line {table.line_numbers[before]} already"
+            way_out = "remove one row" if "modality" in keys else "remove one, or name the column of the mass"
+            raise table.error(row, "patient", what, way_out=way_out)
     return table
 
 
@@ -150,17 +146,16 @@ def _composed_texts(item: Any) -> Any:
     return composed(item) if isinstance(item, str) else item
 
 
-def _composed(table: RawTable) -> RawTable:
-    """The table with names of its columns and cells in one spelling, so that they are those of the mapping."""
+def _raw(path: Path, mapping: ColumnMap, names: Sequence[str | None]) -> RawTable:
+    """The table with its names and cells in one spelling, in which the mapping's columns are there."""
+    table = read_raw(path)
     rows = [{composed(name): composed(cell) for name, cell in row.items()} for row in table.rows]
-    return replace(table, header=[composed(name) for name in table.header], rows=rows)
-
-
-def _check_columns(table: RawTable, names: Sequence[str]) -> None:
-    for name in names:
+    table = replace(table, header=[composed(name) for name in table.header], rows=rows)
+    for name in filter(None, (*mapping.key_columns(), *names)):
         if name not in table.header:
             held = ", ".join(repr(one) for one in table.header)
             raise table.error(1, name, "is missing", way_out=f"correct the mapping; the table has {held}")
+    return table
 
 
 def _key(table: RawTable, line: int, row: Mapping[str, str], mapping: ColumnMap) -> tuple[str, str]:
@@ -226,12 +221,3 @@ def _positive(table: RawTable, line: int, column: str, text: str) -> float:
     if value < 0:
         raise table.error(line, column, f"is {value:g}", way_out="a size is above 0")
     return value
-
-
-def _check_keys(table: Table, names: Sequence[str]) -> None:
-    first: dict[tuple[Any, ...], int] = {}
-    for row, key in enumerate(zip(*(table.columns.get(name, []) for name in names), strict=True)):
-        if (before := first.setdefault(key, row)) != row:
-            what = f"{' + '.join(map(str, key))} stands on line {table.line_numbers[before]} already"
-            way_out = "remove one row" if "modality" in names else "remove one, or name the column of the mass"
-            raise table.error(row, "patient", what, way_out=way_out)

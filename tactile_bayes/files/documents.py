@@ -12,7 +12,7 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, TypeVar
 
-from tactile_bayes.declarations import Meta, Record, field, from_plain, names_of, replace, schema_name
+from tactile_bayes.declarations import Meta, Record, field, from_plain, names_of, replace, schema_name, shown
 from tactile_bayes.errors import BadDataError, in_file, meant
 from tactile_bayes.files.reading import JSON_BYTES, TOML_BYTES, decoding, kind_of, read_text, schema_kind
 from tactile_bayes.options import TrialSettings
@@ -31,11 +31,6 @@ def load_schema(name: str) -> dict[str, Any]:
             document: dict[str, Any] = json.loads((folder / name).read_text(encoding="utf-8"))
             return document
     raise FileNotFoundError(f"schema {name} is not installed with this program")
-
-
-def _shown(value: object) -> str:
-    text = repr(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."
 
 
 def dump_json(document: object) -> str:
@@ -74,7 +69,7 @@ def parse_record(document: object, kind: type[T], *, path: Path) -> T:
     if wanted and found and found != wanted:
         raise BadDataError(f"is {found}, not {wanted}", way_out=f"give {wanted}", path=str(path))
     if schema and isinstance(document, dict) and document.get("schema", schema) != schema:
-        raise BadDataError(f"schema is {_shown(document['schema'])}", way_out=f"give {schema!r}", path=str(path))
+        raise BadDataError(f"schema is {shown(document['schema'])}", way_out=f"give {schema!r}", path=str(path))
     with in_file(path):
         return from_plain(kind, document)
 
@@ -188,21 +183,15 @@ def read_protocol(path: Path) -> tuple[str | None, dict[str, Any]]:
 SET_BY_RECORDING: Final = ("head_id", "tracker_id", "source", "clock", "rotation", "array_calibration_days")
 """Keys that the recording itself writes."""
 OF_A_PERSON: Final = (
-    "name",
-    "patient",
-    "patient_name",
-    "examiner_name",
-    "date_of_birth",
-    "birth_date",
-    "address",
-    "phone",
+    *("name", "patient", "patient_name", "examiner_name", "date_of_birth", "birth_date", "address", "phone"),
 )
 """Keys that no session may have."""
-_LETTERS: Final = "letters from A to Z and a to z, digits, _ and -"
 Text64 = Annotated[str, Meta(max_length=64)]
-Code = Annotated[
-    str, Meta(pattern="^[A-Za-z0-9_-]{1,32}$", extra={"words": f"a text in quotes of up to 32 {_LETTERS}"})
-]
+_CODE: Final = "a text in quotes of up to {} letters from A to Z and a to z, digits, _ and -"
+Code = Annotated[str, Meta(pattern="^[A-Za-z0-9_-]{1,32}$", extra={"words": _CODE.format(32)})]
+Examiner = Annotated[str, Meta(pattern="^[A-Za-z0-9_-]{1,16}$", extra={"words": _CODE.format(16)})]
+Days = Annotated[str, Meta(pattern="^-?[0-9]{1,6}$", extra={"words": "a whole number of days in quotes"})]
+Posture = Literal["supine", "oblique", "sitting", "phantom"]
 _FACT_NAME: Final = "^[a-z][a-z0-9_]{0,39}$"
 FactName = Annotated[str, Meta(pattern=_FACT_NAME)]
 Fact = Annotated[str, Meta(max_length=2000)]
@@ -215,48 +204,25 @@ class Session(Record, forbid_unknown_fields=False):
     nothing here may identify a person.
     """
 
-    head_id: Annotated[Text64, Meta(description="Identity of the scan head.")] | None = None
-    array_id: Annotated[Text64, Meta(description="Identity or serial number of the pressure array.")] | None = None
-    tracker_id: Annotated[Text64, Meta(description="Identity or serial number of the tracker.")] | None = None
-    side: Annotated[Literal["left", "right", "phantom"], Meta(description="Which breast, or a phantom.")] | None = None
-    posture: (
-        Annotated[Literal["supine", "oblique", "sitting", "phantom"], Meta(description="Posture during the scan.")]
-        | None
-    ) = None
-    lubricant: Annotated[Text64, Meta(description="What was put on the skin; `none` for none.")] | None = None
-    examiner: (
-        Annotated[
-            str,
-            Meta(
-                pattern="^[A-Za-z0-9_-]{1,16}$",
-                extra={"words": f"a text in quotes of up to 16 {_LETTERS}"},
-                description="Coded examiner, not a name.",
-            ),
-        ]
-        | None
-    ) = None
-    subject: Annotated[Code, Meta(description="Coded subject, not a name.")] | None = None
-    visit: (
-        Annotated[Code, Meta(description="Code of the visit; `campaign init` takes 1 where it is left out.")] | None
-    ) = None
-    mass: (
-        Annotated[
-            Code, Meta(description="Code of the mass within the subject; `campaign init` takes 1 where it is left out.")
-        ]
-        | None
-    ) = None
-    array_calibration_days: (
-        Annotated[
-            str,
-            Meta(
-                pattern="^-?[0-9]{1,6}$",
-                extra={"words": "a whole number of days in quotes"},
-                description="Age of the array calibration at the recording, in whole days.",
-            ),
-        ]
-        | None
-    ) = None
-    source: Annotated[Text64, Meta(description="Where the scan came from: recorded, imported, simulated.")] | None = (
+    head_id: Annotated[Text64 | None, Meta(description="Identity of the scan head.")] = None
+    array_id: Annotated[Text64 | None, Meta(description="Identity or serial number of the pressure array.")] = None
+    tracker_id: Annotated[Text64 | None, Meta(description="Identity or serial number of the tracker.")] = None
+    side: Annotated[Literal["left", "right", "phantom"] | None, Meta(description="Which breast, or a phantom.")] = None
+    posture: Annotated[Posture | None, Meta(description="Posture during the scan.")] = None
+    lubricant: Annotated[Text64 | None, Meta(description="What was put on the skin; `none` for none.")] = None
+    examiner: Annotated[Examiner | None, Meta(description="Coded examiner, not a name.")] = None
+    subject: Annotated[Code | None, Meta(description="Coded subject, not a name.")] = None
+    visit: Annotated[
+        Code | None, Meta(description="Code of the visit; `campaign init` takes 1 where it is left out.")
+    ] = None
+    mass: Annotated[
+        Code | None,
+        Meta(description="Code of the mass within the subject; `campaign init` takes 1 where it is left out."),
+    ] = None
+    array_calibration_days: Annotated[
+        Days | None, Meta(description="Age of the array calibration at the recording, in whole days.")
+    ] = None
+    source: Annotated[Text64 | None, Meta(description="Where the scan came from: recorded, imported, simulated.")] = (
         None
     )
 
@@ -270,7 +236,7 @@ def check_session(session: Mapping[str, object], *, path: Path) -> None:
         if not re.search(_FACT_NAME, name):
             near = meant(name, names_of(Session))
             way_out = near if near.startswith("did") else "keys are of small letters, digits and _"
-            raise BadDataError(f"{_shown(name)} is not known", way_out=way_out, path=str(path))
+            raise BadDataError(f"{shown(name)} is not known", way_out=way_out, path=str(path))
     parse_record(dict(session), Session, path=path)
     parse_record(dict(session), dict[FactName, Fact], path=path)
 

@@ -12,7 +12,7 @@ from tactile_bayes.declarations import Record, as_dict, names_of
 from tactile_bayes.errors import BadDataError, in_file
 from tactile_bayes.files.documents import load_json, parse_record
 from tactile_bayes.files.netcdf import open_netcdf
-from tactile_bayes.files.reading import open_input
+from tactile_bayes.files.reading import first_bytes, is_json
 from tactile_bayes.files.reports import ESTIMATE, POOLED, AnotherExam, EstimateReport, MassReport, PooledReport
 from tactile_bayes.files.tables import Table
 from tactile_bayes.findings import verdict
@@ -37,9 +37,8 @@ def read_stated_size(path: Path, number: int | None = None) -> StatedSize:
 
     `number`: which estimate of a list, from 1; a list of one needs none.
     """
-    with open_input(path) as file:
-        head = file.read(8)
-    if head.lstrip().startswith((b"{", b"[")):
+    head = first_bytes(path, 8)
+    if is_json(head):
         return _from_json(path, number)
     if number is not None:
         raise BadDataError("is no list of estimates", way_out=f"leave out #{number}", path=str(path))

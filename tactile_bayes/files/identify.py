@@ -12,7 +12,7 @@ from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.documents import load_json, load_schema, parse_json
 from tactile_bayes.files.map_nc import read_map_and_header
 from tactile_bayes.files.netcdf import Group, open_netcdf
-from tactile_bayes.files.reading import HDF5_MAGIC, MCAP_MAGIC, open_input
+from tactile_bayes.files.reading import HDF5_MAGIC, MCAP_MAGIC, first_bytes, is_json
 from tactile_bayes.files.scan_mcap import summarise_scan
 from tactile_bayes.files.size_json import read_repeatability, read_size_calibration
 from tactile_bayes.files.tables import read_table, separator_in
@@ -33,8 +33,7 @@ _TABLES = (
 
 def describe(path: Path) -> dict[str, Any]:
     """Describe a file of ours: ``schema``, ``kind``, and shape, units, quality and provenance as the kind has them."""
-    with open_input(path) as file:
-        head = file.read(4096)
+    head = first_bytes(path, 4096)
     if head.startswith(MCAP_MAGIC):
         return summarise_scan(path)
     if head.startswith(HDF5_MAGIC):
@@ -43,7 +42,7 @@ def describe(path: Path) -> dict[str, Any]:
             if group is not None and "schema" in group.attributes():
                 return _posterior(group)
         return _map(path)
-    if head.lstrip().startswith((b"{", b"[")):
+    if is_json(head):
         return _json(path)
     return _table(path, head)
 
@@ -143,7 +142,7 @@ def _repeatability(path: Path, document: dict[str, Any]) -> dict[str, Any]:
         "schema": document["schema"],
         "kind": "spread between exams of one mass at a site",
         "in_words": found.words(),
-        **{name: document[name] for name in (*kept, *(["half_width"] if "half_width" in document else []))},
+        **{name: document[name] for name in (*kept, "half_width") if name in document},
         "units": {"between_map_sd, median, low, high, half_width": "share of the size"},
         "repeats": {one["name"]: f"{len(one['exams'])} exams" for one in document["repeats"]},
         "outlying": document["outlying"],

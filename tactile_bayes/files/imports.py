@@ -44,6 +44,8 @@ _BESIDE: Final = {
     "--rate-hz": ("frame_time_s",),
 }
 """Options that give what a file of arrays may lack."""
+_TEMPLATE: Final = "`tactile-bayes import SRC --template` prints a MAP.toml for --columns, which says what is what"
+_HELP: Final = "`tactile-bayes import --help` says what they are"
 
 
 class Imported(Record, eq=False):
@@ -111,7 +113,9 @@ def _read(path: Path, given: ArrayMap, beside: Sequence[Source]) -> Source:
         there.update({name: name for name in KNOWN if name in names} | given.arrays)
         there.update(plain_names(names, there, given.values))
         if not there:
-            raise _unknown(held, grid="mean" in names)
+            needed = ", ".join(f"{name} ({in_words(LAYOUT[name].shape)})" for name in LAYOUT if name not in OPTIONAL)
+            more = " (for a grid of values give --as map)" if "mean" in names else ""
+            raise BadDataError(f"lacks {needed} (it has {held})", way_out=f"{_TEMPLATE}{more}; {_HELP}")
         return list(dict.fromkeys(there.values()))
 
     held = read_named(path, choose)
@@ -125,16 +129,6 @@ def of_poses(path: Path, given: Stated) -> Source:
     """Poses of a file of their own: a table, or a sequence metafile."""
     found = read_sequence(path, given, frames=False) if is_sequence(path) else read_poses(path, given)
     return replace(found, path=str(path))
-
-
-def _unknown(held: str, *, grid: bool) -> BadDataError:
-    needed = ", ".join(f"{name} ({in_words(one.shape)})" for name, one in LAYOUT.items() if name not in OPTIONAL)
-    names = "`tactile-bayes import SRC --template` prints a MAP.toml for --columns, which says what is what"
-    more = " (for a grid of values give --as map)" if grid else ""
-    return BadDataError(f"lacks {needed} (it has {held})", way_out=f"{names}{more}; {_HELP}")
-
-
-_HELP: Final = "`tactile-bayes import --help` says what they are"
 
 
 def of_head(given: Path | HeadGeometry) -> Source:

@@ -46,62 +46,44 @@ _WAY_OUT: Final = (
 Triple = tuple[float, float, float]
 Row = tuple[float, float, float, float]
 TaxelRow = Annotated[list[Triple], Meta(min_length=1, max_length=256)]
+Radius = Annotated[float, Meta(gt=0, le=100_000)]
+Rounding = Annotated[float, Meta(ge=0, le=100)]
 
 
 class HeadFile(Record, kw_only=True):
     """A scan head: where its taxels are, and where the tracker's sensor is on it."""
 
     schema: Literal["tactile-bayes/head/1"]
-    note: Annotated[str, Meta(description="Anything, for people.")] | None = None
+    note: Annotated[str | None, Meta(description="Anything, for people.")] = None
     pitch_mm: Pitch
-    surface_mm: (
-        Annotated[
-            list[TaxelRow],
-            Meta(
-                min_length=1,
-                max_length=256,
-                description="(rows, columns, 3) centres of the taxels in `scanhead`: origin at the apex, x across the "
-                "head, y along it, z into the tissue. Or give rows, columns and radius_mm.",
-            ),
-        ]
-        | None
-    ) = None
+    surface_mm: Annotated[
+        Annotated[list[TaxelRow], Meta(min_length=1, max_length=256)] | None,
+        Meta(
+            description="(rows, columns, 3) centres of the taxels in `scanhead`: origin at the apex, x across the "
+            "head, y along it, z into the tissue. Or give rows, columns and radius_mm."
+        ),
+    ] = None
     rows: Rows | None = None
     columns: Columns | None = None
-    radius_mm: (
-        Annotated[
-            float,
-            Meta(
-                gt=0,
-                le=100_000,
-                description="Radius of the arc across the head, mm, above half its width; null for a flat head.",
-            ),
-        ]
-        | None
-    ) = None
+    radius_mm: Annotated[
+        Radius | None,
+        Meta(description="Radius of the arc across the head, mm, above half its width; null for a flat head."),
+    ] = None
     shoulder_mm: Annotated[
-        float, Meta(ge=0, le=100, description="Radius of rounded edges cut into the array across the head, mm.")
+        Rounding, Meta(description="Radius of rounded edges cut into the array across the head, mm.")
     ] = 0.0
-    rim_mm: (
-        Annotated[
-            float,
-            Meta(
-                ge=0,
-                le=100,
-                description="Radius of the rounded edge around the taxels, which presses but senses nothing, mm; for "
-                "`population`. Default: 3, or 0 with shoulder_mm.",
-            ),
-        ]
-        | None
-    ) = None
-    checked_on: Annotated[date, Meta(description="When `check` found it right on a scan.")] | None = None
-    scanhead_from_tracker: (
-        Annotated[
-            tuple[Row, Row, Row, Row],
-            Meta(description="(4, 4) transform from the tracker's sensor to the head; `record` needs it."),
-        ]
-        | None
-    ) = None
+    rim_mm: Annotated[
+        Rounding | None,
+        Meta(
+            description="Radius of the rounded edge around the taxels, which presses but senses nothing, mm; for "
+            "`population`. Default: 3, or 0 with shoulder_mm."
+        ),
+    ] = None
+    checked_on: Annotated[date | None, Meta(description="When `check` found it right on a scan.")] = None
+    scanhead_from_tracker: Annotated[
+        tuple[Row, Row, Row, Row] | None,
+        Meta(description="(4, 4) transform from the tracker's sensor to the head; `record` needs it."),
+    ] = None
 
     def __post_init__(self) -> None:
         if self.surface_mm is not None and len({len(row) for row in self.surface_mm}) > 1:
@@ -205,7 +187,7 @@ class LandmarksFile(Record, kw_only=True):
     schema: Literal["tactile-bayes/landmarks/1"]
     sternal_notch_mm: Annotated[Triple, Meta(description="Sternal notch, mm.")]
     xiphoid_mm: Annotated[Triple, Meta(description="Xiphoid, mm.")]
-    nipple_mm: Annotated[Triple, Meta(description="Nipple, mm; left out where it was not touched.")] | None = None
+    nipple_mm: Annotated[Triple | None, Meta(description="Nipple, mm; left out where it was not touched.")] = None
 
 
 def write_array_calibration(path: Path, content: ArrayCalibrationFile, *, force: bool = False) -> None:

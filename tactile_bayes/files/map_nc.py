@@ -81,7 +81,7 @@ def write_map(path: Path, tactile_map: TactileMap, *, provenance: Provenance, fo
     """Write a map atomically, readable by its owner only; `provenance` holds no clock time, so equal maps give equal
     bytes.
     """
-    _check_lattice(tactile_map.x_mm, tactile_map.y_mm, tactile_map.recipe.cell_mm)
+    _check_lattice({"x_mm": tactile_map.x_mm, "y_mm": tactile_map.y_mm}, tactile_map.recipe.cell_mm)
     groups = {"/": Contents(_variables(tactile_map), _attributes(tactile_map, provenance))}
     write_bytes(path, grouped_netcdf_bytes(groups), force=force)
 
@@ -131,8 +131,13 @@ def read_map_and_header(path: Path) -> tuple[TactileMap, MapHeader]:
             arrays[field] = file.array(name, kind=kind, dimensions=dimensions)
             if arrays[field] is None:
                 raise BadDataError(f"variable {name} is missing", way_out=_WAY_OUT)
-        transforms = {name: _read_transform(file, name) for name in _TRANSFORMS}
-        _check_lattice(arrays["x_mm"], arrays["y_mm"], header.recipe.cell_mm)
+        transforms = {name: file.array(name, kind="f8", dimensions=("row", "column")) for name in _TRANSFORMS}
+        for name, transform in transforms.items():
+            if transform is not None and transform.shape != (4, 4):
+                raise BadDataError(f"variable {name} is not 4 by 4", way_out=_WAY_OUT)
+            if transform is not None:
+                check_rigid(transform, name=name)
+        _check_lattice({"x": arrays["x_mm"], "y": arrays["y_mm"]}, header.recipe.cell_mm)
         tactile_map = TactileMap(
             **arrays,
             **transforms,
@@ -188,18 +193,9 @@ def _header(file: Group) -> MapHeader:
         raise BadDataError(error.what, way_out=_WAY_OUT) from None
 
 
-def _read_transform(file: Group, name: str) -> Any:
-    transform = file.array(name, kind="f8", dimensions=("row", "column"))
-    if transform is not None and transform.shape != (4, 4):
-        raise BadDataError(f"variable {name} is not 4 by 4", way_out=_WAY_OUT)
-    if transform is not None:
-        check_rigid(transform, name=name)
-    return transform
-
-
-def _check_lattice(x_mm: FloatArray, y_mm: FloatArray, cell_mm: float) -> None:
+def _check_lattice(axes: Mapping[str, FloatArray], cell_mm: float) -> None:
     """Raise `BadDataError` unless both axes are finite and step by one cell."""
-    for name, axis in (("x", x_mm), ("y", y_mm)):
+    for name, axis in axes.items():
         if not np.isfinite(axis).all():
             raise BadDataError(f"variable {name} holds values that are not finite", way_out=_WAY_OUT)
         steps = np.diff(axis)

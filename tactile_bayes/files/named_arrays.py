@@ -23,7 +23,7 @@ from tactile_bayes.files.reading import (
     NETCDF_BYTES,
     ZIP_MAGIC,
     decoding,
-    open_input,
+    first_bytes,
     read_bytes,
 )
 
@@ -43,6 +43,7 @@ ARRAY_SUFFIXES: Final = (".npz", ".npy", ".mat", ".h5", ".hdf5")
 _MAT_73: Final = b"MATLAB 7.3 MAT-file"
 _KNOWN: Final = (ZIP_MAGIC[:2], np.lib.format.MAGIC_PREFIX, MAT_5, _MAT_73, HDF5_MAGIC, MCAP_MAGIC, b"CDF")
 _USER_BLOCK: Final = 512  # bytes before the HDF5 file in a .mat of version 7.3
+_LOOKED_AT: Final = _USER_BLOCK + len(HDF5_MAGIC)
 _COPY_AGAIN: Final = "copy the file again"
 _MOST_LEVELS: Final = 8
 
@@ -53,7 +54,7 @@ def read_named(path: Path, choose: Choose) -> Arrays:
     Fields of a structure and members of a group are called ``exam.frames``. Arrays of a .mat have the axes that they
     have in MATLAB.
     """
-    start = _start(path)
+    start = first_bytes(path, _LOOKED_AT)
     with in_file(path):
         if start.startswith(ZIP_MAGIC[:2]):
             return choose_npz(path, choose)
@@ -74,12 +75,7 @@ def read_named(path: Path, choose: Choose) -> Arrays:
 
 def is_text(path: Path) -> bool:
     """True for a file that is none of arrays by its first bytes and its suffix, and may be a text."""
-    return path.suffix.lower() not in ARRAY_SUFFIXES and not _start(path).startswith(_KNOWN)
-
-
-def _start(path: Path) -> bytes:
-    with open_input(path) as stream:
-        return stream.read(_USER_BLOCK + len(HDF5_MAGIC))
+    return path.suffix.lower() not in ARRAY_SUFFIXES and not first_bytes(path, _LOOKED_AT).startswith(_KNOWN)
 
 
 def _of_another_kind(path: Path, start: bytes) -> BadDataError:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import contextlib
 import errno
 import hashlib
@@ -54,6 +55,17 @@ def open_input(path: Path) -> io.BufferedReader:
         os.close(descriptor)
         raise BadDataError(f"is {kind}", way_out="give a regular file", path=str(path))
     return os.fdopen(descriptor, "rb")
+
+
+def first_bytes(path: Path, number: int) -> bytes:
+    """How a regular file begins."""
+    with open_input(path) as file:
+        return file.read(number)
+
+
+def is_json(start: bytes) -> bool:
+    """True for the first bytes of a JSON object or list."""
+    return start.removeprefix(codecs.BOM_UTF8).lstrip().startswith((b"{", b"["))
 
 
 def special_kind(mode: int) -> str:
@@ -212,8 +224,7 @@ _LOOKED_AT = 4096
 def kind_of(path: Path) -> str:
     """Kind of a file in words; empty when its first bytes do not show it."""
     try:
-        with open_input(path) as file:
-            start = file.read(_LOOKED_AT)
+        start = first_bytes(path, _LOOKED_AT)
     except (BadDataError, OSError):
         return ""
     for beginning, kind in _BEGINNINGS.items():

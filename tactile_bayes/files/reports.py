@@ -18,7 +18,8 @@ Chance = Annotated[float, Meta(ge=0, le=1)]
 Least0 = Annotated[float, Meta(ge=0)]
 Above0 = Annotated[float, Meta(gt=0)]
 Number1 = Annotated[int, Meta(ge=1)]
-Diameter = Annotated[float, Meta(gt=0, le=500)] | None
+Length = Annotated[float, Meta(gt=0, le=500)]
+Diameter = Length | None
 Three = tuple[Diameter, Diameter, Diameter]
 ReasonCode = Literal[
     "", "empty", "undetected", "ridge", "cannot_show", "unresolved", "window", "prior", "extrapolated", "method"
@@ -162,12 +163,10 @@ class SmallestLump(Record):
     """On a map without a lump: diameters of the smallest ball that it would have shown, by depth."""
 
     probability: Chance
-    depths_mm: tuple[
-        Annotated[float, Meta(gt=0, le=500)], Annotated[float, Meta(gt=0, le=500)], Annotated[float, Meta(gt=0, le=500)]
-    ]
+    depths_mm: tuple[Length, Length, Length]
     best_mm: Three
     worst_mm: Three
-    spacing_mm: Annotated[float, Meta(gt=0, le=500)]
+    spacing_mm: Length
     places: Annotated[tuple[SmallestAt, ...], Meta(max_length=200)]
 
 

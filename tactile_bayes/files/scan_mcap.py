@@ -296,9 +296,12 @@ def read_scan_report(path: Path) -> ScanFile:
         if not len(frames) and not records.finished:
             way_out = "copy it again from where it was recorded: this copy holds no frame"
             raise BadDataError("was cut off before its first complete frame", way_out=way_out)
+        messages = records.messages("/pose", schema="foxglove.PoseInFrame")
+        places = _pose_table(messages)
+        poses = TrackerPoses(message_times(messages, topic="/pose"), places[:, :3], places[:, 3:])
         landmarks, findings = _landmarks(records), file_findings(records)
         return ScanFile(
-            scan=Scan(frames, _poses(records), head, calibration, landmarks, session, findings),
+            scan=Scan(frames, poses, head, calibration, landmarks, session, findings),
             complete=records.finished and not records.lost,
             damaged=records.damaged,
             lost=tuple(records.lost),
@@ -380,12 +383,6 @@ def _frames(records: McapRecords, head: HeadGeometry) -> PressureFrames:
             raise BadDataError(f"/pressure message {i} holds {len(data)} bytes", way_out=way_out)
         counts[i] = np.frombuffer(data, dtype="<u2").reshape(columns, rows).T
     return PressureFrames(message_times(messages, topic="/pressure"), counts)
-
-
-def _poses(records: McapRecords) -> TrackerPoses:
-    messages = records.messages("/pose", schema="foxglove.PoseInFrame")
-    values = _pose_table(messages)
-    return TrackerPoses(message_times(messages, topic="/pose"), values[:, :3], values[:, 3:])
 
 
 def _pose_table(messages: Messages) -> FloatArray:

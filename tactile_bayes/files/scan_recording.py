@@ -162,8 +162,5 @@ class RecordingWriter(ScanWriter):
 
 def full_disk(path: Path, error: OSError) -> BadDataError:
     """Error for a recording that could not be continued because the disk is full."""
-    return BadDataError(
-        f"cannot be written any further ({error.strerror})",
-        way_out="what was recorded before is kept; free space, then `tactile-bayes repair` it",
-        path=str(path),
-    )
+    way_out = "what was recorded before is kept; free space, then `tactile-bayes repair` it"
+    return BadDataError(f"cannot be written any further ({error.strerror})", way_out=way_out, path=str(path))

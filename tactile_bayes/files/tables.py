@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from tactile_bayes.declarations import Record
-from tactile_bayes.errors import BadDataError
+from tactile_bayes.errors import BadDataError, in_file
 from tactile_bayes.files.documents import load_schema
 from tactile_bayes.files.reading import TABLE_BYTES, ZIP_MAGIC, decoded, read_bytes
 
@@ -55,10 +55,10 @@ def read_text(path: Path) -> str:
     return decoded(data, path=path, way_out=_AS_UTF8, as_utf8=_AS_UTF8)
 
 
-def cells_of(path: Path, text: str) -> Cells:
+def _cells(text: str) -> Cells:
     """Split CSV text into cells; columns without a name or any filled cell are left out."""
     separator = separator_in(text)
-    rows = _rows(path, text, separator)
+    rows = _rows(text, separator)
     if not rows:
         return Cells([], [], separator)
     (_, header), *body = rows
@@ -95,7 +95,7 @@ def may_be_thousands(number: str) -> bool:
     return _THOUSANDS.fullmatch(number) is not None
 
 
-def _rows(path: Path, text: str, separator: str) -> list[tuple[int, list[str]]]:
+def _rows(text: str, separator: str) -> list[tuple[int, list[str]]]:
     """Rows that are not blank, each with its first line number."""
     reader = csv.reader(io.StringIO(text, newline=""), delimiter=separator, strict=True)
     rows: list[tuple[int, list[str]]] = []
@@ -106,8 +106,8 @@ def _rows(path: Path, text: str, separator: str) -> list[tuple[int, list[str]]]:
                 rows.append((before + 1, cells))
             before = reader.line_num
     except csv.Error as error:
-        way_out = "check the quotes and line ends around it"
-        raise BadDataError(f"line {before + 1}: not CSV ({error})", way_out=way_out, path=str(path)) from None
+        what = f"line {before + 1}: not CSV ({error})"
+        raise BadDataError(what, way_out="check the quotes and line ends around it") from None
     return rows
 
 
@@ -147,7 +147,7 @@ class Table(Record):
 
     def error(self, row: int, column: str, what: str, *, way_out: str) -> BadDataError:
         """Error for a cell found wrong after reading, in the reader's own form; rows count from 0."""
-        return _fault(self.path, self.line_numbers[row], column, what, way_out=way_out)
+        return _fault(self.line_numbers[row], column, what, way_out=way_out).at(self.path)
 
 
 def read_table(source: Path | Sheet, schema_name: str) -> Table:
@@ -160,24 +160,29 @@ def read_table(source: Path | Sheet, schema_name: str) -> Table:
     schema = load_schema(schema_name)
     fields = {field["name"]: field for field in schema["fields"]}
     path, text = (source.name, source.text) if isinstance(source, Sheet) else (source, read_text(source))
-    cells_in = cells_of(path, text)
-    header, body = cells_in.header, cells_in.body
-    if not header:
-        raise BadDataError("is empty", way_out=f"its first line must name columns: {_names(fields)}", path=str(path))
-    _check_header(path, header, fields, wide=schema.get("wide", ""))
-    if not body:
-        raise BadDataError("holds a header and no rows", way_out="add at least one row", path=str(path))
     columns: dict[str, list[Any]] = {name: [] for name in fields}
     keys = schema.get("primaryKey", [])
-    for line, cells in body:
-        _check_length(path, line, cells, header)
-        row = dict(zip(header, cells, strict=True))
-        row |= {name: composed(row.get(name, "")) for name in keys}
-        for name, field in fields.items():
-            cell = row.get(name, "")
-            columns[name].append(_parse_cell(path, line, cell, field=field, decimal_comma=cells_in.decimal_comma))
+    with in_file(path):
+        cells_in = _cells(text)
+        header, body = cells_in.header, cells_in.body
+        if not header:
+            raise BadDataError("is empty", way_out=f"its first line must name columns: {_names(fields)}")
+        _check_header(header, fields, wide=schema.get("wide", ""))
+        if not body:
+            raise BadDataError("holds a header and no rows", way_out="add at least one row")
+        for line, cells in body:
+            _check_length(line, cells, header)
+            row = dict(zip(header, cells, strict=True))
+            row |= {name: composed(row.get(name, "")) for name in keys}
+            for name, field in fields.items():
+                cell = row.get(name, "")
+                columns[name].append(_parse_cell(line, cell, field=field, decimal_comma=cells_in.decimal_comma))
     table = Table(path=path, columns=columns, line_numbers=[line for line, _ in body])
-    _check_primary_key(table, keys)
+    first: dict[tuple[Any, ...], int] = {}
+    for index, key in enumerate(_keys(table, keys)):
+        if (before := first.setdefault(key, index)) != index:
+            what = f"{_shown_key(key)} stands on line {table.line_numbers[before]} already"
+            raise table.error(index, " + ".join(keys), what, way_out="remove one row or correct its key")
     return table
 
 
@@ -193,7 +198,7 @@ class RawTable(Record):
 
     def error(self, line: int, column: str, what: str, *, way_out: str) -> BadDataError:
         """Error for a cell; lines count from 1."""
-        return _fault(self.path, line, column, what, way_out=way_out)
+        return _fault(line, column, what, way_out=way_out).at(self.path)
 
     def number(self, line: int, column: str, text: str) -> float:
         """Parse a finite number; an error names its cell."""
@@ -205,15 +210,16 @@ class RawTable(Record):
 
 def read_raw(path: Path) -> RawTable:
     """Read the cells of any CSV table as text; for the errors see `read_table`."""
-    cells = cells_of(path, read_text(path))
-    header, body = cells.header, cells.body
-    if not body:
-        raise BadDataError("holds no rows", way_out="give a header and at least one row", path=str(path))
-    for name in header:
-        if header.count(name) > 1:
-            raise _fault(path, 1, name, "appears more than once", way_out="keep one of them")
-    for line, row in body:
-        _check_length(path, line, row, header)
+    with in_file(path):
+        cells = _cells(read_text(path))
+        header, body = cells.header, cells.body
+        if not body:
+            raise BadDataError("holds no rows", way_out="give a header and at least one row")
+        for name in header:
+            if header.count(name) > 1:
+                raise _fault(1, name, "appears more than once", way_out="keep one of them")
+        for line, row in body:
+            _check_length(line, row, header)
     rows = [dict(zip(header, (cell.strip() for cell in row), strict=True)) for _, row in body]
     return RawTable(path, header, [line for line, _ in body], rows, cells.decimal_comma, cells.separator)
 
@@ -254,17 +260,17 @@ def check_references(table: Table, schema_name: str, *, targets: Mapping[str, Ta
                 raise table.error(row, " + ".join(key["fields"]), what, way_out=way_out)
 
 
-def _check_header(path: Path, header: Sequence[str], fields: Mapping[str, Any], *, wide: str) -> None:
+def _check_header(header: Sequence[str], fields: Mapping[str, Any], *, wide: str) -> None:
     for name in header:
         if name not in fields:
             advice = _other_table(header, fields) or _advice_on_column(name, header, fields)
             advice += f", or {wide}" if wide else ""
-            raise _fault(path, 1, name, "is not known here", way_out=advice)
+            raise _fault(1, name, "is not known here", way_out=advice)
         if header.count(name) > 1:
-            raise _fault(path, 1, name, "appears more than once", way_out="keep one of them")
+            raise _fault(1, name, "appears more than once", way_out="keep one of them")
     for name, field in fields.items():
         if name not in header and (_is_required(field) or field.get("column") == "required"):
-            raise _fault(path, 1, name, "is missing", way_out=f"add it: {field['description']}")
+            raise _fault(1, name, "is missing", way_out=f"add it: {field['description']}")
 
 
 def _other_table(header: Sequence[str], fields: Mapping[str, Any]) -> str:
@@ -289,22 +295,21 @@ def _advice_on_column(name: str, header: Sequence[str], fields: Mapping[str, Any
     return f"did you mean {near[0]}?" if near else f"remove it; the columns are {_names(fields)}"
 
 
-def _check_length(path: Path, line: int, cells: Sequence[str], header: Sequence[str]) -> None:
+def _check_length(line: int, cells: Sequence[str], header: Sequence[str]) -> None:
     if len(cells) == len(header):
         return
     way_out = "give every row a cell for each column"
     if len(cells) > len(header):
         way_out += " (a decimal comma? write 12.5, not 12,5)"
-    what = f"line {line}: {len(cells)} cells under {len(header)} columns"
-    raise BadDataError(what, way_out=way_out, path=str(path))
+    raise BadDataError(f"line {line}: {len(cells)} cells under {len(header)} columns", way_out=way_out)
 
 
-def _parse_cell(path: Path, line: int, text: str, *, field: Mapping[str, Any], decimal_comma: bool) -> Any:
+def _parse_cell(line: int, text: str, *, field: Mapping[str, Any], decimal_comma: bool) -> Any:
     """Parse a cell by the schema's type; None where it is blank and may be."""
     name = field["name"]
     if text == "":
         if _is_required(field):
-            raise _fault(path, line, name, "is blank", way_out=f"fill it in: {field['description']}")
+            raise _fault(line, name, "is blank", way_out=f"fill it in: {field['description']}")
         return None
     try:
         if text != text.strip() or not text.isprintable():
@@ -315,7 +320,7 @@ def _parse_cell(path: Path, line: int, text: str, *, field: Mapping[str, Any], d
         value = _PARSERS[field["type"]](text, field)
         _check_constraints(value, text, field)
     except BadDataError as refusal:
-        raise _fault(path, line, name, refusal.what, way_out=refusal.way_out) from None
+        raise _fault(line, name, refusal.what, way_out=refusal.way_out) from None
     return value
 
 
@@ -404,14 +409,6 @@ def _check_constraints(value: Any, text: str, field: Mapping[str, Any]) -> None:
         raise BadDataError(f"{_shown(text)} does not match {rules['pattern']}", way_out=field["description"])
 
 
-def _check_primary_key(table: Table, fields: Sequence[str]) -> None:
-    first: dict[tuple[Any, ...], int] = {}
-    for row, key in enumerate(_keys(table, fields)):
-        if first.setdefault(key, row) != row:
-            what = f"{_shown_key(key)} stands on line {table.line_numbers[first[key]]} already"
-            raise table.error(row, " + ".join(fields), what, way_out="remove one row or correct its key")
-
-
 def _keys(table: Table, fields: Sequence[str]) -> list[tuple[Any, ...]]:
     return list(zip(*(table.columns[name] for name in fields), strict=True))
 
@@ -436,6 +433,6 @@ def _shown_key(key: Sequence[Any]) -> str:
     return " + ".join(_shown(str(part)) for part in key)
 
 
-def _fault(path: Path, line: int, column: str, what: str, *, way_out: str) -> BadDataError:
+def _fault(line: int, column: str, what: str, *, way_out: str) -> BadDataError:
     shown = column if re.fullmatch(r"\w+( \+ \w+)*", column) and len(column) <= 60 else _shown(column)
-    return BadDataError(f"line {line}, column {shown}: {what}", way_out=way_out, path=str(path))
+    return BadDataError(f"line {line}, column {shown}: {what}", way_out=way_out)

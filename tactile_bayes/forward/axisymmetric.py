@@ -17,6 +17,7 @@ from tactile_bayes.forward.mesh import (
     EXTERIOR_GLAND,
     INTERIOR_FAT,
     INTERIOR_GLAND,
+    CondensedHole,
     IntArray,
     LumpGeometry,
     LumpMesh,
@@ -54,19 +55,6 @@ class LayeredBody(Record):
     thickness_mm: tuple[float, ...]
     """Of each layer on a rigid base; one entry fewer than `modulus_kpa` when the last is a half-space."""
     nu: float = POISSON  #: Poisson's ratio of all, above -1 and up to 0.5 (incompressible).
-
-    def __post_init__(self) -> None:
-        if len(self.modulus_kpa) - len(self.thickness_mm) not in (0, 1) or not self.modulus_kpa:
-            raise BadDataError(
-                f"{len(self.modulus_kpa)} moduli for {len(self.thickness_mm)} thicknesses",
-                way_out="give as many (rigid base), or one modulus more (half-space)",
-            )
-        for name in ("modulus_kpa", "thickness_mm"):
-            for i, value in enumerate(getattr(self, name)):
-                if not (value > 0 and np.isfinite(value)):
-                    raise BadDataError(f"{name}[{i}] is {value}", way_out="it must be above 0")
-        if not -1 < self.nu <= 0.5:
-            raise BadDataError(f"nu is {self.nu}", way_out="it must lie above -1 and at most 0.5")
 
     @classmethod
     def of(cls, layers: Layers) -> LayeredBody:
@@ -269,46 +257,20 @@ class ModePerturbation(Record, eq=False):
     dtheta)."""
 
 
-class CondensedMode(Record, eq=False):
-    """One Fourier order of the body around the lump, condensed onto the lump's boundary."""
-
-    order: int  #: m.
-    flexibility: FloatArray
-    """(b, b) array: Displacements on the boundary for unit forces there, with nothing inside; mm per kPa mm^2."""
-    skin: FloatArray  #: (s, b) array: Sinking of the skin for the same forces.
-    unit_stiffness: FloatArray  #: (b, b) array: The lump, condensed on its boundary, for a modulus of 1 kPa.
-    original_stiffness: FloatArray  #: (b, b) array: The tissue that the lump replaces.
-
-    def perturbation(self, lump_kpa: float) -> ModePerturbation:
-        """Change of the skin's compliance when tissue is replaced by a lump of modulus `lump_kpa`.
-
-        With the flexibility F of the surroundings and the stiffness S inside, the boundary moves by
-        :math:`(I + F S)^{-1} F f`. The difference of two such answers is written as one product, so that it is exact to
-        rounding however small it is, and vanishes for equal stiffness:
-
-        .. math:: -F_s (I + S_1 F)^{-1} (S_1 - S_0) (I + F S_0)^{-1} F_s^T
-        """
-        inside = lump_kpa * self.unit_stiffness
-        identity = np.eye(len(inside))
-        before = np.linalg.solve(identity + self.flexibility @ self.original_stiffness, self.skin.T)
-        forces = np.linalg.solve(identity + inside @ self.flexibility, (inside - self.original_stiffness) @ before)
-        share = 1.0 / (2.0 * np.pi) if self.order == 0 else 1.0 / np.pi
-        matrix = -share * (self.skin @ forces)
-        return ModePerturbation(self.order, (matrix + matrix.T) / 2)
-
-
 class CondensedLump(Record, eq=False):
     """All Fourier orders of one geometry; the perturbation for a stiffness takes milliseconds."""
 
     radius_mm: FloatArray
     """(s,) array: Skin nodes, by increasing distance from the lump's axis, the axis itself left out."""
-    modes: tuple[CondensedMode, ...]  #: Orders 0, 1, ...
+    modes: tuple[CondensedHole, ...]  #: Orders 0, 1, ...: forces in kPa mm^2, displacements in mm.
 
     def perturbation(self, lump_kpa: float) -> tuple[ModePerturbation, ...]:
         """Perturbations of all orders, for a lump of modulus `lump_kpa`."""
         if not lump_kpa > 0:
             raise BadDataError(f"the lump's modulus is {lump_kpa} kPa", way_out="it must be above 0")
-        return tuple(mode.perturbation(lump_kpa) for mode in self.modes)
+        shares = [(0.5 if order == 0 else 1.0) / np.pi for order in range(len(self.modes))]
+        changes = [share * mode.change(lump_kpa) for share, mode in zip(shares, self.modes, strict=True)]
+        return tuple(ModePerturbation(order, change) for order, change in enumerate(changes))
 
 
 def condense_lump(
@@ -354,12 +316,8 @@ def element_stiffness(mesh: LumpMesh, *, nu: float) -> FloatArray:
     """
     gradient, point, area = quadrature(mesh.node_mm[mesh.element])
     strain = _strains(lagrange_points()[0], gradient, point[..., 0])
-    return _polynomial(stiffness_factor(strain, point, area * point[..., 0], normal=3, poisson=nu))
-
-
-def _polynomial(factor: FloatArray) -> FloatArray:
-    """(3, e, k, k) coefficients of ``(A + m B)^T (A + m B)`` for the (2, e, n, k) factors A and B."""
-    a, b = factor
+    # K = (A + m B)^T (A + m B)
+    a, b = stiffness_factor(strain, point, area * point[..., 0], normal=3, poisson=nu)
     cross = a.transpose(0, 2, 1) @ b
     return np.stack([a.transpose(0, 2, 1) @ a, cross + cross.transpose(0, 2, 1), b.transpose(0, 2, 1) @ b])
 
@@ -417,7 +375,7 @@ def order_unknowns(mesh: LumpMesh, order: int) -> tuple[IntArray, FloatArray]:
     return number, sign
 
 
-def _condense(mesh: LumpMesh, elements: FloatArray, modulus_kpa: FloatArray, order: int) -> CondensedMode:
+def _condense(mesh: LumpMesh, elements: FloatArray, modulus_kpa: FloatArray, order: int) -> CondensedHole:
     number, sign = order_unknowns(mesh, order)
     inside = mesh.region >= INTERIOR_FAT
     stiffness = elements[0] + order * elements[1] + order**2 * elements[2]
@@ -440,7 +398,7 @@ def _condense(mesh: LumpMesh, elements: FloatArray, modulus_kpa: FloatArray, ord
 
     lump, within = core(np.ones_like(modulus_kpa)), modulus_kpa[inside]
     original = within[0] * lump if (within == within[0]).all() else core(modulus_kpa)
-    return CondensedMode(order, (flexibility + flexibility.T) / 2, skin, lump, original)
+    return CondensedHole((flexibility + flexibility.T) / 2, skin, lump, original)
 
 
 def _assemble(

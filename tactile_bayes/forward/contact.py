@@ -12,19 +12,9 @@ from tactile_bayes.errors import BadDataError, NotConvergedError, require
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.presets import HEAD_PITCH_MM, HEAD_RADIUS_MM, HEAD_ROWS, HEADS, SHOULDER_MM, SHOULDERS_INSIDE
 
-# --- Frictionless contact of a rigid head with an elastic surface, under a given force.
-#
-# With C the compliance of the surface cells, g the head's profile and :math:`\delta` the depth it is pushed to, the
-# pressures are the one solution of
-#
-# .. math:: p \ge 0, \quad w = Cp + g - \delta \ge 0, \quad p \cdot w = 0, \quad \textstyle\sum p\,\Delta x = F,
-#
-# a small convex quadratic programme (Johnson 1985, section 5.8). Where shoulders lie around the sensing cells, F is
-# the force on the sensing cells alone (decision record 0025).
+# --- The head's cross-section.
 
 BoolArray = np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
-
-_MOST_ROUNDS = 40
 
 
 class Head(Record):
@@ -100,111 +90,20 @@ class Head(Record):
         return np.pad(np.ones(count, dtype=bool), around)
 
 
-class Contact(Record, eq=False):
-    """Solutions of the contact at m positions over n cells."""
-
-    pressure_kpa: FloatArray
-    gap_mm: FloatArray
-    """`pressure_kpa`, `gap_mm` (m, n) arrays: At each cell one is 0 and the other is not negative."""
-    depth_mm: FloatArray  #: (m,) array: How deep the head's lowest point is pushed.
-    rounds: int
-    """In which cells changed between touching and not touching, the last (without a change) included."""
-
-
-def solve_contact(
-    compliance: FloatArray,
-    profile_mm: FloatArray,
-    *,
-    total_kpa: float | FloatArray,
-    touching: BoolArray | None = None,
-    counted: BoolArray | None = None,
-) -> Contact:
-    """Solve the contact of a rigid profile (mm above its lowest point) with a surface at m positions at once.
-
-    The compliance is (m, n, n) mm per kPa, symmetric and positive definite. `total_kpa`, above 0, is the sum of the
-    `counted` (sensing; by default all) cells' pressures: force per unit length over the width of a cell. `touching` is
-    a first guess, (n,) or (m, n).
-
-    Cells that would pull are let go and cells that would overlap are taken in, all at once, until none changes (the
-    primal-dual active set method; Hintermueller, Ito & Kunisch 2003). A position at which that does not end is solved
-    cell by cell, which always ends where all cells are counted; else a NotConvergedError.
-    """
-    m, n = compliance.shape[:2]
-    share = np.ones(n) if counted is None else counted.astype(np.float64)
-    total = np.broadcast_to(np.asarray(total_kpa, dtype=np.float64), (m,))
-    if not (np.isfinite(total).all() and (total > 0).all()):
-        raise BadDataError(f"the head's force is {total.min():g}", way_out="it must be above 0")
-    active = np.ones((m, n), dtype=bool) if touching is None else np.broadcast_to(touching, (m, n)).copy()
-    pressure, gap, depth = np.zeros((m, n)), np.zeros((m, n)), np.zeros(m)
-    open_ = np.arange(m)
-    rounds = 0
-    while len(open_) and rounds < _MOST_ROUNDS:
-        rounds += 1
-        p, w, d = _given_contact(compliance[open_], profile_mm, active[open_], total[open_], share)
-        new = (active[open_] & (p > 0)) | (~active[open_] & (w < -_tolerance(profile_mm, d)))
-        pressure[open_], gap[open_], depth[open_] = p, w, d
-        changed = (new != active[open_]).any(axis=1)
-        active[open_] = new
-        open_ = open_[changed]
-    for i in open_:
-        pressure[i], gap[i], depth[i] = _cell_by_cell(compliance[i], profile_mm, float(total[i]), share)
-    return Contact(np.maximum(pressure, 0.0), np.maximum(gap, 0.0), depth, rounds)
-
-
-def _tolerance(profile_mm: FloatArray, depth_mm: FloatArray) -> FloatArray:
-    """(m, 1) overlap that counts as rounding error, from the lengths involved."""
-    return np.asarray(1e-13 * (np.abs(depth_mm) + float(np.abs(profile_mm).max())))[:, None]
-
-
-def _given_contact(
-    compliance: FloatArray, profile: FloatArray, active: BoolArray, total: float | FloatArray, share: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Pressures (0 off `active`), gaps (0 on it) and depths when the touching cells are known."""
-    n = len(profile)
-    system = np.where(active[:, :, None] & active[:, None, :], compliance, 0.0)
-    index = np.arange(n)
-    system[:, index, index] += ~active
-    sides = np.stack([np.where(active, -profile, 0.0), active.astype(np.float64)], axis=-1)
-    solved = np.linalg.solve(system, sides)
-    rest, unit = solved[..., 0], solved[..., 1]
-    depth = (total - (rest * share).sum(axis=1)) / np.maximum((unit * share).sum(axis=1), 1e-300)
-    pressure = np.where(active, rest + depth[:, None] * unit, 0.0)
-    gap = np.einsum("mij,mj->mi", compliance, pressure) + profile - depth[:, None]
-    return pressure, np.where(active, 0.0, gap), depth
-
-
-def _cell_by_cell(
-    compliance: FloatArray, profile: FloatArray, total: float, share: FloatArray
-) -> tuple[FloatArray, FloatArray, float]:
-    """Solve one position by an active-set method that moves one cell at a time (Lawson & Hanson 1974)."""
-    n = len(profile)
-    active, pressure = np.ones(n, dtype=bool), np.full(n, total / share.sum())
-    for _ in range(20 * n):
-        p, w, d = (part[0] for part in _given_contact(compliance[None], profile, active[None], total, share))
-        if (p[active] > 0).all():
-            pressure = p
-            worst = int(np.argmin(w))
-            if w[worst] >= -float(_tolerance(profile, np.array([d]))[0, 0]):
-                return p, w, float(d)
-            active[worst] = True
-            continue
-        pulls = active & (p <= 0)
-        step = float(np.min(pressure[pulls] / (pressure[pulls] - p[pulls])))
-        pressure = np.where(active, pressure + step * (p - pressure), 0.0)
-        active &= ~(pulls & (pressure <= 1e-14 * total))
-    raise NotConvergedError(f"the contact of {n} cells did not settle; check that the compliance is positive definite")
-
-
 def _circle(radius: float, x: FloatArray) -> FloatArray:
     """Height of a circle about 0 at `x`; 0 beyond it."""
     return np.sqrt(np.maximum(radius**2 - np.asarray(x) ** 2, 0.0))
 
 
-# --- Frictionless contact of a rigid head with an elastic body under a given force: pressures on the taxels.
+# --- Frictionless contact of a rigid head with an elastic surface, under a given force.
 #
-# Pressure is constant over each taxel. A taxel bears pressure where it touches, and is free where there is a gap:
-# ``p >= 0``, ``gap >= 0``, ``p gap = 0``. The depth to which the head sinks is what makes the pressures add up to
-# the force.
+# Pressure is constant over each cell of the face, which is a taxel or a part of one. With C the compliance of the
+# cells, g the head's profile and :math:`\delta` the depth it is pushed to, the pressures are the one solution of
+#
+# .. math:: p \ge 0, \quad w = Cp + g - \delta \ge 0, \quad p \cdot w = 0, \quad \textstyle\sum p\,\Delta x = F,
+#
+# a small convex quadratic programme (Johnson 1985, section 5.8). Where shoulders lie around the sensing cells, F is
+# the force on the sensing cells alone (decision record 0025).
 
 # Pressures and gaps beyond this share of the mean pressure and of the depth count as of the wrong sign.
 _TOLERANCE: Final = 1e-11
@@ -213,7 +112,7 @@ _MOST_STEPS: Final = 2000
 _PATIENCE: Final = 4
 
 
-class SolidContact(Record, eq=False):
+class Contact(Record, eq=False):
     """The solved contact of a head."""
 
     pressure_kpa: FloatArray  #: (n,) array: Of each taxel; 0 where it does not touch.
@@ -244,13 +143,11 @@ class ContactStiffness(Record, eq=False):
 
     def changed(self, vectors: FloatArray, signs: FloatArray) -> ContactStiffness:
         """Stiffness after ``vectors @ diag(signs) @ vectors.T`` is added to the compliance: (n, k) in mm^(1/2)
-        kPa^(-1/2), and signs of 1 or -1.
+        kPa^(-1/2), and signs of 1 or -1. All changes are made in one.
 
         :math:`(C + V s V^T)^{-1} = H - H V (s + V^T H V)^{-1} V^T H` (Woodbury). The sum is positive definite when the
         bracket has as many negative eigenvalues as s (Sylvester's law of inertia).
         """
-        if self.factor.shape[1]:
-            raise BadDataError("this stiffness was changed already", way_out="gather all changes in one")
         factor = self.plain @ vectors
         bracket = np.diag(signs) + vectors.T @ factor
         if np.count_nonzero(np.linalg.eigvalsh(bracket) < 0) != np.count_nonzero(signs < 0):
@@ -269,14 +166,14 @@ class ContactStiffness(Record, eq=False):
         return np.asarray(self.plain[:, chosen] + self.factor @ (self.core @ self.factor[chosen].T))
 
 
-def press(
+def solve_contact(
     stiffness: ContactStiffness,
     height_mm: FloatArray,
     *,
     mean_kpa: float,
     counted: BoolArray | None = None,
     touching: BoolArray | None = None,
-) -> SolidContact:
+) -> Contact:
     r"""Press a head on the body until the force over the area of the counted squares, touching or not, is `mean_kpa`.
 
     Each taxel touches when the head has come down by its `height_mm`, of which the minimum may be any number. `counted`
@@ -293,7 +190,7 @@ def press(
         if mean_kpa < 0:
             raise BadDataError(f"mean_kpa is {mean_kpa}", way_out="a head can press, not pull: give 0 or more")
         lowest = float(height_mm.min())
-        return SolidContact(np.zeros(count), height_mm - lowest, lowest, np.zeros(count, dtype=bool))
+        return Contact(np.zeros(count), height_mm - lowest, lowest, np.zeros(count, dtype=bool))
     share = np.full(count, 1.0 / count) if counted is None else counted / np.count_nonzero(counted)
     level, shaped = stiffness.times(np.stack([np.ones(count), height_mm], axis=-1)).T
     start = touching is not None and (touching & (share > 0)).any()
@@ -329,7 +226,7 @@ def _solve(
     *,
     share: FloatArray,
     mean_kpa: float,
-) -> tuple[SolidContact, BoolArray]:
+) -> tuple[Contact, BoolArray]:
     """Solve the contact for exactly the `touching` squares, and find where pressure or gap has the wrong sign."""
     off = np.flatnonzero(~touching)
     # one column for a unit of depth, one for the head's shape
@@ -345,4 +242,4 @@ def _solve(
     kpa = depth * pressure[:, 0] + pressure[:, 1]
     mm = depth * gap[:, 0] + gap[:, 1]
     wrong = np.where(touching, kpa < -_TOLERANCE * mean_kpa, mm < -_TOLERANCE * max(abs(depth), 1e-300))
-    return SolidContact(kpa, mm, float(depth), touching), wrong
+    return Contact(kpa, mm, float(depth), touching), wrong

@@ -9,7 +9,7 @@ from scipy.optimize import minimize_scalar
 
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.forward.contact import Contact, Head, solve_contact
+from tactile_bayes.forward.contact import ContactStiffness, Head, solve_contact
 from tactile_bayes.forward.plane_strain import CELL_MM, SurfaceCompliance, surface_compliance
 from tactile_bayes.forward.tissue import Layers
 from tactile_bayes.geometry import FloatArray
@@ -100,36 +100,25 @@ def press(
         )
     matrix = surface.without_lump() if stiffness_ratio is None else surface.with_lump(stiffness_ratio)
     level = np.broadcast_to(np.asarray(mean_kpa, dtype=np.float64), (len(first),))
-    usual = _layers_contact(surface.body.layers, head=head, mean_kpa=np.median(level, keepdims=True), cell_mm=cell)
-    touching = usual.pressure_kpa[0] > 0
-    count = int(senses.sum())
-    pressure = np.empty((len(first), count))
-    for chunk in np.array_split(np.arange(len(first)), int(np.ceil(len(first) / 64))):
-        windows = _windows(matrix, first[chunk], len(profile))
-        pressure[chunk] = solve_contact(
-            windows, profile, total_kpa=level[chunk] * count, touching=touching, counted=senses
-        ).pressure_kpa[:, senses]
-    return LineFrames(np.asarray(x_c_mm, dtype=np.float64), _cell_centres(count, cell), pressure)
+    pressure, touching = np.empty((len(first), int(senses.sum()))), None
+    for i, (begin, kpa) in enumerate(zip(first.tolist(), level.tolist(), strict=True)):
+        under = ContactStiffness.of(_window(matrix, begin, len(profile)))
+        found = solve_contact(under, profile, mean_kpa=kpa, counted=senses, touching=touching)
+        pressure[i], touching = found.pressure_kpa[senses], found.touching
+    return LineFrames(np.asarray(x_c_mm, dtype=np.float64), _cell_centres(pressure.shape[1], cell), pressure)
 
 
 def press_layers(
     layers: Layers, *, head: Head = _NOMINAL_HEAD, mean_kpa: float | FloatArray = MEAN_KPA, cell_mm: float = CELL_MM
 ) -> LineFrames:
     """Frames of a body without a lump, P1, one per mean pressure; they do not depend on the head's position."""
-    level = np.atleast_1d(np.asarray(mean_kpa, dtype=np.float64))
-    senses = head.sensing_cells(cell_mm)
-    pressure = _layers_contact(layers, head=head, mean_kpa=level, cell_mm=cell_mm).pressure_kpa[:, senses]
-    return LineFrames(np.zeros(len(level)), _cell_centres(int(senses.sum()), cell_mm), pressure)
-
-
-def _layers_contact(layers: Layers, *, head: Head, mean_kpa: FloatArray, cell_mm: float) -> Contact:
-    """The whole face on a body without a lump, for (m,) mean pressures over the sensing width."""
     profile, senses = head.cell_profile_mm(cell_mm), head.sensing_cells(cell_mm)
     index = np.arange(len(profile))
     row = surface_compliance(np.asarray(cell_mm * index), cell_mm=cell_mm, layers=layers)
-    matrix = row[np.abs(index[:, None] - index[None, :])]
-    windows = np.broadcast_to(matrix, (len(mean_kpa), *matrix.shape))
-    return solve_contact(windows, profile, total_kpa=mean_kpa * senses.sum(), counted=senses)
+    under = ContactStiffness.of(row[np.abs(index[:, None] - index[None, :])])
+    level = np.atleast_1d(np.asarray(mean_kpa, dtype=np.float64))
+    found = [solve_contact(under, profile, mean_kpa=kpa, counted=senses).pressure_kpa[senses] for kpa in level.tolist()]
+    return LineFrames(np.zeros(len(level)), _cell_centres(int(senses.sum()), cell_mm), np.stack(found))
 
 
 def _cell_centres(count: int, cell_mm: float) -> FloatArray:
@@ -137,17 +126,13 @@ def _cell_centres(count: int, cell_mm: float) -> FloatArray:
     return np.asarray(cell_mm * (np.arange(count) - 0.5 * (count - 1)), dtype=np.float64)
 
 
-def _windows(matrix: FloatArray, first: FloatArray, n: int) -> FloatArray:
-    """(m, n, n) diagonal blocks that begin at `first`; between two cells, the weighted mean of both blocks."""
-    blocks = np.lib.stride_tricks.sliding_window_view(matrix, (n, n))
-    low = np.clip(np.floor(first + 1e-9).astype(np.intp), 0, len(matrix) - n)
-    share = first - low
-    windows = blocks[low, low].copy()
-    between = np.flatnonzero(np.abs(share) > 1e-9)
-    if len(between):
-        part, above = share[between, None, None], low[between] + 1
-        windows[between] += part * (blocks[above, above] - windows[between])
-    return windows
+def _window(matrix: FloatArray, first: float, n: int) -> FloatArray:
+    """(n, n) diagonal block that begins at `first`; between two cells, the weighted mean of both blocks."""
+    low = int(np.clip(np.floor(first + 1e-9), 0, len(matrix) - n))
+    share, block = first - low, matrix[low : low + n, low : low + n]
+    if abs(share) <= 1e-9:
+        return block
+    return np.asarray(block + share * (matrix[low + 1 : low + 1 + n, low + 1 : low + 1 + n] - block))
 
 
 def slide(

@@ -54,7 +54,12 @@ def body_mesh(body: Body, *, fineness: int) -> QuadMesh:
     """The body on x >= 0 with a hole where the lump is; twice the fineness is half the element size everywhere."""
     box = _Box.around(body, fineness)
     ring = _blend(_circle(body, box.angles_rad()), box.outline(), np.linspace(0.0, 1.0, 2 * _OUT * fineness + 1))
-    across = _graded(box.half_width_mm, REACH_MM + _BEYOND * body.layers.thickness_mm, box.row_mm, fineness)
+    across = _graded(
+        box.half_width_mm,
+        REACH_MM + _BEYOND * body.layers.thickness_mm,
+        2 * float(box.side_up_mm[1] - box.side_up_mm[0]),
+        fineness,
+    )
     rows = np.concatenate([box.above_mm[:-1], box.side_mm[:-1], box.below_mm])
     blocks = [ring, _grid(across, rows), _grid(box.bottom_x_mm, box.below_mm)]
     if len(box.above_mm) > 1:
@@ -101,50 +106,29 @@ class _Box(Record, eq=False):
 
     @classmethod
     def around(cls, body: Body, fineness: int) -> _Box:
-        h, d, layers = body.centre_mm, body.d_mm, body.layers
+        """The box of a lump; of one clear of the gland it ends on their boundary, so that its side lies in fat."""
+        h, d, layers, clear = body.centre_mm, body.d_mm, body.layers, body.seat > 1.0
         top = h - _BOX * d if h > (_BOX + _LEAST_ABOVE) * d else 0.0
-        if body.seat > 1.0:
-            return cls._above_gland(body, top, fineness)
-        bottom = h + 0.5 * d + min((_BOX - 0.5) * d, 0.5 * (layers.thickness_mm - h - 0.5 * d))
-        side_up = np.linspace(top, layers.fat_mm, 2 * _UP * fineness + 1)
-        row = 2 * float(side_up[1] - side_up[0])
+        under = h + 0.5 * d
+        bottom = layers.fat_mm if clear else under + min((_BOX - 0.5) * d, 0.5 * (layers.thickness_mm - under))
+        middle, down = (0.5 * (top + layers.fat_mm), _UP) if clear else (layers.fat_mm, _DOWN)
+        side_up = np.linspace(top, middle, 2 * _UP * fineness + 1)
+        floor = np.linspace(0.0, _BOX * d, 2 * _DOWN * fineness + 1)
         return cls(
             body,
             _BOX * d,
             _rows_above(top, d, fineness),
             side_up,
-            np.linspace(layers.fat_mm, bottom, 2 * _DOWN * fineness + 1),
-            _graded(bottom, layers.thickness_mm, row, fineness),
+            np.linspace(middle, bottom, 2 * down * fineness + 1),
+            _graded(bottom, layers.thickness_mm, 2 * float(side_up[1] - side_up[0]), fineness),
             _projected(_BOX * d, h - top, _TOP * fineness),
-            np.linspace(0.0, _BOX * d, 2 * _DOWN * fineness + 1),
-        )
-
-    @classmethod
-    def _above_gland(cls, body: Body, top: float, fineness: int) -> _Box:
-        """Box of a lump clear of the gland: it ends at the fat-gland boundary, so that its side lies in fat."""
-        h, d, layers = body.centre_mm, body.d_mm, body.layers
-        half = 0.5 * (top + layers.fat_mm)
-        side_up = np.linspace(top, half, 2 * _UP * fineness + 1)
-        return cls(
-            body,
-            _BOX * d,
-            _rows_above(top, d, fineness),
-            side_up,
-            np.linspace(half, layers.fat_mm, 2 * _UP * fineness + 1),
-            _graded(layers.fat_mm, layers.thickness_mm, 2 * float(side_up[1] - side_up[0]), fineness),
-            _projected(_BOX * d, h - top, _TOP * fineness),
-            _projected(_BOX * d, layers.fat_mm - h, _UP * fineness),
+            _projected(_BOX * d, bottom - h, _UP * fineness) if clear else floor,
         )
 
     @property
     def side_mm(self) -> FloatArray:
         """Depths along the whole side."""
         return np.concatenate([self.side_up_mm[:-1], self.side_down_mm])
-
-    @property
-    def row_mm(self) -> float:
-        """Height of an element beside the box."""
-        return 2 * float(self.side_up_mm[1] - self.side_up_mm[0])
 
     def outline(self) -> FloatArray:
         """(k, 2) points from above the lump along top, side and bottom to below it."""
@@ -316,19 +300,16 @@ def lump_mesh(geometry: LumpGeometry, size: MeshSize | None = None) -> LumpMesh:
     """Mesh a lump in its body; the module describes the layout."""
     size = size or MeshSize()
     g, boundary = geometry, geometry.boundary_mm()
-    corner_r, top, bottom = _box(g, boundary)
-    lines = _Fan(g, boundary, corner_r, top, bottom, size.arc)
+    cut = abs(boundary - g.depth_mm) < g.half_height_mm
+    centre, core = np.array([0.0, boundary if cut else g.depth_mm]), np.linspace(0.0, 1.0, 2 * size.core + 1)
+    arcs, rims = _fan(g, boundary, cut=cut, elements=size.arc)
     patches: list[tuple[FloatArray, int]] = []
-    for arc, rim in lines.sectors():
-        middle = float(rim[len(rim) // 2, 1])
+    for arc, rim in zip(arcs, rims, strict=True):
+        middle, fat = float(rim[len(rim) // 2, 1]), float(arc[len(arc) // 2, 1]) < boundary
         patches.append((_blend(arc, rim, _graded_share(size.rings, 1.25)), int(middle > boundary)))
-        fat = float(arc[len(arc) // 2, 1]) < boundary
-        centre = np.array([0.0, boundary if lines.cut else g.depth_mm])
-        core = np.linspace(0.0, 1.0, 2 * size.core + 1)
         inside = _blend(np.broadcast_to(centre, arc.shape), arc, core)
         patches.append((inside, INTERIOR_FAT if fat else INTERIOR_GLAND))
-    _beyond_box(patches, lines, g, boundary, size)
-    return _merge(patches)
+    return _merge(patches + _beyond_box(rims, g, boundary, size))
 
 
 def _box(g: LumpGeometry, boundary: float) -> tuple[float, float, float]:
@@ -345,68 +326,43 @@ def _box(g: LumpGeometry, boundary: float) -> tuple[float, float, float]:
     return max(g.radius_mm + margin, 0.8 * (g.depth_mm - top)), top, bottom
 
 
-class _Fan:
-    """Intersections of rays from the lump with the box: up to four sectors, split at corners and layer boundary."""
+def _fan(g: LumpGeometry, boundary: float, *, cut: bool, elements: int) -> tuple[list[FloatArray], list[FloatArray]]:
+    """Nodes on the lump and on the box about it, sector by sector from the top pole to the bottom pole.
 
-    def __init__(
-        self, g: LumpGeometry, boundary: float, corner_r: float, top: float, bottom: float, elements: int
-    ) -> None:
-        self.g, self.corner_r, self.top, self.bottom = g, corner_r, top, bottom
-        self.cut = abs(boundary - g.depth_mm) < g.half_height_mm
-        upper = float(np.arctan2(corner_r, g.depth_mm - top))
-        lower = float(np.pi - np.arctan2(corner_r, bottom - g.depth_mm))
-        breaks, depths = [0.0, upper, lower, np.pi], [top, bottom]
-        if self.cut:
-            at = float(np.arccos((g.depth_mm - boundary) / g.half_height_mm))
-            breaks = [0.0, min(upper, 0.6 * at), at, max(lower, np.pi - 0.6 * (np.pi - at)), np.pi]
-            depths = [top, boundary, bottom]
-        self.breaks = breaks
-        # the side of the box is shared out between its corners and the layer boundary
-        self.side_depths = depths
-        share = np.diff(breaks) / np.pi * elements
-        self.counts = [max(2 if 0 < i < len(share) - 1 else 1, round(float(s))) for i, s in enumerate(share)]
-        # a thin bridge of tissue above the lump needs elements as short as it is thick
-        bridge = max(g.depth_mm - g.half_height_mm - top, 0.1 * g.half_height_mm)
-        shortest = g.depth_mm * np.tan(breaks[1] / self.counts[0])
-        self.counts[0] = max(self.counts[0], round(self.counts[0] * min(shortest / bridge, 2.0)))
+    Sectors end at the box's corners, and at the layer boundary where it cuts the lump.
+    """
+    corner_r, top, bottom = _box(g, boundary)
+    upper = float(np.arctan2(corner_r, g.depth_mm - top))
+    lower = float(np.pi - np.arctan2(corner_r, bottom - g.depth_mm))
+    breaks, depths = [0.0, upper, lower, np.pi], [top, bottom]
+    if cut:
+        at = float(np.arccos((g.depth_mm - boundary) / g.half_height_mm))
+        breaks = [0.0, min(upper, 0.6 * at), at, max(lower, np.pi - 0.6 * (np.pi - at)), np.pi]
+        depths = [top, boundary, bottom]
+    share = np.diff(breaks) / np.pi * elements
+    counts = [max(2 if 0 < i < len(share) - 1 else 1, round(float(s))) for i, s in enumerate(share)]
+    # a thin bridge of tissue above the lump needs elements as short as it is thick
+    bridge = max(g.depth_mm - g.half_height_mm - top, 0.1 * g.half_height_mm)
+    shortest = g.depth_mm * np.tan(breaks[1] / counts[0])
+    counts[0] = max(counts[0], round(counts[0] * min(shortest / bridge, 2.0)))
 
-    def side_mm(self) -> FloatArray:
-        """Depths of the nodes on the box's vertical side."""
-        parts = [
-            np.linspace(a, b, 2 * n + 1)
-            for a, b, n in zip(self.side_depths[:-1], self.side_depths[1:], self.counts[1:-1], strict=True)
-        ]
-        return np.concatenate([parts[0], *[part[1:] for part in parts[1:]]])
+    arcs = []
+    for (begin, end), n in zip(pairwise(breaks), counts, strict=True):
+        angle = np.linspace(begin, end, 2 * n + 1)
+        sine = np.sin(angle)
+        sine[np.abs(sine) < 1e-14] = 0.0
+        arcs.append(np.stack([g.radius_mm * sine, g.depth_mm - g.half_height_mm * np.cos(angle)], axis=-1))
 
-    def across_mm(self, sector: int) -> FloatArray:
-        """Radii of the nodes on the box's top (sector 0) or bottom (sector -1): closest together over the lump."""
-        angle = self.breaks[1] if sector == 0 else np.pi - self.breaks[-2]
-        share = np.tan(np.linspace(0.0, angle, 2 * self.counts[sector] + 1)) / np.tan(angle)
+    def lid(z: float, angle: float, n: int) -> FloatArray:
+        """From the axis to the corner, the nodes closest together over the lump."""
+        share = np.tan(np.linspace(0.0, angle, 2 * n + 1)) / np.tan(angle)
         share[-1] = 1.0
-        return np.asarray(self.corner_r * share)
+        return np.stack([corner_r * share, np.full_like(share, z)], axis=-1)
 
-    def sectors(self) -> list[tuple[FloatArray, FloatArray]]:
-        """Nodes on the lump and on the box, sector by sector from the top pole to the bottom pole."""
-        found = []
-        side = self.side_mm()
-        start = 0
-        for i, n in enumerate(self.counts):
-            angle = np.linspace(self.breaks[i], self.breaks[i + 1], 2 * n + 1)
-            sine = np.sin(angle)
-            sine[np.abs(sine) < 1e-14] = 0.0
-            arc = np.stack([self.g.radius_mm * sine, self.g.depth_mm - self.g.half_height_mm * np.cos(angle)], axis=-1)
-            if i == 0:
-                r = self.across_mm(0)
-                rim = np.stack([r, np.full_like(r, self.top)], axis=-1)
-            elif i == len(self.counts) - 1:
-                r = self.across_mm(-1)[::-1]
-                rim = np.stack([r, np.full_like(r, self.bottom)], axis=-1)
-            else:
-                z = side[start : start + 2 * n + 1]
-                rim = np.stack([np.full_like(z, self.corner_r), z], axis=-1)
-                start += 2 * n
-            found.append((arc, rim))
-        return found
+    sides = [np.linspace(a, b, 2 * n + 1) for (a, b), n in zip(pairwise(depths), counts[1:-1], strict=True)]
+    rims = [np.stack([np.full_like(z, corner_r), z], axis=-1) for z in sides]
+    floor = lid(bottom, np.pi - breaks[-2], counts[-1])
+    return arcs, [lid(top, breaks[1], counts[0]), *rims, floor[::-1]]
 
 
 def _graded_share(count: int, ratio: float) -> FloatArray:
@@ -431,19 +387,24 @@ def _graded_line(start: float, stop: float, *, first: float, grade: float, least
 
 
 def _beyond_box(
-    patches: list[tuple[FloatArray, int]], fan: _Fan, g: LumpGeometry, boundary: float, size: MeshSize
-) -> None:
-    """The lattices outside, below and above the box."""
-    reach = max(size.reach_mm, 2.0 * fan.corner_r, 4.0 * g.depth_mm)
-    side = fan.side_mm()
-    element_r = float(fan.corner_r - fan.across_mm(0)[-3])
-    right = _graded_line(fan.corner_r, reach, first=element_r, grade=size.grade)
-    below = _down_from(fan.bottom, g.thickness_mm, boundary, first=float(side[-1] - side[-3]), grade=size.grade)
-    above = _down_from(0.0, fan.top, boundary, first=float(side[2] - side[0]), grade=1.0 + 1e-9)
-    for z in (above, side, below):
-        _lattice(patches, right, z, boundary)
-    _lattice(patches, fan.across_mm(-1), below, boundary)
-    _lattice(patches, fan.across_mm(0), above, boundary)
+    rims: list[FloatArray], g: LumpGeometry, boundary: float, size: MeshSize
+) -> list[tuple[FloatArray, int]]:
+    """The lattices outside, below and above the box, whose sides from the top to the bottom are given."""
+    lid, *sides, floor = rims
+    (corner_r, top), bottom = lid[-1].tolist(), float(floor[0, 1])
+    side = np.concatenate([sides[0][:1, 1], *(part[1:, 1] for part in sides)])
+    reach = max(size.reach_mm, 2.0 * corner_r, 4.0 * g.depth_mm)
+    right = _graded_line(corner_r, reach, first=float(corner_r - lid[-3, 0]), grade=size.grade)
+    below = _down_from(bottom, g.thickness_mm, boundary, first=float(side[-1] - side[-3]), grade=size.grade)
+    above = _down_from(0.0, top, boundary, first=float(side[2] - side[0]), grade=1.0 + 1e-9)
+    patches: list[tuple[FloatArray, int]] = []
+    for r, z in ((right, above), (right, side), (right, below), (floor[::-1, 0], below), (lid[:, 0], above)):
+        # split at the layer boundary
+        for a, b in pairwise([0, *np.flatnonzero(z == boundary), len(z) - 1]):
+            if b > a:
+                part = z[a : b + 1]
+                patches.append((_grid(r, part), int(part[len(part) // 2] > boundary)))
+    return patches
 
 
 def _down_from(start: float, stop: float, boundary: float, *, first: float, grade: float) -> FloatArray:
@@ -455,15 +416,6 @@ def _down_from(start: float, stop: float, boundary: float, *, first: float, grad
     upper = _graded_line(start, boundary, first=first, grade=grade)
     lower = _graded_line(boundary, stop, first=float(upper[-1] - upper[-3]), grade=grade)
     return np.concatenate([upper, lower[1:]])
-
-
-def _lattice(patches: list[tuple[FloatArray, int]], r: FloatArray, z: FloatArray, boundary: float) -> None:
-    """A rectangle of elements, split at the layer boundary."""
-    cuts = [0, *np.flatnonzero(z == boundary), len(z) - 1]
-    for a, b in pairwise(cuts):
-        if b > a:
-            part = z[a : b + 1]
-            patches.append((_grid(r, part), int(part[len(part) // 2] > boundary)))
 
 
 def _merge(patches: list[tuple[FloatArray, int]]) -> LumpMesh:
@@ -550,3 +502,27 @@ def condensed(matrix: csc_array, on: IndexArray, inner: IndexArray) -> FloatArra
     coupling = matrix[inner][:, on].toarray()
     kept = matrix[on][:, on].toarray() - coupling.T @ solved(matrix[inner][:, inner], coupling)
     return np.asarray(0.5 * (kept + kept.T))
+
+
+class CondensedHole(Record, eq=False):
+    r"""A body with a hole where the lump is, condensed onto the hole's boundary and the skin.
+
+    With the flexibility F of the surroundings and the stiffness S of what fills the hole, the boundary moves by
+    :math:`(I + F S)^{-1} F f`. The difference of two such answers is written as one product, so that it is exact to
+    rounding however small it is, and vanishes for equal stiffness:
+
+    .. math:: -F_s (I + S_1 F)^{-1} (S_1 - S_0) (I + F S_0)^{-1} F_s^T
+    """
+
+    flexibility: FloatArray  #: F, (b, b) array: displacements on the boundary for unit forces there, nothing inside.
+    skin: FloatArray  #: F_s, (s, b) array: Sinking of the skin for the same forces.
+    unit_stiffness: FloatArray  #: (b, b) array: The lump, condensed on its boundary, for a modulus of 1 kPa.
+    original_stiffness: FloatArray  #: S_0, (b, b) array: The tissue that the lump replaces.
+
+    def change(self, lump_kpa: float) -> FloatArray:
+        """(s, s) change of the skin's compliance when tissue is replaced by a lump of modulus `lump_kpa`; symmetric."""
+        inside, identity = lump_kpa * self.unit_stiffness, np.eye(len(self.flexibility))
+        before = np.linalg.solve(identity + self.flexibility @ self.original_stiffness, self.skin.T)
+        forces = np.linalg.solve(identity + inside @ self.flexibility, (inside - self.original_stiffness) @ before)
+        change = self.skin @ forces
+        return np.asarray(-0.5 * (change + change.T))

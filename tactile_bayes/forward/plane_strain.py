@@ -9,8 +9,8 @@ from scipy.sparse import csc_array
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.axisymmetric import LayeredBody, surface_flexibility
-from tactile_bayes.forward.mesh import IndexArray as IntArray
 from tactile_bayes.forward.mesh import (
+    CondensedHole,
     QuadMesh,
     body_mesh,
     condensed,
@@ -20,6 +20,7 @@ from tactile_bayes.forward.mesh import (
     solved,
     stiffness_factor,
 )
+from tactile_bayes.forward.mesh import IndexArray as IntArray
 from tactile_bayes.forward.tissue import Body, Layers
 from tactile_bayes.geometry import FloatArray
 
@@ -124,23 +125,13 @@ def _log_primitive(x: FloatArray, b: float) -> FloatArray:
 
 # --- Static condensation of a body with a lump onto its surface and the lump's boundary.
 #
-# The skin of the layered body without a lump answers exactly (`layers.surface_compliance`). The lump adds a matrix
-# of low rank. With H the compliance of the body *with a hole* on the hole's boundary (and from there to the skin),
-# and :math:`S = FF^T` the stiffness of a disc condensed onto the same boundary, filling the hole changes the skin
-# by
-#
-# .. math:: -H_{s\Gamma} F (1 + F^T H_{\Gamma\Gamma} F)^{-1} F^T H_{\Gamma s}.
-#
-# The lump's effect is that of filling the hole with the lump less that of filling it with the layers' own tissue.
-# One factorisation a geometry gives H; an eigenvalue problem of the size of the boundary then gives every stiffness
-# ratio. The body is symmetric, so all this is done twice on half of it: for loads symmetric and antisymmetric in x.
+# The skin of the layered body without a lump answers exactly (`surface_compliance`). What the lump changes is that a
+# hole in the body is filled with the lump and not with the layers' own tissue (`mesh.CondensedHole`). One
+# factorisation a geometry then gives every stiffness ratio. The body is symmetric, so all this is done twice on half of
+# it: for loads symmetric and antisymmetric in x.
 
 FINENESS = 2
 CELL_MM = 0.25
-# Modes of a disc softer than this share of its stiffest are its rigid motions, which cost no energy.
-_RIGID = 1e-11
-# Modes that move the skin by less than this share of the strongest are left out.
-_FAINT = 1e-9
 
 
 class SurfaceCompliance(Record, eq=False):
@@ -150,10 +141,9 @@ class SurfaceCompliance(Record, eq=False):
     edges_mm: FloatArray  #: (n + 1,) array, symmetric about the lump's axis.
     row: FloatArray
     """(n,) array: first row of the (Toeplitz) matrix of the body without the lump, mm per kPa."""
-    own: FloatArray  #: (n, j) array: shapes on the skin by which the layers' own tissue fills the hole.
-    own_stiffness: FloatArray  #: (j,) array: each one's compliance relative to the hole.
-    lump: FloatArray  #: (n, i) array: as `own`, of a lump of unit modulus.
-    lump_stiffness: FloatArray  #: (i,) array.
+    even: CondensedHole
+    odd: CondensedHole
+    """`even`, `odd`: The body on x > 0, for loads symmetric and antisymmetric in x."""
 
     @property
     def x_mm(self) -> FloatArray:
@@ -174,10 +164,11 @@ class SurfaceCompliance(Record, eq=False):
         """(n, n) compliance with a lump of E2/E1 = `stiffness_ratio`, symmetric and positive definite."""
         if not (stiffness_ratio > 0 and np.isfinite(stiffness_ratio)):
             raise BadDataError(f"stiffness_ratio is {stiffness_ratio:g}", way_out="it must be finite and above 0")
-        young = stiffness_ratio * self.body.fat_kpa
-        change = (self.own / (1 + self.own_stiffness)) @ self.own.T
-        change -= (self.lump * (young / (1 + young * self.lump_stiffness))) @ self.lump.T
-        return np.asarray(self.without_lump() + 0.5 * (change + change.T))
+        even, odd = (hole.change(stiffness_ratio * self.body.fat_kpa) for hole in (self.even, self.odd))
+        alike, across = even + odd, even - odd
+        change = np.block([[alike[::-1, ::-1], across[::-1]], [across[:, ::-1], alike]])
+        # each half carries half of a load, and force is pressure times width
+        return np.asarray(self.without_lump() + 0.5 * self.cell_mm * change)
 
 
 def condense(
@@ -194,19 +185,15 @@ def condense(
     filling = disc_mesh(body, fineness=fineness, layered=True) if cut else disc
     stiffness = [assemble(mesh, young_kpa=_tissue(mesh, body), poisson=body.poisson) for mesh in (hole, filling)]
     unit = assemble(disc, young_kpa=np.ones(len(disc.elements)), poisson=body.poisson)
-    parts: list[list[FloatArray]] = [[], [], [], []]
-    for even in (True, False):
-        at_hole, to_skin = _hole_compliance(hole, stiffness[0], body, edges_mm=half, even=even)
-        own = _fill(at_hole, to_skin, _boundary_stiffness(filling, stiffness[1], body, even=even))
-        lump = _fill(at_hole, to_skin, _boundary_stiffness(disc, unit, body, even=even))
-        for part, (shape, value) in zip((parts[0:2], parts[2:4]), (own, lump), strict=True):
-            part[0].append(np.sqrt(cell_mm) * _unfold(shape, even=even))  # force is pressure times width
-            part[1].append(value)
-    edges = np.concatenate([-half[:0:-1], half])
-    own_shapes, lump_shapes = np.hstack(parts[0]), np.hstack(parts[2])
-    return SurfaceCompliance(
-        body, edges, row, own_shapes, np.concatenate(parts[1]), lump_shapes, np.concatenate(parts[3])
+    even, odd = (
+        CondensedHole(
+            *_hole_compliance(hole, stiffness[0], body, edges_mm=half, even=even),
+            _boundary_stiffness(disc, unit, body, even=even),
+            _boundary_stiffness(filling, stiffness[1], body, even=even),
+        )
+        for even in (True, False)
     )
+    return SurfaceCompliance(body, np.concatenate([-half[:0:-1], half]), row, even, odd)
 
 
 def _tissue(mesh: QuadMesh, body: Body) -> FloatArray:
@@ -271,21 +258,3 @@ def _boundary_stiffness(mesh: QuadMesh, stiffness: csc_array, body: Body, *, eve
     inside = ~held
     inside[rim] = False
     return condensed(stiffness, rim, np.flatnonzero(inside))
-
-
-def _fill(at_hole: FloatArray, to_skin: FloatArray, disc: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Shapes on the skin (c, r) and their values (r,) that a disc of unit stiffness scale adds in the hole."""
-    values, vectors = np.linalg.eigh(disc)
-    kept = values > _RIGID * values[-1]
-    factor = vectors[:, kept] * np.sqrt(values[kept])
-    eigenvalues, turn = np.linalg.eigh(factor.T @ at_hole @ factor)
-    shapes = to_skin @ (factor @ turn)
-    size = np.sqrt((shapes**2).sum(axis=0) / np.maximum(eigenvalues, 1e-300))
-    strong = size > _FAINT * size.max()
-    return shapes[:, strong], eigenvalues[strong]
-
-
-def _unfold(shapes: FloatArray, *, even: bool) -> FloatArray:
-    """Continue shapes on x > 0 to both sides; each half carries half of a load."""
-    mirrored = shapes[::-1] if even else -shapes[::-1]
-    return np.asarray(np.sqrt(0.5) * np.concatenate([mirrored, shapes]))

@@ -17,8 +17,7 @@ from tactile_bayes.forward.axisymmetric import (
     skin_spline,
     taxel_compliance,
 )
-from tactile_bayes.forward.contact import ContactStiffness, press
-from tactile_bayes.forward.contact import SolidContact as Contact
+from tactile_bayes.forward.contact import Contact, ContactStiffness, solve_contact
 from tactile_bayes.forward.instrument import SimulatedScan, frame_times, head_positions, level_kpa, record
 from tactile_bayes.forward.mesh import LumpGeometry
 from tactile_bayes.forward.scene import Head, Scene, tissue_truth
@@ -160,7 +159,7 @@ class SolidHead(Record, eq=False):
         vectors = np.concatenate([np.zeros((len(place), 0)), *[vector for vector, _ in parts]], axis=1)
         if vectors.shape[1]:
             stiffness = stiffness.changed(vectors, np.concatenate([sign for _, sign in parts]))
-        contact = press(
+        contact = solve_contact(
             stiffness, -place[:, 2], mean_kpa=mean_kpa, counted=self.face.sensing.ravel(), touching=touching
         )
         return SolidFrame(self.face.taxel_frame(contact.pressure_kpa), contact.depth_mm, contact)

@@ -22,7 +22,13 @@ from tactile_bayes.hardware.readings import (
     ToolReading,
     pose_from_relative,
 )
-from tactile_bayes.hardware.serial_trackers import record_bytes
+from tactile_bayes.hardware.serial_trackers import (
+    FASTRAK,
+    FASTRAK_DECIMALS,
+    LIBERTY,
+    LIBERTY_HEADER_BYTES,
+    record_bytes,
+)
 from tactile_bayes.hardware.trackers import encode_transform
 from tactile_bayes.laboratory_options import FaultOptions
 from tactile_bayes.scans import Scan, TrackerPoses
@@ -223,55 +229,47 @@ class EmulatedTracker(Device):
         return head.encode_end(sent, dropped) if self.said_end else b""
 
 
-Encoder = Callable[[PoseReading, int], bytes]
-
-
-def _station(pose: PoseReading) -> int:
-    return int(pose.tool or 1)
-
-
-def _inches(pose: PoseReading) -> tuple[float, float, float]:
-    x, y, z = pose.position_mm
-    return (x / MM_PER_INCH, y / MM_PER_INCH, z / MM_PER_INCH)
+def _numbers(pose: PoseReading) -> tuple[float, ...]:
+    """Position in inches, and quaternion."""
+    return (*(value / MM_PER_INCH for value in pose.position_mm), *pose.quaternion_wxyz)
 
 
 def _time_ms(pose: PoseReading) -> int:
     return (pose.device_ns or 0) // 1_000_000 % 2**32
 
 
-def _fastrak(pose: PoseReading, _: int) -> bytes:
-    return b"0%d " % _station(pose) + struct.pack("<7f", *_inches(pose), *pose.quaternion_wxyz) + b" "
+def _fastrak(pose: PoseReading) -> bytes:
+    return b"0%d " % int(pose.tool or 1) + FASTRAK.pack(*_numbers(pose)) + b" "
 
 
-def _fastrak_ascii(pose: PoseReading, _: int) -> bytes:
-    place = "".join(f"{value:7.2f}" for value in _inches(pose))
-    turn = "".join(f"{value:7.4f}" for value in pose.quaternion_wxyz)
-    return f"0{_station(pose)} {place}{turn}\r\n".encode()
+def _fastrak_ascii(pose: PoseReading) -> bytes:
+    columns = zip(_numbers(pose), FASTRAK_DECIMALS, strict=True)
+    return f"0{pose.tool or 1} {''.join(f'{value:7.{decimals}f}' for value, decimals in columns)}\r\n".encode()
 
 
-def _liberty(pose: PoseReading, _: int) -> bytes:
-    body = struct.pack("<7fIi", *_inches(pose), *pose.quaternion_wxyz, _time_ms(pose), 0)
-    return struct.pack("<2sBBBBH", b"LY", _station(pose), ord("C"), ord(" "), 0, len(body) + 1) + body + b" "
+def _liberty(pose: PoseReading) -> bytes:
+    head = (b"LY", int(pose.tool or 1), ord("C"), ord(" "), 0, LIBERTY.size - LIBERTY_HEADER_BYTES + 1)
+    return LIBERTY.pack(*head, *_numbers(pose), _time_ms(pose), 0) + b" "
 
 
-def _liberty_ascii(pose: PoseReading, _: int) -> bytes:
-    numbers = [f"{value:.5f}" for value in (*_inches(pose), *pose.quaternion_wxyz)]
-    return f"{_station(pose):02}  {' '.join(numbers)} {_time_ms(pose)} 0\r\n".encode()
+def _liberty_ascii(pose: PoseReading) -> bytes:
+    numbers = " ".join(f"{value:.5f}" for value in _numbers(pose))
+    return f"{int(pose.tool or 1):02}  {numbers} {_time_ms(pose)} 0\r\n".encode()
 
 
-def _bird(pose: PoseReading, _: int) -> bytes:
+def _bird(pose: PoseReading) -> bytes:
     address = bytes([int(pose.tool)]) if pose.tool else b""  # of group mode
-    return record_bytes(_inches(pose), pose.quaternion_wxyz) + address
-
-
-def _no_word(encode: Encoder) -> Callable[[ToolReading, int], bytes]:
-    """Encoder of a protocol that has no word for a tool that is not seen: it then sends nothing."""
-    return lambda pose, number: encode(pose, number) if isinstance(pose, PoseReading) else b""
+    return record_bytes(_numbers(pose)) + address
 
 
 def _igtlink(pose: ToolReading, _: int) -> bytes:
     turn = rotation_from_quaternion(np.array(pose.quaternion_wxyz)) if isinstance(pose, PoseReading) else None
     return encode_transform(pose, turn)
+
+
+def _no_word(encode: Callable[[PoseReading], bytes]) -> Callable[[ToolReading, int], bytes]:
+    """Encoder of a protocol that has no word for a tool that is not seen: it then sends nothing."""
+    return lambda pose, _: encode(pose) if isinstance(pose, PoseReading) else b""
 
 
 PROTOCOLS: Final[dict[str, Callable[[ToolReading, int], bytes]]] = {

@@ -12,7 +12,7 @@ import time
 import tty
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final, Protocol
+from typing import Final
 
 import numpy as np
 
@@ -32,32 +32,8 @@ _SETTLE_S: Final = 0.5
 LINGER_S: Final = 5.0
 
 
-class Link(Protocol):
-    """Interface of the device's end of a connection."""
-
-    url: str  #: For the host to open.
-
-    def fileno(self) -> int:
-        """File descriptor to wait on; ready for reading when a command or a connection has come."""
-
-    def connected(self) -> bool:
-        """True when a host may be listening."""
-
-    def read(self) -> bytes:
-        """Read bytes from the host; empty when none have come."""
-
-    def write(self, data: bytes) -> int:
-        """Send as much as fits; return the number of bytes."""
-
-    def finish(self, patience_s: float) -> None:
-        """Wait until the host has read everything, then close."""
-
-    def close(self) -> None:
-        """Close the connection at once."""
-
-
-class PtyLink(Link):
-    """A pseudo-terminal: the host opens it like a serial device."""
+class PtyLink:
+    """A pseudo-terminal, which the host at `url` opens like a serial device."""
 
     def __init__(self) -> None:
         self._near, self._far = os.openpty()
@@ -66,6 +42,7 @@ class PtyLink(Link):
         self.url = os.ttyname(self._far)
 
     def fileno(self) -> int:
+        """File descriptor to wait on; ready for reading when a command has come."""
         return self._near
 
     def connected(self) -> bool:
@@ -73,12 +50,14 @@ class PtyLink(Link):
         return True
 
     def read(self) -> bytes:
+        """Read bytes from the host; empty when none have come."""
         try:
             return os.read(self._near, _READ)
         except BlockingIOError:
             return b""
 
     def write(self, data: bytes) -> int:
+        """Send as much as fits; return the number of bytes."""
         try:
             return os.write(self._near, data)
         except BlockingIOError:
@@ -102,8 +81,8 @@ class PtyLink(Link):
         os.close(self._far)
 
 
-class TcpLink(Link):
-    """A listening socket that accepts one host at a time."""
+class TcpLink:
+    """A listening socket at `url` that accepts one host at a time."""
 
     def __init__(self, host: str, port: int) -> None:
         try:
@@ -120,6 +99,7 @@ class TcpLink(Link):
         return (self._host or self._listener).fileno()
 
     def connected(self) -> bool:
+        """True when a host may be listening."""
         return self._host is not None
 
     def read(self) -> bytes:
@@ -141,6 +121,7 @@ class TcpLink(Link):
         return data
 
     def write(self, data: bytes) -> int:
+        """As `PtyLink.write`."""
         if self._host is None:
             return len(data)
         try:
@@ -161,9 +142,13 @@ class TcpLink(Link):
         self.close()
 
     def close(self) -> None:
+        """Close the connection at once."""
         if self._host is not None:
             self._host.close()
         self._listener.close()
+
+
+Link = PtyLink | TcpLink
 
 
 @dataclass(slots=True)

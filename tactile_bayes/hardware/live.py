@@ -17,13 +17,13 @@ import numpy as np
 
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.geometry import FloatArray, Plane, apply, patient_from_plane
+from tactile_bayes.geometry import BoolArray, FloatArray, Plane, apply, patient_from_plane
 from tactile_bayes.hardware.ports import PIPE_BYTES
 from tactile_bayes.hardware.readings import CountArray, PoseReading
 from tactile_bayes.hardware.recorder import Report
 from tactile_bayes.mapping.accumulate import MapAccumulator
 from tactile_bayes.mapping.map import TactileMap
-from tactile_bayes.mapping.plane import FramePoses, head_moments, poses_at
+from tactile_bayes.mapping.plane import FramePoses, HeadMoments, head_moments, poses_at
 from tactile_bayes.presets import PRESSURE_WINDOW_KPA
 from tactile_bayes.scans import ElementCalibration, HeadGeometry, TrackerPoses
 
@@ -251,8 +251,8 @@ class LiveMap:
     _report: dict[str, Any] = field(default_factory=dict)
     _landmarks: dict[str, FloatArray] = field(default_factory=dict)
     _map: MapAccumulator | None = None
-    _fed: list[tuple[CountArray, FramePoses]] = field(default_factory=list)
-    """What the map was given, as long as its plane may change."""
+    _fed: list[tuple[CountArray, FramePoses, BoolArray]] = field(default_factory=list)
+    """Frames and poses that the map was given, and which it used, as long as its plane may change."""
     _refits: int = 0
     _pressure_kpa: float = float("nan")
     _host_ns: int = 0
@@ -299,10 +299,10 @@ class LiveMap:
                 return
             self._map = self._map_on(head_moments(self.head, found).plane())
         counts = np.stack([one.counts for one in ready])
-        self._map.add(counts, found)
+        used = self._map.add(counts, found)
         if self._refits < len(REFIT_AT):
-            self._fed.append((counts, found))
-            self._refit(self._map)
+            self._fed.append((counts, found, used))
+            self._refit()
 
     def _map_on(self, plane: Plane) -> MapAccumulator:
         return MapAccumulator(
@@ -312,14 +312,17 @@ class LiveMap:
             pressure_window_kpa=self.window_kpa,
         )
 
-    def _refit(self, grown: MapAccumulator) -> None:
-        """Move the map to the best-fit plane of the frames so far, from time to time."""
-        if grown.figures["frames_used"] < REFIT_AT[self._refits]:
+    def _refit(self) -> None:
+        """Move the map to the best-fit plane of the frames used so far, from time to time."""
+        if sum(int(used.sum()) for _, _, used in self._fed) < REFIT_AT[self._refits]:
             return
         self._refits += 1
+        moments = HeadMoments()
+        for _, poses, used in self._fed:
+            moments += head_moments(self.head, poses.part(used))
         with suppress(BadDataError):  # still too nearly a line: the plane under the head will do until the next time
-            self._map = self._map_on(grown.plane())
-            for counts, poses in self._fed:
+            self._map = self._map_on(moments.plane())
+            for counts, poses, _ in self._fed:
                 self._map.add(counts, poses)
         if self._refits == len(REFIT_AT):
             self._fed.clear()

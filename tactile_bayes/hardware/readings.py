@@ -252,7 +252,6 @@ class SequenceCheck:
 
     def __init__(self) -> None:
         self._expected: int | None = None
-        self.lost = 0
         self.restarts = 0
 
     def missing_before(self, sequence: int) -> int:
@@ -263,7 +262,6 @@ class SequenceCheck:
         if gap > MOST_LOST:
             self.restarts += 1
             return 0
-        self.lost += gap
         return gap
 
 

@@ -62,12 +62,11 @@ def word(low: int, high: int) -> int:
     return number - 65536 if number & 0x8000 else number
 
 
-def record_bytes(position_inch: Sequence[float], quaternion_wxyz: Sequence[float]) -> bytes:
-    """Encode a pose as the device would: truncated to 14 bits."""
-    scaled = [value / _SCALE_INCH * 32768 for value in position_inch] + [value * 32768 for value in quaternion_wxyz]
+def record_bytes(numbers: Sequence[float]) -> bytes:
+    """Encode a pose, its position in inches and its quaternion, as the device would: truncated to 14 bits."""
     out = bytearray()
-    for value in scaled:
-        number = max(-32768, min(32767, math.floor(value))) & 0xFFFF
+    for value, scale in zip(numbers, (*3 * (_SCALE_INCH,), 1, 1, 1, 1), strict=True):
+        number = max(-32768, min(32767, math.floor(value / scale * 32768))) & 0xFFFF
         out += bytes([number >> 2 & 0x7F, number >> 9 & 0x7F])
     out[0] |= 0x80
     return bytes(out)
@@ -83,12 +82,12 @@ def record_bytes(position_inch: Sequence[float], quaternion_wxyz: Sequence[float
 # ----------
 # Polhemus, 3SPACE FASTRAK User's Manual, revision G (2012); PATRIOT and LIBERTY user manuals.
 
-_SEVEN: Final = struct.Struct("<7f")  # position, quaternion
-_DECIMALS: Final = (2, 2, 2, 4, 4, 4, 4)
+FASTRAK: Final = struct.Struct("<7f")  # position, quaternion
+FASTRAK_DECIMALS: Final = (2, 2, 2, 4, 4, 4, 4)
 _COLUMN: Final = 7
 # Tag, station, command, error, spare, size; then position, quaternion, ms, distortion.
-_LIBERTY: Final = struct.Struct("<2sBBBBH7fIi")
-_LIBERTY_HEADER_BYTES: Final = 8
+LIBERTY: Final = struct.Struct("<2sBBBBH7fIi")
+LIBERTY_HEADER_BYTES: Final = 8
 _TAGS: Final = (b"LY", b"PA", b"LU")
 _LONGEST_LINE: Final = 512
 _WORDS_LIBERTY: Final = 9
@@ -104,14 +103,14 @@ class FastrakParser(RecordParser):
     def __init__(self, *, binary: bool = True) -> None:
         super().__init__()
         self._binary = binary
-        self.record_bytes = 3 + _SEVEN.size + 1 if binary else 3 + 7 * _COLUMN + 2
+        self.record_bytes = 3 + FASTRAK.size + 1 if binary else 3 + 7 * _COLUMN + 2
 
     def _record(self, record: bytes) -> PoseReading | None:
         station, error = record[1] - 48, record[2:3]
         if record[:1] != b"0" or not 1 <= station <= 4 or not (error.isalpha() or error == b" "):
             return None
         if self._binary:
-            values = _SEVEN.unpack_from(record, 3) if record[-1:] == b" " else None
+            values = FASTRAK.unpack_from(record, 3) if record[-1:] == b" " else None
         else:
             values = _columns(record[3:-2]) if record[-2:] == b"\r\n" else None
         return None if values is None else _polhemus_pose(values, error, station)
@@ -120,7 +119,7 @@ class FastrakParser(RecordParser):
 def _columns(text: bytes) -> tuple[float, ...] | None:
     """Parse numbers in columns of seven characters, which may touch."""
     cells = [text[i : i + _COLUMN] for i in range(0, len(text), _COLUMN)]
-    for cell, decimals in zip(cells, _DECIMALS, strict=True):
+    for cell, decimals in zip(cells, FASTRAK_DECIMALS, strict=True):
         if not re.fullmatch(rb" *[+-]? *\d*\.\d{%d}" % decimals, cell):
             return None
     return tuple(float(cell.replace(b" ", b"")) for cell in cells)
@@ -132,11 +131,11 @@ class LibertyParser(RecordParser):
     The header's size is a check with a tolerance of the closing space, which firmware may or may not count.
     """
 
-    record_bytes = _LIBERTY.size + 1
+    record_bytes = LIBERTY.size + 1
 
     def _record(self, record: bytes) -> PoseReading | None:
-        tag, station, command, error, _, size, *values, time_ms, distortion = _LIBERTY.unpack_from(record)
-        fits = abs(size - _LIBERTY.size + _LIBERTY_HEADER_BYTES) <= 2
+        tag, station, command, error, _, size, *values, time_ms, distortion = LIBERTY.unpack_from(record)
+        fits = abs(size - LIBERTY.size + LIBERTY_HEADER_BYTES) <= 2
         if tag not in _TAGS or not 1 <= station <= 16 or command not in b"CP" or not fits or record[-1:] != b" ":
             return None
         return _polhemus_pose(values, bytes([error]), station, time_ms, distortion)

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.geometry import BoolArray, FloatArray, IndexArray, Plane
+from tactile_bayes.geometry import BoolArray, FloatArray, IndexArray
 from tactile_bayes.mapping.cells import CellSums, Projection, Projector, Readout, add_frames, chunk_frames
 from tactile_bayes.mapping.map import MapRecipe, TactileMap
-from tactile_bayes.mapping.plane import FramePoses, HeadMoments, head_moments
+from tactile_bayes.mapping.plane import FramePoses
 from tactile_bayes.mapping.profile import GrowingProfile
 from tactile_bayes.mapping.select import SelectedFrames, chunks, gate
 from tactile_bayes.presets import CELL_MM, PRESSURE_WINDOW_KPA
@@ -225,11 +225,6 @@ class Accumulated(Record, eq=False):
     last_change: float = 0.0
     """Largest relative change of a frame's gain in the last pass; 0 unless the gains are solved for."""
 
-    @property
-    def settled(self) -> bool:
-        """True where the gains converged."""
-        return self.last_change <= GAIN_TOLERANCE
-
 
 def accumulate(sources: list[Source], *, cell_mm: float, normalise: str, progress: Progress = untold) -> Accumulated:
     """Average the normalised readings of all used frames in cells on the plane; progress starts anew in each pass.
@@ -270,7 +265,7 @@ def add_all(
 class MapAccumulator:
     """Accumulates frames, in any portions and order, into a map on a plane that can be read at any time.
 
-    Everything that is added up is a whole number of tiny steps (`CellSums`, `HeadMoments`, `Readout`), so neither
+    Everything that is added up is a whole number of tiny steps (`CellSums`, `Readout`), so neither
     portions nor order leave a trace. Each frame is divided by its mean: a gain per frame needs all frames at once.
     """
 
@@ -287,7 +282,7 @@ class MapAccumulator:
         taxels = np.ones(head.shape, dtype=bool)
         self._head, self._readout, self._window_kpa = head, Readout.of(calibration, taxels), pressure_window_kpa
         self._projector = Projector(head, plane_from_base=plane_from_base, taxels=taxels, cell_mm=cell_mm)
-        self._sums, self._moments, self._profile = CellSums(cell_mm), HeadMoments(), GrowingProfile(taxels)
+        self._sums, self._profile = CellSums(cell_mm), GrowingProfile(taxels)
         self._counted: Counter[str] = Counter()
 
     @property
@@ -296,12 +291,13 @@ class MapAccumulator:
         more = {"clipped_values": self._sums.clipped, "negative_readings": self._sums.negative}
         return {name: float(value) for name, value in ({name: self._counted[name] for name in _COUNTED} | more).items()}
 
-    def add(self, counts: CountArray, poses: FramePoses) -> None:
-        """Add (n, rows, columns) frames with the n poses at their times."""
-        for part in chunks(len(counts), chunk_frames(self._readout.size)):
-            self._add(self._readout.counts(counts[part]), poses.part(part))
+    def add(self, counts: CountArray, poses: FramePoses) -> BoolArray:
+        """Add (n, rows, columns) frames with the n poses at their times; returns the (n,) that were used."""
+        parts = chunks(len(counts), chunk_frames(self._readout.size))
+        used = [self._add(self._readout.counts(counts[part]), poses.part(part)) for part in parts]
+        return np.concatenate([np.zeros(0, dtype=bool), *used])
 
-    def _add(self, counts: CountArray, poses: FramePoses) -> None:
+    def _add(self, counts: CountArray, poses: FramePoses) -> BoolArray:
         pressure, valid = self._readout.pressure_kpa(counts)
         level, share = self._readout.levels(pressure, valid)
         low, high, used = gate(poses.known, level, share, pressure_window_kpa=self._window_kpa)
@@ -310,18 +306,15 @@ class MapAccumulator:
         self._counted["frames_total"] += len(used)
         self._counted["dropped_elements"] += int(np.count_nonzero(~(used | low | high | ~poses.known)))
         if not used.any():
-            return
-        poses, pressure, level, share = poses.part(used), pressure[used], level[used], share[used]
+            return used
+        frames = slice(None) if used.all() else used  # nothing is copied where all are used
+        poses, pressure, level, share = poses.part(frames), pressure[frames], level[frames], share[frames]
         self._counted["frames_used"] += len(level)
         self._counted["saturated_readings"] += round(float((1 - share).sum()) * self._readout.size)
-        self._moments += head_moments(self._head, poses)
         self._profile.add(pressure, level, share)
-        valid, projection = None if valid is None else valid[used], self._projector.at(poses)
+        valid, projection = None if valid is None else valid[frames], self._projector.at(poses)
         add_frames(self._sums, self._readout, pressure, valid, projection=projection, level=level)
-
-    def plane(self) -> Plane:
-        """Best-fit plane of the frames used so far; `BadDataError` where these span no plane."""
-        return self._moments.plane()
+        return used
 
     def snapshot(self) -> TactileMap:
         """The map so far, a copy; it has no cell before the first frame.

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from tactile_bayes.declarations import Record, replace
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, check_number
 from tactile_bayes.findings import Finding, by_weight
-from tactile_bayes.geometry import FloatArray, Plane, apply, inverse, patient_from_plane
-from tactile_bayes.mapping.accumulate import Accumulated, accumulate, add_all, sources_of
+from tactile_bayes.geometry import BoolArray, FloatArray, Plane, apply, inverse, patient_from_plane
+from tactile_bayes.mapping.accumulate import GAIN_TOLERANCE, Accumulated, accumulate, add_all, sources_of
 from tactile_bayes.mapping.accumulate import flat_field as find_flat_field
 from tactile_bayes.mapping.arrangement import check_briefly
 from tactile_bayes.mapping.cells import CellSums, yaw_deg
@@ -19,7 +19,7 @@ from tactile_bayes.mapping.convention import check_convention, convention_findin
 from tactile_bayes.mapping.errors import pose_noise_figures, shared_frame_figures
 from tactile_bayes.mapping.latency import estimate_latency
 from tactile_bayes.mapping.map import FEW_READINGS, MapRecipe, TactileMap, broken_assumptions, handling_findings, smooth
-from tactile_bayes.mapping.plane import MAX_POSE_GAP_MS, FramePoses, HeadMoments, head_moments
+from tactile_bayes.mapping.plane import MAX_POSE_GAP_MS, HeadMoments, head_moments
 from tactile_bayes.mapping.plausibility import exam_figures, exam_findings, map_findings, with_cause
 from tactile_bayes.mapping.profile import evenness_figures, head_profile_figures
 from tactile_bayes.mapping.select import (
@@ -63,33 +63,33 @@ def local_plane(
     None takes half the diagonal of the array, within which an array reaches the mass, and widens it while those frames
     span no plane. A given radius without frames, or whose frames span no plane, is a `BadDataError`.
     """
-    mass = find_mass(selections, plane)
+    mass, distances = find_mass(selections, plane), []
+    for part in selections:
+        head = part.scan.head
+        middle = apply(inverse(head.scanhead_from_tracker), head.surface_mm.reshape(-1, 3).mean(axis=0))
+        centre = apply(plane.plane_from_base, part.poses.places_mm(middle))
+        distances.append(np.linalg.norm(centre[:, :2] - mass, axis=1))
     radius = radius_mm or max(
         float(np.hypot(*np.ptp(part.scan.head.surface_mm[..., :2].reshape(-1, 2), axis=0))) / 2 for part in selections
     )
     while True:
+        near = [part.used & (distance <= radius) for part, distance in zip(selections, distances, strict=True)]
+        moments = _moments(selections, near)
         try:
-            return _plane_within(selections, plane, mass, radius)
+            if not moments.count:
+                what = f"no frame lies within {radius:g} mm of the mass"
+                raise BadDataError(what, way_out="give a larger --plane-radius-mm")
+            return moments.plane(), {"plane_radius_mm": float(radius), "plane_frames": float(moments.count)}
         except BadDataError:
             if radius_mm is not None or radius > 500.0:
                 raise
             radius *= _WIDER
 
 
-def _plane_within(
-    selections: Sequence[SelectedFrames], plane: Plane, mass: FloatArray, radius: float
-) -> tuple[Plane, dict[str, float]]:
-    moments = HeadMoments()
-    for part in selections:
-        lever = inverse(part.scan.head.scanhead_from_tracker)
-        middle = apply(lever, part.scan.head.surface_mm.reshape(-1, 3).mean(axis=0))
-        centre = part.poses.position_mm + (part.poses.rotation * middle).sum(axis=2)
-        distance = np.linalg.norm(apply(plane.plane_from_base, centre)[:, :2] - mass, axis=1)
-        near = FramePoses(part.poses.position_mm, part.poses.rotation, part.used & (distance <= radius))
-        moments = moments + head_moments(part.scan.head, near)
-    if not moments.count:
-        raise BadDataError(f"no frame lies within {radius:g} mm of the mass", way_out="give a larger --plane-radius-mm")
-    return moments.plane(), {"plane_radius_mm": float(radius), "plane_frames": float(moments.count)}
+def _moments(selections: Sequence[SelectedFrames], frames: Sequence[BoolArray]) -> HeadMoments:
+    """Of the (n,) frames chosen of each scan."""
+    pairs = zip(selections, frames, strict=True)
+    return sum((head_moments(part.scan.head, part.poses.part(some)) for part, some in pairs), HeadMoments())
 
 
 # --- Figures of a map's report: motion of the head, coverage of the cells.
@@ -103,11 +103,10 @@ def plane_figures(selections: Sequence[SelectedFrames], plane: Plane) -> dict[st
     transform = plane.plane_from_base
     normals, yaws, centres = [], [], []
     for part in selections:
-        rotation, tracker_from_head = part.poses.rotation[part.used], inverse(part.scan.head.scanhead_from_tracker)
-        normals.append((rotation * tracker_from_head[:3, 2]).sum(axis=2).sum(axis=0))
-        yaws.append(yaw_deg(part.scan.head, rotation, plane_from_base=transform))
-        apex = part.poses.position_mm[part.used] + (rotation * tracker_from_head[:3, 3]).sum(axis=2)
-        centres.append(apply(transform, apex))
+        poses, tracker_from_head = part.poses.part(part.used), inverse(part.scan.head.scanhead_from_tracker)
+        normals.append((poses.rotation * tracker_from_head[:3, 2]).sum(axis=2).sum(axis=0))
+        yaws.append(yaw_deg(part.scan.head, poses.rotation, plane_from_base=transform))
+        centres.append(apply(transform, poses.places_mm(tracker_from_head[:3, 3])))
     normal = np.sum(normals, axis=0)
     tilt = np.arctan2(np.linalg.norm(np.cross(transform[2, :3], normal)), transform[2, :3] @ normal)
     span = np.ptp(np.concatenate(centres), axis=0)
@@ -179,14 +178,13 @@ def build_map(
     given = [scans] if isinstance(scans, Scan) else list(scans)
     parts = [every_nth(scan, how.every) for scan in given]
     _check_same_examination(parts)
-    rules = _Rules((float(how.pressure_window_kpa[0]), float(how.pressure_window_kpa[1])), max_pose_gap_ms)
     figures: dict[str, float] = {} if how.every == 1 else {"frames_every": float(how.every)}
     late_ms = 0.0 if isinstance(how.latency_ms, str) else float(how.latency_ms)
-    selections = rules.select(parts, late_ms)
+    selections = _selected(parts, how, late_ms, max_pose_gap_ms)
     figures |= exam_figures(selections)
-    of_scans = _of_scans(given)
+    of_scans = _numbered([scan_findings(scan) for scan in given])
     try:
-        return _built(of_scans, selections, how, rules, figures, late_ms=late_ms, progress=progress)
+        return _built(of_scans, selections, how, figures, late_ms=late_ms, gap_ms=max_pose_gap_ms, progress=progress)
     except BadDataError as error:
         raise with_cause(error, (*of_scans, *exam_findings(figures))) from None
 
@@ -195,20 +193,20 @@ def _built(
     of_scans: tuple[Finding, ...],
     selections: list[SelectedFrames],
     how: MapOptions,
-    rules: _Rules,
     figures: dict[str, float],
     *,
     late_ms: float,
+    gap_ms: float,
     progress: Progress,
 ) -> TactileMap:
     """The map from the frames that are used, whose `figures` it adds to."""
     findings = of_scans + _of_arrangement(selections, late_ms, figures, refuse=not how.as_stated)
     figures |= head_profile_figures(selections)
     if how.flat_field:
-        selections = _flattened(selections, rules, late_ms, figures)
+        selections = _selected(_flattened(selections, figures), how, late_ms, gap_ms)
     if how.latency_ms == "auto":
-        late_ms = _latency(selections, rules, how.cell_mm, figures)
-        selections = rules.select([part.scan for part in selections], late_ms)
+        late_ms = _latency(selections, how.cell_mm, gap_ms, figures)
+        selections = _selected([part.scan for part in selections], how, late_ms, gap_ms)
     figures |= check_convention(selections)
     plane = _plane(selections)
     if how.plane_radius_mm != "all":
@@ -223,15 +221,11 @@ def _built(
     figures.update(shared_frame_figures(sources, done.levels, done.sums))
     figures |= evenness_figures(selections, plane) | stroke_lag_figures(sources)
     figures["stroke_count"] = float(stroke_count(sources))
+    low, high = map(float, how.pressure_window_kpa)
     recipe = MapRecipe(
-        "scan", how.normalise, float(how.cell_mm), rules.window_kpa, late_ms, how.flat_field, how.register_strokes
+        "scan", how.normalise, float(how.cell_mm), (low, high), late_ms, how.flat_field, how.register_strokes
     )
     return _as_map(done, selections, plane, recipe, figures, findings=findings)
-
-
-def _of_scans(scans: list[Scan]) -> tuple[Finding, ...]:
-    """Findings against each scan."""
-    return _numbered([scan_findings(scan) for scan in scans])
 
 
 def _of_arrangement(
@@ -257,54 +251,36 @@ def _numbered(findings: list[tuple[Finding, ...]]) -> tuple[Finding, ...]:
     return tuple(one.at(f"scan {number}") for number, some in enumerate(findings, start=1) for one in some)
 
 
-class _Rules(Record, eq=False):
-    """Rules for using frames, independent of the latency."""
-
-    window_kpa: tuple[float, float]
-    max_pose_gap_ms: float
-
-    def select(self, scans: list[Scan], late_ms: float) -> list[SelectedFrames]:
-        """Select the used frames of every scan; an error if none is left in any of them."""
-        selections = [
-            select_frames(
-                scan, pressure_window_kpa=self.window_kpa, latency_ms=late_ms, max_pose_gap_ms=self.max_pose_gap_ms
-            )
-            for scan in scans
-        ]
-        refuse_without_frames(selections, pressure_window_kpa=self.window_kpa)
-        return selections
+def _selected(scans: list[Scan], how: MapOptions, late_ms: float, gap_ms: float) -> list[SelectedFrames]:
+    """Select the used frames of every scan; an error if none is left in any of them."""
+    window = how.pressure_window_kpa
+    selections = [
+        select_frames(scan, pressure_window_kpa=window, latency_ms=late_ms, max_pose_gap_ms=gap_ms) for scan in scans
+    ]
+    refuse_without_frames(selections, pressure_window_kpa=window)
+    return selections
 
 
-def _flattened(
-    selections: list[SelectedFrames], rules: _Rules, late_ms: float, figures: dict[str, float]
-) -> list[SelectedFrames]:
-    """Divide the head's own response out of the scans and select frames anew; drops scans without a used frame."""
+def _flattened(selections: list[SelectedFrames], figures: dict[str, float]) -> list[Scan]:
+    """The scans with a used frame, the head's own response divided out of them."""
     used = [part for part in selections if part.used.any()]
     flats = [find_flat_field(part) for part in used]
     figures["flat_field_frames"] = float(sum(flat.frames for flat in flats))
     figures["flat_field_sd"] = float(np.mean([flat.response.std() for flat in flats]))
-    return rules.select([flat.applied(part.scan) for flat, part in zip(flats, used, strict=True)], late_ms)
+    return [flat.applied(part.scan) for flat, part in zip(flats, used, strict=True)]
 
 
-def _latency(selections: list[SelectedFrames], rules: _Rules, cell_mm: float, figures: dict[str, float]) -> float:
-    estimate = estimate_latency(
-        selections, plane=_plane(selections), cell_mm=cell_mm, max_pose_gap_ms=rules.max_pose_gap_ms
-    )
-    figures |= {
-        "latency_sd_ms": estimate.sd_ms,
-        "latency_bound_ms": estimate.bound_ms,
-        "latency_frames": float(estimate.frames),
-    }
-    return estimate.latency_ms
+def _latency(selections: list[SelectedFrames], cell_mm: float, gap_ms: float, figures: dict[str, float]) -> float:
+    found = estimate_latency(selections, plane=_plane(selections), cell_mm=cell_mm, max_pose_gap_ms=gap_ms)
+    figures["latency_sd_ms"], figures["latency_bound_ms"] = found.sd_ms, found.bound_ms
+    figures["latency_frames"] = float(found.frames)
+    return found.latency_ms
 
 
 def _plane(selections: list[SelectedFrames]) -> Plane:
     """Best-fit plane of all frames used; an error names the rotation convention that would fit."""
-    moments = HeadMoments()
-    for part in selections:
-        moments = moments + head_moments(part.scan.head, part.used_poses)
     try:
-        return moments.plane()
+        return _moments(selections, [part.used for part in selections]).plane()
     except BadDataError as error:
         if "quaternion order" not in error.way_out:
             raise
@@ -345,7 +321,7 @@ def _as_map(
         **figures,
         "gain_passes": float(done.passes),
         "gain_last_change": done.last_change,
-        "gain_unsettled": float(not done.settled),
+        "gain_unsettled": float(not done.last_change <= GAIN_TOLERANCE),
     }
     tactile_map = TactileMap(
         mean=sums.mean() / done.scale,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import pairwise
 from typing import Final
 
 import numpy as np
@@ -134,6 +135,20 @@ def stroke_starts(x_mm: FloatArray) -> list[int]:
         elif abs(x_mm[far] - x_mm[start]) < min(LEAST_REACH_MM, abs(x_mm[i] - x_mm[start])):
             far = i  # it set out the other way
     return [*ends, len(x_mm)]
+
+
+def strokes_along(x_mm: FloatArray) -> list[tuple[int, int, int]]:
+    """First index, end and way of each stroke along (n,) positions of the head: +1 towards +x, else -1."""
+    ends = pairwise(stroke_starts(x_mm))
+    return [(a, b, 1 if x_mm[min(b, len(x_mm) - 1)] >= x_mm[a] else -1) for a, b in ends if b > a]
+
+
+def ways_along(x_mm: FloatArray) -> FloatArray:
+    """(n,) way of the stroke that each of (n,) positions is of."""
+    way = np.ones(len(x_mm))
+    for start, stop, direction in strokes_along(x_mm):
+        way[start:stop] = direction
+    return way
 
 
 # --- Check of a tracker's rotation convention (order and sense) against the motion of the head.

@@ -35,42 +35,36 @@ def pose_noise_figures(selections: Sequence[SelectedFrames], plane: Plane, *, ce
 
     The noise is what a pose departs by from the cubic through the two poses before and the two after it.
     """
-    scans = [one for part in selections if (one := _Places.of(part, plane)) is not None]
+    scans = [one for part in selections if (one := _place_noise(part, plane)) is not None]
     if not scans:
         return {}
-    frames = np.array([one.frames for one in scans])
-    variance = np.average([one.variance for one in scans], axis=0, weights=frames)
+    variances, frames, independent = (np.array(some) for some in zip(*scans, strict=True))
+    variance = np.average(variances, axis=0, weights=frames)
     if variance.max() > MOST_MM**2:
         return {}
     head = selections[0].scan.head
     sides = [taxels * head.pitch_mm for taxels in head.shape]
-    independent = sum(one.independent for one in scans) / float(frames.sum())
-    figures = [*np.sqrt(variance), *sides, (head.pitch_mm / cell_mm) ** 2 * independent]
+    figures = [*np.sqrt(variance), *sides, (head.pitch_mm / cell_mm) ** 2 * independent.sum() / frames.sum()]
     return {name: float(f"{value:.4g}") for name, value in zip(POSE_NOISE, figures, strict=True)}
 
 
-class _Places(Record, eq=False):
-    """Position errors of a scan's used frames."""
+def _place_noise(part: SelectedFrames, plane: Plane) -> tuple[FloatArray, int, float] | None:
+    """(2,) variance of a used frame's place along the plane's axes, mm^2, the number of used frames, and how many with
+    errors of their own would have a mean known as well: those between two poses share theirs.
 
-    variance: FloatArray  #: (2,) array: Of a frame's place along the plane's axes, mm^2.
-    frames: int  #: Used ones.
-    independent: float
-    """Frames with errors of their own whose mean would be known as well: those between two poses share theirs."""
-
-    @classmethod
-    def of(cls, part: SelectedFrames, plane: Plane) -> _Places | None:
-        """Estimate for one scan; None where it has too few poses."""
-        frames_s = part.scan.frames.time_s[part.used]
-        poses = distinct_poses(part.scan.poses)
-        if len(poses) < LEAST_POSES or not len(frames_s):
-            return None
-        lever = inverse(part.scan.head.scanhead_from_tracker)[:3, 3]
-        apex = poses.position_mm + rotation_from_quaternion(poses.quaternion_wxyz) @ lever
-        departure, weight = _departures(poses.time_s, apply(plane.plane_from_base, apex)[:, :2])
-        square = np.sort(departure**2 / weight[:, None], axis=0)
-        noise = square[: int(KEPT * len(square))].mean(axis=0) / _INNER_SQUARE
-        factor, independent = _interpolation(frames_s, poses.time_s)
-        return cls(noise * factor, len(frames_s), independent)
+    None where a scan has too few poses.
+    """
+    frames_s = part.scan.frames.time_s[part.used]
+    poses = distinct_poses(part.scan.poses)
+    if len(poses) < LEAST_POSES or not len(frames_s):
+        return None
+    lever = inverse(part.scan.head.scanhead_from_tracker)[:3, 3]
+    apex = poses.position_mm + rotation_from_quaternion(poses.quaternion_wxyz) @ lever
+    departure, weight = _departures(poses.time_s, apply(plane.plane_from_base, apex)[:, :2])
+    square = np.sort(departure**2 / weight[:, None], axis=0)
+    noise = square[: int(KEPT * len(square))].mean(axis=0) / _INNER_SQUARE
+    factor, independent = _interpolation(frames_s, poses.time_s)
+    return noise * factor, len(frames_s), independent
 
 
 def _departures(time_s: FloatArray, place_mm: FloatArray) -> tuple[FloatArray, FloatArray]:

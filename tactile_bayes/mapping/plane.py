@@ -40,6 +40,10 @@ class FramePoses(Record, eq=False):
         """A subset of the frames."""
         return FramePoses(self.position_mm[frames], self.rotation[frames], self.known[frames])
 
+    def places_mm(self, point_mm: FloatArray) -> FloatArray:
+        """(n, 3) places in `base` of a (3,) point that is given in the tracker's axes."""
+        return np.asarray(self.position_mm + (self.rotation * point_mm).sum(axis=2))
+
 
 def distinct_poses(poses: TrackerPoses) -> TrackerPoses:
     """Poses without repeats, with quaternion signs unrolled and times strictly rising.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import pairwise
 
 import numpy as np
 from numpy.polynomial import legendre
@@ -11,7 +10,7 @@ from numpy.typing import NDArray
 
 from tactile_bayes.declarations import Record
 from tactile_bayes.geometry import BoolArray, FloatArray, IndexArray, Plane, apply, inverse
-from tactile_bayes.mapping.convention import stroke_starts
+from tactile_bayes.mapping.convention import ways_along
 from tactile_bayes.mapping.select import SelectedFrames, chunks
 from tactile_bayes.presets import HEAD_PROFILE
 
@@ -63,20 +62,23 @@ LEAST_FRAMES = 50
 # Orders across and along the head, those of `HEAD_PROFILE` first. Odd and mixed ones take up how the head was tilted.
 # The fourth across hangs on the head's very rim: two simulations with one body differ in it by half its range.
 _ORDERS = ((2, 0), (0, 2), (0, 4), (0, 0), (4, 0), (1, 0), (0, 1), (1, 1), (2, 2))
-SKEW = _ORDERS.index((1, 0))  #: Which of `ProfileReader.whole` is the first order across the head.
+SKEW = _ORDERS.index((1, 0))  #: Which coefficient is the first order across the head.
 _HIGHEST = 4
-_COLUMNS = len(HEAD_PROFILE) + 1
+_COLUMNS = len(_ORDERS) + 1
 
 
 def head_profile_figures(selections: Sequence[SelectedFrames]) -> dict[str, float]:
     """The map's figures `HEAD_PROFILE`, and ``head_profile_frames``; none where too few frames are free of a lump."""
-    frames = [
-        np.flatnonzero(part.used & _whole(part.level_kpa, part.valid_share, part.good_taxels)) for part in selections
-    ]
-    marks = [frame_marks(part.level_kpa[chosen]) for part, chosen in zip(selections, frames, strict=True)]
-    limit = marks_limit(np.concatenate(marks), MOST_FRAMES)
-    read = [_read(part, each[mark < limit]) for part, each, mark in zip(selections, frames, marks, strict=True)]
-    return profile_figures(np.concatenate(read))
+    marked = [_marked(part) for part in selections]
+    limit = marks_limit(np.concatenate([marks for _, marks in marked]), MOST_FRAMES)
+    pairs = zip(selections, marked, strict=True)
+    return profile_figures(np.concatenate([_read(part, frames[marks < limit]) for part, (frames, marks) in pairs]))
+
+
+def _marked(part: SelectedFrames) -> tuple[IndexArray, NDArray[np.uint64]]:
+    """Frames of a scan that can be read, in the order of time, and their marks."""
+    frames = np.flatnonzero(part.used & _whole(part.level_kpa, part.valid_share, part.good_taxels))
+    return frames, frame_marks(part.level_kpa[frames])
 
 
 def _whole(level_kpa: FloatArray, valid_share: FloatArray, good: BoolArray) -> BoolArray:
@@ -85,14 +87,14 @@ def _whole(level_kpa: FloatArray, valid_share: FloatArray, good: BoolArray) -> B
 
 
 def profile_figures(rows: FloatArray) -> dict[str, float]:
-    """Figures from the (f, 4) rows of `ProfileReader`, in any order: the mean over the lump-free frames.
+    """Figures from the (f, 10) rows of `ProfileReader`, in any order: the mean over the lump-free frames.
 
     A lump, or the edge of a rib, is no smooth profile: the residual of a frame shows it, also where most frames feel
     one. Rows of NaN, from an array without a profile, give no figures.
     """
     if len(rows) < LEAST_FRAMES:
         return {}
-    smooth = rows[lump_free(rows[:, -1]), :-1]
+    smooth = rows[_lump_free(rows), : len(HEAD_PROFILE)]
     if len(smooth) < LEAST_FRAMES:
         return {}
     # Sums of whole steps have no rounding: neither the order of the frames nor a matrix product leaves a trace.
@@ -103,28 +105,16 @@ def profile_figures(rows: FloatArray) -> dict[str, float]:
     }
 
 
-def lump_free(left: FloatArray) -> BoolArray:
-    """(f,) which of at least two frames feel no lump, by the (f,) residuals of their smooth profiles."""
-    return np.asarray(left <= SMOOTH_FACTOR * _tenth(left))
-
-
-def profile_frames(part: SelectedFrames) -> IndexArray:
-    """Frames of one scan that are read: those that are whole, at most `MOST_FRAMES` of them, in the order of time."""
-    frames = np.flatnonzero(part.used & _whole(part.level_kpa, part.valid_share, part.good_taxels))
-    marks = frame_marks(part.level_kpa[frames])
-    return frames[marks < marks_limit(marks, MOST_FRAMES)]
-
-
-def _tenth(values: FloatArray) -> float:
-    """Quantile 0.1 of two values or more, linear between neighbours."""
-    below, share = divmod(0.1 * (len(values) - 1), 1.0)
-    parted = np.partition(values, int(below) + 1)
+def _lump_free(rows: FloatArray) -> BoolArray:
+    """(f,) which of at least two frames feel no lump, by the residuals of their smooth profiles."""
+    below, share = divmod(0.1 * (len(rows) - 1), 1.0)
+    parted = np.partition(rows[:, -1], int(below) + 1)
     low, high = parted[: int(below) + 1].max(), parted[int(below) + 1]
-    return float(low + share * (high - low))
+    return np.asarray(rows[:, -1] <= SMOOTH_FACTOR * float(low + share * (high - low)))  # of the tenth's quantile
 
 
 def _read(part: SelectedFrames, frames: IndexArray) -> FloatArray:
-    """(f, 4) rows of frames, read in portions that fit the processor's cache."""
+    """(f, 10) rows of frames, read in portions that fit the processor's cache."""
     reader, rows = ProfileReader.of(part.good_taxels), np.empty((len(frames), _COLUMNS))
     for chosen in chunks(len(frames), _CHUNK):
         some = frames[chosen]
@@ -180,16 +170,13 @@ class ProfileReader(Record, eq=False):
         return cls(np.ascontiguousarray(np.linalg.pinv(terms)), terms.T @ terms)
 
     def read(self, pressure_kpa: FloatArray, level_kpa: FloatArray) -> FloatArray:
-        """(f, 4) `HEAD_PROFILE` and residual of frames, from (f, taxels) pressures, all valid, and (f,) means above 0.
+        """(f, 10) coefficients of frames, those of `HEAD_PROFILE` first, and residuals, all over the frames' means.
+
+        From (f, taxels) pressures, all valid, and (f,) means above 0.
 
         The residual is the root mean square of what the nine terms leave. NaN where the array has too few rows or
         columns. A frame's bits do not depend on the frames read with it.
         """
-        whole = self.whole(pressure_kpa, level_kpa)
-        return np.ascontiguousarray(np.delete(whole, np.s_[len(HEAD_PROFILE) : -1], axis=1))
-
-    def whole(self, pressure_kpa: FloatArray, level_kpa: FloatArray) -> FloatArray:
-        """(f, 10) coefficients of all nine terms over the frames' means, and residuals; otherwise as `read`."""
         terms = len(_ORDERS)
         if not self.solve.size:
             return np.full((len(pressure_kpa), terms + 1), np.nan)
@@ -232,59 +219,38 @@ def evenness_figures(selections: Sequence[SelectedFrames], plane: Plane) -> dict
     along the strokes, half the difference between strokes towards +x and towards -x; missing where all strokes went one
     way. The last four are missing where too few frames are free of a lump or the head hardly moved.
     """
-    parts = [_Frames.of(part, plane) for part in selections if part.used.any()]
-    figures = _curvature(parts)
-    rows, designs, groups = [], [], []
-    for part in parts:
-        some_rows, some_designs, some_groups = part.profiles()
-        rows.append(some_rows)
-        designs.append(some_designs)
-        groups.append(some_groups)
-    return figures | _profile_changes(np.concatenate(rows), np.concatenate(designs), np.concatenate(groups))
+    parts = [part for part in selections if part.used.any()]
+    motions = [_motion(part, plane) for part in parts]
+    profiles = [_profiles(part, *motion) for part, motion in zip(parts, motions, strict=True)]
+    rows, designs, groups = (np.concatenate(some) for some in zip(*profiles, strict=True))
+    return _curvature(motions) | _profile_changes(rows, designs, groups)
 
 
-class _Frames:
-    """Where the head was in the used frames of a scan: places and normals on the plane, and the strokes' directions."""
-
-    def __init__(self, part: SelectedFrames, place_mm: FloatArray, axes: FloatArray) -> None:
-        self.part, self.place_mm, self.axes = part, place_mm, axes
-        self.way = _ways(place_mm[:, 0])
-
-    @classmethod
-    def of(cls, part: SelectedFrames, plane: Plane) -> _Frames:
-        rotation, tracker_from_head = part.poses.rotation[part.used], inverse(part.scan.head.scanhead_from_tracker)
-        apex = part.poses.position_mm[part.used] + (rotation * tracker_from_head[:3, 3]).sum(axis=2)
-        axes = np.einsum("ij,njk,kl->nil", plane.plane_from_base[:3, :3], rotation, tracker_from_head[:3, :3])
-        return cls(part, apply(plane.plane_from_base, apex), axes)
-
-    def profiles(self) -> tuple[FloatArray, FloatArray, NDArray[np.int64]]:
-        """(f, 10) profiles of the readable frames, the (f, 7) terms of their regression, and (f,) stretches of time."""
-        part = self.part
-        chosen = profile_frames(part)
-        reader = ProfileReader.of(part.good_taxels)
-        among = np.searchsorted(np.flatnonzero(part.used), chosen)
-        level = part.level_kpa[chosen]
-        pressure = part.readout.pressure_kpa(part.readout.counts(part.scan.frames.counts[chosen]))[0]
-        place = self.place_mm[among, :2] / SPAN_MM
-        tilt = self.axes[among, 2, :2]
-        one = np.ones((len(chosen), 1))
-        design = np.hstack([one, place, self.way[among, None], np.log(level)[:, None], tilt])
-        stretch = np.floor(part.scan.frames.time_s[chosen] / _STRETCH_S).astype(np.int64) % _GROUPS
-        return reader.whole(pressure, level), design, stretch
+def _motion(part: SelectedFrames, plane: Plane) -> tuple[FloatArray, FloatArray]:
+    """(n, 3) places of the head on the plane and (n, 3, 3) directions of its axes at the used frames of a scan."""
+    poses, tracker_from_head = part.poses.part(part.used), inverse(part.scan.head.scanhead_from_tracker)
+    place = apply(plane.plane_from_base, poses.places_mm(tracker_from_head[:3, 3]))
+    axes = np.einsum("ij,njk,kl->nil", plane.plane_from_base[:3, :3], poses.rotation, tracker_from_head[:3, :3])
+    return place, axes
 
 
-def _ways(x_mm: FloatArray) -> FloatArray:
-    """(n,) 1 in strokes towards +x, -1 in others."""
-    way, starts = np.ones(len(x_mm)), stroke_starts(x_mm)
-    for start, stop in pairwise(starts):
-        way[start:stop] = 1.0 if x_mm[min(stop, len(x_mm) - 1)] >= x_mm[start] else -1.0
-    return way
+def _profiles(
+    part: SelectedFrames, place_mm: FloatArray, axes: FloatArray
+) -> tuple[FloatArray, FloatArray, NDArray[np.int64]]:
+    """(f, 10) profiles of the readable frames, the (f, 7) terms of their regression, and (f,) stretches of time."""
+    frames, marks = _marked(part)
+    chosen = frames[marks < marks_limit(marks, MOST_FRAMES)]
+    among = np.searchsorted(np.flatnonzero(part.used), chosen)
+    way, level = ways_along(place_mm[:, 0])[among, None], np.log(part.level_kpa[chosen])[:, None]
+    design = np.hstack([np.ones_like(way), place_mm[among, :2] / SPAN_MM, way, level, axes[among, 2, :2]])
+    stretch = np.floor(part.scan.frames.time_s[chosen] / _STRETCH_S).astype(np.int64) % _GROUPS
+    return _read(part, chosen), design, stretch
 
 
-def _curvature(parts: Sequence[_Frames]) -> dict[str, float]:
+def _curvature(motions: Sequence[tuple[FloatArray, FloatArray]]) -> dict[str, float]:
     """Mean over the directions in which the head moved, weighted by how far."""
-    place = np.concatenate([part.place_mm[:, :2] - part.place_mm[:, :2].mean(axis=0) for part in parts])
-    normal = np.concatenate([part.axes[:, :2, 2] - part.axes[:, :2, 2].mean(axis=0) for part in parts])
+    place = np.concatenate([place_mm[:, :2] - place_mm[:, :2].mean(axis=0) for place_mm, _ in motions])
+    normal = np.concatenate([axes[:, :2, 2] - axes[:, :2, 2].mean(axis=0) for _, axes in motions])
     moved = float(np.sum(place**2))
     if not moved > len(place) * _LEAST_SPREAD_MM**2:
         return {}
@@ -295,14 +261,11 @@ def _profile_changes(rows: FloatArray, design: FloatArray, group: NDArray[np.int
     """Changes of the profile with place and stroke, by least squares over the lump-free frames."""
     if len(rows) < LEAST_FRAMES:
         return {}
-    free = lump_free(rows[:, -1])
+    free = _lump_free(rows)
     if np.count_nonzero(free) < LEAST_FRAMES:
         return {}
-    rows, design, group = (
-        rows[free],
-        design[free] - design[free].mean(axis=0) * (np.arange(design.shape[1]) > 0),
-        group[free],
-    )
+    rows, design, group = rows[free], design[free], group[free]
+    design = design - design.mean(axis=0) * (np.arange(design.shape[1]) > 0)
     if min(np.std(design[:, _X]), np.std(design[:, _Y])) * SPAN_MM < _LEAST_SPREAD_MM:
         return {}
     both_ways = np.std(design[:, _WAY]) > 0

@@ -155,38 +155,37 @@ def timing_figures(scans: Sequence[Scan]) -> dict[str, float]:
     ``frames_repeated`` (two of one time), ``pose_rate_hz`` and ``pose_jitter_ms`` of distinct poses, ``pose_repeats``
     (samples sent again) and ``pose_gap_ms`` (the longest between distinct poses).
     """
-    frames = [scan.frames.time_s for scan in scans]
     fresh = [distinct_poses(scan.poses) for scan in scans]
-    poses = [one.time_s for one in fresh]
-    gaps = [np.diff(time).max(initial=0.0) for time in poses]
+    frames, poses = [scan.frames.time_s for scan in scans], [one.time_s for one in fresh]
     return {
         **_regularity("frame", frames),
         **_regularity("pose", poses),
         "frames_missing": float(sum(_missing(time) for time in frames)),
         "frames_repeated": float(sum(int((np.diff(time) == 0).sum()) for time in frames)),
         "pose_repeats": float(sum(len(scan.poses) - len(one) for scan, one in zip(scans, fresh, strict=True))),
-        "pose_gap_ms": 1000.0 * float(max(gaps, default=0.0)),
+        "pose_gap_ms": 1000.0 * max((float(np.diff(time).max(initial=0.0)) for time in poses), default=0.0),
     }
+
+
+def _intervals(times: list[FloatArray]) -> tuple[FloatArray, float]:
+    """Intervals above 0 between records, and the usual one; NaN without any."""
+    steps = np.concatenate([np.diff(time) for time in times])
+    steps = steps[steps > 0]
+    return steps, float(np.median(steps)) if len(steps) else float("nan")
 
 
 def _regularity(name: str, times: list[FloatArray]) -> dict[str, float]:
     """Rate, and standard deviation of the intervals that contain no gap."""
-    steps = np.concatenate([np.diff(time) for time in times])
-    steps = steps[steps > 0]
+    steps, usual = _intervals(times)
     if not len(steps):
         return {}
-    usual = float(np.median(steps))
     regular = steps[steps < _GAP_INTERVALS * usual]
     return {f"{name}_rate_hz": 1.0 / usual, f"{name}_jitter_ms": 1000.0 * float(regular.std())}
 
 
 def _missing(time_s: FloatArray) -> int:
     """Number of frames missing in the gaps."""
-    steps = np.diff(time_s)
-    steps = steps[steps > 0]
-    if not len(steps):
-        return 0
-    usual = float(np.median(steps))
+    steps, usual = _intervals([time_s])
     return int(np.rint(steps[steps >= _GAP_INTERVALS * usual] / usual - 1).sum())
 
 
@@ -245,12 +244,10 @@ class Span:
     @classmethod
     def of(cls, time_s: FloatArray) -> Span:
         """Span of (n,) times that never fall."""
-        if not len(time_s):
-            return cls()
-        steps = np.diff(time_s)
-        longest = int(steps.argmax()) if len(steps) else 0
-        gap_s = float(steps[longest]) if len(steps) else 0.0
-        return cls(len(time_s), float(time_s[0]), float(time_s[-1]), gap_s, float(time_s[longest]))
+        span = cls()
+        for moment_s in time_s.tolist():
+            span.add(moment_s)
+        return span
 
 
 # A hand moves slower than this between two poses, beside what a tracker's noise adds.
@@ -367,16 +364,6 @@ class SelectedFrames(Record, eq=False, dict=True):
     used: BoolArray  #: (n,) bool array: Frames that go into the map.
 
     @property
-    def dropped_no_pose(self) -> int:
-        """Frames without a pose from the tracker."""
-        return int((~self.poses.known).sum())
-
-    @property
-    def dropped_elements(self) -> int:
-        """Frames with a pose and too few valid taxels."""
-        return int((self.poses.known & ~(self.valid_share >= VALID_SHARE)).sum())
-
-    @property
     def good_taxels(self) -> BoolArray:
         """(rows, columns) True for taxels that are not left out."""
         return good_taxels(self.scan.head.shape, self.faults)
@@ -390,11 +377,6 @@ class SelectedFrames(Record, eq=False, dict=True):
         """The projector of the good taxels."""
         good = self.good_taxels
         return Projector(self.scan.head, plane_from_base=plane_from_base, taxels=good, cell_mm=cell_mm)
-
-    @property
-    def used_poses(self) -> FramePoses:
-        """Poses of the frames that go into the map."""
-        return FramePoses(self.poses.position_mm, self.poses.rotation, self.used)
 
 
 def good_taxels(shape: tuple[int, int], faults: Iterable[TaxelFault]) -> BoolArray:
@@ -552,8 +534,10 @@ def frame_figures(selections: Sequence[SelectedFrames]) -> dict[str, float]:
         "scans": len(selections),
         "frames_total": sum(len(part.used) for part in selections),
         "frames_used": sum(int(part.used.sum()) for part in selections),
-        "dropped_no_pose": sum(part.dropped_no_pose for part in selections),
-        "dropped_elements": sum(part.dropped_elements for part in selections),
+        "dropped_no_pose": sum(int((~part.poses.known).sum()) for part in selections),
+        "dropped_elements": sum(
+            int((part.poses.known & ~(part.valid_share >= VALID_SHARE)).sum()) for part in selections
+        ),
         "dropped_low": sum(int(part.low.sum()) for part in selections),
         "dropped_high": sum(int(part.high.sum()) for part in selections),
         "masked_taxels": sum(len(part.faults) for part in selections),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import pairwise
 
 import numpy as np
 
@@ -17,8 +16,9 @@ from tactile_bayes.mapping.convention import (
     CoarseFrames,
     every_stretch,
     numbered_on,
-    stroke_starts,
+    strokes_along,
     thinning,
+    ways_along,
 )
 from tactile_bayes.mapping.latency import ShiftFit
 
@@ -52,9 +52,12 @@ class StrokeShift(Record):
 
 def find_strokes(source: Source, number: int) -> list[StrokeShift]:
     """Find runs of a scan's used frames in one direction along x; a turn belongs to the run before it."""
-    x = source.projection.shift[:, 0] * source.projection.cell_mm
-    ends = pairwise(stroke_starts(x))
-    return [StrokeShift(a, b, number, 1 if x[min(b, len(x) - 1)] >= x[a] else -1) for a, b in ends if b > a]
+    return [StrokeShift(start, stop, number, way) for start, stop, way in strokes_along(_x_mm(source))]
+
+
+def _x_mm(source: Source) -> FloatArray:
+    """(n,) places of the head along x at a scan's used frames."""
+    return source.projection.shift[:, 0] * source.projection.cell_mm
 
 
 def stroke_count(sources: Sequence[Source]) -> int:
@@ -141,21 +144,27 @@ class _Part(Record, eq=False):
 
     @classmethod
     def of(cls, source: Source, number: int, strokes: Sequence[StrokeShift]) -> _Part:
-        time_s = source.selection.scan.frames.time_s
-        readings = len(source.frames) * 5e-3 / POOL_S * source.selection.readout.size / 4 if len(time_s) else 0.0
+        readings = len(source.frames) * 5e-3 / POOL_S * source.selection.readout.size / 4
         every = int(np.ceil(len(strokes) * readings / _MOST_NUMBERS))
-        kept = every_stretch(time_s[source.frames], max(every, 1))
-        coarse = CoarseFrames.of(source.selection, source.frames[kept])
+        kept, coarse, places_mm, block = _averaged(source, max(every, 1))
         first = next(n for n, one in enumerate(strokes) if one.scan == number)
         starts = [one.start for one in strokes if one.scan == number]
         stroke = np.searchsorted(starts, kept[coarse.first], side="right") - 1 + first
-        return cls(coarse, coarse.places_mm(source.projection.part(kept)), stroke, coarse.blocks(time_s))
+        return cls(coarse, places_mm, stroke, block)
 
     def shifted_mm(self, shifts_mm: FloatArray) -> FloatArray:
         """(m, k, 2) places with each stroke moved back along x by its shift, one for each of all strokes."""
         moved = self.places_mm.copy()
         moved[:, :, 0] -= shifts_mm[self.stroke, None]
         return moved
+
+
+def _averaged(source: Source, every: int) -> tuple[IndexArray, CoarseFrames, FloatArray, IndexArray]:
+    """Every so many-th stretch of a scan's used frames: which these are, their averages, places, and shared blocks."""
+    time_s = source.selection.scan.frames.time_s
+    kept = every_stretch(time_s[source.frames], every)
+    coarse = CoarseFrames.of(source.selection, source.frames[kept])
+    return kept, coarse, coarse.places_mm(source.projection.part(kept)), coarse.blocks(time_s)
 
 
 class _Round(Record, eq=False):
@@ -247,29 +256,16 @@ def stroke_lag_figures(sources: Sequence[Source]) -> dict[str, float]:
     0.2 s.
     """
     every = thinning((source.selection.scan.frames.time_s[source.frames] for source in sources), most=MOST_FRAMES)
-    parts, places, moves, blocks = [], [], [], []
-    for number, source in enumerate(sources):
-        way = np.ones(len(source.frames))
-        for stroke in find_strokes(source, number):
-            way[stroke.start : stroke.stop] = stroke.direction
-        time_s = source.selection.scan.frames.time_s
-        kept = every_stretch(time_s[source.frames], every)
-        if not len(kept):
-            continue
-        coarse = CoarseFrames.of(source.selection, source.frames[kept])
-        place = coarse.places_mm(source.projection.part(kept))
-        move = np.zeros_like(place)
-        move[:, :, 0] = way[kept[coarse.first], None]
-        parts.append(coarse)
-        places.append(place)
-        moves.append(move)
-        blocks.append(coarse.blocks(time_s))
-    if not parts:
-        return {}
-    ways = np.concatenate([move[:, 0, 0] for move in moves])
+    averaged = [(source, *_averaged(source, every)) for source in sources if len(source.frames)]
+    moves = []
+    for source, kept, coarse, place_mm, _ in averaged:
+        moves.append(np.zeros_like(place_mm))
+        moves[-1][:, :, 0] = ways_along(_x_mm(source))[kept[coarse.first], None]
+    ways = np.concatenate([np.zeros(0), *(move[:, 0, 0] for move in moves)])
     if not (np.any(ways > 0) and np.any(ways < 0)):
         return {}
-    return _step(ShiftFit.of(parts, places), moves, blocks)
+    fit = ShiftFit.of([coarse for _, _, coarse, _, _ in averaged], [place_mm for *_, place_mm, _ in averaged])
+    return _step(fit, moves, [block for *_, block in averaged])
 
 
 def _step(fit: ShiftFit, moves: Sequence[FloatArray], blocks: Sequence[IndexArray]) -> dict[str, float]:

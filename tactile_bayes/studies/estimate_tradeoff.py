@@ -362,23 +362,21 @@ class Estimator(Record):
 
     tactile_map: TactileMap
     calibration: Calibration | None  #: From widths to sizes; None stops at widths.
-    seed: int  #: Of the random numbers.
-    clock: Clock  #: CPU seconds so far.
-    probability: float = INTERVAL  #: Of the intervals.
+    work: Work
 
     def run(self, options: SamplerSettings) -> Run:
         """A whole estimate, from the map to the size, as a function of the number of the run."""
         calibration = fitted_as(self.calibration, options)
 
         def once(number: int) -> tuple[dict[str, float], SizeAnswer]:
-            rng = np.random.default_rng([self.seed, number, self.tactile_map.fingerprint])
-            begun = self.clock()
+            rng = np.random.default_rng([self.work.seed, number, self.tactile_map.fingerprint])
+            begun = self.work.clock()
             try:
                 found = estimate_map(self.tactile_map, calibration=calibration, options=options, rng=rng)
-                answer = answer_of(found, probability=self.probability)
+                answer = answer_of(found, probability=self.work.probability)
             except NotConvergedError as error:
                 answer = SizeAnswer(str(error), code="method")
-            return {"estimate": self.clock() - begun}, answer
+            return {"estimate": self.work.clock() - begun}, answer
 
         return once
 
@@ -412,7 +410,7 @@ def measure(
     tactile_map: TactileMap, *, calibration: Calibration | None, options: SamplerSettings, work: Work
 ) -> Ladder:
     """Run every setting on one map, from the calibration and options that `estimate` takes by itself for it."""
-    estimator = Estimator(tactile_map, calibration, work.seed, work.clock, work.probability)
+    estimator = Estimator(tactile_map, calibration, work)
     seconds, answer = default_run(estimator.run(options))
     settings = worth_trying(settings_of(options, level_known=tactile_map.background is not None), answer)
     return climbed(settings, estimator.run, lambda: estimator.reference(options), default_s=seconds, work=work)

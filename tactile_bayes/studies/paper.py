@@ -260,9 +260,7 @@ def hard_cases(rows: Sequence[StudyRow]) -> list[StudyRow]:
 
 def widths(rows: Sequence[StudyRow], *, axis: str = "x") -> FloatArray:
     """(n,) widths across (``"x"``) or along the head (``"y"``; NaN in rows without one)."""
-    if axis == "x":
-        return np.array([row.sigma_x_mm for row in rows])
-    return np.array([np.nan if row.sigma_y_mm is None else row.sigma_y_mm for row in rows])
+    return np.array([getattr(row, f"sigma_{axis}_mm") for row in rows], dtype=np.float64)
 
 
 def width_changes(rows: Sequence[StudyRow], *, axis: str = "x") -> FloatArray:
@@ -384,11 +382,9 @@ def find_lookalikes(
     shares, added = {}, {}
     for d in diameters_mm:
         frames = [centred_frame(d, h, settings=coarse, seat=seat) for h in depth_ratios]
-        shares[d], added[d] = (
-            CubicSpline(depth_ratios, np.stack(values))(tried)
-            for values in ([one.share for one in frames], [one.added for one in frames])
-        )
-    best: tuple[float, float, float, float, float] | None = None
+        shares[d] = CubicSpline(depth_ratios, np.stack([one.share for one in frames]))(tried)
+        added[d] = CubicSpline(depth_ratios, np.stack([one.added for one in frames]))(tried)
+    pairs = []  # the gap, then diameter and depth of either lump
     for d, e in itertools.combinations(sorted(diameters_mm), 2):
         if LEAST_SIZE_RATIO * d > e:
             continue
@@ -396,11 +392,11 @@ def find_lookalikes(
         gaps /= np.sqrt(np.mean(added[d] ** 2, axis=1))[:, None]
         gaps[(_middle(added[d]) < LEAST_RISE)[:, None] | (_middle(added[e]) < LEAST_RISE)] = np.inf
         i, j = np.unravel_index(np.argmin(gaps), gaps.shape)
-        if np.isfinite(gaps[i, j]) and (best is None or gaps[i, j] < best[0]):
-            best = (float(gaps[i, j]), d, float(tried[i]), e, float(tried[j]))
-    if best is None:
+        if np.isfinite(gaps[i, j]):
+            pairs.append((float(gaps[i, j]), d, float(tried[i]), e, float(tried[j])))
+    if not pairs:
         return None
-    _, small_mm, small_depth, d_mm, depth = best
+    _, small_mm, small_depth, d_mm, depth = min(pairs)
     small = centred_frame(small_mm, small_depth, settings=settings, seat=seat)
 
     def gap(depth_ratio: float) -> float:

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from tactile_bayes.declarations import Record, as_dict, field, replace
-from tactile_bayes.errors import BadDataError, require
 from tactile_bayes.forward.axisymmetric import CondensedLump, LayeredBody, condense_lump
 from tactile_bayes.forward.mesh import LumpGeometry, MeshSize
 from tactile_bayes.forward.plane_strain import FINENESS
@@ -23,7 +22,7 @@ from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.bump import Bump, FitCells, window_cells
 from tactile_bayes.posterior.white import LEAST_WIDTH_IN_CELLS, MOST_AXIS_RATIO, WIDEST_IN_RADII
-from tactile_bayes.presets import FIT_RADIUS_MM
+from tactile_bayes.presets import FIT_RADIUS_MM, Background
 from tactile_bayes.scans import CountArray, ElementCalibration, HeadGeometry, PressureFrames, Scan, TrackerPoses
 from tactile_bayes.studies.paper import CaseSettings
 
@@ -141,7 +140,6 @@ def _lowest(cells: FitCells, ends: FloatArray, *, free: bool) -> FloatArray:
 
 REACH_MM = 33.0
 LINES_MM = (0.0, 6.0, 12.0)
-BACKGROUNDS = ("fixed", "free")
 _LEVEL = np.eye(3)
 
 
@@ -156,17 +154,9 @@ class SolidSettings(CaseSettings, kw_only=True):
     fit_radius_mm: float = FIT_RADIUS_MM  #: Eq 7 is fitted within this distance of the lump's axis.
     rank_tolerance: float = RANK_TOLERANCE  #: See `solid.skin_perturbation`.
     mesh_reach_mm: float = MeshSize().reach_mm  #: Radius at which the mesh ends, on a rim that does not move.
-    background: str = "free"  #: ``"free"``: Eq 7's level is fitted; ``"fixed"``: it is 1.
+    background: Background = "free"  #: ``"free"``: Eq 7's level is fitted; ``"fixed"``: it is 1.
     flat_field: bool = True
     """True when each taxel is divided by what it reads of the same body without the lump."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        half = self.head.rows * self.head.pitch_mm / 2
-        rule = f"be above {half:g} mm, half the head's width"
-        require(self.head.radius_mm > half, "radius_mm of the head", self.head.radius_mm, rule)
-        if self.background not in BACKGROUNDS:
-            raise BadDataError(f"background is {self.background!r}", way_out=f"it must be {' or '.join(BACKGROUNDS)}")
 
     def as_dict(self) -> dict[str, object]:
         """Plain data for a store's header."""
@@ -191,8 +181,15 @@ class SolidSettings(CaseSettings, kw_only=True):
 
     @property
     def mesh_size(self) -> MeshSize:
-        """Mesh size for the fineness and the reach."""
-        return mesh_size(self.fineness, reach_mm=self.mesh_reach_mm)
+        """Mesh size for the fineness and the reach; 2 is the default, and doubling it halves every element."""
+        default, share = MeshSize(), self.fineness / FINENESS
+        return MeshSize(
+            arc=round(default.arc * share),
+            rings=round(default.rings * share),
+            core=int(np.ceil(default.core * share)),
+            grade=float(default.grade ** (1.0 / share)),
+            reach_mm=self.mesh_reach_mm,
+        )
 
     def on(self, body: Body) -> SolidHead:
         """The head on the body without a lump."""
@@ -204,19 +201,6 @@ class SolidSettings(CaseSettings, kw_only=True):
             condensed, stiffness_ratio * self.fat_kpa, square_mm=self.head.pitch_mm, tolerance=self.rank_tolerance
         )
         return PlacedLump(change, 0.0, 0.0)
-
-
-def mesh_size(fineness: int, *, reach_mm: float = MeshSize().reach_mm) -> MeshSize:
-    """Mesh size of a fineness; 2 is the default, and doubling it halves every element."""
-    default = MeshSize()
-    share = fineness / FINENESS
-    return MeshSize(
-        arc=round(default.arc * share),
-        rings=round(default.rings * share),
-        core=int(np.ceil(default.core * share)),
-        grade=float(default.grade ** (1.0 / share)),
-        reach_mm=reach_mm,
-    )
 
 
 class RasterFrames(Record, eq=False):

@@ -10,6 +10,7 @@ import numpy as np
 from tactile_bayes.declarations import Meta, Record, as_dict, field, names_of, replace
 from tactile_bayes.errors import BadDataError, TactileBayesError
 from tactile_bayes.forward.scene import FLAT_MM, Background, Head, Noise, Scene, Strokes, Tracker
+from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.forward.tissue import SceneBody, SolidLump
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.build import build_map
@@ -207,16 +208,6 @@ def draw_mass(
     return scenes
 
 
-def centred(bodies: BodyPrior) -> BodyPrior:
-    """Copy the prior with every lump's centre on the fat-gland boundary, as in the paper."""
-    return replace(bodies, seat=(0.0, 0.0))
-
-
-def as_settings(bodies: BodyPrior, exams: ExamPrior) -> Mapping[str, object]:
-    """Plain data for a table's header and a calibration's provenance."""
-    return {"bodies": as_dict(bodies), "exams": as_dict(exams)}
-
-
 def _log_uniform(ends: Range, rng: np.random.Generator) -> float:
     return float(np.exp(rng.uniform(np.log(ends[0]), np.log(ends[1]))))
 
@@ -275,20 +266,36 @@ class MassRow(Record):
     head_rim_mm: float | None = None
 
 
-def measure_mass(
-    scenes: Sequence[Scene],
-    *,
-    body: int,
-    scan: Callable[[Scene], Scan],
-    normalise: Sequence[str] = (DEFAULT_NORMALISE,),
-) -> list[MassRow]:
-    """Scan each scene of a mass, map and fit it; returns a row for each scene and normalisation (a map by each from one
-    scan)."""
-    rows = []
-    for i, scene in enumerate(scenes):
-        made = scan(scene)
-        rows += [measure_exam(scene, made, body=body, exam=i, normalise=one) for one in normalise]
-    return rows
+class Population(Record):
+    """Masses to be drawn and examined: all that the rows of a table depend on."""
+
+    scans: int  #: Exams of each mass.
+    seed: int
+    first_centred: int | None = None
+    """From this mass on the lumps are centred on the gland's surface, as in the paper; None for no mass."""
+    normalise: tuple[str, ...] = (DEFAULT_NORMALISE,)  #: A map by each of these from one scan.
+    bodies: BodyPrior = field(default_factory=BodyPrior)
+    exams: ExamPrior = field(default_factory=ExamPrior)
+    head: Head = field(default_factory=Head)
+
+    def scenes(self, index: int) -> list[Scene]:
+        """The exams of one mass."""
+        centred = self.first_centred is not None and index >= self.first_centred
+        bodies = replace(self.bodies, seat=(0.0, 0.0)) if centred else self.bodies
+        return draw_mass(index, scans=self.scans, seed=self.seed, bodies=bodies, exams=self.exams, head=self.head)
+
+    def rows(self, index: int, scan: Callable[[Scene], Scan] | None = None) -> list[MassRow]:
+        """Scan each exam of a mass, by default with the scene's seed, map and fit it; a row for each normalisation."""
+        made = [(i, one, (scan or _scanned)(one)) for i, one in enumerate(self.scenes(index))]
+        return [
+            measure_exam(scene, scanned, body=index, exam=i, normalise=way)
+            for i, scene, scanned in made
+            for way in self.normalise
+        ]
+
+
+def _scanned(scene: Scene) -> Scan:
+    return simulate(scene, rng=np.random.default_rng(scene.seed)).scan
 
 
 def measure_exam(scene: Scene, scan: Scan, *, body: int, exam: int, normalise: str = DEFAULT_NORMALISE) -> MassRow:
@@ -365,10 +372,10 @@ def population_table(columns: Mapping[str, Sequence[float | None]]) -> Populatio
 
     A row without a profile of the head has NaN for it.
     """
-    kept = [i for i, found in enumerate(columns["detected"]) if found]
+    kept = np.flatnonzero(np.array(columns["detected"], dtype=bool))
 
     def column(name: str) -> FloatArray:
-        return np.array([columns[name][i] for i in kept], dtype=np.float64)
+        return np.array(columns[name], dtype=np.float64)[kept]
 
     covariance = np.empty((len(kept), 3, 3))
     for (i, j), name in zip(zip(*np.triu_indices(3), strict=True), SHAPE_COVARIANCE, strict=True):
@@ -376,10 +383,15 @@ def population_table(columns: Mapping[str, Sequence[float | None]]) -> Populatio
     sigma_x, sigma_y = np.log(column("sigma_x_mm")), np.log(column("sigma_y_mm"))
     varied = {name: column(name) for name in UNKNOWNS if name in columns}
     varied = {"depth_mm": column("depth_ratio") * column("d_mm"), **varied}
-    profile = _figures(columns, kept, HEAD_PROFILE)
+    profile = None
+    if all(name in columns for name in HEAD_PROFILE):
+        found = np.stack([column(name) for name in HEAD_PROFILE], axis=1)
+        whole = np.isfinite(found).all(axis=1)
+        found[~whole] = np.nan
+        profile = found if whole.any() else None
     boundary = (column("depth_ratio") + column("seat") / 2) * column("d_mm")
     return PopulationTable(
-        body=np.array([columns["body"][i] for i in kept]),
+        body=np.array(columns["body"])[kept],
         d_mm=column("d_mm"),
         log_amplitude=np.log(column("amplitude")),
         log_width=(sigma_x + sigma_y) / 2,
@@ -389,15 +401,3 @@ def population_table(columns: Mapping[str, Sequence[float | None]]) -> Populatio
         profile=profile,
         log_fat=None if profile is None else np.log(boundary),
     )
-
-
-def _figures(
-    columns: Mapping[str, Sequence[float | None]], kept: Sequence[int], names: Sequence[str]
-) -> FloatArray | None:
-    """(n, k) named figures of the chosen rows, NaN where a row lacks one of them; None where all rows do."""
-    if not all(name in columns for name in names):
-        return None
-    found = np.array([[columns[name][i] for name in names] for i in kept], dtype=np.float64).reshape(-1, len(names))
-    whole = np.isfinite(found).all(axis=1)
-    found[~whole] = np.nan
-    return found if whole.any() else None

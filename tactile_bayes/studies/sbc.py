@@ -336,8 +336,10 @@ def draw_map(truth: Truth, rng: np.random.Generator, prior: BumpPrior) -> Tactil
     level = 1.0 + slope[0] * axis + slope[1] * axis[:, None]
     errors = np.sqrt(reading_variance / count) * rng.standard_normal(count.shape)
     field = np.sqrt(truth.share) * truth.noise_sd * draw_field(axis, rng, length_mm=truth.length_mm)
+    centre, width = np.array([truth.x_mm, truth.y_mm]), np.array([truth.sigma_x_mm, truth.sigma_y_mm])
+    columns, rows = cell_mean_profile(axis - centre[:, None], sigma_mm=width, cell_mm=CELL_MM)
     return TactileMap(
-        mean=level + truth.amplitude * _bump(axis, truth) + errors + field,
+        mean=level + truth.amplitude * (rows[:, None] * columns) + errors + field,
         variance=np.full(count.shape, reading_variance),
         count=count.astype(np.int64),
         x_mm=axis,
@@ -345,13 +347,6 @@ def draw_map(truth: Truth, rng: np.random.Generator, prior: BumpPrior) -> Tactil
         recipe=MapRecipe("grid", "mean", CELL_MM),
         background=1.0,
     )
-
-
-def _bump(axis: FloatArray, truth: Truth) -> FloatArray:
-    """(n, n) cell means of a bump of unit height."""
-    centre, width = np.array([truth.x_mm, truth.y_mm]), np.array([truth.sigma_x_mm, truth.sigma_y_mm])
-    columns, rows = cell_mean_profile(axis - centre[:, None], sigma_mm=width, cell_mm=CELL_MM)
-    return np.asarray(rows[:, None] * columns)
 
 
 def draw_field(axis: FloatArray, rng: np.random.Generator, *, length_mm: float) -> FloatArray:

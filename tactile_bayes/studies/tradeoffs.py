@@ -22,11 +22,11 @@ from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.presets import CELL_MM, DEFAULT_NORMALISE, NORMALISE, SHOULDERS_INSIDE, THICKNESS_MM
 from tactile_bayes.scans import Scan
 from tactile_bayes.size.bodies import BodyCalibration, mean_width_mm
-from tactile_bayes.size.eq6 import SizeCalibration
 from tactile_bayes.size.pooling import Calibration
 from tactile_bayes.size.terms import outside_domain
 from tactile_bayes.studies.estimate_tradeoff import (
     Choice,
+    Clock,
     Estimator,
     Ladder,
     Reference,
@@ -57,12 +57,10 @@ EMPIRICAL, PLANE, SOLID = "empirical", "plane-strain", "solid"
 _PLANE = ((1, 0.5), (1, 0.25), (2, 0.5), (2, 0.25), (3, 0.25), (4, 0.125))
 _RANKS = (1e-3, 1e-4)
 _FINENESSES = (1, 2, 3)
-_REACHES_MM = (110.0,)
+_REACH_MM = 110.0
 # What Eq 6 is learned from where no calibration is given.
 _TAUGHT_MM = (10.0, 15.0, 20.0, 25.0)
 _TAUGHT_DEPTHS = (0.8, 1.0, 1.2)
-
-Clock = Callable[[], float]  #: Seconds of CPU.
 
 
 class LumpCase(Record):
@@ -152,31 +150,28 @@ def case_of(scene: Scene, *, head: str | None = None) -> LumpCase:
 
 def forward_settings(case: LumpCase) -> list[Setting]:
     """All settings to compare: within a model the cheap ones first, its reference last."""
-    found = [Setting(EMPIRICAL, "Eqs 1 to 4", case.plane, "default")]
-    for fineness, cell in _PLANE:
-        chosen = replace(case.plane, fineness=fineness, cell_mm=cell)
-        kind = _kind(chosen == case.plane, cell == case.plane.cell_mm, (fineness, cell) == _PLANE[-1], "contact cell")
+    plane, solid = case.plane, case.solid
+    found = [Setting(EMPIRICAL, "Eqs 1 to 4", plane, "default")]
+    for fineness, cell in _PLANE[:-1]:
+        chosen = replace(plane, fineness=fineness, cell_mm=cell)
+        kind = "default" if chosen == plane else "mesh" if cell == plane.cell_mm else "contact cell"
         found.append(Setting(PLANE, f"fineness {fineness}, cell {cell:g} mm", chosen, kind))
-    for fineness in _FINENESSES:
-        chosen_solid = replace(case.solid, fineness=fineness)
-        kind = _kind(chosen_solid == case.solid, True, fineness == _FINENESSES[-1], "")
-        found.append(Setting(SOLID, f"fineness {fineness}", chosen_solid, kind))
+    for fineness in _FINENESSES[:-1]:
+        finer = replace(solid, fineness=fineness)
+        found.append(Setting(SOLID, f"fineness {fineness}", finer, "default" if finer == solid else "mesh"))
     for rank in _RANKS:
-        found.append(Setting(SOLID, f"rank tolerance {rank:g}", replace(case.solid, rank_tolerance=rank), "rank"))
-    for reach in _REACHES_MM:
-        found.append(Setting(SOLID, f"mesh ends at {reach:g} mm", replace(case.solid, mesh_reach_mm=reach), "reach"))
-    edge = "shoulders" if case.solid.head.shoulders == SHOULDERS_INSIDE else "rim"
-    bare = replace(case.solid, head=replace(case.solid.head, shoulder_mm=0.0, rim_mm=0.0))
-    found.append(Setting(SOLID, f"head without its {edge}", bare, "rim"))
-    return [setting for setting in found if setting.kind != "reference"] + [
-        setting for setting in found if setting.kind == "reference"
+        found.append(Setting(SOLID, f"rank tolerance {rank:g}", replace(solid, rank_tolerance=rank), "rank"))
+    edge = "shoulders" if solid.head.shoulders == SHOULDERS_INSIDE else "rim"
+    bare = replace(solid, head=replace(solid.head, shoulder_mm=0.0, rim_mm=0.0))
+    (fineness, cell), finest = _PLANE[-1], _FINENESSES[-1]
+    reference = replace(plane, fineness=fineness, cell_mm=cell)
+    return [
+        *found,
+        Setting(SOLID, f"mesh ends at {_REACH_MM:g} mm", replace(solid, mesh_reach_mm=_REACH_MM), "reach"),
+        Setting(SOLID, f"head without its {edge}", bare, "rim"),
+        Setting(PLANE, f"fineness {fineness}, cell {cell:g} mm", reference, "reference"),
+        Setting(SOLID, f"fineness {finest}", replace(solid, fineness=finest), "reference"),
     ]
-
-
-def _kind(default: bool, mesh_only: bool, reference: bool, other: str) -> str:
-    if reference:
-        return "reference"
-    return "default" if default else "mesh" if mesh_only else other
 
 
 def measure_forward(case: LumpCase, setting: Setting, *, clock: Clock, runs: int = 1) -> Measured:
@@ -296,44 +291,34 @@ def learned_rule(rows: Sequence[StudyRow]) -> SizeRule:
 
 
 def calibrated_rule(calibration: Calibration, *, name: str) -> SizeRule:
-    """The point estimate of a calibration of either form; `name` is for people."""
+    """The point estimate of a calibration of either form, with its mean coefficients; `name` is for people.
+
+    Over a population it is the median of what `pooled_size` draws for a round lump in a body of which nothing is known,
+    where the map says a and the widths exactly. A map in two dimensions has one width, which stands for both.
+    """
     if isinstance(calibration, BodyCalibration):
-        return _body_rule(calibration, name)
-    return _eq6_rule(calibration, name)
+        population = calibration
 
+        def size(amplitude: float, sigma_x_mm: float, sigma_y_mm: float | None) -> list[float]:
+            width = mean_width_mm(sigma_x_mm, sigma_y_mm)
+            return [float(np.exp(population.corrected_log_size(np.log(np.array(amplitude)), np.log(np.array(width)))))]
 
-def _eq6_rule(calibration: SizeCalibration, name: str) -> SizeRule:
-    """Eq 6 with its mean coefficients for each axis of the head."""
+        scatter = calibration.fit.get("left_out_sd", float(np.exp(calibration.spread.mean[0])))
+        form = "Eq 6" if calibration.residual is None else "Eq 6 and its residual"
+        return SizeRule(size, float(scatter), f"{form} of {name}", calibration.outside)
+    axes = (calibration.x, calibration.y)
 
-    def sizes(amplitude: float, sigma_x_mm: float, sigma_y_mm: float | None) -> list[float]:
-        a = np.array([amplitude])
-        found = [float(calibration.x.size_mm(np.array([sigma_x_mm]), a)[0])]
-        if sigma_y_mm is not None:
-            found.append(float(calibration.y.size_mm(np.array([sigma_y_mm]), a)[0]))
-        return found
+    def sizes(amplitude: float, *widths_mm: float | None) -> list[float]:
+        a, given = np.array([amplitude]), zip(axes, widths_mm, strict=True)
+        return [float(axis.size_mm(np.array([width]), a)[0]) for axis, width in given if width is not None]
 
-    def outside(amplitude: float, sigma_x_mm: float, sigma_y_mm: float | None) -> list[str]:
-        along = [] if sigma_y_mm is None else outside_domain(calibration.y.domain, amplitude, sigma_y_mm)
-        return list(dict.fromkeys([*outside_domain(calibration.x.domain, amplitude, sigma_x_mm), *along]))
+    def outside(amplitude: float, *widths_mm: float | None) -> list[str]:
+        given = [(axis, width) for axis, width in zip(axes, widths_mm, strict=True) if width is not None]
+        return list(
+            dict.fromkeys(one for axis, width in given for one in outside_domain(axis.domain, amplitude, width))
+        )
 
     return SizeRule(sizes, float(calibration.x.draws.mean(axis=0)[4]), f"Eq 6 of {name}", outside)
-
-
-def _body_rule(calibration: BodyCalibration, name: str) -> SizeRule:
-    """A calibration over a population with its mean coefficients, for a round lump in a body of which nothing is known.
-
-    It is the median of what `pooled_size` draws where the map says a and the widths exactly. A map in two dimensions
-    has one width, which stands for both.
-    """
-
-    def sizes(amplitude: float, sigma_x_mm: float, sigma_y_mm: float | None) -> list[float]:
-        width = mean_width_mm(sigma_x_mm, sigma_y_mm)
-        log_a, log_width = np.log(np.array(amplitude)), np.log(np.array(width))
-        return [float(np.exp(calibration.corrected_log_size(log_a, log_width)))]
-
-    scatter = calibration.fit.get("left_out_sd", float(np.exp(calibration.spread.mean[0])))
-    form = "Eq 6" if calibration.residual is None else "Eq 6 and its residual"
-    return SizeRule(sizes, float(scatter), f"{form} of {name}", calibration.outside)
 
 
 # --- Cost of accuracy before the map: cells, frames, time of strokes and normalising, each up to the size.
@@ -390,8 +375,7 @@ def measure_map(scan: Scan, *, inputs: Inputs, work: Work) -> Ladder:
                 tactile_map = build_map(used, **one.options)
                 built_s = clock() - begun
                 calibration, options = inputs(tactile_map)
-                estimator = Estimator(tactile_map, calibration, work.seed, clock, work.probability)
-                seconds, answer = estimator.run(options)(number)
+                seconds, answer = Estimator(tactile_map, calibration, work).run(options)(number)
             except BadDataError as error:
                 if one == settings[0].how:
                     raise
@@ -409,6 +393,6 @@ def _reference(scan: Scan, inputs: Inputs, work: Work) -> Reference:
     begun = work.clock()
     finest = build_map(scan, cell_mm=FINEST_CELL_MM)
     calibration, options = inputs(finest)
-    found = Estimator(finest, calibration, work.seed, work.clock, work.probability).reference(options)
+    found = Estimator(finest, calibration, work).reference(options)
     words = found.words.replace("the default's posterior", f"the map of all frames in cells of {FINEST_CELL_MM:g} mm")
     return replace(found, words=words, cpu_s=work.clock() - begun)

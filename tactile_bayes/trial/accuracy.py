@@ -64,18 +64,19 @@ def figure_with_misses(
     *,
     scale: Scale,
     confidence: float,
-    weight: Callable[[ModalitySizes], FloatArray],
+    power: int,
     missed: Callable[[ModalitySizes], float],
 ) -> Figure:
     r"""Weighted mean over masses, found and missed, with an interval over patients.
 
-    `weight` gives the (n,) weights of the mean, `missed` what the mean would be if every mass were missed.
+    The weights of the mean go with this `power` of the ex-vivo size; `missed` is the mean if every mass were missed.
 
     The mean is :math:`(1 - p) a + p b` with the missed share p of the weights, a over masses found and b if all were
     missed. The corrected interval recovers the variances of a and p from their own intervals (Zou & Donner 2008, Stat.
     Med. 27, 1693): a's is the jackknife's, p's that of Jeffreys' prior for the effective number of patients. Other
     methods treat a miss as one more size.
     """
+    weight = partial(weight_by_size, power=power)
     plain = figure(statistic, sizes, scale=scale, confidence=confidence, leverage=weight)
     if method_of(confidence) != "corrected" or plain.value is None:
         return plain
@@ -101,19 +102,9 @@ def share_interval(share: float, number: float, *, confidence: float) -> Ends:
     return min(share, float(betaincinv(a, b, tail))), max(share, float(betaincinv(a, b, 1 - tail)))
 
 
-def alike(sizes: ModalitySizes) -> FloatArray:
-    """Equal weights of 1."""
-    return np.ones_like(sizes.ex_vivo_mm)
-
-
-def by_size(sizes: ModalitySizes) -> FloatArray:
-    """Weights by ex-vivo size, over the largest."""
-    return np.asarray(sizes.ex_vivo_mm / sizes.ex_vivo_mm.max())
-
-
-def by_square(sizes: ModalitySizes) -> FloatArray:
-    """Weights by squared ex-vivo size, over the largest."""
-    return by_size(sizes) ** 2
+def weight_by_size(sizes: ModalitySizes, *, power: int) -> FloatArray:
+    """Weights by a power of the ex-vivo size, over the largest; 0 weighs all masses alike."""
+    return np.asarray((sizes.ex_vivo_mm / sizes.ex_vivo_mm.max()) ** power)
 
 
 # --- Accuracy against excision: percent and mm errors, and bias.
@@ -128,9 +119,9 @@ def accuracy_figures(sizes: ModalitySizes, *, confidence: float) -> dict[str, Fi
     return {
         "mape_percent": mape_figure(sizes, confidence=confidence),
         "mape_detected_percent": figure(mape_percent, found, scale="log", confidence=confidence),
-        "mae_mm": on_log(mae_mm, sizes, weight=alike, missed=lambda one: float(one.ex_vivo_mm.mean())),
+        "mae_mm": on_log(mae_mm, sizes, power=0, missed=lambda one: float(one.ex_vivo_mm.mean())),
         "mae_detected_mm": figure(mae_mm, found, scale="log", confidence=confidence),
-        "weighted_mape_percent": on_log(weighted_mape_percent, sizes, weight=by_size, missed=lambda _: 100.0),
+        "weighted_mape_percent": on_log(weighted_mape_percent, sizes, power=1, missed=lambda _: 100.0),
         "median_error_percent": figure(median_percent, sizes),
         "bias_percent": bias.mapped(lambda ratio: 100 * (ratio - 1)),
     }
@@ -138,9 +129,7 @@ def accuracy_figures(sizes: ModalitySizes, *, confidence: float) -> dict[str, Fi
 
 def mape_figure(sizes: ModalitySizes, *, confidence: float) -> Figure:
     """Percent error with its interval; a mass not found counts as 100 %."""
-    return figure_with_misses(
-        mape_percent, sizes, scale="log", confidence=confidence, weight=alike, missed=lambda _: 100.0
-    )
+    return figure_with_misses(mape_percent, sizes, scale="log", confidence=confidence, power=0, missed=lambda _: 100.0)
 
 
 def _mm_errors(sizes: ModalitySizes) -> FloatArray:
@@ -198,7 +187,7 @@ def origin_line_figures(sizes: ModalitySizes, *, confidence: float) -> dict[str,
     result: dict[str, Figure] = {}
     for suffix, subset in (("", sizes), ("_detected", sizes.only_detected())):
         result[f"slope_through_origin{suffix}"] = figure_with_misses(
-            slope, subset, scale="linear", confidence=confidence, weight=by_square, missed=lambda _: 0.0
+            slope, subset, scale="linear", confidence=confidence, power=2, missed=lambda _: 0.0
         )
         result[f"r2_centred{suffix}"] = figure(r2_centred, subset)
         result[f"r2_uncentred{suffix}"] = figure(r2_uncentred, subset)

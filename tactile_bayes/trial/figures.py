@@ -135,18 +135,9 @@ class SumStatistic(Record):
             raise UndefinedError(self.undefined)
         return value
 
-    def left_out(self, sizes: ModalitySizes, patients: npt.NDArray[np.int64]) -> FloatArray:
-        """(g,) statistic without each patient in turn; a patient without a mass changes nothing."""
+    def by_patient(self, sizes: ModalitySizes, patients: npt.NDArray[np.int64]) -> FloatArray:
+        """(g, k) sums of the terms within each patient; 0 for one without a mass."""
         terms = self.terms(sizes)
-        return self.finish(terms.sum(axis=0) - self.by_patient(terms, sizes, patients))
-
-    def redrawn(self, sizes: ModalitySizes, patients: npt.NDArray[np.int64], draws: FloatArray) -> FloatArray:
-        """(b,) statistic for each row of (b, g) `draws`: how often each patient was drawn."""
-        return self.finish(draws @ self.by_patient(self.terms(sizes), sizes, patients))
-
-    @staticmethod
-    def by_patient(terms: FloatArray, sizes: ModalitySizes, patients: npt.NDArray[np.int64]) -> FloatArray:
-        """(g, k) sums of the terms within each patient."""
         sums = np.zeros((len(patients), terms.shape[1]))
         np.add.at(sums, np.searchsorted(patients, sizes.patient), terms)
         return sums
@@ -376,7 +367,8 @@ class Sample(Record):
     def _without_each(self, sizes: ModalitySizes, patients: npt.NDArray[np.int64]) -> FloatArray:
         if isinstance(self.statistic, SumStatistic):
             with np.errstate(all="ignore"):
-                values = self.statistic.left_out(sizes, patients)
+                sums = self.statistic.by_patient(sizes, patients)
+                values = self.statistic.finish(sums.sum(axis=0) - sums)
             if np.all(np.abs(values) < LARGEST):
                 return values
         return np.array([finite(self.statistic, sizes.without(one)) for one in patients.tolist()])
@@ -384,7 +376,7 @@ class Sample(Record):
     def _drawn_anew(self, sizes: ModalitySizes, patients: npt.NDArray[np.int64], draws: FloatArray) -> FloatArray:
         if isinstance(self.statistic, SumStatistic):
             with np.errstate(all="ignore"):
-                return self.statistic.redrawn(sizes, patients, draws)
+                return self.statistic.finish(draws @ self.statistic.by_patient(sizes, patients))
         values = np.full(len(draws), np.nan)
         times = draws[:, np.searchsorted(patients, sizes.patient)].astype(np.int64)
         for i, of_mass in enumerate(times):

@@ -99,8 +99,9 @@ def check_intervals(
     """
     if len(sizes.patients) < MIN_PATIENTS:
         return None
-    truth = model.true_mape_percent
-    ends = np.array(list(_ends(sizes, model, confidence=confidence, trials=trials, seed=seed)))
+    truth, rng = model.true_mape_percent, np.random.default_rng([seed, len(sizes.size_mm)])
+    made = (simulate(sizes.patient, sizes.ex_vivo_mm, model, rng=rng) for _ in range(trials))
+    ends = np.array([mape_figure(one, confidence=confidence).interval or (math.nan, math.nan) for one in made])
     defined = ends[np.isfinite(ends[:, 0])]
     if len(defined) == 0:
         return None
@@ -130,18 +131,6 @@ def check_all(
         if (model := observed_errors(one)) is not None
     }
     return {name: check for name, check in checks.items() if check is not None}
-
-
-def _ends(
-    sizes: ModalitySizes, model: ErrorModel, *, confidence: float, trials: int, seed: int
-) -> list[tuple[float, float]]:
-    rng = np.random.default_rng([seed, len(sizes.size_mm)])
-    ends = []
-    for _ in range(trials):
-        one = simulate(sizes.patient, sizes.ex_vivo_mm, model, rng=rng)
-        found = mape_figure(one, confidence=confidence).interval
-        ends.append(found or (math.nan, math.nan))
-    return ends
 
 
 # --- Trial planning by simulation: power, widths of intervals and the value of more maps per mass.
@@ -252,17 +241,18 @@ def designs(patients: Sequence[int], maps: Sequence[int], **assumptions: Any) ->
 
 def run_case(case: PlanCase) -> Design:
     """Simulate the trials of one design."""
-    found = [_trial(case, trial) for trial in range(case.trials)]
-    wins = sum(one.won for one in found)
+    found = np.array([_trial(case, trial) for trial in range(case.trials)], dtype=np.float64)
+    won, tactile, other, tactile_width, ratio_width = found.T
+    wins = int(won.sum())
     return Design(
         patients=case.patients,
         maps=case.maps,
         power=wins / case.trials,
         power_interval=clopper_pearson(wins, case.trials, confidence=0.95),
-        tactile_percent=float(np.mean([one.tactile for one in found])),
-        other_percent=float(np.mean([one.other for one in found])),
-        tactile_width_ratio=_median([one.tactile_width for one in found]),
-        ratio_width_ratio=_median([one.ratio_width for one in found]),
+        tactile_percent=float(tactile.mean()),
+        other_percent=float(other.mean()),
+        tactile_width_ratio=_median(tactile_width),
+        ratio_width_ratio=_median(ratio_width),
     )
 
 
@@ -367,16 +357,12 @@ def _line(x: FloatArray, y: FloatArray, weight: FloatArray) -> tuple[FloatArray,
     return covariance @ design.T @ (weight * y), covariance
 
 
-class _Found(Record):
-    won: bool
-    tactile: float
-    other: float
-    tactile_width: float | None
-    ratio_width: float | None
+def _trial(case: PlanCase, number: int) -> tuple[float, ...]:
+    """Simulate one trial: 1 where it is won, both mean errors, and the widths of the intervals of the tactile one and
+    of their ratio, NaN where there is none.
 
-
-def _trial(case: PlanCase, number: int) -> _Found:
-    """Simulate one trial; designs that differ only in maps get the same masses, for a precise difference."""
+    Designs that differ only in maps get the same masses, for a precise difference.
+    """
     n, rng = case.patients, np.random.default_rng([case.seed, case.patients, number])
     ex_vivo = MEDIAN_MM * np.exp(rng.normal(0, SIZE_LOG_SD, n))
     shared = rng.normal(case.tactile_bias, case.mass_sd, n)
@@ -388,13 +374,9 @@ def _trial(case: PlanCase, number: int) -> _Found:
     p = sign_flip(off, seed=number, flips=FLIPS)
     error = mape_figure(tactile_sizes, confidence=Intervals(case.confidence, method="corrected"))
     ratio = mape_ratio(other_sizes, tactile_sizes, confidence=case.confidence)
-    return _Found(
-        won=p is not None and p < LEVEL and float(off.sum()) < 0,
-        tactile=mape_percent(tactile_sizes),
-        other=mape_percent(other_sizes),
-        tactile_width=_width(error.interval),
-        ratio_width=_width(ratio.interval),
-    )
+    won = p is not None and p < LEVEL and float(off.sum()) < 0
+    widths = (_width(error.interval), _width(ratio.interval))
+    return won, mape_percent(tactile_sizes), mape_percent(other_sizes), *widths
 
 
 def _sizes(name: str, ex_vivo_mm: FloatArray, size_mm: FloatArray) -> ModalitySizes:
@@ -402,13 +384,13 @@ def _sizes(name: str, ex_vivo_mm: FloatArray, size_mm: FloatArray) -> ModalitySi
     return ModalitySizes(name, np.arange(n), ex_vivo_mm, size_mm, (np.zeros(0),) * n)
 
 
-def _width(ends: tuple[float, float] | None) -> float | None:
-    return None if ends is None or ends[0] <= 0 else ends[1] / ends[0]
+def _width(ends: Ends | None) -> float:
+    return math.nan if ends is None or ends[0] <= 0 else ends[1] / ends[0]
 
 
-def _median(values: Sequence[float | None]) -> float | None:
-    known = [value for value in values if value is not None and math.isfinite(value)]
-    return float(np.median(known)) if known else None
+def _median(values: FloatArray) -> float | None:
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if len(known) else None
 
 
 def assumptions_from(

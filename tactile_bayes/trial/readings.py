@@ -131,6 +131,12 @@ class ModalitySizes(Record, eq=False):
         return self.only(self.patient != patient)
 
 
+_COLUMNS = (
+    *("patient", "mass", "modality", "replicate", "status", "size_mm", "low_mm", "high_mm", "probability"),
+    *("synthetic", "sd_mm", "reader", "visit", "date"),
+)
+
+
 def readings_from_columns(columns: Mapping[str, Sequence[Any]], *, fault: CellFault) -> list[Reading]:
     """Make readings from a trial table's columns, checking rules between the cells of a row.
 
@@ -138,18 +144,14 @@ def readings_from_columns(columns: Mapping[str, Sequence[Any]], *, fault: CellFa
     is a size without detection or detection without a size, and an interval that is incomplete, upside down, does not
     contain the reading's own size, or is stated for a mass that was not found.
     """
-    names = ("patient", "mass", "modality", "replicate", "status", "size_mm", "low_mm", "high_mm", "probability")
+    blank: list[None] = [None] * len(columns["patient"])
     readings = []
-    optional = ("sd_mm", "reader", "visit", "date")
-    synthetic = columns.get("synthetic", [None] * len(columns["patient"]))
-    more = [synthetic, *(columns.get(name, [None] * len(columns["patient"])) for name in optional)]
-    for row, cells in enumerate(zip(*(columns[name] for name in names), *more, strict=True)):
-        patient, mass, modality, replicate, status, size_mm, low_mm, high_mm, probability, *others = cells
+    for row, cells in enumerate(zip(*(columns.get(name, blank) for name in _COLUMNS), strict=True)):
+        patient, mass, modality, replicate, status, size_mm, low_mm, high_mm, probability, synthetic, *said = cells
         status = _status(row, status, size_mm, fault=fault)
-        interval = _interval(row, status, size_mm, (low_mm, high_mm, probability), fault=fault)
-        made, *said = others
+        interval = _interval(row, status, size_mm, low_mm, high_mm, probability, fault=fault)
         key = (patient, mass)
-        readings.append(Reading(key, modality, replicate, status, size_mm, interval, bool(made), *said))
+        readings.append(Reading(key, modality, replicate, status, size_mm, interval, bool(synthetic), *said))
     return readings
 
 
@@ -172,20 +174,19 @@ def _interval(
     row: int,
     status: str,
     size_mm: float | None,
-    cells: tuple[float | None, float | None, float | None],
+    low_mm: float | None,
+    high_mm: float | None,
+    probability: float | None,
     *,
     fault: CellFault,
 ) -> Interval | None:
-    low_mm, high_mm, probability = cells
-    if low_mm is None and high_mm is None and probability is None:
-        return None
-    for name, cell in zip(("low_mm", "high_mm", "probability"), cells, strict=True):
-        if cell is None:
-            way_out = "an interval needs low_mm, high_mm and probability, or all three blank"
-            raise fault(row, name, "is blank while the interval's other cells are not", way_out=way_out)
-    assert low_mm is not None
-    assert high_mm is not None
-    assert probability is not None
+    if low_mm is None or high_mm is None or probability is None:
+        cells = {"low_mm": low_mm, "high_mm": high_mm, "probability": probability}
+        blank = [name for name, cell in cells.items() if cell is None]
+        if len(blank) == len(cells):
+            return None
+        way_out = "an interval needs low_mm, high_mm and probability, or all three blank"
+        raise fault(row, blank[0], "is blank while the interval's other cells are not", way_out=way_out)
     if status != "detected":
         way_out = "leave the interval blank, or give status detected"
         raise fault(row, "low_mm", f"is {low_mm:g} while status is {status}", way_out=way_out)

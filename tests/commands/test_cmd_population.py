@@ -15,7 +15,7 @@ from tactile_bayes.files.size_json import read_size_calibration
 from tactile_bayes.files.tables import read_table
 from tactile_bayes.forward.scene import Head
 from tactile_bayes.size.bodies import BodyCalibration
-from tactile_bayes.studies.population import BodyPrior, MassRow, centred, draw_mass, head_columns, measure_mass
+from tactile_bayes.studies.population import BodyPrior, MassRow, Population, draw_mass, head_columns
 
 PHANTOMS = Path(tactile_bayes.__file__).parent / "demo" / "phantoms.csv"
 
@@ -58,8 +58,8 @@ def test_every_drawn_body_can_be() -> None:
 
 
 def test_centred_bodies_are_the_papers() -> None:
-    (scene,) = draw_mass(3, scans=1, seed=7, bodies=centred(BodyPrior()))
-    assert scene.solid_lumps[0].seat == 0.0
+    drawn = Population(scans=1, seed=7, first_centred=3)
+    assert [drawn.scenes(i)[0].solid_lumps[0].seat == 0.0 for i in (2, 3, 4)] == [False, True, True]
 
 
 def test_the_table_has_the_columns_its_schema_names(table: Path) -> None:
@@ -155,11 +155,11 @@ def test_an_interrupted_run_goes_on_and_gives_the_same_table(tmp_path: Path, mon
     """With the simulation stood in for by rows that come from the mass's number alone."""
     calls: list[int] = []
 
-    def quick(index: int, *, scans: int, seed: int, **_: int) -> list[MassRow]:
+    def quick(index: int, *, population: Population) -> list[MassRow]:
         calls.append(index)
         if index == 3 and calls.count(3) == 1:
             raise KeyboardInterrupt
-        return [row(index, exam, seed=seed) for exam in range(scans)]
+        return [row(index, exam, seed=population.seed) for exam in range(population.scans)]
 
     monkeypatch.setattr(population, "rows_of_mass", quick)
     words = ("population", "--masses", 6, "-o", "p.csv")
@@ -179,14 +179,14 @@ def test_a_scan_of_a_plain_lump_is_measured_as_a_patients() -> None:
     from tactile_bayes.forward.scene import Lump
     from tactile_bayes.forward.simulate import simulate
 
-    scenes = draw_mass(2, scans=2, seed=7)
+    drawn = Population(scans=2, seed=7)
 
     def scan(scene):
         bumps = (Lump(x_mm=1.0, y_mm=-1.0, amplitude=0.5, sigma_x_mm=5.0, sigma_y_mm=4.0),)
         plain = replace(scene, body=None, solid_lumps=(), lumps=bumps)
         return simulate(plain, rng=np.random.default_rng(scene.seed)).scan
 
-    rows = measure_mass(scenes, body=2, scan=scan)
+    rows = drawn.rows(2, scan)
     assert [r.exam for r in rows] == [0, 1]
     for found in rows:
         assert found.detected
@@ -195,7 +195,7 @@ def test_a_scan_of_a_plain_lump_is_measured_as_a_patients() -> None:
         assert found.var_p is not None
         assert 0 < found.var_p < 0.05**2
 
-    both = measure_mass(scenes, body=2, scan=scan, normalise=("gain", "mean"))
+    both = replace(drawn, normalise=("gain", "mean")).rows(2, scan)
     assert [(r.exam, r.normalise) for r in both] == [(0, "gain"), (0, "mean"), (1, "gain"), (1, "mean")]
     assert both[::2] == rows
     assert both[1].amplitude != both[0].amplitude
@@ -203,4 +203,4 @@ def test_a_scan_of_a_plain_lump_is_measured_as_a_patients() -> None:
     def nothing(scene):
         return simulate(replace(scene, body=None, solid_lumps=()), rng=np.random.default_rng(scene.seed)).scan
 
-    assert not any(r.detected for r in measure_mass(scenes, body=2, scan=nothing))
+    assert not any(r.detected for r in drawn.rows(2, nothing))

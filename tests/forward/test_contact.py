@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward import contact
-from tactile_bayes.forward.contact import Head, solve_contact
+from tactile_bayes.forward.contact import Contact, ContactStiffness, Head, solve_contact
 from tactile_bayes.forward.line import build_line, head_positions, press, press_layers, slide
 from tactile_bayes.forward.plane_strain import SurfaceCompliance, condense, surface_compliance
 from tactile_bayes.forward.tissue import Body, Layers
@@ -29,13 +29,17 @@ def toeplitz(count: int, cell_mm: float, layers: Layers = DEEP) -> np.ndarray:
     return row[np.abs(index[:, None] - index[None, :])]
 
 
+def pressed(compliance: np.ndarray, profile: np.ndarray, total_kpa: float) -> Contact:
+    """The head under a sum of its cells' pressures."""
+    return solve_contact(ContactStiffness.of(compliance), profile, mean_kpa=total_kpa / len(profile))
+
+
 def test_a_cylinder_presses_as_hertz_says() -> None:
     """Line contact, Johnson (1985) section 4.2(c): half width and peak pressure of a half-ellipse."""
     cell, radius, half_width = 0.1, 200.0, 4.0
     head = Head(width_mm=12.0, radius_mm=radius, shoulder_mm=0.0)
     force = np.pi * PLANE_KPA * half_width**2 / (4 * radius)
-    found = solve_contact(toeplitz(120, cell)[None], head.cell_profile_mm(cell), total_kpa=force / cell)
-    pressure = found.pressure_kpa[0]
+    pressure = pressed(toeplitz(120, cell), head.cell_profile_mm(cell), force / cell).pressure_kpa
     assert pressure.max() == pytest.approx(2 * force / (np.pi * half_width), rel=3e-3)
     assert np.count_nonzero(pressure) * cell == pytest.approx(2 * half_width, abs=2 * cell)
     s = cell * (np.arange(120) - 59.5)
@@ -48,9 +52,7 @@ def test_the_peak_converges_to_hertz() -> None:
     for cell in (0.4, 0.2, 0.1):
         head = Head(width_mm=12.0, radius_mm=400.0, shoulder_mm=0.0)
         force = np.pi * PLANE_KPA * 4.1**2 / 1600.0
-        found = solve_contact(
-            toeplitz(round(12 / cell), cell)[None], head.cell_profile_mm(cell), total_kpa=force / cell
-        )
+        found = pressed(toeplitz(round(12 / cell), cell), head.cell_profile_mm(cell), force / cell)
         errors.append(abs(found.pressure_kpa.max() / (2 * force / (np.pi * 4.1)) - 1))
     assert errors[-1] < errors[0] / 3
 
@@ -60,22 +62,21 @@ def test_a_flat_punch_presses_hardest_at_its_edges() -> None:
     cell, half = 0.25, 12.0
     flat = Head(width_mm=24.0, radius_mm=np.inf, shoulder_mm=0.0)
     assert (flat.cell_profile_mm(cell) == 0).all()
-    found = solve_contact(toeplitz(96, cell)[None], flat.cell_profile_mm(cell), total_kpa=96.0)
+    found = pressed(toeplitz(96, cell), flat.cell_profile_mm(cell), 96.0)
     edges = np.linspace(-half, half, 97)
     exact = 96 * np.diff(np.arcsin(edges / half)) / np.pi
-    np.testing.assert_allclose(found.pressure_kpa[0, 12:-12], exact[12:-12], rtol=5e-3)
-    np.testing.assert_allclose(found.pressure_kpa[0, 4:-4], exact[4:-4], rtol=1e-2)
-    np.testing.assert_allclose(found.pressure_kpa[0], exact, rtol=0.16)  # the edge itself is singular
+    np.testing.assert_allclose(found.pressure_kpa[12:-12], exact[12:-12], rtol=5e-3)
+    np.testing.assert_allclose(found.pressure_kpa[4:-4], exact[4:-4], rtol=1e-2)
+    np.testing.assert_allclose(found.pressure_kpa, exact, rtol=0.16)  # the edge itself is singular
 
 
-def complementarity_holds(found: contact.Contact, compliance: np.ndarray, profile: np.ndarray, total: float) -> None:
+def complementarity_holds(found: Contact, compliance: np.ndarray, profile: np.ndarray, total: float) -> None:
     p, w = found.pressure_kpa, found.gap_mm
-    assert (p >= 0).all()
-    assert (w >= 0).all()
+    assert p.min() >= -1e-11 * total
+    assert w.min() >= -1e-11 * found.depth_mm
     assert np.abs(p * w).max() <= 1e-10
-    np.testing.assert_allclose(p.sum(axis=1), total, rtol=1e-10)
-    gap = np.einsum("mij,mj->mi", compliance, p) + profile - found.depth_mm[:, None]
-    np.testing.assert_allclose(gap, w, rtol=0, atol=1e-10)
+    assert p.sum() == pytest.approx(total, rel=1e-10)
+    np.testing.assert_allclose(compliance @ p + profile - found.depth_mm, w, rtol=0, atol=1e-9 * found.depth_mm)
 
 
 @given(seed=st.integers(0, 2**31), rough=st.floats(0.0, 1.0), total=st.floats(0.1, 1e4))
@@ -83,17 +84,17 @@ def test_whatever_the_profile_each_cell_touches_or_is_free(seed: int, rough: flo
     rng = np.random.default_rng(seed)
     profile = Head().cell_profile_mm(0.5) + rough * rng.normal(size=48)
     profile -= profile.min()
-    compliance = toeplitz(48, 0.5, Layers(12.0))[None]
-    found = solve_contact(compliance, profile, total_kpa=total)
+    compliance = toeplitz(48, 0.5, Layers(12.0))
+    found = pressed(compliance, profile, total)
     complementarity_holds(found, compliance, profile, total)
 
 
 def test_one_cell_at_a_time_gives_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     profile = Head().cell_profile_mm(0.5) + 0.3 * np.sin(np.arange(48.0))
-    compliance = toeplitz(48, 0.5, Layers(12.0))[None]
-    together = solve_contact(compliance, profile, total_kpa=30.0)
-    monkeypatch.setattr(contact, "_MOST_ROUNDS", 0)
-    singly = solve_contact(compliance, profile, total_kpa=30.0)
+    compliance = toeplitz(48, 0.5, Layers(12.0))
+    together = pressed(compliance, profile, 30.0)
+    monkeypatch.setattr(contact, "_PATIENCE", 0)
+    singly = pressed(compliance, profile, 30.0)
     assert (singly.pressure_kpa > 0).sum() < 48
     np.testing.assert_allclose(singly.pressure_kpa, together.pressure_kpa, rtol=0, atol=1e-9)
     complementarity_holds(singly, compliance, profile, 30.0)
@@ -101,10 +102,10 @@ def test_one_cell_at_a_time_gives_the_same(monkeypatch: pytest.MonkeyPatch) -> N
 
 def test_contact_on_a_lump_is_complementary_too(surface: SurfaceCompliance) -> None:
     matrix = surface.with_lump(100.0)
-    windows = np.stack([matrix[i : i + 96, i : i + 96] for i in range(0, 480, 16)])
     profile = Head().cell_profile_mm(0.25)
-    for total in (5.0, 96 * 9.5):
-        complementarity_holds(solve_contact(windows, profile, total_kpa=total), windows, profile, total)
+    for window in (matrix[i : i + 96, i : i + 96] for i in range(0, 480, 16)):
+        for total in (5.0, 96 * 9.5):
+            complementarity_holds(pressed(window, profile, total), window, profile, total)
 
 
 def test_the_shape_of_the_head() -> None:
@@ -138,8 +139,6 @@ def test_impossible_heads_are_named(options: dict[str, float], words: list[str])
 def test_what_cannot_be_pressed_is_said(surface: SurfaceCompliance) -> None:
     with pytest.raises(BadDataError, match="must divide the head's width"):
         Head().cell_profile_mm(0.7)
-    with pytest.raises(BadDataError, match="force is 0"):
-        solve_contact(toeplitz(4, 1.0)[None], np.zeros(4), total_kpa=0.0)
     with pytest.raises(BadDataError, match=r"the head at 60.5 mm leaves the surface, which ends at 72 mm"):
         press(surface, None, np.array([60.5]))
     with pytest.raises(BadDataError, match=r"pitch_mm is 0\.4"):

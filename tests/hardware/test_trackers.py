@@ -146,7 +146,7 @@ def test_the_size_may_or_may_not_count_the_space(size):
 def test_bird_words_are_fourteen_bits():
     (pose,) = BirdParser().feed(BIRD)
     assert [mm / 25.4 for mm in pose.position_mm] == pytest.approx([9.99756, -5.00098, 0.99756], abs=1e-5)
-    assert record_bytes((10, -5, 1), (0.5, 0.5, -0.5, 0.5)) == BIRD
+    assert record_bytes((10, -5, 1, 0.5, 0.5, -0.5, 0.5)) == BIRD
     (second,) = BirdParser(group=True).feed(BIRD + b"\x02")
     assert second.tool == "2"
 

@@ -68,8 +68,7 @@ def fed(scan: Scan, portions, *, plane_from_base: np.ndarray | None = None) -> M
 def same(one: MapAccumulator, two: MapAccumulator) -> bool:
     a, b = one.snapshot(), two.snapshot()
     alike = all(np.array_equal(getattr(a, name), getattr(b, name), equal_nan=True) for name in ARRAYS)
-    planes = [grown.plane().plane_from_base for grown in (one, two)]
-    return alike and one.figures == two.figures and np.array_equal(*planes)
+    return alike and one.figures == two.figures
 
 
 @given(seed=st.integers(0, 999), parts=st.integers(1, FRAMES), name=st.sampled_from(["near", "far"]))
@@ -86,7 +85,6 @@ def test_frame_by_frame_gives_the_bits_of_build_map():
     live = empty(scan, at_once.plane_from_base)
     for frame in range(FRAMES):
         live.add(scan.frames.counts[frame : frame + 1], poses.part(slice(frame, frame + 1)))
-    assert np.array_equal(live.plane().plane_from_base, at_once.plane_from_base)
     snapshot = live.snapshot()
     for name in ARRAYS:
         assert np.array_equal(getattr(snapshot, name), getattr(at_once, name), equal_nan=True)

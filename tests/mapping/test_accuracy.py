@@ -167,4 +167,3 @@ def test_two_hours_do_not_overflow_or_grow():
     assert np.array_equal(many.count, 1440 * one.count)
     assert np.array_equal(many.mean, one.mean, equal_nan=True)
     assert many.variance == pytest.approx(one.variance, abs=1e-6, nan_ok=True)
-    assert long.plane().plane_from_base == pytest.approx(once.plane().plane_from_base, abs=1e-9)

@@ -61,7 +61,7 @@ def inputs_of(tactile_map: TactileMap) -> tuple[Calibration | None, SamplerSetti
 
 
 def estimator_of(tactile_map: TactileMap, calibration: Calibration | None = None) -> Estimator:
-    return Estimator(tactile_map, calibration or inputs_of(tactile_map)[0], 1, time.process_time)
+    return Estimator(tactile_map, calibration or inputs_of(tactile_map)[0], Work(time.process_time, 0.2))
 
 
 def ladder_of(tactile_map: TactileMap, **chosen: object) -> Ladder:

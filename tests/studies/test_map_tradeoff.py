@@ -5,14 +5,14 @@ from __future__ import annotations
 import itertools
 import math
 import re
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import pytest
 from published_schemas import check_document
 
 import tactile_bayes
-from tactile_bayes.actions.tradeoff import tradeoff_of_scan
+from tactile_bayes.api.estimating import estimate_inputs
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.declarations import to_plain
 from tactile_bayes.errors import BadDataError
@@ -23,6 +23,7 @@ from tactile_bayes.scans import Scan
 from tactile_bayes.studies import estimate_tradeoff
 from tactile_bayes.studies import tradeoffs as study
 from tactile_bayes.studies.estimate_tradeoff import SIZE, WIDTHS, Ladder, Priced, Work
+from tactile_bayes.studies.tradeoffs import measure_map
 
 DEMO = Path(tactile_bayes.__file__).parent / "demo" / "scan.mcap"
 
@@ -40,7 +41,8 @@ def ladder() -> Ladder:
         patch.setattr(study, "EVERY", (2, 1000))
         patch.setattr(study, "SHARES_OF_TIME", (0.01,))
         patch.setattr(estimate_tradeoff, "LONG_RUNS", (("importance", 0.01),))
-        return tradeoff_of_scan(demo(), Settings(), Work(lambda: float(next(ticks)), 0.2, 1))
+        work = Work(lambda: float(next(ticks)), 0.2, 1)
+        return measure_map(demo(), inputs=partial(estimate_inputs, Settings()), work=work)
 
 
 def row(label: str) -> Priced:
@@ -88,5 +90,6 @@ def test_what_cannot_be_built_or_sized_is_a_row_too():
 
 
 def test_a_scan_without_a_map_is_refused():
+    short, inputs = first_seconds(demo(), 0.001), partial(estimate_inputs, Settings())
     with pytest.raises(BadDataError):
-        tradeoff_of_scan(first_seconds(demo(), 0.001), Settings(), Work(lambda: 0.0, 0.2, 1))
+        measure_map(short, inputs=inputs, work=Work(lambda: 0.0, 0.2, 1))

@@ -12,7 +12,7 @@ from scipy.optimize import least_squares
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.axisymmetric import LayeredBody, condense_lump, taxel_compliance
-from tactile_bayes.forward.contact import ContactStiffness, press
+from tactile_bayes.forward.contact import ContactStiffness, solve_contact
 from tactile_bayes.forward.mesh import LumpGeometry, MeshSize
 from tactile_bayes.forward.scene import Head, rotation_from_vector
 from tactile_bayes.forward.solid import PlacedLump, SkinPerturbation, SolidHead, skin_perturbation, solid_head
@@ -49,7 +49,7 @@ BALL = (15.0, 15.0, 15.0)
 
 def test_without_a_lump_a_frame_is_the_plain_contact() -> None:
     compliance = taxel_compliance(LayeredBody((5.0, 50.0), (15.0, 55.0)), rows=18, columns=30, pitch_mm=PITCH)
-    plain = press(
+    plain = solve_contact(
         ContactStiffness.of(compliance),
         -face().surface_mm[..., 2].ravel(),
         mean_kpa=9.5,

@@ -10,7 +10,7 @@ from scipy.optimize import nnls
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.axisymmetric import LayeredBody, taxel_compliance
-from tactile_bayes.forward.contact import ContactStiffness, press
+from tactile_bayes.forward.contact import ContactStiffness, solve_contact
 from tactile_bayes.forward.scene import Head
 from tactile_bayes.forward.tissue import head_face
 
@@ -34,7 +34,7 @@ def test_a_sphere_presses_as_hertz_says() -> None:
     pitch, radius, force = 0.5, 50.0, 60.0
     x, y = squares(33, pitch)
     body = ContactStiffness.of(taxel_compliance(HALF_SPACE, rows=33, columns=33, pitch_mm=pitch))
-    contact = press(body, (x**2 + y**2) / (2 * radius), mean_kpa=force / (len(x) * pitch**2))
+    contact = solve_contact(body, (x**2 + y**2) / (2 * radius), mean_kpa=force / (len(x) * pitch**2))
     a = (0.75 * force * radius / E_STAR) ** (1 / 3)
     assert 3.0 < a < 8.0
     peak = 1.5 * force / (np.pi * a**2)
@@ -52,7 +52,7 @@ def test_a_long_cylinder_presses_as_hertz_says() -> None:
     rows, columns, pitch, radius = 20, 120, 0.5, 40.0
     x = np.repeat((np.arange(rows) - (rows - 1) / 2) * pitch, columns)
     body = ContactStiffness.of(taxel_compliance(HALF_SPACE, rows=rows, columns=columns, pitch_mm=pitch))
-    contact = press(body, x**2 / (2 * radius), mean_kpa=0.4)
+    contact = solve_contact(body, x**2 / (2 * radius), mean_kpa=0.4)
     middle = contact.pressure_kpa.reshape(rows, columns)[:, columns // 2]
     line = middle.sum() * pitch
     a = np.sqrt(4 * line * radius / (np.pi * E_STAR))
@@ -62,7 +62,7 @@ def test_a_long_cylinder_presses_as_hertz_says() -> None:
 
 
 def test_a_flat_punch_presses_most_at_its_edge_and_without_a_gap() -> None:
-    contact = press(ContactStiffness.of(small_body()), np.zeros(49), mean_kpa=3.0)
+    contact = solve_contact(ContactStiffness.of(small_body()), np.zeros(49), mean_kpa=3.0)
     pressure = contact.pressure_kpa.reshape(7, 7)
     assert contact.touching.all()
     assert pressure[0, 0] > pressure[0, 3] > pressure[3, 3]
@@ -78,7 +78,7 @@ def test_every_contact_is_complementary_and_bears_its_force(
     heights: list[float], mean: float, start: list[bool]
 ) -> None:
     compliance, height = small_body(), np.array(heights)
-    contact = press(ContactStiffness.of(compliance), height, mean_kpa=mean, touching=np.array(start))
+    contact = solve_contact(ContactStiffness.of(compliance), height, mean_kpa=mean, touching=np.array(start))
     p, gap = contact.pressure_kpa, contact.gap_mm
     scale = max(contact.depth_mm, 1e-9)
     assert p.min() >= -1e-9 * mean
@@ -92,7 +92,7 @@ def test_the_answer_is_that_of_non_negative_least_squares() -> None:
     """At its depth the contact minimises p C p / 2 - p (depth - height) over p >= 0: NNLS of a Cholesky factor."""
     rng = np.random.default_rng(3)
     compliance, height = small_body(), rng.uniform(0, 5, 49)
-    contact = press(ContactStiffness.of(compliance), height, mean_kpa=1.0)
+    contact = solve_contact(ContactStiffness.of(compliance), height, mean_kpa=1.0)
     assert 0 < contact.touching.sum() < 49
     upper = np.linalg.cholesky(compliance).T
     other, _ = nnls(upper, np.linalg.solve(upper.T, contact.depth_mm - height))
@@ -102,7 +102,7 @@ def test_the_answer_is_that_of_non_negative_least_squares() -> None:
 def test_only_the_counted_squares_bear_the_mean() -> None:
     counted = np.zeros(49, dtype=bool)
     counted[10:30] = True
-    contact = press(ContactStiffness.of(small_body()), np.zeros(49), mean_kpa=2.0, counted=counted)
+    contact = solve_contact(ContactStiffness.of(small_body()), np.zeros(49), mean_kpa=2.0, counted=counted)
     assert contact.pressure_kpa[counted].mean() == pytest.approx(2.0)
 
 
@@ -110,8 +110,8 @@ def test_a_low_rank_change_is_the_changed_matrix() -> None:
     rng = np.random.default_rng(0)
     compliance, height = small_body(), rng.uniform(0, 1, 49)
     vectors, signs = 0.02 * rng.standard_normal((49, 5)), np.array([-1.0, -1.0, 1.0, -1.0, 1.0])
-    quick = press(ContactStiffness.of(compliance).changed(vectors, signs), height, mean_kpa=1.0)
-    plain = press(ContactStiffness.of(compliance + (vectors * signs) @ vectors.T), height, mean_kpa=1.0)
+    quick = solve_contact(ContactStiffness.of(compliance).changed(vectors, signs), height, mean_kpa=1.0)
+    plain = solve_contact(ContactStiffness.of(compliance + (vectors * signs) @ vectors.T), height, mean_kpa=1.0)
     np.testing.assert_allclose(quick.pressure_kpa, plain.pressure_kpa, atol=1e-9)
     assert quick.depth_mm == pytest.approx(plain.depth_mm, rel=1e-10)
 
@@ -125,11 +125,11 @@ def test_a_skin_without_compliance_left_is_refused() -> None:
 
 def test_a_head_that_is_not_pressed_hangs_over_the_skin() -> None:
     height = np.linspace(0.5, 3, 49)
-    contact = press(ContactStiffness.of(small_body()), height, mean_kpa=0.0)
+    contact = solve_contact(ContactStiffness.of(small_body()), height, mean_kpa=0.0)
     assert contact.depth_mm == 0.5
     assert not contact.touching.any()
     with pytest.raises(BadDataError, match="not pull"):
-        press(ContactStiffness.of(small_body()), height, mean_kpa=-1.0)
+        solve_contact(ContactStiffness.of(small_body()), height, mean_kpa=-1.0)
 
 
 def test_the_rim_is_tangent_to_the_face_and_feels_nothing() -> None:

@@ -15,13 +15,12 @@ from scipy.optimize import least_squares
 
 from tactile_bayes.actions.study import table_text
 from tactile_bayes.declarations import replace
-from tactile_bayes.errors import EXIT_BAD_DATA, EXIT_USAGE, BadDataError
+from tactile_bayes.errors import EXIT_BAD_DATA, EXIT_USAGE, BadDataError, UsageError
 from tactile_bayes.studies.paper import Geometry, StudyRow
 from tactile_bayes.studies.paper_solid import (
     RasterFrames,
     SolidSettings,
     fit_raster,
-    mesh_size,
     raster_frames,
     raster_map,
 )
@@ -145,7 +144,7 @@ def test_a_ball_too_small_for_the_array_is_marked() -> None:
 
 
 def test_twice_the_fineness_is_half_the_element() -> None:
-    one, two, four = (mesh_size(fineness) for fineness in (1, 2, 4))
+    one, two, four = (SolidSettings(fineness=fineness).mesh_size for fineness in (1, 2, 4))
     assert (two.arc, two.rings, two.core, two.grade) == (18, 6, 3, 1.45)  # what decision record 0024 measured
     assert (four.arc, one.arc) == (36, 9)
     assert four.grade**2 == pytest.approx(two.grade)
@@ -294,7 +293,7 @@ def test_options_reach_the_map_and_the_fit(run_cli: Run, tmp_path: Path) -> None
 
 
 def test_a_level_that_is_neither_is_refused() -> None:
-    with pytest.raises(BadDataError, match="background is 'open'; it must be fixed or free"):
+    with pytest.raises(UsageError, match="background is 'open'"):
         SolidSettings(background="open")
 
 
