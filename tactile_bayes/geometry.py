@@ -7,7 +7,6 @@ Frames: `base` (tracker, paper O), `scanhead` (paper S), `plane` (paper P), `pat
 from __future__ import annotations
 
 import math
-from operator import mul
 from typing import Annotated
 
 import numpy as np
@@ -120,16 +119,14 @@ def fit_plane(centroid_mm: FloatArray, covariance_mm2: FloatArray, *, head_x: Fl
     to span a plane, the normal disagrees with the head's, or `head_x` is zero or along the normal.
     """
     variances, axes = np.linalg.eigh(covariance_mm2)
-    shortest, middle, longest = (math.sqrt(max(variance, 0.0)) for variance in variances.tolist())
+    shortest, middle, longest = np.sqrt(np.maximum(variances, 0.0)).tolist()
     if not middle > 0.05 * longest or not middle > 1e-9:
         raise BadDataError(
             f"the taxel centres lie on a line (spread {longest:.3g} by {middle:.3g} mm)",
             way_out="scan with strokes side by side",
         )
     normal = axes[:, 0]
-    # Plain numbers where nothing but a decision hangs on them: a call of numpy costs more than three products.
-    facing, of = head_z.tolist(), math.hypot(*head_x.tolist())
-    agreement = sum(map(mul, normal.tolist(), facing)) / max(math.hypot(*facing), 1e-300)
+    agreement = float(normal @ head_z) / max(float(np.linalg.norm(head_z)), 1e-300)
     if abs(agreement) < 0.9:
         angle = np.degrees(np.arccos(abs(agreement)))
         raise BadDataError(
@@ -138,17 +135,15 @@ def fit_plane(centroid_mm: FloatArray, covariance_mm2: FloatArray, *, head_x: Fl
         )
     normal = normal if agreement > 0 else -normal
     x_axis = head_x - (head_x @ normal) * normal
-    length = math.sqrt(x_axis @ x_axis)
+    length, of = math.sqrt(x_axis @ x_axis), float(np.linalg.norm(head_x))
     if not length > 0.1 * of:
         raise BadDataError(
             f"the head's x axis is perpendicular to the plane of motion (projected length {length:.2g} of {of:.2g})",
             way_out="check scanhead_from_tracker, and keep the head's direction while scanning",
         )
-    x, n = (x_axis / length).tolist(), normal.tolist()
-    y = [n[1] * x[2] - n[2] * x[1], n[2] * x[0] - n[0] * x[2], n[0] * x[1] - n[1] * x[0]]  # n cross x
-    shift = (-np.array([x, y, n]) @ centroid_mm).tolist()
-    rows = [[*axis, along] for axis, along in zip((x, y, n), shift, strict=True)]
-    return Plane(np.array([*rows, [0.0, 0.0, 0.0, 1.0]]), shortest, np.array([longest, middle, shortest]))
+    x_axis = x_axis / length
+    rotation = np.stack([x_axis, np.cross(normal, x_axis), normal])
+    return Plane(rigid(rotation, -rotation @ centroid_mm), shortest, np.array([longest, middle, shortest]))
 
 
 def patient_from_base(sternal_notch_mm: FloatArray, xiphoid_mm: FloatArray, *, normal: FloatArray) -> FloatArray:

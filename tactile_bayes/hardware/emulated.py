@@ -6,14 +6,14 @@ import math
 import re
 import struct
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from typing import Final
 
 import numpy as np
 
 from tactile_bayes.geometry import FloatArray, rotation_from_quaternion
 from tactile_bayes.hardware import head
-from tactile_bayes.hardware.head import PacketParser
+from tactile_bayes.hardware.head import Packet, PacketParser
 from tactile_bayes.hardware.readings import (
     MM_PER_INCH,
     HelloReading,
@@ -87,6 +87,15 @@ class Device:
         """Process commands and return the answer."""
         raise NotImplementedError
 
+    def _obeyed(self, packets: Iterable[Packet]) -> Iterator[Packet]:
+        """Commands in the open framing, those to start and stop carried out."""
+        for packet in packets:
+            if packet.kind == head.START:
+                self.start()
+            elif packet.kind == head.STOP:
+                self.stop()
+            yield packet
+
     def record(self, index: int) -> bytes:
         """Bytes of one record; empty for a record left out, and where records are sent on request only."""
         del index
@@ -117,12 +126,9 @@ class EmulatedHead(Device):
 
     def hear(self, data: bytes) -> bytes:
         answer = b""
-        for packet in self._commands.feed(data):
+        for packet in self._obeyed(self._commands.feed(data)):
             if packet.kind == head.START:
                 self._every = max(1, packet.payload[0] if packet.payload else 1)
-                self.start()
-            elif packet.kind == head.STOP:
-                self.stop()
             if packet.kind in (head.ASK, head.START):
                 answer += head.encode_hello(self.hello())
         return answer
@@ -195,9 +201,13 @@ class EmulatedTracker(Device):
             self.start()
 
     def hear(self, data: bytes) -> bytes:
-        if self._protocol == "open":
-            return self._hear_open(data)
         answer = b""
+        if self._protocol == "open":
+            for packet in self._obeyed(self._commands.feed(data)):
+                if packet.kind == head.ASK:
+                    answer += head.encode_hello(HelloReading("emulated tracker", 0, 0, 0, 0.0))
+                    answer += self.record(0) if self._faults.breathe_mm else b""
+            return answer
         for letter in _SETTING.sub(b"", data).decode("latin-1"):
             if letter in "PB" and len(self.times_s):
                 self.stop()
@@ -205,18 +215,6 @@ class EmulatedTracker(Device):
             elif letter in "C@":
                 self.start()
             elif letter == "c":
-                self.stop()
-        return answer
-
-    def _hear_open(self, data: bytes) -> bytes:
-        answer = b""
-        for packet in self._commands.feed(data):
-            if packet.kind == head.ASK:
-                answer += head.encode_hello(HelloReading("emulated tracker", 0, 0, 0, 0.0))
-                answer += self.record(0) if self._faults.breathe_mm else b""
-            elif packet.kind == head.START:
-                self.start()
-            elif packet.kind == head.STOP:
                 self.stop()
         return answer
 

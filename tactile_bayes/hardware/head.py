@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import struct
 import zlib
-from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -101,58 +100,34 @@ def encode_packet(kind: int, payload: bytes, *, sequence: int = 0, device_us: in
     return b"\0" + cobs_encode(body + zlib.crc32(body).to_bytes(CRC_BYTES, "little")) + b"\0"
 
 
-@dataclass(slots=True)
-class FramingCounts:
-    """Counts of a stream's packets and bytes."""
-
-    packets: int = 0  #: With a checksum that held.
-    damaged: int = 0
-    """Stretches between zero bytes that are no packet: a checksum that fails, codes that make no sense, noise."""
-    damaged_bytes: int = 0  #: Their length.
-    foreign: int = 0  #: Packets of another version of the framing.
-    foreign_version: int = 0  #: That of the last of them.
-
-
 class PacketParser:
     """Parser of packets from a stream; skips and counts garbage."""
 
     def __init__(self) -> None:
-        self.counts = FramingCounts()
+        self.damaged_bytes = 0
+        """Between zero bytes, and no packet: a checksum that fails, codes that make no sense, noise."""
+        self.foreign_version: int | None = None
+        """That of the last packet of another version of the framing."""
         self._rest = b""
 
     def feed(self, data: bytes) -> list[Packet]:
         """Parse `data`; return the packets completed by it."""
         *parts, self._rest = (self._rest + data).split(b"\0")
         if len(self._rest) > _LONGEST:
-            self._damage(self._rest)
+            self.damaged_bytes += len(self._rest)
             self._rest = b""
-        packets = []
-        for part in parts:
-            if not part:
-                continue
-            packet = self._decode(part)
-            if packet is not None:
-                packets.append(packet)
-        return packets
+        return [packet for part in parts if part and (packet := self._decode(part)) is not None]
 
     def _decode(self, part: bytes) -> Packet | None:
         body = cobs_decode(part) if len(part) <= _LONGEST else None
-        if body is None or len(body) < HEADER.size + CRC_BYTES:
-            self._damage(part)
-            return None
-        if zlib.crc32(body) != _RESIDUE:
-            self._damage(part)
+        if body is None or len(body) < HEADER.size + CRC_BYTES or zlib.crc32(body) != _RESIDUE:
+            self.damaged_bytes += len(part)
             return None
         version, kind, sequence, device_us = HEADER.unpack_from(body)
         if version != VERSION:
-            self.counts.foreign, self.counts.foreign_version = self.counts.foreign + 1, version
+            self.foreign_version = version
             return None
-        self.counts.packets += 1
         return Packet(kind, sequence, device_us, body[HEADER.size : -CRC_BYTES])
-
-    def _damage(self, part: bytes) -> None:
-        self.counts.damaged += 1
-        self.counts.damaged_bytes += len(part)
 
 
 # CRC-32 of any data followed by its own CRC-32, little-endian, is this number.
@@ -224,7 +199,6 @@ class HeadParser:
         self.packets = PacketParser()
         self.sequence = SequenceCheck()
         self.hello: HelloReading | None = None
-        self.misfits = 0
         self.remark = ""
         self._misfit_words = ""
         self._every = every
@@ -232,24 +206,19 @@ class HeadParser:
     @property
     def garbage_bytes(self) -> int:
         """Number of bytes that belong to no valid packet."""
-        return self.packets.counts.damaged_bytes
+        return self.packets.damaged_bytes
 
     @property
     def fault(self) -> str:
         """What is wrong with packets that could not be read."""
-        counts = self.packets.counts
-        if counts.foreign:
-            return f"it sent packets of version {counts.foreign_version} of the framing, this program reads {VERSION}"
+        version = self.packets.foreign_version
+        if version is not None:
+            return f"it sent packets of version {version} of the framing, this program reads {VERSION}"
         return self._misfit_words
 
     def feed(self, data: bytes) -> list[Reading]:
         """Parse `data`; return the completed readings; counts packets with invalid payloads."""
-        found = []
-        for packet in self.packets.feed(data):
-            reading = self._read(packet)
-            if reading is not None:
-                found.append(reading)
-        return found
+        return [reading for packet in self.packets.feed(data) if (reading := self._read(packet)) is not None]
 
     def _read(self, packet: Packet) -> Reading | None:
         match packet.kind:
@@ -276,7 +245,6 @@ class HeadParser:
         return FrameReading(counts, packet.device_us * 1000, lost, self.sequence.restarts > restarts)
 
     def _misfit(self, what: str) -> None:
-        self.misfits += 1
         self._misfit_words = f"it sent {what}"
 
     def _pose(self, packet: Packet) -> ToolReading | None:

@@ -80,29 +80,8 @@ class Report:
         return (self.last_ns - self.first_ns) / 1e9
 
 
-def recording_cautions(report: Report, frames: Span, poses: Span, *, passed_s: float, rate_hz: float) -> list[str]:
-    """Cautions before a recording is used, one line each, from a report that is otherwise complete.
-
-    Frames and poses were measured at times on the head's clock; `passed_s` is the time between the first frame and the
-    last by the host's. The head promised `rate_hz`, or nothing when that is 0.
-    """
-    found = [*overlap_cautions(frames, poses), *_rates(report, passed_s, rate_hz), *_counters(report)]
-    asked = report.poses + report.poses_missing
-    for number, what, why in (
-        (report.poses_missing, "missing", report.missing_why),
-        (report.poses_flagged, "flagged by the tracker", report.flagged_why),
-    ):
-        if number > _TOLD_SHARE * asked:
-            found.append(f"{number:,} of {asked:,} poses {what}: {why}")
-    if report.tracker_remark:
-        found.append(f"the tracker's {report.tracker_remark}")
-    if report.poses > _STUCK_POSES and report.poses_repeated >= report.poses - 1:
-        found.append("every pose is the same: the tracker does not follow the head")
-    return found
-
-
 def _rates(report: Report, passed_s: float, rate_hz: float) -> Iterator[str]:
-    """Compare the head's clock with the host's, and its frame rate with the promised one."""
+    """Compare the head's clock with the host's, on which `passed_s` went by, and its frame rate with that promised."""
     told_s = report.duration_s
     if abs(told_s - passed_s) > max(_RATE_LEAST_S, _RATE_SHARE * passed_s):
         yield f"the head's clock ran {told_s:.1f} s while {passed_s:.1f} s passed on this computer"
@@ -111,17 +90,28 @@ def _rates(report: Report, passed_s: float, rate_hz: float) -> Iterator[str]:
         yield f"the head promised {rate_hz:g} frames per second and measured {came / told_s:.1f}"
 
 
-def _counters(report: Report) -> Iterator[str]:
-    """Count the jumps of clocks and sequence counters."""
+def _oddities(report: Report) -> Iterator[str]:
+    """Jumps of clocks and counters, and poses that are missing, flagged or all alike."""
+
+    def times(number: int) -> str:
+        return "once" if number == 1 else f"{number} times"
+
     for role, steps in (("head", report.head_clock_steps), ("tracker", report.tracker_clock_steps)):
         if steps:
-            yield f"the {role}'s clock stepped {_times(steps)}; this computer's clock was used instead"
+            yield f"the {role}'s clock stepped {times(steps)}; this computer's clock was used instead"
     if report.frame_counter_restarts:
-        yield f"the head's frame counter restarted or was damaged {_times(report.frame_counter_restarts)}"
-
-
-def _times(number: int) -> str:
-    return "once" if number == 1 else f"{number} times"
+        yield f"the head's frame counter restarted or was damaged {times(report.frame_counter_restarts)}"
+    asked = report.poses + report.poses_missing
+    for number, what, why in (
+        (report.poses_missing, "missing", report.missing_why),
+        (report.poses_flagged, "flagged by the tracker", report.flagged_why),
+    ):
+        if number > _TOLD_SHARE * asked:
+            yield f"{number:,} of {asked:,} poses {what}: {why}"
+    if report.tracker_remark:
+        yield f"the tracker's {report.tracker_remark}"
+    if report.poses > _STUCK_POSES and report.poses_repeated >= report.poses - 1:
+        yield "every pose is the same: the tracker does not follow the head"
 
 
 # --- Touching of landmarks with the head's apex: the mean of several poses, and their spread.
@@ -371,7 +361,13 @@ class Recorder:
         elif self._duration_ns is not None and device_ns - report.first_ns >= self._duration_ns:
             self.stop("duration")
             return
-        for text in _oddities(reading, event):
+        remarks = (
+            event,
+            "the frame counter does not go on from the frame before: the head restarted, or its counter is damaged"
+            * reading.restarted,
+            f"{reading.lost} frames lost before this one" * bool(reading.lost),
+        )
+        for text in filter(None, remarks):
             self._note(text, "head", device_ns, host_ns)
         report.frames_lost += reading.lost
         report.frame_counter_restarts += reading.restarted
@@ -503,7 +499,7 @@ class Recorder:
         report.tracker_remark = self._tracker.parser.remark if self._tracker else ""
         passed_s = (self._heard_ns - self._begun_ns) / 1e9
         spans = self._frame_span, self._pose_span
-        report.cautions = recording_cautions(report, *spans, passed_s=passed_s, rate_hz=self._rate_hz)
+        report.cautions = [*overlap_cautions(*spans), *_rates(report, passed_s, self._rate_hz), *_oddities(report)]
         report.cautions += self._jumps.cautions()
         if self._head.parser.fault:
             report.cautions.append(f"the head's line: {self._head.parser.fault}")
@@ -543,13 +539,3 @@ def _numbers(counted: Counter[str]) -> str:
     told = [f"{word or 'one without a name'} {number:,}" for word, number in counted.most_common(_MOST_TOLD)]
     more = [f"and {len(counted) - _MOST_TOLD} more"] if len(counted) > _MOST_TOLD else []
     return ", ".join(told + more)
-
-
-def _oddities(reading: FrameReading, event: str) -> Iterator[str]:
-    """Remarks about a frame."""
-    if event:
-        yield event
-    if reading.restarted:
-        yield "the frame counter does not go on from the frame before: the head restarted, or its counter is damaged"
-    if reading.lost:
-        yield f"{reading.lost} frames lost before this one"

@@ -7,6 +7,7 @@ import re
 import struct
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -454,27 +455,16 @@ def _no_hello(parser: HeadParser, came: bytes, port: Port) -> str:
 
 def probe(url: str) -> str:
     """Identify the device on a port by trying each protocol; this writes to the port."""
-    port = Port(url, baud=DEFAULT_BAUD, role="device")
-    try:
+    with closing(Port(url, baud=DEFAULT_BAUD, role="device")) as port, suppress(DeviceError):
         hello = check_head(port)
-    except DeviceError:
-        pass
-    else:
         kind = f"scan head {hello.device_id!r}, {hello.rows} x {hello.columns} taxels, {hello.rate_hz:g} Hz"
         return kind if hello.rows else f"tracker {hello.device_id!r} in the open framing"
-    finally:
-        port.close()
     for name in ("fastrak", "liberty", "bird"):
-        driver = TRACKERS[name]
-        port = Port(url, baud=driver.baud, role="device")
-        try:
-            driver.check(port)
-        except DeviceError:
-            continue
-        except UsageError as error:  # several tools
-            return f"{driver.title}: --tracker-protocol {name}; {error}"
-        else:
-            return f"{driver.title}: --tracker-protocol {name}"
-        finally:
-            port.close()
+        driver, several = TRACKERS[name], ""
+        with closing(Port(url, baud=driver.baud, role="device")) as port, suppress(DeviceError):
+            try:
+                driver.check(port)
+            except UsageError as error:
+                several = f"; {error}"
+            return f"{driver.title}: --tracker-protocol {name}{several}"
     return "nothing that answers"

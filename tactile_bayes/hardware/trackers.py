@@ -41,18 +41,14 @@ POLYNOMIAL: Final = 0x42F0E1EBA9EA3693
 _BITS: Final = 0xFFFF_FFFF_FFFF_FFFF
 
 
-def _byte_table() -> tuple[int, ...]:
-    """CRC of each single byte."""
-    table = []
-    for byte in range(256):
-        crc = byte << 56
-        for _ in range(8):
-            crc = (crc << 1 ^ (POLYNOMIAL if crc >> 63 else 0)) & _BITS
-        table.append(crc)
-    return tuple(table)
+def _byte_crc(byte: int) -> int:
+    crc = byte << 56
+    for _ in range(8):
+        crc = (crc << 1 ^ (POLYNOMIAL if crc >> 63 else 0)) & _BITS
+    return crc
 
 
-_TABLE: Final = _byte_table()
+_TABLE: Final = tuple(map(_byte_crc, range(256)))
 
 
 def crc64(data: bytes) -> int:
@@ -355,7 +351,9 @@ class NdiTracker:
         self._device = self._open()
         self._begin()
         self.name = self._command("VER:4").splitlines()[0].strip()[:48] or "NDI tracker"
-        described = {self._describe(rom): rom.stem for rom in self._freed(roms)}
+        for handle in self._handles(1):  # of an earlier session
+            self._command("PHF:%02X", handle)
+        described = {self._describe(rom): rom.stem for rom in roms}
         self.tools = {handle: described.get(handle) or self._tool_name(handle) for handle in self._enable()}
         self._command("TSTART:")
         self._frame: int | None = None
@@ -401,12 +399,6 @@ class NdiTracker:
         self._command(f"PHSR:{kind:02X}")
         number = self._api.ndiGetPHSRNumberOfHandles(self._device)
         return [self._api.ndiGetPHSRHandle(self._device, one) for one in range(number)]
-
-    def _freed(self, roms: Sequence[Path]) -> Sequence[Path]:
-        """Free the handles of an earlier session before the first description is sent."""
-        for handle in self._handles(1):
-            self._command("PHF:%02X", handle)
-        return roms
 
     def _describe(self, rom: Path) -> int:
         """Send the description of a wireless tool; return its handle."""
@@ -505,17 +497,11 @@ class NdiPort(Port):
         )
         theirs.close()
         self._serial = _SocketLine(ours)
-        try:
-            self._wait_until_ready()
-        except DeviceError:
-            self.close()
-            raise
-
-    def _wait_until_ready(self) -> None:
         pipe = self._process.stdout
         assert pipe is not None
         told = pipe.readline().decode().strip() if select.select([pipe], [], [], READY_S)[0] else ""
         if told != "ready":
+            self.close()
             raise DeviceError(f"{self.name}: {told or 'the tracker said nothing; check its power'}")
 
     def close(self) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,9 +59,6 @@ GAIN_TOLERANCE = 1e-4
 KEPT_READINGS = 2**26
 _CHUNK = 128
 
-# Of pressures (f, k), which are valid, and the frames they are of: what is added up.
-_Weight = Callable[[FloatArray, "BoolArray | None", slice], "NDArray[np.generic]"]
-
 
 def _solve_gains(
     sources: list[Source], levels: list[FloatArray], *, progress: Progress
@@ -112,11 +109,11 @@ class _System:
         )
         readings = sum(len(source.projection) * len(source.selection.readout.taxels) for source in sources)
         self._kept: dict[tuple[int, int], NDArray[np.int32]] | None = {} if readings <= KEPT_READINGS else None
-        self._count = self._sum(lambda pressure, valid, _: np.ones_like(pressure) if valid is None else valid)
+        self._count = self._total(None)
 
     def improved(self, gains: FloatArray) -> FloatArray:
         """Least-squares gain of each frame against the map of all frames with `gains`: sum(p m) / sum(m^2)."""
-        total = self._sum(lambda pressure, _, frames: pressure / gains[frames, None])
+        total = self._total(gains)
         mean = np.divide(total, self._count, out=np.zeros_like(total), where=self._count > 0)
         better = np.empty(len(gains))
         for frames, flat, pressure, valid in self._parts():
@@ -127,12 +124,15 @@ class _System:
             better[frames] = products / np.einsum("fk,fk->f", expected, expected)
         return better
 
-    def _sum(self, weight: _Weight) -> FloatArray:
-        """Sum of a weight over all readings of each cell."""
+    def _total(self, gains: FloatArray | None) -> FloatArray:
+        """Sum over each cell's readings of their pressure over their frame's gain; without gains, their number."""
         cells = self._shape[0] * self._shape[1]
         total = np.zeros(cells)
         for frames, flat, pressure, valid in self._parts():
-            total += np.bincount(flat.ravel(), weight(pressure, valid, frames).ravel(), cells)
+            if gains is not None:
+                pressure /= gains[frames, None]
+            weight = pressure if gains is not None else np.ones_like(pressure) if valid is None else valid
+            total += np.bincount(flat.ravel(), weight.ravel(), cells)
         return total
 
     def _parts(self) -> Iterator[tuple[slice, NDArray[np.integer], FloatArray, BoolArray | None]]:

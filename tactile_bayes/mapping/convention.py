@@ -217,12 +217,10 @@ def check_convention(selections: Sequence[SelectedFrames]) -> dict[str, float]:
     agreement = convention_agreement(selections)
     if not agreement:
         return {}
-    declared, best = agreement[DECLARED], _best(agreement)
+    declared, best = agreement[DECLARED], max(agreement, key=agreement.__getitem__)
     if declared < LEAST_AGREEMENT or declared < AGREEMENT <= agreement[best]:
         angle = np.degrees(np.arccos(min(1.0, declared)))
-        raise BadDataError(
-            f"the head's face and its motion are {angle:.0f} degrees apart", way_out=_way_out(agreement, best)
-        )
+        raise BadDataError(f"the head's face and its motion are {angle:.0f} degrees apart", way_out=_way_out(agreement))
     figures = {"normal_agreement": declared}
     if agreement[best] > max(declared + BETTER_BY, NEARLY_WHOLE):
         figures |= {"other_convention": float(list(CONVENTIONS).index(best)), "other_agreement": agreement[best]}
@@ -236,7 +234,8 @@ def convention_findings(quality: Mapping[str, float], told: Iterable[Finding] = 
     """
     if "other_convention" in quality:
         other, agreement = list(CONVENTIONS)[int(quality["other_convention"])], quality["other_agreement"]
-        if any(one.kind == "wrong_arrangement" and _asks_for(one, CONVENTIONS[other]) for one in told):
+        options = [f"--correct {name}" for name in CONVENTIONS[other]]
+        if any(one.kind == "wrong_arrangement" and all(map(one.remedy.__contains__, options)) for one in told):
             return ()
         text = "the tracker's rotations seem to be read the wrong way; size and place may be wrong"
         remedy = (
@@ -252,21 +251,13 @@ def convention_findings(quality: Mapping[str, float], told: Iterable[Finding] = 
     return ()
 
 
-def _asks_for(finding: Finding, corrections: Iterable[str]) -> bool:
-    return all(f"--correct {name}" in finding.remedy for name in corrections)
-
-
 def hint(selections: Sequence[SelectedFrames]) -> str:
     """Sentence for a head that seems not to slide along its face: the convention under which it would."""
-    agreement = convention_agreement(selections) or {DECLARED: 0.0}
-    return _way_out(agreement, _best(agreement))
+    return _way_out(convention_agreement(selections) or {DECLARED: 0.0})
 
 
-def _best(agreement: dict[str, float]) -> str:
-    return max(agreement, key=lambda name: agreement[name])
-
-
-def _way_out(agreement: dict[str, float], best: str) -> str:
+def _way_out(agreement: dict[str, float]) -> str:
+    best = max(agreement, key=agreement.__getitem__)
     if best == DECLARED or agreement[best] < AGREEMENT:
         return "check the quaternion order (scalar first) and scanhead_from_tracker"
     found = f"the quaternions seem to be {best} (agreement {agreement[best]:.2f} of 1)"
@@ -277,11 +268,11 @@ def _near_used(part: SelectedFrames) -> TrackerPoses:
     """Distinct poses about the used frames; poses before the head reached the skin say nothing."""
     poses = distinct_poses(part.scan.poses)
     used = part.scan.frames.time_s[part.used]
-    if not len(used) or not len(poses):
-        return TrackerPoses(poses.time_s[:0], poses.position_mm[:0], poses.quaternion_wxyz[:0])
-    after = np.clip(np.searchsorted(used, poses.time_s), 0, len(used) - 1)
-    away = np.minimum(np.abs(used[after] - poses.time_s), np.abs(used[np.maximum(after - 1, 0)] - poses.time_s))
-    near = away <= MAX_POSE_GAP_MS / 1000.0
+    near = np.zeros(len(poses), dtype=bool)
+    if len(used):
+        after = np.clip(np.searchsorted(used, poses.time_s), 0, len(used) - 1)
+        away = np.minimum(np.abs(used[after] - poses.time_s), np.abs(used[np.maximum(after - 1, 0)] - poses.time_s))
+        near = away <= MAX_POSE_GAP_MS / 1000.0
     return TrackerPoses(poses.time_s[near], poses.position_mm[near], poses.quaternion_wxyz[near])
 
 

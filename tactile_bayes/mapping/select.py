@@ -503,7 +503,7 @@ def other_units(mean_kpa: float, stated: str, window: tuple[float, float]) -> st
 _SAMPLE_FRAMES = 200
 
 
-def _counts_asked(scans: Iterable[Scan], stated: str = "kPa") -> str:
+def _counts_asked(scans: Iterable[Scan]) -> str:
     """Ask whether counts are shifted, pressures already or in another unit, where they would fit an exam so."""
     scan = max(scans, key=lambda one: len(one.frames))
     counts, calibration = scan.frames.counts[:: max(1, len(scan.frames) // _SAMPLE_FRAMES)], scan.element_calibration
@@ -521,7 +521,7 @@ def _counts_asked(scans: Iterable[Scan], stated: str = "kPa") -> str:
     if PRESSURE_WINDOW_KPA[0] <= middle <= PRESSURE_WINDOW_KPA[1]:
         return f"are the counts kPa already (median {middle:g})? then gain_kpa_per_count is 1 and offset_kpa 0"
     level = float(np.median(counts * calibration.gain_kpa_per_count + calibration.offset_kpa))
-    asked = other_units(level, stated, PRESSURE_WINDOW_KPA)
+    asked = other_units(level, "kPa", PRESSURE_WINDOW_KPA)
     return f"{asked} gain_kpa_per_count and offset_kpa must give kPa (median {level:.4g})" if asked else ""
 
 
