@@ -40,7 +40,7 @@ GROUPS: dict[str, dict[str, tuple[str, str]]] = {
         "emulate": ("devices.emulate_command", "Serve a scan as a scan head or a tracker would send it."),
     },
     "The laboratory": {
-        "calibrate": ("calibrate.calibrate_command", "Learn a calibration of sizes or of an array."),
+        "calibrate": ("laboratory.calibrate_command", "Learn a calibration of sizes or of an array."),
         "diagnose": ("exam.diagnose_command", "Check a posterior's draws: convergence and figures."),
         "simulate": ("laboratory.simulate_command", "Make a scan with known truth from a scene."),
         "study": ("laboratory.study_command", "Amplitude and width over sizes, depths and stiffnesses."),
@@ -49,7 +49,7 @@ GROUPS: dict[str, dict[str, tuple[str, str]]] = {
         "population": ("laboratory.population_command", "Simulate exams of varied bodies, to calibrate with."),
         "sbc": ("laboratory.sbc_command", "Check the posterior of a map against simulated maps."),
         "compare-model": ("laboratory.compare_model_command", "Compare a scan and its map with a forward model."),
-        "tradeoff": ("tradeoff.tradeoff_command", "Measure what more accuracy costs, here and now."),
+        "tradeoff": ("laboratory.tradeoff_command", "Measure what more accuracy costs, here and now."),
     },
 }
 COMMANDS = {name: found for group in GROUPS.values() for name, found in group.items()}

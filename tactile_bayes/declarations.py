@@ -186,15 +186,7 @@ def _unfolded(value: Any) -> Any:
 def from_plain(kind: type[T], document: object, *, where: str = "") -> T:
     """A record of plain data: dictionaries, lists, texts and numbers.
 
-    Parameters
-    ----------
-    where
-        Place of the data in their file, for the error.
-
-    Raises
-    ------
-    BadDataError
-        In one line: the field at fault, its value, and what it may be.
+    A `BadDataError` names the field at fault, `where` it stands in the file, its value, and what it may be.
     """
     try:
         return _converted(kind, document)
@@ -245,12 +237,8 @@ def rounded(value: T, digits: int = 9) -> T:
 def schema_of(kind: Any, *, nulls: bool = True, shared: bool = False) -> dict[str, Any]:
     """JSON schema (draft 7) of a record's files, from its declaration; the first line of its docstring is the title.
 
-    Parameters
-    ----------
-    nulls
-        Whether the files can hold null: those of TOML cannot.
-    shared
-        Whether a record that stands in several places is described once, among ``definitions``.
+    Files of TOML hold no `nulls`. With `shared` a record that stands in several places is described once, among
+    ``definitions``.
     """
     found = msgspec.json.schema(kind, schema_hook=_custom_schema)
     definitions = found.pop("$defs", {})

@@ -186,18 +186,9 @@ def progress_bar(
 ) -> Iterator[Progress]:
     """Give a ``progress(done, total)`` callback; the bar is erased when the block ends.
 
-    Parameters
-    ----------
-    label
-        What is being counted, in a word or two.
-    stream
-        Where to draw; stderr by default, so that output can be piped.
-    clock
-        Seconds from anywhere.
-    log_every_s
-        Where the stream is no terminal: a line so often, from then on. Default: none.
-    time_left
-        Whether the time left is told, for work whose parts take equally long.
+    The `label` is what is counted. By default it is drawn on stderr, so that output can be piped. Where the stream is
+    no terminal there is a line every `log_every_s`, if at all. The time left is told for work whose parts take equally
+    long.
     """
     out = raw_stream(sys.stderr) if stream is None else stream
     if not out.isatty() and log_every_s is None:

@@ -125,13 +125,7 @@ def path_of(given: None) -> None: ...
 
 
 def path_of(given: PathLike | None) -> Path | None:
-    """Convert to a path, with ``~`` as the home folder; None stays None.
-
-    Raises
-    ------
-    UsageError
-        When it is neither text nor a path.
-    """
+    """Convert a text or path to a path, with ``~`` as the home folder; None stays None."""
     if given is None:
         return None
     if not isinstance(given, str | os.PathLike):
@@ -140,26 +134,14 @@ def path_of(given: PathLike | None) -> Path | None:
 
 
 def required_path(given: PathLike, name: str) -> Path:
-    """Convert to the path of an input.
-
-    Raises
-    ------
-    UsageError
-        As `path_of`, and when it is None.
-    """
+    """Convert to the path of an input, which may not be None."""
     if given is None:
         raise UsageError(f"{name} is None; give the path of a file")
     return path_of(given)
 
 
 def output_path(given: PathLike, written: Format) -> Path:
-    """Convert to the path of an output.
-
-    Raises
-    ------
-    UsageError
-        As `path_of`, and when it has the suffix of another format than the one written.
-    """
+    """Convert to the path of an output, which may not have the suffix of another format than the one written."""
     path = required_path(given, "the path")
     check_suffix(path, written)
     return path

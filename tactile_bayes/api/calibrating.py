@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from tactile_bayes.api.arguments import PathLike, door, output_path, plain, required_path, table_of, takes
 from tactile_bayes.api.repeatability import exams_in, learn_from_exams
-from tactile_bayes.api.site_correction import correct_size
-from tactile_bayes.api.size_calibration import Learned, is_population, learn_eq6, learn_population
+from tactile_bayes.api.size_calibration import Learned, correct_size, is_population, learn_eq6, learn_population
 from tactile_bayes.errors import UsageError
 from tactile_bayes.files.tables import Sheet
 from tactile_bayes.laboratory_options import LearnOptions

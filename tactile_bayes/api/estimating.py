@@ -77,10 +77,7 @@ def estimate_file(
 def input_digests(files: Mapping[str, Path], settings: Settings, calibration: Calibration | None) -> dict[str, str]:
     """Digests of an estimate's inputs by role, with that of the site's repeatability where there is one.
 
-    Raises
-    ------
-    BadDataError
-        When the repeatability is of sizes by another calibration: another form has another slope, so another spread.
+    One of sizes by another calibration is refused: another form has another slope, so another spread.
     """
     digests, found = hash_inputs(**files), settings.repeatability
     if found is None:

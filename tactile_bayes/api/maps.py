@@ -237,13 +237,7 @@ def check(scan: Any, *, pressure_window_kpa: tuple[float, float] = PRESSURE_WIND
 
 
 def scan_given(given: Any) -> Scan:
-    """Return the scan given as a `Scan` or a simulated one.
-
-    Raises
-    ------
-    UsageError
-        When it is neither.
-    """
+    """Return the scan given as a `Scan` or a simulated one; refuse anything else."""
     scan = getattr(given, "scan", given)
     if not isinstance(scan, Scan):
         kind = type(given).__name__

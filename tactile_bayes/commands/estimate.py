@@ -112,15 +112,7 @@ class VisitsCommand(click.Command):
 def numbered(args: Sequence[str], *, strict: bool = True) -> list[str]:
     """The words with every file after ``--with`` as an option of its own, with the number of its group.
 
-    Parameters
-    ----------
-    strict
-        Refuse a ``--with`` that no file follows; a shell that completes words leaves it out.
-
-    Raises
-    ------
-    UsageError
-        When no file follows a ``--with``, and `strict`.
+    A ``--with`` that no file follows is refused where `strict`; a shell that completes words leaves it out.
     """
     found: list[str] = []
     group, files = 0, -1  # files of the group so far; -1 outside one

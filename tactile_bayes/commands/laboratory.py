@@ -1,9 +1,10 @@
-"""Options of the commands on forward models, from `simulate` to `compare-model`."""
+"""Options of the commands of the laboratory, from `calibrate` to `tradeoff`."""
 
 from __future__ import annotations
 
 import click
 
+from tactile_bayes.api.settings import Settings
 from tactile_bayes.commands.options import (
     FORCE,
     JSON,
@@ -23,6 +24,7 @@ from tactile_bayes.commands.options import (
 from tactile_bayes.declarations import names_of
 from tactile_bayes.laboratory_options import (
     CaseOptions,
+    LearnOptions,
     PopulationOptions,
     SbcOptions,
     SectionOptions,
@@ -30,6 +32,115 @@ from tactile_bayes.laboratory_options import (
     TissueOptions,
 )
 from tactile_bayes.options import MapOptions
+
+_FILE = FilePath()
+
+# --- `calibrate`: learn a calibration from known objects, and a site's repeatability from its own exams.
+
+
+@click.group("calibrate", cls=CommandGroup)
+def calibrate_command() -> None:
+    """Learn a calibration from known objects."""
+
+
+@command("size", "calibrate.calibrate_size_action", within=calibrate_command)
+@click.argument("table", metavar="TABLE.csv", type=_FILE)
+@output("SIZE.json", "JSON", "Where to write the calibration.", required=True)
+@takes(LearnOptions, "form")
+@click.option(
+    "--correct",
+    metavar="CALIBRATION",
+    help="Correct this calibration (solid, solid-mean, eq6 or a file learned over bodies) by the table's lumps instead "
+    "of learning one.",
+)
+@path_option(
+    "--against",
+    "TABLE.csv",
+    "Lumps of another origin, with the columns of `population`: how far their sizes are off goes into intervals.",
+)
+@takes(LearnOptions, "fit", "normalise", "background", "fit_radius_mm", "noise", "least_stiffness_ratio")
+@figure("Draw Fig 8 of the paper from the table's lumps (eq6 only).")
+@takes(LearnOptions, "seed")
+@FORCE
+def size() -> None:
+    """Learn Eq 6, d = m sigma / (e a^f) + b, from a study or a set of phantoms, or over a population of bodies.
+
+    TABLE.csv has a row for each lump: d_mm, amplitude, sigma_x_mm, and optionally sigma_y_mm, depth_ratio,
+    stiffness_ratio and seat. With depth_ratio the rows at one diameter depth define Delta sigma as a ratio. How the
+    table's maps were made and fitted stands in its columns normalise, background, fit_radius_mm, noise and flat_field,
+    as in a table of `study`, or is declared by the options; an option that contradicts the table is refused, and
+    `estimate` refuses a map made otherwise.
+
+    --fit joint takes m, b, e and f from all rows at once, on the scale of ln d. --fit two-stage is the paper's: d on
+    sigma in the rows at depth_ratio 1, then ln Delta sigma on ln a; its spread is a bootstrap over diameters. The
+    report tells how far the other fit lies.
+
+    With depth_ratio and stiffness_ratio the table is a study: each geometry
+    (seat, d_mm, depth_ratio) is also left out of the learning in turn, and the report tells how far Eq 6 and a
+    quadratic in logarithms then miss the hard lumps' sizes.
+
+    From a table of `population`, which has a row for each exam of a body, every form tells apart what differs between
+    bodies and between exams of one body. `population` made the maps: nothing is declared, and --normalise chooses among
+    a table's rows. From the pressure over the head where it felt no lump it also learns how deep the fat is: the
+    constants of Eq 6 depend on that, and for a map without that pressure sizes are averaged over the depths that go
+    with it. eq6-residual adds what Eq 6 leaves, a Gaussian process in ln a, ln sigma and the depth; it is the form of
+    the shipped `solid`. The spread between bodies is wide for deep, faint and soft lumps.
+
+    --correct keeps a calibration and learns from 3 lumps or more, better 5 to 20, by how much sizes at this site
+    differ from it: few lumps change it little, and the uncertainty of the correction goes into every size. TABLE.csv
+    has the columns above, with depth_ratio, seat and stiffness_ratio where they are known, and phantom where a lump has
+    several maps; or it lists map files: file, d_mm and the same. The maps must be made as the calibration's.
+
+    Example: tactile-bayes calibrate size phantoms.csv -o size.json
+    """
+
+
+@command("repeatability", "calibrate.calibrate_repeatability_action", within=calibrate_command)
+@click.argument("folder", metavar="OUT", type=_FILE)
+@output("SITE.json", "JSON", "Where to write the spread.", required=True)
+@click.option(
+    "--size-calibration",
+    metavar="SIZE.json",
+    help="Calibration that the exams were sized by, where the name in their estimates does not lead to its file.",
+)
+@FORCE
+def repeatability() -> None:
+    """Learn how far sizes of one mass lie apart between its exams at this site.
+
+    OUT is the folder of a `campaign run`. Masses with two exams or more at one visit take part, from 3 such masses on,
+    better 10: their own size cancels, and errors that each map has anyway are taken off. What is left is the spread
+    that `estimate --repeatability SITE.json` uses instead of that of simulated exams and of the paper's 15 %. Exams
+    without a size, and those of a scan that another exam has, take no part.
+
+    Example: tactile-bayes calibrate repeatability out -o site.json
+    """
+
+
+@command("array", "calibrate.calibrate_array_action", within=calibrate_command)
+@click.option(
+    "--step",
+    "steps",
+    type=(float, _FILE),
+    metavar="KPA SCAN.mcap",
+    multiple=True,
+    required=True,
+    help="The bladder's pressure and what the head recorded under it.",
+)
+@output("ARRAY.json", "JSON", "Where to write the calibration.", required=True)
+@click.option("--head-id", metavar="ID", help="Identifier of the head. Default: what the scans state.")
+@click.option(
+    "--date", "day", type=click.DateTime(["%Y-%m-%d"]), metavar="DAY", help="Day of the measurement. Default: today."
+)
+@FORCE
+def array() -> None:
+    """Learn the gain and offset of each taxel from a pressure bladder, and how uneven they stay.
+
+    Record each step with `record --uncalibrated`. Dead and hot taxels are found and get gain 0, which leaves them out
+    of maps. A parabola is fitted as well, to tell whether a straight line is enough.
+
+    Example: tactile-bayes calibrate array --step 0 p0.mcap --step 8 p8.mcap --step 16 p16.mcap -o array.json
+    """
+
 
 # --- `simulate`: make a scan with known truth from a scene.
 
@@ -64,8 +175,6 @@ def simulate_command() -> None:
 
 
 # --- `population`: simulate, map and fit exams of varied bodies: the table for a size calibration.
-
-_FILE = FilePath()
 
 
 @command("population", "simulation.population_action")
@@ -273,4 +382,132 @@ def compare_model_command() -> None:
     h/d 1, and warns outside.
 
     Example: tactile-bayes compare-model scan.mcap scene.toml --fidelity empirical
+    """
+
+
+# --- What `tradeoff estimate` and `tradeoff map` share: options, the forecast on stderr, and the output.
+
+_TOLERANCE = click.option(
+    "--tolerance-mm",
+    type=FiniteRange(min=0.0, min_open=True),
+    default=0.2,
+    show_default=True,
+    help="Error of the size interval's ends below which more accuracy is not worth its cost.",
+)
+_RUNS = click.option(
+    "--runs",
+    type=click.IntRange(1, 1000),
+    default=3,
+    show_default=True,
+    help="Number of runs of each setting: the least time counts, errors are averaged.",
+)
+_CALIBRATION = click.option(
+    "--size-calibration",
+    metavar="solid|solid-mean|plane-strain|none|SIZE.json",
+    help="Calibration from widths to sizes, as in `estimate`.",
+)
+
+
+@click.group("tradeoff", cls=CommandGroup)
+def tradeoff_command() -> None:
+    """Measure what more accuracy costs on this machine, and which of it a case does not need."""
+
+
+# --- `tradeoff forward`: error in amplitude, width and size against CPU time, for one lump and every forward model.
+
+
+@command("forward", "tradeoff.tradeoff_forward_action", within=tradeoff_command)
+@click.argument("scene", required=False, metavar="[SCENE.toml]", type=_FILE)
+@click.option(
+    "--size-calibration",
+    metavar="solid-mean|plane-strain|learned|SIZE.json",
+    help="Calibration for the sizes: a shipped one, your own file, or Eq 6 learned in this run. Default: each "
+    "model's own.",
+)
+@head_option(
+    "Default: shoulders-inside for plane-strain and the empirical model, as the scene's [head] gives them for solid."
+)
+@figure("Draw error in size against time.")
+@click.option(
+    "--tolerance-percent",
+    type=FiniteRange(min=0.0, min_open=True),
+    default=0.5,
+    show_default=True,
+    help="Error in size below which more accuracy is not worth its cost.",
+)
+@click.option(
+    "--runs",
+    type=click.IntRange(1, 1000),
+    default=1,
+    show_default=True,
+    help="Number of runs; the shortest time counts.",
+)
+@JSON
+@FORCE
+def tradeoff_forward_command() -> None:
+    """Measure error in amplitude, width and size against CPU time, for the lump of a scene.
+
+    The empirical model (which holds for lumps of 10 mm and more down to h/d 1, and warns outside), plane strain at
+    several cells and the solid model at several meshes, ranks and rims compute the
+    map of one lump, here and now; each model's finest setting is the reference of its others. Without SCENE.toml: a
+    hard ball of 15 mm at h/d 1, its centre on the gland.
+
+    Sizes come from the calibration that `estimate` uses, and the cylinder's from `plane-strain`. These maps have no
+    noise and a background of 1, so a size may be off; what counts is how it changes, which is given in mm and percent.
+    With --size-calibration learned Eq 6 is learned, in most of a minute, from each model's own lumps in the same body
+    and under the same head; the calibrations that come with the program are of the default heads.
+
+    Example: tactile-bayes tradeoff forward --figure tradeoff.png
+    """
+
+
+# --- `tradeoff estimate`: every setting of `estimate` on the user's own map, against a long reference.
+
+
+@command("estimate", "tradeoff.tradeoff_estimate_action", within=tradeoff_command)
+@click.argument("maps", metavar="MAP.nc...", nargs=-1, required=True, type=_FILE)
+@_CALIBRATION
+@takes(Settings, "centre_mm")
+@takes(Settings, "settings_file", help="Settings, as in `estimate`.")
+@_TOLERANCE
+@_RUNS
+@figure("Draw error against time.")
+@takes(Settings, "seed")
+@JSON
+@FORCE
+def tradeoff_estimate_command() -> None:
+    """Measure what each setting of `estimate` costs on a map, and how far its size interval is off.
+
+    Whole estimates, from the map to the size, by every method, at several accuracies, noise fields and fit windows, are
+    compared with a long run of the default's posterior, by importance sampling or, where that cannot be trusted, MCMC.
+    With several maps, all of one mass, the settings are tried on the first, and the sizes by one map, two and so on are
+    shown. Times are CPU seconds of this machine; about how long it takes is printed on stderr.
+
+    Where the map has no size by default there is no reference: what each setting says is printed, exit code 6.
+
+    Example: tactile-bayes tradeoff estimate map.nc --figure methods.png
+    """
+
+
+# --- `tradeoff map`: every setting of `map` on the user's own scan, up to the size.
+
+
+@command("map", "tradeoff.tradeoff_map_action", within=tradeoff_command)
+@click.argument("scan", metavar="SCAN.mcap", type=_FILE)
+@_TOLERANCE
+@_RUNS
+@figure("Draw error against time.")
+@takes(Settings, "seed")
+@JSON
+@FORCE
+def tradeoff_map_command() -> None:
+    """Measure what each setting of `map` costs on a scan, and how far it moves the size interval.
+
+    The map is built with several sizes of cells, from a part of the frames, from the first part of the scan, by every
+    way to normalise, and estimated by default. Sizes are compared with a long run on the map of all
+    frames in cells of 0.5 mm. Times are CPU seconds of this machine; about how long it takes is printed on stderr.
+
+    Where that map has no size there is no reference: what each setting says is printed, exit code 6.
+
+    Example: tactile-bayes tradeoff map scan.mcap --figure cells.png
     """

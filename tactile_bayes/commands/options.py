@@ -32,16 +32,9 @@ _SEEN: Final = "tactile_bayes.paths"
 class FilePath(click.Path):
     """Path that is checked against the other paths of the call before the command runs.
 
-    Symbolic and hard links to one file are that file.
-
-    Parameters
-    ----------
-    addresses
-        Whether the address of an object store may stand instead; it stays a text.
-    writes
-        Format of the output that it names; a suffix of another one is refused.
-    guarded
-        Whether a file of this name is only overwritten with --force. Default: where it is an output.
+    Symbolic and hard links to one file are that file. With `addresses` that of an object store may stand instead, and
+    stays a text. `writes` is the format of the output that it names, whose suffix it may have; such a file is `guarded`
+    by default: only overwritten with --force.
     """
 
     def __init__(self, *, addresses: bool = False, writes: Format | None = None, guarded: bool | None = None) -> None:
@@ -50,14 +43,7 @@ class FilePath(click.Path):
         self.guarded = writes is not None if guarded is None else guarded
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Record and return the path.
-
-        Raises
-        ------
-        UsageError
-            When it is written and another argument of the command reads or writes it, or it has the suffix of another
-            format.
-        """
+        """Record and return the path; refuse an output that another argument of the command reads or writes."""
         if self._addresses and "://" in str(value):
             return str(value)
         path = Path(os.fsdecode(super().convert(value, param, ctx)))
@@ -89,13 +75,7 @@ class FigurePath(FilePath):
 
 
 def also_read(*paths: Path | None) -> None:
-    """Refuse the call if it would overwrite one of these further inputs.
-
-    Raises
-    ------
-    UsageError
-        When one of its outputs is one of them.
-    """
+    """Refuse the call if one of its outputs is one of these further inputs."""
     context = click.get_current_context(silent=True)
     seen: list[tuple[Path, bool]] = [] if context is None else context.meta.get(_SEEN, [])
     refuse_same([path for path, written in seen if written], [path for path in paths if path is not None])
@@ -111,15 +91,7 @@ def typed_options() -> set[str]:
 def refuse_same(
     outputs: Iterable[Path | None], inputs: Iterable[Path], *, what: str = "an input of this command"
 ) -> None:
-    """Refuse an output that is the same file as an input, under any name.
-
-    Parameters
-    ----------
-    outputs
-        None where there is none.
-    what
-        What the file is besides, for the error.
-    """
+    """Refuse an output that is the same file as an input, under any name; `what` the file is besides."""
     read = list(inputs)
     for path in outputs:
         if path is not None and any(same_file(path, one) for one in read):
@@ -132,16 +104,11 @@ def refuse_same(
 def command(
     name: str, action: str, *, within: click.Group | None = None, kind: type[click.Command] = click.Command
 ) -> Callable[[Callable[[], None]], click.Command]:
-    """Make a command of its options and of a function that says its help and does nothing.
+    """Make a command, of a group or alone, of its options and of a function that says its help and does nothing.
 
-    Parameters
-    ----------
-    action
-        What it calls with its options by their names: a module of `tactile_bayes.actions`, imported when the command
-        runs, and a function there. A number that it returns is the exit code. No file of the call's outputs exists
-        then, unless --force is given.
-    within
-        Group that the command belongs to; by default it stands alone.
+    The `action` is a module of `tactile_bayes.actions`, imported when the command runs, and a function there that takes
+    the options by their names. A number that it returns is the exit code. Guarded outputs do not exist when it is
+    called, unless --force is given.
     """
     module, function = action.split(".")
 
@@ -192,15 +159,7 @@ def head_option(default: str) -> Callable[[Callable[..., Any]], Callable[..., An
 
 
 def settings_of(*, settings_file: Path | None = None, repeatability: Path | None = None, **options: Any) -> Settings:
-    """Make settings from options and from the files that they name.
-
-    Raises
-    ------
-    BadDataError
-        Naming the file, the key, its value and what is allowed.
-    UsageError
-        When the checkpoint that the file names is another file of the call.
-    """
+    """Make settings from options and from the files that they name, none of which may be an output of the call."""
     from tactile_bayes.files.size_json import read_repeatability, size_calibration_path
 
     if (calibration := options.get("size_calibration")) is not None:
@@ -273,12 +232,8 @@ class NumberOr(_ParamType):
 def takes(record: type[Record], *names: str, **attributes: Any) -> Decorator:
     """The options of a command for some fields of a record, in this order.
 
-    Type, range, default and help come from the field's declaration, `metavar` and the name from its ``extra``.
-
-    Parameters
-    ----------
-    **attributes
-        Of `click.option`, in place of what comes from the declaration.
+    Type, range, default and help come from the field's declaration, `metavar` and the name from its ``extra``;
+    `attributes` of `click.option` stand in place of them.
     """
 
     def add(command: Callable[..., Any]) -> Callable[..., Any]:

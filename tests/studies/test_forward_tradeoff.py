@@ -14,7 +14,7 @@ import pytest
 from click.testing import CliRunner
 
 from tactile_bayes.actions import tradeoff as tradeoff_forward
-from tactile_bayes.commands.tradeoff import tradeoff_forward_command
+from tactile_bayes.commands.laboratory import tradeoff_forward_command
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import EXIT_BAD_DATA, EXIT_USAGE, BadDataError
 from tactile_bayes.files.size_json import read_size_calibration, size_calibration_path
