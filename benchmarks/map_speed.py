@@ -30,13 +30,14 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.accumulate import MapAccumulator
 from tactile_bayes.mapping.cells import (
     CellSums,
+    FramePoses,
     Projection,
     Projector,
     Readout,
     add_frames,
     chunk_frames,
+    head_moments,
 )
-from tactile_bayes.mapping.plane import FramePoses, head_moments
 from tactile_bayes.mapping.select import chunks
 from tactile_bayes.presets import CELL_MM
 from tactile_bayes.scans import ElementCalibration, HeadGeometry

@@ -17,7 +17,7 @@ from tactile_bayes.files.instrument_json import ArrayCalibrationFile, write_arra
 from tactile_bayes.files.provenance import Provenance, hash_inputs
 from tactile_bayes.files.scan_mcap import read_scan
 from tactile_bayes.files.size_json import size_calibration_path
-from tactile_bayes.hardware.bladder import ArrayFit, BladderStep, fit_array
+from tactile_bayes.hardware.head import ArrayFit, BladderStep, fit_array
 from tactile_bayes.laboratory_options import LearnOptions
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.calibration import (

@@ -24,8 +24,8 @@ from tactile_bayes.forward.instrument import SimulatedScan
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.arrangement import ArrangementCheck, check_scan
 from tactile_bayes.mapping.build import build_map as build
+from tactile_bayes.mapping.cells import MAX_POSE_GAP_MS
 from tactile_bayes.mapping.map import TactileMap
-from tactile_bayes.mapping.plane import MAX_POSE_GAP_MS
 from tactile_bayes.options import MapOptions
 from tactile_bayes.presets import PRESSURE_WINDOW_KPA, RESEARCH_USE
 from tactile_bayes.progress import Progress, untold

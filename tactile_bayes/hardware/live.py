@@ -22,8 +22,8 @@ from tactile_bayes.hardware.ports import PIPE_BYTES
 from tactile_bayes.hardware.readings import CountArray, PoseReading
 from tactile_bayes.hardware.recorder import Report
 from tactile_bayes.mapping.accumulate import MapAccumulator
+from tactile_bayes.mapping.cells import FramePoses, HeadMoments, head_moments, poses_at
 from tactile_bayes.mapping.map import TactileMap
-from tactile_bayes.mapping.plane import FramePoses, HeadMoments, head_moments, poses_at
 from tactile_bayes.presets import PRESSURE_WINDOW_KPA
 from tactile_bayes.scans import ElementCalibration, HeadGeometry, TrackerPoses
 

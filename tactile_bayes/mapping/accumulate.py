@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import BoolArray, FloatArray, IndexArray
-from tactile_bayes.mapping.cells import CellSums, Projection, Projector, Readout, add_frames, chunk_frames
+from tactile_bayes.mapping.cells import CellSums, FramePoses, Projection, Projector, Readout, add_frames, chunk_frames
 from tactile_bayes.mapping.map import MapRecipe, TactileMap
-from tactile_bayes.mapping.plane import FramePoses
 from tactile_bayes.mapping.profile import GrowingProfile
 from tactile_bayes.mapping.select import SelectedFrames, chunks, gate
 from tactile_bayes.presets import CELL_MM, PRESSURE_WINDOW_KPA

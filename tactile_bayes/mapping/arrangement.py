@@ -21,6 +21,7 @@ import numpy as np
 from tactile_bayes.declarations import Record, field, replace
 from tactile_bayes.findings import Finding, finding_lines
 from tactile_bayes.geometry import FloatArray, IndexArray, apply, inverse
+from tactile_bayes.mapping.cells import poses_at
 from tactile_bayes.mapping.convention import (
     CONVENTIONS,
     CoarseFrames,
@@ -31,7 +32,6 @@ from tactile_bayes.mapping.convention import (
     thinning,
 )
 from tactile_bayes.mapping.latency import Cells, Nuisance
-from tactile_bayes.mapping.plane import poses_at
 from tactile_bayes.mapping.plausibility import SURE_ODDS, selection_doubts
 from tactile_bayes.mapping.select import SelectedFrames, TaxelFault, select_frames
 from tactile_bayes.presets import CORRECTIONS, PRESSURE_WINDOW_KPA

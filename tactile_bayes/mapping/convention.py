@@ -12,8 +12,7 @@ from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.findings import Finding
 from tactile_bayes.geometry import BoolArray, FloatArray, IndexArray, inverse, rotation_from_quaternion
-from tactile_bayes.mapping.cells import Projection
-from tactile_bayes.mapping.plane import MAX_POSE_GAP_MS, distinct_poses
+from tactile_bayes.mapping.cells import MAX_POSE_GAP_MS, Projection, distinct_poses
 from tactile_bayes.mapping.select import SelectedFrames, chunks
 from tactile_bayes.scans import TrackerPoses
 

@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 from tactile_bayes.declarations import Record
 from tactile_bayes.geometry import BoolArray, FloatArray, Plane, apply, inverse, rotation_from_quaternion
 from tactile_bayes.mapping.accumulate import Source
-from tactile_bayes.mapping.cells import VALUE_STEP, CellSums
+from tactile_bayes.mapping.cells import VALUE_STEP, CellSums, distinct_poses
 from tactile_bayes.mapping.map import FEW_READINGS
-from tactile_bayes.mapping.plane import distinct_poses
 from tactile_bayes.mapping.select import SelectedFrames
 from tactile_bayes.presets import POSE_NOISE
 

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.findings import Finding
 from tactile_bayes.geometry import BoolArray, FloatArray, IndexArray
+from tactile_bayes.mapping.cells import distinct_poses
 from tactile_bayes.mapping.map import FEW_READINGS, TactileMap
-from tactile_bayes.mapping.plane import distinct_poses
 from tactile_bayes.mapping.select import (
     SelectedFrames,
     frame_figures,

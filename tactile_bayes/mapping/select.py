@@ -15,8 +15,15 @@ from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.findings import Finding
 from tactile_bayes.geometry import BoolArray, FloatArray
-from tactile_bayes.mapping.cells import Projector, Readout, chunk_frames
-from tactile_bayes.mapping.plane import MAX_POSE_GAP_MS, FramePoses, distinct_poses, poses_at
+from tactile_bayes.mapping.cells import (
+    MAX_POSE_GAP_MS,
+    FramePoses,
+    Projector,
+    Readout,
+    chunk_frames,
+    distinct_poses,
+    poses_at,
+)
 from tactile_bayes.presets import KPA_PER_UNIT, PRESSURE_WINDOW_KPA
 from tactile_bayes.scans import PressureFrames, Scan, TrackerPoses
 

@@ -35,7 +35,7 @@ from tactile_bayes.hardware.readings import PoseReading
 from tactile_bayes.hardware.recorder import Report
 from tactile_bayes.hardware.serve import LiveServer, address_of, document
 from tactile_bayes.mapping.accumulate import MapAccumulator
-from tactile_bayes.mapping.plane import poses_at
+from tactile_bayes.mapping.cells import poses_at
 from tactile_bayes.report.map_text import live_line, live_text
 from tactile_bayes.terminal import has_styles
 

@@ -11,7 +11,7 @@ from tactile_bayes.declarations import replace
 from tactile_bayes.geometry import rigid
 from tactile_bayes.mapping.accumulate import MapAccumulator
 from tactile_bayes.mapping.build import build_map
-from tactile_bayes.mapping.plane import FramePoses, head_moments, poses_at
+from tactile_bayes.mapping.cells import FramePoses, head_moments, poses_at
 from tactile_bayes.scans import ElementCalibration, Scan
 
 FRAMES = 90

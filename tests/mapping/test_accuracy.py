@@ -13,8 +13,8 @@ from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.geometry import apply, rigid
 from tactile_bayes.mapping.accumulate import MapAccumulator
 from tactile_bayes.mapping.build import build_map
+from tactile_bayes.mapping.cells import FramePoses, head_moments
 from tactile_bayes.mapping.map import TactileMap
-from tactile_bayes.mapping.plane import FramePoses, head_moments
 from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.white import fit_bump
 from tactile_bayes.scans import Scan

@@ -19,8 +19,8 @@ from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.forward.tissue import SceneBody, SolidLump
 from tactile_bayes.mapping.accumulate import MapAccumulator
 from tactile_bayes.mapping.build import build_map
+from tactile_bayes.mapping.cells import poses_at
 from tactile_bayes.mapping.map import TactileMap
-from tactile_bayes.mapping.plane import poses_at
 from tactile_bayes.mapping.profile import (
     LEAST_FRAMES,
     MOST_FRAMES,

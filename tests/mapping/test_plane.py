@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tactile_bayes.geometry import apply, inverse
-from tactile_bayes.mapping.plane import FramePoses, HeadMoments, head_moments
+from tactile_bayes.mapping.cells import FramePoses, HeadMoments, head_moments
 from tactile_bayes.scans import HeadGeometry
 
 

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tactile_bayes.geometry import quaternion_from_rotation
-from tactile_bayes.mapping.plane import distinct_poses, poses_at
+from tactile_bayes.mapping.cells import distinct_poses, poses_at
 from tactile_bayes.scans import TrackerPoses
 
 

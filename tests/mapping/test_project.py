@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.scene import Head
 from tactile_bayes.geometry import rigid
-from tactile_bayes.mapping.cells import Projector
-from tactile_bayes.mapping.plane import FramePoses
+from tactile_bayes.mapping.cells import FramePoses, Projector
 from tactile_bayes.scans import HeadGeometry
 
 # Curved, so that all three of a taxel's coordinates count.
