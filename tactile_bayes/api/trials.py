@@ -21,7 +21,7 @@ from tactile_bayes.files.tables import Sheet, Table, check_references, read_tabl
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.draws import ParameterDraws
 from tactile_bayes.inference.ensemble import ensemble
-from tactile_bayes.inference.importance import importance, importance_options
+from tactile_bayes.inference.importance import ImportanceOptions, importance
 from tactile_bayes.inference.modes import LogDensity, mode_and_covariance
 from tactile_bayes.options import TrialSettings
 from tactile_bayes.presets import INTERVAL, RESEARCH_USE
@@ -55,7 +55,7 @@ def draw(
     """
     try:
         mode, about, _ = mode_and_covariance(log_density, centre, scale=np.sqrt(np.diag(covariance)))
-        return importance(log_density, mode, about, rng=rng, options=importance_options(_ACCURACY_SD))
+        return importance(log_density, mode, about, rng=rng, options=ImportanceOptions(_ACCURACY_SD))
     except NotConvergedError:
         return ensemble(log_density, centre, covariance, rng=rng)
 

@@ -270,11 +270,6 @@ class ImportanceOptions(Record):
     """`first`, `most`: Points of a replicate to begin with, and at most."""
 
 
-def importance_options(accuracy_sd: float | None) -> ImportanceOptions:
-    """The default options, with another accuracy if given."""
-    return ImportanceOptions() if accuracy_sd is None else ImportanceOptions(accuracy_sd=accuracy_sd)
-
-
 def importance(
     log_density: LogDensity,
     mode: FloatArray,
@@ -300,81 +295,52 @@ def importance(
     gaussians = Gaussians.one(mode, covariance)
     if parts is not None and parts.widest(covariance) > TOO_WIDE:
         gaussians = parts
-    sampler, weights, shape, error = _sampled(
-        _settled(log_density, gaussians, rng=rng, options=options), rng=rng, options=options
-    )
+    sampler = _sampled(_settled(log_density, gaussians, rng=rng, options=options), options)
     keep = max(LEAST_KEPT, 2 * sampler.number)
-    chosen = systematic(weights, keep, rng)
+    chosen = systematic(sampler.weights, keep, rng)
+    log_evidence, log_evidence_error = sampler.log_evidence()
     figures = {
-        "pareto_k": float(shape),
-        "end_error_sd": error,
+        "pareto_k": float(sampler.shape),
+        "end_error_sd": sampler.error,
         "evaluations": float(sampler.evaluations),
-        "effective_draws": float(1.0 / np.sum(weights**2)),
-        "log_evidence": sampler.log_evidence(),
-        "log_evidence_error": sampler.log_evidence_error(),
+        "effective_draws": float(1.0 / np.sum(sampler.weights**2)),
+        "log_evidence": log_evidence,
+        "log_evidence_error": log_evidence_error,
         "draws": float(keep),
     }
+    lp, log_weight = sampler.log_target.ravel()[chosen], sampler.log_weights.ravel()[chosen] - log_evidence
+    statistics = {"lp": lp[None], "log_weight": log_weight[None]}
     labels = chosen // sampler.points
-    statistics = {name: values[chosen][None] for name, values in sampler.statistics().items()}
     return ParameterDraws(sampler.theta[chosen][None], "importance", figures, labels=labels, statistics=statistics)
 
 
-_Judged = tuple["_Sampler", FloatArray, float, float]
-"""Points with their weights, the Pareto shape of these, and the error of interval ends in SDs."""
-
-
-def _sampled(sampler: _Sampler, *, rng: np.random.Generator, options: ImportanceOptions) -> _Judged:
-    """More points until the error is reached, if need be from a proposal fitted to them; with weights, shape and error.
+def _sampled(sampler: _Sampler, options: ImportanceOptions) -> _Sampler:
+    """More points until the error is reached, if need be from a proposal fitted to them.
 
     Where the fitted proposal turns out worse than the first one, the first one goes on if its points can be trusted.
     """
-    judged = _extended(sampler, options, most=min(FITTED_AT, options.most), patience=ADAPTED_FROM)
-    if _reached(judged, options):
-        return judged
-    fitted = sampler.adapted(rng)
+    wanted = options.accuracy_sd
+    if sampler.extended(wanted, most=min(FITTED_AT, options.most), patience=ADAPTED_FROM).reached(wanted):
+        return sampler
+    fitted = sampler.adapted()
     fitted.extend(ADAPTED_FROM)
     # a fitted proposal may take twice the points: chains, which come next, are asked for a fifth of the accuracy
-    better = _extended(fitted, options, most=2 * options.most, patience=HEAVY_POINTS, heavy=HEAVY)
-    if _reached(better, options):
-        return better
-    if _trusted(judged[2]):
-        judged = _extended(sampler, options, most=options.most, patience=ADAPTED_FROM)
-        if _reached(judged, options, times=NEAR_ENOUGH):
-            return judged
-    sampler, _, shape, error = better
+    if fitted.extended(wanted, most=2 * options.most, patience=HEAVY_POINTS, heavy=HEAVY).reached(wanted):
+        return fitted
+    if _trusted(sampler.shape):
+        sampler.extended(wanted, most=options.most, patience=ADAPTED_FROM)
+        if sampler.reached(NEAR_ENOUGH * wanted):
+            return sampler
     raise NotConvergedError(
-        f"importance sampling stopped at {sampler.number} points with an end-point error of {error:.3f} SD "
-        f"(wanted {options.accuracy_sd:g}) and Pareto shape {shape:.2f} (wanted {TRUSTED_SHAPE:g} or less); "
+        f"importance sampling stopped at {fitted.number} points with an end-point error of {fitted.error:.3f} SD "
+        f"(wanted {wanted:g}) and Pareto shape {fitted.shape:.2f} (wanted {TRUSTED_SHAPE:g} or less); "
         "use --method ensemble",
-        diagnostics={"pareto_k": float(shape), "end_error_sd": error},
+        diagnostics={"pareto_k": float(fitted.shape), "end_error_sd": fitted.error},
     )
-
-
-def _extended(
-    sampler: _Sampler, options: ImportanceOptions, *, most: int, patience: int, heavy: float = 0.0
-) -> _Judged:
-    """Double the points until the error is reached, or `most` a replicate.
-
-    Or until the tail is heavier than trusted by `heavy`, from `patience` points a replicate on.
-    """
-    while True:
-        weights, shape = sampler.weights()
-        # a few replicates' spread misses what a heavy tail does now and then: 0.036 SD was seen where they said 0.015
-        error = sampler.end_error(weights) * (1.0 + max(shape, 0.0) if np.isfinite(shape) else 1.0)
-        judged = sampler, weights, shape, error
-        hopeless = sampler.points >= patience and not _trusted(shape - heavy)
-        if _reached(judged, options) or sampler.points >= most or hopeless:
-            return judged
-        sampler.extend(sampler.points)
 
 
 def _trusted(shape: float) -> bool:
     return shape == -np.inf or bool(np.isfinite(shape) and shape <= TRUSTED_SHAPE)
-
-
-def _reached(judged: _Judged, options: ImportanceOptions, *, times: float = 1.0) -> bool:
-    _, _, shape, error = judged
-    return _trusted(shape) and error <= times * options.accuracy_sd
 
 
 def _settled(
@@ -385,59 +351,61 @@ def _settled(
     for _ in range(MOST_MOVES):
         sampler = _Sampler(log_density, gaussians, stretch=stretch, rng=rng, spent=spent)
         sampler.extend(options.first)
-        weights, shape = sampler.weights()
+        weights = sampler.weights
         if not np.isfinite(weights).all():
             raise NotConvergedError(
                 "importance sampling found no density about the mode; use --method ensemble",
                 diagnostics={"pareto_k": float("nan")},
             )
-        if shape > HEAVY_TAIL and stretch < WIDE_STRETCH:
+        if sampler.shape > HEAVY_TAIL and stretch < WIDE_STRETCH:
             stretch, spent = WIDE_STRETCH, sampler.evaluations
             continue
         if 1.0 / np.sum(weights**2) > POOR * sampler.number:
             break
-        moved = sampler.theta - weights @ sampler.theta
-        about = (weights[:, None] * moved).T @ moved
+        centre = weights @ sampler.theta
+        about = _covariance(sampler.theta, weights, centre)
         if not np.linalg.eigvalsh(about)[0] > 1e-6 * np.linalg.eigvalsh(gaussians.covariance[0])[0]:
             break
-        gaussians, spent = Gaussians.one(weights @ sampler.theta, about), sampler.evaluations
+        gaussians, spent = Gaussians.one(centre, about), sampler.evaluations
     return sampler
 
 
 class _Sampler:
-    """Points with densities and weights, in order of the replicates.
+    """Points with densities and smoothed weights, in order of the replicates.
 
     Replicates are independent random shifts of the point set; their spread is the error.
     """
 
+    weights: FloatArray  #: (n,) of all points.
+    shape: float  #: Pareto shape of their tail.
+    error: float  #: Largest Monte-Carlo error, over the parameters, of a 95 % interval's ends, in SDs; see `extended`.
+
     def __init__(
         self, log_density: LogDensity, gaussians: Gaussians, *, stretch: float, rng: np.random.Generator, spent: int
     ) -> None:
-        p = gaussians.mean.shape[1]
-        self._log_density = log_density
+        self._log_density, self._rng, self._spent = log_density, rng, spent
         self._proposal = Proposal(gaussians, stretch)
         self._shifts = rng.integers(2**BITS, size=(REPLICATES, self._proposal.dimension), dtype=np.uint32)
-        self._spent = spent
-        self._theta = np.empty((REPLICATES, 0, p))
-        self._log_target = np.empty((REPLICATES, 0))
-        self._log_weights = np.empty((REPLICATES, 0))
+        self._theta = np.empty((REPLICATES, 0, gaussians.mean.shape[1]))
+        self.log_target, self.log_weights = np.empty((REPLICATES, 0)), np.empty((REPLICATES, 0))
 
-    def adapted(self, rng: np.random.Generator) -> _Sampler:
+    def adapted(self) -> _Sampler:
         """One whose proposal is fitted to these points, without points."""
         gaussians, spent = fitted_gaussians(
-            self._log_density, self._proposal, self.theta, self._log_target.ravel(), rng=rng
+            self._log_density, self._proposal, self.theta, self.log_target.ravel(), rng=self._rng
         )
-        return _Sampler(self._log_density, gaussians, stretch=STRETCH, rng=rng, spent=self.evaluations + spent)
+        spent += self.evaluations
+        return _Sampler(self._log_density, gaussians, stretch=STRETCH, rng=self._rng, spent=spent)
 
     @property
     def number(self) -> int:
         """Number of points in all replicates."""
-        return self._log_weights.size
+        return self.log_weights.size
 
     @property
     def points(self) -> int:
         """Number of points per replicate."""
-        return self._log_weights.shape[1]
+        return self.log_weights.shape[1]
 
     @property
     def evaluations(self) -> int:
@@ -454,37 +422,42 @@ class _Sampler:
         theta, log_proposal = self._proposal.points(shifted_sobol(self.points, points, shifts=self._shifts))
         log_target = self._log_density(theta.reshape(-1, theta.shape[2])).reshape(theta.shape[:2])
         self._theta = np.concatenate([self._theta, theta], axis=1)
-        self._log_target = np.concatenate([self._log_target, log_target], axis=1)
-        self._log_weights = np.concatenate([self._log_weights, log_target - log_proposal], axis=1)
+        self.log_target = np.concatenate([self.log_target, log_target], axis=1)
+        self.log_weights = np.concatenate([self.log_weights, log_target - log_proposal], axis=1)
+        self.weights, self.shape = smooth_weights(self.log_weights.ravel())
 
-    def weights(self) -> tuple[FloatArray, float]:
-        """Smoothed weights of all points, and the Pareto shape of their tail."""
-        return smooth_weights(self._log_weights.ravel())
+    def extended(self, accuracy_sd: float, *, most: int, patience: int, heavy: float = 0.0) -> _Sampler:
+        """Double the points until the error is reached, or `most` a replicate.
 
-    def statistics(self) -> dict[str, FloatArray]:
-        """Log density and log weight of all points, the weights' mean 1."""
-        log_weight = self._log_weights.ravel()
-        return {"lp": self._log_target.ravel(), "log_weight": log_weight - self.log_evidence()}
+        Or until the tail is heavier than trusted by `heavy`, from `patience` points a replicate on.
+        """
+        while True:
+            # a few replicates' spread misses what a heavy tail does now and then: 0.036 SD was seen where they said
+            # 0.015
+            self.error = self._end_error() * (1.0 + max(self.shape, 0.0) if np.isfinite(self.shape) else 1.0)
+            hopeless = self.points >= patience and not _trusted(self.shape - heavy)
+            if self.reached(accuracy_sd) or self.points >= most or hopeless:
+                return self
+            self.extend(self.points)
 
-    def log_evidence(self) -> float:
-        """Log of the integral of exp(log density)."""
-        flat = self._log_weights.ravel()
-        return float(np.logaddexp.reduce(flat) - np.log(len(flat)))
+    def reached(self, accuracy_sd: float) -> bool:
+        """True where the weights can be trusted and the error is no larger than this."""
+        return _trusted(self.shape) and self.error <= accuracy_sd
 
-    def log_evidence_error(self) -> float:
-        """Standard error of `log_evidence`, from the replicates."""
-        each = np.logaddexp.reduce(self._log_weights, axis=1)
+    def log_evidence(self) -> tuple[float, float]:
+        """Log of the integral of exp(log density), and its standard error, from the replicates."""
+        each = np.logaddexp.reduce(self.log_weights, axis=1)
         share = np.exp(each - each.max())
-        return float(share.std(ddof=1) / share.mean() / np.sqrt(len(share)))
+        error = float(share.std(ddof=1) / share.mean() / np.sqrt(len(share)))
+        return float(np.logaddexp.reduce(self.log_weights.ravel()) - np.log(self.number)), error
 
-    def end_error(self, weights: FloatArray) -> float:
-        """Largest Monte-Carlo error, over the parameters, of a 95 % interval's ends, in SDs."""
-        by_replicate = weights.reshape(self._log_weights.shape)
+    def _end_error(self) -> float:
+        by_replicate = self.weights.reshape(self.log_weights.shape)
         worst = 0.0
         for i in range(self._theta.shape[2]):
             values = self._theta[:, :, i]
-            mean = float(np.sum(weights * values.ravel()))
-            sd = float(np.sqrt(np.sum(weights * (values.ravel() - mean) ** 2)))
+            mean = float(np.sum(self.weights * values.ravel()))
+            sd = float(np.sqrt(np.sum(self.weights * (values.ravel() - mean) ** 2)))
             ends = [weighted_quantile(v, w, (0.025, 0.975)) for v, w in zip(values, by_replicate, strict=True)]
             error = float(np.sqrt(np.mean(np.var(ends, axis=0, ddof=1)) / len(ends)))
             worst = max(worst, error / sd if sd > 0 else 0.0)

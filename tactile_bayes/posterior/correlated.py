@@ -11,7 +11,7 @@ from tactile_bayes.inference.draws import ParameterDraws, Solved
 from tactile_bayes.inference.points import MOST_PAIRED, normal_quantile, paired_points
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.abstention import rim_fault
-from tactile_bayes.posterior.bump import PoseNoise, covariance_from_log_widths, overlap, trusted
+from tactile_bayes.posterior.bump import covariance_from_log_widths, drawn_widths, overlap, trusted
 from tactile_bayes.posterior.detection import Detection, detection_from_odds
 from tactile_bayes.posterior.draw import (
     DETECTED,
@@ -23,7 +23,8 @@ from tactile_bayes.posterior.draw import (
     scene_asked,
 )
 from tactile_bayes.posterior.field import FLOOR, Window, cosines_for
-from tactile_bayes.posterior.fit import FieldFit, field_window, modal_widths, shape_draws, start_vector, tangent_columns
+from tactile_bayes.posterior.fit import FieldFit, tangent_columns
+from tactile_bayes.posterior.marginal import independent_variance
 from tactile_bayes.posterior.neighbours import (
     WANTED,
     Surroundings,
@@ -128,29 +129,20 @@ def pose_covariance(fit: FieldFit) -> FloatArray:
     covariance = np.zeros((len(fit.mode), len(fit.mode)))
     if noise is None or fit.scene.shape == "ridge":
         return covariance
-    known = tangent_columns(fit)
+    known, window = tangent_columns(fit), fit.target.window
+    across, along = (_roots(axis, side) for axis, side in zip((window.x_mm, window.y_mm), noise.side_mm, strict=True))
+    power = np.outer(np.sum(along**2, axis=1), np.sum(across**2, axis=1))
+    i, j = np.nonzero(power > LEAST_EIGENVALUE * power.max())
+    # columns whose products sum to the share of frames that two cells share, then the independent parts of their errors
+    frames = np.maximum(window.cells.count * noise.frames_per_reading, 1.0)
+    shared = window.of_cells(along[i][:, :, None] * across[j][:, None, :]) / np.sqrt(frames)
     slopes = [known[1 + fit.scene.names.index(name)] for name in ("x", "y")]
-    errors = _error_columns(fit.target.window, noise, slopes)
+    errors = np.concatenate([sd * slope * shared for sd, slope in zip(noise.sd_mm, slopes, strict=True)])
     products = fit.target.products(known, np.concatenate([known, errors]), fit.mode)
     v = len(known)
     moved = np.linalg.solve(products[:, :v], products[:, v:])[1 : p + 1]
     covariance[:p, :p] = moved @ moved.T
     return covariance
-
-
-def _error_columns(window: Window, noise: PoseNoise, slopes: list[FloatArray]) -> FloatArray:
-    """(k, n) independent parts of the cells' errors, from slopes of a unit bump along x and y."""
-    frames = np.maximum(window.cells.count * noise.frames_per_reading, 1.0)
-    shared = _shared_frames(window, noise) / np.sqrt(frames)
-    return np.concatenate([sd * slope * shared for sd, slope in zip(noise.sd_mm, slopes, strict=True)])
-
-
-def _shared_frames(window: Window, noise: PoseNoise) -> FloatArray:
-    """(k, n) columns whose products sum to the share of frames that two cells share."""
-    across, along = (_roots(axis, side) for axis, side in zip((window.x_mm, window.y_mm), noise.side_mm, strict=True))
-    power = np.outer(np.sum(along**2, axis=1), np.sum(across**2, axis=1))
-    i, j = np.nonzero(power > LEAST_EIGENVALUE * power.max())
-    return window.of_cells(along[i][:, :, None] * across[j][:, None, :])
 
 
 def _roots(axis_mm: FloatArray, side_mm: float) -> FloatArray:
@@ -166,7 +158,7 @@ LEAST_VARIANCE = 1e-12
 
 
 class Correlated(Record, eq=False):
-    """An `Assessment` under correlated errors."""
+    """A place on a map under correlated errors."""
 
     tactile_map: TactileMap
     fit: BumpFit
@@ -183,7 +175,7 @@ class Correlated(Record, eq=False):
         except NotConvergedError:
             return cls(tactile_map, fit, Detection(0.0, -np.inf))
         x, y = (float(scene.plain.scene.column(scene.plain.mode[None], name)[0]) for name in "xy")
-        fault = rim_fault(tactile_map, (x, y), modal_widths(scene.plain), radius_mm=options.fit_radius_mm)
+        fault = rim_fault(tactile_map, (x, y), scene.plain.widths_mm, radius_mm=options.fit_radius_mm)
         if not fault and detection.probability >= DETECTED:
             scene, detection = with_neighbours(scene, detection, tactile_map, asked=scene_asked(options))
         return cls(tactile_map, fit, detection, scene, fault)
@@ -196,7 +188,7 @@ class Correlated(Record, eq=False):
 
     def widths_mm(self) -> tuple[float, float]:
         """Its widths."""
-        return modal_widths(self._scene.fit)
+        return self._scene.fit.widths_mm
 
     @property
     def _scene(self) -> SceneChoice:
@@ -212,14 +204,27 @@ class Correlated(Record, eq=False):
         wanted = WANTED.get(asked, "")
         if wanted and choice.fit.scene.extra != wanted:
             raise NotConvergedError(f"no {wanted} found beside the bump; leave out --scene {asked}")
-        solved = Solved(choice.fit.target.conditional)
-        draws, passed_over = draw_parameters(choice.fit, options, rng=rng, progress=progress, solved=solved)
+        fit, target = choice.fit, choice.fit.target
+        solved = Solved(target.conditional)
+        draws, passed_over = draw_parameters(fit, options, rng=rng, progress=progress, solved=solved)
         detection = self.detection
-        if choice.fit is choice.plain and not detection.ridge and "log_evidence" in draws.diagnostics:
-            detection = field_detection(choice.plain, self.tactile_map, draws.diagnostics["log_evidence"])
-        places = pose_covariance(choice.fit)
-        figures = _figures(choice, _places_share(choice.fit, places), passed_over)
-        return MapDraws(detection, self.fit, draws, _posterior(choice.fit, draws, rng, solved, places), figures)
+        if fit is choice.plain and not detection.ridge and "log_evidence" in draws.diagnostics:
+            detection = field_detection(fit, self.tactile_map, draws.diagnostics["log_evidence"])
+        places = pose_covariance(fit)
+        share = None
+        if target.window.cells.pose_noise is not None:
+            widths = [fit.scene.names.index(name) for name in ("u", "v") if name in fit.scene.names]
+            added, other = (float(np.diag(one)[widths].sum()) for one in (places, fit.covariance))
+            share = added / (added + other)
+        figures = NoiseFigures(
+            "field",
+            fit.scene.shape == "rotated",
+            next((one.odds for one in choice.structures if one.name == "rotated"), None),
+            {"field_cosines": target.window.cosines, **target.field_summary(fit.mode)},
+            places_share=share,
+            passed_over=passed_over,
+        )
+        return MapDraws(detection, self.fit, draws, _posterior(fit, draws, rng, solved, places), figures)
 
 
 def fit_and_test(tactile_map: TactileMap, fit: BumpFit, options: SamplerSettings) -> tuple[SceneChoice, Detection]:
@@ -229,24 +234,22 @@ def fit_and_test(tactile_map: TactileMap, fit: BumpFit, options: SamplerSettings
     """
 
     def under(number: int, start: FloatArray) -> tuple[SceneChoice, Detection]:
-        problem = Problem(field_window(fit, cosines=number), options.prior, options.fit_radius_mm, fit.bump.scale)
+        window = Window(fit.cells, independent_variance(fit.cells), cosines=number)
+        problem = Problem(window, options.prior, options.fit_radius_mm, fit.bump.scale)
         choice = choose_shape(problem, start, scene=scene_asked(options))
         return choice, field_detection(choice.plain, tactile_map, choice.plain.log_evidence)
 
-    full, asked = Scene("rotated"), options.field_cosines
-    choice, detection = under(FIELD_COSINES if asked == "auto" else asked, start_vector(fit, full))
+    p, q, r = (float(one) for one in fit.bump.shape_parameters(fit.theta))
+    start, asked = np.array([p + q, p - q, *fit.theta[1:3], r]), options.field_cosines
+    choice, detection = under(FIELD_COSINES if asked == "auto" else asked, start)
     if asked != "auto" or not detection.log_bayes_factor > 0:
         return choice, detection
-    wanted = cosines_needed(choice.plain)
+    plain = choice.plain
+    window, narrower = plain.target.window, min(plain.widths_mm)
+    wanted = max(cosines_for(narrower, axis) for axis in (window.x_mm, window.y_mm))
     if wanted <= FIELD_COSINES:
         return choice, detection
-    return under(wanted, choice.plain.scene.carried(choice.plain.mode, full))
-
-
-def cosines_needed(plain: FieldFit) -> int:
-    """Number of cosines for the narrower width of the fitted bump."""
-    narrower, window = min(modal_widths(plain)), plain.target.window
-    return max(cosines_for(narrower, axis) for axis in (window.x_mm, window.y_mm))
+    return under(wanted, plain.scene.carried(plain.mode, Scene("rotated")))
 
 
 def field_detection(plain: FieldFit, tactile_map: TactileMap, log_evidence: float) -> Detection:
@@ -292,7 +295,7 @@ def _posterior(
     """Draws by name, with tracker position error and what the noise field leaves open of a non-Gaussian bump added."""
     shape = draws.theta.shape[:2]
     theta = draws.theta + _displaced(fit, draws, places + exponent_covariance(fit), rng).reshape(draws.theta.shape)
-    sigma_x, sigma_y, angle = shape_draws(fit, theta)
+    sigma_x, sigma_y, angle = drawn_widths(*fit.scene.widths(theta))
     amplitude, level, noise_sd = fit.target.draw_linear(draws.flat, rng, solved=solved)
     return MapPosterior(
         amplitude=amplitude[:, 0].reshape(shape),
@@ -335,21 +338,3 @@ def _displaced(fit: FieldFit, draws: ParameterDraws, places: FloatArray, rng: np
     width = fit.scene.column(draws.flat, "u") + fit.scene.column(draws.flat, "v")
     points = paired_points(width, draws.replicates, len(kept), rng)
     return np.asarray(normal_quantile(points) @ (vectors[:, kept] * np.sqrt(values[kept])).T)
-
-
-def _places_share(fit: FieldFit, places: FloatArray) -> float | None:
-    """Share of the log widths' variance from tracker position error; None where that is not known."""
-    if fit.target.window.cells.pose_noise is None:
-        return None
-    widths = [fit.scene.names.index(name) for name in ("u", "v") if name in fit.scene.names]
-    added = float(np.diag(places)[widths].sum())
-    return added / (added + float(np.diag(fit.covariance)[widths].sum()))
-
-
-def _figures(choice: SceneChoice, places_share: float | None, passed_over: tuple[str, ...]) -> NoiseFigures:
-    odds = {one.name: one.odds for one in choice.structures}
-    target = choice.fit.target
-    figures = {"field_cosines": target.window.cosines, **target.field_summary(choice.fit.mode)}
-    return NoiseFigures(
-        "field", choice.fit.rotated, odds.get("rotated"), figures, places_share=places_share, passed_over=passed_over
-    )

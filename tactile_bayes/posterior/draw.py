@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from typing import Any, Protocol
 
 import numpy as np
@@ -12,7 +13,7 @@ from tactile_bayes.errors import NotConvergedError, UsageError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.draws import END_ERROR, INDEPENDENT_DRAWS, Labels, ParameterDraws, Solved, distinct_rows
 from tactile_bayes.inference.ensemble import EnsembleOptions, ensemble
-from tactile_bayes.inference.importance import TRUSTED_SHAPE, Gaussians, importance, importance_options
+from tactile_bayes.inference.importance import TRUSTED_SHAPE, Gaussians, ImportanceOptions, importance
 from tactile_bayes.inference.modes import LogDensity
 from tactile_bayes.options import FitSettings
 from tactile_bayes.presets import FIT_RADIUS_MM, Background, Method, Noise, Rotation, SceneAsked
@@ -70,8 +71,6 @@ def scene_asked(options: SamplerSettings) -> SceneAsked:
     turned = by_rotation[options.rotation]
     return turned if options.scene == "auto" else options.scene
 
-
-# --- Posterior draws of a bump, under either noise model: by the chosen method, or by the next one where it fails.
 
 # --- Joint posterior draws, the result of every method and noise model.
 
@@ -176,7 +175,7 @@ class Diagnostics(Record):
         }
 
 
-# --- The ladder of methods.
+# --- Posterior draws of a bump, under either noise model: by the chosen method, or by the next one where it fails.
 
 DISAGREEMENT = 5.0
 """Ends of intervals by two methods differ by more than this many of their joint Monte-Carlo errors: one is wrong."""
@@ -307,10 +306,9 @@ def _draw(
 
 def importance_draws(density: Sampled, *, rng: np.random.Generator, accuracy_sd: float | None = None) -> ParameterDraws:
     """Draw by importance sampling from the Gaussians' common mean and covariance, or from each of them."""
-    options = importance_options(accuracy_sd)
-    return importance(
-        density.log_density, density.mean, density.covariance, rng=rng, options=options, parts=density.parts
-    )
+    options = ImportanceOptions() if accuracy_sd is None else ImportanceOptions(accuracy_sd)
+    about = density.log_density, density.mean, density.covariance
+    return importance(*about, rng=rng, options=options, parts=density.parts)
 
 
 def ensemble_draws(
@@ -334,7 +332,9 @@ def ensemble_draws(
     if accuracy_sd is not None:
         settings = replace(settings, least_ess=(END_ERROR / accuracy_sd) ** 2)
     key = density.checkpoint_key(settings.identity(), rng)
-    start = _start(density, rng)
+    start = None
+    with suppress(NotConvergedError):
+        start = importance_draws(density, rng=rng, accuracy_sd=START_ACCURACY_SD)
     draws = ensemble(
         *about,
         rng=rng,
@@ -354,13 +354,6 @@ def ensemble_draws(
             diagnostics=dict(draws.diagnostics) | {"disagreement": gap},
         )
     return replace(draws, diagnostics=dict(draws.diagnostics) | {"disagreement": gap})
-
-
-def _start(density: Sampled, rng: np.random.Generator) -> ParameterDraws | None:
-    try:
-        return importance_draws(density, rng=rng, accuracy_sd=START_ACCURACY_SD)
-    except NotConvergedError:
-        return None
 
 
 def disagreement(chains: ParameterDraws, weighted: ParameterDraws) -> float:

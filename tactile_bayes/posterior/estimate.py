@@ -26,20 +26,18 @@ from tactile_bayes.posterior.draw import (
     DETECTED,
     ROTATION_ODDS,
     Diagnostics,
-    MapPosterior,
     ModalBump,
     NoiseFigures,
     SamplerSettings,
     check_options,
 )
-from tactile_bayes.posterior.lump_probability import LIKELY, Weighed, weigh
-from tactile_bayes.posterior.result import Estimate, Sensitivity, prior_sensitivity
+from tactile_bayes.posterior.lump_probability import LIKELY, weigh
+from tactile_bayes.posterior.result import Estimate, prior_sensitivity
 from tactile_bayes.posterior.search import Assessment, SizedDraws, best_chance, draw_until_accurate, search
 from tactile_bayes.posterior.white import Candidate, check_background
 from tactile_bayes.presets import CELL_PER_SIGMA
 from tactile_bayes.progress import Progress
 from tactile_bayes.scans import DEFAULT_HEAD, HeadShape
-from tactile_bayes.size.draws import SizePosterior
 from tactile_bayes.size.fat import head_profile
 from tactile_bayes.size.pooling import Calibration
 from tactile_bayes.size.terms import SPREAD, UNLIKE_LEARNED, UNLIKE_ON_PAPER, Recipe, extrapolated, unknown_head
@@ -75,7 +73,12 @@ def estimate_map(
     check_background(tactile_map, options)
     check_options(options)
     if calibration is not None:
-        check_recipe(tactile_map, calibration, options)
+        differs = recipe_differences(tactile_map, calibration, options)
+        if differs:
+            raise BadDataError(
+                f"the size calibration was learned by another recipe: {'; '.join(differs)}",
+                way_out=_way_to(calibration.recipe, tactile_map),
+            )
         calibration = calibration_for(tactile_map, calibration)
     estimate = _answer(tactile_map, calibration, options, rng=rng, progress=progress)
     if estimate.code in NO_LUMP and options.scene != "none" and (why := no_verdict(tactile_map)) is not None:
@@ -109,24 +112,18 @@ def _answer(
         lump = detection.probability >= DETECTED and why.code not in NO_LUMP
         estimate = _none(why, candidates, detection, fit.modal() if lump and fit is not None else None)
         return replace(estimate, weighed=likeliest)
-    weighed = _weighed(tactile_map, seen, seen.detection)
+    # by the bump's mode where it is a lump by the evidence, else by least squares
+    bump = seen.bump() if seen.detection.probability >= DETECTED else seen.fit.modal()
+    weighed = weigh(tactile_map, seen.detection, bump)
     if seen.detection.probability < DETECTED or weighed.probability < LIKELY:
         estimate = _none(undetected(weighed, where=where), candidates, seen.detection)
     elif options.scene == "none":
-        why = Abstention("undetected", "no lump was assumed")
-        estimate = _none(why, candidates, seen.detection)
+        estimate = _none(Abstention("undetected", "no lump was assumed"), candidates, seen.detection)
     else:
         estimate = _measured(tactile_map, seen, candidates, calibration, options, rng=rng, progress=progress)
     if estimate.code == "ridge" and not estimate.reason.startswith("no lump found"):
         estimate = replace(estimate, reason=f"no lump found {where}: {estimate.reason}")
-    return replace(estimate, weighed=_weighed(tactile_map, seen, estimate.detection or seen.detection))
-
-
-def _weighed(tactile_map: TactileMap, seen: Assessment, detection: Detection) -> Weighed:
-    """The assessed place: by its mode where it is a lump by the evidence, else by least squares."""
-    bump = seen.bump() if seen.detection.probability >= DETECTED else seen.fit.modal()
-    widths = (bump.sigma_x_mm, bump.sigma_y_mm)
-    return weigh(tactile_map, detection, centre_mm=(bump.x_mm, bump.y_mm), widths_mm=widths)
+    return replace(estimate, weighed=weigh(tactile_map, estimate.detection or seen.detection, bump))
 
 
 def _measured(
@@ -156,7 +153,7 @@ def _measured(
     detection = made.detection
     if sized.fault is not None:
         return _none(sized.fault, candidates, detection, bump)
-    diagnostics = _diagnostics(sized)
+    diagnostics, posterior = _diagnostics(sized), made.posterior
     if sized.extrapolation_faults:
         return _none(extrapolated(list(sized.extrapolation_faults)), candidates, detection, bump, diagnostics)
     if size is not None and size.invalid > MOST_INVALID * size.d_x_mm.size:
@@ -165,19 +162,21 @@ def _measured(
             "extrapolated", reason, "learn a calibration whose table holds such lumps", UNLIKE_ON_PAPER
         )
         return _none(outside, candidates, detection, bump, diagnostics)
+    drawn = {"sigma_x_mm": posterior.sigma_x_mm, "sigma_y_mm": posterior.sigma_y_mm}
+    drawn |= {} if size is None else {"max_size_mm": size.max_size_mm}
     return Estimate(
         "estimate",
         "" if calibration is not None else "no size calibration was given: widths only",
         detection=detection,
         fit=made.fit,
         draws=made.draws,
-        map_posterior=made.posterior,
+        map_posterior=posterior,
         size=size,
         candidates=candidates,
         diagnostics=diagnostics,
         left_out=_left_out(tactile_map, options, calibration, made.figures),
         scene=seen.scene,
-        sensitivity=_sensitivity(made.posterior, size, options),
+        sensitivity=prior_sensitivity(posterior.sigma_x_mm, posterior.sigma_y_mm, drawn, options.prior),
         bump=bump,
         findings=tuple(_findings(sized, cell_mm=tactile_map.recipe.cell_mm)),
     )
@@ -205,13 +204,6 @@ def _none(
     )
 
 
-def _sensitivity(posterior: MapPosterior, size: SizePosterior | None, options: SamplerSettings) -> Sensitivity:
-    quantities = {"sigma_x_mm": posterior.sigma_x_mm, "sigma_y_mm": posterior.sigma_y_mm}
-    if size is not None:
-        quantities["max_size_mm"] = size.max_size_mm
-    return prior_sensitivity(posterior.sigma_x_mm, posterior.sigma_y_mm, quantities, options.prior)
-
-
 def calibration_for(tactile_map: TactileMap, calibration: Calibration) -> Calibration:
     """The calibration at the map's depth of fat, where both have one."""
     return calibration.at_fat([head_profile(tactile_map.quality)])
@@ -230,16 +222,6 @@ def recipe_differences(tactile_map: TactileMap, calibration: Calibration, fit: S
         head=tactile_map.head,
     )
     return ours.differences(theirs)
-
-
-def check_recipe(tactile_map: TactileMap, calibration: Calibration, fit: SamplerSettings) -> None:
-    """Refuse a map or fit options that differ from the recipe the calibration was learned with."""
-    differs = recipe_differences(tactile_map, calibration, fit)
-    if differs:
-        raise BadDataError(
-            f"the size calibration was learned by another recipe: {'; '.join(differs)}",
-            way_out=_way_to(calibration.recipe, tactile_map),
-        )
 
 
 def way_to_head(head: HeadShape | None) -> str:

@@ -43,24 +43,10 @@ class Whitening(Record, eq=False):
     precision is diagonal."""
     eigenvalues: FloatArray  #: (k,) array: Of ``S^1/2 Phi' D^-1 Phi S^1/2``.
 
-    def shrinkage(self, share: float | FloatArray) -> FloatArray:
-        """(..., k) weights of the squared projections that the field absorbs: ``rho / (1 + rho lambda)``."""
-        rho = np.asarray(share)[..., None]
-        return np.asarray(rho / (1.0 + rho * self.eigenvalues))
-
     def pruned(self, share: float) -> Whitening:
         """Copy without the directions that matter little at this share or a smaller one."""
         keep = share * self.eigenvalues > TOUCHED
         return Whitening(self.length_mm, np.ascontiguousarray(self.turn[:, keep]), self.eigenvalues[keep])
-
-    def log_determinant(self, share: float | FloatArray) -> FloatArray:
-        """(...) log determinant of the covariance over that of D."""
-        return np.asarray(np.log1p(np.asarray(share)[..., None] * self.eigenvalues).sum(axis=-1))
-
-
-def no_field(cosines: int) -> Whitening:
-    """The share of 0, the same for every length: no directions."""
-    return Whitening(float(np.mean(LENGTHS_MM)), np.zeros((cosines**2, 0)), np.zeros(0))
 
 
 def cosine_profiles(axis_mm: FloatArray, *, cosines: int = FIELD_COSINES) -> tuple[FloatArray, FloatArray]:
@@ -136,19 +122,17 @@ class Projected(Record, eq=False):
 
 
 class Profiles(Record, eq=False):
-    """m templates on the grid: products of `rows` (m, ny) and `columns` (m, nx), or `grid` (m, ny, nx) as it is."""
+    """m templates on the grid that are products of `rows` (m, ny) and `columns` (m, nx)."""
 
-    rows: FloatArray | None = None
-    columns: FloatArray | None = None
-    grid: FloatArray | None = None
+    rows: FloatArray
+    columns: FloatArray
 
     def full(self) -> FloatArray:
         """(m, ny, nx) templates."""
-        if self.grid is not None:
-            return self.grid
-        assert self.rows is not None
-        assert self.columns is not None
         return np.asarray(self.rows[:, :, None] * self.columns[:, None, :])
+
+
+Templates = Profiles | FloatArray  #: m templates: products of profiles, or (m, ny, nx) values as they are.
 
 
 class Window:
@@ -175,8 +159,9 @@ class Window:
         grid[..., self._row, self._column] = values
         return grid
 
-    def of_cells(self, grid: FloatArray) -> FloatArray:
-        """(..., k) cell values of (..., ny, nx) grids."""
+    def of_cells(self, templates: Templates) -> FloatArray:
+        """(..., k) cell values of templates or (..., ny, nx) grids."""
+        grid = templates.full() if isinstance(templates, Profiles) else templates
         return np.asarray(grid[..., self._row, self._column])
 
     def field(self, length_mm: float) -> Whitening:
@@ -188,13 +173,15 @@ class Window:
             self._fields[length_mm] = whitening(self._gram, frequency2, length_mm=length_mm)
         return self._fields[length_mm]
 
-    def project(self, templates: Profiles, plain: FloatArray) -> Projected:
+    def project(self, templates: Templates, plain: FloatArray) -> Projected:
         """Inner products of templates with the cosines, with (c, ny, nx) weighted vectors, and with themselves."""
-        if templates.grid is not None:
-            return self._project_grid(templates.grid, plain)
+        if not isinstance(templates, Profiles):
+            m, weighted = len(templates), templates * self.weight
+            half = (weighted.reshape(-1, len(self.x_mm)) @ self._across).reshape(m, len(self.y_mm), self.cosines)
+            low = np.matmul(self._along.T, half).reshape(m, -1)
+            with_plain = templates.reshape(m, -1) @ plain.reshape(len(plain), -1).T
+            return Projected(low, with_plain, np.einsum("mrc,mrc->m", weighted, templates))
         rows, columns = templates.rows, templates.columns
-        assert rows is not None
-        assert columns is not None
         m, c = len(rows), len(plain)
         half = (columns @ self._weighted_across).reshape(m, len(self.y_mm), self.cosines)
         low = np.matmul(self._along.T, half * rows[:, :, None]).reshape(m, -1)
@@ -203,28 +190,17 @@ class Window:
         square = np.einsum("mr,mr->m", rows**2, columns**2 @ self.weight.T)
         return Projected(low, with_plain, square)
 
-    def _project_grid(self, grid: FloatArray, plain: FloatArray) -> Projected:
-        m = len(grid)
-        weighted = grid * self.weight
-        half = (weighted.reshape(-1, len(self.x_mm)) @ self._across).reshape(m, len(self.y_mm), self.cosines)
-        low = np.matmul(self._along.T, half).reshape(m, -1)
-        with_plain = grid.reshape(m, -1) @ plain.reshape(len(plain), -1).T
-        return Projected(low, with_plain, np.einsum("mrc,mrc->m", weighted, grid))
-
-    def product(self, one: Profiles, other: Profiles) -> FloatArray:
+    def product(self, one: Templates, other: Templates) -> FloatArray:
         """(m,) inner products of templates with templates, pairwise."""
-        if one.grid is None and other.grid is None:
-            assert one.rows is not None
-            assert one.columns is not None
-            assert other.rows is not None
-            assert other.columns is not None
+        if isinstance(one, Profiles) and isinstance(other, Profiles):
             across = (one.columns * other.columns) @ self.weight.T
             return np.asarray(np.einsum("mr,mr->m", one.rows * other.rows, across))
-        return np.asarray(np.einsum("mrc,mrc->m", one.full() * self.weight, other.full()))
+        first, second = (two.full() if isinstance(two, Profiles) else two for two in (one, other))
+        return np.asarray(np.einsum("mrc,mrc->m", first * self.weight, second))
 
     def bumps(
         self, x_mm: FloatArray, y_mm: FloatArray, *, p: FloatArray, q: FloatArray, r: FloatArray | None
-    ) -> Profiles:
+    ) -> Templates:
         """Cell means of (m,) blurred Gaussians of unit height; along the grid's axes when r is None."""
         cell, noise = self.cells.cell_mm, self.cells.pose_noise
         blur_x, blur_y = (0.0, 0.0) if noise is None else noise.sd_mm
@@ -239,10 +215,10 @@ class Window:
             across, along = self.x_mm - x_mm[:, None], self.y_mm - y_mm[:, None]
             grid = turned_gaussians(across, along, covariance_mm2=blurred, cell_mm=cell)
             grid *= lower[:, None, None]
-            return Profiles(grid=grid)
+            return grid
 
-    def ridges(self, angle_rad: FloatArray, offset_mm: FloatArray, *, log_width: FloatArray) -> Profiles:
-        """Straight ridges of unit height, Gaussian across, `offset_mm` from `middle` in direction `angle_rad`."""
+    def ridges(self, angle_rad: FloatArray, offset_mm: FloatArray, *, log_width: FloatArray) -> FloatArray:
+        """(m, ny, nx) ridges of unit height, Gaussian across, `offset_mm` from `middle` in direction `angle_rad`."""
         x, y = self.middle
         across_x = np.cos(angle_rad)[:, None] * (self.x_mm - x)
         across_y = np.sin(angle_rad)[:, None] * (self.y_mm - y)
@@ -251,7 +227,7 @@ class Window:
             # a square cell is as wide as a box of its side in every direction, as far as its variance goes
             variance = np.exp(2.0 * log_width) + self.cells.cell_mm**2 / 12.0
             height = np.exp(log_width) / np.sqrt(variance)
-            return Profiles(grid=height[:, None, None] * np.exp(-0.5 * distance**2 / variance[:, None, None]))
+            return np.asarray(height[:, None, None] * np.exp(-0.5 * distance**2 / variance[:, None, None]))
 
     @property
     def middle(self) -> tuple[float, float]:
@@ -313,6 +289,7 @@ LEAST_POWER = 1e-9
 class LinearSolution(Record, eq=False):
     """Conditional posterior of the linear parameters for m shapes and h fields: a multivariate t."""
 
+    evidence: FloatArray  #: (m, h) array: Log of the fields' prior times their evidence.
     amplitude: FloatArray  #: (m, h, v) array: Conditional means under a flat prior.
     power: FloatArray  #: (m, h, v, v) array: Their precision times tau^2.
     level: FloatArray
@@ -330,7 +307,8 @@ class FieldColumns(Record, eq=False):
     shares: FloatArray  #: (h,) array.
     log_prior: float  #: Log prior probability of each share.
     weight: FloatArray
-    """(k, h) array: Of the squared projections that the field takes away, a column a share."""
+    """(k, h) array: Of the squared projections that the field takes away, ``rho / (1 + rho lambda)``; a column a share.
+    """
     plain: FloatArray  #: (k, h * (c + 1)) array: Projections of the fixed columns and the data, so weighted.
     gram: FloatArray  #: (h, c + 1, c + 1) array: Columns and data with each other.
     inverse: FloatArray  #: (h, c, c) array: Of the columns' part.
@@ -343,15 +321,15 @@ class FieldColumns(Record, eq=False):
         cls, field: Whitening, shares: FloatArray, *, log_prior: float, plain_low: FloatArray, plain_gram: FloatArray
     ) -> FieldColumns:
         """Prepare from (c + 1, cosines^2) projections and (c + 1, c + 1) products of the fixed columns and the data."""
-        low = plain_low @ field.turn
-        weight = field.shrinkage(shares)
+        low, power = plain_low @ field.turn, shares[:, None] * field.eigenvalues
+        weight = shares[:, None] / (1.0 + power)
         weighted = low * weight[:, None, :]
         gram = plain_gram - weighted @ low.T
         c = len(plain_gram) - 1
         inverse: FloatArray = np.asarray(np.linalg.inv(gram[:, :c, :c]), dtype=np.float64)
         volume: FloatArray = np.asarray(np.linalg.slogdet(gram[:, :c, :c])[1], dtype=np.float64)
         plain = np.ascontiguousarray(weighted.reshape(len(shares) * (c + 1), low.shape[1]).T)
-        log_det = field.log_determinant(shares) + volume
+        log_det = np.log1p(power).sum(axis=-1) + volume
         floor = FLOOR * float(plain_gram[c, c]) + 1e-300
         return cls(field, shares, log_prior, np.ascontiguousarray(weight.T), plain, gram, inverse, log_det, floor)
 
@@ -393,8 +371,8 @@ class Inner(Record, eq=False):
 
 def solve(
     inner: list[Inner], cross: FloatArray | None, columns: FieldColumns, *, dof: int, amplitude_sd: float
-) -> tuple[FloatArray, LinearSolution]:
-    """Log of the fields' prior times evidence (m, h), and solutions for one or two structures, under one length.
+) -> LinearSolution:
+    """Solutions for one or two structures, under one length.
 
     `inner` holds the inner products of each structure's (m,) templates and `cross`, (m, h), those of one with the
     other; `dof` is cells minus linear parameters, `amplitude_sd` that of the normal prior on each amplitude.
@@ -423,7 +401,7 @@ def solve(
     evidence = np.where((amplitude > 0).all(axis=2), evidence, -np.inf)
     level = np.einsum("hcd,hd->hc", columns.inverse, right)
     slope = np.stack(to_level, axis=2)
-    return evidence, LinearSolution(amplitude, matrix, level, columns.inverse, slope, squares)
+    return LinearSolution(evidence, amplitude, matrix, level, columns.inverse, slope, squares)
 
 
 def joined(solutions: list[LinearSolution]) -> LinearSolution:
@@ -498,8 +476,6 @@ class Spanned:
     def of(cls, bumps: Profiles, window: Window, weighted_plain: FloatArray) -> Spanned | None:
         """Find the basis for products of profiles; None where it would not save time."""
         rows, columns = bumps.rows, bumps.columns
-        assert rows is not None
-        assert columns is not None
         if not (np.isfinite(rows).all() and np.isfinite(columns).all()):
             return None
         high, wide = _norms(rows), _norms(columns)

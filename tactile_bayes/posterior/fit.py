@@ -17,11 +17,9 @@ from tactile_bayes.inference.importance import Gaussians, smooth_weights
 from tactile_bayes.inference.modes import find_mode, finite_differences, mode_and_covariance, stencil
 from tactile_bayes.posterior.bump import drawn_widths
 from tactile_bayes.posterior.draw import Sampled, SamplerSettings, with_beside
-from tactile_bayes.posterior.field import Window
-from tactile_bayes.posterior.marginal import NEGLIGIBLE, CollapsedTarget, independent_variance, linear_columns
+from tactile_bayes.posterior.marginal import NEGLIGIBLE, CollapsedTarget, linear_columns
 from tactile_bayes.posterior.scene import Problem, Scene
-from tactile_bayes.posterior.white import BumpFit
-from tactile_bayes.presets import FIELD_COSINES, Method
+from tactile_bayes.presets import Method
 
 # --- Posterior of a scene under correlated errors: its mode, a Gaussian for each noise field, and draws.
 
@@ -58,16 +56,6 @@ class FieldFit(Record, eq=False):
         return self.target.scene
 
     @property
-    def rotated(self) -> bool:
-        """True where the ellipse may be rotated."""
-        return self.target.rotated
-
-    @property
-    def dof(self) -> float:
-        """Degrees of freedom of the noise scale."""
-        return float(self.target.dof)
-
-    @property
     def log_evidence(self) -> float:
         """Log evidence of the scene, from the Gaussians' volumes."""
         return self.mixture.log_evidence
@@ -76,6 +64,12 @@ class FieldFit(Record, eq=False):
         """Posterior standard deviation of one parameter."""
         i = self.scene.names.index(name)
         return float(np.sqrt(self.covariance[i, i]))
+
+    @property
+    def widths_mm(self) -> tuple[float, float]:
+        """sigma_x_mm and sigma_y_mm at the mode."""
+        sigma_x, sigma_y, _ = drawn_widths(*self.scene.widths(self.mode[None]))
+        return float(sigma_x[0]), float(sigma_y[0])
 
     @property
     def width_sd_mm(self) -> float:
@@ -103,7 +97,7 @@ class FieldFit(Record, eq=False):
         parts = newton_mixture(target, self.mode, self.covariance, least_share=NEGLIGIBLE)
         key = partial(checkpoint_key, self)
         if k == len(mean):
-            density = target if solved is None else partial(target.solved_density, solved=solved)
+            density = target if solved is None else partial(target, solved=solved)
             return Sampled(density, mean, covariance, parts, checkpoint_key=key)
         across, beside = covariance[:k, k:], self.mode[k:]
         added = across @ np.linalg.solve(covariance[k:, k:], across.T)
@@ -121,18 +115,6 @@ class FieldFit(Record, eq=False):
         )
 
 
-def field_window(least_squares: BumpFit, *, cosines: int = FIELD_COSINES) -> Window:
-    """Window of a least-squares bump, with its noise basis."""
-    return Window(least_squares.cells, independent_variance(least_squares.cells), cosines=cosines)
-
-
-def start_vector(least_squares: BumpFit, scene: Scene) -> FloatArray:
-    """Start of the search for a scene's mode, from the least-squares bump."""
-    p, q, r = (float(v) for v in least_squares.bump.shape_parameters(least_squares.theta))
-    turned = np.array([p + q, p - q, least_squares.theta[1], least_squares.theta[2], r])
-    return Scene("rotated").carried(turned, scene)
-
-
 def fit_scene(problem: Problem, scene: Scene, start: FloatArray) -> FieldFit:
     """Find the mode from (p,) parameters, alternating with the choice of noise fields that matter there.
 
@@ -148,20 +130,12 @@ def fit_scene(problem: Problem, scene: Scene, start: FloatArray) -> FieldFit:
             break
     if not np.isfinite(target(mode[None])[0]):
         raise NotConvergedError("no posterior mode: the fitted bump does not rise above the correlated noise")
-    mixture = gaussian_mixture(target, mode, covariance)
-    return FieldFit(target, mode, mixture.moments()[1], mixture)
-
-
-def gaussian_mixture(target: CollapsedTarget, mode: FloatArray, covariance: FloatArray) -> Mixture:
-    """One Gaussian per field about a common mode; a single one where a field has no Gaussian of its own.
-
-    The common curvature is sharper than the mixture is wide where fields with modes of their own share the evidence.
-    """
+    # the common curvature is sharper than the mixture is wide where fields with modes of their own share the evidence
     mixture = newton_mixture(target, mode, covariance)
-    if mixture is not None:
-        return mixture
-    volume = 0.5 * float(np.linalg.slogdet(2.0 * np.pi * covariance)[1])
-    return Mixture(np.ones(1), mode[None], covariance[None], float(target(mode[None])[0]) + volume)
+    if mixture is None:
+        volume = 0.5 * float(np.linalg.slogdet(2.0 * np.pi * covariance)[1])
+        mixture = Mixture(np.ones(1), mode[None], covariance[None], float(target(mode[None])[0]) + volume)
+    return FieldFit(target, mode, mixture.moments()[1], mixture)
 
 
 def newton_mixture(
@@ -218,9 +192,10 @@ def laplace_mixture(fit: FieldFit, *, rng: np.random.Generator, draws: int = IND
     few per cent.
     """
     number = rng.multinomial(draws, fit.mixture.weight)
-    widen = (fit.dof + len(fit.mode)) / fit.dof
+    dof = float(fit.target.dof)
+    widen = (dof + len(fit.mode)) / dof
     parts = [
-        student_draws(mean, widen * covariance, dof=fit.dof, number=int(n), rng=rng)
+        student_draws(mean, widen * covariance, dof=dof, number=int(n), rng=rng)
         for mean, covariance, n in zip(fit.mixture.mean, fit.mixture.covariance, number, strict=True)
     ]
     flat = rng.permutation(np.concatenate(parts))
@@ -251,17 +226,6 @@ def checkpoint_key(fit: FieldFit, settings: str, rng: np.random.Generator) -> st
     return digest.hexdigest()
 
 
-def shape_draws(fit: FieldFit, theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """sigma_x_mm, sigma_y_mm and angle_rad of (..., p) draws."""
-    return drawn_widths(*fit.scene.widths(theta))
-
-
-def modal_widths(fit: FieldFit) -> tuple[float, float]:
-    """sigma_x_mm and sigma_y_mm at the mode."""
-    sigma_x, sigma_y, _ = shape_draws(fit, fit.mode[None])
-    return float(sigma_x[0]), float(sigma_y[0])
-
-
 # --- Derivatives of a window's cells by all free parameters of a fitted scene.
 
 _STEP = 1e-4
@@ -273,6 +237,6 @@ def tangent_columns(fit: FieldFit) -> FloatArray:
     p = len(scene.alone().names)
     steps = _STEP * np.eye(p, len(mode))
     bump = scene.templates(np.concatenate([mode[None], mode + steps, mode - steps]), window)[0]
-    values = window.of_cells(bump.full())
+    values = window.of_cells(bump)
     slopes = (values[1 : p + 1] - values[p + 1 :]) / (2 * _STEP)
     return np.concatenate([values[:1], slopes, linear_columns(window.cells, tilt=scene.tilt)])

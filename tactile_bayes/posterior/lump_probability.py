@@ -13,7 +13,7 @@ from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior.bump import covered_share, trusted, value_scale, window_cells
 from tactile_bayes.posterior.detection import Detection
-from tactile_bayes.posterior.draw import DETECTED
+from tactile_bayes.posterior.draw import DETECTED, ModalBump
 from tactile_bayes.posterior.field import Window
 from tactile_bayes.posterior.marginal import CollapsedTarget, independent_variance
 from tactile_bayes.posterior.scene import Problem, Scene
@@ -71,29 +71,20 @@ class Weighed(Record, eq=False):
 def weigh(
     tactile_map: TactileMap,
     detection: Detection,
+    bump: ModalBump,
     *,
-    centre_mm: tuple[float, float],
-    widths_mm: tuple[float, float],
     fault: str = "",
+    candidate: Candidate | None = None,
 ) -> Weighed:
-    """A rise of known place and widths; `fault` as of a `Candidate`."""
+    """A rise with the bump that the odds are of; `fault` and `candidate` as the search met it."""
+    centre_mm, widths_mm = (bump.x_mm, bump.y_mm), (bump.sigma_x_mm, bump.sigma_y_mm)
     wide, narrow = max(widths_mm), max(min(widths_mm), 1e-3)
     evidence = log1p(float(np.clip(detection.log_bayes_factor, 0.0, MOST_EVIDENCE)))
     too_wide = max(log(max(wide, 1e-3) / WIDE_MM), 0.0)
     open_share = 1.0 - covered_share(tactile_map, centre_mm, radius_mm=1.5 * wide)
     faulty = float(bool(fault) and not fault.startswith(NO_EVIDENCE))
-    return Weighed(
-        detection, centre_mm, (evidence, min(log(wide / narrow), 2.0), min(too_wide, 2.0), open_share, faulty)
-    )
-
-
-def weigh_candidate(tactile_map: TactileMap, candidate: Candidate, detection: Detection) -> Weighed | None:
-    """The same of a candidate, by the bump that the odds are of; None without one."""
-    if candidate.fit is None:
-        return None
-    bump = candidate.assessed or candidate.fit.modal()
-    at, widths = (bump.x_mm, bump.y_mm), (bump.sigma_x_mm, bump.sigma_y_mm)
-    return weigh(tactile_map, detection, centre_mm=at, widths_mm=widths, fault=candidate.fault)
+    features = (evidence, min(log(wide / narrow), 2.0), min(too_wide, 2.0), open_share, faulty)
+    return Weighed(detection, centre_mm, features, candidate)
 
 
 # --- Smallest lump that a map without one would have shown, by place and depth.

@@ -32,9 +32,9 @@ from tactile_bayes.posterior.field import (
     Profiles,
     Projected,
     Spanned,
+    Templates,
     Whitening,
     joined,
-    no_field,
     solve,
 )
 from tactile_bayes.posterior.scene import Problem, Scene
@@ -44,8 +44,6 @@ NEGLIGIBLE = 1e-3
 """Fields with a smaller share of the evidence are left out of the mixture; what they add at the mode is made up for.
 Once a length has as little, and less than the one before it, shorter ones are not looked at."""
 SPANNED = 2048  #: As many share a basis where they can, see `field.Spanned`.
-WithEvidence = tuple[FloatArray, LinearSolution]
-"""Log of the fields' prior times the evidence (m, h), and what is linear."""
 
 
 class CollapsedTarget:
@@ -64,39 +62,23 @@ class CollapsedTarget:
         scaled = self._plain / window.variance
         self._weighted_plain = window.on_grid(scaled)
         self._plain_gram = self._plain @ scaled.T
-        self._plain_low = window.project(Profiles(grid=window.on_grid(self._plain)), self._weighted_plain).low
+        self._plain_low = window.project(window.on_grid(self._plain), self._weighted_plain).low
         self._lengths: dict[float, FieldColumns] = {}
         self._fields: list[FieldColumns] | None = None
         self._made_up = 0.0
-        self.dof = self._count_dof()
 
     def of_scene(self, scene: Scene) -> CollapsedTarget:
         """Copy for another scene in the same window with the same priors; its fields are not settled."""
         if scene.tilt == self.scene.tilt:
             other = copy(self)
             other.scene, other._fields, other._made_up = scene, None, 0.0
-            other.dof = other._count_dof()
             return other
         return CollapsedTarget(self.problem, scene)
 
     @property
-    def dimension(self) -> int:
-        """Number of shape parameters."""
-        return len(self.scene.names)
-
-    @property
-    def rotated(self) -> bool:
-        """True where the ellipse may be rotated."""
-        return self.scene.shape == "rotated"
-
-    @property
-    def structures(self) -> int:
-        """Number of amplitudes: the bump's, and that of a second structure."""
-        return 2 if self.scene.extra else 1
-
-    def _count_dof(self) -> int:
+    def dof(self) -> int:
         """Degrees of freedom of the noise scale."""
-        return max(len(self.window.cells) - len(self._plain) + 1 - self.structures, 1)
+        return max(len(self.window.cells) - len(self._plain) + (-1 if self.scene.extra else 0), 1)
 
     @property
     def fields(self) -> list[FieldColumns]:
@@ -105,12 +87,13 @@ class CollapsedTarget:
             self._fields = list(self._from_the_longest())
         return self._fields
 
-    def __call__(self, theta: FloatArray) -> FloatArray:
-        """(m,) log density of (m, dimension) shape vectors, normalised up to a constant of the data."""
-        return self._mixed(theta, self.by_field(theta))
+    def __call__(self, theta: FloatArray, solved: Solved | None = None) -> FloatArray:
+        """(m,) log density of (m, dimension) shape vectors, normalised up to a constant of the data.
 
-    def solved_density(self, theta: FloatArray, solved: Solved) -> FloatArray:
-        """As the density, storing in `solved` what `draw_linear` needs at these points."""
+        `solved` keeps what `draw_linear` needs at these points.
+        """
+        if solved is None:
+            return self._mixed(theta, self.by_field(theta))
         solution = self.conditional(theta)
         solved.add(theta, solution)
         return self._mixed(theta, solution[0] + self._made_up)
@@ -121,7 +104,7 @@ class CollapsedTarget:
 
     def by_field(self, theta: FloatArray) -> FloatArray:
         """(m, fields) log of each field's prior times its evidence, without the shape's prior."""
-        parts = [np.concatenate([one for one, _ in part], axis=1) for part in self._parts(theta)]
+        parts = [np.concatenate([one.evidence for one in part], axis=1) for part in self._parts(theta)]
         return np.concatenate(parts) + self._made_up
 
     def log_prior(self, theta: FloatArray) -> FloatArray:
@@ -133,7 +116,7 @@ class CollapsedTarget:
         changed."""
         before = self.chosen_fields()
         projected, cross = self._project(self.scene.templates(theta[None], self.window))
-        walked = self._walk(lambda columns: self._under(projected, cross, columns)[0][0])
+        walked = self._walk(lambda columns: self._under(projected, cross, columns).evidence[0])
         evidence = np.concatenate([one for _, one in walked])
         if not np.isfinite(evidence.max()):
             self._fields, self._made_up = None, 0.0
@@ -145,15 +128,13 @@ class CollapsedTarget:
             for columns, keep in kept
             if keep.any()
         ]
-        left = np.concatenate([self._under(projected, cross, columns)[0][0] for columns in self._fields])
+        left = np.concatenate([self._under(projected, cross, columns).evidence[0] for columns in self._fields])
         self._made_up = total - float(np.logaddexp.reduce(left))
         return before != self.chosen_fields()
 
     def settle_lengths(self) -> None:
         """Keep only the lengths with evidence where there is no structure, each with all its shares."""
-        dof = max(len(self.window.cells) - len(self._plain) + 1, 1)
-        walked = self._walk(lambda columns: columns.null_evidence(dof=dof))
-        total = float(np.logaddexp.reduce(np.concatenate([one for _, one in walked])))
+        walked, total = self._walk_without_structure()
         self._fields = [columns for columns, one in walked if one.max() > total + np.log(NEGLIGIBLE)]
         self._made_up = 0.0
 
@@ -163,9 +144,13 @@ class CollapsedTarget:
 
     def null_log_evidence(self) -> float:
         """Log evidence of level and tilt alone under all fields, on the scale of the log density."""
+        return self._walk_without_structure()[1]
+
+    def _walk_without_structure(self) -> tuple[list[tuple[FieldColumns, FloatArray]], float]:
+        """As `_walk`, of level and tilt alone, with the whole of the log evidence."""
         dof = max(len(self.window.cells) - len(self._plain) + 1, 1)
         walked = self._walk(lambda columns: columns.null_evidence(dof=dof))
-        return float(np.logaddexp.reduce(np.concatenate([one for _, one in walked])))
+        return walked, float(np.logaddexp.reduce(np.concatenate([one for _, one in walked])))
 
     def _walk(self, evidence: Callable[[FieldColumns], FloatArray]) -> list[tuple[FieldColumns, FloatArray]]:
         """Evidence without a field, then from the longest length down, until it has vanished."""
@@ -188,8 +173,9 @@ class CollapsedTarget:
             if not len(chosen):
                 continue
             if length not in self._lengths:
-                field = self.window.field(length) if length else no_field(self.window.cosines)
-                self._lengths[length] = self._columns(field, chosen)
+                cosines = self.window.cosines**2  # a share of 0, the same for every length, has no directions
+                none = Whitening(float(np.mean(LENGTHS_MM)), np.zeros((cosines, 0)), np.zeros(0))
+                self._lengths[length] = self._columns(self.window.field(length) if length else none, chosen)
             yield self._lengths[length]
 
     def field_summary(self, theta: FloatArray) -> dict[str, float]:
@@ -206,9 +192,8 @@ class CollapsedTarget:
         by how much the level falls with each (m, h, v), and the sum of squares (m, h).
         """
         parts = []
-        for part in self._parts(theta):
-            evidence, one = _side_by_side(part)
-            parts.append((evidence, one.amplitude, one.power, one.level_slope[..., 0], one.sum_of_squares))
+        for one in map(joined, self._parts(theta)):
+            parts.append((one.evidence, one.amplitude, one.power, one.level_slope[..., 0], one.sum_of_squares))
         return tuple(np.concatenate(part) for part in zip(*parts, strict=True))
 
     def draw_linear(
@@ -220,19 +205,15 @@ class CollapsedTarget:
         """
         unique, back = distinct_rows(theta)
         evidence, centre, power, slope, squares = (solved or self.conditional)(unique)
-        at_zero, level_variance = self._levels()
+        c = len(self._plain) - 1
+        at_zero = np.concatenate([np.einsum("hd,hd->h", one.inverse[:, 0], one.gram[:, :c, c]) for one in self.fields])
+        level_variance = np.concatenate([one.inverse[:, 0, 0] for one in self.fields])
         h = choose(evidence[back], rng)
         tau2 = squares[back, h] / rng.chisquare(self.dof, size=len(theta))
         amplitude = self._draw_amplitudes(centre[back, h], power[back, h], tau2, rng)
         about = np.sqrt(tau2 * level_variance[h]) * rng.standard_normal(len(theta))
-        level = at_zero[h] - np.sum(slope[back, h] * amplitude, axis=1) + about
+        level = (self._mean + at_zero)[h] - np.sum(slope[back, h] * amplitude, axis=1) + about
         return amplitude, level, np.sqrt(tau2 * self.window.variance.mean())
-
-    def _levels(self) -> tuple[FloatArray, FloatArray]:
-        """(h,) levels at amplitudes of 0 under each field, and their variances over tau^2."""
-        c = len(self._plain) - 1
-        level = [np.einsum("hd,hd->h", one.inverse[:, 0], one.gram[:, :c, c]) for one in self.fields]
-        return self._mean + np.concatenate(level), np.concatenate([one.inverse[:, 0, 0] for one in self.fields])
 
     def _draw_amplitudes(
         self, centre: FloatArray, power: FloatArray, tau2: FloatArray, rng: np.random.Generator
@@ -240,17 +221,17 @@ class CollapsedTarget:
         """(m, v) draws given the noise scale: the normal under a flat prior times the amplitudes' prior."""
         data = power / tau2[:, None, None]
         normal = rng.standard_normal((*centre.shape, 1))
-        if self.structures == 1:
+        if len(data[0]) == 1:
             precision = data[:, 0] + 1.0 / self.amplitude_sd**2
             return np.asarray(data[:, 0] * centre / precision + normal[:, 0] / np.sqrt(precision))
-        covariance = np.linalg.inv(data + np.eye(self.structures) / self.amplitude_sd**2)
+        covariance = np.linalg.inv(data + np.eye(2) / self.amplitude_sd**2)
         mean = (covariance @ (data @ centre[..., None]))[..., 0]
         return np.asarray(mean + (np.linalg.cholesky(covariance) @ normal)[..., 0])
 
     def tilt_log_odds(self, theta: FloatArray) -> float:
         """Log Bayes factor of a slope against none at one shape: the Savage-Dickey ratio of its components at 0."""
-        evidence, solution = self._solve(theta[None])
-        weight = evidence[0] - np.logaddexp.reduce(evidence[0])
+        solution = self._solve(theta[None])
+        weight = solution.evidence[0] - np.logaddexp.reduce(solution.evidence[0])
         slope = solution.level_slope[0][:, :, 1:3]
         mean = solution.level[:, 1:3] - np.einsum("hv,hvc->hc", solution.amplitude[0], slope)
         spread = np.einsum("hvc,hvw,hwd->hcd", slope, np.linalg.inv(solution.power[0]), slope)
@@ -263,8 +244,8 @@ class CollapsedTarget:
 
     def amplitude_at(self, theta: FloatArray) -> float:
         """Posterior mean of the bump's amplitude at one shape."""
-        evidence, solution = self._solve(theta[None])
-        weight = np.exp(evidence[0] - np.logaddexp.reduce(evidence[0]))
+        solution = self._solve(theta[None])
+        weight = np.exp(solution.evidence[0] - np.logaddexp.reduce(solution.evidence[0]))
         return float(weight @ solution.amplitude[0, :, 0])
 
     def products(self, one: FloatArray, other: FloatArray, theta: FloatArray) -> FloatArray:
@@ -273,10 +254,7 @@ class CollapsedTarget:
 
     def products_by_field(self, one: FloatArray, other: FloatArray) -> FloatArray:
         """(h, v, w) inner products of (v, n) and (w, n) cell values under each noise field."""
-        low = [
-            self.window.project(Profiles(grid=self.window.on_grid(vectors)), self._weighted_plain).low
-            for vectors in (one, other)
-        ]
+        low = [self.window.project(self.window.on_grid(vectors), self._weighted_plain).low for vectors in (one, other)]
         independent, products = (one / self.window.variance) @ other.T, []
         for columns in self.fields:
             first, second = (vectors @ columns.field.turn for vectors in low)
@@ -288,7 +266,7 @@ class CollapsedTarget:
         evidence = self.by_field(theta[None])[0]
         return np.asarray(np.exp(evidence - np.logaddexp.reduce(evidence)))
 
-    def gains(self, templates: Profiles, theta: FloatArray) -> FloatArray:
+    def gains(self, templates: Templates, theta: FloatArray) -> FloatArray:
         """(m,) log evidence gained at `theta` by adding each template; -inf for a dent.
 
         Fields are those settled; the scene has one structure.
@@ -300,10 +278,10 @@ class CollapsedTarget:
         base, with_it = [], []
         for columns in self.fields:
             one, other = Inner.of(alone, columns), Inner.of(beside, columns)
-            base.append(self._found([one], None, columns)[0][0])
+            base.append(self._found([one], None, columns).evidence[0])
             cross = one.product(other, product, columns)
             both = [one.repeated(len(product)), other]
-            with_it.append(solve(both, cross, columns, dof=self.dof - 1, amplitude_sd=self.amplitude_sd)[0])
+            with_it.append(solve(both, cross, columns, dof=self.dof - 1, amplitude_sd=self.amplitude_sd).evidence)
         gained = np.logaddexp.reduce(np.concatenate(with_it, axis=1), axis=1)
         return np.asarray(gained - np.logaddexp.reduce(np.concatenate(base)))
 
@@ -316,11 +294,11 @@ class CollapsedTarget:
             field, shares, log_prior=log_prior, plain_low=self._plain_low, plain_gram=self._plain_gram
         )
 
-    def _project(self, templates: list[Profiles]) -> tuple[list[Projected], FloatArray | None]:
+    def _project(self, templates: list[Templates]) -> tuple[list[Projected], FloatArray | None]:
         projected = [self.window.project(one, self._weighted_plain) for one in templates]
         return projected, self.window.product(*templates) if len(templates) == 2 else None
 
-    def _parts(self, theta: FloatArray) -> Iterator[list[WithEvidence]]:
+    def _parts(self, theta: FloatArray) -> Iterator[list[LinearSolution]]:
         """Blocks of (m, p) vectors, each solved under every length; large where they share a basis."""
         size = SPANNED if self.scene.separable else BLOCK
         for i in range(0, len(theta), size):
@@ -338,24 +316,20 @@ class CollapsedTarget:
         if not self.scene.separable or len(theta) < LEAST_BUMPS:
             return None
         (bumps,) = self.scene.templates(theta, self.window)
+        assert isinstance(bumps, Profiles)
         return Spanned.of(bumps, self.window, self._weighted_plain)
 
-    def _under(self, projected: list[Projected], cross: FloatArray | None, columns: FieldColumns) -> WithEvidence:
+    def _under(self, projected: list[Projected], cross: FloatArray | None, columns: FieldColumns) -> LinearSolution:
         inner = [Inner.of(one, columns) for one in projected]
         return self._found(inner, None if cross is None else inner[0].product(inner[1], cross, columns), columns)
 
-    def _found(self, inner: list[Inner], cross: FloatArray | None, columns: FieldColumns) -> WithEvidence:
+    def _found(self, inner: list[Inner], cross: FloatArray | None, columns: FieldColumns) -> LinearSolution:
         return solve(inner, cross, columns, dof=self.dof, amplitude_sd=self.amplitude_sd)
 
-    def _solve(self, theta: FloatArray) -> WithEvidence:
-        """Evidence and solutions under all fields at a few vectors."""
+    def _solve(self, theta: FloatArray) -> LinearSolution:
+        """Solutions under all fields at a few vectors."""
         projected, cross = self._project(self.scene.templates(theta, self.window))
-        return _side_by_side([self._under(projected, cross, columns) for columns in self.fields])
-
-
-def _side_by_side(parts: list[WithEvidence]) -> WithEvidence:
-    """Concatenate fields of all lengths."""
-    return np.concatenate([one for one, _ in parts], axis=1), joined([solution for _, solution in parts])
+        return joined([self._under(projected, cross, columns) for columns in self.fields])
 
 
 def independent_variance(cells: FitCells) -> FloatArray:

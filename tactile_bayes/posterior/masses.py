@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
-from tactile_bayes.declarations import replace
+from tactile_bayes.declarations import as_dict, replace
 from tactile_bayes.errors import CANNOT_SHOW, NO_LUMP, NotConvergedError
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.abstention import BEYOND_IT
@@ -23,7 +23,7 @@ from tactile_bayes.posterior.draw import MapPosterior, ModalBump, SamplerSetting
 from tactile_bayes.posterior.lump_probability import LIKELY, weigh
 from tactile_bayes.posterior.neighbours import LEAST_RISE
 from tactile_bayes.posterior.result import Estimate, Mass, Rise
-from tactile_bayes.posterior.search import Assessment, best_chance, search
+from tactile_bayes.posterior.search import best_chance, search
 from tactile_bayes.posterior.white import AT_RIM, Candidate
 
 # --- Other lumps on the map: their places and probabilities.
@@ -56,98 +56,94 @@ def other_rises(tactile_map: TactileMap, estimate: Estimate, options: SamplerSet
     for centre in _places(rest, estimate):
         given = replace(options, centre_mm=centre, start_width_mm=None, scene="auto")
         candidates, seen = search(rest, given)
+        rise = None
         if seen is None:
             rise = _at_rim(rest, candidates, given, estimate)
-        else:
-            rise = _rise_assessed(seen, estimate) if seen.detection.probability >= LEAST_PROBABILITY else None
-        if rise is None or _already_named(rise, rises, rest, estimate) or not _stands_out(rise, rest):
-            misses += 1
-        else:
+        elif seen.detection.probability >= LEAST_PROBABILITY:
+            measured = estimate if estimate.map_posterior is not None else None
+            rise = _rise(seen.bump(), seen.detection.probability, measured)
+        # a fit may move to another rise, or back to the measured lump
+        again = rise is not None and (
+            any(_apart_mm(rise, one) < 2 * SMOOTHING_MM for one in rises)
+            or not _clear_of_lump(rise.x_mm, rise.y_mm, rest, estimate)
+        )
+        if rise is not None and not again and _stands_out(rise, rest):
             rises.append(rise)
+        else:
+            misses += 1
         if misses == MOST_LOOKS or len(rises) == MOST_NAMED:
             break
     return tuple(rises)
 
 
-def _median(posterior: MapPosterior, name: str) -> float:
-    return float(np.median(getattr(posterior, name)))
-
-
 def without(tactile_map: TactileMap, posterior: MapPosterior) -> TactileMap:
     """The map less the bump at the posterior medians."""
-    x, y, angle = (_median(posterior, name) for name in ("x_mm", "y_mm", "angle_rad"))
+    lump, angle = _medians(posterior), float(np.median(posterior.angle_rad))
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    squares = [_median(posterior, name) ** 2 for name in ("sigma_x_mm", "sigma_y_mm")]
-    u, v = np.meshgrid(tactile_map.x_mm - x, tactile_map.y_mm - y)
-    bump = cell_mean_gaussian(
-        u.ravel(), v.ravel(), covariance_mm2=turn @ np.diag(squares) @ turn.T, cell_mm=tactile_map.recipe.cell_mm
-    )
-    return replace(tactile_map, mean=tactile_map.mean - _median(posterior, "amplitude") * bump.reshape(u.shape))
+    covariance = turn @ np.diag([lump.sigma_x_mm**2, lump.sigma_y_mm**2]) @ turn.T
+    u, v = np.meshgrid(tactile_map.x_mm - lump.x_mm, tactile_map.y_mm - lump.y_mm)
+    bump = cell_mean_gaussian(u.ravel(), v.ravel(), covariance_mm2=covariance, cell_mm=tactile_map.recipe.cell_mm)
+    return replace(tactile_map, mean=tactile_map.mean - lump.amplitude * bump.reshape(u.shape))
+
+
+def _medians(posterior: MapPosterior) -> ModalBump:
+    names = ("amplitude", "x_mm", "y_mm", "sigma_x_mm", "sigma_y_mm")
+    return ModalBump(*(float(np.median(getattr(posterior, name))) for name in names))
 
 
 def _lump(estimate: Estimate) -> ModalBump | None:
     """The lump that an estimate is about: at the posterior medians where it was drawn."""
-    posterior = estimate.map_posterior
-    if posterior is None:
-        return estimate.bump
-    names = ("amplitude", "x_mm", "y_mm", "sigma_x_mm", "sigma_y_mm")
-    return ModalBump(*(_median(posterior, name) for name in names))
+    return estimate.bump if estimate.map_posterior is None else _medians(estimate.map_posterior)
+
+
+def _apart_mm(one: ModalBump | Mass, other: ModalBump | Mass) -> float:
+    return float(np.hypot(one.x_mm - other.x_mm, one.y_mm - other.y_mm))
+
+
+def _rise(bump: ModalBump, probability: float, estimate: Estimate | None) -> Rise:
+    """A bump as a rise beside the lump of an estimate, or beside none."""
+    lump = None if estimate is None else _lump(estimate)
+    away = None if lump is None else _apart_mm(bump, lump)
+    return Rise(**as_dict(bump), distance_mm=away, probability=probability)
 
 
 def _places(rest: TactileMap, estimate: Estimate) -> Iterator[tuple[float, float]]:
     """Local maxima above a share of the lump's amplitude, clear of it and of the map's rim, highest first."""
-    found_on = levelled(rest)
+    found_on, lump = levelled(rest), _lump(estimate)
     height = smoothed_excess(found_on)
     for x, y in candidate_centres(found_on, rim_limit=0):
         row, column = (int(np.argmin(np.abs(axis - at))) for axis, at in ((rest.y_mm, y), (rest.x_mm, x)))
-        if height[row, column] > _least_rise(x, y, estimate) and _clear_of_lump(x, y, rest, estimate):
+        least = 0.0
+        if lump is not None:  # a lower rise may be what the subtracted lump left of itself, less of it farther away
+            away = np.hypot(x - lump.x_mm, y - lump.y_mm)
+            far = away > FAR_IN_WIDTHS * max(lump.sigma_x_mm, lump.sigma_y_mm)
+            least = (LEAST_RISE_FAR if far else LEAST_RISE) * lump.amplitude
+        if height[row, column] > least and _clear_of_lump(x, y, rest, estimate):
             yield x, y
 
 
-def _least_rise(x: float, y: float, estimate: Estimate) -> float:
-    """Height below which a rise may be what the subtracted lump left of itself; less of it is left farther away."""
-    lump = _lump(estimate)
-    if lump is None:
-        return 0.0
-    away = np.hypot(x - lump.x_mm, y - lump.y_mm)
-    far = away > FAR_IN_WIDTHS * max(lump.sigma_x_mm, lump.sigma_y_mm)
-    return (LEAST_RISE_FAR if far else LEAST_RISE) * lump.amplitude
-
-
 def _clear_of_lump(x: float, y: float, rest: TactileMap, estimate: Estimate) -> bool:
-    """True for a place clear of the lump and of its scene's second structure."""
-    lump = _lump(estimate)
-    if lump is None:
-        return True
-    away = float(np.hypot(x - lump.x_mm, y - lump.y_mm))
-    return away > BESIDE_IN_WIDTHS * max(lump.sigma_x_mm, lump.sigma_y_mm) and not _belongs_to_scene(
-        x, y, rest, estimate
-    )
-
-
-def _belongs_to_scene(x: float, y: float, rest: TactileMap, estimate: Estimate) -> bool:
-    """True for a place that belongs to the second lump of the lump's scene.
+    """True for a place clear of the lump, and of the second lump of its scene.
 
     One whose centre lies off the map stands for what rises at the rim, which is looked at as elsewhere. A rise beside a
     rib is held against a ridge there.
     """
+    lump, second = _lump(estimate), _second_lump(estimate)
+    if lump is None:
+        return True
+    lumps = [lump, *([second] if second is not None and on_map(rest, second.x_mm, second.y_mm) else [])]
+    widths = [max(one.sigma_x_mm, one.sigma_y_mm) for one in lumps]
+    away = [float(np.hypot(x - one.x_mm, y - one.y_mm)) for one in lumps]
+    return all(mm > BESIDE_IN_WIDTHS * width for mm, width in zip(away, widths, strict=True))
+
+
+def _second_lump(estimate: Estimate) -> ModalBump | None:
+    """The second lump of the lump's scene."""
     if estimate.scene is None or estimate.scene.fit.scene.extra != "second lump":
-        return False
-    one, two, log_width = (float(value) for value in estimate.scene.fit.mode[-3:])
-    away = np.hypot(x - one, y - two)
-    return on_map(rest, one, two) and bool(away < BESIDE_IN_WIDTHS * np.exp(log_width))
-
-
-def _rise_assessed(seen: Assessment, estimate: Estimate) -> Rise:
-    """The assessed place as a `Rise`."""
-    bump, lump, away = seen.bump(), _lump(estimate), None
-    if lump is not None and estimate.map_posterior is not None:
-        away = float(np.hypot(bump.x_mm - lump.x_mm, bump.y_mm - lump.y_mm))
-    return _rise(bump, away, seen.detection.probability)
-
-
-def _rise(bump: ModalBump, away_mm: float | None, probability: float) -> Rise:
-    return Rise(bump.x_mm, bump.y_mm, away_mm, bump.amplitude, bump.sigma_x_mm, bump.sigma_y_mm, probability)
+        return None
+    x, y, log_width = (float(value) for value in estimate.scene.fit.mode[-3:])
+    width = float(np.exp(log_width))
+    return ModalBump(0.0, x, y, width, width)
 
 
 def _at_rim(
@@ -162,7 +158,7 @@ def _at_rim(
     chance = best_chance(rest, candidates, options)
     if chance is None or chance.detection.probability < LEAST_PROBABILITY or chance.probability < LIKELY:
         return None
-    return _rise(bump, None, chance.detection.probability)
+    return _rise(bump, chance.detection.probability, None)
 
 
 def _stands_out(rise: Rise, rest: TactileMap) -> bool:
@@ -176,12 +172,6 @@ def _stands_out(rise: Rise, rest: TactileMap) -> bool:
         return True
     levels = (one.mean[near].mean() - np.median(one.mean[rest.covered]) for one in (rest, levelled(rest)))
     return bool(max(levels) >= LEAST_STANDING * rise.amplitude)
-
-
-def _already_named(rise: Rise, rises: list[Rise], rest: TactileMap, estimate: Estimate) -> bool:
-    """True where a fit moved to another rise, or back to the measured lump."""
-    again = any(np.hypot(rise.x_mm - one.x_mm, rise.y_mm - one.y_mm) < 2 * SMOOTHING_MM for one in rises)
-    return again or not _clear_of_lump(rise.x_mm, rise.y_mm, rest, estimate)
 
 
 # --- All masses of a map: each with its place, its probability and its size, or the reason for none.
@@ -211,12 +201,16 @@ def with_masses(tactile_map: TactileMap, first: Estimate, options: SamplerSettin
     its calibration and random numbers.
     """
     sized = [] if first.bump is None else [Mass(*_place(first), _probability(first), first)]
-    others = _options_of_others(options)
+    # what is known of a lump is of the first, and so is a checkpoint
+    known = {name: value for name, value in options.size_priors.known.items() if name not in OF_A_LUMP}
+    others = replace(options, scene="auto", store=None, size_priors=replace(options.size_priors, known=known))
     rises = [*other_rises(tactile_map, first, options)]
     for rise in [*_second_lump_of_scene(tactile_map, first), *rises]:
         mass = _sized_at(tactile_map, rise, first, others, estimator)
         if mass is None and rise not in rises:
-            mass = Mass(rise.x_mm, rise.y_mm, rise.probability, _unresolved(rise))
+            why = "the map shows it beside the first lump only, not by itself"
+            unresolved = Estimate("no_estimate", why, code="unresolved", advice=BOTH, on_paper=BOTH, bump=rise)
+            mass = Mass(rise.x_mm, rise.y_mm, rise.probability, unresolved)
         if mass is not None and all(_apart(mass, one) for one in sized):
             sized.append(mass)
     sized = by_evidence(sized)
@@ -225,8 +219,15 @@ def with_masses(tactile_map: TactileMap, first: Estimate, options: SamplerSettin
     masses = tuple(
         replace(one, reported=one.estimate is reported, probability=_calibrated(tactile_map, one)) for one in sized
     )
-    beside = tuple(_rise_of_mass(one, masses) for one in masses if not one.reported)
-    return replace(reported, candidates=first.candidates, masses=masses, other_rises=beside)
+    here = next((one for one in masses if one.reported and one.estimate.status == "estimate"), None)
+    beside = []
+    for one in masses:
+        if not one.reported:
+            assert one.estimate.bump is not None
+            away = None if here is None else _apart_mm(one, here)
+            shape = as_dict(replace(one.estimate.bump, x_mm=one.x_mm, y_mm=one.y_mm))
+            beside.append(Rise(**shape | {"distance_mm": away, "probability": one.probability}))
+    return replace(reported, candidates=first.candidates, masses=masses, other_rises=tuple(beside))
 
 
 def by_evidence(masses: Sequence[Mass]) -> list[Mass]:
@@ -252,7 +253,7 @@ def _apart(one: Mass, other: Mass) -> bool:
     """True for two masses, not one measured twice: two narrow bumps may stand close to each other."""
     widths = [max(m.estimate.bump.sigma_x_mm, m.estimate.bump.sigma_y_mm) for m in (one, other) if m.estimate.bump]
     least = min(2 * SMOOTHING_MM, APART_IN_WIDTHS * max(widths, default=np.inf))
-    return bool(np.hypot(one.x_mm - other.x_mm, one.y_mm - other.y_mm) > least)
+    return _apart_mm(one, other) > least
 
 
 def _probability(estimate: Estimate) -> float:
@@ -271,25 +272,16 @@ def _amplitude(estimate: Estimate) -> float:
     return estimate.bump.amplitude
 
 
-def _options_of_others(options: SamplerSettings) -> SamplerSettings:
-    """Options for the masses besides the first: what is known of a lump is of the first, and so is a checkpoint."""
-    known = {name: value for name, value in options.size_priors.known.items() if name not in OF_A_LUMP}
-    return replace(options, scene="auto", store=None, size_priors=replace(options.size_priors, known=known))
-
-
 def _second_lump_of_scene(tactile_map: TactileMap, first: Estimate) -> list[Rise]:
-    """The second lump of the first one's scene, if the evidence put it there and it lies on the map."""
-    choice = first.scene
-    if choice is None or choice.fit.scene.extra != "second lump":
+    """The second lump of the first one's scene, if the evidence put it there and it lies on the map.
+
+    Off the map it stands for what rises at the rim, and `other_rises` judges that.
+    """
+    lump, choice = _second_lump(first), first.scene
+    if choice is None or lump is None or not on_map(tactile_map, lump.x_mm, lump.y_mm):
         return []
     (asked,) = (one for one in choice.structures if one.name == "second lump")
-    if not asked.supported:
-        return []
-    x, y, log_width = (float(value) for value in choice.fit.mode[-3:])
-    if not on_map(tactile_map, x, y):
-        return []  # it stands for what rises at the rim, and `other_rises` judges that
-    width = float(np.exp(log_width))
-    return [Rise(x, y, None, 0.0, width, width, asked.odds / (1.0 + asked.odds))]
+    return [_rise(lump, asked.odds / (1.0 + asked.odds), None)] if asked.supported else []
 
 
 def _sized_at(
@@ -300,17 +292,29 @@ def _sized_at(
     None where neither shows a lump.
     """
     if not on_map(tactile_map, rise.x_mm, rise.y_mm):
-        return Mass(rise.x_mm, rise.y_mm, rise.probability, _off_map(rise))
+        why = "its centre lies off the map"
+        off_map = Estimate("no_estimate", why, code="window", advice=BEYOND_IT, on_paper=BEYOND_IT, bump=rise)
+        return Mass(rise.x_mm, rise.y_mm, rise.probability, off_map)
     given = replace(options, centre_mm=(rise.x_mm, rise.y_mm), start_width_mm=None)
     estimate = _estimated(tactile_map, given, estimator)
     if first.map_posterior is not None and not _same_lump(estimate, rise, first):
-        less = _estimated(without(tactile_map, first.map_posterior), given, estimator)
-        estimate = less if less.size is None or _high_enough(less, first) else _in_the_flank(less)
+        estimate = _estimated(without(tactile_map, first.map_posterior), given, estimator)
+        if estimate.size is not None and _amplitude(estimate) < LEAST_SHARE * _amplitude(first):
+            times = f"{1 / LEAST_SHARE:.0f} times as high"
+            estimate = _not_told_apart(
+                estimate, f"it stands in the flank of a lump more than {times}, which hides its shape"
+            )
     if estimate.code in (*NO_LUMP, CANNOT_SHOW):
         return None
     if _same_lump(estimate, rise, first):
         return Mass(*_place(estimate), max(rise.probability, _probability(estimate)), estimate)
-    return Mass(rise.x_mm, rise.y_mm, rise.probability, replace(_no_size(estimate), bump=_bump_of(rise)))
+    if estimate.status == "estimate":
+        estimate = _not_told_apart(estimate, "its fit moves to the lump beside it: the map does not tell them apart")
+    return Mass(rise.x_mm, rise.y_mm, rise.probability, replace(estimate, bump=rise))
+
+
+def _not_told_apart(estimate: Estimate, reason: str) -> Estimate:
+    return Estimate("no_estimate", reason, detection=estimate.detection, code="unresolved", advice=BOTH, on_paper=BOTH)
 
 
 def _estimated(tactile_map: TactileMap, options: SamplerSettings, estimator: Estimator) -> Estimate:
@@ -329,40 +333,6 @@ def _same_lump(estimate: Estimate, rise: Rise, first: Estimate) -> bool:
     return bool(moved < apart / 2.0)
 
 
-def _high_enough(estimate: Estimate, first: Estimate) -> bool:
-    """True where the map less the first lump is high enough to be sized."""
-    return _amplitude(estimate) >= LEAST_SHARE * _amplitude(first)
-
-
-def _in_the_flank(estimate: Estimate) -> Estimate:
-    reason = f"it stands in the flank of a lump more than {1 / LEAST_SHARE:.0f} times as high, which hides its shape"
-    return Estimate("no_estimate", reason, detection=estimate.detection, code="unresolved", advice=BOTH, on_paper=BOTH)
-
-
-def _no_size(estimate: Estimate) -> Estimate:
-    """The reason for no size of a mass that is not told from the first lump."""
-    if estimate.status == "no_estimate":
-        return estimate
-    reason = "its fit moves to the lump beside it: the map does not tell them apart"
-    return Estimate("no_estimate", reason, detection=estimate.detection, code="unresolved", advice=BOTH, on_paper=BOTH)
-
-
-def _unresolved(rise: Rise) -> Estimate:
-    """A second lump of a scene that is none without that scene."""
-    reason = "the map shows it beside the first lump only, not by itself"
-    return Estimate("no_estimate", reason, code="unresolved", advice=BOTH, on_paper=BOTH, bump=_bump_of(rise))
-
-
-def _off_map(rise: Rise) -> Estimate:
-    """A rise at the rim whose fit has its centre off the map."""
-    reason = "its centre lies off the map"
-    return Estimate("no_estimate", reason, code="window", advice=BEYOND_IT, on_paper=BEYOND_IT, bump=_bump_of(rise))
-
-
-def _bump_of(rise: Rise) -> ModalBump:
-    return ModalBump(rise.amplitude, rise.x_mm, rise.y_mm, rise.sigma_x_mm, rise.sigma_y_mm)
-
-
 def _calibrated(tactile_map: TactileMap, mass: Mass) -> float:
     """Probability that a mass is a lump, by its own estimate, or by the odds and the bump of its rise."""
     bump = mass.estimate.bump
@@ -370,14 +340,4 @@ def _calibrated(tactile_map: TactileMap, mass: Mass) -> float:
     if mass.estimate.probability is not None:
         return mass.estimate.probability
     odds = Detection(mass.probability, float(np.log(mass.probability) - np.log1p(-min(mass.probability, 1.0 - 1e-16))))
-    widths = (bump.sigma_x_mm, bump.sigma_y_mm)
-    return weigh(tactile_map, odds, centre_mm=(bump.x_mm, bump.y_mm), widths_mm=widths).probability
-
-
-def _rise_of_mass(mass: Mass, masses: Sequence[Mass]) -> Rise:
-    """A mass as a rise beside the one that is reported."""
-    bump = mass.estimate.bump
-    assert bump is not None
-    here = next((one for one in masses if one.reported and one.estimate.status == "estimate"), None)
-    away = None if here is None else float(np.hypot(mass.x_mm - here.x_mm, mass.y_mm - here.y_mm))
-    return Rise(mass.x_mm, mass.y_mm, away, bump.amplitude, bump.sigma_x_mm, bump.sigma_y_mm, mass.probability)
+    return weigh(tactile_map, odds, bump).probability

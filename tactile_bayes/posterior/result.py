@@ -69,17 +69,10 @@ def prior_sensitivity(
 Status = Literal["estimate", "no_estimate"]
 
 
-class Rise(Record):
-    """Another rise on the map."""
+class Rise(ModalBump):
+    """Another rise on the map: its bump at the mode."""
 
-    x_mm: float
-    y_mm: float
-    """`x_mm`, `y_mm`: Its centre in `plane`."""
     distance_mm: float | None  #: From the lump that was measured; None where there is none.
-    amplitude: float
-    sigma_x_mm: float
-    sigma_y_mm: float
-    """`amplitude`, `sigma_x_mm`, `sigma_y_mm`: Of its bump at the mode; widths along the axes of its ellipse."""
     probability: float  #: That it is a lump, as `Detection` has it.
 
 

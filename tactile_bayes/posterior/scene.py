@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Final, Literal, assert_never
+from typing import Final, Literal
 
 import numpy as np
 
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.geometry import BoolArray, FloatArray
 from tactile_bayes.options import BumpPrior
-from tactile_bayes.posterior.field import Profiles, Window
+from tactile_bayes.posterior.field import Templates, Window
 from tactile_bayes.posterior.white import WIDEST_IN_RADII
 
 # --- The fit problem that all scenes of one window share: cells, prior and bounds.
@@ -123,20 +123,18 @@ class Scene(Record):
         """True for a scene that is only a bump along the grid's axes: the product of a profile along each."""
         return self.shape in ("round", "ellipse") and not self.extra
 
-    def templates(self, theta: FloatArray, window: Window) -> list[Profiles]:
+    def templates(self, theta: FloatArray, window: Window) -> list[Templates]:
         """Templates of the bump, and of the second structure if there is one, for (m, p) vectors."""
         p, q, r = self.widths(theta)
         if self.shape == "ridge":
-            templates = [window.ridges(self.column(theta, "along"), self.column(theta, "across"), log_width=p)]
+            along, across = self.column(theta, "along"), self.column(theta, "across")
+            templates: list[Templates] = [window.ridges(along, across, log_width=p)]
         else:
             x, y = self.column(theta, "x"), self.column(theta, "y")
             templates = [window.bumps(x, y, p=p, q=q, r=r if self.shape == "rotated" else None)]
         if self.extra:
-            templates.append(
-                neighbour_templates(
-                    window, self.extra, *(self.column(theta, name) for name in _NEIGHBOUR_NAMES[self.extra])
-                )
-            )
+            beside = (self.column(theta, name) for name in _NEIGHBOUR_NAMES[self.extra])
+            templates.append(neighbour_templates(window, self.extra, *beside))
         return templates
 
     def log_prior(self, theta: FloatArray, problem: Problem) -> FloatArray:
@@ -194,14 +192,11 @@ class Scene(Record):
 
 def neighbour_templates(
     window: Window, extra: Neighbour, one: FloatArray, two: FloatArray, log_width: FloatArray
-) -> Profiles:
+) -> Templates:
     """Templates of m second structures: lumps at ``x2, y2``, or ribs of ``angle, offset``, each an (m,) array."""
-    match extra:
-        case "second lump":
-            return window.bumps(one, two, p=log_width, q=np.zeros_like(log_width), r=None)
-        case "rib":
-            return window.ridges(one, two, log_width=log_width)
-    assert_never(extra)
+    if extra == "rib":
+        return window.ridges(one, two, log_width=log_width)
+    return window.bumps(one, two, p=log_width, q=np.zeros_like(log_width), r=None)
 
 
 def ridge_place(offset: FloatArray, radius_mm: float) -> tuple[BoolArray, float]:

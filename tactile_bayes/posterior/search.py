@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from functools import partial
-from typing import Protocol
 
 import numpy as np
 
@@ -16,8 +15,7 @@ from tactile_bayes.posterior.bump import levelled, window_cells
 from tactile_bayes.posterior.correlated import Correlated
 from tactile_bayes.posterior.detection import Detection
 from tactile_bayes.posterior.draw import DETECTED, ModalBump, SamplerSettings
-from tactile_bayes.posterior.lump_probability import NO_EVIDENCE, Weighed, weigh_candidate
-from tactile_bayes.posterior.selection import SceneChoice
+from tactile_bayes.posterior.lump_probability import NO_EVIDENCE, Weighed, weigh
 from tactile_bayes.posterior.white import (
     LEAST_WIDTH_IN_CELLS,
     OUTGROWN,
@@ -33,36 +31,9 @@ from tactile_bayes.progress import Progress
 from tactile_bayes.size.draws import EXTREMES, SizePosterior
 from tactile_bayes.size.pooling import Calibration, draw_sizes
 
-# --- Common interface of both noise models: assess a place on a map, then draw from its posterior.
+# --- Both noise models have the same way: assess a place on a map, then draw from its posterior.
 
-
-class Assessment(Protocol):
-    """A place on a map under one noise model."""
-
-    @property
-    def fit(self) -> BumpFit:
-        """The least-squares fit."""
-
-    @property
-    def detection(self) -> Detection:
-        """The odds of a lump against none."""
-
-    @property
-    def fault(self) -> str:
-        """Reason why the bump cannot be a lump, whatever the odds; empty without one."""
-
-    @property
-    def scene(self) -> SceneChoice | None:
-        """Structures in the window; None under independent errors, and where the density has no mode."""
-
-    def bump(self) -> ModalBump:
-        """Amplitude, centre and widths of the bump at the mode."""
-
-    def widths_mm(self) -> tuple[float, float]:
-        """Widths of the bump at the mode, along the ellipse's axes; cheaper than `bump`."""
-
-    def draw(self, options: SamplerSettings, *, rng: np.random.Generator, progress: Progress | None) -> MapDraws:
-        """Draw from the posterior of this place; `NotConvergedError` when no method converges."""
+Assessment = White | Correlated
 
 
 def assess(tactile_map: TactileMap, fit: BumpFit, options: SamplerSettings) -> Assessment:
@@ -255,25 +226,24 @@ def best_chance(tactile_map: TactileMap, candidates: Sequence[Candidate], option
     for candidate in sorted(candidates, key=lambda one: one.detection is None):
         if candidate.detection is None and len(weighed) >= MOST_LOOKS:
             break
-        fit, detection = candidate.fit, candidate.detection
+        bump, detection = candidate.bump, candidate.detection
         if detection is None:
-            fit, detection = _weighed(tactile_map, candidate, options) or (None, None)
-        if detection is not None:
-            one = weigh_candidate(tactile_map, replace(candidate, fit=fit), detection)
-            weighed += [] if one is None else [replace(one, candidate=candidate)]
+            bump, detection = _weighed(tactile_map, candidate, options)
+        if bump is not None and detection is not None:
+            weighed.append(weigh(tactile_map, detection, bump, fault=candidate.fault, candidate=candidate))
     return max(weighed, key=lambda one: (one.probability, one.detection.log_bayes_factor), default=None)
 
 
 def _weighed(
     tactile_map: TactileMap, candidate: Candidate, options: SamplerSettings
-) -> tuple[BumpFit, Detection] | None:
-    """Odds of a lump at a faulty place, fitted from close by where the first fit moved away or grew too large."""
+) -> tuple[ModalBump | None, Detection | None]:
+    """Bump and odds of a lump at a faulty place; from close by where the first fit moved away or grew too large."""
     fit, settings = candidate.fit, _search_options(tactile_map, options)
     if fit is None or candidate.fault.startswith(OUTGROWN):
         fit, _ = fit_close(levelled(tactile_map), candidate.centre_mm, options=settings)
     if fit is None or min(fit.widths()[:2]) < LEAST_WIDTH_IN_CELLS * fit.cells.cell_mm:
-        return None
-    return fit, assess(tactile_map, _with_cells_of(tactile_map, fit, settings), options).detection
+        return None, None
+    return fit.modal(), assess(tactile_map, _with_cells_of(tactile_map, fit, settings), options).detection
 
 
 def _search_options(tactile_map: TactileMap, fit: SamplerSettings) -> SamplerSettings:

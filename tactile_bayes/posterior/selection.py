@@ -15,7 +15,7 @@ from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.posterior.bump import covariance_from_log_widths
 from tactile_bayes.posterior.draw import ROTATION_ODDS
-from tactile_bayes.posterior.field import FLOOR, FieldColumns, Profiles
+from tactile_bayes.posterior.field import FLOOR, FieldColumns
 from tactile_bayes.posterior.fit import FieldFit, Mixture, fit_scene, newton_mixture, tangent_columns
 from tactile_bayes.posterior.marginal import CollapsedTarget, linear_columns
 from tactile_bayes.posterior.scene import Problem, Scene, Shape
@@ -45,7 +45,7 @@ def pointwise_log_likelihood(target: CollapsedTarget, theta: FloatArray) -> Floa
     evidence = target.by_field(theta)
     log_share = evidence - np.logaddexp.reduce(evidence, axis=1)[:, None]
     window, fixed = target.window, _fixed_columns(target)
-    templates = [window.of_cells(one.full()) for one in target.scene.templates(theta, window)]
+    templates = [window.of_cells(one) for one in target.scene.templates(theta, window)]
     inverse = np.full((len(theta), len(window.cells)), -np.inf)
     for h, precision_of_field in enumerate(_fields(target)):
         precision = precision_of_field()
@@ -64,7 +64,7 @@ def fitted_values(target: CollapsedTarget, theta: FloatArray) -> tuple[FloatArra
     """
     window, at = target.window, theta[None]
     likeliest = int(np.argmax(target.by_field(at)[0]))
-    templates = [window.of_cells(one.full())[0] for one in target.scene.templates(at, window)]
+    templates = [window.of_cells(one)[0] for one in target.scene.templates(at, window)]
     regressors = np.stack([*_fixed_columns(target), *templates])
     precision = next(islice(_fields(target), likeliest, None))()
     middle = window.cells.value.mean()
@@ -77,18 +77,14 @@ def fitted_values(target: CollapsedTarget, theta: FloatArray) -> tuple[FloatArra
 
 def _fields(target: CollapsedTarget) -> Iterator[Callable[[], _Precision]]:
     """Makers of the precision of each field and share, in the order of `CollapsedTarget.by_field`."""
-    cosines = _cosines(target)
+    window = target.window
+    # a row for each cell: its products with the cosines, over its independent variance
+    unit = window.on_grid(np.eye(len(window.cells)))
+    cosines = window.project(unit, np.zeros((1, *window.weight.shape))).low
     for columns in target.fields:
         low = cosines @ columns.field.turn
         for index in range(len(columns.shares)):
-            yield partial(_Precision, 1.0 / target.window.variance, low, columns, index)
-
-
-def _cosines(target: CollapsedTarget) -> FloatArray:
-    """A row for each cell: its products with the cosines, over its independent variance."""
-    window = target.window
-    unit = Profiles(grid=window.on_grid(np.eye(len(window.cells))))
-    return np.asarray(window.project(unit, np.zeros((1, *window.weight.shape))).low)
+            yield partial(_Precision, 1.0 / window.variance, low, columns, index)
 
 
 def _fixed_columns(target: CollapsedTarget) -> FloatArray:

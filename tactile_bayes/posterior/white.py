@@ -56,12 +56,7 @@ from tactile_bayes.progress import Progress
 
 # --- Log posterior density of a least-squares model, with the noise scale integrated out.
 
-LogPrior = Callable[[FloatArray], FloatArray]
-
-
-def flat_prior(theta: FloatArray) -> FloatArray:
-    """(m,) zeros: the improper flat prior of certified regression data sets."""
-    return np.zeros(theta.shape[:-1])
+LogPrior = Callable[[FloatArray], FloatArray]  #: (m, p) to (m,).
 
 
 class Target(Record, eq=False):
@@ -77,39 +72,32 @@ class Target(Record, eq=False):
     data: FloatArray
     weight: FloatArray
     """`data`, `weight` (k,) arrays: Weights are inverse variances up to a common factor."""
-    log_prior: LogPrior  #: (m, p) to (m,).
+    log_prior: LogPrior
     errors: ErrorModel  #: Size, correlation and degrees of freedom of the noise.
     sse_min: float  #: Weighted sum of squares at the least-squares estimate.
     dimension: int
 
     def excess(self, theta: FloatArray) -> FloatArray:
         """(m,) rise of the weighted sum of squares above its minimum, divided by the inflation."""
-        size = block_size(len(self.data))
-        sse = np.concatenate([self._sse(theta[i : i + size]) for i in range(0, len(theta), size)])
-        rise = np.clip(sse - self.sse_min, 0.0, None) / self.errors.inflation
+        size, sse = block_size(len(self.data)), []
+        for i in range(0, len(theta), size):
+            with np.errstate(over="ignore", invalid="ignore"):
+                off = self.data - self.predict(theta[i : i + size])
+                off *= off
+                sse.append(off @ self.weight)
+        rise = np.clip(np.concatenate(sse) - self.sse_min, 0.0, None) / self.errors.inflation
         return np.where(np.isfinite(rise), rise, np.inf)
 
-    def _sse(self, theta: FloatArray) -> FloatArray:
-        with np.errstate(over="ignore", invalid="ignore"):
-            off = self.data - self.predict(theta)
-            off *= off
-            return np.asarray(off @ self.weight)
+    def __call__(self, theta: FloatArray, solved: Solved | None = None) -> FloatArray:
+        """(m,) log density of (m, p) parameter vectors; -inf where the model overflows.
 
-    def __call__(self, theta: FloatArray) -> FloatArray:
-        """(m,) log density of (m, p) parameter vectors; -inf where the model overflows."""
-        return self._at(theta, self.excess(theta))
-
-    def solved_density(self, theta: FloatArray, solved: Solved) -> FloatArray:
-        """As the density, storing the `excess` at these points in `solved` for `draw_noise_sd`."""
+        `solved` keeps the `excess` there for `draw_noise_sd`.
+        """
         excess = self.excess(theta)
-        solved.add(theta, (excess,))
-        return self._at(theta, excess)
-
-    def _at(self, theta: FloatArray, excess: FloatArray) -> FloatArray:
-        variance = self.errors.dof * self.errors.noise_sd**2
+        if solved is not None:
+            solved.add(theta, (excess,))
         exponent = 0.5 * (self.errors.dof + self.dimension)
-        likelihood = -exponent * np.log1p(excess / variance)
-        total = likelihood + self.log_prior(theta)
+        total = -exponent * np.log1p(excess / (self.errors.dof * self.errors.noise_sd**2)) + self.log_prior(theta)
         return np.where(np.isfinite(total), total, -np.inf)
 
     def draw_noise_sd(self, excess: FloatArray, rng: np.random.Generator) -> FloatArray:
@@ -173,21 +161,10 @@ class BumpFit(Record, eq=False):
         off = theta - self.theta
         return np.asarray(np.einsum("mp,pq,mq->m", off, information, off) / self.errors.inflation)
 
-    def target(self, prior: BumpPrior | None) -> Target:
-        """Posterior density of the parameters; flat priors when `prior` is None."""
-        return Target(
-            predict=lambda theta: self.bump.predict(theta, self.cells),
-            data=self.cells.value,
-            weight=self.weight,
-            log_prior=flat_prior if prior is None else self._log_prior(prior),
-            errors=self.errors,
-            sse_min=self.fit.sse,
-            dimension=len(self.theta),
-        )
+    def target(self, prior: BumpPrior) -> Target:
+        """Posterior density of the parameters.
 
-    def _log_prior(self, prior: BumpPrior) -> LogPrior:
-        """Prior of the bumps that `lump_fault` accepts: a rise, no wider than the window, its centre within it.
-
+        The prior is of the bumps that `lump_fault` accepts: a rise, no wider than the window, its centre within it.
         Without these bounds a background a little off its fixed level is "fitted" by a wide shallow dent.
         """
         x, y = self.theta[1:3]
@@ -199,7 +176,15 @@ class BumpFit(Record, eq=False):
             inside &= (theta[:, 0] > 0) & (np.maximum(sigma_x, sigma_y) <= WIDEST_IN_RADII * radius)
             return np.where(inside, self.bump.log_prior(theta, prior), -np.inf)
 
-        return log_prior
+        return Target(
+            predict=lambda theta: self.bump.predict(theta, self.cells),
+            data=self.cells.value,
+            weight=self.weight,
+            log_prior=log_prior,
+            errors=self.errors,
+            sse_min=self.fit.sse,
+            dimension=len(self.theta),
+        )
 
 
 class Candidate(Record, eq=False):
@@ -211,6 +196,11 @@ class Candidate(Record, eq=False):
     detection: Detection | None = None  #: Odds of a lump there; None where nobody has weighed them.
     assessed: ModalBump | None = None
     """The bump that the odds are of; None where it is the fit's."""
+
+    @property
+    def bump(self) -> ModalBump | None:
+        """The bump that the odds are of; None without a fit."""
+        return None if self.fit is None else self.assessed or self.fit.modal()
 
 
 def fitted_candidates(tactile_map: TactileMap, options: SamplerSettings) -> Iterator[Candidate]:
@@ -228,7 +218,9 @@ def fit_bump(
     The fit is None when none can be made at all; the fault says why the bump cannot be a lump, and is empty when it
     can.
     """
-    bump = _bump(tactile_map, options, rotated=options.rotation == "on")
+    check_background(tactile_map, options)
+    level = None if options.background == "free" else tactile_map.background
+    bump = Bump(rotated=options.rotation == "on", background=level, scale=value_scale(tactile_map))
     centre, start, weight_variance = centre_mm, None, None
     widths = START_WIDTHS_MM if options.start_width_mm is None else (options.start_width_mm,)
     for _ in range(6):
@@ -295,12 +287,6 @@ def check_background(tactile_map: TactileMap, options: SamplerSettings) -> None:
             f"the map's level far from a lump is not known (normalise {tactile_map.recipe.normalise}), so a background "
             'cannot be fixed at it; give background = "free"'
         )
-
-
-def _bump(tactile_map: TactileMap, options: SamplerSettings, *, rotated: bool) -> Bump:
-    check_background(tactile_map, options)
-    level = None if options.background == "free" else tactile_map.background
-    return Bump(rotated=rotated, background=level, scale=value_scale(tactile_map))
 
 
 def _best_fit(
@@ -408,7 +394,7 @@ class MapDraws(Record, eq=False):
 
 
 class White(Record, eq=False):
-    """An `Assessment` under independent errors."""
+    """A place on a map under independent errors."""
 
     tactile_map: TactileMap
     fit: BumpFit
@@ -432,20 +418,32 @@ class White(Record, eq=False):
 
     def draw(self, options: SamplerSettings, *, rng: np.random.Generator, progress: Progress | None) -> MapDraws:
         """Draw from the posterior, rotated where the odds favour it."""
-        fit, odds = chosen_rotation(self.tactile_map, self.fit, options=options)
-        draws, posterior = draw_independent(fit, options, rng=rng, progress=progress)
+        fit, odds = self.fit, None
+        if options.rotation == "auto":
+            odds, turned = rotation_odds(self.tactile_map, fit, options=options)
+            fit = turned if turned is not None and odds > ROTATION_ODDS else fit
+        target = fit.target(options.prior)
+        solved = Solved(lambda theta: (target.excess(theta),))
+        draws, _ = draw_parameters(_Independent(fit, target), options, rng=rng, progress=progress, solved=solved)
+        theta = draws.theta
+        sigma_x, sigma_y, angle = drawn_widths(*fit.bump.shape_parameters(theta))
+        # two of the methods are linear about the mode: for them the exact figure would cost more than all the rest
+        exact = draws.method in ("ensemble", "importance")
+        excess = solved(draws.flat)[0] if exact else fit.linear_excess(draws.flat)
+        posterior = MapPosterior(
+            amplitude=theta[..., 0],
+            sigma_x_mm=sigma_x,
+            sigma_y_mm=sigma_y,
+            x_mm=theta[..., 1],
+            y_mm=theta[..., 2],
+            angle_rad=angle,
+            background=fit.bump.level(theta),
+            noise_sd=target.draw_noise_sd(excess, rng).reshape(theta.shape[:2]),
+        )
         figures = {"noise_inflation": fit.errors.inflation, "noise_dof": fit.errors.dof}
         offset = level_offset(fit.fit.residual, weight=fit.weight)
         noise = NoiseFigures("independent", fit.bump.rotated, odds, figures, level_offset=offset)
         return MapDraws(self.detection, fit, draws, posterior, noise)
-
-
-def chosen_rotation(tactile_map: TactileMap, fit: BumpFit, *, options: SamplerSettings) -> tuple[BumpFit, float | None]:
-    """The fit, rotated where the odds favour it, and those odds; None where rotation was not tested."""
-    if options.rotation != "auto":
-        return fit, None
-    odds, turned = rotation_odds(tactile_map, fit, options=options)
-    return (turned, odds) if turned is not None and odds > ROTATION_ODDS else (fit, odds)
 
 
 class _Independent(Record, eq=False):
@@ -469,29 +467,5 @@ class _Independent(Record, eq=False):
     def sampled(self, solved: Solved | None = None) -> Sampled:
         scale = np.sqrt(np.diag(self.fit.covariance))
         mode, covariance, _ = mode_and_covariance(self.target, self.fit.theta, scale=scale)
-        density = self.target if solved is None else partial(self.target.solved_density, solved=solved)
+        density = self.target if solved is None else partial(self.target, solved=solved)
         return Sampled(density, mode, covariance)
-
-
-def draw_independent(
-    fit: BumpFit, options: SamplerSettings, *, rng: np.random.Generator, progress: Progress | None
-) -> tuple[ParameterDraws, MapPosterior]:
-    """Draw by the requested method, and name the joint draws."""
-    target = fit.target(options.prior)
-    solved = Solved(lambda theta: (target.excess(theta),))
-    draws, _ = draw_parameters(_Independent(fit, target), options, rng=rng, progress=progress, solved=solved)
-    theta = draws.theta
-    sigma_x, sigma_y, angle = drawn_widths(*fit.bump.shape_parameters(theta))
-    # two of the methods are linear about the mode: for them the exact figure would cost more than all the rest
-    exact = draws.method in ("ensemble", "importance")
-    excess = solved(draws.flat)[0] if exact else fit.linear_excess(draws.flat)
-    return draws, MapPosterior(
-        amplitude=theta[..., 0],
-        sigma_x_mm=sigma_x,
-        sigma_y_mm=sigma_y,
-        x_mm=theta[..., 1],
-        y_mm=theta[..., 2],
-        angle_rad=angle,
-        background=fit.bump.level(theta),
-        noise_sd=target.draw_noise_sd(excess, rng).reshape(theta.shape[:2]),
-    )

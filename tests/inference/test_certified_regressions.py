@@ -17,7 +17,7 @@ from tactile_bayes.inference.draws import ParameterDraws
 from tactile_bayes.inference.ensemble import ensemble
 from tactile_bayes.inference.modes import laplace, mode_and_covariance, optimise
 from tactile_bayes.posterior.detection import ErrorModel
-from tactile_bayes.posterior.white import Target, flat_prior
+from tactile_bayes.posterior.white import Target
 
 DOF = 242.0
 T_FACTOR = np.sqrt(DOF / (DOF - 2))
@@ -26,7 +26,7 @@ T_FACTOR = np.sqrt(DOF / (DOF - 2))
 def target(nist: Certified, *, noise: float = 1.0) -> Target:
     sse = float(np.sum((nist.y - nist.predict(nist.theta[None])[0]) ** 2))
     errors = ErrorModel(noise_sd=noise * nist.residual_sd, inflation=1.0, dof=DOF)
-    return Target(nist.predict, nist.y, np.ones(250), flat_prior, errors, sse, 8)
+    return Target(nist.predict, nist.y, np.ones(250), lambda theta: np.zeros(len(theta)), errors, sse, 8)
 
 
 def draws(method: str, nist: Certified, *, noise: float = 1.0) -> ParameterDraws:

@@ -19,7 +19,7 @@ from tactile_bayes.posterior.detection import ErrorModel
 from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.result import Estimate
-from tactile_bayes.posterior.white import Target, flat_prior
+from tactile_bayes.posterior.white import Target
 from tactile_bayes.presets import METHODS
 
 ROWS, DIMENSION = 30, 3
@@ -41,7 +41,13 @@ class Linear:
     def target(self, *, noise: float = 1.0, inflation: float = 1.0) -> Target:
         errors = ErrorModel(noise * np.sqrt(self.sse / self.dof), inflation, self.dof)
         return Target(
-            lambda theta: theta @ self.design.T, self.data, np.ones(ROWS), flat_prior, errors, self.sse, DIMENSION
+            lambda theta: theta @ self.design.T,
+            self.data,
+            np.ones(ROWS),
+            lambda at: np.zeros(len(at)),
+            errors,
+            self.sse,
+            DIMENSION,
         )
 
     def draw(self, method: str, **changes: float) -> ParameterDraws:

@@ -9,7 +9,7 @@ from posterior_maps import bump_values, grid_map
 from tactile_bayes.declarations import replace
 from tactile_bayes.posterior.detection import detection_from_odds
 from tactile_bayes.posterior.draw import ModalBump, SamplerSettings
-from tactile_bayes.posterior.lump_probability import LIKELY, Weighed, weigh, weigh_candidate
+from tactile_bayes.posterior.lump_probability import LIKELY, Weighed, weigh
 from tactile_bayes.posterior.white import Candidate, fit_bump
 
 CLEAR = {"log_bayes_factor": 60.0, "centre_mm": (0.0, 0.0), "widths_mm": (5.0, 4.5), "fault": ""}
@@ -18,7 +18,8 @@ CLEAR = {"log_bayes_factor": 60.0, "centre_mm": (0.0, 0.0), "widths_mm": (5.0, 4
 def weighed(**changes: object) -> Weighed:
     given = {**CLEAR, **changes}
     detection = detection_from_odds(given.pop("log_bayes_factor"))  # type: ignore[arg-type]
-    return weigh(grid_map(bump_values(x=0.0, y=0.0)), detection, **given)  # type: ignore[arg-type]
+    bump = ModalBump(0.2, *given["centre_mm"], *given["widths_mm"])  # type: ignore[misc]
+    return weigh(grid_map(bump_values(x=0.0, y=0.0)), detection, bump, fault=given["fault"])  # type: ignore[arg-type]
 
 
 def test_a_clear_round_rise_is_a_lump() -> None:
@@ -44,10 +45,11 @@ def test_a_rise_has_the_width_of_the_bump_that_has_the_evidence() -> None:
     fit, _ = fit_bump(tactile_map, (-10.0, 5.0), options=SamplerSettings())
     narrow = Candidate((-10.0, 5.0), fit, "at the rim of the map (with a sigma of 13.3 mm its flank is 9 mm short)")
     wide = replace(narrow, assessed=ModalBump(0.05, -10.0, 5.0, 13.3, 11.0))
-    told = [weigh_candidate(tactile_map, one, detection_from_odds(35.0)) for one in (narrow, wide)]
-    assert told[0] is not None
-    assert told[1] is not None
-    assert told[0].probability > LIKELY > 0.3 > told[1].probability
+    told = []
+    for one in (narrow, wide):
+        assert one.bump is not None
+        told.append(weigh(tactile_map, detection_from_odds(35.0), one.bump, fault=one.fault).probability)
+    assert told[0] > LIKELY > 0.3 > told[1]
 
 
 def test_more_evidence_never_lowers_it() -> None:

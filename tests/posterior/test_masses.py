@@ -314,7 +314,7 @@ def test_a_second_lump_whose_centre_lies_off_the_map_does_not_end_the_estimate()
 
 
 def test_a_rise_whose_centre_lies_off_the_map_is_a_mass_without_a_size(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(masses_module, "other_rises", lambda *_: (Rise(0.0, 31.0, None, 0.2, 4.0, 4.0, 0.99),))
+    monkeypatch.setattr(masses_module, "other_rises", lambda *_: (Rise(0.2, 0.0, 31.0, 4.0, 4.0, None, 0.99),))
     masses = found_on(at_the_rim()).estimate.masses
     assert places(masses) == [(0, 8), (0, 31)]
     assert masses[1].estimate.code == "window"

@@ -147,5 +147,5 @@ def test_a_level_that_falls_towards_the_rim_is_no_lumps_flank(
     x, y = np.meshgrid(axis, axis)
     mean = bump_values(half_mm=HALF_MM, x=-20.0, y=16.0, sigma_x=sigma, sigma_y=sigma, amplitude=amplitude)
     mean -= fall * (np.exp(-0.5 * ((x + HALF_MM) / 7.0) ** 2) + np.exp(-0.5 * ((y - HALF_MM) / 7.0) ** 2))
-    fitted = Rise(-20.0, 16.0, None, max(amplitude, 0.2 if fall and not stands else 0.0), 8.0, 8.0, 1.0)
+    fitted = Rise(max(amplitude, 0.2 if fall and not stands else 0.0), -20.0, 16.0, 8.0, 8.0, None, 1.0)
     assert _stands_out(fitted, grid_map(mean)) == stands

@@ -7,7 +7,6 @@ from posterior_maps import bump_map, correlated_field
 from scipy.stats import t
 
 from tactile_bayes.posterior.draw import SamplerSettings
-from tactile_bayes.posterior.field import Profiles
 from tactile_bayes.posterior.fit import FieldFit
 from tactile_bayes.posterior.marginal import CollapsedTarget, linear_columns
 from tactile_bayes.posterior.search import search
@@ -35,7 +34,7 @@ def with_one_field(target: CollapsedTarget, index: int) -> CollapsedTarget:
 def covariance(target: CollapsedTarget) -> np.ndarray:
     """(n, n) of the cells under the target's one field, from its precision."""
     window, (columns,) = target.window, target.fields
-    unit = Profiles(grid=window.on_grid(np.eye(len(window.cells))))
+    unit = window.on_grid(np.eye(len(window.cells)))
     low = window.project(unit, np.zeros((1, *window.weight.shape))).low @ columns.field.turn
     return np.linalg.inv(np.diag(1.0 / window.variance) - (low * columns.weight[:, 0]) @ low.T)
 
@@ -60,7 +59,7 @@ def test_each_cell_is_predicted_as_by_a_regression_without_it() -> None:
     found = fit()
     target = with_one_field(found.target, -1)
     window, theta = target.window, found.mode[None]
-    bump = window.of_cells(target.scene.templates(theta, window)[0].full())[0]
+    bump = window.of_cells(target.scene.templates(theta, window)[0])[0]
     x = np.column_stack([*linear_columns(window.cells, tilt=target.scene.tilt), bump])
     c = covariance(target)
     cells = range(0, len(window.cells), 9)

@@ -146,13 +146,13 @@ def test_a_template_is_blurred_by_the_noise(r: float) -> None:
     window = window_of(with_figures(bump_map(), pose_noise_x_mm=1.0, pose_noise_y_mm=0.5))
     p, q = np.array([1.6]), np.array([0.1])
     turned = np.array([r]) if r else None
-    found = window.bumps(np.zeros(1), np.zeros(1), p=p, q=q, r=turned).full()[0]
+    found = window.of_cells(window.bumps(np.zeros(1), np.zeros(1), p=p, q=q, r=turned))[0]
     covariance = covariance_from_log_widths(p, q, np.array([r]))[0]
     blurred = covariance + np.diag([1.0, 0.25])
-    x, y = np.meshgrid(window.x_mm, window.y_mm)
-    plain = cell_mean_gaussian(x.ravel(), y.ravel(), covariance_mm2=blurred, cell_mm=1.0)
+    cells = window.cells
+    plain = cell_mean_gaussian(cells.x_mm, cells.y_mm, covariance_mm2=blurred, cell_mm=1.0)
     lower = np.sqrt(np.linalg.det(covariance) / np.linalg.det(blurred))
-    np.testing.assert_allclose(found.ravel(), lower * plain, atol=1e-4)
+    np.testing.assert_allclose(found, lower * plain, atol=1e-4)
     assert lower < 0.99  # the control: without the blur they would differ by a per cent and more
 
 

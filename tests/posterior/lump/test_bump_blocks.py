@@ -11,7 +11,7 @@ from posterior_maps import bump_map
 from tactile_bayes.declarations import replace
 from tactile_bayes.posterior.bump import BLOCK, LEAST_BLOCK, Bump, FitCells, block_size, window_cells
 from tactile_bayes.posterior.detection import ErrorModel
-from tactile_bayes.posterior.white import Target, flat_prior
+from tactile_bayes.posterior.white import Target
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +61,7 @@ def test_a_density_of_many_vectors_takes_little_memory(fine: FitCells) -> None:
         lambda theta: bump.predict(theta, fine),
         fine.value,
         np.ones(len(fine)),
-        flat_prior,
+        lambda theta: np.zeros(len(theta)),
         ErrorModel(0.02, 1.0, 100.0),
         0.0,
         len(bump.names),
