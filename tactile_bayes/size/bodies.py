@@ -360,24 +360,17 @@ def mean_width_mm(sigma_x_mm: float, sigma_y_mm: float | None) -> float:
     return float(np.sqrt(sigma_x_mm * (sigma_x_mm if sigma_y_mm is None else sigma_y_mm)))
 
 
-class BodyLeft(Record, eq=False):
-    """(n,) mean and variance of B given what is known of the body."""
-
-    expected: FloatArray
-    variance: FloatArray
-
-
 def known_body(
     calibration: BodyCalibration,
     known: Mapping[str, float],
     log_amplitude: FloatArray,
     log_width: FloatArray,
     own_sd: FloatArray,
-) -> BodyLeft:
-    """B given known properties, for (n,) ln a and p of maps and SD(B) there as `BodyCalibration.own_sd` gives it."""
+) -> tuple[FloatArray, FloatArray]:
+    """(n,) mean and variance of B given known properties, for ln a and p of maps and `BodyCalibration.own_sd` there."""
     hidden, none = calibration.hidden, np.zeros(len(log_width))
     if not known:
-        return BodyLeft(none, own_sd**2)
+        return none, own_sd**2
     names = () if hidden is None else hidden.names
     for name, value in known.items():
         if name not in names:
@@ -386,7 +379,7 @@ def known_body(
     assert hidden is not None
     expected = hidden.expected_body(known, calibration.features(log_amplitude, log_width))
     explained_sd = np.minimum(own_sd, hidden.most_sd)
-    return BodyLeft(expected * explained_sd, own_sd**2 - hidden.share(*known) * explained_sd**2)
+    return expected * explained_sd, own_sd**2 - hidden.share(*known) * explained_sd**2
 
 
 def suppositions(
@@ -401,14 +394,15 @@ def suppositions(
         return {}
     at = np.array([middle[0]]), np.array([middle[1]])
     own_sd = calibration.own_sd(calibration.body_sd(*at, np.zeros(1)))
-    before, features = known_body(calibration, known, *at, own_sd), calibration.features(*at)[0]
+    expected, spread = known_body(calibration, known, *at, own_sd)
+    features = calibration.features(*at)[0]
     for label, (name, value) in SUPPOSED.items():
         low, high = calibration.bodies.get(name, (value, value))
         if name not in hidden.names or name in known or not low <= value <= high:
             continue
         if hidden.score(name, value, features) <= LIKELY_SDS:
-            left = known_body(calibration, {**known, name: value}, *at, own_sd)
-            remaining = float(np.clip(variance - float((before.variance - left.variance)[0]), 0.0, variance))
+            then, left = known_body(calibration, {**known, name: value}, *at, own_sd)
+            remaining = float(np.clip(variance - float((spread - left)[0]), 0.0, variance))
             sds = float(np.sqrt(variance)), float(np.sqrt(remaining))
-            supposed[label] = Supposition(name, value, float((left.expected - before.expected)[0]), sds)
+            supposed[label] = Supposition(name, value, float((then - expected)[0]), sds)
     return supposed

@@ -229,19 +229,27 @@ def push_sizes(
     """
     shape, bump = bump.amplitude.shape, bump.flat()
     replicates = even_replicates(bump.amplitude.size) if bump.labels is None else bump.labels
-    key = np.maximum(*_sizes(bump, calibration, calibration.x.draws.mean(axis=0), calibration.y.draws.mean(axis=0)))
-    points = paired_points(key, replicates, 4, rng)
-    coefficients_x = _coefficients_at(points[:, 0], calibration.x, bump.sigma_x_mm, bump.amplitude)
-    coefficients_y = _coefficients_at(points[:, 1], calibration.y, bump.sigma_y_mm, bump.amplitude)
-    d_x, d_y = _sizes(bump, calibration, coefficients_x, coefficients_y)
-    z = normal_quantile(points[:, 2:].T)
-    rho = calibration.residual_correlation
+    axes = calibration.x, calibration.y
+    by_map = _sizes(bump, axes, [axis.draws.mean(axis=0) for axis in axes])
+    points = paired_points(np.maximum(*by_map), replicates, 4, rng)
+    coefficients = [
+        _coefficients_at(points[:, i], axis, sigma_mm, bump.amplitude)
+        for i, (axis, sigma_mm) in enumerate(zip(axes, (bump.sigma_x_mm, bump.sigma_y_mm), strict=True))
+    ]
+    sizes = _sizes(bump, axes, coefficients)
+    z, rho = normal_quantile(points[:, 2:].T), calibration.residual_correlation
     z[1] = rho * z[0] + np.sqrt(1.0 - rho**2) * z[1]
-    scattered_x = d_x * np.exp(calibration.x.scatter(bump.amplitude, draws=coefficients_x) * z[0])
-    scattered_y = d_y * np.exp(calibration.y.scatter(bump.amplitude, draws=coefficients_y) * z[1])
-    valid = (d_x > 0) & (d_y > 0)
-    parts = _variances(bump, calibration, coefficients_x, coefficients_y)
-    d_x, d_y = np.where(valid, scattered_x, np.nan), np.where(valid, scattered_y, np.nan)
+    valid = (sizes[0] > 0) & (sizes[1] > 0)
+    d_x, d_y = (
+        np.where(valid, size * np.exp(axis.scatter(bump.amplitude, draws=drawn) * score), np.nan)
+        for size, axis, drawn, score in zip(sizes, axes, coefficients, z, strict=True)
+    )
+    middle, larger = bump.median(), axes[0 if np.nanmedian(by_map[0] - by_map[1]) >= 0 else 1]
+    parts = {  # variance of ln(max size) with all but one source held at its centre
+        "map": _log_variance(np.maximum(*by_map)),
+        "calibration": _log_variance(np.maximum(*_sizes(middle, axes, coefficients))),
+        "residual": float(larger.scatter(middle.amplitude)[0] ** 2),
+    }
     size = SizePosterior(d_x, d_y, shares(parts), int((~valid).sum()), replicates)
     if another_exam is not None:
         size = replace(size, another_exam=_another(size, parts, another_exam, rng))
@@ -274,32 +282,18 @@ def _coefficients_at(
 
 
 def _sizes(
-    bump: BumpDraws, calibration: SizeCalibration, coefficients_x: FloatArray, coefficients_y: FloatArray
+    bump: BumpDraws, axes: tuple[AxisCalibration, AxisCalibration], coefficients: Sequence[FloatArray]
 ) -> tuple[FloatArray, FloatArray]:
-    """Diameters along the ellipse's own axes, without scatter."""
+    """Diameters along the ellipse's own axes, without scatter, by coefficients of the head's two axes."""
     along = np.cos(bump.angle_rad) ** 2
 
-    def blend(sigma: FloatArray, share_x: FloatArray) -> FloatArray:
-        across = calibration.x.size_mm(sigma, bump.amplitude, draws=coefficients_x)
-        along_head = calibration.y.size_mm(sigma, bump.amplitude, draws=coefficients_y)
+    def blend(sigma_mm: FloatArray, share_x: FloatArray) -> FloatArray:
+        across, along_head = (
+            axis.size_mm(sigma_mm, bump.amplitude, draws=drawn) for axis, drawn in zip(axes, coefficients, strict=True)
+        )
         return share_x * across + (1.0 - share_x) * along_head
 
     return blend(bump.sigma_x_mm, along), blend(bump.sigma_y_mm, 1.0 - along)
-
-
-def _variances(
-    bump: BumpDraws, calibration: SizeCalibration, coefficients_x: FloatArray, coefficients_y: FloatArray
-) -> dict[str, float]:
-    """Variance of ln(max size) with all but one source held at its centre."""
-    middle = bump.median()
-    by_map = _sizes(bump, calibration, calibration.x.draws.mean(axis=0), calibration.y.draws.mean(axis=0))
-    by_coefficients = _sizes(middle, calibration, coefficients_x, coefficients_y)
-    larger: AxisCalibration = calibration.x if np.nanmedian(by_map[0] - by_map[1]) >= 0 else calibration.y
-    return {
-        "map": _log_variance(np.maximum(*by_map)),
-        "calibration": _log_variance(np.maximum(*by_coefficients)),
-        "residual": float(larger.scatter(middle.amplitude)[0] ** 2),
-    }
 
 
 def _log_variance(size_mm: FloatArray) -> float:

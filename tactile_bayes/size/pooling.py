@@ -262,12 +262,12 @@ class _Pool(Record, eq=False, dict=True):
         body_sd, error = self._of_one if len(maps.weight) == 1 else self._errors(maps)
         # what is known of a body explains the spread of the population's bodies, and nothing of other kinds
         own_sd, site = self.calibration.own_sd(body_sd), self.calibration.site
-        left = known_body(self.calibration, self.known, maps.log_amplitude, maps.log_width, own_sd)
+        expected, left = known_body(self.calibration, self.known, maps.log_amplitude, maps.log_width, own_sd)
         form_sd = IRREGULAR_SD * self.figures["irregular_outline"]
-        return left.expected, {
+        return expected, {
             "between_maps": maps.variance,
             "calibration": error,
-            "body": left.variance + self.calibration.other_sd**2 + form_sd**2,
+            "body": left + self.calibration.other_sd**2 + form_sd**2,
             **({} if site is None else {"site": site.variance(maps.log_width)}),
         }
 

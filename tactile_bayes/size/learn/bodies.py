@@ -302,10 +302,10 @@ def size_error(
     middle = a.mean(keepdims=True), p.mean(keepdims=True)
     told = {name: float(exams.unknowns[name][0]) for name in known}
     told = {name: float(np.exp(value)) if name in LOGGED else value for name, value in told.items()}
-    left = known_body(at, told, *middle, at.own_sd(at.body_sd(*middle, np.zeros(1))))
+    expected, left = known_body(at, told, *middle, at.own_sd(at.body_sd(*middle, np.zeros(1))))
     exam = (noise.mean() + np.exp(2 * at.spread.log_exam_sd)) / len(exams)
-    variance = left.variance[0] + at.other_sd**2 + at.coefficient_variance(terms)[0] + exam
-    size = at.log_size(a, p).mean() + left.expected[0]
+    variance = left[0] + at.other_sd**2 + at.coefficient_variance(terms)[0] + exam
+    size = at.log_size(a, p).mean() + expected[0]
     return float(size - np.log(exams.d_mm[0])), float(variance)
 
 
