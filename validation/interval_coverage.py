@@ -359,7 +359,7 @@ def _size_mass(bodies: str, index: int) -> Row:
             single.append(None)
             continue
         one = found.map_posterior
-        shapes.append(ShapeDraws.of(one.bump(), profile=head_profile(tactile_map.quality)))
+        shapes.append(ShapeDraws.of(one, profile=head_profile(tactile_map.quality)))
         single.append(_both(found.size))
     pooled = pool_maps(shapes, calibration=calibration, priors=SizePriors(), rng=np.random.default_rng([SEED, index]))
     return {

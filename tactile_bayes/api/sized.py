@@ -475,11 +475,10 @@ def size_priors(settings: Settings) -> SizePriors:
 def pooling_shape(tactile_map: TactileMap, estimate: Estimate) -> ShapeDraws | None:
     """Draws that pooling needs of a map, with the direction of its axes if landmarks define it."""
     posterior, turn = estimate.map_posterior, tactile_map.patient_from_plane
-    if posterior is None or estimate.draws is None:
+    if posterior is None:
         return None
     angle = 0.0 if turn is None else math.atan2(float(turn[1, 0]), float(turn[0, 0]))
-    bump = posterior.bump(estimate.draws.replicates)
-    return ShapeDraws.of(bump, turn_rad=angle, profile=head_profile(tactile_map.quality))
+    return ShapeDraws.of(posterior, turn_rad=angle, profile=head_profile(tactile_map.quality))
 
 
 def check_one_mass(scans: Sequence[Mapping[str, str]]) -> None:

@@ -183,7 +183,7 @@ def _reached(along: FloatArray, covered: BoolArray, cell: float, reach: float) -
 def rim_fault(
     tactile_map: TactileMap, centre_mm: tuple[float, float], widths_mm: tuple[float, float], *, radius_mm: float
 ) -> str:
-    """Fault of a bump mostly beyond the map's rim, or within a single cell; empty if neither."""
+    """Fault of a bump mostly beyond the map's rim, within a single cell, or of few readings; empty if none."""
     wide, narrow, cell = max(widths_mm), min(widths_mm), tactile_map.recipe.cell_mm
     share = covered_share(tactile_map, centre_mm, radius_mm=1.5 * wide)
     if share < LEAST_COVERED_SHARE:
@@ -195,13 +195,8 @@ def rim_fault(
         return f"{AT_RIM} (with a sigma of {wide:.3g} mm its flank to {side} is {millimetres:.0f} mm short)"
     if narrow < LEAST_WIDTH_IN_CELLS * cell:
         return f"narrower than a cell (sigma {narrow:.2g} mm on {cell:g} mm cells): not resolved"
-    return _few_readings_fault(tactile_map, centre_mm, radius_mm=max(1.5 * wide, cell))
-
-
-def _few_readings_fault(tactile_map: TactileMap, centre_mm: tuple[float, float], *, radius_mm: float) -> str:
-    """Fault of a bump that a few frames at the map's edge made; empty if its cells are as well read as others."""
     typical = float(np.median(tactile_map.count[tactile_map.covered]))
-    cells = window_cells(tactile_map, centre_mm, radius_mm=radius_mm)
+    cells = window_cells(tactile_map, centre_mm, radius_mm=max(1.5 * wide, cell))
     here = float(np.median(cells.count)) if len(cells) else 0.0
     if here >= LEAST_READ * typical:
         return ""

@@ -280,16 +280,13 @@ def overlap(axis_mm: FloatArray, side_mm: float) -> FloatArray:
 
 
 def _smooth(array: FloatArray, width_cells: float) -> FloatArray:
-    """Separable Gaussian smoothing with zeros beyond the edge."""
-    along, across = (_kernel(n, width_cells) for n in array.shape)
-    return np.asarray(along @ array @ across)
-
-
-def _kernel(n: int, width_cells: float) -> FloatArray:
-    """(n, n) Gaussian weights between the cells of a line, zero beyond four widths."""
-    away = np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
-    weight = np.exp(-0.5 * (away / max(width_cells, 0.3)) ** 2)
-    return np.where(away <= max(1, int(np.ceil(4 * width_cells))), weight, 0.0)
+    """Separable Gaussian smoothing with zeros beyond the edge, and beyond four widths."""
+    kernels = []
+    for n in array.shape:
+        away = np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
+        weight = np.exp(-0.5 * (away / max(width_cells, 0.3)) ** 2)
+        kernels.append(np.where(away <= max(1, int(np.ceil(4 * width_cells))), weight, 0.0))
+    return np.asarray(kernels[0] @ array @ kernels[1])
 
 
 # --- The paper's model of a map: one Gaussian bump on a level background (Eq 7), with its priors.

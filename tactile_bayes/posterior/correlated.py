@@ -306,6 +306,7 @@ def _posterior(
         angle_rad=angle,
         background=level.reshape(shape),
         noise_sd=noise_sd.reshape(shape),
+        labels=draws.replicates,
         oblique=_oblique(fit, places),
         irregular=irregular(fit),
     )

@@ -218,23 +218,14 @@ def _blocks(tactile_map: TactileMap, bump: Bump, theta: FloatArray) -> _Blocks:
     side = max(1, int(min(sigma_x, sigma_y) / cell))
     radius = np.sqrt(MOST_BLOCKS / pi) * side * cell
     cells = window_cells(tactile_map, (float(theta[1]), float(theta[2])), radius_mm=float(radius))
-    return _average(cells, bump.unit_bump(theta[None], cells)[0], side)
-
-
-def _average(cells: FitCells, template: FloatArray, side: int) -> _Blocks:
     if not len(cells):
-        empty = np.zeros(0)
-        return _Blocks(empty, empty, empty, empty, empty)
+        return _Blocks(*[np.zeros(0)] * 5)
     key = (cells.row // side) * (int(cells.column.max()) // side + 1) + cells.column // side
     _, index, number = np.unique(key, return_inverse=True, return_counts=True)
     keep = number >= 0.5 * side**2
-
-    def mean(values: FloatArray) -> FloatArray:
-        return np.asarray((np.bincount(index, values) / number)[keep])
-
-    return _Blocks(
-        mean(cells.x_mm), mean(cells.y_mm), mean(cells.value), mean(template), mean(1.0 / cells.count) / number[keep]
-    )
+    averaged = (cells.x_mm, cells.y_mm, cells.value, bump.unit_bump(theta[None], cells)[0], 1.0 / cells.count)
+    x, y, value, template, reading = ((np.bincount(index, one) / number)[keep] for one in averaged)
+    return _Blocks(x, y, value, template, reading / number[keep])
 
 
 def _log_evidences(blocks: _Blocks, width_mm: float, *, amplitude_sd: float) -> tuple[float, float]:

@@ -11,7 +11,7 @@ import numpy as np
 from tactile_bayes.declarations import Record, field, replace
 from tactile_bayes.errors import NotConvergedError, UsageError
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.inference.draws import END_ERROR, INDEPENDENT_DRAWS, Labels, ParameterDraws, Solved, distinct_rows
+from tactile_bayes.inference.draws import END_ERROR, INDEPENDENT_DRAWS, ParameterDraws, Solved, distinct_rows
 from tactile_bayes.inference.ensemble import EnsembleOptions, ensemble
 from tactile_bayes.inference.importance import TRUSTED_SHAPE, Gaussians, ImportanceOptions, importance
 from tactile_bayes.inference.modes import LogDensity
@@ -75,32 +75,19 @@ def scene_asked(options: SamplerSettings) -> SceneAsked:
 # --- Joint posterior draws, the result of every method and noise model.
 
 
-class MapPosterior(Record, eq=False):
+class MapPosterior(BumpDraws, eq=False, kw_only=True):
     """Joint draws of the quantities in Eq 7, each (chain, draw)."""
 
-    amplitude: FloatArray
-    sigma_x_mm: FloatArray
-    sigma_y_mm: FloatArray
     x_mm: FloatArray
     y_mm: FloatArray
-    angle_rad: FloatArray
     background: FloatArray
     noise_sd: FloatArray
-    oblique: tuple[float, float] | None = None
-    """Mean and SD of r, the half log axis ratio 45 degrees from the map's x axis, where the draws have none and it was
-    measured beside them; None otherwise."""
-    irregular: bool = False  #: True where the bump is less regular than a ball's, see `correlated.outline`.
 
     @property
     def medians(self) -> tuple[float, float, float]:
         """Posterior medians of amplitude, sigma_x_mm and sigma_y_mm."""
         amplitude, x, y = (float(np.median(v)) for v in (self.amplitude, self.sigma_x_mm, self.sigma_y_mm))
         return amplitude, x, y
-
-    def bump(self, labels: Labels | None = None) -> BumpDraws:
-        """The draws that a size needs, with the labels of their independent replicates."""
-        drawn = self.amplitude, self.sigma_x_mm, self.sigma_y_mm, self.angle_rad
-        return BumpDraws(*drawn, labels=labels, oblique=self.oblique, irregular=self.irregular)
 
 
 class ModalBump(Record):

@@ -146,28 +146,19 @@ def add_beside(
     """
     if scene not in ASKING:
         return choice
-    fit, beside = _beside_questions(choice.plain.target.problem, choice.plain, surroundings, ridges, scene)
-    chosen = choice if fit is choice.plain else retested(choice, fit)
-    return replace(chosen, structures=(*chosen.structures, *beside))
-
-
-def _beside_questions(
-    problem: Problem, plain: FieldFit, surroundings: Surroundings, ridges: FloatArray, scene: SceneAsked
-) -> tuple[FieldFit, list[Structure]]:
-    """Test a second lump and a rib, each against the scene without; returns the better supported fit."""
-    lumps = second_lumps(plain, problem)
+    plain, wanted = choice.plain, WANTED.get(scene)
+    lumps = second_lumps(plain, plain.target.problem)
     places: dict[Neighbour, FloatArray] = {
         "second lump": lumps[rises(plain, surroundings, "second lump", lumps)],
         "rib": _apart(plain, ridges),
     }
     fits = {
-        extra: _fit_beside(problem, plain, surroundings, extra, rising, forced=WANTED.get(scene) == extra)
+        extra: _fit_beside(plain, surroundings, extra, rising, forced=wanted == extra)
         for extra, rising in places.items()
     }
     asked = [extra for extra, (fit, log_odds, _) in fits.items() if fit is not None and log_odds > np.log(SECOND_ODDS)]
     likeliest = max(asked, key=lambda extra: fits[extra][1], default=None)
-    used = WANTED.get(scene, likeliest)
-    chosen = fits[used][0] if used else plain
+    used = wanted or likeliest
     answers = []
     for extra, (fit, log_odds, bound) in fits.items():
         answer = Structure(extra, odds(log_odds), extra in asked, fit is not None and extra == used, bound)
@@ -176,18 +167,21 @@ def _beside_questions(
             x, y = change_in_sd(plain, fit.scene.carried(fit.mode, plain.scene))
             answer = replace(answer, change_x_sd=sign * x, change_y_sd=sign * y, place=_place(fit))
         answers.append(answer)
-    return chosen or plain, answers
+    chosen = fits[used][0] if used else None
+    retold = choice if chosen is None else retested(choice, chosen)
+    return replace(retold, structures=(*retold.structures, *answers))
 
 
 def _fit_beside(
-    problem: Problem, plain: FieldFit, surroundings: Surroundings, extra: Neighbour, rising: FloatArray, *, forced: bool
+    plain: FieldFit, surroundings: Surroundings, extra: Neighbour, rising: FloatArray, *, forced: bool
 ) -> tuple[FieldFit | None, float, bool]:
     """Fit a second structure: the fit, its log odds, and whether these are only a bound (without a fit)."""
     scene = replace(plain.scene, extra=extra)
     starts, bound = _starts(plain, extra, rising)
     if not starts or (bound < np.log(LEAST_ODDS) and not forced):
         return None, min(bound, 0.0), True
-    fits = [fit for start in starts if (fit := fit_or_none(problem, scene, start)) is not None]
+    found = (fit_or_none(plain.target.problem, scene, start) for start in starts)
+    fits = [fit for fit in found if fit is not None]
     standing = [fit for fit in fits if rises(fit, surroundings, extra, fit.mode[None, -3:])[0]]
     if not standing:
         return None, -np.inf, True
@@ -197,7 +191,10 @@ def _fit_beside(
 
 def _starts(plain: FieldFit, extra: Neighbour, rising: FloatArray) -> tuple[list[FloatArray], float]:
     """Starts for the fit of a second structure, and a bound on the log evidence that it gains."""
-    gains = _gains(plain, rising, extra)
+    window, gains = plain.target.window, np.array([-np.inf])
+    if len(rising):
+        templates = (neighbour_templates(window, extra, *rising[i : i + BLOCK].T) for i in range(0, len(rising), BLOCK))
+        gains = np.concatenate([plain.target.gains(one, plain.mode) for one in templates])
     best = int(np.argmax(gains))
     starts, bound = [np.concatenate([plain.mode, one]) for one in rising[best : best + 1]], float(gains[best])
     if extra == "second lump" and (halves := _split(plain)) is not None:
@@ -270,16 +267,6 @@ def rising_ribs(plain: FieldFit, surroundings: Surroundings) -> FloatArray:
     """(g, 3) ridges of `ribs` along which the map rises beside a bump."""
     places = ribs(plain.target.problem)
     return np.asarray(places[rises(plain, surroundings, "rib", places)])
-
-
-def _gains(plain: FieldFit, grid: FloatArray, extra: Neighbour) -> FloatArray:
-    """(g,) log evidence gained by each template beside the bump at its mode."""
-    window = plain.target.window
-    parts = []
-    for i in range(0, len(grid), BLOCK):
-        templates = neighbour_templates(window, extra, *grid[i : i + BLOCK].T)
-        parts.append(plain.target.gains(templates, plain.mode))
-    return np.asarray(np.concatenate(parts)) if parts else np.array([-np.inf])
 
 
 def _place(fit: FieldFit) -> str:

@@ -119,8 +119,7 @@ def draw_with_size(
     far = tuple(calibration.extrapolation_faults(*posterior.medians))
     if fault or far:
         return SizedDraws(made, None, fault, calibration, far)
-    bump = posterior.bump(made.draws.replicates)
-    size = draw_sizes(bump, calibration=calibration, priors=options.size_priors, rng=rng)
+    size = draw_sizes(posterior, calibration=calibration, priors=options.size_priors, rng=rng)
     return SizedDraws(made, size, None, calibration)
 
 

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from functools import partial
+from collections.abc import Iterator, Sequence
 from itertools import islice
 from math import lgamma, log, pi
-from typing import assert_never
 
 import numpy as np
 
@@ -15,7 +13,7 @@ from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.posterior.bump import covariance_from_log_widths
 from tactile_bayes.posterior.draw import ROTATION_ODDS
-from tactile_bayes.posterior.field import FLOOR, FieldColumns
+from tactile_bayes.posterior.field import FLOOR
 from tactile_bayes.posterior.fit import FieldFit, Mixture, fit_scene, newton_mixture, tangent_columns
 from tactile_bayes.posterior.marginal import CollapsedTarget, linear_columns
 from tactile_bayes.posterior.scene import Problem, Scene, Shape
@@ -47,8 +45,7 @@ def pointwise_log_likelihood(target: CollapsedTarget, theta: FloatArray) -> Floa
     window, fixed = target.window, _fixed_columns(target)
     templates = [window.of_cells(one) for one in target.scene.templates(theta, window)]
     inverse = np.full((len(theta), len(window.cells)), -np.inf)
-    for h, precision_of_field in enumerate(_fields(target)):
-        precision = precision_of_field()
+    for h, precision in enumerate(_fields(target)):
         for m in np.flatnonzero(log_share[:, h] > log(LEAST_SHARE)):
             regressors = np.stack([*fixed, *(one[m] for one in templates)])
             log_density = _without_each(precision, regressors, window.cells.value)
@@ -66,7 +63,7 @@ def fitted_values(target: CollapsedTarget, theta: FloatArray) -> tuple[FloatArra
     likeliest = int(np.argmax(target.by_field(at)[0]))
     templates = [window.of_cells(one)[0] for one in target.scene.templates(at, window)]
     regressors = np.stack([*_fixed_columns(target), *templates])
-    precision = next(islice(_fields(target), likeliest, None))()
+    precision = next(islice(_fields(target), likeliest, None))
     middle = window.cells.value.mean()
     across = precision.times(regressors)
     solved = np.linalg.solve(across @ regressors.T, across @ (window.cells.value - middle))
@@ -75,8 +72,8 @@ def fitted_values(target: CollapsedTarget, theta: FloatArray) -> tuple[FloatArra
     return fit, left - precision.times(left[None])[0] * window.variance
 
 
-def _fields(target: CollapsedTarget) -> Iterator[Callable[[], _Precision]]:
-    """Makers of the precision of each field and share, in the order of `CollapsedTarget.by_field`."""
+def _fields(target: CollapsedTarget) -> Iterator[_Precision]:
+    """The precision of each field and share, in the order of `CollapsedTarget.by_field`."""
     window = target.window
     # a row for each cell: its products with the cosines, over its independent variance
     unit = window.on_grid(np.eye(len(window.cells)))
@@ -84,7 +81,7 @@ def _fields(target: CollapsedTarget) -> Iterator[Callable[[], _Precision]]:
     for columns in target.fields:
         low = cosines @ columns.field.turn
         for index in range(len(columns.shares)):
-            yield partial(_Precision, 1.0 / window.variance, low, columns, index)
+            yield _Precision(1.0 / window.variance, low, columns.weight[:, index])
 
 
 def _fixed_columns(target: CollapsedTarget) -> FloatArray:
@@ -97,9 +94,9 @@ def _fixed_columns(target: CollapsedTarget) -> FloatArray:
 class _Precision:
     """Inverse covariance of the cells under one field and share, up to the noise scale."""
 
-    def __init__(self, weight: FloatArray, low: FloatArray, columns: FieldColumns, index: int) -> None:
-        self._weight, self._low, self._taken = weight, low, columns.weight[:, index]
-        self.diagonal = weight - np.square(low) @ self._taken
+    def __init__(self, weight: FloatArray, low: FloatArray, taken: FloatArray) -> None:
+        self._weight, self._low, self._taken = weight, low, taken
+        self.diagonal = weight - np.square(low) @ taken
 
     def times(self, rows: FloatArray) -> FloatArray:
         """(v, n) products with (v, n) vectors."""
@@ -164,23 +161,14 @@ def choose_shape(problem: Problem, start: FloatArray, *, scene: SceneAsked = "au
     where the evidence does not support it costs coverage and gains little (docs/decisions/0055). Their odds are
     reported all the same.
     """
-    wanted = Scene(_shape_asked(scene))
+    shape: Shape = "round" if scene == "round" else "rotated" if scene == "rotated" else "ellipse"
+    wanted = Scene(shape)
     chosen = fit_scene(problem, wanted, Scene("rotated").carried(start, wanted))
     questions = [_ellipse_question(chosen)] if wanted.shape == "ellipse" else []
     if scene in ASKING:
         chosen, turned = _rotation_question(problem, chosen, start)
         questions.append(turned)
     return SceneChoice(chosen, chosen, _supported_shape(chosen, questions), (*questions, _tilt_question(chosen)))
-
-
-def _shape_asked(scene: SceneAsked) -> Shape:
-    """Shape of the bump in the first fit for a scene."""
-    match scene:
-        case "round" | "rotated":
-            return scene
-        case "auto" | "none" | "ellipse" | "second-lump" | "rib":
-            return "ellipse"
-    assert_never(scene)
 
 
 def retested(choice: SceneChoice, fit: FieldFit) -> SceneChoice:
@@ -374,13 +362,10 @@ def _regression(fit: FieldFit) -> tuple[FloatArray, float, float]:
     amplitude = fit.target.amplitude_at(fit.mode)
     squares = max(float(left[1, 1] - exponent * left[0, 1]), FLOOR * float(products[-1, -1]))
     variance = squares / dof / float(left[0, 0]) / amplitude**2
-    return np.asarray(shared[:, :, 0]), exponent / amplitude, _log_odds(exponent / amplitude, variance)
-
-
-def _log_odds(exponent: float, variance: float) -> float:
-    """Log Bayes factor against 0 (Savage-Dickey) for a normal likelihood and the normal prior."""
-    prior = EXPONENT_SD**2
-    return float(0.5 * (exponent**2 / variance * prior / (prior + variance) - np.log1p(prior / variance)))
+    exponent, prior = exponent / amplitude, EXPONENT_SD**2
+    # Savage-Dickey, for a normal likelihood and the normal prior
+    log_odds = 0.5 * (exponent**2 / variance * prior / (prior + variance) - np.log1p(prior / variance))
+    return np.asarray(shared[:, :, 0]), exponent, float(log_odds)
 
 
 def _raw_column(fit: FieldFit) -> FloatArray:

@@ -439,6 +439,7 @@ class White(Record, eq=False):
             angle_rad=angle,
             background=fit.bump.level(theta),
             noise_sd=target.draw_noise_sd(excess, rng).reshape(theta.shape[:2]),
+            labels=draws.replicates,
         )
         figures = {"noise_inflation": fit.errors.inflation, "noise_dof": fit.errors.dof}
         offset = level_offset(fit.fit.residual, weight=fit.weight)

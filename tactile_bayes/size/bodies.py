@@ -47,7 +47,6 @@ from tactile_bayes.size.terms import (
     monomials,
     outside_domain,
     powers,
-    unknown_fat,
     unlike_bodies,
     within_reach,
 )
@@ -309,7 +308,11 @@ class BodyCalibration(BodyLaw, eq=False, kw_only=True):
 
     def omissions(self) -> list[str]:
         """Sources of error that a size does not contain, in words."""
-        notes = [unknown_fat(self.fat_note, other_sd=self.other_sd)] if self.fat_note else []
+        notes = []
+        if self.fat_note:
+            text = f"the depth of the fat, which would narrow the size: {self.fat_note}"
+            wider = f"; for such a body the interval allows {100 * self.other_sd:.0f} % (SD) more"
+            notes.append(text + (wider if self.other_sd else ""))
         return [*notes, unlike_bodies(self.bodies)] if self.bodies else notes
 
     def _at_any_depth(self, why: str) -> BodyCalibration:

@@ -32,8 +32,9 @@ class BumpDraws(Record, eq=False):
     labels: Labels | None = None
     """(n,) labels of the draws' independent replicates, as `ParameterDraws.labels`."""
     oblique: tuple[float, float] | None = None
-    """Mean and SD of r where the draws have none, as `MapPosterior`'s."""
-    irregular: bool = False  #: The map is that of an irregular lump.
+    """Mean and SD of r, the half log axis ratio 45 degrees from the map's x axis, where the draws have none and it was
+    measured beside them; None otherwise."""
+    irregular: bool = False  #: True where the bump is less regular than a ball's, see `correlated.outline`.
 
     def flat(self) -> BumpDraws:
         """The same draws in one row."""

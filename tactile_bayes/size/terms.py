@@ -237,10 +237,10 @@ class SiteShift(Record, eq=False):
         v, c = log_width - self.centre, self.covariance
         return np.asarray(c[0, 0] + 2.0 * v * c[0, 1] + v**2 * c[1, 1])
 
-    def percent(self, log_width: float, *, probability: float = INTERVAL) -> tuple[float, float, float]:
-        """Median of the shift at p in percent of d, and the ends of its equal-tailed interval."""
+    def percent(self, log_width: float) -> tuple[float, float, float]:
+        """Median of the shift at p in percent of d, and the ends of its equal-tailed interval of `INTERVAL`."""
         p = np.array(log_width)
-        z = float(normal_quantile(np.array(0.5 + probability / 2)))
+        z = float(normal_quantile(np.array(0.5 + INTERVAL / 2)))
         middle, half = float(self.log_shift(p)), float(np.sqrt(self.variance(p))) * z
         low, high = (float(100 * np.expm1(end)) for end in (middle - half, middle + half))
         return float(100 * np.expm1(middle)), low, high
@@ -291,12 +291,6 @@ def extrapolated(far: Sequence[str]) -> Abstention:
 def unknown_head(calibration_head: object) -> str:
     """An unknown head as a source of error left out, where the calibration names its own."""
     return f"whether the map's head is the calibration's ({calibration_head}): the map does not name its head"
-
-
-def unknown_fat(why: str, *, other_sd: float = 0.0) -> str:
-    """The depth of fat as a source left out, and the SD of ln d that is allowed because the body is unlike others."""
-    left_out = f"the depth of the fat, which would narrow the size: {why}"
-    return f"{left_out}; for such a body the interval allows {100 * other_sd:.0f} % (SD) more" if other_sd else left_out
 
 
 def unlike_bodies(ranges: Mapping[str, tuple[float, float]]) -> str:

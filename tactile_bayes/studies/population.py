@@ -330,7 +330,7 @@ def _measured(tactile_map: TactileMap) -> dict[str, Any]:
     found = estimate_map(tactile_map, calibration=None, options=measuring_options(), rng=rng)
     if found.status != "estimate" or found.map_posterior is None:
         return {}
-    draws = ShapeDraws.of(found.map_posterior.bump())
+    draws = ShapeDraws.of(found.map_posterior)
     shape = np.stack([draws.log_amplitude, draws.log_width, draws.q])
     shape = shape[:, np.isfinite(shape).all(axis=0)]
     mean, covariance = shape.mean(axis=1), np.cov(shape)

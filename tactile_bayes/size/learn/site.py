@@ -61,6 +61,9 @@ class SitePrior(Record):
         return np.array([self.shift_sd, self.slope_sd])
 
 
+PRIOR: Final = SitePrior()
+
+
 class PhantomMap(Record, eq=False):
     """One map of a phantom: draws, or a single point; maps of one phantom share its name and diameter."""
 
@@ -98,7 +101,7 @@ class ShiftPosterior(Record, eq=False):
     spread_square: float
 
 
-def shift_posterior(data: Residuals, prior: SitePrior) -> ShiftPosterior:
+def shift_posterior(data: Residuals, prior: SitePrior = PRIOR) -> ShiftPosterior:
     """Posterior of a site's shift given what the calibration leaves of its phantoms."""
     x, y, precision = data.design, data.residual, np.diag(1.0 / np.append(prior.sd, 1.0) ** 2)
     weight = 1.0 / (_GRID[:, None] ** 2 * data.spread_variance + data.map_variance)
@@ -122,7 +125,6 @@ def correct_calibration(
     maps: Sequence[PhantomMap],
     *,
     base: str,
-    prior: SitePrior | None = None,
     left_out: Sequence[str] = (),
 ) -> BodyCalibration:
     """The calibration, called `base` in reports, with a site's correction.
@@ -131,7 +133,6 @@ def correct_calibration(
     says in words which take no part for reasons found before. A calibration that is corrected already is a
     `BadDataError`.
     """
-    prior = prior or SitePrior()
     if calibration.site is not None:
         raise BadDataError(f"{base} is corrected already", way_out="give the calibration that it corrects")
     groups: dict[str, list[PhantomMap]] = {}
@@ -151,7 +152,8 @@ def correct_calibration(
             way_out=f"a correction needs at least {LEAST_PHANTOMS} distinct phantoms; 5 to 20 are better",
         )
     data = Residuals(*np.array([row.left for _, row in rows]).T)
-    posterior = shift_posterior(data, prior)
+    posterior = shift_posterior(data)
+    left = data.residual - data.design[:, :2] @ posterior.mean[:2]
     site = SiteShift(
         centre=calibration.centre.log_width,
         mean=posterior.mean[:2],
@@ -160,10 +162,15 @@ def correct_calibration(
         maps=sum(row.maps for _, row in rows),
         base=base,
         uses_fat=2 * sum(row.uses_fat for _, row in rows) > len(rows),
-        fit=_figures(data, posterior, calibration.centre.log_width),
+        fit={
+            "log_width": float(data.width.mean() + calibration.centre.log_width),
+            "spread_factor": posterior.spread,
+            "sd_before": float(np.sqrt(np.mean(data.residual**2))),
+            "sd_after": float(np.sqrt(np.mean(left**2))),
+        },
         cautions=(
             *no_depth(calibration, [groups[name][0].known for name, _ in rows]),
-            *cautions_of([name for name, _ in rows], data, posterior, prior),
+            *cautions_of([name for name, _ in rows], data, posterior),
         ),
         left_out=tuple(out),
     )
@@ -225,26 +232,16 @@ def _known(
     return explained_sd * float(hidden.expected_body(stated, features)), own, common
 
 
-def _figures(data: Residuals, posterior: ShiftPosterior, centre: float) -> dict[str, float]:
-    left = data.residual - data.design[:, :2] @ posterior.mean[:2]
-    return {
-        "log_width": float(data.width.mean() + centre),
-        "spread_factor": posterior.spread,
-        "sd_before": float(np.sqrt(np.mean(data.residual**2))),
-        "sd_after": float(np.sqrt(np.mean(left**2))),
-    }
-
-
-def cautions_of(names: Sequence[str], data: Residuals, posterior: ShiftPosterior, prior: SitePrior) -> tuple[str, ...]:
+def cautions_of(names: Sequence[str], data: Residuals, posterior: ShiftPosterior) -> tuple[str, ...]:
     """Oddities of a correction by the phantoms of these names, in words."""
     lines = []
-    for value, sd, what in zip(posterior.mean[:2], prior.sd, ("shift", "slope with ln sigma"), strict=True):
+    for value, sd, what in zip(posterior.mean[:2], PRIOR.sd, ("shift", "slope with ln sigma"), strict=True):
         if abs(value) > FAR * sd:
             lines.append(
                 f"the {what} of {value:+.2f} in ln d is {abs(value) / sd:.1f} times what sites are expected to differ "
                 "by: check the sizes' unit, the recipe of the maps and the head"
             )
-    if data.width.std() < ALIKE and np.sqrt(posterior.covariance[1, 1]) > SLOPE_OPEN * prior.slope_sd:
+    if data.width.std() < ALIKE and np.sqrt(posterior.covariance[1, 1]) > SLOPE_OPEN * PRIOR.slope_sd:
         lines.append(
             "the phantoms' maps are too alike in width to tell whether the shift changes with it: "
             "add smaller and larger phantoms"
@@ -254,7 +251,13 @@ def cautions_of(names: Sequence[str], data: Residuals, posterior: ShiftPosterior
             f"the phantoms scatter {posterior.spread:.1f} times as much as the calibration expects: "
             "check their sizes, depths, seats and stiffness"
         )
-    return (*lines, *_apart(names, data, prior))
+    for i, name in enumerate(names):  # those that lie far from what the others predict
+        others, x = shift_posterior(data.without(i)), data.design[i]
+        variance = x @ others.covariance @ x + others.spread_square * data.spread_variance[i] + data.map_variance[i]
+        score = float((data.residual[i] - x @ others.mean) / np.sqrt(variance))
+        if abs(score) > APART:
+            lines.append(f"{name} lies {abs(score):.1f} SDs from what the other phantoms predict: look at its map")
+    return tuple(lines)
 
 
 def no_depth(calibration: BodyCalibration, known: Sequence[Mapping[str, float]]) -> tuple[str, ...]:
@@ -267,19 +270,6 @@ def no_depth(calibration: BodyCalibration, known: Sequence[Mapping[str, float]])
         f"{without} of {len(known)} phantoms have no depth_ratio: where they lie deeper or shallower than lumps of the "
         "calibration, this passes for the site's; state depth_ratio, seat and stiffness_ratio",
     )
-
-
-def _apart(names: Sequence[str], data: Residuals, prior: SitePrior) -> list[str]:
-    """Phantoms that lie far from what the others predict."""
-    lines = []
-    for i, name in enumerate(names):
-        others = shift_posterior(data.without(i), prior)
-        x = data.design[i]
-        variance = x @ others.covariance @ x + others.spread_square * data.spread_variance[i] + data.map_variance[i]
-        score = float((data.residual[i] - x @ others.mean) / np.sqrt(variance))
-        if abs(score) > APART:
-            lines.append(f"{name} lies {abs(score):.1f} SDs from what the other phantoms predict: look at its map")
-    return lines
 
 
 FEWEST_MASSES: Final = 3
