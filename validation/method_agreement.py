@@ -25,8 +25,8 @@ from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import MapRecipe, TactileMap
 from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior.draw import Sampled, SamplerSettings, importance_draws
+from tactile_bayes.posterior.estimate import search
 from tactile_bayes.posterior.fit import FieldFit, fit_scene
-from tactile_bayes.posterior.search import search
 from tactile_bayes.studies.population import ExamPrior, draw_exam
 from tactile_bayes.studies.sbc import draw_field
 from validation.common import parser

@@ -31,8 +31,8 @@ from tactile_bayes.geometry import FloatArray, apply
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior import lump_probability as model
 from tactile_bayes.posterior.draw import DETECTED
+from tactile_bayes.posterior.estimate import search
 from tactile_bayes.posterior.result import Estimate
-from tactile_bayes.posterior.search import search
 from tactile_bayes.studies.population import BodyPrior, ExamPrior, draw_body, draw_exam
 from validation.common import Row, add_row, map_of, parser, pickled, place_on_map, rows_in
 

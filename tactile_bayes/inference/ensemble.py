@@ -163,7 +163,8 @@ def ensemble(
             for sampler in samplers:
                 sampler.advance(options.block)
             if store is not None:
-                store.save(key, _state(samplers))
+                kept_now = zip(*(one.kept() for one in samplers), strict=True)
+                store.save(key, ChainState(*map(np.stack, kept_now)))
         chains = np.stack([sampler.chain() for sampler in samplers])
         figures = chain_diagnostics(chains)
         least = min(figures["ess_bulk"], figures["ess_tail"])
@@ -262,10 +263,6 @@ class _Ensemble:
         self._state = self._emcee_state(
             self._chain[-1].copy(), log_prob=state.log_density[index].copy(), random_state=random_state
         )
-
-
-def _state(samplers: list[_Ensemble]) -> ChainState:
-    return ChainState(*(np.stack(values) for values in zip(*(one.kept() for one in samplers), strict=True)))
 
 
 def _finite_start(

@@ -196,7 +196,11 @@ def mode_and_covariance(
     `NotConvergedError` when no mode is found or the curvature there is not that of a maximum.
     """
     mode, taken = find_mode(log_density, start, scale=scale, tolerance=tolerance)
-    return mode, _covariance(log_density, mode, scale=scale), taken
+    _, hessian = _slopes(log_density, mode, step=5e-2 * scale)
+    values, vectors = np.linalg.eigh(-hessian * np.outer(scale, scale))
+    if not values[0] > 1e-9 * values[-1]:
+        raise NotConvergedError("the posterior has no maximum in every direction; try --method ensemble")
+    return mode, np.asarray((vectors / values) @ vectors.T * np.outer(scale, scale)), taken
 
 
 def find_mode(
@@ -242,11 +246,3 @@ def _newton_step(gradient: FloatArray, curvature: FloatArray, damping: float) ->
     values, vectors = np.linalg.eigh(curvature)
     safe = np.maximum(np.abs(values), 1e-3) + damping * max(1.0, float(np.abs(values).max()))
     return np.asarray(np.clip(vectors @ ((vectors.T @ gradient) / safe), -2.0, 2.0))
-
-
-def _covariance(log_density: LogDensity, theta: FloatArray, *, scale: FloatArray) -> FloatArray:
-    _, hessian = _slopes(log_density, theta, step=5e-2 * scale)
-    values, vectors = np.linalg.eigh(-hessian * np.outer(scale, scale))
-    if not values[0] > 1e-9 * values[-1]:
-        raise NotConvergedError("the posterior has no maximum in every direction; try --method ensemble")
-    return np.asarray((vectors / values) @ vectors.T * np.outer(scale, scale))

@@ -227,7 +227,7 @@ def undetected(weighed: Weighed, *, where: str) -> Abstention:
 
 def shape_fault(sigma_x: FloatArray, sigma_y: FloatArray, *, cell_mm: float, prior: BumpPrior) -> Abstention | None:
     """Reason against a size from draws of the widths: below the cells, a ridge, or as wide as the prior; else None."""
-    fault = _width_fault(float(np.median(sigma_x)), float(np.median(sigma_y)), cell_mm=cell_mm, margin=1.0)
+    fault = width_fault(float(np.median(sigma_x)), float(np.median(sigma_y)), cell_mm=cell_mm, margin=1.0)
     if fault is not None:
         return fault
     sd = max(float(np.std(np.log(sigma_x))), float(np.std(np.log(sigma_y))))
@@ -241,13 +241,11 @@ def shape_fault(sigma_x: FloatArray, sigma_y: FloatArray, *, cell_mm: float, pri
     return None
 
 
-def hopeless_shape(sigma_x_mm: float, sigma_y_mm: float, *, cell_mm: float) -> Abstention | None:
-    """Reason against a size from the widths at the mode, if far beyond the limits, so that no draws are needed."""
-    return _width_fault(sigma_x_mm, sigma_y_mm, cell_mm=cell_mm, margin=HOPELESS)
+def width_fault(x: float, y: float, *, cell_mm: float, margin: float) -> Abstention | None:
+    """Reason for widths beyond the cells' or a ridge's limit by a factor of `margin`; else None.
 
-
-def _width_fault(x: float, y: float, *, cell_mm: float, margin: float) -> Abstention | None:
-    """Reason for widths below the cells' or a ridge's limit by a factor of `margin`; else None."""
+    At the mode `HOPELESS` times the limit is enough: then no draws are needed.
+    """
     wide, narrow = max(x, y), min(x, y)
     if narrow * margin < LEAST_WIDTH_IN_CELLS * cell_mm:
         reason = f"narrower than a cell (sigma {narrow:.2g} mm on {cell_mm:g} mm cells): not resolved"

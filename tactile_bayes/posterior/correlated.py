@@ -20,7 +20,6 @@ from tactile_bayes.posterior.draw import (
     NoiseFigures,
     SamplerSettings,
     draw_parameters,
-    scene_asked,
 )
 from tactile_bayes.posterior.field import FLOOR, Window, cosines_for
 from tactile_bayes.posterior.fit import FieldFit, tangent_columns
@@ -177,7 +176,7 @@ class Correlated(Record, eq=False):
         x, y = (float(scene.plain.scene.column(scene.plain.mode[None], name)[0]) for name in "xy")
         fault = rim_fault(tactile_map, (x, y), scene.plain.widths_mm, radius_mm=options.fit_radius_mm)
         if not fault and detection.probability >= DETECTED:
-            scene, detection = with_neighbours(scene, detection, tactile_map, asked=scene_asked(options))
+            scene, detection = with_neighbours(scene, detection, tactile_map, asked=options.scene_asked)
         return cls(tactile_map, fit, detection, scene, fault)
 
     def bump(self) -> ModalBump:
@@ -200,7 +199,7 @@ class Correlated(Record, eq=False):
 
     def draw(self, options: SamplerSettings, *, rng: np.random.Generator, progress: Progress | None) -> MapDraws:
         """Draw from the posterior; `NotConvergedError` also when the scene's neighbour was not found."""
-        choice, asked = self._scene, scene_asked(options)
+        choice, asked = self._scene, options.scene_asked
         wanted = WANTED.get(asked, "")
         if wanted and choice.fit.scene.extra != wanted:
             raise NotConvergedError(f"no {wanted} found beside the bump; leave out --scene {asked}")
@@ -236,7 +235,7 @@ def fit_and_test(tactile_map: TactileMap, fit: BumpFit, options: SamplerSettings
     def under(number: int, start: FloatArray) -> tuple[SceneChoice, Detection]:
         window = Window(fit.cells, independent_variance(fit.cells), cosines=number)
         problem = Problem(window, options.prior, options.fit_radius_mm, fit.bump.scale)
-        choice = choose_shape(problem, start, scene=scene_asked(options))
+        choice = choose_shape(problem, start, scene=options.scene_asked)
         return choice, field_detection(choice.plain, tactile_map, choice.plain.log_evidence)
 
     p, q, r = (float(one) for one in fit.bump.shape_parameters(fit.theta))

@@ -44,6 +44,12 @@ class SamplerSettings(FitSettings, kw_only=True):
     step_up: bool = True
     """Under a noise field: whether the next method is tried where the one asked for fails."""
 
+    @property
+    def scene_asked(self) -> SceneAsked:
+        """The requested scene; where none is named, the rotation option decides."""
+        by_rotation: dict[Rotation, SceneAsked] = {"on": "rotated", "off": "ellipse", "auto": "auto"}
+        return by_rotation[self.rotation] if self.scene == "auto" else self.scene
+
 
 def check_options(options: SamplerSettings) -> None:
     """Refuse options that contradict each other or do not exist."""
@@ -63,13 +69,6 @@ def check_options(options: SamplerSettings) -> None:
         )
     if options.background != "free":
         raise UsageError('noise = "field" needs a free background; give background = "free" in --settings FILE.toml')
-
-
-def scene_asked(options: SamplerSettings) -> SceneAsked:
-    """The requested scene; where none is named, the rotation option decides."""
-    by_rotation: dict[Rotation, SceneAsked] = {"on": "rotated", "off": "ellipse", "auto": "auto"}
-    turned = by_rotation[options.rotation]
-    return turned if options.scene == "auto" else options.scene
 
 
 # --- Joint posterior draws, the result of every method and noise model.

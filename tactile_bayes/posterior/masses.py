@@ -20,10 +20,10 @@ from tactile_bayes.posterior.bump import (
 )
 from tactile_bayes.posterior.detection import Detection
 from tactile_bayes.posterior.draw import MapPosterior, ModalBump, SamplerSettings
+from tactile_bayes.posterior.estimate import best_chance, search
 from tactile_bayes.posterior.lump_probability import LIKELY, weigh
 from tactile_bayes.posterior.neighbours import LEAST_RISE
 from tactile_bayes.posterior.result import Estimate, Mass, Rise
-from tactile_bayes.posterior.search import best_chance, search
 from tactile_bayes.posterior.white import AT_RIM, Candidate
 
 # --- Other lumps on the map: their places and probabilities.

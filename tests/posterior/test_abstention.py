@@ -11,7 +11,7 @@ from tactile_bayes.declarations import replace
 from tactile_bayes.errors import CODES, NO_LUMP, NotConvergedError, UsageError
 from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior import draw as methods
-from tactile_bayes.posterior import estimate, search
+from tactile_bayes.posterior import estimate
 from tactile_bayes.posterior.abstention import extend_advice, missing_strokes, no_bump, shape_fault
 from tactile_bayes.posterior.detection import Detection
 from tactile_bayes.posterior.draw import SamplerSettings
@@ -207,7 +207,7 @@ def test_a_shape_far_beyond_the_limits_at_its_mode_costs_no_draws(
     """A stripe of readings took 30 s of chains; a shape only just beyond a limit is still drawn, and judged by that."""
     tactile_map = bump_map(noise=WHITE, cell_mm=cell_mm)
     options = replace(FIELD, method="laplace")
-    candidates, seen = search.search(tactile_map, options)
+    candidates, seen = estimate.search(tactile_map, options)
     assert seen is not None
 
     class Odd:

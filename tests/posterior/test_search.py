@@ -9,7 +9,7 @@ from scipy.ndimage import gaussian_filter
 
 from tactile_bayes.declarations import replace
 from tactile_bayes.mapping.map import TactileMap
-from tactile_bayes.posterior import search
+from tactile_bayes.posterior import estimate
 from tactile_bayes.posterior.bump import levelled
 from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map
@@ -56,13 +56,13 @@ def test_a_lower_lump_is_found_behind_a_rise_at_the_edge():
 def test_no_place_is_weighed_twice_for_an_empty_map(monkeypatch: pytest.MonkeyPatch) -> None:
     """Hills 6 mm wide that are no lump: seven weighings, two of them repeated, before a place kept its own."""
     hills = gaussian_filter(np.random.default_rng(5).standard_normal((81, 81)), 6.0, mode="wrap")
-    weigh, places = search.assess, []
+    weigh, places = estimate.assess, []
 
     def counted(tactile_map: TactileMap, fit: BumpFit, options: SamplerSettings) -> object:
         places.append(tuple(fit.theta[1:3]))
         return weigh(tactile_map, fit, options)
 
-    monkeypatch.setattr(search, "assess", counted)
+    monkeypatch.setattr(estimate, "assess", counted)
     found = look(grid_map(1.0 + 0.05 * hills / hills.std() + noise(104)))
     assert found.status == "no_estimate"
     assert len(places) == len(set(places)) == 4
@@ -93,7 +93,7 @@ def test_a_lump_beside_a_rib_is_found_from_close_by(monkeypatch: pytest.MonkeyPa
         assert np.log(np.median(width) / 5.0) == pytest.approx(0.0, abs=3 * np.std(np.log(width)))
     assert look(beside_a_rib(0.0), rotation="auto").status == "no_estimate"
     # the control: from afar least squares grows over both
-    monkeypatch.setattr(search, "_close_search", lambda *_: None)
+    monkeypatch.setattr(estimate, "_close_search", lambda *_: None)
     assert look(beside_a_rib(0.3), rotation="auto").status == "no_estimate"
 
 

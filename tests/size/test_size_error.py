@@ -18,7 +18,7 @@ from tactile_bayes.declarations import replace
 from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.inference.draws import ParameterDraws, Quantity, even_replicates, summarise
 from tactile_bayes.inference.points import normal_cdf, paired_points, stratified_quantiles
-from tactile_bayes.posterior import search as drawn
+from tactile_bayes.posterior import estimate as drawn
 from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.white import MapDraws
 from tactile_bayes.size.draws import BumpDraws, ShapeDraws

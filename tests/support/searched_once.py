@@ -13,9 +13,10 @@ from typing import Any
 import pytest
 
 from tactile_bayes.api import estimating, sized
-from tactile_bayes.posterior import estimate, lump_probability, masses, result, search
+from tactile_bayes.posterior import estimate, lump_probability, masses, result
 
 KEPT = 64
+_searched = estimate.search
 _made: dict[bytes, Any] = {}
 
 
@@ -31,7 +32,7 @@ def _once(function: Callable[..., Any], *asked: Any, key: Any = None, **named: A
 
 
 def _search(*asked: Any) -> Any:
-    return _once(search.search, *asked)
+    return _once(_searched, *asked)
 
 
 def _smallest_lumps(*asked: Any, **named: Any) -> Any:

@@ -7,9 +7,9 @@ from posterior_maps import bump_map, correlated_field
 from scipy.stats import t
 
 from tactile_bayes.posterior.draw import SamplerSettings
+from tactile_bayes.posterior.estimate import search
 from tactile_bayes.posterior.fit import FieldFit
 from tactile_bayes.posterior.marginal import CollapsedTarget, linear_columns
-from tactile_bayes.posterior.search import search
 from tactile_bayes.posterior.selection import pointwise_log_likelihood
 
 
