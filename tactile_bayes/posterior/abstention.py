@@ -97,7 +97,7 @@ def no_bump(
 ) -> Abstention:
     """Reason when no candidate can be measured: no lump, or one that the map covers too poorly.
 
-    `likeliest` is the candidate that is most likely a lump all the same, see `search.best_chance`.
+    `likeliest` is the candidate that is most likely a lump all the same, see `estimate.best_chance`.
     """
     candidate = None if likeliest is None else likeliest.candidate
     if candidate is not None and likeliest is not None and likeliest.probability >= LIKELY:
