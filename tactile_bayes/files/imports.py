@@ -16,12 +16,11 @@ from tactile_bayes.declarations import Record, names_of, replace
 from tactile_bayes.errors import BadDataError, in_file, meant
 from tactile_bayes.files.array_map import plain_names
 from tactile_bayes.files.arrays_layout import KNOWN, LAYOUT, OPTIONAL, ArrayMap, Shape, Stated, in_words
-from tactile_bayes.files.frames_text import read_frames
 from tactile_bayes.files.instrument_json import read_array_calibration, read_head_geometry, read_landmarks
 from tactile_bayes.files.named_arrays import Source, is_text, read_named
 from tactile_bayes.files.npz import Arrays
-from tactile_bayes.files.poses_text import read_poses
 from tactile_bayes.files.scan_mcap import read_scan
+from tactile_bayes.files.scan_text import read_frames, read_poses
 from tactile_bayes.files.sequence_mha import is_sequence, read_sequence
 from tactile_bayes.geometry import FloatArray, check_rigid
 from tactile_bayes.mapping.select import other_units

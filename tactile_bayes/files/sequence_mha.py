@@ -19,8 +19,8 @@ from tactile_bayes.errors import BadDataError, in_file
 from tactile_bayes.files.arrays_layout import Stated
 from tactile_bayes.files.named_arrays import Source
 from tactile_bayes.files.npz import Arrays
-from tactile_bayes.files.poses_text import chosen, seen
 from tactile_bayes.files.reading import NETCDF_BYTES, check_limit, decoding, read_bytes, unpacked_limit
+from tactile_bayes.files.scan_text import chosen, seen
 from tactile_bayes.geometry import FloatArray
 
 _LAST_KEY: Final = re.compile(rb"^ElementDataFile *= *(.*?)\r?\n", re.MULTILINE)
@@ -45,7 +45,7 @@ def is_sequence(path: Path) -> bool:
 
 
 def read_sequence(path: Path, given: Stated, *, frames: bool) -> Source:
-    """Read the poses, and with `frames` the images and their times; see `files.poses_text.read_poses`."""
+    """Read the poses, and with `frames` the images and their times; see `files.scan_text.read_poses`."""
     data = read_bytes(path, most=NETCDF_BYTES)
     with in_file(path):
         last = _LAST_KEY.search(data)
