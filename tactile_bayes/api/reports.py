@@ -16,8 +16,7 @@ from tactile_bayes.api.settings import Settings, refuse_checkpoint
 from tactile_bayes.api.sized import SizeEstimate
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError, UsageError, check_choice
-from tactile_bayes.exports.exam import EstimateFile, MapFile, estimate_of, read_exam, shared_facts
-from tactile_bayes.exports.identity import identity_of
+from tactile_bayes.exports.exam import EstimateFile, MapFile, estimate_of, identity_of, read_exam, shared_facts
 from tactile_bayes.exports.run import FORMATS, Outputs, refuse_untaken
 from tactile_bayes.exports.run import ExportFormat as Format
 from tactile_bayes.exports.run import export as exported_files

@@ -10,8 +10,16 @@ import numpy as np
 from tactile_bayes import __version__
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.exports import exam as codes
-from tactile_bayes.exports.exam import Code, EstimateFile, MapFile, SizedMass, content_uid, required, verdict_words
-from tactile_bayes.exports.identity import Identity
+from tactile_bayes.exports.exam import (
+    Code,
+    EstimateFile,
+    Identity,
+    MapFile,
+    SizedMass,
+    content_uid,
+    required,
+    verdict_words,
+)
 from tactile_bayes.exports.images import (
     MANUFACTURER,
     MODEL,

@@ -13,13 +13,13 @@ from tactile_bayes.exports.exam import (
     FHIR_SYSTEMS,
     Code,
     EstimateFile,
+    Identity,
     SizedMass,
     content_uuid,
     required,
     size_words,
     verdict_words,
 )
-from tactile_bayes.exports.identity import Identity
 from tactile_bayes.files.documents import dump_json
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.presets import RESEARCH_USE

@@ -22,11 +22,12 @@ from tactile_bayes.exports.exam import (
     RELATIVE_PRESSURE,
     Code,
     EstimateFile,
+    Identity,
     MapFile,
+    Moment,
     content_uid,
     required,
 )
-from tactile_bayes.exports.identity import Identity, Moment
 from tactile_bayes.files.reports import EstimateReport
 from tactile_bayes.findings import finding_lines
 from tactile_bayes.geometry import FloatArray, apply

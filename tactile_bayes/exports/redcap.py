@@ -7,8 +7,7 @@ from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 from tactile_bayes.errors import UsageError
-from tactile_bayes.exports.exam import EstimateFile, SizedMass, content_uuid
-from tactile_bayes.exports.identity import Identity
+from tactile_bayes.exports.exam import EstimateFile, Identity, SizedMass, content_uuid
 from tactile_bayes.files.tables import csv_text
 from tactile_bayes.presets import RESEARCH_USE
 

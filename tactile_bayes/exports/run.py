@@ -9,9 +9,8 @@ from typing import Any, Final, Literal, get_args
 from tactile_bayes.declarations import Record, names_of, replace
 from tactile_bayes.errors import UsageError
 from tactile_bayes.exports.dicom import VALUES, dicom_files
-from tactile_bayes.exports.exam import EstimateFile, MapFile, check_pairs
+from tactile_bayes.exports.exam import EstimateFile, Identity, MapFile, check_pairs
 from tactile_bayes.exports.fhir import bundle_json
-from tactile_bayes.exports.identity import Identity
 from tactile_bayes.exports.images import nrrd_bytes
 from tactile_bayes.exports.redcap import dictionary_csv, records_csv
 from tactile_bayes.files.atomic import Format, check_suffix, refuse_existing, same_file, unwritable, write_all

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from tactile_bayes.errors import BadDataError, UsageError
-from tactile_bayes.exports.identity import Identity, Moment, read_worklist
+from tactile_bayes.exports.exam import Identity, Moment, read_worklist
 
 
 @pytest.mark.parametrize(

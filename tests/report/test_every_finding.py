@@ -35,9 +35,8 @@ from tactile_bayes.api.sized import SizeEstimate
 from tactile_bayes.campaigns.match import growth_text
 from tactile_bayes.campaigns.tables import Row, done_text
 from tactile_bayes.declarations import replace
-from tactile_bayes.exports.exam import MapFile, estimate_of
+from tactile_bayes.exports.exam import Identity, MapFile, estimate_of
 from tactile_bayes.exports.fhir import bundle_of
-from tactile_bayes.exports.identity import Identity
 from tactile_bayes.exports.redcap import records_csv
 from tactile_bayes.files.manifest_csv import Exam as Listed
 from tactile_bayes.files.map_nc import read_map, write_map
