@@ -159,15 +159,10 @@ def _density(draws_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
     edges = np.linspace(max(low, 0.0) if draws.min() >= 0 else low, high + 4 * width, 401)
     middle = (edges[1:] + edges[:-1]) / 2
     weights = np.histogram(draws, edges)[0] / len(draws)
-    density = _smoothed(middle, middle, weights, width)
+    kernel = np.exp(-0.5 * (np.subtract.outer(middle, middle) / width) ** 2)
     if draws.min() >= 0:
-        density = density + _smoothed(-middle, middle, weights, width)
-    return middle, density
-
-
-def _smoothed(at_mm: FloatArray, middle_mm: FloatArray, weights: FloatArray, width_mm: float) -> FloatArray:
-    kernel = np.exp(-0.5 * ((at_mm[:, None] - middle_mm[None, :]) / width_mm) ** 2)
-    return np.asarray(kernel @ weights / (width_mm * np.sqrt(2 * np.pi)))
+        kernel += np.exp(-0.5 * (np.add.outer(middle, middle) / width) ** 2)
+    return middle, kernel @ weights / (width * np.sqrt(2 * np.pi))
 
 
 def _draw_density(axes: Axes, size: str, draws_mm: FloatArray, *, colour: str, dash: str, more: str) -> None:
