@@ -28,8 +28,7 @@ from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.presets import REGISTRATION_MM, RESEARCH_USE
 from tactile_bayes.report.compare import compare_report, compare_summary, compare_text
 from tactile_bayes.report.exam_words import Given
-from tactile_bayes.report.growth_figure import draw_comparison
-from tactile_bayes.report.growth_page import Course, DrawnMap, growth_page
+from tactile_bayes.report.growth_page import Course, DrawnMap, draw_comparison, growth_page
 from tactile_bayes.report.pages import PageFiles
 from tactile_bayes.report.pooled import disagreement, fat_apart
 from tactile_bayes.size.bodies import BodyCalibration

@@ -15,8 +15,8 @@ from tactile_bayes.files.map_nc import PosteriorDraws, read_posterior
 from tactile_bayes.findings import finding_lines
 from tactile_bayes.inference.ensemble import convergence
 from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.report.estimate_figures import corner_figure, rank_figure, trace_figure
 from tactile_bayes.report.figure_file import named_exam
-from tactile_bayes.report.posterior_figures import corner_figure, rank_figure, trace_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

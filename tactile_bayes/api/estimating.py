@@ -29,8 +29,14 @@ from tactile_bayes.posterior.white import default_errors
 from tactile_bayes.presets import FIT_RADIUS_MM
 from tactile_bayes.progress import Progress
 from tactile_bayes.report.calibration import calibration_line, site_words
-from tactile_bayes.report.estimate_document import patient_mm
-from tactile_bayes.report.quantities import SizedPlace, side_findings, side_of, touching_findings, touching_masses
+from tactile_bayes.report.estimate_document import (
+    SizedPlace,
+    patient_mm,
+    side_findings,
+    side_of,
+    touching_findings,
+    touching_masses,
+)
 from tactile_bayes.size.bodies import BodyCalibration, mean_width_mm
 from tactile_bayes.size.pooling import Calibration
 

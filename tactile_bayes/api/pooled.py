@@ -23,10 +23,10 @@ from tactile_bayes.findings import Finding
 from tactile_bayes.options import PRIORS
 from tactile_bayes.posterior.estimate import way_to_head
 from tactile_bayes.presets import MATCH_MM
+from tactile_bayes.report.estimate_document import side_of
 from tactile_bayes.report.estimate_figures import draw_size
 from tactile_bayes.report.exam_words import Exam
 from tactile_bayes.report.pooled import pooled_report
-from tactile_bayes.report.quantities import side_of
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.draws import SizePosterior
 from tactile_bayes.size.fat import LEAST_PROBABILITY

@@ -28,10 +28,10 @@ from tactile_bayes.files.provenance import scans_of
 from tactile_bayes.files.reading import HDF5_MAGIC, first_bytes
 from tactile_bayes.files.reports import EstimateReport
 from tactile_bayes.options import IdentityOptions
+from tactile_bayes.report.estimate_document import side_of
 from tactile_bayes.report.exam_page import exam_page
 from tactile_bayes.report.exam_words import Exam, Given, exam_map, headline
 from tactile_bayes.report.pages import PageFiles
-from tactile_bayes.report.quantities import side_of
 
 # --- The page of an exam from files: maps are estimated, an estimate is taken as it is, repeats are pooled.
 

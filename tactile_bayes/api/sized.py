@@ -24,13 +24,12 @@ from tactile_bayes.inference.ensemble import inference_data
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.result import DrawGroup, Estimate, Mass, inference_groups
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.report.estimate_document import estimate_report, patient_mm
+from tactile_bayes.report.estimate_document import estimate_report, leading_size, patient_mm, side_of
 from tactile_bayes.report.estimate_figures import draw_fit, draw_map, draw_size
 from tactile_bayes.report.estimate_text import estimate_summary, estimate_text, exams_label
 from tactile_bayes.report.exam_words import Exam, ExamMap, Given, exam_map
 from tactile_bayes.report.figure_file import named_exam
 from tactile_bayes.report.pages import PageFiles
-from tactile_bayes.report.quantities import leading_size, side_of
 from tactile_bayes.scans import HeadShape
 from tactile_bayes.size.draws import EXTREMES, SIZES, ShapeDraws, SizePosterior
 from tactile_bayes.size.fat import BetweenMaps, head_profile

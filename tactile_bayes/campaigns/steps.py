@@ -55,14 +55,12 @@ from tactile_bayes.findings import by_weight
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.options import MapOptions
-from tactile_bayes.report.estimate_document import size_diagnostics
+from tactile_bayes.report.estimate_document import side_of, size_diagnostics
 from tactile_bayes.report.estimate_figures import draw_map, draw_size
 from tactile_bayes.report.exam_page import exam_page
 from tactile_bayes.report.exam_words import Exam as ShownExam
 from tactile_bayes.report.exam_words import exam_map
-from tactile_bayes.report.growth_figure import draw_comparison
-from tactile_bayes.report.growth_page import Course, growth_page
-from tactile_bayes.report.quantities import side_of
+from tactile_bayes.report.growth_page import Course, draw_comparison, growth_page
 from tactile_bayes.report.svg import thumbnail_svg
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.draws import SIZES, SizePosterior

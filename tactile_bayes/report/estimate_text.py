@@ -16,9 +16,11 @@ from tactile_bayes.posterior.lump_probability import SHARE_WITH_LUMP
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.estimate_document import (
+    from_xiphoid,
     mass_lines,
     numbered,
     others,
+    place_line,
     prior_line,
     scene_line,
     scene_lines,
@@ -26,7 +28,6 @@ from tactile_bayes.report.estimate_document import (
     supposed_line,
     supposed_lines,
 )
-from tactile_bayes.report.quantities import from_xiphoid, place_line
 from tactile_bayes.size.draws import EXTREMES, SIZES
 
 # --- The smallest lump that a map without one would have shown, in a sentence.

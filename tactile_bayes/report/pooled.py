@@ -11,7 +11,7 @@ from tactile_bayes.findings import Finding, by_weight, capital, finding_lines, f
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.calibration import fat_text, site_words, unknowns_text
-from tactile_bayes.report.estimate_document import supposed_line, supposed_lines, suppositions
+from tactile_bayes.report.estimate_document import another_exam, supposed_line, supposed_lines, suppositions
 from tactile_bayes.report.estimate_text import (
     MORE,
     MOST_LINES,
@@ -25,7 +25,6 @@ from tactile_bayes.report.estimate_text import (
     table_row,
     width_lines,
 )
-from tactile_bayes.report.quantities import another_exam
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.draws import EXTREMES
 from tactile_bayes.size.fat import LEAST_PROBABILITY

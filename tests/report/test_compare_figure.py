@@ -22,8 +22,7 @@ from tactile_bayes.files.comparison import Visit
 from tactile_bayes.geometry import rigid
 from tactile_bayes.mapping.map import MapRecipe
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.report.growth_figure import draw_comparison
-from tactile_bayes.report.growth_page import Course, DrawnMap, growth_page
+from tactile_bayes.report.growth_page import Course, DrawnMap, draw_comparison, growth_page
 from tactile_bayes.size.visits import Compared
 
 PLACE = np.array([60.0, 90.0])

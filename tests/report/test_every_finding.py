@@ -51,7 +51,7 @@ from tactile_bayes.mapping.select import scan_findings
 from tactile_bayes.report.campaign_page import SIZED, ExamEntry, MassRow, VisitEntry, campaign_html
 from tactile_bayes.report.compare import Growth, compare_summary, compare_text, growths
 from tactile_bayes.report.exam_page import exam_page
-from tactile_bayes.report.growth_figure import draw_comparison
+from tactile_bayes.report.growth_page import draw_comparison
 from tactile_bayes.report.map_figure import map_figure
 from tactile_bayes.report.map_text import map_summary, map_text
 from tactile_bayes.report.pooled import pooled_summary, pooled_text
@@ -272,11 +272,11 @@ PRINTERS = {
     # behind the outputs above
     "api/comparing", "api/maps", "api/sized", "exports/dicom",
     "exports/fhir", "exports/images", "exports/redcap", "files/map_nc",
-    "report/campaign_page", "report/growth_figure", "report/growth_page", "report/compare", "report/estimate_document",
+    "report/campaign_page", "report/growth_page", "report/compare", "report/estimate_document",
     "report/estimate_figures", "report/estimate_text", "report/exam_page", "report/map_figure", "report/map_text",
     "report/pages", "report/pooled",
     # of draws, not of a size; names of files that were written
-    "report/posterior_figures", "actions/report", "actions/show", "actions/campaign",
+    "actions/report", "actions/show", "actions/campaign",
     # of trials, calibrations, devices and studies
     "api/trials", "actions/calibrate", "actions/devices", "api/diagnosing", "api/planning",
     "campaigns/campaign", "actions/bring_in", "actions/exam",

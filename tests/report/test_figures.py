@@ -16,9 +16,8 @@ from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.mapping.map import MapRecipe, TactileMap
 from tactile_bayes.report import estimate_figures as sizes
 from tactile_bayes.report import map_figure as maps
-from tactile_bayes.report.estimate_figures import size_figure
+from tactile_bayes.report.estimate_figures import corner_figure, size_figure
 from tactile_bayes.report.map_figure import FitContour, Place, map_figure
-from tactile_bayes.report.posterior_figures import corner_figure
 
 INTERVALS = {
     name: Quantity(median=low + 3.0, mean=low + 3.0, sd=1.5, low=low, high=low + 6.0, probability=0.95, kind="eti")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from tactile_bayes.report.quantities import side_findings
+from tactile_bayes.report.estimate_document import side_findings
 
 WORDS = (
     "the scan says left breast, and the landmarks put the lump 60 mm to the patient's right of the xiphoid: side or "

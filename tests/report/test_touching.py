@@ -6,8 +6,7 @@ import pytest
 
 from tactile_bayes.files.reports import Interval, MassReport, Place
 from tactile_bayes.inference.draws import Quantity
-from tactile_bayes.report.estimate_document import mass_words
-from tactile_bayes.report.quantities import touching_findings, touching_masses
+from tactile_bayes.report.estimate_document import mass_words, touching_findings, touching_masses
 
 
 def mass(number: int, x: float, size: float | None, *, half: float = 1.0) -> MassReport:
