@@ -40,8 +40,7 @@ def simulated_fit() -> Any:
     from tactile_bayes.posterior.bump import cell_mean_gaussian, window_cells
     from tactile_bayes.posterior.field import Window
     from tactile_bayes.posterior.fit import fit_scene
-    from tactile_bayes.posterior.marginal import independent_variance
-    from tactile_bayes.posterior.scene import Problem, Scene
+    from tactile_bayes.posterior.marginal import Problem, Scene, independent_variance
 
     rng = np.random.default_rng(1)
     axis = np.arange(-HALF_MM, HALF_MM + 1.0)

@@ -1,7 +1,7 @@
 """Probability of a lump: learned and judged on simulated exams with and without one.
 
     python -m validation lump_probability make DIR [--judge]     # 160 exams, or 146 others; 1.3 s of CPU each
-    python -m validation lump_probability learn DIR              # COEFFICIENTS of posterior/lump_probability.py
+    python -m validation lump_probability learn DIR              # COEFFICIENTS of posterior/verdict.py
     python -m validation lump_probability report DIR... [--figure reliability.png]
 
 A rise counts as a lump where its centre lies within 10 mm of the true lump's. `learn` fits a logistic regression with a

@@ -29,7 +29,7 @@ from tactile_bayes.forward.scene import Scene
 from tactile_bayes.forward.tissue import SolidLump
 from tactile_bayes.geometry import FloatArray, apply
 from tactile_bayes.mapping.map import TactileMap
-from tactile_bayes.posterior import lump_probability as model
+from tactile_bayes.posterior import verdict as model
 from tactile_bayes.posterior.draw import DETECTED
 from tactile_bayes.posterior.estimate import search
 from tactile_bayes.posterior.result import Estimate

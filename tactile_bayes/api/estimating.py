@@ -22,9 +22,9 @@ from tactile_bayes.mapping.map import TactileMap, many_cells
 from tactile_bayes.options import PRIORS, FitSettings
 from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.estimate import OTHER_HEAD, calibration_for, estimate_map, recipe_differences
-from tactile_bayes.posterior.lump_probability import smallest_lumps
 from tactile_bayes.posterior.masses import with_masses
 from tactile_bayes.posterior.result import Estimate
+from tactile_bayes.posterior.verdict import smallest_lumps
 from tactile_bayes.posterior.white import default_errors
 from tactile_bayes.presets import FIT_RADIUS_MM
 from tactile_bayes.progress import Progress

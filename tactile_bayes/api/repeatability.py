@@ -27,8 +27,7 @@ from tactile_bayes.files.size_json import (
     write_repeatability,
 )
 from tactile_bayes.files.tables import read_raw
-from tactile_bayes.inference.draws import Quantity
-from tactile_bayes.inference.points import normal_quantile
+from tactile_bayes.inference.draws import Quantity, normal_quantile
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.learn.site import FEWEST_MASSES, PRIOR_LOG_SD, PRIOR_MEDIAN, RepeatedExams, learn_repeatability
 from tactile_bayes.size.pooling import Repeatability, log_size_alone

@@ -22,9 +22,9 @@ from tactile_bayes.files.map_nc import read_map
 from tactile_bayes.files.reports import EstimateReport, Place
 from tactile_bayes.findings import Finding, finding_lines
 from tactile_bayes.mapping.map import TactileMap
-from tactile_bayes.posterior.abstention import no_verdict
 from tactile_bayes.posterior.bump import on_map
 from tactile_bayes.posterior.result import Estimate
+from tactile_bayes.posterior.verdict import no_verdict
 from tactile_bayes.report.compare import Growth, growths
 from tactile_bayes.trial.readings import day_of, in_order
 

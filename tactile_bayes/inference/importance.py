@@ -7,9 +7,15 @@ import numpy as np
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.geometry import FloatArray, IndexArray
-from tactile_bayes.inference.draws import REPLICATES, ParameterDraws, weighted_quantiles_of
+from tactile_bayes.inference.draws import (
+    BITS,
+    REPLICATES,
+    ParameterDraws,
+    normal_quantile,
+    shifted_sobol,
+    weighted_quantiles_of,
+)
 from tactile_bayes.inference.modes import LogDensity
-from tactile_bayes.inference.points import BITS, normal_quantile, shifted_sobol
 
 # --- Pareto-smoothed importance sampling (PSIS): smoothed weights, and the shape that shows if they can be trusted.
 

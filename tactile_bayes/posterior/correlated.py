@@ -7,10 +7,8 @@ import numpy as np
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.inference.draws import ParameterDraws, Solved
-from tactile_bayes.inference.points import MOST_PAIRED, normal_quantile, paired_points
+from tactile_bayes.inference.draws import MOST_PAIRED, ParameterDraws, Solved, normal_quantile, paired_points
 from tactile_bayes.mapping.map import TactileMap
-from tactile_bayes.posterior.abstention import rim_fault
 from tactile_bayes.posterior.bump import covariance_from_log_widths, drawn_widths, overlap, trusted
 from tactile_bayes.posterior.detection import Detection, detection_from_odds
 from tactile_bayes.posterior.draw import (
@@ -23,7 +21,7 @@ from tactile_bayes.posterior.draw import (
 )
 from tactile_bayes.posterior.field import FLOOR, Window, cosines_for
 from tactile_bayes.posterior.fit import FieldFit, tangent_columns
-from tactile_bayes.posterior.marginal import independent_variance
+from tactile_bayes.posterior.marginal import Problem, Scene, independent_variance
 from tactile_bayes.posterior.neighbours import (
     WANTED,
     Surroundings,
@@ -33,7 +31,6 @@ from tactile_bayes.posterior.neighbours import (
     ridge_text,
     rising_ribs,
 )
-from tactile_bayes.posterior.scene import Problem, Scene
 from tactile_bayes.posterior.selection import (
     ASKING,
     SceneChoice,
@@ -42,6 +39,7 @@ from tactile_bayes.posterior.selection import (
     exponent_covariance,
     newton_step_to,
 )
+from tactile_bayes.posterior.verdict import rim_fault
 from tactile_bayes.posterior.white import BumpFit, MapDraws
 from tactile_bayes.presets import FIELD_COSINES, SceneAsked
 from tactile_bayes.progress import Progress

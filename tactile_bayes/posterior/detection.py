@@ -163,7 +163,7 @@ MOST_BLOCKS = 480
 
 
 class Detection(Record):
-    """Odds of a bump against smooth errors alone; see `lump_probability` for whether it is a lump."""
+    """Odds of a bump against smooth errors alone; see `verdict` for whether it is a lump."""
 
     probability: float
     """Probability of a bump, at even odds and if there were only bumps and smooth errors."""

@@ -13,17 +13,6 @@ from tactile_bayes.findings import Finding, by_weight
 from tactile_bayes.inference.ensemble import convergence
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.mapping.plausibility import map_findings
-from tactile_bayes.posterior.abstention import (
-    FEEL_AGAIN,
-    FEEL_AGAIN_ON_PAPER,
-    HOPELESS,
-    no_bump,
-    no_verdict,
-    searched,
-    shape_fault,
-    undetected,
-    width_fault,
-)
 from tactile_bayes.posterior.bump import levelled, window_cells
 from tactile_bayes.posterior.correlated import Correlated
 from tactile_bayes.posterior.detection import Detection
@@ -36,8 +25,22 @@ from tactile_bayes.posterior.draw import (
     SamplerSettings,
     check_options,
 )
-from tactile_bayes.posterior.lump_probability import LIKELY, NO_EVIDENCE, Weighed, weigh
 from tactile_bayes.posterior.result import Estimate, prior_sensitivity
+from tactile_bayes.posterior.verdict import (
+    FEEL_AGAIN,
+    FEEL_AGAIN_ON_PAPER,
+    HOPELESS,
+    LIKELY,
+    NO_EVIDENCE,
+    Weighed,
+    no_bump,
+    no_verdict,
+    searched,
+    shape_fault,
+    undetected,
+    weigh,
+    width_fault,
+)
 from tactile_bayes.posterior.white import (
     LEAST_WIDTH_IN_CELLS,
     OUTGROWN,

@@ -17,8 +17,7 @@ from tactile_bayes.inference.importance import Gaussians, smooth_weights
 from tactile_bayes.inference.modes import find_mode, finite_differences, mode_and_covariance, stencil
 from tactile_bayes.posterior.bump import drawn_widths
 from tactile_bayes.posterior.draw import Sampled, SamplerSettings, with_beside
-from tactile_bayes.posterior.marginal import NEGLIGIBLE, CollapsedTarget, linear_columns
-from tactile_bayes.posterior.scene import Problem, Scene
+from tactile_bayes.posterior.marginal import NEGLIGIBLE, CollapsedTarget, Problem, Scene, linear_columns
 from tactile_bayes.presets import Method
 
 # --- Posterior of a scene under correlated errors: its mode, a Gaussian for each noise field, and draws.

@@ -9,7 +9,6 @@ import numpy as np
 from tactile_bayes.declarations import as_dict, replace
 from tactile_bayes.errors import CANNOT_SHOW, NO_LUMP, NotConvergedError
 from tactile_bayes.mapping.map import TactileMap
-from tactile_bayes.posterior.abstention import BEYOND_IT
 from tactile_bayes.posterior.bump import (
     SMOOTHING_MM,
     candidate_centres,
@@ -21,9 +20,9 @@ from tactile_bayes.posterior.bump import (
 from tactile_bayes.posterior.detection import Detection
 from tactile_bayes.posterior.draw import MapPosterior, ModalBump, SamplerSettings
 from tactile_bayes.posterior.estimate import best_chance, search
-from tactile_bayes.posterior.lump_probability import LIKELY, weigh
 from tactile_bayes.posterior.neighbours import LEAST_RISE
 from tactile_bayes.posterior.result import Estimate, Mass, Rise
+from tactile_bayes.posterior.verdict import BEYOND_IT, LIKELY, weigh
 from tactile_bayes.posterior.white import AT_RIM, Candidate
 
 # --- Other lumps on the map: their places and probabilities.

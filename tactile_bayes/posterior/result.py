@@ -17,8 +17,8 @@ from tactile_bayes.posterior.bump import principal_widths
 from tactile_bayes.posterior.detection import Detection
 from tactile_bayes.posterior.draw import Diagnostics, MapPosterior, ModalBump
 from tactile_bayes.posterior.fit import FieldFit
-from tactile_bayes.posterior.lump_probability import SmallestLumps, Weighed
 from tactile_bayes.posterior.selection import SceneChoice, fitted_values, pointwise_log_likelihood
+from tactile_bayes.posterior.verdict import SmallestLumps, Weighed
 from tactile_bayes.posterior.white import BumpFit, Candidate
 from tactile_bayes.size.draws import BumpDraws, SizePosterior
 from tactile_bayes.size.pooling import Calibration, SizePriors, draw_sizes

@@ -27,8 +27,7 @@ from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.reports import EstimateReport
 from tactile_bayes.findings import Finding, capital, finding_lines, finding_summary
 from tactile_bayes.findings import verdict as verdict_of
-from tactile_bayes.inference.draws import Quantity
-from tactile_bayes.inference.points import normal_quantile
+from tactile_bayes.inference.draws import Quantity, normal_quantile
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.size.pooling import Repeatability
 from tactile_bayes.size.visits import VOLUME, Change, Compared, JointSizes, doubling_days, straight_line

@@ -11,9 +11,8 @@ from tactile_bayes.files.reports import EstimateReport, MassReport, SmallestLump
 from tactile_bayes.findings import capital, finding_lines, finding_summary
 from tactile_bayes.inference.draws import ParameterDraws, Quantity
 from tactile_bayes.options import BumpPrior
-from tactile_bayes.posterior.abstention import chance_text
-from tactile_bayes.posterior.lump_probability import SHARE_WITH_LUMP
 from tactile_bayes.posterior.result import Estimate
+from tactile_bayes.posterior.verdict import SHARE_WITH_LUMP, chance_text
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.estimate_document import (
     from_xiphoid,

@@ -5,8 +5,7 @@ from __future__ import annotations
 from typing import Any, Final
 
 from tactile_bayes.inference.draws import Quantity
-from tactile_bayes.posterior.abstention import chance_text
-from tactile_bayes.posterior.lump_probability import SHARE_WITH_LUMP
+from tactile_bayes.posterior.verdict import SHARE_WITH_LUMP, chance_text
 from tactile_bayes.presets import INTERVAL, RESEARCH_USE
 from tactile_bayes.report.exam_words import (
     Exam,

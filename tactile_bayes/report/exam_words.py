@@ -19,7 +19,7 @@ from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.mapping.map import FEW_READINGS, TactileMap
 from tactile_bayes.mapping.places import ClockPosition, clock_position, clock_text
 from tactile_bayes.mapping.plausibility import WHY_NOT
-from tactile_bayes.posterior.abstention import chance_text
+from tactile_bayes.posterior.verdict import chance_text
 from tactile_bayes.report.estimate_document import from_xiphoid, others, patient_mm
 from tactile_bayes.report.estimate_text import shape_text, smallest_text, width_lines
 from tactile_bayes.size.pooling import DISAGREE

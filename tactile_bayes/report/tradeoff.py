@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 from tactile_bayes.declarations import Meta, Record
-from tactile_bayes.posterior.lump_probability import LIKELY
+from tactile_bayes.posterior.verdict import LIKELY
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.estimate_text import SOURCES
 from tactile_bayes.report.figure_file import figure_file

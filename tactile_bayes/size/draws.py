@@ -9,8 +9,7 @@ import numpy as np
 
 from tactile_bayes.declarations import Record, field, replace
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.inference.draws import Labels, Quantity, even_replicates, picked_rows, summarise
-from tactile_bayes.inference.points import normal_quantile
+from tactile_bayes.inference.draws import Labels, Quantity, even_replicates, normal_quantile, picked_rows, summarise
 
 EXTREMES: Final = ("max_size_mm", "min_size_mm")
 SIZES: Final = (*EXTREMES, "d_x_mm", "d_y_mm")

@@ -11,8 +11,7 @@ import numpy as np
 from tactile_bayes.declarations import Record, field, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.inference.draws import Labels
-from tactile_bayes.inference.points import normal_quantile, paired_points, stratified_quantiles
+from tactile_bayes.inference.draws import Labels, normal_quantile, paired_points, stratified_quantiles
 from tactile_bayes.size.bodies import BodyCalibration, known_body, suppositions
 from tactile_bayes.size.draws import (
     OVAL_SD,

@@ -14,7 +14,7 @@ import numpy as np
 from tactile_bayes.declarations import Meta, Record, field
 from tactile_bayes.errors import Abstention, BadDataError
 from tactile_bayes.geometry import BoolArray, FloatArray, Matrix, Vector
-from tactile_bayes.inference.points import normal_quantile
+from tactile_bayes.inference.draws import normal_quantile
 from tactile_bayes.presets import INTERVAL, Background, Noise
 from tactile_bayes.scans import HeadShape
 

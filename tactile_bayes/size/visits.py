@@ -26,8 +26,15 @@ from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.findings import Finding
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.inference.draws import Labels, Quantity, summarise
-from tactile_bayes.inference.points import normal_cdf, normal_quantile, paired_points, stratified_quantiles
+from tactile_bayes.inference.draws import (
+    Labels,
+    Quantity,
+    normal_cdf,
+    normal_quantile,
+    paired_points,
+    stratified_quantiles,
+    summarise,
+)
 from tactile_bayes.presets import REGISTRATION_MM
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.draws import ShapeDraws, log_normal, matched_draws

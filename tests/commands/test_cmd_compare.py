@@ -22,7 +22,7 @@ from tactile_bayes.files.comparison import CompareReport
 from tactile_bayes.files.map_nc import read_map, write_map
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.geometry import rigid
-from tactile_bayes.inference.points import normal_quantile
+from tactile_bayes.inference.draws import normal_quantile
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.compare import compare_summary, signed, verdict
 from tactile_bayes.size.visits import Change

@@ -15,7 +15,7 @@ from tactile_bayes.hardware.serve import document
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import MapRecipe, TactileMap
 from tactile_bayes.mapping.places import orientation_of
-from tactile_bayes.posterior.abstention import missing_strokes
+from tactile_bayes.posterior.verdict import missing_strokes
 from tactile_bayes.report.map_figure import map_figure
 from tactile_bayes.report.map_text import live_text
 from tactile_bayes.scans import Landmarks, Scan

@@ -8,7 +8,14 @@ from scipy.special import ndtri
 from scipy.stats import genpareto, qmc
 
 from tactile_bayes.errors import NotConvergedError
-from tactile_bayes.inference.draws import ParameterDraws
+from tactile_bayes.inference.draws import (
+    BITS,
+    MOST_DIMENSIONS,
+    ParameterDraws,
+    normal_quantile,
+    shifted_sobol,
+    sobol_integers,
+)
 from tactile_bayes.inference.importance import (
     TRUSTED_SHAPE,
     Gaussians,
@@ -19,7 +26,6 @@ from tactile_bayes.inference.importance import (
     systematic,
     weighted_quantile,
 )
-from tactile_bayes.inference.points import BITS, MOST_DIMENSIONS, normal_quantile, shifted_sobol, sobol_integers
 
 MEAN = np.array([1.0, -2.0, 0.5])
 COVARIANCE = np.array([[1.0, 0.6, 0.1], [0.6, 2.0, -0.3], [0.1, -0.3, 0.5]])

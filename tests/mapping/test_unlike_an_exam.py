@@ -19,7 +19,7 @@ from tactile_bayes.errors import CANNOT_SHOW, BadDataError
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.plausibility import exam_findings, map_findings, scan_doubts
 from tactile_bayes.mapping.select import find_faults
-from tactile_bayes.posterior.abstention import no_verdict
+from tactile_bayes.posterior.verdict import no_verdict
 from tactile_bayes.scans import ElementCalibration, HeadGeometry, Landmarks, PressureFrames, Scan, TrackerPoses
 
 WINDOW = (5.0, 14.0)

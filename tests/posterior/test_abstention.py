@@ -12,12 +12,11 @@ from tactile_bayes.errors import CODES, NO_LUMP, NotConvergedError, UsageError
 from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior import draw as methods
 from tactile_bayes.posterior import estimate
-from tactile_bayes.posterior.abstention import extend_advice, missing_strokes, no_bump, shape_fault
 from tactile_bayes.posterior.detection import Detection
 from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map
-from tactile_bayes.posterior.lump_probability import Weighed
 from tactile_bayes.posterior.result import Estimate
+from tactile_bayes.posterior.verdict import Weighed, extend_advice, missing_strokes, no_bump, shape_fault
 from tactile_bayes.posterior.white import AT_RIM, Candidate, fit_bump
 
 FIELD = SamplerSettings(background="free", noise="field")

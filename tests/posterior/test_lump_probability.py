@@ -9,7 +9,7 @@ from posterior_maps import bump_values, grid_map
 from tactile_bayes.declarations import replace
 from tactile_bayes.posterior.detection import detection_from_odds
 from tactile_bayes.posterior.draw import ModalBump, SamplerSettings
-from tactile_bayes.posterior.lump_probability import LIKELY, Weighed, weigh
+from tactile_bayes.posterior.verdict import LIKELY, Weighed, weigh
 from tactile_bayes.posterior.white import Candidate, fit_bump
 
 CLEAR = {"log_bayes_factor": 60.0, "centre_mm": (0.0, 0.0), "widths_mm": (5.0, 4.5), "fault": ""}

@@ -9,7 +9,7 @@ from posterior_maps import bump_values, grid_map
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map
-from tactile_bayes.posterior.lump_probability import WIDTHS_MM, needed_amplitudes, smallest_lumps
+from tactile_bayes.posterior.verdict import WIDTHS_MM, needed_amplitudes, smallest_lumps
 from tactile_bayes.report.estimate_document import smallest_lump
 
 FIELD = SamplerSettings(method="laplace", draws=400, background="free", noise="field")

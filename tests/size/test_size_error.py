@@ -16,8 +16,15 @@ from test_pooling import BODY_SD, calibration, shape
 
 from tactile_bayes.declarations import replace
 from tactile_bayes.files.map_nc import write_map
-from tactile_bayes.inference.draws import ParameterDraws, Quantity, even_replicates, summarise
-from tactile_bayes.inference.points import normal_cdf, paired_points, stratified_quantiles
+from tactile_bayes.inference.draws import (
+    ParameterDraws,
+    Quantity,
+    even_replicates,
+    normal_cdf,
+    paired_points,
+    stratified_quantiles,
+    summarise,
+)
 from tactile_bayes.posterior import estimate as drawn
 from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.white import MapDraws

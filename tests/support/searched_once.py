@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from tactile_bayes.api import estimating, sized
-from tactile_bayes.posterior import estimate, lump_probability, masses, result
+from tactile_bayes.posterior import estimate, masses, result, verdict
 
 KEPT = 64
 _searched = estimate.search
@@ -36,7 +36,7 @@ def _search(*asked: Any) -> Any:
 
 
 def _smallest_lumps(*asked: Any, **named: Any) -> Any:
-    return _once(lump_probability.smallest_lumps, *asked, **named)
+    return _once(verdict.smallest_lumps, *asked, **named)
 
 
 def _inference_groups(*asked: Any, **named: Any) -> Any:

@@ -8,8 +8,7 @@ import pytest
 from tactile_bayes.posterior import field as spanned
 from tactile_bayes.posterior import marginal as collapsed
 from tactile_bayes.posterior.field import Spanned
-from tactile_bayes.posterior.marginal import CollapsedTarget
-from tactile_bayes.posterior.scene import Scene
+from tactile_bayes.posterior.marginal import CollapsedTarget, Scene
 from tests.posterior.correlated.test_marginal import START, TURNED, cells_of, noise, target_of
 
 NEAR = 0.03
