@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from tactile_bayes.declarations import Meta, Options
-from tactile_bayes.options import MOST_ITEMS, FieldCosines, Seed
+from tactile_bayes.options import MOST_ITEMS, FieldCosines, Seed, named
 from tactile_bayes.presets import (
     FAT_KPA,
     FIT_RADIUS_MM,
@@ -30,11 +30,7 @@ class RecordOptions(Options, kw_only=True):
     output: Path
     head_url: str
     tracker_url: Annotated[
-        str | None,
-        Meta(
-            description="Port of the tracker; without, there are no poses.",
-            extra={"metavar": "URL", "option": "tracker"},
-        ),
+        str | None, named("URL", "Port of the tracker; without, there are no poses.", option="tracker")
     ] = None
     tracker_protocol: Annotated[
         TrackerProtocol, Meta(description="Protocol of the tracker; a PATRIOT speaks liberty.")
@@ -45,27 +41,17 @@ class RecordOptions(Options, kw_only=True):
         Meta(description="Baud rate of the tracker's port. Default: the protocol's."),
     ] = None
     tracker_rom: Annotated[
-        tuple[Path, ...],
-        Meta(description="ndi: a wireless tool's description, one for each.", extra={"metavar": "ROM", "path": True}),
+        tuple[Path, ...], named("ROM", "ndi: a wireless tool's description, one for each.", path=True)
     ] = ()
     tool: Annotated[
-        str | None,
-        Meta(
-            description="Tool or station on the head, needed where the tracker has several.",
-            extra={"metavar": "NAME", "also": "station"},
-        ),
+        str | None, named("NAME", "Tool or station on the head, needed where the tracker has several.", also="station")
     ] = None
     reference: Annotated[
-        str | None,
-        Meta(
-            description="Tool or station fixed to the body; poses relative to it are free of breathing.",
-            extra={"metavar": "NAME"},
-        ),
+        str | None, named("NAME", "Tool or station fixed to the body; poses relative to it are free of breathing.")
     ] = None
     every: Annotated[int, Meta(ge=1, le=255, description="Record every n-th frame only.")] = 1
     duration_s: Annotated[
-        Annotated[float, Meta(gt=0.0)] | None,
-        Meta(description="Stop after this time, s.", extra={"metavar": "S", "option": "duration"}),
+        Annotated[float, Meta(gt=0.0)] | None, named("S", "Stop after this time, s.", option="duration")
     ] = None
     at_once: Annotated[
         bool, Meta(description="Start at once, without waiting for space. Default: only with --duration.")
@@ -75,22 +61,12 @@ class RecordOptions(Options, kw_only=True):
         Meta(description="Time the poses by their arrival, or trust one clock of both devices."),
     ] = "arrival"
     invert_rotation: Annotated[bool, Meta(description="The tracker gives the inverse rotation.")] = False
-    like: Annotated[
-        Path | None,
-        Meta(description="Take geometry and calibration from this scan.", extra={"metavar": "SCAN.mcap", "path": True}),
-    ] = None
+    like: Annotated[Path | None, named("SCAN.mcap", "Take geometry and calibration from this scan.", path=True)] = None
     head_geometry: Annotated[
-        Path | None,
-        Meta(
-            description="Positions of the taxels and of the tracker's sensor.",
-            extra={"metavar": "HEAD.json", "path": True},
-        ),
+        Path | None, named("HEAD.json", "Positions of the taxels and of the tracker's sensor.", path=True)
     ] = None
     array_calibration: Annotated[
-        Path | None,
-        Meta(
-            description="Array calibration, made by `calibrate array`.", extra={"metavar": "ARRAY.json", "path": True}
-        ),
+        Path | None, named("ARRAY.json", "Array calibration, made by `calibrate array`.", path=True)
     ] = None
     uncalibrated: Annotated[bool, Meta(description="Record with the nominal gain: for bladder steps.")] = False
     accept_calibration: Annotated[
@@ -99,22 +75,21 @@ class RecordOptions(Options, kw_only=True):
     calibration_days: Annotated[
         float, Meta(ge=0.0, description="Age from which an array calibration is stale, days.")
     ] = 1.0
-    landmarks: Annotated[
-        Path | None,
-        Meta(description="Take landmarks from a JSON file or a scan.", extra={"metavar": "FILE", "path": True}),
-    ] = None
+    landmarks: Annotated[Path | None, named("FILE", "Take landmarks from a JSON file or a scan.", path=True)] = None
     side: Annotated[Literal["left", "right", "phantom"] | None, Meta(description="Breast that is scanned.")] = None
     posture: Annotated[
         Literal["supine", "oblique", "sitting", "phantom"] | None, Meta(description="Posture during the scan.")
     ] = None
-    lubricant: Annotated[str | None, Meta(description="Lubricant on the skin.", extra={"metavar": "TEXT"})] = None
-    examiner: Annotated[str | None, Meta(description="A code, not a name.", extra={"metavar": "CODE"})] = None
-    subject: Annotated[str | None, Meta(description="A code, not a name.", extra={"metavar": "CODE"})] = None
+    lubricant: Annotated[str | None, named("TEXT", "Lubricant on the skin.")] = None
+    examiner: Annotated[str | None, named("CODE", "A code, not a name.")] = None
+    subject: Annotated[str | None, named("CODE", "A code, not a name.")] = None
     session_file: Annotated[
         Path | None,
-        Meta(
-            description="Read these five, and other facts in plain text, from a file; an option overrides it.",
-            extra={"metavar": "SESSION.toml", "path": True, "option": "session"},
+        named(
+            "SESSION.toml",
+            "Read these five, and other facts in plain text, from a file; an option overrides it.",
+            path=True,
+            option="session",
         ),
     ] = None
     live: bool = False
@@ -132,37 +107,30 @@ class FaultOptions(Options):
 
     drop: Annotated[Share, Meta(description="Share of the records that are not sent.")] = 0.0
     corrupt: Annotated[Share, Meta(description="Share of the records with one bit changed.")] = 0.0
-    stall: Annotated[
-        Span | None,
-        Meta(description="Send nothing for FOR s from AT s on; those records are lost.", extra={"metavar": "AT FOR"}),
-    ] = None
+    stall: Annotated[Span | None, named("AT FOR", "Send nothing for FOR s from AT s on; those records are lost.")] = (
+        None
+    )
     disconnect_s: Annotated[
-        Annotated[float, Meta(ge=0.0)] | None,
-        Meta(description="Disconnect at AT s.", extra={"metavar": "AT", "option": "disconnect"}),
+        Annotated[float, Meta(ge=0.0)] | None, named("AT", "Disconnect at AT s.", option="disconnect")
     ] = None
     hold: Annotated[int, Meta(ge=1, description="Tracker: measure only every n-th pose.")] = 1
-    hide: Annotated[
-        Span | None,
-        Meta(description="Tracker: its tool is out of sight for FOR s from AT s on.", extra={"metavar": "AT FOR"}),
-    ] = None
+    hide: Annotated[Span | None, named("AT FOR", "Tracker: its tool is out of sight for FOR s from AT s on.")] = None
     breathe_mm: Annotated[
         float,
-        Meta(
+        named(
+            "MM",
+            "Tracker: a second tool, Reference (or station 2), fixed to a body that breathes by MM; the "
+            "first is Probe (or 1).",
+            option="breathe",
             ge=0.0,
             le=100.0,
-            description="Tracker: a second tool, Reference (or station 2), fixed to a body that breathes by MM; the "
-            "first is Probe (or 1).",
-            extra={"metavar": "MM", "option": "breathe"},
         ),
     ] = 0.0
 
 
 SeatName = Annotated[
     str,
-    Meta(
-        description="How far the lump stands out of the gland, if a grid does not state it.",
-        extra={"metavar": "centred|resting|0..2"},
-    ),
+    named("centred|resting|0..2", "How far the lump stands out of the gland, if a grid does not state it."),
 ]
 
 
@@ -194,9 +162,7 @@ class StudyOptions(CaseOptions, kw_only=True):
         Literal["plane-strain", "solid"],
         Meta(description="The paper's two-dimensional body, or balls under the whole head in three dimensions."),
     ] = "plane-strain"
-    grid: Annotated[
-        str, Meta(description="The paper's 150 cases, or a table of cases.", extra={"metavar": "paper|FILE"})
-    ] = "paper"
+    grid: Annotated[str, named("paper|FILE", "The paper's 150 cases, or a table of cases.")] = "paper"
     seat: SeatName = "centred"
     head: Literal["shoulders-inside", "shoulders-outside"] | None = None
     background: Annotated[
@@ -218,12 +184,13 @@ KpaRange = tuple[Annotated[float, Meta(gt=0)], Annotated[float, Meta(gt=0)]]
 class TissueOptions(Options, kw_only=True):
     """Homogeneous tissue under a head, the pressures on it, and how unevenly the head may press."""
 
-    modulus_kpa: Annotated[
-        KpaRange, Meta(description="Young's moduli of the tissue (paper: 15 to 25).", extra={"metavar": "LOW HIGH"})
-    ] = (15.0, 25.0)
-    pressure_kpa: Annotated[
-        KpaRange, Meta(description="Mean pressures under the head (paper: 5 to 14).", extra={"metavar": "LOW HIGH"})
-    ] = PRESSURE_WINDOW_KPA
+    modulus_kpa: Annotated[KpaRange, named("LOW HIGH", "Young's moduli of the tissue (paper: 15 to 25).")] = (
+        15.0,
+        25.0,
+    )
+    pressure_kpa: Annotated[KpaRange, named("LOW HIGH", "Mean pressures under the head (paper: 5 to 14).")] = (
+        PRESSURE_WINDOW_KPA
+    )
     thickness_mm: Annotated[
         float, Meta(gt=0, description="Thickness of the tissue on its rigid base, mm. The paper gives none.")
     ] = THICKNESS_MM
@@ -266,11 +233,7 @@ class SbcOptions(Options, kw_only=True):
         Meta(description="Method of the posterior draws, as in `estimate`; ensemble takes about 20 times as long."),
     ] = "importance"
     field_cosines: Annotated[
-        FieldCosines,
-        Meta(
-            description="Basis functions of the noise field, as field_cosines of `estimate`.",
-            extra={"metavar": "N|auto"},
-        ),
+        FieldCosines, named("N|auto", "Basis functions of the noise field, as field_cosines of `estimate`.")
     ] = "auto"
     seed: Seed = 1
 

@@ -7,7 +7,7 @@ settings of a provenance are made of these records.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Final, Literal
+from typing import Annotated, Any, Final, Literal
 
 from tactile_bayes.declarations import Meta, Options
 from tactile_bayes.errors import UsageError
@@ -59,6 +59,16 @@ IN_FILE: Final = {"file": True}
 """Of a setting that stands in the file of `--settings`, not on the command line."""
 
 
+def named(metavar: str, meaning: str, *, option: str = "", also: str = "", path: bool = False, **rules: Any) -> Meta:
+    """Meaning and rules of an option whose value has a name in the help.
+
+    `option` and `also` name it on the command line, if not by its field, and a second time; a `path` is checked against
+    the call's other files.
+    """
+    held = {"metavar": metavar, "option": option, "also": also, "path": path}
+    return Meta(description=meaning, extra={name: value for name, value in held.items() if value}, **rules)
+
+
 FieldCosines = Annotated[int, Meta(ge=6, le=MOST_FIELD_COSINES)] | Literal["auto"]
 
 
@@ -94,10 +104,7 @@ class FitSettings(BumpPrior, kw_only=True):
     ] = "auto"
     centre_mm: Annotated[
         tuple[float, float] | None,
-        Meta(
-            description="Place on the map to measure. Default: the highest bump that can be a lump.",
-            extra={"metavar": "X Y"},
-        ),
+        named("X Y", "Place on the map to measure. Default: the highest bump that can be a lump."),
     ] = None
     noise: Annotated[
         Noise | None,
@@ -154,7 +161,7 @@ class MapOptions(Options):
     cell_mm: Annotated[float, Meta(ge=0.01, le=50, description="Side of the square cells, mm.")] = CELL_MM
     pressure_window_kpa: Annotated[
         tuple[Annotated[float, Meta(ge=0)], Annotated[float, Meta(ge=0)]],
-        Meta(description="Leave out frames whose mean pressure lies outside.", extra={"metavar": "LOW HIGH"}),
+        named("LOW HIGH", "Leave out frames whose mean pressure lies outside."),
     ] = PRESSURE_WINDOW_KPA
     normalise: Annotated[
         Normalise,
@@ -165,17 +172,13 @@ class MapOptions(Options):
     ] = DEFAULT_NORMALISE
     latency_ms: Annotated[
         Annotated[float, Meta(ge=-10_000, le=10_000)] | Literal["auto"],
-        Meta(
-            description="Delay of the tracker's time stamps; auto: estimate it from the scan, or refuse.",
-            extra={"metavar": "MS|auto"},
-        ),
+        named("MS|auto", "Delay of the tracker's time stamps; auto: estimate it from the scan, or refuse."),
     ] = 0.0
     plane_radius_mm: Annotated[
         Annotated[float, Meta(gt=0)] | Literal["auto", "all"],
-        Meta(
-            description="Fit the plane to frames within this distance of the mass; auto: those whose array can "
-            "reach it.",
-            extra={"metavar": "MM|auto|all"},
+        named(
+            "MM|auto|all",
+            "Fit the plane to frames within this distance of the mass; auto: those whose array can reach it.",
         ),
     ] = "all"
     flat_field: Annotated[
@@ -192,12 +195,7 @@ class MapOptions(Options):
         ),
     ] = False
     every: Annotated[
-        int,
-        Meta(
-            ge=1,
-            description="Use one frame of every N: quicker, and noisier; `tradeoff map` measures both.",
-            extra={"metavar": "N"},
-        ),
+        int, named("N", "Use one frame of every N: quicker, and noisier; `tradeoff map` measures both.", ge=1)
     ] = 1
 
     def __post_init__(self) -> None:
@@ -235,12 +233,7 @@ class TrialSettings(Options):
         Meta(ge=1e-6, le=1e6, description="Ratio of the ex-vivo error's variance to the modality's, for Deming lines."),
     ] = 1.0
     check_intervals: Annotated[
-        int,
-        Meta(
-            ge=0,
-            description="Simulate this many trials of this size and report how often the intervals cover.",
-            extra={"metavar": "TRIALS"},
-        ),
+        int, named("TRIALS", "Simulate this many trials of this size and report how often the intervals cover.", ge=0)
     ] = 0
     bayes: Annotated[
         bool, Meta(description="Predict the error of the next mass, by an errors-in-variables model and MCMC.")
@@ -278,16 +271,14 @@ class PlanOptions(Options, kw_only=True):
     ] = (1, 3, 5)
     power: Annotated[
         Annotated[float, Meta(ge=0.5, le=0.99)] | None,
-        Meta(
-            description="Find the number of patients that reaches this power, such as 0.9.", extra={"metavar": "SHARE"}
-        ),
+        named("SHARE", "Find the number of patients that reaches this power, such as 0.9."),
     ] = None
     precision: Annotated[
         Annotated[float, Meta(ge=1.05, le=10)] | None,
-        Meta(
-            description="Find the number of patients whose interval of the tactile error spans this factor from end to "
+        named(
+            "FACTOR",
+            "Find the number of patients whose interval of the tactile error spans this factor from end to "
             "end, such as 2.",
-            extra={"metavar": "FACTOR"},
         ),
     ] = None
     against: Annotated[str, Meta(description="Modality of the pilot to compare with.")] = "ultrasound"
@@ -306,53 +297,26 @@ class CampaignOptions(Options, kw_only=True):
     """How the exams of a table are mapped and matched, and what is done with them."""
 
     excision: Annotated[
-        Path | None,
-        Meta(
-            description="Sizes measured after excision: adds the trial's report.",
-            extra={"metavar": "EX.csv", "path": True},
-        ),
+        Path | None, named("EX.csv", "Sizes measured after excision: adds the trial's report.", path=True)
     ] = None
     columns: Annotated[
-        Path | None,
-        Meta(
-            description="Layout of a wide EX.csv: which column holds what, in which unit.",
-            extra={"metavar": "MAP.toml", "path": True},
-        ),
+        Path | None, named("MAP.toml", "Layout of a wide EX.csv: which column holds what, in which unit.", path=True)
     ] = None
     protocol: Annotated[
-        Path | None,
-        Meta(
-            description="Pre-specified analysis of the trial, as for `validate`.",
-            extra={"metavar": "FILE.toml", "path": True},
-        ),
+        Path | None, named("FILE.toml", "Pre-specified analysis of the trial, as for `validate`.", path=True)
     ] = None
     normalise: Annotated[Normalise, Meta(description="As `map`.")] = DEFAULT_NORMALISE
     match_mm: Annotated[
         float,
-        Meta(
-            gt=0,
-            description="Distance within which a mass is the one that another exam of the breast names by place.",
-            extra={"metavar": "MM"},
-        ),
+        named("MM", "Distance within which a mass is the one that another exam of the breast names by place.", gt=0),
     ] = MATCH_MM
     figures: Annotated[bool, Meta(description="Draw map and size posterior of each exam.")] = False
     dry_run: Annotated[bool, Meta(description="Print what would be done, and do nothing.")] = False
     copy_to: Annotated[
-        str | None,
-        Meta(
-            description="Copy every file into this folder of an object store, step by step.",
-            extra={"metavar": "s3://BUCKET/FOLDER"},
-        ),
+        str | None, named("s3://BUCKET/FOLDER", "Copy every file into this folder of an object store, step by step.")
     ] = None
     workers: Workers = 1
-    scheduler: Annotated[
-        str | None,
-        Meta(description="Send the exams to a dask scheduler (extra [cluster]).", extra={"metavar": "ADDRESS"}),
-    ] = None
-
-
-def _text(longest: int, metavar: str, meaning: str) -> Meta:
-    return Meta(max_length=longest, description=meaning, extra={"metavar": metavar})
+    scheduler: Annotated[str | None, named("ADDRESS", "Send the exams to a dask scheduler (extra [cluster]).")] = None
 
 
 class IdentityOptions(Options):
@@ -362,21 +326,27 @@ class IdentityOptions(Options):
     may also be a modality worklist item of DICOM.
     """
 
-    patient_id: Annotated[str, _text(64, "ID", "Patient ID; in csv files the beginning of the record ID.")] = ""
-    patient_name: Annotated[str, _text(194, "FAMILY^GIVEN", "Patient's name: FAMILY^GIVEN^MIDDLE^PREFIX^SUFFIX.")] = ""
-    birth_date: Annotated[str, _text(10, "YYYY-MM-DD", "Patient's date of birth: YYYY-MM-DD.")] = ""
-    sex: Annotated[
-        Literal["F", "M", "O", ""], Meta(description="Patient's sex: F, M or O.", extra={"metavar": "F|M|O"})
+    patient_id: Annotated[
+        str, named("ID", "Patient ID; in csv files the beginning of the record ID.", max_length=64)
     ] = ""
-    issuer: Annotated[str, _text(64, "NAME", "Who issued the patient ID.")] = ""
-    accession: Annotated[str, _text(16, "NUMBER", "Accession number.")] = ""
-    referring_physician: Annotated[str, _text(194, "FAMILY^GIVEN", "Referring physician's name, likewise.")] = ""
-    study_id: Annotated[str, _text(16, "ID", "Study ID.")] = ""
-    study_description: Annotated[str, _text(64, "TEXT", "Study description.")] = ""
+    patient_name: Annotated[
+        str, named("FAMILY^GIVEN", "Patient's name: FAMILY^GIVEN^MIDDLE^PREFIX^SUFFIX.", max_length=194)
+    ] = ""
+    birth_date: Annotated[str, named("YYYY-MM-DD", "Patient's date of birth: YYYY-MM-DD.", max_length=10)] = ""
+    sex: Annotated[Literal["F", "M", "O", ""], named("F|M|O", "Patient's sex: F, M or O.")] = ""
+    issuer: Annotated[str, named("NAME", "Who issued the patient ID.", max_length=64)] = ""
+    accession: Annotated[str, named("NUMBER", "Accession number.", max_length=16)] = ""
+    referring_physician: Annotated[
+        str, named("FAMILY^GIVEN", "Referring physician's name, likewise.", max_length=194)
+    ] = ""
+    study_id: Annotated[str, named("ID", "Study ID.", max_length=16)] = ""
+    study_description: Annotated[str, named("TEXT", "Study description.", max_length=64)] = ""
     study_uid: Annotated[
-        str, _text(64, "UID", "Study Instance UID. Default: one that follows from the content of the maps.")
+        str, named("UID", "Study Instance UID. Default: one that follows from the content of the maps.", max_length=64)
     ] = ""
     study_date: Annotated[
-        str, _text(25, "DATE", "Date of the exam: YYYY-MM-DD or YYYY-MM-DDTHH:MM, with +HH:MM for the zone.")
+        str, named("DATE", "Date of the exam: YYYY-MM-DD or YYYY-MM-DDTHH:MM, with +HH:MM for the zone.", max_length=25)
     ] = ""
-    content_date: Annotated[str, _text(25, "DATE", "Date at which the content was made. Default: the exam's.")] = ""
+    content_date: Annotated[
+        str, named("DATE", "Date at which the content was made. Default: the exam's.", max_length=25)
+    ] = ""

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from tactile_bayes.declarations import Meta, Record, extra_of, kinds, part_of
 from tactile_bayes.errors import UsageError, check_number
-from tactile_bayes.options import IN_FILE, PRIORS, FitSettings
+from tactile_bayes.options import IN_FILE, PRIORS, FitSettings, named
 from tactile_bayes.presets import INTERVAL, REGISTRATION_MM
 
 if TYPE_CHECKING:
@@ -29,11 +29,11 @@ class Settings(FitSettings, kw_only=True):
 
     size_calibration: Annotated[
         str | Calibration | None,
-        Meta(
-            description="Calibration from widths to sizes: a shipped one, your own file, or none (widths only). "
+        named(
+            "solid|eq6|solid-mean|plane-strain|none|SIZE.json",
+            "Calibration from widths to sizes: a shipped one, your own file, or none (widths only). "
             "Default: solid, or solid-mean for maps of frames divided by their means; eq6 is the paper's Eq 6 over "
             "such bodies.",
-            extra={"metavar": "solid|eq6|solid-mean|plane-strain|none|SIZE.json"},
         ),
     ] = None
     seed: Annotated[int, Meta(ge=0, description="Random seed.")] = 1
@@ -56,10 +56,10 @@ class Settings(FitSettings, kw_only=True):
     ] = None
     known: Annotated[
         tuple[tuple[str, float], ...],
-        Meta(
-            description="Known property of the body: seat (0 centred on the gland's edge, 1.2 clear of it), depth_mm, "
+        named(
+            "NAME VALUE",
+            "Known property of the body: seat (0 centred on the gland's edge, 1.2 clear of it), depth_mm, "
             "stiffness_ratio, fat_kpa, gland_ratio or thickness_mm.",
-            extra={"metavar": "NAME VALUE"},
         ),
     ] = ()
     checkpoint: Annotated[
@@ -72,10 +72,11 @@ class Settings(FitSettings, kw_only=True):
     ] = None
     settings_file: Annotated[
         Path | None,
-        Meta(
-            description="Priors and rarely used options: background, fit_radius_mm, noise, max_steps... "
-            "(settings.schema.json).",
-            extra={"metavar": "FILE.toml", "path": True, "option": "settings"},
+        named(
+            "FILE.toml",
+            "Priors and rarely used options: background, fit_radius_mm, noise, max_steps... (settings.schema.json).",
+            path=True,
+            option="settings",
         ),
     ] = None
 
