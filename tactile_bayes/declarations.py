@@ -361,7 +361,8 @@ def _inlined(schema: Any, definitions: Mapping[str, Any]) -> Any:
         if all(part == parts[0] for part in parts):
             found["items"] = parts[0]
         elif all("const" in part for part in parts):
-            found = {"const": [part["const"] for part in parts]} | _meaning(found)
+            kept = ("title", "description", "default")
+            found = {"const": [part["const"] for part in parts], **{key: found[key] for key in kept if key in found}}
         else:
             found |= {"items": parts, "additionalItems": False}
     if len(found.get("enum", ())) == 1:
@@ -378,10 +379,6 @@ def _inlined(schema: Any, definitions: Mapping[str, Any]) -> Any:
 
 def _custom_schema(kind: Any) -> dict[str, Any]:
     return {"type": "string", "minLength": 1} if kind is Path else {"type": "array"}
-
-
-def _meaning(schema: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: schema[name] for name in ("title", "description", "default") if name in schema}
 
 
 # Errors

@@ -15,7 +15,7 @@ import click
 from tactile_bayes.api.estimating import answer_file, estimate_file
 from tactile_bayes.api.pooled import of_one_mass, pool_answers
 from tactile_bayes.api.settings import Settings, refuse_checkpoint
-from tactile_bayes.api.sized import Answer, SizeEstimate
+from tactile_bayes.api.sized import Answer
 from tactile_bayes.batch import BatchInterrupted, Outcome, fault_lines, open_executor, run_batch
 from tactile_bayes.commands.options import settings_of
 from tactile_bayes.declarations import replace
@@ -114,7 +114,10 @@ def estimate_action(
         printed = {"as_json": as_json, "verbose": verbose}
         return estimate_pool(maps, answers, settings, output, figure, **printed, force=force)
     if len(maps) == 1:
-        found = _one_map(maps[0], settings)
+        with progress_bar("effective draws") as progress:
+            found = estimate_file(
+                maps[0], settings, progress=progress, notice=lambda line: click.echo(f"{maps[0]}: {line}", err=True)
+            )
         answers = [found.answer]
     else:
         found = None
@@ -133,13 +136,6 @@ def estimate_action(
         _print(maps, answers, as_json=as_json, verbose=verbose, listed=len(maps) > 1)
     failed = [answer.exit_code for answer in answers if answer.report is None]
     return failed[0] if failed else max(answer.exit_code for answer in answers)
-
-
-def _one_map(path: Path, settings: Settings) -> SizeEstimate:
-    with progress_bar("effective draws") as progress:
-        return estimate_file(
-            path, settings, progress=progress, notice=lambda line: click.echo(f"{path}: {line}", err=True)
-        )
 
 
 def _many_maps(maps: tuple[Path, ...], settings: Settings, *, workers: int, scheduler: str | None) -> list[Answer]:

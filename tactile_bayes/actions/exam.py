@@ -87,7 +87,9 @@ def demo_action(output: Path, method: str, force: bool) -> None:
     """Run the main job on an embedded scan: map, estimate, and the report of a trial."""
     _prepare(output, force=force)
     steps = Steps(output, method=method, force=force)
-    truth = _truth(output / "scan.mcap")
+    recorded = read_truth(output / "scan.mcap")
+    assert recorded is not None  # the embedded scan is simulated
+    truth = float(recorded["lumps"][0]["d_mm"])
     click.echo(f"The scan is simulated: a ball of {truth:g} mm in a breast of fat and gland ({output / 'scene.toml'}).")
     click.echo(f"Each step is printed as the command that repeats it by hand.{_how_to_type()}")
     results = {"estimate, the default": steps.default_road(), "the paper's Eq 6": steps.paper_road()}
@@ -182,13 +184,6 @@ def _as_typed(command: click.Command, parameters: dict[str, Any]) -> str:
             values = [] if parameter.is_flag else values
         words += values
     return shlex.join(words)
-
-
-def _truth(scan: Path) -> float:
-    truth = read_truth(scan)
-    if truth is None:
-        raise UsageError(f"{scan} holds no truth; it is not the embedded scan")
-    return float(truth["lumps"][0]["d_mm"])
 
 
 def _apart(default: StatedSize, paper: StatedSize) -> str:

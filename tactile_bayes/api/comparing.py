@@ -34,7 +34,7 @@ from tactile_bayes.report.pooled import disagreement, fat_apart
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.draws import ShapeDraws
 from tactile_bayes.size.fat import LEAST_PROBABILITY, BetweenMaps, one_size_of
-from tactile_bayes.size.pooling import MOST_INVALID, SizePriors, log_sizes
+from tactile_bayes.size.pooling import MOST_INVALID, log_sizes
 from tactile_bayes.size.terms import UNLIKE_LEARNED
 from tactile_bayes.size.visits import (
     Apart,
@@ -365,8 +365,11 @@ def _sized(
         *doubts,
         *(Finding("outside_calibration", f"{UNLIKE_LEARNED}: {text}") for text in outside),
         *([] if depths is None else [fat_apart(depths)]),
-        *_sizes_apart(shapes, fitted, priors),
     ]
+    for number, (maps, at) in enumerate(zip(shapes, fitted, strict=True), start=1):
+        chance = one_size_of(log_sizes(at, maps), priors.between_maps)
+        if chance < LEAST_PROBABILITY:
+            findings.append(disagreement("its maps show different sizes", chance).at(f"visit {number}"))
     another = None if priors.another_exam is None else joint(priors.another_exam)
     return Compared("compared", "", "", apart, tuple(findings), sizes, another)
 
@@ -382,18 +385,6 @@ def _by_visit(
         for text in texts_of(*one.middle)
     ]
     return list(dict.fromkeys(found))
-
-
-def _sizes_apart(
-    shapes: Sequence[Sequence[ShapeDraws]], fitted: Sequence[BodyCalibration], priors: SizePriors
-) -> list[Finding]:
-    """Cautions where the maps of one visit are not of one size."""
-    found = []
-    for number, (maps, at) in enumerate(zip(shapes, fitted, strict=True), start=1):
-        chance = one_size_of(log_sizes(at, maps), priors.between_maps)
-        if chance < LEAST_PROBABILITY:
-            found.append(disagreement("its maps show different sizes", chance).at(f"visit {number}"))
-    return found
 
 
 def _of_visits(visits: Sequence[Sequence[Answer]]) -> list[Finding]:
@@ -475,7 +466,5 @@ def compare(
 
 def _visit(given: Any, settings: dict[str, Any]) -> tuple[SizeEstimate, ...]:
     """Estimates of a visit's maps."""
-    several = (
-        [given] if isinstance(given, str | Path | Map | SizeEstimate) or not isinstance(given, Sequence) else given
-    )
-    return estimated(several, settings)
+    single = isinstance(given, str | Path | Map | SizeEstimate) or not isinstance(given, Sequence)
+    return estimated([given] if single else given, settings)

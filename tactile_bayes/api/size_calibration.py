@@ -27,7 +27,6 @@ from tactile_bayes.progress import Progress
 from tactile_bayes.scans import HeadShape
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.draws import BumpDraws, ShapeDraws
-from tactile_bayes.size.eq6 import LeftOutErrors
 from tactile_bayes.size.learn import bodies as learning
 from tactile_bayes.size.learn.eq6 import (
     OtherFit,
@@ -99,7 +98,12 @@ def learn_eq6(
         else:
             calibration = learn_size_calibration(lumps, recipe=recipe, rng=rng, progress=progress)
         other = other_fit(calibration, lumps)
-        left_out, silent = _left_out(lumps, fit, least_stiffness_ratio=least_stiffness_ratio)
+        one_axis = axis_in_two_stages if fit == "two-stage" else None
+        left_out, silent = None, ""  # cross-validated errors, or why Eq 6 has none
+        try:
+            left_out = left_out_of_study(lumps, least_stiffness_ratio=least_stiffness_ratio, fit=one_axis)
+        except (NotConvergedError, BadDataError) as error:
+            silent = str(error)
     settings = {
         "normalise": recipe.normalise,
         "background": recipe.background,
@@ -231,15 +235,6 @@ def _contradiction(table: Table, name: str, said: object, declared: object) -> B
         )
     what = f"its {name} is {said}, not {declared} as {option} says"
     return BadDataError(what, way_out=way_out, path=str(table.path))
-
-
-def _left_out(lumps: SizeTable, fit: EqSixFit, *, least_stiffness_ratio: float) -> tuple[LeftOutErrors | None, str]:
-    """Cross-validated errors, or the reason why Eq 6 has none."""
-    one_axis = axis_in_two_stages if fit == "two-stage" else None
-    try:
-        return left_out_of_study(lumps, least_stiffness_ratio=least_stiffness_ratio, fit=one_axis), ""
-    except (NotConvergedError, BadDataError) as error:
-        return None, str(error)
 
 
 def rows_of_one_way(rows: Table, normalise: str | None) -> tuple[Normalise, dict[str, list[Any]]]:
