@@ -25,8 +25,7 @@ from tactile_bayes.files.provenance import Provenance, hash_inputs
 from tactile_bayes.files.scan_mcap import read_scan_report, read_truth, write_scan
 from tactile_bayes.findings import LEADS, finding_lines
 from tactile_bayes.mapping.arrangement import check_scan, corrected
-from tactile_bayes.mapping.plausibility import scan_doubts
-from tactile_bayes.presets import PRESSURE_WINDOW_KPA, RESEARCH_USE
+from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.scans import Scan
 
 _BESIDE: Final = {"head_geometry": of_head, "array_calibration": of_calibration, "landmarks": of_landmarks}
@@ -188,8 +187,6 @@ def _arrangement_lines(scan: Scan) -> list[str]:
     """What its frames say of the scan; one that no map could be made of is imported all the same."""
     try:
         check = check_scan(scan, thorough=False)
-        if check is None:
-            return finding_lines(scan_doubts(scan, pressure_window_kpa=PRESSURE_WINDOW_KPA))
     except BadDataError as error:
         return [f"{LEADS['caution']}no map can be made of it: {error}"]
     return [*finding_lines(check.doubts), *(finding_lines(check.findings_of(scan)) or [check.words])]

@@ -11,7 +11,7 @@ from typing import Any
 import click
 
 from tactile_bayes.campaigns.campaign import names_line, run_campaign
-from tactile_bayes.campaigns.exams import Found, find_exams
+from tactile_bayes.campaigns.exams import SCANS, Found, find_exams
 from tactile_bayes.commands.options import settings_of
 from tactile_bayes.declarations import names_of
 from tactile_bayes.errors import BadDataError, UsageError
@@ -38,7 +38,7 @@ def campaign_init_action(folder: Path | str, output: Path, names: str | None, ad
         click.echo(f"left out: {line}", err=True)
     if before is None:
         if not found.rows:
-            what, way_out = "holds no scan (.mcap, .npz) and no map (.nc)", "give the folder of the scans"
+            what, way_out = f"holds no scan ({', '.join(SCANS)}) and no map (.nc)", "give the folder of the scans"
             if found.skipped:
                 what, way_out = "holds no file that can be an exam", "see why each was left out"
             raise BadDataError(what, way_out=way_out, path=str(folder))

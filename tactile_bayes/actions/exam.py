@@ -22,9 +22,7 @@ from tactile_bayes.files.documents import dump_json
 from tactile_bayes.files.estimate_json import StatedSize, read_stated_size
 from tactile_bayes.files.instrument_json import write_head
 from tactile_bayes.files.scan_mcap import read_scan, read_truth
-from tactile_bayes.findings import finding_lines
-from tactile_bayes.mapping.arrangement import TOO_SHORT, check_scan
-from tactile_bayes.mapping.plausibility import scan_doubts
+from tactile_bayes.mapping.arrangement import check_scan
 from tactile_bayes.presets import RESEARCH_USE
 
 # --- `check`: is a scan arranged as it is stated?
@@ -43,12 +41,11 @@ def check_action(
         scan = read_scan(path)
         check = check_scan(scan, pressure_window_kpa=pressure_window_kpa)
         click.echo(f"{path}:")
-        short = () if check else scan_doubts(scan, pressure_window_kpa=pressure_window_kpa)
-        for line in [*finding_lines(short), TOO_SHORT] if check is None else check.lines():
+        for line in check.lines():
             click.echo(f"  {line}")
-        wrong += check is not None and check.refused
+        wrong += check.refused
         if output is not None:
-            if check is None or check.findings or check.doubts:
+            if check.too_short or check.findings or check.doubts:
                 raise BadDataError(
                     "the scan does not show that its head is right", way_out="scan a phantom with a lump"
                 )

@@ -216,7 +216,7 @@ def build_map(
 
 
 @door
-def check(scan: Any, *, pressure_window_kpa: tuple[float, float] = PRESSURE_WINDOW_KPA) -> ArrangementCheck | None:
+def check(scan: Any, *, pressure_window_kpa: tuple[float, float] = PRESSURE_WINDOW_KPA) -> ArrangementCheck:
     """Compare what is stated of a scan's array, lever arm and quaternions with other arrangements.
 
     Parameters
@@ -228,8 +228,8 @@ def check(scan: Any, *, pressure_window_kpa: tuple[float, float] = PRESSURE_WIND
 
     Returns
     -------
-    ArrangementCheck or None
-        `words` says what its frames agree with, `lines()` in full; None where it is too short.
+    ArrangementCheck
+        `words` says what its frames agree with, `lines()` in full; `too_short` where they are too few.
     """
     return check_scan(
         read_scan(scan) if isinstance(scan, str | Path) else scan_given(scan), pressure_window_kpa=pressure_window_kpa

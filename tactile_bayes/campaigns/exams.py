@@ -20,7 +20,9 @@ from tactile_bayes.files.scan_mcap import provenance_of, scan_records
 
 # --- What a file says of its exam: facts of the session, and the files that it was made from.
 
-SCANS: Final = (".mcap", ".npz")
+ARRAYS: Final = (".npz", ".mat", ".h5", ".hdf5")
+"""Of files that hold all arrays of a scan."""
+SCANS: Final = (".mcap", *ARRAYS)
 MAP: Final = ".nc"
 _ENDINGS: Final = (*SCANS, MAP)
 
@@ -35,7 +37,7 @@ class Said(Record):
 def said_by(path: Path, name: str) -> Said:
     """What a scan, arrays of a scan or a map say of the exam."""
     check_name(name)
-    if name.lower().endswith(".npz"):
+    if name.lower().endswith(ARRAYS):
         return Said()
     return _of_map(path) if name.lower().endswith(MAP) else _of_scan(path)
 
@@ -183,7 +185,7 @@ class FolderFiles:
             first, *copies = sorted(names, key=lambda name: (name not in listed, len(name), name))
             found |= {name: f"holds the same bytes as {first}" for name in copies if name not in listed}
         for made, original in self._made_of({name: one for name, one in said.items() if name not in found}):
-            arrays = original.lower().endswith(".npz")  # which say less of the exam than the scan that they became
+            arrays = original.lower().endswith(ARRAYS)  # which say less of the exam than the scan that they became
             first, second = (made, original) if arrays else (original, made)
             if second in listed and first not in listed:
                 first, second = second, first
@@ -260,7 +262,7 @@ class Found(Record):
 def find_exams(
     folder: Path | str, table: Path, *, listed: Sequence[Mapping[str, str]] = (), names: str | None = None
 ) -> Found:
-    """Look through a folder and those below it for scans (.mcap), arrays of scans (.npz) and maps (.nc).
+    """Look through a folder and those below it for scans (.mcap), arrays of scans (`ARRAYS`) and maps (.nc).
 
     The folder may be an address in an object store, whose maps are passed over. `listed` are rows that the table has
     already; paths are written from the table's folder; `names`: see `NamePattern`.

@@ -17,6 +17,7 @@ from tactile_bayes.api.pooled import pool_answers
 from tactile_bayes.api.repeatability import ExamFolder, learn_from_exams
 from tactile_bayes.api.settings import Comparing, Settings
 from tactile_bayes.api.sized import Answer, SizeEstimate, size_priors
+from tactile_bayes.campaigns.exams import ARRAYS
 from tactile_bayes.campaigns.match import OWN_AXES, Match, in_own_axes, matched
 from tactile_bayes.campaigns.settings import CampaignSettings, Writes, digest_of, write_staged
 from tactile_bayes.declarations import EXACT, Record, from_plain, replace, rounded, to_plain
@@ -144,11 +145,11 @@ def make_map(
             return make_map(path, source_sha256=source_sha256, expected=expected, normalise=normalise)
     if sha256(source) != source_sha256:
         raise BadDataError("changed while the campaign ran", way_out="run the campaign again")
-    kind = kind_of(source)
-    if kind == _A_MAP:
+    kind, arrays = kind_of(source), source.suffix.lower() in ARRAYS
+    if kind == _A_MAP and not arrays:
         return _given_map(source, expected)
     writes: Writes = {}
-    if kind == _ARRAYS:
+    if kind == _ARRAYS or arrays:
         scan = read_arrays(source)
         made = Provenance("import", {"as": "scan", "lost": [], "correct": []}, inputs={"source": source_sha256})
         writes[SCAN] = lambda path: write_scan(path, scan, provenance=made, force=True)

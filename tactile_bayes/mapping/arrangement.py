@@ -11,7 +11,7 @@ A breast in which nothing stands out looks alike in all of them: then nothing is
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import product
 from math import exp, log
 from typing import Any, Final
@@ -31,8 +31,8 @@ from tactile_bayes.mapping.convention import (
     import_again,
     thinning,
 )
-from tactile_bayes.mapping.latency import Cells, Nuisance
-from tactile_bayes.mapping.plausibility import SURE_ODDS, selection_doubts
+from tactile_bayes.mapping.latency import Cells
+from tactile_bayes.mapping.plausibility import SURE_ODDS, scan_doubts
 from tactile_bayes.mapping.select import SelectedFrames, TaxelFault, select_frames
 from tactile_bayes.presets import CORRECTIONS, PRESSURE_WINDOW_KPA
 from tactile_bayes.scans import ElementCalibration, HeadGeometry, PressureFrames, Scan, TrackerPoses
@@ -54,28 +54,26 @@ Corrections = tuple[str, ...]
 MOST_CHANGES: Final = 3
 LIKELY_ODDS: Final = 10.0
 """From these odds on another arrangement is a caution, and the one stated counts as shown."""
-LEAST_EXPLAINED: Final = 0.7
-"""Share of what varies over the skin that frames of other times predict in the right arrangement: 0.79 to 0.97 in 26
-scans by another simulator."""
-LEAST_GAIN: Final = 0.3
-LEAST_GAINS: Final = {"inverse-rotation": 0.15, "quarter-turn": 0.45, "quarter-turn-back": 0.45}
-"""Of a correction: a mistake's beside a clear lump gains 0.5 to 1.2, 0.15 to 0.5 where the rotation was the inverse.
-Over empty bodies, whose frames bend as the head rolls, a turn of the array gained up to 0.4."""
+LEAST_EXPLAINED: Final = 0.3
+"""Share of what varies over the skin that frames of other times predict in another arrangement, to be likely."""
 CLOCK_MS: Final = (30, 60, 100, 150, 200, 300, 400, 500)
 """Times by which poses are tried to be late, and early; the best is found to 10 ms."""
-LEAST_CLOCK_GAIN: Final = 0.15
-"""Of another clock: 26 right scans gain 0.02 at most, 100 ms gain 0.2 to 1.0 beside a clear lump."""
-CLOCK_EXPLAINED, CLOCK_LASTING = 0.9, 0.75
-"""Frames that explain less, or whose errors last longer, may have another clock; the others are not asked."""
 LEAST_AGREEMENT: Final = 0.9
-MOST_EXPLAINED: Final = 0.55
+MOST_EXPLAINED: Final = 0.25
 MOST_LASTING: Final = 0.5
-"""`MOST_EXPLAINED`, `MOST_LASTING`: Frames that explain less, with errors that last longer, contradict each other."""
+LEAST_CONTRADICTION: Final = 0.02
+"""Frames that explain less than `MOST_EXPLAINED`, with larger errors that last longer, contradict each other."""
 LEAST_LASTING: Final = 0.15
 """Below it there is nothing but noise to compare."""
 MOST_FRAMES: Final = 250
 _LEAST_BLOCKS: Final = 8
 _CLOCK_STEPS_MS: Final = (-40, -30, -20, -10, 10, 20, 30, 40)
+LEAST_SWAY_MM, LEAST_SWAY_GAIN = 4.0, 0.15
+"""Of a body that moved: right scans gain 0.09 by at most 2.5 mm, 10 mm of breathing gain 0.2 to 0.7."""
+_SWAYS_HZ: Final = (0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5)
+_SWAYS_TRIED, _SWAY_STEPS = 4, 5
+_SWAY_NUMBERS: Final = 5  # that are fitted: a rate, and cosine and sine along two axes
+_FIT_STEPS: Final = 30
 _LEAST_OTHERS: Final = 2
 """Readings of other times that predict one."""
 NOTHING_SHOWN: Final = "too little stands out to show that array, lever arm and quaternions are as stated"
@@ -88,6 +86,7 @@ NOT_CHECKED: Final = Finding(
 )
 _CONTRADICTING: Final = "strokes over one place do not agree on what they felt there; size and place may be wrong"
 _LATE: Final = "the tracker's times do not fit those of the sensor array; size and place may be wrong"
+_MOVED: Final = "the body moved to and fro during the scan, as breathing moves it; size and place may be wrong"
 _MOUNTED: Final = (
     "the sensor array or the tracker seems to be mounted otherwise than is stated; size and place may be wrong"
 )
@@ -148,10 +147,16 @@ class Arrangement(Record, eq=False):
     agreement: float
     """Inner product of the mean normal of the face and the normal of all places: a head slides along its face."""
     late_ms: float = 0.0  #: By how much poses are later than stated; below 0 earlier.
+    sway_mm: float = 0.0
+    sways_a_minute: float = 0.0
+    """`sway_mm`, `sways_a_minute`: How far and how often the body moved to and fro."""
 
     @property
     def in_words(self) -> str:
         """What is wrong if this one is right."""
+        if self.sway_mm:
+            often = f"{self.sways_a_minute:.0f} times a minute"
+            return f"the body moved to and fro by {self.sway_mm:.0f} mm, {often}, as breathing moves it"
         if self.late_ms:
             way = "late" if self.late_ms > 0 else "early"
             return f"the poses' times are {abs(self.late_ms):.0f} ms too {way} against the frames'"
@@ -163,15 +168,14 @@ class Arrangement(Record, eq=False):
         return self.agreement >= LEAST_AGREEMENT and self.explained >= LEAST_EXPLAINED
 
     @property
+    def contradicting(self) -> bool:
+        """True where frames contradict each other by more than a head's response leaves."""
+        return self.explained < MOST_EXPLAINED and self.lasting > MOST_LASTING and self.spread > LEAST_CONTRADICTION
+
+    @property
     def changes(self) -> int:
         """How many things of the scan as it is stated are wrong if this one is right."""
         return len(self.corrections) + bool(self.late_ms)
-
-    @property
-    def least_gain(self) -> float:
-        """What the corrections have to gain in each stretch."""
-        of_clock = LEAST_CLOCK_GAIN if self.late_ms else 0.0
-        return of_clock + sum(LEAST_GAINS.get(name, LEAST_GAIN) for name in self.corrections)
 
     def gain_over(self, other: Arrangement) -> float:
         """Natural log of the likelihood ratio to another one in each stretch.
@@ -202,7 +206,7 @@ class ArrangementCheck(Record, eq=False):
     @property
     def refused(self) -> bool:
         """True where another arrangement wins clearly; another clock can be stated to `map`."""
-        return self.log_odds >= log(SURE_ODDS) and not self.best.late_ms
+        return self.log_odds >= log(SURE_ODDS) and bool(self.best.corrections)
 
     @property
     def not_shown(self) -> tuple[str, ...]:
@@ -215,8 +219,15 @@ class ArrangementCheck(Record, eq=False):
         return self.best is self.stated and any(name in self.not_shown for (name,) in _ARRAY[1:])
 
     @property
+    def too_short(self) -> bool:
+        """True where the scan has too few frames to compare any."""
+        return not self.excluded
+
+    @property
     def words(self) -> str:
         """What the frames agree with, in one sentence."""
+        if self.too_short:
+            return TOO_SHORT
         if self.contradicting:
             return (
                 f"frames contradict each other by {_percent(self.best)} where they overlap, in every arrangement tried"
@@ -239,6 +250,9 @@ class ArrangementCheck(Record, eq=False):
         if self.best.late_ms:
             on_paper = "have the scan mapped again with the tracker's delay"
             return (Finding("late_poses", _LATE, f"{self.words}; {self.remedy}", on_paper),)
+        if self.best.sway_mm:
+            on_paper = "have the scan taken again with the breath held"
+            return (Finding("frames_contradict", _MOVED, f"{self.words}; {self.remedy}", on_paper),)
         if self.best is not self.stated:
             on_paper = "have it checked how the array and the tracker are mounted"
             return (Finding("wrong_arrangement", _MOUNTED, f"{self.words}; {self.remedy}", on_paper),)
@@ -257,6 +271,8 @@ class ArrangementCheck(Record, eq=False):
             return "check the lever arm, both clocks, and that the breast lay still"
         if self.says_nothing:
             return NOT_CHECKED.remedy
+        if self.best.sway_mm:
+            return "record with a reference tool on the body (--reference), or have the breath held"
         if self.best.late_ms:
             return f"map it with --latency-ms {self.asked_ms + self.best.late_ms:.0f}"
         return import_again(self.best.corrections)
@@ -282,25 +298,31 @@ def odds_words(log_odds: float) -> str:
     return "above 10^6" if tens >= 6 else f"10^{tens}" if tens >= 3 else f"{exp(log_odds):.0f}"
 
 
-def check_arrangement(
-    selection: SelectedFrames, *, latency_ms: float = 0.0, most_changes: int = MOST_CHANGES
-) -> ArrangementCheck | None:
-    """Compare arrangements of up to `most_changes` corrections; None for a scan too short to compare any.
+def check_arrangement(selection: SelectedFrames, *, latency_ms: float = 0.0, thorough: bool = True) -> ArrangementCheck:
+    """Compare arrangements of up to `MOST_CHANGES` corrections, or of one where that or none fits, unless `thorough`.
 
-    The best is the likeliest that is plausible and gains enough, with `LIKELY_ODDS` against each of its corrections.
+    The best is the likeliest that is plausible, with `LIKELY_ODDS` against each of its corrections; where none is
+    better than the one stated, a body that moved is tried.
     """
     overlap = _Overlap.of(selection, latency_ms)
     if overlap is None:
-        return None
-    first, *others = _arrangements(selection.scan, most_changes)
+        return _TOO_SHORT
+    first, *others = _arrangements(selection.scan)
+    single = [one for one in others if len(one) == 1]
     stated = overlap.judged(first)
-    if stated.lasting < LEAST_LASTING:
-        return ArrangementCheck(stated, stated, 0.0, {one[0]: 0.0 for one in others if len(one) == 1})
-    tried = [stated, *map(overlap.judged, others)]
-    if stated.explained < CLOCK_EXPLAINED or stated.lasting > CLOCK_LASTING:
-        tried += [overlap.late(sign * ms) for ms in CLOCK_MS for sign in (1, -1)]
-    stretches = int(overlap.block.max()) + 1
-    likely = [one for one in tried if one is stated or (one.plausible and one.gain_over(stated) >= one.least_gain)]
+    if _lasting(_varying(overlap.coarse[0])) < LEAST_LASTING:
+        return ArrangementCheck(stated, stated, 0.0, {one[0]: 0.0 for one in single})
+    tried = [stated, *map(overlap.judged, single), *(overlap.late(sign * ms) for ms in CLOCK_MS for sign in (1, -1))]
+    check = _compared(overlap, tried)
+    if thorough or check.contradicting or check.best.corrections:
+        check = _compared(overlap, [*tried, *map(overlap.judged, others[len(single) :])])
+    return check if check.best is not stated else _still(overlap, check)
+
+
+def _compared(overlap: _Overlap, tried: Sequence[Arrangement]) -> ArrangementCheck:
+    """The best of the arrangements tried against the first, which is stated."""
+    stated, stretches = tried[0], int(overlap.block.max()) + 1
+    likely = [one for one in tried if one is stated or one.plausible]
     best = max(likely, key=lambda one: stretches * one.gain_over(stated) - log(LIKELY_ODDS) * one.changes)
     if best.late_ms:
         near = [overlap.late(best.late_ms + step) for step in _CLOCK_STEPS_MS]
@@ -311,38 +333,96 @@ def check_arrangement(
         if len(one.corrections) == 1
     }
     log_odds = stretches * best.gain_over(stated) - log(len(tried))
-    contradicting = best.explained < MOST_EXPLAINED and best.lasting > MOST_LASTING
     if best is stated or log_odds < log(LIKELY_ODDS):
-        return ArrangementCheck(stated, stated, 0.0, excluded, contradicting)
-    return ArrangementCheck(stated, best, log_odds, excluded, asked_ms=latency_ms)
+        return ArrangementCheck(stated, stated, 0.0, excluded, stated.contradicting)
+    return ArrangementCheck(stated, best, log_odds, excluded, asked_ms=overlap.latency_ms)
 
 
-def check_briefly(selection: SelectedFrames, *, latency_ms: float = 0.0) -> ArrangementCheck | None:
-    """As `check_arrangement`, which goes beyond single corrections only where one of them or none fits."""
-    check = check_arrangement(selection, latency_ms=latency_ms, most_changes=1)
-    if check is None or check.best.late_ms or (check.best is check.stated and not check.contradicting):
+def _still(overlap: _Overlap, check: ArrangementCheck) -> ArrangementCheck:
+    """The check, or that the body moved where frames agree better then."""
+    stated, stretches = check.stated, int(overlap.block.max()) + 1
+    if stated.lasting < MOST_LASTING:
         return check
-    return check_arrangement(selection, latency_ms=latency_ms)
+    moved = overlap.swaying()
+    log_odds = stretches * moved.gain_over(stated) - _SWAY_NUMBERS
+    if moved.sway_mm < LEAST_SWAY_MM or moved.gain_over(stated) < LEAST_SWAY_GAIN or log_odds < log(LIKELY_ODDS):
+        return check
+    return replace(check, best=moved, log_odds=log_odds, contradicting=False)
 
 
 def check_scan(
     scan: Scan, *, pressure_window_kpa: tuple[float, float] = PRESSURE_WINDOW_KPA, thorough: bool = True
-) -> ArrangementCheck | None:
-    """Check a scan as it is recorded, with its frames within the window: thoroughly or `check_briefly`.
+) -> ArrangementCheck:
+    """Check a scan as it is recorded, with its frames within the window.
 
     A scan without a frame that can be used is a `BadDataError`.
     """
     selection = select_frames(scan, pressure_window_kpa=pressure_window_kpa)
-    doubts = selection_doubts(selection, pressure_window_kpa=pressure_window_kpa)
-    check = check_arrangement(selection) if thorough else check_briefly(selection)
-    return None if check is None else replace(check, doubts=doubts)
+    doubts = scan_doubts(selection, pressure_window_kpa=pressure_window_kpa)
+    return replace(check_arrangement(selection, thorough=thorough), doubts=doubts)
 
 
-def _arrangements(scan: Scan, most_changes: int) -> list[Corrections]:
+def _arrangements(scan: Scan) -> list[Corrections]:
     """All corrections to try, the fewest first; of a lever arm that is none, none of the lever arm."""
     lever = _LEVER[:1] if np.allclose(scan.head.scanhead_from_tracker, np.eye(4)) else _LEVER
     every = [sum(parts, ()) for parts in product(_ARRAY, _FRAMES, lever, _ROTATIONS)]
-    return sorted((one for one in every if len(one) <= most_changes), key=len)
+    return sorted((one for one in every if len(one) <= MOST_CHANGES), key=len)
+
+
+_NOT_JUDGED: Final = Arrangement((), spread=0.0, explained=0.0, lasting=0.0, agreement=0.0)
+_TOO_SHORT: Final = ArrangementCheck(_NOT_JUDGED, _NOT_JUDGED, 0.0, {})
+
+
+def _varying(coarse: CoarseFrames) -> FloatArray:
+    """(m, k) averaged readings without a level, slopes and curvatures of each frame and an offset of each block of
+    taxels: what they say of the breast, and noise.
+    """
+    rest = coarse.pressure - (coarse.pressure @ coarse.basis) @ coarse.basis.T
+    return np.asarray(rest - rest.mean(axis=0))
+
+
+def _lasting(values: FloatArray) -> float:
+    """Correlation of (m, k) values from one averaged frame to the next."""
+    square = float(np.sum(values**2))
+    return float(np.sum(values[1:] * values[:-1])) / square if square else 0.0
+
+
+def _levelled(varying: FloatArray, basis: FloatArray, cell: IndexArray) -> FloatArray:
+    """(m k,) readings without what frames and taxels add to one common map, which stays in.
+
+    The least-squares fit of all three by conjugate gradients (Hestenes & Stiefel 1952): by turns it would take
+    hundreds of rounds, and what is left of it looks as if frames contradicted each other.
+    """
+    scale = 1 / np.sqrt(np.maximum(np.bincount(cell), 1))
+    of_taxel = 1 / np.sqrt(len(varying))
+
+    def shares(rest: FloatArray) -> list[FloatArray]:
+        sums = np.bincount(cell, rest.reshape(-1), len(scale))
+        return [rest @ basis, of_taxel * rest.sum(axis=0), scale * sums]
+
+    rest, added = varying.copy(), np.zeros_like(varying)
+    left = step = shares(rest)
+    square = sum(float(np.sum(one**2)) for one in left)
+    for _ in range(_FIT_STEPS):
+        head = step[0] @ basis.T + of_taxel * step[1]
+        change = head + (scale * step[2])[cell].reshape(rest.shape)
+        length = float(np.sum(change**2))
+        if not length:
+            break
+        rest -= square / length * change
+        added += square / length * head
+        left, before = shares(rest), square
+        square = sum(float(np.sum(one**2)) for one in left)
+        step = [one + square / before * last for one, last in zip(left, step, strict=True)]
+    return np.asarray((varying - added).reshape(-1))
+
+
+def _sway(wave: FloatArray, cells: Cells, values: FloatArray, error: FloatArray) -> tuple[float, FloatArray]:
+    """How much less the squared errors are for moves of (m, 2) cosine and sine, and the (2, 2) moves by each, mm."""
+    slope = cells.gradient(values).reshape(len(wave), -1, 2)
+    design = np.einsum("ma,mki->mkai", wave, slope).reshape(len(error), 4)
+    moves = np.linalg.lstsq(design, error, rcond=None)[0]
+    return float(error @ (design @ moves)), moves.reshape(2, 2)
 
 
 class _Overlap(Record, eq=False):
@@ -382,28 +462,48 @@ class _Overlap(Record, eq=False):
 
     def judged(self, corrections: Corrections) -> Arrangement:
         """Predict each averaged reading by those of other times in its cell of the plane."""
+        return self._fitted(corrections)[0]
+
+    def swaying(self) -> Arrangement:
+        """What is stated, of a body that moves to and fro along its skin: at the best rate, by Gauss-Newton steps."""
+        time_s = block_means(self.scan.frames.time_s[self.frames, None], self.coarse[0].first)
+        still = self._fitted(())[1:]
+        waves = {rate: np.hstack([np.cos(turn := 2 * np.pi * rate * time_s), np.sin(turn)]) for rate in _SWAYS_HZ}
+        moved = []
+        for rate in sorted(waves, key=lambda rate: _sway(waves[rate], *still)[0])[-_SWAYS_TRIED:]:
+            sway, (cells, values, error) = np.zeros((2, 2)), still
+            for _ in range(_SWAY_STEPS):
+                sway += _sway(waves[rate], cells, values, error)[1]
+                made, cells, values, error = self._fitted((), (waves[rate] @ sway)[:, None])
+            moved.append(replace(made, sway_mm=2 * float(np.linalg.norm(sway, 2)), sways_a_minute=60 * rate))
+        return min(moved, key=lambda one: one.spread)
+
+    def _fitted(
+        self, corrections: Corrections, moves_mm: FloatArray | float = 0.0
+    ) -> tuple[Arrangement, Cells, FloatArray, FloatArray]:
+        """The arrangement judged with places moved by (m, 1, 2), the cells, levelled readings, and their errors."""
         coarse = self.coarse["transposed" in corrections]
         places, agreement = self._places_mm(corrections)
-        cells = Cells.of([places])
-        nuisance = Nuisance.of([coarse], cells.number)
-        values = nuisance.levelled(coarse.pressure.reshape(-1), cells)
-        values -= values.mean()
-        block = self.block[nuisance.frame]
-        size = int(cells.number.max()) + 1
-        together = block * size + cells.number  # readings of one block in one cell
-        total, count = np.bincount(cells.number, values), np.bincount(cells.number)
-        others = count[cells.number] - np.bincount(together)[together]
-        predicted = total[cells.number] - np.bincount(together, values)[together]
+        cells = Cells.of([places + moves_mm])
+        cell = cells.number
+        varying = _varying(coarse)
+        values = _levelled(varying, coarse.basis, cell)
+        block = np.repeat(self.block, varying.shape[1])
+        size = int(cell.max()) + 1
+        together = block * size + cell  # readings of one block in one cell
+        total, count = np.bincount(cell, values), np.bincount(cell)
+        others = count[cell] - np.bincount(together)[together]
+        predicted = total[cell] - np.bincount(together, values)[together]
         error = values - np.divide(predicted, others, out=np.zeros_like(predicted), where=others >= _LEAST_OTHERS)
-        by_frame = error.reshape(coarse.pressure.shape)
-        total_square, variance = float(error @ error), float(values @ values)
-        return Arrangement(
+        total_square, variance = float(error @ error), float(np.sum(varying**2))
+        made = Arrangement(
             corrections,
             spread=float(np.sqrt(total_square / len(error))),
             explained=1 - total_square / variance if variance else 0.0,
-            lasting=float(np.sum(by_frame[1:] * by_frame[:-1])) / total_square if total_square else 0.0,
+            lasting=_lasting(error.reshape(varying.shape)),
             agreement=agreement,
         )
+        return made, cells, values, error
 
     def _places_mm(self, corrections: Corrections) -> tuple[FloatArray, float]:
         """(m, k, 2) places of the averaged readings on the plane in which they lie, and how the face agrees with it."""

@@ -13,7 +13,7 @@ from tactile_bayes.findings import Finding, by_weight
 from tactile_bayes.geometry import BoolArray, FloatArray, Plane, apply, inverse, patient_from_plane
 from tactile_bayes.mapping.accumulate import GAIN_TOLERANCE, Accumulated, accumulate, add_all, sources_of
 from tactile_bayes.mapping.accumulate import flat_field as find_flat_field
-from tactile_bayes.mapping.arrangement import check_briefly
+from tactile_bayes.mapping.arrangement import check_arrangement
 from tactile_bayes.mapping.cells import MAX_POSE_GAP_MS, CellSums, HeadMoments, head_moments, yaw_deg
 from tactile_bayes.mapping.convention import check_convention, convention_findings, hint
 from tactile_bayes.mapping.errors import pose_noise_figures, shared_frame_figures
@@ -233,13 +233,13 @@ def _of_arrangement(
     """Findings on how each scan is arranged; where another arrangement than the one stated is sure, it is refused."""
     findings = []
     for number, one in enumerate(selections, start=1):
-        check = check_briefly(one, latency_ms=late_ms)
-        if refuse and check is not None and check.refused:
+        check = check_arrangement(one, latency_ms=late_ms, thorough=False)
+        if refuse and check.refused:
             which = f"scan {number}: " if len(selections) > 1 else ""
             raise BadDataError(f"{which}{check.words}", way_out=f"{check.remedy}, or map it with --as-stated")
-        if check is not None:
+        if not check.too_short:
             figures["arrangement_log_odds"] = max(check.log_odds, figures.get("arrangement_log_odds", 0.0))
-        findings.append(() if check is None else check.findings_of(one.scan))
+        findings.append(check.findings_of(one.scan))
     return findings[0] if all(one == findings[0] for one in findings) else _numbered(findings)
 
 

@@ -16,6 +16,7 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 from campaign_files import (
@@ -33,6 +34,7 @@ from campaign_files import (
 )
 from in_process import run_here
 from plain_reports import estimate_report
+from scipy.io import savemat
 
 import tactile_bayes as tb
 from tactile_bayes.campaigns.inputs import open_campaign
@@ -470,12 +472,17 @@ def test_masses_that_were_not_excised_are_left_out_of_the_trial_by_name(finished
 def test_arrays_and_maps_are_exams_too(undisturbed: Path, own: Path) -> None:
     scan = thinned(1, 4)
     np.savez(own / "arrays.npz", **arrays_of(scan))
+    savemat(own / "arrays.mat", arrays_of(thinned(2, 4)))
+    with h5py.File(own / "short.h5", "w") as file:
+        file["counts"] = scan.frames.counts
     shutil.copy(undisturbed / "exams" / "09.v1.m1.r1" / "map.nc", own / "map.nc")
     shutil.copy(own / "map.nc", own / "map2.nc")
-    rows = [("arrays.npz", "20", 1, "left"), ("map.nc", "09", 1, "right")]
-    write_table(own / "exams.csv", rows)
+    rows = [("arrays.npz", "20", 1, "left"), ("map.nc", "09", 1, "right"), ("arrays.mat", "21", 1, "left")]
+    write_table(own / "exams.csv", [*rows, ("short.h5", "22", 1, "left")])
     done = run_here("campaign", "run", "exams.csv", "-o", "out", *FAST, cwd=own)
-    assert "2 exams: 2 sized" in done.stdout, done.stdout + done.stderr
+    assert "4 exams: 3 sized, 0 without a size, 1 failed" in done.stdout, done.stdout + done.stderr
+    told = run_here("import", "short.h5", "-o", "short.mcap", cwd=own).stderr
+    assert rows_of(own / "out" / "failures.csv")[0]["reason"].partition(";")[0] in told  # the same words
     assert (own / "out/exams/09.v1.m1.r1/map.nc").read_bytes() == (own / "map.nc").read_bytes()
     run_here("import", "arrays.npz", "-o", "arrays.mcap", cwd=own)
     assert (own / "out/exams/20.v1.m1.r1/scan.mcap").read_bytes() == (own / "arrays.mcap").read_bytes()

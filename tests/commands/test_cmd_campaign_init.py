@@ -175,7 +175,8 @@ def named(folder: Path, *names: str) -> None:
     for number, name in enumerate(names):
         path = folder / "Studie 1" / name
         path.parent.mkdir(parents=True, exist_ok=True)
-        np.savez(path, **arrays_of(thinned(number, 40)))
+        with path.open("wb") as file:
+            np.savez(file, **arrays_of(thinned(number, 40)))
 
 
 def told(folder: Path, *columns: str) -> list[tuple[str, ...]]:
@@ -186,7 +187,7 @@ def told(folder: Path, *columns: str) -> list[tuple[str, ...]]:
     ("pattern", "names", "expected"),
     [
         ("{patient}_{visit}_{exam}.npz", ("P01_2_02.npz", "P01_2_1.npz"), [("P01", "2", "2"), ("P01", "2", "1")]),
-        ("{patient}_{visit}_{exam}", ("P-1_a_7.npz",), [("P-1", "a", "7")]),
+        ("{patient}_{visit}_{exam}", ("P-1_a_7.mat",), [("P-1", "a", "7")]),
         ("{patient}/visit{visit}-{exam}.npz", ("P01/visit2-1.npz", "P02/visit1-1.npz"),
          [("P01", "2", "1"), ("P02", "1", "1")]),
         ("scan*_{patient}_{visit}", ("scan 17 neu_P01_3.npz",), [("P01", "3", "1")]),

@@ -16,8 +16,9 @@ from tactile_bayes.api.estimating import estimate_one
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import CANNOT_SHOW, BadDataError
+from tactile_bayes.mapping.arrangement import check_scan
 from tactile_bayes.mapping.build import build_map
-from tactile_bayes.mapping.plausibility import exam_findings, map_findings, scan_doubts
+from tactile_bayes.mapping.plausibility import exam_findings, map_findings
 from tactile_bayes.mapping.select import find_faults
 from tactile_bayes.posterior.verdict import no_verdict
 from tactile_bayes.scans import ElementCalibration, HeadGeometry, Landmarks, PressureFrames, Scan, TrackerPoses
@@ -111,6 +112,10 @@ UNLIKE: dict[str, tuple[Callable[[Scan], Scan], str]] = {
         "left out for taxels at",
     ),
     "rounded to kPa": (counts(lambda c: np.rint(c * KPA_PER_COUNT), gain=1 / KPA_PER_COUNT), "one count is"),
+    "noise alone": (
+        counts(lambda c: np.random.default_rng(5).normal(2300, 150, c.shape)),
+        "jump about as noise does",
+    ),
     "readings stand still": (counts(frozen), "readings stand still"),
     "hardly a frame in the window": (counts(light), "frames are used ("),
     "places in m": (moved(1e-3), "the head stood still"),
@@ -144,7 +149,7 @@ def test_an_estimate_from_it_says_that_it_cannot_show_a_lump(name: str) -> None:
 @pytest.mark.parametrize("amplitude", [0.0, 0.6])
 def test_a_right_scan_is_not_doubted(amplitude: float) -> None:
     right = scan(amplitude)
-    assert scan_doubts(right, pressure_window_kpa=WINDOW) == ()
+    assert check_scan(right, pressure_window_kpa=WINDOW, thorough=False).doubts == ()
     assert not [one for one in build_map(right).findings if one.kind in ("unlike_an_exam", "unusual_scan")]
 
 
@@ -175,9 +180,8 @@ UNUSUAL: dict[str, tuple[Callable[[Scan], Scan], str]] = {
 @pytest.mark.parametrize(("made", "told"), UNUSUAL.values(), ids=UNUSUAL)
 def test_what_hides_no_lump_is_told_and_leaves_the_verdict(made: Callable[[Scan], Scan], told: str) -> None:
     one = made(scan(0.0))
-    assert any(
-        told in each.text for each in scan_doubts(one, pressure_window_kpa=WINDOW) if each.kind == "unusual_scan"
-    )
+    doubts = check_scan(one, pressure_window_kpa=WINDOW, thorough=False).doubts
+    assert any(told in each.text for each in doubts if each.kind == "unusual_scan")
     why = no_verdict(build_map(one))
     assert why is None or told not in why.reason
 
