@@ -226,10 +226,7 @@ def estimate_latency(
     if not parts:
         raise _undetermined("no frame has a pose at every delay")
     latency, fit = _solved(parts)
-    strokes = _strokes(parts, latency)
-    regression = _Regression.of(fit, parts, latency, strokes)
-    noise = pose_noise_figures(selections, plane, cell_mm=cell_mm)
-    estimate = regression.estimate(latency, noise, sum(len(part.coarse.frames) for part in parts))
+    estimate = _with_error(latency, fit, parts, pose_noise_figures(selections, plane, cell_mm=cell_mm))
     if not estimate.sd_ms < MOST_SD_MS:
         raise _undetermined(_lack(estimate))
     return estimate
@@ -318,62 +315,38 @@ def _strokes(parts: Sequence[_Part], latency_ms: float) -> tuple[IndexArray, Flo
     return np.concatenate(labels), np.concatenate(ways)
 
 
-class _Regression(Record, eq=False):
-    """The regression at the latency found, and the groups that its errors are shared in."""
+def _with_error(latency_ms: float, fit: ShiftFit, parts: Sequence[_Part], noise: dict[str, float]) -> LatencyEstimate:
+    """The latency with its standard error, bound, and crossings of a lump."""
+    frames = sum(len(part.coarse.frames) for part in parts)
+    moves, frame = [part.moves_mm(latency_ms) for part in parts], fit.frame_numbers()
+    label, ways = _strokes(parts, latency_ms)
+    stroke, count = label[frame], len(ways)
+    block = numbered_on([part.coarse.blocks(part.selection.scan.frames.time_s) for part in parts])[frame]
+    design = fit.design(moves)
+    information = float(design @ design)
+    halves = [fit.of_some(block % 2 == half).design(moves) for half in (0, 1)]
+    true_share = min(1.0, float(halves[0] @ halves[1]) / information) if information > 0 else 0.0
+    felt = np.bincount(stroke, fit.raw_design(moves) ** 2, count)
+    crosses = felt > _CROSSES * felt.max()
+    crossings = (int(np.sum(crosses & (ways > 0))), int(np.sum(crosses & (ways < 0))))
+    if true_share <= 0.0 or count < LEAST_STROKES:
+        return LatencyEstimate(latency_ms, np.inf, np.inf, frames, crossings)
+    bound = _bound(fit, design, noise)
+    scores = np.bincount(stroke, design * fit.data, count)
+    told = np.bincount(stroke, design**2, count)
+    without = (scores.sum() - scores) / np.maximum(information - told, 1e-300)  # each stroke: the others' information
+    between_strokes = float(np.sqrt((count - 1) / count * float(np.sum((without - without.mean()) ** 2))))
+    between_blocks = float(np.linalg.norm(np.bincount(block, design * fit.data))) / information
+    error = np.sqrt((count - 1) / (count - 3)) * max(bound, between_strokes, between_blocks)
+    return LatencyEstimate(latency_ms, error / true_share, bound / true_share, frames, crossings)
 
-    fit: ShiftFit  #: Source of the readings and their gradient.
-    design: FloatArray
-    halves: FloatArray
-    """`design`, `halves` (n,), (2, n) arrays: Design of the latency with the whole gradient, and with those of two
-    halves of the strokes."""
-    raw: FloatArray  #: (n,) array: Design within frames, with the map left in.
-    stroke: IndexArray
-    block: IndexArray
-    """`stroke`, `block` (frames,) int arrays: Of each averaged frame."""
-    ways: FloatArray  #: (strokes,) array.
 
-    @classmethod
-    def of(
-        cls, fit: ShiftFit, parts: Sequence[_Part], latency_ms: float, strokes: tuple[IndexArray, FloatArray]
-    ) -> _Regression:
-        moves = [part.moves_mm(latency_ms) for part in parts]
-        label, ways = strokes
-        block = numbered_on([part.coarse.blocks(part.selection.scan.frames.time_s) for part in parts])
-        even = (block % 2 == 0)[fit.frame_numbers()]
-        halves = np.array([fit.of_some(keep).design(moves) for keep in (even, ~even)])
-        return cls(fit, fit.design(moves), halves, fit.raw_design(moves), label, block, ways)
-
-    def estimate(self, latency_ms: float, noise: dict[str, float], frames: int) -> LatencyEstimate:
-        """Latency with its standard error, bound, and crossings of a lump."""
-        information = float(self.design @ self.design)
-        true_share = min(1.0, float(self.halves[0] @ self.halves[1]) / information) if information > 0 else 0.0
-        told = np.bincount(self.stroke[self.fit.frame_numbers()], self.raw**2, len(self.ways))
-        crosses = told > _CROSSES * told.max()
-        crossings = (int(np.sum(crosses & (self.ways > 0))), int(np.sum(crosses & (self.ways < 0))))
-        if true_share <= 0.0 or len(self.ways) < LEAST_STROKES:
-            return LatencyEstimate(latency_ms, np.inf, np.inf, frames, crossings)
-        bound = self._bound(information, noise)
-        widened = np.sqrt((len(self.ways) - 1) / (len(self.ways) - 3))
-        by_block = np.bincount(self.block[self.fit.frame_numbers()], self.design * self.fit.data)
-        between_blocks = float(np.linalg.norm(by_block)) / information
-        error = widened * max(bound, self._between_strokes(information), between_blocks)
-        return LatencyEstimate(latency_ms, error / true_share, bound / true_share, frames, crossings)
-
-    def _between_strokes(self, information: float) -> float:
-        """Jackknife: each stroke left out, the others' information kept."""
-        stroke, count = self.stroke[self.fit.frame_numbers()], len(self.ways)
-        scores = np.bincount(stroke, self.design * self.fit.data, count)
-        told = np.bincount(stroke, self.design**2, count)
-        without = (scores.sum() - scores) / np.maximum(information - told, 1e-300)
-        variance = (count - 1) / count * float(np.sum((without - without.mean()) ** 2))
-        return float(np.sqrt(variance))
-
-    def _bound(self, information: float, noise: dict[str, float]) -> float:
-        """Standard error from independent errors of readings, and of the frames' places as the tracker tells them."""
-        readings = float(self.fit.data.var()) / information
-        if POSE_NOISE[0] not in noise:
-            return float(np.sqrt(readings))
-        frame = self.fit.frame_numbers()
-        leverage = [np.bincount(frame, self.design * slope) for slope in self.fit.gradient.T]
-        places = sum(noise[name] ** 2 * float(one @ one) for name, one in zip(POSE_NOISE[:2], leverage, strict=True))
-        return float(np.sqrt(readings + places / information**2))
+def _bound(fit: ShiftFit, design: FloatArray, noise: dict[str, float]) -> float:
+    """Standard error from independent errors of readings, and of the frames' places as the tracker tells them."""
+    information = float(design @ design)
+    readings = float(fit.data.var()) / information
+    if POSE_NOISE[0] not in noise:
+        return float(np.sqrt(readings))
+    leverage = [np.bincount(fit.frame_numbers(), design * slope) for slope in fit.gradient.T]
+    places = sum(noise[name] ** 2 * float(one @ one) for name, one in zip(POSE_NOISE[:2], leverage, strict=True))
+    return float(np.sqrt(readings + places / information**2))
