@@ -272,12 +272,8 @@ def fault_lines(outcomes: Iterable[Outcome[Any]]) -> list[str]:
     for one in outcomes:
         if not one.ok:
             names.setdefault(one.error, []).append(one.key)
-    return [f"{_listed(keys)}: {error}" for error, keys in names.items()]
-
-
-def _listed(names: Sequence[str]) -> str:
-    more = len(names) - _LISTED
-    return ", ".join(names[:_LISTED]) + (f" and {more} more" if more > 0 else "")
+    more = {error: f" and {len(keys) - _LISTED} more" if len(keys) > _LISTED else "" for error, keys in names.items()}
+    return [f"{', '.join(keys[:_LISTED])}{more[error]}: {error}" for error, keys in names.items()]
 
 
 def run_batch(

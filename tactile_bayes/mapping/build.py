@@ -14,7 +14,7 @@ from tactile_bayes.geometry import BoolArray, FloatArray, Plane, apply, inverse,
 from tactile_bayes.mapping.accumulate import GAIN_TOLERANCE, Accumulated, accumulate, add_all, sources_of
 from tactile_bayes.mapping.accumulate import flat_field as find_flat_field
 from tactile_bayes.mapping.arrangement import check_arrangement
-from tactile_bayes.mapping.cells import MAX_POSE_GAP_MS, CellSums, HeadMoments, head_moments, yaw_deg
+from tactile_bayes.mapping.cells import MAX_POSE_GAP_MS, CellSums, HeadMoments, head_moments
 from tactile_bayes.mapping.convention import check_convention, convention_findings, hint
 from tactile_bayes.mapping.errors import pose_noise_figures, shared_frame_figures
 from tactile_bayes.mapping.latency import estimate_latency
@@ -104,7 +104,8 @@ def plane_figures(selections: Sequence[SelectedFrames], plane: Plane) -> dict[st
     for part in selections:
         poses, tracker_from_head = part.poses.part(part.used), inverse(part.scan.head.scanhead_from_tracker)
         normals.append((poses.rotation * tracker_from_head[:3, 2]).sum(axis=2).sum(axis=0))
-        yaws.append(yaw_deg(part.scan.head, poses.rotation, plane_from_base=transform))
+        x_axis = (poses.rotation * tracker_from_head[:3, 0]).sum(axis=2) @ transform[:2, :3].T
+        yaws.append(np.degrees(np.arctan2(x_axis[:, 1], x_axis[:, 0])))
         centres.append(apply(transform, poses.places_mm(tracker_from_head[:3, 3])))
     normal = np.sum(normals, axis=0)
     tilt = np.arctan2(np.linalg.norm(np.cross(transform[2, :3], normal)), transform[2, :3] @ normal)

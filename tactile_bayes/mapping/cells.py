@@ -462,13 +462,6 @@ class Projector:
         return Projection(self._taxels, np.ascontiguousarray(matrix.transpose(2, 0, 1)), self._cell_mm)
 
 
-def yaw_deg(head: HeadGeometry, rotation: FloatArray, *, plane_from_base: FloatArray) -> FloatArray:
-    """(n,) angle of the head's x axis on the plane from the plane's x axis, degrees."""
-    axis = inverse(head.scanhead_from_tracker)[:3, 0]
-    on_plane = (rotation * axis).sum(axis=2) @ plane_from_base[:2, :3].T
-    return np.asarray(np.degrees(np.arctan2(on_plane[:, 1], on_plane[:, 0])))
-
-
 # --- Conversion of counts to pressures in whole multiples of a tiny step, so that sums have no rounding error.
 
 # Gains and offsets are rounded to this (kPa): 6e-11. Counts below 2^16 times such a gain, plus such an offset, and the
@@ -494,15 +487,6 @@ class Readout(Record, eq=False, dict=True):
         plain = min(float(room.min(initial=np.inf)) - 1, self.full_count - 1, 65535)
         sound = bool((self.offset_kpa < PRESSURE_RANGE_KPA[1]).all())
         return int(max(plain, -1)) if sound else -1
-
-    @cached_property
-    def never_negative(self) -> bool:
-        """True where no count gives a pressure below 0."""
-        return bool(self.offset_kpa.min(initial=0.0) >= 0)
-
-    @cached_property
-    def _ones(self) -> FloatArray:
-        return np.ones(len(self.taxels))
 
     @classmethod
     def of(cls, calibration: ElementCalibration, good: BoolArray) -> Readout:
@@ -535,10 +519,10 @@ class Readout(Record, eq=False, dict=True):
         # Sums of whole steps: any order of adding gives the same bits, so a matrix product may do it.
         if valid is None and len(self.taxels):
             share = np.full(len(pressure), len(self.taxels) / self.size)
-            return pressure @ self._ones / len(self.taxels), share
+            return pressure @ np.ones(len(self.taxels)) / len(self.taxels), share
         valid = np.ones(pressure.shape, dtype=bool) if valid is None else valid
         number = valid.sum(axis=1)
-        total = np.where(valid, pressure, 0.0) @ self._ones
+        total = np.where(valid, pressure, 0.0) @ np.ones(len(self.taxels))
         level = np.full(len(total), np.nan)
         np.divide(total, number, out=level, where=number > 0)
         return level, number / self.size
@@ -573,7 +557,7 @@ def add_frames(
     first, shape = projection.block()
     flat = projection.flat(first, shape)
     # valid readings lie below the range of the sensor: where none can be negative or clipped, none is looked at
-    bounded = readout.never_negative and PRESSURE_RANGE_KPA[1] / VALUE_STEP < LIMIT_STEPS * float(level.min())
+    bounded = readout.offset_kpa.min() >= 0 and PRESSURE_RANGE_KPA[1] / VALUE_STEP < LIMIT_STEPS * float(level.min())
     if valid is None:
         sums.add_steps(first, shape, flat, steps, bounded=bounded)
     elif valid.any():

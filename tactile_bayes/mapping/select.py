@@ -415,7 +415,10 @@ def select_frames(
     faults = find_faults(scan)
     _refuse_dead(scan, faults)
     poses = poses_at(scan.poses, scan.frames.time_s, latency_ms=latency_ms, max_gap_ms=max_pose_gap_ms)
-    level, share = _levels(scan, good_taxels(scan.head.shape, faults))
+    readout = Readout.of(scan.element_calibration, good_taxels(scan.head.shape, faults))
+    level, share = np.full(len(scan.frames), np.nan), np.zeros(len(scan.frames))
+    for part in chunks(len(scan.frames), chunk_frames(readout.size)):
+        level[part], share[part] = readout.levels(*readout.pressure_kpa(readout.counts(scan.frames.counts[part])))
     low, high, used = gate(poses.known, level, share, pressure_window_kpa=pressure_window_kpa)
     return SelectedFrames(scan, faults, poses, level, share, low, high, used)
 
@@ -427,16 +430,6 @@ def gate(
     candidate = known & (valid_share >= VALID_SHARE)
     low, high = candidate & (level_kpa < pressure_window_kpa[0]), candidate & (level_kpa > pressure_window_kpa[1])
     return low, high, candidate ^ (low | high)
-
-
-def _levels(scan: Scan, good: BoolArray) -> tuple[FloatArray, FloatArray]:
-    """Mean over the valid taxels and share of valid taxels of each frame."""
-    readout = Readout.of(scan.element_calibration, good)
-    level, share = np.full(len(scan.frames), np.nan), np.zeros(len(scan.frames))
-    for part in chunks(len(scan.frames), chunk_frames(good.size)):
-        counts = readout.counts(scan.frames.counts[part])
-        level[part], share[part] = readout.levels(*readout.pressure_kpa(counts))
-    return level, share
 
 
 def _refuse_dead(scan: Scan, faults: tuple[TaxelFault, ...]) -> None:
@@ -548,7 +541,10 @@ def frame_figures(selections: Sequence[SelectedFrames]) -> dict[str, float]:
         "dropped_low": sum(int(part.low.sum()) for part in selections),
         "dropped_high": sum(int(part.high.sum()) for part in selections),
         "masked_taxels": sum(len(part.faults) for part in selections),
-        "saturated_readings": sum(_saturated(part) for part in selections),
+        "saturated_readings": sum(  # of good taxels in used frames
+            int(np.rint((part.good_taxels.sum() - part.valid_share[part.used] * part.good_taxels.size).sum()))
+            for part in selections
+        ),
     }
     levels = np.concatenate([part.level_kpa[part.used] for part in selections])
     felt = np.concatenate([part.level_kpa[part.used | part.low | part.high] for part in selections])
@@ -559,9 +555,3 @@ def frame_figures(selections: Sequence[SelectedFrames]) -> dict[str, float]:
         "level_p05_kpa": float(low),
         "level_p95_kpa": float(high),
     }
-
-
-def _saturated(part: SelectedFrames) -> int:
-    """Number of full-scale readings of good taxels in used frames."""
-    good = int(part.good_taxels.sum())
-    return int(np.rint((good - part.valid_share[part.used] * part.good_taxels.size).sum()))
