@@ -26,8 +26,8 @@ from tactile_bayes.forward.mesh import (
     gathered,
     lagrange_points,
     lump_mesh,
+    moved,
     quadrature,
-    solved,
     stiffness_factor,
 )
 from tactile_bayes.forward.tissue import Layers, SceneBody
@@ -384,12 +384,8 @@ def _condense(mesh: LumpMesh, elements: FloatArray, modulus_kpa: FloatArray, ord
 
     outer, used = _assemble(mesh, stiffness, modulus_kpa, ~inside, number, sign)
     at = np.searchsorted(used, boundary)
-    unit = np.zeros((len(used), len(at)))
-    unit[at, np.arange(len(at))] = 1.0
-    moved = solved(outer, unit)
-    sinking = number[_skin(mesh), 2]
-    skin = moved[np.searchsorted(used, sinking)]
-    flexibility = moved[at]
+    by_rim = moved(outer, at)
+    skin = by_rim[np.searchsorted(used, number[_skin(mesh), 2])]
 
     def core(kpa: FloatArray) -> FloatArray:
         matrix, used = _assemble(mesh, stiffness, kpa, inside, number, sign)
@@ -398,7 +394,7 @@ def _condense(mesh: LumpMesh, elements: FloatArray, modulus_kpa: FloatArray, ord
 
     lump, within = core(np.ones_like(modulus_kpa)), modulus_kpa[inside]
     original = within[0] * lump if (within == within[0]).all() else core(modulus_kpa)
-    return CondensedHole((flexibility + flexibility.T) / 2, skin, lump, original)
+    return CondensedHole(by_rim[at], skin, lump, original)
 
 
 def _assemble(

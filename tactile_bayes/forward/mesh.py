@@ -497,6 +497,15 @@ def solved(matrix: csc_array, sides: FloatArray) -> FloatArray:
     return np.asarray(factor.solve(sides))
 
 
+def moved(matrix: csc_array, on: IndexArray) -> FloatArray:
+    """(n, b) displacements by a unit force on each of the unknowns `on`; symmetric between those."""
+    force = np.zeros((matrix.shape[0], len(on)))
+    force[on, np.arange(len(on))] = 1.0
+    found = solved(matrix, force)
+    found[on] = 0.5 * (found[on] + found[on].T)
+    return found
+
+
 def condensed(matrix: csc_array, on: IndexArray, inner: IndexArray) -> FloatArray:
     """Stiffness condensed onto the unknowns `on`, the inner ones free (Guyan 1965: exact in statics)."""
     coupling = matrix[inner][:, on].toarray()

@@ -16,8 +16,8 @@ from tactile_bayes.forward.mesh import (
     condensed,
     disc_mesh,
     gathered,
+    moved,
     quadrature,
-    solved,
     stiffness_factor,
 )
 from tactile_bayes.forward.mesh import IndexArray as IntArray
@@ -183,7 +183,10 @@ def condense(
     disc = disc_mesh(body, fineness=fineness, layered=False)
     cut = body.seat < 1.0 and body.gland_ratio != 1.0  # the lump, by the fat-gland boundary
     filling = disc_mesh(body, fineness=fineness, layered=True) if cut else disc
-    stiffness = [assemble(mesh, young_kpa=_tissue(mesh, body), poisson=body.poisson) for mesh in (hole, filling)]
+    stiffness = [
+        assemble(mesh, young_kpa=np.where(mesh.gland, body.gland_ratio, 1.0) * body.fat_kpa, poisson=body.poisson)
+        for mesh in (hole, filling)
+    ]
     unit = assemble(disc, young_kpa=np.ones(len(disc.elements)), poisson=body.poisson)
     even, odd = (
         CondensedHole(
@@ -194,11 +197,6 @@ def condense(
         for even in (True, False)
     )
     return SurfaceCompliance(body, np.concatenate([-half[:0:-1], half]), row, even, odd)
-
-
-def _tissue(mesh: QuadMesh, body: Body) -> FloatArray:
-    """(m,) Young's modulus of each element in kPa."""
-    return np.where(mesh.gland, body.gland_ratio, 1.0) * body.fat_kpa
 
 
 def rim_nodes(body: Body, *, fineness: int) -> int:
@@ -234,16 +232,14 @@ def _hole_compliance(
     place = np.full(len(held), -1)
     place[free] = np.arange(len(free))
     rim = _rim_unknowns(mesh, body, held)
-    load = np.zeros((len(free), len(rim)))
-    load[place[rim], np.arange(len(rim))] = 1.0
-    solution = solved(stiffness[free][:, free], load)
+    solution = moved(stiffness[free][:, free], place[rim])
     skin = np.flatnonzero(z < 1e-9 * body.layers.thickness_mm)
     skin = skin[np.argsort(x[skin])]
     vertical = place[2 * skin + 1]
     lowered = np.where(vertical[:, None] >= 0, solution[vertical], 0.0)
     average = skin_average(x[skin], edges_mm=edges_mm, even=even)
     at_rim = solution[place[rim]]
-    return 0.5 * (at_rim + at_rim.T), average @ lowered
+    return at_rim, average @ lowered
 
 
 def _rim_unknowns(mesh: QuadMesh, body: Body, held: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]) -> IntArray:

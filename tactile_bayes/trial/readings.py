@@ -204,18 +204,13 @@ def gather(readings: Iterable[Reading], ex_vivo_mm: Mapping[MassKey, float]) -> 
     Readings come in any order; each mass must be in `ex_vivo_mm`.
     """
     ordered = sorted(readings, key=lambda r: (r.modality != "tactile", r.modality, r.key, r.replicate))
-    number = patient_numbers(ex_vivo_mm)
+    number = {patient: index for index, patient in enumerate(sorted({patient for patient, _ in ex_vivo_mm}))}
     masses = mass_numbers(ex_vivo_mm)
     with np.errstate(over="ignore"):  # a figure of an overflown mean is refused where it is formed
         return {
             name: _gather_modality(name, list(group), ex_vivo_mm=ex_vivo_mm, number=number, masses=masses)
             for name, group in groupby(ordered, key=lambda r: r.modality)
         }
-
-
-def patient_numbers(masses: Iterable[MassKey]) -> dict[str, int]:
-    """Each patient's number, in order of the codes."""
-    return {patient: index for index, patient in enumerate(sorted({patient for patient, _ in masses}))}
 
 
 def mass_numbers(masses: Iterable[MassKey]) -> dict[MassKey, int]:

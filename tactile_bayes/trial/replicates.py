@@ -75,7 +75,8 @@ def components(y: FloatArray, mass: Index, reader: Index) -> Components:
     readers = int(reader.max()) + 1
     problem = _Problem(y - y.mean(), mass, reader)
     start = np.array([1.0, 0.3]) if readers > 1 else np.array([1.0])
-    theta = np.abs(_least(problem.criterion, start))
+    found = [_descend(problem.criterion, start * factor) for factor in (1.0, 0.2, 5.0)]
+    theta = np.abs(min(found, key=problem.criterion))
     residual = problem.residual_variance(theta)
     return Components(
         mass=_variance(theta[0], residual),
@@ -133,13 +134,8 @@ class _Problem:
         return max(0.0, self._solved(theta)[1]) / (self.n - 1)
 
 
-def _least(function: _Criterion, start: FloatArray) -> FloatArray:
-    """Minimum by Newton's method with finite differences, kept downhill; the best of a few starts."""
-    found = [_descend(function, start * factor) for factor in (1.0, 0.2, 5.0)]
-    return min(found, key=function)
-
-
 def _descend(function: _Criterion, theta: FloatArray) -> FloatArray:
+    """A minimum by Newton's method with finite differences, kept downhill."""
     value, k = function(theta), len(theta)
     for _ in range(60):
         h = 1e-4 * np.maximum(np.abs(theta), 1e-2)
