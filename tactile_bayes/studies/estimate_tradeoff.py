@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Generic, TypeVar
 
 import numpy as np
@@ -280,13 +280,34 @@ def settings_of(options: SamplerSettings, *, level_known: bool) -> list[Setting]
 
     `level_known` is whether the map has a background that the paper's least squares can be fixed at.
     """
-    return [
-        Setting(METHOD, f"--method {options.method}", options, default=True),
-        *_methods(options, level_known=level_known),
-        *_draws(options),
-        *(_fields(options) if options.correlated else ()),
-        *_windows(options),
-    ]
+    found = [Setting(METHOD, f"--method {options.method}", options, default=True)]
+    if options.method != "optimise":
+        level: Background = "fixed" if level_known else "free"
+        # another model: no noise field, no prior
+        plain = replace(
+            options, method="optimise", scene="auto", accuracy_mm=None, noise="independent", background=level
+        )
+        found.append(Setting(METHOD, "--method optimise", plain, 0.5, usable=False))
+    for method, weight in (("laplace", 1.0), ("importance", 1.0), ("ensemble", 8.0)):
+        if method != options.method:
+            found.append(Setting(METHOD, f"--method {method}", _by(options, method), weight))
+    for number in LAPLACE_DRAWS if options.correlated else ():
+        drawn = replace(_by(options, "laplace"), draws=number)
+        found.append(Setting(ACCURACY, f"laplace, {number} draws", drawn, usable=False))
+    for accuracy in ACCURACIES_SD:
+        drawn = _by(options, "importance", accuracy)
+        found.append(Setting(ACCURACY, f"--accuracy-sd {accuracy:g}", drawn, 1.0 + 0.005 / accuracy))
+    for accuracy in CHAIN_ACCURACIES_SD if options.correlated else ():
+        drawn = _by(options, "ensemble", accuracy)
+        found.append(Setting(ACCURACY, f"--method ensemble --accuracy-sd {accuracy:g}", drawn, 25.0))
+    for number in FIELDS if options.correlated else ():
+        finer, weight = replace(options, field_cosines=number), max(0.7, (number / 18.0) ** 3.2)
+        found.append(Setting(FIELD, f"field_cosines {number}", finer, weight, usable=False))
+    for radius in RADII_MM:
+        if radius != options.fit_radius_mm:
+            other = replace(options, fit_radius_mm=radius)
+            found.append(Setting(WINDOW, f"fit_radius_mm {radius:g}", other, usable=False))
+    return found
 
 
 def worth_trying(settings: list[Setting], answer: SizeAnswer) -> list[Setting]:
@@ -311,45 +332,6 @@ def _beside_chains(one: Setting) -> Setting:
     if one.axis in (FIELD, WINDOW):
         return replace(one, label=f"{one.label}, laplace", how=_by(one.how, "laplace"), weight=0.05 * one.weight)
     return replace(one, weight=0.2 * one.weight)
-
-
-def _methods(options: SamplerSettings, *, level_known: bool) -> Iterator[Setting]:
-    if options.method != "optimise":
-        level: Background = "fixed" if level_known else "free"
-        # another model: no noise field, no prior
-        plain = replace(
-            options, method="optimise", scene="auto", accuracy_mm=None, noise="independent", background=level
-        )
-        yield Setting(METHOD, "--method optimise", plain, 0.5, usable=False)
-    for method, weight in (("laplace", 1.0), ("importance", 1.0), ("ensemble", 8.0)):
-        if method != options.method:
-            yield Setting(METHOD, f"--method {method}", _by(options, method), weight)
-
-
-def _draws(options: SamplerSettings) -> Iterator[Setting]:
-    for number in LAPLACE_DRAWS:
-        drawn = replace(_by(options, "laplace"), draws=number)
-        if options.correlated:
-            yield Setting(ACCURACY, f"laplace, {number} draws", drawn, usable=False)
-    for accuracy in ACCURACIES_SD:
-        label = f"--accuracy-sd {accuracy:g}"
-        yield Setting(ACCURACY, label, _by(options, "importance", accuracy), 1.0 + 0.005 / accuracy)
-    for accuracy in CHAIN_ACCURACIES_SD if options.correlated else ():
-        label = f"--method ensemble --accuracy-sd {accuracy:g}"
-        yield Setting(ACCURACY, label, _by(options, "ensemble", accuracy), 25.0)
-
-
-def _fields(options: SamplerSettings) -> Iterator[Setting]:
-    for number in FIELDS:
-        finer = replace(options, field_cosines=number)
-        yield Setting(FIELD, f"field_cosines {number}", finer, max(0.7, (number / 18.0) ** 3.2), usable=False)
-
-
-def _windows(options: SamplerSettings) -> Iterator[Setting]:
-    for radius in RADII_MM:
-        if radius != options.fit_radius_mm:
-            other = replace(options, fit_radius_mm=radius)
-            yield Setting(WINDOW, f"fit_radius_mm {radius:g}", other, usable=False)
 
 
 def _by(options: SamplerSettings, method: Any, accuracy_sd: float | None = None) -> SamplerSettings:

@@ -155,27 +155,17 @@ def draw_body(prior: BodyPrior, rng: np.random.Generator) -> tuple[SceneBody, So
 
 def draw_exam(prior: ExamPrior, rng: np.random.Generator) -> Scene:
     """Draw one examination of a body; the lump lies in the middle, shifted by `off_centre_mm`."""
+
+    def drawn(*names: str) -> dict[str, Any]:
+        return {name: rng.uniform(*getattr(prior, name)) for name in names}
+
     lines = int(rng.integers(prior.lines[0], prior.lines[1] + 1))
-    mean, drift = rng.uniform(*prior.mean_kpa), rng.uniform(*prior.drift_kpa)
-    background = Background(mean_kpa=mean, drift_kpa=drift, drift_period_s=rng.uniform(1.5, 5.0))
-    strokes = Strokes(
-        lines=lines,
-        spacing_mm=rng.uniform(*prior.spacing_mm),
-        half_length_mm=rng.uniform(*prior.half_length_mm),
-        wander_mm=rng.uniform(*prior.wander_mm),
-        tilt_deg=rng.uniform(*prior.tilt_deg),
-        yaw_deg=rng.uniform(*prior.yaw_deg),
-    )
-    noise = Noise(
-        element_kpa=rng.uniform(*prior.element_kpa),
-        tracker_mm=rng.uniform(*prior.tracker_mm),
-        tracker_deg=rng.uniform(*prior.tracker_deg),
-        gain_share=rng.uniform(*prior.gain_share),
-    )
-    tracker = Tracker(latency_ms=rng.uniform(*prior.latency_ms))
-    duration = lines * rng.uniform(*prior.line_s)
+    background = Background(**drawn("mean_kpa", "drift_kpa"), drift_period_s=rng.uniform(1.5, 5.0))
+    strokes = Strokes(lines=lines, **drawn("spacing_mm", "half_length_mm", "wander_mm", "tilt_deg", "yaw_deg"))
+    noise = Noise(**drawn("element_kpa", "tracker_mm", "tracker_deg", "gain_share"))
+    tracker = Tracker(**drawn("latency_ms"))
     return Scene(
-        duration_s=duration,
+        duration_s=lines * rng.uniform(*prior.line_s),
         frame_rate_hz=FRAME_RATE_HZ,
         background=background,
         strokes=strokes,
