@@ -254,7 +254,7 @@ def figures(found: ModalitySizes, *, confidence: float) -> dict[str, Figure]:
     """Lower and upper limit in mm and as the logarithm of the ratio, for single readings of detected masses."""
     return {
         f"limit_{side}_{unit}": _limit(terms, sign, found, confidence=confidence)
-        for unit, terms in (("mm", _mm_terms), ("log_ratio", _log_terms))
+        for unit, terms in (("mm", partial(_terms, np.asarray)), ("log_ratio", partial(_terms, np.log)))
         for side, sign in (("low", -1), ("high", 1))
     }
 
@@ -262,25 +262,19 @@ def figures(found: ModalitySizes, *, confidence: float) -> dict[str, Figure]:
 def _limit(
     terms: Callable[[ModalitySizes], FloatArray], sign: int, found: ModalitySizes, *, confidence: float
 ) -> Figure:
+    """A limit; its corrected interval is from those of the mean and, on the log scale, of the SD (Zou 2013)."""
     plain = figure(SumStatistic(terms, partial(_end, sign), _ONE), found, scale="linear", confidence=confidence)
     if method_of(confidence) != "corrected" or plain.interval is None:
         return plain
     try:
-        return replace(plain, interval=_recovered_of_patients(terms, sign, found, confidence=confidence))
+        mean, around = _jackknifed(SumStatistic(terms, _mean, _ONE), found, scale="linear", confidence=confidence)
+        sd, about = _jackknifed(SumStatistic(terms, _sd, _ONE), found, scale="log", confidence=confidence)
     except UndefinedError as undefined:
         return replace(plain, interval=None, interval_reason=str(undefined))
-
-
-def _recovered_of_patients(
-    terms: Callable[[ModalitySizes], FloatArray], sign: int, found: ModalitySizes, *, confidence: float
-) -> Ends:
-    """Interval of a limit from those of the mean and, on the log scale, of the SD (Zou 2013, see `bland_altman`)."""
-    mean, around = _jackknifed(SumStatistic(terms, _mean, _ONE), found, scale="linear", confidence=confidence)
-    sd, about = _jackknifed(SumStatistic(terms, _sd, _ONE), found, scale="log", confidence=confidence)
     limit = mean + sign * _SHARE * sd
-    inner, outer = _SHARE * (sd - about[0]), _SHARE * (about[1] - sd)
-    below, above = (inner, outer) if sign > 0 else (outer, inner)
-    return limit - math.hypot(mean - around[0], below), limit + math.hypot(around[1] - mean, above)
+    below, above = (_SHARE * (sd - about[0]), _SHARE * (about[1] - sd))[::sign]
+    ends = limit - math.hypot(mean - around[0], below), limit + math.hypot(around[1] - mean, above)
+    return replace(plain, interval=ends)
 
 
 def _jackknifed(
@@ -293,24 +287,20 @@ def _jackknifed(
     return value, interval_from_values(value, left, scale=scale, confidence=float(confidence), freedom=freedom)
 
 
-def _mm_terms(sizes: ModalitySizes) -> FloatArray:
-    return _terms(sizes.size_mm - sizes.ex_vivo_mm, sizes.replicates_mm)
+def _terms(scale: Callable[[FloatArray], FloatArray], sizes: ModalitySizes) -> FloatArray:
+    """1, d, d', d'd', 1/m, squares about the mass's mean and their degrees of freedom; ' about the mean of all d.
 
-
-def _log_terms(sizes: ModalitySizes) -> FloatArray:
-    logs = tuple(np.log(group) for group in sizes.replicates_mm)
-    if not any(len(group) > 1 for group in logs):
-        return _terms(np.log(sizes.size_mm / sizes.ex_vivo_mm), logs)
-    return _terms(np.array([group.mean() for group in logs]) - np.log(sizes.ex_vivo_mm), logs)
-
-
-def _terms(differences: FloatArray, replicates: tuple[FloatArray, ...]) -> FloatArray:
-    """1, d, d', d'd', 1/m, squares about the mass's mean and their degrees of freedom; ' about the mean of all d."""
-    if len(differences) == 0:
+    Differences d are on a scale, of the means of replicates on it.
+    """
+    if len(sizes.size_mm) == 0:
         raise UndefinedError("no mass was detected")
+    groups = [scale(group) for group in sizes.replicates_mm]
+    pairs = list(zip(groups, scale(sizes.size_mm), strict=True))
+    means = np.array([group.mean() if len(group) > 1 else size for group, size in pairs])
+    differences = means - scale(sizes.ex_vivo_mm)
     off = centred(differences, differences.mean())
-    number = np.array([max(len(group), 1) for group in replicates], dtype=np.float64)
-    squares = np.array([float(np.sum((group - group.mean()) ** 2)) if len(group) > 1 else 0.0 for group in replicates])
+    number = np.array([max(len(group), 1) for group in groups], dtype=np.float64)
+    squares = np.array([float(np.sum((group - mean) ** 2)) for group, mean in zip(groups, means, strict=True)])
     return columns(1.0, differences, off, off * off, 1 / number, squares, number - 1)
 
 
