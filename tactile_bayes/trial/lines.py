@@ -86,6 +86,9 @@ class PairAngles:
 
 def kendall_sign(x: FloatArray, y: FloatArray) -> int:
     """Sign of Kendall's tau: concordant less discordant pairs."""
+    if len(x) <= MOST_LISTED:
+        first, second = np.triu_indices(len(x), 1)
+        return int(np.sign(np.sum(np.sign(x[second] - x[first]) * np.sign(y[second] - y[first]))))
     order = np.lexsort((y, x))
     discordant = _inversions(x[order], y[order], ties=False)
     tied = _pairs_of_equals(x[order][:, None]) + _pairs_of_equals(np.sort(y)[:, None])

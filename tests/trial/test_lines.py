@@ -220,13 +220,15 @@ def test_inversions_by_brute_force() -> None:
 
 
 @pytest.mark.parametrize("digits", [None, 0])
-def test_kendalls_sign_is_scipys(digits: int | None) -> None:
-    for seed in range(6):
-        rng = np.random.default_rng(seed)
-        x, y = rng.normal(0, 3, (2, 30))
-        if digits is not None:
-            x, y = np.round(x), np.round(y)
-        assert pair_angles.kendall_sign(x, y) == np.sign(stats.kendalltau(x, y).statistic)
+def test_kendalls_sign_is_scipys(digits: int | None, monkeypatch: pytest.MonkeyPatch) -> None:
+    for limit in (pair_angles.MOST_LISTED, 5):
+        monkeypatch.setattr(pair_angles, "MOST_LISTED", limit)
+        for seed in range(6):
+            rng = np.random.default_rng(seed)
+            x, y = rng.normal(0, 3, (2, 30))
+            if digits is not None:
+                x, y = np.round(x), np.round(y)
+            assert pair_angles.kendall_sign(x, y) == np.sign(stats.kendalltau(x, y).statistic)
 
 
 FITS = {
