@@ -229,7 +229,7 @@ class TestContract:
         assert found.map_posterior is not None
         assert found.draws.method == method
         assert found.draws.theta.ndim == 3
-        for name in set(names_of(found.map_posterior)) - {"oblique", "irregular"}:
+        for name in set(names_of(found.map_posterior)) - {"labels", "oblique", "irregular"}:
             values = getattr(found.map_posterior, name)
             assert values.shape == found.draws.theta.shape[:2], name
             assert np.isfinite(values).all(), name
