@@ -9,7 +9,7 @@ import numpy as np
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.contact import Head
-from tactile_bayes.forward.line import EmpiricalModel, LineFrames, TactileLine, build_line, press
+from tactile_bayes.forward.line import LineFrames, TactileLine, build_line, press
 from tactile_bayes.forward.plane_strain import SurfaceCompliance
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.presets import HEAD_PITCH_MM, SHOULDERS_INSIDE, SHOULDERS_OUTSIDE
@@ -82,7 +82,6 @@ class Curves(Record, eq=False):
     elastic_map: TactileLine
     empirical_map: TactileLine
     """`elastic_map`, `empirical_map`: What they average to."""
-    model: EmpiricalModel  #: The fitted empirical model.
 
 
 class Agreement(Record):
@@ -124,7 +123,7 @@ def scene_curves(scene: Scene, settings: StudySettings, *, surface: SurfaceCompl
     elastic = settings.frames(surface, scene.stiffness_ratio)
     model = settings.empirical(scene.d_mm, surface.body.layers, elastic)
     empirical = model.frames(elastic.x_c_mm, elastic.s_mm)
-    return Curves(elastic, empirical, build_line(elastic), build_line(empirical), model)
+    return Curves(elastic, empirical, build_line(elastic), build_line(empirical))
 
 
 def compare(scene: Scene, *, settings: StudySettings, surface: SurfaceCompliance | None = None) -> Agreement:
@@ -137,7 +136,7 @@ def compare(scene: Scene, *, settings: StudySettings, surface: SurfaceCompliance
     shares = frames[0] / frames[0].mean(), frames[1] / frames[1].mean()
     return Agreement(
         scene,
-        mean_squared_difference(fitted.at(0.0), seen.at(0.0)),
+        mean_squared_difference(*frames),
         mean_squared_difference(fitted.pressure_kpa, seen.pressure_kpa),
         mean_squared_difference(ours, theirs),
         float(np.sum((ours - theirs) ** 2) / np.sum((theirs - 1.0) ** 2)),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import suppress
 from functools import partial
 from typing import Annotated, Literal, TypeVar
 
@@ -274,25 +273,23 @@ def _with_errors(line: Line, fit: Callable[[FloatArray, FloatArray], Line], x: F
 
 
 def _limits(found: ModalitySizes, *, confidence: float) -> dict[Unit, Limits]:
+    scales: dict[Unit, Callable[[FloatArray], FloatArray]] = {"mm": np.asarray, "log_ratio": np.log}
     x, y, groups = found.ex_vivo_mm, found.size_mm, found.replicates_mm
     if all(len(group) == 1 for group in groups):
-        differences: dict[Unit, FloatArray] = {"mm": y - x, "log_ratio": np.log(y / x)}
-        return {unit: bland_altman.limits(one, confidence=confidence) for unit, one in differences.items()}
-    of_x, of_y = [np.array([e]) for e in x], list(groups)
-    pairs: dict[Unit, tuple[list[FloatArray], list[FloatArray]]] = {
-        "mm": (of_x, of_y),
-        "log_ratio": ([np.log(one) for one in of_x], [np.log(one) for one in of_y]),
+        return {unit: bland_altman.limits(on(y) - on(x), confidence=confidence) for unit, on in scales.items()}
+    return {
+        unit: bland_altman.limits_unlinked(
+            [on(e) for e in x[:, None]], [on(one) for one in groups], confidence=confidence
+        )
+        for unit, on in scales.items()
     }
-    return {unit: bland_altman.limits_unlinked(*both, confidence=confidence) for unit, both in pairs.items()}
 
 
 def _trends(x: FloatArray, y: FloatArray, *, confidence: float) -> dict[Against, Trend]:
-    trends: dict[Against, Trend] = {}
     against: dict[Against, FloatArray] = {"on_ex_vivo": x, "on_mean": (x + y) / 2}
-    for name, sizes in against.items():
-        with suppress(UndefinedError):
-            trends[name] = bland_altman.trend(y - x, sizes, confidence=confidence)
-    return trends
+    judge = partial(bland_altman.trend, y - x, confidence=confidence)
+    found = {name: _or_none(partial(judge, sizes)) for name, sizes in against.items()}
+    return {name: one for name, one in found.items() if one is not None}
 
 
 def _or_none(compute: Callable[[], _T]) -> _T | None:
