@@ -145,13 +145,6 @@ def _landmarks(request: Request) -> Landmarks | None:
     return scan.landmarks
 
 
-def provenance_of(request: Request, settings: dict[str, Any]) -> Provenance:
-    """Provenance of the recording, without its ports."""
-    names = ("like", "head_geometry", "array_calibration", "landmarks")
-    inputs = {name: path for name in names if (path := getattr(request, name)) is not None}
-    return Provenance("record", settings, hash_inputs(**inputs))
-
-
 # --- Control of a recording by signals and terminal keys.
 
 
@@ -279,7 +272,9 @@ def make_recording(request: Request) -> tuple[Report, bool]:
             )
             observer = stack.enter_context(view)
         stream = stack.enter_context(create_exclusive(request.output, force=request.force))
-        provenance = provenance_of(request, request.settings(hello))
+        names = ("like", "head_geometry", "array_calibration", "landmarks")
+        inputs = {name: path for name in names if (path := getattr(request, name)) is not None}
+        provenance = Provenance("record", request.settings(hello), hash_inputs(**inputs))
         try:
             writer = RecordingWriter(
                 stream, head=head, element_calibration=calibration, session=session, provenance=provenance

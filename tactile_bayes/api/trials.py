@@ -125,9 +125,11 @@ def analyse(
 ) -> TrialResult:
     """Analyse a trial; `protocol` and `title` are of the pre-specified analysis, where there is one."""
     confidence = Intervals(INTERVAL, method=settings.intervals, resamples=settings.resamples, seed=settings.seed)
-    provenance = _provenance(trial, settings, protocol)
+    kept = {name: value for name, value in as_dict(settings).items() if name != "seed"}
+    inputs = hash_inputs(**trial.files, **({} if protocol is None else {"protocol": protocol}))
+    made = Provenance("validate", {"interval_probability": INTERVAL, **kept}, inputs, seed=settings.seed)
     report = summarise(
-        trial, confidence=confidence, error_ratio=settings.error_ratio, seed=settings.seed, provenance=provenance
+        trial, confidence=confidence, error_ratio=settings.error_ratio, seed=settings.seed, provenance=made.as_dict()
     )
     if title is not None:
         report = replace(report, title=title)
@@ -139,17 +141,6 @@ def analyse(
         rng = np.random.default_rng(settings.seed)
         report = replace(report, next_mass=next_mass(trial, sample=draw, rng=rng, probability=INTERVAL))
     return TrialResult(report, trial)
-
-
-def _provenance(trial: Trial, settings: TrialSettings, protocol: Path | None) -> dict[str, Any]:
-    files = {**trial.files, **({} if protocol is None else {"protocol": protocol})}
-    kept = {name: value for name, value in as_dict(settings).items() if name != "seed"}
-    return Provenance(
-        command="validate",
-        settings={"interval_probability": INTERVAL, **kept},
-        inputs=hash_inputs(**files),
-        seed=settings.seed,
-    ).as_dict()
 
 
 # --- Input of `validate` and `plan`: the tables of a trial, tidy or wide, and the estimates that they name.
