@@ -20,6 +20,7 @@ from tactile_bayes.hardware.readings import (
     FrameReading,
     HelloReading,
     MissingReading,
+    Parser,
     PoseReading,
     Reading,
     SequenceCheck,
@@ -197,33 +198,21 @@ def encode_command(kind: int, *, every: int = 1) -> bytes:
     return encode_packet(kind, payload)
 
 
-class HeadParser:
+class HeadParser(Parser):
     """Parser of a device in the open framing, head or tracker."""
 
     def __init__(self, *, every: int = 1) -> None:
         self.packets = PacketParser()
         self.sequence = SequenceCheck()
         self.hello: HelloReading | None = None
-        self.remark = ""
-        self._misfit_words = ""
         self._every = every
 
-    @property
-    def garbage_bytes(self) -> int:
-        """Number of bytes that belong to no valid packet."""
-        return self.packets.damaged_bytes
-
-    @property
-    def fault(self) -> str:
-        """What is wrong with packets that could not be read."""
-        version = self.packets.foreign_version
-        if version is not None:
-            return f"it sent packets of version {version} of the framing, this program reads {VERSION}"
-        return self._misfit_words
-
     def feed(self, data: bytes) -> list[Reading]:
-        """Parse `data`; return the completed readings; counts packets with invalid payloads."""
-        return [reading for packet in self.packets.feed(data) if (reading := self._read(packet)) is not None]
+        found = [reading for packet in self.packets.feed(data) if (reading := self._read(packet)) is not None]
+        self.garbage_bytes, version = self.packets.damaged_bytes, self.packets.foreign_version
+        if version is not None:
+            self.fault = f"it sent packets of version {version} of the framing, this program reads {VERSION}"
+        return found
 
     def _read(self, packet: Packet) -> Reading | None:
         match packet.kind:
@@ -250,7 +239,7 @@ class HeadParser:
         return FrameReading(counts, packet.device_us * 1000, lost, self.sequence.restarts > restarts)
 
     def _misfit(self, what: str) -> None:
-        self._misfit_words = f"it sent {what}"
+        self.fault = f"it sent {what}"
 
     def _pose(self, packet: Packet) -> ToolReading | None:
         tool, _, why = printable(packet.payload[_POSE.size :]).partition("\0")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from typing import Final, NamedTuple, Protocol
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,40 +70,33 @@ class EndReading(NamedTuple):
 Reading = FrameReading | PoseReading | MissingReading | HelloReading | EndReading
 
 
-class Parser(Protocol):
-    """Interface of a protocol's parser."""
+class Parser:
+    """Base of the protocols' parsers: `feed` returns the readings that bytes complete."""
 
-    @property
-    def garbage_bytes(self) -> int:
-        """Number of bytes so far that belong to no valid record."""
-
-    @property
-    def fault(self) -> str:
-        """What is wrong with the last record that could not be read; empty where nothing looked like one."""
-
-    @property
-    def remark(self) -> str:
-        """What is to be known of the records that were read; empty where they are as they should be."""
+    fault = ""
+    """What is wrong with the last record that could not be read; empty where nothing looked like one."""
+    remark = ""
+    """What is to be known of the records that were read; empty where they are as they should be."""
+    garbage_bytes = 0
+    """Number of bytes so far that belong to no valid record."""
 
     def feed(self, data: bytes) -> list[Reading]:
         """Parse `data`; return the completed readings."""
+        raise NotImplementedError
 
 
-class RecordParser:
+class RecordParser(Parser):
     """Parser of fixed-length records; after garbage it tries again at each next byte.
 
     A subclass sets `record_bytes` and says what `_record` makes of that many bytes.
     """
 
     record_bytes: int
-    fault = remark = ""
 
     def __init__(self) -> None:
-        self.garbage_bytes = 0
         self._rest = b""
 
     def feed(self, data: bytes) -> list[Reading]:
-        """Parse `data`; return the completed poses."""
         buffer, place, size = self._rest + data, 0, self.record_bytes
         found: list[Reading] = []
         while len(buffer) - place >= size:

@@ -185,36 +185,24 @@ _TRACKER_BYTES: Final = 32768
 class Sink(Protocol):
     """Interface of a recording's destination; `files` has the one for scan files."""
 
-    def add_frame(self, counts: CountArray, *, device_ns: int, host_ns: int) -> None:
-        """Add one frame."""
-
-    def add_pose(self, position_mm: FloatArray, quaternion_wxyz: FloatArray, *, device_ns: int, host_ns: int) -> None:
-        """Add one pose."""
-
-    def add_landmark(self, name: str, position_mm: FloatArray, *, device_ns: int, host_ns: int) -> None:
-        """Add one touched landmark."""
-
-    def add_note(self, text: str, *, device: str, device_ns: int, host_ns: int, serious: bool = False) -> None:
-        """Add a remark about the data at this time."""
+    def add_frame(self, counts: CountArray, *, device_ns: int, host_ns: int) -> None: ...
+    def add_pose(
+        self, position_mm: FloatArray, quaternion_wxyz: FloatArray, *, device_ns: int, host_ns: int
+    ) -> None: ...
+    def add_landmark(self, name: str, position_mm: FloatArray, *, device_ns: int, host_ns: int) -> None: ...
+    def add_note(self, text: str, *, device: str, device_ns: int, host_ns: int, serious: bool = False) -> None: ...
 
     def flush(self) -> None:
         """Store what was added so far, so that it survives the end of this process."""
 
 
 class Observer(Protocol):
-    """Interface of a recording's spectator, which must never wait."""
+    """Interface of a recording's spectator, which must never wait; it is told the account several times a second."""
 
-    def landmark(self, name: str, position_mm: FloatArray) -> None:
-        """Receive a touched landmark."""
-
-    def frame(self, counts: CountArray, device_ns: int) -> None:
-        """Receive a recorded frame."""
-
-    def pose(self, pose: PoseReading, device_ns: int) -> None:
-        """Receive a recorded pose."""
-
-    def told(self, report: Report) -> None:
-        """Receive the account so far, several times a second."""
+    def landmark(self, name: str, position_mm: FloatArray) -> None: ...
+    def frame(self, counts: CountArray, device_ns: int) -> None: ...
+    def pose(self, pose: PoseReading, device_ns: int) -> None: ...
+    def told(self, report: Report) -> None: ...
 
 
 @dataclass(slots=True)

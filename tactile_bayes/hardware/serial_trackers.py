@@ -142,17 +142,13 @@ class LibertyParser(RecordParser):
         return _polhemus_pose(values, bytes([error]), station, time_ms, distortion)
 
 
-class LibertyAsciiParser:
+class LibertyAsciiParser(Parser):
     """Parser of LIBERTY and PATRIOT text records: station, error, then numbers between spaces."""
 
-    fault = remark = ""
-
     def __init__(self) -> None:
-        self.garbage_bytes = 0
         self._rest = b""
 
     def feed(self, data: bytes) -> list[Reading]:
-        """Parse `data`; return the completed poses."""
         *lines, self._rest = (self._rest + data).split(b"\n")
         if len(self._rest) > _LONGEST_LINE:
             self.garbage_bytes += len(self._rest)

@@ -28,6 +28,7 @@ from tactile_bayes.hardware.readings import (
     NO_ROTATION,
     HelloReading,
     MissingReading,
+    Parser,
     PoseReading,
     Reading,
     ToolReading,
@@ -100,7 +101,7 @@ _RIGID_SLACK: Final = 0.02
 _IN_SIGHT: Final = ("OK", "UNKNOWN")
 
 
-class IgtlinkParser:
+class IgtlinkParser(Parser):
     """Parser of messages with poses; it passes over others, whatever their size.
 
     The header has no checksum, so a spoilt size may claim much of what follows: wherever a message is passed over or
@@ -109,15 +110,12 @@ class IgtlinkParser:
     """
 
     def __init__(self) -> None:
-        self.garbage_bytes = 0
-        self.fault = self.remark = ""
         self._rest = b""
         self._checks = 0
         self._over = 0  # bytes still to come of a message without poses
         self._others: set[str] = set()
 
     def feed(self, data: bytes) -> list[Reading]:
-        """Parse `data`; return the completed readings."""
         buffer, place = self._rest + data, 0
         found: list[Reading] = []
         self._checks = _FEWEST_CHECKED + _CHECKED_SHARE * len(data)
