@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Final, Literal, get_args
 
 from tactile_bayes.declarations import Record, as_dict, from_plain, replace
@@ -144,8 +144,13 @@ def finding_lines(findings: Iterable[Finding], severity: Severity | None = None,
 def finding_summary(findings: Iterable[Finding], severity: Severity, *, most: int, paper: bool = False) -> list[str]:
     """The first findings of one severity in one line that counts the others; empty without any."""
     texts = [one.sentence(paper=paper) for one in by_weight(findings) if one.severity == severity]
+    return joined(texts, most=most, lead=LEADS[severity])
+
+
+def joined(texts: Sequence[str], *, most: int, lead: str) -> list[str]:
+    """The first texts in one line after `lead`, which counts the others; empty without any."""
     more = f" (and {len(texts) - most} more)" if len(texts) > most else ""
-    return [f"{LEADS[severity]}{'; '.join(texts[:most])}{more}."] if texts else []
+    return [f"{lead}{'; '.join(texts[:most])}{more}."] if texts else []
 
 
 def findings_in(listed: object) -> tuple[Finding, ...]:

@@ -36,7 +36,7 @@ from tactile_bayes.mapping.places import orientation_of
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.estimate_text import no_estimate_line
 from tactile_bayes.report.figure_file import plain_matplotlib
-from tactile_bayes.report.map_figure import contour_of, map_figure, places_of
+from tactile_bayes.report.map_figure import contour_of, map_figure
 
 # --- Place of a map in the coordinate system of DICOM and 3D Slicer: L, P, S in mm from the xiphoid.
 #
@@ -281,7 +281,7 @@ def map_picture(source: MapFile, estimate: EstimateFile | None) -> NDArray[np.ui
             source.tactile_map,
             None,
             fit=None if alone is None else contour_of(alone),
-            looked_at=() if alone is None else places_of(alone),
+            looked_at=[] if alone is None else [one for one in alone.candidates if one.fault],
             title="Tactile map" + (f" of the {side} breast" if side in ("left", "right") else ""),
             note=no_estimate_line(unsized[0][:_MOST_NOTE]) if unsized else "",
             findings=None if estimate is None else estimate.report.findings,

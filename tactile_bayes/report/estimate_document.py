@@ -351,7 +351,7 @@ def supposed_lines(supposed: Suppositions | None, median_mm: float, *, places: i
         pair = _pair(supposed, median_mm, (first, second))
         if pair:
             values = [after.format(one.value) for after, one in zip(follow, pair, strict=True)]
-            sizes = [_size(one.max_size_mm, places) for one in pair]
+            sizes = [size_words(one.max_size_mm, places) for one in pair]
             found.append(f"Were {words}{values[0]}: {sizes[0]}; {second}{values[1]}: {sizes[1]}.")
     return found
 
@@ -379,7 +379,8 @@ def _pair(supposed: Suppositions | None, median_mm: float, names: tuple[str, str
     return pair if moves and len(pair) == 2 else []
 
 
-def _size(size: SizeInterval, places: int) -> str:
+def size_words(size: Quantity | Interval, places: int = 1) -> str:
+    """A size with its interval in brackets."""
     return f"{size.median:.{places}f} mm ({size.low:.{places}f} to {size.high:.{places}f})"
 
 

@@ -19,7 +19,7 @@ from tactile_bayes.posterior.result import Estimate, FittedCells, fitted_cells
 from tactile_bayes.report.estimate_document import leading_size
 from tactile_bayes.report.estimate_text import exams_label, no_estimate_line
 from tactile_bayes.report.figure_file import figure_file, finish, load_matplotlib
-from tactile_bayes.report.map_figure import contour_of, draw_panel, map_figure, places_of
+from tactile_bayes.report.map_figure import contour_of, draw_panel, map_figure
 from tactile_bayes.size.draws import SizePosterior
 
 if TYPE_CHECKING:
@@ -213,7 +213,7 @@ def draw_map(tactile_map: TactileMap, report: EstimateReport, path: Path | None,
         path,
         fit=contour_of(report),
         masses=report.masses,
-        looked_at=places_of(report),
+        looked_at=[one for one in report.candidates if one.fault],
         title=f"Tactile map: {name}",
         note=note,
         findings=report.findings,

@@ -8,7 +8,7 @@ from typing import Any
 
 from tactile_bayes.declarations import from_plain
 from tactile_bayes.files.reports import EstimateReport, MassReport, SmallestLump
-from tactile_bayes.findings import capital, finding_lines, finding_summary
+from tactile_bayes.findings import capital, finding_lines, finding_summary, joined
 from tactile_bayes.inference.draws import ParameterDraws, Quantity
 from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior.result import Estimate
@@ -167,14 +167,6 @@ def width_lines(variance_share: Mapping[str, float], *, paper: bool = False) -> 
     ways = [narrowed[name] for name, share in ranked if share >= WORTH_NARROWING and name in narrowed]
     lines = [f"What makes the interval wide: {', '.join(parts)}."] if parts else []
     return [*lines, f"What would narrow it: {'; '.join(ways)}."] if ways else lines
-
-
-def joined(texts: Sequence[str], *, most: int, lead: str) -> list[str]:
-    """Join the first texts in one line after `lead`, and count the others; empty for no text."""
-    if not texts:
-        return []
-    more = f" (and {len(texts) - most} more)" if len(texts) > most else ""
-    return [f"{lead}{'; '.join(texts[:most])}{more}."]
 
 
 # --- An estimate as a short table a clinician can read.

@@ -7,9 +7,9 @@ from typing import Any, Final
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.posterior.verdict import SHARE_WITH_LUMP, chance_text
 from tactile_bayes.presets import INTERVAL, RESEARCH_USE
+from tactile_bayes.report.estimate_document import size_words
 from tactile_bayes.report.exam_words import (
     Exam,
-    ExamMap,
     facts,
     finding_sentences,
     headline,
@@ -60,6 +60,7 @@ def exam_page(exam: Exam) -> str:
     seed = [] if made is None else [f"seed {made}"]
     masses = sorted(exam.main.masses, key=lambda one: one.number)
     shown = exam.maps[:MOST_REPEATS] if several else ()
+    alone = ["no size" if (q := one.report.max_size_mm) is None else size_words(q) for one in shown]
     return page(
         "exam",
         title=cut(exam.title, 60) or TITLE,
@@ -81,7 +82,7 @@ def exam_page(exam: Exam) -> str:
         most_masses=MOST_MASSES,
         maps=len(exam.maps),
         disagrees=exam.disagrees,
-        repeats=list(zip(small_pictures(shown, room_mm=_REPEAT_MM), map(_alone, shown), strict=True)) if shown else [],
+        repeats=list(zip(small_pictures(shown, room_mm=_REPEAT_MM), alone, strict=True)) if shown else [],
         of_map=f" (map {exam.main_number})" if several else "",
         quality=list(quality_rows(exam)),
         foot=foot(exam.scans, f"method {report.origin.settings.get('method', 'unknown')}", *seed),
@@ -131,9 +132,3 @@ def _intervals(exam: Exam, size: Quantity) -> list[tuple[str, Quantity]]:
     narrow = "exams alike" if alike is None else f"if exams differ by {100 * alike:.0f} %"
     patients = f"as exams of patients differ, {100 * another.between_map_sd:.0f} %"
     return [(patients, size), (narrow, narrow_size)]
-
-
-def _alone(one: ExamMap) -> str:
-    """The size that a repeat gives by itself."""
-    size = one.report.max_size_mm
-    return "no size" if size is None else f"{size.median:.1f} mm ({size.low:.1f} to {size.high:.1f})"

@@ -20,7 +20,7 @@ from tactile_bayes.mapping.map import FEW_READINGS, TactileMap
 from tactile_bayes.mapping.places import ClockPosition, clock_position, clock_text
 from tactile_bayes.mapping.plausibility import WHY_NOT
 from tactile_bayes.posterior.verdict import chance_text
-from tactile_bayes.report.estimate_document import from_xiphoid, others, patient_mm
+from tactile_bayes.report.estimate_document import from_xiphoid, others, patient_mm, size_words
 from tactile_bayes.report.estimate_text import shape_text, smallest_text, width_lines
 from tactile_bayes.size.pooling import DISAGREE
 
@@ -395,7 +395,7 @@ def mass_row(mass: ExamMass) -> tuple[str, str, str]:
         chance = "" if mass.probability is None else f" (probability of a lump {chance_text(mass.probability)})"
         size = f"no size{chance}: {mass.why}"
     else:
-        size = f"{mass.largest.median:.1f} mm ({mass.largest.low:.1f} to {mass.largest.high:.1f})"
+        size = size_words(mass.largest)
     return str(mass.number), size, short_place(mass)
 
 

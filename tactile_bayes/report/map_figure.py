@@ -11,7 +11,7 @@ import numpy as np
 
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.files.reports import EstimateReport, MassReport
+from tactile_bayes.files.reports import EstimateReport, MassReport, PassedOver
 from tactile_bayes.findings import Finding
 from tactile_bayes.mapping.map import FEW_READINGS, TactileMap
 from tactile_bayes.mapping.places import Orientation, orientation_of
@@ -60,13 +60,6 @@ class FitContour(Record):
     """`level`, `amplitude`: Of the fitted bump, in the map's values; None leaves the colours to the map."""
 
 
-class Place(Record):
-    """A place looked at on the map, and why no lump was measured there."""
-
-    centre_mm: tuple[float, float]
-    reason: str
-
-
 def contour_of(report: EstimateReport) -> FitContour | None:
     """Ellipse and size of an estimate's lump, at the posterior medians; None without one."""
     centre, across, along = report.centre_mm, report.sigma_x_mm, report.sigma_y_mm
@@ -76,11 +69,6 @@ def contour_of(report: EstimateReport) -> FitContour | None:
     turn = 0.0 if angle is None else angle.median
     widths = across.median, along.median
     return FitContour(centre.median, *widths, turn, _size_mm(report), level.median, height.median)
-
-
-def places_of(report: EstimateReport) -> list[Place]:
-    """The places of an estimate that were looked at in vain."""
-    return [Place((one.x_mm, one.y_mm), one.fault) for one in report.candidates if one.fault]
 
 
 def _size_mm(told: EstimateReport | MassReport) -> tuple[float, float] | None:
@@ -94,7 +82,7 @@ def map_figure(
     *,
     fit: FitContour | None = None,
     masses: Sequence[MassReport] = (),
-    looked_at: Sequence[Place] = (),
+    looked_at: Sequence[PassedOver] = (),
     title: str = "",
     note: str = "",
     findings: Sequence[Finding] | None = None,
@@ -216,10 +204,10 @@ def _hatch_few(axes: Axes, tactile_map: TactileMap, view: Orientation) -> None:
     lines.set_clip_path(cells, axes.transData)
 
 
-def _explain(axes: Axes, tactile_map: TactileMap, places: Sequence[Place]) -> None:
+def _explain(axes: Axes, tactile_map: TactileMap, places: Sequence[PassedOver]) -> None:
     """Explain hatching and places below the coverage panel, where no cell is hidden."""
     at = "({:.0f}, {:.0f}) mm"
-    lines = [f"{i}  {at.format(*place.centre_mm)}: {place.reason}" for i, place in enumerate(places, start=1)]
+    lines = [f"{i}  {at.format(place.x_mm, place.y_mm)}: {place.fault}" for i, place in enumerate(places, start=1)]
     wrapped = [textwrap.wrap(line, 66, subsequent_indent="    ", max_lines=2) for line in lines[:_EXPLAINED_PLACES]]
     shown = ["\n".join(line) for line in wrapped]
     if len(lines) > len(shown):
@@ -315,10 +303,10 @@ def _draw_masses(axes: Axes, masses: Sequence[MassReport], fit: FitContour | Non
             _draw_ellipse(axes, centre, size_mm, angle, view, linewidth=1.0)
 
 
-def _draw_places(axes: Axes, places: Sequence[Place], view: Orientation) -> None:
+def _draw_places(axes: Axes, places: Sequence[PassedOver], view: Orientation) -> None:
     """Draw a numbered cross at each place where no lump was measured."""
     for number, place in enumerate(places, start=1):
-        at = _pair(view, *place.centre_mm)
+        at = _pair(view, place.x_mm, place.y_mm)
         axes.plot(*at, "x", color="white", markersize=6, markeredgewidth=1.4, path_effects=_outlined(3.0))
         if number <= _EXPLAINED_PLACES:
             beside = _ABOVE | {"ha": "left", "va": "center", "fontsize": 9, "path_effects": _outlined(2.5)}

@@ -16,7 +16,7 @@ from tactile_bayes.declarations import from_plain, replace
 from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.reports import AnotherExam, EstimateReport, Supposed
-from tactile_bayes.findings import Finding
+from tactile_bayes.findings import Finding, joined
 from tactile_bayes.inference.draws import summarise
 from tactile_bayes.mapping.map import TactileMap, broken_assumptions
 from tactile_bayes.posterior.draw import SamplerSettings
@@ -30,7 +30,6 @@ from tactile_bayes.report.estimate_text import (
     decimals,
     estimate_summary,
     estimate_text,
-    joined,
     width_lines,
 )
 

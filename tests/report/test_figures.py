@@ -11,13 +11,14 @@ import pytest
 
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, UsageError
+from tactile_bayes.files.reports import PassedOver
 from tactile_bayes.geometry import rigid
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.mapping.map import MapRecipe, TactileMap
 from tactile_bayes.report import estimate_figures as sizes
 from tactile_bayes.report import map_figure as maps
 from tactile_bayes.report.estimate_figures import corner_figure, size_figure
-from tactile_bayes.report.map_figure import FitContour, Place, map_figure
+from tactile_bayes.report.map_figure import FitContour, map_figure
 
 INTERVALS = {
     name: Quantity(median=low + 3.0, mean=low + 3.0, sd=1.5, low=low, high=low + 6.0, probability=0.95, kind="eti")
@@ -84,7 +85,7 @@ def test_a_map_is_drawn_in_the_same_bytes_each_time(tmp_path, fit, normalise):
 def test_a_map_of_any_form_leaves_no_band_of_its_figure_empty(tmp_path, shape, fit, places):
     whole, (ny, nx) = bump_map(), shape
     part = {name: getattr(whole, name)[:ny, :nx] for name in ("mean", "variance", "count")}
-    looked_at = [Place((0.0, float(n)), "no bump that the window holds: the fit ran away") for n in range(places)]
+    looked_at = [PassedOver(0.0, float(n), "no bump that the window holds: the fit ran away") for n in range(places)]
     cut = replace(whole, **part, x_mm=whole.x_mm[:nx], y_mm=whole.y_mm[:ny])
     map_figure(cut, tmp_path / "map.png", fit=fit, looked_at=looked_at)
     from PIL import Image
@@ -155,7 +156,7 @@ def test_a_rib_beside_the_lump_does_not_take_all_colours(axes):
 
 
 def test_places_that_were_looked_at_are_marked_with_their_reasons(axes):
-    places = [Place((float(i), 0.0), f"reason {i}") for i in range(6)]
+    places = [PassedOver(float(i), 0.0, f"reason {i}") for i in range(6)]
     map_figure(bump_map(), None, looked_at=places, note="No estimate: nothing there.")
     crosses = [line for line in axes[0].lines if line.get_marker() == "x"]
     assert [line.get_xdata()[0] for line in crosses] == [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]
