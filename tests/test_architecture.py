@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 from collections.abc import Callable, Iterator
 from functools import cache
 from graphlib import CycleError, TopologicalSorter
@@ -18,6 +19,7 @@ MODULES = sorted(PACKAGE.rglob("*.py"))
 SHELL = {"cli.py", "__main__.py", "actions", "commands", "report"}
 CORE = [path for path in MODULES if path.relative_to(PACKAGE).parts[0] not in SHELL]
 MOST_LINES = 600
+ACTION = re.compile(r'"(\w+)\.(\w+_action)"')
 MOST_INSIDE = 30
 
 
@@ -196,6 +198,19 @@ def test_a_fault_with_a_message_is_an_error_of_ours():
                 yield f"line {node.lineno}: raise an error of ours instead of an assert with a message"
 
     assert broken(rule) == []
+
+
+def test_every_command_names_a_function_that_is_there():
+    named = [one for path in MODULES if path.parent.name == "commands" for one in ACTION.findall(text_of(path))]
+    assert len(named) == sum(len(actions_in(path)) for path in MODULES)
+    for module, function in named:
+        assert function in actions_in(PACKAGE / "actions" / f"{module}.py")
+
+
+def actions_in(path: Path) -> list[str]:
+    """Functions of a file of actions that a command calls."""
+    functions = [node.name for node in tree_of(path).body if isinstance(node, ast.FunctionDef)]
+    return [name for name in functions if name.endswith("_action")] if path.parent.name == "actions" else []
 
 
 def test_public_functions_and_classes_say_what_they_do():

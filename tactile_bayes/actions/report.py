@@ -36,7 +36,7 @@ def report_action(
             option = "--settings" if name == "settings_file" else f"--{name.replace('_', '-')}"
             raise UsageError(f"an estimate has settings of its own; leave out {option}, or give the map alone")
     settings = settings_of(**asked)
-    exam = exam_of_files(sorted_files, settings, given, notice=lambda line: click.echo(line, err=True))
+    exam = given.on(exam_of_files(sorted_files, settings, notice=lambda line: click.echo(line, err=True)))
     page.write(exam_page(exam))
     if exam.main.tactile_map is None:
         click.echo("note: without its map the page has no picture and no coverage; give MAP.nc too", err=True)

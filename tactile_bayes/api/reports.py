@@ -63,7 +63,7 @@ def _is_estimate(path: Path) -> bool:
     return first_bytes(path, len(HDF5_MAGIC)) == HDF5_MAGIC and is_posterior(path)
 
 
-def exam_of_files(files: ExamFiles, settings: Settings, given: Given, *, notice: Notice | None = None) -> Exam:
+def exam_of_files(files: ExamFiles, settings: Settings, *, notice: Notice | None = None) -> Exam:
     """Read maps, or an estimate and its map, and put a page's exam together.
 
     `files`: maps of one mass; or an estimate, best with its map: what ``estimate`` printed with ``--json`` or wrote
@@ -71,7 +71,7 @@ def exam_of_files(files: ExamFiles, settings: Settings, given: Given, *, notice:
     """
     maps = files.maps
     if files.estimates:
-        return _from_estimate(files.estimates[0], maps[0] if maps else None, given)
+        return _from_estimate(files.estimates[0], maps[0] if maps else None)
     if len(maps) > 1:
         refuse_checkpoint(settings)
     found = []
@@ -79,20 +79,18 @@ def exam_of_files(files: ExamFiles, settings: Settings, given: Given, *, notice:
         tell = None if notice is None else lambda line, path=path: notice(f"{path}: {line}")
         found.append(estimate_file(path, settings, notice=tell))
     inputs = {f"map_{number}": path for number, path in enumerate(maps, start=1)}
-    return exam_of(found, settings, given, inputs=inputs)
+    return exam_of(found, settings, inputs=inputs)
 
 
-def exam_of(
-    found: Sequence[SizeEstimate], settings: Settings, given: Given, *, inputs: Mapping[str, Path] | None = None
-) -> Exam:
+def exam_of(found: Sequence[SizeEstimate], settings: Settings, *, inputs: Mapping[str, Path] | None = None) -> Exam:
     """Exam of maps that were estimated; several are pooled."""
     if len(found) == 1:
-        return given.on(found[0].exam())
+        return found[0].exam()
     names = [f"map {number}" for number in range(1, len(found) + 1)]
-    return given.on(pool_estimates(found, settings, names=names, inputs=inputs or {}).exam())
+    return pool_estimates(found, settings, names=names, inputs=inputs or {}).exam()
 
 
-def _from_estimate(source: Path, path: Path | None, given: Given) -> Exam:
+def _from_estimate(source: Path, path: Path | None) -> Exam:
     """Exam of an estimate, and of its map where that is given: the estimate must name it by its digest."""
     if source.suffix.lower() == ".json":
         document = load_json(source, way_out="give what `estimate --json` printed for one map")
@@ -105,8 +103,7 @@ def _from_estimate(source: Path, path: Path | None, given: Given) -> Exam:
         if sha256(path) not in [one.sha256 for one in report.origin.inputs if one.role == "map"]:
             raise BadDataError(f"is not the estimate of {path}", way_out="give the map it names", path=str(source))
         tactile_map, scans = read_map_and_scans(path)
-    shown = exam_map(tactile_map, report, side=side_of(scans))
-    return given.on(Exam((shown,), None, scans))
+    return Exam((exam_map(tactile_map, report, side=side_of(scans)),), None, scans)
 
 
 # --- The page of an exam from Python.
@@ -154,29 +151,30 @@ def exam_report(
     BadDataError
         When a file is damaged or of another kind, or the maps are of different exams.
     """
-    page = PageFiles(path_of(path), path_of(pdf), force)
+    page, words = PageFiles(path_of(path), path_of(pdf), force), Given(title, name, day)
     page.check()
     given = listed(files)
     if not given:
         raise UsageError("nothing was given to report; give maps, or an estimate")
-    exam = _exam(given, Given(title, name, day), settings)
+    exam = words.on(_exam(given, settings))
     page.write(exam_page(exam))
     return headline(exam)
 
 
-def _exam(given: Sequence[Any], words: Given, settings: dict[str, Any]) -> Exam:
+def _exam(given: Sequence[Any], settings: dict[str, Any]) -> Exam:
     """The exam of files alone, or of what Python holds."""
     if all(isinstance(one, str | Path) for one in given):
         files = ExamFiles.sort([path_of(one) for one in given])
         if files.estimates and settings:
             raise UsageError(f"an estimate has settings of its own; leave out {next(iter(settings))}, or give the map")
-        return exam_of_files(files, settings_of(settings), words)
+        return exam_of_files(files, settings_of(settings))
     if len(given) == 1 and isinstance(given[0], PooledSize):
-        return words.on(given[0].exam())
+        exam: Exam = given[0].exam()
+        return exam
     used = settings_of(settings)
     if len(given) > 1:
         refuse_checkpoint(used)
-    return exam_of(estimated(given, settings), used, words)
+    return exam_of(estimated(given, settings), used)
 
 
 # --- Export of maps and estimates to the files that other systems take.
