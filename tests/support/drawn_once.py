@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import pytest
@@ -13,10 +13,11 @@ _drawn: dict[int, bytes] = {}
 _draw = trial_html._svg
 
 
-def _svg(draw: Any, panels: int) -> bytes:
-    if panels not in _drawn:
-        _drawn[panels] = _draw(draw, panels)
-    return _drawn[panels]
+def _svg(panels: Sequence[Any], *, alike: bool = False) -> bytes:
+    number = len(panels)
+    if number not in _drawn:
+        _drawn[number] = _draw(panels, alike=alike)
+    return _drawn[number]
 
 
 @pytest.fixture(scope="module", autouse=True)
