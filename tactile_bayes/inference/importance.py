@@ -44,7 +44,10 @@ def smooth_weights(log_weights: FloatArray) -> tuple[FloatArray, float]:
     shape, scale = fit_generalised_pareto(excess)
     if np.isfinite(shape):
         probability = (np.arange(tail) + 0.5) / tail
-        weights[top] = np.minimum(cut + _pareto_quantile(probability, shape, scale), 1.0)
+        log_beyond = np.log1p(-probability)
+        near_exponential = abs(shape) < 1e-10
+        quantile = -scale * log_beyond if near_exponential else scale * np.expm1(-shape * log_beyond) / shape
+        weights[top] = np.minimum(cut + quantile, 1.0)
     return weights / weights.sum(), shape
 
 
@@ -71,12 +74,6 @@ def fit_generalised_pareto(excess: FloatArray) -> tuple[float, float]:
     shape = float(np.mean(np.log1p(-best * positive)))
     scale = -shape / best
     return (n * shape + 10 * 0.5) / (n + 10), scale
-
-
-def _pareto_quantile(probability: FloatArray, shape: float, scale: float) -> FloatArray:
-    if abs(shape) < 1e-10:
-        return np.asarray(-scale * np.log1p(-probability))
-    return np.asarray(scale * np.expm1(-shape * np.log1p(-probability)) / shape)
 
 
 # --- The density that importance sampling draws from: one Gaussian or a mixture of several, their tails bent outwards.

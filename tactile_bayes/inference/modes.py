@@ -216,7 +216,10 @@ def find_mode(
     damping = 1e-8
     for taken in range(1, MOST_STEPS + 1):
         gradient, hessian = _slopes(log_density, theta, step=1e-2 * scale)
-        step = scale * _newton_step(gradient * scale, -hessian * np.outer(scale, scale), damping)
+        # uphill in standardised units; directions of negative curvature are flipped
+        values, vectors = np.linalg.eigh(-hessian * np.outer(scale, scale))
+        safe = np.maximum(np.abs(values), 1e-3) + damping * max(1.0, float(np.abs(values).max()))
+        step = scale * np.clip(vectors @ ((vectors.T @ (gradient * scale)) / safe), -2.0, 2.0)
         trial = theta + step
         trial_value = float(log_density(trial[None])[0])
         small = np.abs(step / scale).max() < tolerance
@@ -239,10 +242,3 @@ def _slopes(log_density: LogDensity, theta: FloatArray, *, step: FloatArray) -> 
             "the posterior's mode lies at the edge of what the window allows; try --method ensemble"
         )
     return finite_differences(values, step=step)
-
-
-def _newton_step(gradient: FloatArray, curvature: FloatArray, damping: float) -> FloatArray:
-    """Uphill step in standardised units; directions of negative curvature are flipped."""
-    values, vectors = np.linalg.eigh(curvature)
-    safe = np.maximum(np.abs(values), 1e-3) + damping * max(1.0, float(np.abs(values).max()))
-    return np.asarray(np.clip(vectors @ ((vectors.T @ gradient) / safe), -2.0, 2.0))

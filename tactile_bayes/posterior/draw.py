@@ -239,9 +239,18 @@ def draw_parameters(
     """
     passed_over: list[str] = []
     figures: Mapping[str, float] = {}
+    accuracy = accuracy_in_sd(options, fitted.width_sd_mm)
     for method in fitted.methods(options):
         try:
-            draws = _draw(fitted, method, rng=rng, options=options, progress=progress, solved=solved)
+            if method in ("optimise", "laplace"):
+                draws = fitted.at_mode(method, options.draws, rng)
+            elif method == "importance":
+                density = fitted.sampled(solved)
+                draws = density.finished(importance_draws(density, rng=rng, accuracy_sd=accuracy), rng)
+            else:
+                density = fitted.sampled()
+                chains = ensemble_draws(density, rng=rng, accuracy_sd=accuracy, options=options, progress=progress)
+                draws = density.finished(chains, rng)
         except NotConvergedError as error:
             passed_over.append(f"{method}: {error}")
             figures = error.diagnostics
@@ -268,26 +277,6 @@ def _with_end_error(draws: ParameterDraws, width_sd_mm: float | None) -> Paramet
     figures = dict(draws.diagnostics)
     figures.setdefault("end_error_sd", END_ERROR / float(np.sqrt(draws.effective_draws)))
     return replace(draws, diagnostics=figures | {"end_error_mm": figures["end_error_sd"] * width_sd_mm})
-
-
-def _draw(
-    fitted: Drawable,
-    method: Method,
-    *,
-    rng: np.random.Generator,
-    options: SamplerSettings,
-    progress: Progress | None,
-    solved: Solved | None,
-) -> ParameterDraws:
-    if method in ("optimise", "laplace"):
-        return fitted.at_mode(method, options.draws, rng)
-    accuracy = accuracy_in_sd(options, fitted.width_sd_mm)
-    density = fitted.sampled(solved if method == "importance" else None)
-    if method == "importance":
-        draws = importance_draws(density, rng=rng, accuracy_sd=accuracy)
-    else:
-        draws = ensemble_draws(density, rng=rng, accuracy_sd=accuracy, options=options, progress=progress)
-    return density.finished(draws, rng)
 
 
 def importance_draws(density: Sampled, *, rng: np.random.Generator, accuracy_sd: float | None = None) -> ParameterDraws:

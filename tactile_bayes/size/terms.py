@@ -7,6 +7,7 @@ intervals hold and the size is given with a caution; farther out nothing is know
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import accumulate
 from typing import Annotated, Final, Literal
 
 import numpy as np
@@ -69,19 +70,14 @@ def powers(order: int) -> tuple[tuple[int, int], ...]:
 def monomials(values: Sequence[FloatArray], exponents: Sequence[tuple[int, ...]]) -> FloatArray:
     """(..., terms) products of the (...) values' powers."""
     highest = max(max(one) for one in exponents)
-    raised = [_raised(np.asarray(value, dtype=np.float64), highest) for value in values]
+    raised = []
+    for value in values:
+        one = np.asarray(value, dtype=np.float64)
+        raised.append(list(accumulate([np.ones_like(one), *[one] * highest], np.multiply)))
     products = np.stack([raised[0][one[0]] for one in exponents], axis=-1)
     for i in range(1, len(values)):
         products *= np.stack([raised[i][one[i]] for one in exponents], axis=-1)
     return products
-
-
-def _raised(value: FloatArray, highest: int) -> list[FloatArray]:
-    """Powers from 0 up, by multiplication."""
-    raised = [np.ones_like(value)]
-    for _ in range(highest):
-        raised.append(raised[-1] * value)
-    return raised
 
 
 class Recipe(Record):
