@@ -31,13 +31,12 @@ from tactile_bayes.size.learn.regression import (
     PopulationTable,
     body_spread,
     check_population,
-    domain_of,
-    error_figures,
     fit_residual,
     hidden_terms,
     learn_round,
     leverages,
     map_variance,
+    ranges_of,
 )
 from tactile_bayes.size.terms import LOGGED, Recipe, monomials, powers
 
@@ -195,7 +194,18 @@ def _calibration(
     body_sd = np.exp(rows.spread_terms(data) @ spread)
     inverse, leverage = leverages(features)
     held = float(np.mean(np.abs(left) <= ndtri(0.5 + HELD / 2) * np.sqrt(body_sd**2 + noise)))
-    spreads = {"body_sd": float(np.median(body_sd)), "exam_sd": exam.sd}
+    ranged = {"amplitude": np.exp(maps.log_amplitude), "sigma_mm": np.exp(maps.log_width), "d_mm": maps.d_mm}
+    off = np.expm1(-left)  # of sizes of bodies left out
+    figures = {
+        "maps": float(len(maps)),
+        "bodies": float(data.groups),
+        "body_sd": float(np.median(body_sd)),
+        "exam_sd": exam.sd,
+        "left_out_sd": float(left.std()),
+        "left_out_mae_percent": float(100 * np.mean(np.abs(off))),
+        "left_out_bias_percent": float(100 * np.mean(off)),
+        "left_out_held_percent": 100 * held,
+    }
     calibration = BodyCalibration(
         centre=rows.centre,
         eq6=Eq6Law(rows.eq6_powers, eq6.mean, eq6.covariance, _log_amplitude_one_deep(maps)),
@@ -205,12 +215,14 @@ def _calibration(
         feature_powers=rows.feature_powers,
         information_inverse=inverse,
         most_leverage=float(np.quantile(leverage, INSIDE)),
-        domain=domain_of(maps),
+        domain=ranges_of(
+            {"amplitude": np.exp(maps.log_amplitude), "sigma_mm": np.exp(maps.log_width), "d_mm": maps.d_mm}
+        ),
         recipe=recipe,
         depth=rows.depth,
         hidden=hidden_terms(maps, data, body=left, body_sd=body_sd, features=features),
         hidden_any=None,
-        fit=error_figures(maps, data, spreads, -left, held),
+        fit=figures,
         source=source,
         bodies={},
     )

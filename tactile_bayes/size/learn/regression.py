@@ -180,21 +180,6 @@ def map_variance(table: PopulationTable, slope: FloatArray) -> FloatArray:
     return np.asarray(np.einsum("in,nij,jn->n", slope, table.covariance[:, :2, :2], slope))
 
 
-def error_figures(
-    table: PopulationTable, data: BodyRegression, spreads: Mapping[str, float], error: FloatArray, share_held: float
-) -> dict[str, float]:
-    """Figures of a fit, with (groups,) ln(predicted / true size) of bodies left out and the share of them held."""
-    return {
-        "maps": float(len(table)),
-        "bodies": float(data.groups),
-        **spreads,
-        "left_out_sd": float(error.std()),
-        "left_out_mae_percent": float(100 * np.mean(np.abs(np.expm1(error)))),
-        "left_out_bias_percent": float(100 * np.mean(np.expm1(error))),
-        "left_out_held_percent": 100 * share_held,
-    }
-
-
 def check_population(table: PopulationTable) -> None:
     """Raise `BadDataError` where bodies are too few, do not vary or hold a number that is not finite."""
     bodies = len(np.unique(table.body))
@@ -206,13 +191,6 @@ def check_population(table: PopulationTable) -> None:
     finite = [table.d_mm, table.log_amplitude, table.log_width, table.half_log_ratio, table.covariance]
     if not all(np.isfinite(values).all() for values in finite):
         raise BadDataError("a row holds a number that is not finite", way_out="leave it out")
-
-
-def domain_of(table: PopulationTable) -> dict[str, tuple[float, float]]:
-    """Ranges of amplitude, mean width and diameter."""
-    return ranges_of(
-        {"amplitude": np.exp(table.log_amplitude), "sigma_mm": np.exp(table.log_width), "d_mm": table.d_mm}
-    )
 
 
 def ranges_of(values: Mapping[str, FloatArray]) -> dict[str, tuple[float, float]]:
