@@ -215,9 +215,7 @@ def _calibration(
         feature_powers=rows.feature_powers,
         information_inverse=inverse,
         most_leverage=float(np.quantile(leverage, INSIDE)),
-        domain=ranges_of(
-            {"amplitude": np.exp(maps.log_amplitude), "sigma_mm": np.exp(maps.log_width), "d_mm": maps.d_mm}
-        ),
+        domain=ranges_of(ranged),
         recipe=recipe,
         depth=rows.depth,
         hidden=hidden_terms(maps, data, body=left, body_sd=body_sd, features=features),
