@@ -19,12 +19,11 @@ from tactile_bayes.campaigns.report import (
     Written,
     check_inputs,
     copy_outputs,
-    counts_words,
     repeatability_words,
     write_outputs,
 )
 from tactile_bayes.campaigns.run import Bar, Campaign, CampaignState
-from tactile_bayes.campaigns.settings import CampaignSettings
+from tactile_bayes.campaigns.steps import CampaignSettings
 from tactile_bayes.declarations import Record, names_of
 from tactile_bayes.errors import UsageError
 from tactile_bayes.files.atomic import same_file
@@ -74,8 +73,7 @@ class CampaignResult(Record, eq=False):
 
     def _done(self, written: Written) -> Iterator[str]:
         campaign, found = self.campaign, self.campaign.found
-        counts = counts_words(written.sized, written.unsized, written.failed)
-        yield f"{self.folder}: {len(campaign.exams)} exams: {counts}"
+        yield f"{self.folder}: {len(campaign.exams)} exams: {written.counts}"
         if written.pooled:
             yield f"{written.pooled} masses pooled, each at one visit"
         elif campaign.not_pooled:
@@ -94,9 +92,7 @@ class CampaignResult(Record, eq=False):
             yield f"no trial report: {written.no_report}"
 
     def __repr__(self) -> str:
-        if self.written is None:
-            return f"<CampaignResult of {len(self.campaign.exams)} exams: nothing was run>"
-        counts = counts_words(self.written.sized, self.written.unsized, self.written.failed)
+        counts = "nothing was run" if self.written is None else self.written.counts
         return f"<CampaignResult of {len(self.campaign.exams)} exams: {counts}>"
 
     def _repr_html_(self) -> str:

@@ -35,36 +35,27 @@ class Said(Record):
 
 
 def said_by(path: Path, name: str) -> Said:
-    """What a scan, arrays of a scan or a map say of the exam."""
+    """What a scan, arrays of a scan or a map say of the exam: facts on which all scans of the file agree."""
     check_name(name)
     if name.lower().endswith(ARRAYS):
         return Said()
-    return _of_map(path) if name.lower().endswith(MAP) else _of_scan(path)
+    if name.lower().endswith(MAP):
+        _, scans = read_map_and_scans(path)
+        sessions: Sequence[Mapping[str, Any]] = scans
+        made: Any = scans
+    else:
+        records = scan_records(path, keep=())
+        sessions, made = [records.metadata.get("session", {})], provenance_of(records).get("inputs")
+    told = {column: {session.get(key) or "" for session in sessions} for column, key in SAME_IN_SCANS.items()}
+    facts = {column: min(values) for column, values in told.items() if len(values) == 1 and values != {""}}
+    inputs = [one for one in made if isinstance(one, dict)] if isinstance(made, list | tuple) else []
+    return Said(facts, frozenset(str(one["sha256"]) for one in inputs if "sha256" in one))
 
 
 def check_name(name: str) -> None:
     """Refuse the name of a file that a table of exams does not take."""
     if name[0] in "=+@-" or name != name.strip() or not name.isprintable() or len(name) > 1000:
         raise BadDataError("the table takes no such file name: rename it")
-
-
-def _of_scan(path: Path) -> Said:
-    records = scan_records(path, keep=())
-    made = provenance_of(records).get("inputs")
-    inputs = made if isinstance(made, list) else []
-    sources = frozenset(str(one.get("sha256")) for one in inputs if isinstance(one, dict))
-    return Said(_facts([records.metadata.get("session", {})]), sources)
-
-
-def _of_map(path: Path) -> Said:
-    _, scans = read_map_and_scans(path)
-    return Said(_facts(scans), frozenset(one["sha256"] for one in scans if "sha256" in one))
-
-
-def _facts(sessions: Sequence[Mapping[str, Any]]) -> dict[str, str]:
-    """Facts on which all scans of a file agree."""
-    told = {column: {session.get(key) or "" for session in sessions} for column, key in SAME_IN_SCANS.items()}
-    return {column: min(values) for column, values in told.items() if len(values) == 1 and values != {""}}
 
 
 # --- What a file's name says of its exam, by a pattern such as ``{patient}_{visit}_{exam}.npz``.
@@ -105,10 +96,7 @@ class NamePattern:
     def facts(self, name: str) -> dict[str, str]:
         """What a file's name says, by the columns of the table.
 
-        Raises
-        ------
-        BadDataError
-            When the name does not follow the pattern, or a word in it is no side, date or number.
+        A name that does not follow the pattern, or a word in it that is no side, date or number, is a `BadDataError`.
         """
         parts = name.replace(os.sep, "/").split("/")
         known = "/".join(parts[-self._parts :])
@@ -132,14 +120,16 @@ class NamePattern:
             told["replicate"] = str(int(number))
         return told
 
-    def add_to(self, said: Said, name: str) -> Said:
-        """What a file and its name say; where they contradict each other that is an error."""
-        told = self.facts(name)
-        for column, value in told.items():
-            inside = said.facts.get(column, value)
-            if inside.casefold() != value.casefold():
-                raise BadDataError(f"its name says {column} {value}, the file says {inside}")
-        return replace(said, facts={**told, **said.facts})
+
+def _told(path: Path, name: str, pattern: NamePattern | None) -> Said:
+    """What a file and its name say; where they contradict each other that is an error."""
+    said = said_by(path, name)
+    told = {} if pattern is None else pattern.facts(name)
+    for column, value in told.items():
+        inside = said.facts.get(column, value)
+        if inside.casefold() != value.casefold():
+            raise BadDataError(f"its name says {column} {value}, the file says {inside}")
+    return replace(said, facts={**told, **said.facts})
 
 
 # --- Files of a folder that may be exams, and which of them are the same exam twice.
@@ -267,18 +257,17 @@ def find_exams(
     The folder may be an address in an object store, whose maps are passed over. `listed` are rows that the table has
     already; paths are written from the table's folder; `names`: see `NamePattern`.
     """
-    known = {_normal(row["file"]): row for row in listed}
+    known = {row["file"] if is_address(row["file"]) else os.path.normpath(row["file"]): row for row in listed}
     pattern = None if names is None else NamePattern(names)
     found = _stored(folder, known, pattern) if isinstance(folder, str) else _local(folder, table, known, pattern)
     found.spelled.extend(_spell_as(listed, found.rows))
-    found.rows.sort(key=_order)
+    found.rows.sort(
+        key=lambda row: (natural(row["patient"].casefold()), natural(row["visit"]), row["mass"], row["file"])
+    )
     _number(found.rows, listed)
-    found.gone.extend(row["file"] for name, row in known.items() if _is_gone(table.parent, name))
+    gone = (name for name in known if not is_address(name) and not os.path.lexists(table.parent / name))
+    found.gone.extend(known[name]["file"] for name in gone)
     return found
-
-
-def _order(row: Mapping[str, str]) -> tuple[Any, ...]:
-    return natural(row["patient"].casefold()), natural(row["visit"]), row["mass"], row["file"]
 
 
 def _local(folder: Path, table: Path, known: Mapping[str, Mapping[str, str]], pattern: NamePattern | None) -> Found:
@@ -287,9 +276,7 @@ def _local(folder: Path, table: Path, known: Mapping[str, Mapping[str, str]], pa
     found = Found(skipped=files.closed, others=files.others)
     for name, path in files.paths.items():
         try:
-            said[name] = said_by(path, name)
-            if pattern is not None and name not in known:
-                said[name] = pattern.add_to(said.pop(name), name)
+            said[name] = _told(path, name, None if name in known else pattern)
         except BadDataError as error:
             if name not in known:
                 found.skipped.append(f"{name}: {error.what}")
@@ -303,27 +290,16 @@ def _local(folder: Path, table: Path, known: Mapping[str, Mapping[str, str]], pa
 def _stored(address: str, known: Mapping[str, Mapping[str, str]], pattern: NamePattern | None) -> Found:
     """Scans in an object store, each named by its address."""
     found = Found()
-    for one in files_below(check_address(address), *SCANS):
-        if one in known:
-            continue
+    for one in (name for name in files_below(check_address(address), *SCANS) if name not in known):
         try:
             check_name(one)
             with fetched(one) as copy:
-                said = said_by(copy, one)
-            facts = (said if pattern is None else pattern.add_to(said, one)).facts
+                facts = _told(copy, one, pattern).facts
         except BadDataError as error:
             found.skipped.append(f"{one}: {error.what}")
         else:
             found.rows.append({"file": one, **_DEFAULTS, **facts})
     return found
-
-
-def _normal(name: str) -> str:
-    return name if is_address(name) else os.path.normpath(name)
-
-
-def _is_gone(folder: Path, name: str) -> bool:
-    return not is_address(name) and not os.path.lexists(folder / name)
 
 
 def _spell_as(listed: Iterable[Mapping[str, str]], rows: Sequence[dict[str, Any]]) -> Iterator[str]:

@@ -16,8 +16,7 @@ from typing import Any, Final
 from tactile_bayes.batch import CLUSTER_LOST, run_batch
 from tactile_bayes.batch_store import BatchStore, open_store
 from tactile_bayes.campaigns.match import Breasts
-from tactile_bayes.campaigns.settings import STAGED, clear_staged, put_in_place, stamp
-from tactile_bayes.campaigns.steps import FILES, UNWRITTEN, Result
+from tactile_bayes.campaigns.steps import FILES, STAGED, UNWRITTEN, Result, clear_staged, put_in_place, stamp
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError, TactileBayesError, UsageError
 from tactile_bayes.files.atomic import sha256, unwritable
@@ -178,7 +177,28 @@ class Sources(Record):
 class _Source(Record):
     path: Path
     key: str
-    address: str = ""
+    address: str
+    settled: bool  #: Whether its times can be trusted: it was not changed a moment ago.
+
+    @classmethod
+    def of(cls, exam: Exam) -> _Source:
+        """The exam's file, with a key that tells its content from a later one; a store's tag needs no time."""
+        try:
+            if exam.address:
+                said, changed = version_of(exam.address), 0.0
+            else:
+                known = exam.path.stat()
+                said, changed = stamp(exam.path), max(known.st_mtime, known.st_ctime)
+        except (OSError, BadDataError):
+            return cls(exam.path, exam.file, exam.address, settled=False)
+        key = f"{READ} {exam.file} {hashlib.sha256(said.encode()).hexdigest()[:32]}"
+        return cls(exam.path, key, exam.address, changed < time.time() - _SETTLED_S)
+
+    def read(self) -> dict[str, Any]:
+        """The file's digest, and how long it took."""
+        begun = time.perf_counter()
+        digest = sha256_of(self.address) if self.address else sha256(self.path)
+        return {"sha256": digest, "seconds": round(time.perf_counter() - begun, 6)}
 
 
 def read_sources(
@@ -194,12 +214,15 @@ def read_sources(
     New digests go into the journal (`keep`), or else files in object stores that are not known are passed over. A lost
     cluster is a `TactileBayesError`.
     """
-    settled, fresh = _sorted_out({exam.path: exam for exam in exams})
+    sources = [_Source.of(exam) for exam in {exam.path: exam for exam in exams}.values()]
     values: Mapping[str, Any] = {} if store is None else store.values
-    found = Sources({one.path: values[one.key]["sha256"] for one in settled if one.key in values}, {})
-    for sources, kept in ((settled, store if keep else None), (fresh, None)):
-        waiting = [one for one in sources if one.path not in found.digests and (keep or not one.address)]
-        outcomes = run_batch(_read, waiting, key=attrgetter("key"), executor=executor, store=kept, progress=progress)
+    found = Sources({one.path: values[one.key]["sha256"] for one in sources if one.settled and one.key in values}, {})
+    for settled, kept in ((True, store if keep else None), (False, None)):
+        unknown = [one for one in sources if one.settled == settled and one.path not in found.digests]
+        waiting = [one for one in unknown if keep or not one.address]
+        outcomes = run_batch(
+            _Source.read, waiting, key=attrgetter("key"), executor=executor, store=kept, progress=progress
+        )
         for one, outcome in zip(waiting, outcomes, strict=True):
             if outcome.value is not None:
                 found.digests[one.path] = outcome.value["sha256"]
@@ -208,37 +231,6 @@ def read_sources(
             else:
                 found.faults[one.path] = outcome.error.removeprefix(f"{one.address or one.path}: ")
     return found
-
-
-def _sorted_out(exams: Mapping[Path, Exam]) -> tuple[list[_Source], list[_Source]]:
-    """Files whose times can be trusted, and those changed a moment ago; each with its key."""
-    settled: list[_Source] = []
-    fresh: list[_Source] = []
-    now = time.time()
-    for path, exam in exams.items():
-        try:
-            said, changed = _version(exam)
-        except (OSError, BadDataError):
-            fresh.append(_Source(path, exam.file, exam.address))
-            continue
-        said = hashlib.sha256(said.encode()).hexdigest()[:32]
-        trusted = settled if changed < now - _SETTLED_S else fresh
-        trusted.append(_Source(path, f"{READ} {exam.file} {said}", exam.address))
-    return settled, fresh
-
-
-def _version(exam: Exam) -> tuple[str, float]:
-    """What tells a file's content from a later one, and when it last changed; a store's tag needs no time."""
-    if exam.address:
-        return version_of(exam.address), 0.0
-    known = exam.path.stat()
-    return stamp(exam.path), max(known.st_mtime, known.st_ctime)
-
-
-def _read(source: _Source) -> dict[str, Any]:
-    begun = time.perf_counter()
-    digest = sha256_of(source.address) if source.address else sha256(source.path)
-    return {"sha256": digest, "seconds": round(time.perf_counter() - begun, 6)}
 
 
 class Alike:

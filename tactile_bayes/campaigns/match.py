@@ -1,4 +1,4 @@
-"""Which exams and estimates belong to one mass, and how it grew between visits."""
+"""Which exams and estimates belong to one mass, and the order of its visits."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections import defaultdict
 from collections.abc import Container, Mapping, Sequence
 from datetime import date
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
@@ -15,22 +15,15 @@ from tactile_bayes.api.settings import Settings
 from tactile_bayes.api.sized import SizeEstimate
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import Abstention, BadDataError
-from tactile_bayes.files.comparison import CompareReport
-from tactile_bayes.files.documents import read_record
-from tactile_bayes.files.manifest_csv import COMPARED, GROWTH, GROWTH_PAGE, Exam, columns_of, natural, table_text
+from tactile_bayes.files.manifest_csv import Exam, natural
 from tactile_bayes.files.map_nc import read_map
 from tactile_bayes.files.reports import EstimateReport, Place
-from tactile_bayes.findings import Finding, finding_lines
+from tactile_bayes.findings import Finding
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.bump import on_map
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.posterior.verdict import no_verdict
-from tactile_bayes.report.compare import Growth, growths
 from tactile_bayes.trial.readings import day_of, in_order
-
-if TYPE_CHECKING:
-    from tactile_bayes.campaigns.run import Campaign
-
 
 # --- Matching of a campaign's exams to masses that the table names by place in another exam of the same breast.
 #
@@ -165,7 +158,7 @@ def unnamed(reports: Sequence[EstimateReport]) -> list[Finding]:
     ]
 
 
-# --- Growth between the visits of a campaign's masses: who is compared, and the table of what came of it.
+# --- Visits of a campaign's masses, which are compared for growth.
 
 Visits = dict[str, list[Exam]]  #: Exams of one mass by the code of the visit, in order of time.
 
@@ -196,46 +189,3 @@ def days_of(visits: Mapping[str, Sequence[Exam]]) -> tuple[float, ...] | None:
     first = days[0]
     known = [float((day - first).days) for day in days if day is not None and first is not None]
     return tuple(known) if len(known) == len(days) else None
-
-
-def growth_rows(campaign: Campaign) -> list[Growth]:
-    """What `compare` says of each mass with several visits, in order of the masses."""
-    compared, rows = campaign.found.results["compare"], []
-    for name, visits in grown_masses(campaign.exams).items():
-        codes, exam = [*visits], next(iter(visits.values()))[0]
-        place = f"{GROWTH}/{name}"
-        if name in compared:
-            report = read_record(campaign.folder / place / COMPARED, CompareReport)
-            of = {one.map for visit in report.visits for one in visit.maps}
-            sized = [code for code, exams in visits.items() if any(one.name in of for one in exams)]
-            rows += growths(exam.patient, exam.mass, sized, report, f"{place}/{GROWTH_PAGE}")
-        else:
-            fault = campaign.found.faults.get(name)
-            reason = "exams of fewer than two visits came through" if fault is None else fault.reason
-            rows.append(Growth(exam.patient, exam.mass, codes[0], codes[-1], "failed", campaign.not_compared or reason))
-    return rows
-
-
-def growth_text(rows: Sequence[Growth]) -> str:
-    """``growth.csv``: a row for each later visit of a mass."""
-    return table_text([_line(row) for row in rows], columns_of("growth"))
-
-
-def _line(row: Growth) -> dict[str, object]:
-    first, later = (q.median for q in row.sizes_mm) if row.sizes_mm else (None, None)
-    change = row.percent
-    names = {"change_percent": "median", "low_percent": "low", "high_percent": "high", "probability": "probability"}
-    return {
-        "patient": row.patient,
-        "mass": row.mass,
-        "earlier_visit": row.earlier,
-        "later_visit": row.later,
-        "days": row.days,
-        "status": row.status,
-        "reason": row.reason or None,
-        "earlier_mm": first,
-        "later_mm": later,
-        **{column: None if change is None else getattr(change, name) for column, name in names.items()},
-        "verdict": row.verdict or None,
-        "findings": " ".join(finding_lines(row.findings)) or None,
-    }

@@ -2,53 +2,338 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from datetime import date
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from tactile_bayes import __version__
 from tactile_bayes.api.trials import analyse, load_trial, read_excision
-from tactile_bayes.campaigns.match import growth_rows, growth_text, visit_dates
+from tactile_bayes.campaigns.match import grown_masses, unnamed, visit_dates
 from tactile_bayes.campaigns.run import Campaign
-from tactile_bayes.campaigns.tables import Row, done_text, exam_rows, failures_text, pooled_reports, trial_text
-from tactile_bayes.declarations import Record
-from tactile_bayes.errors import BadDataError, UsageError
+from tactile_bayes.declarations import Record, replace
+from tactile_bayes.errors import CANNOT_SHOW, BadDataError, UsageError
 from tactile_bayes.files.atomic import write_text
-from tactile_bayes.files.documents import read_protocol
+from tactile_bayes.files.comparison import CompareReport
+from tactile_bayes.files.documents import read_protocol, read_record
 from tactile_bayes.files.manifest_csv import (
+    COMPARED,
     DONE,
+    ESTIMATE,
     EXAM_PAGE,
     EXAMS,
     FAILURES,
     GROWN,
+    GROWTH,
+    GROWTH_PAGE,
     JOURNAL,
     MAP_FIGURE,
+    MASSES,
+    POOLED,
     REPEATABILITY,
     SIZE_FIGURE,
+    SIZED,
     SIZED_FIGURE,
     THUMBNAIL,
     TRIAL,
     Exam,
+    columns_of,
+    table_text,
 )
 from tactile_bayes.files.reading import IMAGE_BYTES, put, read_bytes
-from tactile_bayes.files.reports import PooledReport
+from tactile_bayes.files.reports import EstimateReport, PooledReport, centre_of
 from tactile_bayes.files.tables import Table
-from tactile_bayes.findings import capital
+from tactile_bayes.findings import Finding, Verdict, by_weight, capital, finding_lines, verdict
+from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.options import TrialSettings
-from tactile_bayes.report.campaign_page import (
-    FAILED,
-    SIZED,
-    UNSIZED,
-    ExamEntry,
-    MassRow,
-    VisitEntry,
-    campaign_html,
-    worst,
-)
-from tactile_bayes.report.compare import Growth, growth_line
+from tactile_bayes.report.campaign_page import ExamEntry, MassRow, VisitEntry, campaign_html, worst
+from tactile_bayes.report.compare import Growth, growth_line, growths
 from tactile_bayes.trial.readings import at_excision, in_order
+
+# --- Tables: exams done, failures, and the trial table that `validate` takes.
+
+TACTILE, POOLED_MODALITY = "tactile", "tactile-pooled"
+_TRIAL_COLUMNS: Final = (
+    "patient", "mass", "modality", "replicate", "size_mm", "status", "sd_mm", "low_mm", "high_mm", "probability",
+    "reader", "visit", "date", "reason", "synthetic",
+)  # fmt: skip
+
+
+_SIZES: Final = {
+    "size_mm": "median", "sd_mm": "sd", "low_mm": "low", "high_mm": "high", "probability": "probability",
+}  # fmt: skip
+_OF_AN_ESTIMATE: Final = (
+    "smallest_lump", "d_x_mm", "d_y_mm", "amplitude", "sigma_x_mm", "sigma_y_mm", "background", "noise_sd",
+    "supposing", "centre_patient_mm", "position", "angle_deg", "variance_share", "scene",
+    "prior_sensitivity",
+)  # fmt: skip
+_OF_A_MASS: Final = ("amplitude", "max_size_mm", "min_size_mm", "d_x_mm", "d_y_mm", "angle_deg", "another_exam")
+"""`_OF_AN_ESTIMATE`, `_OF_A_MASS`: What no table shows."""
+
+
+class Row(Record, eq=False):
+    """One exam as the tables and the index show it."""
+
+    exam: Exam  #: Of exams.csv.
+    report: EstimateReport | None
+    """The estimate, by the campaign's repeatability where it has one; None where a step failed."""
+    step: str = ""
+    fault: str = ""
+    """`step`, `fault`: Which step failed and why; empty where none did."""
+    scans: tuple[Mapping[str, str], ...] = ()
+    synthetic: bool | None = None
+    """`scans`, `synthetic`: Of the file: digests and facts, whether it is simulated (None: unknown)."""
+    findings: tuple[Finding, ...] = ()
+    """What speaks against the exam: of its estimate, of the pooled size of its mass, of the table."""
+
+    @property
+    def size(self) -> Quantity | None:
+        """Largest size with the interval of the tables; None without one."""
+        return None if self.report is None else self.report.max_size_mm
+
+    @property
+    def reason(self) -> str:
+        """Why there is no size; empty where there is one."""
+        if self.report is None:
+            return f"{self.step} failed: {self.fault}"
+        return "" if self.size is not None else self.report.reason
+
+    @property
+    def status(self) -> str:
+        """As the trial table has it: an exam without an estimate looked for the mass in vain, others were not done."""
+        return _status(self.report)
+
+    def has(self, kind: str) -> bool:
+        """Whether a finding of the kind speaks against it."""
+        return any(one.kind == kind for one in self.findings)
+
+    @property
+    def verdict(self) -> Verdict:
+        """Sound, doubtful or no answer."""
+        return verdict(self.findings, answered=self.size is not None)
+
+
+def _status(report: EstimateReport | PooledReport | None) -> str:
+    if report is None:
+        return "not_done"
+    if report.max_size_mm is not None:
+        return "detected"
+    silent = isinstance(report, EstimateReport) and report.reason_code == CANNOT_SHOW
+    return "not_detected" if report.status == "no_estimate" and not silent else "not_done"
+
+
+def exam_rows(campaign: Campaign, pooled: Mapping[str, PooledReport]) -> list[Row]:
+    """Every exam of the table, in its order; `pooled` are the masses by their names."""
+    together = _of_pooled(pooled.values())
+    rows = [_row(campaign, exam, together.get(exam.name, ())) for exam in campaign.exams]
+    of_scan: dict[Path, list[EstimateReport]] = defaultdict(list)
+    for row in rows:
+        of_scan[row.exam.path] += [] if row.report is None else [row.report]
+    more = {path: unnamed(reports) for path, reports in of_scan.items() if reports}
+    return [
+        row if row.report is None else replace(row, findings=by_weight((*row.findings, *more[row.exam.path])))
+        for row in rows
+    ]
+
+
+def _of_pooled(pooled: Iterable[PooledReport]) -> dict[str, tuple[Finding, ...]]:
+    """What the pooled size of its mass says against each exam, such as that its lump lies elsewhere."""
+    return {
+        name: tuple(
+            replace(one, about="")
+            for one in report.findings
+            if (one.about == f"map {number}" and one.kind != "several_masses")  # its row says which mass it is of
+            or one.kind == "maps_disagree"
+        )
+        for report in pooled
+        for number, name in enumerate((one.map for one in report.maps), start=1)
+    }
+
+
+def _row(campaign: Campaign, exam: Exam, together: tuple[Finding, ...]) -> Row:
+    fault = campaign.found.faults.get(exam.name)
+    mapped = campaign.found.of("map", exam.name) or {}
+    facts: dict[str, Any] = {"scans": tuple(mapped.get("scans", ())), "synthetic": mapped.get("synthetic")}
+    if fault is not None and fault.step not in ("figures", "page"):
+        return Row(exam, None, fault.step, fault.reason, **facts)
+    by_site = SIZED in (campaign.found.of("size", exam.name) or {"files": ()})["files"]
+    report = read_record(campaign.folder / EXAMS / exam.name / (SIZED if by_site else ESTIMATE), EstimateReport)
+    return Row(exam, _shortened(report), findings=(*report.findings, *together), **facts)
+
+
+def _shortened(report: EstimateReport) -> EstimateReport:
+    """The report with what tables and pages show: the rest of it is a hundred times as much."""
+    masses = tuple(replace(one, **dict.fromkeys(_OF_A_MASS)) for one in report.masses)
+    rest: dict[str, Any] = {"candidates": (), "other_rises": (), "touching": (), "left_out": (), "prior": {}}
+    return replace(report, masses=masses, diagnostics={}, provenance={}, **dict.fromkeys(_OF_AN_ESTIMATE), **rest)
+
+
+def pooled_reports(campaign: Campaign) -> dict[str, PooledReport]:
+    """Each pooled mass, by its name."""
+    folder = campaign.folder / MASSES
+    return {name: read_record(folder / name / POOLED, PooledReport) for name in campaign.found.results["pool"]}
+
+
+def done_text(rows: Sequence[Row]) -> str:
+    """``exams_done.csv``: exams with an estimate, or with the reason for none."""
+    return table_text([_done(row) for row in rows if row.report is not None], columns_of("exams_done"))
+
+
+def _done(row: Row) -> dict[str, object]:
+    report = row.report
+    assert report is not None
+    x_mm, y_mm = centre_of(report.centre_mm) or (None, None)
+    smallest = report.min_size_mm
+    return {
+        **_names(row.exam),
+        "side": row.exam.side,
+        "reader": row.exam.reader,
+        "folder": f"{EXAMS}/{row.exam.name}",
+        "scan_sha256": " ".join(scan["sha256"] for scan in row.scans if "sha256" in scan) or None,
+        "status": row.status,
+        "reason": row.reason or None,
+        **_figures(row.size, _SIZES),
+        "smallest_mm": None if smallest is None else smallest.median,
+        "detected_probability": report.detected_probability,
+        "centre_x_mm": x_mm,
+        "centre_y_mm": y_mm,
+        "verdict": row.verdict,
+        "findings": " ".join(finding_lines(row.findings)) or None,
+        "synthetic": row.synthetic,
+    }
+
+
+def _names(exam: Exam) -> dict[str, object]:
+    return {name: getattr(exam, name) for name in ("patient", "visit", "mass", "replicate", "file")}
+
+
+def _figures(quantity: Quantity | None, names: Mapping[str, str]) -> dict[str, object]:
+    """Figures of a quantity by their columns; none without one."""
+    return {} if quantity is None else {column: getattr(quantity, name) for column, name in names.items()}
+
+
+def failures_text(campaign: Campaign, rows: Sequence[Row]) -> str:
+    """``failures.csv``: exams, and masses that could not be pooled or compared, with the step and the reason."""
+    failed = {row.exam.name: _names(row.exam) for row in rows}
+    failed |= {row.exam.of_mass: {**_names(row.exam), "replicate": None, "file": None} for row in rows}
+    blank = {"visit": None, "replicate": None, "file": None}
+    failed |= {row.exam.of_visits: {**_names(row.exam), **blank} for row in rows}
+    found = campaign.found.faults
+    lines = [
+        failed[name] | {"step": found[name].step, "reason": found[name].reason} for name in failed if name in found
+    ]
+    return table_text(lines, columns_of("failures"))
+
+
+def trial_text(
+    campaign: Campaign,
+    rows: Sequence[Row],
+    pooled: Mapping[str, PooledReport],
+    masses: Collection[tuple[str, str]] | None,
+) -> str:
+    """``trial.csv``: every exam as a reading of ``tactile``, every pooled visit as one of ``tactile-pooled``.
+
+    `masses` have a size after excision: the others are left out. None takes all. Numbers run over the visits of a mass.
+    """
+    taken = [row for row in rows if masses is None or (row.exam.patient, row.exam.mass) in masses]
+    readings = [
+        _reading(row.exam, TACTILE, row.report, row.reason, reader=row.exam.reader, synthetic=row.synthetic)
+        for row in taken
+    ]
+    if pooled:
+        visits: dict[str, list[Row]] = defaultdict(list)
+        for row in taken:
+            visits[row.exam.of_mass].append(row)
+        readings += [_together(campaign, some, pooled.get(name)) for name, some in visits.items()]
+    count: Counter[tuple[object, ...]] = Counter()
+    for one in readings:
+        key = (one["patient"], one["mass"], one["modality"])
+        count[key] += 1
+        one["replicate"] = count[key]
+    return table_text(readings, _TRIAL_COLUMNS)
+
+
+def _together(campaign: Campaign, rows: Sequence[Row], report: PooledReport | None) -> dict[str, object]:
+    """The reading of a mass at a visit."""
+    exam = rows[-1].exam
+    fault = campaign.found.faults.get(exam.of_mass)
+    reason = "every exam failed" if fault is None else f"{fault.step} failed: {fault.reason}"
+    told = [row.synthetic for row in rows if row.synthetic is not None]  # a failed exam does not say
+    synthetic = any(told) if told else None
+    return _reading(exam, POOLED_MODALITY, report, reason if report is None else report.reason, synthetic=synthetic)
+
+
+def _reading(
+    exam: Exam,
+    modality: str,
+    report: EstimateReport | PooledReport | None,
+    reason: str,
+    *,
+    synthetic: bool | None,
+    reader: str | None = None,
+) -> dict[str, object]:
+    status = _status(report)
+    return {
+        "patient": exam.patient,
+        "mass": exam.mass,
+        "modality": modality,
+        "status": status,
+        **_figures(None if report is None else report.max_size_mm, _SIZES),
+        "reader": reader,
+        "visit": exam.visit,
+        "date": exam.day,
+        "reason": (reason or None) if status != "detected" else None,
+        "synthetic": synthetic,
+    }
+
+
+# --- Growth between the visits of masses, as rows and as a table.
+
+
+def growth_rows(campaign: Campaign) -> list[Growth]:
+    """What `compare` says of each mass with several visits, in order of the masses."""
+    compared, rows = campaign.found.results["compare"], []
+    for name, visits in grown_masses(campaign.exams).items():
+        codes, exam = [*visits], next(iter(visits.values()))[0]
+        place = f"{GROWTH}/{name}"
+        if name in compared:
+            report = read_record(campaign.folder / place / COMPARED, CompareReport)
+            of = {one.map for visit in report.visits for one in visit.maps}
+            sized = [code for code, exams in visits.items() if any(one.name in of for one in exams)]
+            rows += growths(exam.patient, exam.mass, sized, report, f"{place}/{GROWTH_PAGE}")
+        else:
+            fault = campaign.found.faults.get(name)
+            reason = "exams of fewer than two visits came through" if fault is None else fault.reason
+            rows.append(Growth(exam.patient, exam.mass, codes[0], codes[-1], "failed", campaign.not_compared or reason))
+    return rows
+
+
+def growth_text(rows: Sequence[Growth]) -> str:
+    """``growth.csv``: a row for each later visit of a mass."""
+    return table_text([_growth_line(row) for row in rows], columns_of("growth"))
+
+
+def _growth_line(row: Growth) -> dict[str, object]:
+    first, later = (q.median for q in row.sizes_mm) if row.sizes_mm else (None, None)
+    names = {"change_percent": "median", "low_percent": "low", "high_percent": "high", "probability": "probability"}
+    return {
+        "patient": row.patient,
+        "mass": row.mass,
+        "earlier_visit": row.earlier,
+        "later_visit": row.later,
+        "days": row.days,
+        "status": row.status,
+        "reason": row.reason or None,
+        "earlier_mm": first,
+        "later_mm": later,
+        **_figures(row.percent, names),
+        "verdict": row.verdict or None,
+        "findings": " ".join(finding_lines(row.findings)) or None,
+    }
+
+
+# --- Tables, index and report as files.
 
 REPORT, PAGE, INDEX = "report.json", "report.html", "index.html"
 WRITTEN: Final = (DONE, FAILURES, TRIAL, GROWN, REPORT, PAGE, INDEX, REPEATABILITY)
@@ -78,10 +363,7 @@ class Excision(Record):
 class Written(Record):
     """What was written, in numbers and words."""
 
-    sized: int
-    unsized: int
-    failed: int
-    """`sized`, `unsized`, `failed`: Exams by how they ended."""
+    counts: str  #: How the exams ended, in words.
     pooled: int  #: Masses at a visit that were pooled.
     left_out: tuple[str, ...] = ()  #: Masses without a size after excision, as ``patient mass``.
     report: str = ""  #: The trial report as text; empty where there is none.
@@ -95,9 +377,11 @@ class Written(Record):
 
 def write_outputs(campaign: Campaign, excision: Excision | None, protocol: Path | None = None) -> Written:
     """Write tables, the index and, where excision sizes are given, the trial's report."""
-    folder, rows, growth = campaign.folder, exam_rows(campaign), growth_rows(campaign)
+    folder, growth, pooled = campaign.folder, growth_rows(campaign), pooled_reports(campaign)
+    rows = exam_rows(campaign, pooled)
     masses = None if excision is None else excision.masses()
-    tables = {DONE: done_text(rows), FAILURES: failures_text(campaign, rows), TRIAL: trial_text(campaign, rows, masses)}
+    tables = {DONE: done_text(rows), FAILURES: failures_text(campaign, rows)}
+    tables |= {TRIAL: trial_text(campaign, rows, pooled, masses)}
     tables |= {GROWN: growth_text(growth)} if growth else {}
     for name, text in tables.items():
         write_text(folder / name, text, force=True)
@@ -107,12 +391,13 @@ def write_outputs(campaign: Campaign, excision: Excision | None, protocol: Path 
     links = {name: name for name in tables}
     links |= {"trial report": PAGE} if report else {}
     links |= {REPEATABILITY: REPEATABILITY} if campaign.repeatability else {}
-    counts = _counts(rows)
-    write_text(folder / INDEX, _page(campaign, rows, counts, links, growth), force=True)
+    sized, failed = sum(row.size is not None for row in rows), sum(row.report is None for row in rows)
+    counts = f"{sized} sized, {len(rows) - sized - failed} without a size, {failed} failed"
+    write_text(folder / INDEX, _page(campaign, rows, pooled, growth, counts=counts, links=links), force=True)
     left_out = set() if masses is None else {(row.exam.patient, row.exam.mass) for row in rows} - masses
     return Written(
-        *counts,
-        pooled=len(campaign.found.results["pool"]),
+        counts,
+        pooled=len(pooled),
         left_out=tuple(f"{patient} {mass}" for patient, mass in sorted(left_out)),
         report=report,
         no_report=fault,
@@ -137,15 +422,15 @@ def check_inputs(exams: Sequence[Exam], excision: Excision | None, protocol: Pat
     if protocol is not None and excision is None:
         raise UsageError("--protocol is for the trial's report; give --excision too")
     if excision is not None:
-        _check_spelling(excision, exams)
-        _check_dates(excision, exams)
+        table = excision.table()
+        _check_spelling(table, exams)
+        _check_dates(table, exams)
     if protocol is not None:
         _trial_settings(protocol)
 
 
-def _check_spelling(excision: Excision, exams: Iterable[Exam]) -> None:
+def _check_spelling(table: Table, exams: Iterable[Exam]) -> None:
     """Refuse a row that is of a mass of the exams but for capitals: the mass would be left out of the trial."""
-    table = excision.table()
     known = {(exam.patient.casefold(), exam.mass.casefold()): exam for exam in exams}
     for row, (patient, mass) in enumerate(zip(table.columns["patient"], table.columns["mass"], strict=True)):
         exam = known.get((patient.casefold(), mass.casefold()))
@@ -157,9 +442,9 @@ def _check_spelling(excision: Excision, exams: Iterable[Exam]) -> None:
                 raise table.error(row, column, what, way_out="write it one way in both tables")
 
 
-def _check_dates(excision: Excision, exams: Sequence[Exam]) -> None:
+def _check_dates(table: Table, exams: Sequence[Exam]) -> None:
     """Refuse a mass that was excised before every exam."""
-    columns = excision.table().columns
+    columns = table.columns
     keys = zip(columns["patient"], columns["mass"], strict=True)
 
     def fault(row: int, column: str, what: str, /, *, way_out: str) -> BadDataError:
@@ -175,12 +460,6 @@ def _trial_settings(protocol: Path | None) -> tuple[TrialSettings, str | None]:
         return TrialSettings(), None
     title, fixed = read_protocol(protocol)
     return TrialSettings(**fixed), title
-
-
-def _counts(rows: Sequence[Row]) -> tuple[int, int, int]:
-    sized = sum(row.size is not None for row in rows)
-    failed = sum(row.report is None for row in rows)
-    return sized, len(rows) - sized - failed, failed
 
 
 def _write_report(folder: Path, excision: Excision, protocol: Path | None, growth: Sequence[Growth]) -> tuple[str, str]:
@@ -199,54 +478,43 @@ def _write_report(folder: Path, excision: Excision, protocol: Path | None, growt
 def _page(
     campaign: Campaign,
     rows: Sequence[Row],
-    counts: tuple[int, int, int],
-    links: Mapping[str, str],
+    pooled: Mapping[str, PooledReport],
     growth: Sequence[Growth],
+    *,
+    counts: str,
+    links: Mapping[str, str],
 ) -> str:
-    inline = len(rows) <= _MOST_INLINE
-    masses = list(_masses(campaign, rows, growth, inline=inline))
+    """The index: a row for each mass, in the order of the table."""
+    changes = {(one.patient, one.mass): one for one in growth}  # the last one of each mass: to its last visit
+    of_mass: dict[str, dict[str, list[Row]]] = defaultdict(lambda: defaultdict(list))
+    for row in rows:
+        of_mass[row.exam.of_visits][row.exam.visit].append(row)
+    masses = []
+    for visits in of_mass.values():
+        dates = visit_dates({code: [row.exam for row in some] for code, some in visits.items()})
+        ordered = in_order(dates) or list(visits)
+        first = visits[ordered[0]][0].exam
+        entries = []
+        for code in ordered:
+            exams = tuple(_exam(campaign, row, inline=len(rows) <= _MOST_INLINE) for row in visits[code])
+            entries.append(_visit(dates[code], visits[code], exams, pooled.get(visits[code][0].exam.of_mass)))
+        change = changes.get((first.patient, first.mass))
+        masses.append(MassRow(first.patient, first.mass, tuple(entries), first.side or "", change))
     shown = worst(masses, _MOST_ROWS)
     patients = len({row.patient for row in masses})
-    lines = [f"{len(masses)} masses of {patients} patients; {len(rows)} exams: {counts_words(*counts)}."]
+    lines = [f"{len(masses)} masses of {patients} patients; {len(rows)} exams: {counts}."]
     if len(shown) < len(masses):
         lines.append(f"Here are the {len(shown)} to be looked at first; all are in {DONE} and {FAILURES}.")
     lines += [repeatability_words(campaign)] if campaign.repeatability else []
     return campaign_html(shown, lines=lines, links=links, version=__version__)
 
 
-def _masses(campaign: Campaign, rows: Sequence[Row], growth: Sequence[Growth], *, inline: bool) -> Iterator[MassRow]:
-    """A row of the index for each mass, in the order of the table."""
-    pooled = pooled_reports(campaign)
-    changes = {(one.patient, one.mass): one for one in growth}  # the last one of each mass: to its last visit
-    masses: dict[str, dict[str, list[Row]]] = defaultdict(lambda: defaultdict(list))
-    for row in rows:
-        masses[row.exam.of_visits][row.exam.visit].append(row)
-    for visits in masses.values():
-        dates = visit_dates({code: [row.exam for row in some] for code, some in visits.items()})
-        ordered = in_order(dates) or list(visits)
-        first = visits[ordered[0]][0].exam
-        yield MassRow(
-            first.patient,
-            first.mass,
-            tuple(_visit(campaign, code, dates[code], visits[code], pooled, inline=inline) for code in ordered),
-            first.side or "",
-            changes.get((first.patient, first.mass)),
-        )
-
-
 def _visit(
-    campaign: Campaign,
-    code: str,
-    day: date | None,
-    rows: Sequence[Row],
-    pooled: Mapping[str, PooledReport],
-    *,
-    inline: bool,
+    day: date | None, rows: Sequence[Row], exams: tuple[ExamEntry, ...], report: PooledReport | None
 ) -> VisitEntry:
     """A visit with its size: the pooled one where there is one, else that of its one exam."""
-    exams = tuple(_exam(campaign, row, inline=inline) for row in rows)
+    code = rows[0].exam.visit
     words = code if day is None or day.isoformat() == code else f"{code}, {day.isoformat()}"
-    report = pooled.get(rows[0].exam.of_mass)
     if report is not None:
         size = report.leading.max_size_mm
         used = sum(one.status == "estimate" for one in report.maps)
@@ -271,13 +539,13 @@ def _exam(campaign: Campaign, row: Row, *, inline: bool) -> ExamEntry:
     reader = f", {exam.reader}" if exam.reader else ""
     return ExamEntry(
         f"visit {exam.visit}, exam {exam.replicate}{reader}",
-        FAILED if row.report is None else UNSIZED if size is None else SIZED,
         row.reason,
         size,
         row.findings,
         picture,
         f"{folder}/{EXAM_PAGE}" if EXAM_PAGE in made else "",
         {name: f"{folder}/{name}" for name in _LINKS if name in made},
+        failed=row.report is None,
     )
 
 
@@ -288,8 +556,3 @@ def repeatability_words(campaign: Campaign) -> str:
         return f"spread between exams not learned: {campaign.not_learned}" if campaign.not_learned else ""
     words = found.words()
     return f"{capital(words)}; every size is by this spread, learned from the repeats ({REPEATABILITY})."
-
-
-def counts_words(sized: int, unsized: int, failed: int) -> str:
-    """How the exams ended, in words."""
-    return f"{sized} sized, {unsized} without a size, {failed} failed"

@@ -28,15 +28,16 @@ from tactile_bayes.batch import CLUSTER_LOST, BatchInterrupted, Outcome, run_bat
 from tactile_bayes.batch_store import BatchStore
 from tactile_bayes.campaigns.inputs import READ, Alike, StepResults, read_sources, unchanged
 from tactile_bayes.campaigns.match import Breasts, Match, NamedPlace, Visits, days_of, grown_masses, visit_dates
-from tactile_bayes.campaigns.settings import CampaignSettings, digest_of
 from tactile_bayes.campaigns.steps import (
     FEWEST_MASSES,
     FILES,
     NOT_LEARNED,
+    CampaignSettings,
     Made,
     Result,
     Task,
     copy_tasks,
+    digest_of,
     learn_repeatability,
     make_estimate,
     make_figures,
@@ -228,10 +229,11 @@ class Campaign:
         """
         self._read_sources()
         sound = [exam for exam in self.exams if exam.name not in self.found.faults]
-        self.not_pooled = self._why_not_pooled()
+        self.not_pooled = self.not_compared = self._not_over_bodies()
+        if len({exam.of_mass for exam in self.exams}) == len(self.exams):
+            self.not_pooled = "no mass has several exams at one visit"
         masses = 0 if self.not_pooled else len({exam.of_mass for exam in sound})
         learns = taught_by(sound, self.settings) >= FEWEST_MASSES
-        self.not_compared = self._not_over_bodies()
         grown = 0 if self.not_compared else len(grown_masses(sound))
         self._stages.needed.update(
             steps_needed(len(sound), masses, settings=self.settings, learns=learns, compared=grown)
@@ -464,12 +466,6 @@ class Campaign:
         self._stages.run(step, [], without=masses - len(known))
         if self.settings.copy_to:
             self._stages.run("copy", [], without=masses - len(known))
-
-    def _why_not_pooled(self) -> str:
-        """Why no mass is pooled; empty where some mass has several exams and the calibration can pool them."""
-        if len({exam.of_mass for exam in self.exams}) == len(self.exams):
-            return "no mass has several exams at one visit"
-        return self._not_over_bodies()
 
     def _not_over_bodies(self) -> str:
         """Which calibration cannot size several maps together; empty for none."""

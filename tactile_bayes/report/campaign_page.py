@@ -17,16 +17,15 @@ from tactile_bayes.report.compare import Growth
 from tactile_bayes.report.pages import TEMPLATES, page
 from tactile_bayes.report.svg import THUMB_ENDS, THUMB_SCALE, colour_steps
 
-FAILED, UNSIZED, SIZED = "failed", "without a size", "sized"
-_CLASSES: Final = {FAILED: "failed", UNSIZED: "without", SIZED: "sized"}
+STATUSES: Final = ("failed", "without a size", "sized")
+"""How an exam or a mass ended, those to be looked at first before the others."""
+FAILED, UNSIZED, SIZED = STATUSES
 
 
 class ExamEntry(Record, eq=False):
     """One exam of a visit."""
 
     words: str  #: Such as ``visit 1, exam 2``.
-    status: str
-    """`FAILED`, `UNSIZED` or `SIZED`."""
     reason: str = ""  #: Why there is no size; empty where there is one.
     size: Quantity | None = None  #: Largest size, mm, with the interval that leads; None without one.
     findings: tuple[Finding, ...] = ()  #: What speaks against the exam.
@@ -35,6 +34,12 @@ class ExamEntry(Record, eq=False):
     page: str = ""  #: The exam's page from the index's folder; empty without one.
     links: Mapping[str, str] = field(default_factory=dict)
     """Other files of the exam, by the words of their links."""
+    failed: bool = False  #: Whether a step failed, for the reason.
+
+    @property
+    def status(self) -> str:
+        """One of `STATUSES`."""
+        return FAILED if self.failed else UNSIZED if self.size is None else SIZED
 
     @property
     def alt(self) -> str:
@@ -90,12 +95,7 @@ class MassRow(Record, eq=False):
         """Of the last visit; a mass is failed where all its exams there are."""
         if self.last.size is not None:
             return SIZED
-        return FAILED if all(exam.status == FAILED for exam in self.last.exams) else UNSIZED
-
-    @property
-    def kind(self) -> str:
-        """Class of the row in the style sheet."""
-        return _CLASSES[self.status]
+        return FAILED if all(exam.failed for exam in self.last.exams) else UNSIZED
 
     @property
     def told(self) -> Iterator[tuple[str, str]]:
@@ -115,17 +115,16 @@ class MassRow(Record, eq=False):
                 yield severity, text if len(exams) == len(every) else f"{text} ({'; '.join(exams)})"
             yield from ((severity, text) for text in finding_lines(compared, severity, paper=True))
         for exam in every:
-            if exam.status == FAILED:
+            if exam.failed:
                 yield "caution", f"{exam.words}: {exam.reason}"
 
     @property
     def badness(self) -> tuple[int, int, int, float]:
         """Sort key of what is to be looked at first."""
         size, findings = self.last.size, [one for exam in self.exams for one in exam.findings]
-        failed = sum(exam.status == FAILED for exam in self.exams)
+        failed = sum(exam.failed for exam in self.exams)
         doubts = sum(10 if one.severity == "caution" else 1 for one in findings)
-        order = (FAILED, UNSIZED, SIZED).index(self.status)
-        return order, -failed, -doubts, 0.0 if size is None else -self.width
+        return STATUSES.index(self.status), -failed, -doubts, 0.0 if size is None else -self.width
 
     @property
     def width(self) -> float:
@@ -168,7 +167,7 @@ def campaign_html(rows: Sequence[MassRow], *, lines: Sequence[str], links: Mappi
         lines=lines,
         order=WORST_FIRST,
         beside=links,
-        counts={status: sum(row.status == status for row in rows) for status in _CLASSES},
+        counts={status: sum(row.status == status for row in rows) for status in STATUSES},
         rows=rows,
         growing=any(row.growth is not None for row in rows),
         scale=THUMB_SCALE,

@@ -38,8 +38,8 @@ from scipy.io import savemat
 
 import tactile_bayes as tb
 from tactile_bayes.campaigns.inputs import open_campaign
+from tactile_bayes.campaigns.report import Row
 from tactile_bayes.campaigns.steps import Task, make_map, run_step
-from tactile_bayes.campaigns.tables import Row
 from tactile_bayes.errors import UsageError
 from tactile_bayes.files.documents import load_schema
 from tactile_bayes.files.manifest_csv import Exam as Listed

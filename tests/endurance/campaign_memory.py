@@ -24,8 +24,7 @@ import psutil
 
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.batch import LocalWorkers, open_executor, run_batch
-from tactile_bayes.campaigns.settings import put_in_place
-from tactile_bayes.campaigns.steps import Task, make_estimate, make_figures, make_map, run_step
+from tactile_bayes.campaigns.steps import Task, make_estimate, make_figures, make_map, put_in_place, run_step
 from tactile_bayes.errors import TactileBayesError
 from tactile_bayes.files.atomic import sha256
 

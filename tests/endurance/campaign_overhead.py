@@ -27,10 +27,8 @@ from campaign_scale import PORT, Cluster, Watch, entries
 from tactile_bayes.batch import open_executor, run_batch
 from tactile_bayes.campaigns import report as campaign_report
 from tactile_bayes.campaigns import run as campaigns
-from tactile_bayes.campaigns import tables as campaign_tables
 from tactile_bayes.campaigns.inputs import Sources, open_campaign
-from tactile_bayes.campaigns.settings import CampaignSettings
-from tactile_bayes.campaigns.steps import Task
+from tactile_bayes.campaigns.steps import CampaignSettings, Task
 from tactile_bayes.files.documents import read_record
 from tactile_bayes.files.manifest_csv import ESTIMATE, EXAMS, JOURNAL, Exam
 
@@ -64,8 +62,7 @@ def client(out: Path, exams: int) -> None:
             (campaigns, "run_step", step),
             (campaigns, "read_sources", sources),
             (campaigns, "unchanged", lambda *_: True),
-            (campaign_tables, "read_record", lambda _path, kind: read_record(estimate, kind)),
-            (campaign_tables, "pooled_reports", lambda _campaign: {}),
+            (campaign_report, "read_record", lambda _path, kind: read_record(estimate, kind)),
             (campaign_report, "pooled_reports", lambda _campaign: {}),
         ):
             stack.enter_context(mock.patch.object(module, name, fake))

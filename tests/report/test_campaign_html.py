@@ -70,7 +70,7 @@ def told(text: str) -> tuple[Finding, ...]:
 
 
 def row_of(text: str) -> MassRow:
-    exam = ExamEntry(text, UNSIZED, text, None, told(text), b"<svg/>", text, {text: text})
+    exam = ExamEntry(text, text, None, told(text), b"<svg/>", text, {text: text})
     grown = Growth(text, text, text, text, "failed", text, link=text)
     return MassRow(text, text, (VisitEntry(text, (exam,), why=text),), text, grown)
 
@@ -80,7 +80,7 @@ def mass(name: str, *exams: ExamEntry, size: Quantity | None = None) -> MassRow:
 
 
 def sized(size: Quantity, *findings: Finding) -> ExamEntry:
-    return ExamEntry("visit 1, exam 1", SIZED, size=size, findings=findings)
+    return ExamEntry("visit 1, exam 1", size=size, findings=findings)
 
 
 def test_hostile_texts_add_no_tag_and_no_attribute() -> None:
@@ -113,14 +113,14 @@ def test_the_page_loads_nothing_and_runs_its_own_script_alone() -> None:
 
 
 def test_the_worst_come_first_as_the_page_says() -> None:
-    failed, narrow = ExamEntry("visit 1, exam 2", FAILED, "map failed"), replace(SIZE, low=13.5, high=14.5)
+    failed, narrow = ExamEntry("visit 1, exam 2", "map failed", failed=True), replace(SIZE, low=13.5, high=14.5)
     rows = [
         mass("narrow", sized(narrow), size=narrow),
         mass("wide", sized(SIZE), size=SIZE),
         mass("checked", sized(SIZE, Finding("few_strokes", "a"), Finding("curved_skin", "b")), size=SIZE),
         mass("doubtful", sized(SIZE, Finding("side", "a")), size=SIZE),
         mass("one lost", sized(narrow), failed, size=narrow),
-        mass("empty", ExamEntry("visit 1, exam 1", UNSIZED, "no lump")),
+        mass("empty", ExamEntry("visit 1, exam 1", "no lump")),
         mass("lost", failed),
     ]
     names = [row.patient for row in worst(rows, 10)]
@@ -132,7 +132,7 @@ def test_a_mass_is_of_its_last_visit_and_names_the_exams_that_a_finding_is_of() 
     doubt = Finding("side", "words")
     visits = (
         VisitEntry("1", (sized(SIZE, doubt),), SIZE),
-        VisitEntry("2", (ExamEntry("visit 2, exam 1", UNSIZED, "no lump"),), why="no lump"),
+        VisitEntry("2", (ExamEntry("visit 2, exam 1", "no lump"),), why="no lump"),
     )
     row = MassRow("P", "1", visits)
     assert (row.status, row.last.size) == (UNSIZED, None)
@@ -152,7 +152,7 @@ def test_what_speaks_against_a_comparison_is_told_once_beside_what_speaks_agains
 
 def test_each_mass_can_be_filtered_and_put_in_order() -> None:
     page = page_of(
-        mass("a", ExamEntry("visit 1, exam 1", UNSIZED, "x")),
+        mass("a", ExamEntry("visit 1, exam 1", "x")),
         mass("b", sized(SIZE, Finding("few_strokes", "look")), size=SIZE),
     )
     found = {attrs["data-status"]: attrs["data-flagged"] for tag, attrs in Tags(page).tags if "data-status" in attrs}

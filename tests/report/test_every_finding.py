@@ -32,8 +32,7 @@ from tactile_bayes.api.maps import Map
 from tactile_bayes.api.pooled import PooledSize
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.api.sized import SizeEstimate
-from tactile_bayes.campaigns.match import growth_text
-from tactile_bayes.campaigns.tables import Row, done_text
+from tactile_bayes.campaigns.report import Row, done_text, growth_text
 from tactile_bayes.declarations import replace
 from tactile_bayes.exports.exam import Identity, MapFile, estimate_of
 from tactile_bayes.exports.fhir import bundle_of
@@ -48,7 +47,7 @@ from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import MapRecipe, TactileMap
 from tactile_bayes.mapping.select import scan_findings
-from tactile_bayes.report.campaign_page import SIZED, ExamEntry, MassRow, VisitEntry, campaign_html
+from tactile_bayes.report.campaign_page import ExamEntry, MassRow, VisitEntry, campaign_html
 from tactile_bayes.report.compare import Growth, compare_summary, compare_text, growths
 from tactile_bayes.report.exam_page import exam_page
 from tactile_bayes.report.growth_page import draw_comparison
@@ -203,7 +202,7 @@ def growth_table(made: Made) -> str:
 
 def campaign_card(made: Made) -> str:
     size = Quantity(median=15.0, mean=15.0, sd=1.0, low=13.0, high=17.0, probability=0.95, kind="eti")
-    exam = ExamEntry("visit 1, exam 1", SIZED, size=size, findings=made.findings)
+    exam = ExamEntry("visit 1, exam 1", size=size, findings=made.findings)
     rows = [MassRow("a", "1", (VisitEntry("1", (exam,), size),))]
     return words_of(campaign_html(rows, lines=(), links={}, version="1"))
 

@@ -21,7 +21,7 @@ from posterior_maps import bump_map
 import tactile_bayes as tb
 from tactile_bayes.api.maps import Map
 from tactile_bayes.inference.draws import Quantity
-from tactile_bayes.report.campaign_page import FAILED, SIZED, UNSIZED, ExamEntry, MassRow, VisitEntry, campaign_html
+from tactile_bayes.report.campaign_page import ExamEntry, MassRow, VisitEntry, campaign_html
 from tactile_bayes.report.pages import TEMPLATES
 
 DEMO = Path(tb.__file__).parent / "demo"
@@ -72,9 +72,9 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     assert run_here("validate", DEMO / "trial.csv", *given, cwd=folder).returncode == 0
     size = Quantity(median=14.0, mean=14.0, sd=1.4, low=12.0, high=17.5, probability=0.95, kind="eti")
     exams = [
-        ExamEntry("visit 1, exam 1", SIZED, "", size, (), b"<svg/>", "exams/a/exam.html"),
-        ExamEntry("visit 1, exam 2", UNSIZED, "no lump", thumbnail=b"<svg/>", page="exams/b/exam.html"),
-        ExamEntry("visit 1, exam 3", FAILED, "map failed"),
+        ExamEntry("visit 1, exam 1", "", size, (), b"<svg/>", "exams/a/exam.html"),
+        ExamEntry("visit 1, exam 2", "no lump", thumbnail=b"<svg/>", page="exams/b/exam.html"),
+        ExamEntry("visit 1, exam 3", "map failed", failed=True),
     ]
     rows = [MassRow("P1", "1", (VisitEntry("1", tuple(exams), size, 1),))]
     found = {path.stem: path.read_text() for path in folder.glob("*.html")}
