@@ -97,8 +97,6 @@ def scan(
         if note.startswith("CAUTION"):
             warnings.warn(note, stacklevel=3)
     found = with_checked(made.scan, _checked_head(head))
-    if made.notes:
-        found = replace(found, session={**found.session, "imported_as": "; ".join(made.notes)[:2000]})
     return corrected(with_session(found, path_of(session)), correct)
 
 

@@ -203,8 +203,10 @@ def combined(sources: Sequence[Source], given: Stated) -> Imported:
     _check_shapes(held)
     _check_counts(held)
     _check_units(held, calibrated=pressure)
-    scan = _scan(held, {"frames_unit": str(stated.unit)} if pressure else {})
-    return Imported(scan, tuple(told))
+    facts = {"frames_unit": str(stated.unit)} if pressure else {}
+    if told:
+        facts["imported_as"] = "; ".join(told)[:2000]
+    return Imported(_scan(held, facts), tuple(told))
 
 
 def _refuse_missing(held: Arrays) -> None:
