@@ -48,13 +48,19 @@ def _plain(value: Any) -> str:
         return "yes" if value else "no"
     if isinstance(value, float):
         return f"{value:.6g}"
-    if isinstance(value, list) and np.size(value) > _MOST_NUMBERS and np.asarray(value).dtype.kind in "if":
-        return f"{np.size(value)} numbers, {np.min(value):.6g} to {np.max(value):.6g}"
     if isinstance(value, list):
+        leaves = list(_leaves(value))
+        if len(leaves) > _MOST_NUMBERS and all(isinstance(one, int | float) for one in leaves):
+            return f"{len(leaves)} numbers, {min(leaves):.6g} to {max(leaves):.6g}"
         return ", ".join(_plain(item) for item in value) if value else "none"
     if isinstance(value, dict):
         return "none" if not value else "; ".join(f"{k} {_plain(v)}" for k, v in value.items())
     return "none" if value is None else str(value)
+
+
+def _leaves(value: list[Any]) -> Iterator[Any]:
+    for item in value:
+        yield from _leaves(item) if isinstance(item, list) else [item]
 
 
 # --- A scan in a few lines, for every command that makes one.

@@ -25,7 +25,7 @@ from tactile_bayes.mapping.select import (
     refuse_without_frames,
     timing_figures,
 )
-from tactile_bayes.scans import HeadShape, Landmarks
+from tactile_bayes.scans import HeadShape, Landmarks, Scan
 
 RATE_HZ: Final = (5.0, 2000.0)
 """Of frames."""
@@ -44,7 +44,7 @@ MOST_ZIGZAG_MM: Final = 3.0
 FROZEN_S, MOST_FROZEN = 0.3, 0.1
 """Frames that repeat each other for so long are the array's last one; their share among those used."""
 MOST_FLICKER: Final = 0.7
-"""Of the frames' mean pressures: 0.2 at most in 466 right scans, 1 in noise."""
+"""Of `_flicker`: 0.2 at most in 466 right scans, 1 in noise."""
 _STILL_TAXELS: Final = 0.01
 """Share of the taxels that may change in a frame that repeats the last one."""
 MOST_REPEATED: Final = 0.5
@@ -163,10 +163,27 @@ def _stillness(part: SelectedFrames, still: BoolArray) -> Iterator[tuple[str, fl
 
 
 def _flicker(part: SelectedFrames) -> Iterator[tuple[str, float]]:
-    """Variance of the frames' means between neighbours over that among all: 1 of noise, near 0 of a hand's pressure."""
-    level = part.level_kpa[part.used]
-    if len(level) >= LEAST_FRAMES and level.std():
-        yield "level_flicker", float(np.mean(np.diff(level) ** 2) / (2 * np.var(level)))
+    """Variance between neighbouring frames over that among all, of their means and of what is left: the smaller.
+
+    Both are 1 in noise. A hand's pressure changes steadily; a bench holds the mean, and a flat phantom leaves nothing
+    else, but what a head feels on it is the same from frame to frame.
+    """
+    numbers = np.flatnonzero(part.used)
+    if len(numbers) < LEAST_FRAMES:
+        return
+    level = part.level_kpa[numbers]
+    first = np.unique(np.linspace(0, len(numbers) - 2, _SAMPLE_FRAMES).astype(int))
+    one, following = (_pattern_kpa(part.scan, numbers[at]) for at in (first, first + 1))
+    if level.std() and one.any():
+        pattern = np.mean((following - one) ** 2) / np.mean(one**2)
+        yield "frame_flicker", float(min(np.mean(np.diff(level) ** 2) / np.var(level), pattern)) / 2
+
+
+def _pattern_kpa(scan: Scan, frames: IndexArray) -> FloatArray:
+    """(n, rows, columns) readings of frames, less their means."""
+    given = scan.element_calibration
+    pressure = given.gain_kpa_per_count * scan.frames.counts[frames] + given.offset_kpa
+    return np.asarray(pressure - pressure.mean(axis=(1, 2), keepdims=True))
 
 
 def _motion(part: SelectedFrames) -> Iterator[tuple[str, float]]:
@@ -252,8 +269,10 @@ def _unlike(quality: Mapping[str, float], head: HeadShape | None) -> Iterator[tu
         yield text, "press less hard, or repair the array"
     if (zigzag := quality.get("pose_zigzag_mm", 0.0)) > MOST_ZIGZAG_MM:
         yield f"the poses jump to and fro: they lie {zigzag:.1f} mm beside the middle of their neighbours", _ONE_TOOL
-    if quality.get("level_flicker", 0.0) > MOST_FLICKER:
-        text = "the frames' mean pressures jump about as noise does, and a hand's pressure changes steadily"
+    if quality.get("frame_flicker", 0.0) > MOST_FLICKER:
+        text = (
+            "each frame differs from the one before as noise does: what a hand does and a head feels changes steadily"
+        )
         yield text, "check the array's cable and supply, and that the times are the frames' own"
     if quality.get("frozen_share", 0.0) > MOST_FROZEN:
         share = 100 * quality["frozen_share"]

@@ -29,11 +29,12 @@ def thinned(start: int, step: int, **session: str) -> Scan:
 
 
 def level(start: int, **session: str) -> Scan:
-    """A scan that feels no lump: frames of one pressure with noise, on the packaged scan's strokes."""
+    """A scan that feels no lump: a hand's pressure with noise, on the packaged scan's strokes."""
     scan = thinned(start, 2, **session)
     rng = np.random.default_rng(start)
     calibration = scan.element_calibration
-    kpa = 9.0 + 0.2 * rng.standard_normal(scan.frames.counts.shape)
+    hand = 9.0 + 0.5 * np.sin(2.0 * scan.frames.time_s)
+    kpa = hand[:, None, None] + 0.2 * rng.standard_normal(scan.frames.counts.shape)
     counts = np.rint((kpa - calibration.offset_kpa) / calibration.gain_kpa_per_count)
     return replace(scan, frames=PressureFrames(scan.frames.time_s, np.clip(counts, 0, 4000).astype(np.uint16)))
 
