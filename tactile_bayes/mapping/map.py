@@ -225,7 +225,7 @@ def _broken(quality: Mapping[str, float]) -> Iterator[Finding]:
         far = change > BROKEN_PROFILE_CHANGE  # so far that sizes fail
         end = "the size may be off by more than its interval" if far else "the size is for even fat"
         text = (
-            f"the head presses otherwise in one part of the map than in another (by {change:.3f} in 30 mm, as the "
+            f"the head presses differently in one part of the map than in another (by {change:.3f} in 30 mm, as the "
             "pressure falls off from the head's middle): the fat is of uneven depth, "
             f"or a rib or another lump lies near; {end}"
         )
