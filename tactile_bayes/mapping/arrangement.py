@@ -90,9 +90,7 @@ NOT_CHECKED: Final = Finding(
 _CONTRADICTING: Final = "strokes over one place do not agree on what they felt there; size and place may be wrong"
 _LATE: Final = "the tracker's times do not fit those of the sensor array; size and place may be wrong"
 _MOVED: Final = "the body moved to and fro during the scan, as breathing moves it; size and place may be wrong"
-_MOUNTED: Final = (
-    "the sensor array or the tracker seems not to be mounted as stated; size and place may be wrong"
-)
+_MOUNTED: Final = "the sensor array or the tracker seems not to be mounted as stated; size and place may be wrong"
 TOO_SHORT: Final = "too few frames to compare arrangements"
 _QUARTER: Final = np.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
 
