@@ -125,6 +125,7 @@ def test_no_file_imports_itself_by_way_of_others():
     assert circle(arrows) == []
 
 
+@pytest.mark.long
 def test_few_imports_stand_in_functions():
     """A reader sees at the top what a file needs; figures, devices and help texts spare their heavy ones."""
     inside = {

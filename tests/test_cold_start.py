@@ -101,6 +101,7 @@ def estimate_inputs(tmp_path: Path, run_cli) -> tuple[Path, Path]:
     return map_path, calibration
 
 
+@pytest.mark.long
 def test_the_laplace_estimate_imports_only_what_it_uses(run_python, estimate_inputs):
     map_path, calibration = estimate_inputs
     options = ("--size-calibration", calibration, "--method", "laplace", "--json")

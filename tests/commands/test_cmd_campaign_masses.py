@@ -76,6 +76,7 @@ def test_replicates_and_visits_are_matched_by_place_in_patient_axes(folder: Path
     assert centre(folder / "c", "P1.v2.m2.r1") == (21, -6)
 
 
+@pytest.mark.long
 def test_without_a_place_the_largest_is_taken_and_the_other_is_told(folder: Path) -> None:
     """The control: no row names a place."""
     told = campaign(folder, "b.nc,P1,1,2,2,left,,")

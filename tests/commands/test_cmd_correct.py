@@ -60,6 +60,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return place
 
 
+@pytest.mark.long
 def test_the_report_tells_the_shift_and_what_is_odd(folder: Path) -> None:
     told = (folder / "phantoms.txt").read_text()
     assert "solid, corrected by 12 phantoms of this site: +2" in told
@@ -68,6 +69,7 @@ def test_the_report_tells_the_shift_and_what_is_odd(folder: Path) -> None:
     assert "the depth of fat is not used" in (folder / "plain.txt").read_text()
 
 
+@pytest.mark.long
 def test_estimate_adds_the_shift_and_says_by_what(folder: Path) -> None:
     words = ("estimate", "demo.nc", "--method", "laplace", "--json", "--size-calibration")
     plain = tb.estimate(folder / "demo.nc", method="laplace", size_calibration="solid").answer.document
@@ -83,6 +85,7 @@ def test_estimate_adds_the_shift_and_says_by_what(folder: Path) -> None:
     assert "sizes by the calibration phantoms.json (solid, corrected by 12 phantoms of this site: +" in told
 
 
+@pytest.mark.long
 def test_phantoms_without_the_heads_profile_correct_sizes_without_depth_of_fat(folder: Path) -> None:
     words = ("estimate", "demo.nc", "--method", "laplace", "-v", "--size-calibration")
     told = run_here(*words, "plain.json", cwd=folder).stdout
@@ -91,6 +94,7 @@ def test_phantoms_without_the_heads_profile_correct_sizes_without_depth_of_fat(f
     assert "fat under the head" in run_here(*words, "phantoms.json", cwd=folder).stdout
 
 
+@pytest.mark.long
 def test_maps_are_pooled_with_the_correction(folder: Path) -> None:
     words = ("estimate", "demo.nc", "--pool", "--method", "laplace", "--size-calibration")
     sizes = [
@@ -103,6 +107,7 @@ def test_maps_are_pooled_with_the_correction(folder: Path) -> None:
         assert "izes by solid, corrected by 12 phantoms of this site" in told
 
 
+@pytest.mark.long
 def test_show_describes_the_correction_and_its_base(folder: Path) -> None:
     found = json.loads(run_here("show", "phantoms.json", "--json", cwd=folder).stdout)
     assert found["schema"] == "tactile-bayes/site-calibration/1"
@@ -113,6 +118,7 @@ def test_show_describes_the_correction_and_its_base(folder: Path) -> None:
     assert "correction" in run_here("show", "phantoms.json", cwd=folder).stdout
 
 
+@pytest.mark.long
 def test_python_gives_what_the_file_holds(folder: Path) -> None:
     given = tb.calibrate_size(table(), correct="solid")
     written = body_calibration(folder / "phantoms.json")
@@ -127,6 +133,7 @@ def test_python_gives_what_the_file_holds(folder: Path) -> None:
         tb.calibrate_size(table(), correct="solid", form="eq6-residual")
 
 
+@pytest.mark.long
 def test_map_files_are_estimated_and_keep_the_depth_of_fat(folder: Path) -> None:
     for i in range(3):
         shutil.copyfile(folder / "demo.nc", folder / f"m{i}.nc")
@@ -178,6 +185,7 @@ def test_tables_that_do_not_fit_are_refused_in_one_line(tmp_path: Path, change, 
     assert not (tmp_path / "out.json").exists()
 
 
+@pytest.mark.long
 def test_what_cannot_be_corrected_is_refused(folder: Path) -> None:
     words = ("calibrate", "size", "phantoms.csv", "-o", "never.json", "--correct")
     for name in ("plane-strain", "none"):
@@ -191,6 +199,7 @@ def test_what_cannot_be_corrected_is_refused(folder: Path) -> None:
     assert "leave it out with --correct" in fit.stderr
 
 
+@pytest.mark.long
 def test_a_damaged_file_is_refused(folder: Path) -> None:
     document = json.loads((folder / "phantoms.json").read_text())
     document["site"]["covariance"] = [[1.0, 2.0], [2.0, 1.0]]

@@ -77,6 +77,7 @@ def test_the_tables_of_another_head_are_others(monkeypatch: pytest.MonkeyPatch) 
         assert outside["centred_frame"] < 0.5 * inside["centred_frame"]
 
 
+@pytest.mark.long
 def test_how_many_cases_cannot_be_seen_depends_on_the_head(tmp_path: Path) -> None:
     """Record 0075 has 47 and 38 of 150: a few of the nine between, and two that stay what they are."""
     grid = tmp_path / "grid.csv"

@@ -181,6 +181,7 @@ def test_a_mass_seen_on_too_few_maps_gets_no_size(folder: Path) -> None:
     assert "No estimate: a lump was found on 0 of 1 maps" in some.stdout
 
 
+@pytest.mark.long
 def test_a_known_seat_moves_the_size(folder: Path) -> None:
     def median(*more: str) -> float:
         done = run_here("estimate", "mass1.nc", *FAST, *settings(folder, between_map_sd=0), "--json", *more, cwd=folder)

@@ -32,6 +32,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.long
 def test_it_is_learned_from_a_campaigns_folder_and_says_what_it_means(site: Path) -> None:
     document = json.loads((site / "site.json").read_text())
     assert document["low"] < 0.08 < document["high"]
@@ -47,6 +48,7 @@ def test_it_is_learned_from_a_campaigns_folder_and_says_what_it_means(site: Path
     assert (site / "site.json").stat().st_mode & 0o777 == 0o600
 
 
+@pytest.mark.long
 def test_show_describes_the_file(site: Path) -> None:
     shown = run_here("show", "site.json", cwd=site).stdout
     assert "spread between exams of one mass at a site" in shown
@@ -54,6 +56,7 @@ def test_show_describes_the_file(site: Path) -> None:
     assert "draws_1" not in shown
 
 
+@pytest.mark.long
 def test_an_estimate_by_it_has_one_interval_and_says_whose(site: Path) -> None:
     told = run_here("estimate", "map.nc", *FAST, "--repeatability", "site.json", cwd=site)
     assert told.returncode == 0, told.stderr
@@ -129,6 +132,7 @@ def test_a_comparison_is_at_the_sites_repeatability(site: Path, tmp_path: Path) 
     assert "the repeatability is of sizes by solid" in refused.stderr
 
 
+@pytest.mark.long
 def test_python_learns_and_uses_it(site: Path, tmp_path: Path) -> None:
     found = tb.calibrate_repeatability(site / "out", path=tmp_path / "again.json")
     assert (tmp_path / "again.json").read_bytes() == (site / "site.json").read_bytes()
@@ -186,6 +190,7 @@ def refusal(site: Path, *words: object) -> tuple[int, str]:
     return done.returncode, done.stderr
 
 
+@pytest.mark.long
 def test_another_calibration_normalisation_or_a_stated_spread_is_refused(site: Path) -> None:
     code, told = refusal(site, "--size-calibration", "eq6")
     assert code == 3
@@ -202,6 +207,7 @@ def test_another_calibration_normalisation_or_a_stated_spread_is_refused(site: P
     assert "and this size is by solid-mean (frames normalised by mean)" in done.stderr
 
 
+@pytest.mark.long
 def test_a_file_of_another_kind_and_a_calibration_that_did_not_size_are_refused(site: Path, tmp_path: Path) -> None:
     (tmp_path / "x.json").write_text('{"schema": "tactile-bayes/plan/1"}')
     done = run_here("estimate", site / "map.nc", "--repeatability", "x.json", cwd=tmp_path)

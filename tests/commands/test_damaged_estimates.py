@@ -217,6 +217,7 @@ def test_a_map_whose_list_of_scales_is_of_another_type_is_one_line(folder: Path)
     assert "variable mean has dimensions" in done.stderr
 
 
+@pytest.mark.long
 def test_an_estimate_with_half_of_its_outline_is_one_line(folder: Path) -> None:
     """The page asked for the other half and ended in a traceback."""
     document = json.loads((folder / "one.json").read_text())

@@ -47,6 +47,7 @@ CASES = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("case", CASES)
 def test_a_full_disk_takes_the_file_and_not_the_result(case: str, full: Path) -> None:
     words, printed = CASES[case]

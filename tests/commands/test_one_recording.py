@@ -57,6 +57,7 @@ def told_of(pooled: dict[str, Any]) -> list[tuple[str, str]]:
     return [(one["about"], one["text"]) for one in pooled["findings"] if one["kind"] == "same_scan"]
 
 
+@pytest.mark.long
 def test_a_map_keeps_the_digests_of_file_and_frames(folder: Path) -> None:
     first, again, other = (facts(folder / f"{name}.nc") for name in ("a", "again", "b"))
     assert first["sha256"] != again["sha256"]
@@ -77,6 +78,7 @@ def test_compare_refuses_it_and_pooling_and_the_page_caution(folder: Path, tmp_p
     assert f"CAUTION: map 2: {TOLD.format('map 1')}" in (tmp_path / "page.html").read_text()
 
 
+@pytest.mark.long
 def test_python_knows_it_also_of_scans_that_are_in_no_file() -> None:
     first = tb.build_map(thinned(0, 4, side="right", examiner="E1"))
     again = tb.build_map(thinned(0, 4, side="right", examiner="E2"), cell_mm=1.2)
@@ -88,6 +90,7 @@ def test_python_knows_it_also_of_scans_that_are_in_no_file() -> None:
         tb.compare(first, again, method="laplace")
 
 
+@pytest.mark.long
 def test_maps_of_earlier_versions_are_told_apart_by_their_files(folder: Path, tmp_path: Path) -> None:
     for name in ("a", "again"):
         made, _ = read_map_and_scans(folder / f"{name}.nc")

@@ -87,6 +87,7 @@ def image_of(path: Path) -> Iterator[Any]:
         yield image
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("degrees", [0.0, 80.0, 200.0, 280.0])
 def test_values_lie_at_their_places_in_the_patient(degrees: float, tmp_path: Path) -> None:
     """highdicom's affine of the image against the program's transforms, for all four quarter turns of the picture."""
@@ -170,6 +171,7 @@ def test_own_codes_are_declared_and_research_use_is_said(files: dict[str, Any]) 
     assert files["map"].ContentQualification == "RESEARCH"
 
 
+@pytest.mark.long
 def test_no_lump_is_a_report_without_sizes(exam: Path, tmp_path: Path) -> None:
     report = report_of(exam, tmp_path / "out", "empty.nc", "empty.json")
     assert {concept(one) for one in items(report, "NUM")} <= {"111012"}

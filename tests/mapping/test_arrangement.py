@@ -103,6 +103,7 @@ def test_two_mistakes_at_once_are_named_both():
     assert set(check.best.corrections) == {"columns-reversed", "scalar-last"}
 
 
+@pytest.mark.long
 def test_the_base_of_the_tracker_may_lie_anyhow():
     rng = np.random.default_rng(3)
     turn = rotation_from_quaternion(rng.standard_normal(4))
@@ -115,6 +116,7 @@ def test_the_base_of_the_tracker_may_lie_anyhow():
     assert checked(moved).best.spread == pytest.approx(checked(scan).best.spread, rel=0.05)
 
 
+@pytest.mark.long
 def test_frames_of_another_clock_contradict_each_other():
     """Control: places of other frames fit in no arrangement."""
     scan = lump()
@@ -157,6 +159,7 @@ def test_each_scan_of_a_map_is_checked():
         tb.build_map([lump(), mistaken(lump(), "rows-reversed")])
 
 
+@pytest.mark.long
 def test_a_body_that_breathes_is_named_and_a_still_one_is_not():
     scan = lump()
     poses = scan.poses

@@ -366,6 +366,7 @@ def test_shared_scans_show_the_lump_where_it_is(shared_data, name, latency_ms):
     assert tactile_map.quality["coverage"] > 0.8
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("normalise", ["mean", "gain"])
 def test_a_shared_scan_of_two_halves_is_the_whole(shared_data, normalise):
     scan = scans.shared_scan(shared_data / "scans" / "s05_two_masses.npz")

@@ -159,6 +159,7 @@ def test_repeats_that_lie_apart_and_an_uncertain_centre_widen_it():
     assert min(wider.angle_sd_deg, vague.angle_sd_deg) > 2 * plain.angle_sd_deg
 
 
+@pytest.mark.long
 def test_nipples_of_several_scans_are_averaged_and_those_far_apart_refused():
     up, _ = axes_of(70)
 

@@ -148,6 +148,7 @@ def test_an_accident_is_told_and_is_no_map_without_a_lump(made: Callable[[Scan],
     assert why.code == CANNOT_SHOW
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["readings stand still", "hardly a frame in the window"])
 def test_an_estimate_from_it_says_that_it_cannot_show_a_lump(name: str) -> None:
     one, told = UNLIKE[name]

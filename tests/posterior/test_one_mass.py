@@ -165,6 +165,7 @@ def test_python_and_the_page_size_the_same_mass(exams: Path, tmp_path: Path) -> 
     assert "another rise stands at" not in text
 
 
+@pytest.mark.long
 def test_visits_are_compared_at_one_mass(exams: Path) -> None:
     """The later visit's report is about another mass; the control says which, and is refused."""
     compared = json.loads(run_here("compare", "m1.nc", "--with", "m3.nc", "--json", *FAST, cwd=exams).stdout)

@@ -240,6 +240,7 @@ def test_without_a_size_it_says_what_each_setting_answers(case: str, tmp_path: P
     draw_ladder(found, tmp_path / "f.png", title=case)
 
 
+@pytest.mark.long
 def test_a_row_says_that_chains_took_over():
     taken_over = replace(row("--method importance"), answers=(row("--method ensemble").answer,))
     said = ladder_text(replace(ladder(), rows=(taken_over, row("--method ensemble"))))

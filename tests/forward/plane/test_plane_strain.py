@@ -273,6 +273,7 @@ def test_half_the_cell_gives_the_same_map_everywhere(d: float, depth_ratio: floa
     agrees_with_half_its_cell(Body(d, depth_ratio, seat))
 
 
+@pytest.mark.long
 def test_the_limit_of_no_volume_change_is_approached_and_not_locked() -> None:
     maps = [line_figures(Body(15, 0.9, 0.0, poisson=nu)) for nu in (0.495, 0.499, 0.4999, 0.49999)]
     steps = np.abs(np.diff(maps, axis=0))

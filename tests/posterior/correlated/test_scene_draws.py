@@ -110,6 +110,7 @@ def test_what_stands_beside_adds_its_uncertainty() -> None:
     np.testing.assert_allclose(whole.flat[:, :4].var(axis=0), held.flat.var(axis=0) + added, rtol=0.05)
 
 
+@pytest.mark.long
 def test_a_method_that_fails_hands_on(monkeypatch: pytest.MonkeyPatch) -> None:
     def heavy(_: Sampled, **__: object) -> ParameterDraws:
         raise NotConvergedError("Pareto shape 0.91", diagnostics={"pareto_k": 0.91})
