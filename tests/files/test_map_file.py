@@ -135,6 +135,12 @@ def test_a_map_off_its_lattice_is_not_written(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+def test_an_axis_of_one_huge_value_is_off_its_lattice(tmp_path):
+    """Its rounding would be as large as the cells, and the estimate ended in a singular matrix."""
+    with pytest.raises(BadDataError, match="x_mm steps by 0 to 0 mm"):
+        write_map(tmp_path / "map.nc", replace(plain_map(), x_mm=np.full(8, -1e9)), provenance=PROVENANCE)
+
+
 def _edit(change):
     """Change an open file."""
 
