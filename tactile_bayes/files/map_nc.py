@@ -199,7 +199,7 @@ def _check_lattice(axes: Mapping[str, FloatArray], cell_mm: float) -> None:
         if not np.isfinite(axis).all():
             raise BadDataError(f"variable {name} holds values that are not finite", way_out=_WAY_OUT)
         steps = np.diff(axis)
-        rounding = 1e-6 * max(cell_mm, float(np.abs(axis).max()))
+        rounding = 1e-6 * max(cell_mm, float(np.abs(axis).max(initial=0.0)))
         if len(steps) and float(np.abs(steps - cell_mm).max()) > min(rounding, 0.01 * cell_mm):
             what = f"variable {name} steps by {steps.min():g} to {steps.max():g} mm, not by the cell of {cell_mm:g} mm"
             raise BadDataError(what, way_out=_WAY_OUT)
