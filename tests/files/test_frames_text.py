@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +37,7 @@ def rows(values: Any, separator: str = ",", digits: int = 4) -> list[str]:
     return [separator.join(f"{value:.{digits}f}" for value in row) for row in values]
 
 
+@cache
 def timed(scale: float, separator: str = ",") -> list[str]:
     return [f"{scale * t:.4f}{separator}{row}" for t, row in zip(TIME, rows(FLAT, separator), strict=True)]
 
