@@ -38,9 +38,8 @@ def simulated_fit() -> Any:
     from tactile_bayes.mapping.map import MapRecipe, TactileMap
     from tactile_bayes.options import BumpPrior
     from tactile_bayes.posterior.bump import cell_mean_gaussian, window_cells
-    from tactile_bayes.posterior.field import Window
     from tactile_bayes.posterior.fit import fit_scene
-    from tactile_bayes.posterior.marginal import Problem, Scene, independent_variance
+    from tactile_bayes.posterior.window import Problem, Scene, Window, independent_variance
 
     rng = np.random.default_rng(1)
     axis = np.arange(-HALF_MM, HALF_MM + 1.0)

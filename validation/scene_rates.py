@@ -24,8 +24,8 @@ from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior.bump import cell_mean_gaussian
 from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map
-from tactile_bayes.posterior.field import LENGTHS_MM
 from tactile_bayes.posterior.masses import other_rises
+from tactile_bayes.posterior.window import LENGTHS_MM
 from tactile_bayes.studies.sbc import draw_field, draw_truth
 from validation.common import Table, parser, percent
 

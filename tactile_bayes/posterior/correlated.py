@@ -19,9 +19,8 @@ from tactile_bayes.posterior.draw import (
     SamplerSettings,
     draw_parameters,
 )
-from tactile_bayes.posterior.field import FLOOR, Window, cosines_for
 from tactile_bayes.posterior.fit import FieldFit, tangent_columns
-from tactile_bayes.posterior.marginal import Problem, Scene, independent_variance
+from tactile_bayes.posterior.marginal import FLOOR
 from tactile_bayes.posterior.neighbours import (
     WANTED,
     Surroundings,
@@ -41,6 +40,7 @@ from tactile_bayes.posterior.selection import (
 )
 from tactile_bayes.posterior.verdict import rim_fault
 from tactile_bayes.posterior.white import BumpFit, MapDraws
+from tactile_bayes.posterior.window import Problem, Scene, Window, cosines_for, independent_variance
 from tactile_bayes.presets import FIELD_COSINES, SceneAsked
 from tactile_bayes.progress import Progress
 

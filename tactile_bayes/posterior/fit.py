@@ -17,7 +17,8 @@ from tactile_bayes.inference.importance import Gaussians, smooth_weights
 from tactile_bayes.inference.modes import find_mode, finite_differences, mode_and_covariance, stencil
 from tactile_bayes.posterior.bump import drawn_widths
 from tactile_bayes.posterior.draw import Sampled, SamplerSettings, with_beside
-from tactile_bayes.posterior.marginal import NEGLIGIBLE, CollapsedTarget, Problem, Scene, linear_columns
+from tactile_bayes.posterior.marginal import NEGLIGIBLE, CollapsedTarget
+from tactile_bayes.posterior.window import Problem, Scene, linear_columns
 from tactile_bayes.presets import Method
 
 # --- Posterior of a scene under correlated errors: its mode, a Gaussian for each noise field, and draws.
@@ -147,7 +148,7 @@ def newton_mixture(
     """
     scale = np.sqrt(np.diag(covariance))
     points = stencil(start, step=0.3 * scale)
-    by_field = target.by_field(points) + target.log_prior(points)[:, None]
+    by_field = target.by_field(points) + target.scene.log_prior(points, target.problem)[:, None]
     whole = float(np.logaddexp.reduce(by_field[0]))
     share = np.exp(by_field[0] - whole) if np.isfinite(whole) else np.zeros(by_field.shape[1])
     means, covariances, masses = [], [], []

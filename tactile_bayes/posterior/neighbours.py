@@ -11,15 +11,7 @@ from tactile_bayes.geometry import BoolArray, FloatArray
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.bump import SMOOTHING_MM, smoothed_excess
 from tactile_bayes.posterior.fit import FieldFit
-from tactile_bayes.posterior.marginal import (
-    APART,
-    BLOCK,
-    REACH_IN_RADII,
-    Neighbour,
-    Problem,
-    Scene,
-    neighbour_templates,
-)
+from tactile_bayes.posterior.marginal import BLOCK
 from tactile_bayes.posterior.selection import (
     ASKING,
     LEAST_ODDS,
@@ -30,6 +22,7 @@ from tactile_bayes.posterior.selection import (
     odds,
     retested,
 )
+from tactile_bayes.posterior.window import APART, REACH_IN_RADII, Neighbour, Problem, Scene, neighbour_templates
 from tactile_bayes.presets import SceneAsked
 
 # --- Check of structures at the window's rim against the map around it.

@@ -13,9 +13,9 @@ from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.posterior.bump import covariance_from_log_widths
 from tactile_bayes.posterior.draw import ROTATION_ODDS
-from tactile_bayes.posterior.field import FLOOR
 from tactile_bayes.posterior.fit import FieldFit, Mixture, fit_scene, newton_mixture, tangent_columns
-from tactile_bayes.posterior.marginal import CollapsedTarget, Problem, Scene, Shape, linear_columns
+from tactile_bayes.posterior.marginal import FLOOR, CollapsedTarget
+from tactile_bayes.posterior.window import Problem, Scene, Shape, linear_columns
 from tactile_bayes.presets import SceneAsked
 
 # --- Density of a window's cells under correlated errors: the density of each given the others.

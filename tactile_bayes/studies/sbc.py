@@ -14,8 +14,8 @@ from tactile_bayes.mapping.map import MapRecipe, TactileMap
 from tactile_bayes.options import BumpPrior, FieldCosines
 from tactile_bayes.posterior.draw import MapPosterior, SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map
-from tactile_bayes.posterior.field import LENGTHS_MM, SHARES, cell_mean_profile
 from tactile_bayes.posterior.white import WIDEST_IN_RADII
+from tactile_bayes.posterior.window import LENGTHS_MM, SHARES, cell_mean_profile
 from tactile_bayes.presets import Method
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.draws import BumpDraws, ShapeDraws, ShapePrior

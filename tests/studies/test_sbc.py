@@ -12,7 +12,7 @@ from tactile_bayes.declarations import as_dict, replace
 from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior import draw
 from tactile_bayes.posterior.draw import MapPosterior
-from tactile_bayes.posterior.field import LENGTHS_MM
+from tactile_bayes.posterior.window import LENGTHS_MM
 from tactile_bayes.report.laboratory import verdict
 from tactile_bayes.studies import sbc
 from tactile_bayes.studies.sbc import (

@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tactile_bayes.posterior import field as spanned
 from tactile_bayes.posterior import marginal as collapsed
-from tactile_bayes.posterior.field import Spanned
-from tactile_bayes.posterior.marginal import CollapsedTarget, Scene
+from tactile_bayes.posterior.marginal import CollapsedTarget, Spanned
+from tactile_bayes.posterior.window import Scene
 from tests.posterior.correlated.test_marginal import START, TURNED, cells_of, noise, target_of
 
 NEAR = 0.03
@@ -72,7 +71,7 @@ def test_a_strong_maps_bumps_are_few(monkeypatch: pytest.MonkeyPatch) -> None:
     assert 25 <= few._coefficients.shape[1] <= 90
     assert basis(1.5, {}) is None
     assert basis(NEAR, {"x": 1e4}) is None
-    monkeypatch.setattr(spanned, "MOST_PRODUCTS", 10)
+    monkeypatch.setattr(collapsed, "MOST_PRODUCTS", 10)
     assert basis(NEAR, {}) is None
 
 
@@ -81,5 +80,5 @@ def test_dropping_more_would_show(monkeypatch: pytest.MonkeyPatch) -> None:
     target = target_of(cells_of(noise(0, white=0.001)), scene=Scene("ellipse"))
     theta = points(target.scene, NEAR, {})
     exact = each_by_itself(target, theta, monkeypatch)[0]
-    monkeypatch.setattr(spanned, "DROPPED", 1e-3)
+    monkeypatch.setattr(collapsed, "DROPPED", 1e-3)
     assert np.nanmax(np.abs(target.conditional(theta)[0] - exact)[np.isfinite(exact)]) > 1e-3

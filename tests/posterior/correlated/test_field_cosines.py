@@ -10,8 +10,8 @@ from posterior_maps import bump_map, correlated_field
 
 from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map
-from tactile_bayes.posterior.field import cosines_for
 from tactile_bayes.posterior.result import Estimate
+from tactile_bayes.posterior.window import cosines_for
 from tactile_bayes.presets import FIELD_COSINES, FINE_FIELD_COSINES
 
 WINDOW = np.arange(-20.0, 21.0)

@@ -18,9 +18,17 @@ from tactile_bayes.posterior.bump import (
     window_cells,
 )
 from tactile_bayes.posterior.draw import SamplerSettings, draw_parameters
-from tactile_bayes.posterior.field import Window, _one, cosine_profiles, gram_of_cosines, spectrum
 from tactile_bayes.posterior.fit import FieldFit, fit_scene
-from tactile_bayes.posterior.marginal import CollapsedTarget, Problem, Scene, independent_variance
+from tactile_bayes.posterior.marginal import CollapsedTarget, _one
+from tactile_bayes.posterior.window import (
+    Problem,
+    Scene,
+    Window,
+    cosine_profiles,
+    gram_of_cosines,
+    independent_variance,
+    spectrum,
+)
 
 RADIUS = 20.0
 START = np.array([np.log(6.0), np.log(4.5), 1.3, -0.8, 0.0])

@@ -24,10 +24,9 @@ from tactile_bayes.posterior.bump import PoseNoise, cell_mean_gaussian, window_c
 from tactile_bayes.posterior.correlated import pose_covariance
 from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map
-from tactile_bayes.posterior.field import Window
 from tactile_bayes.posterior.fit import FieldFit, tangent_columns
-from tactile_bayes.posterior.marginal import independent_variance
 from tactile_bayes.posterior.result import Estimate
+from tactile_bayes.posterior.window import Window, independent_variance
 from tactile_bayes.presets import POSE_NOISE
 from tactile_bayes.report.map_text import map_text
 from tactile_bayes.scans import Scan, TrackerPoses

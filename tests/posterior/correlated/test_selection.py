@@ -12,10 +12,9 @@ from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior import neighbours as beside
 from tactile_bayes.posterior.bump import window_cells
-from tactile_bayes.posterior.field import Window
-from tactile_bayes.posterior.marginal import Problem, Scene, independent_variance
 from tactile_bayes.posterior.neighbours import Surroundings, add_beside, rising_ribs
 from tactile_bayes.posterior.selection import SceneChoice, Structure, choose_shape
+from tactile_bayes.posterior.window import Problem, Scene, Window, independent_variance
 
 RADIUS, HALF, SIZE = 20.0, 35.0, 71
 AXIS = np.arange(SIZE) - HALF

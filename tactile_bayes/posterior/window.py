@@ -1,14 +1,17 @@
-"""Correlated noise as a field of cosines on a window, and what is linear in the model under it."""
+"""A fit window: the grid of its cells, the noise field on it, and the scenes that it may hold."""
 
 from __future__ import annotations
 
-from math import lgamma, log, pi
+from collections.abc import Mapping
+from typing import Final, Literal
 
 import numpy as np
 
-from tactile_bayes.declarations import Record, names_of
-from tactile_bayes.geometry import FloatArray, IndexArray
+from tactile_bayes.declarations import Record, replace
+from tactile_bayes.geometry import BoolArray, FloatArray
+from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior.bump import FitCells, cell_mean_gaussian, covariance_from_log_widths
+from tactile_bayes.posterior.white import WIDEST_IN_RADII
 from tactile_bayes.presets import FIELD_COSINES, FINE_FIELD_COSINES
 
 # --- Correlated noise model: a Gaussian random field on a cosine basis plus white noise, whitened once for many fits.
@@ -150,6 +153,8 @@ class Window:
         self._along, self._frequency_y = cosine_profiles(self.y_mm, cosines=cosines)
         by_row = self.weight.T[:, :, None] * self._across[:, None, :]
         self._weighted_across = by_row.reshape(len(self.x_mm), -1)
+        self.middle = float(np.mean(cells.x_mm)), float(np.mean(cells.y_mm))
+        """Mean of the cells' centres, in mm."""
         self._fields: dict[float, Whitening] = {}
         self._gram: FloatArray | None = None
 
@@ -190,6 +195,11 @@ class Window:
         square = np.einsum("mr,mr->m", rows**2, columns**2 @ self.weight.T)
         return Projected(low, with_plain, square)
 
+    def projected(self, templates: list[Templates], plain: FloatArray) -> tuple[list[Projected], FloatArray | None]:
+        """`project` of one or two structures' templates, and the `product` of two."""
+        cross = self.product(*templates) if len(templates) == 2 else None
+        return [self.project(one, plain) for one in templates], cross
+
     def product(self, one: Templates, other: Templates) -> FloatArray:
         """(m,) inner products of templates with templates, pairwise."""
         if isinstance(one, Profiles) and isinstance(other, Profiles):
@@ -228,11 +238,6 @@ class Window:
             variance = np.exp(2.0 * log_width) + self.cells.cell_mm**2 / 12.0
             height = np.exp(log_width) / np.sqrt(variance)
             return np.asarray(height[:, None, None] * np.exp(-0.5 * distance**2 / variance[:, None, None]))
-
-    @property
-    def middle(self) -> tuple[float, float]:
-        """Mean of the cells' centres, in mm."""
-        return float(np.mean(self.cells.x_mm)), float(np.mean(self.cells.y_mm))
 
 
 def turned_gaussians(x_mm: FloatArray, y_mm: FloatArray, *, covariance_mm2: FloatArray, cell_mm: float) -> FloatArray:
@@ -276,248 +281,214 @@ def cell_mean_profile(distance_mm: FloatArray, *, sigma_mm: FloatArray, cell_mm:
     return np.asarray(gaussian * (1.0 - cell_mm**4 / 2880.0 * fourth))
 
 
-# --- Solutions for the linear parameters (amplitudes, level, tilt) given the shape, for many shapes and noise fields.
-
-FLOOR = 1e-9
-"""Share of the data's sum of squares that is noise in any case: 3e-5 of the signal, less than any sensor's steps.
-Without it a map free of noise leaves differences of large sums, which are rounding."""
-
-LEAST_POWER = 1e-9
-"""Power of a template, over what the prior on its amplitude is worth: less tells nothing and would only overflow."""
+# --- The fit problem that all scenes of one window share: cells, prior and bounds.
 
 
-class LinearSolution(Record, eq=False):
-    """Conditional posterior of the linear parameters for m shapes and h fields: a multivariate t."""
+class Problem(Record, eq=False):
+    """A window with its cells, and the assumptions about a bump in it."""
 
-    evidence: FloatArray  #: (m, h) array: Log of the fields' prior times their evidence.
-    amplitude: FloatArray  #: (m, h, v) array: Conditional means under a flat prior.
-    power: FloatArray  #: (m, h, v, v) array: Their precision times tau^2.
-    level: FloatArray
-    level_covariance: FloatArray
-    """`level`, `level_covariance` (h, c), (h, c, c) arrays: Level and tilt at amplitudes of 0, and their covariance
-    over tau^2 given the amplitudes."""
-    level_slope: FloatArray  #: (m, h, v, c) array: By how much level and tilt fall as an amplitude rises.
-    sum_of_squares: FloatArray  #: (m, h) array.
+    window: Window  #: The cells; scenes share one, and with it the noise fields.
+    prior: BumpPrior  #: On widths and amplitudes.
+    radius_mm: float  #: Radius of the window; bounds the centre about the window's middle.
+    amplitude_scale: float = 1.0  #: Unit of the amplitudes' prior, see `bump.value_scale`.
+    departure: FloatArray | None = None
+    """(k, n) array: Further fixed columns, see `selection.ask_departure`; None for none."""
 
-
-class FieldColumns(Record, eq=False):
-    """Fixed columns and data under the noise fields of one length: the part that does not depend on the shape."""
-
-    field: Whitening  #: The length.
-    shares: FloatArray  #: (h,) array.
-    log_prior: float  #: Log prior probability of each share.
-    weight: FloatArray
-    """(k, h) array: Of the squared projections that the field takes away, ``rho / (1 + rho lambda)``; a column a share.
-    """
-    plain: FloatArray  #: (k, h * (c + 1)) array: Projections of the fixed columns and the data, so weighted.
-    gram: FloatArray  #: (h, c + 1, c + 1) array: Columns and data with each other.
-    inverse: FloatArray  #: (h, c, c) array: Of the columns' part.
-    log_det: FloatArray
-    """(h,) array: Log determinant of the covariance (over that of D) and of the columns' part."""
-    floor: float  #: Sum of squares that is noise in any case.
-
-    @classmethod
-    def of(
-        cls, field: Whitening, shares: FloatArray, *, log_prior: float, plain_low: FloatArray, plain_gram: FloatArray
-    ) -> FieldColumns:
-        """Prepare from (c + 1, cosines^2) projections and (c + 1, c + 1) products of the fixed columns and the data."""
-        low, power = plain_low @ field.turn, shares[:, None] * field.eigenvalues
-        weight = shares[:, None] / (1.0 + power)
-        weighted = low * weight[:, None, :]
-        gram = plain_gram - weighted @ low.T
-        c = len(plain_gram) - 1
-        inverse: FloatArray = np.asarray(np.linalg.inv(gram[:, :c, :c]), dtype=np.float64)
-        volume: FloatArray = np.asarray(np.linalg.slogdet(gram[:, :c, :c])[1], dtype=np.float64)
-        plain = np.ascontiguousarray(weighted.reshape(len(shares) * (c + 1), low.shape[1]).T)
-        log_det = np.log1p(power).sum(axis=-1) + volume
-        floor = FLOOR * float(plain_gram[c, c]) + 1e-300
-        return cls(field, shares, log_prior, np.ascontiguousarray(weight.T), plain, gram, inverse, log_det, floor)
-
-    def rest(self) -> FloatArray:
-        """(h,) residual sum of squares of the fixed columns alone."""
-        c = self.inverse.shape[1]
-        right = self.gram[:, :c, c]
-        return np.asarray(self.gram[:, c, c] - np.einsum("hc,hcd,hd->h", right, self.inverse, right))
-
-    def null_evidence(self, *, dof: int) -> FloatArray:
-        """(h,) log prior plus log evidence of the fixed columns alone."""
-        squares = np.maximum(self.rest(), 0.0) + self.floor
-        return self.log_prior - 0.5 * self.log_det + lgamma(dof / 2) - 0.5 * dof * np.log(pi * squares)
+    @property
+    def widest_mm(self) -> float:
+        """Upper bound of the widths."""
+        return WIDEST_IN_RADII * self.radius_mm
 
 
-class Inner(Record, eq=False):
-    """Inner products of m templates under the noise fields of one length with h shares."""
-
-    plain: FloatArray  #: (m, h, c + 1) array: With the fixed columns and the data.
-    square: FloatArray  #: (m, h) array: With themselves.
-    low: FloatArray
-    """(m, k) array: Projections on the field's directions; none where templates are never held against others."""
-
-    @classmethod
-    def of(cls, projected: Projected, columns: FieldColumns) -> Inner:
-        """Inner products from those without a field."""
-        low = projected.low @ columns.field.turn
-        taken = (low @ columns.plain).reshape(len(low), len(columns.shares), -1)
-        return cls(projected.plain[:, None, :] - taken, projected.square[:, None] - low**2 @ columns.weight, low)
-
-    def repeated(self, number: int) -> Inner:
-        """Each template's inner products, repeated."""
-        return Inner(*(np.repeat(one, number, axis=0) for one in (self.plain, self.square, self.low)))
-
-    def product(self, other: Inner, product: FloatArray, columns: FieldColumns) -> FloatArray:
-        """(m, h) inner products with other templates, from their (m,) products without the field."""
-        return np.asarray(product[:, None] - (self.low * other.low) @ columns.weight)
-
-
-def solve(
-    inner: list[Inner], cross: FloatArray | None, columns: FieldColumns, *, dof: int, amplitude_sd: float
-) -> LinearSolution:
-    """Solutions for one or two structures, under one length.
-
-    `inner` holds the inner products of each structure's (m,) templates and `cross`, (m, h), those of one with the
-    other; `dof` is cells minus linear parameters, `amplitude_sd` that of the normal prior on each amplitude.
-    """
-    c = columns.inverse.shape[1]
-    plain = [one.plain for one in inner]
-    to_level = [np.matmul(one[:, :, None, :c], columns.inverse)[:, :, 0] for one in plain]
-    right = columns.gram[:, :c, c]
-    along = [one[:, :, c] - np.sum(t * right, axis=2) for one, t in zip(plain, to_level, strict=True)]
-
-    def power(i: int, j: int, product: FloatArray) -> FloatArray:
-        return np.asarray(product - np.sum(to_level[i] * plain[j][:, :, :c], axis=2))
-
-    rest, floor = columns.rest(), columns.floor
-    # a template with hardly any weight in the window, beyond its rim or between its cells, leaves the prior unchanged
-    least = LEAST_POWER * (np.maximum(rest, 0.0) + floor) / dof / amplitude_sd**2
-    diagonal = [np.maximum(power(i, i, one.square), least) for i, one in enumerate(inner)]
-    if cross is None:
-        structures = _one(along[0], diagonal[0], rest, floor, dof=dof, amplitude_sd=amplitude_sd)
-    else:
-        structures = _two(along, diagonal, power(0, 1, cross), rest, floor, dof=dof, amplitude_sd=amplitude_sd)
-    log_factor, amplitude, matrix, squares = structures
-    constant = columns.log_prior - 0.5 * columns.log_det + lgamma(dof / 2) - 0.5 * dof * log(pi)
-    evidence = constant + log_factor - 0.5 * dof * np.log(squares)
-    # a dent is no lump: only rises have density
-    evidence = np.where((amplitude > 0).all(axis=2), evidence, -np.inf)
-    level = np.einsum("hcd,hd->hc", columns.inverse, right)
-    slope = np.stack(to_level, axis=2)
-    return LinearSolution(evidence, amplitude, matrix, level, columns.inverse, slope, squares)
-
-
-def joined(solutions: list[LinearSolution]) -> LinearSolution:
-    """Concatenate the fields of several lengths."""
-    by_field = {"level", "level_covariance"}
-    return LinearSolution(
-        *(
-            np.concatenate([getattr(one, name) for one in solutions], axis=0 if name in by_field else 1)
-            for name in names_of(LinearSolution)
-        )
-    )
-
-
-def _one(
-    along: FloatArray, power: FloatArray, rest: FloatArray, floor: float, *, dof: int, amplitude_sd: float
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Log factor, amplitudes, precision and sum of squares for one structure."""
-    amplitude = along / power
-    squares = np.maximum(rest - along * amplitude, 0.0) + floor
-    variance = amplitude_sd**2 + squares / dof / power
-    log_factor = -0.5 * (np.log(power) + np.log(2 * pi * variance) + (amplitude / np.sqrt(variance)) ** 2)
-    return log_factor, amplitude[..., None], power[..., None, None], squares
-
-
-def _two(
-    along: list[FloatArray],
-    diagonal: list[FloatArray],
-    off: FloatArray,
-    rest: FloatArray,
-    floor: float,
-    *,
-    dof: int,
-    amplitude_sd: float,
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """As `_one` for two structures, with the two by two matrices written out."""
-    one, two = diagonal
-    det = np.maximum(one * two - off**2, 1e-12 * one * two)
-    first, second = (two * along[0] - off * along[1]) / det, (one * along[1] - off * along[0]) / det
-    squares = np.maximum(rest - along[0] * first - along[1] * second, 0.0) + floor
-    tau2 = squares / dof
-    a, b, between = amplitude_sd**2 + tau2 * two / det, amplitude_sd**2 + tau2 * one / det, -tau2 * off / det
-    volume = a * b - between**2
-    square = (b * first**2 + a * second**2 - 2 * between * first * second) / volume
-    log_factor = -0.5 * (np.log(det) + np.log((2 * pi) ** 2 * volume) + square)
-    matrix = np.stack([np.stack([one, off], axis=-1), np.stack([off, two], axis=-1)], axis=-2)
-    return log_factor, np.stack([first, second], axis=-1), matrix, squares
-
-
-# --- Low-rank basis shared by many bumps, for fast inner products.
+# --- Scenes: the structures that a fit window may hold, with their parameters and prior.
 #
-# Points about one mode have nearly the same bump. Along each axis their profiles are sums of about ten, told by a
-# singular value decomposition of the points' own, and every bump is a sum of products of two. What a posterior
-# needs of a bump is linear or quadratic in it: it is worked out once for the products that span, and for a point
-# only its coefficients are left.
+# Or a ridge in the bump's place: what a lump's evidence is held against where a ridge is to be feared.
 
-DROPPED = 1e-8  #: Norm of what is dropped of all the bumps together, over that of the least of them.
-LEAST_BUMPS = 256  #: Fewer have no basis that pays.
-MOST_PRODUCTS = 200  #: More cost as much as each bump by itself.
+Shape = Literal["round", "ellipse", "rotated", "ridge"]
+Neighbour = Literal["second lump", "rib"]
+Extra = Literal[Neighbour, ""]
+REACH_IN_RADII = 1.5
+"""How far from the window's middle a second structure is looked for: beyond its rim a flank still shows."""
+APART = 2.0
+"""A second lump lies at least this many widths from the first: closer, two Gaussians have one top. A rib may run under
+the bump if it is no more than this many times as wide: a wider one is the level's own curve."""
+STEP = {
+    "u": 0.06,
+    "v": 0.06,
+    "r": 0.06,
+    "x": 0.3,
+    "y": 0.3,
+    "x2": 0.6,
+    "y2": 0.6,
+    "w2": 0.15,
+    "angle": 0.08,
+    "offset": 0.6,
+    "along": 0.08,
+    "across": 0.6,
+}
+"""About one posterior standard deviation of each parameter: steps of the search for the mode."""
+
+_BUMP_NAMES: Final[Mapping[Shape, tuple[str, ...]]] = {
+    "round": ("u", "x", "y"),
+    "ellipse": ("u", "v", "x", "y"),
+    "rotated": ("u", "v", "x", "y", "r"),
+    "ridge": ("u", "along", "across"),
+}
+_NEIGHBOUR_NAMES: Final[Mapping[Extra, tuple[str, ...]]] = {
+    "": (),
+    "second lump": ("x2", "y2", "w2"),
+    "rib": ("angle", "offset", "w2"),
+}
 
 
-class Spanned:
-    """Bumps along the grid's axes in a shared basis: sums of products of two profiles.
+class Scene(Record):
+    """Structures in a model.
 
-    The (m, r) coefficients have a row per bump; `products` are inner products of the r templates that span them, the
-    (r, r) `gram` those with each other.
+    The parameters are ``u, v, x, y`` (logs of the widths while nothing is turned, and the centre), without v for a
+    round bump, with r for a turned one; then ``x2, y2, w2`` (centre and log width of a second round lump) or
+    ``angle, offset, w2`` (a ridge). A ridge in the bump's place has ``u, along, across``: log width, angle, offset.
     """
 
-    def __init__(self, coefficients: FloatArray, products: Projected, gram: FloatArray) -> None:
-        self._coefficients, self._products, self._gram = coefficients, products, gram
+    shape: Shape = "ellipse"  #: Shape of the bump.
+    tilt: bool = True  #: The level may slope.
+    extra: Extra = ""  #: Structure beside the bump.
 
-    @classmethod
-    def of(cls, bumps: Profiles, window: Window, weighted_plain: FloatArray) -> Spanned | None:
-        """Find the basis for products of profiles; None where it would not save time."""
-        rows, columns = bumps.rows, bumps.columns
-        if not (np.isfinite(rows).all() and np.isfinite(columns).all()):
-            return None
-        high, wide = _norms(rows), _norms(columns)
-        along, across = _basis(rows, high.min()), _basis(columns, wide.min())
-        by_row, by_column = rows @ along.T, columns @ across.T
-        size = np.square(by_row).T @ np.square(by_column)
-        i, j = _kept(size, (high * wide).min())
-        if not 0 < len(i) <= MOST_PRODUCTS:
-            return None
-        products = window.project(Profiles(along[i], across[j]), weighted_plain)
-        return cls(by_row[:, i] * by_column[:, j], products, _gram(window, along, across)[i[:, None], i, j[:, None], j])
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the shape parameters, the most important first (see `importance`)."""
+        return _BUMP_NAMES[self.shape] + _NEIGHBOUR_NAMES[self.extra]
 
-    def inner(self, columns: FieldColumns) -> Inner:
-        """Inner products under the noise fields of one length."""
-        basis = Inner.of(self._products, columns)
-        c = self._coefficients
-        m, (r, h, plain) = len(c), basis.plain.shape
-        shared = (basis.low[:, None, :] * columns.weight.T) @ basis.low.T
-        power = self._gram - shared.transpose(1, 0, 2)
-        square = np.stack([np.einsum("mr,mr->m", c @ one, c) for one in power], axis=1)
-        return Inner((c @ basis.plain.reshape(r, -1)).reshape(m, h, plain), square, np.empty((m, 0)))
+    @property
+    def steps(self) -> FloatArray:
+        """(p,) typical small step of each parameter."""
+        return np.array([STEP[name] for name in self.names])
+
+    def alone(self) -> Scene:
+        """Copy without the second structure."""
+        return replace(self, extra="")
+
+    def column(self, theta: FloatArray, name: str) -> FloatArray:
+        """(...) values of one parameter of (..., p) vectors; those that the scene does not have are 0, v is u."""
+        if name in self.names:
+            return np.asarray(theta[..., self.names.index(name)])
+        return self.column(theta, "u") if name == "v" else np.zeros(theta.shape[:-1])
+
+    def widths(self, theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """p, q, r (see `covariance_from_log_widths`) of (..., p) vectors."""
+        u, v = self.column(theta, "u"), self.column(theta, "v")
+        return (u + v) / 2.0, (u - v) / 2.0, self.column(theta, "r")
+
+    def carried(self, theta: FloatArray, other: Scene) -> FloatArray:
+        """Convert a vector to another scene: shared parameters keep their values, others are 0."""
+        p, _, _ = self.widths(theta)
+        values = {name: self.column(theta, name) for name in other.names}
+        if other.shape == "round":
+            values["u"] = p
+        return np.array([values[name] for name in other.names])
+
+    @property
+    def separable(self) -> bool:
+        """True for a scene that is only a bump along the grid's axes: the product of a profile along each."""
+        return self.shape in ("round", "ellipse") and not self.extra
+
+    def templates(self, theta: FloatArray, window: Window) -> list[Templates]:
+        """Templates of the bump, and of the second structure if there is one, for (m, p) vectors."""
+        p, q, r = self.widths(theta)
+        if self.shape == "ridge":
+            along, across = self.column(theta, "along"), self.column(theta, "across")
+            templates: list[Templates] = [window.ridges(along, across, log_width=p)]
+        else:
+            x, y = self.column(theta, "x"), self.column(theta, "y")
+            templates = [window.bumps(x, y, p=p, q=q, r=r if self.shape == "rotated" else None)]
+        if self.extra:
+            beside = (self.column(theta, name) for name in _NEIGHBOUR_NAMES[self.extra])
+            templates.append(neighbour_templates(window, self.extra, *beside))
+        return templates
+
+    def log_prior(self, theta: FloatArray, problem: Problem) -> FloatArray:
+        """(m,) normalised log prior of the shape; -inf outside the window and where a bump is wider than it."""
+        prior, middle, radius_mm = problem.prior, problem.window.middle, problem.radius_mm
+        p, q, r = self.widths(theta)
+        ratio = np.hypot(q, r)
+        total = log_normal_density(p, np.log(prior.width_median_mm), prior.log_width_sd)
+        if self.shape == "ridge":
+            inside, volume = ridge_place(self.column(theta, "across"), radius_mm)
+        else:
+            x, y = self.column(theta, "x") - middle[0], self.column(theta, "y") - middle[1]
+            inside, volume = np.hypot(x, y) <= radius_mm, np.pi * radius_mm**2
+        inside, total = inside & (p + ratio <= np.log(problem.widest_mm)), total - np.log(volume)
+        if self.shape in ("ellipse", "rotated"):
+            # q is half of u - v, p half of their sum: the volume of (u, v) is twice that of (p, q)
+            total = total + log_normal_density(q, 0.0, prior.log_ratio_sd) - np.log(2.0)
+        if self.shape == "rotated":
+            total = total + log_normal_density(r, 0.0, prior.log_ratio_sd)
+        if self.extra:
+            beside, allowed = self._log_prior_beside(theta, problem)
+            total, inside = total + beside, inside & allowed & (self.column(theta, "w2") <= np.log(problem.widest_mm))
+        return np.where(inside, total, -np.inf)
+
+    def _log_prior_beside(self, theta: FloatArray, problem: Problem) -> tuple[FloatArray, BoolArray]:
+        """Log prior of the second structure (its amplitude's is in the target), and whether its place is allowed."""
+        prior, middle, radius_mm = problem.prior, problem.window.middle, problem.radius_mm
+        w, reach = self.column(theta, "w2"), REACH_IN_RADII * radius_mm
+        total = log_normal_density(w, np.log(prior.width_median_mm), prior.log_width_sd)
+        if self.extra == "rib":
+            allowed, volume = ridge_place(self.column(theta, "offset"), radius_mm)
+            if self.shape != "ridge":
+                allowed &= self.rib_apart(theta, middle)
+            return total - np.log(volume), allowed
+        x2, y2 = self.column(theta, "x2"), self.column(theta, "y2")
+        allowed = np.hypot(x2 - middle[0], y2 - middle[1]) <= reach
+        if self.shape != "ridge":
+            away = np.hypot(x2 - self.column(theta, "x"), y2 - self.column(theta, "y"))
+            p, _, _ = self.widths(theta)
+            allowed &= away >= APART * np.exp(np.maximum(p, w))
+        return total - np.log(np.pi * reach**2), allowed
+
+    def rib_apart(self, theta: FloatArray, middle: tuple[float, float]) -> BoolArray:
+        """(m,) whether a rib is clear of the bump, or at most `APART` times as wide."""
+        p, _, _ = self.widths(theta)
+        return np.asarray(self.rib_clear(theta, middle) | (self.column(theta, "w2") - p <= np.log(APART)))
+
+    def rib_clear(self, theta: FloatArray, middle: tuple[float, float]) -> BoolArray:
+        """(m,) whether a rib lies `APART` widths, of it or the bump, from the bump's centre."""
+        angle, (p, _, _) = self.column(theta, "angle"), self.widths(theta)
+        x, y = self.column(theta, "x") - middle[0], self.column(theta, "y") - middle[1]
+        away = np.abs(self.column(theta, "offset") - x * np.cos(angle) - y * np.sin(angle))
+        return np.asarray(away >= APART * np.exp(np.maximum(p, self.column(theta, "w2"))))
 
 
-def _norms(profiles: FloatArray) -> FloatArray:
-    return np.asarray(np.sqrt(np.einsum("mn,mn->m", profiles, profiles)))
+def neighbour_templates(
+    window: Window, extra: Neighbour, one: FloatArray, two: FloatArray, log_width: FloatArray
+) -> Templates:
+    """Templates of m second structures: lumps at ``x2, y2``, or ribs of ``angle, offset``, each an (m,) array."""
+    if extra == "rib":
+        return window.ridges(one, two, log_width=log_width)
+    return window.bumps(one, two, p=log_width, q=np.zeros_like(log_width), r=None)
 
 
-def _basis(profiles: FloatArray, least: float) -> FloatArray:
-    """(r, n) orthonormal profiles that span (m, n) ones."""
-    _, size, basis = np.linalg.svd(np.linalg.qr(profiles, mode="r"), full_matrices=False)
-    left = np.sqrt(np.cumsum(size[::-1] ** 2)[::-1])
-    return np.asarray(basis[left > DROPPED * least])
+def ridge_place(offset: FloatArray, radius_mm: float) -> tuple[BoolArray, float]:
+    """(m,) whether ridges may lie this far from the window's middle, and the volume of angles and offsets."""
+    reach = REACH_IN_RADII * radius_mm
+    return np.abs(offset) <= reach, float(np.pi * 2.0 * reach)
 
 
-def _gram(window: Window, along: FloatArray, across: FloatArray) -> FloatArray:
-    """(ry, ry, rx, rx) weighted inner products of pairs of profile products."""
-    rows, columns = ((one[:, None] * one).reshape(len(one) ** 2, -1) for one in (along, across))
-    return np.asarray(rows @ window.weight @ columns.T).reshape(len(along), len(along), len(across), len(across))
+def log_normal_density(value: FloatArray, mean: float, sd: float) -> FloatArray:
+    """(...) log density of a normal distribution."""
+    return np.asarray(-0.5 * ((value - mean) / sd) ** 2 - np.log(sd * np.sqrt(2.0 * np.pi)))
 
 
-def _kept(size: FloatArray, least: float) -> tuple[IndexArray, IndexArray]:
-    """Rows and columns kept of (ry, rx) squared norms; the dropped ones sum to `DROPPED` at most."""
-    order = np.argsort(size, axis=None)
-    kept = order[np.sqrt(np.cumsum(size.ravel()[order])) > DROPPED * least]
-    return kept // size.shape[1], kept % size.shape[1]
+def independent_variance(cells: FitCells) -> FloatArray:
+    """(n,) independent variance of the cells, mean 1: reading variance over count where readings were counted."""
+    variance = 1.0 / cells.count if cells.reading_variance > 0 else np.ones(len(cells))
+    return np.asarray(variance / variance.mean())
+
+
+def linear_columns(cells: FitCells, *, tilt: bool) -> FloatArray:
+    """(c, n) columns of level and tilt across the window, in units of its half width."""
+    ones = np.ones((1, len(cells)))
+    if not tilt:
+        return ones
+    x, y = cells.x_mm - cells.x_mm.mean(), cells.y_mm - cells.y_mm.mean()
+    size = max(float(np.abs(x).max()), float(np.abs(y).max()), 1e-6)
+    return np.concatenate([ones, np.stack([x, y]) / size])
