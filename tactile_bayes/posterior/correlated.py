@@ -19,7 +19,16 @@ from tactile_bayes.posterior.draw import (
     SamplerSettings,
     draw_parameters,
 )
-from tactile_bayes.posterior.fit import FieldFit, tangent_columns
+from tactile_bayes.posterior.fit import (
+    ASKING,
+    FieldFit,
+    SceneChoice,
+    ask_departure,
+    choose_shape,
+    exponent_covariance,
+    newton_step_to,
+    tangent_columns,
+)
 from tactile_bayes.posterior.marginal import FLOOR
 from tactile_bayes.posterior.neighbours import (
     WANTED,
@@ -29,14 +38,6 @@ from tactile_bayes.posterior.neighbours import (
     ridge_instead,
     ridge_text,
     rising_ribs,
-)
-from tactile_bayes.posterior.selection import (
-    ASKING,
-    SceneChoice,
-    ask_departure,
-    choose_shape,
-    exponent_covariance,
-    newton_step_to,
 )
 from tactile_bayes.posterior.verdict import rim_fault
 from tactile_bayes.posterior.white import BumpFit, MapDraws

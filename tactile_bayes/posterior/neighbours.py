@@ -10,11 +10,10 @@ from tactile_bayes.declarations import Record, replace
 from tactile_bayes.geometry import BoolArray, FloatArray
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.bump import SMOOTHING_MM, smoothed_excess
-from tactile_bayes.posterior.fit import FieldFit
-from tactile_bayes.posterior.marginal import BLOCK
-from tactile_bayes.posterior.selection import (
+from tactile_bayes.posterior.fit import (
     ASKING,
     LEAST_ODDS,
+    FieldFit,
     SceneChoice,
     Structure,
     change_in_sd,
@@ -22,6 +21,7 @@ from tactile_bayes.posterior.selection import (
     odds,
     retested,
 )
+from tactile_bayes.posterior.marginal import BLOCK
 from tactile_bayes.posterior.window import APART, REACH_IN_RADII, Neighbour, Problem, Scene, neighbour_templates
 from tactile_bayes.presets import SceneAsked
 

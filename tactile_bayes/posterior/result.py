@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from itertools import islice
+from math import lgamma, log, pi
 from typing import Literal
 
 import numpy as np
@@ -16,10 +18,11 @@ from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior.bump import principal_widths
 from tactile_bayes.posterior.detection import Detection
 from tactile_bayes.posterior.draw import Diagnostics, MapPosterior, ModalBump
-from tactile_bayes.posterior.fit import FieldFit
-from tactile_bayes.posterior.selection import SceneChoice, fitted_values, pointwise_log_likelihood
+from tactile_bayes.posterior.fit import FieldFit, SceneChoice
+from tactile_bayes.posterior.marginal import CollapsedTarget
 from tactile_bayes.posterior.verdict import SmallestLumps, Weighed
 from tactile_bayes.posterior.white import BumpFit, Candidate
+from tactile_bayes.posterior.window import linear_columns
 from tactile_bayes.size.draws import BumpDraws, SizePosterior
 from tactile_bayes.size.pooling import Calibration, SizePriors, draw_sizes
 
@@ -135,6 +138,108 @@ class Mass(Record, eq=False):
         """Median of the largest diameter; None without a size."""
         size = self.estimate.size
         return None if size is None else size.median_mm
+
+
+# --- Density of a window's cells under correlated errors: the density of each given the others.
+#
+# A likelihood with correlated errors is no product over cells. What takes the place of a cell's factor is the
+# density of its value given all the others, with level, tilt, amplitudes and the noise scale integrated out as in
+# `marginal`. For one field, with :math:`Q = C^{-1} - C^{-1} X (X^T C^{-1} X)^{-1} X^T C^{-1}`,
+#
+# .. math::
+#     y_i \mid y_{-i}, \theta \sim t_{\nu - 1}\Bigl(y_i - (Qy)_i / Q_{ii},\; S_{-i} / ((\nu - 1)\, Q_{ii})\Bigr),
+#     \qquad S_{-i} = y^T Q y - (Qy)_i^2 / Q_{ii}.
+#
+# Fields are mixed with their evidence without the cell. The sum over cells is not the log likelihood of the map.
+#
+# References
+# ----------
+# Buerkner, Gabry & Vehtari (2021), Computational Statistics 36:1243 (non-factorised models).
+
+LEAST_SHARE = 1e-6  #: Fields with a smaller share of the evidence at a draw add nothing there.
+
+
+def pointwise_log_likelihood(target: CollapsedTarget, theta: FloatArray) -> FloatArray:
+    """(m, n) log density of each cell's value given the other cells, at (m, p) draws of the scene's parameters."""
+    evidence = target.by_field(theta)
+    log_share = evidence - np.logaddexp.reduce(evidence, axis=1)[:, None]
+    window, fixed = target.window, _fixed_columns(target)
+    templates = [window.of_cells(one) for one in target.scene.templates(theta, window)]
+    inverse = np.full((len(theta), len(window.cells)), -np.inf)
+    for h, precision in enumerate(_fields(target)):
+        for m in np.flatnonzero(log_share[:, h] > log(LEAST_SHARE)):
+            regressors = np.stack([*fixed, *(one[m] for one in templates)])
+            log_density = _without_each(precision, regressors, window.cells.value)
+            # p(field | the others) is its share over the cell's density under it
+            inverse[m] = np.logaddexp(inverse[m], log_share[m, h] - log_density)
+    return -inverse
+
+
+def fitted_values(target: CollapsedTarget, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """(n,) values of the model without noise at a (p,) shape, by generalised least squares in the likeliest field.
+
+    And the (n,) field's expectation given the data: the part of what is left that neighbouring cells share.
+    """
+    window, at = target.window, theta[None]
+    likeliest = int(np.argmax(target.by_field(at)[0]))
+    templates = [window.of_cells(one)[0] for one in target.scene.templates(at, window)]
+    regressors = np.stack([*_fixed_columns(target), *templates])
+    precision = next(islice(_fields(target), likeliest, None))
+    middle = window.cells.value.mean()
+    across = precision.times(regressors)
+    solved = np.linalg.solve(across @ regressors.T, across @ (window.cells.value - middle))
+    fit = np.asarray(middle + solved @ regressors)
+    left = window.cells.value - fit
+    return fit, left - precision.times(left[None])[0] * window.variance
+
+
+def _fields(target: CollapsedTarget) -> Iterator[_Precision]:
+    """The precision of each field and share, in the order of `CollapsedTarget.by_field`."""
+    window = target.window
+    # a row for each cell: its products with the cosines, over its independent variance
+    unit = window.on_grid(np.eye(len(window.cells)))
+    cosines = window.project(unit, np.zeros((1, *window.weight.shape))).low
+    for columns in target.fields:
+        low = cosines @ columns.field.turn
+        for index in range(len(columns.shares)):
+            yield _Precision(1.0 / window.variance, low, columns.weight[:, index])
+
+
+def _fixed_columns(target: CollapsedTarget) -> FloatArray:
+    """(c, n) level, tilt and the departure from a Gaussian where there is one."""
+    columns = linear_columns(target.window.cells, tilt=target.scene.tilt)
+    departure = target.problem.departure
+    return columns if departure is None else np.concatenate([columns, departure])
+
+
+class _Precision:
+    """Inverse covariance of the cells under one field and share, up to the noise scale."""
+
+    def __init__(self, weight: FloatArray, low: FloatArray, taken: FloatArray) -> None:
+        self._weight, self._low, self._taken = weight, low, taken
+        self.diagonal = weight - np.square(low) @ taken
+
+    def times(self, rows: FloatArray) -> FloatArray:
+        """(v, n) products with (v, n) vectors."""
+        return np.asarray(rows * self._weight - ((rows @ self._low) * self._taken) @ self._low.T)
+
+
+def _without_each(precision: _Precision, regressors: FloatArray, value: FloatArray) -> FloatArray:
+    """(n,) log density of each value given the others, for (v, n) columns with free coefficients."""
+    # without its mean, a large level does not cost the digits that the bump is in
+    centred = value - value.mean()
+    weighted = precision.times(np.concatenate([regressors, centred[None]]))
+    across, data = weighted[:-1], weighted[-1]
+    inverse = np.linalg.inv(across @ regressors.T)
+    residual = data - (inverse @ (across @ centred)) @ across
+    power = precision.diagonal - np.einsum("vn,vw,wn->n", across, inverse, across)
+    dof = len(value) - len(regressors) - 1
+    squares = float(residual @ centred) - residual**2 / power
+    scale = squares / (dof * power)
+    constant = lgamma((dof + 1) / 2) - lgamma(dof / 2) - 0.5 * log(dof * pi)
+    return np.asarray(
+        constant - 0.5 * np.log(scale) - 0.5 * (dof + 1) * np.log1p((residual / power) ** 2 / (dof * scale))
+    )
 
 
 # --- Fitted values of an estimate's window beside its data: level, tilt, bump and what lies beside it, without noise.

@@ -292,7 +292,7 @@ class Problem(Record, eq=False):
     radius_mm: float  #: Radius of the window; bounds the centre about the window's middle.
     amplitude_scale: float = 1.0  #: Unit of the amplitudes' prior, see `bump.value_scale`.
     departure: FloatArray | None = None
-    """(k, n) array: Further fixed columns, see `selection.ask_departure`; None for none."""
+    """(k, n) array: Further fixed columns, see `fit.ask_departure`; None for none."""
 
     @property
     def widest_mm(self) -> float:

@@ -39,8 +39,8 @@ from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.mapping.places import SIDES, ClockPosition, Position, clock_position, clock_text
 from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior.draw import MapPosterior
+from tactile_bayes.posterior.fit import SceneChoice, Structure
 from tactile_bayes.posterior.result import WIDER, Estimate, Sensitivity
-from tactile_bayes.posterior.selection import SceneChoice, Structure
 from tactile_bayes.posterior.verdict import PROBABILITY, SmallestLumps, chance_text
 from tactile_bayes.posterior.window import LENGTHS_MM, SHARES
 from tactile_bayes.presets import RESEARCH_USE

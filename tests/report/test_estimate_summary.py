@@ -21,8 +21,8 @@ from tactile_bayes.inference.draws import summarise
 from tactile_bayes.mapping.map import TactileMap, broken_assumptions
 from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map
+from tactile_bayes.posterior.fit import Structure
 from tactile_bayes.posterior.result import Estimate, Mass, Sensitivity
-from tactile_bayes.posterior.selection import Structure
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.estimate_document import _change, sensitivity_line, supposed_line
 from tactile_bayes.report.estimate_text import (

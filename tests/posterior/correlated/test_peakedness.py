@@ -13,9 +13,15 @@ from posterior_maps import correlated_field, grid_map
 
 from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map
-from tactile_bayes.posterior.fit import FieldFit, tangent_columns
+from tactile_bayes.posterior.fit import (
+    FieldFit,
+    Structure,
+    _departure,
+    ask_departure,
+    exponent_covariance,
+    tangent_columns,
+)
 from tactile_bayes.posterior.result import Estimate
-from tactile_bayes.posterior.selection import Structure, _departure, ask_departure, exponent_covariance
 from tactile_bayes.report.estimate_document import scene_lines
 
 AXIS = np.arange(-26.0, 27.0)

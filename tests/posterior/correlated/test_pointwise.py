@@ -10,7 +10,7 @@ from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.estimate import search
 from tactile_bayes.posterior.fit import FieldFit
 from tactile_bayes.posterior.marginal import CollapsedTarget
-from tactile_bayes.posterior.selection import pointwise_log_likelihood
+from tactile_bayes.posterior.result import pointwise_log_likelihood
 from tactile_bayes.posterior.window import linear_columns
 
 

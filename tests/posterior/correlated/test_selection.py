@@ -12,8 +12,8 @@ from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior import neighbours as beside
 from tactile_bayes.posterior.bump import window_cells
+from tactile_bayes.posterior.fit import SceneChoice, Structure, choose_shape
 from tactile_bayes.posterior.neighbours import Surroundings, add_beside, rising_ribs
-from tactile_bayes.posterior.selection import SceneChoice, Structure, choose_shape
 from tactile_bayes.posterior.window import Problem, Scene, Window, independent_variance
 
 RADIUS, HALF, SIZE = 20.0, 35.0, 71
