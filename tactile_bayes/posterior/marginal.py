@@ -323,7 +323,7 @@ class CollapsedTarget:
     @property
     def dof(self) -> int:
         """Degrees of freedom of the noise scale."""
-        return max(self._plain.shape[1] - len(self._plain) - bool(self.scene.extra), 1)
+        return max(len(self._plain[0]) - len(self._plain) - bool(self.scene.extra), 1)
 
     @property
     def fields(self) -> list[FieldColumns]:
@@ -389,7 +389,7 @@ class CollapsedTarget:
 
     def _walk_without_structure(self) -> tuple[list[tuple[FieldColumns, FloatArray]], float]:
         """As `_walk`, of level and tilt alone, with the whole of the log evidence."""
-        dof = max(self._plain.shape[1] - len(self._plain) + 1, 1)
+        dof = max(len(self._plain[0]) - len(self._plain) + 1, 1)
         walked = self._walk(lambda columns: columns.null_evidence(dof=dof))
         return walked, float(np.logaddexp.reduce(np.concatenate([one for _, one in walked])))
 
