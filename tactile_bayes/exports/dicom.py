@@ -1,47 +1,425 @@
-"""DICOM of an exam: maps and a structured report."""
+"""DICOM of an exam: maps as values and as pictures, and a structured report."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import io
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tactile_bayes import __version__
-from tactile_bayes.errors import BadDataError
+from tactile_bayes.declarations import Record
+from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.exports import exam as codes
 from tactile_bayes.exports.exam import (
     Code,
     EstimateFile,
     Identity,
     MapFile,
+    Moment,
     SizedMass,
     content_uid,
+    lps_from_plane,
+    on_plane,
     required,
     verdict_words,
 )
-from tactile_bayes.exports.images import (
-    MANUFACTURER,
-    MODEL,
-    PARAMETRIC_MAP,
-    Study,
-    add_study,
-    coded,
-    declare_scheme,
-    dicom_bytes,
-    frame_of_reference,
-    lps_from_plane,
-    on_plane,
-    parametric_map,
-    secondary_capture,
-    study_of,
-)
+from tactile_bayes.files.reports import EstimateReport
+from tactile_bayes.findings import finding_lines
+from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.draws import Quantity
+from tactile_bayes.mapping.map import TactileMap
+from tactile_bayes.mapping.places import orientation_of
 from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.report.estimate_text import no_estimate_line
+from tactile_bayes.report.figure_file import plain_matplotlib
+from tactile_bayes.report.map_figure import contour_of, map_figure
+
+# --- What the DICOM objects of one export share: patient, study, equipment, identifiers, and their bytes.
+
+MANUFACTURER: Final = "tactile_bayes (research software)"
+MODEL: Final = "tactile-bayes"
+UTF_8: Final = "ISO_IR 192"
+EXPLICIT_LITTLE_ENDIAN: Final = "1.2.840.10008.1.2.1"
+# What highdicom writes by the clock; all may be left out.
+_OF_THE_CLOCK: Final = (
+    "InstanceCreationDate",
+    "InstanceCreationTime",
+    "DateOfSecondaryCapture",
+    "TimeOfSecondaryCapture",
+    "ContributionDateTime",
+)
+# Written where the standard wants a serial number and nobody gave one.
+NO_SERIAL_NUMBER: Final = "unknown"
+
+
+class Study(Record, eq=False):
+    """Patient and study of one export."""
+
+    identity: Identity  #: As given; its `patient_id` may come from the scan.
+    moment: Moment
+    content: Moment
+    """`moment`, `content`: When the exam was and when the content was made, with the time of day."""
+    study_uid: str  #: As given, or by the content of the maps.
+    key: tuple[str, ...]  #: What identifiers of the objects follow from, besides their own content.
+
+    def uid(self, role: str, *parts: str) -> str:
+        """Identifier of an object, or of its series, by the study and the object's content."""
+        return content_uid(role, self.study_uid, *self.key, *parts)
+
+
+def study_of(identity: Identity, maps: Sequence[MapFile]) -> Study:
+    """The study that maps of one exam belong to."""
+    moment, content = identity.study, identity.content
+    if moment is None or content is None:
+        way_out = "give --study-date YYYY-MM-DDTHH:MM, or a --worklist with study_date"
+        raise UsageError(f"DICOM needs to know when the exam was; {way_out}")
+    for name, one in (("study-date", moment), ("content-date", content)):
+        if not one.time:
+            raise UsageError(f"DICOM needs the time of day; give --{name} {one.iso_date}THH:MM")
+    given = [f"{name}={value}" for name, value in sorted(identity.given.items())]
+    digests = sorted(one.digest for one in maps)
+    # equal for all exports of one exam, whatever else is exported with it
+    person = [line for line in given if line.startswith(("patient_id=", "issuer=", "accession=", "study_date="))]
+    study_uid = identity.study_uid or content_uid("study", *digests, *person)
+    return Study(identity, moment, content, study_uid, (__version__, *given))
+
+
+def add_study(dataset: Any, study: Study, facts: Mapping[str, str] | None = None) -> None:
+    """Write the modules of patient, study and equipment into a dataset; what nobody gave stays empty.
+
+    `facts`: of an image's exam, for the breast and its side; neither is written of a phantom.
+    """
+    identity = study.identity
+    dataset.SpecificCharacterSet = UTF_8
+    dataset.PatientName = identity.patient_name
+    dataset.PatientID = identity.patient_id
+    if identity.issuer:
+        dataset.IssuerOfPatientID = identity.issuer
+    dataset.PatientBirthDate = identity.birth_date.replace("-", "")
+    dataset.PatientSex = identity.sex
+    dataset.StudyInstanceUID = study.study_uid
+    dataset.StudyDate, dataset.StudyTime = study.moment.date, study.moment.time
+    dataset.ContentDate, dataset.ContentTime = study.content.date, study.content.time
+    if study.moment.zone:
+        dataset.TimezoneOffsetFromUTC = study.moment.zone
+    dataset.AccessionNumber = identity.accession
+    dataset.StudyID = identity.study_id
+    dataset.ReferringPhysicianName = identity.referring_physician
+    if identity.study_description:
+        dataset.StudyDescription = identity.study_description
+    dataset.Manufacturer = MANUFACTURER
+    dataset.ManufacturerModelName = MODEL
+    dataset.DeviceSerialNumber = NO_SERIAL_NUMBER
+    dataset.SoftwareVersions = __version__
+    if facts is not None:
+        dataset.Laterality = laterality(facts)
+        if dataset.Laterality:
+            dataset.BodyPartExamined = "BREAST"
+
+
+def coded(code: Code) -> Any:
+    """A concept as highdicom has it."""
+    return required("highdicom").sr.CodedConcept(code.value, code.scheme, code.meaning)
+
+
+def item(**attributes: Any) -> Any:
+    """A dataset of these attributes, for a sequence."""
+    dataset = required("pydicom").Dataset()
+    for name, value in attributes.items():
+        setattr(dataset, name, value)
+    return dataset
+
+
+def laterality(facts: Mapping[str, str]) -> str:
+    """``L`` or ``R`` by the scan's session; empty for a phantom or an unknown side."""
+    side = facts.get("side", "")
+    return side[0].upper() if side in ("left", "right") else ""
+
+
+def declare_scheme(dataset: Any) -> None:
+    """Declare this program's own coding scheme, as a file must that uses one."""
+    dataset.CodingSchemeIdentificationSequence = [
+        item(
+            CodingSchemeDesignator=codes.OWN_SCHEME,
+            CodingSchemeUID=codes.OWN_SCHEME_UID,
+            CodingSchemeName=codes.OWN_SCHEME_NAME,
+            CodingSchemeResponsibleOrganization=MODEL,
+        )
+    ]
+
+
+def dicom_bytes(dataset: Any) -> bytes:
+    """The dataset as a file of DICOM's part 10; nothing in it depends on the clock."""
+    pydicom = required("pydicom")
+    for one in (dataset, *dataset.get("ContributingEquipmentSequence", ())):
+        for name in _OF_THE_CLOCK:
+            if name in one:
+                delattr(one, name)
+    meta = pydicom.dataset.FileMetaDataset()
+    meta.MediaStorageSOPClassUID = dataset.SOPClassUID
+    meta.MediaStorageSOPInstanceUID = dataset.SOPInstanceUID
+    meta.TransferSyntaxUID = EXPLICIT_LITTLE_ENDIAN
+    meta.ImplementationClassUID = content_uid("implementation", MODEL)
+    meta.ImplementationVersionName = "TACTILE_BAYES"
+    plain = pydicom.Dataset(dataset)
+    plain.file_meta = meta
+    buffer = io.BytesIO()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        pydicom.dcmwrite(buffer, plain, enforce_file_format=True, implicit_vr=False, little_endian=True)
+    return buffer.getvalue()
+
+
+# --- The map's figure as pixels, drawn from what an estimate's file says.
+
+_MOST_NOTE: Final = 400  #: Characters that have a place above the figure.
+
+
+def map_picture(source: MapFile, estimate: EstimateFile | None) -> NDArray[np.uint8]:
+    """(rows, columns, 3) red, green and blue of the map's figure; of an estimate of this map alone with its ellipse.
+
+    No file name is in it, because those may hold patients' names.
+    """
+    report = None if estimate is None or estimate.kind != "estimate" else estimate.report
+    alone = report if isinstance(report, EstimateReport) else None
+    unsized = [] if estimate is None or estimate.sized else [one.reason for one in estimate.masses]
+    side = source.facts.get("side")
+    with plain_matplotlib() as library:
+        figure = map_figure(
+            source.tactile_map,
+            None,
+            fit=None if alone is None else contour_of(alone),
+            looked_at=[] if alone is None else [one for one in alone.candidates if one.fault],
+            title="Tactile map" + (f" of the {side} breast" if side in ("left", "right") else ""),
+            note=no_estimate_line(unsized[0][:_MOST_NOTE]) if unsized else "",
+            findings=None if estimate is None else estimate.report.findings,
+        )
+        canvas = library.backends.backend_agg.FigureCanvasAgg(figure)
+        canvas.draw()
+        pixels = np.asarray(canvas.buffer_rgba())
+    return np.ascontiguousarray(pixels[:, :, :3])
+
+
+# --- The map's figure as a DICOM Secondary Capture, which every viewer shows.
+
+PICTURE_SERIES: Final = 2
+
+
+def secondary_capture(source: MapFile, estimate: EstimateFile | None, *, study: Study, number: int) -> Any:
+    """The figure as a Secondary Capture in red, green and blue.
+
+    `number`: of the instance in its series, from 1.
+    """
+    highdicom = required("highdicom")
+    digest = "" if estimate is None else estimate.digest
+    dataset = highdicom.sc.SCImage(
+        pixel_array=map_picture(source, estimate),
+        photometric_interpretation="RGB",
+        bits_allocated=8,
+        coordinate_system="PATIENT",
+        patient_orientation=("L", "F"),
+        study_instance_uid=study.study_uid,
+        series_instance_uid=study.uid("series of pictures"),
+        series_number=PICTURE_SERIES,
+        sop_instance_uid=study.uid("picture", source.digest, digest),
+        instance_number=number,
+        manufacturer=MANUFACTURER,
+        transfer_syntax_uid=EXPLICIT_LITTLE_ENDIAN,
+        series_description=f"Map figure. {RESEARCH_USE}",
+        content_date=study.content.date,
+        content_time=study.content.time,
+    )
+    add_study(dataset, study, source.facts)
+    if source.tactile_map.patient_from_plane is None:
+        dataset.PatientOrientation = ""
+    dataset.BurnedInAnnotation = "NO"  # nothing in it says who the patient is, nor when the exam was
+    dataset.RecognizableVisualFeatures = "NO"
+    dataset.ImageComments = f"{RESEARCH_USE} SHA-256 of the map: {source.digest}"
+    return dataset
+
+
+# --- A map as an image.
+
+
+class ImagePlane(Record, eq=False):
+    """A map's values as the rows of an image that faces the viewer as every picture of the program does."""
+
+    values: FloatArray  #: (rows, columns) array: Row 0 on top; NaN without data.
+    row_direction: FloatArray
+    column_direction: FloatArray
+    """`row_direction`, `column_direction` (3,) arrays: Unit vectors in L, P, S: along a row, and down a column."""
+    corner_mm: FloatArray  #: (3,) array: Centre of the first value of the first row.
+
+
+def image_plane(tactile_map: TactileMap, transform: FloatArray) -> ImagePlane:
+    """Image of a map's means, placed by a (4, 4) transform from its plane."""
+    view = orientation_of(tactile_map)
+    values = np.where(tactile_map.covered, tactile_map.mean, np.nan)
+    axes = {"x": (tactile_map.x_mm, transform[:3, 0]), "y": (tactile_map.y_mm, transform[:3, 1])}
+    corner, directions = dict[str, float](), list[FloatArray]()
+    for towards, sign in ((view.right, 1.0), (view.up, -1.0)):
+        centres, axis = axes[towards[1]]
+        step = sign if towards[0] == "+" else -sign
+        corner[towards[1]] = float(centres[0] if step > 0 else centres[-1])
+        directions.append(step * axis)
+    shown = np.ascontiguousarray(view.screen(values))
+    along, down = directions
+    return ImagePlane(shown, along, down, on_plane(transform, (corner["x"], corner["y"])))
+
+
+# --- A map as a DICOM Parametric Map: float values, with their place in the patient where it is known.
+
+PARAMETRIC_MAP: Final = "1.2.840.10008.5.1.4.1.1.30"
+MAP_SERIES: Final = 1
+POSTURES: Final = ("supine", "oblique", "sitting")
+"""Of a person; a phantom has no patient's coordinates."""
+_IMAGE_TYPE: Final = ["DERIVED", "PRIMARY", "VOLUME", "QUANTITY"]
+
+
+def frame_of_reference(source: MapFile) -> str | None:
+    """Identifier of the map's own coordinates in the patient; None where they are not known.
+
+    They are known with landmarks, in a posture of a person. They are the map's own: no other image shares them, not
+    even another map of the exam, because the third axis follows the normal of the scanned skin.
+    """
+    if source.tactile_map.patient_from_plane is None or source.facts.get("posture") not in POSTURES:
+        return None
+    return content_uid("frame of reference", source.digest)
+
+
+def parametric_map(source: MapFile, *, study: Study, number: int) -> Any:
+    """The map's means as a Parametric Map of one frame that faces the viewer as the program's pictures do.
+
+    Cells without data are NaN, which is also the padding value. A Parametric Map must lie in a frame of reference, so a
+    map without a place in the patient cannot be one.
+
+    `number`: of the instance in its series, from 1.
+    """
+    reference = frame_of_reference(source)
+    transform = lps_from_plane(source.tactile_map)
+    if reference is None or transform is None:
+        raise ValueError("the map's place in the patient is not known")
+    plane = image_plane(source.tactile_map, transform)
+    dataset = required("pydicom").Dataset()
+    add_study(dataset, study, source.facts)
+    if dataset.Laterality:
+        del dataset.Laterality  # the frame has it, and it must not be said twice
+    declare_scheme(dataset)
+    dataset.SOPClassUID = PARAMETRIC_MAP
+    dataset.SOPInstanceUID = study.uid("parametric map", source.digest)
+    dataset.Modality = "OT"
+    dataset.SeriesInstanceUID = study.uid("series of parametric maps")
+    dataset.SeriesNumber, dataset.InstanceNumber = MAP_SERIES, number
+    dataset.SeriesDescription = f"Tactile map. {RESEARCH_USE}"
+    dataset.FrameOfReferenceUID = reference
+    dataset.PositionReferenceIndicator = "XIPHOID"
+    _add_content(dataset, source, plane)
+    _add_dimension(dataset, study, source)
+    dataset.SharedFunctionalGroupsSequence = [_shared_groups(source, plane)]
+    content = item(StackID="1", InStackPositionNumber=1, DimensionIndexValues=[1])
+    position = item(ImagePositionPatient=[_decimal(value) for value in plane.corner_mm])
+    frame = item(FrameContentSequence=[content], PlanePositionSequence=[position])
+    dataset.PerFrameFunctionalGroupsSequence = [frame]
+    return dataset
+
+
+def _add_content(dataset: Any, source: MapFile, plane: ImagePlane) -> None:
+    values = plane.values.astype("<f4")
+    dataset.SamplesPerPixel = 1
+    dataset.PhotometricInterpretation = "MONOCHROME2"
+    dataset.NumberOfFrames = 1
+    dataset.Rows, dataset.Columns = values.shape
+    dataset.BitsAllocated = 32
+    dataset.FloatPixelPaddingValue = dataset.FloatPixelPaddingRangeLimit = float("nan")
+    dataset.FloatPixelData = values.tobytes()
+    dataset.ImageType = _IMAGE_TYPE
+    dataset.ContentLabel = "TACTILE_MAP"
+    dataset.ContentDescription = source.tactile_map.recipe.value_words[:64]
+    dataset.ContentCreatorName = ""
+    dataset.ContentQualification = "RESEARCH"
+    dataset.BurnedInAnnotation = "NO"
+    dataset.RecognizableVisualFeatures = "NO"
+    dataset.LossyImageCompression = "00"
+    dataset.PresentationLUTShape = "IDENTITY"
+    dataset.AcquisitionContextSequence = []
+    told = [RESEARCH_USE, *finding_lines(source.tactile_map.findings, paper=True)]
+    dataset.ImageComments = f"{' '.join(told)} SHA-256 of the map: {source.digest}"
+
+
+def _add_dimension(dataset: Any, study: Study, source: MapFile) -> None:
+    """One dimension, the place in a stack of one frame."""
+    pydicom = required("pydicom")
+    organization = study.uid("dimension", source.digest)
+    dataset.DimensionOrganizationSequence = [item(DimensionOrganizationUID=organization)]
+    dataset.DimensionIndexSequence = [
+        item(
+            DimensionOrganizationUID=organization,
+            DimensionIndexPointer=pydicom.tag.Tag("InStackPositionNumber"),
+            FunctionalGroupPointer=pydicom.tag.Tag("FrameContentSequence"),
+        )
+    ]
+
+
+def _shared_groups(source: MapFile, plane: ImagePlane) -> Any:
+    highdicom = required("highdicom")
+    cell = source.tactile_map.recipe.cell_mm
+    cosines = np.concatenate([plane.row_direction, plane.column_direction])
+    low, high = float(np.nanmin(plane.values)), float(np.nanmax(plane.values))
+    window = {"WindowCenter": _decimal((low + high) / 2), "WindowWidth": _decimal(max(high - low, 1e-6))}
+    groups = item(
+        PixelMeasuresSequence=highdicom.PixelMeasuresSequence((cell, cell), cell),
+        RealWorldValueMappingSequence=[_value_mapping(source)],
+        ParametricMapFrameTypeSequence=[item(FrameType=_IMAGE_TYPE)],
+        PixelValueTransformationSequence=[item(RescaleIntercept=0, RescaleSlope=1, RescaleType="US")],
+        FrameVOILUTSequence=[item(**window, VOILUTFunction="LINEAR_EXACT")],
+        PlaneOrientationSequence=[
+            item(ImageOrientationPatient=[_decimal(0.0 if abs(one) < 1e-12 else one) for one in cosines])
+        ],
+    )
+    side = laterality(source.facts)
+    if side:
+        region = item(
+            CodeValue=codes.BREAST.value, CodingSchemeDesignator=codes.BREAST.scheme, CodeMeaning=codes.BREAST.meaning
+        )
+        groups.FrameAnatomySequence = [item(FrameLaterality=side, AnatomicRegionSequence=[region])]
+    return groups
+
+
+def _value_mapping(source: MapFile) -> Any:
+    """What the stored values are: themselves, in the map's unit."""
+    highdicom, pydicom = required("highdicom"), required("pydicom")
+    recipe, values = source.tactile_map.recipe, source.tactile_map.mean[source.tactile_map.covered]
+    what = codes.RELATIVE_PRESSURE if recipe.value_unit == "1" else codes.PRESSURE
+    kilopascal = pydicom.sr.coding.Code("kPa", "UCUM", "kilopascal")
+    unit = kilopascal if recipe.value_unit == "kPa" else pydicom.sr.codedict.codes.UCUM.NoUnits
+    ends = np.array([values.min(), values.max()], "<f4").astype(float)
+    return highdicom.pm.RealWorldValueMapping(
+        lut_label="TACTILE",
+        lut_explanation=recipe.value_words[:64],
+        unit=unit,
+        value_range=(float(ends[0]), float(ends[1])),
+        slope=1.0,
+        intercept=0.0,
+        quantity_definition=coded(what) if recipe.source == "scan" else None,
+    )
+
+
+def _decimal(value: float) -> str:
+    """A number as DICOM's decimal string of at most 16 characters."""
+    for digits in range(12, 5, -1):
+        text = f"{value + 0.0:.{digits}g}"
+        if len(text) <= 16:
+            return text
+    return f"{value:.5g}"
+
 
 # --- An estimate as a DICOM Comprehensive 3D SR by TID 1500: one measurement group per mass.
 
-SERIES: Final = 3
+REPORT_SERIES: Final = 3
 _MM: Final = Code("mm", "UCUM", "millimeter")
 _PERCENT: Final = Code("%", "UCUM", "percent")
 
@@ -68,7 +446,7 @@ def structured_report(estimate: EstimateFile, maps: Sequence[MapFile], *, eviden
         evidence=evidence,
         content=report[0],
         series_instance_uid=study.uid("series of reports"),
-        series_number=SERIES,
+        series_number=REPORT_SERIES,
         sop_instance_uid=study.uid("report", estimate.digest, *sorted(one.digest for one in maps)),
         instance_number=1,
         manufacturer=MANUFACTURER,
@@ -150,13 +528,13 @@ def _measurements(finding: SizedMass, evidence: Sequence[Any]) -> Iterator[Any]:
     images = [sr.SourceImageForMeasurement(one.SOPClassUID, one.SOPInstanceUID) for one in values or evidence]
     for name, size in ((codes.LONG_AXIS, finding.largest), (codes.SHORT_AXIS, finding.smallest)):
         if size is not None:
-            yield _size(name, size, images)
+            yield _sized(name, size, images)
     if finding.probability is not None:
         percent = float(f"{100 * finding.probability:.9g}")
         yield sr.Measurement(coded(codes.CERTAINTY), percent, coded(_PERCENT), referenced_images=images)
 
 
-def _size(name: Code, size: Quantity, images: Sequence[Any]) -> Any:
+def _sized(name: Code, size: Quantity, images: Sequence[Any]) -> Any:
     """A size's median, with its interval as properties of the number."""
     sr = required("highdicom").sr
     measurement = sr.Measurement(

@@ -15,6 +15,8 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
+import numpy as np
+
 from tactile_bayes.declarations import Record, as_dict, names_of, replace
 from tactile_bayes.errors import CANNOT_SHOW, NO_LUMP, BadDataError, TactileBayesError, UsageError
 from tactile_bayes.files.atomic import sha256
@@ -33,6 +35,7 @@ from tactile_bayes.files.reading import (
 )
 from tactile_bayes.files.reports import EstimateReport, MassReport, PooledReport, centre_of
 from tactile_bayes.findings import capital, finding_lines
+from tactile_bayes.geometry import FloatArray, apply
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.options import IdentityOptions
@@ -531,3 +534,27 @@ def _of_dicom(dataset: Any, path: Path) -> Identity:
     if not any(found.values()):
         raise BadDataError("says nothing of a patient or study", way_out=_ONE_ITEM, path=str(path))
     return _identity(found, path)
+
+
+# --- Place of a map in the coordinate system of DICOM and 3D Slicer: L, P, S in mm from the xiphoid.
+#
+# The program's `patient` frame has x to the patient's right, y from the xiphoid to the sternal notch and z into the
+# body. L, P, S are -x, z, y. Two landmarks and the normal of the scanned skin define it, no scanner: its origin is
+# the xiphoid, and its turn about the long axis of the body follows the skin, so that on the side of the breast P
+# leans towards it.
+
+LPS_FROM_PATIENT: Final[FloatArray] = np.array(
+    [[-1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+)
+
+
+def lps_from_plane(tactile_map: TactileMap) -> FloatArray | None:
+    """(4, 4) transform from the map's plane to L, P, S in mm; None without landmarks."""
+    if tactile_map.patient_from_plane is None:
+        return None
+    return np.asarray(LPS_FROM_PATIENT @ tactile_map.patient_from_plane)
+
+
+def on_plane(transform: FloatArray, point_mm: tuple[float, float]) -> FloatArray:
+    """(3,) place of a point of the map's plane."""
+    return apply(transform, np.array([*point_mm, 0.0]))

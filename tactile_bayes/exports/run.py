@@ -1,19 +1,62 @@
-"""One call for every export: what is asked for, checked, then written."""
+"""One call for every export: what is asked for, checked, then written; and maps for 3D Slicer."""
 
 from __future__ import annotations
 
+import io
+import warnings
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, Final, Literal, get_args
 
+import numpy as np
+
 from tactile_bayes.declarations import Record, names_of, replace
-from tactile_bayes.errors import UsageError
+from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.exports.dicom import VALUES, dicom_files
-from tactile_bayes.exports.exam import EstimateFile, Identity, MapFile, check_pairs
+from tactile_bayes.exports.exam import EstimateFile, Identity, MapFile, check_pairs, lps_from_plane, on_plane, required
 from tactile_bayes.exports.fhir import bundle_json
-from tactile_bayes.exports.images import nrrd_bytes
 from tactile_bayes.exports.redcap import dictionary_csv, records_csv
 from tactile_bayes.files.atomic import Format, check_suffix, refuse_existing, same_file, unwritable, write_all
+from tactile_bayes.findings import finding_lines
+from tactile_bayes.presets import RESEARCH_USE
+
+# --- Maps as NRRD, the format of 3D Slicer: one slice in the patient's frame.
+
+
+def nrrd_bytes(source: MapFile) -> bytes:
+    """A map as the bytes of a NRRD file: float32 values (nx, ny, 1), NaN where there are none.
+
+    The axes are the plane's, in ``left-posterior-superior`` and mm; the slice is as thick as a cell is wide.
+    """
+    nrrd = required("nrrd")
+    one = source.tactile_map
+    transform = lps_from_plane(one)
+    if transform is None:
+        what = "has no landmarks, so its place in the patient is not known"
+        way_out = "3D Slicer takes maps of scans in which sternal notch and xiphoid were touched"
+        raise BadDataError(what, way_out=way_out, path=str(source.path))
+    values = np.where(one.covered, one.mean, np.nan).T[:, :, None].astype("<f4")
+    header: dict[str, Any] = {
+        "space": "left-posterior-superior",
+        "kinds": ["domain", "domain", "domain"],
+        "space units": ["mm", "mm", "mm"],
+        "space directions": transform[:3, :3].T * one.recipe.cell_mm,
+        "space origin": on_plane(transform, (float(one.x_mm[0]), float(one.y_mm[0]))),
+        "encoding": "gzip",
+        "content": "tactile map",
+        "tactile_bayes_values": one.recipe.value_words.encode("ascii", "replace").decode(),
+        "tactile_bayes_map_sha256": source.digest,
+        "tactile_bayes_findings": " ".join(finding_lines(one.findings, paper=True)).encode("ascii", "replace").decode(),
+        "tactile_bayes_research_use": RESEARCH_USE,
+    }
+    buffer = io.BytesIO()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # the library asks for the time in an old way
+        nrrd.write(buffer, values, header, index_order="F", compression_level=9)
+    head, _, data = buffer.getvalue().partition(b"\n\n")
+    kept = [line for line in head.split(b"\n") if not line.startswith(b"#")]  # one has the time of day
+    return b"\n".join(kept) + b"\n\n" + data
+
 
 # --- Writing the files of an export: one file, or a folder that holds those of no other export.
 

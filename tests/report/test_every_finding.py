@@ -169,7 +169,7 @@ def exam_words(made: Made, *, several: bool) -> str:
 
 def nrrd(made: Made) -> str:
     pytest.importorskip("nrrd")
-    from tactile_bayes.exports.images import nrrd_bytes
+    from tactile_bayes.exports.run import nrrd_bytes
 
     return nrrd_bytes(made.map_file).partition(b"\n\n")[0].decode()
 
@@ -270,7 +270,7 @@ OUTPUTS: dict[str, Output] = {
 PRINTERS = {
     # behind the outputs above
     "api/comparing", "api/maps", "api/sized", "exports/dicom",
-    "exports/fhir", "exports/images", "exports/redcap", "files/map_nc",
+    "exports/fhir", "exports/run", "exports/redcap", "files/map_nc",
     "report/campaign_page", "report/growth_page", "report/compare", "report/estimate_document",
     "report/estimate_figures", "report/estimate_text", "report/exam_page", "report/map_figure", "report/map_text",
     "report/pages", "report/pooled",
