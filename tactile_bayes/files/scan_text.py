@@ -3,15 +3,16 @@
 Layouts of poses that are known by their columns:
 
 - NDI's (ToolBox, and the examples of the Combined API): ``Frame#, PortHandle, Face#, TransformStatus, Q0, Qx, Qy, Qz,
-  Tx, Ty, Tz, Error``, mm, scalar first, a row without numbers where the tool is not seen
+  Tx, Ty, Tz, Error``, mm, scalar first, a row without numbers where the tool is not seen; several tools side by side,
+  each with its markers' places behind it. Loggers on its library write ``R00`` to ``R22`` in place of a quaternion
 - azimuth, elevation and roll in degrees, as Polhemus trackers send them: ``x, y, z, az, el, roll``, in cm or inches
 - OptiTrack's (Motive): ``Frame, Time (Seconds), X, Y, Z, W, X, Y, Z`` below ``Length Units,Meters``, rotation first
 - homogeneous matrices: 12 or 16 numbers a row, with a time before them
 
 Layouts of frames that are known by what stands in them:
 
-- one row a frame: numbers alone, or below a header that names times and counters (pedar and pliance of novel:
-  ``time[secs]``, then a column a sensor)
+- one row a frame: numbers alone, or below a header that names times, counters and sums (pedar and pliance of novel:
+  ``time[secs]``, then a column a sensor; ``S_1_1`` of XSENSOR, ``elem1 [psi.]`` of PPS, behind the figures of a frame)
 - one block of rows a frame, with a line such as ``Frame 12`` or a blank one between (Tekscan's ASCII movie with
   ``ROWS``, ``SECONDS_PER_FRAME`` and ``UNITS``; XSENSOR's CSV with ``Time`` and ``Units``)
 """
@@ -126,7 +127,7 @@ def _without(row: FloatArray, layout: str) -> str:
 def chosen(names: Sequence[str], given: Stated, *, what: str) -> str:
     """The tool that is stated, or the only one."""
     if given.tool is not None:
-        alike = [name for name in names if given.tool in (name, name.split()[0])]
+        alike = [name for name in names if given.tool in (name, name.split()[0], name.split("To")[0])]
         if len(alike) == 1:
             return alike[0]
         raise BadDataError(f"has no one tool {given.tool!r} in {what}", way_out=f"--tool is one of {', '.join(names)}")
@@ -144,8 +145,10 @@ def _named(table: TextTable, header: Line, given: Stated) -> Source:
         for i, kind in enumerate(kinds):
             if kind == "qw" and kinds[max(i - 3, 0) : i] == list(_PLACE):  # of a quaternion, not of a place
                 kinds[i - 3 : i] = ["qx", "qy", "qz"]
-    layout = "wxyz" if {"qw", "qx", "qy"} & set(kinds) else "euler"
-    names = (*_PLACE, *_ROTATIONS[layout])
+    turned = _named_matrix(header.fields)
+    kinds = [name if name in turned else kind for name, kind in zip(map(str.lower, header.fields), kinds, strict=True)]
+    layout = "matrix" if turned else "wxyz" if {"qw", "qx", "qy"} & set(kinds) else "euler"
+    names = (*_PLACE, *(turned or _ROTATIONS[layout]))
     if not set(names) <= set(kinds):
         what = f"line {header.number} names no {', '.join(sorted(set(names) - set(kinds)))}"
         way_out = "name columns Tx, Ty, Tz and Q0, Qx, Qy, Qz, or x, y, z and azimuth, elevation, roll"
@@ -153,8 +156,9 @@ def _named(table: TextTable, header: Line, given: Stated) -> Source:
     if given.pose_layout not in (None, layout):
         raise BadDataError(f"line {header.number} names its rotations ({layout})", way_out="leave --pose-layout out")
     rows = [line for line in table.lines if line.number > header.number]
-    columns, rows = _of_one_tool(kinds, rows, names, given)
-    numbers = np.column_stack([_values(rows, columns[name]) for name in names])
+    columns, rows = _of_one_tool(header, kinds, rows, names, given)
+    order = (3, 4, 5, 0, 6, 7, 8, 1, 9, 10, 11, 2) if turned else range(len(names))  # rows of a matrix: R, then place
+    numbers = np.column_stack([_values(rows, columns[names[i]]) for i in order])
     status = [_field(line, columns["status"]) for line in rows] if "status" in columns else [""] * len(rows)
     time, unit = _times(rows, columns, header, given)
     stated: dict[str, Any] = {"pose_time_unit": unit} if unit else {}
@@ -170,17 +174,25 @@ def _named(table: TextTable, header: Line, given: Stated) -> Source:
     return replace(found, notes=(named, *found.notes))
 
 
+def _named_matrix(fields: Sequence[str]) -> tuple[str, ...]:
+    """Names of the nine numbers of a rotation matrix, row by row, from R00 or R11 on; empty without them."""
+    held = {name.lower() for name in fields}
+    each = (tuple(f"r{i}{j}" for i in range(first, first + 3) for j in range(first, first + 3)) for first in (0, 1))
+    return next((names for names in each if held.issuperset(names)), ())
+
+
 def _of_one_tool(
-    kinds: Sequence[str], rows: Sequence[Line], names: Sequence[str], given: Stated
+    header: Line, kinds: Sequence[str], rows: Sequence[Line], names: Sequence[str], given: Stated
 ) -> tuple[dict[str, int], list[Line]]:
     """Columns of one tool, which may stand beside others (as NDI writes them) or in rows between theirs."""
     first = names[3]
     sets = [i for i, kind in enumerate(kinds) if kind == first]
     at = sets[0]
     if len(sets) > 1:
-        numbered = [str(i + 1) for i in range(len(sets))]
-        at = sets[int(chosen(numbered, given, what=f"{len(sets)} groups of columns")) - 1]
-    columns = {kind: _nearest(kinds, kind, at, pose=kind in names) for kind in set(kinds) if kind}
+        numbered = [f"{i + 1}{_port_before(header.fields[:one])}" for i, one in enumerate(sets)]
+        at = sets[numbered.index(chosen(numbered, given, what=f"{len(sets)} groups of columns"))]
+    ahead = not set(_PLACE) & set(kinds[: sets[0]])  # a tool's place stands behind its rotation, not before it
+    columns = {kind: _nearest(kinds, kind, at, pose=kind in names, ahead=ahead) for kind in set(kinds) if kind}
     held = list(rows)
     if len(sets) == 1 and "tool" in columns:
         tools = dict.fromkeys(_field(line, columns["tool"]) for line in rows)
@@ -189,11 +201,19 @@ def _of_one_tool(
     return columns, held
 
 
-def _nearest(kinds: Sequence[str], kind: str, at: int, *, pose: bool) -> int:
+def _port_before(names: Sequence[str]) -> str:
+    """What NDI's ToolBox calls the tool of the columns that follow; empty where nothing does."""
+    ports = [name for name in names if name.lower().startswith("port ")]
+    return f" ({' '.join(ports[-1].split())})" if ports else ""
+
+
+def _nearest(kinds: Sequence[str], kind: str, at: int, *, pose: bool, ahead: bool) -> int:
     """The column of a kind beside another; what is said of a tool stands before its pose."""
     places = [i for i, one in enumerate(kinds) if one == kind]
-    before = [i for i in places if i < at]
-    return min(places, key=lambda i: abs(i - at)) if pose or not before else before[-1]
+    beside = [i for i in places if (i > at) == (ahead and pose)]
+    if kind in _PLACE or not pose:
+        places = beside or places
+    return min(places, key=lambda i: abs(i - at))
 
 
 def _field(line: Line, column: int) -> str:
@@ -303,15 +323,20 @@ _UNITS: Final = {
     "raw": "counts",
 }
 """Units by what programs call them, in small letters."""
-_UNIT_LINE: Final = re.compile(r"^\W*(pressure[ _])?units?\b[^\w]*([\w/^²]+)", re.IGNORECASE)
-_UNIT_WORD: Final = re.compile(r"[\[(]\s*(kpa|psi|mmhg|n/cm2|n/cm²|n/cm\^2)\s*[\])]", re.IGNORECASE)
-_PERIOD_LINE: Final = re.compile(r"\b(seconds_per_frame|time per pic)\b\D*([\d.,]+)", re.IGNORECASE)
+_NUMBER: Final = r"(\d+(?:[.,]\d+)?(?:e[+-]?\d+)?)"
+_UNIT_LINE: Final = re.compile(r"^\W*(?:(?:pressure[ _])?units?\b|pressure values in\b)[^\w]*([\w/^²]+)", re.IGNORECASE)
+_UNIT_WORD: Final = re.compile(r"[\[(]\s*(kpa|psi|mmhg|n/cm2|n/cm²|n/cm\^2)\.?\s*[\])]", re.IGNORECASE)
+_FULL_SCALE: Final = re.compile(r"\b\d+ *= *full[ -]scale", re.IGNORECASE)
+"""SingleTact's program says so of counts in columns that it calls PSI."""
+_PERIOD_LINE: Final = re.compile(rf"\b(seconds_per_frame|time per (?:pic|frame))\b\D*{_NUMBER}", re.IGNORECASE)
 _RATE_LINE: Final = re.compile(
-    r"\b((?:sampl\w*|scan\w*|frame|record\w*)[ _]?(?:rate|frequency)|frames per second|fps)\b\D*([\d.,]+)",
+    rf"\b((?:sampl\w*|scan\w*|frame|record\w*)[ _]?(?:rate|frequency)|frames per second|fps)\b\D*{_NUMBER}",
     re.IGNORECASE,
 )
-_TIME_LINE: Final = re.compile(r"\btime\b[^\d\n]*(\d[\d:.,]*)\s*(ms|s|secs?|seconds)?\b", re.IGNORECASE)
-_SATURATION_LINE: Final = re.compile(r"^\W*saturation[_ ]pressure\b\D*([\d.,]+)", re.IGNORECASE)
+_TIME_LINE: Final = re.compile(r"\btime\b[^\d\n]*(\d+(?:[:.,]\d+)*)\s*(ms|s|secs?|seconds)?\b", re.IGNORECASE)
+_SATURATION_LINE: Final = re.compile(rf"^\W*saturation[_ ]pressure\b\D*{_NUMBER}", re.IGNORECASE)
+_FIELD_NAME: Final = re.compile(r"b[xyz]_?\d*", re.IGNORECASE)
+"""A component of a magnetometer's field, as ReSkin's library calls it."""
 _TIME_NAME: Final = re.compile(r"(time|t|timestamp|elapsed|elapsed time|secs?|seconds|clock|zeit)", re.IGNORECASE)
 _OTHER_NAME: Final = re.compile(
     r"^(no|nr|#|n|i|id)\W*$|\b(frame|index|idx|sample|number|counter|date|sum|total|mean|average|avg|max|min|peak|force|"
@@ -341,6 +366,9 @@ def read_frames(path: Path, given: Stated, *, shape: tuple[int, int] | None) -> 
     before = [line for line in lines if line.number < blocks[0][0].number]
     stated, told = _said(before)
     notes = [f"frames: {table.words}", *told]
+    if of_fields := next((one for one in before if _names_fields(one)), None):
+        what = f"is a log of magnetic fields by line {of_fields.number} ({', '.join(of_fields.fields[:4])})"
+        raise BadDataError(what, way_out="make pressures of them by your calibration, and give those")
     if len(blocks) > 1 and len(blocks[0]) > 1:
         return _of_blocks(lines, blocks, stated, notes)
     rows = [line for block in blocks for line in block]
@@ -397,6 +425,10 @@ def _blocks(lines: Sequence[Line], taxels: int | None) -> list[list[Line]]:
     return blocks if len(lengths) == 1 else [[line for block in blocks for line in block]]
 
 
+def _names_fields(line: Line) -> bool:
+    return len({name[:2].lower() for name in line.fields if _FIELD_NAME.fullmatch(name)}) == 3
+
+
 def _like_a_row(line: Line, width: int) -> str:
     """What a line holds that looks like one of the table, and is not; empty for a title and for other lines."""
     if len(line.fields) < 2 or line.text.lstrip('" ').lower().startswith(("frame", "time", "@@")):
@@ -424,8 +456,10 @@ def _said(before: Iterable[Line]) -> tuple[Stated, list[str]]:
 
 def _said_in(text: str) -> Iterable[tuple[str, Any]]:
     unit = _UNIT_LINE.search(text)
-    word = unit[2] if unit else (named[1] if (named := _UNIT_WORD.search(text)) else "")
-    if word.lower() in _UNITS:
+    word = unit[1] if unit else (named[1] if (named := _UNIT_WORD.search(text)) else "")
+    if _FULL_SCALE.search(text):
+        yield "unit", "counts"
+    elif word.lower() in _UNITS:
         yield "unit", _UNITS[word.lower()]
     for pattern, option, made in (
         (_PERIOD_LINE, "rate_hz", lambda value: 1 / value),
@@ -498,6 +532,13 @@ def _of_rows(
     return Source(arrays, stated, tuple(notes))
 
 
+def _numbered_alike(names: Sequence[str], taxels: int) -> list[int]:
+    """The columns whose names differ by their numbers only, where there are as many as taxels; else none."""
+    stems = [re.sub(r"\d+", "0", name) for name in names]
+    alike = [stem for stem, number in Counter(stems).items() if number == taxels]
+    return [i for i, stem in enumerate(stems) if alike == [stem]]
+
+
 def _columns(values: FloatArray, names: list[str], taxels: int | None, given: Stated) -> tuple[int | None, list[int]]:
     """Columns of times (None without) and of readings: as stated, by their names, else by how many there are."""
     width = values.shape[1]
@@ -508,6 +549,8 @@ def _columns(values: FloatArray, names: list[str], taxels: int | None, given: St
     first = given.skip_columns
     if first is None and (timed or others):
         readings = [i for i in range(width) if i not in (*timed, *others)]
+        if taxels is not None and len(readings) != taxels:
+            readings = _numbered_alike(names, taxels) or readings
         if taxels is None or len(readings) == taxels:
             return (timed[0] if timed else None), readings
         told = ", ".join(repr(one) for one in (*names[:3], *names[-1:]))

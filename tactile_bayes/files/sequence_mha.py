@@ -93,6 +93,7 @@ def _frames(keys: dict[str, str], data: bytes) -> Arrays:
         kind = np.dtype(_TYPES[keys["ElementType"]])
     if keys.get("BinaryDataByteOrderMSB", keys.get("ElementByteOrderMSB", "False")) == "True":
         kind = kind.newbyteorder(">")
+    shape = shape[:1] + tuple(one for one in shape[1:] if one > 1) if len(shape) > 3 else shape  # slices of one image
     size = int(np.prod(shape, dtype=object)) * kind.itemsize
     check_limit(size, unpacked_limit(len(data)), what="its frames unpack to {} bytes")
     if keys.get("CompressedData", "False") == "True":

@@ -22,6 +22,7 @@ _SAMPLED: Final = 300  # lines by which the separator is told
 _LEAST_NUMBERS: Final = 0.6  # share of a line's fields that are numbers where it is one of the table
 _AS_UTF8: Final = "save it as UTF-8 text"
 _AROUND: Final = " \t\"'[](){}"  # of a field, as R and Python print numbers
+_TOUCHING: Final = re.compile(r"(\.\d+)(?=[+-]\d+\.\d)")  # numbers of Polhemus, of one width each
 _CLOCK: Final = re.compile(r"(?:(\d{1,2}):)?(\d{1,2}):(\d{1,2}(?:\.\d+)?)")
 _DATED: Final = re.compile(r"\d{4}-\d{2}-\d{2}[T ]\d{1,2}:\d{2}:\d{2}(\.\d+)?(Z|[+-]\d{2}:?\d{2})?")
 _UNIT_OF_TIME: Final = re.compile(r"(?:[\[(_ ]|(?<=time))(ms|us|ns|s|min|msec|µs|secs?|seconds)[\])]?$", re.IGNORECASE)
@@ -146,7 +147,7 @@ def _is_number(text: str, marks: Sequence[str]) -> bool:
 
 def fields_of(text: str, separator: str) -> list[str]:
     """Fields of a line without the blanks around them."""
-    text = " ".join(text.split()) if separator == " " else text
+    text = " ".join(_TOUCHING.sub(r"\1 ", text).split()) if separator == " " else text
     with decoding("is not a table of text", way_out="give a table of numbers, such as .csv"):
         return [one.strip() for one in next(csv.reader([text], delimiter=separator, skipinitialspace=True), [])]
 
