@@ -268,9 +268,11 @@ def _check_header(header: Sequence[str], fields: Mapping[str, Any], *, wide: str
             raise _fault(1, name, "is not known here", way_out=advice)
         if header.count(name) > 1:
             raise _fault(1, name, "appears more than once", way_out="keep one of them")
-    for name, field in fields.items():
-        if name not in header and (_is_required(field) or field.get("column") == "required"):
-            raise _fault(1, name, "is missing", way_out=f"add it: {field['description']}")
+    needed = [name for name, field in fields.items() if _is_required(field) or field.get("column") == "required"]
+    if missing := [name for name in needed if name not in header]:
+        first, *others = (fields[name]["description"].rstrip(".") for name in missing)
+        also = "".join(f"; and {name}: {words}" for name, words in zip(missing[1:], others, strict=True))
+        raise _fault(1, missing[0], "is missing", way_out=f"add it: {first}{also}")
 
 
 def _other_table(header: Sequence[str], fields: Mapping[str, Any]) -> str:

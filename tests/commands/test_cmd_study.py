@@ -146,6 +146,7 @@ def test_what_cannot_be_is_said_in_one_line(name: str, run_cli: Run, tmp_path: P
         ("d_mm,depth_ratio,stiffness_ratio\n10,1,0\n", ["line 2", "stiffness_ratio", "above 0"]),
         ("d_mm,depth_ratio,stiffness_ratio\n10,1,8\n10,1,8\n", ["g.csv", "appears twice"]),
         ("d_mm,depth_ratio\n10,1\n", ["stiffness_ratio", "is missing"]),
+        ("d_mm\n10\n", ["depth_ratio: is missing", "and stiffness_ratio: "]),
         ("d_cm,depth_ratio,stiffness_ratio\n1,1,8\n", ["convert it to d_mm"]),
         ("seat,d_mm,depth_ratio,stiffness_ratio\nhigh,10,1,8\n", ["seat is 'high'"]),
     ],
