@@ -35,6 +35,8 @@ from tactile_bayes.size.visits import VOLUME, Change, Compared, JointSizes, doub
 # --- Growth of masses between visits, as `compare` told it: rows of a table and a section of a page.
 
 _VERDICTS: Final = {"grown": "grown", "shrunk": "shrunk", "no_change_shown": "no change shown"}
+_ALIKE_ONLY: Final = "if exams repeat as simulated ones do; if they differ as those of patients did, no change is shown"
+"""What a verdict rests on where the site has not learned how its own exams repeat."""
 
 
 class Growth(Record, eq=False):
@@ -59,7 +61,8 @@ class Growth(Record, eq=False):
     @property
     def outcome(self) -> str:
         """What became of the mass, or why nothing is known of it."""
-        return _VERDICTS.get(self.verdict, f"not compared: {self.reason}")
+        told = _VERDICTS.get(self.verdict)
+        return ", ".join(filter(None, (told, self.reason))) if told else f"not compared: {self.reason}"
 
     @property
     def words(self) -> str:
@@ -74,7 +77,8 @@ def growths(patient: str, mass: str, visits: Sequence[str], report: CompareRepor
     sizes = [one.max_size_mm for one in report.visits if one.max_size_mm is not None]
     return [
         Growth(
-            patient, mass, visits[0], visits[change.later - 1], "compared", days=report.visits[change.later - 1].day,
+            patient, mass, visits[0], visits[change.later - 1], "compared",
+            _ALIKE_ONLY if change.for_alike_exams_only else "", days=report.visits[change.later - 1].day,
             sizes_mm=(sizes[0], sizes[change.later - 1]), percent=change.percent,
             verdict=change.verdict, findings=report.findings, link=link,
         )
@@ -90,7 +94,8 @@ def growth_line(rows: Sequence[Growth], table: str) -> str:
     counts["not compared"] = sum(not row.verdict for row in rows)
     masses = len({(row.patient, row.mass) for row in rows})
     told = ", ".join(f"{count} {words}" for words, count in counts.items() if count)
-    return f"growth of {masses} mass{'es' * (masses > 1)} with several visits: {told} ({table})"
+    compared = f" ({len(rows)} later visits)" if len(rows) > masses else ""
+    return f"growth of {masses} mass{'es' * (masses > 1)} with several visits{compared}: {told} ({table})"
 
 
 # --- The report of a comparison: what `compare --json` prints.
@@ -328,7 +333,7 @@ def _direction(grown: float) -> str:
 
 def _verdict_line(change: ChangeReport) -> str:
     if change.verdict != "no_change_shown":
-        return f"The mass has {change.verdict}."
+        return f"The mass has {change.verdict}{f', {_ALIKE_ONLY}' if change.for_alike_exams_only else ''}."
     least = change.smallest_detectable_percent
     growth, shrinkage = f"{least.growth:.0f} %", f"{least.shrinkage:.0f} %"
     return f"No change shown; a growth of less than {growth} or a shrinkage of less than {shrinkage} can stay unseen."

@@ -24,7 +24,7 @@ from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.geometry import rigid
 from tactile_bayes.inference.draws import normal_quantile
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.report.compare import compare_summary, signed, verdict
+from tactile_bayes.report.compare import compare_summary, growths, signed, verdict
 from tactile_bayes.size.visits import Change
 
 FAST = ("--method", "laplace")
@@ -323,9 +323,13 @@ def test_what_is_shown_is_beyond_the_smallest_detectable_change_and_what_is_not_
         assert (verdict(change) == "shrunk") == (share < -shrinkage)
 
 
-def reworded(grown: dict, **figures: object) -> str:
+def with_change(grown: dict, **figures: object) -> CompareReport:
     (change,) = grown["changes"]
-    return summary({**grown, "changes": [{**change, **figures}]})
+    return from_plain(CompareReport, {**grown, "changes": [{**change, **figures}]})
+
+
+def reworded(grown: dict, **figures: object) -> str:
+    return compare_summary(with_change(grown, **figures))
 
 
 def summary(document: dict) -> str:
@@ -348,3 +352,14 @@ def test_a_wider_spread_between_exams_adds_no_second_verdict(grown: dict) -> Non
     assert "probability that it has grown: 0.900." in text
     assert text.count("The mass has") == 1
     assert "no change shown" not in text.lower()
+    assert "The mass has grown." in text
+
+
+def test_a_change_that_exams_of_patients_would_not_show_says_on_what_it_rests(grown: dict) -> None:
+    wide = grown["changes"][0]["another_exam"]
+    around_0 = {**wide, "percent": {**wide["percent"], "low": -1.0}}
+    words = "grown, if exams repeat as simulated ones do; if they differ as those of patients did, no change is shown"
+    assert f"The mass has {words}." in reworded(grown, another_exam=around_0)
+    for another, outcome in ((around_0, words), (wide, "grown"), (None, "grown")):
+        (row,) = growths("P1", "1", "12", with_change(grown, another_exam=another), "")
+        assert row.outcome == outcome

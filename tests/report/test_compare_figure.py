@@ -158,8 +158,8 @@ def test_the_page_has_a_ring_as_large_as_each_size_and_the_texts_verdict(three: 
     words = html.unescape(re.sub(r"<style>.*?</style>|<[^>]*>", " ", page, flags=re.DOTALL))
     words = " ".join(words.split())
     assert three.growth == "grown"
-    assert "The mass has grown." in three.text
-    assert "The mass has grown." in words
+    assert "The mass has grown, if exams repeat as simulated ones do;" in three.text
+    assert "The mass has grown, if exams repeat as simulated ones do;" in words
     for told in ("Patient P07", "Side right", "Visit v1, 2026-01-10", "Visit v3, 2026-07-20", RESEARCH_USE):
         assert told in words
     for line in three.text.splitlines():
