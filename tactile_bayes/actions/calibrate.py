@@ -8,8 +8,8 @@ from typing import Any
 
 import click
 
-from tactile_bayes.api.calibrating import learn
 from tactile_bayes.api.repeatability import exams_in, learn_from_exams
+from tactile_bayes.api.size_calibration import learn
 from tactile_bayes.commands.options import also_read, typed_options
 from tactile_bayes.declarations import as_dict
 from tactile_bayes.errors import BadDataError, in_file

@@ -2,57 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 from tactile_bayes.api.arguments import PathLike, door, output_path, plain, required_path, table_of, takes
 from tactile_bayes.api.repeatability import exams_in, learn_from_exams
-from tactile_bayes.api.size_calibration import Learned, correct_size, is_population, learn_eq6, learn_population
-from tactile_bayes.errors import UsageError
-from tactile_bayes.files.tables import Sheet
+from tactile_bayes.api.size_calibration import learn
 from tactile_bayes.laboratory_options import LearnOptions
-from tactile_bayes.progress import Progress
 from tactile_bayes.size.pooling import Calibration, Repeatability
 
 if TYPE_CHECKING:
     import pandas
-
-_MAPS: Final = ("normalise", "background", "fit_radius_mm", "noise")  #: How a table's maps were made, if it is silent.
-
-
-def learn(
-    table: Path | Sheet,
-    asked: LearnOptions,
-    given: Collection[str],
-    *,
-    correct: str | None = None,
-    against: Path | None = None,
-    progress: Progress | None = None,
-) -> Learned:
-    """Learn a size calibration in the way that table and options ask for; those of another way are refused.
-
-    `given`: names of the options that somebody gave; `correct`: name or path of the calibration to correct; `against`:
-    lumps of another origin, for one over bodies.
-    """
-    declared = {name: getattr(asked, name) for name in _MAPS}
-    if correct is not None:
-        why = "is for learning a calibration; leave it out with --correct"
-        _refuse(given, why, "form", "against", "fit", "least_stiffness_ratio", "figure")
-        return correct_size(table, correct, declared, seed=asked.seed, progress=progress)
-    if asked.form != "eq6" or is_population(table):
-        why = "is for tables of lumps: a table of `population` fixes how its maps were made"
-        _refuse(given, why, "fit", *_MAPS[1:], "least_stiffness_ratio", "figure", "seed")
-        return learn_population(table, asked.form, asked.normalise, against=against)
-    _refuse(given, "is for a table of `population`; leave it out", "against")
-    ratio = asked.least_stiffness_ratio
-    return learn_eq6(table, declared, fit=asked.fit, least_stiffness_ratio=ratio, seed=asked.seed, progress=progress)
-
-
-def _refuse(given: Collection[str], why: str, *others: str) -> None:
-    for name in others:
-        if name in given:
-            raise UsageError(f"--{name.replace('_', '-')} {why}")
 
 
 @door

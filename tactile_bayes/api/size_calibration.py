@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import csv
-import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final, Literal, cast
+from typing import Any, Final, cast
 
 import numpy as np
 
@@ -22,6 +21,7 @@ from tactile_bayes.files.size_json import SHIPPED, read_size_calibration, size_c
 from tactile_bayes.files.tables import Sheet, Table, read_table
 from tactile_bayes.forward.tissue import parse_seat
 from tactile_bayes.geometry import FloatArray
+from tactile_bayes.laboratory_options import LearnOptions
 from tactile_bayes.presets import FIT_RADIUS_MM, HEAD_PROFILE, LEAST_HARD_RATIO, Background
 from tactile_bayes.progress import Progress
 from tactile_bayes.scans import HeadShape
@@ -44,10 +44,8 @@ from tactile_bayes.size.pooling import Calibration
 from tactile_bayes.size.terms import Normalise, Recipe
 from tactile_bayes.studies.population import measuring_options, population_table, table_bodies, table_head
 
-EqSixFit = Literal["joint", "two-stage"]
-PopulationForm = Literal["eq6", "eq6-residual"]
-"""What can be learned from a table of `population`; only the first from a table of lumps."""
 _SOURCE: Final = "balls in a population of bodies, scanned by the solid model"
+_MAPS: Final = ("normalise", "background", "fit_radius_mm", "noise")  #: How a table's maps were made, if it is silent.
 
 
 class Learned(Record, eq=False):
@@ -70,38 +68,66 @@ class Learned(Record, eq=False):
         write_size_calibration(path, self.calibration, base=self.base, provenance=provenance, force=force)
 
 
-def files_of(**tables: Path | Sheet | None) -> dict[str, Path]:
+def learn(
+    table: Path | Sheet,
+    asked: LearnOptions,
+    given: Collection[str],
+    *,
+    correct: str | None = None,
+    against: Path | None = None,
+    progress: Progress | None = None,
+) -> Learned:
+    """Learn a size calibration in the way that table and options ask for; those of another way are refused.
+
+    `given`: names of the options that somebody gave; `correct`: name or path of the calibration to correct; `against`:
+    lumps of another origin, for one over bodies.
+    """
+    if correct is not None:
+        why = "is for learning a calibration; leave it out with --correct"
+        _refuse(given, why, "form", "against", "fit", "least_stiffness_ratio", "figure")
+        return _corrected(table, correct, asked, progress)
+    if asked.form != "eq6" or {"body", "exam"} <= set(_header_of(table)):
+        why = "is for tables of lumps: a table of `population` fixes how its maps were made"
+        _refuse(given, why, "fit", *_MAPS[1:], "least_stiffness_ratio", "figure", "seed")
+        return _over_bodies(table, asked, against)
+    _refuse(given, "is for a table of `population`; leave it out", "against")
+    return _eq6(table, asked, progress)
+
+
+def _refuse(given: Collection[str], why: str, *others: str) -> None:
+    for name in others:
+        if name in given:
+            raise UsageError(f"--{name.replace('_', '-')} {why}")
+
+
+def _files(**tables: Path | Sheet | None) -> dict[str, Path]:
     """Those of the tables that are files, by role."""
     return {role: table for role, table in tables.items() if isinstance(table, Path)}
 
 
-def learn_eq6(
-    table: Path | Sheet,
-    declared: Mapping[str, Any],
-    *,
-    fit: EqSixFit = "joint",
-    least_stiffness_ratio: float = 0.0,
-    seed: int = 1,
-    progress: Progress | None = None,
-) -> Learned:
-    """Learn Eq 6 from a table of lumps, of which those softer than `least_stiffness_ratio` take no part.
+def _declared(asked: LearnOptions) -> dict[str, Any]:
+    return {name: getattr(asked, name) for name in _MAPS}
+
+
+def _eq6(table: Path | Sheet, asked: LearnOptions, progress: Progress | None) -> Learned:
+    """Learn Eq 6 from a table of lumps, of which those softer than asked take no part.
 
     By the posterior of all coefficients from all rows (``"joint"``), or as printed, with a bootstrap (``"two-stage"``).
     """
     rows = read_table(table, "size_table.table.json")
-    recipe = table_recipe(rows, declared)
+    recipe, least = table_recipe(rows, _declared(asked)), asked.least_stiffness_ratio
     with in_file(rows.path):
-        lumps = size_table(rows, least_stiffness_ratio=least_stiffness_ratio)
-        rng = np.random.default_rng(seed)
-        if fit == "two-stage":
+        lumps = size_table(rows, least_stiffness_ratio=least)
+        rng = np.random.default_rng(asked.seed)
+        if asked.fit == "two-stage":
             calibration = learn_two_stage(lumps, recipe=recipe, rng=rng)
         else:
             calibration = learn_size_calibration(lumps, recipe=recipe, rng=rng, progress=progress)
         other = other_fit(calibration, lumps)
-        one_axis = axis_in_two_stages if fit == "two-stage" else None
+        one_axis = axis_in_two_stages if asked.fit == "two-stage" else None
         left_out, silent = None, ""  # cross-validated errors, or why Eq 6 has none
         try:
-            left_out = left_out_of_study(lumps, least_stiffness_ratio=least_stiffness_ratio, fit=one_axis)
+            left_out = left_out_of_study(lumps, least_stiffness_ratio=least, fit=one_axis)
         except (NotConvergedError, BadDataError) as error:
             silent = str(error)
     settings = {
@@ -109,12 +135,12 @@ def learn_eq6(
         "background": recipe.background,
         "fit_radius_mm": recipe.radius_mm,
         "noise": recipe.noise,
-        "least_stiffness_ratio": least_stiffness_ratio,
-        "fit": fit,
+        "least_stiffness_ratio": least,
+        "fit": asked.fit,
     }
-    cautions = table_cautions(rows.columns, least_stiffness_ratio=least_stiffness_ratio)
+    cautions = table_cautions(rows.columns, least_stiffness_ratio=least)
     learned = replace(calibration, left_out=left_out, cautions=cautions)
-    return Learned(learned, settings, files_of(table=table), seed, lumps=lumps, not_left_out=silent, other_fit=other)
+    return Learned(learned, settings, _files(table=table), asked.seed, None, lumps, silent, other)
 
 
 def table_cautions(columns: Mapping[str, Sequence[Any]], *, least_stiffness_ratio: float = 0.0) -> tuple[str, ...]:
@@ -133,54 +159,42 @@ def table_cautions(columns: Mapping[str, Sequence[Any]], *, least_stiffness_rati
     return tuple(found)
 
 
-def learn_population(
-    table: Path | Sheet, form: PopulationForm, normalise: str | None = None, *, against: Path | None = None
-) -> Learned:
-    """Learn a calibration from a table of `population`.
-
-    `normalise` is that of the rows to learn from, and may be left out where all are alike. Lumps of another origin, in
-    the same columns, tell by how much such bodies depart: `against`.
-    """
+def _over_bodies(table: Path | Sheet, asked: LearnOptions, against: Path | None) -> Learned:
+    """Learn a calibration from a table of `population`; lumps `against` it tell by how much such bodies depart."""
     given = None if against is None else read_table(against, "population.table.json")
     rows, fit = read_table(table, "population.table.json"), measuring_options()
-    way, columns = rows_of_one_way(rows, normalise)
-    settings: dict[str, Any] = {"form": form, "masses": len(set(columns["body"])), "bodies": table_bodies(columns)}
+    way, columns = rows_of_one_way(rows, asked.normalise)
+    bodies, residual = table_bodies(columns), asked.form == "eq6-residual"
+    settings: dict[str, Any] = {"form": asked.form, "masses": len(set(columns["body"])), "bodies": bodies}
     with in_file(rows.path):
         head = table_head(columns)
         recipe = Recipe(
             way, fit.background, fit.fit_radius_mm, declared=False, noise=fit.noise, flat_field=False, head=head
         )
-        found = learning.learn_population(
-            population_table(columns), recipe=recipe, source=_SOURCE, residual=form == "eq6-residual"
-        )
-    if form == "eq6-residual" and found.residual is None:
+        found = learning.learn_population(population_table(columns), recipe=recipe, source=_SOURCE, residual=residual)
+    if residual and found.residual is None:
         raise BadDataError(
             f"fewer than {learning.LEAST_BODIES} bodies have a lump and a head profile: too few for a residual",
             way_out="give a larger population, or --form eq6",
             path=str(rows.path),
         )
-    found = replace(found, bodies=settings["bodies"])
+    found = replace(found, bodies=bodies)
     if given is not None:
         other_table = population_table(rows_of_one_way(given, way)[1])
         settings["other_masses"] = len(set(other_table.body.tolist()))
         source = f"{settings['other_masses']} lumps of {given.path.name}"
         found = learning.learn_other_sd(found, other_table, source=source)
-    return Learned(found, settings, files_of(table=table, against=against))
+    return Learned(found, settings, _files(table=table, against=against))
 
 
-def is_population(source: Path | Sheet) -> bool:
-    """Whether a table is one of `population`: exams of bodies, by its header."""
-    return {"body", "exam"} <= set(header_of(source))
-
-
-def header_of(source: Path | Sheet) -> list[str]:
+def _header_of(source: Path | Sheet) -> list[str]:
     """The names in a table's first line."""
     if isinstance(source, Path):
         with open_input(source) as file:
             first = file.readline(4096).decode("utf-8-sig", errors="replace")
     else:
         first = source.text.partition("\n")[0]
-    return [name.strip() for name in next(csv.reader(io.StringIO(first)), [])]
+    return [name.strip() for name in next(csv.reader([first]), [])]
 
 
 def table_recipe(table: Table, declared: Mapping[str, Any]) -> Recipe:
@@ -188,7 +202,13 @@ def table_recipe(table: Table, declared: Mapping[str, Any]) -> Recipe:
     said = {name: _alike(table, name) for name in (*declared, "flat_field")}
     for name, value in declared.items():
         if None not in (value, said[name]) and value != said[name]:
-            raise _contradiction(table, name, said[name], value)
+            option = f"--{name.replace('_', '-')}"
+            way_out = f"leave out {option}"
+            if name == "normalise":
+                way_out += f", and size maps made with `map --normalise {said[name]}`; "
+                way_out += "`population` gives a table for --normalise gain"
+            what = f"its {name} is {said[name]}, not {value} as {option} says"
+            raise BadDataError(what, way_out=way_out, path=str(table.path))
     found = {name: value if said[name] is None else said[name] for name, value in declared.items()}
     normalise: Normalise = found["normalise"] or "mean"
     background: Background = found["background"] or ("free" if normalise == "none" else "fixed")
@@ -226,17 +246,6 @@ def _alike(table: Table, name: str) -> Any:
     return values[0]
 
 
-def _contradiction(table: Table, name: str, said: object, declared: object) -> BadDataError:
-    option = f"--{name.replace('_', '-')}"
-    way_out = f"leave out {option}"
-    if name == "normalise":
-        way_out += (
-            f", and size maps made with `map --normalise {said}`; `population` gives a table for --normalise gain"
-        )
-    what = f"its {name} is {said}, not {declared} as {option} says"
-    return BadDataError(what, way_out=way_out, path=str(table.path))
-
-
 def rows_of_one_way(rows: Table, normalise: str | None) -> tuple[Normalise, dict[str, list[Any]]]:
     """How a `population` table's maps were normalised, and its columns for the rows that were.
 
@@ -244,19 +253,16 @@ def rows_of_one_way(rows: Table, normalise: str | None) -> tuple[Normalise, dict
     """
     ways = [str(value or "mean") for value in rows.columns.get("normalise", ["mean"] * len(rows))]
     found = sorted(set(ways))
+    chosen, what, advice = normalise or found[0], "", ""
     if normalise is None and len(found) > 1:
-        raise BadDataError(
+        what, advice = (
             f"its maps were normalised in several ways ({', '.join(found)})",
-            way_out=f"learn from the rows of one way: --normalise {found[0]}",
-            path=str(rows.path),
+            "learn from the rows of one way:",
         )
-    chosen = normalise or found[0]
-    if chosen not in found:
-        raise BadDataError(
-            f"none of its maps were made with --normalise {chosen}",
-            way_out=f"give --normalise {found[0]}",
-            path=str(rows.path),
-        )
+    elif chosen not in found:
+        what, advice = f"none of its maps were made with --normalise {chosen}", "give"
+    if what:
+        raise BadDataError(what, way_out=f"{advice} --normalise {found[0]}", path=str(rows.path))
     kept = [i for i, way in enumerate(ways) if way == chosen]
     return cast("Normalise", chosen), {name: [values[i] for i in kept] for name, values in rows.columns.items()}
 
@@ -310,92 +316,87 @@ HARDEST_RATIO = 100.0
 """Largest E2/E1 of the simulated bodies; a harder lump counts as this one, because widths hardly change beyond it."""
 
 
-class _Phantoms(Record):
-    maps: list[PhantomMap]
-    left_out: list[str]
-    inputs: dict[str, Path]
+ShapeOf = Callable[[int, str], ShapeDraws | str]
+"""The bump of a row of that number and of a phantom of that name, or which is left out and why."""
 
 
-def correct_size(
-    table: Path | Sheet, base: str, declared: Mapping[str, Any], *, seed: int = 1, progress: Progress | None = None
-) -> Learned:
+def _corrected(table: Path | Sheet, base: str, asked: LearnOptions, progress: Progress | None) -> Learned:
     """Correct a calibration over bodies by phantoms.
 
     `table`: a row for each map of a phantom: its bump (size_table) or its file (phantom_maps); `base`: name or path of
-    the calibration; `declared`: as for `table_recipe`; for a table of bumps; `seed`: of the random numbers with which
-    maps are estimated.
+    the calibration.
     """
-    path = size_calibration_path(base)
+    path, declared = size_calibration_path(base), _declared(asked)
     calibration = None if path is None else read_size_calibration(path)
     if path is None or not isinstance(calibration, BodyCalibration):
         raise UsageError(
             f"{base} cannot be corrected: it was not learned over bodies; "
             "give --correct solid, solid-mean or eq6, or a file learned from a table of `population`"
         )
-    where = table if isinstance(table, Path) else table.name
-    by_files = "file" in header_of(table)
-    with in_file(where):
+    by_files, inputs = "file" in _header_of(table), {**_files(table=table), "size_calibration": path}
+    with in_file(table if isinstance(table, Path) else table.name):
         if by_files:
             for name in (name for name, value in declared.items() if value is not None):
-                option = name.replace("_", "-")
-                what = f"--{option} is for tables of amplitudes and widths"
+                what = f"--{name.replace('_', '-')} is for tables of amplitudes and widths"
                 raise UsageError(f"{what}: map files state how they were made")
-            found = _from_maps(table, base, seed=seed, progress=progress)
+            rows = read_table(table, "phantom_maps.table.json")
+            names = [str(one) for one in rows.columns["file"]]
+            folder = table.parent if isinstance(table, Path) else Path()
+            inputs |= {f"map_{i}": folder / name for i, name in enumerate(names, start=1)}
+            shape_of = _of_maps(rows, folder, Settings(size_calibration=base, seed=asked.seed), progress)
         else:
-            found = _from_bumps(table, calibration, declared)
+            rows = read_table(table, "size_table.table.json")
+            _check_recipe(rows, calibration, declared)
+            _check_head(rows, calibration)
+            names, shape_of = [f"line {line}" for line in rows.line_numbers], _of_bumps(rows)
+        maps, left_out = [], []
+        for i, phantom in enumerate(_names(rows, names)):
+            shape = shape_of(i, phantom)
+            if isinstance(shape, str):
+                left_out.append(shape)
+            else:
+                maps.append(PhantomMap(phantom, rows.columns["d_mm"][i], shape, _known(rows, i)))
         name = base if base in SHIPPED else path.name
-        corrected = correct_calibration(calibration, found.maps, base=name, left_out=found.left_out)
+        corrected = correct_calibration(calibration, maps, base=name, left_out=left_out)
     document: Any = load_json(path)
-    settings = {"correct": name, "of": "maps" if by_files else "bumps", "seed": seed}
-    inputs = {**files_of(table=table), "size_calibration": path, **found.inputs}
+    settings = {"correct": name, "of": "maps" if by_files else "bumps", "seed": asked.seed}
     return Learned(corrected, settings, inputs, base=document)
 
 
-def _from_bumps(source: Path | Sheet, calibration: BodyCalibration, declared: Mapping[str, Any]) -> _Phantoms:
-    """The phantoms of a table of amplitudes and widths."""
-    rows = read_table(source, "size_table.table.json")
-    _check_recipe(rows, calibration, declared)
-    _check_head(rows, calibration)
-    columns, maps, left_out = rows.columns, [], []
-    for i, name in enumerate(_names(rows, [f"line {line}" for line in rows.line_numbers])):
+def _of_bumps(rows: Table) -> ShapeOf:
+    """The bumps of a table of amplitudes and widths."""
+    columns = rows.columns
+
+    def shape_of(i: int, name: str) -> ShapeDraws | str:
         if columns["sigma_y_mm"][i] is None:
             raise rows.error(i, "sigma_y_mm", "is blank", way_out="give both widths of the map")
         if columns["detectable"][i] is False:
-            left_out.append(f"{name}: its row says that it is not detectable")
-        elif (why := _too_soft(rows, i)) is not None:
-            left_out.append(f"{name}: {why}")
-        else:
-            amplitude, sigma_x, sigma_y = (
-                np.array([columns[one][i]], dtype=np.float64) for one in ("amplitude", "sigma_x_mm", "sigma_y_mm")
-            )
-            told = tuple(columns[one][i] for one in HEAD_PROFILE)
-            profile = None if None in told else told
-            shape = ShapeDraws.of(BumpDraws(amplitude, sigma_x, sigma_y, np.zeros(1)), profile=profile)
-            maps.append(PhantomMap(name, columns["d_mm"][i], shape, _known(rows, i)))
-    return _Phantoms(maps, left_out, {})
-
-
-def _from_maps(source: Path | Sheet, base: str, *, seed: int, progress: Progress | None) -> _Phantoms:
-    """The phantoms of a table of map files, each estimated by the calibration's recipe."""
-    rows = read_table(source, "phantom_maps.table.json")
-    folder = source.parent if isinstance(source, Path) else Path()
-    settings, columns = Settings(size_calibration=base, seed=seed), rows.columns
-    maps, left_out, inputs = [], [], {}
-    for i, name in enumerate(_names(rows, [str(one) for one in columns["file"]])):
-        path = folder / columns["file"][i]
-        inputs[f"map_{i + 1}"] = path
+            return f"{name}: its row says that it is not detectable"
         if (why := _too_soft(rows, i)) is not None:
-            left_out.append(f"{name}: {why}")
-            continue
-        outcome = estimate_file(path, settings)
-        shape = pooling_shape(outcome.tactile_map, outcome.estimate)
-        if shape is None:
-            left_out.append(f"{columns['file'][i]}: {outcome.estimate.reason}")
-        else:
-            maps.append(PhantomMap(name, columns["d_mm"][i], shape, _known(rows, i)))
+            return f"{name}: {why}"
+        amplitude, sigma_x, sigma_y = (
+            np.array([columns[one][i]], dtype=np.float64) for one in ("amplitude", "sigma_x_mm", "sigma_y_mm")
+        )
+        told = tuple(columns[one][i] for one in HEAD_PROFILE)
+        bump = BumpDraws(amplitude, sigma_x, sigma_y, np.zeros(1))
+        return ShapeDraws.of(bump, profile=None if None in told else told)
+
+    return shape_of
+
+
+def _of_maps(rows: Table, folder: Path, settings: Settings, progress: Progress | None) -> ShapeOf:
+    """The bumps of a table of map files, each estimated by the calibration's recipe."""
+
+    def shape_of(i: int, name: str) -> ShapeDraws | str:
+        if (why := _too_soft(rows, i)) is not None:
+            return f"{name}: {why}"
+        file = rows.columns["file"][i]
+        outcome = estimate_file(folder / file, settings)
         if progress is not None:
             progress(i + 1, len(rows))
-    return _Phantoms(maps, left_out, inputs)
+        return pooling_shape(outcome.tactile_map, outcome.estimate) or f"{file}: {outcome.estimate.reason}"
+
+    return shape_of
 
 
 def _names(rows: Table, otherwise: list[str]) -> list[str]:

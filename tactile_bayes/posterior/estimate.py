@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from functools import partial
 
 import numpy as np
 
@@ -209,6 +208,16 @@ DEFAULT_ACCURACY_SD = {"importance": 0.02, "ensemble": 0.1}
 MOST_REFINEMENTS, SAFETY, LEAST_ACCURACY_SD = 3, 0.8, 1e-3
 
 
+class Work(Record, eq=False):
+    """What an estimate is made of."""
+
+    tactile_map: TactileMap
+    calibration: Calibration | None
+    options: SamplerSettings
+    rng: np.random.Generator
+    progress: Progress | None = None  #: Called with effective draws done and wanted.
+
+
 class SizedDraws(Record, eq=False):
     """Draws of one map with its size by `calibration`; `fault` and `extrapolation_faults` say why there is none."""
 
@@ -219,29 +228,20 @@ class SizedDraws(Record, eq=False):
     extrapolation_faults: tuple[str, ...] = ()
 
 
-def draw_until_accurate(
-    tactile_map: TactileMap,
-    seen: Assessment,
-    calibration: Calibration | None,
-    options: SamplerSettings,
-    *,
-    rng: np.random.Generator,
-    progress: Progress | None,
-) -> SizedDraws:
+def draw_until_accurate(work: Work, seen: Assessment) -> SizedDraws:
     """Draw until the size interval is as accurate as requested.
 
     The method stops when the widths are exact enough, which mostly makes the size so too. Where a method cannot draw
     more finely the last draws stand, with their error.
     """
-    draw = partial(draw_with_size, tactile_map, seen, calibration, rng=rng, progress=progress)
-    sized = draw(options)
+    sized = draw_with_size(work, seen)
     for _ in range(MOST_REFINEMENTS):
-        finer = _finer(sized, options)
+        finer = _finer(sized, work.options)
         if finer is None:
             break
-        options = replace(options, accuracy_sd=finer)
+        work = replace(work, options=replace(work.options, accuracy_sd=finer))
         try:
-            sized = draw(options)
+            sized = draw_with_size(work, seen)
         except NotConvergedError:
             break
     return sized
@@ -259,28 +259,19 @@ def _finer(sized: SizedDraws, options: SamplerSettings) -> float | None:
     return None if short >= 1.0 else max(SAFETY * short * wanted, LEAST_ACCURACY_SD)
 
 
-def draw_with_size(
-    tactile_map: TactileMap,
-    seen: Assessment,
-    calibration: Calibration | None,
-    options: SamplerSettings,
-    *,
-    rng: np.random.Generator,
-    progress: Progress | None,
-) -> SizedDraws:
+def draw_with_size(work: Work, seen: Assessment) -> SizedDraws:
     """Draw once, and size the draws where the calibration reaches so far."""
-    made = seen.draw(options, rng=rng, progress=progress)
+    options, cell_mm = work.options, work.tactile_map.recipe.cell_mm
+    made = seen.draw(options, rng=work.rng, progress=work.progress)
     posterior = made.posterior
-    fault = shape_fault(
-        posterior.sigma_x_mm, posterior.sigma_y_mm, cell_mm=tactile_map.recipe.cell_mm, prior=options.prior
-    )
-    if calibration is None:
+    fault = shape_fault(posterior.sigma_x_mm, posterior.sigma_y_mm, cell_mm=cell_mm, prior=options.prior)
+    if work.calibration is None:
         return SizedDraws(made, None, fault, None)
-    calibration = calibration.at_depth_or_fallback(*posterior.medians)
+    calibration = work.calibration.at_depth_or_fallback(*posterior.medians)
     far = tuple(calibration.extrapolation_faults(*posterior.medians))
     if fault or far:
         return SizedDraws(made, None, fault, calibration, far)
-    size = draw_sizes(posterior, calibration=calibration, priors=options.size_priors, rng=rng)
+    size = draw_sizes(posterior, calibration=calibration, priors=options.size_priors, rng=work.rng)
     return SizedDraws(made, size, None, calibration)
 
 
@@ -324,22 +315,16 @@ def estimate_map(
                 way_out=_way_to(calibration.recipe, tactile_map),
             )
         calibration = calibration_for(tactile_map, calibration)
-    estimate = _answer(tactile_map, calibration, options, rng=rng, progress=progress)
+    estimate = _answer(Work(tactile_map, calibration, options, rng, progress))
     if estimate.code in NO_LUMP and options.scene != "none" and (why := no_verdict(tactile_map)) is not None:
         estimate = _none(why, estimate.candidates)
     of_map = (*map_findings(tactile_map), *tactile_map.findings)
     return replace(estimate, findings=by_weight((*of_map, *estimate.findings)))
 
 
-def _answer(
-    tactile_map: TactileMap,
-    calibration: Calibration | None,
-    options: SamplerSettings,
-    *,
-    rng: np.random.Generator,
-    progress: Progress | None,
-) -> Estimate:
+def _answer(work: Work) -> Estimate:
     """The lump's size, or why there is none."""
+    tactile_map, options = work.tactile_map, work.options
     if not tactile_map.covered.any():
         return _none(Abstention("empty", "the map has no covered cell"))
     where = searched(tactile_map, options.centre_mm)
@@ -364,29 +349,21 @@ def _answer(
     elif options.scene == "none":
         estimate = _none(Abstention("undetected", "no lump was assumed"), candidates, seen.detection)
     else:
-        estimate = _measured(tactile_map, seen, candidates, calibration, options, rng=rng, progress=progress)
+        estimate = _measured(work, seen, candidates)
     if estimate.code == "ridge" and not estimate.reason.startswith("no lump found"):
         estimate = replace(estimate, reason=f"no lump found {where}: {estimate.reason}")
     return replace(estimate, weighed=weigh(tactile_map, estimate.detection or seen.detection, bump))
 
 
-def _measured(
-    tactile_map: TactileMap,
-    seen: Assessment,
-    candidates: tuple[Candidate, ...],
-    calibration: Calibration | None,
-    options: SamplerSettings,
-    *,
-    rng: np.random.Generator,
-    progress: Progress | None,
-) -> Estimate:
+def _measured(work: Work, seen: Assessment, candidates: tuple[Candidate, ...]) -> Estimate:
     """Draw a lump that is one by the evidence, and size it; or the reason why not."""
+    options, cell_mm = work.options, work.tactile_map.recipe.cell_mm
     detection, bump = seen.detection, seen.bump()
-    hopeless = width_fault(*seen.widths_mm(), cell_mm=tactile_map.recipe.cell_mm, margin=HOPELESS)
+    hopeless = width_fault(*seen.widths_mm(), cell_mm=cell_mm, margin=HOPELESS)
     if hopeless is not None:
         return _none(hopeless, candidates, detection, bump)
     try:
-        sized = draw_until_accurate(tactile_map, seen, calibration, options, rng=rng, progress=progress)
+        sized = draw_until_accurate(work, seen)
     except NotConvergedError as error:
         if options.method == "ensemble" or not options.correlated:
             raise
@@ -418,11 +395,11 @@ def _measured(
         size=size,
         candidates=candidates,
         diagnostics=diagnostics,
-        left_out=_left_out(tactile_map, options, calibration, made.figures),
+        left_out=_left_out(work.tactile_map, options, calibration, made.figures),
         scene=seen.scene,
         sensitivity=prior_sensitivity(posterior.sigma_x_mm, posterior.sigma_y_mm, drawn, options.prior),
         bump=bump,
-        findings=tuple(_findings(sized, cell_mm=tactile_map.recipe.cell_mm)),
+        findings=tuple(_findings(sized, cell_mm=cell_mm)),
     )
 
 

@@ -163,7 +163,8 @@ def test_draws_are_made_finer_until_the_size_is_as_exact_as_asked(monkeypatch: p
     """With a method that draws as finely as it is told; the size's error is then what ends it."""
     asked = []
 
-    def once(_map, _seen, _calibration, options, *, rng, progress):  # noqa: ARG001
+    def once(work, _seen):
+        options, rng = work.options, work.rng
         asked.append(options.accuracy_sd)
         number = 2000 if options.accuracy_sd is None else int(2000 * (0.02 / options.accuracy_sd) ** 2)
         size = pooled_size([shape(2.7, noise=0.02, seed=9)], calibration=calibration(), priors=SizePriors(),
@@ -174,7 +175,7 @@ def test_draws_are_made_finer_until_the_size_is_as_exact_as_asked(monkeypatch: p
     monkeypatch.setattr(drawn, "draw_with_size", once)
     for options in (SamplerSettings(), SamplerSettings(accuracy_sd=0.01), SamplerSettings(accuracy_mm=0.005)):
         asked.clear()
-        found = drawn.draw_until_accurate(None, None, None, options, rng=np.random.default_rng(2), progress=None)
+        found = drawn.draw_until_accurate(drawn.Work(None, None, options, np.random.default_rng(2)), None)
         size = found.size.summarise("max_size_mm", probability=PROBABILITY)
         if options.accuracy_mm is not None:
             assert size.mc_error <= options.accuracy_mm
