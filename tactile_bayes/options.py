@@ -17,6 +17,7 @@ from tactile_bayes.presets import (
     MATCH_MM,
     MOST_FIELD_COSINES,
     PRESSURE_WINDOW_KPA,
+    REGISTRATION_MM,
     Background,
     Method,
     Noise,
@@ -209,6 +210,41 @@ class MapOptions(Options):
             raise UsageError(
                 "a lump that follows the head mimics a latency; with register_strokes give latency_ms a number"
             )
+
+
+GROWN_BY: Final = (0.2,)
+"""Shares of the diameter that a growth's probability is told for; 20 % is the step of RECIST 1.1."""
+
+
+class Comparing(Options):
+    """How visits are compared."""
+
+    days: Annotated[
+        tuple[float, ...] | None,
+        Meta(description="Time of each visit in days, the first at 0; None where it is not known."),
+    ] = None
+    grown_by: Annotated[
+        tuple[Annotated[float, Meta(gt=-1, lt=10)], ...],
+        Meta(description="Shares of the diameter by which it may have grown or more."),
+    ] = GROWN_BY
+    same_mass: Annotated[
+        bool,
+        Meta(description="Say that the visits are of one mass where landmarks are missing, or place it too far apart."),
+    ] = False
+    registration_mm: Annotated[
+        float, Meta(gt=0, description="SD each way of one mass's place between visits, by posture and landmarks.")
+    ] = REGISTRATION_MM
+
+    def check_visits(self, visits: int) -> None:
+        """Refuse days that are no times of so many visits."""
+        if self.days is None:
+            return
+        if len(self.days) != visits:
+            given, later = len(self.days) - 1, visits - 1
+            raise UsageError(f"times are given for {given} later visits, and there are {later}; give one for each")
+        if any(after <= before for before, after in zip(self.days, self.days[1:], strict=False)):
+            listed = ", ".join(f"{day:g}" for day in self.days)
+            raise UsageError(f"the visits' days are {listed}; give them in order, each later than the one before")
 
 
 IntervalMethod = Literal["corrected", "jackknife", "bca"]

@@ -10,13 +10,14 @@ import click
 
 from tactile_bayes.api.comparing import Comparison, compare_estimates
 from tactile_bayes.api.estimating import estimate_file
-from tactile_bayes.api.settings import Comparing, Settings, dates_of, refuse_checkpoint, times_of
+from tactile_bayes.api.settings import Settings, dates_of, refuse_checkpoint, times_of
 from tactile_bayes.api.sized import SizeEstimate
 from tactile_bayes.commands.options import settings_of
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import UsageError
 from tactile_bayes.files.atomic import given_twice
 from tactile_bayes.files.reports import json_text
+from tactile_bayes.options import Comparing
 from tactile_bayes.report.compare import compare_summary, compare_text
 from tactile_bayes.report.exam_words import Given
 from tactile_bayes.report.pages import PageFiles

@@ -13,7 +13,7 @@ from typing import Any
 import click
 
 from tactile_bayes.api.estimating import answer_file, estimate_file
-from tactile_bayes.api.pooled import of_one_mass, pool_answers
+from tactile_bayes.api.pooled import elsewhere, pool_answers
 from tactile_bayes.api.settings import Settings, refuse_checkpoint
 from tactile_bayes.api.sized import Answer
 from tactile_bayes.batch import BatchInterrupted, Outcome, fault_lines, open_executor, run_batch
@@ -47,10 +47,8 @@ def estimate_pool(
     A map that could not be read stops it: its error is printed, for a mass is not sized from what is left by accident.
     """
     if settings.centre_mm is None:
-        reports = [answer.report for answer in answers]
-        answers = of_one_mass(
-            answers, reports, lambda i, place: answer_file(maps[i], settings=replace(settings, centre_mm=place))
-        )
+        for i, place in elsewhere([answer.report for answer in answers]).items():
+            answers[i] = answer_file(maps[i], settings=replace(settings, centre_mm=place))
     failed = [answer for answer in answers if answer.report is None]
     for answer in failed:
         click.echo(answer.text, err=True)

@@ -15,7 +15,7 @@ from tactile_bayes.api.estimates import estimated, settings_of
 from tactile_bayes.api.estimating import input_digests
 from tactile_bayes.api.maps import Map
 from tactile_bayes.api.pooled import common_calibration, one_mass, place_of
-from tactile_bayes.api.settings import GROWN_BY, Comparing, Settings, refuse_checkpoint, times_of
+from tactile_bayes.api.settings import Settings, refuse_checkpoint, times_of
 from tactile_bayes.api.sized import Answer, SizeEstimate, size_priors
 from tactile_bayes.declarations import Record, as_dict, replace
 from tactile_bayes.errors import CANNOT_SHOW, EXIT_DONE, EXIT_NO_ESTIMATE, UsageError
@@ -25,6 +25,7 @@ from tactile_bayes.files.reports import centre_of
 from tactile_bayes.findings import Finding, Verdict, by_weight, finding_lines, verdict
 from tactile_bayes.inference.draws import Draws
 from tactile_bayes.mapping.map import TactileMap
+from tactile_bayes.options import GROWN_BY, Comparing
 from tactile_bayes.presets import REGISTRATION_MM, RESEARCH_USE
 from tactile_bayes.report.compare import compare_report, compare_summary, compare_text
 from tactile_bayes.report.exam_words import Given
@@ -51,9 +52,6 @@ from tactile_bayes.size.visits import (
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-
-Scans = Sequence[Mapping[str, str]]
 
 
 # --- Two visits and more compared: whether they are of one mass, and the change of its size.
@@ -160,8 +158,16 @@ class Comparison(Record, eq=False):
 
     def page_text(self, *, title: str, name: str) -> str:
         """The page's HTML."""
-        scans = [[one.provenance.scans for one in visit] for visit in self.visits]
-        course = course_of(scans, title=title, name=name, dates=self.dates)
+        of_visits = [[scan for one in visit for scan in one.provenance.scans] for visit in self.visits]
+
+        def agreed(fact: str, among: Sequence[Mapping[str, str]]) -> str:
+            values = {scan[fact] for scan in among if scan.get(fact)}
+            return values.pop() if len(values) == 1 else ""
+
+        codes = tuple(agreed("visit", visit) for visit in of_visits)
+        patient, side, mass = (agreed(fact, list(chain(*of_visits))) for fact in ("subject", "side", "mass"))
+        told = codes if all(codes) and len(set(codes)) == len(codes) else ()
+        course = Course(title, name, patient, side, mass, visits=told, dates=self.dates)
         return growth_page(self.compared, self.report, self._drawn(), course)
 
     @door
@@ -208,7 +214,14 @@ def compare_answers(
     files = {**inputs, **({"size_calibration": path} if path else {})}
     digests = input_digests(files, settings, calibration)
     compared = _compared(visits, calibration, settings, comparing)
-    compared = replace(compared, findings=by_weight((*compared.findings, *_of_visits(visits))))
+    of_visits = (
+        one.at(f"visit {number}" if len(maps) == 1 else f"visit {number}, map {i}")
+        for number, maps in enumerate(visits, start=1)
+        for i, answer in enumerate(maps, start=1)
+        for one in answer.findings
+        if one.kind != "outside_calibration"  # of a size alone: judged anew
+    )
+    compared = replace(compared, findings=by_weight((*compared.findings, *of_visits)))
     scans = [scan for one in visits for scan in _scans(one)]
     recorded = {name: value for name, value in settings.recorded().items() if name in _RECORDED}
     provenance = Provenance("compare", recorded | as_dict(comparing), digests, seed=settings.seed, scans=scans)
@@ -216,8 +229,7 @@ def compare_answers(
         compared,
         [[answer.report for answer in one if answer.report is not None] for one in visits],
         names,
-        days=comparing.days,
-        grown_by=comparing.grown_by,
+        comparing,
         probability=settings.interval,
         provenance=provenance,
         repeatability=settings.repeatability,
@@ -252,23 +264,6 @@ def drawn_maps(maps: Sequence[Sequence[TactileMap]], visits: Sequence[Sequence[A
         return DrawnMap(one, centre_of(report.centre_mm), axes, 0.0 if angle is None else angle.median)
 
     return [list(map(drawn, some, answers)) for some, answers in zip(maps, visits, strict=True)]
-
-
-def course_of(scans: Sequence[Sequence[Scans]], *, title: str, name: str, dates: Sequence[str]) -> Course:
-    """What the scans of each visit's maps say of the patient, the mass and the visits."""
-    of_visits = [[scan for some in visit for scan in some] for visit in scans]
-
-    def agreed(fact: str, among: Sequence[Mapping[str, str]]) -> str:
-        values = {scan[fact] for scan in among if scan.get(fact)}
-        return values.pop() if len(values) == 1 else ""
-
-    every = list(chain.from_iterable(of_visits))
-    codes = tuple(agreed("visit", visit) for visit in of_visits)
-    told = {
-        ours: agreed(theirs, every) for ours, theirs in (("patient", "subject"), ("side", "side"), ("mass", "mass"))
-    }
-    visits = codes if all(codes) and len(set(codes)) == len(codes) else ()
-    return Course(title, name, visits=visits, dates=tuple(dates), **told)
 
 
 def _compared(
@@ -387,17 +382,6 @@ def _by_visit(
     return list(dict.fromkeys(found))
 
 
-def _of_visits(visits: Sequence[Sequence[Answer]]) -> list[Finding]:
-    """What speaks against the maps of each visit; a size alone outside its calibration is judged anew."""
-    return [
-        one.at(f"visit {number}" if len(maps) == 1 else f"visit {number}, map {i}")
-        for number, maps in enumerate(visits, start=1)
-        for i, answer in enumerate(maps, start=1)
-        for one in answer.findings
-        if one.kind != "outside_calibration"
-    ]
-
-
 def _scans(answers: Sequence[Answer]) -> list[Mapping[str, str]]:
     return [scan for one in answers if one.report is not None for scan in scans_of(one.report.provenance)]
 
@@ -446,12 +430,9 @@ def compare(
     """
     used = settings_of(settings)
     refuse_checkpoint(used)
-    times = times_of(
-        None
-        if days is None
-        else [plain(day) for day in sequence_of("days", days, "numbers, one for each later visit")],
-        None if dates is None else sequence_of("dates", dates, "dates, one for each visit"),
-    )
+    later = None if days is None else map(plain, sequence_of("days", days, "numbers, one for each later visit"))
+    dated = None if dates is None else sequence_of("dates", dates, "dates, one for each visit")
+    times = times_of(None if later is None else list(later), dated)
     shares = tuple(plain(one) for one in sequence_of("grown_by", grown_by, "shares, such as 0.2 for 20 %"))
     comparing = Comparing(times, shares, same_mass, plain(registration_mm))
     comparing.check_visits(2 + len(more))
@@ -461,7 +442,7 @@ def compare(
         raise UsageError("a map is given twice; give each map once, at its own visit")
     names = [[one.name or f"visit {v} map {i}" for i, one in enumerate(visit, 1)] for v, visit in enumerate(visits, 1)]
     found = compare_estimates(visits, used, comparing=comparing, names=names, inputs={})
-    return replace(found, dates=() if dates is None else tuple(str(one) for one in dates))
+    return replace(found, dates=tuple(map(str, dated or ())))
 
 
 def _visit(given: Any, settings: dict[str, Any]) -> tuple[SizeEstimate, ...]:

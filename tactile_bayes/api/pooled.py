@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import combinations
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -13,11 +13,11 @@ from tactile_bayes.api.arguments import PathLike, door, path_of
 from tactile_bayes.api.estimating import estimated_at, input_digests
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.api.sized import Answer, SizedExam, SizeEstimate, check_one_mass, size_priors
-from tactile_bayes.declarations import Record, replace
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import CANNOT_SHOW, BadDataError, UsageError
 from tactile_bayes.files.map_nc import write_pooled
 from tactile_bayes.files.provenance import Provenance, scans_of
-from tactile_bayes.files.reports import EstimateReport, PooledReport
+from tactile_bayes.files.reports import EstimateReport, MassReport, PooledReport
 from tactile_bayes.files.size_json import default_for, read_size_calibration, size_calibration_path
 from tactile_bayes.findings import Finding
 from tactile_bayes.options import PRIORS
@@ -37,8 +37,6 @@ from tactile_bayes.size.visits import one_place_probability
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-T = TypeVar("T")
-
 # --- Which mass of each map is the one that is pooled: by its place in the patient.
 #
 # A report is about the surest mass of its map, so of two maps of one breast each may report another one. With
@@ -47,39 +45,13 @@ T = TypeVar("T")
 MapPlace = tuple[float, float]
 
 
-class _Mass(Record):
-    """A mass of one map: its places in the patient and on the map, mm, and what ranks it."""
-
-    patient_mm: MapPlace
-    map_mm: MapPlace
-    sized: bool
-    reported: bool
-    amplitude: float
-
-    def away_mm(self, other: _Mass) -> float:
-        return float(np.hypot(*np.subtract(self.patient_mm, other.patient_mm)))
-
-
-def of_one_mass(
-    found: Sequence[T], reports: Sequence[EstimateReport | None], again: Callable[[int, MapPlace], T]
-) -> list[T]:
-    """Estimates of the mass that most maps show; a map whose report is about another one is estimated at its place.
-
-    `again`: takes the number of a map in the list and a place on it, and gives the estimate there.
-    """
-    same = list(found)
-    for i, place in elsewhere(reports).items():
-        same[i] = again(i, place)
-    return same
-
-
 def one_mass(found: Sequence[SizeEstimate]) -> tuple[SizeEstimate, ...]:
-    """The same with maps and draws at hand; estimates of a place that somebody gave stay as they are."""
-
-    def again(i: int, place: MapPlace) -> SizeEstimate:
-        return estimated_at(found[i], place) if found[i].settings.centre_mm is None else found[i]
-
-    return tuple(of_one_mass(found, [one.answer.report for one in found], again))
+    """Estimates of the mass that most maps show; those of a place that somebody gave stay as they are."""
+    same = list(found)
+    for i, place in elsewhere([one.answer.report for one in found]).items():
+        if found[i].settings.centre_mm is None:
+            same[i] = estimated_at(found[i], place)
+    return tuple(same)
 
 
 def pool_estimates(
@@ -100,7 +72,7 @@ def elsewhere(reports: Sequence[EstimateReport | None]) -> dict[int, MapPlace]:
     if maps is None or common is None:
         return {}
     there = {i: _nearest(masses, common) for i, masses in maps.items()}
-    return {i: one.map_mm for i, one in there.items() if one is not None and not one.reported}
+    return {i: one.centre_mm.median for i, one in there.items() if one is not None and not one.reported}
 
 
 def apart_from_others(reports: Sequence[EstimateReport | None]) -> dict[int, str]:
@@ -110,8 +82,8 @@ def apart_from_others(reports: Sequence[EstimateReport | None]) -> dict[int, str
         return {}
     reported = {i: [one for one in masses if one.reported] for i, masses in maps.items()}
     found = [one for masses in reported.values() for one in masses]
-    common = _common(reported) or max(found, key=lambda one: one.amplitude, default=None)
-    away = {i: one.away_mm(common) for i, masses in reported.items() for one in masses if common is not None}
+    common = _common(reported) or max(found, key=_amplitude, default=None)
+    away = {i: _away_mm(one, common) for i, masses in reported.items() for one in masses if common is not None}
     words = "its mass lies {:.0f} mm from that of the other maps and may be another one"
     return {i: words.format(mm) for i, mm in away.items() if mm > MATCH_MM}
 
@@ -124,46 +96,39 @@ def one_place(reports: Sequence[EstimateReport | None]) -> bool | None:
     return not apart_from_others(reports)
 
 
-def _masses(reports: Sequence[EstimateReport | None]) -> dict[int, list[_Mass]] | None:
+def _masses(reports: Sequence[EstimateReport | None]) -> dict[int, tuple[MassReport, ...]] | None:
     """Masses of the maps with a lump, by the map's place in the list; None where one has no place in the patient."""
-    found: dict[int, list[_Mass]] = {}
-    for i, report in enumerate(reports):
-        listed = () if report is None else report.masses
-        placed = [
-            _Mass(
-                one.centre_patient_mm.median,
-                one.centre_mm.median,
-                one.max_size_mm is not None,
-                one.reported,
-                0.0 if one.amplitude is None else one.amplitude.median,
-            )
-            for one in listed
-            if one.centre_patient_mm is not None
-        ]
-        if len(placed) < len(listed):
-            return None
-        if placed:
-            found[i] = placed
-    return found
+    found = {i: one.masses for i, one in enumerate(reports) if one is not None and one.masses}
+    return None if any(one.centre_patient_mm is None for masses in found.values() for one in masses) else found
 
 
-def _common(maps: Mapping[int, Sequence[_Mass]]) -> _Mass | None:
+def _away_mm(one: MassReport, other: MassReport) -> float:
+    assert one.centre_patient_mm is not None  # see `_masses`
+    assert other.centre_patient_mm is not None
+    return float(np.hypot(*np.subtract(one.centre_patient_mm.median, other.centre_patient_mm.median)))
+
+
+def _amplitude(mass: MassReport) -> float:
+    return 0.0 if mass.amplitude is None else mass.amplitude.median
+
+
+def _common(maps: Mapping[int, Sequence[MassReport]]) -> MassReport | None:
     """A mass at the place where most maps show one, sized by most, then reported by most; None where all are apart."""
     best = max((one for masses in maps.values() for one in masses), key=lambda one: _worth(maps, one), default=None)
     return best if best is not None and _worth(maps, best)[0] > 1 else None
 
 
-def _worth(maps: Mapping[int, Sequence[_Mass]], common: _Mass) -> tuple[int, int, int, float]:
+def _worth(maps: Mapping[int, Sequence[MassReport]], common: MassReport) -> tuple[int, int, int, float]:
     """On how many maps a mass is found, sized and reported, and the median of its amplitudes."""
     there = [one for one in (_nearest(masses, common) for masses in maps.values()) if one is not None]
-    amplitude = float(np.median([one.amplitude for one in there]))
-    return len(there), sum(one.sized for one in there), sum(one.reported for one in there), amplitude
+    sized, reported = sum(one.max_size_mm is not None for one in there), sum(one.reported for one in there)
+    return len(there), sized, reported, float(np.median([_amplitude(one) for one in there]))
 
 
-def _nearest(masses: Sequence[_Mass], common: _Mass) -> _Mass | None:
+def _nearest(masses: Sequence[MassReport], common: MassReport) -> MassReport | None:
     """The mass nearest to a place, if it lies within `MATCH_MM` of it."""
-    near = min(masses, key=common.away_mm, default=None)
-    return near if near is not None and near.away_mm(common) <= MATCH_MM else None
+    near = min(masses, key=lambda one: _away_mm(one, common), default=None)
+    return near if near is not None and _away_mm(near, common) <= MATCH_MM else None
 
 
 def place_of(report: EstimateReport | None) -> PatientPlace | None:

@@ -7,10 +7,10 @@ from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
-from tactile_bayes.declarations import Meta, Record, extra_of, kinds, part_of
-from tactile_bayes.errors import UsageError, check_number
+from tactile_bayes.declarations import Meta, extra_of, kinds, part_of
+from tactile_bayes.errors import UsageError
 from tactile_bayes.options import IN_FILE, PRIORS, FitSettings, named
-from tactile_bayes.presets import INTERVAL, REGISTRATION_MM
+from tactile_bayes.presets import INTERVAL
 
 if TYPE_CHECKING:
     from tactile_bayes.size.pooling import Calibration, Repeatability
@@ -135,39 +135,7 @@ def refuse_checkpoint(settings: Settings) -> None:
         raise UsageError("a checkpoint is of one map; give one map, or leave checkpoint out of the settings")
 
 
-# --- How visits are compared: options of `compare`, shared by the command line and Python.
-
-GROWN_BY = (0.2,)
-"""Shares of the diameter that a growth's probability is told for; 20 % is the step of RECIST 1.1."""
-
-
-class Comparing(Record):
-    """How visits are compared."""
-
-    days: tuple[float, ...] | None = None
-    """Time of each visit in days, the first at 0; None where it is not known."""
-    grown_by: tuple[float, ...] = GROWN_BY  #: Shares of the diameter by which it may have grown or more.
-    same_mass: bool = False
-    """Whether somebody says that the visits are of one mass, where their places do not show it."""
-    registration_mm: float = REGISTRATION_MM  #: SD each way of a mass's place between two visits.
-
-    def __post_init__(self) -> None:
-        for share in self.grown_by:
-            check_number("a share of grown_by", share, -1, 10, open_ends=True)
-        for day in self.days or ():
-            check_number("a day of days", day)
-        check_number("registration_mm", self.registration_mm, 0, open_ends=True)
-
-    def check_visits(self, visits: int) -> None:
-        """Refuse days that are no times of so many visits."""
-        if self.days is None:
-            return
-        if len(self.days) != visits:
-            given, later = len(self.days) - 1, visits - 1
-            raise UsageError(f"times are given for {given} later visits, and there are {later}; give one for each")
-        if any(after <= before for before, after in zip(self.days, self.days[1:], strict=False)):
-            listed = ", ".join(f"{day:g}" for day in self.days)
-            raise UsageError(f"the visits' days are {listed}; give them in order, each later than the one before")
+# --- When the visits of a comparison were.
 
 
 def times_of(days: Sequence[float] | None, dates: Sequence[str] | None) -> tuple[float, ...] | None:

@@ -19,7 +19,7 @@ from tactile_bayes.api.comparing import compare_answers, drawn_maps
 from tactile_bayes.api.estimating import choose_calibration, estimate_file
 from tactile_bayes.api.pooled import pool_answers
 from tactile_bayes.api.repeatability import ExamFolder, learn_from_exams
-from tactile_bayes.api.settings import Comparing, Settings
+from tactile_bayes.api.settings import Settings
 from tactile_bayes.api.sized import Answer, SizeEstimate, size_priors
 from tactile_bayes.campaigns.exams import ARRAYS
 from tactile_bayes.campaigns.match import OWN_AXES, Match, in_own_axes, matched
@@ -58,7 +58,7 @@ from tactile_bayes.files.scan_mcap import read_scan, write_scan
 from tactile_bayes.findings import by_weight
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import TactileMap
-from tactile_bayes.options import MapOptions
+from tactile_bayes.options import Comparing, MapOptions
 from tactile_bayes.presets import DEFAULT_NORMALISE, MATCH_MM
 from tactile_bayes.report.estimate_document import side_of, size_diagnostics
 from tactile_bayes.report.estimate_figures import draw_map, draw_size

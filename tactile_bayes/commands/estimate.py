@@ -7,7 +7,7 @@ from typing import Any, Final
 
 import click
 
-from tactile_bayes.api.settings import GROWN_BY, Settings
+from tactile_bayes.api.settings import Settings
 from tactile_bayes.commands.options import (
     FORCE,
     FilePath,
@@ -21,8 +21,7 @@ from tactile_bayes.commands.options import (
 )
 from tactile_bayes.declarations import names_of
 from tactile_bayes.errors import UsageError
-from tactile_bayes.options import MapOptions
-from tactile_bayes.presets import REGISTRATION_MM
+from tactile_bayes.options import GROWN_BY, Comparing, MapOptions
 
 # --- `map`: from scans to a tactile map.
 
@@ -162,18 +161,7 @@ _PERCENT = tuple(100 * share for share in GROWN_BY)
     metavar="PERCENT",
     help="Growth of the diameter, in percent, that a probability of more is told for.",
 )
-@click.option(
-    "--same-mass",
-    is_flag=True,
-    help="Say that the visits are of one mass where landmarks are missing, or place it too far apart.",
-)
-@click.option(
-    "--registration-mm",
-    type=FiniteRange(min=0.0, min_open=True),
-    default=REGISTRATION_MM,
-    show_default=True,
-    help="SD each way of one mass's place between visits, by posture and landmarks.",
-)
+@takes(Comparing, "same_mass", "registration_mm")
 @takes(
     Settings, "size_calibration", metavar="solid|eq6|solid-mean|SIZE.json",
     help="Calibration over bodies. Default: solid, or solid-mean for maps of frames divided by their means."

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Final, Literal
+from typing import Final, Literal
 
 import numpy as np
 
@@ -28,6 +28,7 @@ from tactile_bayes.files.reports import EstimateReport
 from tactile_bayes.findings import Finding, capital, finding_lines, finding_summary
 from tactile_bayes.findings import verdict as verdict_of
 from tactile_bayes.inference.draws import Quantity, normal_quantile
+from tactile_bayes.options import Comparing
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.size.pooling import Repeatability
 from tactile_bayes.size.visits import VOLUME, Change, Compared, JointSizes, doubling_days, straight_line
@@ -108,23 +109,19 @@ def compare_report(
     compared: Compared,
     visits: Sequence[Sequence[EstimateReport]],
     names: Sequence[Sequence[str]],
+    comparing: Comparing,
     *,
-    days: Sequence[float] | None,
-    grown_by: Sequence[float],
     probability: float,
     provenance: Provenance,
     repeatability: Repeatability | None = None,
 ) -> CompareReport:
     """Report of a comparison from what `estimate` says of each visit's maps.
 
-    `days`: time of each visit; None where it is not known; `grown_by`: shares of the diameter; `repeatability`: of the
-    site, where the comparison used one.
+    `repeatability`: of the site, where the comparison used one.
     """
-    joint, dated = compared.joint, [None] * len(visits) if days is None else days
-    changes: list[ChangeReport] = []
-    if joint is not None:
-        asked: dict[str, Any] = {"days": days, "grown_by": grown_by, "probability": probability}
-        changes = [_change(joint, compared.another, later, **asked) for later in range(1, len(visits))]
+    joint, days = compared.joint, comparing.days
+    dated = [None] * len(visits) if days is None else days
+    later = () if joint is None else range(1, len(visits))
     return CompareReport(
         schema=COMPARE,
         status=compared.status,
@@ -151,7 +148,7 @@ def compare_report(
             else rounded(VisitPlace(visit, one.distance_mm, one.sd_mm, one.shift_mm, one.probability))
             for visit, one in enumerate(compared.apart, start=2)
         ),
-        changes=tuple(changes),
+        changes=tuple(_change(compared, number, comparing, probability) for number in later),
         trend=None if joint is None or days is None or len(visits) < 3 else _trend(joint, days, probability),
         between_map_sd=None if joint is None else rounded(joint.between_map_sd),
         repeatability=UNSET if repeatability is None else repeatability.words(),
@@ -161,16 +158,10 @@ def compare_report(
     )
 
 
-def _change(
-    joint: JointSizes,
-    another: JointSizes | None,
-    later: int,
-    *,
-    days: Sequence[float] | None,
-    grown_by: Sequence[float],
-    probability: float,
-) -> ChangeReport:
+def _change(compared: Compared, later: int, comparing: Comparing, probability: float) -> ChangeReport:
     """Change from the first visit to a later one, and if exams of one mass differ as the paper's maps do."""
+    joint, another, days = compared.joint, compared.another, comparing.days
+    assert joint is not None
     change, told, rate = joint.change(0, later), None, None
     growth, shrinkage = change.smallest_detectable(SHOWN)
     if another is not None:
@@ -187,7 +178,9 @@ def _change(
         log_ratio=change.log_summary(probability).rounded,
         percent=change.percent(probability).rounded,
         probability_grown=rounded(change.probability_above(0.0)),
-        grown_by=tuple(rounded(GrownBy(100.0 * share, change.probability_above(share))) for share in grown_by),
+        grown_by=tuple(
+            rounded(GrownBy(100.0 * share, change.probability_above(share))) for share in comparing.grown_by
+        ),
         smallest_detectable_percent=rounded(Detectable(100.0 * growth, 100.0 * shrinkage)),
         growth_rate=rate,
         another_exam=told,
