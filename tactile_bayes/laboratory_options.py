@@ -5,23 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
+from tactile_bayes import presets
 from tactile_bayes.declarations import Meta, Options
 from tactile_bayes.options import MOST_ITEMS, FieldCosines, Seed, named
-from tactile_bayes.presets import (
-    FAT_KPA,
-    FIT_RADIUS_MM,
-    GLAND_RATIO,
-    HEAD_RADIUS_MM,
-    MEAN_KPA,
-    POISSON,
-    PRESSURE_WINDOW_KPA,
-    SHOULDER_MM,
-    THICKNESS_MM,
-    Background,
-    Noise,
-    Normalise,
-    TrackerProtocol,
-)
+from tactile_bayes.presets import Background, Noise, Normalise, TrackerProtocol
 
 
 class RecordOptions(Options, kw_only=True):
@@ -137,17 +124,19 @@ SeatName = Annotated[
 class SectionOptions(Options, kw_only=True):
     """Cross-section of a simulated head."""
 
-    head_radius_mm: Annotated[float, Meta(gt=0, le=1e6, description="Radius of the head's arc, mm.")] = HEAD_RADIUS_MM
-    shoulder_mm: Annotated[float, Meta(ge=0, description="Radius of the head's shoulders, mm.")] = SHOULDER_MM
+    head_radius_mm: Annotated[float, Meta(gt=0, le=1e6, description="Radius of the head's arc, mm.")] = (
+        presets.HEAD_RADIUS_MM
+    )
+    shoulder_mm: Annotated[float, Meta(ge=0, description="Radius of the head's shoulders, mm.")] = presets.SHOULDER_MM
 
 
 class CaseOptions(Options, kw_only=True):
     """Pressure, tissue and mesh of a forward study."""
 
-    mean_kpa: Annotated[float, Meta(gt=0, description="Mean pressure on the head.")] = MEAN_KPA
-    fat_kpa: Annotated[float, Meta(gt=0, description="Young's modulus of fat.")] = FAT_KPA
-    poisson: Annotated[float, Meta(description="Poisson's ratio of the tissues.")] = POISSON
-    gland_ratio: Annotated[float, Meta(gt=0, description="Modulus of gland over fat.")] = GLAND_RATIO
+    mean_kpa: Annotated[float, Meta(gt=0, description="Mean pressure on the head.")] = presets.MEAN_KPA
+    fat_kpa: Annotated[float, Meta(gt=0, description="Young's modulus of fat.")] = presets.FAT_KPA
+    poisson: Annotated[float, Meta(description="Poisson's ratio of the tissues.")] = presets.POISSON
+    gland_ratio: Annotated[float, Meta(gt=0, description="Modulus of gland over fat.")] = presets.GLAND_RATIO
     thickness_mm: Annotated[
         Annotated[float, Meta(gt=0)] | None,
         Meta(description="Depth of the chest wall, mm. Default: 70, or deeper for deep lumps."),
@@ -189,12 +178,12 @@ class TissueOptions(Options, kw_only=True):
         25.0,
     )
     pressure_kpa: Annotated[KpaRange, named("LOW HIGH", "Mean pressures under the head (paper: 5 to 14).")] = (
-        PRESSURE_WINDOW_KPA
+        presets.PRESSURE_WINDOW_KPA
     )
     thickness_mm: Annotated[
         float, Meta(gt=0, description="Thickness of the tissue on its rigid base, mm. The paper gives none.")
-    ] = THICKNESS_MM
-    poisson: Annotated[float, Meta(ge=0, lt=0.5, description="Poisson's ratio of the tissue.")] = POISSON
+    ] = presets.THICKNESS_MM
+    poisson: Annotated[float, Meta(ge=0, lt=0.5, description="Poisson's ratio of the tissue.")] = presets.POISSON
     limit_percent: Annotated[
         float,
         Meta(gt=0, description="Largest allowed departure of a taxel from the frame's mean, % of it (paper: 7.5)."),
@@ -273,7 +262,7 @@ class LearnOptions(Options, kw_only=True):
         Annotated[float, Meta(gt=0)] | None,
         Meta(
             description="Radius of the table's fit windows, mm, if the table does not state it. Default: "
-            f"{FIT_RADIUS_MM:g}."
+            f"{presets.FIT_RADIUS_MM:g}."
         ),
     ] = None
     noise: Annotated[

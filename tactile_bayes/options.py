@@ -9,22 +9,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
+from tactile_bayes import presets
 from tactile_bayes.declarations import Meta, Options
 from tactile_bayes.errors import UsageError
-from tactile_bayes.presets import (
-    CELL_MM,
-    DEFAULT_NORMALISE,
-    MATCH_MM,
-    MOST_FIELD_COSINES,
-    PRESSURE_WINDOW_KPA,
-    REGISTRATION_MM,
-    Background,
-    Method,
-    Noise,
-    Normalise,
-    Rotation,
-    SceneAsked,
-)
+from tactile_bayes.presets import Background, Method, Noise, Normalise, Rotation, SceneAsked
 
 
 class BumpPrior(Options):
@@ -70,7 +58,7 @@ def named(metavar: str, meaning: str, *, option: str = "", also: str = "", path:
     return Meta(description=meaning, extra={name: value for name, value in held.items() if value}, **rules)
 
 
-FieldCosines = Annotated[int, Meta(ge=6, le=MOST_FIELD_COSINES)] | Literal["auto"]
+FieldCosines = Annotated[int, Meta(ge=6, le=presets.MOST_FIELD_COSINES)] | Literal["auto"]
 
 
 class FitSettings(BumpPrior, kw_only=True):
@@ -159,18 +147,18 @@ class FitSettings(BumpPrior, kw_only=True):
 class MapOptions(Options):
     """How a map is built of scans."""
 
-    cell_mm: Annotated[float, Meta(ge=0.01, le=50, description="Side of the square cells, mm.")] = CELL_MM
+    cell_mm: Annotated[float, Meta(ge=0.01, le=50, description="Side of the square cells, mm.")] = presets.CELL_MM
     pressure_window_kpa: Annotated[
         tuple[Annotated[float, Meta(ge=0)], Annotated[float, Meta(ge=0)]],
         named("LOW HIGH", "Leave out frames whose mean pressure lies outside."),
-    ] = PRESSURE_WINDOW_KPA
+    ] = presets.PRESSURE_WINDOW_KPA
     normalise: Annotated[
         Normalise,
         Meta(
             description="gain: estimate one gain per frame; mean: divide each frame by its mean (the paper); none: "
             "keep kPa."
         ),
-    ] = DEFAULT_NORMALISE
+    ] = presets.DEFAULT_NORMALISE
     latency_ms: Annotated[
         Annotated[float, Meta(ge=-10_000, le=10_000)] | Literal["auto"],
         named("MS|auto", "Delay of the tracker's time stamps; auto: estimate it from the scan, or refuse."),
@@ -233,7 +221,7 @@ class Comparing(Options):
     ] = False
     registration_mm: Annotated[
         float, Meta(gt=0, description="SD each way of one mass's place between visits, by posture and landmarks.")
-    ] = REGISTRATION_MM
+    ] = presets.REGISTRATION_MM
 
     def check_visits(self, visits: int) -> None:
         """Refuse days that are no times of so many visits."""
@@ -341,11 +329,11 @@ class CampaignOptions(Options, kw_only=True):
     protocol: Annotated[
         Path | None, named("FILE.toml", "Pre-specified analysis of the trial, as for `validate`.", path=True)
     ] = None
-    normalise: Annotated[Normalise, Meta(description="As `map`.")] = DEFAULT_NORMALISE
+    normalise: Annotated[Normalise, Meta(description="As `map`.")] = presets.DEFAULT_NORMALISE
     match_mm: Annotated[
         float,
         named("MM", "Distance within which a mass is the one that another exam of the breast names by place.", gt=0),
-    ] = MATCH_MM
+    ] = presets.MATCH_MM
     figures: Annotated[bool, Meta(description="Draw map and size posterior of each exam.")] = False
     dry_run: Annotated[bool, Meta(description="Print what would be done, and do nothing.")] = False
     copy_to: Annotated[

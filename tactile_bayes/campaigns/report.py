@@ -14,33 +14,11 @@ from tactile_bayes.campaigns.match import grown_masses, unnamed, visit_dates
 from tactile_bayes.campaigns.run import Campaign
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import CANNOT_SHOW, BadDataError, UsageError
+from tactile_bayes.files import manifest_csv as layout
 from tactile_bayes.files.atomic import write_text
 from tactile_bayes.files.comparison import CompareReport
 from tactile_bayes.files.documents import read_protocol, read_record
-from tactile_bayes.files.manifest_csv import (
-    COMPARED,
-    DONE,
-    ESTIMATE,
-    EXAM_PAGE,
-    EXAMS,
-    FAILURES,
-    GROWN,
-    GROWTH,
-    GROWTH_PAGE,
-    JOURNAL,
-    MAP_FIGURE,
-    MASSES,
-    POOLED,
-    REPEATABILITY,
-    SIZE_FIGURE,
-    SIZED,
-    SIZED_FIGURE,
-    THUMBNAIL,
-    TRIAL,
-    Exam,
-    columns_of,
-    table_text,
-)
+from tactile_bayes.files.manifest_csv import Exam
 from tactile_bayes.files.reading import IMAGE_BYTES, put, read_bytes
 from tactile_bayes.files.reports import EstimateReport, PooledReport, centre_of
 from tactile_bayes.files.tables import Table
@@ -157,8 +135,10 @@ def _row(campaign: Campaign, exam: Exam, together: tuple[Finding, ...]) -> Row:
     facts: dict[str, Any] = {"scans": tuple(mapped.get("scans", ())), "synthetic": mapped.get("synthetic")}
     if fault is not None and fault.step not in ("figures", "page"):
         return Row(exam, None, fault.step, fault.reason, **facts)
-    by_site = SIZED in (campaign.found.of("size", exam.name) or {"files": ()})["files"]
-    report = read_record(campaign.folder / EXAMS / exam.name / (SIZED if by_site else ESTIMATE), EstimateReport)
+    by_site = layout.SIZED in (campaign.found.of("size", exam.name) or {"files": ()})["files"]
+    report = read_record(
+        campaign.folder / layout.EXAMS / exam.name / (layout.SIZED if by_site else layout.ESTIMATE), EstimateReport
+    )
     return Row(exam, _shortened(report), findings=(*report.findings, *together), **facts)
 
 
@@ -171,13 +151,13 @@ def _shortened(report: EstimateReport) -> EstimateReport:
 
 def pooled_reports(campaign: Campaign) -> dict[str, PooledReport]:
     """Each pooled mass, by its name."""
-    folder = campaign.folder / MASSES
-    return {name: read_record(folder / name / POOLED, PooledReport) for name in campaign.found.results["pool"]}
+    folder = campaign.folder / layout.MASSES
+    return {name: read_record(folder / name / layout.POOLED, PooledReport) for name in campaign.found.results["pool"]}
 
 
 def done_text(rows: Sequence[Row]) -> str:
     """``exams_done.csv``: exams with an estimate, or with the reason for none."""
-    return table_text([_done(row) for row in rows if row.report is not None], columns_of("exams_done"))
+    return layout.table_text([_done(row) for row in rows if row.report is not None], layout.columns_of("exams_done"))
 
 
 def _done(row: Row) -> dict[str, object]:
@@ -189,7 +169,7 @@ def _done(row: Row) -> dict[str, object]:
         **_names(row.exam),
         "side": row.exam.side,
         "reader": row.exam.reader,
-        "folder": f"{EXAMS}/{row.exam.name}",
+        "folder": f"{layout.EXAMS}/{row.exam.name}",
         "scan_sha256": " ".join(scan["sha256"] for scan in row.scans if "sha256" in scan) or None,
         "status": row.status,
         "reason": row.reason or None,
@@ -223,7 +203,7 @@ def failures_text(campaign: Campaign, rows: Sequence[Row]) -> str:
     lines = [
         failed[name] | {"step": found[name].step, "reason": found[name].reason} for name in failed if name in found
     ]
-    return table_text(lines, columns_of("failures"))
+    return layout.table_text(lines, layout.columns_of("failures"))
 
 
 def trial_text(
@@ -251,7 +231,7 @@ def trial_text(
         key = (one["patient"], one["mass"], one["modality"])
         count[key] += 1
         one["replicate"] = count[key]
-    return table_text(readings, _TRIAL_COLUMNS)
+    return layout.table_text(readings, _TRIAL_COLUMNS)
 
 
 def _together(campaign: Campaign, rows: Sequence[Row], report: PooledReport | None) -> dict[str, object]:
@@ -296,12 +276,12 @@ def growth_rows(campaign: Campaign) -> list[Growth]:
     compared, rows = campaign.found.results["compare"], []
     for name, visits in grown_masses(campaign.exams).items():
         codes, exam = [*visits], next(iter(visits.values()))[0]
-        place = f"{GROWTH}/{name}"
+        place = f"{layout.GROWTH}/{name}"
         if name in compared:
-            report = read_record(campaign.folder / place / COMPARED, CompareReport)
+            report = read_record(campaign.folder / place / layout.COMPARED, CompareReport)
             of = {one.map for visit in report.visits for one in visit.maps}
             sized = [code for code, exams in visits.items() if any(one.name in of for one in exams)]
-            rows += growths(exam.patient, exam.mass, sized, report, f"{place}/{GROWTH_PAGE}")
+            rows += growths(exam.patient, exam.mass, sized, report, f"{place}/{layout.GROWTH_PAGE}")
         else:
             fault = campaign.found.faults.get(name)
             reason = "exams of fewer than two visits came through" if fault is None else fault.reason
@@ -311,7 +291,7 @@ def growth_rows(campaign: Campaign) -> list[Growth]:
 
 def growth_text(rows: Sequence[Growth]) -> str:
     """``growth.csv``: a row for each later visit of a mass."""
-    return table_text([_growth_line(row) for row in rows], columns_of("growth"))
+    return layout.table_text([_growth_line(row) for row in rows], layout.columns_of("growth"))
 
 
 def _growth_line(row: Growth) -> dict[str, object]:
@@ -336,12 +316,12 @@ def _growth_line(row: Growth) -> dict[str, object]:
 # --- Tables, index and report as files.
 
 REPORT, PAGE, INDEX = "report.json", "report.html", "index.html"
-WRITTEN: Final = (DONE, FAILURES, TRIAL, GROWN, REPORT, PAGE, INDEX, REPEATABILITY)
+WRITTEN: Final = (layout.DONE, layout.FAILURES, layout.TRIAL, layout.GROWN, REPORT, PAGE, INDEX, layout.REPEATABILITY)
 """Files beside the exams."""
 _MOST_INLINE: Final = 300
 """With more exams the index names its thumbnails' files instead of holding them."""
 _MOST_ROWS: Final = 5_000  #: More masses than a browser shows at ease.
-_LINKS: Final = (MAP_FIGURE, SIZE_FIGURE, SIZED_FIGURE)
+_LINKS: Final = (layout.MAP_FIGURE, layout.SIZE_FIGURE, layout.SIZED_FIGURE)
 
 
 class Excision(Record):
@@ -380,17 +360,17 @@ def write_outputs(campaign: Campaign, excision: Excision | None, protocol: Path 
     folder, growth, pooled = campaign.folder, growth_rows(campaign), pooled_reports(campaign)
     rows = exam_rows(campaign, pooled)
     masses = None if excision is None else excision.masses()
-    tables = {DONE: done_text(rows), FAILURES: failures_text(campaign, rows)}
-    tables |= {TRIAL: trial_text(campaign, rows, pooled, masses)}
-    tables |= {GROWN: growth_text(growth)} if growth else {}
+    tables = {layout.DONE: done_text(rows), layout.FAILURES: failures_text(campaign, rows)}
+    tables |= {layout.TRIAL: trial_text(campaign, rows, pooled, masses)}
+    tables |= {layout.GROWN: growth_text(growth)} if growth else {}
     for name, text in tables.items():
         write_text(folder / name, text, force=True)
     report, fault = ("", "") if excision is None else _write_report(folder, excision, protocol, growth)
-    for name in (*(() if report else (REPORT, PAGE)), *(() if growth else (GROWN,))):
+    for name in (*(() if report else (REPORT, PAGE)), *(() if growth else (layout.GROWN,))):
         (folder / name).unlink(missing_ok=True)
     links = {name: name for name in tables}
     links |= {"trial report": PAGE} if report else {}
-    links |= {REPEATABILITY: REPEATABILITY} if campaign.repeatability else {}
+    links |= {layout.REPEATABILITY: layout.REPEATABILITY} if campaign.repeatability else {}
     sized, failed = sum(row.size is not None for row in rows), sum(row.report is None for row in rows)
     counts = f"{sized} sized, {len(rows) - sized - failed} without a size, {failed} failed"
     write_text(folder / INDEX, _page(campaign, rows, pooled, growth, counts=counts, links=links), force=True)
@@ -402,14 +382,14 @@ def write_outputs(campaign: Campaign, excision: Excision | None, protocol: Path 
         report=report,
         no_report=fault,
         unnamed=tuple(row.exam.name for row in rows if row.has("unnamed_mass")),
-        growth=growth_line(growth, GROWN),
+        growth=growth_line(growth, layout.GROWN),
         disagreeing=tuple(dict.fromkeys(row.exam.of_mass for row in rows if row.has("maps_disagree"))),
     )
 
 
 def copy_outputs(folder: Path, address: str) -> None:
     """Copy what lies beside the exams into the object store, and last the journal: with it the copy is whole."""
-    for name in (*WRITTEN, JOURNAL):
+    for name in (*WRITTEN, layout.JOURNAL):
         if (folder / name).exists():
             put(folder / name, f"{address}/{name}")
 
@@ -466,7 +446,7 @@ def _write_report(folder: Path, excision: Excision, protocol: Path | None, growt
     """Write what `validate` writes for the trial table; returns its text, or why there is none."""
     settings, title = _trial_settings(protocol)
     try:
-        inputs = load_trial(folder / TRIAL, excision.path, excision.columns, tidy_trial=True)
+        inputs = load_trial(folder / layout.TRIAL, excision.path, excision.columns, tidy_trial=True)
         found = analyse(inputs, settings, protocol=protocol, title=title)
     except BadDataError as error:
         return "", error.what
@@ -504,7 +484,9 @@ def _page(
     patients = len({row.patient for row in masses})
     lines = [f"{len(masses)} masses of {patients} patients; {len(rows)} exams: {counts}."]
     if len(shown) < len(masses):
-        lines.append(f"Here are the {len(shown)} to be looked at first; all are in {DONE} and {FAILURES}.")
+        lines.append(
+            f"Here are the {len(shown)} to be looked at first; all are in {layout.DONE} and {layout.FAILURES}."
+        )
     lines += [repeatability_words(campaign)] if campaign.repeatability else []
     return campaign_html(shown, lines=lines, links=links, version=__version__)
 
@@ -525,14 +507,14 @@ def _visit(
 
 
 def _exam(campaign: Campaign, row: Row, *, inline: bool) -> ExamEntry:
-    exam, folder = row.exam, f"{EXAMS}/{row.exam.name}"
+    exam, folder = row.exam, f"{layout.EXAMS}/{row.exam.name}"
     made = {
         name
         for step in ("map", "estimate", "figures", "size", "page")
         for name in (campaign.found.of(step, exam.name) or {"files": ()})["files"]
         if row.report is not None
     }
-    picture: bytes | str | None = f"{folder}/{THUMBNAIL}" if THUMBNAIL in made else None
+    picture: bytes | str | None = f"{folder}/{layout.THUMBNAIL}" if layout.THUMBNAIL in made else None
     if inline and isinstance(picture, str):
         picture = read_bytes(campaign.folder / picture, most=IMAGE_BYTES)
     size = None if row.report is None else row.report.leading.max_size_mm
@@ -543,7 +525,7 @@ def _exam(campaign: Campaign, row: Row, *, inline: bool) -> ExamEntry:
         size,
         row.findings,
         picture,
-        f"{folder}/{EXAM_PAGE}" if EXAM_PAGE in made else "",
+        f"{folder}/{layout.EXAM_PAGE}" if layout.EXAM_PAGE in made else "",
         {name: f"{folder}/{name}" for name in _LINKS if name in made},
         failed=row.report is None,
     )
@@ -555,4 +537,4 @@ def repeatability_words(campaign: Campaign) -> str:
     if found is None:
         return f"spread between exams not learned: {campaign.not_learned}" if campaign.not_learned else ""
     words = found.words()
-    return f"{capital(words)}; every size is by this spread, learned from the repeats ({REPEATABILITY})."
+    return f"{capital(words)}; every size is by this spread, learned from the repeats ({layout.REPEATABILITY})."

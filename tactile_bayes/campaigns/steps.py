@@ -25,30 +25,11 @@ from tactile_bayes.campaigns.exams import ARRAYS
 from tactile_bayes.campaigns.match import OWN_AXES, Match, in_own_axes, matched
 from tactile_bayes.declarations import EXACT, Record, field, from_plain, replace, rounded, to_plain
 from tactile_bayes.errors import BadDataError, UsageError
+from tactile_bayes.files import manifest_csv as layout
 from tactile_bayes.files.atomic import sha256, write_bytes, write_text
 from tactile_bayes.files.documents import read_record
 from tactile_bayes.files.imports import read_arrays
-from tactile_bayes.files.manifest_csv import (
-    COMPARED,
-    COMPARED_FIGURE,
-    ESTIMATE,
-    EXAM_PAGE,
-    GROWTH_PAGE,
-    MAP,
-    MAP_FIGURE,
-    POOLED,
-    POOLED_DRAWS,
-    POSTERIOR,
-    REPEATABILITY,
-    SAME_IN_SCANS,
-    SCAN,
-    SHAPE,
-    SIZE_FIGURE,
-    SIZED,
-    SIZED_FIGURE,
-    THUMBNAIL,
-    Exam,
-)
+from tactile_bayes.files.manifest_csv import Exam
 from tactile_bayes.files.map_nc import read_map, read_map_and_scans, write_map
 from tactile_bayes.files.npz import read_shape, write_shape
 from tactile_bayes.files.provenance import Provenance, scan_facts
@@ -177,14 +158,14 @@ def clear_staged(folder: Path, names: Collection[str]) -> None:
 # their digests, so that a later run can tell whether they are still what it made.
 
 FILES: Final = {
-    "map": (SCAN, MAP),
-    "estimate": (ESTIMATE, POSTERIOR, SHAPE),
-    "figures": (MAP_FIGURE, SIZE_FIGURE),
-    "repeatability": (REPEATABILITY,),
-    "size": (SIZED, SIZED_FIGURE),
-    "page": (EXAM_PAGE, THUMBNAIL),
-    "pool": (POOLED, POOLED_DRAWS),
-    "compare": (COMPARED, GROWTH_PAGE, COMPARED_FIGURE),
+    "map": (layout.SCAN, layout.MAP),
+    "estimate": (layout.ESTIMATE, layout.POSTERIOR, layout.SHAPE),
+    "figures": (layout.MAP_FIGURE, layout.SIZE_FIGURE),
+    "repeatability": (layout.REPEATABILITY,),
+    "size": (layout.SIZED, layout.SIZED_FIGURE),
+    "page": (layout.EXAM_PAGE, layout.THUMBNAIL),
+    "pool": (layout.POOLED, layout.POOLED_DRAWS),
+    "compare": (layout.COMPARED, layout.GROWTH_PAGE, layout.COMPARED_FIGURE),
     "copy": (),
 }
 """The files that each step may write."""
@@ -256,7 +237,7 @@ def make_map(
     if kind == _ARRAYS or arrays:
         scan = read_arrays(source)
         made = Provenance("import", {"as": "scan", "lost": [], "correct": []}, inputs={"source": source_sha256})
-        writes[SCAN] = lambda path: write_scan(path, scan, provenance=made, force=True)
+        writes[layout.SCAN] = lambda path: write_scan(path, scan, provenance=made, force=True)
     else:
         scan = read_scan(source)
         check_facts(expected, scan.session)
@@ -264,7 +245,7 @@ def make_map(
     settings = to_plain(from_plain(MapOptions, {"normalise": normalise}), digits=EXACT)
     provenance = Provenance("map", settings, {"scan_1": source_sha256}, scans=[facts])
     tactile_map = build_map(scan, normalise=normalise)
-    writes[MAP] = lambda path: write_map(path, tactile_map, provenance=provenance, force=True)
+    writes[layout.MAP] = lambda path: write_map(path, tactile_map, provenance=provenance, force=True)
     simulated = scan.session.get("source") == "simulated"
     return {"scans": [facts], "synthetic": simulated, "normalise": normalise}, writes
 
@@ -276,7 +257,7 @@ def _given_map(source: Path, expected: Mapping[str, str]) -> Made:
         check_facts(expected, facts)
     data = read_bytes(source, most=NETCDF_BYTES)
     found = {"scans": list(scans), "synthetic": None, "normalise": tactile_map.recipe.normalise}
-    return found, {MAP: lambda path: write_bytes(path, data, force=True)}
+    return found, {layout.MAP: lambda path: write_bytes(path, data, force=True)}
 
 
 def check_facts(expected: Mapping[str, str], facts: Mapping[str, str]) -> None:
@@ -284,7 +265,9 @@ def check_facts(expected: Mapping[str, str], facts: Mapping[str, str]) -> None:
 
     What either leaves out is not compared, nor are capitals: the table has no two codes that differ by these alone.
     """
-    both = {ours: facts[theirs] for ours, theirs in SAME_IN_SCANS.items() if facts.get(theirs) and expected.get(ours)}
+    both = {
+        ours: facts[theirs] for ours, theirs in layout.SAME_IN_SCANS.items() if facts.get(theirs) and expected.get(ours)
+    }
     differs = [name for name, value in both.items() if value.casefold() != expected[name].casefold()]
     if not differs:
         return
@@ -300,19 +283,19 @@ def make_estimate(folder: Path, settings: Settings, match: Match | None) -> Made
     answer = found.answer
     assert answer.report is not None
     report, shape = answer.report.checked(), answer.shape
-    writes: Writes = {ESTIMATE: lambda path: write_text(path, json_text(report), force=True)}
+    writes: Writes = {layout.ESTIMATE: lambda path: write_text(path, json_text(report), force=True)}
     if found.status == "estimate":
-        writes[POSTERIOR] = lambda path: found.write(path, force=True)
+        writes[layout.POSTERIOR] = lambda path: found.write(path, force=True)
     if shape is not None:
-        writes[SHAPE] = lambda path: write_shape(path, shape, force=True)
+        writes[layout.SHAPE] = lambda path: write_shape(path, shape, force=True)
     return {"exit_code": answer.exit_code}, writes
 
 
 def _estimated(folder: Path, settings: Settings, match: Match | None) -> SizeEstimate:
     """The exam's estimate: of the mass that its row names, where other exams have it."""
     if match is None:
-        return estimate_file(folder / MAP, settings)
-    found = matched(folder / MAP, settings, match)
+        return estimate_file(folder / layout.MAP, settings)
+    found = matched(folder / layout.MAP, settings, match)
     if not in_own_axes(found.tactile_map, match.places):
         return found
     findings = by_weight((*found.estimate.findings, OWN_AXES))
@@ -325,10 +308,10 @@ def make_figures(folder: Path, settings: Settings, match: Match | None) -> Made:
     tactile_map, estimate, report = found.tactile_map, found.estimate, found.answer.report
     name, size, writes = folder.name, estimate.size, Writes()
     if tactile_map.covered.any() and report is not None:
-        writes[MAP_FIGURE] = lambda path: draw_map(tactile_map, report, path, name=name, force=True)
+        writes[layout.MAP_FIGURE] = lambda path: draw_map(tactile_map, report, path, name=name, force=True)
     if size is not None:
         given: dict[str, Any] = {"probability": found.probability, "findings": estimate.findings}
-        writes[SIZE_FIGURE] = lambda path: draw_size(size, path, name=name, force=True, **given)
+        writes[layout.SIZE_FIGURE] = lambda path: draw_size(size, path, name=name, force=True, **given)
     return {}, writes
 
 
@@ -337,28 +320,28 @@ def make_page(folder: Path, expected: Mapping[str, str], *, report: str) -> Made
 
     The table tells what the scans do not.
     """
-    tactile_map, scans = read_map_and_scans(folder / MAP)
-    told = {SAME_IN_SCANS[name]: text for name, text in expected.items() if name in SAME_IN_SCANS}
+    tactile_map, scans = read_map_and_scans(folder / layout.MAP)
+    told = {layout.SAME_IN_SCANS[name]: text for name, text in expected.items() if name in layout.SAME_IN_SCANS}
     facts = [told | scan for scan in scans or [{}]]
     shown = exam_map(tactile_map, read_record(folder / report, EstimateReport), side=side_of(facts))
     title = f"Tactile exam {expected['replicate']}"
     page = exam_page(ShownExam((shown,), None, facts, title=title, day=expected.get("date", "")))
-    writes: Writes = {EXAM_PAGE: lambda path: write_text(path, page, force=True)}
+    writes: Writes = {layout.EXAM_PAGE: lambda path: write_text(path, page, force=True)}
     if tactile_map.covered.any():
         picture = thumbnail_svg(shown, label=f"Map of {folder.name}")
-        writes[THUMBNAIL] = lambda path: write_text(path, picture, force=True)
+        writes[layout.THUMBNAIL] = lambda path: write_text(path, picture, force=True)
     return {}, writes
 
 
 def make_pool(folder: Path, names: Sequence[str], settings: Settings) -> Made:
     """Pool exams of a mass as `estimate --pool` does, from what their estimates left in their folders below this."""
     answers = [_answer(folder / name) for name in names]
-    inputs = {f"map_{i}": folder / name / MAP for i, name in enumerate(names, start=1)}
+    inputs = {f"map_{i}": folder / name / layout.MAP for i, name in enumerate(names, start=1)}
     found = pool_answers(answers, settings, names=names, inputs=inputs)
     report = found.pooled_report.checked()
-    writes: Writes = {POOLED: lambda path: write_text(path, json_text(report), force=True)}
+    writes: Writes = {layout.POOLED: lambda path: write_text(path, json_text(report), force=True)}
     if found.pooled.size is not None:
-        writes[POOLED_DRAWS] = lambda path: found.write(path, force=True)
+        writes[layout.POOLED_DRAWS] = lambda path: found.write(path, force=True)
     return {}, writes
 
 
@@ -385,28 +368,30 @@ def make_growth(
         settings,
         comparing=Comparing(days=days, same_mass=not placed),
         names=visits,
-        inputs={f"visit_{v}_map_{i}": folder / name / MAP for v, i, name in numbered},
+        inputs={f"visit_{v}_map_{i}": folder / name / layout.MAP for v, i, name in numbered},
     )
     report = compared.report.checked()
-    drawn = drawn_maps([[read_map(folder / name / MAP) for name in names] for names in visits], answers)
+    drawn = drawn_maps([[read_map(folder / name / layout.MAP) for name in names] for names in visits], answers)
     page = growth_page(compared.compared, report, drawn, course)
     writes: Writes = {
-        COMPARED: lambda path: write_text(path, json_text(report), force=True),
-        GROWTH_PAGE: lambda path: write_text(path, page, force=True),
+        layout.COMPARED: lambda path: write_text(path, json_text(report), force=True),
+        layout.GROWTH_PAGE: lambda path: write_text(path, page, force=True),
     }
     if figures and compared.compared.joint is not None:
-        writes[COMPARED_FIGURE] = lambda path: draw_comparison(compared.compared, report, drawn, path, force=True)
+        writes[layout.COMPARED_FIGURE] = lambda path: draw_comparison(
+            compared.compared, report, drawn, path, force=True
+        )
     return {}, writes
 
 
 def _answer(folder: Path) -> Answer:
     """An exam's answer for pooling, from its folder."""
-    tactile_map: TactileMap = read_map(folder / MAP)
+    tactile_map: TactileMap = read_map(folder / layout.MAP)
     return Answer(
-        read_record(folder / ESTIMATE, EstimateReport),
+        read_record(folder / layout.ESTIMATE, EstimateReport),
         text="",
         exit_code=0,
-        shape=read_shape(folder / SHAPE) if (folder / SHAPE).exists() else None,
+        shape=read_shape(folder / layout.SHAPE) if (folder / layout.SHAPE).exists() else None,
         normalise=tactile_map.recipe.normalise,
         fingerprint=tactile_map.fingerprint,
         head=tactile_map.head,
@@ -467,7 +452,7 @@ def learn_repeatability(repeats: Sequence[ExamFolder]) -> Made:
         learned = learn_from_exams(repeats, fewest=FEWEST_MASSES)
     except BadDataError as error:
         return {NOT_LEARNED: f"{error.what}; {error.way_out}"}, {}
-    return {}, {REPEATABILITY: lambda path: learned.write(path, force=True)}
+    return {}, {layout.REPEATABILITY: lambda path: learned.write(path, force=True)}
 
 
 def make_size(folder: Path, settings: Settings, *, figures: bool) -> Made:
@@ -475,20 +460,20 @@ def make_size(folder: Path, settings: Settings, *, figures: bool) -> Made:
 
     The size is from the draws of the exam, in the axes of its map as `estimate` has it.
     """
-    report = read_record(folder / ESTIMATE, EstimateReport)
+    report = read_record(folder / layout.ESTIMATE, EstimateReport)
     if report.max_size_mm is None:
         return {}, {}
-    tactile_map = read_map(folder / MAP)
+    tactile_map = read_map(folder / layout.MAP)
     _, calibration, _ = choose_calibration(settings, tactile_map)
     assert isinstance(calibration, BodyCalibration)
-    shape = replace(read_shape(folder / SHAPE), turn_rad=0.0)
+    shape = replace(read_shape(folder / layout.SHAPE), turn_rad=0.0)
     rng = np.random.default_rng([settings.seed, tactile_map.fingerprint, _ANOTHER_STREAM])
     size = size_alone(shape, calibration=calibration, priors=size_priors(settings), rng=rng)
     sized = _resized(report, size, settings).checked()
-    writes: Writes = {SIZED: lambda path: write_text(path, json_text(sized), force=True)}
+    writes: Writes = {layout.SIZED: lambda path: write_text(path, json_text(sized), force=True)}
     if figures:
         given: dict[str, Any] = {"probability": settings.interval, "findings": sized.findings}
-        writes[SIZED_FIGURE] = lambda path: draw_size(size, path, name=folder.name, force=True, **given)
+        writes[layout.SIZED_FIGURE] = lambda path: draw_size(size, path, name=folder.name, force=True, **given)
     return {}, writes
 
 

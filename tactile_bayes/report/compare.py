@@ -8,21 +8,8 @@ from typing import Final, Literal
 import numpy as np
 
 from tactile_bayes.declarations import UNSET, Record, rounded
-from tactile_bayes.files.comparison import (
-    COMPARE,
-    AnotherChange,
-    ChangeReport,
-    CompareReport,
-    Detectable,
-    Doubling,
-    GrownBy,
-    GrowthRate,
-    Rate,
-    TrendReport,
-    Visit,
-    VisitMap,
-    VisitPlace,
-)
+from tactile_bayes.files import comparison as comparison
+from tactile_bayes.files.comparison import CompareReport
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.reports import EstimateReport
 from tactile_bayes.findings import Finding, capital, finding_lines, finding_summary
@@ -123,29 +110,29 @@ def compare_report(
     dated = [None] * len(visits) if days is None else days
     later = () if joint is None else range(1, len(visits))
     return CompareReport(
-        schema=COMPARE,
+        schema=comparison.COMPARE,
         status=compared.status,
         verdict=verdict_of(compared.findings, answered=joint is not None),
         entries=tuple(one.entry for one in compared.findings),
         reason=compared.reason,
         advice=compared.advice,
         visits=tuple(
-            Visit(
+            comparison.Visit(
                 visit=i + 1,
                 day=dated[i],
                 max_size_mm=None if joint is None else joint.size_mm(i, probability).rounded,
                 fat_mm=None if joint is None else rounded(joint.calibrations[i].fat_mm),
                 maps=tuple(
-                    VisitMap(name, one.status, one.reason, one.detected_probability)
+                    comparison.VisitMap(name, one.status, one.reason, one.detected_probability)
                     for name, one in zip(names[i], reports, strict=True)
                 ),
             )
             for i, reports in enumerate(visits)
         ),
         places=tuple(
-            VisitPlace(visit, None, None, None, None)
+            comparison.VisitPlace(visit, None, None, None, None)
             if one is None
-            else rounded(VisitPlace(visit, one.distance_mm, one.sd_mm, one.shift_mm, one.probability))
+            else rounded(comparison.VisitPlace(visit, one.distance_mm, one.sd_mm, one.shift_mm, one.probability))
             for visit, one in enumerate(compared.apart, start=2)
         ),
         changes=tuple(_change(compared, number, comparing, probability) for number in later),
@@ -158,7 +145,7 @@ def compare_report(
     )
 
 
-def _change(compared: Compared, later: int, comparing: Comparing, probability: float) -> ChangeReport:
+def _change(compared: Compared, later: int, comparing: Comparing, probability: float) -> comparison.ChangeReport:
     """Change from the first visit to a later one, and if exams of one mass differ as the paper's maps do."""
     joint, another, days = compared.joint, compared.another, comparing.days
     assert joint is not None
@@ -167,11 +154,13 @@ def _change(compared: Compared, later: int, comparing: Comparing, probability: f
     if another is not None:
         other = another.change(0, later)
         grown = rounded(other.probability_above(0.0))
-        told = AnotherChange(rounded(another.between_map_sd), other.percent(probability).rounded, grown)
+        told = comparison.AnotherChange(rounded(another.between_map_sd), other.percent(probability).rounded, grown)
     if days is not None:
         q, apart = change.log_summary(probability), days[later] - days[0]
-        rate = GrowthRate(apart, *_rates([VOLUME * one / apart for one in (q.median, q.low, q.high)], probability))
-    return ChangeReport(
+        rate = comparison.GrowthRate(
+            apart, *_rates([VOLUME * one / apart for one in (q.median, q.low, q.high)], probability)
+        )
+    return comparison.ChangeReport(
         earlier=1,
         later=later + 1,
         verdict=verdict(change),
@@ -179,9 +168,9 @@ def _change(compared: Compared, later: int, comparing: Comparing, probability: f
         percent=change.percent(probability).rounded,
         probability_grown=rounded(change.probability_above(0.0)),
         grown_by=tuple(
-            rounded(GrownBy(100.0 * share, change.probability_above(share))) for share in comparing.grown_by
+            rounded(comparison.GrownBy(100.0 * share, change.probability_above(share))) for share in comparing.grown_by
         ),
-        smallest_detectable_percent=rounded(Detectable(100.0 * growth, 100.0 * shrinkage)),
+        smallest_detectable_percent=rounded(comparison.Detectable(100.0 * growth, 100.0 * shrinkage)),
         growth_rate=rate,
         another_exam=told,
     )
@@ -195,19 +184,19 @@ def verdict(change: Change) -> Literal["grown", "shrunk", "no_change_shown"]:
     return "shrunk" if q.high < 0.0 else "no_change_shown"
 
 
-def _rates(growth: Sequence[float], probability: float) -> tuple[Rate, Doubling]:
+def _rates(growth: Sequence[float], probability: float) -> tuple[comparison.Rate, comparison.Doubling]:
     """A growth rate in percent of the volume per day, and the doubling times, at its median and its ends."""
     median, low, high = (rounded(100.0 * one) for one in growth)
-    times = Doubling(*(doubling_days(growth[i]) for i in (0, 2, 1)))
-    return Rate(median, low, high, probability), rounded(times)
+    times = comparison.Doubling(*(doubling_days(growth[i]) for i in (0, 2, 1)))
+    return comparison.Rate(median, low, high, probability), rounded(times)
 
 
-def _trend(joint: JointSizes, days: Sequence[float], probability: float) -> TrendReport:
+def _trend(joint: JointSizes, days: Sequence[float], probability: float) -> comparison.TrendReport:
     """Straight line of ln d over all visits."""
     line = straight_line(*joint.moments, days)
     half = float(normal_quantile(np.array(0.5 + probability / 2))) * line.sd
     rates = _rates([VOLUME * (line.per_day + one) for one in (0.0, -half, half)], probability)
-    return TrendReport(len(days), days[-1] - days[0], *rates, rounded(line.departure))
+    return comparison.TrendReport(len(days), days[-1] - days[0], *rates, rounded(line.departure))
 
 
 # --- A comparison of visits as text: the change of size in words that its odds carry.
@@ -287,7 +276,7 @@ def _refusal(report: CompareReport) -> str:
     return f"{head}: {report.reason}.{advice}"
 
 
-def _visit_line(visit: Visit) -> str:
+def _visit_line(visit: comparison.Visit) -> str:
     found = sum(one.status == "estimate" for one in visit.maps)
     maps = f"{found} of {len(visit.maps)} maps" if len(visit.maps) > 1 else "1 map"
     day = "" if visit.day is None or visit.visit == 1 else f", day {visit.day:g}"
@@ -298,7 +287,7 @@ def _visit_line(visit: Visit) -> str:
     return f"{head}: largest size {q.median:.1f} mm ({q.low:.1f} to {q.high:.1f}, {_share(q)} interval)"
 
 
-def _place_line(place: VisitPlace, *, name: bool = False) -> list[str]:
+def _place_line(place: comparison.VisitPlace, *, name: bool = False) -> list[str]:
     if place.distance_mm is None:
         return []
     which = f" of visit {place.visit}" if name else ""
@@ -306,13 +295,13 @@ def _place_line(place: VisitPlace, *, name: bool = False) -> list[str]:
     return [f"Place{which}: {place.distance_mm:.0f} mm from visit 1 by the landmarks ({sd})."]
 
 
-def _change_line(change: ChangeReport) -> str:
+def _change_line(change: comparison.ChangeReport) -> str:
     q, pair = change.percent, f"Change of the diameter, visit {change.earlier} to {change.later}"
     median, low, high = (signed(one) for one in (q.median, q.low, q.high))
     return f"{pair}: {median} % ({low} to {high} %, {_share(q)} interval)."
 
 
-def _odds_line(change: ChangeReport) -> str:
+def _odds_line(change: comparison.ChangeReport) -> str:
     more = "".join(
         f"; that it has grown by more than {one.percent:g} %: {_odds(one.probability)}" for one in change.grown_by
     )
@@ -324,7 +313,7 @@ def _direction(grown: float) -> str:
     return f"has grown: {_odds(grown)}" if grown >= 0.5 else f"has shrunk: {_odds(1.0 - grown)}"
 
 
-def _verdict_line(change: ChangeReport) -> str:
+def _verdict_line(change: comparison.ChangeReport) -> str:
     if change.verdict != "no_change_shown":
         return f"The mass has {change.verdict}{f', {_ALIKE_ONLY}' if change.for_alike_exams_only else ''}."
     least = change.smallest_detectable_percent
@@ -332,13 +321,13 @@ def _verdict_line(change: ChangeReport) -> str:
     return f"No change shown; a growth of less than {growth} or a shrinkage of less than {shrinkage} can stay unseen."
 
 
-def _rate_lines(change: ChangeReport) -> list[str]:
+def _rate_lines(change: comparison.ChangeReport) -> list[str]:
     """Growth rate between two visits."""
     rate = change.growth_rate
     return [] if rate is None else [f"Growth rate over {rate.days:g} days: {_rate_words(rate)}."]
 
 
-def _trend_lines(trend: TrendReport) -> list[str]:
+def _trend_lines(trend: comparison.TrendReport) -> list[str]:
     """Growth rate by the straight line through all visits."""
     lines = [f"Trend over {trend.visits} visits in {trend.days:g} days: {_rate_words(trend)}."]
     chance = trend.straight_line_probability
@@ -347,7 +336,7 @@ def _trend_lines(trend: TrendReport) -> list[str]:
     return lines
 
 
-def _rate_words(rate: GrowthRate | TrendReport) -> str:
+def _rate_words(rate: comparison.GrowthRate | comparison.TrendReport) -> str:
     q, times = rate.percent_per_day, rate.doubling_days
     words = f"{q.median:+.2f} % of the volume a day ({q.low:+.2f} to {q.high:+.2f} %)"
     if times.shortest is None:
@@ -357,7 +346,7 @@ def _rate_words(rate: GrowthRate | TrendReport) -> str:
     return f"{words}, doubling in {times.median:.0f} days ({times.shortest:.0f} to {times.longest:.0f})"
 
 
-def _another_line(change: ChangeReport) -> list[str]:
+def _another_line(change: comparison.ChangeReport) -> list[str]:
     another = change.another_exam
     if another is None:
         return []
