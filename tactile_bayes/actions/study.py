@@ -50,20 +50,8 @@ from tactile_bayes.report.paper_head import (
 from tactile_bayes.report.study import frames_text, lookalikes_text, solid_figures, study_figures, study_text
 from tactile_bayes.shell import progress_bar
 from tactile_bayes.size.bodies import BodyCalibration
-from tactile_bayes.studies import sbc
+from tactile_bayes.studies import paper, sbc
 from tactile_bayes.studies.model_comparison import compare_model, measured_frames
-from tactile_bayes.studies.paper import (
-    Geometry,
-    HomogeneousTissue,
-    StudyRow,
-    StudySettings,
-    group_cases,
-    most_even,
-    narrowest,
-    paper_grid,
-    search_heads,
-    uniformity,
-)
 from tactile_bayes.studies.paper_solid import SolidSettings
 from tactile_bayes.studies.paper_tables import (
     NEAREST_HEADS,
@@ -104,8 +92,8 @@ def prepare_figures(folder: Path, *, model: str, force: bool) -> list[Path]:
 
 
 def draw_figures(
-    rows: list[StudyRow],
-    settings: StudySettings | SolidSettings,
+    rows: list[paper.StudyRow],
+    settings: paper.StudySettings | SolidSettings,
     paths: list[Path],
     *,
     seat: float,
@@ -154,7 +142,7 @@ def study_action(
         named = "--measured-frames" if measured_frames else "--phantom"
         raise UsageError(f"{named} is for --figures of the plane-strain model; give --figures DIR")
     frames = [] if measured_frames is None else read_frames(measured_frames)
-    geometries = paper_grid(chosen) if asked.grid == "paper" else read_grid(Path(asked.grid), seat=chosen)
+    geometries = paper.paper_grid(chosen) if asked.grid == "paper" else read_grid(Path(asked.grid), seat=chosen)
     paths = [] if figures is None else prepare_figures(figures, model=model, force=force)
     with open_executor(workers=workers, cluster=scheduler) as executor:
         rows = run_study(geometries, settings=settings, executor=executor, output=output)
@@ -170,7 +158,7 @@ def study_action(
     click.echo(RESEARCH_USE, err=output is None)
 
 
-def study_settings(asked: StudyOptions, at: SectionOptions) -> StudySettings | SolidSettings:
+def study_settings(asked: StudyOptions, at: SectionOptions) -> paper.StudySettings | SolidSettings:
     """Make the settings of the study of a model."""
     default = SHOULDERS_INSIDE if asked.model == "plane-strain" else SHOULDERS_OUTSIDE
     section = _section(at, asked.head or default)
@@ -179,7 +167,7 @@ def study_settings(asked: StudyOptions, at: SectionOptions) -> StudySettings | S
         if asked.background == "free" or asked.flat_field:
             named = "--background free" if asked.background == "free" else "--flat-field"
             raise UsageError(f"{named} is for --model solid: in two dimensions Eq 5 is fitted with a background of 1")
-        return StudySettings(head=section, **case)
+        return paper.StudySettings(head=section, **case)
     array = Array(radius_mm=at.head_radius_mm, rim_mm=at.shoulder_mm).with_shoulders(section.shoulders)
     solid: dict[str, Any] = {"background": asked.background or "free", "flat_field": asked.flat_field is not False}
     return SolidSettings(head=array, **case, **solid)
@@ -190,27 +178,27 @@ def _section(at: SectionOptions, shoulders: str | None) -> Head:
     return Head(radius_mm=at.head_radius_mm, shoulder_mm=at.shoulder_mm, shoulders=shoulders or SHOULDERS_INSIDE)
 
 
-def read_grid(path: Path, *, seat: float) -> list[Geometry]:
+def read_grid(path: Path, *, seat: float) -> list[paper.Geometry]:
     """Read the cases of a table; `seat` is the default of rows without one."""
     table = read_table(path, _GRID_SCHEMA)
     seats = [seat if text is None else parse_seat(text) for text in table.columns["seat"]]
     names = ("d_mm", "depth_ratio", "stiffness_ratio")
     with in_file(path):
-        return group_cases(zip(seats, *(table.columns[name] for name in names), strict=True))
+        return paper.group_cases(zip(seats, *(table.columns[name] for name in names), strict=True))
 
 
 def run_study(
-    geometries: list[Geometry],
+    geometries: list[paper.Geometry],
     *,
-    settings: StudySettings | SolidSettings,
+    settings: paper.StudySettings | SolidSettings,
     executor: Executor,
     output: Path | None = None,
-) -> list[StudyRow]:
+) -> list[paper.StudyRow]:
     """Compute all rows, in order of the geometries; finished ones are stored beside `output`."""
     for geometry in geometries:
         settings.body(geometry.d_mm, geometry.depth_ratio, seat=geometry.seat)
     with (
-        open_unfinished(output, list[StudyRow], settings=settings.as_dict()) as store,
+        open_unfinished(output, list[paper.StudyRow], settings=settings.as_dict()) as store,
         progress_bar("geometries") as progress,
     ):
         try:
@@ -231,12 +219,12 @@ def run_study(
     return _rows(outcomes)
 
 
-def _rows(outcomes: Iterable[Outcome[list[StudyRow]]]) -> list[StudyRow]:
+def _rows(outcomes: Iterable[Outcome[list[paper.StudyRow]]]) -> list[paper.StudyRow]:
     """Rows of the finished geometries."""
     return [row for outcome in outcomes for row in outcome.value or []]
 
 
-def table_text(rows: list[StudyRow]) -> str:
+def table_text(rows: list[paper.StudyRow]) -> str:
     """CSV of the study for `calibrate size`; columns of the solid model only where a row has them."""
     names = ["seat", "d_mm", "depth_ratio", "stiffness_ratio", "amplitude", "sigma_x_mm"]
     if any(row.sigma_y_mm is not None for row in rows):
@@ -271,7 +259,7 @@ def tables_action(*, seat: str, head: str | None, search: bool, workers: int, as
 def run_tables(seat: float, *, heads: Sequence[Head], workers: int) -> tuple[ByHead, ByHead]:
     """Agreement of both models over the cases of the tables, and over the phantoms, under each head."""
     scenes = table_scenes(seat) + phantom_scenes(seat)
-    work = partial(compare_heads, settings=StudySettings(), heads=heads)
+    work = partial(compare_heads, settings=paper.StudySettings(), heads=heads)
     with open_executor(workers=workers) as executor, progress_bar("lumps") as progress:
         outcomes = run_batch(work, scenes, key=lambda scene: scene.name, executor=executor, progress=progress)
     for outcome in outcomes:
@@ -289,9 +277,9 @@ def head_uniformity_action(
     *, head_radius_mm: float, shoulder_mm: float, head: str | None, as_json: bool, **tissue: Any
 ) -> None:
     """Compute how evenly one head presses on homogeneous tissue."""
-    body = HomogeneousTissue(**tissue)
+    body = paper.HomogeneousTissue(**tissue)
     section = SectionOptions(head_radius_mm=head_radius_mm, shoulder_mm=shoulder_mm)
-    found, limit = uniformity(_section(section, head), body), body.limit_percent / 100
+    found, limit = paper.uniformity(_section(section, head), body), body.limit_percent / 100
     if as_json:
         click.echo(json.dumps(uniformity_document(found, body, limit=limit), indent=2))
         return
@@ -301,9 +289,9 @@ def head_uniformity_action(
 
 def head_design_action(*, head: str | None, figure: Path | None, as_json: bool, force: bool, **tissue: Any) -> None:
     """Find the head that presses evenly on homogeneous tissue (section 2.1 of the paper)."""
-    body = HomogeneousTissue(**tissue)
+    body = paper.HomogeneousTissue(**tissue)
     limit = body.limit_percent / 100
-    found = search_heads(body, kinds=HEADS if head is None else (head,))
+    found = paper.search_heads(body, kinds=HEADS if head is None else (head,))
     if figure is not None:
         design_figure(found, body, limit=limit, path=figure, force=force)
     if as_json:
@@ -311,8 +299,8 @@ def head_design_action(*, head: str | None, figure: Path | None, as_json: bool, 
     else:
         click.echo(design_text(found, body, limit=limit))
         click.echo(RESEARCH_USE)
-    if narrowest(found, limit=limit) is None:
-        best = most_even(found)
+    if paper.narrowest(found, limit=limit) is None:
+        best = paper.most_even(found)
         raise UsageError(
             f"no head keeps the pressure within {body.limit_percent:g} % of its mean: the most even one, "
             f"{named(best.head)}, reaches {100 * best.worst:.1f} %; give a larger --limit-percent, narrower ranges or "

@@ -35,21 +35,8 @@ from tactile_bayes.report.laboratory import TradeoffReport, draw_tradeoff, trade
 from tactile_bayes.report.tradeoff import DIGITS, draw_ladder, ladder_file, ladder_text
 from tactile_bayes.shell import progress_bar
 from tactile_bayes.size.pooling import PooledEstimate
+from tactile_bayes.studies import tradeoffs
 from tactile_bayes.studies.estimate_tradeoff import SIZE, Clock, Ladder, PooledRow, SizeAnswer, Work, measure
-from tactile_bayes.studies.tradeoffs import (
-    PLANE,
-    SOLID,
-    LumpCase,
-    Measured,
-    SizeRule,
-    calibrated_rule,
-    case_of,
-    forward_settings,
-    learned_rule,
-    measure_forward,
-    measure_map,
-    teach,
-)
 
 # --- The size by several maps of one mass.
 
@@ -165,21 +152,21 @@ def tradeoff_forward_action(
     click.echo(RESEARCH_USE)
 
 
-def _case(path: Path | None, head: str | None) -> LumpCase:
+def _case(path: Path | None, head: str | None) -> tradeoffs.LumpCase:
     if path is None:
-        return case_of(Scene(body=SceneBody(), solid_lumps=(SolidLump(seat=0.0),)), head=head)
+        return tradeoffs.case_of(Scene(body=SceneBody(), solid_lumps=(SolidLump(seat=0.0),)), head=head)
     with in_file(path):
-        return case_of(read_scene(path), head=head)
+        return tradeoffs.case_of(read_scene(path), head=head)
 
 
-def run_tradeoff(case: LumpCase, calibration: str | None, *, tolerance: float, runs: int) -> TradeoffReport:
+def run_tradeoff(case: tradeoffs.LumpCase, calibration: str | None, *, tolerance: float, runs: int) -> TradeoffReport:
     """Learn Eq 6 or read the calibrations, then measure all settings."""
     # a raster's frames are divided by their means
-    own = {PLANE: "plane-strain", SOLID: "solid-mean"}
-    rules = {model: _rule(case, model, calibration or own[model]) for model in (PLANE, SOLID)}
-    found: list[Measured] = []
-    settings = forward_settings(case)
-    measure = partial(measure_forward, case, clock=time.process_time)
+    own = {tradeoffs.PLANE: "plane-strain", tradeoffs.SOLID: "solid-mean"}
+    rules = {model: _rule(case, model, calibration or own[model]) for model in (tradeoffs.PLANE, tradeoffs.SOLID)}
+    found: list[tradeoffs.Measured] = []
+    settings = tradeoffs.forward_settings(case)
+    measure = partial(tradeoffs.measure_forward, case, clock=time.process_time)
     measure(settings[0])  # imports cost nothing afterwards
     measure(settings[-1])
     with progress_bar("settings") as progress:
@@ -189,15 +176,15 @@ def run_tradeoff(case: LumpCase, calibration: str | None, *, tolerance: float, r
     return TradeoffReport(case, tuple(found), rules, tolerance)
 
 
-def _rule(case: LumpCase, model: str, name: str) -> SizeRule:
+def _rule(case: tradeoffs.LumpCase, model: str, name: str) -> tradeoffs.SizeRule:
     """Rule from a model's widths to sizes: a calibration by name or path, or one learned here."""
     if name == LEARNED:
         with progress_bar(f"lumps for Eq 6, {model}") as progress:
-            return learned_rule(teach(case, model, progress=progress))
+            return tradeoffs.learned_rule(tradeoffs.teach(case, model, progress=progress))
     path = size_calibration_path(name)
     if path is None:
         raise UsageError(f"--size-calibration {name} gives no sizes; name a calibration, or say {LEARNED}")
-    return calibrated_rule(read_size_calibration(path), name=path.name)
+    return tradeoffs.calibrated_rule(read_size_calibration(path), name=path.name)
 
 
 # --- `tradeoff estimate`: every setting of `estimate` on the user's own map, against a long reference.
@@ -273,7 +260,7 @@ def tradeoff_map_action(
     settings = Settings(seed=seed)
     with progress_bar("settings") as progress:
         work = Work(time.process_time, tolerance_mm, runs, forecast, progress, seed, settings.interval)
-        ladder = measure_map(loaded, inputs=partial(estimate_inputs, settings), work=work)
+        ladder = tradeoffs.measure_map(loaded, inputs=partial(estimate_inputs, settings), work=work)
     ladder = replace(ladder, shared_cpu_s={"reading the scan": read_s})
     kept = {"tolerance_mm": tolerance_mm, "runs": runs}
     provenance = Provenance("tradeoff map", kept, hash_inputs(scan=scan), seed=seed).as_dict()

@@ -13,18 +13,10 @@ from tactile_bayes.api.arguments import PathLike, door, path_of, plain, takes
 from tactile_bayes.api.maps import scan_given
 from tactile_bayes.declarations import EXACT, replace, to_plain
 from tactile_bayes.errors import UsageError
+from tactile_bayes.files import imports
 from tactile_bayes.files.array_map import read_array_map
 from tactile_bayes.files.arrays_layout import ArrayMap, Stated
 from tactile_bayes.files.documents import with_session
-from tactile_bayes.files.imports import (
-    combined,
-    import_arrays,
-    of_calibration,
-    of_head,
-    of_landmarks,
-    of_poses,
-    with_checked,
-)
 from tactile_bayes.files.instrument_json import head_geometry
 from tactile_bayes.files.named_arrays import Source
 from tactile_bayes.files.npz import Arrays
@@ -89,14 +81,14 @@ def scan(
     given = _stated(columns, stated)
     beside = [_poses(poses, given), _head(head), _calibration(calibration), _landmarks(landmarks)]
     if isinstance(frames, str | Path):
-        made = import_arrays(path_of(frames), given, beside)
+        made = imports.import_arrays(path_of(frames), given, beside)
     else:
         times = {} if time is None else {"frame_time_s": _array(time)}
-        made = combined([Source({"frames": _array(frames), **times}), *beside], given)
+        made = imports.combined([Source({"frames": _array(frames), **times}), *beside], given)
     for note in made.notes:
         if note.startswith("CAUTION"):
             warnings.warn(note, stacklevel=3)
-    found = with_checked(made.scan, _checked_head(head))
+    found = imports.with_checked(made.scan, _checked_head(head))
     return corrected(with_session(found, path_of(session)), correct)
 
 
@@ -123,7 +115,7 @@ def _poses(given: Any, stated: ArrayMap) -> Source:
     if given is None:
         return Source({})
     if isinstance(given, str | Path):
-        return of_poses(path_of(given), stated)
+        return imports.of_poses(path_of(given), stated)
     if isinstance(given, TrackerPoses):
         return Source(_named(given.time_s, given.position_mm, given.quaternion_wxyz))
     if isinstance(given, tuple | list) and len(given) == 3:
@@ -147,8 +139,8 @@ def _named(time: Any, position: Any, quaternion: Any) -> Arrays:
 def _head(given: Any) -> Source:
     if isinstance(given, Mapping):
         document = {"schema": _HEAD_SCHEMA, **to_plain(dict(given), digits=EXACT)}
-        return of_head(head_geometry(document, path=Path("head")))
-    return _beside(given, HeadGeometry, of_head, lambda other: other.head)
+        return imports.of_head(head_geometry(document, path=Path("head")))
+    return _beside(given, HeadGeometry, imports.of_head, lambda other: other.head)
 
 
 def _checked_head(given: Any) -> Path | HeadGeometry | None:
@@ -161,14 +153,14 @@ def _checked_head(given: Any) -> Path | HeadGeometry | None:
 def _calibration(given: Any) -> Source:
     if isinstance(given, tuple | list) and len(given) == 2:
         return Source({"gain_kpa_per_count": _array(given[0]), "offset_kpa": _array(given[1])})
-    return _beside(given, ElementCalibration, of_calibration, lambda other: other.element_calibration)
+    return _beside(given, ElementCalibration, imports.of_calibration, lambda other: other.element_calibration)
 
 
 def _landmarks(given: Any) -> Source:
     points = None if given is None or isinstance(given, str | Path | Landmarks | Scan) else _array(given)
     if points is not None and points.shape in ((2, 3), (3, 3)):
         return Source({"landmarks_mm": points[:2], **({"nipple_mm": points[2]} if len(points) == 3 else {})})
-    return _beside(given, Landmarks, of_landmarks, lambda other: other.landmarks)
+    return _beside(given, Landmarks, imports.of_landmarks, lambda other: other.landmarks)
 
 
 def _beside(given: Any, kind: type, made: Callable[[Any], Source], part: Callable[[Scan], Any]) -> Source:

@@ -27,22 +27,8 @@ from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.progress import Progress, untold
 from tactile_bayes.report.trial import plan_text
 from tactile_bayes.report.trial_html import plan_figure
+from tactile_bayes.trial import planning
 from tactile_bayes.trial.figures import MIN_PATIENTS, UndefinedError
-from tactile_bayes.trial.planning import (
-    ROUNDS,
-    Design,
-    ErrorSource,
-    Needed,
-    PlanCase,
-    PlanReport,
-    assumptions_from,
-    designs,
-    first_guess,
-    map_gains,
-    patients_needed,
-    run_case,
-    sizes_about,
-)
 from tactile_bayes.trial.readings import Trial, unit_doubts
 
 if TYPE_CHECKING:
@@ -55,7 +41,7 @@ _ERRORS = names_of(PlanErrors)
 class TrialPlan(Record, eq=False):
     """Power and widths of intervals of planned trials; `report` is what the file of ``plan -o`` holds."""
 
-    report: PlanReport
+    report: planning.PlanReport
     doubts: tuple[str, ...] = ()  #: What speaks against the pilot's tables.
 
     @property
@@ -104,7 +90,7 @@ class Pilot(Record, eq=False):
             if name not in sizes:
                 way_out = f"it has {', '.join(sizes)}; choose one with --against"
                 raise BadDataError(f"holds no readings by {name}", way_out=way_out, path=str(self.path))
-        found = assumptions_from(sizes["tactile"], sizes[against], map_sd=given.get("map_sd"))
+        found = planning.assumptions_from(sizes["tactile"], sizes[against], map_sd=given.get("map_sd"))
         if found is None:
             way_out = "give the errors by options"
             raise BadDataError("has fewer than 3 masses found by a modality", way_out=way_out, path=str(self.path))
@@ -186,7 +172,7 @@ def planned(given: Mapping[str, Any], pilot: Pilot | None, progress: Progress) -
         raise UsageError("--power and --precision find the number of patients; leave out --patients")
     by_default = as_dict(PlanErrors(**stated))
     errors = by_default if pilot is None else pilot.errors(asked.against, stated)
-    rest: ErrorSource = "default" if pilot is None else "pilot"
+    rest: planning.ErrorSource = "default" if pilot is None else "pilot"
     assumptions = {**errors, "trials": asked.trials, "seed": asked.seed}
     each_maps = (MAPS_OF_AIMS,) if wanted and "maps" not in given else sorted(set(asked.maps))
     with open_executor(workers=asked.workers) as executor:
@@ -194,18 +180,18 @@ def planned(given: Mapping[str, Any], pilot: Pilot | None, progress: Progress) -
         if wanted:
             found, needed = _needed(each_maps, wanted, assumptions, run)
         else:
-            found, needed = run(list(designs(sorted(set(asked.patients)), each_maps, **assumptions))), ()
+            found, needed = run(list(planning.designs(sorted(set(asked.patients)), each_maps, **assumptions))), ()
     assumed = {name: float(f"{errors[name]:.9g}") for name in _ERRORS}
-    sources: dict[str, ErrorSource] = {name: "option" if name in stated else rest for name in _ERRORS}
+    sources: dict[str, planning.ErrorSource] = {name: "option" if name in stated else rest for name in _ERRORS}
     inputs = hash_inputs(**({} if pilot is None else pilot.files))
     settings: dict[str, Any] = {"trials": asked.trials, "errors": assumed, "errors_from": sources}
     settings |= {str(aim): target for aim, target in wanted.items()}
-    report = PlanReport(
+    report = planning.PlanReport(
         schema="tactile-bayes/plan/1",
         errors=assumed,
         errors_from=sources,
         designs=found,
-        gains=() if wanted else map_gains(found),
+        gains=() if wanted else planning.map_gains(found),
         needed=needed,
         provenance=Provenance("plan", settings, inputs, seed=asked.seed).as_dict(),
         research_use=RESEARCH_USE,
@@ -213,8 +199,10 @@ def planned(given: Mapping[str, Any], pilot: Pilot | None, progress: Progress) -
     return TrialPlan(report, () if pilot is None else tuple(pilot.doubts()))
 
 
-def _simulated(cases: Sequence[PlanCase], *, executor: Executor, progress: Progress) -> tuple[Design, ...]:
-    outcomes = run_batch(run_case, cases, key=attrgetter("key"), executor=executor, progress=progress)
+def _simulated(
+    cases: Sequence[planning.PlanCase], *, executor: Executor, progress: Progress
+) -> tuple[planning.Design, ...]:
+    outcomes = run_batch(planning.run_case, cases, key=attrgetter("key"), executor=executor, progress=progress)
     for outcome in outcomes:
         if outcome.value is None:
             raise BadDataError(f"{outcome.key}: {outcome.error}", way_out="change the errors assumed")
@@ -225,21 +213,27 @@ def _needed(
     maps: Sequence[int],
     aims: Mapping[Aim, float],
     assumptions: Mapping[str, Any],
-    run: Callable[[Sequence[PlanCase]], tuple[Design, ...]],
-) -> tuple[tuple[Design, ...], tuple[Needed, ...]]:
+    run: Callable[[Sequence[planning.PlanCase]], tuple[planning.Design, ...]],
+) -> tuple[tuple[planning.Design, ...], tuple[planning.Needed, ...]]:
     """Designs about the numbers of patients that reach the aims, and these numbers."""
-    found: dict[tuple[int, int], Design] = {}
+    found: dict[tuple[int, int], planning.Design] = {}
     needed = []
     for number, (aim, target) in itertools.product(maps, aims.items()):
         try:
-            guess = first_guess(PlanCase(patients=MIN_PATIENTS, maps=number, **assumptions), aim, target)
+            guess = planning.first_guess(
+                planning.PlanCase(patients=MIN_PATIENTS, maps=number, **assumptions), aim, target
+            )
         except UndefinedError as undefined:
             raise BadDataError(str(undefined), way_out="change the errors assumed") from None
-        for _ in range(ROUNDS):
-            about = sizes_about(guess)
-            cases = [one for one in designs(about, [number], **assumptions) if (number, one.patients) not in found]
+        for _ in range(planning.ROUNDS):
+            about = planning.sizes_about(guess)
+            cases = [
+                one for one in planning.designs(about, [number], **assumptions) if (number, one.patients) not in found
+            ]
             found |= {(number, one.patients): one for one in run(cases)}
-            answer = patients_needed([found[number, one] for one in about], aim, target, trials=assumptions["trials"])
+            answer = planning.patients_needed(
+                [found[number, one] for one in about], aim, target, trials=assumptions["trials"]
+            )
             if answer is None or about[0] <= answer.patients <= about[-1] or answer.patients == guess:
                 break
             guess = answer.patients

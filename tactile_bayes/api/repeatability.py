@@ -11,21 +11,13 @@ import numpy as np
 
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError, UsageError
+from tactile_bayes.files import size_json
 from tactile_bayes.files.atomic import sha256
 from tactile_bayes.files.documents import read_record
 from tactile_bayes.files.manifest_csv import DONE, ESTIMATE, EXAMS, SHAPE, exam_name, mass_name
 from tactile_bayes.files.npz import read_shape
 from tactile_bayes.files.provenance import Provenance, recordings, scans_of
 from tactile_bayes.files.reports import EstimateReport
-from tactile_bayes.files.size_json import (
-    SHIPPED,
-    HalfWidth,
-    RepeatedMass,
-    read_size_calibration,
-    repeatability_document,
-    size_calibration_path,
-    write_repeatability,
-)
 from tactile_bayes.files.tables import read_raw
 from tactile_bayes.inference.draws import Quantity, normal_quantile
 from tactile_bayes.size.bodies import BodyCalibration
@@ -54,7 +46,7 @@ class LearnedRepeatability(Record, eq=False):
 
     def write(self, path: Path, *, force: bool = False) -> None:
         """Write the file that `estimate --repeatability` takes."""
-        write_repeatability(path, self.document, force=force)
+        size_json.write_repeatability(path, self.document, force=force)
 
 
 class _Repeat(Record, eq=False):
@@ -114,7 +106,7 @@ def learn_from_exams(
         normalise=calibration.recipe.normalise,
     )
     entries = [
-        RepeatedMass(
+        size_json.RepeatedMass(
             name=mass.name,
             exams=[repeat.exam.name for repeat in group],
             log_size=list(mass.centre),
@@ -126,8 +118,8 @@ def learn_from_exams(
     settings = {"prior": {"median": PRIOR_MEDIAN, "log_sd": PRIOR_LOG_SD}}
     inputs = {f"draws_{i}": repeat.digest for i, repeat in enumerate(one_by_one, start=1)}
     provenance = Provenance(COMMAND, settings, {"size_calibration": digest, **inputs})
-    half_width = HalfWidth(**_half_widths(one_by_one, found.sd))
-    document = repeatability_document(
+    half_width = size_json.HalfWidth(**_half_widths(one_by_one, found.sd))
+    document = size_json.repeatability_document(
         found, repeats=entries, left_out=left_out, half_width=half_width, provenance=provenance
     )
     return LearnedRepeatability(found, document)
@@ -196,15 +188,15 @@ def _calibration_named(repeats: Sequence[_Repeat]) -> tuple[str, str]:
 
 def _calibration(name: str, digest: str, given: str | None) -> BodyCalibration:
     """The calibration with this digest: the one given, or that of the name, or a shipped one."""
-    names = [name, *SHIPPED] if given is None else [given]
-    paths = [path for one in names if (path := size_calibration_path(one)) is not None]
+    names = [name, *size_json.SHIPPED] if given is None else [given]
+    paths = [path for one in names if (path := size_json.size_calibration_path(one)) is not None]
     path = next((path for path in paths if (given is not None or path.is_file()) and sha256(path) == digest), None)
     if path is None and given is not None:
         what = f"{given} is not the calibration that the exams were sized by ({name})"
         raise BadDataError(what, way_out="give that one, or run the campaign again with this one")
     if path is None:
         raise UsageError(f"calibration {name}, which sized the exams, is not found; name it by --size-calibration")
-    calibration = read_size_calibration(path)
+    calibration = size_json.read_size_calibration(path)
     if not isinstance(calibration, BodyCalibration):
         raise UsageError(f"the spread between exams is learned through a calibration over bodies, which {name} is not")
     return calibration

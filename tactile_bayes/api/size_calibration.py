@@ -28,17 +28,7 @@ from tactile_bayes.scans import HeadShape
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.draws import BumpDraws, ShapeDraws
 from tactile_bayes.size.learn import bodies as learning
-from tactile_bayes.size.learn.eq6 import (
-    OtherFit,
-    SizeTable,
-    StudyCases,
-    axis_in_two_stages,
-    learn_size_calibration,
-    learn_two_stage,
-    left_out_of_study,
-    other_fit,
-    width_changes,
-)
+from tactile_bayes.size.learn import eq6
 from tactile_bayes.size.learn.site import PhantomMap, correct_calibration
 from tactile_bayes.size.pooling import Calibration
 from tactile_bayes.size.terms import Normalise, Recipe
@@ -56,10 +46,10 @@ class Learned(Record, eq=False):
     inputs: dict[str, Path]  #: Files by role, for the provenance.
     seed: int | None = None  #: Of the random numbers; None where it used none.
     base: dict[str, Any] | None = None  #: Document of the calibration that was corrected.
-    lumps: SizeTable | None = None  #: The table as Eq 6 takes it, where that was learned.
+    lumps: eq6.SizeTable | None = None  #: The table as Eq 6 takes it, where that was learned.
     not_left_out: str = ""
     """Why no geometry could be left out; empty where they were, or the table is no study."""
-    other_fit: OtherFit | None = None
+    other_fit: eq6.OtherFit | None = None
     """What the other of the two fits makes of the table; None where it has none."""
 
     def write(self, path: Path, *, force: bool = False) -> None:
@@ -120,14 +110,14 @@ def _eq6(table: Path | Sheet, asked: LearnOptions, progress: Progress | None) ->
         lumps = size_table(rows, least_stiffness_ratio=least)
         rng = np.random.default_rng(asked.seed)
         if asked.fit == "two-stage":
-            calibration = learn_two_stage(lumps, recipe=recipe, rng=rng)
+            calibration = eq6.learn_two_stage(lumps, recipe=recipe, rng=rng)
         else:
-            calibration = learn_size_calibration(lumps, recipe=recipe, rng=rng, progress=progress)
-        other = other_fit(calibration, lumps)
-        one_axis = axis_in_two_stages if asked.fit == "two-stage" else None
+            calibration = eq6.learn_size_calibration(lumps, recipe=recipe, rng=rng, progress=progress)
+        other = eq6.other_fit(calibration, lumps)
+        one_axis = eq6.axis_in_two_stages if asked.fit == "two-stage" else None
         left_out, silent = None, ""  # cross-validated errors, or why Eq 6 has none
         try:
-            left_out = left_out_of_study(lumps, least_stiffness_ratio=least, fit=one_axis)
+            left_out = eq6.left_out_of_study(lumps, least_stiffness_ratio=least, fit=one_axis)
         except (NotConvergedError, BadDataError) as error:
             silent = str(error)
     settings = {
@@ -267,7 +257,7 @@ def rows_of_one_way(rows: Table, normalise: str | None) -> tuple[Normalise, dict
     return cast("Normalise", chosen), {name: [values[i] for i in kept] for name, values in rows.columns.items()}
 
 
-def size_table(table: Table, *, least_stiffness_ratio: float = 0.0) -> SizeTable:
+def size_table(table: Table, *, least_stiffness_ratio: float = 0.0) -> eq6.SizeTable:
     """Columns of a table as arrays, with Delta sigma where depths are given; without softer lumps."""
     # only lumps marked as detectable: fits to the others describe a trough
     shown = [
@@ -292,22 +282,22 @@ def size_table(table: Table, *, least_stiffness_ratio: float = 0.0) -> SizeTable
     if d_mm is None or amplitude is None or sigma_x is None:
         raise BadDataError("no rows", way_out="give a row for each lump", path=str(table.path))
     if depth is None:
-        return SizeTable(d_mm, amplitude, sigma_x, sigma_y)
+        return eq6.SizeTable(d_mm, amplitude, sigma_x, sigma_y)
     same = [columns[name] for name in ("seat", "d_mm", "stiffness_ratio", "thickness_mm", "head_radius_mm", "head")]
     group = list(zip(*same, strict=True))
-    change_x = width_changes(sigma_x, depth_ratio=depth, group=group)
-    change_y = None if sigma_y is None else width_changes(sigma_y, depth_ratio=depth, group=group)
-    return SizeTable(d_mm, amplitude, sigma_x, sigma_y, change_x, change_y, _study_cases(columns), depth)
+    change_x = eq6.width_changes(sigma_x, depth_ratio=depth, group=group)
+    change_y = None if sigma_y is None else eq6.width_changes(sigma_y, depth_ratio=depth, group=group)
+    return eq6.SizeTable(d_mm, amplitude, sigma_x, sigma_y, change_x, change_y, _study_cases(columns), depth)
 
 
-def _study_cases(columns: dict[str, list[Any]]) -> StudyCases | None:
+def _study_cases(columns: dict[str, list[Any]]) -> eq6.StudyCases | None:
     """Study case of each row; None where a row lacks the lump's stiffness."""
     if None in columns["stiffness_ratio"]:
         return None
     depth, ratio = (np.asarray(columns[name], dtype=np.float64) for name in ("depth_ratio", "stiffness_ratio"))
     told = {name: columns[name] for name in ("thickness_mm", "head_radius_mm") if None not in columns[name]}
     others = {name: np.asarray(values, dtype=np.float64) for name, values in told.items()}
-    return StudyCases(tuple(columns["seat"]), depth, ratio, others)
+    return eq6.StudyCases(tuple(columns["seat"]), depth, ratio, others)
 
 
 # --- A calibration corrected by a site's phantoms, from a table of their bumps or of their map files.

@@ -26,29 +26,9 @@ from tactile_bayes.api.repeatability import ExamFolder
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.batch import CLUSTER_LOST, BatchInterrupted, Outcome, run_batch
 from tactile_bayes.batch_store import BatchStore
+from tactile_bayes.campaigns import steps
 from tactile_bayes.campaigns.inputs import READ, Alike, StepResults, read_sources, unchanged
 from tactile_bayes.campaigns.match import Breasts, Match, NamedPlace, Visits, days_of, grown_masses, visit_dates
-from tactile_bayes.campaigns.steps import (
-    FEWEST_MASSES,
-    FILES,
-    NOT_LEARNED,
-    CampaignSettings,
-    Made,
-    Result,
-    Task,
-    copy_tasks,
-    digest_of,
-    learn_repeatability,
-    make_estimate,
-    make_figures,
-    make_growth,
-    make_map,
-    make_page,
-    make_pool,
-    make_size,
-    run_step,
-    taught_by,
-)
 from tactile_bayes.declarations import Record, field, names_of, replace
 from tactile_bayes.errors import TactileBayesError
 from tactile_bayes.files.atomic import sha256
@@ -83,7 +63,7 @@ class CampaignState(Record, eq=False):
     names: dict[str, list[str]] = field(default_factory=lambda: defaultdict(list))
     """By step, the first few exams or masses of `todo`."""
 
-    def of(self, step: str, name: str) -> Result | None:
+    def of(self, step: str, name: str) -> steps.Result | None:
         """Result of a step of an exam or mass; None where there is none."""
         return self.results[step].get(name)
 
@@ -97,14 +77,14 @@ class Stages:
 
     def __init__(self, *, store: BatchStore | None, executor: Executor | None = None, dry: bool = False) -> None:
         values = {} if store is None else store.values
-        results = {step: StepResults(values) for step in FILES}
+        results = {step: StepResults(values) for step in steps.FILES}
         self.found = CampaignState(results)
         self.needed: Counter[str] = Counter()
         self.tell: Progress = untold
         self._store, self._executor, self._dry = store, executor, dry
         self._done = 0
 
-    def run(self, step: str, tasks: Sequence[Task], *, without: int = 0) -> None:
+    def run(self, step: str, tasks: Sequence[steps.Task], *, without: int = 0) -> None:
         """Run one step for those that need it.
 
         `without` is how many more have no inputs: in a plan they will need the step, in a run they failed before it.
@@ -128,7 +108,7 @@ class Stages:
             else:
                 self.found.faults[task.name] = Fault(step, outcome.error)
 
-    def _run(self, step: str, tasks: Sequence[Task]) -> list[Outcome[Result]]:
+    def _run(self, step: str, tasks: Sequence[steps.Task]) -> list[Outcome[steps.Result]]:
         before, total = self._done, self._done + self.needed.total()
 
         def tell(done: int, _total: int) -> None:
@@ -136,7 +116,7 @@ class Stages:
 
         try:
             outcomes = run_batch(
-                run_step, tasks, key=attrgetter("key"), executor=self._executor, store=self._store, progress=tell
+                steps.run_step, tasks, key=attrgetter("key"), executor=self._executor, store=self._store, progress=tell
             )
         except BatchInterrupted as stop:
             path = None if self._store is None else self._store.path
@@ -145,7 +125,7 @@ class Stages:
         self.needed[step] -= len(tasks)
         return outcomes
 
-    def _kept(self, tasks: Sequence[Task]) -> list[Task]:
+    def _kept(self, tasks: Sequence[steps.Task]) -> list[steps.Task]:
         """Tasks done by earlier runs whose files are still what they were; the results of others are forgotten."""
         if self._store is None:
             return []
@@ -158,7 +138,7 @@ class Stages:
 
 
 def steps_needed(
-    exams: int, masses: int, *, settings: CampaignSettings, learns: bool, compared: int = 0
+    exams: int, masses: int, *, settings: steps.CampaignSettings, learns: bool, compared: int = 0
 ) -> dict[str, int]:
     """Steps that so many exams and masses take, done or not.
 
@@ -197,7 +177,7 @@ class Campaign:
         self,
         exams: Sequence[Exam],
         folder: Path,
-        settings: CampaignSettings,
+        settings: steps.CampaignSettings,
         *,
         store: BatchStore | None,
         executor: Executor | None = None,
@@ -233,7 +213,7 @@ class Campaign:
         if len({exam.of_mass for exam in self.exams}) == len(self.exams):
             self.not_pooled = "no mass has several exams at one visit"
         masses = 0 if self.not_pooled else len({exam.of_mass for exam in sound})
-        learns = taught_by(sound, self.settings) >= FEWEST_MASSES
+        learns = steps.taught_by(sound, self.settings) >= steps.FEWEST_MASSES
         grown = 0 if self.not_compared else len(grown_masses(sound))
         self._stages.needed.update(
             steps_needed(len(sound), masses, settings=self.settings, learns=learns, compared=grown)
@@ -279,7 +259,7 @@ class Campaign:
         if self.settings.figures:
             tasks = [self._estimate_task(exam, "figures") for exam in self._estimated(mapped)]
             self._stages.run("figures", tasks, without=len(exams) - len(tasks))
-        self._copy(EXAMS, [exam.name for exam in exams], steps=("map", "estimate", "figures"))
+        self._copy(EXAMS, [exam.name for exam in exams], made_by=("map", "estimate", "figures"))
 
     def _estimated(self, exams: Sequence[Exam]) -> list[Exam]:
         """Those that have an estimate."""
@@ -298,27 +278,27 @@ class Campaign:
         self._stages.needed.subtract({step: count for step, count in spared.items() if step != "map"})
         return left
 
-    def _copy(self, kind: str, names: Sequence[str], *, steps: Sequence[str]) -> None:
+    def _copy(self, kind: str, names: Sequence[str], *, made_by: Sequence[str]) -> None:
         """Copy what steps made of exams or masses into the object store."""
         if self.settings.copy_to:
-            results = [self.found.results[step] for step in steps]
-            tasks = copy_tasks(self.folder / kind, names, results, to=f"{self.settings.copy_to}/{kind}")
+            results = [self.found.results[step] for step in made_by]
+            tasks = steps.copy_tasks(self.folder / kind, names, results, to=f"{self.settings.copy_to}/{kind}")
             self._stages.run("copy", tasks, without=len(names) - len(tasks))
 
     def _folder_of(self, exam: Exam) -> Path:
         return self.folder / EXAMS / exam.name
 
-    def _task(self, step: str, exam: Exam, key: object, make: Callable[[], Made]) -> Task:
+    def _task(self, step: str, exam: Exam, key: object, make: Callable[[], steps.Made]) -> steps.Task:
         """A step of an exam; `key` is all that its files depend on."""
-        return Task(step, exam.name, self._folder_of(exam), digest_of(key), make)
+        return steps.Task(step, exam.name, self._folder_of(exam), steps.digest_of(key), make)
 
-    def _map_task(self, exam: Exam) -> Task:
+    def _map_task(self, exam: Exam) -> steps.Task:
         given: dict[str, Any] = {"expected": self._expected(exam), "normalise": self.settings.normalise}
         digest = self._digests[exam.path]
-        make = partial(make_map, exam.path, source_sha256=digest, address=exam.address, **given)
+        make = partial(steps.make_map, exam.path, source_sha256=digest, address=exam.address, **given)
         return self._task("map", exam, {"scan": digest, **given}, make)
 
-    def _estimate_task(self, exam: Exam, step: str) -> Task:
+    def _estimate_task(self, exam: Exam, step: str) -> steps.Task:
         """Task of the estimate, or of its figures."""
         made = self.found.results["map"]
         settings, normalise = self.settings.of(exam), made[exam.name]["normalise"]
@@ -328,7 +308,7 @@ class Campaign:
             match = Match(exam.mass, places, self.settings.match_mm)
             told = [[one.mass, one.exam, made[one.exam]["files"][MAP], one.centre_mm] for one in places]
             key["match"] = {"mass": exam.mass, "most_mm": match.most_mm, "places": told}
-        make = make_estimate if step == "estimate" else make_figures
+        make = steps.make_estimate if step == "estimate" else steps.make_figures
         return self._task(step, exam, key, partial(make, self._folder_of(exam), settings, match))
 
     def _placed(self, mapped: Sequence[Exam]) -> list[Exam]:
@@ -372,11 +352,11 @@ class Campaign:
     def _learn_repeatability(self, sound: Sequence[Exam]) -> None:
         """Learn the spread between exams from the repeats, and size every exam by it from what its estimate left."""
         estimated, needed = self._estimated(sound), self._stages.needed
-        masses = taught_by(sound if self._dry else estimated, self.settings)
-        if masses < FEWEST_MASSES:
+        masses = steps.taught_by(sound if self._dry else estimated, self.settings)
+        if masses < steps.FEWEST_MASSES:
             if masses:
                 have = "mass has" if masses == 1 else "masses have"
-                self.not_learned = f"{masses} {have} repeated exams, and it takes {FEWEST_MASSES}"
+                self.not_learned = f"{masses} {have} repeated exams, and it takes {steps.FEWEST_MASSES}"
             needed["repeatability"] = needed["size"] = 0
             return
         complete = not self._dry or len(estimated) == len(sound)
@@ -390,8 +370,8 @@ class Campaign:
         if result is None:
             fault = self.found.faults.pop(SITE, None)
             self.not_learned = "" if fault is None else fault.reason
-        elif NOT_LEARNED in result:
-            self.not_learned = result[NOT_LEARNED]
+        elif steps.NOT_LEARNED in result:
+            self.not_learned = result[steps.NOT_LEARNED]
         else:
             self.repeatability = read_repeatability(self.folder / REPEATABILITY)
         again = estimated if self.repeatability else []
@@ -405,14 +385,14 @@ class Campaign:
         for block in _blocks(sound, self._block):
             known = [] if self._sizes_unknown else self._estimated(block)
             self._stages.run("page", [self._page_task(exam) for exam in known], without=len(block) - len(known))
-            self._copy(EXAMS, [exam.name for exam in block], steps=("size", "page"))
+            self._copy(EXAMS, [exam.name for exam in block], made_by=("size", "page"))
 
-    def _page_task(self, exam: Exam) -> Task:
+    def _page_task(self, exam: Exam) -> steps.Task:
         sized = self._file("size", exam, SIZED)
         day = "" if exam.day is None else exam.day.isoformat()
         told = self._expected(exam) | {"replicate": str(exam.replicate), "date": day}
         key = {"map": self._file("map", exam, MAP), "size": sized or self._file("estimate", exam, ESTIMATE)}
-        make = partial(make_page, self._folder_of(exam), told, report=ESTIMATE if sized is None else SIZED)
+        make = partial(steps.make_page, self._folder_of(exam), told, report=ESTIMATE if sized is None else SIZED)
         return self._task("page", exam, {**key, "told": told}, make)
 
     def _expected(self, exam: Exam) -> dict[str, str]:
@@ -420,15 +400,15 @@ class Campaign:
         columns = ("patient", "side", "reader", "visit", "mass")
         return {name: value for name in columns if (value := getattr(exam, name)) is not None}
 
-    def _repeatability_task(self, exams: Sequence[Exam]) -> Task:
+    def _repeatability_task(self, exams: Sequence[Exam]) -> steps.Task:
         files = [[exam.name, *(self._file("estimate", exam, file) for file in (ESTIMATE, SHAPE))] for exam in exams]
         repeats = [
             ExamFolder(exam.name, exam.of_mass, f"{exam.patient} {exam.mass}", self._folder_of(exam)) for exam in exams
         ]
-        digest = digest_of([FEWEST_MASSES, files])
-        return Task("repeatability", SITE, self.folder, digest, partial(learn_repeatability, repeats))
+        digest = steps.digest_of([steps.FEWEST_MASSES, files])
+        return steps.Task("repeatability", SITE, self.folder, digest, partial(steps.learn_repeatability, repeats))
 
-    def _size_task(self, exam: Exam) -> Task | None:
+    def _size_task(self, exam: Exam) -> steps.Task | None:
         """Task of a size by the repeatability; None where the exam has no draws, or another calibration."""
         made = self.found.results["map"][exam.name]
         settings = self._by_repeatability(self.settings.of(exam), made["normalise"])
@@ -437,7 +417,7 @@ class Campaign:
             return None
         files = [made["files"][MAP], self._file("estimate", exam, ESTIMATE), shape]
         key = {"files": files, "figures": figures, **self._settings_key(settings, made["normalise"])}
-        return self._task("size", exam, key, partial(make_size, self._folder_of(exam), settings, figures=figures))
+        return self._task("size", exam, key, partial(steps.make_size, self._folder_of(exam), settings, figures=figures))
 
     def _by_repeatability(self, settings: Settings, normalise: str) -> Settings:
         """Settings with the learned repeatability, where it is for the calibration that they lead to."""
@@ -456,13 +436,19 @@ class Campaign:
         self._of_masses("pool", MASSES, groups, self._pool_task, masses=len({exam.of_mass for exam in sound}))
 
     def _of_masses(
-        self, step: str, kind: str, found: Mapping[str, _Any], task_of: Callable[[str, _Any], Task], *, masses: int
+        self,
+        step: str,
+        kind: str,
+        found: Mapping[str, _Any],
+        task_of: Callable[[str, _Any], steps.Task],
+        *,
+        masses: int,
     ) -> None:
         """Run a step for the masses that have what it needs, out of so many."""
         known = {} if self._sizes_unknown else found
         for names in _blocks(list(known), self._block):
             self._stages.run(step, [task_of(name, known[name]) for name in names])
-            self._copy(kind, names, steps=(step,))
+            self._copy(kind, names, made_by=(step,))
         self._stages.run(step, [], without=masses - len(known))
         if self.settings.copy_to:
             self._stages.run("copy", [], without=masses - len(known))
@@ -475,10 +461,10 @@ class Campaign:
                 return f"size calibration {name} is not learned over bodies"
         return ""
 
-    def _pool_task(self, name: str, exams: Sequence[Exam]) -> Task:
+    def _pool_task(self, name: str, exams: Sequence[Exam]) -> steps.Task:
         settings, key = self._of_one_mass(exams)
-        make = partial(make_pool, self.folder / EXAMS, [exam.name for exam in exams], settings)
-        return Task("pool", name, self.folder / MASSES / name, digest_of(key), make)
+        make = partial(steps.make_pool, self.folder / EXAMS, [exam.name for exam in exams], settings)
+        return steps.Task("pool", name, self.folder / MASSES / name, steps.digest_of(key), make)
 
     def _of_one_mass(self, exams: Sequence[Exam]) -> tuple[Settings, dict[str, Any]]:
         """Settings by which exams are sized together, and all that the result depends on."""
@@ -493,17 +479,19 @@ class Campaign:
         masses = len(grown_masses(sound))
         self._of_masses("compare", GROWTH, grown_masses(self._estimated(sound)), self._compare_task, masses=masses)
 
-    def _compare_task(self, name: str, visits: Visits) -> Task:
+    def _compare_task(self, name: str, visits: Visits) -> steps.Task:
         settings, key = self._of_one_mass([exam for exams in visits.values() for exam in exams])
         days, figures = days_of(visits), self.settings.figures
         dates = tuple("" if day is None else day.isoformat() for day in visit_dates(visits).values())
         first = next(iter(visits.values()))[0]
         course = Course("", "", first.patient, first.side or "", first.mass, tuple(visits), dates if any(dates) else ())
         counts = [len(exams) for exams in visits.values()]
-        digest = digest_of({**key, "visits": counts, "days": days, "figures": figures, "course": repr(course)})
+        digest = steps.digest_of({**key, "visits": counts, "days": days, "figures": figures, "course": repr(course)})
         names = [[exam.name for exam in exams] for exams in visits.values()]
-        make = partial(make_growth, self.folder / EXAMS, names, settings, days=days, course=course, figures=figures)
-        return Task("compare", name, self.folder / GROWTH / name, digest, make)
+        make = partial(
+            steps.make_growth, self.folder / EXAMS, names, settings, days=days, course=course, figures=figures
+        )
+        return steps.Task("compare", name, self.folder / GROWTH / name, digest, make)
 
     def _file(self, step: str, exam: Exam, file: str) -> str | None:
         result = self.found.of(step, exam.name)

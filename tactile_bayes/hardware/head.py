@@ -14,20 +14,7 @@ from numpy.typing import NDArray
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError, DeviceError
 from tactile_bayes.geometry import FloatArray, rotation_from_quaternion
-from tactile_bayes.hardware.readings import (
-    CountArray,
-    EndReading,
-    FrameReading,
-    HelloReading,
-    MissingReading,
-    Parser,
-    PoseReading,
-    Reading,
-    SequenceCheck,
-    ToolReading,
-    plausible,
-    printable,
-)
+from tactile_bayes.hardware import readings
 from tactile_bayes.scans import ElementCalibration
 
 # --- The open framing of scan heads: COBS between zero bytes, version, type, sequence, device time, checksum.
@@ -161,14 +148,14 @@ _POSE: Final = struct.Struct("<H7d")  # ns beyond the header's microseconds, x y
 _MAX_ID: Final = 64
 
 
-def encode_hello(hello: HelloReading) -> bytes:
+def encode_hello(hello: readings.HelloReading) -> bytes:
     """Encode a device's identity: rows and columns (0 for a tracker), saturation count, rate, name."""
     numbers = _HELLO.pack(hello.rows, hello.columns, hello.saturation_count, round(hello.rate_hz * 1000))
     name = hello.device_id.encode()[:_MAX_ID]
     return encode_packet(HELLO, numbers + name)
 
 
-def encode_frame(counts: CountArray, *, sequence: int, device_us: int) -> bytes:
+def encode_frame(counts: readings.CountArray, *, sequence: int, device_us: int) -> bytes:
     """Encode one (rows, columns) frame row by row."""
     return encode_packet(FRAME, counts.astype("<u2").tobytes(), sequence=sequence, device_us=device_us)
 
@@ -178,12 +165,12 @@ def encode_end(sent: int, dropped: int) -> bytes:
     return encode_packet(END, _END.pack(sent, dropped))
 
 
-def encode_pose(pose: ToolReading, *, sequence: int) -> bytes:
+def encode_pose(pose: readings.ToolReading, *, sequence: int) -> bytes:
     """Encode a pose without rounding: doubles in mm, and the nanoseconds that the header's microseconds leave out.
 
     The tool's name follows, and a zero byte and why there is no pose, or what speaks against it.
     """
-    if isinstance(pose, PoseReading):
+    if isinstance(pose, readings.PoseReading):
         device_us, rest_ns = divmod(pose.device_ns or 0, 1000)
         payload, why = _POSE.pack(rest_ns, *pose.position_mm, *pose.quaternion_wxyz), ", ".join(pose.flags)
     else:
@@ -198,23 +185,23 @@ def encode_command(kind: int, *, every: int = 1) -> bytes:
     return encode_packet(kind, payload)
 
 
-class HeadParser(Parser):
+class HeadParser(readings.Parser):
     """Parser of a device in the open framing, head or tracker."""
 
     def __init__(self, *, every: int = 1) -> None:
         self.packets = PacketParser()
-        self.sequence = SequenceCheck()
-        self.hello: HelloReading | None = None
+        self.sequence = readings.SequenceCheck()
+        self.hello: readings.HelloReading | None = None
         self._every = every
 
-    def feed(self, data: bytes) -> list[Reading]:
+    def feed(self, data: bytes) -> list[readings.Reading]:
         found = [reading for packet in self.packets.feed(data) if (reading := self._read(packet)) is not None]
         self.garbage_bytes, version = self.packets.damaged_bytes, self.packets.foreign_version
         if version is not None:
             self.fault = f"it sent packets of version {version} of the framing, this program reads {VERSION}"
         return found
 
-    def _read(self, packet: Packet) -> Reading | None:
+    def _read(self, packet: Packet) -> readings.Reading | None:
         match packet.kind:
             case 2:
                 return self._frame(packet)
@@ -223,12 +210,12 @@ class HeadParser(Parser):
             case 1:
                 return self._hello(packet)
             case 3 if len(packet.payload) >= _END.size:
-                return EndReading(*_END.unpack_from(packet.payload))
+                return readings.EndReading(*_END.unpack_from(packet.payload))
             case _:
                 self._misfit(f"a packet of kind {packet.kind} with {len(packet.payload)} bytes")
                 return None
 
-    def _frame(self, packet: Packet) -> FrameReading | None:
+    def _frame(self, packet: Packet) -> readings.FrameReading | None:
         shape = (self.hello.rows, self.hello.columns) if self.hello else None
         if shape is None or len(packet.payload) != 2 * shape[0] * shape[1]:
             self._misfit(f"a FRAME of {len(packet.payload)} bytes" + ("" if shape else " before its HELLO"))
@@ -236,36 +223,36 @@ class HeadParser(Parser):
         restarts = self.sequence.restarts
         lost = self.sequence.missing_before(packet.sequence // self._every)
         counts = np.frombuffer(packet.payload, dtype="<u2").reshape(shape)
-        return FrameReading(counts, packet.device_us * 1000, lost, self.sequence.restarts > restarts)
+        return readings.FrameReading(counts, packet.device_us * 1000, lost, self.sequence.restarts > restarts)
 
     def _misfit(self, what: str) -> None:
         self.fault = f"it sent {what}"
 
-    def _pose(self, packet: Packet) -> ToolReading | None:
-        tool, _, why = printable(packet.payload[_POSE.size :]).partition("\0")
+    def _pose(self, packet: Packet) -> readings.ToolReading | None:
+        tool, _, why = readings.printable(packet.payload[_POSE.size :]).partition("\0")
         if len(packet.payload) < _POSE.size or max(len(tool), len(why)) > _MAX_ID:
             self._misfit(f"a POSE of {len(packet.payload)} bytes")
             return None
         rest_ns, x, y, z, qw, qx, qy, qz = _POSE.unpack_from(packet.payload)
         if why and math.isnan(x):
-            return MissingReading(why, tool)
-        if not plausible((x, y, z), (qw, qx, qy, qz)) or rest_ns > 999:
+            return readings.MissingReading(why, tool)
+        if not readings.plausible((x, y, z), (qw, qx, qy, qz)) or rest_ns > 999:
             self._misfit(f"a POSE that can be none, {x:g} {y:g} {z:g} mm, {qw:g} {qx:g} {qy:g} {qz:g}")
             return None
         self.sequence.missing_before(packet.sequence)
         flags = (why,) if why else ()
-        return PoseReading((x, y, z), (qw, qx, qy, qz), packet.device_us * 1000 + rest_ns, flags, tool)
+        return readings.PoseReading((x, y, z), (qw, qx, qy, qz), packet.device_us * 1000 + rest_ns, flags, tool)
 
-    def _hello(self, packet: Packet) -> HelloReading | None:
+    def _hello(self, packet: Packet) -> readings.HelloReading | None:
         if len(packet.payload) < _HELLO.size:
             self._misfit(f"a HELLO of {len(packet.payload)} bytes")
             return None
         rows, columns, saturation, millihertz = _HELLO.unpack_from(packet.payload)
-        name = printable(packet.payload[_HELLO.size :])
+        name = readings.printable(packet.payload[_HELLO.size :])
         if self.hello is not None and (name, rows, columns) != self.hello[:3]:
             self._misfit(f"a HELLO of {name!r} with {rows} x {columns} taxels beside that of {self.hello.device_id!r}")
             return None
-        self.hello = HelloReading(name, rows, columns, saturation, millihertz / 1000)
+        self.hello = readings.HelloReading(name, rows, columns, saturation, millihertz / 1000)
         return self.hello
 
 
@@ -280,7 +267,7 @@ def needed_baud(taxels: int, *, rate_hz: float) -> int:
     return round(frame_bytes_on_wire(taxels) * rate_hz * BITS_PER_BYTE_8N1)
 
 
-def check_link_rate(hello: HelloReading, *, baud: int, every: int = 1, port: str = "head") -> None:
+def check_link_rate(hello: readings.HelloReading, *, baud: int, every: int = 1, port: str = "head") -> None:
     """Refuse a line too slow for every n-th of the head's frames, with the rate needed and the decimation that would
     fit.
     """
@@ -313,7 +300,7 @@ class BladderStep(Record, eq=False):
     """(rows, columns) bool array: Taxels that reached full scale in any frame."""
 
     @classmethod
-    def of(cls, pressure_kpa: float, frames: CountArray, *, saturation_count: int) -> BladderStep:
+    def of(cls, pressure_kpa: float, frames: readings.CountArray, *, saturation_count: int) -> BladderStep:
         """Average the frames of a step."""
         if not np.isfinite(pressure_kpa) or pressure_kpa < 0:
             raise BadDataError(f"a step of {pressure_kpa} kPa", way_out="give the bladder's pressure, 0 or more")

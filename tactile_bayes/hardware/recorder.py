@@ -15,18 +15,8 @@ import numpy as np
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import DeviceError
 from tactile_bayes.geometry import FloatArray, inverse, rotation_from_quaternion
+from tactile_bayes.hardware import readings
 from tactile_bayes.hardware.ports import SILENT_S, Port, Stream
-from tactile_bayes.hardware.readings import (
-    CountArray,
-    EndReading,
-    Follower,
-    FrameReading,
-    MissingReading,
-    Parser,
-    PoseClock,
-    PoseReading,
-    tally,
-)
 from tactile_bayes.mapping.select import Jumps, Span, apart, overlap_cautions
 
 # --- Summary of a recording: what arrived, what was lost, and what makes it unfit for use.
@@ -155,7 +145,7 @@ class LandmarkTouch:
         self._wanted = samples
         self._points: list[FloatArray] = []
 
-    def add(self, pose: PoseReading) -> Touch | None:
+    def add(self, pose: readings.PoseReading) -> Touch | None:
         """Add one pose; returns the landmark when there are enough. Poses that the tracker flags are skipped."""
         if pose.flags:
             return None
@@ -185,7 +175,7 @@ _TRACKER_BYTES: Final = 32768
 class Sink(Protocol):
     """Interface of a recording's destination; `files` has the one for scan files."""
 
-    def add_frame(self, counts: CountArray, *, device_ns: int, host_ns: int) -> None: ...
+    def add_frame(self, counts: readings.CountArray, *, device_ns: int, host_ns: int) -> None: ...
     def add_pose(
         self, position_mm: FloatArray, quaternion_wxyz: FloatArray, *, device_ns: int, host_ns: int
     ) -> None: ...
@@ -200,8 +190,8 @@ class Observer(Protocol):
     """Interface of a recording's spectator, which must never wait; it is told the account several times a second."""
 
     def landmark(self, name: str, position_mm: FloatArray) -> None: ...
-    def frame(self, counts: CountArray, device_ns: int) -> None: ...
-    def pose(self, pose: PoseReading, device_ns: int) -> None: ...
+    def frame(self, counts: readings.CountArray, device_ns: int) -> None: ...
+    def pose(self, pose: readings.PoseReading, device_ns: int) -> None: ...
     def told(self, report: Report) -> None: ...
 
 
@@ -212,7 +202,7 @@ class Line:
     role: str
     port: Port
     stream: Stream
-    parser: Parser
+    parser: readings.Parser
     start: bytes
     stop: bytes
     silent_s: float = SILENT_S  #: After so long without a byte it has gone.
@@ -236,7 +226,7 @@ class Recorder:
         sink: Sink,
         *,
         shared_clock: bool = False,
-        follower: Follower | None = None,
+        follower: readings.Follower | None = None,
         duration_s: float | None = None,
         rate_hz: float = 0.0,
         observer: Observer | None = None,
@@ -245,8 +235,8 @@ class Recorder:
         self.report = Report()
         self._head, self._tracker, self._sink = head, tracker, sink
         self._lines = [line for line in (head, tracker) if line is not None]
-        self._clock = PoseClock(shared=shared_clock)
-        self._follower = follower or Follower()
+        self._clock = readings.PoseClock(shared=shared_clock)
+        self._follower = follower or readings.Follower()
         self._why_missing: Counter[str] = Counter()
         self._why_flagged: Counter[str] = Counter()
         self._jumps = Jumps()
@@ -258,7 +248,7 @@ class Recorder:
         self._now_ns = clock_ns
         self._zero_ns = clock_ns()
         self._touch: LandmarkTouch | None = None
-        self._last_pose: PoseReading | None = None
+        self._last_pose: readings.PoseReading | None = None
         self._pose_ns = -1
         self._drain_until_ns: int | None = None
         self.recording = False
@@ -326,20 +316,20 @@ class Recorder:
 
     def _read(self, line: Line, reading: object, host_ns: int) -> None:
         match reading:
-            case FrameReading():
+            case readings.FrameReading():
                 self._frame(reading, host_ns)
-            case PoseReading() | MissingReading():
+            case readings.PoseReading() | readings.MissingReading():
                 for one, came_ns in self._follower.take(reading, host_ns):
-                    if isinstance(one, PoseReading):
+                    if isinstance(one, readings.PoseReading):
                         self._pose(one, came_ns)
                     else:
                         self._missing(one, came_ns)
-            case EndReading():
+            case readings.EndReading():
                 self._ended(line, reading)
             case _:
                 pass
 
-    def _frame(self, reading: FrameReading, host_ns: int) -> None:
+    def _frame(self, reading: readings.FrameReading, host_ns: int) -> None:
         if not self.recording:
             return
         report, host_ns = self.report, host_ns - self._zero_ns
@@ -367,13 +357,13 @@ class Recorder:
         if self._observer is not None:
             self._observer.frame(reading.counts, device_ns)
 
-    def _pose(self, reading: PoseReading, host_ns: int) -> None:
+    def _pose(self, reading: readings.PoseReading, host_ns: int) -> None:
         host_ns -= self._zero_ns
         self._touched(reading, host_ns)
         if not self.recording:
             return
         if reading.device_ns is not None and self._last_pose is not None and reading[:3] == self._last_pose[:3]:
-            self._missing(MissingReading("an old record sent again", reading.tool), host_ns + self._zero_ns)
+            self._missing(readings.MissingReading("an old record sent again", reading.tool), host_ns + self._zero_ns)
             return
         moment = self._clock.place(reading.device_ns, host_ns)
         if moment is None:
@@ -398,12 +388,12 @@ class Recorder:
         if self._observer is not None:
             self._observer.pose(reading, device_ns)
 
-    def _missing(self, reading: MissingReading, host_ns: int) -> None:
+    def _missing(self, reading: readings.MissingReading, host_ns: int) -> None:
         """Count a pose that the tracker does not have, once frames come; the log has where a gap begins and ends."""
         if not (self.recording and self.report.frames):
             return
         self.report.poses_missing += 1
-        tally(self._why_missing, reading.why)
+        readings.tally(self._why_missing, reading.why)
         self._unseen(reading.why, host_ns - self._zero_ns)
 
     def _unseen(self, why: str, host_ns: int) -> None:
@@ -413,18 +403,18 @@ class Recorder:
             self._note(text, "tracker", max(0, self._pose_ns), host_ns)
         self.report.unseen = why
 
-    def _flags(self, reading: PoseReading) -> tuple[str, ...]:
+    def _flags(self, reading: readings.PoseReading) -> tuple[str, ...]:
         """Flags that the device set on a pose, and whether it repeats the last one."""
         self.report.poses_flagged += bool(reading.flags)
         for flag in reading.flags:
-            tally(self._why_flagged, flag.rstrip("-0123456789 "))
+            readings.tally(self._why_flagged, flag.rstrip("-0123456789 "))
         last, self._last_pose = self._last_pose, reading
         if last is None or (last.position_mm, last.quaternion_wxyz) != (reading.position_mm, reading.quaternion_wxyz):
             return reading.flags
         self.report.poses_repeated += 1
         return (*reading.flags, "repeated")
 
-    def _touched(self, reading: PoseReading, host_ns: int) -> None:
+    def _touched(self, reading: readings.PoseReading, host_ns: int) -> None:
         touch = self._touch.add(reading) if self._touch else None
         if touch is None:
             return
@@ -439,7 +429,7 @@ class Recorder:
     def _note(self, text: str, device: str, device_ns: int, host_ns: int, *, serious: bool = True) -> None:
         self._sink.add_note(text, device=device, device_ns=device_ns, host_ns=max(0, host_ns), serious=serious)
 
-    def _ended(self, line: Line, reading: EndReading) -> None:
+    def _ended(self, line: Line, reading: readings.EndReading) -> None:
         if not self.recording:
             return
         line.finished = True

@@ -89,7 +89,10 @@ CALLS: dict[str, tuple[Callable[..., Any], str]] = {
     "days as a number": (lambda one: tb.compare(one, one, days=3), "days is 3; give a list"),  # type: ignore[arg-type]
     "dates as a text": (lambda one: tb.compare(one, one, dates="2026-01-01"), "dates is '2026-01-01'; give a list"),
     "growth as a number": (lambda one: tb.compare(one, one, grown_by=0.2), "grown_by is 0.2"),  # type: ignore[arg-type]
-    "growth in percent": (lambda one: tb.compare(one, one, grown_by=[20]), "grown_by is 20; give a number above -1"),
+    "growth in percent": (
+        lambda one: tb.compare(one, one, grown_by=[20]),
+        r"grown_by\[0\] is 20; give a number above -1",
+    ),
     "a shift as text": (lambda one: tb.compare(one, one, registration_mm="5"), "registration_mm is '5'"),  # type: ignore[arg-type]
     "a title of no text": (lambda one: one.report("x.html", title=3), "title is 3; give a text"),
     "a day of no text": (lambda one: one.report("x.html", day=3), "'3' is no date"),
