@@ -152,15 +152,13 @@ class InlineExecutor(Executor):
 
 
 def open_executor(*, workers: int = 1, cluster: str | None = None) -> AbstractContextManager[Executor]:
-    """Open the executor that ``--workers`` and ``--cluster`` ask for: a cluster if an address is given, else local."""
-    return cluster_executor(cluster) if cluster else local_executor(workers)
+    """Open the executor that ``--workers`` and ``--cluster`` ask for: over a cluster if an address is given.
 
-
-def local_executor(workers: int) -> Executor:
-    """Executor over `workers` processes of this machine; 0 or 1 runs in this process, with the same results.
-
-    Processes that are killed are replaced; see `LocalWorkers`.
+    Else over processes of this machine, of which those that are killed are replaced; 0 or 1 `workers` run in this
+    process, with the same results.
     """
+    if cluster:
+        return cluster_executor(cluster)
     if workers < 0:
         raise UsageError(f"workers is {workers}; give 0 or 1 for this process, more for that many processes")
     return InlineExecutor() if workers <= 1 else LocalWorkers(workers)
@@ -295,12 +293,21 @@ def run_batch(
     key. Without an executor the items are run here, one by one. Items that the store already has are not run again;
     failed ones are. `progress` is called with (done, total) once at the start and after each item.
     """
-    work = dict(_named(items, key))
+    work: dict[str, Item] = {}
+    for item in items:
+        if (name := key(item)) in work:
+            raise BadDataError(f"two items of the batch are called {name!r}", way_out="give each its own name")
+        work[name] = item
     kept = {} if store is None else store.values
     outcomes: dict[str, Outcome[Result]] = {name: Outcome(name, value=kept[name]) for name in work if name in kept}
 
     def keep(outcome: Outcome[Result]) -> None:
-        outcomes[outcome.key] = outcome if store is None else _stored(outcome, store)
+        if store is not None and outcome.ok:  # as a resumed batch reads it: fresh and resumed results are equal
+            try:
+                outcome = Outcome(outcome.key, value=store.add(outcome.key, outcome.value))
+            except (TypeError, ValueError) as error:  # not JSON, or refused by the store's encoder
+                outcome = Outcome(outcome.key, error=one_line(error))
+        outcomes[outcome.key] = outcome
         if progress is not None:
             progress(len(outcomes), len(work))
 
@@ -313,26 +320,6 @@ def run_batch(
         done = [outcomes[name] for name in work if name in outcomes]
         raise BatchInterrupted(done, total=len(work), store=None if store is None else store.path) from None
     return [outcomes[name] for name in work]
-
-
-def _named(items: Iterable[Item], key: Callable[[Item], str]) -> Iterator[tuple[str, Item]]:
-    seen: set[str] = set()
-    for item in items:
-        name = key(item)
-        if name in seen:
-            raise BadDataError(f"two items of the batch are called {name!r}", way_out="give each its own name")
-        seen.add(name)
-        yield name, item
-
-
-def _stored(outcome: Outcome[Result], store: BatchStore) -> Outcome[Result]:
-    """Convert an outcome to what a resumed batch will read, so that fresh and resumed results are equal."""
-    if not outcome.ok:
-        return outcome
-    try:
-        return Outcome(outcome.key, value=store.add(outcome.key, outcome.value))
-    except (TypeError, ValueError) as error:  # not JSON, or refused by the store's encoder
-        return Outcome(outcome.key, error=one_line(error))
 
 
 class _Run(Generic[Item, Result]):
@@ -353,8 +340,8 @@ class _Run(Generic[Item, Result]):
         self._workers = executor if isinstance(executor, LocalWorkers) else None
         self._rest: deque[tuple[str, Item]] = deque(todo)
         self._suspects: deque[tuple[str, Item]] = deque()
-        self._waiting: dict[Future[tuple[Result | None, str]], tuple[str, Item]] = {}
-        self._finished: SimpleQueue[Future[tuple[Result | None, str]]] = SimpleQueue()
+        self._waiting: dict[Future[Outcome[Result]], tuple[str, Item]] = {}
+        self._finished: SimpleQueue[Future[Outcome[Result]]] = SimpleQueue()
         self._alone = False
 
     def run(self) -> None:
@@ -380,7 +367,7 @@ class _Run(Generic[Item, Result]):
                 return
 
     def _submit(self, work: tuple[str, Item]) -> None:
-        future = self._executor.submit(_attempt, self._function, work[1])
+        future = self._executor.submit(_attempt, self._function, work[0], work[1])
         self._waiting[future] = work
         future.add_done_callback(self._finished.put)
 
@@ -422,21 +409,20 @@ class _Run(Generic[Item, Result]):
             self._workers.stop()
 
 
-def _attempt(function: Callable[[Item], Result], item: Item) -> tuple[Result | None, str]:
-    """Run one item; return its error as text, which every executor can send back."""
+def _attempt(function: Callable[[Item], Result], name: str, item: Item) -> Outcome[Result]:
+    """Run one item; its error is text, which every executor can send back."""
     try:
-        return function(item), ""
+        return Outcome(name, function(item))
     except Exception as error:
-        return None, one_line(error)
+        return Outcome(name, error=one_line(error))
 
 
-def _settle(name: str, future: Future[tuple[Result | None, str]]) -> Outcome[Result]:
+def _settle(name: str, future: Future[Outcome[Result]]) -> Outcome[Result]:
     """Read the outcome of a finished future; a lost worker or a result that cannot be sent is the item's error."""
     try:
-        value, error = future.result()
+        return future.result()
     except CancelledError:
         return Outcome(name, error=CLUSTER_LOST)
     except Exception as fault:
         killed = type(fault).__name__ == "KilledWorker"  # dask's, after several workers ended over the item
         return Outcome(name, error=DIED_OFTEN if killed else one_line(fault))
-    return Outcome(name, value=value, error=error)

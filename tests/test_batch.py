@@ -27,7 +27,6 @@ from tactile_bayes.batch import (
     InlineExecutor,
     cluster_executor,
     fault_lines,
-    local_executor,
     open_executor,
     run_batch,
 )
@@ -126,7 +125,7 @@ def test_two_items_of_one_name_are_refused():
 
 @pytest.mark.parametrize("workers", [1, 2])
 def test_a_failed_item_is_named_and_the_rest_kept(workers):
-    with local_executor(workers) as executor:
+    with open_executor(workers=workers) as executor:
         outcomes = run_batch(refuse_odd, range(4), key=lambda item: f"case {item}", executor=executor)
     assert [outcome.value for outcome in outcomes] == [0, None, 4, None]
     assert [outcome.ok for outcome in outcomes] == [True, False, True, False]
@@ -136,7 +135,7 @@ def test_a_failed_item_is_named_and_the_rest_kept(workers):
 
 @pytest.mark.parametrize("workers", [1, 2])
 def test_an_error_that_cannot_travel_is_still_one_line(workers):
-    with local_executor(workers) as executor:
+    with open_executor(workers=workers) as executor:
         (outcome,) = run_batch(raise_unpicklable, [7], key=str, executor=executor)
     assert outcome.error == "LocalError: cannot travel 7"
 
@@ -151,7 +150,7 @@ def die_once(work: tuple[int, Path]) -> int:
 
 
 def test_a_killed_worker_costs_no_result(tmp_path):
-    with local_executor(2) as executor:
+    with open_executor(workers=2) as executor:
         outcomes = run_batch(die_once, [(i, tmp_path) for i in range(8)], key=repr, executor=executor)
     assert (tmp_path / "died").exists()
     assert [outcome.value for outcome in outcomes] == list(range(8))
@@ -167,7 +166,7 @@ def test_a_worker_killed_while_it_hands_over_its_result_holds_up_nobody(tmp_path
             import os, sys, time
             from pathlib import Path
             from tactile_bayes.batch import run_batch
-            from tactile_bayes.batch import local_executor
+            from tactile_bayes.batch import open_executor
 
             def large(item):
                 (Path(sys.argv[1]) / "writing").write_text(str(os.getpid()))
@@ -176,7 +175,7 @@ def test_a_worker_killed_while_it_hands_over_its_result_holds_up_nobody(tmp_path
                 return bytes(20_000_000)
 
             if __name__ == "__main__":
-                with local_executor(2) as executor:
+                with open_executor(workers=2) as executor:
                     outcomes = run_batch(large, range(3), key=str, executor=executor)
                 print([len(outcome.value) for outcome in outcomes])
             """
@@ -205,7 +204,7 @@ def waits_to_write(pid: int) -> bool:
 
 
 def test_an_item_whose_worker_dies_twice_is_at_fault_and_no_other():
-    with local_executor(2) as executor:
+    with open_executor(workers=2) as executor:
         outcomes = run_batch(die_on_three, range(8), key=str, executor=executor)
     assert [outcome.value for outcome in outcomes] == [0, 1, 2, None, 4, 5, 6, 7]
     assert outcomes[3].error == batch.DIED_TWICE
@@ -219,7 +218,7 @@ def test_ctrl_c_carries_what_is_done_and_does_not_wait_for_workers(tmp_path):
             wait_until((tmp_path / "pid").exists)
             raise KeyboardInterrupt
 
-    with local_executor(2) as executor, pytest.raises(BatchInterrupted) as stop:
+    with open_executor(workers=2) as executor, pytest.raises(BatchInterrupted) as stop:
         run_batch(
             sleep_for_ever,
             [(0, tmp_path), (1, tmp_path)],
@@ -278,7 +277,7 @@ def test_after_the_loss_of_a_cluster_nothing_more_is_handed_out(tmp_path):
 
 def test_negative_workers_are_refused():
     with pytest.raises(UsageError, match="workers is -1"):
-        local_executor(-1)
+        open_executor(workers=-1)
 
 
 # --- interruption
@@ -508,7 +507,7 @@ def test_a_killed_batch_resumes_and_its_workers_end(tmp_path, child_environment)
             from pathlib import Path
             from tactile_bayes.batch import run_batch
             from tactile_bayes.batch_store import BatchStore, open_store
-            from tactile_bayes.batch import local_executor
+            from tactile_bayes.batch import open_executor
 
             def slow(item):
                 (Path(sys.argv[1]) / f"pid-{os.getpid()}").touch()
@@ -516,7 +515,8 @@ def test_a_killed_batch_resumes_and_its_workers_end(tmp_path, child_environment)
                 return item * 10
 
             if __name__ == "__main__":
-                with open_store(Path(sys.argv[1]) / "store", settings={}) as store, local_executor(2) as executor:
+                place = Path(sys.argv[1]) / "store"
+                with open_store(place, settings={}) as store, open_executor(workers=2) as executor:
                     outcomes = run_batch(slow, range(int(sys.argv[2])), key=str, executor=executor, store=store)
                 print(sum(outcome.value for outcome in outcomes))
             """
