@@ -65,6 +65,7 @@ def plain_names(
             continue
         taken = {*known.values(), *found.values()}
         alike = [name for name in names if name.rpartition(".")[2].lower() in words and name not in taken]
+        alike = [name for name in alike if name.rpartition(".")[2] in words] or alike  # t, where there is a T too
         if here in _BESIDE:
             both = {**known, **found}
             group = next((both[one].rpartition(".")[0] for one in _BESIDE[here] if one in both), "")
@@ -88,6 +89,8 @@ def _arrays(shapes: Mapping[str, Shape]) -> Iterator[str]:
 def _line(name: str, guessed: Mapping[str, str], shapes: Mapping[str, Shape], told: str) -> str:
     if name in shapes:
         return f"# {name} is called so  # {told}"
+    if name == "counts" and "frames" in shapes:
+        return f"# counts are called frames  # {told}"
     if name in guessed:
         return f"{name} = {dump_json(guessed[name]).strip()}  # guessed; {told}"
     return f'# {name} = ""  # {told}'
@@ -110,6 +113,7 @@ def _guessed(shapes: Mapping[str, Shape]) -> dict[str, str]:
     }
     for here, places in _BESIDE.items():
         only = [free[found[name][0]] for name in places if len(found.get(name, ())) == 1]
+        only += [shapes[name] for name in places if name in shapes]
         ends = {max(shape[0], shape[-1], key=int) for shape in only}  # either may be that of time
         found[here] = of(lambda s, ends=ends: len(s) == 1 and s[0] in ends)  # type: ignore[misc]
     by_shape = {here: names[0] for here, names in found.items() if here not in shapes and len(names) == 1}

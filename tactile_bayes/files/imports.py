@@ -19,6 +19,7 @@ from tactile_bayes.files.arrays_layout import KNOWN, LAYOUT, OPTIONAL, ArrayMap,
 from tactile_bayes.files.instrument_json import read_array_calibration, read_head_geometry, read_landmarks
 from tactile_bayes.files.named_arrays import Source, is_text, read_named
 from tactile_bayes.files.npz import Arrays
+from tactile_bayes.files.reading import kind_of
 from tactile_bayes.files.scan_mcap import read_scan
 from tactile_bayes.files.scan_text import read_frames, read_poses
 from tactile_bayes.files.sequence_mha import is_sequence, read_sequence
@@ -34,6 +35,7 @@ _STEP_KPA: Final = 0.001
 _MOST_COUNTS: Final = 65535
 _SECONDS: Final = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0}
 _MM: Final = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "inch": 25.4}
+_MOST_NAMES: Final = 12  # of a file's arrays in an error
 _NOT_RIGID: Final = 1e-3  # of matrices that were written with few digits
 _TIME_OPTIONS: Final = {"frame_time_s": "time-unit", "pose_time_s": "pose-time-unit"}
 _BESIDE: Final = {
@@ -103,9 +105,10 @@ def _read(path: Path, given: ArrayMap, beside: Sequence[Source]) -> Source:
         if name not in KNOWN:
             raise BadDataError(f"--columns: {name!r} is no array of a scan", way_out=meant(name, KNOWN))
     there: dict[str, str] = {}
+    others: set[str] = set()
 
     def choose(names: Sequence[str]) -> list[str]:
-        held = ", ".join(sorted(names)[:12]) or "nothing"
+        held = ", ".join(sorted(names)[:_MOST_NAMES]) or "nothing"
         for here, name in given.arrays.items():
             if name not in names:
                 raise BadDataError(f"has no array {name!r} for {here}", way_out=f"it has {held}")
@@ -115,17 +118,23 @@ def _read(path: Path, given: ArrayMap, beside: Sequence[Source]) -> Source:
             needed = ", ".join(f"{name} ({in_words(LAYOUT[name].shape)})" for name in LAYOUT if name not in OPTIONAL)
             more = " (for a grid of values give --as map)" if "mean" in names else ""
             raise BadDataError(f"lacks {needed} (it has {held})", way_out=f"{_TEMPLATE}{more}; {_HELP}")
+        others.update(set(names) - set(there.values()))
         return list(dict.fromkeys(there.values()))
 
     held = read_named(path, choose)
     arrays = {here: held[name] for here, name in there.items()}
     guessed = {here: name for here, name in there.items() if name not in (here, given.arrays.get(here))}
     arrays |= {name: np.asarray(value) for name, value in given.values.items()}
-    return Source(arrays, notes=tuple(f"{name} is taken for {here}" for here, name in guessed.items()))
+    notes = tuple(f"{name} is taken for {here}" for here, name in guessed.items())
+    return Source(arrays, notes=notes, others=tuple(sorted(others)))
 
 
 def of_poses(path: Path, given: Stated) -> Source:
     """Poses of a file of their own: a table, or a sequence metafile."""
+    if not is_sequence(path) and not is_text(path):
+        what = f"is {kind_of(path) or 'a file of arrays'}, and poses that stand apart are a table of text"
+        way_out = "save them as .csv, or in the frames' file as pose_matrix and pose_time_s"
+        raise BadDataError(what, way_out=way_out, path=str(path))
     found = read_sequence(path, given, frames=False) if is_sequence(path) else read_poses(path, given)
     return replace(found, path=str(path))
 
@@ -199,7 +208,7 @@ def combined(sources: Sequence[Source], given: Stated) -> Imported:
     for name in ("gain_kpa_per_count", "offset_kpa"):
         if name in held and held[name].size == 1 and held.get("counts", np.empty(0)).ndim == 3:
             held[name] = np.full(held["counts"].shape[1:], float(held[name].item()))  # one for all taxels
-    _refuse_missing(held)
+    _refuse_missing(held, [name for source in sources for name in source.others])
     _check_shapes(held)
     _check_counts(held)
     _check_units(held, calibrated=pressure)
@@ -209,13 +218,17 @@ def combined(sources: Sequence[Source], given: Stated) -> Imported:
     return Imported(_scan(held, facts), tuple(told))
 
 
-def _refuse_missing(held: Arrays) -> None:
+def _refuse_missing(held: Arrays, others: Sequence[str]) -> None:
     missing = [name for name in LAYOUT if name not in held and name not in OPTIONAL]
     if not missing:
         return
     lacks = ", ".join(f"{name} ({in_words(LAYOUT[name].shape)})" for name in missing)
     options = [option for option, gives in _BESIDE.items() if set(gives) & set(missing)]
     way_out = f"add them, or give {', '.join(options)}" if options else "add them"
+    if others:
+        raise BadDataError(
+            f"lacks {lacks}; not known: {', '.join(others[:_MOST_NAMES])}", way_out=f"{_TEMPLATE}; or {way_out}"
+        )
     raise BadDataError(f"lacks {lacks} (it has {', '.join(sorted(held))})", way_out=f"{way_out}; {_HELP}")
 
 

@@ -38,6 +38,7 @@ class Source(Record, eq=False):
     arrays: Arrays
     stated: Stated = Stated()
     notes: tuple[str, ...] = ()
+    others: tuple[str, ...] = ()  #: Names in its file that are none of a scan.
     path: str = ""  #: Of a file beside the frames', for errors.
 
 

@@ -58,6 +58,9 @@ def choose_npz(path: Path, choose: Callable[[Sequence[str]], Iterable[str]]) -> 
         _check_zip(stream)
         with decoding("is not a whole .npz file", way_out="copy it again"), zipfile.ZipFile(stream) as archive:
             members = {name.removesuffix(".npy"): archive.getinfo(name) for name in archive.namelist()}
+            if members and not any(name.endswith(".npy") for name in archive.namelist()):
+                what = f"is a zip archive without arrays (it has {', '.join(sorted(members)[:3])})"
+                raise BadDataError(what, way_out="save the sheet of a spreadsheet as .csv, arrays with numpy.savez")
             wanted = {name: members[name] for name in choose(list(members))}
             unpacked = sum(member.file_size for member in wanted.values())
             most = unpacked_limit(os.fstat(stream.fileno()).st_size)

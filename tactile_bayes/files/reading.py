@@ -190,6 +190,8 @@ _BEGINNINGS = {
     b"MM\x00*": "an image",
     b"P5": "an image",
     b"%PDF": "a PDF",
+    b"\x93NUMPY": "an array of numpy (.npy)",
+    b"MATLAB 5.0 MAT-file": "a .mat",
     b"CDF\x01": "a netCDF-3 file",
     b"CDF\x02": "a netCDF-3 file",
     b"CDF\x05": "a netCDF-3 file",

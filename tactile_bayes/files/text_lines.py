@@ -13,7 +13,7 @@ import numpy as np
 
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.files.reading import TABLE_BYTES, decoded, decoding, read_bytes
+from tactile_bayes.files.reading import TABLE_BYTES, decoded, decoding, kind_of, read_bytes
 from tactile_bayes.files.tables import may_be_thousands
 from tactile_bayes.geometry import FloatArray
 
@@ -76,6 +76,8 @@ def number(text: str, *, decimal_comma: bool = False) -> float:
 def read_lines(path: Path) -> list[str]:
     """Lines of a text, UTF-8 or with a byte order mark; a minus sign that is no hyphen is one."""
     data = read_bytes(path, most=TABLE_BYTES)
+    if b"\0" in data and (kind := kind_of(path)):
+        raise BadDataError(f"is {kind}, not a table of text", way_out="save it as .csv", path=str(path))
     text = decoded(data, path=path, way_out=_AS_UTF8, as_utf8=_AS_UTF8, may_be=("UTF-16",))
     if "\0" in text:
         raise BadDataError("is not text", way_out="give numbers as .npz, .npy, .mat, HDF5 or a table", path=str(path))

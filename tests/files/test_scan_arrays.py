@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
+import zipfile
 import zlib
 from collections.abc import Callable
 from copy import deepcopy
@@ -25,7 +26,7 @@ from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.array_map import array_template
 from tactile_bayes.files.arrays_layout import ArrayMap
 from tactile_bayes.files.documents import parse_toml
-from tactile_bayes.files.imports import import_arrays, read_arrays
+from tactile_bayes.files.imports import import_arrays, of_poses, read_arrays
 from tactile_bayes.files.named_arrays import read_named
 from tactile_bayes.files.scan_mcap import read_scan
 from tactile_bayes.forward.scene import Scene
@@ -407,6 +408,39 @@ def test_other_files_are_named_for_what_they_are(tmp_path: Path) -> None:
     (tmp_path / "x.h5").write_bytes(b"hello")
     with pytest.raises(BadDataError, match=r"is not an \.npz, \.npy, \.mat or HDF5 file"):
         read_arrays(tmp_path / "x.h5")
+    with zipfile.ZipFile(tmp_path / "sheet.xlsx", "w") as sheet:
+        sheet.writestr("xl/workbook.xml", "<workbook/>")
+    with pytest.raises(BadDataError, match=r"zip archive without arrays \(it has xl/workbook.xml\); save the sheet"):
+        read_arrays(tmp_path / "sheet.xlsx")
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("poses.npy", r"is an array of numpy \(\.npy\), and poses that stand apart are a table"),
+        ("poses.npz", r"is an archive .*; save them as \.csv, or in the frames' file as pose_matrix"),
+        ("npy.csv", r"is an array of numpy \(\.npy\), and poses"),
+    ],
+)
+def test_poses_apart_in_arrays_are_named_for_what_they_are(
+    pressed: Arrays, tmp_path: Path, name: str, words: str
+) -> None:
+    with (tmp_path / name).open("wb") as file:
+        (np.savez if name.endswith("z") else np.save)(file, pressed["position_mm"])
+    with pytest.raises(BadDataError, match=words):
+        of_poses(tmp_path / name, ArrayMap())
+
+
+def test_what_is_called_otherwise_is_listed_beside_what_is_missing(pressed: Arrays, tmp_path: Path) -> None:
+    """As `frames`, `t`, `T` (matrices) and `t_pose` of a notebook are."""
+    pressed["t"], pressed["t_pose"] = pressed.pop("frame_time_s"), pressed.pop("pose_time_s")
+    pressed["T"] = np.tile(np.eye(4), (len(pressed.pop("quaternion_wxyz")), 1, 1))
+    del pressed["position_mm"]
+    as_npz(tmp_path / "exam.npz", pressed)
+    with pytest.raises(BadDataError, match=r"lacks position_mm .* not known: T, t_pose; .*--template"):
+        import_arrays(tmp_path / "exam.npz", ArrayMap(unit="kPa"))
+    found = parse_toml(array_template(tmp_path / "exam.npz"), way_out="")["arrays"]
+    assert found == {"frame_time_s": "t", "pose_time_s": "t_pose", "pose_matrix": "T"}
 
 
 def test_the_template_names_what_shapes_tell_and_is_read_back(pressed: Arrays, tmp_path: Path) -> None:
