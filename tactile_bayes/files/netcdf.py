@@ -243,9 +243,10 @@ class Group:
             return
         declared = int(np.prod(found.chunks, dtype=object)) * found.dtype.itemsize
         check_limit(declared, self._most_bytes, what=f"a chunk of variable {name} unpacks to {{}} bytes")
-        for number in range(found.id.get_num_chunks()):
-            stored = found.id.get_chunk_info(number)
-            check_limit(stored.size, self._most_bytes, what=f"a chunk of variable {name} takes {{}} bytes")
+        chunks = [found.id.get_chunk_info(number) for number in range(found.id.get_num_chunks())]
+        largest = max((stored.size for stored in chunks), default=0)
+        check_limit(largest, self._most_bytes, what=f"a chunk of variable {name} takes {{}} bytes")
+        for stored in chunks:
             over = _unpacked_bytes(found, stored, filters, most=declared + 1) - declared
             if over:
                 what = f"a chunk of variable {name} unpacks to {'more' if over > 0 else 'less'} than it declares"

@@ -455,22 +455,18 @@ class _Sampler:
         return float(np.logaddexp.reduce(self.log_weights.ravel()) - np.log(self.number)), error
 
     def _end_error(self) -> float:
-        by_replicate = self.weights.reshape(self.log_weights.shape)
+        by_replicate, tails = self.weights.reshape(self.log_weights.shape), np.array([0.025, 0.975])
         worst = 0.0
         for i in range(self._theta.shape[2]):
             values = self._theta[:, :, i]
             mean = float(np.sum(self.weights * values.ravel()))
             sd = float(np.sqrt(np.sum(self.weights * (values.ravel() - mean) ** 2)))
-            ends = [weighted_quantile(v, w, (0.025, 0.975)) for v, w in zip(values, by_replicate, strict=True)]
+            order = np.argsort(values, axis=1)
+            ordered, weights = (np.take_along_axis(one, order, axis=1) for one in (values, by_replicate))
+            ends = [weighted_quantiles_of(v, w, tails) for v, w in zip(ordered, weights, strict=True)]
             error = float(np.sqrt(np.mean(np.var(ends, axis=0, ddof=1)) / len(ends)))
             worst = max(worst, error / sd if sd > 0 else 0.0)
         return worst
-
-
-def weighted_quantile(values: FloatArray, weights: FloatArray, probabilities: tuple[float, ...]) -> FloatArray:
-    """Quantiles of weighted draws, linear between the midpoints of their steps."""
-    order = np.argsort(values)
-    return weighted_quantiles_of(values[order], weights[order], np.array(probabilities))
 
 
 def systematic(weights: FloatArray, number: int, rng: np.random.Generator) -> IndexArray:

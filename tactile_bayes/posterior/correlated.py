@@ -95,9 +95,9 @@ def outline(fit: FieldFit) -> tuple[FloatArray, FloatArray]:
 
 def _columns(fit: FieldFit) -> tuple[FloatArray, FloatArray]:
     """(4, n) columns of the outline, and (2, n) of the oblique axis ratio and the exponent."""
-    scene, mode, cells = fit.scene, fit.mode, fit.target.window.cells
-    away = np.stack([cells.x_mm - scene.column(mode, "x"), cells.y_mm - scene.column(mode, "y")])
-    x, y = np.linalg.solve(np.linalg.cholesky(covariance_from_log_widths(*scene.widths(mode))), away)
+    cells, (x, y) = fit.target.window.cells, fit.centre_mm
+    root = np.linalg.cholesky(covariance_from_log_widths(*fit.scene.widths(fit.mode)))
+    x, y = np.linalg.solve(root, np.stack([cells.x_mm - x, cells.y_mm - y]))
     square = x**2 + y**2
     bump = np.exp(-0.5 * square)
     outer = bump * square
@@ -172,8 +172,8 @@ class Correlated(Record, eq=False):
             scene, detection = fit_and_test(tactile_map, fit, options)
         except NotConvergedError:
             return cls(tactile_map, fit, Detection(0.0, -np.inf))
-        x, y = (float(scene.plain.scene.column(scene.plain.mode[None], name)[0]) for name in "xy")
-        fault = rim_fault(tactile_map, (x, y), scene.plain.widths_mm, radius_mm=options.fit_radius_mm)
+        plain = scene.plain
+        fault = rim_fault(tactile_map, plain.centre_mm, plain.widths_mm, radius_mm=options.fit_radius_mm)
         if not fault and detection.probability >= DETECTED:
             scene, detection = with_neighbours(scene, detection, tactile_map, asked=options.scene_asked)
         return cls(tactile_map, fit, detection, scene, fault)
@@ -181,12 +181,7 @@ class Correlated(Record, eq=False):
     def bump(self) -> ModalBump:
         """The bump at the scene's mode."""
         fit = self._scene.fit
-        x, y = (float(fit.scene.column(fit.mode, name)) for name in "xy")
-        return ModalBump(fit.target.amplitude_at(fit.mode), x, y, *self.widths_mm())
-
-    def widths_mm(self) -> tuple[float, float]:
-        """Its widths."""
-        return self._scene.fit.widths_mm
+        return ModalBump(fit.target.amplitude_at(fit.mode), *fit.centre_mm, *fit.widths_mm)
 
     @property
     def _scene(self) -> SceneChoice:

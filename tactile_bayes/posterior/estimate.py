@@ -359,7 +359,7 @@ def _measured(work: Work, seen: Assessment, candidates: tuple[Candidate, ...]) -
     """Draw a lump that is one by the evidence, and size it; or the reason why not."""
     options, cell_mm = work.options, work.tactile_map.recipe.cell_mm
     detection, bump = seen.detection, seen.bump()
-    hopeless = width_fault(*seen.widths_mm(), cell_mm=cell_mm, margin=HOPELESS)
+    hopeless = width_fault(bump.sigma_x_mm, bump.sigma_y_mm, cell_mm=cell_mm, margin=HOPELESS)
     if hopeless is not None:
         return _none(hopeless, candidates, detection, bump)
     try:

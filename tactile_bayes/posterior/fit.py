@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
-from functools import partial
+from collections.abc import Mapping, Sequence
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from tactile_bayes.inference.modes import find_mode, finite_differences, mode_an
 from tactile_bayes.posterior.bump import covariance_from_log_widths, drawn_widths
 from tactile_bayes.posterior.draw import ROTATION_ODDS, Sampled, SamplerSettings, with_beside
 from tactile_bayes.posterior.marginal import FLOOR, NEGLIGIBLE, CollapsedTarget
-from tactile_bayes.posterior.window import Problem, Scene, Shape, linear_columns
+from tactile_bayes.posterior.window import STEP, Problem, Scene, Shape, linear_columns
 from tactile_bayes.presets import Method, SceneAsked
 
 # --- Posterior of a scene under correlated errors: its mode, a Gaussian for each noise field, and draws.
@@ -40,7 +40,7 @@ class Mixture(Gaussians, eq=False):
     log_evidence: float  #: Log of the integral of the density that the mixture stands for.
 
 
-class FieldFit(Record, eq=False):
+class FieldFit(Record, eq=False, dict=True):
     """A scene fitted at the mode of its marginal posterior."""
 
     target: CollapsedTarget  #: Its density, with the noise fields that matter there.
@@ -55,6 +55,19 @@ class FieldFit(Record, eq=False):
         """Structures in the model."""
         return self.target.scene
 
+    @cached_property
+    def at(self) -> Mapping[str, float]:
+        """Parameters at the mode by name, 0 for those that the scene does not have; p, q and r of `Scene.widths`."""
+        scene = self.scene
+        widths = zip("pqr", scene.widths(self.mode), strict=True)
+        named = {name: scene.column(self.mode, name) for name in STEP} | dict(widths)
+        return {name: float(value) for name, value in named.items()}
+
+    @property
+    def centre_mm(self) -> tuple[float, float]:
+        """The bump's centre at the mode."""
+        return self.at["x"], self.at["y"]
+
     @property
     def log_evidence(self) -> float:
         """Log evidence of the scene, from the Gaussians' volumes."""
@@ -68,14 +81,14 @@ class FieldFit(Record, eq=False):
     @property
     def widths_mm(self) -> tuple[float, float]:
         """sigma_x_mm and sigma_y_mm at the mode."""
-        sigma_x, sigma_y, _ = drawn_widths(*self.scene.widths(self.mode[None]))
+        sigma_x, sigma_y, _ = drawn_widths(*(np.array([self.at[name]]) for name in "pqr"))
         return float(sigma_x[0]), float(sigma_y[0])
 
     @property
     def width_sd_mm(self) -> float:
         """Posterior SD of the less certain width, from the Gaussian approximation."""
         names = [name for name in ("u", "v") if name in self.scene.names]
-        return max(self.sd(name) * float(np.exp(self.scene.column(self.mode, name))) for name in names)
+        return max(self.sd(name) * float(np.exp(self.at[name])) for name in names)
 
     def methods(self, options: SamplerSettings) -> Sequence[Method]:
         """The requested method, and the next one where a step up is allowed."""
@@ -491,9 +504,8 @@ def _regression(fit: FieldFit) -> tuple[FloatArray, float, float]:
 
 def _raw_column(fit: FieldFit) -> FloatArray:
     """(n,) derivative of the bump by its exponent, at the cells' centres."""
-    scene, mode, cells = fit.scene, fit.mode, fit.target.window.cells
-    p, q, r = scene.widths(mode)
-    away = np.stack([cells.x_mm - scene.column(mode, "x"), cells.y_mm - scene.column(mode, "y")], axis=-1)
-    covariance = covariance_from_log_widths(p, q, r)
+    cells, (x, y) = fit.target.window.cells, fit.centre_mm
+    away = np.stack([cells.x_mm - x, cells.y_mm - y], axis=-1)
+    covariance = covariance_from_log_widths(*fit.scene.widths(fit.mode))
     h = 0.5 * np.einsum("ni,ij,nj->n", away, np.linalg.inv(covariance), away)
     return np.asarray(-h * np.log(np.maximum(h, 1e-12)) * np.exp(-h))

@@ -206,7 +206,7 @@ def _starts(plain: FieldFit, extra: Neighbour, rising: FloatArray) -> tuple[list
 def _split(plain: FieldFit) -> FloatArray | None:
     """Start with two round lumps in place of one long bump; None where it is not long."""
     scene, mode = plain.scene, plain.mode
-    p, q, r = (float(v) for v in scene.widths(mode))
+    p, q, r = (plain.at[name] for name in "pqr")
     ratio = float(np.hypot(q, r))
     if ratio < np.log(LONG) / 2.0 or scene.shape == "round":
         return None
@@ -221,15 +221,14 @@ def _split(plain: FieldFit) -> FloatArray | None:
 
 def rises(fit: FieldFit, surroundings: Surroundings, extra: Neighbour, places: FloatArray) -> BoolArray:
     """(g,) whether the map rises by a share of the bump's amplitude at places of second lumps or ribs."""
-    scene, target = fit.scene, fit.target
-    amplitude = target.amplitude_at(fit.mode)
+    amplitude = fit.target.amplitude_at(fit.mode)
     rise = surroundings.rise(
         extra,
         places,
-        bump_mm=(float(scene.column(fit.mode, "x")), float(scene.column(fit.mode, "y"))),
-        bump_width_mm=float(np.exp(scene.widths(fit.mode)[0])),
+        bump_mm=fit.centre_mm,
+        bump_width_mm=float(np.exp(fit.at["p"])),
         amplitude=amplitude,
-        middle=target.window.middle,
+        middle=fit.target.window.middle,
     )
     return np.asarray(rise > LEAST_RISE * amplitude)
 
@@ -239,10 +238,8 @@ def second_lumps(plain: FieldFit, problem: Problem) -> FloatArray:
     reach = REACH_IN_RADII * problem.radius_mm
     axis = np.arange(-reach, reach + 1e-9, GRID_MM)
     x, y, w = (v.ravel() for v in np.meshgrid(axis, axis, np.log(GRID_WIDTHS_MM), indexing="ij"))
-    middle = problem.window.middle
-    p = float(plain.scene.widths(plain.mode)[0])
-    centre = [float(plain.scene.column(plain.mode, name)) for name in "xy"]
-    apart = np.hypot(x + middle[0] - centre[0], y + middle[1] - centre[1]) > (APART + 0.5) * np.exp(np.maximum(p, w))
+    middle, centre, wider = problem.window.middle, plain.centre_mm, np.exp(np.maximum(plain.at["p"], w))
+    apart = np.hypot(x + middle[0] - centre[0], y + middle[1] - centre[1]) > (APART + 0.5) * wider
     keep = apart & (np.hypot(x, y) < reach)
     return np.asarray(np.stack([x + middle[0], y + middle[1], w], axis=1)[keep])
 
@@ -270,17 +267,13 @@ def rising_ribs(plain: FieldFit, surroundings: Surroundings) -> FloatArray:
 
 
 def _place(fit: FieldFit) -> str:
-    scene, mode = fit.scene, fit.mode
-    width = float(np.exp(scene.column(mode, "w2")))
-    if scene.extra == "second lump":
-        x, y = float(scene.column(mode, "x2")), float(scene.column(mode, "y2"))
-        return f"at ({x:.1f}, {y:.1f}) mm, sigma {width:.1f} mm"
-    angle = float(np.degrees(scene.column(mode, "angle")) + 90.0) % 180.0
-    offset = float(scene.column(mode, "offset"))
-    middle, direction = fit.target.window.middle, float(scene.column(mode, "angle"))
-    centre = [float(scene.column(mode, name)) - m for name, m in zip("xy", middle, strict=True)]
-    away = abs(offset - centre[0] * np.cos(direction) - centre[1] * np.sin(direction))
-    return f"{away:.1f} mm from the lump's centre, along {angle:.0f} deg, sigma {width:.1f} mm"
+    at, width = fit.at, np.exp(fit.at["w2"])
+    if fit.scene.extra == "second lump":
+        return f"at ({at['x2']:.1f}, {at['y2']:.1f}) mm, sigma {width:.1f} mm"
+    angle, middle = at["angle"], fit.target.window.middle
+    away = abs(at["offset"] - (at["x"] - middle[0]) * np.cos(angle) - (at["y"] - middle[1]) * np.sin(angle))
+    along = (np.degrees(angle) + 90.0) % 180.0
+    return f"{away:.1f} mm from the lump's centre, along {along:.0f} deg, sigma {width:.1f} mm"
 
 
 # --- Lump or ridge: evidence for a lump against a rib-like ridge, where the map rises along a line.
@@ -305,8 +298,8 @@ def _holds_the_bump(ridge: FieldFit, plain: FieldFit) -> bool:
     """True where the second lump of a ridge's scene has moved onto the bump: that scene is not without the lump."""
     if ridge.scene.extra != "second lump":
         return False
-    x, y = (float(ridge.scene.column(ridge.mode, f"{name}2") - plain.scene.column(plain.mode, name)) for name in "xy")
-    return bool(np.hypot(x, y) < APART * np.exp(float(plain.scene.widths(plain.mode)[0])))
+    x, y = (ridge.at[f"{name}2"] - plain.at[name] for name in "xy")
+    return bool(np.hypot(x, y) < APART * np.exp(plain.at["p"]))
 
 
 def beside_ridge(choice: SceneChoice, ridge: FieldFit) -> FieldFit | None:
@@ -338,9 +331,9 @@ def _ridge_starts(choice: SceneChoice, problem: Problem, places: FloatArray) -> 
 def _through_bump(fit: FieldFit, problem: Problem) -> FloatArray:
     """(g, 3) ridges of the bump's width through its centre, in all directions."""
     angle = np.pi * np.arange(GRID_ANGLES) / GRID_ANGLES
-    x, y = (float(fit.scene.column(fit.mode, name)) - m for name, m in zip("xy", problem.window.middle, strict=True))
-    width = np.full(GRID_ANGLES, float(fit.scene.widths(fit.mode)[0]))
-    return np.stack([width, angle, x * np.cos(angle) + y * np.sin(angle)], axis=1)
+    x, y = (fit.at[name] - m for name, m in zip("xy", problem.window.middle, strict=True))
+    offset = x * np.cos(angle) + y * np.sin(angle)
+    return np.stack([np.full(GRID_ANGLES, fit.at["p"]), angle, offset], axis=1)
 
 
 def _best(choice: SceneChoice, scene: Scene, starts: FloatArray) -> FloatArray:
@@ -351,5 +344,5 @@ def _best(choice: SceneChoice, scene: Scene, starts: FloatArray) -> FloatArray:
 
 def ridge_text(fit: FieldFit) -> str:
     """Direction and width of a ridge in words."""
-    angle = float(np.degrees(fit.scene.column(fit.mode, "along")) + 90.0) % 180.0
-    return f"a ridge along {angle:.0f} deg, sigma {float(np.exp(fit.scene.widths(fit.mode)[0])):.1f} mm"
+    angle = (np.degrees(fit.at["along"]) + 90.0) % 180.0
+    return f"a ridge along {angle:.0f} deg, sigma {np.exp(fit.at['p']):.1f} mm"

@@ -412,10 +412,6 @@ class White(Record, eq=False):
         """The bump of the least-squares fit."""
         return self.fit.modal()
 
-    def widths_mm(self) -> tuple[float, float]:
-        """Its widths."""
-        return self.fit.widths()[:2]
-
     def draw(self, options: SamplerSettings, *, rng: np.random.Generator, progress: Progress | None) -> MapDraws:
         """Draw from the posterior, rotated where the odds favour it."""
         fit, odds = self.fit, None
