@@ -213,11 +213,8 @@ def test_a_shape_far_beyond_the_limits_at_its_mode_costs_no_draws(
         fit, detection, fault, scene = seen.fit, seen.detection, "", seen.scene
         drawings = 0
 
-        def widths_mm(self) -> tuple[float, float]:
-            return widths
-
         def bump(self) -> object:
-            return seen.bump()
+            return replace(seen.bump(), sigma_x_mm=widths[0], sigma_y_mm=widths[1])
 
         def draw(self, *given: object, **named: object) -> object:
             Odd.drawings += 1
