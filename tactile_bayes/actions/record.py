@@ -37,8 +37,7 @@ from tactile_bayes.hardware.readings import Follower, HelloReading
 from tactile_bayes.hardware.recorder import LandmarkTouch, Line, Observer, Recorder, Report
 from tactile_bayes.hardware.serial_trackers import TRACKERS, check_head, open_tracker
 from tactile_bayes.laboratory_options import RecordOptions
-from tactile_bayes.presets import PRESSURE_RANGE_KPA
-from tactile_bayes.report.map_text import record_text
+from tactile_bayes.presets import PRESSURE_RANGE_KPA, RESEARCH_USE
 from tactile_bayes.scans import ElementCalibration, HeadGeometry, Landmarks
 
 # --- Options of one recording, and the part of them that the file stores.
@@ -244,6 +243,32 @@ def record_action(output: Path, **options: Any) -> int:
     if report.fault:
         raise DeviceError(report.fault)
     return EXIT_INTERRUPTED if interrupted and request.duration_s is not None else EXIT_DONE
+
+
+def record_text(report: Report, *, output: str) -> str:
+    """Summary of a recording and its losses in a few lines."""
+    rate = (report.frames - 1) / report.duration_s if report.frames > 1 and report.duration_s > 0 else 0.0
+    dropped = f" (the head dropped {report.head_dropped})" if report.head_dropped else ""
+    lines = [
+        f"{output}: scan, ended by {report.ended_by}",
+        f"{report.frames} frames in {report.duration_s:.3f} s, {rate:.1f} Hz; {report.poses} poses",
+        f"frames lost {report.frames_lost}{dropped}",
+        f"poses repeated {report.poses_repeated}, flagged {report.poses_flagged}, missing {report.poses_missing}"
+        + (f" ({report.missing_why})" if report.missing_why else ""),
+        *([f"records of other tools left out: {report.other_tools}"] if report.other_tools else []),
+        *report.landmarks,
+    ]
+    odd = {
+        "times the head's counter of time wrapped": report.head_clock_wraps,
+        "times the tracker's counter of time wrapped": report.tracker_clock_wraps,
+        "poses without a time, left out": report.poses_without_time,
+        "bytes from the head that made no sense": report.head_garbage_bytes,
+        "bytes from the tracker that made no sense": report.tracker_garbage_bytes,
+        "bytes this computer came too late for": report.overrun_bytes,
+    }
+    lines += [f"{words}: {number}" for words, number in odd.items() if number]
+    lines += [f"caution: {text}" for text in report.cautions]
+    return "\n".join([*lines, RESEARCH_USE]) + "\n"
 
 
 def make_recording(request: Request) -> tuple[Report, bool]:

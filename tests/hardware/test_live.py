@@ -18,7 +18,7 @@ from emulated_devices import head_and_tracker, short_scan
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
-from tactile_bayes.actions.live_view import Turn, live_estimate
+from tactile_bayes.actions.live_view import Turn, live_estimate, live_line, live_text
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import UsageError
 from tactile_bayes.hardware.live import (
@@ -36,7 +36,6 @@ from tactile_bayes.hardware.recorder import Report
 from tactile_bayes.hardware.serve import LiveServer, address_of, document
 from tactile_bayes.mapping.accumulate import MapAccumulator
 from tactile_bayes.mapping.cells import poses_at
-from tactile_bayes.report.map_text import live_line, live_text
 from tactile_bayes.terminal import has_styles
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from mapping_scans import gaussian, make_scan, strokes
 
+from tactile_bayes.actions.live_view import live_text
 from tactile_bayes.declarations import replace
 from tactile_bayes.hardware.live import LiveMap, LiveState, SeenFrame, SeenLandmark, SeenPose
 from tactile_bayes.hardware.serve import document
@@ -17,7 +18,6 @@ from tactile_bayes.mapping.map import MapRecipe, TactileMap
 from tactile_bayes.mapping.places import orientation_of
 from tactile_bayes.posterior.verdict import missing_strokes
 from tactile_bayes.report.map_figure import map_figure
-from tactile_bayes.report.map_text import live_text
 from tactile_bayes.scans import Landmarks, Scan
 
 INTO_BODY = np.array([0.0, 0.0, 1.0])  # of `make_scan`: its head's z axis is the base's

@@ -275,7 +275,7 @@ PRINTERS = {
     "report/estimate_figures", "report/estimate_text", "report/exam_page", "report/map_figure", "report/map_text",
     "report/pages", "report/pooled",
     # of draws, not of a size; names of files that were written
-    "actions/report", "actions/show", "actions/campaign",
+    "actions/report", "actions/show", "actions/campaign", "actions/live_view", "actions/record",
     # of trials, calibrations, devices and studies
     "api/trials", "actions/calibrate", "actions/devices", "api/diagnosing", "api/planning",
     "campaigns/campaign", "actions/bring_in", "actions/exam",
