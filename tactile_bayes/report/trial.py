@@ -362,11 +362,13 @@ def _reasons(name: str, report: ModalityReport, keys: Sequence[str]) -> Iterator
     figures = {key: why for key, why in owed.items() if not key.endswith("_interval")}
     words = {key: text for key, (text, _) in (_FIRST | _FOUND).items()}
     for reason in dict.fromkeys(figures.values()):
-        affected = ", ".join(words.get(key, key) for key, why in figures.items() if why == reason)
+        affected = ", ".join(words.get(key, key.replace("_", " ")) for key, why in figures.items() if why == reason)
         yield f"{name}: no {affected}: {reason}"
-    intervals = [key.removesuffix("_interval") for key in owed if key.endswith("_interval")]
-    for reason in dict.fromkeys(owed[f"{key}_interval"] for key in intervals if key not in figures):
-        yield f"{name}: no interval of some figures: {reason}"
+    intervals = {key.removesuffix("_interval"): why for key, why in owed.items() if key.endswith("_interval")}
+    intervals = {key: why for key, why in intervals.items() if key not in figures}
+    for reason in dict.fromkeys(intervals.values()):
+        affected = ", ".join(words.get(key, key.replace("_", " ")) for key, why in intervals.items() if why == reason)
+        yield f"{name}: no interval of {affected}: {reason}"
 
 
 def found_share(report: ModalityReport) -> str:
