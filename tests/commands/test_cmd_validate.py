@@ -129,7 +129,8 @@ def split(trial: Path, ex: Path) -> tuple[object, ...]:
 def test_few_patients_get_no_interval_and_are_told_why(tmp_path: Path) -> None:
     trial, ex = small(tmp_path, "P1,1,cbe,1,12,detected\nP2,1,cbe,1,,not_detected\n")
     text = validate(trial, "--excision", ex).stdout
-    assert ": no interval of error %, error mm, bias %, slope: an interval needs at least 8 patients (found 2)" in text
+    assert "cbe: no interval of error %, error mm, slope: an interval needs at least 8 patients (found 2)" in text
+    assert "cbe: no interval of bias %: an interval needs at least 8 patients (found 1)" in text
     assert "synthetic" not in text
     one = json.loads(validate(trial, "--excision", ex, "--json").stdout)["modalities"]["cbe"]
     assert one["mape_percent"] == pytest.approx(60)
