@@ -34,9 +34,8 @@ from scipy.sparse.linalg import splu
 
 from benchmarks.measure import environment
 from tactile_bayes.forward.contact import ContactStiffness, Head, solve_contact
-from tactile_bayes.forward.line import build_line, head_positions, press
 from tactile_bayes.forward.mesh import QuadMesh, body_mesh, disc_mesh, joined, rectangle_mesh
-from tactile_bayes.forward.plane_strain import assemble, condense, skin_average
+from tactile_bayes.forward.plane import assemble, build_line, condense, head_positions, press, skin_average
 from tactile_bayes.forward.tissue import Body
 from tactile_bayes.presets import MEAN_KPA
 from tactile_bayes.studies.paper import fit_line

@@ -17,8 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from tactile_bayes.files.provenance import Provenance
-from tactile_bayes.files.scan_mcap import read_scan, write_scan
-from tactile_bayes.files.scan_recording import RecordingWriter, create_exclusive
+from tactile_bayes.files.scan_mcap import RecordingWriter, create_exclusive, read_scan, write_scan
 from tactile_bayes.forward.scene import Lump, Scene
 from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.hardware.emulated import EmulatedHead

@@ -14,9 +14,7 @@ import numpy as np
 from tactile_bayes.declarations import replace
 from tactile_bayes.trial import accuracy, method_comparison
 from tactile_bayes.trial import accuracy as origin_line
-from tactile_bayes.trial import limits as patient_limits
 from tactile_bayes.trial.figures import Figure, Intervals, Method
-from tactile_bayes.trial.limits import limits
 from tactile_bayes.trial.lines import concordance, deming, least_squares
 from tactile_bayes.trial.method_comparison import compare_methods
 from tactile_bayes.trial.planning import ErrorModel, simulate
@@ -96,7 +94,7 @@ def _trial(design: str, error: str, rng: np.random.Generator, *, copies: int = 1
 def _truth(sizes: ModalitySizes) -> dict[str, float]:
     found = sizes.only_detected()
     x, y = found.ex_vivo_mm, found.size_mm
-    limit = patient_limits.figures(found, confidence=0.95)
+    limit = method_comparison.limit_figures(found, confidence=0.95)
     return {
         "mape_percent": accuracy.mape_percent(sizes),
         "slope_through_origin": origin_line.slope(sizes),
@@ -129,7 +127,7 @@ def _customary(sizes: ModalitySizes) -> dict[str, Ends]:
     found = sizes.only_detected()
     plain = {"mm": found.size_mm - found.ex_vivo_mm, "log_ratio": np.log(found.size_mm / found.ex_vivo_mm)}
     for unit, off in plain.items():
-        both = limits(off)
+        both = method_comparison.limits(off)
         assert both.low_interval is not None
         assert both.high_interval is not None
         ends |= {f"limit_low_{unit}": both.low_interval, f"limit_high_{unit}": both.high_interval}

@@ -13,14 +13,13 @@ from tactile_bayes.actions.show import describe_scan
 from tactile_bayes.commands.options import refuse_same
 from tactile_bayes.declarations import Record, as_dict, names_of, replace
 from tactile_bayes.errors import EXIT_DONE, BadDataError, TactileBayesError, UsageError, one_line
-from tactile_bayes.files.array_map import array_template, read_array_map
 from tactile_bayes.files.arrays_layout import ArrayMap, GridOptions, Stated
 from tactile_bayes.files.atomic import check_suffix, refuse_existing
 from tactile_bayes.files.documents import with_session
 from tactile_bayes.files.grids import import_grid
 from tactile_bayes.files.imports import import_arrays, of_calibration, of_head, of_landmarks, of_poses, with_checked
 from tactile_bayes.files.map_nc import write_map
-from tactile_bayes.files.named_arrays import ARRAY_SUFFIXES, Source
+from tactile_bayes.files.named_arrays import ARRAY_SUFFIXES, Source, array_template, read_array_map
 from tactile_bayes.files.provenance import Provenance, hash_inputs
 from tactile_bayes.files.scan_mcap import read_scan_report, read_truth, write_scan
 from tactile_bayes.findings import LEADS, finding_lines

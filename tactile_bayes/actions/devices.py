@@ -21,8 +21,7 @@ from tactile_bayes.actions.record import record_action
 from tactile_bayes.actions.show import describe_scan
 from tactile_bayes.errors import BadDataError, DeviceError, UsageError
 from tactile_bayes.files.provenance import Provenance, hash_inputs
-from tactile_bayes.files.scan_mcap import read_scan, read_scan_report, read_truth, write_scan
-from tactile_bayes.files.scan_recording import refuse_recording
+from tactile_bayes.files.scan_mcap import read_scan, read_scan_report, read_truth, refuse_recording, write_scan
 from tactile_bayes.hardware.emulated import Device, EmulatedHead, EmulatedNdi, EmulatedTracker, Faults
 from tactile_bayes.hardware.emulator import Emulator, Link, PtyLink, Stage, TcpLink
 from tactile_bayes.hardware.head import rotation_sense

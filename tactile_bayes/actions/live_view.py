@@ -32,7 +32,7 @@ from tactile_bayes.findings import finding_summary
 from tactile_bayes.geometry import FloatArray, apply, inverse
 from tactile_bayes.hardware.live import Feed, FeedReader, LiveMap, LiveState, colour_limits, grey_levels
 from tactile_bayes.hardware.serve import LiveServer, address_of
-from tactile_bayes.mapping.map import TactileMap
+from tactile_bayes.mapping.map import TactileMap, block_sums
 from tactile_bayes.mapping.places import Orientation, orientation_of
 from tactile_bayes.posterior.bump import candidate_centres
 from tactile_bayes.posterior.draw import SamplerSettings
@@ -393,13 +393,8 @@ def _legend(tactile_map: TactileMap, view: Orientation, step: int, *, marked: bo
 
 def _shrunk(values: FloatArray, step: int) -> FloatArray:
     """Means over squares of `step` cells; NaN where all cells are NaN."""
-    rows, columns = (-(-n // step) for n in values.shape)
-    padded = np.full((rows * step, columns * step), np.nan)
-    padded[: values.shape[0], : values.shape[1]] = values
-    squares = padded.reshape(rows, step, columns, step)
-    known = np.isfinite(squares)
-    number = known.sum(axis=(1, 3))
-    total = np.where(known, squares, 0.0).sum(axis=(1, 3))
+    known = np.isfinite(values)
+    number, total = block_sums(known.astype(float), step), block_sums(np.where(known, values, 0.0), step)
     return np.asarray(np.where(number > 0, total / np.maximum(number, 1), np.nan))
 
 

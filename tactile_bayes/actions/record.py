@@ -26,8 +26,7 @@ from tactile_bayes.files.atomic import refuse_existing, unwritable
 from tactile_bayes.files.documents import check_session, read_session
 from tactile_bayes.files.instrument_json import read_array_calibration, read_head_geometry, read_landmarks
 from tactile_bayes.files.provenance import Provenance, hash_inputs
-from tactile_bayes.files.scan_mcap import read_scan
-from tactile_bayes.files.scan_recording import RecordingWriter, create_exclusive, full_disk
+from tactile_bayes.files.scan_mcap import RecordingWriter, create_exclusive, full_disk, read_scan
 from tactile_bayes.files.size_json import size_calibration_path
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.hardware import head

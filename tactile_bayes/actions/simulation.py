@@ -22,7 +22,7 @@ from tactile_bayes.files.provenance import Provenance, hash_inputs
 from tactile_bayes.files.scan_mcap import write_scan
 from tactile_bayes.files.scene_toml import read_scene
 from tactile_bayes.files.tables import csv_text
-from tactile_bayes.forward.line import outside_range
+from tactile_bayes.forward.plane import outside_range
 from tactile_bayes.forward.scene import Head, Scene
 from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.laboratory_options import PopulationOptions

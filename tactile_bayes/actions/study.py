@@ -27,7 +27,7 @@ from tactile_bayes.files.size_json import DEFAULT, read_size_calibration, size_c
 from tactile_bayes.files.tables import csv_text, read_table
 from tactile_bayes.findings import finding_lines
 from tactile_bayes.forward.contact import Head
-from tactile_bayes.forward.line import outside_range
+from tactile_bayes.forward.plane import outside_range
 from tactile_bayes.forward.scene import Head as Array
 from tactile_bayes.forward.tissue import parse_seat
 from tactile_bayes.laboratory_options import CaseOptions, SbcOptions, SectionOptions, StudyOptions

@@ -14,11 +14,10 @@ from tactile_bayes.api.maps import scan_given
 from tactile_bayes.declarations import EXACT, replace, to_plain
 from tactile_bayes.errors import UsageError
 from tactile_bayes.files import imports
-from tactile_bayes.files.array_map import read_array_map
 from tactile_bayes.files.arrays_layout import ArrayMap, Stated
 from tactile_bayes.files.documents import with_session
 from tactile_bayes.files.instrument_json import head_geometry
-from tactile_bayes.files.named_arrays import Source
+from tactile_bayes.files.named_arrays import Source, read_array_map
 from tactile_bayes.files.npz import Arrays
 from tactile_bayes.mapping.arrangement import corrected
 from tactile_bayes.scans import ElementCalibration, HeadGeometry, Landmarks, Scan, TrackerPoses

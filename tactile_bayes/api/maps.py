@@ -14,8 +14,7 @@ from tactile_bayes.declarations import EXACT, Record, as_dict, to_plain
 from tactile_bayes.errors import UsageError, check_number
 from tactile_bayes.files.arrays_layout import GridOptions
 from tactile_bayes.files.atomic import sha256
-from tactile_bayes.files.grid_files import GRID_SUFFIXES, Grid
-from tactile_bayes.files.grids import grid_map, import_grid
+from tactile_bayes.files.grids import GRID_SUFFIXES, Grid, grid_map, import_grid
 from tactile_bayes.files.map_nc import read_map_and_scans, write_map
 from tactile_bayes.files.provenance import Provenance, repeated_scans, scan_facts
 from tactile_bayes.files.scene_toml import read_scene, scene_of

@@ -4,19 +4,35 @@ from __future__ import annotations
 
 import csv
 import io
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from tactile_bayes.declarations import as_dict
-from tactile_bayes.errors import BadDataError
+from tactile_bayes.errors import BadDataError, in_file
 from tactile_bayes.files.documents import load_json, load_schema, parse_json
 from tactile_bayes.files.map_nc import read_map_and_header
+from tactile_bayes.files.mcap_records import McapRecords
 from tactile_bayes.files.netcdf import Group, open_netcdf
 from tactile_bayes.files.reading import HDF5_MAGIC, MCAP_MAGIC, first_bytes, is_json
-from tactile_bayes.files.scan_mcap import summarise_scan
+from tactile_bayes.files.scan_mcap import (
+    LANDMARK_NAMES,
+    NIPPLE,
+    SCAN_SCHEMA,
+    attached,
+    file_findings,
+    message_times,
+    provenance_of,
+    scan_records,
+)
 from tactile_bayes.files.size_json import read_repeatability, read_size_calibration
 from tactile_bayes.files.tables import read_table, separator_in
 from tactile_bayes.findings import finding_lines, findings_in
+from tactile_bayes.geometry import FloatArray
+from tactile_bayes.mapping.select import Span, with_times
+from tactile_bayes.scans import HeadGeometry
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.pooling import Calibration
 
@@ -35,7 +51,7 @@ def describe(path: Path) -> dict[str, Any]:
     """Describe a file of ours: ``schema``, ``kind``, and shape, units, quality and provenance as the kind has them."""
     head = first_bytes(path, 4096)
     if head.startswith(MCAP_MAGIC):
-        return summarise_scan(path)
+        return _scan(path)
     if head.startswith(HDF5_MAGIC):
         with open_netcdf(path, way_out="it may be cut short; make it again") as netcdf:
             group = netcdf.group("posterior")
@@ -206,3 +222,57 @@ def _foreign(path: Path) -> BadDataError:
         way_out="bring arrays, grids and images in with `tactile-bayes import`",
         path=str(path),
     )
+
+
+# --- Summary of a scan file, counted while reading it from front to back; no message is kept.
+
+
+def _scan(path: Path) -> dict[str, Any]:
+    """Summarise frames, poses, duration, losses, session and provenance; memory grows by one time per message.
+
+    Nothing looks into the messages: those that hold what they must not are not met.
+    """
+    records = scan_records(path, keep=())
+    with in_file(path):
+        return _summary(records)
+
+
+def _summary(records: McapRecords) -> dict[str, Any]:
+    head = attached(records, HeadGeometry, "head.json")
+    time_s = message_times(records.messages("/pressure", schema="foxglove.Grid"), topic="/pressure")
+    pose_s = message_times(records.messages("/pose", schema="foxglove.PoseInFrame"), topic="/pose")
+    account = records.metadata.get("recording", {})
+    span_s = float(time_s[-1] - time_s[0]) if len(time_s) else 0.0
+    topics = records.topic_counts()
+    return {
+        "schema": SCAN_SCHEMA,
+        "kind": "scan",
+        "complete": records.finished and not records.lost,
+        "findings": finding_lines(with_times(file_findings(records), Span.of(time_s), Span.of(pose_s))),
+        "frames": len(time_s),
+        "taxels": list(head.shape),
+        "poses": len(pose_s),
+        "duration_s": span_s,
+        "frame_rate_hz": (len(time_s) - 1) / span_s if span_s > 0 else None,
+        **_recording(account, topics, time_s),
+        "landmarks": all(_touched(records, name) for name in LANDMARK_NAMES),
+        "nipple": _touched(records, NIPPLE),
+        "units": {"counts": "raw, 0 to saturation", "pressure": "kPa", "position": "mm", "time": "s"},
+        "session": dict(records.metadata.get("session", {})),
+        "provenance": provenance_of(records),
+    }
+
+
+def _touched(records: McapRecords, name: str) -> bool:
+    return len(records.messages("/landmark", schema="foxglove.PoseInFrame", name=name)) > 0
+
+
+def _recording(account: Mapping[str, str], topics: Mapping[str, int], time_s: FloatArray) -> dict[str, Any]:
+    """Losses: gaps between the frames' times, and the recorder's account if the file has one."""
+    steps = np.diff(time_s)
+    period = float(np.median(steps)) if len(steps) else 0.0
+    missing = int(np.clip(np.rint(steps / period) - 1, 0, None).sum()) if period > 0 else 0
+    losses = ("frames_lost", "head_dropped", "poses_repeated", "poses_flagged", "flagged_why", "poses_missing")
+    names = (*losses, "missing_why", "other_tools", "overrun_bytes", "ended_by", "fault")
+    told = {name: account[name] for name in names if account.get(name)}
+    return {"frames_missing": missing, "notes": topics.get("/log", 0)} | ({"recording": told} if told else {})

@@ -1,14 +1,18 @@
-"""A scan as an MCAP file."""
+"""A scan as an MCAP file, also while it is recorded."""
 
 from __future__ import annotations
 
+import fcntl
 import json
+import os
+import threading
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any, Final, TypeVar
 
 import numpy as np
 from foxglove_schemas_protobuf.Grid_pb2 import Grid
+from foxglove_schemas_protobuf.Log_pb2 import Log
 from foxglove_schemas_protobuf.PackedElementField_pb2 import PackedElementField
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from google.protobuf.message import DecodeError
@@ -18,15 +22,14 @@ from numpy.typing import NDArray
 
 from tactile_bayes import __version__
 from tactile_bayes.declarations import Record, from_plain
-from tactile_bayes.errors import BadDataError, in_file
+from tactile_bayes.errors import BadDataError, UsageError, in_file
 from tactile_bayes.files.atomic import atomic_path, refuse_existing
 from tactile_bayes.files.documents import check_session, parse_json
 from tactile_bayes.files.instrument_json import calibration_document, head_document
 from tactile_bayes.files.mcap_records import McapRecords, Messages, read_records
 from tactile_bayes.files.provenance import Provenance
-from tactile_bayes.findings import Finding, finding_lines, findings_in
+from tactile_bayes.findings import Finding, findings_in
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.mapping.select import Span, with_times
 from tactile_bayes.scans import (
     CountArray,
     ElementCalibration,
@@ -288,8 +291,8 @@ def read_scan_report(path: Path) -> ScanFile:
     """
     records = scan_records(path, keep=TOPICS)
     with in_file(path):
-        head = _attached(records, HeadGeometry, "head.json")
-        calibration = _attached(records, ElementCalibration, _CALIBRATION)
+        head = attached(records, HeadGeometry, "head.json")
+        calibration = attached(records, ElementCalibration, _CALIBRATION)
         session = records.metadata.get("session", {})
         check_session(session, path=path)
         frames = _frames(records, head)
@@ -343,7 +346,7 @@ def provenance_of(records: McapRecords) -> dict[str, Any]:
     return _json_object(records.metadata.get("provenance", {}).get("json", "{}"), name="provenance")
 
 
-def _attached(records: McapRecords, kind: type[T], name: str) -> T:
+def attached(records: McapRecords, kind: type[T], name: str) -> T:
     """A record from its JSON among the attachments."""
     if name not in records.attachments:
         way_out = "copy it again: it was cut off in its header"
@@ -418,55 +421,151 @@ def _decode(kind: Any, body: bytes) -> Any:
         raise BadDataError(what, way_out="copy it again, or write such messages") from None
 
 
-# --- Summary of a scan file, counted while reading it from front to back; no message is kept.
+# --- A scan's file during its recording: readable at any moment, whatever happens to the program.
+#
+# Beside what every scan's file holds there is ``/log``, foxglove.Log: one message for each thing that went wrong, with
+# the device time of the frame or pose it belongs to; and, when the recording ended in order, a metadata record
+# ``recording`` with the account.
+
+LOG_TOPIC: Final = "/log"
+ACCOUNT: Final = "recording"
+# So often what was handed to the system is seen onto the disk: power may fail.
+SYNC_S: Final = 0.5
 
 
-def summarise_scan(path: Path) -> dict[str, Any]:
-    """Summarise frames, poses, duration, losses, session and provenance; memory grows by one time per message.
+def create_exclusive(path: Path, *, force: bool) -> IO[bytes]:
+    """Create a new file for its owner only; under its final name, because it must survive a kill.
 
-    Nothing looks into the messages: those that hold what they must not are not met.
+    It is locked until it is closed: another recording, or `repair`, leaves it alone.
     """
-    records = scan_records(path, keep=())
-    with in_file(path):
-        return _summary(records)
+    refuse_existing(path, force=force)
+    flags = os.O_WRONLY | os.O_CREAT | (0 if force else os.O_EXCL)
+    try:
+        stream = os.fdopen(os.open(path, flags, 0o600), "wb")
+    except OSError as error:
+        raise UsageError(f"{path} cannot be written ({error.strerror}); choose another place") from None
+    try:
+        _lock(stream, path)
+    except UsageError:
+        stream.close()
+        raise
+    stream.truncate(0)
+    return stream
 
 
-def _summary(records: McapRecords) -> dict[str, Any]:
-    head = _attached(records, HeadGeometry, "head.json")
-    time_s = message_times(records.messages("/pressure", schema="foxglove.Grid"), topic="/pressure")
-    pose_s = message_times(records.messages("/pose", schema="foxglove.PoseInFrame"), topic="/pose")
-    account = records.metadata.get("recording", {})
-    span_s = float(time_s[-1] - time_s[0]) if len(time_s) else 0.0
-    topics = records.topic_counts()
-    return {
-        "schema": SCAN_SCHEMA,
-        "kind": "scan",
-        "complete": records.finished and not records.lost,
-        "findings": finding_lines(with_times(file_findings(records), Span.of(time_s), Span.of(pose_s))),
-        "frames": len(time_s),
-        "taxels": list(head.shape),
-        "poses": len(pose_s),
-        "duration_s": span_s,
-        "frame_rate_hz": (len(time_s) - 1) / span_s if span_s > 0 else None,
-        **_recording(account, topics, time_s),
-        "landmarks": all(_touched(records, name) for name in LANDMARK_NAMES),
-        "nipple": _touched(records, NIPPLE),
-        "units": {"counts": "raw, 0 to saturation", "pressure": "kPa", "position": "mm", "time": "s"},
-        "session": dict(records.metadata.get("session", {})),
-        "provenance": provenance_of(records),
-    }
+def refuse_recording(path: Path) -> None:
+    """Raise `UsageError` when a file is being recorded right now."""
+    try:
+        stream = path.open("rb")
+    except OSError:
+        return  # whoever reads it says what is wrong with it
+    with stream:
+        _lock(stream, path)
 
 
-def _touched(records: McapRecords, name: str) -> bool:
-    return len(records.messages("/landmark", schema="foxglove.PoseInFrame", name=name)) > 0
+def _lock(stream: IO[bytes], path: Path) -> None:
+    try:
+        fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise UsageError(f"{path} is being recorded; wait for its end, or choose another name") from None
+    except OSError:
+        return  # some network file systems have no locks
 
 
-def _recording(account: Mapping[str, str], topics: Mapping[str, int], time_s: FloatArray) -> dict[str, Any]:
-    """Losses: gaps between the frames' times, and the recorder's account if the file has one."""
-    steps = np.diff(time_s)
-    period = float(np.median(steps)) if len(steps) else 0.0
-    missing = int(np.clip(np.rint(steps / period) - 1, 0, None).sum()) if period > 0 else 0
-    losses = ("frames_lost", "head_dropped", "poses_repeated", "poses_flagged", "flagged_why", "poses_missing")
-    names = (*losses, "missing_why", "other_tools", "overrun_bytes", "ended_by", "fault")
-    told = {name: account[name] for name in names if account.get(name)}
-    return {"frames_missing": missing, "notes": topics.get("/log", 0)} | ({"recording": told} if told else {})
+class _Syncer:
+    """Thread that syncs a file to the disk repeatedly, so that the writer does not wait for the disk.
+
+    A thread, because the system lets go of the interpreter while it waits; readers are processes of their own and know
+    nothing of it.
+    """
+
+    def __init__(self, descriptor: int) -> None:
+        self._descriptor = descriptor
+        self._dirty, self._ended = threading.Event(), threading.Event()
+        self._error: OSError | None = None
+        self._thread = threading.Thread(target=self._run, name="sync", daemon=True)
+        self._thread.start()
+
+    def ask(self) -> None:
+        """Request a sync; raises the last sync's error."""
+        if self._error is not None:
+            raise self._error
+        self._dirty.set()
+
+    def stop(self) -> None:
+        """Wait for the running sync."""
+        self._ended.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        while not self._ended.wait(SYNC_S):
+            if not self._dirty.is_set():
+                continue
+            self._dirty.clear()
+            try:
+                getattr(os, "fdatasync", os.fsync)(self._descriptor)  # not every system has the first
+            except OSError as error:
+                self._error = error
+                return
+
+
+class RecordingWriter(ScanWriter):
+    """A `ScanWriter` that can flush at once, and stores notes about problems; the session was checked before the file
+    was made.
+    """
+
+    def __init__(
+        self,
+        stream: IO[bytes],
+        *,
+        head: HeadGeometry,
+        element_calibration: ElementCalibration,
+        session: Mapping[str, str],
+        provenance: Provenance,
+    ) -> None:
+        super().__init__(
+            stream, head=head, element_calibration=element_calibration, session=session, provenance=provenance
+        )
+        self._stream = stream
+        self._syncer: _Syncer | None = None
+        self._log_channel: int = self._writer.register_channel(
+            topic=LOG_TOPIC, message_encoding="protobuf", schema_id=self._schema(Log)
+        )
+        self.flush()
+
+    def add_note(self, text: str, *, device: str, device_ns: int, host_ns: int, serious: bool = False) -> None:
+        """Add a line about the data at this time."""
+        message = Log(level=Log.WARNING if serious else Log.INFO, message=text, name=device)
+        self._send_message(self._log_channel, message, device_ns=device_ns, host_ns=host_ns)
+
+    def flush(self) -> None:
+        """Close the chunk and hand it to the system, from where it survives this process.
+
+        Within `SYNC_S` it is on the disk too, and survives the computer. An OSError may be that of the disk before this
+        call.
+        """
+        self._writer.flush()
+        if self._syncer is None:
+            self._syncer = _Syncer(self._stream.fileno())
+        self._syncer.ask()
+
+    def close(self, account: Mapping[str, Any]) -> None:
+        """Write the account, the index and the footer, and sync them to the disk."""
+        self.stop_syncing()
+        self._writer.flush()
+        self._writer.add_metadata(ACCOUNT, {name: str(value) for name, value in account.items()})
+        self.finish()
+        self._stream.flush()
+        os.fsync(self._stream.fileno())
+
+    def stop_syncing(self) -> None:
+        """Release the file in any case; call it before closing the stream."""
+        if self._syncer is not None:
+            self._syncer.stop()
+            self._syncer = None
+
+
+def full_disk(path: Path, error: OSError) -> BadDataError:
+    """Error for a recording that could not be continued because the disk is full."""
+    way_out = "what was recorded before is kept; free space, then `tactile-bayes repair` it"
+    return BadDataError(f"cannot be written any further ({error.strerror})", way_out=way_out, path=str(path))

@@ -363,3 +363,12 @@ def _extent(excess: FloatArray, at: int) -> float:
             return float("nan")
         width += abs(i - at) + float((excess[i] - half) / (excess[i] - excess[i + way]))
     return width
+
+
+def block_sums(values: FloatArray, times: int) -> FloatArray:
+    """Sums over blocks of `times` by `times` cells; what is left at the ends is filled up with zeros."""
+    ny, nx = (-(-n // times) for n in values.shape)
+    padded = np.zeros((ny * times, nx * times))
+    padded[: values.shape[0], : values.shape[1]] = values
+    summed: FloatArray = padded.reshape(ny, times, nx, times).sum(axis=(1, 3))
+    return summed

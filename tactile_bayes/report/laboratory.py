@@ -13,7 +13,7 @@ import numpy as np
 from tactile_bayes.declarations import Record, as_dict, names_of
 from tactile_bayes.files.tables import csv_text
 from tactile_bayes.forward.contact import Head
-from tactile_bayes.forward.line import RANGE, outside_range
+from tactile_bayes.forward.plane import RANGE, outside_range
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.options import FieldCosines
 from tactile_bayes.presets import RESEARCH_USE

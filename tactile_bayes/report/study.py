@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tactile_bayes.forward.axisymmetric import LayeredBody
-from tactile_bayes.forward.line import LineFrames, build_line
+from tactile_bayes.forward.plane import LineFrames, build_line
 from tactile_bayes.forward.solid import PlacedLump, SolidHead, face_of, solid_head
 from tactile_bayes.forward.tissue import Layers
 from tactile_bayes.geometry import FloatArray

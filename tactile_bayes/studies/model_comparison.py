@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.forward.line import fit_shape, lump_pressure
+from tactile_bayes.forward.plane import fit_shape, lump_pressure
 from tactile_bayes.forward.scene import Scene
 from tactile_bayes.forward.simulate import felt_at_poses
 from tactile_bayes.geometry import FloatArray, inverse

@@ -13,19 +13,21 @@ from scipy.optimize import minimize_scalar
 from tactile_bayes.declarations import Record, as_dict, field, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.contact import Head
-from tactile_bayes.forward.line import (
+from tactile_bayes.forward.plane import (
+    CELL_MM,
     POSITIONS_MM,
     EmpiricalModel,
     LineFrames,
+    SurfaceCompliance,
     TactileLine,
     build_line,
+    condense,
     fit_empirical,
     fit_shape,
     press,
     press_layers,
     slide,
 )
-from tactile_bayes.forward.plane_strain import CELL_MM, SurfaceCompliance, condense
 from tactile_bayes.forward.tissue import SEATS, Body, Layers
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.laboratory_options import CaseOptions, TissueOptions
@@ -99,7 +101,7 @@ class StudySettings(CaseSettings, kw_only=True):
     positions_mm: tuple[float, float, float] = POSITIONS_MM
     """First and last position of the head and the step between them."""
     fit_radius_mm: float = FIT_RADIUS_MM  #: Eq 5 is fitted where abs(x) is at most this.
-    cell_mm: float = CELL_MM  #: Of the contact, see `plane_strain.condense`.
+    cell_mm: float = CELL_MM  #: Of the contact, see `plane.condense`.
 
     def as_dict(self) -> dict[str, object]:
         """Plain data for a store's header and for a report."""

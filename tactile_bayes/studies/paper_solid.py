@@ -12,7 +12,7 @@ from scipy.optimize import minimize
 from tactile_bayes.declarations import Record, as_dict, field, replace
 from tactile_bayes.forward.axisymmetric import CondensedLump, LayeredBody, condense_lump
 from tactile_bayes.forward.mesh import LumpGeometry, MeshSize
-from tactile_bayes.forward.plane_strain import FINENESS
+from tactile_bayes.forward.plane import FINENESS
 from tactile_bayes.forward.scene import Head
 from tactile_bayes.forward.solid import RANK_TOLERANCE, PlacedLump, SolidHead, face_of, skin_perturbation, solid_head
 from tactile_bayes.forward.tissue import Body, SceneBody

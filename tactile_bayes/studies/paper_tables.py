@@ -9,8 +9,7 @@ import numpy as np
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.contact import Head
-from tactile_bayes.forward.line import LineFrames, TactileLine, build_line, press
-from tactile_bayes.forward.plane_strain import SurfaceCompliance
+from tactile_bayes.forward.plane import LineFrames, SurfaceCompliance, TactileLine, build_line, press
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.presets import HEAD_PITCH_MM, SHOULDERS_INSIDE, SHOULDERS_OUTSIDE
 from tactile_bayes.studies.paper import HARD_RATIO, LineFit, StudySettings, fit_line

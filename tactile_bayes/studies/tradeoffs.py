@@ -9,9 +9,8 @@ import numpy as np
 
 from tactile_bayes.declarations import Record, field, replace
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.forward.line import build_line, head_positions
 from tactile_bayes.forward.mesh import lump_mesh
-from tactile_bayes.forward.plane_strain import rim_nodes
+from tactile_bayes.forward.plane import build_line, head_positions, rim_nodes
 from tactile_bayes.forward.scene import Scene
 from tactile_bayes.forward.tissue import Body, SceneBody, fat_thickness
 from tactile_bayes.geometry import FloatArray

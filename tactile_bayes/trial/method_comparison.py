@@ -1,21 +1,23 @@
-"""Lines, concordance and limits of agreement of one modality against excision, with intervals over patients."""
+"""One modality against excision: lines, concordance and limits of agreement, with intervals over patients."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
+import math
+from collections.abc import Callable, Sequence
+from functools import cache, partial
 from typing import Annotated, Literal, TypeVar
 
 import numpy as np
+from scipy.special import chdtri, chndtrix, gammaincc, nctdtrit, ndtri, stdtr
 
-from tactile_bayes.declarations import UNSET, Meta, UnsetType
-from tactile_bayes.trial import limits as bland_altman
+from tactile_bayes.declarations import UNSET, Meta, Record, UnsetType, replace
 from tactile_bayes.trial.figures import (
     Count,
     Ends,
     Figure,
     Figures,
     Reasons,
+    Sample,
     Scale,
     Statistic,
     SumStatistic,
@@ -23,10 +25,12 @@ from tactile_bayes.trial.figures import (
     columns,
     fields_of,
     figure,
+    interval_from_values,
+    kurtosis_freedom,
     method_of,
+    on_scale,
     ratio,
 )
-from tactile_bayes.trial.limits import Limits, Trend
 from tactile_bayes.trial.lines import (
     Concordance,
     Line,
@@ -38,9 +42,302 @@ from tactile_bayes.trial.lines import (
     jackknife_errors,
     least_squares,
     passing_bablok,
+    student,
     weighted_deming,
 )
 from tactile_bayes.trial.readings import FloatArray, ModalitySizes
+
+# --- Exact factors k such that mean + k SD of a normal sample bounds its percentiles with a stated confidence.
+
+_NODES = 400
+
+
+def percentile_factor(n: int, *, percentile: float, confidence: float) -> float:
+    r"""k with :math:`P(\mu + z_p \sigma \le \bar x + k s) =` `confidence` for a sample of n.
+
+    A quantile of the noncentral t distribution over root n: the one-sided tolerance factor (Odeh & Owen 1980).
+    Carkeet (2015), Optom. Vis. Sci. 92, e71, uses it for limits of agreement taken one at a time.
+    """
+    return float(nctdtrit(n - 1, math.sqrt(n) * float(ndtri(percentile)), confidence)) / math.sqrt(n)
+
+
+@cache
+def content_factor(n: int, *, content: float, confidence: float) -> float:
+    r"""k such that mean +- k SD of a sample of n holds at least `content` of the population with this confidence.
+
+    Two-sided tolerance factor of Wald & Wolfowitz (1946), exact as in Odeh & Owen (1980); Carkeet (2015) uses it for
+    the two limits of agreement taken as a pair.
+    """
+    at, normal = np.polynomial.legendre.leggauss(_NODES)
+    reach = min(9.0, float(ndtri(1 - 1e-17)))
+    off = (at + 1) / 2 * reach
+    weight = normal / 2 * reach * 2 * np.exp(-(off**2) / 2) / math.sqrt(2 * math.pi)
+    radius2, freedom = chndtrix(content, 1, off**2 / n), n - 1  # Phi(shift + r) - Phi(shift - r) = content
+
+    def reached(k: float) -> float:
+        return float(weight @ gammaincc(freedom / 2, freedom * radius2 / k**2 / 2))
+
+    low, high = 0.0, 1.0
+    while reached(high) < confidence and high < 1e12:
+        low, high = high, 4 * high
+    while high - low > 1e-13 * high:
+        middle = (low + high) / 2
+        low, high = (middle, high) if reached(middle) < confidence else (low, middle)
+    return (low + high) / 2
+
+
+# --- Limits of agreement: bias and spread of the differences between two methods, with and without replicates.
+#
+# Differences are the method under test less the reference, y - x. Intervals take the masses as independent; where a
+# patient has several masses the jackknife over patients stands beside them.
+# Share of the differences that lie between the limits.
+SHARE = 0.95
+_REACH = float(ndtri(0.5 + 0.5 * SHARE))  #: SDs of a normal distribution within which they lie.
+# Times that errors proportional to size must be likelier than constant ones, and masses needed to judge it.
+LIKELIER = 3.0
+LEAST_MASSES = 8
+
+
+class Limits(Record):
+    """Limits of agreement and their intervals; all in the unit of the differences."""
+
+    n: Count
+    bias: float
+    bias_interval: Ends | None
+    sd: float  #: Standard deviation that the limits are built on: of one difference, for single readings.
+    low: float
+    high: float
+    """`low`, `high`: bias -+ z sd, between which the stated share of differences lies."""
+    low_interval: Ends | None = None
+    high_interval: Ends | None = None
+    """`low_interval`, `high_interval`: Each limit on its own: exact for single readings (Carkeet 2015), by variance
+    recovery with replicates."""
+    pair_intervals: tuple[Ends, Ends] | None = None
+    """Of both limits taken together, exact (Carkeet 2015); None with replicates."""
+    approximate_intervals: tuple[Ends, Ends] | None = None
+    """Bland & Altman's (1986), for comparison with other programs; None with replicates."""
+    components: dict[str, float] | None = None
+    """Variances that add up to ``sd`` squared, by name; empty for single readings."""
+
+
+def limits(differences: FloatArray, *, confidence: float = 0.95) -> Limits:
+    r"""Limits of agreement of single readings, between which `SHARE` of the differences lie.
+
+    Differences are y - x; fewer than two leave the limits undefined.
+
+    Bland & Altman (1986), Lancet i, 307: limits :math:`\bar d \mp z s`, their standard error
+    :math:`s\sqrt{1/n + z^2/(2(n-1))}` for the approximate intervals. The exact ones are tolerance factors: Carkeet
+    (2015), Optom. Vis. Sci. 92, e71.
+    """
+    n = len(differences)
+    if n < 2:
+        raise UndefinedError(f"limits of agreement need at least 2 masses (found {n})")
+    bias, sd = float(differences.mean()), float(differences.std(ddof=1))
+    z, tail = _REACH, 0.5 + 0.5 * confidence
+    t = student(n - 1, confidence=confidence)
+    inner = percentile_factor(n, percentile=0.5 + 0.5 * SHARE, confidence=1 - tail)
+    outer = percentile_factor(n, percentile=0.5 + 0.5 * SHARE, confidence=tail)
+    pair = [content_factor(n, content=SHARE, confidence=c) for c in (1 - tail, tail)]
+    reach = t * math.sqrt(1 / n + z * z / (2 * (n - 1)))
+    return Limits(
+        n=n,
+        bias=bias,
+        bias_interval=(bias - t * sd / math.sqrt(n), bias + t * sd / math.sqrt(n)),
+        sd=sd,
+        low=bias - z * sd,
+        high=bias + z * sd,
+        low_interval=(bias - outer * sd, bias - inner * sd),
+        high_interval=(bias + inner * sd, bias + outer * sd),
+        pair_intervals=((bias - pair[1] * sd, bias - pair[0] * sd), (bias + pair[0] * sd, bias + pair[1] * sd)),
+        approximate_intervals=(
+            (bias - (z + reach) * sd, bias - (z - reach) * sd),
+            (bias + (z - reach) * sd, bias + (z + reach) * sd),
+        ),
+    )
+
+
+def limits_unlinked(x: Sequence[FloatArray], y: Sequence[FloatArray], *, confidence: float = 0.95) -> Limits:
+    r"""Limits for single readings from unpaired replicates of an unchanging true size.
+
+    Each mass has one or more replicates x by the reference and y by the method under test.
+
+    The variance of the differences of means, plus what averaging took out of it:
+
+    .. math:: s^2 = s_{\bar d}^2 + (1 - 1/m_x) s_{xw}^2 + (1 - 1/m_y) s_{yw}^2
+
+    with the harmonic means m of the numbers of replicates and the within-mass variances of one-way analyses of
+    variance: Bland & Altman (1999), Stat. Methods Med. Res. 8, 135, section 5; intervals by variance recovery, Zou
+    (2013), Stat. Methods Med. Res. 22, 630.
+    """
+    means = np.array([b.mean() - a.mean() for a, b in zip(x, y, strict=True)])
+    n = len(means)
+    if n < 2:
+        raise UndefinedError(f"limits of agreement need at least 2 masses (found {n})")
+    between = float(means.var(ddof=1))
+    parts = {"means": (between, n - 1), "reference_within": _averaged_out(x), "within": _averaged_out(y)}
+    total = sum(variance for variance, _ in parts.values())
+    bias, z = float(means.mean()), _REACH
+    low, high = bias - z * math.sqrt(total), bias + z * math.sqrt(total)
+    wide, narrow = _recovered(list(parts.values()), total, z=z, bias_variance=between / n, confidence=confidence)
+    t = student(n - 1, confidence=confidence) * math.sqrt(between / n)
+    return Limits(
+        n=n,
+        bias=bias,
+        bias_interval=(bias - t, bias + t),
+        sd=math.sqrt(total),
+        low=low,
+        high=high,
+        low_interval=(low - wide, low + narrow),
+        high_interval=(high - narrow, high + wide),
+        components={name: variance for name, (variance, _) in parts.items()},
+    )
+
+
+def _averaged_out(groups: Sequence[FloatArray]) -> tuple[float, int]:
+    """Variance of one reading that averaging over a mass's replicates removed, and its degrees of freedom."""
+    numbers = np.array([len(group) for group in groups])
+    freedom = int(numbers.sum()) - len(groups)
+    squares = sum(float(np.sum((group - group.mean()) ** 2)) for group in groups if len(group) > 1)
+    return (1 - float(np.mean(1 / numbers))) * squares / max(freedom, 1), freedom
+
+
+class Trend(Record):
+    """How differences change with size: slope of a least-squares line, per unit of size, with its t test."""
+
+    slope: float
+    interval: Ends | None
+    p_value: float | None
+
+
+def trend(differences: FloatArray, sizes: FloatArray, *, confidence: float = 0.95) -> Trend:
+    """Test proportional bias: slope of the differences on size.
+
+    `sizes` are the means of both methods (Bland & Altman 1999) or, when the reference is much the better of the two,
+    the reference itself (Krouwer 2008, Stat. Med. 27, 778): against the mean, unequal errors alone make a slope.
+    """
+    line = least_squares(sizes, differences)
+    both = line.intervals(confidence=confidence)
+    if both is None or line.slope_se is None:
+        return Trend(line.slope, None, None)
+    if line.slope_se == 0:
+        return Trend(line.slope, both[1], 1.0 if line.slope == 0 else 0.0)
+    return Trend(line.slope, both[1], 2 * float(stdtr(line.n - 2, -abs(line.slope) / line.slope_se)))
+
+
+def errors_are_proportional(x: FloatArray, y: FloatArray) -> bool:
+    r"""Whether normal ln y - ln x with one SD is likelier than normal y - x, by a factor of `LIKELIER`.
+
+    False for fewer than `LEAST_MASSES` masses.
+
+    Likelihoods of y, profiled over mean and SD as in Box & Cox (1964), J. R. Stat. Soc. B 26, 211: the logarithm's
+    carries the Jacobian :math:`\prod 1/y`.
+    """
+    n = len(x)
+    if n < LEAST_MASSES:
+        return False
+    with np.errstate(all="ignore"):
+        logs, off = np.var(np.log(y) - np.log(x)), np.var(y - x)
+        gain = 0.5 * n * (np.log(off) - np.log(logs)) - float(np.sum(np.log(y)))
+    return bool(np.isfinite(gain) and gain > np.log(LIKELIER))
+
+
+def _recovered(
+    parts: Sequence[tuple[float, int]], total: float, *, z: float, bias_variance: float, confidence: float
+) -> Ends:
+    """Outer and inner reach of a limit's interval, from chi-squared intervals of each variance (Zou 2013)."""
+    tail = 0.5 - 0.5 * confidence
+    below = above = 0.0
+    for variance, freedom in parts:
+        if freedom == 0 or variance == 0:
+            continue
+        below += (variance * (1 - freedom / float(chdtri(freedom, tail)))) ** 2
+        above += (variance * (1 - freedom / float(chdtri(freedom, 1 - tail)))) ** 2
+    low, high = math.sqrt(max(0.0, total - math.sqrt(below))), math.sqrt(total + math.sqrt(above))
+    of_bias = float(ndtri(1 - tail)) ** 2 * bias_variance
+    wide = math.sqrt(of_bias + (z * (high - math.sqrt(total))) ** 2)
+    narrow = math.sqrt(of_bias + (z * (math.sqrt(total) - low)) ** 2)
+    return wide, narrow
+
+
+# --- Limits of agreement with intervals over patients, for differences of any distribution and any masses per patient.
+#
+# The exact and the approximate intervals that other programs print take the masses as independent and the
+# differences as normal; they stand beside these in the JSON report.
+
+_ONE = "one mass has no spread"
+
+
+def limit_figures(found: ModalitySizes, *, confidence: float) -> dict[str, Figure]:
+    """Lower and upper limit in mm and as the logarithm of the ratio, for single readings of detected masses."""
+    return {
+        f"limit_{side}_{unit}": _limit(terms, sign, found, confidence=confidence)
+        for unit, terms in (("mm", partial(_limit_terms, np.asarray)), ("log_ratio", partial(_limit_terms, np.log)))
+        for side, sign in (("low", -1), ("high", 1))
+    }
+
+
+def _limit(
+    terms: Callable[[ModalitySizes], FloatArray], sign: int, found: ModalitySizes, *, confidence: float
+) -> Figure:
+    """A limit; its corrected interval is from those of the mean and, on the log scale, of the SD (Zou 2013)."""
+    plain = figure(SumStatistic(terms, partial(_limit_end, sign), _ONE), found, scale="linear", confidence=confidence)
+    if method_of(confidence) != "corrected" or plain.interval is None:
+        return plain
+    try:
+        mean, around = _jackknifed(SumStatistic(terms, _limit_mean, _ONE), found, scale="linear", confidence=confidence)
+        sd, about = _jackknifed(SumStatistic(terms, _limit_sd, _ONE), found, scale="log", confidence=confidence)
+    except UndefinedError as undefined:
+        return replace(plain, interval=None, interval_reason=str(undefined))
+    limit = mean + sign * _REACH * sd
+    below, above = (_REACH * (sd - about[0]), _REACH * (about[1] - sd))[::sign]
+    ends = limit - math.hypot(mean - around[0], below), limit + math.hypot(around[1] - mean, above)
+    return replace(plain, interval=ends)
+
+
+def _jackknifed(
+    statistic: SumStatistic, found: ModalitySizes, *, scale: Scale, confidence: float
+) -> tuple[float, Ends]:
+    """Value with its jackknife interval, and the degrees of freedom of its leave-one-out values."""
+    sample = Sample(statistic, (found,))
+    value, left = sample.value(), sample.left_out()
+    freedom = kurtosis_freedom(np.asarray(on_scale(left, scale)))
+    return value, interval_from_values(value, left, scale=scale, confidence=float(confidence), freedom=freedom)
+
+
+def _limit_terms(scale: Callable[[FloatArray], FloatArray], sizes: ModalitySizes) -> FloatArray:
+    """1, d, d', d'd', 1/m, squares about the mass's mean and their degrees of freedom; ' about the mean of all d.
+
+    Differences d are on a scale, of the means of replicates on it.
+    """
+    if len(sizes.size_mm) == 0:
+        raise UndefinedError("no mass was detected")
+    groups = [scale(group) for group in sizes.replicates_mm]
+    pairs = list(zip(groups, scale(sizes.size_mm), strict=True))
+    means = np.array([group.mean() if len(group) > 1 else size for group, size in pairs])
+    differences = means - scale(sizes.ex_vivo_mm)
+    off = centred(differences, differences.mean())
+    number = np.array([max(len(group), 1) for group in groups], dtype=np.float64)
+    squares = np.array([float(np.sum((group - mean) ** 2)) for group, mean in zip(groups, means, strict=True)])
+    return columns(1.0, differences, off, off * off, 1 / number, squares, number - 1)
+
+
+def _limit_mean(sums: FloatArray) -> FloatArray:
+    return ratio(sums[..., 1], sums[..., 0])
+
+
+def _limit_sd(sums: FloatArray) -> FloatArray:
+    """SD of one difference: that of the masses' means, plus the part that averaging over replicates removed."""
+    n, _, first, second, inverse, squares, freedom = np.moveaxis(sums, -1, 0)
+    between = ratio(second - first**2 / n, n - 1)
+    within = np.where(freedom > 0.5, ratio(squares, freedom), 0.0)
+    return np.asarray(np.sqrt(np.maximum(between + (1 - inverse / n) * within, 0.0)))
+
+
+def _limit_end(sign: int, sums: FloatArray) -> FloatArray:
+    return np.asarray(_limit_mean(sums) + sign * _REACH * _limit_sd(sums))
+
+
+# --- Everything of one modality.
 
 # Lines that are not sums are fitted anew without each patient; beyond so many masses that takes too long.
 MOST_REFITTED = 300
@@ -128,7 +425,7 @@ def compare_methods(sizes: ModalitySizes, *, confidence: float, error_ratio: flo
         limits=_limits(found, confidence=level) if judged else {},
         trends=_trends(x, y, confidence=level) if judged else {},
         concordance_parts=_or_none(lambda: concordance(x, y, confidence=level)) if judged else None,
-        errors_grow_with_size=judged and bland_altman.errors_are_proportional(x, y),
+        errors_grow_with_size=judged and errors_are_proportional(x, y),
     )
 
 
@@ -138,7 +435,7 @@ def _figures(found: ModalitySizes, *, confidence: float, error_ratio: float, rob
     for name, statistic, scale in _statistics(error_ratio, robust, slope):
         wanted = scale if isinstance(statistic, SumStatistic) or len(found.size_mm) <= MOST_REFITTED else None
         figures[name] = figure(statistic, found, scale=wanted, confidence=confidence, leverage=_squared_distance)
-    return figures | bland_altman.figures(found, confidence=confidence)
+    return figures | limit_figures(found, confidence=confidence)
 
 
 def _squared_distance(sizes: ModalitySizes) -> FloatArray:
@@ -160,7 +457,7 @@ def _statistics(error_ratio: float, robust: _Fit, slope: Scale) -> list[tuple[st
         *((f"{name}_slope", fit.part("slope"), slope) for name, fit in fits),
         ("concordance", SumStatistic(_terms, _concordance, "concordance needs sizes that vary"), "fisher"),
         ("difference_mean_mm", SumStatistic(_terms, _bias), "linear"),
-        ("difference_sd_mm", SumStatistic(_terms, _sd, "one mass has no spread"), "log"),
+        ("difference_sd_mm", SumStatistic(_terms, _sd, _ONE), "log"),
     ]
 
 
@@ -276,18 +573,16 @@ def _limits(found: ModalitySizes, *, confidence: float) -> dict[Unit, Limits]:
     scales: dict[Unit, Callable[[FloatArray], FloatArray]] = {"mm": np.asarray, "log_ratio": np.log}
     x, y, groups = found.ex_vivo_mm, found.size_mm, found.replicates_mm
     if all(len(group) == 1 for group in groups):
-        return {unit: bland_altman.limits(on(y) - on(x), confidence=confidence) for unit, on in scales.items()}
+        return {unit: limits(on(y) - on(x), confidence=confidence) for unit, on in scales.items()}
     return {
-        unit: bland_altman.limits_unlinked(
-            [on(e) for e in x[:, None]], [on(one) for one in groups], confidence=confidence
-        )
+        unit: limits_unlinked([on(e) for e in x[:, None]], [on(one) for one in groups], confidence=confidence)
         for unit, on in scales.items()
     }
 
 
 def _trends(x: FloatArray, y: FloatArray, *, confidence: float) -> dict[Against, Trend]:
     against: dict[Against, FloatArray] = {"on_ex_vivo": x, "on_mean": (x + y) / 2}
-    judge = partial(bland_altman.trend, y - x, confidence=confidence)
+    judge = partial(trend, y - x, confidence=confidence)
     found = {name: _or_none(partial(judge, sizes)) for name, sizes in against.items()}
     return {name: one for name, one in found.items() if one is not None}
 

@@ -14,12 +14,12 @@ import click
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from map_files import read_grid
 
 from tactile_bayes.cli import cli
 from tactile_bayes.commands.options import WRITTEN, FilePath
 from tactile_bayes.errors import UsageError
 from tactile_bayes.files.atomic import write_text
-from tactile_bayes.files.grids import read_grid
 from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.files.provenance import Provenance
 

@@ -23,8 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from tactile_bayes.files.provenance import Provenance
-from tactile_bayes.files.scan_mcap import read_scan, read_scan_report
-from tactile_bayes.files.scan_recording import RecordingWriter, create_exclusive
+from tactile_bayes.files.scan_mcap import RecordingWriter, create_exclusive, read_scan, read_scan_report
 
 RATE_HZ = 200.0
 SCENE = """[scene]

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from map_files import read_grid
 from PIL import Image
 from scipy.io import savemat
 from scipy.ndimage import gaussian_filter
@@ -18,8 +19,7 @@ from scipy.ndimage import gaussian_filter
 import tactile_bayes
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.arrays_layout import GridOptions
-from tactile_bayes.files.grid_files import open_grid
-from tactile_bayes.files.grids import import_grid, read_grid
+from tactile_bayes.files.grids import import_grid, open_grid
 from tactile_bayes.files.scan_mcap import read_scan
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.posterior.bump import window_cells

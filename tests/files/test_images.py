@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from map_files import read_grid
 
 from tactile_bayes.errors import BadDataError, UsageError
-from tactile_bayes.files.grids import read_grid
 from tactile_bayes.files.images import Picture, read_image
 
 A = np.arange(12).reshape(3, 4)

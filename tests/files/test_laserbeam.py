@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from map_files import read_grid
 from scipy.optimize import curve_fit
 
-from tactile_bayes.files.grids import read_grid
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map

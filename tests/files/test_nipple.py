@@ -14,9 +14,10 @@ from mapping_scans import make_scan, strokes
 
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError
+from tactile_bayes.files.identify import describe
 from tactile_bayes.files.instrument_json import read_landmarks
 from tactile_bayes.files.map_nc import read_map, write_map
-from tactile_bayes.files.scan_mcap import read_scan, summarise_scan, write_scan
+from tactile_bayes.files.scan_mcap import read_scan, write_scan
 from tactile_bayes.scans import Landmarks, Scan
 
 NOTCH, XIPHOID, NIPPLE = (np.array(p) for p in ([0.0, 200.0, 0.0], [0.0, 0.0, 0.0], [-80.0, 60.0, -3.0]))
@@ -37,7 +38,7 @@ def test_a_scan_file_keeps_the_nipple(tmp_path: Path, nipple: bool) -> None:
     np.testing.assert_array_equal(marks.sternal_notch_mm, NOTCH)
     if nipple:
         np.testing.assert_array_equal(marks.nipple_mm, NIPPLE)
-    assert summarise_scan(path)["nipple"] is nipple
+    assert describe(path)["nipple"] is nipple
     assert (b"nipple" in path.read_bytes()) is nipple  # no channel without a touch: old scans keep their bytes
 
 

@@ -23,11 +23,10 @@ from scipy.spatial.transform import Rotation
 
 import tactile_bayes as tb
 from tactile_bayes.errors import BadDataError, UsageError
-from tactile_bayes.files.array_map import array_template
 from tactile_bayes.files.arrays_layout import ArrayMap
 from tactile_bayes.files.documents import parse_toml
 from tactile_bayes.files.imports import import_arrays, of_poses, read_arrays
-from tactile_bayes.files.named_arrays import read_named
+from tactile_bayes.files.named_arrays import array_template, read_named
 from tactile_bayes.files.scan_mcap import read_scan
 from tactile_bayes.forward.scene import Scene
 from tactile_bayes.forward.simulate import simulate

@@ -10,8 +10,16 @@ from hypothesis import strategies as st
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward import contact
 from tactile_bayes.forward.contact import Contact, ContactStiffness, Head, solve_contact
-from tactile_bayes.forward.line import build_line, head_positions, press, press_layers, slide
-from tactile_bayes.forward.plane_strain import SurfaceCompliance, condense, surface_compliance
+from tactile_bayes.forward.plane import (
+    SurfaceCompliance,
+    build_line,
+    condense,
+    head_positions,
+    press,
+    press_layers,
+    slide,
+    surface_compliance,
+)
 from tactile_bayes.forward.tissue import Body, Layers
 
 DEEP = Layers(2000.0, 6000.0, gland_ratio=1.0)  # as good as a half-plane for loads of millimetres

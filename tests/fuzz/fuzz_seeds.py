@@ -182,12 +182,13 @@ def _jsons(folder: Path) -> list[bytes]:
 
 
 def _map(folder: Path) -> bytes:
-    from tactile_bayes.files.grids import read_grid
+    from tactile_bayes.files.arrays_layout import GridOptions
+    from tactile_bayes.files.grids import import_grid
     from tactile_bayes.files.map_nc import write_map
     from tactile_bayes.files.provenance import Provenance
 
     (folder / "m.npz").write_bytes(_npz({"mean": _grid(), "spacing_mm": np.array(1.0)}))
-    tactile_map = read_grid(folder / "m.npz", normalise="mean")
+    tactile_map, _ = import_grid(folder / "m.npz", GridOptions(normalise="mean"))
     write_map(folder / "m.nc", tactile_map, provenance=Provenance("fuzz", {}), force=True)
     return (folder / "m.nc").read_bytes()
 
@@ -293,9 +294,10 @@ def _metafile() -> bytes:
 
 
 def _read_grid(path: Path) -> object:
-    from tactile_bayes.files.grids import read_grid
+    from tactile_bayes.files.arrays_layout import GridOptions
+    from tactile_bayes.files.grids import import_grid
 
-    return read_grid(path, spacing_mm=None if path.suffix == ".npz" else 1.0)
+    return import_grid(path, GridOptions(spacing_mm=None if path.suffix == ".npz" else 1.0))
 
 
 def _read_tables(path: Path) -> object:

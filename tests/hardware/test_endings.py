@@ -19,8 +19,7 @@ from emulated_devices import head_and_tracker, serving, short_scan
 
 from tactile_bayes.errors import DeviceError, UsageError
 from tactile_bayes.files.provenance import Provenance
-from tactile_bayes.files.scan_mcap import read_scan_report, write_scan
-from tactile_bayes.files.scan_recording import create_exclusive
+from tactile_bayes.files.scan_mcap import create_exclusive, read_scan_report, write_scan
 from tactile_bayes.hardware.emulated import EmulatedTracker
 from tactile_bayes.hardware.emulator import PtyLink
 from tactile_bayes.hardware.live import LiveState

@@ -12,8 +12,7 @@ from foxglove_schemas_protobuf.Grid_pb2 import Grid
 from mcap.reader import make_reader
 
 from tactile_bayes.files.provenance import Provenance
-from tactile_bayes.files.scan_mcap import write_scan
-from tactile_bayes.files.scan_recording import RecordingWriter
+from tactile_bayes.files.scan_mcap import RecordingWriter, write_scan
 from tests.endurance.recording import write_moment
 
 STATM = Path("/proc/self/statm")

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 from tactile_bayes.commands.devices import PROTOCOLS as CHOICES
 from tactile_bayes.errors import DeviceError
-from tactile_bayes.files import scan_recording
+from tactile_bayes.files import scan_mcap
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.geometry import inverse, quaternion_from_rotation, rigid
 from tactile_bayes.hardware import reading
@@ -273,10 +273,10 @@ def synced(tmp_path, monkeypatch):
     """A writer whose way to the disk is watched: when it was gone, and what was on the file then."""
     scan, seen = short_scan(0.2), []
     path = tmp_path / "a.mcap"
-    monkeypatch.setattr(scan_recording, "SYNC_S", 0.05)
+    monkeypatch.setattr(scan_mcap, "SYNC_S", 0.05)
     monkeypatch.setattr(os, "fdatasync", lambda _: seen.append((threading.get_ident(), path.stat().st_size)))
-    with scan_recording.create_exclusive(path, force=False) as stream:
-        writer = scan_recording.RecordingWriter(
+    with scan_mcap.create_exclusive(path, force=False) as stream:
+        writer = scan_mcap.RecordingWriter(
             stream,
             head=scan.head,
             element_calibration=scan.element_calibration,

@@ -22,8 +22,9 @@ from hypothesis import strategies as st
 import tactile_bayes as tb
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, DeviceError, UsageError
+from tactile_bayes.files.identify import describe
 from tactile_bayes.files.provenance import Provenance
-from tactile_bayes.files.scan_mcap import read_scan, summarise_scan, write_scan
+from tactile_bayes.files.scan_mcap import read_scan, write_scan
 from tactile_bayes.geometry import rotation_from_quaternion
 from tactile_bayes.hardware import serial_trackers
 from tactile_bayes.hardware.emulated import EmulatedHead, EmulatedNdi, EmulatedTracker, Faults
@@ -439,7 +440,7 @@ def test_a_hidden_tool_leaves_a_gap_that_show_and_map_tell(tmp_path, protocol):
     if protocol != "ndi":
         period = float(np.median(np.diff(scan.poses.time_s)))
         assert abs(report.poses_missing - 0.5 / period) <= 2
-    told = summarise_scan(tmp_path / "a.mcap")
+    told = describe(tmp_path / "a.mcap")
     assert said in " ".join(told["findings"])
     assert told["recording"]["missing_why"] == f"{why} {report.poses_missing:,}"
     assert told["notes"] >= 2  # where the gap begins and where it ends
@@ -558,7 +559,7 @@ def test_a_tracker_that_floods_costs_no_frame(tmp_path, monkeypatch):
     with serving(head, PtyLink()) as emulator, contextlib.suppress(DeviceError):
         tb.record(tmp_path / "a.mcap", head=emulator._link.url, **given)
     listener.close()
-    found = summarise_scan(tmp_path / "a.mcap")
+    found = describe(tmp_path / "a.mcap")
     assert (found["frames_missing"], found["complete"]) == (0, True)
     assert found["frames"] > 100
     assert found["recording"]["ended_by"].startswith("duration")

@@ -9,8 +9,8 @@ import pytest
 from scipy import integrate, optimize, stats
 
 from tactile_bayes.trial.figures import UndefinedError
-from tactile_bayes.trial.limits import content_factor, limits, limits_unlinked, percentile_factor, trend
 from tactile_bayes.trial.lines import concordance, least_squares
+from tactile_bayes.trial.method_comparison import content_factor, limits, limits_unlinked, percentile_factor, trend
 from tactile_bayes.trial.readings import ModalitySizes, Reading
 from tactile_bayes.trial.replicates import components, icc, log_sd_within, reader_components
 from tactile_bayes.trial.replicates import replicate_figures as figures

@@ -10,8 +10,7 @@ from scipy import stats
 
 from tactile_bayes.trial.accuracy import mape_figure, mape_ratios, share_interval
 from tactile_bayes.trial.figures import Intervals, effective_number, interval_from_values, kurtosis_freedom
-from tactile_bayes.trial.limits import figures, limits, limits_unlinked
-from tactile_bayes.trial.method_comparison import compare_methods
+from tactile_bayes.trial.method_comparison import compare_methods, limit_figures, limits, limits_unlinked
 from tactile_bayes.trial.planning import ErrorModel, check_intervals
 from tactile_bayes.trial.readings import ModalitySizes, Reading, gather
 
@@ -91,7 +90,7 @@ def test_limits_over_patients_have_the_values_of_the_exact_ones() -> None:
     single = limits(plain.size_mm - plain.ex_vivo_mm)
     several = limits_unlinked([np.array([e]) for e in replicated.ex_vivo_mm], list(groups))
     for one, expected in ((plain, single), (replicated, several)):
-        found = figures(one, confidence=CORRECTED)
+        found = limit_figures(one, confidence=CORRECTED)
         assert found["limit_low_mm"].value == pytest.approx(expected.low)
         assert found["limit_high_mm"].value == pytest.approx(expected.high)
 
@@ -103,7 +102,7 @@ def held(intervals: str, trials: int = 300) -> float:
     for _ in range(trials):
         one = trial(rng, patient, shared=0.16)
         ends = (
-            figures(one, confidence=CORRECTED)["limit_high_log_ratio"].interval
+            limit_figures(one, confidence=CORRECTED)["limit_high_log_ratio"].interval
             if intervals == "patients"
             else limits(np.log(one.size_mm / one.ex_vivo_mm)).high_interval
         )

@@ -16,8 +16,8 @@ from tactile_bayes.commands.trial import plan_command, validate_command
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.report.trial import trial_text
 from tactile_bayes.trial.figures import Figure, Intervals, UndefinedError
-from tactile_bayes.trial.limits import errors_are_proportional
 from tactile_bayes.trial.lines import deming
+from tactile_bayes.trial.method_comparison import errors_are_proportional
 from tactile_bayes.trial.readings import ModalitySizes, Reading, Trial, unit_doubts
 from tactile_bayes.trial.summary import TrialReport, summarise
 

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.forward.line import (
+from tactile_bayes.forward.plane import (
     SHARE,
     EmpiricalModel,
     build_line,

@@ -11,7 +11,7 @@ from tactile_bayes.cli import cli
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.contact import Head
-from tactile_bayes.forward.line import TactileLine
+from tactile_bayes.forward.plane import TactileLine
 from tactile_bayes.inference.modes import fit_least_squares
 from tactile_bayes.posterior.bump import cell_mean_gaussian
 from tactile_bayes.presets import HEADS
