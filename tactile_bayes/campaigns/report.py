@@ -27,6 +27,7 @@ from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.options import TrialSettings
 from tactile_bayes.report.campaign_page import ExamEntry, MassRow, VisitEntry, campaign_html, worst
 from tactile_bayes.report.compare import Growth, growth_line, growths
+from tactile_bayes.report.exam_words import reason_on_paper
 from tactile_bayes.trial.readings import at_excision, in_order
 
 # --- Tables: exams done, failures, and the trial table that `validate` takes.
@@ -502,8 +503,13 @@ def _visit(
         used = sum(one.status == "estimate" for one in report.maps)
         return VisitEntry(words, exams, size, used if len(rows) > 1 else 0, "" if size else report.reason)
     size = exams[0].size if len(exams) == 1 else None
-    reasons = dict.fromkeys(row.reason for row in rows)
+    reasons = dict.fromkeys(map(_why, rows))
     return VisitEntry(words, exams, size, why="" if size else "; ".join(filter(None, reasons)) or "not pooled")
+
+
+def _why(row: Row) -> str:
+    """Why an exam has no size, as its page says it; empty where it has one."""
+    return row.reason if row.report is None or row.size is not None else reason_on_paper(row.report)
 
 
 def _exam(campaign: Campaign, row: Row, *, inline: bool) -> ExamEntry:
@@ -521,7 +527,7 @@ def _exam(campaign: Campaign, row: Row, *, inline: bool) -> ExamEntry:
     reader = f", {exam.reader}" if exam.reader else ""
     return ExamEntry(
         f"visit {exam.visit}, exam {exam.replicate}{reader}",
-        row.reason,
+        _why(row),
         size,
         row.findings,
         picture,

@@ -189,6 +189,12 @@ def headline(exam: Exam) -> str:
     return "No lump found in the area covered" if exam.main.report.reason_code in NO_LUMP else "No size"
 
 
+def reason_on_paper(report: EstimateReport) -> str:
+    """Why there is no size, for a list on paper, where a place in mm of the map says nothing."""
+    rib = report.reason_code == "ridge"
+    return "no lump found: what rises is long like a rib, not round like a lump" if rib else report.reason
+
+
 def largest(exam: Exam) -> Quantity | None:
     """The largest size that the page reports: the pooled one of several maps."""
     return exam.report.leading.max_size_mm

@@ -33,7 +33,7 @@ from tactile_bayes.report.campaign_page import (
     worst,
 )
 from tactile_bayes.report.compare import Growth
-from tactile_bayes.report.exam_words import exam_map
+from tactile_bayes.report.exam_words import exam_map, reason_on_paper
 from tactile_bayes.report.svg import THUMB_SCALE, thumbnail_svg
 
 SVG = "{http://www.w3.org/2000/svg}"
@@ -217,3 +217,9 @@ def test_the_ring_lies_about_the_lump() -> None:
     assert np.ptp(points, axis=0) == pytest.approx(THUMB_SCALE * np.array([12.0, 8.0]), rel=0.02)
     bright = np.argwhere(pixels_of(picture)[..., 0] == pixels_of(picture)[..., 0].max()).mean(axis=0)[::-1]
     assert points.mean(axis=0) == pytest.approx(THUMB_SCALE * (bright + 0.5), abs=THUMB_SCALE)
+
+
+def test_a_reason_on_paper_names_no_place_of_the_map() -> None:
+    ridge = replace(NO_SIZE, reason="what rises near (-21.9, -12.5) mm is a ridge, not a lump", reason_code="ridge")
+    assert reason_on_paper(ridge) == "no lump found: what rises is long like a rib, not round like a lump"
+    assert reason_on_paper(replace(ridge, reason_code="undetected")) == ridge.reason
