@@ -10,8 +10,9 @@ from typing import Any
 
 import click
 
-from tactile_bayes.campaigns.campaign import names_line, run_campaign
+from tactile_bayes.campaigns.campaign import run_campaign
 from tactile_bayes.campaigns.exams import SCANS, Found, find_exams
+from tactile_bayes.campaigns.report import names_line
 from tactile_bayes.commands.options import settings_of
 from tactile_bayes.declarations import names_of
 from tactile_bayes.errors import BadDataError, UsageError

@@ -6,7 +6,7 @@ import os
 from collections.abc import Iterable, Iterator, Sequence
 from html import escape
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 from tactile_bayes.api.arguments import PathLike, door, path_of, plain, required_path, takes
 from tactile_bayes.api.estimates import settings_of
@@ -14,12 +14,12 @@ from tactile_bayes.api.settings import Settings
 from tactile_bayes.batch import open_executor
 from tactile_bayes.campaigns.inputs import open_campaign, tidy
 from tactile_bayes.campaigns.report import (
+    MOST_NAMED,
     WRITTEN,
     Excision,
     Written,
     check_inputs,
     copy_outputs,
-    repeatability_words,
     write_outputs,
 )
 from tactile_bayes.campaigns.run import Bar, Campaign, CampaignState
@@ -34,8 +34,6 @@ from tactile_bayes.options import CampaignOptions
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.size.pooling import Repeatability
 
-MOST_NAMED: Final = 5  #: So many exams or masses are named in a line.
-
 
 class CampaignResult(Record, eq=False):
     """What a campaign did, or would do."""
@@ -43,7 +41,6 @@ class CampaignResult(Record, eq=False):
     campaign: Campaign
     folder: Path
     written: Written | None  #: What was written; None where nothing was run.
-    unlisted: tuple[str, ...] = ()  #: Folders of exams that the table does not list.
 
     @property
     def text(self) -> str:
@@ -74,22 +71,13 @@ class CampaignResult(Record, eq=False):
     def _done(self, written: Written) -> Iterator[str]:
         campaign, found = self.campaign, self.campaign.found
         yield f"{self.folder}: {len(campaign.exams)} exams: {written.counts}"
-        if written.pooled:
-            yield f"{written.pooled} masses pooled, each at one visit"
-        elif campaign.not_pooled:
-            yield f"no mass pooled: {campaign.not_pooled}"
-        yield from filter(None, (repeatability_words(campaign), written.growth))
+        yield from written.masses
         yield f"{sum(found.todo.values())} steps run, {sum(found.kept.values())} kept from earlier runs"
         for step, todo in found.todo.items():
             more = "" if _few(found, step) else f" and {todo - len(found.names[step])} more"
             if todo and any(found.kept.values()):
                 yield f"{step} run: {', '.join(found.names[step])}{more}"
-        yield from names_line("no size after excision, left out of trial.csv", written.left_out)
-        yield from names_line("masses whose exams disagree, without a pooled size", written.disagreeing)
-        yield from names_line("exams with a mass that no row names, see their findings", written.unnamed)
-        yield from names_line("folders of exams that the table does not list", self.unlisted)
-        if written.no_report and not written.report:
-            yield f"no trial report: {written.no_report}"
+        yield from written.doubts
 
     def __repr__(self) -> str:
         counts = "nothing was run" if self.written is None else self.written.counts
@@ -162,7 +150,11 @@ def run_campaign(
     settings = CampaignSettings(estimate, asked.normalise, asked.figures, asked.match_mm, own_repeatability, copy_to)
     table = read_manifest(exams)
     _check_folder(table, output, settings)
-    _keep_inputs([exams, asked.excision, asked.columns, asked.protocol, *read, *_calibrations(table, settings)], output)
+    names = {settings.of(exam).calibration_name for exam in table} - {None}
+    used = [exams, asked.excision, asked.columns, asked.protocol, *read, *map(size_calibration_path, map(str, names))]
+    for path in (output / name for name in WRITTEN):
+        if any(one is not None and same_file(path, one) for one in used):
+            raise UsageError(f"{path} is an input of this command; choose another name for the output")
     if asked.columns is not None and asked.excision is None:
         raise UsageError("--columns is the layout of the excision table; give --excision too")
     measured = None if asked.excision is None else Excision(asked.excision, asked.columns)
@@ -177,10 +169,10 @@ def run_campaign(
         if asked.dry_run:
             return CampaignResult(run, output, None)
         left = tidy(place, table, run.found.results, unread=run.unread)
-        written = write_outputs(run, measured, asked.protocol)
+        written = write_outputs(run, measured, asked.protocol, unlisted=left)
         if settings.copy_to:
             copy_outputs(place, settings.copy_to)
-    return CampaignResult(run, output, written, tuple(left))
+    return CampaignResult(run, output, written)
 
 
 def _check_folder(table: Sequence[Exam], output: Path, settings: CampaignSettings) -> None:
@@ -194,24 +186,6 @@ def _check_folder(table: Sequence[Exam], output: Path, settings: CampaignSetting
     inside = next((exam.file for exam in local if Path(os.path.realpath(exam.path)).is_relative_to(folder)), None)
     if inside is not None:
         raise UsageError(f"{inside} lies in the output folder {output}; choose another folder")
-
-
-def _calibrations(table: Sequence[Exam], settings: CampaignSettings) -> Iterator[Path | None]:
-    for name in {settings.of(exam).calibration_name for exam in table} - {None}:
-        yield size_calibration_path(str(name))
-
-
-def _keep_inputs(read: Sequence[Path | None], output: Path) -> None:
-    """Refuse a folder where a file that is read would be written over."""
-    for path in (output / name for name in WRITTEN):
-        if any(one is not None and same_file(path, one) for one in read):
-            raise UsageError(f"{path} is an input of this command; choose another name for the output")
-
-
-def names_line(words: str, names: Sequence[str]) -> list[str]:
-    """The first names in a line that counts the others; none without any."""
-    more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
-    return [f"{words}: {', '.join(names[:MOST_NAMED])}{more}"] if names else []
 
 
 def _few(found: CampaignState, step: str) -> bool:

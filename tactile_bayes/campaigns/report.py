@@ -83,10 +83,6 @@ class Row(Record, eq=False):
         """As the trial table has it: an exam without an estimate looked for the mass in vain, others were not done."""
         return _status(self.report)
 
-    def has(self, kind: str) -> bool:
-        """Whether a finding of the kind speaks against it."""
-        return any(one.kind == kind for one in self.findings)
-
     @property
     def verdict(self) -> Verdict:
         """Sound, doubtful or no answer."""
@@ -342,22 +338,21 @@ class Excision(Record):
 
 
 class Written(Record):
-    """What was written, in numbers and words."""
+    """What was written, in words."""
 
-    counts: str  #: How the exams ended, in words.
-    pooled: int  #: Masses at a visit that were pooled.
-    left_out: tuple[str, ...] = ()  #: Masses without a size after excision, as ``patient mass``.
-    report: str = ""  #: The trial report as text; empty where there is none.
-    no_report: str = ""  #: Why there is none, where excision sizes were given.
-    unnamed: tuple[str, ...] = ()  #: Exams whose map shows a mass that no row names.
-    growth: str = ""
-    """What became of masses with several visits, in a sentence; empty where there are none."""
-    disagreeing: tuple[str, ...] = ()
-    """Masses at a visit whose exams are not of one size or place."""
+    counts: str  #: How the exams ended.
+    masses: tuple[str, ...]  #: What became of masses with several exams or visits, a line each.
+    doubts: tuple[str, ...]  #: What is to be looked at, a line each.
+    report: str  #: The trial report as text; empty where there is none.
 
 
-def write_outputs(campaign: Campaign, excision: Excision | None, protocol: Path | None = None) -> Written:
-    """Write tables, the index and, where excision sizes are given, the trial's report."""
+def write_outputs(
+    campaign: Campaign, excision: Excision | None, protocol: Path | None = None, *, unlisted: Sequence[str] = ()
+) -> Written:
+    """Write tables, the index and, where excision sizes are given, the trial's report.
+
+    `unlisted` are folders of exams that the table does not list.
+    """
     folder, growth, pooled = campaign.folder, growth_rows(campaign), pooled_reports(campaign)
     rows = exam_rows(campaign, pooled)
     masses = None if excision is None else excision.masses()
@@ -376,16 +371,35 @@ def write_outputs(campaign: Campaign, excision: Excision | None, protocol: Path 
     counts = f"{sized} sized, {len(rows) - sized - failed} without a size, {failed} failed"
     write_text(folder / INDEX, _page(campaign, rows, pooled, growth, counts=counts, links=links), force=True)
     left_out = set() if masses is None else {(row.exam.patient, row.exam.mass) for row in rows} - masses
+    together = f"no mass pooled: {campaign.not_pooled}" if campaign.not_pooled else ""
+    together = f"{len(pooled)} masses pooled, each at one visit" if pooled else together
+    doubts = {
+        "no size after excision, left out of trial.csv": [" ".join(mass) for mass in sorted(left_out)],
+        "masses whose exams disagree, without a pooled size": _with(rows, "maps_disagree", "of_mass"),
+        "exams with a mass that no row names, see their findings": _with(rows, "unnamed_mass", "name"),
+        "folders of exams that the table does not list": unlisted,
+    }
+    lines = [line for words, names in doubts.items() for line in names_line(words, names)]
     return Written(
         counts,
-        pooled=len(pooled),
-        left_out=tuple(f"{patient} {mass}" for patient, mass in sorted(left_out)),
-        report=report,
-        no_report=fault,
-        unnamed=tuple(row.exam.name for row in rows if row.has("unnamed_mass")),
-        growth=growth_line(growth, layout.GROWN),
-        disagreeing=tuple(dict.fromkeys(row.exam.of_mass for row in rows if row.has("maps_disagree"))),
+        tuple(filter(None, (together, repeatability_words(campaign), growth_line(growth, layout.GROWN)))),
+        (*lines, *([f"no trial report: {fault}"] if fault and not report else [])),
+        report,
     )
+
+
+def _with(rows: Sequence[Row], kind: str, name: str) -> list[str]:
+    """Names of the exams, or of their masses, that a finding of the kind speaks against, each once."""
+    return list(dict.fromkeys(getattr(row.exam, name) for row in rows if any(one.kind == kind for one in row.findings)))
+
+
+MOST_NAMED: Final = 5  #: So many exams or masses are named in a line.
+
+
+def names_line(words: str, names: Sequence[str]) -> list[str]:
+    """The first names in a line that counts the others; none without any."""
+    more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
+    return [f"{words}: {', '.join(names[:MOST_NAMED])}{more}"] if names else []
 
 
 def copy_outputs(folder: Path, address: str) -> None:
