@@ -7,6 +7,7 @@ import os
 import re
 from collections.abc import Callable, Collection, Iterable, Sequence
 from functools import wraps
+from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, ParamSpec, TypeVar, overload
 
@@ -109,6 +110,18 @@ def sequence_of(name: str, given: Any, what: str) -> Sequence[Any]:
 def plain(value: Any) -> Any:
     """A number of numpy's as one of Python's, which files and reports hold; anything else as it is."""
     return value.item() if isinstance(value, np.generic) else value
+
+
+class Told(Record, eq=False):
+    """What a function returns, in a notebook shown as its text."""
+
+    @property
+    def text(self) -> str:
+        """In words."""
+        raise NotImplementedError
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{escape(self.text)}</pre>"
 
 
 # --- Paths as texts or `Path`, tables as files or DataFrames.

@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from html import escape
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tactile_bayes.api.arguments import PathLike, door, path_of, plain, sequence_of, takes
+from tactile_bayes.api.arguments import PathLike, Told, door, path_of, plain, sequence_of, takes
 from tactile_bayes.api.estimates import estimated, settings_of
 from tactile_bayes.api.estimating import input_digests
 from tactile_bayes.api.maps import Map
 from tactile_bayes.api.pooled import common_calibration, one_mass, place_of
 from tactile_bayes.api.settings import Settings, refuse_checkpoint, times_of
 from tactile_bayes.api.sized import Answer, SizeEstimate, size_priors
-from tactile_bayes.declarations import Record, as_dict, replace
+from tactile_bayes.declarations import as_dict, replace
 from tactile_bayes.errors import CANNOT_SHOW, EXIT_DONE, EXIT_NO_ESTIMATE, UsageError
 from tactile_bayes.files.comparison import CompareReport
 from tactile_bayes.files.provenance import Provenance, repeated_scans, scans_of
@@ -26,7 +25,7 @@ from tactile_bayes.findings import Finding, Verdict, by_weight, finding_lines, v
 from tactile_bayes.inference.draws import Draws
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.options import GROWN_BY, Comparing
-from tactile_bayes.presets import REGISTRATION_MM, RESEARCH_USE
+from tactile_bayes.presets import REGISTRATION_MM
 from tactile_bayes.report.compare import compare_report, compare_summary, compare_text
 from tactile_bayes.report.exam_words import Given
 from tactile_bayes.report.growth_page import Course, DrawnMap, draw_comparison, growth_page
@@ -57,7 +56,7 @@ if TYPE_CHECKING:
 # --- Two visits and more compared: whether they are of one mass, and the change of its size.
 
 
-class Comparison(Record, eq=False):
+class Comparison(Told, eq=False):
     """The size of one mass at several visits, and its change from the first to the last."""
 
     compared: Compared
@@ -183,9 +182,6 @@ class Comparison(Record, eq=False):
         cautions = finding_lines(self.findings, "caution", paper=True)
         words = f"not compared: {self.why}" if self.growth is None else f"{self.change_percent}, {self.growth}"
         return f"<Comparison {' '.join([*cautions, f'of {len(self.report.visits)} visits: {words}'])}>"
-
-    def _repr_html_(self) -> str:
-        return f"<pre>{escape(self.text)}</pre><p><small>{escape(RESEARCH_USE)}</small></p>"
 
 
 def compare_answers(

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tactile_bayes.api.arguments import PathLike, door, path_of, required_path
-from tactile_bayes.declarations import Record
+from tactile_bayes.api.arguments import PathLike, Told, door, path_of, required_path
 from tactile_bayes.errors import UsageError, check_choice
 from tactile_bayes.files.map_nc import PosteriorDraws, read_posterior
 from tactile_bayes.findings import finding_lines
@@ -25,7 +23,7 @@ _QUANTITIES = ("max_size_mm", "min_size_mm", "d_x_mm", "d_y_mm", "amplitude", "s
 _FIGURES = {"trace": trace_figure, "rank": rank_figure, "corner": corner_figure}
 
 
-class Diagnosis(Record, eq=False):
+class Diagnosis(Told, eq=False):
     """How far the draws of a posterior can be trusted."""
 
     posterior: PosteriorDraws
@@ -87,9 +85,6 @@ class Diagnosis(Record, eq=False):
         worst = max((one.get("rhat", np.nan) for one in self.quantities.values()), default=np.nan)
         agree = f", R-hat up to {worst:.3f}" if self.chains > 1 else ""
         return f"<Diagnosis of {self.path.name}: method {self.posterior.method}, {self.chains} chains{agree}>"
-
-    def _repr_html_(self) -> str:
-        return f"<pre>{escape(self.text)}</pre>"
 
 
 @door

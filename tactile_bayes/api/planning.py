@@ -6,14 +6,13 @@ import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from functools import partial
-from html import escape
 from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tactile_bayes.api.arguments import PathLike, door, plain, sequence_of, table_of, takes
+from tactile_bayes.api.arguments import PathLike, Told, door, plain, sequence_of, table_of, takes
 from tactile_bayes.api.trials import load_trial
 from tactile_bayes.batch import open_executor, run_batch
 from tactile_bayes.declarations import EXACT, Record, as_dict, names_of, to_plain
@@ -38,7 +37,7 @@ MAPS_OF_AIMS = 3  #: Maps of a mass where the number of patients is asked for, b
 _ERRORS = names_of(PlanErrors)
 
 
-class TrialPlan(Record, eq=False):
+class TrialPlan(Told, eq=False):
     """Power and widths of intervals of planned trials; `report` is what the file of ``plan -o`` holds."""
 
     report: planning.PlanReport
@@ -66,9 +65,6 @@ class TrialPlan(Record, eq=False):
     def __repr__(self) -> str:
         first, last = self.report.designs[0], self.report.designs[-1]
         return f"<TrialPlan power {first.power:.2f} ({first.patients} patients) to {last.power:.2f} ({last.patients})>"
-
-    def _repr_html_(self) -> str:
-        return f"<pre>{escape(self.text)}</pre>"
 
 
 class Pilot(Record, eq=False):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -39,39 +39,26 @@ Notice = Callable[[str], None]
 Scans = Sequence[Mapping[str, str]]
 
 
-class ExamFiles(Record):
-    """Files of a page: maps, and estimates as JSON or as a posterior's file."""
+def exam_of_files(
+    paths: Sequence[Path], settings: Settings, *, typed: Collection[str], notice: Notice | None = None
+) -> Exam:
+    """Read maps, or an estimate and its map, in any order, and put a page's exam together.
 
-    maps: tuple[Path, ...]
-    estimates: tuple[Path, ...]
-
-    @classmethod
-    def sort(cls, paths: Sequence[Path]) -> ExamFiles:
-        """Tell maps from estimates, in any order."""
-        if twice := given_twice(paths):
-            raise UsageError(f"{twice} is given twice; give each file once")
-        estimates = tuple(path for path in paths if _is_estimate(path))
-        maps = tuple(path for path in paths if path not in estimates)
-        if len(estimates) > 1 or (estimates and len(maps) > 1):
-            raise UsageError("an estimate goes with one map; several maps are estimated and pooled: give maps alone")
-        return cls(maps, estimates)
-
-
-def _is_estimate(path: Path) -> bool:
-    if path.suffix.lower() == ".json":
-        return True
-    return first_bytes(path, len(HDF5_MAGIC)) == HDF5_MAGIC and is_posterior(path)
-
-
-def exam_of_files(files: ExamFiles, settings: Settings, *, notice: Notice | None = None) -> Exam:
-    """Read maps, or an estimate and its map, and put a page's exam together.
-
-    `files`: maps of one mass; or an estimate, best with its map: what ``estimate`` printed with ``--json`` or wrote
-    with ``-o``; `notice`: called with a line that a user may want to read while waiting.
+    `paths`: maps of one mass; or an estimate, best with its map: what ``estimate`` printed with ``--json`` or wrote
+    with ``-o``; `typed`: the settings that somebody gave; `notice`: called with a line that a user may want to read
+    while waiting.
     """
-    maps = files.maps
-    if files.estimates:
-        return _from_estimate(files.estimates[0], maps[0] if maps else None)
+    if twice := given_twice(paths):
+        raise UsageError(f"{twice} is given twice; give each file once")
+    estimates = [path for path in paths if _is_estimate(path)]
+    maps = [path for path in paths if path not in estimates]
+    if len(estimates) > 1 or (estimates and len(maps) > 1):
+        raise UsageError("an estimate goes with one map; several maps are estimated and pooled: give maps alone")
+    if estimates:
+        for name in typed:  # they would change nothing
+            option = "--settings" if name == "settings_file" else f"--{name.replace('_', '-')}"
+            raise UsageError(f"an estimate has settings of its own; leave out {option}, or give the map alone")
+        return _from_estimate(estimates[0], maps[0] if maps else None)
     if len(maps) > 1:
         refuse_checkpoint(settings)
     found = []
@@ -80,6 +67,12 @@ def exam_of_files(files: ExamFiles, settings: Settings, *, notice: Notice | None
         found.append(estimate_file(path, settings, notice=tell))
     inputs = {f"map_{number}": path for number, path in enumerate(maps, start=1)}
     return exam_of(found, settings, inputs=inputs)
+
+
+def _is_estimate(path: Path) -> bool:
+    if path.suffix.lower() == ".json":
+        return True
+    return first_bytes(path, len(HDF5_MAGIC)) == HDF5_MAGIC and is_posterior(path)
 
 
 def exam_of(found: Sequence[SizeEstimate], settings: Settings, *, inputs: Mapping[str, Path] | None = None) -> Exam:
@@ -164,10 +157,7 @@ def exam_report(
 def _exam(given: Sequence[Any], settings: dict[str, Any]) -> Exam:
     """The exam of files alone, or of what Python holds."""
     if all(isinstance(one, str | Path) for one in given):
-        files = ExamFiles.sort([path_of(one) for one in given])
-        if files.estimates and settings:
-            raise UsageError(f"an estimate has settings of its own; leave out {next(iter(settings))}, or give the map")
-        return exam_of_files(files, settings_of(settings))
+        return exam_of_files([path_of(one) for one in given], settings_of(settings), typed=settings)
     if len(given) == 1 and isinstance(given[0], PooledSize):
         exam: Exam = given[0].exam()
         return exam

@@ -120,10 +120,11 @@ class Sized(Record, eq=False, dict=True):
         columns = self._columns()
         if not columns:
             raise UsageError(f"there are no draws: {self.why}")
-        return inference_data({name: draws.values for name, draws in columns.items()}, self._groups())
+        groups = {name: (group.arrays, group.notes) for name, group in self._groups().items()}
+        return inference_data({name: draws.values for name, draws in columns.items()}, groups)
 
-    def _groups(self) -> dict[str, Any]:
-        """Arrays and notes of the groups besides ``posterior``."""
+    def _groups(self) -> dict[str, DrawGroup]:
+        """The groups besides ``posterior``."""
         return {}
 
     @property
@@ -171,16 +172,11 @@ class MassEstimate(Sized, eq=False, dict=True):
     patient_mm: tuple[float, float] | None
     """x and y from the xiphoid, to the patient's right and up; None where the map has no landmarks."""
     probability: float  #: Of the intervals shown by default.
-    reason: str  #: Why it has no size; empty where it has one.
+    why: str  #: Why it has no size; empty where it has one.
 
     @property
     def _size(self) -> SizePosterior | None:
         return self.mass.estimate.size
-
-    @property
-    def why(self) -> str:
-        """Why there is no size; empty where there is one."""
-        return self.reason
 
     @property
     def findings(self) -> tuple[Finding, ...]:
@@ -365,11 +361,7 @@ class SizeEstimate(SizedExam, eq=False, dict=True, kw_only=True):
         shapes = {name: draws for name in _SHAPES if (draws := self._of_shape(name)) is not None}
         return {**super()._columns(), **shapes}
 
-    def _groups(self) -> dict[str, Any]:
-        return {name: (group.arrays, group.notes) for name, group in self._beside().items()}
-
-    def _beside(self) -> dict[str, DrawGroup]:
-        """What goes with the draws, see `inference_groups`."""
+    def _groups(self) -> dict[str, DrawGroup]:
         rng = np.random.default_rng([self.settings.seed, self.tactile_map.fingerprint, 1])
         priors = size_priors(self.settings)
         return inference_groups(self.estimate, calibration=self.calibration, size_priors=priors, rng=rng)
@@ -458,7 +450,7 @@ class SizeEstimate(SizedExam, eq=False, dict=True, kw_only=True):
     def write(self, path: Path, *, force: bool = False) -> None:
         """Write the draws of an estimate, and what goes with them."""
         assert self.answer.report is not None
-        groups, report = self._beside(), self.answer.report
+        groups, report = self._groups(), self.answer.report
         write_posterior(path, self.estimate, provenance=self.provenance, groups=groups, report=report, force=force)
 
 

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tactile_bayes.api.arguments import PathLike, door, path_of, plain, table_of, takes
-from tactile_bayes.declarations import Record, as_dict, replace, to_plain
+from tactile_bayes.api.arguments import PathLike, Told, door, path_of, plain, table_of, takes
+from tactile_bayes.declarations import as_dict, replace, to_plain
 from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.files.atomic import write_text
 from tactile_bayes.files.column_map import read_mapping, read_wide, read_wide_excision
@@ -24,7 +23,7 @@ from tactile_bayes.inference.ensemble import ensemble
 from tactile_bayes.inference.importance import ImportanceOptions, importance
 from tactile_bayes.inference.modes import LogDensity, mode_and_covariance
 from tactile_bayes.options import TrialSettings
-from tactile_bayes.presets import INTERVAL, RESEARCH_USE
+from tactile_bayes.presets import INTERVAL
 from tactile_bayes.report.compare import Growth
 from tactile_bayes.report.pages import PageFiles
 from tactile_bayes.report.trial import DIGITS, trial_text
@@ -63,7 +62,7 @@ def draw(
 # --- Analysis of a trial from its tables: errors, lines, agreement and calibration of each modality.
 
 
-class TrialResult(Record, eq=False):
+class TrialResult(Told, eq=False):
     """How each modality's sizes compare with excision.
 
     `report` is what the file of ``validate --json`` holds, and `trial` what it was made from.
@@ -115,9 +114,6 @@ class TrialResult(Record, eq=False):
     def __repr__(self) -> str:
         counts, names = self.report.counts, ", ".join(self.report.modalities)
         return f"<TrialResult {counts.masses} masses of {counts.patients} patients: {names}>"
-
-    def _repr_html_(self) -> str:
-        return f"<pre>{escape(self.text)}</pre><p><small>{escape(RESEARCH_USE)}</small></p>"
 
 
 def analyse(

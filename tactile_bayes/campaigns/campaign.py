@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator, Sequence
-from html import escape
 from pathlib import Path
 from typing import Any
 
-from tactile_bayes.api.arguments import PathLike, door, path_of, plain, required_path, takes
+from tactile_bayes.api.arguments import PathLike, Told, door, path_of, plain, required_path, takes
 from tactile_bayes.api.estimates import settings_of
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.batch import open_executor
@@ -24,7 +23,7 @@ from tactile_bayes.campaigns.report import (
 )
 from tactile_bayes.campaigns.run import Bar, Campaign, CampaignState
 from tactile_bayes.campaigns.steps import CampaignSettings
-from tactile_bayes.declarations import Record, names_of
+from tactile_bayes.declarations import names_of
 from tactile_bayes.errors import UsageError
 from tactile_bayes.files.atomic import same_file
 from tactile_bayes.files.manifest_csv import Exam, read_manifest
@@ -35,7 +34,7 @@ from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.size.pooling import Repeatability
 
 
-class CampaignResult(Record, eq=False):
+class CampaignResult(Told, eq=False):
     """What a campaign did, or would do."""
 
     campaign: Campaign
@@ -82,9 +81,6 @@ class CampaignResult(Record, eq=False):
     def __repr__(self) -> str:
         counts = "nothing was run" if self.written is None else self.written.counts
         return f"<CampaignResult of {len(self.campaign.exams)} exams: {counts}>"
-
-    def _repr_html_(self) -> str:
-        return f"<pre>{escape(self.text)}</pre>"
 
 
 @door
