@@ -19,7 +19,7 @@ from tactile_bayes.files.documents import with_session
 from tactile_bayes.files.grids import import_grid
 from tactile_bayes.files.imports import import_arrays, of_calibration, of_head, of_landmarks, of_poses, with_checked
 from tactile_bayes.files.map_nc import write_map
-from tactile_bayes.files.named_arrays import ARRAY_SUFFIXES, Source, array_template, read_array_map
+from tactile_bayes.files.named_arrays import ARRAY_SUFFIXES, array_template, read_array_map
 from tactile_bayes.files.provenance import Provenance, hash_inputs
 from tactile_bayes.files.scan_mcap import read_scan_report, read_truth, write_scan
 from tactile_bayes.findings import LEADS, finding_lines
@@ -59,10 +59,6 @@ def import_action(
     output: Path | None,
     template: bool,
     columns: Path | None,
-    poses: Path | None,
-    head_geometry: Path | None,
-    array_calibration: Path | None,
-    landmarks: Path | None,
     **given: Any,
 ) -> int:
     """Import scans, grids and images from other programs."""
@@ -75,13 +71,7 @@ def import_action(
     stated = {name: given.pop(name) for name in names_of(Stated)}
     arrays = ArrayMap() if columns is None else read_array_map(columns)
     arrays = replace(arrays, **{name: value for name, value in stated.items() if value is not None})
-    paths = {
-        "poses": poses,
-        "head_geometry": head_geometry,
-        "array_calibration": array_calibration,
-        "landmarks": landmarks,
-    }
-    beside = {name: path for name, path in paths.items() if path is not None}
+    beside = {name: path for name in ("poses", *_BESIDE) if (path := given.pop(name)) is not None}
     grid = GridOptions(**{name: given.pop(name) for name in names_of(GridOptions)})
     wanted = Wanted(**given, grid=grid, arrays=arrays, beside=beside)
     if len(sources) == 1 and not output.is_dir():
@@ -138,7 +128,8 @@ def _import(source: Path, output: Path, wanted: Wanted) -> list[str]:
         given = " and ".join(wanted.of_arrays)
         raise UsageError(f"{given}: for arrays and tables; {source} is a scan already: leave out")
     if kind == "scan" and wanted.grid != GridOptions():
-        given = " and ".join(f"--{name.replace('_', '-')}" for name in _changed(wanted.grid))
+        changed = [name for name, value in as_dict(wanted.grid).items() if value != getattr(GridOptions(), name)]
+        given = " and ".join(f"--{name.replace('_', '-')}" for name in changed)
         raise UsageError(f"{given}: for maps only; leave out or give --as map")
     if kind == "map" and wanted.of_a_scan:
         unit = " (a map's unit is --units)" if wanted.arrays.unit else ""
@@ -155,7 +146,8 @@ def _import_scan(source: Path, output: Path, wanted: Wanted) -> list[str]:
         file = read_scan_report(source)
         scan, lost, truth = file.scan, file.lost, read_truth(source)
     else:
-        beside = [_of_file(name, path, wanted.arrays) for name, path in wanted.beside.items()]
+        files = wanted.beside.items()
+        beside = [of_poses(file, wanted.arrays) if name == "poses" else _BESIDE[name](file) for name, file in files]
         made = import_arrays(source, wanted.arrays, beside)
         scan, notes = with_checked(made.scan, wanted.beside.get("head_geometry")), made.notes
     session = {} if wanted.session_file is None else {"session": wanted.session_file}
@@ -165,15 +157,6 @@ def _import_scan(source: Path, output: Path, wanted: Wanted) -> list[str]:
     provenance = Provenance("import", settings, inputs=inputs)
     write_scan(output, scan, provenance=provenance, truth=truth, force=wanted.force)
     return [*describe_scan(scan), *notes, *(f"lost: {line}" for line in lost), *_arrangement_lines(scan)]
-
-
-def _of_file(option: str, path: Path, arrays: ArrayMap) -> Source:
-    return of_poses(path, arrays) if option == "poses" else _BESIDE[option](path)
-
-
-def _changed(asked: GridOptions) -> list[str]:
-    """Names of the options that are not as they are by default."""
-    return [name for name, value in as_dict(asked).items() if value != getattr(GridOptions(), name)]
 
 
 def _stated(arrays: ArrayMap) -> Mapping[str, Any]:

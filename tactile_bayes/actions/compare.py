@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from itertools import groupby
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
 import click
 
-from tactile_bayes.api.comparing import Comparison, compare_estimates
+from tactile_bayes.api.comparing import compare_estimates
 from tactile_bayes.api.estimating import estimate_file
-from tactile_bayes.api.settings import Settings, dates_of, refuse_checkpoint, times_of
+from tactile_bayes.api.settings import dates_of, refuse_checkpoint, times_of
 from tactile_bayes.api.sized import SizeEstimate
 from tactile_bayes.commands.options import settings_of
 from tactile_bayes.declarations import replace
@@ -22,14 +23,6 @@ from tactile_bayes.report.compare import compare_summary, compare_text
 from tactile_bayes.report.exam_words import Given
 from tactile_bayes.report.pages import PageFiles
 from tactile_bayes.shell import progress_bar
-
-
-def groups_of(later: Sequence[tuple[int, Path]]) -> list[tuple[Path, ...]]:
-    """Files of each group, in the order of the groups."""
-    found: dict[int, list[Path]] = {}
-    for number, path in later:
-        found.setdefault(number, []).append(path)
-    return [tuple(found[number]) for number in sorted(found)]
 
 
 def compare_action(
@@ -58,7 +51,7 @@ def compare_action(
         registration_mm=registration_mm,
     )
     settings = settings_of(**asked)
-    visits = [first, *groups_of(later)]
+    visits = [first, *(tuple(path for _, path in group) for _, group in groupby(later, itemgetter(0)))]
     if twice := given_twice(path for maps in visits for path in maps):
         raise UsageError(f"{twice} is given twice; give each map once, at its own visit")
     refuse_checkpoint(settings)
@@ -69,7 +62,15 @@ def compare_action(
     page = None if output is None else PageFiles(output, pdf, force)
     if page is not None:
         page.check()
-    found = replace(_compare(visits, settings, comparing), dates=dates_of(dates))
+    done, total = list[list[SizeEstimate]](), sum(len(maps) for maps in visits)
+    with progress_bar("maps") as progress:
+        for maps in visits:
+            done.append([estimate_file(path, settings) for path in maps])
+            progress(sum(map(len, done)), total)
+    names = [[str(path) for path in maps] for maps in visits]
+    inputs = {f"visit_{v}_map_{i}": path for v, maps in enumerate(visits, 1) for i, path in enumerate(maps, 1)}
+    found = compare_estimates(done, settings, comparing=comparing, names=names, inputs=inputs)
+    found = replace(found, dates=dates_of(dates))
     report = found.report.checked()
     text_of = json_text if as_json else compare_text if verbose else compare_summary
     try:
@@ -80,15 +81,3 @@ def compare_action(
     finally:  # what was computed is not lost with the figure
         click.echo(text_of(report), nl=False)
     return found.exit_code
-
-
-def _compare(visits: list[tuple[Path, ...]], settings: Settings, comparing: Comparing) -> Comparison:
-    """Estimate every map and compare. An error with one map stops it."""
-    total, found = sum(len(maps) for maps in visits), list[list[SizeEstimate]]()
-    with progress_bar("maps") as progress:
-        for maps in visits:
-            found.append([estimate_file(path, settings) for path in maps])
-            progress(sum(len(one) for one in found), total)
-    names = [[str(path) for path in maps] for maps in visits]
-    inputs = {f"visit_{v}_map_{i}": path for v, maps in enumerate(visits, 1) for i, path in enumerate(maps, 1)}
-    return compare_estimates(found, settings, comparing=comparing, names=names, inputs=inputs)

@@ -12,7 +12,6 @@ import numpy as np
 from tactile_bayes.api.arguments import PathLike, Told, door, path_of, plain, sequence_of, takes
 from tactile_bayes.api.estimates import estimated, settings_of
 from tactile_bayes.api.estimating import input_digests
-from tactile_bayes.api.maps import Map
 from tactile_bayes.api.pooled import common_calibration, one_mass, place_of
 from tactile_bayes.api.settings import Settings, refuse_checkpoint, times_of
 from tactile_bayes.api.sized import Answer, SizeEstimate, size_priors
@@ -432,16 +431,13 @@ def compare(
     shares = tuple(plain(one) for one in sequence_of("grown_by", grown_by, "shares, such as 0.2 for 20 %"))
     comparing = Comparing(times, shares, same_mass, plain(registration_mm))
     comparing.check_visits(2 + len(more))
-    visits = tuple(_visit(one, settings) for one in (first, second, *more))
+    visits = [
+        estimated(one if isinstance(one, Sequence) and not isinstance(one, str) else [one], settings)
+        for one in (first, second, *more)
+    ]
     prints = [one.tactile_map.fingerprint for visit in visits for one in visit]
     if len(set(prints)) < len(prints):
         raise UsageError("a map is given twice; give each map once, at its own visit")
     names = [[one.name or f"visit {v} map {i}" for i, one in enumerate(visit, 1)] for v, visit in enumerate(visits, 1)]
     found = compare_estimates(visits, used, comparing=comparing, names=names, inputs={})
     return replace(found, dates=tuple(map(str, dated or ())))
-
-
-def _visit(given: Any, settings: dict[str, Any]) -> tuple[SizeEstimate, ...]:
-    """Estimates of a visit's maps."""
-    single = isinstance(given, str | Path | Map | SizeEstimate) or not isinstance(given, Sequence)
-    return estimated([given] if single else given, settings)

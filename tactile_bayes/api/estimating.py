@@ -28,15 +28,8 @@ from tactile_bayes.posterior.verdict import smallest_lumps
 from tactile_bayes.posterior.white import default_errors
 from tactile_bayes.presets import FIT_RADIUS_MM
 from tactile_bayes.progress import Progress
+from tactile_bayes.report import estimate_document
 from tactile_bayes.report.calibration import calibration_line, site_words
-from tactile_bayes.report.estimate_document import (
-    SizedPlace,
-    patient_mm,
-    side_findings,
-    side_of,
-    touching_findings,
-    touching_masses,
-)
 from tactile_bayes.size.bodies import BodyCalibration, mean_width_mm
 from tactile_bayes.size.pooling import Calibration
 
@@ -172,10 +165,10 @@ def _with_place(
     estimate: Estimate, tactile_map: TactileMap, scans: Sequence[Mapping[str, str]], *, probability: float
 ) -> Estimate:
     """The estimate with what speaks against the place of its masses: side and landmarks, and how near they lie."""
-    here = [patient_mm(tactile_map, one.x_mm, one.y_mm) for one in estimate.masses if one.reported]
-    side = side_findings(side_of(scans), here[0] if here else None)
+    here = [estimate_document.patient_mm(tactile_map, one.x_mm, one.y_mm) for one in estimate.masses if one.reported]
+    side = estimate_document.side_findings(estimate_document.side_of(scans), here[0] if here else None)
     sized = [
-        SizedPlace(
+        estimate_document.SizedPlace(
             number,
             Place(one.x_mm, one.y_mm),
             one.estimate.size.summarise("max_size_mm", probability=probability).rounded,
@@ -183,7 +176,7 @@ def _with_place(
         for number, one in enumerate(estimate.masses, start=1)
         if one.estimate.size is not None
     ]
-    touching = touching_findings(touching_masses(sized)) if len(sized) > 1 else []
+    touching = estimate_document.touching_findings(estimate_document.touching_masses(sized)) if len(sized) > 1 else []
     return replace(estimate, findings=by_weight((*side, *estimate.findings, *touching)))
 
 

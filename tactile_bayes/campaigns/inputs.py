@@ -71,12 +71,11 @@ def _taken(result: Result) -> Result:
 def unchanged(folder: Path, result: Result) -> bool:
     """Whether the files of a step are still what it wrote: by their stamps, and where these differ by their digests."""
     stamps = result.get("stamps", {})
-    return all(_same(folder / name, digest, stamps.get(name)) for name, digest in result["files"].items())
-
-
-def _same(path: Path, digest: str, stamped: str | None) -> bool:
     try:
-        return stamp(path) == stamped or sha256(path) == digest
+        return all(
+            stamp(folder / name) == stamps.get(name) or sha256(folder / name) == digest
+            for name, digest in result["files"].items()
+        )
     except (OSError, TactileBayesError):
         return False
 

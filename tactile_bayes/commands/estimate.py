@@ -8,36 +8,26 @@ from typing import Any, Final
 import click
 
 from tactile_bayes.api.settings import Settings
-from tactile_bayes.commands.options import (
-    FORCE,
-    FilePath,
-    FiniteRange,
-    command,
-    figure,
-    output,
-    page_options,
-    scheduler_option,
-    takes,
-)
+from tactile_bayes.commands import options
 from tactile_bayes.declarations import names_of
 from tactile_bayes.errors import UsageError
 from tactile_bayes.options import GROWN_BY, Comparing, MapOptions
 
 # --- `map`: from scans to a tactile map.
 
-_FILE = FilePath()
+_FILE = options.FilePath()
 
 
-@command("map", "mapping.map_action")
+@options.command("map", "mapping.map_action")
 @click.argument("scans", metavar="SCAN.mcap...", nargs=-1, required=True, type=_FILE)
-@output(
+@options.output(
     "MAP.nc",
     "netCDF",
     "Where to write the map. Default: beside the first scan; map.nc for scan.mcap, s01.nc for s01.mcap.",
 )
-@takes(MapOptions, *names_of(MapOptions))
-@figure("Draw the map and its coverage.")
-@FORCE
+@options.takes(MapOptions, *names_of(MapOptions))
+@options.figure("Draw the map and its coverage.")
+@options.FORCE
 @click.option("-v", "--verbose", is_flag=True, help="Print all figures of the map; times on stderr.")
 def map_command() -> None:
     """Build a tactile map from one scan, or one common map from several scans of the same examination.
@@ -54,15 +44,15 @@ def map_command() -> None:
 # --- `estimate`: estimate sizes from tactile maps.
 
 
-@command("estimate", "estimate.estimate_action")
+@options.command("estimate", "estimate.estimate_action")
 @click.argument("maps", metavar="MAP.nc...", nargs=-1, required=True, type=_FILE)
-@takes(Settings, "size_calibration", "method", "seed", "interval")
-@output("POST.nc", "netCDF", "Write all draws (netCDF that arviz opens).")
+@options.takes(Settings, "size_calibration", "method", "seed", "interval")
+@options.output("POST.nc", "netCDF", "Write all draws (netCDF that arviz opens).")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON: one object, or a list for several maps.")
-@figure("Draw the size posterior, or the map where there is no size.")
-@figure("Draw the map with the lump's size, or with the places looked at.", "--map-figure")
-@figure("Draw data, fit and residual of the fit window, or the map where there is no estimate.", "--fit-figure")
-@takes(Settings, "centre_mm", "scene", "settings_file", "accuracy_sd", "known", "repeatability")
+@options.figure("Draw the size posterior, or the map where there is no size.")
+@options.figure("Draw the map with the lump's size, or with the places looked at.", "--map-figure")
+@options.figure("Draw data, fit and residual of the fit window, or the map where there is no estimate.", "--fit-figure")
+@options.takes(Settings, "centre_mm", "scene", "settings_file", "accuracy_sd", "known", "repeatability")
 @click.option("--pool", is_flag=True, help="Pool the maps, all of one mass, into one size.")
 @click.option(
     "--workers",
@@ -71,8 +61,8 @@ def map_command() -> None:
     show_default=True,
     help="Number of worker processes, for several maps.",
 )
-@scheduler_option("several maps")
-@FORCE
+@options.scheduler_option("several maps")
+@options.FORCE
 @click.option(
     "-v", "--verbose", is_flag=True, help="Print the full report instead of 12 lines, and the time taken on stderr."
 )
@@ -133,7 +123,7 @@ def numbered(args: Sequence[str], *, strict: bool = True) -> list[str]:
 _PERCENT = tuple(100 * share for share in GROWN_BY)
 
 
-@command("compare", "compare.compare_action", kind=VisitsCommand)
+@options.command("compare", "compare.compare_action", kind=VisitsCommand)
 @click.argument("first", metavar="VISIT1.nc...", nargs=-1, required=True, type=_FILE)
 @click.option(
     "--with",
@@ -146,7 +136,7 @@ _PERCENT = tuple(100 * share for share in GROWN_BY)
 )
 @click.option(
     "--days",
-    type=FiniteRange(),
+    type=options.FiniteRange(),
     multiple=True,
     metavar="DAYS",
     help="Time of a later visit in days from the first, once for each: growth rates are told.",
@@ -154,33 +144,35 @@ _PERCENT = tuple(100 * share for share in GROWN_BY)
 @click.option("--dates", metavar="DATE,DATE...", help="The visits' dates, in place of --days: 2026-01-15,2026-04-20.")
 @click.option(
     "--grown-by",
-    type=FiniteRange(min=-100.0, max=1000.0, min_open=True, max_open=True),
+    type=options.FiniteRange(min=-100.0, max=1000.0, min_open=True, max_open=True),
     multiple=True,
     default=_PERCENT,
     show_default=True,
     metavar="PERCENT",
     help="Growth of the diameter, in percent, that a probability of more is told for.",
 )
-@takes(Comparing, "same_mass", "registration_mm")
-@takes(
+@options.takes(Comparing, "same_mass", "registration_mm")
+@options.takes(
     Settings, "size_calibration", metavar="solid|eq6|solid-mean|SIZE.json",
     help="Calibration over bodies. Default: solid, or solid-mean for maps of frames divided by their means."
 )  # fmt: skip
-@takes(Settings, "method", help="As `estimate`.")
-@takes(
+@options.takes(Settings, "method", help="As `estimate`.")
+@options.takes(
     Settings, "settings_file", help="As `estimate`; between_map_sd states the spread between exams of a visit."
 )  # fmt: skip
-@takes(
+@options.takes(
     Settings, "repeatability",
     help="Spread between exams of one mass at this site, from `calibrate repeatability`. Default: two intervals, for "
     "exams as alike as simulated ones and as the paper's."
 )  # fmt: skip
-@takes(Settings, "seed", "interval")
+@options.takes(Settings, "seed", "interval")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-@output("GROWTH.html", "HTML", "Write one page: the maps on common axes, the size at each visit, and the change.")
-@page_options("GROWTH.pdf", "Tactile exams over time")
-@figure("Draw the maps, their difference and the change.")
-@FORCE
+@options.output(
+    "GROWTH.html", "HTML", "Write one page: the maps on common axes, the size at each visit, and the change."
+)
+@options.page_options("GROWTH.pdf", "Tactile exams over time")
+@options.figure("Draw the maps, their difference and the change.")
+@options.FORCE
 @click.option("-v", "--verbose", is_flag=True, help="Print the full report instead of 12 lines.")
 def compare_command() -> None:
     """Compare the size of a mass at two visits and more.
@@ -198,25 +190,25 @@ def compare_command() -> None:
 # --- `report`: one page of an exam, to read and to print.
 
 
-@command("report", "report.report_action")
+@options.command("report", "report.report_action")
 @click.argument("files", metavar="MAP.nc... [POST.nc|ESTIMATE.json]", nargs=-1, required=True, type=_FILE)
 @click.option("-o", "--output", metavar="EXAM.html", required=True, type=_FILE, help="Page to write.")
-@page_options("EXAM.pdf", "Tactile exam")
+@options.page_options("EXAM.pdf", "Tactile exam")
 @click.option("--date", "day", default="", metavar="YYYY-MM-DD", help="Date to print on the page. Default: none.")
-@takes(
+@options.takes(
     Settings,
     "size_calibration",
     metavar="solid|eq6|solid-mean|plane-strain|SIZE.json",
     help="Calibration from widths to sizes, as of `estimate`. Default: the one that fits the maps.",
 )
-@takes(Settings, "settings_file", help="Settings, as of `estimate`.")
-@takes(
+@options.takes(Settings, "settings_file", help="Settings, as of `estimate`.")
+@options.takes(
     Settings,
     "repeatability",
     help="Spread between exams of one mass at this site, as of `estimate`. Default: two intervals.",
 )
-@takes(Settings, "seed", "interval")
-@FORCE
+@options.takes(Settings, "seed", "interval")
+@options.FORCE
 def report_command() -> None:
     """Write one page of an exam: the map, the size with its intervals, the place, and how good the exam was.
 

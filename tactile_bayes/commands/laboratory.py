@@ -4,64 +4,43 @@ from __future__ import annotations
 
 import click
 
+from tactile_bayes import laboratory_options
 from tactile_bayes.api.settings import Settings
-from tactile_bayes.commands.options import (
-    FORCE,
-    JSON,
-    SESSION,
-    WORKERS,
-    CommandGroup,
-    FilePath,
-    FiniteRange,
-    command,
-    figure,
-    head_option,
-    output,
-    path_option,
-    scheduler_option,
-    takes,
-)
+from tactile_bayes.commands import options
 from tactile_bayes.declarations import names_of
-from tactile_bayes.laboratory_options import (
-    CaseOptions,
-    LearnOptions,
-    PopulationOptions,
-    SbcOptions,
-    SectionOptions,
-    StudyOptions,
-    TissueOptions,
-)
 from tactile_bayes.options import MapOptions
 
-_FILE = FilePath()
+_FILE = options.FilePath()
 
 # --- `calibrate`: learn a calibration from known objects, and a site's repeatability from its own exams.
 
 
-@click.group("calibrate", cls=CommandGroup)
+@click.group("calibrate", cls=options.CommandGroup)
 def calibrate_command() -> None:
     """Learn a calibration from known objects."""
 
 
-@command("size", "calibrate.calibrate_size_action", within=calibrate_command)
+@options.command("size", "calibrate.calibrate_size_action", within=calibrate_command)
 @click.argument("table", metavar="TABLE.csv", type=_FILE)
-@output("SIZE.json", "JSON", "Where to write the calibration.", required=True)
-@takes(LearnOptions, "form")
+@options.output("SIZE.json", "JSON", "Where to write the calibration.", required=True)
+@options.takes(laboratory_options.LearnOptions, "form")
 @click.option(
     "--correct",
     metavar="CALIBRATION",
     help="Correct this calibration (solid, solid-mean, eq6 or a file learned over bodies) by the table's lumps instead "
     "of learning one.",
 )
-@path_option(
+@options.path_option(
     "--against",
     "TABLE.csv",
     "Lumps of another origin, with the columns of `population`: how far their sizes are off goes into intervals.",
 )
-@takes(LearnOptions, "fit", "normalise", "background", "fit_radius_mm", "noise", "least_stiffness_ratio")
-@figure("Draw Fig 8 of the paper from the table's lumps (eq6 only).")
-@takes(LearnOptions, "seed")
-@FORCE
+@options.takes(
+    laboratory_options.LearnOptions, "fit", "normalise", "background", "fit_radius_mm", "noise", "least_stiffness_ratio"
+)
+@options.figure("Draw Fig 8 of the paper from the table's lumps (eq6 only).")
+@options.takes(laboratory_options.LearnOptions, "seed")
+@options.FORCE
 def size() -> None:
     """Learn Eq 6, d = m sigma / (e a^f) + b, from a study or a set of phantoms, or over a population of bodies.
 
@@ -95,15 +74,15 @@ def size() -> None:
     """
 
 
-@command("repeatability", "calibrate.calibrate_repeatability_action", within=calibrate_command)
+@options.command("repeatability", "calibrate.calibrate_repeatability_action", within=calibrate_command)
 @click.argument("folder", metavar="OUT", type=_FILE)
-@output("SITE.json", "JSON", "Where to write the spread.", required=True)
+@options.output("SITE.json", "JSON", "Where to write the spread.", required=True)
 @click.option(
     "--size-calibration",
     metavar="SIZE.json",
     help="Calibration that the exams were sized by, where the name in their estimates does not lead to its file.",
 )
-@FORCE
+@options.FORCE
 def repeatability() -> None:
     """Learn how far sizes of one mass lie apart between its exams at this site.
 
@@ -116,7 +95,7 @@ def repeatability() -> None:
     """
 
 
-@command("array", "calibrate.calibrate_array_action", within=calibrate_command)
+@options.command("array", "calibrate.calibrate_array_action", within=calibrate_command)
 @click.option(
     "--step",
     "steps",
@@ -126,12 +105,12 @@ def repeatability() -> None:
     required=True,
     help="The bladder's pressure and what the head recorded under it.",
 )
-@output("ARRAY.json", "JSON", "Where to write the calibration.", required=True)
+@options.output("ARRAY.json", "JSON", "Where to write the calibration.", required=True)
 @click.option("--head-id", metavar="ID", help="Identifier of the head. Default: what the scans state.")
 @click.option(
     "--date", "day", type=click.DateTime(["%Y-%m-%d"]), metavar="DAY", help="Day of the measurement. Default: today."
 )
-@FORCE
+@options.FORCE
 def array() -> None:
     """Learn the gain and offset of each taxel from a pressure bladder, and how uneven they stay.
 
@@ -145,21 +124,21 @@ def array() -> None:
 # --- `simulate`: make a scan with known truth from a scene.
 
 
-@command("simulate", "simulation.simulate_action")
-@click.argument("scene", type=FilePath())
-@click.option("-o", "--output", required=True, type=FilePath(writes="MCAP"), help="Scan file to write (.mcap).")
+@options.command("simulate", "simulation.simulate_action")
+@click.argument("scene", type=options.FilePath())
+@click.option("-o", "--output", required=True, type=options.FilePath(writes="MCAP"), help="Scan file to write (.mcap).")
 @click.option("--seed", type=click.IntRange(min=0), help="Seed of the random numbers, in place of the scene's.")
 @click.option(
     "--fidelity",
     type=click.Choice(["empirical-gaussian", "empirical", "plane-strain", "solid"]),
     help="Model of the tissue. Default: the one the scene is written for.",
 )
-@head_option(
+@options.head_option(
     "Default: as the scene's [head] gives them for solid, shoulders-inside for plane-strain and empirical. "
     "empirical-gaussian has none."
 )
-@SESSION
-@FORCE
+@options.SESSION
+@options.FORCE
 def simulate_command() -> None:
     """Make a scan with known truth from SCENE, a TOML file.
 
@@ -177,10 +156,10 @@ def simulate_command() -> None:
 # --- `population`: simulate, map and fit exams of varied bodies: the table for a size calibration.
 
 
-@command("population", "simulation.population_action")
-@output("TABLE.csv", "CSV", "Where to write the table.", required=True)
-@takes(PopulationOptions, "masses", "centred", "scans", "normalise")
-@path_option(
+@options.command("population", "simulation.population_action")
+@options.output("TABLE.csv", "CSV", "Where to write the table.", required=True)
+@options.takes(laboratory_options.PopulationOptions, "masses", "centred", "scans", "normalise")
+@options.path_option(
     "--head",
     "HEAD.json",
     "The head, as for `record`: its taxels or their grid and arc. Default: 16 by 26 taxels 1.5 mm apart, arc of 35 mm.",
@@ -193,10 +172,10 @@ def simulate_command() -> None:
     help="Ranges of lumps, bodies and exams, in the tables [bodies] and [exams]. Default: those of the shipped "
     "calibrations.",
 )
-@takes(PopulationOptions, "seed")
-@WORKERS
-@scheduler_option("the masses")
-@FORCE
+@options.takes(laboratory_options.PopulationOptions, "seed")
+@options.WORKERS
+@options.scheduler_option("the masses")
+@options.FORCE
 def population_command() -> None:
     """Simulate exams of varied bodies and fit their maps: the table that a size calibration is learned from.
 
@@ -213,14 +192,14 @@ def population_command() -> None:
 # --- `sbc`: simulation-based calibration of a map's posterior.
 
 
-@command("sbc", "study.sbc_action")
-@takes(SbcOptions, *names_of(SbcOptions))
-@WORKERS
-@scheduler_option("the maps")
-@output("TABLE.csv", "CSV", "Write truths and ranks; an interrupted run resumes from it.")
-@figure("Draw the ECDFs of the ranks with their bands.")
-@JSON
-@FORCE
+@options.command("sbc", "study.sbc_action")
+@options.takes(laboratory_options.SbcOptions, *names_of(laboratory_options.SbcOptions))
+@options.WORKERS
+@options.scheduler_option("the maps")
+@options.output("TABLE.csv", "CSV", "Write truths and ranks; an interrupted run resumes from it.")
+@options.figure("Draw the ECDFs of the ranks with their bands.")
+@options.JSON
+@options.FORCE
 def sbc_command() -> None:
     """Check the posterior against itself: simulation-based calibration and coverage.
 
@@ -238,32 +217,32 @@ def sbc_command() -> None:
 # --- `study`: amplitude and width of the maps of simulated lumps.
 
 
-@command("study", "study.study_action")
-@takes(StudyOptions, "model", "grid", "seat")
-@output("TABLE.csv", "CSV", "Write the table. Default: print it.")
-@path_option(
+@options.command("study", "study.study_action")
+@options.takes(laboratory_options.StudyOptions, "model", "grid", "seat")
+@options.output("TABLE.csv", "CSV", "Write the table. Default: print it.")
+@options.path_option(
     "--figures",
     "DIR",
     "Draw figures 5 to 8 of the paper into this directory, and in two dimensions the frames of four lumps. "
     "The empirical model in them holds for lumps of 10 mm and more down to h/d 1.",
 )
-@path_option(
+@options.path_option(
     "--measured-frames",
     "FRAMES.csv",
     "Your own frames, drawn into figure 6 beside both models: columns s_mm, pressure_kpa and optionally x_c_mm.",
 )
 @click.option(
     "--phantom",
-    type=(FiniteRange(min=0.0, min_open=True),) * 2,
+    type=(options.FiniteRange(min=0.0, min_open=True),) * 2,
     metavar="D H/D",
     help="Lump of figure 6: diameter in mm, and depth over diameter. Default: 12.5 0.825, the paper's.",
 )
-@takes(SectionOptions, *names_of(SectionOptions))
-@head_option("Default: shoulders-inside for plane-strain, shoulders-outside for solid.")
-@takes(StudyOptions, *names_of(CaseOptions), "background", "flat_field")
-@WORKERS
-@scheduler_option("the geometries")
-@FORCE
+@options.takes(laboratory_options.SectionOptions, *names_of(laboratory_options.SectionOptions))
+@options.head_option("Default: shoulders-inside for plane-strain, shoulders-outside for solid.")
+@options.takes(laboratory_options.StudyOptions, *names_of(laboratory_options.CaseOptions), "background", "flat_field")
+@options.WORKERS
+@options.scheduler_option("the geometries")
+@options.FORCE
 def study_command() -> None:
     """Run the forward study of section 2.4: amplitude and width of the map over sizes, depths and stiffnesses.
 
@@ -285,13 +264,13 @@ def study_command() -> None:
 # --- `tables`: recompute Tables 1 and 2 of the paper.
 
 
-@command("tables", "study.tables_action")
-@takes(StudyOptions, "seat", help="How far the lump stands out of the gland.")
-@takes(SectionOptions, *names_of(SectionOptions))
-@head_option("Default: shoulders-inside.")
+@options.command("tables", "study.tables_action")
+@options.takes(laboratory_options.StudyOptions, "seat", help="How far the lump stands out of the gland.")
+@options.takes(laboratory_options.SectionOptions, *names_of(laboratory_options.SectionOptions))
+@options.head_option("Default: shoulders-inside.")
 @click.option("--heads", "search", is_flag=True, help="Compute the tables for many heads, and name the nearest one.")
-@WORKERS
-@JSON
+@options.WORKERS
+@options.JSON
 def tables_command() -> None:
     """Recompute Tables 1 and 2 of the paper beside the printed figures.
 
@@ -307,16 +286,16 @@ def tables_command() -> None:
 # --- `head`: how evenly a scan head presses, and the head that presses most evenly (section 2.1 of the paper).
 
 
-@click.group("head", cls=CommandGroup)
+@click.group("head", cls=options.CommandGroup)
 def head_command() -> None:
     """How evenly a scan head presses on tissue without a lump: the homogeneous-pressure condition of section 2.1."""
 
 
-@command("uniformity", "study.head_uniformity_action", within=head_command)
-@takes(SectionOptions, *names_of(SectionOptions))
-@head_option("Default: shoulders-inside.")
-@takes(TissueOptions, *names_of(TissueOptions))
-@JSON
+@options.command("uniformity", "study.head_uniformity_action", within=head_command)
+@options.takes(laboratory_options.SectionOptions, *names_of(laboratory_options.SectionOptions))
+@options.head_option("Default: shoulders-inside.")
+@options.takes(laboratory_options.TissueOptions, *names_of(laboratory_options.TissueOptions))
+@options.JSON
 def head_uniformity_command() -> None:
     """Compute how evenly one head presses on homogeneous tissue.
 
@@ -327,12 +306,12 @@ def head_uniformity_command() -> None:
     """
 
 
-@command("design", "study.head_design_action", within=head_command)
-@head_option("Default: both are searched.")
-@takes(TissueOptions, *names_of(TissueOptions))
-@figure("Draw the non-uniformity over radius and shoulder.")
-@JSON
-@FORCE
+@options.command("design", "study.head_design_action", within=head_command)
+@options.head_option("Default: both are searched.")
+@options.takes(laboratory_options.TissueOptions, *names_of(laboratory_options.TissueOptions))
+@options.figure("Draw the non-uniformity over radius and shoulder.")
+@options.JSON
+@options.FORCE
 def head_design_command() -> None:
     """Find the head that presses evenly on homogeneous tissue (section 2.1 of the paper).
 
@@ -349,7 +328,7 @@ def head_design_command() -> None:
 _FIDELITIES = ("solid", "plane-strain", "empirical", "empirical-gaussian")
 
 
-@command("compare-model", "study.compare_model_action")
+@options.command("compare-model", "study.compare_model_action")
 @click.argument("scan", metavar="SCAN.mcap", type=_FILE)
 @click.argument("scene", metavar="SCENE.toml", type=_FILE)
 @click.option(
@@ -359,19 +338,19 @@ _FIDELITIES = ("solid", "plane-strain", "empirical", "empirical-gaussian")
     multiple=True,
     help="Model of the tissue; may be repeated. Default: the one the scene is written for.",
 )
-@head_option("Default: as for `simulate`.")
+@options.head_option("Default: as for `simulate`.")
 @click.option(
     "--at",
     type=(float, float),
     metavar="X Y",
     help="The lump's place on the scan's map, mm. Default: the highest bump that can be one; 0 0 for a scene of none.",
 )
-@takes(MapOptions, "every", help="Compare one frame in so many.")
-@takes(MapOptions, "cell_mm", "pressure_window_kpa")
+@options.takes(MapOptions, "every", help="Compare one frame in so many.")
+@options.takes(MapOptions, "cell_mm", "pressure_window_kpa")
 @click.option("--latency-ms", type=float, default=0.0, show_default=True, help="Delay of the tracker's time stamps.")
-@figure("Draw frames, maps and what the model leaves.")
-@JSON
-@FORCE
+@options.figure("Draw frames, maps and what the model leaves.")
+@options.JSON
+@options.FORCE
 def compare_model_command() -> None:
     """Compare a scan's frames and map with a forward model of SCENE (section 2.3 of the paper).
 
@@ -389,7 +368,7 @@ def compare_model_command() -> None:
 
 _TOLERANCE = click.option(
     "--tolerance-mm",
-    type=FiniteRange(min=0.0, min_open=True),
+    type=options.FiniteRange(min=0.0, min_open=True),
     default=0.2,
     show_default=True,
     help="Error of the size interval's ends below which more accuracy is not worth its cost.",
@@ -408,7 +387,7 @@ _CALIBRATION = click.option(
 )
 
 
-@click.group("tradeoff", cls=CommandGroup)
+@click.group("tradeoff", cls=options.CommandGroup)
 def tradeoff_command() -> None:
     """Measure what more accuracy costs on this machine, and which of it a case does not need."""
 
@@ -416,7 +395,7 @@ def tradeoff_command() -> None:
 # --- `tradeoff forward`: error in amplitude, width and size against CPU time, for one lump and every forward model.
 
 
-@command("forward", "tradeoff.tradeoff_forward_action", within=tradeoff_command)
+@options.command("forward", "tradeoff.tradeoff_forward_action", within=tradeoff_command)
 @click.argument("scene", required=False, metavar="[SCENE.toml]", type=_FILE)
 @click.option(
     "--size-calibration",
@@ -424,13 +403,13 @@ def tradeoff_command() -> None:
     help="Calibration for the sizes: a shipped one, your own file, or Eq 6 learned in this run. Default: each "
     "model's own.",
 )
-@head_option(
+@options.head_option(
     "Default: shoulders-inside for plane-strain and the empirical model, as the scene's [head] gives them for solid."
 )
-@figure("Draw error in size against time.")
+@options.figure("Draw error in size against time.")
 @click.option(
     "--tolerance-percent",
-    type=FiniteRange(min=0.0, min_open=True),
+    type=options.FiniteRange(min=0.0, min_open=True),
     default=0.5,
     show_default=True,
     help="Error in size below which more accuracy is not worth its cost.",
@@ -442,8 +421,8 @@ def tradeoff_command() -> None:
     show_default=True,
     help="Number of runs; the shortest time counts.",
 )
-@JSON
-@FORCE
+@options.JSON
+@options.FORCE
 def tradeoff_forward_command() -> None:
     """Measure error in amplitude, width and size against CPU time, for the lump of a scene.
 
@@ -464,17 +443,17 @@ def tradeoff_forward_command() -> None:
 # --- `tradeoff estimate`: every setting of `estimate` on the user's own map, against a long reference.
 
 
-@command("estimate", "tradeoff.tradeoff_estimate_action", within=tradeoff_command)
+@options.command("estimate", "tradeoff.tradeoff_estimate_action", within=tradeoff_command)
 @click.argument("maps", metavar="MAP.nc...", nargs=-1, required=True, type=_FILE)
 @_CALIBRATION
-@takes(Settings, "centre_mm")
-@takes(Settings, "settings_file", help="Settings, as in `estimate`.")
+@options.takes(Settings, "centre_mm")
+@options.takes(Settings, "settings_file", help="Settings, as in `estimate`.")
 @_TOLERANCE
 @_RUNS
-@figure("Draw error against time.")
-@takes(Settings, "seed")
-@JSON
-@FORCE
+@options.figure("Draw error against time.")
+@options.takes(Settings, "seed")
+@options.JSON
+@options.FORCE
 def tradeoff_estimate_command() -> None:
     """Measure what each setting of `estimate` costs on a map, and how far its size interval is off.
 
@@ -492,14 +471,14 @@ def tradeoff_estimate_command() -> None:
 # --- `tradeoff map`: every setting of `map` on the user's own scan, up to the size.
 
 
-@command("map", "tradeoff.tradeoff_map_action", within=tradeoff_command)
+@options.command("map", "tradeoff.tradeoff_map_action", within=tradeoff_command)
 @click.argument("scan", metavar="SCAN.mcap", type=_FILE)
 @_TOLERANCE
 @_RUNS
-@figure("Draw error against time.")
-@takes(Settings, "seed")
-@JSON
-@FORCE
+@options.figure("Draw error against time.")
+@options.takes(Settings, "seed")
+@options.JSON
+@options.FORCE
 def tradeoff_map_command() -> None:
     """Measure what each setting of `map` costs on a scan, and how far it moves the size interval.
 

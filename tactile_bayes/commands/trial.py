@@ -5,33 +5,22 @@ from __future__ import annotations
 import click
 
 from tactile_bayes.api.settings import Settings
-from tactile_bayes.commands.options import (
-    FORCE,
-    JSON,
-    PRINTED,
-    CommandGroup,
-    FilePath,
-    command,
-    figure,
-    output,
-    path_option,
-    takes,
-)
+from tactile_bayes.commands import options
 from tactile_bayes.declarations import names_of
 from tactile_bayes.options import CampaignOptions, PlanErrors, PlanOptions, TrialSettings
 
 # --- `validate`: compare each modality with excision.
 
-_FILE = FilePath()
+_FILE = options.FilePath()
 
 
-@command("validate", "trial.validate_action")
+@options.command("validate", "trial.validate_action")
 @click.argument("trial", metavar="TRIAL.csv", type=_FILE)
-@path_option("--excision", "EX.csv", "Sizes measured after excision.", required=True)
-@path_option("--columns", "MAP.toml", "Layout of a wide TRIAL.csv: which column holds which reading.")
-@takes(TrialSettings, "intervals", "resamples", "seed", "error_ratio")
-@takes(TrialSettings, "check_intervals", show_default=False)
-@takes(TrialSettings, "bayes")
+@options.path_option("--excision", "EX.csv", "Sizes measured after excision.", required=True)
+@options.path_option("--columns", "MAP.toml", "Layout of a wide TRIAL.csv: which column holds which reading.")
+@options.takes(TrialSettings, "intervals", "resamples", "seed", "error_ratio")
+@options.takes(TrialSettings, "check_intervals", show_default=False)
+@options.takes(TrialSettings, "bayes")
 @click.option(
     "-v",
     "--methods",
@@ -40,17 +29,17 @@ _FILE = FilePath()
     is_flag=True,
     help="Also print lines, limits of agreement, repeatability, pairs and r squared.",
 )
-@JSON
-@output("REPORT.json", "JSON", "Write the report as JSON to this file.")
+@options.JSON
+@options.output("REPORT.json", "JSON", "Write the report as JSON to this file.")
 @click.option(
     "--html",
     metavar="REPORT.html",
-    type=FilePath(writes="HTML"),
+    type=options.FilePath(writes="HTML"),
     help="Write tables and figures as one self-contained page.",
 )
-@path_option("--pdf", "REPORT.pdf", PRINTED)
-@path_option("--protocol", "FILE.toml", "Pre-specified analysis; the report records its hash.")
-@FORCE
+@options.path_option("--pdf", "REPORT.pdf", options.PRINTED)
+@options.path_option("--protocol", "FILE.toml", "Pre-specified analysis; the report records its hash.")
+@options.FORCE
 def validate_command() -> None:
     """Compare sizes with excision: errors, lines, agreement, repeatability and calibration of each modality.
 
@@ -65,16 +54,16 @@ def validate_command() -> None:
 # --- `plan`: sample size of a trial, and the value of more maps per mass.
 
 
-@command("plan", "trial.plan_action")
-@takes(PlanOptions, "patients", "maps", "power", "precision")
-@takes(PlanErrors, *names_of(PlanErrors))
-@path_option("--pilot", "TRIAL.csv", "Take the errors that no option gives from this trial; needs --excision.")
-@path_option("--excision", "EX.csv", "Sizes measured after excision in the pilot.")
-@takes(PlanOptions, "against", "trials", "seed", "workers")
-@JSON
-@output("PLAN.json", "JSON", "Write the plan as JSON to this file.")
-@figure("Draw power against the number of patients.")
-@FORCE
+@options.command("plan", "trial.plan_action")
+@options.takes(PlanOptions, "patients", "maps", "power", "precision")
+@options.takes(PlanErrors, *names_of(PlanErrors))
+@options.path_option("--pilot", "TRIAL.csv", "Take the errors that no option gives from this trial; needs --excision.")
+@options.path_option("--excision", "EX.csv", "Sizes measured after excision in the pilot.")
+@options.takes(PlanOptions, "against", "trials", "seed", "workers")
+@options.JSON
+@options.output("PLAN.json", "JSON", "Write the plan as JSON to this file.")
+@options.figure("Draw power against the number of patients.")
+@options.FORCE
 def plan_command() -> None:
     """Plan a trial: how many patients, how many maps of a mass, by simulation.
 
@@ -89,19 +78,19 @@ def plan_command() -> None:
 # --- `campaign`: from a folder of exams to the trial's report.
 
 
-@click.group("campaign", cls=CommandGroup)
+@click.group("campaign", cls=options.CommandGroup)
 def campaign_command() -> None:
     """From a folder of exams to the trial's report, in one resumable run."""
 
 
-@command("init", "campaign.campaign_init_action", within=campaign_command)
-@click.argument("folder", metavar="FOLDER", type=FilePath(addresses=True))
+@options.command("init", "campaign.campaign_init_action", within=campaign_command)
+@click.argument("folder", metavar="FOLDER", type=options.FilePath(addresses=True))
 @click.option(
     "-o",
     "--output",
     required=True,
     metavar="EXAMS.csv",
-    type=FilePath(writes="CSV", guarded=False),
+    type=options.FilePath(writes="CSV", guarded=False),
     help="Where to write the table.",
 )
 @click.option(
@@ -111,7 +100,7 @@ def campaign_command() -> None:
     "* for anything, and / for folders.",
 )
 @click.option("--add", is_flag=True, help="Keep the rows of an EXAMS.csv that is there, and add those of other files.")
-@FORCE
+@options.FORCE
 def campaign_init_command() -> None:
     """Write the table of exams from a folder of scans and what they carry.
 
@@ -126,14 +115,16 @@ def campaign_init_command() -> None:
     """
 
 
-@command("run", "campaign.campaign_run_action", within=campaign_command)
+@options.command("run", "campaign.campaign_run_action", within=campaign_command)
 @click.argument("exams", metavar="EXAMS.csv", type=_FILE)
 @click.option("-o", "--output", required=True, metavar="DIR", type=_FILE, help="Folder for all files.")
-@takes(CampaignOptions, "excision", "columns", "protocol")
-@takes(Settings, "method", help="As `estimate`.")
-@takes(Settings, "size_calibration", metavar="NAME|SIZE.json", help="As `estimate`, unless a row names its own.")
-@takes(Settings, "settings_file", help="Priors and more, as `estimate`.")
-@takes(CampaignOptions, "normalise", "match_mm")
+@options.takes(CampaignOptions, "excision", "columns", "protocol")
+@options.takes(Settings, "method", help="As `estimate`.")
+@options.takes(
+    Settings, "size_calibration", metavar="NAME|SIZE.json", help="As `estimate`, unless a row names its own."
+)
+@options.takes(Settings, "settings_file", help="Priors and more, as `estimate`.")
+@options.takes(CampaignOptions, "normalise", "match_mm")
 @click.option(
     "--repeatability",
     metavar="none|SITE.json",
@@ -141,8 +132,8 @@ def campaign_init_command() -> None:
     "for patients, the tables hold the narrower). Default: learned from this campaign's repeats, where 5 masses "
     "have them.",
 )
-@takes(Settings, "seed")
-@takes(CampaignOptions, "figures", "dry_run", "copy_to", "workers", "scheduler")
+@options.takes(Settings, "seed")
+@options.takes(CampaignOptions, "figures", "dry_run", "copy_to", "workers", "scheduler")
 def campaign_run_command() -> None:
     """Map, estimate and pool the exams of a table, and report the trial.
 
