@@ -19,20 +19,12 @@ import numpy as np
 
 from tactile_bayes.declarations import Record, as_dict, names_of, replace
 from tactile_bayes.errors import CANNOT_SHOW, NO_LUMP, BadDataError, TactileBayesError, UsageError
+from tactile_bayes.files import reading
 from tactile_bayes.files.atomic import sha256
 from tactile_bayes.files.documents import load_json, parse_json, parse_record
 from tactile_bayes.files.estimate_json import REPORTS, checked_report
 from tactile_bayes.files.map_nc import posterior_attributes, read_map_and_scans
 from tactile_bayes.files.provenance import EXAM_FACTS, scans_of
-from tactile_bayes.files.reading import (
-    HDF5_MAGIC,
-    first_bytes,
-    is_json,
-    kind_of,
-    other_encoding,
-    read_bytes,
-    schema_kind,
-)
 from tactile_bayes.files.reports import EstimateReport, MassReport, PooledReport, centre_of
 from tactile_bayes.findings import capital, finding_lines
 from tactile_bayes.geometry import FloatArray, apply
@@ -225,8 +217,8 @@ def plain_line(text: str) -> str:
 
 def read_exam(path: Path) -> MapFile | list[EstimateFile]:
     """Read a file of this program, whichever kind it is; a list of estimates gives several."""
-    head = first_bytes(path, 8)
-    if head.startswith(HDF5_MAGIC):
+    head = reading.first_bytes(path, 8)
+    if head.startswith(reading.HDF5_MAGIC):
         attributes = posterior_attributes(path, way_out=_WAY_OUT)
         if attributes is not None:
             if "estimate" not in attributes:
@@ -236,8 +228,8 @@ def read_exam(path: Path) -> MapFile | list[EstimateFile]:
             return [replace(estimate, kind="posterior", digest=sha256(path))]
         tactile_map, scans = read_map_and_scans(path)
         return MapFile(path, sha256(path), tactile_map, shared_facts(scans))
-    if not is_json(head):
-        kind = kind_of(path) or ("none of these" if head else "empty")
+    if not reading.is_json(head):
+        kind = reading.kind_of(path) or ("none of these" if head else "empty")
         raise BadDataError(f"is {kind}", way_out=_WAY_OUT, path=str(path))
     document = load_json(path, way_out=_WAY_OUT)
     listed = document if isinstance(document, list) else [document]
@@ -257,7 +249,7 @@ def estimate_of(document: object, path: Path) -> EstimateFile:
     """An estimate from its JSON object; `path` is what messages call it."""
     schema = document.get("schema") if isinstance(document, dict) else None
     if not isinstance(document, dict) or not isinstance(schema, str) or schema not in REPORTS:
-        raise BadDataError(f"is {schema_kind(schema) or 'no estimate'}", way_out=_WAY_OUT, path=str(path))
+        raise BadDataError(f"is {reading.schema_kind(schema) or 'no estimate'}", way_out=_WAY_OUT, path=str(path))
     report = checked_report(document, REPORTS[schema], path=path)
     text = json.dumps(document, sort_keys=True)
     return EstimateFile(
@@ -463,8 +455,8 @@ def identity_of(worklist: Path | None, given: Mapping[str, Any]) -> Identity:
 
 def read_worklist(path: Path) -> Identity:
     """Read the identity that a worklist file gives."""
-    data = read_bytes(path, most=_MOST_BYTES)
-    if not other_encoding(data) and not is_json(data):
+    data = reading.read_bytes(path, most=_MOST_BYTES)
+    if not reading.other_encoding(data) and not reading.is_json(data):
         pydicom = required("pydicom")
         with _decoding(path, "is neither JSON nor a DICOM file"):
             item = pydicom.dcmread(path, stop_before_pixels=True)

@@ -14,16 +14,8 @@ from typing import IO, Any, Final
 import numpy as np
 
 from tactile_bayes.errors import BadDataError, in_file
+from tactile_bayes.files import reading
 from tactile_bayes.files.atomic import write_bytes
-from tactile_bayes.files.reading import (
-    NETCDF_BYTES,
-    ZIP_MAGIC,
-    check_limit,
-    decoding,
-    open_input,
-    read_bytes,
-    unpacked_limit,
-)
 from tactile_bayes.inference.ensemble import ChainState
 from tactile_bayes.size.draws import ShapeDraws
 
@@ -54,17 +46,17 @@ def load_npz(path: Path, *, required: Sequence[str], optional: Sequence[str]) ->
 
 def choose_npz(path: Path, choose: Callable[[Sequence[str]], Iterable[str]]) -> Arrays:
     """Read the arrays that `choose` takes from the names in an .npz file; for the errors see `load_npz`."""
-    with open_input(path) as stream:
+    with reading.open_input(path) as stream:
         _check_zip(stream)
-        with decoding("is not a whole .npz file", way_out="copy it again"), zipfile.ZipFile(stream) as archive:
+        with reading.decoding("is not a whole .npz file", way_out="copy it again"), zipfile.ZipFile(stream) as archive:
             members = {name.removesuffix(".npy"): archive.getinfo(name) for name in archive.namelist()}
             if members and not any(name.endswith(".npy") for name in archive.namelist()):
                 what = f"is a zip archive without arrays (it has {', '.join(sorted(members)[:3])})"
                 raise BadDataError(what, way_out="save the sheet of a spreadsheet as .csv, arrays with numpy.savez")
             wanted = {name: members[name] for name in choose(list(members))}
             unpacked = sum(member.file_size for member in wanted.values())
-            most = unpacked_limit(os.fstat(stream.fileno()).st_size)
-            check_limit(unpacked, most, what="its arrays unpack to {} bytes")
+            most = reading.unpacked_limit(os.fstat(stream.fileno()).st_size)
+            reading.check_limit(unpacked, most, what="its arrays unpack to {} bytes")
             arrays = {}
             for name, member in wanted.items():
                 if member.flag_bits & _ENCRYPTED:
@@ -76,7 +68,7 @@ def choose_npz(path: Path, choose: Callable[[Sequence[str]], Iterable[str]]) -> 
 
 def load_npy(path: Path) -> Arrays:
     """Read an .npy file: one array, called ``frames``, or the fields of a structured one; see `load_npz`."""
-    data = read_bytes(path, most=NETCDF_BYTES)
+    data = reading.read_bytes(path, most=reading.NETCDF_BYTES)
     array = _array(io.BytesIO(data), len(data), "its array")
     if array.dtype.names is None:
         return {"frames": array}
@@ -87,7 +79,7 @@ def _check_zip(stream: IO[bytes]) -> None:
     start = stream.read(6)
     if zipfile.is_zipfile(stream):
         return
-    if start.startswith(ZIP_MAGIC[:2]):
+    if start.startswith(reading.ZIP_MAGIC[:2]):
         raise BadDataError("is a zip archive that is cut off (no directory at its end)", way_out="copy it again")
     if start == np.lib.format.MAGIC_PREFIX:
         raise BadDataError("is a single .npy array", way_out="save all arrays in one file with numpy.savez_compressed")
@@ -95,7 +87,7 @@ def _check_zip(stream: IO[bytes]) -> None:
 
 
 def _array(stream: IO[bytes], length: int, name: str) -> np.ndarray[Any, np.dtype[Any]]:
-    with decoding(f"{name} is damaged", way_out=_COPY_AGAIN):
+    with reading.decoding(f"{name} is damaged", way_out=_COPY_AGAIN):
         shape, in_columns, dtype = _HEADERS[np.lib.format.read_magic(stream)](stream)
         if dtype.hasobject:
             what = f"{name} holds Python objects, which are never unpickled"

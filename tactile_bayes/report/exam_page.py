@@ -7,32 +7,10 @@ from typing import Any, Final
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.posterior.verdict import SHARE_WITH_LUMP, chance_text
 from tactile_bayes.presets import INTERVAL, RESEARCH_USE
+from tactile_bayes.report import exam_words, svg
 from tactile_bayes.report.estimate_document import size_words
-from tactile_bayes.report.exam_words import (
-    Exam,
-    facts,
-    finding_sentences,
-    headline,
-    largest,
-    mass_row,
-    narrowing_sentences,
-    nothing_sentences,
-    place_sentence,
-    quality_rows,
-    size_sentences,
-    why_no_clock,
-)
+from tactile_bayes.report.exam_words import Exam, headline, largest
 from tactile_bayes.report.pages import cut, foot, page
-from tactile_bayes.report.svg import (
-    Frame,
-    breast_dial,
-    colour_bar,
-    exam_picture,
-    marked,
-    size_ruler,
-    small_pictures,
-    smallest_pictures,
-)
 
 # --- An exam as one self-contained page that prints to one side of A4: no script, nothing loaded, every text escaped.
 
@@ -65,26 +43,27 @@ def exam_page(exam: Exam) -> str:
         "exam",
         title=cut(exam.title, 60) or TITLE,
         crowded=crowded,
-        facts=list(facts(exam)),
+        facts=list(exam_words.facts(exam)),
         research_use=RESEARCH_USE,
         headline=headline(exam),
-        findings=finding_sentences(exam, most),
+        findings=exam_words.finding_sentences(exam, most),
         longest_finding=longest,
         picture=_picture(exam, crowded=crowded),
         no_map=NO_MAP,
-        smallest=[] if least is None or drawn is None else list(smallest_pictures(drawn, least)),
+        smallest=[] if least is None or drawn is None else list(svg.smallest_pictures(drawn, least)),
         of_mass=f" of mass {exam.main.masses[0].number}" if len(masses) > 1 else "",
         place=_place(exam) if masses else None,
-        size=size and {"ruler": size_ruler(_intervals(exam, size)), "sentences": list(size_sentences(exam))},
-        nothing=[] if size else list(nothing_sentences(exam)),
-        narrowing=narrowing_sentences(exam),
-        masses=[mass_row(one) for one in masses],
+        size=size
+        and {"ruler": svg.size_ruler(_intervals(exam, size)), "sentences": list(exam_words.size_sentences(exam))},
+        nothing=[] if size else list(exam_words.nothing_sentences(exam)),
+        narrowing=exam_words.narrowing_sentences(exam),
+        masses=[exam_words.mass_row(one) for one in masses],
         most_masses=MOST_MASSES,
         maps=len(exam.maps),
         disagrees=exam.disagrees,
-        repeats=list(zip(small_pictures(shown, room_mm=_REPEAT_MM), alone, strict=True)) if shown else [],
+        repeats=list(zip(svg.small_pictures(shown, room_mm=_REPEAT_MM), alone, strict=True)) if shown else [],
         of_map=f" (map {exam.main_number})" if several else "",
-        quality=list(quality_rows(exam)),
+        quality=list(exam_words.quality_rows(exam)),
         foot=foot(exam.scans, f"method {report.origin.settings.get('method', 'unknown')}", *seed),
     )
 
@@ -95,32 +74,36 @@ def _picture(exam: Exam, *, crowded: bool) -> dict[str, str] | None:
     if tactile_map is None:
         return None
     height_mm = _LOWER_MM if crowded else _PICTURE_MM[1]
-    frame = Frame.within(tactile_map, width_mm=_PICTURE_MM[0], height_mm=height_mm)
+    frame = svg.Frame.within(tactile_map, width_mm=_PICTURE_MM[0], height_mm=height_mm)
     lines = [f"Map {exam.main_number} of {len(exam.maps)}."] if len(exam.maps) > 1 else []
     if largest(exam) is not None:
         of_all = " of all maps" if len(exam.maps) > 1 else ""
         lines.append(f"Full line: the estimated size{of_all}; dashed: the ends of its interval.")
     elif exam.disagrees:
         lines.append("Full line: the size by this map alone; dashed: the ends of its interval.")
-    if marked(exam.main) is not None:
+    if svg.marked(exam.main) is not None:
         lines.append("Cross: the place that is meant.")
     lines.append(frame.view.sentence)
     lines += ["Striped: few readings; grey: none."] if tactile_map.counts_known else []
     size = "Life size" if frame.scale == 1.0 else f"{frame.scale:.2f} of life size"
     lines.append(f"{size} when printed at 100 %.")
-    drawn = exam_picture(exam.drawn, frame, label=f"Map: {headline(exam)}")
-    return {"drawn": drawn, "colours": colour_bar(exam.main), "words": " ".join(lines)}
+    drawn = svg.exam_picture(exam.drawn, frame, label=f"Map: {headline(exam)}")
+    return {"drawn": drawn, "colours": svg.colour_bar(exam.main), "words": " ".join(lines)}
 
 
 def _place(exam: Exam) -> dict[str, Any]:
     """Where the lump lies, beside a clock face of the breast."""
     mass, size = exam.main.masses[0], largest(exam)
-    sentences = [place_sentence(mass, INTERVAL if size is None else size.probability)]
+    sentences = [exam_words.place_sentence(mass, INTERVAL if size is None else size.probability)]
     if mass.probability is not None:
         which = f"map {exam.main_number}" if len(exam.maps) > 1 else "this map"
         told = f"Probability that it is a lump, by {which}: {chance_text(mass.probability)}"
         sentences.append(f"{told}, if one such exam in {1 / SHARE_WITH_LUMP:g} shows one.")
-    return {"dial": breast_dial(exam.main.masses), "sentences": sentences, "no_clock": why_no_clock(exam)}
+    return {
+        "dial": svg.breast_dial(exam.main.masses),
+        "sentences": sentences,
+        "no_clock": exam_words.why_no_clock(exam),
+    }
 
 
 def _intervals(exam: Exam, size: Quantity) -> list[tuple[str, Quantity]]:

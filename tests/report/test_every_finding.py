@@ -269,7 +269,7 @@ OUTPUTS: dict[str, Output] = {
 }
 PRINTERS = {
     # behind the outputs above
-    "api/comparing", "api/maps", "api/sized", "exports/dicom",
+    "api/maps", "api/sized", "exports/dicom",
     "exports/fhir", "exports/run", "exports/redcap", "files/map_nc",
     "report/campaign_page", "report/growth_page", "report/compare", "report/estimate_document",
     "report/estimate_figures", "report/estimate_text", "report/exam_page", "report/map_figure", "report/map_text",
@@ -277,7 +277,7 @@ PRINTERS = {
     # of draws, not of a size; names of files that were written
     "actions/report", "actions/show", "actions/campaign", "actions/live_view", "actions/record",
     # of trials, calibrations, devices and studies
-    "api/trials", "actions/calibrate", "actions/devices", "api/diagnosing", "api/planning",
+    "actions/calibrate", "actions/devices", "api/diagnosing", "api/planning",
     "campaigns/campaign", "actions/bring_in", "actions/exam",
     "actions/simulation", "actions/study",
     "actions/tradeoff", "files/size_json", "presets", "report/calibration",
