@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import fcntl
+import json
 import os
-import pickle
 import select
 import struct
 import time
@@ -29,11 +29,18 @@ from tactile_bayes.scans import ElementCalibration, HeadGeometry, TrackerPoses
 
 # --- Feed of a recording to its live view, through a pipe on which the recorder never waits.
 #
-# A message is its length as u32 and a pickled `Seen`; one that does not fit is left out, and the view misses it while
-# the file does not.
+# A message is ``kind u8, length u32, payload``; one that does not fit is left out, and the view misses it while the
+# file does not.
 
+FRAME: Final = 1
+POSE: Final = 2
+REPORT: Final = 3
 _TOLD: Final = ("frames", "frames_lost", "poses", "first_ns", "last_ns", "unseen")
-_LENGTH: Final = struct.Struct("<I")
+LANDMARK: Final = 4
+_HEADER: Final = struct.Struct("<BI")
+_TIMES: Final = struct.Struct("<qq")  # device ns, host ns (monotonic)
+_POSE: Final = struct.Struct("<q7d")
+_POINT: Final = struct.Struct("<3d")
 
 
 class SeenFrame(NamedTuple):
@@ -74,23 +81,23 @@ class Feed:
 
     def frame(self, counts: CountArray, device_ns: int) -> None:
         """Send a recorded frame."""
-        self._send(SeenFrame(counts, device_ns, time.monotonic_ns()))
+        times = _TIMES.pack(device_ns, time.monotonic_ns())
+        self._send(FRAME, times + struct.pack("<BB", *counts.shape) + counts.astype("<u2").tobytes())
 
     def pose(self, pose: PoseReading, device_ns: int) -> None:
         """Send a recorded pose."""
-        self._send(SeenPose(device_ns, pose.position_mm, pose.quaternion_wxyz))
+        self._send(POSE, _POSE.pack(device_ns, *pose.position_mm, *pose.quaternion_wxyz))
 
     def landmark(self, name: str, position_mm: FloatArray) -> None:
         """Send a landmark, touched or read from a file."""
-        self._send(SeenLandmark(name, tuple(position_mm.tolist())))
+        self._send(LANDMARK, _POINT.pack(*position_mm.tolist()) + name.encode())
 
     def told(self, report: Report) -> None:
         """Send the account so far."""
-        self._send({name: getattr(report, name) for name in _TOLD})
+        self._send(REPORT, json.dumps({name: getattr(report, name) for name in _TOLD}).encode())
 
-    def _send(self, seen: Seen) -> None:
-        payload = pickle.dumps(seen)
-        message = _LENGTH.pack(len(payload)) + payload
+    def _send(self, kind: int, payload: bytes) -> None:
+        message = _HEADER.pack(kind, len(payload)) + payload
         if len(message) > select.PIPE_BUF:  # could go in by halves
             self.missed += 1
             return
@@ -128,14 +135,28 @@ class FeedReader:
 
     def _messages(self, data: bytes) -> Iterator[Seen]:
         buffer, place = self._rest + data, 0
-        while len(buffer) - place >= _LENGTH.size:
-            (length,) = _LENGTH.unpack_from(buffer, place)
-            start = place + _LENGTH.size
+        while len(buffer) - place >= _HEADER.size:
+            kind, length = _HEADER.unpack_from(buffer, place)
+            start = place + _HEADER.size
             if len(buffer) - start < length:
                 break
             place = start + length
-            yield pickle.loads(buffer[start:place])
+            yield _decode(kind, buffer[start:place])
         self._rest = buffer[place:]
+
+
+def _decode(kind: int, payload: bytes) -> Seen:
+    if kind == FRAME:
+        device_ns, host_ns = _TIMES.unpack_from(payload)
+        shape = (payload[_TIMES.size], payload[_TIMES.size + 1])
+        counts = np.frombuffer(payload, dtype="<u2", offset=_TIMES.size + 2).reshape(shape)
+        return SeenFrame(counts, device_ns, host_ns)
+    if kind == POSE:
+        device_ns, *values = _POSE.unpack(payload)
+        return SeenPose(device_ns, tuple(values[:3]), tuple(values[3:]))
+    if kind == LANDMARK:
+        return SeenLandmark(payload[_POINT.size :].decode(), _POINT.unpack_from(payload))
+    return dict(json.loads(payload))
 
 
 # --- The growing map and the pressure during a recording, for a live view.
