@@ -46,7 +46,7 @@ FIT_RADIUS_MM: Final = 20.0
 HEAD_PROFILE: Final = ("head_profile_x2", "head_profile_y2", "head_profile_y4")
 
 # Figures of a map: SD of a frame's place along the plane's axes and the sides of the array there, mm, and how many
-# frames with an error of their own felt a cell for each reading in it, see `mapping.errors`.
+# frames with an error of their own felt a cell for each reading in it, see `mapping.profile`.
 POSE_NOISE: Final = ("pose_noise_x_mm", "pose_noise_y_mm", "frame_side_x_mm", "frame_side_y_mm", "frames_per_reading")
 
 Normalise = Literal["mean", "gain", "none"]

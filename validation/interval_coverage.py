@@ -344,8 +344,8 @@ def _size_mass(bodies: str, index: int) -> Row:
     from tactile_bayes.files.size_json import DEFAULT, read_size_calibration, size_calibration_path
     from tactile_bayes.size.bodies import BodyCalibration
     from tactile_bayes.size.draws import ShapeDraws
-    from tactile_bayes.size.fat import head_profile
     from tactile_bayes.size.pooling import SizePriors, pool_maps
+    from tactile_bayes.size.terms import head_profile
 
     path = size_calibration_path(DEFAULT)
     assert path is not None

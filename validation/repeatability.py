@@ -31,7 +31,7 @@ from scipy.special import ndtr, ndtri
 
 from tactile_bayes.declarations import replace
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.size.fat import BetweenMaps
+from tactile_bayes.size.draws import BetweenMaps
 from tactile_bayes.size.learn.site import GRID, RepeatedExams, learn_repeatability
 from validation.common import Table, parser, program, share
 

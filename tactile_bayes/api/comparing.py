@@ -31,8 +31,7 @@ from tactile_bayes.report.growth_page import Course, DrawnMap, draw_comparison, 
 from tactile_bayes.report.pages import PageFiles
 from tactile_bayes.report.pooled import disagreement, fat_apart
 from tactile_bayes.size.bodies import BodyCalibration
-from tactile_bayes.size.draws import ShapeDraws
-from tactile_bayes.size.fat import LEAST_PROBABILITY, BetweenMaps, one_size_of
+from tactile_bayes.size.draws import LEAST_PROBABILITY, BetweenMaps, ShapeDraws, one_size_of
 from tactile_bayes.size.pooling import MOST_INVALID, log_sizes
 from tactile_bayes.size.terms import UNLIKE_LEARNED
 from tactile_bayes.size.visits import (

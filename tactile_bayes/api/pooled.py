@@ -28,8 +28,7 @@ from tactile_bayes.report.estimate_figures import draw_size
 from tactile_bayes.report.exam_words import Exam
 from tactile_bayes.report.pooled import pooled_report
 from tactile_bayes.size.bodies import BodyCalibration
-from tactile_bayes.size.draws import SizePosterior
-from tactile_bayes.size.fat import LEAST_PROBABILITY
+from tactile_bayes.size.draws import LEAST_PROBABILITY, SizePosterior
 from tactile_bayes.size.pooling import DISAGREE, PooledEstimate, pool_maps
 from tactile_bayes.size.visits import Place as PatientPlace
 from tactile_bayes.size.visits import one_place_probability

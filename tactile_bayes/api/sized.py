@@ -31,9 +31,9 @@ from tactile_bayes.report.exam_words import Exam, ExamMap, Given, exam_map
 from tactile_bayes.report.figure_file import named_exam
 from tactile_bayes.report.pages import PageFiles
 from tactile_bayes.scans import HeadShape
-from tactile_bayes.size.draws import EXTREMES, SIZES, ShapeDraws, SizePosterior
-from tactile_bayes.size.fat import BetweenMaps, head_profile
+from tactile_bayes.size.draws import EXTREMES, SIZES, BetweenMaps, ShapeDraws, SizePosterior
 from tactile_bayes.size.pooling import Calibration, SizePriors
+from tactile_bayes.size.terms import head_profile
 
 if TYPE_CHECKING:
     import pandas

@@ -11,16 +11,22 @@ from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, check_number
 from tactile_bayes.findings import Finding, by_weight
 from tactile_bayes.geometry import BoolArray, FloatArray, Plane, apply, inverse, patient_from_plane
-from tactile_bayes.mapping.accumulate import GAIN_TOLERANCE, Accumulated, accumulate, add_all, sources_of
+from tactile_bayes.mapping.accumulate import (
+    GAIN_TOLERANCE,
+    Accumulated,
+    accumulate,
+    add_all,
+    shared_frame_figures,
+    sources_of,
+)
 from tactile_bayes.mapping.accumulate import flat_field as find_flat_field
 from tactile_bayes.mapping.arrangement import check_arrangement
 from tactile_bayes.mapping.cells import MAX_POSE_GAP_MS, CellSums, HeadMoments, head_moments
 from tactile_bayes.mapping.convention import check_convention, convention_findings, hint
-from tactile_bayes.mapping.errors import pose_noise_figures, shared_frame_figures
 from tactile_bayes.mapping.latency import estimate_latency
 from tactile_bayes.mapping.map import FEW_READINGS, MapRecipe, TactileMap, broken_assumptions, handling_findings, smooth
 from tactile_bayes.mapping.plausibility import exam_figures, exam_findings, map_findings, with_cause
-from tactile_bayes.mapping.profile import evenness_figures, head_profile_figures
+from tactile_bayes.mapping.profile import evenness_figures, head_profile_figures, pose_noise_figures
 from tactile_bayes.mapping.select import (
     SelectedFrames,
     every_nth,

@@ -12,8 +12,8 @@ from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import BoolArray, FloatArray, IndexArray, Plane
 from tactile_bayes.mapping.cells import FramePoses, Projector, poses_at
 from tactile_bayes.mapping.convention import CoarseFrames, numbered_on, stroke_starts
-from tactile_bayes.mapping.errors import pose_noise_figures
 from tactile_bayes.mapping.map import smooth
+from tactile_bayes.mapping.profile import pose_noise_figures
 from tactile_bayes.mapping.select import SelectedFrames
 from tactile_bayes.presets import POSE_NOISE
 

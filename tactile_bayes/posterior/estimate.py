@@ -55,9 +55,16 @@ from tactile_bayes.presets import CELL_PER_SIGMA, INTERVAL
 from tactile_bayes.progress import Progress
 from tactile_bayes.scans import DEFAULT_HEAD, HeadShape
 from tactile_bayes.size.draws import EXTREMES, SizePosterior
-from tactile_bayes.size.fat import head_profile
 from tactile_bayes.size.pooling import Calibration, draw_sizes
-from tactile_bayes.size.terms import SPREAD, UNLIKE_LEARNED, UNLIKE_ON_PAPER, Recipe, extrapolated, unknown_head
+from tactile_bayes.size.terms import (
+    SPREAD,
+    UNLIKE_LEARNED,
+    UNLIKE_ON_PAPER,
+    Recipe,
+    extrapolated,
+    head_profile,
+    unknown_head,
+)
 
 # --- Search for the lump: candidate places, highest first, each fitted and assessed.
 #

@@ -10,8 +10,8 @@ import numpy as np
 
 from tactile_bayes.presets import HELD, INTERVAL, RESEARCH_USE
 from tactile_bayes.size.bodies import BodyCalibration
+from tactile_bayes.size.draws import PAPER_SPREAD
 from tactile_bayes.size.eq6 import COEFFICIENTS, AxisCalibration, LeftOutErrors, SizeCalibration
-from tactile_bayes.size.fat import PAPER_SPREAD
 from tactile_bayes.size.pooling import Calibration
 from tactile_bayes.size.terms import SiteShift
 

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from tactile_bayes.findings import finding_lines, verdict
-from tactile_bayes.mapping.errors import LEAST_SHARE
+from tactile_bayes.mapping.accumulate import LEAST_SHARE
 from tactile_bayes.mapping.map import FEW_READINGS, TactileMap, advise_cell, skewed
 from tactile_bayes.mapping.plausibility import WHY_NOT
 from tactile_bayes.mapping.profile import SPAN_MM

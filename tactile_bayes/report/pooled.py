@@ -26,8 +26,7 @@ from tactile_bayes.report.estimate_text import (
     width_lines,
 )
 from tactile_bayes.size.bodies import BodyCalibration
-from tactile_bayes.size.draws import EXTREMES
-from tactile_bayes.size.fat import LEAST_PROBABILITY
+from tactile_bayes.size.draws import EXTREMES, LEAST_PROBABILITY
 from tactile_bayes.size.pooling import DISAGREE, PooledEstimate, Repeatability
 from tactile_bayes.size.terms import UNLIKE_LEARNED, unknown_head
 

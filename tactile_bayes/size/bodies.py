@@ -4,7 +4,7 @@ With u, v and w as in `eq6`,
 
 .. math:: \ln d = \ln\text{Eq 6}(u, v, w) + h(u, v, w) + B + E
 
-Eq 6 has constants that depend on the depth of the fat. h is what it leaves (`fat.Residual`); a calibration by Eq 6
+Eq 6 has constants that depend on the depth of the fat. h is what it leaves (`Residual`); a calibration by Eq 6
 alone has none. B differs from body to body by what a map does not show (seat, stiffness, moduli): ln SD(B) is a full
 quadratic in u, v and w. E differs from exam to exam of one body. A body of another origin than the table's departs by
 more, `other_sd`.
@@ -29,15 +29,18 @@ import numpy as np
 from tactile_bayes.declarations import Meta, Record, replace
 from tactile_bayes.errors import BadDataError, UsageError, check_number, meant
 from tactile_bayes.geometry import BoolArray, FloatArray, Matrix, Vector
-from tactile_bayes.size.draws import ShapeDraws, Supposition
+from tactile_bayes.size.draws import BetweenMaps, ShapeDraws, Supposition
 from tactile_bayes.size.eq6 import Eq6Law, Power, Powers, eq6_coefficients, eq6_log_size, eq6_terms
-from tactile_bayes.size.fat import WEIGHTS, BetweenMaps, FatDepth, Residual
 from tactile_bayes.size.terms import (
     LEARN_ANEW,
+    MOST_LEVERAGE,
+    WEIGHTS,
     Above0,
     Domain,
+    FatDepth,
     HiddenTerms,
     Recipe,
+    Residual,
     RoundLumps,
     Share,
     SiteShift,
@@ -53,8 +56,6 @@ from tactile_bayes.size.terms import (
 
 UNLIKE: Final = "is unlike the bodies of the table"
 NO_PROFILE: Final = "the phantoms that correct the calibration have no pressure profile of the head"
-MOST_LEVERAGE: Final = 1.0
-"""A map is outside the table where its leverage exceeds this multiple of the table's largest."""
 FARTHEST_LEVERAGE: Final = 3.0  #: Beyond this multiple there is no size.
 UNLIKE_SD: Final = 0.1
 """SD of ln d by which a body may differ because its map or its head profile is unlike the table's (record 0123)."""

@@ -25,8 +25,7 @@ from tactile_bayes.declarations import Meta, Record, field, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import BoolArray, FloatArray, Matrix, Vector
 from tactile_bayes.inference.draws import even_replicates, normal_quantile, paired_points
-from tactile_bayes.size.draws import BumpDraws, SizePosterior, shares
-from tactile_bayes.size.fat import BetweenMaps
+from tactile_bayes.size.draws import BetweenMaps, BumpDraws, SizePosterior, shares
 from tactile_bayes.size.terms import (
     LEARN_ANEW,
     ONE_WIDTH,

@@ -14,7 +14,9 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.draws import Labels, normal_quantile, paired_points, stratified_quantiles
 from tactile_bayes.size.bodies import BodyCalibration, known_body, suppositions
 from tactile_bayes.size.draws import (
+    LEAST_PROBABILITY,
     OVAL_SD,
+    BetweenMaps,
     BumpDraws,
     Elongation,
     ShapeDraws,
@@ -23,12 +25,13 @@ from tactile_bayes.size.draws import (
     elongation,
     first_axis,
     matched_draws,
+    one_size_probability,
+    outlying_maps,
     shares,
     shown_share,
     turn_matrix,
 )
 from tactile_bayes.size.eq6 import SizeCalibration, push_sizes
-from tactile_bayes.size.fat import LEAST_PROBABILITY, BetweenMaps, one_size_probability, outlying_maps
 from tactile_bayes.size.terms import extrapolated
 
 # --- Sizes from the maps of one mass, one or several.

@@ -37,8 +37,7 @@ from tactile_bayes.inference.draws import (
 )
 from tactile_bayes.presets import REGISTRATION_MM
 from tactile_bayes.size.bodies import BodyCalibration
-from tactile_bayes.size.draws import ShapeDraws, log_normal, matched_draws
-from tactile_bayes.size.fat import BetweenMaps, above_chi_square
+from tactile_bayes.size.draws import BetweenMaps, ShapeDraws, above_chi_square, log_normal, matched_draws
 from tactile_bayes.size.pooling import POOLED_DRAWS, MassMaps, SizePriors, Weighted, log_sizes, lump_shape
 
 MOST_VISITS: Final = 10

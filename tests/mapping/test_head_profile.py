@@ -35,7 +35,7 @@ from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.presets import HEAD_PROFILE
 from tactile_bayes.scans import Scan
 from tactile_bayes.size.bodies import BodyCalibration
-from tactile_bayes.size.fat import head_profile
+from tactile_bayes.size.terms import head_profile
 
 TRUE_FAT_MM = {"s01": 15.0, "s03": 20.0, "s05": 12.0, "s07": 12.0, "s11": 24.0}
 """By truth.csv: depth of the centre where centred; a tenth of a diameter below the ball where resting."""

@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 
 from tactile_bayes.declarations import replace
-from tactile_bayes.mapping.accumulate import MapAccumulator
+from tactile_bayes.mapping.accumulate import LEAST_SHARE, MapAccumulator
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.cells import poses_at
-from tactile_bayes.mapping.errors import LEAST_SHARE
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.report.map_text import map_text
 from tactile_bayes.scans import Scan

@@ -13,8 +13,7 @@ from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.size_json import read_size_calibration, size_calibration_path
 from tactile_bayes.size.bodies import BodyCalibration
-from tactile_bayes.size.draws import ShapeDraws, ShapePrior
-from tactile_bayes.size.fat import BetweenMaps
+from tactile_bayes.size.draws import BetweenMaps, ShapeDraws, ShapePrior
 from tactile_bayes.size.pooling import POOLED_DRAWS, SizePriors, pooled_size
 from tactile_bayes.size.terms import SiteShift
 from tactile_bayes.size.visits import (

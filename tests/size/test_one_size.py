@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tactile_bayes.size.fat import EXAM_SD, LEAST_PROBABILITY, BetweenMaps, one_size_probability
+from tactile_bayes.size.draws import EXAM_SD, LEAST_PROBABILITY, BetweenMaps, one_size_probability
 from tactile_bayes.size.visits import Place, apart, one_place_probability
 
 KNOWN = BetweenMaps(EXAM_SD, 0.0)

@@ -14,13 +14,14 @@ from tactile_bayes.size.draws import (
     SHOWN,
     SHOWN_CV,
     SHOWN_POWER,
+    BetweenMaps,
     ShapeDraws,
     ShapePrior,
     elongation,
+    outlying_maps,
     shown_share,
     turn_matrix,
 )
-from tactile_bayes.size.fat import BetweenMaps, outlying_maps
 from tactile_bayes.size.pooling import IRREGULAR_SD, SizePriors, pool_maps, pooled_size
 from tactile_bayes.size.terms import HiddenTerms
 

@@ -10,8 +10,7 @@ from tactile_bayes.api.settings import Settings
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.size_json import read_size_calibration, size_calibration_path
-from tactile_bayes.size.draws import SIZES
-from tactile_bayes.size.fat import BetweenMaps
+from tactile_bayes.size.draws import SIZES, BetweenMaps
 from tactile_bayes.size.pooling import Repeatability, SizePriors, size_alone
 
 SITE = Repeatability(0.1, 0.15, 0.098, 0.07, 0.13, masses=12, maps=36)

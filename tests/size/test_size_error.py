@@ -28,9 +28,8 @@ from tactile_bayes.inference.draws import (
 from tactile_bayes.posterior import estimate as drawn
 from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.white import MapDraws
-from tactile_bayes.size.draws import BumpDraws, ShapeDraws
+from tactile_bayes.size.draws import BetweenMaps, BumpDraws, ShapeDraws
 from tactile_bayes.size.eq6 import AxisCalibration, SizeCalibration, push_sizes
-from tactile_bayes.size.fat import BetweenMaps
 from tactile_bayes.size.pooling import SizePriors, pool_maps, pooled_size
 
 SEEDS = 24

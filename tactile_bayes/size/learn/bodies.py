@@ -22,7 +22,6 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.presets import HELD
 from tactile_bayes.size.bodies import CUBIC, QUADRATIC, BodyCalibration, Centre, Spread, known_body
 from tactile_bayes.size.eq6 import BY_DEPTH, MU, PLAIN, Eq6Law, F, Powers, eq6_log_size, eq6_terms
-from tactile_bayes.size.fat import FatDepth, profile_terms
 from tactile_bayes.size.learn.regression import (
     BodiesLeft,
     BodyRegression,
@@ -38,7 +37,7 @@ from tactile_bayes.size.learn.regression import (
     map_variance,
     ranges_of,
 )
-from tactile_bayes.size.terms import LOGGED, Recipe, monomials, powers
+from tactile_bayes.size.terms import LOGGED, FatDepth, Recipe, monomials, powers, profile_terms
 
 LEAST_BODIES: Final = 80
 """With a head profile: with fewer bodies Eq 6 without the fat's depth is all that a table supports."""

@@ -13,8 +13,7 @@ from tactile_bayes.declarations import Record, field, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import BoolArray, FloatArray, IndexArray
 from tactile_bayes.inference.modes import mode_and_covariance
-from tactile_bayes.size.fat import Kernel, Residual
-from tactile_bayes.size.terms import INVERTED, HiddenTerms, RoundLumps
+from tactile_bayes.size.terms import INVERTED, HiddenTerms, Kernel, Residual, RoundLumps
 
 # --- Regression of ln d on features of a population's maps, with repeated exams per body.
 #
@@ -257,7 +256,7 @@ def _weighted(terms: FloatArray, values: FloatArray, variance: FloatArray) -> Fl
     return np.asarray(np.linalg.lstsq(terms * root[:, None], values * root, rcond=None)[0])
 
 
-# --- Learning of what Eq 6 leaves of a population's sizes, see `size.fat`, and of the spread between bodies.
+# --- Learning of what Eq 6 leaves of a population's sizes, see `size.terms`, and of the spread between bodies.
 #
 # Given the kernel and the spread of B, the weights have a normal posterior in closed form, and with them each
 # body's size as the others predict it. Kernel and spread are those by which bodies left out are most probable, with

@@ -14,7 +14,7 @@ as a normal of its mean and covariance.
 Spread between exams of one mass: exam j of mass i gives :math:`g_{ij} = \mu_i + E_{ij} + e_{ij}`, with
 :math:`E_{ij} \sim N(0, \tau^2)` between exams and :math:`e_{ij} \sim N(0, v_{ij})` the map's own error. Nothing is
 supposed of :math:`\mu_i`: the mass's size, and all that its body does to every map of it, cancel. The restricted
-likelihood of tau is the product over masses of that of one mass, `fat.restricted_log_likelihood`.
+likelihood of tau is the product over masses of that of one mass, `restricted_log_likelihood`.
 """
 
 from __future__ import annotations
@@ -28,8 +28,7 @@ from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.size.bodies import BodyCalibration
-from tactile_bayes.size.draws import ShapeDraws
-from tactile_bayes.size.fat import apart_by_chance, restricted_log_likelihood
+from tactile_bayes.size.draws import ShapeDraws, apart_by_chance, restricted_log_likelihood
 from tactile_bayes.size.pooling import PROBABILITY, Repeatability, log_sizes
 from tactile_bayes.size.terms import SiteShift
 

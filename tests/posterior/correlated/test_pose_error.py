@@ -18,8 +18,8 @@ from tactile_bayes.forward.scene import Lump, Noise, Scene, Strokes
 from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.build import build_map
-from tactile_bayes.mapping.errors import MOST_MM, _departures, _interpolation
 from tactile_bayes.mapping.map import TactileMap
+from tactile_bayes.mapping.profile import MOST_MM, _departures, _interpolation
 from tactile_bayes.posterior.bump import PoseNoise, cell_mean_gaussian, window_cells
 from tactile_bayes.posterior.correlated import pose_covariance
 from tactile_bayes.posterior.draw import SamplerSettings

@@ -8,7 +8,7 @@ from scipy.linalg import null_space
 from scipy.stats import binomtest, chi2, multivariate_normal
 
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.size.fat import BetweenMaps, restricted_log_likelihood
+from tactile_bayes.size.draws import BetweenMaps, restricted_log_likelihood
 from tactile_bayes.size.learn.site import GRID, RepeatedExams, learn_repeatability
 
 

@@ -16,8 +16,7 @@ from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.size_json import read_size_calibration, size_calibration_path
 from tactile_bayes.size.bodies import BodyCalibration
-from tactile_bayes.size.draws import BumpDraws, ShapeDraws, ShapePrior
-from tactile_bayes.size.fat import BetweenMaps
+from tactile_bayes.size.draws import BetweenMaps, BumpDraws, ShapeDraws, ShapePrior
 from tactile_bayes.size.learn.site import LACK, PhantomMap, Residuals, SitePrior, correct_calibration, shift_posterior
 from tactile_bayes.size.pooling import SizePriors, pool_maps, pooled_size
 from tactile_bayes.size.terms import HiddenTerms
