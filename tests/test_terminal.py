@@ -17,7 +17,7 @@ import pytest
 
 import tactile_bayes as tb
 from tactile_bayes.findings import LEADS
-from tactile_bayes.terminal import STYLES, dressed, padded, shown_columns
+from tactile_bayes.shell import STYLES, dressed, padded, shown_columns
 
 ESCAPES = re.compile(r"\x1b\[[0-9;]*m")
 SENTENCE = "What would narrow it: more exams of this mass, pooled (estimate --pool); the depth of the lump."

@@ -39,7 +39,7 @@ from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.presets import FIELD_COSINES, INTERVAL, RESEARCH_USE, VIRIDIS
 from tactile_bayes.scans import ElementCalibration, HeadGeometry
-from tactile_bayes.terminal import has_styles
+from tactile_bayes.shell import has_styles
 
 DRAWINGS_PER_S = 10.0
 TAKEN_EVERY_S = 1 / DRAWINGS_PER_S / 2  #: Frames are added to the map some at a time, twice a drawing.

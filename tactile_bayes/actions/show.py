@@ -15,7 +15,7 @@ from tactile_bayes.files.size_json import SHIPPED, size_calibration_path
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.scans import Scan
-from tactile_bayes.terminal import padded, shown_columns
+from tactile_bayes.shell import padded, shown_columns
 
 
 def show_action(file: Path, as_json: bool) -> None:

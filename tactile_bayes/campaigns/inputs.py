@@ -15,7 +15,7 @@ from typing import Any, Final
 
 from tactile_bayes.batch import CLUSTER_LOST, run_batch
 from tactile_bayes.batch_store import BatchStore, open_store
-from tactile_bayes.campaigns.match import Breasts
+from tactile_bayes.campaigns.exams import Breasts
 from tactile_bayes.campaigns.steps import FILES, STAGED, UNWRITTEN, Result, clear_staged, put_in_place, stamp
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError, TactileBayesError, UsageError

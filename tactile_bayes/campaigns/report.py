@@ -10,7 +10,7 @@ from typing import Any, Final
 
 from tactile_bayes import __version__
 from tactile_bayes.api.trials import analyse, load_trial, read_excision
-from tactile_bayes.campaigns.match import grown_masses, unnamed, visit_dates
+from tactile_bayes.campaigns.exams import grown_masses, unnamed, visit_dates
 from tactile_bayes.campaigns.run import Campaign
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import CANNOT_SHOW, BadDataError, UsageError

@@ -27,8 +27,8 @@ from tactile_bayes.api.settings import Settings
 from tactile_bayes.batch import CLUSTER_LOST, BatchInterrupted, Outcome, run_batch
 from tactile_bayes.batch_store import BatchStore
 from tactile_bayes.campaigns import steps
+from tactile_bayes.campaigns.exams import Breasts, Match, NamedPlace, Visits, days_of, grown_masses, visit_dates
 from tactile_bayes.campaigns.inputs import READ, Alike, StepResults, read_sources, unchanged
-from tactile_bayes.campaigns.match import Breasts, Match, NamedPlace, Visits, days_of, grown_masses, visit_dates
 from tactile_bayes.declarations import Record, field, names_of, replace
 from tactile_bayes.errors import TactileBayesError
 from tactile_bayes.files.atomic import sha256

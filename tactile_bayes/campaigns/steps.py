@@ -21,8 +21,7 @@ from tactile_bayes.api.pooled import pool_answers
 from tactile_bayes.api.repeatability import ExamFolder, learn_from_exams
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.api.sized import Answer, SizeEstimate, size_priors
-from tactile_bayes.campaigns.exams import ARRAYS
-from tactile_bayes.campaigns.match import OWN_AXES, Match, in_own_axes, matched
+from tactile_bayes.campaigns.exams import ARRAYS, OWN_AXES, Match, in_own_axes, matched
 from tactile_bayes.declarations import EXACT, Record, field, from_plain, replace, rounded, to_plain
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files import manifest_csv as layout

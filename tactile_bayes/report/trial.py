@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Final
 
 from tactile_bayes.declarations import UNSET, replace
-from tactile_bayes.terminal import padded, shown_columns
+from tactile_bayes.shell import padded, shown_columns
 from tactile_bayes.trial.accuracy import REFERENCE, ModalityRatio, PairedComparison, least_p
 from tactile_bayes.trial.figures import MIN_PATIENTS, Ends, Figure
 from tactile_bayes.trial.method_comparison import Unit

@@ -1,4 +1,4 @@
-"""Draws of a map's amplitude and shape, of the lump's elongation, and of sizes; how far these lie apart between maps."""
+"""Draws of a map's amplitude and shape, of the lump's elongation, and of sizes, which differ between maps."""
 
 from __future__ import annotations
 

@@ -36,7 +36,7 @@ from tactile_bayes.hardware.recorder import Report
 from tactile_bayes.hardware.serve import LiveServer, address_of, document
 from tactile_bayes.mapping.accumulate import MapAccumulator
 from tactile_bayes.mapping.cells import poses_at
-from tactile_bayes.terminal import has_styles
+from tactile_bayes.shell import has_styles
 
 
 @pytest.fixture(scope="module")
