@@ -166,21 +166,11 @@ def _pivot(url: str, protocol: str, tool: str | None, duration_s: float) -> None
 # --- `replay`: play a scan through emulated devices and the recorder.
 
 
-def replay_action(
-    *,
-    scan: Path,
-    output: Path | None,
-    live: bool,
-    serve: str | None,
-    size_calibration: str,
-    speed: float,
-    force: bool,
-) -> int:
+def replay_action(*, scan: Path, output: Path | None, speed: float, **given: Any) -> int:
     """Replay a scan through emulated devices, recorder and live view, as if it were being recorded."""
     found = read_scan(scan)
     with tempfile.TemporaryDirectory() as folder, _emulated(scan, speed, poses=bool(len(found.poses))) as urls:
-        options = {"like": scan, "clock": "shared", "at_once": True, "live": live, "serve": serve, "force": force}
-        options["size_calibration"] = size_calibration
+        options = {"like": scan, "clock": "shared", "at_once": True, **given}
         options |= {f"{role}_url": url for role, url in urls.items()} | {"tracker_protocol": "open"}
         if found.landmarks is not None:
             options["landmarks"] = scan

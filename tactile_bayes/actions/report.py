@@ -42,28 +42,9 @@ def report_action(
 # --- `export`: write maps and estimates as the files that other systems take.
 
 
-def export_action(
-    *,
-    files: tuple[Path, ...],
-    to: Any,
-    output: Path | None,
-    worklist: Path | None,
-    patient_id_from_scan: bool,
-    dictionary: Path | None,
-    force: bool,
-    **identity: str | None,
-) -> None:
+def export_action(*, files: tuple[Path, ...], output: Path | None, dictionary: Path | None, **given: Any) -> None:
     """Export maps and estimates as DICOM, FHIR, NRRD (3D Slicer) or CSV (REDCap)."""
-    written = export(
-        files,
-        output,
-        to=to,
-        worklist=worklist,
-        patient_id_from_scan=patient_id_from_scan,
-        dictionary=dictionary,
-        force=force,
-        **{name: value for name, value in identity.items() if value},
-    )
+    written = export(files, output, dictionary=dictionary, **{name: value for name, value in given.items() if value})
     for path in written.paths:
         is_dictionary = path == dictionary
         click.echo(f"{path}: {'data dictionary for REDCap' if is_dictionary else f'{path.stat().st_size} bytes'}")

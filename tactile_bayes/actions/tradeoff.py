@@ -139,7 +139,10 @@ def tradeoff_forward_action(
     """Measure error in amplitude, width and size against CPU time, for the lump of a scene."""
     if size_calibration not in (None, "learned"):
         also_read(size_calibration_path(size_calibration))
-    report = run_tradeoff(_case(scene, head), size_calibration, tolerance=tolerance_percent / 100, runs=runs)
+    with in_file(scene or ""):
+        drawn = Scene(body=SceneBody(), solid_lumps=(SolidLump(seat=0.0),)) if scene is None else read_scene(scene)
+        case = tradeoffs.case_of(drawn, head=head)
+    report = run_tradeoff(case, size_calibration, tolerance=tolerance_percent / 100, runs=runs)
     try:
         if figure is not None:
             draw_tradeoff(report, figure, force=force)
@@ -150,13 +153,6 @@ def tradeoff_forward_action(
     if figure is not None:
         click.echo(f"the figure is in {figure}")
     click.echo(RESEARCH_USE)
-
-
-def _case(path: Path | None, head: str | None) -> tradeoffs.LumpCase:
-    if path is None:
-        return tradeoffs.case_of(Scene(body=SceneBody(), solid_lumps=(SolidLump(seat=0.0),)), head=head)
-    with in_file(path):
-        return tradeoffs.case_of(read_scene(path), head=head)
 
 
 def run_tradeoff(case: tradeoffs.LumpCase, calibration: str | None, *, tolerance: float, runs: int) -> TradeoffReport:

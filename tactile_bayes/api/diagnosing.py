@@ -50,27 +50,24 @@ class Diagnosis(Told, eq=False):
     @property
     def text(self) -> str:
         """What ``diagnose`` prints."""
-        return "\n".join([*finding_lines(self.posterior.findings), *self._table(), RESEARCH_USE]) + "\n"
-
-    def _table(self) -> list[str]:
         found, chains = self.posterior, self.chains
         number = next(iter(found.draws.values())).size
-        lines = [f"method {found.method}: {number} draws in {chains} chain{'s' if chains > 1 else ''}"]
+        lines = [*finding_lines(found.findings)]
+        lines.append(f"method {found.method}: {number} draws in {chains} chain{'s' if chains > 1 else ''}")
         if chains == 1:
             shape = found.diagnostics.get("pareto_k")
             lines += [] if shape is None else [f"Pareto shape of the weights {shape:.2f} (trusted up to 0.7)"]
-            return [*lines, *(f"{name:14}{one['median']:>10.4g}" for name, one in self.quantities.items())]
-        lines.append(
-            f"{'':14}{'median':>10}{'R-hat':>8}{'bulk ESS':>10}{'tail ESS':>10}"
-            f"{'MCSE of median':>16}{'of 95 % ends':>16}"
-        )
+            lines += [f"{name:14}{one['median']:>10.4g}" for name, one in self.quantities.items()]
+            return "\n".join([*lines, RESEARCH_USE]) + "\n"
+        head = f"{'':14}{'median':>10}{'R-hat':>8}{'bulk ESS':>10}{'tail ESS':>10}"
+        lines.append(f"{head}{'MCSE of median':>16}{'of 95 % ends':>16}")
         for name, one in self.quantities.items():
             ends = max(one["mcse_low"], one["mcse_high"])
             lines.append(
                 f"{name:14}{one['median']:>10.4g}{one['rhat']:>8.3f}{one['ess_bulk']:>10.0f}{one['ess_tail']:>10.0f}"
                 f"{one['mcse_median']:>16.2g}{ends:>16.2g}"
             )
-        return lines
+        return "\n".join([*lines, RESEARCH_USE]) + "\n"
 
     @door
     def plot(self, kind: str = "trace", path: PathLike | None = None, *, force: bool = False) -> Figure:

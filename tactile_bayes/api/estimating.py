@@ -183,14 +183,9 @@ def _with_place(
 def choose_calibration(
     settings: Settings, tactile_map: TactileMap
 ) -> tuple[Path | None, Calibration | None, NoSize | None]:
-    """The calibration that was named, or the shipped one if none was and it fits map and options.
+    """The calibration that was named, or the shipped one if none was and it fits map and options, with its path.
 
-    Returns
-    -------
-    path, calibration
-        None where there is none.
-    why_none
-        Why the shipped one was not used; None when it was, or when the user decided.
+    None where there is none; then with why the shipped one was not used, unless the user decided.
     """
     if settings.size_calibration is None or isinstance(settings.size_calibration, str):
         path = size_calibration_path(settings.size_calibration or default_for(tactile_map.recipe.normalise))

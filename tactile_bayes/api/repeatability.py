@@ -87,16 +87,19 @@ def learn_from_exams(
 ) -> LearnedRepeatability:
     """Learn the spread between exams of one mass from those that were repeated within a visit.
 
-    `exams`: estimated ones; those without a size and those of a scan that another exam has are left out;
-    `size_calibration`: name or path of the calibration that they were sized by, where it is in no file that the
-    estimates name; `fewest`: masses with repeated exams that it takes. Default:
-    `size.learn.repeatability.FEWEST_MASSES`.
+    Exams without a size, and those of a scan that another exam has, are left out. `size_calibration`: name or path of
+    that by which they were sized, where it is in no file that they name; `fewest`: masses with repeats that it takes.
     """
     groups, left_out = _repeats(exams)
     one_by_one = [repeat for group in groups for repeat in group]
     name, digest = _calibration_named(one_by_one)
     calibration = _calibration(name, digest, size_calibration) if one_by_one else None
-    masses = [] if calibration is None else [_repeated(group, calibration) for group in groups]
+    masses = []
+    for group in groups:
+        assert calibration is not None
+        alone = [log_size_alone(calibration, read_shape(one.exam.folder / SHAPE)) for one in group]
+        first, values = group[0].exam, np.array(alone)
+        masses.append(RepeatedExams(first.of_mass, first.mass, values[:, 0], values[:, 1]))
     learned = learn_repeatability(masses, fewest=fewest or FEWEST_MASSES)
     assert calibration is not None
     found = replace(
@@ -200,12 +203,6 @@ def _calibration(name: str, digest: str, given: str | None) -> BodyCalibration:
     if not isinstance(calibration, BodyCalibration):
         raise UsageError(f"the spread between exams is learned through a calibration over bodies, which {name} is not")
     return calibration
-
-
-def _repeated(group: Sequence[_Repeat], calibration: BodyCalibration) -> RepeatedExams:
-    first = group[0].exam
-    values = np.array([log_size_alone(calibration, read_shape(repeat.exam.folder / SHAPE)) for repeat in group])
-    return RepeatedExams(first.of_mass, first.mass, values[:, 0], values[:, 1])
 
 
 def _half_widths(repeats: Sequence[_Repeat], sd: float) -> dict[str, float]:

@@ -50,7 +50,11 @@ def exam_of_files(
     """
     if twice := given_twice(paths):
         raise UsageError(f"{twice} is given twice; give each file once")
-    estimates = [path for path in paths if _is_estimate(path)]
+    estimates = [
+        path
+        for path in paths
+        if path.suffix.lower() == ".json" or (first_bytes(path, len(HDF5_MAGIC)) == HDF5_MAGIC and is_posterior(path))
+    ]
     maps = [path for path in paths if path not in estimates]
     if len(estimates) > 1 or (estimates and len(maps) > 1):
         raise UsageError("an estimate goes with one map; several maps are estimated and pooled: give maps alone")
@@ -67,12 +71,6 @@ def exam_of_files(
         found.append(estimate_file(path, settings, notice=tell))
     inputs = {f"map_{number}": path for number, path in enumerate(maps, start=1)}
     return exam_of(found, settings, inputs=inputs)
-
-
-def _is_estimate(path: Path) -> bool:
-    if path.suffix.lower() == ".json":
-        return True
-    return first_bytes(path, len(HDF5_MAGIC)) == HDF5_MAGIC and is_posterior(path)
 
 
 def exam_of(found: Sequence[SizeEstimate], settings: Settings, *, inputs: Mapping[str, Path] | None = None) -> Exam:
