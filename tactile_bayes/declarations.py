@@ -5,8 +5,8 @@ A declaration gives a field its type, range and meaning::
     class Head(Record):
         "Grid and curvature of a scan head's taxels."
 
-        rows: Annotated[int, Meta(ge=1, description="Taxels across the head.")]
-        radius_mm: Annotated[float, Meta(gt=0, description="Of the arc across the head.")] | None = None
+        rows: Annotated[int, says("Taxels across the head.", ge=1)]
+        radius_mm: Annotated[float, says("Of the arc across the head.", gt=0)] | None = None
 
 `from_plain` makes one of what JSON or TOML held, `to_plain` the reverse, `schema_of` the schema in data_schema/. Files
 go through `files.documents.read_record`, which first refuses doubled keys, huge numbers and depth. Arrays are nested
@@ -78,6 +78,11 @@ class Record(_Struct, frozen=True, forbid_unknown_fields=True):
     def __repr__(self) -> str:
         values = (f"{name}={_short(getattr(self, name))}" for name in self.__struct_fields__)
         return f"{type(self).__qualname__}({', '.join(values)})"
+
+
+def says(meaning: str, **rules: Any) -> Meta:
+    """What a field means, with its range and more."""
+    return Meta(description=meaning, **rules)
 
 
 class Options(Record):

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
 from tactile_bayes import presets
-from tactile_bayes.declarations import Meta, Options
+from tactile_bayes.declarations import Meta, Options, says
 from tactile_bayes.errors import UsageError
 from tactile_bayes.presets import Background, Method, Noise, Normalise, Rotation, SceneAsked
 
@@ -19,21 +19,19 @@ class BumpPrior(Options):
     """Proper, weak priors, all of them printed with the estimate."""
 
     amplitude_sd: Annotated[
-        float, Meta(gt=0, le=1000, description="Normal about 0, in units of the map's scale (1 for a normalised map)")
+        float, says("Normal about 0, in units of the map's scale (1 for a normalised map)", gt=0, le=1000)
     ] = 2.0
     width_median_mm: Annotated[
-        float, Meta(gt=0, le=100, description="Median of the geometric mean of the two widths, log-normal")
+        float, says("Median of the geometric mean of the two widths, log-normal", gt=0, le=100)
     ] = 5.0
-    log_width_sd: Annotated[float, Meta(gt=0, le=10, description="SD of its natural log")] = 1.0
+    log_width_sd: Annotated[float, says("SD of its natural log", gt=0, le=10)] = 1.0
     log_ratio_sd: Annotated[
-        float, Meta(gt=0, le=5, description="SD of half the log of the axis ratio, along and across the diagonal")
+        float, says("SD of half the log of the axis ratio, along and across the diagonal", gt=0, le=5)
     ] = 0.5
     tilt_sd: Annotated[
         float,
-        Meta(
-            gt=0,
-            le=1000,
-            description="SD of the level's slope over half a window, in units of the map's scale; for its odds only",
+        says(
+            "SD of the level's slope over half a window, in units of the map's scale; for its odds only", gt=0, le=1000
         ),
     ] = 0.1
 
@@ -66,28 +64,26 @@ class FitSettings(BumpPrior, kw_only=True):
 
     method: Annotated[
         Method,
-        Meta(
-            description="importance: weighted draws; ensemble: MCMC; laplace: mode, curvature; optimise: the paper's "
-            "least squares."
+        says(
+            "importance: weighted draws; ensemble: MCMC; laplace: mode, curvature; optimise: the paper's least squares."
         ),
     ] = "importance"
     background: Annotated[
         Background | None,
-        Meta(
-            description="Level about the lump: fixed at 1, or fitted. Default: as for the calibration's maps; free "
+        says(
+            "Level about the lump: fixed at 1, or fitted. Default: as for the calibration's maps; free "
             "where the level is not known (normalise none)",
             extra=IN_FILE,
         ),
     ] = None
     fit_radius_mm: Annotated[
         Annotated[float, Meta(gt=0)] | None,
-        Meta(description="Radius of the fitted window. Default: the calibration's, else 20", extra=IN_FILE),
+        says("Radius of the fitted window. Default: the calibration's, else 20", extra=IN_FILE),
     ] = None
     rotation: Annotated[
         Rotation,
-        Meta(
-            description="Rotated ellipse: used where the map favours it, always, or never. Correlated noise: "
-            "`--scene` decides",
+        says(
+            "Rotated ellipse: used where the map favours it, always, or never. Correlated noise: `--scene` decides",
             extra=IN_FILE,
         ),
     ] = "auto"
@@ -97,40 +93,39 @@ class FitSettings(BumpPrior, kw_only=True):
     ] = None
     noise: Annotated[
         Noise | None,
-        Meta(
-            description="independent: white noise, the likelihood divided by the inflation of correlated errors; "
+        says(
+            "independent: white noise, the likelihood divided by the inflation of correlated errors; "
             "field: correlated noise in the model. Default: the calibration's",
             extra=IN_FILE,
         ),
     ] = None
     field_cosines: Annotated[
         FieldCosines,
-        Meta(
-            description="Basis functions of the correlated noise along each axis: more are slower and resolve shorter "
+        says(
+            "Basis functions of the correlated noise along each axis: more are slower and resolve shorter "
             "correlation; `tradeoff estimate` measures the difference. auto: 18, up to 30 for a narrow lump",
             extra=IN_FILE,
         ),
     ] = "auto"
     accuracy_sd: Annotated[
         Annotated[float, Meta(ge=0.001, le=0.5)] | None,
-        Meta(
-            description="Monte-Carlo error to reach in the interval ends of sizes and map widths, in posterior SDs. "
+        says(
+            "Monte-Carlo error to reach in the interval ends of sizes and map widths, in posterior SDs. "
             "Default: 0.02 for importance, 0.1 for ensemble."
         ),
     ] = None
     accuracy_mm: Annotated[
         Annotated[float, Meta(ge=0.0001, le=10)] | None,
-        Meta(
-            description="Wanted Monte-Carlo error of interval ends, in mm; the finer of this and --accuracy-sd holds",
-            extra=IN_FILE,
+        says(
+            "Wanted Monte-Carlo error of interval ends, in mm; the finer of this and --accuracy-sd holds", extra=IN_FILE
         ),
     ] = None
     scene: Annotated[
-        SceneAsked, Meta(description="Structures in the fit window; auto: the simplest scene that the map supports.")
+        SceneAsked, says("Structures in the fit window; auto: the simplest scene that the map supports.")
     ] = "auto"
     max_steps: Annotated[
         Annotated[int, Meta(ge=150)] | None,
-        Meta(description="Longest MCMC chain (method ensemble) before it gives up", extra=IN_FILE),
+        says("Longest MCMC chain (method ensemble) before it gives up", extra=IN_FILE),
     ] = None
 
     @property
@@ -147,17 +142,14 @@ class FitSettings(BumpPrior, kw_only=True):
 class MapOptions(Options):
     """How a map is built of scans."""
 
-    cell_mm: Annotated[float, Meta(ge=0.01, le=50, description="Side of the square cells, mm.")] = presets.CELL_MM
+    cell_mm: Annotated[float, says("Side of the square cells, mm.", ge=0.01, le=50)] = presets.CELL_MM
     pressure_window_kpa: Annotated[
         tuple[Annotated[float, Meta(ge=0)], Annotated[float, Meta(ge=0)]],
         named("LOW HIGH", "Leave out frames whose mean pressure lies outside."),
     ] = presets.PRESSURE_WINDOW_KPA
     normalise: Annotated[
         Normalise,
-        Meta(
-            description="gain: estimate one gain per frame; mean: divide each frame by its mean (the paper); none: "
-            "keep kPa."
-        ),
+        says("gain: estimate one gain per frame; mean: divide each frame by its mean (the paper); none: keep kPa."),
     ] = presets.DEFAULT_NORMALISE
     latency_ms: Annotated[
         Annotated[float, Meta(ge=-10_000, le=10_000)] | Literal["auto"],
@@ -170,16 +162,14 @@ class MapOptions(Options):
             "Fit the plane to frames within this distance of the mass; auto: those whose array can reach it.",
         ),
     ] = "all"
-    flat_field: Annotated[
-        bool, Meta(description="Remove the head's own response, measured on frames without a lump.")
-    ] = False
+    flat_field: Annotated[bool, says("Remove the head's own response, measured on frames without a lump.")] = False
     register_strokes: Annotated[
-        bool, Meta(description="Align the strokes with each other, for a lump that moves with the head.")
+        bool, says("Align the strokes with each other, for a lump that moves with the head.")
     ] = False
     as_stated: Annotated[
         bool,
-        Meta(
-            description="Take array, lever arm and quaternions as stated, with a caution where frames contradict them; "
+        says(
+            "Take array, lever arm and quaternions as stated, with a caution where frames contradict them; "
             "else such a scan is refused."
         ),
     ] = False
@@ -209,18 +199,18 @@ class Comparing(Options):
 
     days: Annotated[
         tuple[float, ...] | None,
-        Meta(description="Time of each visit in days, the first at 0; None where it is not known."),
+        says("Time of each visit in days, the first at 0; None where it is not known."),
     ] = None
     grown_by: Annotated[
         tuple[Annotated[float, Meta(gt=-1, lt=10)], ...],
-        Meta(description="Shares of the diameter by which it may have grown or more."),
+        says("Shares of the diameter by which it may have grown or more."),
     ] = GROWN_BY
     same_mass: Annotated[
         bool,
-        Meta(description="Say that the visits are of one mass where landmarks are missing, or place it too far apart."),
+        says("Say that the visits are of one mass where landmarks are missing, or place it too far apart."),
     ] = False
     registration_mm: Annotated[
-        float, Meta(gt=0, description="SD each way of one mass's place between visits, by posture and landmarks.")
+        float, says("SD each way of one mass's place between visits, by posture and landmarks.", gt=0)
     ] = presets.REGISTRATION_MM
 
     def check_visits(self, visits: int) -> None:
@@ -236,8 +226,8 @@ class Comparing(Options):
 
 
 IntervalMethod = Literal["corrected", "jackknife", "bca"]
-Seed = Annotated[int, Meta(ge=0, description="Random seed.")]
-Workers = Annotated[int, Meta(ge=0, description="Number of worker processes.")]
+Seed = Annotated[int, says("Random seed.", ge=0)]
+Workers = Annotated[int, says("Number of worker processes.", ge=0)]
 
 
 class TrialSettings(Options):
@@ -245,23 +235,23 @@ class TrialSettings(Options):
 
     intervals: Annotated[
         IntervalMethod,
-        Meta(
-            description="Interval method, resampling patients. corrected: jackknife with Student's t, corrected for "
+        says(
+            "Interval method, resampling patients. corrected: jackknife with Student's t, corrected for "
             "rare misses and few influential patients; jackknife: uncorrected; bca: bootstrap."
         ),
     ] = "corrected"
-    resamples: Annotated[int, Meta(ge=200, le=100_000, description="Number of bootstrap resamples.")] = 2000
+    resamples: Annotated[int, says("Number of bootstrap resamples.", ge=200, le=100_000)] = 2000
     seed: Seed = 1999
     error_ratio: Annotated[
         float,
-        Meta(ge=1e-6, le=1e6, description="Ratio of the ex-vivo error's variance to the modality's, for Deming lines."),
+        says("Ratio of the ex-vivo error's variance to the modality's, for Deming lines.", ge=1e-6, le=1e6),
     ] = 1.0
     check_intervals: Annotated[
         int, named("TRIALS", "Simulate this many trials of this size and report how often the intervals cover.", ge=0)
     ] = 0
-    bayes: Annotated[
-        bool, Meta(description="Predict the error of the next mass, by an errors-in-variables model and MCMC.")
-    ] = False
+    bayes: Annotated[bool, says("Predict the error of the next mass, by an errors-in-variables model and MCMC.")] = (
+        False
+    )
 
 
 Aim = Literal["power", "precision"]
@@ -270,16 +260,12 @@ Aim = Literal["power", "precision"]
 class PlanErrors(Options):
     """Errors of ln size that a plan assumes; an SD of 0.15 is about 15 %."""
 
-    tactile_bias: Annotated[float, Meta(ge=-3, le=3, description="Mean of ln(size / ex vivo).")] = 0.02
-    mass_sd: Annotated[float, Meta(ge=0, le=3, description="SD of ln size shared by a mass's maps.")] = 0.18
-    map_sd: Annotated[float, Meta(ge=0, le=3, description="SD of ln size of single maps.")] = 0.15
-    other_bias: Annotated[
-        float, Meta(ge=-3, le=3, description="Mean of ln(size / ex vivo) of the modality compared with.")
-    ] = -0.08
-    other_sd: Annotated[float, Meta(ge=0, le=3, description="SD of ln size of the modality compared with.")] = 0.40
-    other_miss: Annotated[
-        float, Meta(ge=0, le=1, description="Share of masses that the modality compared with misses.")
-    ] = 0.04
+    tactile_bias: Annotated[float, says("Mean of ln(size / ex vivo).", ge=-3, le=3)] = 0.02
+    mass_sd: Annotated[float, says("SD of ln size shared by a mass's maps.", ge=0, le=3)] = 0.18
+    map_sd: Annotated[float, says("SD of ln size of single maps.", ge=0, le=3)] = 0.15
+    other_bias: Annotated[float, says("Mean of ln(size / ex vivo) of the modality compared with.", ge=-3, le=3)] = -0.08
+    other_sd: Annotated[float, says("SD of ln size of the modality compared with.", ge=0, le=3)] = 0.40
+    other_miss: Annotated[float, says("Share of masses that the modality compared with misses.", ge=0, le=1)] = 0.04
 
 
 class PlanOptions(Options, kw_only=True):
@@ -287,11 +273,11 @@ class PlanOptions(Options, kw_only=True):
 
     patients: Annotated[
         tuple[Annotated[int, Meta(ge=8, le=MOST_PATIENTS)], ...],
-        Meta(description="Number of patients, one mass each."),
+        says("Number of patients, one mass each."),
     ] = (16, 24, 32, 48)
     maps: Annotated[
         tuple[Annotated[int, Meta(ge=1, le=1000)], ...],
-        Meta(description="Number of tactile maps per mass; 3 with --power or --precision."),
+        says("Number of tactile maps per mass; 3 with --power or --precision."),
     ] = (1, 3, 5)
     power: Annotated[
         Annotated[float, Meta(ge=0.5, le=0.99)] | None,
@@ -305,8 +291,8 @@ class PlanOptions(Options, kw_only=True):
             "end, such as 2.",
         ),
     ] = None
-    against: Annotated[str, Meta(description="Modality of the pilot to compare with.")] = "ultrasound"
-    trials: Annotated[int, Meta(ge=50, le=MOST_ITEMS, description="Number of simulated trials per design.")] = 1000
+    against: Annotated[str, says("Modality of the pilot to compare with.")] = "ultrasound"
+    trials: Annotated[int, says("Number of simulated trials per design.", ge=50, le=MOST_ITEMS)] = 1000
     seed: Seed = 1999
     workers: Workers = 1
 
@@ -329,13 +315,13 @@ class CampaignOptions(Options, kw_only=True):
     protocol: Annotated[
         Path | None, named("FILE.toml", "Pre-specified analysis of the trial, as for `validate`.", path=True)
     ] = None
-    normalise: Annotated[Normalise, Meta(description="As `map`.")] = presets.DEFAULT_NORMALISE
+    normalise: Annotated[Normalise, says("As `map`.")] = presets.DEFAULT_NORMALISE
     match_mm: Annotated[
         float,
         named("MM", "Distance within which a mass is the one that another exam of the breast names by place.", gt=0),
     ] = presets.MATCH_MM
-    figures: Annotated[bool, Meta(description="Draw map and size posterior of each exam.")] = False
-    dry_run: Annotated[bool, Meta(description="Print what would be done, and do nothing.")] = False
+    figures: Annotated[bool, says("Draw map and size posterior of each exam.")] = False
+    dry_run: Annotated[bool, says("Print what would be done, and do nothing.")] = False
     copy_to: Annotated[
         str | None, named("s3://BUCKET/FOLDER", "Copy every file into this folder of an object store, step by step.")
     ] = None

@@ -7,7 +7,7 @@ from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
-from tactile_bayes.declarations import Meta, extra_of, kinds, part_of
+from tactile_bayes.declarations import Meta, extra_of, kinds, part_of, says
 from tactile_bayes.errors import UsageError
 from tactile_bayes.options import IN_FILE, PRIORS, FitSettings, named
 from tactile_bayes.presets import INTERVAL
@@ -36,20 +36,20 @@ class Settings(FitSettings, kw_only=True):
             "such bodies.",
         ),
     ] = None
-    seed: Annotated[int, Meta(ge=0, description="Random seed.")] = 1
-    interval: Annotated[float, Meta(gt=0.0, lt=1.0, description="Probability of the intervals.")] = INTERVAL
+    seed: Annotated[int, says("Random seed.", ge=0)] = 1
+    interval: Annotated[float, says("Probability of the intervals.", gt=0.0, lt=1.0)] = INTERVAL
     between_map_sd: Annotated[
         Annotated[float, Meta(ge=0, le=2)] | None,
-        Meta(
-            description="SD of ln size between maps of one mass, taken as known. Default: one interval for exams as "
+        says(
+            "SD of ln size between maps of one mass, taken as known. Default: one interval for exams as "
             "the calibration's (0.05 if solid), one as the paper's (0.15)",
             extra=IN_FILE,
         ),
     ] = None
     repeatability: Annotated[
         Repeatability | None,
-        Meta(
-            description="Spread between exams of one mass at this site, from `calibrate repeatability`: sizes then "
+        says(
+            "Spread between exams of one mass at this site, from `calibrate repeatability`: sizes then "
             "have one interval, for any exam there. Default: two, for exams as the paper's and as simulated ones.",
             extra=_SITE,
         ),
@@ -64,9 +64,8 @@ class Settings(FitSettings, kw_only=True):
     ] = ()
     checkpoint: Annotated[
         Path | None,
-        Meta(
-            description="File that MCMC (method ensemble) saves its state in and resumes from; relative to the "
-            "settings file",
+        says(
+            "File that MCMC (method ensemble) saves its state in and resumes from; relative to the settings file",
             extra=IN_FILE,
         ),
     ] = None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Final, Literal, NamedTuple
 
-from tactile_bayes.declarations import Meta, Options, field
+from tactile_bayes.declarations import Meta, Options, field, says
 from tactile_bayes.errors import UsageError
 from tactile_bayes.presets import Normalise
 
@@ -81,79 +81,73 @@ class Stated(Options, kw_only=True):
 
     unit: Annotated[
         Unit | None,
-        Meta(
-            description="Scan: unit of the frames; counts are raw, others need no calibration. Default: the file's, "
-            "else counts."
-        ),
+        says("Scan: unit of the frames; counts are raw, others need no calibration. Default: the file's, else counts."),
     ] = None
     saturation: Annotated[
         Annotated[float, Meta(gt=0)] | None,
-        Meta(description="Scan: reading from which on a taxel carries no pressure, in the frames' unit."),
+        says("Scan: reading from which on a taxel carries no pressure, in the frames' unit."),
     ] = None
     frame_shape: Annotated[
         tuple[Annotated[int, Meta(ge=1)], Annotated[int, Meta(ge=1)]] | None,
-        Meta(
-            description="Scan: rows (across the head) and columns of frames that are one row of numbers. Default: the "
-            "head's.",
+        says(
+            "Scan: rows (across the head) and columns of frames that are one row of numbers. Default: the head's.",
             extra={"metavar": "ROWS COLUMNS"},
         ),
     ] = None
     frame_order: Annotated[
         Literal["rows", "columns"] | None,
-        Meta(description="Scan: whether such a row runs along the array's rows or columns. Default: rows."),
+        says("Scan: whether such a row runs along the array's rows or columns. Default: rows."),
     ] = None
     skip_columns: Annotated[
         Annotated[int, Meta(ge=0)] | None,
-        Meta(description="Scan: columns of a table of frames before its readings. Default: told by the header."),
+        says("Scan: columns of a table of frames before its readings. Default: told by the header."),
     ] = None
     decimal: Annotated[
         Literal["point", "comma"] | None,
-        Meta(description="Scan: decimal sign of tables. Default: told by their numbers, where these can tell."),
+        says("Scan: decimal sign of tables. Default: told by their numbers, where these can tell."),
     ] = None
     rate_hz: Annotated[
-        Rate | None, Meta(description="Scan: frames a second, where they have no times.", extra={"metavar": "HZ"})
+        Rate | None, says("Scan: frames a second, where they have no times.", extra={"metavar": "HZ"})
     ] = None
-    time_unit: Annotated[
-        TimeUnit | None, Meta(description="Scan: unit of the frames' times. Default: the file's, else s.")
-    ] = None
+    time_unit: Annotated[TimeUnit | None, says("Scan: unit of the frames' times. Default: the file's, else s.")] = None
     pose_layout: Annotated[
         PoseLayout | None,
-        Meta(
-            description="Scan: rotations of the poses: quaternions with the scalar first or last, azimuth, elevation "
+        says(
+            "Scan: rotations of the poses: quaternions with the scalar first or last, azimuth, elevation "
             "and roll, or rows of a 4 x 4 matrix. Default: by the names of the columns, else wxyz."
         ),
     ] = None
     length_unit: Annotated[
         Literal["mm", "cm", "m", "inch"] | None,
-        Meta(description="Scan: unit of the poses' positions. Default: the file's, else mm."),
+        says("Scan: unit of the poses' positions. Default: the file's, else mm."),
     ] = None
-    pose_time_unit: Annotated[
-        TimeUnit | None, Meta(description="Scan: unit of the poses' times. Default: the file's, else s.")
-    ] = None
+    pose_time_unit: Annotated[TimeUnit | None, says("Scan: unit of the poses' times. Default: the file's, else s.")] = (
+        None
+    )
     pose_rate_hz: Annotated[
         Rate | None,
-        Meta(description="Scan: poses a second, where they have frame numbers or no times.", extra={"metavar": "HZ"}),
+        says("Scan: poses a second, where they have frame numbers or no times.", extra={"metavar": "HZ"}),
     ] = None
     pose_offset_s: Annotated[
         Annotated[float, Meta(ge=-1e10, le=1e10)] | None,
-        Meta(description="Scan: added to the poses' times, for the frames' clock. Default: 0.", extra={"metavar": "S"}),
+        says("Scan: added to the poses' times, for the frames' clock. Default: 0.", extra={"metavar": "S"}),
     ] = None
     pose_good: Annotated[
         str | None,
-        Meta(description="Scan: value of the poses' status where the tool is seen. Default: OK, Enabled and the like."),
+        says("Scan: value of the poses' status where the tool is seen. Default: OK, Enabled and the like."),
     ] = None
-    tool: Annotated[
-        str | None, Meta(description="Scan: which tool or station of the poses' file.", extra={"metavar": "NAME"})
-    ] = None
+    tool: Annotated[str | None, says("Scan: which tool or station of the poses' file.", extra={"metavar": "NAME"})] = (
+        None
+    )
 
 
 class ArrayMap(Stated, kw_only=True):
     """What a file calls the arrays of a scan, and what is stated of them: the TOML of `import --columns`."""
 
-    arrays: Annotated[dict[str, str], Meta(description='Name in the file by the name here: counts = "P".')] = field(
+    arrays: Annotated[dict[str, str], says('Name in the file by the name here: counts = "P".')] = field(
         default_factory=dict
     )
-    values: Annotated[dict[str, Any], Meta(description="Arrays that the file lacks, such as pitch_mm = 1.5.")] = field(
+    values: Annotated[dict[str, Any], says("Arrays that the file lacks, such as pitch_mm = 1.5.")] = field(
         default_factory=dict
     )
 
@@ -166,42 +160,35 @@ _LONGEST_UNITS: Final = 20
 class GridOptions(Options, kw_only=True):
     """What is stated of a grid of values that becomes a map."""
 
-    spacing_mm: Annotated[
-        float | None, Meta(description="Map: side of the square cells, in mm.", extra={"metavar": "H"})
-    ] = None
+    spacing_mm: Annotated[float | None, says("Map: side of the square cells, in mm.", extra={"metavar": "H"})] = None
     cell_mm: Annotated[
         Annotated[float, Meta(gt=0)] | None,
-        Meta(
-            description="Map: average finer cells into cells of up to this side. Default: 1 where they are finer than "
-            "0.5.",
+        says(
+            "Map: average finer cells into cells of up to this side. Default: 1 where they are finer than 0.5.",
             extra={"metavar": "H"},
         ),
     ] = None
-    normalise: Annotated[Normalise, Meta(description="Map: how the values are already normalised.")] = "none"
+    normalise: Annotated[Normalise, says("Map: how the values are already normalised.")] = "none"
     level: Annotated[
         Annotated[float, Meta(gt=0)] | Literal["fit"] | None,
-        Meta(
-            description="Map: divide values such as kPa by their level beside the lump: a number, or fit, to take it "
-            "from the map.",
+        says(
+            "Map: divide values such as kPa by their level beside the lump: a number, or fit, to take it from the map.",
             extra={"metavar": "L|fit"},
         ),
     ] = None
     units: Annotated[
         str | None,
-        Meta(
-            description="Map: unit of values that are not normalised, such as kPa. Default: unknown.",
-            extra={"metavar": "TEXT"},
-        ),
+        says("Map: unit of values that are not normalised, such as kPa. Default: unknown.", extra={"metavar": "TEXT"}),
     ] = None
     no_value: Annotated[
         tuple[str, ...],
-        Meta(
-            description="Map: a number or text that stands for no value, such as -9999; none: every number is a value.",
+        says(
+            "Map: a number or text that stands for no value, such as -9999; none: every number is a value.",
             extra={"metavar": "V"},
         ),
     ] = ()
     array: Annotated[
-        str | None, Meta(description="Map: which array of SRC, where it holds several.", extra={"metavar": "NAME"})
+        str | None, says("Map: which array of SRC, where it holds several.", extra={"metavar": "NAME"})
     ] = None
 
     def __post_init__(self) -> None:

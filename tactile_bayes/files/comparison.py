@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Final, Literal
 
-from tactile_bayes.declarations import UNSET, Meta, Record, UnsetType, field
+from tactile_bayes.declarations import UNSET, Meta, Record, UnsetType, field, says
 from tactile_bayes.files.reports import Above0, Chance, Entries, Interval, Judgement, Least0, Number1, Report
 from tactile_bayes.inference.draws import Quantity
 
@@ -24,16 +24,13 @@ class Visit(Record):
     """A visit with its size and its maps."""
 
     visit: Number1
-    day: Annotated[float | None, Meta(description="Days from the first visit; null where not given.")]
+    day: Annotated[float | None, says("Days from the first visit; null where not given.")]
     max_size_mm: Annotated[
-        Quantity | None, Meta(description="Largest diameter; the joint posterior's, in which the lump keeps its form.")
+        Quantity | None, says("Largest diameter; the joint posterior's, in which the lump keeps its form.")
     ]
     fat_mm: Annotated[
         float | None,
-        Meta(
-            description="Depth of the fat under the head by the visit's pressure profiles; null where not all visits "
-            "tell it."
-        ),
+        says("Depth of the fat under the head by the visit's pressure profiles; null where not all visits tell it."),
     ]
     maps: Annotated[tuple[VisitMap, ...], Meta(min_length=1)]
 
@@ -45,14 +42,14 @@ class VisitPlace(Record):
     distance_mm: Least0 | None
     sd_mm: Annotated[
         Least0 | None,
-        Meta(description="SD by which one mass comes out apart between the visits, in the direction of the shift."),
+        says("SD by which one mass comes out apart between the visits, in the direction of the shift."),
     ]
     shift_mm: Annotated[
-        tuple[float, float] | None, Meta(description="x and y in the patient's frame, from the first visit's place.")
+        tuple[float, float] | None, says("x and y in the patient's frame, from the first visit's place.")
     ]
     probability: Annotated[
         Chance | None,
-        Meta(description="That one mass comes out as far apart or farther; below 0.02 the visits are not compared."),
+        says("That one mass comes out as far apart or farther; below 0.02 the visits are not compared."),
     ]
 
 
@@ -103,7 +100,7 @@ class TrendReport(Record):
     percent_per_day: Rate
     doubling_days: Doubling
     straight_line_probability: Annotated[
-        Chance | None, Meta(description="That sizes on a straight line come out as far from one or farther.")
+        Chance | None, says("That sizes on a straight line come out as far from one or farther.")
     ]
 
 
@@ -122,20 +119,17 @@ class ChangeReport(Record):
     later: Annotated[int, Meta(ge=2)]
     verdict: Annotated[
         Literal["grown", "shrunk", "no_change_shown"],
-        Meta(description="grown or shrunk where the 95 % interval leaves out no change."),
+        says("grown or shrunk where the 95 % interval leaves out no change."),
     ]
-    log_ratio: Annotated[Quantity, Meta(description="ln of the later diameter over the earlier.")]
-    percent: Annotated[Quantity, Meta(description="Change of the diameter in percent.")]
+    log_ratio: Annotated[Quantity, says("ln of the later diameter over the earlier.")]
+    percent: Annotated[Quantity, says("Change of the diameter in percent.")]
     probability_grown: Chance
     grown_by: tuple[GrownBy, ...]
     smallest_detectable_percent: Detectable
     growth_rate: GrowthRate | None
     another_exam: Annotated[
         AnotherChange | None,
-        Meta(
-            description="The same if exams of one mass differ as the paper's maps did; null where their spread is "
-            "stated."
-        ),
+        says("The same if exams of one mass differ as the paper's maps did; null where their spread is stated."),
     ]
 
     @property
@@ -155,36 +149,29 @@ class CompareReport(Report, kw_only=True):
     schema: Literal["tactile-bayes/compare/1"]
     status: Annotated[
         Literal["compared", "not_one_mass", "no_estimate"],
-        Meta(
-            description="not_one_mass: the visits were not shown to be of one mass; no_estimate: a visit has no size."
-        ),
+        says("not_one_mass: the visits were not shown to be of one mass; no_estimate: a visit has no size."),
     ]
     verdict: Judgement
     entries: Entries = field(name="findings")
-    reason: Annotated[str, Meta(description="Why nothing is compared; empty otherwise.")]
-    advice: Annotated[str, Meta(description="What would help where nothing is compared.")]
+    reason: Annotated[str, says("Why nothing is compared; empty otherwise.")]
+    advice: Annotated[str, says("What would help where nothing is compared.")]
     visits: Annotated[tuple[Visit, ...], Meta(min_length=2)]
     places: Annotated[
         tuple[VisitPlace, ...],
-        Meta(
-            description="How far the mass of each later visit lies from the first visit's, by the landmarks; null "
-            "without."
-        ),
+        says("How far the mass of each later visit lies from the first visit's, by the landmarks; null without."),
     ]
     changes: Annotated[
         tuple[ChangeReport, ...],
-        Meta(description="Change from the first visit to each later one; empty where nothing is compared."),
+        says("Change from the first visit to each later one; empty where nothing is compared."),
     ]
     trend: Annotated[
         TrendReport | None,
-        Meta(description="Straight line of ln d over three visits and more with days; null otherwise."),
+        says("Straight line of ln d over three visits and more with days; null otherwise."),
     ]
-    between_map_sd: Annotated[
-        Least0 | None, Meta(description="SD of ln d between the exams of a visit, root mean square.")
-    ]
+    between_map_sd: Annotated[Least0 | None, says("SD of ln d between the exams of a visit, root mean square.")]
     repeatability: Annotated[
         str | UnsetType,
-        Meta(description="How far exams of one mass lie apart at this site, where --repeatability told it"),
+        says("How far exams of one mass lie apart at this site, where --repeatability told it"),
     ] = UNSET
     left_out: tuple[str, ...]
     research_use: str

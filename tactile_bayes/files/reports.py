@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Any, Final, Literal, Self
 
-from tactile_bayes.declarations import EXACT, UNSET, Meta, Record, UnsetType, field, from_plain, to_plain
+from tactile_bayes.declarations import EXACT, UNSET, Meta, Record, UnsetType, field, from_plain, says, to_plain
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.documents import dump_json
 from tactile_bayes.findings import Finding, FindingEntry, Verdict
@@ -26,9 +26,9 @@ ReasonCode = Literal[
 ]
 Shape = Literal["round", "ellipse", "rotated"]
 Entries = Annotated[
-    tuple[FindingEntry, ...], Meta(description="What speaks against the result, cautions first; see docs/formats.md")
+    tuple[FindingEntry, ...], says("What speaks against the result, cautions first; see docs/formats.md")
 ]
-Judgement = Annotated[Verdict, Meta(description="no_answer: there is no size; doubtful: a caution stands")]
+Judgement = Annotated[Verdict, says("no_answer: there is no size; doubtful: a caution stands")]
 
 
 class Report(Record, kw_only=True):
@@ -138,12 +138,12 @@ class AnotherExam(Record):
     variance_share: dict[str, Annotated[float, Meta(ge=0, le=100)]]
 
 
-SUPPOSING: Final = Meta(
-    description="How large the lump would be if more were known of the body, by name (soft, hard, centred, resting): "
+SUPPOSING: Final = says(
+    "How large the lump would be if more were known of the body, by name (soft, hard, centred, resting): "
     "the property, its value, and the largest size with it; null without a size"
 )
-LEADING: Final = Meta(
-    description="Where it is not null, the sizes that lead (record 0130): for exams as far apart as those of "
+LEADING: Final = says(
+    "Where it is not null, the sizes that lead (record 0130): for exams as far apart as those of "
     "patients; SD of ln size between exams, and the sizes with it"
 )
 
@@ -236,7 +236,7 @@ class MassReport(Record, kw_only=True):
     d_y_mm: Quantity | None
     angle_deg: Quantity | None
     another_exam: AnotherExam | None
-    reason: Annotated[str, Meta(description="Why it has no size; empty where it has one.")]
+    reason: Annotated[str, says("Why it has no size; empty where it has one.")]
     reason_code: ReasonCode
     advice: str
     position: Position | None = None
@@ -305,14 +305,12 @@ class EstimateReport(Report, kw_only=True):
     reason: str
     reason_code: ReasonCode = ""
     advice: str = ""
-    on_paper: Annotated[
-        str, Meta(description="The advice for a reader of the exam's page, who has no command line")
-    ] = ""
-    about_mm: Annotated[Place | None, Meta(description="Place on the map that the reason is about")] = None
+    on_paper: Annotated[str, says("The advice for a reader of the exam's page, who has no command line")] = ""
+    about_mm: Annotated[Place | None, says("Place on the map that the reason is about")] = None
     smallest_lump: Annotated[
         SmallestLump | None,
-        Meta(
-            description="On a map without a lump: diameters in mm of the smallest ball that it would have shown with "
+        says(
+            "On a map without a lump: diameters in mm of the smallest ball that it would have shown with "
             "this probability, by depth; null where not even a ball of 30 mm"
         ),
     ] = None
@@ -329,12 +327,12 @@ class EstimateReport(Report, kw_only=True):
     supposing: Annotated[dict[str, Supposed] | None, SUPPOSING] = None
     centre_mm: Point | None
     centre_patient_mm: Annotated[
-        Point | None, Meta(description="mm from the xiphoid: x to the patient's right, y towards the sternal notch")
+        Point | None, says("mm from the xiphoid: x to the patient's right, y towards the sternal notch")
     ] = None
     position: Annotated[
         Position | None,
-        Meta(
-            description="Place of the lump about the nipple, as the examiner sees it who faces the patient: hours on "
+        says(
+            "Place of the lump about the nipple, as the examiner sees it who faces the patient: hours on "
             "the clock, 12 towards the head, and mm along the map; null without a nipple, notch and xiphoid, or a side"
         ),
     ] = None
@@ -347,19 +345,19 @@ class EstimateReport(Report, kw_only=True):
     candidates: tuple[PassedOver, ...]
     other_rises: Annotated[
         tuple[OtherRise, ...],
-        Meta(description="Other rises that are lumps by the evidence, highest first; mm on the map."),
+        says("Other rises that are lumps by the evidence, highest first; mm on the map."),
     ] = ()
     masses: Annotated[
         tuple[MassReport, ...],
-        Meta(
-            description="All masses of the map, the surest first. The top-level fields are those of the reported one: "
+        says(
+            "All masses of the map, the surest first. The top-level fields are those of the reported one: "
             "the surest, or that of the place that was given."
         ),
     ]
     touching: Annotated[
         tuple[Touching, ...],
-        Meta(
-            description="Pairs of sized masses that may be one lump: their numbers, mm between their centres, and the "
+        says(
+            "Pairs of sized masses that may be one lump: their numbers, mm between their centres, and the "
             "length over both."
         ),
     ] = ()
@@ -398,15 +396,14 @@ class PooledMap(Record, kw_only=True):
     map: str
     mass: Annotated[
         tuple[Number1, ...],
-        Meta(
-            max_length=2,
-            description="Number of the mass that was sized, and how many the map has; empty where it is the only one.",
+        says(
+            "Number of the mass that was sized, and how many the map has; empty where it is the only one.", max_length=2
         ),
     ] = ()
     status: Literal["estimate", "no_estimate"]
     reason: str
     detected_probability: float | None
-    max_size_mm: Annotated[Interval | None, Meta(description="largest size by this map alone, as `estimate` gives it")]
+    max_size_mm: Annotated[Interval | None, says("largest size by this map alone, as `estimate` gives it")]
     outlying: bool
 
 
@@ -424,7 +421,7 @@ class PooledReport(Report, kw_only=True):
     schema: Literal["tactile-bayes/pooled/1"]
     status: Annotated[
         Literal["estimate", "no_estimate", "maps_disagree"],
-        Meta(description="maps_disagree: each map has its size, and they are not of one size or not at one place"),
+        says("maps_disagree: each map has its size, and they are not of one size or not at one place"),
     ]
     verdict: Judgement
     entries: Entries = field(name="findings")
@@ -436,29 +433,24 @@ class PooledReport(Report, kw_only=True):
     maps: Annotated[tuple[PooledMap, ...], Meta(min_length=1)]
     one_size_probability: Annotated[
         Chance | None,
-        Meta(description="that maps of one mass are as far apart in size or farther; null for a single one"),
+        says("that maps of one mass are as far apart in size or farther; null for a single one"),
     ]
-    one_place_probability: Annotated[
-        Chance | None, Meta(description="likewise of their places by the landmarks; null without two")
-    ]
+    one_place_probability: Annotated[Chance | None, says("likewise of their places by the landmarks; null without two")]
     variance_share: dict[str, float] | None
     figures: dict[str, float]
     left_out: tuple[str, ...] = ()
     fat_mm: Annotated[
         Above0 | None,
-        Meta(description="Depth of the fat under the head by its pressure profile; null where the maps do not tell."),
+        says("Depth of the fat under the head by its pressure profile; null where the maps do not tell."),
     ] = None
     unknowns: dict[str, float]
     site: Annotated[
         str | None,
-        Meta(description="The correction of the calibration by a site's phantoms, in words; null without one."),
+        says("The correction of the calibration by a site's phantoms, in words; null without one."),
     ] = None
     repeatability: Annotated[
         str | UnsetType,
-        Meta(
-            description="The site's spread between exams of one mass that the size supposes, in words; missing "
-            "without one."
-        ),
+        says("The site's spread between exams of one mass that the size supposes, in words; missing without one."),
     ] = UNSET
     research_use: str
     provenance: dict[str, Any]

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Final
 
-from tactile_bayes.declarations import Meta, Record, as_dict, field, from_plain, names_of
+from tactile_bayes.declarations import Record, as_dict, field, from_plain, names_of, says
 from tactile_bayes.errors import BadDataError, in_file
 from tactile_bayes.files.documents import parse_toml
 from tactile_bayes.files.reading import TOML_BYTES, read_text
@@ -58,37 +58,33 @@ class SceneFile(Record):
     tissue.
     """
 
-    scene: Annotated[Timing, Meta(description="Length and rates.")] = field(default_factory=Timing)
-    background: Annotated[Background, Meta(description="Mean pressure away from lumps, against time.")] = field(
+    scene: Annotated[Timing, says("Length and rates.")] = field(default_factory=Timing)
+    background: Annotated[Background, says("Mean pressure away from lumps, against time.")] = field(
         default_factory=Background
     )
     body: SceneBody | None = None
     lump: Annotated[
         tuple[LumpTable, ...],
-        Meta(
-            max_length=100,
-            description="Lumps: either Gaussian rises of the normalised pressure (amplitude, sigma), or tissue (d_mm, "
+        says(
+            "Lumps: either Gaussian rises of the normalised pressure (amplitude, sigma), or tissue (d_mm, "
             "depth_ratio).",
+            max_length=100,
         ),
     ] = ()
     rib: Annotated[
-        tuple[Annotated[Rib, Meta(description="One rib.")], ...],
-        Meta(max_length=10, description="Ribs for the solid model: rows of stiff balls along x, across the head."),
+        tuple[Annotated[Rib, says("One rib.")], ...],
+        says("Ribs for the solid model: rows of stiff balls along x, across the head.", max_length=10),
     ] = ()
-    strokes: Annotated[Strokes, Meta(description="Back and forth across the head, line after line along it.")] = field(
+    strokes: Annotated[Strokes, says("Back and forth across the head, line after line along it.")] = field(
         default_factory=Strokes
     )
-    head: Annotated[Head, Meta(description="A section of a circular cylinder.")] = field(default_factory=Head)
-    noise: Annotated[Noise, Meta(description="Standard deviations of everything random.")] = field(
-        default_factory=Noise
+    head: Annotated[Head, says("A section of a circular cylinder.")] = field(default_factory=Head)
+    noise: Annotated[Noise, says("Standard deviations of everything random.")] = field(default_factory=Noise)
+    tracker: Annotated[Tracker, says("Where the tracker's base stands and how its sensor sits in the handle.")] = field(
+        default_factory=Tracker
     )
-    tracker: Annotated[
-        Tracker, Meta(description="Where the tracker's base stands and how its sensor sits in the handle.")
-    ] = field(default_factory=Tracker)
-    taxels: Annotated[Taxels, Meta(description="Faulty elements as [row, column] from 0.")] = field(
-        default_factory=Taxels
-    )
-    landmarks: Annotated[SceneLandmarks, Meta(description="Points touched before the scan, in the plane.")] = field(
+    taxels: Annotated[Taxels, says("Faulty elements as [row, column] from 0.")] = field(default_factory=Taxels)
+    landmarks: Annotated[SceneLandmarks, says("Points touched before the scan, in the plane.")] = field(
         default_factory=SceneLandmarks
     )
 

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Final
 
 import numpy as np
 
-from tactile_bayes.declarations import Meta, Record, as_dict, check, field, replace
+from tactile_bayes.declarations import Meta, Record, as_dict, check, field, replace, says
 from tactile_bayes.errors import BadDataError, require
 from tactile_bayes.forward.contact import Head as Section
 from tactile_bayes.forward.tissue import Diameter, Place, Rib, SceneBody, SolidLump, check_solid, fat_thickness
@@ -42,24 +42,22 @@ FLAT_MM: Final = 100_000.0
 class Background(Record):
     """Mean pressure under the head away from lumps, over time."""
 
-    mean_kpa: Annotated[float, Meta(gt=0, le=34, description="Level once contact is made, kPa.")] = 9.5
-    drift_kpa: Annotated[
-        float, Meta(ge=0, le=34, description="Amplitude of a sine on top of it, kPa; below mean_kpa.")
-    ] = 0.5
-    drift_period_s: Annotated[float, Meta(gt=0, le=600, description="Its period, s.")] = 3.0
-    ramp_s: Annotated[float, Meta(ge=0, le=60, description="Time to press down at the start, s.")] = 0.2
+    mean_kpa: Annotated[float, says("Level once contact is made, kPa.", gt=0, le=34)] = 9.5
+    drift_kpa: Annotated[float, says("Amplitude of a sine on top of it, kPa; below mean_kpa.", ge=0, le=34)] = 0.5
+    drift_period_s: Annotated[float, says("Its period, s.", gt=0, le=600)] = 3.0
+    ramp_s: Annotated[float, says("Time to press down at the start, s.", ge=0, le=60)] = 0.2
     load_sharing: Annotated[
         bool,
-        Meta(description="true: constant force, each frame keeps its mean and the background falls beside a lump."),
+        says("true: constant force, each frame keeps its mean and the background falls beside a lump."),
     ] = False
 
 
-Amplitude = Annotated[float, Meta(ge=-1, le=20, description="Height above a background of 1.")]
-SigmaX = Annotated[float, Meta(ge=0.1, le=200, description="Standard deviation along the lump's first axis, mm.")]
-SigmaY = Annotated[float, Meta(ge=0.1, le=200, description="Standard deviation along its second axis, mm.")]
+Amplitude = Annotated[float, says("Height above a background of 1.", ge=-1, le=20)]
+SigmaX = Annotated[float, says("Standard deviation along the lump's first axis, mm.", ge=0.1, le=200)]
+SigmaY = Annotated[float, says("Standard deviation along its second axis, mm.", ge=0.1, le=200)]
 Angle = Annotated[
     float,
-    Meta(ge=-360, le=360, description="From the plane's x axis to the lump's first axis, positive towards y, degrees."),
+    says("From the plane's x axis to the lump's first axis, positive towards y, degrees.", ge=-360, le=360),
 ]
 
 
@@ -78,24 +76,20 @@ class Lump(Record):
 class Strokes(Record):
     """Path of the head: back and forth across, line after line along."""
 
-    lines: Annotated[int, Meta(ge=1, le=200, description="Parallel lines.")] = 5
-    spacing_mm: Annotated[float, Meta(ge=0, le=100, description="Distance between lines, mm.")] = 6.0
-    half_length_mm: Annotated[
-        float, Meta(ge=0, le=500, description="Reach of each line either side of the middle, mm.")
-    ] = 34.0
-    wander_mm: Annotated[float, Meta(ge=0, le=50, description="Amplitude of the slow departure from the line, mm.")] = (
-        0.5
-    )
-    tilt_deg: Annotated[float, Meta(ge=0, le=30, description="Amplitude of the head's rocking, degrees.")] = 2.0
+    lines: Annotated[int, says("Parallel lines.", ge=1, le=200)] = 5
+    spacing_mm: Annotated[float, says("Distance between lines, mm.", ge=0, le=100)] = 6.0
+    half_length_mm: Annotated[float, says("Reach of each line either side of the middle, mm.", ge=0, le=500)] = 34.0
+    wander_mm: Annotated[float, says("Amplitude of the slow departure from the line, mm.", ge=0, le=50)] = 0.5
+    tilt_deg: Annotated[float, says("Amplitude of the head's rocking, degrees.", ge=0, le=30)] = 2.0
     yaw_deg: Annotated[
         float,
-        Meta(ge=-90, le=90, description="Turn of the head about the normal, away from square to the strokes, degrees."),
+        says("Turn of the head about the normal, away from square to the strokes, degrees.", ge=-90, le=90),
     ] = 0.0
 
 
-Rows = Annotated[int, Meta(ge=1, le=256, description="Taxels across the head.")]
-Columns = Annotated[int, Meta(ge=1, le=256, description="Taxels along the head.")]
-Pitch = Annotated[float, Meta(gt=0, lt=100, description="Distance between neighbouring taxels, mm.")]
+Rows = Annotated[int, says("Taxels across the head.", ge=1, le=256)]
+Columns = Annotated[int, says("Taxels along the head.", ge=1, le=256)]
+Pitch = Annotated[float, says("Distance between neighbouring taxels, mm.", gt=0, lt=100)]
 
 
 class Head(Record):
@@ -104,17 +98,17 @@ class Head(Record):
     rows: Rows = HEAD_ROWS
     columns: Columns = HEAD_COLUMNS
     pitch_mm: Pitch = HEAD_PITCH_MM
-    radius_mm: Annotated[float, Meta(gt=0, le=100_000, description="Radius of the face, mm; above half the width.")] = (
+    radius_mm: Annotated[float, says("Radius of the face, mm; above half the width.", gt=0, le=100_000)] = (
         HEAD_RADIUS_MM
     )
-    shoulder_mm: Annotated[float, Meta(ge=0, le=100, description="Radius of its rounded edges, mm; 0 for none.")] = 0.0
+    shoulder_mm: Annotated[float, says("Radius of its rounded edges, mm; 0 for none.", ge=0, le=100)] = 0.0
     rim_mm: Annotated[
         float,
-        Meta(
+        says(
+            "Radius of the rounded edge around the taxels, mm, which presses but feels nothing (solid "
+            "model); in two dimensions the edge lies within the array, unless simulate --head shoulders-outside.",
             ge=0,
             le=100,
-            description="Radius of the rounded edge around the taxels, mm, which presses but feels nothing (solid "
-            "model); in two dimensions the edge lies within the array, unless simulate --head shoulders-outside.",
         ),
     ] = 3.0
 
@@ -150,40 +144,40 @@ class Head(Record):
 class Noise(Record):
     """Standard deviations of all random errors."""
 
-    element_kpa: Annotated[float, Meta(ge=0, le=34, description="Of each reading, kPa.")] = 0.2
-    tracker_mm: Annotated[float, Meta(ge=0, le=50, description="Of each position, per axis, mm.")] = 0.4
-    tracker_deg: Annotated[float, Meta(ge=0, le=30, description="Of each rotation, per axis, degrees.")] = 0.2
+    element_kpa: Annotated[float, says("Of each reading, kPa.", ge=0, le=34)] = 0.2
+    tracker_mm: Annotated[float, says("Of each position, per axis, mm.", ge=0, le=50)] = 0.4
+    tracker_deg: Annotated[float, says("Of each rotation, per axis, degrees.", ge=0, le=30)] = 0.2
     gain_spread: Annotated[
         float,
-        Meta(ge=0, le=0.2, description="Between the true gains of the taxels, as a share; the calibration knows it."),
+        says("Between the true gains of the taxels, as a share; the calibration knows it.", ge=0, le=0.2),
     ] = 0.03
-    gain_share: Annotated[
-        float, Meta(ge=0, le=0.2, description="Error of the calibration, as a share of the gain.")
-    ] = 0.01
+    gain_share: Annotated[float, says("Error of the calibration, as a share of the gain.", ge=0, le=0.2)] = 0.01
 
 
 class Tracker(Record):
     """Place of the tracker's base, and the sensor's pose in the handle; rotations are vectors."""
 
-    latency_ms: Annotated[float, Meta(ge=0, le=1000, description="By how much a pose's stamp is late, ms.")] = 0.0
-    base_rotation_deg: Annotated[Rotation, Meta(description="Rotation vector of base from plane, degrees.")] = (
+    latency_ms: Annotated[float, says("By how much a pose's stamp is late, ms.", ge=0, le=1000)] = 0.0
+    base_rotation_deg: Annotated[Rotation, says("Rotation vector of base from plane, degrees.")] = (
         165.0,
         25.0,
         -20.0,
     )
-    base_offset_mm: Annotated[tuple[BaseMm, BaseMm, BaseMm], Meta(description="The plane's origin in base, mm.")] = (
+    base_offset_mm: Annotated[tuple[BaseMm, BaseMm, BaseMm], says("The plane's origin in base, mm.")] = (
         175.0,
         -112.0,
         133.0,
     )
-    lever_rotation_deg: Annotated[Rotation, Meta(description="Rotation vector of scanhead from tracker, degrees.")] = (
+    lever_rotation_deg: Annotated[Rotation, says("Rotation vector of scanhead from tracker, degrees.")] = (
         0.0,
         3.0,
         -90.0,
     )
-    lever_offset_mm: Annotated[
-        tuple[LeverMm, LeverMm, LeverMm], Meta(description="The tracker's sensor in scanhead, mm.")
-    ] = (0.0, 10.0, -55.0)
+    lever_offset_mm: Annotated[tuple[LeverMm, LeverMm, LeverMm], says("The tracker's sensor in scanhead, mm.")] = (
+        0.0,
+        10.0,
+        -55.0,
+    )
 
     def base_from_plane(self) -> FloatArray:
         """(4, 4) transform."""
@@ -197,26 +191,26 @@ class Tracker(Record):
 class Taxels(Record):
     """Faulty elements as (row, column): dead ones read 0, saturated ones full scale."""
 
-    dead: Annotated[tuple[Taxel, ...], Meta(description="Read 0 throughout.")] = ()
-    saturated: Annotated[tuple[Taxel, ...], Meta(description="Read full scale throughout.")] = ()
+    dead: Annotated[tuple[Taxel, ...], says("Read 0 throughout.")] = ()
+    saturated: Annotated[tuple[Taxel, ...], says("Read full scale throughout.")] = ()
 
 
 class SceneLandmarks(Record):
     """Landmarks in the scene's `plane`."""
 
-    touched: Annotated[bool, Meta(description="false leaves them out of the scan.")] = True
-    xiphoid_mm: Annotated[Point, Meta(description="Xiphoid, mm.")] = (-60.0, -90.0, 0.0)
-    sternal_notch_mm: Annotated[Point, Meta(description="Sternal notch, mm.")] = (-60.0, 90.0, 0.0)
-    nipple_mm: Annotated[Point, Meta(description="Nipple, mm; left out where it is not touched.")] | None = None
+    touched: Annotated[bool, says("false leaves them out of the scan.")] = True
+    xiphoid_mm: Annotated[Point, says("Xiphoid, mm.")] = (-60.0, -90.0, 0.0)
+    sternal_notch_mm: Annotated[Point, says("Sternal notch, mm.")] = (-60.0, 90.0, 0.0)
+    nipple_mm: Annotated[Point, says("Nipple, mm; left out where it is not touched.")] | None = None
 
 
 class Timing(Record):
     """Length and rates of a scan."""
 
-    seed: Annotated[int, Meta(ge=0, le=2**63 - 1, description="Seed of the random numbers; --seed replaces it.")] = 1
-    duration_s: Annotated[float, Meta(gt=0, le=600, description="Duration of the scan, s.")] = 7.0
-    frame_rate_hz: Annotated[float, Meta(gt=0, le=2000, description="Pressure frames per second.")] = 200.0
-    pose_rate_hz: Annotated[float, Meta(gt=0, le=2000, description="Tracker poses per second.")] = 120.0
+    seed: Annotated[int, says("Seed of the random numbers; --seed replaces it.", ge=0, le=2**63 - 1)] = 1
+    duration_s: Annotated[float, says("Duration of the scan, s.", gt=0, le=600)] = 7.0
+    frame_rate_hz: Annotated[float, says("Pressure frames per second.", gt=0, le=2000)] = 200.0
+    pose_rate_hz: Annotated[float, says("Tracker poses per second.", gt=0, le=2000)] = 120.0
 
 
 class Scene(Timing):

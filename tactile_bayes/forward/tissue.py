@@ -9,7 +9,7 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_bayes.declarations import Meta, Record, check
+from tactile_bayes.declarations import Record, check, says
 from tactile_bayes.errors import BadDataError, require
 from tactile_bayes.forward.contact import Head
 from tactile_bayes.geometry import FloatArray
@@ -184,38 +184,33 @@ _SAME_MM = 0.01
 # The skin over a lump, and the tissue under it, as a share of its half height.
 _LEAST_COVER = 0.02
 
-Place = Annotated[float, Meta(ge=-500, le=500, description="Centre in the plane, mm.")]
+Place = Annotated[float, says("Centre in the plane, mm.", ge=-500, le=500)]
 Diameter = Annotated[
     float,
-    Meta(
+    says(
+        "Diameter, mm. Of a Gaussian lump the declared truth, from which nothing is computed; of tissue "
+        "the diameter across the vertical (15).",
         gt=0,
         le=500,
-        description="Diameter, mm. Of a Gaussian lump the declared truth, from which nothing is computed; of tissue "
-        "the diameter across the vertical (15).",
     ),
 ]
-Height = Annotated[
-    float, Meta(gt=0, le=500, description="Tissue: diameter along the vertical, mm; left out for a ball.")
-]
+Height = Annotated[float, says("Tissue: diameter along the vertical, mm; left out for a ball.", gt=0, le=500)]
 DepthRatio = Annotated[
     float,
-    Meta(
+    says(
+        "Tissue: h/d, depth of the centre over the diameter; the lump must fit between skin and chest wall.",
         gt=0,
         le=100,
-        description="Tissue: h/d, depth of the centre over the diameter; the lump must fit between skin and chest "
-        "wall.",
     ),
 ]
-Stiffness = Annotated[
-    float, Meta(gt=0, le=1_000_000, description="Tissue: modulus of the lump over that of fat (100).")
-]
+Stiffness = Annotated[float, says("Tissue: modulus of the lump over that of fat (100).", gt=0, le=1_000_000)]
 Seat = Annotated[
     float,
-    Meta(
+    says(
+        "Tissue: the fat-gland boundary lies at the centre's depth + seat x half the height: 0 through the "
+        "centre (centred), 1 under the lowest point; the phantoms' resting lumps have 1.2.",
         ge=0,
         le=20,
-        description="Tissue: the fat-gland boundary lies at the centre's depth + seat x half the height: 0 through the "
-        "centre (centred), 1 under the lowest point; the phantoms' resting lumps have 1.2.",
     ),
 ]
 
@@ -223,20 +218,18 @@ Seat = Annotated[
 class SceneBody(Record):
     """Fat over gland on a rigid chest wall, for lumps of tissue."""
 
-    fat_kpa: Annotated[float, Meta(gt=0, le=10_000, description="Young's modulus of fat, kPa.")] = FAT_KPA
-    gland_ratio: Annotated[float, Meta(gt=0, le=10_000, description="Modulus of gland over that of fat.")] = GLAND_RATIO
-    thickness_mm: Annotated[float, Meta(gt=0, le=500, description="Depth of the chest wall below the skin, mm.")] = (
-        THICKNESS_MM
-    )
-    nu: Annotated[float, Meta(ge=0, lt=0.5, description="Poisson's ratio of everything, lumps included.")] = POISSON
+    fat_kpa: Annotated[float, says("Young's modulus of fat, kPa.", gt=0, le=10_000)] = FAT_KPA
+    gland_ratio: Annotated[float, says("Modulus of gland over that of fat.", gt=0, le=10_000)] = GLAND_RATIO
+    thickness_mm: Annotated[float, says("Depth of the chest wall below the skin, mm.", gt=0, le=500)] = THICKNESS_MM
+    nu: Annotated[float, says("Poisson's ratio of everything, lumps included.", ge=0, lt=0.5)] = POISSON
     fat_mm: (
         Annotated[
             float,
-            Meta(
+            says(
+                "Depth of the boundary between fat and gland, mm. Left out, the lumps' seats decide; 15 mm "
+                "without lumps.",
                 gt=0,
                 le=500,
-                description="Depth of the boundary between fat and gland, mm. Left out, the lumps' seats decide; 15 mm "
-                "without lumps.",
             ),
         ]
         | None
@@ -274,17 +267,15 @@ class Rib(Record):
     The balls have no seat: the boundary of fat and gland is the lumps' or the body's.
     """
 
-    x_mm: Annotated[float, Meta(ge=-500, le=500, description="Middle of the row in the plane, mm.")] = 0.0
-    y_mm: Annotated[float, Meta(ge=-500, le=500, description="Middle of the row in the plane, mm.")] = 26.0
-    d_mm: Annotated[float, Meta(gt=0, le=100, description="Diameter of the balls, mm.")] = 12.0
-    depth_mm: Annotated[float, Meta(gt=0, le=500, description="Depth of the balls' centres, mm.")] = 12.0
-    spacing_mm: Annotated[float, Meta(ge=0.5, le=100, description="From ball to ball, mm; they may overlap.")] = 8.0
+    x_mm: Annotated[float, says("Middle of the row in the plane, mm.", ge=-500, le=500)] = 0.0
+    y_mm: Annotated[float, says("Middle of the row in the plane, mm.", ge=-500, le=500)] = 26.0
+    d_mm: Annotated[float, says("Diameter of the balls, mm.", gt=0, le=100)] = 12.0
+    depth_mm: Annotated[float, says("Depth of the balls' centres, mm.", gt=0, le=500)] = 12.0
+    spacing_mm: Annotated[float, says("From ball to ball, mm; they may overlap.", ge=0.5, le=100)] = 8.0
     half_length_mm: Annotated[
-        float, Meta(gt=0, le=500, description="The outermost balls lie at most this far from the middle, mm.")
+        float, says("The outermost balls lie at most this far from the middle, mm.", gt=0, le=500)
     ] = 40.0
-    stiffness_ratio: Annotated[
-        float, Meta(gt=0, le=1_000_000, description="Modulus of the balls over that of fat.")
-    ] = 100.0
+    stiffness_ratio: Annotated[float, says("Modulus of the balls over that of fat.", gt=0, le=1_000_000)] = 100.0
 
     def balls(self) -> tuple[SolidLump, ...]:
         """The row as lumps."""

@@ -7,7 +7,7 @@ from typing import Annotated, Final, Literal
 
 import numpy as np
 
-from tactile_bayes.declarations import Meta, Record, field, replace, rounded
+from tactile_bayes.declarations import Meta, Record, field, replace, rounded, says
 from tactile_bayes.errors import check_number
 from tactile_bayes.geometry import FloatArray, IndexArray
 from tactile_bayes.presets import INTERVAL
@@ -102,10 +102,10 @@ class Quantity(Record, kw_only=True):
     """`low`, `high`: Ends of the equal-tailed interval of `probability`."""
     mc_error: Annotated[
         float,
-        Meta(
-            ge=0,
-            description="Monte-Carlo standard error of the wider of low and high, in their unit: digits beyond it mean "
+        says(
+            "Monte-Carlo standard error of the wider of low and high, in their unit: digits beyond it mean "
             "nothing, whatever number of digits is written.",
+            ge=0,
         ),
     ] = 0.0
     probability: Annotated[float, Meta(gt=0, lt=1)]

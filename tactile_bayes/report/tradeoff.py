@@ -8,7 +8,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
-from tactile_bayes.declarations import Meta, Record
+from tactile_bayes.declarations import Meta, Record, says
 from tactile_bayes.posterior.verdict import LIKELY
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.estimate_text import SOURCES
@@ -87,7 +87,7 @@ def _without_number(ladder: Ladder) -> str:
 # --- What `tradeoff estimate --json` and `tradeoff map --json` print.
 
 DIGITS: Final = 6
-Seconds = Annotated[dict[str, float], Meta(description="CPU seconds by part.")]
+Seconds = Annotated[dict[str, float], says("CPU seconds by part.")]
 
 
 class QuantityFile(Record):
@@ -96,22 +96,20 @@ class QuantityFile(Record):
     median: float | None
     low: float | None
     high: float | None
-    mc_error: Annotated[float | None, Meta(description="Monte-Carlo error of the interval's ends.")]
+    mc_error: Annotated[float | None, says("Monte-Carlo error of the interval's ends.")]
 
 
 class AnswerFile(Record):
     """What one estimate says."""
 
-    reason: Annotated[str, Meta(description="Why there is no number; empty where there is one.")]
+    reason: Annotated[str, says("Why there is no number; empty where there is one.")]
     detected_probability: Annotated[float, Meta(ge=0, le=1)] | None
-    method: Annotated[str, Meta(description="The method that drew.")]
+    method: Annotated[str, says("The method that drew.")]
     quantities: Annotated[
         dict[str, QuantityFile],
-        Meta(description="Medians and 95 % intervals, mm: max_size_mm, sigma_x_mm, sigma_y_mm."),
+        says("Medians and 95 % intervals, mm: max_size_mm, sigma_x_mm, sigma_y_mm."),
     ]
-    variance_share: Annotated[
-        dict[str, float], Meta(description="Percent of the variance of ln(largest size) by source.")
-    ]
+    variance_share: Annotated[dict[str, float], says("Percent of the variance of ln(largest size) by source.")]
 
 
 class ReferenceFile(Record):
@@ -131,17 +129,15 @@ class SettingFile(Record):
     setting: str
     default: bool
     usable: Annotated[
-        bool, Meta(description="Whether it may be chosen to save time; other settings are another model or less data.")
+        bool, says("Whether it may be chosen to save time; other settings are another model or less data.")
     ]
     runs: Annotated[int, Meta(ge=1)]
     cpu_s: Seconds
     median_off_mm: float | None
-    ends_off_mm: Annotated[
-        float | None, Meta(description="Root mean square over runs and both ends of the reported interval.")
-    ]
+    ends_off_mm: Annotated[float | None, says("Root mean square over runs and both ends of the reported interval.")]
     width_ends_off_mm: float | None
     answer: AnswerFile
-    frontier: Annotated[bool, Meta(description="No other setting is quicker and nearer at once.")]
+    frontier: Annotated[bool, says("No other setting is quicker and nearer at once.")]
 
 
 class PooledFile(Record):
@@ -150,7 +146,7 @@ class PooledFile(Record):
     maps: Annotated[int, Meta(ge=1)]
     cpu_s: float
     answer: AnswerFile
-    another_half_width_mm: Annotated[float | None, Meta(description="Half width of the interval of another exam, mm.")]
+    another_half_width_mm: Annotated[float | None, says("Half width of the interval of another exam, mm.")]
 
 
 class TradeoffFile(Record):
@@ -161,7 +157,7 @@ class TradeoffFile(Record):
     tolerance_mm: Annotated[float, Meta(gt=0)]
     reference: ReferenceFile
     settings: Annotated[tuple[SettingFile, ...], Meta(min_length=1)]
-    enough: Annotated[str | None, Meta(description="The cheapest usable setting within the tolerance.")]
+    enough: Annotated[str | None, says("The cheapest usable setting within the tolerance.")]
     pooled: tuple[PooledFile, ...]
     shared_cpu_s: Seconds
     advice: Annotated[tuple[str, ...], Meta(min_length=1)]

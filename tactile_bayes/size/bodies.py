@@ -26,7 +26,7 @@ from typing import Annotated, Final
 
 import numpy as np
 
-from tactile_bayes.declarations import Meta, Record, replace
+from tactile_bayes.declarations import Record, replace, says
 from tactile_bayes.errors import BadDataError, UsageError, check_number, meant
 from tactile_bayes.geometry import BoolArray, FloatArray, Matrix, Vector
 from tactile_bayes.size.draws import BetweenMaps, ShapeDraws, Supposition
@@ -89,10 +89,10 @@ class Spread(Record, eq=False):
     powers: tuple[Power, ...]
     mean: Vector
     covariance: Matrix
-    log_exam_sd: Annotated[float, Meta(description="ln SD between exams of a body.")]
+    log_exam_sd: Annotated[float, says("ln SD between exams of a body.")]
     log_exam_sd_variance: Share
-    other_sd: Annotated[float, Meta(ge=0, description="By which bodies of another origin depart.")]
-    other_source: Annotated[str, Meta(description="What told it.")]
+    other_sd: Annotated[float, says("By which bodies of another origin depart.", ge=0)]
+    other_source: Annotated[str, says("What told it.")]
 
     def __post_init__(self) -> None:
         s = len(self.powers)
@@ -104,24 +104,22 @@ class Spread(Record, eq=False):
 class BodyLaw(Record, eq=False, kw_only=True):
     """Law learned over a population: Eq 6 by the depth of the fat, its residual, and what a map does not show."""
 
-    source: Annotated[str, Meta(description="What the table was made of.")]
-    bodies: Annotated[
-        Mapping[str, tuple[float, float]], Meta(description="Ranges of its lumps and bodies, by its columns.")
-    ]
+    source: Annotated[str, says("What the table was made of.")]
+    bodies: Annotated[Mapping[str, tuple[float, float]], says("Ranges of its lumps and bodies, by its columns.")]
     recipe: Recipe
     centre: Centre
     eq6: Eq6Law
-    residual: Annotated[Residual | None, Meta(description="null for Eq 6 alone.")]
+    residual: Annotated[Residual | None, says("null for Eq 6 alone.")]
     spread: Spread
     round_lumps: RoundLumps
-    depth: Annotated[FatDepth | None, Meta(description="null where the table's maps did not tell it.")]
-    feature_powers: Annotated[tuple[Power, ...], Meta(description="Of u, v and w in the features of a map.")]
-    information_inverse: Annotated[Matrix, Meta(description="For the leverage of a map, over its features.")]
-    most_leverage: Annotated[Above0, Meta(description="Of maps inside the table.")]
+    depth: Annotated[FatDepth | None, says("null where the table's maps did not tell it.")]
+    feature_powers: Annotated[tuple[Power, ...], says("Of u, v and w in the features of a map.")]
+    information_inverse: Annotated[Matrix, says("For the leverage of a map, over its features.")]
+    most_leverage: Annotated[Above0, says("Of maps inside the table.")]
     domain: Domain
-    hidden: Annotated[HiddenTerms | None, Meta(description="What B is made of.")]
-    hidden_any: Annotated[HiddenTerms | None, Meta(description="The same where the depth is not known.")]
-    fit: Annotated[Mapping[str, float], Meta(description="Figures of the fit.")]
+    hidden: Annotated[HiddenTerms | None, says("What B is made of.")]
+    hidden_any: Annotated[HiddenTerms | None, says("The same where the depth is not known.")]
+    fit: Annotated[Mapping[str, float], says("Figures of the fit.")]
 
     def __post_init__(self) -> None:
         s, c = len(self.spread.powers), len(self.feature_powers)

@@ -21,7 +21,7 @@ from typing import Annotated, Final, Literal
 
 import numpy as np
 
-from tactile_bayes.declarations import Meta, Record, field, replace
+from tactile_bayes.declarations import Meta, Record, field, replace, says
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import BoolArray, FloatArray, Matrix, Vector
 from tactile_bayes.inference.draws import even_replicates, normal_quantile, paired_points
@@ -54,12 +54,12 @@ class Eq6Law(Record, eq=False):
 
     powers: Annotated[
         tuple[Power, ...],
-        Meta(description="Which of mu (0), f (1) and b (2) each coefficient is of, and its powers of v and w."),
+        says("Which of mu (0), f (1) and b (2) each coefficient is of, and its powers of v and w."),
     ]
     mean: Vector
     covariance: Matrix
     log_amplitude_one_deep: Annotated[
-        float, Meta(description="ln a of lumps one diameter deep, where Delta sigma is 1: e = exp(-f times this).")
+        float, says("ln a of lumps one diameter deep, where Delta sigma is 1: e = exp(-f times this).")
     ]
 
     def __post_init__(self) -> None:
@@ -108,8 +108,8 @@ class AxisCalibration(Record, eq=False):
     The residual standard deviation of ln d is :math:`s\,(a / a_0)^{-g}`: fainter maps tell less.
     """
 
-    draws: Annotated[Matrix, Meta(description="m, b (mm), e, f, scatter and its slope in each row.")]
-    reference_amplitude: Annotated[Above0, Meta(description="Of the scatter.")]
+    draws: Annotated[Matrix, says("m, b (mm), e, f, scatter and its slope in each row.")]
+    reference_amplitude: Annotated[Above0, says("Of the scatter.")]
     domain: Domain
     fit: Mapping[str, float] = field(default_factory=dict)
 
@@ -146,7 +146,7 @@ class LeftOutErrors(Record):
 
     cases: Annotated[int, Meta(ge=1)]
     geometries: Annotated[int, Meta(ge=1)]
-    least_stiffness_ratio: Annotated[Share, Meta(description="Softer lumps took no part.")]
+    least_stiffness_ratio: Annotated[Share, says("Softer lumps took no part.")]
     eq6: Annotated[Mapping[str, Share], Meta(extra_json_schema={"required": ["both"]})]
     log_quadratic: Annotated[Mapping[str, Share], Meta(extra_json_schema={"required": ["both"]})]
 
@@ -158,17 +158,15 @@ class LeftOutErrors(Record):
 class SizeCalibration(Record, eq=False):
     """Eq 6 for each axis of the head, from a study or phantoms: the same for all maps, whatever their fat."""
 
-    x: Annotated[AxisCalibration, Meta(description="Across the head.")]
-    y: Annotated[AxisCalibration, Meta(description="Along the head; the same where the table has one width.")]
+    x: Annotated[AxisCalibration, says("Across the head.")]
+    y: Annotated[AxisCalibration, says("Along the head; the same where the table has one width.")]
     residual_correlation: Annotated[
-        float, Meta(ge=-1, le=1, description="A lump that looks large along one axis tends to along the other.")
+        float, says("A lump that looks large along one axis tends to along the other.", ge=-1, le=1)
     ]
     recipe: Recipe
     axes: Annotated[tuple[Literal["x", "y", "both"], ...], Meta(min_length=1, max_length=2)] = ("x", "y")
     left_out: LeftOutErrors | None = None
-    cautions: Annotated[
-        tuple[str, ...], Meta(description="What of the table's lumps is of one kind, or unlike a patient's.")
-    ] = ()
+    cautions: Annotated[tuple[str, ...], says("What of the table's lumps is of one kind, or unlike a patient's.")] = ()
 
     @property
     def fat_mm(self) -> None:

@@ -14,7 +14,7 @@ from typing import Annotated, Final, Literal
 
 import numpy as np
 
-from tactile_bayes.declarations import Meta, Record, field
+from tactile_bayes.declarations import Meta, Record, field, says
 from tactile_bayes.errors import Abstention, BadDataError
 from tactile_bayes.geometry import BoolArray, FloatArray, Matrix, Vector
 from tactile_bayes.inference.draws import normal_quantile
@@ -25,9 +25,7 @@ LEARN_ANEW: Final = "learn the calibration anew"
 _RANGES: Final = ("amplitude", "sigma_mm", "d_mm")
 Normalise = Literal["mean", "gain", "none"]
 Range = tuple[Annotated[float, Meta(gt=0)], Annotated[float, Meta(gt=0)]]
-Domain = Annotated[
-    Mapping[str, Range], Meta(description="Ranges in the table.", extra_json_schema={"required": [*_RANGES]})
-]
+Domain = Annotated[Mapping[str, Range], says("Ranges in the table.", extra_json_schema={"required": [*_RANGES]})]
 """Ranges of amplitude, sigma_mm (geometric mean) and d_mm."""
 Share = Annotated[float, Meta(ge=0)]
 Above0 = Annotated[float, Meta(gt=0)]
@@ -85,19 +83,15 @@ def monomials(values: Sequence[FloatArray], exponents: Sequence[tuple[int, ...]]
 class Recipe(Record):
     """How a table's maps were built and fitted; a patient's map must agree."""
 
-    normalise: Annotated[Normalise, Meta(description="As the option of `map`.")]
-    background: Annotated[Background, Meta(description="Whether the fit had a level of its own.")]
-    radius_mm: Annotated[float, Meta(gt=0, description="Of the fitted window.")]
-    declared: Annotated[
-        bool, Meta(description="true: stated for a table made elsewhere; false: the program made the maps.")
-    ]
-    noise: Annotated[Noise, Meta(description="independent: least squares; field: correlated noise.")] = "independent"
+    normalise: Annotated[Normalise, says("As the option of `map`.")]
+    background: Annotated[Background, says("Whether the fit had a level of its own.")]
+    radius_mm: Annotated[float, says("Of the fitted window.", gt=0)]
+    declared: Annotated[bool, says("true: stated for a table made elsewhere; false: the program made the maps.")]
+    noise: Annotated[Noise, says("independent: least squares; field: correlated noise.")] = "independent"
     flat_field: Annotated[
-        bool | None, Meta(description="Whether the head's own response was taken off; null where nobody says.")
+        bool | None, says("Whether the head's own response was taken off; null where nobody says.")
     ] = None
-    head: Annotated[
-        HeadShape | None, Meta(description="Head that the maps were made with; null where nobody says.")
-    ] = None
+    head: Annotated[HeadShape | None, says("Head that the maps were made with; null where nobody says.")] = None
 
     @property
     def _settings(self) -> dict[str, str]:
@@ -133,11 +127,11 @@ class Recipe(Record):
 class RoundLumps(Record, eq=False):
     """Half log axis ratio of a ball's map, and how far maps are from it."""
 
-    coefficients: Annotated[Vector, Meta(description="Of the powers of the spread.")]
-    body_sd: Annotated[float, Meta(ge=0, description="Between bodies.")]
-    exam_sd: Annotated[float, Meta(ge=0, description="Between exams of a body.")]
+    coefficients: Annotated[Vector, says("Of the powers of the spread.")]
+    body_sd: Annotated[float, says("Between bodies.", ge=0)]
+    exam_sd: Annotated[float, says("Between exams of a body.", ge=0)]
     map_factor: Annotated[
-        float, Meta(ge=0, description="Variance over that of a map's posterior: deep and faint lumps are off by more.")
+        float, says("Variance over that of a map's posterior: deep and faint lumps are off by more.", ge=0)
     ]
 
     def variance(self, of_maps: FloatArray, *, maps: int = 1) -> FloatArray:
@@ -152,14 +146,14 @@ class HiddenTerms(Record, eq=False, omit_defaults=True):
     """
 
     names: Annotated[tuple[str, ...], Meta(min_length=1)]
-    expected: Annotated[Matrix, Meta(description="Coefficients of a map's features in what is expected of each.")]
-    covariance: Annotated[Matrix, Meta(description="About that.")]
-    with_body: Annotated[Vector, Meta(description="Covariance with B over its SD.")]
-    body_variance: Annotated[float, Meta(gt=0, description="Of B in the units of with_body.")]
-    inverted: Annotated[tuple[str, ...], Meta(description="Properties that enter by their inverse.")] = ()
-    most_sd: Annotated[
-        float, Meta(gt=0, description="SD of B beyond which they explain no more: there the map is unlike.")
-    ] = float("inf")
+    expected: Annotated[Matrix, says("Coefficients of a map's features in what is expected of each.")]
+    covariance: Annotated[Matrix, says("About that.")]
+    with_body: Annotated[Vector, says("Covariance with B over its SD.")]
+    body_variance: Annotated[float, says("Of B in the units of with_body.", gt=0)]
+    inverted: Annotated[tuple[str, ...], says("Properties that enter by their inverse.")] = ()
+    most_sd: Annotated[float, says("SD of B beyond which they explain no more: there the map is unlike.", gt=0)] = (
+        float("inf")
+    )
 
     def __post_init__(self) -> None:
         k = len(self.names)
@@ -204,21 +198,21 @@ class SiteShift(Record, eq=False):
     from the simulation.
     """
 
-    centre: Annotated[float, Meta(description="p_0.")] = field(name="centre_log_width")
-    mean: Annotated[Vector, Meta(description="Of c0 and c1.")]
+    centre: Annotated[float, says("p_0.")] = field(name="centre_log_width")
+    mean: Annotated[Vector, says("Of c0 and c1.")]
     covariance: Matrix
-    phantoms: Annotated[int, Meta(ge=3, description="Distinct lumps.")]
+    phantoms: Annotated[int, says("Distinct lumps.", ge=3)]
     maps: Annotated[int, Meta(ge=3)]
-    base: Annotated[str, Meta(description="Name of the calibration that is corrected.")]
+    base: Annotated[str, says("Name of the calibration that is corrected.")]
     uses_fat: Annotated[
-        bool, Meta(description="Whether the phantoms were sized with the depth of fat; if not, no size with this is.")
+        bool, says("Whether the phantoms were sized with the depth of fat; if not, no size with this is.")
     ]
     fit: Annotated[
         Mapping[str, float],
-        Meta(description="log_width: mean p of the phantoms; spread_factor; sd_before and sd_after: RMS of ln d."),
+        says("log_width: mean p of the phantoms; spread_factor; sd_before and sd_after: RMS of ln d."),
     ]
-    cautions: Annotated[tuple[str, ...], Meta(description="Why it should be looked at.")] = ()
-    left_out: Annotated[tuple[str, ...], Meta(description="Phantoms that took no part, and why.")] = ()
+    cautions: Annotated[tuple[str, ...], says("Why it should be looked at.")] = ()
+    left_out: Annotated[tuple[str, ...], says("Phantoms that took no part, and why.")] = ()
     parameters: tuple[Literal["c0"], Literal["c1"]] = ("c0", "c1")
 
     def __post_init__(self) -> None:
@@ -329,15 +323,15 @@ def head_profile(quality: Mapping[str, float]) -> tuple[float, ...] | None:
 class FatDepth(Record, eq=False):
     """Regression of the ln of the depth of the fat-gland boundary in mm on the head's pressure profile."""
 
-    centre: Annotated[Vector, Meta(description="Of the profile.")]
-    scale: Annotated[Vector, Meta(description="Of the profile.")]
-    coefficients: Annotated[Vector, Meta(description="Of 1, the scaled profile, and its products.")]
-    information_inverse: Annotated[Matrix, Meta(description="For the leverage of a new profile.")]
-    most_leverage: Annotated[Above0, Meta(description="Largest in the table.")]
-    log_sd: Annotated[Share, Meta(description="How far single exams of the table lie from the truth.")]
-    fat_mm: Annotated[Range, Meta(description="Range of the depth in the table.")]
-    expected: Annotated[Vector, Meta(description="Of a full quadratic in u and v: w without a profile.")]
-    expected_sd: Annotated[Share, Meta(description="Of w about that.")]
+    centre: Annotated[Vector, says("Of the profile.")]
+    scale: Annotated[Vector, says("Of the profile.")]
+    coefficients: Annotated[Vector, says("Of 1, the scaled profile, and its products.")]
+    information_inverse: Annotated[Matrix, says("For the leverage of a new profile.")]
+    most_leverage: Annotated[Above0, says("Largest in the table.")]
+    log_sd: Annotated[Share, says("How far single exams of the table lie from the truth.")]
+    fat_mm: Annotated[Range, says("Range of the depth in the table.")]
+    expected: Annotated[Vector, says("Of a full quadratic in u and v: w without a profile.")]
+    expected_sd: Annotated[Share, says("Of w about that.")]
     profile: tuple[str, ...] = HEAD_PROFILE
 
     def __post_init__(self) -> None:
@@ -417,9 +411,9 @@ _NUGGET = 1e-6
 class Kernel(Record, eq=False, dict=True):
     """Squared exponential kernel between values of u, v and w, and the functions that it gives by its points."""
 
-    points: Annotated[Matrix, Meta(description="u, v and w of the points.")]
-    lengths: Annotated[Vector, Meta(description="Length of the kernel along each.")]
-    scale: Annotated[float, Meta(gt=0, description="SD of the process before any data.")]
+    points: Annotated[Matrix, says("u, v and w of the points.")]
+    lengths: Annotated[Vector, says("Length of the kernel along each.")]
+    scale: Annotated[float, says("SD of the process before any data.", gt=0)]
 
     def __post_init__(self) -> None:
         check_shapes(self, points=(len(self.points), 3), lengths=(3,))
@@ -448,9 +442,9 @@ class Kernel(Record, eq=False, dict=True):
 class Residual(Kernel, eq=False, dict=True):
     """Gaussian process in u, v and w that is added to ln d, with the posterior of its weights."""
 
-    mean: Annotated[Vector, Meta(description="Of the weights.")]
+    mean: Annotated[Vector, says("Of the weights.")]
     covariance_factor: Annotated[
-        tuple[tuple[float, ...], ...], Meta(description="Rows of the Cholesky factor of the weights' covariance.")
+        tuple[tuple[float, ...], ...], says("Rows of the Cholesky factor of the weights' covariance.")
     ]
 
     def __post_init__(self) -> None:

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from tactile_bayes.declarations import Meta, Record, as_dict, field, names_of, replace
+from tactile_bayes.declarations import Meta, Record, as_dict, field, names_of, replace, says
 from tactile_bayes.errors import BadDataError, TactileBayesError
 from tactile_bayes.forward.scene import FLAT_MM, Background, Head, Noise, Scene, Strokes, Tracker
 from tactile_bayes.forward.simulate import simulate
@@ -65,52 +65,50 @@ class BodyPrior(_Ranges):
     carcinomas under a few per cent of strain (Samani et al. 2007) to rigid, moduli lie about the paper's 5 kPa and 10.
     """
 
-    d_mm: Annotated[tuple[Diameter, Diameter], Meta(description="Diameter of the lump, a ball, mm.")] = (5.0, 30.0)
-    depth_ratio: Annotated[
-        tuple[DepthRatio, DepthRatio], Meta(description="Depth of its centre over its diameter.")
-    ] = (0.56, 1.8)
-    stiffness_ratio: Annotated[tuple[Ratio, Ratio], Meta(description="Its modulus over that of fat.")] = (6.0, 100.0)
+    d_mm: Annotated[tuple[Diameter, Diameter], says("Diameter of the lump, a ball, mm.")] = (5.0, 30.0)
+    depth_ratio: Annotated[tuple[DepthRatio, DepthRatio], says("Depth of its centre over its diameter.")] = (0.56, 1.8)
+    stiffness_ratio: Annotated[tuple[Ratio, Ratio], says("Its modulus over that of fat.")] = (6.0, 100.0)
     seat: Annotated[
         tuple[Seat, Seat],
-        Meta(
-            description="How far it stands out of the gland: 0 centred on the gland's surface, 1 touching it from "
-            "above."
-        ),
+        says("How far it stands out of the gland: 0 centred on the gland's surface, 1 touching it from above."),
     ] = (0.0, 1.2)
-    fat_kpa: Annotated[tuple[Modulus, Modulus], Meta(description="Young's modulus of fat, kPa.")] = (3.5, 7.5)
-    gland_ratio: Annotated[tuple[Ratio, Ratio], Meta(description="Modulus of gland over that of fat.")] = (5.0, 16.0)
+    fat_kpa: Annotated[tuple[Modulus, Modulus], says("Young's modulus of fat, kPa.")] = (3.5, 7.5)
+    gland_ratio: Annotated[tuple[Ratio, Ratio], says("Modulus of gland over that of fat.")] = (5.0, 16.0)
     thickness_mm: Annotated[
         tuple[Thickness, Thickness],
-        Meta(description="Thickness of the breast under the head, mm; more where the lump needs it."),
+        says("Thickness of the breast under the head, mm; more where the lump needs it."),
     ] = (40.0, 90.0)
 
 
 class ExamPrior(_Ranges):
     """Ranges of an examiner's technique and of the instrument's errors, drawn anew for each scan."""
 
-    mean_kpa: Annotated[tuple[Pressure, Pressure], Meta(description="Mean pressure of a scan, kPa.")] = (7.0, 12.0)
-    drift_kpa: Annotated[
-        tuple[To10, To10], Meta(description="Amplitude of its drift, kPa; below the lowest mean_kpa.")
-    ] = (0.2, 1.5)
-    yaw_deg: Annotated[tuple[Yaw, Yaw], Meta(description="Turn of the head about the normal, degrees.")] = (-30.0, 30.0)
-    tilt_deg: Annotated[tuple[Tilt, Tilt], Meta(description="Amplitude of its rocking, degrees.")] = (0.5, 4.0)
-    wander_mm: Annotated[tuple[To10, To10], Meta(description="Departure from the line, mm.")] = (0.2, 1.5)
-    lines: Annotated[tuple[Lines, Lines], Meta(description="Parallel lines.")] = (4, 7)
-    spacing_mm: Annotated[tuple[Length, Length], Meta(description="Distance between them, mm.")] = (4.0, 7.0)
-    half_length_mm: Annotated[
-        tuple[Length, Length], Meta(description="Reach of a line either side of the middle, mm.")
-    ] = (28.0, 38.0)
+    mean_kpa: Annotated[tuple[Pressure, Pressure], says("Mean pressure of a scan, kPa.")] = (7.0, 12.0)
+    drift_kpa: Annotated[tuple[To10, To10], says("Amplitude of its drift, kPa; below the lowest mean_kpa.")] = (
+        0.2,
+        1.5,
+    )
+    yaw_deg: Annotated[tuple[Yaw, Yaw], says("Turn of the head about the normal, degrees.")] = (-30.0, 30.0)
+    tilt_deg: Annotated[tuple[Tilt, Tilt], says("Amplitude of its rocking, degrees.")] = (0.5, 4.0)
+    wander_mm: Annotated[tuple[To10, To10], says("Departure from the line, mm.")] = (0.2, 1.5)
+    lines: Annotated[tuple[Lines, Lines], says("Parallel lines.")] = (4, 7)
+    spacing_mm: Annotated[tuple[Length, Length], says("Distance between them, mm.")] = (4.0, 7.0)
+    half_length_mm: Annotated[tuple[Length, Length], says("Reach of a line either side of the middle, mm.")] = (
+        28.0,
+        38.0,
+    )
     off_centre_mm: Annotated[
-        tuple[Shift, Shift], Meta(description="Distance of the strokes' middle from the lump, each way, mm.")
+        tuple[Shift, Shift], says("Distance of the strokes' middle from the lump, each way, mm.")
     ] = (-6.0, 6.0)
-    line_s: Annotated[tuple[Seconds, Seconds], Meta(description="Time for a line, s.")] = (1.0, 1.8)
-    element_kpa: Annotated[tuple[To10, To10], Meta(description="SD of a reading, kPa.")] = (0.02, 0.3)
-    tracker_mm: Annotated[tuple[To10, To10], Meta(description="SD of the tracker's position, mm.")] = (0.05, 0.6)
-    tracker_deg: Annotated[tuple[To10, To10], Meta(description="SD of its attitude, degrees.")] = (0.02, 0.3)
-    gain_share: Annotated[
-        tuple[Share, Share], Meta(description="Error of the array's calibration, as a share of the gain.")
-    ] = (0.002, 0.02)
-    latency_ms: Annotated[tuple[Latency, Latency], Meta(description="By how much the stamp of a pose is late, ms.")] = (
+    line_s: Annotated[tuple[Seconds, Seconds], says("Time for a line, s.")] = (1.0, 1.8)
+    element_kpa: Annotated[tuple[To10, To10], says("SD of a reading, kPa.")] = (0.02, 0.3)
+    tracker_mm: Annotated[tuple[To10, To10], says("SD of the tracker's position, mm.")] = (0.05, 0.6)
+    tracker_deg: Annotated[tuple[To10, To10], says("SD of its attitude, degrees.")] = (0.02, 0.3)
+    gain_share: Annotated[tuple[Share, Share], says("Error of the array's calibration, as a share of the gain.")] = (
+        0.002,
+        0.02,
+    )
+    latency_ms: Annotated[tuple[Latency, Latency], says("By how much the stamp of a pose is late, ms.")] = (
         0.0,
         12.0,
     )
@@ -130,13 +128,10 @@ class BodiesFile(Record):
 
     bodies: Annotated[
         BodyPrior,
-        Meta(
-            description="Lumps and bodies, each property drawn by itself; sizes, stiffnesses and moduli on the log "
-            "scale."
-        ),
+        says("Lumps and bodies, each property drawn by itself; sizes, stiffnesses and moduli on the log scale."),
     ] = field(default_factory=BodyPrior)
     exams: Annotated[
-        ExamPrior, Meta(description="Technique of the examiner and errors of the instrument, drawn anew for each exam.")
+        ExamPrior, says("Technique of the examiner and errors of the instrument, drawn anew for each exam.")
     ] = field(default_factory=ExamPrior)
 
 

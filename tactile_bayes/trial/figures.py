@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import betaincinv, ndtr, ndtri, stdtrit
 
-from tactile_bayes.declarations import UNSET, Meta, Record, replace
+from tactile_bayes.declarations import UNSET, Meta, Record, replace, says
 from tactile_bayes.trial.readings import FloatArray, ModalitySizes
 
 # --- Jackknife intervals over patients, keeping a patient's masses together.
@@ -277,7 +277,7 @@ AtMostOne = Annotated[float, Meta(le=1)]
 Share = Annotated[float, Meta(ge=0, le=1)]
 Correlation = Annotated[float, Meta(ge=-1, le=1)]
 Reason = Annotated[str, Meta(min_length=1)]
-Reasons = Annotated[dict[str, Reason], Meta(description="Why a figure or an interval is null.")]
+Reasons = Annotated[dict[str, Reason], says("Why a figure or an interval is null.")]
 
 
 class Figures(Record):

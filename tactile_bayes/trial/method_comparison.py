@@ -10,7 +10,7 @@ from typing import Annotated, Literal, TypeVar
 import numpy as np
 from scipy.special import chdtri, chndtrix, gammaincc, nctdtrit, ndtri, stdtr
 
-from tactile_bayes.declarations import UNSET, Meta, Record, UnsetType, replace
+from tactile_bayes.declarations import UNSET, Record, UnsetType, replace, says
 from tactile_bayes.trial.figures import (
     Count,
     Ends,
@@ -351,12 +351,10 @@ Unit = Literal["mm", "log_ratio"]
 Against = Literal["on_ex_vivo", "on_mean"]
 _Refitted = Ends | None | UnsetType
 """The interval of a figure that has none where there are more than `MOST_REFITTED` masses."""
-_LimitMm = Annotated[
-    float, Meta(description="Limit of agreement in mm for single readings; the interval is over patients.")
-]
+_LimitMm = Annotated[float, says("Limit of agreement in mm for single readings; the interval is over patients.")]
 _LimitLog = Annotated[
     float,
-    Meta(description="Limit of agreement in ln(size / ex vivo) for single readings; the interval is over patients."),
+    says("Limit of agreement in ln(size / ex vivo) for single readings; the interval is over patients."),
 ]
 
 
@@ -364,7 +362,7 @@ class MethodComparison(Figures, kw_only=True):
     """Detected masses as measurements: lines, concordance, limits of agreement, with intervals over patients."""
 
     masses: Count
-    error_ratio: Annotated[float, Meta(gt=0, description="Variance of the ex-vivo error over that of the modality's.")]
+    error_ratio: Annotated[float, says("Variance of the ex-vivo error over that of the modality's.", gt=0)]
     ols_intercept_mm: float | None
     ols_intercept_mm_interval: Ends | None
     ols_slope: float | None
@@ -396,17 +394,17 @@ class MethodComparison(Figures, kw_only=True):
     limit_high_log_ratio: _LimitLog | None
     limit_high_log_ratio_interval: Ends | None
     reasons: Reasons
-    analytic_intervals: Annotated[dict[str, Ends | None], Meta(description="As if masses were independent.")]
+    analytic_intervals: Annotated[dict[str, Ends | None], says("As if masses were independent.")]
     limits: Annotated[
         dict[Unit, Limits],
-        Meta(description="Of differences and of logarithms of ratios; of single readings, replicates allowed for."),
+        says("Of differences and of logarithms of ratios; of single readings, replicates allowed for."),
     ]
     trends: Annotated[
-        dict[Against, Trend], Meta(description="Slope of the differences on the ex-vivo size, and on the mean of both.")
+        dict[Against, Trend], says("Slope of the differences on the ex-vivo size, and on the mean of both.")
     ]
     concordance_parts: Concordance | None
     errors_grow_with_size: Annotated[
-        bool, Meta(description="Errors are likelier proportional to size than constant: limits in mm suit no one size.")
+        bool, says("Errors are likelier proportional to size than constant: limits in mm suit no one size.")
     ]
 
 
