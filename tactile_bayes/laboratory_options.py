@@ -22,8 +22,7 @@ class RecordOptions(Options, kw_only=True):
     tracker_protocol: Annotated[TrackerProtocol, says("Protocol of the tracker; a PATRIOT speaks liberty.")] = "fastrak"
     head_baud: Annotated[int, says("Baud rate of the head's port.", ge=300)] = 2_000_000
     tracker_baud: Annotated[
-        Annotated[int, Meta(ge=300)] | None,
-        says("Baud rate of the tracker's port. Default: the protocol's."),
+        Annotated[int, Meta(ge=300)] | None, says("Baud rate of the tracker's port. Default: the protocol's.")
     ] = None
     tracker_rom: Annotated[
         tuple[Path, ...], named("ROM", "ndi: a wireless tool's description, one for each.", path=True)
@@ -40,8 +39,7 @@ class RecordOptions(Options, kw_only=True):
     ] = None
     at_once: Annotated[bool, says("Start at once, without waiting for space. Default: only with --duration.")] = False
     clock: Annotated[
-        Literal["arrival", "shared"],
-        says("Time the poses by their arrival, or trust one clock of both devices."),
+        Literal["arrival", "shared"], says("Time the poses by their arrival, or trust one clock of both devices.")
     ] = "arrival"
     invert_rotation: Annotated[bool, says("The tracker gives the inverse rotation.")] = False
     like: Annotated[Path | None, named("SCAN.mcap", "Take geometry and calibration from this scan.", path=True)] = None
@@ -108,8 +106,7 @@ class FaultOptions(Options):
 
 
 SeatName = Annotated[
-    str,
-    named("centred|resting|0..2", "How far the lump stands out of the gland, if a grid does not state it."),
+    str, named("centred|resting|0..2", "How far the lump stands out of the gland, if a grid does not state it.")
 ]
 
 
@@ -128,8 +125,7 @@ class CaseOptions(Options, kw_only=True):
     poisson: Annotated[float, says("Poisson's ratio of the tissues.")] = presets.POISSON
     gland_ratio: Annotated[float, says("Modulus of gland over fat.", gt=0)] = presets.GLAND_RATIO
     thickness_mm: Annotated[
-        Annotated[float, Meta(gt=0)] | None,
-        says("Depth of the chest wall, mm. Default: 70, or deeper for deep lumps."),
+        Annotated[float, Meta(gt=0)] | None, says("Depth of the chest wall, mm. Default: 70, or deeper for deep lumps.")
     ] = None
     fineness: Annotated[int, says("Mesh fineness; doubling it halves the elements.", ge=1, le=8)] = 2
 
@@ -149,8 +145,7 @@ class StudyOptions(CaseOptions, kw_only=True):
         says("Background of Eq 7, solid only: free (default) is fitted, fixed is 1. In two dimensions it is 1."),
     ] = None
     flat_field: Annotated[
-        bool | None,
-        says("Remove what the head reads of the same body without the lump, solid only. Default: on."),
+        bool | None, says("Remove what the head reads of the same body without the lump, solid only. Default: on.")
     ] = None
 
 
@@ -172,8 +167,7 @@ class TissueOptions(Options, kw_only=True):
     ] = presets.THICKNESS_MM
     poisson: Annotated[float, says("Poisson's ratio of the tissue.", ge=0, lt=0.5)] = presets.POISSON
     limit_percent: Annotated[
-        float,
-        says("Largest allowed departure of a taxel from the frame's mean, % of it (paper: 7.5).", gt=0),
+        float, says("Largest allowed departure of a taxel from the frame's mean, % of it (paper: 7.5).", gt=0)
     ] = 7.5
 
 
@@ -253,7 +247,6 @@ class LearnOptions(Options, kw_only=True):
         ),
     ] = None
     least_stiffness_ratio: Annotated[
-        float,
-        says("Leave out lumps softer than this: above 8 the paper's widths change by less than 5 %.", ge=0),
+        float, says("Leave out lumps softer than this: above 8 the paper's widths change by less than 5 %.", ge=0)
     ] = 0.0
     seed: Seed = 1

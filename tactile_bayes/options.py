@@ -198,16 +198,14 @@ class Comparing(Options):
     """How visits are compared."""
 
     days: Annotated[
-        tuple[float, ...] | None,
-        says("Time of each visit in days, the first at 0; None where it is not known."),
+        tuple[float, ...] | None, says("Time of each visit in days, the first at 0; None where it is not known.")
     ] = None
     grown_by: Annotated[
         tuple[Annotated[float, Meta(gt=-1, lt=10)], ...],
         says("Shares of the diameter by which it may have grown or more."),
     ] = GROWN_BY
     same_mass: Annotated[
-        bool,
-        says("Say that the visits are of one mass where landmarks are missing, or place it too far apart."),
+        bool, says("Say that the visits are of one mass where landmarks are missing, or place it too far apart.")
     ] = False
     registration_mm: Annotated[
         float, says("SD each way of one mass's place between visits, by posture and landmarks.", gt=0)
@@ -243,8 +241,7 @@ class TrialSettings(Options):
     resamples: Annotated[int, says("Number of bootstrap resamples.", ge=200, le=100_000)] = 2000
     seed: Seed = 1999
     error_ratio: Annotated[
-        float,
-        says("Ratio of the ex-vivo error's variance to the modality's, for Deming lines.", ge=1e-6, le=1e6),
+        float, says("Ratio of the ex-vivo error's variance to the modality's, for Deming lines.", ge=1e-6, le=1e6)
     ] = 1.0
     check_intervals: Annotated[
         int, named("TRIALS", "Simulate this many trials of this size and report how often the intervals cover.", ge=0)
@@ -272,8 +269,7 @@ class PlanOptions(Options, kw_only=True):
     """Designs of a trial that are simulated, or what the number of patients is to reach instead of being given."""
 
     patients: Annotated[
-        tuple[Annotated[int, Meta(ge=8, le=MOST_PATIENTS)], ...],
-        says("Number of patients, one mass each."),
+        tuple[Annotated[int, Meta(ge=8, le=MOST_PATIENTS)], ...], says("Number of patients, one mass each.")
     ] = (16, 24, 32, 48)
     maps: Annotated[
         tuple[Annotated[int, Meta(ge=1, le=1000)], ...],

@@ -36,8 +36,7 @@ class HeadShape(Record):
     columns: Annotated[Count, says("Taxels along the head.")]
     pitch_mm: Annotated[float, says("Distance between neighbours, mm.", gt=0)]
     radius_mm: Annotated[
-        float | None,
-        says("Radius of the arc across the head, mm; null where it is flat, negative where it is hollow."),
+        float | None, says("Radius of the arc across the head, mm; null where it is flat, negative where it is hollow.")
     ]
     radius_along_mm: Annotated[float | None, says("The same along the head.")] = None
     uneven_mm: Annotated[float, says("Root mean square departure of the taxels from these arcs, mm.", ge=0)] = 0.0

@@ -54,12 +54,7 @@ class Wanted(Record):
 
 
 def import_action(
-    *,
-    sources: tuple[Path, ...],
-    output: Path | None,
-    template: bool,
-    columns: Path | None,
-    **given: Any,
+    *, sources: tuple[Path, ...], output: Path | None, template: bool, columns: Path | None, **given: Any
 ) -> int:
     """Import scans, grids and images from other programs."""
     if template:

@@ -36,15 +36,7 @@ from tactile_bayes.scans import Scan
 
 
 def emulate_action(
-    *,
-    kind: str,
-    scan: Path,
-    protocol: str,
-    tcp: str | None,
-    once: bool,
-    speed: float,
-    seed: int,
-    **given: Any,
+    *, kind: str, scan: Path, protocol: str, tcp: str | None, once: bool, speed: float, seed: int, **given: Any
 ) -> None:
     """Serve a scan as a scan head or a tracker would send it, or as both, at its own rate, with faults on request."""
     roles = ("head", "tracker") if kind == "both" else (kind,)

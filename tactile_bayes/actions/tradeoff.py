@@ -240,13 +240,7 @@ def _said(calibration: str | None, centre_mm: tuple[float, float] | None, settin
 
 
 def tradeoff_map_action(
-    scan: Path,
-    tolerance_mm: float,
-    runs: int,
-    figure: Path | None,
-    seed: int,
-    as_json: bool,
-    force: bool,
+    scan: Path, tolerance_mm: float, runs: int, figure: Path | None, seed: int, as_json: bool, force: bool
 ) -> int:
     """Measure what each setting of `map` costs on a scan, and how far it moves the size interval."""
     read_scan(scan)  # imports and first calls cost nothing afterwards

@@ -125,16 +125,14 @@ class Stated(Options, kw_only=True):
         None
     )
     pose_rate_hz: Annotated[
-        Rate | None,
-        says("Scan: poses a second, where they have frame numbers or no times.", extra={"metavar": "HZ"}),
+        Rate | None, says("Scan: poses a second, where they have frame numbers or no times.", extra={"metavar": "HZ"})
     ] = None
     pose_offset_s: Annotated[
         Annotated[float, Meta(ge=-1e10, le=1e10)] | None,
         says("Scan: added to the poses' times, for the frames' clock. Default: 0.", extra={"metavar": "S"}),
     ] = None
     pose_good: Annotated[
-        str | None,
-        says("Scan: value of the poses' status where the tool is seen. Default: OK, Enabled and the like."),
+        str | None, says("Scan: value of the poses' status where the tool is seen. Default: OK, Enabled and the like.")
     ] = None
     tool: Annotated[str | None, says("Scan: which tool or station of the poses' file.", extra={"metavar": "NAME"})] = (
         None

@@ -41,15 +41,13 @@ class VisitPlace(Record):
     visit: Annotated[int, Meta(ge=2)]
     distance_mm: Least0 | None
     sd_mm: Annotated[
-        Least0 | None,
-        says("SD by which one mass comes out apart between the visits, in the direction of the shift."),
+        Least0 | None, says("SD by which one mass comes out apart between the visits, in the direction of the shift.")
     ]
     shift_mm: Annotated[
         tuple[float, float] | None, says("x and y in the patient's frame, from the first visit's place.")
     ]
     probability: Annotated[
-        Chance | None,
-        says("That one mass comes out as far apart or farther; below 0.02 the visits are not compared."),
+        Chance | None, says("That one mass comes out as far apart or farther; below 0.02 the visits are not compared.")
     ]
 
 
@@ -165,13 +163,11 @@ class CompareReport(Report, kw_only=True):
         says("Change from the first visit to each later one; empty where nothing is compared."),
     ]
     trend: Annotated[
-        TrendReport | None,
-        says("Straight line of ln d over three visits and more with days; null otherwise."),
+        TrendReport | None, says("Straight line of ln d over three visits and more with days; null otherwise.")
     ]
     between_map_sd: Annotated[Least0 | None, says("SD of ln d between the exams of a visit, root mean square.")]
     repeatability: Annotated[
-        str | UnsetType,
-        says("How far exams of one mass lie apart at this site, where --repeatability told it"),
+        str | UnsetType, says("How far exams of one mass lie apart at this site, where --repeatability told it")
     ] = UNSET
     left_out: tuple[str, ...]
     research_use: str

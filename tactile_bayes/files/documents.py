@@ -214,8 +214,7 @@ class Session(Record, forbid_unknown_fields=False):
     subject: Annotated[Code | None, says("Coded subject, not a name.")] = None
     visit: Annotated[Code | None, says("Code of the visit; `campaign init` takes 1 where it is left out.")] = None
     mass: Annotated[
-        Code | None,
-        says("Code of the mass within the subject; `campaign init` takes 1 where it is left out."),
+        Code | None, says("Code of the mass within the subject; `campaign init` takes 1 where it is left out.")
     ] = None
     array_calibration_days: Annotated[
         Days | None, says("Age of the array calibration at the recording, in whole days.")

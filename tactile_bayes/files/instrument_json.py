@@ -66,8 +66,7 @@ class HeadFile(Record, kw_only=True):
     rows: Rows | None = None
     columns: Columns | None = None
     radius_mm: Annotated[
-        Radius | None,
-        says("Radius of the arc across the head, mm, above half its width; null for a flat head."),
+        Radius | None, says("Radius of the arc across the head, mm, above half its width; null for a flat head.")
     ] = None
     shoulder_mm: Annotated[Rounding, says("Radius of rounded edges cut into the array across the head, mm.")] = 0.0
     rim_mm: Annotated[

@@ -344,8 +344,7 @@ class EstimateReport(Report, kw_only=True):
     diagnostics: dict[str, Any]
     candidates: tuple[PassedOver, ...]
     other_rises: Annotated[
-        tuple[OtherRise, ...],
-        says("Other rises that are lumps by the evidence, highest first; mm on the map."),
+        tuple[OtherRise, ...], says("Other rises that are lumps by the evidence, highest first; mm on the map.")
     ] = ()
     masses: Annotated[
         tuple[MassReport, ...],
@@ -432,21 +431,18 @@ class PooledReport(Report, kw_only=True):
     supposing: Annotated[dict[str, Supposed] | None, SUPPOSING] = None
     maps: Annotated[tuple[PooledMap, ...], Meta(min_length=1)]
     one_size_probability: Annotated[
-        Chance | None,
-        says("that maps of one mass are as far apart in size or farther; null for a single one"),
+        Chance | None, says("that maps of one mass are as far apart in size or farther; null for a single one")
     ]
     one_place_probability: Annotated[Chance | None, says("likewise of their places by the landmarks; null without two")]
     variance_share: dict[str, float] | None
     figures: dict[str, float]
     left_out: tuple[str, ...] = ()
     fat_mm: Annotated[
-        Above0 | None,
-        says("Depth of the fat under the head by its pressure profile; null where the maps do not tell."),
+        Above0 | None, says("Depth of the fat under the head by its pressure profile; null where the maps do not tell.")
     ] = None
     unknowns: dict[str, float]
     site: Annotated[
-        str | None,
-        says("The correction of the calibration by a site's phantoms, in words; null without one."),
+        str | None, says("The correction of the calibration by a site's phantoms, in words; null without one.")
     ] = None
     repeatability: Annotated[
         str | UnsetType,

@@ -221,8 +221,7 @@ class RepeatedMass(Record):
     log_size: Annotated[list[float], says("ln d (mm) by each exam alone, without what no map shows", min_length=2)]
     map_sd: Annotated[list[Annotated[float, Meta(ge=0)]], says("SD of each by the map's own errors", min_length=2)]
     by_chance: Annotated[
-        float,
-        says("Probability, by the other masses, that exams of a mass lie as far apart as these", ge=0, le=1),
+        float, says("Probability, by the other masses, that exams of a mass lie as far apart as these", ge=0, le=1)
     ]
 
 

@@ -47,8 +47,7 @@ class Background(Record):
     drift_period_s: Annotated[float, says("Its period, s.", gt=0, le=600)] = 3.0
     ramp_s: Annotated[float, says("Time to press down at the start, s.", ge=0, le=60)] = 0.2
     load_sharing: Annotated[
-        bool,
-        says("true: constant force, each frame keeps its mean and the background falls beside a lump."),
+        bool, says("true: constant force, each frame keeps its mean and the background falls beside a lump.")
     ] = False
 
 
@@ -56,8 +55,7 @@ Amplitude = Annotated[float, says("Height above a background of 1.", ge=-1, le=2
 SigmaX = Annotated[float, says("Standard deviation along the lump's first axis, mm.", ge=0.1, le=200)]
 SigmaY = Annotated[float, says("Standard deviation along its second axis, mm.", ge=0.1, le=200)]
 Angle = Annotated[
-    float,
-    says("From the plane's x axis to the lump's first axis, positive towards y, degrees.", ge=-360, le=360),
+    float, says("From the plane's x axis to the lump's first axis, positive towards y, degrees.", ge=-360, le=360)
 ]
 
 
@@ -82,8 +80,7 @@ class Strokes(Record):
     wander_mm: Annotated[float, says("Amplitude of the slow departure from the line, mm.", ge=0, le=50)] = 0.5
     tilt_deg: Annotated[float, says("Amplitude of the head's rocking, degrees.", ge=0, le=30)] = 2.0
     yaw_deg: Annotated[
-        float,
-        says("Turn of the head about the normal, away from square to the strokes, degrees.", ge=-90, le=90),
+        float, says("Turn of the head about the normal, away from square to the strokes, degrees.", ge=-90, le=90)
     ] = 0.0
 
 
@@ -148,8 +145,7 @@ class Noise(Record):
     tracker_mm: Annotated[float, says("Of each position, per axis, mm.", ge=0, le=50)] = 0.4
     tracker_deg: Annotated[float, says("Of each rotation, per axis, degrees.", ge=0, le=30)] = 0.2
     gain_spread: Annotated[
-        float,
-        says("Between the true gains of the taxels, as a share; the calibration knows it.", ge=0, le=0.2),
+        float, says("Between the true gains of the taxels, as a share; the calibration knows it.", ge=0, le=0.2)
     ] = 0.03
     gain_share: Annotated[float, says("Error of the calibration, as a share of the gain.", ge=0, le=0.2)] = 0.01
 
@@ -158,11 +154,7 @@ class Tracker(Record):
     """Place of the tracker's base, and the sensor's pose in the handle; rotations are vectors."""
 
     latency_ms: Annotated[float, says("By how much a pose's stamp is late, ms.", ge=0, le=1000)] = 0.0
-    base_rotation_deg: Annotated[Rotation, says("Rotation vector of base from plane, degrees.")] = (
-        165.0,
-        25.0,
-        -20.0,
-    )
+    base_rotation_deg: Annotated[Rotation, says("Rotation vector of base from plane, degrees.")] = (165.0, 25.0, -20.0)
     base_offset_mm: Annotated[tuple[BaseMm, BaseMm, BaseMm], says("The plane's origin in base, mm.")] = (
         175.0,
         -112.0,

@@ -10,13 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_bayes.declarations import Record
-from tactile_bayes.forward.axisymmetric import (
-    CondensedLump,
-    LayeredBody,
-    condense_lump,
-    skin_spline,
-    taxel_compliance,
-)
+from tactile_bayes.forward.axisymmetric import CondensedLump, LayeredBody, condense_lump, skin_spline, taxel_compliance
 from tactile_bayes.forward.contact import Contact, ContactStiffness, solve_contact
 from tactile_bayes.forward.instrument import SimulatedScan, frame_times, head_positions, level_kpa, record
 from tactile_bayes.forward.mesh import LumpGeometry

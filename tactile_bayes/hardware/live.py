@@ -306,10 +306,7 @@ class LiveMap:
 
     def _map_on(self, plane: Plane) -> MapAccumulator:
         return MapAccumulator(
-            self.head,
-            self.calibration,
-            plane_from_base=plane.plane_from_base,
-            pressure_window_kpa=self.window_kpa,
+            self.head, self.calibration, plane_from_base=plane.plane_from_base, pressure_window_kpa=self.window_kpa
         )
 
     def _refit(self) -> None:

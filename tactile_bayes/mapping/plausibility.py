@@ -19,12 +19,7 @@ from tactile_bayes.findings import Finding
 from tactile_bayes.geometry import BoolArray, FloatArray, IndexArray
 from tactile_bayes.mapping.cells import distinct_poses
 from tactile_bayes.mapping.map import FEW_READINGS, TactileMap
-from tactile_bayes.mapping.select import (
-    SelectedFrames,
-    frame_figures,
-    refuse_without_frames,
-    timing_figures,
-)
+from tactile_bayes.mapping.select import SelectedFrames, frame_figures, refuse_without_frames, timing_figures
 from tactile_bayes.scans import HeadShape, Landmarks, Scan
 
 RATE_HZ: Final = (5.0, 2000.0)

@@ -475,12 +475,7 @@ def numbered(masses: Sequence[MassReport]) -> str:
 
 
 def estimate_report(
-    estimate: Estimate,
-    tactile_map: TactileMap,
-    *,
-    probability: float,
-    prior: BumpPrior,
-    provenance: Provenance,
+    estimate: Estimate, tactile_map: TactileMap, *, probability: float, prior: BumpPrior, provenance: Provenance
 ) -> EstimateReport:
     """Report of one map."""
     quantities = estimate_quantities(estimate, tactile_map, probability=probability)

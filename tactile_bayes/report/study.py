@@ -130,12 +130,7 @@ def study_figures(
 
 
 def solid_figures(
-    rows: Sequence[StudyRow],
-    settings: SolidSettings,
-    paths: Sequence[Path],
-    *,
-    seat: float,
-    force: bool = False,
+    rows: Sequence[StudyRow], settings: SolidSettings, paths: Sequence[Path], *, seat: float, force: bool = False
 ) -> None:
     """Draw the four figures for balls as PNG files; rows and seat are as in `study_figures`."""
     of_seat = [row for row in rows if row.seat == seat_name(seat)]

@@ -106,8 +106,7 @@ class AnswerFile(Record):
     detected_probability: Annotated[float, Meta(ge=0, le=1)] | None
     method: Annotated[str, says("The method that drew.")]
     quantities: Annotated[
-        dict[str, QuantityFile],
-        says("Medians and 95 % intervals, mm: max_size_mm, sigma_x_mm, sigma_y_mm."),
+        dict[str, QuantityFile], says("Medians and 95 % intervals, mm: max_size_mm, sigma_x_mm, sigma_y_mm.")
     ]
     variance_share: Annotated[dict[str, float], says("Percent of the variance of ln(largest size) by source.")]
 

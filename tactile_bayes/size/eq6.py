@@ -53,8 +53,7 @@ class Eq6Law(Record, eq=False):
     """Posterior of Eq 6's coefficients over a population, taken as normal: d = exp(mu + v - f u) + b."""
 
     powers: Annotated[
-        tuple[Power, ...],
-        says("Which of mu (0), f (1) and b (2) each coefficient is of, and its powers of v and w."),
+        tuple[Power, ...], says("Which of mu (0), f (1) and b (2) each coefficient is of, and its powers of v and w.")
     ]
     mean: Vector
     covariance: Matrix

@@ -75,8 +75,7 @@ class BodyPrior(_Ranges):
     fat_kpa: Annotated[tuple[Modulus, Modulus], says("Young's modulus of fat, kPa.")] = (3.5, 7.5)
     gland_ratio: Annotated[tuple[Ratio, Ratio], says("Modulus of gland over that of fat.")] = (5.0, 16.0)
     thickness_mm: Annotated[
-        tuple[Thickness, Thickness],
-        says("Thickness of the breast under the head, mm; more where the lump needs it."),
+        tuple[Thickness, Thickness], says("Thickness of the breast under the head, mm; more where the lump needs it.")
     ] = (40.0, 90.0)
 
 
@@ -108,10 +107,7 @@ class ExamPrior(_Ranges):
         0.002,
         0.02,
     )
-    latency_ms: Annotated[tuple[Latency, Latency], says("By how much the stamp of a pose is late, ms.")] = (
-        0.0,
-        12.0,
-    )
+    latency_ms: Annotated[tuple[Latency, Latency], says("By how much the stamp of a pose is late, ms.")] = (0.0, 12.0)
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -269,8 +269,7 @@ class ModalityRatio(Figures):
     masses: Annotated[int, says("That both modalities looked for.", ge=0)]
     masses_detected: Annotated[int, says("That both found.", ge=0)]
     ratio: Annotated[
-        NotNegative | None,
-        says("On the masses that both looked for; masses not detected counted as size 0."),
+        NotNegative | None, says("On the masses that both looked for; masses not detected counted as size 0.")
     ]
     ratio_interval: Ends | None
     ratio_detected: Annotated[NotNegative | None, says("On the masses that both detected.")]

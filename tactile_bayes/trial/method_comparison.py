@@ -353,8 +353,7 @@ _Refitted = Ends | None | UnsetType
 """The interval of a figure that has none where there are more than `MOST_REFITTED` masses."""
 _LimitMm = Annotated[float, says("Limit of agreement in mm for single readings; the interval is over patients.")]
 _LimitLog = Annotated[
-    float,
-    says("Limit of agreement in ln(size / ex vivo) for single readings; the interval is over patients."),
+    float, says("Limit of agreement in ln(size / ex vivo) for single readings; the interval is over patients.")
 ]
 
 

@@ -13,15 +13,7 @@ from scipy.special import ndtri
 from tactile_bayes.declarations import Meta, Record, says
 from tactile_bayes.options import MOST_PATIENTS, Aim
 from tactile_bayes.trial.accuracy import mape_figure, mape_percent, mape_ratio, sign_flip
-from tactile_bayes.trial.figures import (
-    MIN_PATIENTS,
-    Ends,
-    Intervals,
-    Share,
-    UndefinedError,
-    clopper_pearson,
-    figure,
-)
+from tactile_bayes.trial.figures import MIN_PATIENTS, Ends, Intervals, Share, UndefinedError, clopper_pearson, figure
 from tactile_bayes.trial.readings import FloatArray, ModalitySizes
 from tactile_bayes.trial.replicates import log_sd_within
 
@@ -176,8 +168,7 @@ class Design(Record):
     patients: int
     maps: int
     power: Annotated[
-        float,
-        says("Share of trials with a smaller tactile error and a sign-flip test below 5 %.", ge=0, le=1),
+        float, says("Share of trials with a smaller tactile error and a sign-flip test below 5 %.", ge=0, le=1)
     ]
     power_interval: Annotated[Ends, says("Exact 95 % interval of that share: the simulation's own error.")]
     tactile_percent: Annotated[float, says("Mean tactile error over the trials.")]
@@ -203,8 +194,7 @@ class Needed(Record):
 
     aim: Aim
     target: Annotated[
-        float,
-        says("Power, or the median factor from the lower to the upper end of the tactile error's interval."),
+        float, says("Power, or the median factor from the lower to the upper end of the tactile error's interval.")
     ]
     maps: int
     patients: Annotated[int, says("The least that reach it, one mass each.", ge=MIN_PATIENTS)]

@@ -18,13 +18,7 @@ from tactile_bayes.trial.accuracy import (
     origin_line_figures,
     paired_comparisons,
 )
-from tactile_bayes.trial.calibration import (
-    Calibration,
-    Coverage,
-    calibration,
-    coverage,
-    prediction_of,
-)
+from tactile_bayes.trial.calibration import Calibration, Coverage, calibration, coverage, prediction_of
 from tactile_bayes.trial.figures import (
     SEED,
     AtMostOne,
@@ -44,12 +38,7 @@ from tactile_bayes.trial.method_comparison import MethodComparison, compare_meth
 from tactile_bayes.trial.next_mass import NextMass
 from tactile_bayes.trial.planning import IntervalCheck
 from tactile_bayes.trial.readings import ModalitySizes, Trial, unit_doubts
-from tactile_bayes.trial.replicates import (
-    ReplicateFigures,
-    reader_components,
-    replicate_figures,
-    spread_figures,
-)
+from tactile_bayes.trial.replicates import ReplicateFigures, reader_components, replicate_figures, spread_figures
 
 FAMILIES: tuple[Callable[..., dict[str, Figure]], ...] = (accuracy_figures, origin_line_figures, spread_figures)
 
@@ -96,8 +85,7 @@ class ModalityReport(Figures):
     masses_not_done: Count
     masses_without_reading: Count
     mape_percent: Annotated[
-        NotNegative | None,
-        says("Mean absolute error in percent of the ex-vivo size; a mass not detected has size 0."),
+        NotNegative | None, says("Mean absolute error in percent of the ex-vivo size; a mass not detected has size 0.")
     ]
     mape_percent_interval: Ends | None
     mape_detected_percent: Annotated[NotNegative | None, says("The same over detected masses.")]
@@ -117,8 +105,7 @@ class ModalityReport(Figures):
     ]
     bias_percent_interval: Ends | None
     slope_through_origin: Annotated[
-        NotNegative | None,
-        says("Slope of sizes on ex-vivo sizes without intercept; a mass not detected has size 0."),
+        NotNegative | None, says("Slope of sizes on ex-vivo sizes without intercept; a mass not detected has size 0.")
     ]
     slope_through_origin_interval: Ends | None
     r2_centred: Annotated[AtMostOne | None, says("1 - SSE0 / SST; a mass not detected has size 0.")]
@@ -136,8 +123,7 @@ class ModalityReport(Figures):
     within_mass_sd_mm: Annotated[NotNegative | None, says("Mean over masses of the SD of detected replicates, mm.")]
     within_mass_sd_mm_interval: Ends | None
     within_mass_sd_rms_mm: Annotated[
-        NotNegative | None,
-        says("Root of the mean variance of detected replicates, by degrees of freedom, mm."),
+        NotNegative | None, says("Root of the mean variance of detected replicates, by degrees of freedom, mm.")
     ]
     within_mass_sd_rms_mm_interval: Ends | None
     within_mass_cv_percent: Annotated[
@@ -154,8 +140,7 @@ class ModalityReport(Figures):
     replicates: ReplicateFigures
     calibration: Calibration | None
     cautions: Annotated[
-        tuple[str, ...],
-        says("Conditions of this trial under which intervals hold less often than they say."),
+        tuple[str, ...], says("Conditions of this trial under which intervals hold less often than they say.")
     ]
 
 
@@ -193,10 +178,7 @@ class TrialReport(Record, kw_only=True):
     doubts: Annotated[tuple[str, ...], says("What looks like another unit than mm.")]
     conventions: dict[str, str]
     interval_check: (
-        Annotated[
-            dict[str, IntervalCheck],
-            says("Simulated coverage of the intervals of mape_percent, by modality."),
-        ]
+        Annotated[dict[str, IntervalCheck], says("Simulated coverage of the intervals of mape_percent, by modality.")]
         | UnsetType
     ) = UNSET
     next_mass: Annotated[NextMass, says("Errors-in-variables model: what the next mass may bring.")] | UnsetType = UNSET

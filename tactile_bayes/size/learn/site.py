@@ -120,11 +120,7 @@ def shift_posterior(data: Residuals, prior: SitePrior = PRIOR) -> ShiftPosterior
 
 
 def correct_calibration(
-    calibration: BodyCalibration,
-    maps: Sequence[PhantomMap],
-    *,
-    base: str,
-    left_out: Sequence[str] = (),
+    calibration: BodyCalibration, maps: Sequence[PhantomMap], *, base: str, left_out: Sequence[str] = ()
 ) -> BodyCalibration:
     """The calibration, called `base` in reports, with a site's correction.
 
