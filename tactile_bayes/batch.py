@@ -238,12 +238,9 @@ CLUSTER_LOST = "the dask scheduler was lost before an answer came; start it agai
 class Outcome(Record, Generic[Result]):
     """The outcome of one item: its result, or its error."""
 
-    key: str
-    """The item's name."""
-    value: Result | None = None
-    """The function's result; None when it failed."""
-    error: str = ""
-    """Why it failed, in one line; empty when it did not."""
+    key: str  #: The item's name.
+    value: Result | None = None  #: The function's result; None when it failed.
+    error: str = ""  #: Why it failed, in one line; empty when it did not.
 
     @property
     def ok(self) -> bool:

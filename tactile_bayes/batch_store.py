@@ -22,8 +22,7 @@ from tactile_bayes.declarations import EXACT, from_plain, to_plain
 from tactile_bayes.errors import BadDataError, UsageError
 
 STORE_SCHEMA: Final = "tactile-bayes.batch/2"
-_FLUSHED_EVERY_S: Final = 5.0
-"""Lines reach the disk at least this often: what a loss of power may cost."""
+_FLUSHED_EVERY_S: Final = 5.0  #: Lines reach the disk at least this often: what a loss of power may cost.
 _READ_BYTES: Final = 4096
 
 

@@ -52,10 +52,8 @@ from msgspec import field as field
 from tactile_bayes.errors import BadDataError, UsageError, meant, number_words
 
 T = TypeVar("T")
-EXACT: Final = 17
-"""Significant digits that give a float back as it was."""
-MOST_SHOWN: Final = 100
-"""Characters of a value that a record's repr shows; of a longer one it shows what it is."""
+EXACT: Final = 17  #: Significant digits that give a float back as it was.
+MOST_SHOWN: Final = 100  #: Characters of a value that a record's repr shows; of a longer one it shows what it is.
 
 if TYPE_CHECKING:  # to a type checker each record is frozen, as the class below makes them
 

@@ -190,8 +190,7 @@ def one_line(error: BaseException) -> str:
 
 # --- Reasons for giving no number: a sentence, a code for programs, and what would help.
 
-CANNOT_SHOW = "cannot_show"
-"""Code of data that cannot show whether there is a lump."""
+CANNOT_SHOW = "cannot_show"  #: Code of data that cannot show whether there is a lump.
 CODES = ("empty", "undetected", "ridge", CANNOT_SHOW, "unresolved", "window", "prior", "extrapolated", "method")
 NO_LUMP = ("empty", "undetected", "ridge")
 """Codes of maps that show no lump where one would show; the others but `CANNOT_SHOW` show one without a size."""
@@ -201,13 +200,9 @@ NO_LUMP = ("empty", "undetected", "ridge")
 class Abstention:
     """The reason for giving no number."""
 
-    code: str
-    """One of `CODES`."""
-    reason: str
-    """With the figure and the limit."""
-    advice: str = ""
-    """The remedy at the command line; empty when there is none."""
-    on_paper: str = ""
-    """The same for a reader of the exam's page, who has no command line."""
+    code: str  #: One of `CODES`.
+    reason: str  #: With the figure and the limit.
+    advice: str = ""  #: The remedy at the command line; empty when there is none.
+    on_paper: str = ""  #: The same for a reader of the exam's page, who has no command line.
     about_mm: tuple[float, float] | None = None
     """The place on the map that the reason is about; None where it is about no one place."""

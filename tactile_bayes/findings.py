@@ -66,16 +66,12 @@ LEADS: Final[Mapping[Severity, str]] = {"caution": "CAUTION: ", "check": "To che
 class Finding(Record):
     """Something that speaks against a result."""
 
-    kind: str
-    """A key of `KINDS`."""
-    text: str
-    """One sentence in a clinician's words, without capital and full stop, and without a name of an option."""
+    kind: str  #: A key of `KINDS`.
+    text: str  #: One sentence in a clinician's words, without capital and full stop, and without a name of an option.
     remedy: str = ""
     """The laboratory's terms where `text` leaves them out, and what to do at the command line; may be empty."""
-    on_paper: str = ""
-    """The same for a reader of the page, who has no command line."""
-    about: str = ""
-    """What it is about, where a result is of several: "map 2", "visit 1"; else empty."""
+    on_paper: str = ""  #: The same for a reader of the page, who has no command line.
+    about: str = ""  #: What it is about, where a result is of several: "map 2", "visit 1"; else empty.
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:

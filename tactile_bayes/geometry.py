@@ -104,10 +104,8 @@ class Plane(Record, eq=False):
     plane_from_base: FloatArray
     """(4, 4) array: Origin at the centroid, z along the sensor normal (into the tissue), x along the mean head x axis.
     """
-    rms_mm: float
-    """Root mean square distance of the points from the plane."""
-    spread_mm: FloatArray
-    """(3,) array: Standard deviations of the points along the principal axes, descending."""
+    rms_mm: float  #: Root mean square distance of the points from the plane.
+    spread_mm: FloatArray  #: (3,) array: Standard deviations of the points along the principal axes, descending.
 
 
 def fit_plane(centroid_mm: FloatArray, covariance_mm2: FloatArray, *, head_x: FloatArray, head_z: FloatArray) -> Plane:

@@ -40,10 +40,8 @@ PRIORS: Final = BumpPrior.__struct_fields__
 
 
 MOST_PATIENTS: Final = 10_000  #: Of a plan.
-MOST_ITEMS: Final = 1_000_000
-"""Of a batch: memory holds a name and an outcome for each."""
-IN_FILE: Final = {"file": True}
-"""Of a setting that stands in the file of `--settings`, not on the command line."""
+MOST_ITEMS: Final = 1_000_000  #: Of a batch: memory holds a name and an outcome for each.
+IN_FILE: Final = {"file": True}  #: Of a setting that stands in the file of `--settings`, not on the command line.
 
 
 def named(metavar: str, meaning: str, *, option: str = "", also: str = "", path: bool = False, **rules: Any) -> Meta:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-Progress = Callable[[int, int], None]
-"""Called with what is done and how much there is."""
+Progress = Callable[[int, int], None]  #: Called with what is done and how much there is.
 
 
 def untold(_done: int, _total: int) -> None:

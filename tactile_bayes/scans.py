@@ -17,8 +17,7 @@ from tactile_bayes.presets import HEAD_COLUMNS, HEAD_PITCH_MM, HEAD_RADIUS_MM, H
 
 # --- Shape of a head's sensing face in a few numbers, by which a size calibration knows the maps it was made for.
 
-FLAT_RADIUS_MM: Final = 10_000.0
-"""An arc of this radius or more counts as flat: over 40 mm it rises by 0.02 mm."""
+FLAT_RADIUS_MM: Final = 10_000.0  #: An arc of this radius or more counts as flat: over 40 mm it rises by 0.02 mm.
 # How far a head may depart from a calibration's; see docs/decisions/0101 for what such departures do to sizes.
 PITCH_SHARE: Final = 0.03
 SIDE_SHARE: Final = 0.08
@@ -182,12 +181,10 @@ class HeadGeometry(Record, eq=False):
     surface_mm: FloatArray
     """(rows, columns, 3) array: Taxel centres in `scanhead`: origin at the apex of the face, z into the tissue, axis 0
     across the head (x), axis 1 along it (y)."""
-    pitch_mm: float
-    """Distance between neighbouring taxels."""
+    pitch_mm: float  #: Distance between neighbouring taxels.
     scanhead_from_tracker: FloatArray
     """(4, 4) array: The lever arm: ``p_scanhead = scanhead_from_tracker @ p_tracker``."""
-    checked_on: str = ""
-    """Day on which a scan showed that this is right, as YEAR-MONTH-DAY; empty where none did."""
+    checked_on: str = ""  #: Day on which a scan showed that this is right, as YEAR-MONTH-DAY; empty where none did.
 
     def __post_init__(self) -> None:
         surface = _check_finite(self.surface_mm, name="surface_mm", shape=(None, None, 3))
@@ -208,8 +205,7 @@ class ElementCalibration(Record, eq=False):
 
     gain_kpa_per_count: FloatArray
     offset_kpa: FloatArray
-    saturation_count: int = 4095
-    """Readings at or above it are saturated and carry no pressure."""
+    saturation_count: int = 4095  #: Readings at or above it are saturated and carry no pressure.
 
     def __post_init__(self) -> None:
         gain = _check_finite(self.gain_kpa_per_count, name="gain_kpa_per_count", shape=(None, None))
@@ -232,10 +228,8 @@ class ElementCalibration(Record, eq=False):
 class PressureFrames(Record, eq=False):
     """Raw frames of the array."""
 
-    time_s: FloatArray
-    """(n,) array: Device time of each frame; never runs backwards."""
-    counts: CountArray
-    """(n, rows, columns) uint16 array."""
+    time_s: FloatArray  #: (n,) array: Device time of each frame; never runs backwards.
+    counts: CountArray  #: (n, rows, columns) uint16 array.
 
     def __post_init__(self) -> None:
         time = _check_times(self.time_s, name="frame_time_s")
@@ -262,11 +256,9 @@ class PressureFrames(Record, eq=False):
 class TrackerPoses(Record, eq=False):
     """Poses of the tracker's sensor in `base`: (m, 3) positions and (m, 4) quaternions."""
 
-    time_s: FloatArray
-    """(m,) array: Device time on the frames' clock."""
+    time_s: FloatArray  #: (m,) array: Device time on the frames' clock.
     position_mm: FloatArray
-    quaternion_wxyz: FloatArray
-    """Scalar first; ``p_base = position + R(q) p_tracker``. Signs are free."""
+    quaternion_wxyz: FloatArray  #: Scalar first; ``p_base = position + R(q) p_tracker``. Signs are free.
 
     def __post_init__(self) -> None:
         time = _check_times(self.time_s, name="pose_time_s")
@@ -293,8 +285,7 @@ class Landmarks(Record, eq=False):
     xiphoid_mm: FloatArray
     spread_mm: float | None = None
     """Largest distance of an earlier touch from the last one, where a landmark was touched again; else None."""
-    nipple_mm: FloatArray | None = None
-    """None where it was not touched: a lump then has no place by the clock."""
+    nipple_mm: FloatArray | None = None  #: None where it was not touched: a lump then has no place by the clock.
 
     def __post_init__(self) -> None:
         if self.spread_mm is not None and not 0 <= self.spread_mm < np.inf:
@@ -316,12 +307,10 @@ class Scan(Record, eq=False):
     poses: TrackerPoses
     head: HeadGeometry
     element_calibration: ElementCalibration
-    landmarks: Landmarks | None = None
-    """None when they were not touched: the map then has no patient frame."""
+    landmarks: Landmarks | None = None  #: None when they were not touched: the map then has no patient frame.
     session: Mapping[str, str] = field(default_factory=dict)
     """Plain text facts (device ids, side, posture...); no names."""
-    findings: tuple[Finding, ...] = ()
-    """Losses of its file and notes of its recorder."""
+    findings: tuple[Finding, ...] = ()  #: Losses of its file and notes of its recorder.
 
     def __post_init__(self) -> None:
         taxels = self.frames.counts.shape[1:]

@@ -47,10 +47,8 @@ class Learned(Record, eq=False):
     seed: int | None = None  #: Of the random numbers; None where it used none.
     base: dict[str, Any] | None = None  #: Document of the calibration that was corrected.
     lumps: eq6.SizeTable | None = None  #: The table as Eq 6 takes it, where that was learned.
-    not_left_out: str = ""
-    """Why no geometry could be left out; empty where they were, or the table is no study."""
-    other_fit: eq6.OtherFit | None = None
-    """What the other of the two fits makes of the table; None where it has none."""
+    not_left_out: str = ""  #: Why no geometry could be left out; empty where they were, or the table is no study.
+    other_fit: eq6.OtherFit | None = None  #: What the other of the two fits makes of the table; None where it has none.
 
     def write(self, path: Path, *, force: bool = False) -> None:
         """Write the file that `estimate --size-calibration` takes."""

@@ -32,8 +32,7 @@ from tactile_bayes.trial.readings import day_of, in_order
 
 # --- What a file says of its exam: facts of the session, and the files that it was made from.
 
-ARRAYS: Final = (".npz", ".mat", ".h5", ".hdf5")
-"""Of files that hold all arrays of a scan."""
+ARRAYS: Final = (".npz", ".mat", ".h5", ".hdf5")  #: Of files that hold all arrays of a scan.
 SCANS: Final = (".mcap", *ARRAYS)
 MAP: Final = ".nc"
 _ENDINGS: Final = (*SCANS, MAP)
@@ -250,13 +249,11 @@ _CODES: Final = ("patient", "visit", "mass")
 class Found(Record):
     """Rows for exams.csv, and what somebody should know of the folder."""
 
-    rows: list[dict[str, Any]] = field(default_factory=list)
-    """Of files that the table does not list yet."""
+    rows: list[dict[str, Any]] = field(default_factory=list)  #: Of files that the table does not list yet.
     skipped: list[str] = field(default_factory=list)  #: Files that give none, with the reason.
     spelled: list[str] = field(default_factory=list)
     """Codes that a file writes in other capitals than the table, in words."""
-    gone: list[str] = field(default_factory=list)
-    """Files that the table lists and that are not there."""
+    gone: list[str] = field(default_factory=list)  #: Files that the table lists and that are not there.
     others: Mapping[str, int] = field(default_factory=dict)
     """How many files are no exams by their names, by the ends of these."""
 
@@ -351,8 +348,7 @@ def _number(rows: Sequence[dict[str, Any]], listed: Iterable[Mapping[str, str]])
 # breast, at any visit, are matched to it: of the masses that their map lists, the one within a stated distance in
 # patient axes, or in the maps' own axes where a scan has no landmarks.
 
-SAME_MM: Final = 6.0
-"""Centres on one map nearer than this are of one mass: candidates of a search are so far apart."""
+SAME_MM: Final = 6.0  #: Centres on one map nearer than this are of one mass: candidates of a search are so far apart.
 OWN_AXES: Final = Finding(
     "own_axes", "its mass was matched by place in the maps' own axes, because a scan has no landmarks"
 )

@@ -162,8 +162,7 @@ def _remove_if_empty(folder: Path) -> None:
 # changed within the last seconds are always read, for their times may not yet tell two writes apart.
 
 READ: Final = "read"  #: Step of the journal that holds a file's digest.
-_SETTLED_S: Final = 10.0
-"""A file that was last changed so long ago has times that tell this content from a later one."""
+_SETTLED_S: Final = 10.0  #: A file that was last changed so long ago has times that tell this content from a later one.
 
 
 class Sources(Record):

@@ -315,8 +315,7 @@ def _growth_line(row: Growth) -> dict[str, object]:
 REPORT, PAGE, INDEX = "report.json", "report.html", "index.html"
 WRITTEN: Final = (layout.DONE, layout.FAILURES, layout.TRIAL, layout.GROWN, REPORT, PAGE, INDEX, layout.REPEATABILITY)
 """Files beside the exams."""
-_MOST_INLINE: Final = 300
-"""With more exams the index names its thumbnails' files instead of holding them."""
+_MOST_INLINE: Final = 300  #: With more exams the index names its thumbnails' files instead of holding them.
 _MOST_ROWS: Final = 5_000  #: More masses than a browser shows at ease.
 _LINKS: Final = (layout.MAP_FIGURE, layout.SIZE_FIGURE, layout.SIZED_FIGURE)
 

@@ -161,8 +161,7 @@ def steps_needed(
 
 Bar = Callable[[str], AbstractContextManager[Progress]]
 _Any = TypeVar("_Any")
-_BLOCK: Final = 64
-"""Exams that go through the steps together at least; workers wait for the slowest of a block."""
+_BLOCK: Final = 64  #: Exams that go through the steps together at least; workers wait for the slowest of a block.
 _AHEAD_IN_BLOCK: Final = 8  #: Blocks hold so many times what an executor takes ahead.
 
 

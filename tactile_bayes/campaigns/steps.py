@@ -82,8 +82,7 @@ class CampaignSettings(Record):
     """Whether the spread between exams is learned from the campaign's own repeats, where enough masses have them and
     the estimate's settings do not say it.
     """
-    copy_to: str = ""
-    """Address of a folder in an object store that gets a copy of every file; empty for none."""
+    copy_to: str = ""  #: Address of a folder in an object store that gets a copy of every file; empty for none.
 
     def of(self, exam: Exam) -> Settings:
         """Settings of one exam's estimate."""
@@ -168,14 +167,12 @@ FILES: Final = {
     "copy": (),
 }
 """The files that each step may write."""
-UNWRITTEN: Final = "unwritten"
-"""Key of a result that the disk did not take: the campaign's fault, not the exam's."""
+UNWRITTEN: Final = "unwritten"  #: Key of a result that the disk did not take: the campaign's fault, not the exam's.
 _A_MAP, _ARRAYS = "a map or posterior (netCDF)", "an archive (.npz or a spreadsheet)"
 """What `kind_of` calls the files that are no scans."""
 
 Result = dict[str, Any]
-Made = tuple[Result, Writes]
-"""What a step found, and how to write each of its files."""
+Made = tuple[Result, Writes]  #: What a step found, and how to write each of its files.
 
 
 class Task(Record):
@@ -432,8 +429,7 @@ def copy_files(folder: Path, files: Sequence[str], *, to: str) -> Made:
 
 FEWEST_MASSES: Final = 5  #: Masses with repeats from which a campaign learns by itself.
 NOT_LEARNED: Final = "not_learned"  #: Key of the reason in the result of a step that did not learn.
-_ANOTHER_STREAM: Final = 1
-"""Of random numbers: the sizes' points must not be those that drew the map's posterior."""
+_ANOTHER_STREAM: Final = 1  #: Of random numbers: the sizes' points must not be those that drew the map's posterior.
 
 
 def taught_by(exams: Iterable[Exam], settings: CampaignSettings) -> int:

@@ -13,8 +13,7 @@ from tactile_bayes.presets import TrackerProtocol
 
 # --- `record`: a scan head and a tracker into a scan file.
 
-_RECORDING = names_of(RecordOptions)[2:-4]
-"""Between the output with the head's port and the options of the live view."""
+_RECORDING = names_of(RecordOptions)[2:-4]  #: Between the output with the head's port and the options of the live view.
 
 
 @command("record", "record.record_action")

@@ -275,8 +275,7 @@ def image_plane(tactile_map: TactileMap, transform: FloatArray) -> ImagePlane:
 
 PARAMETRIC_MAP: Final = "1.2.840.10008.5.1.4.1.1.30"
 MAP_SERIES: Final = 1
-POSTURES: Final = ("supine", "oblique", "sitting")
-"""Of a person; a phantom has no patient's coordinates."""
+POSTURES: Final = ("supine", "oblique", "sitting")  #: Of a person; a phantom has no patient's coordinates.
 _IMAGE_TYPE: Final = ["DERIVED", "PRIMARY", "VOLUME", "QUANTITY"]
 
 

@@ -177,8 +177,7 @@ class EstimateFile(Record, eq=False):
     digest: str  #: SHA-256 of the estimate's content.
     report: EstimateReport | PooledReport
     masses: tuple[SizedMass, ...]
-    maps: tuple[str, ...]
-    """SHA-256 of the maps that it was made from; empty where the file does not tell."""
+    maps: tuple[str, ...]  #: SHA-256 of the maps that it was made from; empty where the file does not tell.
     facts: Facts
 
     @property
@@ -322,8 +321,7 @@ _MOMENT: Final = re.compile(
 )
 _UID: Final = re.compile(r"(0|[1-9]\d*)(\.(0|[1-9]\d*))+", re.ASCII)
 _NAMES: Final = ("patient_name", "referring_physician")
-_REPLACED: Final = "\ufffd"
-"""Stands where a program could not read a letter: no name or code holds it."""
+_REPLACED: Final = "\ufffd"  #: Stands where a program could not read a letter: no name or code holds it.
 
 
 class Moment(Record):

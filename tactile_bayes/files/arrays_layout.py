@@ -14,13 +14,11 @@ Shape = tuple[str | int, ...]
 class ArrayLayout(NamedTuple):
     """One array of a scan."""
 
-    shape: Shape
-    """Lengths of its axes; n frames, m poses. Letters are lengths that must agree between arrays."""
+    shape: Shape  #: Lengths of its axes; n frames, m poses. Letters are lengths that must agree between arrays.
     meaning: str
     kind: str = "real"  #: Numbers it may have: ``integer`` or ``real``.
     unit: str = "1"  #: Of its numbers; ``1`` where they have none.
-    frame: str = ""
-    """Coordinate frame of places and directions, or the clock of times; empty where there is none."""
+    frame: str = ""  #: Coordinate frame of places and directions, or the clock of times; empty where there is none.
 
 
 LAYOUT: Final[dict[str, ArrayLayout]] = {

@@ -275,8 +275,7 @@ def _of_arrays(path: Path, array: str) -> Grid:
 
 # --- Cells without a value: what stands for "no value" is declared by the file or by the caller, or stands apart.
 
-ALL_ARE_VALUES: Final = "none"
-"""Given as ``--no-value`` where every number is a value."""
+ALL_ARE_VALUES: Final = "none"  #: Given as ``--no-value`` where every number is a value.
 _BEYOND: Final = 1e12  #: No value of a map is larger.
 _FEWEST_STEPS: Final = 20
 _TIMES: Final = 3.0
@@ -392,8 +391,7 @@ def _places(cells: BoolArray) -> str:
 # A map divided by its level has a median near 1; farther off than this, it was not divided.
 _NORMALISED_MEDIAN: Final = (0.2, 5.0)
 _LEAST_SPACING_MM: Final = 0.01
-_MOST_KPA: Final = 1000.0
-"""Median of a grid in kPa: no examination presses with more, and as Pa it is a light touch."""
+_MOST_KPA: Final = 1000.0  #: Median of a grid in kPa: no examination presses with more, and as Pa it is a light touch.
 _LONGEST_MM: Final = 500.0
 """No examined breast is longer; frames that stand one in a row, or one below the other, are."""
 

@@ -29,8 +29,7 @@ from tactile_bayes.scans import ElementCalibration, HeadGeometry, Landmarks, Pre
 
 # No value of a scan is larger, seconds since 1970 included; the squares of damaged ones would overflow.
 _LARGEST: Final = 1e12
-_STEP_KPA: Final = 0.001
-"""To which pressures are kept: a tenth of what the best arrays resolve."""
+_STEP_KPA: Final = 0.001  #: To which pressures are kept: a tenth of what the best arrays resolve.
 _MOST_COUNTS: Final = 65535
 _SECONDS: Final = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0}
 _MM: Final = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "inch": 25.4}

@@ -24,8 +24,7 @@ from tactile_bayes.trial.readings import Reading, at_excision
 JOURNAL: Final = "campaign.journal"
 EXAMS, MASSES, GROWTH = "exams", "masses", "growth"
 """Folders that hold one of each exam, of each mass pooled at a visit, and of each mass compared between visits."""
-DONE, FAILURES, TRIAL, GROWN = "exams_done.csv", "failures.csv", "trial.csv", "growth.csv"
-"""Tables beside them."""
+DONE, FAILURES, TRIAL, GROWN = "exams_done.csv", "failures.csv", "trial.csv", "growth.csv"  #: Tables beside them.
 
 SCAN, MAP, ESTIMATE, POSTERIOR = "scan.mcap", "map.nc", "estimate.json", "posterior.nc"
 SHAPE, MAP_FIGURE, SIZE_FIGURE = "shape.npz", "map.png", "size.png"
@@ -77,8 +76,7 @@ class Exam(Record):
     centre_mm: tuple[float, float] | None = None
     """Place of the mass on the map; None takes the highest bump that can be a lump."""
     known: tuple[tuple[str, float], ...] = ()  #: Properties of the body, by the names of `KNOWN`.
-    calibration: str | None = None
-    """Name or path of a size calibration; None takes the campaign's."""
+    calibration: str | None = None  #: Name or path of a size calibration; None takes the campaign's.
     line: int = field(default=0)  #: Of the table.
 
     @property

@@ -286,8 +286,7 @@ class PosteriorDraws(Record, eq=False):
     method: str  #: That gave the draws.
     draws: dict[str, FloatArray]  #: (chain, draw) arrays by name.
     diagnostics: dict[str, Any]  #: As the estimate's JSON has them.
-    scans: tuple[dict[str, str], ...] = ()
-    """The scans at the beginning, as `Provenance.scans` has them."""
+    scans: tuple[dict[str, str], ...] = ()  #: The scans at the beginning, as `Provenance.scans` has them.
     findings: tuple[Finding, ...] = ()  #: They speak against the estimate.
 
 

@@ -43,8 +43,7 @@ class Source(Record, eq=False):
     path: str = ""  #: Of a file beside the frames', for errors.
 
 
-Choose = Callable[[Sequence[str]], Iterable[str]]
-"""Takes the names in a file and returns those to read."""
+Choose = Callable[[Sequence[str]], Iterable[str]]  #: Takes the names in a file and returns those to read.
 ARRAY_SUFFIXES: Final = (".npz", ".npy", ".mat", ".h5", ".hdf5")
 _MAT_5: Final = b"MATLAB 5.0 MAT-file"
 _MAT_73: Final = b"MATLAB 7.3 MAT-file"

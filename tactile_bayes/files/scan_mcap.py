@@ -277,8 +277,7 @@ class ScanFile(Record, eq=False):
 
     scan: Scan
     complete: bool  #: The file was closed properly and nothing was lost.
-    damaged: bool
-    """A checksum failed: bytes changed after they were written. An unfinished file is not damaged."""
+    damaged: bool  #: A checksum failed: bytes changed after they were written. An unfinished file is not damaged.
     lost: tuple[str, ...]  #: One line a loss, for people.
     topics: Mapping[str, int]  #: Messages read, by topic.
     provenance: Mapping[str, Any]  #: As `Provenance.as_dict` wrote it.

@@ -29,8 +29,7 @@ _UNIT_OF_TIME: Final = re.compile(r"(?:[\[(_ ]|(?<=time))(ms|us|ns|s|min|msec|µ
 _DECIMAL_COMMA: Final = re.compile(r"[+-]?[0-9]*,[0-9]+(e[+-]?[0-9]+)?", re.IGNORECASE)
 FEWEST_LABELS: Final = 8
 """So many numbers that count 0, 1, 2... or 1, 2, 3... are labels of rows or columns, not readings."""
-NO_SENSEL: Final = "B"
-"""A cell beside the sensor in Tekscan's files."""
+NO_SENSEL: Final = "B"  #: A cell beside the sensor in Tekscan's files.
 _NO_VALUE: Final = ("", "nan", "na", "n/a", "-", "--", NO_SENSEL.lower(), "null")
 """Words for a reading that there is not."""
 

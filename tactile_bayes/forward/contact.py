@@ -26,8 +26,7 @@ class Head(Record):
 
     width_mm: float = HEAD_ROWS * HEAD_PITCH_MM  #: Of the sensing part.
     radius_mm: float = HEAD_RADIUS_MM  #: Of the arc; infinity for a flat head.
-    shoulder_mm: float = SHOULDER_MM
-    """Radius of the round between arc and side, tangent to both; 0 for a sharp edge."""
+    shoulder_mm: float = SHOULDER_MM  #: Radius of the round between arc and side, tangent to both; 0 for a sharp edge.
     shoulders: str = SHOULDERS_INSIDE
     """``"shoulders-inside"``: the rounds are cut into the sensing width, which is the whole face.
     ``"shoulders-outside"``: the arc spans the sensing width, and the rounds lie around it, press and sense nothing."""

@@ -140,8 +140,7 @@ class SurfaceCompliance(Record, eq=False):
 
     body: Body
     edges_mm: FloatArray  #: (n + 1,) array, symmetric about the lump's axis.
-    row: FloatArray
-    """(n,) array: first row of the (Toeplitz) matrix of the body without the lump, mm per kPa."""
+    row: FloatArray  #: (n,) array: first row of the (Toeplitz) matrix of the body without the lump, mm per kPa.
     even: CondensedHole
     odd: CondensedHole
     """`even`, `odd`: The body on x > 0, for loads symmetric and antisymmetric in x."""
@@ -412,8 +411,7 @@ def build_line(frames: LineFrames, *, normalise: str = "mean") -> TactileLine:
 # Symbols as in the paper, except that its three meanings of *a* have names of their own: `SHARE` (alpha, 0.5), the
 # curvature :math:`1/a(t)^2` of the homogeneous profile, and the map's amplitude, which is not part of this model.
 
-SHARE = 0.5
-"""alpha: share of the homogeneous profile that is taken off the frame over the lump (P2 = P0 - alpha P1)."""
+SHARE = 0.5  #: alpha: share of the homogeneous profile that is taken off the frame over the lump (P2 = P0 - alpha P1).
 
 DEEPEST_RATIO, LEAST_D_MM = 1.0, 10.0
 """h/d up to which, and diameter in mm from which, the map of Eqs 1 to 4 has a lump about as high and wide as plane

@@ -192,8 +192,7 @@ def simulate_plane(
 class PlaneSection(Record, eq=False):
     """A scene's section across the lump."""
 
-    head: Head
-    """Section of the head: shoulders of the scene's `shoulder_mm`, or its `rim_mm` where that is 0."""
+    head: Head  #: Section of the head: shoulders of the scene's `shoulder_mm`, or its `rim_mm` where that is 0.
     pitch_mm: float  #: Width of a taxel, of six of the contact's cells.
     layers: Layers  #: The body without the lump.
     lump: tuple[Body, float] | None  #: Below the skin, with its stiffness ratio; None for nothing.

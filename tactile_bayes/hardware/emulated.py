@@ -68,8 +68,7 @@ class Device:
     starts = 0  #: Number of START commands so far; each begins the scan anew.
     streaming = False  #: True when the device sends, or will when the scan begins.
     stopped = False  #: True when the host's last command about sending was STOP.
-    said_end = False
-    """True when the device has told the host that everything was sent, as some protocols do."""
+    said_end = False  #: True when the device has told the host that everything was sent, as some protocols do.
 
     def start(self) -> None:
         """Begin to send."""

@@ -296,8 +296,7 @@ class BladderStep(Record, eq=False):
 
     pressure_kpa: float  #: Of the bladder.
     counts: FloatArray  #: (rows, columns) array: Mean over the frames.
-    saturated: NDArray[np.bool_]
-    """(rows, columns) bool array: Taxels that reached full scale in any frame."""
+    saturated: NDArray[np.bool_]  #: (rows, columns) bool array: Taxels that reached full scale in any frame.
 
     @classmethod
     def of(cls, pressure_kpa: float, frames: readings.CountArray, *, saturation_count: int) -> BladderStep:

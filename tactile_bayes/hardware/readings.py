@@ -31,16 +31,14 @@ class PoseReading(NamedTuple):
     """One pose of the tracker's sensor in `base`."""
 
     position_mm: tuple[float, float, float]
-    quaternion_wxyz: Quaternion
-    """Scalar first, as the device gave it: not normalised, sign free."""
+    quaternion_wxyz: Quaternion  #: Scalar first, as the device gave it: not normalised, sign free.
     device_ns: int | None = None  #: The tracker's clock; None when the protocol carries none.
     flags: tuple[str, ...] = ()
     """The device's objections to this pose, for example ``"error W"`` or ``"distortion 12"``."""
     tool: str = ""  #: Which of the tracker's tools or stations; empty where it names none.
 
 
-NO_ROTATION: Final = "no rotation"
-"""Why there is no pose where a record's numbers are none of a place and a rotation."""
+NO_ROTATION: Final = "no rotation"  #: Why there is no pose where a record's numbers are none of a place and a rotation.
 
 
 class MissingReading(NamedTuple):
@@ -73,12 +71,9 @@ Reading = FrameReading | PoseReading | MissingReading | HelloReading | EndReadin
 class Parser:
     """Base of the protocols' parsers: `feed` returns the readings that bytes complete."""
 
-    fault = ""
-    """What is wrong with the last record that could not be read; empty where nothing looked like one."""
-    remark = ""
-    """What is to be known of the records that were read; empty where they are as they should be."""
-    garbage_bytes = 0
-    """Number of bytes so far that belong to no valid record."""
+    fault = ""  #: What is wrong with the last record that could not be read; empty where nothing looked like one.
+    remark = ""  #: What is to be known of the records that were read; empty where they are as they should be.
+    garbage_bytes = 0  #: Number of bytes so far that belong to no valid record.
 
     def feed(self, data: bytes) -> list[Reading]:
         """Parse `data`; return the completed readings."""
@@ -316,8 +311,7 @@ class ArrivalClock:
 class Moment(NamedTuple):
     """Time at which a record was measured."""
 
-    time_ns: int
-    """On the device's clock made continuous: 0 or more, never below the time before, below 2^63."""
+    time_ns: int  #: On the device's clock made continuous: 0 or more, never below the time before, below 2^63.
     event: str = ""  #: Step of the clock just now in words; empty when it went on as it should.
 
 

@@ -49,8 +49,7 @@ class Report:
     missing_why: str = ""
     flagged_why: str = ""
     """`missing_why`, `flagged_why`: The tracker's reasons, each with its number."""
-    other_tools: str = ""
-    """Tools that were not followed, each with the number of its records."""
+    other_tools: str = ""  #: Tools that were not followed, each with the number of its records.
     tracker_remark: str = ""
     poses_without_time: int = 0
     head_garbage_bytes: int = 0

@@ -236,8 +236,7 @@ class TrackerDriver(Record):
     several: tuple[bytes, ...] = ()  #: Commands after which records say whose they are, where a tool is named.
     other_parser: Callable[[], Parser] | None = None  #: Of records in the other form that the device may be set to.
     silent_s: float = SILENT_S  #: After so long without a byte it has gone; a server may send nothing of a hidden tool.
-    hint: str = "check its power, cable and line rate"
-    """Advice when nothing comes."""
+    hint: str = "check its power, cable and line rate"  #: Advice when nothing comes.
 
     def check(self, port: Port, *, tool: str | None = None, reference: str | None = None) -> Answer:
         """Set the tracker up, ask for records and choose the tools to follow.

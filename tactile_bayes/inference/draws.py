@@ -18,8 +18,7 @@ END_ERROR = 2.67
 """Monte-Carlo error of an end of a 95 % interval, in SDs, times the root of the independent draws (normal tails)."""
 INDEPENDENT_DRAWS = 4000
 """Draws of the methods that draw independently: end-point Monte-Carlo error of a 95 % interval about 0.04 SD."""
-REPLICATES = 4
-"""Independent parts of every set of draws; what differs between them is the Monte-Carlo error."""
+REPLICATES = 4  #: Independent parts of every set of draws; what differs between them is the Monte-Carlo error.
 Labels = IndexArray
 
 
@@ -434,8 +433,7 @@ def _directions(column: int) -> np.ndarray[tuple[int, ...], np.dtype[np.uint32]]
 # --- Evenly spread points and smoothed quantiles, for small Monte-Carlo errors of quantities not read from the map.
 
 MOST_PAIRED = MOST_DIMENSIONS - 1
-MERGED, LEAST_MERGED = 8, 512
-"""Neighbouring normals of a mixture that are taken as one, where there are as many."""
+MERGED, LEAST_MERGED = 8, 512  #: Neighbouring normals of a mixture that are taken as one, where there are as many.
 _NODES = np.sinh(np.linspace(-3.0, 3.0, 81))
 """Where a mixture's distribution function is computed, in SDs from its mean; dense in the middle."""
 LEAST_SD = 1e-2  #: Least SD of a component, as a share of the mixture's: a narrower one is widened to this.

@@ -185,8 +185,7 @@ class Proposal:
 
 ADDED = 256  #: Points of each Gaussian added, and points that its width is taken from.
 MOST_ADDED = 32
-ENOUGH = 0.75
-"""Share of effective points at which no more Gaussians are added, if the weights' tail is light as well."""
+ENOUGH = 0.75  #: Share of effective points at which no more Gaussians are added, if the weights' tail is light as well.
 LIGHT_TAIL = 0.3  #: Pareto shape of weights that more points will hardly show to be heavier.
 LEAST_VARIANCE = 1e-6
 """Least variance of a Gaussian in any direction, over that of all the points: points may lie in a plane."""
@@ -247,10 +246,8 @@ HEAVY_TAIL = 0.3  #: Pareto shape of the first points' weights above which the w
 TOO_WIDE = 2.0
 """A part of the density with this many times the variance of one Gaussian gives weights of infinite variance under it:
 then the proposal has a Gaussian for each part."""
-ADAPTED_FROM = 1024
-"""Points a replicate from which a tail heavier than trusted lets a mixture be fitted to them."""
-POOR = 0.5
-"""Below this share of effective draws the proposal is moved to the weighted moments of the points so far."""
+ADAPTED_FROM = 1024  #: Points a replicate from which a tail heavier than trusted lets a mixture be fitted to them.
+POOR = 0.5  #: Below this share of effective draws the proposal is moved to the weighted moments of the points so far.
 FITTED_AT = 4096
 """Points a replicate at which a mixture is fitted where the error is not reached: with four times as many it is cheaper
 only now and then."""

@@ -42,8 +42,7 @@ class MapRecipe(Record):
     source: str  #: ``"scan"`` or ``"grid"`` (a map imported as it is).
     normalise: Annotated[str, Meta(pattern="^(mean|gain|none)$", extra={"words": "mean, gain or none"})]
     cell_mm: Annotated[float, Meta(gt=0)]  #: Side of the square cells.
-    pressure_window_kpa: tuple[float, float] | None = None
-    """The gate on the frame's mean; None for an imported grid."""
+    pressure_window_kpa: tuple[float, float] | None = None  #: The gate on the frame's mean; None for an imported grid.
     latency_ms: float = 0.0  #: By how much a pose's stamp is late against the frames.
     flat_field: bool = False  #: True where the head's own response was taken off.
     registered: bool = False  #: True where the strokes were shifted onto each other.
@@ -92,11 +91,9 @@ class TactileMap(Record, eq=False):
     """Frames that went in. Cells share frames, so a map has fewer independent errors than readings."""
     quality: Mapping[str, float] = field(default_factory=dict)
     """Counts and figures for the report (frames dropped low/high, tilt, rms...)."""
-    masked_taxels: tuple[str, ...] = ()
-    """Taxels that were left out, one line each: ``"row 3 column 7 dead"``."""
+    masked_taxels: tuple[str, ...] = ()  #: Taxels that were left out, one line each: ``"row 3 column 7 dead"``.
     head: HeadShape | None = None  #: Shape of the head that made the scan; None for an imported grid.
-    nipple_mm: FloatArray | None = None
-    """(3,) array or None: The nipple in `plane`; None where it was not touched."""
+    nipple_mm: FloatArray | None = None  #: (3,) array or None: The nipple in `plane`; None where it was not touched.
     findings: tuple[Finding, ...] = ()  #: Findings against sizes from it.
 
     def __post_init__(self) -> None:
@@ -155,8 +152,7 @@ class TactileMap(Record, eq=False):
 
 # --- Notice for maps with many more cells than a fit needs.
 
-MANY_CELLS: Final = 20_000
-"""In a window: 0.25 mm in the default one, up to five times the time of 1 mm (record 0074)."""
+MANY_CELLS: Final = 20_000  #: In a window: 0.25 mm in the default one, up to five times the time of 1 mm (record 0074).
 
 
 def many_cells(tactile_map: TactileMap, radius_mm: float) -> str | None:
@@ -302,8 +298,7 @@ class CellAdvice(Record):
     """Advice on the size of the cells."""
 
     sigma_mm: float  #: Width of the narrower side of the map's highest bump, from its half height.
-    coarsest_mm: float
-    """Largest cell that leaves its widths within one posterior SD of those by cells of 1 mm."""
+    coarsest_mm: float  #: Largest cell that leaves its widths within one posterior SD of those by cells of 1 mm.
     cell_mm: float  #: The map's own.
     readings: float  #: Median readings a cell.
 

@@ -308,8 +308,7 @@ def _solved(normal: FloatArray, right: FloatArray) -> FloatArray:
 LEAST_POSES = 50
 MOST_MM = 1.5
 """Poses further than this from the path through their neighbours are no tracker's noise: the head itself jumps."""
-KEPT = 0.9
-"""Share of the departures that count, the smallest: at turning points the head itself leaves the path."""
+KEPT = 0.9  #: Share of the departures that count, the smallest: at turning points the head itself leaves the path.
 # A normal distribution's mean square within its inner nine tenths, over its variance: 1 - 2 c phi(c) / 0.9.
 _INNER_SQUARE = 0.6230155
 

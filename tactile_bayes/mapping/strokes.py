@@ -46,8 +46,7 @@ class StrokeShift(Record):
     shift_mm: float = 0.0
     sd_mm: float = np.inf
     """`shift_mm`, `sd_mm`: Along x of the plane, and its standard error."""
-    known: bool = False
-    """True where the stroke crossed a lump or an edge that fixes a shift; else the shift is 0."""
+    known: bool = False  #: True where the stroke crossed a lump or an edge that fixes a shift; else the shift is 0.
 
 
 def find_strokes(source: Source, number: int) -> list[StrokeShift]:
@@ -172,8 +171,7 @@ class _Round(Record, eq=False):
 
     normal: FloatArray  #: (K, K) array: Product of the strokes' designs over the variance of what is left.
     score: FloatArray  #: (K,) array: Their product with what is left, over the same.
-    widened: FloatArray
-    """(K,) array: By how much standard errors exceed those of independent errors and exact slopes."""
+    widened: FloatArray  #: (K,) array: By how much standard errors exceed those of independent errors and exact slopes.
 
     @classmethod
     def of(cls, parts: Sequence[_Part], shifts_mm: FloatArray) -> _Round:

@@ -54,8 +54,7 @@ from tactile_bayes.progress import Progress
 
 BALLS_SD = (0.008, 0.01)
 """SDs of skewness and change of balls' maps beyond their noise, over the amplitude (record 0107)."""
-NOISE_FACTOR = 2.5
-"""Variance of both over that by the residuals: deep and faint lumps are off by more than they say."""
+NOISE_FACTOR = 2.5  #: Variance of both over that by the residuals: deep and faint lumps are off by more than they say.
 MOST_SDS = 2.5  #: Length of either beyond which a ball is unlikely: of two components, in the SD of one.
 
 

@@ -19,12 +19,10 @@ from tactile_bayes.posterior.bump import Bump, FitCells, window_cells
 class ErrorModel(Record):
     """Size and correlation of a map's errors, from a fit's residuals."""
 
-    noise_sd: float
-    """Standard deviation of a cell of unit weight."""
+    noise_sd: float  #: Standard deviation of a cell of unit weight.
     inflation: float
     """Factor by which correlated errors widen the parameters' variance over that of independent cells; at least 1."""
-    dof: float
-    """Effective degrees of freedom of `noise_sd`."""
+    dof: float  #: Effective degrees of freedom of `noise_sd`.
 
 
 MINIMUM_DOF = 6.0
@@ -165,10 +163,8 @@ MOST_BLOCKS = 480
 class Detection(Record):
     """Odds of a bump against smooth errors alone; see `verdict` for whether it is a lump."""
 
-    probability: float
-    """Probability of a bump, at even odds and if there were only bumps and smooth errors."""
-    log_bayes_factor: float
-    """Natural log of the evidence ratio."""
+    probability: float  #: Probability of a bump, at even odds and if there were only bumps and smooth errors.
+    log_bayes_factor: float  #: Natural log of the evidence ratio.
     ridge: str = ""
     """The ridge, in words, that a lump's evidence was held against; empty where it was held against noise alone."""
 

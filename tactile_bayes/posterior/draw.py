@@ -41,8 +41,7 @@ class SamplerSettings(FitSettings, kw_only=True):
     store: Any = None  #: `ChainStore` where an ensemble keeps its state between runs, under a noise field.
     draws: int = INDEPENDENT_DRAWS
     """Of ``laplace`` under a noise field; 400 know the ends of an interval to a tenth of an SD."""
-    step_up: bool = True
-    """Under a noise field: whether the next method is tried where the one asked for fails."""
+    step_up: bool = True  #: Under a noise field: whether the next method is tried where the one asked for fails.
 
     @property
     def scene_asked(self) -> SceneAsked:
@@ -108,8 +107,7 @@ class NoiseFigures(Record):
     noise: str  #: ``"independent"`` or ``"field"``.
     rotated: bool
     rotation_odds: float | None  #: Odds of a rotated ellipse; None where that was decided beforehand.
-    figures: Mapping[str, float]
-    """Inflation and degrees of freedom, or the noise field's cosines, length and share."""
+    figures: Mapping[str, float]  #: Inflation and degrees of freedom, or the noise field's cosines, length and share.
     level_offset: float | None = None
     """Offset of the cells about the bump from the background, under independent errors; else None."""
     places_share: float | None = None
@@ -184,8 +182,7 @@ class Sampled(Record, eq=False):
     """A Gaussian for each noise field, also for those with little share of the density at the mode: under strongly
     correlated errors the widths are less certain, so that a field with 0.3 % of the density there had 4 % of the
     posterior, and all of its tails. None where one of them has no maximum, and under independent errors."""
-    beside: FloatArray = field(default_factory=lambda: np.zeros(0))
-    """(j,) array: The second structure's parameters."""
+    beside: FloatArray = field(default_factory=lambda: np.zeros(0))  #: (j,) array: The second structure's parameters.
     spread: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
     """(k, k) array: Root of the covariance that the second structure's uncertainty adds."""
     checkpoint_key: Callable[[str, np.random.Generator], str] | None = None

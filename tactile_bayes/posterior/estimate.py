@@ -78,8 +78,7 @@ def assess(tactile_map: TactileMap, fit: BumpFit, options: SamplerSettings) -> A
     return (Correlated if options.correlated else White).of(tactile_map, fit, options)
 
 
-MOST_LOOKS = 3
-"""Places that are no lump by the evidence before the search ends: each look is a chance to be wrong."""
+MOST_LOOKS = 3  #: Places that are no lump by the evidence before the search ends: each look is a chance to be wrong.
 
 
 def search(tactile_map: TactileMap, options: SamplerSettings) -> tuple[tuple[Candidate, ...], Assessment | None]:

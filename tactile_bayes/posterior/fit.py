@@ -29,8 +29,7 @@ ROUGH, FINE = 0.3, 1e-3
 LEAST_SHARE = 1e-2
 """Fields with a smaller share of the density at the mode have no Gaussian of their own in what `laplace` draws."""
 LADDER: tuple[Method, ...] = ("laplace", "importance", "ensemble")
-STEPS_UP = 1
-"""Methods tried after the requested one: a user who wants a quick one does not wait minutes for chains."""
+STEPS_UP = 1  #: Methods tried after the requested one: a user who wants a quick one does not wait minutes for chains.
 CHECKED = 512  #: Draws of the Gaussians that are weighed to judge them.
 
 

@@ -72,8 +72,7 @@ class FieldColumns(Record, eq=False):
     plain: FloatArray  #: (k, h * (c + 1)) array: Projections of the fixed columns and the data, so weighted.
     gram: FloatArray  #: (h, c + 1, c + 1) array: Columns and data with each other.
     inverse: FloatArray  #: (h, c, c) array: Of the columns' part.
-    log_det: FloatArray
-    """(h,) array: Log determinant of the covariance (over that of D) and of the columns' part."""
+    log_det: FloatArray  #: (h,) array: Log determinant of the covariance (over that of D) and of the columns' part.
     floor: float  #: Sum of squares that is noise in any case.
 
     @classmethod

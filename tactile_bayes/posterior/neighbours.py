@@ -27,11 +27,9 @@ from tactile_bayes.presets import SceneAsked
 
 # --- Check of structures at the window's rim against the map around it.
 
-CLEAR_IN_WIDTHS = 2.0
-"""Cells nearer to the bump than this many of its widths say nothing of what lies beside it."""
+CLEAR_IN_WIDTHS = 2.0  #: Cells nearer to the bump than this many of its widths say nothing of what lies beside it.
 STRIP_MM = 0.5
-PIECE_MM = 10.0
-"""Length of the pieces of a ridge whose rises are compared."""
+PIECE_MM = 10.0  #: Length of the pieces of a ridge whose rises are compared.
 LEAST_CELLS, LEAST_IN_PIECE = 4.0, 1.0
 """Least weight of a place, and of a piece: with less of it on the map there is nothing to see."""
 
@@ -39,12 +37,9 @@ LEAST_CELLS, LEAST_IN_PIECE = 4.0, 1.0
 class Surroundings(Record, eq=False):
     """Smoothed map less its level, not finite where the map has no data."""
 
-    x_mm: FloatArray
-    """(nx,) array."""
-    y_mm: FloatArray
-    """(ny,) array."""
-    excess: FloatArray
-    """(ny, nx) array."""
+    x_mm: FloatArray  #: (nx,) array.
+    y_mm: FloatArray  #: (ny,) array.
+    excess: FloatArray  #: (ny, nx) array.
 
     @classmethod
     def of(cls, tactile_map: TactileMap) -> Surroundings:
@@ -124,12 +119,10 @@ def _median_piece(number: FloatArray, total: FloatArray) -> FloatArray:
 
 # --- Structures beside the bump: a second lump or a rib, in or just beyond the window.
 
-SECOND_ODDS = 10.0
-"""For a second lump or a rib: a bump that is not quite a Gaussian must not bring one."""
+SECOND_ODDS = 10.0  #: For a second lump or a rib: a bump that is not quite a Gaussian must not bring one.
 LEAST_RISE = 0.05
 """Share of the bump's amplitude: beside 15 single simulated lumps at most 0.01, beside a second one 0.08 and more."""
-LONG = 1.5
-"""A bump with a larger axis ratio is also tried as two round lumps side by side."""
+LONG = 1.5  #: A bump with a larger axis ratio is also tried as two round lumps side by side.
 GRID_MM = 4.0
 GRID_WIDTHS_MM = (3.0, 5.0, 8.0)
 GRID_ANGLES = 12

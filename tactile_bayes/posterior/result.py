@@ -106,15 +106,13 @@ class Estimate(Record, eq=False):
     """
     smallest: SmallestLumps | None = None
     """On a map without a lump: the smallest that it would have shown; None where nobody has asked."""
-    scene: SceneChoice | None = None
-    """Under a noise field: what the window holds, and what was asked about it."""
+    scene: SceneChoice | None = None  #: Under a noise field: what the window holds, and what was asked about it.
     sensitivity: Sensitivity | None = None  #: How far the answer leans on the prior of the widths.
     other_rises: tuple[Rise, ...] = ()
     """Other rises that are lumps by the evidence, see `masses.other_rises`; empty where nobody has looked."""
     bump: ModalBump | None = None
     """The bump at the mode of the lump that the answer is about, sized or not; None where there is no lump."""
-    masses: tuple[Mass, ...] = ()
-    """All masses of the map, see `masses.with_masses`; empty where nobody has looked."""
+    masses: tuple[Mass, ...] = ()  #: All masses of the map, see `masses.with_masses`; empty where nobody has looked.
     findings: tuple[Finding, ...] = ()  #: Findings against the answer, cautions first.
 
     @property
@@ -292,8 +290,7 @@ def fitted_cells(estimate: Estimate) -> FittedCells | None:
 # Groups and names are those of the InferenceData schema of ArviZ (Kumar et al. 2019, JOSS 4:1143).
 
 PRIOR_DRAWS = 2000
-LIKELIHOOD_DRAWS = 400
-"""Evenly thinned: a value for each cell and draw takes a second and 4 MB for 400 of them."""
+LIKELIHOOD_DRAWS = 400  #: Evenly thinned: a value for each cell and draw takes a second and 4 MB for 400 of them.
 LEAST_SIZED = 100  #: Fewer prior draws within the calibration's range say nothing of a size.
 
 

@@ -25,17 +25,14 @@ from tactile_bayes.presets import FIELD_COSINES, FIT_RADIUS_MM
 
 # --- Probability that a rise of a map is a lump, calibrated on simulated exams with and without one.
 
-SHARE_WITH_LUMP: Final = 0.5
-"""Half of the simulated exams hold a lump: the prior probability behind the answer."""
+SHARE_WITH_LUMP: Final = 0.5  #: Half of the simulated exams hold a lump: the prior probability behind the answer.
 COEFFICIENTS: Final = (1.14, 0.8, -2.36, -4.3, -2.32, -2.47)
 """Intercept and those of `Weighed.features`; printed by ``python -m validation lump_probability learn``, 0127."""
 ENDS: Final = (0.05, 0.99)
 """The exams that were simulated cannot tell probabilities nearer to 0 or 1: of the 40 rises that say least in the exams
 learned from, 2 lie within 10 mm of a lump that the map does not show."""
-LIKELY: Final = 0.5
-"""A rise with a lower probability is no lump by the verdict, whatever its evidence."""
-UNPROVEN: Final = 0.49
-"""Most that is told of a rise without the evidence for a size: it is not told as a lump."""
+LIKELY: Final = 0.5  #: A rise with a lower probability is no lump by the verdict, whatever its evidence.
+UNPROVEN: Final = 0.49  #: Most that is told of a rise without the evidence for a size: it is not told as a lump.
 MOST_EVIDENCE: Final = 50.0
 WIDE_MM: Final = 8.0
 NO_EVIDENCE: Final = "no lump by the evidence"
@@ -44,15 +41,12 @@ NO_EVIDENCE: Final = "no lump by the evidence"
 class Weighed(Record, eq=False):
     """A rise with the odds of a bump there, and the probability that it is a lump."""
 
-    detection: Detection
-    """Evidence for a bump against smooth errors, and a ridge where one rises."""
-    centre_mm: tuple[float, float]
-    """Centre of the bump."""
+    detection: Detection  #: Evidence for a bump against smooth errors, and a ridge where one rises.
+    centre_mm: tuple[float, float]  #: Centre of the bump.
     features: tuple[float, ...]
     """Log of 1 plus the log Bayes factor, log of the axis ratio, by how much the log of the width exceeds that of
     `WIDE_MM`, share of the bump that the map does not cover, and 1 where a fault speaks against measuring it."""
-    candidate: Candidate | None = None
-    """Where the search met it."""
+    candidate: Candidate | None = None  #: Where the search met it.
 
     @property
     def axis_ratio(self) -> float:
@@ -111,8 +105,7 @@ ENCLOSED_IN_WIDTHS = 1.6
 
 Of 800 simulated exams 46 showed a lump wider than 8 mm, all of them enclosed so; the end of strokes made one more rise.
 """
-LEAST_SEEN = 0.25
-"""Share of a side's breadth that must be covered for the side to reach as far."""
+LEAST_SEEN = 0.25  #: Share of a side's breadth that must be covered for the side to reach as far.
 LEAST_READ = 0.25
 """Least share of the map's typical number of readings in a cell, for a bump's cells: 134 lumps had 1.8 and more.
 
@@ -345,8 +338,7 @@ that is no stiffer does not show at all."""
 SIZES_MM: Final = np.arange(4.0, 30.5, 0.5)
 LEAST_DEPTH_RATIO: Final = 0.56
 """Depth of the ball's middle, over its diameter: nearer to the skin no ball was simulated."""
-USUAL_FAT_MM: Final = 15.0
-"""Where a map does not tell the depth of fat."""
+USUAL_FAT_MM: Final = 15.0  #: Where a map does not tell the depth of fat.
 LOG_AMPLITUDE: Final = (-2.61, 3.393, -3.27, 1.003, 0.251, -0.049, -0.983)
 LOG_SIGMA: Final = (1.865, -0.168, 0.988, -0.155)
 """Coefficients of `lump_features`, and of its first four: ``python -m validation smallest_lump learn`` prints them."""
@@ -363,14 +355,11 @@ LEAST_CELLS, LEAST_SHARE, NEAR_MM = 100, 0.6, 7.5
 class SmallestLumps(Record, eq=False):
     """Diameters in mm of the smallest ball that a map would have shown with `PROBABILITY`."""
 
-    places_mm: FloatArray
-    """(n, 2) array: In `plane`."""
-    depths_mm: FloatArray
-    """(k,) array: Of the ball's middle below the skin."""
+    places_mm: FloatArray  #: (n, 2) array: In `plane`.
+    depths_mm: FloatArray  #: (k,) array: Of the ball's middle below the skin.
     d_mm: FloatArray
     """(n, k) array: At each place for each depth; inf where not even the largest ball would have shown."""
-    spacing_mm: float
-    """Between the places."""
+    spacing_mm: float  #: Between the places.
 
 
 def smallest_lumps(tactile_map: TactileMap, *, fat_mm: float | None = None) -> SmallestLumps:

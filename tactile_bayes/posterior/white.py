@@ -120,8 +120,7 @@ PATIENCE = 16  #: Iterations: a clear lump takes 4 to 15.
 OUTGROWN, AT_RIM = "wider than the window", "at the rim of the map"
 FIT_TOLERANCE = 1e-8
 """Tolerance of the least squares, in units of `Bump.step_scale`: far below any error that a map has."""
-PLACE_TOLERANCE = 1e-2
-"""The same where least squares only finds the place: the posterior's mode is sought from there."""
+PLACE_TOLERANCE = 1e-2  #: The same where least squares only finds the place: the posterior's mode is sought from there.
 JOINED = 0.05  #: So near to a minimum, in the same units, a fit ends in it.
 
 
@@ -194,8 +193,7 @@ class Candidate(Record, eq=False):
     fit: BumpFit | None  #: None where least squares found no minimum.
     fault: str  #: Why the place cannot be a lump; empty when it can.
     detection: Detection | None = None  #: Odds of a lump there; None where nobody has weighed them.
-    assessed: ModalBump | None = None
-    """The bump that the odds are of; None where it is the fit's."""
+    assessed: ModalBump | None = None  #: The bump that the odds are of; None where it is the fit's.
 
     @property
     def bump(self) -> ModalBump | None:

@@ -26,15 +26,13 @@ from tactile_bayes.presets import FIELD_COSINES, FINE_FIELD_COSINES
 # Solin & Saerkkae (2020), Statistics and Computing 30:419 (the basis); Rasmussen & Williams (2006), ch. 4 (the
 #   spectrum).
 
-MARGIN = 1.3
-"""Width of the rectangle in widths of the window: the field need not be flat where the window ends."""
+MARGIN = 1.3  #: Width of the rectangle in widths of the window: the field need not be flat where the window ends.
 LENGTHS_MM = (1.5, 3.0, 6.0, 12.0)
 SHARES = (0.0, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0)
 """Variances of the field tried, over the mean independent variance of a cell."""
 HALF_WAVE_IN_WIDTHS = 0.83
 """The shortest half wave that a bump's width calls for: below 3.5 mm, in a window of 20 mm, more than the fewest."""
-TOUCHED = 1e-2
-"""Directions in which the field's variance is a smaller part of the independent one are dropped."""
+TOUCHED = 1e-2  #: Directions in which the field's variance is a smaller part of the independent one are dropped.
 
 
 class Whitening(Record, eq=False):
@@ -291,8 +289,7 @@ class Problem(Record, eq=False):
     prior: BumpPrior  #: On widths and amplitudes.
     radius_mm: float  #: Radius of the window; bounds the centre about the window's middle.
     amplitude_scale: float = 1.0  #: Unit of the amplitudes' prior, see `bump.value_scale`.
-    departure: FloatArray | None = None
-    """(k, n) array: Further fixed columns, see `fit.ask_departure`; None for none."""
+    departure: FloatArray | None = None  #: (k, n) array: Further fixed columns, see `fit.ask_departure`; None for none.
 
     @property
     def widest_mm(self) -> float:

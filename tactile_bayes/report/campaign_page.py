@@ -32,8 +32,7 @@ class ExamEntry(Record, eq=False):
     thumbnail: bytes | str | None = None
     """SVG of the map, or the name of its file from the page's folder; None without one."""
     page: str = ""  #: The exam's page from the index's folder; empty without one.
-    links: Mapping[str, str] = field(default_factory=dict)
-    """Other files of the exam, by the words of their links."""
+    links: Mapping[str, str] = field(default_factory=dict)  #: Other files of the exam, by the words of their links.
     failed: bool = False  #: Whether a step failed, for the reason.
 
     @property

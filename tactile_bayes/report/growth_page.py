@@ -68,8 +68,7 @@ class LaidMap(Record, eq=False):
     """A visit's maps averaged on a common grid about its mass."""
 
     values: FloatArray  #: (n, n) array: Rows upwards, columns to the right on the screen; NaN without data.
-    origin_mm: FloatArray
-    """(2,) array: Left of and above the xiphoid, where the mass lies; (0, 0) without landmarks."""
+    origin_mm: FloatArray  #: (2,) array: Left of and above the xiphoid, where the mass lies; (0, 0) without landmarks.
     ring_mm: FloatArray | None
     """(2, m) array: Right of and above the mass, the ellipse of its size at the visit; None without one."""
 

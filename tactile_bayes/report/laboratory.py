@@ -47,8 +47,7 @@ from tactile_bayes.studies.tradeoffs import EMPIRICAL, PLANE, SOLID, LumpCase, M
 # --- Reports of simulation-based calibration: text, data, table and figure.
 
 SCHEMA = "tactile-bayes/sbc/1"
-NARROW = 1.05
-"""A larger spread of the ranks is called too narrow a posterior, and too wide below its inverse."""
+NARROW = 1.05  #: A larger spread of the ranks is called too narrow a posterior, and too wide below its inverse.
 SHIFT = 3.0  #: Standard errors of the mean rank beyond which a posterior is called too low or too high.
 
 

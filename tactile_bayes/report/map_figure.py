@@ -53,8 +53,7 @@ class FitContour(Record):
     sigma_y_mm: float
     """`sigma_x_mm`, `sigma_y_mm`: Widths along the fit's own axes."""
     angle_deg: float = 0.0  #: From the plane's x axis to the fit's, positive from x towards y.
-    size_mm: tuple[float, float] | None = None
-    """The lump's size along the same axes; None where the fit gave no size."""
+    size_mm: tuple[float, float] | None = None  #: The lump's size along the same axes; None where the fit gave no size.
     level: float = 1.0
     amplitude: float | None = None
     """`level`, `amplitude`: Of the fitted bump, in the map's values; None leaves the colours to the map."""

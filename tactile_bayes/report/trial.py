@@ -190,8 +190,7 @@ _FOUND = {
     "r2_centred": ("r2", ".2f"),
     "r2_centred_detected": ("r2 found", ".2f"),
 }
-SPELLED: Final = {"cbe": "clinical breast examination (cbe)"}
-"""Modalities that tables abbreviate, in words."""
+SPELLED: Final = {"cbe": "clinical breast examination (cbe)"}  #: Modalities that tables abbreviate, in words.
 MOST_LABEL: Final = 11  #: Letters of a modality's name up to which its figures stand beside it.
 MORE: Final = "More (lines, limits of agreement, repeatability, pairs, r2): validate -v."
 

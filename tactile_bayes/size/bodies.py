@@ -70,8 +70,7 @@ SUPPOSED: Final[Mapping[str, tuple[str, float]]] = {
 }
 """A property and its value by name: lumps of 8 to 15 and 50 to 100 times the stiffness of fat, centred on the gland's
 surface and resting on it."""
-LIKELY_SDS: Final = 2.5
-"""A value farther than this from what the map leads one to expect is not supposed."""
+LIKELY_SDS: Final = 2.5  #: A value farther than this from what the map leads one to expect is not supposed.
 _STEP = 1e-4
 
 
@@ -137,8 +136,7 @@ class BodyLaw(Record, eq=False, kw_only=True):
 class BodyCalibration(BodyLaw, eq=False, kw_only=True):
     """A calibration over a population, for any mass or one whose depth of fat is known."""
 
-    fat_mm: float | None = None
-    """Depth F of the mass that this calibration is for; None where it is not known."""
+    fat_mm: float | None = None  #: Depth F of the mass that this calibration is for; None where it is not known.
     fat_note: str = ""  #: Why the depth is not used though the calibration could; empty otherwise.
     site: SiteShift | None = None  #: Correction by a site's own phantoms.
 

@@ -13,8 +13,7 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.draws import Labels, Quantity, even_replicates, normal_quantile, picked_rows, summarise
 
 EXTREMES: Final = ("max_size_mm", "min_size_mm")
-SIZES: Final = (*EXTREMES, "d_x_mm", "d_y_mm")
-"""Names of the sizes that a posterior has, in the order of reports."""
+SIZES: Final = (*EXTREMES, "d_x_mm", "d_y_mm")  #: Names of the sizes that a posterior has, in the order of reports.
 SHOWN, SHOWN_POWER = 0.083, 1.5
 """Share of a lump's half log axis ratio that its map shows: factor, and power of d in map widths (record 0107)."""
 SHOWN_CV: Final = 0.2  #: Coefficient of variation of that between lumps.
@@ -29,8 +28,7 @@ class BumpDraws(Record, eq=False):
     sigma_x_mm: FloatArray
     sigma_y_mm: FloatArray
     angle_rad: FloatArray
-    labels: Labels | None = None
-    """(n,) labels of the draws' independent replicates, as `ParameterDraws.labels`."""
+    labels: Labels | None = None  #: (n,) labels of the draws' independent replicates, as `ParameterDraws.labels`.
     oblique: tuple[float, float] | None = None
     """Mean and SD of r, the half log axis ratio 45 degrees from the map's x axis, where the draws have none and it was
     measured beside them; None otherwise."""
@@ -222,15 +220,13 @@ class SizePosterior(Record, eq=False):
 
     d_x_mm: FloatArray
     d_y_mm: FloatArray
-    variance_share: dict[str, float]
-    """Percent of the variance of ln(max size) by source; they sum to 100."""
+    variance_share: dict[str, float]  #: Percent of the variance of ln(max size) by source; they sum to 100.
     invalid: int
     replicates: Labels
     """(chain * draw,) label of the independent replicate of each draw: their spread is the Monte-Carlo error."""
     figures: Mapping[str, float] = field(default_factory=dict)
     """Further figures: the probability of a lump that is not round, the spread between maps..."""
-    outliers: tuple[int, ...] = ()
-    """Those of several maps that lie apart from the rest, by their place in the list."""
+    outliers: tuple[int, ...] = ()  #: Those of several maps that lie apart from the rest, by their place in the list.
     another_exam: SizePosterior | None = None
     """The same if another exam of the mass may come out as far apart as in the paper's trial; None where not told."""
     supposing: Mapping[str, Supposition] = field(default_factory=dict)

@@ -50,8 +50,7 @@ DIMENSIONS = 6
 _SCORE = 2  #: Coordinate of the spread of B.
 MOST_INVALID = 0.05
 DISAGREE: Final = "maps_disagree"  #: Status of maps that are not of one size, or not of one mass.
-IRREGULAR_SD = 0.15
-"""SD of ln d by which the mean diameter of a lump with an irregular outline is off (record 0107)."""
+IRREGULAR_SD = 0.15  #: SD of ln d by which the mean diameter of a lump with an irregular outline is off (record 0107).
 
 
 class SizePriors(Record):
@@ -287,23 +286,20 @@ class PooledEstimate(Record, eq=False):
     """Result of pooling the maps of one mass."""
 
     status: Literal["estimate", "no_estimate", "maps_disagree"]
-    reason: str
-    """As of `Estimate`; also ``maps_disagree``, where the maps are not of one size, or not of one mass."""
+    reason: str  #: As of `Estimate`; also ``maps_disagree``, where the maps are not of one size, or not of one mass.
     size: SizePosterior | None = None
     centres: Mapping[int, float] = field(default_factory=dict)
     """ln d by each map alone, by its place in the list; maps without a lump are missing."""
     outlying: tuple[int, ...] = ()  #: Places of the maps that lie apart from the rest.
     outside: tuple[str, ...] = ()  #: How maps lie outside the calibration's table, in words.
-    calibration: BodyCalibration | None = None
-    """The one used: for the depth of fat that the maps tell, where they do."""
+    calibration: BodyCalibration | None = None  #: The one used: for the depth of fat that the maps tell, where they do.
     fat_apart_mm: tuple[float, float] | None = None
     """Least and largest depth of fat by single maps, where they can hardly be of one body; None otherwise."""
     one_size: float | None = None
     one_size_apart: float | None = None
     """Probability that maps of one mass come out as far apart in size or farther, by the spread of
     `one_size_probability` and, where a second interval is told, by the paper's maps; None without several maps."""
-    one_place: float | None = None
-    """Likewise for the places of their masses in the patient; None without landmarks."""
+    one_place: float | None = None  #: Likewise for the places of their masses in the patient; None without landmarks.
 
 
 def pool_maps(

@@ -186,8 +186,7 @@ class AmplitudeLaw(Record):
     posture_sd: float  #: Of ln s.
     fat_sd: float  #: Of ln F between exams of one posture.
     exam_factor: float  #: SD of ln a between exams, beside the maps' noise, over that of ln d.
-    otherwise: float
-    """Probability that something else changes the amplitude, with an SD of 1 in ln a."""
+    otherwise: float  #: Probability that something else changes the amplitude, with an SD of 1 in ln a.
 
     @property
     def exponents(self) -> FloatArray:
@@ -257,8 +256,7 @@ class JointSizes(Record, eq=False):
     replicates: Labels
     between_map_sd: float  #: Spread between exams of a visit, root mean square.
     correlation: FloatArray  #: (v, v) of B between the visits.
-    calibrations: tuple[BodyCalibration, ...]
-    """One per visit: at the depth of fat that its maps give."""
+    calibrations: tuple[BodyCalibration, ...]  #: One per visit: at the depth of fat that its maps give.
 
     def change(self, earlier: int, later: int) -> Change:
         """Change from one visit to another."""

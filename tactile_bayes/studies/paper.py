@@ -318,8 +318,7 @@ DEPTH_RATIOS = (0.6, 0.7, 0.8, 0.9, 1.0, 1.2, 1.5)
 LEAST_RISE = 0.1
 """A lump takes part when it raises the middle of the head by this share of the frame's mean: five times the noise."""
 LEAST_SIZE_RATIO = 1.5  #: Of the larger lump's diameter to the smaller one's.
-ALIKE = 0.05
-"""Frames that differ by less than this share of what the lump adds are called indistinguishable."""
+ALIKE = 0.05  #: Frames that differ by less than this share of what the lump adds are called indistinguishable.
 # Of the depths in diameters that are tried by interpolation between those solved.
 _STEP = 0.01
 
@@ -473,8 +472,7 @@ class Uniformity(Record, eq=False):
 
     head: Head  #: Its section.
     s_mm: FloatArray  #: (n,) array: Taxel positions across the head.
-    share: FloatArray
-    """(3, 3, n) array: Pressure over the frame's mean, for each modulus and each mean pressure."""
+    share: FloatArray  #: (3, 3, n) array: Pressure over the frame's mean, for each modulus and each mean pressure.
 
     @property
     def largest(self) -> FloatArray:

@@ -155,8 +155,7 @@ class SolidSettings(CaseSettings, kw_only=True):
     rank_tolerance: float = RANK_TOLERANCE  #: See `solid.skin_perturbation`.
     mesh_reach_mm: float = MeshSize().reach_mm  #: Radius at which the mesh ends, on a rim that does not move.
     background: Background = "free"  #: ``"free"``: Eq 7's level is fitted; ``"fixed"``: it is 1.
-    flat_field: bool = True
-    """True when each taxel is divided by what it reads of the same body without the lump."""
+    flat_field: bool = True  #: True when each taxel is divided by what it reads of the same body without the lump.
 
     def as_dict(self) -> dict[str, object]:
         """Plain data for a store's header."""

@@ -220,8 +220,7 @@ class MassRow(Record):
     gland_ratio: float
     thickness_mm: float
     mean_kpa: float | None = None  #: Mean pressure of the frames used.
-    detected: bool = False
-    """True when a patient's path would give an estimate; if not, what follows is None."""
+    detected: bool = False  #: True when a patient's path would give an estimate; if not, what follows is None.
     amplitude: float | None = None  #: Median, as those of the widths.
     sigma_x_mm: float | None = None
     sigma_y_mm: float | None = None

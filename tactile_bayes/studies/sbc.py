@@ -161,8 +161,7 @@ RADIUS_MM = 20.0
 CENTRE_MM = 5.0
 NOISE_SD = (0.005, 0.1)
 COUNTS = (20, 80)
-DRAWS = 99
-"""Draws among which a truth is ranked: 100 ranks, divisible into the bins and the intervals below."""
+DRAWS = 99  #: Draws among which a truth is ranked: 100 ranks, divisible into the bins and the intervals below.
 PARAMETERS = ("amplitude", "sigma_x_mm", "sigma_y_mm", "x_mm", "y_mm")
 """Ranks of an amplitude or a width are those of its logarithm."""
 SIZE = "size_mm"

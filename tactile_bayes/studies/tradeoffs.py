@@ -251,8 +251,7 @@ class SizeRule(Record, eq=False):
     """Rule that converts amplitude and widths to a size."""
 
     sizes: Sizes  #: Diameters; the largest is the size.
-    scatter: float
-    """Standard deviation of ln d that it leaves: of what Eq 6 was learned from, or of bodies left out."""
+    scatter: float  #: Standard deviation of ln d that it leaves: of what Eq 6 was learned from, or of bodies left out.
     source: str  #: In words.
     outside_of: Outside | None = None  #: What of a map is none of the calibration's.
 

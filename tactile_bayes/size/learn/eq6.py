@@ -363,8 +363,7 @@ def _with_scatter(coefficients: FloatArray, data: AxisRows, counts: FloatArray) 
 
 # --- Cross-validation of a size calibration's form over the geometries of a study.
 
-LEAST_GEOMETRIES = 8
-"""A quadratic has six coefficients, and one geometry is missing from each fit."""
+LEAST_GEOMETRIES = 8  #: A quadratic has six coefficients, and one geometry is missing from each fit.
 
 FitAxis = Callable[[AxisRows], AxisCalibration]
 """Eq 6 from the rows of one axis: `axis_at_mode` or `axis_in_two_stages`."""

@@ -31,8 +31,7 @@ T = TypeVar("T")
 LEAST_BODIES = 20
 EXPLAINED: Final = 0.75
 """Share of the table's bodies, by SD(B), of which known properties tell as much as they do of all, in that SD."""
-_ROUND_START = (np.log(0.01), np.log(2.0))
-"""ln s and ln kappa where the search for the spread of balls' maps begins."""
+_ROUND_START = (np.log(0.01), np.log(2.0))  #: ln s and ln kappa where the search for the spread of balls' maps begins.
 _ROUND_PRIOR_SD = 1.5  #: Prior SD of either about these: with a dozen bodies they stay near.
 # Centre and width of the priors on ln(sd between bodies), its slope with ln a, ln(sd between exams).
 _PRIOR = np.array([[np.log(0.1), 1.0], [0.0, 0.3], [np.log(0.03), 1.0]])
@@ -41,8 +40,7 @@ _PRIOR = np.array([[np.log(0.1), 1.0], [0.0, 0.3], [np.log(0.03), 1.0]])
 class PopulationTable(Record, eq=False):
     """Maps of known lumps, one per row: true diameter; ln a, p and q of the map."""
 
-    body: np.ndarray[tuple[int], np.dtype[np.generic]]
-    """(n,) of int or str: rows of one name are exams of one body."""
+    body: np.ndarray[tuple[int], np.dtype[np.generic]]  #: (n,) of int or str: rows of one name are exams of one body.
     d_mm: FloatArray
     log_amplitude: FloatArray
     log_width: FloatArray
@@ -52,8 +50,7 @@ class PopulationTable(Record, eq=False):
     """(n,) arrays of what was varied and no map shows, by name; logarithms of those in `LOGGED`."""
     profile: FloatArray | None = None
     """(n, 3) `presets.HEAD_PROFILE` of each map, NaN for a map without; None where no map has it."""
-    log_fat: FloatArray | None = None
-    """(n,) ln of the depth of the fat-gland boundary in mm; None with `profile`."""
+    log_fat: FloatArray | None = None  #: (n,) ln of the depth of the fat-gland boundary in mm; None with `profile`.
 
     def __len__(self) -> int:
         return len(self.d_mm)
@@ -268,8 +265,7 @@ SEED: Final = 1  #: Seed of the choice of bodies that are the points.
 _LENGTH, _SCALE, _BODY_SD = (np.log(2.0), 1.0), (np.log(0.3), 1.0), (np.log(0.1), 1.0)
 """Centre and width of the normal priors on the logs of lengths, scale and SD(B) at the centre."""
 _SLOPE_SD = 0.3  #: Width of the prior on the other coefficients of ln SD(B).
-_START_LENGTHS = (2.0, 0.7)
-"""There are modes where what is smooth is taken for scatter, and the other way round."""
+_START_LENGTHS = (2.0, 0.7)  #: There are modes where what is smooth is taken for scatter, and the other way round.
 _MOST_ITERATIONS = 200
 _DIFFERENCE = 1e-4  #: Step of the gradient: below it the rounding of the solutions shows.
 
@@ -280,8 +276,7 @@ class BodiesLeft(Record, eq=False):
     x: FloatArray  #: (b, 3) means of u, v and w over each body's exams: they differ little.
     features: FloatArray  #: (b, s) of ln SD(B).
     left: FloatArray  #: (b,) ln d less Eq 6's, each body left out of its fit.
-    noise: FloatArray
-    """(b,) variance of `left` by the body's exams and by the error of Eq 6's coefficients."""
+    noise: FloatArray  #: (b,) variance of `left` by the body's exams and by the error of Eq 6's coefficients.
 
 
 class FittedResidual(Record, eq=False):

@@ -271,8 +271,7 @@ FEWEST_MASSES: Final = 3
 PRIOR_MEDIAN: Final = 0.08
 """Prior median of tau: between the spread of simulated exams (5 %) and that of the paper's maps (15 %)."""
 PRIOR_LOG_SD: Final = 1.0  #: 95 % of the prior lies between 1.1 and 57 %.
-FALSE_ALARMS: Final = 0.05
-"""Share of sites with nothing wrong at which some mass is named as outlying."""
+FALSE_ALARMS: Final = 0.05  #: Share of sites with nothing wrong at which some mass is named as outlying.
 GRID: Final = np.geomspace(1e-3, 1.5, 600)
 
 
