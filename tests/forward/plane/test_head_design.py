@@ -121,9 +121,9 @@ def test_the_command_says_what_one_head_does() -> None:
 def test_where_no_head_meets_the_limit_the_command_says_so_and_fails(monkeypatch) -> None:
     from functools import partial
 
-    from tactile_bayes.actions import study as head_design
+    from tactile_bayes.studies import paper
 
-    monkeypatch.setattr(head_design, "search_heads", partial(search_heads, **SMALL))
+    monkeypatch.setattr(paper, "search_heads", partial(search_heads, **SMALL))
     done = run("head", "design", "--head", SHOULDERS_INSIDE)
     assert isinstance(done.exception, UsageError)
     assert done.exception.exit_code == EXIT_USAGE
@@ -134,9 +134,9 @@ def test_where_no_head_meets_the_limit_the_command_says_so_and_fails(monkeypatch
 def test_the_picture_and_the_json_hold_the_search(tmp_path, monkeypatch) -> None:
     from functools import partial
 
-    from tactile_bayes.actions import study as head_design
+    from tactile_bayes.studies import paper
 
-    monkeypatch.setattr(head_design, "search_heads", partial(search_heads, **SMALL))
+    monkeypatch.setattr(paper, "search_heads", partial(search_heads, **SMALL))
     done = run("head", "design", "--figure", tmp_path / "head.png", "--json")
     assert done.exit_code == 0, done.output
     document = json.loads(done.stdout)
