@@ -122,7 +122,7 @@ def pose_covariance(fit: FieldFit) -> FloatArray:
     What lies beside the bump is taken as it is.
     """
     noise = fit.target.window.cells.pose_noise
-    p = len(fit.scene.alone().names)
+    p = fit.scene.own
     covariance = np.zeros((len(fit.mode), len(fit.mode)))
     if noise is None or fit.scene.shape == "ridge":
         return covariance

@@ -105,7 +105,7 @@ class FieldFit(Record, eq=False, dict=True):
     def sampled(self, solved: Solved | None = None) -> Sampled:
         """The density to sample; without a second structure it is the fit's own, and keeps its solutions."""
         mean, covariance = self.mixture.moments()
-        k, target = len(self.scene.alone().names), self.target
+        k, target = self.scene.own, self.target
         parts = newton_mixture(target, self.mode, self.covariance, least_share=NEGLIGIBLE)
         key = partial(checkpoint_key, self)
         if k == len(mean):
@@ -246,7 +246,7 @@ _STEP = 1e-4
 def tangent_columns(fit: FieldFit) -> FloatArray:
     """(v, n) the unit bump, its derivatives by its own parameters first, then level and tilt."""
     window, scene, mode = fit.target.window, fit.scene, fit.mode
-    p = len(scene.alone().names)
+    p = scene.own
     steps = _STEP * np.eye(p, len(mode))
     bump = scene.templates(np.concatenate([mode[None], mode + steps, mode - steps]), window)[0]
     values = window.of_cells(bump)
@@ -331,8 +331,8 @@ def newton_step_to(fit: FieldFit, scene: Scene) -> Mixture | None:
     start = fit.scene.carried(fit.mode, scene)
     target.settle_fields(start)
     scale = np.diag(np.square(scene.steps))
-    shared = [name for name in scene.names if name in fit.scene.names]
-    here, there = ([s.names.index(n) for n in shared] for s in (fit.scene, scene))
+    names, wanted = fit.scene.names, scene.names
+    there, here = zip(*((i, names.index(name)) for i, name in enumerate(wanted) if name in names), strict=True)
     scale[np.ix_(there, there)] = fit.covariance[np.ix_(here, here)]
     return newton_mixture(target, start, scale)
 
@@ -464,7 +464,7 @@ def exponent_covariance(fit: FieldFit) -> FloatArray:
     if fit.target.problem.departure is None:
         return covariance
     shared, exponent, _ = _regression(fit)
-    weight, p = fit.target.field_weights(fit.mode), len(fit.scene.alone().names)
+    weight, p = fit.target.field_weights(fit.mode), fit.scene.own
     moved = exponent * (shared - weight @ shared)[:, 1 : p + 1]
     covariance[:p, :p] = (weight[:, None] * moved).T @ moved
     return covariance

@@ -7,7 +7,7 @@ from typing import Final, Literal
 
 import numpy as np
 
-from tactile_bayes.declarations import Record, replace
+from tactile_bayes.declarations import Record
 from tactile_bayes.geometry import BoolArray, FloatArray
 from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior.bump import FitCells, cell_mean_gaussian, covariance_from_log_widths
@@ -360,9 +360,10 @@ class Scene(Record):
         """(p,) typical small step of each parameter."""
         return np.array([STEP[name] for name in self.names])
 
-    def alone(self) -> Scene:
-        """Copy without the second structure."""
-        return replace(self, extra="")
+    @property
+    def own(self) -> int:
+        """Number of the bump's own parameters, which are the first."""
+        return len(_BUMP_NAMES[self.shape])
 
     def column(self, theta: FloatArray, name: str) -> FloatArray:
         """(...) values of one parameter of (..., p) vectors; those that the scene does not have are 0, v is u."""
@@ -483,7 +484,7 @@ def independent_variance(cells: FitCells) -> FloatArray:
 
 def linear_columns(cells: FitCells, *, tilt: bool) -> FloatArray:
     """(c, n) columns of level and tilt across the window, in units of its half width."""
-    ones = np.ones((1, len(cells)))
+    ones = np.ones_like(cells.value)[None]
     if not tilt:
         return ones
     x, y = cells.x_mm - cells.x_mm.mean(), cells.y_mm - cells.y_mm.mean()

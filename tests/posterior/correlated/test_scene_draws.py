@@ -92,7 +92,7 @@ def test_evidence_is_that_of_a_quadrature() -> None:
 @pytest.mark.parametrize("name", list(FITS))
 def test_gaussians_are_as_wide_as_the_density(name: str) -> None:
     fit = FITS[name]()
-    k = len(fit.scene.alone().names)
+    k = fit.scene.own
     exact = fit.sampled().finished(
         importance_draws(fit.sampled(), rng=np.random.default_rng(1)), np.random.default_rng(2)
     )
