@@ -222,10 +222,8 @@ def _worker_version() -> str:
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-# Items handed to the executor ahead of their results; bounds the memory that waiting items take.
-_WINDOW = 1024
-# Items named in a line on a fault they share.
-_LISTED = 3
+_WINDOW = 1024  #: Items handed to the executor ahead of their results; bounds the memory that waiting items take.
+_LISTED = 3  #: Items named in a line on a fault they share.
 
 
 DIED_TWICE = (

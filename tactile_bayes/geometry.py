@@ -22,8 +22,7 @@ Vector = Annotated[FloatArray, Meta(extra_json_schema={"items": {"type": "number
 """Field of a record that holds a list of numbers in its files."""
 Matrix = Annotated[FloatArray, Meta(extra_json_schema={"items": {"type": "array", "items": {"type": "number"}}})]
 """The same of a list of rows of numbers."""
-# A rotation's R R^T departs from the identity by no more.
-NOT_RIGID = 1e-6
+NOT_RIGID = 1e-6  #: A rotation's R R^T departs from the identity by no more.
 
 
 def rotation_from_quaternion(quaternion_wxyz: FloatArray) -> FloatArray:

@@ -37,8 +37,7 @@ MEAN_KPA: Final = 9.5
 LEAST_HARD_RATIO: Final = 8.0
 
 CELL_MM: Final = 1.0
-# A cell wider than this share of the narrower sigma is called coarse in the report.
-CELL_PER_SIGMA: Final = 0.75
+CELL_PER_SIGMA: Final = 0.75  #: A cell wider than this share of the narrower sigma is called coarse in the report.
 # Radius about the lump's centre inside which the map is fitted, where no size calibration says otherwise.
 FIT_RADIUS_MM: Final = 20.0
 
@@ -62,8 +61,7 @@ Background = Literal["fixed", "free"]
 Rotation = Literal["auto", "off", "on"]
 SceneAsked = Literal["auto", "none", "round", "ellipse", "rotated", "second-lump", "rib"]
 INTERVAL: Final = 0.95
-# Probability of the intervals of a size calibration that are held against bodies left out.
-HELD: Final = 0.9
+HELD: Final = 0.9  #: Probability of the intervals of a size calibration that are held against bodies left out.
 # Along each axis, of a map's noise field. Fewer are faster; what is finer than they resolve counts as independent.
 # A narrow bump gets more than these by itself, up to the second number.
 FIELD_COSINES: Final = 18

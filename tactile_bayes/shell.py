@@ -271,8 +271,7 @@ def _interrupt(number: int, frame: object) -> None:
 
 # --- Progress on stderr: a bar on a terminal for work that takes a while, lines in a log where a command asks for them.
 
-# Work that ends sooner draws nothing.
-QUIET_S = 2.0
+QUIET_S = 2.0  #: Work that ends sooner draws nothing.
 # Seconds between two drawings.
 REDRAW_S = 0.1
 _WIDTH = 30

@@ -40,8 +40,7 @@ if TYPE_CHECKING:
 
 # --- Sampler for the next mass's model: importance sampling about the mode, or MCMC where it cannot be trusted.
 
-# Monte-Carlo error of interval ends, in posterior SDs.
-_ACCURACY_SD = 0.03
+_ACCURACY_SD = 0.03  #: Monte-Carlo error of interval ends, in posterior SDs.
 
 
 def draw(

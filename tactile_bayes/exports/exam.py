@@ -76,13 +76,11 @@ FHIR_SYSTEMS: Final = {
 # CID 7469 Generic Intensity and Size Measurements
 LONG_AXIS: Final = Code("103339001", "SCT", "Long axis")
 SHORT_AXIS: Final = Code("103340004", "SCT", "Short axis")
-# CID 7464 General Region of Interest Measurement Modifiers
-MEDIAN: Final = Code("373099004", "SCT", "Median")
+MEDIAN: Final = Code("373099004", "SCT", "Median")  #: CID 7464 General Region of Interest Measurement Modifiers
 # CID 225 Measurement Uncertainty
 UPPER_RANGE: Final = Code("371886008", "SCT", "+, range of upper measurement uncertainty")
 LOWER_RANGE: Final = Code("371885007", "SCT", "-, range of lower measurement uncertainty")
-# CID 6055 Breast Clinical Finding or Indicated Problem
-BREAST_LUMP: Final = Code("89164003", "SCT", "Breast lump")
+BREAST_LUMP: Final = Code("89164003", "SCT", "Breast lump")  #: CID 6055 Breast Clinical Finding or Indicated Problem
 # CID 4031 Common Anatomic Regions, CID 6022 Side, CID 244 Laterality
 BREAST: Final = Code("76752008", "SCT", "Breast")
 SIDES: Final = {"left": Code("7771000", "SCT", "Left"), "right": Code("24028007", "SCT", "Right")}

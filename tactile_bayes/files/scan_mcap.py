@@ -428,8 +428,7 @@ def _decode(kind: Any, body: bytes) -> Any:
 
 LOG_TOPIC: Final = "/log"
 ACCOUNT: Final = "recording"
-# So often what was handed to the system is seen onto the disk: power may fail.
-SYNC_S: Final = 0.5
+SYNC_S: Final = 0.5  #: So often what was handed to the system is seen onto the disk: power may fail.
 
 
 def create_exclusive(path: Path, *, force: bool) -> IO[bytes]:

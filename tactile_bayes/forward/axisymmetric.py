@@ -244,8 +244,7 @@ def _mean_over_two_squares(
 # two-dimensional problem. The body around the lump is condensed once onto the lump's boundary and the skin; a lump
 # of any stiffness is then a small dense matrix on that boundary.
 
-# Orders m are left out from where their share of the perturbation has fallen to this.
-_LEAST_SHARE: Final = 1e-4
+_LEAST_SHARE: Final = 1e-4  #: Orders m are left out from where their share of the perturbation has fallen to this.
 
 
 class ModePerturbation(Record, eq=False):

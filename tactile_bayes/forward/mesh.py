@@ -25,10 +25,8 @@ from tactile_bayes.geometry import FloatArray
 
 IndexArray = np.ndarray[tuple[int, ...], np.dtype[np.intp]]
 
-# Half width of the box about the lump, and how far it reaches above and below the centre, in diameters.
-_BOX = 0.75
-# A box whose top would leave less than this many diameters of rows above it goes to the skin.
-_LEAST_ABOVE = 0.35
+_BOX = 0.75  #: Half width of the box about the lump, and how far it reaches above and below the centre, in diameters.
+_LEAST_ABOVE = 0.35  #: A box whose top would leave less than this many diameters of rows above it goes to the skin.
 # Beyond the outermost head position (72 mm) the body goes on for this many thicknesses.
 _BEYOND = 3.0
 REACH_MM = 72.0

@@ -24,16 +24,13 @@ from tactile_bayes.presets import HEAD_PITCH_MM
 # The skin's compliance under the head is the exact one of the layers without a lump, plus what each lump changes,
 # condensed to a few functions about the lump's vertical axis. Several lumps are summed as if each were alone.
 
-# Functions that carry less than this share of the largest are left out.
-RANK_TOLERANCE: Final = 1e-5
+RANK_TOLERANCE: Final = 1e-5  #: Functions that carry less than this share of the largest are left out.
 # Step of the tables in r: linear interpolation between entries is then off by less than 1e-4 of a function.
 STEP_MM: Final = 0.05
-# Largest r in the tables.
-REACH_MM: Final = 75.0
+REACH_MM: Final = 75.0  #: Largest r in the tables.
 # Functions with a sum of squares under the face below this share of a square's own compliance are left out of a frame.
 _LEAST_WEIGHT: Final = 1e-6
-# Directions of the ring that stands for a square when a function is averaged over it.
-_DIRECTIONS: Final = 24
+_DIRECTIONS: Final = 24  #: Directions of the ring that stands for a square when a function is averaged over it.
 
 
 class SkinPerturbation(Record, eq=False):

@@ -177,12 +177,9 @@ def _squares(half_mm: float, reach_mm: float, pitch_mm: float) -> int:
 
 # --- Lumps of tissue in a body, as a scene gives them: sizes, depths and stiffness instead of a bump's shape.
 
-# Default thickness of the fat in a scene without lumps.
-PLAIN_FAT_MM = 15.0
-# Fat thicknesses that lumps imply may differ by this before they are called different.
-_SAME_MM = 0.01
-# The skin over a lump, and the tissue under it, as a share of its half height.
-_LEAST_COVER = 0.02
+PLAIN_FAT_MM = 15.0  #: Default thickness of the fat in a scene without lumps.
+_SAME_MM = 0.01  #: Fat thicknesses that lumps imply may differ by this before they are called different.
+_LEAST_COVER = 0.02  #: The skin over a lump, and the tissue under it, as a share of its half height.
 
 Place = Annotated[float, says("Centre in the plane, mm.", ge=-500, le=500)]
 Diameter = Annotated[
@@ -293,8 +290,7 @@ class Rib(Record):
         )
 
 
-# Every ball is solved for in every frame.
-MOST_BALLS = 60
+MOST_BALLS = 60  #: Every ball is solved for in every frame.
 
 
 def fat_thickness(body: SceneBody, lumps: Sequence[SolidLump]) -> float:

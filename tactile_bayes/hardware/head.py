@@ -287,8 +287,7 @@ def check_link_rate(hello: readings.HelloReading, *, baud: int, every: int = 1, 
 DEAD_SHARE: Final = 0.1
 HOT_RATIO: Final = 2.5
 MIN_FRAMES: Final = 10
-# With fewer steps a curvature fits the noise.
-STEPS_FOR_CURVATURE: Final = 4
+STEPS_FOR_CURVATURE: Final = 4  #: With fewer steps a curvature fits the noise.
 
 
 class BladderStep(Record, eq=False):
@@ -412,8 +411,7 @@ def _places(mask: NDArray[np.bool_]) -> tuple[tuple[int, int], ...]:
 # --- Test of a tracker's rotation convention (sensor to base, or inverse) by turning it about a fixed point.
 
 LEAST_TURN_DEG: Final = 20.0
-# How many times worse the wrong sense must fit before the right one is believed.
-CLEAR: Final = 3.0
+CLEAR: Final = 3.0  #: How many times worse the wrong sense must fit before the right one is believed.
 
 
 class RotationSense(Record):

@@ -28,8 +28,7 @@ from tactile_bayes.hardware import reading
 #
 # A `DeviceError` from here is one line: which port, what was expected, what came, what to try.
 
-# How long a device may take to answer.
-ANSWER_S = 2.5
+ANSWER_S = 2.5  #: How long a device may take to answer.
 # Without a byte for so long a device has gone.
 SILENT_S: Final = 3.0
 _SHOWN_BYTES: Final = 12
@@ -41,8 +40,7 @@ _READ_S: Final = 0.01
 GONE: Final = (OSError, serial.SerialException, termios.error)
 # In "[Errno 111] Connection refused" and "(25, 'Inappropriate ioctl for device')".
 _ERROR_NUMBER: Final = re.compile(r"(?:\[Errno |\()(\d+)[\],]")
-# Of a network's URL: host and port.
-_NETWORK: Final = ("socket://", "rfc2217://")
+_NETWORK: Final = ("socket://", "rfc2217://")  #: Of a network's URL: host and port.
 
 
 class Port:
@@ -234,10 +232,8 @@ def guess(vendor: int | None, product: str) -> str:
 
 # --- The recorder's end of a reading process: pipe, bytes with arrival times, losses.
 
-# Room for six seconds of a head at 200 Hz while the writer waits for the disk.
-PIPE_BYTES: Final = 1 << 20
-# A reader starts in 20 ms; on a busy computer it may take seconds.
-READY_S: Final = 15.0
+PIPE_BYTES: Final = 1 << 20  #: Room for six seconds of a head at 200 Hz while the writer waits for the disk.
+READY_S: Final = 15.0  #: A reader starts in 20 ms; on a busy computer it may take seconds.
 
 
 class Piece(NamedTuple):

@@ -229,8 +229,7 @@ def _product(a: Quaternion, b: Quaternion) -> Quaternion:
     )
 
 
-# More missing records than this are no loss: a silent device ends a recording long before.
-MOST_LOST: Final = 100_000
+MOST_LOST: Final = 100_000  #: More missing records than this are no loss: a silent device ends a recording long before.
 
 
 class SequenceCheck:
@@ -259,10 +258,8 @@ _WINDOW_NS: Final = 2_000_000_000
 _S: Final = 1_000_000_000
 # Files hold times as signed 64-bit ns. A clock that has counted for longer than this (146 years) loses whole periods.
 LATEST_NS: Final = 1 << 62
-# A record cannot be measured this much later than it arrives: its clock has stepped forward.
-AHEAD_NS: Final = 2 * _S
-# How well a wrap must agree with the time that passed on this computer.
-_SLIP_NS: Final = _S // 4
+AHEAD_NS: Final = 2 * _S  #: A record cannot be measured this much later than it arrives: its clock has stepped forward.
+_SLIP_NS: Final = _S // 4  #: How well a wrap must agree with the time that passed on this computer.
 # After so many steps a clock is not believed any more.
 MOST_STEPS: Final = 20
 STILL_NS: Final = _S // 10

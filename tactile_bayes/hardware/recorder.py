@@ -25,8 +25,7 @@ from tactile_bayes.mapping.select import Jumps, Span, apart, overlap_cautions
 _RATE_SHARE: Final = 0.02
 _RATE_LEAST_S: Final = 0.5
 _STUCK_POSES: Final = 10
-# Of missing or flagged poses: fewer are those of any exam.
-_TOLD_SHARE: Final = 0.01
+_TOLD_SHARE: Final = 0.01  #: Of missing or flagged poses: fewer are those of any exam.
 
 
 @dataclass(slots=True)
@@ -106,8 +105,7 @@ def _oddities(report: Report) -> Iterator[str]:
 # --- Touching of landmarks with the head's apex: the mean of several poses, and their spread.
 
 SAMPLES: Final = 60
-# A hand at rest on bone; more says that the head slipped while it touched.
-STEADY_MM: Final = 2.0
+STEADY_MM: Final = 2.0  #: A hand at rest on bone; more says that the head slipped while it touched.
 
 
 class Touch(Record, eq=False):
@@ -161,8 +159,7 @@ class LandmarkTouch:
 
 FLUSH_S: Final = 0.2
 DRAIN_S: Final = 0.25
-# A recording with a duration goes on for so long at most when the head's clock is behind.
-OVERTIME_S: Final = 1.0
+OVERTIME_S: Final = 1.0  #: A recording with a duration goes on for so long at most when the head's clock is behind.
 # After so long without a pose the examiner is told, also where the tracker says nothing.
 _HIDDEN_NS: Final = 300_000_000
 _MOST_TOLD: Final = 5

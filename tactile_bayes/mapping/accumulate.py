@@ -166,8 +166,7 @@ class _System:
 
 # --- Response of each taxel to an even pressure, from frames without a lump.
 
-# Frames that are looked at, spread evenly over the scan.
-MOST_FRAMES = 4096
+MOST_FRAMES = 4096  #: Frames that are looked at, spread evenly over the scan.
 # A frame is called lump-free when its departure from the head's usual profile is within this factor of the calmest
 # tenth's, and there must be this many of them.
 CALM_FACTOR = 1.1
@@ -368,8 +367,7 @@ RUN_FRAMES = 25
 # Fewer readings (of about that many frames' worth) than this, about a map that other frames made, say nothing.
 LEAST_RUNS = 2
 LEAST_READINGS = 1000
-# Neighbours are compared up to this distance, in taxel pitches.
-REACH_PITCHES = 8
+REACH_PITCHES = 8  #: Neighbours are compared up to this distance, in taxel pitches.
 # A length is told only where at least this share is common to neighbours, and none longer than this (mm).
 LEAST_SHARE = 0.02
 LONGEST_MM = 100.0

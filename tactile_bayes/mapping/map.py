@@ -32,8 +32,7 @@ def smooth(values: NDArray[np.generic], *, passes: int = 4) -> FloatArray:
 
 # --- The tactile map, with the recipe by which it was built.
 
-# A cell with fewer readings than this is flagged: its mean is noisy, and its variance says little.
-FEW_READINGS = 10
+FEW_READINGS = 10  #: A cell with fewer readings than this is flagged: its mean is noisy, and its variance says little.
 
 
 class MapRecipe(Record):

@@ -54,8 +54,7 @@ def marks_limit(marks: NDArray[np.uint64], most: int) -> np.uint64:
 # Frames that are read, chosen by their marks; those of a scan of 10 s at 200 Hz are read all.
 MOST_FRAMES = 2048
 _CHUNK = 128
-# The figures are means of whole multiples of this.
-_STEP = 2.0**-32
+_STEP = 2.0**-32  #: The figures are means of whole multiples of this.
 # A frame is called lump-free when what is left of it beside a smooth profile is within this factor of the smoothest
 # tenth's, and there must be this many of them.
 SMOOTH_FACTOR = 1.1
@@ -205,8 +204,7 @@ SPAN_MM = 30.0  #: Distance over which a change of the profile is stated.
 # Neighbouring frames share errors: standard errors come from leaving out every tenth stretch of this many seconds.
 _STRETCH_S = 0.5
 _GROUPS = 10
-# A direction that the head moved in by less than this (SD, mm) tells no change.
-_LEAST_SPREAD_MM = 3.0
+_LEAST_SPREAD_MM = 3.0  #: A direction that the head moved in by less than this (SD, mm) tells no change.
 # Columns of the regression.
 _X, _Y, _WAY = 1, 2, 3
 

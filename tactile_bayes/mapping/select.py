@@ -35,10 +35,8 @@ DEAD_SHARE = 0.1
 HOT_RATIO = 2.0
 FLICKER_RATIO = 10.0
 FLICKER_KPA = 1.0
-# One that is saturated in a larger share of the frames is left out of all of them.
-SATURATED_SHARE = 0.1
-# Fewer frames than this say nothing about what never changes.
-MIN_FRAMES = 10
+SATURATED_SHARE = 0.1  #: One that is saturated in a larger share of the frames is left out of all of them.
+MIN_FRAMES = 10  #: Fewer frames than this say nothing about what never changes.
 # One that repeats its last count in a larger share of the frames, where most do so in less than half of that, is stuck.
 STILL_SHARE = 0.5
 # One that keeps a count through this share of the blocks of so many frames in which most taxels change dies on the way.
@@ -151,8 +149,7 @@ def _element_levels(scan: Scan) -> _Levels:
 
 # --- Regularity of frames and poses: rates, jitter, repeats, gaps and missing records.
 
-# An interval longer than this many usual ones holds frames that never came.
-_GAP_INTERVALS = 1.5
+_GAP_INTERVALS = 1.5  #: An interval longer than this many usual ones holds frames that never came.
 
 
 def timing_figures(scans: Sequence[Scan]) -> dict[str, float]:
@@ -223,10 +220,8 @@ def _with_frames(scan: Scan, kept: slice) -> Scan:
 
 # --- Overlap in time of a scan's poses and frames, and cautions where it is poor.
 
-# Shorter mismatches and gaps cost a few frames at most.
-TOLERATED_S: Final = 0.1
-# Frames are missing where an interval is this many times the mean.
-_LONG_INTERVALS: Final = 5.0
+TOLERATED_S: Final = 0.1  #: Shorter mismatches and gaps cost a few frames at most.
+_LONG_INTERVALS: Final = 5.0  #: Frames are missing where an interval is this many times the mean.
 
 
 @dataclass(slots=True)
@@ -260,8 +255,7 @@ class Span:
 # A hand moves slower than this between two poses, beside what a tracker's noise adds.
 _HAND_MM_PER_S: Final = 5_000.0
 _NOISE_MM: Final = 30.0
-# Of a step, what the two poses are apart from being opposite to each other.
-_OPPOSITE_SHARE: Final = 0.2
+_OPPOSITE_SHARE: Final = 0.2  #: Of a step, what the two poses are apart from being opposite to each other.
 
 
 @dataclass(slots=True)
@@ -352,8 +346,7 @@ def with_times(findings: Sequence[Finding], frames: Span, poses: Span) -> tuple[
 
 # --- Selection of the frames that go into a map, and the reasons for leaving others out (paper step ii, the gate).
 
-# A frame with a smaller share of valid taxels than this is dropped.
-VALID_SHARE = 0.9
+VALID_SHARE = 0.9  #: A frame with a smaller share of valid taxels than this is dropped.
 
 
 class SelectedFrames(Record, eq=False, dict=True):

@@ -24,15 +24,13 @@ from tactile_bayes.mapping.latency import ShiftFit
 
 # --- Registration of single strokes: shifts along x that put a lump that moves with the head back in one place.
 
-# A stroke's shift counts as known when its standard error is below this.
-KNOWN_SD_MM = 0.5
+KNOWN_SD_MM = 0.5  #: A stroke's shift counts as known when its standard error is below this.
 # Shifts are taken to scatter by this (SD) before the scan is looked at; none is taken to be longer than twice that.
 EXPECTED_MM = 4.0
 # By this (SD) strokes over still lumps of the solid model differ, beyond noise: the frames are not the map's alone.
 MISFIT_MM = 0.06
 _ROUNDS = 4
-# Frames are thinned out until all strokes' designs together have no more numbers than this.
-_MOST_NUMBERS = 3e7
+_MOST_NUMBERS = 3e7  #: Frames are thinned out until all strokes' designs together have no more numbers than this.
 
 
 class StrokeShift(Record):
@@ -240,8 +238,7 @@ def _moved(source: Source, strokes: list[StrokeShift]) -> Source:
 # wide. One unknown of the regression in `mapping.latency.ShiftFit`, in one round: enough for a warning.
 # `register_strokes` finds each stroke's shift.
 
-# Averaged frames that are used, spread evenly: more would cost as much as the map itself.
-MOST_FRAMES = 160
+MOST_FRAMES = 160  #: Averaged frames that are used, spread evenly: more would cost as much as the map itself.
 
 
 def stroke_lag_figures(sources: Sequence[Source]) -> dict[str, float]:

@@ -471,8 +471,7 @@ def _row_of_setting(one: Measured, report: TradeoffReport) -> dict[str, Any]:
 
 # --- Figure of the forward models' trade-off: error in size against CPU time.
 
-# Smaller errors are drawn here: below rounding of what anybody reads.
-_LEAST_PERCENT = 0.003
+_LEAST_PERCENT = 0.003  #: Smaller errors are drawn here: below rounding of what anybody reads.
 
 
 def draw_tradeoff(report: TradeoffReport, path: Path, *, force: bool = False) -> None:

@@ -22,8 +22,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _SCALE_BAR_MM = 10.0
-# Lines of hatching across the longer side of the map.
-_HATCHES = 60
+_HATCHES = 60  #: Lines of hatching across the longer side of the map.
 # The colours span at least this share of the level below and above it, so that noise alone does not look like a lump.
 _LEAST_COLOURS = (0.9, 1.3)
 # With a fit they end so many amplitudes above the level, so that a rib beside the lump does not take them all.
@@ -39,10 +38,8 @@ _ABOVE: Final[dict[str, Any]] = {
 }
 # Of a legend below a picture, where it hides no cell.
 _BELOW: Final[dict[str, Any]] = {"loc": "upper left", "bbox_to_anchor": (0.0, 0.0), "borderaxespad": 4.0}
-# Width of a figure and its height at most: it ends where its panels do.
-_MOST_IN: Final = (10.0, 9.0)
-# Places that were looked at in vain: so many are explained, the others are only marked.
-_EXPLAINED_PLACES: Final = 4
+_MOST_IN: Final = (10.0, 9.0)  #: Width of a figure and its height at most: it ends where its panels do.
+_EXPLAINED_PLACES: Final = 4  #: Places that were looked at in vain: so many are explained, the others are only marked.
 
 
 class FitContour(Record):

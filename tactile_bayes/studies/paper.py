@@ -44,8 +44,7 @@ FIT_RADIUS_MM = 48.0
 # A bump lower than this share of the background is not called detectable, nor one whose width is not resolved.
 DETECTABLE = 0.02
 HARD_RATIO = 100.0
-# The line is a map that does not change in y: a bump of this width there.
-_NO_CHANGE_MM = 1e6
+_NO_CHANGE_MM = 1e6  #: The line is a map that does not change in y: a bump of this width there.
 
 
 class CaseSettings(CaseOptions, kw_only=True):
@@ -319,8 +318,7 @@ LEAST_RISE = 0.1
 """A lump takes part when it raises the middle of the head by this share of the frame's mean: five times the noise."""
 LEAST_SIZE_RATIO = 1.5  #: Of the larger lump's diameter to the smaller one's.
 ALIKE = 0.05  #: Frames that differ by less than this share of what the lump adds are called indistinguishable.
-# Of the depths in diameters that are tried by interpolation between those solved.
-_STEP = 0.01
+_STEP = 0.01  #: Of the depths in diameters that are tried by interpolation between those solved.
 
 
 class CentredFrame(Record, eq=False):

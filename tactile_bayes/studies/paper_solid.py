@@ -30,12 +30,10 @@ from tactile_bayes.studies.paper import CaseSettings
 
 # Readings travel as whole numbers: this many a unit of the frame's mean, so that 30 times the mean still fits.
 _COUNTS: Final = 2048
-# Where the rest of the program would leave out frames by their mean, which here is 1.
-_WINDOW: Final = (0.5, 2.0)
+_WINDOW: Final = (0.5, 2.0)  #: Where the rest of the program would leave out frames by their mean, which here is 1.
 # A narrower bump than this share of the taxels' pitch is one that the pitch does not resolve.
 _LEAST_WIDTH_IN_PITCHES: Final = 0.8
-# Widths that are tried before the best pair of them is refined, along each axis.
-_TRIED: Final = 14
+_TRIED: Final = 14  #: Widths that are tried before the best pair of them is refined, along each axis.
 
 
 def raster_map(frames: RasterFrames) -> TactileMap:

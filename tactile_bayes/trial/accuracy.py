@@ -36,8 +36,7 @@ from tactile_bayes.trial.readings import FloatArray, ModalitySizes
 
 # --- Cautions about a modality's intervals, where the data meet a caution's condition.
 
-# Up to so many misses, each moves the mean error by more than an uncorrected interval allows for.
-FEW_MISSES = 3
+FEW_MISSES = 3  #: Up to so many misses, each moves the mean error by more than an uncorrected interval allows for.
 
 
 def cautions(sizes: ModalitySizes, *, confidence: float) -> tuple[str, ...]:

@@ -178,8 +178,7 @@ def clopper_pearson(k: float, n: float, *, confidence: float) -> tuple[float, fl
 Method = Literal["corrected", "jackknife", "bca"]
 RESAMPLES = 2000
 SEED = 1999
-# Of the redrawn trials, at least this share must have the figure at all.
-_LEAST_DEFINED = 0.99
+_LEAST_DEFINED = 0.99  #: Of the redrawn trials, at least this share must have the figure at all.
 
 
 class Intervals(float):
@@ -240,8 +239,7 @@ def bca_interval(value: float, drawn: FloatArray, left_out: FloatArray, *, confi
 
 # --- A figure of a trial: a number, its interval, and the reason where one of them is missing.
 
-# Room above for percent and squares; NaN fails the comparison too.
-LARGEST = 1e150
+LARGEST = 1e150  #: Room above for percent and squares; NaN fails the comparison too.
 
 Statistic = Callable[[ModalitySizes], float]
 Leverage = Callable[[ModalitySizes], FloatArray]

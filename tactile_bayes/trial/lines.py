@@ -17,8 +17,7 @@ from tactile_bayes.trial.readings import FloatArray
 
 # Up to so many points the pairs are listed (2 million of them); beyond, ranks are found by counting inversions.
 MOST_LISTED = 2000
-# Beyond MOST_LISTED an ordered angle is found to this many radians.
-RESOLUTION = 1e-9
+RESOLUTION = 1e-9  #: Beyond MOST_LISTED an ordered angle is found to this many radians.
 # Differences below this share of the mean of the two numbers are rounding, as in laboratories' programs.
 _EQUAL = 1e-12
 

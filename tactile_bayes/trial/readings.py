@@ -251,8 +251,7 @@ def _gather_modality(
 # Largest extents of palpable masses lie well inside; beyond, a size is more likely in another unit or misplaced.
 LEAST_MM, MOST_MM = 2.0, 150.0
 UNITS = {"cm": 10.0, "inches": 25.4, "m": 1000.0}
-# A median ratio within this factor of a unit is doubted. No modality is wrong sixfold in the median.
-NEAR = 1.6
+NEAR = 1.6  #: A median ratio within this factor of a unit is doubted. No modality is wrong sixfold in the median.
 
 
 def unit_doubts(sizes: Mapping[str, ModalitySizes], ex_vivo_mm: FloatArray) -> list[str]:
