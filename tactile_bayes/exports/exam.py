@@ -150,9 +150,7 @@ class SizedMass(Record, eq=False):
     probability: float | None = None  #: That there is a lump; None where the file does not tell.
     centre_mm: tuple[float, float] | None = None
     centre_patient_mm: tuple[float, float] | None = None
-    """`centre_mm`, `centre_patient_mm`: Medians of x and y in `plane` and in `patient`; None where the file does not
-    tell.
-    """
+    """`centre_mm`, `centre_patient_mm`: Medians of x and y in `plane` and in `patient`; None where it is not told."""
     alike_exams: str = ""
     """The interval if exams of the mass differ less, in words; empty where there is one interval."""
 

@@ -92,9 +92,7 @@ def read_wide(path: Path, mapping_path: Path) -> Table:
 
 
 def read_wide_excision(path: Path, mapping_path: Path) -> Table:
-    """Read ex-vivo sizes from a wide table into columns of ``excision.table.json``; rows without a size are
-    left out.
-    """
+    """Read ex-vivo sizes of a wide table into columns of ``excision.table.json``; rows without one are left out."""
     mapping = read_mapping(mapping_path)
     excision = mapping.excision
     if excision is None:

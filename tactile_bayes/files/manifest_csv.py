@@ -61,9 +61,7 @@ class Exam(Record):
 
     file: str
     path: Path
-    """`file`, `path`: As the table has it, and where it is, absolute; of a file in an object store the path is no more
-    than a name.
-    """
+    """`file`, `path`: As the table has it, and where it is, absolute; only a name for a file in an object store."""
     patient: str
     visit: str
     mass: str

@@ -78,9 +78,7 @@ class MapHeader(Record, kw_only=True):
 
 
 def write_map(path: Path, tactile_map: TactileMap, *, provenance: Provenance, force: bool = False) -> None:
-    """Write a map atomically, readable by its owner only; `provenance` holds no clock time, so equal maps give equal
-    bytes.
-    """
+    """Write a map atomically, readable by its owner only; equal maps give equal bytes: no clock time is held."""
     _check_lattice({"x_mm": tactile_map.x_mm, "y_mm": tactile_map.y_mm}, tactile_map.recipe.cell_mm)
     groups = {"/": Contents(_variables(tactile_map), _attributes(tactile_map, provenance))}
     write_bytes(path, grouped_netcdf_bytes(groups), force=force)
@@ -314,9 +312,7 @@ def read_posterior(path: Path) -> PosteriorDraws:
 
 
 def read_estimate(path: Path) -> EstimateReport:
-    """The estimate's report, as ``estimate --json`` prints it, from its posterior's file. A pooled posterior has none
-    and is refused.
-    """
+    """The estimate's report, as ``estimate --json`` prints it, from its posterior's file; a pooled one is refused."""
     attributes = posterior_attributes(path, way_out="give what `estimate` wrote with -o") or {}
     if attributes.get("method") == "pooled":
         raise BadDataError("holds a size pooled from several maps", way_out="give the maps", path=str(path))

@@ -163,9 +163,7 @@ class McapRecords:
     lost: list[str] = field(default_factory=list)  #: One line a loss.
 
     def messages(self, topic: str, *, schema: str, name: str | None = None) -> Messages:
-        """Messages of a topic (and of channels with that `name` in their metadata). A channel of another type is an
-        error.
-        """
+        """Messages of a topic, and of channels with that `name` in their metadata; another type is an error."""
         found = Messages()
         for number, channel in self.channels.items():
             if channel.topic != topic or (name is not None and channel.metadata.get("name") != name):
@@ -221,9 +219,7 @@ class McapRecords:
 
 
 def read_records(path: Path, *, keep: Collection[str] | None = None) -> McapRecords:
-    """Read a file from front to back, with or without its index; of topics not in `keep` only the times, None keeps
-    all.
-    """
+    """Read a file from front to back, with or without its index; of topics not in `keep` (None: all) only the times."""
     records = McapRecords(keep=keep)
     with open_input(path) as stream, in_file(path):
         try:

@@ -257,9 +257,7 @@ _TIMES_BESIDE: Final = {"frame_time_s": ("counts", "frames"), "pose_time_s": ("p
 def plain_names(
     names: Sequence[str], known: Mapping[str, str], values: Mapping[str, Any] | None = None
 ) -> dict[str, str]:
-    """Names in a file that are plain words for arrays which are neither `known` in it nor `values` given elsewhere, by
-    the names here.
-    """
+    """A file's plain words for arrays neither `known` in it nor `values` given elsewhere, by the names here."""
     found: dict[str, str] = {}
     for here, words in _PLAIN_WORDS.items():
         same = {here, "frames"} if here == "counts" else {here}

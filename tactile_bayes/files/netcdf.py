@@ -173,9 +173,7 @@ class Group:
         return sorted(name for name in map(str, self._place) if self._array(name) is not None)
 
     def array(self, name: str, *, kind: str, dimensions: tuple[str, ...]) -> Any:
-        """The values of a variable of the given type (``f8``, ``i8``, ``u2``) and dimensions; None where
-        there is none.
-        """
+        """Values of a variable of this type (``f8``, ``i8``, ``u2``) and dimensions; None where there is none."""
         found = self._array(name)
         if found is None:
             return None

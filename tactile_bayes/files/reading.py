@@ -237,9 +237,7 @@ def kind_of(path: Path) -> str:
 
 
 def schema_kind(schema: object) -> str:
-    """Kind of a document in words by its ``schema``, such as ``tactile-bayes/estimate/1``; empty for another
-    program's.
-    """
+    """Kind of a document in words by its ``schema``, such as ``tactile-bayes/estimate/1``; empty for others."""
     parts = schema.split("/") if isinstance(schema, str) else []
     if len(parts) < 2 or parts[0] != "tactile-bayes":
         return ""
@@ -347,9 +345,7 @@ def _store(address: str) -> Any:
 
 @contextlib.contextmanager
 def _of_store(address: str) -> Iterator[None]:
-    """Faults of reading: a file's own where there is none or nobody may read it; otherwise the store's, which spares
-    the exam.
-    """
+    """Faults of reading: a file's own where it is missing or closed; otherwise the store's, which spares the exam."""
     try:
         yield
     except UsageError:

@@ -285,9 +285,7 @@ class ScanFile(Record, eq=False):
 
 
 def read_scan_report(path: Path) -> ScanFile:
-    """Read a scan, with a report of the file's content and losses. A file cut off before its first complete chunk is an
-    error.
-    """
+    """Read a scan, and what its file holds and lost; one cut off before its first complete chunk is an error."""
     records = scan_records(path, keep=TOPICS)
     with in_file(path):
         head = attached(records, HeadGeometry, "head.json")
@@ -508,9 +506,7 @@ class _Syncer:
 
 
 class RecordingWriter(ScanWriter):
-    """A `ScanWriter` that can flush at once, and stores notes about problems; the session was checked before the file
-    was made.
-    """
+    """A `ScanWriter` that can flush at once and stores notes about problems; the session was checked before."""
 
     def __init__(
         self,

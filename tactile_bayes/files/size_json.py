@@ -294,9 +294,7 @@ def repeatability_document(
     half_width: HalfWidth | None,
     provenance: Provenance,
 ) -> dict[str, Any]:
-    """The JSON object, in numbers of nine significant digits; `left_out` are exams that took no part, with
-    the reason.
-    """
+    """The JSON object, in nine significant digits; `left_out` are exams that took no part, with the reason."""
     file = RepeatabilityFile(
         schema="tactile-bayes/repeatability/1",
         research_use=RESEARCH_USE,

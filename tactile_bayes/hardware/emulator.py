@@ -161,9 +161,7 @@ class Served:
 
 
 class Stage:
-    """Clock of a scan being played, shared by all devices that play it together; `speed` is seconds of the scan in a
-    second.
-    """
+    """Clock of a scan that devices play together; `speed` is seconds of the scan in a second."""
 
     def __init__(self, *, speed: float = 1.0, clock: Callable[[], float] = time.monotonic) -> None:
         self._speed, self._clock = speed, clock

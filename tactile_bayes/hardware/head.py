@@ -268,9 +268,7 @@ def needed_baud(taxels: int, *, rate_hz: float) -> int:
 
 
 def check_link_rate(hello: readings.HelloReading, *, baud: int, every: int = 1, port: str = "head") -> None:
-    """Refuse a line too slow for every n-th of the head's frames, with the rate needed and the decimation that would
-    fit.
-    """
+    """Refuse a line too slow for every n-th of the head's frames; the rate needed and what would fit are told."""
     need = needed_baud(hello.rows * hello.columns, rate_hz=hello.rate_hz / every)
     if need <= baud:
         return
@@ -323,9 +321,7 @@ class ArrayFit(Record, eq=False):
     hot: tuple[tuple[int, int], ...]
     """`dead`, `hot`: (row, column) of taxels that hardly answer, or far too much."""
     nonuniformity: FloatArray
-    """(steps,) array: Standard deviation over the good taxels of the calibrated pressure, as a share of the step's (NaN
-    at 0).
-    """
+    """(steps,) array: SD of the calibrated pressure over the good taxels, as a share of the step's (NaN at 0)."""
     curved_nonuniformity: FloatArray  #: (steps,) array: The same with the parabolas.
     pressure_kpa: FloatArray  #: (steps,) array: Rising.
 

@@ -233,9 +233,7 @@ MOST_LOST: Final = 100_000  #: More missing records than this are no loss: a sil
 
 
 class SequenceCheck:
-    """Counts missing records by a 32-bit counter that wraps, and restarts: back, or forward by more than
-    `MOST_LOST`.
-    """
+    """Counts missing records by a 32-bit counter that wraps, and restarts: back, or `MOST_LOST` and more ahead."""
 
     def __init__(self) -> None:
         self._expected: int | None = None

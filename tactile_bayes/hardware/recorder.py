@@ -132,9 +132,7 @@ class Touch(Record, eq=False):
 
 
 class LandmarkTouch:
-    """Averages the next `samples` poses to a landmark: the apex of the head touches it, the tracker sits in
-    the handle.
-    """
+    """Averages the next `samples` poses to a landmark that the head's apex touches; the tracker is in the handle."""
 
     def __init__(self, name: str, *, scanhead_from_tracker: FloatArray, samples: int = SAMPLES) -> None:
         self.name = name

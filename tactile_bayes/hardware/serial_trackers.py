@@ -410,9 +410,7 @@ TRACKERS: Final[dict[str, TrackerDriver]] = {
 
 
 def open_tracker(protocol: str, url: str, *, baud: int | None = None, roms: Sequence[Path] = ()) -> Port:
-    """Open the port of a tracker, at the protocol's own rate where none is given; `roms` describe wireless NDI
-    tools.
-    """
+    """Open the port of a tracker, by default at the protocol's own rate; `roms` describe wireless NDI tools."""
     if protocol == "ndi":
         return NdiPort(url, roms=roms)
     return Port(url, baud=baud or TRACKERS[protocol].baud or 9600, role="tracker")
