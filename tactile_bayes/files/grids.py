@@ -171,7 +171,7 @@ def _no_number(rows: Sequence[list[str]], marks: set[str], before: int) -> BadDa
         way_out = "leave out the column of names"
     elif (row, column) == (before + 1, 1) and len(faults) == 1:
         way_out = f"leave out the labels of rows and columns; {way_out}"
-    elif re.search(r"\d", field):
+    elif re.search(r"\d", field) and "#" not in field:  # 1.#QNAN and #DIV/0! are words
         way_out = "write numbers as 1.5"
     return BadDataError(what, way_out=way_out)
 
@@ -486,7 +486,10 @@ def _divided(made: TactileMap, level: float | str) -> TactileMap:
         background=1.0,
         findings=(*made.findings, *([found] if isinstance(level, str) else [])),
     )
-    _check_level(divided.mean[divided.covered], normalise="gain", units="")
+    median = float(np.median(divided.mean[divided.covered]))
+    if not _NORMALISED_MEDIAN[0] <= median <= _NORMALISED_MEDIAN[1]:
+        what = f"the median value is {by * median:.4g}, not near the level of {by:.4g}"
+        raise BadDataError(what, way_out="give the level in the values' own unit, or --level fit")
     return divided
 
 

@@ -20,6 +20,7 @@ _WAY_OUT: Final = "save it as grey TIFF (8, 16 or 32 bits), PNG or PGM, or its n
 _KINDS: Final = {1: "unsigned", 2: "signed", 3: "floating-point"}
 # Tags of TIFF 6.0 (1992), and that of GDAL for the value of pixels without data.
 _SUBFILE, _BITS, _PHOTOMETRIC, _DESCRIPTION, _SAMPLES = 254, 258, 262, 270, 277
+_JPEG: Final = b"\xff\xd8\xff"
 _X_RESOLUTION, _Y_RESOLUTION, _PLANAR, _RESOLUTION_UNIT, _FORMAT, _NO_DATA = 282, 283, 284, 296, 339, 42113
 _ORIENTATION: Final = 274
 _MM: Final = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "inch": 25.4, "in": 25.4, "um": 1e-3, "micron": 1e-3, "\u00b5m": 1e-3}
@@ -81,7 +82,9 @@ def _decoded(data: bytes) -> Picture:
         try:
             image = Image.open(io.BytesIO(data), formats=("TIFF", "PNG"))
         except UnidentifiedImageError:
-            what = "is not an image"
+            what = (
+                "is a JPEG, whose values are changed where it saves space" if data[:3] == _JPEG else "is not an image"
+            )
             if data[:4] in (b"II*\x00", b"MM\x00*"):  # a TIFF that Pillow has no mode for
                 directory: Any = TiffImagePlugin.ImageFileDirectory_v2(data[:8])
                 stream = io.BytesIO(data)
@@ -94,12 +97,14 @@ def _decoded(data: bytes) -> Picture:
         tags = getattr(image, "tag_v2", None)
         described = _png_facts(data, image.info) if tags is None else _tiff_facts(tags)
         turned = int(image.getexif().get(_ORIENTATION, 1))
+        lossy = "values are near those that were saved: it is compressed as a JPEG is"
+        notes = [lossy] if image.info.get("compression") == "jpeg" else []
         image.load()
         ImageOps.exif_transpose(image, in_place=True)  # what its own reader has not done already
         mode, pixels = image.mode, np.asarray(image.convert("RGBA") if image.mode == "P" else image)
     values, without = _grey(pixels, mode)
     values, without = described.read(values, without)
-    notes = [f"turned as its orientation ({turned}) says"] if turned != 1 else []
+    notes += [f"turned as its orientation ({turned}) says"] if turned != 1 else []
     return Picture(np.where(without, np.nan, values), described.spacing_mm, (*notes, *described.notes))
 
 

@@ -20,7 +20,7 @@ from tactile_bayes.files.named_arrays import Source, is_text, plain_names, read_
 from tactile_bayes.files.npz import Arrays
 from tactile_bayes.files.reading import kind_of
 from tactile_bayes.files.scan_mcap import read_scan
-from tactile_bayes.files.scan_text import read_frames, read_poses
+from tactile_bayes.files.scan_text import IDENTITY, read_frames, read_poses, seen
 from tactile_bayes.files.sequence_mha import is_sequence, read_sequence
 from tactile_bayes.geometry import FloatArray, check_rigid
 from tactile_bayes.mapping.select import other_units
@@ -190,6 +190,7 @@ def combined(sources: Sequence[Source], given: Stated) -> Imported:
         told += [*_overridden(given, source.stated), *source.notes]
         stated = _over(stated, source.stated)
         held |= {name: np.asarray(one) for name, one in source.arrays.items()}
+    _leave_out_gaps(held, stated, told)
     _check_numbers(held)
     if "frames" in held:
         held["counts"] = held.pop("frames")
@@ -235,6 +236,24 @@ def _squeezed(array: np.ndarray[Any, Any], want: Shape) -> np.ndarray[Any, Any]:
     if array.ndim > len(want) and (len(want) < 2) and array.size == max(array.shape, default=1):
         return array.reshape(-1) if want else array.reshape(())
     return array
+
+
+def _leave_out_gaps(held: Arrays, stated: Stated, told: list[str]) -> None:
+    """Leave out poses of arrays that are not finite or the identity: the tool was not seen."""
+    layout = "matrix" if "pose_matrix" in held else stated.pose_layout or "wxyz"
+    parts = [held[name] for name in ("pose_matrix", "position_mm", "quaternion_wxyz") if name in held]
+    time = held.get("pose_time_s", np.empty(0)).reshape(-1)
+    if not parts or any(one.dtype.kind not in "iuf" or one.ndim < 2 or len(one) != len(time) for one in parts):
+        return  # whatever is wrong is told later
+    numbers = np.hstack([one.reshape(len(time), -1) for one in parts]).astype(np.float64)
+    same = (
+        numbers[:, :12] == IDENTITY[layout] if numbers[:, :12].shape[1] == len(IDENTITY[layout]) else np.zeros((1, 1))
+    )
+    if np.isfinite(numbers).all() and not same.all(axis=1).any():
+        return
+    found = seen(time, numbers, [""] * len(time), layout=layout)
+    held.update(found.arrays)
+    told += found.notes
 
 
 def _poses(held: Arrays, stated: Stated, told: list[str]) -> None:

@@ -67,6 +67,13 @@ _BARE: Final = {"wxyz": 7, "xyzw": 7, "euler": 6, "matrix": 16}
 """Numbers of a pose in a text without names, by its layout; a time and a station may stand before them."""
 _MOST_NUMBERS: Final = 20  # of a pose with what stands before it
 _MOST_STATIONS: Final = 16
+IDENTITY: Final[Mapping[str, FloatArray]] = {
+    "matrix": np.eye(4).ravel()[:12],
+    "wxyz": np.eye(7)[3],
+    "xyzw": np.eye(7)[6],
+    "euler": np.zeros(6),
+}
+"""Numbers that a server goes on sending while a tool is out of sight, of a pose by its layout."""
 _LARGEST_MM: Final = 1e7  # NDI writes -3.697314e28 where a tool is not seen
 
 
@@ -119,9 +126,11 @@ def _without(row: FloatArray, layout: str) -> str:
         return "without numbers"
     if (np.abs(row) > _LARGEST_MM).any():
         return "with numbers that mean none"
+    if np.array_equal(row[:12], IDENTITY[layout]):
+        return "with the identity"
     if layout == "matrix":
-        return "with the identity matrix" if np.array_equal(row[:12], np.eye(4).ravel()[:12]) else ""
-    return "without a rotation" if layout != "euler" and not row[3:].any() else "" if row.any() else "of zeros"
+        return ""
+    return "without a rotation" if layout != "euler" and not row[3:].any() else ""
 
 
 def chosen(names: Sequence[str], given: Stated, *, what: str) -> str:

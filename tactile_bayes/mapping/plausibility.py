@@ -60,6 +60,12 @@ MOST_REACH_MM: Final = 500.0
 LEAST_GAP, LEAST_RANGE = 0.4, 12.0
 """Cells are far outside the rest where so large a share of the values' range is empty, in a range of so many quartile
 distances."""
+_MOST_LEVELS: Final = 9.0  # of a value that is taken for one: fill values would cover the rest
+LEAST_GRID_CM2: Final = 4.0
+"""Of a grid whose head is not known."""
+DIP_MM, LEAST_DIP, DIP_OVER_RISE = 6.0, 0.15, 1.5
+"""A map that in means of so large squares dips by so much of its level, and so many times what it rises by, is of
+readings that fall where pressure rises: right ones dip by less than they rise, or by 0.1."""
 _CHUNK: Final = 4096
 _SAMPLE_FRAMES: Final = 500
 
@@ -347,9 +353,44 @@ def _of_cells(tactile_map: TactileMap) -> Iterator[tuple[str, str]]:
             f"{share:.1f} % of the readings were at full scale and left out, where a lump would press",
             "press less hard",
         )
+    if head is None and area < LEAST_GRID_CM2 * 100:
+        text = f"the grid covers {area / 100:.2g} cm2: a lump and what lies beside it need more"
+        yield text, "scan with strokes side by side"
+    depth, height = _extremes(tactile_map)
+    if depth > LEAST_DIP and depth > DIP_OVER_RISE * height:
+        text = (
+            f"the map dips by {100 * depth:.0f} % of its level and rises by {100 * height:.0f} %: what is harder than "
+            "the tissue about it, as lumps are, presses harder"
+        )
+        yield text, "check whether the readings fall where pressure rises, and leave out what lies off the tissue"
     count = tactile_map.count[covered]
     held = tactile_map.mean[covered][count >= FEW_READINGS * float(tactile_map.counts_known)]
     yield from _of_values(held)
+
+
+def _extremes(tactile_map: TactileMap) -> tuple[float, float]:
+    """How far the map goes below and above its median, over it, in means of covered squares of `DIP_MM`.
+
+    A slope has no dips: what lies below the median has to lie below a trend of second degree, too.
+    """
+    side = min(max(1, round(DIP_MM / tactile_map.recipe.cell_mm)), *tactile_map.mean.shape)
+
+    def sums(values: FloatArray) -> FloatArray:
+        total = np.pad(values.cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))
+        return np.asarray(total[side:, side:] - total[:-side, side:] - total[side:, :-side] + total[:-side, :-side])
+
+    held = sums(tactile_map.covered.astype(np.float64))
+    whole = held > 0.9 * side**2
+    level = float(np.median(tactile_map.mean[tactile_map.covered]))
+    if not whole.any() or not level > 0:
+        return 0.0, 0.0
+    relative = np.clip(np.where(tactile_map.covered, tactile_map.mean / level, 0.0), -_MOST_LEVELS, _MOST_LEVELS)
+    means = sums(relative)[whole] / held[whole]
+    y, x = np.nonzero(whole) / np.max(whole.shape, initial=1)
+    trend = np.column_stack([np.ones_like(x), x, y, x * x, x * y, y * y])
+    flat = means - trend @ np.linalg.lstsq(trend, means)[0]
+    both = np.stack([means - 1.0, flat - np.median(flat)])
+    return -float(both.min(axis=1).max()), float(both.max())
 
 
 def _of_values(values: FloatArray) -> Iterator[tuple[str, str]]:
@@ -357,6 +398,9 @@ def _of_values(values: FloatArray) -> Iterator[tuple[str, str]]:
     if len(values) < 2:
         return
     ordered = np.sort(values)
+    if ordered[0] == ordered[-1]:
+        yield f"all {len(ordered)} cells hold {ordered[0]:.4g}: nothing was felt", "check what was saved"
+        return
     steps, low, high = np.diff(ordered), *np.quantile(ordered, [0.25, 0.75])
     span, widest = float(ordered[-1] - ordered[0]), int(np.argmax(steps))
     if steps[widest] > LEAST_GAP * span and span > LEAST_RANGE * float(high - low):

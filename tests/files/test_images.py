@@ -205,6 +205,7 @@ REFUSED: dict[str, tuple[bytes, str]] = {
         png(packed(interleaved(A, A), 8), bits=8, colour=4),
         "pixels that are transparent in part",
     ),
+    "a JPEG": (b"\xff\xd8\xff\xe0" + bytes(30), "is a JPEG, whose values are changed"),
     "PGM over its maximum": (b"P5 4 3 5\n" + A.astype("u1").tobytes(), "holds the value 11, and its maximum is 5"),
     "PGM cut off": (b"P5 4 3 255\n" + bytes(5), "5 of 12 pixels"),
     "two PGM": (2 * (b"P5 4 3 255\n" + A.astype("u1").tobytes()), "several images"),

@@ -168,7 +168,7 @@ def test_rows_that_mean_no_pose_are_gaps_whatever_marks_them(tmp_path: Path) -> 
     same(found, [i for i in range(len(TIME)) if i not in (5, 6, 11)])
     told = found.session["imported_as"]
     assert "3 of 36 poses left out as gaps" in told
-    for why in ("1 with the identity matrix", "1 without numbers", "1 with numbers that mean none"):
+    for why in ("1 with the identity", "1 without numbers", "1 with numbers that mean none"):
         assert why in told
     turned = ["t,x,y,z,qw,qx,qy,qz", *with_times(QUATERNIONS)]
     turned[4] = f"{TIME[3]:.4f},0,0,0,0,0,0,0"

@@ -112,6 +112,7 @@ UNLIKE: dict[str, tuple[Callable[[Scan], Scan], str]] = {
         "left out for taxels at",
     ),
     "rounded to kPa": (counts(lambda c: np.rint(c * KPA_PER_COUNT), gain=1 / KPA_PER_COUNT), "one count is"),
+    "an inverting amplifier": (counts(lambda c: c.max() - c, gain=3.0), "the map dips by"),
     "noise alone": (
         counts(lambda c: np.random.default_rng(5).normal(2300, 150, c.shape)),
         "as noise does",
@@ -231,6 +232,26 @@ def filled(value: float) -> Callable[[np.ndarray], np.ndarray]:
 @pytest.mark.parametrize("value", [1e20, -9999.0, 65535.0, 255.0, -1.0, 9999.0])
 def test_values_that_stand_for_none_are_told(value: float) -> None:
     assert any("18 of 2601 cells lie far outside the rest" in text for text in grid(filled(value)))
+
+
+def test_a_map_that_dips_where_a_lump_would_rise_is_told_and_a_slope_is_not() -> None:
+    """Readings that fall where pressure rises, as of a white that is zero or an inverting amplifier."""
+    assert any("the map dips by" in text for text in grid(lambda v: 2.0 - v))
+    assert any("the map dips by" in text for text in grid(lambda v: 10.0 * (2.0 - v)))
+    slope = 0.5 * np.mgrid[-25:26, -25:26][1] / 51
+    assert grid(lambda v: v + slope) == grid(lambda v: v * (1.0 + slope)) == []
+
+
+def test_a_grid_that_could_not_show_a_lump_is_told() -> None:
+    assert any("all 2601 cells hold 1: nothing was felt" in text for text in grid(np.ones_like))
+    assert any("the grid covers 3.6 cm2" in text for text in grid(lambda v: np.where(corner(19), v, np.nan)))
+    assert grid(lambda v: np.where(corner(30), v, np.nan)) == []
+
+
+def corner(cells: int) -> np.ndarray:
+    inside = np.zeros((51, 51), dtype=bool)
+    inside[:cells, :cells] = True
+    return inside
 
 
 def test_a_dead_line_and_a_plateau_are_told_and_a_lump_is_not() -> None:

@@ -28,6 +28,10 @@ def run(values: np.ndarray, *, count: np.ndarray | int = 40, **options: object) 
     return estimate_map(grid_map(values, count=count), calibration=None, options=settings, rng=np.random.default_rng(1))
 
 
+STEP = np.where(np.arange(51) < 25, 0.999, 1.0) * np.ones((51, 1))
+"""Nothing rises above its surroundings."""
+
+
 def cut(*, right: int) -> np.ndarray:
     values = bump_values(x=0.0, y=0.0, sigma_x=6.0, sigma_y=6.0) + WHITE
     values[:, 25 + right :] = np.nan
@@ -38,7 +42,8 @@ def cut(*, right: int) -> np.ndarray:
     ("values", "code", "advice"),
     [
         (np.full((9, 9), np.nan), "cannot_show", "map a scan"),
-        (np.ones((51, 51)), "empty", "go over the place again"),
+        (np.ones((51, 51)), "cannot_show", "what was saved"),
+        (STEP, "empty", "go over the place again"),
         (1 + WHITE, "undetected", "go over the place again"),
         (cut(right=1), "window", "mm to the picture's right (+x)"),
     ],

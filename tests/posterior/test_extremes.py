@@ -44,8 +44,8 @@ NOTHING = {
     "no readings": (grid_map(np.ones((9, 9)), count=0), SamplerSettings(), "no covered cell"),
     "one cell": (few(1), SamplerSettings(), "covered cells for"),
     "three cells": (few(3), SamplerSettings(), "covered cells for"),
-    "flat": (grid_map(np.ones((51, 51))), SamplerSettings(), "nothing rises"),
-    "flat, level unknown": (unknown_level(np.full((51, 51), 7.0)), FREE, "nothing rises"),
+    "flat": (grid_map(np.ones((51, 51))), SamplerSettings(), "nothing was felt"),
+    "flat, level unknown": (unknown_level(np.full((51, 51), 7.0)), FREE, "nothing was felt"),
     "noise only": (grid_map(1 + NOISE), SamplerSettings(), ""),
     "a depression": (grid_map(bump_values(amplitude=-0.3) + NOISE), SamplerSettings(), ""),
     "narrower than a cell": (
