@@ -12,6 +12,7 @@ from tactile_bayes.findings import Finding, by_weight
 from tactile_bayes.inference.ensemble import convergence
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.mapping.plausibility import map_findings
+from tactile_bayes.posterior import verdict, white
 from tactile_bayes.posterior.bump import levelled, window_cells
 from tactile_bayes.posterior.correlated import Correlated
 from tactile_bayes.posterior.detection import Detection
@@ -25,32 +26,7 @@ from tactile_bayes.posterior.draw import (
     check_options,
 )
 from tactile_bayes.posterior.result import Estimate, prior_sensitivity
-from tactile_bayes.posterior.verdict import (
-    FEEL_AGAIN,
-    FEEL_AGAIN_ON_PAPER,
-    HOPELESS,
-    LIKELY,
-    NO_EVIDENCE,
-    Weighed,
-    no_bump,
-    no_verdict,
-    searched,
-    shape_fault,
-    undetected,
-    weigh,
-    width_fault,
-)
-from tactile_bayes.posterior.white import (
-    LEAST_WIDTH_IN_CELLS,
-    OUTGROWN,
-    BumpFit,
-    Candidate,
-    MapDraws,
-    White,
-    check_background,
-    fit_close,
-    fitted_candidates,
-)
+from tactile_bayes.posterior.white import BumpFit, Candidate, MapDraws, White
 from tactile_bayes.presets import CELL_PER_SIGMA, INTERVAL
 from tactile_bayes.progress import Progress
 from tactile_bayes.scans import DEFAULT_HEAD, HeadShape
@@ -105,7 +81,7 @@ def search(tactile_map: TactileMap, options: SamplerSettings) -> tuple[tuple[Can
         if looks == MOST_LOOKS:
             break
         rather = f": rather {detection.ridge}" if detection.ridge else ""
-        fault = f"{NO_EVIDENCE}{rather}"
+        fault = f"{verdict.NO_EVIDENCE}{rather}"
         tried[-1] = replace(candidate, fault=fault)
     if options.correlated:
         close = _close_search(tactile_map, tried, options)
@@ -120,10 +96,10 @@ def _places(tactile_map: TactileMap, options: SamplerSettings) -> Iterator[Candi
     """Candidate places, highest first, fitted on demand."""
     settings = _search_options(tactile_map, options)
     if not options.correlated:
-        yield from fitted_candidates(tactile_map, settings)
+        yield from white.fitted_candidates(tactile_map, settings)
         return
     found_on = levelled(tactile_map)
-    for one in fitted_candidates(found_on, settings):
+    for one in white.fitted_candidates(found_on, settings):
         if found_on is tactile_map or one.fit is None:
             yield one
         else:
@@ -148,9 +124,9 @@ def _close_search(
     """
     looks, settings, found_on = 0, _search_options(tactile_map, options), levelled(tactile_map)
     for i, candidate in enumerate(tried):
-        if candidate.fit is not None and not candidate.fault.startswith(OUTGROWN):
+        if candidate.fit is not None and not candidate.fault.startswith(white.OUTGROWN):
             continue
-        fit, fault = fit_close(found_on, candidate.centre_mm, options=settings)
+        fit, fault = white.fit_close(found_on, candidate.centre_mm, options=settings)
         if fit is None or fault:
             continue
         fit = _with_cells_of(tactile_map, fit, settings)
@@ -166,14 +142,16 @@ def _close_search(
     return None
 
 
-def best_chance(tactile_map: TactileMap, candidates: Sequence[Candidate], options: SamplerSettings) -> Weighed | None:
+def best_chance(
+    tactile_map: TactileMap, candidates: Sequence[Candidate], options: SamplerSettings
+) -> verdict.Weighed | None:
     """The most probable lump among rises that cannot be measured; None where none can be assessed.
 
     Those that the search has weighed count. Where they are fewer than `MOST_LOOKS` the highest others are weighed too,
     from a smaller window where the fit ran away or outgrew its own. A fit to a single cell says nothing of a lump and
     is passed over.
     """
-    weighed: list[Weighed] = []
+    weighed: list[verdict.Weighed] = []
     for candidate in sorted(candidates, key=lambda one: one.detection is None):
         if candidate.detection is None and len(weighed) >= MOST_LOOKS:
             break
@@ -181,7 +159,7 @@ def best_chance(tactile_map: TactileMap, candidates: Sequence[Candidate], option
         if detection is None:
             bump, detection = _weighed(tactile_map, candidate, options)
         if bump is not None and detection is not None:
-            weighed.append(weigh(tactile_map, detection, bump, fault=candidate.fault, candidate=candidate))
+            weighed.append(verdict.weigh(tactile_map, detection, bump, fault=candidate.fault, candidate=candidate))
     return max(weighed, key=lambda one: (one.probability, one.detection.log_bayes_factor), default=None)
 
 
@@ -190,9 +168,9 @@ def _weighed(
 ) -> tuple[ModalBump | None, Detection | None]:
     """Bump and odds of a lump at a faulty place; from close by where the first fit moved away or grew too large."""
     fit, settings = candidate.fit, _search_options(tactile_map, options)
-    if fit is None or candidate.fault.startswith(OUTGROWN):
-        fit, _ = fit_close(levelled(tactile_map), candidate.centre_mm, options=settings)
-    if fit is None or min(fit.widths()[:2]) < LEAST_WIDTH_IN_CELLS * fit.cells.cell_mm:
+    if fit is None or candidate.fault.startswith(white.OUTGROWN):
+        fit, _ = white.fit_close(levelled(tactile_map), candidate.centre_mm, options=settings)
+    if fit is None or min(fit.widths()[:2]) < white.LEAST_WIDTH_IN_CELLS * fit.cells.cell_mm:
         return None, None
     return fit.modal(), assess(tactile_map, _with_cells_of(tactile_map, fit, settings), options).detection
 
@@ -270,7 +248,7 @@ def draw_with_size(work: Work, seen: Assessment) -> SizedDraws:
     options, cell_mm = work.options, work.tactile_map.recipe.cell_mm
     made = seen.draw(options, rng=work.rng, progress=work.progress)
     posterior = made.posterior
-    fault = shape_fault(posterior.sigma_x_mm, posterior.sigma_y_mm, cell_mm=cell_mm, prior=options.prior)
+    fault = verdict.shape_fault(posterior.sigma_x_mm, posterior.sigma_y_mm, cell_mm=cell_mm, prior=options.prior)
     if work.calibration is None:
         return SizedDraws(made, None, fault, None)
     calibration = work.calibration.at_depth_or_fallback(*posterior.medians)
@@ -311,7 +289,7 @@ def estimate_map(
     `BadDataError` when the map or the fit options differ from the calibration's recipe, `UsageError` when an option
     does not go with another or with the map, `NotConvergedError` when the method does not converge.
     """
-    check_background(tactile_map, options)
+    white.check_background(tactile_map, options)
     check_options(options)
     if calibration is not None:
         differs = recipe_differences(tactile_map, calibration, options)
@@ -322,7 +300,7 @@ def estimate_map(
             )
         calibration = calibration_for(tactile_map, calibration)
     estimate = _answer(Work(tactile_map, calibration, options, rng, progress))
-    if estimate.code in NO_LUMP and options.scene != "none" and (why := no_verdict(tactile_map)) is not None:
+    if estimate.code in NO_LUMP and options.scene != "none" and (why := verdict.no_verdict(tactile_map)) is not None:
         estimate = _none(why, estimate.candidates)
     of_map = (*map_findings(tactile_map), *tactile_map.findings)
     return replace(estimate, findings=by_weight((*of_map, *estimate.findings)))
@@ -333,14 +311,14 @@ def _answer(work: Work) -> Estimate:
     tactile_map, options = work.tactile_map, work.options
     if not tactile_map.covered.any():
         return _none(Abstention("empty", "the map has no covered cell"))
-    where = searched(tactile_map, options.centre_mm)
+    where = verdict.searched(tactile_map, options.centre_mm)
     candidates, seen = search(tactile_map, options)
     if not candidates:
         reason = f"no lump found {where}: nothing rises above the background"
-        return _none(Abstention("empty", reason, FEEL_AGAIN, FEEL_AGAIN_ON_PAPER))
+        return _none(Abstention("empty", reason, verdict.FEEL_AGAIN, verdict.FEEL_AGAIN_ON_PAPER))
     if seen is None:
         likeliest = best_chance(tactile_map, candidates, options)
-        why = no_bump(tactile_map, candidates, likeliest, where=where)
+        why = verdict.no_bump(tactile_map, candidates, likeliest, where=where)
         if likeliest is None:
             return _none(why, candidates)
         fit, detection = None if likeliest.candidate is None else likeliest.candidate.fit, likeliest.detection
@@ -349,23 +327,23 @@ def _answer(work: Work) -> Estimate:
         return replace(estimate, weighed=likeliest)
     # by the bump's mode where it is a lump by the evidence, else by least squares
     bump = seen.bump() if seen.detection.probability >= DETECTED else seen.fit.modal()
-    weighed = weigh(tactile_map, seen.detection, bump)
-    if seen.detection.probability < DETECTED or weighed.probability < LIKELY:
-        estimate = _none(undetected(weighed, where=where), candidates, seen.detection)
+    weighed = verdict.weigh(tactile_map, seen.detection, bump)
+    if seen.detection.probability < DETECTED or weighed.probability < verdict.LIKELY:
+        estimate = _none(verdict.undetected(weighed, where=where), candidates, seen.detection)
     elif options.scene == "none":
         estimate = _none(Abstention("undetected", "no lump was assumed"), candidates, seen.detection)
     else:
         estimate = _measured(work, seen, candidates)
     if estimate.code == "ridge" and not estimate.reason.startswith("no lump found"):
         estimate = replace(estimate, reason=f"no lump found {where}: {estimate.reason}")
-    return replace(estimate, weighed=weigh(tactile_map, estimate.detection or seen.detection, bump))
+    return replace(estimate, weighed=verdict.weigh(tactile_map, estimate.detection or seen.detection, bump))
 
 
 def _measured(work: Work, seen: Assessment, candidates: tuple[Candidate, ...]) -> Estimate:
     """Draw a lump that is one by the evidence, and size it; or the reason why not."""
     options, cell_mm = work.options, work.tactile_map.recipe.cell_mm
     detection, bump = seen.detection, seen.bump()
-    hopeless = width_fault(bump.sigma_x_mm, bump.sigma_y_mm, cell_mm=cell_mm, margin=HOPELESS)
+    hopeless = verdict.width_fault(bump.sigma_x_mm, bump.sigma_y_mm, cell_mm=cell_mm, margin=verdict.HOPELESS)
     if hopeless is not None:
         return _none(hopeless, candidates, detection, bump)
     try:

@@ -10,28 +10,9 @@ from typing import Any, Final, cast
 import numpy as np
 
 from tactile_bayes.declarations import Record, as_dict, rounded
+from tactile_bayes.files import reports
 from tactile_bayes.files.provenance import Provenance
-from tactile_bayes.files.reports import (
-    ESTIMATE,
-    AnotherExam,
-    EstimateReport,
-    Interval,
-    MassReport,
-    OtherRise,
-    PassedOver,
-    Place,
-    Point,
-    PriorSensitivity,
-    ReasonCode,
-    SceneReport,
-    Shape,
-    SizeInterval,
-    SmallestAt,
-    SmallestLump,
-    StructureReport,
-    Supposed,
-    Touching,
-)
+from tactile_bayes.files.reports import EstimateReport, MassReport
 from tactile_bayes.findings import Finding, capital, verdict
 from tactile_bayes.geometry import FloatArray, apply
 from tactile_bayes.inference.draws import Quantity, summarise
@@ -79,14 +60,14 @@ def estimate_quantities(estimate: Estimate, tactile_map: TactileMap, *, probabil
     return found
 
 
-def another_exam(size: SizePosterior | None, *, probability: float) -> AnotherExam | None:
+def another_exam(size: SizePosterior | None, *, probability: float) -> reports.AnotherExam | None:
     """The spread between exams of a mass as a share of its size, and both sizes with it; None where it is not told."""
     another = None if size is None else size.another_exam
     if another is None:
         return None
     largest, smallest = (another.summarise(name, probability=probability).rounded for name in EXTREMES)
     shares = rounded(dict(another.variance_share))
-    return AnotherExam(rounded(another.figures["between_map_sd"]), largest, smallest, shares)
+    return reports.AnotherExam(rounded(another.figures["between_map_sd"]), largest, smallest, shares)
 
 
 # --- Place of a lump in the breast, by clock and distance from the nipple, of an estimate and in words.
@@ -154,11 +135,11 @@ class SizedPlace(Record):
     """A mass with its place and size, as far as it takes to tell whether it touches another."""
 
     number: int
-    centre_mm: Place
+    centre_mm: reports.Place
     max_size_mm: Quantity | None
 
 
-def touching_masses(masses: Sequence[MassReport | SizedPlace]) -> tuple[Touching, ...]:
+def touching_masses(masses: Sequence[MassReport | SizedPlace]) -> tuple[reports.Touching, ...]:
     """Pairs of sized masses whose outlines may touch.
 
     Both lie in one body, so their errors go together: ends of the length are made of the same ends of both sizes. A
@@ -174,18 +155,18 @@ def touching_masses(masses: Sequence[MassReport | SizedPlace]) -> tuple[Touching
             ends = zip((size.median, size.low, size.high), (beside.median, beside.low, beside.high), strict=True)
             # one may lie within the other's outline
             median, low, high = (rounded(max(apart + (a + b) / 2, a, b)) for a, b in ends)
-            length = Interval(median, low, high, size.probability)
-            found.append(Touching((one.number, other.number), rounded(apart), length))
+            length = reports.Interval(median, low, high, size.probability)
+            found.append(reports.Touching((one.number, other.number), rounded(apart), length))
     return tuple(found)
 
 
-def together_words(pair: Touching) -> str:
+def together_words(pair: reports.Touching) -> str:
     """How long two masses are together."""
     length = pair.together_mm
     return f"together {length.median:.1f} mm long ({length.low:.1f} to {length.high:.1f})"
 
 
-def touching_findings(pairs: Sequence[Touching]) -> list[Finding]:
+def touching_findings(pairs: Sequence[reports.Touching]) -> list[Finding]:
     """Which masses may be one lump."""
     return [
         Finding("touching", "masses {} and {} may be one lump: ".format(*one.masses) + together_words(one))
@@ -290,16 +271,16 @@ def prior_line(prior: BumpPrior, *, field: bool) -> str:
     return f"Priors: {'; '.join(parts)}."
 
 
-def scene_report(choice: SceneChoice) -> SceneReport:
+def scene_report(choice: SceneChoice) -> reports.SceneReport:
     """The scene, as files have it."""
     scene = choice.fit.scene
-    return SceneReport(
-        supported=cast("Shape", choice.supported),
-        shape=cast("Shape", scene.shape),
+    return reports.SceneReport(
+        supported=cast("reports.Shape", choice.supported),
+        shape=cast("reports.Shape", scene.shape),
         tilt=scene.tilt,
         beside=scene.extra or None,
         structures=tuple(
-            StructureReport(
+            reports.StructureReport(
                 name=one.name,
                 odds=_six_digits(one.odds),
                 odds_are_a_bound=one.bound,
@@ -328,20 +309,20 @@ PAIRS = (
 """Of suppositions, with the words of the first, and what follows each, a value in it."""
 
 
-Suppositions = Mapping[str, Supposed]
+Suppositions = Mapping[str, reports.Supposed]
 
 
-def suppositions(size: SizePosterior | None, largest: Quantity | None) -> dict[str, Supposed] | None:
+def suppositions(size: SizePosterior | None, largest: Quantity | None) -> dict[str, reports.Supposed] | None:
     """The property that is supposed, its value, and the largest size with it, by name; None without a size."""
     if size is None or largest is None:
         return None
     ends = (largest.median, largest.low, largest.high)
 
-    def moved(one: Supposition) -> SizeInterval:
+    def moved(one: Supposition) -> reports.SizeInterval:
         median, low, high = (rounded(one.moved(end, median_mm=largest.median)) for end in ends)
-        return SizeInterval(median, low, high, largest.probability)
+        return reports.SizeInterval(median, low, high, largest.probability)
 
-    return {label: Supposed(one.name, one.value, moved(one)) for label, one in size.supposing.items()}
+    return {label: reports.Supposed(one.name, one.value, moved(one)) for label, one in size.supposing.items()}
 
 
 def supposed_lines(supposed: Suppositions | None, median_mm: float, *, places: int) -> list[str]:
@@ -372,14 +353,14 @@ def supposed_line(supposed: Suppositions | None, median_mm: float, *, places: in
     return [f"{words}; softer still, larger." if soft > hard else f"{words}."]
 
 
-def _pair(supposed: Suppositions | None, median_mm: float, names: tuple[str, str]) -> list[Supposed]:
+def _pair(supposed: Suppositions | None, median_mm: float, names: tuple[str, str]) -> list[reports.Supposed]:
     """Two suppositions, where one of them at least moves the largest size; empty otherwise."""
     pair = [] if supposed is None else [supposed[name] for name in names if name in supposed]
     moves = any(abs(one.max_size_mm.median / median_mm - 1) >= LEAST_CHANGE for one in pair)
     return pair if moves and len(pair) == 2 else []
 
 
-def size_words(size: Quantity | Interval, places: int = 1) -> str:
+def size_words(size: Quantity | reports.Interval, places: int = 1) -> str:
     """A size with its interval in brackets."""
     return f"{size.median:.{places}f} mm ({size.low:.{places}f} to {size.high:.{places}f})"
 
@@ -406,13 +387,13 @@ def _mass_reports(
             MassReport(
                 number=number,
                 reported=mass.reported,
-                centre_mm=rounded(Place(mass.x_mm, mass.y_mm)),
-                centre_patient_mm=None if patient is None else rounded(Place(*patient)),
+                centre_mm=rounded(reports.Place(mass.x_mm, mass.y_mm)),
+                centre_patient_mm=None if patient is None else rounded(reports.Place(*patient)),
                 detected_probability=rounded(mass.probability),
                 **_told(own, ("amplitude", *SIZES, "angle_deg")),
                 another_exam=another_exam(mass.estimate.size, probability=probability),
                 reason=why if mass.estimate.size is None else "",
-                reason_code=cast("ReasonCode", mass.estimate.code),
+                reason_code=cast("reports.ReasonCode", mass.estimate.code),
                 advice=mass.estimate.advice,
                 position=None if place is None else place.told(probability),
             )
@@ -481,9 +462,9 @@ def estimate_report(
     quantities = estimate_quantities(estimate, tactile_map, probability=probability)
     place = lump_place(estimate.map_posterior, tactile_map, provenance.scans)
 
-    def point(name: str) -> Point | None:
+    def point(name: str) -> reports.Point | None:
         x, y = f"{name}.x", f"{name}.y"
-        return Point(quantities[x].rounded, quantities[y].rounded) if x in quantities else None
+        return reports.Point(quantities[x].rounded, quantities[y].rounded) if x in quantities else None
 
     about, size, moved = estimate.about_mm, estimate.size, estimate.sensitivity
     masses = _mass_reports(estimate, tactile_map, quantities, probability=probability, scans=provenance.scans)
@@ -491,15 +472,15 @@ def estimate_report(
     if estimate.detection is not None:
         diagnostics["log_bayes_factor"] = estimate.detection.log_bayes_factor
     return EstimateReport(
-        schema=ESTIMATE,
+        schema=reports.ESTIMATE,
         status=estimate.status,
         verdict=verdict(estimate.findings, answered=size is not None),
         entries=tuple(one.entry for one in estimate.findings),
         reason=estimate.reason,
-        reason_code=cast("ReasonCode", estimate.code),
+        reason_code=cast("reports.ReasonCode", estimate.code),
         advice=estimate.advice,
         on_paper=estimate.on_paper,
-        about_mm=None if about is None else rounded(Place(*about)),
+        about_mm=None if about is None else rounded(reports.Place(*about)),
         smallest_lump=None if estimate.smallest is None else smallest_lump(estimate.smallest),
         **_told(quantities, (*SIZES, *WIDTHS, "angle_deg")),
         another_exam=another_exam(size, probability=probability),
@@ -510,10 +491,12 @@ def estimate_report(
         detected_probability=rounded(estimate.probability),
         variance_share=None if size is None else rounded(dict(size.variance_share)),
         scene=None if estimate.scene is None else scene_report(estimate.scene),
-        prior_sensitivity=None if moved is None else rounded(PriorSensitivity(WIDER, {**moved.median}, {**moved.ends})),
+        prior_sensitivity=None
+        if moved is None
+        else rounded(reports.PriorSensitivity(WIDER, {**moved.median}, {**moved.ends})),
         diagnostics=_finite(diagnostics) | ({} if size is None else size_diagnostics(size)),
-        candidates=tuple(PassedOver(*rounded(one.centre_mm), one.fault) for one in estimate.candidates),
-        other_rises=tuple(rounded(OtherRise(**as_dict(one)), 6) for one in estimate.other_rises),
+        candidates=tuple(reports.PassedOver(*rounded(one.centre_mm), one.fault) for one in estimate.candidates),
+        other_rises=tuple(rounded(reports.OtherRise(**as_dict(one)), 6) for one in estimate.other_rises),
         masses=masses,
         touching=touching_masses(masses),
         left_out=tuple(estimate.left_out),
@@ -523,19 +506,19 @@ def estimate_report(
     )
 
 
-def smallest_lump(found: SmallestLumps) -> SmallestLump:
+def smallest_lump(found: SmallestLumps) -> reports.SmallestLump:
     """What a map without a lump would have shown, as files have it."""
 
     def row(diameters: FloatArray) -> Any:
         return tuple(float(d) if math.isfinite(d) else None for d in diameters)
 
     places = [
-        SmallestAt(round(float(x), 3), round(float(y), 3), row(d))
+        reports.SmallestAt(round(float(x), 3), round(float(y), 3), row(d))
         for (x, y), d in zip(found.places_mm, found.d_mm, strict=True)
     ]
     depths: Any = tuple(round(float(depth), 1) for depth in found.depths_mm)
     best, worst = row(found.d_mm.min(axis=0)), row(found.d_mm.max(axis=0))
-    return SmallestLump(PROBABILITY, depths, best, worst, round(found.spacing_mm, 3), tuple(places))
+    return reports.SmallestLump(PROBABILITY, depths, best, worst, round(found.spacing_mm, 3), tuple(places))
 
 
 def size_diagnostics(size: SizePosterior) -> dict[str, Any]:

@@ -14,19 +14,7 @@ from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.posterior.verdict import SHARE_WITH_LUMP, chance_text
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.report.estimate_document import (
-    from_xiphoid,
-    mass_lines,
-    numbered,
-    others,
-    place_line,
-    prior_line,
-    scene_line,
-    scene_lines,
-    sensitivity_line,
-    supposed_line,
-    supposed_lines,
-)
+from tactile_bayes.report import estimate_document
 from tactile_bayes.size.draws import EXTREMES, SIZES
 
 # --- The smallest lump that a map without one would have shown, in a sentence.
@@ -197,21 +185,21 @@ LEAST_SHARE = 0.005  #: Of the width variance, below which the tracker's share i
 def estimate_text(estimate: Estimate, report: EstimateReport) -> str:
     """Full report of one map: sizes with intervals, sources of uncertainty, omissions; `report` is the estimate's."""
     if estimate.status == "no_estimate":
-        lines = [*finding_lines(report.findings), *_no_estimate(report), *mass_lines(report.masses)]
+        lines = [*finding_lines(report.findings), *_no_estimate(report), *estimate_document.mass_lines(report.masses)]
         return "\n".join([*lines, *passed_over(estimate), RESEARCH_USE]) + "\n"
     lines = [*finding_lines(report.findings, "caution"), *size_table(report), "", *_no_size(report)]
     if report.position is not None:
-        lines.append(place_line(report.position))
+        lines.append(estimate_document.place_line(report.position))
     lines += _findings(estimate, report)
     if estimate.scene is not None:
-        lines += scene_lines(estimate.scene)
-        if beside := " and ".join(str(one.number) for one in others(report.masses)):
+        lines += estimate_document.scene_lines(estimate.scene)
+        if beside := " and ".join(str(one.number) for one in estimate_document.others(report.masses)):
             lines.append(f"These odds are of this window alone: mass {beside} of the map is above.")
-    if estimate.sensitivity is not None and (by_prior := sensitivity_line(estimate.sensitivity)):
+    if estimate.sensitivity is not None and (by_prior := estimate_document.sensitivity_line(estimate.sensitivity)):
         lines.append(by_prior)
     lines += [*finding_lines(report.findings, "check"), *passed_over(estimate)]
     lines += [f"Left out: {'; '.join(report.left_out)}."] if report.left_out else []
-    lines.append(prior_line(from_plain(BumpPrior, report.prior), field=estimate.scene is not None))
+    lines.append(estimate_document.prior_line(from_plain(BumpPrior, report.prior), field=estimate.scene is not None))
     return "\n".join([*lines, RESEARCH_USE]) + "\n"
 
 
@@ -274,17 +262,17 @@ def size_table(report: EstimateReport, shown: Collection[str] = _NAMES) -> list[
 def _findings(estimate: Estimate, report: EstimateReport) -> list[str]:
     lines, found, figures, largest = [], estimate.diagnostics, report.figures, report.max_size_mm
     if report.detected_probability is not None:
-        which = f"{number}. " if (number := numbered(report.masses)) else ""
+        which = f"{number}. " if (number := estimate_document.numbered(report.masses)) else ""
         prior = f"where {100 * SHARE_WITH_LUMP:g} % of exams hold one"
         lines.append(f"{which}Probability of a lump: {chance_text(report.detected_probability)}, {prior}.")
-    lines += mass_lines(report.masses)
+    lines += estimate_document.mass_lines(report.masses)
     if largest is not None:
         if report.another_exam is not None:
             lines.append(two_intervals_text(figures.get("between_map_sd"), report.another_exam.between_map_sd))
         lines += width_lines(report.leading.variance_share or {})
         if found is not None and found.repeatability:
             lines.append(site_interval_text(found.repeatability))
-        lines += supposed_lines(report.supposing, largest.median, places=size_decimals([largest]))
+        lines += estimate_document.supposed_lines(report.supposing, largest.median, places=size_decimals([largest]))
         if "oval_probability" in figures:
             lines.append(shape_text(figures))
         if found is not None and found.size_calibration:
@@ -366,7 +354,7 @@ def estimate_summary(estimate: Estimate, report: EstimateReport) -> str:
     else:
         body = _something(estimate, report, body, checks)
     if estimate.scene is not None:
-        model = [scene_line(estimate.scene)]
+        model = [estimate_document.scene_line(estimate.scene)]
     else:
         model = joined(report.left_out, most=2, lead="Left out: ")
     return "\n".join([*body, " ".join([*model, MORE]), RESEARCH_USE]) + "\n"
@@ -386,19 +374,19 @@ def _something(estimate: Estimate, report: EstimateReport, cautions: list[str], 
     lines = [*lines, *beside, *after, *widths[: max(room - len(beside), 0)], *last]
     if largest is None or len(lines) >= MOST_LINES - 2:
         return lines
-    return [*lines, *supposed_line(report.supposing, largest.median, places=size_decimals([largest]))]
+    return [*lines, *estimate_document.supposed_line(report.supposing, largest.median, places=size_decimals([largest]))]
 
 
 def _lump(report: EstimateReport) -> list[str]:
     """Probability of a lump, and its place; of several masses, which one it is."""
-    chance, number = report.detected_probability, numbered(report.masses)
+    chance, number = report.detected_probability, estimate_document.numbered(report.masses)
     parts = [] if chance is None else [f"Probability of a lump {chance_text(chance)}"]
     if report.amplitude is not None:
         parts.append(f"amplitude {report.amplitude.median:.2g}")
     if report.position is not None:
         parts.append(report.position.text)
     elif report.centre_patient_mm is not None:
-        parts.append(from_xiphoid(*report.centre_patient_mm.median))
+        parts.append(estimate_document.from_xiphoid(*report.centre_patient_mm.median))
     if report.centre_mm is not None:
         parts.append("at ({:.1f}, {:.1f}) mm on the map".format(*report.centre_mm.median))
     text = ", ".join(parts)
@@ -407,7 +395,7 @@ def _lump(report: EstimateReport) -> list[str]:
 
 def _masses(masses: Sequence[MassReport], *, room: int) -> list[str]:
     """At most `room` lines on the masses besides the reported one, at least one; the last counts those left out."""
-    lines = mass_lines(masses)
+    lines = estimate_document.mass_lines(masses)
     shown = lines[: max(room, 1)]
     if left := len(lines) - len(shown):
         shown[-1] = f"{shown[-1].rstrip('.')}; and {left} more {'mass' if left == 1 else 'masses'}."

@@ -20,6 +20,7 @@ from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.figure_file import figure_file, finish
 from tactile_bayes.report.paper_head import named
 from tactile_bayes.report.study import COLOURS, MARKS
+from tactile_bayes.studies import sbc
 from tactile_bayes.studies.paper import seat_name
 from tactile_bayes.studies.paper_tables import (
     DEFINITION,
@@ -29,18 +30,6 @@ from tactile_bayes.studies.paper_tables import (
     TABLE_DIAMETERS_MM,
     Agreement,
     table_distance,
-)
-from tactile_bayes.studies.sbc import (
-    BAND,
-    DRAWS,
-    RANKED,
-    MapRanks,
-    RankTest,
-    Truth,
-    ecdf_band,
-    ecdf_counts,
-    other_rises,
-    rank_tests,
 )
 from tactile_bayes.studies.tradeoffs import EMPIRICAL, PLANE, SOLID, LumpCase, Measured, SizeRule, change, cheapest
 
@@ -52,12 +41,12 @@ SHIFT = 3.0  #: Standard errors of the mean rank beyond which a posterior is cal
 
 
 def sbc_document(
-    maps: Sequence[MapRanks], *, method: str, seed: int, maps_per_s: float | None, cosines: FieldCosines = "auto"
+    maps: Sequence[sbc.MapRanks], *, method: str, seed: int, maps_per_s: float | None, cosines: FieldCosines = "auto"
 ) -> dict[str, Any]:
     """All results as plain data; `maps_per_s` is of the maps that this run made, None where it made none."""
     ranked = [one.outcome for one in maps if one.ranks is not None]
     silent = [one.outcome for one in maps if one.ranks is None and one.probability is None]
-    tests, others = rank_tests(list(maps)), other_rises(list(maps))
+    tests, others = sbc.rank_tests(list(maps)), sbc.other_rises(list(maps))
     return {
         "schema": SCHEMA,
         "method": method,
@@ -68,7 +57,7 @@ def sbc_document(
         "abstained": dict(sorted(Counter(silent).items())),
         "drawn_by": dict(sorted(Counter(ranked).items())),
         "elsewhere": as_dict(others) | {"too_many": others.too_many},
-        "draws": DRAWS,
+        "draws": sbc.DRAWS,
         "maps_per_s": maps_per_s,
         "parameters": [as_dict(one) | {"inside_band": one.inside, "verdict": verdict(one)} for one in tests],
         "p_together": min(1.0, len(tests) * min(one.ecdf_p for one in tests)) if tests else None,
@@ -76,7 +65,7 @@ def sbc_document(
     }
 
 
-def verdict(test: RankTest) -> str:
+def verdict(test: sbc.RankTest) -> str:
     """``"ok"``, or the way in which a parameter's posterior fails."""
     if test.inside:
         return "ok"
@@ -109,7 +98,7 @@ def _lines(document: dict[str, Any]) -> Iterator[str]:
     if not tests:
         return
     drawn = ", ".join(f"{name} {number}" for name, number in document["drawn_by"].items())
-    yield f"ranks among {DRAWS} draws, drawn by: {drawn}"
+    yield f"ranks among {sbc.DRAWS} draws, drawn by: {drawn}"
     yield ""
     yield f"{'parameter':<11}{'chi2 p':>7}{'ECDF p':>8}  {'50 % holds':<16}{'90 % holds':<16}verdict"
     for one in tests:
@@ -120,40 +109,40 @@ def _lines(document: dict[str, Any]) -> Iterator[str]:
 
 
 def _conclusion(tests: Sequence[dict[str, Any]], together: float) -> Iterator[str]:
-    failed, band = [one["name"] for one in tests if not one["inside_band"]], f"{100 * BAND:g} % band"
+    failed, band = [one["name"] for one in tests if not one["inside_band"]], f"{100 * sbc.BAND:g} % band"
     if failed:
         yield f"FAILS for {', '.join(failed)}: the ranks leave their simultaneous {band}."
-        chance = f"{100 * (1 - BAND ** len(tests)):.0f} % of runs"
+        chance = f"{100 * (1 - sbc.BAND ** len(tests)):.0f} % of runs"
         seldom = f"of {len(tests)} calibrated parameters one or more leave theirs in {chance}"
-        advice = "run again with another --seed" if together > 1 - BAND else "that is no chance"
+        advice = "run again with another --seed" if together > 1 - sbc.BAND else "that is no chance"
         yield f"All {len(tests)} together: p = {together:.2g} ({seldom}); {advice}."
     else:
         yield f"All ranks stay in their simultaneous {band}s."
 
 
-def table_text(maps: Sequence[MapRanks]) -> str:
+def table_text(maps: Sequence[sbc.MapRanks]) -> str:
     """CSV with one row per map: truth, ranks (empty without an estimate) and outcome."""
-    header = ["map", *names_of(Truth), *(f"rank_{name}" for name in RANKED), "outcome", "probability"]
+    header = ["map", *names_of(sbc.Truth), *(f"rank_{name}" for name in sbc.RANKED), "outcome", "probability"]
     rows = []
     for one in maps:
-        ranks = [*(one.ranks or ()), *[None] * len(RANKED)][: len(RANKED)]
+        ranks = [*(one.ranks or ()), *[None] * len(sbc.RANKED)][: len(sbc.RANKED)]
         rows.append([one.index, *as_dict(one.truth).values(), *ranks, one.outcome, one.probability])
     return csv_text(header, rows, digits=8)
 
 
-def sbc_figure(maps: Sequence[MapRanks], path: Path, *, force: bool = False) -> None:
+def sbc_figure(maps: Sequence[sbc.MapRanks], path: Path, *, force: bool = False) -> None:
     """Draw the ECDF of each parameter's ranks minus the uniform one, with the simultaneous band, as PNG."""
     found = [one.ranks for one in maps if one.ranks is not None]
-    names = RANKED[: len(found[0])] if found else RANKED
+    names = sbc.RANKED[: len(found[0])] if found else sbc.RANKED
     ranks = np.array(found).reshape(-1, len(names))
-    n, at = len(ranks), np.arange(1, DRAWS + 1) / (DRAWS + 1)
-    inside = {test.name: test.inside for test in rank_tests(list(maps))}
-    foot = f"{n} maps with an estimate of {len(maps)}; grey: {100 * BAND:g} % band of the whole path."
+    n, at = len(ranks), np.arange(1, sbc.DRAWS + 1) / (sbc.DRAWS + 1)
+    inside = {test.name: test.inside for test in sbc.rank_tests(list(maps))}
+    foot = f"{n} maps with an estimate of {len(maps)}; grey: {100 * sbc.BAND:g} % band of the whole path."
     with figure_file(path, size_in=(2.2 * len(names), 2.9), foot=foot, force=force) as figure:
         for i, (axes, name) in enumerate(zip(figure.subplots(1, len(names), sharey=True), names, strict=True)):
             if n:
-                low, high = ecdf_band(n, DRAWS)
-                share = ecdf_counts(ranks[None, :, i], DRAWS)[0] / n
+                low, high = sbc.ecdf_band(n, sbc.DRAWS)
+                share = sbc.ecdf_counts(ranks[None, :, i], sbc.DRAWS)[0] / n
                 axes.fill_between(at, low - at, high - at, step="mid", color="0.85", linewidth=0)
                 axes.step(at, share - at, where="mid", color=COLOURS[0 if inside[name] else 1], linewidth=1.2)
             axes.axhline(0.0, color="0.5", linewidth=0.6)
