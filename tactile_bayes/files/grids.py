@@ -13,7 +13,7 @@ from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError, UsageError, in_file
 from tactile_bayes.files.arrays_layout import GridOptions
 from tactile_bayes.files.images import read_image
-from tactile_bayes.files.named_arrays import ARRAY_SUFFIXES, read_named
+from tactile_bayes.files.named_arrays import ARRAY_SUFFIXES, AXES, read_named, turned_by_axes
 from tactile_bayes.files.text_lines import (
     FEWEST_LABELS,
     NO_SENSEL,
@@ -248,23 +248,25 @@ def _of_arrays(path: Path, array: str) -> Grid:
     """The array that is named, else ``mean``, else the only one of rows and columns."""
 
     def wanted(names: Sequence[str]) -> Sequence[str]:
-        return [name for name in _BESIDE if name in names] if "mean" in names and not array else names
+        return [name for name in (*_BESIDE, *AXES) if name in names] if "mean" in names and not array else names
 
     arrays = read_named(path, wanted)
+    notes = turned_by_axes(arrays)
     if not array and "mean" in arrays:
         if "spacing_mm" not in arrays:
-            return Grid(arrays)
+            return Grid(arrays, notes=notes)
         sides = np.atleast_1d(arrays.pop("spacing_mm"))
         if sides.dtype.kind not in "iuf" or sides.ndim != 1 or len(sides) not in (1, 2):
             what = f"spacing_mm is {sides.dtype} of shape {sides.shape}"
             raise BadDataError(what, way_out="it must be one number")
-        return Grid(arrays, (float(sides[0]), float(sides[-1])))
+        return Grid(arrays, (float(sides[0]), float(sides[-1])), notes=notes)
     flat = {name: held for name, held in arrays.items() if held.ndim == 2 and min(held.shape) > 1}
     if array:
         flat = {name: held for name, held in flat.items() if name == array}
     if len(flat) == 1:
         ((name, values),) = flat.items()
-        return Grid({"mean": values}, notes=() if array or len(arrays) == 1 else (f"the array {name!r} was taken",))
+        taken = () if array or len(arrays) == 1 else (f"the array {name!r} was taken",)
+        return Grid({"mean": values}, notes=(*taken, *notes))
     has = ", ".join(f"{name} {held.shape}" for name, held in sorted(arrays.items())[:12]) or "nothing"
     if len(flat) > 1:
         raise BadDataError(f"holds several arrays of rows and columns ({has})", way_out="name one with --array NAME")

@@ -34,6 +34,7 @@ _MOST_COUNTS: Final = 65535
 _SECONDS: Final = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0}
 _MM: Final = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "inch": 25.4}
 _MOST_NAMES: Final = 12  # of a file's arrays in an error
+_TURN: Final = 2 * np.pi
 _NOT_RIGID: Final = 1e-3  # of matrices that were written with few digits
 _TIME_OPTIONS: Final = {"frame_time_s": "time-unit", "pose_time_s": "pose-time-unit"}
 _BESIDE: Final = {
@@ -268,6 +269,10 @@ def _poses(held: Arrays, stated: Stated, told: list[str]) -> None:
             held[name] = held[name].T
             told.append(f"{name} of shape {(width, number)} read along its columns")
     if "quaternion_wxyz" in held and stated.pose_layout in ("xyzw", "euler"):
+        if stated.pose_layout == "euler" and np.abs(held["quaternion_wxyz"]).max() <= _TURN:
+            told.append(
+                f"angles lie within {_TURN:.1f} and are read as degrees: radians are to be multiplied by 57.296"
+            )
         held["quaternion_wxyz"] = quaternions(held["quaternion_wxyz"], stated.pose_layout)
     if "position_mm" in held:
         held["position_mm"] = held["position_mm"] * _MM[stated.length_unit or "mm"]

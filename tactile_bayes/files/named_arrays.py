@@ -93,6 +93,39 @@ def _of_another_kind(path: Path, start: bytes) -> BadDataError:
     return BadDataError(what, way_out="save the arrays with numpy.savez_compressed")
 
 
+AXES: Final = ("x", "y")
+"""Places of the columns and rows of a grid, or of each of its cells."""
+
+
+def turned_by_axes(arrays: Arrays) -> tuple[str, ...]:
+    """Turn grids in place so that x rises along their rows and y from row to row, by `AXES`, which are taken out."""
+    x, y = (np.asarray(arrays.pop(name, ())) for name in AXES)
+    if x.ndim == y.ndim == 2 and x.size and x.shape == y.shape:
+        x, y = (x[0], y[:, 0]) if x[0, 0] != x[0, -1] else (x[:, 0], y[0])
+    places = {
+        name: line for name, line in zip(AXES, (x, y), strict=True) if line.ndim == 1 and line.dtype.kind in "iuf"
+    }
+    notes = []
+    for name, line in places.items():
+        with np.errstate(all="ignore"):
+            steps = np.diff(line.astype(np.float64))
+        if len(steps) and not np.allclose(steps, steps.mean(), rtol=0.01, atol=0.0):
+            what = f"{name} runs in unequal steps ({steps.min():.4g} to {steps.max():.4g})"
+            raise BadDataError(what, way_out="a grid has square cells of one side: interpolate it")
+        if len(steps):
+            notes.append(f"{name} runs in steps of {abs(steps[0]):g}")
+    for name, grid in arrays.items():
+        if grid.ndim == 2 and len(x) != len(y) and grid.shape == (len(x), len(y)):
+            arrays[name] = grid.T
+            notes.append("rows and columns were swapped: x runs from row to row")
+        for axis, key in ((1, "x"), (0, "y")):
+            line = places.get(key, np.empty(0))
+            if arrays[name].ndim == 2 and len(line) == arrays[name].shape[axis] > 1 and line[0] > line[-1]:
+                arrays[name] = np.flip(arrays[name], axis)
+                notes.append(f"turned round along {key}, which falls from {line[0]:g} to {line[-1]:g}")
+    return tuple(dict.fromkeys(notes))
+
+
 # --- netCDF-3, by scipy.
 
 
@@ -264,6 +297,7 @@ def plain_names(
         if same & {*known, *(values or {})}:
             continue
         taken = {*known.values(), *found.values()}
+        words = (*words, *same)  # within a group
         alike = [name for name in names if name.rpartition(".")[2].lower() in words and name not in taken]
         alike = [name for name in alike if name.rpartition(".")[2] in words] or alike  # t, where there is a T too
         if here in _TIMES_BESIDE:

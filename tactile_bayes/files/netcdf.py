@@ -236,7 +236,8 @@ class Group:
         created = found.id.get_create_plist()
         filters = [created.get_filter(number)[0] for number in range(created.get_nfilters())]
         if len(set(filters)) < len(filters) or not set(filters) <= {_DEFLATE, _SHUFFLE, _CHECKSUM}:
-            raise BadDataError(f"variable {name} is packed by filters {filters}", way_out=self._way_out)
+            way_out = "pack it by gzip, with shuffle and checksum or without: h5repack -f GZIP=4"
+            raise BadDataError(f"variable {name} is packed by filters {filters}", way_out=way_out)
         if not found.chunks:
             return
         declared = int(np.prod(found.chunks, dtype=object)) * found.dtype.itemsize

@@ -61,6 +61,7 @@ _PLACE: Final = ("x", "y", "z")
 _SEEN: Final = ("ok", "enabled", "valid", "tracked", "good", "true", "visible")
 """Status of a tool that is seen, in small letters."""
 _UNIT: Final = re.compile(r"[\[(_ ](mm|cm|m|in|inch|inches)[\])]?$", re.IGNORECASE)
+_RADIANS: Final = re.compile(r"[\[(_ ]rad(ians)?\b", re.IGNORECASE)
 _LENGTH_LINE: Final = re.compile(r"\blength units?\W+(meters|millimeters|centimeters|mm|cm|m)\b", re.IGNORECASE)
 _LENGTHS: Final = {"in": "inch", "inches": "inch", "meters": "m", "millimeters": "mm", "centimeters": "cm"}
 _BARE: Final = {"wxyz": 7, "xyzw": 7, "euler": 6, "matrix": 16}
@@ -89,7 +90,7 @@ def read_poses(path: Path, given: Stated) -> Source:
 def kind_of_column(name: str) -> str:
     """What a column of a tracker's table holds, by its name; empty for one of anything else."""
     plain = re.sub(r"[^a-z0-9]", "", re.sub(r"[\[(].*?[\])]", "", name.lower()))
-    return _NAMES.get(plain) or _NAMES.get(re.sub(r"(mm|cm|inch|in|deg|ms|us|s)$", "", plain), "")
+    return _NAMES.get(plain) or _NAMES.get(re.sub(r"(mm|cm|inch|in|deg|rad|ms|us|s)$", "", plain), "")
 
 
 def is_header_of_poses(line: Line) -> bool:
@@ -168,6 +169,8 @@ def _named(table: TextTable, header: Line, given: Stated) -> Source:
     columns, rows = _of_one_tool(header, kinds, rows, names, given)
     order = (3, 4, 5, 0, 6, 7, 8, 1, 9, 10, 11, 2) if turned else range(len(names))  # rows of a matrix: R, then place
     numbers = np.column_stack([_values(rows, columns[names[i]]) for i in order])
+    if layout == "euler" and _RADIANS.search(header.fields[columns["azimuth"]]):
+        numbers[:, 3:] *= 180 / np.pi
     status = [_field(line, columns["status"]) for line in rows] if "status" in columns else [""] * len(rows)
     time, unit = _times(rows, columns, header, given)
     stated: dict[str, Any] = {"pose_time_unit": unit} if unit else {}

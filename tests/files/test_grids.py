@@ -421,6 +421,38 @@ def test_one_array_is_one_map_in_every_kind_of_file(tmp_path: Path) -> None:
         np.testing.assert_array_equal(read_grid(path, spacing_mm=1.0, units="kPa").mean, values, err_msg=path.name)
 
 
+Y, X = np.arange(61.0) - 30, np.arange(71.0) - 35
+AXES: dict[str, dict[str, Any]] = {
+    "y falls": {"mean": lump()[::-1], "y": Y[::-1], "x": X},
+    "both fall": {"mean": lump()[::-1, ::-1], "y": Y[::-1], "x": X[::-1]},
+    "x from row to row": {"mean": lump().T, "y": Y, "x": X},
+    "x from row to row, y falls": {"mean": lump()[::-1].T, "y": Y[::-1], "x": X},
+    "a place of each cell": {"mean": lump()[:, ::-1], "x": np.meshgrid(X[::-1], Y)[0], "y": np.meshgrid(X, Y)[1]},
+    "the same, turned": {"mean": lump().T, "x": np.meshgrid(X, Y)[0].T, "y": np.meshgrid(X, Y)[1].T},
+}
+
+
+@pytest.mark.parametrize("arrays", AXES.values(), ids=AXES)
+def test_a_grid_lies_as_its_places_say(tmp_path: Path, arrays: dict[str, Any]) -> None:
+    np.savez(tmp_path / "grid.npz", **arrays)
+    found, notes = import_grid(tmp_path / "grid.npz", GridOptions(spacing_mm=1.0, normalise="gain"))
+    np.testing.assert_array_equal(found.mean, lump())
+    assert "x runs in steps of 1" in notes
+    np.savez(tmp_path / "grid.npz", **{**arrays, "x": arrays["x"] ** 3})
+    with pytest.raises(BadDataError, match="x runs in unequal steps"):
+        import_grid(tmp_path / "grid.npz", GridOptions(spacing_mm=1.0, normalise="gain"))
+
+
+def test_a_level_in_another_unit_and_words_of_spreadsheets_have_their_way_out(tmp_path: Path) -> None:
+    np.savetxt(tmp_path / "grid.csv", lump(), delimiter=",")
+    with pytest.raises(BadDataError, match=r"the median value is 1.*, not near the level of 1000; give the level in"):
+        import_grid(tmp_path / "grid.csv", GridOptions(spacing_mm=1.0, level=1000.0))
+    for word in ("#DIV/0!", "1.#QNAN"):
+        (tmp_path / "sheet.csv").write_text(f"1,{word},1\n1,1.1,1\n1,1,1\n")
+        with pytest.raises(BadDataError, match=f"--no-value {word}"):
+            import_grid(tmp_path / "sheet.csv", GridOptions(spacing_mm=1.0))
+
+
 @pytest.mark.parametrize("factor", [1.0, 8.4, 1200.0])
 @pytest.mark.parametrize("slope", [0.0, 0.002])
 def test_a_level_is_fitted_beside_the_lump(tmp_path: Path, factor: float, slope: float) -> None:

@@ -62,9 +62,9 @@ def with_times(lines: list[str], made: Callable[[float], str] = "{:.4f}".format)
     return [f"{made(t)},{line}" for t, line in zip(TIME, lines, strict=True)]
 
 
-def polhemus(stations: int = 1) -> list[str]:
+def polhemus(stations: int = 1, unit: float = 1.0) -> list[str]:
     """Azimuth, elevation and roll in degrees: about z, the new y, the new x (Polhemus, FASTRAK User's Manual)."""
-    angles = TURNED.as_euler("ZYX", degrees=True)
+    angles = unit * TURNED.as_euler("ZYX", degrees=True)
     return [
         f"{t:.4f},{s},{numbers(place / 10 + 5 * (s - 1), turn)}"
         for t, place, turn in zip(TIME, PLACE, angles, strict=True)
@@ -128,6 +128,11 @@ LAYOUTS: dict[str, tuple[list[str], dict[str, Any], list[int] | None]] = {
         {"pose_layout": "euler", "length_unit": "cm", "pose_rate_hz": 120.0},
         None,
     ),
+    "azimuth in radians": (
+        [EULER.replace("azimuth", "azimuth (rad)"), *polhemus(unit=np.pi / 180)],
+        {},
+        None,
+    ),
     "OptiTrack": (motive(), {}, KEPT),
     "OptiTrack, the second body": (motive(2), {"tool": "2"}, KEPT),
     "quaternions": (with_times(QUATERNIONS), {"pose_layout": "wxyz"}, None),
@@ -172,8 +177,29 @@ def test_rows_that_mean_no_pose_are_gaps_whatever_marks_them(tmp_path: Path) -> 
         assert why in told
     turned = ["t,x,y,z,qw,qx,qy,qz", *with_times(QUATERNIONS)]
     turned[4] = f"{TIME[3]:.4f},0,0,0,0,0,0,0"
+    turned[7] = f"{TIME[6]:.4f},0,0,0,1,0,0,0"
     (tmp_path / "poses.csv").write_text("\n".join(turned))
-    same(brought_in(tmp_path / "poses.csv"), [i for i in range(len(TIME)) if i != 3])
+    same(brought_in(tmp_path / "poses.csv"), [i for i in range(len(TIME)) if i not in (3, 6)])
+
+
+@pytest.mark.parametrize("hidden", [np.nan, 1.0], ids=["NaN", "identity"])
+@pytest.mark.parametrize("as_matrices", [True, False])
+def test_gaps_of_arrays_are_gaps_too(hidden: float, as_matrices: bool) -> None:
+    """MATLAB and Python leave NaN or the identity where the tool is not seen."""
+    matrices, place, turn = MATRICES.copy(), PLACE.copy(), POSES.quaternion_wxyz.copy()
+    matrices[4:7], place[4:7], turn[4:7] = hidden * np.eye(4), 0.0, hidden * np.array([1.0, 0, 0, 0])
+    poses = (TIME, matrices) if as_matrices else (TIME, place, turn)
+    found = tb.scan(pressures(SCAN), SCAN.frames.time_s, poses, head=SCAN.head, unit="kPa")
+    same(found, [i for i in range(len(TIME)) if i not in (4, 5, 6)])
+    assert "3 of 36 poses left out as gaps" in found.session["imported_as"]
+
+
+def test_angles_that_may_be_radians_are_asked_about() -> None:
+    angles = TURNED.as_euler("ZYX")
+    found = tb.scan(
+        pressures(SCAN), SCAN.frames.time_s, (TIME, PLACE, angles), head=SCAN.head, unit="kPa", pose_layout="euler"
+    )
+    assert "angles lie within 6.3 and are read as degrees" in found.session["imported_as"]
 
 
 def test_a_status_in_numbers_has_to_be_stated(tmp_path: Path) -> None:

@@ -120,6 +120,19 @@ def test_fields_of_a_structure_and_members_of_a_group_are_named(good: Arrays, sc
         same(import_arrays(path, names).scan, scan)
 
 
+def test_the_layouts_own_names_are_found_within_groups(pressed: Arrays, scan: Scan, head: Path, tmp_path: Path) -> None:
+    poses = {name: pressed.pop(name) for name in ("position_mm", "quaternion_wxyz", "pose_time_s")}
+    frames = {name: pressed.pop(name) for name in ("frames", "frame_time_s")}
+    scipy.io.savemat(tmp_path / "exam.mat", {"exam": {"array": frames, "tracker": poses}})
+    found = tb.scan(tmp_path / "exam.mat", head=head, unit="kPa")
+    np.testing.assert_array_equal(found.poses.position_mm, scan.poses.position_mm)
+    with h5py.File(tmp_path / "exam.h5", "w") as file:
+        for name, one in {**frames, **poses}.items():
+            file.create_dataset(name, data=one, chunks=True, compression="lzf")
+    with pytest.raises(BadDataError, match=r"is packed by filters .*; pack it by gzip"):
+        tb.scan(tmp_path / "exam.h5", head=head, unit="kPa")
+
+
 def test_plain_words_are_taken_for_arrays_and_said(pressed: Arrays, scan: Scan, tmp_path: Path) -> None:
     """Times are told apart by the group that they stand in; two that fit are none."""
     words = {"frames": "Pressure", "frame_time_s": "time", "position_mm": "position", "quaternion_wxyz": "quat"}
