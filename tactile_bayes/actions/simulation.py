@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -108,8 +107,8 @@ def population_action(
         open_unfinished(output, list[MassRow], settings=as_dict(population)) as store,
         progress_bar("masses") as progress,
     ):
-        work, masses = partial(rows_of_mass, population=population), range(asked.masses + asked.centred)
-        outcomes = run_batch(work, masses, key=str, executor=executor, store=store, progress=progress)
+        masses = range(asked.masses + asked.centred)
+        outcomes = run_batch(population.rows, masses, key=str, executor=executor, store=store, progress=progress)
     rows = [row for outcome in outcomes for row in outcome.value or []]
     write_text(output, table_text(rows), force=force)
     failed = [outcome for outcome in outcomes if not outcome.ok]
@@ -124,11 +123,6 @@ def population_action(
     if failed:
         missing = f"{len(failed)} of {len(outcomes)} masses are missing"
         raise TactileBayesError(f"{missing}; {unfinished(output)} keeps the others: run again")
-
-
-def rows_of_mass(index: int, *, population: Population) -> list[MassRow]:
-    """Rows of one mass, in any process."""
-    return population.rows(index)
 
 
 def table_text(rows: list[MassRow]) -> str:

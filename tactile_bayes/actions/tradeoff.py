@@ -216,7 +216,10 @@ def tradeoff_estimate_action(
             ladder = measure(tactile_map, calibration=calibration, options=options, work=work)
         if len(maps) > 1:
             ladder = replace(ladder, pooled=pooled_rows(maps, settings, clock=time.process_time))
-    cold = fresh_cpu_s(["estimate", str(maps[0]), *_said(size_calibration, centre_mm, settings_file)])
+    said = [] if size_calibration is None else ["--size-calibration", size_calibration]
+    said += [] if centre_mm is None else ["--centre-mm", *map(repr, centre_mm)]
+    said += [] if settings_file is None else ["--settings", str(settings_file)]
+    cold = fresh_cpu_s(["estimate", str(maps[0]), *said])  # the same as the default row
     if cold is not None:
         shared = {"start of the program and reading the map": max(cold - ladder.default.seconds, 0.0)}
         ladder = replace(ladder, shared_cpu_s=shared)
@@ -227,13 +230,6 @@ def tradeoff_estimate_action(
     return show(
         ladder, varied="estimate", title=title, figure=figure, as_json=as_json, force=force, provenance=provenance
     )
-
-
-def _said(calibration: str | None, centre_mm: tuple[float, float] | None, settings_file: Path | None) -> list[str]:
-    """The options of an `estimate` that does the same as the default row."""
-    words = [] if calibration is None else ["--size-calibration", calibration]
-    words += [] if centre_mm is None else ["--centre-mm", *map(repr, centre_mm)]
-    return words + ([] if settings_file is None else ["--settings", str(settings_file)])
 
 
 # --- `tradeoff map`: every setting of `map` on the user's own scan, up to the size.

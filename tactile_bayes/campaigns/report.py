@@ -136,14 +136,12 @@ def _row(campaign: Campaign, exam: Exam, together: tuple[Finding, ...]) -> Row:
     report = read_record(
         campaign.folder / layout.EXAMS / exam.name / (layout.SIZED if by_site else layout.ESTIMATE), EstimateReport
     )
-    return Row(exam, _shortened(report), findings=(*report.findings, *together), **facts)
-
-
-def _shortened(report: EstimateReport) -> EstimateReport:
-    """The report with what tables and pages show: the rest of it is a hundred times as much."""
+    # what tables and pages show: the rest of a report is a hundred times as much
     masses = tuple(replace(one, **dict.fromkeys(_OF_A_MASS)) for one in report.masses)
     rest: dict[str, Any] = {"candidates": (), "other_rises": (), "touching": (), "left_out": (), "prior": {}}
-    return replace(report, masses=masses, diagnostics={}, provenance={}, **dict.fromkeys(_OF_AN_ESTIMATE), **rest)
+    rest |= dict.fromkeys(_OF_AN_ESTIMATE)
+    shown = replace(report, masses=masses, diagnostics={}, provenance={}, **rest)
+    return Row(exam, shown, findings=(*report.findings, *together), **facts)
 
 
 def pooled_reports(campaign: Campaign) -> dict[str, PooledReport]:

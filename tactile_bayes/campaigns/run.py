@@ -193,7 +193,7 @@ class Campaign:
         self.not_learned = ""  # why it was not, where masses have repeats
         self._sizes_unknown = False
         self._store, self._executor, self._dry = store, executor, dry
-        self._bar: Bar = _no_bar if bar is None else bar
+        self._bar: Bar = (lambda _label: nullcontext(untold)) if bar is None else bar
         self._block = max(_BLOCK, _AHEAD_IN_BLOCK * int(getattr(executor, "ahead", 0)))
         self._breasts = Breasts(exams)
         self._recordings = Alike(self._breasts, "recording")
@@ -513,7 +513,3 @@ def _blocks_of_patients(exams: Sequence[Exam], size: int) -> Iterator[Sequence[E
         if end == len(exams) or (end - start >= size and exams[end].patient != exams[end - 1].patient):
             yield exams[start:end]
             start = end
-
-
-def _no_bar(_label: str) -> AbstractContextManager[Progress]:
-    return nullcontext(untold)

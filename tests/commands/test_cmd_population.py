@@ -155,13 +155,13 @@ def test_an_interrupted_run_goes_on_and_gives_the_same_table(tmp_path: Path, mon
     """With the simulation stood in for by rows that come from the mass's number alone."""
     calls: list[int] = []
 
-    def quick(index: int, *, population: Population) -> list[MassRow]:
+    def quick(population: Population, index: int) -> list[MassRow]:
         calls.append(index)
         if index == 3 and calls.count(3) == 1:
             raise KeyboardInterrupt
         return [row(index, exam, seed=population.seed) for exam in range(population.scans)]
 
-    monkeypatch.setattr(population, "rows_of_mass", quick)
+    monkeypatch.setattr(Population, "rows", quick)
     words = ("population", "--masses", 6, "-o", "p.csv")
     assert run_here(*words, cwd=tmp_path).returncode == 130
     assert not (tmp_path / "p.csv").exists()
