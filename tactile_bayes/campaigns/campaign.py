@@ -11,16 +11,8 @@ from tactile_bayes.api.arguments import PathLike, Told, door, path_of, plain, re
 from tactile_bayes.api.estimates import settings_of
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.batch import open_executor
+from tactile_bayes.campaigns import report
 from tactile_bayes.campaigns.inputs import open_campaign, tidy
-from tactile_bayes.campaigns.report import (
-    MOST_NAMED,
-    WRITTEN,
-    Excision,
-    Written,
-    check_inputs,
-    copy_outputs,
-    write_outputs,
-)
 from tactile_bayes.campaigns.run import Bar, Campaign, CampaignState
 from tactile_bayes.campaigns.steps import CampaignSettings
 from tactile_bayes.declarations import names_of
@@ -39,21 +31,21 @@ class CampaignResult(Told, eq=False):
 
     campaign: Campaign
     folder: Path
-    written: Written | None  #: What was written; None where nothing was run.
+    written: report.Written | None  #: What was written; None where nothing was run.
 
     @property
     def text(self) -> str:
         """What ``campaign run`` prints."""
         lines = self._planned() if self.written is None else self._done(self.written)
-        report = "" if self.written is None else self.written.report  # which ends with the words of research
-        return "\n".join([*lines, report or f"{RESEARCH_USE}\n"])
+        told = "" if self.written is None else self.written.report  # which ends with the words of research
+        return "\n".join([*lines, told or f"{RESEARCH_USE}\n"])
 
     @property
     def failed(self) -> tuple[str, ...]:
         """A line for each of the first exams or masses that failed, and one that counts the others."""
         faults = self.campaign.found.faults
-        lines = [f"{name}: {fault.step}: {fault.reason}" for name, fault in list(faults.items())[:MOST_NAMED]]
-        more = [f"{len(faults) - MOST_NAMED} more, see failures.csv"] if len(faults) > MOST_NAMED else []
+        lines = [f"{name}: {fault.step}: {fault.reason}" for name, fault in list(faults.items())[: report.MOST_NAMED]]
+        more = [f"{len(faults) - report.MOST_NAMED} more, see failures.csv"] if len(faults) > report.MOST_NAMED else []
         return (*lines, *more)
 
     def _planned(self) -> Iterator[str]:
@@ -61,13 +53,13 @@ class CampaignResult(Told, eq=False):
         for step, todo in found.todo.items():
             named = f" ({', '.join(found.names[step])})" if _few(found, step) and found.kept[step] else ""
             yield f"{step}: {todo} to do{named}, {found.kept[step]} done"
-        for name, fault in list(found.faults.items())[:MOST_NAMED]:
+        for name, fault in list(found.faults.items())[: report.MOST_NAMED]:
             yield f"{name}: {fault.step} failed: {fault.reason}"
-        if len(found.faults) > MOST_NAMED:
-            yield f"{len(found.faults) - MOST_NAMED} more failed"
+        if len(found.faults) > report.MOST_NAMED:
+            yield f"{len(found.faults) - report.MOST_NAMED} more failed"
         yield "Nothing was run."
 
-    def _done(self, written: Written) -> Iterator[str]:
+    def _done(self, written: report.Written) -> Iterator[str]:
         campaign, found = self.campaign, self.campaign.found
         yield f"{self.folder}: {len(campaign.exams)} exams: {written.counts}"
         yield from written.masses
@@ -148,13 +140,13 @@ def run_campaign(
     _check_folder(table, output, settings)
     names = {settings.of(exam).calibration_name for exam in table} - {None}
     used = [exams, asked.excision, asked.columns, asked.protocol, *read, *map(size_calibration_path, map(str, names))]
-    for path in (output / name for name in WRITTEN):
+    for path in (output / name for name in report.WRITTEN):
         if any(one is not None and same_file(path, one) for one in used):
             raise UsageError(f"{path} is an input of this command; choose another name for the output")
     if asked.columns is not None and asked.excision is None:
         raise UsageError("--columns is the layout of the excision table; give --excision too")
-    measured = None if asked.excision is None else Excision(asked.excision, asked.columns)
-    check_inputs(table, measured, asked.protocol)
+    measured = None if asked.excision is None else report.Excision(asked.excision, asked.columns)
+    report.check_inputs(table, measured, asked.protocol)
     with (
         open_campaign(output, dry=asked.dry_run) as store,
         open_executor(workers=asked.workers, cluster=None if asked.dry_run else asked.scheduler) as executor,
@@ -165,9 +157,9 @@ def run_campaign(
         if asked.dry_run:
             return CampaignResult(run, output, None)
         left = tidy(place, table, run.found.results, unread=run.unread)
-        written = write_outputs(run, measured, asked.protocol, unlisted=left)
+        written = report.write_outputs(run, measured, asked.protocol, unlisted=left)
         if settings.copy_to:
-            copy_outputs(place, settings.copy_to)
+            report.copy_outputs(place, settings.copy_to)
     return CampaignResult(run, output, written)
 
 

@@ -20,7 +20,7 @@ from mcap.writer import CompressionType, Writer
 from mcap_protobuf.schema import build_file_descriptor_set
 from numpy.typing import NDArray
 
-from tactile_bayes import __version__
+from tactile_bayes import __version__, scans
 from tactile_bayes.declarations import Record, from_plain
 from tactile_bayes.errors import BadDataError, UsageError, in_file
 from tactile_bayes.files.atomic import atomic_path, refuse_existing
@@ -30,15 +30,6 @@ from tactile_bayes.files.mcap_records import McapRecords, Messages, read_records
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.findings import Finding, findings_in
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.scans import (
-    CountArray,
-    ElementCalibration,
-    HeadGeometry,
-    Landmarks,
-    PressureFrames,
-    Scan,
-    TrackerPoses,
-)
 
 # --- Scan files: MCAP that Foxglove opens, readable after the recording program was killed.
 #
@@ -84,8 +75,8 @@ class ScanWriter:
         self,
         stream: IO[bytes],
         *,
-        head: HeadGeometry,
-        element_calibration: ElementCalibration,
+        head: scans.HeadGeometry,
+        element_calibration: scans.ElementCalibration,
         session: Mapping[str, str],
         provenance: Provenance,
         truth: Mapping[str, Any] | None = None,
@@ -135,7 +126,7 @@ class ScanWriter:
         )
         return number
 
-    def add_frame(self, counts: CountArray, *, device_ns: int, host_ns: int) -> None:
+    def add_frame(self, counts: scans.CountArray, *, device_ns: int, host_ns: int) -> None:
         """Add one (rows, columns) frame of raw counts."""
         if counts.shape != self._shape:
             raise BadDataError(f"a frame has shape {counts.shape}", way_out=f"this head has {self._shape} taxels")
@@ -183,7 +174,7 @@ def _stamp(message: Any, device_ns: int) -> None:
     message.timestamp.seconds, message.timestamp.nanos = divmod(device_ns, _NS)
 
 
-def _grid_of(head: HeadGeometry) -> Any:
+def _grid_of(head: scans.HeadGeometry) -> Any:
     """Grid message without time and counts: the constant part of this head's frames."""
     rows, columns = head.shape
     pitch = head.pitch_mm
@@ -221,7 +212,7 @@ def s_from_ns(time_ns: NDArray[np.int64]) -> FloatArray:
 
 
 def write_scan(
-    path: Path, scan: Scan, *, provenance: Provenance, truth: Mapping[str, Any] | None = None, force: bool = False
+    path: Path, scan: scans.Scan, *, provenance: Provenance, truth: Mapping[str, Any] | None = None, force: bool = False
 ) -> None:
     """Write a scan; equal scans give equal bytes under one version of zstd and protobuf.
 
@@ -243,7 +234,7 @@ def write_scan(
         writer.finish()
 
 
-def _write_messages(writer: ScanWriter, scan: Scan) -> None:
+def _write_messages(writer: ScanWriter, scan: scans.Scan) -> None:
     frame_ns = ns_from_s(scan.frames.time_s)
     all_ns = np.concatenate([frame_ns, ns_from_s(scan.poses.time_s)])
     if scan.landmarks is not None:
@@ -259,7 +250,7 @@ def _write_messages(writer: ScanWriter, scan: Scan) -> None:
             writer.add_pose(scan.poses.position_mm[j], scan.poses.quaternion_wxyz[j], device_ns=time, host_ns=time)
 
 
-def read_scan(path: Path) -> Scan:
+def read_scan(path: Path) -> scans.Scan:
     """Read a scan; from an unfinished file, everything up to the last complete chunk.
 
     Damaged chunks are an error: a scan with a hole must not pass for a whole one. `read_scan_report` reads around the
@@ -275,7 +266,7 @@ def read_scan(path: Path) -> Scan:
 class ScanFile(Record, eq=False):
     """A scan and the report on its file."""
 
-    scan: Scan
+    scan: scans.Scan
     complete: bool  #: The file was closed properly and nothing was lost.
     damaged: bool  #: A checksum failed: bytes changed after they were written. An unfinished file is not damaged.
     lost: tuple[str, ...]  #: One line a loss, for people.
@@ -288,8 +279,8 @@ def read_scan_report(path: Path) -> ScanFile:
     """Read a scan, and what its file holds and lost; one cut off before its first complete chunk is an error."""
     records = scan_records(path, keep=TOPICS)
     with in_file(path):
-        head = attached(records, HeadGeometry, "head.json")
-        calibration = attached(records, ElementCalibration, _CALIBRATION)
+        head = attached(records, scans.HeadGeometry, "head.json")
+        calibration = attached(records, scans.ElementCalibration, _CALIBRATION)
         session = records.metadata.get("session", {})
         check_session(session, path=path)
         frames = _frames(records, head)
@@ -298,10 +289,10 @@ def read_scan_report(path: Path) -> ScanFile:
             raise BadDataError("was cut off before its first complete frame", way_out=way_out)
         messages = records.messages("/pose", schema="foxglove.PoseInFrame")
         places = _pose_table(messages)
-        poses = TrackerPoses(message_times(messages, topic="/pose"), places[:, :3], places[:, 3:])
+        poses = scans.TrackerPoses(message_times(messages, topic="/pose"), places[:, :3], places[:, 3:])
         landmarks, findings = _landmarks(records), file_findings(records)
         return ScanFile(
-            scan=Scan(frames, poses, head, calibration, landmarks, session, findings),
+            scan=scans.Scan(frames, poses, head, calibration, landmarks, session, findings),
             complete=records.finished and not records.lost,
             damaged=records.damaged,
             lost=tuple(records.lost),
@@ -372,7 +363,7 @@ def message_times(messages: Messages, *, topic: str) -> FloatArray:
     return s_from_ns(times.astype(np.int64))
 
 
-def _frames(records: McapRecords, head: HeadGeometry) -> PressureFrames:
+def _frames(records: McapRecords, head: scans.HeadGeometry) -> scans.PressureFrames:
     messages = records.messages("/pressure", schema="foxglove.Grid")
     rows, columns = head.shape
     counts: NDArray[np.uint16] = np.empty((len(messages), rows, columns), dtype=np.uint16)
@@ -382,7 +373,7 @@ def _frames(records: McapRecords, head: HeadGeometry) -> PressureFrames:
             way_out = f"{rows} x {columns} uint16 counts are needed"
             raise BadDataError(f"/pressure message {i} holds {len(data)} bytes", way_out=way_out)
         counts[i] = np.frombuffer(data, dtype="<u2").reshape(columns, rows).T
-    return PressureFrames(message_times(messages, topic="/pressure"), counts)
+    return scans.PressureFrames(message_times(messages, topic="/pressure"), counts)
 
 
 def _pose_table(messages: Messages) -> FloatArray:
@@ -395,7 +386,7 @@ def _pose_table(messages: Messages) -> FloatArray:
     return table
 
 
-def _landmarks(records: McapRecords) -> Landmarks | None:
+def _landmarks(records: McapRecords) -> scans.Landmarks | None:
     """Last touch of each landmark, and the distance of earlier ones from it; None unless `LANDMARK_NAMES` were."""
     points, apart = {}, []
     for name in (*LANDMARK_NAMES, NIPPLE):
@@ -407,7 +398,7 @@ def _landmarks(records: McapRecords) -> Landmarks | None:
         places = _pose_table(touches)[:, :3]
         points[f"{name}_mm"] = places[-1]
         apart += np.linalg.norm(places[:-1] - places[-1], axis=1).tolist()
-    return Landmarks(**points, spread_mm=max(apart) if apart else None)
+    return scans.Landmarks(**points, spread_mm=max(apart) if apart else None)
 
 
 def _decode(kind: Any, body: bytes) -> Any:
@@ -512,8 +503,8 @@ class RecordingWriter(ScanWriter):
         self,
         stream: IO[bytes],
         *,
-        head: HeadGeometry,
-        element_calibration: ElementCalibration,
+        head: scans.HeadGeometry,
+        element_calibration: scans.ElementCalibration,
         session: Mapping[str, str],
         provenance: Provenance,
     ) -> None:

@@ -23,6 +23,7 @@ from tactile_bayes.scans import Scan
 from tactile_bayes.size.bodies import BodyCalibration, mean_width_mm
 from tactile_bayes.size.pooling import Calibration
 from tactile_bayes.size.terms import outside_domain
+from tactile_bayes.studies import paper
 from tactile_bayes.studies.estimate_tradeoff import (
     Choice,
     Clock,
@@ -34,15 +35,6 @@ from tactile_bayes.studies.estimate_tradeoff import (
     Work,
     climbed,
     default_run,
-)
-from tactile_bayes.studies.paper import (
-    HARD_RATIO,
-    Geometry,
-    LineFit,
-    StudyRow,
-    StudySettings,
-    fit_line,
-    learn_as_printed,
 )
 from tactile_bayes.studies.paper_solid import SolidSettings
 
@@ -70,7 +62,7 @@ class LumpCase(Record):
     stiffness_ratio: float
     seat: float
     """`d_mm`, `depth_ratio`, `stiffness_ratio`, `seat`: As in `study.Geometry`."""
-    plane: StudySettings
+    plane: paper.StudySettings
     solid: SolidSettings
     """`plane`, `solid`: The default settings of both models for its body and head. All maps are as they are and fitted
     with a level of 1, as those in two dimensions are."""
@@ -92,7 +84,7 @@ class Setting(Record):
     model: str
     """``"empirical"``, ``"plane-strain"`` or ``"solid"``."""
     label: str  #: For people.
-    settings: StudySettings | SolidSettings
+    settings: paper.StudySettings | SolidSettings
     """Of the model; the empirical one is fitted to plane-strain frames of these."""
     kind: str
     """``"mesh"`` where only the elements differ from the default, ``"default"``, ``"reference"`` for the finest mesh,
@@ -140,7 +132,7 @@ def case_of(scene: Scene, *, head: str | None = None) -> LumpCase:
         lump.depth_ratio,
         lump.stiffness_ratio,
         round(seat, 9) + 0.0,
-        StudySettings(head=section, **tissue),
+        paper.StudySettings(head=section, **tissue),
         SolidSettings(head=array, **tissue, background="fixed", flat_field=False),
     )
     _ = case.body  # refuses what neither model can do
@@ -190,21 +182,21 @@ def measure_forward(case: LumpCase, setting: Setting, *, clock: Clock, runs: int
     return Measured(setting, element, float(lump), float(one_map), found.amplitude, *found.widths_mm)
 
 
-def _empirical(case: LumpCase) -> Callable[[float], LineFit]:
+def _empirical(case: LumpCase) -> Callable[[float], paper.LineFit]:
     """The fit of the map of Eqs 1 to 4, which are fitted to plane-strain frames."""
     settings = case.plane
     over = settings.over(settings.surface(case.body), case.stiffness_ratio)
     model = settings.empirical(case.d_mm, case.body.layers, over)
 
-    def fitted(_: float) -> LineFit:
-        return fit_line(
+    def fitted(_: float) -> paper.LineFit:
+        return paper.fit_line(
             build_line(model.frames(head_positions(settings.positions_mm), over.s_mm)), settings.fit_radius_mm
         )
 
     return fitted
 
 
-def _element_mm(case: LumpCase, settings: StudySettings | SolidSettings) -> float:
+def _element_mm(case: LumpCase, settings: paper.StudySettings | SolidSettings) -> float:
     """Half the lump's circumference over the elements on it."""
     if isinstance(settings, SolidSettings):
         nodes = len(lump_mesh(settings.geometry(case.body), settings.mesh_size).arc)
@@ -213,13 +205,13 @@ def _element_mm(case: LumpCase, settings: StudySettings | SolidSettings) -> floa
     return float(np.pi * case.body.radius_mm / ((nodes - 1) / 2))
 
 
-def teach(case: LumpCase, model: str, *, progress: Callable[[int, int], None]) -> list[StudyRow]:
+def teach(case: LumpCase, model: str, *, progress: Callable[[int, int], None]) -> list[paper.StudyRow]:
     """Simulate hard lumps of several sizes and depths in the case's body, to learn Eq 6 from."""
-    geometries = [Geometry(case.seat, d, h, (HARD_RATIO,)) for d in _TAUGHT_MM for h in _TAUGHT_DEPTHS]
+    geometries = [paper.Geometry(case.seat, d, h, (paper.HARD_RATIO,)) for d in _TAUGHT_MM for h in _TAUGHT_DEPTHS]
     deepest = max(d * (h + max(0.6, 0.5 * case.seat)) + 2.0 for d in _TAUGHT_MM for h in _TAUGHT_DEPTHS)
     thickness = max(case.solid.thickness_mm or THICKNESS_MM, deepest)
     settings = replace(case.solid if model == SOLID else case.plane, thickness_mm=thickness)
-    rows: list[StudyRow] = []
+    rows: list[paper.StudyRow] = []
     for number, geometry in enumerate(geometries, start=1):
         rows += settings.rows(geometry)
         progress(number, len(geometries))
@@ -268,10 +260,10 @@ class SizeRule(Record, eq=False):
         return self.outside_of(one.amplitude, one.sigma_x_mm, one.sigma_y_mm)
 
 
-def learned_rule(rows: Sequence[StudyRow]) -> SizeRule:
+def learned_rule(rows: Sequence[paper.StudyRow]) -> SizeRule:
     """Learn Eq 6 in two stages from a study's rows, for each axis of the head, and its scatter over the rows."""
     axes = ["x", "y"] if rows[0].sigma_y_mm is not None else ["x"]
-    learned = [learn_as_printed(rows, axis=axis) for axis in axes]
+    learned = [paper.learn_as_printed(rows, axis=axis) for axis in axes]
 
     def sizes(amplitude: float, sigma_x_mm: float, sigma_y_mm: float | None) -> list[float]:
         widths = (sigma_x_mm, sigma_y_mm)
