@@ -99,12 +99,13 @@ AXES: Final = ("x", "y")
 
 def turned_by_axes(arrays: Arrays) -> tuple[str, ...]:
     """Turn grids in place so that x rises along their rows and y from row to row, by `AXES`, which are taken out."""
-    x, y = (np.asarray(arrays.pop(name, ())) for name in AXES)
-    if x.ndim == y.ndim == 2 and x.size and x.shape == y.shape:
+    x, y = (arrays.get(name, np.empty(0)) for name in AXES)
+    if x.ndim == y.ndim == 2 and x.size and x.shape == y.shape and len(arrays) > len(AXES):
         x, y = (x[0], y[:, 0]) if x[0, 0] != x[0, -1] else (x[:, 0], y[0])
-    places = {
-        name: line for name, line in zip(AXES, (x, y), strict=True) if line.ndim == 1 and line.dtype.kind in "iuf"
-    }
+    lines = zip(AXES, (x, y), strict=True)
+    places = {name: line for name, line in lines if line.ndim == 1 and line.dtype.kind in "iuf"}
+    for name in places:
+        arrays.pop(name, None)
     notes = []
     for name, line in places.items():
         with np.errstate(all="ignore"):
