@@ -11,19 +11,10 @@ import numpy as np
 
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError, UsageError, in_file
+from tactile_bayes.files import text_lines
 from tactile_bayes.files.arrays_layout import GridOptions
 from tactile_bayes.files.images import read_image
 from tactile_bayes.files.named_arrays import ARRAY_SUFFIXES, AXES, read_named, turned_by_axes
-from tactile_bayes.files.text_lines import (
-    FEWEST_LABELS,
-    NO_SENSEL,
-    counts_up,
-    fields_of,
-    read_lines,
-    refuse_thousands,
-    separator_of,
-    with_comma,
-)
 from tactile_bayes.findings import Finding
 from tactile_bayes.geometry import BoolArray, FloatArray
 from tactile_bayes.mapping.map import MapRecipe, TactileMap, block_sums
@@ -63,11 +54,11 @@ _MM: Final = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4, "inch": 25.4, None
 def read_table(path: Path, *, no_value: Sequence[str] = ()) -> Grid:
     """Read a table of text, NaN where a field is empty or one of the texts of `no_value`."""
     words = [one for one in no_value if not is_number(one)]  # numbers are looked for among the values
-    texts = read_lines(path)
-    separator = separator_of(texts, words) or ","
-    rows = [fields_of(one, separator) for one in texts]
-    commas = with_comma(rows, words)
-    refuse_thousands(commas, way_out="write numbers without commas")
+    texts = text_lines.read_lines(path)
+    separator = text_lines.separator_of(texts, words) or ","
+    rows = [text_lines.fields_of(one, separator) for one in texts]
+    commas = text_lines.with_comma(rows, words)
+    text_lines.refuse_thousands(commas, way_out="write numbers without commas")
     decimal = {one for one in commas if one.count(",") == 1}
     rows = [[field.replace(",", ".") if field in decimal else field for field in row] for row in rows]
     first, last = _numbers_within(rows, no_value)
@@ -76,7 +67,7 @@ def read_table(path: Path, *, no_value: Sequence[str] = ()) -> Grid:
         what = f"its first column is called {names[0][:20]!r}, as before frames that stand one a row"
         raise BadDataError(what, way_out="import them as a scan, or give one frame as rows and columns")
     text = "\n".join(texts)
-    marks = (*words, NO_SENSEL) if "ASCII_DATA" in text else tuple(words)
+    marks = (*words, text_lines.NO_SENSEL) if "ASCII_DATA" in text else tuple(words)
     before, rows, after, notes = rows[:first], rows[first:last], rows[last:], list[str]()
     _refuse_several(rows, first)
     for part, where in ((before, "before"), (after, "after")):
@@ -106,7 +97,7 @@ def is_number(field: str) -> bool:
 
 def _numbers_within(rows: Sequence[list[str]], no_value: Sequence[str]) -> tuple[int, int]:
     """Where lines of numbers begin and end: there every field is one, or empty, or a mark for no value."""
-    marks = {"", NO_SENSEL, *no_value}
+    marks = {"", text_lines.NO_SENSEL, *no_value}
     plain = [
         i
         for i, row in enumerate(rows)
@@ -182,14 +173,14 @@ def _refuse_labels(table: FloatArray) -> None:
     both = np.isnan(table[0, 0]) and _evenly(row[1:]) and _evenly(column[1:])
     for found, line, where in (
         (both, row[1:], "row 1 and column 1"),
-        (counts_up(row), row, "row 1"),
-        (counts_up(column), column, "column 1"),
+        (text_lines.counts_up(row), row, "row 1"),
+        (text_lines.counts_up(column), column, "column 1"),
     ):
         if found:
             way_out = "save the grid without them (pandas: to_csv(..., header=False, index=False))"
             raise BadDataError(f"{where} count {_first_three(line)}... as labels do", way_out=way_out)
     for name, line, beside in (("column", column, table[:, 1:].T), ("row", row, table[1:])):
-        if len(line) >= FEWEST_LABELS and _evenly(line) and not any(map(_evenly, beside)):
+        if len(line) >= text_lines.FEWEST_LABELS and _evenly(line) and not any(map(_evenly, beside)):
             what = f"{name} 1 runs in equal steps ({_first_three(line)}...)"
             raise BadDataError(what, way_out="leave out times or places; frames that stand one a row are a scan")
 

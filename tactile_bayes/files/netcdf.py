@@ -15,16 +15,8 @@ import numpy as np
 
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError, in_file
+from tactile_bayes.files import reading
 from tactile_bayes.files.documents import check_text
-from tactile_bayes.files.reading import (
-    HDF5_MAGIC,
-    NETCDF_BYTES,
-    check_limit,
-    decoding,
-    not_a,
-    open_input,
-    unpacked_limit,
-)
 
 # --- Check of an HDF5 file's text heaps before the library opens it: a damaged size makes the library loop forever.
 
@@ -201,7 +193,9 @@ class Group:
         return sorted(name for name in map(str, self._place) if isinstance(self._own(name), h5py.Group))
 
     def _values(self, name: str, found: Any) -> Any:
-        check_limit(found.size * found.dtype.itemsize, self._most_bytes, what=f"variable {name} unpacks to {{}} bytes")
+        reading.check_limit(
+            found.size * found.dtype.itemsize, self._most_bytes, what=f"variable {name} unpacks to {{}} bytes"
+        )
         self._check_chunks(name, found)
         return found[...]
 
@@ -241,10 +235,10 @@ class Group:
         if not found.chunks:
             return
         declared = int(np.prod(found.chunks, dtype=object)) * found.dtype.itemsize
-        check_limit(declared, self._most_bytes, what=f"a chunk of variable {name} unpacks to {{}} bytes")
+        reading.check_limit(declared, self._most_bytes, what=f"a chunk of variable {name} unpacks to {{}} bytes")
         chunks = [found.id.get_chunk_info(number) for number in range(found.id.get_num_chunks())]
         largest = max((stored.size for stored in chunks), default=0)
-        check_limit(largest, self._most_bytes, what=f"a chunk of variable {name} takes {{}} bytes")
+        reading.check_limit(largest, self._most_bytes, what=f"a chunk of variable {name} takes {{}} bytes")
         for stored in chunks:
             over = _unpacked_bytes(found, stored, filters, most=declared + 1) - declared
             if over:
@@ -304,13 +298,13 @@ def _has_scales(dataset: Any) -> bool:
 def open_netcdf(path: Path, *, way_out: str, begins_at: int = 0) -> Iterator[Group]:
     """The root group of a netCDF-4 or HDF5 file, whose first byte is at `begins_at`; every fault in the block becomes a
     `BadDataError` that names `path`."""
-    with in_file(path), open_input(path) as stream, decoding(_DAMAGED, way_out=way_out):
+    with in_file(path), reading.open_input(path) as stream, reading.decoding(_DAMAGED, way_out=way_out):
         stream.seek(begins_at)
-        if stream.read(len(HDF5_MAGIC)) != HDF5_MAGIC:
-            raise not_a(path, "a map or posterior (netCDF)", what=_DAMAGED, way_out=way_out)
-        check_limit(stream.seek(0, io.SEEK_END), NETCDF_BYTES, what="it has {} bytes")
+        if stream.read(len(reading.HDF5_MAGIC)) != reading.HDF5_MAGIC:
+            raise reading.not_a(path, "a map or posterior (netCDF)", what=_DAMAGED, way_out=way_out)
+        reading.check_limit(stream.seek(0, io.SEEK_END), reading.NETCDF_BYTES, what="it has {} bytes")
         stream.seek(0)
         data = stream.read()
         check_heaps(data, way_out=way_out)
         with h5py.File(io.BytesIO(data), "r") as file:
-            yield Group(file, most_bytes=unpacked_limit(len(data)), way_out=way_out)
+            yield Group(file, most_bytes=reading.unpacked_limit(len(data)), way_out=way_out)

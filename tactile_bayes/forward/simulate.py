@@ -9,18 +9,10 @@ import numpy as np
 
 from tactile_bayes.declarations import Record, as_dict, replace
 from tactile_bayes.errors import BadDataError
+from tactile_bayes.forward import plane
 from tactile_bayes.forward.contact import Head
 from tactile_bayes.forward.instrument import SimulatedScan, frame_times, head_positions, level_kpa, record
 from tactile_bayes.forward.mesh import REACH_MM
-from tactile_bayes.forward.plane import (
-    EmpiricalModel,
-    LineFrames,
-    SurfaceCompliance,
-    condense,
-    fit_empirical,
-    press,
-    press_layers,
-)
 from tactile_bayes.forward.scene import Scene, normalised_pressure, tissue_truth
 from tactile_bayes.forward.solid import frames_at_poses, simulate_solid
 from tactile_bayes.forward.tissue import MOST_SEAT, Body, Layers, SceneBody, SolidLump, fat_thickness
@@ -222,7 +214,7 @@ class PlaneSection(Record, eq=False):
         if self.lump is None:
             return lambda _, mean_kpa: self._far(mean_kpa).pressure_kpa
         body, ratio = self.lump
-        surface = condense(body, reach_mm=reach_mm, cell_mm=self.cell_mm)
+        surface = plane.condense(body, reach_mm=reach_mm, cell_mm=self.cell_mm)
         if fidelity == "plane-strain":
             return lambda x_mm, mean_kpa: self._over(surface, ratio, x_mm, mean_kpa).pressure_kpa
         model, s = self.empirical_model(surface)
@@ -233,21 +225,21 @@ class PlaneSection(Record, eq=False):
 
         return empirical
 
-    def empirical_model(self, surface: SurfaceCompliance) -> tuple[EmpiricalModel, FloatArray]:
+    def empirical_model(self, surface: plane.SurfaceCompliance) -> tuple[plane.EmpiricalModel, FloatArray]:
         """Eqs 1 to 4 fitted to what taxels see far from and over the lump, and the taxels' places across the head."""
         assert self.lump is not None
         far, over = self._far(self.mean_kpa), self._over(surface, self.lump[1], np.zeros(1), self.mean_kpa)
         s, d, half = over.s_mm, surface.body.d_mm, self.head.half_width_mm
-        return fit_empirical(s, far.at(0.0), over.at(0.0), d_mm=d, half_width_mm=half), s
+        return plane.fit_empirical(s, far.at(0.0), over.at(0.0), d_mm=d, half_width_mm=half), s
 
-    def _far(self, mean_kpa: float | FloatArray) -> LineFrames:
-        far = press_layers(self.layers, head=self.head, mean_kpa=mean_kpa, cell_mm=self.cell_mm)
+    def _far(self, mean_kpa: float | FloatArray) -> plane.LineFrames:
+        far = plane.press_layers(self.layers, head=self.head, mean_kpa=mean_kpa, cell_mm=self.cell_mm)
         return far.as_taxels(self.pitch_mm)
 
     def _over(
-        self, surface: SurfaceCompliance, ratio: float, x_mm: FloatArray, mean_kpa: float | FloatArray
-    ) -> LineFrames:
-        return press(surface, ratio, x_mm, head=self.head, mean_kpa=mean_kpa).as_taxels(self.pitch_mm)
+        self, surface: plane.SurfaceCompliance, ratio: float, x_mm: FloatArray, mean_kpa: float | FloatArray
+    ) -> plane.LineFrames:
+        return plane.press(surface, ratio, x_mm, head=self.head, mean_kpa=mean_kpa).as_taxels(self.pitch_mm)
 
 
 def plane_section(scene: Scene, fidelity: str, *, shoulders: str = SHOULDERS_INSIDE) -> PlaneSection:

@@ -15,15 +15,7 @@ from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.findings import Finding
 from tactile_bayes.geometry import BoolArray, FloatArray
-from tactile_bayes.mapping.cells import (
-    MAX_POSE_GAP_MS,
-    FramePoses,
-    Projector,
-    Readout,
-    chunk_frames,
-    distinct_poses,
-    poses_at,
-)
+from tactile_bayes.mapping import cells
 from tactile_bayes.presets import KPA_PER_UNIT, PRESSURE_WINDOW_KPA
 from tactile_bayes.scans import PressureFrames, Scan, TrackerPoses
 
@@ -159,7 +151,7 @@ def timing_figures(scans: Sequence[Scan]) -> dict[str, float]:
     ``frames_repeated`` (two of one time), ``pose_rate_hz`` and ``pose_jitter_ms`` of distinct poses, ``pose_repeats``
     (samples sent again) and ``pose_gap_ms`` (the longest between distinct poses).
     """
-    fresh = [distinct_poses(scan.poses) for scan in scans]
+    fresh = [cells.distinct_poses(scan.poses) for scan in scans]
     frames, poses = [scan.frames.time_s for scan in scans], [one.time_s for one in fresh]
     return {
         **_regularity("frame", frames),
@@ -354,7 +346,7 @@ class SelectedFrames(Record, eq=False, dict=True):
 
     scan: Scan  #: As recorded.
     faults: tuple[TaxelFault, ...]  #: Taxels left out of every frame.
-    poses: FramePoses  #: Pose of the tracker at each frame.
+    poses: cells.FramePoses  #: Pose of the tracker at each frame.
     level_kpa: FloatArray  #: (n,) array: Mean over the valid taxels; NaN where there is none.
     valid_share: FloatArray  #: (n,) array: Share of the taxels of the array that are good and not saturated.
     low: BoolArray
@@ -369,14 +361,14 @@ class SelectedFrames(Record, eq=False, dict=True):
         return good_taxels(self.scan.head.shape, self.faults)
 
     @cached_property
-    def readout(self) -> Readout:
+    def readout(self) -> cells.Readout:
         """The good taxels, and the conversion of their counts."""
-        return Readout.of(self.scan.element_calibration, self.good_taxels)
+        return cells.Readout.of(self.scan.element_calibration, self.good_taxels)
 
-    def projector(self, *, plane_from_base: FloatArray, cell_mm: float) -> Projector:
+    def projector(self, *, plane_from_base: FloatArray, cell_mm: float) -> cells.Projector:
         """The projector of the good taxels."""
         good = self.good_taxels
-        return Projector(self.scan.head, plane_from_base=plane_from_base, taxels=good, cell_mm=cell_mm)
+        return cells.Projector(self.scan.head, plane_from_base=plane_from_base, taxels=good, cell_mm=cell_mm)
 
 
 def good_taxels(shape: tuple[int, int], faults: Iterable[TaxelFault]) -> BoolArray:
@@ -398,7 +390,7 @@ def select_frames(
     *,
     pressure_window_kpa: tuple[float, float],
     latency_ms: float = 0.0,
-    max_pose_gap_ms: float = MAX_POSE_GAP_MS,
+    max_pose_gap_ms: float = cells.MAX_POSE_GAP_MS,
 ) -> SelectedFrames:
     """Decide for every frame of a scan whether it is used; a head without a working taxel is a `BadDataError`.
 
@@ -407,10 +399,10 @@ def select_frames(
     """
     faults = find_faults(scan)
     _refuse_dead(scan, faults)
-    poses = poses_at(scan.poses, scan.frames.time_s, latency_ms=latency_ms, max_gap_ms=max_pose_gap_ms)
-    readout = Readout.of(scan.element_calibration, good_taxels(scan.head.shape, faults))
+    poses = cells.poses_at(scan.poses, scan.frames.time_s, latency_ms=latency_ms, max_gap_ms=max_pose_gap_ms)
+    readout = cells.Readout.of(scan.element_calibration, good_taxels(scan.head.shape, faults))
     level, share = np.full(len(scan.frames), np.nan), np.zeros(len(scan.frames))
-    for part in chunks(len(scan.frames), chunk_frames(readout.size)):
+    for part in chunks(len(scan.frames), cells.chunk_frames(readout.size)):
         level[part], share[part] = readout.levels(*readout.pressure_kpa(readout.counts(scan.frames.counts[part])))
     low, high, used = gate(poses.known, level, share, pressure_window_kpa=pressure_window_kpa)
     return SelectedFrames(scan, faults, poses, level, share, low, high, used)

@@ -9,17 +9,8 @@ import numpy as np
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import BoolArray, FloatArray, IndexArray
+from tactile_bayes.mapping import convention
 from tactile_bayes.mapping.accumulate import Source
-from tactile_bayes.mapping.convention import (
-    LEAST_REACH_MM,
-    POOL_S,
-    CoarseFrames,
-    every_stretch,
-    numbered_on,
-    strokes_along,
-    thinning,
-    ways_along,
-)
 from tactile_bayes.mapping.latency import ShiftFit
 
 # --- Registration of single strokes: shifts along x that put a lump that moves with the head back in one place.
@@ -49,7 +40,7 @@ class StrokeShift(Record):
 
 def find_strokes(source: Source, number: int) -> list[StrokeShift]:
     """Find runs of a scan's used frames in one direction along x; a turn belongs to the run before it."""
-    return [StrokeShift(start, stop, number, way) for start, stop, way in strokes_along(_x_mm(source))]
+    return [StrokeShift(start, stop, number, way) for start, stop, way in convention.strokes_along(_x_mm(source))]
 
 
 def _x_mm(source: Source) -> FloatArray:
@@ -82,7 +73,7 @@ def register_strokes(sources: Sequence[Source]) -> tuple[list[Source], list[Stro
     strokes = [stroke for number, source in enumerate(sources) for stroke in find_strokes(source, number)]
     if len(strokes) < 2:
         raise BadDataError(
-            f"the scan has {len(strokes)} stroke over {LEAST_REACH_MM:g} mm", way_out="scan back and forth"
+            f"the scan has {len(strokes)} stroke over {convention.LEAST_REACH_MM:g} mm", way_out="scan back and forth"
         )
     parts = [_Part.of(source, number, strokes) for number, source in enumerate(sources)]
     shifts = np.zeros(len(strokes))
@@ -133,7 +124,7 @@ def mobility(strokes: Sequence[StrokeShift]) -> tuple[float, float]:
 class _Part(Record, eq=False):
     """One scan's averaged frames."""
 
-    coarse: CoarseFrames  #: Thinned out where there are many strokes.
+    coarse: convention.CoarseFrames  #: Thinned out where there are many strokes.
     places_mm: FloatArray  #: (m, k, 2) array.
     stroke: IndexArray
     block: IndexArray
@@ -141,7 +132,7 @@ class _Part(Record, eq=False):
 
     @classmethod
     def of(cls, source: Source, number: int, strokes: Sequence[StrokeShift]) -> _Part:
-        readings = len(source.frames) * 5e-3 / POOL_S * source.selection.readout.size / 4
+        readings = len(source.frames) * 5e-3 / convention.POOL_S * source.selection.readout.size / 4
         every = int(np.ceil(len(strokes) * readings / _MOST_NUMBERS))
         kept, coarse, places_mm, block = _averaged(source, max(every, 1))
         first = next(n for n, one in enumerate(strokes) if one.scan == number)
@@ -156,11 +147,11 @@ class _Part(Record, eq=False):
         return moved
 
 
-def _averaged(source: Source, every: int) -> tuple[IndexArray, CoarseFrames, FloatArray, IndexArray]:
+def _averaged(source: Source, every: int) -> tuple[IndexArray, convention.CoarseFrames, FloatArray, IndexArray]:
     """Every so many-th stretch of a scan's used frames: which these are, their averages, places, and shared blocks."""
     time_s = source.selection.scan.frames.time_s
-    kept = every_stretch(time_s[source.frames], every)
-    coarse = CoarseFrames.of(source.selection, source.frames[kept])
+    kept = convention.every_stretch(time_s[source.frames], every)
+    coarse = convention.CoarseFrames.of(source.selection, source.frames[kept])
     return kept, coarse, coarse.places_mm(source.projection.part(kept)), coarse.blocks(time_s)
 
 
@@ -175,7 +166,7 @@ class _Round(Record, eq=False):
     def of(cls, parts: Sequence[_Part], shifts_mm: FloatArray) -> _Round:
         fit = ShiftFit.of([part.coarse for part in parts], [part.shifted_mm(shifts_mm) for part in parts])
         frame = fit.frame_numbers()
-        block = numbered_on([part.block for part in parts])
+        block = convention.numbered_on([part.block for part in parts])
         even = (block % 2 == 0)[frame]
         halves = [fit.of_some(keep) for keep in (even, ~even)]
         columns, told = [], []
@@ -250,12 +241,14 @@ def stroke_lag_figures(sources: Sequence[Source]) -> dict[str, float]:
     linear step from no shift, so a figure above 1 mm is rough. The standard error holds errors that frames share over
     0.2 s.
     """
-    every = thinning((source.selection.scan.frames.time_s[source.frames] for source in sources), most=MOST_FRAMES)
+    every = convention.thinning(
+        (source.selection.scan.frames.time_s[source.frames] for source in sources), most=MOST_FRAMES
+    )
     averaged = [(source, *_averaged(source, every)) for source in sources if len(source.frames)]
     moves = []
     for source, kept, coarse, place_mm, _ in averaged:
         moves.append(np.zeros_like(place_mm))
-        moves[-1][:, :, 0] = ways_along(_x_mm(source))[kept[coarse.first], None]
+        moves[-1][:, :, 0] = convention.ways_along(_x_mm(source))[kept[coarse.first], None]
     ways = np.concatenate([np.zeros(0), *(move[:, 0, 0] for move in moves)])
     if not (np.any(ways > 0) and np.any(ways < 0)):
         return {}
@@ -270,6 +263,6 @@ def _step(fit: ShiftFit, moves: Sequence[FloatArray], blocks: Sequence[IndexArra
         return {}
     # a lump that is ahead of its place is seen at places that are behind theirs
     lag = -float(design @ fit.data) / whole
-    block = numbered_on(blocks)[fit.frame_numbers()]
+    block = convention.numbered_on(blocks)[fit.frame_numbers()]
     scores = np.bincount(block, design * (fit.data + lag * design))
     return {"stroke_lag_mm": lag, "stroke_lag_sd_mm": float(np.sqrt(np.sum(scores**2))) / whole}

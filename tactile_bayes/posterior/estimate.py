@@ -30,17 +30,9 @@ from tactile_bayes.posterior.white import BumpFit, Candidate, MapDraws, White
 from tactile_bayes.presets import CELL_PER_SIGMA, INTERVAL
 from tactile_bayes.progress import Progress
 from tactile_bayes.scans import DEFAULT_HEAD, HeadShape
+from tactile_bayes.size import terms
 from tactile_bayes.size.draws import EXTREMES, SizePosterior
 from tactile_bayes.size.pooling import Calibration, draw_sizes
-from tactile_bayes.size.terms import (
-    SPREAD,
-    UNLIKE_LEARNED,
-    UNLIKE_ON_PAPER,
-    Recipe,
-    extrapolated,
-    head_profile,
-    unknown_head,
-)
 
 # --- Search for the lump: candidate places, highest first, each fitted and assessed.
 #
@@ -360,11 +352,11 @@ def _measured(work: Work, seen: Assessment, candidates: tuple[Candidate, ...]) -
         return _none(sized.fault, candidates, detection, bump)
     diagnostics, posterior = _diagnostics(sized), made.posterior
     if sized.extrapolation_faults:
-        return _none(extrapolated(list(sized.extrapolation_faults)), candidates, detection, bump, diagnostics)
+        return _none(terms.extrapolated(list(sized.extrapolation_faults)), candidates, detection, bump, diagnostics)
     if size is not None and size.invalid > MOST_INVALID * size.d_x_mm.size:
         reason = f"no positive size in {size.invalid} of {size.d_x_mm.size} draws: outside the calibration"
         outside = Abstention(
-            "extrapolated", reason, "learn a calibration whose table holds such lumps", UNLIKE_ON_PAPER
+            "extrapolated", reason, "learn a calibration whose table holds such lumps", terms.UNLIKE_ON_PAPER
         )
         return _none(outside, candidates, detection, bump, diagnostics)
     drawn = {"sigma_x_mm": posterior.sigma_x_mm, "sigma_y_mm": posterior.sigma_y_mm}
@@ -411,7 +403,7 @@ def _none(
 
 def calibration_for(tactile_map: TactileMap, calibration: Calibration) -> Calibration:
     """The calibration at the map's depth of fat, where both have one."""
-    return calibration.at_fat([head_profile(tactile_map.quality)])
+    return calibration.at_fat([terms.head_profile(tactile_map.quality)])
 
 
 def recipe_differences(tactile_map: TactileMap, calibration: Calibration, fit: SamplerSettings) -> list[str]:
@@ -435,7 +427,7 @@ def way_to_head(head: HeadShape | None) -> str:
     return f"give --size-calibration solid or eq6, which are for this head; or {OTHER_HEAD}" if shipped else OTHER_HEAD
 
 
-def _way_to(recipe: Recipe, tactile_map: TactileMap) -> str:
+def _way_to(recipe: terms.Recipe, tactile_map: TactileMap) -> str:
     """Command that makes a map fit a calibration: its map command where the map differs, else the fit's options."""
     if recipe.head_differences(tactile_map.head):
         return way_to_head(tactile_map.head)
@@ -476,7 +468,7 @@ def _findings(sized: SizedDraws, *, cell_mm: float) -> Iterator[Finding]:
     if calibration is not None:
         beyond = [] if sized.size is None else calibration.beyond_lumps(sized.size.median_mm)
         for text in (*calibration.outside(*posterior.medians), *beyond):
-            yield Finding("outside_calibration", f"{UNLIKE_LEARNED}: {text}")
+            yield Finding("outside_calibration", f"{terms.UNLIKE_LEARNED}: {text}")
     if posterior.irregular:
         yield _IRREGULAR
     if cell_mm > CELL_PER_SIGMA * min(posterior.medians[1:]):
@@ -505,9 +497,9 @@ def _left_out(
     if options.background == "fixed":
         notes.append("a free background (fixed where normalising puts it, as printed in Eq 7)")
     if calibration is None:
-        return (*notes, SPREAD)
+        return (*notes, terms.SPREAD)
     stated = options.size_priors.another_exam or options.size_priors.between_maps
-    notes += [] if stated is None or stated.sd > 0 else [SPREAD]
+    notes += [] if stated is None or stated.sd > 0 else [terms.SPREAD]
     head = calibration.recipe.head
-    notes += [] if head is None or tactile_map.head is not None else [unknown_head(head)]
+    notes += [] if head is None or tactile_map.head is not None else [terms.unknown_head(head)]
     return (*notes, *calibration.omissions())

@@ -10,21 +10,9 @@ from tactile_bayes.files.reports import POOLED, EstimateReport, Interval, Pooled
 from tactile_bayes.findings import Finding, by_weight, capital, finding_lines, finding_summary, verdict
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.report import estimate_text
 from tactile_bayes.report.calibration import fat_text, site_words, unknowns_text
 from tactile_bayes.report.estimate_document import another_exam, supposed_line, supposed_lines, suppositions
-from tactile_bayes.report.estimate_text import (
-    MORE,
-    MOST_LINES,
-    SIZE_DECIMALS,
-    decimals,
-    ends_text,
-    exams_label,
-    shape_text,
-    site_interval_text,
-    table_head,
-    table_row,
-    width_lines,
-)
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.draws import EXTREMES, LEAST_PROBABILITY
 from tactile_bayes.size.pooling import DISAGREE, PooledEstimate, Repeatability
@@ -166,7 +154,7 @@ def pooled_summary(report: PooledReport) -> str:
     if largest is None:
         lines.append(_no_size(report))
     else:
-        lines += _table(report) + width_lines(report.leading.variance_share or {})
+        lines += _table(report) + estimate_text.width_lines(report.leading.variance_share or {})
         parts = [
             f"sizes by {report.site}" if report.site else "",
             f"interval ends to {largest.mc_error / largest.sd:.3f} SD" if largest.sd > 0 else "",
@@ -175,9 +163,9 @@ def pooled_summary(report: PooledReport) -> str:
             "irregular outline, with a wider interval" if figures.get("irregular_outline") else "",
         ]
         lines.append(f"Quality: {'; '.join(filter(None, parts))}.")
-        if len(lines) < MOST_LINES - 2:
+        if len(lines) < estimate_text.MOST_LINES - 2:
             lines += supposed_line(report.supposing, largest.median, places=_places(report))
-    return "\n".join([*lines, MORE, RESEARCH_USE]) + "\n"
+    return "\n".join([*lines, estimate_text.MORE, RESEARCH_USE]) + "\n"
 
 
 def _size_words(size: Interval, *, with_ends: bool) -> str:
@@ -202,16 +190,18 @@ def pooled_text(report: PooledReport) -> str:
     if report.max_size_mm is None:
         return "\n".join([*lines, _no_size(report), RESEARCH_USE]) + "\n"
     worst, figures = _worst(report), report.figures
-    lines += ["", *_table(report), "", *width_lines(report.leading.variance_share or {})]
+    lines += ["", *_table(report), "", *estimate_text.width_lines(report.leading.variance_share or {})]
     lines += supposed_lines(report.supposing, report.max_size_mm.median, places=_places(report))
     lines.append(f"Spread between the maps of this mass: {100 * figures['between_map_sd']:.0f} %.")
     if report.one_size_probability is not None:
         chance = _chance(report.one_size_probability)
         lines.append(f"Probability that maps of one mass are as far apart in size or farther: {chance}.")
     if report.site_words:
-        lines.append(site_interval_text(report.site_words))
-    lines.append(shape_text(figures))
-    lines.append(f"Monte-Carlo error of the interval ends: {ends_text('sizes', worst.mc_error, worst.sd)}.")
+        lines.append(estimate_text.site_interval_text(report.site_words))
+    lines.append(estimate_text.shape_text(figures))
+    lines.append(
+        f"Monte-Carlo error of the interval ends: {estimate_text.ends_text('sizes', worst.mc_error, worst.sd)}."
+    )
     lines.append(f"{capital(fat_text(report.fat_mm) + unknowns_text(report.unknowns))}.")
     lines += [f"Sizes by {report.site}."] if report.site else []
     lines += [f"Left out: {'; '.join(report.left_out)}."] if report.left_out else []
@@ -227,7 +217,7 @@ def _worst(report: PooledReport) -> Quantity:
 
 def _places(report: PooledReport) -> int:
     """Decimal places of the sizes."""
-    return decimals(_worst(report).mc_error, most=SIZE_DECIMALS)
+    return estimate_text.decimals(_worst(report).mc_error, most=estimate_text.SIZE_DECIMALS)
 
 
 def _table(report: PooledReport) -> list[str]:
@@ -235,6 +225,10 @@ def _table(report: PooledReport) -> list[str]:
     leads, places = report.leading, _places(report)
     rows = [("largest size", leads.max_size_mm), ("smallest size", leads.min_size_mm)]
     if report.another_exam is not None:
-        rows.append((exams_label(report.figures.get("between_map_sd")), report.max_size_mm))
-    told = (table_row(label, q.median, (q.low, q.high), unit="mm", places=places) for label, q in rows if q is not None)
-    return [table_head(_worst(report).probability), *told]
+        rows.append((estimate_text.exams_label(report.figures.get("between_map_sd")), report.max_size_mm))
+    told = (
+        estimate_text.table_row(label, q.median, (q.low, q.high), unit="mm", places=places)
+        for label, q in rows
+        if q is not None
+    )
+    return [estimate_text.table_head(_worst(report).probability), *told]

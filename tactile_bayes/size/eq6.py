@@ -25,20 +25,8 @@ from tactile_bayes.declarations import Meta, Record, field, replace, says
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import BoolArray, FloatArray, Matrix, Vector
 from tactile_bayes.inference.draws import even_replicates, normal_quantile, paired_points
+from tactile_bayes.size import terms
 from tactile_bayes.size.draws import BetweenMaps, BumpDraws, SizePosterior, shares
-from tactile_bayes.size.terms import (
-    LEARN_ANEW,
-    ONE_WIDTH,
-    Above0,
-    Domain,
-    Recipe,
-    Share,
-    beyond_lumps,
-    check_domain,
-    check_shapes,
-    outside_domain,
-    within_reach,
-)
 
 MU, F, B = range(3)
 Power = tuple[Annotated[int, Meta(ge=0, le=9)], Annotated[int, Meta(ge=0, le=9)], Annotated[int, Meta(ge=0, le=9)]]
@@ -63,9 +51,9 @@ class Eq6Law(Record, eq=False):
 
     def __post_init__(self) -> None:
         k = len(self.powers)
-        check_shapes(self, mean=(k,), covariance=(k, k))
+        terms.check_shapes(self, mean=(k,), covariance=(k, k))
         if any(row > B for row, _, _ in self.powers):
-            raise BadDataError("powers names more than mu, f and b", way_out=LEARN_ANEW)
+            raise BadDataError("powers names more than mu, f and b", way_out=terms.LEARN_ANEW)
 
 
 def eq6_coefficients(theta: Sequence[float] | FloatArray, powers: Powers, v: FloatArray, w: FloatArray) -> FloatArray:
@@ -108,13 +96,13 @@ class AxisCalibration(Record, eq=False):
     """
 
     draws: Annotated[Matrix, says("m, b (mm), e, f, scatter and its slope in each row.")]
-    reference_amplitude: Annotated[Above0, says("Of the scatter.")]
-    domain: Domain
+    reference_amplitude: Annotated[terms.Above0, says("Of the scatter.")]
+    domain: terms.Domain
     fit: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        check_shapes(self, draws=(max(len(self.draws), 1), len(COEFFICIENTS)))
-        check_domain(self.domain)
+        terms.check_shapes(self, draws=(max(len(self.draws), 1), len(COEFFICIENTS)))
+        terms.check_domain(self.domain)
 
     def size_mm(self, sigma_mm: FloatArray, amplitude: FloatArray, *, draws: FloatArray | None = None) -> FloatArray:
         r"""Diameter in mm by Eq 6, without residual scatter: :math:`d = m\,\sigma / (e\,a^f) + b`.
@@ -145,13 +133,13 @@ class LeftOutErrors(Record):
 
     cases: Annotated[int, Meta(ge=1)]
     geometries: Annotated[int, Meta(ge=1)]
-    least_stiffness_ratio: Annotated[Share, says("Softer lumps took no part.")]
-    eq6: Annotated[Mapping[str, Share], Meta(extra_json_schema={"required": ["both"]})]
-    log_quadratic: Annotated[Mapping[str, Share], Meta(extra_json_schema={"required": ["both"]})]
+    least_stiffness_ratio: Annotated[terms.Share, says("Softer lumps took no part.")]
+    eq6: Annotated[Mapping[str, terms.Share], Meta(extra_json_schema={"required": ["both"]})]
+    log_quadratic: Annotated[Mapping[str, terms.Share], Meta(extra_json_schema={"required": ["both"]})]
 
     def __post_init__(self) -> None:
         if not {"both"} <= set(self.eq6) <= {"x", "y", "both"} or set(self.log_quadratic) != set(self.eq6):
-            raise BadDataError("left_out has errors by other widths than x, y and both", way_out=LEARN_ANEW)
+            raise BadDataError("left_out has errors by other widths than x, y and both", way_out=terms.LEARN_ANEW)
 
 
 class SizeCalibration(Record, eq=False):
@@ -162,7 +150,7 @@ class SizeCalibration(Record, eq=False):
     residual_correlation: Annotated[
         float, says("A lump that looks large along one axis tends to along the other.", ge=-1, le=1)
     ]
-    recipe: Recipe
+    recipe: terms.Recipe
     axes: Annotated[tuple[Literal["x", "y", "both"], ...], Meta(min_length=1, max_length=2)] = ("x", "y")
     left_out: LeftOutErrors | None = None
     cautions: Annotated[tuple[str, ...], says("What of the table's lumps is of one kind, or unlike a patient's.")] = ()
@@ -191,20 +179,22 @@ class SizeCalibration(Record, eq=False):
 
     def within_reach(self, amplitude: FloatArray, sigma_x_mm: FloatArray, sigma_y_mm: FloatArray) -> BoolArray:
         """(n,) True for maps without `extrapolation_faults`."""
-        by_x = within_reach(self.x.domain, amplitude, sigma_x_mm)
-        return np.asarray(by_x & within_reach(self.y.domain, amplitude, sigma_y_mm))
+        by_x = terms.within_reach(self.x.domain, amplitude, sigma_x_mm)
+        return np.asarray(by_x & terms.within_reach(self.y.domain, amplitude, sigma_y_mm))
 
     def _by_axes(self, amplitude: float, x_mm: float, y_mm: float, *, far: bool = False) -> list[str]:
         axes = (("x", self.x.domain, x_mm), ("y", self.y.domain, y_mm))
-        return [f"{name}: {text}" for name, own, mm in axes for text in outside_domain(own, amplitude, mm, far=far)]
+        return [
+            f"{name}: {text}" for name, own, mm in axes for text in terms.outside_domain(own, amplitude, mm, far=far)
+        ]
 
     def beyond_lumps(self, largest_mm: float) -> list[str]:
         """In what a size lies beyond the tables' lumps, in words; empty when it lies within."""
-        return beyond_lumps(self.x.domain, largest_mm)
+        return terms.beyond_lumps(self.x.domain, largest_mm)
 
     def omissions(self) -> list[str]:
         """Sources of error that a size does not contain, in words."""
-        return [ONE_WIDTH] if self.axes == ("both",) else []
+        return [terms.ONE_WIDTH] if self.axes == ("both",) else []
 
     @property
     def in_two_stages(self) -> bool:

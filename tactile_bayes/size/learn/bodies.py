@@ -22,21 +22,7 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.presets import HELD
 from tactile_bayes.size.bodies import CUBIC, QUADRATIC, BodyCalibration, Centre, Spread, known_body
 from tactile_bayes.size.eq6 import BY_DEPTH, MU, PLAIN, Eq6Law, F, Powers, eq6_log_size, eq6_terms
-from tactile_bayes.size.learn.regression import (
-    BodiesLeft,
-    BodyRegression,
-    ExamSpread,
-    FittedResidual,
-    PopulationTable,
-    body_spread,
-    check_population,
-    fit_residual,
-    hidden_terms,
-    learn_round,
-    leverages,
-    map_variance,
-    ranges_of,
-)
+from tactile_bayes.size.learn import regression
 from tactile_bayes.size.terms import LOGGED, FatDepth, Recipe, monomials, powers, profile_terms
 
 LEAST_BODIES: Final = 80
@@ -48,23 +34,25 @@ _OTHER_SDS = np.linspace(0.0, 0.3, 301)  #: Grid of tau.
 
 
 def learn_population(
-    table: PopulationTable, *, recipe: Recipe, source: str = "", residual: bool = True
+    table: regression.PopulationTable, *, recipe: Recipe, source: str = "", residual: bool = True
 ) -> BodyCalibration:
     """Learn the calibration: Eq 6, by the depth of the fat where maps have a head profile, and what it leaves.
 
     Without `residual`, and from a table without profiles, it is Eq 6 alone. `BadDataError` when bodies are too few or
     do not vary, `NotConvergedError` when the posterior has no mode.
     """
-    check_population(table)
+    regression.check_population(table)
     rows = TableRows.of(table)
     eq6 = fit_eq6(rows)
     left = eq6.data.mean_log_d - eq6.data.mean_terms @ eq6.mean
-    left = left / (1.0 - leverages(eq6.data.mean_terms)[1])  # each body left out of the fit
+    left = left / (1.0 - regression.leverages(eq6.data.mean_terms)[1])  # each body left out of the fit
     size, slope = rows.log_size(eq6.mean), rows.map_slopes(eq6.mean)
     exam, noise = _exams(rows, eq6, size, slope)
     fitted = None
     if residual and rows.depth is not None:
-        fitted = fit_residual(BodiesLeft(rows.of_bodies(eq6.data), rows.spread_terms(eq6.data), left, noise))
+        fitted = regression.fit_residual(
+            regression.BodiesLeft(rows.of_bodies(eq6.data), rows.spread_terms(eq6.data), left, noise)
+        )
         steps = np.eye(3)[:2] * _STEP  # along u and v
         slopes = [(fitted.at(rows.values + h) - fitted.at(rows.values - h)) / (2 * _STEP) for h in steps]
         size, slope = size + fitted.at(rows.values), slope + np.stack(slopes)
@@ -79,13 +67,13 @@ class TableRows(Record, eq=False):
     Without it, `depth` is None and w 0.
     """
 
-    maps: PopulationTable
+    maps: regression.PopulationTable
     depth: FatDepth | None
     centre: Centre
     values: FloatArray
 
     @classmethod
-    def of(cls, table: PopulationTable) -> TableRows:
+    def of(cls, table: regression.PopulationTable) -> TableRows:
         """The rows with a profile, or all where too few bodies have one."""
         maps, depth, log_depth = table, None, np.zeros(len(table))
         if table.profile is not None and table.log_fat is not None:
@@ -117,11 +105,11 @@ class TableRows(Record, eq=False):
         """The same of ln SD(B)."""
         return QUADRATIC[:6] if self.depth is None else QUADRATIC
 
-    def of_bodies(self, data: BodyRegression) -> FloatArray:
+    def of_bodies(self, data: regression.BodyRegression) -> FloatArray:
         """(b, 3) means of u, v and w over each body's exams."""
         return np.stack([data.mean(column) for column in self.values.T], axis=1)
 
-    def spread_terms(self, data: BodyRegression) -> FloatArray:
+    def spread_terms(self, data: regression.BodyRegression) -> FloatArray:
         """(b, s) terms of ln SD(B) at these."""
         return monomials(list(self.of_bodies(data).T), self.spread_powers)
 
@@ -137,12 +125,12 @@ class TableRows(Record, eq=False):
         by_v = self.log_size(theta, dv=h) - self.log_size(theta, dv=-h)
         return np.stack([by_u, by_v]) / (2 * h)
 
-    def tangent(self, theta: FloatArray) -> BodyRegression:
+    def tangent(self, theta: FloatArray) -> regression.BodyRegression:
         """The regression of ln d on the tangent of Eq 6 at these coefficients."""
         u, v, w = self.values.T
         terms = eq6_terms(u, v, w, theta, self.eq6_powers)
         constant = self.log_size(theta) - terms @ theta
-        return BodyRegression.linear(self.maps, terms, u=u, constant=constant, slope=self.map_slopes(theta))
+        return regression.BodyRegression.linear(self.maps, terms, u=u, constant=constant, slope=self.map_slopes(theta))
 
 
 def learn_depth(profile: FloatArray, log_fat: FloatArray) -> FatDepth:
@@ -167,10 +155,12 @@ def learn_depth(profile: FloatArray, log_fat: FloatArray) -> FatDepth:
     )
 
 
-def _exams(rows: TableRows, eq6: Eq6Fit, size: FloatArray, slope: FloatArray) -> tuple[ExamSpread, FloatArray]:
+def _exams(
+    rows: TableRows, eq6: Eq6Fit, size: FloatArray, slope: FloatArray
+) -> tuple[regression.ExamSpread, FloatArray]:
     """Spread between exams, and (b,) variance of each body's ln d by its exams and the coefficients of Eq 6."""
     u = rows.values[:, 0]
-    data = BodyRegression.linear(rows.maps, eq6.data.terms, u=u, constant=eq6.data.constant, slope=slope)
+    data = regression.BodyRegression.linear(rows.maps, eq6.data.terms, u=u, constant=eq6.data.constant, slope=slope)
     exam = data.exam_spread(size)
     coefficients = np.sum(data.mean_terms @ eq6.covariance * data.mean_terms, axis=1)
     return exam, (exam.sd**2 + data.mean(data.map_variance)) / data.exams + coefficients
@@ -179,8 +169,8 @@ def _exams(rows: TableRows, eq6: Eq6Fit, size: FloatArray, slope: FloatArray) ->
 def _calibration(
     rows: TableRows,
     eq6: Eq6Fit,
-    fitted: FittedResidual | None,
-    exam: ExamSpread,
+    fitted: regression.FittedResidual | None,
+    exam: regression.ExamSpread,
     *,
     left: FloatArray,
     noise: FloatArray,
@@ -189,9 +179,9 @@ def _calibration(
 ) -> BodyCalibration:
     """The calibration by (b,) ln d less what the other bodies lead one to expect of it, and its variance without B."""
     data, maps, features = eq6.data, rows.maps, monomials(list(rows.values.T), rows.feature_powers)
-    spread, of_spread = body_spread(rows.spread_terms(data), left, noise)
+    spread, of_spread = regression.body_spread(rows.spread_terms(data), left, noise)
     body_sd = np.exp(rows.spread_terms(data) @ spread)
-    inverse, leverage = leverages(features)
+    inverse, leverage = regression.leverages(features)
     held = float(np.mean(np.abs(left) <= ndtri(0.5 + HELD / 2) * np.sqrt(body_sd**2 + noise)))
     ranged = {"amplitude": np.exp(maps.log_amplitude), "sigma_mm": np.exp(maps.log_width), "d_mm": maps.d_mm}
     off = np.expm1(-left)  # of sizes of bodies left out
@@ -210,14 +200,14 @@ def _calibration(
         eq6=Eq6Law(rows.eq6_powers, eq6.mean, eq6.covariance, _log_amplitude_one_deep(maps)),
         residual=None if fitted is None else fitted.residual,
         spread=Spread(rows.spread_powers, spread, of_spread, exam.log_sd, exam.variance, 0.0, ""),
-        round_lumps=learn_round(maps, monomials(list(rows.values.T), rows.spread_powers)),
+        round_lumps=regression.learn_round(maps, monomials(list(rows.values.T), rows.spread_powers)),
         feature_powers=rows.feature_powers,
         information_inverse=inverse,
         most_leverage=float(np.quantile(leverage, INSIDE)),
-        domain=ranges_of(ranged),
+        domain=regression.ranges_of(ranged),
         recipe=recipe,
         depth=rows.depth,
-        hidden=hidden_terms(maps, data, body=left, body_sd=body_sd, features=features),
+        hidden=regression.hidden_terms(maps, data, body=left, body_sd=body_sd, features=features),
         hidden_any=None,
         fit=figures,
         source=source,
@@ -228,11 +218,11 @@ def _calibration(
     at, a, p = calibration.at_fat([None]), maps.log_amplitude, maps.log_width
     body = data.mean(np.log(maps.d_mm) - at.log_size(a, p))
     body_sd = at.body_sd(data.mean(a), data.mean(p), np.zeros(data.groups))
-    hidden_any = hidden_terms(maps, data, body=body, body_sd=body_sd, features=at.features(a, p))
+    hidden_any = regression.hidden_terms(maps, data, body=body, body_sd=body_sd, features=at.features(a, p))
     return replace(calibration, hidden_any=hidden_any)
 
 
-def _log_amplitude_one_deep(table: PopulationTable) -> float:
+def _log_amplitude_one_deep(table: regression.PopulationTable) -> float:
     """ln a of lumps one diameter deep, by a quadratic in ln(h/d); 0, so that e is 1, where depths are not known."""
     if "depth_mm" not in table.unknowns:
         return 0.0
@@ -246,7 +236,7 @@ class Eq6Fit(Record, eq=False):
 
     mean: FloatArray
     covariance: FloatArray
-    data: BodyRegression
+    data: regression.BodyRegression
 
 
 def fit_eq6(rows: TableRows) -> Eq6Fit:
@@ -279,7 +269,7 @@ def _least_squares(rows: TableRows) -> FloatArray:
     raise NotConvergedError("Eq 6 does not fit this table")
 
 
-def _misfit(data: BodyRegression, theta: FloatArray) -> float:
+def _misfit(data: regression.BodyRegression, theta: FloatArray) -> float:
     """Sum of squares where the tangent touches; infinite where a row has no size."""
     total = float(np.sum((data.mean_log_d - data.mean_terms @ theta) ** 2))
     return total if np.isfinite(total) else float("inf")
@@ -292,7 +282,7 @@ class Sized(Record):
     variance: FloatArray
 
 
-def sized(calibration: BodyCalibration, table: PopulationTable, *, known: Sequence[str] = ()) -> Sized:
+def sized(calibration: BodyCalibration, table: regression.PopulationTable, *, known: Sequence[str] = ()) -> Sized:
     """The bodies of a table, each by all its exams; of the properties in `known` the true value is told."""
     bodies = np.unique(table.body)
     errors = np.array([size_error(calibration, table.rows(table.body == one), known=known) for one in bodies])
@@ -300,13 +290,13 @@ def sized(calibration: BodyCalibration, table: PopulationTable, *, known: Sequen
 
 
 def size_error(
-    calibration: BodyCalibration, exams: PopulationTable, *, known: Sequence[str] = ()
+    calibration: BodyCalibration, exams: regression.PopulationTable, *, known: Sequence[str] = ()
 ) -> tuple[float, float]:
     """Log error of one body by the mean of its exams, and the variance that the calibration states."""
     at = calibration.at_fat(_known(exams.profile, len(exams)))
     a, p = exams.log_amplitude, exams.log_width
     by_a = (at.log_size(a + _MAP_STEP, p) - at.log_size(a - _MAP_STEP, p)) / (2 * _MAP_STEP)
-    noise = map_variance(exams, np.stack([by_a, at.width_slope(a, p)]))
+    noise = regression.map_variance(exams, np.stack([by_a, at.width_slope(a, p)]))
     terms = at.terms(a, p).mean(axis=0, keepdims=True)
     middle = a.mean(keepdims=True), p.mean(keepdims=True)
     told = {name: float(exams.unknowns[name][0]) for name in known}
@@ -318,7 +308,7 @@ def size_error(
     return float(size - np.log(exams.d_mm[0])), float(variance)
 
 
-def learn_other_sd(calibration: BodyCalibration, table: PopulationTable, *, source: str) -> BodyCalibration:
+def learn_other_sd(calibration: BodyCalibration, table: regression.PopulationTable, *, source: str) -> BodyCalibration:
     """The calibration with `other_sd` from lumps of another origin: the most probable tau, even a priori.
 
     Its fit tells ``other_masses``, ``other_sd_most``, below which tau lies with 95 % probability, and the errors.
