@@ -26,15 +26,7 @@ from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.findings import Finding
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.inference.draws import (
-    Labels,
-    Quantity,
-    normal_cdf,
-    normal_quantile,
-    paired_points,
-    stratified_quantiles,
-    summarise,
-)
+from tactile_bayes.inference import draws
 from tactile_bayes.presets import REGISTRATION_MM
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.draws import BetweenMaps, ShapeDraws, above_chi_square, log_normal, matched_draws
@@ -218,11 +210,11 @@ class Change(Record, eq=False):
     log_ratio: FloatArray  #: (n,) draws of ln of the later size over the earlier one.
     mean: FloatArray
     sd: FloatArray  #: (n,) of the normal that each draw comes from.
-    replicates: Labels  #: (n,) label of the independent replicate of each draw.
+    replicates: draws.Labels  #: (n,) label of the independent replicate of each draw.
 
     def probability_above(self, share: float) -> float:
         """Probability that the size grew by more than this share of it (0.2: by more than 20 %)."""
-        return float(np.mean(normal_cdf((self.mean - np.log1p(share)) / self.sd)))
+        return float(np.mean(draws.normal_cdf((self.mean - np.log1p(share)) / self.sd)))
 
     @property
     def log_sd(self) -> float:
@@ -238,13 +230,13 @@ class Change(Record, eq=False):
         q = self.log_summary(probability)
         return float(np.expm1(q.median - q.low)), float(-np.expm1(q.median - q.high))
 
-    def percent(self, probability: float) -> Quantity:
+    def percent(self, probability: float) -> draws.Quantity:
         """Summary of the change of the diameter in percent."""
-        return summarise(100.0 * np.expm1(self.log_ratio), probability=probability, replicates=self.replicates)
+        return draws.summarise(100.0 * np.expm1(self.log_ratio), probability=probability, replicates=self.replicates)
 
-    def log_summary(self, probability: float) -> Quantity:
+    def log_summary(self, probability: float) -> draws.Quantity:
         """Summary of the log ratio."""
-        return summarise(self.log_ratio, probability=probability, replicates=self.replicates)
+        return draws.summarise(self.log_ratio, probability=probability, replicates=self.replicates)
 
 
 class JointSizes(Record, eq=False):
@@ -253,7 +245,7 @@ class JointSizes(Record, eq=False):
     log_size: FloatArray  #: (v, n) draws of ln of the largest size in mm.
     mean: FloatArray
     covariance: FloatArray  #: (v, n) and (n, v, v) of the normals that the draws come from.
-    replicates: Labels
+    replicates: draws.Labels
     between_map_sd: float  #: Spread between exams of a visit, root mean square.
     correlation: FloatArray  #: (v, v) of B between the visits.
     calibrations: tuple[BodyCalibration, ...]  #: One per visit: at the depth of fat that its maps give.
@@ -263,12 +255,12 @@ class JointSizes(Record, eq=False):
         c = self.covariance
         sd = np.sqrt(np.maximum(c[:, later, later] + c[:, earlier, earlier] - 2.0 * c[:, later, earlier], 1e-18))
         mean = self.mean[later] - self.mean[earlier]
-        drawn = stratified_quantiles(self.log_size[later] - self.log_size[earlier], mean, sd, self.replicates)
+        drawn = draws.stratified_quantiles(self.log_size[later] - self.log_size[earlier], mean, sd, self.replicates)
         return Change(drawn, mean, sd, self.replicates)
 
-    def size_mm(self, visit: int, probability: float) -> Quantity:
+    def size_mm(self, visit: int, probability: float) -> draws.Quantity:
         """Summary of the largest size at a visit."""
-        return summarise(np.exp(self.log_size[visit]), probability=probability, replicates=self.replicates)
+        return draws.summarise(np.exp(self.log_size[visit]), probability=probability, replicates=self.replicates)
 
     @property
     def moments(self) -> tuple[FloatArray, FloatArray]:
@@ -306,7 +298,7 @@ def joint_sizes(
     ends = np.cumsum([len(maps) for maps in visits])
     parts = [MassMaps.of(used[end - len(maps) : end], at) for maps, end, at in zip(visits, ends, fitted, strict=True)]
     middle = np.mean([one.by_map.mean(axis=0) for one in parts], axis=0)
-    points = paired_points(middle, replicates, DIMENSIONS, rng)
+    points = draws.paired_points(middle, replicates, DIMENSIONS, rng)
     tau = between.at(points[:, 0], *[(one.centre, one.noise) for one in parts])  # one for all visits
     sizes = [one for maps, at in zip(visits, fitted, strict=True) for one in log_sizes(at, maps)]
     oval, _ = lump_shape(fitted[0], flat, sizes, priors.shape)
@@ -315,7 +307,7 @@ def joint_sizes(
     if law is None:
         law = SHARED_WITHOUT_DEPTH if fitted[0].fat_mm is None else SHARED_BODY
     correlation = law.correlation(np.array([float(np.nanmean(one.mean)) for one in averaged]))
-    covariance = _covariance(averaged, fitted, correlation, normal_quantile(points[:, 1]))
+    covariance = _covariance(averaged, fitted, correlation, draws.normal_quantile(points[:, 1]))
     mean = np.stack([one.mean for one in averaged]) + np.hypot(half[:, 0], half[:, 1])
     if amplitudes is not None:
         left, noise = amplitudes.at_one_depth(averaged, fitted)
@@ -398,7 +390,7 @@ def _with_amplitudes(
     return mean - moved, turned
 
 
-def _drawn(mean: FloatArray, covariance: FloatArray, z: FloatArray, replicates: Labels) -> FloatArray:
+def _drawn(mean: FloatArray, covariance: FloatArray, z: FloatArray, replicates: draws.Labels) -> FloatArray:
     """(v, n) draws of ln d, each visit's with the evenly spaced quantiles of its mixture of normals."""
     v = len(mean)
     finite = np.isfinite(covariance).all(axis=(1, 2))
@@ -406,7 +398,7 @@ def _drawn(mean: FloatArray, covariance: FloatArray, z: FloatArray, replicates: 
     root[finite] = np.linalg.cholesky(covariance[finite] + 1e-12 * np.eye(v))
     raw = mean + np.einsum("nvw,nw->vn", root, z)
     sd = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)).T
-    return np.stack([stratified_quantiles(raw[i], mean[i], sd[i], replicates) for i in range(v)])
+    return np.stack([draws.stratified_quantiles(raw[i], mean[i], sd[i], replicates) for i in range(v)])
 
 
 class Trend(Record):

@@ -12,22 +12,8 @@ from scipy.optimize import minimize_scalar
 
 from tactile_bayes.declarations import Record, as_dict, field, replace
 from tactile_bayes.errors import BadDataError
+from tactile_bayes.forward import plane
 from tactile_bayes.forward.contact import Head
-from tactile_bayes.forward.plane import (
-    CELL_MM,
-    POSITIONS_MM,
-    EmpiricalModel,
-    LineFrames,
-    SurfaceCompliance,
-    TactileLine,
-    build_line,
-    condense,
-    fit_empirical,
-    fit_shape,
-    press,
-    press_layers,
-    slide,
-)
 from tactile_bayes.forward.tissue import SEATS, Body, Layers
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.laboratory_options import CaseOptions, TissueOptions
@@ -97,10 +83,10 @@ class StudySettings(CaseSettings, kw_only=True):
     """Settings of a study: everything but its cases that the table depends on."""
 
     head: Head = field(default_factory=Head)  #: Cross-section of the head.
-    positions_mm: tuple[float, float, float] = POSITIONS_MM
+    positions_mm: tuple[float, float, float] = plane.POSITIONS_MM
     """First and last position of the head and the step between them."""
     fit_radius_mm: float = FIT_RADIUS_MM  #: Eq 5 is fitted where abs(x) is at most this.
-    cell_mm: float = CELL_MM  #: Of the contact, see `plane.condense`.
+    cell_mm: float = plane.CELL_MM  #: Of the contact, see `plane.condense`.
 
     def as_dict(self) -> dict[str, object]:
         """Plain data for a store's header and for a report."""
@@ -111,31 +97,33 @@ class StudySettings(CaseSettings, kw_only=True):
 
     def fitter(self, body: Body) -> Callable[[float], LineFit]:
         surface = self.surface(body)
-        return lambda ratio: fit_line(build_line(self.frames(surface, ratio)), self.fit_radius_mm)
+        return lambda ratio: fit_line(plane.build_line(self.frames(surface, ratio)), self.fit_radius_mm)
 
-    def surface(self, body: Body) -> SurfaceCompliance:
+    def surface(self, body: Body) -> plane.SurfaceCompliance:
         """The body condensed onto the surface that the head travels over."""
         half_face_mm = 0.5 * self.cell_mm * len(self.head.sensing_cells(self.cell_mm))
         reach = max(abs(self.positions_mm[0]), abs(self.positions_mm[1])) + half_face_mm
-        return condense(body, reach_mm=reach, cell_mm=self.cell_mm, fineness=self.fineness)
+        return plane.condense(body, reach_mm=reach, cell_mm=self.cell_mm, fineness=self.fineness)
 
-    def frames(self, surface: SurfaceCompliance, stiffness_ratio: float | None) -> LineFrames:
+    def frames(self, surface: plane.SurfaceCompliance, stiffness_ratio: float | None) -> plane.LineFrames:
         """Frames of the head at all its positions."""
-        return slide(surface, stiffness_ratio, head=self.head, mean_kpa=self.mean_kpa, positions_mm=self.positions_mm)
+        return plane.slide(
+            surface, stiffness_ratio, head=self.head, mean_kpa=self.mean_kpa, positions_mm=self.positions_mm
+        )
 
-    def over(self, surface: SurfaceCompliance, stiffness_ratio: float = HARD_RATIO) -> LineFrames:
+    def over(self, surface: plane.SurfaceCompliance, stiffness_ratio: float = HARD_RATIO) -> plane.LineFrames:
         """The frame with the head's centre over the lump."""
-        return press(surface, stiffness_ratio, np.zeros(1), head=self.head, mean_kpa=self.mean_kpa)
+        return plane.press(surface, stiffness_ratio, np.zeros(1), head=self.head, mean_kpa=self.mean_kpa)
 
-    def far(self, layers: Layers) -> LineFrames:
+    def far(self, layers: Layers) -> plane.LineFrames:
         """The frame far from any lump."""
-        return press_layers(layers, head=self.head, mean_kpa=self.mean_kpa, cell_mm=self.cell_mm)
+        return plane.press_layers(layers, head=self.head, mean_kpa=self.mean_kpa, cell_mm=self.cell_mm)
 
-    def empirical(self, d_mm: float, layers: Layers, over: LineFrames) -> EmpiricalModel:
+    def empirical(self, d_mm: float, layers: Layers, over: plane.LineFrames) -> plane.EmpiricalModel:
         """The empirical model, fitted to what taxels see far from a lump and `over` it."""
         seen, far = over.as_taxels(HEAD_PITCH_MM), self.far(layers).as_taxels(HEAD_PITCH_MM)
         half_width = self.head.half_width_mm
-        return fit_empirical(seen.s_mm, far.at(0.0), seen.at(0.0), d_mm=d_mm, half_width_mm=half_width)
+        return plane.fit_empirical(seen.s_mm, far.at(0.0), seen.at(0.0), d_mm=d_mm, half_width_mm=half_width)
 
 
 class Geometry(Record):
@@ -169,7 +157,7 @@ class LineFit(Record):
         return self.sigma_mm, None
 
 
-def fit_line(line: TactileLine, radius_mm: float) -> LineFit:
+def fit_line(line: plane.TactileLine, radius_mm: float) -> LineFit:
     """Fit Eq 5 with background 1 and the bump on the lump's axis, averaged over cells as for a patient's map.
 
     Only widths from half a cell to three quarters of the radius count, also as for a patient's map. A bump that runs to
@@ -183,7 +171,7 @@ def fit_line(line: TactileLine, radius_mm: float) -> LineFit:
         return cell_mean_gaussian(x, np.zeros_like(x), covariance_mm2=covariance, cell_mm=line.cell_mm)
 
     ends = np.log([LEAST_WIDTH_IN_CELLS * line.cell_mm, WIDEST_IN_RADII * radius_mm])
-    found = fit_shape(bump, excess, grid=np.linspace(ends[0], ends[1], 60))
+    found = plane.fit_shape(bump, excess, grid=np.linspace(ends[0], ends[1], 60))
     resolved = bool(ends[0] + 1e-6 < found.parameter < ends[1] - 1e-6)
     return LineFit(found.height, float(np.exp(found.parameter)), float(np.sqrt(found.sse / len(x))), resolved)
 
@@ -356,7 +344,7 @@ def centred_frame(d_mm: float, depth_ratio: float, *, settings: StudySettings, s
     """The frame over a hard lump of one size and depth."""
     body = settings.body(d_mm, depth_ratio, seat=seat)
     reach = 0.5 * settings.cell_mm * len(settings.head.sensing_cells(settings.cell_mm))
-    surface = condense(body, reach_mm=reach, cell_mm=settings.cell_mm, fineness=settings.fineness)
+    surface = plane.condense(body, reach_mm=reach, cell_mm=settings.cell_mm, fineness=settings.fineness)
     over, far = (one.as_taxels(HEAD_PITCH_MM) for one in (settings.over(surface), settings.far(body.layers)))
     share, plain = (np.asarray(one.at(0.0) / one.at(0.0).mean()) for one in (over, far))
     return CentredFrame(d_mm, depth_ratio, over.s_mm, share, share - plain)
@@ -460,7 +448,9 @@ class HomogeneousTissue(TissueOptions):
         # Halving the thickness into two equal layers is the homogeneous body.
         layers = Layers(0.5 * self.thickness_mm, self.thickness_mm, 1.0, 1.0, self.poisson)
         strain = self.pressures_kpa[None, :] / self.moduli_kpa[:, None]
-        frames = press_layers(layers, head=head, mean_kpa=strain.ravel(), cell_mm=cell_mm).as_taxels(HEAD_PITCH_MM)
+        frames = plane.press_layers(layers, head=head, mean_kpa=strain.ravel(), cell_mm=cell_mm).as_taxels(
+            HEAD_PITCH_MM
+        )
         share = frames.pressure_kpa / frames.pressure_kpa.mean(axis=1, keepdims=True)
         return frames.s_mm, share.reshape(3, 3, -1)
 
