@@ -11,7 +11,6 @@ import numpy as np
 
 from tactile_bayes.api.arguments import PathLike, Told, door, path_of, plain, sequence_of, takes
 from tactile_bayes.api.estimates import estimated, settings_of
-from tactile_bayes.api.estimating import input_digests
 from tactile_bayes.api.pooled import common_calibration, one_mass, place_of
 from tactile_bayes.api.settings import Settings, refuse_checkpoint, times_of
 from tactile_bayes.api.sized import Answer, SizeEstimate, size_priors
@@ -182,19 +181,14 @@ class Comparison(Told, eq=False):
         return f"<Comparison {' '.join([*cautions, f'of {len(self.report.visits)} visits: {words}'])}>"
 
 
-def compare_answers(
-    visits: Sequence[Sequence[Answer]],
-    settings: Settings,
-    *,
-    comparing: Comparing,
-    names: Sequence[Sequence[str]],
-    inputs: Mapping[str, Path],
-) -> Comparison:
-    """Compare the visits of one mass.
+Names = Sequence[Sequence[str]]  #: Of the maps of each visit, for the report.
+Files = Mapping[str, Path]  #: That the maps came from, by role, for the provenance.
 
-    `visits`: answers for the maps of each visit, in order of time; none of them an error; `names`: of the maps, for the
-    report; `inputs`: files that the maps came from, by role, for the provenance.
-    """
+
+def compare_answers(
+    visits: Sequence[Sequence[Answer]], settings: Settings, comparing: Comparing, *, names: Names, inputs: Files
+) -> Comparison:
+    """Compare the visits of one mass, from answers for their maps in order of time, none of them an error."""
     if len(visits) < 2 or not all(visits):
         raise UsageError("a comparison needs two visits of a map or more each: `compare VISIT1.nc --with VISIT2.nc`")
     comparing.check_visits(len(visits))
@@ -202,11 +196,9 @@ def compare_answers(
         raise UsageError("a comparison needs a size calibration; leave out --size-calibration none")
     every = list(chain.from_iterable(visits))
     named = list(chain.from_iterable(names))
-    path, calibration = common_calibration(every, settings, names=named)
+    calibration, digests = common_calibration(every, settings, names=named, inputs=inputs)
     for index, earlier in repeated_scans([_scans([one]) for one in every]).items():  # they are no two exams
         raise UsageError(f"{named[index]} and {named[earlier]} are of one scan; give one map of each scan")
-    files = {**inputs, **({"size_calibration": path} if path else {})}
-    digests = input_digests(files, settings, calibration)
     compared = _compared(visits, calibration, settings, comparing)
     of_visits = (
         one.at(f"visit {number}" if len(maps) == 1 else f"visit {number}, map {i}")
@@ -232,18 +224,13 @@ def compare_answers(
 
 
 def compare_estimates(
-    visits: Sequence[Sequence[SizeEstimate]],
-    settings: Settings,
-    *,
-    comparing: Comparing,
-    names: Sequence[Sequence[str]],
-    inputs: Mapping[str, Path],
+    visits: Sequence[Sequence[SizeEstimate]], settings: Settings, comparing: Comparing, *, names: Names, inputs: Files
 ) -> Comparison:
     """Compare visits, maps estimated again where they are of another mass; see `compare_answers`."""
     every = iter(one_mass([one for visit in visits for one in visit]))
     same = tuple(tuple(next(every) for _ in visit) for visit in visits)
     answers = [[one.answer for one in visit] for visit in same]
-    return replace(compare_answers(answers, settings, comparing=comparing, names=names, inputs=inputs), visits=same)
+    return replace(compare_answers(answers, settings, comparing, names=names, inputs=inputs), visits=same)
 
 
 def drawn_maps(maps: Sequence[Sequence[TactileMap]], visits: Sequence[Sequence[Answer]]) -> list[list[DrawnMap]]:
@@ -438,5 +425,5 @@ def compare(
     if len(set(prints)) < len(prints):
         raise UsageError("a map is given twice; give each map once, at its own visit")
     names = [[one.name or f"visit {v} map {i}" for i, one in enumerate(visit, 1)] for v, visit in enumerate(visits, 1)]
-    found = compare_estimates(visits, used, comparing=comparing, names=names, inputs={})
+    found = compare_estimates(visits, used, comparing, names=names, inputs={})
     return replace(found, dates=tuple(map(str, dated or ())))

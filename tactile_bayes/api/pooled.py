@@ -205,9 +205,7 @@ def pool_answers(
     reports = [answer.report for answer in answers if answer.report is not None]
     scans = [scan for report in reports for scan in scans_of(report.provenance)]
     check_one_mass(scans)
-    path, calibration = common_calibration(answers, settings, names=names)
-    files = {**inputs, **({"size_calibration": path} if path else {})}
-    digests = input_digests(files, settings, calibration)
+    calibration, digests = common_calibration(answers, settings, names=names, inputs=inputs)
     # the maps' values in sorted order are part of the seed: their order on the command line leaves no trace
     words = sorted(answer.fingerprint for answer in answers)
     places = [place for one in answers if one.shape is not None and (place := place_of(one.report)) is not None]
@@ -260,9 +258,9 @@ def _no_size(
 
 
 def common_calibration(
-    answers: Sequence[Answer], settings: Settings, *, names: Sequence[str]
-) -> tuple[Path | None, BodyCalibration]:
-    """The calibration that sizes all these maps together, and its file if it is in one."""
+    answers: Sequence[Answer], settings: Settings, *, names: Sequence[str], inputs: Mapping[str, Path]
+) -> tuple[BodyCalibration, dict[str, str]]:
+    """The calibration that sizes all these maps together, and the digests of all files by role."""
     path, calibration = None, settings.size_calibration
     if calibration is None:
         ways = sorted({answer.normalise for answer in answers})
@@ -284,4 +282,5 @@ def common_calibration(
         if differs := calibration.recipe.head_differences(answer.head):
             what = f"{name}: the calibration is for another head: {'; '.join(differs)}"
             raise BadDataError(what, way_out=way_to_head(answer.head))
-    return path, calibration
+    files = {**inputs, **({"size_calibration": path} if path else {})}
+    return calibration, input_digests(files, settings, calibration)

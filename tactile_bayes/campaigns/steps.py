@@ -362,7 +362,7 @@ def make_growth(
     compared = compare_answers(
         answers,
         settings,
-        comparing=Comparing(days=days, same_mass=not placed),
+        Comparing(days=days, same_mass=not placed),
         names=visits,
         inputs={f"visit_{v}_map_{i}": folder / name / layout.MAP for v, i, name in numbered},
     )
