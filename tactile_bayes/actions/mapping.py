@@ -9,12 +9,11 @@ from typing import Any
 
 import click
 
-from tactile_bayes.api.maps import map_provenance
 from tactile_bayes.declarations import EXACT, to_plain
 from tactile_bayes.errors import UsageError
-from tactile_bayes.files.atomic import given_twice, refuse_existing
+from tactile_bayes.files.atomic import given_twice, refuse_existing, sha256
 from tactile_bayes.files.map_nc import write_map
-from tactile_bayes.files.provenance import repeated_scans
+from tactile_bayes.files.provenance import Provenance, repeated_scans, scan_facts
 from tactile_bayes.files.scan_mcap import read_scan
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.options import MapOptions
@@ -38,7 +37,10 @@ def map_action(
     settings = to_plain(MapOptions(**options), digits=EXACT)
     clock = _Clock(verbose)
     loaded = [read_scan(path) for path in scans]
-    provenance = map_provenance(scans, loaded, settings)
+    read = zip(loaded, scans, strict=True)
+    facts = [scan_facts(scan.session, frames=scan.frames.sha256, file=sha256(path)) for scan, path in read]
+    inputs = {f"scan_{number}": fact["sha256"] for number, fact in enumerate(facts, start=1)}
+    provenance = Provenance("map", settings, inputs, scans=facts)
     for later, earlier in repeated_scans([[facts] for facts in provenance.scans]).items():
         raise UsageError(f"{scans[later]} holds the recording of {scans[earlier]}; give each recording once")
     clock.tell("read")

@@ -36,24 +36,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-# --- The provenance of a map of scan files.
-
-
-def map_provenance(paths: Sequence[Path], scans: Sequence[Scan], settings: Mapping[str, Any]) -> Provenance:
-    """Provenance of a map: its settings, the scans' digests, and what the scans say of their exam."""
-    facts = exam_facts(paths, scans)
-    inputs = {f"scan_{number}": fact["sha256"] for number, fact in enumerate(facts, start=1)}
-    return Provenance("map", settings, inputs, scans=facts)
-
-
-def exam_facts(paths: Sequence[Path], scans: Sequence[Scan]) -> list[dict[str, str]]:
-    """Digests of each scan and what it says of its exam, for `Provenance.scans`."""
-    return [
-        scan_facts(scan.session, frames=scan.frames.sha256, file=sha256(path))
-        for path, scan in zip(paths, scans, strict=True)
-    ]
-
-
 # --- Scans and tactile maps: read, simulate, build, show.
 
 _DEMO = Path(__file__).resolve().parents[1] / "demo" / "scan.mcap"
@@ -198,13 +180,10 @@ def build_map(
     loaded: list[Scan] = []
     facts: list[dict[str, str]] = []
     for one in given:
-        if isinstance(one, str | Path):
-            loaded.append(read_scan(one))
-            facts += exam_facts([path_of(one)], loaded[-1:])
-            continue
-        scan = scan_given(one)
-        loaded.append(scan)
-        facts.append(scan_facts(scan.session, frames=scan.frames.sha256))
+        path = path_of(one) if isinstance(one, str | Path) else None
+        loaded.append(scan_given(one) if path is None else read_scan(path))
+        digest = "" if path is None else sha256(path)
+        facts.append(scan_facts(loaded[-1].session, frames=loaded[-1].frames.sha256, file=digest))
     for later, earlier in repeated_scans([[one] for one in facts]).items():
         raise UsageError(
             f"scan {later + 1} is the recording of scan {earlier + 1}, whose frames would count twice; give it once"
