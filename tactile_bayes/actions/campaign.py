@@ -13,6 +13,7 @@ import click
 from tactile_bayes.campaigns.campaign import run_campaign
 from tactile_bayes.campaigns.exams import SCANS, Found, find_exams
 from tactile_bayes.campaigns.report import names_line
+from tactile_bayes.campaigns.steps import CampaignSettings
 from tactile_bayes.commands.options import settings_of
 from tactile_bayes.declarations import names_of
 from tactile_bayes.errors import BadDataError, UsageError
@@ -79,17 +80,16 @@ def campaign_run_action(
     exams: Path, output: Path, settings_file: Path | None, repeatability: str | None, **options: Any
 ) -> None:
     """Map, estimate and pool the exams of a table, and report the trial."""
-    asked = CampaignOptions(**{name: options.pop(name) for name in names_of(CampaignOptions)})
+    asked = {name: options.pop(name) for name in names_of(CampaignOptions)}
     given = None if repeatability in (None, NONE) else Path(str(repeatability))
+    estimate = settings_of(settings_file=settings_file, repeatability=given, **options)
     found = run_campaign(
         exams,
         output,
-        asked,
-        settings_of(settings_file=settings_file, repeatability=given, **options),
-        own_repeatability=repeatability is None,
+        CampaignSettings(**asked, estimate=estimate, own_repeatability=repeatability is None),
         read=[path for path in (settings_file, given) if path],
         bar=partial(progress_bar, log_every_s=_LOG_EVERY_S, time_left=False),
     )
-    for line in () if asked.dry_run else found.failed:
+    for line in () if asked["dry_run"] else found.failed:
         click.echo(f"failed: {line}", err=True)
     click.echo(found.text, nl=False)

@@ -15,7 +15,7 @@ from tactile_bayes.campaigns import report
 from tactile_bayes.campaigns.inputs import open_campaign, tidy
 from tactile_bayes.campaigns.run import Bar, Campaign, CampaignState
 from tactile_bayes.campaigns.steps import CampaignSettings
-from tactile_bayes.declarations import names_of
+from tactile_bayes.declarations import names_of, replace
 from tactile_bayes.errors import UsageError
 from tactile_bayes.files.atomic import same_file
 from tactile_bayes.files.manifest_csv import Exam, read_manifest
@@ -115,49 +115,47 @@ def campaign(
     return run_campaign(
         required_path(exams, "exams"),
         required_path(output, "output"),
-        CampaignOptions(**given),
-        settings_of(options | spread),
-        own_repeatability=repeatability is None,
+        CampaignSettings(**given, estimate=settings_of(options | spread), own_repeatability=repeatability is None),
         read=[Path(one) for one in spread.values() if isinstance(one, str | os.PathLike)],
         bar=bar,
     )
 
 
 def run_campaign(
-    exams: Path,
-    output: Path,
-    asked: CampaignOptions,
-    estimate: Settings,
-    *,
-    own_repeatability: bool,
-    read: Iterable[Path],
-    bar: Bar | None,
+    exams: Path, output: Path, settings: CampaignSettings, *, read: Iterable[Path], bar: Bar | None
 ) -> CampaignResult:
     """Check all inputs, run what is missing, and write what is beside the exams; `read` are further inputs."""
-    copy_to = "" if asked.copy_to is None else check_address(asked.copy_to)
-    settings = CampaignSettings(estimate, asked.normalise, asked.figures, asked.match_mm, own_repeatability, copy_to)
+    if settings.copy_to is not None:
+        settings = replace(settings, copy_to=check_address(settings.copy_to))
     table = read_manifest(exams)
     _check_folder(table, output, settings)
     names = {settings.of(exam).calibration_name for exam in table} - {None}
-    used = [exams, asked.excision, asked.columns, asked.protocol, *read, *map(size_calibration_path, map(str, names))]
+    used = [
+        exams,
+        settings.excision,
+        settings.columns,
+        settings.protocol,
+        *read,
+        *map(size_calibration_path, map(str, names)),
+    ]
     for path in (output / name for name in report.WRITTEN):
         if any(one is not None and same_file(path, one) for one in used):
             raise UsageError(f"{path} is an input of this command; choose another name for the output")
-    if asked.columns is not None and asked.excision is None:
+    if settings.columns is not None and settings.excision is None:
         raise UsageError("--columns is the layout of the excision table; give --excision too")
-    measured = None if asked.excision is None else report.Excision(asked.excision, asked.columns)
-    report.check_inputs(table, measured, asked.protocol)
+    measured = None if settings.excision is None else report.Excision(settings.excision, settings.columns)
+    report.check_inputs(table, measured, settings.protocol)
     with (
-        open_campaign(output, dry=asked.dry_run) as store,
-        open_executor(workers=asked.workers, cluster=None if asked.dry_run else asked.scheduler) as executor,
+        open_campaign(output, dry=settings.dry_run) as store,
+        open_executor(workers=settings.workers, cluster=None if settings.dry_run else settings.scheduler) as executor,
     ):
         place = Path(os.path.abspath(output))  # noqa: PTH100 (links stay links)
-        run = Campaign(table, place, settings, store=store, executor=executor, dry=asked.dry_run, bar=bar)
+        run = Campaign(table, place, settings, store=store, executor=executor, dry=settings.dry_run, bar=bar)
         run.run()
-        if asked.dry_run:
+        if settings.dry_run:
             return CampaignResult(run, output, None)
         left = tidy(place, table, run.found.results, unread=run.unread)
-        written = report.write_outputs(run, measured, asked.protocol, unlisted=left)
+        written = report.write_outputs(run, measured, settings.protocol, unlisted=left)
         if settings.copy_to:
             report.copy_outputs(place, settings.copy_to)
     return CampaignResult(run, output, written)

@@ -38,8 +38,7 @@ from tactile_bayes.files.scan_mcap import read_scan, write_scan
 from tactile_bayes.findings import by_weight
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import TactileMap
-from tactile_bayes.options import Comparing, MapOptions
-from tactile_bayes.presets import DEFAULT_NORMALISE, MATCH_MM
+from tactile_bayes.options import CampaignOptions, Comparing, MapOptions
 from tactile_bayes.report.estimate_document import side_of, size_diagnostics
 from tactile_bayes.report.estimate_figures import draw_map, draw_size
 from tactile_bayes.report.exam_page import exam_page
@@ -69,20 +68,15 @@ def stamp(path: Path) -> str:
 # --- Settings of all exams of a campaign.
 
 
-class CampaignSettings(Record):
-    """Settings of all exams."""
+class CampaignSettings(CampaignOptions, kw_only=True):
+    """Settings of all exams: the campaign's options, and those of `estimate`."""
 
     estimate: Settings = field(default_factory=Settings)
     """As of `estimate`; a row of the table may replace place, known values and calibration."""
-    normalise: str = DEFAULT_NORMALISE  #: As of `map`.
-    figures: bool = False  #: Whether the figures of `estimate` are drawn for each exam.
-    match_mm: float = MATCH_MM
-    """Within this distance a mass is that which another exam of the breast names by its place."""
     own_repeatability: bool = True
     """Whether the spread between exams is learned from the campaign's own repeats, where enough masses have them and
     the estimate's settings do not say it.
     """
-    copy_to: str = ""  #: Address of a folder in an object store that gets a copy of every file; empty for none.
 
     def of(self, exam: Exam) -> Settings:
         """Settings of one exam's estimate."""
