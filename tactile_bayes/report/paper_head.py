@@ -133,7 +133,9 @@ def _grid(kind: str, found: Sequence[Uniformity], *, limit: float) -> list[str]:
     for radius in sorted({one.head.radius_mm for one in found}):
         name = "flat" if np.isinf(radius) else f"{radius:g}"
         row = [cells.get((radius, shoulder)) for shoulder in shoulders]
-        marked = ["-" if one is None else f"{100 * one:.1f}{'*' if one <= limit else ' '}" for one in row]
+        marked = [
+            "-" if one is None else f"{100 * one:.{0 if one >= 1 else 1}f}{'*' if one <= limit else ' '}" for one in row
+        ]
         lines.append(f"{name:>8}" + "".join(f"{cell:>6}" for cell in marked))
     return lines
 
