@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
+from unicodedata import normalize
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -108,10 +109,12 @@ def _read(path: Path, given: ArrayMap, beside: Sequence[Source]) -> Source:
 
     def choose(names: Sequence[str]) -> list[str]:
         held = ", ".join(sorted(names)[:_MOST_NAMES]) or "nothing"
-        for here, name in given.arrays.items():
-            if name not in names:
-                raise BadDataError(f"has no array {name!r} for {here}", way_out=f"it has {held}")
-        there.update({name: name for name in KNOWN if name in names} | given.arrays)
+        spelled = {normalize("NFC", name): name for name in names}  # a letter and its mark may be one sign or two
+        for here, said in given.arrays.items():
+            there[here] = said if said in names else spelled.get(normalize("NFC", said), "")
+            if not there[here]:
+                raise BadDataError(f"has no array {said!r} for {here}", way_out=f"it has {held}")
+        there.update({name: name for name in KNOWN if name in names and name not in there})
         there.update(plain_names(names, there, given.values))
         if not there:
             needed = ", ".join(f"{name} ({in_words(LAYOUT[name].shape)})" for name in LAYOUT if name not in OPTIONAL)
@@ -467,7 +470,8 @@ def _check_units(arrays: Arrays, *, calibrated: bool) -> None:
         raise BadDataError(f"head_surface_mm spans only {extent:.4g}", way_out=metres)
     travel, reach = float(np.ptp(position, axis=0).max()), float(np.abs(position).max())
     if travel < 1.0 and reach < 5.0 and len(position) > 1:
-        raise BadDataError(f"position_mm spans only {travel:.4g}, none beyond {reach:.4g}", way_out=metres)
+        what = f"position_mm spans only {travel:.4g}, none beyond {reach:.4g}"
+        raise BadDataError(what, way_out=f"{metres} or their unit, --length-unit m or inch")
     if "landmarks_mm" in arrays:
         apart = float(np.linalg.norm(arrays["landmarks_mm"][0] - arrays["landmarks_mm"][1]))
         if apart < 10.0:

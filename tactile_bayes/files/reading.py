@@ -116,7 +116,7 @@ def decoded(
     except UnicodeDecodeError as error:
         line = data.count(b"\n", 0, error.start) + 1
         what = f"line {line}: byte 0x{data[error.start]:02x} is not {other or 'UTF-8'} text"
-        raise BadDataError(what, way_out=way_out, path=str(path)) from None
+        raise BadDataError(what, way_out=way_out if b"\0" in data else as_utf8, path=str(path)) from None
 
 
 def check_limit(size: int, most: int, *, what: str) -> None:

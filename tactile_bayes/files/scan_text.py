@@ -161,7 +161,7 @@ def _named(table: TextTable, header: Line, given: Stated) -> Source:
     names = (*_PLACE, *(turned or _ROTATIONS[layout]))
     if not set(names) <= set(kinds):
         what = f"line {header.number} names no {', '.join(sorted(set(names) - set(kinds)))}"
-        way_out = "name columns Tx, Ty, Tz and Q0, Qx, Qy, Qz, or x, y, z and azimuth, elevation, roll"
+        way_out = "name columns Tx, Ty, Tz and Q0, Qx, Qy, Qz or R00 to R22, or x, y, z and azimuth, elevation, roll"
         raise BadDataError(what, way_out=way_out)
     if given.pose_layout not in (None, layout):
         raise BadDataError(f"line {header.number} names its rotations ({layout})", way_out="leave --pose-layout out")
@@ -252,6 +252,10 @@ def _unseen(status: Sequence[str], given: Stated) -> list[str]:
 def _times(rows: Sequence[Line], columns: Mapping[str, int], header: Line, given: Stated) -> tuple[FloatArray, str]:
     """Times of all rows and their unit where the header says it."""
     held = {name: _values(rows, column) for name, column in columns.items() if name in _TIMES}
+    if "time" in held and not np.isfinite(held["time"]).any():
+        what = f"its column of times holds {_field(rows[0], columns['time'])!r}, which is no time that is known"
+        way_out = "write s, HH:MM:SS.s or YYYY-MM-DD HH:MM:SS.s, or leave it out and give --pose-rate-hz"
+        raise BadDataError(what, way_out=way_out)
     if "time" in held:
         return _settled(held["time"]), unit_of_time(header.fields[columns["time"]])
     if "seconds" in held:

@@ -97,7 +97,9 @@ def read_text_table(path: Path, decimal: str | None = None) -> TextTable:
     split, before = [], 0
     for i, one in enumerate(texts, start=1):
         if one.strip():
-            fields = fields_of(one, separator)
+            fields = fields_of(one.lstrip("# "), separator)  # numpy writes it before names
+            if one.lstrip().startswith("#") and any(_is_number(field, ()) for field in fields):
+                fields = fields_of(one, separator)
             while len(fields) > 1 and not fields[-1]:
                 fields.pop()
             split.append((i, one, fields, i > before + 1))

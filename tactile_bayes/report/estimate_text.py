@@ -171,7 +171,7 @@ ROWS = (
     ("amplitude", "amplitude", ""),
     ("sigma_x_mm", "map width sigma_x", "mm"),
     ("sigma_y_mm", "map width sigma_y", "mm"),
-    ("angle_deg", "angle of the ellipse", "deg"),
+    ("angle_deg", "angle from x to sigma_x", "deg"),
     ("centre_mm.x", "centre on the map, x", "mm"),
     ("centre_mm.y", "centre on the map, y", "mm"),
     ("centre_patient_mm.x", "patient's right of xiphoid, x", "mm"),

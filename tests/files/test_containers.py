@@ -146,7 +146,8 @@ ENCODED = {
     "UTF-16 text": TEXT.encode("utf-16"),
     "UTF-16 \\(without a byte order mark\\) text": TEXT.encode("utf-16-le"),
     "UTF-32 text": TEXT.encode("utf-32"),
-    "byte 0xf6 is not UTF-8": TEXT.encode("latin-1"),
+    "byte 0xf6 is not UTF-8 text; save it as": TEXT.encode("latin-1"),
+    "byte 0xf4 is not UTF-8": bytes(9) + b"\xf4",
 }
 
 

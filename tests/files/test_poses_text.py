@@ -143,6 +143,11 @@ LAYOUTS: dict[str, tuple[list[str], dict[str, Any], list[int] | None]] = {
         {},
         None,
     ),
+    "names behind #": (
+        ["# t x y z qw qx qy qz", *(one.replace(",", " ") for one in with_times(QUATERNIONS))],
+        {},
+        None,
+    ),
     "matrices": (with_times(ROWS_OF_16), {}, None),
     "matrices of 12": (with_times([numbers(one[:3]) for one in MATRICES]), {}, None),
     "matrices by rate": (ROWS_OF_16, {"pose_rate_hz": 120.0}, None),
@@ -221,6 +226,16 @@ FAULTS: dict[str, tuple[list[str], dict[str, Any], str]] = {
     "no times": ([NDI, *ndi()], {}, "has frame numbers but no times; .*pose_rate_hz"),
     "no unit": ([EULER.replace(" (cm)", ""), *polhemus()], {}, "does not say the unit of x, y and z.*length_unit"),
     "no layout": (with_times(QUATERNIONS), {}, "has 8 numbers a row and no names; give pose_layout"),
+    "another clock": (
+        ["time,x,y,z,qw,qx,qy,qz", *with_times(QUATERNIONS, lambda t: f"10:15:{t:06.3f} AM")],
+        {},
+        r"its column of times holds '10:15:00\.000 AM', which is no time that is known; write s",
+    ),
+    "metres": (
+        ["t,x,y,z,qw,qx,qy,qz", *with_times(IN_METRES)],
+        {},
+        "looks like metres .* or their unit, .*length_unit m",
+    ),
     "no qz": (["t,x,y,z,qw,qx,qy", *with_times(QUATERNIONS)], {}, "line 1 names no qz"),
     "numbered from 1": (["t,x,y,z,q1,q2,q3,q4", *with_times(QUATERNIONS)], {}, "line 1 names no qw"),
     "both": (["t,x,y,z,qw,qx,qy,qz", *with_times(QUATERNIONS)], {"pose_layout": "xyzw"}, "leave pose_layout out"),

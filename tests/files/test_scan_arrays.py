@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
+import unicodedata
 import zipfile
 import zlib
 from collections.abc import Callable
@@ -476,6 +477,14 @@ def test_the_template_names_what_shapes_tell_and_is_read_back(pressed: Arrays, t
     assert len(read_scan(tmp_path / "exam.mcap").frames) == len(pressed["frames"])
     empty = run_here("import", "--template", cwd=tmp_path)
     assert parse_toml(empty.stdout, way_out="") == {"arrays": {}, "values": {}}
+
+
+def test_a_name_is_found_however_its_letters_are_spelled(pressed: Arrays, tmp_path: Path) -> None:
+    """A Mac may write an umlaut as two signs, and a TOML's editor as one."""
+    pressed[unicodedata.normalize("NFD", "Größe")] = pressed.pop("frames")
+    as_npz(tmp_path / "exam.npz", pressed)
+    found = import_arrays(tmp_path / "exam.npz", ArrayMap(arrays={"counts": "Größe"}, unit="kPa")).scan
+    assert len(found.frames) == len(pressed["frame_time_s"])
 
 
 def test_values_of_the_map_stand_for_arrays_that_no_file_has(pressed: Arrays, tmp_path: Path) -> None:
