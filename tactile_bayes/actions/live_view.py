@@ -13,6 +13,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import textwrap
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
@@ -265,6 +266,11 @@ def _look(reader: Any, live: LiveMap, estimator: Estimator, showing: list[Callab
     return drawings
 
 
+def can_redraw() -> bool:
+    """Whether the view has a terminal whose lines it can draw over; what others write there is lost."""
+    return sys.stderr.isatty() and os.environ.get("TERM", "dumb") not in ("dumb", "")
+
+
 @contextlib.contextmanager
 def terminal_view(*, keys: bool = False) -> Iterator[Callable[[LiveState], None]]:
     """Draw on a terminal; one line per second where it cannot be redrawn.
@@ -272,7 +278,7 @@ def terminal_view(*, keys: bool = False) -> Iterator[Callable[[LiveState], None]
     `keys` says whether the recording's keys can be pressed there.
     """
     out = sys.stderr
-    if not out.isatty() or os.environ.get("TERM", "dumb") in ("dumb", ""):
+    if not can_redraw():
         last = 0.0
 
         def tell(state: LiveState) -> None:
@@ -321,7 +327,7 @@ def live_text(state: LiveState, *, columns: int, lines: int, colour: bool, keys:
     `keys` says whether the recording's keys can be pressed on this terminal.
     """
     above = [_pressure(state, columns, colour=colour), _figures(state)[:columns], state.size_words[:columns]]
-    below = [RESEARCH_USE[:columns]]
+    below = [*textwrap.wrap(state.landmark_words, columns), RESEARCH_USE[:columns]]
     if keys:
         below.insert(0, KEYS[:columns])
     room = max(2, lines - len(above) - len(below) - 1)

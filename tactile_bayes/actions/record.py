@@ -18,7 +18,7 @@ from typing import Any
 import click
 import numpy as np
 
-from tactile_bayes.actions.live_view import live_view
+from tactile_bayes.actions.live_view import KEYS, can_redraw, live_view
 from tactile_bayes.commands.options import also_read
 from tactile_bayes.declarations import as_dict
 from tactile_bayes.errors import EXIT_DONE, EXIT_INTERRUPTED, DeviceError, UsageError
@@ -179,13 +179,17 @@ class Stopper:
 
 
 class Keys:
-    """Keys of a terminal for landmarks, start and stop; without a terminal there are none."""
+    """Keys of a terminal for landmarks, start and stop; without a terminal there are none.
 
-    def __init__(self, recorder: Recorder, scanhead_from_tracker: FloatArray, *, wait: bool) -> None:
+    Nothing is printed where a `drawn` live view says it: it would draw over the words.
+    """
+
+    def __init__(self, recorder: Recorder, scanhead_from_tracker: FloatArray, *, wait: bool, drawn: bool) -> None:
         self._recorder = recorder
         self._lever = scanhead_from_tracker
         self._terminal = sys.stdin.isatty()
         self.waiting = wait and self._terminal
+        self._drawn = drawn
         self._settings: list[Any] = []
         self._told = 0
 
@@ -194,7 +198,7 @@ class Keys:
             self._settings = termios.tcgetattr(sys.stdin)
             tty.setcbreak(sys.stdin)
         if self.waiting:
-            click.echo("n sternal notch, x xiphoid, p nipple, space start, q stop", err=True)
+            self._say(KEYS)
             self._recorder.listen()
         return self
 
@@ -206,7 +210,7 @@ class Keys:
     def look(self) -> None:
         """Act on the keys pressed since the last call, and report landmarks."""
         for text in self._recorder.report.landmarks[self._told :]:
-            click.echo(text, err=True)
+            self._say(text)
             self._told += 1
         if not self._terminal or not select.select([sys.stdin], [], [], 0)[0]:
             return
@@ -218,6 +222,10 @@ class Keys:
         for key in keys.decode("latin-1"):
             self._press(key)
 
+    def _say(self, words: str) -> None:
+        if not self._drawn:
+            click.echo(words, err=True)
+
     def _press(self, key: str) -> None:
         names = {"n": "sternal_notch", "x": "xiphoid", "p": "nipple"}
         if key in names:
@@ -225,7 +233,7 @@ class Keys:
         elif key == " " and self.waiting:
             self.waiting = False
             self._recorder.start()
-            click.echo("recording", err=True)
+            self._say("recording")
         elif key == "q":
             self._recorder.stop("q")
 
@@ -385,7 +393,8 @@ def _check_fit(hello: HelloReading, head: HeadGeometry, request: Request) -> Non
 
 
 def _run(recorder: Recorder, stopper: Any, head: HeadGeometry, request: Request) -> Report:
-    with Keys(recorder, head.scanhead_from_tracker, wait=request.duration_s is None and not request.at_once) as keys:
+    wait, drawn = request.duration_s is None and not request.at_once, request.live and can_redraw()
+    with Keys(recorder, head.scanhead_from_tracker, wait=wait, drawn=drawn) as keys:
         if not keys.waiting:
             recorder.start()
 

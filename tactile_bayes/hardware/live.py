@@ -93,8 +93,9 @@ class Feed:
         self._send(LANDMARK, _POINT.pack(*position_mm.tolist()) + name.encode())
 
     def told(self, report: Report) -> None:
-        """Send the account so far."""
-        self._send(REPORT, json.dumps({name: getattr(report, name) for name in _TOLD}).encode())
+        """Send the account so far, with the landmark that was touched last."""
+        told = {name: getattr(report, name) for name in _TOLD} | {"touched": "".join(report.landmarks[-1:])}
+        self._send(REPORT, json.dumps(told).encode())
 
     def _send(self, kind: int, payload: bytes) -> None:
         message = _HEADER.pack(kind, len(payload)) + payload
@@ -183,6 +184,8 @@ class LiveState(Record, eq=False):
     duration_s: float = 0.0  #: Recorded so far.
     used_share: float = 0.0  #: Of the frames that the map has used.
     latency_ms: float = 0.0  #: From the recorder to this state, of its youngest frame.
+    landmarks: tuple[str, ...] = ()  #: Names of those touched or read from a file.
+    touched: str = ""  #: The last one that was touched, with its place and whether the head was still, in words.
     size: str = ""  #: The current estimate in words.
     lump_base_mm: FloatArray | None = None
     """(3,) array or None: Where the estimate's lump lies, in `base`: the plane changes while the map grows."""
@@ -209,6 +212,12 @@ class LiveState(Record, eq=False):
             f"{unseen}{self.duration_s:.1f} s, {self.frames} frames, {self.frames_lost} lost, {self.poses} poses, "
             f"{self.covered_mm2 / 100:.1f} cm² covered"
         )
+
+    @property
+    def landmark_words(self) -> str:
+        """Which landmarks are known, and the last touch in words; empty while there are none."""
+        known = ", ".join(name.replace("_", " ") for name in self.landmarks)
+        return f"landmarks: {known}" + (f"; {self.touched}" if self.touched else "") if known else ""
 
     @property
     def pressure_words(self) -> str:
@@ -349,6 +358,8 @@ class LiveMap:
             duration_s=(report.get("last_ns", 0) - report.get("first_ns", 0)) / 1e9,
             used_share=figures["frames_used"] / max(1.0, figures["frames_total"]),
             latency_ms=(time.monotonic_ns() - self._host_ns) / 1e6 if self._host_ns else 0.0,
+            landmarks=tuple(self._landmarks),
+            touched=report.get("touched", ""),
             size=size,
             lump_base_mm=lump_base_mm,
         )

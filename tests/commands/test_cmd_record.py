@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import pty
 import resource
 import signal
 import stat
+import struct
 import subprocess
 import sys
+import termios
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -441,3 +445,40 @@ def test_keys_touch_landmarks_start_and_stop(child_environment, tmp_path, source
     recorded = read_scan(tmp_path / "a.mcap")
     assert recorded.landmarks is not None
     assert np.linalg.norm(recorded.landmarks.xiphoid_mm) > 0
+
+
+@pytest.mark.long
+def test_a_live_view_keeps_the_words_that_confirm_a_landmark(child_environment, tmp_path, source, long_scan):
+    """They were printed beside the view, which drew over them at once."""
+    near, far = pty.openpty()
+    fcntl.ioctl(far, termios.TIOCSWINSZ, struct.pack("HHHH", 30, 100, 0, 0))
+    environment = {**child_environment, "TERM": "xterm"}
+    with head_and_tracker(long_scan) as devices:
+        words = [sys.executable, "-m", "tactile_bayes", "record", "-o", "a.mcap", *devices, "--like", str(source)]
+        process = subprocess.Popen(
+            [*words, "--live"], cwd=tmp_path, env=environment, stdin=far, stdout=subprocess.PIPE, stderr=far
+        )
+        os.close(far)
+        shown = b""
+
+        def shows(wanted: bytes) -> None:
+            nonlocal shown
+            while wanted not in shown.rpartition(b"\x1b[H")[2]:  # in the view as it was drawn last
+                shown += os.read(near, 65536)
+
+        shows(b"keys: n sternal notch")
+        os.write(near, b"n")
+        shows(b"landmarks: sternal notch; sternal notch at")
+        os.write(near, b"x")
+        shows(b"landmarks: sternal notch, xiphoid; xiphoid at")
+        shown = b""
+        os.write(near, b" ")
+        shows(b"landmarks: sternal notch, xiphoid; xiphoid at")
+        os.write(near, b"q")
+        with suppress(OSError):  # the terminal is closed
+            while os.read(near, 65536):
+                pass
+        out, _ = process.communicate(timeout=20)
+    os.close(near)
+    assert process.returncode == 0
+    assert b"xiphoid at" in out

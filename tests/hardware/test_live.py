@@ -153,6 +153,18 @@ def test_a_screen_names_its_keys_colours_scale_and_the_lump(state):
     assert "keys" not in live_text(state, columns=100, lines=40, colour=False)
 
 
+def test_a_screen_tells_of_the_landmarks(scan):
+    live = LiveMap(scan.head, scan.element_calibration)
+    assert live.state().landmark_words == ""
+    live.take([SeenLandmark("sternal_notch", (1.0, 2.0, 3.0))])  # of a file
+    assert live.state().landmark_words == "landmarks: sternal notch"
+    touched = "xiphoid at 1.0 2.0 3.0 mm, spread 3.10 mm over 60 samples; the head moved, touch it again"
+    live.take([SeenLandmark("xiphoid", (1.0, 2.0, 3.0)), {"touched": touched}])
+    text = live_text(live.state(), columns=60, lines=24, colour=False, keys=True)
+    assert max(map(len, text.splitlines())) <= 60
+    assert f"landmarks: sternal notch, xiphoid; {touched}" in " ".join(text.split())
+
+
 def test_landmarks_in_one_place_give_a_view_no_patient_axes(scan):
     live = LiveMap(scan.head, scan.element_calibration)
     live.take([SeenLandmark(name, (1.0, 2.0, 3.0)) for name in ("sternal_notch", "xiphoid")])

@@ -17,7 +17,7 @@ from tactile_bayes.hardware.live import LiveMap, SeenFrame, SeenLandmark, SeenPo
 def test_a_key_touches_its_landmark(key: str, name: str) -> None:
     touched: list[str] = []
     recorder = SimpleNamespace(touch=lambda landmark: touched.append(landmark.name))
-    Keys(recorder, np.eye(4), wait=False)._press(key)
+    Keys(recorder, np.eye(4), wait=False, drawn=False)._press(key)
     assert touched == [name]
 
 
