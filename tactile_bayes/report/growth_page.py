@@ -416,7 +416,7 @@ def _draw_change(axes: Axes, compared: Compared) -> None:
         return
     percent = 100.0 * np.expm1(joint.change(0, len(joint.log_size) - 1).log_ratio)
     low, high = np.nanquantile(percent, [0.001, 0.999])
-    axes.hist(percent[(percent > low) & (percent < high)], bins=60, color="0.6")
+    axes.hist(percent[(percent > low) & (percent < high)], bins=60, color="0.5")
     axes.axvline(0.0, color="black", linewidth=1.2)
     axes.set_xlabel("change of the diameter (%)", fontsize=9)
     axes.set_title("Posterior of the change", loc="left", fontsize=11)

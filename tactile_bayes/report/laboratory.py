@@ -482,7 +482,7 @@ def draw_tradeoff(report: TradeoffReport, path: Path, *, force: bool = False) ->
             axes.annotate(f"{model}, finest", (finest, _LEAST_PERCENT), xytext=(2, 2), rotation=90, **beside)
             if np.isfinite(scatter):
                 axes.axhline(scatter, color=COLOURS[i], lw=0.8, ls="--")
-        axes.axhline(100 * report.tolerance, color="0.6", lw=0.8)
+        axes.axhline(100 * report.tolerance, color="0.5", lw=0.8)
         axes.set_xscale("log")
         axes.set_yscale("log")
         axes.margins(x=0.2, y=0.1)

@@ -268,7 +268,7 @@ def _draw_fit(axes: Axes, fit: FitContour, view: Orientation) -> None:
     for size_mm, dash, width, label in ellipses:
         _draw_ellipse(axes, centre, size_mm, fit.angle_deg, view, linewidth=width, linestyle=dash, label=label)
     axes.plot(*centre, "+", color="white", markersize=9, markeredgewidth=1.6, path_effects=_outlined(3.2))
-    axes.legend(fontsize=8, facecolor="0.5", labelcolor="white", **_BELOW)
+    axes.legend(fontsize=8, facecolor="0.4", labelcolor="white", **_BELOW)
 
 
 def _draw_ellipse(

@@ -106,7 +106,7 @@ def _draw_sizes(sizes: ModalitySizes, sds: Mapping[int, float], slope: float | N
         end = min(reach, reach / slope) if slope > 0 else reach
         axes.plot([0, end], [0, slope * end], color=_LINE, linewidth=1.5, label=f"through zero, slope {slope:.2f}")
     across, along = np.array([sds[int(mass)] for mass in found.mass]), _spread(found)
-    bars: dict[str, Any] = {"elinewidth": 0.8, "capsize": 1.5, "ecolor": "0.6"}
+    bars: dict[str, Any] = {"elinewidth": 0.8, "capsize": 1.5, "ecolor": "0.5"}
     bars |= {"xerr": across if across.any() else None, "yerr": along if along.any() else None}
     points: dict[str, Any] = {"fmt": "o", "markersize": 4, "color": _DOTS, "label": f"{len(found.size_mm)} masses"}
     axes.errorbar(found.ex_vivo_mm, found.size_mm, **points, **bars)

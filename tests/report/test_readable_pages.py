@@ -5,6 +5,7 @@ What an automated checker (axe-core) asks of a page, for those of its rules that
 
 from __future__ import annotations
 
+import base64
 import itertools
 import re
 from collections import Counter
@@ -12,6 +13,7 @@ from collections.abc import Iterator
 from html.parser import HTMLParser
 from importlib import resources
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -197,3 +199,66 @@ def test_text_and_lines_of_drawings_have_contrast(kind: str, pages: dict[str, st
             if tag in ("text", "path"):
                 edges[what] = stroke
     assert seen > 2
+
+
+Style = dict[str, str]
+Drawn = tuple[ElementTree.Element, str, Style]
+
+
+def figures_of(page: str) -> list[ElementTree.Element]:
+    """The figures that stand in a page as images."""
+    found = re.findall(r'<img[^>]*src="data:image/svg\+xml;base64,([^"]*)"', page)
+    return [ElementTree.fromstring(base64.b64decode(one)) for one in found]
+
+
+def drawn(element: ElementTree.Element, part: str = "", style: Style | None = None) -> Iterator[Drawn]:
+    """What a figure shows, in the order in which it is painted: the element, the part it is of, and its style."""
+    style = (style or {}) | dict(re.findall(r"([\w-]+): ([^;]+)", element.get("style", "")))
+    part = f"{part}/{element.get('id', '')}".rstrip("/")
+    name = element.tag.rpartition("}")[2]
+    if name in ("path", "use"):
+        yield element, part, style
+    for inner in element if name not in ("defs", "clipPath") else ():
+        yield from drawn(inner, part, style)
+
+
+def mixed(colour: str, share: float, back: str) -> str:
+    """A colour that lets through what is behind it."""
+    top, under = (np.array([int(one[i : i + 2], 16) for i in (1, 3, 5)]) for one in (colour, back))
+    return "#" + "".join(f"{round(value):02x}" for value in share * top + (1 - share) * under)
+
+
+def test_text_and_lines_of_a_trials_figures_have_contrast(pages: dict[str, str]) -> None:
+    """Each text against all that was painted before within the figure's own ground; lines and dots against the paper.
+
+    Frames of legends part nothing that their text does not, and bands are told by the lines within them.
+    """
+    figures = figures_of(pages["trial"])
+    assert len(figures) == pages["trial"].count("<img") >= 3
+    for figure in figures:
+        boxes: list[tuple[Box, str]] = []
+        words = 0
+        for element, part, style in drawn(figure):
+            fill, stroke = style.get("fill", "#000000"), style.get("stroke", "none")
+            if "/text_" in part:
+                continue
+            back = "#ffffff"
+            if fill != "none" and "patch" in part:
+                points = np.array(re.findall(r"-?[\d.]+", element.get("d", "")), dtype=float).reshape(-1, 2)
+                box = (*points.min(axis=0).tolist(), *points.max(axis=0).tolist())
+                share = float(style.get("opacity", style.get("fill-opacity", 1)))
+                under = behind((box[0] + box[2]) / 2, (box[1] + box[3]) / 2, boxes).replace("#fff", "#ffffff")[:7]
+                boxes.append((box, mixed(fill, share, under)))
+            elif "legend" not in part or "line2d" in part:
+                seen = max(contrast(one, back) for one in (fill, stroke) if one != "none")
+                assert seen >= 3.0, (part, style)
+        for group in figure.iter("{http://www.w3.org/2000/svg}g"):
+            if not group.get("id", "").startswith("text_"):
+                continue
+            place = re.search(r"translate\(([\d.-]+) ([\d.-]+)\)", ElementTree.tostring(group, encoding="unicode"))
+            assert place is not None
+            fills = {style.get("fill", "#000000") for _, _, style in drawn(group)}
+            ground = behind(float(place[1]), float(place[2]), boxes)
+            assert least_contrast(fills, ground) >= 4.5, (group.get("id"), fills, ground)
+            words += 1
+        assert words > 20
