@@ -6,13 +6,40 @@ import atexit
 import gc
 import importlib
 import os
+import re
 import sys
+from collections.abc import Iterable
 
 import click
 
 from tactile_bayes import __version__
 from tactile_bayes.errors import EXIT_FAULT, EXIT_INTERRUPTED, EXIT_READER_GONE, EXIT_USAGE, TactileBayesError
 from tactile_bayes.shell import ReaderGoneError, ended_in_order, protect_streams, release_streams
+
+_HYPHEN = "\ue000"  # Stands for one while lines are broken: "--array-calibration" is a word to copy.
+
+
+class WholeWords(click.HelpFormatter):
+    """Help whose lines do not break at hyphens."""
+
+    def write(self, string: str) -> None:
+        """Write with hyphens."""
+        super().write(string.replace(_HYPHEN, "-"))
+
+    def write_text(self, text: str) -> None:
+        """Write paragraphs."""
+        super().write_text(_joined(text))
+
+    def write_dl(self, rows: Iterable[tuple[str, str]], col_max: int = 30, col_spacing: int = 2) -> None:
+        """Write words beside what is said of them."""
+        super().write_dl([(_joined(word), _joined(told)) for word, told in rows], col_max, col_spacing)
+
+
+def _joined(text: str) -> str:
+    return re.sub(r"(?<=[\w-])-(?=\w)|(?<!\S)-(?=[\w-])", _HYPHEN, text)
+
+
+click.Context.formatter_class = WholeWords
 
 # group -> name -> (function in a module under tactile_bayes.commands, imported when it runs; one line of help)
 GROUPS: dict[str, dict[str, tuple[str, str]]] = {

@@ -47,7 +47,8 @@ STYLES: Final = {
 LEAST_COLUMNS: Final = 20  #: Below it nothing is wrapped: a terminal without a size says 0.
 MOST_NAME: Final = 40  #: Columns of a row's name up to which the text beside it stays in its own column.
 COMMAND_END: Final = " \\"  #: Of a line of a command that goes on in the next one, as shells read it.
-_UNIT: Final = r"(?<=\d) (?=(?:%|mm|cm2?|kPa|ms|s|Hz|deg)(?![\w-]))"  #: The blank before it, where no line breaks.
+_UNIT: Final = r"(?<=\d) (?=(?:%|mm|cm2?|kPa|ms|s|Hz|deg)(?![\w-]))|(?<=\bp) (?=[<.\d])"
+"""The blank before a unit, or of a p value, where no line breaks."""
 _JOINED: Final = "\x1f"  #: Stands for that blank, as it is printable in no text here.
 _WIDE: Final = "\x1e"  #: Stands behind a letter of two columns while a line is broken, and is printable in no text.
 _HANGING: Final = 2  #: Columns by which the further lines of a sentence are indented.

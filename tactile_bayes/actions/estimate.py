@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -23,6 +22,7 @@ from tactile_bayes.errors import EXIT_DONE, EXIT_FAULT, EXIT_NO_ESTIMATE, UsageE
 from tactile_bayes.files.atomic import given_twice
 from tactile_bayes.files.documents import dump_json
 from tactile_bayes.files.reports import json_text
+from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.estimate_figures import draw_size
 from tactile_bayes.report.figure_file import named_exam
 from tactile_bayes.report.pooled import pooled_summary, pooled_text
@@ -129,9 +129,10 @@ def estimate_action(
                 if path is not None:
                     draw(path, force=force)
     finally:  # what was computed is not lost with a file
-        if verbose:
-            print(f"estimate: {time.perf_counter() - begun:.3f} s", file=sys.stderr)
+        took_s = time.perf_counter() - begun
         _print(maps, answers, as_json=as_json, verbose=verbose, listed=len(maps) > 1)
+        if verbose:
+            click.echo(f"estimate: {took_s:.3f} s", err=True)
     failed = [answer.exit_code for answer in answers if answer.report is None]
     return failed[0] if failed else max(answer.exit_code for answer in answers)
 
@@ -177,6 +178,9 @@ def _print(maps: Sequence[Path], answers: list[Answer], *, as_json: bool, verbos
         documents = [answer.report.checked().document for answer in answers if answer.report is not None]
         click.echo(dump_json(documents if listed else documents[0]), nl=False)
         return
-    for path, answer in zip(maps, answers, strict=True):
-        if answer.report is not None:
-            click.echo((f"{path}\n" if listed else "") + (answer.full_text if verbose else answer.text), nl=listed)
+    texts = [
+        (f"{path}\n" if listed else "") + (answer.full_text if verbose else answer.text)
+        for path, answer in zip(maps, answers, strict=True)
+        if answer.report is not None
+    ]
+    click.echo("\n".join([*(one.replace(f"{RESEARCH_USE}\n", "") for one in texts[:-1]), *texts[-1:]]), nl=False)

@@ -54,9 +54,8 @@ def check_action(
             click.echo(f"{output}: the head, checked on {day}")
     click.echo(RESEARCH_USE)
     if wrong:
-        raise BadDataError(
-            f"{wrong} of {len(scans)} scans are not arranged as they are stated", way_out="import them again, corrected"
-        )
+        which = f"{wrong} of {len(scans)} scans are" if len(scans) > 1 else "the scan is"
+        raise BadDataError(f"{which} not arranged as stated", way_out="correct what is named above")
 
 
 # --- `diagnose`: how far the draws of a posterior can be trusted, as a table and as pictures.
@@ -190,13 +189,16 @@ def _apart(default: StatedSize, paper: StatedSize) -> str:
     share = 100 * (paper.size_mm / default.size_mm - 1.0)
     return (
         f"Eq 6 lies {share:+.0f} % from the default here. The default follows the bodies it was learned over more "
-        "closely;\nEq 6 has four constants, which -v prints for each map and the paper explains."
+        "closely; Eq 6 has four constants, which -v prints for each map and the paper explains."
     )
 
 
 def _summary(truth_mm: float, results: dict[str, StatedSize]) -> str:
     """True size and estimates, one per line."""
-    lines = [f"{'Largest size of the lump':28}{'mm':>9}   95 % interval", f"{'true':28}{truth_mm:>9.1f}"]
+    lines = [
+        f"{'Largest size of the lump':28}{'mm':>9}   95 % interval for exams of simulated bodies",
+        f"{'true':28}{truth_mm:>9.1f}",
+    ]
     for name, size in results.items():
         if size.size_mm is None or size.low_mm is None or size.high_mm is None:
             lines.append(f"{name:28}{'none':>9}")

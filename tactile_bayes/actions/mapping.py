@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -35,7 +34,7 @@ def map_action(
             raise UsageError(f"{output} exists; name another with -o, or give --force")
         refuse_existing(output, force=force)
     settings = to_plain(MapOptions(**options), digits=EXACT)
-    clock = _Clock(verbose)
+    clock = _Clock()
     loaded = [read_scan(path) for path in scans]
     read = zip(loaded, scans, strict=True)
     facts = [scan_facts(scan.session, frames=scan.frames.sha256, file=sha256(path)) for scan, path in read]
@@ -56,6 +55,8 @@ def map_action(
     finally:  # the map is written, whatever becomes of the figure
         text = map_text(tactile_map) if verbose else map_summary(tactile_map, written=str(output))
         click.echo(text, nl=False)
+        if verbose:
+            click.echo("\n".join(clock.told), err=True)
 
 
 def beside(scan: Path) -> Path:
@@ -64,14 +65,13 @@ def beside(scan: Path) -> Path:
 
 
 class _Clock:
-    """Prints the time of each step, if requested."""
+    """The time of each step, in words."""
 
-    def __init__(self, verbose: bool) -> None:
-        self._verbose = verbose
+    def __init__(self) -> None:
+        self.told: list[str] = []
         self._last = time.perf_counter()
 
     def tell(self, step: str) -> None:
         now = time.perf_counter()
-        if self._verbose:
-            print(f"{step}: {now - self._last:.3f} s", file=sys.stderr)
+        self.told.append(f"{step}: {now - self._last:.3f} s")
         self._last = now

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Executor
 from functools import cache, partial
@@ -47,7 +48,14 @@ from tactile_bayes.report.paper_head import (
     uniformity_document,
     uniformity_text,
 )
-from tactile_bayes.report.study import frames_text, lookalikes_text, solid_figures, study_figures, study_text
+from tactile_bayes.report.study import (
+    frames_text,
+    lookalikes_text,
+    solid_figures,
+    study_figures,
+    study_table,
+    study_text,
+)
 from tactile_bayes.shell import progress_bar
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.studies import paper, sbc
@@ -147,7 +155,7 @@ def study_action(
     with open_executor(workers=workers, cluster=scheduler) as executor:
         rows = run_study(geometries, settings=settings, executor=executor, output=output)
     if output is None:
-        click.echo(table_text(rows), nl=False)
+        click.echo(study_table(rows) if sys.stdout.isatty() else table_text(rows), nl=False)
     else:
         write_text(output, table_text(rows), force=force)
         unfinished(output).unlink(missing_ok=True)

@@ -63,6 +63,7 @@ class CampaignResult(Told, eq=False):
         campaign, found = self.campaign, self.campaign.found
         yield f"{self.folder}: {len(campaign.exams)} exams: {written.counts}"
         yield from written.masses
+        yield f"to look at: {self.folder / report.INDEX}, a row for each mass with the pages of its exams"
         yield f"{sum(found.todo.values())} steps run, {sum(found.kept.values())} kept from earlier runs"
         for step, todo in found.todo.items():
             more = "" if _few(found, step) else f" and {todo - len(found.names[step])} more"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import math
 import struct
+import textwrap
 import warnings
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -247,13 +248,16 @@ def _numbers(element: Element, order: str) -> np.ndarray:
 # --- What a file calls the arrays of a scan, as TOML, and a template of it for a file.
 
 _HEADING: Final = """\
-# Names of a scan's arrays in {path}, for `tactile-bayes import SRC --columns MAP.toml -o SCAN.mcap`.
-# Complete it, and leave out what another file gives: --head-geometry, --array-calibration, --landmarks, --poses.
+# Names of a scan's arrays in {path}, for
+#   tactile-bayes import SRC --columns MAP.toml -o SCAN.mcap
+# Complete it, and leave out what another file gives: --head-geometry,
+# --array-calibration, --landmarks, --poses.
 
-# unit = "kPa"        # of frames that are pressures (or Pa, psi, mmHg, N/cm2): they need no gain and no offset
+# unit = "kPa"        # of frames that are pressures (or Pa, psi, mmHg, N/cm2)
 # time_unit = "ms"    # of the frames' times, where it is not s (or us, min)
 # length_unit = "cm"  # of the places, where it is not mm (or m, inch)
 """
+_COLUMNS: Final = 79  #: Of a line: one that breaks on a terminal is no comment any more when it is copied.
 _VALUES: Final = """
 [values]
 # pitch_mm = 1.5  # numbers that no file has
@@ -323,12 +327,14 @@ def _array_lines(shapes: Mapping[str, Shape]) -> Iterator[str]:
 
 def _line(name: str, guessed: Mapping[str, str], shapes: Mapping[str, Shape], told: str) -> str:
     if name in shapes:
-        return f"# {name} is called so  # {told}"
-    if name == "counts" and "frames" in shapes:
-        return f"# counts are called frames  # {told}"
-    if name in guessed:
-        return f"{name} = {dump_json(guessed[name]).strip()}  # guessed; {told}"
-    return f'# {name} = ""  # {told}'
+        line = f"# {name}: found under this name"
+    elif name == "counts" and "frames" in shapes:
+        line = "# counts: found as frames"
+    elif name in guessed:
+        line = f"{name} = {dump_json(guessed[name]).strip()}  # guessed"
+    else:
+        line = f'# {name} = ""'
+    return "\n".join([line, *textwrap.wrap(told, _COLUMNS, initial_indent="#   ", subsequent_indent="#   ")])
 
 
 def _guessed(shapes: Mapping[str, Shape]) -> dict[str, str]:

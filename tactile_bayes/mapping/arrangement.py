@@ -282,7 +282,8 @@ class ArrangementCheck(Record, eq=False):
         """The answer in full: what the frames agree with, what they exclude, what they leave open, and what to do."""
         lines = [*finding_lines(self.doubts), self.words, *([self.remedy] if self.findings else [])]
         if self.best is self.stated and not self.says_nothing:
-            odds = {name: odds_words(self.excluded[name]) for name in self.excluded if name not in self.not_shown}
+            surest = sorted(self.excluded.items(), key=lambda pair: -min(pair[1], log(1e6)))
+            odds = {name: odds_words(found) for name, found in surest if name not in self.not_shown}
             for words in dict.fromkeys(odds.values()):
                 lines.append(f"excluded (odds {words}): {', '.join(name for name in odds if odds[name] == words)}")
             lines += [f"not excluded: {CORRECTIONS[name]}" for name in self.not_shown]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from typing import Final, Literal
 
@@ -75,15 +76,13 @@ def growths(patient: str, mass: str, visits: Sequence[str], report: CompareRepor
 
 
 def growth_line(rows: Sequence[Growth], table: str) -> str:
-    """All rows in one sentence; empty without any."""
+    """Each mass by its last visit, in one sentence; empty without any."""
     if not rows:
         return ""
-    counts = {words: sum(row.verdict == name for row in rows) for name, words in _VERDICTS.items()}
-    counts["not compared"] = sum(not row.verdict for row in rows)
-    masses = len({(row.patient, row.mass) for row in rows})
-    told = ", ".join(f"{count} {words}" for words, count in counts.items() if count)
-    compared = f" ({len(rows)} later visits)" if len(rows) > masses else ""
-    return f"growth of {masses} mass{'es' * (masses > 1)} with several visits{compared}: {told} ({table})"
+    last = {(row.patient, row.mass): row.verdict for row in rows}
+    counts = Counter(_VERDICTS.get(found, "not compared") for found in last.values())
+    told = ", ".join(f"{counts[words]} {words}" for words in (*_VERDICTS.values(), "not compared") if counts[words])
+    return f"growth of {len(last)} mass{'es' * (len(last) > 1)} with several visits: {told} ({table})"
 
 
 # --- The report of a comparison: what `compare --json` prints.
@@ -214,11 +213,9 @@ def compare_summary(report: CompareReport) -> str:
         return "\n".join([*lines, _refusal(report), *checks, RESEARCH_USE]) + "\n"
     last, visits = report.changes[-1], report.visits
     shown = visits if len(visits) <= _MOST_VISITS else (visits[0], visits[-1])
-    lines += [_visit_line(one) for one in shown]
-    lines += _place_line(report.places[-1])
-    lines += [_change_line(last), _odds_line(last), _verdict_line(last)]
+    lines += [_verdict_line(last), _change_line(last), _odds_line(last), *_another_line(last)]
     lines += (_rate_lines(last) if report.trend is None else _trend_lines(report.trend))[:1]
-    lines += _site_line(report) + _another_line(last)
+    lines += [*_site_line(report), *(_visit_line(one) for one in shown), *_place_line(report.places[-1])]
     lines += finding_summary(findings, "check", most=2)
     return "\n".join([*lines, MORE, RESEARCH_USE]) + "\n"
 
@@ -226,6 +223,10 @@ def compare_summary(report: CompareReport) -> str:
 def compare_text(report: CompareReport) -> str:
     """Full report."""
     lines = finding_lines(report.findings, "caution")
+    for change in report.changes:
+        lines += [_verdict_line(change), _change_line(change), _odds_line(change)]
+        lines += [*_another_line(change), *_rate_lines(change), ""]
+    lines += [] if report.trend is None else [*_trend_lines(report.trend), ""]
     for one in report.visits:
         lines.append(_visit_line(one))
         for found in one.maps:
@@ -236,10 +237,6 @@ def compare_text(report: CompareReport) -> str:
     lines += finding_lines(report.findings, "check")
     if report.status != "compared":
         return "\n".join([*lines, _refusal(report), RESEARCH_USE]) + "\n"
-    for change in report.changes:
-        lines += ["", _change_line(change), _odds_line(change), _verdict_line(change)]
-        lines += _rate_lines(change) + _another_line(change)
-    lines += [] if report.trend is None else ["", *_trend_lines(report.trend)]
     lines += [*_site_line(report), _model_line(report)]
     if report.left_out:
         lines.append(f"Left out: {'; '.join(report.left_out)}.")

@@ -107,6 +107,11 @@ def place_line(place: Position) -> str:
     return f"Place: {place.text}; {100 * distance.probability:g} % interval{clock} {ends}."
 
 
+def at_place(x_mm: float, y_mm: float) -> str:
+    """A place on the map, to a tenth of a mm and without a zero below 0."""
+    return f"at ({round(x_mm, 1) + 0.0:.1f}, {round(y_mm, 1) + 0.0:.1f}) mm"
+
+
 def from_xiphoid(x_mm: float, y_mm: float) -> str:
     """A place in the patient's axes, in words."""
     across = f"{abs(x_mm):.0f} mm to the patient's {'right' if x_mm >= 0 else 'left'}"
@@ -428,7 +433,7 @@ def mass_lines(masses: Sequence[MassReport]) -> list[str]:
 def mass_words(mass: MassReport, here: MassReport | None) -> str:
     """A mass's place, its distance from the reported one, its size or why it has none, and its probability."""
     x, y = mass.centre_mm.x, mass.centre_mm.y
-    place = f"at ({x:.1f}, {y:.1f}) mm"
+    place = at_place(x, y)
     if here is not None:
         away = np.hypot(x - here.centre_mm.x, y - here.centre_mm.y)
         place += f", {away:.0f} mm from mass {here.number}"

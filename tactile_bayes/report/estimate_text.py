@@ -210,8 +210,14 @@ def no_estimate_line(reason: str) -> str:
 
 
 def _no_estimate(report: EstimateReport) -> list[str]:
-    """Why there is no estimate, what a map without a lump would have shown, and what would help."""
+    """Why there is no estimate, what a map without a lump would have shown, and what would help.
+
+    Where a finding is the reason, its own line above has it and its remedy.
+    """
     smallest = [] if report.smallest_lump is None else [f"{smallest_text(report.smallest_lump)}."]
+    for one in report.findings:
+        if report.reason.endswith(f": {one.text}"):
+            return [no_estimate_line(report.reason.removesuffix(f": {one.text}")), *smallest]
     return [no_estimate_line(report.reason), *smallest, *_advice(report)]
 
 
@@ -388,7 +394,7 @@ def _lump(report: EstimateReport) -> list[str]:
     elif report.centre_patient_mm is not None:
         parts.append(estimate_document.from_xiphoid(*report.centre_patient_mm.median))
     if report.centre_mm is not None:
-        parts.append("at ({:.1f}, {:.1f}) mm on the map".format(*report.centre_mm.median))
+        parts.append(f"{estimate_document.at_place(*report.centre_mm.median)} on the map")
     text = ", ".join(parts)
     return [f"{number}: {text[0].lower()}{text[1:]}." if number else f"{text}."] if parts else []
 

@@ -61,17 +61,10 @@ def map_summary(tactile_map: TactileMap, *, written: str) -> str:
     findings, quality = tactile_map.findings, tactile_map.quality
     rows, columns = tactile_map.mean.shape
     cell = tactile_map.recipe.cell_mm
-    used = dict(_frames(tactile_map)).get("frames used", "")
-    number, *more = used.split(", ")
-    figures = [f"{number} frames", *more] if used else []
-    if "coverage" in quality:
-        figures.append(f"{100 * quality['coverage']:.0f} % covered")
-    if "stroke_lag_mm" in quality:
-        figures.append(f"stroke lag {quality['stroke_lag_mm']:+.1f} +- {quality['stroke_lag_sd_mm']:.1f} mm")
     dropped = "; ".join(_dropped(tactile_map))
     lines = [
         *finding_lines(findings, "caution"),
-        f"{verdict(findings, answered=True)}: {', '.join(figures)}",
+        _verdict_line(tactile_map),
         *([f"left out: {dropped}"] if dropped else []),
         f"written: {written}, {columns * cell:g} x {rows * cell:g} mm in cells of {cell:g} mm",
         *finding_lines(findings, "check"),
@@ -81,14 +74,28 @@ def map_summary(tactile_map: TactileMap, *, written: str) -> str:
     return "\n".join([*lines, RESEARCH_USE]) + "\n"
 
 
+def _verdict_line(tactile_map: TactileMap) -> str:
+    """Whether the map is sound, with the figures that lead to it."""
+    quality = tactile_map.quality
+    used = dict(_frames(tactile_map)).get("frames used", "")
+    number, *more = used.split(", ")
+    figures = [f"{number} frames", *more] if used else []
+    if "coverage" in quality:
+        figures.append(f"{100 * quality['coverage']:.0f} % covered")
+    if "stroke_lag_mm" in quality:
+        figures.append(f"stroke lag {quality['stroke_lag_mm']:+.1f} +- {quality['stroke_lag_sd_mm']:.1f} mm")
+    return f"{verdict(tactile_map.findings, answered=True)}: {', '.join(figures)}"
+
+
 def map_text(tactile_map: TactileMap) -> str:
-    """Full report of a map: cautions, a table, what is to be checked, notes and the research-use line."""
+    """Full report of a map: cautions and verdict, a table, what is to be checked, notes and the research-use line."""
     parts = (_what, _frames, _making, _cells)
     rows = [row for part in parts for row in part(tactile_map)]
     width = max(len(name) for name, _ in rows)
     lines = [f"{name.ljust(width)}  {text}" for name, text in rows]
     cautions, checks = (finding_lines(tactile_map.findings, one) for one in ("caution", "check"))
-    return "\n".join([*cautions, *lines, "", *checks, *_notes(tactile_map), RESEARCH_USE]) + "\n"
+    head = [*cautions, _verdict_line(tactile_map), ""]
+    return "\n".join([*head, *lines, "", *checks, *_notes(tactile_map), RESEARCH_USE]) + "\n"
 
 
 def _what(tactile_map: TactileMap) -> Iterator[tuple[str, str]]:

@@ -46,6 +46,16 @@ if TYPE_CHECKING:
 # --- A forward study in a few lines.
 
 
+def study_table(rows: Sequence[StudyRow]) -> str:
+    """Amplitude and width of every case, for a reader: the table as CSV is wider than a terminal."""
+    lines = [f"{'seat':12}{'d, mm':>7}{'h/d':>7}{'E2/E1':>7}{'amplitude':>11}{'sigma, mm':>11}  shows"]
+    for one in rows:
+        lump = f"{one.seat:12}{one.d_mm:>7g}{one.depth_ratio:>7g}{one.stiffness_ratio:>7g}"
+        bump = f"{one.amplitude:>11.3f}{one.sigma_x_mm:>11.2f}"
+        lines.append(f"{lump}{bump}  {'yes' if one.detectable else 'no'}")
+    return "\n".join([*lines, "With all columns, to calibrate by: -o TABLE.csv.", ""])
+
+
 def study_text(rows: Sequence[StudyRow]) -> str:
     """How many cases show; for each seat Eq 6 in two stages along each axis of the head, and Fig 7b in a line."""
     shown = sum(row.detectable for row in rows)

@@ -469,7 +469,7 @@ def test_the_template_names_what_shapes_tell_and_is_read_back(pressed: Arrays, t
         "pose_time_s": "tt",
     }
     assert f"#   P: {len(pressed['frames'])} x 16 x 26" in text
-    assert "pitch_mm is called so" in text
+    assert "pitch_mm: found under this name" in text
     (tmp_path / "map.toml").write_text(text.replace('# unit = "kPa"', 'unit = "kPa"'))
     done = run_here("import", "exam.mat", "--columns", "map.toml", "-o", "exam.mcap", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
