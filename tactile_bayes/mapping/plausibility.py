@@ -42,7 +42,7 @@ MOST_FLICKER: Final = 0.7
 """Of `_flicker`: 0.2 at most in 466 right scans, 1 in noise."""
 _STILL_TAXELS: Final = 0.01
 """Share of the taxels that may change in a frame that repeats the last one."""
-MOST_REPEATED: Final = 0.5
+MOST_REPEATED: Final = 0.4  # where each frame is there twice, half of them repeat the one before
 PLATEAU: Final = 30
 TAXEL_PLATEAU: Final = 10
 """Readings at the highest count, of the array and of one taxel, that are a plateau if those of the three counts below

@@ -175,6 +175,7 @@ def test_a_map_without_a_lump_says_so_where_nothing_stands_against_it() -> None:
 
 UNUSUAL: dict[str, tuple[Callable[[Scan], Scan], str]] = {
     "a slow array read often": (counts(lambda c: np.repeat(c[::5], 5, axis=0)), "repeat the one before"),
+    "each frame twice": (counts(lambda c: np.repeat(c[::2], 2, axis=0)), "repeat the one before"),
     "wrapped below 0": (
         counts(lambda c: np.where(c == c.min(), 65530, c), saturation=65535),
         "stand just below 65,536",
