@@ -30,8 +30,7 @@ import numpy as np
 from tactile_bayes.declarations import replace
 from tactile_bayes.forward.axisymmetric import LayeredBody, skin_flexibility, taxel_compliance
 from tactile_bayes.forward.contact import ContactStiffness
-from tactile_bayes.forward.instrument import frame_times, head_positions, level_kpa, record
-from tactile_bayes.forward.scene import Scene, rotation_from_vector
+from tactile_bayes.forward.scene import Scene, frame_times, head_positions, level_kpa, record, rotation_from_vector
 from tactile_bayes.forward.solid import (
     PlacedLump,
     SolidFrame,

@@ -16,7 +16,6 @@ from tactile_bayes.api.settings import Settings, refuse_checkpoint, times_of
 from tactile_bayes.api.sized import Answer, SizeEstimate, size_priors
 from tactile_bayes.declarations import as_dict, replace
 from tactile_bayes.errors import CANNOT_SHOW, EXIT_DONE, EXIT_NO_ESTIMATE, UsageError
-from tactile_bayes.files.comparison import CompareReport
 from tactile_bayes.files.provenance import Provenance, repeated_scans, scans_of
 from tactile_bayes.files.reports import centre_of
 from tactile_bayes.findings import Finding, Verdict, by_weight, finding_lines, verdict
@@ -24,7 +23,7 @@ from tactile_bayes.inference.draws import Draws
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.options import GROWN_BY, Comparing
 from tactile_bayes.presets import REGISTRATION_MM
-from tactile_bayes.report.compare import compare_report, compare_summary, compare_text
+from tactile_bayes.report.compare import CompareReport, compare_report, compare_summary, compare_text
 from tactile_bayes.report.exam_words import Given
 from tactile_bayes.report.growth_page import Course, DrawnMap, draw_comparison, growth_page
 from tactile_bayes.report.pages import PageFiles

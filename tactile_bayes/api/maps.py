@@ -19,7 +19,7 @@ from tactile_bayes.files.map_nc import read_map_and_scans, write_map
 from tactile_bayes.files.provenance import Provenance, repeated_scans, scan_facts
 from tactile_bayes.files.scene_toml import read_scene, scene_of
 from tactile_bayes.findings import Finding, finding_lines
-from tactile_bayes.forward.instrument import SimulatedScan
+from tactile_bayes.forward.scene import SimulatedScan
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.arrangement import ArrangementCheck, check_scan
 from tactile_bayes.mapping.build import build_map as build

@@ -16,7 +16,6 @@ from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import CANNOT_SHOW, BadDataError, UsageError
 from tactile_bayes.files import manifest_csv as layout
 from tactile_bayes.files.atomic import write_text
-from tactile_bayes.files.comparison import CompareReport
 from tactile_bayes.files.documents import read_protocol, read_record
 from tactile_bayes.files.manifest_csv import Exam
 from tactile_bayes.files.reading import IMAGE_BYTES, put, read_bytes
@@ -26,7 +25,7 @@ from tactile_bayes.findings import Finding, Verdict, by_weight, capital, finding
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.options import TrialSettings
 from tactile_bayes.report.campaign_page import ExamEntry, MassRow, VisitEntry, campaign_html, worst
-from tactile_bayes.report.compare import Growth, growth_line, growths
+from tactile_bayes.report.compare import CompareReport, Growth, growth_line, growths
 from tactile_bayes.report.exam_words import reason_on_paper
 from tactile_bayes.trial.readings import at_excision, in_order
 

@@ -11,9 +11,17 @@ from tactile_bayes.declarations import Record, as_dict, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward import plane
 from tactile_bayes.forward.contact import Head
-from tactile_bayes.forward.instrument import SimulatedScan, frame_times, head_positions, level_kpa, record
 from tactile_bayes.forward.mesh import REACH_MM
-from tactile_bayes.forward.scene import Scene, normalised_pressure, tissue_truth
+from tactile_bayes.forward.scene import (
+    Scene,
+    SimulatedScan,
+    frame_times,
+    head_positions,
+    level_kpa,
+    normalised_pressure,
+    record,
+    tissue_truth,
+)
 from tactile_bayes.forward.solid import frames_at_poses, simulate_solid
 from tactile_bayes.forward.tissue import MOST_SEAT, Body, Layers, SceneBody, SolidLump, fat_thickness
 from tactile_bayes.geometry import FloatArray

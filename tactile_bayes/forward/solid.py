@@ -12,9 +12,17 @@ from numpy.typing import NDArray
 from tactile_bayes.declarations import Record
 from tactile_bayes.forward.axisymmetric import CondensedLump, LayeredBody, condense_lump, skin_spline, taxel_compliance
 from tactile_bayes.forward.contact import Contact, ContactStiffness, solve_contact
-from tactile_bayes.forward.instrument import SimulatedScan, frame_times, head_positions, level_kpa, record
 from tactile_bayes.forward.mesh import LumpGeometry
-from tactile_bayes.forward.scene import Head, Scene, tissue_truth
+from tactile_bayes.forward.scene import (
+    Head,
+    Scene,
+    SimulatedScan,
+    frame_times,
+    head_positions,
+    level_kpa,
+    record,
+    tissue_truth,
+)
 from tactile_bayes.forward.tissue import HeadFace, SceneBody, SolidLump, fat_thickness, head_face
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.presets import HEAD_PITCH_MM

@@ -155,9 +155,12 @@ def cannot_show(why: str, advice: str = "", on_paper: str = "") -> Abstention:
     return Abstention(CANNOT_SHOW, f"the data cannot show whether there is a lump: {why}", advice, on_paper)
 
 
-def chance_text(probability: float) -> str:
-    """Format a probability with no more digits than it is worth."""
-    return "below 0.01" if probability < 0.01 else "above 0.99" if probability > 0.99 else f"{probability:.2f}"
+def chance_text(probability: float, digits: int = 2) -> str:
+    """Format a probability with no more digits than it is worth: "0.32", "below 0.01" or "above 0.99"."""
+    least = 10.0**-digits
+    if least <= probability <= 1.0 - least:
+        return f"{probability:.{digits}f}"
+    return f"below {least:g}" if probability < least else f"above {1.0 - least:g}"
 
 
 def no_bump(

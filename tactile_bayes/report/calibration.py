@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from tactile_bayes.posterior.verdict import chance_text
 from tactile_bayes.presets import HELD, INTERVAL, RESEARCH_USE
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.draws import PAPER_SPREAD
@@ -67,7 +68,7 @@ def repeatability_text(document: Mapping[str, Any]) -> str:
     calibration = document["calibration"]
     median, low, high = (100 * document[name] for name in ("median", "low", "high"))
     apart = [
-        f"{one['name']} (probability by chance {_chance(one['by_chance'])})"
+        f"{one['name']} (probability by chance {chance_text(one['by_chance'], 4)})"
         for one in document["repeats"]
         if one["name"] in document["outlying"]
     ]
@@ -88,10 +89,6 @@ def repeatability_text(document: Mapping[str, Any]) -> str:
     lines += _names("Took no part", document["left_out"])
     lines.append("Use it: tactile-bayes estimate MAP.nc --repeatability SITE.json")
     return "\n".join([*lines, RESEARCH_USE]) + "\n"
-
-
-def _chance(probability: float) -> str:
-    return "below 0.0001" if probability < 1e-4 else f"{probability:.2g}"
 
 
 def _names(lead: str, texts: Sequence[str]) -> list[str]:

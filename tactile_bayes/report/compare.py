@@ -1,25 +1,202 @@
-"""The report of a comparison of visits made, and in words."""
+"""The report of a comparison of visits: declared as its file has it, made, and in words."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from typing import Final, Literal
+from typing import Annotated, Any, Final, Literal
 
 import numpy as np
 
-from tactile_bayes.declarations import UNSET, Record, rounded
-from tactile_bayes.files import comparison as comparison
-from tactile_bayes.files.comparison import CompareReport
+from tactile_bayes.declarations import UNSET, Meta, Record, UnsetType, field, rounded, says
 from tactile_bayes.files.provenance import Provenance
-from tactile_bayes.files.reports import EstimateReport
+from tactile_bayes.files.reports import (
+    Above0,
+    Chance,
+    Entries,
+    EstimateReport,
+    Interval,
+    Judgement,
+    Least0,
+    Number1,
+    Report,
+)
 from tactile_bayes.findings import Finding, capital, finding_lines, finding_summary
 from tactile_bayes.findings import verdict as verdict_of
 from tactile_bayes.inference.draws import Quantity, normal_quantile
 from tactile_bayes.options import Comparing
+from tactile_bayes.posterior.verdict import chance_text
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.size.pooling import Repeatability
 from tactile_bayes.size.visits import VOLUME, Change, Compared, JointSizes, doubling_days, straight_line
+
+# --- The report, as `compare --json` prints it.
+
+COMPARE: Final = "tactile-bayes/compare/1"
+
+
+class VisitMap(Record):
+    """One of the maps of a visit."""
+
+    map: str
+    status: Literal["estimate", "no_estimate"]
+    reason: str
+    detected_probability: float | None
+
+
+class Visit(Record):
+    """A visit with its size and its maps."""
+
+    visit: Number1
+    day: Annotated[float | None, says("Days from the first visit; null where not given.")]
+    max_size_mm: Annotated[
+        Quantity | None, says("Largest diameter; the joint posterior's, in which the lump keeps its form.")
+    ]
+    fat_mm: Annotated[
+        float | None,
+        says("Depth of the fat under the head by the visit's pressure profiles; null where not all visits tell it."),
+    ]
+    maps: Annotated[tuple[VisitMap, ...], Meta(min_length=1)]
+
+
+class VisitPlace(Record):
+    """How far the mass of a later visit lies from the first visit's."""
+
+    visit: Annotated[int, Meta(ge=2)]
+    distance_mm: Least0 | None
+    sd_mm: Annotated[
+        Least0 | None, says("SD by which one mass comes out apart between the visits, in the direction of the shift.")
+    ]
+    shift_mm: Annotated[
+        tuple[float, float] | None, says("x and y in the patient's frame, from the first visit's place.")
+    ]
+    probability: Annotated[
+        Chance | None, says("That one mass comes out as far apart or farther; below 0.02 the visits are not compared.")
+    ]
+
+
+class GrownBy(Record):
+    """Probability of a growth by more than this many percent of the diameter."""
+
+    percent: Annotated[float, Meta(gt=-100)]
+    probability: Chance
+
+
+class Detectable(Record):
+    """Least growth and shrinkage of the diameter whose 95 % interval would leave out no change, percent."""
+
+    growth: Least0
+    shrinkage: Annotated[float, Meta(ge=0, le=100)]
+
+
+class Rate(Interval):
+    """Specific growth rate of the volume in percent per day."""
+
+    median: float
+    low: float
+    high: float
+    probability: Annotated[float, Meta(gt=0, lt=1)]
+
+
+class Doubling(Record):
+    """Doubling time of the volume in days at the rate's median and ends; null where it does not grow."""
+
+    median: Above0 | None
+    shortest: Above0 | None
+    longest: Above0 | None
+
+
+class GrowthRate(Record):
+    """Growth between two visits so many days apart."""
+
+    days: Above0
+    percent_per_day: Rate
+    doubling_days: Doubling
+
+
+class TrendReport(Record):
+    """Straight line of ln d over three visits and more."""
+
+    visits: Annotated[int, Meta(ge=3)]
+    days: Above0
+    percent_per_day: Rate
+    doubling_days: Doubling
+    straight_line_probability: Annotated[
+        Chance | None, says("That sizes on a straight line come out as far from one or farther.")
+    ]
+
+
+class AnotherChange(Record):
+    """The change if exams of one mass differ as the paper's maps did."""
+
+    between_map_sd: Least0
+    percent: Quantity
+    probability_grown: Chance
+
+
+class ChangeReport(Record):
+    """Change from the first visit to a later one."""
+
+    earlier: Number1
+    later: Annotated[int, Meta(ge=2)]
+    verdict: Annotated[
+        Literal["grown", "shrunk", "no_change_shown"],
+        says("grown or shrunk where the 95 % interval leaves out no change."),
+    ]
+    log_ratio: Annotated[Quantity, says("ln of the later diameter over the earlier.")]
+    percent: Annotated[Quantity, says("Change of the diameter in percent.")]
+    probability_grown: Chance
+    grown_by: tuple[GrownBy, ...]
+    smallest_detectable_percent: Detectable
+    growth_rate: GrowthRate | None
+    another_exam: Annotated[
+        AnotherChange | None,
+        says("The same if exams of one mass differ as the paper's maps did; null where their spread is stated."),
+    ]
+
+    @property
+    def for_alike_exams_only(self) -> bool:
+        """True where a change is shown, but not if exams differ as patients' did."""
+        another = self.another_exam
+        return (
+            self.verdict != "no_change_shown"
+            and another is not None
+            and another.percent.low <= 0 <= another.percent.high
+        )
+
+
+class CompareReport(Report, kw_only=True):
+    """Change of a mass's size between visits."""
+
+    schema: Literal["tactile-bayes/compare/1"]
+    status: Annotated[
+        Literal["compared", "not_one_mass", "no_estimate"],
+        says("not_one_mass: the visits were not shown to be of one mass; no_estimate: a visit has no size."),
+    ]
+    verdict: Judgement
+    entries: Entries = field(name="findings")
+    reason: Annotated[str, says("Why nothing is compared; empty otherwise.")]
+    advice: Annotated[str, says("What would help where nothing is compared.")]
+    visits: Annotated[tuple[Visit, ...], Meta(min_length=2)]
+    places: Annotated[
+        tuple[VisitPlace, ...],
+        says("How far the mass of each later visit lies from the first visit's, by the landmarks; null without."),
+    ]
+    changes: Annotated[
+        tuple[ChangeReport, ...],
+        says("Change from the first visit to each later one; empty where nothing is compared."),
+    ]
+    trend: Annotated[
+        TrendReport | None, says("Straight line of ln d over three visits and more with days; null otherwise.")
+    ]
+    between_map_sd: Annotated[Least0 | None, says("SD of ln d between the exams of a visit, root mean square.")]
+    repeatability: Annotated[
+        str | UnsetType, says("How far exams of one mass lie apart at this site, where --repeatability told it")
+    ] = UNSET
+    left_out: tuple[str, ...]
+    research_use: str
+    provenance: dict[str, Any]
+
 
 # --- Growth of masses between visits, as `compare` told it: rows of a table and a section of a page.
 
@@ -85,7 +262,7 @@ def growth_line(rows: Sequence[Growth], table: str) -> str:
     return f"growth of {len(last)} mass{'es' * (len(last) > 1)} with several visits: {told} ({table})"
 
 
-# --- The report of a comparison: what `compare --json` prints.
+# --- The report of a comparison made.
 
 SHOWN: Final = 0.95
 """Probability of the interval that leaves out no change where a growth, or a shrinkage, is called one."""
@@ -109,29 +286,29 @@ def compare_report(
     dated = [None] * len(visits) if days is None else days
     later = () if joint is None else range(1, len(visits))
     return CompareReport(
-        schema=comparison.COMPARE,
+        schema=COMPARE,
         status=compared.status,
         verdict=verdict_of(compared.findings, answered=joint is not None),
         entries=tuple(one.entry for one in compared.findings),
         reason=compared.reason,
         advice=compared.advice,
         visits=tuple(
-            comparison.Visit(
+            Visit(
                 visit=i + 1,
                 day=dated[i],
                 max_size_mm=None if joint is None else joint.size_mm(i, probability).rounded,
                 fat_mm=None if joint is None else rounded(joint.calibrations[i].fat_mm),
                 maps=tuple(
-                    comparison.VisitMap(name, one.status, one.reason, one.detected_probability)
+                    VisitMap(name, one.status, one.reason, one.detected_probability)
                     for name, one in zip(names[i], reports, strict=True)
                 ),
             )
             for i, reports in enumerate(visits)
         ),
         places=tuple(
-            comparison.VisitPlace(visit, None, None, None, None)
+            VisitPlace(visit, None, None, None, None)
             if one is None
-            else rounded(comparison.VisitPlace(visit, one.distance_mm, one.sd_mm, one.shift_mm, one.probability))
+            else rounded(VisitPlace(visit, one.distance_mm, one.sd_mm, one.shift_mm, one.probability))
             for visit, one in enumerate(compared.apart, start=2)
         ),
         changes=tuple(_change(compared, number, comparing, probability) for number in later),
@@ -144,7 +321,7 @@ def compare_report(
     )
 
 
-def _change(compared: Compared, later: int, comparing: Comparing, probability: float) -> comparison.ChangeReport:
+def _change(compared: Compared, later: int, comparing: Comparing, probability: float) -> ChangeReport:
     """Change from the first visit to a later one, and if exams of one mass differ as the paper's maps do."""
     joint, another, days = compared.joint, compared.another, comparing.days
     assert joint is not None
@@ -153,13 +330,11 @@ def _change(compared: Compared, later: int, comparing: Comparing, probability: f
     if another is not None:
         other = another.change(0, later)
         grown = rounded(other.probability_above(0.0))
-        told = comparison.AnotherChange(rounded(another.between_map_sd), other.percent(probability).rounded, grown)
+        told = AnotherChange(rounded(another.between_map_sd), other.percent(probability).rounded, grown)
     if days is not None:
         q, apart = change.log_summary(probability), days[later] - days[0]
-        rate = comparison.GrowthRate(
-            apart, *_rates([VOLUME * one / apart for one in (q.median, q.low, q.high)], probability)
-        )
-    return comparison.ChangeReport(
+        rate = GrowthRate(apart, *_rates([VOLUME * one / apart for one in (q.median, q.low, q.high)], probability))
+    return ChangeReport(
         earlier=1,
         later=later + 1,
         verdict=verdict(change),
@@ -167,9 +342,9 @@ def _change(compared: Compared, later: int, comparing: Comparing, probability: f
         percent=change.percent(probability).rounded,
         probability_grown=rounded(change.probability_above(0.0)),
         grown_by=tuple(
-            rounded(comparison.GrownBy(100.0 * share, change.probability_above(share))) for share in comparing.grown_by
+            rounded(GrownBy(100.0 * share, change.probability_above(share))) for share in comparing.grown_by
         ),
-        smallest_detectable_percent=rounded(comparison.Detectable(100.0 * growth, 100.0 * shrinkage)),
+        smallest_detectable_percent=rounded(Detectable(100.0 * growth, 100.0 * shrinkage)),
         growth_rate=rate,
         another_exam=told,
     )
@@ -183,19 +358,19 @@ def verdict(change: Change) -> Literal["grown", "shrunk", "no_change_shown"]:
     return "shrunk" if q.high < 0.0 else "no_change_shown"
 
 
-def _rates(growth: Sequence[float], probability: float) -> tuple[comparison.Rate, comparison.Doubling]:
+def _rates(growth: Sequence[float], probability: float) -> tuple[Rate, Doubling]:
     """A growth rate in percent of the volume per day, and the doubling times, at its median and its ends."""
     median, low, high = (rounded(100.0 * one) for one in growth)
-    times = comparison.Doubling(*(doubling_days(growth[i]) for i in (0, 2, 1)))
-    return comparison.Rate(median, low, high, probability), rounded(times)
+    times = Doubling(*(doubling_days(growth[i]) for i in (0, 2, 1)))
+    return Rate(median, low, high, probability), rounded(times)
 
 
-def _trend(joint: JointSizes, days: Sequence[float], probability: float) -> comparison.TrendReport:
+def _trend(joint: JointSizes, days: Sequence[float], probability: float) -> TrendReport:
     """Straight line of ln d over all visits."""
     line = straight_line(*joint.moments, days)
     half = float(normal_quantile(np.array(0.5 + probability / 2))) * line.sd
     rates = _rates([VOLUME * (line.per_day + one) for one in (0.0, -half, half)], probability)
-    return comparison.TrendReport(len(days), days[-1] - days[0], *rates, rounded(line.departure))
+    return TrendReport(len(days), days[-1] - days[0], *rates, rounded(line.departure))
 
 
 # --- A comparison of visits as text: the change of size in words that its odds carry.
@@ -273,7 +448,7 @@ def _refusal(report: CompareReport) -> str:
     return f"{head}: {report.reason}.{advice}"
 
 
-def _visit_line(visit: comparison.Visit) -> str:
+def _visit_line(visit: Visit) -> str:
     found = sum(one.status == "estimate" for one in visit.maps)
     maps = f"{found} of {len(visit.maps)} maps" if len(visit.maps) > 1 else "1 map"
     day = "" if visit.day is None or visit.visit == 1 else f", day {visit.day:g}"
@@ -284,7 +459,7 @@ def _visit_line(visit: comparison.Visit) -> str:
     return f"{head}: largest size {q.median:.1f} mm ({q.low:.1f} to {q.high:.1f}, {_share(q)} interval)"
 
 
-def _place_line(place: comparison.VisitPlace, *, name: bool = False) -> list[str]:
+def _place_line(place: VisitPlace, *, name: bool = False) -> list[str]:
     if place.distance_mm is None:
         return []
     which = f" of visit {place.visit}" if name else ""
@@ -292,25 +467,25 @@ def _place_line(place: comparison.VisitPlace, *, name: bool = False) -> list[str
     return [f"Place{which}: {place.distance_mm:.0f} mm from visit 1 by the landmarks ({sd})."]
 
 
-def _change_line(change: comparison.ChangeReport) -> str:
+def _change_line(change: ChangeReport) -> str:
     q, pair = change.percent, f"Change of the diameter, visit {change.earlier} to {change.later}"
     median, low, high = (signed(one) for one in (q.median, q.low, q.high))
     return f"{pair}: {median} % ({low} to {high} %, {_share(q)} interval)."
 
 
-def _odds_line(change: comparison.ChangeReport) -> str:
+def _odds_line(change: ChangeReport) -> str:
     more = "".join(
-        f"; that it has grown by more than {one.percent:g} %: {_odds(one.probability)}" for one in change.grown_by
+        f"; that it has grown by more than {one.percent:g} %: {chance_text(one.probability, 3)}"
+        for one in change.grown_by
     )
     return f"Probability that it {_direction(change.probability_grown)}{more}."
 
 
 def _direction(grown: float) -> str:
-    """The likelier direction with its probability, worded alike for both."""
-    return f"has grown: {_odds(grown)}" if grown >= 0.5 else f"has shrunk: {_odds(1.0 - grown)}"
+    return f"has grown: {chance_text(grown, 3)}" if grown >= 0.5 else f"has shrunk: {chance_text(1.0 - grown, 3)}"
 
 
-def _verdict_line(change: comparison.ChangeReport) -> str:
+def _verdict_line(change: ChangeReport) -> str:
     if change.verdict != "no_change_shown":
         return f"The mass has {change.verdict}{f', {_ALIKE_ONLY}' if change.for_alike_exams_only else ''}."
     least = change.smallest_detectable_percent
@@ -318,22 +493,24 @@ def _verdict_line(change: comparison.ChangeReport) -> str:
     return f"No change shown; a growth of less than {growth} or a shrinkage of less than {shrinkage} can stay unseen."
 
 
-def _rate_lines(change: comparison.ChangeReport) -> list[str]:
+def _rate_lines(change: ChangeReport) -> list[str]:
     """Growth rate between two visits."""
     rate = change.growth_rate
     return [] if rate is None else [f"Growth rate over {rate.days:g} days: {_rate_words(rate)}."]
 
 
-def _trend_lines(trend: comparison.TrendReport) -> list[str]:
+def _trend_lines(trend: TrendReport) -> list[str]:
     """Growth rate by the straight line through all visits."""
     lines = [f"Trend over {trend.visits} visits in {trend.days:g} days: {_rate_words(trend)}."]
     chance = trend.straight_line_probability
     if chance is not None and chance < 0.05:
-        lines.append(f"The sizes do not follow one steady growth (probability {_odds(chance)}): see the changes.")
+        lines.append(
+            f"The sizes do not follow one steady growth (probability {chance_text(chance, 3)}): see the changes."
+        )
     return lines
 
 
-def _rate_words(rate: comparison.GrowthRate | comparison.TrendReport) -> str:
+def _rate_words(rate: GrowthRate | TrendReport) -> str:
     q, times = rate.percent_per_day, rate.doubling_days
     words = f"{q.median:+.2f} % of the volume a day ({q.low:+.2f} to {q.high:+.2f} %)"
     if times.shortest is None:
@@ -343,7 +520,7 @@ def _rate_words(rate: comparison.GrowthRate | comparison.TrendReport) -> str:
     return f"{words}, doubling in {times.median:.0f} days ({times.shortest:.0f} to {times.longest:.0f})"
 
 
-def _another_line(change: comparison.ChangeReport) -> list[str]:
+def _another_line(change: ChangeReport) -> list[str]:
     another = change.another_exam
     if another is None:
         return []
@@ -370,12 +547,6 @@ def _model_line(report: CompareReport) -> str:
 def signed(percent: float) -> str:
     """Whole percent with its sign; none has no sign."""
     return f"{round(percent):+d}" if round(percent) else "0"
-
-
-def _odds(probability: float) -> str:
-    if probability > 0.999:
-        return ">0.999"
-    return "<0.001" if probability < 0.001 else f"{probability:.3f}"
 
 
 def _share(q: Quantity) -> str:

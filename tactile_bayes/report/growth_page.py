@@ -10,14 +10,21 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from tactile_bayes.declarations import Record, replace
-from tactile_bayes.files.comparison import CompareReport, Visit
 from tactile_bayes.findings import finding_lines
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.mapping.places import PATIENT_WORDS, Orientation, orientation_of
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.report.compare import change_sentences, compare_summary, rate_sentences, signed, verdict_sentence
+from tactile_bayes.report.compare import (
+    CompareReport,
+    Visit,
+    change_sentences,
+    compare_summary,
+    rate_sentences,
+    signed,
+    verdict_sentence,
+)
 from tactile_bayes.report.figure_file import figure_file, named_exam
 from tactile_bayes.report.map_figure import draw_cells, draw_edges
 from tactile_bayes.report.pages import cut, foot, page

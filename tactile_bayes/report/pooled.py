@@ -9,6 +9,7 @@ from tactile_bayes.files.provenance import Provenance, repeated_scans, scans_of
 from tactile_bayes.files.reports import POOLED, EstimateReport, Interval, PooledMap, PooledReport
 from tactile_bayes.findings import Finding, by_weight, capital, finding_lines, finding_summary, verdict
 from tactile_bayes.inference.draws import Quantity
+from tactile_bayes.posterior.verdict import chance_text
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report import estimate_text
 from tactile_bayes.report.calibration import fat_text, site_words, unknowns_text
@@ -119,15 +120,13 @@ def disagreement(what: str, probability: float, if_exams_differ: float | None = 
     by the paper's.
     """
     patients = (
-        "" if if_exams_differ is None else f" ({_chance(if_exams_differ)} if exams differ as those of patients did)"
+        ""
+        if if_exams_differ is None
+        else f" ({chance_text(if_exams_differ, 3)} if exams differ as those of patients did)"
     )
-    text = f"{what}; one mass gives maps so far apart with a probability of {_chance(probability)}{patients}"
+    text = f"{what}; one mass gives maps so far apart with a probability of {chance_text(probability, 3)}{patients}"
     on_paper = "look at each map: one may be of another mass or of another day"
     return Finding("maps_disagree", text, f"{on_paper}, or exams differ more at this site (--repeatability)", on_paper)
-
-
-def _chance(probability: float) -> str:
-    return "under 0.001" if probability < 0.001 else f"{probability:.1g}"
 
 
 def _number(index: int) -> str:
@@ -194,7 +193,7 @@ def pooled_text(report: PooledReport) -> str:
     lines += supposed_lines(report.supposing, report.max_size_mm.median, places=_places(report))
     lines.append(f"Spread between the maps of this mass: {100 * figures['between_map_sd']:.0f} %.")
     if report.one_size_probability is not None:
-        chance = _chance(report.one_size_probability)
+        chance = chance_text(report.one_size_probability, 3)
         lines.append(f"Probability that maps of one mass are as far apart in size or farther: {chance}.")
     if report.site_words:
         lines.append(estimate_text.site_interval_text(report.site_words))

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 from tactile_bayes.declarations import Meta, Record, says
-from tactile_bayes.posterior.verdict import LIKELY
+from tactile_bayes.posterior.verdict import LIKELY, chance_text
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.estimate_text import SOURCES
 from tactile_bayes.report.figure_file import figure_file
@@ -73,7 +73,7 @@ def _without_number(ladder: Ladder) -> str:
     chances = [one.answer.probability for one in ladder.rows if one.answer.probability is not None]
     span = ""
     if chances:
-        ends = (f"{one:.2g}" if one >= 0.001 else "below 0.001" for one in (min(chances), max(chances)))
+        ends = (chance_text(one, 3) for one in (min(chances), max(chances)))
         span = f" (probability of one {' to '.join(dict.fromkeys(ends))})"
     if not sized:
         return f"Advice: no setting gives a size{span}; more accuracy changes no answer, another scan may."

@@ -17,8 +17,18 @@ from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.documents import load_schema
 from tactile_bayes.files.scan_mcap import read_scan, read_truth
 from tactile_bayes.files.scene_toml import read_scene, scene_from_toml
-from tactile_bayes.forward.instrument import head_positions, level_kpa
-from tactile_bayes.forward.scene import Background, Lump, Noise, Scene, SceneLandmarks, Strokes, Taxels, Tracker
+from tactile_bayes.forward.scene import (
+    Background,
+    Lump,
+    Noise,
+    Scene,
+    SceneLandmarks,
+    Strokes,
+    Taxels,
+    Tracker,
+    head_positions,
+    level_kpa,
+)
 from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.forward.tissue import SolidLump
 from tactile_bayes.geometry import apply, inverse, rotation_from_quaternion

@@ -7,8 +7,7 @@ import pytest
 from numpy.polynomial import legendre
 
 from tactile_bayes.declarations import replace
-from tactile_bayes.forward.instrument import head_positions
-from tactile_bayes.forward.scene import Lump, Noise, Scene, Strokes, Tracker
+from tactile_bayes.forward.scene import Lump, Noise, Scene, Strokes, Tracker, head_positions
 from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import broken_assumptions, skewed

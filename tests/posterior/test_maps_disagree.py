@@ -56,7 +56,7 @@ def test_two_sizes_are_listed_as_estimate_gives_them_and_none_is_pooled(folder: 
     both = ", ".join(f"{q['median']:.1f} ({q['low']:.1f} to {q['high']:.1f})" for q in sizes)
     assert f"alone sized at {both} mm." in done.stdout
     assert done.stdout.startswith("CAUTION: the maps show different sizes, ")
-    assert "with a probability of under 0.001" in done.stdout
+    assert "with a probability of below 0.001" in done.stdout
     assert "largest size" not in done.stdout
     document = pooled(folder, "a.nc", "b.nc")
     assert (document["status"], document["verdict"]) == ("maps_disagree", "no_answer")

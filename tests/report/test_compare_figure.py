@@ -18,10 +18,10 @@ import tactile_bayes as tb
 from tactile_bayes.api.maps import Map
 from tactile_bayes.api.sized import SizeEstimate
 from tactile_bayes.declarations import replace
-from tactile_bayes.files.comparison import Visit
 from tactile_bayes.geometry import rigid
 from tactile_bayes.mapping.map import MapRecipe
 from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.report.compare import Visit
 from tactile_bayes.report.growth_page import Course, DrawnMap, draw_comparison, growth_page
 from tactile_bayes.size.visits import Compared
 

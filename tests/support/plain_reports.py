@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 from tactile_bayes.declarations import names_of
-from tactile_bayes.files.comparison import COMPARE, CompareReport
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.reports import ESTIMATE, POOLED, EstimateReport, PooledReport
 from tactile_bayes.mapping.map import TactileMap
@@ -13,6 +12,7 @@ from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report import estimate_document
+from tactile_bayes.report.compare import COMPARE, CompareReport
 from tactile_bayes.report.estimate_text import estimate_text
 
 _HEAD: dict[str, Any] = {"status": "no_estimate", "verdict": "no_answer", "entries": (), "reason": "", "left_out": ()}

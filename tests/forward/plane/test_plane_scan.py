@@ -15,9 +15,8 @@ from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.scan_mcap import read_truth
 from tactile_bayes.forward import scene as scene_types
 from tactile_bayes.forward.contact import Head
-from tactile_bayes.forward.instrument import frame_times, head_positions, level_kpa
 from tactile_bayes.forward.plane import condense, kappa, press, press_layers
-from tactile_bayes.forward.scene import Background, Lump, Noise, Scene, Strokes
+from tactile_bayes.forward.scene import Background, Lump, Noise, Scene, Strokes, frame_times, head_positions, level_kpa
 from tactile_bayes.forward.simulate import plane_frames, plane_section, simulate
 from tactile_bayes.forward.tissue import Body, Layers, Rib, SceneBody, SolidLump
 

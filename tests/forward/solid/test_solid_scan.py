@@ -16,8 +16,19 @@ from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.scan_mcap import read_scan, read_truth
 from tactile_bayes.files.scene_toml import read_scene, scene_from_toml
-from tactile_bayes.forward.instrument import SimulatedScan, frame_times, head_positions, level_kpa
-from tactile_bayes.forward.scene import Background, Head, Lump, Noise, Scene, Strokes, Tracker
+from tactile_bayes.forward.scene import (
+    Background,
+    Head,
+    Lump,
+    Noise,
+    Scene,
+    SimulatedScan,
+    Strokes,
+    Tracker,
+    frame_times,
+    head_positions,
+    level_kpa,
+)
 from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.forward.solid import (
     PlacedLump,
