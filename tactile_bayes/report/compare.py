@@ -474,10 +474,8 @@ def _change_line(change: ChangeReport) -> str:
 
 
 def _odds_line(change: ChangeReport) -> str:
-    more = "".join(
-        f"; that it has grown by more than {one.percent:g} %: {chance_text(one.probability, 3)}"
-        for one in change.grown_by
-    )
+    odds = [(one.percent, chance_text(one.probability, 3)) for one in change.grown_by]
+    more = "".join(f"; that it has grown by more than {percent:g} %: {chance}" for percent, chance in odds)
     return f"Probability that it {_direction(change.probability_grown)}{more}."
 
 
@@ -502,11 +500,8 @@ def _rate_lines(change: ChangeReport) -> list[str]:
 def _trend_lines(trend: TrendReport) -> list[str]:
     """Growth rate by the straight line through all visits."""
     lines = [f"Trend over {trend.visits} visits in {trend.days:g} days: {_rate_words(trend)}."]
-    chance = trend.straight_line_probability
-    if chance is not None and chance < 0.05:
-        lines.append(
-            f"The sizes do not follow one steady growth (probability {chance_text(chance, 3)}): see the changes."
-        )
+    if (p := trend.straight_line_probability) is not None and p < 0.05:
+        lines.append(f"The sizes do not follow one steady growth (probability {chance_text(p, 3)}): see the changes.")
     return lines
 
 

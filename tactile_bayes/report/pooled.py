@@ -119,11 +119,9 @@ def disagreement(what: str, probability: float, if_exams_differ: float | None = 
     `probability`, `if_exams_differ`: of maps of one mass that are as far apart or farther, by the spread supposed and
     by the paper's.
     """
-    patients = (
-        ""
-        if if_exams_differ is None
-        else f" ({chance_text(if_exams_differ, 3)} if exams differ as those of patients did)"
-    )
+    patients = ""
+    if if_exams_differ is not None:
+        patients = f" ({chance_text(if_exams_differ, 3)} if exams differ as those of patients did)"
     text = f"{what}; one mass gives maps so far apart with a probability of {chance_text(probability, 3)}{patients}"
     on_paper = "look at each map: one may be of another mass or of another day"
     return Finding("maps_disagree", text, f"{on_paper}, or exams differ more at this site (--repeatability)", on_paper)
