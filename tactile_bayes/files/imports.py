@@ -575,9 +575,8 @@ def read_sequence(path: Path, given: Stated, *, frames: bool) -> Source:
         with decoding("is no metafile", way_out=_COPY_AGAIN):
             keys = dict(_LINE.findall(data[: last.end()].decode("utf-8")))
         found = _sequence_poses(keys, given)
-        return (
-            replace(found, arrays={**found.arrays, **_sequence_frames(keys, data[last.end() :])}) if frames else found
-        )
+        images = _sequence_frames(keys, data[last.end() :]) if frames else {}
+        return replace(found, arrays={**found.arrays, **images})
 
 
 def _of_each(keys: dict[str, str], name: str, number: int) -> list[str]:
