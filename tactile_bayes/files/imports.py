@@ -5,8 +5,6 @@ Arrays in mm, kPa and s, read without pickle; `arrays_layout.LAYOUT` says what e
 
 from __future__ import annotations
 
-import re
-import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -21,9 +19,10 @@ from tactile_bayes.files.arrays_layout import KNOWN, LAYOUT, OPTIONAL, ArrayMap,
 from tactile_bayes.files.instrument_json import read_array_calibration, read_head_geometry, read_landmarks
 from tactile_bayes.files.named_arrays import Source, is_text, plain_names, read_named
 from tactile_bayes.files.npz import Arrays
-from tactile_bayes.files.reading import NETCDF_BYTES, check_limit, decoding, kind_of, read_bytes, unpacked_limit
+from tactile_bayes.files.reading import kind_of
 from tactile_bayes.files.scan_mcap import read_scan
-from tactile_bayes.files.scan_text import IDENTITY, chosen, read_frames, read_poses, seen
+from tactile_bayes.files.scan_text import IDENTITY, read_frames, read_poses, seen
+from tactile_bayes.files.sequence_mha import is_sequence, read_sequence
 from tactile_bayes.geometry import FloatArray, check_rigid
 from tactile_bayes.mapping.select import other_units
 from tactile_bayes.presets import KPA_PER_UNIT, PRESSURE_RANGE_KPA, PRESSURE_WINDOW_KPA
@@ -536,93 +535,3 @@ def _scan(arrays: Arrays, facts: Mapping[str, str]) -> Scan:
         else Landmarks(landmarks[0], landmarks[1], nipple_mm=values.get("nipple_mm")),
         session={"source": "imported", **facts},
     )
-
-
-# Sequence metafiles (``.mha``, ``.igs.mha``): frames as an image of three axes, with a transform and a time for each.
-#
-# PLUS writes them: a header of ``Key = value`` lines, among them ``Seq_Frame0000_ProbeToTrackerTransform`` with the 16
-# numbers of a matrix in mm, its ``...TransformStatus`` (OK or INVALID) and ``Seq_Frame0000_Timestamp`` in s, then after
-# ``ElementDataFile = LOCAL`` the numbers, packed by zlib where ``CompressedData`` is True.
-
-_LAST_KEY: Final = re.compile(rb"^ElementDataFile *= *(.*?)\r?\n", re.MULTILINE)
-_LINE: Final = re.compile(r"^\s*(\w+)\s*=\s*(.*?)\s*$", re.MULTILINE)
-_OF_FRAME: Final = re.compile(r"Seq_Frame(\d+)_(\w+)")
-_TYPES: Final = {
-    "MET_UCHAR": "u1",
-    "MET_CHAR": "i1",
-    "MET_USHORT": "u2",
-    "MET_SHORT": "i2",
-    "MET_UINT": "u4",
-    "MET_INT": "i4",
-    "MET_FLOAT": "f4",
-    "MET_DOUBLE": "f8",
-}
-_COPY_AGAIN: Final = "copy the file again"
-
-
-def is_sequence(path: Path) -> bool:
-    """True for the name of a metafile with its data in it."""
-    return path.suffix.lower() == ".mha"
-
-
-def read_sequence(path: Path, given: Stated, *, frames: bool) -> Source:
-    """Read the poses, and with `frames` the images and their times; see `files.scan_text.read_poses`."""
-    data = read_bytes(path, most=NETCDF_BYTES)
-    with in_file(path):
-        last = _LAST_KEY.search(data)
-        if last is None or last[1] != b"LOCAL":
-            raise BadDataError("has no numbers behind a line ElementDataFile = LOCAL", way_out="save it as one .mha")
-        with decoding("is no metafile", way_out=_COPY_AGAIN):
-            keys = dict(_LINE.findall(data[: last.end()].decode("utf-8")))
-        found = _sequence_poses(keys, given)
-        images = _sequence_frames(keys, data[last.end() :]) if frames else {}
-        return replace(found, arrays={**found.arrays, **images})
-
-
-def _of_each(keys: dict[str, str], name: str, number: int) -> list[str]:
-    """A value of every frame, empty where it has none."""
-    return [keys.get(f"Seq_Frame{i:04d}_{name}", "") for i in range(number)]
-
-
-def _numbers_of(texts: list[str], width: int) -> FloatArray:
-    """(n, width) numbers, NaN where a frame has none."""
-    rows = [text.split() for text in texts]
-    with decoding("holds a transform or a time that is no number", way_out=_COPY_AGAIN):
-        return np.array([[float(one) for one in row] if len(row) == width else [np.nan] * width for row in rows])
-
-
-def _sequence_poses(keys: dict[str, str], given: Stated) -> Source:
-    held = [one for key in keys if (one := _OF_FRAME.fullmatch(key))]
-    number = len({one[1] for one in held})
-    tools = dict.fromkeys(one[2] for one in held if one[2].endswith("Transform"))
-    if not tools:
-        raise BadDataError("has no transforms of frames", way_out="give poses that were recorded with the frames")
-    tool = chosen([name.removesuffix("Transform") for name in tools], given, what="its transforms")
-    status = _of_each(keys, f"{tool}TransformStatus", number)
-    why = ["" if one in ("OK", "") else f"with status {one}" for one in status]
-    time = _numbers_of(_of_each(keys, "Timestamp", number), 1)[:, 0]
-    if not np.isfinite(time).all():
-        raise BadDataError("has frames without a time", way_out="give the times, Seq_Frame0000_Timestamp")
-    matrices = _numbers_of(_of_each(keys, f"{tool}Transform", number), 16)
-    found = seen(time, matrices, why, layout="matrix", stated={"pose_time_unit": "s"})
-    return replace(found, notes=(f"poses by {tool}Transform", *found.notes))
-
-
-def _sequence_frames(keys: dict[str, str], data: bytes) -> Arrays:
-    """(n, rows, columns) numbers and their times; the first axis of a metafile runs along a row."""
-    with decoding("is no metafile", way_out=_COPY_AGAIN):
-        shape = tuple(int(one) for one in reversed(keys["DimSize"].split()))
-        kind = np.dtype(_TYPES[keys["ElementType"]])
-    if keys.get("BinaryDataByteOrderMSB", keys.get("ElementByteOrderMSB", "False")) == "True":
-        kind = kind.newbyteorder(">")
-    shape = shape[:1] + tuple(one for one in shape[1:] if one > 1) if len(shape) > 3 else shape  # slices of one image
-    size = int(np.prod(shape, dtype=object)) * kind.itemsize
-    check_limit(size, unpacked_limit(len(data)), what="its frames unpack to {} bytes")
-    if keys.get("CompressedData", "False") == "True":
-        with decoding("is not whole", way_out=_COPY_AGAIN):
-            data = zlib.decompressobj().decompress(data, size + 1)
-    if len(shape) != 3 or len(data) != size or min(shape) < 1:
-        what = f"has DimSize {keys['DimSize']} of {kind} and {len(data)} bytes"
-        raise BadDataError(what, way_out="give columns, rows and frames, unpacked or packed by zlib")
-    time = _numbers_of(_of_each(keys, "Timestamp", shape[0]), 1)[:, 0]
-    return {"frames": np.frombuffer(data, dtype=kind).reshape(shape), "frame_time_s": time}

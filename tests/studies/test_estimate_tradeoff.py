@@ -266,8 +266,8 @@ def test_settings_that_disagree_are_not_believed():
     some = replace(made("some", 1.0, math.nan), answers=(replace(row("--method laplace").answer, probability=0.96),))
     said = advice(Ladder((none, some), Reference("none: no lump", None, 1.0), 0.2))
     assert said == [
-        "Advice: the default gives no size, 1 of 2 settings do (some) (probability of one 0.900 to 0.960): the map is at "
-        "the limit of what can be sized. Believe none of them; scan the place again."
+        "Advice: the default gives no size, 1 of 2 settings do (some) (probability of one 0.900 to 0.960): the map is "
+        "at the limit of what can be sized. Believe none of them; scan the place again."
     ]
 
 
