@@ -30,7 +30,9 @@ def report_action(
     given, page = Given(title, name, day), PageFiles(output, pdf, force)
     page.check()
     typed = [name for name in asked if name in typed_options()]
-    found = exam_of_files(files, settings_of(**asked), typed=typed, notice=lambda line: click.echo(line, err=True))
+    found = exam_of_files(
+        files, lambda: settings_of(**asked), typed=typed, notice=lambda line: click.echo(line, err=True)
+    )
     exam = given.on(found)
     page.write(exam_page(exam))
     if exam.main.tactile_map is None:

@@ -40,13 +40,13 @@ Scans = Sequence[Mapping[str, str]]
 
 
 def exam_of_files(
-    paths: Sequence[Path], settings: Settings, *, typed: Collection[str], notice: Notice | None = None
+    paths: Sequence[Path], given: Callable[[], Settings], *, typed: Collection[str], notice: Notice | None = None
 ) -> Exam:
     """Read maps, or an estimate and its map, in any order, and put a page's exam together.
 
     `paths`: maps of one mass; or an estimate, best with its map: what ``estimate`` printed with ``--json`` or wrote
-    with ``-o``; `typed`: the settings that somebody gave; `notice`: called with a line that a user may want to read
-    while waiting.
+    with ``-o``; `given`: makes the settings, of which an estimate takes none; `typed`: those that somebody gave;
+    `notice`: called with a line that a user may want to read while waiting.
     """
     if twice := given_twice(paths):
         raise UsageError(f"{twice} is given twice; give each file once")
@@ -63,6 +63,7 @@ def exam_of_files(
             option = "--settings" if name == "settings_file" else f"--{name.replace('_', '-')}"
             raise UsageError(f"an estimate has settings of its own; leave out {option}, or give the map alone")
         return _from_estimate(estimates[0], maps[0] if maps else None)
+    settings = given()
     if len(maps) > 1:
         refuse_checkpoint(settings)
     found = []
@@ -155,7 +156,7 @@ def exam_report(
 def _exam(given: Sequence[Any], settings: dict[str, Any]) -> Exam:
     """The exam of files alone, or of what Python holds."""
     if all(isinstance(one, str | Path) for one in given):
-        return exam_of_files([path_of(one) for one in given], settings_of(settings), typed=settings)
+        return exam_of_files([path_of(one) for one in given], lambda: settings_of(settings), typed=settings)
     if len(given) == 1 and isinstance(given[0], PooledSize):
         exam: Exam = given[0].exam()
         return exam
