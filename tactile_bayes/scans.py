@@ -218,9 +218,13 @@ class ElementCalibration(Record, eq=False):
             )
         settle(self, gain_kpa_per_count=gain, offset_kpa=offset)
 
+    def linear_kpa(self, counts: CountArray | FloatArray) -> FloatArray:
+        """Gain x (..., rows, columns) counts + offset, of saturated readings too."""
+        return np.asarray(self.gain_kpa_per_count * counts + self.offset_kpa)
+
     def to_kpa(self, counts: CountArray) -> FloatArray:
         """Pressure in kPa of (n, rows, columns) counts; NaN where a reading is saturated (count or 34 kPa)."""
-        pressure = counts * self.gain_kpa_per_count + self.offset_kpa
+        pressure = self.linear_kpa(counts)
         pressure[(counts >= self.saturation_count) | (pressure >= PRESSURE_RANGE_KPA[1])] = np.nan
         return pressure
 

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import click
 
@@ -28,6 +28,10 @@ from tactile_bayes.presets import RESEARCH_USE
 # --- `check`: is a scan arranged as it is stated?
 
 
+_OF_RECORDING: Final = ("data_lost", "recorder_noted", "times_apart")
+"""Findings of a phantom's scan that say nothing against its head."""
+
+
 def check_action(
     *, scans: tuple[Path, ...], pressure_window_kpa: tuple[float, float], output: Path | None, force: bool
 ) -> None:
@@ -45,7 +49,8 @@ def check_action(
             click.echo(f"  {line}")
         wrong += check.refused
         if output is not None:
-            if check.too_short or check.findings or check.doubts:
+            doubted = any(one.kind not in _OF_RECORDING for one in check.doubts)
+            if check.too_short or check.findings or doubted:
                 raise BadDataError(
                     "the scan does not show that its head is right", way_out="scan a phantom with a lump"
                 )

@@ -21,7 +21,7 @@ import numpy as np
 from tactile_bayes.declarations import Record, field, replace
 from tactile_bayes.findings import Finding, finding_lines
 from tactile_bayes.geometry import FloatArray, IndexArray, apply, inverse
-from tactile_bayes.mapping.cells import poses_at
+from tactile_bayes.mapping.cells import between
 from tactile_bayes.mapping.convention import (
     CONVENTIONS,
     CoarseFrames,
@@ -31,9 +31,9 @@ from tactile_bayes.mapping.convention import (
     import_again,
     thinning,
 )
-from tactile_bayes.mapping.latency import Cells
+from tactile_bayes.mapping.latency import COMPARED, Cells, map_fit
 from tactile_bayes.mapping.plausibility import SURE_ODDS, scan_doubts
-from tactile_bayes.mapping.select import SelectedFrames, TaxelFault, select_frames
+from tactile_bayes.mapping.select import SelectedFrames, TaxelFault, scan_findings, select_frames
 from tactile_bayes.presets import CORRECTIONS, PRESSURE_WINDOW_KPA
 from tactile_bayes.scans import ElementCalibration, HeadGeometry, PressureFrames, Scan, TrackerPoses
 
@@ -68,6 +68,8 @@ LEAST_LASTING: Final = 0.15
 MOST_FRAMES: Final = 250
 _LEAST_BLOCKS: Final = 8
 _CLOCK_STEPS_MS: Final = (-40, -30, -20, -10, 10, 20, 30, 40)
+_OWN_LATENCY_MS: Final = (-20, -10, 10, 20)
+"""Latencies that trackers have of their own, which poses that are late or early have to be likelier than."""
 LEAST_SWAY_MM, LEAST_SWAY_GAIN = 4.0, 0.15
 """Of a body that moved: right scans gain 0.09 by at most 2.5 mm, 10 mm of breathing gain 0.2 to 0.7."""
 _SWAYS_HZ: Final = (0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5)
@@ -76,7 +78,6 @@ _LEAST_SWAY_START: Final = 0.03
 """Of the squared errors, what the first step must take off for more: at most 0.03 in 8 of 11 right scans, 0.031 to 0.28
 in the 20 that breathe and are told."""
 _SWAY_NUMBERS: Final = 5  # that are fitted: a rate, and cosine and sine along two axes
-_FIT_STEPS: Final = 30
 _LEAST_OTHERS: Final = 2
 """Readings of other times that predict one."""
 NOTHING_SHOWN: Final = "too little stands out to show that array, lever arm and quaternions are as stated"
@@ -202,7 +203,7 @@ class ArrangementCheck(Record, eq=False):
     """True where frames contradict each other whatever is corrected."""
     asked_ms: float = 0.0  #: Latency that the poses were stated to have.
     doubts: tuple[Finding, ...] = ()
-    """What in the scan is unlike an exam, where it was looked for; see `plausibility.scan_doubts`."""
+    """What was noted of the scan, and what in it is unlike an exam, where it was looked for."""
 
     @property
     def refused(self) -> bool:
@@ -312,7 +313,7 @@ def check_arrangement(selection: SelectedFrames, *, latency_ms: float = 0.0, tho
     first, *others = _arrangements(selection.scan)
     single = [one for one in others if len(one) == 1]
     stated = overlap.judged(first)
-    if _lasting(_varying(overlap.coarse[0])) < LEAST_LASTING:
+    if _lasting(overlap.varying[0]) < LEAST_LASTING:
         return ArrangementCheck(stated, stated, 0.0, {one[0]: 0.0 for one in single})
     tried = [stated, *map(overlap.judged, single), *(overlap.late(sign * ms) for ms in CLOCK_MS for sign in (1, -1))]
     check = _compared(overlap, tried)
@@ -326,15 +327,18 @@ def _compared(overlap: _Overlap, tried: Sequence[Arrangement]) -> ArrangementChe
     stated, stretches = tried[0], int(overlap.block.max()) + 1
     likely = [one for one in tried if one is stated or one.plausible]
     best = max(likely, key=lambda one: stretches * one.gain_over(stated) - log(LIKELY_ODDS) * one.changes)
+    against = stated
     if best.late_ms:
         near = [overlap.late(best.late_ms + step) for step in _CLOCK_STEPS_MS]
         best = max([best, *near], key=lambda one: one.gain_over(stated))
+        own = [overlap.late(ms) for ms in _OWN_LATENCY_MS]
+        against = max([stated, *own], key=lambda one: one.gain_over(stated))
     excluded = {
         one.corrections[0]: stretches * stated.gain_over(one) - log(len(tried))
         for one in tried
         if len(one.corrections) == 1
     }
-    log_odds = stretches * best.gain_over(stated) - log(len(tried))
+    log_odds = stretches * best.gain_over(against) - log(len(tried))
     if best is stated or log_odds < log(LIKELY_ODDS):
         return ArrangementCheck(stated, stated, 0.0, excluded, stated.contradicting)
     return ArrangementCheck(stated, best, log_odds, excluded, asked_ms=overlap.latency_ms)
@@ -362,7 +366,7 @@ def check_scan(
     A scan without a frame that can be used is a `BadDataError`.
     """
     selection = select_frames(scan, pressure_window_kpa=pressure_window_kpa)
-    doubts = scan_doubts(selection, pressure_window_kpa=pressure_window_kpa)
+    doubts = (*scan_findings(scan), *scan_doubts(selection, pressure_window_kpa=pressure_window_kpa))
     return replace(check_arrangement(selection, thorough=thorough), doubts=doubts)
 
 
@@ -377,48 +381,10 @@ _NOT_JUDGED: Final = Arrangement((), spread=0.0, explained=0.0, lasting=0.0, agr
 _TOO_SHORT: Final = ArrangementCheck(_NOT_JUDGED, _NOT_JUDGED, 0.0, {})
 
 
-def _varying(coarse: CoarseFrames) -> FloatArray:
-    """(m, k) averaged readings without a level, slopes and curvatures of each frame and an offset of each block of
-    taxels: what they say of the breast, and noise.
-    """
-    rest = coarse.pressure - (coarse.pressure @ coarse.basis) @ coarse.basis.T
-    return np.asarray(rest - rest.mean(axis=0))
-
-
 def _lasting(values: FloatArray) -> float:
     """Correlation of (m, k) values from one averaged frame to the next."""
     square = float(np.sum(values**2))
     return float(np.sum(values[1:] * values[:-1])) / square if square else 0.0
-
-
-def _levelled(varying: FloatArray, basis: FloatArray, cell: IndexArray) -> FloatArray:
-    """(m k,) readings without what frames and taxels add to one common map, which stays in.
-
-    The least-squares fit of all three by conjugate gradients (Hestenes & Stiefel 1952): by turns it would take
-    hundreds of rounds, and what is left of it looks as if frames contradicted each other.
-    """
-    scale = 1 / np.sqrt(np.maximum(np.bincount(cell), 1))
-    of_taxel = 1 / np.sqrt(len(varying))
-
-    def shares(rest: FloatArray) -> list[FloatArray]:
-        sums = np.bincount(cell, rest.reshape(-1), len(scale))
-        return [rest @ basis, of_taxel * rest.sum(axis=0), scale * sums]
-
-    rest, added = varying.copy(), np.zeros_like(varying)
-    left = step = shares(rest)
-    square = sum(float(np.sum(one**2)) for one in left)
-    for _ in range(_FIT_STEPS):
-        head = step[0] @ basis.T + of_taxel * step[1]
-        change = head + (scale * step[2])[cell].reshape(rest.shape)
-        length = float(np.sum(change**2))
-        if not length:
-            break
-        rest -= square / length * change
-        added += square / length * head
-        left, before = shares(rest), square
-        square = sum(float(np.sum(one**2)) for one in left)
-        step = [one + square / before * last for one, last in zip(left, step, strict=True)]
-    return np.asarray((varying - added).reshape(-1))
 
 
 def _sway(wave: FloatArray, cells: Cells, values: FloatArray, error: FloatArray) -> tuple[float, FloatArray]:
@@ -432,10 +398,12 @@ def _sway(wave: FloatArray, cells: Cells, values: FloatArray, error: FloatArray)
 class _Overlap(Record, eq=False):
     """Averaged frames of a scan, as they are and with the array transposed, and what is needed to place them."""
 
-    scan: Scan
+    scan: Scan  #: With distinct poses.
     frames: IndexArray
     latency_ms: float
     coarse: tuple[CoarseFrames, CoarseFrames]
+    varying: tuple[FloatArray, FloatArray]
+    """(m, k) averaged readings without what frames and taxels add: what they say of the breast, and noise."""
     taxels: tuple[IndexArray, IndexArray]
     """Flat indices of the good ones, for each of `coarse`."""
     block: IndexArray
@@ -445,7 +413,7 @@ class _Overlap(Record, eq=False):
 
     @classmethod
     def of(cls, stated: SelectedFrames, latency_ms: float) -> _Overlap | None:
-        scan, used = stated.scan, np.flatnonzero(stated.used)
+        scan, used = replace(stated.scan, poses=stated.fresh), np.flatnonzero(stated.used)
         if not len(used):
             return None
         time_s = scan.frames.time_s[used]
@@ -458,7 +426,8 @@ class _Overlap(Record, eq=False):
         if int(block.max()) + 1 < _LEAST_BLOCKS:
             return None
         taxels = (np.flatnonzero(stated.good_taxels), np.flatnonzero(other.good_taxels))
-        return cls(scan, frames, latency_ms, coarse, taxels, block)
+        varying = (coarse[0].without_head(coarse[0].pressure), coarse[1].without_head(coarse[1].pressure))
+        return cls(scan, frames, latency_ms, coarse, varying, taxels, block)
 
     def late(self, late_ms: float) -> Arrangement:
         """What is stated, with poses that are later by so much."""
@@ -481,10 +450,10 @@ class _Overlap(Record, eq=False):
             return None
         moved = []
         for rate in sorted(gains, key=gains.__getitem__)[-_SWAYS_TRIED:]:
-            sway, (cells, values, error) = np.zeros((2, 2)), still
+            sway, (cells, levelled, error) = np.zeros((2, 2)), still
             for _ in range(_SWAY_STEPS):
-                sway += _sway(waves[rate], cells, values, error)[1]
-                made, cells, values, error = self._fitted((), (waves[rate] @ sway)[:, None])
+                sway += _sway(waves[rate], cells, levelled, error)[1]
+                made, cells, levelled, error = self._fitted((), (waves[rate] @ sway)[:, None])
             moved.append(replace(made, sway_mm=2 * float(np.linalg.norm(sway, 2)), sways_a_minute=60 * rate))
         return min(moved, key=lambda one: one.spread)
 
@@ -492,19 +461,21 @@ class _Overlap(Record, eq=False):
         self, corrections: Corrections, moves_mm: FloatArray | float = 0.0
     ) -> tuple[Arrangement, Cells, FloatArray, FloatArray]:
         """The arrangement judged with places moved by (m, 1, 2), the cells, levelled readings, and their errors."""
-        coarse = self.coarse["transposed" in corrections]
+        transposed = "transposed" in corrections
+        coarse, varying = self.coarse[transposed], self.varying[transposed]
         places, agreement = self._places_mm(corrections)
         cells = Cells.of([places + moves_mm])
         cell = cells.number
-        varying = _varying(coarse)
-        values = _levelled(varying, coarse.basis, cell)
+        rest, levelled = map_fit([coarse], varying.reshape(-1), cells, tolerance=COMPARED)
         block = np.repeat(self.block, varying.shape[1])
         size = int(cell.max()) + 1
         together = block * size + cell  # readings of one block in one cell
-        total, count = np.bincount(cell, values), np.bincount(cell)
+        total, count = np.bincount(cell, rest), np.bincount(cell)
         others = count[cell] - np.bincount(together)[together]
-        predicted = total[cell] - np.bincount(together, values)[together]
-        error = values - np.divide(predicted, others, out=np.zeros_like(predicted), where=others >= _LEAST_OTHERS)
+        predicted = total[cell] - np.bincount(together, rest)[together]
+        error = varying.reshape(-1).copy()  # of what no others predict
+        known = others >= _LEAST_OTHERS
+        error[known] = rest[known] - predicted[known] / others[known]
         total_square, variance = float(error @ error), float(np.sum(varying**2))
         made = Arrangement(
             corrections,
@@ -513,7 +484,7 @@ class _Overlap(Record, eq=False):
             lasting=_lasting(error.reshape(varying.shape)),
             agreement=agreement,
         )
-        return made, cells, values, error
+        return made, cells, levelled, error
 
     def _places_mm(self, corrections: Corrections) -> tuple[FloatArray, float]:
         """(m, k, 2) places of the averaged readings on the plane in which they lie, and how the face agrees with it."""
@@ -526,7 +497,8 @@ class _Overlap(Record, eq=False):
         on_tracker = apply(tracker_from_head, surface.reshape(-1, 3)[self.taxels[transposed]])
         rotation, centre = self._path(tuple(name for name in corrections if name in _ROTATIONS[-1]))
         place = centre[:, None] + (rotation @ (coarse.weight.T @ on_tracker).T).transpose(0, 2, 1)
-        axes = np.linalg.eigh(np.cov(place.reshape(-1, 3).T))[1]
+        around = (place - place.mean(axis=(0, 1))).reshape(-1, 3)
+        axes = np.linalg.eigh(around.T @ around)[1]
         agreement = abs(float(axes[:, 0] @ (rotation @ tracker_from_head[:3, 2]).mean(axis=0)))
         return np.asarray(place @ axes[:, [2, 1]]), agreement
 
@@ -534,7 +506,7 @@ class _Overlap(Record, eq=False):
         """(m, 3, 3) mean rotations and (m, 3) mean places of the tracker at the averaged frames."""
         if rotations not in self.paths:
             scan, first = corrected(self.scan, rotations), self.coarse[0].first
-            poses = poses_at(scan.poses, scan.frames.time_s[self.frames], latency_ms=self.latency_ms)
+            poses = between(scan.poses, scan.frames.time_s[self.frames], latency_ms=self.latency_ms)
             means = block_means(poses.rotation.reshape(-1, 9), first).reshape(-1, 3, 3)
             self.paths[rotations] = means, block_means(poses.position_mm, first)
         return self.paths[rotations]

@@ -29,6 +29,9 @@ from tactile_bayes.scans import CountArray, ElementCalibration, HeadGeometry, Tr
 # --- Poses of the head at the frames' times, interpolated from the tracker's.
 
 MAX_POSE_GAP_MS = 50.0
+# A place, or a rotation, that repeats itself and then leaps by so much (mm; difference of quaternions, 2 degrees) was
+# an old one. One that never leaps may be a head that rests, or a rig that does not turn.
+_LEAP_MM, _LEAP_TURN = 2.0, 0.0175
 
 
 class FramePoses(Record, eq=False):
@@ -53,13 +56,35 @@ def distinct_poses(poses: TrackerPoses) -> TrackerPoses:
     """Poses without repeats, with quaternion signs unrolled and times strictly rising.
 
     Trackers repeat their last sample when asked faster than they measure. A repeat is an old pose with a new time
-    stamp: it would drag the head behind, so only the first of a run stays.
+    stamp: it would drag the head behind, so only the first of a run stays. So does one of which the place alone, or the
+    rotation alone, stood still.
     """
     quaternion = unroll_quaternion_signs(poses.quaternion_wxyz)
     new = np.ones(len(poses), dtype=bool)
     new[1:] = (np.diff(poses.position_mm, axis=0) != 0).any(axis=1) | (np.diff(quaternion, axis=0) != 0).any(axis=1)
     new[1:] &= np.diff(poses.time_s) > 0
-    return TrackerPoses(poses.time_s[new], poses.position_mm[new], quaternion[new])
+    time_s, place_mm, quaternion = poses.time_s[new], poses.position_mm[new], quaternion[new]
+    old = _stood_still(time_s, place_mm, leap=_LEAP_MM, at_end=True)
+    old |= _stood_still(time_s, quaternion, leap=_LEAP_TURN, at_end=False)
+    return TrackerPoses(time_s[~old], place_mm[~old], quaternion[~old])
+
+
+def leaps(poses: TrackerPoses) -> BoolArray:
+    """(n - 1,) True where the next pose lies far from one."""
+    far = np.linalg.norm(np.diff(poses.position_mm, axis=0), axis=1) >= _LEAP_MM
+    return np.asarray(far | (np.linalg.norm(np.diff(poses.quaternion_wxyz, axis=0), axis=1) >= _LEAP_TURN))
+
+
+def _stood_still(time_s: FloatArray, values: FloatArray, *, leap: float, at_end: bool) -> BoolArray:
+    """(n,) True where (n, k) values repeat the one before, in a run that ends in a leap; `at_end`: in a gap or none."""
+    old, step, gap_s = np.zeros(len(values), dtype=bool), np.diff(values, axis=0), MAX_POSE_GAP_MS / 1000.0
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], (step == 0).all(axis=1), [0]])))
+    for first, last in edges.reshape(-1, 2).tolist():
+        if last + 1 < len(values) and time_s[last + 1] - time_s[last] <= gap_s:
+            old[first + 1 : last + 1] = np.linalg.norm(step[last]) >= leap
+        else:
+            old[first + 1 : last + 1] = at_end and time_s[last] - time_s[first] > gap_s
+    return old
 
 
 def poses_at(
@@ -72,7 +97,13 @@ def poses_at(
     interpolated linearly, rotations by normalised linear interpolation of neighbouring quaternions, which departs from
     the great arc by less than (angle between poses)^3 / 60: nothing at tracker rates.
     """
-    fresh = distinct_poses(poses)
+    return between(distinct_poses(poses), time_s, latency_ms=latency_ms, max_gap_ms=max_gap_ms)
+
+
+def between(
+    fresh: TrackerPoses, time_s: FloatArray, *, latency_ms: float = 0.0, max_gap_ms: float = MAX_POSE_GAP_MS
+) -> FramePoses:
+    """`poses_at` of poses that are distinct already."""
     moments_s = fresh.time_s - latency_ms / 1000.0
     if len(fresh) == 0:
         nothing = np.zeros((len(time_s), 3))

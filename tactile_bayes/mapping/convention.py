@@ -12,7 +12,7 @@ from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.findings import Finding
 from tactile_bayes.geometry import BoolArray, FloatArray, IndexArray, inverse, rotation_from_quaternion
-from tactile_bayes.mapping.cells import MAX_POSE_GAP_MS, Projection, distinct_poses
+from tactile_bayes.mapping.cells import MAX_POSE_GAP_MS, Projection
 from tactile_bayes.mapping.select import SelectedFrames, chunks
 from tactile_bayes.scans import TrackerPoses
 
@@ -86,6 +86,17 @@ class CoarseFrames(Record, eq=False):
     def blocks(self, time_s: FloatArray) -> IndexArray:
         """(m,) which stretch of `SHARED_S` each averaged frame lies in, from the times of the scan's frames."""
         return np.unique(np.floor(time_s[self.frames[self.first]] / SHARED_S), return_inverse=True)[1]
+
+    def without_head(self, values: FloatArray) -> FloatArray:
+        """(m, k) values without a level, slopes and curvatures of each frame and an offset of each block of taxels.
+
+        Both are projections and commute: together they take off the least-squares fit of the two.
+        """
+        return self.within_frames(values - values.mean(axis=0))
+
+    def within_frames(self, values: FloatArray) -> FloatArray:
+        """(m, k) values without their level, slopes and curvatures in each frame."""
+        return np.asarray(values - (values @ self.basis) @ self.basis.T)
 
     def places_mm(self, projection: Projection) -> FloatArray:
         """(m, k, 2) mean places of the blocks on the plane, from the projection of `frames`."""
@@ -265,7 +276,7 @@ def _way_out(agreement: dict[str, float]) -> str:
 
 def _near_used(part: SelectedFrames) -> TrackerPoses:
     """Distinct poses about the used frames; poses before the head reached the skin say nothing."""
-    poses = distinct_poses(part.scan.poses)
+    poses = part.fresh
     used = part.scan.frames.time_s[part.used]
     near = np.zeros(len(poses), dtype=bool)
     if len(used):

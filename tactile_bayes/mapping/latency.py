@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -10,7 +10,7 @@ import numpy as np
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import BoolArray, FloatArray, IndexArray, Plane
-from tactile_bayes.mapping.cells import FramePoses, Projector, poses_at
+from tactile_bayes.mapping.cells import FramePoses, Projector, between
 from tactile_bayes.mapping.convention import CoarseFrames, numbered_on, stroke_starts
 from tactile_bayes.mapping.map import smooth
 from tactile_bayes.mapping.profile import pose_noise_figures
@@ -32,31 +32,32 @@ from tactile_bayes.presets import POSE_NOISE
 
 # Cells of the map, mm: as the averaged frames and taxels are. Slopes within a cell are followed.
 CELL_MM = (2.0, 3.0)
-_LEVELLING_ROUNDS, _GRADIENT_ROUNDS = 12, 2
-_PROJECTION_ROUNDS, _PROJECTION_TOLERANCE = 40, 1e-4
+_FIT_STEPS = 200
+# Of the pull on the groups' values, what may be left: shifts are finer than errors that are only compared.
+_FIT_TOLERANCE, COMPARED = 2e-3, 1e-2
 
 
 class ShiftFit(Record, eq=False):
     """Readings of one or several scans at supposed places, ready for a regression on shifts."""
 
+    parts: tuple[CoarseFrames, ...]  #: The scans.
     cells: Cells  #: Where the readings lie.
+    row_cell: IndexArray  #: (n,) int array: Cell of the map of the head's rows that each reading is of.
     levelled: FloatArray  #: (n,) array: Readings without what frames and taxels add to one common map.
     gradient: FloatArray  #: (n, 2) array: Of the map at each reading, 1/mm along x and y.
     data: FloatArray  #: (n,) array: Readings with the nuisances taken off.
-    nuisance: Nuisance  #: The nuisances that were taken off.
 
     @classmethod
     def of(cls, parts: Sequence[CoarseFrames], places_mm: Sequence[FloatArray]) -> ShiftFit:
         """Find the map's gradient and take the nuisances off the readings."""
         cells = Cells.of(places_mm)
-        nuisance = Nuisance.of(parts, cells.number)
         pressure = np.concatenate([part.pressure.reshape(-1) for part in parts])
-        gradient = np.zeros((len(pressure), 2))
-        for _ in range(_GRADIENT_ROUNDS):
-            levelled = nuisance.levelled(pressure - np.einsum("ni,ni->n", gradient, cells.offset_mm), cells)
-            gradient = cells.gradient(levelled)
-        data = nuisance.without(pressure - np.einsum("ni,ni->n", gradient, cells.offset_mm))
-        return cls(cells, levelled, gradient, data, nuisance)
+        levelled = map_fit(parts, pressure, cells)[1]
+        gradient = cells.gradient(levelled)
+        row = np.concatenate([np.tile(part.row, len(part.pressure)) for part in parts])
+        row_cell = np.unique(row * (cells.number.max() + 1) + cells.number, return_inverse=True)[1]
+        data = _fitted(parts, pressure - cells.within(gradient), row_cell)[0]
+        return cls(tuple(parts), cells, row_cell, levelled, gradient, data)
 
     def of_some(self, keep: BoolArray) -> ShiftFit:
         """The same with the gradient of the map that some of the readings make."""
@@ -64,15 +65,16 @@ class ShiftFit(Record, eq=False):
 
     def frame_numbers(self) -> IndexArray:
         """(n,) averaged frame of each reading, counted through all scans."""
-        return self.nuisance.frame
+        readings = np.concatenate([np.full(*part.pressure.shape) for part in self.parts])
+        return np.repeat(np.arange(len(readings)), readings)
 
     def design(self, moves: Sequence[FloatArray]) -> FloatArray:
         """(n,) change of the readings when their places move by (m, k, 2), without the nuisances."""
-        return self.nuisance.without(self._changes(moves))
+        return _fitted(self.parts, self._changes(moves), self.row_cell)[0]
 
     def raw_design(self, moves: Sequence[FloatArray]) -> FloatArray:
         """(n,) the same with the map and the taxels' offsets left in."""
-        return self.nuisance.within_frames(self._changes(moves))
+        return _by_part(self.parts, CoarseFrames.within_frames, self._changes(moves))
 
     def _changes(self, moves: Sequence[FloatArray]) -> FloatArray:
         moved = np.concatenate([one.reshape(-1, 2) for one in moves])
@@ -95,11 +97,9 @@ class Cells(Record, eq=False):
         columns, rows = (whole.max(axis=0) + 1).tolist()
         return cls(whole[:, 1] * columns + whole[:, 0], offset, (rows, columns))
 
-    def means(self, values: FloatArray) -> FloatArray:
-        """(cells,) mean of the values in each cell; 0 in an empty one."""
-        size = self.shape[0] * self.shape[1]
-        count = np.bincount(self.number, minlength=size)
-        return np.asarray(np.bincount(self.number, values, size) / np.maximum(count, 1))
+    def within(self, gradient: FloatArray) -> FloatArray:
+        """(n,) rise from the cell's centre to each reading along (n, 2) gradients there."""
+        return np.asarray(np.einsum("ni,ni->n", gradient, self.offset_mm))
 
     def gradient(self, values: FloatArray, *, keep: BoolArray | None = None) -> FloatArray:
         """(n, 2) gradient at each reading of the values' map, smoothed once; 0 beside a cell without kept values."""
@@ -115,65 +115,55 @@ class Cells(Record, eq=False):
         return np.asarray(np.nan_to_num(slopes)[self.number])
 
 
-class Nuisance(Record, eq=False):
-    """Variation besides the map: in each frame, in each block of taxels, and from row to row of the head."""
-
-    bases: tuple[FloatArray, ...]  #: (k, 6) arrays: Of each scan.
-    shapes: tuple[tuple[int, int], ...]  #: Frames and blocks of taxels of each scan.
-    frame: IndexArray
-    taxel: IndexArray
-    row_cell: IndexArray
-    """`frame`, `taxel`, `row_cell` (n,) int arrays: Averaged frame, block of taxels, and cell of the map of the head's
-    rows that each reading is of."""
-
-    @classmethod
-    def of(cls, parts: Sequence[CoarseFrames], cell: IndexArray) -> Nuisance:
-        """Nuisances of some scans, whose readings lie in the given cells."""
-        shapes = tuple((len(part.pressure), len(part.row)) for part in parts)
-        frames = np.cumsum([0, *(m for m, _ in shapes)])
-        taxels = np.cumsum([0, *(k for _, k in shapes)])
-        frame = [np.repeat(np.arange(m) + start, k) for (m, k), start in zip(shapes, frames, strict=False)]
-        taxel = [np.tile(np.arange(k) + start, m) for (m, k), start in zip(shapes, taxels, strict=False)]
-        row = [np.tile(part.row, len(part.pressure)) for part in parts]
-        row_cell = np.unique(np.concatenate(row) * (cell.max() + 1) + cell, return_inverse=True)[1]
-        bases = tuple(part.basis for part in parts)
-        return cls(bases, shapes, np.concatenate(frame), np.concatenate(taxel), row_cell)
-
-    def within_frames(self, values: FloatArray) -> FloatArray:
-        """(n,) values without their quadratic in each frame."""
-        rest, start = np.empty_like(values), 0
-        for basis, (m, k) in zip(self.bases, self.shapes, strict=True):
-            block = values[start : start + m * k].reshape(m, k)
-            rest[start : start + m * k] = (block - (block @ basis) @ basis.T).reshape(-1)
-            start += m * k
-        return rest
-
-    def levelled(self, values: FloatArray, cells: Cells) -> FloatArray:
-        """(n,) values without what frames and taxels add to one common map, which stays in."""
-        frames, taxels = np.zeros_like(values), np.zeros_like(values)
-        for _ in range(_LEVELLING_ROUNDS):
-            left = values - cells.means(values - frames - taxels)[cells.number]
-            taxels = _group_means(left - frames, self.taxel)
-            rest = left - taxels
-            frames = rest - self.within_frames(rest)
-        return np.asarray(values - taxels - (frames - frames.mean()))
-
-    def without(self, values: FloatArray) -> FloatArray:
-        """(n,) values projected off all three, by turns."""
-        left, limit = values.copy(), _PROJECTION_TOLERANCE * float(values.std())
-        for _ in range(_PROJECTION_ROUNDS):
-            left = self.within_frames(left)
-            left -= _group_means(left, self.taxel)
-            step = _group_means(left, self.row_cell)
-            left -= step
-            if float(np.abs(step).max(initial=0.0)) <= limit:
-                break
-        return left
+def map_fit(
+    parts: Sequence[CoarseFrames], values: FloatArray, cells: Cells, *, tolerance: float = _FIT_TOLERANCE
+) -> tuple[FloatArray, FloatArray]:
+    """(n,) what frames, taxels and one map leave of the readings of some scans, and (n,) the readings without frames
+    and taxels, at their cells' centres: the map's gradient is followed within cells.
+    """
+    rest, mapped = _fitted(parts, values, cells.number, tolerance=tolerance)
+    at_centres = values - cells.within(cells.gradient(rest + mapped))
+    rest, mapped = _fitted(parts, at_centres, cells.number, start=mapped, tolerance=tolerance)
+    return rest, rest + mapped
 
 
-def _group_means(values: FloatArray, group: IndexArray) -> FloatArray:
-    """(n,) mean of each value's group."""
-    return np.asarray((np.bincount(group, values) / np.maximum(np.bincount(group), 1))[group])
+def _fitted(
+    parts: Sequence[CoarseFrames],
+    values: FloatArray,
+    group: IndexArray,
+    *,
+    start: FloatArray | float = 0.0,
+    tolerance: float = _FIT_TOLERANCE,
+) -> tuple[FloatArray, FloatArray]:
+    """(n,) what frames, taxels and groups leave of the readings of some scans, and (n,) what their group adds.
+
+    The least-squares fit of all three: frames and taxels are eliminated, and the groups' values, scaled by their number
+    of readings, found by conjugate gradients (Hestenes & Stiefel 1952) from those of `start` on.
+    """
+    scale = 1 / np.sqrt(np.maximum(np.bincount(group), 1))
+    whole = scale * np.bincount(group, _by_part(parts, CoarseFrames.without_head, values))
+    rest = _by_part(parts, CoarseFrames.without_head, values - start)
+    found, step, square = np.zeros_like(scale), np.zeros_like(scale), np.inf
+    for _ in range(_FIT_STEPS):
+        left, before = scale * np.bincount(group, rest), square
+        square = float(left @ left)
+        if square <= tolerance**2 * float(whole @ whole):
+            break
+        step = left + square / before * step
+        change = _by_part(parts, CoarseFrames.without_head, (scale * step)[group])
+        length = square / float(change @ change)
+        rest -= length * change
+        found += length * scale * step
+    return rest, start + found[group]
+
+
+def _by_part(
+    parts: Sequence[CoarseFrames], method: Callable[[CoarseFrames, FloatArray], FloatArray], values: FloatArray
+) -> FloatArray:
+    """(n,) values with a method of each scan applied to its own."""
+    ends = np.cumsum([part.pressure.size for part in parts])[:-1]
+    split = zip(parts, np.split(values, ends), strict=True)
+    return np.concatenate([method(part, some.reshape(part.pressure.shape)).reshape(-1) for part, some in split])
 
 
 # --- Latency of the tracker against the array: the delay at which opposite strokes show a lump at one place.
@@ -280,8 +270,7 @@ class _Part(Record, eq=False):
 
 
 def _poses(selection: SelectedFrames, latency_ms: float, gap_ms: float) -> FramePoses:
-    scan = selection.scan
-    return poses_at(scan.poses, scan.frames.time_s, latency_ms=latency_ms, max_gap_ms=gap_ms)
+    return between(selection.fresh, selection.scan.frames.time_s, latency_ms=latency_ms, max_gap_ms=gap_ms)
 
 
 def _solved(parts: Sequence[_Part]) -> tuple[float, ShiftFit]:

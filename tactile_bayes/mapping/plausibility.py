@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.findings import Finding
 from tactile_bayes.geometry import BoolArray, FloatArray, IndexArray
-from tactile_bayes.mapping.cells import distinct_poses
 from tactile_bayes.mapping.map import FEW_READINGS, TactileMap
 from tactile_bayes.mapping.select import SelectedFrames, frame_figures, refuse_without_frames, timing_figures
 from tactile_bayes.scans import HeadShape, Landmarks, Scan
@@ -182,14 +181,13 @@ def _flicker(part: SelectedFrames) -> Iterator[tuple[str, float]]:
 
 def _pattern_kpa(scan: Scan, frames: IndexArray) -> FloatArray:
     """(n, rows, columns) readings of frames, less their means."""
-    given = scan.element_calibration
-    pressure = given.gain_kpa_per_count * scan.frames.counts[frames] + given.offset_kpa
+    pressure = scan.element_calibration.linear_kpa(scan.frames.counts[frames])
     return np.asarray(pressure - pressure.mean(axis=(1, 2), keepdims=True))
 
 
 def _motion(part: SelectedFrames) -> Iterator[tuple[str, float]]:
     """How far poses zigzag."""
-    poses = distinct_poses(part.scan.poses)
+    poses = part.fresh
     if len(poses) < 3:
         return
     middle = (poses.position_mm[2:] + poses.position_mm[:-2]) / 2
@@ -228,8 +226,20 @@ def scan_doubts(selection: SelectedFrames, *, pressure_window_kpa: tuple[float, 
     """
     refuse_without_frames([selection], pressure_window_kpa=pressure_window_kpa)
     figures = frame_figures([selection]) | timing_figures([selection.scan]) | exam_figures([selection])
-    head = selection.scan.head
-    return exam_findings(figures, HeadShape.of(head.surface_mm, head.pitch_mm))
+    given = selection.scan.head
+    head = HeadShape.of(given.surface_mm, given.pitch_mm)
+    at_rest = _at_rest(_felt_mm2(selection, head), head, "the frames cover")
+    still = [_finding("unlike_an_exam", *told) for told in at_rest if figures["frames_used"] >= LEAST_FRAMES]
+    return (*still, *exam_findings(figures, head))
+
+
+def _felt_mm2(selection: SelectedFrames, head: HeadShape) -> float:
+    """Largest area that an array can have passed over that went so far along and across its way."""
+    places = selection.poses.position_mm[selection.used]
+    around = places - places.mean(axis=0)
+    _, *reach_mm = np.ptp(around @ np.linalg.eigh(around.T @ around)[1], axis=0)
+    side, other = head.sides_mm
+    return float(max((side + a) * (other + b) for a, b in (reach_mm, reach_mm[::-1])))
 
 
 # --- Findings.
@@ -341,10 +351,8 @@ def _of_cells(tactile_map: TactileMap) -> Iterator[tuple[str, str]]:
     if not covered.any():
         return
     area, head = float(covered.sum()) * cell**2, tactile_map.head
-    if head is not None and area < LEAST_AREA * head.sides_mm[0] * head.sides_mm[1]:
-        array = "{:.0f} x {:.0f} mm".format(*head.sides_mm)
-        text = f"the map covers {area / 100:.2g} cm2, hardly more than the array itself ({array}): the head stood still"
-        yield text, "scan with strokes side by side; if it did move, check the poses and their unit"
+    if head is not None:
+        yield from _at_rest(area, head, "the map covers")
     saturated, frames = tactile_map.quality.get("saturated_readings", 0.0), tactile_map.frame_count
     readings = frames * (1 if head is None else head.rows * head.columns)
     if saturated > MOST_SATURATED * readings:
@@ -391,6 +399,14 @@ def _extremes(tactile_map: TactileMap) -> tuple[float, float]:
     flat = means - trend @ np.linalg.lstsq(trend, means)[0]
     both = np.stack([means - 1.0, flat - np.median(flat)])
     return -float(both.min(axis=1).max()), float(both.max())
+
+
+def _at_rest(area_mm2: float, head: HeadShape, covers: str) -> Iterator[tuple[str, str]]:
+    """Sentence and remedy for an area that is hardly larger than the array."""
+    if area_mm2 < LEAST_AREA * head.sides_mm[0] * head.sides_mm[1]:
+        array = "{:.0f} x {:.0f} mm".format(*head.sides_mm)
+        text = f"{covers} {area_mm2 / 100:.2g} cm2, hardly more than the array itself ({array}): the head stood still"
+        yield text, "scan with strokes side by side; if it did move, check the poses and their unit"
 
 
 def _of_values(values: FloatArray) -> Iterator[tuple[str, str]]:

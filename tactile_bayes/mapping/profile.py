@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from tactile_bayes.declarations import Record
 from tactile_bayes.geometry import BoolArray, FloatArray, IndexArray, Plane, apply, inverse, rotation_from_quaternion
-from tactile_bayes.mapping.cells import distinct_poses
 from tactile_bayes.mapping.convention import ways_along
 from tactile_bayes.mapping.select import SelectedFrames, chunks
 from tactile_bayes.presets import HEAD_PROFILE, POSE_NOISE
@@ -336,7 +335,7 @@ def _place_noise(part: SelectedFrames, plane: Plane) -> tuple[FloatArray, int, f
     None where a scan has too few poses.
     """
     frames_s = part.scan.frames.time_s[part.used]
-    poses = distinct_poses(part.scan.poses)
+    poses = part.fresh
     if len(poses) < LEAST_POSES or not len(frames_s):
         return None
     lever = inverse(part.scan.head.scanhead_from_tracker)[:3, 3]

@@ -131,7 +131,7 @@ def _element_levels(scan: Scan) -> _Levels:
     return _Levels(
         counts.min(axis=0),
         highest,
-        calibration.gain_kpa_per_count * (total / n) + calibration.offset_kpa,
+        calibration.linear_kpa(total / n),
         calibration.gain_kpa_per_count * (steps / max(n - 1, 1)),
         (still - 1) / max(n - 1, 1),  # the first frame was compared with itself
         lost / max(moving, 1),
@@ -326,7 +326,24 @@ def scan_findings(scan: Scan) -> tuple[Finding, ...]:
     found = with_times(scan.findings, Span.of(scan.frames.time_s), Span.of(scan.poses.time_s))
     jumps = Jumps.of(scan.poses).cautions()  # the recorder noted them too
     kept = [one for one in found if one.text not in jumps]
-    return (*kept, *(Finding("poses_jump", text) for text in jumps))
+    frozen = (Finding("times_apart", text) for text in _frozen_cautions(scan.poses))
+    return (*kept, *frozen, *(Finding("poses_jump", text) for text in jumps))
+
+
+def _frozen_cautions(poses: TrackerPoses) -> list[str]:
+    """A line on the times in which the tracker repeated a place or a rotation while the head moved on; or none."""
+    fresh = cells.distinct_poses(poses)
+    if not len(fresh):
+        return []
+    ends = np.append(np.searchsorted(poses.time_s, fresh.time_s[1:]), len(poses)) - 1
+    stood_s = poses.time_s[ends] - fresh.time_s
+    long = (stood_s > TOLERATED_S) & np.append(cells.leaps(fresh), True)
+    if not long.any():
+        return []
+    longest = int(np.argmax(np.where(long, stood_s, 0.0)))
+    others = f" (longest of {long.sum()})" if long.sum() > 1 else ""
+    when = f"for {stood_s[longest]:.2f} s from {fresh.time_s[longest]:.2f} s on{others}"
+    return [f"the tracker repeated one place or rotation {when}: frames of that time are left out"]
 
 
 def with_times(findings: Sequence[Finding], frames: Span, poses: Span) -> tuple[Finding, ...]:
@@ -346,6 +363,7 @@ class SelectedFrames(Record, eq=False, dict=True):
 
     scan: Scan  #: As recorded.
     faults: tuple[TaxelFault, ...]  #: Taxels left out of every frame.
+    fresh: TrackerPoses  #: The tracker's poses without repeats.
     poses: cells.FramePoses  #: Pose of the tracker at each frame.
     level_kpa: FloatArray  #: (n,) array: Mean over the valid taxels; NaN where there is none.
     valid_share: FloatArray  #: (n,) array: Share of the taxels of the array that are good and not saturated.
@@ -399,13 +417,14 @@ def select_frames(
     """
     faults = find_faults(scan)
     _refuse_dead(scan, faults)
-    poses = cells.poses_at(scan.poses, scan.frames.time_s, latency_ms=latency_ms, max_gap_ms=max_pose_gap_ms)
+    fresh = cells.distinct_poses(scan.poses)
+    poses = cells.between(fresh, scan.frames.time_s, latency_ms=latency_ms, max_gap_ms=max_pose_gap_ms)
     readout = cells.Readout.of(scan.element_calibration, good_taxels(scan.head.shape, faults))
     level, share = np.full(len(scan.frames), np.nan), np.zeros(len(scan.frames))
     for part in chunks(len(scan.frames), cells.chunk_frames(readout.size)):
         level[part], share[part] = readout.levels(*readout.pressure_kpa(readout.counts(scan.frames.counts[part])))
     low, high, used = gate(poses.known, level, share, pressure_window_kpa=pressure_window_kpa)
-    return SelectedFrames(scan, faults, poses, level, share, low, high, used)
+    return SelectedFrames(scan, faults, fresh, poses, level, share, low, high, used)
 
 
 def gate(
@@ -505,7 +524,7 @@ def _counts_asked(scans: Iterable[Scan]) -> str:
     middle = float(np.median(counts))
     if PRESSURE_WINDOW_KPA[0] <= middle <= PRESSURE_WINDOW_KPA[1]:
         return f"are the counts kPa already (median {middle:g})? then gain_kpa_per_count is 1 and offset_kpa 0"
-    level = float(np.median(counts * calibration.gain_kpa_per_count + calibration.offset_kpa))
+    level = float(np.median(calibration.linear_kpa(counts)))
     asked = other_units(level, "kPa", PRESSURE_WINDOW_KPA)
     return f"{asked} gain_kpa_per_count and offset_kpa must give kPa (median {level:.4g})" if asked else ""
 

@@ -83,7 +83,7 @@ def _verdict_line(tactile_map: TactileMap) -> str:
     if "coverage" in quality:
         figures.append(f"{100 * quality['coverage']:.0f} % covered")
     if "stroke_lag_mm" in quality:
-        figures.append(f"stroke lag {quality['stroke_lag_mm']:+.1f} +- {quality['stroke_lag_sd_mm']:.1f} mm")
+        figures.append(f"stroke lag {quality['stroke_lag_mm']:+.2f} +- {quality['stroke_lag_sd_mm']:.2f} mm")
     return f"{verdict(tactile_map.findings, answered=True)}: {', '.join(figures)}"
 
 

@@ -75,6 +75,58 @@ def test_a_frozen_tracker_is_a_gap():
     assert known[:20].all()
 
 
+def strokes(**frozen: slice) -> TrackerPoses:
+    """3 s of strokes of 60 mm at 100 poses a second, turning by 20 degrees; the part named stands still meanwhile."""
+    time = 0.01 * np.arange(300)
+    angle = np.radians(10.0 * np.sin(3.0 * time))
+    values = {
+        "place": np.stack([30.0 * np.sin(4.0 * time), 5.0 * time, 0.01 * time], axis=1),
+        "rotation": np.stack([np.cos(angle / 2), 0 * time, 0 * time, np.sin(angle / 2)], axis=1),
+    }
+    for name, when in frozen.items():
+        values[name][when] = values[name][when.start]
+    return TrackerPoses(time, values["place"], values["rotation"])
+
+
+STILL = slice(100, 150)
+
+
+@pytest.mark.parametrize("part", ["place", "rotation"])
+def test_a_place_or_a_rotation_that_stands_still_alone_is_a_gap(part: str) -> None:
+    poses = strokes(**{part: STILL})
+    known = poses_at(poses, poses.time_s).known
+    assert known.tolist() == [not 100 < n < 150 for n in range(300)]
+    assert poses_at(strokes(), poses.time_s).known.all()
+
+
+def test_a_place_that_stands_still_for_some_poses_is_bridged() -> None:
+    """Control of what a repeat costs: interpolated, the head is where it was."""
+    right = strokes()
+    held = poses_at(strokes(place=slice(100, 104)), right.time_s)
+    assert held.known.all()
+    assert held.position_mm == pytest.approx(right.position_mm, abs=0.1)
+
+
+def test_a_place_that_stands_still_to_the_end_is_none() -> None:
+    poses = strokes(place=slice(200, 300))
+    assert poses_at(poses, poses.time_s).known.tolist() == [n <= 200 for n in range(300)]
+
+
+def test_a_head_that_rests_or_does_not_turn_is_no_frozen_tracker() -> None:
+    """Controls: a rig that never turns, one that turns between strokes, and a place told to 0.5 mm."""
+    poses = strokes()
+    never = np.tile([1.0, 0.0, 0.0, 0.0], (300, 1))
+    between = poses.quaternion_wxyz.copy()
+    between[:100], between[150:] = between[100], between[149]
+    coarse = 0.5 * np.rint(poses.position_mm / 0.5)
+    for place, rotation in (
+        (poses.position_mm, never),
+        (poses.position_mm, between),
+        (coarse, poses.quaternion_wxyz),
+    ):
+        assert len(distinct_poses(TrackerPoses(poses.time_s, place, rotation))) == 300
+
+
 def test_no_pose_knows_no_frame():
     nothing = TrackerPoses(np.zeros(0), np.zeros((0, 3)), np.zeros((0, 4)))
     found = poses_at(nothing, np.arange(3.0))

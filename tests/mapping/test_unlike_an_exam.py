@@ -207,6 +207,64 @@ def test_a_clock_that_stands_still_is_told_and_a_map_without_times_is_not_doubte
     assert "clock stands still" in exam_findings({**counted, "frames_missing": 0.0})[0].text
 
 
+# --- trackers that stand still
+
+
+def still(*spans: tuple[int, int], place: bool = True, rotation: bool = False) -> Callable[[Scan], Scan]:
+    """Places, rotations or both that repeat the first of each span, of a hand whose rotation always wanders."""
+
+    def made(given: TrackerPoses) -> TrackerPoses:
+        places, angle = given.position_mm.copy(), 0.1 * np.sin(7.0 * given.time_s)
+        turns = np.stack([np.cos(angle / 2), 0 * angle, 0 * angle, np.sin(angle / 2)], axis=1)
+        for start, stop in spans:
+            if place:
+                places[start:stop] = places[start]
+            if rotation:
+                turns[start:stop] = turns[start]
+        return TrackerPoses(given.time_s, places, turns)
+
+    return poses(made)
+
+
+FROZEN: dict[str, tuple[Callable[[Scan], Scan], str]] = {
+    "place": (still((130, 230)), "for 0.99 s from 101.30 s on"),
+    "rotation": (still((130, 230), place=False, rotation=True), "for 0.99 s from 101.30 s on"),
+    "both": (still((130, 230), rotation=True), "for 0.99 s from 101.30 s on"),
+    "place, several times": (still((20, 60), (130, 160), (230, 260)), "for 0.39 s from 100.20 s on (longest of 3)"),
+    "to the end": (still((300, 500)), "from 103.00 s on"),
+}
+
+
+@pytest.mark.parametrize(("made", "told"), FROZEN.values(), ids=FROZEN)
+def test_a_tracker_that_stands_still_is_told_and_its_frames_are_left_out(
+    made: Callable[[Scan], Scan], told: str
+) -> None:
+    one, right = made(scan()), still()(scan())
+    for findings in (build_map(one).findings, check_scan(one, thorough=False).doubts):
+        assert any(told in found.text for found in findings if found.kind == "times_apart")
+    missing = build_map(one).quality["dropped_no_pose"] - build_map(right).quality["dropped_no_pose"]
+    assert missing >= 90
+
+
+def test_a_slow_tracker_is_not_told() -> None:
+    """Each pose sent twice, thrice and four times: up to 40 ms old."""
+    for times in (1, 2, 3, 4):
+        slow = still()(scan())
+        first = np.arange(len(slow.poses)) // times * times
+        held = slow.poses
+        slow = replace(slow, poses=TrackerPoses(held.time_s, held.position_mm[first], held.quaternion_wxyz[first]))
+        assert not [one for one in build_map(slow).findings if one.kind == "times_apart"]
+        assert check_scan(slow, thorough=False).doubts == ()
+
+
+@pytest.mark.parametrize("noise_mm", [0.0, 0.05])
+def test_a_check_of_a_scan_without_places_tells_it(noise_mm: float) -> None:
+    noise = noise_mm * np.random.default_rng(4).standard_normal((500, 3))
+    one = poses(lambda given: TrackerPoses(given.time_s, noise, given.quaternion_wxyz))(still()(scan()))
+    told = "the head stood still" if noise_mm else "the tracker repeated one place"
+    assert any(told in doubt.text for doubt in check_scan(one, thorough=False).doubts)
+
+
 # --- a map's cells, of whatever source
 
 
