@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import ast
+import inspect
 import json
+import re
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
+
+import msgspec
 
 from tactile_bayes.api.settings import SettingsFile
 from tactile_bayes.declarations import Record, schema_of
@@ -54,13 +59,56 @@ OF_TOML: dict[str, type[Record]] = {
 
 def schemas() -> dict[Path, str]:
     """What each generated schema has to hold."""
-    found = {name: schema_of(kind, shared=True) for name, kind in OF_JSON.items()}
-    found |= {name: schema_of(kind, nulls=False) for name, kind in OF_TOML.items()}
+    found = {name: schema_of(kind, meanings(kind), shared=True) for name, kind in OF_JSON.items()}
+    found |= {name: schema_of(kind, meanings(kind), nulls=False) for name, kind in OF_TOML.items()}
     found["scan_session.schema.json"] = _session()
     for name, tables in OPEN_TABLES.items():
         for key, kind in tables.items():
-            _add_known(found[name]["properties"][key], schema_of(kind))
+            _add_known(found[name]["properties"][key], schema_of(kind, meanings(kind)))
     return {SCHEMAS / name: json.dumps(one, indent=2, ensure_ascii=False) + "\n" for name, one in found.items()}
+
+
+def meanings(kind: Any) -> dict[str, dict[str, str]]:
+    """What the sources of all records in a declaration say of their fields, by the records' names and the keys."""
+    found: dict[str, dict[str, str]] = {}
+
+    def look(one: Any) -> None:
+        if isinstance(one, type) and issubclass(one, Record) and one.__name__ not in found:
+            fields = msgspec.structs.fields(one)
+            told = {name: text for part in reversed(one.__mro__) for name, text in _said(part).items()}
+            found[one.__name__] = {part.encode_name: told[part.name] for part in fields if part.name in told}
+            for part in fields:
+                look(part.type)
+        for part in get_args(one):
+            look(part)
+
+    look(kind)
+    return found
+
+
+_NAMES = re.compile(r"((?:`\w+`(?:, | and )?)+): (.*)")
+
+
+def _said(record: type) -> dict[str, str]:
+    """Meaning of a class's own fields: ``#: Text`` behind one, or a text below, which may name several."""
+    try:
+        source = inspect.getsource(record)
+    except (OSError, TypeError):  # made of another's fields
+        return {}
+    found: dict[str, str] = {}
+    lines, last = source.splitlines(), ""
+    for node in ast.parse(source).body[0].body:  # type: ignore[attr-defined]
+        if isinstance(node, ast.AnnAssign):
+            last = ast.unparse(node.target)
+            _, sign, text = lines[(node.end_lineno or 1) - 1].partition("#: ")
+            found |= {last: text} if sign else {}
+        elif isinstance(node, ast.Expr) and last:
+            text = " ".join(ast.literal_eval(node.value).split())
+            several = _NAMES.fullmatch(text)
+            found |= dict.fromkeys(re.findall(r"\w+", several[1]), several[2]) if several else {last: text}
+        else:
+            last = ""
+    return found
 
 
 def _add_known(table: dict[str, Any], known: dict[str, Any]) -> None:
@@ -74,7 +122,7 @@ def _session() -> dict[str, Any]:
     """Schema of a session: known facts, and others by their names."""
     others = schema_of(dict[FactName, Fact])
     names = others["propertyNames"] | {"not": {"enum": list(OF_A_PERSON)}}
-    return schema_of(Session, nulls=False) | {
+    return schema_of(Session, meanings(Session), nulls=False) | {
         "propertyNames": names,
         "additionalProperties": others["additionalProperties"],
     }

@@ -237,14 +237,19 @@ def rounded(value: T, digits: int = 9) -> T:
     return cast("T", found)
 
 
-def schema_of(kind: Any, *, nulls: bool = True, shared: bool = False) -> dict[str, Any]:
+def schema_of(
+    kind: Any, meanings: Mapping[str, Mapping[str, str]] = {}, *, nulls: bool = True, shared: bool = False
+) -> dict[str, Any]:
     """JSON schema (draft 7) of a record's files, from its declaration; the first line of its docstring is the title.
 
     Files of TOML hold no `nulls`. With `shared` a record that stands in several places is described once, among
-    ``definitions``.
+    ``definitions``. `meanings`: of keys by the names of their records, where no `Meta` says them.
     """
     found = msgspec.json.schema(kind, schema_hook=_custom_schema)
     definitions = found.pop("$defs", {})
+    for name, told in meanings.items():
+        keys = definitions.get(name, {}).get("properties", {})
+        keys |= {key: {"description": told[key], **one} for key, one in keys.items() if key in told}
     several = _repeated([found, definitions]) if shared else {}
     body = _inlined(found, {**definitions, **several})
     if several:
