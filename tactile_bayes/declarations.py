@@ -5,9 +5,10 @@ A declaration gives a field its type, range and meaning::
     class Head(Record):
         "Grid and curvature of a scan head's taxels."
 
-        rows: Annotated[int, says("Taxels across the head.", ge=1)]
-        radius_mm: Annotated[float, says("Of the arc across the head.", gt=0)] | None = None
+        rows: Annotated[int, Meta(ge=1)]  #: Taxels across the head.
+        radius_mm: Annotated[float, Meta(gt=0)] | None = None  #: Of the arc across the head.
 
+Schemas take the meaning from there; `says` says that of an option, which a command's help has, and of a kind of value.
 `from_plain` makes one of what JSON or TOML held, `to_plain` the reverse, `schema_of` the schema in data_schema/. Files
 go through `files.documents.read_record`, which first refuses doubled keys, huge numbers and depth. Arrays are nested
 lists in files; `geometry.Vector` and `geometry.Matrix` declare them. A range belongs to its own member of a union:

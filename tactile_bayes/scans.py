@@ -9,7 +9,7 @@ from typing import Annotated, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_bayes.declarations import Meta, Record, field, says, settle, to_plain
+from tactile_bayes.declarations import Meta, Record, field, settle, to_plain
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.findings import Finding
 from tactile_bayes.geometry import FloatArray, check_rigid
@@ -31,18 +31,15 @@ Count = Annotated[int, Meta(ge=1)]
 class HeadShape(Record):
     """Grid and curvature of a scan head's taxels."""
 
-    rows: Annotated[Count, says("Taxels across the head.")]
-    columns: Annotated[Count, says("Taxels along the head.")]
-    pitch_mm: Annotated[float, says("Distance between neighbours, mm.", gt=0)]
-    radius_mm: Annotated[
-        float | None, says("Radius of the arc across the head, mm; null where it is flat, negative where it is hollow.")
-    ]
-    radius_along_mm: Annotated[float | None, says("The same along the head.")] = None
-    uneven_mm: Annotated[float, says("Root mean square departure of the taxels from these arcs, mm.", ge=0)] = 0.0
-    rim_mm: Annotated[
-        Annotated[float, Meta(ge=0)] | None,
-        says("Radius of the edge around the taxels, which presses and senses nothing; null where unknown."),
-    ] = None
+    rows: Count  #: Taxels across the head.
+    columns: Count  #: Taxels along the head.
+    pitch_mm: Annotated[float, Meta(gt=0)]  #: Distance between neighbours, mm.
+    radius_mm: float | None
+    """Radius of the arc across the head, mm; null where it is flat, negative where it is hollow."""
+    radius_along_mm: float | None = None  #: The same along the head.
+    uneven_mm: Annotated[float, Meta(ge=0)] = 0.0  #: Root mean square departure of the taxels from these arcs, mm.
+    rim_mm: Annotated[float, Meta(ge=0)] | None = None
+    """Radius of the edge around the taxels, which presses and senses nothing; null where unknown."""
 
     def __post_init__(self) -> None:
         for name in ("radius_mm", "radius_along_mm"):

@@ -11,7 +11,7 @@ from datetime import date
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from tactile_bayes.declarations import Meta, Record, replace, says
+from tactile_bayes.declarations import Meta, Record, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.documents import load_toml, parse_record
 from tactile_bayes.files.tables import RawTable, Table, composed, parse_date, read_raw
@@ -30,15 +30,15 @@ class ReadingColumns(Record, kw_only=True):
 
     modality: Modality
     replicate: Annotated[int, Meta(ge=1)] = 1
-    size: Annotated[Column, says("Column of the size.")]
+    size: Column  #: Column of the size.
     unit: Unit | None = None
     sd: Column | None = None
     low: Column | None = None
     high: Column | None = None
     probability: Annotated[float, Meta(gt=0, lt=1)] | None = None
     reader: Column | None = None
-    visit: Annotated[Column, says("Code of the visit that these readings are of, such as 1.")] | None = None
-    date: Annotated[Column, says("Column of the readings' date.")] | None = None
+    visit: Column | None = None  #: Code of the visit that these readings are of, such as 1.
+    date: Column | None = None  #: Column of the readings' date.
 
 
 class ExcisionColumns(Record):
@@ -48,26 +48,20 @@ class ExcisionColumns(Record):
     second: Column | None = None
     sd: Column | None = None
     unit: Unit | None = None
-    date: Annotated[Column, says("Column of the date of excision.")] | None = None
+    date: Column | None = None  #: Column of the date of excision.
 
 
 class ColumnMap(Record):
     """Which column of a wide table holds which reading."""
 
-    patient: Annotated[Column, says("Column of the coded patient.")]
-    mass: Annotated[Column | None, says("Column of the mass within the patient; without it every patient has one.")] = (
-        None
-    )
-    unit: Annotated[Unit, says("Of all sizes, unless a reading says otherwise.")] = "mm"
-    not_detected: Annotated[
-        tuple[str, ...], says("Words that the table writes for a mass looked for and not found.")
-    ] = ()
-    not_done: Annotated[tuple[str, ...], says("Words for a mass not looked for; a blank is one already.")] = ()
-    synthetic: Annotated[bool | None, says("Whether all readings were made by a generator.")] = None
-    reading: Annotated[
-        Annotated[tuple[ReadingColumns, ...], Meta(min_length=1)] | None,
-        says("One for each modality and replicate of a wide table of readings."),
-    ] = None
+    patient: Column  #: Column of the coded patient.
+    mass: Column | None = None  #: Column of the mass within the patient; without it every patient has one.
+    unit: Unit = "mm"  #: Of all sizes, unless a reading says otherwise.
+    not_detected: tuple[str, ...] = ()  #: Words that the table writes for a mass looked for and not found.
+    not_done: tuple[str, ...] = ()  #: Words for a mass not looked for; a blank is one already.
+    synthetic: bool | None = None  #: Whether all readings were made by a generator.
+    reading: Annotated[tuple[ReadingColumns, ...], Meta(min_length=1)] | None = None
+    """One for each modality and replicate of a wide table of readings."""
     excision: ExcisionColumns | None = None
 
     def key_columns(self) -> list[str]:

@@ -12,7 +12,7 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, TypeVar
 
-from tactile_bayes.declarations import Meta, Record, field, from_plain, names_of, replace, says, schema_name, shown
+from tactile_bayes.declarations import Meta, Record, field, from_plain, names_of, replace, schema_name, shown
 from tactile_bayes.errors import BadDataError, in_file, meant
 from tactile_bayes.files.reading import JSON_BYTES, TOML_BYTES, decoding, kind_of, read_text, schema_kind
 from tactile_bayes.options import TrialSettings
@@ -165,10 +165,9 @@ def check_text(where: str, text: str, *, way_out: str) -> None:
 class Protocol(Record, forbid_unknown_fields=False):
     """A pre-specified analysis of a trial."""
 
-    title: Annotated[str, says("Title of the report.")] | None = None
-    analysis: Annotated[
-        TrialSettings, says("Settings fixed beforehand; an option that contradicts one is refused.")
-    ] = field(default_factory=TrialSettings)
+    title: str | None = None  #: Title of the report.
+    analysis: TrialSettings = field(default_factory=TrialSettings)
+    """Settings fixed beforehand; an option that contradicts one is refused."""
 
 
 def read_protocol(path: Path) -> tuple[str | None, dict[str, Any]]:
@@ -204,22 +203,18 @@ class Session(Record, forbid_unknown_fields=False):
     nothing here may identify a person.
     """
 
-    head_id: Annotated[Text64 | None, says("Identity of the scan head.")] = None
-    array_id: Annotated[Text64 | None, says("Identity or serial number of the pressure array.")] = None
-    tracker_id: Annotated[Text64 | None, says("Identity or serial number of the tracker.")] = None
-    side: Annotated[Literal["left", "right", "phantom"] | None, says("Which breast, or a phantom.")] = None
-    posture: Annotated[Posture | None, says("Posture during the scan.")] = None
-    lubricant: Annotated[Text64 | None, says("What was put on the skin; `none` for none.")] = None
-    examiner: Annotated[Examiner | None, says("Coded examiner, not a name.")] = None
-    subject: Annotated[Code | None, says("Coded subject, not a name.")] = None
-    visit: Annotated[Code | None, says("Code of the visit; `campaign init` takes 1 where it is left out.")] = None
-    mass: Annotated[
-        Code | None, says("Code of the mass within the subject; `campaign init` takes 1 where it is left out.")
-    ] = None
-    array_calibration_days: Annotated[
-        Days | None, says("Age of the array calibration at the recording, in whole days.")
-    ] = None
-    source: Annotated[Text64 | None, says("Where the scan came from: recorded, imported, simulated.")] = None
+    head_id: Text64 | None = None  #: Identity of the scan head.
+    array_id: Text64 | None = None  #: Identity or serial number of the pressure array.
+    tracker_id: Text64 | None = None  #: Identity or serial number of the tracker.
+    side: Literal["left", "right", "phantom"] | None = None  #: Which breast, or a phantom.
+    posture: Posture | None = None  #: Posture during the scan.
+    lubricant: Text64 | None = None  #: What was put on the skin; `none` for none.
+    examiner: Examiner | None = None  #: Coded examiner, not a name.
+    subject: Code | None = None  #: Coded subject, not a name.
+    visit: Code | None = None  #: Code of the visit; `campaign init` takes 1 where it is left out.
+    mass: Code | None = None  #: Code of the mass within the subject; `campaign init` takes 1 where it is left out.
+    array_calibration_days: Days | None = None  #: Age of the array calibration at the recording, in whole days.
+    source: Text64 | None = None  #: Where the scan came from: recorded, imported, simulated.
 
 
 def check_session(session: Mapping[str, object], *, path: Path) -> None:

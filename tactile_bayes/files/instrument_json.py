@@ -8,7 +8,7 @@ from typing import Annotated, Any, Final, Literal
 
 import numpy as np
 
-from tactile_bayes.declarations import EXACT, Meta, Record, field, says, to_plain
+from tactile_bayes.declarations import EXACT, Meta, Record, field, to_plain
 from tactile_bayes.errors import BadDataError, in_file
 from tactile_bayes.files.atomic import write_text
 from tactile_bayes.files.documents import dump_json, load_json, parse_record, read_record
@@ -54,33 +54,24 @@ class HeadFile(Record, kw_only=True):
     """A scan head: where its taxels are, and where the tracker's sensor is on it."""
 
     schema: Literal["tactile-bayes/head/1"]
-    note: Annotated[str | None, says("Anything, for people.")] = None
+    note: str | None = None  #: Anything, for people.
     pitch_mm: Pitch
-    surface_mm: Annotated[
-        Annotated[list[TaxelRow], Meta(min_length=1, max_length=256)] | None,
-        says(
-            "(rows, columns, 3) centres of the taxels in `scanhead`: origin at the apex, x across the "
-            "head, y along it, z into the tissue. Or give rows, columns and radius_mm."
-        ),
-    ] = None
+    surface_mm: Annotated[list[TaxelRow], Meta(min_length=1, max_length=256)] | None = None
+    """(rows, columns, 3) centres of the taxels in `scanhead`: origin at the apex, x across the head, y along it, z into
+    the tissue. Or give rows, columns and radius_mm.
+    """
     rows: Rows | None = None
     columns: Columns | None = None
-    radius_mm: Annotated[
-        Radius | None, says("Radius of the arc across the head, mm, above half its width; null for a flat head.")
-    ] = None
-    shoulder_mm: Annotated[Rounding, says("Radius of rounded edges cut into the array across the head, mm.")] = 0.0
-    rim_mm: Annotated[
-        Rounding | None,
-        says(
-            "Radius of the rounded edge around the taxels, which presses but senses nothing, mm; for "
-            "`population`. Default: 3, or 0 with shoulder_mm."
-        ),
-    ] = None
-    checked_on: Annotated[date | None, says("When `check` found it right on a scan.")] = None
-    scanhead_from_tracker: Annotated[
-        tuple[Row, Row, Row, Row] | None,
-        says("(4, 4) transform from the tracker's sensor to the head; `record` needs it."),
-    ] = None
+    radius_mm: Radius | None = None
+    """Radius of the arc across the head, mm, above half its width; null for a flat head."""
+    shoulder_mm: Rounding = 0.0  #: Radius of rounded edges cut into the array across the head, mm.
+    rim_mm: Rounding | None = None
+    """Radius of the rounded edge around the taxels, which presses but senses nothing, mm; for `population`. Default: 3,
+    or 0 with shoulder_mm.
+    """
+    checked_on: date | None = None  #: When `check` found it right on a scan.
+    scanhead_from_tracker: tuple[Row, Row, Row, Row] | None = None
+    """(4, 4) transform from the tracker's sensor to the head; `record` needs it."""
 
     def __post_init__(self) -> None:
         if self.surface_mm is not None and len({len(row) for row in self.surface_mm}) > 1:
@@ -160,13 +151,13 @@ class ArrayCalibrationFile(Record, eq=False, kw_only=True):
     """Calibration of a pressure array."""
 
     schema: Literal["tactile-bayes/array-calibration/1"] = "tactile-bayes/array-calibration/1"
-    head_id: Annotated[str, says("The head it was measured on.")]
-    day: Annotated[date, says("When it was measured.")] = field(name="date")
+    head_id: str  #: The head it was measured on.
+    day: date = field(name="date")  #: When it was measured.
     units: dict[str, str] = field(default_factory=_UNITS.copy)
-    saturation_count: Annotated[int, says("Readings at or above it carry no pressure.", ge=1)]
+    saturation_count: Annotated[int, Meta(ge=1)]  #: Readings at or above it carry no pressure.
     gain_kpa_per_count: Matrix
     offset_kpa: Matrix
-    quality: Annotated[dict[str, Any], says("Figures of the fit.")] = field(default_factory=dict)
+    quality: dict[str, Any] = field(default_factory=dict)  #: Figures of the fit.
     provenance: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -182,9 +173,9 @@ class LandmarksFile(Record, kw_only=True):
     """Landmarks touched before a scan, in `base`."""
 
     schema: Literal["tactile-bayes/landmarks/1"]
-    sternal_notch_mm: Annotated[Triple, says("Sternal notch, mm.")]
-    xiphoid_mm: Annotated[Triple, says("Xiphoid, mm.")]
-    nipple_mm: Annotated[Triple | None, says("Nipple, mm; left out where it was not touched.")] = None
+    sternal_notch_mm: Triple  #: Sternal notch, mm.
+    xiphoid_mm: Triple  #: Xiphoid, mm.
+    nipple_mm: Triple | None = None  #: Nipple, mm; left out where it was not touched.
 
 
 def write_array_calibration(path: Path, content: ArrayCalibrationFile, *, force: bool = False) -> None:

@@ -236,7 +236,7 @@ class MassReport(Record, kw_only=True):
     d_y_mm: Quantity | None
     angle_deg: Quantity | None
     another_exam: AnotherExam | None
-    reason: Annotated[str, says("Why it has no size; empty where it has one.")]
+    reason: str  #: Why it has no size; empty where it has one.
     reason_code: ReasonCode
     advice: str
     position: Position | None = None
@@ -305,15 +305,12 @@ class EstimateReport(Report, kw_only=True):
     reason: str
     reason_code: ReasonCode = ""
     advice: str = ""
-    on_paper: Annotated[str, says("The advice for a reader of the exam's page, who has no command line")] = ""
-    about_mm: Annotated[Place | None, says("Place on the map that the reason is about")] = None
-    smallest_lump: Annotated[
-        SmallestLump | None,
-        says(
-            "On a map without a lump: diameters in mm of the smallest ball that it would have shown with "
-            "this probability, by depth; null where not even a ball of 30 mm"
-        ),
-    ] = None
+    on_paper: str = ""  #: The advice for a reader of the exam's page, who has no command line
+    about_mm: Place | None = None  #: Place on the map that the reason is about
+    smallest_lump: SmallestLump | None = None
+    """On a map without a lump: diameters in mm of the smallest ball that it would have shown with this probability, by
+    depth; null where not even a ball of 30 mm
+    """
     max_size_mm: Quantity | None
     min_size_mm: Quantity | None
     d_x_mm: Quantity | None
@@ -326,16 +323,12 @@ class EstimateReport(Report, kw_only=True):
     another_exam: Annotated[AnotherExam | None, LEADING] = None
     supposing: Annotated[dict[str, Supposed] | None, SUPPOSING] = None
     centre_mm: Point | None
-    centre_patient_mm: Annotated[
-        Point | None, says("mm from the xiphoid: x to the patient's right, y towards the sternal notch")
-    ] = None
-    position: Annotated[
-        Position | None,
-        says(
-            "Place of the lump about the nipple, as the examiner sees it who faces the patient: hours on "
-            "the clock, 12 towards the head, and mm along the map; null without a nipple, notch and xiphoid, or a side"
-        ),
-    ] = None
+    centre_patient_mm: Point | None = None
+    """mm from the xiphoid: x to the patient's right, y towards the sternal notch"""
+    position: Position | None = None
+    """Place of the lump about the nipple, as the examiner sees it who faces the patient: hours on the clock, 12 towards
+    the head, and mm along the map; null without a nipple, notch and xiphoid, or a side
+    """
     angle_deg: Quantity | None
     detected_probability: Chance | None
     variance_share: dict[str, float] | None
@@ -343,23 +336,14 @@ class EstimateReport(Report, kw_only=True):
     prior_sensitivity: PriorSensitivity | None = None
     diagnostics: dict[str, Any]
     candidates: tuple[PassedOver, ...]
-    other_rises: Annotated[
-        tuple[OtherRise, ...], says("Other rises that are lumps by the evidence, highest first; mm on the map.")
-    ] = ()
-    masses: Annotated[
-        tuple[MassReport, ...],
-        says(
-            "All masses of the map, the surest first. The top-level fields are those of the reported one: "
-            "the surest, or that of the place that was given."
-        ),
-    ]
-    touching: Annotated[
-        tuple[Touching, ...],
-        says(
-            "Pairs of sized masses that may be one lump: their numbers, mm between their centres, and the "
-            "length over both."
-        ),
-    ] = ()
+    other_rises: tuple[OtherRise, ...] = ()
+    """Other rises that are lumps by the evidence, highest first; mm on the map."""
+    masses: tuple[MassReport, ...]
+    """All masses of the map, the surest first. The top-level fields are those of the reported one: the surest, or that
+    of the place that was given.
+    """
+    touching: tuple[Touching, ...] = ()
+    """Pairs of sized masses that may be one lump: their numbers, mm between their centres, and the length over both."""
     left_out: tuple[str, ...]
     prior: dict[str, Any]
     research_use: str
@@ -393,16 +377,12 @@ class PooledMap(Record, kw_only=True):
     """One of the maps of a mass, as its own estimate has it."""
 
     map: str
-    mass: Annotated[
-        tuple[Number1, ...],
-        says(
-            "Number of the mass that was sized, and how many the map has; empty where it is the only one.", max_length=2
-        ),
-    ] = ()
+    mass: Annotated[tuple[Number1, ...], Meta(max_length=2)] = ()
+    """Number of the mass that was sized, and how many the map has; empty where it is the only one."""
     status: Literal["estimate", "no_estimate"]
     reason: str
     detected_probability: float | None
-    max_size_mm: Annotated[Interval | None, says("largest size by this map alone, as `estimate` gives it")]
+    max_size_mm: Interval | None  #: largest size by this map alone, as `estimate` gives it
     outlying: bool
 
 
@@ -418,10 +398,8 @@ class PooledReport(Report, kw_only=True):
     """Size of a mass from several maps."""
 
     schema: Literal["tactile-bayes/pooled/1"]
-    status: Annotated[
-        Literal["estimate", "no_estimate", "maps_disagree"],
-        says("maps_disagree: each map has its size, and they are not of one size or not at one place"),
-    ]
+    status: Literal["estimate", "no_estimate", "maps_disagree"]
+    """maps_disagree: each map has its size, and they are not of one size or not at one place"""
     verdict: Judgement
     entries: Entries = field(name="findings")
     reason: str
@@ -430,24 +408,18 @@ class PooledReport(Report, kw_only=True):
     another_exam: Annotated[AnotherExam | None, LEADING] = None
     supposing: Annotated[dict[str, Supposed] | None, SUPPOSING] = None
     maps: Annotated[tuple[PooledMap, ...], Meta(min_length=1)]
-    one_size_probability: Annotated[
-        Chance | None, says("that maps of one mass are as far apart in size or farther; null for a single one")
-    ]
-    one_place_probability: Annotated[Chance | None, says("likewise of their places by the landmarks; null without two")]
+    one_size_probability: Chance | None
+    """that maps of one mass are as far apart in size or farther; null for a single one"""
+    one_place_probability: Chance | None  #: likewise of their places by the landmarks; null without two
     variance_share: dict[str, float] | None
     figures: dict[str, float]
     left_out: tuple[str, ...] = ()
-    fat_mm: Annotated[
-        Above0 | None, says("Depth of the fat under the head by its pressure profile; null where the maps do not tell.")
-    ] = None
+    fat_mm: Above0 | None = None
+    """Depth of the fat under the head by its pressure profile; null where the maps do not tell."""
     unknowns: dict[str, float]
-    site: Annotated[
-        str | None, says("The correction of the calibration by a site's phantoms, in words; null without one.")
-    ] = None
-    repeatability: Annotated[
-        str | UnsetType,
-        says("The site's spread between exams of one mass that the size supposes, in words; missing without one."),
-    ] = UNSET
+    site: str | None = None  #: The correction of the calibration by a site's phantoms, in words; null without one.
+    repeatability: str | UnsetType = UNSET
+    """The site's spread between exams of one mass that the size supposes, in words; missing without one."""
     research_use: str
     provenance: dict[str, Any]
 

@@ -6,44 +6,32 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Final
 
-from tactile_bayes.declarations import Record, as_dict, field, from_plain, names_of, says
+from tactile_bayes.declarations import Meta, Record, as_dict, field, from_plain, names_of, says
 from tactile_bayes.errors import BadDataError, in_file
 from tactile_bayes.files.documents import parse_toml
 from tactile_bayes.files.reading import TOML_BYTES, read_text
 from tactile_bayes.forward.scene import (
-    Amplitude,
-    Angle,
     Background,
     Head,
     Lump,
     Noise,
     Scene,
     SceneLandmarks,
-    SigmaX,
-    SigmaY,
     Strokes,
     Taxels,
     Timing,
     Tracker,
 )
-from tactile_bayes.forward.tissue import DepthRatio, Diameter, Height, Place, Rib, SceneBody, Seat, SolidLump, Stiffness
+from tactile_bayes.forward.tissue import DepthRatio, Height, Rib, SceneBody, Seat, SolidLump, Stiffness
 
 # A lump with one of the first is tissue; only a Gaussian one may have the others.
 _OF_TISSUE: Final = ("depth_ratio", "stiffness_ratio", "seat", "height_mm")
 _OF_BUMPS: Final = ("amplitude", "sigma_x_mm", "sigma_y_mm", "angle_deg")
-_BUMP: Final = Lump()
 
 
-class LumpTable(Record):
+class LumpTable(Lump):
     """One lump."""
 
-    x_mm: Place = _BUMP.x_mm
-    y_mm: Place = _BUMP.y_mm
-    amplitude: Amplitude = _BUMP.amplitude
-    sigma_x_mm: SigmaX = _BUMP.sigma_x_mm
-    sigma_y_mm: SigmaY = _BUMP.sigma_y_mm
-    angle_deg: Angle = _BUMP.angle_deg
-    d_mm: Diameter | None = None
     height_mm: Height | None = None
     depth_ratio: DepthRatio | None = None
     stiffness_ratio: Stiffness | None = None
@@ -58,35 +46,25 @@ class SceneFile(Record):
     tissue.
     """
 
-    scene: Annotated[Timing, says("Length and rates.")] = field(default_factory=Timing)
-    background: Annotated[Background, says("Mean pressure away from lumps, against time.")] = field(
-        default_factory=Background
-    )
+    scene: Timing = field(default_factory=Timing)  #: Length and rates.
+    background: Background = field(default_factory=Background)
+    """Mean pressure away from lumps, against time."""
     body: SceneBody | None = None
-    lump: Annotated[
-        tuple[LumpTable, ...],
-        says(
-            "Lumps: either Gaussian rises of the normalised pressure (amplitude, sigma), or tissue (d_mm, "
-            "depth_ratio).",
-            max_length=100,
-        ),
-    ] = ()
+    lump: Annotated[tuple[LumpTable, ...], Meta(max_length=100)] = ()
+    """Lumps: either Gaussian rises of the normalised pressure (amplitude, sigma), or tissue (d_mm, depth_ratio)."""
     rib: Annotated[
         tuple[Annotated[Rib, says("One rib.")], ...],
         says("Ribs for the solid model: rows of stiff balls along x, across the head.", max_length=10),
     ] = ()
-    strokes: Annotated[Strokes, says("Back and forth across the head, line after line along it.")] = field(
-        default_factory=Strokes
-    )
-    head: Annotated[Head, says("A section of a circular cylinder.")] = field(default_factory=Head)
-    noise: Annotated[Noise, says("Standard deviations of everything random.")] = field(default_factory=Noise)
-    tracker: Annotated[Tracker, says("Where the tracker's base stands and how its sensor sits in the handle.")] = field(
-        default_factory=Tracker
-    )
-    taxels: Annotated[Taxels, says("Faulty elements as [row, column] from 0.")] = field(default_factory=Taxels)
-    landmarks: Annotated[SceneLandmarks, says("Points touched before the scan, in the plane.")] = field(
-        default_factory=SceneLandmarks
-    )
+    strokes: Strokes = field(default_factory=Strokes)
+    """Back and forth across the head, line after line along it."""
+    head: Head = field(default_factory=Head)  #: A section of a circular cylinder.
+    noise: Noise = field(default_factory=Noise)  #: Standard deviations of everything random.
+    tracker: Tracker = field(default_factory=Tracker)
+    """Where the tracker's base stands and how its sensor sits in the handle."""
+    taxels: Taxels = field(default_factory=Taxels)  #: Faulty elements as [row, column] from 0.
+    landmarks: SceneLandmarks = field(default_factory=SceneLandmarks)
+    """Points touched before the scan, in the plane."""
 
 
 def read_scene(path: Path) -> Scene:

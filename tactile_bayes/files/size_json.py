@@ -9,7 +9,7 @@ from typing import Annotated, Any, Final, Literal
 
 import numpy as np
 
-from tactile_bayes.declarations import Meta, Record, field, replace, says, to_plain
+from tactile_bayes.declarations import Meta, Record, field, replace, to_plain
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.atomic import sha256, write_text
 from tactile_bayes.files.documents import dump_json, load_json, parse_record, read_record
@@ -72,9 +72,8 @@ class PopulationFile(BodyLaw, eq=False, kw_only=True):
     schema: Literal["tactile-bayes/size-calibration/4"]
     form: Literal["population"]
     provenance: dict[str, Any]
-    constants: Annotated[
-        Mapping[str, float], says("m, b in mm, e and f of Eq 6 at the centre; for people, not read.")
-    ] = field(default_factory=dict)
+    constants: Mapping[str, float] = field(default_factory=dict)
+    """m, b in mm, e and f of Eq 6 at the centre; for people, not read."""
     research_use: str = RESEARCH_USE
 
 
@@ -83,8 +82,8 @@ class SiteFile(Record, eq=False, kw_only=True):
 
     schema: Literal["tactile-bayes/site-calibration/1"]
     form: Literal["site"]
-    site: Annotated[SiteShift, says("ln d = the base's + c0 + c1 (ln of the mean width - centre).")]
-    base: Annotated[dict[str, Any], says("The whole calibration: size_population.schema.json.")]
+    site: SiteShift  #: ln d = the base's + c0 + c1 (ln of the mean width - centre).
+    base: dict[str, Any]  #: The whole calibration: size_population.schema.json.
     provenance: dict[str, Any]
     research_use: str = RESEARCH_USE
 
@@ -102,10 +101,7 @@ class Eq6File(SizeCalibration, eq=False, kw_only=True):
     """Size calibration: posterior of the coefficients of Eq 6."""
 
     schema: Literal["tactile-bayes/size-calibration/1"]
-    form: Annotated[
-        Literal["eq6"],
-        says("ln d = ln(m sigma / (e a^f) + b) + N(0, scatter (a / reference_amplitude)^-scatter_slope)"),
-    ]
+    form: Literal["eq6"]  #: ln d = ln(m sigma / (e a^f) + b) + N(0, scatter (a / reference_amplitude)^-scatter_slope)
     x: AxisFile
     y: AxisFile
     axes: Annotated[tuple[Literal["x", "y", "both"], ...], Meta(min_length=1, max_length=2)]
@@ -200,29 +196,26 @@ class UsedCalibration(Record):
     """The size calibration that sized the exams."""
 
     name: str
-    sha256: Annotated[
-        Sha256, says("Of the calibration's file: sizes by another one have another spread, and are refused")
-    ]
-    normalise: Annotated[str, says("How the maps' frames were normalised, as the option of `map`")]
+    sha256: Sha256  #: Of the calibration's file: sizes by another one have another spread, and are refused
+    normalise: str  #: How the maps' frames were normalised, as the option of `map`
 
 
 class HalfWidth(Record):
     """Half width of the 95 % interval of a single exam, a share of the size: median over the exams that took part."""
 
-    as_estimated: Annotated[float, says("By the spread that the exams were estimated with")]
-    with_it: Annotated[float, says("By the learned spread")]
+    as_estimated: float  #: By the spread that the exams were estimated with
+    with_it: float  #: By the learned spread
 
 
 class RepeatedMass(Record):
     """A mass at a visit with repeated exams."""
 
-    name: Annotated[str, says("Of the mass at this visit, as its folder")]
+    name: str  #: Of the mass at this visit, as its folder
     exams: Annotated[list[str], Meta(min_length=2)]
-    log_size: Annotated[list[float], says("ln d (mm) by each exam alone, without what no map shows", min_length=2)]
-    map_sd: Annotated[list[Annotated[float, Meta(ge=0)]], says("SD of each by the map's own errors", min_length=2)]
-    by_chance: Annotated[
-        float, says("Probability, by the other masses, that exams of a mass lie as far apart as these", ge=0, le=1)
-    ]
+    log_size: Annotated[list[float], Meta(min_length=2)]  #: ln d (mm) by each exam alone, without what no map shows
+    map_sd: Annotated[list[Annotated[float, Meta(ge=0)]], Meta(min_length=2)]  #: SD of each by the map's own errors
+    by_chance: Annotated[float, Meta(ge=0, le=1)]
+    """Probability, by the other masses, that exams of a mass lie as far apart as these"""
 
 
 class RepeatabilityFile(Record, kw_only=True, omit_defaults=True):
@@ -230,45 +223,30 @@ class RepeatabilityFile(Record, kw_only=True, omit_defaults=True):
 
     schema: Literal["tactile-bayes/repeatability/1"]
     research_use: str
-    between_map_sd: Annotated[
-        float,
-        says(
-            "SD of ln d between exams of one mass beyond the maps' own errors: root mean square of its "
-            "posterior, which adds to the variance of one map's size",
-            gt=0,
-            le=2,
-        ),
-    ]
-    log_sd: Annotated[
-        float,
-        says(
-            "SD of the natural log of that spread: the log-normal with this and between_map_sd as its root "
-            "mean square is the prior that `estimate --repeatability` uses",
-            ge=0,
-            le=3,
-        ),
-    ]
-    median: Annotated[float, says("Median of the spread's posterior", gt=0)]
-    low: Annotated[float, says("Lower end of its equal-tailed interval", gt=0)]
-    high: Annotated[float, says("Upper end", gt=0)]
-    probability: Annotated[float, says("Of that interval", ge=0.95, le=0.95)]
-    masses: Annotated[int, says("Masses with repeated exams; visits of a mass count once", ge=3)]
-    maps: Annotated[int, says("Exams that took part", ge=6)]
+    between_map_sd: Annotated[float, Meta(gt=0, le=2)]
+    """SD of ln d between exams of one mass beyond the maps' own errors: root mean square of its posterior, which adds
+    to the variance of one map's size
+    """
+    log_sd: Annotated[float, Meta(ge=0, le=3)]
+    """SD of the natural log of that spread: the log-normal with this and between_map_sd as its root mean square is the
+    prior that `estimate --repeatability` uses
+    """
+    median: Annotated[float, Meta(gt=0)]  #: Median of the spread's posterior
+    low: Annotated[float, Meta(gt=0)]  #: Lower end of its equal-tailed interval
+    high: Annotated[float, Meta(gt=0)]  #: Upper end
+    probability: Annotated[float, Meta(ge=0.95, le=0.95)]  #: Of that interval
+    masses: Annotated[int, Meta(ge=3)]  #: Masses with repeated exams; visits of a mass count once
+    maps: Annotated[int, Meta(ge=6)]  #: Exams that took part
     calibration: UsedCalibration
     half_width: HalfWidth | None = None
-    repeats: Annotated[list[RepeatedMass], says("Masses at a visit with repeated exams", min_length=3)]
-    outlying: Annotated[
-        tuple[str, ...],
-        says(
-            "Masses whose exams lie further apart than the other masses lead one to expect (false alarm at "
-            "one site in 20); they took part"
-        ),
-    ]
-    left_out: Annotated[list[str], says("Exams of masses with repeats that took no part, and why")]
-    provenance: Annotated[
-        dict[str, Any],
-        says("inputs: the size calibration, and the draws of each exam (shape.npz), in the order of repeats"),
-    ]
+    repeats: Annotated[list[RepeatedMass], Meta(min_length=3)]  #: Masses at a visit with repeated exams
+    outlying: tuple[str, ...]
+    """Masses whose exams lie further apart than the other masses lead one to expect (false alarm at one site in 20);
+    they took part
+    """
+    left_out: list[str]  #: Exams of masses with repeats that took no part, and why
+    provenance: dict[str, Any]
+    """inputs: the size calibration, and the draws of each exam (shape.npz), in the order of repeats"""
 
     def __post_init__(self) -> None:
         _ = self.repeatability()  # refuses what is none

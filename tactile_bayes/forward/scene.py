@@ -53,21 +53,12 @@ FLAT_MM: Final = 100_000.0
 class Background(Record):
     """Mean pressure under the head away from lumps, over time."""
 
-    mean_kpa: Annotated[float, says("Level once contact is made, kPa.", gt=0, le=34)] = 9.5
-    drift_kpa: Annotated[float, says("Amplitude of a sine on top of it, kPa; below mean_kpa.", ge=0, le=34)] = 0.5
-    drift_period_s: Annotated[float, says("Its period, s.", gt=0, le=600)] = 3.0
-    ramp_s: Annotated[float, says("Time to press down at the start, s.", ge=0, le=60)] = 0.2
-    load_sharing: Annotated[
-        bool, says("true: constant force, each frame keeps its mean and the background falls beside a lump.")
-    ] = False
-
-
-Amplitude = Annotated[float, says("Height above a background of 1.", ge=-1, le=20)]
-SigmaX = Annotated[float, says("Standard deviation along the lump's first axis, mm.", ge=0.1, le=200)]
-SigmaY = Annotated[float, says("Standard deviation along its second axis, mm.", ge=0.1, le=200)]
-Angle = Annotated[
-    float, says("From the plane's x axis to the lump's first axis, positive towards y, degrees.", ge=-360, le=360)
-]
+    mean_kpa: Annotated[float, Meta(gt=0, le=34)] = 9.5  #: Level once contact is made, kPa.
+    drift_kpa: Annotated[float, Meta(ge=0, le=34)] = 0.5  #: Amplitude of a sine on top of it, kPa; below mean_kpa.
+    drift_period_s: Annotated[float, Meta(gt=0, le=600)] = 3.0  #: Its period, s.
+    ramp_s: Annotated[float, Meta(ge=0, le=60)] = 0.2  #: Time to press down at the start, s.
+    load_sharing: bool = False
+    """true: constant force, each frame keeps its mean and the background falls beside a lump."""
 
 
 class Lump(Record):
@@ -75,24 +66,24 @@ class Lump(Record):
 
     x_mm: Place = 0.0
     y_mm: Place = 0.0
-    amplitude: Amplitude = 0.3
-    sigma_x_mm: SigmaX = 5.0
-    sigma_y_mm: SigmaY = 5.0
-    angle_deg: Angle = 0.0
+    amplitude: Annotated[float, Meta(ge=-1, le=20)] = 0.3  #: Height above a background of 1.
+    sigma_x_mm: Annotated[float, Meta(ge=0.1, le=200)] = 5.0  #: Standard deviation along the lump's first axis, mm.
+    sigma_y_mm: Annotated[float, Meta(ge=0.1, le=200)] = 5.0  #: Standard deviation along its second axis, mm.
+    angle_deg: Annotated[float, Meta(ge=-360, le=360)] = 0.0
+    """From the plane's x axis to the lump's first axis, positive towards y, degrees."""
     d_mm: Diameter | None = None
 
 
 class Strokes(Record):
     """Path of the head: back and forth across, line after line along."""
 
-    lines: Annotated[int, says("Parallel lines.", ge=1, le=200)] = 5
-    spacing_mm: Annotated[float, says("Distance between lines, mm.", ge=0, le=100)] = 6.0
-    half_length_mm: Annotated[float, says("Reach of each line either side of the middle, mm.", ge=0, le=500)] = 34.0
-    wander_mm: Annotated[float, says("Amplitude of the slow departure from the line, mm.", ge=0, le=50)] = 0.5
-    tilt_deg: Annotated[float, says("Amplitude of the head's rocking, degrees.", ge=0, le=30)] = 2.0
-    yaw_deg: Annotated[
-        float, says("Turn of the head about the normal, away from square to the strokes, degrees.", ge=-90, le=90)
-    ] = 0.0
+    lines: Annotated[int, Meta(ge=1, le=200)] = 5  #: Parallel lines.
+    spacing_mm: Annotated[float, Meta(ge=0, le=100)] = 6.0  #: Distance between lines, mm.
+    half_length_mm: Annotated[float, Meta(ge=0, le=500)] = 34.0  #: Reach of each line either side of the middle, mm.
+    wander_mm: Annotated[float, Meta(ge=0, le=50)] = 0.5  #: Amplitude of the slow departure from the line, mm.
+    tilt_deg: Annotated[float, Meta(ge=0, le=30)] = 2.0  #: Amplitude of the head's rocking, degrees.
+    yaw_deg: Annotated[float, Meta(ge=-90, le=90)] = 0.0
+    """Turn of the head about the normal, away from square to the strokes, degrees."""
 
 
 Rows = Annotated[int, says("Taxels across the head.", ge=1, le=256)]
@@ -106,19 +97,13 @@ class Head(Record):
     rows: Rows = HEAD_ROWS
     columns: Columns = HEAD_COLUMNS
     pitch_mm: Pitch = HEAD_PITCH_MM
-    radius_mm: Annotated[float, says("Radius of the face, mm; above half the width.", gt=0, le=100_000)] = (
-        HEAD_RADIUS_MM
-    )
-    shoulder_mm: Annotated[float, says("Radius of its rounded edges, mm; 0 for none.", ge=0, le=100)] = 0.0
-    rim_mm: Annotated[
-        float,
-        says(
-            "Radius of the rounded edge around the taxels, mm, which presses but feels nothing (solid "
-            "model); in two dimensions the edge lies within the array, unless simulate --head shoulders-outside.",
-            ge=0,
-            le=100,
-        ),
-    ] = 3.0
+    radius_mm: Annotated[float, Meta(gt=0, le=100_000)] = HEAD_RADIUS_MM
+    """Radius of the face, mm; above half the width."""
+    shoulder_mm: Annotated[float, Meta(ge=0, le=100)] = 0.0  #: Radius of its rounded edges, mm; 0 for none.
+    rim_mm: Annotated[float, Meta(ge=0, le=100)] = 3.0
+    """Radius of the rounded edge around the taxels, mm, which presses but feels nothing (solid model); in two
+    dimensions the edge lies within the array, unless simulate --head shoulders-outside.
+    """
 
     def surface_mm(self) -> FloatArray:
         """(rows, columns, 3) taxel centres in `scanhead`: origin at the apex, z into the tissue, so z <= 0."""
@@ -152,35 +137,22 @@ class Head(Record):
 class Noise(Record):
     """Standard deviations of all random errors."""
 
-    element_kpa: Annotated[float, says("Of each reading, kPa.", ge=0, le=34)] = 0.2
-    tracker_mm: Annotated[float, says("Of each position, per axis, mm.", ge=0, le=50)] = 0.4
-    tracker_deg: Annotated[float, says("Of each rotation, per axis, degrees.", ge=0, le=30)] = 0.2
-    gain_spread: Annotated[
-        float, says("Between the true gains of the taxels, as a share; the calibration knows it.", ge=0, le=0.2)
-    ] = 0.03
-    gain_share: Annotated[float, says("Error of the calibration, as a share of the gain.", ge=0, le=0.2)] = 0.01
+    element_kpa: Annotated[float, Meta(ge=0, le=34)] = 0.2  #: Of each reading, kPa.
+    tracker_mm: Annotated[float, Meta(ge=0, le=50)] = 0.4  #: Of each position, per axis, mm.
+    tracker_deg: Annotated[float, Meta(ge=0, le=30)] = 0.2  #: Of each rotation, per axis, degrees.
+    gain_spread: Annotated[float, Meta(ge=0, le=0.2)] = 0.03
+    """Between the true gains of the taxels, as a share; the calibration knows it."""
+    gain_share: Annotated[float, Meta(ge=0, le=0.2)] = 0.01  #: Error of the calibration, as a share of the gain.
 
 
 class Tracker(Record):
     """Place of the tracker's base, and the sensor's pose in the handle; rotations are vectors."""
 
-    latency_ms: Annotated[float, says("By how much a pose's stamp is late, ms.", ge=0, le=1000)] = 0.0
-    base_rotation_deg: Annotated[Rotation, says("Rotation vector of base from plane, degrees.")] = (165.0, 25.0, -20.0)
-    base_offset_mm: Annotated[tuple[BaseMm, BaseMm, BaseMm], says("The plane's origin in base, mm.")] = (
-        175.0,
-        -112.0,
-        133.0,
-    )
-    lever_rotation_deg: Annotated[Rotation, says("Rotation vector of scanhead from tracker, degrees.")] = (
-        0.0,
-        3.0,
-        -90.0,
-    )
-    lever_offset_mm: Annotated[tuple[LeverMm, LeverMm, LeverMm], says("The tracker's sensor in scanhead, mm.")] = (
-        0.0,
-        10.0,
-        -55.0,
-    )
+    latency_ms: Annotated[float, Meta(ge=0, le=1000)] = 0.0  #: By how much a pose's stamp is late, ms.
+    base_rotation_deg: Rotation = (165.0, 25.0, -20.0)  #: Rotation vector of base from plane, degrees.
+    base_offset_mm: tuple[BaseMm, BaseMm, BaseMm] = (175.0, -112.0, 133.0)  #: The plane's origin in base, mm.
+    lever_rotation_deg: Rotation = (0.0, 3.0, -90.0)  #: Rotation vector of scanhead from tracker, degrees.
+    lever_offset_mm: tuple[LeverMm, LeverMm, LeverMm] = (0.0, 10.0, -55.0)  #: The tracker's sensor in scanhead, mm.
 
     def base_from_plane(self) -> FloatArray:
         """(4, 4) transform."""
@@ -194,26 +166,26 @@ class Tracker(Record):
 class Taxels(Record):
     """Faulty elements as (row, column): dead ones read 0, saturated ones full scale."""
 
-    dead: Annotated[tuple[Taxel, ...], says("Read 0 throughout.")] = ()
-    saturated: Annotated[tuple[Taxel, ...], says("Read full scale throughout.")] = ()
+    dead: tuple[Taxel, ...] = ()  #: Read 0 throughout.
+    saturated: tuple[Taxel, ...] = ()  #: Read full scale throughout.
 
 
 class SceneLandmarks(Record):
     """Landmarks in the scene's `plane`."""
 
-    touched: Annotated[bool, says("false leaves them out of the scan.")] = True
-    xiphoid_mm: Annotated[Point, says("Xiphoid, mm.")] = (-60.0, -90.0, 0.0)
-    sternal_notch_mm: Annotated[Point, says("Sternal notch, mm.")] = (-60.0, 90.0, 0.0)
-    nipple_mm: Annotated[Point, says("Nipple, mm; left out where it is not touched.")] | None = None
+    touched: bool = True  #: false leaves them out of the scan.
+    xiphoid_mm: Point = (-60.0, -90.0, 0.0)  #: Xiphoid, mm.
+    sternal_notch_mm: Point = (-60.0, 90.0, 0.0)  #: Sternal notch, mm.
+    nipple_mm: Point | None = None  #: Nipple, mm; left out where it is not touched.
 
 
 class Timing(Record):
     """Length and rates of a scan."""
 
-    seed: Annotated[int, says("Seed of the random numbers; --seed replaces it.", ge=0, le=2**63 - 1)] = 1
-    duration_s: Annotated[float, says("Duration of the scan, s.", gt=0, le=600)] = 7.0
-    frame_rate_hz: Annotated[float, says("Pressure frames per second.", gt=0, le=2000)] = 200.0
-    pose_rate_hz: Annotated[float, says("Tracker poses per second.", gt=0, le=2000)] = 120.0
+    seed: Annotated[int, Meta(ge=0, le=2**63 - 1)] = 1  #: Seed of the random numbers; --seed replaces it.
+    duration_s: Annotated[float, Meta(gt=0, le=600)] = 7.0  #: Duration of the scan, s.
+    frame_rate_hz: Annotated[float, Meta(gt=0, le=2000)] = 200.0  #: Pressure frames per second.
+    pose_rate_hz: Annotated[float, Meta(gt=0, le=2000)] = 120.0  #: Tracker poses per second.
 
 
 class Scene(Timing):

@@ -9,7 +9,7 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_bayes.declarations import Record, check, says
+from tactile_bayes.declarations import Meta, Record, check, says
 from tactile_bayes.errors import BadDataError, require
 from tactile_bayes.forward.contact import Head
 from tactile_bayes.geometry import FloatArray
@@ -215,22 +215,12 @@ Seat = Annotated[
 class SceneBody(Record):
     """Fat over gland on a rigid chest wall, for lumps of tissue."""
 
-    fat_kpa: Annotated[float, says("Young's modulus of fat, kPa.", gt=0, le=10_000)] = FAT_KPA
-    gland_ratio: Annotated[float, says("Modulus of gland over that of fat.", gt=0, le=10_000)] = GLAND_RATIO
-    thickness_mm: Annotated[float, says("Depth of the chest wall below the skin, mm.", gt=0, le=500)] = THICKNESS_MM
-    nu: Annotated[float, says("Poisson's ratio of everything, lumps included.", ge=0, lt=0.5)] = POISSON
-    fat_mm: (
-        Annotated[
-            float,
-            says(
-                "Depth of the boundary between fat and gland, mm. Left out, the lumps' seats decide; 15 mm "
-                "without lumps.",
-                gt=0,
-                le=500,
-            ),
-        ]
-        | None
-    ) = None
+    fat_kpa: Annotated[float, Meta(gt=0, le=10_000)] = FAT_KPA  #: Young's modulus of fat, kPa.
+    gland_ratio: Annotated[float, Meta(gt=0, le=10_000)] = GLAND_RATIO  #: Modulus of gland over that of fat.
+    thickness_mm: Annotated[float, Meta(gt=0, le=500)] = THICKNESS_MM  #: Depth of the chest wall below the skin, mm.
+    nu: Annotated[float, Meta(ge=0, lt=0.5)] = POISSON  #: Poisson's ratio of everything, lumps included.
+    fat_mm: Annotated[float, Meta(gt=0, le=500)] | None = None
+    """Depth of the boundary between fat and gland, mm. Left out, the lumps' seats decide; 15 mm without lumps."""
 
 
 class SolidLump(Record):
@@ -264,15 +254,14 @@ class Rib(Record):
     The balls have no seat: the boundary of fat and gland is the lumps' or the body's.
     """
 
-    x_mm: Annotated[float, says("Middle of the row in the plane, mm.", ge=-500, le=500)] = 0.0
-    y_mm: Annotated[float, says("Middle of the row in the plane, mm.", ge=-500, le=500)] = 26.0
-    d_mm: Annotated[float, says("Diameter of the balls, mm.", gt=0, le=100)] = 12.0
-    depth_mm: Annotated[float, says("Depth of the balls' centres, mm.", gt=0, le=500)] = 12.0
-    spacing_mm: Annotated[float, says("From ball to ball, mm; they may overlap.", ge=0.5, le=100)] = 8.0
-    half_length_mm: Annotated[
-        float, says("The outermost balls lie at most this far from the middle, mm.", gt=0, le=500)
-    ] = 40.0
-    stiffness_ratio: Annotated[float, says("Modulus of the balls over that of fat.", gt=0, le=1_000_000)] = 100.0
+    x_mm: Annotated[float, Meta(ge=-500, le=500)] = 0.0  #: Middle of the row in the plane, mm.
+    y_mm: Annotated[float, Meta(ge=-500, le=500)] = 26.0  #: Middle of the row in the plane, mm.
+    d_mm: Annotated[float, Meta(gt=0, le=100)] = 12.0  #: Diameter of the balls, mm.
+    depth_mm: Annotated[float, Meta(gt=0, le=500)] = 12.0  #: Depth of the balls' centres, mm.
+    spacing_mm: Annotated[float, Meta(ge=0.5, le=100)] = 8.0  #: From ball to ball, mm; they may overlap.
+    half_length_mm: Annotated[float, Meta(gt=0, le=500)] = 40.0
+    """The outermost balls lie at most this far from the middle, mm."""
+    stiffness_ratio: Annotated[float, Meta(gt=0, le=1_000_000)] = 100.0  #: Modulus of the balls over that of fat.
 
     def balls(self) -> tuple[SolidLump, ...]:
         """The row as lumps."""

@@ -7,7 +7,7 @@ from typing import Annotated, Final, Literal
 
 import numpy as np
 
-from tactile_bayes.declarations import Meta, Record, field, replace, rounded, says
+from tactile_bayes.declarations import Meta, Record, field, replace, rounded
 from tactile_bayes.errors import check_number
 from tactile_bayes.geometry import FloatArray, IndexArray
 from tactile_bayes.presets import INTERVAL
@@ -99,14 +99,10 @@ class Quantity(Record, kw_only=True):
     low: float
     high: float
     """`low`, `high`: Ends of the equal-tailed interval of `probability`."""
-    mc_error: Annotated[
-        float,
-        says(
-            "Monte-Carlo standard error of the wider of low and high, in their unit: digits beyond it mean "
-            "nothing, whatever number of digits is written.",
-            ge=0,
-        ),
-    ] = 0.0
+    mc_error: Annotated[float, Meta(ge=0)] = 0.0
+    """Monte-Carlo standard error of the wider of low and high, in their unit: digits beyond it mean nothing, whatever
+    number of digits is written.
+    """
     probability: Annotated[float, Meta(gt=0, lt=1)]
     kind: Literal["eti", "hdi"]
 

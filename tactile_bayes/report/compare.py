@@ -8,7 +8,7 @@ from typing import Annotated, Any, Final, Literal
 
 import numpy as np
 
-from tactile_bayes.declarations import UNSET, Meta, Record, UnsetType, field, rounded, says
+from tactile_bayes.declarations import UNSET, Meta, Record, UnsetType, field, rounded
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.reports import (
     Above0,
@@ -48,14 +48,10 @@ class Visit(Record):
     """A visit with its size and its maps."""
 
     visit: Number1
-    day: Annotated[float | None, says("Days from the first visit; null where not given.")]
-    max_size_mm: Annotated[
-        Quantity | None, says("Largest diameter; the joint posterior's, in which the lump keeps its form.")
-    ]
-    fat_mm: Annotated[
-        float | None,
-        says("Depth of the fat under the head by the visit's pressure profiles; null where not all visits tell it."),
-    ]
+    day: float | None  #: Days from the first visit; null where not given.
+    max_size_mm: Quantity | None  #: Largest diameter; the joint posterior's, in which the lump keeps its form.
+    fat_mm: float | None
+    """Depth of the fat under the head by the visit's pressure profiles; null where not all visits tell it."""
     maps: Annotated[tuple[VisitMap, ...], Meta(min_length=1)]
 
 
@@ -64,15 +60,10 @@ class VisitPlace(Record):
 
     visit: Annotated[int, Meta(ge=2)]
     distance_mm: Least0 | None
-    sd_mm: Annotated[
-        Least0 | None, says("SD by which one mass comes out apart between the visits, in the direction of the shift.")
-    ]
-    shift_mm: Annotated[
-        tuple[float, float] | None, says("x and y in the patient's frame, from the first visit's place.")
-    ]
-    probability: Annotated[
-        Chance | None, says("That one mass comes out as far apart or farther; below 0.02 the visits are not compared.")
-    ]
+    sd_mm: Least0 | None  #: SD by which one mass comes out apart between the visits, in the direction of the shift.
+    shift_mm: tuple[float, float] | None  #: x and y in the patient's frame, from the first visit's place.
+    probability: Chance | None
+    """That one mass comes out as far apart or farther; below 0.02 the visits are not compared."""
 
 
 class GrownBy(Record):
@@ -121,9 +112,7 @@ class TrendReport(Record):
     days: Above0
     percent_per_day: Rate
     doubling_days: Doubling
-    straight_line_probability: Annotated[
-        Chance | None, says("That sizes on a straight line come out as far from one or farther.")
-    ]
+    straight_line_probability: Chance | None  #: That sizes on a straight line come out as far from one or farther.
 
 
 class AnotherChange(Record):
@@ -139,20 +128,16 @@ class ChangeReport(Record):
 
     earlier: Number1
     later: Annotated[int, Meta(ge=2)]
-    verdict: Annotated[
-        Literal["grown", "shrunk", "no_change_shown"],
-        says("grown or shrunk where the 95 % interval leaves out no change."),
-    ]
-    log_ratio: Annotated[Quantity, says("ln of the later diameter over the earlier.")]
-    percent: Annotated[Quantity, says("Change of the diameter in percent.")]
+    verdict: Literal["grown", "shrunk", "no_change_shown"]
+    """grown or shrunk where the 95 % interval leaves out no change."""
+    log_ratio: Quantity  #: ln of the later diameter over the earlier.
+    percent: Quantity  #: Change of the diameter in percent.
     probability_grown: Chance
     grown_by: tuple[GrownBy, ...]
     smallest_detectable_percent: Detectable
     growth_rate: GrowthRate | None
-    another_exam: Annotated[
-        AnotherChange | None,
-        says("The same if exams of one mass differ as the paper's maps did; null where their spread is stated."),
-    ]
+    another_exam: AnotherChange | None
+    """The same if exams of one mass differ as the paper's maps did; null where their spread is stated."""
 
     @property
     def for_alike_exams_only(self) -> bool:
@@ -169,30 +154,21 @@ class CompareReport(Report, kw_only=True):
     """Change of a mass's size between visits."""
 
     schema: Literal["tactile-bayes/compare/1"]
-    status: Annotated[
-        Literal["compared", "not_one_mass", "no_estimate"],
-        says("not_one_mass: the visits were not shown to be of one mass; no_estimate: a visit has no size."),
-    ]
+    status: Literal["compared", "not_one_mass", "no_estimate"]
+    """not_one_mass: the visits were not shown to be of one mass; no_estimate: a visit has no size."""
     verdict: Judgement
     entries: Entries = field(name="findings")
-    reason: Annotated[str, says("Why nothing is compared; empty otherwise.")]
-    advice: Annotated[str, says("What would help where nothing is compared.")]
+    reason: str  #: Why nothing is compared; empty otherwise.
+    advice: str  #: What would help where nothing is compared.
     visits: Annotated[tuple[Visit, ...], Meta(min_length=2)]
-    places: Annotated[
-        tuple[VisitPlace, ...],
-        says("How far the mass of each later visit lies from the first visit's, by the landmarks; null without."),
-    ]
-    changes: Annotated[
-        tuple[ChangeReport, ...],
-        says("Change from the first visit to each later one; empty where nothing is compared."),
-    ]
-    trend: Annotated[
-        TrendReport | None, says("Straight line of ln d over three visits and more with days; null otherwise.")
-    ]
-    between_map_sd: Annotated[Least0 | None, says("SD of ln d between the exams of a visit, root mean square.")]
-    repeatability: Annotated[
-        str | UnsetType, says("How far exams of one mass lie apart at this site, where --repeatability told it")
-    ] = UNSET
+    places: tuple[VisitPlace, ...]
+    """How far the mass of each later visit lies from the first visit's, by the landmarks; null without."""
+    changes: tuple[ChangeReport, ...]
+    """Change from the first visit to each later one; empty where nothing is compared."""
+    trend: TrendReport | None  #: Straight line of ln d over three visits and more with days; null otherwise.
+    between_map_sd: Least0 | None  #: SD of ln d between the exams of a visit, root mean square.
+    repeatability: str | UnsetType = UNSET
+    """How far exams of one mass lie apart at this site, where --repeatability told it"""
     left_out: tuple[str, ...]
     research_use: str
     provenance: dict[str, Any]

@@ -96,19 +96,17 @@ class QuantityFile(Record):
     median: float | None
     low: float | None
     high: float | None
-    mc_error: Annotated[float | None, says("Monte-Carlo error of the interval's ends.")]
+    mc_error: float | None  #: Monte-Carlo error of the interval's ends.
 
 
 class AnswerFile(Record):
     """What one estimate says."""
 
-    reason: Annotated[str, says("Why there is no number; empty where there is one.")]
+    reason: str  #: Why there is no number; empty where there is one.
     detected_probability: Annotated[float, Meta(ge=0, le=1)] | None
-    method: Annotated[str, says("The method that drew.")]
-    quantities: Annotated[
-        dict[str, QuantityFile], says("Medians and 95 % intervals, mm: max_size_mm, sigma_x_mm, sigma_y_mm.")
-    ]
-    variance_share: Annotated[dict[str, float], says("Percent of the variance of ln(largest size) by source.")]
+    method: str  #: The method that drew.
+    quantities: dict[str, QuantityFile]  #: Medians and 95 % intervals, mm: max_size_mm, sigma_x_mm, sigma_y_mm.
+    variance_share: dict[str, float]  #: Percent of the variance of ln(largest size) by source.
 
 
 class ReferenceFile(Record):
@@ -127,16 +125,14 @@ class SettingFile(Record):
     axis: str
     setting: str
     default: bool
-    usable: Annotated[
-        bool, says("Whether it may be chosen to save time; other settings are another model or less data.")
-    ]
+    usable: bool  #: Whether it may be chosen to save time; other settings are another model or less data.
     runs: Annotated[int, Meta(ge=1)]
     cpu_s: Seconds
     median_off_mm: float | None
-    ends_off_mm: Annotated[float | None, says("Root mean square over runs and both ends of the reported interval.")]
+    ends_off_mm: float | None  #: Root mean square over runs and both ends of the reported interval.
     width_ends_off_mm: float | None
     answer: AnswerFile
-    frontier: Annotated[bool, says("No other setting is quicker and nearer at once.")]
+    frontier: bool  #: No other setting is quicker and nearer at once.
 
 
 class PooledFile(Record):
@@ -145,7 +141,7 @@ class PooledFile(Record):
     maps: Annotated[int, Meta(ge=1)]
     cpu_s: float
     answer: AnswerFile
-    another_half_width_mm: Annotated[float | None, says("Half width of the interval of another exam, mm.")]
+    another_half_width_mm: float | None  #: Half width of the interval of another exam, mm.
 
 
 class TradeoffFile(Record):
@@ -156,7 +152,7 @@ class TradeoffFile(Record):
     tolerance_mm: Annotated[float, Meta(gt=0)]
     reference: ReferenceFile
     settings: Annotated[tuple[SettingFile, ...], Meta(min_length=1)]
-    enough: Annotated[str | None, says("The cheapest usable setting within the tolerance.")]
+    enough: str | None  #: The cheapest usable setting within the tolerance.
     pooled: tuple[PooledFile, ...]
     shared_cpu_s: Seconds
     advice: Annotated[tuple[str, ...], Meta(min_length=1)]

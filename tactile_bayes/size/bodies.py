@@ -26,7 +26,7 @@ from typing import Annotated, Final
 
 import numpy as np
 
-from tactile_bayes.declarations import Record, replace, says
+from tactile_bayes.declarations import Meta, Record, replace
 from tactile_bayes.errors import BadDataError, UsageError, check_number, meant
 from tactile_bayes.geometry import BoolArray, FloatArray, Matrix, Vector
 from tactile_bayes.size.draws import BetweenMaps, ShapeDraws, Supposition
@@ -88,10 +88,10 @@ class Spread(Record, eq=False):
     powers: tuple[Power, ...]
     mean: Vector
     covariance: Matrix
-    log_exam_sd: Annotated[float, says("ln SD between exams of a body.")]
+    log_exam_sd: float  #: ln SD between exams of a body.
     log_exam_sd_variance: Share
-    other_sd: Annotated[float, says("By which bodies of another origin depart.", ge=0)]
-    other_source: Annotated[str, says("What told it.")]
+    other_sd: Annotated[float, Meta(ge=0)]  #: By which bodies of another origin depart.
+    other_source: str  #: What told it.
 
     def __post_init__(self) -> None:
         s = len(self.powers)
@@ -103,22 +103,22 @@ class Spread(Record, eq=False):
 class BodyLaw(Record, eq=False, kw_only=True):
     """Law learned over a population: Eq 6 by the depth of the fat, its residual, and what a map does not show."""
 
-    source: Annotated[str, says("What the table was made of.")]
-    bodies: Annotated[Mapping[str, tuple[float, float]], says("Ranges of its lumps and bodies, by its columns.")]
+    source: str  #: What the table was made of.
+    bodies: Mapping[str, tuple[float, float]]  #: Ranges of its lumps and bodies, by its columns.
     recipe: Recipe
     centre: Centre
     eq6: Eq6Law
-    residual: Annotated[Residual | None, says("null for Eq 6 alone.")]
+    residual: Residual | None  #: null for Eq 6 alone.
     spread: Spread
     round_lumps: RoundLumps
-    depth: Annotated[FatDepth | None, says("null where the table's maps did not tell it.")]
-    feature_powers: Annotated[tuple[Power, ...], says("Of u, v and w in the features of a map.")]
-    information_inverse: Annotated[Matrix, says("For the leverage of a map, over its features.")]
-    most_leverage: Annotated[Above0, says("Of maps inside the table.")]
+    depth: FatDepth | None  #: null where the table's maps did not tell it.
+    feature_powers: tuple[Power, ...]  #: Of u, v and w in the features of a map.
+    information_inverse: Matrix  #: For the leverage of a map, over its features.
+    most_leverage: Above0  #: Of maps inside the table.
     domain: Domain
-    hidden: Annotated[HiddenTerms | None, says("What B is made of.")]
-    hidden_any: Annotated[HiddenTerms | None, says("The same where the depth is not known.")]
-    fit: Annotated[Mapping[str, float], says("Figures of the fit.")]
+    hidden: HiddenTerms | None  #: What B is made of.
+    hidden_any: HiddenTerms | None  #: The same where the depth is not known.
+    fit: Mapping[str, float]  #: Figures of the fit.
 
     def __post_init__(self) -> None:
         s, c = len(self.spread.powers), len(self.feature_powers)

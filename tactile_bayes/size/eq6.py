@@ -21,7 +21,7 @@ from typing import Annotated, Final, Literal
 
 import numpy as np
 
-from tactile_bayes.declarations import Meta, Record, field, replace, says
+from tactile_bayes.declarations import Meta, Record, field, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import BoolArray, FloatArray, Matrix, Vector
 from tactile_bayes.inference.draws import even_replicates, normal_quantile, paired_points
@@ -40,14 +40,10 @@ BY_DEPTH: Final[Powers] = (*((row, i, k) for row in (MU, F) for k in range(3) fo
 class Eq6Law(Record, eq=False):
     """Posterior of Eq 6's coefficients over a population, taken as normal: d = exp(mu + v - f u) + b."""
 
-    powers: Annotated[
-        tuple[Power, ...], says("Which of mu (0), f (1) and b (2) each coefficient is of, and its powers of v and w.")
-    ]
+    powers: tuple[Power, ...]  #: Which of mu (0), f (1) and b (2) each coefficient is of, and its powers of v and w.
     mean: Vector
     covariance: Matrix
-    log_amplitude_one_deep: Annotated[
-        float, says("ln a of lumps one diameter deep, where Delta sigma is 1: e = exp(-f times this).")
-    ]
+    log_amplitude_one_deep: float  #: ln a of lumps one diameter deep, where Delta sigma is 1: e = exp(-f times this).
 
     def __post_init__(self) -> None:
         k = len(self.powers)
@@ -95,8 +91,8 @@ class AxisCalibration(Record, eq=False):
     The residual standard deviation of ln d is :math:`s\,(a / a_0)^{-g}`: fainter maps tell less.
     """
 
-    draws: Annotated[Matrix, says("m, b (mm), e, f, scatter and its slope in each row.")]
-    reference_amplitude: Annotated[terms.Above0, says("Of the scatter.")]
+    draws: Matrix  #: m, b (mm), e, f, scatter and its slope in each row.
+    reference_amplitude: terms.Above0  #: Of the scatter.
     domain: terms.Domain
     fit: Mapping[str, float] = field(default_factory=dict)
 
@@ -133,7 +129,7 @@ class LeftOutErrors(Record):
 
     cases: Annotated[int, Meta(ge=1)]
     geometries: Annotated[int, Meta(ge=1)]
-    least_stiffness_ratio: Annotated[terms.Share, says("Softer lumps took no part.")]
+    least_stiffness_ratio: terms.Share  #: Softer lumps took no part.
     eq6: Annotated[Mapping[str, terms.Share], Meta(extra_json_schema={"required": ["both"]})]
     log_quadratic: Annotated[Mapping[str, terms.Share], Meta(extra_json_schema={"required": ["both"]})]
 
@@ -145,15 +141,14 @@ class LeftOutErrors(Record):
 class SizeCalibration(Record, eq=False):
     """Eq 6 for each axis of the head, from a study or phantoms: the same for all maps, whatever their fat."""
 
-    x: Annotated[AxisCalibration, says("Across the head.")]
-    y: Annotated[AxisCalibration, says("Along the head; the same where the table has one width.")]
-    residual_correlation: Annotated[
-        float, says("A lump that looks large along one axis tends to along the other.", ge=-1, le=1)
-    ]
+    x: AxisCalibration  #: Across the head.
+    y: AxisCalibration  #: Along the head; the same where the table has one width.
+    residual_correlation: Annotated[float, Meta(ge=-1, le=1)]
+    """A lump that looks large along one axis tends to along the other."""
     recipe: terms.Recipe
     axes: Annotated[tuple[Literal["x", "y", "both"], ...], Meta(min_length=1, max_length=2)] = ("x", "y")
     left_out: LeftOutErrors | None = None
-    cautions: Annotated[tuple[str, ...], says("What of the table's lumps is of one kind, or unlike a patient's.")] = ()
+    cautions: tuple[str, ...] = ()  #: What of the table's lumps is of one kind, or unlike a patient's.
 
     @property
     def fat_mm(self) -> None:

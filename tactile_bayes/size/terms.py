@@ -83,15 +83,13 @@ def monomials(values: Sequence[FloatArray], exponents: Sequence[tuple[int, ...]]
 class Recipe(Record):
     """How a table's maps were built and fitted; a patient's map must agree."""
 
-    normalise: Annotated[Normalise, says("As the option of `map`.")]
-    background: Annotated[Background, says("Whether the fit had a level of its own.")]
-    radius_mm: Annotated[float, says("Of the fitted window.", gt=0)]
-    declared: Annotated[bool, says("true: stated for a table made elsewhere; false: the program made the maps.")]
-    noise: Annotated[Noise, says("independent: least squares; field: correlated noise.")] = "independent"
-    flat_field: Annotated[
-        bool | None, says("Whether the head's own response was taken off; null where nobody says.")
-    ] = None
-    head: Annotated[HeadShape | None, says("Head that the maps were made with; null where nobody says.")] = None
+    normalise: Normalise  #: As the option of `map`.
+    background: Background  #: Whether the fit had a level of its own.
+    radius_mm: Annotated[float, Meta(gt=0)]  #: Of the fitted window.
+    declared: bool  #: true: stated for a table made elsewhere; false: the program made the maps.
+    noise: Noise = "independent"  #: independent: least squares; field: correlated noise.
+    flat_field: bool | None = None  #: Whether the head's own response was taken off; null where nobody says.
+    head: HeadShape | None = None  #: Head that the maps were made with; null where nobody says.
 
     @property
     def _settings(self) -> dict[str, str]:
@@ -127,12 +125,11 @@ class Recipe(Record):
 class RoundLumps(Record, eq=False):
     """Half log axis ratio of a ball's map, and how far maps are from it."""
 
-    coefficients: Annotated[Vector, says("Of the powers of the spread.")]
-    body_sd: Annotated[float, says("Between bodies.", ge=0)]
-    exam_sd: Annotated[float, says("Between exams of a body.", ge=0)]
-    map_factor: Annotated[
-        float, says("Variance over that of a map's posterior: deep and faint lumps are off by more.", ge=0)
-    ]
+    coefficients: Vector  #: Of the powers of the spread.
+    body_sd: Annotated[float, Meta(ge=0)]  #: Between bodies.
+    exam_sd: Annotated[float, Meta(ge=0)]  #: Between exams of a body.
+    map_factor: Annotated[float, Meta(ge=0)]
+    """Variance over that of a map's posterior: deep and faint lumps are off by more."""
 
     def variance(self, of_maps: FloatArray, *, maps: int = 1) -> FloatArray:
         """Variance of the mean excess over some maps of a mass, whose posteriors give its mean this variance."""
@@ -146,14 +143,13 @@ class HiddenTerms(Record, eq=False, omit_defaults=True):
     """
 
     names: Annotated[tuple[str, ...], Meta(min_length=1)]
-    expected: Annotated[Matrix, says("Coefficients of a map's features in what is expected of each.")]
-    covariance: Annotated[Matrix, says("About that.")]
-    with_body: Annotated[Vector, says("Covariance with B over its SD.")]
-    body_variance: Annotated[float, says("Of B in the units of with_body.", gt=0)]
-    inverted: Annotated[tuple[str, ...], says("Properties that enter by their inverse.")] = ()
-    most_sd: Annotated[float, says("SD of B beyond which they explain no more: there the map is unlike.", gt=0)] = (
-        float("inf")
-    )
+    expected: Matrix  #: Coefficients of a map's features in what is expected of each.
+    covariance: Matrix  #: About that.
+    with_body: Vector  #: Covariance with B over its SD.
+    body_variance: Annotated[float, Meta(gt=0)]  #: Of B in the units of with_body.
+    inverted: tuple[str, ...] = ()  #: Properties that enter by their inverse.
+    most_sd: Annotated[float, Meta(gt=0)] = float("inf")
+    """SD of B beyond which they explain no more: there the map is unlike."""
 
     def __post_init__(self) -> None:
         k = len(self.names)
@@ -198,21 +194,16 @@ class SiteShift(Record, eq=False):
     from the simulation.
     """
 
-    centre: Annotated[float, says("p_0.")] = field(name="centre_log_width")
-    mean: Annotated[Vector, says("Of c0 and c1.")]
+    centre: float = field(name="centre_log_width")  #: p_0.
+    mean: Vector  #: Of c0 and c1.
     covariance: Matrix
-    phantoms: Annotated[int, says("Distinct lumps.", ge=3)]
+    phantoms: Annotated[int, Meta(ge=3)]  #: Distinct lumps.
     maps: Annotated[int, Meta(ge=3)]
-    base: Annotated[str, says("Name of the calibration that is corrected.")]
-    uses_fat: Annotated[
-        bool, says("Whether the phantoms were sized with the depth of fat; if not, no size with this is.")
-    ]
-    fit: Annotated[
-        Mapping[str, float],
-        says("log_width: mean p of the phantoms; spread_factor; sd_before and sd_after: RMS of ln d."),
-    ]
-    cautions: Annotated[tuple[str, ...], says("Why it should be looked at.")] = ()
-    left_out: Annotated[tuple[str, ...], says("Phantoms that took no part, and why.")] = ()
+    base: str  #: Name of the calibration that is corrected.
+    uses_fat: bool  #: Whether the phantoms were sized with the depth of fat; if not, no size with this is.
+    fit: Mapping[str, float]  #: log_width: mean p of the phantoms; spread_factor; sd_before and sd_after: RMS of ln d.
+    cautions: tuple[str, ...] = ()  #: Why it should be looked at.
+    left_out: tuple[str, ...] = ()  #: Phantoms that took no part, and why.
     parameters: tuple[Literal["c0"], Literal["c1"]] = ("c0", "c1")
 
     def __post_init__(self) -> None:
@@ -323,15 +314,15 @@ def head_profile(quality: Mapping[str, float]) -> tuple[float, ...] | None:
 class FatDepth(Record, eq=False):
     """Regression of the ln of the depth of the fat-gland boundary in mm on the head's pressure profile."""
 
-    centre: Annotated[Vector, says("Of the profile.")]
-    scale: Annotated[Vector, says("Of the profile.")]
-    coefficients: Annotated[Vector, says("Of 1, the scaled profile, and its products.")]
-    information_inverse: Annotated[Matrix, says("For the leverage of a new profile.")]
-    most_leverage: Annotated[Above0, says("Largest in the table.")]
-    log_sd: Annotated[Share, says("How far single exams of the table lie from the truth.")]
-    fat_mm: Annotated[Range, says("Range of the depth in the table.")]
-    expected: Annotated[Vector, says("Of a full quadratic in u and v: w without a profile.")]
-    expected_sd: Annotated[Share, says("Of w about that.")]
+    centre: Vector  #: Of the profile.
+    scale: Vector  #: Of the profile.
+    coefficients: Vector  #: Of 1, the scaled profile, and its products.
+    information_inverse: Matrix  #: For the leverage of a new profile.
+    most_leverage: Above0  #: Largest in the table.
+    log_sd: Share  #: How far single exams of the table lie from the truth.
+    fat_mm: Range  #: Range of the depth in the table.
+    expected: Vector  #: Of a full quadratic in u and v: w without a profile.
+    expected_sd: Share  #: Of w about that.
     profile: tuple[str, ...] = HEAD_PROFILE
 
     def __post_init__(self) -> None:
@@ -411,9 +402,9 @@ _NUGGET = 1e-6
 class Kernel(Record, eq=False, dict=True):
     """Squared exponential kernel between values of u, v and w, and the functions that it gives by its points."""
 
-    points: Annotated[Matrix, says("u, v and w of the points.")]
-    lengths: Annotated[Vector, says("Length of the kernel along each.")]
-    scale: Annotated[float, says("SD of the process before any data.", gt=0)]
+    points: Matrix  #: u, v and w of the points.
+    lengths: Vector  #: Length of the kernel along each.
+    scale: Annotated[float, Meta(gt=0)]  #: SD of the process before any data.
 
     def __post_init__(self) -> None:
         check_shapes(self, points=(len(self.points), 3), lengths=(3,))
@@ -442,10 +433,8 @@ class Kernel(Record, eq=False, dict=True):
 class Residual(Kernel, eq=False, dict=True):
     """Gaussian process in u, v and w that is added to ln d, with the posterior of its weights."""
 
-    mean: Annotated[Vector, says("Of the weights.")]
-    covariance_factor: Annotated[
-        tuple[tuple[float, ...], ...], says("Rows of the Cholesky factor of the weights' covariance.")
-    ]
+    mean: Vector  #: Of the weights.
+    covariance_factor: tuple[tuple[float, ...], ...]  #: Rows of the Cholesky factor of the weights' covariance.
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from tactile_bayes.declarations import Meta, Record, as_dict, field, names_of, replace, says
+from tactile_bayes.declarations import Meta, Record, as_dict, field, names_of, replace
 from tactile_bayes.errors import BadDataError, TactileBayesError
 from tactile_bayes.forward.scene import FLAT_MM, Background, Head, Noise, Scene, Strokes, Tracker
 from tactile_bayes.forward.simulate import simulate
@@ -65,49 +65,47 @@ class BodyPrior(_Ranges):
     carcinomas under a few per cent of strain (Samani et al. 2007) to rigid, moduli lie about the paper's 5 kPa and 10.
     """
 
-    d_mm: Annotated[tuple[Diameter, Diameter], says("Diameter of the lump, a ball, mm.")] = (5.0, 30.0)
-    depth_ratio: Annotated[tuple[DepthRatio, DepthRatio], says("Depth of its centre over its diameter.")] = (0.56, 1.8)
-    stiffness_ratio: Annotated[tuple[Ratio, Ratio], says("Its modulus over that of fat.")] = (6.0, 100.0)
-    seat: Annotated[
-        tuple[Seat, Seat],
-        says("How far it stands out of the gland: 0 centred on the gland's surface, 1 touching it from above."),
-    ] = (0.0, 1.2)
-    fat_kpa: Annotated[tuple[Modulus, Modulus], says("Young's modulus of fat, kPa.")] = (3.5, 7.5)
-    gland_ratio: Annotated[tuple[Ratio, Ratio], says("Modulus of gland over that of fat.")] = (5.0, 16.0)
-    thickness_mm: Annotated[
-        tuple[Thickness, Thickness], says("Thickness of the breast under the head, mm; more where the lump needs it.")
-    ] = (40.0, 90.0)
+    d_mm: tuple[Diameter, Diameter] = (5.0, 30.0)  #: Diameter of the lump, a ball, mm.
+    depth_ratio: tuple[DepthRatio, DepthRatio] = (0.56, 1.8)  #: Depth of its centre over its diameter.
+    stiffness_ratio: tuple[Ratio, Ratio] = (6.0, 100.0)  #: Its modulus over that of fat.
+    seat: tuple[Seat, Seat] = (0.0, 1.2)
+    """How far it stands out of the gland: 0 centred on the gland's surface, 1 touching it from above."""
+    fat_kpa: tuple[Modulus, Modulus] = (3.5, 7.5)  #: Young's modulus of fat, kPa.
+    gland_ratio: tuple[Ratio, Ratio] = (5.0, 16.0)  #: Modulus of gland over that of fat.
+    thickness_mm: tuple[Thickness, Thickness] = (40.0, 90.0)
+    """Thickness of the breast under the head, mm; more where the lump needs it."""
 
 
 class ExamPrior(_Ranges):
     """Ranges of an examiner's technique and of the instrument's errors, drawn anew for each scan."""
 
-    mean_kpa: Annotated[tuple[Pressure, Pressure], says("Mean pressure of a scan, kPa.")] = (7.0, 12.0)
-    drift_kpa: Annotated[tuple[To10, To10], says("Amplitude of its drift, kPa; below the lowest mean_kpa.")] = (
+    mean_kpa: tuple[Pressure, Pressure] = (7.0, 12.0)  #: Mean pressure of a scan, kPa.
+    drift_kpa: tuple[To10, To10] = (
         0.2,
         1.5,
     )
-    yaw_deg: Annotated[tuple[Yaw, Yaw], says("Turn of the head about the normal, degrees.")] = (-30.0, 30.0)
-    tilt_deg: Annotated[tuple[Tilt, Tilt], says("Amplitude of its rocking, degrees.")] = (0.5, 4.0)
-    wander_mm: Annotated[tuple[To10, To10], says("Departure from the line, mm.")] = (0.2, 1.5)
-    lines: Annotated[tuple[Lines, Lines], says("Parallel lines.")] = (4, 7)
-    spacing_mm: Annotated[tuple[Length, Length], says("Distance between them, mm.")] = (4.0, 7.0)
-    half_length_mm: Annotated[tuple[Length, Length], says("Reach of a line either side of the middle, mm.")] = (
+    """Amplitude of its drift, kPa; below the lowest mean_kpa."""
+    yaw_deg: tuple[Yaw, Yaw] = (-30.0, 30.0)  #: Turn of the head about the normal, degrees.
+    tilt_deg: tuple[Tilt, Tilt] = (0.5, 4.0)  #: Amplitude of its rocking, degrees.
+    wander_mm: tuple[To10, To10] = (0.2, 1.5)  #: Departure from the line, mm.
+    lines: tuple[Lines, Lines] = (4, 7)  #: Parallel lines.
+    spacing_mm: tuple[Length, Length] = (4.0, 7.0)  #: Distance between them, mm.
+    half_length_mm: tuple[Length, Length] = (
         28.0,
         38.0,
     )
-    off_centre_mm: Annotated[
-        tuple[Shift, Shift], says("Distance of the strokes' middle from the lump, each way, mm.")
-    ] = (-6.0, 6.0)
-    line_s: Annotated[tuple[Seconds, Seconds], says("Time for a line, s.")] = (1.0, 1.8)
-    element_kpa: Annotated[tuple[To10, To10], says("SD of a reading, kPa.")] = (0.02, 0.3)
-    tracker_mm: Annotated[tuple[To10, To10], says("SD of the tracker's position, mm.")] = (0.05, 0.6)
-    tracker_deg: Annotated[tuple[To10, To10], says("SD of its attitude, degrees.")] = (0.02, 0.3)
-    gain_share: Annotated[tuple[Share, Share], says("Error of the array's calibration, as a share of the gain.")] = (
+    """Reach of a line either side of the middle, mm."""
+    off_centre_mm: tuple[Shift, Shift] = (-6.0, 6.0)  #: Distance of the strokes' middle from the lump, each way, mm.
+    line_s: tuple[Seconds, Seconds] = (1.0, 1.8)  #: Time for a line, s.
+    element_kpa: tuple[To10, To10] = (0.02, 0.3)  #: SD of a reading, kPa.
+    tracker_mm: tuple[To10, To10] = (0.05, 0.6)  #: SD of the tracker's position, mm.
+    tracker_deg: tuple[To10, To10] = (0.02, 0.3)  #: SD of its attitude, degrees.
+    gain_share: tuple[Share, Share] = (
         0.002,
         0.02,
     )
-    latency_ms: Annotated[tuple[Latency, Latency], says("By how much the stamp of a pose is late, ms.")] = (0.0, 12.0)
+    """Error of the array's calibration, as a share of the gain."""
+    latency_ms: tuple[Latency, Latency] = (0.0, 12.0)  #: By how much the stamp of a pose is late, ms.
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -122,13 +120,10 @@ class BodiesFile(Record):
     Each value is a range, low end first; a missing key keeps its default.
     """
 
-    bodies: Annotated[
-        BodyPrior,
-        says("Lumps and bodies, each property drawn by itself; sizes, stiffnesses and moduli on the log scale."),
-    ] = field(default_factory=BodyPrior)
-    exams: Annotated[
-        ExamPrior, says("Technique of the examiner and errors of the instrument, drawn anew for each exam.")
-    ] = field(default_factory=ExamPrior)
+    bodies: BodyPrior = field(default_factory=BodyPrior)
+    """Lumps and bodies, each property drawn by itself; sizes, stiffnesses and moduli on the log scale."""
+    exams: ExamPrior = field(default_factory=ExamPrior)
+    """Technique of the examiner and errors of the instrument, drawn anew for each exam."""
 
 
 def draw_body(prior: BodyPrior, rng: np.random.Generator) -> tuple[SceneBody, SolidLump]:

@@ -11,7 +11,7 @@ from typing import Annotated
 import numpy as np
 from scipy.special import betaincinv
 
-from tactile_bayes.declarations import replace, says
+from tactile_bayes.declarations import Meta, replace
 from tactile_bayes.trial.figures import (
     Count,
     Ends,
@@ -265,13 +265,11 @@ REFERENCE = "tactile"
 class ModalityRatio(Figures):
     """Percent error of one modality over the tactile one's on common masses."""
 
-    masses: Annotated[int, says("That both modalities looked for.", ge=0)]
-    masses_detected: Annotated[int, says("That both found.", ge=0)]
-    ratio: Annotated[
-        NotNegative | None, says("On the masses that both looked for; masses not detected counted as size 0.")
-    ]
+    masses: Annotated[int, Meta(ge=0)]  #: That both modalities looked for.
+    masses_detected: Annotated[int, Meta(ge=0)]  #: That both found.
+    ratio: NotNegative | None  #: On the masses that both looked for; masses not detected counted as size 0.
     ratio_interval: Ends | None
-    ratio_detected: Annotated[NotNegative | None, says("On the masses that both detected.")]
+    ratio_detected: NotNegative | None  #: On the masses that both detected.
     ratio_detected_interval: Ends | None
     reasons: Reasons
 
@@ -331,13 +329,11 @@ class PairedComparison(Figures):
     patients: Count
     first_percent: float | None
     second_percent: float | None
-    p_value: Annotated[
-        float | None, says("Two-sided, of the sign-flip test by patient; null where no patient differs.")
-    ]
-    p_holm: Annotated[float | None, says("The same, corrected for all pairs of this trial.")]
-    difference_percent: Annotated[float | None, says("Mean error of the first less that of the second.")]
+    p_value: float | None  #: Two-sided, of the sign-flip test by patient; null where no patient differs.
+    p_holm: float | None  #: The same, corrected for all pairs of this trial.
+    difference_percent: float | None  #: Mean error of the first less that of the second.
     difference_percent_interval: Ends | None
-    ratio: Annotated[float | None, says("Mean error of the first over that of the second.")]
+    ratio: float | None  #: Mean error of the first over that of the second.
     ratio_interval: Ends | None
     reasons: Reasons
 

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import chdtri, kolmogi, ndtr, ndtri
 
-from tactile_bayes.declarations import Meta, Record, says
+from tactile_bayes.declarations import Meta, Record
 from tactile_bayes.trial.figures import MIN_PATIENTS, Count, Ends, Share, clopper_pearson
 from tactile_bayes.trial.readings import FloatArray, IntervalReading, Reading, Trial, mass_numbers
 
@@ -89,20 +89,14 @@ class Calibration(Record):
     n: Count
     masses: Count
     levels: tuple[LevelCoverage, ...]
-    pit: Annotated[tuple[Count, ...], says("Integral transforms: counts in ten equal bins.")]
-    ecdf_band: Annotated[
-        float, says("Half-width of the band about the transforms' distribution function (Kolmogorov).")
-    ]
-    ecdf_distance: Annotated[
-        float, says("Largest distance from the diagonal; above the band, the uncertainties are refuted.")
-    ]
-    crps_mm: Annotated[float | None, says("Mean continuous ranked probability score of the size.")]
-    interval_score_mm: Annotated[
-        float | None, says("Mean interval score at 95 %: width, and 40 mm for each mm outside.")
-    ]
-    scale: Annotated[float, says("Factor by which SDs should be multiplied to be honest in the mean square.")]
+    pit: tuple[Count, ...]  #: Integral transforms: counts in ten equal bins.
+    ecdf_band: float  #: Half-width of the band about the transforms' distribution function (Kolmogorov).
+    ecdf_distance: float  #: Largest distance from the diagonal; above the band, the uncertainties are refuted.
+    crps_mm: float | None  #: Mean continuous ranked probability score of the size.
+    interval_score_mm: float | None  #: Mean interval score at 95 %: width, and 40 mm for each mm outside.
+    scale: float  #: Factor by which SDs should be multiplied to be honest in the mean square.
     scale_interval: Ends
-    shift_percent: Annotated[float, says("Median of the found sizes over the predicted, less 100 %.")]
+    shift_percent: float  #: Median of the found sizes over the predicted, less 100 %.
     advice: str
 
 

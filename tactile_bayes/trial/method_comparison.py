@@ -10,7 +10,7 @@ from typing import Annotated, Literal, TypeVar
 import numpy as np
 from scipy.special import chdtri, chndtrix, gammaincc, nctdtrit, ndtri, stdtr
 
-from tactile_bayes.declarations import UNSET, Record, UnsetType, replace, says
+from tactile_bayes.declarations import UNSET, Meta, Record, UnsetType, replace, says
 from tactile_bayes.trial.figures import (
     Count,
     Ends,
@@ -361,7 +361,7 @@ class MethodComparison(Figures, kw_only=True):
     """Detected masses as measurements: lines, concordance, limits of agreement, with intervals over patients."""
 
     masses: Count
-    error_ratio: Annotated[float, says("Variance of the ex-vivo error over that of the modality's.", gt=0)]
+    error_ratio: Annotated[float, Meta(gt=0)]  #: Variance of the ex-vivo error over that of the modality's.
     ols_intercept_mm: float | None
     ols_intercept_mm_interval: Ends | None
     ols_slope: float | None
@@ -393,18 +393,13 @@ class MethodComparison(Figures, kw_only=True):
     limit_high_log_ratio: _LimitLog | None
     limit_high_log_ratio_interval: Ends | None
     reasons: Reasons
-    analytic_intervals: Annotated[dict[str, Ends | None], says("As if masses were independent.")]
-    limits: Annotated[
-        dict[Unit, Limits],
-        says("Of differences and of logarithms of ratios; of single readings, replicates allowed for."),
-    ]
-    trends: Annotated[
-        dict[Against, Trend], says("Slope of the differences on the ex-vivo size, and on the mean of both.")
-    ]
+    analytic_intervals: dict[str, Ends | None]  #: As if masses were independent.
+    limits: dict[Unit, Limits]
+    """Of differences and of logarithms of ratios; of single readings, replicates allowed for."""
+    trends: dict[Against, Trend]  #: Slope of the differences on the ex-vivo size, and on the mean of both.
     concordance_parts: Concordance | None
-    errors_grow_with_size: Annotated[
-        bool, says("Errors are likelier proportional to size than constant: limits in mm suit no one size.")
-    ]
+    errors_grow_with_size: bool
+    """Errors are likelier proportional to size than constant: limits in mm suit no one size."""
 
 
 def compare_methods(sizes: ModalitySizes, *, confidence: float, error_ratio: float = 1.0) -> MethodComparison:

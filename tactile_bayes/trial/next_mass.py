@@ -23,12 +23,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from itertools import combinations
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 from scipy.special import erf, expit, log_expit
 
-from tactile_bayes.declarations import Record, rounded, says
+from tactile_bayes.declarations import Record, rounded
 from tactile_bayes.trial.figures import MIN_PATIENTS, Count
 from tactile_bayes.trial.readings import FloatArray, ModalitySizes, Trial, mass_numbers
 
@@ -59,10 +59,10 @@ class NextOfModality(Record):
 
     masses: Count
     patients: Count
-    mape_percent: Annotated[Middle, says("Expected error of the next mass, misses included.")]
-    mape_detected_percent: Annotated[Middle, says("Expected error of one that is found.")]
+    mape_percent: Middle  #: Expected error of the next mass, misses included.
+    mape_detected_percent: Middle  #: Expected error of one that is found.
     bias_percent: Middle
-    log_slope: Annotated[Middle, says("Slope of ln size.")]
+    log_slope: Middle  #: Slope of ln size.
     total_sd: Middle
     patient_sd: Middle
     mass_sd: Middle
@@ -94,7 +94,7 @@ class NextMass(Record):
     modalities: dict[str, NextOfModality]
     interval: IntervalKind
     probability_less_error: dict[str, float]
-    left_out: Annotated[dict[str, str], says("Modalities without a model, and why.")]
+    left_out: dict[str, str]  #: Modalities without a model, and why.
     diagnostics: dict[str, dict[str, float]]
 
     def lines(self) -> list[str]:

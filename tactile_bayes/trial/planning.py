@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from scipy.special import ndtri
 
-from tactile_bayes.declarations import Meta, Record, says
+from tactile_bayes.declarations import Meta, Record
 from tactile_bayes.options import MOST_PATIENTS, Aim
 from tactile_bayes.trial.accuracy import mape_figure, mape_percent, mape_ratio, sign_flip
 from tactile_bayes.trial.figures import MIN_PATIENTS, Ends, Intervals, Share, UndefinedError, clopper_pearson, figure
@@ -23,10 +23,10 @@ from tactile_bayes.trial.replicates import log_sd_within
 class ErrorModel(Record):
     """Errors of one modality in log size: normal, partly shared by the masses of a patient."""
 
-    bias: Annotated[float, says("Mean of ln(size / ex vivo).")]
-    mass_sd: Annotated[float, says("SD of the mass's own part.")]
-    patient_sd: Annotated[float, says("SD of the part that a patient's masses share.")] = 0.0
-    miss: Annotated[float, says("Probability that a mass is not found.")] = 0.0
+    bias: float  #: Mean of ln(size / ex vivo).
+    mass_sd: float  #: SD of the mass's own part.
+    patient_sd: float = 0.0  #: SD of the part that a patient's masses share.
+    miss: float = 0.0  #: Probability that a mass is not found.
 
     @property
     def true_mape_percent(self) -> float:
@@ -44,14 +44,14 @@ class ErrorModel(Record):
 class IntervalCheck(Record):
     """Coverage of the percent error's intervals in simulated trials."""
 
-    trials: Annotated[int, says("Simulated trials with an interval.", ge=1)]
-    covered: Annotated[int, says("Trials whose interval holds the true error.", ge=0)]
+    trials: Annotated[int, Meta(ge=1)]  #: Simulated trials with an interval.
+    covered: Annotated[int, Meta(ge=0)]  #: Trials whose interval holds the true error.
     share: Share
     share_interval: Ends
-    above: Annotated[int, says("Trials whose interval lies above the true error.", ge=0)]
-    below: Annotated[int, says("Trials whose interval lies below it.", ge=0)]
-    undefined: Annotated[int, says("Trials without an interval.", ge=0)]
-    median_width_ratio: Annotated[float, says("Median of the upper over the lower end.")]
+    above: Annotated[int, Meta(ge=0)]  #: Trials whose interval lies above the true error.
+    below: Annotated[int, Meta(ge=0)]  #: Trials whose interval lies below it.
+    undefined: Annotated[int, Meta(ge=0)]  #: Trials without an interval.
+    median_width_ratio: float  #: Median of the upper over the lower end.
     model: ErrorModel
     true_mape_percent: float
 
@@ -167,16 +167,13 @@ class Design(Record):
 
     patients: int
     maps: int
-    power: Annotated[
-        float, says("Share of trials with a smaller tactile error and a sign-flip test below 5 %.", ge=0, le=1)
-    ]
-    power_interval: Annotated[Ends, says("Exact 95 % interval of that share: the simulation's own error.")]
-    tactile_percent: Annotated[float, says("Mean tactile error over the trials.")]
-    other_percent: Annotated[float, says("Mean error of the other modality over the trials.")]
-    tactile_width_ratio: Annotated[float | None, says("Median upper over lower end of the tactile error's interval.")]
-    ratio_width_ratio: Annotated[
-        float | None, says("Median upper over lower end of the interval of the ratio of errors.")
-    ]
+    power: Annotated[float, Meta(ge=0, le=1)]
+    """Share of trials with a smaller tactile error and a sign-flip test below 5 %."""
+    power_interval: Ends  #: Exact 95 % interval of that share: the simulation's own error.
+    tactile_percent: float  #: Mean tactile error over the trials.
+    other_percent: float  #: Mean error of the other modality over the trials.
+    tactile_width_ratio: float | None  #: Median upper over lower end of the tactile error's interval.
+    ratio_width_ratio: float | None  #: Median upper over lower end of the interval of the ratio of errors.
 
 
 class Gain(Record):
@@ -193,25 +190,21 @@ class Needed(Record):
     """How many patients reach an aim."""
 
     aim: Aim
-    target: Annotated[
-        float, says("Power, or the median factor from the lower to the upper end of the tactile error's interval.")
-    ]
+    target: float  #: Power, or the median factor from the lower to the upper end of the tactile error's interval.
     maps: int
-    patients: Annotated[int, says("The least that reach it, one mass each.", ge=MIN_PATIENTS)]
-    patients_interval: Annotated[
-        Ends | None, says("95 % interval of that number: the simulation's own error; null where too few.")
-    ]
+    patients: Annotated[int, Meta(ge=MIN_PATIENTS)]  #: The least that reach it, one mass each.
+    patients_interval: Ends | None  #: 95 % interval of that number: the simulation's own error; null where too few.
 
 
 class PlanReport(Record, kw_only=True):
     """Power and widths of planned trials."""
 
     schema: Literal["tactile-bayes/plan/1"]
-    errors: Annotated[dict[str, float], says("Assumed errors of ln size.")]
-    errors_from: Annotated[dict[str, ErrorSource], says("Where each assumed error comes from.")]
+    errors: dict[str, float]  #: Assumed errors of ln size.
+    errors_from: dict[str, ErrorSource]  #: Where each assumed error comes from.
     designs: Annotated[tuple[Design, ...], Meta(min_length=1)]
     gains: tuple[Gain, ...]
-    needed: Annotated[tuple[Needed, ...], says("By the designs above, where --power or --precision asked for it.")] = ()
+    needed: tuple[Needed, ...] = ()  #: By the designs above, where --power or --precision asked for it.
     provenance: dict[str, Any]
     research_use: Annotated[str, Meta(min_length=1)]
 

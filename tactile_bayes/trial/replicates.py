@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
 
-from tactile_bayes.declarations import Record, replace, says
+from tactile_bayes.declarations import Record, replace
 from tactile_bayes.trial.figures import (
     Count,
     Ends,
@@ -49,18 +48,14 @@ class ReplicateFigures(Figures):
 
     within_mass_log_sd: float | None
     within_mass_log_sd_interval: Ends | None
-    repeatability_low_percent: Annotated[
-        float | None, says("Change between two readings of one mass: lower end in 95 % of pairs.")
-    ]
+    repeatability_low_percent: float | None  #: Change between two readings of one mass: lower end in 95 % of pairs.
     repeatability_low_percent_interval: Ends | None
-    repeatability_high_percent: Annotated[
-        float | None, says("Change between two readings of one mass: upper end in 95 % of pairs.")
-    ]
+    repeatability_high_percent: float | None  #: Change between two readings of one mass: upper end in 95 % of pairs.
     repeatability_high_percent_interval: Ends | None
-    icc: Annotated[float | None, says("Intraclass correlation.")]
+    icc: float | None  #: Intraclass correlation.
     icc_interval: Ends | None
     reasons: Reasons
-    variance_components: Annotated[Components | None, says("REML variances of ln size.")]
+    variance_components: Components | None  #: REML variances of ln size.
 
 
 def components(y: FloatArray, mass: Index, reader: Index) -> Components:

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from tactile_bayes.declarations import UNSET, Meta, Record, UnsetType, says
+from tactile_bayes.declarations import UNSET, Meta, Record, UnsetType
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.trial.accuracy import (
     ModalityRatio,
@@ -76,7 +76,7 @@ CONVENTIONS: dict[str, str] = {
 class ModalityReport(Figures):
     """Counts, figures and coverage of one modality on its `n` masses."""
 
-    n: Annotated[int, says("Masses looked for.", ge=0)]
+    n: Annotated[int, Meta(ge=0)]  #: Masses looked for.
     detected: Count
     detected_interval: Ends | None
     patients: Count
@@ -84,64 +84,50 @@ class ModalityReport(Figures):
     readings_detected: Count
     masses_not_done: Count
     masses_without_reading: Count
-    mape_percent: Annotated[
-        NotNegative | None, says("Mean absolute error in percent of the ex-vivo size; a mass not detected has size 0.")
-    ]
+    mape_percent: NotNegative | None
+    """Mean absolute error in percent of the ex-vivo size; a mass not detected has size 0."""
     mape_percent_interval: Ends | None
-    mape_detected_percent: Annotated[NotNegative | None, says("The same over detected masses.")]
+    mape_detected_percent: NotNegative | None  #: The same over detected masses.
     mape_detected_percent_interval: Ends | None
-    mae_mm: Annotated[NotNegative | None, says("Mean absolute error in mm; a mass not detected has size 0.")]
+    mae_mm: NotNegative | None  #: Mean absolute error in mm; a mass not detected has size 0.
     mae_mm_interval: Ends | None
-    mae_detected_mm: Annotated[NotNegative | None, says("The same over detected masses.")]
+    mae_detected_mm: NotNegative | None  #: The same over detected masses.
     mae_detected_mm_interval: Ends | None
-    weighted_mape_percent: Annotated[
-        NotNegative | None, says("Sum of absolute errors over the sum of ex-vivo sizes, percent.")
-    ]
+    weighted_mape_percent: NotNegative | None  #: Sum of absolute errors over the sum of ex-vivo sizes, percent.
     weighted_mape_percent_interval: Ends | None
-    median_error_percent: Annotated[NotNegative | None, says("Median absolute error in percent of the ex-vivo size.")]
-    bias_percent: Annotated[
-        Annotated[float, Meta(ge=-100)] | None,
-        says("100 (geometric mean of size over ex-vivo size - 1), over detected masses."),
-    ]
+    median_error_percent: NotNegative | None  #: Median absolute error in percent of the ex-vivo size.
+    bias_percent: Annotated[float, Meta(ge=-100)] | None
+    """100 (geometric mean of size over ex-vivo size - 1), over detected masses."""
     bias_percent_interval: Ends | None
-    slope_through_origin: Annotated[
-        NotNegative | None, says("Slope of sizes on ex-vivo sizes without intercept; a mass not detected has size 0.")
-    ]
+    slope_through_origin: NotNegative | None
+    """Slope of sizes on ex-vivo sizes without intercept; a mass not detected has size 0."""
     slope_through_origin_interval: Ends | None
-    r2_centred: Annotated[AtMostOne | None, says("1 - SSE0 / SST; a mass not detected has size 0.")]
-    r2_uncentred: Annotated[AtMostOne | None, says("1 - SSE0 / sum of squared sizes; a mass not detected has size 0.")]
-    r2_pearson: Annotated[Share | None, says("Squared correlation coefficient; a mass not detected has size 0.")]
-    pearson_r: Annotated[Correlation | None, says("Correlation coefficient; a mass not detected has size 0.")]
-    slope_through_origin_detected: Annotated[
-        NotNegative | None, says("Slope of sizes on ex-vivo sizes without intercept, over detected masses.")
-    ]
+    r2_centred: AtMostOne | None  #: 1 - SSE0 / SST; a mass not detected has size 0.
+    r2_uncentred: AtMostOne | None  #: 1 - SSE0 / sum of squared sizes; a mass not detected has size 0.
+    r2_pearson: Share | None  #: Squared correlation coefficient; a mass not detected has size 0.
+    pearson_r: Correlation | None  #: Correlation coefficient; a mass not detected has size 0.
+    slope_through_origin_detected: NotNegative | None
+    """Slope of sizes on ex-vivo sizes without intercept, over detected masses."""
     slope_through_origin_detected_interval: Ends | None
-    r2_centred_detected: Annotated[AtMostOne | None, says("1 - SSE0 / SST, over detected masses.")]
-    r2_uncentred_detected: Annotated[AtMostOne | None, says("1 - SSE0 / sum of squared sizes, over detected masses.")]
-    r2_pearson_detected: Annotated[Share | None, says("Squared correlation coefficient, over detected masses.")]
-    pearson_r_detected: Annotated[Correlation | None, says("Correlation coefficient, over detected masses.")]
-    within_mass_sd_mm: Annotated[NotNegative | None, says("Mean over masses of the SD of detected replicates, mm.")]
+    r2_centred_detected: AtMostOne | None  #: 1 - SSE0 / SST, over detected masses.
+    r2_uncentred_detected: AtMostOne | None  #: 1 - SSE0 / sum of squared sizes, over detected masses.
+    r2_pearson_detected: Share | None  #: Squared correlation coefficient, over detected masses.
+    pearson_r_detected: Correlation | None  #: Correlation coefficient, over detected masses.
+    within_mass_sd_mm: NotNegative | None  #: Mean over masses of the SD of detected replicates, mm.
     within_mass_sd_mm_interval: Ends | None
-    within_mass_sd_rms_mm: Annotated[
-        NotNegative | None, says("Root of the mean variance of detected replicates, by degrees of freedom, mm.")
-    ]
+    within_mass_sd_rms_mm: NotNegative | None
+    """Root of the mean variance of detected replicates, by degrees of freedom, mm."""
     within_mass_sd_rms_mm_interval: Ends | None
-    within_mass_cv_percent: Annotated[
-        NotNegative | None, says("Mean over masses of SD over mean of detected replicates, percent.")
-    ]
+    within_mass_cv_percent: NotNegative | None  #: Mean over masses of SD over mean of detected replicates, percent.
     within_mass_cv_percent_interval: Ends | None
-    within_mass_cv_rms_percent: Annotated[
-        NotNegative | None, says("Root mean square of SD over mean, by degrees of freedom, percent.")
-    ]
+    within_mass_cv_rms_percent: NotNegative | None  #: Root mean square of SD over mean, by degrees of freedom, percent.
     within_mass_cv_rms_percent_interval: Ends | None
     reasons: Reasons
     coverage: tuple[Coverage, ...]
     method_comparison: MethodComparison
     replicates: ReplicateFigures
     calibration: Calibration | None
-    cautions: Annotated[
-        tuple[str, ...], says("Conditions of this trial under which intervals hold less often than they say.")
-    ]
+    cautions: tuple[str, ...]  #: Conditions of this trial under which intervals hold less often than they say.
 
 
 class Counts(Record):
@@ -161,27 +147,18 @@ class TrialReport(Record, kw_only=True):
     """Accuracy of each modality against excision."""
 
     schema: Literal["tactile-bayes/validate/1"]
-    title: Annotated[str, says("Of the protocol.")] | UnsetType = UNSET
-    interval_probability: Annotated[float, says("Of every interval in this document.", gt=0, lt=1)]
+    title: str | UnsetType = UNSET  #: Of the protocol.
+    interval_probability: Annotated[float, Meta(gt=0, lt=1)]  #: Of every interval in this document.
     counts: Counts
     modalities: Annotated[dict[str, ModalityReport], Meta(min_length=1)]
-    mape_ratio_to_tactile: Annotated[
-        dict[str, ModalityRatio],
-        says(
-            "Percent error of each other modality over the tactile one's, on common masses; empty without "
-            "a tactile one."
-        ),
-    ]
-    paired_comparisons: Annotated[
-        tuple[PairedComparison, ...], says("Every pair of modalities on the masses that both looked for.")
-    ]
-    doubts: Annotated[tuple[str, ...], says("What looks like another unit than mm.")]
+    mape_ratio_to_tactile: dict[str, ModalityRatio]
+    """Percent error of each other modality over the tactile one's, on common masses; empty without a tactile one."""
+    paired_comparisons: tuple[PairedComparison, ...]  #: Every pair of modalities on the masses that both looked for.
+    doubts: tuple[str, ...]  #: What looks like another unit than mm.
     conventions: dict[str, str]
-    interval_check: (
-        Annotated[dict[str, IntervalCheck], says("Simulated coverage of the intervals of mape_percent, by modality.")]
-        | UnsetType
-    ) = UNSET
-    next_mass: Annotated[NextMass, says("Errors-in-variables model: what the next mass may bring.")] | UnsetType = UNSET
+    interval_check: dict[str, IntervalCheck] | UnsetType = UNSET
+    """Simulated coverage of the intervals of mape_percent, by modality."""
+    next_mass: NextMass | UnsetType = UNSET  #: Errors-in-variables model: what the next mass may bring.
     provenance: dict[str, Any]
     research_use: Annotated[str, Meta(min_length=1)]
 
