@@ -59,13 +59,13 @@ class Diagnosis(Told, eq=False):
             lines += [] if shape is None else [f"Pareto shape of the weights {shape:.2f} (trusted up to 0.7)"]
             lines += [f"{name:14}{one['median']:>10.4g}" for name, one in self.quantities.items()]
             return "\n".join([*lines, RESEARCH_USE]) + "\n"
-        head = f"{'':14}{'median':>10}{'R-hat':>8}{'bulk ESS':>10}{'tail ESS':>10}"
-        lines.append(f"{head}{'MCSE of median':>16}{'of 95 % ends':>16}")
+        head = f"{'':12}{'median':>9}{'R-hat':>7}{'bulk ESS':>10}{'tail ESS':>10}"
+        lines.append(f"{head}{'MCSE of median':>16}{'of 95 % ends':>14}")
         for name, one in self.quantities.items():
             ends = max(one["mcse_low"], one["mcse_high"])
             lines.append(
-                f"{name:14}{one['median']:>10.4g}{one['rhat']:>8.3f}{one['ess_bulk']:>10.0f}{one['ess_tail']:>10.0f}"
-                f"{one['mcse_median']:>16.2g}{ends:>16.2g}"
+                f"{name:12}{one['median']:>9.4g}{one['rhat']:>7.3f}{one['ess_bulk']:>10.0f}{one['ess_tail']:>10.0f}"
+                f"{one['mcse_median']:>16.2g}{ends:>14.2g}"
             )
         return "\n".join([*lines, RESEARCH_USE]) + "\n"
 

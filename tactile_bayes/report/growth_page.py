@@ -330,7 +330,8 @@ def _mark(one: _Point, scale: float, *, row: int, named: bool) -> Iterator[str]:
     yield f'<circle cx="{one.x:.2f}" cy="{y:.2f}" r="1.1" fill="#111"/>'
     code, _, when = one.words.removeprefix("Visit ").partition(", ")
     if named:
-        yield text(one.x + 1.4, y - 1.2, f"{one.size.median:.1f}", anchor="start")
+        edge = ' stroke="#fff" stroke-width="1" paint-order="stroke"'  # the line of the trend passes here
+        yield text(one.x + 1.4, y - 1.2, f"{one.size.median:.1f}", anchor="start", more=edge)
         yield text(one.x, floor + 7 + 3 * row, when[:14], size=2.5)
     yield text(one.x, floor + 4, code[:14] if named else code[:4])
 

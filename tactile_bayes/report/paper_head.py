@@ -59,9 +59,8 @@ def uniformity_text(found: Uniformity, tissue: HomogeneousTissue, *, limit: floa
 
 def design_text(found: Sequence[Uniformity], tissue: HomogeneousTissue, *, limit: float) -> str:
     """The whole search: the answer with its own table, then a table for each place of the shoulders."""
-    lines = [_tissue_line(tissue)]
     count = sum(one.worst <= limit for one in found)
-    lines.append(f"{count} of {len(found)} heads stay within {100 * limit:g} % of the mean")
+    lines = [f"{count} of {len(found)} heads stay within {100 * limit:g} % of the mean"]
 
     def told(one: Uniformity, worst: float) -> str:
         return f"{named(one.head)}, {100 * worst:.1f} %, face {one.face_mm:.1f} mm wide"
@@ -72,6 +71,7 @@ def design_text(found: Sequence[Uniformity], tissue: HomogeneousTissue, *, limit
         lines += [f"narrowest within the limit: {told(answer, answer.worst)}", *_pressure_table(answer, tissue)]
     if (by_rms := narrowest(found, limit=limit, by_rms=True)) is not None:
         lines.append(f"narrowest whose root mean square is within it: {told(by_rms, by_rms.worst_rms)}")
+    lines.append(_tissue_line(tissue))
     for kind in dict.fromkeys(one.head.shoulders for one in found):
         lines += ["", *_grid(kind, [one for one in found if one.head.shoulders == kind], limit=limit)]
     return "\n".join(lines)
