@@ -350,7 +350,8 @@ def _modality_notes(name: str, report: ModalityReport, *, percent: str) -> Itera
         low, high = one.fraction_interval
         yield (
             f"{name}: {100 * one.probability:g} % intervals cover {one.covered} of {one.n} "
-            f"({one.fraction:.0%}, {percent} interval {low:.0%} to {high:.0%}) on {_plural(one.masses, 'mass')}"
+            f"({100 * one.fraction:.0f} %, {percent} interval {100 * low:.0f} to {100 * high:.0f} %) "
+            f"on {_plural(one.masses, 'mass')}"
         )
     yield from _reasons(name, report, [key for key in report.reasons if key.removesuffix("_interval") in _FIRST])
 
