@@ -59,7 +59,7 @@ def answered(scan: Scan, mistake: str) -> str:
         return "contradiction"
     if check.best is check.stated:
         return "nothing said"
-    if mistake == RIGHT or not set(check.best.corrections) <= MENDED_BY[mistake]:
+    if mistake == RIGHT or not check.best.corrections or not set(check.best.corrections) <= MENDED_BY[mistake]:
         return "wrongly named"
     return "refused, named" if check.refused else "caution, named"
 
