@@ -145,11 +145,17 @@ def trusted(tactile_map: TactileMap) -> BoolArray:
     At the rim of a map a handful of readings from one side of the head decide a cell, and they are off together.
     Worked out once per map, and read-only.
     """
-    covered = tactile_map.covered
-    if covered.any():
-        covered = covered & (tactile_map.count >= FEW_READINGS * np.median(tactile_map.count[covered]))
+    covered = read_well(tactile_map, FEW_READINGS)
     covered.setflags(write=False)
     return covered
+
+
+def read_well(tactile_map: TactileMap, share: float) -> BoolArray:
+    """(ny, nx) True for covered cells with at least a share of the median count."""
+    covered = tactile_map.covered
+    if not covered.any():
+        return covered
+    return np.asarray(covered & (tactile_map.count >= share * np.median(tactile_map.count[covered])))
 
 
 def window_cells(tactile_map: TactileMap, centre_mm: tuple[float, float], *, radius_mm: float) -> FitCells:

@@ -15,6 +15,7 @@ from tactile_bayes.posterior.bump import (
     cell_mean_gaussian,
     levelled,
     on_map,
+    read_well,
     smoothed_excess,
 )
 from tactile_bayes.posterior.detection import Detection
@@ -27,15 +28,18 @@ from tactile_bayes.posterior.white import AT_RIM, Candidate
 
 # --- Other lumps on the map: their places and probabilities.
 
-BESIDE_IN_WIDTHS = 2.5
+BESIDE_IN_WIDTHS = 2.0
 """Nearer to the lump than this many of its larger width, what a lump that is no Gaussian leaves looks like a rise."""
+CLOSE_IN_WIDTHS, LEAST_RISE_CLOSE = 2.5, 0.1
 FAR_IN_WIDTHS, LEAST_RISE_FAR = 4.0, 0.02
-"""Farther than so many widths a rise needs this share of the lump's amplitude only."""
+"""Nearer or farther than so many widths a rise needs this share of the lump's amplitude."""
 LEAST_RISE_AT_RIM = 0.5
 """Share of the lump's amplitude, for a rise that the map covers too poorly: the ends of strokes make small ones."""
 MOST_NAMED, MOST_LOOKS = 4, 3
 """Rises that are named, and places that turn out to be none before the search ends: each look costs some 50 ms."""
 LEAST_PROBABILITY = 0.95
+WELL_READ = 0.5
+"""Share of the median count from which on a cell is read well."""
 LEAST_STANDING, STANDING_MM = 0.35, 2.5
 """Share of a rise's amplitude by which the map at its centre, so far about it, must stand above its level: a level that
 falls towards the rim on two sides is like a bump's flanks, and no lump."""
@@ -49,30 +53,53 @@ def other_rises(tactile_map: TactileMap, estimate: Estimate, options: SamplerSet
     """
     if estimate.bump is None and options.centre_mm is None:
         return ()
-    rest = tactile_map if estimate.map_posterior is None else without(tactile_map, estimate.map_posterior)
     rises: list[Rise] = []
-    misses = 0
-    for centre in _places(rest, estimate):
-        given = replace(options, centre_mm=centre, start_width_mm=None, scene="auto")
-        candidates, seen = search(rest, given)
-        rise = None
-        if seen is None:
-            rise = _at_rim(rest, candidates, given, estimate)
-        elif seen.detection.probability >= LEAST_PROBABILITY:
-            measured = estimate if estimate.map_posterior is not None else None
-            rise = _rise(seen.bump(), seen.detection.probability, measured)
-        # a fit may move to another rise, or back to the measured lump
-        again = rise is not None and (
-            any(_apart_mm(rise, one) < 2 * SMOOTHING_MM for one in rises)
-            or not _clear_of_lump(rise.x_mm, rise.y_mm, rest, estimate)
-        )
-        if rise is not None and not again and _stands_out(rise, rest):
-            rises.append(rise)
-        else:
-            misses += 1
-        if misses == MOST_LOOKS or len(rises) == MOST_NAMED:
-            break
+    for rest in _rests(tactile_map, estimate):
+        misses = 0
+        for centre in _places(rest, estimate):
+            if misses == MOST_LOOKS or len(rises) == MOST_NAMED:
+                break
+            if any(np.hypot(centre[0] - one.x_mm, centre[1] - one.y_mm) < 2 * SMOOTHING_MM for one in rises):
+                continue
+            rise = _rise_at(centre, rest, estimate, options)
+            # a fit may move to another rise, or back to the measured lump
+            again = rise is not None and (
+                any(_apart_mm(rise, one) < 2 * SMOOTHING_MM for one in rises)
+                or not _clear_of_lump(rise.x_mm, rise.y_mm, rest, estimate)
+            )
+            if rise is not None and not again and _stands_out(rise, rest):
+                rises.append(rise)
+            else:
+                misses += 1
     return tuple(rises)
+
+
+def _rise_at(
+    centre_mm: tuple[float, float], rest: TactileMap, estimate: Estimate, options: SamplerSettings
+) -> Rise | None:
+    """A rise of a place that is a lump by the evidence."""
+    given = replace(options, centre_mm=centre_mm, start_width_mm=None, scene="auto")
+    candidates, seen = search(rest, given)
+    if seen is None:
+        return _at_rim(rest, candidates, given, estimate)
+    if seen.detection.probability < LEAST_PROBABILITY:
+        return None
+    return _rise(seen.bump(), seen.detection.probability, None if estimate.map_posterior is None else estimate)
+
+
+def _rests(tactile_map: TactileMap, estimate: Estimate) -> Iterator[TactileMap]:
+    """The map less the measured lump, and the part of it that was read well.
+
+    Few frames reach the map's rim, and their errors are larger: as part of a rise's window they hide it.
+    """
+    if estimate.map_posterior is None:
+        yield tactile_map
+        return
+    rest = without(tactile_map, estimate.map_posterior)
+    yield rest
+    well = read_well(rest, WELL_READ)
+    if well.sum() < rest.covered.sum():
+        yield replace(rest, count=np.where(well, rest.count, 0))
 
 
 def without(tactile_map: TactileMap, posterior: MapPosterior) -> TactileMap:
@@ -114,9 +141,9 @@ def _places(rest: TactileMap, estimate: Estimate) -> Iterator[tuple[float, float
         row, column = (int(np.argmin(np.abs(axis - at))) for axis, at in ((rest.y_mm, y), (rest.x_mm, x)))
         least = 0.0
         if lump is not None:  # a lower rise may be what the subtracted lump left of itself, less of it farther away
-            away = np.hypot(x - lump.x_mm, y - lump.y_mm)
-            far = away > FAR_IN_WIDTHS * max(lump.sigma_x_mm, lump.sigma_y_mm)
-            least = (LEAST_RISE_FAR if far else LEAST_RISE) * lump.amplitude
+            away = np.hypot(x - lump.x_mm, y - lump.y_mm) / max(lump.sigma_x_mm, lump.sigma_y_mm)
+            share = LEAST_RISE_CLOSE if away < CLOSE_IN_WIDTHS else LEAST_RISE
+            least = (LEAST_RISE_FAR if away > FAR_IN_WIDTHS else share) * lump.amplitude
         if height[row, column] > least and _clear_of_lump(x, y, rest, estimate):
             yield x, y
 
@@ -297,7 +324,10 @@ def _sized_at(
     given = replace(options, centre_mm=(rise.x_mm, rise.y_mm), start_width_mm=None)
     estimate = _estimated(tactile_map, given, estimator)
     if first.map_posterior is not None and not _same_lump(estimate, rise, first):
-        estimate = _estimated(without(tactile_map, first.map_posterior), given, estimator)
+        for rest in _rests(tactile_map, first):
+            estimate = _estimated(rest, given, estimator)
+            if _same_lump(estimate, rise, first):
+                break
         if estimate.size is not None and _amplitude(estimate) < LEAST_SHARE * _amplitude(first):
             times = f"{1 / LEAST_SHARE:.0f} times as high"
             estimate = _not_told_apart(

@@ -24,16 +24,22 @@ SMALL = (15.0, 2.0)
 
 def values(*, second: float, seed: int = 1) -> np.ndarray:
     """A lump at (-18, 2) mm on errors with a length of 3 mm, and 33 mm from it a second of some amplitude."""
-    rng = np.random.default_rng(seed)
     first = bump_values(half_mm=HALF_MM, x=-18.0, y=2.0, sigma_x=4.5, sigma_y=4.5, amplitude=0.5)
     other = bump_values(half_mm=HALF_MM, x=SMALL[0], y=SMALL[1], sigma_x=4.0, sigma_y=4.0, amplitude=second, level=0.0)
-    field = correlated_field(rng, len(first), length_cells=3.0)
-    return first + other + 0.005 * field + 0.005 * rng.standard_normal(first.shape)
+    return first + other + errors(seed)
 
 
-def looked(mean: np.ndarray, centre: tuple[float, float] | None = None) -> tuple[Estimate, tuple[Rise, ...]]:
+def errors(seed: int) -> np.ndarray:
+    """A field with a length of 3 mm and independent errors."""
+    rng, n = np.random.default_rng(seed), 2 * round(HALF_MM) + 1
+    return 0.005 * correlated_field(rng, n, length_cells=3.0) + 0.005 * rng.standard_normal((n, n))
+
+
+def looked(
+    mean: np.ndarray, centre: tuple[float, float] | None = None, *, count: np.ndarray | int = 40
+) -> tuple[Estimate, tuple[Rise, ...]]:
     options = SamplerSettings(method="laplace", draws=400, background="free", centre_mm=centre, noise="field")
-    tactile_map = grid_map(mean)
+    tactile_map = grid_map(mean, count=count)
     found = estimate_map(tactile_map, calibration=None, options=options, rng=np.random.default_rng(1))
     return found, other_rises(tactile_map, found, options)
 
@@ -52,6 +58,41 @@ def test_one_lump_is_not_named_twice() -> None:
     """The control of the test above; `validation.scene_rates` has the shares over hundreds of maps."""
     for seed in range(3):
         assert looked(values(second=0.0, seed=seed))[1] == ()
+
+
+def test_a_lump_close_to_a_larger_one_is_named() -> None:
+    """Their centres are 2.3 widths of the larger one apart."""
+    larger = bump_values(half_mm=HALF_MM, x=-18.0, y=2.0, sigma_x=6.0, sigma_y=6.0, amplitude=0.5) + errors(1)
+    other = bump_values(half_mm=HALF_MM, x=-4.0, y=2.0, sigma_x=4.0, sigma_y=4.0, amplitude=0.1, level=0.0)
+    (rise,) = looked(larger + other)[1]
+    assert np.hypot(rise.x_mm + 4.0, rise.y_mm - 2.0) < 1.0
+    assert looked(larger)[1] == ()  # the control: that one alone
+
+
+@pytest.mark.parametrize("exponent", [1.7, 2.5])
+def test_what_a_lump_that_is_no_gaussian_leaves_is_not_named(exponent: float) -> None:
+    axis = np.arange(-HALF_MM, HALF_MM + 1.0)
+    away = np.hypot(axis + 18.0, axis[:, None] - 2.0)
+    found, rises = looked(1.0 + 0.5 * np.exp(-0.5 * (away / 6.0) ** exponent) + errors(1))
+    assert found.status == "estimate"
+    assert rises == ()
+
+
+def test_a_lump_beside_a_rim_that_was_read_seldom_is_named() -> None:
+    """The rim's errors are larger, and as part of the window they hid it."""
+    rim = np.arange(-HALF_MM, HALF_MM + 1.0)[:, None] < -20.0
+    count = np.where(rim & np.ones(71, dtype=bool), 8, 40)
+
+    def named(second: float, count: np.ndarray | int) -> list[tuple[int, int]]:
+        other = bump_values(half_mm=HALF_MM, x=15.0, y=-12.0, sigma_x=4.0, sigma_y=4.0, amplitude=second, level=0.0)
+        uneven = np.where(rim, 0.1 * correlated_field(np.random.default_rng(2), 71, length_cells=4.0), 0.0)
+        _, rises = looked(values(second=0.0) + other + uneven, count=count)
+        return [(round(rise.x_mm), round(rise.y_mm)) for rise in rises]
+
+    assert named(0.1, count) == [(15, -12)]
+    # the controls: no lump there, and a rim that was read as often as the rest, where such errors are the map's own
+    assert named(0.0, count) == []
+    assert named(0.1, 40) == []
 
 
 def test_at_a_place_that_was_given_the_rest_of_the_map_is_named() -> None:
