@@ -218,8 +218,13 @@ def test_it_can_be_read_printed_and_drawn(tmp_path: Path):
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
 
 
+def flat(rows: int, columns: int) -> TactileMap:
+    """A map on which nothing rises; one of a single value would be no map of a breast."""
+    return grid_map(np.where(np.arange(columns) < columns // 2, 0.999, 1.0) * np.ones((rows, 1)), normalise="gain")
+
+
 NO_SIZE = {
-    "empty": (lambda: grid_map(np.ones((31, 31)), normalise="gain"), "nothing rises above the background"),
+    "empty": (lambda: flat(31, 31), "nothing rises above the background"),
     "faint": (lambda: field_map(half_mm=13.0, amplitude=0.01), "no lump found|probability"),
     "one cell wide": (lambda: field_map(half_mm=10.0, amplitude=0.5, sigma_x=0.4, sigma_y=0.4), "cell|no lump found"),
     "no cell": (lambda: grid_map(np.full((9, 9), np.nan), normalise="gain"), "no covered cell"),
@@ -297,13 +302,13 @@ def test_poor_maps_are_measured_too(case: str, monkeypatch: pytest.MonkeyPatch):
 @pytest.mark.long
 def test_the_command_says_how_long_it_takes_and_pools(tmp_path: Path, run_cli: Run, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(study, "FIELDS", (8, 12))
-    write_map(tmp_path / "empty.nc", grid_map(np.ones((15, 15)), normalise="gain"), provenance=Provenance("map", {}))
+    write_map(tmp_path / "empty.nc", flat(25, 25), provenance=Provenance("map", {}))
     done = run_cli("tradeoff", "estimate", "empty.nc", "--runs", "1", "--figure", "f.png", cwd=tmp_path)
     assert done.returncode == 6
     assert "s of CPU to go" in done.stderr
     assert "no setting gives a size" in done.stdout
     assert (tmp_path / "f.png").stat().st_size > 1000
-    write_map(tmp_path / "other.nc", grid_map(np.ones((13, 15)), normalise="gain"), provenance=Provenance("map", {}))
+    write_map(tmp_path / "other.nc", flat(23, 25), provenance=Provenance("map", {}))
     both = run_cli("tradeoff", "estimate", "empty.nc", "other.nc", "--runs", "1", cwd=tmp_path)
     assert (both.returncode, "a lump was found on 0 of 2 maps" in both.stdout) == (6, True)
     twice = run_cli("tradeoff", "estimate", "empty.nc", "empty.nc", cwd=tmp_path)
