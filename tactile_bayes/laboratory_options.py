@@ -35,7 +35,7 @@ class RecordOptions(Options, kw_only=True):
     ] = None
     every: Annotated[int, says("Record every n-th frame only.", ge=1, le=255)] = 1
     duration_s: Annotated[
-        Annotated[float, Meta(gt=0.0)] | None, named("S", "Stop after this time, s.", option="duration")
+        Annotated[float, Meta(gt=0)] | None, named("S", "Stop after this time, s.", option="duration")
     ] = None
     at_once: Annotated[bool, says("Start at once, without waiting for space. Default: only with --duration.")] = False
     clock: Annotated[
@@ -51,7 +51,7 @@ class RecordOptions(Options, kw_only=True):
     ] = None
     uncalibrated: Annotated[bool, says("Record with the nominal gain: for bladder steps.")] = False
     accept_calibration: Annotated[bool, says("Accept an array calibration that is stale or of another head.")] = False
-    calibration_days: Annotated[float, says("Age from which an array calibration is stale, days.", ge=0.0)] = 1.0
+    calibration_days: Annotated[float, says("Age from which an array calibration is stale, days.", ge=0)] = 1.0
     landmarks: Annotated[Path | None, named("FILE", "Take landmarks from a JSON file or a scan.", path=True)] = None
     side: Annotated[Literal["left", "right", "phantom"] | None, says("Breast that is scanned.")] = None
     posture: Annotated[Literal["supine", "oblique", "sitting", "phantom"] | None, says("Posture during the scan.")] = (
@@ -75,8 +75,8 @@ class RecordOptions(Options, kw_only=True):
     force: bool = False
 
 
-Span = tuple[Annotated[float, Meta(ge=0.0)], Annotated[float, Meta(ge=0.0)]]  #: Begin and length, s.
-Share = Annotated[float, Meta(ge=0.0, le=1.0)]
+Span = tuple[Annotated[float, Meta(ge=0)], Annotated[float, Meta(ge=0)]]  #: Begin and length, s.
+Share = Annotated[float, Meta(ge=0, le=1)]
 
 
 class FaultOptions(Options):
@@ -88,7 +88,7 @@ class FaultOptions(Options):
         None
     )
     disconnect_s: Annotated[
-        Annotated[float, Meta(ge=0.0)] | None, named("AT", "Disconnect at AT s.", option="disconnect")
+        Annotated[float, Meta(ge=0)] | None, named("AT", "Disconnect at AT s.", option="disconnect")
     ] = None
     hold: Annotated[int, says("Tracker: measure only every n-th pose.", ge=1)] = 1
     hide: Annotated[Span | None, named("AT FOR", "Tracker: its tool is out of sight for FOR s from AT s on.")] = None
@@ -99,8 +99,8 @@ class FaultOptions(Options):
             "Tracker: a second tool, Reference (or station 2), fixed to a body that breathes by MM; the "
             "first is Probe (or 1).",
             option="breathe",
-            ge=0.0,
-            le=100.0,
+            ge=0,
+            le=100,
         ),
     ] = 0.0
 

@@ -37,7 +37,7 @@ class Settings(FitSettings, kw_only=True):
         ),
     ] = None
     seed: Annotated[int, says("Random seed.", ge=0)] = 1
-    interval: Annotated[float, says("Probability of the intervals.", gt=0.0, lt=1.0)] = INTERVAL
+    interval: Annotated[float, says("Probability of the intervals.", gt=0, lt=1)] = INTERVAL
     between_map_sd: Annotated[
         Annotated[float, Meta(ge=0, le=2)] | None,
         says(
