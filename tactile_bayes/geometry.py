@@ -107,6 +107,12 @@ class Plane(Record, eq=False):
     spread_mm: FloatArray  #: (3,) array: Standard deviations of the points along the principal axes, descending.
 
 
+def principal_axes(points_mm: FloatArray) -> FloatArray:
+    """(3, 3) principal axes of (n, 3) points in columns, the direction in which they spread least first."""
+    around = points_mm - points_mm.mean(axis=0)
+    return np.asarray(np.linalg.eigh(around.T @ around)[1])
+
+
 def fit_plane(centroid_mm: FloatArray, covariance_mm2: FloatArray, *, head_x: FloatArray, head_z: FloatArray) -> Plane:
     """Best-fit plane from the (3,) mean and (3, 3) covariance of taxel centres in `base` (paper step i).
 

@@ -20,7 +20,7 @@ import numpy as np
 
 from tactile_bayes.declarations import Record, field, replace
 from tactile_bayes.findings import Finding, finding_lines
-from tactile_bayes.geometry import FloatArray, IndexArray, apply, inverse
+from tactile_bayes.geometry import FloatArray, IndexArray, apply, inverse, principal_axes
 from tactile_bayes.mapping.cells import between
 from tactile_bayes.mapping.convention import (
     CONVENTIONS,
@@ -500,8 +500,7 @@ class _Overlap(Record, eq=False):
         on_tracker = apply(tracker_from_head, surface.reshape(-1, 3)[self.taxels[transposed]])
         rotation, centre = self._path(tuple(name for name in corrections if name in _ROTATIONS[-1]))
         place = centre[:, None] + (rotation @ (coarse.weight.T @ on_tracker).T).transpose(0, 2, 1)
-        around = (place - place.mean(axis=(0, 1))).reshape(-1, 3)
-        axes = np.linalg.eigh(around.T @ around)[1]
+        axes = principal_axes(place.reshape(-1, 3))
         agreement = abs(float(axes[:, 0] @ (rotation @ tracker_from_head[:3, 2]).mean(axis=0)))
         return np.asarray(place @ axes[:, [2, 1]]), agreement
 

@@ -65,7 +65,7 @@ class ShiftFit(Record, eq=False):
 
     def frame_numbers(self) -> IndexArray:
         """(n,) averaged frame of each reading, counted through all scans."""
-        readings = np.concatenate([np.full(*part.pressure.shape) for part in self.parts])
+        readings = np.concatenate([np.full(m, k) for m, k in (part.pressure.shape for part in self.parts)])
         return np.repeat(np.arange(len(readings)), readings)
 
     def design(self, moves: Sequence[FloatArray]) -> FloatArray:
@@ -132,7 +132,7 @@ def _fitted(
     values: FloatArray,
     group: IndexArray,
     *,
-    start: FloatArray | float = 0.0,
+    start: FloatArray | None = None,
     tolerance: float = _FIT_TOLERANCE,
 ) -> tuple[FloatArray, FloatArray]:
     """(n,) what frames, taxels and groups leave of the readings of some scans, and (n,) what their group adds.
@@ -141,8 +141,10 @@ def _fitted(
     of readings, found by conjugate gradients (Hestenes & Stiefel 1952) from those of `start` on.
     """
     scale = 1 / np.sqrt(np.maximum(np.bincount(group), 1))
-    whole = scale * np.bincount(group, _by_part(parts, CoarseFrames.without_head, values))
-    rest = _by_part(parts, CoarseFrames.without_head, values - start)
+    rest = _by_part(parts, CoarseFrames.without_head, values)
+    whole = scale * np.bincount(group, rest)
+    if start is not None:
+        rest = _by_part(parts, CoarseFrames.without_head, values - start)
     found, step, square = np.zeros_like(scale), np.zeros_like(scale), np.inf
     for _ in range(_FIT_STEPS):
         left, before = scale * np.bincount(group, rest), square
@@ -154,7 +156,7 @@ def _fitted(
         length = square / float(change @ change)
         rest -= length * change
         found += length * scale * step
-    return rest, start + found[group]
+    return rest, found[group] if start is None else start + found[group]
 
 
 def _by_part(

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.findings import Finding
-from tactile_bayes.geometry import BoolArray, FloatArray, IndexArray
+from tactile_bayes.geometry import BoolArray, FloatArray, IndexArray, principal_axes
 from tactile_bayes.mapping.map import FEW_READINGS, TactileMap
 from tactile_bayes.mapping.select import SelectedFrames, frame_figures, refuse_without_frames, timing_figures
 from tactile_bayes.scans import HeadShape, Landmarks, Scan
@@ -236,8 +236,7 @@ def scan_doubts(selection: SelectedFrames, *, pressure_window_kpa: tuple[float, 
 def _felt_mm2(selection: SelectedFrames, head: HeadShape) -> float:
     """Largest area that an array can have passed over that went so far along and across its way."""
     places = selection.poses.position_mm[selection.used]
-    around = places - places.mean(axis=0)
-    _, *reach_mm = np.ptp(around @ np.linalg.eigh(around.T @ around)[1], axis=0)
+    _, *reach_mm = np.ptp(places @ principal_axes(places), axis=0)
     side, other = head.sides_mm
     return float(max((side + a) * (other + b) for a, b in (reach_mm, reach_mm[::-1])))
 

@@ -59,19 +59,23 @@ def other_rises(tactile_map: TactileMap, estimate: Estimate, options: SamplerSet
         for centre in _places(rest, estimate):
             if misses == MOST_LOOKS or len(rises) == MOST_NAMED:
                 break
-            if any(np.hypot(centre[0] - one.x_mm, centre[1] - one.y_mm) < 2 * SMOOTHING_MM for one in rises):
+            if _named(*centre, rises):
                 continue
             rise = _rise_at(centre, rest, estimate, options)
             # a fit may move to another rise, or back to the measured lump
             again = rise is not None and (
-                any(_apart_mm(rise, one) < 2 * SMOOTHING_MM for one in rises)
-                or not _clear_of_lump(rise.x_mm, rise.y_mm, rest, estimate)
+                _named(rise.x_mm, rise.y_mm, rises) or not _clear_of_lump(rise.x_mm, rise.y_mm, rest, estimate)
             )
             if rise is not None and not again and _stands_out(rise, rest):
                 rises.append(rise)
             else:
                 misses += 1
     return tuple(rises)
+
+
+def _named(x_mm: float, y_mm: float, rises: Sequence[Rise]) -> bool:
+    """True for a place that is one of the rises'."""
+    return any(np.hypot(x_mm - one.x_mm, y_mm - one.y_mm) < 2 * SMOOTHING_MM for one in rises)
 
 
 def _rise_at(

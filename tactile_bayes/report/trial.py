@@ -360,15 +360,13 @@ def _reasons(name: str, report: ModalityReport, keys: Sequence[str]) -> Iterator
     """Why figures or their intervals are missing; missing replicates are named in the JSON only."""
     owed = {key: report.reasons[key] for key in keys if not key.startswith(("within_mass", "calibration"))}
     figures = {key: why for key, why in owed.items() if not key.endswith("_interval")}
-    words = {key: text for key, (text, _) in (_FIRST | _FOUND).items()}
-    for reason in dict.fromkeys(figures.values()):
-        affected = ", ".join(words.get(key, key.replace("_", " ")) for key, why in figures.items() if why == reason)
-        yield f"{name}: no {affected}: {reason}"
     intervals = {key.removesuffix("_interval"): why for key, why in owed.items() if key.endswith("_interval")}
     intervals = {key: why for key, why in intervals.items() if key not in figures}
-    for reason in dict.fromkeys(intervals.values()):
-        affected = ", ".join(words.get(key, key.replace("_", " ")) for key, why in intervals.items() if why == reason)
-        yield f"{name}: no interval of {affected}: {reason}"
+    words = {key: text for key, (text, _) in (_FIRST | _FOUND).items()}
+    for what, missing in (("", figures), ("interval of ", intervals)):
+        for reason in dict.fromkeys(missing.values()):
+            affected = ", ".join(words.get(key, key.replace("_", " ")) for key, why in missing.items() if why == reason)
+            yield f"{name}: no {what}{affected}: {reason}"
 
 
 def found_share(report: ModalityReport) -> str:
