@@ -16,9 +16,8 @@ from tactile_bayes.declarations import Record, schema_of
 from tactile_bayes.files.arrays_layout import ArrayMap
 from tactile_bayes.files.column_map import ColumnMap
 from tactile_bayes.files.documents import OF_A_PERSON, Fact, FactName, Protocol, Session
-from tactile_bayes.files.instrument_json import HeadFile
+from tactile_bayes.files.instrument import HeadFile, SceneFile
 from tactile_bayes.files.reports import EstimateReport, Figures, Origin, PooledFigures, PooledReport, Shares
-from tactile_bayes.files.scene_toml import SceneFile
 from tactile_bayes.files.size_json import Eq6File, PopulationFile, RepeatabilityFile, SiteFile
 from tactile_bayes.options import IdentityOptions
 from tactile_bayes.report.compare import CompareReport

@@ -17,7 +17,7 @@ from pathlib import Path
 import tactile_bayes as tb
 from tactile_bayes.errors import TactileBayesError
 from tactile_bayes.files.documents import read_record
-from tactile_bayes.files.instrument_json import read_simulated_head
+from tactile_bayes.files.instrument import read_simulated_head
 from tactile_bayes.forward.scene import Head, Scene
 from tactile_bayes.studies.population import BodiesFile, BodyPrior, ExamPrior, draw_mass
 from validation.common import errors_of, parser, run, scan_of

@@ -24,7 +24,7 @@ from scipy.optimize import least_squares
 from tactile_bayes.api.estimating import estimate_inputs, estimate_one
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.declarations import replace
-from tactile_bayes.files.scene_toml import read_scene
+from tactile_bayes.files.instrument import read_scene
 from tactile_bayes.forward.scene import Scene
 from tactile_bayes.forward.tissue import SolidLump
 from tactile_bayes.geometry import FloatArray, apply

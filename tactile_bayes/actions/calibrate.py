@@ -13,12 +13,12 @@ from tactile_bayes.api.size_calibration import learn
 from tactile_bayes.commands.options import also_read, typed_options
 from tactile_bayes.declarations import as_dict
 from tactile_bayes.errors import BadDataError, in_file
-from tactile_bayes.files.instrument_json import ArrayCalibrationFile, write_array_calibration
+from tactile_bayes.files.instrument import ArrayCalibrationFile, write_array_calibration
 from tactile_bayes.files.provenance import Provenance, hash_inputs
 from tactile_bayes.files.scan_mcap import read_scan
 from tactile_bayes.files.size_json import size_calibration_path
 from tactile_bayes.hardware.head import ArrayFit, BladderStep, fit_array
-from tactile_bayes.laboratory_options import LearnOptions
+from tactile_bayes.options import LearnOptions
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.calibration import (
     body_calibration_text,
@@ -30,8 +30,6 @@ from tactile_bayes.report.study import eq6_figure
 from tactile_bayes.scans import Scan
 from tactile_bayes.shell import progress_bar
 from tactile_bayes.size.bodies import BodyCalibration
-
-# --- `calibrate array`: learn an array's calibration from recorded bladder steps, for `record` to attach.
 
 
 def calibrate_array(

@@ -32,8 +32,6 @@ from tactile_bayes.hardware.serial_trackers import TRACKERS, open_tracker, probe
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.scans import Scan
 
-# --- `emulate`: serve a scan as a device would send it.
-
 
 def emulate_action(
     *, kind: str, scan: Path, protocol: str, tcp: str | None, once: bool, speed: float, seed: int, **given: Any
@@ -113,9 +111,6 @@ def _link(tcp: str | None, *, after: int) -> Link:
     return TcpLink(host or "127.0.0.1", number)  # a patient's scan: other computers only where an address is given
 
 
-# --- `devices`: list serial ports and check which way a tracker's rotations go.
-
-
 def devices_action(
     *, url: str | None, pivot_url: str | None, tracker_protocol: str, tool: str | None, duration: float
 ) -> None:
@@ -155,9 +150,6 @@ def _pivot(url: str, protocol: str, tool: str | None, duration_s: float) -> None
     click.echo(f"{len(poses)} poses, turned by {sense.turn_deg:.0f} degrees: {sense}")
 
 
-# --- `replay`: play a scan through emulated devices and the recorder.
-
-
 def replay_action(*, scan: Path, output: Path | None, speed: float, **given: Any) -> int:
     """Replay a scan through emulated devices, recorder and live view, as if it were being recorded."""
     found = read_scan(scan)
@@ -190,9 +182,6 @@ def _emulated(scan: Path, speed: float, *, poses: bool) -> Iterator[dict[str, st
         process.terminate()
         process.wait()
         process.stdout.close()
-
-
-# --- `repair`: close a scan file that was cut off.
 
 
 def repair_action(*, scan: Path, output: Path | None, force: bool) -> None:

@@ -28,8 +28,6 @@ from tactile_bayes.report.figure_file import named_exam
 from tactile_bayes.report.pooled import pooled_summary, pooled_text
 from tactile_bayes.shell import progress_bar
 
-# --- `estimate --pool`: one size from several maps of one mass.
-
 
 def estimate_pool(
     maps: tuple[Path, ...],
@@ -74,9 +72,6 @@ def estimate_pool(
     finally:  # what was computed is not lost with a file
         click.echo(text_of(report), nl=False)
     return EXIT_DONE if found.pooled.size is not None else EXIT_NO_ESTIMATE
-
-
-# --- `estimate`: estimate sizes from tactile maps.
 
 
 def estimate_action(

@@ -20,13 +20,10 @@ from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.atomic import refuse_existing, unwritable, write_bytes
 from tactile_bayes.files.documents import dump_json
 from tactile_bayes.files.estimate_json import StatedSize, read_stated_size
-from tactile_bayes.files.instrument_json import write_head
+from tactile_bayes.files.instrument import write_head
 from tactile_bayes.files.scan_mcap import read_scan, read_truth
 from tactile_bayes.mapping.arrangement import check_scan
 from tactile_bayes.presets import RESEARCH_USE
-
-# --- `check`: is a scan arranged as it is stated?
-
 
 _OF_RECORDING: Final = ("data_lost", "recorder_noted", "times_apart")
 """Findings of a phantom's scan that say nothing against its head."""
@@ -63,9 +60,6 @@ def check_action(
         raise BadDataError(f"{which} not arranged as stated", way_out="correct what is named above")
 
 
-# --- `diagnose`: how far the draws of a posterior can be trusted, as a table and as pictures.
-
-
 def diagnose_action(
     posterior: Path, trace: Path | None, rank: Path | None, corner: Path | None, as_json: bool, force: bool
 ) -> None:
@@ -77,8 +71,6 @@ def diagnose_action(
         found.plot(kind, path, force=force)
     click.echo(dump_json(found.document) if as_json else found.text, nl=False)
 
-
-# --- `demo`: the main steps on data that comes with the program.
 
 EMBEDDED = ("scan.mcap", "phantoms.csv", "trial.csv", "excision.csv", "scene.toml", "empty.toml")
 PROGRAM = "tactile-bayes"

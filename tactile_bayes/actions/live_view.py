@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from tactile_bayes.batch import prepare_worker
 from tactile_bayes.declarations import from_plain, replace
 from tactile_bayes.errors import TactileBayesError
-from tactile_bayes.files.instrument_json import calibration_document, head_document
+from tactile_bayes.files.instrument import calibration_document, head_document
 from tactile_bayes.files.size_json import read_size_calibration, size_calibration_path
 from tactile_bayes.findings import finding_summary
 from tactile_bayes.geometry import FloatArray, apply, inverse

@@ -24,7 +24,7 @@ from tactile_bayes.declarations import as_dict
 from tactile_bayes.errors import EXIT_DONE, EXIT_INTERRUPTED, DeviceError, UsageError
 from tactile_bayes.files.atomic import refuse_existing, unwritable
 from tactile_bayes.files.documents import check_session, read_session
-from tactile_bayes.files.instrument_json import read_array_calibration, read_head_geometry, read_landmarks
+from tactile_bayes.files.instrument import read_array_calibration, read_head_geometry, read_landmarks
 from tactile_bayes.files.provenance import Provenance, hash_inputs
 from tactile_bayes.files.scan_mcap import RecordingWriter, create_exclusive, full_disk, read_scan
 from tactile_bayes.files.size_json import size_calibration_path
@@ -35,7 +35,7 @@ from tactile_bayes.hardware.ports import Port, read_in_process
 from tactile_bayes.hardware.readings import Follower, HelloReading
 from tactile_bayes.hardware.recorder import LandmarkTouch, Line, Observer, Recorder, Report
 from tactile_bayes.hardware.serial_trackers import TRACKERS, check_head, open_tracker
-from tactile_bayes.laboratory_options import RecordOptions
+from tactile_bayes.options import RecordOptions
 from tactile_bayes.presets import PRESSURE_RANGE_KPA, RESEARCH_USE
 from tactile_bayes.scans import ElementCalibration, HeadGeometry, Landmarks
 
@@ -236,9 +236,6 @@ class Keys:
             self._say("recording")
         elif key == "q":
             self._recorder.stop("q")
-
-
-# --- `record`: record a scan head and a tracker to a scan file without losing data.
 
 
 def record_action(output: Path, **options: Any) -> int:

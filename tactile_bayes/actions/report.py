@@ -41,9 +41,6 @@ def report_action(
     click.echo(RESEARCH_USE)
 
 
-# --- `export`: write maps and estimates as the files that other systems take.
-
-
 def export_action(*, files: tuple[Path, ...], output: Path | None, dictionary: Path | None, **given: Any) -> None:
     """Export maps and estimates as DICOM, FHIR, NRRD (3D Slicer) or CSV (REDCap)."""
     written = export(files, output, dictionary=dictionary, **{name: value for name, value in given.items() if value})

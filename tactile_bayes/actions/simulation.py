@@ -16,20 +16,17 @@ from tactile_bayes.declarations import as_dict, names_of
 from tactile_bayes.errors import TactileBayesError
 from tactile_bayes.files.atomic import write_text
 from tactile_bayes.files.documents import read_toml_record, with_session
-from tactile_bayes.files.instrument_json import read_simulated_head
+from tactile_bayes.files.instrument import read_scene, read_simulated_head
 from tactile_bayes.files.provenance import Provenance, hash_inputs
 from tactile_bayes.files.scan_mcap import write_scan
-from tactile_bayes.files.scene_toml import read_scene
 from tactile_bayes.files.tables import csv_text
 from tactile_bayes.forward.plane import outside_range
 from tactile_bayes.forward.scene import Head, Scene
 from tactile_bayes.forward.simulate import simulate
-from tactile_bayes.laboratory_options import PopulationOptions
+from tactile_bayes.options import PopulationOptions
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.shell import progress_bar
 from tactile_bayes.studies.population import BodiesFile, MassRow, Population
-
-# --- `simulate`: make a scan with known truth from a scene.
 
 
 def simulate_action(
@@ -75,9 +72,6 @@ def _scene_lines(scene: Scene) -> Iterator[str]:
     for rib in scene.ribs:
         where = f"{rib.depth_mm:g} mm deep, {rib.spacing_mm:g} mm apart along x"
         yield f"rib at y {rib.y_mm:g} mm: {len(rib.balls())} balls of {rib.d_mm:g} mm, {where}"
-
-
-# --- `population`: simulate, map and fit exams of varied bodies: the table for a size calibration.
 
 
 def population_action(

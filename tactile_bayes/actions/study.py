@@ -21,9 +21,9 @@ from tactile_bayes.declarations import names_of
 from tactile_bayes.errors import TactileBayesError, UsageError, in_file
 from tactile_bayes.files.atomic import refuse_existing, write_text
 from tactile_bayes.files.documents import dump_json
+from tactile_bayes.files.instrument import read_scene
 from tactile_bayes.files.provenance import hash_inputs
 from tactile_bayes.files.scan_mcap import read_scan
-from tactile_bayes.files.scene_toml import read_scene
 from tactile_bayes.files.size_json import DEFAULT, read_size_calibration, size_calibration_path
 from tactile_bayes.files.tables import csv_text, read_table
 from tactile_bayes.findings import finding_lines
@@ -31,9 +31,8 @@ from tactile_bayes.forward.contact import Head
 from tactile_bayes.forward.plane import outside_range
 from tactile_bayes.forward.scene import Head as Array
 from tactile_bayes.forward.tissue import parse_seat
-from tactile_bayes.laboratory_options import CaseOptions, SbcOptions, SectionOptions, StudyOptions
 from tactile_bayes.mapping.select import scan_findings
-from tactile_bayes.options import FieldCosines
+from tactile_bayes.options import CaseOptions, FieldCosines, SbcOptions, SectionOptions, StudyOptions
 from tactile_bayes.presets import HEADS, RESEARCH_USE, SHOULDERS_INSIDE, SHOULDERS_OUTSIDE, Method
 from tactile_bayes.report.laboratory import heads_text, sbc_document, sbc_figure, sbc_text, tables_document, tables_text
 from tactile_bayes.report.laboratory import table_text as ranks_table
@@ -242,8 +241,6 @@ def table_text(rows: list[paper.StudyRow]) -> str:
     return csv_text(names, ([getattr(row, name) for name in names] for row in rows), digits=6)
 
 
-# --- `tables`: recompute Tables 1 and 2 of the paper.
-
 ByHead = Mapping[Head, Sequence[Agreement]]
 
 
@@ -276,9 +273,6 @@ def run_tables(seat: float, *, heads: Sequence[Head], workers: int) -> tuple[ByH
     count, by_head = len(table_scenes(seat)), zip(*(outcome.value or [] for outcome in outcomes), strict=True)
     found = dict(zip(heads, by_head, strict=True))
     return {head: rows[:count] for head, rows in found.items()}, {head: rows[count:] for head, rows in found.items()}
-
-
-# --- `head`: how evenly a scan head presses, and the head that presses most evenly (section 2.1 of the paper).
 
 
 def head_uniformity_action(
@@ -314,9 +308,6 @@ def head_design_action(*, head: str | None, figure: Path | None, as_json: bool, 
             f"{named(best.head)}, reaches {100 * best.worst:.1f} %; give a larger --limit-percent, narrower ranges or "
             "another --thickness-mm"
         )
-
-
-# --- `compare-model`: a scan's frames and map against a forward model of a scene (section 2.3 of the paper).
 
 
 def compare_model_action(
@@ -355,9 +346,6 @@ def compare_model_action(
         click.echo(line, err=True)
     click.echo(comparison_text(measured, found))
     click.echo(RESEARCH_USE)
-
-
-# --- `sbc`: simulation-based calibration of a map's posterior.
 
 
 def sbc_action(

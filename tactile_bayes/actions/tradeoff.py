@@ -23,10 +23,10 @@ from tactile_bayes.declarations import replace, to_plain
 from tactile_bayes.errors import EXIT_DONE, EXIT_NO_ESTIMATE, UsageError, in_file
 from tactile_bayes.files.atomic import given_twice
 from tactile_bayes.files.documents import dump_json
+from tactile_bayes.files.instrument import read_scene
 from tactile_bayes.files.map_nc import read_map
 from tactile_bayes.files.provenance import Provenance, hash_inputs
 from tactile_bayes.files.scan_mcap import read_scan
-from tactile_bayes.files.scene_toml import read_scene
 from tactile_bayes.files.size_json import read_size_calibration, size_calibration_path
 from tactile_bayes.forward.scene import Scene
 from tactile_bayes.forward.tissue import SceneBody, SolidLump
@@ -120,8 +120,6 @@ def show(
     return EXIT_NO_ESTIMATE if ladder.reference.answer is None else EXIT_DONE
 
 
-# --- `tradeoff forward`: error in amplitude, width and size against CPU time, for one lump and every forward model.
-
 LEARNED = "learned"
 
 
@@ -183,9 +181,6 @@ def _rule(case: tradeoffs.LumpCase, model: str, name: str) -> tradeoffs.SizeRule
     return tradeoffs.calibrated_rule(read_size_calibration(path), name=path.name)
 
 
-# --- `tradeoff estimate`: every setting of `estimate` on the user's own map, against a long reference.
-
-
 def tradeoff_estimate_action(
     maps: tuple[Path, ...],
     size_calibration: str | None,
@@ -230,9 +225,6 @@ def tradeoff_estimate_action(
     return show(
         ladder, varied="estimate", title=title, figure=figure, as_json=as_json, force=force, provenance=provenance
     )
-
-
-# --- `tradeoff map`: every setting of `map` on the user's own scan, up to the size.
 
 
 def tradeoff_map_action(

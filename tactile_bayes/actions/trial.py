@@ -16,8 +16,6 @@ from tactile_bayes.options import TrialSettings
 from tactile_bayes.report.pages import PageFiles
 from tactile_bayes.shell import progress_bar
 
-# --- `validate`: compare each modality with excision.
-
 
 def validate_action(
     trial: Path,
@@ -64,9 +62,6 @@ def _settings(given: dict[str, Any], protocol: Path | None) -> tuple[str | None,
             option = f"--{name.replace('_', '-')} {given[name]}"
             raise UsageError(f"{option} contradicts {protocol}, which fixes {name} = {value}; leave the option out")
     return title, TrialSettings(**(given | fixed))
-
-
-# --- `plan`: sample size of a trial, and the value of more maps per mass.
 
 
 def plan_action(

@@ -16,7 +16,7 @@ from tactile_bayes.errors import UsageError
 from tactile_bayes.files import imports
 from tactile_bayes.files.arrays_layout import ArrayMap, Stated
 from tactile_bayes.files.documents import with_session
-from tactile_bayes.files.instrument_json import head_geometry
+from tactile_bayes.files.instrument import head_geometry
 from tactile_bayes.files.named_arrays import Source, read_array_map
 from tactile_bayes.files.npz import Arrays
 from tactile_bayes.mapping.arrangement import corrected

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 from tactile_bayes.api.arguments import PathLike, door, output_path, plain, required_path, table_of, takes
 from tactile_bayes.api.repeatability import exams_in, learn_from_exams
 from tactile_bayes.api.size_calibration import learn
-from tactile_bayes.laboratory_options import LearnOptions
+from tactile_bayes.options import LearnOptions
 from tactile_bayes.size.pooling import Calibration, Repeatability
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ def calibrate_size(
     path
         Also write the calibration there.
     **options
-        As of `tactile_bayes.laboratory_options.LearnOptions`, by default as on the command line: form, fit, seed,
+        As of `tactile_bayes.options.LearnOptions`, by default as on the command line: form, fit, seed,
         least_stiffness_ratio, and normalise, background, fit_radius_mm, noise of the table's maps where it does not
         say; of a table of `population`, normalise: which rows to learn from.
 

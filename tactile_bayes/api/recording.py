@@ -9,7 +9,7 @@ from tactile_bayes.actions.record import Request, make_recording
 from tactile_bayes.api.arguments import PathLike, door, path_of, plain, takes
 from tactile_bayes.errors import DeviceError, check_number
 from tactile_bayes.hardware.recorder import Report
-from tactile_bayes.laboratory_options import RecordOptions
+from tactile_bayes.options import RecordOptions
 
 _PATHS = ("like", "head_geometry", "array_calibration", "landmarks")
 _NAMED = ("output", "head_url", "duration_s", "tracker_url", "session_file")  #: Keywords of their own.
@@ -43,7 +43,7 @@ def record(
     session
         File of facts of the exam.
     **options
-        As of `tactile_bayes.laboratory_options.RecordOptions`, by default as of `tactile-bayes record`:
+        As of `tactile_bayes.options.RecordOptions`, by default as of `tactile-bayes record`:
         tracker_protocol, like, head_geometry, array_calibration, side, subject, force...
 
     Returns

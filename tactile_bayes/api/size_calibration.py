@@ -21,7 +21,7 @@ from tactile_bayes.files.size_json import SHIPPED, read_size_calibration, size_c
 from tactile_bayes.files.tables import Sheet, Table, read_table
 from tactile_bayes.forward.tissue import parse_seat
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.laboratory_options import LearnOptions
+from tactile_bayes.options import LearnOptions
 from tactile_bayes.presets import FIT_RADIUS_MM, HEAD_PROFILE, LEAST_HARD_RATIO, Background
 from tactile_bayes.progress import Progress
 from tactile_bayes.scans import HeadShape

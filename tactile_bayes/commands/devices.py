@@ -8,10 +8,8 @@ import click
 
 from tactile_bayes.commands.options import FORCE, SPEED, FilePath, FiniteRange, command, live_options, output, takes
 from tactile_bayes.declarations import names_of
-from tactile_bayes.laboratory_options import FaultOptions, RecordOptions
+from tactile_bayes.options import FaultOptions, RecordOptions
 from tactile_bayes.presets import TrackerProtocol
-
-# --- `record`: a scan head and a tracker into a scan file.
 
 _RECORDING = names_of(RecordOptions)[2:-4]  #: Between the output with the head's port and the options of the live view.
 
@@ -32,8 +30,6 @@ def record_command() -> None:
     Example: tactile-bayes record -o scan.mcap --head /dev/ttyACM0 --tracker /dev/ttyUSB0 --like last.mcap
     """
 
-
-# --- `emulate`: serve a scan as a device would send it.
 
 PROTOCOLS = get_args(TrackerProtocol)
 
@@ -70,9 +66,6 @@ def emulate_command() -> None:
 
     Example: tactile-bayes emulate both scan.mcap
     """
-
-
-# --- `devices`: list serial ports and check which way a tracker's rotations go.
 
 
 @command("devices", "devices.devices_action")
@@ -112,8 +105,6 @@ def devices_command() -> None:
     """
 
 
-# --- `replay`: play a scan through emulated devices and the recorder.
-
 _FILE = FilePath()
 
 
@@ -128,9 +119,6 @@ def replay_command() -> None:
 
     Example: tactile-bayes replay scan.mcap --live
     """
-
-
-# --- `repair`: close a scan file that was cut off.
 
 
 @command("repair", "devices.repair_action")

@@ -13,8 +13,6 @@ from tactile_bayes.declarations import names_of
 from tactile_bayes.errors import UsageError
 from tactile_bayes.options import GROWN_BY, Comparing, MapOptions
 
-# --- `map`: from scans to a tactile map.
-
 _FILE = options.FilePath()
 
 
@@ -39,9 +37,6 @@ def map_command() -> None:
 
     Example: tactile-bayes map scan.mcap -o map.nc --figure map.png
     """
-
-
-# --- `estimate`: estimate sizes from tactile maps.
 
 
 @options.command("estimate", "estimate.estimate_action")
@@ -117,9 +112,6 @@ def numbered(args: Sequence[str], *, strict: bool = True) -> list[str]:
     return found
 
 
-# --- `compare`: change of a mass's size between visits.
-
-
 _PERCENT = tuple(100 * share for share in GROWN_BY)
 
 
@@ -185,9 +177,6 @@ def compare_command() -> None:
 
     Example: tactile-bayes compare jan1.nc jan2.nc --with apr1.nc apr2.nc --days 92 -o growth.html
     """
-
-
-# --- `report`: one page of an exam, to read and to print.
 
 
 @options.command("report", "report.report_action")

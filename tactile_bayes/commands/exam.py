@@ -11,11 +11,8 @@ import click
 from tactile_bayes.commands.options import FORCE, JSON, SESSION, FilePath, command, figure, path_option, takes
 from tactile_bayes.declarations import names_of
 from tactile_bayes.files.arrays_layout import GridOptions, Stated, layout_lines
-from tactile_bayes.laboratory_options import RecordOptions
-from tactile_bayes.options import IdentityOptions, MapOptions
+from tactile_bayes.options import IdentityOptions, MapOptions, RecordOptions
 from tactile_bayes.presets import CORRECTIONS, METHODS
-
-# --- `demo`: the main steps on data that comes with the program.
 
 
 @command("demo", "exam.demo_action")
@@ -44,9 +41,6 @@ def demo_command() -> None:
     Markov chains through Eq 6, and both results are compared with the true size. The trial is synthetic. Each step is
     printed as the command that does it by hand.
     """
-
-
-# --- `import`: import scans, grids and images from other programs.
 
 
 @command("import", "bring_in.import_action")
@@ -101,9 +95,6 @@ _ARRAYS = "\n".join([_HEADING, "", "\b", *layout_lines(), "", _MORE])
 import_command.help = f"{cleandoc(import_command.help or '')}\n\n{_ARRAYS}"
 
 
-# --- `check`: is a scan arranged as it is stated?
-
-
 @command("check", "exam.check_action")
 @click.argument("scans", nargs=-1, required=True, metavar="SCAN...", type=FilePath())
 @takes(MapOptions, "pressure_window_kpa")
@@ -126,9 +117,6 @@ def check_command() -> None:
     """
 
 
-# --- `show`: describe a file.
-
-
 @command("show", "show.show_action")
 @click.argument("file", type=FilePath())
 @JSON
@@ -141,8 +129,6 @@ def show_command() -> None:
     Example: tactile-bayes show map.nc
     """
 
-
-# --- `export`: write maps and estimates as the files that other systems take.
 
 _FORMATS: Final = ("dicom", "fhir", "nrrd", "csv")
 
@@ -171,9 +157,6 @@ def export_command() -> None:
 
     Example: tactile-bayes export map.nc estimate.json --to dicom --study-date 2026-11-24T10:30 -o exam
     """
-
-
-# --- `diagnose`: how far the draws of a posterior can be trusted, as a table and as pictures.
 
 
 @command("diagnose", "exam.diagnose_action")

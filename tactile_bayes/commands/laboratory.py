@@ -4,15 +4,21 @@ from __future__ import annotations
 
 import click
 
-from tactile_bayes import laboratory_options
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.commands import options
 from tactile_bayes.declarations import names_of
-from tactile_bayes.options import MapOptions
+from tactile_bayes.options import (
+    CaseOptions,
+    LearnOptions,
+    MapOptions,
+    PopulationOptions,
+    SbcOptions,
+    SectionOptions,
+    StudyOptions,
+    TissueOptions,
+)
 
 _FILE = options.FilePath()
-
-# --- `calibrate`: learn a calibration from known objects, and a site's repeatability from its own exams.
 
 
 @click.group("calibrate", cls=options.CommandGroup)
@@ -23,7 +29,7 @@ def calibrate_command() -> None:
 @options.command("size", "calibrate.calibrate_size_action", within=calibrate_command)
 @click.argument("table", metavar="TABLE.csv", type=_FILE)
 @options.output("SIZE.json", "JSON", "Where to write the calibration.", required=True)
-@options.takes(laboratory_options.LearnOptions, "form")
+@options.takes(LearnOptions, "form")
 @click.option(
     "--correct",
     metavar="CALIBRATION",
@@ -35,11 +41,9 @@ def calibrate_command() -> None:
     "TABLE.csv",
     "Lumps of another origin, with the columns of `population`: how far their sizes are off goes into intervals.",
 )
-@options.takes(
-    laboratory_options.LearnOptions, "fit", "normalise", "background", "fit_radius_mm", "noise", "least_stiffness_ratio"
-)
+@options.takes(LearnOptions, "fit", "normalise", "background", "fit_radius_mm", "noise", "least_stiffness_ratio")
 @options.figure("Draw Fig 8 of the paper from the table's lumps (eq6 only).")
-@options.takes(laboratory_options.LearnOptions, "seed")
+@options.takes(LearnOptions, "seed")
 @options.FORCE
 def size() -> None:
     """Learn Eq 6, d = m sigma / (e a^f) + b, from a study or a set of phantoms, or over a population of bodies.
@@ -121,9 +125,6 @@ def array() -> None:
     """
 
 
-# --- `simulate`: make a scan with known truth from a scene.
-
-
 @options.command("simulate", "simulation.simulate_action")
 @click.argument("scene", type=options.FilePath())
 @click.option("-o", "--output", required=True, type=options.FilePath(writes="MCAP"), help="Scan file to write (.mcap).")
@@ -153,12 +154,9 @@ def simulate_command() -> None:
     """
 
 
-# --- `population`: simulate, map and fit exams of varied bodies: the table for a size calibration.
-
-
 @options.command("population", "simulation.population_action")
 @options.output("TABLE.csv", "CSV", "Where to write the table.", required=True)
-@options.takes(laboratory_options.PopulationOptions, "masses", "centred", "scans", "normalise")
+@options.takes(PopulationOptions, "masses", "centred", "scans", "normalise")
 @options.path_option(
     "--head",
     "HEAD.json",
@@ -172,7 +170,7 @@ def simulate_command() -> None:
     help="Ranges of lumps, bodies and exams, in the tables [bodies] and [exams]. Default: those of the shipped "
     "calibrations.",
 )
-@options.takes(laboratory_options.PopulationOptions, "seed")
+@options.takes(PopulationOptions, "seed")
 @options.WORKERS
 @options.scheduler_option("the masses")
 @options.FORCE
@@ -189,11 +187,8 @@ def population_command() -> None:
     """
 
 
-# --- `sbc`: simulation-based calibration of a map's posterior.
-
-
 @options.command("sbc", "study.sbc_action")
-@options.takes(laboratory_options.SbcOptions, *names_of(laboratory_options.SbcOptions))
+@options.takes(SbcOptions, *names_of(SbcOptions))
 @options.WORKERS
 @options.scheduler_option("the maps")
 @options.output("TABLE.csv", "CSV", "Write truths and ranks; an interrupted run resumes from it.")
@@ -214,11 +209,8 @@ def sbc_command() -> None:
     """
 
 
-# --- `study`: amplitude and width of the maps of simulated lumps.
-
-
 @options.command("study", "study.study_action")
-@options.takes(laboratory_options.StudyOptions, "model", "grid", "seat")
+@options.takes(StudyOptions, "model", "grid", "seat")
 @options.output("TABLE.csv", "CSV", "Write the table. Default: print it.")
 @options.path_option(
     "--figures",
@@ -237,9 +229,9 @@ def sbc_command() -> None:
     metavar="D H/D",
     help="Lump of figure 6: diameter in mm, and depth over diameter. Default: 12.5 0.825, the paper's.",
 )
-@options.takes(laboratory_options.SectionOptions, *names_of(laboratory_options.SectionOptions))
+@options.takes(SectionOptions, *names_of(SectionOptions))
 @options.head_option("Default: shoulders-inside for plane-strain, shoulders-outside for solid.")
-@options.takes(laboratory_options.StudyOptions, *names_of(laboratory_options.CaseOptions), "background", "flat_field")
+@options.takes(StudyOptions, *names_of(CaseOptions), "background", "flat_field")
 @options.WORKERS
 @options.scheduler_option("the geometries")
 @options.FORCE
@@ -261,12 +253,9 @@ def study_command() -> None:
     """
 
 
-# --- `tables`: recompute Tables 1 and 2 of the paper.
-
-
 @options.command("tables", "study.tables_action")
-@options.takes(laboratory_options.StudyOptions, "seat", help="How far the lump stands out of the gland.")
-@options.takes(laboratory_options.SectionOptions, *names_of(laboratory_options.SectionOptions))
+@options.takes(StudyOptions, "seat", help="How far the lump stands out of the gland.")
+@options.takes(SectionOptions, *names_of(SectionOptions))
 @options.head_option("Default: shoulders-inside.")
 @click.option("--heads", "search", is_flag=True, help="Compute the tables for many heads, and name the nearest one.")
 @options.WORKERS
@@ -283,18 +272,15 @@ def tables_command() -> None:
     """
 
 
-# --- `head`: how evenly a scan head presses, and the head that presses most evenly (section 2.1 of the paper).
-
-
 @click.group("head", cls=options.CommandGroup)
 def head_command() -> None:
     """How evenly a scan head presses on tissue without a lump: the homogeneous-pressure condition of section 2.1."""
 
 
 @options.command("uniformity", "study.head_uniformity_action", within=head_command)
-@options.takes(laboratory_options.SectionOptions, *names_of(laboratory_options.SectionOptions))
+@options.takes(SectionOptions, *names_of(SectionOptions))
 @options.head_option("Default: shoulders-inside.")
-@options.takes(laboratory_options.TissueOptions, *names_of(laboratory_options.TissueOptions))
+@options.takes(TissueOptions, *names_of(TissueOptions))
 @options.JSON
 def head_uniformity_command() -> None:
     """Compute how evenly one head presses on homogeneous tissue.
@@ -308,7 +294,7 @@ def head_uniformity_command() -> None:
 
 @options.command("design", "study.head_design_action", within=head_command)
 @options.head_option("Default: both are searched.")
-@options.takes(laboratory_options.TissueOptions, *names_of(laboratory_options.TissueOptions))
+@options.takes(TissueOptions, *names_of(TissueOptions))
 @options.figure("Draw the non-uniformity over radius and shoulder.")
 @options.JSON
 @options.FORCE
@@ -322,8 +308,6 @@ def head_design_command() -> None:
     Example: tactile-bayes head design --figure head.png
     """
 
-
-# --- `compare-model`: a scan's frames and map against a forward model of a scene (section 2.3 of the paper).
 
 _FIDELITIES = ("solid", "plane-strain", "empirical", "empirical-gaussian")
 
@@ -392,9 +376,6 @@ def tradeoff_command() -> None:
     """Measure what more accuracy costs on this machine, and which of it a case does not need."""
 
 
-# --- `tradeoff forward`: error in amplitude, width and size against CPU time, for one lump and every forward model.
-
-
 @options.command("forward", "tradeoff.tradeoff_forward_action", within=tradeoff_command)
 @click.argument("scene", required=False, metavar="[SCENE.toml]", type=_FILE)
 @click.option(
@@ -440,9 +421,6 @@ def tradeoff_forward_command() -> None:
     """
 
 
-# --- `tradeoff estimate`: every setting of `estimate` on the user's own map, against a long reference.
-
-
 @options.command("estimate", "tradeoff.tradeoff_estimate_action", within=tradeoff_command)
 @click.argument("maps", metavar="MAP.nc...", nargs=-1, required=True, type=_FILE)
 @_CALIBRATION
@@ -466,9 +444,6 @@ def tradeoff_estimate_command() -> None:
 
     Example: tactile-bayes tradeoff estimate map.nc --figure methods.png
     """
-
-
-# --- `tradeoff map`: every setting of `map` on the user's own scan, up to the size.
 
 
 @options.command("map", "tradeoff.tradeoff_map_action", within=tradeoff_command)

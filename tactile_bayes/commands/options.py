@@ -142,9 +142,6 @@ class CommandGroup(click.Group):
             formatter.write_dl(whole)
 
 
-# --- `--head`: where the shoulders of a simulated head lie.
-
-
 def head_option(default: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Make the option; its help ends with a sentence about the default."""
     return click.option(

@@ -9,8 +9,6 @@ from tactile_bayes.commands import options
 from tactile_bayes.declarations import names_of
 from tactile_bayes.options import CampaignOptions, PlanErrors, PlanOptions, TrialSettings
 
-# --- `validate`: compare each modality with excision.
-
 _FILE = options.FilePath()
 
 
@@ -51,9 +49,6 @@ def validate_command() -> None:
     """
 
 
-# --- `plan`: sample size of a trial, and the value of more maps per mass.
-
-
 @options.command("plan", "trial.plan_action")
 @options.takes(PlanOptions, "patients", "maps", "power", "precision")
 @options.takes(PlanErrors, *names_of(PlanErrors))
@@ -73,9 +68,6 @@ def plan_command() -> None:
 
     Example: tactile-bayes plan --power 0.9 --maps 3 --figure plan.png
     """
-
-
-# --- `campaign`: from a folder of exams to the trial's report.
 
 
 @click.group("campaign", cls=options.CommandGroup)

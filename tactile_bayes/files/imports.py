@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from tactile_bayes.declarations import Record, names_of, replace
 from tactile_bayes.errors import BadDataError, in_file, meant
 from tactile_bayes.files.arrays_layout import KNOWN, LAYOUT, OPTIONAL, ArrayMap, Shape, Stated, in_words
-from tactile_bayes.files.instrument_json import read_array_calibration, read_head_geometry, read_landmarks
+from tactile_bayes.files.instrument import read_array_calibration, read_head_geometry, read_landmarks
 from tactile_bayes.files.named_arrays import Source, is_text, plain_names, read_named
 from tactile_bayes.files.npz import Arrays
 from tactile_bayes.files.reading import kind_of

@@ -25,7 +25,7 @@ from tactile_bayes.declarations import Record, from_plain
 from tactile_bayes.errors import BadDataError, UsageError, in_file
 from tactile_bayes.files.atomic import atomic_path, refuse_existing
 from tactile_bayes.files.documents import check_session, parse_json
-from tactile_bayes.files.instrument_json import calibration_document, head_document
+from tactile_bayes.files.instrument import calibration_document, head_document
 from tactile_bayes.files.mcap_records import McapRecords, Messages, read_records
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.findings import Finding, findings_in

@@ -30,7 +30,7 @@ from tactile_bayes.hardware.serial_trackers import (
     record_bytes,
 )
 from tactile_bayes.hardware.trackers import encode_transform
-from tactile_bayes.laboratory_options import FaultOptions
+from tactile_bayes.options import FaultOptions
 from tactile_bayes.scans import Scan, TrackerPoses
 
 # --- Emulated devices: a scan's frames and poses as a head or a tracker sends them, with faults on request.

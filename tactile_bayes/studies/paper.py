@@ -16,7 +16,7 @@ from tactile_bayes.forward import plane
 from tactile_bayes.forward.contact import Head
 from tactile_bayes.forward.tissue import SEATS, Body, Layers
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.laboratory_options import CaseOptions, TissueOptions
+from tactile_bayes.options import CaseOptions, TissueOptions
 from tactile_bayes.posterior.bump import cell_mean_gaussian
 from tactile_bayes.posterior.white import LEAST_WIDTH_IN_CELLS, WIDEST_IN_RADII
 from tactile_bayes.presets import HEAD_PITCH_MM, HEADS, SHOULDERS_INSIDE

@@ -11,7 +11,7 @@ from in_process import run_here
 
 import tactile_bayes as tb
 from tactile_bayes.declarations import replace
-from tactile_bayes.files.instrument_json import read_head_geometry
+from tactile_bayes.files.instrument import read_head_geometry
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.scan_mcap import read_scan, write_scan
 from tactile_bayes.mapping.build import build_map

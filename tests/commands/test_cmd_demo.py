@@ -12,7 +12,7 @@ from subprocess import CompletedProcess
 import pytest
 
 from tactile_bayes.actions.exam import _how_to_type
-from tactile_bayes.files.scene_toml import read_scene
+from tactile_bayes.files.instrument import read_scene
 from tactile_bayes.forward.tissue import SolidLump
 
 Run = Callable[..., "CompletedProcess[str]"]

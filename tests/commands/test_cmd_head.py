@@ -15,7 +15,7 @@ from tactile_bayes.actions import study as tables
 from tactile_bayes.actions.study import study_settings
 from tactile_bayes.cli import cli
 from tactile_bayes.files.scan_mcap import read_scan, read_truth
-from tactile_bayes.laboratory_options import SectionOptions, StudyOptions
+from tactile_bayes.options import SectionOptions, StudyOptions
 from tactile_bayes.presets import HEADS, SHOULDERS_INSIDE, SHOULDERS_OUTSIDE
 
 DEFAULTS = {"plane-strain": SHOULDERS_INSIDE, "empirical": SHOULDERS_INSIDE, "solid": SHOULDERS_OUTSIDE}

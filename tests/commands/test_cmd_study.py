@@ -85,7 +85,7 @@ def test_an_interrupted_study_goes_on_where_it_stopped(folder: Path, run_cli: Ru
     """The store of a killed run: two geometries, and a third half written."""
     from tactile_bayes.actions.study import study_settings
     from tactile_bayes.batch_store import open_store
-    from tactile_bayes.laboratory_options import SectionOptions, StudyOptions
+    from tactile_bayes.options import SectionOptions, StudyOptions
 
     settings = study_settings(StudyOptions(fineness=1), SectionOptions())
     (tmp_path / "grid.csv").write_text(GRID)

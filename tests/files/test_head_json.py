@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.files.instrument_json import read_head_geometry, read_simulated_head
+from tactile_bayes.files.instrument import read_head_geometry, read_simulated_head
 from tactile_bayes.forward.scene import FLAT_MM, Head
 
 ARC = {"schema": "tactile-bayes/head/1", "pitch_mm": 1.5, "rows": 10, "columns": 12, "radius_mm": 20.0}

@@ -24,13 +24,12 @@ from tactile_bayes.files.documents import parse_toml, read_protocol
 from tactile_bayes.files.estimate_json import read_stated_size
 from tactile_bayes.files.identify import describe
 from tactile_bayes.files.imports import read_arrays
-from tactile_bayes.files.instrument_json import read_landmarks
+from tactile_bayes.files.instrument import read_landmarks, read_scene
 from tactile_bayes.files.map_nc import read_map, write_map
 from tactile_bayes.files.npz import CheckpointFile
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.scan_mcap import read_scan, read_scan_report
 from tactile_bayes.files.scan_text import read_poses
-from tactile_bayes.files.scene_toml import read_scene
 from tactile_bayes.files.size_json import read_size_calibration
 from tactile_bayes.files.tables import read_table
 from tactile_bayes.inference.ensemble import ChainState

@@ -15,7 +15,7 @@ from mapping_scans import make_scan, strokes
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.identify import describe
-from tactile_bayes.files.instrument_json import read_landmarks
+from tactile_bayes.files.instrument import read_landmarks
 from tactile_bayes.files.map_nc import read_map, write_map
 from tactile_bayes.files.scan_mcap import read_scan, write_scan
 from tactile_bayes.scans import Landmarks, Scan

@@ -15,8 +15,8 @@ import tactile_bayes
 from tactile_bayes.declarations import as_dict, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.documents import load_schema
+from tactile_bayes.files.instrument import read_scene, scene_from_toml
 from tactile_bayes.files.scan_mcap import read_scan, read_truth
-from tactile_bayes.files.scene_toml import read_scene, scene_from_toml
 from tactile_bayes.forward.scene import (
     Background,
     Lump,

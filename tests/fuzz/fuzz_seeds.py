@@ -321,14 +321,14 @@ def _read_tomls(path: Path) -> object:
     from tactile_bayes.api.settings import read_settings
     from tactile_bayes.files.column_map import read_mapping
     from tactile_bayes.files.documents import read_protocol
-    from tactile_bayes.files.scene_toml import read_scene
+    from tactile_bayes.files.instrument import read_scene
 
     return _first([lambda read=read: read(path) for read in (read_settings, read_protocol, read_mapping, read_scene)])
 
 
 def _read_jsons(path: Path) -> object:
     from tactile_bayes.files.estimate_json import read_stated_size
-    from tactile_bayes.files.instrument_json import read_array_calibration, read_head_geometry, read_landmarks
+    from tactile_bayes.files.instrument import read_array_calibration, read_head_geometry, read_landmarks
     from tactile_bayes.files.size_json import read_repeatability, read_size_calibration
 
     readers = (

@@ -11,7 +11,7 @@ import pytest
 from emulated_devices import serving, short_scan
 
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.files.instrument_json import read_array_calibration
+from tactile_bayes.files.instrument import read_array_calibration
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.scan_mcap import read_scan, write_scan
 from tactile_bayes.hardware.emulated import EmulatedHead

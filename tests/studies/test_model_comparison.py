@@ -13,7 +13,7 @@ from in_process import run_here
 from tactile_bayes.cli import cli
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import EXIT_BAD_DATA, BadDataError
-from tactile_bayes.files.scene_toml import read_scene
+from tactile_bayes.files.instrument import read_scene
 from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.studies.model_comparison import compare_model, line_bump, measured_frames, residual_slope
 

@@ -14,8 +14,8 @@ from posterior_maps import find_bump
 
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError
+from tactile_bayes.files.instrument import read_scene, scene_from_toml
 from tactile_bayes.files.scan_mcap import read_scan, read_truth
-from tactile_bayes.files.scene_toml import read_scene, scene_from_toml
 from tactile_bayes.forward.scene import (
     Background,
     Head,

@@ -11,7 +11,7 @@ from posterior_maps import bump_map, correlated_field, find_bump, grid_map
 
 import tactile_bayes
 from tactile_bayes.declarations import replace
-from tactile_bayes.files.scene_toml import read_scene
+from tactile_bayes.files.instrument import read_scene
 from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import TactileMap

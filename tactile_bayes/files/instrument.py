@@ -1,19 +1,37 @@
-"""A scan head and its instrument, as JSON."""
+"""The instrument and its scene as files: head, array calibration and landmarks in JSON, a simulated scan in TOML."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from datetime import date
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
 import numpy as np
 
-from tactile_bayes.declarations import EXACT, Meta, Record, field, to_plain
+from tactile_bayes.declarations import EXACT, Meta, Record, as_dict, field, from_plain, names_of, says, to_plain
 from tactile_bayes.errors import BadDataError, in_file
 from tactile_bayes.files.atomic import write_text
-from tactile_bayes.files.documents import dump_json, load_json, parse_record, read_record
-from tactile_bayes.forward.scene import FLAT_MM, Columns, Head, Pitch, Rows, Scene
-from tactile_bayes.geometry import FloatArray, Matrix
+from tactile_bayes.files.documents import dump_json, load_json, parse_record, parse_toml, read_record
+from tactile_bayes.files.reading import TOML_BYTES, read_text
+from tactile_bayes.forward.scene import (
+    FLAT_MM,
+    Background,
+    Columns,
+    Head,
+    Lump,
+    Noise,
+    Pitch,
+    Rows,
+    Scene,
+    SceneLandmarks,
+    Strokes,
+    Taxels,
+    Timing,
+    Tracker,
+)
+from tactile_bayes.forward.tissue import DepthRatio, Height, Rib, SceneBody, Seat, SolidLump, Stiffness
+from tactile_bayes.geometry import Matrix
 from tactile_bayes.scans import ElementCalibration, HeadGeometry, HeadShape, Landmarks
 
 # --- Heads and calibrations as a scan file has them.
@@ -92,7 +110,7 @@ def head_geometry(document: object, *, path: Path) -> HeadGeometry:
     with in_file(path):
         if file.scanhead_from_tracker is None:
             raise BadDataError("lacks scanhead_from_tracker", way_out="add the transform from the sensor to the head")
-        surface = _arc(file).surface_mm() if file.surface_mm is None else np.array(file.surface_mm)
+        surface = _head_of(file).surface_mm() if file.surface_mm is None else np.array(file.surface_mm)
         day = "" if file.checked_on is None else file.checked_on.isoformat()
         return HeadGeometry(surface, file.pitch_mm, np.array(file.scanhead_from_tracker), day)
 
@@ -101,7 +119,7 @@ def read_simulated_head(path: Path) -> Head:
     """Read a head for the solid model, in which taxels form a regular grid on an arc, or on a plane."""
     file = _head_file(load_json(path, way_out=_WAY_OUT), path)
     with in_file(path):
-        return _arc(file) if file.surface_mm is None else _fitted(file, np.array(file.surface_mm))
+        return _head_of(file)
 
 
 def _head_file(document: object, path: Path) -> HeadFile:
@@ -115,30 +133,23 @@ def _head_file(document: object, path: Path) -> HeadFile:
     return file
 
 
-def _arc(file: HeadFile) -> Head:
-    """Head of a grid on an arc, checked as a scene's."""
-    assert file.rows is not None
-    assert file.columns is not None
-    return _checked(file, file.rows, file.columns, file.radius_mm)
-
-
-def _checked(file: HeadFile, rows: int, columns: int, radius_mm: float | None) -> Head:
+def _head_of(file: HeadFile) -> Head:
+    """The head as a grid on an arc, checked as a scene's; its taxels must be where the file has them."""
+    surface_mm = None if file.surface_mm is None else np.array(file.surface_mm)
+    grid = file if surface_mm is None else HeadShape.of(surface_mm, file.pitch_mm)
+    assert grid.rows is not None
+    assert grid.columns is not None
+    radius_mm = FLAT_MM if grid.radius_mm is None else grid.radius_mm
     rim = (0.0 if file.shoulder_mm else _DEFAULT_RIM_MM) if file.rim_mm is None else file.rim_mm
-    head = Head(rows, columns, file.pitch_mm, FLAT_MM if radius_mm is None else radius_mm, file.shoulder_mm, rim)
+    head = Head(grid.rows, grid.columns, file.pitch_mm, radius_mm, file.shoulder_mm, rim)
     Scene(head=head)  # refuses what is no head
-    return head
-
-
-def _fitted(file: HeadFile, surface_mm: FloatArray) -> Head:
-    """Head whose taxels are where `surface_mm` has them."""
-    shape = HeadShape.of(surface_mm, file.pitch_mm)
-    head = _checked(file, shape.rows, shape.columns, shape.radius_mm)
-    away = (surface_mm - head.surface_mm()).reshape(-1, 3)
-    apart = float(np.abs(away - away.mean(axis=0)).max())  # wherever a site puts the origin
-    if apart > _REGULAR_MM:
-        grid = f"a regular grid of {file.pitch_mm:g} mm on an arc across the head"
-        way_out = "the model has such heads only: give rows, columns and radius_mm of the nearest one (null: flat)"
-        raise BadDataError(f"surface_mm lies up to {apart:.2g} mm from {grid}", way_out=way_out)
+    if surface_mm is not None:
+        away = (surface_mm - head.surface_mm()).reshape(-1, 3)
+        apart = float(np.abs(away - away.mean(axis=0)).max())  # wherever a site puts the origin
+        if apart > _REGULAR_MM:
+            regular = f"a regular grid of {file.pitch_mm:g} mm on an arc across the head"
+            way_out = "the model has such heads only: give rows, columns and radius_mm of the nearest one (null: flat)"
+            raise BadDataError(f"surface_mm lies up to {apart:.2g} mm from {regular}", way_out=way_out)
     return head
 
 
@@ -193,3 +204,85 @@ def read_landmarks(path: Path) -> Landmarks:
     found = read_record(path, LandmarksFile, way_out="give sternal_notch_mm and xiphoid_mm, three numbers each")
     nipple = None if found.nipple_mm is None else np.array(found.nipple_mm)
     return Landmarks(np.array(found.sternal_notch_mm), np.array(found.xiphoid_mm), nipple_mm=nipple)
+
+
+# --- Scenes of simulated scans, as TOML.
+
+# A lump with one of the first is tissue; only a Gaussian one may have the others.
+_OF_TISSUE: Final = ("depth_ratio", "stiffness_ratio", "seat", "height_mm")
+_OF_BUMPS: Final = ("amplitude", "sigma_x_mm", "sigma_y_mm", "angle_deg")
+
+
+class LumpTable(Lump):
+    """One lump."""
+
+    height_mm: Height | None = None
+    depth_ratio: DepthRatio | None = None
+    stiffness_ratio: Stiffness | None = None
+    seat: Seat | None = None
+
+
+class SceneFile(Record):
+    """Scene of a simulated scan.
+
+    The TOML document `simulate` reads. Everything may be left out. Units are in the keys; lumps and landmarks lie in
+    the scene's plane: origin at the centre of the strokes, x along them (across the head), y along the head, z into the
+    tissue.
+    """
+
+    scene: Timing = field(default_factory=Timing)  #: Length and rates.
+    background: Background = field(default_factory=Background)
+    """Mean pressure away from lumps, against time."""
+    body: SceneBody | None = None
+    lump: Annotated[tuple[LumpTable, ...], Meta(max_length=100)] = ()
+    """Lumps: either Gaussian rises of the normalised pressure (amplitude, sigma), or tissue (d_mm, depth_ratio)."""
+    rib: Annotated[
+        tuple[Annotated[Rib, says("One rib.")], ...],
+        says("Ribs for the solid model: rows of stiff balls along x, across the head.", max_length=10),
+    ] = ()
+    strokes: Strokes = field(default_factory=Strokes)
+    """Back and forth across the head, line after line along it."""
+    head: Head = field(default_factory=Head)  #: A section of a circular cylinder.
+    noise: Noise = field(default_factory=Noise)  #: Standard deviations of everything random.
+    tracker: Tracker = field(default_factory=Tracker)
+    """Where the tracker's base stands and how its sensor sits in the handle."""
+    taxels: Taxels = field(default_factory=Taxels)  #: Faulty elements as [row, column] from 0.
+    landmarks: SceneLandmarks = field(default_factory=SceneLandmarks)
+    """Points touched before the scan, in the plane."""
+
+
+def read_scene(path: Path) -> Scene:
+    """Read a scene; missing keys take their defaults."""
+    text = read_text(path, most=TOML_BYTES, way_out="give a scene as TOML")
+    with in_file(path):
+        return scene_of(parse_toml(text, way_out="see the scene in the documentation"))
+
+
+def scene_of(document: Mapping[str, Any]) -> Scene:
+    """A scene from plain data as its TOML holds; for the errors see `read_scene`."""
+    file = from_plain(SceneFile, document)
+    given = {name: getattr(file, name) for name in names_of(file)}
+    bumps, tissue = _lumps(given.pop("lump"), document.get("lump", ()))
+    return Scene(**as_dict(given.pop("scene")), lumps=bumps, solid_lumps=tissue, ribs=given.pop("rib"), **given)
+
+
+def _lumps(
+    tables: Sequence[LumpTable], given: Sequence[Mapping[str, Any]]
+) -> tuple[tuple[Lump, ...], tuple[SolidLump, ...]]:
+    """Lumps that are bumps, and lumps that are tissue, by the keys that the file gives."""
+    bumps, tissue = [], []
+    for i, (table, keys) in enumerate(zip(tables, given, strict=True)):
+        values = {key: getattr(table, key) for key in keys}
+        solid = [key for key in _OF_TISSUE if key in keys]
+        both = [key for key in _OF_BUMPS if key in keys]
+        if solid and both:
+            what = f"lump[{i}] gives {both[0]}, of a bump, and {solid[0]}, of tissue"
+            raise BadDataError(what, way_out=f"leave out {', '.join(both)} or {', '.join(solid)}")
+        if not solid:
+            bumps.append(Lump(**values))
+            continue
+        for key in ("d_mm", "depth_ratio"):
+            if key not in keys:
+                raise BadDataError(f"lump[{i}] gives no {key}", way_out=f"a lump of tissue with {solid[0]} needs it")
+        tissue.append(SolidLump(**values))
+    return tuple(bumps), tuple(tissue)
