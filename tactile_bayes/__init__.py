@@ -29,17 +29,17 @@ __version__ = "0.1.0"
 
 _NAMES = {
     "api.arrays": ("scan",),
-    "api.calibrating": ("calibrate_repeatability", "calibrate_size"),
     "api.comparing": ("Comparison", "compare"),
     "api.diagnosing": ("Diagnosis", "diagnose"),
     "api.estimates": ("estimate", "pool"),
     "api.maps": ("Map", "build_map", "check", "demo_map", "demo_scan", "map_of", "read_map", "read_scan", "simulate"),
-    "api.planning": ("TrialPlan", "plan"),
     "api.pooled": ("PooledSize",),
     "api.recording": ("record",),
     "api.reports": ("ExportedFiles", "exam_report", "export"),
+    "api.repeatability": ("calibrate_repeatability",),
+    "api.size_calibration": ("calibrate_size",),
     "api.sized": ("SizeEstimate",),
-    "api.trials": ("TrialResult", "validate"),
+    "api.trials": ("TrialPlan", "TrialResult", "plan", "validate"),
     "campaigns.campaign": ("CampaignResult", "campaign"),
     "inference.draws": ("Draws",),
 }

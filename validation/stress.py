@@ -147,7 +147,7 @@ def document_of(scan: Scan) -> dict[str, Any]:
     """What `map` and `estimate` make of a scan, as `estimate --json` prints it, with the map's figures."""
     tactile_map = build_map(scan, as_stated=True)
     outcome = estimate_one(tactile_map, Settings())
-    return {**(outcome.answer.document or {}), "quality": dict(tactile_map.quality)}
+    return {**outcome.answer.document, "quality": dict(tactile_map.quality)}
 
 
 def simulate(folder: Path, bodies: int) -> None:

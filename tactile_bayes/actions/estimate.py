@@ -14,7 +14,7 @@ import click
 from tactile_bayes.api.estimating import answer_file, estimate_file
 from tactile_bayes.api.pooled import elsewhere, pool_answers
 from tactile_bayes.api.settings import Settings, refuse_checkpoint
-from tactile_bayes.api.sized import Answer
+from tactile_bayes.api.sized import Answer, Failure
 from tactile_bayes.batch import BatchInterrupted, Outcome, fault_lines, open_executor, run_batch
 from tactile_bayes.commands.options import settings_of
 from tactile_bayes.declarations import replace
@@ -28,10 +28,12 @@ from tactile_bayes.report.figure_file import named_exam
 from tactile_bayes.report.pooled import pooled_summary, pooled_text
 from tactile_bayes.shell import progress_bar
 
+Answers = Sequence[Answer | Failure]
+
 
 def estimate_pool(
     maps: tuple[Path, ...],
-    answers: list[Answer],
+    answers: Answers,
     settings: Settings,
     output: Path | None,
     figure: Path | None,
@@ -44,16 +46,16 @@ def estimate_pool(
 
     A map that could not be read stops it: its error is printed, for a mass is not sized from what is left by accident.
     """
-    if settings.centre_mm is None:
-        for i, place in elsewhere([answer.report for answer in answers]).items():
-            answers[i] = answer_file(maps[i], settings=replace(settings, centre_mm=place))
-    failed = [answer for answer in answers if answer.report is None]
-    for answer in failed:
-        click.echo(answer.text, err=True)
-    if failed:
+    if failed := [one for one in answers if isinstance(one, Failure)]:
+        for one in failed:
+            click.echo(one.text, err=True)
         return failed[0].exit_code
+    same = [one for one in answers if isinstance(one, Answer)]
+    if settings.centre_mm is None:
+        for i, place in elsewhere([one.report for one in same]).items():
+            same[i] = estimate_file(maps[i], replace(settings, centre_mm=place)).answer
     inputs = {f"map_{i + 1}": one for i, one in enumerate(maps)}
-    found = pool_answers(answers, settings, names=[str(one) for one in maps], inputs=inputs)
+    found = pool_answers(same, settings, names=[str(one) for one in maps], inputs=inputs)
     report = found.pooled_report.checked()
     text_of = json_text if as_json else pooled_text if verbose else pooled_summary
     try:
@@ -100,6 +102,7 @@ def estimate_action(
     if any(outputs) and len(maps) > 1 and not pool:
         raise UsageError("--output and the figures take one map at a time; use --json for several")
     begun = time.perf_counter()
+    answers: Answers
     if pool:
         if map_figure or fit_figure:
             raise UsageError("--map-figure and --fit-figure draw one map; leave out --pool")
@@ -128,11 +131,11 @@ def estimate_action(
         _print(maps, answers, as_json=as_json, verbose=verbose, listed=len(maps) > 1)
         if verbose:
             click.echo(f"estimate: {took_s:.3f} s", err=True)
-    failed = [answer.exit_code for answer in answers if answer.report is None]
-    return failed[0] if failed else max(answer.exit_code for answer in answers)
+    failed = [one.exit_code for one in answers if isinstance(one, Failure)]
+    return failed[0] if failed else max(one.exit_code for one in answers)
 
 
-def _many_maps(maps: tuple[Path, ...], settings: Settings, *, workers: int, scheduler: str | None) -> list[Answer]:
+def _many_maps(maps: tuple[Path, ...], settings: Settings, *, workers: int, scheduler: str | None) -> Answers:
     chosen = open_executor(workers=min(workers, len(maps)), cluster=scheduler)
     with chosen as executor, progress_bar("maps") as progress:
         outcomes = run_batch(
@@ -141,13 +144,13 @@ def _many_maps(maps: tuple[Path, ...], settings: Settings, *, workers: int, sche
     return _answers(outcomes)
 
 
-def _answers(outcomes: Iterable[Outcome[Answer]]) -> list[Answer]:
+def _answers(outcomes: Iterable[Outcome[Answer | Failure]]) -> Answers:
     """Answers for all maps; maps with the same error of the batch are named together in the first's answer."""
     found = list(outcomes)
     lines = dict(zip(dict.fromkeys(one.error for one in found if not one.ok), fault_lines(found), strict=True))
     faults = (lines.pop(one.error, "") if not one.ok else "" for one in found)
     return [
-        one.value if one.value is not None else Answer(None, f"error: {fault}" if fault else "", EXIT_FAULT)
+        one.value if one.value is not None else Failure(f"error: {fault}" if fault else "", EXIT_FAULT)
         for one, fault in zip(found, faults, strict=True)
     ]
 
@@ -164,18 +167,18 @@ def _printed_if_interrupted(maps: tuple[Path, ...], *, as_json: bool, verbose: b
         raise
 
 
-def _print(maps: Sequence[Path], answers: list[Answer], *, as_json: bool, verbose: bool, listed: bool) -> None:
+def _print(maps: Sequence[Path], answers: Answers, *, as_json: bool, verbose: bool, listed: bool) -> None:
     """Print errors on stderr and answers on stdout: in full with `verbose`, `listed` for several maps."""
-    for answer in answers:
-        if answer.report is None and answer.text:
-            click.echo(answer.text, err=True)
+    for one in answers:
+        if isinstance(one, Failure) and one.text:
+            click.echo(one.text, err=True)
     if as_json:
-        documents = [answer.report.checked().document for answer in answers if answer.report is not None]
+        documents = [one.report.checked().document for one in answers if isinstance(one, Answer)]
         click.echo(dump_json(documents if listed else documents[0]), nl=False)
         return
     texts = [
-        (f"{path}\n" if listed else "") + (answer.full_text if verbose else answer.text)
-        for path, answer in zip(maps, answers, strict=True)
-        if answer.report is not None
+        (f"{path}\n" if listed else "") + (one.full_text if verbose else one.text)
+        for path, one in zip(maps, answers, strict=True)
+        if isinstance(one, Answer)
     ]
     click.echo("\n".join([*(one.replace(f"{RESEARCH_USE}\n", "") for one in texts[:-1]), *texts[-1:]]), nl=False)

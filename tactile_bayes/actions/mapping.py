@@ -17,8 +17,7 @@ from tactile_bayes.files.scan_mcap import read_scan
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.options import MapOptions
 from tactile_bayes.report.figure_file import named_exam
-from tactile_bayes.report.map_figure import map_figure
-from tactile_bayes.report.map_text import map_summary, map_text
+from tactile_bayes.report.map import map_figure, map_summary, map_text
 from tactile_bayes.shell import progress_bar
 
 

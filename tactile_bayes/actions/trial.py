@@ -7,8 +7,7 @@ from typing import Any
 
 import click
 
-from tactile_bayes.api.planning import planned, read_pilot
-from tactile_bayes.api.trials import analyse, load_trial
+from tactile_bayes.api.trials import analyse, load_trial, planned, read_pilot
 from tactile_bayes.commands.options import also_read, typed_options
 from tactile_bayes.errors import UsageError
 from tactile_bayes.files.documents import dump_json, read_protocol

@@ -17,10 +17,8 @@ from tactile_bayes.api.sized import Answer, SizeEstimate, size_priors
 from tactile_bayes.declarations import as_dict, replace
 from tactile_bayes.errors import CANNOT_SHOW, EXIT_DONE, EXIT_NO_ESTIMATE, UsageError
 from tactile_bayes.files.provenance import Provenance, repeated_scans, scans_of
-from tactile_bayes.files.reports import centre_of
 from tactile_bayes.findings import Finding, Verdict, by_weight, finding_lines, verdict
 from tactile_bayes.inference.draws import Draws
-from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.options import GROWN_BY, Comparing
 from tactile_bayes.presets import REGISTRATION_MM
 from tactile_bayes.report.compare import CompareReport, compare_report, compare_summary, compare_text
@@ -171,8 +169,7 @@ class Comparison(Told, eq=False):
         return draw_comparison(self.compared, self.report, self._drawn(), path_of(path), force=force)
 
     def _drawn(self) -> list[list[DrawnMap]]:
-        maps = [[one.tactile_map for one in visit] for visit in self.visits]
-        return drawn_maps(maps, [[one.answer for one in visit] for visit in self.visits])
+        return [[DrawnMap.of(one.tactile_map, one.answer.report) for one in visit] for visit in self.visits]
 
     def __repr__(self) -> str:
         cautions = finding_lines(self.findings, "caution", paper=True)
@@ -187,7 +184,7 @@ Files = Mapping[str, Path]  #: That the maps came from, by role, for the provena
 def compare_answers(
     visits: Sequence[Sequence[Answer]], settings: Settings, comparing: Comparing, *, names: Names, inputs: Files
 ) -> Comparison:
-    """Compare the visits of one mass, from answers for their maps in order of time, none of them an error."""
+    """Compare the visits of one mass, from answers for their maps in order of time."""
     if len(visits) < 2 or not all(visits):
         raise UsageError("a comparison needs two visits of a map or more each: `compare VISIT1.nc --with VISIT2.nc`")
     comparing.check_visits(len(visits))
@@ -212,7 +209,7 @@ def compare_answers(
     provenance = Provenance("compare", recorded | as_dict(comparing), digests, seed=settings.seed, scans=scans)
     report = compare_report(
         compared,
-        [[answer.report for answer in one if answer.report is not None] for one in visits],
+        [[answer.report for answer in one] for one in visits],
         names,
         comparing,
         probability=settings.interval,
@@ -230,20 +227,6 @@ def compare_estimates(
     same = tuple(tuple(next(every) for _ in visit) for visit in visits)
     answers = [[one.answer for one in visit] for visit in same]
     return replace(compare_answers(answers, settings, comparing, names=names, inputs=inputs), visits=same)
-
-
-def drawn_maps(maps: Sequence[Sequence[TactileMap]], visits: Sequence[Sequence[Answer]]) -> list[list[DrawnMap]]:
-    """The maps of each visit with their lumps, for the page and the figure."""
-
-    def drawn(one: TactileMap, answer: Answer) -> DrawnMap:
-        report = answer.report
-        if report is None or answer.shape is None:
-            return DrawnMap(one, None)
-        along, across, angle = report.d_x_mm, report.d_y_mm, report.angle_deg
-        axes = None if along is None or across is None else (along.median, across.median)
-        return DrawnMap(one, centre_of(report.centre_mm), axes, 0.0 if angle is None else angle.median)
-
-    return [list(map(drawn, some, answers)) for some, answers in zip(maps, visits, strict=True)]
 
 
 def _compared(
@@ -266,7 +249,7 @@ def _compared(
 def _missing(maps: Sequence[Answer], visit: str) -> str:
     """Why a visit has no size: too few of the maps that could show a lump show one; empty where enough do."""
     found = sum(answer.shape is not None for answer in maps)
-    silent = [one.report for one in maps if one.report is not None and one.report.reason_code == CANNOT_SHOW]
+    silent = [one.report for one in maps if one.report.reason_code == CANNOT_SHOW]
     if found and 2 * found >= len(maps) - len(silent):
         return ""
     if silent and len(silent) == len(maps):
@@ -363,7 +346,7 @@ def _by_visit(
 
 
 def _scans(answers: Sequence[Answer]) -> list[Mapping[str, str]]:
-    return [scan for one in answers if one.report is not None for scan in scans_of(one.report.provenance)]
+    return [scan for one in answers for scan in scans_of(one.report.provenance)]
 
 
 _RECORDED = ("size_calibration", "method", "interval", "scene", "between_map_sd", "repeatability")

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from tactile_bayes.api.settings import Settings
-from tactile_bayes.api.sized import Answer, SizeEstimate, size_priors
+from tactile_bayes.api.sized import Answer, Failure, SizeEstimate, size_priors
 from tactile_bayes.declarations import Record, names_of, replace
 from tactile_bayes.errors import NO_LUMP, BadDataError, TactileBayesError, in_file
 from tactile_bayes.files.map_nc import read_map_and_scans
@@ -54,13 +54,13 @@ _LEAST_SQUARES = NoSize(
 )
 
 
-def answer_file(path: Path, *, settings: Settings) -> Answer:
-    """Answer for a map file, in any process; an error with this map becomes its answer."""
+def answer_file(path: Path, *, settings: Settings) -> Answer | Failure:
+    """Answer for a map file, in any process."""
     try:
         return estimate_file(path, settings).answer
     except TactileBayesError as error:
         text = str(error) if str(path) in str(error) else f"{path}: {error}"
-        return Answer(None, f"error: {text}", error.exit_code)
+        return Failure(f"error: {text}", error.exit_code)
 
 
 def estimate_file(

@@ -28,7 +28,7 @@ from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.options import MapOptions
 from tactile_bayes.presets import PRESSURE_WINDOW_KPA, RESEARCH_USE
 from tactile_bayes.progress import Progress, untold
-from tactile_bayes.report.map_figure import map_figure
+from tactile_bayes.report.map import map_figure
 from tactile_bayes.scans import Scan
 
 if TYPE_CHECKING:

@@ -61,25 +61,20 @@ def pool_estimates(
     return replace(pool_answers([one.answer for one in same], settings, names=names, inputs=inputs), maps=same)
 
 
-def elsewhere(reports: Sequence[EstimateReport | None]) -> dict[int, MapPlace]:
+def elsewhere(reports: Sequence[EstimateReport]) -> dict[int, MapPlace]:
     """Maps that report another mass than the common one, with the place of that one on each, mm.
 
     Empty where a map with a lump has no landmarks, or no two maps show a mass at one place.
     """
     maps = _masses(reports)
-    common = None if maps is None else _common(maps)
-    if maps is None or common is None:
-        return {}
-    there = {i: _nearest(masses, common) for i, masses in maps.items()}
+    common = _common(maps)
+    there = {} if common is None else {i: _nearest(masses, common) for i, masses in maps.items()}
     return {i: one.centre_mm.median for i, one in there.items() if one is not None and not one.reported}
 
 
-def apart_from_others(reports: Sequence[EstimateReport | None]) -> dict[int, str]:
+def apart_from_others(reports: Sequence[EstimateReport]) -> dict[int, str]:
     """Maps whose reported mass lies elsewhere than the common one, in words; empty without landmarks."""
-    maps = _masses(reports)
-    if maps is None:
-        return {}
-    reported = {i: [one for one in masses if one.reported] for i, masses in maps.items()}
+    reported = {i: [one for one in masses if one.reported] for i, masses in _masses(reports).items()}
     found = [one for masses in reported.values() for one in masses]
     common = _common(reported) or max(found, key=_amplitude, default=None)
     away = {i: _away_mm(one, common) for i, masses in reported.items() for one in masses if common is not None}
@@ -87,18 +82,15 @@ def apart_from_others(reports: Sequence[EstimateReport | None]) -> dict[int, str
     return {i: words.format(mm) for i, mm in away.items() if mm > MATCH_MM}
 
 
-def one_place(reports: Sequence[EstimateReport | None]) -> bool | None:
+def one_place(reports: Sequence[EstimateReport]) -> bool | None:
     """Whether the reported masses of all maps lie at one place; None where that cannot be told."""
-    maps = _masses(reports)
-    if maps is None or len(maps) < 2:
-        return None
-    return not apart_from_others(reports)
+    return None if len(_masses(reports)) < 2 else not apart_from_others(reports)
 
 
-def _masses(reports: Sequence[EstimateReport | None]) -> dict[int, tuple[MassReport, ...]] | None:
-    """Masses of the maps with a lump, by the map's place in the list; None where one has no place in the patient."""
-    found = {i: one.masses for i, one in enumerate(reports) if one is not None and one.masses}
-    return None if any(one.centre_patient_mm is None for masses in found.values() for one in masses) else found
+def _masses(reports: Sequence[EstimateReport]) -> dict[int, tuple[MassReport, ...]]:
+    """Masses of the maps with a lump, by the map's place in the list; none where one has no place in the patient."""
+    found = {i: one.masses for i, one in enumerate(reports) if one.masses}
+    return {} if any(one.centre_patient_mm is None for masses in found.values() for one in masses) else found
 
 
 def _away_mm(one: MassReport, other: MassReport) -> float:
@@ -113,15 +105,15 @@ def _amplitude(mass: MassReport) -> float:
 
 def _common(maps: Mapping[int, Sequence[MassReport]]) -> MassReport | None:
     """A mass at the place where most maps show one, sized by most, then reported by most; None where all are apart."""
-    best = max((one for masses in maps.values() for one in masses), key=lambda one: _worth(maps, one), default=None)
-    return best if best is not None and _worth(maps, best)[0] > 1 else None
 
+    def worth(common: MassReport) -> tuple[int, int, int, float]:
+        """On how many maps it is found, sized and reported, and the median of its amplitudes."""
+        there = [one for one in (_nearest(masses, common) for masses in maps.values()) if one is not None]
+        sized, reported = sum(one.max_size_mm is not None for one in there), sum(one.reported for one in there)
+        return len(there), sized, reported, float(np.median([_amplitude(one) for one in there]))
 
-def _worth(maps: Mapping[int, Sequence[MassReport]], common: MassReport) -> tuple[int, int, int, float]:
-    """On how many maps a mass is found, sized and reported, and the median of its amplitudes."""
-    there = [one for one in (_nearest(masses, common) for masses in maps.values()) if one is not None]
-    sized, reported = sum(one.max_size_mm is not None for one in there), sum(one.reported for one in there)
-    return len(there), sized, reported, float(np.median([_amplitude(one) for one in there]))
+    best = max((one for masses in maps.values() for one in masses), key=worth, default=None)
+    return best if best is not None and worth(best)[0] > 1 else None
 
 
 def _nearest(masses: Sequence[MassReport], common: MassReport) -> MassReport | None:
@@ -130,12 +122,10 @@ def _nearest(masses: Sequence[MassReport], common: MassReport) -> MassReport | N
     return near if near is not None and _away_mm(near, common) <= MATCH_MM else None
 
 
-def place_of(report: EstimateReport | None) -> PatientPlace | None:
+def place_of(report: EstimateReport) -> PatientPlace | None:
     """Where a map's reported mass lies in the patient; None without a lump or landmarks."""
-    centre = None if report is None else report.centre_patient_mm
-    if centre is None:
-        return None
-    return PatientPlace(np.array(centre.median), np.diag([centre.x.sd**2, centre.y.sd**2]))
+    centre = report.centre_patient_mm
+    return None if centre is None else PatientPlace(np.array(centre.median), np.diag([centre.x.sd**2, centre.y.sd**2]))
 
 
 # --- One size from several maps of one mass.
@@ -199,10 +189,10 @@ def pool_answers(
 ) -> PooledSize:
     """Pool the maps of one mass.
 
-    `answers`: of each map; none of them an error; `names`: of the maps, for the report; `inputs`: files that the maps
-    came from, by role, for the provenance.
+    `answers`: of each map; `names`: of the maps, for the report; `inputs`: files that the maps came from, by role, for
+    the provenance.
     """
-    reports = [answer.report for answer in answers if answer.report is not None]
+    reports = [answer.report for answer in answers]
     scans = [scan for report in reports for scan in scans_of(report.provenance)]
     check_one_mass(scans)
     calibration, digests = common_calibration(answers, settings, names=names, inputs=inputs)
@@ -210,9 +200,9 @@ def pool_answers(
     words = sorted(answer.fingerprint for answer in answers)
     places = [place for one in answers if one.shape is not None and (place := place_of(one.report)) is not None]
     chance = one_place_probability(places) if len(places) > 1 else None
-    pooled = _no_size(answers, places, chance) or pool_maps(
+    pooled = _no_size(reports, places, chance) or pool_maps(
         [answer.shape for answer in answers],
-        silent=sum(one.report is not None and one.report.reason_code == CANNOT_SHOW for one in answers),
+        silent=sum(one.reason_code == CANNOT_SHOW for one in reports),
         calibration=calibration,
         priors=size_priors(settings),
         rng=np.random.default_rng([settings.seed, *words]),
@@ -242,15 +232,15 @@ def pool_answers(
 
 
 def _no_size(
-    answers: Sequence[Answer], places: Sequence[PatientPlace], one_place: float | None
+    reports: Sequence[EstimateReport], places: Sequence[PatientPlace], one_place: float | None
 ) -> PooledEstimate | None:
     """Reason for no size: a map too far outside the calibration's range, cells too large, or several masses."""
-    for i, answer in enumerate(answers, start=1):
-        if answer.report is not None and answer.report.reason_code == "extrapolated":
-            return PooledEstimate("no_estimate", f"map {i}: {answer.report.reason}")
-    if all(answer.report is None or answer.report.reason_code == CANNOT_SHOW for answer in answers):
-        why = next((one.report.reason for one in answers if one.report is not None), "")
-        return PooledEstimate("no_estimate", f"map 1: {why}" if len(answers) > 1 else why)
+    for i, report in enumerate(reports, start=1):
+        if report.reason_code == "extrapolated":
+            return PooledEstimate("no_estimate", f"map {i}: {report.reason}")
+    if all(report.reason_code == CANNOT_SHOW for report in reports):
+        why = reports[0].reason
+        return PooledEstimate("no_estimate", f"map 1: {why}" if len(reports) > 1 else why)
     if one_place is None or one_place >= LEAST_PROBABILITY:
         return None
     most = max(float(np.hypot(*(a.centre_mm - b.centre_mm))) for a, b in combinations(places, 2))

@@ -1,4 +1,4 @@
-"""A site's repeatability: learned from the repeated exams of a campaign's folder, and found for an estimate."""
+"""A site's repeatability, learned from the repeated exams of a campaign's folder."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from tactile_bayes.api.arguments import PathLike, door, output_path, required_path
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files import size_json
@@ -219,3 +220,38 @@ def _half_widths(repeats: Sequence[_Repeat], sd: float) -> dict[str, float]:
         after.append(max(variance - spread**2, 0.0) + sd**2)
     names = {"as_estimated": before, "with_it": after}
     return {name: math.expm1(1.96 * float(np.median(np.sqrt(values)))) for name, values in names.items()}
+
+
+@door
+def calibrate_repeatability(
+    folder: PathLike, *, size_calibration: PathLike | None = None, path: PathLike | None = None, force: bool = False
+) -> Repeatability:
+    """Learn how far sizes of one mass lie apart between its exams at a site.
+
+    Parameters
+    ----------
+    folder
+        Of a ``campaign run`` with at least 3 masses that have repeated exams.
+    size_calibration
+        Calibration that the exams were sized by, where the name in their estimates does not lead to its file.
+    path
+        Also write it there.
+
+    Returns
+    -------
+    Repeatability
+        For ``estimate(..., repeatability=...)``: `median`, `low` and `high` of the spread, a share of the size.
+
+    Raises
+    ------
+    BadDataError
+        When there are too few masses with repeated exams, or the exams were sized by several calibrations.
+    UsageError
+        When the calibration's file is not found.
+    """
+    target = None if path is None else output_path(path, "JSON")
+    given = None if size_calibration is None else str(size_calibration)
+    learned = learn_from_exams(exams_in(required_path(folder, "folder")), size_calibration=given)
+    if target is not None:
+        learned.write(target, force=force)
+    return learned.repeatability

@@ -5,10 +5,11 @@ from __future__ import annotations
 import csv
 from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final, cast
+from typing import TYPE_CHECKING, Any, Final, cast
 
 import numpy as np
 
+from tactile_bayes.api.arguments import PathLike, door, output_path, plain, table_of, takes
 from tactile_bayes.api.estimating import estimate_file
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.api.sized import pooling_shape
@@ -33,6 +34,9 @@ from tactile_bayes.size.learn.site import PhantomMap, correct_calibration
 from tactile_bayes.size.pooling import Calibration
 from tactile_bayes.size.terms import Normalise, Recipe
 from tactile_bayes.studies.population import measuring_options, population_table, table_bodies, table_head
+
+if TYPE_CHECKING:
+    import pandas
 
 _SOURCE: Final = "balls in a population of bodies, scanned by the solid model"
 _MAPS: Final = ("normalise", "background", "fit_radius_mm", "noise")  #: How a table's maps were made, if it is silent.
@@ -447,3 +451,53 @@ def _check_head(rows: Table, calibration: BodyCalibration) -> None:
         if radius_mm is not None and head.differences(replace(head, radius_mm=radius_mm)):
             what = f"is {radius_mm:g}, and the calibration is for a head {ours}"
             raise rows.error(i, "head_radius_mm", what, way_out="learn a calibration for this head")
+
+
+# --- From Python.
+
+
+@door
+@takes(LearnOptions)
+def calibrate_size(
+    table: PathLike | pandas.DataFrame,
+    *,
+    correct: PathLike | None = None,
+    path: PathLike | None = None,
+    force: bool = False,
+    **options: Any,
+) -> Calibration:
+    """Learn a size calibration from lumps of known size.
+
+    Parameters
+    ----------
+    table
+        A row for each lump: d_mm, amplitude, sigma_x_mm...; or a table of `population`, a row for each exam.
+    correct
+        Name or path of a calibration over bodies that the table's lumps correct; the table may also list map files.
+    path
+        Also write the calibration there.
+    **options
+        As of `tactile_bayes.options.LearnOptions`, by default as on the command line: form, fit, seed,
+        least_stiffness_ratio, and normalise, background, fit_radius_mm, noise of the table's maps where it does not
+        say; of a table of `population`, normalise: which rows to learn from.
+
+    Returns
+    -------
+    calibration
+        For ``estimate(..., size_calibration=...)``.
+
+    Raises
+    ------
+    BadDataError
+        Naming the table, the line, the column, the value and the way out.
+    TypeError
+        When a keyword is none of these.
+    UsageError
+        When a keyword's value cannot be one, or goes with another form.
+    """
+    asked = LearnOptions(**{name: plain(value) for name, value in options.items()})
+    target = None if path is None else output_path(path, "JSON")
+    learned = learn(table_of(table, "table"), asked, options, correct=None if correct is None else str(correct))
+    if target is not None:
+        learned.write(target, force=force)
+    return learned.calibration

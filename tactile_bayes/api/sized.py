@@ -211,26 +211,37 @@ class MassEstimate(Sized, eq=False, dict=True):
 
 
 class Answer(Record):
-    """Answer for one map: its report and its text, or an error with its exit code; without map and draws."""
+    """Answer for one map: its report and its text, without map and draws."""
 
-    report: EstimateReport | None
-    text: str  #: The report in at most 12 lines, or the error.
-    exit_code: int
-    shape: ShapeDraws | None = None  #: What pooling needs of a map on which a lump was found.
-    normalise: str = ""  #: How the map's frames were normalised.
-    fingerprint: int = 0  #: What the map's values seed random numbers with.
+    report: EstimateReport
+    shape: ShapeDraws | None  #: What pooling needs of a map on which a lump was found.
+    normalise: str  #: How the map's frames were normalised.
+    fingerprint: int  #: What the map's values seed random numbers with.
+    head: HeadShape | None  #: What the map was made with.
+    text: str = ""  #: The report in at most 12 lines.
     full_text: str = ""  #: All of the report.
-    head: HeadShape | None = None  #: What the map was made with.
+
+    @property
+    def exit_code(self) -> int:
+        """0 for an estimate, else 6."""
+        return EXIT_DONE if self.report.status == "estimate" else EXIT_NO_ESTIMATE
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """What speaks against the answer, cautions first; nothing for an error."""
-        return () if self.report is None else self.report.findings
+        """What speaks against the answer, cautions first."""
+        return self.report.findings
 
     @property
-    def document(self) -> dict[str, Any] | None:
-        """What ``estimate --json`` prints; None for an error."""
-        return None if self.report is None else self.report.document
+    def document(self) -> dict[str, Any]:
+        """What ``estimate --json`` prints."""
+        return self.report.document
+
+
+class Failure(Record):
+    """Why a map of several has no answer, with its exit code."""
+
+    text: str
+    exit_code: int
 
 
 class SizedExam(Sized, eq=False, dict=True, kw_only=True):
@@ -374,18 +385,16 @@ class SizeEstimate(SizedExam, eq=False, dict=True, kw_only=True):
         report = estimate_report(estimate, tactile_map, probability=probability, prior=prior, provenance=provenance)
         return Answer(
             report,
-            text=estimate_summary(estimate, report),
-            exit_code=EXIT_DONE if self.status == "estimate" else EXIT_NO_ESTIMATE,
-            shape=pooling_shape(tactile_map, estimate),
-            normalise=tactile_map.recipe.normalise,
-            fingerprint=tactile_map.fingerprint,
-            full_text=estimate_text(estimate, report),
-            head=tactile_map.head,
+            pooling_shape(tactile_map, estimate),
+            tactile_map.recipe.normalise,
+            tactile_map.fingerprint,
+            tactile_map.head,
+            estimate_summary(estimate, report),
+            estimate_text(estimate, report),
         )
 
     def page_map(self, side: str) -> ExamMap:
         """The map as a page of the exam shows it; `side` is the breast, as the scans have it."""
-        assert self.answer.report is not None
         return exam_map(self.tactile_map, self.answer.report, side=side)
 
     def exam(self) -> Exam:
@@ -412,9 +421,7 @@ class SizeEstimate(SizedExam, eq=False, dict=True, kw_only=True):
     @door
     def plot_map(self, path: PathLike | None = None, *, force: bool = False) -> Figure:
         """Draw the map with the lump's ellipse and size, or with the places looked at."""
-        report = self.answer.report
-        assert report is not None
-        return draw_map(self.tactile_map, report, path_of(path), name=self._titled, force=force)
+        return draw_map(self.tactile_map, self.answer.report, path_of(path), name=self._titled, force=force)
 
     @door
     def plot_fit(self, path: PathLike | None = None, *, force: bool = False) -> Figure:
@@ -449,7 +456,6 @@ class SizeEstimate(SizedExam, eq=False, dict=True, kw_only=True):
 
     def write(self, path: Path, *, force: bool = False) -> None:
         """Write the draws of an estimate, and what goes with them."""
-        assert self.answer.report is not None
         groups, report = self._groups(), self.answer.report
         write_posterior(path, self.estimate, provenance=self.provenance, groups=groups, report=report, force=force)
 

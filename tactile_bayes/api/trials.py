@@ -1,16 +1,21 @@
-"""A trial's tables to its report."""
+"""A trial from its tables to its report, and a trial planned."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor
+from functools import partial
+from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tactile_bayes.api.arguments import PathLike, Told, door, path_of, plain, table_of, takes
-from tactile_bayes.declarations import as_dict, replace, to_plain
-from tactile_bayes.errors import NotConvergedError
+from tactile_bayes.api.arguments import PathLike, Told, door, path_of, plain, sequence_of, table_of, takes
+from tactile_bayes.batch import open_executor, run_batch
+from tactile_bayes.declarations import EXACT, Record, as_dict, names_of, replace, to_plain
+from tactile_bayes.errors import BadDataError, NotConvergedError, UsageError
 from tactile_bayes.files.atomic import write_text
 from tactile_bayes.files.column_map import read_mapping, read_wide, read_wide_excision
 from tactile_bayes.files.documents import dump_json
@@ -22,16 +27,18 @@ from tactile_bayes.inference.draws import ParameterDraws
 from tactile_bayes.inference.ensemble import ensemble
 from tactile_bayes.inference.importance import ImportanceOptions, importance
 from tactile_bayes.inference.modes import LogDensity, mode_and_covariance
-from tactile_bayes.options import TrialSettings
-from tactile_bayes.presets import INTERVAL
+from tactile_bayes.options import MOST_PATIENTS, Aim, PlanErrors, PlanOptions, TrialSettings
+from tactile_bayes.presets import INTERVAL, RESEARCH_USE
+from tactile_bayes.progress import Progress, untold
 from tactile_bayes.report.compare import Growth
 from tactile_bayes.report.pages import PageFiles
-from tactile_bayes.report.trial import DIGITS, trial_text
-from tactile_bayes.report.trial_html import trial_html
-from tactile_bayes.trial.figures import Intervals
+from tactile_bayes.report.trial import DIGITS, plan_text, trial_text
+from tactile_bayes.report.trial_html import plan_figure, trial_html
+from tactile_bayes.trial import planning
+from tactile_bayes.trial.figures import MIN_PATIENTS, Intervals, UndefinedError
 from tactile_bayes.trial.next_mass import next_mass
 from tactile_bayes.trial.planning import check_all
-from tactile_bayes.trial.readings import Trial, at_excision, readings_from_columns
+from tactile_bayes.trial.readings import Trial, at_excision, readings_from_columns, unit_doubts
 from tactile_bayes.trial.summary import TrialReport, summarise
 
 if TYPE_CHECKING:
@@ -205,3 +212,210 @@ def validate(
     """
     used = TrialSettings(**{name: plain(value) for name, value in settings.items()})
     return analyse(load_trial(table_of(trial, "trial"), table_of(excision, "excision"), path_of(columns)), used)
+
+
+MAPS_OF_AIMS = 3  #: Maps of a mass where the number of patients is asked for, by default.
+_ERRORS = names_of(PlanErrors)
+
+
+class TrialPlan(Told, eq=False):
+    """Power and widths of intervals of planned trials; `report` is what the file of ``plan -o`` holds."""
+
+    report: planning.PlanReport
+    doubts: tuple[str, ...] = ()  #: What speaks against the pilot's tables.
+
+    @property
+    def document(self) -> dict[str, Any]:
+        """What ``plan --json`` prints."""
+        document: dict[str, Any] = to_plain(self.report, digits=EXACT)
+        return document
+
+    @property
+    def text(self) -> str:
+        """What ``plan`` prints."""
+        return plan_text(self.report)
+
+    def write_json(self, path: Path, *, force: bool = False) -> None:
+        """Write what ``plan -o`` writes."""
+        write_text(path, dump_json(self.document), force=force)
+
+    def draw(self, path: Path, *, force: bool = False) -> None:
+        """Draw what ``plan --figure`` draws."""
+        plan_figure(self.report, path, force=force)
+
+    def __repr__(self) -> str:
+        first, last = self.report.designs[0], self.report.designs[-1]
+        return f"<TrialPlan power {first.power:.2f} ({first.patients} patients) to {last.power:.2f} ({last.patients})>"
+
+
+class Pilot(Record, eq=False):
+    """An earlier trial that errors are taken from."""
+
+    trial: Trial
+    path: Path  #: Of its readings, for errors; the name of a DataFrame.
+
+    def doubts(self) -> Iterator[str]:
+        """What speaks against its tables, a line each."""
+        yield from self.trial.other_visits.lines()
+        sizes, ex_vivo = self.trial.sizes(), np.array(list(self.trial.ex_vivo_mm.values()))
+        yield from (f"doubtful: {doubt}" for doubt in unit_doubts(sizes, ex_vivo))
+
+    def errors(self, against: str, given: Mapping[str, float]) -> dict[str, float]:
+        """Errors of ln size, those that are given as they are."""
+        sizes = self.trial.sizes()
+        for name in ("tactile", against):
+            if name not in sizes:
+                way_out = f"it has {', '.join(sizes)}; choose one with --against"
+                raise BadDataError(f"holds no readings by {name}", way_out=way_out, path=str(self.path))
+        found = planning.assumptions_from(sizes["tactile"], sizes[against], map_sd=given.get("map_sd"))
+        if found is None:
+            way_out = "give the errors by options"
+            raise BadDataError("has fewer than 3 masses found by a modality", way_out=way_out, path=str(self.path))
+        if "map_sd" not in found:
+            what = "has no mass with two tactile readings, so the SD of single maps is unknown"
+            raise BadDataError(what, way_out="give it with --map-sd", path=str(self.path))
+        return {**found, **given}
+
+    @property
+    def files(self) -> dict[str, Path]:
+        """The two tables, where they are files."""
+        files = self.trial.files
+        return {role: files[name] for role, name in (("pilot", "trial"), ("excision", "excision")) if name in files}
+
+
+def read_pilot(pilot: Path | Sheet | None, excision: Path | Sheet | None, against: str | None) -> Pilot | None:
+    """Read a pilot's tables, None without one; refuses what goes only with one, and a pilot without its excision."""
+    if pilot is None:
+        for name, given in (("excision", excision), ("against", against)):
+            if given is not None:
+                raise UsageError(f"--{name} says how a pilot is read; give --pilot TRIAL.csv, or leave it out")
+        return None
+    if excision is None:
+        raise UsageError("--pilot needs --excision; give the pilot's excision table")
+    if against == "tactile":
+        raise UsageError("--against tactile compares tactile sizes with themselves; name another modality")
+    return Pilot(load_trial(pilot, excision, None), pilot.name if isinstance(pilot, Sheet) else pilot)
+
+
+@door
+@takes(PlanOptions, PlanErrors)
+def plan(
+    *,
+    pilot: PathLike | pandas.DataFrame | None = None,
+    excision: PathLike | pandas.DataFrame | None = None,
+    progress: Progress = untold,
+    **options: Any,
+) -> TrialPlan:
+    """Plan a trial: power, widths of intervals and the worth of more maps, by simulation.
+
+    Parameters
+    ----------
+    pilot, excision
+        Tables of an earlier trial, files or DataFrames: the errors that no keyword gives are taken from it.
+    progress
+        Called with designs done and wanted.
+    **options
+        As of `tactile_bayes.options.PlanOptions` and `PlanErrors`, by default as on the command line: patients, maps,
+        power, precision, against, trials, map_sd... Every pair of patients and maps is a design; with a power or a
+        precision `report.needed` says how many patients do.
+
+    Raises
+    ------
+    BadDataError
+        When a table is not what it must be, or tells too little of the errors.
+    UsageError
+        When a value cannot be one, or goes only with a pilot.
+
+    Examples
+    --------
+    >>> import tactile_bayes as tb
+    >>> tb.plan(patients=[24], maps=[3], trials=50).report.designs[0].patients
+    24
+    """
+    given = {name: plain(value) for name, value in options.items() if value is not None}
+    for name in {"patients", "maps"} & set(given):
+        given[name] = tuple(map(plain, sequence_of(name, given[name], "whole numbers")))
+    readings = None if pilot is None else table_of(pilot, "pilot")
+    sizes = None if excision is None else table_of(excision, "excision")
+    return planned(given, read_pilot(readings, sizes, given.get("against")), progress)
+
+
+def planned(given: Mapping[str, Any], pilot: Pilot | None, progress: Progress) -> TrialPlan:
+    """Plan with the options and errors that are given, then the errors of the pilot, then the defaults."""
+    asked = PlanOptions(**{name: value for name, value in given.items() if name not in _ERRORS})
+    stated = {name: value for name, value in given.items() if name in _ERRORS}
+    wanted = asked.wanted
+    if wanted and "patients" in given:
+        raise UsageError("--power and --precision find the number of patients; leave out --patients")
+    by_default = as_dict(PlanErrors(**stated))
+    errors = by_default if pilot is None else pilot.errors(asked.against, stated)
+    rest: planning.ErrorSource = "default" if pilot is None else "pilot"
+    assumptions = {**errors, "trials": asked.trials, "seed": asked.seed}
+    each_maps = (MAPS_OF_AIMS,) if wanted and "maps" not in given else sorted(set(asked.maps))
+    with open_executor(workers=asked.workers) as executor:
+        run = partial(_simulated, executor=executor, progress=progress)
+        if wanted:
+            found, needed = _needed(each_maps, wanted, assumptions, run)
+        else:
+            found, needed = run(list(planning.designs(sorted(set(asked.patients)), each_maps, **assumptions))), ()
+    assumed = {name: float(f"{errors[name]:.9g}") for name in _ERRORS}
+    sources: dict[str, planning.ErrorSource] = {name: "option" if name in stated else rest for name in _ERRORS}
+    inputs = hash_inputs(**({} if pilot is None else pilot.files))
+    settings: dict[str, Any] = {"trials": asked.trials, "errors": assumed, "errors_from": sources}
+    settings |= {str(aim): target for aim, target in wanted.items()}
+    report = planning.PlanReport(
+        schema="tactile-bayes/plan/1",
+        errors=assumed,
+        errors_from=sources,
+        designs=found,
+        gains=() if wanted else planning.map_gains(found),
+        needed=needed,
+        provenance=Provenance("plan", settings, inputs, seed=asked.seed).as_dict(),
+        research_use=RESEARCH_USE,
+    )
+    return TrialPlan(report, () if pilot is None else tuple(pilot.doubts()))
+
+
+def _simulated(
+    cases: Sequence[planning.PlanCase], *, executor: Executor, progress: Progress
+) -> tuple[planning.Design, ...]:
+    outcomes = run_batch(planning.run_case, cases, key=attrgetter("key"), executor=executor, progress=progress)
+    for outcome in outcomes:
+        if outcome.value is None:
+            raise BadDataError(f"{outcome.key}: {outcome.error}", way_out="change the errors assumed")
+    return tuple(outcome.value for outcome in outcomes if outcome.value is not None)
+
+
+def _needed(
+    maps: Sequence[int],
+    aims: Mapping[Aim, float],
+    assumptions: Mapping[str, Any],
+    run: Callable[[Sequence[planning.PlanCase]], tuple[planning.Design, ...]],
+) -> tuple[tuple[planning.Design, ...], tuple[planning.Needed, ...]]:
+    """Designs about the numbers of patients that reach the aims, and these numbers."""
+    found: dict[tuple[int, int], planning.Design] = {}
+    needed = []
+    for number, (aim, target) in itertools.product(maps, aims.items()):
+        try:
+            guess = planning.first_guess(
+                planning.PlanCase(patients=MIN_PATIENTS, maps=number, **assumptions), aim, target
+            )
+        except UndefinedError as undefined:
+            raise BadDataError(str(undefined), way_out="change the errors assumed") from None
+        for _ in range(planning.ROUNDS):
+            about = planning.sizes_about(guess)
+            cases = [
+                one for one in planning.designs(about, [number], **assumptions) if (number, one.patients) not in found
+            ]
+            found |= {(number, one.patients): one for one in run(cases)}
+            answer = planning.patients_needed(
+                [found[number, one] for one in about], aim, target, trials=assumptions["trials"]
+            )
+            if answer is None or about[0] <= answer.patients <= about[-1] or answer.patients == guess:
+                break
+            guess = answer.patients
+        if answer is None or answer.patients >= MOST_PATIENTS:
+            what = f"{MOST_PATIENTS} patients do not reach {aim} {target:g} (maps of each mass: {number})"
+            raise BadDataError(what, way_out="ask for less, or change the errors assumed")
+        needed.append(answer)
+    return tuple(found[key] for key in sorted(found)), tuple(needed)

@@ -15,7 +15,7 @@ from typing import Any, Final
 import numpy as np
 
 from tactile_bayes import __version__
-from tactile_bayes.api.comparing import compare_answers, drawn_maps
+from tactile_bayes.api.comparing import compare_answers
 from tactile_bayes.api.estimating import choose_calibration, estimate_file
 from tactile_bayes.api.pooled import pool_answers
 from tactile_bayes.api.repeatability import ExamFolder, learn_from_exams
@@ -44,7 +44,7 @@ from tactile_bayes.report.estimate_figures import draw_map, draw_size
 from tactile_bayes.report.exam_page import exam_page
 from tactile_bayes.report.exam_words import Exam as ShownExam
 from tactile_bayes.report.exam_words import exam_map
-from tactile_bayes.report.growth_page import Course, draw_comparison, growth_page
+from tactile_bayes.report.growth_page import Course, DrawnMap, draw_comparison, growth_page
 from tactile_bayes.report.svg import thumbnail_svg
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.draws import SIZES, SizePosterior
@@ -271,7 +271,6 @@ def make_estimate(folder: Path, settings: Settings, match: Match | None) -> Made
     """The estimate, the draws of its size and what pools and sizes by the site start from."""
     found = _estimated(folder, settings, match)
     answer = found.answer
-    assert answer.report is not None
     report, shape = answer.report.checked(), answer.shape
     writes: Writes = {layout.ESTIMATE: lambda path: write_text(path, json_text(report), force=True)}
     if found.status == "estimate":
@@ -297,7 +296,7 @@ def make_figures(folder: Path, settings: Settings, match: Match | None) -> Made:
     found = _estimated(folder, settings, match)
     tactile_map, estimate, report = found.tactile_map, found.estimate, found.answer.report
     name, size, writes = folder.name, estimate.size, Writes()
-    if tactile_map.covered.any() and report is not None:
+    if tactile_map.covered.any():
         writes[layout.MAP_FIGURE] = lambda path: draw_map(tactile_map, report, path, name=name, force=True)
     if size is not None:
         given: dict[str, Any] = {"probability": found.probability, "findings": estimate.findings}
@@ -351,7 +350,7 @@ def make_growth(
     """
     answers = [[_answer(folder / name) for name in names] for names in visits]
     found = [one for maps in answers for one in maps if one.shape is not None]
-    placed = all(one.report is not None and one.report.centre_patient_mm is not None for one in found)
+    placed = all(one.report.centre_patient_mm is not None for one in found)
     numbered = [(v, i, name) for v, names in enumerate(visits, 1) for i, name in enumerate(names, 1)]
     compared = compare_answers(
         answers,
@@ -361,7 +360,10 @@ def make_growth(
         inputs={f"visit_{v}_map_{i}": folder / name / layout.MAP for v, i, name in numbered},
     )
     report = compared.report.checked()
-    drawn = drawn_maps([[read_map(folder / name / layout.MAP) for name in names] for names in visits], answers)
+    drawn = [
+        [DrawnMap.of(read_map(folder / name / layout.MAP), one.report) for name, one in zip(names, maps, strict=True)]
+        for names, maps in zip(visits, answers, strict=True)
+    ]
     page = growth_page(compared.compared, report, drawn, course)
     writes: Writes = {
         layout.COMPARED: lambda path: write_text(path, json_text(report), force=True),
@@ -379,8 +381,6 @@ def _answer(folder: Path) -> Answer:
     tactile_map: TactileMap = read_map(folder / layout.MAP)
     return Answer(
         read_record(folder / layout.ESTIMATE, EstimateReport),
-        text="",
-        exit_code=0,
         shape=read_shape(folder / layout.SHAPE) if (folder / layout.SHAPE).exists() else None,
         normalise=tactile_map.recipe.normalise,
         fingerprint=tactile_map.fingerprint,

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_bayes import __version__
-from tactile_bayes.declarations import Record
+from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.exports import exam as codes
 from tactile_bayes.exports.exam import (
@@ -36,7 +36,7 @@ from tactile_bayes.mapping.places import orientation_of
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.estimate_text import no_estimate_line
 from tactile_bayes.report.figure_file import plain_matplotlib
-from tactile_bayes.report.map_figure import contour_of, map_figure
+from tactile_bayes.report.map import map_figure
 
 # --- What the DICOM objects of one export share: patient, study, equipment, identifiers, and their bytes.
 
@@ -185,15 +185,14 @@ def map_picture(source: MapFile, estimate: EstimateFile | None) -> NDArray[np.ui
     No file name is in it, because those may hold patients' names.
     """
     report = None if estimate is None or estimate.kind != "estimate" else estimate.report
-    alone = report if isinstance(report, EstimateReport) else None
+    alone = replace(report, masses=()) if isinstance(report, EstimateReport) else None
     unsized = [] if estimate is None or estimate.sized else [one.reason for one in estimate.masses]
     side = source.facts.get("side")
     with plain_matplotlib() as library:
         figure = map_figure(
             source.tactile_map,
             None,
-            fit=None if alone is None else contour_of(alone),
-            looked_at=[] if alone is None else [one for one in alone.candidates if one.fault],
+            report=alone,
             title="Tactile map" + (f" of the {side} breast" if side in ("left", "right") else ""),
             note=no_estimate_line(unsized[0][:_MOST_NOTE]) if unsized else "",
             findings=None if estimate is None else estimate.report.findings,

@@ -19,7 +19,7 @@ from tactile_bayes.posterior.result import Estimate, FittedCells, fitted_cells
 from tactile_bayes.report.estimate_document import leading_size
 from tactile_bayes.report.estimate_text import exams_label, no_estimate_line
 from tactile_bayes.report.figure_file import figure_file, finish, load_matplotlib
-from tactile_bayes.report.map_figure import contour_of, draw_panel, map_figure
+from tactile_bayes.report.map import draw_panel, map_figure
 from tactile_bayes.size.draws import SizePosterior
 
 if TYPE_CHECKING:
@@ -208,17 +208,7 @@ def draw_map(tactile_map: TactileMap, report: EstimateReport, path: Path | None,
     note = ""
     if report.reason and report.max_size_mm is None:
         note = no_estimate_line(report.reason) if report.status == "no_estimate" else f"No size: {report.reason}."
-    return map_figure(
-        tactile_map,
-        path,
-        fit=contour_of(report),
-        masses=report.masses,
-        looked_at=[one for one in report.candidates if one.fault],
-        title=f"Tactile map: {name}",
-        note=note,
-        findings=report.findings,
-        force=force,
-    )
+    return map_figure(tactile_map, path, report=report, title=f"Tactile map: {name}", note=note, force=force)
 
 
 # --- Pictures of a posterior's draws: traces, ranks of the chains, and a corner of pairs.

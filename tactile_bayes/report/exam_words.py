@@ -12,7 +12,16 @@ import numpy as np
 
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import CANNOT_SHOW, NO_LUMP, UsageError
-from tactile_bayes.files.reports import EstimateReport, Interval, MassReport, Place, Point, PooledReport, centre_of
+from tactile_bayes.files.reports import (
+    EstimateReport,
+    Interval,
+    MassReport,
+    Place,
+    Point,
+    PooledReport,
+    centre_of,
+    ellipse_of,
+)
 from tactile_bayes.findings import capital, finding_lines
 from tactile_bayes.geometry import apply
 from tactile_bayes.inference.draws import Quantity
@@ -151,12 +160,10 @@ def _mass(
         variances = (centre.x.sd**2, centre.y.sd**2) if isinstance(centre, Point) else (0.0, 0.0)
         place = clock_position(tactile_map, centre.median, side=side, covariance_mm2=np.diag(variances))
         patient = patient_mm(tactile_map, *centre.median)
-    along, across = told.d_x_mm, told.d_y_mm
     return ExamMass(
         number,
         centre.median,
-        axes_mm=None if along is None or across is None else (along.median, across.median),
-        angle_deg=0.0 if told.angle_deg is None else told.angle_deg.median,
+        *ellipse_of(told),
         largest=told.leading.max_size_mm,
         probability=told.detected_probability,
         place=place,

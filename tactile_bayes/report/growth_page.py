@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from tactile_bayes.declarations import Record, replace
+from tactile_bayes.files.reports import EstimateReport, centre_of, ellipse_of
 from tactile_bayes.findings import finding_lines
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.draws import Quantity
@@ -26,7 +27,7 @@ from tactile_bayes.report.compare import (
     verdict_sentence,
 )
 from tactile_bayes.report.figure_file import figure_file, named_exam
-from tactile_bayes.report.map_figure import draw_cells, draw_edges
+from tactile_bayes.report.map import draw_cells, draw_edges
 from tactile_bayes.report.pages import cut, foot, page
 from tactile_bayes.report.svg import (
     STEPS,
@@ -63,6 +64,11 @@ class DrawnMap(Record, eq=False):
     centre_mm: tuple[float, float] | None  #: On the plane; None where none was found.
     axes_mm: tuple[float, float] | None = None  #: None without a size.
     angle_deg: float = 0.0
+
+    @classmethod
+    def of(cls, tactile_map: TactileMap, report: EstimateReport) -> DrawnMap:
+        """A map with the lump of its estimate."""
+        return cls(tactile_map, centre_of(report.centre_mm), *ellipse_of(report))
 
     @property
     def rotation(self) -> FloatArray:

@@ -19,7 +19,7 @@ from tactile_bayes.files.scan_mcap import write_scan
 from tactile_bayes.findings import Finding
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.report.map_text import map_summary
+from tactile_bayes.report.map import map_summary
 from tactile_bayes.scans import Landmarks, Scan
 
 

@@ -17,7 +17,7 @@ from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import MapRecipe, TactileMap
 from tactile_bayes.mapping.places import orientation_of
 from tactile_bayes.posterior.verdict import missing_strokes
-from tactile_bayes.report.map_figure import map_figure
+from tactile_bayes.report.map import map_figure
 from tactile_bayes.scans import Landmarks, Scan
 
 INTO_BODY = np.array([0.0, 0.0, 1.0])  # of `make_scan`: its head's z axis is the base's

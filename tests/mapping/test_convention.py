@@ -16,7 +16,7 @@ from tactile_bayes.mapping import convention
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.convention import CONVENTIONS, check_convention, convention_findings, import_again
 from tactile_bayes.mapping.select import SelectedFrames, select_frames
-from tactile_bayes.report.map_text import map_text
+from tactile_bayes.report.map import map_text
 from tactile_bayes.scans import HeadGeometry, Scan, TrackerPoses
 
 WRONG = list(CONVENTIONS)[1:]

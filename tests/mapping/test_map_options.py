@@ -11,7 +11,7 @@ from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import advise_cell
 from tactile_bayes.mapping.select import timing_figures
-from tactile_bayes.report.map_text import map_text
+from tactile_bayes.report.map import map_text
 from tactile_bayes.scans import ElementCalibration, Landmarks, PressureFrames, Scan, TrackerPoses
 
 

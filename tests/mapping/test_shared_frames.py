@@ -13,7 +13,7 @@ from tactile_bayes.mapping.accumulate import LEAST_SHARE, MapAccumulator
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.cells import poses_at
 from tactile_bayes.mapping.map import TactileMap
-from tactile_bayes.report.map_text import map_text
+from tactile_bayes.report.map import map_text
 from tactile_bayes.scans import Scan
 
 NAMES = {"shared_share", "shared_length_mm", "effective_readings", "shared_frames"}

@@ -12,7 +12,7 @@ from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.convention import POOL_S, every_stretch, thinning
 from tactile_bayes.mapping.select import every_nth, first_seconds
-from tactile_bayes.report.map_text import map_text
+from tactile_bayes.report.map import map_text
 from tactile_bayes.scans import PressureFrames
 
 

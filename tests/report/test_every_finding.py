@@ -26,7 +26,7 @@ from in_process import run_here
 from posterior_maps import bump_map
 
 import tactile_bayes as tb
-from tactile_bayes.api.comparing import Comparison, drawn_maps
+from tactile_bayes.api.comparing import Comparison
 from tactile_bayes.api.estimating import estimate_one
 from tactile_bayes.api.maps import Map
 from tactile_bayes.api.pooled import PooledSize
@@ -50,9 +50,8 @@ from tactile_bayes.mapping.select import scan_findings
 from tactile_bayes.report.campaign_page import ExamEntry, MassRow, VisitEntry, campaign_html
 from tactile_bayes.report.compare import Growth, compare_summary, compare_text, growths
 from tactile_bayes.report.exam_page import exam_page
-from tactile_bayes.report.growth_page import draw_comparison
-from tactile_bayes.report.map_figure import map_figure
-from tactile_bayes.report.map_text import map_summary, map_text
+from tactile_bayes.report.growth_page import DrawnMap, draw_comparison
+from tactile_bayes.report.map import map_figure, map_summary, map_text
 from tactile_bayes.report.pooled import pooled_summary, pooled_text
 
 FAST = Settings(method="laplace")
@@ -208,7 +207,7 @@ def campaign_card(made: Made) -> str:
 
 
 def drawn(made: Made) -> Any:
-    maps = drawn_maps([[made.map], [made.map]], [[made.answer], [made.answer]])
+    maps = [[DrawnMap.of(made.map, made.answer.report)] for _ in range(2)]
     return draw_comparison(made.compared.compared, made.compared.report, maps, None)
 
 
@@ -272,12 +271,12 @@ PRINTERS = {
     "actions/estimate", "api/maps", "api/sized", "exports/dicom",
     "exports/fhir", "exports/run", "exports/redcap", "files/map_nc",
     "report/campaign_page", "report/growth_page", "report/compare", "report/estimate_document",
-    "report/estimate_figures", "report/estimate_text", "report/exam_page", "report/map_figure", "report/map_text",
+    "report/estimate_figures", "report/estimate_text", "report/exam_page", "report/map",
     "report/pages", "report/pooled",
     # of draws, not of a size; names of files that were written
     "actions/report", "actions/show", "actions/campaign", "actions/live_view", "actions/record",
     # of trials, calibrations, devices and studies
-    "actions/calibrate", "actions/devices", "api/diagnosing", "api/planning",
+    "actions/calibrate", "actions/devices", "api/diagnosing", "api/trials",
     "campaigns/campaign", "actions/bring_in", "actions/exam",
     "actions/simulation", "actions/study",
     "actions/tradeoff", "files/size_json", "presets", "report/calibration",

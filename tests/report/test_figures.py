@@ -8,23 +8,33 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from plain_reports import estimate_report
 
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, UsageError
-from tactile_bayes.files.reports import PassedOver
+from tactile_bayes.files.reports import PassedOver, Point
 from tactile_bayes.geometry import rigid
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.mapping.map import MapRecipe, TactileMap
 from tactile_bayes.report import estimate_figures as sizes
-from tactile_bayes.report import map_figure as maps
+from tactile_bayes.report import map as maps
 from tactile_bayes.report.estimate_figures import corner_figure, size_figure
-from tactile_bayes.report.map_figure import FitContour, map_figure
+from tactile_bayes.report.map import map_figure
 
-INTERVALS = {
-    name: Quantity(median=low + 3.0, mean=low + 3.0, sd=1.5, low=low, high=low + 6.0, probability=0.95, kind="eti")
-    for name, low in (("max", 12.0), ("min", 9.0))
-}
-FIT = FitContour((3.0, -2.0), 6.0, 4.0, 20.0)
+
+def quantity(median: float) -> Quantity:
+    ends = {"low": median - 3.0, "high": median + 3.0}
+    return Quantity(median=median, mean=median, sd=1.5, **ends, probability=0.95, kind="eti")
+
+
+INTERVALS = {"max": quantity(15.0), "min": quantity(12.0)}
+FIT = estimate_report(
+    centre_mm=Point(quantity(3.0), quantity(-2.0)),
+    sigma_x_mm=quantity(6.0),
+    sigma_y_mm=quantity(4.0),
+    angle_deg=quantity(20.0),
+    background=quantity(1.0),
+)
 
 
 def bump_map(*, normalise: str = "mean") -> TactileMap:
@@ -72,7 +82,7 @@ def axes(monkeypatch):
 @pytest.mark.parametrize(("fit", "normalise"), [(None, "mean"), (FIT, "gain"), (None, "none")])
 def test_a_map_is_drawn_in_the_same_bytes_each_time(tmp_path, fit, normalise):
     for name in ("a.png", "b.png"):
-        map_figure(bump_map(normalise=normalise), tmp_path / name, fit=fit, title="Map 1")
+        map_figure(bump_map(normalise=normalise), tmp_path / name, report=fit, title="Map 1")
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
     assert b"Matplotlib" not in (tmp_path / "a.png").read_bytes()
     assert png_size(tmp_path / "a.png")[0] == 1500
@@ -86,8 +96,9 @@ def test_a_map_of_any_form_leaves_no_band_of_its_figure_empty(tmp_path, shape, f
     whole, (ny, nx) = bump_map(), shape
     part = {name: getattr(whole, name)[:ny, :nx] for name in ("mean", "variance", "count")}
     looked_at = [PassedOver(0.0, float(n), "no bump that the window holds: the fit ran away") for n in range(places)]
+    report = replace(fit or estimate_report(), candidates=tuple(looked_at))
     cut = replace(whole, **part, x_mm=whole.x_mm[:nx], y_mm=whole.y_mm[:ny])
-    map_figure(cut, tmp_path / "map.png", fit=fit, looked_at=looked_at)
+    map_figure(cut, tmp_path / "map.png", report=report)
     from PIL import Image
 
     dark = np.asarray(Image.open(tmp_path / "map.png").convert("L")) < 250
@@ -127,7 +138,7 @@ def test_an_imported_grid_is_drawn_as_its_file_reads(axes):
 
 
 def test_the_size_is_drawn_and_one_sigma_of_the_bump_is_named_as_no_lump(axes):
-    map_figure(bump_map(), None, fit=replace(FIT, size_mm=(14.0, 10.0)))
+    map_figure(bump_map(), None, report=replace(FIT, d_x_mm=quantity(14.0), d_y_mm=quantity(10.0)))
     ellipses = axes[0].patches
     assert [(one.width, one.height, one.angle) for one in ellipses] == [(14.0, 10.0, 20.0), (12.0, 8.0, 20.0)]
     assert {one.center for one in ellipses} == {(3.0, -2.0)}
@@ -138,7 +149,7 @@ def test_the_size_is_drawn_and_one_sigma_of_the_bump_is_named_as_no_lump(axes):
 def test_an_ellipse_turns_with_a_plane_that_is_shown_by_a_quarter_turn(axes):
     """With the notch along x the picture has y across: the ellipse's long axis keeps its cells."""
     to_patient = rigid(np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), np.zeros(3))
-    map_figure(replace(bump_map(), patient_from_plane=to_patient), None, fit=FIT)
+    map_figure(replace(bump_map(), patient_from_plane=to_patient), None, report=FIT)
     (ellipse,) = axes[0].patches
     assert (ellipse.center, ellipse.width, ellipse.height, ellipse.angle) == ((-2.0, 3.0), 8.0, 12.0, -20.0)
     (image,) = axes[0].images
@@ -149,7 +160,7 @@ def test_a_rib_beside_the_lump_does_not_take_all_colours(axes):
     ribbed = bump_map()
     mean = ribbed.mean.copy()
     mean[-6:] = 4.0
-    map_figure(replace(ribbed, mean=mean), None, fit=replace(FIT, amplitude=0.5))
+    map_figure(replace(ribbed, mean=mean), None, report=replace(FIT, amplitude=quantity(0.5)))
     assert axes[0].images[0].get_clim()[1] == pytest.approx(1 + 1.25 * 0.5)
     map_figure(replace(ribbed, mean=mean), None)
     assert axes[1].images[0].get_clim()[1] == 4.0
@@ -157,7 +168,7 @@ def test_a_rib_beside_the_lump_does_not_take_all_colours(axes):
 
 def test_places_that_were_looked_at_are_marked_with_their_reasons(axes):
     places = [PassedOver(float(i), 0.0, f"reason {i}") for i in range(6)]
-    map_figure(bump_map(), None, looked_at=places, note="No estimate: nothing there.")
+    map_figure(bump_map(), None, report=estimate_report(candidates=tuple(places)), note="No estimate: nothing there.")
     crosses = [line for line in axes[0].lines if line.get_marker() == "x"]
     assert [line.get_xdata()[0] for line in crosses] == [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]
     words = "\n".join(text.get_text() for text in axes[0].figure.axes[1].texts)
@@ -185,7 +196,7 @@ def test_a_grid_without_counts_is_not_hatched_and_its_unit_is_unknown(axes):
 )
 def test_a_figure_is_what_its_suffix_says_in_the_same_bytes_each_time(tmp_path, suffix, begins):
     for name in ("a", "b"):
-        map_figure(bump_map(), tmp_path / f"{name}{suffix}", fit=FIT)
+        map_figure(bump_map(), tmp_path / f"{name}{suffix}", report=FIT)
         size_figure(draws(0, 15), draws(1, 12), tmp_path / f"size-{name}{suffix}", intervals=INTERVALS)
     for name in ("", "size-"):
         written = (tmp_path / f"{name}a{suffix}").read_bytes()

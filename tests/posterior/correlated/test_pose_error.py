@@ -28,7 +28,7 @@ from tactile_bayes.posterior.fit import FieldFit, tangent_columns
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.posterior.window import Window, independent_variance
 from tactile_bayes.presets import POSE_NOISE
-from tactile_bayes.report.map_text import map_text
+from tactile_bayes.report.map import map_text
 from tactile_bayes.scans import Scan, TrackerPoses
 
 SIGMA = (4.5, 5.5)
