@@ -17,6 +17,7 @@ from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.mapping.places import PATIENT_WORDS, Orientation, orientation_of
 from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.report import svg
 from tactile_bayes.report.compare import (
     CompareReport,
     Visit,
@@ -29,21 +30,6 @@ from tactile_bayes.report.compare import (
 from tactile_bayes.report.figure_file import figure_file, named_exam
 from tactile_bayes.report.map import draw_cells, draw_edges
 from tactile_bayes.report.pages import cut, foot, page
-from tactile_bayes.report.svg import (
-    STEPS,
-    colour_steps,
-    drawing,
-    edge_names,
-    ellipse_mm,
-    line,
-    picture_of,
-    scale_bar,
-    size_ruler,
-    spread_limits,
-    stroked,
-    text,
-    through,
-)
 from tactile_bayes.size.visits import Compared, straight_line
 
 if TYPE_CHECKING:
@@ -127,7 +113,7 @@ def _laid(maps: Sequence[DrawnMap], size: Quantity | None, view: Orientation) ->
         values.append(_nearest(one, x, y))
         if ring is None and size is not None and drawn.axes_mm is not None:
             largest = max(drawn.axes_mm)
-            shape = ellipse_mm(drawn.axes_mm, drawn.angle_deg) * size.median / largest  # as its map has it
+            shape = svg.ellipse_mm(drawn.axes_mm, drawn.angle_deg) * size.median / largest  # as its map has it
             ring = signs[:, None] * (rotation @ shape)
     if not values:
         return LaidMap(np.full(right.shape, np.nan), np.zeros(2), None)
@@ -152,7 +138,7 @@ def _nearest(tactile_map: TactileMap, x_mm: FloatArray, y_mm: FloatArray) -> Flo
 
 def common_limits(maps: Sequence[LaidMap]) -> tuple[float, float]:
     """Values at the ends of the colours, one range for all maps."""
-    return spread_limits(np.concatenate([one.values[np.isfinite(one.values)] for one in maps]))
+    return svg.spread_limits(np.concatenate([one.values[np.isfinite(one.values)] for one in maps]))
 
 
 # --- The page.
@@ -198,11 +184,13 @@ def growth_page(compared: Compared, report: CompareReport, visits: Sequence[Sequ
         findings=finding_lines(report.findings, paper=True),
         maps=[_picture(laid[i], view, limits, course, report.visits[i]) for i in shown],
         left_out=len(laid) - len(shown),
-        colours=colour_steps(limits, words, more=any(bool((one.values > limits[1]).any()) for one in laid)),
+        colours=svg.colour_steps(limits, words, more=any(bool((one.values > limits[1]).any()) for one in laid)),
         seen=_seen(view),
         chart=_chart(compared, report, course),
         bars=_bars(compared, report),
-        change=size_ruler(list(_changes(report, course)), unit="%", label="Change of the largest diameter in percent"),
+        change=svg.size_ruler(
+            list(_changes(report, course)), unit="%", label="Change of the largest diameter in percent"
+        ),
         sentences=change_sentences(report),
         rates=rate_sentences(report),
         rows=[_row(report, course, visit) for visit in report.visits],
@@ -231,13 +219,13 @@ def _picture(
 ) -> tuple[str, str, str]:
     """Inline SVG of a visit's map with its ring, sides and scale bar, the visit in words, and its size."""
     side, q = _SCALE * (2 * HALF_MM + STEP_MM), visit.max_size_mm
-    parts = [picture_of(laid.values[::-1], limits, (side, side))]
+    parts = [svg.picture_of(laid.values[::-1], limits, (side, side))]
     if laid.ring_mm is not None:
         points = side / 2 + _SCALE * laid.ring_mm * [[1.0], [-1.0]]
-        parts.append(stroked(through(points.T.tolist()) + "Z", 0.5, kind="size"))
-    parts += edge_names(view, (side, side), small=True)
-    parts += scale_bar(side, _SCALE, least_mm=6.0, inset=2.0, size=2.4)
-    drawn = drawing("map", f"Map of {course.of(visit)}", (0.0, 0.0, side, side), parts)
+        parts.append(svg.stroked(svg.through(points.T.tolist()) + "Z", 0.5, kind="size"))
+    parts += svg.edge_names(view, (side, side), small=True)
+    parts += svg.scale_bar(side, _SCALE, least_mm=6.0, inset=2.0, size=2.4)
+    drawn = svg.drawing("map", f"Map of {course.of(visit)}", (0.0, 0.0, side, side), parts)
     unsized = "not sized" if any(one.status == "estimate" for one in visit.maps) else "no lump found"
     return drawn, course.of(visit), unsized if q is None else f"{q.median:.1f} mm"
 
@@ -300,13 +288,13 @@ def _chart(compared: Compared, report: CompareReport, course: Course) -> str:
     if report.trend is not None:
         trend = straight_line(*joint.moments, times)
         sizes = np.exp(trend.level + trend.per_day * (np.array(times) - np.mean(times)))
-        path = through((one.x, _up(size, scale)) for one, size in zip(points, sizes, strict=True))
+        path = svg.through((one.x, _up(size, scale)) for one, size in zip(points, sizes, strict=True))
         dash = 'stroke-width="0.4" stroke-dasharray="1.5 1"'
         parts.append(f'<path class="trend" d="{path}" fill="none" stroke="#555" {dash}/>')
     gap = float(min(np.diff([one.x for one in points])))
     for i, one in enumerate(points):
         parts += _mark(one, scale, row=i % 2 if gap < _ROOM_MM[0] else 0, named=gap >= _ROOM_MM[1])
-    return drawing("ruler", "Largest diameter at each visit with its intervals", (0.0, 0.0, width, height), parts)
+    return svg.drawing("ruler", "Largest diameter at each visit with its intervals", (0.0, 0.0, width, height), parts)
 
 
 def _up(size_mm: float, scale: float) -> float:
@@ -317,13 +305,13 @@ def _up(size_mm: float, scale: float) -> float:
 def _size_axis(top_mm: float, scale: float) -> Iterator[str]:
     floor = _up(0.0, scale)
     right = _BOX_MM[0] - _RIGHT_MM
-    yield line(f"M{_LEFT_MM} {_ABOVE_MM}V{floor:.2f}H{right}", 0.25)
-    step = next((one for one in STEPS if top_mm / one <= 6), STEPS[-1])
+    yield svg.line(f"M{_LEFT_MM} {_ABOVE_MM}V{floor:.2f}H{right}", 0.25)
+    step = next((one for one in svg.STEPS if top_mm / one <= 6), svg.STEPS[-1])
     for tick in range(0, int(top_mm) + 1, step):
         y = _up(tick, scale)
-        yield line(f"M{_LEFT_MM} {y:.2f}h-1", 0.25)
-        yield text(_LEFT_MM - 1.6, y + 0.9, f"{tick}", anchor="end")
-    yield text(_LEFT_MM + 1, _ABOVE_MM + 1, "mm", anchor="start")
+        yield svg.line(f"M{_LEFT_MM} {y:.2f}h-1", 0.25)
+        yield svg.text(_LEFT_MM - 1.6, y + 0.9, f"{tick}", anchor="end")
+    yield svg.text(_LEFT_MM + 1, _ABOVE_MM + 1, "mm", anchor="start")
 
 
 def _mark(one: _Point, scale: float, *, row: int, named: bool) -> Iterator[str]:
@@ -331,15 +319,15 @@ def _mark(one: _Point, scale: float, *, row: int, named: bool) -> Iterator[str]:
     for q, thick in ((one.wide, 0.25), (one.size, 0.9)):
         if q is not None:
             low, high = (_up(end, scale) for end in (q.low, q.high))
-            yield line(f"M{one.x:.2f} {low:.2f}V{high:.2f}", thick)
+            yield svg.line(f"M{one.x:.2f} {low:.2f}V{high:.2f}", thick)
     y, floor = _up(one.size.median, scale), _up(0.0, scale)
     yield f'<circle cx="{one.x:.2f}" cy="{y:.2f}" r="1.1" fill="#111"/>'
     code, _, when = one.words.removeprefix("Visit ").partition(", ")
     if named:
         edge = ' stroke="#fff" stroke-width="1" paint-order="stroke"'  # the line of the trend passes here
-        yield text(one.x + 1.4, y - 1.2, f"{one.size.median:.1f}", anchor="start", more=edge)
-        yield text(one.x, floor + 7 + 3 * row, when[:14], size=2.5)
-    yield text(one.x, floor + 4, code[:14] if named else code[:4])
+        yield svg.text(one.x + 1.4, y - 1.2, f"{one.size.median:.1f}", anchor="start", more=edge)
+        yield svg.text(one.x, floor + 7 + 3 * row, when[:14], size=2.5)
+    yield svg.text(one.x, floor + 4, code[:14] if named else code[:4])
 
 
 # --- Picture of a comparison: the visits' maps on common axes and colours, their difference, and the change of size.
