@@ -26,6 +26,7 @@ from tactile_bayes.findings import LEADS, finding_lines
 from tactile_bayes.mapping.arrangement import check_scan, corrected
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.scans import Scan
+from tactile_bayes.shell import progress_bar
 
 _BESIDE: Final = {"head_geometry": of_head, "array_calibration": of_calibration, "landmarks": of_landmarks}
 
@@ -170,10 +171,11 @@ def _arrangement_lines(scan: Scan) -> list[str]:
 
 
 def _import_map(source: Path, output: Path, wanted: Wanted) -> list[str]:
-    tactile_map, notes = import_grid(source, wanted.grid)
-    asked = {**as_dict(wanted.grid), "spacing_mm": tactile_map.recipe.cell_mm}
-    provenance = Provenance("import", {"as": "map", **asked, "notes": notes}, inputs=hash_inputs(source=source))
-    write_map(output, tactile_map, provenance=provenance, force=wanted.force)
+    with progress_bar("steps", time_left=False) as progress:
+        tactile_map, notes = import_grid(source, wanted.grid, progress=progress)
+        asked = {**as_dict(wanted.grid), "spacing_mm": tactile_map.recipe.cell_mm}
+        provenance = Provenance("import", {"as": "map", **asked, "notes": notes}, inputs=hash_inputs(source=source))
+        write_map(output, tactile_map, provenance=provenance, force=wanted.force)
     ny, nx = tactile_map.mean.shape
     covered = int(tactile_map.covered.sum())
     low, high = np.nanmin(tactile_map.mean), np.nanmax(tactile_map.mean)

@@ -21,6 +21,7 @@ from tactile_bayes.mapping.map import MapRecipe, TactileMap, block_sums
 from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.presets import CELL_MM
+from tactile_bayes.progress import Progress, untold
 
 # --- What a file or a caller gives before it is a map.
 
@@ -389,10 +390,17 @@ _LONGEST_MM: Final = 500.0
 """No examined breast is longer; frames that stand one in a row, or one below the other, are."""
 
 
-def import_grid(path: Path, asked: GridOptions) -> tuple[TactileMap, list[str]]:
-    """The map of a file, and what was found on reading it; see `open_grid` and `grid_map`."""
+def import_grid(path: Path, asked: GridOptions, *, progress: Progress = untold) -> tuple[TactileMap, list[str]]:
+    """The map of a file, and what was found on reading it; see `open_grid` and `grid_map`.
+
+    Of three steps, reading, the map and what is done with it, `progress` is told the first two.
+    """
     with in_file(path):
-        return grid_map(open_grid(path, no_value=asked.no_value, array=asked.array or ""), asked)
+        grid = open_grid(path, no_value=asked.no_value, array=asked.array or "")
+        progress(1, 3)
+        made = grid_map(grid, asked)
+    progress(2, 3)
+    return made
 
 
 def grid_map(grid: Grid, asked: GridOptions) -> tuple[TactileMap, list[str]]:

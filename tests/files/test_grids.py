@@ -443,6 +443,17 @@ def test_a_grid_lies_as_its_places_say(tmp_path: Path, arrays: dict[str, Any]) -
         import_grid(tmp_path / "grid.npz", GridOptions(spacing_mm=1.0, normalise="gain"))
 
 
+def test_the_steps_of_an_import_are_told(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", lump())
+    told: list[tuple[int, int]] = []
+    import_grid(
+        tmp_path / "a.npy",
+        GridOptions(spacing_mm=1.0, normalise="gain"),
+        progress=lambda done, total: told.append((done, total)),
+    )
+    assert told == [(1, 3), (2, 3)]
+
+
 def test_a_level_in_another_unit_and_words_of_spreadsheets_have_their_way_out(tmp_path: Path) -> None:
     np.savetxt(tmp_path / "grid.csv", lump(), delimiter=",")
     with pytest.raises(BadDataError, match=r"the median value is 1.*, not near the level of 1000; give the level in"):

@@ -12,10 +12,19 @@ import tactile_bayes as tb
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import inverse, quaternion_from_rotation, rigid, rotation_from_quaternion
-from tactile_bayes.mapping.arrangement import ArrangementCheck, check_arrangement, check_scan, corrected
+from tactile_bayes.mapping.arrangement import (
+    LEAST_SWAY_GAIN,
+    LEAST_SWAY_MM,
+    ArrangementCheck,
+    _Overlap,
+    check_arrangement,
+    check_scan,
+    corrected,
+)
 from tactile_bayes.mapping.select import select_frames
 from tactile_bayes.presets import CORRECTIONS
 from tactile_bayes.scans import ElementCalibration, HeadGeometry, PressureFrames, Scan, TrackerPoses
+from validation.lump_probability_scenes import draw
 
 # What undoes a mistake; most are their own inverses.
 UNDONE_BY = {
@@ -68,6 +77,12 @@ def reshaped(array: np.ndarray) -> np.ndarray:
 
 def checked(scan: Scan) -> ArrangementCheck:
     return check_arrangement(select_frames(scan, pressure_window_kpa=(5.0, 14.0)), thorough=False)
+
+
+def overlap(scan: Scan) -> _Overlap:
+    found = _Overlap.of(select_frames(scan, pressure_window_kpa=(5.0, 14.0)), 0.0)
+    assert found is not None
+    return found
 
 
 @pytest.mark.parametrize("name", SEEN)
@@ -176,6 +191,19 @@ def test_a_body_that_breathes_is_named_and_a_still_one_is_not():
         assert not check.refused
 
 
+@pytest.mark.long
+def test_what_the_strokes_drag_along_is_no_body_that_moves():
+    """Over this lump a body that moves by 8 mm fits better by far; so does one that follows the strokes by a fifth."""
+    scan = draw(6, seed=20294303).scan()
+    check, found = checked(scan), overlap(scan).swaying()
+    assert found is not None
+    moved, dragged = found
+    assert moved.sway_mm > LEAST_SWAY_MM
+    assert moved.gain_over(check.stated) > LEAST_SWAY_GAIN
+    assert moved.gain_over(dragged) < LEAST_SWAY_GAIN / 2
+    assert not check.findings
+
+
 # --- clocks
 
 
@@ -204,3 +232,20 @@ def test_the_latency_that_is_stated_is_what_the_clock_is_held_against():
     assert right.best is right.stated
     wrong = check_arrangement(late, latency_ms=150.0)
     assert float(wrong.remedy.split()[-1]) == pytest.approx(300.0, abs=25.0)
+
+
+@pytest.mark.long
+def test_a_clock_that_is_no_better_than_those_beside_it_is_not_named():
+    """Frames over uneven fat agree better the earlier their poses are said to be."""
+    scan = draw(95, seed=20292303).scan()
+    check, early = checked(scan), overlap(scan).late(-500.0)
+    assert early.plausible
+    assert early.gain_over(check.stated) > 0.15
+    assert check.best is check.stated
+
+
+def test_frames_without_a_pose_by_another_clock_do_not_count():
+    never = overlap(lump()).late(60_000.0)
+    assert never.spread == never.explained == 0.0
+    assert not never.plausible
+    assert never.gain_over(checked(lump()).stated) < 0
