@@ -1,7 +1,5 @@
 from tactile_bayes import errors as errors
 from tactile_bayes.api.arrays import scan as scan
-from tactile_bayes.api.calibrating import calibrate_repeatability as calibrate_repeatability
-from tactile_bayes.api.calibrating import calibrate_size as calibrate_size
 from tactile_bayes.api.comparing import Comparison as Comparison
 from tactile_bayes.api.comparing import compare as compare
 from tactile_bayes.api.diagnosing import Diagnosis as Diagnosis
@@ -17,15 +15,17 @@ from tactile_bayes.api.maps import map_of as map_of
 from tactile_bayes.api.maps import read_map as read_map
 from tactile_bayes.api.maps import read_scan as read_scan
 from tactile_bayes.api.maps import simulate as simulate
-from tactile_bayes.api.planning import TrialPlan as TrialPlan
-from tactile_bayes.api.planning import plan as plan
 from tactile_bayes.api.pooled import PooledSize as PooledSize
 from tactile_bayes.api.recording import record as record
+from tactile_bayes.api.repeatability import calibrate_repeatability as calibrate_repeatability
 from tactile_bayes.api.reports import ExportedFiles as ExportedFiles
 from tactile_bayes.api.reports import exam_report as exam_report
 from tactile_bayes.api.reports import export as export
+from tactile_bayes.api.size_calibration import calibrate_size as calibrate_size
 from tactile_bayes.api.sized import SizeEstimate as SizeEstimate
+from tactile_bayes.api.trials import TrialPlan as TrialPlan
 from tactile_bayes.api.trials import TrialResult as TrialResult
+from tactile_bayes.api.trials import plan as plan
 from tactile_bayes.api.trials import validate as validate
 from tactile_bayes.campaigns.campaign import CampaignResult as CampaignResult
 from tactile_bayes.campaigns.campaign import campaign as campaign
