@@ -13,6 +13,7 @@ import os
 import stat
 import time
 import zlib
+from collections import UserDict
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
@@ -26,32 +27,19 @@ _FLUSHED_EVERY_S: Final = 5.0  #: Lines reach the disk at least this often: what
 _READ_BYTES: Final = 4096
 
 
-class StoredValues(Mapping[str, Any]):
-    """Results by the names of their items, each read from the store's file when it is asked for."""
+class StoredValues(UserDict[str, Any]):
+    """Results by the names of their items, each read from the store's file when it is asked for.
+
+    `data` is where their lines begin; the latest line of a name counts. A result that is deleted is missing in this
+    run, and its line stays in the file.
+    """
 
     def __init__(self, descriptor: int, decode: Callable[[Any], Any]) -> None:
+        super().__init__()
         self._descriptor, self._decode = descriptor, decode
-        self._at: dict[str, int] = {}
 
     def __getitem__(self, name: str) -> Any:
-        return self._decode(_unsealed(_line_at(self._descriptor, self._at[name]))["value"])
-
-    def __contains__(self, name: object) -> bool:
-        return name in self._at
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._at)
-
-    def __len__(self) -> int:
-        return len(self._at)
-
-    def place(self, name: str, offset: int) -> None:
-        """Note where the line of a result begins; the latest line of a name counts."""
-        self._at[name] = offset
-
-    def forget(self, name: str) -> None:
-        """Take a result for missing in this run; its line stays in the file."""
-        del self._at[name]
+        return self._decode(_unsealed(_line_at(self._descriptor, self.data[name]))["value"])
 
 
 class BatchStore:
@@ -82,7 +70,7 @@ class BatchStore:
         line = json.dumps({"key": name, "value": self._encode(value)}, ensure_ascii=False)
         began = self._end
         self._append(_sealed(line))
-        self.values.place(name, began)
+        self.values.data[name] = began
         return self._decode(json.loads(line)["value"])
 
     def load(self, header: Mapping[str, Any]) -> None:
@@ -96,7 +84,7 @@ class BatchStore:
                 if not line.endswith(b"\n"):
                     break
                 name = _name_in(line[:-1].decode("utf-8", errors="replace"), number=number, path=self.path)
-                self.values.place(name, self._end)
+                self.values.data[name] = self._end
                 self._end += len(line)
         if not self._read_only:
             os.ftruncate(self._descriptor, self._end)

@@ -63,8 +63,14 @@ if TYPE_CHECKING:  # to a type checker each record is frozen, as the class below
         __struct_fields__: ClassVar[tuple[str, ...]]
 
         def __init_subclass__(cls, **options: Any) -> None: ...
+
+    S = TypeVar("S", bound=_Struct)
+
+    def replace(record: S, **changes: Any) -> S:
+        """A copy of a record with some fields changed."""
 else:
     _Struct = msgspec.Struct
+    replace = msgspec.structs.replace
 
 
 class Record(_Struct, frozen=True, forbid_unknown_fields=True):
@@ -153,13 +159,6 @@ def part_of(record: Any, names: Sequence[str], meaning: str) -> Any:
     fields.sort(key=lambda one: names.index(one[0]))
     name = f"{record.__name__}Part"
     return msgspec.defstruct(name, fields, bases=(Record,), namespace={"__doc__": meaning}, frozen=True, kw_only=True)
-
-
-def replace(record: T, **changes: Any) -> T:
-    """A copy of a record, or of a data class, with some fields changed."""
-    changed: Any = msgspec.structs.replace if isinstance(record, msgspec.Struct) else dataclasses.replace
-    copy: T = changed(record, **changes)
-    return copy
 
 
 def settle(record: Any, **values: Any) -> None:

@@ -116,16 +116,9 @@ def _shortened(text: str) -> str:
 
 
 class BadDataError(TactileBayesError, ValueError):
-    """A file, array or table has invalid content.
+    """A file, array or table has invalid content: `what` is wrong, with the value, and the `way_out`.
 
-    Parameters
-    ----------
-    what
-        What is wrong, with the value: ``"frame_time_s runs backwards at index 7 (1.250 after 1.255)"``.
-    way_out
-        What the user can do about it.
-    path
-        The file, when one is at fault. Code that holds only arrays leaves it out; the reader fills it in.
+    `path` is the file at fault. Code that holds only arrays leaves it out; the reader fills it in.
     """
 
     exit_code = EXIT_BAD_DATA
@@ -165,12 +158,7 @@ class DeviceError(TactileBayesError):
 class NotConvergedError(TactileBayesError):
     """A sampler or solver stopped before its own criteria were met.
 
-    Parameters
-    ----------
-    message
-        What was not reached and how much longer to run.
-    diagnostics
-        The figures at the time of stopping (for example ``{"rhat": 1.03, "ess_bulk": 410.0}``).
+    The message says what was not reached and how much longer to run; `diagnostics` are the figures at that time.
     """
 
     exit_code = EXIT_NOT_CONVERGED

@@ -389,7 +389,7 @@ def test_a_store_holds_places_of_lines_and_reads_what_they_say(tmp_path):
     path, long = tmp_path / "store", "x" * 20_000  # longer than one read
     with open_store(path, settings={}) as store:
         run_batch({"a": long, "b": 1}.__getitem__, ["a", "b"], key=str, store=store)
-        store.values.forget("a")
+        del store.values["a"]
         assert (list(store.values), store.values.get("a")) == (["b"], None)
         store.add("a", "again")
         assert store.values["a"] == "again"

@@ -32,10 +32,11 @@ from tactile_bayes.shell import progress_bar
 from tactile_bayes.size.bodies import BodyCalibration
 
 
-def calibrate_array(
-    steps: tuple[tuple[float, Path], ...], output: Path, *, head_id: str | None, day: date, force: bool
-) -> str:
-    """Fit the calibration, write it, and print the result."""
+def calibrate_array_action(
+    steps: tuple[tuple[float, Path], ...], output: Path, head_id: str | None, day: datetime | None, force: bool
+) -> None:
+    """Learn the gain and offset of each taxel from a pressure bladder, and how uneven they stay."""
+    measured = day.date() if day else date.today()
     scans = [read_scan(path) for _, path in steps]
     head = head_id or _one_head(scans)
     full = scans[0].element_calibration.saturation_count
@@ -47,10 +48,10 @@ def calibrate_array(
     inputs = hash_inputs(**{f"step_{number}": path for number, (_, path) in enumerate(steps, start=1)})
     made = Provenance("calibrate array", {"pressure_kpa": [kpa for kpa, _ in steps]}, inputs)
     content = ArrayCalibrationFile(
-        head_id=head, day=day, quality=_quality(fit), provenance=made.as_dict(), **as_dict(fit.calibration)
+        head_id=head, day=measured, quality=_quality(fit), provenance=made.as_dict(), **as_dict(fit.calibration)
     )
     write_array_calibration(output, content, force=force)
-    return _text(fit, head, output)
+    click.echo(_text(fit, head, output), nl=False)
 
 
 def _one_head(scans: list[Scan]) -> str:
@@ -124,11 +125,3 @@ def calibrate_repeatability_action(folder: Path, output: Path, size_calibration:
     learned = learn_from_exams(exams_in(folder), size_calibration=size_calibration)
     learned.write(output, force=force)
     click.echo(repeatability_text(learned.document), nl=False)
-
-
-def calibrate_array_action(
-    steps: tuple[tuple[float, Path], ...], output: Path, head_id: str | None, day: datetime | None, force: bool
-) -> None:
-    """Learn the gain and offset of each taxel from a pressure bladder, and how uneven they stay."""
-    measured = day.date() if day else date.today()
-    click.echo(calibrate_array(steps, output, head_id=head_id, day=measured, force=force), nl=False)

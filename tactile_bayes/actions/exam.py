@@ -15,7 +15,7 @@ import click
 from tactile_bayes.api.diagnosing import diagnose
 from tactile_bayes.commands import estimate
 from tactile_bayes.commands import trial as validate
-from tactile_bayes.declarations import Record, replace
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.atomic import refuse_existing, unwritable, write_bytes
 from tactile_bayes.files.documents import dump_json
@@ -78,67 +78,49 @@ PROGRAM = "tactile-bayes"
 
 def demo_action(output: Path, method: str, force: bool) -> None:
     """Run the main job on an embedded scan: map, estimate, and the report of a trial."""
+
+    def step(words: str, command: click.Command, **parameters: Any) -> None:
+        """Run a step and print it as the command that does it by hand; typed again, that meets what the demo made."""
+        click.echo(f"\n{words}\n\n$ {PROGRAM} {command.name} {_as_typed(command, parameters | {'force': True})}")
+        try:
+            click.get_current_context().invoke(command, **parameters, force=force)
+        except click.exceptions.Exit as end:  # a step that says its exit code; anything but 0 ends the demo with it
+            if end.exit_code:
+                raise
+        click.echo()
+
     _prepare(output, force=force)
-    steps = Steps(output, method=method, force=force)
+    tactile_map, posterior, paper_posterior = (output / f"{name}.nc" for name in ("map", "posterior", "posterior_eq6"))
     recorded = read_truth(output / "scan.mcap")
     assert recorded is not None  # the embedded scan is simulated
     truth = float(recorded["lumps"][0]["d_mm"])
     click.echo(f"The scan is simulated: a ball of {truth:g} mm in a breast of fat and gland ({output / 'scene.toml'}).")
     click.echo(f"Each step is printed as the command that repeats it by hand.{_how_to_type()}")
-    results = {"estimate, the default": steps.default_road(), "the paper's Eq 6": steps.paper_road()}
-    steps.trial()
-    click.echo(_summary(truth, results))
-    click.echo(_apart(*results.values()))
+    step(
+        "1. Build the tactile map: all readings of the scan, averaged in cells of 1 mm.",
+        estimate.map_command, scans=(output / "scan.mcap",), output=tactile_map,
+    )  # fmt: skip
+    step(
+        "2. Estimate the size of the lump, with the calibration that comes with the program.",
+        estimate.estimate_command, maps=(tactile_map,), method=method, output=posterior,
+        figure=output / "size.png", map_figure=output / "map.png",
+    )  # fmt: skip
+    step(
+        "3. The same map by the paper's own road: Markov chains over the bump, each draw through Eq 6.",
+        estimate.estimate_command, maps=(tactile_map,), method="ensemble", size_calibration="eq6",
+        output=paper_posterior,
+    )  # fmt: skip
+    step(
+        "4. Compare sizes with excision, in a synthetic trial of the paper's size.",
+        validate.validate_command, trial=output / "trial.csv", excision=output / "excision.csv",
+        output=output / "trial.json", html=output / "trial.html",
+    )  # fmt: skip
+    default, paper = read_stated_size(posterior), read_stated_size(paper_posterior)
+    click.echo(_summary(truth, {"estimate, the default": default, "the paper's Eq 6": paper}))
+    click.echo(_apart(default, paper))
     click.echo(f"Written to {output}: {', '.join(sorted(path.name for path in output.iterdir()))}.")
     click.echo(f"Your own data: `{PROGRAM} import --help` says how arrays, grids and images come in.")
     click.echo(RESEARCH_USE)
-
-
-class Steps(Record):
-    """Steps of the demo, run in the folder with its inputs."""
-
-    folder: Path  #: Holds the embedded files and takes what is made of them.
-    method: str  #: Of the default road's estimate.
-    force: bool  #: Whether files of an earlier demo are overwritten.
-
-    def default_road(self) -> StatedSize:
-        """Map and estimate with default options; returns the size."""
-        self._say("1. Build the tactile map: all readings of the scan, averaged in cells of 1 mm.")
-        tactile_map, posterior = self.folder / "map.nc", self.folder / "posterior.nc"
-        self._run(estimate.map_command, "map", scans=(self.folder / "scan.mcap",), output=tactile_map)
-        self._say("2. Estimate the size of the lump, with the calibration that comes with the program.")
-        figures = {"figure": self.folder / "size.png", "map_figure": self.folder / "map.png"}
-        options = {"method": self.method, "output": posterior, **figures}
-        self._run(estimate.estimate_command, "estimate", maps=(tactile_map,), **options)
-        return read_stated_size(posterior)
-
-    def paper_road(self) -> StatedSize:
-        """The same map by the paper's own way: Markov chains through Eq 6."""
-        self._say("3. The same map by the paper's own road: Markov chains over the bump, each draw through Eq 6.")
-        tactile_map, posterior = self.folder / "map.nc", self.folder / "posterior_eq6.nc"
-        options = {"size_calibration": "eq6", "output": posterior}
-        self._run(estimate.estimate_command, "estimate", maps=(tactile_map,), method="ensemble", **options)
-        return read_stated_size(posterior)
-
-    def trial(self) -> None:
-        """Report a synthetic trial."""
-        self._say("4. Compare sizes with excision, in a synthetic trial of the paper's size.")
-        inputs = {"trial": self.folder / "trial.csv", "excision": self.folder / "excision.csv"}
-        outputs = {"output": self.folder / "trial.json", "html": self.folder / "trial.html"}
-        self._run(validate.validate_command, "validate", **inputs, **outputs)
-
-    def _say(self, text: str) -> None:
-        click.echo(f"\n{text}\n")
-
-    def _run(self, command: click.Command, name: str, **parameters: Any) -> None:
-        # typed again, it meets what the demo made
-        click.echo(f"$ {PROGRAM} {name} {_as_typed(command, parameters | {'force': True})}")
-        try:
-            click.get_current_context().invoke(command, **parameters, force=self.force)
-        except click.exceptions.Exit as end:  # a step that says its exit code; anything but 0 ends the demo with it
-            if end.exit_code:
-                raise
-        click.echo()
 
 
 def _prepare(output: Path, *, force: bool) -> None:

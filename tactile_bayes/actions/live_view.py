@@ -93,21 +93,16 @@ class LiveAnswer(NamedTuple):
 
 
 class Estimator:
-    """Estimates the newest map's size repeatedly in a process of its own."""
+    """Estimates the newest map's size repeatedly in a process of its own, which starts before there is a map."""
 
     def __init__(self, calibration: str | None) -> None:
         self._calibration = calibration
-        self._pool: ProcessPoolExecutor | None = None
-        self._running: Future[LiveAnswer] | None = None
-        self._begun: float = 0.0
+        self._pool = ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn"), initializer=_prepare)
+        self._running: Future[LiveAnswer] | None = self._pool.submit(LiveAnswer)
+        self._begun = time.monotonic()
         self.answer = LiveAnswer()
         self.done = 0
         self.seconds = 0.0
-
-    def warm_up(self) -> None:
-        """Start the process and its imports before there is a map."""
-        self._pool = ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn"), initializer=_prepare)
-        self._running, self._begun = self._pool.submit(LiveAnswer), time.monotonic()
 
     def look(self, tactile_map: TactileMap | None) -> None:
         """Take the answer if it has come, and start the next estimate."""
@@ -117,21 +112,16 @@ class Estimator:
                 self.answer, self.done = answer if answer.text else self.answer, self.done + 1
             self.seconds, self._running = time.monotonic() - self._begun, None
         if self._running is None and tactile_map is not None:
-            self._ask(tactile_map)
-
-    def _ask(self, tactile_map: TactileMap) -> None:
-        self._begun = time.monotonic()
-        with contextlib.suppress(RuntimeError):  # a broken pool takes no work
-            if self._pool is not None:
+            self._begun = time.monotonic()
+            with contextlib.suppress(RuntimeError):  # a broken pool takes no work
                 self._running = self._pool.submit(live_estimate, tactile_map, self._calibration)
 
     def close(self) -> None:
         """End the process, also during an estimate."""
-        if self._pool is not None:
-            for child in multiprocessing.active_children():
-                child.terminate()
-            # waited for: the interpreter's own end would meet a pool that is half closed
-            self._pool.shutdown(wait=True, cancel_futures=True)
+        for child in multiprocessing.active_children():
+            child.terminate()
+        # waited for: the interpreter's own end would meet a pool that is half closed
+        self._pool.shutdown(wait=True, cancel_futures=True)
 
 
 def _prepare() -> None:
@@ -231,7 +221,6 @@ def run(pipe: int, setup: dict[str, Any]) -> None:
     reader = FeedReader(pipe)
     live = LiveMap(from_plain(HeadGeometry, setup["head"]), from_plain(ElementCalibration, setup["calibration"]))
     estimator = Estimator(setup["size_calibration"])
-    estimator.warm_up()
     with contextlib.ExitStack() as stack:
         stack.callback(estimator.close)
         showing: list[Callable[[LiveState], None]] = []
@@ -374,7 +363,10 @@ def _picture(state: LiveState, columns: int, lines: int, *, colour: bool) -> lis
         row, column = int(down / step / 2), int(across / step)
         if 0 <= row < len(rows) and 0 <= column < len(rows[row]):
             rows[row][column] = f"\x1b[0;1;97m{_MARK}" if colour else _MARK
-    legend = _legend(state.tactile_map, view, step, marked=state.lump_mm is not None)[:legend_lines]
+    dark, bright = colour_limits(state.tactile_map.mean) or (np.nan, np.nan)
+    recipe, marked = state.tactile_map.recipe, "" if state.lump_mm is None else f"; {_MARK} the lump"
+    scale = f"a character is {step * recipe.cell_mm:g} mm wide{marked}"
+    legend = [view.words, f"{recipe.value_words}: dark {dark:.3g} to bright {bright:.3g}", scale][:legend_lines]
     return [*_framed(rows, view, columns, colour=colour), *(line[:columns] for line in legend)]
 
 
@@ -387,14 +379,6 @@ def _framed(rows: list[list[str]], view: Orientation, columns: int, *, colour: b
     middle = len(rows) // 2
     lines[middle] = f"{edges['left']:>{_MARGIN - 1}} {lines[middle][_MARGIN:]} {edges['right']}"
     return [(" " * _MARGIN + top)[:columns], *lines, (" " * _MARGIN + bottom)[:columns]]
-
-
-def _legend(tactile_map: TactileMap, view: Orientation, step: int, *, marked: bool) -> list[str]:
-    """Legend: orientation, meaning of the colours, length of a character."""
-    limits = colour_limits(tactile_map.mean)
-    low, high = limits if limits is not None else (np.nan, np.nan)
-    scale = f"a character is {step * tactile_map.recipe.cell_mm:g} mm wide" + (f"; {_MARK} the lump" if marked else "")
-    return [view.words, f"{tactile_map.recipe.value_words}: dark {low:.3g} to bright {high:.3g}", scale]
 
 
 def _shrunk(values: FloatArray, step: int) -> FloatArray:

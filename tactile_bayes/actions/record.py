@@ -9,6 +9,7 @@ import signal
 import sys
 import termios
 import tty
+from collections.abc import Iterator
 from contextlib import ExitStack, suppress
 from datetime import date
 from pathlib import Path
@@ -33,13 +34,11 @@ from tactile_bayes.hardware import head
 from tactile_bayes.hardware.head import HeadParser
 from tactile_bayes.hardware.ports import Port, read_in_process
 from tactile_bayes.hardware.readings import Follower, HelloReading
-from tactile_bayes.hardware.recorder import LandmarkTouch, Line, Observer, Recorder, Report
+from tactile_bayes.hardware.recorder import LandmarkTouch, Line, Recorder, Report
 from tactile_bayes.hardware.serial_trackers import TRACKERS, check_head, open_tracker
 from tactile_bayes.options import RecordOptions
 from tactile_bayes.presets import PRESSURE_RANGE_KPA, RESEARCH_USE
 from tactile_bayes.scans import ElementCalibration, HeadGeometry, Landmarks
-
-# --- Options of one recording, and the part of them that the file stores.
 
 
 class Request(RecordOptions, kw_only=True):
@@ -75,8 +74,6 @@ class Request(RecordOptions, kw_only=True):
         }
 
 
-# --- Instrument and provenance of a recording, checked before it starts.
-
 _NOMINAL_FULL_SCALE = 4095
 
 
@@ -89,43 +86,38 @@ def instrument_of(request: Request) -> tuple[HeadGeometry, ElementCalibration, L
         head = like.head
     else:
         raise UsageError("the head's geometry is missing; give --head-geometry HEAD.json or --like SCAN.mcap")
-    return head, _calibration(request, head, like), _landmarks(request)
-
-
-def _calibration(request: Request, head: HeadGeometry, like: Any) -> ElementCalibration:
     if request.uncalibrated:
         gain = np.full(head.shape, PRESSURE_RANGE_KPA[1] / _NOMINAL_FULL_SCALE)
-        return ElementCalibration(gain, np.zeros(head.shape), saturation_count=_NOMINAL_FULL_SCALE)
-    if request.array_calibration:
-        return read_array_calibration(request.array_calibration).calibration
-    if like is not None:
-        return like.element_calibration  # type: ignore[no-any-return]
-    raise UsageError("the array's calibration is missing; give --array-calibration, --like or --uncalibrated")
+        calibration = ElementCalibration(gain, np.zeros(head.shape), saturation_count=_NOMINAL_FULL_SCALE)
+    elif request.array_calibration:
+        calibration = read_array_calibration(request.array_calibration).calibration
+    elif like is not None:
+        calibration = like.element_calibration
+    else:
+        raise UsageError("the array's calibration is missing; give --array-calibration, --like or --uncalibrated")
+    return head, calibration, _landmarks(request)
 
 
-def refuse_calibration(request: Request, *, head_id: str, today: date) -> None:
-    """Raise `UsageError` for a calibration that is stale or of another head, unless accepted."""
-    if not request.array_calibration or request.uncalibrated or request.accept_calibration:
-        return
+def calibration_age(request: Request, *, head_id: str, today: date) -> dict[str, str]:
+    """Session fact on the age of the array calibration, in days; empty where it came from no calibration file.
+
+    One that is stale or of another head is a `UsageError`, unless it is accepted.
+    """
+    if not request.array_calibration or request.uncalibrated:
+        return {}
     found = read_array_calibration(request.array_calibration)
     age = (today - found.day).days
-    if found.head_id != head_id:
+    if found.head_id != head_id and not request.accept_calibration:
         raise UsageError(
             f"{request.array_calibration} was measured on head {found.head_id!r}, this is {head_id!r}; calibrate this "
             "head, or give --accept-calibration"
         )
-    if not 0 <= age <= request.calibration_days:
+    if not 0 <= age <= request.calibration_days and not request.accept_calibration:
         raise UsageError(
             f"{request.array_calibration} is of {found.day}, {age} days ago (at most {request.calibration_days:g}); "
             "calibrate again, or give --accept-calibration"
         )
-
-
-def calibration_age(request: Request, *, today: date) -> dict[str, str]:
-    """Session fact on the age of the array calibration, in days; empty where it came from no calibration file."""
-    if not request.array_calibration or request.uncalibrated:
-        return {}
-    return {"array_calibration_days": str((today - read_array_calibration(request.array_calibration).day).days)}
+    return {"array_calibration_days": str(age)}
 
 
 def _landmarks(request: Request) -> Landmarks | None:
@@ -143,38 +135,19 @@ def _landmarks(request: Request) -> Landmarks | None:
     return scan.landmarks
 
 
-# --- Control of a recording by signals and terminal keys.
+@contextlib.contextmanager
+def noted_signals() -> Iterator[list[str]]:
+    """Names of the signals that have come to end the recording: Ctrl-C, SIGTERM or SIGHUP; they end nothing else."""
+    came: list[str] = []
 
+    def note(number: int, _frame: object) -> None:
+        came.append("Ctrl-C" if number == signal.SIGINT else signal.Signals(number).name)
 
-class Stopper:
-    """Ends a recording in order on Ctrl-C, SIGTERM or SIGHUP."""
-
-    def __init__(self, recorder: Recorder) -> None:
-        self._recorder = recorder
-        self._why = ""
-        self._before: dict[int, Any] = {}
-
-    @property
-    def interrupted(self) -> bool:
-        """True when a signal has come."""
-        return bool(self._why)
-
-    def look(self) -> None:
-        """Stop the recorder if a signal has come."""
-        if self._why:
-            self._recorder.stop(self._why)
-
-    def _note(self, number: int, frame: object) -> None:
-        del frame
-        self._why = "Ctrl-C" if number == signal.SIGINT else signal.Signals(number).name
-
-    def __enter__(self) -> Stopper:
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-            self._before[number] = signal.signal(number, self._note)
-        return self
-
-    def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        for number, handler in self._before.items():
+    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    try:
+        yield came
+    finally:
+        for number, handler in before.items():
             signal.signal(number, handler)
 
 
@@ -291,10 +264,10 @@ def make_recording(request: Request) -> tuple[Report, bool]:
     with ExitStack() as stack:
         hello, lines, follower = _connect(request, stack)
         _check_fit(hello, head, request)
-        session = request.session(hello, follower, facts) | calibration_age(request, today=date.today())
+        age = calibration_age(request, head_id=hello.device_id, today=date.today())
+        session = request.session(hello, follower, facts) | age
         check_session(session, path=request.output)
-        refuse_calibration(request, head_id=hello.device_id, today=date.today())
-        observer: Observer | None = None
+        observer = None
         if request.live or request.serve:
             view = live_view(
                 head, calibration, terminal=request.live, serve=request.serve, size_calibration=request.size_calibration
@@ -327,16 +300,16 @@ def make_recording(request: Request) -> tuple[Report, bool]:
             writer.add_landmark(name, position_mm, device_ns=0, host_ns=0)
             if observer is not None:
                 observer.landmark(name, position_mm)
-        stopper = stack.enter_context(Stopper(recorder))
+        signals = stack.enter_context(noted_signals())
         try:
-            report = _run(recorder, stopper, head, request)
+            report = _run(recorder, signals, head, request)
             writer.close(as_dict(report) | {"cautions": "\n".join(report.cautions)})
         except OSError as error:
             writer.stop_syncing()
             with suppress(OSError):  # what is still in its buffer cannot be written either
                 stream.close()
             raise full_disk(request.output, error) from None
-    return report, stopper.interrupted
+    return report, bool(signals)
 
 
 def _connect(request: Request, stack: ExitStack) -> tuple[HelloReading, tuple[Line, Line | None], Follower]:
@@ -389,7 +362,7 @@ def _check_fit(hello: HelloReading, head: HeadGeometry, request: Request) -> Non
         click.echo(f"one frame in {request.every}: {hello.rate_hz / request.every:g} Hz", err=True)
 
 
-def _run(recorder: Recorder, stopper: Any, head: HeadGeometry, request: Request) -> Report:
+def _run(recorder: Recorder, signals: list[str], head: HeadGeometry, request: Request) -> Report:
     wait, drawn = request.duration_s is None and not request.at_once, request.live and can_redraw()
     with Keys(recorder, head.scanhead_from_tracker, wait=wait, drawn=drawn) as keys:
         if not keys.waiting:
@@ -397,6 +370,7 @@ def _run(recorder: Recorder, stopper: Any, head: HeadGeometry, request: Request)
 
         def look() -> None:
             keys.look()
-            stopper.look()
+            if signals:
+                recorder.stop(signals[-1])
 
         return recorder.run(look)

@@ -63,9 +63,6 @@ def _leaves(value: list[Any]) -> Iterator[Any]:
         yield from _leaves(item) if isinstance(item, list) else [item]
 
 
-# --- A scan in a few lines, for every command that makes one.
-
-
 def describe_scan(scan: Scan) -> list[str]:
     """Summary of a scan in a few lines."""
     times, poses = scan.frames.time_s, scan.poses

@@ -72,8 +72,6 @@ from tactile_bayes.studies.paper_tables import (
     table_scenes,
 )
 
-# --- Figures of `study`: where they go, the frames that a user measured, and what is drawn from either model.
-
 _FRAMES_SCHEMA = "measured_frames.table.json"
 
 
@@ -251,14 +249,14 @@ def tables_action(*, seat: str, head: str | None, search: bool, workers: int, as
     nearest = NEAREST_HEADS.get(at)
     heads = list(dict.fromkeys([asked, *([nearest] if nearest else []), *(TRIED_HEADS if search else ())]))
     found, phantoms = run_tables(at, heads=heads, workers=workers)
-    if as_json:
-        click.echo(json.dumps(tables_document(found, phantoms, seat=at), indent=2))
-        return
     beside = found[nearest] if nearest and nearest != asked else None
-    click.echo(tables_text(found[asked], phantoms[asked], head=asked, nearest=nearest, beside=beside))
-    if search:
-        click.echo(heads_text(found))
-    click.echo(RESEARCH_USE)
+    text = tables_text(found[asked], phantoms[asked], head=asked, nearest=nearest, beside=beside)
+    searched = f"\n{heads_text(found)}" if search else ""
+    _tell(tables_document(found, phantoms, seat=at), text + searched, as_json=as_json)
+
+
+def _tell(document: Any, text: str, *, as_json: bool) -> None:
+    click.echo(json.dumps(document, indent=2) if as_json else f"{text}\n{RESEARCH_USE}")
 
 
 def run_tables(seat: float, *, heads: Sequence[Head], workers: int) -> tuple[ByHead, ByHead]:
@@ -282,11 +280,8 @@ def head_uniformity_action(
     body = paper.HomogeneousTissue(**tissue)
     section = SectionOptions(head_radius_mm=head_radius_mm, shoulder_mm=shoulder_mm)
     found, limit = paper.uniformity(_section(section, head), body), body.limit_percent / 100
-    if as_json:
-        click.echo(json.dumps(uniformity_document(found, body, limit=limit), indent=2))
-        return
-    click.echo(uniformity_text(found, body, limit=limit))
-    click.echo(RESEARCH_USE)
+    text = uniformity_text(found, body, limit=limit)
+    _tell(uniformity_document(found, body, limit=limit), text, as_json=as_json)
 
 
 def head_design_action(*, head: str | None, figure: Path | None, as_json: bool, force: bool, **tissue: Any) -> None:
@@ -296,11 +291,7 @@ def head_design_action(*, head: str | None, figure: Path | None, as_json: bool, 
     found = paper.search_heads(body, kinds=HEADS if head is None else (head,))
     if figure is not None:
         design_figure(found, body, limit=limit, path=figure, force=force)
-    if as_json:
-        click.echo(json.dumps(design_document(found, body, limit=limit), indent=2))
-    else:
-        click.echo(design_text(found, body, limit=limit))
-        click.echo(RESEARCH_USE)
+    _tell(design_document(found, body, limit=limit), design_text(found, body, limit=limit), as_json=as_json)
     if paper.narrowest(found, limit=limit) is None:
         best = paper.most_even(found)
         raise UsageError(
@@ -337,15 +328,10 @@ def compare_model_action(
             found.append(compare_model(measured, body, fidelity=fidelity, head=head, progress=progress))
     if figure is not None:
         comparison_figure(measured, found, figure, title=f"{scan.stem} against {scene.stem}", force=force)
-    if as_json:
-        click.echo(
-            dump_json(comparison_document(measured, found, inputs=hash_inputs(scan=scan, scene=scene))), nl=False
-        )
-        return
-    for line in finding_lines(scan_findings(loaded)):
+    for line in () if as_json else finding_lines(scan_findings(loaded)):
         click.echo(line, err=True)
-    click.echo(comparison_text(measured, found))
-    click.echo(RESEARCH_USE)
+    document = comparison_document(measured, found, inputs=hash_inputs(scan=scan, scene=scene))
+    _tell(document, comparison_text(measured, found), as_json=as_json)
 
 
 def sbc_action(

@@ -38,8 +38,6 @@ from tactile_bayes.size.pooling import PooledEstimate
 from tactile_bayes.studies import tradeoffs
 from tactile_bayes.studies.estimate_tradeoff import SIZE, Clock, Ladder, PooledRow, SizeAnswer, Work, measure
 
-# --- The size by several maps of one mass.
-
 
 def pooled_rows(paths: Sequence[Path], settings: Settings, *, clock: Clock) -> tuple[PooledRow, ...]:
     """The size by the first map of one mass, by the first two, and so on."""
@@ -69,13 +67,11 @@ def _pooled_answer(pooled: PooledEstimate, settings: Settings) -> tuple[SizeAnsw
     return answer, 0.5 * (another.high - another.low)
 
 
-# --- CPU time of this program in a process of its own: what a user who types one command waits for.
-
 TIMES = 2
 
 
 def fresh_cpu_s(words: Sequence[str]) -> float | None:
-    """Least CPU seconds of a command in a fresh process; None where the system does not tell them."""
+    """Least CPU seconds of a command in a fresh process, as its user waits for it; None where nobody tells them."""
     spent = []
     for _ in range(TIMES):
         before = os.times()

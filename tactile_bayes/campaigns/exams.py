@@ -457,11 +457,6 @@ def nearest(wanted: Mapping[str, tuple[float, float]], place: tuple[float, float
     return first if away[first] <= most_mm else ""
 
 
-def in_own_axes(tactile_map: TactileMap, places: Sequence[NamedPlace]) -> bool:
-    """Whether places are compared in the maps' own axes."""
-    return any(one.patient_from_plane is None for one in (tactile_map, *(read_map(place.path) for place in places)))
-
-
 def unnamed(reports: Sequence[EstimateReport]) -> list[Finding]:
     """Masses of one scan that no row names; the reports are those of all rows of the scan."""
     centres = [one.centre_mm for report in reports for one in report.masses if one.reported]

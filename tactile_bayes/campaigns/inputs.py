@@ -6,7 +6,7 @@ import contextlib
 import hashlib
 import os
 import time
-from collections import defaultdict
+from collections import UserDict, defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from operator import attrgetter
@@ -80,28 +80,18 @@ def unchanged(folder: Path, result: Result) -> bool:
         return False
 
 
-class StepResults(Mapping[str, Result]):
-    """Results of one step by the names of the exams or masses, read from the journal when they are asked for."""
+class StepResults(UserDict[str, Any]):
+    """Results of one step by the names of the exams or masses, read from the journal when they are asked for.
+
+    `data` is under which keys the journal has them.
+    """
 
     def __init__(self, values: Mapping[str, Result]) -> None:
+        super().__init__()
         self._values = values
-        self._keys: dict[str, str] = {}
-
-    def add(self, name: str, key: str) -> None:
-        """Note under which key the journal holds a result."""
-        self._keys[name] = key
 
     def __getitem__(self, name: str) -> Result:
-        return self._values[self._keys[name]]
-
-    def __contains__(self, name: object) -> bool:
-        return name in self._keys
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._keys)
-
-    def __len__(self) -> int:
-        return len(self._keys)
+        return self._values[self.data[name]]
 
 
 def tidy(

@@ -149,12 +149,8 @@ def pooled_reports(campaign: Campaign) -> dict[str, PooledReport]:
     return {name: read_record(folder / name / layout.POOLED, PooledReport) for name in campaign.found.results["pool"]}
 
 
-def done_text(rows: Sequence[Row]) -> str:
-    """``exams_done.csv``: exams with an estimate, or with the reason for none."""
-    return layout.table_text([_done(row) for row in rows if row.report is not None], layout.columns_of("exams_done"))
-
-
-def _done(row: Row) -> dict[str, object]:
+def done_line(row: Row) -> dict[str, object]:
+    """An exam in ``exams_done.csv``: with an estimate, or with the reason for none."""
     report = row.report
     assert report is not None
     x_mm, y_mm = centre_of(report.centre_mm) or (None, None)
@@ -187,25 +183,22 @@ def _figures(quantity: Quantity | None, names: Mapping[str, str]) -> dict[str, o
     return {} if quantity is None else {column: getattr(quantity, name) for column, name in names.items()}
 
 
-def failures_text(campaign: Campaign, rows: Sequence[Row]) -> str:
+def failure_lines(campaign: Campaign, rows: Sequence[Row]) -> list[dict[str, object]]:
     """``failures.csv``: exams, and masses that could not be pooled or compared, with the step and the reason."""
     failed = {row.exam.name: _names(row.exam) for row in rows}
     failed |= {row.exam.of_mass: {**_names(row.exam), "replicate": None, "file": None} for row in rows}
     blank = {"visit": None, "replicate": None, "file": None}
     failed |= {row.exam.of_visits: {**_names(row.exam), **blank} for row in rows}
     found = campaign.found.faults
-    lines = [
-        failed[name] | {"step": found[name].step, "reason": found[name].reason} for name in failed if name in found
-    ]
-    return layout.table_text(lines, layout.columns_of("failures"))
+    return [failed[name] | {"step": found[name].step, "reason": found[name].reason} for name in failed if name in found]
 
 
-def trial_text(
+def trial_lines(
     campaign: Campaign,
     rows: Sequence[Row],
     pooled: Mapping[str, PooledReport],
     masses: Collection[tuple[str, str]] | None,
-) -> str:
+) -> list[dict[str, object]]:
     """``trial.csv``: every exam as a reading of ``tactile``, every pooled visit as one of ``tactile-pooled``.
 
     `masses` have a size after excision: the others are left out. None takes all. Numbers run over the visits of a mass.
@@ -225,7 +218,7 @@ def trial_text(
         key = (one["patient"], one["mass"], one["modality"])
         count[key] += 1
         one["replicate"] = count[key]
-    return layout.table_text(readings, _TRIAL_COLUMNS)
+    return readings
 
 
 def _together(campaign: Campaign, rows: Sequence[Row], report: PooledReport | None) -> dict[str, object]:
@@ -262,9 +255,6 @@ def _reading(
     }
 
 
-# --- Growth between the visits of masses, as rows and as a table.
-
-
 def growth_rows(campaign: Campaign) -> list[Growth]:
     """What `compare` says of each mass with several visits, in order of the masses."""
     compared, rows = campaign.found.results["compare"], []
@@ -283,12 +273,8 @@ def growth_rows(campaign: Campaign) -> list[Growth]:
     return rows
 
 
-def growth_text(rows: Sequence[Growth]) -> str:
-    """``growth.csv``: a row for each later visit of a mass."""
-    return layout.table_text([_growth_line(row) for row in rows], layout.columns_of("growth"))
-
-
-def _growth_line(row: Growth) -> dict[str, object]:
+def grown_line(row: Growth) -> dict[str, object]:
+    """A later visit of a mass in ``growth.csv``."""
     first, later = (q.median for q in row.sizes_mm) if row.sizes_mm else (None, None)
     names = {"change_percent": "median", "low_percent": "low", "high_percent": "high", "probability": "probability"}
     return {
@@ -352,11 +338,15 @@ def write_outputs(
     folder, growth, pooled = campaign.folder, growth_rows(campaign), pooled_reports(campaign)
     rows = exam_rows(campaign, pooled)
     masses = None if excision is None else excision.masses()
-    tables = {layout.DONE: done_text(rows), layout.FAILURES: failures_text(campaign, rows)}
-    tables |= {layout.TRIAL: trial_text(campaign, rows, pooled, masses)}
-    tables |= {layout.GROWN: growth_text(growth)} if growth else {}
-    for name, text in tables.items():
-        write_text(folder / name, text, force=True)
+    tables = {
+        layout.DONE: [done_line(row) for row in rows if row.report is not None],
+        layout.FAILURES: failure_lines(campaign, rows),
+        layout.TRIAL: trial_lines(campaign, rows, pooled, masses),
+        **({layout.GROWN: [grown_line(one) for one in growth]} if growth else {}),
+    }
+    for name, lines in tables.items():
+        columns = _TRIAL_COLUMNS if name == layout.TRIAL else layout.columns_of(Path(name).stem)
+        write_text(folder / name, layout.table_text(lines, columns), force=True)
     report, fault = ("", "") if excision is None else _write_report(folder, excision, protocol, growth)
     for name in (*(() if report else (REPORT, PAGE)), *(() if growth else (layout.GROWN,))):
         (folder / name).unlink(missing_ok=True)
@@ -375,11 +365,11 @@ def write_outputs(
         "exams with a mass that no row names, see their findings": _with(rows, "unnamed_mass", "name"),
         "folders of exams that the table does not list": unlisted,
     }
-    lines = [line for words, names in doubts.items() for line in names_line(words, names)]
+    doubtful = [line for words, names in doubts.items() for line in names_line(words, names)]
     return Written(
         counts,
         tuple(filter(None, (together, repeatability_words(campaign), growth_line(growth, layout.GROWN)))),
-        (*lines, *([f"no trial report: {fault}"] if fault and not report else [])),
+        (*doubtful, *([f"no trial report: {fault}"] if fault and not report else [])),
         report,
     )
 

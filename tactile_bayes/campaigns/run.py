@@ -91,7 +91,7 @@ class Stages:
         """
         kept = self._kept(tasks)
         for task in kept:
-            self.found.results[step].add(task.name, task.key)
+            self.found.results[step].data[task.name] = task.key
         done = {task.key for task in kept}
         missing = [task for task in tasks if task.key not in done]
         self.found.kept[step] += len(kept)
@@ -102,7 +102,7 @@ class Stages:
             return
         for task, outcome in zip(missing, self._run(step, missing), strict=True):
             if outcome.value is not None:
-                self.found.results[step].add(task.name, task.key)
+                self.found.results[step].data[task.name] = task.key
             elif outcome.error == CLUSTER_LOST:
                 raise TactileBayesError(f"{CLUSTER_LOST}; what is done is kept")
             else:
@@ -133,7 +133,7 @@ class Stages:
         known = [task for task in tasks if task.key in values]
         for task in known:
             if not unchanged(task.folder, values[task.key]):
-                values.forget(task.key)
+                del values[task.key]
         return [task for task in known if task.key in values]
 
 
@@ -156,8 +156,6 @@ def steps_needed(
     needed |= {"repeatability": 1, "size": exams} if learns else {}
     return {**needed, "copy": (2 * exams + masses + compared) * bool(settings.copy_to)}
 
-
-# --- The campaign.
 
 Bar = Callable[[str], AbstractContextManager[Progress]]
 _Any = TypeVar("_Any")

@@ -21,7 +21,7 @@ from tactile_bayes.api.pooled import pool_answers
 from tactile_bayes.api.repeatability import ExamFolder, learn_from_exams
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.api.sized import Answer, SizeEstimate, size_priors
-from tactile_bayes.campaigns.exams import ARRAYS, OWN_AXES, Match, in_own_axes, matched
+from tactile_bayes.campaigns.exams import ARRAYS, OWN_AXES, Match, matched
 from tactile_bayes.declarations import EXACT, Record, field, from_plain, replace, rounded, to_plain
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files import manifest_csv as layout
@@ -50,8 +50,6 @@ from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.draws import SIZES, SizePosterior
 from tactile_bayes.size.pooling import size_alone
 
-# --- What tells a campaign that something changed: digests of plain data, and stamps of files.
-
 
 def digest_of(key: object) -> str:
     """Digest of plain data and the program's version."""
@@ -63,9 +61,6 @@ def stamp(path: Path) -> str:
     """Size, times and inode of a file, which differ when it was written to or replaced."""
     known = path.stat()
     return f"{known.st_size} {known.st_mtime_ns} {known.st_ctime_ns} {known.st_ino}"
-
-
-# --- Settings of all exams of a campaign.
 
 
 class CampaignSettings(CampaignOptions, kw_only=True):
@@ -285,7 +280,8 @@ def _estimated(folder: Path, settings: Settings, match: Match | None) -> SizeEst
     if match is None:
         return estimate_file(folder / layout.MAP, settings)
     found = matched(folder / layout.MAP, settings, match)
-    if not in_own_axes(found.tactile_map, match.places):
+    maps = (found.tactile_map, *(read_map(one.path) for one in match.places))
+    if all(one.patient_from_plane is not None for one in maps):
         return found
     findings = by_weight((*found.estimate.findings, OWN_AXES))
     return replace(found, estimate=replace(found.estimate, findings=findings))
@@ -386,9 +382,6 @@ def _answer(folder: Path) -> Answer:
         fingerprint=tactile_map.fingerprint,
         head=tactile_map.head,
     )
-
-
-# --- Copies of a campaign's files in an object store: a step for each exam and mass, after those that make its files.
 
 
 def copy_tasks(folder: Path, names: Sequence[str], results: Sequence[Mapping[str, Result]], *, to: str) -> list[Task]:

@@ -37,9 +37,11 @@ class FilePath(click.Path):
     by default: only overwritten with --force.
     """
 
-    def __init__(self, *, addresses: bool = False, writes: Format | None = None, guarded: bool | None = None) -> None:
+    def __init__(
+        self, *, addresses: bool = False, writes: Format | Literal["figure"] | None = None, guarded: bool | None = None
+    ) -> None:
         super().__init__(path_type=Path, readable=False)  # its reader says it in one line
-        self._addresses, self._writes = addresses, writes
+        self._addresses, self.writes = addresses, writes
         self.guarded = writes is not None if guarded is None else guarded
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
@@ -56,21 +58,10 @@ class FilePath(click.Path):
                 elif written or other_written:
                     refuse_same([path], [other])
             seen.append((path, written))
-        if self._writes is not None:
-            check_suffix(path, self._writes)
-        return path
-
-
-class FigurePath(FilePath):
-    """Path of a figure; an unknown suffix is refused before any work."""
-
-    def __init__(self) -> None:
-        super().__init__(guarded=True)
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Check the suffix and return the path."""
-        path = super().convert(value, param, ctx)
-        figure_file.check_suffix(path)
+        if self.writes == "figure":
+            figure_file.check_suffix(path)
+        elif self.writes is not None:
+            check_suffix(path, self.writes)
         return path
 
 
@@ -96,9 +87,6 @@ def refuse_same(
     for path in outputs:
         if path is not None and any(same_file(path, one) for one in read):
             raise UsageError(f"{path} is {what}; choose another name for the output")
-
-
-# --- A command: its options, its help, and the function that it calls.
 
 
 def command(
@@ -150,9 +138,6 @@ def head_option(default: str) -> Callable[[Callable[..., Any]], Callable[..., An
         help="Where the head's rounded shoulders lie: cut into the sensing width, or around it, where they press and "
         f"sense nothing. {default}",
     )
-
-
-# --- Settings of a call from its options and its settings file.
 
 
 def settings_of(*, settings_file: Path | None = None, repeatability: Path | None = None, **options: Any) -> Settings:
@@ -221,9 +206,6 @@ class NumberOr(_ParamType):
             return self.number(value)
         except ValueError:
             self.fail(f"{value!r} is not a number, nor {' nor '.join(map(repr, self.words))}", param, ctx)
-
-
-# --- Options made from the records that declare them.
 
 
 def takes(record: type[Record], *names: str, **attributes: Any) -> Decorator:
@@ -303,7 +285,7 @@ def output(metavar: str, writes: Format, meaning: str, *, required: bool = False
 
 def figure(meaning: str, name: str = "--figure") -> Decorator:
     """``--figure``, or another option that names a figure to write."""
-    return click.option(name, metavar="FIG.png|.pdf|.svg", type=FigurePath(), help=meaning)
+    return click.option(name, metavar="FIG.png|.pdf|.svg", type=FilePath(writes="figure"), help=meaning)
 
 
 def path_option(name: str, metavar: str, meaning: str, **attributes: Any) -> Decorator:

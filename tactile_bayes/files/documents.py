@@ -159,9 +159,6 @@ def check_text(where: str, text: str, *, way_out: str) -> None:
         raise BadDataError(f"{where or 'a key'} holds the character {code}: {text[:40]!a}", way_out=way_out)
 
 
-# --- A pre-specified analysis in TOML: settings fixed before the data were seen, and other text.
-
-
 class Protocol(Record, forbid_unknown_fields=False):
     """A pre-specified analysis of a trial."""
 

@@ -23,8 +23,6 @@ from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.presets import CELL_MM
 from tactile_bayes.progress import Progress, untold
 
-# --- What a file or a caller gives before it is a map.
-
 
 class Grid(Record, eq=False):
     """Values in rows and columns, and what their file says of them."""
@@ -461,9 +459,6 @@ def _averaged(made: TactileMap, times: int) -> TactileMap:
         axes[name] = np.asarray(first + times * step * np.arange(-(-len(axis) // times)), dtype=np.float64)
     recipe = replace(made.recipe, cell_mm=times * made.recipe.cell_mm)
     return replace(made, mean=mean, variance=variance, count=count, recipe=recipe, **axes)
-
-
-# --- Values that are divided by their level here: by a number that is stated, or by what is fitted about the bump.
 
 
 def _divided(made: TactileMap, level: float | str) -> TactileMap:

@@ -215,9 +215,6 @@ def _foreign(path: Path) -> BadDataError:
     )
 
 
-# --- Summary of a scan file, counted while reading it from front to back; no message is kept.
-
-
 def _scan(path: Path) -> dict[str, Any]:
     """Summarise frames, poses, duration, losses, session and provenance; memory grows by one time per message.
 

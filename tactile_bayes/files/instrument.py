@@ -34,8 +34,6 @@ from tactile_bayes.forward.tissue import DepthRatio, Height, Rib, SceneBody, Sea
 from tactile_bayes.geometry import Matrix
 from tactile_bayes.scans import ElementCalibration, HeadGeometry, HeadShape, Landmarks
 
-# --- Heads and calibrations as a scan file has them.
-
 
 def head_document(head: HeadGeometry) -> dict[str, Any]:
     """Head geometry as plain data; JSON keeps every bit of a double."""

@@ -231,8 +231,7 @@ def write_posterior(
     if estimate.size is not None:
         variables |= {name: getattr(estimate.size, name) for name in _OF_A_SIZE}
     figures = {} if estimate.diagnostics is None else estimate.diagnostics.as_dict()
-    attributes = _posterior_attributes(estimate.draws.method, figures, provenance, report)
-    write_bytes(path, _posterior_bytes(variables, attributes, groups), force=force)
+    _write_draws(path, variables, estimate.draws.method, figures, provenance, report, groups, force=force)
 
 
 def write_pooled(
@@ -240,15 +239,23 @@ def write_pooled(
 ) -> None:
     """Write the draws of a mass's size from several maps, with its report, atomically."""
     variables = {name: np.atleast_2d(getattr(size, name)) for name in _OF_A_SIZE}
-    attributes = _posterior_attributes("pooled", size.figures, provenance, report)
-    write_bytes(path, _posterior_bytes(variables, attributes, {}), force=force)
+    _write_draws(path, variables, "pooled", size.figures, provenance, report, {}, force=force)
 
 
-def _posterior_attributes(
-    method: str, figures: Mapping[str, Any], provenance: Provenance, report: EstimateReport | PooledReport
-) -> dict[str, str]:
+def _write_draws(
+    path: Path,
+    variables: Mapping[str, Any],
+    method: str,
+    figures: Mapping[str, Any],
+    provenance: Provenance,
+    report: EstimateReport | PooledReport,
+    groups: Mapping[str, DrawGroup],
+    *,
+    force: bool,
+) -> None:
+    """A file with groups as InferenceData has them: the (chain, draw) variables of the posterior, then the others."""
     finite = {name: v for name, v in figures.items() if not isinstance(v, float) or math.isfinite(v)}
-    return {
+    attributes = {
         "schema": POSTERIOR_SCHEMA,
         "research_use": RESEARCH_USE,
         "method": method,
@@ -256,17 +263,11 @@ def _posterior_attributes(
         "diagnostics": json.dumps(finite),
         "estimate": json.dumps(report.document),
     }
-
-
-def _posterior_bytes(
-    variables: Mapping[str, Any], attributes: Mapping[str, str], groups: Mapping[str, DrawGroup]
-) -> bytes:
-    """A file with groups as InferenceData has them: the (chain, draw) variables of the posterior, then the others."""
     axes = ("chain", "draw")
     draws = {name: (axes, np.asarray(values, dtype=np.float64)) for name, values in variables.items()}
     held = {"posterior": Contents(_with_coordinates(draws), attributes)}
     held |= {name: Contents(_with_coordinates(group.arrays), group.notes) for name, group in groups.items()}
-    return grouped_netcdf_bytes(held)
+    write_bytes(path, grouped_netcdf_bytes(held), force=force)
 
 
 def _with_coordinates(arrays: Mapping[str, tuple[tuple[str, ...], FloatArray]]) -> dict[str, Variable]:

@@ -128,9 +128,6 @@ def turned_by_axes(arrays: Arrays) -> tuple[str, ...]:
     return tuple(dict.fromkeys(notes))
 
 
-# --- netCDF-3, by scipy.
-
-
 def _netcdf_3(path: Path) -> Arrays:
     data = read_bytes(path, most=NETCDF_BYTES)
     with (
@@ -142,10 +139,8 @@ def _netcdf_3(path: Path) -> Arrays:
         return {name: as_declared(np.array(one.data), vars(one)["_attributes"]) for name, one in real.items()}
 
 
-# --- HDF5, which MATLAB's version 7.3 is.
-
-
 def _hdf5(path: Path, choose: Choose, *, begins_at: int = 0) -> Arrays:
+    """Arrays of an HDF5 file, which MATLAB's of version 7.3 is, too."""
     with open_netcdf(path, way_out=_COPY_AGAIN, begins_at=begins_at) as root:
         held = dict(_members(root, "", levels=_MOST_LEVELS))
         return {name: np.asarray(held[name].numbers(name.rpartition(".")[2])) for name in choose(list(held))}

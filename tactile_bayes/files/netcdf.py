@@ -193,10 +193,30 @@ class Group:
         return sorted(name for name in map(str, self._place) if isinstance(self._own(name), h5py.Group))
 
     def _values(self, name: str, found: Any) -> Any:
-        reading.check_limit(
-            found.size * found.dtype.itemsize, self._most_bytes, what=f"variable {name} unpacks to {{}} bytes"
-        )
-        self._check_chunks(name, found)
+        """Values of a dataset, of whose chunks each unpacks to its declared size.
+
+        HDF5 unpacks more for as long as there is memory, takes what is missing from whatever lies in memory, and ends
+        the process where a checksum has less than its four bytes.
+        """
+        created = found.id.get_create_plist()
+        filters = [created.get_filter(number)[0] for number in range(created.get_nfilters())]
+        if len(set(filters)) < len(filters) or not set(filters) <= {_DEFLATE, _SHUFFLE, _CHECKSUM}:
+            way_out = "pack it by gzip, with shuffle and checksum or without: h5repack -f GZIP=4"
+            raise BadDataError(f"variable {name} is packed by filters {filters}", way_out=way_out)
+        chunks = [found.id.get_chunk_info(n) for n in range(found.id.get_num_chunks())] if found.chunks else []
+        declared = int(np.prod(found.chunks or (0,), dtype=object)) * found.dtype.itemsize
+        sizes = {
+            f"variable {name} unpacks to {{}} bytes": found.size * found.dtype.itemsize,
+            f"a chunk of variable {name} unpacks to {{}} bytes": declared,
+            f"a chunk of variable {name} takes {{}} bytes": max((stored.size for stored in chunks), default=0),
+        }
+        largest = max(sizes, key=lambda what: sizes[what])
+        reading.check_limit(sizes[largest], self._most_bytes, what=largest)
+        for stored in chunks:
+            over = _unpacked_bytes(found, stored, filters, most=declared + 1) - declared
+            if over:
+                what = f"a chunk of variable {name} unpacks to {'more' if over > 0 else 'less'} than it declares"
+                raise BadDataError(what, way_out=self._way_out)
         return found[...]
 
     def _own(self, name: str) -> Any:
@@ -220,30 +240,6 @@ class Group:
         scale = b"" if found is None else found.attrs.get("NAME", b"")
         text = scale.decode("utf-8", "replace") if isinstance(scale, bytes) else str(scale)
         return None if text.startswith(_NO_VARIABLE.partition("{")[0]) else found
-
-    def _check_chunks(self, name: str, found: Any) -> None:
-        """Refuse a chunk that does not unpack to its declared size.
-
-        HDF5 unpacks more for as long as there is memory, takes what is missing from whatever lies in memory, and ends
-        the process where a checksum has less than its four bytes.
-        """
-        created = found.id.get_create_plist()
-        filters = [created.get_filter(number)[0] for number in range(created.get_nfilters())]
-        if len(set(filters)) < len(filters) or not set(filters) <= {_DEFLATE, _SHUFFLE, _CHECKSUM}:
-            way_out = "pack it by gzip, with shuffle and checksum or without: h5repack -f GZIP=4"
-            raise BadDataError(f"variable {name} is packed by filters {filters}", way_out=way_out)
-        if not found.chunks:
-            return
-        declared = int(np.prod(found.chunks, dtype=object)) * found.dtype.itemsize
-        reading.check_limit(declared, self._most_bytes, what=f"a chunk of variable {name} unpacks to {{}} bytes")
-        chunks = [found.id.get_chunk_info(number) for number in range(found.id.get_num_chunks())]
-        largest = max((stored.size for stored in chunks), default=0)
-        reading.check_limit(largest, self._most_bytes, what=f"a chunk of variable {name} takes {{}} bytes")
-        for stored in chunks:
-            over = _unpacked_bytes(found, stored, filters, most=declared + 1) - declared
-            if over:
-                what = f"a chunk of variable {name} unpacks to {'more' if over > 0 else 'less'} than it declares"
-                raise BadDataError(what, way_out=self._way_out)
 
 
 def _unpacked_bytes(found: Any, stored: Any, filters: list[int], *, most: int) -> int:

@@ -71,9 +71,6 @@ def json_text(report: Report) -> str:
     return dump_json(report.document)
 
 
-# --- What reports are made of.
-
-
 class Place(Record):
     """A place in mm."""
 

@@ -7,6 +7,7 @@ import json
 import os
 import threading
 from collections.abc import Collection, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import IO, Any, Final, TypeVar
 
@@ -230,24 +231,20 @@ def write_scan(
             truth=truth,
             findings=scan.findings,
         )
-        _write_messages(writer, scan)
+        frame_ns = ns_from_s(scan.frames.time_s)
+        all_ns = np.concatenate([frame_ns, ns_from_s(scan.poses.time_s)])
+        if scan.landmarks is not None:
+            start = int(all_ns.min()) if len(all_ns) else 0
+            for name, point in scan.landmarks.points().items():
+                writer.add_landmark(name, point, device_ns=start, host_ns=start)
+        for i in np.argsort(all_ns, kind="stable").tolist():
+            time = int(all_ns[i])
+            if i < len(frame_ns):
+                writer.add_frame(scan.frames.counts[i], device_ns=time, host_ns=time)
+            else:
+                j = i - len(frame_ns)
+                writer.add_pose(scan.poses.position_mm[j], scan.poses.quaternion_wxyz[j], device_ns=time, host_ns=time)
         writer.finish()
-
-
-def _write_messages(writer: ScanWriter, scan: scans.Scan) -> None:
-    frame_ns = ns_from_s(scan.frames.time_s)
-    all_ns = np.concatenate([frame_ns, ns_from_s(scan.poses.time_s)])
-    if scan.landmarks is not None:
-        start = int(all_ns.min()) if len(all_ns) else 0
-        for name, point in scan.landmarks.points().items():
-            writer.add_landmark(name, point, device_ns=start, host_ns=start)
-    for i in np.argsort(all_ns, kind="stable").tolist():
-        time = int(all_ns[i])
-        if i < len(frame_ns):
-            writer.add_frame(scan.frames.counts[i], device_ns=time, host_ns=time)
-        else:
-            j = i - len(frame_ns)
-            writer.add_pose(scan.poses.position_mm[j], scan.poses.quaternion_wxyz[j], device_ns=time, host_ns=time)
 
 
 def read_scan(path: Path) -> scans.Scan:
@@ -459,60 +456,16 @@ def _lock(stream: IO[bytes], path: Path) -> None:
         return  # some network file systems have no locks
 
 
-class _Syncer:
-    """Thread that syncs a file to the disk repeatedly, so that the writer does not wait for the disk.
-
-    A thread, because the system lets go of the interpreter while it waits; readers are processes of their own and know
-    nothing of it.
-    """
-
-    def __init__(self, descriptor: int) -> None:
-        self._descriptor = descriptor
-        self._dirty, self._ended = threading.Event(), threading.Event()
-        self._error: OSError | None = None
-        self._thread = threading.Thread(target=self._run, name="sync", daemon=True)
-        self._thread.start()
-
-    def ask(self) -> None:
-        """Request a sync; raises the last sync's error."""
-        if self._error is not None:
-            raise self._error
-        self._dirty.set()
-
-    def stop(self) -> None:
-        """Wait for the running sync."""
-        self._ended.set()
-        self._thread.join()
-
-    def _run(self) -> None:
-        while not self._ended.wait(SYNC_S):
-            if not self._dirty.is_set():
-                continue
-            self._dirty.clear()
-            try:
-                getattr(os, "fdatasync", os.fsync)(self._descriptor)  # not every system has the first
-            except OSError as error:
-                self._error = error
-                return
-
-
 class RecordingWriter(ScanWriter):
     """A `ScanWriter` that can flush at once and stores notes about problems; the session was checked before."""
 
-    def __init__(
-        self,
-        stream: IO[bytes],
-        *,
-        head: scans.HeadGeometry,
-        element_calibration: scans.ElementCalibration,
-        session: Mapping[str, str],
-        provenance: Provenance,
-    ) -> None:
-        super().__init__(
-            stream, head=head, element_calibration=element_calibration, session=session, provenance=provenance
-        )
+    def __init__(self, stream: IO[bytes], **described: Any) -> None:
+        super().__init__(stream, **described)
         self._stream = stream
-        self._syncer: _Syncer | None = None
+        # A thread, because the system lets go of the interpreter while it waits for the disk.
+        self._thread, self._ended = ThreadPoolExecutor(1, thread_name_prefix="sync"), threading.Event()
+        self._asked = False
+        self._synced: Future[None] | None = None
         self._log_channel: int = self._writer.register_channel(
             topic=LOG_TOPIC, message_encoding="protobuf", schema_id=self._schema(Log)
         )
@@ -530,9 +483,16 @@ class RecordingWriter(ScanWriter):
         call.
         """
         self._writer.flush()
-        if self._syncer is None:
-            self._syncer = _Syncer(self._stream.fileno())
-        self._syncer.ask()
+        if self._synced is not None and self._synced.done():
+            self._synced.result()
+        if not self._asked:
+            self._asked = True
+            self._synced = self._thread.submit(self._sync, self._stream.fileno())
+
+    def _sync(self, descriptor: int) -> None:
+        self._ended.wait(SYNC_S)
+        self._asked = False  # what is flushed from here on asks again
+        getattr(os, "fdatasync", os.fsync)(descriptor)  # not every system has the first
 
     def close(self, account: Mapping[str, Any]) -> None:
         """Write the account, the index and the footer, and sync them to the disk."""
@@ -545,9 +505,8 @@ class RecordingWriter(ScanWriter):
 
     def stop_syncing(self) -> None:
         """Release the file in any case; call it before closing the stream."""
-        if self._syncer is not None:
-            self._syncer.stop()
-            self._syncer = None
+        self._ended.set()
+        self._thread.shutdown()
 
 
 def full_disk(path: Path, error: OSError) -> BadDataError:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import difflib
 import io
@@ -319,11 +320,34 @@ def _parse_cell(line: int, text: str, *, field: Mapping[str, Any], decimal_comma
             raise BadDataError(what, way_out="remove them")
         if decimal_comma and field["type"] == "number":
             text = _with_point(text)
-        value = _PARSERS[field["type"]](text, field)
+        value = _parsed(text, field)
         _check_constraints(value, text, field)
     except BadDataError as refusal:
         raise _fault(line, name, refusal.what, way_out=refusal.way_out) from None
     return value
+
+
+def _parsed(text: str, field: Mapping[str, Any]) -> Any:
+    """A cell by the type of its field."""
+    match field["type"]:
+        case "string":
+            return text
+        case "number":
+            return _parse_number(text, field)
+        case "integer":
+            if _INTEGER.fullmatch(text) and len(text) <= 15:
+                return int(text)
+            what, way_out = "is not a whole number", f"write it as 1, 2, 3; {_blank_advice(field)}"
+        case "date":
+            with contextlib.suppress(ValueError):
+                return parse_date(text)
+            what, way_out = "is no date", f"write it as 2026-03-01; {_blank_advice(field)}"
+        case _:
+            for value, words in ((True, field["trueValues"]), (False, field["falseValues"])):
+                if text in words:
+                    return value
+            what, way_out = "is neither true nor false", "write true or false"
+    raise BadDataError(f"{_shown(text)} {what}", way_out=way_out)
 
 
 def _parse_number(text: str, field: Mapping[str, Any]) -> float:
@@ -351,21 +375,6 @@ def _with_point(text: str) -> str:
     return text.replace(",", ".") if DECIMAL_COMMA.fullmatch(text) else text
 
 
-def _parse_integer(text: str, field: Mapping[str, Any]) -> int:
-    if not _INTEGER.fullmatch(text) or len(text) > 15:
-        way_out = f"write it as 1, 2, 3; {_blank_advice(field)}"
-        raise BadDataError(f"{_shown(text)} is not a whole number", way_out=way_out)
-    return int(text)
-
-
-def _parse_date(text: str, field: Mapping[str, Any]) -> date:
-    try:
-        return parse_date(text)
-    except ValueError:
-        way_out = f"write it as 2026-03-01; {_blank_advice(field)}"
-        raise BadDataError(f"{_shown(text)} is no date", way_out=way_out) from None
-
-
 def parse_date(text: str) -> date:
     """Date of a cell, year-month-day; else a ValueError."""
     if not _DATE.fullmatch(text):
@@ -373,20 +382,6 @@ def parse_date(text: str) -> date:
     return date.fromisoformat(text)
 
 
-def _parse_boolean(text: str, field: Mapping[str, Any]) -> bool:
-    for value, words in ((True, field["trueValues"]), (False, field["falseValues"])):
-        if text in words:
-            return value
-    raise BadDataError(f"{_shown(text)} is neither true nor false", way_out="write true or false")
-
-
-_PARSERS = {
-    "string": lambda text, _: text,
-    "number": _parse_number,
-    "integer": _parse_integer,
-    "boolean": _parse_boolean,
-    "date": _parse_date,
-}
 _LIMITS: dict[str, tuple[Callable[[Any, Any], bool], str]] = {
     "minimum": (operator.ge, "at least"),
     "exclusiveMinimum": (operator.gt, "above"),

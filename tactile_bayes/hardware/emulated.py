@@ -160,7 +160,12 @@ class PlayedTools:
 
     def readings(self, index: int) -> list[ToolReading]:
         """Readings at the n-th time, of the second tool first."""
-        pose, hidden, breath_mm = self._pose(index), self._faults.hide, self._faults.breathe_mm
+        measured = index - index % max(1, self._faults.hold)  # the values of the latest measurement, at its own time
+        x, y, z = self._poses.position_mm[measured].tolist()
+        w, i, j, k = self._poses.quaternion_wxyz[measured].tolist()
+        seconds, rest = divmod(float(self._poses.time_s[index]), 1.0)
+        pose = PoseReading((x, y, z), (w, i, j, k), int(seconds) * _NS + round(rest * _NS))
+        hidden, breath_mm = self._faults.hide, self._faults.breathe_mm
         time_s = float(self._poses.time_s[index] - self._poses.time_s[0])
         bases = []
         if breath_mm:
@@ -172,18 +177,9 @@ class PlayedTools:
             return [*bases, MissingReading("out of sight", pose.tool)]
         return [*bases, pose]
 
-    def _pose(self, index: int) -> PoseReading:
-        """The n-th pose: at its own time, with the values of the latest measurement."""
-        measured = index - index % max(1, self._faults.hold)
-        x, y, z = (float(value) for value in self._poses.position_mm[measured])
-        w, i, j, k = (float(value) for value in self._poses.quaternion_wxyz[measured])
-        time_s = float(self._poses.time_s[index])
-        whole = int(time_s)
-        return PoseReading((x, y, z), (w, i, j, k), whole * _NS + round((time_s - whole) * _NS))
-
 
 class EmulatedTracker(Device):
-    """An emulated tracker of one of `PROTOCOLS`, or in the open framing, with a tracker's faults."""
+    """An emulated tracker of one of `PROTOCOLS`, with a tracker's faults."""
 
     def __init__(self, poses: TrackerPoses, *, protocol: str, faults: Faults | None = None) -> None:
         self.times_s = poses.time_s
@@ -192,7 +188,6 @@ class EmulatedTracker(Device):
         self._faults = faults or Faults()
         names = ("Probe", "Reference") if protocol in ("open", "igtlink") else ("1", "2")
         self._tools = PlayedTools(poses, self._faults, names=names)
-        self._encode = PROTOCOLS[protocol]
 
     def greet(self) -> None:
         """Start sending in OpenIGTLink, whose servers send to whoever connects."""
@@ -218,7 +213,7 @@ class EmulatedTracker(Device):
         return answer
 
     def record(self, index: int) -> bytes:
-        return b"".join(self._encode(one, index) for one in self._tools.readings(index))
+        return b"".join(encoded(self._protocol, one, index) for one in self._tools.readings(index))
 
     def end(self, sent: int, dropped: int) -> bytes:
         """Encode an END in the open framing; other protocols have none."""
@@ -226,58 +221,34 @@ class EmulatedTracker(Device):
         return head.encode_end(sent, dropped) if self.said_end else b""
 
 
-def _numbers(pose: PoseReading) -> tuple[float, ...]:
-    """Position in inches, and quaternion."""
-    return (*(value / MM_PER_INCH for value in pose.position_mm), *pose.quaternion_wxyz)
+PROTOCOLS: Final = ("fastrak", "fastrak-ascii", "liberty", "liberty-ascii", "bird", "open", "igtlink")
 
 
-def _time_ms(pose: PoseReading) -> int:
-    return (pose.device_ns or 0) // 1_000_000 % 2**32
-
-
-def _fastrak(pose: PoseReading) -> bytes:
-    return b"0%d " % int(pose.tool or 1) + FASTRAK.pack(*_numbers(pose)) + b" "
-
-
-def _fastrak_ascii(pose: PoseReading) -> bytes:
-    columns = zip(_numbers(pose), FASTRAK_DECIMALS, strict=True)
-    return f"0{pose.tool or 1} {''.join(f'{value:7.{decimals}f}' for value, decimals in columns)}\r\n".encode()
-
-
-def _liberty(pose: PoseReading) -> bytes:
-    head = (b"LY", int(pose.tool or 1), ord("C"), ord(" "), 0, LIBERTY.size - LIBERTY_HEADER_BYTES + 1)
-    return LIBERTY.pack(*head, *_numbers(pose), _time_ms(pose), 0) + b" "
-
-
-def _liberty_ascii(pose: PoseReading) -> bytes:
-    numbers = " ".join(f"{value:.5f}" for value in _numbers(pose))
-    return f"{int(pose.tool or 1):02}  {numbers} {_time_ms(pose)} 0\r\n".encode()
-
-
-def _bird(pose: PoseReading) -> bytes:
-    address = bytes([int(pose.tool)]) if pose.tool else b""  # of group mode
-    return record_bytes(_numbers(pose)) + address
-
-
-def _igtlink(pose: ToolReading, _: int) -> bytes:
-    turn = rotation_from_quaternion(np.array(pose.quaternion_wxyz)) if isinstance(pose, PoseReading) else None
-    return encode_transform(pose, turn)
-
-
-def _no_word(encode: Callable[[PoseReading], bytes]) -> Callable[[ToolReading, int], bytes]:
-    """Encoder of a protocol that has no word for a tool that is not seen: it then sends nothing."""
-    return lambda pose, _: encode(pose) if isinstance(pose, PoseReading) else b""
-
-
-PROTOCOLS: Final[dict[str, Callable[[ToolReading, int], bytes]]] = {
-    "fastrak": _no_word(_fastrak),
-    "fastrak-ascii": _no_word(_fastrak_ascii),
-    "liberty": _no_word(_liberty),
-    "liberty-ascii": _no_word(_liberty_ascii),
-    "bird": _no_word(_bird),
-    "open": lambda pose, number: head.encode_pose(pose, sequence=number),
-    "igtlink": _igtlink,
-}
+def encoded(protocol: str, pose: ToolReading, number: int) -> bytes:
+    """A reading in one of `PROTOCOLS`; nothing of a tool that is not seen, where the protocol has no word for that."""
+    if protocol == "open":
+        return head.encode_pose(pose, sequence=number)
+    if protocol == "igtlink":
+        turn = rotation_from_quaternion(np.array(pose.quaternion_wxyz)) if isinstance(pose, PoseReading) else None
+        return encode_transform(pose, turn)
+    if not isinstance(pose, PoseReading):
+        return b""
+    station = int(pose.tool or 1)
+    numbers = (*(value / MM_PER_INCH for value in pose.position_mm), *pose.quaternion_wxyz)
+    time_ms = (pose.device_ns or 0) // 1_000_000 % 2**32
+    match protocol:
+        case "fastrak":
+            return b"0%d " % station + FASTRAK.pack(*numbers) + b" "
+        case "fastrak-ascii":
+            columns = (f"{value:7.{places}f}" for value, places in zip(numbers, FASTRAK_DECIMALS, strict=True))
+            return f"0{station} {''.join(columns)}\r\n".encode()
+        case "liberty":
+            header = (b"LY", station, ord("C"), ord(" "), 0, LIBERTY.size - LIBERTY_HEADER_BYTES + 1)
+            return LIBERTY.pack(*header, *numbers, time_ms, 0) + b" "
+        case "liberty-ascii":
+            return f"{station:02}  {' '.join(f'{value:.5f}' for value in numbers)} {time_ms} 0\r\n".encode()
+        case _:  # of a bird, whose address stands behind it in group mode
+            return record_bytes(numbers) + (bytes([station]) if pose.tool else b"")
 
 
 # --- Emulated NDI tracker: the commands of the combined API that a host needs to follow one tool.
@@ -292,6 +263,8 @@ _OUT_OF_VOLUME: Final = 0x40
 _START: Final = 0xA5C4
 _BAD_CRC, _UNKNOWN, _NOT_NOW = 0x04, 0x01, 0x0C
 _POLYNOMIAL: Final = 0xA001
+_LISTED: Final = {1: "to be freed", 2: "plugged in", 3: "initialised", 4: "enabled"}
+"""States of ports that PHSR asks for by numbers; by others it asks for all."""
 _LONGEST: Final = 4096
 
 
@@ -362,7 +335,9 @@ class EmulatedNdi(Device):
             case "VER":
                 return "Emulated NDI tracker\nfor tests"
             case "PHSR":
-                return self._listed(int(rest or "0", 16))
+                listed = _LISTED.get(int(rest or "0", 16), "any")
+                handles = self._handles if self._port == listed or (self._port != "none" and listed == "any") else ()
+                return f"{len(handles):02X}{''.join(f'{one:02X}{_PORT_STATUS:03X}' for one in sorted(handles))}"
             case "PHRQ":
                 self._port, self._asked = "asked for", self._asked + 1
                 return f"{HANDLE + self._asked - 1:02X}"
@@ -378,13 +353,6 @@ class EmulatedNdi(Device):
             case _:
                 return None
         return "OKAY"
-
-    def _listed(self, kind: int) -> str:
-        wanted = {0: None, 1: "to be freed", 2: "plugged in", 3: "initialised", 4: "enabled"}.get(kind)
-        if self._port != "none" if wanted is None else self._port == wanted:
-            ports = "".join(f"{handle:02X}{_PORT_STATUS:03X}" for handle in sorted(self._handles))
-            return f"{len(self._handles):02X}{ports}"
-        return "00"
 
     def _poses_now(self) -> bytes:
         if self._begun is None or self._port != "enabled":

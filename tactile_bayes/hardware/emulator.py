@@ -216,9 +216,11 @@ class Emulator:
         """Serve until the link breaks, or, with `once`, until a scan has been sent and read."""
         while not self.unplugged:
             self._step()
-            if once and self._finished_at and self._left_alone():
-                self._link.finish(LINGER_S)
-                self.unplugged = True
+            if once and self._finished_at and not self._waiting:
+                waited = time.monotonic() - self._finished_at > LINGER_S
+                if self._device.said_end or self._device.stopped or waited:
+                    self._link.finish(LINGER_S)
+                    self.unplugged = True
         return self.served
 
     def _step(self) -> None:
@@ -237,12 +239,6 @@ class Emulator:
             elif not self._leads:
                 self._hold_still()
         self._pass_on()
-
-    def _left_alone(self) -> bool:
-        """True when the host is done: the device's END, the host's STOP, or time enough has passed."""
-        if self._waiting:
-            return False
-        return self._device.said_end or self._device.stopped or time.monotonic() - self._finished_at > LINGER_S
 
     def _pass_on(self) -> None:
         if self._waiting and not self.unplugged:
@@ -287,7 +283,10 @@ class Emulator:
         while self._next < len(times) and times[self._next] - times[0] <= elapsed_s:
             moment = float(times[self._next] - times[0])
             if self._faults.disconnect_s is not None and moment >= self._faults.disconnect_s:
-                self._unplug()
+                with contextlib.suppress(OSError):
+                    self._link.write(bytes(self._waiting))
+                self.unplugged = True
+                self._link.close()
                 return
             self._send(self._device.record(self._next), moment)
             self._next += 1
@@ -306,9 +305,3 @@ class Emulator:
         self.served.faulty += disturbed != record
         self.served.sent += bool(disturbed)
         self._waiting += disturbed
-
-    def _unplug(self) -> None:
-        with contextlib.suppress(OSError):
-            self._link.write(bytes(self._waiting))
-        self.unplugged = True
-        self._link.close()

@@ -70,7 +70,7 @@ Seen = SeenFrame | SeenPose | SeenLandmark | dict[str, Any]
 
 
 class Feed:
-    """The recorder's end of the feed, a pipe; an `Observer`."""
+    """The recorder's end of the feed, a pipe; it observes the recording."""
 
     def __init__(self, pipe: int) -> None:
         self._pipe = pipe

@@ -163,7 +163,9 @@ class Follower:
         if reading.tool == self.tool:
             yield from self._followed(reading, host_ns)
         elif reading.tool == self.reference:
-            yield from self._referred(reading, host_ns)
+            self._base = (reading, host_ns) if isinstance(reading, PoseReading) else None
+            self._fresh = self._base is not None and self._held is None
+            yield from self._release()
         else:
             tally(self.others, reading.tool)
 
@@ -177,11 +179,6 @@ class Follower:
         if base is not None and (self._fresh or base[0].device_ns == reading.device_ns is not None):
             yield from self._release()
             self._fresh = False
-
-    def _referred(self, reading: ToolReading, host_ns: int) -> Iterator[tuple[ToolReading, int]]:
-        self._base = (reading, host_ns) if isinstance(reading, PoseReading) else None
-        self._fresh = self._base is not None and self._held is None
-        yield from self._release()
 
     def _release(self) -> Iterator[tuple[ToolReading, int]]:
         if self._held is None:

@@ -241,12 +241,8 @@ class TrackerDriver(Record):
     def check(self, port: Port, *, tool: str | None = None, reference: str | None = None) -> Answer:
         """Set the tracker up, ask for records and choose the tools to follow.
 
-        Raises
-        ------
-        DeviceError
-            When no record comes that fits the protocol, or none of a tool that is asked for.
-        UsageError
-            When it sends several tools and none was chosen.
+        No record that fits the protocol, or none of a tool that is asked for, is a `DeviceError`; several tools of
+        which none was chosen are a `UsageError`.
         """
         before = self._prepare(port, several=bool(tool or reference))
         best, came = self._listen(port, tool, reference)

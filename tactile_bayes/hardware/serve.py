@@ -191,27 +191,23 @@ class LiveServer:
 
     def _talk(self, connection: Any) -> None:
         """Send each new state until the page closes or the recording ends."""
+        seen = 0
         with self._news:
             self._pages.add(connection)
         try:
-            self._send_news(connection)
+            while True:
+                with self._news:
+                    while self._number == seen and not self._over:
+                        self._news.wait()
+                    text, seen, over = self._text, self._number, self._over
+                if over:
+                    return
+                connection.send(text)
+        except self._closed:
+            return
         finally:
             with self._news:
                 self._pages.discard(connection)
-
-    def _send_news(self, connection: Any) -> None:
-        seen = 0
-        while True:
-            with self._news:
-                while self._number == seen and not self._over:
-                    self._news.wait()
-                text, seen, over = self._text, self._number, self._over
-            if over:
-                return
-            try:
-                connection.send(text)
-            except self._closed:
-                return
 
 
 def document(state: LiveState) -> dict[str, Any]:

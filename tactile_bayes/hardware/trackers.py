@@ -199,7 +199,10 @@ class IgtlinkParser(Parser):
             kind, size = header[0][2:-1], _HEADER.unpack_from(buffer, place)[5]
             if kind not in _POSES:
                 self._over = _HEADER.size + size
-                self._note_other(kind.decode())
+                if kind.decode() not in self._others and len(self._others) < _MOST_KINDS:
+                    self._others.add(kind.decode())
+                    wanted = ", ".join(one.decode() for one in _POSES)
+                    self.fault = f"{', '.join(sorted(self._others))} came, but no {wanted}"
         if self._over:
             begin = _find_header(buffer, place + 1)
         else:
@@ -214,11 +217,6 @@ class IgtlinkParser(Parser):
             if _TURNED_HEADER.match(buffer, place):
                 self.fault = "its numbers are little-endian; OpenIGTLink is big-endian"
         return used
-
-    def _note_other(self, kind: str) -> None:
-        if kind not in self._others and len(self._others) < _MOST_KINDS:
-            self._others.add(kind)
-            self.fault = f"{', '.join(sorted(self._others))} came, but no {', '.join(one.decode() for one in _POSES)}"
 
 
 def _find_header(buffer: bytes, start: int) -> int:
@@ -484,7 +482,7 @@ class NdiPort(Port):
     """An NDI tracker in a process of its own, as a port in the open framing."""
 
     def __init__(self, url: str, *, roms: Sequence[Path] = ()) -> None:
-        self.url, self.baud, self.role, self._is_socket = url, 0, "tracker", False
+        self.url, self.baud, self.role, self._is_socket = url, 0, "tracker", True
         self._relayed = None
         if find_spec(MODULE) is None:
             raise DeviceError(f"{self.name}: needs the package ndicapi; pip install 'tactile-bayes[ndi]'")
@@ -519,10 +517,6 @@ class _SocketLine:
 
     def fileno(self) -> int:
         return self._line.fileno()
-
-    @property
-    def in_waiting(self) -> int:
-        return 4096 if select.select([self._line], [], [], 0)[0] else 0
 
     def read(self, size: int) -> bytes:
         if size <= 0 or not select.select([self._line], [], [], _LOOK_S)[0]:

@@ -32,7 +32,6 @@ from tactile_bayes.actions.live_view import Estimator
 
 if __name__ == "__main__":
     estimator = Estimator(None)
-    estimator.warm_up()
     while estimator.done == 0:
         estimator.look(None)
         time.sleep(0.01)

@@ -39,8 +39,11 @@ def test_the_live_view_has_the_patients_axes_from_notch_and_xiphoid_alone(names:
 
 def test_a_recording_tells_the_age_of_its_array_calibration(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
-        "tactile_bayes.actions.record.read_array_calibration", lambda _: SimpleNamespace(day=date(2026, 1, 30))
+        "tactile_bayes.actions.record.read_array_calibration",
+        lambda _: SimpleNamespace(day=date(2026, 1, 30), head_id="7"),
     )
-    request = SimpleNamespace(array_calibration="array.json", uncalibrated=False)
-    assert calibration_age(request, today=date(2026, 2, 2)) == {"array_calibration_days": "3"}
-    assert calibration_age(SimpleNamespace(array_calibration=None, uncalibrated=False), today=date(2026, 2, 2)) == {}
+    given = {"uncalibrated": False, "accept_calibration": False, "calibration_days": 5.0}
+    day = {"head_id": "7", "today": date(2026, 2, 2)}
+    request = SimpleNamespace(array_calibration="array.json", **given)
+    assert calibration_age(request, **day) == {"array_calibration_days": "3"}
+    assert calibration_age(SimpleNamespace(array_calibration=None, **given), **day) == {}

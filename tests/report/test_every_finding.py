@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import csv
 import html
-import io
 import json
 import re
 from collections.abc import Callable, Sequence
@@ -32,7 +31,7 @@ from tactile_bayes.api.maps import Map
 from tactile_bayes.api.pooled import PooledSize
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.api.sized import SizeEstimate
-from tactile_bayes.campaigns.report import Row, done_text, growth_text
+from tactile_bayes.campaigns.report import Row, done_line, grown_line
 from tactile_bayes.declarations import replace
 from tactile_bayes.exports.exam import Identity, MapFile, estimate_of
 from tactile_bayes.exports.fhir import bundle_of
@@ -185,8 +184,8 @@ def dicom(made: Made, name: str) -> str:
 
 def campaign_row(made: Made) -> str:
     row = Row(Listed("a.nc", Path("a.nc"), "P", "1", "1", 1), made.answer.report, scans=SCANS, findings=made.findings)
-    (cells,) = csv.DictReader(io.StringIO(done_text([row])))
-    return f"{cells['verdict']} {cells['findings']}"
+    cells = done_line(row)
+    return f"{cells['verdict']} {cells['findings'] or ''}"
 
 
 def growth_of(made: Made) -> Growth:
@@ -195,8 +194,8 @@ def growth_of(made: Made) -> Growth:
 
 
 def growth_table(made: Made) -> str:
-    (cells,) = csv.DictReader(io.StringIO(growth_text([growth_of(made)])))
-    return cells["findings"]
+    cells = grown_line(growth_of(made))
+    return cells["findings"] or ""
 
 
 def campaign_card(made: Made) -> str:

@@ -378,7 +378,6 @@ def test_every_command_that_draws_refuses_another_suffix_before_any_work():
     import click
 
     from tactile_bayes.cli import COMMANDS
-    from tactile_bayes.commands.options import FigurePath
 
     def commands(command: click.Command) -> list[click.Command]:
         if not isinstance(command, click.Group):
@@ -397,7 +396,7 @@ def test_every_command_that_draws_refuses_another_suffix_before_any_work():
     # map, calibrate size, two of estimate, compare, three of diagnose, head design, compare-model, sbc, three of
     # tradeoff
     assert len(found) == 15
-    assert all(isinstance(one, FigurePath) for one in found)
+    assert all(one.writes == "figure" for one in found)
 
 
 def test_the_regions_of_pairs_say_how_many_draws_they_hold() -> None:

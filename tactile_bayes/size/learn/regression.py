@@ -71,7 +71,7 @@ def rows_of(columns: T, keep: BoolArray) -> T:
         return cast("T", tuple(compress(whole, keep)))
     if isinstance(whole, dict):
         return cast("T", {name: rows_of(one, keep) for name, one in whole.items()})
-    return replace(columns, **{name: rows_of(getattr(whole, name), keep) for name in whole.__struct_fields__})
+    return cast("T", replace(whole, **{name: rows_of(getattr(whole, name), keep) for name in whole.__struct_fields__}))
 
 
 class ExamSpread(Record):
