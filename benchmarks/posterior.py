@@ -39,7 +39,8 @@ def simulated_fit() -> Any:
     from tactile_bayes.options import BumpPrior
     from tactile_bayes.posterior.bump import cell_mean_gaussian, window_cells
     from tactile_bayes.posterior.fit import fit_scene
-    from tactile_bayes.posterior.window import Problem, Scene, Window, independent_variance
+    from tactile_bayes.posterior.marginal import Scene
+    from tactile_bayes.posterior.window import Problem, Window, independent_variance
 
     rng = np.random.default_rng(1)
     axis = np.arange(-HALF_MM, HALF_MM + 1.0)
@@ -188,8 +189,8 @@ def _in_jax(fit: Any) -> Callable[[Any], Any]:
     target, window = fit.target, fit.target.window
     x, y, weight = jnp.asarray(window.x_mm), jnp.asarray(window.y_mm), jnp.asarray(window.weight)
     across, along = jnp.asarray(window._across), jnp.asarray(window._along)
-    plain = jnp.asarray(target._weighted_plain)
-    c, dof, cell = len(target._plain) - 1, target.dof, window.cells.cell_mm
+    plain = jnp.asarray(target.linear.weighted)
+    c, dof, cell = len(target.linear.plain) - 1, target.dof, window.cells.cell_mm
 
     def profile(distance: Any, sigma: Any) -> Any:
         wide = sigma**2 + cell**2 / 12.0

@@ -21,7 +21,7 @@ from tactile_bayes.forward.axisymmetric import CondensedLump, LayeredBody, conde
 from tactile_bayes.forward.contact import ContactStiffness, solve_contact
 from tactile_bayes.forward.mesh import LumpGeometry, MeshSize, lump_mesh
 from tactile_bayes.forward.scene import Head
-from tactile_bayes.forward.solid import PlacedLump, SolidHead, face_of, skin_perturbation, solid_head
+from tactile_bayes.forward.simulate import PlacedLump, SolidHead, face_of, skin_perturbation, solid_head
 from tactile_bayes.forward.tissue import SceneBody
 
 SCHEMA = "tactile-bayes/benchmarks/solid/1"

@@ -7,7 +7,7 @@ import pytest
 
 from tactile_bayes.forward.axisymmetric import LayeredBody
 from tactile_bayes.forward.scene import Scene, Strokes
-from tactile_bayes.forward.solid import solid_frames
+from tactile_bayes.forward.simulate import solid_frames
 from tactile_bayes.forward.tissue import SceneBody, SolidLump
 from validation.stress import CONTROL, STRESSES, jobs
 from validation.stress_frames import Physics, VaryingLayers, shear_sinking, stressed_frames

@@ -31,7 +31,7 @@ from tactile_bayes.declarations import replace
 from tactile_bayes.forward.axisymmetric import LayeredBody, skin_flexibility, taxel_compliance
 from tactile_bayes.forward.contact import ContactStiffness
 from tactile_bayes.forward.scene import Scene, frame_times, head_positions, level_kpa, record, rotation_from_vector
-from tactile_bayes.forward.solid import (
+from tactile_bayes.forward.simulate import (
     PlacedLump,
     SolidFrame,
     SolidHead,

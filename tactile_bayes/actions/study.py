@@ -58,9 +58,7 @@ from tactile_bayes.report.study import (
 from tactile_bayes.shell import progress_bar
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.studies import paper, sbc
-from tactile_bayes.studies.model_comparison import compare_model, measured_frames
-from tactile_bayes.studies.paper_solid import SolidSettings
-from tactile_bayes.studies.paper_tables import (
+from tactile_bayes.studies.model_comparison import (
     NEAREST_HEADS,
     PHANTOMS,
     TRIED_HEADS,
@@ -68,9 +66,12 @@ from tactile_bayes.studies.paper_tables import (
     MeasuredFrame,
     compare_frames,
     compare_heads,
+    compare_model,
+    measured_frames,
     phantom_scenes,
     table_scenes,
 )
+from tactile_bayes.studies.paper_solid import SolidSettings
 
 _FRAMES_SCHEMA = "measured_frames.table.json"
 

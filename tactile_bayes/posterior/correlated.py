@@ -29,7 +29,7 @@ from tactile_bayes.posterior.fit import (
     newton_step_to,
     tangent_columns,
 )
-from tactile_bayes.posterior.marginal import FLOOR
+from tactile_bayes.posterior.marginal import Scene
 from tactile_bayes.posterior.neighbours import (
     WANTED,
     Surroundings,
@@ -41,7 +41,7 @@ from tactile_bayes.posterior.neighbours import (
 )
 from tactile_bayes.posterior.verdict import rim_fault
 from tactile_bayes.posterior.white import BumpFit, MapDraws
-from tactile_bayes.posterior.window import Problem, Scene, Window, cosines_for, independent_variance
+from tactile_bayes.posterior.window import FLOOR, Problem, Window, cosines_for, independent_variance
 from tactile_bayes.presets import FIELD_COSINES, SceneAsked
 from tactile_bayes.progress import Progress
 

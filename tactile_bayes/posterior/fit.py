@@ -17,8 +17,8 @@ from tactile_bayes.inference.importance import Gaussians, smooth_weights
 from tactile_bayes.inference.modes import find_mode, finite_differences, mode_and_covariance, stencil
 from tactile_bayes.posterior.bump import covariance_from_log_widths, drawn_widths
 from tactile_bayes.posterior.draw import ROTATION_ODDS, Sampled, SamplerSettings, with_beside
-from tactile_bayes.posterior.marginal import FLOOR, NEGLIGIBLE, CollapsedTarget
-from tactile_bayes.posterior.window import STEP, Problem, Scene, Shape, linear_columns
+from tactile_bayes.posterior.marginal import STEP, CollapsedTarget, Scene, Shape
+from tactile_bayes.posterior.window import FLOOR, NEGLIGIBLE, Problem, linear_columns
 from tactile_bayes.presets import Method, SceneAsked
 
 # --- Posterior of a scene under correlated errors: its mode, a Gaussian for each noise field, and draws.

@@ -1,211 +1,206 @@
-r"""Marginal posterior of the shape of a window's scene: amplitudes, level, tilt and noise integrated out.
-
-For one noise field h (length and share) the map is linear in level, tilt and amplitudes given the places and widths.
-With flat priors on level and tilt, a normal one of variance s^2 on each of v amplitudes and the Jeffreys prior on the
-noise scale,
-
-.. math::
-    p(y \mid \theta, h) \propto |C_h|^{-1/2}\, |X^T C_h^{-1} X|^{-1/2}\, |P|^{-1/2}\,
-        \Gamma(\nu/2)\,(\pi S)^{-\nu/2}\; N(\hat a;\, 0,\, s^2 + P^{-1} S / \nu), \qquad \nu = n - c - v,
-
-X the c columns of level and tilt, P the amplitudes' precision and S the generalised least-squares sum of squares. Only
-the last factor is approximate: the prior is taken at the mean noise scale. Fields are mixed with their evidence.
-"""
+"""Scenes that a fit window may hold, and the marginal posterior of their shape: all that is linear integrated out."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from copy import copy
-from math import lgamma, log, pi
+from collections.abc import Iterator, Mapping
+from functools import cached_property
+from typing import Final, Literal
 
 import numpy as np
 
-from tactile_bayes.declarations import Record, names_of
-from tactile_bayes.geometry import FloatArray, IndexArray
+from tactile_bayes.declarations import Record
+from tactile_bayes.geometry import BoolArray, FloatArray, IndexArray
 from tactile_bayes.inference.draws import Solution, Solved, distinct_rows
 from tactile_bayes.posterior.window import (
-    LENGTHS_MM,
-    SHARES,
+    FieldColumns,
+    Inner,
+    LinearModel,
+    LinearSolution,
     Problem,
     Profiles,
     Projected,
-    Scene,
     Templates,
-    Whitening,
     Window,
-    linear_columns,
+    joined,
 )
 
-# --- Solutions for the linear parameters (amplitudes, level, tilt) given the shape, for many shapes and noise fields.
+# --- Scenes: the structures that a fit window may hold, with their parameters and prior.
+#
+# Or a ridge in the bump's place: what a lump's evidence is held against where a ridge is to be feared.
 
-FLOOR = 1e-9
-"""Share of the data's sum of squares that is noise in any case: 3e-5 of the signal, less than any sensor's steps.
-Without it a map free of noise leaves differences of large sums, which are rounding."""
+Shape = Literal["round", "ellipse", "rotated", "ridge"]
+Neighbour = Literal["second lump", "rib"]
+Extra = Literal[Neighbour, ""]
+REACH_IN_RADII = 1.5
+"""How far from the window's middle a second structure is looked for: beyond its rim a flank still shows."""
+APART = 2.0
+"""A second lump lies at least this many widths from the first: closer, two Gaussians have one top. A rib may run under
+the bump if it is no more than this many times as wide: a wider one is the level's own curve."""
+STEP = {
+    "u": 0.06,
+    "v": 0.06,
+    "r": 0.06,
+    "x": 0.3,
+    "y": 0.3,
+    "x2": 0.6,
+    "y2": 0.6,
+    "w2": 0.15,
+    "angle": 0.08,
+    "offset": 0.6,
+    "along": 0.08,
+    "across": 0.6,
+}
+"""About one posterior standard deviation of each parameter: steps of the search for the mode."""
 
-LEAST_POWER = 1e-9
-"""Power of a template, over what the prior on its amplitude is worth: less tells nothing and would only overflow."""
+_BUMP_NAMES: Final[Mapping[Shape, tuple[str, ...]]] = {
+    "round": ("u", "x", "y"),
+    "ellipse": ("u", "v", "x", "y"),
+    "rotated": ("u", "v", "x", "y", "r"),
+    "ridge": ("u", "along", "across"),
+}
+_NEIGHBOUR_NAMES: Final[Mapping[Extra, tuple[str, ...]]] = {
+    "": (),
+    "second lump": ("x2", "y2", "w2"),
+    "rib": ("angle", "offset", "w2"),
+}
 
 
-class LinearSolution(Record, eq=False):
-    """Conditional posterior of the linear parameters for m shapes and h fields: a multivariate t."""
+class Scene(Record, dict=True):
+    """Structures in a model.
 
-    evidence: FloatArray  #: (m, h) array: Log of the fields' prior times their evidence.
-    amplitude: FloatArray  #: (m, h, v) array: Conditional means under a flat prior.
-    power: FloatArray  #: (m, h, v, v) array: Their precision times tau^2.
-    level: FloatArray
-    level_covariance: FloatArray
-    """`level`, `level_covariance` (h, c), (h, c, c) arrays: Level and tilt at amplitudes of 0, and their covariance
-    over tau^2 given the amplitudes."""
-    level_slope: FloatArray  #: (m, h, v, c) array: By how much level and tilt fall as an amplitude rises.
-    sum_of_squares: FloatArray  #: (m, h) array.
-
-
-class FieldColumns(Record, eq=False):
-    """Fixed columns and data under the noise fields of one length: the part that does not depend on the shape."""
-
-    field: Whitening  #: The length.
-    shares: FloatArray  #: (h,) array.
-    log_prior: float  #: Log prior probability of each share.
-    weight: FloatArray
-    """(k, h) array: Of the squared projections that the field takes away, ``rho / (1 + rho lambda)``; a column a share.
+    The parameters are ``u, v, x, y`` (logs of the widths while nothing is turned, and the centre), without v for a
+    round bump, with r for a turned one; then ``x2, y2, w2`` (centre and log width of a second round lump) or
+    ``angle, offset, w2`` (a ridge). A ridge in the bump's place has ``u, along, across``: log width, angle, offset.
     """
-    plain: FloatArray  #: (k, h * (c + 1)) array: Projections of the fixed columns and the data, so weighted.
-    gram: FloatArray  #: (h, c + 1, c + 1) array: Columns and data with each other.
-    inverse: FloatArray  #: (h, c, c) array: Of the columns' part.
-    log_det: FloatArray  #: (h,) array: Log determinant of the covariance (over that of D) and of the columns' part.
-    floor: float  #: Sum of squares that is noise in any case.
 
-    @classmethod
-    def of(
-        cls, field: Whitening, shares: FloatArray, *, log_prior: float, plain_low: FloatArray, plain_gram: FloatArray
-    ) -> FieldColumns:
-        """Prepare from (c + 1, cosines^2) projections and (c + 1, c + 1) products of the fixed columns and the data."""
-        low, power = plain_low @ field.turn, shares[:, None] * field.eigenvalues
-        weight = shares[:, None] / (1.0 + power)
-        weighted = low * weight[:, None, :]
-        gram = plain_gram - weighted @ low.T
-        c = len(plain_gram) - 1
-        inverse: FloatArray = np.asarray(np.linalg.inv(gram[:, :c, :c]), dtype=np.float64)
-        volume: FloatArray = np.asarray(np.linalg.slogdet(gram[:, :c, :c])[1], dtype=np.float64)
-        plain = np.ascontiguousarray(weighted.reshape(len(shares) * (c + 1), low.shape[1]).T)
-        log_det = np.log1p(power).sum(axis=-1) + volume
-        floor = FLOOR * float(plain_gram[c, c]) + 1e-300
-        return cls(field, shares, log_prior, np.ascontiguousarray(weight.T), plain, gram, inverse, log_det, floor)
+    shape: Shape = "ellipse"  #: Shape of the bump.
+    tilt: bool = True  #: The level may slope.
+    extra: Extra = ""  #: Structure beside the bump.
 
-    def rest(self) -> FloatArray:
-        """(h,) residual sum of squares of the fixed columns alone."""
-        c = self.inverse.shape[1]
-        right = self.gram[:, :c, c]
-        return np.asarray(self.gram[:, c, c] - np.einsum("hc,hcd,hd->h", right, self.inverse, right))
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Names of the shape parameters, the most important first (see `importance`)."""
+        return _BUMP_NAMES[self.shape] + _NEIGHBOUR_NAMES[self.extra]
 
-    def null_evidence(self, *, dof: int) -> FloatArray:
-        """(h,) log prior plus log evidence of the fixed columns alone."""
-        squares = np.maximum(self.rest(), 0.0) + self.floor
-        return self.log_prior - 0.5 * self.log_det + lgamma(dof / 2) - 0.5 * dof * np.log(pi * squares)
+    @cached_property
+    def steps(self) -> FloatArray:
+        """(p,) typical small step of each parameter."""
+        return np.array([STEP[name] for name in self.names])
 
+    @cached_property
+    def own(self) -> int:
+        """Number of the bump's own parameters, which are the first."""
+        return len(_BUMP_NAMES[self.shape])
 
-class Inner(Record, eq=False):
-    """Inner products of m templates under the noise fields of one length with h shares."""
+    def column(self, theta: FloatArray, name: str) -> FloatArray:
+        """(...) values of one parameter of (..., p) vectors; those that the scene does not have are 0, v is u."""
+        if name in self.names:
+            return np.asarray(theta[..., self.names.index(name)])
+        return self.column(theta, "u") if name == "v" else np.zeros(theta.shape[:-1])
 
-    plain: FloatArray  #: (m, h, c + 1) array: With the fixed columns and the data.
-    square: FloatArray  #: (m, h) array: With themselves.
-    low: FloatArray
-    """(m, k) array: Projections on the field's directions; none where templates are never held against others."""
+    def widths(self, theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """p, q, r (see `covariance_from_log_widths`) of (..., p) vectors."""
+        u, v = self.column(theta, "u"), self.column(theta, "v")
+        return (u + v) / 2.0, (u - v) / 2.0, self.column(theta, "r")
 
-    @classmethod
-    def of(cls, projected: Projected, columns: FieldColumns) -> Inner:
-        """Inner products from those without a field."""
-        low = projected.low @ columns.field.turn
-        taken = (low @ columns.plain).reshape(len(low), len(columns.shares), -1)
-        return cls(projected.plain[:, None, :] - taken, projected.square[:, None] - low**2 @ columns.weight, low)
+    def carried(self, theta: FloatArray, other: Scene) -> FloatArray:
+        """Convert a vector to another scene: shared parameters keep their values, others are 0."""
+        p, _, _ = self.widths(theta)
+        values = {name: self.column(theta, name) for name in other.names}
+        if other.shape == "round":
+            values["u"] = p
+        return np.array([values[name] for name in other.names])
 
-    def repeated(self, number: int) -> Inner:
-        """Each template's inner products, repeated."""
-        return Inner(*(np.repeat(one, number, axis=0) for one in (self.plain, self.square, self.low)))
+    @property
+    def separable(self) -> bool:
+        """True for a scene that is only a bump along the grid's axes: the product of a profile along each."""
+        return self.shape in ("round", "ellipse") and not self.extra
 
-    def product(self, other: Inner, product: FloatArray, columns: FieldColumns) -> FloatArray:
-        """(m, h) inner products with other templates, from their (m,) products without the field."""
-        return np.asarray(product[:, None] - (self.low * other.low) @ columns.weight)
+    def templates(self, theta: FloatArray, window: Window) -> list[Templates]:
+        """Templates of the bump, and of the second structure if there is one, for (m, p) vectors."""
+        p, q, r = self.widths(theta)
+        if self.shape == "ridge":
+            along, across = self.column(theta, "along"), self.column(theta, "across")
+            templates: list[Templates] = [window.ridges(along, across, log_width=p)]
+        else:
+            x, y = self.column(theta, "x"), self.column(theta, "y")
+            templates = [window.bumps(x, y, p=p, q=q, r=r if self.shape == "rotated" else None)]
+        if self.extra:
+            beside = (self.column(theta, name) for name in _NEIGHBOUR_NAMES[self.extra])
+            templates.append(neighbour_templates(window, self.extra, *beside))
+        return templates
 
+    def log_prior(self, theta: FloatArray, problem: Problem) -> FloatArray:
+        """(m,) normalised log prior of the shape; -inf outside the window and where a bump is wider than it."""
+        prior, middle, radius_mm = problem.prior, problem.window.middle, problem.radius_mm
+        p, q, r = self.widths(theta)
+        ratio = np.hypot(q, r)
+        total = log_normal_density(p, np.log(prior.width_median_mm), prior.log_width_sd)
+        if self.shape == "ridge":
+            inside, volume = ridge_place(self.column(theta, "across"), radius_mm)
+        else:
+            x, y = self.column(theta, "x") - middle[0], self.column(theta, "y") - middle[1]
+            inside, volume = np.hypot(x, y) <= radius_mm, np.pi * radius_mm**2
+        inside, total = inside & (p + ratio <= np.log(problem.widest_mm)), total - np.log(volume)
+        if self.shape in ("ellipse", "rotated"):
+            # q is half of u - v, p half of their sum: the volume of (u, v) is twice that of (p, q)
+            total = total + log_normal_density(q, 0.0, prior.log_ratio_sd) - np.log(2.0)
+        if self.shape == "rotated":
+            total = total + log_normal_density(r, 0.0, prior.log_ratio_sd)
+        if self.extra:
+            beside, allowed = self._log_prior_beside(theta, problem)
+            total, inside = total + beside, inside & allowed & (self.column(theta, "w2") <= np.log(problem.widest_mm))
+        return np.where(inside, total, -np.inf)
 
-def solve(
-    inner: list[Inner], cross: FloatArray | None, columns: FieldColumns, *, dof: int, amplitude_sd: float
-) -> LinearSolution:
-    """Solutions for one or two structures, under one length.
+    def _log_prior_beside(self, theta: FloatArray, problem: Problem) -> tuple[FloatArray, BoolArray]:
+        """Log prior of the second structure (its amplitude's is in the target), and whether its place is allowed."""
+        prior, middle, radius_mm = problem.prior, problem.window.middle, problem.radius_mm
+        w, reach = self.column(theta, "w2"), REACH_IN_RADII * radius_mm
+        total = log_normal_density(w, np.log(prior.width_median_mm), prior.log_width_sd)
+        if self.extra == "rib":
+            allowed, volume = ridge_place(self.column(theta, "offset"), radius_mm)
+            if self.shape != "ridge":
+                allowed &= self.rib_apart(theta, middle)
+            return total - np.log(volume), allowed
+        x2, y2 = self.column(theta, "x2"), self.column(theta, "y2")
+        allowed = np.hypot(x2 - middle[0], y2 - middle[1]) <= reach
+        if self.shape != "ridge":
+            away = np.hypot(x2 - self.column(theta, "x"), y2 - self.column(theta, "y"))
+            p, _, _ = self.widths(theta)
+            allowed &= away >= APART * np.exp(np.maximum(p, w))
+        return total - np.log(np.pi * reach**2), allowed
 
-    `inner` holds the inner products of each structure's (m,) templates and `cross`, (m, h), those of one with the
-    other; `dof` is cells minus linear parameters, `amplitude_sd` that of the normal prior on each amplitude.
-    """
-    c = columns.inverse.shape[1]
-    plain = [one.plain for one in inner]
-    to_level = [np.matmul(one[:, :, None, :c], columns.inverse)[:, :, 0] for one in plain]
-    right = columns.gram[:, :c, c]
-    along = [one[:, :, c] - np.sum(t * right, axis=2) for one, t in zip(plain, to_level, strict=True)]
+    def rib_apart(self, theta: FloatArray, middle: tuple[float, float]) -> BoolArray:
+        """(m,) whether a rib is clear of the bump, or at most `APART` times as wide."""
+        p, _, _ = self.widths(theta)
+        return np.asarray(self.rib_clear(theta, middle) | (self.column(theta, "w2") - p <= np.log(APART)))
 
-    def power(i: int, j: int, product: FloatArray) -> FloatArray:
-        return np.asarray(product - np.sum(to_level[i] * plain[j][:, :, :c], axis=2))
-
-    rest, floor = columns.rest(), columns.floor
-    # a template with hardly any weight in the window, beyond its rim or between its cells, leaves the prior unchanged
-    least = LEAST_POWER * (np.maximum(rest, 0.0) + floor) / dof / amplitude_sd**2
-    diagonal = [np.maximum(power(i, i, one.square), least) for i, one in enumerate(inner)]
-    if cross is None:
-        structures = _one(along[0], diagonal[0], rest, floor, dof=dof, amplitude_sd=amplitude_sd)
-    else:
-        structures = _two(along, diagonal, power(0, 1, cross), rest, floor, dof=dof, amplitude_sd=amplitude_sd)
-    log_factor, amplitude, matrix, squares = structures
-    constant = columns.log_prior - 0.5 * columns.log_det + lgamma(dof / 2) - 0.5 * dof * log(pi)
-    evidence = constant + log_factor - 0.5 * dof * np.log(squares)
-    # a dent is no lump: only rises have density
-    evidence = np.where((amplitude > 0).all(axis=2), evidence, -np.inf)
-    level = np.einsum("hcd,hd->hc", columns.inverse, right)
-    slope = np.stack(to_level, axis=2)
-    return LinearSolution(evidence, amplitude, matrix, level, columns.inverse, slope, squares)
-
-
-_FIELD_AXIS = {name: int(not name.startswith("level") or name == "level_slope") for name in names_of(LinearSolution)}
-
-
-def joined(solutions: list[LinearSolution]) -> LinearSolution:
-    """Concatenate the fields of several lengths."""
-    return LinearSolution(
-        *(np.concatenate([getattr(one, name) for one in solutions], axis=axis) for name, axis in _FIELD_AXIS.items())
-    )
-
-
-def _one(
-    along: FloatArray, power: FloatArray, rest: FloatArray, floor: float, *, dof: int, amplitude_sd: float
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Log factor, amplitudes, precision and sum of squares for one structure."""
-    amplitude = along / power
-    squares = np.maximum(rest - along * amplitude, 0.0) + floor
-    variance = amplitude_sd**2 + squares / dof / power
-    log_factor = -0.5 * (np.log(power) + np.log(2 * pi * variance) + (amplitude / np.sqrt(variance)) ** 2)
-    return log_factor, amplitude[..., None], power[..., None, None], squares
+    def rib_clear(self, theta: FloatArray, middle: tuple[float, float]) -> BoolArray:
+        """(m,) whether a rib lies `APART` widths, of it or the bump, from the bump's centre."""
+        angle, (p, _, _) = self.column(theta, "angle"), self.widths(theta)
+        x, y = self.column(theta, "x") - middle[0], self.column(theta, "y") - middle[1]
+        away = np.abs(self.column(theta, "offset") - x * np.cos(angle) - y * np.sin(angle))
+        return np.asarray(away >= APART * np.exp(np.maximum(p, self.column(theta, "w2"))))
 
 
-def _two(
-    along: list[FloatArray],
-    diagonal: list[FloatArray],
-    off: FloatArray,
-    rest: FloatArray,
-    floor: float,
-    *,
-    dof: int,
-    amplitude_sd: float,
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """As `_one` for two structures, with the two by two matrices written out."""
-    one, two = diagonal
-    det = np.maximum(one * two - off**2, 1e-12 * one * two)
-    first, second = (two * along[0] - off * along[1]) / det, (one * along[1] - off * along[0]) / det
-    squares = np.maximum(rest - along[0] * first - along[1] * second, 0.0) + floor
-    tau2 = squares / dof
-    a, b, between = amplitude_sd**2 + tau2 * two / det, amplitude_sd**2 + tau2 * one / det, -tau2 * off / det
-    volume = a * b - between**2
-    square = (b * first**2 + a * second**2 - 2 * between * first * second) / volume
-    log_factor = -0.5 * (np.log(det) + np.log((2 * pi) ** 2 * volume) + square)
-    matrix = np.stack([np.stack([one, off], axis=-1), np.stack([off, two], axis=-1)], axis=-2)
-    return log_factor, np.stack([first, second], axis=-1), matrix, squares
+def neighbour_templates(
+    window: Window, extra: Neighbour, one: FloatArray, two: FloatArray, log_width: FloatArray
+) -> Templates:
+    """Templates of m second structures: lumps at ``x2, y2``, or ribs of ``angle, offset``, each an (m,) array."""
+    if extra == "rib":
+        return window.ridges(one, two, log_width=log_width)
+    return window.bumps(one, two, p=log_width, q=np.zeros_like(log_width), r=None)
+
+
+def ridge_place(offset: FloatArray, radius_mm: float) -> tuple[BoolArray, float]:
+    """(m,) whether ridges may lie this far from the window's middle, and the volume of angles and offsets."""
+    reach = REACH_IN_RADII * radius_mm
+    return np.abs(offset) <= reach, float(np.pi * 2.0 * reach)
+
+
+def log_normal_density(value: FloatArray, mean: float, sd: float) -> FloatArray:
+    """(...) log density of a normal distribution."""
+    return np.asarray(-0.5 * ((value - mean) / sd) ** 2 - np.log(sd * np.sqrt(2.0 * np.pi)))
 
 
 # --- Low-rank basis shared by many bumps, for fast inner products.
@@ -227,26 +222,31 @@ class Spanned:
     (r, r) `gram` those with each other.
     """
 
-    def __init__(self, coefficients: FloatArray, products: Projected, gram: FloatArray) -> None:
-        self._coefficients, self._products, self._gram = coefficients, products, gram
+    def __init__(self, coefficients: FloatArray, products: Projected, gram: FloatArray, linear: LinearModel) -> None:
+        self._coefficients, self._products, self._gram, self._linear = coefficients, products, gram, linear
 
     @classmethod
-    def of(cls, bumps: Profiles, window: Window, weighted_plain: FloatArray) -> Spanned | None:
+    def of(cls, bumps: Profiles, linear: LinearModel) -> Spanned | None:
         """Find the basis for products of profiles; None where it would not save time."""
         rows, columns = bumps.rows, bumps.columns
         if not (np.isfinite(rows).all() and np.isfinite(columns).all()):
             return None
-        high, wide = _norms(rows), _norms(columns)
+        high, wide = (np.sqrt(np.einsum("mn,mn->m", one, one)) for one in (rows, columns))
         along, across = _basis(rows, high.min()), _basis(columns, wide.min())
         by_row, by_column = rows @ along.T, columns @ across.T
         size = np.square(by_row).T @ np.square(by_column)
         i, j = _kept(size, (high * wide).min())
         if not 0 < len(i) <= MOST_PRODUCTS:
             return None
-        products = window.project(Profiles(along[i], across[j]), weighted_plain)
-        return cls(by_row[:, i] * by_column[:, j], products, _gram(window, along, across)[i[:, None], i, j[:, None], j])
+        (products,), _ = linear.projected([Profiles(along[i], across[j])])
+        gram = _gram(linear.window, along, across)[i[:, None], i, j[:, None], j]
+        return cls(by_row[:, i] * by_column[:, j], products, gram, linear)
 
-    def inner(self, columns: FieldColumns) -> Inner:
+    def solution(self, fields: list[FieldColumns]) -> LinearSolution:
+        """Solutions for the bumps under all noise fields."""
+        return joined([self._linear.solve([self._inner(columns)], None, columns) for columns in fields])
+
+    def _inner(self, columns: FieldColumns) -> Inner:
         """Inner products under the noise fields of one length."""
         basis = Inner.of(self._products, columns)
         c = self._coefficients
@@ -255,10 +255,6 @@ class Spanned:
         power = self._gram - shared.transpose(1, 0, 2)
         square = np.stack([np.einsum("mr,mr->m", c @ one, c) for one in power], axis=1)
         return Inner((c @ basis.plain.reshape(r, -1)).reshape(m, h, plain), square, np.empty((m, 0)))
-
-
-def _norms(profiles: FloatArray) -> FloatArray:
-    return np.asarray(np.sqrt(np.einsum("mn,mn->m", profiles, profiles)))
 
 
 def _basis(profiles: FloatArray, least: float) -> FloatArray:
@@ -284,51 +280,33 @@ def _kept(size: FloatArray, least: float) -> tuple[IndexArray, IndexArray]:
 # --- The marginal posterior of a scene under all noise fields.
 
 BLOCK = 128  #: Shapes solved at a time: fewer spend their time on calls, more leave the processor's cache.
-NEGLIGIBLE = 1e-3
-"""Fields with a smaller share of the evidence are left out of the mixture; what they add at the mode is made up for.
-Once a length has as little, and less than the one before it, shorter ones are not looked at."""
 SPANNED = 2048  #: As many share a basis where they can, see `Spanned`.
 
 
 class CollapsedTarget:
     """Log density of a scene's shape parameters (see `Scene`) for one window, mixed over noise fields."""
 
-    def __init__(self, problem: Problem, scene: Scene) -> None:
-        self.problem, self.scene = problem, scene
-        self.window = window = problem.window
-        self.amplitude_sd = problem.prior.amplitude_sd * problem.amplitude_scale
-        # without its mean, a large level does not cost the digits that the bump is in
-        self._mean = float(np.mean(window.cells.value))
-        centred = window.cells.value - self._mean
-        fixed = [linear_columns(window.cells, tilt=scene.tilt)]
-        fixed += [] if problem.departure is None else [problem.departure]
-        self._plain = np.concatenate([*fixed, centred[None]])
-        scaled = self._plain / window.variance
-        self._weighted_plain = window.on_grid(scaled)
-        self._plain_gram = self._plain @ scaled.T
-        self._plain_low = window.project(window.on_grid(self._plain), self._weighted_plain).low
-        self._lengths: dict[float, FieldColumns] = {}
+    def __init__(self, problem: Problem, scene: Scene, linear: LinearModel | None = None) -> None:
+        self.problem, self.scene, self.window = problem, scene, problem.window
+        self.linear = linear or LinearModel(problem, tilt=scene.tilt)
+        self.amplitude_sd = self.linear.amplitude_sd
         self._fields: list[FieldColumns] | None = None
         self._made_up = 0.0
 
     def of_scene(self, scene: Scene) -> CollapsedTarget:
-        """Copy for another scene in the same window with the same priors; its fields are not settled."""
-        if scene.tilt == self.scene.tilt:
-            other = copy(self)
-            other.scene, other._fields, other._made_up = scene, None, 0.0
-            return other
-        return CollapsedTarget(self.problem, scene)
+        """That of another scene in the same window with the same priors; its fields are not settled."""
+        return CollapsedTarget(self.problem, scene, self.linear if scene.tilt == self.scene.tilt else None)
 
     @property
     def dof(self) -> int:
         """Degrees of freedom of the noise scale."""
-        return max(len(self._plain[0]) - len(self._plain) - bool(self.scene.extra), 1)
+        return self.linear.dof(2 if self.scene.extra else 1)
 
     @property
     def fields(self) -> list[FieldColumns]:
         """Noise fields of the mixture by length, each with its shares; all of them until settled."""
         if self._fields is None:
-            self._fields = list(self._from_the_longest())
+            self._fields = list(self.linear.every_field())
         return self._fields
 
     def __call__(self, theta: FloatArray, solved: Solved | None = None) -> FloatArray:
@@ -337,46 +315,28 @@ class CollapsedTarget:
         `solved` keeps what `draw_linear` needs at these points.
         """
         if solved is None:
-            return self._mixed(theta, self.by_field(theta))
-        solution = self.conditional(theta)
-        solved.add(theta, solution)
-        return self._mixed(theta, solution[0] + self._made_up)
-
-    def _mixed(self, theta: FloatArray, by_field: FloatArray) -> FloatArray:
+            by_field = self.by_field(theta)
+        else:
+            solution = self.conditional(theta)
+            solved.add(theta, solution)
+            by_field = solution[0] + self._made_up
         total = np.logaddexp.reduce(by_field, axis=1) + self.scene.log_prior(theta, self.problem)
         return np.where(np.isfinite(total), total, -np.inf)
 
     def by_field(self, theta: FloatArray) -> FloatArray:
         """(m, fields) log of each field's prior times its evidence, without the shape's prior."""
-        parts = [np.concatenate([one.evidence for one in part], axis=1) for part in self._parts(theta)]
-        return np.concatenate(parts) + self._made_up
+        return np.concatenate([one.evidence for one in self._solutions(theta)]) + self._made_up
 
     def settle_fields(self, theta: FloatArray) -> bool:
         """Keep only the noise fields with evidence at one shape; the others cost time and add nothing. True if that
         changed."""
         before = self.chosen_fields()
-        projected, cross = self._projected(theta[None])
-        walked = self._walk(lambda columns: self._under(projected, cross, columns).evidence[0])
-        evidence = np.concatenate([one for _, one in walked])
-        if not np.isfinite(evidence.max()):
-            self._fields, self._made_up = None, 0.0
-            return before != self.chosen_fields()
-        total = float(np.logaddexp.reduce(evidence))
-        kept = [(columns, one > total + np.log(NEGLIGIBLE)) for columns, one in walked]
-        self._fields = [
-            self._columns(columns.field.pruned(float(columns.shares[keep].max())), columns.shares[keep])
-            for columns, keep in kept
-            if keep.any()
-        ]
-        left = np.concatenate([self._under(projected, cross, columns).evidence[0] for columns in self._fields])
-        self._made_up = total - float(np.logaddexp.reduce(left))
+        self._fields, self._made_up = self.linear.with_evidence(self.scene.templates(theta[None], self.window))
         return before != self.chosen_fields()
 
     def settle_lengths(self) -> None:
         """Keep only the lengths with evidence where there is no structure, each with all its shares."""
-        walked, total = self._walk_without_structure()
-        self._fields = [columns for columns, one in walked if one.max() > total + np.log(NEGLIGIBLE)]
-        self._made_up = 0.0
+        self._fields, self._made_up = self.linear.without_structure()[0], 0.0
 
     def chosen_fields(self) -> list[tuple[float, tuple[float, ...]]]:
         """Correlation lengths in the mixture, each with its shares."""
@@ -384,39 +344,7 @@ class CollapsedTarget:
 
     def null_log_evidence(self) -> float:
         """Log evidence of level and tilt alone under all fields, on the scale of the log density."""
-        return self._walk_without_structure()[1]
-
-    def _walk_without_structure(self) -> tuple[list[tuple[FieldColumns, FloatArray]], float]:
-        """As `_walk`, of level and tilt alone, with the whole of the log evidence."""
-        dof = max(len(self._plain[0]) - len(self._plain) + 1, 1)
-        walked = self._walk(lambda columns: columns.null_evidence(dof=dof))
-        return walked, float(np.logaddexp.reduce(np.concatenate([one for _, one in walked])))
-
-    def _walk(self, evidence: Callable[[FieldColumns], FloatArray]) -> list[tuple[FieldColumns, FloatArray]]:
-        """Evidence without a field, then from the longest length down, until it has vanished."""
-        walked: list[tuple[FieldColumns, FloatArray]] = []
-        best = before = -np.inf
-        for columns in self._from_the_longest():
-            one = evidence(columns)
-            walked.append((columns, one))
-            if one.max() < min(before, best + np.log(NEGLIGIBLE)):
-                break
-            best = max(best, float(one.max()))
-            before = float(one.max()) if columns.shares[0] > 0 else -np.inf
-        return walked
-
-    def _from_the_longest(self) -> Iterator[FieldColumns]:
-        """No field, then each length with all shares, computed when reached."""
-        shares = np.array(SHARES)
-        for length in (0.0, *sorted(LENGTHS_MM, reverse=True)):
-            chosen = shares[(shares > 0) == (length > 0)]
-            if not len(chosen):
-                continue
-            if length not in self._lengths:
-                cosines = self.window.cosines**2  # a share of 0, the same for every length, has no directions
-                none = Whitening(float(np.mean(LENGTHS_MM)), np.zeros((cosines, 0)), np.zeros(0))
-                self._lengths[length] = self._columns(self.window.field(length) if length else none, chosen)
-            yield self._lengths[length]
+        return self.linear.without_structure()[1]
 
     def field_summary(self, theta: FloatArray) -> dict[str, float]:
         """Evidence-weighted correlation length (mm) and share of a cell's error variance in the field, at one shape."""
@@ -431,9 +359,10 @@ class CollapsedTarget:
         Log of prior times evidence (m, h), and of `LinearSolution` the amplitudes (m, h, v), their power (m, h, v, v),
         by how much the level falls with each (m, h, v), and the sum of squares (m, h).
         """
-        parts = []
-        for one in map(joined, self._parts(theta)):
-            parts.append((one.evidence, one.amplitude, one.power, one.level_slope[..., 0], one.sum_of_squares))
+        parts = [
+            (one.evidence, one.amplitude, one.power, one.level_slope[..., 0], one.sum_of_squares)
+            for one in self._solutions(theta)
+        ]
         return tuple(np.concatenate(part) for part in zip(*parts, strict=True))
 
     def draw_linear(
@@ -445,14 +374,14 @@ class CollapsedTarget:
         """
         unique, back = distinct_rows(theta)
         evidence, centre, power, slope, squares = (solved or self.conditional)(unique)
-        c = len(self._plain) - 1
+        c = len(self.linear.plain) - 1
         at_zero = np.concatenate([np.einsum("hd,hd->h", one.inverse[:, 0], one.gram[:, :c, c]) for one in self.fields])
         level_variance = np.concatenate([one.inverse[:, 0, 0] for one in self.fields])
         h = choose(evidence[back], rng)
         tau2 = squares[back, h] / rng.chisquare(self.dof, size=len(theta))
         amplitude = self._draw_amplitudes(centre[back, h], power[back, h], tau2, rng)
         about = np.sqrt(tau2 * level_variance[h]) * rng.standard_normal(len(theta))
-        level = (self._mean + at_zero)[h] - np.sum(slope[back, h] * amplitude, axis=1) + about
+        level = (self.linear.mean + at_zero)[h] - np.sum(slope[back, h] * amplitude, axis=1) + about
         return amplitude, level, np.sqrt(tau2 * self.window.variance.mean())
 
     def _draw_amplitudes(
@@ -470,7 +399,7 @@ class CollapsedTarget:
 
     def tilt_log_odds(self, theta: FloatArray) -> float:
         """Log Bayes factor of a slope against none at one shape: the Savage-Dickey ratio of its components at 0."""
-        solution = self._solve(theta[None])
+        (solution,) = self._solutions(theta[None])
         weight = solution.evidence[0] - np.logaddexp.reduce(solution.evidence[0])
         slope = solution.level_slope[0][:, :, 1:3]
         mean = solution.level[:, 1:3] - np.einsum("hv,hvc->hc", solution.amplitude[0], slope)
@@ -484,7 +413,7 @@ class CollapsedTarget:
 
     def amplitude_at(self, theta: FloatArray) -> float:
         """Posterior mean of the bump's amplitude at one shape."""
-        solution = self._solve(theta[None])
+        (solution,) = self._solutions(theta[None])
         weight = np.exp(solution.evidence[0] - np.logaddexp.reduce(solution.evidence[0]))
         return float(weight @ solution.amplitude[0, :, 0])
 
@@ -494,8 +423,9 @@ class CollapsedTarget:
 
     def products_by_field(self, one: FloatArray, other: FloatArray) -> FloatArray:
         """(h, v, w) inner products of (v, n) and (w, n) cell values under each noise field."""
-        low = [self.window.project(self.window.on_grid(vectors), self._weighted_plain).low for vectors in (one, other)]
-        independent, products = (one / self.window.variance) @ other.T, []
+        window = self.window
+        low = [window.project(window.on_grid(vectors), self.linear.weighted).low for vectors in (one, other)]
+        independent, products = (one / window.variance) @ other.T, []
         for columns in self.fields:
             first, second = (vectors @ columns.field.turn for vectors in low)
             products += [independent - (first * weight) @ second.T for weight in columns.weight.T]
@@ -512,60 +442,33 @@ class CollapsedTarget:
         Fields are those settled; the scene has one structure.
         """
         (bump,) = self.scene.templates(theta[None], self.window)
-        alone, beside = (self.window.project(one, self._weighted_plain) for one in (bump, templates))
+        (alone,), _ = self.linear.projected([bump])
+        (beside,), _ = self.linear.projected([templates])
         product = self.window.product(bump, templates)
         base, with_it = [], []
         for columns in self.fields:
             one, other = Inner.of(alone, columns), Inner.of(beside, columns)
-            base.append(self._found([one], None, columns).evidence[0])
+            base.append(self.linear.solve([one], None, columns).evidence[0])
             cross = one.product(other, product, columns)
-            both = [one.repeated(len(product)), other]
-            with_it.append(solve(both, cross, columns, dof=self.dof - 1, amplitude_sd=self.amplitude_sd).evidence)
+            with_it.append(self.linear.solve([one.repeated(len(product)), other], cross, columns).evidence)
         gained = np.logaddexp.reduce(np.concatenate(with_it, axis=1), axis=1)
         return np.asarray(gained - np.logaddexp.reduce(np.concatenate(base)))
 
-    def _columns(self, field: Whitening, shares: FloatArray) -> FieldColumns:
-        """Level, tilt and data under the fields of one length; without a field, all lengths are one."""
-        log_prior = -float(np.log(len(LENGTHS_MM) * len(SHARES)))
-        if not shares.any():
-            log_prior += float(np.log(len(LENGTHS_MM)))
-        return FieldColumns.of(
-            field, shares, log_prior=log_prior, plain_low=self._plain_low, plain_gram=self._plain_gram
-        )
-
-    def _parts(self, theta: FloatArray) -> Iterator[list[LinearSolution]]:
-        """Blocks of (m, p) vectors, each solved under every length; large where they share a basis."""
+    def _solutions(self, theta: FloatArray) -> Iterator[LinearSolution]:
+        """Blocks of (m, p) vectors, solved under every field; large where they share a basis."""
+        fields = self.fields
         size = SPANNED if len(theta) >= LEAST_BUMPS and self.scene.separable else BLOCK
         for i in range(0, len(theta), size):
             points = theta[i : i + size]
-            if len(points) >= LEAST_BUMPS and (spanned := self._spanned(points)) is not None:
-                yield [self._found([spanned.inner(columns)], None, columns) for columns in self.fields]
-                continue
+            if len(points) >= LEAST_BUMPS:
+                (bumps,) = self.scene.templates(points, self.window)
+                assert isinstance(bumps, Profiles)
+                spanned = Spanned.of(bumps, self.linear)
+                if spanned is not None:
+                    yield spanned.solution(fields)
+                    continue
             for j in range(0, len(points), BLOCK):
-                projected, cross = self._projected(points[j : j + BLOCK])
-                yield [self._under(projected, cross, columns) for columns in self.fields]
-
-    def _projected(self, theta: FloatArray) -> tuple[list[Projected], FloatArray | None]:
-        """Inner products of each structure's templates at (m, p) vectors, and of two structures with each other."""
-        return self.window.projected(self.scene.templates(theta, self.window), self._weighted_plain)
-
-    def _spanned(self, theta: FloatArray) -> Spanned | None:
-        """Basis shared by the bumps of a separable scene; None where there is none, or where it does not save time."""
-        (bumps,) = self.scene.templates(theta, self.window)
-        assert isinstance(bumps, Profiles)
-        return Spanned.of(bumps, self.window, self._weighted_plain)
-
-    def _under(self, projected: list[Projected], cross: FloatArray | None, columns: FieldColumns) -> LinearSolution:
-        inner = [Inner.of(one, columns) for one in projected]
-        return self._found(inner, None if cross is None else inner[0].product(inner[1], cross, columns), columns)
-
-    def _found(self, inner: list[Inner], cross: FloatArray | None, columns: FieldColumns) -> LinearSolution:
-        return solve(inner, cross, columns, dof=self.dof, amplitude_sd=self.amplitude_sd)
-
-    def _solve(self, theta: FloatArray) -> LinearSolution:
-        """Solutions under all fields at a few vectors."""
-        (solutions,) = self._parts(theta)
-        return joined(solutions)
+                yield self.linear.under_each(self.scene.templates(points[j : j + BLOCK], self.window), fields)
 
 
 def choose(evidence: FloatArray, rng: np.random.Generator) -> IndexArray:

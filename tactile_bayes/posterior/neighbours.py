@@ -21,8 +21,8 @@ from tactile_bayes.posterior.fit import (
     odds,
     retested,
 )
-from tactile_bayes.posterior.marginal import BLOCK
-from tactile_bayes.posterior.window import APART, REACH_IN_RADII, Neighbour, Problem, Scene, neighbour_templates
+from tactile_bayes.posterior.marginal import APART, BLOCK, REACH_IN_RADII, Neighbour, Scene, neighbour_templates
+from tactile_bayes.posterior.window import Problem
 from tactile_bayes.presets import SceneAsked
 
 # --- Check of structures at the window's rim against the map around it.

@@ -18,9 +18,9 @@ from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior.bump import covered_share, map_ends, on_map, trusted, value_scale, window_cells
 from tactile_bayes.posterior.detection import Detection
 from tactile_bayes.posterior.draw import DETECTED, ModalBump
-from tactile_bayes.posterior.marginal import CollapsedTarget
+from tactile_bayes.posterior.marginal import CollapsedTarget, Scene
 from tactile_bayes.posterior.white import AT_RIM, LEAST_COVERED_SHARE, LEAST_WIDTH_IN_CELLS, MOST_AXIS_RATIO, Candidate
-from tactile_bayes.posterior.window import Problem, Scene, Window, independent_variance
+from tactile_bayes.posterior.window import Problem, Window, independent_variance
 from tactile_bayes.presets import FIELD_COSINES, FIT_RADIUS_MM
 
 # --- Probability that a rise of a map is a lump, calibrated on simulated exams with and without one.

@@ -1,14 +1,27 @@
-"""A fit window: the grid of its cells, the noise field on it, and the scenes that it may hold."""
+r"""A fit window: its grid, the noise fields on it, and level, tilt and amplitudes integrated out under them.
+
+For one noise field h (length and share) the map is linear in level, tilt and amplitudes given the places and widths.
+With flat priors on level and tilt, a normal one of variance s^2 on each of v amplitudes and the Jeffreys prior on the
+noise scale,
+
+.. math::
+    p(y \mid \theta, h) \propto |C_h|^{-1/2}\, |X^T C_h^{-1} X|^{-1/2}\, |P|^{-1/2}\,
+        \Gamma(\nu/2)\,(\pi S)^{-\nu/2}\; N(\hat a;\, 0,\, s^2 + P^{-1} S / \nu), \qquad \nu = n - c - v,
+
+X the c columns of level and tilt, P the amplitudes' precision and S the generalised least-squares sum of squares. Only
+the last factor is approximate: the prior is taken at the mean noise scale. Fields are mixed with their evidence.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Final, Literal
+from collections.abc import Callable, Iterator
+from functools import cached_property
+from math import lgamma, log, pi
 
 import numpy as np
 
-from tactile_bayes.declarations import Record
-from tactile_bayes.geometry import BoolArray, FloatArray
+from tactile_bayes.declarations import Record, names_of
+from tactile_bayes.geometry import FloatArray
 from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior.bump import FitCells, cell_mean_gaussian, covariance_from_log_widths
 from tactile_bayes.posterior.white import WIDEST_IN_RADII
@@ -193,11 +206,6 @@ class Window:
         square = np.einsum("mr,mr->m", rows**2, columns**2 @ self.weight.T)
         return Projected(low, with_plain, square)
 
-    def projected(self, templates: list[Templates], plain: FloatArray) -> tuple[list[Projected], FloatArray | None]:
-        """`project` of one or two structures' templates, and the `product` of two."""
-        cross = self.product(*templates) if len(templates) == 2 else None
-        return [self.project(one, plain) for one in templates], cross
-
     def product(self, one: Templates, other: Templates) -> FloatArray:
         """(m,) inner products of templates with templates, pairwise."""
         if isinstance(one, Profiles) and isinstance(other, Profiles):
@@ -279,203 +287,6 @@ def cell_mean_profile(distance_mm: FloatArray, *, sigma_mm: FloatArray, cell_mm:
     return np.asarray(gaussian * (1.0 - cell_mm**4 / 2880.0 * fourth))
 
 
-# --- The fit problem that all scenes of one window share: cells, prior and bounds.
-
-
-class Problem(Record, eq=False):
-    """A window with its cells, and the assumptions about a bump in it."""
-
-    window: Window  #: The cells; scenes share one, and with it the noise fields.
-    prior: BumpPrior  #: On widths and amplitudes.
-    radius_mm: float  #: Radius of the window; bounds the centre about the window's middle.
-    amplitude_scale: float = 1.0  #: Unit of the amplitudes' prior, see `bump.value_scale`.
-    departure: FloatArray | None = None  #: (k, n) array: Further fixed columns, see `fit.ask_departure`; None for none.
-
-    @property
-    def widest_mm(self) -> float:
-        """Upper bound of the widths."""
-        return WIDEST_IN_RADII * self.radius_mm
-
-
-# --- Scenes: the structures that a fit window may hold, with their parameters and prior.
-#
-# Or a ridge in the bump's place: what a lump's evidence is held against where a ridge is to be feared.
-
-Shape = Literal["round", "ellipse", "rotated", "ridge"]
-Neighbour = Literal["second lump", "rib"]
-Extra = Literal[Neighbour, ""]
-REACH_IN_RADII = 1.5
-"""How far from the window's middle a second structure is looked for: beyond its rim a flank still shows."""
-APART = 2.0
-"""A second lump lies at least this many widths from the first: closer, two Gaussians have one top. A rib may run under
-the bump if it is no more than this many times as wide: a wider one is the level's own curve."""
-STEP = {
-    "u": 0.06,
-    "v": 0.06,
-    "r": 0.06,
-    "x": 0.3,
-    "y": 0.3,
-    "x2": 0.6,
-    "y2": 0.6,
-    "w2": 0.15,
-    "angle": 0.08,
-    "offset": 0.6,
-    "along": 0.08,
-    "across": 0.6,
-}
-"""About one posterior standard deviation of each parameter: steps of the search for the mode."""
-
-_BUMP_NAMES: Final[Mapping[Shape, tuple[str, ...]]] = {
-    "round": ("u", "x", "y"),
-    "ellipse": ("u", "v", "x", "y"),
-    "rotated": ("u", "v", "x", "y", "r"),
-    "ridge": ("u", "along", "across"),
-}
-_NEIGHBOUR_NAMES: Final[Mapping[Extra, tuple[str, ...]]] = {
-    "": (),
-    "second lump": ("x2", "y2", "w2"),
-    "rib": ("angle", "offset", "w2"),
-}
-
-
-class Scene(Record):
-    """Structures in a model.
-
-    The parameters are ``u, v, x, y`` (logs of the widths while nothing is turned, and the centre), without v for a
-    round bump, with r for a turned one; then ``x2, y2, w2`` (centre and log width of a second round lump) or
-    ``angle, offset, w2`` (a ridge). A ridge in the bump's place has ``u, along, across``: log width, angle, offset.
-    """
-
-    shape: Shape = "ellipse"  #: Shape of the bump.
-    tilt: bool = True  #: The level may slope.
-    extra: Extra = ""  #: Structure beside the bump.
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the shape parameters, the most important first (see `importance`)."""
-        return _BUMP_NAMES[self.shape] + _NEIGHBOUR_NAMES[self.extra]
-
-    @property
-    def steps(self) -> FloatArray:
-        """(p,) typical small step of each parameter."""
-        return np.array([STEP[name] for name in self.names])
-
-    @property
-    def own(self) -> int:
-        """Number of the bump's own parameters, which are the first."""
-        return len(_BUMP_NAMES[self.shape])
-
-    def column(self, theta: FloatArray, name: str) -> FloatArray:
-        """(...) values of one parameter of (..., p) vectors; those that the scene does not have are 0, v is u."""
-        if name in self.names:
-            return np.asarray(theta[..., self.names.index(name)])
-        return self.column(theta, "u") if name == "v" else np.zeros(theta.shape[:-1])
-
-    def widths(self, theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """p, q, r (see `covariance_from_log_widths`) of (..., p) vectors."""
-        u, v = self.column(theta, "u"), self.column(theta, "v")
-        return (u + v) / 2.0, (u - v) / 2.0, self.column(theta, "r")
-
-    def carried(self, theta: FloatArray, other: Scene) -> FloatArray:
-        """Convert a vector to another scene: shared parameters keep their values, others are 0."""
-        p, _, _ = self.widths(theta)
-        values = {name: self.column(theta, name) for name in other.names}
-        if other.shape == "round":
-            values["u"] = p
-        return np.array([values[name] for name in other.names])
-
-    @property
-    def separable(self) -> bool:
-        """True for a scene that is only a bump along the grid's axes: the product of a profile along each."""
-        return self.shape in ("round", "ellipse") and not self.extra
-
-    def templates(self, theta: FloatArray, window: Window) -> list[Templates]:
-        """Templates of the bump, and of the second structure if there is one, for (m, p) vectors."""
-        p, q, r = self.widths(theta)
-        if self.shape == "ridge":
-            along, across = self.column(theta, "along"), self.column(theta, "across")
-            templates: list[Templates] = [window.ridges(along, across, log_width=p)]
-        else:
-            x, y = self.column(theta, "x"), self.column(theta, "y")
-            templates = [window.bumps(x, y, p=p, q=q, r=r if self.shape == "rotated" else None)]
-        if self.extra:
-            beside = (self.column(theta, name) for name in _NEIGHBOUR_NAMES[self.extra])
-            templates.append(neighbour_templates(window, self.extra, *beside))
-        return templates
-
-    def log_prior(self, theta: FloatArray, problem: Problem) -> FloatArray:
-        """(m,) normalised log prior of the shape; -inf outside the window and where a bump is wider than it."""
-        prior, middle, radius_mm = problem.prior, problem.window.middle, problem.radius_mm
-        p, q, r = self.widths(theta)
-        ratio = np.hypot(q, r)
-        total = log_normal_density(p, np.log(prior.width_median_mm), prior.log_width_sd)
-        if self.shape == "ridge":
-            inside, volume = ridge_place(self.column(theta, "across"), radius_mm)
-        else:
-            x, y = self.column(theta, "x") - middle[0], self.column(theta, "y") - middle[1]
-            inside, volume = np.hypot(x, y) <= radius_mm, np.pi * radius_mm**2
-        inside, total = inside & (p + ratio <= np.log(problem.widest_mm)), total - np.log(volume)
-        if self.shape in ("ellipse", "rotated"):
-            # q is half of u - v, p half of their sum: the volume of (u, v) is twice that of (p, q)
-            total = total + log_normal_density(q, 0.0, prior.log_ratio_sd) - np.log(2.0)
-        if self.shape == "rotated":
-            total = total + log_normal_density(r, 0.0, prior.log_ratio_sd)
-        if self.extra:
-            beside, allowed = self._log_prior_beside(theta, problem)
-            total, inside = total + beside, inside & allowed & (self.column(theta, "w2") <= np.log(problem.widest_mm))
-        return np.where(inside, total, -np.inf)
-
-    def _log_prior_beside(self, theta: FloatArray, problem: Problem) -> tuple[FloatArray, BoolArray]:
-        """Log prior of the second structure (its amplitude's is in the target), and whether its place is allowed."""
-        prior, middle, radius_mm = problem.prior, problem.window.middle, problem.radius_mm
-        w, reach = self.column(theta, "w2"), REACH_IN_RADII * radius_mm
-        total = log_normal_density(w, np.log(prior.width_median_mm), prior.log_width_sd)
-        if self.extra == "rib":
-            allowed, volume = ridge_place(self.column(theta, "offset"), radius_mm)
-            if self.shape != "ridge":
-                allowed &= self.rib_apart(theta, middle)
-            return total - np.log(volume), allowed
-        x2, y2 = self.column(theta, "x2"), self.column(theta, "y2")
-        allowed = np.hypot(x2 - middle[0], y2 - middle[1]) <= reach
-        if self.shape != "ridge":
-            away = np.hypot(x2 - self.column(theta, "x"), y2 - self.column(theta, "y"))
-            p, _, _ = self.widths(theta)
-            allowed &= away >= APART * np.exp(np.maximum(p, w))
-        return total - np.log(np.pi * reach**2), allowed
-
-    def rib_apart(self, theta: FloatArray, middle: tuple[float, float]) -> BoolArray:
-        """(m,) whether a rib is clear of the bump, or at most `APART` times as wide."""
-        p, _, _ = self.widths(theta)
-        return np.asarray(self.rib_clear(theta, middle) | (self.column(theta, "w2") - p <= np.log(APART)))
-
-    def rib_clear(self, theta: FloatArray, middle: tuple[float, float]) -> BoolArray:
-        """(m,) whether a rib lies `APART` widths, of it or the bump, from the bump's centre."""
-        angle, (p, _, _) = self.column(theta, "angle"), self.widths(theta)
-        x, y = self.column(theta, "x") - middle[0], self.column(theta, "y") - middle[1]
-        away = np.abs(self.column(theta, "offset") - x * np.cos(angle) - y * np.sin(angle))
-        return np.asarray(away >= APART * np.exp(np.maximum(p, self.column(theta, "w2"))))
-
-
-def neighbour_templates(
-    window: Window, extra: Neighbour, one: FloatArray, two: FloatArray, log_width: FloatArray
-) -> Templates:
-    """Templates of m second structures: lumps at ``x2, y2``, or ribs of ``angle, offset``, each an (m,) array."""
-    if extra == "rib":
-        return window.ridges(one, two, log_width=log_width)
-    return window.bumps(one, two, p=log_width, q=np.zeros_like(log_width), r=None)
-
-
-def ridge_place(offset: FloatArray, radius_mm: float) -> tuple[BoolArray, float]:
-    """(m,) whether ridges may lie this far from the window's middle, and the volume of angles and offsets."""
-    reach = REACH_IN_RADII * radius_mm
-    return np.abs(offset) <= reach, float(np.pi * 2.0 * reach)
-
-
-def log_normal_density(value: FloatArray, mean: float, sd: float) -> FloatArray:
-    """(...) log density of a normal distribution."""
-    return np.asarray(-0.5 * ((value - mean) / sd) ** 2 - np.log(sd * np.sqrt(2.0 * np.pi)))
-
-
 def independent_variance(cells: FitCells) -> FloatArray:
     """(n,) independent variance of the cells, mean 1: reading variance over count where readings were counted."""
     variance = 1.0 / cells.count if cells.reading_variance > 0 else np.ones(len(cells))
@@ -490,3 +301,284 @@ def linear_columns(cells: FitCells, *, tilt: bool) -> FloatArray:
     x, y = cells.x_mm - cells.x_mm.mean(), cells.y_mm - cells.y_mm.mean()
     size = max(float(np.abs(x).max()), float(np.abs(y).max()), 1e-6)
     return np.concatenate([ones, np.stack([x, y]) / size])
+
+
+# --- The fit problem that all scenes of one window share: cells, prior and bounds.
+
+
+class Problem(Record, eq=False, dict=True):
+    """A window with its cells, and the assumptions about a bump in it."""
+
+    window: Window  #: The cells; scenes share one, and with it the noise fields.
+    prior: BumpPrior  #: On widths and amplitudes.
+    radius_mm: float  #: Radius of the window; bounds the centre about the window's middle.
+    amplitude_scale: float = 1.0  #: Unit of the amplitudes' prior, see `bump.value_scale`.
+    departure: FloatArray | None = None  #: (k, n) array: Further fixed columns, see `fit.ask_departure`; None for none.
+
+    @cached_property
+    def widest_mm(self) -> float:
+        """Upper bound of the widths."""
+        return WIDEST_IN_RADII * self.radius_mm
+
+
+# --- Solutions for the linear parameters (amplitudes, level, tilt) given the shape, for many shapes and noise fields.
+
+FLOOR = 1e-9
+"""Share of the data's sum of squares that is noise in any case: 3e-5 of the signal, less than any sensor's steps.
+Without it a map free of noise leaves differences of large sums, which are rounding."""
+
+LEAST_POWER = 1e-9
+"""Power of a template, over what the prior on its amplitude is worth: less tells nothing and would only overflow."""
+
+
+class LinearSolution(Record, eq=False):
+    """Conditional posterior of the linear parameters for m shapes and h fields: a multivariate t."""
+
+    evidence: FloatArray  #: (m, h) array: Log of the fields' prior times their evidence.
+    amplitude: FloatArray  #: (m, h, v) array: Conditional means under a flat prior.
+    power: FloatArray  #: (m, h, v, v) array: Their precision times tau^2.
+    level: FloatArray
+    level_covariance: FloatArray
+    """`level`, `level_covariance` (h, c), (h, c, c) arrays: Level and tilt at amplitudes of 0, and their covariance
+    over tau^2 given the amplitudes."""
+    level_slope: FloatArray  #: (m, h, v, c) array: By how much level and tilt fall as an amplitude rises.
+    sum_of_squares: FloatArray  #: (m, h) array.
+
+
+class FieldColumns(Record, eq=False):
+    """Fixed columns and data under the noise fields of one length: the part that does not depend on the shape."""
+
+    field: Whitening  #: The length.
+    shares: FloatArray  #: (h,) array.
+    log_prior: float  #: Log prior probability of each share.
+    weight: FloatArray
+    """(k, h) array: Of the squared projections that the field takes away, ``rho / (1 + rho lambda)``; a column a share.
+    """
+    plain: FloatArray  #: (k, h * (c + 1)) array: Projections of the fixed columns and the data, so weighted.
+    gram: FloatArray  #: (h, c + 1, c + 1) array: Columns and data with each other.
+    inverse: FloatArray  #: (h, c, c) array: Of the columns' part.
+    log_det: FloatArray  #: (h,) array: Log determinant of the covariance (over that of D) and of the columns' part.
+    floor: float  #: Sum of squares that is noise in any case.
+
+    def rest(self) -> FloatArray:
+        """(h,) residual sum of squares of the fixed columns alone."""
+        c = self.inverse.shape[1]
+        right = self.gram[:, :c, c]
+        return np.asarray(self.gram[:, c, c] - np.einsum("hc,hcd,hd->h", right, self.inverse, right))
+
+    def null_evidence(self, *, dof: int) -> FloatArray:
+        """(h,) log prior plus log evidence of the fixed columns alone."""
+        squares = np.maximum(self.rest(), 0.0) + self.floor
+        return self.log_prior - 0.5 * self.log_det + lgamma(dof / 2) - 0.5 * dof * np.log(pi * squares)
+
+
+class Inner(Record, eq=False):
+    """Inner products of m templates under the noise fields of one length with h shares."""
+
+    plain: FloatArray  #: (m, h, c + 1) array: With the fixed columns and the data.
+    square: FloatArray  #: (m, h) array: With themselves.
+    low: FloatArray
+    """(m, k) array: Projections on the field's directions; none where templates are never held against others."""
+
+    @classmethod
+    def of(cls, projected: Projected, columns: FieldColumns) -> Inner:
+        """Inner products from those without a field."""
+        low = projected.low @ columns.field.turn
+        taken = (low @ columns.plain).reshape(len(low), len(columns.shares), -1)
+        return cls(projected.plain[:, None, :] - taken, projected.square[:, None] - low**2 @ columns.weight, low)
+
+    def repeated(self, number: int) -> Inner:
+        """Each template's inner products, repeated."""
+        return Inner(*(np.repeat(one, number, axis=0) for one in (self.plain, self.square, self.low)))
+
+    def product(self, other: Inner, product: FloatArray, columns: FieldColumns) -> FloatArray:
+        """(m, h) inner products with other templates, from their (m,) products without the field."""
+        return np.asarray(product[:, None] - (self.low * other.low) @ columns.weight)
+
+
+NEGLIGIBLE = 1e-3
+"""Fields with a smaller share of the evidence are left out of the mixture; what they add at the mode is made up for.
+Once a length has as little, and less than the one before it, shorter ones are not looked at."""
+
+
+class LinearModel:
+    """Level, tilt and data of a window, and what is linear in them with templates, under each noise field."""
+
+    def __init__(self, problem: Problem, *, tilt: bool) -> None:
+        self.window = window = problem.window
+        self.amplitude_sd = problem.prior.amplitude_sd * problem.amplitude_scale
+        # without its mean, a large level does not cost the digits that the bump is in
+        self.mean = float(np.mean(window.cells.value))
+        fixed = [linear_columns(window.cells, tilt=tilt)]
+        fixed += [] if problem.departure is None else [problem.departure]
+        self.plain = np.concatenate([*fixed, (window.cells.value - self.mean)[None]])
+        scaled = self.plain / window.variance
+        self.weighted = window.on_grid(scaled)
+        self._gram = self.plain @ scaled.T
+        self._low = window.project(window.on_grid(self.plain), self.weighted).low
+        self._lengths: dict[float, FieldColumns] = {}
+
+    def dof(self, structures: int) -> int:
+        """Degrees of freedom of the noise scale beside so many structures."""
+        return max(len(self.plain[0]) - len(self.plain) + 1 - structures, 1)
+
+    def columns(self, field: Whitening, shares: FloatArray) -> FieldColumns:
+        """Level, tilt and data under the fields of one length; without a field, all lengths are one."""
+        log_prior = -float(np.log(len(LENGTHS_MM) * len(SHARES)))
+        log_prior += 0.0 if shares.any() else float(np.log(len(LENGTHS_MM)))
+        low, power = self._low @ field.turn, shares[:, None] * field.eigenvalues
+        weight = shares[:, None] / (1.0 + power)
+        weighted = low * weight[:, None, :]
+        gram = self._gram - weighted @ low.T
+        c = len(self.plain) - 1
+        inverse: FloatArray = np.asarray(np.linalg.inv(gram[:, :c, :c]), dtype=np.float64)
+        volume: FloatArray = np.asarray(np.linalg.slogdet(gram[:, :c, :c])[1], dtype=np.float64)
+        plain = np.ascontiguousarray(weighted.reshape(len(shares) * (c + 1), low.shape[1]).T)
+        log_det = np.log1p(power).sum(axis=-1) + volume
+        floor = FLOOR * float(self._gram[c, c]) + 1e-300
+        return FieldColumns(
+            field, shares, log_prior, np.ascontiguousarray(weight.T), plain, gram, inverse, log_det, floor
+        )
+
+    def every_field(self) -> Iterator[FieldColumns]:
+        """No field, then each length from the longest on with all shares, computed when reached."""
+        shares = np.array(SHARES)
+        for length in (0.0, *sorted(LENGTHS_MM, reverse=True)):
+            chosen = shares[(shares > 0) == (length > 0)]
+            if not len(chosen):
+                continue
+            if length not in self._lengths:
+                cosines = self.window.cosines**2  # a share of 0, the same for every length, has no directions
+                none = Whitening(float(np.mean(LENGTHS_MM)), np.zeros((cosines, 0)), np.zeros(0))
+                self._lengths[length] = self.columns(self.window.field(length) if length else none, chosen)
+            yield self._lengths[length]
+
+    def with_evidence(self, templates: list[Templates]) -> tuple[list[FieldColumns] | None, float]:
+        """The fields with evidence beside one template of each structure, and the log evidence that the others add.
+
+        None and 0 where no field has any.
+        """
+        projected, cross = self.projected(templates)
+        walked, total = self._walk(lambda columns: self.under(projected, cross, columns).evidence[0])
+        if not np.isfinite(total):
+            return None, 0.0
+        kept = [(columns, one > total + np.log(NEGLIGIBLE)) for columns, one in walked]
+        fields = [
+            self.columns(columns.field.pruned(float(columns.shares[keep].max())), columns.shares[keep])
+            for columns, keep in kept
+            if keep.any()
+        ]
+        left = np.concatenate([self.under(projected, cross, columns).evidence[0] for columns in fields])
+        return fields, total - float(np.logaddexp.reduce(left))
+
+    def without_structure(self) -> tuple[list[FieldColumns], float]:
+        """The lengths with evidence for level and tilt alone, with all their shares, and the whole of the log
+        evidence."""
+        walked, total = self._walk(lambda columns: columns.null_evidence(dof=self.dof(0)))
+        return [columns for columns, one in walked if one.max() > total + np.log(NEGLIGIBLE)], total
+
+    def _walk(
+        self, evidence: Callable[[FieldColumns], FloatArray]
+    ) -> tuple[list[tuple[FieldColumns, FloatArray]], float]:
+        """Evidence without a field, then from the longest length down, until it has vanished; and its log sum."""
+        walked: list[tuple[FieldColumns, FloatArray]] = []
+        best = before = -np.inf
+        for columns in self.every_field():
+            one = evidence(columns)
+            walked.append((columns, one))
+            if one.max() < min(before, best + np.log(NEGLIGIBLE)):
+                break
+            best = max(best, float(one.max()))
+            before = float(one.max()) if columns.shares[0] > 0 else -np.inf
+        return walked, float(np.logaddexp.reduce(np.concatenate([one for _, one in walked])))
+
+    def projected(self, templates: list[Templates]) -> tuple[list[Projected], FloatArray | None]:
+        """Inner products of one or two structures' templates, and those of two with each other."""
+        cross = self.window.product(*templates) if len(templates) == 2 else None
+        return [self.window.project(one, self.weighted) for one in templates], cross
+
+    def under_each(self, templates: list[Templates], fields: list[FieldColumns]) -> LinearSolution:
+        """Solutions for each structure's (m,) templates under all fields."""
+        projected, cross = self.projected(templates)
+        return joined([self.under(projected, cross, columns) for columns in fields])
+
+    def under(self, projected: list[Projected], cross: FloatArray | None, columns: FieldColumns) -> LinearSolution:
+        """The same under the fields of one length, from inner products without a field."""
+        inner = [Inner.of(one, columns) for one in projected]
+        return self.solve(inner, None if cross is None else inner[0].product(inner[1], cross, columns), columns)
+
+    def solve(self, inner: list[Inner], cross: FloatArray | None, columns: FieldColumns) -> LinearSolution:
+        """Solutions under one length: `inner` of each structure's (m,) templates, `cross` (m, h) of two with each
+        other."""
+        c, dof = columns.inverse.shape[1], self.dof(len(inner))
+        plain = [one.plain for one in inner]
+        to_level = [np.matmul(one[:, :, None, :c], columns.inverse)[:, :, 0] for one in plain]
+        right = columns.gram[:, :c, c]
+        along = [one[:, :, c] - np.sum(t * right, axis=2) for one, t in zip(plain, to_level, strict=True)]
+
+        def power(i: int, j: int, product: FloatArray) -> FloatArray:
+            return np.asarray(product - np.sum(to_level[i] * plain[j][:, :, :c], axis=2))
+
+        rest, floor = columns.rest(), columns.floor
+        # a template with hardly any weight in the window, beyond its rim or between its cells, leaves the prior
+        # unchanged
+        least = LEAST_POWER * (np.maximum(rest, 0.0) + floor) / dof / self.amplitude_sd**2
+        diagonal = [np.maximum(power(i, i, one.square), least) for i, one in enumerate(inner)]
+        if cross is None:
+            structures = _one(along[0], diagonal[0], rest, floor, dof=dof, amplitude_sd=self.amplitude_sd)
+        else:
+            between = power(0, 1, cross)
+            structures = _two(along, diagonal, between, rest, floor, dof=dof, amplitude_sd=self.amplitude_sd)
+        log_factor, amplitude, matrix, squares = structures
+        constant = columns.log_prior - 0.5 * columns.log_det + lgamma(dof / 2) - 0.5 * dof * log(pi)
+        evidence = constant + log_factor - 0.5 * dof * np.log(squares)
+        # a dent is no lump: only rises have density
+        evidence = np.where((amplitude > 0).all(axis=2), evidence, -np.inf)
+        level = np.einsum("hcd,hd->hc", columns.inverse, right)
+        slope = np.stack(to_level, axis=2)
+        return LinearSolution(evidence, amplitude, matrix, level, columns.inverse, slope, squares)
+
+
+_FIELD_AXIS = {name: int(not name.startswith("level") or name == "level_slope") for name in names_of(LinearSolution)}
+
+
+def joined(solutions: list[LinearSolution]) -> LinearSolution:
+    """Concatenate the fields of several lengths."""
+    return LinearSolution(
+        *(np.concatenate([getattr(one, name) for one in solutions], axis=axis) for name, axis in _FIELD_AXIS.items())
+    )
+
+
+def _one(
+    along: FloatArray, power: FloatArray, rest: FloatArray, floor: float, *, dof: int, amplitude_sd: float
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Log factor, amplitudes, precision and sum of squares for one structure."""
+    amplitude = along / power
+    squares = np.maximum(rest - along * amplitude, 0.0) + floor
+    variance = amplitude_sd**2 + squares / dof / power
+    log_factor = -0.5 * (np.log(power) + np.log(2 * pi * variance) + (amplitude / np.sqrt(variance)) ** 2)
+    return log_factor, amplitude[..., None], power[..., None, None], squares
+
+
+def _two(
+    along: list[FloatArray],
+    diagonal: list[FloatArray],
+    off: FloatArray,
+    rest: FloatArray,
+    floor: float,
+    *,
+    dof: int,
+    amplitude_sd: float,
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """As `_one` for two structures, with the two by two matrices written out."""
+    one, two = diagonal
+    det = np.maximum(one * two - off**2, 1e-12 * one * two)
+    first, second = (two * along[0] - off * along[1]) / det, (one * along[1] - off * along[0]) / det
+    squares = np.maximum(rest - along[0] * first - along[1] * second, 0.0) + floor
+    tau2 = squares / dof
+    a, b, between = amplitude_sd**2 + tau2 * two / det, amplitude_sd**2 + tau2 * one / det, -tau2 * off / det
+    volume = a * b - between**2
+    square = (b * first**2 + a * second**2 - 2 * between * first * second) / volume
+    log_factor = -0.5 * (np.log(det) + np.log((2 * pi) ** 2 * volume) + square)
+    matrix = np.stack([np.stack([one, off], axis=-1), np.stack([off, two], axis=-1)], axis=-2)
+    return log_factor, np.stack([first, second], axis=-1), matrix, squares

@@ -20,7 +20,7 @@ from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.figure_file import figure_file, finish
 from tactile_bayes.report.paper_head import named
 from tactile_bayes.report.study import COLOURS, MARKS
-from tactile_bayes.studies import paper_tables, sbc
+from tactile_bayes.studies import model_comparison, sbc
 from tactile_bayes.studies.paper import seat_name
 from tactile_bayes.studies.tradeoffs import EMPIRICAL, PLANE, SOLID, LumpCase, Measured, SizeRule, change, cheapest
 
@@ -143,32 +143,32 @@ def sbc_figure(maps: Sequence[sbc.MapRanks], path: Path, *, force: bool = False)
 
 # --- Tables 1 and 2 of the paper as text and as plain data: ours, the nearest head's and the printed figures.
 
-ByHead = Mapping[Head, Sequence[paper_tables.Agreement]]
+ByHead = Mapping[Head, Sequence[model_comparison.Agreement]]
 
 
 def tables_text(
-    found: Sequence[paper_tables.Agreement],
-    phantoms: Sequence[paper_tables.Agreement],
+    found: Sequence[model_comparison.Agreement],
+    phantoms: Sequence[model_comparison.Agreement],
     *,
     head: Head,
     nearest: Head | None = None,
-    beside: Sequence[paper_tables.Agreement] | None = None,
+    beside: Sequence[model_comparison.Agreement] | None = None,
 ) -> str:
     """Both tables, the widths and amplitudes of the ten lumps, and the phantoms, under `head`.
 
     `nearest` is the head nearest to the printed tables, `beside` its ten lumps; None where there is none, or it is
     `head`.
     """
-    lines = [f"mean MSD: {_answer(found, beside)}", "", paper_tables.DEFINITION, "", f"head: {named(head)}"]
+    lines = [f"mean MSD: {_answer(found, beside)}", "", model_comparison.DEFINITION, "", f"head: {named(head)}"]
     if nearest is not None and beside is not None:
         lines.append(f"after the slash the head nearest to the print: {named(nearest)}")
     lines += ["in brackets the printed figure", ""]
     lines += _table(
-        "Table 1: frame centred on the lump, MSD %", "centred_frame", found, beside, paper_tables.PRINTED_FRAMES
+        "Table 1: frame centred on the lump, MSD %", "centred_frame", found, beside, model_comparison.PRINTED_FRAMES
     )
     lines += _table("The same of frames divided by their means, MSD %", "normalised_frame", found, beside)
     lines += _table("All frames of the map, MSD % (printed average 4.3)", "all_frames", found, beside)
-    lines += _table("Table 2: map, MSD %", "map", found, beside, paper_tables.PRINTED_MAPS)
+    lines += _table("Table 2: map, MSD %", "map", found, beside, model_comparison.PRINTED_MAPS)
     lines += _table("Map, strict MSD %", "map_strict", found, beside)
     lines += _others(found)
     lines += ["Eq 5 fitted to both maps (background 1); the elastic model first:"]
@@ -192,10 +192,10 @@ def heads_text(found: ByHead) -> str:
         "off: distance from the 20 printed cells, percentage points; shoulders outside or inside",
         f"{'head':<26}{'Table 1 (4.1)':>18}{'all (4.3)':>11}{'Table 2 (2.4)':>18}{'off':>7}",
     ]
-    for head, rows in sorted(found.items(), key=lambda item: paper_tables.table_distance(item[1])):
+    for head, rows in sorted(found.items(), key=lambda item: model_comparison.table_distance(item[1])):
         frames, maps = (_span([getattr(one, name) for one in rows]) for name in ("centred_frame", "map"))
         every, name = f"{_mean(rows, 'all_frames'):.1f}", named(head).replace("shoulders-", "")
-        lines.append(f"{name:<26}{frames:>18}{every:>11}{maps:>18}{paper_tables.table_distance(rows):>7.2f}")
+        lines.append(f"{name:<26}{frames:>18}{every:>11}{maps:>18}{model_comparison.table_distance(rows):>7.2f}")
     return "\n".join(lines)
 
 
@@ -205,17 +205,17 @@ def _span(shares: Sequence[float], to: str = " to ") -> str:
     return f"{sum(percent) / len(percent):.1f} ({low}{to}{high})"
 
 
-def _mean(found: Sequence[paper_tables.Agreement], name: str) -> float:
+def _mean(found: Sequence[model_comparison.Agreement], name: str) -> float:
     """In percent."""
     return float(sum(100 * getattr(one, name) for one in found) / len(found))
 
 
-def _answer(found: Sequence[paper_tables.Agreement], beside: Sequence[paper_tables.Agreement] | None) -> str:
+def _answer(found: Sequence[model_comparison.Agreement], beside: Sequence[model_comparison.Agreement] | None) -> str:
     """How near both tables come to the print."""
     told = []
     for words, name, printed in (
-        ("frames", "centred_frame", paper_tables.PRINTED_FRAMES),
-        ("maps", "map", paper_tables.PRINTED_MAPS),
+        ("frames", "centred_frame", model_comparison.PRINTED_FRAMES),
+        ("maps", "map", model_comparison.PRINTED_MAPS),
     ):
         nearest = "" if beside is None else f"nearest head {_mean(beside, name):.1f}, "
         told.append(f"{words} {_mean(found, name):.1f} % ({nearest}printed {_printed_mean(printed):.1f})")
@@ -227,13 +227,13 @@ def _printed_mean(printed: Mapping[float, Sequence[float]]) -> float:
     return sum(values) / len(values)
 
 
-def _others(found: Sequence[paper_tables.Agreement]) -> list[str]:
+def _others(found: Sequence[model_comparison.Agreement]) -> list[str]:
     """Results of other definitions: means over the cases with the least and the largest."""
     lines = [
         "Other definitions, %: mean (least-largest); printed 4.0-4.3, 2.2-2.7",
         f"{'':<32}{'frame':>16}{'frame / mean':>16}{'map':>16}",
     ]
-    for i, name in enumerate(paper_tables.OTHER_DEFINITIONS):
+    for i, name in enumerate(model_comparison.OTHER_DEFINITIONS):
         cells = (_span(shares, "-") for shares in zip(*(one.others[i] for one in found), strict=True))
         lines.append(f"{name.replace('root mean square', 'RMS'):<32}" + "".join(f"{cell:>16}" for cell in cells))
     return [*lines, ""]
@@ -242,12 +242,12 @@ def _others(found: Sequence[paper_tables.Agreement]) -> list[str]:
 def _table(
     title: str,
     name: str,
-    found: Sequence[paper_tables.Agreement],
-    beside: Sequence[paper_tables.Agreement] | None,
+    found: Sequence[model_comparison.Agreement],
+    beside: Sequence[model_comparison.Agreement] | None,
     printed: Mapping[float, Sequence[float]] | None = None,
 ) -> list[str]:
     """One table with diameters across: this head / the nearest head (printed)."""
-    lines = [title, f"{'h/d':>5}" + "".join(f"{f'd {d:g} mm':>15}" for d in paper_tables.TABLE_DIAMETERS_MM)]
+    lines = [title, f"{'h/d':>5}" + "".join(f"{f'd {d:g} mm':>15}" for d in model_comparison.TABLE_DIAMETERS_MM)]
     heads = [found] if beside is None else [found, beside]
     for depth in dict.fromkeys(one.scene.depth_ratio for one in found):
         of_depth = ([getattr(one, name) for one in rows if one.scene.depth_ratio == depth] for rows in heads)
@@ -264,20 +264,20 @@ def tables_document(found: ByHead, phantoms: ByHead, *, seat: float) -> dict[str
     first = next(iter(found))
     return {
         "schema": "tactile-bayes/tables/1",
-        "definition": paper_tables.DEFINITION,
-        "other_definitions": list(paper_tables.OTHER_DEFINITIONS),
+        "definition": model_comparison.DEFINITION,
+        "other_definitions": list(model_comparison.OTHER_DEFINITIONS),
         "seat": seat,
         "head": first.shoulders,
         "printed_percent": {
-            "frames": {f"{h:g}": list(row) for h, row in paper_tables.PRINTED_FRAMES.items()},
-            "maps": {f"{h:g}": list(row) for h, row in paper_tables.PRINTED_MAPS.items()},
+            "frames": {f"{h:g}": list(row) for h, row in model_comparison.PRINTED_FRAMES.items()},
+            "maps": {f"{h:g}": list(row) for h, row in model_comparison.PRINTED_MAPS.items()},
         },
         "cases": [as_dict(one) for one in found[first]],
         "phantoms": [as_dict(one) for one in phantoms[first]],
         "heads": [
             {
                 **as_dict(head),
-                "distance": paper_tables.table_distance(rows),
+                "distance": model_comparison.table_distance(rows),
                 "frames": [one.centred_frame for one in rows],
                 "all_frames": [one.all_frames for one in rows],
                 "maps": [one.map for one in rows],

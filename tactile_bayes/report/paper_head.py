@@ -17,7 +17,7 @@ from tactile_bayes.report.figure_file import figure_file, finish
 from tactile_bayes.report.study import COLOURS
 from tactile_bayes.studies.model_comparison import (
     NEAR_MM,
-    MeasuredFrames,
+    MeasuredScan,
     ModelComparison,
     centre_line,
     centre_row,
@@ -252,7 +252,7 @@ _ROWS = {
 }
 
 
-def comparison_text(measured: MeasuredFrames, found: Sequence[ModelComparison]) -> str:
+def comparison_text(measured: MeasuredScan, found: Sequence[ModelComparison]) -> str:
     """How far each model is off, then frames, maps and the bumps on them, with a few models side by side."""
     place = measured.place_mm
     lines = [
@@ -270,7 +270,7 @@ def comparison_text(measured: MeasuredFrames, found: Sequence[ModelComparison]) 
     return "\n".join(line.rstrip() for line in lines)
 
 
-def _columns(measured: MeasuredFrames, found: Sequence[ModelComparison]) -> Iterator[str]:
+def _columns(measured: MeasuredScan, found: Sequence[ModelComparison]) -> Iterator[str]:
     names = [one.fidelity.partition("-") for one in found]
     yield _cells("", "paper", *(first for first, _, _ in names))
     if any(second for _, _, second in names):
@@ -281,7 +281,7 @@ def _columns(measured: MeasuredFrames, found: Sequence[ModelComparison]) -> Iter
     slopes = np.transpose([residual_slope(measured, one) for one in found])
     for words, values in zip(_SLOPE.values(), slopes, strict=True):
         yield _cells(words, "", *(f"{value:.4f}" for value in values))
-    every: list[MeasuredFrames | ModelComparison] = [measured, *found]
+    every: list[MeasuredScan | ModelComparison] = [measured, *found]
     bumps = np.transpose([_shape(one.lump) for one in every])
     on_line = np.transpose([line_bump(measured, one.tactile_map) for one in every])
     yield ""
@@ -303,7 +303,7 @@ def _plain(value: float) -> str:
 
 
 def comparison_document(
-    measured: MeasuredFrames, found: Sequence[ModelComparison], *, inputs: dict[str, Any]
+    measured: MeasuredScan, found: Sequence[ModelComparison], *, inputs: dict[str, Any]
 ) -> dict[str, Any]:
     """The same as plain data; differences as shares, null where no bump was fitted."""
     return {
@@ -333,7 +333,7 @@ def _shape(lump: BumpFit | None) -> tuple[float, float, float]:
     return float(lump.theta[0]), sigma_x, sigma_y
 
 
-def _bumps(measured: MeasuredFrames, lump: BumpFit | None, tactile_map: TactileMap) -> dict[str, float | None]:
+def _bumps(measured: MeasuredScan, lump: BumpFit | None, tactile_map: TactileMap) -> dict[str, float | None]:
     """Eq 7 of a map, null without, and Eq 5 of its centre line."""
     amplitude, sigma_x, sigma_y = map(_number, _shape(lump))
     line = dict(zip(("line_amplitude", "line_sigma_mm"), line_bump(measured, tactile_map), strict=True))
@@ -354,7 +354,7 @@ _ALONG_MM = 6.0
 
 
 def comparison_figure(
-    measured: MeasuredFrames, found: Sequence[ModelComparison], path: Path, *, title: str, force: bool = False
+    measured: MeasuredScan, found: Sequence[ModelComparison], path: Path, *, title: str, force: bool = False
 ) -> None:
     """Draw the comparison; maps and residual are those of the first model."""
     with figure_file(path, size_in=(12.0, 8.0), foot=f"{title}.", force=force) as figure:
@@ -374,7 +374,7 @@ def comparison_figure(
 
 
 def _draw_frames(
-    axes: Axes, measured: MeasuredFrames, found: Sequence[ModelComparison], place_mm: float, letter: str
+    axes: Axes, measured: MeasuredScan, found: Sequence[ModelComparison], place_mm: float, letter: str
 ) -> None:
     """The centre line of frames whose middle lies at a distance from the lump across it, averaged."""
     off = measured.origin_mm[:, :2] - measured.place_mm
@@ -390,7 +390,7 @@ def _draw_frames(
     finish(axes, f"{letter} {words}", "position on the head (mm)", "pressure (kPa)")
 
 
-def _draw_line(axes: Axes, measured: MeasuredFrames, found: Sequence[ModelComparison]) -> None:
+def _draw_line(axes: Axes, measured: MeasuredScan, found: Sequence[ModelComparison]) -> None:
     """The map across the lump."""
     x, mean = centre_row(measured, measured.tactile_map)
     near = np.abs(x) <= NEAR_MM
@@ -404,7 +404,7 @@ def _draw_line(axes: Axes, measured: MeasuredFrames, found: Sequence[ModelCompar
 
 
 def _draw_map(
-    axes: Axes, measured: MeasuredFrames, values: FloatArray, title: str, ends: tuple[float, float], colours: str
+    axes: Axes, measured: MeasuredScan, values: FloatArray, title: str, ends: tuple[float, float], colours: str
 ) -> QuadMesh:
     made = measured.tactile_map
     mesh = axes.pcolormesh(made.x_mm, made.y_mm, values, cmap=colours, vmin=ends[0], vmax=ends[1], shading="nearest")

@@ -11,7 +11,7 @@ import numpy as np
 
 from tactile_bayes.forward.axisymmetric import LayeredBody
 from tactile_bayes.forward.plane import LineFrames, build_line
-from tactile_bayes.forward.solid import PlacedLump, SolidHead, face_of, solid_head
+from tactile_bayes.forward.simulate import PlacedLump, SolidHead, face_of, solid_head
 from tactile_bayes.forward.tissue import Layers
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.map import TactileMap
@@ -19,6 +19,13 @@ from tactile_bayes.presets import HEAD_PITCH_MM, THICKNESS_MM
 from tactile_bayes.report.figure_file import figure_file, finish
 from tactile_bayes.size.eq6 import AxisCalibration, SizeCalibration
 from tactile_bayes.size.learn.eq6 import SizeTable
+from tactile_bayes.studies.model_comparison import (
+    PHANTOMS,
+    FrameAgreement,
+    TableScene,
+    mean_squared_difference,
+    scene_curves,
+)
 from tactile_bayes.studies.paper import (
     ALIKE,
     DETECTABLE,
@@ -37,7 +44,6 @@ from tactile_bayes.studies.paper import (
     widths,
 )
 from tactile_bayes.studies.paper_solid import SolidSettings, fit_raster, raster_frames, raster_map
-from tactile_bayes.studies.paper_tables import PHANTOMS, FrameAgreement, Scene, mean_squared_difference, scene_curves
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -123,14 +129,14 @@ def study_figures(
     with _panels(paths[0], _caption("Figure 5", settings, seat), force=force) as panels:
         _frames_of_lumps(*panels, settings, seat, found)
     with _panels(paths[1], _caption("Figure 6", settings, seat), force=force) as panels:
-        _frames_and_maps(*panels, settings, Scene(PHANTOM, *phantom, seat), measured)
+        _frames_and_maps(*panels, settings, TableScene(PHANTOM, *phantom, seat), measured)
     with _panels(paths[2], _caption("Figure 7", settings, seat), force=force) as panels:
         _figure_7(*panels, of_seat, _lines_by_stiffness(settings, seat), "(a) maps, d {:g} mm, h/d {:g}", _SMALL)
     figure_8(of_seat, paths[3], force=force)
     with figure_file(paths[4], size_in=(10.0, 7.6), foot=_caption("Dotted: Eq 3", settings, seat), force=force) as four:
         # frame by frame for the phantoms of section 2.3: its curves "for four lumps"
         for axes, (d, h) in zip(four.subplots(2, 2).ravel(), PHANTOMS.values(), strict=True):
-            curves = scene_curves(Scene("", d, h, seat), settings)
+            curves = scene_curves(TableScene("", d, h, seat), settings)
             ours, theirs = curves.empirical.as_taxels(HEAD_PITCH_MM), curves.elastic.as_taxels(HEAD_PITCH_MM)
             share = 100 * mean_squared_difference(ours.pressure_kpa, theirs.pressure_kpa)
             _draw_frames(axes, theirs, ours)
@@ -241,7 +247,7 @@ def _middle_frame(head: SolidHead, lumps: Sequence[PlacedLump], settings: SolidS
 
 
 def _frames_and_maps(
-    left: Axes, right: Axes, settings: StudySettings, scene: Scene, measured: Sequence[FrameAgreement]
+    left: Axes, right: Axes, settings: StudySettings, scene: TableScene, measured: Sequence[FrameAgreement]
 ) -> None:
     """Fig 6: frames and map of a phantom, elastic and empirical; measured frames, thick, where there are any."""
     curves = scene_curves(scene, settings)

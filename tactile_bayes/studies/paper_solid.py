@@ -14,7 +14,7 @@ from tactile_bayes.forward.axisymmetric import CondensedLump, LayeredBody, conde
 from tactile_bayes.forward.mesh import LumpGeometry, MeshSize
 from tactile_bayes.forward.plane import FINENESS
 from tactile_bayes.forward.scene import Head
-from tactile_bayes.forward.solid import RANK_TOLERANCE, PlacedLump, SolidHead, face_of, skin_perturbation, solid_head
+from tactile_bayes.forward.simulate import RANK_TOLERANCE, PlacedLump, SolidHead, face_of, skin_perturbation, solid_head
 from tactile_bayes.forward.tissue import Body, SceneBody
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.accumulate import FlatField

@@ -13,8 +13,7 @@ from tactile_bayes.declarations import replace
 from tactile_bayes.errors import EXIT_BAD_DATA
 from tactile_bayes.forward.contact import Head
 from tactile_bayes.report.laboratory import heads_text, tables_text
-from tactile_bayes.studies.paper import LineFit
-from tactile_bayes.studies.paper_tables import (
+from tactile_bayes.studies.model_comparison import (
     NEAREST_HEADS,
     OTHER_DEFINITIONS,
     PRINTED_FRAMES,
@@ -27,6 +26,7 @@ from tactile_bayes.studies.paper_tables import (
     table_distance,
     table_scenes,
 )
+from tactile_bayes.studies.paper import LineFit
 
 Run = Callable[..., "CompletedProcess[str]"]
 

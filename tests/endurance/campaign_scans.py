@@ -21,7 +21,7 @@ from tactile_bayes.declarations import replace
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.scan_mcap import write_scan
 from tactile_bayes.forward.scene import Background, Noise, Scene, Strokes, frame_times, record
-from tactile_bayes.forward.solid import solid_frames
+from tactile_bayes.forward.simulate import solid_frames
 from tactile_bayes.forward.tissue import SceneBody, SolidLump
 from tactile_bayes.scans import Scan
 

@@ -21,7 +21,7 @@ from tactile_bayes.inference.importance import importance
 from tactile_bayes.inference.modes import mode_and_covariance
 from tactile_bayes.posterior.draw import Sampled, importance_draws
 from tactile_bayes.posterior.fit import FieldFit
-from tactile_bayes.posterior.window import Scene
+from tactile_bayes.posterior.marginal import Scene
 from tests.inference.test_methods import LINEAR
 from tests.posterior.correlated.test_marginal import cells_of, fitted, noise
 from tests.posterior.correlated.test_scene_draws import half_covered, strong, weak

@@ -20,18 +20,18 @@ from tactile_bayes.forward.plane import (
     lump_pressure,
     outside_range,
 )
-from tactile_bayes.studies.paper import StudySettings
-from tactile_bayes.studies.paper_tables import (
+from tactile_bayes.studies.model_comparison import (
     PHANTOMS,
     PRINTED_FRAMES,
     PRINTED_MAPS,
-    Scene,
+    TableScene,
     compare,
     mean_squared_difference,
     phantom_scenes,
     scene_curves,
     table_scenes,
 )
+from tactile_bayes.studies.paper import StudySettings
 
 S = 0.25 * (np.arange(96) - 47.5)
 MODEL = EmpiricalModel(
@@ -140,7 +140,7 @@ def quick() -> StudySettings:
 
 def test_where_the_paper_shows_agreement_there_is_some(quick: StudySettings) -> None:
     """Its first phantom, the lump resting: curves of figure 6."""
-    curves = scene_curves(Scene("first", 12.5, 0.825, 1.0), quick)
+    curves = scene_curves(TableScene("first", 12.5, 0.825, 1.0), quick)
     inner = np.abs(curves.elastic_map.x_mm) < 25
     ours, theirs = curves.empirical_map.mean[inner], curves.elastic_map.mean[inner]
     assert mean_squared_difference(ours, theirs) < 0.026
@@ -149,7 +149,7 @@ def test_where_the_paper_shows_agreement_there_is_some(quick: StudySettings) -> 
 
 def test_a_small_difference_of_squares_hides_a_wrong_bump(quick: StudySettings) -> None:
     """Decision 0007: the norm that the paper prints does not see what the strict one and the fit see."""
-    found = compare(Scene("deep", 15.5, 1.4, 0.0), settings=quick)
+    found = compare(TableScene("deep", 15.5, 1.4, 0.0), settings=quick)
     assert found.map < 0.025
     assert found.map_strict > 0.5
     assert abs(found.empirical.amplitude / found.elastic.amplitude - 1) > 0.3
@@ -168,7 +168,7 @@ SEEN = {
 def test_where_the_empirical_map_loses_a_lump_it_warns(lump: tuple[float, float]) -> None:
     """Against the plane-strain model; a lump inside the range is the negative control."""
     d, h = lump
-    found = compare(Scene("", d, h, 0.0), settings=StudySettings())
+    found = compare(TableScene("", d, h, 0.0), settings=StudySettings())
     assert (found.elastic.amplitude, found.empirical.amplitude) == pytest.approx(SEEN[lump], abs=2e-3)
     lost = found.empirical.amplitude < 0.5 * found.elastic.amplitude
     assert lost == (outside_range(d, h) is not None)

@@ -11,8 +11,8 @@ from in_process import run_here
 from tactile_bayes.actions.study import read_frames
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.presets import HEAD_PITCH_MM
+from tactile_bayes.studies.model_comparison import MeasuredFrame, compare_frames
 from tactile_bayes.studies.paper import StudySettings
-from tactile_bayes.studies.paper_tables import MeasuredFrame, compare_frames
 
 COARSE = StudySettings(fineness=1)
 LUMP = {"d_mm": 12.5, "depth_ratio": 0.825, "seat": 0.0}

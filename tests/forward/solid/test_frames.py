@@ -15,7 +15,7 @@ from tactile_bayes.forward.axisymmetric import LayeredBody, condense_lump, taxel
 from tactile_bayes.forward.contact import ContactStiffness, solve_contact
 from tactile_bayes.forward.mesh import LumpGeometry, MeshSize
 from tactile_bayes.forward.scene import Head, rotation_from_vector
-from tactile_bayes.forward.solid import PlacedLump, SkinPerturbation, SolidHead, skin_perturbation, solid_head
+from tactile_bayes.forward.simulate import PlacedLump, SkinPerturbation, SolidHead, skin_perturbation, solid_head
 from tactile_bayes.forward.tissue import HeadFace, SceneBody, head_face
 
 LEVEL = np.eye(3)

@@ -29,13 +29,13 @@ from tactile_bayes.forward.scene import (
     head_positions,
     level_kpa,
 )
-from tactile_bayes.forward.simulate import simulate
-from tactile_bayes.forward.solid import (
+from tactile_bayes.forward.simulate import (
     PlacedLump,
     SolidHead,
     condensed_lump,
     face_of,
     layers_of,
+    simulate,
     skin_perturbation,
     solid_frames,
     solid_head,

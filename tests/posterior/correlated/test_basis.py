@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from tactile_bayes.posterior import marginal as collapsed
-from tactile_bayes.posterior.marginal import CollapsedTarget, Spanned
-from tactile_bayes.posterior.window import Scene
+from tactile_bayes.posterior.marginal import CollapsedTarget, Scene, Spanned
 from tests.posterior.correlated.test_marginal import START, TURNED, cells_of, noise, target_of
 
 NEAR = 0.03
@@ -64,7 +63,8 @@ def test_a_strong_maps_bumps_are_few(monkeypatch: pytest.MonkeyPatch) -> None:
     target = target_of(cells_of(noise(0)), scene=Scene("ellipse"))
 
     def basis(spread: float, at: dict[str, float]) -> Spanned | None:
-        return target._spanned(points(target.scene, spread, at))
+        (bumps,) = target.scene.templates(points(target.scene, spread, at), target.window)
+        return Spanned.of(bumps, target.linear)
 
     few = basis(NEAR, {})
     assert few is not None

@@ -19,11 +19,11 @@ from tactile_bayes.posterior.bump import (
 )
 from tactile_bayes.posterior.draw import SamplerSettings, draw_parameters
 from tactile_bayes.posterior.fit import FieldFit, fit_scene
-from tactile_bayes.posterior.marginal import CollapsedTarget, _one
+from tactile_bayes.posterior.marginal import CollapsedTarget, Scene
 from tactile_bayes.posterior.window import (
     Problem,
-    Scene,
     Window,
+    _one,
     cosine_profiles,
     gram_of_cosines,
     independent_variance,
@@ -118,11 +118,11 @@ def test_low_rank_algebra_is_dense_algebra(scene: Scene) -> None:
     beside = {"second lump": [7.0, 6.0, 1.2], "rib": [0.7, 5.0, 1.0], "": []}[scene.extra]
     begin[len(begin) - len(beside) :] = beside
     theta = np.array([begin, begin + 0.1])
-    solution = target._solve(theta)
+    (solution,) = target._solutions(theta)
     evidence = solution.evidence
     basis, frequency2 = dense_basis(target.window)
     templates = bumps_of(target, theta)
-    level = target._plain[:-1].T
+    level = target.linear.plain[:-1].T
     data = cells.value - cells.value.mean()
     n, c, v = len(cells), level.shape[1], len(templates)
     column = 0
@@ -224,7 +224,7 @@ def test_amplitude_and_noise_come_back() -> None:
     assert level.mean() == pytest.approx(1.0, abs=0.005)
     # against dense algebra without a field: the spread of the level, and that it falls as the amplitude rises
     variance = fit.target.window.variance
-    design = np.column_stack([*fit.target._plain[:-1], bumps_of(fit.target, fit.mode[None])[0, 0]])
+    design = np.column_stack([*fit.target.linear.plain[:-1], bumps_of(fit.target, fit.mode[None])[0, 0]])
     joint = np.linalg.inv(design.T @ (design / variance[:, None]))
     white = np.sqrt(joint[0, 0]) * 0.01 / np.sqrt(variance.mean())
     assert 0.9 * white < level.std() < 3.0 * white
@@ -268,7 +268,7 @@ def test_intervals_cover(errors: dict[str, float]) -> None:
 
 
 def test_independent_errors_would_not_cover(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(collapsed, "SHARES", (0.0,))
+    monkeypatch.setattr("tactile_bayes.posterior.window.SHARES", (0.0,))
     assert coverage(15, white=0.003, field=0.02, length=4.0).max() < 0.73
 
 

@@ -28,7 +28,7 @@ def with_one_field(target: CollapsedTarget, index: int) -> CollapsedTarget:
     one = target.of_scene(target.scene)
     every = [(columns, h) for columns in target.fields for h in range(len(columns.shares))]
     columns, h = every[index]
-    one._fields = [one._columns(columns.field, columns.shares[h : h + 1])]
+    one._fields = [one.linear.columns(columns.field, columns.shares[h : h + 1])]
     return one
 
 

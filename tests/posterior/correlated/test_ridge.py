@@ -11,9 +11,9 @@ from tactile_bayes.posterior import correlated as field_estimate
 from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.fit import fit_scene
+from tactile_bayes.posterior.marginal import Scene
 from tactile_bayes.posterior.neighbours import beside_ridge, ridge_instead
 from tactile_bayes.posterior.result import Estimate
-from tactile_bayes.posterior.window import Scene
 from tests.posterior.correlated.test_selection import AXIS, bump, choose, errors, rib
 
 

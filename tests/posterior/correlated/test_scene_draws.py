@@ -18,7 +18,8 @@ from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior import draw as methods
 from tactile_bayes.posterior.draw import Sampled, SamplerSettings, disagreement, draw_parameters, importance_draws
 from tactile_bayes.posterior.fit import FieldFit, fit_scene
-from tactile_bayes.posterior.window import Problem, Scene
+from tactile_bayes.posterior.marginal import Scene
+from tactile_bayes.posterior.window import Problem
 from tests.posterior.correlated.test_marginal import cells_of, fitted, noise
 from tests.posterior.correlated.test_selection import bump, choose, errors, rib, second
 

@@ -13,8 +13,9 @@ from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior import neighbours as beside
 from tactile_bayes.posterior.bump import window_cells
 from tactile_bayes.posterior.fit import SceneChoice, Structure, choose_shape
+from tactile_bayes.posterior.marginal import Scene
 from tactile_bayes.posterior.neighbours import Surroundings, add_beside, rising_ribs
-from tactile_bayes.posterior.window import Problem, Scene, Window, independent_variance
+from tactile_bayes.posterior.window import Problem, Window, independent_variance
 
 RADIUS, HALF, SIZE = 20.0, 35.0, 71
 AXIS = np.arange(SIZE) - HALF
@@ -82,7 +83,7 @@ def test_structures_are_rarely_invented(name: str, most: float) -> None:
 
 def test_independent_errors_would_invent_them(monkeypatch: pytest.MonkeyPatch) -> None:
     """The negative control: without a field the same errors make ellipses and tilts."""
-    monkeypatch.setattr("tactile_bayes.posterior.marginal.SHARES", (0.0,))
+    monkeypatch.setattr("tactile_bayes.posterior.window.SHARES", (0.0,))
     choices = [choose(bump() + errors(3000 + seed)) for seed in range(6)]
     assert sum(asked(c, "ellipse").supported or asked(c, "tilt").supported for c in choices) >= 4
 

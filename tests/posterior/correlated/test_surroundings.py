@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from tactile_bayes.posterior.bump import SMOOTHING_MM
+from tactile_bayes.posterior.marginal import Extra
 from tactile_bayes.posterior.neighbours import CLEAR_IN_WIDTHS, LEAST_CELLS, PIECE_MM, Surroundings
-from tactile_bayes.posterior.window import Extra
 
 BUMP = {"bump_mm": (1.0, -2.0), "bump_width_mm": 4.0, "amplitude": 0.3, "middle": (0.5, 0.5)}
 
