@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 import numpy.typing as npt
@@ -57,17 +57,9 @@ class PairAngles:
         if not self._counted:
             return float(self._angles[rank - 1])
         low, high = -math.pi / 2, math.pi / 2
-        count_low, count_high = 0, self.number
-        widths = [high - low]
         while high - low > RESOLUTION:
-            share = _next_share(rank, count_low, count_high, widths)
-            middle = low + share * (high - low)
-            count = self.below(middle, inclusive=True)
-            if count >= rank:
-                high, count_high = middle, count
-            else:
-                low, count_low = middle, count
-            widths.append(high - low)
+            middle = (low + high) / 2
+            low, high = (low, middle) if self.below(middle, inclusive=True) >= rank else (middle, high)
         return high
 
     def shift(self, *, rising: bool) -> int:
@@ -77,11 +69,6 @@ class PairAngles:
         on_or_above = self.number - self.below(math.pi / 4, inclusive=False)
         return -(on_or_above + self.number - self.below(math.pi / 4, inclusive=True))
 
-    def exactly_on_the_shift(self, *, rising: bool) -> int:
-        """Number of angles exactly 45 degrees against the line."""
-        at = -math.pi / 4 if rising else math.pi / 4
-        return self.below(at, inclusive=True) - self.below(at, inclusive=False)
-
 
 def kendall_sign(x: FloatArray, y: FloatArray) -> int:
     """Sign of Kendall's tau: concordant less discordant pairs."""
@@ -90,8 +77,8 @@ def kendall_sign(x: FloatArray, y: FloatArray) -> int:
         return int(np.sign(np.sum(np.sign(x[second] - x[first]) * np.sign(y[second] - y[first]))))
     order = np.lexsort((y, x))
     discordant = _inversions(x[order], y[order], ties=False)
-    tied = _pairs_of_equals(x[order][:, None]) + _pairs_of_equals(np.sort(y)[:, None])
-    both = _pairs_of_equals(np.stack([x[order], y[order]], axis=1))
+    tied = _pairs_of_equals(x[:, None]) + _pairs_of_equals(y[:, None])
+    both = _pairs_of_equals(np.stack([x, y], axis=1))
     concordant = len(x) * (len(x) - 1) // 2 - tied + both - discordant
     return (concordant > discordant) - (concordant < discordant)
 
@@ -110,24 +97,10 @@ def _difference(a: FloatArray, b: FloatArray) -> FloatArray:
     return np.where(np.abs(difference) < _EQUAL * (np.abs(a) + np.abs(b)) / 2, 0.0, difference)
 
 
-def _next_share(rank: int, count_low: int, count_high: int, widths: Sequence[float]) -> float:
-    """Where to count next in the bracket: by interpolation, offset to alternate sides so that both ends close in.
-
-    Where that does not shrink the bracket eightfold in three steps, its middle.
-    """
-    step = len(widths)
-    if count_high == count_low or (step > 3 and widths[-1] > widths[-4] / 8):
-        return 0.5
-    share = (rank - 0.5 - count_low) / (count_high - count_low)
-    beside = 0.98 * share if step % 2 else 1 - 0.98 * (1 - share)
-    return min(0.999, max(0.001, beside))
-
-
 def _pairs_of_equals(rows: FloatArray) -> int:
-    """Number of pairs of equal rows in (n, k) sorted rows."""
-    new = np.any(rows[1:] != rows[:-1], axis=1)
-    lengths = np.diff(np.concatenate([[-1], np.flatnonzero(new), [len(rows) - 1]]))
-    return int(np.sum(lengths * (lengths - 1) // 2))
+    """Number of pairs of equal rows in (n, k) rows."""
+    _, number = np.unique(rows, axis=0, return_counts=True)
+    return int(np.sum(number * (number - 1) // 2))
 
 
 def _inversions(x: FloatArray, z: FloatArray, *, ties: bool) -> int:
@@ -210,7 +183,8 @@ def _slope_ends(angles: PairAngles, shift: int, *, rising: bool, confidence: flo
     reach = math.floor(float(ndtri(0.5 + 0.5 * confidence)) * sd + 0.5)
     low, high = angles.number - reach + shift, angles.number + reach + shift
     # ranks below the slopes of -1 (+1 for a falling line) say nothing of the line
-    least = 2 * angles.exactly_on_the_shift(rising=rising) + 1
+    against = -math.pi / 4 if rising else math.pi / 4
+    least = 2 * (angles.below(against, inclusive=True) - angles.below(against, inclusive=False)) + 1
     if (low + 1) // 2 < least or (high + 1) // 2 > angles.number - (high % 2 == 0):
         return -math.inf, math.inf
     return _at(angles, low), _at(angles, high)

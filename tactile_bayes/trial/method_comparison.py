@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from functools import cache, partial
+from functools import cache, lru_cache, partial
 from typing import Annotated, Literal, TypeVar
 
 import numpy as np
 from scipy.special import chdtri, chndtrix, gammaincc, nctdtrit, ndtri, stdtr
 
 from tactile_bayes.declarations import UNSET, Meta, Record, UnsetType, replace, says
+from tactile_bayes.trial import lines
 from tactile_bayes.trial.figures import (
     Count,
     Ends,
@@ -30,20 +31,6 @@ from tactile_bayes.trial.figures import (
     method_of,
     on_scale,
     ratio,
-)
-from tactile_bayes.trial.lines import (
-    Concordance,
-    Line,
-    PassingBablok,
-    centred,
-    concordance,
-    deming,
-    deming_slopes,
-    jackknife_errors,
-    least_squares,
-    passing_bablok,
-    student,
-    weighted_deming,
 )
 from tactile_bayes.trial.readings import FloatArray, ModalitySizes
 
@@ -134,7 +121,7 @@ def limits(differences: FloatArray, *, confidence: float = 0.95) -> Limits:
         raise UndefinedError(f"limits of agreement need at least 2 masses (found {n})")
     bias, sd = float(differences.mean()), float(differences.std(ddof=1))
     z, tail = _REACH, 0.5 + 0.5 * confidence
-    t = student(n - 1, confidence=confidence)
+    t = lines.student(n - 1, confidence=confidence)
     inner = percentile_factor(n, percentile=0.5 + 0.5 * SHARE, confidence=1 - tail)
     outer = percentile_factor(n, percentile=0.5 + 0.5 * SHARE, confidence=tail)
     pair = [content_factor(n, content=SHARE, confidence=c) for c in (1 - tail, tail)]
@@ -179,7 +166,7 @@ def limits_unlinked(x: Sequence[FloatArray], y: Sequence[FloatArray], *, confide
     bias, z = float(means.mean()), _REACH
     low, high = bias - z * math.sqrt(total), bias + z * math.sqrt(total)
     wide, narrow = _recovered(list(parts.values()), total, z=z, bias_variance=between / n, confidence=confidence)
-    t = student(n - 1, confidence=confidence) * math.sqrt(between / n)
+    t = lines.student(n - 1, confidence=confidence) * math.sqrt(between / n)
     return Limits(
         n=n,
         bias=bias,
@@ -215,7 +202,7 @@ def trend(differences: FloatArray, sizes: FloatArray, *, confidence: float = 0.9
     `sizes` are the means of both methods (Bland & Altman 1999) or, when the reference is much the better of the two,
     the reference itself (Krouwer 2008, Stat. Med. 27, 778): against the mean, unequal errors alone make a slope.
     """
-    line = least_squares(sizes, differences)
+    line = lines.least_squares(sizes, differences)
     both = line.intervals(confidence=confidence)
     if both is None or line.slope_se is None:
         return Trend(line.slope, None, None)
@@ -280,7 +267,8 @@ def _limit(
     terms: Callable[[ModalitySizes], FloatArray], sign: int, found: ModalitySizes, *, confidence: float
 ) -> Figure:
     """A limit; its corrected interval is from those of the mean and, on the log scale, of the SD (Zou 2013)."""
-    plain = figure(SumStatistic(terms, partial(_limit_end, sign), _ONE), found, scale="linear", confidence=confidence)
+    end = SumStatistic(terms, lambda sums: _limit_mean(sums) + sign * _REACH * _limit_sd(sums), _ONE)
+    plain = figure(end, found, scale="linear", confidence=confidence)
     if method_of(confidence) != "corrected" or plain.interval is None:
         return plain
     try:
@@ -315,7 +303,7 @@ def _limit_terms(scale: Callable[[FloatArray], FloatArray], sizes: ModalitySizes
     pairs = list(zip(groups, scale(sizes.size_mm), strict=True))
     means = np.array([group.mean() if len(group) > 1 else size for group, size in pairs])
     differences = means - scale(sizes.ex_vivo_mm)
-    off = centred(differences, differences.mean())
+    off = lines.centred(differences, differences.mean())
     number = np.array([max(len(group), 1) for group in groups], dtype=np.float64)
     squares = np.array([float(np.sum((group - mean) ** 2)) for group, mean in zip(groups, means, strict=True)])
     return columns(1.0, differences, off, off * off, 1 / number, squares, number - 1)
@@ -333,10 +321,6 @@ def _limit_sd(sums: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt(np.maximum(between + (1 - inverse / n) * within, 0.0)))
 
 
-def _limit_end(sign: int, sums: FloatArray) -> FloatArray:
-    return np.asarray(_limit_mean(sums) + sign * _REACH * _limit_sd(sums))
-
-
 # --- Everything of one modality.
 
 # Lines that are not sums are fitted anew without each patient; beyond so many masses that takes too long.
@@ -345,8 +329,7 @@ MOST_REFITTED = 300
 _SMALLEST, _LARGEST = 1e-100, 1e100
 
 _T = TypeVar("_T")
-
-
+_Fit = Callable[[ModalitySizes], lines.Line | lines.PassingBablok]
 Unit = Literal["mm", "log_ratio"]
 Against = Literal["on_ex_vivo", "on_mean"]
 _Refitted = Ends | None | UnsetType
@@ -397,7 +380,7 @@ class MethodComparison(Figures, kw_only=True):
     limits: dict[Unit, Limits]
     """Of differences and of logarithms of ratios; of single readings, replicates allowed for."""
     trends: dict[Against, Trend]  #: Slope of the differences on the ex-vivo size, and on the mean of both.
-    concordance_parts: Concordance | None
+    concordance_parts: lines.Concordance | None
     errors_grow_with_size: bool
     """Errors are likelier proportional to size than constant: limits in mm suit no one size."""
 
@@ -406,7 +389,7 @@ def compare_methods(sizes: ModalitySizes, *, confidence: float, error_ratio: flo
     """Compare one modality's detected sizes with excision."""
     found = sizes.only_detected()
     x, y = found.ex_vivo_mm, found.size_mm
-    robust = _Fit(partial(passing_bablok, confidence=float(confidence)))
+    robust = _fitted(partial(lines.passing_bablok, confidence=float(confidence)))
     figures = _figures(found, confidence=confidence, error_ratio=error_ratio, robust=robust)
     judged, level = len(x) >= 2 and _squarable(x, y), float(confidence)
     return MethodComparison(
@@ -416,7 +399,7 @@ def compare_methods(sizes: ModalitySizes, *, confidence: float, error_ratio: flo
         analytic_intervals=_analytic(found, robust, confidence=level, error_ratio=error_ratio) if judged else {},
         limits=_limits(found, confidence=level) if judged else {},
         trends=_trends(x, y, confidence=level) if judged else {},
-        concordance_parts=_or_none(lambda: concordance(x, y, confidence=level)) if judged else None,
+        concordance_parts=_or_none(lambda: lines.concordance(x, y, confidence=level)) if judged else None,
         errors_grow_with_size=judged and errors_are_proportional(x, y),
     )
 
@@ -438,15 +421,24 @@ def _squared_distance(sizes: ModalitySizes) -> FloatArray:
 
 def _statistics(error_ratio: float, robust: _Fit, slope: Scale) -> list[tuple[str, Statistic, Scale]]:
     """All figures with their names and the scales of their intervals."""
-    demings = partial(_deming_slope, error_ratio=error_ratio)
-    fits = (("weighted_deming", _Fit(partial(weighted_deming, error_ratio=error_ratio))), ("passing_bablok", robust))
+    fits = (
+        ("weighted_deming", _fitted(partial(lines.weighted_deming, error_ratio=error_ratio))),
+        ("passing_bablok", robust),
+    )
+
+    def demings(sums: FloatArray) -> FloatArray:
+        return lines.deming_slopes(*_squares(sums), error_ratio=error_ratio)
+
+    def part(fit: _Fit, name: str) -> Statistic:
+        return lambda sizes: float(getattr(fit(sizes), name))
+
     return [
         ("ols_intercept_mm", SumStatistic(_terms, _intercept_with(_ols_slope), _NO_LINE), "linear"),
         ("ols_slope", SumStatistic(_terms, _ols_slope, _NO_LINE), slope),
         ("deming_intercept_mm", SumStatistic(_terms, _intercept_with(demings), _NO_LINE), "linear"),
         ("deming_slope", SumStatistic(_terms, demings, _NO_LINE), slope),
-        *((f"{name}_intercept_mm", fit.part("intercept"), "linear") for name, fit in fits),
-        *((f"{name}_slope", fit.part("slope"), slope) for name, fit in fits),
+        *((f"{name}_intercept_mm", part(fit, "intercept"), "linear") for name, fit in fits),
+        *((f"{name}_slope", part(fit, "slope"), slope) for name, fit in fits),
         ("concordance", SumStatistic(_terms, _concordance, "concordance needs sizes that vary"), "fisher"),
         ("difference_mean_mm", SumStatistic(_terms, _bias), "linear"),
         ("difference_sd_mm", SumStatistic(_terms, _sd, _ONE), "log"),
@@ -462,7 +454,7 @@ def _terms(sizes: ModalitySizes) -> FloatArray:
     if len(x) == 0:
         raise UndefinedError("no mass was detected")
     _need_squares(x, y)
-    dx, dy = centred(x, x.mean()), centred(y, y.mean())
+    dx, dy = lines.centred(x, x.mean()), lines.centred(y, y.mean())
     return columns(1.0, x, y, dx, dy, dx * dx, dx * dy, dy * dy)
 
 
@@ -475,10 +467,6 @@ def _squares(sums: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
 def _ols_slope(sums: FloatArray) -> FloatArray:
     u, _, p = _squares(sums)
     return ratio(p, u)
-
-
-def _deming_slope(sums: FloatArray, *, error_ratio: float) -> FloatArray:
-    return deming_slopes(*_squares(sums), error_ratio=error_ratio)
 
 
 def _intercept_with(slope: Callable[[FloatArray], FloatArray]) -> Callable[[FloatArray], FloatArray]:
@@ -504,22 +492,15 @@ def _sd(sums: FloatArray) -> FloatArray:
     return np.sqrt(np.maximum(ratio(u + q - 2 * p, sums[..., 0] - 1), 0.0))
 
 
-class _Fit:
+def _fitted(fit: Callable[[FloatArray, FloatArray], lines.Line | lines.PassingBablok]) -> _Fit:
     """A line that several figures share, fitted once to the same masses."""
 
-    def __init__(self, fit: Callable[[FloatArray, FloatArray], Line | PassingBablok]) -> None:
-        self._fit = fit
-        self._last: tuple[ModalitySizes, Line | PassingBablok] | None = None
+    @lru_cache(maxsize=1)
+    def fitted(sizes: ModalitySizes) -> lines.Line | lines.PassingBablok:
+        _need_squares(sizes.ex_vivo_mm, sizes.size_mm)
+        return fit(sizes.ex_vivo_mm, sizes.size_mm)
 
-    def __call__(self, sizes: ModalitySizes) -> Line | PassingBablok:
-        if self._last is None or self._last[0] is not sizes:
-            _need_squares(sizes.ex_vivo_mm, sizes.size_mm)
-            self._last = sizes, self._fit(sizes.ex_vivo_mm, sizes.size_mm)
-        return self._last[1]
-
-    def part(self, name: str) -> Statistic:
-        """One number of the line as a statistic."""
-        return lambda sizes: float(getattr(self(sizes), name))
+    return fitted
 
 
 def _need_squares(x: FloatArray, y: FloatArray) -> None:
@@ -534,11 +515,17 @@ def _squarable(x: FloatArray, y: FloatArray) -> bool:
 
 def _analytic(found: ModalitySizes, robust: _Fit, *, confidence: float, error_ratio: float) -> dict[str, Ends | None]:
     x, y = found.ex_vivo_mm, found.size_mm
-    weighted = partial(weighted_deming, error_ratio=error_ratio)
-    fits: dict[str, Callable[[], Line]] = {
-        "ols": lambda: least_squares(x, y),
-        "deming": lambda: deming(x, y, error_ratio=error_ratio),
-        "weighted_deming": lambda: _with_errors(weighted(x, y), weighted, x, y),
+
+    def by_jackknife() -> lines.Line:
+        """Errors from leaving out one mass at a time, which is usual where no formula exists."""
+        weighted = partial(lines.weighted_deming, error_ratio=error_ratio)
+        line, few = weighted(x, y), 3 < len(x) <= MOST_REFITTED
+        return lines.Line(line.intercept, line.slope, line.n, *lines.jackknife_errors(weighted, x, y)) if few else line
+
+    fits: dict[str, Callable[[], lines.Line]] = {
+        "ols": lambda: lines.least_squares(x, y),
+        "deming": lambda: lines.deming(x, y, error_ratio=error_ratio),
+        "weighted_deming": by_jackknife,
     }
     ends: dict[str, Ends | None] = {}
     for name, fit in fits.items():
@@ -546,19 +533,12 @@ def _analytic(found: ModalitySizes, robust: _Fit, *, confidence: float, error_ra
         two = None if plain is None else plain.intervals(confidence=confidence)
         ends[f"{name}_intercept_mm"], ends[f"{name}_slope"] = two or (None, None)
     line = _or_none(lambda: robust(found))
-    if isinstance(line, PassingBablok):
+    if isinstance(line, lines.PassingBablok):
         for name, both in (("intercept_mm", line.intercept_interval), ("slope", line.slope_interval)):
             ends[f"passing_bablok_{name}"] = both if np.all(np.isfinite(both)) else None
-    agreement = _or_none(lambda: concordance(x, y, confidence=confidence))
+    agreement = _or_none(lambda: lines.concordance(x, y, confidence=confidence))
     ends["concordance"] = None if agreement is None else agreement.interval
     return ends
-
-
-def _with_errors(line: Line, fit: Callable[[FloatArray, FloatArray], Line], x: FloatArray, y: FloatArray) -> Line:
-    """The line with errors from leaving out one mass at a time, which is usual where no formula exists."""
-    if not 3 < len(x) <= MOST_REFITTED:
-        return line
-    return Line(line.intercept, line.slope, line.n, *jackknife_errors(fit, x, y))
 
 
 def _limits(found: ModalitySizes, *, confidence: float) -> dict[Unit, Limits]:

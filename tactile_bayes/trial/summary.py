@@ -9,15 +9,7 @@ import numpy as np
 
 from tactile_bayes.declarations import UNSET, Meta, Record, UnsetType
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.trial.accuracy import (
-    ModalityRatio,
-    PairedComparison,
-    accuracy_figures,
-    cautions,
-    mape_ratios,
-    origin_line_figures,
-    paired_comparisons,
-)
+from tactile_bayes.trial import accuracy
 from tactile_bayes.trial.calibration import Calibration, Coverage, calibration, coverage, prediction_of
 from tactile_bayes.trial.figures import (
     SEED,
@@ -40,7 +32,11 @@ from tactile_bayes.trial.planning import IntervalCheck
 from tactile_bayes.trial.readings import ModalitySizes, Trial, unit_doubts
 from tactile_bayes.trial.replicates import ReplicateFigures, reader_components, replicate_figures, spread_figures
 
-FAMILIES: tuple[Callable[..., dict[str, Figure]], ...] = (accuracy_figures, origin_line_figures, spread_figures)
+FAMILIES: tuple[Callable[..., dict[str, Figure]], ...] = (
+    accuracy.accuracy_figures,
+    accuracy.origin_line_figures,
+    spread_figures,
+)
 
 
 CONVENTIONS: dict[str, str] = {
@@ -151,9 +147,11 @@ class TrialReport(Record, kw_only=True):
     interval_probability: Annotated[float, Meta(gt=0, lt=1)]  #: Of every interval in this document.
     counts: Counts
     modalities: Annotated[dict[str, ModalityReport], Meta(min_length=1)]
-    mape_ratio_to_tactile: dict[str, ModalityRatio]
+    mape_ratio_to_tactile: dict[str, accuracy.ModalityRatio]
     """Percent error of each other modality over the tactile one's, on common masses; empty without a tactile one."""
-    paired_comparisons: tuple[PairedComparison, ...]  #: Every pair of modalities on the masses that both looked for.
+    paired_comparisons: tuple[
+        accuracy.PairedComparison, ...
+    ]  #: Every pair of modalities on the masses that both looked for.
     doubts: tuple[str, ...]  #: What looks like another unit than mm.
     conventions: dict[str, str]
     interval_check: dict[str, IntervalCheck] | UnsetType = UNSET
@@ -194,8 +192,8 @@ def summarise(
             name: modality_report(one, confidence=confidence, error_ratio=error_ratio, trial=trial)
             for name, one in sizes.items()
         },
-        mape_ratio_to_tactile=mape_ratios(sizes, confidence=confidence),
-        paired_comparisons=tuple(paired_comparisons(sizes, confidence=confidence, seed=seed)),
+        mape_ratio_to_tactile=accuracy.mape_ratios(sizes, confidence=confidence),
+        paired_comparisons=tuple(accuracy.paired_comparisons(sizes, confidence=confidence, seed=seed)),
         doubts=tuple(unit_doubts(sizes, np.array(list(ex_vivo_mm.values()), dtype=np.float64))),
         conventions=CONVENTIONS,
         provenance=dict(provenance or {}),
@@ -237,5 +235,5 @@ def modality_report(
             variance_components=None if trial is None else reader_components(trial.found(sizes.name)),
         ),
         calibration=None if prediction is None else calibration(prediction, confidence=float(confidence)),
-        cautions=cautions(sizes, confidence=confidence),
+        cautions=accuracy.cautions(sizes, confidence=confidence),
     )
