@@ -7,6 +7,7 @@ from typing import Annotated, Any, Final
 
 import numpy as np
 
+from tactile_bayes import presets
 from tactile_bayes.declarations import Meta, Record, as_dict, check, field, replace, says
 from tactile_bayes.errors import BadDataError, require
 from tactile_bayes.forward.contact import Head as Section
@@ -19,15 +20,6 @@ from tactile_bayes.geometry import (
     quaternion_from_rotation,
     rigid,
     rotation_from_quaternion,
-)
-from tactile_bayes.presets import (
-    HEAD_COLUMNS,
-    HEAD_PITCH_MM,
-    HEAD_RADIUS_MM,
-    HEAD_ROWS,
-    PRESSURE_RANGE_KPA,
-    SHOULDERS_INSIDE,
-    SHOULDERS_OUTSIDE,
 )
 from tactile_bayes.scans import ElementCalibration, HeadGeometry, Landmarks, PressureFrames, Scan, TrackerPoses
 
@@ -94,10 +86,10 @@ Pitch = Annotated[float, says("Distance between neighbouring taxels, mm.", gt=0,
 class Head(Record):
     """A section of a circular cylinder, its edges rounded off."""
 
-    rows: Rows = HEAD_ROWS
-    columns: Columns = HEAD_COLUMNS
-    pitch_mm: Pitch = HEAD_PITCH_MM
-    radius_mm: Annotated[float, Meta(gt=0, le=100_000)] = HEAD_RADIUS_MM
+    rows: Rows = presets.HEAD_ROWS
+    columns: Columns = presets.HEAD_COLUMNS
+    pitch_mm: Pitch = presets.HEAD_PITCH_MM
+    radius_mm: Annotated[float, Meta(gt=0, le=100_000)] = presets.HEAD_RADIUS_MM
     """Radius of the face, mm; above half the width."""
     shoulder_mm: Annotated[float, Meta(ge=0, le=100)] = 0.0  #: Radius of its rounded edges, mm; 0 for none.
     rim_mm: Annotated[float, Meta(ge=0, le=100)] = 3.0
@@ -119,12 +111,12 @@ class Head(Record):
     @property
     def shoulders(self) -> str:
         """Which of `presets.HEADS` this is in three dimensions."""
-        return SHOULDERS_INSIDE if self.shoulder_mm > 0 else SHOULDERS_OUTSIDE
+        return presets.SHOULDERS_INSIDE if self.shoulder_mm > 0 else presets.SHOULDERS_OUTSIDE
 
     def with_shoulders(self, shoulders: str) -> Head:
         """Copy of the head with its shoulders placed as `shoulders` says, one of `presets.HEADS`."""
         edge = self.section(shoulders).shoulder_mm
-        inside = shoulders == SHOULDERS_INSIDE
+        inside = shoulders == presets.SHOULDERS_INSIDE
         return replace(self, shoulder_mm=edge if inside else 0.0, rim_mm=0.0 if inside else edge)
 
     def section(self, shoulders: str) -> Section:
@@ -435,7 +427,7 @@ def _frames(scene: Scene, felt: Felt, true_gain: FloatArray, *, rng: np.random.G
 def _calibration(scene: Scene, *, rng: np.random.Generator) -> tuple[FloatArray, ElementCalibration]:
     """True gains, and the calibration that a bladder would give."""
     shape = (scene.head.rows, scene.head.columns)
-    nominal = PRESSURE_RANGE_KPA[1] / FULL_SCALE_COUNT
+    nominal = presets.PRESSURE_RANGE_KPA[1] / FULL_SCALE_COUNT
     # Four standard deviations out, a gain could turn negative at the widest spread allowed.
     spread, error = np.clip(rng.standard_normal((2, *shape)), -4.0, 4.0)
     true_gain = nominal * (1 + scene.noise.gain_spread * spread)

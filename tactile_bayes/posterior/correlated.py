@@ -9,6 +9,7 @@ from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.draws import MOST_PAIRED, ParameterDraws, Solved, normal_quantile, paired_points
 from tactile_bayes.mapping.map import TactileMap
+from tactile_bayes.posterior import neighbours
 from tactile_bayes.posterior.bump import covariance_from_log_widths, drawn_widths, overlap, trusted
 from tactile_bayes.posterior.detection import Detection, detection_from_odds
 from tactile_bayes.posterior.draw import (
@@ -30,15 +31,6 @@ from tactile_bayes.posterior.fit import (
     tangent_columns,
 )
 from tactile_bayes.posterior.marginal import Scene
-from tactile_bayes.posterior.neighbours import (
-    WANTED,
-    Surroundings,
-    add_beside,
-    beside_ridge,
-    ridge_instead,
-    ridge_text,
-    rising_ribs,
-)
 from tactile_bayes.posterior.verdict import rim_fault
 from tactile_bayes.posterior.white import BumpFit, MapDraws
 from tactile_bayes.posterior.window import FLOOR, Problem, Window, cosines_for, independent_variance
@@ -193,7 +185,7 @@ class Correlated(Record, eq=False):
     def draw(self, options: SamplerSettings, *, rng: np.random.Generator, progress: Progress | None) -> MapDraws:
         """Draw from the posterior; `NotConvergedError` also when the scene's neighbour was not found."""
         choice, asked = self._scene, options.scene_asked
-        wanted = WANTED.get(asked, "")
+        wanted = neighbours.WANTED.get(asked, "")
         if wanted and choice.fit.scene.extra != wanted:
             raise NotConvergedError(f"no {wanted} found beside the bump; leave out --scene {asked}")
         fit, target = choice.fit, choice.fit.target
@@ -268,15 +260,15 @@ def with_neighbours(
     """
     if asked not in ASKING:
         return ask_departure(choice), detection
-    surroundings = Surroundings.of(tactile_map)
-    ridges = rising_ribs(choice.plain, surroundings)
-    choice = add_beside(choice, surroundings, ridges=ridges, scene=asked)
-    ridge = ridge_instead(choice, ridges)
+    surroundings = neighbours.Surroundings.of(tactile_map)
+    ridges = neighbours.rising_ribs(choice.plain, surroundings)
+    choice = neighbours.add_beside(choice, surroundings, ridges=ridges, scene=asked)
+    ridge = neighbours.ridge_instead(choice, ridges)
     if ridge is None or ridge.log_evidence < choice.plain.target.null_log_evidence():
         return ask_departure(choice), detection
     against = ridge.log_evidence + _searched(choice.plain, tactile_map)
-    detection = detection_from_odds(choice.fit.log_evidence - against, ridge=ridge_text(ridge))
-    if detection.probability < DETECTED and (both := beside_ridge(choice, ridge)) is not None:
+    detection = detection_from_odds(choice.fit.log_evidence - against, ridge=neighbours.ridge_text(ridge))
+    if detection.probability < DETECTED and (both := neighbours.beside_ridge(choice, ridge)) is not None:
         detection = detection_from_odds(both.log_evidence - against, ridge=detection.ridge)
     return ask_departure(choice), detection
 

@@ -10,16 +10,8 @@ import numpy as np
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import UsageError
 from tactile_bayes.geometry import FloatArray
+from tactile_bayes.inference import modes
 from tactile_bayes.inference.draws import ParameterDraws, Solved
-from tactile_bayes.inference.modes import (
-    LeastSquaresFit,
-    ModelFunction,
-    fit_least_squares,
-    inverse_information,
-    laplace,
-    mode_and_covariance,
-    optimise,
-)
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior.bump import (
@@ -68,7 +60,7 @@ class Target(Record, eq=False):
     the former for c = 1 and nu = k - p.
     """
 
-    predict: ModelFunction  #: (m, p) parameter vectors to (m, k) predictions.
+    predict: modes.ModelFunction  #: (m, p) parameter vectors to (m, k) predictions.
     data: FloatArray
     weight: FloatArray
     """`data`, `weight` (k,) arrays: Weights are inverse variances up to a common factor."""
@@ -130,7 +122,7 @@ class BumpFit(Record, eq=False):
     bump: Bump
     cells: FitCells
     weight: FloatArray
-    fit: LeastSquaresFit
+    fit: modes.LeastSquaresFit
     errors: ErrorModel
     """`bump`, `cells`, `weight`, `fit`, `errors`: Model, cells of the window, their weights, the minimum, the judged
     errors."""
@@ -243,7 +235,7 @@ def fit_bump(
     # a map without any noise still has the rounding of its numbers
     rounding = 1e-9 * bump.scale + 1e-14 * float(np.abs(cells.value).max())
     errors = replace(errors, noise_sd=max(errors.noise_sd, rounding))
-    covariance = errors.noise_sd**2 * errors.inflation * inverse_information(fit.jacobian, weight)
+    covariance = errors.noise_sd**2 * errors.inflation * modes.inverse_information(fit.jacobian, weight)
     sigma_x, sigma_y, _ = bump.widths(fit.theta)
     share = covered_share(tactile_map, centre, radius_mm=1.5 * float(max(sigma_x, sigma_y)))
     result = BumpFit(bump, cells, weight, fit, errors, covariance, share)
@@ -295,7 +287,7 @@ def _best_fit(
     weight: FloatArray,
     centre: tuple[float, float],
     options: SamplerSettings,
-) -> LeastSquaresFit:
+) -> modes.LeastSquaresFit:
     """The lowest minimum from several starts.
 
     One that leaves the window, outgrows it or comes to a minimum that another has found is not followed further. Under
@@ -303,7 +295,7 @@ def _best_fit(
     another minimum beside one that is `CLEAR`.
     """
     radius_mm, place_only = options.fit_radius_mm, options.correlated
-    fits: list[LeastSquaresFit] = []
+    fits: list[modes.LeastSquaresFit] = []
 
     def lost(theta: FloatArray) -> bool:
         away = np.hypot(theta[1] - centre[0], theta[2] - centre[1]) > radius_mm
@@ -315,7 +307,7 @@ def _best_fit(
     mean = float(weight @ cells.value) / float(weight.sum())
     about_mean = float(weight @ (cells.value - mean) ** 2)
     for begin in starts:
-        fit = fit_least_squares(
+        fit = modes.fit_least_squares(
             lambda theta: bump.predict(theta, cells),
             begin,
             data=cells.value,
@@ -456,11 +448,13 @@ class _Independent(Record, eq=False):
         del number
         fit = self.fit
         if method == "optimise":
-            return optimise(fit.theta, fit.covariance, dof=fit.errors.dof, rng=rng)
-        return laplace(self.target, fit.theta, scale=np.sqrt(np.diag(fit.covariance)), dof=fit.errors.dof, rng=rng)
+            return modes.optimise(fit.theta, fit.covariance, dof=fit.errors.dof, rng=rng)
+        return modes.laplace(
+            self.target, fit.theta, scale=np.sqrt(np.diag(fit.covariance)), dof=fit.errors.dof, rng=rng
+        )
 
     def sampled(self, solved: Solved | None = None) -> Sampled:
         scale = np.sqrt(np.diag(self.fit.covariance))
-        mode, covariance, _ = mode_and_covariance(self.target, self.fit.theta, scale=scale)
+        mode, covariance, _ = modes.mode_and_covariance(self.target, self.fit.theta, scale=scale)
         density = self.target if solved is None else partial(self.target, solved=solved)
         return Sampled(density, mode, covariance)

@@ -29,39 +29,19 @@ import numpy as np
 from tactile_bayes.declarations import Meta, Record, replace
 from tactile_bayes.errors import BadDataError, UsageError, check_number, meant
 from tactile_bayes.geometry import BoolArray, FloatArray, Matrix, Vector
+from tactile_bayes.size import terms
 from tactile_bayes.size.draws import BetweenMaps, ShapeDraws, Supposition
 from tactile_bayes.size.eq6 import Eq6Law, Power, Powers, eq6_coefficients, eq6_log_size, eq6_terms
-from tactile_bayes.size.terms import (
-    LEARN_ANEW,
-    MOST_LEVERAGE,
-    WEIGHTS,
-    Above0,
-    Domain,
-    FatDepth,
-    HiddenTerms,
-    Recipe,
-    Residual,
-    RoundLumps,
-    Share,
-    SiteShift,
-    beyond_lumps,
-    check_domain,
-    check_shapes,
-    monomials,
-    outside_domain,
-    powers,
-    unlike_bodies,
-    within_reach,
-)
+from tactile_bayes.size.terms import SiteShift
 
 UNLIKE: Final = "is unlike the bodies of the table"
 NO_PROFILE: Final = "the phantoms that correct the calibration have no pressure profile of the head"
 FARTHEST_LEVERAGE: Final = 3.0  #: Beyond this multiple there is no size.
 UNLIKE_SD: Final = 0.1
 """SD of ln d by which a body may differ because its map or its head profile is unlike the table's (record 0123)."""
-QUADRATIC: Final[Powers] = tuple((i, j, k) for k in range(3) for i, j in powers(2 - k))
+QUADRATIC: Final[Powers] = tuple((i, j, k) for k in range(3) for i, j in terms.powers(2 - k))
 """Powers of u, v and w in a full quadratic; the first six are those without w."""
-CUBIC: Final[Powers] = (*QUADRATIC, *((i, j, k) for k in range(4) for i, j in powers(3 - k) if i + j + k == 3))
+CUBIC: Final[Powers] = (*QUADRATIC, *((i, j, k) for k in range(4) for i, j in terms.powers(3 - k) if i + j + k == 3))
 SUPPOSED: Final[Mapping[str, tuple[str, float]]] = {
     "soft": ("stiffness_ratio", 11.0),
     "hard": ("stiffness_ratio", 70.0),
@@ -89,15 +69,15 @@ class Spread(Record, eq=False):
     mean: Vector
     covariance: Matrix
     log_exam_sd: float  #: ln SD between exams of a body.
-    log_exam_sd_variance: Share
+    log_exam_sd_variance: terms.Share
     other_sd: Annotated[float, Meta(ge=0)]  #: By which bodies of another origin depart.
     other_source: str  #: What told it.
 
     def __post_init__(self) -> None:
         s = len(self.powers)
-        check_shapes(self, mean=(s,), covariance=(s, s))
+        terms.check_shapes(self, mean=(s,), covariance=(s, s))
         if not np.isfinite([self.log_exam_sd, self.log_exam_sd_variance, self.other_sd]).all():
-            raise BadDataError("a spread between exams or bodies is not finite", way_out=LEARN_ANEW)
+            raise BadDataError("a spread between exams or bodies is not finite", way_out=terms.LEARN_ANEW)
 
 
 class BodyLaw(Record, eq=False, kw_only=True):
@@ -105,32 +85,32 @@ class BodyLaw(Record, eq=False, kw_only=True):
 
     source: str  #: What the table was made of.
     bodies: Mapping[str, tuple[float, float]]  #: Ranges of its lumps and bodies, by its columns.
-    recipe: Recipe
+    recipe: terms.Recipe
     centre: Centre
     eq6: Eq6Law
-    residual: Residual | None  #: null for Eq 6 alone.
+    residual: terms.Residual | None  #: null for Eq 6 alone.
     spread: Spread
-    round_lumps: RoundLumps
-    depth: FatDepth | None  #: null where the table's maps did not tell it.
+    round_lumps: terms.RoundLumps
+    depth: terms.FatDepth | None  #: null where the table's maps did not tell it.
     feature_powers: tuple[Power, ...]  #: Of u, v and w in the features of a map.
     information_inverse: Matrix  #: For the leverage of a map, over its features.
-    most_leverage: Above0  #: Of maps inside the table.
-    domain: Domain
-    hidden: HiddenTerms | None  #: What B is made of.
-    hidden_any: HiddenTerms | None  #: The same where the depth is not known.
+    most_leverage: terms.Above0  #: Of maps inside the table.
+    domain: terms.Domain
+    hidden: terms.HiddenTerms | None  #: What B is made of.
+    hidden_any: terms.HiddenTerms | None  #: The same where the depth is not known.
     fit: Mapping[str, float]  #: Figures of the fit.
 
     def __post_init__(self) -> None:
         s, c = len(self.spread.powers), len(self.feature_powers)
-        check_domain(self.domain)
-        check_shapes(self, information_inverse=(c, c))
-        check_shapes(self.round_lumps, coefficients=(s,))
+        terms.check_domain(self.domain)
+        terms.check_shapes(self, information_inverse=(c, c))
+        terms.check_shapes(self.round_lumps, coefficients=(s,))
         for hidden in (self.hidden, self.hidden_any):
             if hidden is not None and hidden.expected.shape[1] != c:
-                raise BadDataError("hidden has arrays of other sizes than its names", way_out=LEARN_ANEW)
+                raise BadDataError("hidden has arrays of other sizes than its names", way_out=terms.LEARN_ANEW)
         by_depth = any(one[2] for one in (*self.eq6.powers, *self.spread.powers, *self.feature_powers))
         if self.depth is None and (by_depth or self.residual is not None):
-            raise BadDataError("depth is missing, on which other parts depend", way_out=LEARN_ANEW)
+            raise BadDataError("depth is missing, on which other parts depend", way_out=terms.LEARN_ANEW)
 
 
 class BodyCalibration(BodyLaw, eq=False, kw_only=True):
@@ -162,7 +142,7 @@ class BodyCalibration(BodyLaw, eq=False, kw_only=True):
     ) -> BodyCalibration:
         """This calibration, or the one for any depth where no body of the table looks like the map at this depth."""
         sigma_mm = mean_width_mm(sigma_x_mm, sigma_y_mm)
-        if self.fat_mm is None or self.leverage(amplitude, sigma_mm) <= MOST_LEVERAGE:
+        if self.fat_mm is None or self.leverage(amplitude, sigma_mm) <= terms.MOST_LEVERAGE:
             return self
         what = f"amplitude {amplitude:.3g} with sigma {sigma_mm:.3g} mm over {self.fat_mm:.3g} mm of fat"
         return self._at_any_depth(f"{what} {UNLIKE}").widened_for_atypical_body()
@@ -295,13 +275,13 @@ class BodyCalibration(BodyLaw, eq=False, kw_only=True):
     def within_reach(self, amplitude: FloatArray, sigma_x_mm: FloatArray, sigma_y_mm: FloatArray) -> BoolArray:
         """(n,) True for maps without `extrapolation_faults`."""
         sigma_mm = np.sqrt(sigma_x_mm * sigma_y_mm)
-        inside = within_reach(self.domain, amplitude, sigma_mm)
+        inside = terms.within_reach(self.domain, amplitude, sigma_mm)
         inside[inside] = self._leverages(amplitude[inside], sigma_mm[inside]) <= FARTHEST_LEVERAGE
         return inside
 
     def beyond_lumps(self, largest_mm: float) -> list[str]:
         """In what a size lies beyond the table's lumps, in words; empty when it lies within."""
-        return beyond_lumps(self.domain, largest_mm)
+        return terms.beyond_lumps(self.domain, largest_mm)
 
     def omissions(self) -> list[str]:
         """Sources of error that a size does not contain, in words."""
@@ -310,7 +290,7 @@ class BodyCalibration(BodyLaw, eq=False, kw_only=True):
             text = f"the depth of the fat, which would narrow the size: {self.fat_note}"
             wider = f"; for such a body the interval allows {100 * self.other_sd:.0f} % (SD) more"
             notes.append(text + (wider if self.other_sd else ""))
-        return [*notes, unlike_bodies(self.bodies)] if self.bodies else notes
+        return [*notes, terms.unlike_bodies(self.bodies)] if self.bodies else notes
 
     def _at_any_depth(self, why: str) -> BodyCalibration:
         return replace(self, fat_mm=None, fat_note=why, hidden=self.hidden_any)
@@ -332,10 +312,10 @@ class BodyCalibration(BodyLaw, eq=False, kw_only=True):
 
     def _averaged(self, values: FloatArray) -> FloatArray:
         """Over the depths of fat where these are not known."""
-        return np.asarray(np.tensordot(WEIGHTS, values, 1)) if self._averages else values
+        return np.asarray(np.tensordot(terms.WEIGHTS, values, 1)) if self._averages else values
 
     def _monomials(self, log_amplitude: FloatArray, log_width: FloatArray, exponents: Powers) -> FloatArray:
-        return monomials(np.broadcast_arrays(*self._values(log_amplitude, log_width)), exponents)
+        return terms.monomials(np.broadcast_arrays(*self._values(log_amplitude, log_width)), exponents)
 
     def _log_sizes(self, log_amplitude: FloatArray, log_width: FloatArray) -> FloatArray:
         values = self._values(log_amplitude, log_width)
@@ -346,10 +326,10 @@ class BodyCalibration(BodyLaw, eq=False, kw_only=True):
 
     def _outside(self, amplitude: float, sigma_mm: float, *, far: bool = False) -> list[str]:
         """The map's amplitude and width where one is outside its range, or the pair unlike those of the table."""
-        if texts := outside_domain(self.domain, amplitude, sigma_mm, far=far):
+        if texts := terms.outside_domain(self.domain, amplitude, sigma_mm, far=far):
             return texts
         leverage = self.leverage(amplitude, sigma_mm)
-        if leverage <= (FARTHEST_LEVERAGE if far else MOST_LEVERAGE):
+        if leverage <= (FARTHEST_LEVERAGE if far else terms.MOST_LEVERAGE):
             return []
         pair = f"amplitude {amplitude:.3g} with sigma {sigma_mm:.3g} mm, a pair unlike those of the table"
         return [f"{pair} (leverage {leverage:.1f} times the limit)"]

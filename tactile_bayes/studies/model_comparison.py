@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_bayes import presets
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward import plane
@@ -19,14 +20,6 @@ from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.mapping.select import SelectedFrames, select_frames
 from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.white import BumpFit, fit_bump, fitted_candidates
-from tactile_bayes.presets import (
-    CELL_MM,
-    FIT_RADIUS_MM,
-    HEAD_PITCH_MM,
-    PRESSURE_WINDOW_KPA,
-    SHOULDERS_INSIDE,
-    SHOULDERS_OUTSIDE,
-)
 from tactile_bayes.progress import Progress, untold
 from tactile_bayes.scans import ElementCalibration, PressureFrames, Scan
 from tactile_bayes.studies.paper import HARD_RATIO, LineFit, StudySettings, fit_line
@@ -67,13 +60,17 @@ PHANTOMS = {
 TRIED_HEADS = tuple(
     Head(radius_mm=radius, shoulder_mm=shoulder, shoulders=kind)
     for radius in (13.0, 16.0, 20.0, 25.0, 35.0, 70.0)
-    for kind, shoulder in ((SHOULDERS_INSIDE, 3.0), (SHOULDERS_OUTSIDE, 3.0), (SHOULDERS_OUTSIDE, 15.0))
+    for kind, shoulder in (
+        (presets.SHOULDERS_INSIDE, 3.0),
+        (presets.SHOULDERS_OUTSIDE, 3.0),
+        (presets.SHOULDERS_OUTSIDE, 15.0),
+    )
     if shoulder < radius
 )
 """Heads that the tables are computed for with ``tables --heads``."""
 NEAREST_HEADS = {
-    0.0: Head(radius_mm=13.0, shoulder_mm=3.0, shoulders=SHOULDERS_INSIDE),
-    1.0: Head(radius_mm=70.0, shoulder_mm=3.0, shoulders=SHOULDERS_OUTSIDE),
+    0.0: Head(radius_mm=13.0, shoulder_mm=3.0, shoulders=presets.SHOULDERS_INSIDE),
+    1.0: Head(radius_mm=70.0, shoulder_mm=3.0, shoulders=presets.SHOULDERS_OUTSIDE),
 }
 """By seat: of `TRIED_HEADS` the one whose tables lie nearest to the printed ones (`table_distance`; record 0096)."""
 
@@ -149,7 +146,7 @@ def compare(scene: TableScene, *, settings: StudySettings, surface: plane.Surfac
     curves = scene_curves(scene, settings, surface=surface)
     inside = np.abs(curves.elastic_map.x_mm) <= settings.fit_radius_mm
     ours, theirs = curves.empirical_map.mean[inside], curves.elastic_map.mean[inside]
-    fitted, seen = curves.empirical.as_taxels(HEAD_PITCH_MM), curves.elastic.as_taxels(HEAD_PITCH_MM)
+    fitted, seen = curves.empirical.as_taxels(presets.HEAD_PITCH_MM), curves.elastic.as_taxels(presets.HEAD_PITCH_MM)
     frames = fitted.at(0.0), seen.at(0.0)
     shares = frames[0] / frames[0].mean(), frames[1] / frames[1].mean()
     return Agreement(
@@ -248,7 +245,7 @@ def compare_frames(
     model = settings.empirical(d_mm, surface.body.layers, settings.over(surface))
     places = np.array([frame.x_c_mm for frame in frames])
     means = np.array([frame.pressure_kpa.mean() for frame in frames])
-    solved = plane.press(surface, HARD_RATIO, places, head=head, mean_kpa=means).as_taxels(HEAD_PITCH_MM)
+    solved = plane.press(surface, HARD_RATIO, places, head=head, mean_kpa=means).as_taxels(presets.HEAD_PITCH_MM)
     found = []
     for frame, elastic, mean in zip(frames, solved.pressure_kpa, means, strict=True):
         empirical = mean / nominal * model.surface_pressure(frame.s_mm, np.full(len(frame.s_mm), frame.x_c_mm))
@@ -305,8 +302,8 @@ def measured_frames(
     scan: Scan,
     *,
     every: int = 1,
-    cell_mm: float = CELL_MM,
-    pressure_window_kpa: tuple[float, float] = PRESSURE_WINDOW_KPA,
+    cell_mm: float = presets.CELL_MM,
+    pressure_window_kpa: tuple[float, float] = presets.PRESSURE_WINDOW_KPA,
     latency_ms: float = 0.0,
     place_mm: tuple[float, float] | None = None,
 ) -> MeasuredScan:
@@ -383,12 +380,12 @@ def centre_row(measured: MeasuredScan, tactile_map: TactileMap) -> tuple[FloatAr
 def line_bump(measured: MeasuredScan, tactile_map: TactileMap) -> tuple[float, float]:
     """Amplitude and sigma (mm) of Eq 5, level 1, on the map's centre line within `FIT_RADIUS_MM` of the lump."""
     x, mean = centre_row(measured, tactile_map)
-    near = np.abs(x) <= FIT_RADIUS_MM
+    near = np.abs(x) <= presets.FIT_RADIUS_MM
 
     def bump(log_width: float) -> FloatArray:
         return plane.lump_pressure(x[near], height_kpa=1.0, width_mm=float(np.exp(log_width)))
 
-    ends = np.log([0.5 * tactile_map.recipe.cell_mm, FIT_RADIUS_MM])
+    ends = np.log([0.5 * tactile_map.recipe.cell_mm, presets.FIT_RADIUS_MM])
     found = plane.fit_shape(bump, mean[near] - 1.0, grid=np.linspace(ends[0], ends[1], 60))
     return found.height, float(np.exp(found.parameter))
 
@@ -431,7 +428,7 @@ def _model_map(measured: MeasuredScan, pressure_kpa: FloatArray) -> TactileMap:
     gains = ElementCalibration(gain, np.zeros_like(gain), saturation_count=np.iinfo(np.uint16).max)
     scan = replace(measured.scan, frames=PressureFrames(measured.scan.frames.time_s, counts), element_calibration=gains)
     recipe = measured.tactile_map.recipe
-    low, high = recipe.pressure_window_kpa or PRESSURE_WINDOW_KPA
+    low, high = recipe.pressure_window_kpa or presets.PRESSURE_WINDOW_KPA
     # The model's level is the measured one's to rounding: no frame may fall out at the window's ends.
     return build_map(
         scan,
