@@ -44,7 +44,7 @@ from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.posterior.white import default_errors, fit_bump
 from tactile_bayes.presets import FIELD_COSINES, POSE_NOISE
 from tactile_bayes.size.draws import SizePosterior
-from tactile_bayes.studies.population import draw_mass
+from tactile_bayes.studies.population import Population
 from validation.common import Row, Table, add_row, parser, rows_in, share
 from validation.own_trial import draw_mass_like_trial
 
@@ -351,7 +351,11 @@ def _size_mass(bodies: str, index: int) -> Row:
     assert path is not None
     calibration = read_size_calibration(path)
     assert isinstance(calibration, BodyCalibration)
-    scenes = draw_mass(index, scans=3, seed=SEED) if bodies == "population" else draw_mass_like_trial(index, seed=SEED)
+    scenes = (
+        Population(scans=3, seed=SEED).scenes(index)
+        if bodies == "population"
+        else draw_mass_like_trial(index, seed=SEED)
+    )
     lump, shapes, single = scenes[0].solid_lumps[0], [], []
     for tactile_map, found in _estimates(scenes, calibration):
         if tactile_map is None or found is None or found.map_posterior is None or found.size is None:

@@ -18,7 +18,7 @@ import numpy as np
 from tactile_bayes.declarations import replace
 from tactile_bayes.forward.scene import Scene
 from tactile_bayes.forward.tissue import Rib, SceneBody, SolidLump
-from tactile_bayes.studies.population import BodyPrior, ExamPrior, draw_body, draw_exam, draw_mass
+from tactile_bayes.studies.population import BodyPrior, ExamPrior, Population, draw_body, draw_exam
 from validation.common import keep_scan
 
 Kind = Literal["two", "one", "empty", "faint", "ribbed", "near", "single"]
@@ -65,7 +65,7 @@ class Exam:
 def draw(kind: Kind, index: int) -> Exam:
     """The exam of a kind and number."""
     if kind == "one":
-        return Exam(kind, index, draw_mass(index, scans=1, seed=SEED)[0])
+        return Exam(kind, index, Population(scans=1, seed=SEED).scenes(index)[0])
     rng = np.random.default_rng([SEED, KINDS.index(kind), index])
     if kind in JUDGED:
         rng = np.random.default_rng([JUDGED_SEED, JUDGED[kind], index])

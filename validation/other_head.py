@@ -19,7 +19,7 @@ from tactile_bayes.errors import TactileBayesError
 from tactile_bayes.files.documents import read_record
 from tactile_bayes.files.instrument import read_simulated_head
 from tactile_bayes.forward.scene import Head, Scene
-from tactile_bayes.studies.population import BodiesFile, BodyPrior, ExamPrior, draw_mass
+from tactile_bayes.studies.population import BodiesFile, BodyPrior, ExamPrior, Population
 from validation.common import errors_of, parser, run, scan_of
 
 SEED, TRIAL_SEED = 7, 20261215
@@ -41,7 +41,9 @@ def trial_scenes(
 ) -> list[Scene]:
     """Exams of bodies that no calibration has seen, those of a mass one after the other."""
     prior, technique = priors or (BodyPrior(), ExamPrior())
-    drawn = [draw_mass(i, scans=exams, seed=seed, bodies=prior, exams=technique, head=head) for i in range(masses)]
+    drawn = [
+        Population(scans=exams, seed=seed, bodies=prior, exams=technique, head=head).scenes(i) for i in range(masses)
+    ]
     return [scene for scenes in drawn for scene in scenes]
 
 
@@ -68,7 +70,7 @@ def sized(path: Path | None, size: Path) -> tuple[float, float, float] | str:
 
 def refusals(own: Scene, size: Path) -> list[str]:
     """What is said of this head's map with the shipped calibration, and of a default map with this calibration."""
-    default = draw_mass(1, scans=1, seed=TRIAL_SEED)[0]
+    default = Population(scans=1, seed=TRIAL_SEED).scenes(1)[0]
     said = []
     for what, scene, calibration in (("this head, solid", own, "solid"), ("default head, this", default, str(size))):
         try:

@@ -236,13 +236,13 @@ def _write_scans(folder: Path, masses: int, spread: float) -> None:
     from tactile_bayes.files.provenance import Provenance
     from tactile_bayes.files.scan_mcap import write_scan
     from tactile_bayes.forward.simulate import simulate
-    from tactile_bayes.studies.population import BodyPrior, draw_mass
+    from tactile_bayes.studies.population import BodyPrior, Population
 
     bodies = BodyPrior(d_mm=(9.0, 20.0), depth_ratio=(0.56, 1.2))
     rows, truth = ["file,patient,visit,mass,replicate"], {}
     for index in range(masses):
         rng = np.random.default_rng([SEED, index])
-        for j, scene in enumerate(draw_mass(index, scans=3, seed=SEED, bodies=bodies), start=1):
+        for j, scene in enumerate(Population(scans=3, seed=SEED, bodies=bodies).scenes(index), start=1):
             lump = scene.solid_lumps[0]
             truth[f"{index:02}"] = lump.d_mm
             other = replace(lump, d_mm=lump.d_mm * float(np.exp(rng.normal(0.0, spread))))

@@ -28,7 +28,7 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import broken_assumptions, skewed
 from tactile_bayes.scans import Scan
-from tactile_bayes.studies.population import BodyPrior, draw_mass
+from tactile_bayes.studies.population import BodyPrior, Population
 from validation.common import Row, parser, pickled
 from validation.stress_frames import Physics, VaryingLayers, stressed_scan
 
@@ -133,7 +133,7 @@ def jobs(bodies: int) -> Iterator[tuple[str, int]]:
 
 def scene_of(body: int) -> Scene:
     """The exam of a body without stress."""
-    (scene,) = draw_mass(body, scans=1, seed=SEED, bodies=BODIES)
+    (scene,) = Population(scans=1, seed=SEED, bodies=BODIES).scenes(body)
     return replace(scene, frame_rate_hz=FRAME_RATE_HZ)
 
 

@@ -24,7 +24,7 @@ from tactile_bayes.declarations import replace
 from tactile_bayes.errors import TactileBayesError
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.scans import Scan
-from tactile_bayes.studies.population import draw_mass
+from tactile_bayes.studies.population import Population
 from validation.common import errors_of, parser, pickled
 from validation.stress import BODIES, CONTROL, FRAME_RATE_HZ, STRESSES
 from validation.stress_frames import stressed_scan
@@ -37,7 +37,7 @@ def scans_of(body: int, seed: int) -> tuple[str, float, list[Scan]]:
     rng = np.random.default_rng([seed, body, 7])
     name = str(rng.choice([one for one in STRESSES if one != CONTROL]))
     drawn, scans, d_mm = int(rng.integers(2**31)), [], 0.0
-    for scene in draw_mass(body, scans=EXAMS, seed=seed, bodies=BODIES):
+    for scene in Population(scans=EXAMS, seed=seed, bodies=BODIES).scenes(body):
         # a body's stress lies the same way in all its exams
         slow = replace(scene, frame_rate_hz=FRAME_RATE_HZ)
         changed, physics = STRESSES[name].apply(slow, np.random.default_rng(drawn))

@@ -20,6 +20,7 @@ from tactile_bayes.options import CaseOptions, TissueOptions
 from tactile_bayes.posterior.bump import cell_mean_gaussian
 from tactile_bayes.posterior.white import LEAST_WIDTH_IN_CELLS, WIDEST_IN_RADII
 from tactile_bayes.presets import HEAD_PITCH_MM, HEADS, SHOULDERS_INSIDE
+from tactile_bayes.size.learn import eq6
 
 # --- The forward study of section 2.4: the Gaussian that each lump's map shows, over sizes, depths and stiffnesses.
 
@@ -54,28 +55,14 @@ class CaseSettings(CaseOptions, kw_only=True):
         """The rows of one geometry: the body is condensed once for all stiffnesses of its lump."""
         body = self.body(geometry.d_mm, geometry.depth_ratio, seat=geometry.seat)
         fitted, rows = self.fitter(body), []
+        setting = body.layers.thickness_mm, self.head.radius_mm, self.head.shoulders
         for ratio in geometry.stiffness_ratios:
             found = fitted(ratio)
+            case = seat_name(geometry.seat), geometry.d_mm, geometry.depth_ratio, ratio
             sigma_x, sigma_y = found.widths_mm
-            rows.append(
-                StudyRow(
-                    seat_name(geometry.seat),
-                    geometry.d_mm,
-                    geometry.depth_ratio,
-                    ratio,
-                    found.amplitude,
-                    sigma_x,
-                    found.rms,
-                    bool(found.amplitude >= DETECTABLE and found.resolved),
-                    sigma_y,
-                    body.layers.thickness_mm,
-                    self.head.radius_mm,
-                    self.head.shoulders,
-                    normalise="mean",
-                    noise="independent",
-                    **self.recipe(),
-                )
-            )
+            detectable = bool(found.amplitude >= DETECTABLE and found.resolved)
+            seen = found.amplitude, sigma_x, found.rms, detectable, sigma_y
+            rows.append(StudyRow(*case, *seen, *setting, normalise="mean", noise="independent", **self.recipe()))
         return rows
 
 
@@ -254,11 +241,9 @@ def widths(rows: Sequence[StudyRow], *, axis: str = "x") -> FloatArray:
 
 def width_changes(rows: Sequence[StudyRow], *, axis: str = "x") -> FloatArray:
     """Delta sigma of each row: its width over that of the same lump at one diameter depth; NaN without such a row."""
-    sigma = widths(rows, axis=axis)
     lump = [(row.seat, row.d_mm, row.stiffness_ratio) for row in rows]
-    level = [abs(row.depth_ratio - 1.0) < 1e-9 for row in rows]
-    reference = {key: width for key, width, at in zip(lump, sigma, level, strict=True) if at}
-    return np.array([width / reference.get(key, np.nan) for key, width in zip(lump, sigma, strict=True)])
+    depth_ratio = np.array([row.depth_ratio for row in rows])
+    return eq6.width_changes(widths(rows, axis=axis), depth_ratio=depth_ratio, group=lump)
 
 
 def stiffness_changes(rows: Sequence[StudyRow], *, least_ratio: float = 8.0) -> dict[float, float]:

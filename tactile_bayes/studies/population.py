@@ -160,30 +160,6 @@ def draw_exam(prior: ExamPrior, rng: np.random.Generator) -> Scene:
     )
 
 
-def draw_mass(
-    index: int,
-    *,
-    scans: int,
-    seed: int,
-    bodies: BodyPrior | None = None,
-    exams: ExamPrior | None = None,
-    head: Head | None = None,
-) -> list[Scene]:
-    """Draw the scenes of one mass, examined several times; they depend only on index, seed, priors and head, by default
-    the paper's."""
-    rng = np.random.default_rng([seed, index])
-    body, lump = draw_body(bodies or BodyPrior(), rng)
-    exam_prior = exams or ExamPrior()
-    scenes = []
-    for number in range(scans):
-        exam = draw_exam(exam_prior, rng)
-        x, y = rng.uniform(*exam_prior.off_centre_mm, size=2)
-        placed = replace(lump, x_mm=float(x), y_mm=float(y))
-        scene_seed = int(np.random.SeedSequence([seed, index, number]).generate_state(1)[0])
-        scenes.append(replace(exam, seed=scene_seed, body=body, solid_lumps=(placed,), head=head or Head()))
-    return scenes
-
-
 def _log_uniform(ends: Range, rng: np.random.Generator) -> float:
     return float(np.exp(rng.uniform(np.log(ends[0]), np.log(ends[1]))))
 
@@ -256,8 +232,16 @@ class Population(Record):
     def scenes(self, index: int) -> list[Scene]:
         """The exams of one mass."""
         centred = self.first_centred is not None and index >= self.first_centred
-        bodies = replace(self.bodies, seat=(0.0, 0.0)) if centred else self.bodies
-        return draw_mass(index, scans=self.scans, seed=self.seed, bodies=bodies, exams=self.exams, head=self.head)
+        rng = np.random.default_rng([self.seed, index])
+        body, lump = draw_body(replace(self.bodies, seat=(0.0, 0.0)) if centred else self.bodies, rng)
+        scenes = []
+        for number in range(self.scans):
+            exam = draw_exam(self.exams, rng)
+            x, y = rng.uniform(*self.exams.off_centre_mm, size=2)
+            placed = replace(lump, x_mm=float(x), y_mm=float(y))
+            seed = int(np.random.SeedSequence([self.seed, index, number]).generate_state(1)[0])
+            scenes.append(replace(exam, seed=seed, body=body, solid_lumps=(placed,), head=self.head))
+        return scenes
 
     def rows(self, index: int, scan: Callable[[Scene], Scan] | None = None) -> list[MassRow]:
         """Scan each exam of a mass, by default with the scene's seed, map and fit it; a row for each normalisation."""
@@ -277,19 +261,9 @@ def measure_exam(scene: Scene, scan: Scan, *, body: int, exam: int, normalise: s
     """Row of one exam; the measured columns are empty where no map can be built or no lump is detected."""
     lump, tissue = scene.solid_lumps[0], scene.body
     assert tissue is not None
-    row = MassRow(
-        body,
-        exam,
-        lump.d_mm,
-        lump.depth_ratio,
-        lump.stiffness_ratio,
-        lump.seat or 0.0,
-        tissue.fat_kpa,
-        tissue.gland_ratio,
-        tissue.thickness_mm,
-        normalise=normalise,
-        **head_columns(scene.head),
-    )
+    truth = as_dict(replace(lump, seat=lump.seat or 0.0)) | as_dict(tissue)
+    columns = {name: truth[name] for name in BODY_COLUMNS} | head_columns(scene.head)
+    row = MassRow(body, exam, normalise=normalise, **columns)
     try:
         tactile_map = build_map(scan, normalise=normalise, as_stated=True)
         quality = tactile_map.quality

@@ -15,7 +15,7 @@ from tactile_bayes.files.size_json import read_size_calibration
 from tactile_bayes.files.tables import read_table
 from tactile_bayes.forward.scene import Head
 from tactile_bayes.size.bodies import BodyCalibration
-from tactile_bayes.studies.population import BodyPrior, MassRow, Population, draw_mass, head_columns
+from tactile_bayes.studies.population import BodyPrior, MassRow, Population, head_columns
 
 PHANTOMS = Path(tactile_bayes.__file__).parent / "demo" / "phantoms.csv"
 
@@ -41,7 +41,7 @@ def table(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_mass_is_drawn_alike_wherever_it_is_drawn_and_others_differ() -> None:
-    one, again, other = (draw_mass(i, scans=2, seed=7) for i in (3, 3, 4))
+    one, again, other = (Population(scans=2, seed=7).scenes(i) for i in (3, 3, 4))
     assert one == again
     assert one[0].solid_lumps[0].d_mm == one[1].solid_lumps[0].d_mm
     assert one[0].strokes != one[1].strokes
@@ -52,7 +52,7 @@ def test_every_drawn_body_can_be() -> None:
     """A scene refuses a lump through the skin or the wall: all of the prior must pass it."""
     prior = BodyPrior()
     for i in range(300):
-        (scene,) = draw_mass(i, scans=1, seed=99)
+        (scene,) = Population(scans=1, seed=99).scenes(i)
         lump = scene.solid_lumps[0]
         assert prior.d_mm[0] <= lump.d_mm <= prior.d_mm[1]
 

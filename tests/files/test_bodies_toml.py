@@ -8,7 +8,7 @@ import pytest
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.documents import read_toml_record
-from tactile_bayes.studies.population import BodiesFile, BodyPrior, draw_mass
+from tactile_bayes.studies.population import BodiesFile, BodyPrior, Population
 
 
 def written(folder: Path, text: str) -> Path:
@@ -24,7 +24,7 @@ def test_what_is_given_is_drawn_from(tmp_path: Path) -> None:
     assert bodies.d_mm == (8, 9)
     assert bodies.fat_kpa == BodyPrior().fat_kpa
     for i in range(20):
-        (scene,) = draw_mass(i, scans=1, seed=3, bodies=bodies, exams=exams)
+        (scene,) = Population(scans=1, seed=3, bodies=bodies, exams=exams).scenes(i)
         assert 8 <= scene.solid_lumps[0].d_mm <= 9
         assert scene.solid_lumps[0].seat == 0
         assert scene.strokes.lines == 3
