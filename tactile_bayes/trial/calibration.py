@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from itertools import groupby
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
 from typing import Annotated
 
 import numpy as np
@@ -13,7 +13,7 @@ from scipy.special import chdtri, kolmogi, ndtr, ndtri
 
 from tactile_bayes.declarations import Meta, Record
 from tactile_bayes.trial.figures import MIN_PATIENTS, Count, Ends, Share, clopper_pearson
-from tactile_bayes.trial.readings import FloatArray, IntervalReading, Reading, Trial, mass_numbers
+from tactile_bayes.trial.readings import FloatArray, MassKey, Reading, Trial, mass_numbers
 
 # --- Coverage of stated intervals against the size after excision.
 
@@ -33,20 +33,24 @@ class Coverage(Record):
     fraction_interval: Ends
 
 
-def coverage(intervals: Sequence[IntervalReading], *, confidence: float) -> list[Coverage]:
-    """Coverage at each nominal probability, with an exact interval.
+def coverage(
+    readings: Sequence[Reading], ex_vivo_mm: Mapping[MassKey, float], *, confidence: float
+) -> tuple[Coverage, ...]:
+    """Coverage at each nominal probability by the readings that state an interval, its ends included.
 
     Replicates of a mass share its ex-vivo size, so n intervals on m masses are not n trials. The interval takes the
     share covered as found on m trials: exact where each mass has one interval, on the wide side where it has more.
     """
-    ordered = sorted(intervals, key=lambda one: one.interval.probability)
+    stated: dict[float, list[tuple[MassKey, bool]]] = defaultdict(list)
+    for one in readings:
+        if (ends := one.interval) is not None:
+            stated[ends.probability].append((one.key, ends.low_mm <= ex_vivo_mm[one.key] <= ends.high_mm))
     found = []
-    for probability, same in groupby(ordered, key=lambda one: one.interval.probability):
-        group = list(same)
-        n, covered, masses = len(group), sum(one.covered for one in group), len({one.key for one in group})
-        ends = clopper_pearson(covered * masses / n, masses, confidence=confidence)
-        found.append(Coverage(probability, n, covered, masses, covered / n, ends))
-    return found
+    for probability, group in sorted(stated.items()):
+        n, covered, masses = len(group), sum(inside for _, inside in group), len({key for key, _ in group})
+        share = clopper_pearson(covered * masses / n, masses, confidence=confidence)
+        found.append(Coverage(probability, n, covered, masses, covered / n, share))
+    return tuple(found)
 
 
 # --- Calibration of stated uncertainties: probability integral transforms, scores, and the implied correction.

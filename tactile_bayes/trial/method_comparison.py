@@ -555,8 +555,8 @@ def _limits(found: ModalitySizes, *, confidence: float) -> dict[Unit, Limits]:
 def _trends(x: FloatArray, y: FloatArray, *, confidence: float) -> dict[Against, Trend]:
     against: dict[Against, FloatArray] = {"on_ex_vivo": x, "on_mean": (x + y) / 2}
     judge = partial(trend, y - x, confidence=confidence)
-    found = {name: _or_none(partial(judge, sizes)) for name, sizes in against.items()}
-    return {name: one for name, one in found.items() if one is not None}
+    found = ((name, _or_none(partial(judge, sizes))) for name, sizes in against.items())
+    return {name: one for name, one in found if one is not None}
 
 
 def _or_none(compute: Callable[[], _T]) -> _T | None:

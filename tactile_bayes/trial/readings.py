@@ -52,19 +52,6 @@ class Reading(Record):
     day: date | None = None
 
 
-class IntervalReading(Record):
-    """A stated interval beside the size found after excision."""
-
-    key: MassKey
-    interval: Interval
-    ex_vivo_mm: float
-
-    @property
-    def covered(self) -> bool:
-        """Whether the ex-vivo size lies in the interval, ends included."""
-        return self.interval.low_mm <= self.ex_vivo_mm <= self.interval.high_mm
-
-
 class ModalitySizes(Record, eq=False):
     """Sizes of n masses by one modality, ordered by patient and mass whatever the order of the rows."""
 
@@ -73,7 +60,6 @@ class ModalitySizes(Record, eq=False):
     ex_vivo_mm: FloatArray  #: (n,) array, above 0.
     size_mm: FloatArray  #: (n,) array: mean over the detected replicates; 0 where none was detected.
     replicates_mm: tuple[FloatArray, ...]  #: n arrays: the detected replicates of each mass.
-    intervals: tuple[IntervalReading, ...] = ()  #: The credible intervals that the readings state.
     readings: int = 0
     masses_not_done: int = 0
     masses_without_reading: int = 0
@@ -238,7 +224,6 @@ def _gather_modality(
         ex_vivo_mm=np.array([ex_vivo_mm[key] for key in by_mass], dtype=np.float64),
         size_mm=np.array([sizes.mean() if len(sizes) else 0.0 for sizes in replicates], dtype=np.float64),
         replicates_mm=replicates,
-        intervals=tuple(IntervalReading(r.key, r.interval, ex_vivo_mm[r.key]) for r in done if r.interval),
         readings=len(done),
         masses_not_done=len(seen) - len(by_mass),
         masses_without_reading=len(ex_vivo_mm) - len(seen),

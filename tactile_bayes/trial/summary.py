@@ -189,7 +189,7 @@ def summarise(
             readings_after_excision=trial.other_visits.later,
         ),
         modalities={
-            name: modality_report(one, confidence=confidence, error_ratio=error_ratio, trial=trial)
+            name: modality_report(one, trial, confidence=confidence, error_ratio=error_ratio)
             for name, one in sizes.items()
         },
         mape_ratio_to_tactile=accuracy.mape_ratios(sizes, confidence=confidence),
@@ -211,10 +211,10 @@ def _detected_interval(sizes: ModalitySizes, *, confidence: float) -> tuple[floa
 
 
 def modality_report(
-    sizes: ModalitySizes, *, confidence: float, error_ratio: float = 1.0, trial: Trial | None = None
+    sizes: ModalitySizes, trial: Trial, *, confidence: float, error_ratio: float = 1.0
 ) -> ModalityReport:
     """Report one modality: counts, all figures, coverage."""
-    prediction = None if trial is None else prediction_of(trial, sizes.name)
+    found, prediction = trial.found(sizes.name), prediction_of(trial, sizes.name)
     fields = fields_of({name: one for family in FAMILIES for name, one in family(sizes, confidence=confidence).items()})
     if prediction is None:
         fields["reasons"]["calibration"] = "no reading states an interval or a standard deviation"
@@ -228,11 +228,11 @@ def modality_report(
         masses_not_done=sizes.masses_not_done,
         masses_without_reading=sizes.masses_without_reading,
         **fields,
-        coverage=tuple(coverage(sizes.intervals, confidence=float(confidence))),
+        coverage=coverage(found, trial.ex_vivo_mm, confidence=float(confidence)),
         method_comparison=compare_methods(sizes, confidence=confidence, error_ratio=error_ratio),
         replicates=ReplicateFigures(
             **fields_of(replicate_figures(sizes, confidence=confidence)),
-            variance_components=None if trial is None else reader_components(trial.found(sizes.name)),
+            variance_components=reader_components(found),
         ),
         calibration=None if prediction is None else calibration(prediction, confidence=float(confidence)),
         cautions=accuracy.cautions(sizes, confidence=confidence),

@@ -153,7 +153,7 @@ EXTREMES = {
 @pytest.mark.parametrize("name", EXTREMES)
 def test_extremes_have_defined_answers(name: str) -> None:
     (ex_vivo, size), expected = EXTREMES[name]
-    report = modality_report(single(ex_vivo, size), confidence=0.95)
+    report = modality_report(single(ex_vivo, size), Trial([], {}), confidence=0.95)
     for key, value in expected.items():
         if value is None:
             assert report.figure(key).value is None

@@ -16,7 +16,7 @@ from tactile_bayes.trial.figures import (
     figure,
     interval_from_values,
 )
-from tactile_bayes.trial.readings import Interval, IntervalReading, ModalitySizes
+from tactile_bayes.trial.readings import Interval, ModalitySizes, Reading
 
 NOMINAL = 0.95
 
@@ -117,13 +117,16 @@ def test_masses_of_one_patient_must_go_together() -> None:
     assert mape_covered(1000, by_mass=True, **shape) < 0.80
 
 
-def interval_reading(mass: str, low: float, high: float, *, probability: float = 0.95) -> IntervalReading:
-    return IntervalReading(("P1", mass), Interval(low, high, probability), 10.0)
+EX_VIVO_MM = {("P1", str(mass)): 10.0 for mass in range(20)}
+
+
+def interval_reading(mass: str, low: float, high: float, *, probability: float = 0.95) -> Reading:
+    return Reading(("P1", mass), "tactile", 1, "detected", low, Interval(low, high, probability))
 
 
 def test_coverage_counts_ends_as_covered_and_splits_by_probability() -> None:
     wide = [interval_reading("1", 10, 12), interval_reading("2", 8, 10), interval_reading("3", 11, 12)]
-    half, full = coverage([*wide, interval_reading("1", 9, 11, probability=0.5)], confidence=NOMINAL)
+    half, full = coverage([*wide, interval_reading("1", 9, 11, probability=0.5)], EX_VIVO_MM, confidence=NOMINAL)
     assert (half.probability, half.covered, half.n) == (0.5, 1, 1)
     assert (full.probability, full.covered, full.n, full.masses) == (0.95, 2, 3, 3)
     assert full.fraction_interval == pytest.approx(clopper_pearson(2, 3, confidence=NOMINAL))
@@ -131,7 +134,7 @@ def test_coverage_counts_ends_as_covered_and_splits_by_probability() -> None:
 
 def test_repeating_the_maps_of_a_mass_does_not_sharpen_coverage() -> None:
     one_each = [interval_reading(str(i), 9, 11 if i else 9.5) for i in range(20)]
-    (once,) = coverage(one_each, confidence=NOMINAL)
-    (five_times,) = coverage(one_each * 5, confidence=NOMINAL)
+    (once,) = coverage(one_each, EX_VIVO_MM, confidence=NOMINAL)
+    (five_times,) = coverage(one_each * 5, EX_VIVO_MM, confidence=NOMINAL)
     assert (five_times.n, five_times.covered, five_times.masses) == (100, 95, 20)
     assert five_times.fraction_interval == pytest.approx(once.fraction_interval)
