@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from tactile_bayes.forward.axisymmetric import LayeredBody
-from tactile_bayes.forward.scene import Scene, Strokes
-from tactile_bayes.forward.simulate import solid_frames
+from tactile_bayes.forward.scene import Scene, Strokes, head_positions, level_kpa
+from tactile_bayes.forward.simulate import frames_at_poses
 from tactile_bayes.forward.tissue import SceneBody, SolidLump
 from validation.stress import CONTROL, STRESSES, jobs
 from validation.stress_frames import Physics, VaryingLayers, shear_sinking, stressed_frames
@@ -31,7 +31,8 @@ def fat(slope: float) -> Physics:
 
 @pytest.fixture(scope="module")
 def plain() -> np.ndarray:
-    return solid_frames(SCENE, TIMES)[0]
+    level = level_kpa(SCENE.background, TIMES)
+    return frames_at_poses(SCENE, *head_positions(SCENE, TIMES), mean_kpa=level)[0]
 
 
 @pytest.mark.parametrize("physics", [Physics(), fat(0.0), Physics(skin_radius_mm=1e9)], ids=["none", "even", "flat"])

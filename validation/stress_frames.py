@@ -124,7 +124,7 @@ def on_sphere(scene: Scene, scan: Scan, radius_mm: float) -> Scan:
 def stressed_frames(
     scene: Scene, time_s: FloatArray, physics: Physics, *, empty: bool = False
 ) -> tuple[FloatArray, FloatArray]:
-    """Pressures (n, rows, columns) and depths (n,) as `solid_frames` returns them, by the changed physics."""
+    """Pressures (n, rows, columns) and depths (n,) as `frames_at_poses` returns them, by the changed physics."""
     rotation, origin = head_positions(scene, time_s)
     level = level_kpa(scene.background, time_s)
     way = np.tanh(np.gradient(origin[:, 0], time_s) / _SLOW_MM_S)

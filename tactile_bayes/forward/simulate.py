@@ -62,22 +62,32 @@ def simulate(
     alone are too quick to call it.
     """
     chosen, scene = _prepared(scene, fidelity, head)
+    if chosen == "empirical-gaussian":
+        if head is not None:
+            raise BadDataError(
+                "--head is given for the empirical-gaussian model, whose bumps do not depend on the head's shoulders",
+                way_out="leave --head out, or choose another --fidelity",
+            )
+
+        def felt(time_s: FloatArray) -> FloatArray:
+            poses, level = head_positions(scene, time_s), level_kpa(scene.background, time_s)
+            return _gaussian_frames(scene, *poses, level, share_load=scene.background.load_sharing)
+
+        lumps, background = [as_dict(lump) for lump in scene.lumps], as_dict(scene.background)
+        return record(scene, felt=felt, truth={"model": "gaussian", "lumps": lumps, "background": background}, rng=rng)
+    time = frame_times(scene)
+    poses, level = head_positions(scene, time), level_kpa(scene.background, time)
+    told = {"model": chosen, "head": scene.head.shoulders}
     if chosen == "solid":
-        return simulate_solid(scene, rng=rng, progress=progress)
-    if chosen in ("plane-strain", "empirical"):
-        return simulate_plane(scene, rng=rng, fidelity=chosen, shoulders=head or SHOULDERS_INSIDE, progress=progress)
-    if head is not None:
-        raise BadDataError(
-            "--head is given for the empirical-gaussian model, whose bumps do not depend on the head's shoulders",
-            way_out="leave --head out, or choose another --fidelity",
-        )
-
-    def felt(time_s: FloatArray) -> FloatArray:
-        poses, level = head_positions(scene, time_s), level_kpa(scene.background, time_s)
-        return _gaussian_frames(scene, *poses, level, share_load=scene.background.load_sharing)
-
-    lumps, background = [as_dict(lump) for lump in scene.lumps], as_dict(scene.background)
-    return record(scene, felt=felt, truth={"model": "gaussian", "lumps": lumps, "background": background}, rng=rng)
+        pressure, depth = frames_at_poses(scene, *poses, mean_kpa=level, progress=progress)
+    else:
+        told = {"model": chosen, "shape": _SHAPE, "head": head or SHOULDERS_INSIDE}
+        section = plane_section(scene, chosen, shoulders=head or SHOULDERS_INSIDE)
+        sections = section.sections(chosen, reach_mm=_reach_of_strokes(scene, section))
+        pressure = plane_frames(scene, *poses, level, sections, lump_x_mm=section.x_mm, progress=progress)
+    truth = told | tissue_truth(scene)
+    sunk = (lambda at: np.interp(at, time, depth)) if chosen == "solid" else None
+    return record(scene, felt=lambda at: pressure[np.searchsorted(time, at)], depth=sunk, truth=truth, rng=rng)
 
 
 def _prepared(scene: Scene, fidelity: str | None, head: str | None) -> tuple[str, Scene]:
@@ -155,7 +165,9 @@ def _gaussian_frames(
 #
 # Nothing changes along y. Each column of taxels feels what a head of the same section feels at that column's place
 # across the lump: its profile is repeated along the head. The head stays level in this: tilts are in the poses, not in
-# the pressures, and how deep the head sinks is not followed.
+# the pressures, and how deep the head sinks is not followed. The plane-strain model solves the head's contact at each
+# place and force; the empirical one takes Eqs 1 to 4 as printed, fitted to two frames of the plane-strain model at the
+# nominal pressure, and scaled with the pressure.
 
 Sections = Callable[[FloatArray, FloatArray], FloatArray]
 """Profiles (m, rows) in kPa of a head at (m,) places from the lump's axis, with (m,) mean pressures in kPa."""
@@ -167,23 +179,8 @@ _FRAMES_AT_ONCE = 100
 _SHAPE = "a cylinder along y: each frame's profile across the head is repeated along it"
 
 
-def simulate_plane(
-    scene: Scene,
-    *,
-    rng: np.random.Generator,
-    fidelity: str,
-    shoulders: str = SHOULDERS_INSIDE,
-    progress: Progress = untold,
-) -> SimulatedScan:
-    """Make a scan in two dimensions of a scene that gives tissue: at most one lump, whose section is a circle, and no
-    rib.
-
-    ``fidelity="plane-strain"`` solves the head's contact at each place and force; ``"empirical"`` takes Eqs 1 to 4 as
-    printed, fitted to two frames of the plane-strain model at the nominal pressure, and scaled with the pressure.
-    `shoulders` is one of `presets.HEADS`. `rng` is the instrument's alone; `progress` is called with frames done and
-    frames in all.
-    """
-    section, time = plane_section(scene, fidelity, shoulders=shoulders), frame_times(scene)
+def _reach_of_strokes(scene: Scene, section: PlaneSection) -> float:
+    """How far the head's edges get from the lump's axis, mm."""
     half_mm, most = section.half_face_mm, section.most_reach_mm
     stroke = scene.strokes.half_length_mm + scene.strokes.wander_mm + scene.head.columns * scene.head.pitch_mm / 2
     reach = stroke + abs(section.x_mm) + half_mm + 1.0
@@ -193,12 +190,7 @@ def simulate_plane(
             f"a head {2 * half_mm:g} mm wide)",
             way_out=f"the mesh reaches {most:g} mm: shorten the strokes or narrow the head",
         )
-    level, sections = level_kpa(scene.background, time), section.sections(fidelity, reach_mm=reach)
-    pressure = plane_frames(
-        scene, *head_positions(scene, time), level, sections, lump_x_mm=section.x_mm, progress=progress
-    )
-    truth = {"model": fidelity, "shape": _SHAPE, "head": shoulders, **tissue_truth(scene)}
-    return record(scene, felt=lambda at: pressure[np.searchsorted(time, at)], truth=truth, rng=rng)
+    return reach
 
 
 class PlaneSection(Record, eq=False):
@@ -491,38 +483,17 @@ def solid_head(face: HeadFace, body: LayeredBody) -> SolidHead:
 
 
 # --- Three-dimensional scans of lumps of tissue in a layered body, solved frame by frame.
-
-
-def simulate_solid(scene: Scene, *, rng: np.random.Generator, progress: Progress = untold) -> SimulatedScan:
-    """Make a scan of a scene that gives tissue; `rng` is the instrument's alone. Ribs are rows of balls.
-
-    The mean over the taxels follows the scene's background, as an examiner holds it by the tone; where the head sinks
-    less, over a lump, its pose says so. Tilts are the scene's. Each frame is at rest: nothing slides, creeps or lags.
-    """
-    time = frame_times(scene)
-    pressure, depth = solid_frames(scene, time, progress=progress)
-    return record(
-        scene,
-        felt=lambda at: pressure[np.searchsorted(time, at)],
-        depth=lambda at: np.interp(at, time, depth),
-        truth={"model": "solid", "head": scene.head.shoulders, **tissue_truth(scene)},
-        rng=rng,
-    )
-
-
-def solid_frames(scene: Scene, time_s: FloatArray, *, progress: Progress = untold) -> tuple[FloatArray, FloatArray]:
-    """Pressures in kPa, (n, rows, columns), on the head at (n,) times, without noise, and z in mm of its apex in the
-    scene's `plane`."""
-    rotation, origin = head_positions(scene, time_s)
-    level = level_kpa(scene.background, time_s)
-    return frames_at_poses(scene, rotation, origin, mean_kpa=level, progress=progress)
+#
+# The mean over the taxels follows the scene's background, as an examiner holds it by the tone; where the head sinks
+# less, over a lump, its pose says so. Tilts are the scene's. Each frame is at rest: nothing slides, creeps or lags.
+# Ribs are rows of balls.
 
 
 def frames_at_poses(
     scene: Scene, rotation: FloatArray, origin_mm: FloatArray, *, mean_kpa: FloatArray, progress: Progress = untold
 ) -> tuple[FloatArray, FloatArray]:
-    """As `solid_frames`, at given poses from `scanhead` to the scene's `plane` and mean pressures, which decide the
-    depth."""
+    """Pressures in kPa, (n, rows, columns), on the head at poses from `scanhead` to the scene's `plane`, without noise,
+    and z in mm of its apex there, which the mean pressures decide."""
     body = scene.body or SceneBody()
     head, lumps = _head(scene.head, body, fat_thickness(body, scene.solid_lumps)), _placed(scene)
     count = len(mean_kpa)

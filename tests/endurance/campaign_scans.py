@@ -20,8 +20,9 @@ import numpy as np
 from tactile_bayes.declarations import replace
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.scan_mcap import write_scan
+from tactile_bayes.forward import scene as scenes
 from tactile_bayes.forward.scene import Background, Noise, Scene, Strokes, frame_times, record
-from tactile_bayes.forward.simulate import solid_frames
+from tactile_bayes.forward.simulate import frames_at_poses
 from tactile_bayes.forward.tissue import SceneBody, SolidLump
 from tactile_bayes.scans import Scan
 
@@ -67,7 +68,9 @@ class Body:
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
         self._time = frame_times(scene)
-        self._pressure, self._depth = solid_frames(scene, self._time)
+        level = scenes.level_kpa(scene.background, self._time)
+        poses = scenes.head_positions(scene, self._time)
+        self._pressure, self._depth = frames_at_poses(scene, *poses, mean_kpa=level)
 
     @property
     def ex_vivo_mm(self) -> float:

@@ -34,10 +34,10 @@ from tactile_bayes.forward.simulate import (
     SolidHead,
     condensed_lump,
     face_of,
+    frames_at_poses,
     layers_of,
     simulate,
     skin_perturbation,
-    solid_frames,
     solid_head,
 )
 from tactile_bayes.forward.tissue import Rib, SceneBody, SolidLump, fat_thickness
@@ -70,6 +70,10 @@ TOML = "[scene]\nseed = 4\nduration_s = 0.1\n[body]\n[[lump]]\nd_mm = 15\ndepth_
 @cache
 def short_scan() -> SimulatedScan:
     return simulate(SHORT, rng=np.random.default_rng(0))
+
+
+def solid_frames(scene: Scene, time_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return frames_at_poses(scene, *head_positions(scene, time_s), mean_kpa=level_kpa(scene.background, time_s))
 
 
 @cache
