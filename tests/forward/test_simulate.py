@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 import tactile_bayes
 from tactile_bayes.declarations import as_dict, replace
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.files.documents import load_schema
-from tactile_bayes.files.instrument import read_scene, scene_from_toml
+from tactile_bayes.files.documents import load_schema, parse_toml
+from tactile_bayes.files.instrument import read_scene, scene_of
 from tactile_bayes.files.scan_mcap import read_scan, read_truth
 from tactile_bayes.forward.scene import (
     Background,
@@ -38,6 +38,10 @@ SILENT = Noise(0.0, 0.0, 0.0, 0.0, 0.0)
 LUMP = Lump(x_mm=4.0, y_mm=-3.0, amplitude=0.4, sigma_x_mm=6.0, sigma_y_mm=4.0, angle_deg=30.0)
 QUIET = Scene(duration_s=1.0, pose_rate_hz=200.0, lumps=(LUMP,), noise=SILENT, background=Background(ramp_s=0.0))
 DEMO = Path(tactile_bayes.__file__).parent / "demo"
+
+
+def scene_from_text(text: str) -> Scene:
+    return scene_of(parse_toml(text, way_out="see the scene in the documentation"))
 
 
 def run(scene: Scene, seed: int = 0) -> Scan:
@@ -161,7 +165,7 @@ def test_a_lump_in_a_file_has_the_keys_of_both_kinds_and_the_defaults_of_a_bump(
 
 
 def test_an_empty_scene_is_the_default_scene() -> None:
-    assert scene_from_toml("") == Scene()
+    assert scene_from_text("") == Scene()
 
 
 BAD_SCENES = [

@@ -14,7 +14,8 @@ from posterior_maps import find_bump
 
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.files.instrument import read_scene, scene_from_toml
+from tactile_bayes.files.documents import parse_toml
+from tactile_bayes.files.instrument import read_scene, scene_of
 from tactile_bayes.files.scan_mcap import read_scan, read_truth
 from tactile_bayes.forward.scene import (
     Background,
@@ -70,6 +71,10 @@ TOML = "[scene]\nseed = 4\nduration_s = 0.1\n[body]\n[[lump]]\nd_mm = 15\ndepth_
 @cache
 def short_scan() -> SimulatedScan:
     return simulate(SHORT, rng=np.random.default_rng(0))
+
+
+def scene_from_text(text: str) -> Scene:
+    return scene_of(parse_toml(text, way_out="see the scene in the documentation"))
 
 
 def solid_frames(scene: Scene, time_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -137,7 +142,7 @@ def test_a_spheroid_and_several_lumps() -> None:
 
 
 def test_a_scene_of_tissue_without_a_lump() -> None:
-    scene = scene_from_toml("[scene]\nduration_s = 0.02\n[body]\n")
+    scene = scene_from_text("[scene]\nduration_s = 0.02\n[body]\n")
     assert scene.fidelity == "solid"
     truth = simulate(scene, rng=np.random.default_rng(0)).truth
     assert truth["lumps"] == []
@@ -145,9 +150,9 @@ def test_a_scene_of_tissue_without_a_lump() -> None:
 
 
 def test_the_scene_decides_the_model() -> None:
-    assert scene_from_toml(TOML).fidelity == "solid"
-    assert scene_from_toml("[[lump]]\namplitude = 0.2").fidelity == "empirical-gaussian"
-    assert scene_from_toml("").fidelity == "empirical-gaussian"
+    assert scene_from_text(TOML).fidelity == "solid"
+    assert scene_from_text("[[lump]]\namplitude = 0.2").fidelity == "empirical-gaussian"
+    assert scene_from_text("").fidelity == "empirical-gaussian"
     rng = np.random.default_rng(0)
     with pytest.raises(BadDataError, match=r"lump\[0\] gives no depth_ratio; the solid model needs"):
         simulate(Scene(lumps=(Lump(),)), rng=rng, fidelity="solid")
@@ -158,7 +163,7 @@ def test_the_scene_decides_the_model() -> None:
 
 
 def test_a_rib_is_a_row_of_balls_and_no_lump() -> None:
-    scene = scene_from_toml("[scene]\nduration_s = 0.02\n[body]\nfat_mm = 12\n[[rib]]\nhalf_length_mm = 9\n")
+    scene = scene_from_text("[scene]\nduration_s = 0.02\n[body]\nfat_mm = 12\n[[rib]]\nhalf_length_mm = 9\n")
     assert scene.fidelity == "solid"
     assert [(ball.x_mm, ball.y_mm, ball.depth_mm) for ball in scene.stiff_balls] == [(x, 26, 12) for x in (-8, 0, 8)]
     truth = simulate(scene, rng=np.random.default_rng(0)).truth
@@ -220,7 +225,7 @@ def test_what_cannot_be_is_told_in_one_line(tmp_path: Path, text: str, words: st
 
 def test_given_fat_places_lumps_of_any_size() -> None:
     text = "[body]\nfat_mm = 12\n" + LUMP + "depth_ratio = 0.8\n[[lump]]\nd_mm = 10\ndepth_ratio = 1.6\n"
-    scene = scene_from_toml(text)
+    scene = scene_from_text(text)
     assert scene.body is not None
     assert fat_thickness(scene.body, scene.solid_lumps) == 12.0
 
