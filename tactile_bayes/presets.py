@@ -18,6 +18,9 @@ PRESSURE_WINDOW_KPA: Final = (5.0, 14.0)
 # kPa in one of each unit of pressure: the inch-pound and the technical definitions, exact or to 7 digits.
 KPA_PER_UNIT: Final = {"kPa": 1.0, "Pa": 0.001, "psi": 6.894757, "mmHg": 0.1333224, "N/cm2": 10.0}
 
+# mm in one of each unit of length.
+MM_PER_UNIT: Final = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4, "inch": 25.4, "um": 1e-3}
+
 # The head as simulated: an arc with rounded shoulders (shared design notes; the paper: "nearly a circular cylinder").
 HEAD_RADIUS_MM: Final = 35.0
 SHOULDER_MM: Final = 3.0

@@ -175,23 +175,14 @@ class PrintableStream:
         try:
             action(*arguments)
         except OSError as error:
-            _abandon(self._stream)
-            self._failure = _failure(error) if self._required else None
+            nowhere = os.open(os.devnull, os.O_WRONLY)  # else Python tries again at exit and prints a traceback
+            os.dup2(nowhere, self._stream.fileno())
+            os.close(nowhere)
+            full = f"the standard output cannot be written ({error.strerror}); make room, or send it elsewhere"
+            failure = ReaderGoneError() if error.errno == errno.EPIPE else UsageError(full)
+            self._failure = failure if self._required else None
         if self._failure is not None:
             raise self._failure
-
-
-def _failure(error: OSError) -> Exception:
-    if error.errno == errno.EPIPE:
-        return ReaderGoneError()
-    return UsageError(f"the standard output cannot be written ({error.strerror}); make room, or send it elsewhere")
-
-
-def _abandon(stream: TextIO) -> None:
-    """Discard buffered output; otherwise Python would try again at exit and print a traceback."""
-    nowhere = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nowhere, stream.fileno())
-    os.close(nowhere)
 
 
 def protect_streams() -> None:
@@ -294,59 +285,38 @@ def progress_bar(
     long.
     """
     out = raw_stream(sys.stderr) if stream is None else stream
-    if not out.isatty() and log_every_s is None:
+    bar = out.isatty()
+    every_s = REDRAW_S if bar else log_every_s
+    if every_s is None:
         yield untold
         return
-    teller = _Teller(label, out, clock, log_every_s=None if out.isatty() else log_every_s, time_left=time_left)
-    try:
-        yield teller.update
-    finally:
-        teller.erase()
+    begun, drawn = clock(), 0
+    due = begun + (QUIET_S if bar else every_s)
+    first: int | None = None  # what a resumed run had before it began
 
-
-class _Teller:
-    """Tells of work: a line of a log every so often, or else a bar that is redrawn."""
-
-    def __init__(
-        self, label: str, out: TextIO, clock: Callable[[], float], *, log_every_s: float | None, time_left: bool
-    ) -> None:
-        self._label, self._out, self._clock, self._time_left = label, out, clock, time_left
-        self._bar = log_every_s is None
-        quiet_s, self._every_s = (QUIET_S, REDRAW_S) if log_every_s is None else (log_every_s, log_every_s)
-        self._begun = clock()
-        self._next = self._begun + quiet_s
-        self._first: int | None = None  # what a resumed run had before it began
-        self._drawn = 0
-
-    def update(self, done: int, total: int) -> None:
-        """Tell `done` of `total`, at most every so often."""
-        now = self._clock()
-        self._first = done if self._first is None else self._first
-        if now < self._next or total <= 0:
+    def tell(done: int, total: int) -> None:
+        nonlocal first, due, drawn
+        now, first = clock(), done if first is None else first
+        if now < due or total <= 0:
             return
-        self._next = now + self._every_s
-        left = self._left(now, done, total)
-        if self._bar:
+        due, left = now + every_s, ""
+        if time_left and first < done < total:
+            left = f" {duration(round((now - begun) * (total - done) / (done - first)))} left"
+        if bar:
             filled = _WIDTH * done // total
-            line = f"{self._label} [{'#' * filled}{'-' * (_WIDTH - filled)}] {done}/{total}{left}"
-            self._out.write("\r" + line.ljust(self._drawn))
-            self._drawn = len(line)
+            line = f"{label} [{'#' * filled}{'-' * (_WIDTH - filled)}] {done}/{total}{left}"
+            out.write("\r" + line.ljust(drawn))
+            drawn = len(line)
         else:
-            self._out.write(f"{self._label}: {done} of {total} done{',' if left else ''}{left}\n")
-        self._out.flush()
+            out.write(f"{label}: {done} of {total} done{',' if left else ''}{left}\n")
+        out.flush()
 
-    def _left(self, now: float, done: int, total: int) -> str:
-        """The time left, after a blank; empty where it is not known."""
-        new = done - (self._first or 0)
-        if not self._time_left or new <= 0 or done >= total:
-            return ""
-        return f" {duration(round((now - self._begun) * (total - done) / new))} left"
-
-    def erase(self) -> None:
-        """Erase the bar."""
-        if self._drawn:
-            self._out.write("\r" + " " * self._drawn + "\r")
-            self._out.flush()
+    try:
+        yield tell
+    finally:
+        if drawn:
+            out.write("\r" + " " * drawn + "\r")
+            out.flush()
 
 
 def duration(seconds: int) -> str:

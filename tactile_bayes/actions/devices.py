@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import signal
 import subprocess
 import sys
 import tempfile
@@ -67,24 +66,13 @@ def emulate_action(
 
 def _serve(emulators: list[Emulator], *, once: bool) -> None:
     """Run the first emulator here and the others in threads, until all have ended or a signal comes."""
-    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
-        signal.signal(number, _leave)
     others = [Thread(target=one.run, kwargs={"once": once}, daemon=True) for one in emulators[1:]]
-    with contextlib.suppress(_LeaveError):
+    with contextlib.suppress(KeyboardInterrupt):  # which the other signals are, too
         for other in others:
             other.start()
         emulators[0].run(once=once)
         for other in others:
             other.join()
-
-
-class _LeaveError(Exception):
-    """A signal asked this program to end."""
-
-
-def _leave(number: int, frame: object) -> None:
-    del number, frame
-    raise _LeaveError
 
 
 def _device(kind: str, scan: Scan, protocol: str, faults: Faults, *, path: Path, held: Stage | None) -> Device:

@@ -63,14 +63,8 @@ def estimate_pool(
             found.write(output, force=force)
         if found.pooled.size is not None and figure is not None:
             name = named_exam(f"{len(found.pooled_report.maps)} maps pooled", found.provenance.scans)
-            draw_size(
-                found.pooled.size,
-                figure,
-                name=name,
-                probability=found.probability,
-                findings=found.findings,
-                force=force,
-            )
+            given: dict[str, Any] = {"probability": found.probability, "findings": found.findings}
+            draw_size(found.pooled.size, figure, name=name, force=force, **given)
     finally:  # what was computed is not lost with a file
         click.echo(text_of(report), nl=False)
     return EXIT_DONE if found.pooled.size is not None else EXIT_NO_ESTIMATE

@@ -356,7 +356,9 @@ def _picture(state: LiveState, columns: int, lines: int, *, colour: bool) -> lis
     pixels = view.screen(values)
     # A character is twice as high as wide: two cells of the map share one, one above the other.
     step = max(1, -(-pixels.shape[1] // wide), -(-pixels.shape[0] // (2 * high)))
-    small = _shrunk(pixels, step)
+    known = np.isfinite(pixels)  # means over squares of `step` cells; NaN where all cells are NaN
+    number, total = block_sums(known.astype(float), step), block_sums(np.where(known, pixels, 0.0), step)
+    small = np.asarray(np.where(number > 0, total / np.maximum(number, 1), np.nan))
     rows = _blocks(small) if colour else _shades(small)
     if state.lump_mm is not None:
         across, down = view.place(state.tactile_map, state.lump_mm)
@@ -379,13 +381,6 @@ def _framed(rows: list[list[str]], view: Orientation, columns: int, *, colour: b
     middle = len(rows) // 2
     lines[middle] = f"{edges['left']:>{_MARGIN - 1}} {lines[middle][_MARGIN:]} {edges['right']}"
     return [(" " * _MARGIN + top)[:columns], *lines, (" " * _MARGIN + bottom)[:columns]]
-
-
-def _shrunk(values: FloatArray, step: int) -> FloatArray:
-    """Means over squares of `step` cells; NaN where all cells are NaN."""
-    known = np.isfinite(values)
-    number, total = block_sums(known.astype(float), step), block_sums(np.where(known, values, 0.0), step)
-    return np.asarray(np.where(number > 0, total / np.maximum(number, 1), np.nan))
 
 
 def _blocks(values: FloatArray) -> list[list[str]]:

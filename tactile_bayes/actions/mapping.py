@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +34,7 @@ def map_action(
             raise UsageError(f"{output} exists; name another with -o, or give --force")
         refuse_existing(output, force=force)
     settings = to_plain(MapOptions(**options), digits=EXACT)
-    clock = _Clock()
+    marks = [("begun", time.perf_counter())]
     loaded = [read_scan(path) for path in scans]
     read = zip(loaded, scans, strict=True)
     facts = [scan_facts(scan.session, frames=scan.frames.sha256, file=sha256(path)) for scan, path in read]
@@ -41,36 +42,24 @@ def map_action(
     provenance = Provenance("map", settings, inputs, scans=facts)
     for later, earlier in repeated_scans([[facts] for facts in provenance.scans]).items():
         raise UsageError(f"{scans[later]} holds the recording of {scans[earlier]}; give each recording once")
-    clock.tell("read")
+    marks.append(("read", time.perf_counter()))
     with progress_bar("frames") as progress:
         tactile_map = build_map(loaded, **options, progress=progress)
-    clock.tell("map")
+    marks.append(("map", time.perf_counter()))
     write_map(output, tactile_map, provenance=provenance, force=force)
     try:
         if figure:
             title = f"Tactile map: {named_exam(output.stem, provenance.scans)}"
             map_figure(tactile_map, figure, title=title, force=force)
-        clock.tell("write")
+        marks.append(("write", time.perf_counter()))
     finally:  # the map is written, whatever becomes of the figure
         text = map_text(tactile_map) if verbose else map_summary(tactile_map, written=str(output))
         click.echo(text, nl=False)
         if verbose:
-            click.echo("\n".join(clock.told), err=True)
+            for (_, before), (step, after) in pairwise(marks):
+                click.echo(f"{step}: {after - before:.3f} s", err=True)
 
 
 def beside(scan: Path) -> Path:
     """Where the map of a scan is written if no one says so: in its folder, and named after it."""
     return scan.parent / ("map.nc" if scan.stem == "scan" else f"{scan.stem}.nc")
-
-
-class _Clock:
-    """The time of each step, in words."""
-
-    def __init__(self) -> None:
-        self.told: list[str] = []
-        self._last = time.perf_counter()
-
-    def tell(self, step: str) -> None:
-        now = time.perf_counter()
-        self.told.append(f"{step}: {now - self._last:.3f} s")
-        self._last = now

@@ -242,19 +242,15 @@ def _option(record: type[Record], name: str, attributes: Mapping[str, Any]) -> D
         of_field |= {"default": default, "show_default": True} if shown else {}
         if isinstance(of_field["type"], NumberOr) and default is not None:
             of_field["default"] = default if isinstance(default, str) else f"{default:g}"
-    return click.option(flag, *also, name, **_fitting(name, {**of_field, **attributes}))
+    of_field |= attributes
+    kind = of_field.get("type")
+    if isinstance(kind, click.Choice) and not of_field["metavar"] and len("|".join(kind.choices)) > MOST_CHOICES:
+        of_field["help"] += f" One of {', '.join(kind.choices)}."
+        of_field["metavar"] = name.rpartition("_")[2].upper()
+    return click.option(flag, *also, name, **of_field)
 
 
 MOST_CHOICES: Final = 50  #: Letters of all the choices of an option up to which its help has them beside its name.
-
-
-def _fitting(name: str, of_field: dict[str, Any]) -> dict[str, Any]:
-    """An option whose choices are too many for the column of names has them in its help."""
-    kind = of_field.get("type")
-    if not isinstance(kind, click.Choice) or of_field["metavar"] or len("|".join(kind.choices)) <= MOST_CHOICES:
-        return of_field
-    told = f"{of_field['help']} One of {', '.join(kind.choices)}."
-    return {**of_field, "help": told, "metavar": name.rpartition("_")[2].upper()}
 
 
 def _click_type(kind: Any) -> Any:

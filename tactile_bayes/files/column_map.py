@@ -9,15 +9,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from datetime import date
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
-from tactile_bayes.declarations import Meta, Record, replace
+from tactile_bayes.declarations import Meta, Record
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.documents import load_toml, parse_record
 from tactile_bayes.files.tables import RawTable, Table, composed, parse_date, read_raw
+from tactile_bayes.presets import MM_PER_UNIT
 
-_EXCISION = ("patient", "mass", "ex_vivo_mm", "ex_vivo_second_mm", "sd_mm", "date")
-_FACTOR = {"mm": 1.0, "cm": 10.0, "in": 25.4}
 Unit = Literal["mm", "cm", "in"]
 Column = Annotated[str, Meta(min_length=1)]
 Modality = Annotated[
@@ -76,13 +75,9 @@ def read_wide(path: Path, mapping_path: Path) -> Table:
         way_out = "add one for each modality, or give a table of readings that is tidy"
         raise BadDataError("has no [[reading]]", way_out=way_out, path=str(mapping_path))
     named = [(one.size, one.sd, one.low, one.high, one.reader, one.date) for one in mapping.reading]
-    raw = _raw(path, mapping, [name for names in named for name in names])
-    rows = zip(raw.line_numbers, raw.rows, strict=True)
-    return _table(
-        path,
-        [(line, _reading(raw, line, row, reading, mapping)) for line, row in rows for reading in mapping.reading],
-        ("patient", "mass", "modality", "replicate"),
-    )
+    rows = _rows(path, mapping, [name for names in named for name in names])
+    readings = [(row.line, _reading(row, reading, mapping)) for row in rows for reading in mapping.reading]
+    return _table(path, readings, ("patient", "mass", "modality", "replicate"))
 
 
 def read_wide_excision(path: Path, mapping_path: Path) -> Table:
@@ -92,20 +87,23 @@ def read_wide_excision(path: Path, mapping_path: Path) -> Table:
     if excision is None:
         way_out = "add it, with size as the column of the sizes"
         raise BadDataError("has no table [excision]", way_out=way_out, path=str(mapping_path))
-    raw = _raw(path, mapping, (excision.size, excision.second, excision.sd, excision.date))
-    factor = _FACTOR[excision.unit or mapping.unit]
-    rows = []
-    for line, row in zip(raw.line_numbers, raw.rows, strict=True):
-        if row[excision.size]:
-            patient, mass = _key(raw, line, row, mapping)
-            size = factor * _positive(raw, line, excision.size, row[excision.size])
-            second, sd = (_number(raw, line, row, column, factor) for column in (excision.second, excision.sd))
-            day = _date(raw, line, row, excision.date)
-            rows.append((line, dict(zip(_EXCISION, (patient, mass, size, second, sd, day), strict=True))))
+    factor = MM_PER_UNIT[excision.unit or mapping.unit]
+    held = _rows(path, mapping, (excision.size, excision.second, excision.sd, excision.date))
+    rows = [row for row in held if row.cells[excision.size]]
     if not rows:
         what = f"column {excision.size}: holds no size"
         raise BadDataError(what, way_out="correct the mapping or the table", path=str(path))
-    return _table(path, rows, ("patient", "mass"))
+    sizes = [
+        {
+            **row.key(mapping),
+            "ex_vivo_mm": row.size(excision.size, factor),
+            "ex_vivo_second_mm": row.number(excision.second, factor),
+            "sd_mm": row.number(excision.sd, factor),
+            "date": row.day(excision.date),
+        }
+        for row in rows
+    ]
+    return _table(path, [(row.line, one) for row, one in zip(rows, sizes, strict=True)], ("patient", "mass"))
 
 
 def _table(path: Path, rows: Sequence[tuple[int, dict[str, Any]]], keys: Sequence[str]) -> Table:
@@ -136,45 +134,74 @@ def _composed_texts(item: Any) -> Any:
     return composed(item) if isinstance(item, str) else item
 
 
-def _raw(path: Path, mapping: ColumnMap, names: Sequence[str | None]) -> RawTable:
-    """The table with its names and cells in one spelling, in which the mapping's columns are there."""
+class _Row(NamedTuple):
+    """A row of a wide table."""
+
+    table: RawTable
+    line: int
+    cells: Mapping[str, str]
+
+    def key(self, mapping: ColumnMap) -> dict[str, Any]:
+        """Patient and mass."""
+        for name in mapping.key_columns():
+            if not self.cells[name]:
+                raise self.table.error(self.line, name, "is blank", way_out="every row needs its patient and mass")
+        mass = "1" if mapping.mass is None else self.cells[mapping.mass]
+        return {"patient": self.cells[mapping.patient], "mass": mass}
+
+    def number(self, column: str | None, factor: float) -> float | None:
+        """A number in mm; None without its column or cell."""
+        text = self.cells[column] if column else ""
+        return factor * self.table.number(self.line, str(column), text) if text else None
+
+    def size(self, column: str, factor: float) -> float:
+        """A size in mm, which is above 0."""
+        value = self.table.number(self.line, column, self.cells[column])
+        if value == 0:
+            ask = 'does 0 mean that the mass was not found? then add not_detected = ["0"] to the mapping'
+            raise self.table.error(self.line, column, "is 0", way_out=ask)
+        if value < 0:
+            raise self.table.error(self.line, column, f"is {value:g}", way_out="a size is above 0")
+        return factor * value
+
+    def day(self, column: str | None) -> date | None:
+        """A date; None without its column or cell."""
+        text = self.cells[column] if column else ""
+        try:
+            return parse_date(text) if text else None
+        except ValueError:
+            raise self.table.error(
+                self.line, str(column), f"{text!r} is no date", way_out="write it as 2026-03-01"
+            ) from None
+
+
+def _rows(path: Path, mapping: ColumnMap, names: Sequence[str | None]) -> list[_Row]:
+    """The rows with their names and cells in one spelling; the mapping's columns must be there."""
     table = read_raw(path)
-    rows = [{composed(name): composed(cell) for name, cell in row.items()} for row in table.rows]
-    table = replace(table, header=[composed(name) for name in table.header], rows=rows)
+    header = [composed(name) for name in table.header]
     for name in filter(None, (*mapping.key_columns(), *names)):
-        if name not in table.header:
-            held = ", ".join(repr(one) for one in table.header)
+        if name not in header:
+            held = ", ".join(repr(one) for one in header)
             raise table.error(1, name, "is missing", way_out=f"correct the mapping; the table has {held}")
-    return table
+    cells = ({composed(name): composed(cell) for name, cell in row.items()} for row in table.rows)
+    return [_Row(table, line, row) for line, row in zip(table.line_numbers, cells, strict=True)]
 
 
-def _key(table: RawTable, line: int, row: Mapping[str, str], mapping: ColumnMap) -> tuple[str, str]:
-    """Patient and mass of a row."""
-    for name in mapping.key_columns():
-        if not row[name]:
-            raise table.error(line, name, "is blank", way_out="every row needs its patient and mass")
-    return row[mapping.patient], "1" if mapping.mass is None else row[mapping.mass]
-
-
-def _reading(
-    table: RawTable, line: int, row: Mapping[str, str], reading: ReadingColumns, mapping: ColumnMap
-) -> dict[str, Any]:
-    patient, mass = _key(table, line, row, mapping)
-    factor = _FACTOR[reading.unit or mapping.unit]
-    text = row[reading.size]
+def _reading(row: _Row, reading: ReadingColumns, mapping: ColumnMap) -> dict[str, Any]:
+    key, factor = row.key(mapping), MM_PER_UNIT[reading.unit or mapping.unit]
+    text = row.cells[reading.size]
     status, size = "not_done", None
     if text and text in mapping.not_detected:
         status = "not_detected"
     elif text and text not in mapping.not_done:
-        status, size = "detected", factor * _positive(table, line, reading.size, text)
-    sd, low, high = (_number(table, line, row, column, factor) for column in (reading.sd, reading.low, reading.high))
+        status, size = "detected", row.size(reading.size, factor)
+    sd, low, high = (row.number(column, factor) for column in (reading.sd, reading.low, reading.high))
     probability = None if low is None else reading.probability
     if status == "detected" and reading.low and low is not None and probability is None:
         what = "is an interval's end without probability"
-        raise table.error(line, reading.low, what, way_out="add it to the mapping")
+        raise row.table.error(row.line, reading.low, what, way_out="add it to the mapping")
     return {
-        "patient": patient,
-        "mass": mass,
+        **key,
         "modality": reading.modality,
         "replicate": reading.replicate,
         "size_mm": size,
@@ -183,31 +210,9 @@ def _reading(
         "low_mm": low,
         "high_mm": high,
         "probability": probability,
-        "reader": (row[reading.reader] or None) if reading.reader else None,
+        "reader": (row.cells[reading.reader] or None) if reading.reader else None,
         "visit": reading.visit,
-        "date": _date(table, line, row, reading.date),
+        "date": row.day(reading.date),
         "posterior": None,
         "synthetic": mapping.synthetic,
     }
-
-
-def _number(table: RawTable, line: int, row: Mapping[str, str], column: str | None, factor: float) -> float | None:
-    return factor * table.number(line, column, row[column]) if column and row[column] else None
-
-
-def _date(table: RawTable, line: int, row: Mapping[str, str], column: str | None) -> date | None:
-    text = row[column] if column else ""
-    try:
-        return parse_date(text) if text else None
-    except ValueError:
-        raise table.error(line, str(column), f"{text!r} is no date", way_out="write it as 2026-03-01") from None
-
-
-def _positive(table: RawTable, line: int, column: str, text: str) -> float:
-    value = table.number(line, column, text)
-    if value == 0:
-        ask = 'does 0 mean that the mass was not found? then add not_detected = ["0"] to the mapping'
-        raise table.error(line, column, "is 0", way_out=ask)
-    if value < 0:
-        raise table.error(line, column, f"is {value:g}", way_out="a size is above 0")
-    return value

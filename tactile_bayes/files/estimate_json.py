@@ -75,16 +75,17 @@ def fill_from_posteriors(table: Table) -> tuple[dict[str, list[Any]], list[Path]
 
 def _check_status(table: Table, row: int, stated: StatedSize) -> None:
     status, sized = table.columns["status"][row], stated.size_mm is not None
-    if status == "detected" and not sized:
-        what = "names an estimate without a size while status is detected"
-        raise table.error(row, "posterior", what, way_out="give status not_detected, or not_done")
-    if status is None and not sized:
-        what = "is blank beside a posterior that names an estimate without a size"
+    if (status == "detected") == sized and status is not None:
+        return
+    column, what = "posterior", f"names an estimate with a size while status is {status or 'blank'}"
+    way_out = "give status detected, or leave posterior blank"
+    if not sized and status is None:
+        column, what = "status", "is blank beside a posterior that names an estimate without a size"
         way_out = "give status not_detected (the mass was looked for), or not_done"
-        raise table.error(row, "status", what, way_out=way_out)
-    if status != "detected" and sized:
-        what = f"names an estimate with a size while status is {status or 'blank'}"
-        raise table.error(row, "posterior", what, way_out="give status detected, or leave posterior blank")
+    elif not sized:
+        what = "names an estimate without a size while status is detected"
+        way_out = "give status not_detected, or not_done"
+    raise table.error(row, column, what, way_out=way_out)
 
 
 def _from_json(path: Path, number: int | None) -> StatedSize:

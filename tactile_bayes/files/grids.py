@@ -20,7 +20,7 @@ from tactile_bayes.geometry import BoolArray, FloatArray
 from tactile_bayes.mapping.map import MapRecipe, TactileMap, block_sums
 from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map
-from tactile_bayes.presets import CELL_MM
+from tactile_bayes.presets import CELL_MM, MM_PER_UNIT
 from tactile_bayes.progress import Progress, untold
 
 
@@ -47,7 +47,6 @@ _SPACING_LINE: Final = re.compile(
     r"^(ROW|COL)_SPACING[\s,;:=]+([0-9.]+)[\s,;]*(mm|cm|m|in|inch)?[\s,;]*$", re.MULTILINE
 )
 _UNITS_LINE: Final = re.compile(r"^UNITS[\s,;:=]+([^\s,;]+)[\s,;]*$", re.MULTILINE)
-_MM: Final = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4, "inch": 25.4, None: 1.0}
 
 
 def read_table(path: Path, *, no_value: Sequence[str] = ()) -> Grid:
@@ -84,7 +83,7 @@ def read_table(path: Path, *, no_value: Sequence[str] = ()) -> Grid:
     _refuse_list(values)
     named = _UNITS_LINE.search(text)
     units = "" if named is None else "kPa" if named[1].lower() == "kpa" else named[1]
-    sides = {side: float(number) * _MM[unit or None] for side, number, unit in _SPACING_LINE.findall(text)}
+    sides = {side: float(number) * MM_PER_UNIT[unit or "mm"] for side, number, unit in _SPACING_LINE.findall(text)}
     spacing = (sides["COL"], sides["ROW"]) if len(sides) == 2 else None
     return Grid({"mean": values}, spacing, None, units, tuple(notes))
 

@@ -15,6 +15,7 @@ from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.reading import CELLS, IMAGE_BYTES, check_limit, decoding, read_bytes
 from tactile_bayes.geometry import BoolArray, FloatArray
+from tactile_bayes.presets import MM_PER_UNIT
 
 _WAY_OUT: Final = "save it as grey TIFF (8, 16 or 32 bits), PNG or PGM, or its numbers as .npy"
 _KINDS: Final = {1: "unsigned", 2: "signed", 3: "floating-point"}
@@ -23,7 +24,7 @@ _SUBFILE, _BITS, _PHOTOMETRIC, _DESCRIPTION, _SAMPLES = 254, 258, 262, 270, 277
 _JPEG: Final = b"\xff\xd8\xff"
 _X_RESOLUTION, _Y_RESOLUTION, _PLANAR, _RESOLUTION_UNIT, _FORMAT, _NO_DATA = 282, 283, 284, 296, 339, 42113
 _ORIENTATION: Final = 274
-_MM: Final = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "inch": 25.4, "in": 25.4, "um": 1e-3, "micron": 1e-3, "\u00b5m": 1e-3}
+_MM: Final = {**MM_PER_UNIT, "micron": 1e-3, "\u00b5m": 1e-3}
 _WHITE_IS_ZERO, _BLACK_IS_ZERO, _PALETTE = 0, 1, 3
 # Samples a pixel, bits and kind of the sample, that the decoder gives back as the file has them.
 _DECODED: Final = {(1, bits, 1) for bits in (2, 4, 8, 12, 16, 32)} | {(1, 8, 2), (1, 16, 2), (1, 32, 2), (1, 32, 3)}

@@ -25,7 +25,7 @@ from tactile_bayes.files.scan_text import IDENTITY, read_frames, read_poses, see
 from tactile_bayes.files.sequence_mha import is_sequence, read_sequence
 from tactile_bayes.geometry import FloatArray, check_rigid
 from tactile_bayes.mapping.select import other_units
-from tactile_bayes.presets import KPA_PER_UNIT, PRESSURE_RANGE_KPA, PRESSURE_WINDOW_KPA
+from tactile_bayes.presets import KPA_PER_UNIT, MM_PER_UNIT, PRESSURE_RANGE_KPA, PRESSURE_WINDOW_KPA
 from tactile_bayes.scans import ElementCalibration, HeadGeometry, Landmarks, PressureFrames, Scan, TrackerPoses
 
 # No value of a scan is larger, seconds since 1970 included; the squares of damaged ones would overflow.
@@ -33,7 +33,6 @@ _LARGEST: Final = 1e12
 _STEP_KPA: Final = 0.001  #: To which pressures are kept: a tenth of what the best arrays resolve.
 _MOST_COUNTS: Final = 65535
 _SECONDS: Final = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0}
-_MM: Final = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "inch": 25.4}
 _MOST_NAMES: Final = 12  # of a file's arrays in an error
 _TURN: Final = 2 * np.pi
 _NOT_RIGID: Final = 1e-3  # of matrices that were written with few digits
@@ -278,7 +277,7 @@ def _poses(held: Arrays, stated: Stated, told: list[str]) -> None:
             )
         held["quaternion_wxyz"] = quaternions(held["quaternion_wxyz"], stated.pose_layout)
     if "position_mm" in held:
-        held["position_mm"] = held["position_mm"] * _MM[stated.length_unit or "mm"]
+        held["position_mm"] = held["position_mm"] * MM_PER_UNIT[stated.length_unit or "mm"]
 
 
 def quaternions(rotations: FloatArray, layout: str) -> FloatArray:
@@ -477,22 +476,18 @@ def _check_units(arrays: Arrays, *, calibrated: bool) -> None:
         if apart < 10.0:
             raise BadDataError(f"the points of landmarks_mm are {apart:.4g} apart", way_out=metres)
     if "nipple_mm" in arrays:
-        _check_nipple(arrays, metres)
+        if "landmarks_mm" not in arrays:
+            what = "nipple_mm is without landmarks_mm"
+            raise BadDataError(what, way_out="give notch and xiphoid too: they say what is up")
+        near = float(np.linalg.norm(arrays["landmarks_mm"] - arrays["nipple_mm"], axis=1).min())
+        if near < 10.0:
+            raise BadDataError(f"nipple_mm is {near:.4g} from a point of landmarks_mm", way_out=metres)
     full_scale = float(np.median(arrays["gain_kpa_per_count"])) * 4095
     if not calibrated and (full_scale > 1000.0 or 0 < full_scale < 0.5):
         what = f"gain_kpa_per_count gives {full_scale:.4g} kPa at 4095 counts"
         raise BadDataError(what, way_out="looks like Pa or MPa, give kPa")
     _check_clock(arrays["frame_time_s"], arrays["pose_time_s"])
     _check_pitch(surface, float(arrays["pitch_mm"]))
-
-
-def _check_nipple(arrays: Arrays, metres: str) -> None:
-    if "landmarks_mm" not in arrays:
-        what = "nipple_mm is without landmarks_mm"
-        raise BadDataError(what, way_out="give notch and xiphoid too: they say what is up")
-    near = float(np.linalg.norm(arrays["landmarks_mm"] - arrays["nipple_mm"], axis=1).min())
-    if near < 10.0:
-        raise BadDataError(f"nipple_mm is {near:.4g} from a point of landmarks_mm", way_out=metres)
 
 
 def _check_clock(frame_time_s: np.ndarray[Any, Any], pose_time_s: np.ndarray[Any, Any]) -> None:

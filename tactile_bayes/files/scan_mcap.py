@@ -205,13 +205,6 @@ def ns_from_s(time_s: FloatArray) -> NDArray[np.int64]:
     return seconds.astype(np.int64) * _NS + nanos.astype(np.int64)
 
 
-def s_from_ns(time_ns: NDArray[np.int64]) -> FloatArray:
-    """Convert whole ns to times in s; undoes `ns_from_s` to the bit."""
-    seconds, nanos = np.divmod(time_ns, _NS)
-    times: FloatArray = seconds + nanos / _NS
-    return times
-
-
 def write_scan(
     path: Path, scan: scans.Scan, *, provenance: Provenance, truth: Mapping[str, Any] | None = None, force: bool = False
 ) -> None:
@@ -269,7 +262,6 @@ class ScanFile(Record, eq=False):
     lost: tuple[str, ...]  #: One line a loss, for people.
     topics: Mapping[str, int]  #: Messages read, by topic.
     provenance: Mapping[str, Any]  #: As `Provenance.as_dict` wrote it.
-    schema: str  #: Schema id of the file.
 
 
 def read_scan_report(path: Path) -> ScanFile:
@@ -295,7 +287,6 @@ def read_scan_report(path: Path) -> ScanFile:
             lost=tuple(records.lost),
             topics=records.topic_counts(),
             provenance=provenance_of(records),
-            schema=SCAN_SCHEMA,
         )
 
 
@@ -357,7 +348,8 @@ def message_times(messages: Messages, *, topic: str) -> FloatArray:
     if latest > _LATEST_NS:
         way_out = f"times must be {_LATEST_NS} ns or less; import it with times from 0"
         raise BadDataError(f"{topic} holds a time of {latest} ns", way_out=way_out)
-    return s_from_ns(times.astype(np.int64))
+    seconds, nanos = np.divmod(times.astype(np.int64), _NS)  # undoes `ns_from_s` to the bit
+    return np.asarray(seconds + nanos / _NS)
 
 
 def _frames(records: McapRecords, head: scans.HeadGeometry) -> scans.PressureFrames:

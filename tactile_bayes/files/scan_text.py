@@ -382,9 +382,10 @@ def read_frames(path: Path, given: Stated, *, shape: tuple[int, int] | None) -> 
     before = [line for line in lines if line.number < blocks[0][0].number]
     stated, told = _said(before)
     notes = [f"frames: {table.words}", *told]
-    if of_fields := next((one for one in before if _names_fields(one)), None):
-        what = f"is a log of magnetic fields by line {of_fields.number} ({', '.join(of_fields.fields[:4])})"
-        raise BadDataError(what, way_out="make pressures of them by your calibration, and give those")
+    for line in before:
+        if len({name[:2].lower() for name in line.fields if _FIELD_NAME.fullmatch(name)}) == 3:
+            what = f"is a log of magnetic fields by line {line.number} ({', '.join(line.fields[:4])})"
+            raise BadDataError(what, way_out="make pressures of them by your calibration, and give those")
     if len(blocks) > 1 and len(blocks[0]) > 1:
         return _of_blocks(lines, blocks, stated, notes)
     rows = [line for block in blocks for line in block]
@@ -439,10 +440,6 @@ def _blocks(lines: Sequence[Line], taxels: int | None) -> list[list[Line]]:
         what = f"has frames of {len(blocks[0])} rows and, at line {odd[0].number}, one of {len(odd)}"
         raise BadDataError(what, way_out="leave out a frame that is cut off")
     return blocks if len(lengths) == 1 else [[line for block in blocks for line in block]]
-
-
-def _names_fields(line: Line) -> bool:
-    return len({name[:2].lower() for name in line.fields if _FIELD_NAME.fullmatch(name)}) == 3
 
 
 def _like_a_row(line: Line, width: int) -> str:

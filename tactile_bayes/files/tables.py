@@ -19,6 +19,7 @@ from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError, in_file
 from tactile_bayes.files.documents import load_schema
 from tactile_bayes.files.reading import TABLE_BYTES, ZIP_MAGIC, decoded, read_bytes
+from tactile_bayes.presets import MM_PER_UNIT
 
 # --- Cells of a CSV file as text: its encoding, its separator, its quotes, and the decimal commas of spreadsheets.
 #
@@ -123,7 +124,6 @@ _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 _DATE = re.compile(r"[0-9]{4}-[0-9]{2}-[0-9]{2}")
 _INTEGER = re.compile(r"[+-]?[0-9]+")
 _NOT_FINITE = {"nan", "inf", "infinity"}
-_TO_MM = {"cm": "10", "m": "1000", "in": "25.4", "inch": "25.4", "um": "0.001"}
 
 
 class Sheet(Record):
@@ -289,8 +289,8 @@ def _other_table(header: Sequence[str], fields: Mapping[str, Any]) -> str:
 
 def _advice_on_column(name: str, header: Sequence[str], fields: Mapping[str, Any]) -> str:
     stem, _, unit = name.strip().lower().rpartition("_")
-    if unit in _TO_MM and f"{stem}_mm" in fields:
-        return f"convert it to {stem}_mm (multiply by {_TO_MM[unit]})"
+    if unit in MM_PER_UNIT and unit != "mm" and f"{stem}_mm" in fields:
+        return f"convert it to {stem}_mm (multiply by {MM_PER_UNIT[unit]:g})"
     wanted = [field for field in fields if field not in header]
     if f"{name.strip().lower()}_mm" in wanted:
         return f"did you mean {name.strip().lower()}_mm, in millimetres?"

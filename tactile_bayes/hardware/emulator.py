@@ -236,8 +236,10 @@ class Emulator:
                 self._round, self._next, self._finished_at, self.served = number, 0, 0.0, Served()
             if elapsed_s is not None:
                 self._send_due(elapsed_s)
-            elif not self._leads:
-                self._hold_still()
+            elif not self._leads and time.monotonic() - self._held_at > (_HOLD_S if self._held else _SETTLE_S):
+                # not right after a START, when the scan is about to begin
+                self._held_at, self._held = time.monotonic(), True
+                self._waiting += self._device.record(0)
         self._pass_on()
 
     def _pass_on(self) -> None:
@@ -269,12 +271,6 @@ class Emulator:
                 self._stage.begin()
         elif self._leads and (self._device.stopped or not self._link.connected()):
             self._stage.end()
-
-    def _hold_still(self) -> None:
-        """Repeat the first record now and then; not right after a START, when the scan is about to begin."""
-        if time.monotonic() - self._held_at > (_HOLD_S if self._held else _SETTLE_S):
-            self._held_at, self._held = time.monotonic(), True
-            self._waiting += self._device.record(0)
 
     def _send_due(self, elapsed_s: float) -> None:
         times = self._device.times_s

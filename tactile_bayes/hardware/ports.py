@@ -236,13 +236,6 @@ PIPE_BYTES: Final = 1 << 20  #: Room for six seconds of a head at 200 Hz while t
 READY_S: Final = 15.0  #: A reader starts in 20 ms; on a busy computer it may take seconds.
 
 
-class Piece(NamedTuple):
-    """Bytes of a device with the host's time of reading (monotonic ns)."""
-
-    host_ns: int
-    data: bytes
-
-
 @dataclass(slots=True)
 class Stream:
     """A device read by a process of its own."""
@@ -270,8 +263,8 @@ class Stream:
             if select.select([self], [], [], left)[0]:
                 self.read()
 
-    def read(self, most: int = PIPE_BYTES) -> list[Piece]:
-        """Read the pieces that have come, up to so many bytes; sets `ended` after the last."""
+    def read(self, most: int = PIPE_BYTES) -> list[tuple[int, bytes]]:
+        """What has come, up to so many bytes, with the host's times (monotonic ns); sets `ended` after the last."""
         try:
             data = os.read(self.pipe, most)
         except BlockingIOError:
@@ -292,7 +285,7 @@ class Stream:
             start = place + size
             place = start + length
             if length:
-                pieces.append(Piece(host_ns, buffer[start:place]))
+                pieces.append((host_ns, buffer[start:place]))
             else:
                 self.ended = True
         self._rest = buffer[place:]

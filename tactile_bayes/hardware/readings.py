@@ -346,7 +346,13 @@ class DeviceClock:
         if not self._trusted:
             return Moment(self._by_host(host_ns))
         if time_ns < self._last_ns:
-            return self._back(raw_ns, host_ns, before_ns)
+            period_ns = wrap_period(before_ns, raw_ns, passed_ns=host_ns - self._host_ns)
+            if period_ns is None:
+                return self._step(raw_ns, host_ns, f"stepped back by {(before_ns - raw_ns) / 1e9:.3f} s")
+            self.wraps += 1
+            self._shift_ns += period_ns
+            what = f"the clock wrapped after {period_ns / 1e9:.6f} s"
+            return Moment(max(self._last_ns, raw_ns + self._shift_ns), what)
         if time_ns == self._last_ns and host_ns - self._moved_ns > STILL_NS:
             self._trusted = False
             return self._step(raw_ns, host_ns, "stood still")
@@ -354,14 +360,6 @@ class DeviceClock:
         if ahead_ns > AHEAD_NS:
             return self._step(raw_ns, host_ns, f"stepped forward by {ahead_ns / 1e9:.3f} s")
         return Moment(time_ns)
-
-    def _back(self, raw_ns: int, host_ns: int, before_ns: int) -> Moment:
-        period_ns = wrap_period(before_ns, raw_ns, passed_ns=host_ns - self._host_ns)
-        if period_ns is None:
-            return self._step(raw_ns, host_ns, f"stepped back by {(before_ns - raw_ns) / 1e9:.3f} s")
-        self.wraps += 1
-        self._shift_ns += period_ns
-        return Moment(max(self._last_ns, raw_ns + self._shift_ns), f"the clock wrapped after {period_ns / 1e9:.6f} s")
 
     def _step(self, raw_ns: int, host_ns: int, what: str) -> Moment:
         time_ns = self._by_host(host_ns)
