@@ -112,7 +112,7 @@ def numbered(args: Sequence[str], *, strict: bool = True) -> list[str]:
 _PERCENT = tuple(100 * share for share in GROWN_BY)
 
 
-@options.command("compare", "compare.compare_action", kind=VisitsCommand)
+@options.command("compare", "pages.compare_action", kind=VisitsCommand)
 @click.argument("first", metavar="VISIT1.nc...", nargs=-1, required=True, type=_FILE)
 @click.option(
     "--with",
@@ -176,7 +176,7 @@ def compare_command() -> None:
     """
 
 
-@options.command("report", "report.report_action")
+@options.command("report", "pages.report_action")
 @click.argument("files", metavar="MAP.nc... [POST.nc|ESTIMATE.json]", nargs=-1, required=True, type=_FILE)
 @click.option("-o", "--output", metavar="EXAM.html", required=True, type=_FILE, help="Page to write.")
 @options.page_options("EXAM.pdf", "Tactile exam")

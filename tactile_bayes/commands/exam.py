@@ -133,7 +133,7 @@ def show_command() -> None:
 _FORMATS: Final = ("dicom", "fhir", "nrrd", "csv")
 
 
-@command("export", "report.export_action")
+@command("export", "pages.export_action")
 @click.argument("files", metavar="FILE...", nargs=-1, type=FilePath())
 @click.option("--to", required=True, type=click.Choice(_FORMATS), help="Format to write.")
 @click.option(

@@ -273,7 +273,7 @@ PRINTERS = {
     "report/estimate_figures", "report/estimate_text", "report/exam_page", "report/map",
     "report/pages", "report/pooled",
     # of draws, not of a size; names of files that were written
-    "actions/report", "actions/show", "actions/campaign", "actions/live_view", "actions/record",
+    "actions/pages", "actions/show", "actions/campaign", "actions/live_view", "actions/record",
     # of trials, calibrations, devices and studies
     "actions/calibrate", "actions/devices", "api/diagnosing", "api/trials",
     "campaigns/campaign", "actions/bring_in", "actions/exam",
