@@ -92,7 +92,10 @@ def skin_flexibility(wave_number: FloatArray, body: LayeredBody) -> FloatArray:
     below: FloatArray | None = None
     layers = list(zip(body.modulus_kpa, body.thickness_mm, strict=False))
     if not body.on_rigid_base:
-        below = _half_space_stiffness(k, body.modulus_kpa[-1], body.nu)
+        # tractions on the face of a half-space for unit displacements of it
+        displacement, traction = _waves(np.zeros_like(k), body.nu)
+        scale = (body.modulus_kpa[-1] / (1.0 + body.nu)) * k
+        below = np.asarray(-scale[:, None, None] * traction @ np.linalg.inv(displacement))
     for modulus, thickness in reversed(layers):
         stiffness = _layer_stiffness(k, modulus, thickness, body.nu)
         upper, across = stiffness[:, :2, :2], stiffness[:, :2, 2:]
@@ -116,13 +119,6 @@ def _waves(depth: FloatArray, nu: float) -> tuple[FloatArray, FloatArray]:
     displacement = np.array([[one, depth], [one, depth + kappa]]) * decay
     traction = -np.array([[one, depth + (1.0 - 2.0 * nu)], [one, depth + 2.0 * (1.0 - nu)]]) * decay
     return np.moveaxis(displacement, -1, 0), np.moveaxis(traction, -1, 0)
-
-
-def _half_space_stiffness(k: FloatArray, modulus_kpa: float, nu: float) -> FloatArray:
-    """(n, 2, 2) tractions on the face of a half-space for unit displacements of it."""
-    displacement, traction = _waves(np.zeros_like(k), nu)
-    scale = (modulus_kpa / (1.0 + nu)) * k
-    return np.asarray(-scale[:, None, None] * traction @ np.linalg.inv(displacement))
 
 
 def _layer_stiffness(k: FloatArray, modulus_kpa: float, thickness_mm: float, nu: float) -> FloatArray:
@@ -247,15 +243,6 @@ def _mean_over_two_squares(
 _LEAST_SHARE: Final = 1e-4  #: Orders m are left out from where their share of the perturbation has fallen to this.
 
 
-class ModePerturbation(Record, eq=False):
-    """Perturbation of Fourier order m."""
-
-    order: int  #: m.
-    matrix: FloatArray
-    """(s, s) array: Symmetric: sinking in mm at skin node i for a unit force in kPa mm^2 at skin node j, per cos(m
-    dtheta)."""
-
-
 class CondensedLump(Record, eq=False):
     """All Fourier orders of one geometry; the perturbation for a stiffness takes milliseconds."""
 
@@ -263,13 +250,14 @@ class CondensedLump(Record, eq=False):
     """(s,) array: Skin nodes, by increasing distance from the lump's axis, the axis itself left out."""
     modes: tuple[CondensedHole, ...]  #: Orders 0, 1, ...: forces in kPa mm^2, displacements in mm.
 
-    def perturbation(self, lump_kpa: float) -> tuple[ModePerturbation, ...]:
-        """Perturbations of all orders, for a lump of modulus `lump_kpa`."""
+    def perturbation(self, lump_kpa: float) -> list[FloatArray]:
+        """(s, s) perturbation of each order m for a lump of modulus `lump_kpa`, symmetric.
+
+        Sinking in mm at skin node i for a unit force in kPa mm^2 at skin node j, per cos(m dtheta).
+        """
         if not lump_kpa > 0:
             raise BadDataError(f"the lump's modulus is {lump_kpa} kPa", way_out="it must be above 0")
-        shares = [(0.5 if order == 0 else 1.0) / np.pi for order in range(len(self.modes))]
-        changes = [share * mode.change(lump_kpa) for share, mode in zip(shares, self.modes, strict=True)]
-        return tuple(ModePerturbation(order, change) for order, change in enumerate(changes))
+        return [(0.5 if m == 0 else 1.0) / np.pi * mode.change(lump_kpa) for m, mode in enumerate(self.modes)]
 
 
 def condense_lump(

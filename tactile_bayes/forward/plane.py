@@ -95,7 +95,11 @@ def surface_compliance(offset_mm: FloatArray, *, cell_mm: float, layers: Layers)
     rest = surface_flexibility(k, LayeredBody.of(layers)) + layers_tail * np.expm1(-k * depth) / k
     rest *= weight * np.sinc(k * cell_mm / (2 * np.pi)) ** 2
     smooth = cell_mm / np.pi * np.cos(np.outer(offset, k)) @ rest
-    return np.asarray(smooth + layers_tail * _log_average(offset, cell_mm, depth) / np.pi)
+    # integral of (1 - e^-kb)/k cos kx over k, i.e. 0.5 ln(1 + b^2/x^2), averaged over both cells, times the width
+    steps = offset[:, None] + cell_mm * np.array([-1.0, 0.0, 1.0])
+    difference = _log_primitive(steps, depth) - _log_primitive(steps, 0.0)
+    log_average = 0.5 * difference @ np.array([1.0, -2.0, 1.0]) / cell_mm
+    return np.asarray(smooth + layers_tail * log_average / np.pi)
 
 
 def _wave_numbers(depth_mm: float, thickness_mm: float, *, reach_mm: float) -> tuple[FloatArray, FloatArray]:
@@ -107,13 +111,6 @@ def _wave_numbers(depth_mm: float, thickness_mm: float, *, reach_mm: float) -> t
     points, weights = np.polynomial.legendre.leggauss(8)
     low, high = np.array(panels[:-1])[:, None], np.array(panels[1:])[:, None]
     return (0.5 * (low + high + (high - low) * points)).reshape(-1), (0.5 * (high - low) * weights).reshape(-1)
-
-
-def _log_average(offset_mm: FloatArray, cell_mm: float, depth_mm: float) -> FloatArray:
-    """Integral of (1 - e^-kb)/k cos kx over k, i.e. 0.5 ln(1 + b^2/x^2), averaged over both cells, times the width."""
-    steps = offset_mm[:, None] + cell_mm * np.array([-1.0, 0.0, 1.0])
-    difference = _log_primitive(steps, depth_mm) - _log_primitive(steps, 0.0)
-    return np.asarray(0.5 * difference @ np.array([1.0, -2.0, 1.0]) / cell_mm)
 
 
 def _log_primitive(x: FloatArray, b: float) -> FloatArray:

@@ -291,20 +291,19 @@ def tissue_truth(scene: Scene) -> dict[str, Any]:
     body = scene.body or SceneBody()
     fat = fat_thickness(body, scene.solid_lumps)
     return {
-        "lumps": [_lump_truth(lump, body, fat) for lump in scene.solid_lumps],
+        "lumps": [
+            as_dict(lump)
+            | {
+                "height_mm": lump.vertical_mm,
+                "seat": (fat - lump.depth_mm) / (lump.vertical_mm / 2),
+                "depth_mm": lump.depth_mm,
+                "lump_kpa": lump.stiffness_ratio * body.fat_kpa,
+            }
+            for lump in scene.solid_lumps
+        ],
         "ribs": [as_dict(rib) | {"ball_x_mm": [ball.x_mm for ball in rib.balls()]} for rib in scene.ribs],
         "body": as_dict(body) | {"fat_mm": fat},
         "background": as_dict(scene.background),
-    }
-
-
-def _lump_truth(lump: SolidLump, body: SceneBody, fat_mm: float) -> dict[str, Any]:
-    seat = (fat_mm - lump.depth_mm) / (lump.vertical_mm / 2)
-    return as_dict(lump) | {
-        "height_mm": lump.vertical_mm,
-        "seat": seat,
-        "depth_mm": lump.depth_mm,
-        "lump_kpa": lump.stiffness_ratio * body.fat_kpa,
     }
 
 

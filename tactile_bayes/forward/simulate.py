@@ -383,7 +383,7 @@ def skin_perturbation(
 
     Load and displacement are averaged over squares of `square_mm`; 0 for points.
     """
-    parts = [(mode.order, *np.linalg.eigh(mode.matrix)) for mode in condensed.perturbation(lump_kpa)]
+    parts = [(order, *np.linalg.eigh(matrix)) for order, matrix in enumerate(condensed.perturbation(lump_kpa))]
     largest = max(float(np.abs(value).max()) for _, value, _ in parts)
     last = float(condensed.radius_mm[-1])
     r: FloatArray = STEP_MM * np.arange(int(np.ceil(min(TABLE_MM, last) / STEP_MM)) + 1, dtype=np.float64)

@@ -317,16 +317,11 @@ def _ridge_starts(choice: SceneChoice, problem: Problem, places: FloatArray) -> 
     extra = choice.fit.scene.extra
     if extra:
         scene, beside = Scene("ridge", extra=extra), choice.fit.mode[-3:]
-        through = _through_bump(choice.fit, problem)
-        yield scene, _best(choice, scene, np.column_stack([through, np.tile(beside, (len(through), 1))]))
-
-
-def _through_bump(fit: FieldFit, problem: Problem) -> FloatArray:
-    """(g, 3) ridges of the bump's width through its centre, in all directions."""
-    angle = np.pi * np.arange(GRID_ANGLES) / GRID_ANGLES
-    x, y = (fit.at[name] - m for name, m in zip("xy", problem.window.middle, strict=True))
-    offset = x * np.cos(angle) + y * np.sin(angle)
-    return np.stack([np.full(GRID_ANGLES, fit.at["p"]), angle, offset], axis=1)
+        # ridges of the bump's width through its centre, in all directions
+        angle, at = np.pi * np.arange(GRID_ANGLES) / GRID_ANGLES, choice.fit.at
+        x, y = (at[name] - m for name, m in zip("xy", problem.window.middle, strict=True))
+        through = [np.full(GRID_ANGLES, at["p"]), angle, x * np.cos(angle) + y * np.sin(angle)]
+        yield scene, _best(choice, scene, np.column_stack([*through, np.tile(beside, (GRID_ANGLES, 1))]))
 
 
 def _best(choice: SceneChoice, scene: Scene, starts: FloatArray) -> FloatArray:

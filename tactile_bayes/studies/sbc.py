@@ -302,7 +302,10 @@ def _sizes(bumps: Mapping[str, FloatArray], calibration: BodyCalibration, rng: n
 
 def draw_truth(rng: np.random.Generator, prior: BumpPrior) -> Truth:
     """Draw bump and noise field from the prior of the field posterior; the module describes improper parts."""
-    p, q = _draw_log_widths(rng, prior)
+    widest, p, q = np.log(WIDEST_IN_RADII * RADIUS_MM), np.inf, 0.0
+    while p + abs(q) > widest:
+        p = np.log(prior.width_median_mm) + prior.log_width_sd * rng.standard_normal()
+        q = prior.log_ratio_sd * rng.standard_normal()
     away, direction = CENTRE_MM * np.sqrt(rng.uniform()), rng.uniform(0.0, 2.0 * np.pi)
     return Truth(
         amplitude=float(abs(prior.amplitude_sd * rng.standard_normal())),
@@ -314,16 +317,6 @@ def draw_truth(rng: np.random.Generator, prior: BumpPrior) -> Truth:
         share=float(rng.choice(SHARES)),
         noise_sd=float(np.exp(rng.uniform(*np.log(NOISE_SD)))),
     )
-
-
-def _draw_log_widths(rng: np.random.Generator, prior: BumpPrior) -> tuple[float, float]:
-    """Draw mean and half difference of the log widths, none wider than the window allows."""
-    widest = np.log(WIDEST_IN_RADII * RADIUS_MM)
-    while True:
-        p = np.log(prior.width_median_mm) + prior.log_width_sd * rng.standard_normal()
-        q = prior.log_ratio_sd * rng.standard_normal()
-        if p + abs(q) <= widest:
-            return float(p), float(q)
 
 
 def draw_map(truth: Truth, rng: np.random.Generator, prior: BumpPrior) -> TactileMap:

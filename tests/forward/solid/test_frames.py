@@ -124,7 +124,7 @@ def test_the_short_sum_is_the_perturbation() -> None:
     short = skin_perturbation(lump, 500.0, square_mm=0.0)
     r = lump.radius_mm[:7]
     values, signs = short.vectors(r * np.cos(0.7), r * np.sin(0.7))
-    exact = sum(mode.matrix[:7, :7] for mode in lump.perturbation(500.0))
+    exact = sum(mode[:7, :7] for mode in lump.perturbation(500.0))
     np.testing.assert_allclose((values * signs) @ values.T, exact, atol=2e-4 * np.abs(exact).max())
 
 
