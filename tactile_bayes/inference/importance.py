@@ -7,14 +7,7 @@ import numpy as np
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.geometry import FloatArray, IndexArray
-from tactile_bayes.inference.draws import (
-    BITS,
-    REPLICATES,
-    ParameterDraws,
-    normal_quantile,
-    shifted_sobol,
-    weighted_quantiles_of,
-)
+from tactile_bayes.inference import draws
 from tactile_bayes.inference.modes import LogDensity
 
 # --- Pareto-smoothed importance sampling (PSIS): smoothed weights, and the shape that shows if they can be trusted.
@@ -148,7 +141,7 @@ class Proposal:
         """Points (..., p) and their log densities (...) for (..., dimension) uniform coordinates."""
         mean, b = self._gaussians.mean, self._stretch
         p = mean.shape[1]
-        z = normal_quantile(uniform[..., :p])
+        z = draws.normal_quantile(uniform[..., :p])
         bent = np.sinh(b * z) / b
         if len(mean) == 1:
             return mean[0] + bent @ self._roots[0].T, self._log_bent(z) - self._log_det[0]
@@ -278,7 +271,7 @@ def importance(
     rng: np.random.Generator,
     options: ImportanceOptions | None = None,
     parts: Gaussians | None = None,
-) -> ParameterDraws:
+) -> draws.ParameterDraws:
     """Draw from a log density, (m, p) to (m,), by importance sampling; returns draws of equal weight.
 
     The proposal has the (p,) mode and (p, p) covariance given, or is made of `parts`, Gaussians that the density is
@@ -311,7 +304,9 @@ def importance(
     lp, log_weight = sampler.log_target.ravel()[chosen], sampler.log_weights.ravel()[chosen] - log_evidence
     statistics = {"lp": lp[None], "log_weight": log_weight[None]}
     labels = chosen // sampler.points
-    return ParameterDraws(sampler.theta[chosen][None], "importance", figures, labels=labels, statistics=statistics)
+    return draws.ParameterDraws(
+        sampler.theta[chosen][None], "importance", figures, labels=labels, statistics=statistics
+    )
 
 
 def _sampled(sampler: _Sampler, options: ImportanceOptions) -> _Sampler:
@@ -385,9 +380,9 @@ class _Sampler:
     ) -> None:
         self._log_density, self._rng, self._spent = log_density, rng, spent
         self._proposal = Proposal(gaussians, stretch)
-        self._shifts = rng.integers(2**BITS, size=(REPLICATES, self._proposal.dimension), dtype=np.uint32)
-        self._theta = np.empty((REPLICATES, 0, gaussians.mean.shape[1]))
-        self.log_target, self.log_weights = np.empty((REPLICATES, 0)), np.empty((REPLICATES, 0))
+        self._shifts = rng.integers(2**draws.BITS, size=(draws.REPLICATES, self._proposal.dimension), dtype=np.uint32)
+        self._theta = np.empty((draws.REPLICATES, 0, gaussians.mean.shape[1]))
+        self.log_target, self.log_weights = np.empty((draws.REPLICATES, 0)), np.empty((draws.REPLICATES, 0))
 
     def adapted(self) -> _Sampler:
         """One whose proposal is fitted to these points, without points."""
@@ -419,7 +414,7 @@ class _Sampler:
 
     def extend(self, points: int) -> None:
         """Add `points` to every replicate."""
-        theta, log_proposal = self._proposal.points(shifted_sobol(self.points, points, shifts=self._shifts))
+        theta, log_proposal = self._proposal.points(draws.shifted_sobol(self.points, points, shifts=self._shifts))
         log_target = self._log_density(theta.reshape(-1, theta.shape[2])).reshape(theta.shape[:2])
         self._theta = np.concatenate([self._theta, theta], axis=1)
         self.log_target = np.concatenate([self.log_target, log_target], axis=1)
@@ -460,7 +455,7 @@ class _Sampler:
             sd = float(np.sqrt(np.sum(self.weights * (values.ravel() - mean) ** 2)))
             order = np.argsort(values, axis=1)
             ordered, weights = (np.take_along_axis(one, order, axis=1) for one in (values, by_replicate))
-            ends = [weighted_quantiles_of(v, w, tails) for v, w in zip(ordered, weights, strict=True)]
+            ends = [draws.weighted_quantiles_of(v, w, tails) for v, w in zip(ordered, weights, strict=True)]
             error = float(np.sqrt(np.mean(np.var(ends, axis=0, ddof=1)) / len(ends)))
             worst = max(worst, error / sd if sd > 0 else 0.0)
         return worst

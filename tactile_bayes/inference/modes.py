@@ -72,12 +72,6 @@ class LeastSquaresFit(Record, eq=False):
     converged: bool  #: The relative step fell below the tolerance.
     iterations: int
 
-    def covariance(self, weight: FloatArray) -> FloatArray:
-        """(p, p) least-squares covariance, residual variance SSE / (k - p) included; inf where undetermined."""
-        k, p = self.jacobian.shape
-        inverse = inverse_information(self.jacobian, weight)
-        return self.sse / max(k - p, 1) * inverse if np.isfinite(inverse).all() else inverse
-
 
 def inverse_information(jacobian: FloatArray, weight: FloatArray) -> FloatArray:
     """``(J' W J)^-1``, scaled to unit columns first; a (p, p) matrix of inf when it is singular."""

@@ -146,12 +146,6 @@ class BumpFit(Record, eq=False):
         amplitude, x, y = (float(value) for value in self.theta[:3])
         return ModalBump(amplitude, x, y, *self.widths()[:2])
 
-    def linear_excess(self, theta: FloatArray) -> FloatArray:
-        """(m,) `Target.excess` for a model linearised about the fit, as mode-and-curvature methods assume."""
-        information = self.fit.jacobian.T @ (self.weight[:, None] * self.fit.jacobian)
-        off = theta - self.theta
-        return np.asarray(np.einsum("mp,pq,mq->m", off, information, off) / self.errors.inflation)
-
     def target(self, prior: BumpPrior) -> Target:
         """Posterior density of the parameters.
 
@@ -414,8 +408,12 @@ class White(Record, eq=False):
         theta = draws.theta
         sigma_x, sigma_y, angle = drawn_widths(*fit.bump.shape_parameters(theta))
         # two of the methods are linear about the mode: for them the exact figure would cost more than all the rest
-        exact = draws.method in ("ensemble", "importance")
-        excess = solved(draws.flat)[0] if exact else fit.linear_excess(draws.flat)
+        if draws.method in ("ensemble", "importance"):
+            excess = solved(draws.flat)[0]
+        else:
+            information = fit.fit.jacobian.T @ (fit.weight[:, None] * fit.fit.jacobian)
+            off = draws.flat - fit.theta
+            excess = np.einsum("mp,pq,mq->m", off, information, off) / fit.errors.inflation
         posterior = MapPosterior(
             amplitude=theta[..., 0],
             sigma_x_mm=sigma_x,

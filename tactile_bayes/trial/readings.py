@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import date
 from itertools import groupby, pairwise
 from pathlib import Path
@@ -135,7 +135,7 @@ def readings_from_columns(columns: Mapping[str, Sequence[Any]], *, fault: CellFa
     for row, cells in enumerate(zip(*(columns.get(name, blank) for name in _COLUMNS), strict=True)):
         patient, mass, modality, replicate, status, size_mm, low_mm, high_mm, probability, synthetic, *said = cells
         status = _status(row, status, size_mm, fault=fault)
-        interval = _interval(row, status, size_mm, low_mm, high_mm, probability, fault=fault)
+        interval = _interval(row, status, size_mm, (low_mm, high_mm, probability), fault=fault)
         key = (patient, mass)
         readings.append(Reading(key, modality, replicate, status, size_mm, interval, bool(synthetic), *said))
     return readings
@@ -157,18 +157,11 @@ def _status(row: int, status: str | None, size_mm: float | None, *, fault: CellF
 
 
 def _interval(
-    row: int,
-    status: str,
-    size_mm: float | None,
-    low_mm: float | None,
-    high_mm: float | None,
-    probability: float | None,
-    *,
-    fault: CellFault,
+    row: int, status: str, size_mm: float | None, cells: Sequence[float | None], *, fault: CellFault
 ) -> Interval | None:
+    low_mm, high_mm, probability = cells
     if low_mm is None or high_mm is None or probability is None:
-        cells = {"low_mm": low_mm, "high_mm": high_mm, "probability": probability}
-        blank = [name for name, cell in cells.items() if cell is None]
+        blank = [name for name, cell in zip(("low_mm", "high_mm", "probability"), cells, strict=True) if cell is None]
         if len(blank) == len(cells):
             return None
         way_out = "an interval needs low_mm, high_mm and probability, or all three blank"
@@ -244,36 +237,27 @@ def unit_doubts(sizes: Mapping[str, ModalitySizes], ex_vivo_mm: FloatArray) -> l
 
     `ex_vivo_mm` is of all excised masses.
     """
-    doubts = [] if (doubt := _outside("ex-vivo sizes", ex_vivo_mm)) is None else [doubt]
-    for name, one in sizes.items():
-        doubts += _modality_doubts(name, one.only_detected())
+    doubts = _outside("ex-vivo sizes", ex_vivo_mm)
+    for name, detected in ((name, one.only_detected()) for name, one in sizes.items() if one.detected.any()):
+        doubts += _outside(f"{name} sizes", np.concatenate(detected.replicates_mm))
+        with np.errstate(over="ignore", under="ignore"):
+            ratio = float(np.median(detected.size_mm / detected.ex_vivo_mm))
+        found = f"{name} sizes are {ratio:.3g} times the ex-vivo sizes in the median"
+        for unit, factor in UNITS.items():
+            if factor / NEAR < ratio < factor * NEAR:
+                doubts.append(f"{found}: are the ex-vivo sizes in {unit}?")
+            elif factor / NEAR < 1 / max(ratio, 1e-300) < factor * NEAR:
+                doubts.append(f"{found}: are the {name} sizes in {unit}?")
     return doubts
 
 
-def _modality_doubts(name: str, detected: ModalitySizes) -> Iterator[str]:
-    if len(detected.size_mm) == 0:
-        return
-    outside = _outside(f"{name} sizes", np.concatenate(detected.replicates_mm))
-    if outside is not None:
-        yield outside
-    with np.errstate(over="ignore", under="ignore"):
-        ratio = float(np.median(detected.size_mm / detected.ex_vivo_mm))
-    found = f"{name} sizes are {ratio:.3g} times the ex-vivo sizes in the median"
-    for unit, factor in UNITS.items():
-        if factor / NEAR < ratio < factor * NEAR:
-            yield f"{found}: are the ex-vivo sizes in {unit}?"
-        elif factor / NEAR < 1 / max(ratio, 1e-300) < factor * NEAR:
-            yield f"{found}: are the {name} sizes in {unit}?"
-
-
-def _outside(what: str, values_mm: FloatArray) -> str | None:
+def _outside(what: str, values_mm: FloatArray) -> list[str]:
     outside = (values_mm < LEAST_MM) | (values_mm > MOST_MM)
-    if not outside.any():
-        return None
-    return (
+    text = (
         f"{int(outside.sum())} of {len(values_mm)} {what} lie outside {LEAST_MM:g} to {MOST_MM:g} mm "
-        f"(from {values_mm.min():.3g} to {values_mm.max():.3g}): are they in mm?"
+        f"(from {values_mm.min(initial=np.inf):.3g} to {values_mm.max(initial=0.0):.3g}): are they in mm?"
     )
+    return [text] if outside.any() else []
 
 
 # --- Which readings of a trial belong to the excision: those of the last visit on or before it.

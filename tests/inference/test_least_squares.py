@@ -11,9 +11,16 @@ from hypothesis import strategies as st
 from nist import DATASETS, read
 from scipy.optimize import least_squares
 
-from tactile_bayes.inference.modes import fit_least_squares, inverse_information, numerical_jacobian
+from tactile_bayes.inference.modes import LeastSquaresFit, fit_least_squares, inverse_information, numerical_jacobian
 
 SIX_DIGITS = 1e-6
+
+
+def covariance(fit: LeastSquaresFit, weight: np.ndarray) -> np.ndarray:
+    """(p, p) of the parameters, residual variance SSE / (k - p) included; inf where undetermined."""
+    k, p = fit.jacobian.shape
+    inverse = inverse_information(fit.jacobian, weight)
+    return fit.sse / max(k - p, 1) * inverse if np.isfinite(inverse).all() else inverse
 
 
 @pytest.mark.parametrize("start", [0, 1])
@@ -26,7 +33,7 @@ def test_certified_parameters_and_deviations(shared_data: Path, name: str, start
     fit = fit_least_squares(nist.predict, begin, data=nist.y, weight=weight, scale=np.abs(begin))
     assert fit.converged
     np.testing.assert_allclose(fit.theta, nist.theta, rtol=SIX_DIGITS)
-    np.testing.assert_allclose(np.sqrt(np.diag(fit.covariance(weight))), nist.sd, rtol=SIX_DIGITS)
+    np.testing.assert_allclose(np.sqrt(np.diag(covariance(fit, weight))), nist.sd, rtol=SIX_DIGITS)
     assert np.sqrt(fit.sse / 242) == pytest.approx(nist.residual_sd, rel=SIX_DIGITS)
 
 
@@ -56,7 +63,7 @@ def test_a_random_bump_as_scipy_fits_it(seed: int) -> None:
     assert ours.sse == pytest.approx(2 * theirs.cost, rel=1e-9)
     np.testing.assert_allclose(ours.theta, theirs.x, atol=2e-5)
     theirs_covariance = 2 * theirs.cost / 294 * np.linalg.inv(theirs.jac.T @ theirs.jac)
-    np.testing.assert_allclose(np.diag(ours.covariance(weight)), np.diag(theirs_covariance), rtol=1e-3)
+    np.testing.assert_allclose(np.diag(covariance(ours, weight)), np.diag(theirs_covariance), rtol=1e-3)
 
 
 def test_a_linear_model_is_solved_in_closed_form() -> None:
@@ -66,14 +73,14 @@ def test_a_linear_model_is_solved_in_closed_form() -> None:
     normal = np.linalg.inv(design.T @ (weight[:, None] * design))
     exact = normal @ (design.T @ (weight * data))
     np.testing.assert_allclose(fit.theta, exact, rtol=1e-9)
-    np.testing.assert_allclose(fit.covariance(weight), fit.sse / 37 * normal, rtol=1e-7)
+    np.testing.assert_allclose(covariance(fit, weight), fit.sse / 37 * normal, rtol=1e-7)
 
 
 def test_what_the_data_do_not_determine_has_no_finite_covariance() -> None:
     design = np.ones((10, 2))
     assert np.isinf(inverse_information(design, np.ones(10))).all()
     fit = fit_least_squares(lambda t: t @ design.T, np.zeros(2), data=np.ones(10), weight=np.ones(10), scale=np.ones(2))
-    assert np.isinf(fit.covariance(np.ones(10))).all()
+    assert np.isinf(covariance(fit, np.ones(10))).all()
 
 
 def test_a_model_that_breaks_down_is_not_called_converged() -> None:
