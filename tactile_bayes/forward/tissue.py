@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_bayes.declarations import Meta, Record, check, says
+from tactile_bayes.declarations import Meta, Record, check, says, settle
 from tactile_bayes.errors import BadDataError, require
 from tactile_bayes.forward.contact import Head
 from tactile_bayes.geometry import FloatArray
@@ -29,8 +28,7 @@ SEATS = {"centred": 0.0, "resting": 1.0}
 """Named seats. Where the lump's centre lies on the fat-gland boundary, and where the lump only touches it."""
 
 
-@dataclass(frozen=True, slots=True)
-class Layers:
+class Layers(Record):
     """The layered body without a lump."""
 
     fat_mm: float  #: Depth of the fat-gland boundary.
@@ -49,8 +47,7 @@ class Layers:
         require(0 <= self.poisson < 0.5, "poisson", self.poisson, "be at least 0 and below 0.5")
 
 
-@dataclass(frozen=True, slots=True)
-class Body:
+class Body(Record):
     """Three layers and the place of a circular lump; the lump's stiffness is given elsewhere.
 
     Wellman & Howe (1999) section 2.2: fat of 5 kPa, gland ten times as stiff, a rigid chest wall, plane strain.
@@ -79,10 +76,10 @@ class Body:
             0 <= self.seat <= MOST_SEAT, "seat", self.seat, f"be between 0 (centred) and {MOST_SEAT:g}; 1 is resting"
         )
         if 1.0 - _RESTS < self.seat < 1.0 + _THINNEST_FILM:
-            object.__setattr__(self, "seat", 1.0)
+            settle(self, seat=1.0)
         if self.thickness_mm is None:
             deep = self.centre_mm + max(0.6, 0.5 * self.seat) * self.d_mm + 2.0
-            object.__setattr__(self, "thickness_mm", max(THICKNESS_MM, deep))
+            settle(self, thickness_mm=max(THICKNESS_MM, deep))
         bottom = self.centre_mm + self.radius_mm
         require(
             self.layers.thickness_mm > 1.0001 * bottom,
@@ -126,8 +123,7 @@ def parse_seat(text: str) -> float:
 # shows.
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class HeadFace:
+class HeadFace(Record, eq=False):
     """Squares of the face on the taxels' pitch, with the rows and columns of the rim."""
 
     surface_mm: FloatArray

@@ -15,6 +15,7 @@ from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.presets import INTERVAL, MOST_FIELD_COSINES, Background
+from tactile_bayes.progress import Progress, untold
 from tactile_bayes.size.pooling import Calibration
 
 # --- The reported numbers of one estimate, and how far they lie from a reference.
@@ -102,7 +103,6 @@ def _rms(values: Sequence[float]) -> float:
 # --- Settings with what each costs and answers, against one reference; the frontier, and which setting is enough.
 
 Clock = Callable[[], float]
-Progress = Callable[[int, int], None]
 WORTH = 0.8  #: A setting that takes more than this share of the default's time is not worth a choice.
 MOST_S = 4.0  #: CPU seconds after which a setting is not run again: its least time is known well enough.
 
@@ -115,7 +115,7 @@ class Work(Record):
     runs: int = 3  #: Of each setting: times are the least of them, distances their root mean square.
     announce: Callable[[float], None] = lambda _seconds: None
     """Called once, when the default has been timed, with about how many CPU seconds the rest will take."""
-    progress: Progress | None = None  #: Called with settings done and in all.
+    progress: Progress = untold  #: Called with settings done and in all.
     seed: int = 1  #: Of the random numbers.
     probability: float = INTERVAL  #: Of the intervals.
 
@@ -255,8 +255,7 @@ def climbed(
     made, rows = reference(), []
     for number, one in enumerate(choices, start=1):
         rows.append(priced(one, run_of(one.how), made, runs=work.runs))
-        if work.progress is not None:
-            work.progress(number, len(choices))
+        work.progress(number, len(choices))
     return Ladder(tuple(rows), made, work.tolerance_mm)
 
 

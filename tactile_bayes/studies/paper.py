@@ -304,11 +304,6 @@ class CentredFrame(Record, eq=False):
     share: FloatArray  #: (n,) array: Pressure over the frame's mean.
     added: FloatArray  #: (n,) array: `share` less that of the same layers without the lump.
 
-    @property
-    def rise(self) -> float:
-        """Pressure that the lump adds in the middle of the head."""
-        return float(_middle(self.added))
-
 
 class Lookalikes(Record, eq=False):
     """Two lumps of different size with the most alike frames."""

@@ -10,6 +10,7 @@ from posterior_maps import TRUTH, bump_map, bump_values, find_bump, grid_map
 from scipy.special import erf
 
 from tactile_bayes.declarations import replace
+from tactile_bayes.inference import modes
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior import white as fit_module
 from tactile_bayes.posterior.draw import SamplerSettings
@@ -165,13 +166,13 @@ def test_other_widths_are_tried_where_one_does_not_explain_the_window(
 ) -> None:
     """And always where least squares is the answer, not only a place to begin."""
     starts: list[np.ndarray] = []
-    original = fit_module.fit_least_squares
+    original = modes.fit_least_squares
 
     def counted(model: object, begin: np.ndarray, **settings: object) -> object:
         starts.append(begin)
         return original(model, begin, **settings)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(fit_module, "fit_least_squares", counted)
+    monkeypatch.setattr(modes, "fit_least_squares", counted)
     values = bump_values() + errors * np.random.default_rng(2).standard_normal((51, 51))
     fit_bump(grid_map(values), (1.0, -1.0), options=SamplerSettings(rotation="off", noise=noise))
     tried = {round(float(np.exp(start[3])), 6) for start in starts}
