@@ -24,7 +24,6 @@ from tactile_bayes.report.compare import (
     change_sentences,
     compare_summary,
     rate_sentences,
-    signed,
     verdict_sentence,
 )
 from tactile_bayes.report.figure_file import figure_file, named_exam
@@ -185,33 +184,19 @@ def growth_page(compared: Compared, report: CompareReport, visits: Sequence[Sequ
         maps=[_picture(laid[i], view, limits, course, report.visits[i]) for i in shown],
         left_out=len(laid) - len(shown),
         colours=svg.colour_steps(limits, words, more=any(bool((one.values > limits[1]).any()) for one in laid)),
-        seen=_seen(view),
+        view=view,
+        side_mm=2 * HALF_MM,
         chart=_chart(compared, report, course),
-        bars=_bars(compared, report),
+        another=compared.another,
         change=svg.size_ruler(
             list(_changes(report, course)), unit="%", label="Change of the largest diameter in percent"
         ),
         sentences=change_sentences(report),
         rates=rate_sentences(report),
-        rows=[_row(report, course, visit) for visit in report.visits],
+        report=report,
+        course=course,
         foot=foot(report.provenance.get("scans", ())),
     )
-
-
-def _seen(view: Orientation) -> str:
-    return (
-        f"{view.sentence} Every map shows {2 * HALF_MM:g} mm about the mass (one without a lump, about its middle), "
-        "all in the same colours; ring: the estimated size at that visit; grey: no or few readings. Later visits are "
-        "moved so that the mass lies at one place."
-    )
-
-
-def _bars(compared: Compared, report: CompareReport) -> str:
-    """What the intervals of the sizes suppose."""
-    if compared.another is None or report.between_map_sd is None:
-        return "Bars: intervals."
-    narrow, wide = (100 * one for one in (report.between_map_sd, compared.another.between_map_sd))
-    return f"Bars: intervals if exams of one mass differ by {narrow:.0f} %; thin lines: by {wide:.0f} %."
 
 
 def _picture(
@@ -237,17 +222,6 @@ def _changes(report: CompareReport, course: Course) -> Iterator[tuple[str, Quant
         another = change.another_exam if change is report.changes[-1] else None
         if another is not None:
             yield f"the same if exams of one mass differ by {100 * another.between_map_sd:.0f} %", another.percent
-
-
-def _row(report: CompareReport, course: Course, visit: Visit) -> tuple[str, ...]:
-    """Cells of the table: the visit, its maps, size, change and place."""
-    q, number = visit.max_size_mm, visit.visit - 2
-    size = "" if q is None else f"{q.median:.1f} ({q.low:.1f} to {q.high:.1f})"
-    c = report.changes[number].percent if report.changes and number >= 0 else None
-    change = "" if c is None else f"{signed(c.median)} ({signed(c.low)} to {signed(c.high)})"
-    away = report.places[number].distance_mm if number >= 0 and report.places else None
-    found = sum(one.status == "estimate" for one in visit.maps)
-    return course.of(visit), f"{found} of {len(visit.maps)}", size, change, "" if away is None else f"{away:.0f}"
 
 
 # --- The size at each visit over time, as inline SVG.

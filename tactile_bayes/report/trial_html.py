@@ -6,7 +6,7 @@ import base64
 import io
 import itertools
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from itertools import cycle
 from pathlib import Path
@@ -33,7 +33,7 @@ from tactile_bayes.report.trial import (
 from tactile_bayes.trial.calibration import BINS, Calibration, Prediction, prediction_of
 from tactile_bayes.trial.figures import Ends, Figures
 from tactile_bayes.trial.method_comparison import MethodComparison
-from tactile_bayes.trial.next_mass import NextMass
+from tactile_bayes.trial.next_mass import NextOfModality
 from tactile_bayes.trial.planning import PlanReport
 from tactile_bayes.trial.readings import FloatArray, ModalitySizes, Trial, mass_numbers
 from tactile_bayes.trial.summary import ModalityReport, TrialReport
@@ -200,97 +200,45 @@ def _draw_plan(axes: Axes, plan: PlanReport, aim: Aim) -> None:
 
 # --- Trial report as one self-contained page: tables, figures, settings, hashes; no script, no network.
 
-Table = tuple[Sequence[str], Sequence[Sequence[str]]]
-"""Heads and rows; an interval in brackets is set in small type below its number."""
-_FIRST = {
-    "mape_percent": ("mean error, %", ".1f"),
-    "mae_mm": ("mean error, mm", ".1f"),
-    "bias_percent": ("bias of masses found, %", "+.1f"),
-    "slope_through_origin": ("slope of the line through 0", ".2f"),
-}
-_MORE = {
-    "mape_detected_percent": ("mean error of masses found, %", ".1f"),
-    "weighted_mape_percent": ("weighted by size, %", ".1f"),
-    "median_error_percent": ("median error, %", ".1f"),
-    "r2_centred": ("r2 centred", ".2f"),
-    "r2_uncentred": ("r2 uncentred", ".2f"),
-    "r2_pearson": ("r2 Pearson", ".2f"),
-}
-_METHODS = {
-    "ols_slope": ("least squares slope", ".2f"),
-    "ols_intercept_mm": ("intercept mm", ".1f"),
-    "deming_slope": ("Deming slope", ".2f"),
-    "deming_intercept_mm": ("intercept mm", ".1f"),
-    "weighted_deming_slope": ("weighted Deming slope", ".2f"),
-    "weighted_deming_intercept_mm": ("intercept mm", ".1f"),
-    "passing_bablok_slope": ("Passing-Bablok slope", ".2f"),
-    "passing_bablok_intercept_mm": ("intercept mm", ".1f"),
-    "concordance": ("concordance", ".2f"),
-}
-_SPREAD = {
-    "within_mass_cv_rms_percent": ("SD within a mass, % (root mean square)", ".1f"),
-    "within_mass_cv_percent": ("% (mean of SDs)", ".1f"),
-}
-_REPEATS = {
-    "repeatability_low_percent": ("repeatability down %", ".0f"),
-    "repeatability_high_percent": ("up %", "+.0f"),
-    "icc": ("intraclass correlation (ICC)", ".2f"),
-}
-_NEXT = {
-    "mape_percent": "expected error %",
-    "mape_detected_percent": "if found %",
-    "bias_percent": "bias %",
-    "log_slope": "slope of ln size",
-    "patient_sd": "SD patients",
-    "mass_sd": "SD masses",
-    "replicate_sd": "SD maps",
-}
-
 
 def trial_html(report: TrialReport, trial: Trial, *, text: str, growth: Sequence[Growth] = ()) -> str:
     """Full HTML page of a trial's report, with the text report at its end for those who copy from it.
 
     `growth` is of masses with several visits, beside the trial.
     """
-    ratio = next((one.method_comparison.error_ratio for one in report.modalities.values()), 1.0)
-    counts, percent = report.counts, f"{100 * report.interval_probability:g} %"
-    opening = f"{counts.masses} masses of {counts.patients} patients, {counts.readings} readings."
     modalities = report.modalities.items()
-    trends = itertools.starmap(_trend, modalities)
+    methods = [one.method_comparison for _, one in modalities]
     return page(
         "trial",
         title="Sizes against excision",
+        report=report,
         protocol="" if report.title is UNSET else report.title,
-        opening=f"{opening} In brackets: {percent} intervals over patients.",
+        percent=f"{100 * report.interval_probability:g} %",
         marks=_marks(report, trial),
         comparisons=comparison_sentences(report),
-        errors=(
-            ["", "masses found", *_heads(_FIRST)],
-            [[SPELLED.get(name, name), found_share(one), *_cells(one, _FIRST)] for name, one in modalities],
-        ),
+        spelled=SPELLED,
         masses=_masses(trial),
-        more=(["", *_heads(_MORE)], [[name, *_cells(one, _MORE)] for name, one in modalities]),
         ratios=[ratio_line(name, one) for name, one in report.mape_ratio_to_tactile.items()],
-        cautions=[f"{name}: {caution}" for name, one in modalities for caution in one.cautions],
         sizes_svg=_base64(sizes_figure(report, trial)),
-        lines=(["", *_heads(_METHODS)], [[name, *_cells(one.method_comparison, _METHODS)] for name, one in modalities]),
-        error_ratio=f"{ratio:g}",
-        limits=(
-            ["", "scale", "bias", "lower limit", "upper limit"],
-            [[name, *row] for name, one in modalities for row in limit_rows(one)],
-        ),
-        growing=[line for line in (growing_line(report), *trends) if line],
+        error_ratio=f"{methods[0].error_ratio if methods else 1.0:g}",
+        growing=[line for line in (growing_line(report), *itertools.starmap(_trend, modalities)) if line],
         differences_svg=_base64(differences_figure(report, trial)),
-        replicates=_replicates(report),
+        replicates=[(name, one) for name, one in modalities if one.replicates.within_mass_log_sd is not None],
         calibrations=list(_calibrations(report, trial)),
-        pairs=_pairs(report),
         growth=growth,
-        next_mass=None if report.next_mass is UNSET else _next_mass(report.next_mass),
-        checks=_checks(report),
-        settings=_settings(report),
-        inputs=report.provenance["inputs"],
+        next_mass=None if report.next_mass is UNSET else report.next_mass,
+        checks={} if report.interval_check is UNSET else report.interval_check,
         text=text,
-        research_use=report.research_use,
+        # what puts figures into words
+        cells=_cells,
+        found_share=found_share,
+        limit_rows=limit_rows,
+        shown=shown,
+        number=number,
+        of_variances=_of_variances,
+        middles=_middles,
+        with_ends=_with,
+        dumps=json.dumps,
     )
 
 
@@ -304,8 +252,8 @@ def _marks(report: TrialReport, trial: Trial) -> list[str]:
     return marks
 
 
-def _masses(trial: Trial) -> Table:
-    """Size and residual of each mass by each modality, in the order of the excision table."""
+def _masses(trial: Trial) -> tuple[list[str], list[list[str]]]:
+    """Heads and rows: size and residual of each mass by each modality, in the order of the excision table."""
     sizes, numbers = trial.sizes(), mass_numbers(trial.ex_vivo_mm)
     cells: dict[tuple[int, str], str] = {}
     for name, one in sizes.items():
@@ -330,83 +278,28 @@ def _trend(name: str, report: ModalityReport) -> str | None:
     )
 
 
-def _replicates(report: TrialReport) -> Table | None:
-    rows = []
-    for name, one in report.modalities.items():
-        parts = one.replicates.variance_components
-        sds = [None, None, None] if parts is None else [parts.mass, parts.reader, parts.map]
-        if one.replicates.within_mass_log_sd is not None:
-            of_sds = (number(None if sd is None else 100 * sd**0.5, ".0f") for sd in sds)
-            rows.append([name, *_cells(one, _SPREAD), *_cells(one.replicates, _REPEATS), *of_sds])
-    heads = ["", *_heads(_SPREAD), *_heads(_REPEATS), "SD masses %", "readers %", "maps %"]
-    return (heads, rows) if rows else None
-
-
-def _calibrations(report: TrialReport, trial: Trial) -> Iterator[tuple[str, str, str]]:
-    """Name, words and picture of each modality that states its uncertainty."""
+def _calibrations(report: TrialReport, trial: Trial) -> Iterator[tuple[str, Calibration, str]]:
+    """Name, figures and picture of each modality that states its uncertainty."""
     for name, one in report.modalities.items():
         found, prediction = one.calibration, prediction_of(trial, name)
-        if found is None or prediction is None:
-            continue
-        words = (
-            f"{found.n} readings of {found.masses} masses; CRPS {number(found.crps_mm, '.2f')} mm, interval score "
-            f"{number(found.interval_score_mm, '.1f')} mm. Advice: {found.advice}."
-        )
-        yield name, words, _base64(calibration_figure(prediction, found))
-
-
-def _pairs(report: TrialReport) -> Table | None:
-    rows = [
-        [
-            f"{one.first} - {one.second}",
-            str(one.masses),
-            shown(one.figure("difference_percent"), "+.1f"),
-            shown(one.figure("ratio"), ".2f"),
-            number(one.p_value, ".4f"),
-            number(one.p_holm, ".4f"),
-        ]
-        for one in report.paired_comparisons
-    ]
-    heads = ["", "masses", "difference of mean errors, points", "ratio", "p", "p Holm"]
-    return (heads, rows) if rows else None
-
-
-def _next_mass(found: NextMass) -> dict[str, Any]:
-    rows = [
-        [name, *(_with(middle.median, (middle.low, middle.high)) for middle in (getattr(one, key) for key in _NEXT))]
-        for name, one in found.modalities.items()
-    ]
-    return {
-        "table": (["", *_NEXT.values()], rows),
-        "less_error": [f"Probability that {pair}: {p:.3f}" for pair, p in found.probability_less_error.items()],
-        "percent": f"{100 * found.interval.probability:g}",
-    }
-
-
-def _checks(report: TrialReport) -> Table | None:
-    if report.interval_check is UNSET or not report.interval_check:
-        return None
-    rows = [
-        [name, str(one.trials), f"{one.true_mape_percent:.1f}", _with(one.share, one.share_interval), str(one.above),
-         str(one.below)]
-        for name, one in report.interval_check.items()
-    ]  # fmt: skip
-    return ["", "simulated trials", "true mean error, %", "covered", "interval above it", "interval below it"], rows
-
-
-def _settings(report: TrialReport) -> Table:
-    made = report.provenance
-    rows = [[key, json.dumps(value)] for key, value in made["settings"].items()]
-    rows += [["seed", str(made["seed"])], ["program", f"{made['program']} {made['version']}"]]
-    return ["setting", "value"], rows
-
-
-def _heads(wanted: Mapping[str, tuple[str, str]]) -> list[str]:
-    return [words for words, _ in wanted.values()]
+        if found is not None and prediction is not None:
+            yield name, found, _base64(calibration_figure(prediction, found))
 
 
 def _cells(figures: Figures, wanted: Mapping[str, tuple[str, str]]) -> list[str]:
+    """Figures with their intervals, by what is `wanted`: head and format of each by name."""
     return [shown(figures.figure(key), spec) for key, (_, spec) in wanted.items()]
+
+
+def _of_variances(report: ModalityReport) -> list[str]:
+    """SDs of masses, readers and maps, percent."""
+    parts = report.replicates.variance_components
+    variances = (None, None, None) if parts is None else (parts.mass, parts.reader, parts.map)
+    return [number(None if one is None else 100 * one**0.5, ".0f") for one in variances]
+
+
+def _middles(one: NextOfModality, names: Iterable[str]) -> list[str]:
+    return [_with(middle.median, (middle.low, middle.high)) for middle in (getattr(one, name) for name in names)]
 
 
 def _with(value: float, ends: Ends) -> str:
