@@ -98,13 +98,13 @@ def report_action(
     **asked: Any,
 ) -> None:
     """Write one page of an exam: the map, the size with its intervals, the place, and how good the exam was."""
-    given, page = Given(title, name, day), PageFiles(output, pdf, force)
+    words, page = Given(title, name, day), PageFiles(output, pdf, force)
     page.check()
     typed = [name for name in asked if name in typed_options()]
     found = exam_of_files(
         files, lambda: settings_of(**asked), typed=typed, notice=lambda line: click.echo(line, err=True)
     )
-    exam = given.on(found)
+    exam = replace(found, given=words)
     page.write(exam_page(exam))
     if exam.main.tactile_map is None:
         click.echo("note: without its map the page has no picture and no coverage; give MAP.nc too", err=True)

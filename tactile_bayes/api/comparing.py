@@ -200,7 +200,7 @@ def compare_answers(
         one.at(f"visit {number}" if len(maps) == 1 else f"visit {number}, map {i}")
         for number, maps in enumerate(visits, start=1)
         for i, answer in enumerate(maps, start=1)
-        for one in answer.findings
+        for one in answer.report.findings
         if one.kind != "outside_calibration"  # of a size alone: judged anew
     )
     compared = replace(compared, findings=by_weight((*compared.findings, *of_visits)))

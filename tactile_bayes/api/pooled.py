@@ -28,7 +28,7 @@ from tactile_bayes.report.estimate_figures import draw_size
 from tactile_bayes.report.exam_words import Exam
 from tactile_bayes.report.pooled import pooled_report
 from tactile_bayes.size.bodies import BodyCalibration
-from tactile_bayes.size.draws import LEAST_PROBABILITY, SizePosterior
+from tactile_bayes.size.draws import LEAST_PROBABILITY
 from tactile_bayes.size.pooling import DISAGREE, PooledEstimate, pool_maps
 from tactile_bayes.size.visits import Place as PatientPlace
 from tactile_bayes.size.visits import one_place_probability
@@ -139,13 +139,8 @@ class PooledSize(SizedExam, eq=False, dict=True, kw_only=True):
     maps: tuple[SizeEstimate, ...] = ()  #: The estimates of the maps alone, where they are at hand.
 
     @property
-    def _size(self) -> SizePosterior | None:
-        return self.pooled.size
-
-    @property
-    def why(self) -> str:
-        """Why there is no size; empty where there is one."""
-        return "" if self._size is not None else self.pooled.reason
+    def _found(self) -> PooledEstimate:
+        return self.pooled
 
     @property
     def findings(self) -> tuple[Finding, ...]:

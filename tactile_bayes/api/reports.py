@@ -148,7 +148,7 @@ def exam_report(
     given = listed(files)
     if not given:
         raise UsageError("nothing was given to report; give maps, or an estimate")
-    exam = words.on(_exam(given, settings))
+    exam = replace(_exam(given, settings), given=words)
     page.write(exam_page(exam))
     return headline(exam)
 

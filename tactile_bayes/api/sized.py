@@ -13,7 +13,7 @@ import numpy as np
 
 from tactile_bayes.api.arguments import PathLike, door, in_keywords, output_path, path_of
 from tactile_bayes.api.settings import Settings
-from tactile_bayes.declarations import Record
+from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import EXIT_DONE, EXIT_NO_ESTIMATE, BadDataError, UsageError
 from tactile_bayes.files.map_nc import write_posterior
 from tactile_bayes.files.provenance import Provenance
@@ -32,7 +32,7 @@ from tactile_bayes.report.figure_file import named_exam
 from tactile_bayes.report.pages import PageFiles
 from tactile_bayes.scans import HeadShape
 from tactile_bayes.size.draws import EXTREMES, SIZES, BetweenMaps, ShapeDraws, SizePosterior
-from tactile_bayes.size.pooling import Calibration, SizePriors
+from tactile_bayes.size.pooling import Calibration, PooledEstimate, SizePriors
 from tactile_bayes.size.terms import head_profile
 
 if TYPE_CHECKING:
@@ -49,16 +49,19 @@ class Sized(Record, eq=False, dict=True):
     """Base of the estimates from one map, of one of its masses, and from several maps."""
 
     @property
-    def _size(self) -> SizePosterior | None:
+    def _found(self) -> Estimate | PooledEstimate:
         raise NotImplementedError
+
+    @property
+    def _size(self) -> SizePosterior | None:
+        return self._found.size
 
     @property
     def why(self) -> str:
         """Why there is no size, or no estimate at all; empty where there is a size."""
-        raise NotImplementedError
+        return "" if self._size is not None else self._found.reason
 
-    def _of_size(self, name: str) -> Draws | None:
-        size = self._size
+    def _drawn(self, size: SizePosterior | None, name: str) -> Draws | None:
         if size is None:
             return None
         return Draws(np.atleast_2d(getattr(size, name)), "mm", self.probability, size.replicates)
@@ -75,12 +78,12 @@ class Sized(Record, eq=False, dict=True):
         These draws are the posterior's that `save` writes and `validate` reads. Where `max_size_another_exam_mm` is not
         None, that is the one that reports lead with (docs/decisions/0130).
         """
-        return self._of_size("max_size_mm")
+        return self._drawn(self._size, "max_size_mm")
 
     @property
     def min_size_mm(self) -> Draws | None:
         """Smallest diameter; None without a size."""
-        return self._of_size("min_size_mm")
+        return self._drawn(self._size, "min_size_mm")
 
     @property
     def max_size_another_exam_mm(self) -> Draws | None:
@@ -89,13 +92,10 @@ class Sized(Record, eq=False, dict=True):
         None without a size, or where the spread between exams was stated or learned at the site: `max_size_mm` has it
         then.
         """
-        size = None if self._size is None else self._size.another_exam
-        if size is None:
-            return None
-        return Draws(np.atleast_2d(size.max_size_mm), "mm", self.probability, size.replicates)
+        return self._drawn(None if self._size is None else self._size.another_exam, "max_size_mm")
 
     def _columns(self) -> dict[str, Draws]:
-        found = {name: self._of_size(name) for name in SIZES}
+        found = {name: self._drawn(self._size, name) for name in SIZES}
         return {name: draws for name, draws in found.items() if draws is not None}
 
     def to_dataframe(self) -> pandas.DataFrame:
@@ -151,8 +151,7 @@ class Sized(Record, eq=False, dict=True):
             return
         leads = leading_size(self._size)
         for name in EXTREMES:
-            draws = Draws(np.atleast_2d(getattr(leads, name)), "mm", self.probability, leads.replicates)
-            yield f"{'largest' if name == 'max_size_mm' else 'smallest'} size", repr(draws)
+            yield f"{'largest' if name == 'max_size_mm' else 'smallest'} size", repr(self._drawn(leads, name))
         if leads is not self._size:
             yield f"largest size {exams_label(self._size.figures.get('between_map_sd'))}", repr(self.max_size_mm)
 
@@ -175,13 +174,13 @@ class MassEstimate(Sized, eq=False, dict=True):
     why: str  #: Why it has no size; empty where it has one.
 
     @property
-    def _size(self) -> SizePosterior | None:
-        return self.mass.estimate.size
+    def _found(self) -> Estimate:
+        return self.mass.estimate
 
     @property
     def findings(self) -> tuple[Finding, ...]:
         """What speaks against its size, cautions first."""
-        return self.mass.estimate.findings
+        return self._found.findings
 
     def _rows(self) -> Iterator[tuple[str, str]]:
         yield from super()._rows()
@@ -225,11 +224,6 @@ class Answer(Record):
     def exit_code(self) -> int:
         """0 for an estimate, else 6."""
         return EXIT_DONE if self.report.status == "estimate" else EXIT_NO_ESTIMATE
-
-    @property
-    def findings(self) -> tuple[Finding, ...]:
-        """What speaks against the answer, cautions first."""
-        return self.report.findings
 
     @property
     def document(self) -> dict[str, Any]:
@@ -276,7 +270,7 @@ class SizedExam(Sized, eq=False, dict=True, kw_only=True):
 
         page, given = PageFiles(path_of(path), path_of(pdf), force), Given(title, name, day)
         page.check()
-        page.write(exam_page(given.on(self.exam())))
+        page.write(exam_page(replace(self.exam(), given=given)))
 
 
 class SizeEstimate(SizedExam, eq=False, dict=True, kw_only=True):
@@ -287,18 +281,13 @@ class SizeEstimate(SizedExam, eq=False, dict=True, kw_only=True):
     calibration: Calibration | None = None  #: The one that sized the lump, at its depth.
 
     @property
-    def _size(self) -> SizePosterior | None:
-        return self.estimate.size
+    def _found(self) -> Estimate:
+        return self.estimate
 
     @property
     def status(self) -> str:
         """``"estimate"`` or ``"no_estimate"``."""
         return self.estimate.status
-
-    @property
-    def why(self) -> str:
-        """Why there is no size, or no estimate at all; empty where there is a size."""
-        return "" if self._size is not None else self.estimate.reason
 
     @property
     def advice(self) -> str:

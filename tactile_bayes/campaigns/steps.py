@@ -43,7 +43,7 @@ from tactile_bayes.report.estimate_document import side_of, size_diagnostics
 from tactile_bayes.report.estimate_figures import draw_map, draw_size
 from tactile_bayes.report.exam_page import exam_page
 from tactile_bayes.report.exam_words import Exam as ShownExam
-from tactile_bayes.report.exam_words import exam_map
+from tactile_bayes.report.exam_words import Given, exam_map
 from tactile_bayes.report.growth_page import Course, DrawnMap, draw_comparison, growth_page
 from tactile_bayes.report.svg import thumbnail_svg
 from tactile_bayes.size.bodies import BodyCalibration
@@ -310,7 +310,7 @@ def make_page(folder: Path, expected: Mapping[str, str], *, report: str) -> Made
     facts = [told | scan for scan in scans or [{}]]
     shown = exam_map(tactile_map, read_record(folder / report, EstimateReport), side=side_of(facts))
     title = f"Tactile exam {expected['replicate']}"
-    page = exam_page(ShownExam((shown,), None, facts, title=title, day=expected.get("date", "")))
+    page = exam_page(ShownExam((shown,), None, facts, Given(title, day=expected.get("date", ""))))
     writes: Writes = {layout.EXAM_PAGE: lambda path: write_text(path, page, force=True)}
     if tactile_map.covered.any():
         picture = thumbnail_svg(shown, label=f"Map of {folder.name}")

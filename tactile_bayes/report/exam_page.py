@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from typing import Any, Final
 
+from tactile_bayes.findings import finding_lines
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.posterior.verdict import SHARE_WITH_LUMP, chance_text
 from tactile_bayes.presets import INTERVAL, RESEARCH_USE
 from tactile_bayes.report import exam_words, svg
 from tactile_bayes.report.estimate_document import size_words
+from tactile_bayes.report.estimate_text import width_lines
 from tactile_bayes.report.exam_words import Exam, headline, largest
 from tactile_bayes.report.pages import cut, foot, page
 
@@ -34,19 +36,21 @@ def exam_page(exam: Exam) -> str:
     most, longest = _FINDINGS[crowded]
     size, several = largest(exam), len(exam.maps) > 1
     drawn, report, least = exam.main.tactile_map, exam.main.report, exam.main.report.smallest_lump
-    made = report.provenance.get("seed")
-    seed = [] if made is None else [f"seed {made}"]
+    seed, told = report.provenance.get("seed"), finding_lines(exam.report.findings, paper=True)
+    if len(told) > most:
+        told = [*told[:most], f"And {len(told) - most} more, which the full report tells."]
     masses = sorted(exam.main.masses, key=lambda one: one.number)
+    made = f"method {report.origin.settings.get('method', 'unknown')}"
     shown = exam.maps[:MOST_REPEATS] if several else ()
     alone = ["no size" if (q := one.report.max_size_mm) is None else size_words(q) for one in shown]
     return page(
         "exam",
-        title=cut(exam.title, 60) or TITLE,
+        title=cut(exam.given.title, 60) or TITLE,
         crowded=crowded,
         facts=list(exam_words.facts(exam)),
         research_use=RESEARCH_USE,
         headline=headline(exam),
-        findings=exam_words.finding_sentences(exam, most),
+        findings=told,
         longest_finding=longest,
         picture=_picture(exam, crowded=crowded),
         no_map=NO_MAP,
@@ -56,7 +60,7 @@ def exam_page(exam: Exam) -> str:
         size=size
         and {"ruler": svg.size_ruler(_intervals(exam, size)), "sentences": list(exam_words.size_sentences(exam))},
         nothing=[] if size else list(exam_words.nothing_sentences(exam)),
-        narrowing=exam_words.narrowing_sentences(exam),
+        narrowing=width_lines(exam.report.leading.variance_share or {}, paper=True),
         masses=[exam_words.mass_row(one) for one in masses],
         most_masses=MOST_MASSES,
         maps=len(exam.maps),
@@ -64,7 +68,7 @@ def exam_page(exam: Exam) -> str:
         repeats=list(zip(svg.small_pictures(shown, room_mm=_REPEAT_MM), alone, strict=True)) if shown else [],
         of_map=f" (map {exam.main_number})" if several else "",
         quality=list(exam_words.quality_rows(exam)),
-        foot=foot(exam.scans, f"method {report.origin.settings.get('method', 'unknown')}", *seed),
+        foot=foot(exam.scans, made if seed is None else f"{made}; seed {seed}"),
     )
 
 

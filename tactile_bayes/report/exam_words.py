@@ -22,7 +22,7 @@ from tactile_bayes.files.reports import (
     centre_of,
     ellipse_of,
 )
-from tactile_bayes.findings import capital, finding_lines
+from tactile_bayes.findings import capital
 from tactile_bayes.geometry import apply
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.mapping.map import FEW_READINGS, TactileMap
@@ -30,7 +30,7 @@ from tactile_bayes.mapping.places import ClockPosition, clock_position, clock_te
 from tactile_bayes.mapping.plausibility import WHY_NOT
 from tactile_bayes.posterior.verdict import chance_text
 from tactile_bayes.report.estimate_document import from_xiphoid, others, patient_mm, size_words
-from tactile_bayes.report.estimate_text import shape_text, smallest_text, width_lines
+from tactile_bayes.report.estimate_text import shape_text, smallest_text
 from tactile_bayes.size.pooling import DISAGREE
 
 _LONGEST: Final = {"title": 60, "name": 50}
@@ -67,16 +67,35 @@ class ExamMap(Record, eq=False):
     masses: tuple[ExamMass, ...]
 
 
+class Given(Record):
+    """What was given for the page besides maps: title, name and date, empty where they were not."""
+
+    title: str = ""
+    name: str = ""
+    day: str = ""
+
+    def __post_init__(self) -> None:
+        for option, longest in _LONGEST.items():
+            value = getattr(self, option)
+            if not isinstance(value, str):
+                raise UsageError(f"{option} is {value!r}; give a text")
+            if not value.isprintable() or len(value) > longest:
+                what = f"{option} is of {len(value)} letters or not printable"
+                raise UsageError(f"{what}; give up to {longest} letters")
+        day, is_date = str(self.day), False
+        with suppress(ValueError):
+            is_date = bool(_DATE.fullmatch(day) and date.fromisoformat(day))
+        if self.day and not is_date:
+            raise UsageError(f"date {day[:40]!r} is no date; give it as YEAR-MONTH-DAY, such as 2026-03-01")
+
+
 class Exam(Record, eq=False):
     """What one page shows."""
 
     maps: tuple[ExamMap, ...]  #: Several are repeats of one mass.
     pooled: PooledReport | None = None  #: The size from all maps; None with one map.
     scans: Sequence[Mapping[str, str]] = ()  #: The scans at the beginning, as `Provenance.scans` has them.
-    title: str = ""
-    name: str = ""
-    day: str = ""
-    """`title`, `name`, `day`: Given for the page; empty where they were not."""
+    given: Given = Given()
 
     @property
     def main_number(self) -> int:
@@ -114,32 +133,6 @@ class Exam(Record, eq=False):
     def figures(self) -> Mapping[str, Any]:
         """Figures of the size: spread between exams, whether the lump is oval."""
         return self.report.figures
-
-
-class Given(Record):
-    """What was given for the page besides maps: title, name and date, empty where they were not."""
-
-    title: str = ""
-    name: str = ""
-    day: str = ""
-
-    def __post_init__(self) -> None:
-        for option, longest in _LONGEST.items():
-            value = getattr(self, option)
-            if not isinstance(value, str):
-                raise UsageError(f"{option} is {value!r}; give a text")
-            if not value.isprintable() or len(value) > longest:
-                what = f"{option} is of {len(value)} letters or not printable"
-                raise UsageError(f"{what}; give up to {longest} letters")
-        day, is_date = str(self.day), False
-        with suppress(ValueError):
-            is_date = bool(_DATE.fullmatch(day) and date.fromisoformat(day))
-        if self.day and not is_date:
-            raise UsageError(f"date {day[:40]!r} is no date; give it as YEAR-MONTH-DAY, such as 2026-03-01")
-
-    def on(self, exam: Exam) -> Exam:
-        """The exam with them."""
-        return replace(exam, title=self.title, name=self.name, day=self.day)
 
 
 def exam_map(tactile_map: TactileMap | None, report: EstimateReport, *, side: str) -> ExamMap:
@@ -313,19 +306,6 @@ def why_no_clock(exam: Exam) -> str:
     return f"No clock position: the scan names no {' and no '.join(lacks)}." if lacks else ""
 
 
-def narrowing_sentences(exam: Exam) -> list[str]:
-    """What makes the interval wide and what would narrow it."""
-    share = exam.report.leading.variance_share
-    return [] if share is None else width_lines(share, paper=True)
-
-
-def finding_sentences(exam: Exam, most: int) -> list[str]:
-    """What speaks against the result, cautions first; lists longer than `most` end with their number."""
-    told = finding_lines(exam.report.findings, paper=True)
-    more = len(told) - most
-    return [*told[:most], f"And {more} more, which the full report tells."] if more > 0 else told
-
-
 def quality_rows(exam: Exam) -> Iterator[tuple[str, str]]:
     """Rows of the table on how good the exam was."""
     if exam.main.tactile_map is not None:
@@ -414,16 +394,16 @@ def mass_row(mass: ExamMass) -> tuple[str, str, str]:
 
 def facts(exam: Exam) -> Iterator[tuple[str, str]]:
     """What the scans say of the exam, with what was given for the page."""
-    if exam.name:
-        yield "Name", exam.name
+    if exam.given.name:
+        yield "Name", exam.given.name
     for key, words in (("subject", "Subject"), ("side", "Side"), ("mass", "Mass"), ("visit", "Visit"),
                        ("posture", "Posture"), ("examiner", "Examiner")):  # fmt: skip
         values = list(dict.fromkeys(scan[key] for scan in exam.scans if scan.get(key)))
         if values:
             more = f" and {len(values) - 2} more" if len(values) > 2 else ""
             yield words, ", ".join(value[:24] for value in values[:2]) + more
-    if exam.day:
-        yield "Date", exam.day
+    if exam.given.day:
+        yield "Date", exam.given.day
 
 
 def _percent(quantity: Quantity | Interval) -> str:

@@ -46,11 +46,11 @@ def cut(text: str, longest: int = 400) -> str:
     return line if len(line) <= longest else f"{line[: longest - 1]}…"
 
 
-def foot(scans: Iterable[Mapping[str, str]], *more: str) -> str:
-    """Last line of a page: the program, more of it, the first scans by their digests, and what sizes come from."""
+def foot(scans: Iterable[Mapping[str, str]], more: str = "") -> str:
+    """Last line of a page: the program, `more` of it, the first scans by their digests, and what sizes come from."""
     digests = [one["sha256"][:12] for one in scans if one.get("sha256")][:_MOST_SCANS]
     told = [f"scan{'s' if len(digests) > 1 else ''} {', '.join(digests)}"] if digests else []
-    made = "; ".join([f"tactile-bayes {__version__}", *more, *told])
+    made = "; ".join(filter(None, [f"tactile-bayes {__version__}", more, *told]))
     return f"{made}. Sizes come from simulated bodies; no scan of a person has been used. {RESEARCH_USE}"
 
 
