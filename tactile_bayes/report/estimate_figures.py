@@ -99,51 +99,38 @@ _ROUND: Final = 0.9
 _KINDS: Final = {"eti": "equal-tailed", "hdi": "highest-density"}
 
 
-def size_figure(
-    draws_max_mm: FloatArray,
-    draws_min_mm: FloatArray,
-    path: Path | None,
-    *,
-    intervals: Mapping[str, Quantity],
-    supposes: str = "",
-    title: str = "",
-    findings: Sequence[Finding] = (),
-    force: bool = False,
+def draw_size(
+    size: SizePosterior, path: Path | None, *, name: str, probability: float, findings: Sequence[Finding], force: bool
 ) -> Figure:
-    """Draw the posterior of a lump's largest and smallest size; with a path, also write it (PNG, PDF or SVG).
+    """Draw the posterior of the largest and smallest size with their intervals, and what speaks against them.
 
-    `draws_max_mm`, `draws_min_mm` (n,) arrays: posterior draws; those that are not finite are left out; `intervals`:
-    for ``"max"``, ``"min"`` and ``"alike"``, drawn as bars labelled with probability and kind; the last is of the
-    largest size if exams differ less, as it `supposes`; `title`: above the figure; nothing that identifies a person;
-    `findings`: what speaks against the size, told above it.
+    Where the largest size has two intervals, the densities are of the one that leads, and a bar below has the other,
+    with what it supposes. Draws that are not finite are left out. `name`: nothing that identifies a person.
     """
-    alike = float(np.mean(np.isclose(draws_max_mm, draws_min_mm))) if len(draws_max_mm) == len(draws_min_mm) else 0.0
-    rows = [("largest", draws_max_mm, _MAX_COLOUR, "-", "max"), ("smallest", draws_min_mm, _MIN_COLOUR, "--", "min")]
-    more = ""
+    leads = leading_size(size)
+    rows = [("largest", "max_size_mm", _MAX_COLOUR, "-"), ("smallest", "min_size_mm", _MIN_COLOUR, "--")]
+    drawn = {which: getattr(leads, which).ravel() for _, which, _, _ in rows}
+    alike, more = float(np.mean(np.isclose(*drawn.values()))), ""
     if alike >= _ROUND:
         rows, more = rows[:1], f"\n(the smallest is the same in {100 * alike:.0f} % of the draws)"
-    bars = len(rows) + ("alike" in intervals)
-    with figure_file(path, size_in=(7.0, 3.2 + 0.4 * bars), force=force, findings=findings) as figure:
+    bars = [(words, leads.summarise(which, probability=probability), colour, "") for words, which, colour, _ in rows]
+    if size.another_exam is not None:
+        supposes = exams_label(size.figures.get("between_map_sd"))
+        bars.append(("largest", size.summarise("max_size_mm", probability=probability), _ALIKE_COLOUR, supposes))
+    with figure_file(path, size_in=(7.0, 3.2 + 0.4 * len(bars)), force=force, findings=findings) as figure:
         axes = figure.subplots()
-        for row, (size, draws, colour, dash, key) in enumerate(rows):
-            _draw_density(axes, size, draws, colour=colour, dash=dash, more=more)
-            if key in intervals:
-                _draw_interval(axes, intervals[key], size=size, row=row, colour=colour)
-        if "alike" in intervals:
-            alike_looks: dict[str, Any] = {"row": len(rows), "colour": _ALIKE_COLOUR, "supposes": supposes}
-            _draw_interval(axes, intervals["alike"], size="largest", **alike_looks)
-        axes.set_xlim(_span((draws_max_mm, draws_min_mm), intervals))
+        for words, which, colour, dash in rows:
+            _draw_density(axes, words, drawn[which], colour=colour, dash=dash, more=more)
+        for row, (words, q, colour, supposes) in enumerate(bars):
+            _draw_interval(axes, q, size=words, row=row, colour=colour, supposes=supposes)
+        # nearly all draws and all intervals, without a heavy tail's outermost draws
+        ends = [float(end) for one in drawn.values() for end in np.quantile(one[np.isfinite(one)], _SHOWN)]
+        ends += [end for _, q, _, _ in bars for end in (q.low, q.high)]
+        margin = 0.05 * (max(ends) - min(ends)) or 1.0
+        axes.set_xlim(max(0.0, min(ends) - margin) if min(ends) >= 0 else min(ends) - margin, max(ends) + margin)
         axes.set_ylim(bottom=0)
-        finish(axes, title or "Size of the lump", "size (mm)", "posterior density (1/mm)", fontsize=8)
+        finish(axes, f"Size of the lump: {name}", "size (mm)", "posterior density (1/mm)", fontsize=8)
     return figure
-
-
-def _span(draws_mm: Sequence[FloatArray], intervals: Mapping[str, Quantity]) -> tuple[float, float]:
-    """Ends of the axis: nearly all draws and all intervals, without a heavy tail's outermost draws."""
-    ends = [float(end) for one in draws_mm for end in np.quantile(one[np.isfinite(one)], _SHOWN)]
-    ends += [end for one in intervals.values() for end in (one.low, one.high)]
-    margin = 0.05 * (max(ends) - min(ends)) or 1.0
-    return max(0.0, min(ends) - margin) if min(ends) >= 0 else min(ends) - margin, max(ends) + margin
 
 
 def _density(draws_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -173,7 +160,7 @@ def _draw_density(axes: Axes, size: str, draws_mm: FloatArray, *, colour: str, d
     axes.vlines(median, 0.0, float(np.interp(median, sizes, density)), color=colour, linestyle=dash, linewidth=1.2)
 
 
-def _draw_interval(axes: Axes, q: Quantity, *, size: str, row: int, colour: str, supposes: str = "") -> None:
+def _draw_interval(axes: Axes, q: Quantity, *, size: str, row: int, colour: str, supposes: str) -> None:
     """Draw a bar below the densities, labelled with the size that it is of, its ends, probability and kind."""
     transforms = load_matplotlib().transforms
     # in inches below the axes: the layout makes room for what does not grow with them
@@ -186,21 +173,7 @@ def _draw_interval(axes: Axes, q: Quantity, *, size: str, row: int, colour: str,
     axes.text(*place, text.rstrip(), transform=across, ha="center", va="top", fontsize=8, color=colour)
 
 
-# --- The figures of `estimate`: the size posterior, and the map with the lump or the places looked at.
-
-
-def draw_size(
-    size: SizePosterior, path: Path | None, *, name: str, probability: float, findings: Sequence[Finding], force: bool
-) -> Figure:
-    """Draw the posterior of the largest and smallest size with their intervals, and what speaks against them."""
-    leads, supposes = leading_size(size), ""
-    intervals = {which: leads.summarise(f"{which}_size_mm", probability=probability) for which in ("max", "min")}
-    if size.another_exam is not None:
-        intervals["alike"] = size.summarise("max_size_mm", probability=probability)
-        supposes = exams_label(size.figures.get("between_map_sd"))
-    told: dict[str, Any] = {"intervals": intervals, "supposes": supposes, "findings": findings}
-    draws, title = (leads.max_size_mm.ravel(), leads.min_size_mm.ravel()), f"Size of the lump: {name}"
-    return size_figure(*draws, path, title=title, force=force, **told)
+# --- The map of an estimate: with the lump, or with the places looked at.
 
 
 def draw_map(tactile_map: TactileMap, report: EstimateReport, path: Path | None, *, name: str, force: bool) -> Figure:

@@ -34,7 +34,7 @@ from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.exam_page import exam_page
-from tactile_bayes.report.exam_words import Exam, exam_map, headline, reach_text
+from tactile_bayes.report.exam_words import Exam, Given, exam_map, headline, reach_text
 from tactile_bayes.report.pages import BROWSERS, find_printer
 from tactile_bayes.scans import Landmarks
 
@@ -96,7 +96,7 @@ def demo() -> tuple[TactileMap, EstimateReport]:
 def exam(scans: tuple[Mapping[str, str], ...] = SCANS, **more: Any) -> Exam:
     tactile_map, report = demo()
     side = scans[0].get("side", "") if scans else ""
-    return Exam((exam_map(tactile_map, report, side=side),), None, scans, **more)
+    return Exam((exam_map(tactile_map, report, side=side),), None, scans, Given(**more))
 
 
 SMALLEST = SmallestLump(
@@ -171,7 +171,8 @@ def test_hostile_and_endless_texts_add_no_tag_and_stay_short() -> None:
     plain = Page(exam_page(exam(title="t", name="n")))
     for text in (HOSTILE, HOSTILE * 120, "a" * 10_000):
         facts = dict.fromkeys(("subject", "posture", "examiner", "visit", "mass", "sha256"), text)
-        page = exam_page(exam(({**facts, "side": "left"},), title=text, name=text))
+        given = "".join(filter(str.isprintable, text))[:50]  # a longer one, and one that is not printable, is refused
+        page = exam_page(exam(({**facts, "side": "left"},), title=given, name=given))
         found = Page(page)
         assert found.named("script") == found.named("img") == []
         names = {name for _, attrs in found.tags for name in attrs}
@@ -412,7 +413,7 @@ def full() -> Exam:
     facts = dict.fromkeys(("subject", "posture", "examiner", "visit", "mass"), "W" * 99)
     scans = tuple({**facts, "side": "left", "sha256": f"{n}" * 64, "subject": f"{n}" + "W" * 99} for n in range(12))
     maps = (exam_map(tall, told, side="left"),) * 12
-    return Exam(maps, pooled, scans, title="W" * 120, name="W" * 80, day="2026-03-01")
+    return Exam(maps, pooled, scans, Given("W" * 60, "W" * 50, "2026-03-01"))
 
 
 @pytest.mark.slow

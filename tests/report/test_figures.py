@@ -18,7 +18,7 @@ from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.mapping.map import MapRecipe, TactileMap
 from tactile_bayes.report import estimate_figures as sizes
 from tactile_bayes.report import map as maps
-from tactile_bayes.report.estimate_figures import corner_figure, size_figure
+from tactile_bayes.report.estimate_figures import corner_figure, draw_size
 from tactile_bayes.report.map import map_figure
 
 
@@ -27,7 +27,7 @@ def quantity(median: float) -> Quantity:
     return Quantity(median=median, mean=median, sd=1.5, **ends, probability=0.95, kind="eti")
 
 
-INTERVALS = {"max": quantity(15.0), "min": quantity(12.0)}
+INTERVALS = {"max_size_mm": quantity(15.0), "min_size_mm": quantity(12.0)}
 FIT = estimate_report(
     centre_mm=Point(quantity(3.0), quantity(-2.0)),
     sigma_x_mm=quantity(6.0),
@@ -35,6 +35,26 @@ FIT = estimate_report(
     angle_deg=quantity(20.0),
     background=quantity(1.0),
 )
+
+
+class Sizes:
+    """Draws of both sizes, whose intervals are known."""
+
+    another_exam = None
+
+    def __init__(self, largest: np.ndarray, smallest: np.ndarray) -> None:
+        self.max_size_mm, self.min_size_mm = largest, smallest
+
+    def summarise(self, name: str, *, probability: float) -> Quantity:
+        return replace(INTERVALS[name], probability=probability)
+
+
+def size_figure(largest: np.ndarray, smallest: np.ndarray, path: Path | None):
+    return draw_size(Sizes(largest, smallest), path, name="s01", probability=0.95, findings=(), force=False)
+
+
+def densities(axes) -> list:
+    return [line for line in axes.lines if len(line.get_xdata()) > 2]
 
 
 def bump_map(*, normalise: str = "mean") -> TactileMap:
@@ -197,7 +217,7 @@ def test_a_grid_without_counts_is_not_hatched_and_its_unit_is_unknown(axes):
 def test_a_figure_is_what_its_suffix_says_in_the_same_bytes_each_time(tmp_path, suffix, begins):
     for name in ("a", "b"):
         map_figure(bump_map(), tmp_path / f"{name}{suffix}", report=FIT)
-        size_figure(draws(0, 15), draws(1, 12), tmp_path / f"size-{name}{suffix}", intervals=INTERVALS)
+        size_figure(draws(0, 15), draws(1, 12), tmp_path / f"size-{name}{suffix}")
     for name in ("", "size-"):
         written = (tmp_path / f"{name}a{suffix}").read_bytes()
         assert written.startswith(begins)
@@ -291,7 +311,7 @@ def test_an_existing_picture_stays_without_force(tmp_path):
     with pytest.raises(UsageError, match="--force"):
         map_figure(bump_map(), path)
     with pytest.raises(UsageError, match="--force"):
-        size_figure(draws(0, 15), draws(1, 12), path, intervals=INTERVALS)
+        size_figure(draws(0, 15), draws(1, 12), path)
     assert path.read_text() == "mine"
     map_figure(bump_map(), path, force=True)
     assert png_size(path)
@@ -299,7 +319,7 @@ def test_an_existing_picture_stays_without_force(tmp_path):
 
 def test_a_size_is_drawn_with_its_intervals_named(tmp_path, axes):
     for name in ("a.png", "b.png"):
-        size_figure(draws(0, 15), draws(1, 12), tmp_path / name, intervals=INTERVALS)
+        size_figure(draws(0, 15), draws(1, 12), tmp_path / name)
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
     assert [text.get_text() for text in axes[0].texts] == [
         "largest, 12.0 to 18.0 mm: 95 % interval (equal-tailed)",
@@ -308,8 +328,8 @@ def test_a_size_is_drawn_with_its_intervals_named(tmp_path, axes):
 
 
 def test_the_axis_of_sizes_ends_near_its_intervals_and_medians_are_marked(axes):
-    heavy = np.concatenate([draws(0, 15), [90.0, 120.0]])
-    size_figure(heavy, draws(1, 12), None, intervals=INTERVALS, title="Size of the lump: s01")
+    heavy = np.concatenate([draws(0, 15)[:-2], [90.0, 120.0]])
+    size_figure(heavy, draws(1, 12), None)
     low, high = axes[0].get_xlim()
     assert 5 < low < 9
     assert 18 < high < 22
@@ -319,40 +339,40 @@ def test_the_axis_of_sizes_ends_near_its_intervals_and_medians_are_marked(axes):
 
 
 def test_densities_have_area_one_and_their_draws_mean(axes):
-    size_figure(draws(0, 15), draws(1, 12), None, intervals={})
-    for line, centre in zip(axes[0].lines, (15, 12), strict=True):
+    size_figure(draws(0, 15), draws(1, 12), None)
+    for line, centre in zip(densities(axes[0]), (15, 12), strict=True):
         x, y = line.get_data()
         assert integral(y, x) == pytest.approx(1, abs=0.01)
         assert integral(x * y, x) == pytest.approx(centre, abs=0.2)
 
 
 def test_a_density_of_sizes_stays_above_zero(axes):
-    size_figure(np.abs(draws(0, 0)), np.abs(draws(1, 0)) / 2, None, intervals={})
-    for line in axes[0].lines:
+    size_figure(np.abs(draws(0, 0)), np.abs(draws(1, 0)) / 2, None)
+    for line in densities(axes[0]):
         x, y = line.get_data()
         assert x.min() >= 0
         assert integral(y, x) == pytest.approx(1, abs=0.02)
         assert y[0] == pytest.approx(y.max(), rel=0.1)
 
 
-@pytest.mark.parametrize("bad", [np.array([]), np.array([np.nan, 3.0])])
-def test_too_few_draws_are_refused(tmp_path, bad):
+def test_too_few_draws_are_refused(tmp_path):
+    bad = np.array([np.nan, 3.0])
     with pytest.raises(BadDataError, match="finite draws cannot be drawn"):
-        size_figure(bad, draws(0, 12), tmp_path / "size.png", intervals={})
+        size_figure(bad, bad, tmp_path / "size.png")
     assert not list(tmp_path.iterdir())
 
 
 def test_one_density_is_drawn_where_largest_and_smallest_are_the_same(axes):
     size = draws(0, 15)
     nearly = np.where(np.arange(len(size)) % 20 == 0, 0.9 * size, size)
-    size_figure(size, nearly, None, intervals=INTERVALS)
+    size_figure(size, nearly, None)
     assert len(axes[0].lines) == 2  # its density and the bar of its interval
     assert "the same in 95 % of the draws" in axes[0].get_legend().get_texts()[0].get_text()
     assert [text.get_text()[:8] for text in axes[0].texts] == ["largest,"]
 
 
 def test_equal_draws_are_drawn(tmp_path):
-    size_figure(np.full(9, 12.0), draws(0, 10), tmp_path / "size.png", intervals=INTERVALS)
+    size_figure(np.full(9, 12.0), draws(0, 10)[:9], tmp_path / "size.png")
     assert png_size(tmp_path / "size.png") == (1050, 600)
 
 
@@ -362,9 +382,10 @@ def test_no_window_system_is_asked_for(run_python, tmp_path):
         [
             "import sys, numpy as np",
             "from pathlib import Path",
-            "from tactile_bayes.report.estimate_figures import size_figure",
+            "from tactile_bayes.report.estimate_figures import corner_figure",
             "r = np.random.default_rng(0)",
-            "size_figure(r.normal(15, 1, 99), r.normal(12, 1, 99), Path('s.png'), intervals={})",
+            "drawn = {'max_size_mm': r.normal(15, 1, (1, 99)), 'amplitude': r.normal(1, 1, (1, 99))}",
+            "corner_figure(drawn, Path('s.png'))",
             "assert 'matplotlib.pyplot' not in sys.modules, 'pyplot'",
         ]
     )
