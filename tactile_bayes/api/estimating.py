@@ -171,7 +171,7 @@ def _with_place(
         estimate_document.SizedPlace(
             number,
             Place(one.x_mm, one.y_mm),
-            one.estimate.size.summarise("max_size_mm", probability=probability).rounded,
+            one.estimate.size.summarise("max_size_mm", probability=probability),
         )
         for number, one in enumerate(estimate.masses, start=1)
         if one.estimate.size is not None

@@ -5,7 +5,19 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Any, Final, Literal, Self
 
-from tactile_bayes.declarations import EXACT, UNSET, Meta, Record, UnsetType, field, from_plain, says, to_plain
+from tactile_bayes.declarations import (
+    EXACT,
+    UNSET,
+    Meta,
+    Record,
+    UnsetType,
+    field,
+    from_plain,
+    replace,
+    rounded,
+    says,
+    to_plain,
+)
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.documents import dump_json
 from tactile_bayes.findings import Finding, FindingEntry, Verdict
@@ -59,6 +71,12 @@ class Report(Record, kw_only=True):
         """The site's spread between exams, in words; empty without one."""
         words = getattr(self, "repeatability", UNSET)
         return words if isinstance(words, str) else ""
+
+    @property
+    def rounded(self) -> Self:
+        """The same with nine significant digits, but for what it was made with and what the method says of itself."""
+        kept = {name: getattr(self, name) for name in ("diagnostics", "prior", "provenance") if hasattr(self, name)}
+        return replace(rounded(self), **kept)
 
     def checked(self) -> Self:
         """Itself, held against its declaration as a file would be."""

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Final, Literal
 
 import numpy as np
 
-from tactile_bayes.declarations import UNSET, Meta, Record, UnsetType, field, rounded
+from tactile_bayes.declarations import UNSET, Meta, Record, UnsetType, field
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.reports import (
     Above0,
@@ -272,8 +272,8 @@ def compare_report(
             Visit(
                 visit=i + 1,
                 day=dated[i],
-                max_size_mm=None if joint is None else joint.size_mm(i, probability).rounded,
-                fat_mm=None if joint is None else rounded(joint.calibrations[i].fat_mm),
+                max_size_mm=None if joint is None else joint.size_mm(i, probability),
+                fat_mm=None if joint is None else joint.calibrations[i].fat_mm,
                 maps=tuple(
                     VisitMap(name, one.status, one.reason, one.detected_probability)
                     for name, one in zip(names[i], reports, strict=True)
@@ -284,17 +284,17 @@ def compare_report(
         places=tuple(
             VisitPlace(visit, None, None, None, None)
             if one is None
-            else rounded(VisitPlace(visit, one.distance_mm, one.sd_mm, one.shift_mm, one.probability))
+            else VisitPlace(visit, one.distance_mm, one.sd_mm, one.shift_mm, one.probability)
             for visit, one in enumerate(compared.apart, start=2)
         ),
         changes=tuple(_change(compared, number, comparing, probability) for number in later),
         trend=None if joint is None or days is None or len(visits) < 3 else _trend(joint, days, probability),
-        between_map_sd=None if joint is None else rounded(joint.between_map_sd),
+        between_map_sd=None if joint is None else joint.between_map_sd,
         repeatability=UNSET if repeatability is None else repeatability.words(),
         left_out=() if joint is None else tuple(joint.calibrations[0].omissions()),
         research_use=RESEARCH_USE,
         provenance=provenance.as_dict(),
-    )
+    ).rounded
 
 
 def _change(compared: Compared, later: int, comparing: Comparing, probability: float) -> ChangeReport:
@@ -305,8 +305,7 @@ def _change(compared: Compared, later: int, comparing: Comparing, probability: f
     growth, shrinkage = change.smallest_detectable(SHOWN)
     if another is not None:
         other = another.change(0, later)
-        grown = rounded(other.probability_above(0.0))
-        told = AnotherChange(rounded(another.between_map_sd), other.percent(probability).rounded, grown)
+        told = AnotherChange(another.between_map_sd, other.percent(probability), other.probability_above(0.0))
     if days is not None:
         q, apart = change.log_summary(probability), days[later] - days[0]
         rate = GrowthRate(apart, *_rates([VOLUME * one / apart for one in (q.median, q.low, q.high)], probability))
@@ -314,13 +313,11 @@ def _change(compared: Compared, later: int, comparing: Comparing, probability: f
         earlier=1,
         later=later + 1,
         verdict=verdict(change),
-        log_ratio=change.log_summary(probability).rounded,
-        percent=change.percent(probability).rounded,
-        probability_grown=rounded(change.probability_above(0.0)),
-        grown_by=tuple(
-            rounded(GrownBy(100.0 * share, change.probability_above(share))) for share in comparing.grown_by
-        ),
-        smallest_detectable_percent=rounded(Detectable(100.0 * growth, 100.0 * shrinkage)),
+        log_ratio=change.log_summary(probability),
+        percent=change.percent(probability),
+        probability_grown=change.probability_above(0.0),
+        grown_by=tuple(GrownBy(100.0 * share, change.probability_above(share)) for share in comparing.grown_by),
+        smallest_detectable_percent=Detectable(100.0 * growth, 100.0 * shrinkage),
         growth_rate=rate,
         another_exam=told,
     )
@@ -336,9 +333,9 @@ def verdict(change: Change) -> Literal["grown", "shrunk", "no_change_shown"]:
 
 def _rates(growth: Sequence[float], probability: float) -> tuple[Rate, Doubling]:
     """A growth rate in percent of the volume per day, and the doubling times, at its median and its ends."""
-    median, low, high = (rounded(100.0 * one) for one in growth)
+    median, low, high = (100.0 * one for one in growth)
     times = Doubling(*(doubling_days(growth[i]) for i in (0, 2, 1)))
-    return Rate(median, low, high, probability), rounded(times)
+    return Rate(median, low, high, probability), times
 
 
 def _trend(joint: JointSizes, days: Sequence[float], probability: float) -> TrendReport:
@@ -346,7 +343,7 @@ def _trend(joint: JointSizes, days: Sequence[float], probability: float) -> Tren
     line = straight_line(*joint.moments, days)
     half = float(normal_quantile(np.array(0.5 + probability / 2))) * line.sd
     rates = _rates([VOLUME * (line.per_day + one) for one in (0.0, -half, half)], probability)
-    return TrendReport(len(days), days[-1] - days[0], *rates, rounded(line.departure))
+    return TrendReport(len(days), days[-1] - days[0], *rates, line.departure)
 
 
 # --- A comparison of visits as text: the change of size in words that its odds carry.

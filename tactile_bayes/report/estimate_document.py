@@ -25,7 +25,7 @@ from tactile_bayes.posterior.result import WIDER, Estimate, Sensitivity
 from tactile_bayes.posterior.verdict import PROBABILITY, SmallestLumps, chance_text
 from tactile_bayes.posterior.window import LENGTHS_MM, SHARES
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.size.draws import EXTREMES, SIZES, SizePosterior, Supposition
+from tactile_bayes.size.draws import EXTREMES, SIZES, SizePosterior
 
 # --- Summaries of an estimate's draws, by name.
 
@@ -65,9 +65,8 @@ def another_exam(size: SizePosterior | None, *, probability: float) -> reports.A
     another = None if size is None else size.another_exam
     if another is None:
         return None
-    largest, smallest = (another.summarise(name, probability=probability).rounded for name in EXTREMES)
-    shares = rounded(dict(another.variance_share))
-    return reports.AnotherExam(rounded(another.figures["between_map_sd"]), largest, smallest, shares)
+    largest, smallest = (another.summarise(name, probability=probability) for name in EXTREMES)
+    return reports.AnotherExam(another.figures["between_map_sd"], largest, smallest, dict(another.variance_share))
 
 
 # --- Place of a lump in the breast, by clock and distance from the nipple, of an estimate and in words.
@@ -159,9 +158,9 @@ def touching_masses(masses: Sequence[MassReport | SizedPlace]) -> tuple[reports.
         if apart <= (size.high + beside.high) / 2:
             ends = zip((size.median, size.low, size.high), (beside.median, beside.low, beside.high), strict=True)
             # one may lie within the other's outline
-            median, low, high = (rounded(max(apart + (a + b) / 2, a, b)) for a, b in ends)
+            median, low, high = (max(apart + (a + b) / 2, a, b) for a, b in ends)
             length = reports.Interval(median, low, high, size.probability)
-            found.append(reports.Touching((one.number, other.number), rounded(apart), length))
+            found.append(reports.Touching((one.number, other.number), apart, length))
     return tuple(found)
 
 
@@ -287,12 +286,12 @@ def scene_report(choice: SceneChoice) -> reports.SceneReport:
         structures=tuple(
             reports.StructureReport(
                 name=one.name,
-                odds=_six_digits(one.odds),
+                odds=_if_finite(one.odds),
                 odds_are_a_bound=one.bound,
                 supported=one.supported,
                 used=one.used,
-                change_sigma_x_sd=_six_digits(one.change_x_sd),
-                change_sigma_y_sd=_six_digits(one.change_y_sd),
+                change_sigma_x_sd=_if_finite(one.change_x_sd),
+                change_sigma_y_sd=_if_finite(one.change_y_sd),
                 place=one.place,
             )
             for one in choice.structures
@@ -300,8 +299,8 @@ def scene_report(choice: SceneChoice) -> reports.SceneReport:
     )
 
 
-def _six_digits(value: float | None) -> float | None:
-    return None if value is None or not math.isfinite(value) else rounded(value, 6)
+def _if_finite(value: float | None) -> float | None:
+    return value if value is not None and math.isfinite(value) else None
 
 
 # --- How large a lump would be if it were soft, hard, centred on the gland's surface or resting on it: data and text.
@@ -321,13 +320,10 @@ def suppositions(size: SizePosterior | None, largest: Quantity | None) -> dict[s
     """The property that is supposed, its value, and the largest size with it, by name; None without a size."""
     if size is None or largest is None:
         return None
-    ends = (largest.median, largest.low, largest.high)
-
-    def moved(one: Supposition) -> reports.SizeInterval:
-        median, low, high = (rounded(one.moved(end, median_mm=largest.median)) for end in ends)
-        return reports.SizeInterval(median, low, high, largest.probability)
-
-    return {label: reports.Supposed(one.name, one.value, moved(one)) for label, one in size.supposing.items()}
+    return {
+        label: reports.Supposed(one.name, one.value, reports.SizeInterval(*one.moved(largest), largest.probability))
+        for label, one in size.supposing.items()
+    }
 
 
 def supposed_lines(supposed: Suppositions | None, median_mm: float, *, places: int) -> list[str]:
@@ -392,10 +388,10 @@ def _mass_reports(
             MassReport(
                 number=number,
                 reported=mass.reported,
-                centre_mm=rounded(reports.Place(mass.x_mm, mass.y_mm)),
-                centre_patient_mm=None if patient is None else rounded(reports.Place(*patient)),
-                detected_probability=rounded(mass.probability),
-                **_told(own, ("amplitude", *SIZES, "angle_deg")),
+                centre_mm=reports.Place(mass.x_mm, mass.y_mm),
+                centre_patient_mm=None if patient is None else reports.Place(*patient),
+                detected_probability=mass.probability,
+                **{name: own.get(name) for name in ("amplitude", *SIZES, "angle_deg")},
                 another_exam=another_exam(mass.estimate.size, probability=probability),
                 reason=why if mass.estimate.size is None else "",
                 reason_code=cast("reports.ReasonCode", mass.estimate.code),
@@ -404,11 +400,6 @@ def _mass_reports(
             )
         )
     return tuple(found)
-
-
-def _told(quantities: Mapping[str, Quantity], names: Sequence[str]) -> dict[str, Any]:
-    """Some of the quantities as files have them; None where there is none."""
-    return {name: quantities[name].rounded if name in quantities else None for name in names}
 
 
 def patient_mm(tactile_map: TactileMap, x_mm: float, y_mm: float) -> tuple[float, float] | None:
@@ -469,7 +460,7 @@ def estimate_report(
 
     def point(name: str) -> reports.Point | None:
         x, y = f"{name}.x", f"{name}.y"
-        return reports.Point(quantities[x].rounded, quantities[y].rounded) if x in quantities else None
+        return reports.Point(quantities[x], quantities[y]) if x in quantities else None
 
     about, size, moved = estimate.about_mm, estimate.size, estimate.sensitivity
     masses = _mass_reports(estimate, tactile_map, quantities, probability=probability, scans=provenance.scans)
@@ -485,22 +476,20 @@ def estimate_report(
         reason_code=cast("reports.ReasonCode", estimate.code),
         advice=estimate.advice,
         on_paper=estimate.on_paper,
-        about_mm=None if about is None else rounded(reports.Place(*about)),
+        about_mm=None if about is None else reports.Place(*about),
         smallest_lump=None if estimate.smallest is None else smallest_lump(estimate.smallest),
-        **_told(quantities, (*SIZES, *WIDTHS, "angle_deg")),
+        **{name: quantities.get(name) for name in (*SIZES, *WIDTHS, "angle_deg")},
         another_exam=another_exam(size, probability=probability),
         supposing=suppositions(size, quantities.get("max_size_mm")),
         centre_mm=point("centre_mm"),
         centre_patient_mm=point("centre_patient_mm"),
         position=None if place is None else place.told(probability),
-        detected_probability=rounded(estimate.probability),
-        variance_share=None if size is None else rounded(dict(size.variance_share)),
-        scene=None if estimate.scene is None else scene_report(estimate.scene),
-        prior_sensitivity=None
-        if moved is None
-        else rounded(reports.PriorSensitivity(WIDER, {**moved.median}, {**moved.ends})),
+        detected_probability=estimate.probability,
+        variance_share=None if size is None else dict(size.variance_share),
+        scene=None if estimate.scene is None else rounded(scene_report(estimate.scene), 6),
+        prior_sensitivity=None if moved is None else reports.PriorSensitivity(WIDER, {**moved.median}, {**moved.ends}),
         diagnostics=_finite(diagnostics) | ({} if size is None else size_diagnostics(size)),
-        candidates=tuple(reports.PassedOver(*rounded(one.centre_mm), one.fault) for one in estimate.candidates),
+        candidates=tuple(reports.PassedOver(*one.centre_mm, one.fault) for one in estimate.candidates),
         other_rises=tuple(rounded(reports.OtherRise(**as_dict(one)), 6) for one in estimate.other_rises),
         masses=masses,
         touching=touching_masses(masses),
@@ -508,7 +497,7 @@ def estimate_report(
         prior=as_dict(prior),
         research_use=RESEARCH_USE,
         provenance=provenance.as_dict(),
-    )
+    ).rounded
 
 
 def smallest_lump(found: SmallestLumps) -> reports.SmallestLump:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 
-from tactile_bayes.declarations import UNSET, rounded
+from tactile_bayes.declarations import UNSET
 from tactile_bayes.files.provenance import Provenance, repeated_scans, scans_of
 from tactile_bayes.files.reports import POOLED, EstimateReport, Interval, PooledMap, PooledReport
 from tactile_bayes.findings import Finding, by_weight, capital, finding_lines, finding_summary, verdict
@@ -50,23 +50,23 @@ def pooled_report(
         verdict=verdict(findings, answered=size is not None),
         entries=tuple(one.entry for one in findings),
         reason=pooled.reason,
-        max_size_mm=None if largest is None else largest.rounded,
-        min_size_mm=None if smallest is None else smallest.rounded,
+        max_size_mm=largest,
+        min_size_mm=smallest,
         another_exam=another_exam(size, probability=probability),
         supposing=suppositions(size, largest),
         maps=tuple(_map(i, name, reports[i], pooled) for i, name in enumerate(names)),
-        one_size_probability=rounded(pooled.one_size),
-        one_place_probability=rounded(pooled.one_place),
-        variance_share=None if size is None else rounded(dict(size.variance_share)),
-        figures={} if size is None else rounded(dict(size.figures)),
+        one_size_probability=pooled.one_size,
+        one_place_probability=pooled.one_place,
+        variance_share=None if size is None else dict(size.variance_share),
+        figures={} if size is None else dict(size.figures),
         left_out=(*([head] if any(head in one.left_out for one in reports) else []), *used.omissions()),
-        fat_mm=rounded(used.fat_mm),
-        unknowns=rounded(dict(used.unknowns)),
+        fat_mm=used.fat_mm,
+        unknowns=dict(used.unknowns),
         site=None if used.site is None else site_words(used.site),
         repeatability=UNSET if repeatability is None else repeatability.words(),
         research_use=RESEARCH_USE,
         provenance=provenance.as_dict(),
-    )
+    ).rounded
 
 
 def _map(index: int, name: str, report: EstimateReport, pooled: PooledEstimate) -> PooledMap:

@@ -207,9 +207,11 @@ class Supposition(Record):
         """Change of the size, as a share."""
         return float(np.expm1(self.log_shift))
 
-    def moved(self, size_mm: float, *, median_mm: float) -> float:
-        """Size where one of a distribution with this median comes to lie: the median itself, or an interval's end."""
-        return float(median_mm * np.exp(self.log_shift) * (size_mm / median_mm) ** self.sd_ratio)
+    def moved(self, size: Quantity) -> tuple[float, float, float]:
+        """Where the median of a size and its interval's ends come to lie."""
+        middle, spread = float(size.median * np.exp(self.log_shift)), self.sd_ratio
+        low, high = (float(middle * (end / size.median) ** spread) for end in (size.low, size.high))
+        return middle, low, high
 
 
 class SizePosterior(Record, eq=False):
