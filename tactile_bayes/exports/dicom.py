@@ -244,18 +244,12 @@ def secondary_capture(source: MapFile, estimate: EstimateFile | None, *, study: 
 # --- A map as an image.
 
 
-class ImagePlane(Record, eq=False):
-    """A map's values as the rows of an image that faces the viewer as every picture of the program does."""
+def image_plane(tactile_map: TactileMap, transform: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """A map's means as the rows of an image that faces the viewer as every picture of the program does.
 
-    values: FloatArray  #: (rows, columns) array: Row 0 on top; NaN without data.
-    row_direction: FloatArray
-    column_direction: FloatArray
-    """`row_direction`, `column_direction` (3,) arrays: Unit vectors in L, P, S: along a row, and down a column."""
-    corner_mm: FloatArray  #: (3,) array: Centre of the first value of the first row.
-
-
-def image_plane(tactile_map: TactileMap, transform: FloatArray) -> ImagePlane:
-    """Image of a map's means, placed by a (4, 4) transform from its plane."""
+    `transform` (4, 4) places the map's plane. Returns (rows, columns) values, row 0 on top and NaN without data; (2, 3)
+    unit vectors in L, P, S along a row and down a column; and the (3,) centre of the first value of the first row, mm.
+    """
     view = orientation_of(tactile_map)
     values = np.where(tactile_map.covered, tactile_map.mean, np.nan)
     axes = {"x": (tactile_map.x_mm, transform[:3, 0]), "y": (tactile_map.y_mm, transform[:3, 1])}
@@ -265,9 +259,8 @@ def image_plane(tactile_map: TactileMap, transform: FloatArray) -> ImagePlane:
         step = sign if towards[0] == "+" else -sign
         corner[towards[1]] = float(centres[0] if step > 0 else centres[-1])
         directions.append(step * axis)
-    shown = np.ascontiguousarray(view.screen(values))
-    along, down = directions
-    return ImagePlane(shown, along, down, on_plane(transform, (corner["x"], corner["y"])))
+    place = on_plane(transform, (corner["x"], corner["y"]))
+    return np.ascontiguousarray(view.screen(values)), np.array(directions), place
 
 
 # --- A map as a DICOM Parametric Map: float values, with their place in the patient where it is known.
@@ -301,8 +294,9 @@ def parametric_map(source: MapFile, *, study: Study, number: int) -> Any:
     transform = lps_from_plane(source.tactile_map)
     if reference is None or transform is None:
         raise ValueError("the map's place in the patient is not known")
-    plane = image_plane(source.tactile_map, transform)
-    dataset = required("pydicom").Dataset()
+    values, directions, corner_mm = image_plane(source.tactile_map, transform)
+    pydicom = required("pydicom")
+    dataset = pydicom.Dataset()
     add_study(dataset, study, source.facts)
     if dataset.Laterality:
         del dataset.Laterality  # the frame has it, and it must not be said twice
@@ -315,25 +309,31 @@ def parametric_map(source: MapFile, *, study: Study, number: int) -> Any:
     dataset.SeriesDescription = f"Tactile map. {RESEARCH_USE}"
     dataset.FrameOfReferenceUID = reference
     dataset.PositionReferenceIndicator = "XIPHOID"
-    _add_content(dataset, source, plane)
-    _add_dimension(dataset, study, source)
-    dataset.SharedFunctionalGroupsSequence = [_shared_groups(source, plane)]
+    _add_content(dataset, source, values)
+    dataset.SharedFunctionalGroupsSequence = [_shared_groups(source, values, directions)]
+    # one dimension, the place in a stack of one frame
+    organization = study.uid("dimension", source.digest)
+    pointers = {
+        "DimensionIndexPointer": pydicom.tag.Tag("InStackPositionNumber"),
+        "FunctionalGroupPointer": pydicom.tag.Tag("FrameContentSequence"),
+    }
+    dataset.DimensionOrganizationSequence = [item(DimensionOrganizationUID=organization)]
+    dataset.DimensionIndexSequence = [item(DimensionOrganizationUID=organization, **pointers)]
     content = item(StackID="1", InStackPositionNumber=1, DimensionIndexValues=[1])
-    position = item(ImagePositionPatient=[_decimal(value) for value in plane.corner_mm])
+    position = item(ImagePositionPatient=[_decimal(value) for value in corner_mm])
     frame = item(FrameContentSequence=[content], PlanePositionSequence=[position])
     dataset.PerFrameFunctionalGroupsSequence = [frame]
     return dataset
 
 
-def _add_content(dataset: Any, source: MapFile, plane: ImagePlane) -> None:
-    values = plane.values.astype("<f4")
+def _add_content(dataset: Any, source: MapFile, values: FloatArray) -> None:
     dataset.SamplesPerPixel = 1
     dataset.PhotometricInterpretation = "MONOCHROME2"
     dataset.NumberOfFrames = 1
     dataset.Rows, dataset.Columns = values.shape
     dataset.BitsAllocated = 32
     dataset.FloatPixelPaddingValue = dataset.FloatPixelPaddingRangeLimit = float("nan")
-    dataset.FloatPixelData = values.tobytes()
+    dataset.FloatPixelData = values.astype("<f4").tobytes()
     dataset.ImageType = _IMAGE_TYPE
     dataset.ContentLabel = "TACTILE_MAP"
     dataset.ContentDescription = source.tactile_map.recipe.value_words[:64]
@@ -348,25 +348,10 @@ def _add_content(dataset: Any, source: MapFile, plane: ImagePlane) -> None:
     dataset.ImageComments = f"{' '.join(told)} SHA-256 of the map: {source.digest}"
 
 
-def _add_dimension(dataset: Any, study: Study, source: MapFile) -> None:
-    """One dimension, the place in a stack of one frame."""
-    pydicom = required("pydicom")
-    organization = study.uid("dimension", source.digest)
-    dataset.DimensionOrganizationSequence = [item(DimensionOrganizationUID=organization)]
-    dataset.DimensionIndexSequence = [
-        item(
-            DimensionOrganizationUID=organization,
-            DimensionIndexPointer=pydicom.tag.Tag("InStackPositionNumber"),
-            FunctionalGroupPointer=pydicom.tag.Tag("FrameContentSequence"),
-        )
-    ]
-
-
-def _shared_groups(source: MapFile, plane: ImagePlane) -> Any:
+def _shared_groups(source: MapFile, values: FloatArray, directions: FloatArray) -> Any:
     highdicom = required("highdicom")
     cell = source.tactile_map.recipe.cell_mm
-    cosines = np.concatenate([plane.row_direction, plane.column_direction])
-    low, high = float(np.nanmin(plane.values)), float(np.nanmax(plane.values))
+    low, high = float(np.nanmin(values)), float(np.nanmax(values))
     window = {"WindowCenter": _decimal((low + high) / 2), "WindowWidth": _decimal(max(high - low, 1e-6))}
     groups = item(
         PixelMeasuresSequence=highdicom.PixelMeasuresSequence((cell, cell), cell),
@@ -375,7 +360,7 @@ def _shared_groups(source: MapFile, plane: ImagePlane) -> Any:
         PixelValueTransformationSequence=[item(RescaleIntercept=0, RescaleSlope=1, RescaleType="US")],
         FrameVOILUTSequence=[item(**window, VOILUTFunction="LINEAR_EXACT")],
         PlaneOrientationSequence=[
-            item(ImageOrientationPatient=[_decimal(0.0 if abs(one) < 1e-12 else one) for one in cosines])
+            item(ImageOrientationPatient=[_decimal(0.0 if abs(one) < 1e-12 else one) for one in directions.ravel()])
         ],
     )
     side = laterality(source.facts)

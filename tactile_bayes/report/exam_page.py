@@ -36,6 +36,8 @@ def exam_page(exam: Exam) -> str:
     most, longest = _FINDINGS[crowded]
     size, several = largest(exam), len(exam.maps) > 1
     drawn, report, least = exam.main.tactile_map, exam.main.report, exam.main.report.smallest_lump
+    height_mm = _LOWER_MM if crowded else _PICTURE_MM[1]
+    frame = None if drawn is None else svg.Frame.within(drawn, width_mm=_PICTURE_MM[0], height_mm=height_mm)
     seed, told = report.provenance.get("seed"), finding_lines(exam.report.findings, paper=True)
     if len(told) > most:
         told = [*told[:most], f"And {len(told) - most} more, which the full report tells."]
@@ -52,7 +54,11 @@ def exam_page(exam: Exam) -> str:
         headline=headline(exam),
         findings=told,
         longest_finding=longest,
-        picture=_picture(exam, crowded=crowded),
+        exam=exam,
+        frame=frame,
+        picture=frame and svg.exam_picture(exam.drawn, frame, label=f"Map: {headline(exam)}"),
+        colours=frame and svg.colour_bar(exam.main),
+        marked=frame and svg.marked(exam.main),
         no_map=NO_MAP,
         smallest=[] if least is None or drawn is None else list(svg.smallest_pictures(drawn, least)),
         of_mass=f" of mass {exam.main.masses[0].number}" if len(masses) > 1 else "",
@@ -64,35 +70,11 @@ def exam_page(exam: Exam) -> str:
         masses=[exam_words.mass_row(one) for one in masses],
         most_masses=MOST_MASSES,
         maps=len(exam.maps),
-        disagrees=exam.disagrees,
         repeats=list(zip(svg.small_pictures(shown, room_mm=_REPEAT_MM), alone, strict=True)) if shown else [],
         of_map=f" (map {exam.main_number})" if several else "",
         quality=list(exam_words.quality_rows(exam)),
         foot=foot(exam.scans, made if seed is None else f"{made}; seed {seed}"),
     )
-
-
-def _picture(exam: Exam, *, crowded: bool) -> dict[str, str] | None:
-    """The map, as large as it is where the page has room, with its colours and what the lines are."""
-    tactile_map = exam.main.tactile_map
-    if tactile_map is None:
-        return None
-    height_mm = _LOWER_MM if crowded else _PICTURE_MM[1]
-    frame = svg.Frame.within(tactile_map, width_mm=_PICTURE_MM[0], height_mm=height_mm)
-    lines = [f"Map {exam.main_number} of {len(exam.maps)}."] if len(exam.maps) > 1 else []
-    if largest(exam) is not None:
-        of_all = " of all maps" if len(exam.maps) > 1 else ""
-        lines.append(f"Full line: the estimated size{of_all}; dashed: the ends of its interval.")
-    elif exam.disagrees:
-        lines.append("Full line: the size by this map alone; dashed: the ends of its interval.")
-    if svg.marked(exam.main) is not None:
-        lines.append("Cross: the place that is meant.")
-    lines.append(frame.view.sentence)
-    lines += ["Striped: few readings; grey: none."] if tactile_map.counts_known else []
-    size = "Life size" if frame.scale == 1.0 else f"{frame.scale:.2f} of life size"
-    lines.append(f"{size} when printed at 100 %.")
-    drawn = svg.exam_picture(exam.drawn, frame, label=f"Map: {headline(exam)}")
-    return {"drawn": drawn, "colours": svg.colour_bar(exam.main), "words": " ".join(lines)}
 
 
 def _place(exam: Exam) -> dict[str, Any]:
