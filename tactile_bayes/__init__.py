@@ -28,13 +28,13 @@ from importlib import import_module
 __version__ = "0.1.0"
 
 _NAMES = {
+    "actions.record": ("record",),
     "api.arrays": ("scan",),
     "api.comparing": ("Comparison", "compare"),
     "api.diagnosing": ("Diagnosis", "diagnose"),
     "api.estimates": ("estimate", "pool"),
     "api.maps": ("Map", "build_map", "check", "demo_map", "demo_scan", "map_of", "read_map", "read_scan", "simulate"),
     "api.pooled": ("PooledSize",),
-    "api.recording": ("record",),
     "api.reports": ("ExportedFiles", "exam_report", "export"),
     "api.repeatability": ("calibrate_repeatability",),
     "api.size_calibration": ("calibrate_size",),

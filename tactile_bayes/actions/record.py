@@ -20,9 +20,10 @@ import click
 import numpy as np
 
 from tactile_bayes.actions.live_view import KEYS, can_redraw, live_view
+from tactile_bayes.api.arguments import PathLike, door, path_of, plain, takes
 from tactile_bayes.commands.options import also_read
 from tactile_bayes.declarations import as_dict
-from tactile_bayes.errors import EXIT_DONE, EXIT_INTERRUPTED, DeviceError, UsageError
+from tactile_bayes.errors import EXIT_DONE, EXIT_INTERRUPTED, DeviceError, UsageError, check_number
 from tactile_bayes.files.atomic import refuse_existing, unwritable
 from tactile_bayes.files.documents import check_session, read_session
 from tactile_bayes.files.instrument import read_array_calibration, read_head_geometry, read_landmarks
@@ -374,3 +375,65 @@ def _run(recorder: Recorder, signals: list[str], head: HeadGeometry, request: Re
                 recorder.stop(signals[-1])
 
         return recorder.run(look)
+
+
+# --- From scripts: the same recorder, started at once.
+
+_PATHS = ("like", "head_geometry", "array_calibration", "landmarks")
+_NAMED = ("output", "head_url", "duration_s", "tracker_url", "session_file")  #: Keywords of their own.
+
+
+@door
+@takes(RecordOptions, without=_NAMED)
+def record(
+    output: PathLike,
+    *,
+    head: str,
+    duration_s: float,
+    tracker: str | None = None,
+    session: PathLike | None = None,
+    **options: Any,
+) -> Report:
+    """Record a scan head and a tracker into a scan file for some seconds, starting now.
+
+    Call it from the main thread: Ctrl-C ends the recording in order.
+
+    Parameters
+    ----------
+    output
+        Scan file to write (``.mcap``).
+    head
+        Port of the scan head.
+    duration_s
+        By the head's clock.
+    tracker
+        Port of the tracker; without, there are no poses.
+    session
+        File of facts of the exam.
+    **options
+        As of `tactile_bayes.options.RecordOptions`, by default as of `tactile-bayes record`:
+        tracker_protocol, like, head_geometry, array_calibration, side, subject, force...
+
+    Returns
+    -------
+    Report
+        Frames, poses, what was lost, and cautions.
+
+    Raises
+    ------
+    DeviceError
+        When a port cannot be opened, or a device stopped answering; what came before is in the file.
+    UsageError
+        When options contradict each other, or the file exists and `force` is false.
+    """
+    given = {name: plain(value) for name, value in options.items()}
+    check_number("duration_s", duration_s, 0, open_ends=True)
+    given |= {name: path_of(given[name]) for name in _PATHS if name in given}
+    roms = given.get("tracker_rom", ())
+    given["tracker_rom"] = tuple(map(path_of, [roms] if isinstance(roms, str | Path) else roms))
+    given |= {"output": path_of(output), "head_url": head, "duration_s": duration_s, "at_once": True}
+    given |= {"tracker_url": tracker, "session_file": path_of(session)}
+    report, _ = make_recording(Request(**given))
+    if report.fault:
+        raise DeviceError(report.fault)
+    return report
