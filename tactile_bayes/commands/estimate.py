@@ -49,13 +49,7 @@ def map_command() -> None:
 @options.figure("Draw data, fit and residual of the fit window, or the map where there is no estimate.", "--fit-figure")
 @options.takes(Settings, "centre_mm", "scene", "settings_file", "accuracy_sd", "known", "repeatability")
 @click.option("--pool", is_flag=True, help="Pool the maps, all of one mass, into one size.")
-@click.option(
-    "--workers",
-    type=click.IntRange(min=1),
-    default=1,
-    show_default=True,
-    help="Number of worker processes, for several maps.",
-)
+@options.number("--workers", click.IntRange(min=1), 1, "Number of worker processes, for several maps.")
 @options.scheduler_option("several maps")
 @options.FORCE
 @click.option(

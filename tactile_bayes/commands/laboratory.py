@@ -19,6 +19,7 @@ from tactile_bayes.options import (
 )
 
 _FILE = options.FilePath()
+_ABOVE_0 = options.FiniteRange(min=0.0, min_open=True)
 
 
 @click.group("calibrate", cls=options.CommandGroup)
@@ -225,7 +226,7 @@ def sbc_command() -> None:
 )
 @click.option(
     "--phantom",
-    type=(options.FiniteRange(min=0.0, min_open=True),) * 2,
+    type=(_ABOVE_0,) * 2,
     metavar="D H/D",
     help="Lump of figure 6: diameter in mm, and depth over diameter. Default: 12.5 0.825, the paper's.",
 )
@@ -331,7 +332,7 @@ _FIDELITIES = ("solid", "plane-strain", "empirical", "empirical-gaussian")
 )
 @options.takes(MapOptions, "every", help="Compare one frame in so many.")
 @options.takes(MapOptions, "cell_mm", "pressure_window_kpa")
-@click.option("--latency-ms", type=float, default=0.0, show_default=True, help="Delay of the tracker's time stamps.")
+@options.number("--latency-ms", click.FLOAT, 0.0, "Delay of the tracker's time stamps.")
 @options.figure("Draw frames, maps and what the model leaves.")
 @options.JSON
 @options.FORCE
@@ -350,24 +351,15 @@ def compare_model_command() -> None:
 
 # --- What `tradeoff estimate` and `tradeoff map` share: options, the forecast on stderr, and the output.
 
-_TOLERANCE = click.option(
+_OF_RUNS = click.IntRange(1, 1000)
+_TOLERANCE = options.number(
     "--tolerance-mm",
-    type=options.FiniteRange(min=0.0, min_open=True),
-    default=0.2,
-    show_default=True,
-    help="Error of the size interval's ends below which more accuracy is not worth its cost.",
+    _ABOVE_0,
+    0.2,
+    "Error of the size interval's ends below which more accuracy is not worth its cost.",
 )
-_RUNS = click.option(
-    "--runs",
-    type=click.IntRange(1, 1000),
-    default=3,
-    show_default=True,
-    help="Number of runs of each setting: the least time counts, errors are averaged.",
-)
-_CALIBRATION = click.option(
-    "--size-calibration",
-    metavar="solid|solid-mean|plane-strain|none|SIZE.json",
-    help="Calibration from widths to sizes, as in `estimate`.",
+_RUNS = options.number(
+    "--runs", _OF_RUNS, 3, "Number of runs of each setting: the least time counts, errors are averaged."
 )
 
 
@@ -388,20 +380,8 @@ def tradeoff_command() -> None:
     "Default: shoulders-inside for plane-strain and the empirical model, as the scene's [head] gives them for solid."
 )
 @options.figure("Draw error in size against time.")
-@click.option(
-    "--tolerance-percent",
-    type=options.FiniteRange(min=0.0, min_open=True),
-    default=0.5,
-    show_default=True,
-    help="Error in size below which more accuracy is not worth its cost.",
-)
-@click.option(
-    "--runs",
-    type=click.IntRange(1, 1000),
-    default=1,
-    show_default=True,
-    help="Number of runs; the shortest time counts.",
-)
+@options.number("--tolerance-percent", _ABOVE_0, 0.5, "Error in size below which more accuracy is not worth its cost.")
+@options.number("--runs", _OF_RUNS, 1, "Number of runs; the shortest time counts.")
 @options.JSON
 @options.FORCE
 def tradeoff_forward_command() -> None:
@@ -423,7 +403,11 @@ def tradeoff_forward_command() -> None:
 
 @options.command("estimate", "tradeoff.tradeoff_estimate_action", within=tradeoff_command)
 @click.argument("maps", metavar="MAP.nc...", nargs=-1, required=True, type=_FILE)
-@_CALIBRATION
+@click.option(
+    "--size-calibration",
+    metavar="solid|solid-mean|plane-strain|none|SIZE.json",
+    help="Calibration from widths to sizes, as in `estimate`.",
+)
 @options.takes(Settings, "centre_mm")
 @options.takes(Settings, "settings_file", help="Settings, as in `estimate`.")
 @_TOLERANCE

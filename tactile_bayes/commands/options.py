@@ -284,6 +284,11 @@ def figure(meaning: str, name: str = "--figure") -> Decorator:
     return click.option(name, metavar="FIG.png|.pdf|.svg", type=FilePath(writes="figure"), help=meaning)
 
 
+def number(name: str, kind: _ParamType, default: float, meaning: str) -> Decorator:
+    """An option of a number with a default that its help shows."""
+    return click.option(name, type=kind, default=default, show_default=True, help=meaning)
+
+
 def path_option(name: str, metavar: str, meaning: str, **attributes: Any) -> Decorator:
     """An option that names a file or a folder."""
     return click.option(name, metavar=metavar, type=FilePath(), help=meaning, **attributes)
@@ -313,12 +318,8 @@ SESSION = click.option(
     help="Facts of the exam for the scan: subject, side, posture, examiner, visit and more, in plain text.",
 )
 JSON = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-SPEED = click.option(
-    "--speed", type=FiniteRange(0.01, 100.0), default=1.0, show_default=True, help="Playback speed; 1 is real time."
-)
-WORKERS = click.option(
-    "--workers", type=click.IntRange(min=0), default=1, show_default=True, help="Number of worker processes."
-)
+SPEED = number("--speed", FiniteRange(0.01, 100.0), 1.0, "Playback speed; 1 is real time.")
+WORKERS = number("--workers", click.IntRange(min=0), 1, "Number of worker processes.")
 
 
 def live_options(command: Callable[..., Any]) -> Callable[..., Any]:
