@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final
+from typing import Any, Final
 
 import click
 
@@ -79,9 +79,12 @@ class VisitsCommand(click.Command):
     ``--with 1 a --with 1 b``.
     """
 
-    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Parse the command line."""
-        return super().parse_args(ctx, numbered(args, strict=not ctx.resilient_parsing))
+    def make_parser(self, ctx: click.Context) -> Any:
+        """Make the parser of the command line."""
+        parser = super().make_parser(ctx)
+        parse = parser.parse_args
+        parser.parse_args = lambda args: parse(numbered(args, strict=not ctx.resilient_parsing))  # type: ignore[method-assign]
+        return parser
 
 
 def numbered(args: Sequence[str], *, strict: bool = True) -> list[str]:
