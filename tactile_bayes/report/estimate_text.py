@@ -258,7 +258,7 @@ def size_table(report: EstimateReport, shown: Collection[str] = _NAMES) -> list[
         if name not in found or (name == "min_size_mm" and ANOTHER_SMALLEST in found):
             continue
         if name == "max_size_mm" and ANOTHER_LARGEST in found:
-            label = exams_label(report.figures.get("between_map_sd"))
+            label = exams_label(report.diagnostics.get("between_map_sd"))
         q = found[name]
         places = of_sizes if name in (*SIZES, ANOTHER_LARGEST, ANOTHER_SMALLEST) else decimals(q.mc_error)
         rows.append(table_row(label, q.median, (q.low, q.high), unit=unit, places=places))
@@ -266,7 +266,7 @@ def size_table(report: EstimateReport, shown: Collection[str] = _NAMES) -> list[
 
 
 def _findings(estimate: Estimate, report: EstimateReport) -> list[str]:
-    lines, found, figures, largest = [], estimate.diagnostics, report.figures, report.max_size_mm
+    lines, found, figures, largest = [], estimate.diagnostics, report.diagnostics, report.max_size_mm
     if report.detected_probability is not None:
         which = f"{number}. " if (number := estimate_document.numbered(report.masses)) else ""
         prior = f"where {100 * SHARE_WITH_LUMP:g} % of exams hold one"
@@ -302,7 +302,7 @@ def _findings(estimate: Estimate, report: EstimateReport) -> list[str]:
 
 def invalid_draws(report: EstimateReport) -> list[str]:
     """How many draws gave no size; empty for none."""
-    number = report.figures.get("invalid_draws")
+    number = report.diagnostics.get("invalid_draws")
     return [f"{number} draws gave no size and were left out"] if number else []
 
 

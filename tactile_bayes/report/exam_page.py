@@ -17,10 +17,6 @@ from tactile_bayes.report.pages import cut, foot, page
 # --- An exam as one self-contained page that prints to one side of A4: no script, nothing loaded, every text escaped.
 
 TITLE: Final = "Tactile exam"
-NO_MAP: Final = (
-    "The map is not at hand: this page shows no picture of it, and does not say what was covered nor how hard was "
-    "pressed. Given the map too, it does."
-)
 MOST_REPEATS: Final = 5
 MOST_MASSES: Final = 4
 _FINDINGS: Final = ((2, 320), (1, 220))  #: Findings and letters of each, and on a crowded page.
@@ -59,7 +55,6 @@ def exam_page(exam: Exam) -> str:
         picture=frame and svg.exam_picture(exam.drawn, frame, label=f"Map: {headline(exam)}"),
         colours=frame and svg.colour_bar(exam.main),
         marked=frame and svg.marked(exam.main),
-        no_map=NO_MAP,
         smallest=[] if least is None or drawn is None else list(svg.smallest_pictures(drawn, least)),
         of_mass=f" of mass {exam.main.masses[0].number}" if len(masses) > 1 else "",
         place=_place(exam) if masses else None,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import io
-import itertools
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
@@ -214,14 +213,14 @@ def trial_html(report: TrialReport, trial: Trial, *, text: str, growth: Sequence
         report=report,
         protocol="" if report.title is UNSET else report.title,
         percent=f"{100 * report.interval_probability:g} %",
-        marks=_marks(report, trial),
+        other_visits=trial.other_visits.lines(),
         comparisons=comparison_sentences(report),
         spelled=SPELLED,
         masses=_masses(trial),
         ratios=[ratio_line(name, one) for name, one in report.mape_ratio_to_tactile.items()],
         sizes_svg=_base64(sizes_figure(report, trial)),
         error_ratio=f"{methods[0].error_ratio if methods else 1.0:g}",
-        growing=[line for line in (growing_line(report), *itertools.starmap(_trend, modalities)) if line],
+        growing=growing_line(report),
         differences_svg=_base64(differences_figure(report, trial)),
         replicates=[(name, one) for name, one in modalities if one.replicates.within_mass_log_sd is not None],
         calibrations=list(_calibrations(report, trial)),
@@ -242,16 +241,6 @@ def trial_html(report: TrialReport, trial: Trial, *, text: str, growth: Sequence
     )
 
 
-def _marks(report: TrialReport, trial: Trial) -> list[str]:
-    """What has to be known before the tables are read."""
-    counts = report.counts
-    marks = [f"{line}." for line in trial.other_visits.lines()] + [f"Doubtful: {doubt}" for doubt in report.doubts]
-    if counts.synthetic_readings:
-        share = "All" if counts.synthetic_readings == counts.readings else str(counts.synthetic_readings)
-        marks.append(f"{share} readings are synthetic: made by a generator, not measured.")
-    return marks
-
-
 def _masses(trial: Trial) -> tuple[list[str], list[list[str]]]:
     """Heads and rows: size and residual of each mass by each modality, in the order of the excision table."""
     sizes, numbers = trial.sizes(), mass_numbers(trial.ex_vivo_mm)
@@ -265,17 +254,6 @@ def _masses(trial: Trial) -> tuple[list[str], list[list[str]]]:
         for place, (key, ex_vivo) in enumerate(trial.ex_vivo_mm.items(), start=1)
     ]
     return ["mass", "after excision, mm", *(f"{name}, mm" for name in sizes)], rows
-
-
-def _trend(name: str, report: ModalityReport) -> str | None:
-    """Whether the difference changes with the ex-vivo size, where it was tested."""
-    found = report.method_comparison.trends.get("on_ex_vivo")
-    if found is None or found.p_value is None or found.p_value >= 0.05:
-        return None
-    return (
-        f"{name}: the difference changes by {found.slope:+.2f} mm per mm of ex-vivo size "
-        f"(p {found.p_value:.3f}, masses taken as independent)."
-    )
 
 
 def _calibrations(report: TrialReport, trial: Trial) -> Iterator[tuple[str, Calibration, str]]:
