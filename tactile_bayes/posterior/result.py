@@ -22,7 +22,6 @@ from tactile_bayes.posterior.fit import FieldFit, SceneChoice
 from tactile_bayes.posterior.marginal import CollapsedTarget
 from tactile_bayes.posterior.verdict import SmallestLumps, Weighed
 from tactile_bayes.posterior.white import BumpFit, Candidate
-from tactile_bayes.posterior.window import linear_columns
 from tactile_bayes.size.draws import BumpDraws, SizePosterior
 from tactile_bayes.size.pooling import Calibration, SizePriors, draw_sizes
 
@@ -161,7 +160,7 @@ def pointwise_log_likelihood(target: CollapsedTarget, theta: FloatArray) -> Floa
     """(m, n) log density of each cell's value given the other cells, at (m, p) draws of the scene's parameters."""
     evidence = target.by_field(theta)
     log_share = evidence - np.logaddexp.reduce(evidence, axis=1)[:, None]
-    window, fixed = target.window, _fixed_columns(target)
+    window, fixed = target.window, target.linear.plain[:-1]
     templates = [window.of_cells(one) for one in target.scene.templates(theta, window)]
     inverse = np.full((len(theta), len(window.cells)), -np.inf)
     for h, precision in enumerate(_fields(target)):
@@ -181,7 +180,7 @@ def fitted_values(target: CollapsedTarget, theta: FloatArray) -> tuple[FloatArra
     window, at = target.window, theta[None]
     likeliest = int(np.argmax(target.by_field(at)[0]))
     templates = [window.of_cells(one)[0] for one in target.scene.templates(at, window)]
-    regressors = np.stack([*_fixed_columns(target), *templates])
+    regressors = np.stack([*target.linear.plain[:-1], *templates])
     precision = next(islice(_fields(target), likeliest, None))
     middle = window.cells.value.mean()
     across = precision.times(regressors)
@@ -201,13 +200,6 @@ def _fields(target: CollapsedTarget) -> Iterator[_Precision]:
         low = cosines @ columns.field.turn
         for index in range(len(columns.shares)):
             yield _Precision(1.0 / window.variance, low, columns.weight[:, index])
-
-
-def _fixed_columns(target: CollapsedTarget) -> FloatArray:
-    """(c, n) level, tilt and the departure from a Gaussian where there is one."""
-    columns = linear_columns(target.window.cells, tilt=target.scene.tilt)
-    departure = target.problem.departure
-    return columns if departure is None else np.concatenate([columns, departure])
 
 
 class _Precision:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from itertools import pairwise
+from itertools import pairwise, product
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -211,9 +211,7 @@ class PlanReport(Record, kw_only=True):
 
 def designs(patients: Sequence[int], maps: Sequence[int], **assumptions: Any) -> Iterator[PlanCase]:
     """All combinations of numbers of patients and numbers of maps."""
-    for n in patients:
-        for m in maps:
-            yield PlanCase(patients=n, maps=m, **assumptions)
+    return (PlanCase(patients=n, maps=m, **assumptions) for n, m in product(patients, maps))
 
 
 def run_case(case: PlanCase) -> Design:

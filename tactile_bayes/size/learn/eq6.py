@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 
 import numpy as np
 from scipy.special import ndtri, stdtrit
@@ -147,18 +148,14 @@ def _mode(data: AxisRows) -> tuple[AxisRows, FloatArray, FloatArray]:
     if data.width_change is None or np.isfinite(data.width_change).sum() < 4:
         data = AxisRows(data.d_mm, data.amplitude, data.sigma_mm, None)
         scale, start = scale[:5], start[:5]
-    mode, covariance, _ = mode_and_covariance(lambda theta: _log_density(theta, data), start, scale=scale)
+    mode, covariance, _ = mode_and_covariance(partial(_log_density, data=data), start, scale=scale)
     return data, mode, covariance
 
 
 def _learn_axis(data: AxisRows, *, rng: np.random.Generator, progress: Progress | None) -> AxisCalibration:
     data, mode, covariance = _mode(data)
-
-    def log_density(theta: FloatArray) -> FloatArray:
-        return _log_density(theta, data)
-
-    options = EnsembleOptions(keep=DRAWS_KEPT, max_steps=20_000, block=300)
-    draws = ensemble(log_density, mode, covariance, rng=rng, options=options, progress=progress)
+    options, density = EnsembleOptions(keep=DRAWS_KEPT, max_steps=20_000, block=300), partial(_log_density, data=data)
+    draws = ensemble(density, mode, covariance, rng=rng, options=options, progress=progress)
     axis = data.calibration(_coefficients(draws.flat, data))
     told = {name: draws.diagnostics[name] for name in ("rhat", "ess_tail")}
     return replace(axis, fit={**agreement(axis, data), "e_identified": float(data.width_change is not None), **told})
