@@ -153,7 +153,8 @@ def report(folder: Path) -> None:
     two = [row for row in found if row["kind"] in ("two", "near")]
     beside = list(others(found))
     print(f"exams with two lumps: {len(two)}, one of them listed in {len(beside)}")
-    print(f"the other one listed too: {share(sum(row['listed'] for row in beside), len(beside))}")
+    both = sum(row["listed"] for row in beside)
+    print(f"the other one listed too: {share(both, len(beside))}; of all {share(both, len(two))}")
     for name, (value, edges) in BINS.items():
         for low, high in pairwise(edges):
             these = [row for row in beside if low <= value(row) < high]

@@ -159,7 +159,7 @@ def found_on(tactile_map: TactileMap, rng: np.random.Generator) -> set[str]:
     """Names of `COLUMNS` that the report of one map would have."""
     options = SamplerSettings(method="laplace", background="free", fit_radius_mm=RADIUS_MM, noise="field", draws=1000)
     answer = estimate_map(tactile_map, calibration=None, options=options, rng=rng)
-    others = {"another rise"} if other_rises(tactile_map, answer, options) else set()
+    others = {"another rise"} if any(other_rises(tactile_map, answer, options)) else set()
     if answer.scene is None:
         return others
     found = {"lump"} | others | {one.name for one in answer.scene.structures if one.supported}

@@ -225,7 +225,7 @@ class PassedOver(Record, forbid_unknown_fields=False):
 
 
 class OtherRise(Record):
-    """Another rise that is a lump by the evidence; mm on the map."""
+    """A mass besides the reported one, as a rise; mm on the map."""
 
     x_mm: float
     y_mm: float
@@ -352,7 +352,7 @@ class EstimateReport(Report, kw_only=True):
     diagnostics: dict[str, Any]
     candidates: tuple[PassedOver, ...]
     other_rises: tuple[OtherRise, ...] = ()
-    """Other rises that are lumps by the evidence, highest first; mm on the map."""
+    """The masses besides the reported one, as rises; mm on the map."""
     masses: tuple[MassReport, ...]
     """All masses of the map, the surest first. The top-level fields are those of the reported one: the surest, or that
     of the place that was given.

@@ -20,10 +20,10 @@ from tactile_bayes.posterior.bump import (
 )
 from tactile_bayes.posterior.detection import Detection
 from tactile_bayes.posterior.draw import MapPosterior, ModalBump, SamplerSettings
-from tactile_bayes.posterior.estimate import best_chance, search
+from tactile_bayes.posterior.estimate import Assessment, best_chance, search
 from tactile_bayes.posterior.neighbours import LEAST_RISE
 from tactile_bayes.posterior.result import Estimate, Mass, Rise
-from tactile_bayes.posterior.verdict import BEYOND_IT, LIKELY, weigh
+from tactile_bayes.posterior.verdict import BEYOND_IT, LIKELY, MORE_LINES, MORE_LINES_ON_PAPER, weigh
 from tactile_bayes.posterior.white import AT_RIM, Candidate
 
 # --- Other lumps on the map: their places and probabilities.
@@ -33,11 +33,14 @@ BESIDE_IN_WIDTHS = 2.0
 CLOSE_IN_WIDTHS, LEAST_RISE_CLOSE = 2.5, 0.1
 FAR_IN_WIDTHS, LEAST_RISE_FAR = 4.0, 0.02
 """Nearer or farther than so many widths a rise needs this share of the lump's amplitude."""
-LEAST_RISE_AT_RIM = 0.5
+LEAST_RISE_AT_RIM = 0.3
 """Share of the lump's amplitude, for a rise that the map covers too poorly: the ends of strokes make small ones."""
 MOST_NAMED, MOST_LOOKS = 4, 3
 """Rises that are named, and places that turn out to be none before the search ends: each look costs some 50 ms."""
 LEAST_PROBABILITY = 0.95
+LEAST_BESIDE = 0.05
+"""From this probability on a rise beside a measured lump is listed without a size, if its shape is `LIKELY` a lump's
+and it has `LEAST_SHARE` of the lump's amplitude."""
 WELL_READ = 0.5
 """Share of the median count from which on a cell is read well."""
 LEAST_STANDING, STANDING_MM = 0.35, 2.5
@@ -45,32 +48,43 @@ LEAST_STANDING, STANDING_MM = 0.35, 2.5
 falls towards the rim on two sides is like a bump's flanks, and no lump."""
 
 
-def other_rises(tactile_map: TactileMap, estimate: Estimate, options: SamplerSettings) -> tuple[Rise, ...]:
-    """Find rises that are lumps by the evidence once the measured lump is subtracted, the highest first.
+def other_rises(
+    tactile_map: TactileMap, estimate: Estimate, options: SamplerSettings
+) -> tuple[tuple[Rise, ...], tuple[Rise, ...]]:
+    """Find rises that are lumps by the evidence once the measured lump is subtracted, and likely ones hardly shown.
 
-    A structure that the lump's own scene holds (a second lump, a rib) is named there. Where there is no lump the whole
-    map has been searched, unless a place was given: then the rest of the map is searched here.
+    The highest come first, of those hardly shown the surest. A structure that the lump's own scene holds (a second
+    lump, a rib) is named there. Where there is no lump the whole map has been searched, unless a place was given: then
+    the rest of the map is searched here.
     """
     if estimate.bump is None and options.centre_mm is None:
-        return ()
-    rises: list[Rise] = []
-    for rest in _rests(tactile_map, estimate):
+        return (), ()
+    shown: list[Rise] = []
+    hardly: list[Rise] = []
+    whole, *well_read = _rests(tactile_map, estimate)
+    for rest, to_rim in [(whole, False), *((one, far) for far in (False, True) for one in well_read)]:
         misses = 0
-        for centre in _places(rest, estimate):
-            if misses == MOST_LOOKS or len(rises) == MOST_NAMED:
+        for centre in _places(rest, estimate, to_rim=to_rim):
+            if misses == MOST_LOOKS or len(shown) == MOST_NAMED:
                 break
-            if _named(*centre, rises):
+            if _named(*centre, shown):
                 continue
-            rise = _rise_at(centre, rest, estimate, options)
+            rise, proven = _rise_at(centre, rest, whole, estimate, options)
             # a fit may move to another rise, or back to the measured lump
-            again = rise is not None and (
-                _named(rise.x_mm, rise.y_mm, rises) or not _clear_of_lump(rise.x_mm, rise.y_mm, rest, estimate)
-            )
-            if rise is not None and not again and _stands_out(rise, rest):
-                rises.append(rise)
-            else:
-                misses += 1
-    return tuple(rises)
+            if rise is not None and (
+                _named(rise.x_mm, rise.y_mm, shown)
+                or not _clear_of_lump(rise.x_mm, rise.y_mm, rest, estimate)
+                or not _stands_out(rise, rest)
+            ):
+                rise = None
+            if rise is not None:
+                (shown if proven else hardly).append(rise)
+            misses += rise is None or not proven
+    named = [*shown]
+    for rise in sorted(hardly, key=lambda one: one.probability, reverse=True):
+        if len(named) < MOST_NAMED and not _named(rise.x_mm, rise.y_mm, named):
+            named.append(rise)
+    return tuple(shown), tuple(named[len(shown) :])
 
 
 def _named(x_mm: float, y_mm: float, rises: Sequence[Rise]) -> bool:
@@ -79,16 +93,27 @@ def _named(x_mm: float, y_mm: float, rises: Sequence[Rise]) -> bool:
 
 
 def _rise_at(
-    centre_mm: tuple[float, float], rest: TactileMap, estimate: Estimate, options: SamplerSettings
-) -> Rise | None:
-    """A rise of a place that is a lump by the evidence."""
+    centre_mm: tuple[float, float], rest: TactileMap, whole: TactileMap, estimate: Estimate, options: SamplerSettings
+) -> tuple[Rise | None, bool]:
+    """A rise of a place that is a lump by the evidence, or is likely one; and whether it is one by the evidence."""
     given = replace(options, centre_mm=centre_mm, start_width_mm=None, scene="auto")
     candidates, seen = search(rest, given)
     if seen is None:
-        return _at_rim(rest, candidates, given, estimate)
-    if seen.detection.probability < LEAST_PROBABILITY:
-        return None
-    return _rise(seen.bump(), seen.detection.probability, None if estimate.map_posterior is None else estimate)
+        return _at_rim(rest, whole, candidates, given, estimate)
+    detection = seen.detection
+    proven = detection.probability >= LEAST_PROBABILITY
+    if not proven and not _may_be_lump(seen, rest, estimate):
+        return None, False
+    return _rise(seen.bump(), detection.probability, None if estimate.map_posterior is None else estimate), proven
+
+
+def _may_be_lump(seen: Assessment, rest: TactileMap, estimate: Estimate) -> bool:
+    """True for a rise without the evidence of a lump that is likely one all the same, beside a measured lump."""
+    if estimate.map_posterior is None or seen.detection.probability < LEAST_BESIDE:
+        return False
+    bump = seen.bump()
+    high = bump.amplitude >= LEAST_SHARE * _medians(estimate.map_posterior).amplitude
+    return high and weigh(rest, seen.detection, bump).chance >= LIKELY
 
 
 def _rests(tactile_map: TactileMap, estimate: Estimate) -> Iterator[TactileMap]:
@@ -137,17 +162,21 @@ def _rise(bump: ModalBump, probability: float, estimate: Estimate | None) -> Ris
     return Rise(**as_dict(bump), distance_mm=away, probability=probability)
 
 
-def _places(rest: TactileMap, estimate: Estimate) -> Iterator[tuple[float, float]]:
-    """Local maxima above a share of the lump's amplitude, clear of it and of the map's rim, highest first."""
+def _places(rest: TactileMap, estimate: Estimate, *, to_rim: bool) -> Iterator[tuple[float, float]]:
+    """Local maxima clear of the lump, above a share of its amplitude, highest first: inside the map, or at its rim."""
     found_on, lump = levelled(rest), _lump(estimate)
     height = smoothed_excess(found_on)
-    for x, y in candidate_centres(found_on, rim_limit=0):
+    centres = candidate_centres(found_on, rim_limit=0)
+    if to_rim:
+        centres = [one for one in candidate_centres(found_on) if one not in centres]
+    for x, y in centres:
         row, column = (int(np.argmin(np.abs(axis - at))) for axis, at in ((rest.y_mm, y), (rest.x_mm, x)))
         least = 0.0
         if lump is not None:  # a lower rise may be what the subtracted lump left of itself, less of it farther away
             away = np.hypot(x - lump.x_mm, y - lump.y_mm) / max(lump.sigma_x_mm, lump.sigma_y_mm)
             share = LEAST_RISE_CLOSE if away < CLOSE_IN_WIDTHS else LEAST_RISE
-            least = (LEAST_RISE_FAR if away > FAR_IN_WIDTHS else share) * lump.amplitude
+            share = LEAST_RISE_FAR if away > FAR_IN_WIDTHS else share
+            least = (LEAST_RISE_AT_RIM if to_rim else share) * lump.amplitude
         if height[row, column] > least and _clear_of_lump(x, y, rest, estimate):
             yield x, y
 
@@ -177,18 +206,28 @@ def _second_lump(estimate: Estimate) -> ModalBump | None:
 
 
 def _at_rim(
-    rest: TactileMap, candidates: tuple[Candidate, ...], options: SamplerSettings, estimate: Estimate
-) -> Rise | None:
-    """A rise that is a lump by the evidence and that the map covers too poorly to measure; None where there is none."""
+    rest: TactileMap,
+    whole: TactileMap,
+    candidates: tuple[Candidate, ...],
+    options: SamplerSettings,
+    estimate: Estimate,
+) -> tuple[Rise | None, bool]:
+    """A rise that is a lump by the evidence and that the map covers too poorly to measure; None where there is none.
+
+    At the end of the well-read part the whole map shows how far the rise is covered.
+    """
     if not candidates or candidates[0].fit is None or not candidates[0].fault.startswith(AT_RIM):
-        return None
+        return None, False
     bump, lump = candidates[0].fit.modal(), _lump(estimate)
     if bump.amplitude <= (0.0 if lump is None else LEAST_RISE_AT_RIM * lump.amplitude):
-        return None
+        return None, False
     chance = best_chance(rest, candidates, options)
-    if chance is None or chance.detection.probability < LEAST_PROBABILITY or chance.probability < LIKELY:
-        return None
-    return _rise(bump, chance.detection.probability, None)
+    if chance is None or chance.detection.probability < LEAST_PROBABILITY:
+        return None, False
+    proven = chance.probability >= LIKELY
+    if not proven and (rest is whole or weigh(whole, chance.detection, bump).probability < LIKELY):
+        return None, False
+    return _rise(bump, chance.detection.probability, None), proven
 
 
 def _stands_out(rise: Rise, rest: TactileMap) -> bool:
@@ -234,15 +273,17 @@ def with_masses(tactile_map: TactileMap, first: Estimate, options: SamplerSettin
     # what is known of a lump is of the first, and so is a checkpoint
     known = {name: value for name, value in options.size_priors.known.items() if name not in OF_A_LUMP}
     others = replace(options, scene="auto", store=None, size_priors=replace(options.size_priors, known=known))
-    rises = [*other_rises(tactile_map, first, options)]
-    for rise in [*_second_lump_of_scene(tactile_map, first), *rises]:
+    shown, hardly = other_rises(tactile_map, first, options)
+    for rise in [*_second_lump_of_scene(tactile_map, first), *shown]:
         mass = _sized_at(tactile_map, rise, first, others, estimator)
-        if mass is None and rise not in rises:
+        if mass is None and rise not in shown:
             why = "the map shows it beside the first lump only, not by itself"
             unresolved = Estimate("no_estimate", why, code="unresolved", advice=BOTH, on_paper=BOTH, bump=rise)
             mass = Mass(rise.x_mm, rise.y_mm, rise.probability, unresolved)
         if mass is not None and all(_apart(mass, one) for one in sized):
             sized.append(mass)
+    unsized = [_hardly_shown(rise) for rise in hardly]
+    sized += [mass for mass in unsized if all(_apart(mass, one) for one in sized)]
     sized = by_evidence(sized)
     kept = options.centre_mm is not None or bool(set(OF_A_LUMP) & set(options.size_priors.known))
     reported = first if kept or not sized else sized[0].estimate
@@ -328,10 +369,13 @@ def _sized_at(
     given = replace(options, centre_mm=(rise.x_mm, rise.y_mm), start_width_mm=None)
     estimate = _estimated(tactile_map, given, estimator)
     if first.map_posterior is not None and not _same_lump(estimate, rise, first):
+        on_rests: list[Estimate] = []
         for rest in _rests(tactile_map, first):
-            estimate = _estimated(rest, given, estimator)
-            if _same_lump(estimate, rise, first):
+            on_rests.append(_estimated(rest, given, estimator))
+            if _same_lump(on_rests[-1], rise, first):
                 break
+        # a part of the map that hides a lump does not outvote the whole that shows one
+        estimate = max(on_rests, key=lambda one: (_same_lump(one, rise, first), one.code not in NO_LUMP))
         if estimate.size is not None and _amplitude(estimate) < LEAST_SHARE * _amplitude(first):
             times = f"{1 / LEAST_SHARE:.0f} times as high"
             estimate = _not_told_apart(
@@ -344,6 +388,13 @@ def _sized_at(
     if estimate.status == "estimate":
         estimate = _not_told_apart(estimate, "its fit moves to the lump beside it: the map does not tell them apart")
     return Mass(rise.x_mm, rise.y_mm, rise.probability, replace(estimate, bump=rise))
+
+
+def _hardly_shown(rise: Rise) -> Mass:
+    """The mass of a rise that is likely a lump, of which the map shows too little for a size."""
+    why = "the map shows too little of it for a size"
+    estimate = Estimate("no_estimate", why, code="prior", advice=MORE_LINES, on_paper=MORE_LINES_ON_PAPER, bump=rise)
+    return Mass(rise.x_mm, rise.y_mm, rise.probability, estimate)
 
 
 def _not_told_apart(estimate: Estimate, reason: str) -> Estimate:
@@ -373,4 +424,4 @@ def _calibrated(tactile_map: TactileMap, mass: Mass) -> float:
     if mass.estimate.probability is not None:
         return mass.estimate.probability
     odds = Detection(mass.probability, float(np.log(mass.probability) - np.log1p(-min(mass.probability, 1.0 - 1e-16))))
-    return weigh(tactile_map, odds, bump).probability
+    return weigh(tactile_map, odds, bump).chance

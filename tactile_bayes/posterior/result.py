@@ -108,7 +108,7 @@ class Estimate(Record, eq=False):
     scene: SceneChoice | None = None  #: Under a noise field: what the window holds, and what was asked about it.
     sensitivity: Sensitivity | None = None  #: How far the answer leans on the prior of the widths.
     other_rises: tuple[Rise, ...] = ()
-    """Other rises that are lumps by the evidence, see `masses.other_rises`; empty where nobody has looked."""
+    """The masses besides the reported one, as rises; empty where nobody has looked."""
     bump: ModalBump | None = None
     """The bump at the mode of the lump that the answer is about, sized or not; None where there is no lump."""
     masses: tuple[Mass, ...] = ()  #: All masses of the map, see `masses.with_masses`; empty where nobody has looked.

@@ -54,15 +54,19 @@ class Weighed(Record, eq=False):
         return exp(self.features[1])
 
     @property
-    def probability(self) -> float:
-        """Probability of a lump, where half of the exams hold one.
+    def chance(self) -> float:
+        """Probability of a lump, where half of the exams hold one, with or without the evidence for a size.
 
         The evidence of a bump is against smooth errors. Rims, ridges, ribs, creases and uneven fat rise, too; they are
         told by the other features.
         """
         score = COEFFICIENTS[0] + float(np.dot(COEFFICIENTS[1:], self.features))
-        most = ENDS[1] if self.detection.probability >= DETECTED else UNPROVEN
-        return float(np.clip(1.0 / (1.0 + exp(-score)), ENDS[0], most))
+        return float(np.clip(1.0 / (1.0 + exp(-score)), *ENDS))
+
+    @property
+    def probability(self) -> float:
+        """The `chance`; at most `UNPROVEN` without the evidence."""
+        return self.chance if self.detection.probability >= DETECTED else min(self.chance, UNPROVEN)
 
 
 def weigh(

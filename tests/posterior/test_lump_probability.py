@@ -61,3 +61,4 @@ def test_without_the_evidence_for_a_size_it_is_never_told_as_a_lump() -> None:
     """The control: with it the same rise is."""
     assert max(weighed(log_bayes_factor=value).probability for value in (-np.inf, -3.0, 0.0, 2.9)) < LIKELY
     assert weighed(log_bayes_factor=3.0).probability > LIKELY
+    assert weighed(log_bayes_factor=0.0).chance > LIKELY  # as a rise beside a measured lump is told

@@ -30,6 +30,7 @@ from tactile_bayes.posterior.draw import ModalBump, SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.masses import by_evidence, with_masses
 from tactile_bayes.posterior.result import Estimate, Mass, Rise
+from tactile_bayes.posterior.verdict import LIKELY
 from tactile_bayes.size.draws import SizePosterior
 
 WIDE, NARROW = (-17.0, 2.0), (16.0, 2.0)
@@ -136,6 +137,20 @@ def test_a_second_lump_in_the_window_is_listed_and_sized() -> None:
     assert masses[1].largest_mm == pytest.approx(alone.largest_mm, rel=0.25)
 
 
+def test_a_rise_that_the_map_hardly_shows_is_listed_last_and_without_a_size() -> None:
+    rng = np.random.default_rng(1)
+    values = bump_values(half_mm=35.0, x=-18.0, y=2.0, sigma_x=4.5, sigma_y=4.5, amplitude=0.5)
+    noise = 0.02 * correlated_field(rng, len(values), length_cells=5.0) + 0.005 * rng.standard_normal(values.shape)
+    other = bump_values(half_mm=35.0, x=15.0, y=2.0, sigma_x=6.0, sigma_y=6.0, amplitude=0.12, level=0.0)
+    estimate = found_on(grid_map(values + other + noise, normalise="gain")).estimate
+    lump, low = estimate.masses
+    assert lump.reported
+    assert (low.largest_mm, low.estimate.code, low.reported) == (None, "prior", False)
+    assert LIKELY <= low.probability < lump.probability
+    # the control: the errors alone bring none
+    assert len(found_on(grid_map(values + noise, normalise="gain")).estimate.masses) == 1
+
+
 def narrow_bumps(*, second: float, seed: int = 1) -> TactileMap:
     """A narrow bump, and another 5.5 mm from it: less than two widths of what smooths the map for the search."""
     rng = np.random.default_rng(seed)
@@ -214,6 +229,15 @@ def test_a_mass_that_the_whole_map_does_not_show_has_the_size_of_the_map_less_th
     assert masses[1].estimate.map_posterior is not None
     # the control: what neither shows is not listed
     assert places(with_masses(two, first, options, lambda *_: unseen).masses) == [WIDE]
+
+    uneven = replace(two, count=np.where(two.y_mm[:, None] < -30.0, 8, two.count))
+
+    def on_all_of_the_rest(a_map: TactileMap, _: SamplerSettings) -> Estimate:
+        whole = a_map is not uneven and bool(a_map.covered.all())
+        return Estimate("no_estimate", "too narrow", code="unresolved") if whole else unseen
+
+    masses = with_masses(uneven, found_on(uneven).estimate, options, on_all_of_the_rest).masses
+    assert [one.estimate.code for one in masses] == ["", "unresolved"]
 
 
 @pytest.mark.long
@@ -314,7 +338,7 @@ def test_a_second_lump_whose_centre_lies_off_the_map_does_not_end_the_estimate()
 
 
 def test_a_rise_whose_centre_lies_off_the_map_is_a_mass_without_a_size(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(masses_module, "other_rises", lambda *_: (Rise(0.2, 0.0, 31.0, 4.0, 4.0, None, 0.99),))
+    monkeypatch.setattr(masses_module, "other_rises", lambda *_: ((Rise(0.2, 0.0, 31.0, 4.0, 4.0, None, 0.99),), ()))
     masses = found_on(at_the_rim()).estimate.masses
     assert places(masses) == [(0, 8), (0, 31)]
     assert masses[1].estimate.code == "window"

@@ -36,12 +36,13 @@ def errors(seed: int) -> np.ndarray:
 
 
 def looked(
-    mean: np.ndarray, centre: tuple[float, float] | None = None, *, count: np.ndarray | int = 40
+    mean: np.ndarray, centre: tuple[float, float] | None = None, *, count: np.ndarray | int = 40, hardly: bool = False
 ) -> tuple[Estimate, tuple[Rise, ...]]:
+    """What was measured, and the rises that are lumps by the evidence, or those that the map hardly shows."""
     options = SamplerSettings(method="laplace", draws=400, background="free", centre_mm=centre, noise="field")
     tactile_map = grid_map(mean, count=count)
     found = estimate_map(tactile_map, calibration=None, options=options, rng=np.random.default_rng(1))
-    return found, other_rises(tactile_map, found, options)
+    return found, other_rises(tactile_map, found, options)[int(hardly)]
 
 
 def test_another_lump_far_away_is_named_where_it_stands() -> None:
@@ -95,6 +96,43 @@ def test_a_lump_beside_a_rim_that_was_read_seldom_is_named() -> None:
     assert named(0.1, 40) == []
 
 
+def test_a_low_rise_beside_a_lump_is_hardly_shown() -> None:
+    """Errors with a length of 5 mm explain it nearly as well."""
+    rng = np.random.default_rng(1)
+    noise = 0.02 * correlated_field(rng, 71, length_cells=5.0) + 0.005 * rng.standard_normal((71, 71))
+
+    def listed(lump: float, second: float, *, hardly: bool = True) -> list[tuple[int, int]]:
+        first = bump_values(half_mm=HALF_MM, x=-18.0, y=2.0, sigma_x=4.5, sigma_y=4.5, amplitude=lump)
+        other = bump_values(half_mm=HALF_MM, x=15.0, y=2.0, sigma_x=6.0, sigma_y=6.0, amplitude=second, level=0.0)
+        _, rises = looked(first + other + noise, hardly=hardly)
+        return [(round(rise.x_mm), round(rise.y_mm)) for rise in rises]
+
+    assert listed(0.5, 0.12) == [(14, 4)]
+    assert listed(0.5, 0.12, hardly=False) == []
+    # the controls: the errors alone, with more evidence, beside a lump 8 times as high, and beside none
+    assert listed(0.5, 0.0) == []
+    assert (listed(0.5, 0.15), len(listed(0.5, 0.15, hardly=False))) == ([], 1)
+    assert listed(0.9, 0.12) == []
+    assert listed(0.0, 0.12) == []
+
+
+def test_a_lump_that_goes_on_into_a_rim_that_was_read_seldom_is_hardly_shown() -> None:
+    rng, rim = np.random.default_rng(1), np.arange(-HALF_MM, HALF_MM + 1.0)[:, None] < -20.0
+    first = bump_values(half_mm=HALF_MM, x=-18.0, y=8.0, sigma_x=4.5, sigma_y=4.5, amplitude=0.3)
+    uneven = np.where(rim, 0.2 * correlated_field(np.random.default_rng(2), 71, length_cells=4.0), 0.0)
+    noise = 0.005 * correlated_field(rng, 71, length_cells=3.0) + 0.005 * rng.standard_normal((71, 71))
+
+    def listed(second: float) -> list[tuple[int, int]]:
+        other = bump_values(half_mm=HALF_MM, x=12.0, y=-25.0, sigma_x=6.0, sigma_y=6.0, amplitude=second, level=0.0)
+        _, rises = looked(
+            first + other + uneven + noise, count=np.where(rim & np.ones(71, dtype=bool), 8, 40), hardly=True
+        )
+        return [(round(rise.x_mm), round(rise.y_mm)) for rise in rises]
+
+    assert listed(0.25) == [(12, -25)]
+    assert listed(0.0) == []
+
+
 def test_at_a_place_that_was_given_the_rest_of_the_map_is_named() -> None:
     found, rises = looked(values(second=0.1), SMALL)
     assert found.status == "estimate"
@@ -138,7 +176,7 @@ def test_a_place_without_a_mode_is_no_rise(monkeypatch: pytest.MonkeyPatch) -> N
         raise NotConvergedError("no mode")
 
     monkeypatch.setattr("tactile_bayes.posterior.correlated.fit_and_test", no_mode)
-    assert other_rises(tactile_map, found, options) == ()
+    assert other_rises(tactile_map, found, options) == ((), ())
 
 
 @pytest.fixture(scope="module")
