@@ -8,7 +8,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Final, Protocol
 
 import numpy as np
 
@@ -166,6 +166,29 @@ _TICK_S: Final = 0.05
 _TRACKER_BYTES: Final = 32768
 
 
+class Sink(Protocol):
+    """Interface of a recording's destination; `files` has the one for scan files."""
+
+    def add_frame(self, counts: readings.CountArray, *, device_ns: int, host_ns: int) -> None: ...
+    def add_pose(
+        self, position_mm: FloatArray, quaternion_wxyz: FloatArray, *, device_ns: int, host_ns: int
+    ) -> None: ...
+    def add_landmark(self, name: str, position_mm: FloatArray, *, device_ns: int, host_ns: int) -> None: ...
+    def add_note(self, text: str, *, device: str, device_ns: int, host_ns: int, serious: bool = False) -> None: ...
+
+    def flush(self) -> None:
+        """Store what was added so far, so that it survives the end of this process."""
+
+
+class Observer(Protocol):
+    """Interface of a recording's spectator, which must never wait; it is told the account several times a second."""
+
+    def landmark(self, name: str, position_mm: FloatArray) -> None: ...
+    def frame(self, counts: readings.CountArray, device_ns: int) -> None: ...
+    def pose(self, pose: readings.PoseReading, device_ns: int) -> None: ...
+    def told(self, report: Report) -> None: ...
+
+
 @dataclass(slots=True)
 class Line:
     """A device in use: port, reading process, parser, and commands to start and stop it."""
@@ -184,9 +207,7 @@ class Line:
 class Recorder:
     """Runs one recording of devices that were checked and do not stream yet; without a tracker it has no poses.
 
-    The sink, a `files.scan_mcap.RecordingWriter`, gets everything in order of arrival, of the tracker's tools the one
-    that `follower` follows. The observer, a `live.Feed`, never waits, and is told the account several times a second.
-    `duration_s`
+    The sink gets everything in order of arrival, of the tracker's tools the one that `follower` follows. `duration_s`
     is by the head's clock made continuous, and at most `OVERTIME_S` longer by the host's; None goes on until it is
     stopped. The head promised `rate_hz`, or nothing when that is 0. `clock_ns` is the host time that the reading
     processes stamp with.
@@ -196,13 +217,13 @@ class Recorder:
         self,
         head: Line,
         tracker: Line | None,
-        sink: Any,
+        sink: Sink,
         *,
         shared_clock: bool = False,
         follower: readings.Follower | None = None,
         duration_s: float | None = None,
         rate_hz: float = 0.0,
-        observer: Any = None,
+        observer: Observer | None = None,
         clock_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         self.report = Report()

@@ -34,7 +34,7 @@ def read_all(stream: Stream, size: int) -> bytes:
     found = b""
     while len(found) < size:
         assert select.select([stream], [], [], 10.0)[0], f"{len(found)} of {size} bytes came"
-        found += b"".join(piece.data for piece in stream.read())
+        found += b"".join(data for _, data in stream.read())
         if stream.ended:
             break
     return found
@@ -64,9 +64,9 @@ def test_a_reader_hands_over_what_it_reads_in_order_with_rising_times(line):
         os.write(ours, data)
     while len(found) < 35_000:
         assert select.select([stream], [], [], 10.0)[0]
-        for piece in stream.read():
-            stamps.append(piece.host_ns)
-            found += piece.data
+        for host_ns, data in stream.read():
+            stamps.append(host_ns)
+            found += data
     assert found == b"".join(sent)
     assert stamps == sorted(stamps)
     os.close(ours)
@@ -115,7 +115,7 @@ def test_a_full_pipe_loses_whole_records_and_counts_them(line):
     time.sleep(0.2)
     kept = 0
     while select.select([stream], [], [], 0.3)[0]:
-        kept += sum(len(piece.data) for piece in stream.read())
+        kept += sum(len(data) for _, data in stream.read())
     os.write(ours, b"y")
     kept += len(read_all(stream, 1))
     assert stream.overrun_bytes > 0
