@@ -20,6 +20,7 @@ What is changed, and how it is derived:
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -130,7 +131,7 @@ def stressed_frames(
     way = np.tanh(np.gradient(origin[:, 0], time_s) / _SLOW_MM_S)
     model = _Model.of(scene, physics, level)
     if empty:
-        model = replace(model, stages=[(head, _nothing(lump)) for head, lump in model.stages])
+        model = dataclasses.replace(model, stages=[(head, _nothing(lump)) for head, lump in model.stages])
     pressure = np.empty((len(time_s), scene.head.rows, scene.head.columns))
     depth, before = np.empty(len(time_s)), None
     for i in range(len(time_s)):

@@ -250,14 +250,14 @@ def tables_action(*, seat: str, head: str | None, search: bool, workers: int, as
     nearest = NEAREST_HEADS.get(at)
     heads = list(dict.fromkeys([asked, *([nearest] if nearest else []), *(TRIED_HEADS if search else ())]))
     found, phantoms = run_tables(at, heads=heads, workers=workers)
+    if as_json:
+        click.echo(json.dumps(tables_document(found, phantoms, seat=at), indent=2))
+        return
     beside = found[nearest] if nearest and nearest != asked else None
-    text = tables_text(found[asked], phantoms[asked], head=asked, nearest=nearest, beside=beside)
-    searched = f"\n{heads_text(found)}" if search else ""
-    _tell(tables_document(found, phantoms, seat=at), text + searched, as_json=as_json)
-
-
-def _tell(document: Any, text: str, *, as_json: bool) -> None:
-    click.echo(json.dumps(document, indent=2) if as_json else f"{text}\n{RESEARCH_USE}")
+    click.echo(tables_text(found[asked], phantoms[asked], head=asked, nearest=nearest, beside=beside))
+    if search:
+        click.echo(heads_text(found))
+    click.echo(RESEARCH_USE)
 
 
 def run_tables(seat: float, *, heads: Sequence[Head], workers: int) -> tuple[ByHead, ByHead]:
@@ -281,8 +281,10 @@ def head_uniformity_action(
     body = paper.HomogeneousTissue(**tissue)
     section = SectionOptions(head_radius_mm=head_radius_mm, shoulder_mm=shoulder_mm)
     found, limit = paper.uniformity(_section(section, head), body), body.limit_percent / 100
-    text = uniformity_text(found, body, limit=limit)
-    _tell(uniformity_document(found, body, limit=limit), text, as_json=as_json)
+    if as_json:
+        click.echo(json.dumps(uniformity_document(found, body, limit=limit), indent=2))
+    else:
+        click.echo(f"{uniformity_text(found, body, limit=limit)}\n{RESEARCH_USE}")
 
 
 def head_design_action(*, head: str | None, figure: Path | None, as_json: bool, force: bool, **tissue: Any) -> None:
@@ -292,7 +294,10 @@ def head_design_action(*, head: str | None, figure: Path | None, as_json: bool, 
     found = paper.search_heads(body, kinds=HEADS if head is None else (head,))
     if figure is not None:
         design_figure(found, body, limit=limit, path=figure, force=force)
-    _tell(design_document(found, body, limit=limit), design_text(found, body, limit=limit), as_json=as_json)
+    if as_json:
+        click.echo(json.dumps(design_document(found, body, limit=limit), indent=2))
+    else:
+        click.echo(f"{design_text(found, body, limit=limit)}\n{RESEARCH_USE}")
     if paper.narrowest(found, limit=limit) is None:
         best = paper.most_even(found)
         raise UsageError(
@@ -329,10 +334,13 @@ def compare_model_action(
             found.append(compare_model(measured, body, fidelity=fidelity, head=head, progress=progress))
     if figure is not None:
         comparison_figure(measured, found, figure, title=f"{scan.stem} against {scene.stem}", force=force)
-    for line in () if as_json else finding_lines(scan_findings(loaded)):
+    if as_json:
+        document = comparison_document(measured, found, inputs=hash_inputs(scan=scan, scene=scene))
+        click.echo(dump_json(document), nl=False)
+        return
+    for line in finding_lines(scan_findings(loaded)):
         click.echo(line, err=True)
-    document = comparison_document(measured, found, inputs=hash_inputs(scan=scan, scene=scene))
-    _tell(document, comparison_text(measured, found), as_json=as_json)
+    click.echo(f"{comparison_text(measured, found)}\n{RESEARCH_USE}")
 
 
 def sbc_action(

@@ -7,7 +7,7 @@ import pytest
 from posterior_maps import grid_map
 
 from tactile_bayes.declarations import replace
-from tactile_bayes.posterior import correlated as field_estimate
+from tactile_bayes.posterior import neighbours
 from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.fit import fit_scene
@@ -43,7 +43,7 @@ def test_a_ridge_alone_gets_no_number(seed: int) -> None:
 @pytest.mark.long
 def test_it_would_get_one_if_only_noise_were_asked(monkeypatch: pytest.MonkeyPatch) -> None:
     """The control: on these maps nothing but the ridge's own evidence stands against a number."""
-    monkeypatch.setattr(field_estimate, "ridge_instead", lambda *_: None)
+    monkeypatch.setattr(neighbours, "ridge_instead", lambda *_: None)
     assert [estimate(1.0 + ridge(seed) + errors(seed)).status for seed in (6, 13)] == ["estimate", "estimate"]
 
 
