@@ -96,6 +96,7 @@ def test_a_lump_beside_a_rim_that_was_read_seldom_is_named() -> None:
     assert named(0.1, 40) == []
 
 
+@pytest.mark.long
 def test_a_low_rise_beside_a_lump_is_hardly_shown() -> None:
     """Errors with a length of 5 mm explain it nearly as well."""
     rng = np.random.default_rng(1)

@@ -228,6 +228,7 @@ def mixed(colour: str, share: float, back: str) -> str:
     return "#" + "".join(f"{round(value):02x}" for value in share * top + (1 - share) * under)
 
 
+@pytest.mark.long
 def test_text_and_lines_of_a_trials_figures_have_contrast(pages: dict[str, str]) -> None:
     """Each text against all that was painted before within the figure's own ground; lines and dots against the paper.
 

@@ -252,6 +252,7 @@ def test_a_row_says_that_chains_took_over():
     assert said.count("(by MCMC: importance sampling failed)") == 1
 
 
+@pytest.mark.long
 def test_beside_chains_other_models_are_tried_by_laplace():
     settings = study.settings_of(SamplerSettings(background="free", noise="field"), level_known=True)
     chains, weights = row("--method ensemble").answer, row("--method importance").answer
