@@ -353,13 +353,12 @@ def _still(overlap: _Overlap, check: ArrangementCheck) -> ArrangementCheck:
     stated, stretches = check.stated, int(overlap.block.max()) + 1
     if stated.lasting < MOST_LASTING:
         return check
-    found = overlap.swaying()
-    if found is None:
+    moved = overlap.swaying()
+    if moved is None or moved.sway_mm < LEAST_SWAY_MM or moved.gain_over(stated) < LEAST_SWAY_GAIN:
         return check
-    moved, dragged = found
-    gain = min(moved.gain_over(stated), moved.gain_over(dragged))
+    gain = min(moved.gain_over(stated), moved.gain_over(overlap.dragged()))
     log_odds = stretches * gain - _SWAY_NUMBERS
-    if moved.sway_mm < LEAST_SWAY_MM or gain < LEAST_SWAY_GAIN or log_odds < log(LIKELY_ODDS):
+    if gain < LEAST_SWAY_GAIN or log_odds < log(LIKELY_ODDS):
         return check
     return replace(check, best=moved, log_odds=log_odds, contradicting=False)
 
@@ -443,11 +442,10 @@ class _Overlap(Record, eq=False):
         """Predict each averaged reading by those of other times in its cell of the plane."""
         return self._fitted(corrections)[0]
 
-    def swaying(self) -> tuple[Arrangement, Arrangement] | None:
-        """What is stated, of a body that moves to and fro along its skin at the best rate, and of one that is dragged.
+    def swaying(self) -> Arrangement | None:
+        """What is stated, of a body that moves to and fro along its skin at the best rate.
 
-        What a head feels follows its strokes by up to a fifth of their way, and where strokes are as slow as breaths
-        the body seems to move. None where the first step takes off little.
+        None where the first step takes off little.
         """
         time_s = block_means(self.scan.frames.time_s[self.frames, None], self.coarse[0].first)
         still = self._fitted(())[1:]
@@ -459,9 +457,17 @@ class _Overlap(Record, eq=False):
         for rate in sorted(gains, key=gains.__getitem__)[-_SWAYS_TRIED:]:
             made, sway = self._moving(waves[rate], still)
             found.append(replace(made, sway_mm=2 * float(np.linalg.norm(sway, 2)), sways_a_minute=60 * rate))
+        return min(found, key=lambda one: one.spread)
+
+    def dragged(self) -> Arrangement:
+        """What is stated, of a body that the strokes drag along.
+
+        What a head feels follows its strokes by up to a fifth of their way, and where strokes are as slow as breaths
+        the body seems to move.
+        """
         path = self._places_mm(())[0].mean(axis=1)
         strokes = (path - path.mean(axis=0)) @ principal_axes(path)[:, [-1]]
-        return min(found, key=lambda one: one.spread), self._moving(strokes, still)[0]
+        return self._moving(strokes, self._fitted(())[1:])[0]
 
     def _moving(
         self, course: FloatArray, still: tuple[Cells, FloatArray, FloatArray]

@@ -195,9 +195,9 @@ def test_a_body_that_breathes_is_named_and_a_still_one_is_not():
 def test_what_the_strokes_drag_along_is_no_body_that_moves():
     """Over this lump a body that moves by 8 mm fits better by far; so does one that follows the strokes by a fifth."""
     scan = draw(6, seed=20294303).scan()
-    check, found = checked(scan), overlap(scan).swaying()
-    assert found is not None
-    moved, dragged = found
+    check, given = checked(scan), overlap(scan)
+    moved, dragged = given.swaying(), given.dragged()
+    assert moved is not None
     assert moved.sway_mm > LEAST_SWAY_MM
     assert moved.gain_over(check.stated) > LEAST_SWAY_GAIN
     assert moved.gain_over(dragged) < LEAST_SWAY_GAIN / 2
