@@ -350,16 +350,16 @@ class Sample(Record):
 
     def left_out(self) -> FloatArray:
         """(g,) statistic without each patient."""
-        return self._combined([self._without_each(one, self.patients) for one in self.sizes])
+        return self._combined([self._without_each(one, self.patients) for one in self.sizes], " without one patient")
 
     def redrawn(self, draws: FloatArray) -> FloatArray:
         """(b,) statistic for each row of (b, g) counts of patients; NaN where undefined."""
         return self.combine(*(self._drawn_anew(one, self.patients, draws) for one in self.sizes))
 
-    def _combined(self, values: Sequence[FloatArray]) -> FloatArray:
+    def _combined(self, values: Sequence[FloatArray], where: str = "") -> FloatArray:
         made = self.combine(*values)
         if np.any(np.isnan(made)):
-            raise UndefinedError(self.undefined)
+            raise UndefinedError(self.undefined + where)
         return made
 
     def _without_each(self, sizes: ModalitySizes, patients: npt.NDArray[np.int64]) -> FloatArray:

@@ -14,7 +14,7 @@ from tactile_bayes.files.documents import dump_json
 from tactile_bayes.trial import accuracy
 from tactile_bayes.trial import accuracy as origin_line
 from tactile_bayes.trial import replicates as spread
-from tactile_bayes.trial.accuracy import mape_ratios
+from tactile_bayes.trial.accuracy import mape_ratios, paired_comparisons
 from tactile_bayes.trial.figures import UndefinedError
 from tactile_bayes.trial.readings import ModalitySizes, Reading, Trial
 from tactile_bayes.trial.summary import FAMILIES, TrialReport, modality_report, summarise
@@ -194,6 +194,14 @@ def test_ratio_to_an_error_of_zero_is_undefined() -> None:
     ratio = mape_ratios({"tactile": perfect, "cbe": off}, confidence=0.95)["cbe"]
     assert ratio.ratio is None
     assert ratio.reasons["ratio"] == "the error of tactile is 0"
+
+
+def test_ratio_to_an_error_of_one_patient_alone_says_whose() -> None:
+    """Without that patient the error is 0, with all it is not."""
+    ten = [10.0] * 9
+    sizes = {"tactile": single(ten, [11.0] * 9), "cbe": single(ten, [*[10.0] * 8, 12.0], name="cbe")}
+    (pair,) = paired_comparisons(sizes, confidence=0.95)
+    assert pair.reasons["ratio_interval"] == "the error of cbe is 0 without one patient"
 
 
 def test_without_tactile_there_is_no_ratio() -> None:
