@@ -215,7 +215,8 @@ def _gather_modality(
         name=name,
         patient=np.array([number[patient] for patient, _ in by_mass], dtype=np.int64),
         ex_vivo_mm=np.array([ex_vivo_mm[key] for key in by_mass], dtype=np.float64),
-        size_mm=np.array([sizes.mean() if len(sizes) else 0.0 for sizes in replicates], dtype=np.float64),
+        # equal readings have their own value for a mean, to the last bit: rounding would be an error beside excision
+        size_mm=np.array([np.clip(one.mean(), one.min(), one.max()) if len(one) else 0.0 for one in replicates]),
         replicates_mm=replicates,
         readings=len(done),
         masses_not_done=len(seen) - len(by_mass),

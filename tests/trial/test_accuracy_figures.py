@@ -196,6 +196,15 @@ def test_ratio_to_an_error_of_zero_is_undefined() -> None:
     assert ratio.reasons["ratio"] == "the error of tactile is 0"
 
 
+def test_equal_readings_of_the_true_size_have_no_error() -> None:
+    """The sum of three equal readings, divided by three, may differ from them in the last bit."""
+    key = ("P1", "1")
+    for size in np.arange(10.1, 30, 0.1).tolist():
+        readings = [Reading(key, "tactile", k, "detected", size) for k in range(1, 8)]
+        off = [Reading(key, "cbe", 1, "detected", 2 * size)]
+        assert summarise(Trial([*readings, *off], {key: size})).mape_ratio_to_tactile["cbe"].ratio is None
+
+
 def test_ratio_to_an_error_of_one_patient_alone_says_whose() -> None:
     """Without that patient the error is 0, with all it is not."""
     ten = [10.0] * 9
