@@ -38,7 +38,7 @@ Run = Callable[..., "subprocess.CompletedProcess[str]"]
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Options by which a part of the slow tests is run, another one each time."""
+    """Options by which a part of the long or slow tests is run, another one each time."""
     parser.addoption("--begin-at", type=int, default=0, metavar="N", help="Begin at a place that N decides.")
     parser.addoption("--budget", type=float, metavar="S", help="Skip tests that would begin after S seconds.")
 
@@ -61,7 +61,7 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
     """Skip what would begin too late."""
     budget = item.config.getoption("--budget")
     if budget is not None and time.monotonic() - STARTED_S > budget:
-        pytest.skip("the time for slow tests is spent")
+        pytest.skip("the time for long tests is spent")
 
 
 @pytest.fixture(scope="session", autouse=True)
