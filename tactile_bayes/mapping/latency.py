@@ -90,12 +90,12 @@ class Cells(Record, eq=False):
 
     @classmethod
     def of(cls, places_mm: Sequence[FloatArray]) -> Cells:
-        place = np.concatenate([one.reshape(-1, 2) for one in places_mm])
-        index = np.floor(place / CELL_MM)
-        offset = place - (index + 0.5) * CELL_MM
-        whole = (index - index.min(axis=0)).astype(np.intp)
-        columns, rows = (whole.max(axis=0) + 1).tolist()
-        return cls(whole[:, 1] * columns + whole[:, 0], offset, (rows, columns))
+        size = np.reshape(CELL_MM, (2, 1))
+        place = np.concatenate([one.reshape(-1, 2) for one in places_mm]).T.copy()
+        index = np.floor(place / size)
+        x, y = (index - index.min(axis=1, keepdims=True)).astype(np.intp)
+        columns, rows = int(x.max()) + 1, int(y.max()) + 1
+        return cls(y * columns + x, (place - (index + 0.5) * size).T, (rows, columns))
 
     def within(self, gradient: FloatArray) -> FloatArray:
         """(n,) rise from the cell's centre to each reading along (n, 2) gradients there."""
@@ -163,6 +163,8 @@ def _by_part(
     parts: Sequence[CoarseFrames], method: Callable[[CoarseFrames, FloatArray], FloatArray], values: FloatArray
 ) -> FloatArray:
     """(n,) values with a method of each scan applied to its own."""
+    if len(parts) == 1:
+        return method(parts[0], values.reshape(parts[0].pressure.shape)).reshape(-1)
     ends = np.cumsum([part.pressure.size for part in parts])[:-1]
     split = zip(parts, np.split(values, ends), strict=True)
     return np.concatenate([method(part, some.reshape(part.pressure.shape)).reshape(-1) for part, some in split])
