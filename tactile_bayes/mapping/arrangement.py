@@ -65,6 +65,8 @@ LEAST_CONTRADICTION: Final = 0.02
 """Frames that explain less than `MOST_EXPLAINED`, with larger errors that last longer, contradict each other."""
 LEAST_LASTING: Final = 0.15
 """Below it there is nothing but noise to compare."""
+_ROUNDING: Final = 1e-12
+"""What varies no more, in readings over their frames' means, does not vary."""
 MOST_FRAMES: Final = 250
 _LEAST_BLOCKS: Final = 8
 _CLOCK_STEPS_MS: Final = (-40, -30, -20, -10, 10, 20, 30, 40)
@@ -389,7 +391,7 @@ _TOO_SHORT: Final = ArrangementCheck(_NOT_JUDGED, _NOT_JUDGED, 0.0, {})
 def _lasting(values: FloatArray) -> float:
     """Correlation of (m, k) values from one averaged frame to the next."""
     square = float(np.sum(values**2))
-    return float(np.sum(values[1:] * values[:-1])) / square if square else 0.0
+    return float(np.sum(values[1:] * values[:-1])) / square if square > _ROUNDING**2 * values.size else 0.0
 
 
 def _moves(course: FloatArray, cells: Cells, values: FloatArray, error: FloatArray) -> tuple[float, FloatArray]:

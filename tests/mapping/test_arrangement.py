@@ -149,6 +149,16 @@ def test_an_empty_breast_says_that_it_shows_nothing():
     assert [one.kind for one in check.findings] == ["arrangement_unknown"]
 
 
+def test_readings_that_differ_by_rounding_alone_say_nothing():
+    scan = lump()
+    alike = np.full_like(scan.frames.counts, 777)
+    gain = np.full(alike.shape[1:], 0.0137)
+    calibration = ElementCalibration(gain, np.full_like(gain, 0.1), scan.element_calibration.saturation_count)
+    found = checked(replace(scan, frames=PressureFrames(scan.frames.time_s, alike), element_calibration=calibration))
+    assert found.says_nothing
+    assert found.best is found.stated
+
+
 def test_a_scan_of_a_second_is_too_short():
     scan = lump()
     short = replace(scan, frames=PressureFrames(scan.frames.time_s[:100], scan.frames.counts[:100]))
