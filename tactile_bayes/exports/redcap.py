@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
-from typing import Final, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Final, Literal, NamedTuple
 
 from tactile_bayes.errors import UsageError
 from tactile_bayes.exports.exam import EstimateFile, Identity, SizedMass, content_uuid
 from tactile_bayes.files.tables import csv_text
+from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.presets import RESEARCH_USE
 
 FORM: Final = "tactile_exam"
@@ -34,72 +35,98 @@ DICTIONARY_HEADER: Final = (
 )
 """The 18 columns of a data dictionary, as a REDCap project downloads its own."""
 _RECORD: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}", re.ASCII)
-_CHOICES: Final = {
-    "tb_status": ("size", "no size", "no lump that can be measured", "the data cannot show one"),
-    "tb_verdict": ("sound", "doubtful", "no answer"),
-    "tb_side": ("left", "right", "phantom"),
-    "tb_posture": ("supine", "oblique", "sitting", "phantom"),
-    "tb_source": ("one map", "several maps of one mass"),
+_STATUSES: Final = {
+    "sized": "size",
+    "not-sized": "no size",
+    "no-lump-shown": "no lump that can be measured",
+    "no-verdict": "the data cannot show one",
 }
-"""Answers of the fields that have some; their codes are 1, 2, 3..."""
-_STATUSES: Final = ("sized", "not-sized", "no-lump-shown", "no-verdict")
-"""Values of `SizedMass.outcome`, in the order of those answers."""
+"""Answers of the status, by the value of `SizedMass.outcome`."""
+COMPLETE: Final = f"{FORM}_complete"
+"""The form's own status, which REDCap adds to every form: 0 incomplete, 1 unverified, 2 complete."""
+
+
+class Row(NamedTuple):
+    """A mass of an estimate, of which a record is made."""
+
+    record_id: str
+    estimate: EstimateFile
+    mass: SizedMass
+    identity: Identity
+
+    def fact(self, name: str) -> str:
+        """What the scans say of the exam; empty where they say nothing."""
+        return self.estimate.facts.get(name, "")
+
+    def of_size(self, which: Literal["largest", "smallest"], part: str) -> float | None:
+        """A part of a size's summary; None without a size."""
+        size: Quantity | None = getattr(self.mass, which)
+        return None if size is None else getattr(size, part)
+
+    def from_xiphoid(self, axis: int) -> float | None:
+        """A coordinate of the lump in the patient's axes; None where it is not known."""
+        return None if self.mass.centre_patient_mm is None else self.mass.centre_patient_mm[axis]
 
 
 class Field(NamedTuple):
-    """One variable of the form: its name, label, and number's range where it is one."""
+    """One variable of the form: its name, label, what a record has there, and number's range where it is one."""
 
     name: str
     label: str
+    value: Callable[[Row], str | float | None]
     note: str = ""
     validation: str = ""
     least: str = ""
     most: str = ""
+    choices: Sequence[str] = ()  #: Answers, of which the value is one, or none; their codes are 1, 2, 3...
 
 
 _MM: Final = ("mm", "number", "0", "500")
+_FROM_XIPHOID: Final = ("mm", "number", "-500", "500")
+_SHARE: Final = ("", "number", "0", "1")
+_SOURCES: Final = ("one map", "several maps of one mass")
+_VERDICTS: Final = ("sound", "doubtful", "no answer")
+_POSTURES: Final = ("supine", "oblique", "sitting", "phantom")
 FIELDS: Final = (
-    Field("record_id", "Record ID"),
-    Field("tb_status", "Outcome"),
-    Field("tb_reason", "Why there is no size"),
-    Field("tb_exam_date", "Date of the exam", "", "date_ymd"),
-    Field("tb_side", "Breast"),
-    Field("tb_posture", "Posture"),
-    Field("tb_visit", "Visit (code)"),
-    Field("tb_mass", "Mass (code)"),
-    Field("tb_mass_number", "Mass within the estimate", "", "integer", "1", "99"),
-    Field("tb_examiner", "Examiner (code)"),
-    Field("tb_source", "Estimated from"),
-    Field("tb_maps", "Maps", "", "integer", "0", "999"),
-    Field("tb_max_mm", "Largest size, median", *_MM),
-    Field("tb_max_low_mm", "Largest size, lower end of the interval", *_MM),
-    Field("tb_max_high_mm", "Largest size, upper end of the interval", *_MM),
-    Field("tb_min_mm", "Smallest size, median", *_MM),
-    Field("tb_min_low_mm", "Smallest size, lower end of the interval", *_MM),
-    Field("tb_min_high_mm", "Smallest size, upper end of the interval", *_MM),
-    Field("tb_interval_prob", "Probability of the intervals", "", "number", "0", "1"),
-    Field("tb_lump_prob", "Probability of a lump", "", "number", "0", "1"),
-    Field("tb_right_mm", "Lump from the xiphoid to the patient's right", "mm", "number", "-500", "500"),
-    Field("tb_up_mm", "Lump from the xiphoid to the sternal notch", "mm", "number", "-500", "500"),
-    Field("tb_verdict", "Verdict"),
-    Field("tb_findings", "What speaks against the result"),
-    Field("tb_method", "Method and calibration"),
-    Field("tb_version", "Version of tactile-bayes"),
-    Field("tb_map_sha256", "SHA-256 of the map", "the first of several"),
-    Field("tb_estimate_sha256", "SHA-256 of the estimate"),
-    Field("tb_research_use", "Use", RESEARCH_USE),
+    Field("record_id", "Record ID", lambda r: r.record_id),
+    Field("tb_status", "Outcome", lambda r: _STATUSES[r.mass.outcome.value], choices=tuple(_STATUSES.values())),
+    Field("tb_reason", "Why there is no size", lambda r: r.mass.reason),
+    Field("tb_exam_date", "Date of the exam", lambda r: getattr(r.identity.study, "iso_date", ""), "", "date_ymd"),
+    Field("tb_side", "Breast", lambda r: r.fact("side"), choices=("left", "right", "phantom")),
+    Field("tb_posture", "Posture", lambda r: r.fact("posture"), choices=_POSTURES),
+    Field("tb_visit", "Visit (code)", lambda r: r.fact("visit")),
+    Field("tb_mass", "Mass (code)", lambda r: r.fact("mass")),
+    Field("tb_mass_number", "Mass within the estimate", lambda r: r.mass.number, "", "integer", "1", "99"),
+    Field("tb_examiner", "Examiner (code)", lambda r: r.fact("examiner")),
+    Field("tb_source", "Estimated from", lambda r: _SOURCES[len(r.estimate.maps) > 1], choices=_SOURCES),
+    Field("tb_maps", "Maps", lambda r: len(r.estimate.maps), "", "integer", "0", "999"),
+    Field("tb_max_mm", "Largest size, median", lambda r: r.of_size("largest", "median"), *_MM),
+    Field("tb_max_low_mm", "Largest size, lower end of the interval", lambda r: r.of_size("largest", "low"), *_MM),
+    Field("tb_max_high_mm", "Largest size, upper end of the interval", lambda r: r.of_size("largest", "high"), *_MM),
+    Field("tb_min_mm", "Smallest size, median", lambda r: r.of_size("smallest", "median"), *_MM),
+    Field("tb_min_low_mm", "Smallest size, lower end of the interval", lambda r: r.of_size("smallest", "low"), *_MM),
+    Field("tb_min_high_mm", "Smallest size, upper end of the interval", lambda r: r.of_size("smallest", "high"), *_MM),
+    Field("tb_interval_prob", "Probability of the intervals", lambda r: r.of_size("largest", "probability"), *_SHARE),
+    Field("tb_lump_prob", "Probability of a lump", lambda r: r.mass.probability, *_SHARE),
+    Field("tb_right_mm", "Lump from the xiphoid to the patient's right", lambda r: r.from_xiphoid(0), *_FROM_XIPHOID),
+    Field("tb_up_mm", "Lump from the xiphoid to the sternal notch", lambda r: r.from_xiphoid(1), *_FROM_XIPHOID),
+    Field("tb_verdict", "Verdict", lambda r: r.estimate.report.verdict.replace("_", " "), choices=_VERDICTS),
+    Field("tb_findings", "What speaks against the result", lambda r: " ".join(r.estimate.lines)),
+    Field("tb_method", "Method and calibration", lambda r: r.estimate.method_words),
+    Field("tb_version", "Version of tactile-bayes", lambda r: r.estimate.version),
+    Field("tb_map_sha256", "SHA-256 of the map", lambda r: next(iter(r.estimate.maps), ""), "the first of several"),
+    Field("tb_estimate_sha256", "SHA-256 of the estimate", lambda r: r.estimate.digest),
+    Field("tb_research_use", "Use", lambda _: RESEARCH_USE, RESEARCH_USE),
 )
-COMPLETE: Final = f"{FORM}_complete"
-"""The form's own status, which REDCap adds to every form: 0 incomplete, 1 unverified, 2 complete."""
 
 
 def dictionary_csv() -> str:
     """The data dictionary of the form, for a new project or to append to one."""
     rows = []
-    for name, label, note, validation, least, most in FIELDS:
-        choices = " | ".join(f"{code}, {words}" for code, words in enumerate(_CHOICES.get(name, ()), start=1))
-        kind = "radio" if choices else "notes" if name in ("tb_reason", "tb_findings") else "text"
-        row = [name, FORM, "", kind, label, choices, note, validation, least, most]
+    for one in FIELDS:
+        choices = " | ".join(f"{code}, {words}" for code, words in enumerate(one.choices, start=1))
+        kind = "radio" if choices else "notes" if one.name in ("tb_reason", "tb_findings") else "text"
+        row = [one.name, FORM, "", kind, one.label, choices, one.note, one.validation, one.least, one.most]
         rows.append(row + [""] * (len(DICTIONARY_HEADER) - len(row)))
     return csv_text(DICTIONARY_HEADER, rows)
 
@@ -110,18 +137,17 @@ def records_csv(estimates: Sequence[EstimateFile], identity: Identity, *, id_fro
     `identity`: its `patient_id` begins the record IDs; without one they follow from the estimates' content;
     `id_from_scan`: take the subject codes of the scans for patient IDs.
     """
-    rows, seen = [], dict[str, EstimateFile]()
+    rows = dict[str, Row]()
     for estimate in estimates:
-        for finding in estimate.masses:
-            name = _record_id(estimate, finding, identity, id_from_scan=id_from_scan)
-            if name in seen:
-                both = f"{estimate.path} and {seen[name].path} would both be record {name}"
+        for mass in estimate.masses:
+            name = _record_id(estimate, mass, identity, id_from_scan=id_from_scan)
+            if name in rows:
+                both = f"{estimate.path} and {rows[name].estimate.path} would both be record {name}"
                 way_out = "give a scan's visit and mass in its session, or export them into two files"
                 raise UsageError(f"{both}; {way_out}")
-            seen[name] = estimate
-            rows.append({"record_id": name, COMPLETE: "1"} | _row(estimate, finding, identity))
-    header = [*(one.name for one in FIELDS), COMPLETE]
-    return csv_text(header, ([row.get(name) for name in header] for row in rows))
+            rows[name] = Row(name, estimate, mass, identity)
+    cells = ([*(_cell(one, row) for one in FIELDS), "1"] for row in rows.values())
+    return csv_text([*(one.name for one in FIELDS), COMPLETE], cells)
 
 
 def _record_id(estimate: EstimateFile, finding: SizedMass, identity: Identity, *, id_from_scan: bool) -> str:
@@ -146,48 +172,13 @@ def _record_id(estimate: EstimateFile, finding: SizedMass, identity: Identity, *
     return name
 
 
-def _row(estimate: EstimateFile, finding: SizedMass, identity: Identity) -> dict[str, str]:
-    facts = estimate.facts
-    row = {
-        "tb_status": str(_STATUSES.index(finding.outcome.value) + 1),
-        "tb_reason": finding.reason,
-        "tb_exam_date": identity.study.iso_date if identity.study else "",
-        "tb_side": _choice("tb_side", facts.get("side")),
-        "tb_posture": _choice("tb_posture", facts.get("posture")),
-        "tb_visit": facts.get("visit", ""),
-        "tb_mass": facts.get("mass", ""),
-        "tb_mass_number": str(finding.number),
-        "tb_examiner": facts.get("examiner", ""),
-        "tb_source": "2" if len(estimate.maps) > 1 else "1",
-        "tb_maps": str(len(estimate.maps)),
-        "tb_lump_prob": _number(finding.probability),
-        "tb_verdict": _choice("tb_verdict", estimate.report.verdict.replace("_", " ")),
-        "tb_findings": " ".join(estimate.lines),
-        "tb_method": estimate.method_words,
-        "tb_version": estimate.version,
-        "tb_map_sha256": next(iter(estimate.maps), ""),
-        "tb_estimate_sha256": estimate.digest,
-        "tb_research_use": RESEARCH_USE,
-    }
-    for name, size in (("max", finding.largest), ("min", finding.smallest)):
-        if size is not None:
-            row |= {f"tb_{name}_mm": _number(size.median), "tb_interval_prob": _number(size.probability)}
-            row |= {f"tb_{name}_low_mm": _number(size.low), f"tb_{name}_high_mm": _number(size.high)}
-    if finding.centre_patient_mm is not None:
-        row |= dict(zip(("tb_right_mm", "tb_up_mm"), map(_number, finding.centre_patient_mm), strict=True))
-    return {name: _plain(value) for name, value in row.items()}
-
-
-def _choice(name: str, word: str | None) -> str:
-    return str(_CHOICES[name].index(word) + 1) if word in _CHOICES[name] else ""
-
-
-def _number(value: float | None) -> str:
-    return "" if value is None else f"{value:.9g}" if abs(value) >= 1e-4 else f"{value:.9f}".rstrip("0").rstrip(".")
-
-
-def _plain(text: str) -> str:
-    """A cell in one line that no spreadsheet takes for a formula."""
-    line = " ".join(text.split())
+def _cell(field: Field, row: Row) -> str:
+    """A value as a cell in one line that no spreadsheet takes for a formula; an answer by its code."""
+    value = field.value(row)
+    if field.choices:
+        return str(field.choices.index(value) + 1) if value in field.choices else ""
+    if isinstance(value, float):
+        value = f"{value:.9g}" if abs(value) >= 1e-4 else f"{value:.9f}".rstrip("0").rstrip(".")
+    line = " ".join(str("" if value is None else value).split())
     number = re.fullmatch(r"-[0-9]*\.?[0-9]+(e[+-]?[0-9]+)?", line)
     return f"'{line}" if line[:1] in ("=", "@", "+", "-") and not number else line
