@@ -161,27 +161,27 @@ def _as_typed(command: click.Command, parameters: dict[str, Any]) -> str:
     return shlex.join(words)
 
 
-def _apart(default: StatedSize, paper: StatedSize) -> str:
+def _apart(default: StatedSize | None, paper: StatedSize | None) -> str:
     """How far the paper's road lies from the default, and why one would want either."""
-    if default.size_mm is None or paper.size_mm is None:
+    if default is None or paper is None:
         return "One of the two roads has no size; its reason is above."
-    share = 100 * (paper.size_mm / default.size_mm - 1.0)
+    share = 100 * (paper.median / default.median - 1.0)
     return (
         f"Eq 6 lies {share:+.0f} % from the default here. The default follows the bodies it was learned over more "
         "closely; Eq 6 has four constants, which -v prints for each map and the paper explains."
     )
 
 
-def _summary(truth_mm: float, results: dict[str, StatedSize]) -> str:
+def _summary(truth_mm: float, results: dict[str, StatedSize | None]) -> str:
     """True size and estimates, one per line."""
     lines = [
         f"{'Largest size of the lump':28}{'mm':>9}   95 % interval for exams of simulated bodies",
         f"{'true':28}{truth_mm:>9.1f}",
     ]
     for name, size in results.items():
-        if size.size_mm is None or size.low_mm is None or size.high_mm is None:
+        if size is None:
             lines.append(f"{name:28}{'none':>9}")
             continue
-        covered = "covers the true size" if size.low_mm <= truth_mm <= size.high_mm else "misses the true size"
-        lines.append(f"{name:28}{size.size_mm:>9.1f}   {size.low_mm:.1f} to {size.high_mm:.1f} mm, {covered}")
+        covered = "covers the true size" if size.low <= truth_mm <= size.high else "misses the true size"
+        lines.append(f"{name:28}{size.median:>9.1f}   {size.low:.1f} to {size.high:.1f} mm, {covered}")
     return "\n".join(lines)

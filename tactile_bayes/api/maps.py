@@ -14,9 +14,10 @@ from tactile_bayes.declarations import EXACT, Record, as_dict, to_plain
 from tactile_bayes.errors import UsageError, check_number
 from tactile_bayes.files.arrays_layout import GridOptions
 from tactile_bayes.files.atomic import sha256
-from tactile_bayes.files.grids import GRID_SUFFIXES, Grid, grid_map, import_grid
+from tactile_bayes.files.grids import GRID_SUFFIXES, grid_map, import_grid
 from tactile_bayes.files.instrument import read_scene, scene_of
 from tactile_bayes.files.map_nc import read_map_and_scans, write_map
+from tactile_bayes.files.named_arrays import Grid
 from tactile_bayes.files.provenance import Provenance, repeated_scans, scan_facts
 from tactile_bayes.findings import Finding, finding_lines
 from tactile_bayes.forward.scene import SimulatedScan

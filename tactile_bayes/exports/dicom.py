@@ -13,20 +13,7 @@ from numpy.typing import NDArray
 from tactile_bayes import __version__
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError, UsageError
-from tactile_bayes.exports import exam as codes
-from tactile_bayes.exports.exam import (
-    Code,
-    EstimateFile,
-    Identity,
-    MapFile,
-    Moment,
-    SizedMass,
-    content_uid,
-    lps_from_plane,
-    on_plane,
-    required,
-    verdict_words,
-)
+from tactile_bayes.exports import exam
 from tactile_bayes.files.reports import EstimateReport
 from tactile_bayes.findings import finding_lines
 from tactile_bayes.geometry import FloatArray
@@ -59,19 +46,19 @@ NO_SERIAL_NUMBER: Final = "unknown"
 class Study(Record, eq=False):
     """Patient and study of one export."""
 
-    identity: Identity  #: As given; its `patient_id` may come from the scan.
-    moment: Moment
-    content: Moment
+    identity: exam.Identity  #: As given; its `patient_id` may come from the scan.
+    moment: exam.Moment
+    content: exam.Moment
     """`moment`, `content`: When the exam was and when the content was made, with the time of day."""
     study_uid: str  #: As given, or by the content of the maps.
     key: tuple[str, ...]  #: What identifiers of the objects follow from, besides their own content.
 
     def uid(self, role: str, *parts: str) -> str:
         """Identifier of an object, or of its series, by the study and the object's content."""
-        return content_uid(role, self.study_uid, *self.key, *parts)
+        return exam.content_uid(role, self.study_uid, *self.key, *parts)
 
 
-def study_of(identity: Identity, maps: Sequence[MapFile]) -> Study:
+def study_of(identity: exam.Identity, maps: Sequence[exam.MapFile]) -> Study:
     """The study that maps of one exam belong to."""
     moment, content = identity.study, identity.content
     if moment is None or content is None:
@@ -84,7 +71,7 @@ def study_of(identity: Identity, maps: Sequence[MapFile]) -> Study:
     digests = sorted(one.digest for one in maps)
     # equal for all exports of one exam, whatever else is exported with it
     person = [line for line in given if line.startswith(("patient_id=", "issuer=", "accession=", "study_date="))]
-    study_uid = identity.study_uid or content_uid("study", *digests, *person)
+    study_uid = identity.study_uid or exam.content_uid("study", *digests, *person)
     return Study(identity, moment, content, study_uid, (__version__, *given))
 
 
@@ -121,14 +108,14 @@ def add_study(dataset: Any, study: Study, facts: Mapping[str, str] | None = None
             dataset.BodyPartExamined = "BREAST"
 
 
-def coded(code: Code) -> Any:
+def coded(code: exam.Code) -> Any:
     """A concept as highdicom has it."""
-    return required("highdicom").sr.CodedConcept(code.value, code.scheme, code.meaning)
+    return exam.required("highdicom").sr.CodedConcept(code.value, code.scheme, code.meaning)
 
 
 def item(**attributes: Any) -> Any:
     """A dataset of these attributes, for a sequence."""
-    dataset = required("pydicom").Dataset()
+    dataset = exam.required("pydicom").Dataset()
     for name, value in attributes.items():
         setattr(dataset, name, value)
     return dataset
@@ -144,9 +131,9 @@ def declare_scheme(dataset: Any) -> None:
     """Declare this program's own coding scheme, as a file must that uses one."""
     dataset.CodingSchemeIdentificationSequence = [
         item(
-            CodingSchemeDesignator=codes.OWN_SCHEME,
-            CodingSchemeUID=codes.OWN_SCHEME_UID,
-            CodingSchemeName=codes.OWN_SCHEME_NAME,
+            CodingSchemeDesignator=exam.OWN_SCHEME,
+            CodingSchemeUID=exam.OWN_SCHEME_UID,
+            CodingSchemeName=exam.OWN_SCHEME_NAME,
             CodingSchemeResponsibleOrganization=MODEL,
         )
     ]
@@ -154,7 +141,7 @@ def declare_scheme(dataset: Any) -> None:
 
 def dicom_bytes(dataset: Any) -> bytes:
     """The dataset as a file of DICOM's part 10; nothing in it depends on the clock."""
-    pydicom = required("pydicom")
+    pydicom = exam.required("pydicom")
     for one in (dataset, *dataset.get("ContributingEquipmentSequence", ())):
         for name in _OF_THE_CLOCK:
             if name in one:
@@ -163,7 +150,7 @@ def dicom_bytes(dataset: Any) -> bytes:
     meta.MediaStorageSOPClassUID = dataset.SOPClassUID
     meta.MediaStorageSOPInstanceUID = dataset.SOPInstanceUID
     meta.TransferSyntaxUID = EXPLICIT_LITTLE_ENDIAN
-    meta.ImplementationClassUID = content_uid("implementation", MODEL)
+    meta.ImplementationClassUID = exam.content_uid("implementation", MODEL)
     meta.ImplementationVersionName = "TACTILE_BAYES"
     plain = pydicom.Dataset(dataset)
     plain.file_meta = meta
@@ -179,7 +166,7 @@ def dicom_bytes(dataset: Any) -> bytes:
 _MOST_NOTE: Final = 400  #: Characters that have a place above the figure.
 
 
-def map_picture(source: MapFile, estimate: EstimateFile | None) -> NDArray[np.uint8]:
+def map_picture(source: exam.MapFile, estimate: exam.EstimateFile | None) -> NDArray[np.uint8]:
     """(rows, columns, 3) red, green and blue of the map's figure; of an estimate of this map alone with its ellipse.
 
     No file name is in it, because those may hold patients' names.
@@ -208,12 +195,12 @@ def map_picture(source: MapFile, estimate: EstimateFile | None) -> NDArray[np.ui
 PICTURE_SERIES: Final = 2
 
 
-def secondary_capture(source: MapFile, estimate: EstimateFile | None, *, study: Study, number: int) -> Any:
+def secondary_capture(source: exam.MapFile, estimate: exam.EstimateFile | None, *, study: Study, number: int) -> Any:
     """The figure as a Secondary Capture in red, green and blue.
 
     `number`: of the instance in its series, from 1.
     """
-    highdicom = required("highdicom")
+    highdicom = exam.required("highdicom")
     digest = "" if estimate is None else estimate.digest
     dataset = highdicom.sc.SCImage(
         pixel_array=map_picture(source, estimate),
@@ -259,7 +246,7 @@ def image_plane(tactile_map: TactileMap, transform: FloatArray) -> tuple[FloatAr
         step = sign if towards[0] == "+" else -sign
         corner[towards[1]] = float(centres[0] if step > 0 else centres[-1])
         directions.append(step * axis)
-    place = on_plane(transform, (corner["x"], corner["y"]))
+    place = exam.on_plane(transform, (corner["x"], corner["y"]))
     return np.ascontiguousarray(view.screen(values)), np.array(directions), place
 
 
@@ -271,7 +258,7 @@ POSTURES: Final = ("supine", "oblique", "sitting")  #: Of a person; a phantom ha
 _IMAGE_TYPE: Final = ["DERIVED", "PRIMARY", "VOLUME", "QUANTITY"]
 
 
-def frame_of_reference(source: MapFile) -> str | None:
+def frame_of_reference(source: exam.MapFile) -> str | None:
     """Identifier of the map's own coordinates in the patient; None where they are not known.
 
     They are known with landmarks, in a posture of a person. They are the map's own: no other image shares them, not
@@ -279,10 +266,10 @@ def frame_of_reference(source: MapFile) -> str | None:
     """
     if source.tactile_map.patient_from_plane is None or source.facts.get("posture") not in POSTURES:
         return None
-    return content_uid("frame of reference", source.digest)
+    return exam.content_uid("frame of reference", source.digest)
 
 
-def parametric_map(source: MapFile, *, study: Study, number: int) -> Any:
+def parametric_map(source: exam.MapFile, *, study: Study, number: int) -> Any:
     """The map's means as a Parametric Map of one frame that faces the viewer as the program's pictures do.
 
     Cells without data are NaN, which is also the padding value. A Parametric Map must lie in a frame of reference, so a
@@ -291,11 +278,11 @@ def parametric_map(source: MapFile, *, study: Study, number: int) -> Any:
     `number`: of the instance in its series, from 1.
     """
     reference = frame_of_reference(source)
-    transform = lps_from_plane(source.tactile_map)
+    transform = exam.lps_from_plane(source.tactile_map)
     if reference is None or transform is None:
         raise ValueError("the map's place in the patient is not known")
     values, directions, corner_mm = image_plane(source.tactile_map, transform)
-    pydicom = required("pydicom")
+    pydicom = exam.required("pydicom")
     dataset = pydicom.Dataset()
     add_study(dataset, study, source.facts)
     if dataset.Laterality:
@@ -326,7 +313,7 @@ def parametric_map(source: MapFile, *, study: Study, number: int) -> Any:
     return dataset
 
 
-def _add_content(dataset: Any, source: MapFile, values: FloatArray) -> None:
+def _add_content(dataset: Any, source: exam.MapFile, values: FloatArray) -> None:
     dataset.SamplesPerPixel = 1
     dataset.PhotometricInterpretation = "MONOCHROME2"
     dataset.NumberOfFrames = 1
@@ -348,8 +335,8 @@ def _add_content(dataset: Any, source: MapFile, values: FloatArray) -> None:
     dataset.ImageComments = f"{' '.join(told)} SHA-256 of the map: {source.digest}"
 
 
-def _shared_groups(source: MapFile, values: FloatArray, directions: FloatArray) -> Any:
-    highdicom = required("highdicom")
+def _shared_groups(source: exam.MapFile, values: FloatArray, directions: FloatArray) -> Any:
+    highdicom = exam.required("highdicom")
     cell = source.tactile_map.recipe.cell_mm
     low, high = float(np.nanmin(values)), float(np.nanmax(values))
     window = {"WindowCenter": _decimal((low + high) / 2), "WindowWidth": _decimal(max(high - low, 1e-6))}
@@ -366,17 +353,17 @@ def _shared_groups(source: MapFile, values: FloatArray, directions: FloatArray) 
     side = laterality(source.facts)
     if side:
         region = item(
-            CodeValue=codes.BREAST.value, CodingSchemeDesignator=codes.BREAST.scheme, CodeMeaning=codes.BREAST.meaning
+            CodeValue=exam.BREAST.value, CodingSchemeDesignator=exam.BREAST.scheme, CodeMeaning=exam.BREAST.meaning
         )
         groups.FrameAnatomySequence = [item(FrameLaterality=side, AnatomicRegionSequence=[region])]
     return groups
 
 
-def _value_mapping(source: MapFile) -> Any:
+def _value_mapping(source: exam.MapFile) -> Any:
     """What the stored values are: themselves, in the map's unit."""
-    highdicom, pydicom = required("highdicom"), required("pydicom")
+    highdicom, pydicom = exam.required("highdicom"), exam.required("pydicom")
     recipe, values = source.tactile_map.recipe, source.tactile_map.mean[source.tactile_map.covered]
-    what = codes.RELATIVE_PRESSURE if recipe.value_unit == "1" else codes.PRESSURE
+    what = exam.RELATIVE_PRESSURE if recipe.value_unit == "1" else exam.PRESSURE
     kilopascal = pydicom.sr.coding.Code("kPa", "UCUM", "kilopascal")
     unit = kilopascal if recipe.value_unit == "kPa" else pydicom.sr.codedict.codes.UCUM.NoUnits
     ends = np.array([values.min(), values.max()], "<f4").astype(float)
@@ -403,11 +390,13 @@ def _decimal(value: float) -> str:
 # --- An estimate as a DICOM Comprehensive 3D SR by TID 1500: one measurement group per mass.
 
 REPORT_SERIES: Final = 3
-_MM: Final = Code("mm", "UCUM", "millimeter")
-_PERCENT: Final = Code("%", "UCUM", "percent")
+_MM: Final = exam.Code("mm", "UCUM", "millimeter")
+_PERCENT: Final = exam.Code("%", "UCUM", "percent")
 
 
-def structured_report(estimate: EstimateFile, maps: Sequence[MapFile], *, evidence: Sequence[Any], study: Study) -> Any:
+def structured_report(
+    estimate: exam.EstimateFile, maps: Sequence[exam.MapFile], *, evidence: Sequence[Any], study: Study
+) -> Any:
     """The estimate as a structured report, preliminary and unverified.
 
     A size is the median; the ends of its interval, with its probability, are properties of that measurement. A mass
@@ -415,15 +404,15 @@ def structured_report(estimate: EstimateFile, maps: Sequence[MapFile], *, eviden
 
     `maps`: that the estimate was made from; `evidence`: the DICOM objects of the maps.
     """
-    sr = required("highdicom").sr
+    sr = exam.required("highdicom").sr
     report = sr.MeasurementReport(
         observation_context=_observer(),
-        procedure_reported=coded(codes.EXAM),
+        procedure_reported=coded(exam.EXAM),
         imaging_measurements=[_group(estimate, one, maps, evidence) for one in estimate.masses],
-        title=coded(codes.REPORT_TITLE),
+        title=coded(exam.REPORT_TITLE),
     )
     digests = [f"SHA-256 of the estimate: {estimate.digest}", *(f"SHA-256 of a map: {one}" for one in estimate.maps)]
-    for text in (RESEARCH_USE, verdict_words(estimate), *estimate.lines, *digests):
+    for text in (RESEARCH_USE, exam.verdict_words(estimate), *estimate.lines, *digests):
         report[0].ContentSequence.append(_comment(text))
     dataset = sr.Comprehensive3DSR(
         evidence=evidence,
@@ -445,9 +434,9 @@ def structured_report(estimate: EstimateFile, maps: Sequence[MapFile], *, eviden
 
 def _observer() -> Any:
     """The program as the observer."""
-    sr, codes_of = required("highdicom").sr, required("pydicom").sr.codedict.codes
+    sr, codes_of = exam.required("highdicom").sr, exam.required("pydicom").sr.codedict.codes
     device = sr.DeviceObserverIdentifyingAttributes(
-        uid=content_uid("device", MODEL, __version__),
+        uid=exam.content_uid("device", MODEL, __version__),
         name=MODEL,
         manufacturer_name=MANUFACTURER,
         model_name=f"{MODEL} {__version__}",
@@ -456,21 +445,23 @@ def _observer() -> Any:
     return sr.ObservationContext(observer_device_context=context)
 
 
-def _group(estimate: EstimateFile, finding: SizedMass, maps: Sequence[MapFile], evidence: Sequence[Any]) -> Any:
+def _group(
+    estimate: exam.EstimateFile, finding: exam.SizedMass, maps: Sequence[exam.MapFile], evidence: Sequence[Any]
+) -> Any:
     """Measurement group of a mass, at its place in the patient where that is known."""
-    sr = required("highdicom").sr
+    sr = exam.required("highdicom").sr
     what = {
         "tracking_identifier": sr.TrackingIdentifier(
-            uid=content_uid("mass", estimate.digest, str(finding.number)), identifier=f"mass {finding.number}"
+            uid=exam.content_uid("mass", estimate.digest, str(finding.number)), identifier=f"mass {finding.number}"
         ),
-        "finding_type": None if finding.largest is None else coded(codes.BREAST_LUMP),
-        "method": coded(codes.METHOD),
+        "finding_type": None if finding.largest is None else coded(exam.BREAST_LUMP),
+        "method": coded(exam.METHOD),
         "algorithm_id": sr.AlgorithmIdentification(
             name=MODEL, version=estimate.version or __version__, parameters=[estimate.method_words]
         ),
         "finding_sites": _sites(estimate, maps),
         "measurements": list(_measurements(finding, evidence)),
-        "qualitative_evaluations": [sr.QualitativeEvaluation(coded(codes.OUTCOME), coded(finding.outcome))],
+        "qualitative_evaluations": [sr.QualitativeEvaluation(coded(exam.OUTCOME), coded(finding.outcome))],
     }
     region = _region(finding, maps)
     if region is None:
@@ -483,52 +474,52 @@ def _group(estimate: EstimateFile, finding: SizedMass, maps: Sequence[MapFile], 
     return group
 
 
-def _sites(estimate: EstimateFile, maps: Sequence[MapFile]) -> list[Any] | None:
+def _sites(estimate: exam.EstimateFile, maps: Sequence[exam.MapFile]) -> list[Any] | None:
     """The breast with its side; None for a phantom or an unknown side."""
     said = {one.facts.get("side") for one in maps} or {estimate.facts.get("side")}
     side = said.pop() if len(said) == 1 else None
-    if side not in codes.SIDES:
+    if side not in exam.SIDES:
         return None
-    site = required("highdicom").sr.FindingSite
-    return [site(anatomic_location=coded(codes.BREAST), laterality=coded(codes.SIDES[side]))]
+    site = exam.required("highdicom").sr.FindingSite
+    return [site(anatomic_location=coded(exam.BREAST), laterality=coded(exam.SIDES[side]))]
 
 
-def _region(finding: SizedMass, maps: Sequence[MapFile]) -> Any | None:
+def _region(finding: exam.SizedMass, maps: Sequence[exam.MapFile]) -> Any | None:
     """The lump's centre as a point in the map's frame of reference; of one map whose place is known."""
     if len(maps) != 1 or finding.centre_mm is None:
         return None
-    reference, transform = frame_of_reference(maps[0]), lps_from_plane(maps[0].tactile_map)
+    reference, transform = frame_of_reference(maps[0]), exam.lps_from_plane(maps[0].tactile_map)
     if reference is None or transform is None:
         return None
-    centre = on_plane(transform, finding.centre_mm)
-    return required("highdicom").sr.ImageRegion3D("POINT", np.array([centre]), reference)
+    centre = exam.on_plane(transform, finding.centre_mm)
+    return exam.required("highdicom").sr.ImageRegion3D("POINT", np.array([centre]), reference)
 
 
-def _measurements(finding: SizedMass, evidence: Sequence[Any]) -> Iterator[Any]:
+def _measurements(finding: exam.SizedMass, evidence: Sequence[Any]) -> Iterator[Any]:
     """Sizes and certainty, with references to the maps' values, or to their pictures where there are no values."""
-    sr = required("highdicom").sr
+    sr = exam.required("highdicom").sr
     values = [one for one in evidence if one.SOPClassUID == PARAMETRIC_MAP]
     images = [sr.SourceImageForMeasurement(one.SOPClassUID, one.SOPInstanceUID) for one in values or evidence]
-    for name, size in ((codes.LONG_AXIS, finding.largest), (codes.SHORT_AXIS, finding.smallest)):
+    for name, size in ((exam.LONG_AXIS, finding.largest), (exam.SHORT_AXIS, finding.smallest)):
         if size is not None:
             yield _sized(name, size, images)
     if finding.probability is not None:
         percent = float(f"{100 * finding.probability:.9g}")
-        yield sr.Measurement(coded(codes.CERTAINTY), percent, coded(_PERCENT), referenced_images=images)
+        yield sr.Measurement(coded(exam.CERTAINTY), percent, coded(_PERCENT), referenced_images=images)
 
 
-def _sized(name: Code, size: Quantity, images: Sequence[Any]) -> Any:
+def _sized(name: exam.Code, size: Quantity, images: Sequence[Any]) -> Any:
     """A size's median, with its interval as properties of the number."""
-    sr = required("highdicom").sr
+    sr = exam.required("highdicom").sr
     measurement = sr.Measurement(
-        coded(name), size.median, coded(_MM), derivation=coded(codes.MEDIAN), referenced_images=images
+        coded(name), size.median, coded(_MM), derivation=coded(exam.MEDIAN), referenced_images=images
     )
     for concept, value, unit in (
-        (codes.UPPER_RANGE, size.high - size.median, _MM),
-        (codes.LOWER_RANGE, size.median - size.low, _MM),
-        (codes.INTERVAL_LOW, size.low, _MM),
-        (codes.INTERVAL_HIGH, size.high, _MM),
-        (codes.INTERVAL_PROBABILITY, 100 * size.probability, _PERCENT),
+        (exam.UPPER_RANGE, size.high - size.median, _MM),
+        (exam.LOWER_RANGE, size.median - size.low, _MM),
+        (exam.INTERVAL_LOW, size.low, _MM),
+        (exam.INTERVAL_HIGH, size.high, _MM),
+        (exam.INTERVAL_PROBABILITY, 100 * size.probability, _PERCENT),
     ):
         number = sr.NumContentItem(
             name=coded(concept),
@@ -541,9 +532,9 @@ def _sized(name: Code, size: Quantity, images: Sequence[Any]) -> Any:
 
 
 def _comment(text: str) -> Any:
-    sr = required("highdicom").sr
+    sr = exam.required("highdicom").sr
     relation = sr.RelationshipTypeValues.CONTAINS
-    return sr.TextContentItem(name=coded(codes.COMMENT), value=text, relationship_type=relation)
+    return sr.TextContentItem(name=coded(exam.COMMENT), value=text, relationship_type=relation)
 
 
 # --- An exam as DICOM files: each map's values and picture, and the report of the estimate.
@@ -551,12 +542,14 @@ def _comment(text: str) -> Any:
 VALUES, PICTURE, REPORT = "map", "picture", "report"
 
 
-def dicom_files(maps: Sequence[MapFile], estimate: EstimateFile | None, *, identity: Identity) -> dict[str, bytes]:
+def dicom_files(
+    maps: Sequence[exam.MapFile], estimate: exam.EstimateFile | None, *, identity: exam.Identity
+) -> dict[str, bytes]:
     """Bytes of the files by their names.
 
     Maps whose place in the patient is not known have a picture and no values: a Parametric Map must have a place.
     """
-    required("highdicom")
+    exam.required("highdicom")
     for one in maps:
         if not one.tactile_map.covered.any():
             raise BadDataError("holds no data", way_out="map a scan with frames in the window", path=str(one.path))

@@ -22,10 +22,10 @@ from tactile_bayes.errors import CANNOT_SHOW, NO_LUMP, BadDataError, TactileBaye
 from tactile_bayes.files import reading
 from tactile_bayes.files.atomic import sha256
 from tactile_bayes.files.documents import load_json, parse_json, parse_record
-from tactile_bayes.files.estimate_json import REPORTS, checked_report
+from tactile_bayes.files.estimate_json import checked_report
 from tactile_bayes.files.map_nc import posterior_attributes, read_map_and_scans
 from tactile_bayes.files.provenance import EXAM_FACTS, scans_of
-from tactile_bayes.files.reports import EstimateReport, MassReport, PooledReport, centre_of
+from tactile_bayes.files.reports import REPORTS, EstimateReport, MassReport, PooledReport, centre_of
 from tactile_bayes.findings import capital, finding_lines
 from tactile_bayes.geometry import FloatArray, apply
 from tactile_bayes.inference.draws import Quantity

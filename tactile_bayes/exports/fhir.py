@@ -8,18 +8,7 @@ from typing import Any, Final
 
 from tactile_bayes import __version__
 from tactile_bayes.errors import BadDataError, one_line
-from tactile_bayes.exports import exam as codes
-from tactile_bayes.exports.exam import (
-    FHIR_SYSTEMS,
-    Code,
-    EstimateFile,
-    Identity,
-    SizedMass,
-    content_uuid,
-    required,
-    size_words,
-    verdict_words,
-)
+from tactile_bayes.exports import exam
 from tactile_bayes.files.documents import dump_json
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.presets import RESEARCH_USE
@@ -34,11 +23,11 @@ _XHTML: Final = "http://www.w3.org/1999/xhtml"
 _IDENTIFIERS: Final = "http://terminology.hl7.org/CodeSystem/v2-0203"
 
 
-def bundle_json(estimate: EstimateFile, identity: Identity) -> str:
+def bundle_json(estimate: exam.EstimateFile, identity: exam.Identity) -> str:
     """The Bundle as JSON, checked by the models of fhir.resources."""
     bundle = bundle_of(estimate, identity)
     # R4B has all resources used here as R4 has them; the package's R4 ended with its version 6
-    models = required("fhir.resources.R4B.bundle")
+    models = exam.required("fhir.resources.R4B.bundle")
     try:
         models.Bundle.model_validate(bundle)
     except ValueError as error:
@@ -46,22 +35,22 @@ def bundle_json(estimate: EstimateFile, identity: Identity) -> str:
     return dump_json(bundle)
 
 
-def bundle_of(estimate: EstimateFile, identity: Identity) -> dict[str, Any]:
+def bundle_of(estimate: exam.EstimateFile, identity: exam.Identity) -> dict[str, Any]:
     """The Bundle as plain data: patient (if any is named), device, observations, report."""
-    exam = _Exam(estimate, identity)
-    observations = [one for finding in estimate.masses for one in exam.observations(finding)]
-    patient = [exam.patient()] if exam.patient_url else []
-    resources = [*patient, exam.device(), *observations, exam.report(observations)]
+    parts = _Exam(estimate, identity)
+    observations = [one for finding in estimate.masses for one in parts.observations(finding)]
+    patient = [parts.patient()] if parts.patient_url else []
+    resources = [*patient, parts.device(), *observations, parts.report(observations)]
     entries = [{"fullUrl": f"urn:uuid:{one['id']}", "resource": one} for one in resources]
-    identifier = {"system": "urn:ietf:rfc:3986", "value": exam.url("bundle")}
-    head = {"resourceType": "Bundle", "id": exam.id("bundle"), "identifier": identifier, "type": "collection"}
+    identifier = {"system": "urn:ietf:rfc:3986", "value": parts.url("bundle")}
+    head = {"resourceType": "Bundle", "id": parts.id("bundle"), "identifier": identifier, "type": "collection"}
     return {**head, "entry": entries}
 
 
 class _Exam:
     """One estimate of one patient, whose resources refer to each other by identifiers from their content."""
 
-    def __init__(self, estimate: EstimateFile, identity: Identity) -> None:
+    def __init__(self, estimate: exam.EstimateFile, identity: exam.Identity) -> None:
         self.estimate, self.identity = estimate, identity
         self.key = (__version__, estimate.digest, *(f"{k}={v}" for k, v in sorted(identity.given.items())))
         person = {"patient_id", "issuer", "patient_name", "birth_date", "sex"}
@@ -69,7 +58,7 @@ class _Exam:
 
     def id(self, role: str) -> str:
         """Logical identifier of a resource."""
-        return str(content_uuid(role, *self.key))
+        return str(exam.content_uuid(role, *self.key))
 
     def url(self, role: str) -> str:
         """Reference to a resource of the bundle."""
@@ -109,22 +98,22 @@ class _Exam:
             found["effectiveDateTime"] = self.identity.study.fhir
         return found
 
-    def observations(self, finding: SizedMass) -> Iterator[dict[str, Any]]:
+    def observations(self, finding: exam.SizedMass) -> Iterator[dict[str, Any]]:
         """Largest and smallest size of a mass, and the probability of a lump."""
         n = finding.number
-        sizes = (("largest", codes.LONG_AXIS, finding.largest), ("smallest", codes.SHORT_AXIS, finding.smallest))
+        sizes = (("largest", exam.LONG_AXIS, finding.largest), ("smallest", exam.SHORT_AXIS, finding.smallest))
         for word, code, size in sizes:
             text = f"{word.capitalize()} size of the lump"
             value = _size(size) if size is not None else _absent(finding)
             yield self._observation(f"{word} {n}", _concept(code, text=text), finding) | value
         if finding.probability is not None:
             percent = _quantity(float(f"{100 * finding.probability:.9g}"), "%", "%")
-            concept = _concept(codes.CERTAINTY, text="Probability of a lump")
+            concept = _concept(exam.CERTAINTY, text="Probability of a lump")
             yield self._observation(f"probability {n}", concept, finding) | {"valueQuantity": percent}
 
-    def _observation(self, role: str, code: dict[str, Any], finding: SizedMass) -> dict[str, Any]:
-        site = codes.BREASTS.get(self.estimate.facts.get("side", ""))
-        notes = [RESEARCH_USE, verdict_words(self.estimate), *self.estimate.lines]
+    def _observation(self, role: str, code: dict[str, Any], finding: exam.SizedMass) -> dict[str, Any]:
+        site = exam.BREASTS.get(self.estimate.facts.get("side", ""))
+        notes = [RESEARCH_USE, exam.verdict_words(self.estimate), *self.estimate.lines]
         notes += [finding.alike_exams] if finding.alike_exams else []
         if len(self.estimate.masses) > 1:
             notes.append(f"Mass {finding.number} of {len(self.estimate.masses)}")
@@ -135,7 +124,7 @@ class _Exam:
             "category": [{"coding": [{"system": _CATEGORY, "code": "imaging", "display": "Imaging"}]}],
             "code": code,
             **({"bodySite": _concept(site)} if site else {}),
-            "method": _concept(codes.METHOD, text=self.estimate.method_words),
+            "method": _concept(exam.METHOD, text=self.estimate.method_words),
             "device": {"reference": self.url("device")},
             "note": [{"text": text} for text in notes],
         }
@@ -154,31 +143,31 @@ class _Exam:
             "identifier": [{"system": "urn:ietf:rfc:3986", "value": self.url("report")}],
             **({"basedOn": [order]} if number else {}),
             **self._common(),
-            "code": _concept(codes.EXAM),
+            "code": _concept(exam.EXAM),
             "result": [{"reference": f"urn:uuid:{one['id']}"} for one in observations],
             "conclusion": " ".join(lines),
             "conclusionCode": [_concept(one.outcome) for one in self.estimate.masses],
         }
 
 
-def _lines(estimate: EstimateFile) -> Iterator[str]:
+def _lines(estimate: exam.EstimateFile) -> Iterator[str]:
     """The report in sentences, what speaks against it first."""
-    yield verdict_words(estimate)
+    yield exam.verdict_words(estimate)
     yield from estimate.lines
     for one in estimate.masses:
         mass = f"Mass {one.number}: " if len(estimate.masses) > 1 else ""
         if one.largest is None or one.smallest is None:
             yield f"{mass}{one.outcome.meaning}. Reason: {one.reason or one.code}."
             continue
-        yield f"{mass}Largest size {size_words(one.largest)}."
-        yield f"{mass}Smallest size {size_words(one.smallest)}."
+        yield f"{mass}Largest size {exam.size_words(one.largest)}."
+        yield f"{mass}Smallest size {exam.size_words(one.smallest)}."
         if one.alike_exams:
             yield f"{mass}{one.alike_exams}."
     yield RESEARCH_USE
 
 
-def _concept(code: Code, *, text: str = "") -> dict[str, Any]:
-    coding = {"system": FHIR_SYSTEMS[code.scheme], "code": code.value, "display": code.meaning}
+def _concept(code: exam.Code, *, text: str = "") -> dict[str, Any]:
+    coding = {"system": exam.FHIR_SYSTEMS[code.scheme], "code": code.value, "display": code.meaning}
     return {"coding": [coding], "text": text or code.meaning}
 
 
@@ -196,16 +185,16 @@ def _size(size: Quantity) -> dict[str, Any]:
     ]
     extension = [{"url": CONFIDENCE_INTERVAL, "extension": parts}]
     probability = _quantity(percent, "%", "%")
-    components = ((codes.INTERVAL_LOW, low), (codes.INTERVAL_HIGH, high), (codes.INTERVAL_PROBABILITY, probability))
+    components = ((exam.INTERVAL_LOW, low), (exam.INTERVAL_HIGH, high), (exam.INTERVAL_PROBABILITY, probability))
     return {
         "valueQuantity": {"extension": extension, **_quantity(size.median, "mm", "mm")},
         "component": [{"code": _concept(code), "valueQuantity": value} for code, value in components],
     }
 
 
-def _absent(finding: SizedMass) -> dict[str, Any]:
+def _absent(finding: exam.SizedMass) -> dict[str, Any]:
     """Why there is no value."""
-    unknown = finding.outcome is not codes.NOT_DETECTED
+    unknown = finding.outcome is not exam.NOT_DETECTED
     code = ("unknown", "Unknown") if unknown else ("not-applicable", "Not Applicable")
     coding = {"system": ABSENT, "code": code[0], "display": code[1]}
     return {"dataAbsentReason": {"coding": [coding], "text": finding.reason or finding.outcome.meaning}}

@@ -184,7 +184,7 @@ def _rows(path: Path, mapping: ColumnMap, names: Sequence[str | None]) -> list[_
             held = ", ".join(repr(one) for one in header)
             raise table.error(1, name, "is missing", way_out=f"correct the mapping; the table has {held}")
     cells = ({composed(name): composed(cell) for name, cell in row.items()} for row in table.rows)
-    return [_Row(table, line, row) for line, row in zip(table.line_numbers, cells, strict=True)]
+    return [_Row(table, line, row) for (line, _), row in zip(table.body, cells, strict=True)]
 
 
 def _reading(row: _Row, reading: ReadingColumns, mapping: ColumnMap) -> dict[str, Any]:

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
 import numpy as np
 
-from tactile_bayes.declarations import Record, as_dict, names_of
 from tactile_bayes.errors import BadDataError, in_file
 from tactile_bayes.files.documents import load_json, parse_record
 from tactile_bayes.files.netcdf import open_netcdf
 from tactile_bayes.files.reading import first_bytes, is_json
-from tactile_bayes.files.reports import ESTIMATE, POOLED, AnotherExam, EstimateReport, MassReport, PooledReport
+from tactile_bayes.files.reports import (
+    AnotherExam,
+    EstimateReport,
+    Interval,
+    MassReport,
+    PooledReport,
+)
 from tactile_bayes.files.tables import Table
 from tactile_bayes.findings import verdict
 from tactile_bayes.inference.draws import Quantity
@@ -23,17 +28,13 @@ from tactile_bayes.inference.draws import Quantity
 PROBABILITY = 0.95
 
 
-class StatedSize(Record):
-    """Largest size in mm with its interval; None throughout where there was no estimate."""
-
-    size_mm: float | None = None
-    low_mm: float | None = None
-    high_mm: float | None = None
-    probability: float | None = None
+_COLUMNS: Final = {"size_mm": "median", "low_mm": "low", "high_mm": "high", "probability": "probability"}
+"""Columns of a trial table that a size fills."""
+StatedSize = Quantity | Interval
 
 
-def read_stated_size(path: Path, number: int | None = None) -> StatedSize:
-    """The largest size that an estimate states.
+def read_stated_size(path: Path, number: int | None = None) -> StatedSize | None:
+    """The largest size that an estimate states, in mm with its interval; None where there was no estimate.
 
     `number`: which estimate of a list, from 1; a list of one needs none.
     """
@@ -58,7 +59,7 @@ def fill_from_posteriors(table: Table) -> tuple[dict[str, list[Any]], list[Path]
     for row, name in enumerate(filled.get("posterior", [])):
         if not name:
             continue
-        for column in (*names_of(StatedSize), "sd_mm"):
+        for column in (*_COLUMNS, "sd_mm"):
             if (value := filled[column][row]) is not None:
                 what, way_out = f"is {value:g} beside a posterior", "leave it blank: the file says it"
                 raise table.error(row, column, what, way_out=way_out)
@@ -66,15 +67,15 @@ def fill_from_posteriors(table: Table) -> tuple[dict[str, list[Any]], list[Path]
         if not (mark and number.isascii() and number.isdigit() and len(number) < 10) or (folder / name).exists():
             stem, number = name, ""
         stated = read_stated_size(folder / stem, int(number) if number else None)
-        _check_status(table, row, stated)
-        for column, value in as_dict(stated).items():
-            filled[column][row] = value
+        _check_status(table, row, sized=stated is not None)
+        for column, part in _COLUMNS.items():
+            filled[column][row] = None if stated is None else getattr(stated, part)
         paths.append(folder / stem)
     return filled, list(dict.fromkeys(paths))
 
 
-def _check_status(table: Table, row: int, stated: StatedSize) -> None:
-    status, sized = table.columns["status"][row], stated.size_mm is not None
+def _check_status(table: Table, row: int, *, sized: bool) -> None:
+    status = table.columns["status"][row]
     if (status == "detected") == sized and status is not None:
         return
     column, what = "posterior", f"names an estimate with a size while status is {status or 'blank'}"
@@ -88,7 +89,7 @@ def _check_status(table: Table, row: int, stated: StatedSize) -> None:
     raise table.error(row, column, what, way_out=way_out)
 
 
-def _from_json(path: Path, number: int | None) -> StatedSize:
+def _from_json(path: Path, number: int | None) -> Quantity | None:
     document = load_json(path, way_out="give `estimate --json`")
     if isinstance(document, list):
         number = 1 if number is None and len(document) == 1 else number
@@ -101,11 +102,10 @@ def _from_json(path: Path, number: int | None) -> StatedSize:
         raise BadDataError("holds one estimate, no list", way_out=f"leave out #{number}", path=str(path))
     pooled = isinstance(document, dict) and str(document.get("schema", "")).startswith("tactile-bayes/pooled/")
     kind: type[EstimateReport | PooledReport] = PooledReport if pooled else EstimateReport
-    size = parse_record(document, kind, path=path).max_size_mm
-    return StatedSize() if size is None else StatedSize(size.median, size.low, size.high, size.probability)
+    return parse_record(document, kind, path=path).max_size_mm
 
 
-def _from_netcdf(path: Path) -> StatedSize:
+def _from_netcdf(path: Path) -> Interval:
     with open_netcdf(path, way_out="give what `estimate` wrote with --json or -o") as file:
         group = file.group("posterior")
         values = None if group is None else group.array("max_size_mm", kind="f8", dimensions=("chain", "draw"))
@@ -114,13 +114,11 @@ def _from_netcdf(path: Path) -> StatedSize:
         way_out = "estimate with --size-calibration, so that the posterior holds sizes"
         raise BadDataError("holds no draws of max_size_mm", way_out=way_out, path=str(path))
     low, median, high = np.quantile(values, [0.5 - PROBABILITY / 2, 0.5, 0.5 + PROBABILITY / 2])
-    return StatedSize(float(median), float(low), float(high), PROBABILITY)
+    return Interval(float(median), float(low), float(high), PROBABILITY)
 
 
 # --- Checks of an estimate beyond its declaration: sizes that can be one lump's, in their order.
 
-REPORTS: Final[Mapping[str, type[EstimateReport | PooledReport]]] = {ESTIMATE: EstimateReport, POOLED: PooledReport}
-"""What ``estimate`` prints as JSON, by the ids of its schemas."""
 MOST_MM: Final = 500.0  #: Sizes above it are no lump's.
 _SIZES: Final = ("max_size_mm", "min_size_mm", "d_x_mm", "d_y_mm")
 _WAY_OUT: Final = "give the JSON as `estimate --json` printed it"

@@ -9,12 +9,12 @@ from typing import Any, Final
 
 import numpy as np
 
-from tactile_bayes.declarations import Record, replace
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, UsageError, in_file
 from tactile_bayes.files import text_lines
 from tactile_bayes.files.arrays_layout import GridOptions
 from tactile_bayes.files.images import read_image
-from tactile_bayes.files.named_arrays import ARRAY_SUFFIXES, AXES, read_named, turned_by_axes
+from tactile_bayes.files.named_arrays import ARRAY_SUFFIXES, AXES, Grid, read_named, turned_by_axes
 from tactile_bayes.findings import Finding
 from tactile_bayes.geometry import BoolArray, FloatArray
 from tactile_bayes.mapping.map import MapRecipe, TactileMap, block_sums
@@ -22,17 +22,6 @@ from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.presets import CELL_MM, MM_PER_UNIT
 from tactile_bayes.progress import Progress, untold
-
-
-class Grid(Record, eq=False):
-    """Values in rows and columns, and what their file says of them."""
-
-    arrays: dict[str, np.ndarray[Any, Any]]  #: ``mean (ny, nx)`` and, where known, ``count`` and ``variance``.
-    spacing_mm: tuple[float, float] | None = None  #: Width and height of a cell, where the file states it.
-    resolution_mm: tuple[float, float] | None = None  #: The same by an image's resolution, often of its printing.
-    units: str = ""  #: Where the file states it.
-    notes: tuple[str, ...] = ()  #: What was done on reading it.
-
 
 # --- A grid of numbers in a text table, as programs and spreadsheets write it.
 #
@@ -224,8 +213,7 @@ def open_grid(path: Path, *, no_value: Sequence[str] = (), array: str = "") -> G
     if array:
         raise UsageError(f"--array is for files of arrays; {path} has none")
     if suffix in IMAGE_SUFFIXES:
-        picture = read_image(path)
-        return Grid({"mean": picture.values}, None, picture.spacing_mm, "", picture.notes)
+        return read_image(path)
     if suffix in TABLE_SUFFIXES:
         return read_table(path, no_value=no_value)
     sheets = suffix in (".xlsx", ".xls", ".ods")

@@ -13,6 +13,7 @@ import numpy as np
 
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError
+from tactile_bayes.files.named_arrays import Grid
 from tactile_bayes.files.reading import CELLS, IMAGE_BYTES, check_limit, decoding, read_bytes
 from tactile_bayes.geometry import BoolArray, FloatArray
 from tactile_bayes.presets import MM_PER_UNIT
@@ -32,21 +33,16 @@ _DECODED_OF_MANY: Final = {(samples, 8, 1) for samples in (2, 3, 4)}
 _GREY_HEADER: Final = re.compile(rb"P([25])" + 3 * rb"(?:\s|#[^\n\r]*[\n\r])+(\d{1,9})" + rb"\s")
 
 
-class Picture(Record, eq=False):
-    """Pixels of a grey image, and what its file says of them."""
+def read_image(path: Path) -> Grid:
+    """Read a grey TIFF, PNG or PGM as the file numbers its pixels, more is brighter, NaN where it says "no value".
 
-    values: FloatArray  #: (rows, columns) as the file numbers them, more is brighter; NaN where it says "no value".
-    spacing_mm: tuple[float, float] | None = None  #: Width and height of a pixel; None where the file does not say.
-    notes: tuple[str, ...] = ()  #: What was done that a viewer would not show.
-
-
-def read_image(path: Path) -> Picture:
-    """Read a grey TIFF, PNG or PGM; colours, several images and samples that would be changed are refused."""
+    Colours, several images and samples that would be changed are refused; what a viewer would not show is noted.
+    """
     data = read_bytes(path, most=IMAGE_BYTES)  # from memory: a chunk cannot claim more than there is
     return _graymap(data) if data[:1] == b"P" else _decoded(data)
 
 
-def _graymap(data: bytes) -> Picture:
+def _graymap(data: bytes) -> Grid:
     """PGM by netpbm's description, ``P2`` or ``P5``: values lie between 0 and a maximum that scales nothing here."""
     header = _GREY_HEADER.match(data)
     if header is None:
@@ -68,10 +64,10 @@ def _graymap(data: bytes) -> Picture:
         raise BadDataError(f"cannot be decoded ({len(values)} of {width * height} pixels)", way_out="copy it again")
     if not 0 < top < 65536 or values.max() > top:
         raise BadDataError(f"holds the value {values.max()}, and its maximum is {top}", way_out="copy it again")
-    return Picture(values.reshape(height, width).astype(np.float64))
+    return Grid({"mean": values.reshape(height, width).astype(np.float64)})
 
 
-def _decoded(data: bytes) -> Picture:
+def _decoded(data: bytes) -> Grid:
     """TIFF or PNG by Pillow, which scales, inverts and cuts samples here and there: see the branches."""
     from PIL import Image, ImageOps, TiffImagePlugin, UnidentifiedImageError
 
@@ -106,7 +102,8 @@ def _decoded(data: bytes) -> Picture:
     values, without = _grey(pixels, mode)
     values, without = described.read(values, without)
     notes += [f"turned as its orientation ({turned}) says"] if turned != 1 else []
-    return Picture(np.where(without, np.nan, values), described.spacing_mm, (*notes, *described.notes))
+    held = {"mean": np.where(without, np.nan, values)}
+    return Grid(held, resolution_mm=described.spacing_mm, notes=(*notes, *described.notes))
 
 
 def _choose_page(image: Any) -> None:

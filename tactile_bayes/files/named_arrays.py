@@ -17,21 +17,11 @@ import scipy.io
 
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError, in_file
+from tactile_bayes.files import reading
 from tactile_bayes.files.arrays_layout import KNOWN, LAYOUT, OPTIONAL, ArrayMap, Shape, Stated, in_words
 from tactile_bayes.files.documents import dump_json, read_toml_record
 from tactile_bayes.files.netcdf import Group, as_declared, open_netcdf
 from tactile_bayes.files.npz import Arrays, choose_npz, load_npy
-from tactile_bayes.files.reading import (
-    HDF5_MAGIC,
-    MCAP_MAGIC,
-    NETCDF_BYTES,
-    ZIP_MAGIC,
-    check_limit,
-    decoding,
-    first_bytes,
-    read_bytes,
-    unpacked_limit,
-)
 
 
 class Source(Record, eq=False):
@@ -44,13 +34,25 @@ class Source(Record, eq=False):
     path: str = ""  #: Of a file beside the frames', for errors.
 
 
+class Grid(Record, eq=False):
+    """A grid or an image, and what its file says of it."""
+
+    arrays: Arrays  #: ``mean (ny, nx)`` and, where known, ``count`` and ``variance``.
+    spacing_mm: tuple[float, float] | None = None  #: Width and height of a cell, where the file states it.
+    resolution_mm: tuple[float, float] | None = None  #: The same by an image's resolution, often of its printing.
+    units: str = ""  #: Where the file states it.
+    notes: tuple[str, ...] = ()  #: What was done on reading it.
+
+
 Choose = Callable[[Sequence[str]], Iterable[str]]  #: Takes the names in a file and returns those to read.
 ARRAY_SUFFIXES: Final = (".npz", ".npy", ".mat", ".h5", ".hdf5")
 _MAT_5: Final = b"MATLAB 5.0 MAT-file"
 _MAT_73: Final = b"MATLAB 7.3 MAT-file"
-_KNOWN: Final = (ZIP_MAGIC[:2], np.lib.format.MAGIC_PREFIX, _MAT_5, _MAT_73, HDF5_MAGIC, MCAP_MAGIC, b"CDF")
+_ZIP: Final = reading.ZIP_MAGIC[:2]
+_NPY: Final = np.lib.format.MAGIC_PREFIX
+_KNOWN: Final = (_ZIP, _NPY, _MAT_5, _MAT_73, reading.HDF5_MAGIC, reading.MCAP_MAGIC, b"CDF")
 _USER_BLOCK: Final = 512  # bytes before the HDF5 file in a .mat of version 7.3
-_LOOKED_AT: Final = _USER_BLOCK + len(HDF5_MAGIC)
+_LOOKED_AT: Final = _USER_BLOCK + len(reading.HDF5_MAGIC)
 _COPY_AGAIN: Final = "copy the file again"
 _MOST_LEVELS: Final = 8
 
@@ -61,17 +63,17 @@ def read_named(path: Path, choose: Choose) -> Arrays:
     Fields of a structure and members of a group are called ``exam.frames``. Arrays of a .mat have the axes that they
     have in MATLAB.
     """
-    start = first_bytes(path, _LOOKED_AT)
+    start = reading.first_bytes(path, _LOOKED_AT)
     with in_file(path):
-        if start.startswith(ZIP_MAGIC[:2]):
+        if start.startswith(_ZIP):
             return choose_npz(path, choose)
-        if start.startswith(np.lib.format.MAGIC_PREFIX):
+        if start.startswith(_NPY):
             arrays = load_npy(path)
         elif start.startswith(_MAT_5):
             arrays = _mat_5(path)
         elif start.startswith(_MAT_73):
             return {name: array.T for name, array in _hdf5(path, choose, begins_at=_USER_BLOCK).items()}
-        elif start.startswith(HDF5_MAGIC):
+        elif start.startswith(reading.HDF5_MAGIC):
             return _hdf5(path, choose)
         elif start.startswith(b"CDF"):
             arrays = _netcdf_3(path)
@@ -82,11 +84,11 @@ def read_named(path: Path, choose: Choose) -> Arrays:
 
 def is_text(path: Path) -> bool:
     """True for a file that is none of arrays by its first bytes and its suffix, and may be a text."""
-    return path.suffix.lower() not in ARRAY_SUFFIXES and not first_bytes(path, _LOOKED_AT).startswith(_KNOWN)
+    return path.suffix.lower() not in ARRAY_SUFFIXES and not reading.first_bytes(path, _LOOKED_AT).startswith(_KNOWN)
 
 
 def _of_another_kind(path: Path, start: bytes) -> BadDataError:
-    if start.startswith(MCAP_MAGIC):
+    if start.startswith(reading.MCAP_MAGIC):
         return BadDataError("is a scan", way_out="give it as it is")
     if path.suffix.lower() == ".mat":
         return BadDataError("is not a .mat of version 5 to 7.3", way_out="save it with save(..., '-v7')")
@@ -129,9 +131,9 @@ def turned_by_axes(arrays: Arrays) -> tuple[str, ...]:
 
 
 def _netcdf_3(path: Path) -> Arrays:
-    data = read_bytes(path, most=NETCDF_BYTES)
+    data = reading.read_bytes(path, most=reading.NETCDF_BYTES)
     with (
-        decoding("is not a whole netCDF-3 file", way_out=_COPY_AGAIN),
+        reading.decoding("is not a whole netCDF-3 file", way_out=_COPY_AGAIN),
         warnings.catch_warnings(action="ignore"),
         scipy.io.netcdf_file(io.BytesIO(data), "r", mmap=False) as file,
     ):
@@ -175,16 +177,16 @@ Element = tuple[int, bytes]
 
 def _mat_5(path: Path) -> Arrays:
     """Read all arrays; fields of a structure are called ``exam.frames``, what holds no numbers is an object."""
-    data = read_bytes(path, most=NETCDF_BYTES)
+    data = reading.read_bytes(path, most=reading.NETCDF_BYTES)
     order = "<" if data[126:128] == b"IM" else ">"
-    most = unpacked_limit(len(data))
+    most = reading.unpacked_limit(len(data))
     found: Arrays = {}
-    with decoding("is not a whole .mat file", way_out=_COPY_AGAIN):
+    with reading.decoding("is not a whole .mat file", way_out=_COPY_AGAIN):
         for kind, element in _elements(data[_HEADER:], order):
             parts = [(kind, element)]
             if kind == _COMPRESSED:
                 unpacked = zlib.decompressobj().decompress(element, most + 1)
-                check_limit(len(unpacked), most, what="its arrays unpack to {} bytes or more")
+                reading.check_limit(len(unpacked), most, what="its arrays unpack to {} bytes or more")
                 most -= len(unpacked)
                 parts = list(_elements(unpacked, order))
             for inner, content in parts:

@@ -43,7 +43,21 @@ Entries = Annotated[
 Judgement = Annotated[Verdict, says("no_answer: there is no size; doubtful: a caution stands")]
 
 
-class Report(Record, kw_only=True):
+class Sized(Record):
+    """What has sizes, and may have others for exams as far apart as those of patients."""
+
+    @property
+    def leading(self) -> Self | AnotherExam:
+        """What holds the sizes that lead (record 0130).
+
+        Until a site's repeatability is known these are the sizes for exams as far apart as patients' (`another_exam`);
+        with it, or a stated spread, there is one interval.
+        """
+        another: AnotherExam | None = getattr(self, "another_exam", None)
+        return self if another is None else another
+
+
+class Report(Sized, kw_only=True):
     """What all reports have in common."""
 
     def __repr__(self) -> str:
@@ -236,7 +250,7 @@ class OtherRise(Record):
     probability: Chance
 
 
-class MassReport(Record, kw_only=True):
+class MassReport(Sized, kw_only=True):
     """One of the masses on a map."""
 
     number: Number1
@@ -255,11 +269,6 @@ class MassReport(Record, kw_only=True):
     reason_code: ReasonCode
     advice: str
     position: Position | None = None
-
-    @property
-    def leading(self) -> MassReport | AnotherExam:
-        """What holds the sizes that lead (record 0130): for exams as far apart as patients', where it has them."""
-        return self if self.another_exam is None else self.another_exam
 
 
 class Touching(Record):
@@ -371,15 +380,6 @@ class EstimateReport(Report, kw_only=True):
             from_plain(Shares, self.variance_share, where="variance_share")
 
     @property
-    def leading(self) -> EstimateReport | AnotherExam:
-        """What holds the sizes that lead (record 0130).
-
-        Until a site's repeatability is known these are the sizes for exams as far apart as patients' (`another_exam`);
-        with it, or a stated spread, there is one interval.
-        """
-        return self if self.another_exam is None else self.another_exam
-
-    @property
     def figures(self) -> Mapping[str, Any]:
         """Figures of the size: spread between exams, whether the lump is oval."""
         return self.diagnostics
@@ -448,7 +448,6 @@ class PooledReport(Report, kw_only=True):
     def __post_init__(self) -> None:
         from_plain(PooledFigures, self.figures, where="figures")
 
-    @property
-    def leading(self) -> PooledReport | AnotherExam:
-        """What holds the sizes that lead, see `EstimateReport.leading`."""
-        return self if self.another_exam is None else self.another_exam
+
+REPORTS: Final[Mapping[str, type[EstimateReport | PooledReport]]] = {ESTIMATE: EstimateReport, POOLED: PooledReport}
+"""What ``estimate`` prints as JSON, by the ids of its schemas."""

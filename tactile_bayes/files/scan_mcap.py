@@ -34,23 +34,9 @@ from tactile_bayes.geometry import FloatArray
 
 # --- Scan files: MCAP that Foxglove opens, readable after the recording program was killed.
 #
-# Layout (schema id ``tactile-bayes/scan/1``)
-#     Metadata and attachments come first, so that even an unfinished file says what it is:
-#     ``tactile-bayes`` (schema id, units), ``session`` (plain text facts), ``provenance``, and ``truth`` for a
-#       simulated
-#     scan; attachments ``head.json`` and ``element_calibration.json``. Then messages, zstd, chunks of at most 64 KiB:
-#
-#     - ``/pressure``, foxglove.Grid: raw counts, one uint16 field; the grid's columns run along x of `scanhead` and its
-#       rows along y, so that a viewer draws the head the right way round;
-#     - ``/pose``, foxglove.PoseInFrame in `base`: the tracker's sensor;
-#     - ``/landmark``, foxglove.PoseInFrame in `base`: one channel a landmark, its name in the channel's metadata.
-#
-# Units
-#     Lengths are in mm, not in the metres that Foxglove assumes: mm / 1000 * 1000 is not always the number it was, and
-#     a scan must come back as it went in. Viewers draw a head of 24 x 39 "metres"; each channel's metadata says ``mm``.
-#
-# Times
-#     ``publish_time`` and the message's timestamp are the device's, ``log_time`` is the host's; all in ns.
+# docs/formats.md has the layout. Metadata and attachments come first, so that even an unfinished file says what it is.
+# Lengths are in mm, not in the metres that Foxglove assumes: mm / 1000 * 1000 is not always the number it was, and a
+# scan must come back as it went in. Viewers draw a head of 24 x 39 "metres"; each channel's metadata says ``mm``.
 
 SCAN_SCHEMA: Final = "tactile-bayes/scan/1"
 CHUNK_BYTES: Final = 64 * 1024
@@ -399,10 +385,6 @@ def _decode(kind: Any, body: bytes) -> Any:
 
 
 # --- A scan's file during its recording: readable at any moment, whatever happens to the program.
-#
-# Beside what every scan's file holds there is ``/log``, foxglove.Log: one message for each thing that went wrong, with
-# the device time of the frame or pose it belongs to; and, when the recording ended in order, a metadata record
-# ``recording`` with the account.
 
 LOG_TOPIC: Final = "/log"
 ACCOUNT: Final = "recording"

@@ -39,15 +39,6 @@ _NOT_TEXT: Final = (
 """First bytes of files that are no UTF-8 text, what they are, and the way out."""
 
 
-class Cells(Record):
-    """A CSV file's rows that are not blank."""
-
-    header: list[str]  #: Cells of the first of them; none where there is none.
-    body: list[tuple[int, list[str]]]  #: The others, each with the line on which it begins.
-    separator: str = ","  #: Between the cells.
-    decimal_comma: bool = False  #: True when numbers are written as 12,5.
-
-
 def read_text(path: Path) -> str:
     """Text of a CSV file in UTF-8, with or without a byte order mark."""
     data = read_bytes(path, most=TABLE_BYTES)
@@ -57,20 +48,17 @@ def read_text(path: Path) -> str:
     return decoded(data, path=path, way_out=_AS_UTF8, as_utf8=_AS_UTF8)
 
 
-def _cells(text: str) -> Cells:
+def _raw(path: Path, text: str) -> RawTable:
     """Split CSV text into cells; columns without a name or any filled cell are left out."""
     separator = separator_in(text)
-    rows = _rows(text, separator)
-    if not rows:
-        return Cells([], [], separator)
-    (_, header), *body = rows
+    (_, header), *body = _rows(text, separator) or [(1, [])]
     end = len(header)
     while end and not header[end - 1] and not any(cell for _, cells in body for cell in cells[end - 1 :]):
         end -= 1
     if end < len(header):
         header, body = header[:end], [(line, cells[:end]) for line, cells in body]
     commas = (cell for _, row in body for cell in map(str.strip, row) if DECIMAL_COMMA.fullmatch(cell))
-    return Cells(header, body, separator, separator != "," and not all(map(may_be_thousands, commas)))
+    return RawTable(path, header, body, separator, separator != "," and not all(map(may_be_thousands, commas)))
 
 
 def separator_in(text: str) -> str:
@@ -164,8 +152,8 @@ def read_table(source: Path | Sheet, schema_name: str) -> Table:
     columns: dict[str, list[Any]] = {name: [] for name in fields}
     keys = schema.get("primaryKey", [])
     with in_file(path):
-        cells_in = _cells(text)
-        header, body = cells_in.header, cells_in.body
+        raw = _raw(path, text)
+        header, body = raw.header, raw.body
         if not header:
             raise BadDataError("is empty", way_out=f"its first line must name columns: {_names(fields)}")
         _check_header(header, fields, wide=schema.get("wide", ""))
@@ -177,7 +165,7 @@ def read_table(source: Path | Sheet, schema_name: str) -> Table:
             row |= {name: composed(row.get(name, "")) for name in keys}
             for name, field in fields.items():
                 cell = row.get(name, "")
-                columns[name].append(_parse_cell(line, cell, field=field, decimal_comma=cells_in.decimal_comma))
+                columns[name].append(_parse_cell(line, cell, field=field, decimal_comma=raw.decimal_comma))
     table = Table(path=path, columns=columns, line_numbers=[line for line, _ in body])
     first: dict[tuple[Any, ...], int] = {}
     for index, key in enumerate(_keys(table, keys)):
@@ -188,14 +176,18 @@ def read_table(source: Path | Sheet, schema_name: str) -> Table:
 
 
 class RawTable(Record):
-    """A CSV table under no schema."""
+    """A CSV table under no schema: its rows that are not blank."""
 
     path: Path  #: Where it was read.
-    header: list[str]  #: Names of its columns.
-    line_numbers: list[int]  #: The line at which each row begins.
-    rows: list[dict[str, str]]  #: Cells as text, without blanks around them, by their columns.
-    decimal_comma: bool = False  #: True when its numbers are written as 12,5.
-    separator: str = ","  #: Between its cells.
+    header: list[str]  #: Cells of the first row; none where there is none.
+    body: list[tuple[int, list[str]]]  #: The others, each with the line at which it begins.
+    separator: str  #: Between the cells.
+    decimal_comma: bool  #: True when numbers are written as 12,5.
+
+    @property
+    def rows(self) -> list[dict[str, str]]:
+        """Cells of the body without blanks around them, by their columns."""
+        return [dict(zip(self.header, map(str.strip, cells), strict=True)) for _, cells in self.body]
 
     def error(self, line: int, column: str, what: str, *, way_out: str) -> BadDataError:
         """Error for a cell; lines count from 1."""
@@ -212,25 +204,21 @@ class RawTable(Record):
 def read_raw(path: Path) -> RawTable:
     """Read the cells of any CSV table as text; for the errors see `read_table`."""
     with in_file(path):
-        cells = _cells(read_text(path))
-        header, body = cells.header, cells.body
-        if not body:
+        table = _raw(path, read_text(path))
+        if not table.body:
             raise BadDataError("holds no rows", way_out="give a header and at least one row")
-        for name in header:
-            if header.count(name) > 1:
+        for name in table.header:
+            if table.header.count(name) > 1:
                 raise _fault(1, name, "appears more than once", way_out="keep one of them")
-        for line, row in body:
-            _check_length(line, row, header)
-    rows = [dict(zip(header, (cell.strip() for cell in row), strict=True)) for _, row in body]
-    return RawTable(path, header, [line for line, _ in body], rows, cells.decimal_comma, cells.separator)
+        for line, row in table.body:
+            _check_length(line, row, table.header)
+    return table
 
 
-def csv_text(
-    names: Sequence[str], rows: Iterable[Iterable[object]], *, digits: int | None = None, separator: str = ","
-) -> str:
+def csv_text(names: Sequence[str], rows: Iterable[Iterable[object]], *, digits: int | None = None) -> str:
     """CSV text of rows below their names, with cells of `csv_cell`."""
     out = io.StringIO(newline="")
-    writer = csv.writer(out, delimiter=separator, lineterminator="\n")
+    writer = csv.writer(out, lineterminator="\n")
     writer.writerow(names)
     writer.writerows([csv_cell(value, digits) for value in row] for row in rows)
     return out.getvalue()

@@ -148,9 +148,9 @@ def test_maps_that_do_not_tell_the_depth_of_the_fat_are_pooled_without_and_say_s
 def test_validate_reads_a_pooled_mass_from_json_and_from_draws(pooled: dict, folder: Path) -> None:
     (folder / "pooled.json").write_text(json.dumps(pooled))
     from_json, from_draws = (read_stated_size(folder / name) for name in ("pooled.json", "post.nc"))
-    assert from_json.size_mm == pytest.approx(pooled["max_size_mm"]["median"])
-    assert from_draws.size_mm == pytest.approx(from_json.size_mm, rel=1e-6)
-    assert from_draws.low_mm == pytest.approx(from_json.low_mm, rel=1e-6)
+    assert from_json.median == pytest.approx(pooled["max_size_mm"]["median"])
+    assert from_draws.median == pytest.approx(from_json.median, rel=1e-6)
+    assert from_draws.low == pytest.approx(from_json.low, rel=1e-6)
 
 
 def test_the_order_of_the_maps_leaves_the_size(pooled: dict, folder: Path) -> None:

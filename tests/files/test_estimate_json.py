@@ -13,7 +13,8 @@ from in_process import run_here
 from repeated_exams import estimate_document
 
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.files.estimate_json import MOST_MM, REPORTS, checked_report
+from tactile_bayes.files.estimate_json import MOST_MM, checked_report
+from tactile_bayes.files.reports import REPORTS
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.report.svg import size_ruler
 

@@ -14,7 +14,8 @@ import pytest
 from map_files import read_grid
 
 from tactile_bayes.errors import BadDataError, UsageError
-from tactile_bayes.files.images import Picture, read_image
+from tactile_bayes.files.images import read_image
+from tactile_bayes.files.named_arrays import Grid
 
 A = np.arange(12).reshape(3, 4)
 _TYPES = {3: "H", 4: "I"}
@@ -90,7 +91,7 @@ def interleaved(*channels: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
     return np.stack(channels, axis=-1).reshape(3, -1)
 
 
-def picture(tmp_path: Path, data: bytes) -> Picture:
+def picture(tmp_path: Path, data: bytes) -> Grid:
     path = tmp_path / ("g.pgm" if data[:1] == b"P" else "g.png" if data[:1] == b"\x89" else "g.tif")
     path.write_bytes(data)
     return read_image(path)
@@ -173,7 +174,7 @@ READ: dict[str, tuple[bytes, Any]] = {
 
 @pytest.mark.parametrize(("data", "values"), READ.values(), ids=READ)
 def test_values_are_those_in_the_file(tmp_path: Path, data: bytes, values: Any) -> None:
-    np.testing.assert_array_equal(picture(tmp_path, data).values, values)
+    np.testing.assert_array_equal(picture(tmp_path, data).arrays["mean"], values)
 
 
 REFUSED: dict[str, tuple[bytes, str]] = {
@@ -241,7 +242,7 @@ def test_a_resolution_is_read_and_told_where_the_stated_spacing_differs(
     tmp_path: Path, tags: dict[int, Any], mm: float
 ) -> None:
     found = picture(tmp_path, tiff({"data": A.astype("u1").tobytes(), "tags": tags}))
-    assert found.spacing_mm == pytest.approx((mm, mm))
+    assert found.resolution_mm == pytest.approx((mm, mm))
     with pytest.raises(UsageError, match=rf"needs --spacing-mm.*its resolution says {mm:g} mm a pixel"):
         read_grid(tmp_path / "g.tif")
     assert read_grid(tmp_path / "g.tif", spacing_mm=1.0).recipe.cell_mm == 1.0
