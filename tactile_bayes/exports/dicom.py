@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,10 +75,10 @@ def study_of(identity: exam.Identity, maps: Sequence[exam.MapFile]) -> Study:
     return Study(identity, moment, content, study_uid, (__version__, *given))
 
 
-def add_study(dataset: Any, study: Study, facts: Mapping[str, str] | None = None) -> None:
+def add_study(dataset: Any, study: Study, source: exam.MapFile | None = None) -> None:
     """Write the modules of patient, study and equipment into a dataset; what nobody gave stays empty.
 
-    `facts`: of an image's exam, for the breast and its side; neither is written of a phantom.
+    `source`: of an image, for what it shows: the breast and its side, neither of a phantom.
     """
     identity = study.identity
     dataset.SpecificCharacterSet = UTF_8
@@ -102,10 +102,12 @@ def add_study(dataset: Any, study: Study, facts: Mapping[str, str] | None = None
     dataset.ManufacturerModelName = MODEL
     dataset.DeviceSerialNumber = NO_SERIAL_NUMBER
     dataset.SoftwareVersions = __version__
-    if facts is not None:
-        dataset.Laterality = laterality(facts)
+    if source is not None:
+        dataset.Laterality = laterality(source.facts)
         if dataset.Laterality:
             dataset.BodyPartExamined = "BREAST"
+        dataset.BurnedInAnnotation = "NO"  # nothing in it says who the patient is, nor when the exam was
+        dataset.RecognizableVisualFeatures = "NO"
 
 
 def coded(code: exam.Code) -> Any:
@@ -192,8 +194,6 @@ def map_picture(source: exam.MapFile, estimate: exam.EstimateFile | None) -> NDA
 
 # --- The map's figure as a DICOM Secondary Capture, which every viewer shows.
 
-PICTURE_SERIES: Final = 2
-
 
 def secondary_capture(source: exam.MapFile, estimate: exam.EstimateFile | None, *, study: Study, number: int) -> Any:
     """The figure as a Secondary Capture in red, green and blue.
@@ -210,7 +210,7 @@ def secondary_capture(source: exam.MapFile, estimate: exam.EstimateFile | None, 
         patient_orientation=("L", "F"),
         study_instance_uid=study.study_uid,
         series_instance_uid=study.uid("series of pictures"),
-        series_number=PICTURE_SERIES,
+        series_number=2,
         sop_instance_uid=study.uid("picture", source.digest, digest),
         instance_number=number,
         manufacturer=MANUFACTURER,
@@ -219,11 +219,9 @@ def secondary_capture(source: exam.MapFile, estimate: exam.EstimateFile | None, 
         content_date=study.content.date,
         content_time=study.content.time,
     )
-    add_study(dataset, study, source.facts)
+    add_study(dataset, study, source)
     if source.tactile_map.patient_from_plane is None:
         dataset.PatientOrientation = ""
-    dataset.BurnedInAnnotation = "NO"  # nothing in it says who the patient is, nor when the exam was
-    dataset.RecognizableVisualFeatures = "NO"
     dataset.ImageComments = f"{RESEARCH_USE} SHA-256 of the map: {source.digest}"
     return dataset
 
@@ -253,38 +251,38 @@ def image_plane(tactile_map: TactileMap, transform: FloatArray) -> tuple[FloatAr
 # --- A map as a DICOM Parametric Map: float values, with their place in the patient where it is known.
 
 PARAMETRIC_MAP: Final = "1.2.840.10008.5.1.4.1.1.30"
-MAP_SERIES: Final = 1
 POSTURES: Final = ("supine", "oblique", "sitting")  #: Of a person; a phantom has no patient's coordinates.
 _IMAGE_TYPE: Final = ["DERIVED", "PRIMARY", "VOLUME", "QUANTITY"]
 
 
-def frame_of_reference(source: exam.MapFile) -> str | None:
-    """Identifier of the map's own coordinates in the patient; None where they are not known.
+class Place(NamedTuple):
+    """A map's own coordinates in the patient."""
 
-    They are known with landmarks, in a posture of a person. They are the map's own: no other image shares them, not
-    even another map of the exam, because the third axis follows the normal of the scanned skin.
+    reference: str  #: Identifier of its frame of reference.
+    transform: FloatArray  #: (4, 4) from its plane to L, P, S in mm.
+
+
+def place_of(source: exam.MapFile) -> Place | None:
+    """The map's coordinates in the patient, known with landmarks, in a posture of a person; None where they are not.
+
+    They are the map's own: no other image shares them, not even another map of the exam, because the third axis follows
+    the normal of the scanned skin.
     """
-    if source.tactile_map.patient_from_plane is None or source.facts.get("posture") not in POSTURES:
+    transform = exam.lps_from_plane(source.tactile_map)
+    if transform is None or source.facts.get("posture") not in POSTURES:
         return None
-    return exam.content_uid("frame of reference", source.digest)
+    return Place(exam.content_uid("frame of reference", source.digest), transform)
 
 
-def parametric_map(source: exam.MapFile, *, study: Study, number: int) -> Any:
+def parametric_map(source: exam.MapFile, place: Place, *, study: Study, number: int) -> Any:
     """The map's means as a Parametric Map of one frame that faces the viewer as the program's pictures do.
 
-    Cells without data are NaN, which is also the padding value. A Parametric Map must lie in a frame of reference, so a
-    map without a place in the patient cannot be one.
-
-    `number`: of the instance in its series, from 1.
+    Cells without data are NaN, which is also the padding value. `number`: of the instance in its series, from 1.
     """
-    reference = frame_of_reference(source)
-    transform = exam.lps_from_plane(source.tactile_map)
-    if reference is None or transform is None:
-        raise ValueError("the map's place in the patient is not known")
-    values, directions, corner_mm = image_plane(source.tactile_map, transform)
+    values, directions, corner_mm = image_plane(source.tactile_map, place.transform)
     pydicom = exam.required("pydicom")
     dataset = pydicom.Dataset()
-    add_study(dataset, study, source.facts)
+    add_study(dataset, study, source)
     if dataset.Laterality:
         del dataset.Laterality  # the frame has it, and it must not be said twice
     declare_scheme(dataset)
@@ -292,9 +290,9 @@ def parametric_map(source: exam.MapFile, *, study: Study, number: int) -> Any:
     dataset.SOPInstanceUID = study.uid("parametric map", source.digest)
     dataset.Modality = "OT"
     dataset.SeriesInstanceUID = study.uid("series of parametric maps")
-    dataset.SeriesNumber, dataset.InstanceNumber = MAP_SERIES, number
+    dataset.SeriesNumber, dataset.InstanceNumber = 1, number
     dataset.SeriesDescription = f"Tactile map. {RESEARCH_USE}"
-    dataset.FrameOfReferenceUID = reference
+    dataset.FrameOfReferenceUID = place.reference
     dataset.PositionReferenceIndicator = "XIPHOID"
     _add_content(dataset, source, values)
     dataset.SharedFunctionalGroupsSequence = [_shared_groups(source, values, directions)]
@@ -326,8 +324,6 @@ def _add_content(dataset: Any, source: exam.MapFile, values: FloatArray) -> None
     dataset.ContentDescription = source.tactile_map.recipe.value_words[:64]
     dataset.ContentCreatorName = ""
     dataset.ContentQualification = "RESEARCH"
-    dataset.BurnedInAnnotation = "NO"
-    dataset.RecognizableVisualFeatures = "NO"
     dataset.LossyImageCompression = "00"
     dataset.PresentationLUTShape = "IDENTITY"
     dataset.AcquisitionContextSequence = []
@@ -389,7 +385,6 @@ def _decimal(value: float) -> str:
 
 # --- An estimate as a DICOM Comprehensive 3D SR by TID 1500: one measurement group per mass.
 
-REPORT_SERIES: Final = 3
 _MM: Final = exam.Code("mm", "UCUM", "millimeter")
 _PERCENT: Final = exam.Code("%", "UCUM", "percent")
 
@@ -418,7 +413,7 @@ def structured_report(
         evidence=evidence,
         content=report[0],
         series_instance_uid=study.uid("series of reports"),
-        series_number=REPORT_SERIES,
+        series_number=3,
         sop_instance_uid=study.uid("report", estimate.digest, *sorted(one.digest for one in maps)),
         instance_number=1,
         manufacturer=MANUFACTURER,
@@ -486,13 +481,11 @@ def _sites(estimate: exam.EstimateFile, maps: Sequence[exam.MapFile]) -> list[An
 
 def _region(finding: exam.SizedMass, maps: Sequence[exam.MapFile]) -> Any | None:
     """The lump's centre as a point in the map's frame of reference; of one map whose place is known."""
-    if len(maps) != 1 or finding.centre_mm is None:
+    place = place_of(maps[0]) if len(maps) == 1 else None
+    if place is None or finding.centre_mm is None:
         return None
-    reference, transform = frame_of_reference(maps[0]), exam.lps_from_plane(maps[0].tactile_map)
-    if reference is None or transform is None:
-        return None
-    centre = exam.on_plane(transform, finding.centre_mm)
-    return exam.required("highdicom").sr.ImageRegion3D("POINT", np.array([centre]), reference)
+    centre = exam.on_plane(place.transform, finding.centre_mm)
+    return exam.required("highdicom").sr.ImageRegion3D("POINT", np.array([centre]), place.reference)
 
 
 def _measurements(finding: exam.SizedMass, evidence: Sequence[Any]) -> Iterator[Any]:
@@ -539,7 +532,7 @@ def _comment(text: str) -> Any:
 
 # --- An exam as DICOM files: each map's values and picture, and the report of the estimate.
 
-VALUES, PICTURE, REPORT = "map", "picture", "report"
+VALUES: Final = "map"
 
 
 def dicom_files(
@@ -556,13 +549,13 @@ def dicom_files(
     study = study_of(identity, maps)
     numbered = [(f"_{i}" if len(maps) > 1 else "", i, one) for i, one in enumerate(maps, start=1)]
     objects = {
-        f"{VALUES}{suffix}.dcm": parametric_map(one, study=study, number=number)
+        f"{VALUES}{suffix}.dcm": parametric_map(one, place, study=study, number=number)
         for suffix, number, one in numbered
-        if frame_of_reference(one) is not None
+        if (place := place_of(one)) is not None
     }
     for suffix, number, one in numbered:
-        objects[f"{PICTURE}{suffix}.dcm"] = secondary_capture(one, estimate, study=study, number=number)
+        objects[f"picture{suffix}.dcm"] = secondary_capture(one, estimate, study=study, number=number)
     if estimate is not None:
         evidence = list(objects.values())
-        objects[f"{REPORT}.dcm"] = structured_report(estimate, maps, evidence=evidence, study=study)
+        objects["report.dcm"] = structured_report(estimate, maps, evidence=evidence, study=study)
     return {name: dicom_bytes(dataset) for name, dataset in objects.items()}

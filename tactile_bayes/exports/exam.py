@@ -395,16 +395,6 @@ class Identity(IdentityOptions):
         """When the content was made: by default when the exam was."""
         return Moment.of(self.content_date, name="content_date") if self.content_date else self.study
 
-    def with_options(self, options: Mapping[str, str]) -> Identity:
-        """The identity with what the command line gives besides."""
-        for name, value in options.items():
-            known = getattr(self, name)
-            if known and known != value:
-                raise UsageError(
-                    f"{name} is {_short(value)} by the option and {_short(known)} in the worklist; leave one out"
-                )
-        return replace(self, **dict(options))
-
 
 def _check_text(name: str, value: str) -> None:
     if _REPLACED in value:
@@ -443,8 +433,15 @@ _TAG: Final = re.compile(r"[0-9A-Fa-f]{8}")
 
 
 def identity_of(worklist: Path | None, given: Mapping[str, Any]) -> Identity:
-    """The identity that a worklist gives, where there is one, with what is given besides."""
-    return Identity(**given) if worklist is None else read_worklist(worklist).with_options(given)
+    """The identity that a worklist gives, where there is one, with what the command line gives besides."""
+    found = Identity() if worklist is None else read_worklist(worklist)
+    for name, value in given.items():
+        known = getattr(found, name)
+        if known and known != value:
+            raise UsageError(
+                f"{name} is {_short(value)} by the option and {_short(known)} in the worklist; leave one out"
+            )
+    return replace(found, **given)
 
 
 def read_worklist(path: Path) -> Identity:

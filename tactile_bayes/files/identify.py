@@ -15,7 +15,6 @@ from tactile_bayes.errors import BadDataError, in_file
 from tactile_bayes.files import scan_mcap
 from tactile_bayes.files.documents import load_json, load_schema, parse_json
 from tactile_bayes.files.map_nc import read_map_and_header
-from tactile_bayes.files.mcap_records import McapRecords
 from tactile_bayes.files.netcdf import Group, open_netcdf
 from tactile_bayes.files.reading import HDF5_MAGIC, MCAP_MAGIC, first_bytes, is_json
 from tactile_bayes.files.size_json import read_repeatability, read_size_calibration
@@ -222,13 +221,15 @@ def _scan(path: Path) -> dict[str, Any]:
     """
     records = scan_mcap.scan_records(path, keep=())
     with in_file(path):
-        return _summary(records)
-
-
-def _summary(records: McapRecords) -> dict[str, Any]:
-    head = scan_mcap.attached(records, HeadGeometry, "head.json")
-    time_s = scan_mcap.message_times(records.messages("/pressure", schema="foxglove.Grid"), topic="/pressure")
-    pose_s = scan_mcap.message_times(records.messages("/pose", schema="foxglove.PoseInFrame"), topic="/pose")
+        head = scan_mcap.attached(records, HeadGeometry, "head.json")
+        time_s = scan_mcap.message_times(records.messages("/pressure", schema="foxglove.Grid"), topic="/pressure")
+        pose_s = scan_mcap.message_times(records.messages("/pose", schema="foxglove.PoseInFrame"), topic="/pose")
+        touches = {
+            name: len(records.messages("/landmark", schema="foxglove.PoseInFrame", name=name))
+            for name in (*scan_mcap.LANDMARK_NAMES, scan_mcap.NIPPLE)
+        }
+        findings = with_times(scan_mcap.file_findings(records), Span.of(time_s), Span.of(pose_s))
+        provenance = scan_mcap.provenance_of(records)
     account = records.metadata.get("recording", {})
     span_s = float(time_s[-1] - time_s[0]) if len(time_s) else 0.0
     topics = records.topic_counts()
@@ -236,23 +237,19 @@ def _summary(records: McapRecords) -> dict[str, Any]:
         "schema": scan_mcap.SCAN_SCHEMA,
         "kind": "scan",
         "complete": records.finished and not records.lost,
-        "findings": finding_lines(with_times(scan_mcap.file_findings(records), Span.of(time_s), Span.of(pose_s))),
+        "findings": finding_lines(findings),
         "frames": len(time_s),
         "taxels": list(head.shape),
         "poses": len(pose_s),
         "duration_s": span_s,
         "frame_rate_hz": (len(time_s) - 1) / span_s if span_s > 0 else None,
         **_recording(account, topics, time_s),
-        "landmarks": all(_touched(records, name) for name in scan_mcap.LANDMARK_NAMES),
-        "nipple": _touched(records, scan_mcap.NIPPLE),
+        "landmarks": all(touches[name] for name in scan_mcap.LANDMARK_NAMES),
+        "nipple": touches[scan_mcap.NIPPLE] > 0,
         "units": {"counts": "raw, 0 to saturation", "pressure": "kPa", "position": "mm", "time": "s"},
         "session": dict(records.metadata.get("session", {})),
-        "provenance": scan_mcap.provenance_of(records),
+        "provenance": provenance,
     }
-
-
-def _touched(records: McapRecords, name: str) -> bool:
-    return len(records.messages("/landmark", schema="foxglove.PoseInFrame", name=name)) > 0
 
 
 def _recording(account: Mapping[str, str], topics: Mapping[str, int], time_s: FloatArray) -> dict[str, Any]:

@@ -78,20 +78,17 @@ def _source_of(error: BadDataError, sources: Sequence[Source]) -> str:
     return next((one.path for one in reversed(sources) if one.path and same & set(one.arrays)), sources[0].path)
 
 
-def _over(given: Stated, said: Stated) -> Stated:
-    """What is stated by the caller, and otherwise by a file."""
+def _over(given: Stated, said: Stated) -> tuple[Stated, list[str]]:
+    """What is stated by the caller, and otherwise by a file, and a line for each thing that they say otherwise."""
+    ours = {name: value for name in names_of(Stated) if (value := getattr(given, name)) is not None}
+    told = [
+        f"{name.replace('_', '-')} {value} as stated, where the file says {theirs}"
+        for name, value in ours.items()
+        if (theirs := getattr(said, name)) not in (None, value)
+    ]
     if given.unit not in (None, said.unit):
         said = replace(said, saturation=None)  # in the file's unit
-    return replace(said, **{name: value for name in names_of(Stated) if (value := getattr(given, name)) is not None})
-
-
-def _overridden(given: Stated, said: Stated) -> list[str]:
-    """A line for each thing that the caller states and a file says otherwise."""
-    return [
-        f"{name.replace('_', '-')} {ours} as stated, where the file says {theirs}"
-        for name in names_of(Stated)
-        if None not in (ours := getattr(given, name), theirs := getattr(said, name)) and ours != theirs
-    ]
+    return replace(said, **ours), told
 
 
 def _read(path: Path, given: ArrayMap, beside: Sequence[Source]) -> Source:
@@ -190,8 +187,8 @@ def combined(sources: Sequence[Source], given: Stated) -> Imported:
     told: list[str] = []
     held: Arrays = {}
     for source in sources:
-        told += [*_overridden(given, source.stated), *source.notes]
-        stated = _over(stated, source.stated)
+        told += [*_over(given, source.stated)[1], *source.notes]
+        stated, _ = _over(stated, source.stated)
         held |= {name: np.asarray(one) for name, one in source.arrays.items()}
     _leave_out_gaps(held, stated, told)
     _check_numbers(held)
@@ -517,7 +514,7 @@ def _check_pitch(surface: np.ndarray[Any, Any], pitch_mm: float) -> None:
 def _scan(arrays: Arrays, facts: Mapping[str, str]) -> Scan:
     values = {name: np.asarray(array, dtype=np.float64) for name, array in arrays.items() if name != "counts"}
     check_rigid(values["array_from_tracker"], name="array_from_tracker")
-    landmarks = values.get("landmarks_mm")
+    marks = values.get("landmarks_mm")
     return Scan(
         frames=PressureFrames(values["frame_time_s"], arrays["counts"].astype(np.uint16)),
         poses=TrackerPoses(values["pose_time_s"], values["position_mm"], values["quaternion_wxyz"]),
@@ -525,8 +522,6 @@ def _scan(arrays: Arrays, facts: Mapping[str, str]) -> Scan:
         element_calibration=ElementCalibration(
             values["gain_kpa_per_count"], values["offset_kpa"], int(values.get("saturation_count", 4095))
         ),
-        landmarks=None
-        if landmarks is None
-        else Landmarks(landmarks[0], landmarks[1], nipple_mm=values.get("nipple_mm")),
+        landmarks=None if marks is None else Landmarks(marks[0], marks[1], nipple_mm=values.get("nipple_mm")),
         session={"source": "imported", **facts},
     )

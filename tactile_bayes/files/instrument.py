@@ -14,22 +14,7 @@ from tactile_bayes.errors import BadDataError, in_file
 from tactile_bayes.files.atomic import write_text
 from tactile_bayes.files.documents import dump_json, load_json, parse_record, parse_toml, read_record
 from tactile_bayes.files.reading import TOML_BYTES, read_text
-from tactile_bayes.forward.scene import (
-    FLAT_MM,
-    Background,
-    Columns,
-    Head,
-    Lump,
-    Noise,
-    Pitch,
-    Rows,
-    Scene,
-    SceneLandmarks,
-    Strokes,
-    Taxels,
-    Timing,
-    Tracker,
-)
+from tactile_bayes.forward import scene as scenes
 from tactile_bayes.forward.tissue import DepthRatio, Height, Rib, SceneBody, Seat, SolidLump, Stiffness
 from tactile_bayes.geometry import Matrix
 from tactile_bayes.scans import ElementCalibration, HeadGeometry, HeadShape, Landmarks
@@ -53,7 +38,7 @@ def calibration_document(calibration: ElementCalibration) -> dict[str, Any]:
 
 # --- Heads as JSON: places of the taxels, or their grid and arc, for `record` and for simulated bodies.
 
-_DEFAULT_RIM_MM: Final = Head().rim_mm
+_DEFAULT_RIM_MM: Final = scenes.Head().rim_mm
 # Taxels further than this from a regular grid on an arc make a head that the models do not have.
 _REGULAR_MM: Final = 0.05
 _WAY_OUT: Final = (
@@ -71,13 +56,13 @@ class HeadFile(Record, kw_only=True):
 
     schema: Literal["tactile-bayes/head/1"]
     note: str | None = None  #: Anything, for people.
-    pitch_mm: Pitch
+    pitch_mm: scenes.Pitch
     surface_mm: Annotated[list[TaxelRow], Meta(min_length=1, max_length=256)] | None = None
     """(rows, columns, 3) centres of the taxels in `scanhead`: origin at the apex, x across the head, y along it, z into
     the tissue. Or give rows, columns and radius_mm.
     """
-    rows: Rows | None = None
-    columns: Columns | None = None
+    rows: scenes.Rows | None = None
+    columns: scenes.Columns | None = None
     radius_mm: Radius | None = None
     """Radius of the arc across the head, mm, above half its width; null for a flat head."""
     shoulder_mm: Rounding = 0.0  #: Radius of rounded edges cut into the array across the head, mm.
@@ -113,7 +98,7 @@ def head_geometry(document: object, *, path: Path) -> HeadGeometry:
         return HeadGeometry(surface, file.pitch_mm, np.array(file.scanhead_from_tracker), day)
 
 
-def read_simulated_head(path: Path) -> Head:
+def read_simulated_head(path: Path) -> scenes.Head:
     """Read a head for the solid model, in which taxels form a regular grid on an arc, or on a plane."""
     file = _head_file(load_json(path, way_out=_WAY_OUT), path)
     with in_file(path):
@@ -131,16 +116,16 @@ def _head_file(document: object, path: Path) -> HeadFile:
     return file
 
 
-def _head_of(file: HeadFile) -> Head:
+def _head_of(file: HeadFile) -> scenes.Head:
     """The head as a grid on an arc, checked as a scene's; its taxels must be where the file has them."""
     surface_mm = None if file.surface_mm is None else np.array(file.surface_mm)
     grid = file if surface_mm is None else HeadShape.of(surface_mm, file.pitch_mm)
     assert grid.rows is not None
     assert grid.columns is not None
-    radius_mm = FLAT_MM if grid.radius_mm is None else grid.radius_mm
+    radius_mm = scenes.FLAT_MM if grid.radius_mm is None else grid.radius_mm
     rim = (0.0 if file.shoulder_mm else _DEFAULT_RIM_MM) if file.rim_mm is None else file.rim_mm
-    head = Head(grid.rows, grid.columns, file.pitch_mm, radius_mm, file.shoulder_mm, rim)
-    Scene(head=head)  # refuses what is no head
+    head = scenes.Head(grid.rows, grid.columns, file.pitch_mm, radius_mm, file.shoulder_mm, rim)
+    scenes.Scene(head=head)  # refuses what is no head
     if surface_mm is not None:
         away = (surface_mm - head.surface_mm()).reshape(-1, 3)
         apart = float(np.abs(away - away.mean(axis=0)).max())  # wherever a site puts the origin
@@ -211,7 +196,7 @@ _OF_TISSUE: Final = ("depth_ratio", "stiffness_ratio", "seat", "height_mm")
 _OF_BUMPS: Final = ("amplitude", "sigma_x_mm", "sigma_y_mm", "angle_deg")
 
 
-class LumpTable(Lump):
+class LumpTable(scenes.Lump):
     """One lump."""
 
     height_mm: Height | None = None
@@ -228,8 +213,8 @@ class SceneFile(Record):
     tissue.
     """
 
-    scene: Timing = field(default_factory=Timing)  #: Length and rates.
-    background: Background = field(default_factory=Background)
+    scene: scenes.Timing = field(default_factory=scenes.Timing)  #: Length and rates.
+    background: scenes.Background = field(default_factory=scenes.Background)
     """Mean pressure away from lumps, against time."""
     body: SceneBody | None = None
     lump: Annotated[tuple[LumpTable, ...], Meta(max_length=100)] = ()
@@ -238,35 +223,35 @@ class SceneFile(Record):
         tuple[Annotated[Rib, says("One rib.")], ...],
         says("Ribs for the solid model: rows of stiff balls along x, across the head.", max_length=10),
     ] = ()
-    strokes: Strokes = field(default_factory=Strokes)
+    strokes: scenes.Strokes = field(default_factory=scenes.Strokes)
     """Back and forth across the head, line after line along it."""
-    head: Head = field(default_factory=Head)  #: A section of a circular cylinder.
-    noise: Noise = field(default_factory=Noise)  #: Standard deviations of everything random.
-    tracker: Tracker = field(default_factory=Tracker)
+    head: scenes.Head = field(default_factory=scenes.Head)  #: A section of a circular cylinder.
+    noise: scenes.Noise = field(default_factory=scenes.Noise)  #: Standard deviations of everything random.
+    tracker: scenes.Tracker = field(default_factory=scenes.Tracker)
     """Where the tracker's base stands and how its sensor sits in the handle."""
-    taxels: Taxels = field(default_factory=Taxels)  #: Faulty elements as [row, column] from 0.
-    landmarks: SceneLandmarks = field(default_factory=SceneLandmarks)
+    taxels: scenes.Taxels = field(default_factory=scenes.Taxels)  #: Faulty elements as [row, column] from 0.
+    landmarks: scenes.SceneLandmarks = field(default_factory=scenes.SceneLandmarks)
     """Points touched before the scan, in the plane."""
 
 
-def read_scene(path: Path) -> Scene:
+def read_scene(path: Path) -> scenes.Scene:
     """Read a scene; missing keys take their defaults."""
     text = read_text(path, most=TOML_BYTES, way_out="give a scene as TOML")
     with in_file(path):
         return scene_of(parse_toml(text, way_out="see the scene in the documentation"))
 
 
-def scene_of(document: Mapping[str, Any]) -> Scene:
+def scene_of(document: Mapping[str, Any]) -> scenes.Scene:
     """A scene from plain data as its TOML holds; for the errors see `read_scene`."""
     file = from_plain(SceneFile, document)
     given = {name: getattr(file, name) for name in names_of(file)}
     bumps, tissue = _lumps(given.pop("lump"), document.get("lump", ()))
-    return Scene(**as_dict(given.pop("scene")), lumps=bumps, solid_lumps=tissue, ribs=given.pop("rib"), **given)
+    return scenes.Scene(**as_dict(given.pop("scene")), lumps=bumps, solid_lumps=tissue, ribs=given.pop("rib"), **given)
 
 
 def _lumps(
     tables: Sequence[LumpTable], given: Sequence[Mapping[str, Any]]
-) -> tuple[tuple[Lump, ...], tuple[SolidLump, ...]]:
+) -> tuple[tuple[scenes.Lump, ...], tuple[SolidLump, ...]]:
     """Lumps that are bumps, and lumps that are tissue, by the keys that the file gives."""
     bumps, tissue = [], []
     for i, (table, keys) in enumerate(zip(tables, given, strict=True)):
@@ -277,7 +262,7 @@ def _lumps(
             what = f"lump[{i}] gives {both[0]}, of a bump, and {solid[0]}, of tissue"
             raise BadDataError(what, way_out=f"leave out {', '.join(both)} or {', '.join(solid)}")
         if not solid:
-            bumps.append(Lump(**values))
+            bumps.append(scenes.Lump(**values))
             continue
         for key in ("d_mm", "depth_ratio"):
             if key not in keys:

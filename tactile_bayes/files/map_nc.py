@@ -34,23 +34,18 @@ from tactile_bayes.size.draws import SizePosterior
 SCHEMA: Final = "tactile-bayes/map/2"
 _WAY_OUT = "give a map this program wrote, or make it again with `tactile-bayes map`"
 
+_CELLS: Final = ("y", "x")
 # field of the map, whose variable has no _mm -> (type, dimensions, attributes for other programs)
 _FIELDS: dict[str, tuple[str, tuple[str, ...], dict[str, str]]] = {
     "y_mm": ("f8", ("y",), {"units": "mm", "axis": "Y", "long_name": "cell centres along the head"}),
     "x_mm": ("f8", ("x",), {"units": "mm", "axis": "X", "long_name": "cell centres across the head"}),
-    "mean": (
-        "f8",
-        ("y", "x"),
-        {"long_name": "mean of the readings in the cell", "ancillary_variables": "variance count"},
-    ),
+    "mean": ("f8", _CELLS, {"long_name": "mean of the readings in the cell", "ancillary_variables": "variance count"}),
     "variance": (
-        "f8",
-        ("y", "x"),
+        *("f8", _CELLS),
         {"long_name": "variance of the readings in the cell about their mean", "ancillary_variables": "count"},
     ),
     "count": (
-        "i8",
-        ("y", "x"),
+        *("i8", _CELLS),
         {"units": "1", "long_name": "readings in the cell", "standard_name": "number_of_observations"},
     ),
 }

@@ -181,20 +181,17 @@ def unreadable(path: Path, error: OSError) -> BadDataError:
 MCAP_MAGIC: Final = b"\x89MCAP0\r\n"
 HDF5_MAGIC: Final = b"\x89HDF\r\n\x1a\n"
 ZIP_MAGIC: Final = b"PK\x03\x04"
+_SCAN, _MAP, _ARCHIVE = "a scan", "a map or posterior (netCDF)", "an archive (.npz or a spreadsheet)"
+_IMAGE, _NETCDF_3 = "an image", "a netCDF-3 file"
 _BEGINNINGS = {
-    MCAP_MAGIC: "a scan",
-    HDF5_MAGIC: "a map or posterior (netCDF)",
-    ZIP_MAGIC: "an archive (.npz or a spreadsheet)",
-    b"\x89PNG": "an image",
-    b"II*\x00": "an image",
-    b"MM\x00*": "an image",
-    b"P5": "an image",
+    MCAP_MAGIC: _SCAN,
+    HDF5_MAGIC: _MAP,
+    ZIP_MAGIC: _ARCHIVE,
+    **dict.fromkeys((b"\x89PNG", b"II*\x00", b"MM\x00*", b"P5"), _IMAGE),
     b"%PDF": "a PDF",
     b"\x93NUMPY": "an array of numpy (.npy)",
     b"MATLAB 5.0 MAT-file": "a .mat",
-    b"CDF\x01": "a netCDF-3 file",
-    b"CDF\x02": "a netCDF-3 file",
-    b"CDF\x05": "a netCDF-3 file",
+    **dict.fromkeys((b"CDF\x01", b"CDF\x02", b"CDF\x05"), _NETCDF_3),
 }
 _SCHEMA = re.compile(rb'"schema"\s*:\s*"tactile-bayes/([a-z0-9-]+)/')
 _DOCUMENTS = {
@@ -207,18 +204,12 @@ _DOCUMENTS = {
     "plan": "a trial plan (JSON)",
 }
 _WAYS = {
-    ("a scan", "a map or posterior (netCDF)"): "build its map first: `tactile-bayes map {path} -o MAP.nc`",
-    ("an archive (.npz or a spreadsheet)", "a scan"): "bring it in first: `tactile-bayes import {path} -o SCAN.mcap`",
-    (
-        "an archive (.npz or a spreadsheet)",
-        "a map or posterior (netCDF)",
-    ): "bring it in first: `tactile-bayes import --help` says how",
-    ("an image", "a map or posterior (netCDF)"): "bring it in first: `tactile-bayes import {path} --as map -o MAP.nc`",
-    (
-        "a netCDF-3 file",
-        "a map or posterior (netCDF)",
-    ): "convert it to netCDF-4, for example `nccopy -k nc4 {path} NEW.nc`",
-    ("a map or posterior (netCDF)", "a scan"): "give the scan that the map was built from",
+    (_SCAN, _MAP): "build its map first: `tactile-bayes map {path} -o MAP.nc`",
+    (_ARCHIVE, _SCAN): "bring it in first: `tactile-bayes import {path} -o SCAN.mcap`",
+    (_ARCHIVE, _MAP): "bring it in first: `tactile-bayes import --help` says how",
+    (_IMAGE, _MAP): "bring it in first: `tactile-bayes import {path} --as map -o MAP.nc`",
+    (_NETCDF_3, _MAP): "convert it to netCDF-4, for example `nccopy -k nc4 {path} NEW.nc`",
+    (_MAP, _SCAN): "give the scan that the map was built from",
 }
 _LOOKED_AT = 4096
 
@@ -266,7 +257,6 @@ def not_a(path: Path, wanted: str, *, what: str, way_out: str) -> BadDataError:
 SCHEMES: Final = ("s3", "gs", "abfs")
 """Kinds of stores; `s3` is tried in the tests, each of the others needs its own package beside fsspec."""
 _ADDRESS: Final = re.compile(rf"({'|'.join(SCHEMES)})://[^/\s@:]+(/[^\x00-\x1f\x7f]*)?")
-_READ_BYTES: Final = 2**20
 
 
 def is_address(name: object) -> bool:
@@ -293,11 +283,8 @@ def version_of(address: str) -> str:
 
 def sha256_of(address: str) -> str:
     """Hex digest of a file's bytes, read as a stream; see `version_of` for the errors."""
-    digest = hashlib.sha256()
     with _of_store(address), _store(address).open(address, "rb") as file:
-        while data := file.read(_READ_BYTES):
-            digest.update(data)
-    return digest.hexdigest()
+        return str(hashlib.file_digest(file, "sha256").hexdigest())
 
 
 @contextlib.contextmanager

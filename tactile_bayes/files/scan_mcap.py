@@ -246,7 +246,6 @@ class ScanFile(Record, eq=False):
     complete: bool  #: The file was closed properly and nothing was lost.
     damaged: bool  #: A checksum failed: bytes changed after they were written. An unfinished file is not damaged.
     lost: tuple[str, ...]  #: One line a loss, for people.
-    topics: Mapping[str, int]  #: Messages read, by topic.
     provenance: Mapping[str, Any]  #: As `Provenance.as_dict` wrote it.
 
 
@@ -271,7 +270,6 @@ def read_scan_report(path: Path) -> ScanFile:
             complete=records.finished and not records.lost,
             damaged=records.damaged,
             lost=tuple(records.lost),
-            topics=records.topic_counts(),
             provenance=provenance_of(records),
         )
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from tactile_bayes.errors import BadDataError, UsageError
-from tactile_bayes.exports.exam import Identity, Moment, read_worklist
+from tactile_bayes.exports.exam import Identity, Moment, identity_of, read_worklist
 
 
 @pytest.mark.parametrize(
@@ -63,11 +63,12 @@ def test_what_dicom_cannot_hold_is_refused_with_its_name(name: str, value: str) 
     assert len(str(caught.value).splitlines()) == 1
 
 
-def test_an_option_that_contradicts_the_worklist_is_refused() -> None:
-    known = Identity(patient_id="A")
-    assert known.with_options({"patient_id": "A", "sex": "F"}).sex == "F"
+def test_an_option_that_contradicts_the_worklist_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "w.json"
+    path.write_text(json.dumps({"patient_id": "A"}))
+    assert identity_of(path, {"patient_id": "A", "sex": "F"}).sex == "F"
     with pytest.raises(UsageError, match="'B' by the option and 'A' in the worklist"):
-        known.with_options({"patient_id": "B"})
+        identity_of(path, {"patient_id": "B"})
 
 
 def test_plain_keys(tmp_path: Path) -> None:

@@ -109,7 +109,7 @@ def test_the_same_scan_gives_the_same_bytes(scan: Scan, whole: Path, tmp_path: P
 
 def test_the_report_counts_topics_and_names_the_maker(whole: Path) -> None:
     file = read_scan_report(whole)
-    assert file.topics == {"/landmark": 2, "/pose": 120, "/pressure": 200}
+    assert (len(file.scan.poses), len(file.scan.frames)) == (120, 200)
     assert file.complete
     assert not file.damaged
     assert file.lost == ()
