@@ -15,7 +15,7 @@ from tactile_bayes.api.settings import Settings
 from tactile_bayes.api.sized import Answer, SizedExam, SizeEstimate, check_one_mass, size_priors
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import CANNOT_SHOW, BadDataError, UsageError
-from tactile_bayes.files.map_nc import write_pooled
+from tactile_bayes.files.map_nc import write_posterior
 from tactile_bayes.files.provenance import Provenance, scans_of
 from tactile_bayes.files.reports import EstimateReport, MassReport, PooledReport
 from tactile_bayes.files.size_json import default_for, read_size_calibration, size_calibration_path
@@ -172,7 +172,7 @@ class PooledSize(SizedExam, eq=False, dict=True, kw_only=True):
     def write(self, path: Path, *, force: bool = False) -> None:
         """Write the draws of a size, with its report."""
         assert self.pooled.size is not None
-        write_pooled(path, self.pooled.size, provenance=self.provenance, report=self.pooled_report, force=force)
+        write_posterior(path, self.pooled.size, provenance=self.provenance, report=self.pooled_report, force=force)
 
     def exam(self) -> Exam:
         scans = self.provenance.scans

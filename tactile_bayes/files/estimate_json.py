@@ -12,13 +12,7 @@ from tactile_bayes.errors import BadDataError, in_file
 from tactile_bayes.files.documents import load_json, parse_record
 from tactile_bayes.files.netcdf import open_netcdf
 from tactile_bayes.files.reading import first_bytes, is_json
-from tactile_bayes.files.reports import (
-    AnotherExam,
-    EstimateReport,
-    Interval,
-    MassReport,
-    PooledReport,
-)
+from tactile_bayes.files.reports import AnotherExam, EstimateReport, Interval, MassReport, PooledReport
 from tactile_bayes.files.tables import Table
 from tactile_bayes.findings import verdict
 from tactile_bayes.inference.draws import Quantity

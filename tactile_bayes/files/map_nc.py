@@ -207,48 +207,20 @@ _OF_A_SIZE: Final = ("d_x_mm", "d_y_mm", "max_size_mm", "min_size_mm")
 
 def write_posterior(
     path: Path,
-    estimate: Estimate,
+    found: Estimate | SizePosterior,
     *,
-    provenance: Provenance,
-    groups: Mapping[str, DrawGroup],
-    report: EstimateReport,
-    force: bool = False,
-) -> None:
-    """Write the draws of an estimate atomically; equal draws give equal bytes, see `grouped_netcdf_bytes`.
-
-    `groups` go beside the draws, see `inference_groups`; `report` is the estimate's, which `read_estimate` gives back.
-    A map without an estimate has no draws: a ValueError.
-    """
-    if estimate.map_posterior is None or estimate.draws is None:
-        raise ValueError("no estimate, so no posterior to write")
-    posterior = estimate.map_posterior
-    variables = {name: getattr(posterior, name) for name in _OF_A_MAP}
-    if estimate.size is not None:
-        variables |= {name: getattr(estimate.size, name) for name in _OF_A_SIZE}
-    figures = {} if estimate.diagnostics is None else estimate.diagnostics.as_dict()
-    _write_draws(path, variables, estimate.draws.method, figures, provenance, report, groups, force=force)
-
-
-def write_pooled(
-    path: Path, size: SizePosterior, *, provenance: Provenance, report: PooledReport, force: bool = False
-) -> None:
-    """Write the draws of a mass's size from several maps, with its report, atomically."""
-    variables = {name: np.atleast_2d(getattr(size, name)) for name in _OF_A_SIZE}
-    _write_draws(path, variables, "pooled", size.figures, provenance, report, {}, force=force)
-
-
-def _write_draws(
-    path: Path,
-    variables: Mapping[str, Any],
-    method: str,
-    figures: Mapping[str, Any],
     provenance: Provenance,
     report: EstimateReport | PooledReport,
-    groups: Mapping[str, DrawGroup],
-    *,
-    force: bool,
+    groups: Mapping[str, DrawGroup] | None = None,
+    force: bool = False,
 ) -> None:
-    """A file with groups as InferenceData has them: the (chain, draw) variables of the posterior, then the others."""
+    """Write the draws of an estimate, or of a mass's size from several maps, atomically; equal draws give equal bytes.
+
+    The file has groups as InferenceData has them: the (chain, draw) variables of the posterior, then `groups`, see
+    `inference_groups`; `report` is the estimate's, which `read_estimate` gives back. A map without an estimate has no
+    draws: a ValueError.
+    """
+    method, draws, figures = _draws_of(found)
     finite = {name: v for name, v in figures.items() if not isinstance(v, float) or math.isfinite(v)}
     attributes = {
         "schema": POSTERIOR_SCHEMA,
@@ -258,11 +230,22 @@ def _write_draws(
         "diagnostics": json.dumps(finite),
         "estimate": json.dumps(report.document),
     }
-    axes = ("chain", "draw")
-    draws = {name: (axes, np.asarray(values, dtype=np.float64)) for name, values in variables.items()}
-    held = {"posterior": Contents(_with_coordinates(draws), attributes)}
-    held |= {name: Contents(_with_coordinates(group.arrays), group.notes) for name, group in groups.items()}
+    on_axes = {name: (("chain", "draw"), np.asarray(values, dtype=np.float64)) for name, values in draws.items()}
+    held = {"posterior": Contents(_with_coordinates(on_axes), attributes)}
+    held |= {name: Contents(_with_coordinates(group.arrays), group.notes) for name, group in (groups or {}).items()}
     write_bytes(path, grouped_netcdf_bytes(held), force=force)
+
+
+def _draws_of(found: Estimate | SizePosterior) -> tuple[str, dict[str, FloatArray], Mapping[str, Any]]:
+    """The method, the (chain, draw) arrays by name, and the figures of the method."""
+    if isinstance(found, SizePosterior):
+        return "pooled", {name: np.atleast_2d(getattr(found, name)) for name in _OF_A_SIZE}, found.figures
+    if found.map_posterior is None or found.draws is None:
+        raise ValueError("no estimate, so no posterior to write")
+    draws = {name: getattr(found.map_posterior, name) for name in _OF_A_MAP}
+    if found.size is not None:
+        draws |= {name: getattr(found.size, name) for name in _OF_A_SIZE}
+    return found.draws.method, draws, {} if found.diagnostics is None else found.diagnostics.as_dict()
 
 
 def _with_coordinates(arrays: Mapping[str, tuple[tuple[str, ...], FloatArray]]) -> dict[str, Variable]:
@@ -285,7 +268,7 @@ class PosteriorDraws(Record, eq=False):
 
 
 def read_posterior(path: Path) -> PosteriorDraws:
-    """Read what `write_posterior` or `write_pooled` wrote."""
+    """Read what `write_posterior` wrote."""
     way_out = "give what `estimate` wrote with -o"
     with open_netcdf(path, way_out=way_out) as file:
         group = file.group("posterior")

@@ -32,7 +32,7 @@ from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, in_file
 from tactile_bayes.files.arrays_layout import Stated
 from tactile_bayes.files.named_arrays import Source
-from tactile_bayes.files.text_lines import NO_SENSEL, Line, TextTable, counts_up, number, read_text_table, unit_of_time
+from tactile_bayes.files.text_lines import NO_SENSEL, Line, counts_up, number, read_text_table, unit_of_time
 from tactile_bayes.geometry import FloatArray
 
 # --- Poses: columns by their names, or numbers in a stated layout.
@@ -81,10 +81,10 @@ _LARGEST_MM: Final = 1e7  # NDI writes -3.697314e28 where a tool is not seen
 def read_poses(path: Path, given: Stated) -> Source:
     """Read times, places and rotations; rows in which the tool is not seen are left out and counted."""
     with in_file(path):
-        table = read_text_table(path, given.decimal)
-        header = next((line for line in table.lines if is_header_of_poses(line)), None)
-        found = _bare(table, given) if header is None else _named(table, header, given)
-        return replace(found, notes=(f"poses: {table.words}", *found.notes))
+        lines, words = read_text_table(path, given.decimal)
+        header = next((line for line in lines if is_header_of_poses(line)), None)
+        found = _bare(lines, given) if header is None else _named(lines, header, given)
+        return replace(found, notes=(f"poses: {words}", *found.notes))
 
 
 def kind_of_column(name: str) -> str:
@@ -149,7 +149,7 @@ def chosen(names: Sequence[str], given: Stated, *, what: str) -> str:
 # --- Columns by their names.
 
 
-def _named(table: TextTable, header: Line, given: Stated) -> Source:
+def _named(lines: Sequence[Line], header: Line, given: Stated) -> Source:
     kinds = [kind_of_column(name) for name in header.fields]
     if "qx" not in kinds:
         for i, kind in enumerate(kinds):
@@ -165,7 +165,7 @@ def _named(table: TextTable, header: Line, given: Stated) -> Source:
         raise BadDataError(what, way_out=way_out)
     if given.pose_layout not in (None, layout):
         raise BadDataError(f"line {header.number} names its rotations ({layout})", way_out="leave --pose-layout out")
-    rows = [line for line in table.lines if line.number > header.number]
+    rows = [line for line in lines if line.number > header.number]
     columns, rows = _of_one_tool(header, kinds, rows, names, given)
     order = (3, 4, 5, 0, 6, 7, 8, 1, 9, 10, 11, 2) if turned else range(len(names))  # rows of a matrix: R, then place
     numbers = np.column_stack([_values(rows, columns[names[i]]) for i in order])
@@ -174,7 +174,7 @@ def _named(table: TextTable, header: Line, given: Stated) -> Source:
     status = [_field(line, columns["status"]) for line in rows] if "status" in columns else [""] * len(rows)
     time, unit = _times(rows, columns, header, given)
     stated: dict[str, Any] = {"pose_time_unit": unit} if unit else {}
-    above = [line.text for line in table.lines if line.number < header.number]
+    above = [line.text for line in lines if line.number < header.number]
     lengths = [_UNIT.search(header.fields[columns["x"]].strip()), *map(_LENGTH_LINE.search, above)]
     if length := next((found[1].lower() for found in lengths if found), ""):
         stated["length_unit"] = _LENGTHS.get(length, length)
@@ -282,8 +282,8 @@ def _settled(values: FloatArray) -> FloatArray:
 # --- Numbers without names.
 
 
-def _bare(table: TextTable, given: Stated) -> Source:
-    rows = [line for line in table.lines if line.is_numbers and len(line.fields) > 1]
+def _bare(lines: Sequence[Line], given: Stated) -> Source:
+    rows = [line for line in lines if line.is_numbers and len(line.fields) > 1]
     width = max(Counter(len(line.fields) for line in rows).items(), key=lambda one: one[1])[0] if rows else 0
     values = np.array([line.values for line in rows if len(line.fields) == width], dtype=np.float64)
     if width > _MOST_NUMBERS:
@@ -308,7 +308,7 @@ def _bare(table: TextTable, given: Stated) -> Source:
     time, unit, told = _bare_times(before[keep], given, f"has {width} numbers a row")
     found = seen(time, numbers[keep], [""] * len(time), layout=layout, stated=unit)
     notes = [f"poses as {layout} from column {width - size + 1} on, times {told}"]
-    if lost := sum(line.number > rows[0].number for line in table.lines) + 1 - len(values):
+    if lost := sum(line.number > rows[0].number for line in lines) + 1 - len(values):
         notes.append(f"{lost} lines of other than {width} numbers left out as gaps")
     return replace(found, notes=(*notes, *found.notes))
 
@@ -368,8 +368,8 @@ _SAMPLED: Final = 50
 
 def read_frames(path: Path, given: Stated, *, shape: tuple[int, int] | None) -> Source:
     """Read frames and, where the text has them, times, unit and rate; `shape` is the head's, where it is known."""
-    table = read_text_table(path, given.decimal)
-    lines = _without_words(table.lines)
+    lines, words = read_text_table(path, given.decimal)
+    lines = _without_words(lines)
     shape = given.frame_shape or shape
     if header := next((line for line in lines if is_header_of_poses(line) and len(line.fields) < _MOST_OF_POSES), None):
         what = f"is a table of poses by line {header.number}"
@@ -381,7 +381,7 @@ def read_frames(path: Path, given: Stated, *, shape: tuple[int, int] | None) -> 
         raise BadDataError(what, way_out="export the rows and columns without them, and give a head of these")
     before = [line for line in lines if line.number < blocks[0][0].number]
     stated, told = _said(before)
-    notes = [f"frames: {table.words}", *told]
+    notes = [f"frames: {words}", *told]
     for line in before:
         if len({name[:2].lower() for name in line.fields if _FIELD_NAME.fullmatch(name)}) == 3:
             what = f"is a log of magnetic fields by line {line.number} ({', '.join(line.fields[:4])})"

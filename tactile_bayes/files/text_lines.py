@@ -49,13 +49,6 @@ class Line(Record):
         return None not in self.values
 
 
-class TextTable(Record):
-    """A text in lines and fields."""
-
-    lines: list[Line]
-    words: str  #: How its fields are separated.
-
-
 def number(text: str, *, decimal_comma: bool = False) -> float:
     """A number, a time of day in s, or a date and time in s since 1970; NaN for no value, else a ValueError."""
     text = text.strip(_AROUND)
@@ -84,8 +77,8 @@ def read_lines(path: Path) -> list[str]:
     return text.removesuffix("\n").split("\n")
 
 
-def read_text_table(path: Path, decimal: str | None = None) -> TextTable:
-    """Read the lines of a text that are not blank; the separator is the one that makes numbers of them.
+def read_text_table(path: Path, decimal: str | None = None) -> tuple[list[Line], str]:
+    """The lines of a text that are not blank, and how their fields are separated: so that most of them are numbers.
 
     `decimal` is ``"point"`` or ``"comma"`` where it is stated, without which commas that may separate thousands are
     refused.
@@ -112,7 +105,7 @@ def read_text_table(path: Path, decimal: str | None = None) -> TextTable:
         Line(i, text, fields, [_value(one, decimal_comma=comma) for one in fields], after)
         for i, text, fields, after in split
     ]
-    return TextTable(lines, f"fields between {_SEPARATORS[separator]}{', decimal commas' if comma else ''}")
+    return lines, f"fields between {_SEPARATORS[separator]}{', decimal commas' if comma else ''}"
 
 
 def _value(text: str, *, decimal_comma: bool) -> float | None:
