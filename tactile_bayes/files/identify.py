@@ -27,14 +27,7 @@ from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.pooling import Calibration
 
 _UNITS = {"sigma": "mm", "d": "mm", "amplitude": "1 is the background"}
-_TABLES = (
-    "trial.table.json",
-    "excision.table.json",
-    "exams.table.json",
-    "population.table.json",
-    "size_table.table.json",
-    "phantom_maps.table.json",
-)
+_TABLES = ("trial", "excision", "exams", "population", "size_table", "phantom_maps")
 
 
 def describe(path: Path) -> dict[str, Any]:
@@ -196,13 +189,13 @@ def _table(path: Path, head: bytes) -> dict[str, Any]:
     except (UnicodeDecodeError, csv.Error):
         raise _foreign(path) from None
     for name in _TABLES:
-        schema = load_schema(name)
+        schema = load_schema(f"{name}.table.json")
         required = {f["name"] for f in schema["fields"] if f.get("constraints", {}).get("required")}
         if header and required <= set(header):
-            table = read_table(path, name)
+            table = read_table(path, f"{name}.table.json")
             filled = [n for n, values in table.columns.items() if any(v is not None for v in values)]
-            kind = name.split(".")[0].replace("_", " ")
-            return {"schema": schema.get("$id", name), "kind": f"table: {kind}", "rows": len(table), "columns": filled}
+            kind = f"table: {name.replace('_', ' ')}"
+            return {"schema": schema["$id"], "kind": kind, "rows": len(table), "columns": filled}
     raise _foreign(path)
 
 
