@@ -368,8 +368,8 @@ _SAMPLED: Final = 50
 
 def read_frames(path: Path, given: Stated, *, shape: tuple[int, int] | None) -> Source:
     """Read frames and, where the text has them, times, unit and rate; `shape` is the head's, where it is known."""
-    lines, words = read_text_table(path, given.decimal)
-    lines = _without_words(lines)
+    held, words = read_text_table(path, given.decimal)
+    lines = _without_words(held)
     shape = given.frame_shape or shape
     if header := next((line for line in lines if is_header_of_poses(line) and len(line.fields) < _MOST_OF_POSES), None):
         what = f"is a table of poses by line {header.number}"
