@@ -124,4 +124,4 @@ def calibrate_repeatability_action(folder: Path, output: Path, size_calibration:
         also_read(size_calibration_path(size_calibration))
     learned = learn_from_exams(exams_in(folder), size_calibration=size_calibration)
     learned.write(output, force=force)
-    click.echo(repeatability_text(learned.document), nl=False)
+    click.echo(repeatability_text(learned), nl=False)

@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
 from tactile_bayes.api.arguments import PathLike, door, output_path, required_path
-from tactile_bayes.declarations import Record, replace
+from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files import size_json
 from tactile_bayes.files.atomic import sha256
@@ -21,9 +21,10 @@ from tactile_bayes.files.provenance import Provenance, recordings, scans_of
 from tactile_bayes.files.reports import EstimateReport
 from tactile_bayes.files.tables import read_raw
 from tactile_bayes.inference.draws import Quantity, normal_quantile
+from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.learn.site import FEWEST_MASSES, PRIOR_LOG_SD, PRIOR_MEDIAN, RepeatedExams, learn_repeatability
-from tactile_bayes.size.pooling import Repeatability, log_size_alone
+from tactile_bayes.size.pooling import PROBABILITY, Repeatability, log_size_alone
 
 COMMAND: Final = "calibrate repeatability"
 _AGAIN: Final = "run the campaign again"
@@ -37,17 +38,6 @@ class ExamFolder(Record):
     mass: str
     """`of_mass`, `mass`: Names of the mass at this visit, and at any."""
     folder: Path  #: Which holds what its estimate left.
-
-
-class LearnedRepeatability(Record, eq=False):
-    """A repeatability and its JSON object, see data_schema/repeatability.schema.json."""
-
-    repeatability: Repeatability
-    document: dict[str, Any]
-
-    def write(self, path: Path, *, force: bool = False) -> None:
-        """Write the file that `estimate --repeatability` takes."""
-        size_json.write_repeatability(path, self.document, force=force)
 
 
 class _Repeat(Record, eq=False):
@@ -85,7 +75,7 @@ def exams_in(folder: Path) -> list[ExamFolder]:
 
 def learn_from_exams(
     exams: Sequence[ExamFolder], *, size_calibration: str | None = None, fewest: int | None = None
-) -> LearnedRepeatability:
+) -> size_json.RepeatabilityFile:
     """Learn the spread between exams of one mass from those that were repeated within a visit.
 
     Exams without a size, and those of a scan that another exam has, are left out. `size_calibration`: name or path of
@@ -103,12 +93,7 @@ def learn_from_exams(
         masses.append(RepeatedExams(first.of_mass, first.mass, values[:, 0], values[:, 1]))
     learned = learn_repeatability(masses, fewest=fewest or FEWEST_MASSES)
     assert calibration is not None
-    found = replace(
-        learned.repeatability,
-        calibration=Path(name).name,  # a file's folder may say whose it is
-        calibration_sha256=digest,
-        normalise=calibration.recipe.normalise,
-    )
+    found = learned.repeatability
     entries = [
         size_json.RepeatedMass(
             name=mass.name,
@@ -122,11 +107,19 @@ def learn_from_exams(
     settings = {"prior": {"median": PRIOR_MEDIAN, "log_sd": PRIOR_LOG_SD}}
     inputs = {f"draws_{i}": repeat.digest for i, repeat in enumerate(one_by_one, start=1)}
     provenance = Provenance(COMMAND, settings, {"size_calibration": digest, **inputs})
-    half_width = size_json.HalfWidth(**_half_widths(one_by_one, found.sd))
-    document = size_json.repeatability_document(
-        found, repeats=entries, left_out=left_out, half_width=half_width, provenance=provenance
+    shown = Path(name).name  # a file's folder may say whose it is
+    return size_json.RepeatabilityFile(
+        schema="tactile-bayes/repeatability/1",
+        research_use=RESEARCH_USE,
+        between_map_sd=found.sd,
+        probability=PROBABILITY,
+        calibration=size_json.UsedCalibration(shown, digest, calibration.recipe.normalise),
+        half_width=_half_widths(one_by_one, found.sd),
+        repeats=entries,
+        left_out=left_out,
+        provenance=provenance.as_dict(),
+        **{name: getattr(found, name) for name in size_json.SPREAD},
     )
-    return LearnedRepeatability(found, document)
 
 
 def _repeats(exams: Sequence[ExamFolder]) -> tuple[list[list[_Repeat]], list[str]]:
@@ -206,7 +199,7 @@ def _calibration(name: str, digest: str, given: str | None) -> BodyCalibration:
     return calibration
 
 
-def _half_widths(repeats: Sequence[_Repeat], sd: float) -> dict[str, float]:
+def _half_widths(repeats: Sequence[_Repeat], sd: float) -> size_json.HalfWidth:
     """Half width of a single exam's 95 % interval, as estimated and with this spread: medians over the exams.
 
     Each interval is taken as a normal of ln d, of which the spread that it was made with is a part.
@@ -218,8 +211,7 @@ def _half_widths(repeats: Sequence[_Repeat], sd: float) -> dict[str, float]:
         variance = (math.log(size.high / size.low) / (2.0 * score)) ** 2
         before.append(variance)
         after.append(max(variance - spread**2, 0.0) + sd**2)
-    names = {"as_estimated": before, "with_it": after}
-    return {name: math.expm1(1.96 * float(np.median(np.sqrt(values)))) for name, values in names.items()}
+    return size_json.HalfWidth(*(math.expm1(1.96 * float(np.median(np.sqrt(one)))) for one in (before, after)))
 
 
 @door
@@ -254,4 +246,4 @@ def calibrate_repeatability(
     learned = learn_from_exams(exams_in(required_path(folder, "folder")), size_calibration=given)
     if target is not None:
         learned.write(target, force=force)
-    return learned.repeatability
+    return learned.spread()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
@@ -18,7 +18,7 @@ from tactile_bayes.geometry import Matrix, Vector
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.size.bodies import BodyCalibration, BodyLaw
 from tactile_bayes.size.eq6 import COEFFICIENTS, AxisCalibration, SizeCalibration
-from tactile_bayes.size.pooling import PROBABILITY, Calibration, Repeatability
+from tactile_bayes.size.pooling import Calibration, Repeatability
 from tactile_bayes.size.terms import SiteShift
 
 # --- Size calibrations that come with the program, by name.
@@ -187,7 +187,7 @@ def parse_size_calibration(document: Any, *, path: Path) -> Calibration:
 
 # --- A site's repeatability as JSON.
 
-_SPREAD: Final = ("log_sd", "median", "low", "high", "masses", "maps", "outlying")
+SPREAD: Final = ("log_sd", "median", "low", "high", "masses", "maps", "outlying")
 """What the file and `Repeatability` call alike."""
 Sha256 = Annotated[str, Meta(pattern="^[0-9a-f]{64}$", extra={"words": "a SHA-256, 64 digits from 0 to f"})]
 
@@ -249,9 +249,9 @@ class RepeatabilityFile(Record, kw_only=True, omit_defaults=True):
     """inputs: the size calibration, and the draws of each exam (shape.npz), in the order of repeats"""
 
     def __post_init__(self) -> None:
-        _ = self.repeatability()  # refuses what is none
+        _ = self.spread()  # refuses what is none
 
-    def repeatability(self, digest: str = "") -> Repeatability:
+    def spread(self, digest: str = "") -> Repeatability:
         """The spread that a size uses, with the hash of the file it is from."""
         used = self.calibration
         return Repeatability(
@@ -260,41 +260,17 @@ class RepeatabilityFile(Record, kw_only=True, omit_defaults=True):
             calibration_sha256=used.sha256,
             normalise=used.normalise,
             sha256=digest,
-            **{name: getattr(self, name) for name in _SPREAD},
+            **{name: getattr(self, name) for name in SPREAD},
         )
 
-
-def repeatability_document(
-    found: Repeatability,
-    *,
-    repeats: Sequence[RepeatedMass],
-    left_out: Sequence[str],
-    half_width: HalfWidth | None,
-    provenance: Provenance,
-) -> dict[str, Any]:
-    """The JSON object, in nine significant digits; `left_out` are exams that took no part, with the reason."""
-    file = RepeatabilityFile(
-        schema="tactile-bayes/repeatability/1",
-        research_use=RESEARCH_USE,
-        between_map_sd=found.sd,
-        probability=PROBABILITY,
-        calibration=UsedCalibration(found.calibration, found.calibration_sha256, found.normalise),
-        half_width=half_width,
-        repeats=list(repeats),
-        left_out=list(left_out),
-        **{name: getattr(found, name) for name in _SPREAD},
-        provenance=provenance.as_dict(),
-    )
-    return dict(to_plain(file))
-
-
-def write_repeatability(path: Path, document: dict[str, Any], *, force: bool = False) -> None:
-    """Write the JSON object atomically, held against its declaration."""
-    parse_record(document, RepeatabilityFile, path=path)
-    write_text(path, dump_json(document), force=force)
+    def write(self, path: Path, *, force: bool = False) -> None:
+        """Write the file that `estimate --repeatability` takes, in nine significant digits, atomically."""
+        document = to_plain(self)
+        parse_record(document, RepeatabilityFile, path=path)
+        write_text(path, dump_json(document), force=force)
 
 
 def read_repeatability(path: Path) -> Repeatability:
-    """Read what `write_repeatability` wrote."""
+    """Read what `RepeatabilityFile.write` wrote."""
     found = read_record(path, RepeatabilityFile, way_out="give a file of `calibrate repeatability`")
-    return found.repeatability(sha256(path))
+    return found.spread(sha256(path))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from tactile_bayes.size.pooling import Calibration
 from tactile_bayes.size.terms import SiteShift
 
 if TYPE_CHECKING:
+    from tactile_bayes.files.size_json import RepeatabilityFile
     from tactile_bayes.size.learn.eq6 import OtherFit
 
 # --- A site's correction of a size calibration as text for people.
@@ -63,30 +64,29 @@ _MOST_NAMED: Final = 5
 FEW: Final = 5  #: Masses below which the report says that they are few.
 
 
-def repeatability_text(document: Mapping[str, Any]) -> str:
-    """Report of what repeated exams say of a site, see data_schema/repeatability.schema.json."""
-    calibration = document["calibration"]
-    median, low, high = (100 * document[name] for name in ("median", "low", "high"))
+def repeatability_text(site: RepeatabilityFile) -> str:
+    """Report of what repeated exams say of a site."""
+    median, low, high = (100 * one for one in (site.median, site.low, site.high))
     apart = [
-        f"{one['name']} (probability by chance {chance_text(one['by_chance'], 4)})"
-        for one in document["repeats"]
-        if one["name"] in document["outlying"]
+        f"{one.name} (probability by chance {chance_text(one.by_chance, 4)})"
+        for one in site.repeats
+        if one.name in site.outlying
     ]
     lead = "CAUTION: exams lie further apart than the other masses lead one to expect; look at the maps of"
     lines = _names(lead, apart)
-    if document["masses"] < FEW:
-        lines.append(f"CAUTION: {document['masses']} masses are few; the interval of the spread is wide.")
+    if site.masses < FEW:
+        lines.append(f"CAUTION: {site.masses} masses are few; the interval of the spread is wide.")
     lines += [
         f"Exams of one mass differ by {median:.1f} % at this site (95 %: {low:.1f} to {high:.1f}): SD of ln d beyond "
         "the errors that each map has anyway.",
-        f"Learned from {document['masses']} masses and {document['maps']} exams, sized by {calibration['name']} "
-        f"(frames normalised by {calibration['normalise']}). Maps of one mass in the paper differed by "
+        f"Learned from {site.masses} masses and {site.maps} exams, sized by {site.calibration.name} "
+        f"(frames normalised by {site.calibration.normalise}). Maps of one mass in the paper differed by "
         f"{100 * PAPER_SPREAD:.0f} %.",
     ]
-    if (half := document.get("half_width")) is not None:
-        ends = f"about +-{100 * half['with_it']:.0f} % of the size with it, +-{100 * half['as_estimated']:.0f} %"
+    if (half := site.half_width) is not None:
+        ends = f"about +-{100 * half.with_it:.0f} % of the size with it, +-{100 * half.as_estimated:.0f} %"
         lines.append(f"The 95 % interval of one exam: {ends} as estimated.")
-    lines += _names("Took no part", document["left_out"])
+    lines += _names("Took no part", site.left_out)
     lines.append("Use it: tactile-bayes estimate MAP.nc --repeatability SITE.json")
     return "\n".join([*lines, RESEARCH_USE]) + "\n"
 

@@ -27,7 +27,7 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_what_is_written_is_read(written: Path) -> None:
-    learned = learn_from_exams(exams_in(written.parent / "out")).repeatability
+    learned = learn_from_exams(exams_in(written.parent / "out")).spread()
     read = read_repeatability(written)
     assert read.sha256 == sha256(written)
     for name in ("sd", "log_sd", "median", "low", "high"):
