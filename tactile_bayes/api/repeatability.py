@@ -34,9 +34,8 @@ class ExamFolder(Record):
     """An exam that was estimated, of a mass at a visit."""
 
     name: str  #: Of the exam.
-    of_mass: str
-    mass: str
-    """`of_mass`, `mass`: Names of the mass at this visit, and at any."""
+    of_mass: str  #: Name of the mass at this visit.
+    mass: str  #: And at any.
     folder: Path  #: Which holds what its estimate left.
 
 
@@ -44,9 +43,8 @@ class _Repeat(Record, eq=False):
     """A repeated exam with a size."""
 
     exam: ExamFolder
-    calibration: str
+    calibration: str  #: That sized it, as its estimate names it.
     calibration_sha256: str
-    """`calibration`, `calibration_sha256`: That sized it, as its estimate names it."""
     scans: tuple[str, ...]
     """Recordings that it came from, as `recordings` names them; empty where its estimate does not say."""
     digest: str  #: Of the draws that pooling keeps.

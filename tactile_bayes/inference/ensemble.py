@@ -34,13 +34,15 @@ def chain_diagnostics(chains: FloatArray) -> dict[str, float]:
 
     Vehtari, Gelman, Simpson, Carpenter & Buerkner (2021), Bayesian Analysis 16:667.
     """
-    columns = [np.ascontiguousarray(chains[:, :, i]) for i in range(chains.shape[2])]
+    each = [_agreement(np.ascontiguousarray(chains[:, :, i])) for i in range(chains.shape[2])]
+    return {name: (max if name == "rhat" else min)(one[name] for one in each) for name in each[0]}
+
+
+def _agreement(draws: FloatArray) -> dict[str, float]:
+    """Rank-normalised split R-hat, and bulk and tail effective draws, of (chain, draw) draws."""
     arviz = _arviz()
-    return {
-        "rhat": float(max(arviz.rhat(column, method="rank") for column in columns)),
-        "ess_bulk": float(min(arviz.ess(column, method="bulk") for column in columns)),
-        "ess_tail": float(min(arviz.ess(column, method="tail") for column in columns)),
-    }
+    figures = {"rhat": float(arviz.rhat(draws, method="rank"))}
+    return figures | {f"ess_{part}": float(arviz.ess(draws, method=part)) for part in ("bulk", "tail")}
 
 
 def convergence(draws: FloatArray) -> dict[str, float]:
@@ -52,13 +54,8 @@ def convergence(draws: FloatArray) -> dict[str, float]:
     """
     known = np.where(np.isfinite(draws), draws, np.nanmin(draws))
     errors = {"mcse_median": 0.5, "mcse_low": 0.025, "mcse_high": 0.975}
-    arviz = _arviz()
-    return {
-        "rhat": float(arviz.rhat(known, method="rank")),
-        "ess_bulk": float(arviz.ess(known, method="bulk")),
-        "ess_tail": float(arviz.ess(known, method="tail")),
-        **{name: float(arviz.mcse(known, method="quantile", prob=at)) for name, at in errors.items()},
-    }
+    quantile = {name: float(_arviz().mcse(known, method="quantile", prob=at)) for name, at in errors.items()}
+    return _agreement(known) | quantile
 
 
 Arrays = Mapping[str, tuple[tuple[str, ...], FloatArray]]
@@ -117,9 +114,8 @@ class EnsembleOptions(Record):
     """Independent ensembles; walkers of one ensemble share their history, so R-hat compares ensembles."""
     block: int = 150  #: Steps between two looks at the diagnostics.
     max_steps: int = 6000  #: Give up after this many.
-    least_ess: float = 800.0
-    most_rhat: float = 1.01
-    """`least_ess`, `most_rhat`: Bulk and tail effective draws, and R-hat, that every parameter must reach."""
+    least_ess: float = 800.0  #: Bulk and tail effective draws that every parameter must reach.
+    most_rhat: float = 1.01  #: And R-hat.
     keep: int = 8000  #: Draws kept, thinned evenly over all ensembles.
 
     def identity(self) -> str:

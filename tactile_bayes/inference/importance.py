@@ -76,9 +76,8 @@ class Gaussians(Record, eq=False):
     """A mixture of Gaussians."""
 
     weight: FloatArray  #: (h,) array: Sum 1.
-    mean: FloatArray
-    covariance: FloatArray
-    """`mean`, `covariance` (h, p), (h, p, p) arrays."""
+    mean: FloatArray  #: (h, p) array.
+    covariance: FloatArray  #: (h, p, p) array.
 
     @classmethod
     def one(cls, mean: FloatArray, covariance: FloatArray) -> Gaussians:
@@ -258,9 +257,8 @@ class ImportanceOptions(Record):
 
     accuracy_sd: float = 0.02
     """Wanted Monte-Carlo error of the ends of a 95 % interval, in posterior standard deviations."""
-    first: int = 256
-    most: int = 16384
-    """`first`, `most`: Points of a replicate to begin with, and at most."""
+    first: int = 256  #: Points of a replicate to begin with.
+    most: int = 16384  #: And at most.
 
 
 def importance(

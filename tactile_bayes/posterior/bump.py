@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
@@ -61,24 +62,22 @@ def covariance_from_log_widths(p: FloatArray, q: FloatArray, r: FloatArray) -> F
     )
 
 
-def principal_widths(p: FloatArray, q: FloatArray, r: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def principal_widths(
+    p: FloatArray, q: FloatArray, r: FloatArray, *, first: Sequence[float] | FloatArray = (1.0, 0.0)
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Widths (mm) along the ellipse's own axes, and the angle of the first.
 
-    ``sigma_x_mm`` is the standard deviation along the axis within 45 degrees of x, ``sigma_y_mm`` the one at right
-    angles to it; ``angle_rad`` goes from x to the axis of ``sigma_x_mm``, in (-pi/4, pi/4], 0 for a round Gaussian.
+    ``sigma_x_mm`` is the standard deviation along the axis within 45 degrees of `first`, by default x, ``sigma_y_mm``
+    the one at right angles to it; ``angle_rad`` goes from x to the axis of ``sigma_x_mm``, 0 for a round Gaussian.
     """
-    ratio = np.hypot(q, r)
-    signed = np.where(q >= 0, ratio, -ratio)
-    angle = np.where(ratio > 0, 0.5 * np.arctan2(np.where(q >= 0, r, -r), np.abs(q)), 0.0)
-    return np.exp(p + signed), np.exp(p - signed), angle
+    ratio, sign = np.hypot(q, r), np.where(q * first[0] + r * first[1] >= 0, 1.0, -1.0)
+    angle = np.where(ratio > 0, 0.5 * np.arctan2(sign * r, sign * q), 0.0)
+    return np.exp(p + sign * ratio), np.exp(p - sign * ratio), angle
 
 
 def drawn_widths(p: FloatArray, q: FloatArray, r: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """The same of draws of one ellipse: ``sigma_x_mm`` is along the axis within 45 degrees of their `first_axis`."""
-    axis = first_axis(q, r)
-    ratio, sign = np.hypot(q, r), np.where(q * axis[0] + r * axis[1] >= 0, 1.0, -1.0)
-    angle = np.where(ratio > 0, 0.5 * np.arctan2(sign * r, sign * q), 0.0)
-    return np.exp(p + sign * ratio), np.exp(p - sign * ratio), angle
+    """The same of draws of one ellipse: the first width is along the axis that they all call x."""
+    return principal_widths(p, q, r, first=first_axis(q, r))
 
 
 # --- Cells to be fitted: candidates for a lump, and the window about one of them.
@@ -113,22 +112,25 @@ class FitCells(Record, eq=False):
     """The cells of one window, flattened."""
 
     x_mm: FloatArray
-    y_mm: FloatArray
-    """`x_mm`, `y_mm` (k,) arrays: Cell centres in `plane`."""
-    value: FloatArray
-    variance: FloatArray
-    count: FloatArray
-    """`value`, `variance`, `count` (k,) arrays: Mean, within-cell variance (NaN where it is not known) and number of
-    readings."""
+    y_mm: FloatArray  #: (k,) arrays: Cell centres in `plane`.
+    value: FloatArray  #: (k,) array: Mean of the readings.
+    variance: FloatArray  #: (k,) array: Within a cell; NaN where it is not known.
+    count: FloatArray  #: (k,) array: Number of readings.
     row: IndexArray
-    column: IndexArray
-    """`row`, `column` (k,) int arrays: Where the cells lie in the map's grid."""
+    column: IndexArray  #: (k,) int arrays: Where the cells lie in the map's grid.
     cell_mm: float  #: Side of a cell.
     pose_noise: PoseNoise | None = None
     """Tracker position error of the frames; None where the map does not give it."""
 
     def __len__(self) -> int:
         return len(self.value)
+
+    def on_grid(self, values: FloatArray) -> FloatArray:
+        """(..., ny, nx) smallest grid that contains the cells, of (..., k) values; 0 where there is no cell."""
+        row, column = self.row - self.row.min(), self.column - self.column.min()
+        grid = np.zeros((*values.shape[:-1], int(row.max()) + 1, int(column.max()) + 1))
+        grid[..., row, column] = values
+        return grid
 
     @property
     def reading_variance(self) -> float:

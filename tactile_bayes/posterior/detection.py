@@ -70,8 +70,7 @@ def error_model(cells: FitCells, *, jacobian: FloatArray, residual: FloatArray, 
     if not noise_variance > 0 or k <= p:
         return ErrorModel(float(np.sqrt(max(noise_variance, 0.0))), 1.0, float(dof))
     white = residual * np.sqrt(weight / noise_variance)
-    grid = _on_grid(cells, white)
-    correlation, half = residual_autocorrelation(*grid)
+    correlation, half = residual_autocorrelation(*cells.on_grid(np.stack([white, np.ones(k)])))
     root = jacobian * np.sqrt(weight)[:, None]
     information = inverse_information(jacobian, weight)
     if not np.isfinite(information).all():
@@ -95,16 +94,6 @@ def fitted_tilt(cells: FitCells, residual: FloatArray, *, weight: FloatArray) ->
 def level_offset(residual: FloatArray, *, weight: FloatArray) -> float:
     """Mean residual of the window: distance of the map's level from the assumed background."""
     return float(weight @ residual / weight.sum())
-
-
-def _on_grid(cells: FitCells, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Values on the smallest grid that contains the cells, and a mask of the cells."""
-    row, column = cells.row - cells.row.min(), cells.column - cells.column.min()
-    grid = np.zeros((int(row.max()) + 1, int(column.max()) + 1))
-    mask = np.zeros_like(grid)
-    grid[row, column] = values
-    mask[row, column] = 1.0
-    return grid, mask
 
 
 def residual_autocorrelation(grid: FloatArray, mask: FloatArray) -> tuple[FloatArray, int]:
@@ -138,17 +127,10 @@ def _correlate_columns(cells: FitCells, columns: FloatArray, correlation: FloatA
     """``C @ columns`` for the stationary correlation on the cells' grid."""
     if half == 0:
         return columns
-    row, column = cells.row - cells.row.min(), cells.column - cells.column.min()
-    ny, nx = int(row.max()) + 1, int(column.max()) + 1
-    size = (ny + 2 * half, nx + 2 * half)
-    kernel = np.fft.rfft2(correlation, size)
-    out = np.empty_like(columns)
-    for j in range(columns.shape[1]):
-        grid = np.zeros((ny, nx))
-        grid[row, column] = columns[:, j]
-        full = np.fft.irfft2(np.fft.rfft2(grid, size) * kernel, size)
-        out[:, j] = full[half : half + ny, half : half + nx][row, column]
-    return out
+    grid = cells.on_grid(columns.T)
+    size = (grid.shape[1] + 2 * half, grid.shape[2] + 2 * half)
+    full = np.fft.irfft2(np.fft.rfft2(grid, size) * np.fft.rfft2(correlation, size), size)
+    return full[:, cells.row - cells.row.min() + half, cells.column - cells.column.min() + half].T
 
 
 # --- Detection of a lump: evidence for a bump against noise alone, over the whole map.

@@ -126,13 +126,11 @@ class NoiseFigures(Record):
 class Diagnostics(Record):
     """Diagnostics of an estimate."""
 
-    cells: int
-    covered_share: float
-    """`cells`, `covered_share`: Cells in the fit window, and the share of it that they cover."""
+    cells: int  #: In the fit window.
+    covered_share: float  #: Of the window, by these.
     fat_mm: float | None  #: Depth of fat that the size is for; None where the map does not give it.
-    method: str
-    sampler: Mapping[str, float]
-    """`method`, `sampler`: The method that drew, and its own figures."""
+    method: str  #: The method that drew.
+    sampler: Mapping[str, float]  #: Its own figures.
     noise: NoiseFigures
     calibration: str = ""  #: Name of the calibration that gave the size, in words; not in the JSON.
     size_calibration: str = ""  #: Which calibration gave the size and what it cannot know, in words.
@@ -176,8 +174,7 @@ class Sampled(Record, eq=False):
 
     log_density: LogDensity  #: (m,) of (m, k) parameters of the bump.
     mean: FloatArray
-    covariance: FloatArray
-    """`mean`, `covariance` (k,), (k, k) arrays: About, for the density."""
+    covariance: FloatArray  #: (k,), (k, k) arrays: About those of the density.
     parts: Gaussians | None = None
     """A Gaussian for each noise field, also for those with little share of the density at the mode: under strongly
     correlated errors the widths are less certain, so that a field with 0.3 % of the density there had 4 % of the

@@ -43,10 +43,8 @@ class FieldFit(Record, eq=False, dict=True):
     """A scene fitted at the mode of its marginal posterior."""
 
     target: CollapsedTarget  #: Its density, with the noise fields that matter there.
-    mode: FloatArray
-    covariance: FloatArray
-    """`mode`, `covariance` (p,), (p, p) arrays: Of the scene's parameters; the covariance is the mixture's, not the
-    curvature at the mode."""
+    mode: FloatArray  #: (p,) array: The scene's parameters.
+    covariance: FloatArray  #: (p, p) array: The mixture's, not the curvature at the mode.
     mixture: Mixture  #: One Gaussian per noise field.
 
     @property

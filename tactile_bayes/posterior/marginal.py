@@ -401,11 +401,14 @@ class CollapsedTarget:
         """Log Bayes factor of a slope against none at one shape: the Savage-Dickey ratio of its components at 0."""
         (solution,) = self._solutions(theta[None])
         weight = solution.evidence[0] - np.logaddexp.reduce(solution.evidence[0])
+        # level and tilt at amplitudes of 0, and their covariance over tau^2 given the amplitudes
+        inverse, c = np.concatenate([one.inverse for one in self.fields]), len(self.linear.plain) - 1
+        level = np.concatenate([np.einsum("hcd,hd->hc", one.inverse, one.gram[:, :c, c]) for one in self.fields])
         slope = solution.level_slope[0][:, :, 1:3]
-        mean = solution.level[:, 1:3] - np.einsum("hv,hvc->hc", solution.amplitude[0], slope)
+        mean = level[:, 1:3] - np.einsum("hv,hvc->hc", solution.amplitude[0], slope)
         spread = np.einsum("hvc,hvw,hwd->hcd", slope, np.linalg.inv(solution.power[0]), slope)
         tau2 = solution.sum_of_squares[0] / self.dof
-        covariance = tau2[:, None, None] * (solution.level_covariance[:, 1:3, 1:3] + spread)
+        covariance = tau2[:, None, None] * (inverse[:, 1:3, 1:3] + spread)
         square = np.einsum("hc,hcd,hd->h", mean, np.linalg.inv(covariance), mean)
         at_zero = -0.5 * (square + np.linalg.slogdet(covariance)[1]) - np.log(2.0 * np.pi)
         prior = -np.log(2.0 * np.pi * (self.problem.prior.tilt_sd * self.problem.amplitude_scale) ** 2)

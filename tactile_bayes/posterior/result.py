@@ -34,9 +34,8 @@ TAIL = 0.025
 class Sensitivity(Record):
     """Effect of doubling the width prior's SD, in posterior SDs."""
 
-    median: Mapping[str, float]
-    ends: Mapping[str, float]
-    """`median`, `ends`: By quantity: shift of the median, and the larger shift of the two ends of the 95 % interval."""
+    median: Mapping[str, float]  #: Shift of the median by quantity.
+    ends: Mapping[str, float]  #: The larger shift of the two ends of the 95 % interval.
     pareto_k: float  #: Shape of the weights; above 0.7 the shifts are not to be trusted.
 
 
@@ -82,35 +81,26 @@ class Estimate(Record, eq=False):
     """The answer for one map."""
 
     status: Status
-    reason: str
-    """`status`, `reason`: ``"estimate"``, or ``"no_estimate"`` and why. With an estimate the reason says what is
-    missing from it, if anything."""
+    reason: str  #: Why there is no estimate, or what is missing from one, if anything.
     detection: Detection | None = None  #: None when no bump could be tested.
     fit: BumpFit | None = None
     draws: ParameterDraws | None = None
-    map_posterior: MapPosterior | None = None
-    size: SizePosterior | None = None
-    """`fit`, `draws`, `map_posterior`, `size`: None without an estimate; `size` is None also without a size
-    calibration."""
+    map_posterior: MapPosterior | None = None  #: Like the two above None without an estimate.
+    size: SizePosterior | None = None  #: None also without a size calibration.
     candidates: tuple[Candidate, ...] = ()  #: Every place that was looked at.
     diagnostics: Diagnostics | None = None  #: Figures and flags for the report; None where nothing was drawn.
     left_out: tuple[str, ...] = ()  #: Sources of error that the estimate does not contain, in words.
     code: str = ""
     advice: str = ""
     on_paper: str = ""
-    about_mm: tuple[float, float] | None = None
-    """`code`, `advice`, `on_paper`, `about_mm`: Without an estimate: as in `Abstention`."""
-    weighed: Weighed | None = None
-    """The lump of the answer, or the rise that is most like one, with its probability; None where nothing was weighed.
-    """
+    about_mm: tuple[float, float] | None = None  #: Like the three above as in `Abstention`, without an estimate.
+    weighed: Weighed | None = None  #: The lump of the answer, or what rises most like one.
     smallest: SmallestLumps | None = None
     """On a map without a lump: the smallest that it would have shown; None where nobody has asked."""
     scene: SceneChoice | None = None  #: Under a noise field: what the window holds, and what was asked about it.
     sensitivity: Sensitivity | None = None  #: How far the answer leans on the prior of the widths.
-    other_rises: tuple[Rise, ...] = ()
-    """The masses besides the reported one, as rises; empty where nobody has looked."""
-    bump: ModalBump | None = None
-    """The bump at the mode of the lump that the answer is about, sized or not; None where there is no lump."""
+    other_rises: tuple[Rise, ...] = ()  #: The masses besides the reported one; empty where nobody has looked.
+    bump: ModalBump | None = None  #: At the mode, of the lump that the answer is about, sized or not; None without one.
     masses: tuple[Mass, ...] = ()  #: All masses of the map, see `masses.with_masses`; empty where nobody has looked.
     findings: tuple[Finding, ...] = ()  #: Findings against the answer, cautions first.
 
@@ -124,8 +114,7 @@ class Mass(Record, eq=False):
     """One of the masses on a map."""
 
     x_mm: float
-    y_mm: float
-    """`x_mm`, `y_mm`: Its centre in `plane`: the posterior median, or where the fit has it."""
+    y_mm: float  #: Its centre in `plane`: the posterior median, or where the fit has it.
     probability: float  #: That it is a lump; of a second lump in another's window, by its odds.
     estimate: Estimate  #: Its own: draws and size, or why there is none.
     reported: bool = False  #: The map's `Estimate` is this mass's.
@@ -239,11 +228,9 @@ class FittedCells(Record, eq=False):
     """Cells of a fit window."""
 
     x_mm: FloatArray
-    y_mm: FloatArray
-    """`x_mm`, `y_mm` (n,) arrays: Their centres in `plane`."""
-    value: FloatArray
-    fit: FloatArray
-    """`value`, `fit` (n,) arrays: The map's values, and the model's at the posterior's middle."""
+    y_mm: FloatArray  #: (n,) arrays: Their centres in `plane`.
+    value: FloatArray  #: (n,) array: The map's.
+    fit: FloatArray  #: (n,) array: The model's at the posterior's middle.
     shared: FloatArray | None = None
     """(n,) array: What neighbouring cells share of the noise, as the noise field has it; None for independent noise.
 

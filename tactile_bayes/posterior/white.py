@@ -62,8 +62,7 @@ class Target(Record, eq=False):
 
     predict: modes.ModelFunction  #: (m, p) parameter vectors to (m, k) predictions.
     data: FloatArray
-    weight: FloatArray
-    """`data`, `weight` (k,) arrays: Weights are inverse variances up to a common factor."""
+    weight: FloatArray  #: (k,) array: Inverse variances up to a common factor.
     log_prior: LogPrior
     errors: ErrorModel  #: Size, correlation and degrees of freedom of the noise.
     sse_min: float  #: Weighted sum of squares at the least-squares estimate.
@@ -119,16 +118,13 @@ JOINED = 0.05  #: So near to a minimum, in the same units, a fit ends in it.
 class BumpFit(Record, eq=False):
     """A least-squares bump, with all that the methods need."""
 
-    bump: Bump
-    cells: FitCells
-    weight: FloatArray
-    fit: modes.LeastSquaresFit
+    bump: Bump  #: The model.
+    cells: FitCells  #: Of the window.
+    weight: FloatArray  #: Of the cells.
+    fit: modes.LeastSquaresFit  #: The minimum.
     errors: ErrorModel
-    """`bump`, `cells`, `weight`, `fit`, `errors`: Model, cells of the window, their weights, the minimum, the judged
-    errors."""
     covariance: FloatArray
-    """(p, p) array: Of the parameters, correlated errors included; under a noise field, which has them in the model,
-    not."""
+    """(p, p) array: Of the parameters, correlated errors included, but under a noise field: its model has them."""
     covered_share: float  #: Share of the disc of 1.5 widths about the centre that the map covers.
 
     @property

@@ -57,6 +57,18 @@ class Whitening(Record, eq=False):
     precision is diagonal."""
     eigenvalues: FloatArray  #: (k,) array: Of ``S^1/2 Phi' D^-1 Phi S^1/2``.
 
+    @classmethod
+    def of(cls, gram: FloatArray, frequency2: FloatArray, *, length_mm: float) -> Whitening:
+        """Prepare one length, from the (k, k) gram ``Phi' D^-1 Phi`` and (k,) squared frequencies, 1/mm^2.
+
+        The cosines have the variances of an exponential correlation in the plane, scaled to a mean variance of 1.
+        """
+        density = (1.0 / length_mm**2 + frequency2) ** -1.5
+        root = np.sqrt(density / density.sum())
+        values, vectors = np.linalg.eigh(root[:, None] * gram * root)
+        keep = values > 1e-9 * values[-1]
+        return cls(length_mm, root[:, None] * vectors[:, keep], values[keep])
+
     def pruned(self, share: float) -> Whitening:
         """Copy without the directions that matter little at this share or a smaller one."""
         keep = share * self.eigenvalues > TOUCHED
@@ -102,21 +114,6 @@ def gram_of_cosines(along: FloatArray, across: FloatArray, *, weight: FloatArray
     # axes: y, y', x, x'
     products = (pairs[0].T @ weight @ pairs[1]).reshape(cosines, cosines, cosines, cosines)
     return np.asarray(products.transpose(0, 2, 1, 3).reshape(cosines**2, cosines**2))
-
-
-def spectrum(frequency2: FloatArray, length_mm: float) -> FloatArray:
-    """(k,) variances of the cosines for an exponential correlation in the plane, scaled to a mean variance of 1."""
-    density = (1.0 / length_mm**2 + frequency2) ** -1.5
-    return np.asarray(density / density.sum())
-
-
-def whitening(gram: FloatArray, frequency2: FloatArray, *, length_mm: float) -> Whitening:
-    """Prepare the noise field of one length, from the (k, k) gram ``Phi' D^-1 Phi`` and (k,) frequencies squared,
-    1/mm^2."""
-    root = np.sqrt(spectrum(frequency2, length_mm))
-    values, vectors = np.linalg.eigh(root[:, None] * gram * root)
-    keep = values > 1e-9 * values[-1]
-    return Whitening(length_mm, root[:, None] * vectors[:, keep], values[keep])
 
 
 # --- The fit window as a regular grid, with fast separable inner products of Gaussian templates and the noise basis.
@@ -186,7 +183,7 @@ class Window:
             if self._gram is None:
                 self._gram = gram_of_cosines(self._along, self._across, weight=self.weight)
             frequency2 = (self._frequency_y[:, None] + self._frequency_x[None, :]).ravel()
-            self._fields[length_mm] = whitening(self._gram, frequency2, length_mm=length_mm)
+            self._fields[length_mm] = Whitening.of(self._gram, frequency2, length_mm=length_mm)
         return self._fields[length_mm]
 
     def project(self, templates: Templates, plain: FloatArray) -> Projected:
@@ -222,8 +219,9 @@ class Window:
         blur_x, blur_y = (0.0, 0.0) if noise is None else noise.sd_mm
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             if r is None:
-                columns = blurred_profile(self.x_mm - x_mm[:, None], np.exp(p + q), blur_mm=blur_x, cell_mm=cell)
-                rows = blurred_profile(self.y_mm - y_mm[:, None], np.exp(p - q), blur_mm=blur_y, cell_mm=cell)
+                away_x, away_y = self.x_mm - x_mm[:, None], self.y_mm - y_mm[:, None]
+                columns = cell_mean_profile(away_x, sigma_mm=np.exp(p + q), cell_mm=cell, blur_mm=blur_x)
+                rows = cell_mean_profile(away_y, sigma_mm=np.exp(p - q), cell_mm=cell, blur_mm=blur_y)
                 return Profiles(rows, columns)
             covariance = covariance_from_log_widths(p, q, r)
             blurred = covariance + np.diag([blur_x**2, blur_y**2])
@@ -268,23 +266,21 @@ def turned_gaussians(x_mm: FloatArray, y_mm: FloatArray, *, covariance_mm2: Floa
     return square
 
 
-def blurred_profile(distance_mm: FloatArray, sigma_mm: FloatArray, *, blur_mm: float, cell_mm: float) -> FloatArray:
-    """As `cell_mean_profile`, for Gaussians of unit height before a blur of this SD."""
-    wide = np.hypot(sigma_mm, blur_mm)
-    return (sigma_mm / wide)[:, None] * cell_mean_profile(distance_mm, sigma_mm=wide, cell_mm=cell_mm)
+def cell_mean_profile(
+    distance_mm: FloatArray, *, sigma_mm: FloatArray, cell_mm: float, blur_mm: float = 0.0
+) -> FloatArray:
+    """(m, k) means over cells of one-dimensional Gaussians, of unit height before a blur of this SD.
 
-
-def cell_mean_profile(distance_mm: FloatArray, *, sigma_mm: FloatArray, cell_mm: float) -> FloatArray:
-    """(m, k) means over cells of one-dimensional unit Gaussians, the factors of `cell_mean_gaussian`.
-
+    They are the factors of `cell_mean_gaussian`.
     The two corrections of that function's series are multiplied here and added there: a difference of the order of
     the terms that both leave out.
     """
-    wide = (sigma_mm**2 + cell_mm**2 / 12.0)[:, None]
+    blurred = np.hypot(sigma_mm, blur_mm)
+    wide = (blurred**2 + cell_mm**2 / 12.0)[:, None]
     square = distance_mm**2 / wide
-    gaussian = sigma_mm[:, None] / np.sqrt(wide) * np.exp(-0.5 * square)
+    gaussian = blurred[:, None] / np.sqrt(wide) * np.exp(-0.5 * square)
     fourth = (square * (square - 6.0) + 3.0) / wide**2
-    return np.asarray(gaussian * (1.0 - cell_mm**4 / 2880.0 * fourth))
+    return (sigma_mm / blurred)[:, None] * (gaussian * (1.0 - cell_mm**4 / 2880.0 * fourth))
 
 
 def independent_variance(cells: FitCells) -> FloatArray:
@@ -337,10 +333,6 @@ class LinearSolution(Record, eq=False):
     evidence: FloatArray  #: (m, h) array: Log of the fields' prior times their evidence.
     amplitude: FloatArray  #: (m, h, v) array: Conditional means under a flat prior.
     power: FloatArray  #: (m, h, v, v) array: Their precision times tau^2.
-    level: FloatArray
-    level_covariance: FloatArray
-    """`level`, `level_covariance` (h, c), (h, c, c) arrays: Level and tilt at amplitudes of 0, and their covariance
-    over tau^2 given the amplitudes."""
     level_slope: FloatArray  #: (m, h, v, c) array: By how much level and tilt fall as an amplitude rises.
     sum_of_squares: FloatArray  #: (m, h) array.
 
@@ -534,19 +526,13 @@ class LinearModel:
         evidence = constant + log_factor - 0.5 * dof * np.log(squares)
         # a dent is no lump: only rises have density
         evidence = np.where((amplitude > 0).all(axis=2), evidence, -np.inf)
-        level = np.einsum("hcd,hd->hc", columns.inverse, right)
-        slope = np.stack(to_level, axis=2)
-        return LinearSolution(evidence, amplitude, matrix, level, columns.inverse, slope, squares)
-
-
-_FIELD_AXIS = {name: int(not name.startswith("level") or name == "level_slope") for name in names_of(LinearSolution)}
+        return LinearSolution(evidence, amplitude, matrix, np.stack(to_level, axis=2), squares)
 
 
 def joined(solutions: list[LinearSolution]) -> LinearSolution:
     """Concatenate the fields of several lengths."""
-    return LinearSolution(
-        *(np.concatenate([getattr(one, name) for one in solutions], axis=axis) for name, axis in _FIELD_AXIS.items())
-    )
+    each = ([getattr(one, name) for one in solutions] for name in names_of(LinearSolution))
+    return LinearSolution(*(np.concatenate(parts, axis=1) for parts in each))
 
 
 def _one(

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Final
 
 import numpy as np
-from scipy.special import gammaincc
+from scipy.special import chdtrc
 
 from tactile_bayes.declarations import Record, field, replace
 from tactile_bayes.geometry import FloatArray
@@ -371,9 +371,4 @@ def apart_by_chance(centre: FloatArray, noise: FloatArray, grid: FloatArray) -> 
     weight = 1.0 / (noise[:, None] + grid**2)
     mean = np.sum(weight * centre[:, None], axis=0) / weight.sum(axis=0)
     q = np.sum(weight * (centre[:, None] - mean) ** 2, axis=0)
-    return above_chi_square(q, len(centre) - 1)
-
-
-def above_chi_square(q: FloatArray, degrees: int) -> FloatArray:
-    """(...,) probability that a chi-squared variable is above q."""
-    return np.asarray(gammaincc(0.5 * degrees, 0.5 * q))
+    return np.asarray(chdtrc(len(centre) - 1, q))

@@ -21,6 +21,7 @@ from collections.abc import Mapping, Sequence
 from typing import Final, Literal
 
 import numpy as np
+from scipy.special import chdtrc
 
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError, UsageError
@@ -29,7 +30,7 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference import draws
 from tactile_bayes.presets import REGISTRATION_MM
 from tactile_bayes.size.bodies import BodyCalibration
-from tactile_bayes.size.draws import BetweenMaps, ShapeDraws, above_chi_square, log_normal, matched_draws
+from tactile_bayes.size.draws import BetweenMaps, ShapeDraws, log_normal, matched_draws
 from tactile_bayes.size.pooling import POOLED_DRAWS, MassMaps, SizePriors, Weighted, log_sizes, lump_shape
 
 MOST_VISITS: Final = 10
@@ -120,7 +121,7 @@ def one_place_probability(places: Sequence[Place], *, registration_mm: float = R
     weights = np.linalg.inv(np.stack([one.covariance_mm2 + 0.5 * registration_mm**2 * np.eye(2) for one in places]))
     mean = np.linalg.solve(weights.sum(axis=0), np.einsum("kij,kj->i", weights, centres))
     q = float(np.einsum("ki,kij,kj->", centres - mean, weights, centres - mean))
-    return float(above_chi_square(np.array(q), 2 * (len(places) - 1)))
+    return float(chdtrc(2 * (len(places) - 1), q))
 
 
 class SharedBody(Record):
@@ -422,7 +423,7 @@ def straight_line(log_size: FloatArray, covariance: FloatArray, days: Sequence[f
     line = spread @ (weighted.T @ log_size)
     left = log_size - columns @ line
     square, dof = left @ np.linalg.solve(covariance, left), len(days) - 2
-    departure = float(above_chi_square(square, dof)) if dof > 0 else None
+    departure = float(chdtrc(dof, square)) if dof > 0 else None
     return Trend(float(line[0]), float(line[1]), float(np.sqrt(spread[1, 1])), departure)
 
 

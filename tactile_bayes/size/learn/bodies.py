@@ -71,6 +71,9 @@ class TableRows(Record, eq=False):
     depth: FatDepth | None
     centre: Centre
     values: FloatArray
+    eq6_powers: Powers = PLAIN  #: Those of `Eq6Law`.
+    feature_powers: Powers = QUADRATIC[:6]  #: Of the features of a map, see `BodyLaw`.
+    spread_powers: Powers = QUADRATIC[:6]  #: Of the terms of ln SD(B).
 
     @classmethod
     def of(cls, table: regression.PopulationTable) -> TableRows:
@@ -84,26 +87,12 @@ class TableRows(Record, eq=False):
         rows = np.column_stack([maps.log_amplitude, maps.log_width, log_depth])
         centre = [round(float(column.mean()), 3) for column in rows.T]
         values = rows - centre
-        if depth is not None:
-            x = monomials(list(values.T[:2]), powers(2))  # what amplitude and width lead one to expect of w
-            expected = np.asarray(np.linalg.lstsq(x, values[:, 2], rcond=None)[0])
-            depth = replace(depth, expected=expected, expected_sd=float(np.std(values[:, 2] - x @ expected)))
-        return cls(maps, depth, Centre(*centre), values)
-
-    @property
-    def eq6_powers(self) -> Powers:
-        """Those of `Eq6Law`."""
-        return PLAIN if self.depth is None else BY_DEPTH
-
-    @property
-    def feature_powers(self) -> Powers:
-        """Powers of the features of a map, see `BodyLaw`."""
-        return QUADRATIC[:6] if self.depth is None else CUBIC
-
-    @property
-    def spread_powers(self) -> Powers:
-        """The same of ln SD(B)."""
-        return QUADRATIC[:6] if self.depth is None else QUADRATIC
+        if depth is None:
+            return cls(maps, None, Centre(*centre), values)
+        x = monomials(list(values.T[:2]), powers(2))  # what amplitude and width lead one to expect of w
+        expected = np.asarray(np.linalg.lstsq(x, values[:, 2], rcond=None)[0])
+        depth = replace(depth, expected=expected, expected_sd=float(np.std(values[:, 2] - x @ expected)))
+        return cls(maps, depth, Centre(*centre), values, BY_DEPTH, CUBIC, QUADRATIC)
 
     def of_bodies(self, data: regression.BodyRegression) -> FloatArray:
         """(b, 3) means of u, v and w over each body's exams."""

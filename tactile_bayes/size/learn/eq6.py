@@ -98,8 +98,8 @@ def learn_size_calibration(
     return _by_axes(table, recipe, lambda data: _learn_axis(data, rng=rng, progress=progress))
 
 
-def axis_rows(table: SizeTable) -> tuple[AxisRows, AxisRows | None]:
-    """Rows with positive amplitude for the regression of each axis; None along the head without widths along it."""
+def axis_rows(table: SizeTable) -> list[AxisRows]:
+    """Rows with positive amplitude for the regression of each axis: across the head, and along it where widths are."""
     rising = table.amplitude > 0
     if rising.sum() < 8:
         raise BadDataError(
@@ -110,25 +110,26 @@ def axis_rows(table: SizeTable) -> tuple[AxisRows, AxisRows | None]:
     if any(s is not None and np.ptp(s[rising]) <= 0 for s in (table.sigma_x_mm, table.sigma_y_mm)):
         raise BadDataError("all rows have one width", way_out="m and b need maps of several widths to be told apart")
     kept = rows_of(table, rising)
-    x = AxisRows(kept.d_mm, kept.amplitude, kept.sigma_x_mm, kept.width_change_x, kept.depth_ratio)
-    if kept.sigma_y_mm is None:
-        return x, None
-    return x, AxisRows(kept.d_mm, kept.amplitude, kept.sigma_y_mm, kept.width_change_y, kept.depth_ratio)
+    widths = (kept.sigma_x_mm, kept.width_change_x), (kept.sigma_y_mm, kept.width_change_y)
+    return [
+        AxisRows(kept.d_mm, kept.amplitude, sigma, change, kept.depth_ratio)
+        for sigma, change in widths
+        if sigma is not None
+    ]
 
 
 def _by_axes(table: SizeTable, recipe: Recipe, learn: Callable[[AxisRows], AxisCalibration]) -> SizeCalibration:
     """Calibration of the axes across and along the head; both alike where the table has one width."""
-    x_rows, y_rows = axis_rows(table)
-    x = learn(x_rows)
-    if y_rows is None:
-        return SizeCalibration(x, x, 1.0, recipe, axes=("both",))
-    y = learn(y_rows)
-    correlation = np.corrcoef(_standard_residuals(x, x_rows), _standard_residuals(y, y_rows))[0, 1]
-    return SizeCalibration(x, y, float(np.clip(correlation, -1, 1)), recipe)
-
-
-def _standard_residuals(axis: AxisCalibration, data: AxisRows) -> FloatArray:
-    return np.asarray(log_error(axis.size_mm(data.sigma_mm, data.amplitude), data.d_mm) / axis.scatter(data.amplitude))
+    rows = axis_rows(table)
+    axes = [learn(data) for data in rows]
+    if len(axes) == 1:
+        return SizeCalibration(axes[0], axes[0], 1.0, recipe, axes=("both",))
+    standard = [
+        log_error(axis.size_mm(data.sigma_mm, data.amplitude), data.d_mm) / axis.scatter(data.amplitude)
+        for axis, data in zip(axes, rows, strict=True)
+    ]
+    x, y = axes
+    return SizeCalibration(x, y, float(np.clip(np.corrcoef(standard[0], standard[1])[0, 1], -1, 1)), recipe)
 
 
 def log_error(size_mm: FloatArray, d_mm: FloatArray) -> FloatArray:
@@ -252,13 +253,13 @@ def other_fit(calibration: SizeCalibration, table: SizeTable) -> OtherFit | None
     """Fit the same table the other way; None where that fit does not exist, as without depths."""
     name = "joint" if calibration.in_two_stages else "two-stage"
     fit = axis_at_mode if name == "joint" else axis_in_two_stages
-    pairs = [(axis, data) for axis, data in zip((calibration.x, calibration.y), axis_rows(table), strict=True) if data]
+    rows = axis_rows(table)
     try:
-        others = [fit(data) for _, data in pairs]
+        others = [fit(data) for data in rows]
     except BadDataError:
         return None
     differences = []
-    for (axis, data), other in zip(pairs, others, strict=True):
+    for axis, other, data in zip((calibration.x, calibration.y), others, rows, strict=False):
         ours, theirs = (one.size_mm(data.sigma_mm, data.amplitude) for one in (axis, other))
         differences.append(float(np.mean(np.abs(ours - theirs) / data.d_mm)))
     return OtherFit(name, tuple(tuple(one.draws[0, :4].tolist()) for one in others), tuple(differences))
@@ -364,7 +365,6 @@ LEAST_GEOMETRIES = 8  #: A quadratic has six coefficients, and one geometry is m
 
 FitAxis = Callable[[AxisRows], AxisCalibration]
 """Eq 6 from the rows of one axis: `axis_at_mode` or `axis_in_two_stages`."""
-_Predict = Callable[[BoolArray], FloatArray]
 
 
 def left_out_of_study(
@@ -381,27 +381,33 @@ def left_out_of_study(
     By both widths the size of Eq 6 is the geometric mean of those by each; the quadratic, of least squares, takes the
     geometric mean of the widths.
     """
-    if table.cases is None:
+    least, cases = least_stiffness_ratio or LEAST_HARD_RATIO, table.cases
+    if cases is None:
         return None
-    least = least_stiffness_ratio or LEAST_HARD_RATIO
-    table = rows_of(table, (table.cases.stiffness_ratio >= least) & (table.amplitude > 0))
-    assert table.cases is not None
-    geometry = geometry_numbers(table.d_mm, table.cases)
-    if len(geometry) == 0 or geometry.max() + 1 < LEAST_GEOMETRIES:
+    hard = (cases.stiffness_ratio >= least) & (table.amplitude > 0)
+    table, cases = rows_of(table, hard), rows_of(cases, hard)
+    geometry = geometry_numbers(table.d_mm, cases)
+    number = int(geometry.max(initial=-1)) + 1
+    if number < LEAST_GEOMETRIES:
         return None
     widths = {"x": table.sigma_x_mm} if table.sigma_y_mm is None else {"x": table.sigma_x_mm, "y": table.sigma_y_mm}
     both = np.exp(np.mean([np.log(sigma) for sigma in widths.values()], axis=0))
-    eq6 = {name: _left_out(geometry, _eq6(table, sigma, fit or axis_at_mode)) for name, sigma in widths.items()}
-    eq6["both"] = np.exp(np.mean([np.log(np.maximum(size, 1e-3)) for size in eq6.values()], axis=0))
-    quadratic = {name: _left_out(geometry, _quadratic(table, sigma)) for name, sigma in widths.items()}
-    quadratic["both"] = _left_out(geometry, _quadratic(table, both))
-    if len(widths) == 1:
-        del eq6["x"], quadratic["x"]
-
-    def errors(sizes: dict[str, FloatArray]) -> dict[str, float]:
-        return {name: float(np.mean(np.abs(size / table.d_mm - 1.0))) for name, size in sizes.items()}
-
-    return LeftOutErrors(len(geometry), int(geometry.max()) + 1, least, errors(eq6), errors(quadratic))
+    eq6, quadratic = ({name: np.empty(len(geometry)) for name in (*widths, "both")} for _ in range(2))
+    for out in (geometry == i for i in range(number)):  # the sizes of each geometry, predicted from the others
+        for name, sigma in (widths | {"both": both}).items():
+            quadratic[name][out] = _quadratic(table, sigma, ~out)[out]
+            if name in widths:
+                eq6[name][out] = _eq6(table, cases, sigma, ~out, fit or axis_at_mode)[out]
+    eq6["both"] = np.exp(np.mean([np.log(np.maximum(eq6[name], 1e-3)) for name in widths], axis=0))
+    errors = [
+        {
+            name: float(np.mean(np.abs(size / table.d_mm - 1.0)))
+            for name, size in sizes.items()
+            if len(widths) > 1 or name == "both"
+        }
+        for sizes in (eq6, quadratic)
+    ]
+    return LeftOutErrors(len(geometry), number, least, *errors)
 
 
 def geometry_numbers(d_mm: FloatArray, cases: StudyCases) -> IndexArray:
@@ -411,41 +417,22 @@ def geometry_numbers(d_mm: FloatArray, cases: StudyCases) -> IndexArray:
     return np.array([number[name] for name in names], dtype=np.intp)
 
 
-def _left_out(geometry: IndexArray, predict: _Predict) -> FloatArray:
-    """(n,) sizes in mm, each predicted from the other geometries."""
-    sizes = np.empty(len(geometry))
-    for number in range(int(geometry.max()) + 1):
-        kept = geometry != number
-        sizes[~kept] = predict(kept)[~kept]
-    return sizes
+def _eq6(table: SizeTable, cases: StudyCases, sigma_mm: FloatArray, kept: BoolArray, fit: FitAxis) -> FloatArray:
+    """(n,) sizes in mm by Eq 6 from the rows kept."""
+    d_mm, depth = table.d_mm[kept], cases.depth_ratio[kept]
+    change = width_changes(sigma_mm[kept], depth_ratio=depth, group=rows_of(cases, kept).lumps(d_mm))
+    try:
+        axis = fit(AxisRows(d_mm, table.amplitude[kept], sigma_mm[kept], change, depth))
+    except NotConvergedError:
+        out = int(np.flatnonzero(~kept)[0])
+        where = f"{cases.seat[out]}, d {table.d_mm[out]:g} mm, h/d {cases.depth_ratio[out]:g}"
+        raise NotConvergedError(f"Eq 6 has no mode without the geometry {where}") from None
+    return axis.size_mm(sigma_mm, table.amplitude)
 
 
-def _eq6(table: SizeTable, sigma_mm: FloatArray, fit: FitAxis) -> _Predict:
-    cases = table.cases
-    assert cases is not None
-    lump = cases.lumps(table.d_mm)
-
-    def predict(kept: BoolArray) -> FloatArray:
-        group = [key for key, is_kept in zip(lump, kept, strict=True) if is_kept]
-        change = width_changes(sigma_mm[kept], depth_ratio=cases.depth_ratio[kept], group=group)
-        try:
-            depth = cases.depth_ratio[kept]
-            axis = fit(AxisRows(table.d_mm[kept], table.amplitude[kept], sigma_mm[kept], change, depth))
-        except NotConvergedError:
-            out = int(np.flatnonzero(~kept)[0])
-            where = f"{cases.seat[out]}, d {table.d_mm[out]:g} mm, h/d {cases.depth_ratio[out]:g}"
-            raise NotConvergedError(f"Eq 6 has no mode without the geometry {where}") from None
-        return axis.size_mm(sigma_mm, table.amplitude)
-
-    return predict
-
-
-def _quadratic(table: SizeTable, sigma_mm: FloatArray) -> _Predict:
+def _quadratic(table: SizeTable, sigma_mm: FloatArray, kept: BoolArray) -> FloatArray:
+    """(n,) the same by least squares of ln d on a quadratic in ln a and ln sigma."""
     u, v = np.log(table.amplitude), np.log(sigma_mm)
     terms = monomials((u - u.mean(), v - v.mean()), powers(2))
-
-    def predict(kept: BoolArray) -> FloatArray:
-        coefficients = np.linalg.lstsq(terms[kept], np.log(table.d_mm[kept]), rcond=None)[0]
-        return np.asarray(np.exp(terms @ coefficients))
-
-    return predict
+    coefficients = np.linalg.lstsq(terms[kept], np.log(table.d_mm[kept]), rcond=None)[0]
+    return np.asarray(np.exp(terms @ coefficients))
