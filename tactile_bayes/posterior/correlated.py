@@ -170,21 +170,15 @@ class Correlated(Record, eq=False):
         return cls(tactile_map, fit, detection, scene, fault)
 
     def bump(self) -> ModalBump:
-        """The bump at the scene's mode."""
-        fit = self._scene.fit
+        """The bump at the scene's mode, which there is where the detection has any odds."""
+        assert self.scene is not None
+        fit = self.scene.fit
         return ModalBump(fit.target.amplitude_at(fit.mode), *fit.centre_mm, *fit.widths_mm)
-
-    @property
-    def _scene(self) -> SceneChoice:
-        if self.scene is None:
-            raise NotConvergedError(
-                "no bump at this place stands out from the correlated noise, so nothing can be drawn"
-            )
-        return self.scene
 
     def draw(self, options: SamplerSettings, *, rng: np.random.Generator, progress: Progress | None) -> MapDraws:
         """Draw from the posterior; `NotConvergedError` also when the scene's neighbour was not found."""
-        choice, asked = self._scene, options.scene_asked
+        choice, asked = self.scene, options.scene_asked
+        assert choice is not None
         wanted = neighbours.WANTED.get(asked, "")
         if wanted and choice.fit.scene.extra != wanted:
             raise NotConvergedError(f"no {wanted} found beside the bump; leave out --scene {asked}")

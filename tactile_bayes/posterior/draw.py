@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from tactile_bayes.declarations import Record, field, replace
+from tactile_bayes.declarations import Record, field, names_of, replace
 from tactile_bayes.errors import NotConvergedError, UsageError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.draws import END_ERROR, INDEPENDENT_DRAWS, ParameterDraws, Solved, distinct_rows
@@ -84,8 +84,13 @@ class MapPosterior(BumpDraws, eq=False, kw_only=True):
     @property
     def medians(self) -> tuple[float, float, float]:
         """Posterior medians of amplitude, sigma_x_mm and sigma_y_mm."""
-        amplitude, x, y = (float(np.median(v)) for v in (self.amplitude, self.sigma_x_mm, self.sigma_y_mm))
-        return amplitude, x, y
+        middle = self.middle
+        return middle.amplitude, middle.sigma_x_mm, middle.sigma_y_mm
+
+    @property
+    def middle(self) -> ModalBump:
+        """The bump at the posterior medians."""
+        return ModalBump(*(float(np.median(getattr(self, name))) for name in names_of(ModalBump)))
 
 
 class ModalBump(Record):

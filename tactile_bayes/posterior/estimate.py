@@ -195,13 +195,12 @@ class Work(Record, eq=False):
 
 
 class SizedDraws(Record, eq=False):
-    """Draws of one map with its size by `calibration`; `fault` and `extrapolation_faults` say why there is none."""
+    """Draws of one map with its size by `calibration`; `fault` says why there is none."""
 
     made: MapDraws
     size: SizePosterior | None
     fault: Abstention | None
     calibration: Calibration | None
-    extrapolation_faults: tuple[str, ...] = ()
 
 
 def draw_until_accurate(work: Work, seen: Assessment) -> SizedDraws:
@@ -244,9 +243,10 @@ def draw_with_size(work: Work, seen: Assessment) -> SizedDraws:
     if work.calibration is None:
         return SizedDraws(made, None, fault, None)
     calibration = work.calibration.at_depth_or_fallback(*posterior.medians)
-    far = tuple(calibration.extrapolation_faults(*posterior.medians))
-    if fault or far:
-        return SizedDraws(made, None, fault, calibration, far)
+    if fault is None and (far := calibration.extrapolation_faults(*posterior.medians)):
+        fault = terms.extrapolated(far)
+    if fault:
+        return SizedDraws(made, None, fault, calibration)
     size = draw_sizes(posterior, calibration=calibration, priors=options.size_priors, rng=work.rng)
     return SizedDraws(made, size, None, calibration)
 
@@ -346,19 +346,15 @@ def _measured(work: Work, seen: Assessment, candidates: tuple[Candidate, ...]) -
         advice = "give --method ensemble, with a larger max_steps in --settings FILE.toml"
         why = Abstention("method", f"no method converged: {error}", advice, OTHER_METHOD_ON_PAPER)
         return _none(why, candidates, detection, bump)
-    made, size, calibration = sized.made, sized.size, sized.calibration
-    detection = made.detection
-    if sized.fault is not None:
-        return _none(sized.fault, candidates, detection, bump)
-    diagnostics, posterior = _diagnostics(sized), made.posterior
-    if sized.extrapolation_faults:
-        return _none(terms.extrapolated(list(sized.extrapolation_faults)), candidates, detection, bump, diagnostics)
+    made, size, calibration, fault = sized.made, sized.size, sized.calibration, sized.fault
+    detection, posterior, diagnostics = made.detection, made.posterior, _diagnostics(sized)
     if size is not None and size.invalid > MOST_INVALID * size.d_x_mm.size:
         reason = f"no positive size in {size.invalid} of {size.d_x_mm.size} draws: outside the calibration"
-        outside = Abstention(
-            "extrapolated", reason, "learn a calibration whose table holds such lumps", terms.UNLIKE_ON_PAPER
-        )
-        return _none(outside, candidates, detection, bump, diagnostics)
+        advice = "learn a calibration whose table holds such lumps"
+        fault = Abstention("extrapolated", reason, advice, terms.UNLIKE_ON_PAPER)
+    if fault is not None:
+        told = diagnostics if fault.code == "extrapolated" else None
+        return _none(fault, candidates, detection, bump, told)
     drawn = {"sigma_x_mm": posterior.sigma_x_mm, "sigma_y_mm": posterior.sigma_y_mm}
     drawn |= {} if size is None else {"max_size_mm": size.max_size_mm}
     return Estimate(

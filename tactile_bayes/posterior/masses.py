@@ -112,7 +112,7 @@ def _may_be_lump(seen: Assessment, rest: TactileMap, estimate: Estimate) -> bool
     if estimate.map_posterior is None or seen.detection.probability < LEAST_BESIDE:
         return False
     bump = seen.bump()
-    high = bump.amplitude >= LEAST_SHARE * _medians(estimate.map_posterior).amplitude
+    high = bump.amplitude >= LEAST_SHARE * estimate.map_posterior.middle.amplitude
     return high and weigh(rest, seen.detection, bump).chance >= LIKELY
 
 
@@ -133,22 +133,12 @@ def _rests(tactile_map: TactileMap, estimate: Estimate) -> Iterator[TactileMap]:
 
 def without(tactile_map: TactileMap, posterior: MapPosterior) -> TactileMap:
     """The map less the bump at the posterior medians."""
-    lump, angle = _medians(posterior), float(np.median(posterior.angle_rad))
+    lump, angle = posterior.middle, float(np.median(posterior.angle_rad))
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     covariance = turn @ np.diag([lump.sigma_x_mm**2, lump.sigma_y_mm**2]) @ turn.T
     u, v = np.meshgrid(tactile_map.x_mm - lump.x_mm, tactile_map.y_mm - lump.y_mm)
     bump = cell_mean_gaussian(u.ravel(), v.ravel(), covariance_mm2=covariance, cell_mm=tactile_map.recipe.cell_mm)
     return replace(tactile_map, mean=tactile_map.mean - lump.amplitude * bump.reshape(u.shape))
-
-
-def _medians(posterior: MapPosterior) -> ModalBump:
-    names = ("amplitude", "x_mm", "y_mm", "sigma_x_mm", "sigma_y_mm")
-    return ModalBump(*(float(np.median(getattr(posterior, name))) for name in names))
-
-
-def _lump(estimate: Estimate) -> ModalBump | None:
-    """The lump that an estimate is about: at the posterior medians where it was drawn."""
-    return estimate.bump if estimate.map_posterior is None else _medians(estimate.map_posterior)
 
 
 def _apart_mm(one: ModalBump | Mass, other: ModalBump | Mass) -> float:
@@ -157,14 +147,14 @@ def _apart_mm(one: ModalBump | Mass, other: ModalBump | Mass) -> float:
 
 def _rise(bump: ModalBump, probability: float, estimate: Estimate | None) -> Rise:
     """A bump as a rise beside the lump of an estimate, or beside none."""
-    lump = None if estimate is None else _lump(estimate)
+    lump = None if estimate is None else estimate.lump
     away = None if lump is None else _apart_mm(bump, lump)
     return Rise(**as_dict(bump), distance_mm=away, probability=probability)
 
 
 def _places(rest: TactileMap, estimate: Estimate, *, to_rim: bool) -> Iterator[tuple[float, float]]:
     """Local maxima clear of the lump, above a share of its amplitude, highest first: inside the map, or at its rim."""
-    found_on, lump = levelled(rest), _lump(estimate)
+    found_on, lump = levelled(rest), estimate.lump
     height = smoothed_excess(found_on)
     centres = candidate_centres(found_on, rim_limit=0)
     if to_rim:
@@ -187,7 +177,7 @@ def _clear_of_lump(x: float, y: float, rest: TactileMap, estimate: Estimate) -> 
     One whose centre lies off the map stands for what rises at the rim, which is looked at as elsewhere. A rise beside a
     rib is held against a ridge there.
     """
-    lump, second = _lump(estimate), _second_lump(estimate)
+    lump, second = estimate.lump, _second_lump(estimate)
     if lump is None:
         return True
     lumps = [lump, *([second] if second is not None and on_map(rest, second.x_mm, second.y_mm) else [])]
@@ -218,7 +208,7 @@ def _at_rim(
     """
     if not candidates or candidates[0].fit is None or not candidates[0].fault.startswith(AT_RIM):
         return None, False
-    bump, lump = candidates[0].fit.modal(), _lump(estimate)
+    bump, lump = candidates[0].fit.modal(), estimate.lump
     if bump.amplitude <= (0.0 if lump is None else LEAST_RISE_AT_RIM * lump.amplitude):
         return None, False
     chance = best_chance(rest, candidates, options)
@@ -333,7 +323,7 @@ def _probability(estimate: Estimate) -> float:
 
 def _place(estimate: Estimate) -> tuple[float, float]:
     """Centre in `plane`: of the posterior where there is one."""
-    lump = _lump(estimate)
+    lump = estimate.lump
     assert lump is not None
     return lump.x_mm, lump.y_mm
 

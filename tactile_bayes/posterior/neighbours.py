@@ -140,7 +140,7 @@ def add_beside(
     if scene not in ASKING:
         return choice
     plain, wanted = choice.plain, WANTED.get(scene)
-    lumps = second_lumps(plain, plain.target.problem)
+    lumps = second_lumps(plain)
     places: dict[Neighbour, FloatArray] = {
         "second lump": lumps[rises(plain, surroundings, "second lump", lumps)],
         "rib": _apart(plain, ridges),
@@ -226,8 +226,9 @@ def rises(fit: FieldFit, surroundings: Surroundings, extra: Neighbour, places: F
     return np.asarray(rise > LEAST_RISE * amplitude)
 
 
-def second_lumps(plain: FieldFit, problem: Problem) -> FloatArray:
+def second_lumps(plain: FieldFit) -> FloatArray:
     """(g, 3) grid of second lumps to try, apart from the first: centres and log widths."""
+    problem = plain.target.problem
     reach = REACH_IN_RADII * problem.radius_mm
     axis = np.arange(-reach, reach + 1e-9, GRID_MM)
     x, y, w = (v.ravel() for v in np.meshgrid(axis, axis, np.log(GRID_WIDTHS_MM), indexing="ij"))
@@ -235,15 +236,6 @@ def second_lumps(plain: FieldFit, problem: Problem) -> FloatArray:
     apart = np.hypot(x + middle[0] - centre[0], y + middle[1] - centre[1]) > (APART + 0.5) * wider
     keep = apart & (np.hypot(x, y) < reach)
     return np.asarray(np.stack([x + middle[0], y + middle[1], w], axis=1)[keep])
-
-
-def ribs(problem: Problem) -> FloatArray:
-    """(g, 3) grid of ridges to try: angles, offsets and log widths."""
-    reach = REACH_IN_RADII * problem.radius_mm
-    offsets = np.arange(-reach + 0.5 * GRID_MM, reach, GRID_MM)
-    angles = np.pi * np.arange(GRID_ANGLES) / GRID_ANGLES
-    grids = np.meshgrid(angles, offsets, np.log(GRID_WIDTHS_MM), indexing="ij")
-    return np.stack([v.ravel() for v in grids], axis=1)
 
 
 def _apart(plain: FieldFit, ridges: FloatArray) -> FloatArray:
@@ -254,8 +246,12 @@ def _apart(plain: FieldFit, ridges: FloatArray) -> FloatArray:
 
 
 def rising_ribs(plain: FieldFit, surroundings: Surroundings) -> FloatArray:
-    """(g, 3) ridges of `ribs` along which the map rises beside a bump."""
-    places = ribs(plain.target.problem)
+    """(g, 3) angles, offsets and log widths, of a grid, of ridges along which the map rises beside a bump."""
+    reach = REACH_IN_RADII * plain.target.problem.radius_mm
+    offsets = np.arange(-reach + 0.5 * GRID_MM, reach, GRID_MM)
+    angles = np.pi * np.arange(GRID_ANGLES) / GRID_ANGLES
+    grids = np.meshgrid(angles, offsets, np.log(GRID_WIDTHS_MM), indexing="ij")
+    places = np.stack([v.ravel() for v in grids], axis=1)
     return np.asarray(places[rises(plain, surroundings, "rib", places)])
 
 

@@ -109,6 +109,11 @@ class Estimate(Record, eq=False):
         """Probability that the lump of the answer, or the likeliest rise, is one; None where nothing was weighed."""
         return None if self.weighed is None else self.weighed.probability
 
+    @property
+    def lump(self) -> ModalBump | None:
+        """The bump of the lump that the answer is about: at the posterior medians where it was drawn."""
+        return self.bump if self.map_posterior is None else self.map_posterior.middle
+
 
 class Mass(Record, eq=False):
     """One of the masses on a map."""

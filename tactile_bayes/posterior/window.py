@@ -48,6 +48,12 @@ HALF_WAVE_IN_WIDTHS = 0.83
 TOUCHED = 1e-2  #: Directions in which the field's variance is a smaller part of the independent one are dropped.
 
 
+def spectrum(frequency2: FloatArray, length_mm: float) -> FloatArray:
+    """(k,) variances of cosines of squared frequencies, 1/mm^2, for an exponential correlation; of sum 1."""
+    density = (1.0 / length_mm**2 + frequency2) ** -1.5
+    return np.asarray(density / density.sum())
+
+
 class Whitening(Record, eq=False):
     """The noise field of one correlation length, prepared for every share."""
 
@@ -59,12 +65,8 @@ class Whitening(Record, eq=False):
 
     @classmethod
     def of(cls, gram: FloatArray, frequency2: FloatArray, *, length_mm: float) -> Whitening:
-        """Prepare one length, from the (k, k) gram ``Phi' D^-1 Phi`` and (k,) squared frequencies, 1/mm^2.
-
-        The cosines have the variances of an exponential correlation in the plane, scaled to a mean variance of 1.
-        """
-        density = (1.0 / length_mm**2 + frequency2) ** -1.5
-        root = np.sqrt(density / density.sum())
+        """Prepare one length, from the (k, k) gram ``Phi' D^-1 Phi`` and (k,) frequencies squared."""
+        root = np.sqrt(spectrum(frequency2, length_mm))
         values, vectors = np.linalg.eigh(root[:, None] * gram * root)
         keep = values > 1e-9 * values[-1]
         return cls(length_mm, root[:, None] * vectors[:, keep], values[keep])

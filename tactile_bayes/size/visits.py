@@ -24,7 +24,7 @@ import numpy as np
 from scipy.special import chdtrc
 
 from tactile_bayes.declarations import Record
-from tactile_bayes.errors import BadDataError, UsageError
+from tactile_bayes.errors import UsageError
 from tactile_bayes.findings import Finding
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference import draws
@@ -137,13 +137,7 @@ class SharedBody(Record):
     """
 
     redrawn: float  #: f, 0 to 1.
-    length: float  #: Lambda.
-
-    def __post_init__(self) -> None:
-        if not (0.0 <= self.redrawn <= 1.0 and self.length > 0.0):
-            raise BadDataError(
-                f"redrawn is {self.redrawn:g} and length {self.length:g}", way_out="give 0 to 1, and a length above 0"
-            )
+    length: float  #: Lambda, above 0.
 
     def correlation(self, log_size: FloatArray) -> FloatArray:
         """(v, v) correlation matrix of visits whose maps give these (v,) log sizes."""

@@ -133,20 +133,23 @@ def correct_calibration(
     groups: dict[str, list[PhantomMap]] = {}
     for one in maps:
         groups.setdefault(one.phantom, []).append(one)
-    rows, out = [], list(left_out)
+    rows: dict[str, tuple[float, ...]] = {}
+    with_fat, out = 0, list(left_out)
     for name, group in groups.items():
-        row = _phantom(calibration, group)
-        if isinstance(row, str):
-            out.append(f"{name}: {row}")
-        else:
-            rows.append((name, row))
+        rises = all(np.isfinite(one.shape.log_amplitude).any() for one in group)
+        used = calibration.for_maps([one.shape for one in group]) if rises else calibration
+        if why := _misfit(used, group) if rises else "a map does not rise above its background":
+            out.append(f"{name}: {why}")
+            continue
+        rows[name] = _row(used, group)
+        with_fat += used.fat_mm is not None or calibration.depth is None
     if len(rows) < LEAST_PHANTOMS:
         why = f" ({'; '.join(out)})" if out else ""
         raise BadDataError(
             f"{len(rows)} phantom{'' if len(rows) == 1 else 's'} in the range of {base}{why}",
             way_out=f"a correction needs at least {LEAST_PHANTOMS} distinct phantoms; 5 to 20 are better",
         )
-    data = Residuals(*np.array([row.left for _, row in rows]).T)
+    data = Residuals(*np.array(list(rows.values())).T)
     posterior = shift_posterior(data)
     left = data.residual - data.design[:, :2] @ posterior.mean[:2]
     site = SiteShift(
@@ -154,9 +157,9 @@ def correct_calibration(
         mean=posterior.mean[:2],
         covariance=posterior.covariance[:2, :2],
         phantoms=len(rows),
-        maps=sum(row.maps for _, row in rows),
+        maps=sum(len(groups[name]) for name in rows),
         base=base,
-        uses_fat=2 * sum(row.uses_fat for _, row in rows) > len(rows),
+        uses_fat=2 * with_fat > len(rows),
         fit={
             "log_width": float(data.width.mean() + calibration.centre.log_width),
             "spread_factor": posterior.spread,
@@ -164,31 +167,26 @@ def correct_calibration(
             "sd_after": float(np.sqrt(np.mean(left**2))),
         },
         cautions=(
-            *no_depth(calibration, [groups[name][0].known for name, _ in rows]),
-            *cautions_of([name for name, _ in rows], data, posterior),
+            *no_depth(calibration, [groups[name][0].known for name in rows]),
+            *cautions_of(list(rows), data, posterior),
         ),
         left_out=tuple(out),
     )
     return replace(calibration, site=site)
 
 
-class _Phantom(Record):
-    left: tuple[float, ...]  #: As the columns of `Residuals`.
-    maps: int
-    uses_fat: bool
-
-
-def _phantom(calibration: BodyCalibration, maps: Sequence[PhantomMap]) -> _Phantom | str:
-    """Residual of a phantom under the calibration, or why it takes no part."""
-    if not all(np.isfinite(one.shape.log_amplitude).any() for one in maps):
-        return "a map does not rise above its background"
-    shapes = [one.shape for one in maps]
-    centre, used = calibration.centre.log_width, calibration.for_maps(shapes)
+def _misfit(used: BodyCalibration, maps: Sequence[PhantomMap]) -> str:
+    """Why a phantom takes no part; empty where it does."""
+    note = used.fat_note  # beyond the depth's range it is sized without the depth, as any map is
     for one in maps:
-        note = used.fat_note  # beyond the depth's range it is sized without the depth, as any map is
         if outside := [text for text in used.outside(*one.shape.middle) if not (note and text.startswith(note))]:
             return "; ".join(outside)
-    log_size = log_sizes(used, shapes)
+    return ""
+
+
+def _row(used: BodyCalibration, maps: Sequence[PhantomMap]) -> tuple[float, ...]:
+    """A phantom under the calibration, as the columns of `Residuals`."""
+    log_size = log_sizes(used, [one.shape for one in maps])
     log_a, log_width = (
         np.array([np.nanmean(getattr(m.shape, n)) for m in maps]) for n in ("log_amplitude", "log_width")
     )
@@ -199,9 +197,9 @@ def _phantom(calibration: BodyCalibration, maps: Sequence[PhantomMap]) -> _Phant
     n = len(maps)
     exam = used.between_exams.sd**2 / n
     noise = float(np.mean([np.nanvar(size) for size in log_size])) / n
-    variances = alone + used.other_sd**2 + exam, noise
-    columns = float(left.mean()) - expected, float(log_width.mean()) - centre, *variances, float(np.sqrt(together))
-    return _Phantom(columns, n, used.fat_mm is not None or calibration.depth is None)
+    width = float(log_width.mean()) - used.centre.log_width
+    variance = alone + used.other_sd**2 + exam
+    return float(left.mean()) - expected, width, variance, noise, float(np.sqrt(together))
 
 
 def _known(
