@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from itertools import compress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, cast
 
@@ -194,13 +195,12 @@ def table_recipe(table: Table, declared: Mapping[str, Any]) -> Recipe:
     said = {name: _alike(table, name) for name in (*declared, "flat_field")}
     for name, value in declared.items():
         if None not in (value, said[name]) and value != said[name]:
-            option = f"--{name.replace('_', '-')}"
-            way_out = f"leave out {option}"
+            option, also = f"--{name.replace('_', '-')}", ""
             if name == "normalise":
-                way_out += f", and size maps made with `map --normalise {said[name]}`; "
-                way_out += "`population` gives a table for --normalise gain"
+                also = f", and size maps made with `map --normalise {said[name]}`; "
+                also += "`population` gives a table for --normalise gain"
             what = f"its {name} is {said[name]}, not {value} as {option} says"
-            raise BadDataError(what, way_out=way_out, path=str(table.path))
+            raise BadDataError(what, way_out=f"leave out {option}{also}", path=str(table.path))
     found = {name: value if said[name] is None else said[name] for name, value in declared.items()}
     normalise: Normalise = found["normalise"] or "mean"
     background: Background = found["background"] or ("free" if normalise == "none" else "fixed")
@@ -245,15 +245,11 @@ def rows_of_one_way(rows: Table, normalise: str | None) -> tuple[Normalise, dict
     """
     ways = [str(value or "mean") for value in rows.columns.get("normalise", ["mean"] * len(rows))]
     found = sorted(set(ways))
-    chosen, what, advice = normalise or found[0], "", ""
-    if normalise is None and len(found) > 1:
-        what, advice = (
-            f"its maps were normalised in several ways ({', '.join(found)})",
-            "learn from the rows of one way:",
-        )
-    elif chosen not in found:
-        what, advice = f"none of its maps were made with --normalise {chosen}", "give"
-    if what:
+    chosen, several = normalise or found[0], normalise is None and len(found) > 1
+    if several or chosen not in found:
+        what = f"none of its maps were made with --normalise {chosen}"
+        what = f"its maps were normalised in several ways ({', '.join(found)})" if several else what
+        advice = "learn from the rows of one way:" if several else "give"
         raise BadDataError(what, way_out=f"{advice} --normalise {found[0]}", path=str(rows.path))
     kept = [i for i, way in enumerate(ways) if way == chosen]
     return cast("Normalise", chosen), {name: [values[i] for i in kept] for name, values in rows.columns.items()}
@@ -266,9 +262,7 @@ def size_table(table: Table, *, least_stiffness_ratio: float = 0.0) -> eq6.SizeT
         flag is not False and (ratio is None or ratio >= least_stiffness_ratio)
         for flag, ratio in zip(table.columns["detectable"], table.columns["stiffness_ratio"], strict=True)
     ]
-    columns = {
-        name: [v for v, keep in zip(values, shown, strict=True) if keep] for name, values in table.columns.items()
-    }
+    columns = {name: list(compress(values, shown)) for name, values in table.columns.items()}
 
     def array(name: str) -> FloatArray | None:
         values = columns[name]
@@ -287,8 +281,9 @@ def size_table(table: Table, *, least_stiffness_ratio: float = 0.0) -> eq6.SizeT
         return eq6.SizeTable(d_mm, amplitude, sigma_x, sigma_y)
     same = [columns[name] for name in ("seat", "d_mm", "stiffness_ratio", "thickness_mm", "head_radius_mm", "head")]
     group = list(zip(*same, strict=True))
-    change_x = eq6.width_changes(sigma_x, depth_ratio=depth, group=group)
-    change_y = None if sigma_y is None else eq6.width_changes(sigma_y, depth_ratio=depth, group=group)
+    change_x, change_y = (
+        None if one is None else eq6.width_changes(one, depth_ratio=depth, group=group) for one in (sigma_x, sigma_y)
+    )
     return eq6.SizeTable(d_mm, amplitude, sigma_x, sigma_y, change_x, change_y, _study_cases(columns), depth)
 
 
@@ -306,10 +301,6 @@ def _study_cases(columns: dict[str, list[Any]]) -> eq6.StudyCases | None:
 
 HARDEST_RATIO = 100.0
 """Largest E2/E1 of the simulated bodies; a harder lump counts as this one, because widths hardly change beyond it."""
-
-
-ShapeOf = Callable[[int, str], ShapeDraws | str]
-"""The bump of a row of that number and of a phantom of that name, or which is left out and why."""
 
 
 def _corrected(table: Path | Sheet, base: str, asked: LearnOptions, progress: Progress | None) -> Learned:
@@ -335,19 +326,26 @@ def _corrected(table: Path | Sheet, base: str, asked: LearnOptions, progress: Pr
             names = [str(one) for one in rows.columns["file"]]
             folder = table.parent if isinstance(table, Path) else Path()
             inputs |= {f"map_{i}": folder / name for i, name in enumerate(names, start=1)}
-            shape_of = _of_maps(rows, folder, Settings(size_calibration=base, seed=asked.seed), progress)
         else:
             rows = read_table(table, "size_table.table.json")
             _check_recipe(rows, calibration, declared)
             _check_head(rows, calibration)
-            names, shape_of = [f"line {line}" for line in rows.line_numbers], _of_bumps(rows)
-        maps, left_out = [], []
+            names = [f"line {line}" for line in rows.line_numbers]
+        maps, left_out, by_recipe = [], [], Settings(size_calibration=base, seed=asked.seed)
         for i, phantom in enumerate(_names(rows, names)):
-            shape = shape_of(i, phantom)
-            if isinstance(shape, str):
-                left_out.append(shape)
-            else:
-                maps.append(PhantomMap(phantom, rows.columns["d_mm"][i], shape, _known(rows, i)))
+            bump = None if by_files else _bump(rows, i)
+            if why := _unfit(rows, i):
+                left_out.append(f"{phantom}: {why}")
+                continue
+            if bump is None:
+                outcome = estimate_file(folder / names[i], by_recipe)
+                if progress is not None:
+                    progress(i + 1, len(rows))
+                bump = pooling_shape(outcome.tactile_map, outcome.estimate)
+                if bump is None:
+                    left_out.append(f"{names[i]}: {outcome.estimate.reason}")
+                    continue
+            maps.append(PhantomMap(phantom, rows.columns["d_mm"][i], bump, _known(rows, i)))
         name = base if base in SHIPPED else path.name
         corrected = correct_calibration(calibration, maps, base=name, left_out=left_out)
     document: Any = load_json(path)
@@ -355,40 +353,14 @@ def _corrected(table: Path | Sheet, base: str, asked: LearnOptions, progress: Pr
     return Learned(corrected, settings, inputs, base=document)
 
 
-def _of_bumps(rows: Table) -> ShapeOf:
-    """The bumps of a table of amplitudes and widths."""
-    columns = rows.columns
-
-    def shape_of(i: int, name: str) -> ShapeDraws | str:
-        if columns["sigma_y_mm"][i] is None:
-            raise rows.error(i, "sigma_y_mm", "is blank", way_out="give both widths of the map")
-        if columns["detectable"][i] is False:
-            return f"{name}: its row says that it is not detectable"
-        if (why := _too_soft(rows, i)) is not None:
-            return f"{name}: {why}"
-        amplitude, sigma_x, sigma_y = (
-            np.array([columns[one][i]], dtype=np.float64) for one in ("amplitude", "sigma_x_mm", "sigma_y_mm")
-        )
-        told = tuple(columns[one][i] for one in HEAD_PROFILE)
-        bump = BumpDraws(amplitude, sigma_x, sigma_y, np.zeros(1))
-        return ShapeDraws.of(bump, profile=None if None in told else told)
-
-    return shape_of
-
-
-def _of_maps(rows: Table, folder: Path, settings: Settings, progress: Progress | None) -> ShapeOf:
-    """The bumps of a table of map files, each estimated by the calibration's recipe."""
-
-    def shape_of(i: int, name: str) -> ShapeDraws | str:
-        if (why := _too_soft(rows, i)) is not None:
-            return f"{name}: {why}"
-        file = rows.columns["file"][i]
-        outcome = estimate_file(folder / file, settings)
-        if progress is not None:
-            progress(i + 1, len(rows))
-        return pooling_shape(outcome.tactile_map, outcome.estimate) or f"{file}: {outcome.estimate.reason}"
-
-    return shape_of
+def _bump(rows: Table, i: int) -> ShapeDraws:
+    """The bump of a row with its amplitude and widths."""
+    row = {name: values[i] for name, values in rows.columns.items()}
+    if row["sigma_y_mm"] is None:
+        raise rows.error(i, "sigma_y_mm", "is blank", way_out="give both widths of the map")
+    a, x, y = (np.array([row[one]], dtype=np.float64) for one in ("amplitude", "sigma_x_mm", "sigma_y_mm"))
+    told = tuple(row[one] for one in HEAD_PROFILE)
+    return ShapeDraws.of(BumpDraws(a, x, y, np.zeros(1)), profile=None if None in told else told)
 
 
 def _names(rows: Table, otherwise: list[str]) -> list[str]:
@@ -422,11 +394,13 @@ def _known(rows: Table, i: int) -> dict[str, float]:
     return found
 
 
-def _too_soft(rows: Table, i: int) -> str | None:
-    """Why a lump is too soft for a calibration over bodies with hard ones."""
+def _unfit(rows: Table, i: int) -> str:
+    """Why a lump takes no part: not shown, or too soft for a calibration over bodies with hard ones."""
+    if "detectable" in rows.columns and rows.columns["detectable"][i] is False:
+        return "its row says that it is not detectable"
     ratio = rows.columns["stiffness_ratio"][i]
     if ratio is None or ratio >= LEAST_HARD_RATIO:
-        return None
+        return ""
     return f"its stiffness_ratio is {ratio:g}, and the calibration's lumps have {LEAST_HARD_RATIO:g} and more"
 
 

@@ -17,7 +17,7 @@ From a study or phantoms it is learned for each axis of the head, as draws of it
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Final, Literal
+from typing import Annotated, ClassVar, Final, Literal
 
 import numpy as np
 
@@ -61,9 +61,10 @@ def eq6_coefficients(theta: Sequence[float] | FloatArray, powers: Powers, v: Flo
 
 
 def eq6_parts(
-    u: FloatArray, v: FloatArray, mu: FloatArray, f: FloatArray, b_mm: FloatArray
+    u: FloatArray, v: FloatArray, w: FloatArray, theta: FloatArray, powers: Powers
 ) -> tuple[FloatArray, FloatArray]:
     """The term of Eq 6 that is proportional to sigma, and d, both (...,) in mm; d is NaN where it is not positive."""
+    mu, f, b_mm = eq6_coefficients(theta, powers, v, w)
     stretched = np.exp(mu + v - f * u)
     size = stretched + b_mm
     return stretched, np.where(size > 0, size, np.nan)
@@ -71,7 +72,7 @@ def eq6_parts(
 
 def eq6_terms(u: FloatArray, v: FloatArray, w: FloatArray, theta: FloatArray, powers: Powers) -> FloatArray:
     """(..., k) derivatives of ln d by the coefficients; NaN where Eq 6 has no positive size."""
-    stretched, size = eq6_parts(u, v, *eq6_coefficients(theta, powers, v, w))
+    stretched, size = eq6_parts(u, v, w, theta, powers)
     share = stretched / size
     slopes = (share, -u * share, 1.0 / size)
     return np.stack([slopes[row] * v**i * w**k for row, i, k in powers], axis=-1)
@@ -79,7 +80,7 @@ def eq6_terms(u: FloatArray, v: FloatArray, w: FloatArray, theta: FloatArray, po
 
 def eq6_log_size(u: FloatArray, v: FloatArray, w: FloatArray, theta: FloatArray, powers: Powers) -> FloatArray:
     """(...,) ln d, d in mm."""
-    return np.asarray(np.log(eq6_parts(u, v, *eq6_coefficients(theta, powers, v, w))[1]))
+    return np.asarray(np.log(eq6_parts(u, v, w, theta, powers)[1]))
 
 
 COEFFICIENTS: Final = ("m", "b_mm", "e", "f", "scatter", "scatter_slope")
@@ -150,9 +151,7 @@ class SizeCalibration(Record, eq=False):
     left_out: LeftOutErrors | None = None
     cautions: tuple[str, ...] = ()  #: What of the table's lumps is of one kind, or unlike a patient's.
 
-    @property
-    def fat_mm(self) -> None:
-        """Depth of fat of the calibration: None for Eq 6."""
+    fat_mm: ClassVar[None] = None  #: Depth of fat of the calibration: none for Eq 6.
 
     def at_fat(self, profiles: Sequence[tuple[float, ...] | None]) -> SizeCalibration:
         """Return the calibration unchanged: Eq 6 does not depend on the depth of fat."""

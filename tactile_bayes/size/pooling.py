@@ -330,39 +330,32 @@ def pool_maps(
     sizes = log_sizes(at_depth, used)
     centres = {i: float(np.nanmean(one)) for i, one in zip(places, sizes, strict=True)}
     centre, noise = np.array(list(centres.values())), np.array([np.nanvar(one) for one in sizes])
-    chances = _one_size(centre, noise, priors)
-    if chances["one_size"] is not None and chances["one_size"] < LEAST_PROBABILITY:
-        far_off = outlying_maps(centre, noise, priors.spread_of_others)
-        apart = tuple(sorted(places[i] for i in far_off))
-        return PooledEstimate(
-            DISAGREE, "the maps show different sizes", None, centres, apart, (), at_depth, fat_apart_mm, **chances
-        )
+    outlying = tuple(sorted(places[i] for i in outlying_maps(centre, noise, priors.spread_of_others)))
+    another = None if priors.between_maps is not None or len(used) < 2 else priors.another_exam
+    found = PooledEstimate(
+        DISAGREE,
+        "the maps show different sizes",
+        centres=centres,
+        outlying=outlying,
+        calibration=at_depth,
+        fat_apart_mm=fat_apart_mm,
+        one_size=None if len(used) < 2 else one_size_probability(centre, noise, priors.between_maps),
+        one_size_apart=None if another is None else one_size_probability(centre, noise, another),
+    )
+    if found.one_size is not None and found.one_size < LEAST_PROBABILITY:
+        return found
     size = pooled_size(used, calibration=at_depth, priors=priors, rng=rng, number=POOLED_DRAWS)
     if size.invalid > MOST_INVALID * size.d_x_mm.size:
         return PooledEstimate("no_estimate", f"no positive size in {size.invalid} of {size.d_x_mm.size} draws")
     outside = [f"map {i + 1}: {text}" for i, middle in named for text in at_depth.outside(*middle)]
     outside += at_depth.beyond_lumps(size.median_mm)
     reason = "" if len(places) == len(shapes) else f"a lump was found on {len(places)} of {len(shapes)} maps"
-    outlying = tuple(sorted(places[i] for i in size.outliers))
     if len(used) > 1:
         weights = {
             f"weight_{sorted(places).index(i) + 1}": size.figures[f"weight_{j + 1}"] for j, i in enumerate(places)
         }
         size = replace(size, figures={**size.figures, **weights})
-    return PooledEstimate(
-        "estimate", reason, size, centres, outlying, tuple(outside), at_depth, fat_apart_mm, **chances
-    )
-
-
-def _one_size(centre: FloatArray, noise: FloatArray, priors: SizePriors) -> dict[str, float | None]:
-    """Probabilities that maps of one mass come out so far apart; the second where a second interval is told too."""
-    if len(centre) < 2:
-        return {"one_size": None, "one_size_apart": None}
-    another = None if priors.between_maps is not None else priors.another_exam
-    return {
-        "one_size": one_size_probability(centre, noise, priors.between_maps),
-        "one_size_apart": None if another is None else one_size_probability(centre, noise, another),
-    }
+    return replace(found, status="estimate", reason=reason, size=size, outside=tuple(outside))
 
 
 # --- A site's repeatability: how far sizes of one mass lie apart between its exams, learned from repeated exams there.
