@@ -401,9 +401,9 @@ class CollapsedTarget:
         """Log Bayes factor of a slope against none at one shape: the Savage-Dickey ratio of its components at 0."""
         (solution,) = self._solutions(theta[None])
         weight = solution.evidence[0] - np.logaddexp.reduce(solution.evidence[0])
-        # level and tilt at amplitudes of 0, and their covariance over tau^2 given the amplitudes
-        inverse, c = np.concatenate([one.inverse for one in self.fields]), len(self.linear.plain) - 1
-        level = np.concatenate([np.einsum("hcd,hd->hc", one.inverse, one.gram[:, :c, c]) for one in self.fields])
+        level, inverse = (
+            np.concatenate(parts) for parts in zip(*((one.level(), one.inverse) for one in self.fields), strict=True)
+        )
         slope = solution.level_slope[0][:, :, 1:3]
         mean = level[:, 1:3] - np.einsum("hv,hvc->hc", solution.amplitude[0], slope)
         spread = np.einsum("hvc,hvw,hwd->hcd", slope, np.linalg.inv(solution.power[0]), slope)

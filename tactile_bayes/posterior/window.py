@@ -360,6 +360,11 @@ class FieldColumns(Record, eq=False):
         right = self.gram[:, :c, c]
         return np.asarray(self.gram[:, c, c] - np.einsum("hc,hcd,hd->h", right, self.inverse, right))
 
+    def level(self) -> FloatArray:
+        """(h, c) level and tilt at amplitudes of 0."""
+        c = self.inverse.shape[1]
+        return np.asarray(np.einsum("hcd,hd->hc", self.inverse, self.gram[:, :c, c]))
+
     def null_evidence(self, *, dof: int) -> FloatArray:
         """(h,) log prior plus log evidence of the fixed columns alone."""
         squares = np.maximum(self.rest(), 0.0) + self.floor

@@ -242,24 +242,17 @@ class BodyCalibration(BodyLaw, eq=False, kw_only=True):
     @property
     def coefficient_covariance(self) -> FloatArray:
         """(k + m, k + m) of Eq 6's coefficients and the residual's weights, which are independent."""
-        k, m = len(self.eq6.mean), 0 if self.residual is None else len(self.residual.mean)
-        covariance = np.zeros((k + m, k + m))
-        covariance[:k, :k] = self.eq6.covariance
-        if self.residual is not None:
-            covariance[k:, k:] = self.residual.covariance
-        return covariance
+        if self.residual is None:
+            return self.eq6.covariance
+        apart = np.zeros((len(self.eq6.mean), len(self.residual.mean)))
+        return np.block([[self.eq6.covariance, apart], [apart.T, self.residual.covariance]])
 
     def coefficient_variance(self, terms: FloatArray) -> FloatArray:
         """(n,) variance of ln d by the coefficients' error, for (n, k + m) terms."""
         return np.asarray(np.maximum(np.sum(terms @ self.coefficient_covariance * terms, axis=-1), 0.0))
 
-    def leverage(self, amplitude: float, sigma_mm: float) -> float:
-        """Leverage of a map over the largest in the table; infinite without a rise."""
-        if not (amplitude > 0 and sigma_mm > 0):
-            return float("inf")
-        return float(self._leverages(np.array(amplitude), np.array(sigma_mm)))
-
-    def _leverages(self, amplitude: FloatArray, sigma_mm: FloatArray) -> FloatArray:
+    def leverage(self, amplitude: FloatArray | float, sigma_mm: FloatArray | float) -> FloatArray:
+        """(...,) leverage of maps, which rise, over the largest in the table."""
         x = self.features(np.log(amplitude), np.log(sigma_mm))
         return np.asarray(np.einsum("...i,ij,...j->...", x, self.information_inverse, x) / self.most_leverage)
 
@@ -276,7 +269,7 @@ class BodyCalibration(BodyLaw, eq=False, kw_only=True):
         """(n,) True for maps without `extrapolation_faults`."""
         sigma_mm = np.sqrt(sigma_x_mm * sigma_y_mm)
         inside = terms.within_reach(self.domain, amplitude, sigma_mm)
-        inside[inside] = self._leverages(amplitude[inside], sigma_mm[inside]) <= FARTHEST_LEVERAGE
+        inside[inside] = self.leverage(amplitude[inside], sigma_mm[inside]) <= FARTHEST_LEVERAGE
         return inside
 
     def beyond_lumps(self, largest_mm: float) -> list[str]:
@@ -348,9 +341,9 @@ def known_body(
     own_sd: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
     """(n,) mean and variance of B given known properties, for ln a and p of maps and `BodyCalibration.own_sd` there."""
-    hidden, none = calibration.hidden, np.zeros(len(log_width))
+    hidden = calibration.hidden
     if not known:
-        return none, own_sd**2
+        return np.zeros(len(log_width)), own_sd**2
     names = () if hidden is None else hidden.names
     for name, value in known.items():
         if name not in names:

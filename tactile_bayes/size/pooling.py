@@ -36,11 +36,9 @@ from tactile_bayes.size.terms import extrapolated
 
 # --- Sizes from the maps of one mass, one or several.
 #
-# Map i gives :math:`g_i`, the log size by the calibration's form, with its own noise. Maps of one mass differ by
-# more than that: :math:`g_i = \ln d - B + E_i`, with :math:`E_i \sim N(0, \tau^2)` between maps. tau is learned
-# from the maps at hand, with a prior about the spread that the calibration's exams show; one map says nothing about
-# it, so there the prior speaks. A second interval has a prior about the spread of the paper's maps. B, what no map
-# shows of a body, is common to all maps of a mass and does not average out.
+# Map i gives :math:`g_i = \ln d - B + E_i`, the log size by the calibration's form, with E as in `draws`. The prior of
+# tau is about the spread that the calibration's exams show; a second interval's, about that of the paper's maps. B,
+# what no map shows of a body, is common to all maps of a mass and does not average out.
 
 Calibration = SizeCalibration | BodyCalibration
 """One learned from a study or phantoms, or over a population: whoever uses it needs to know no more."""

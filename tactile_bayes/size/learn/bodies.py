@@ -54,8 +54,9 @@ def learn_population(
             regression.BodiesLeft(rows.of_bodies(eq6.data), rows.spread_terms(eq6.data), left, noise)
         )
         steps = np.eye(3)[:2] * _STEP  # along u and v
-        slopes = [(fitted.at(rows.values + h) - fitted.at(rows.values - h)) / (2 * _STEP) for h in steps]
-        size, slope = size + fitted.at(rows.values), slope + np.stack(slopes)
+        at = fitted.residual.at
+        slopes = [(at(rows.values + h) - at(rows.values - h)) / (2 * _STEP) for h in steps]
+        size, slope = size + at(rows.values), slope + np.stack(slopes)
         exam, noise = _exams(rows, eq6, size, slope)
         left, noise = left - fitted.predicted, noise + fitted.variance
     return _calibration(rows, eq6, fitted, exam, left=left, noise=noise, recipe=recipe, source=source)
@@ -176,7 +177,7 @@ def _calibration(
     off = np.expm1(-left)  # of sizes of bodies left out
     figures = {
         "maps": float(len(maps)),
-        "bodies": float(data.groups),
+        "bodies": float(len(data.exams)),
         "body_sd": float(np.median(body_sd)),
         "exam_sd": exam.sd,
         "left_out_sd": float(left.std()),
@@ -206,7 +207,7 @@ def _calibration(
         return calibration
     at, a, p = calibration.at_fat([None]), maps.log_amplitude, maps.log_width
     body = data.mean(np.log(maps.d_mm) - at.log_size(a, p))
-    body_sd = at.body_sd(data.mean(a), data.mean(p), np.zeros(data.groups))
+    body_sd = at.body_sd(data.mean(a), data.mean(p), np.zeros(len(data.exams)))
     hidden_any = regression.hidden_terms(maps, data, body=body, body_sd=body_sd, features=at.features(a, p))
     return replace(calibration, hidden_any=hidden_any)
 
@@ -282,7 +283,8 @@ def size_error(
     calibration: BodyCalibration, exams: regression.PopulationTable, *, known: Sequence[str] = ()
 ) -> tuple[float, float]:
     """Log error of one body by the mean of its exams, and the variance that the calibration states."""
-    at = calibration.at_fat(_known(exams.profile, len(exams)))
+    profiles = [None] * len(exams) if exams.profile is None else exams.profile.tolist()
+    at = calibration.at_fat([tuple(one) if one and np.isfinite(one).all() else None for one in profiles])
     a, p = exams.log_amplitude, exams.log_width
     by_a = (at.log_size(a + _MAP_STEP, p) - at.log_size(a - _MAP_STEP, p)) / (2 * _MAP_STEP)
     noise = regression.map_variance(exams, np.stack([by_a, at.width_slope(a, p)]))
@@ -317,10 +319,3 @@ def learn_other_sd(calibration: BodyCalibration, table: regression.PopulationTab
     }
     found_out = calibration.with_other_sd(other_sd, other_source=source)
     return replace(found_out, fit={**calibration.fit, **fit})
-
-
-def _known(figures: FloatArray | None, number: int) -> Sequence[tuple[float, ...] | None]:
-    """Figures of each exam; None where it has none."""
-    if figures is None:
-        return [None] * number
-    return [tuple(one) if np.isfinite(one).all() else None for one in figures]

@@ -112,11 +112,6 @@ class BodyRegression(Record, eq=False):
         left, mean_u = (np.bincount(group, one) / exams for one in (np.log(table.d_mm) - constant, u))
         return cls(terms, constant, map_variance(table, slope), group, exams, mean_terms, left, mean_u)
 
-    @property
-    def groups(self) -> int:
-        """Number of bodies."""
-        return len(self.exams)
-
     def mean(self, values: FloatArray) -> FloatArray:
         """(groups,) means of (n,) values over each body's exams."""
         return np.asarray(np.bincount(self.group, values) / self.exams)
@@ -212,7 +207,7 @@ def hidden_terms(
     rest = varied - design @ coefficients
     most_sd = float(np.quantile(body_sd, EXPLAINED))
     told = np.minimum(1.0, most_sd / body_sd)
-    freedom = max(data.groups - design.shape[1], 1)
+    freedom = max(len(design) - design.shape[1], 1)
     return HiddenTerms(
         names=tuple(table.unknowns),
         expected=np.asarray(coefficients.T),
@@ -291,10 +286,6 @@ class FittedResidual(Record, eq=False):
     covariance: FloatArray
     predicted: FloatArray
     variance: FloatArray
-
-    def at(self, x: FloatArray) -> FloatArray:
-        """(n,) the residual at (n, 3) values."""
-        return np.asarray(self.kernel.functions(x) @ self.mean)
 
     @property
     def residual(self) -> Residual:
@@ -382,6 +373,5 @@ def _spread_prior(log_spread: FloatArray) -> float:
 
 
 def _start(bodies: BodiesLeft, length: float) -> FloatArray:
-    lengths, spread = np.full(bodies.x.shape[1], np.log(length)), np.zeros(bodies.features.shape[1])
-    spread[0] = _BODY_SD[0]
-    return np.concatenate([lengths, [_SCALE[0]], spread])
+    lengths, slopes = np.full(bodies.x.shape[1], np.log(length)), np.zeros(bodies.features.shape[1] - 1)
+    return np.concatenate([lengths, [_SCALE[0], _BODY_SD[0]], slopes])
