@@ -381,16 +381,24 @@ def _as_counts(held: Arrays, stated: Stated, told: list[str]) -> None:
     whole = frames.dtype.kind in "iu" and frames.min() >= 0 and frames.max() <= _MOST_COUNTS
     kpa = frames.astype(np.float64) * factor
     gain, offset = (factor, 0.0) if whole else (_STEP_KPA, min(0.0, float(np.floor(kpa.min() / _STEP_KPA)) * _STEP_KPA))
+    told.append(_told_pressure(kpa, unit, kept="" if whole else f", kept to {1000 * _STEP_KPA:g} Pa"))
+    if offset + gain * _MOST_COUNTS < min(kpa.max(), PRESSURE_RANGE_KPA[1]):  # the others would be cut off
+        at = tuple(map(int, np.unravel_index(kpa.argmin(), kpa.shape)))
+        what = f"frames in {unit} hold {frames.min():g} (first at {at}), and an array reads no such pressure"
+        raise BadDataError(
+            what, way_out="write 0 in all frames of an element that does not work, or repair the reading"
+        )
     held["counts"] = np.clip(np.rint((kpa - offset) / gain), 0, _MOST_COUNTS).astype(np.uint16)
     full = _MOST_COUNTS if stated.saturation is None else round((stated.saturation * factor - offset) / gain)
     held |= {"gain_kpa_per_count": np.asarray(gain), "offset_kpa": np.asarray(offset)}
     held["saturation_count"] = np.asarray(min(max(full, 1), _MOST_COUNTS))
-    told.append(_told_pressure(kpa, unit, kept="" if whole else f", kept to {1000 * _STEP_KPA:g} Pa"))
 
 
 def _told_pressure(kpa: FloatArray, unit: str, *, kept: str) -> str:
     """What the frames' means are, with a question for their unit where no examination presses so."""
     means = kpa.reshape(len(kpa), -1).mean(axis=1)
+    if means.max() < 0:
+        raise BadDataError(f"frames in {unit} are below 0 throughout", way_out="give pressures that rise when pressed")
     pressed = means[means >= means.max() / 2]
     low, high = np.quantile(pressed, [0.05, 0.95]) / KPA_PER_UNIT[unit]
     middle = float(np.median(pressed))

@@ -214,6 +214,21 @@ def test_pressures_below_zero_are_kept_and_a_saturation_is_in_the_unit(pressed: 
     np.testing.assert_allclose(kpa[~np.isnan(kpa)], frames[~np.isnan(kpa)], atol=6e-4)
 
 
+def test_a_number_far_below_zero_is_refused_where_it_would_cut_off_the_readings(pressed: Arrays) -> None:
+    """It would be the least of 65,536 steps of 1 Pa, and every taxel that works would lie above the greatest."""
+    frames = pressed["frames"].copy()
+    frames[:, 3, 4] = -999.0
+    with pytest.raises(BadDataError, match=r"hold -999 \(first at \(0, 3, 4\)\), and an array reads no such pressure"):
+        scan_of(pressed | {"frames": frames}, unit="kPa")
+    with pytest.raises(BadDataError, match="are these Pa"):
+        scan_of(pressed | {"frames": 1000 * pressed["frames"] - 3000}, unit="kPa")
+
+
+def test_pressures_below_zero_throughout_are_refused(pressed: Arrays) -> None:
+    with pytest.raises(BadDataError, match="below 0 throughout; give pressures that rise"):
+        scan_of(pressed | {"frames": -pressed["frames"] - 1.0}, unit="kPa")
+
+
 def scan_of(arrays: Arrays, **stated: Any) -> Scan:
     poses = (arrays["pose_time_s"], arrays["position_mm"], arrays["quaternion_wxyz"])
     head = {
