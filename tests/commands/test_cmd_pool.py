@@ -190,12 +190,24 @@ def test_a_known_seat_moves_the_size(folder: Path) -> None:
     assert median("--known", "seat", "0") > 1.03 * median() > 1.06 * median("--known", "seat", "1.2")
 
 
+def test_maps_that_no_calibration_fits_alone_are_not_pooled_to_a_size(folder: Path) -> None:
+    """The pool's calibration was looked up by the normalisation alone: two such maps got a size, each alone none."""
+    done = run_here(
+        "estimate", "mass1.nc", "mass2.nc", "--pool", *settings(folder, fit_radius_mm=12.0), *FAST, cwd=folder
+    )
+    assert done.returncode == 6
+    assert "No estimate: map 1: the shipped calibration does not fit: fit radius 12 mm" in done.stdout
+
+
 @pytest.mark.parametrize(
     ("arguments", "code", "words"),
     [
         (["mass1.nc", "--known", "weather", "1"], 2, "no property weather; known are depth_mm"),
         (["mass1.nc", "--known", "depth_mm", "0"], 2, "depth_mm is 0"),
         (["mass1.nc", "--known", "seat", "-1"], 2, "seat is -1"),
+        (["mass1.nc", "--known", "seat", "99"], 2, "seat is 99; give a number from 0 to 2.39"),
+        (["mass1.nc", "--known", "thickness_mm", "1e300"], 2, "thickness_mm is 1e+300; give a number from 20.0286 to"),
+        (["mass1.nc", "--known", "depth_mm", "110"], 2, "depth_mm is 110; give a number from 1.401 to 107.9"),
         (["mass1.nc", "mass2.nc", "--pool", "--size-calibration", "none"], 2, "--pool needs a size calibration"),
         (["mass1.nc", "mass2.nc", "--pool", "--size-calibration", "eq6.json"], 2, "use solid"),
         (["mass1.nc", "mass2.nc", "--pool", "--map-figure", "x.png"], 2, "--map-figure"),
