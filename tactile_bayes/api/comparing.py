@@ -11,7 +11,7 @@ import numpy as np
 
 from tactile_bayes.api.arguments import PathLike, Told, door, path_of, plain, sequence_of, takes
 from tactile_bayes.api.estimates import estimated, settings_of
-from tactile_bayes.api.pooled import common_calibration, one_mass, place_of
+from tactile_bayes.api.pooled import common_calibration, one_mass, place_of, without_calibration
 from tactile_bayes.api.settings import Settings, refuse_checkpoint, times_of
 from tactile_bayes.api.sized import Answer, SizeEstimate, size_priors
 from tactile_bayes.declarations import as_dict, replace
@@ -240,6 +240,8 @@ def _compared(
         return Compared("not_one_mass", "; ".join(contradicted), advice)
     if missing:
         return Compared("no_estimate", "; ".join(missing), "scan the mass again, or leave that visit out")
+    if unfit := without_calibration([one.report for maps in visits for one in maps]):
+        return Compared("no_estimate", unfit, "compare maps that have a size each")
     refused, apart, doubts = _by_place(found, comparing)
     if refused is not None:
         return refused

@@ -233,6 +233,8 @@ def _no_size(
     for i, report in enumerate(reports, start=1):
         if report.reason_code == "extrapolated":
             return PooledEstimate("no_estimate", f"map {i}: {report.reason}")
+    if why := without_calibration(reports):
+        return PooledEstimate("no_estimate", why)
     if all(report.reason_code == CANNOT_SHOW for report in reports):
         why = reports[0].reason
         return PooledEstimate("no_estimate", f"map 1: {why}" if len(reports) > 1 else why)
@@ -240,6 +242,12 @@ def _no_size(
         return None
     most = max(float(np.hypot(*(a.centre_mm - b.centre_mm))) for a, b in combinations(places, 2))
     return PooledEstimate(DISAGREE, f"by the landmarks the masses of the maps lie up to {most:.0f} mm apart")
+
+
+def without_calibration(reports: Sequence[EstimateReport]) -> str:
+    """Why the first map that has no size for want of a calibration has none; empty where all have one."""
+    reasons = (f"map {i}: {one.reason}" for i, one in enumerate(reports, start=1) if one.reason and not one.reason_code)
+    return next(reasons, "")
 
 
 def common_calibration(

@@ -200,6 +200,12 @@ def test_what_cannot_be_compared_is_one_clear_line(folder: Path, words: tuple, c
     assert done.stdout == ""
 
 
+def test_maps_that_no_calibration_fits_alone_have_no_change(folder: Path) -> None:
+    done = run(folder, "a0.nc", "--with", "same0.nc", *settings(folder, fit_radius_mm=12.0))
+    assert done.returncode == 6
+    assert "Not compared: map 1: the shipped calibration does not fit: fit radius 12 mm" in done.stdout
+
+
 def test_a_posterior_is_refused_and_its_map_is_asked_for(folder: Path) -> None:
     run_here("estimate", "a0.nc", "-o", "post.nc", "--force", *FAST, cwd=folder)
     done = run(folder, "a1.nc", "--with", "post.nc")
