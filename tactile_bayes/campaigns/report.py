@@ -228,7 +228,9 @@ def _together(campaign: Campaign, rows: Sequence[Row], report: PooledReport | No
     reason = "every exam failed" if fault is None else f"{fault.step} failed: {fault.reason}"
     told = [row.synthetic for row in rows if row.synthetic is not None]  # a failed exam does not say
     synthetic = any(told) if told else None
-    return _reading(exam, POOLED_MODALITY, report, reason if report is None else report.reason, synthetic=synthetic)
+    reading = _reading(exam, POOLED_MODALITY, report, reason if report is None else report.reason, synthetic=synthetic)
+    silent = reading["status"] == "not_detected" and all(row.status == "not_done" for row in rows)
+    return reading | {"status": "not_done"} if silent else reading
 
 
 def _reading(

@@ -15,6 +15,8 @@ import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import h5py
 import numpy as np
@@ -33,12 +35,12 @@ from campaign_files import (
     write_table,
 )
 from in_process import run_here
-from plain_reports import estimate_report
+from plain_reports import estimate_report, pooled_report
 from scipy.io import savemat
 
 import tactile_bayes as tb
 from tactile_bayes.campaigns.inputs import open_campaign
-from tactile_bayes.campaigns.report import Row
+from tactile_bayes.campaigns.report import Row, trial_lines
 from tactile_bayes.campaigns.steps import Task, make_map, run_step
 from tactile_bayes.errors import UsageError
 from tactile_bayes.files.documents import load_schema
@@ -340,8 +342,11 @@ def test_half_a_place_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("code", "status"), [("cannot_show", "not_done"), ("undetected", "not_detected")])
 def test_an_exam_that_cannot_show_a_lump_was_not_done(code: str, status: str) -> None:
     """Not held against the modality; the control is a map that could have shown a lump."""
-    report = estimate_report(reason_code=code)
-    assert Row(Listed("a.nc", Path("a.nc"), "P", "1", "1", 1), report).status == status
+    row = Row(Listed("a.nc", Path("a.nc"), "P", "1", "1", 1), estimate_report(reason_code=code))
+    assert row.status == status
+    without_faults: Any = SimpleNamespace(found=SimpleNamespace(faults={}))
+    together = {row.exam.of_mass: pooled_report(reason="no size", maps=())}
+    assert [one["status"] for one in trial_lines(without_faults, [row], together, None)] == [status, status]
 
 
 @pytest.mark.long
