@@ -74,12 +74,11 @@ class Outputs(Record):
 
     def check(self, *, files: bool) -> None:
         """Refuse, before any work is done, what could not be written; `files` says whether something is exported."""
-        if not files and self.dictionary is None:
-            raise UsageError("no file was given to export; give a map, an estimate or both")
         if files and self.path is None:
             raise UsageError("there is nowhere to write to; give the path (-o OUT)")
-        if self.path is not None and not files:
-            raise UsageError(f"no file was given to export to {self.path}; give a map, an estimate or both")
+        if not files and (self.dictionary is None or self.path is not None):
+            where = "" if self.dictionary is None else f" to {self.path}"
+            raise UsageError(f"no file was given to export{where}; give a map, an estimate or both")
         if self.dictionary is not None and self.to != "csv":
             raise UsageError("--dictionary is REDCap's; give it with --to csv")
         if self.path is not None and self.dictionary is not None and same_file(self.path, self.dictionary):

@@ -16,37 +16,25 @@ class ArrayLayout(NamedTuple):
 
     shape: Shape  #: Lengths of its axes; n frames, m poses. Letters are lengths that must agree between arrays.
     meaning: str
-    kind: str = "real"  #: Numbers it may have: ``integer`` or ``real``.
-    unit: str = "1"  #: Of its numbers; ``1`` where they have none.
-    frame: str = ""  #: Coordinate frame of places and directions, or the clock of times; empty where there is none.
 
 
 LAYOUT: Final[dict[str, ArrayLayout]] = {
     "counts": ArrayLayout(
-        ("n", "rows", "columns"), "raw readings, 0 to 65535; rows across the head (x), columns along it (y)", "integer"
+        ("n", "rows", "columns"), "raw readings, 0 to 65535; rows across the head (x), columns along it (y)"
     ),
-    "frame_time_s": ArrayLayout(("n",), "time of each frame", unit="s", frame="the frames' clock"),
-    "position_mm": ArrayLayout(("m", 3), "tracker sensor in the tracker's base frame", unit="mm", frame="base"),
-    "quaternion_wxyz": ArrayLayout(
-        ("m", 4), "its rotation, scalar first, from the sensor to the base frame", frame="base from sensor"
-    ),
-    "pose_time_s": ArrayLayout(("m",), "time of each pose, on the frames' clock", unit="s", frame="the frames' clock"),
-    "gain_kpa_per_count": ArrayLayout(
-        ("rows", "columns"), "pressure in kPa = gain x counts + offset", unit="kPa/count"
-    ),
-    "offset_kpa": ArrayLayout(("rows", "columns"), "see gain_kpa_per_count", unit="kPa"),
-    "pitch_mm": ArrayLayout((), "distance between neighbouring elements", unit="mm"),
-    "array_from_tracker": ArrayLayout(
-        (4, 4), "transform from the tracker sensor to the scan head, mm", unit="mm", frame="scanhead from sensor"
-    ),
+    "frame_time_s": ArrayLayout(("n",), "time of each frame"),
+    "position_mm": ArrayLayout(("m", 3), "tracker sensor in the tracker's base frame"),
+    "quaternion_wxyz": ArrayLayout(("m", 4), "its rotation, scalar first, from the sensor to the base frame"),
+    "pose_time_s": ArrayLayout(("m",), "time of each pose, on the frames' clock"),
+    "gain_kpa_per_count": ArrayLayout(("rows", "columns"), "pressure in kPa = gain x counts + offset"),
+    "offset_kpa": ArrayLayout(("rows", "columns"), "see gain_kpa_per_count"),
+    "pitch_mm": ArrayLayout((), "distance between neighbouring elements"),
+    "array_from_tracker": ArrayLayout((4, 4), "transform from the tracker sensor to the scan head, mm"),
     "head_surface_mm": ArrayLayout(
-        ("rows", "columns", 3),
-        "element centres; origin at the apex of the face, z into the tissue",
-        unit="mm",
-        frame="scanhead",
+        ("rows", "columns", 3), "element centres; origin at the apex of the face, z into the tissue"
     ),
-    "landmarks_mm": ArrayLayout((2, 3), "sternal notch and xiphoid in the base frame", unit="mm", frame="base"),
-    "nipple_mm": ArrayLayout((3,), "nipple in the base frame, beside landmarks_mm", unit="mm", frame="base"),
+    "landmarks_mm": ArrayLayout((2, 3), "sternal notch and xiphoid in the base frame"),
+    "nipple_mm": ArrayLayout((3,), "nipple in the base frame, beside landmarks_mm"),
     "saturation_count": ArrayLayout((), "readings at or above it carry no pressure; 4095 if left out"),
 }
 """Each array by its name."""

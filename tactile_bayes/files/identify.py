@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +14,7 @@ from tactile_bayes.errors import BadDataError, in_file
 from tactile_bayes.files import scan_mcap
 from tactile_bayes.files.documents import load_json, load_schema, parse_json
 from tactile_bayes.files.map_nc import read_map_and_header
+from tactile_bayes.files.mcap_records import McapRecords
 from tactile_bayes.files.netcdf import Group, open_netcdf
 from tactile_bayes.files.reading import HDF5_MAGIC, MCAP_MAGIC, first_bytes, is_json
 from tactile_bayes.files.size_json import read_repeatability, read_size_calibration
@@ -223,9 +223,7 @@ def _scan(path: Path) -> dict[str, Any]:
         }
         findings = with_times(scan_mcap.file_findings(records), Span.of(time_s), Span.of(pose_s))
         provenance = scan_mcap.provenance_of(records)
-    account = records.metadata.get("recording", {})
     span_s = float(time_s[-1] - time_s[0]) if len(time_s) else 0.0
-    topics = records.topic_counts()
     return {
         "schema": scan_mcap.SCAN_SCHEMA,
         "kind": "scan",
@@ -236,7 +234,7 @@ def _scan(path: Path) -> dict[str, Any]:
         "poses": len(pose_s),
         "duration_s": span_s,
         "frame_rate_hz": (len(time_s) - 1) / span_s if span_s > 0 else None,
-        **_recording(account, topics, time_s),
+        **_recording(records, time_s),
         "landmarks": all(touches[name] for name in scan_mcap.LANDMARK_NAMES),
         "nipple": touches[scan_mcap.NIPPLE] > 0,
         "units": {"counts": "raw, 0 to saturation", "pressure": "kPa", "position": "mm", "time": "s"},
@@ -245,12 +243,15 @@ def _scan(path: Path) -> dict[str, Any]:
     }
 
 
-def _recording(account: Mapping[str, str], topics: Mapping[str, int], time_s: FloatArray) -> dict[str, Any]:
+def _recording(records: McapRecords, time_s: FloatArray) -> dict[str, Any]:
     """Losses: gaps between the frames' times, and the recorder's account if the file has one."""
     steps = np.diff(time_s)
     period = float(np.median(steps)) if len(steps) else 0.0
     missing = int(np.clip(np.rint(steps / period) - 1, 0, None).sum()) if period > 0 else 0
     losses = ("frames_lost", "head_dropped", "poses_repeated", "poses_flagged", "flagged_why", "poses_missing")
     names = (*losses, "missing_why", "other_tools", "overrun_bytes", "ended_by", "fault")
+    account = records.metadata.get("recording", {})
     told = {name: account[name] for name in names if account.get(name)}
-    return {"frames_missing": missing, "notes": topics.get("/log", 0)} | ({"recording": told} if told else {})
+    logs = [number for number, channel in records.channels.items() if channel.topic == "/log"]
+    notes = sum(len(records.by_channel.get(number, ())) for number in logs)
+    return {"frames_missing": missing, "notes": notes} | ({"recording": told} if told else {})

@@ -6,7 +6,6 @@ import io
 import struct
 import zlib
 from array import array
-from collections import Counter
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -96,7 +95,7 @@ class Messages:
 
     def __init__(self, *, keep: bool = True) -> None:
         self._times = array("Q")
-        self._logged = array("Q")
+        self.logged = array("Q")
         self._ends = array("Q")
         self._data = bytearray()
         self.keep = keep
@@ -107,7 +106,7 @@ class Messages:
     def add(self, time_ns: int, logged_ns: int, body: memoryview) -> None:
         """Add one message with its publish and log times."""
         self._times.append(time_ns)
-        self._logged.append(logged_ns)
+        self.logged.append(logged_ns)
         if self.keep:
             self._data += body
             self._ends.append(len(self._data))
@@ -116,14 +115,9 @@ class Messages:
         """Add all messages of another channel."""
         start = len(self._data)
         self._times += other._times
-        self._logged += other._logged
+        self.logged += other.logged
         self._data += other._data
         self._ends.extend(start + end for end in other._ends)
-
-    @property
-    def span_ns(self) -> tuple[int, int]:
-        """First and last log time."""
-        return min(self._logged), max(self._logged)
 
     @property
     def times_ns(self) -> NDArray[np.uint64]:
@@ -141,7 +135,7 @@ class Messages:
         times = np.array(self._times, dtype=np.uint64)
         if (times[1:] >= times[:-1]).all():
             return np.arange(len(times))
-        return np.argsort(np.array(self._logged, dtype=np.uint64), kind="stable")
+        return np.argsort(np.array(self.logged, dtype=np.uint64), kind="stable")
 
 
 @dataclass(slots=True)
@@ -175,39 +169,27 @@ class McapRecords:
             if not len(found):
                 found = held
             elif len(held):
-                (a, b), (c, d) = found.span_ns, held.span_ns
+                (a, b), (c, d) = ((min(one.logged), max(one.logged)) for one in (found, held))
                 if name is None and a <= d and c <= b:  # one after the other they are one recording
                     what = f"{topic} has messages on two channels at the same time, as of two heads or two trackers"
                     raise BadDataError(what, way_out="keep one of the channels, or one topic for each")
                 found.extend(held)
         return found
 
-    def topic_counts(self) -> dict[str, int]:
-        """Number of messages per topic."""
-        counts: Counter[str] = Counter()
-        for number, channel in self.channels.items():
-            counts[channel.topic] += len(self.by_channel.get(number, ()))
-        return dict(sorted(counts.items()))
-
     def lose(self, what: str, *, damaged: bool = True) -> None:
         """Note a loss."""
         self.lost.append(what)
         self.damaged |= damaged
 
-    def channel_messages(self, number: int) -> Messages:
-        """Messages of a channel; bodies of unknown channels are kept until the channel is defined."""
-        found = self.by_channel.get(number)
-        if found is None:
-            channel = self.channels.get(number)
-            keep = self.keep is None or channel is None or channel.topic in self.keep
-            found = self.by_channel[number] = Messages(keep=keep)
-        return found
-
     def take(self, record: Any, data: memoryview) -> None:
         """Keep a description, or a message whose place in the data `_parsed` gave."""
         match record:
-            case channel, published_ns, logged_ns, start, end:
-                self.channel_messages(channel).add(published_ns, logged_ns, data[start:end])
+            case number, published_ns, logged_ns, start, end:
+                if number not in self.by_channel:  # bodies of an unknown channel are kept until it is defined
+                    channel = self.channels.get(number)
+                    keep = self.keep is None or channel is None or channel.topic in self.keep
+                    self.by_channel[number] = Messages(keep=keep)
+                self.by_channel[number].add(published_ns, logged_ns, data[start:end])
             case Metadata():
                 self.metadata[record.name] = dict(record.metadata)
             case Attachment():
