@@ -17,7 +17,7 @@ from tactile_bayes.files.arrays_layout import ArrayMap, GridOptions, Stated
 from tactile_bayes.files.atomic import check_suffix, refuse_existing
 from tactile_bayes.files.documents import with_session
 from tactile_bayes.files.grids import import_grid
-from tactile_bayes.files.imports import import_arrays, of_calibration, of_head, of_landmarks, of_poses, with_checked
+from tactile_bayes.files.imports import import_arrays, of_calibration, of_head, of_landmarks, of_poses
 from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.files.named_arrays import ARRAY_SUFFIXES, array_template, read_array_map
 from tactile_bayes.files.provenance import Provenance, hash_inputs
@@ -145,7 +145,7 @@ def _import_scan(source: Path, output: Path, wanted: Wanted) -> list[str]:
         files = wanted.beside.items()
         beside = [of_poses(file, wanted.arrays) if name == "poses" else _BESIDE[name](file) for name, file in files]
         made = import_arrays(source, wanted.arrays, beside)
-        scan, notes = with_checked(made.scan, wanted.beside.get("head_geometry")), made.notes
+        scan, notes = made.scan, made.notes
     session = {} if wanted.session_file is None else {"session": wanted.session_file}
     inputs = hash_inputs(source=source, **session, **wanted.beside)
     settings = {"as": "scan", "lost": list(lost), "correct": list(wanted.corrections), **_stated(wanted.arrays)}

@@ -87,8 +87,7 @@ def scan(
     for note in made.notes:
         if note.startswith("CAUTION"):
             warnings.warn(note, stacklevel=3)
-    found = imports.with_checked(made.scan, _checked_head(head))
-    return corrected(with_session(found, path_of(session)), correct)
+    return corrected(with_session(made.scan, path_of(session)), correct)
 
 
 def _array(given: Any) -> Any:
@@ -140,13 +139,6 @@ def _head(given: Any) -> Source:
         document = {"schema": _HEAD_SCHEMA, **to_plain(dict(given), digits=EXACT)}
         return imports.of_head(head_geometry(document, path=Path("head")))
     return _beside(given, HeadGeometry, imports.of_head, lambda other: other.head)
-
-
-def _checked_head(given: Any) -> Path | HeadGeometry | None:
-    """The head that was given, where it may say when it was checked."""
-    if isinstance(given, str | Path):
-        return path_of(given)
-    return getattr(given, "head", given if isinstance(given, HeadGeometry) else None)
 
 
 def _calibration(given: Any) -> Source:

@@ -93,7 +93,7 @@ class Outputs(Record):
         paths, folder = dict[Path, bytes](), None
         if exported is not None and self.path is not None:
             if "" not in exported.files:
-                folder = _prepared_folder(self.path, set(exported.files), force=self.force)
+                folder = _prepared_folder(self.path, set(exported.files))
             paths = {self.path / name if name else self.path: data for name, data in exported.files.items()}
         if self.dictionary is not None:
             paths[self.dictionary] = dictionary_csv().encode()
@@ -106,7 +106,7 @@ class Outputs(Record):
         return tuple(paths)
 
 
-def _prepared_folder(folder: Path, names: set[str], *, force: bool) -> Path | None:
+def _prepared_folder(folder: Path, names: set[str]) -> Path | None:
     """Refuse a folder in which the files would stand beside those of another export; make it, and return a new one."""
     new = not folder.exists()
     try:
@@ -118,8 +118,6 @@ def _prepared_folder(folder: Path, names: set[str], *, force: bool) -> Path | No
         raise unwritable(folder, error) from None
     if others:
         raise UsageError(f"{folder} holds {others[0]} of another export; give another folder")
-    for name in sorted(names):
-        refuse_existing(folder / name, force=force)
     return folder if new else None
 
 

@@ -140,19 +140,12 @@ def of_poses(path: Path, given: Stated) -> Source:
 def of_head(given: Path | HeadGeometry) -> Source:
     """Arrays of a scan that are the head's."""
     head = given if isinstance(given, HeadGeometry) else read_head_geometry(given)
-    return Source(
-        {
-            "pitch_mm": np.asarray(head.pitch_mm),
-            "array_from_tracker": head.scanhead_from_tracker,
-            "head_surface_mm": head.surface_mm,
-        }
-    )
-
-
-def with_checked(scan: Scan, given: Path | HeadGeometry | None) -> Scan:
-    """The scan, with the day on which the head that was given for it was checked."""
-    head = read_head_geometry(given) if isinstance(given, Path) else given
-    return scan if head is None else replace(scan, head=replace(scan.head, checked_on=head.checked_on))
+    arrays = {
+        "pitch_mm": np.asarray(head.pitch_mm),
+        "array_from_tracker": head.scanhead_from_tracker,
+        "head_surface_mm": head.surface_mm,
+    }
+    return Source(arrays, checked_on=head.checked_on)
 
 
 def of_calibration(given: Path | ElementCalibration) -> Source:
@@ -186,7 +179,9 @@ def combined(sources: Sequence[Source], given: Stated) -> Imported:
     stated = given
     told: list[str] = []
     held: Arrays = {}
+    checked_on = ""
     for source in sources:
+        checked_on = source.checked_on or checked_on
         told += [*_over(given, source.stated)[1], *source.notes]
         stated, _ = _over(stated, source.stated)
         held |= {name: np.asarray(one) for name, one in source.arrays.items()}
@@ -214,7 +209,7 @@ def combined(sources: Sequence[Source], given: Stated) -> Imported:
     facts = {"frames_unit": str(stated.unit)} if pressure else {}
     if told:
         facts["imported_as"] = "; ".join(told)[:2000]
-    return Imported(_scan(held, facts), tuple(told))
+    return Imported(_scan(held, facts, checked_on), tuple(told))
 
 
 def _refuse_missing(held: Arrays, others: Sequence[str]) -> None:
@@ -519,14 +514,15 @@ def _check_pitch(surface: np.ndarray[Any, Any], pitch_mm: float) -> None:
             raise BadDataError(what, way_out="give both in mm, for the same head")
 
 
-def _scan(arrays: Arrays, facts: Mapping[str, str]) -> Scan:
+def _scan(arrays: Arrays, facts: Mapping[str, str], checked_on: str) -> Scan:
     values = {name: np.asarray(array, dtype=np.float64) for name, array in arrays.items() if name != "counts"}
-    check_rigid(values["array_from_tracker"], name="array_from_tracker")
     marks = values.get("landmarks_mm")
+    surface, transform = values["head_surface_mm"], values["array_from_tracker"]
+    check_rigid(transform, name="array_from_tracker")
     return Scan(
         frames=PressureFrames(values["frame_time_s"], arrays["counts"].astype(np.uint16)),
         poses=TrackerPoses(values["pose_time_s"], values["position_mm"], values["quaternion_wxyz"]),
-        head=HeadGeometry(values["head_surface_mm"], float(values["pitch_mm"]), values["array_from_tracker"]),
+        head=HeadGeometry(surface, float(values["pitch_mm"]), transform, checked_on),
         element_calibration=ElementCalibration(
             values["gain_kpa_per_count"], values["offset_kpa"], int(values.get("saturation_count", 4095))
         ),

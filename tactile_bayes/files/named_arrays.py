@@ -32,6 +32,7 @@ class Source(Record, eq=False):
     notes: tuple[str, ...] = ()
     others: tuple[str, ...] = ()  #: Names in its file that are none of a scan.
     path: str = ""  #: Of a file beside the frames', for errors.
+    checked_on: str = ""  #: Day on which its head was found right on a scan, as `HeadGeometry` has it.
 
 
 class Grid(Record, eq=False):

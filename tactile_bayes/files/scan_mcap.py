@@ -198,7 +198,6 @@ def write_scan(
 
     A `Scan` knows no host times: ``log_time`` is then the device time. Landmarks, which have no time, carry the first.
     """
-    refuse_existing(path, force=force)
     check_session(scan.session, path=path)
     with atomic_path(path, force=force) as partial, partial.open("wb") as stream:
         writer = ScanWriter(
