@@ -155,10 +155,11 @@ def load_trial(trial: Path | Sheet, excision: Path | Sheet, columns: Path | None
     `tidy_trial` is tidy whatever the mapping holds.
     """
     sizes = read_excision(excision, columns)
-    if columns is None or tidy_trial or isinstance(trial, Sheet) or read_mapping(columns).reading is None:
+    mapping = None if columns is None or tidy_trial or isinstance(trial, Sheet) else read_mapping(columns)
+    if mapping is None or mapping.reading is None or isinstance(trial, Sheet):
         table = read_table(trial, "trial.table.json")
     else:
-        table = read_wide(trial, columns)
+        table = read_wide(trial, mapping, mapping.reading)
     check_references(table, "trial.table.json", targets={"excision": sizes})
     filled, posteriors = fill_from_posteriors(table)
     keys = list(zip(sizes.columns["patient"], sizes.columns["mass"], strict=True))
@@ -178,9 +179,10 @@ def load_trial(trial: Path | Sheet, excision: Path | Sheet, columns: Path | None
 
 def read_excision(excision: Path | Sheet, columns: Path | None) -> Table:
     """Sizes after excision: from a wide table where the mapping has ``[excision]``, otherwise from a tidy one."""
-    if columns is None or not isinstance(excision, Path) or read_mapping(columns).excision is None:
+    mapping = None if columns is None or isinstance(excision, Sheet) else read_mapping(columns)
+    if mapping is None or mapping.excision is None or isinstance(excision, Sheet):
         return read_table(excision, "excision.table.json")
-    return read_wide_excision(excision, columns)
+    return read_wide_excision(excision, mapping, mapping.excision)
 
 
 @door

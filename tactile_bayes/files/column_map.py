@@ -68,28 +68,20 @@ class ColumnMap(Record):
         return [self.patient] if self.mass is None else [self.patient, self.mass]
 
 
-def read_wide(path: Path, mapping_path: Path) -> Table:
+def read_wide(path: Path, mapping: ColumnMap, readings: Sequence[ReadingColumns]) -> Table:
     """Convert a wide table to a tidy one with the columns of ``trial.table.json``; readings keep their line numbers."""
-    mapping = read_mapping(mapping_path)
-    if mapping.reading is None:
-        way_out = "add one for each modality, or give a table of readings that is tidy"
-        raise BadDataError("has no [[reading]]", way_out=way_out, path=str(mapping_path))
-    named = [(one.size, one.sd, one.low, one.high, one.reader, one.date) for one in mapping.reading]
+    named = [(one.size, one.sd, one.low, one.high, one.reader, one.date) for one in readings]
     rows = _rows(path, mapping, [name for names in named for name in names])
-    readings = [(row.line, _reading(row, reading, mapping)) for row in rows for reading in mapping.reading]
-    return _table(path, readings, ("patient", "mass", "modality", "replicate"))
+    tidy = [_reading(row, one, mapping) for row in rows for one in readings]
+    keys = ("patient", "mass", "modality", "replicate")
+    return _table(path, tidy, keys, lines=[row.line for row in rows for _ in readings])
 
 
-def read_wide_excision(path: Path, mapping_path: Path) -> Table:
+def read_wide_excision(path: Path, mapping: ColumnMap, excision: ExcisionColumns) -> Table:
     """Read ex-vivo sizes of a wide table into columns of ``excision.table.json``; rows without one are left out."""
-    mapping = read_mapping(mapping_path)
-    excision = mapping.excision
-    if excision is None:
-        way_out = "add it, with size as the column of the sizes"
-        raise BadDataError("has no table [excision]", way_out=way_out, path=str(mapping_path))
     factor = MM_PER_UNIT[excision.unit or mapping.unit]
-    held = _rows(path, mapping, (excision.size, excision.second, excision.sd, excision.date))
-    rows = [row for row in held if row.cells[excision.size]]
+    named = (excision.size, excision.second, excision.sd, excision.date)
+    rows = [row for row in _rows(path, mapping, named) if row.cells[excision.size]]
     if not rows:
         what = f"column {excision.size}: holds no size"
         raise BadDataError(what, way_out="correct the mapping or the table", path=str(path))
@@ -103,13 +95,13 @@ def read_wide_excision(path: Path, mapping_path: Path) -> Table:
         }
         for row in rows
     ]
-    return _table(path, [(row.line, one) for row, one in zip(rows, sizes, strict=True)], ("patient", "mass"))
+    return _table(path, sizes, ("patient", "mass"), lines=[row.line for row in rows])
 
 
-def _table(path: Path, rows: Sequence[tuple[int, dict[str, Any]]], keys: Sequence[str]) -> Table:
-    """Rows with their line numbers as columns; no two may have the same keys."""
-    columns = {name: [row[name] for _, row in rows] for name in rows[0][1]}
-    table = Table(path=path, columns=columns, line_numbers=[line for line, _ in rows])
+def _table(path: Path, rows: Sequence[Mapping[str, Any]], keys: Sequence[str], *, lines: list[int]) -> Table:
+    """Rows as columns; no two may have the same keys."""
+    columns = {name: [row[name] for row in rows] for name in rows[0]}
+    table = Table(path=path, columns=columns, line_numbers=lines)
     first: dict[tuple[Any, ...], int] = {}
     for row, key in enumerate(zip(*(columns[name] for name in keys), strict=True)):
         if (before := first.setdefault(key, row)) != row:

@@ -72,6 +72,9 @@ class MapHeader(Record, kw_only=True):
     provenance: dict[str, Any]
 
 
+_ALIKE: Final = ("recipe", "background", "frame_count", "masked_taxels")  #: Of a header and of its map.
+
+
 def write_map(path: Path, tactile_map: TactileMap, *, provenance: Provenance, force: bool = False) -> None:
     """Write a map atomically, readable by its owner only; equal maps give equal bytes: no clock time is held."""
     _check_lattice({"x_mm": tactile_map.x_mm, "y_mm": tactile_map.y_mm}, tactile_map.recipe.cell_mm)
@@ -134,11 +137,8 @@ def read_map_and_header(path: Path) -> tuple[TactileMap, MapHeader]:
         tactile_map = TactileMap(
             **arrays,
             **transforms,
-            recipe=header.recipe,
-            background=header.background,
-            frame_count=header.frame_count,
+            **{name: getattr(header, name) for name in _ALIKE},
             quality={name: math.nan if value is None else value for name, value in header.quality.items()},
-            masked_taxels=header.masked_taxels,
             head=None if isinstance(header.head, UnsetType) else header.head,
             nipple_mm=None if isinstance(header.nipple_mm, UnsetType) else np.array(header.nipple_mm),
             findings=tuple(one.finding for one in header.findings),
@@ -153,11 +153,8 @@ def _attributes(tactile_map: TactileMap, provenance: Provenance) -> dict[str, st
     """
     header = MapHeader(
         schema=SCHEMA,
-        recipe=tactile_map.recipe,
-        background=tactile_map.background,
-        frame_count=int(tactile_map.frame_count),
+        **{name: getattr(tactile_map, name) for name in _ALIKE},
         quality={name: float(v) if np.isfinite(v) else None for name, v in tactile_map.quality.items()},
-        masked_taxels=tactile_map.masked_taxels,
         head=UNSET if tactile_map.head is None else tactile_map.head,
         nipple_mm=UNSET if tactile_map.nipple_mm is None else tuple(tactile_map.nipple_mm.tolist()),
         findings=tuple(one.entry for one in tactile_map.findings),

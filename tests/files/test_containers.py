@@ -16,7 +16,7 @@ from mcap.writer import CompressionType, Writer
 
 import tactile_bayes
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.files.column_map import read_wide, read_wide_excision
+from tactile_bayes.files.column_map import read_mapping, read_wide, read_wide_excision
 from tactile_bayes.files.documents import load_json, load_toml
 from tactile_bayes.files.map_nc import read_map, write_map
 from tactile_bayes.files.provenance import Provenance
@@ -182,13 +182,19 @@ size = "Pr\u00e4parat"
 
 def test_a_name_spelled_in_two_ways_is_one_column_and_one_patient(tmp_path: Path) -> None:
     (tmp_path / "map.toml").write_text(MAPPING)
-    table = f"Kennung {COMPOSED},Gro\u0308\u00dfe,Pra\u0308parat\n{APART},12,13\n"
-    (tmp_path / "wide.csv").write_text(table)
-    assert read_wide(tmp_path / "wide.csv", tmp_path / "map.toml").columns["patient"] == [COMPOSED]
-    assert read_wide_excision(tmp_path / "wide.csv", tmp_path / "map.toml").columns["patient"] == [COMPOSED]
-    (tmp_path / "twice.csv").write_text(f"{table}{COMPOSED},12,13\n")
+    text = f"Kennung {COMPOSED},Gro\u0308\u00dfe,Pra\u0308parat\n{APART},12,13\n"
+    (tmp_path / "wide.csv").write_text(text)
+    mapping = read_mapping(tmp_path / "map.toml")
+    assert mapping.reading is not None
+    assert mapping.excision is not None
+    for table in (
+        read_wide(tmp_path / "wide.csv", mapping, mapping.reading),
+        read_wide_excision(tmp_path / "wide.csv", mapping, mapping.excision),
+    ):
+        assert table.columns["patient"] == [COMPOSED]
+    (tmp_path / "twice.csv").write_text(f"{text}{COMPOSED},12,13\n")
     with pytest.raises(BadDataError, match="stands on line 2 already"):
-        read_wide(tmp_path / "twice.csv", tmp_path / "map.toml")
+        read_wide(tmp_path / "twice.csv", mapping, mapping.reading)
     row = "1,ultrasound,1,detected,12"
     (tmp_path / "tidy.csv").write_text(
         f"patient,mass,modality,replicate,status,size_mm\n{COMPOSED},{row}\n{APART},{row}\n"

@@ -212,8 +212,9 @@ def test_a_calibration_with_a_short_row_is_one_line(place: tuple[str, ...], tmp_
 def test_a_header_without_end_is_told_in_short(tmp_path: Path) -> None:
     (tmp_path / "map.toml").write_text('patient = "record_id"\n[[reading]]\nmodality = "palpation"\nsize = "ex"\n')
     (tmp_path / "wide.csv").write_text("[" * 5000 + ",ex\n1,2\n")
+    mapping = read_mapping(tmp_path / "map.toml")
     with pytest.raises(BadDataError, match="record_id: is missing") as error:
-        read_wide(tmp_path / "wide.csv", tmp_path / "map.toml")
+        read_wide(tmp_path / "wide.csv", mapping, mapping.reading)
     assert len(str(error.value)) < 2000
 
 

@@ -309,12 +309,18 @@ def _read_tables(path: Path) -> object:
 
 
 def _read_wide(path: Path) -> object:
-    from tactile_bayes.files.column_map import read_wide, read_wide_excision
+    from tactile_bayes.files.column_map import read_mapping, read_wide, read_wide_excision
 
-    mapping = path.with_name("mapping.toml")
-    if not mapping.exists():
-        mapping.write_text(MAPPING)
-    return _first([lambda: read_wide(path, mapping), lambda: read_wide_excision(path, mapping)])
+    named = path.with_name("mapping.toml")
+    if not named.exists():
+        named.write_text(MAPPING)
+    mapping = read_mapping(named)
+    return _first(
+        [
+            lambda: read_wide(path, mapping, mapping.reading),
+            lambda: read_wide_excision(path, mapping, mapping.excision),
+        ]
+    )
 
 
 def _read_tomls(path: Path) -> object:
