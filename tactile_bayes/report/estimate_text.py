@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any
 
 from tactile_bayes.declarations import from_plain
-from tactile_bayes.files.reports import EstimateReport, MassReport, SmallestLump
+from tactile_bayes.files.reports import EstimateReport, MassReport, PooledReport, SmallestLump
 from tactile_bayes.findings import capital, finding_lines, finding_summary, joined
 from tactile_bayes.inference.draws import ParameterDraws, Quantity
 from tactile_bayes.options import BumpPrior
@@ -79,17 +79,6 @@ def decimals(mc_error: float, *, most: int = 3) -> int:
     if not mc_error > 0:
         return most
     return min(most, max(0, -math.floor(math.log10(2.0 * mc_error))))
-
-
-def table_head(probability: float) -> str:
-    """The first line of a table of medians and intervals."""
-    return f"{'':28}{'median':>9}   {100 * probability:g} % interval (equal-tailed)"
-
-
-def table_row(label: str, median: float, ends: tuple[float, float], *, unit: str, places: int) -> str:
-    """Row of that table: label, median and interval with a number of decimal places."""
-    interval = f"{ends[0]:.{places}f} to {ends[1]:.{places}f} {unit}".rstrip()
-    return f"{label:28}{median:>9.{places}f}   {interval}"
 
 
 def ends_text(name: str, mc_error: float, sd: float) -> str:
@@ -230,12 +219,12 @@ def _advice(report: EstimateReport) -> list[str]:
     return [f"What would help: {report.advice}."] if report.advice else []
 
 
-def _quantities(report: EstimateReport) -> dict[str, Quantity]:
+def _quantities(report: EstimateReport | PooledReport) -> dict[str, Quantity]:
     """What the report has of `ROWS`, by name."""
     found: dict[str, Any] = {}
     for path, _, _ in ROWS:
         holder, _, name = path.rpartition(".")
-        held = getattr(report, holder) if holder else report
+        held = getattr(report, holder, None) if holder else report
         found[path] = getattr(held, name, None)
     return {name: quantity for name, quantity in found.items() if quantity is not None}
 
@@ -245,23 +234,25 @@ def size_decimals(sizes: Iterable[Quantity]) -> int:
     return min((decimals(one.mc_error, most=SIZE_DECIMALS) for one in sizes), default=SIZE_DECIMALS)
 
 
-def size_table(report: EstimateReport, shown: Collection[str] = _NAMES) -> list[str]:
+def size_table(report: EstimateReport | PooledReport, shown: Collection[str] = _NAMES) -> list[str]:
     """Table with a row per quantity; all sizes have the digits that the least certain one supports.
 
     Where sizes have two intervals that for exams of patients leads, and the narrower one of the largest size follows,
     with the spread of the exams that it is for.
     """
     found = {name: quantity for name, quantity in _quantities(report).items() if name in shown}
-    rows = [table_head(next(iter(found.values())).probability)]
+    probability = next(iter(found.values())).probability
+    rows = [f"{'':28}{'median':>9}   {100 * probability:g} % interval (equal-tailed)"]
     of_sizes = size_decimals([found[name] for name in SIZES if name in found])
     for name, label, unit in ROWS:
         if name not in found or (name == "min_size_mm" and ANOTHER_SMALLEST in found):
             continue
         if name == "max_size_mm" and ANOTHER_LARGEST in found:
-            label = exams_label(report.diagnostics.get("between_map_sd"))
+            label = exams_label(report.figures.get("between_map_sd"))
         q = found[name]
         places = of_sizes if name in (*SIZES, ANOTHER_LARGEST, ANOTHER_SMALLEST) else decimals(q.mc_error)
-        rows.append(table_row(label, q.median, (q.low, q.high), unit=unit, places=places))
+        interval = f"{q.low:.{places}f} to {q.high:.{places}f} {unit}".rstrip()
+        rows.append(f"{label:28}{q.median:>9.{places}f}   {interval}")
     return rows
 
 

@@ -151,7 +151,7 @@ def pooled_summary(report: PooledReport) -> str:
     if largest is None:
         lines.append(_no_size(report))
     else:
-        lines += _table(report) + estimate_text.width_lines(report.leading.variance_share or {})
+        lines += estimate_text.size_table(report) + estimate_text.width_lines(report.leading.variance_share or {})
         parts = [
             f"sizes by {report.site}" if report.site else "",
             f"interval ends to {largest.mc_error / largest.sd:.3f} SD" if largest.sd > 0 else "",
@@ -161,7 +161,8 @@ def pooled_summary(report: PooledReport) -> str:
         ]
         lines.append(f"Quality: {'; '.join(filter(None, parts))}.")
         if len(lines) < estimate_text.MOST_LINES - 2:
-            lines += supposed_line(report.supposing, largest.median, places=_places(report))
+            places = estimate_text.size_decimals(_sizes(report))
+            lines += supposed_line(report.supposing, largest.median, places=places)
     return "\n".join([*lines, estimate_text.MORE, RESEARCH_USE]) + "\n"
 
 
@@ -186,9 +187,15 @@ def pooled_text(report: PooledReport) -> str:
     lines += finding_lines(report.findings, "check")
     if report.max_size_mm is None:
         return "\n".join([*lines, _no_size(report), RESEARCH_USE]) + "\n"
-    worst, figures = _worst(report), report.figures
-    lines += ["", *_table(report), "", *estimate_text.width_lines(report.leading.variance_share or {})]
-    lines += supposed_lines(report.supposing, report.max_size_mm.median, places=_places(report))
+    sizes, figures = _sizes(report), report.figures
+    worst, places = max(sizes, key=lambda q: q.mc_error), estimate_text.size_decimals(sizes)
+    lines += [
+        "",
+        *estimate_text.size_table(report),
+        "",
+        *estimate_text.width_lines(report.leading.variance_share or {}),
+    ]
+    lines += supposed_lines(report.supposing, report.max_size_mm.median, places=places)
     lines.append(f"Spread between the maps of this mass: {100 * figures['between_map_sd']:.0f} %.")
     if report.one_size_probability is not None:
         chance = chance_text(report.one_size_probability, 3)
@@ -206,26 +213,6 @@ def pooled_text(report: PooledReport) -> str:
     return "\n".join([*lines, RESEARCH_USE]) + "\n"
 
 
-def _worst(report: PooledReport) -> Quantity:
-    """Summary of the size with the larger Monte-Carlo error."""
-    sizes = (report.max_size_mm, report.min_size_mm)
-    return max((one for one in sizes if one is not None), key=lambda q: q.mc_error)
-
-
-def _places(report: PooledReport) -> int:
-    """Decimal places of the sizes."""
-    return estimate_text.decimals(_worst(report).mc_error, most=estimate_text.SIZE_DECIMALS)
-
-
-def _table(report: PooledReport) -> list[str]:
-    """Table of both sizes with their intervals."""
-    leads, places = report.leading, _places(report)
-    rows = [("largest size", leads.max_size_mm), ("smallest size", leads.min_size_mm)]
-    if report.another_exam is not None:
-        rows.append((estimate_text.exams_label(report.figures.get("between_map_sd")), report.max_size_mm))
-    told = (
-        estimate_text.table_row(label, q.median, (q.low, q.high), unit="mm", places=places)
-        for label, q in rows
-        if q is not None
-    )
-    return [estimate_text.table_head(_worst(report).probability), *told]
+def _sizes(report: PooledReport) -> list[Quantity]:
+    """The largest and the smallest size."""
+    return [one for one in (report.max_size_mm, report.min_size_mm) if one is not None]
