@@ -37,6 +37,13 @@ _UNITS = {
 _DROPPED = WHY_NOT | {"dropped_low": "pressed below {0:g} kPa", "dropped_high": "pressed above {1:g} kPa"}
 # Rows of the full report: a name, the figure without which there is none, and the text; after "+" what is added to it.
 _ROWS: Final = """
+map | cell_mm | {size} (across x along the head), cells of {cell_mm:g} mm
+values | least | {least:.3g} to {most:.3g} {units}
+frames used | frames | {frames}
++ | scans_used | , {scans_used}
++ | every | , {every}
+  left out | dropped | {dropped}
+mean pressure | frames | {mean_pressure_kpa:.1f} kPa
 frames | frame_rate_hz | {frame_rate_hz:.1f} Hz, jitter {frame_jitter_ms:.2f} ms, {frames_missing:.0f} missing
 poses | pose_rate_hz | {pose_rate_hz:.1f} Hz, {pose_repeats:.0f} repeats dropped, longest gap {pose_gap_ms:.0f} ms
 latency | latency_sd_ms | {latency_ms:.2f} +- {latency_sd_ms:.2f} ms, from {latency_frames:.0f} frames
@@ -64,134 +71,103 @@ stroke lag | stroke_lag_mm | lump ahead by {stroke_lag_mm:+.2f} +- {stroke_lag_s
 + | stroke_lag_mm |  (below 0: a latency left in the poses)
 flat field | flat_field_frames | from {flat_field_frames:.0f} frames without a lump;
 + | flat_field_frames |  taxels differ by {flat_field_percent:.1f} % (SD)
+coverage | coverage | {covered_percent:.0f} % of the cells, {median_count:.0f} readings a cell
+shared errors | effective_readings | {shared} of a reading's variance is its neighbours' in the frame too{over};
++ | effective_readings |  {median_count:.0f} readings a cell are worth {effective_readings:.0f} independent ones
+shared errors | unshared | not known: too few frames that cross each other's cells, or readings without scatter
+resolves | cell_mm | lumps of map width sigma {resolved_mm:.2g} mm or more
+cell | advice | {advice}
+gain solve | gain_passes | {gain_passes:.0f} passes, last change {gain_last_change:.1e}
 """
 
 
 def map_summary(tactile_map: TactileMap, *, written: str) -> str:
     """Short report of a map: its verdict with the figures that lead to it, and the names of the files written."""
-    findings, quality = tactile_map.findings, tactile_map.quality
-    rows, columns = tactile_map.mean.shape
-    cell = tactile_map.recipe.cell_mm
-    dropped = "; ".join(_dropped(tactile_map))
+    findings, told = tactile_map.findings, _told(tactile_map)
     lines = [
         *finding_lines(findings, "caution"),
-        _verdict_line(tactile_map),
-        *([f"left out: {dropped}"] if dropped else []),
-        f"written: {written}, {columns * cell:g} x {rows * cell:g} mm in cells of {cell:g} mm",
+        _verdict_line(findings, told),
+        *([f"left out: {'; '.join(told['dropped'].splitlines())}"] if "dropped" in told else []),
+        f"written: {written}, {told['size']} in cells of {told['cell_mm']:g} mm",
         *finding_lines(findings, "check"),
-        *_advice(quality),
+        *_advice(tactile_map.quality),
         "More (timing, plane, pressure, noise): map -v.",
     ]
     return "\n".join([*lines, RESEARCH_USE]) + "\n"
 
 
-def _verdict_line(tactile_map: TactileMap) -> str:
+def _verdict_line(findings: Sequence[Finding], told: Mapping[str, Any]) -> str:
     """Whether the map is sound, with the figures that lead to it."""
-    quality = tactile_map.quality
-    used = dict(_frames(tactile_map)).get("frames used", "")
-    number, *more = used.split(", ")
-    figures = [f"{number} frames", *more] if used else []
-    if "coverage" in quality:
-        figures.append(f"{100 * quality['coverage']:.0f} % covered")
-    if "stroke_lag_mm" in quality:
-        figures.append(f"stroke lag {quality['stroke_lag_mm']:+.2f} +- {quality['stroke_lag_sd_mm']:.2f} mm")
-    return f"{verdict(tactile_map.findings, answered=True)}: {', '.join(figures)}"
+    figures = [f"{told['frames']} frames"] if "frames" in told else []
+    figures += [told[name] for name in ("scans_used", "every") if name in told]
+    if "coverage" in told:
+        figures.append(f"{told['covered_percent']:.0f} % covered")
+    if "stroke_lag_mm" in told:
+        figures.append("stroke lag {stroke_lag_mm:+.2f} +- {stroke_lag_sd_mm:.2f} mm".format_map(told))
+    return f"{verdict(findings, answered=True)}: {', '.join(figures)}"
 
 
 def map_text(tactile_map: TactileMap) -> str:
     """Full report of a map: cautions and verdict, a table, what is to be checked, notes and the research-use line."""
-    parts = (_what, _frames, _making, _cells)
-    rows = [row for part in parts for row in part(tactile_map)]
+    findings, told, rows = tactile_map.findings, _told(tactile_map), list[tuple[str, str]]()
+    if (advice := advise_cell(tactile_map)) is not None:
+        told["advice"] = advice.text()
+    for line in _ROWS.strip("\n").splitlines():
+        name, figure, text = line.split("|")
+        if figure.strip() in told:
+            first, before = rows.pop() if name == "+ " else (name.rstrip(), "")
+            rows.append((first, before + text.removeprefix(" ").format_map(told)))
     width = max(len(name) for name, _ in rows)
-    lines = [f"{name.ljust(width)}  {text}" for name, text in rows]
-    cautions, checks = (finding_lines(tactile_map.findings, one) for one in ("caution", "check"))
-    head = [*cautions, _verdict_line(tactile_map), ""]
+    lines = [f"{name.ljust(width)}  {part}" for name, text in rows for part in text.splitlines()]
+    head = [*finding_lines(findings, "caution"), _verdict_line(findings, told), ""]
+    checks = finding_lines(findings, "check")
     return "\n".join([*head, *lines, "", *checks, *_notes(tactile_map), RESEARCH_USE]) + "\n"
 
 
-def _what(tactile_map: TactileMap) -> Iterator[tuple[str, str]]:
-    """Size of the map and the range of its values."""
+def _told(tactile_map: TactileMap) -> dict[str, Any]:
+    """What is told of a map, by name: its figures, and words on them; what is not known is left out."""
+    quality, recipe, values = tactile_map.quality, tactile_map.recipe, tactile_map.mean[tactile_map.covered]
     rows, columns = tactile_map.mean.shape
-    cell = tactile_map.recipe.cell_mm
-    yield "map", f"{columns * cell:g} x {rows * cell:g} mm (across x along the head), cells of {cell:g} mm"
-    values = tactile_map.mean[tactile_map.covered]
+    told: dict[str, Any] = {
+        **quality,
+        "cell_mm": recipe.cell_mm,
+        "size": f"{columns * recipe.cell_mm:g} x {rows * recipe.cell_mm:g} mm",
+        "latency_ms": recipe.latency_ms,
+        "fitted_to": f"{quality['plane_frames']:.0f} frames" if "plane_frames" in quality else "all frames used",
+        "patient_axes": "none: no landmarks",
+        "span_mm": SPAN_MM,
+        "flat_field_percent": 100 * quality.get("flat_field_sd", np.nan),
+        "covered_percent": 100 * quality.get("coverage", np.nan),
+        "resolved_mm": recipe.cell_mm / CELL_PER_SIGMA,
+        "over": f", over {quality['shared_length_mm']:.1f} mm" if "shared_length_mm" in quality else "",
+    }
     if values.size:
-        recipe = tactile_map.recipe
         units = _UNITS.get(recipe.normalise, f"{recipe.value_unit or 'of unknown unit'} (normalise none)")
-        yield "values", f"{values.min():.3g} to {values.max():.3g} {units}"
-
-
-def _frames(tactile_map: TactileMap) -> Iterator[tuple[str, str]]:
-    """Frames used and left out, each with its reason."""
-    quality = tactile_map.quality
-    if "frames_total" not in quality:
-        return
-    scans = f", {quality['scans']:.0f} scans" if quality.get("scans", 1) > 1 else ""
-    every = f", one of every {quality['frames_every']:.0f} of the scan" if "frames_every" in quality else ""
-    yield "frames used", f"{quality['frames_used']:.0f} of {quality['frames_total']:.0f}{scans}{every}"
-    yield from (("  left out", text) for text in _dropped(tactile_map))
-    yield "mean pressure", f"{quality['mean_pressure_kpa']:.1f} kPa"
-
-
-def _dropped(tactile_map: TactileMap) -> Iterator[str]:
-    """How many frames were left out for each reason."""
-    quality = tactile_map.quality
-    window = tactile_map.recipe.pressure_window_kpa or (np.nan, np.nan)
-    yield from (f"{quality[name]:.0f} {why.format(*window)}" for name, why in _DROPPED.items() if quality.get(name))
-
-
-def _making(tactile_map: TactileMap) -> Iterator[tuple[str, str]]:
-    """Timing, plane, and what the strokes tell: `_ROWS`, as far as the map has their figures."""
-    quality = tactile_map.quality
-    shifts = [
+        told |= {"least": values.min(), "most": values.max(), "units": units}
+    if "frames_total" in quality:
+        told["frames"] = "{frames_used:.0f} of {frames_total:.0f}".format_map(quality)
+        if quality.get("scans", 1) > 1:
+            told["scans_used"] = f"{quality['scans']:.0f} scans"
+        if "frames_every" in quality:
+            told["every"] = f"one of every {quality['frames_every']:.0f} of the scan"
+    window = recipe.pressure_window_kpa or (np.nan, np.nan)
+    out = [f"{quality[name]:.0f} {why.format(*window)}" for name, why in _DROPPED.items() if quality.get(name)]
+    if out:
+        told["dropped"] = "\n".join(out)
+    if tactile_map.patient_from_plane is not None:
+        repeats = quality.get("landmark_spread_mm")
+        told["patient_axes"] = "from the landmarks" + ("" if repeats is None else f", repeats within {repeats:.1f} mm")
+    told["shifts"] = ", ".join(
         f"{number}: {quality[f'stroke_{number}_shift_x_mm']:+.2f} +- {quality[f'stroke_{number}_sd_x_mm']:.2f}"
         for number in range(1, int(quality.get("strokes", 0)) + 1)
         if f"stroke_{number}_shift_x_mm" in quality
-    ]
-    axes = "none: no landmarks"
-    if tactile_map.patient_from_plane is not None:
-        repeats = quality.get("landmark_spread_mm")
-        axes = "from the landmarks" + ("" if repeats is None else f", repeats within {repeats:.1f} mm")
-    values = {
-        **quality,
-        "latency_ms": tactile_map.recipe.latency_ms,
-        "fitted_to": f"{quality['plane_frames']:.0f} frames" if "plane_frames" in quality else "all frames used",
-        "patient_axes": axes,
-        "shifts": ", ".join(shifts),
-        "span_mm": SPAN_MM,
-        "flat_field_percent": 100 * quality.get("flat_field_sd", np.nan),
-    }
-    rows: list[tuple[str, str]] = []
-    for line in _ROWS.strip("\n").splitlines():
-        name, figure, text = line.split("|")
-        if figure.strip() in quality:
-            first, before = rows.pop() if name == "+ " else (name.rstrip(), "")
-            rows.append((first, before + text.removeprefix(" ").format_map(values)))
-    yield from rows
-
-
-def _cells(tactile_map: TactileMap) -> Iterator[tuple[str, str]]:
-    """Coverage, error correlation within a frame, and what the cells resolve."""
-    quality = tactile_map.quality
-    if "coverage" in quality:
-        covered = f"{100 * quality['coverage']:.0f} % of the cells"
-        yield "coverage", f"{covered}, {quality['median_count']:.0f} readings a cell"
+    )
     if "effective_readings" in quality:
-        share = f"under {100 * LEAST_SHARE:.0f} %"
-        if quality["shared_share"] >= LEAST_SHARE:
-            share = f"{100 * quality['shared_share']:.0f} %"
-        length = f", over {quality['shared_length_mm']:.1f} mm" if "shared_length_mm" in quality else ""
-        readings = f"{quality['median_count']:.0f} readings a cell"
-        worth = f"{readings} are worth {quality['effective_readings']:.0f} independent ones"
-        yield "shared errors", f"{share} of a reading's variance is its neighbours' in the frame too{length}; {worth}"
+        known, least = quality["shared_share"] >= LEAST_SHARE, f"under {100 * LEAST_SHARE:.0f} %"
+        told["shared"] = f"{100 * quality['shared_share']:.0f} %" if known else least
     elif "median_count" in quality:
-        yield "shared errors", "not known: too few frames that cross each other's cells, or readings without scatter"
-    yield "resolves", f"lumps of map width sigma {tactile_map.recipe.cell_mm / CELL_PER_SIGMA:.2g} mm or more"
-    advice = advise_cell(tactile_map)
-    if advice is not None:
-        yield "cell", advice.text()
-    if tactile_map.recipe.normalise == "gain":
-        yield "gain solve", f"{quality['gain_passes']:.0f} passes, last change {quality['gain_last_change']:.1e}"
+        told["unshared"] = True
+    return told
 
 
 def _notes(tactile_map: TactileMap) -> Iterator[str]:
