@@ -12,7 +12,7 @@ from tactile_bayes.trial.accuracy import REFERENCE, ModalityRatio, PairedCompari
 from tactile_bayes.trial.figures import MIN_PATIENTS, Ends, Figure
 from tactile_bayes.trial.method_comparison import Unit
 from tactile_bayes.trial.planning import Design, Needed, PlanReport
-from tactile_bayes.trial.summary import Counts, ModalityReport, TrialReport
+from tactile_bayes.trial.summary import ModalityReport, TrialReport
 
 DIGITS: Final = 12  #: Of the numbers of `validate`'s file, so that the order of summation changes no byte.
 
@@ -200,10 +200,13 @@ def trial_text(report: TrialReport, *, left_out: Sequence[str] = (), methods: bo
 
     `left_out` says in words which readings of other visits take no part.
     """
-    counts = report.counts
+    counts, made = report.counts, ""
+    if counts.synthetic_readings:
+        share = "all" if counts.synthetic_readings == counts.readings else f"{counts.synthetic_readings} of them"
+        made = f" ({share} synthetic: made by a generator, not measured)"
     lines = [
         f"Sizes against excision: {_plural(counts.masses, 'mass')} of {_plural(counts.patients, 'patient')}, "
-        f"{_plural(counts.readings, 'reading')}{_synthetic(counts)}",
+        f"{_plural(counts.readings, 'reading')}{made}",
         *left_out,
         *(f"Doubtful: {doubt}" for doubt in report.doubts),
         *comparison_sentences(report),
@@ -231,7 +234,8 @@ def comparison_sentences(report: TrialReport) -> list[str]:
 def _comparison_sentence(pair: PairedComparison, percent: str) -> str:
     quotient, first, second = pair.figure("ratio"), pair.first, pair.second
     if second == REFERENCE:
-        quotient, first, second = _inverse(quotient), second, first
+        first, second = second, first
+        quotient = quotient.mapped(lambda ratio: 1 / ratio) if quotient.value else replace(quotient, value=None)
     other, masses = SPELLED.get(second, second), _plural(pair.masses, "mass")
     if quotient.value is None:
         return f"{first} and {other} are not compared on {masses}: {quotient.reason or 'an error is 0'}"
@@ -239,14 +243,6 @@ def _comparison_sentence(pair: PairedComparison, percent: str) -> str:
     told = f"no interval: {quotient.interval_reason}" if ends is None else f"{percent} {ends[0]:.2f} to {ends[1]:.2f}"
     p = "" if pair.p_holm is None else f", p {_short_p(pair.p_holm)}"
     return f"{first} errs {quotient.value:.2f} times as much as {other}, {told}{p}, {masses}"
-
-
-def _inverse(quotient: Figure) -> Figure:
-    """The quotient of the second over the first."""
-    if not quotient.value:
-        return replace(quotient, value=None)
-    ends = quotient.interval
-    return replace(quotient, value=1 / quotient.value, interval=None if ends is None else (1 / ends[1], 1 / ends[0]))
 
 
 def _short_p(p: float) -> str:
@@ -376,13 +372,6 @@ def found_share(report: ModalityReport) -> str:
         return share
     low, high = report.detected_interval
     return f"{share} [{100 * low:.0f}, {100 * high:.0f} %]"
-
-
-def _synthetic(counts: Counts) -> str:
-    if not counts.synthetic_readings:
-        return ""
-    share = "all" if counts.synthetic_readings == counts.readings else f"{counts.synthetic_readings} of them"
-    return f" ({share} synthetic: made by a generator, not measured)"
 
 
 def _plural(count: int, noun: str) -> str:

@@ -68,14 +68,18 @@ def figure_with_misses(
 ) -> Figure:
     r"""Weighted mean over masses, found and missed, with an interval over patients.
 
-    The weights of the mean go with this `power` of the ex-vivo size; `missed` is the mean if every mass were missed.
+    The weights of the mean go with this `power` of the ex-vivo size, where 0 weighs all masses alike; `missed` is the
+    mean if every mass were missed.
 
     The mean is :math:`(1 - p) a + p b` with the missed share p of the weights, a over masses found and b if all were
     missed. The corrected interval recovers the variances of a and p from their own intervals (Zou & Donner 2008, Stat.
     Med. 27, 1693): a's is the jackknife's, p's that of Jeffreys' prior for the effective number of patients. Other
     methods treat a miss as one more size.
     """
-    weight = partial(weight_by_size, power=power)
+
+    def weight(of: ModalitySizes) -> FloatArray:
+        return np.asarray((of.ex_vivo_mm / of.ex_vivo_mm.max()) ** power)
+
     plain = figure(statistic, sizes, scale=scale, confidence=confidence, leverage=weight)
     if method_of(confidence) != "corrected" or plain.value is None:
         return plain
@@ -99,11 +103,6 @@ def share_interval(share: float, number: float, *, confidence: float) -> Ends:
     """
     tail, a, b = 0.5 * (1 - confidence), share * number + 0.5, (1 - share) * number + 0.5
     return min(share, float(betaincinv(a, b, tail))), max(share, float(betaincinv(a, b, 1 - tail)))
-
-
-def weight_by_size(sizes: ModalitySizes, *, power: int) -> FloatArray:
-    """Weights by a power of the ex-vivo size, over the largest; 0 weighs all masses alike."""
-    return np.asarray((sizes.ex_vivo_mm / sizes.ex_vivo_mm.max()) ** power)
 
 
 # --- Accuracy against excision: percent and mm errors, and bias.
@@ -203,15 +202,17 @@ def _terms(sizes: ModalitySizes) -> FloatArray:
     return columns(e * e, e * y, y * y, 1.0, de, dy, de * de, de * dy, dy * dy)
 
 
-def _terms_of_varied_sizes(sizes: ModalitySizes) -> FloatArray:
-    _need_spread(sizes.size_mm, f"all {len(sizes.size_mm)} sizes are equal")
+def _terms_of_varied(sizes: ModalitySizes, *, ex_vivo: bool) -> FloatArray:
+    """The terms where the sizes vary, and with `ex_vivo` the ex-vivo sizes too."""
+    for name, values in (("sizes", sizes.size_mm), ("ex-vivo sizes", sizes.ex_vivo_mm))[: 1 + ex_vivo]:
+        if all_equal(some(values)):
+            raise UndefinedError(
+                "one mass has no spread" if len(values) == 1 else f"all {len(values)} {name} are equal"
+            )
     return _terms(sizes)
 
 
-def _terms_of_varied_pairs(sizes: ModalitySizes) -> FloatArray:
-    terms = _terms_of_varied_sizes(sizes)
-    _need_spread(sizes.ex_vivo_mm, f"all {len(sizes.ex_vivo_mm)} ex-vivo sizes are equal")
-    return terms
+_of_sizes, _of_pairs = (partial(_terms_of_varied, ex_vivo=one) for one in (False, True))
 
 
 def _slope(sums: FloatArray) -> FloatArray:
@@ -238,23 +239,17 @@ slope = SumStatistic(_terms, _slope)
 
 # Share of the variance about the mean that the line through zero explains, 1 - SSE0 / SST; below 0 when the mean of
 # the sizes would do better. Kvalseth (1985), Am. Stat. 39, 279, recommends it.
-r2_centred = SumStatistic(_terms_of_varied_sizes, lambda sums: 1 - ratio(_sse(sums), _sst(sums)))
+r2_centred = SumStatistic(_of_sizes, lambda sums: 1 - ratio(_sse(sums), _sst(sums)))
 
 # Share of the sum of squares about zero that the line explains, 1 - SSE0 / sum y^2: what R prints for
 # lm(y ~ 0 + x). It flatters: any line through a cloud far from zero explains most of it.
 r2_uncentred = SumStatistic(_terms, lambda sums: 1 - ratio(_sse(sums), sums[..., 2]), "no mass was detected")
 
 # Correlation coefficient; its sign says what the squares hide.
-pearson_r = SumStatistic(_terms_of_varied_pairs, _pearson)
+pearson_r = SumStatistic(_of_pairs, _pearson)
 
 # Squared correlation coefficient; blind to scale and offset.
-r2_pearson = SumStatistic(_terms_of_varied_pairs, lambda sums: _pearson(sums) ** 2)
-
-
-def _need_spread(values: FloatArray, reason: str) -> None:
-    some(values)
-    if all_equal(values):
-        raise UndefinedError("one mass has no spread" if len(values) == 1 else reason)
+r2_pearson = SumStatistic(_of_pairs, lambda sums: _pearson(sums) ** 2)
 
 
 # --- Ratio of one modality's error to another's.

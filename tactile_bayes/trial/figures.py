@@ -256,13 +256,13 @@ class Figure(Record):
     has_interval: bool = False  #: Whether an interval belongs to this figure at all.
 
     def mapped(self, function: Callable[[float], float]) -> Figure:
-        """Convert the figure by an increasing function; ends beyond double precision drop the interval."""
+        """Convert the figure by a monotonic function; ends beyond double precision drop the interval."""
         ends = self.interval
         one = replace(self, value=None if self.value is None else function(self.value))
         if ends is None:
             return one
         with contextlib.suppress(OverflowError):
-            low, high = function(ends[0]), function(ends[1])
+            low, high = sorted(map(function, ends))
             if abs(low) < LARGEST and abs(high) < LARGEST:
                 return replace(one, interval=(low, high))
         return replace(one, interval=None, interval_reason="the interval is wider than double precision holds")

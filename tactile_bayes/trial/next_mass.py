@@ -119,10 +119,15 @@ def next_mass(trial: Trial, *, sample: Sampler, rng: np.random.Generator, probab
     are fitted one by one, so that the probability that one errs less takes their errors as independent.
     """
     posteriors, left_out = posteriors_of(trial, sample=sample, rng=rng, probability=probability)
+    compared = {}
+    for one, other in combinations(posteriors, 2):  # P(A < B) for independent draws, over all pairs of them
+        a, b = posteriors[one].mape_percent, posteriors[other].mape_percent
+        below = float(np.mean(np.searchsorted(np.sort(a), b)) / len(a))
+        compared[f"{one} errs less than {other}"] = rounded(below)
     return NextMass(
         {name: one.summary for name, one in posteriors.items()},
         IntervalKind("eti", probability),
-        {name: rounded(p) for name, p in _compared(posteriors).items()},
+        compared,
         left_out,
         {name: one.diagnostics for name, one in posteriors.items()},
     )
@@ -145,14 +150,6 @@ def posteriors_of(
             continue
         posteriors[name] = _fit(one, caliper, sample=sample, rng=rng, probability=probability)
     return posteriors, left_out
-
-
-def _compared(posteriors: Mapping[str, Posterior]) -> dict[str, float]:
-    found = {}
-    for one, other in combinations(posteriors, 2):  # P(A < B) for independent draws, over all pairs of them
-        a, b = posteriors[one].mape_percent, posteriors[other].mape_percent
-        found[f"{one} errs less than {other}"] = float(np.mean(np.searchsorted(np.sort(a), b)) / len(a))
-    return found
 
 
 def _fit(

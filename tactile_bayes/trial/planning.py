@@ -312,7 +312,7 @@ def patients_needed(found: Sequence[Design], aim: Aim, target: float, *, trials:
         weight.append(1 / sd)
     if len(at) < 2:
         return None
-    (slope, start), covariance = _line(np.array(at), np.array(level), np.array(weight))
+    (slope, start), covariance = np.polyfit(at, level, 1, w=weight, cov="unscaled")
     wanted = float(ndtri(target)) if aim == "power" else math.log(target)
     x = (wanted - start) / slope
     if slope <= 0 or x <= 0:
@@ -323,13 +323,6 @@ def patients_needed(found: Sequence[Design], aim: Aim, target: float, *, trials:
         sd = math.sqrt(float(np.array([x, 1.0]) @ covariance @ np.array([x, 1.0]))) / slope
         ends = (max(x - 1.96 * sd, 0.0) ** 2, (x + 1.96 * sd) ** 2)
     return Needed(aim=aim, target=target, maps=found[0].maps, patients=patients, patients_interval=ends)
-
-
-def _line(x: FloatArray, y: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Slope and intercept by weighted least squares, and their covariance for weights of 1 over the SD."""
-    design = np.stack([x, np.ones_like(x)], axis=1) * weight[:, None]
-    covariance: FloatArray = np.linalg.pinv(design.T @ design).astype(np.float64)
-    return covariance @ design.T @ (weight * y), covariance
 
 
 def _trial(case: PlanCase, number: int) -> tuple[float, ...]:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from tactile_bayes.declarations import Record, replace
+from tactile_bayes.declarations import Record
 from tactile_bayes.trial.figures import (
     Count,
     Ends,
@@ -236,12 +236,9 @@ def replicate_figures(sizes: ModalitySizes, *, confidence: float) -> dict[str, F
     """
     replicated = sizes.only_replicated()
     log_sd = figure(log_sd_within, replicated, scale="log", confidence=confidence)
-    low = log_sd.mapped(lambda sd: 100 * math.expm1(-_PAIR * sd))
-    if low.interval is not None:  # it falls as its source rises
-        low = replace(low, interval=low.interval[::-1])
     return {
         "within_mass_log_sd": log_sd,
-        "repeatability_low_percent": low,
+        "repeatability_low_percent": log_sd.mapped(lambda sd: 100 * math.expm1(-_PAIR * sd)),
         "repeatability_high_percent": log_sd.mapped(lambda sd: 100 * math.expm1(_PAIR * sd)),
         "icc": figure(icc, replicated, scale="fisher", confidence=confidence),
     }

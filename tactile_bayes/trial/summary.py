@@ -201,15 +201,6 @@ def summarise(
     )
 
 
-def _detected_interval(sizes: ModalitySizes, *, confidence: float) -> tuple[float, float] | None:
-    """Interval of the share of masses found, for the effective number of patients: masses of one are no new trials."""
-    n = len(sizes.size_mm)
-    if n == 0:
-        return None
-    number = effective_number(np.ones(n), sizes.patient)
-    return clopper_pearson(float(sizes.detected.mean()) * number, number, confidence=confidence)
-
-
 def modality_report(
     sizes: ModalitySizes, trial: Trial, *, confidence: float, error_ratio: float = 1.0
 ) -> ModalityReport:
@@ -218,10 +209,14 @@ def modality_report(
     fields = fields_of({name: one for family in FAMILIES for name, one in family(sizes, confidence=confidence).items()})
     if prediction is None:
         fields["reasons"]["calibration"] = "no reading states an interval or a standard deviation"
+    share, n = None, len(sizes.size_mm)
+    if n:  # for the effective number of patients: masses of one are no new trials
+        number = effective_number(np.ones(n), sizes.patient)
+        share = clopper_pearson(float(sizes.detected.mean()) * number, number, confidence=float(confidence))
     return ModalityReport(
-        n=len(sizes.size_mm),
+        n=n,
         detected=int(sizes.detected.sum()),
-        detected_interval=_detected_interval(sizes, confidence=float(confidence)),
+        detected_interval=share,
         patients=len(sizes.patients),
         readings=sizes.readings,
         readings_detected=sum(len(group) for group in sizes.replicates_mm),
