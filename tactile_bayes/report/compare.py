@@ -354,26 +354,21 @@ _MOST_VISITS: Final = 3  #: Visits that a short report names one by one.
 
 def compare_summary(report: CompareReport) -> str:
     """Report in at most 12 lines; `compare_text` gives the rest."""
-    findings = report.findings
-    lines = finding_summary(findings, "caution", most=2)
-    if report.status != "compared":
-        checks = finding_summary(findings, "check", most=2)
-        return "\n".join([*lines, _refusal(report), *checks, RESEARCH_USE]) + "\n"
-    last, visits = report.changes[-1], report.visits
-    shown = visits if len(visits) <= _MOST_VISITS else (visits[0], visits[-1])
-    lines += [_verdict_line(last), _change_line(last), _odds_line(last), *_another_line(last)]
-    lines += (_rate_lines(last) if report.trend is None else _trend_lines(report.trend))[:1]
-    lines += [*_site_line(report), *(_visit_line(one) for one in shown), *_place_line(report.places[-1])]
-    lines += finding_summary(findings, "check", most=2)
-    return "\n".join([*lines, MORE, RESEARCH_USE]) + "\n"
+    lines = [*finding_summary(report.findings, "caution", most=2), verdict_sentence(report)]
+    more, visits = [], report.visits
+    if report.status == "compared":
+        shown = visits if len(visits) <= _MOST_VISITS else (visits[0], visits[-1])
+        lines += [*_change_lines(report.changes[-1]), *rate_sentences(report)[:1], *_site_line(report)]
+        lines += [*map(_visit_line, shown), *_place_line(report.places[-1])]
+        more = [MORE]
+    return "\n".join([*lines, *finding_summary(report.findings, "check", most=2), *more, RESEARCH_USE]) + "\n"
 
 
 def compare_text(report: CompareReport) -> str:
     """Full report."""
     lines = finding_lines(report.findings, "caution")
     for change in report.changes:
-        lines += [_verdict_line(change), _change_line(change), _odds_line(change)]
-        lines += [*_another_line(change), *_rate_lines(change), ""]
+        lines += [_verdict_line(change), *_change_lines(change), *_rate_lines(change), ""]
     lines += [] if report.trend is None else [*_trend_lines(report.trend), ""]
     for one in report.visits:
         lines.append(_visit_line(one))
@@ -403,8 +398,8 @@ def change_sentences(report: CompareReport) -> list[str]:
     """The change to the last visit with its odds, and what it supposes."""
     if report.status != "compared":
         return []
-    last = report.changes[-1]
-    return [_change_line(last), _odds_line(last), *_site_line(report), *_another_line(last)]
+    change, odds, *another = _change_lines(report.changes[-1])
+    return [change, odds, *_site_line(report), *another]
 
 
 def rate_sentences(report: CompareReport) -> list[str]:
@@ -440,16 +435,22 @@ def _place_line(place: VisitPlace, *, name: bool = False) -> list[str]:
     return [f"Place{which}: {place.distance_mm:.0f} mm from visit 1 by the landmarks ({sd})."]
 
 
-def _change_line(change: ChangeReport) -> str:
-    q, pair = change.percent, f"Change of the diameter, visit {change.earlier} to {change.later}"
-    median, low, high = (signed(one) for one in (q.median, q.low, q.high))
-    return f"{pair}: {median} % ({low} to {high} %, {_share(q)} interval)."
-
-
-def _odds_line(change: ChangeReport) -> str:
+def _change_lines(change: ChangeReport) -> list[str]:
+    """The change, its odds, and both if exams of one mass differ as the paper's maps did, where the spread is none."""
+    q, another = change.percent, change.another_exam
+    median, low, high = map(signed, (q.median, q.low, q.high))
     odds = [(one.percent, chance_text(one.probability, 3)) for one in change.grown_by]
     more = "".join(f"; that it has grown by more than {percent:g} %: {chance}" for percent, chance in odds)
-    return f"Probability that it {_direction(change.probability_grown)}{more}."
+    lines = [
+        f"Change of the diameter, visit {change.earlier} to {change.later}: {median} % ({low} to {high} %, {_share(q)} "
+        "interval).",
+        f"Probability that it {_direction(change.probability_grown)}{more}.",
+    ]
+    if another is None:
+        return lines
+    ends = f"{signed(another.percent.low)} to {signed(another.percent.high)} %"
+    chance = f"probability that it {_direction(another.probability_grown)}"
+    return [*lines, f"If exams of one mass differ by {100 * another.between_map_sd:.0f} %: {ends}, {chance}."]
 
 
 def _direction(grown: float) -> str:
@@ -486,16 +487,6 @@ def _rate_words(rate: GrowthRate | TrendReport) -> str:
     if times.longest is None:
         return f"{words}, doubling in no less than {times.shortest:.0f} days"
     return f"{words}, doubling in {times.median:.0f} days ({times.shortest:.0f} to {times.longest:.0f})"
-
-
-def _another_line(change: ChangeReport) -> list[str]:
-    another = change.another_exam
-    if another is None:
-        return []
-    q, spread = another.percent, 100 * another.between_map_sd
-    direction = _direction(another.probability_grown)
-    odds = f"{signed(q.low)} to {signed(q.high)} %, probability that it {direction}"
-    return [f"If exams of one mass differ by {spread:.0f} %: {odds}."]
 
 
 def _site_line(report: CompareReport) -> list[str]:

@@ -11,7 +11,7 @@ from tactile_bayes.presets import INTERVAL, RESEARCH_USE
 from tactile_bayes.report import exam_words, svg
 from tactile_bayes.report.estimate_document import size_words
 from tactile_bayes.report.estimate_text import width_lines
-from tactile_bayes.report.exam_words import Exam, headline, largest
+from tactile_bayes.report.exam_words import Exam, headline
 from tactile_bayes.report.pages import cut, foot, page
 
 # --- An exam as one self-contained page that prints to one side of A4: no script, nothing loaded, every text escaped.
@@ -30,7 +30,7 @@ def exam_page(exam: Exam) -> str:
     """Full HTML page of an exam; equal exams give equal text."""
     crowded = len(exam.maps) > 1 and len(exam.main.masses) > 1
     most, longest = _FINDINGS[crowded]
-    size, several = largest(exam), len(exam.maps) > 1
+    size, several = exam.largest, len(exam.maps) > 1
     drawn, report, least = exam.main.tactile_map, exam.main.report, exam.main.report.smallest_lump
     height_mm = _LOWER_MM if crowded else _PICTURE_MM[1]
     frame = None if drawn is None else svg.Frame.within(drawn, width_mm=_PICTURE_MM[0], height_mm=height_mm)
@@ -74,8 +74,8 @@ def exam_page(exam: Exam) -> str:
 
 def _place(exam: Exam) -> dict[str, Any]:
     """Where the lump lies, beside a clock face of the breast."""
-    mass, size = exam.main.masses[0], largest(exam)
-    sentences = [exam_words.place_sentence(mass, INTERVAL if size is None else size.probability)]
+    mass = exam.main.masses[0]
+    sentences = [exam_words.place_sentence(mass, INTERVAL if exam.largest is None else exam.largest.probability)]
     if mass.probability is not None:
         which = f"map {exam.main_number}" if len(exam.maps) > 1 else "this map"
         told = f"Probability that it is a lump, by {which}: {chance_text(mass.probability)}"
@@ -89,7 +89,7 @@ def _place(exam: Exam) -> dict[str, Any]:
 
 def _intervals(exam: Exam, size: Quantity) -> list[tuple[str, Quantity]]:
     """Both intervals of the largest size, with what they suppose."""
-    another, alike = exam.report.another_exam, exam.figures.get("between_map_sd")
+    another, alike = exam.report.another_exam, exam.report.figures.get("between_map_sd")
     narrow_size = exam.report.max_size_mm
     if another is None or narrow_size is None:
         return [("this exam" if exam.pooled is None else "these exams", size)]

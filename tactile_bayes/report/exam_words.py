@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from datetime import date
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -125,14 +125,14 @@ class Exam(Record, eq=False):
         return self.main.report if self.pooled is None else self.pooled
 
     @property
+    def largest(self) -> Quantity | None:
+        """The largest size that the page reports: the pooled one of several maps."""
+        return self.report.leading.max_size_mm
+
+    @property
     def disagrees(self) -> bool:
         """Whether the maps are not of one size, or not of one mass."""
         return self.pooled is not None and self.pooled.status == DISAGREE
-
-    @property
-    def figures(self) -> Mapping[str, Any]:
-        """Figures of the size: spread between exams, whether the lump is oval."""
-        return self.report.figures
 
 
 def exam_map(tactile_map: TactileMap | None, report: EstimateReport, *, side: str) -> ExamMap:
@@ -175,7 +175,7 @@ _LEFT_OUT: Final = WHY_NOT | {
 
 def headline(exam: Exam) -> str:
     """The finding in a few words."""
-    size, masses = largest(exam), exam.main.masses
+    size, masses = exam.largest, exam.main.masses
     if size is not None:
         what = "Lump of" if len(masses) < 2 else f"{len(masses)} masses, mass {masses[0].number}"
         interval = f"{_percent(size)} interval {size.low:.1f} to {size.high:.1f} mm"
@@ -195,20 +195,15 @@ def reason_on_paper(report: EstimateReport) -> str:
     return "no lump found: what rises is long like a rib, not round like a lump" if rib else report.reason
 
 
-def largest(exam: Exam) -> Quantity | None:
-    """The largest size that the page reports: the pooled one of several maps."""
-    return exam.report.leading.max_size_mm
-
-
 def size_sentences(exam: Exam) -> Iterator[str]:
     """The largest size with both intervals and the smallest size."""
-    report, size = exam.report, largest(exam)
+    report, size = exam.report, exam.largest
     if size is None:
         return
     share = _percent(size)
     yield f"The largest diameter is about {size.median:.1f} mm (the middle of its probable values)."
     yield f"With a probability of {share} it lies between {size.low:.1f} and {size.high:.1f} mm{_supposed(exam)}."
-    alike, spread = report.max_size_mm, exam.figures.get("between_map_sd")
+    alike, spread = report.max_size_mm, report.figures.get("between_map_sd")
     if report.another_exam is not None and alike is not None:
         told = "did not differ" if spread is None else f"differed by {100 * spread:.0f} % only"
         learned = "as these maps suggest" if exam.pooled is not None else "as those of simulated bodies do"
@@ -220,20 +215,20 @@ def size_sentences(exam: Exam) -> Iterator[str]:
     if least is not None:
         ends = f"{share}: {least.low:.1f} to {least.high:.1f} mm"
         yield f"The smallest diameter is about {least.median:.1f} mm ({ends})."
-    if "oval_probability" in exam.figures:
-        yield shape_text(exam.figures)
+    if "oval_probability" in report.figures:
+        yield shape_text(report.figures)
 
 
 def _supposed(exam: Exam) -> str:
     """What the size's interval supposes of the spread between exams, and where that is from."""
-    report, spread = exam.report, exam.figures.get("between_map_sd")
+    report, spread = exam.report, exam.report.figures.get("between_map_sd")
     if report.another_exam is not None:
         after = " after these maps" if exam.pooled is not None else ""
         share = f"{100 * report.another_exam.between_map_sd:.0f} %"
         return f", if exams of a lump differ by {share}{after}, as those of patients did in the published trial"
     if spread is None:
         return ""
-    at_site = exam.figures.get("repeatability") if exam.pooled is None else exam.pooled.site_words
+    at_site = report.figures.get("repeatability") if exam.pooled is None else exam.pooled.site_words
     if at_site and exam.pooled is None:
         return f"; {at_site}"
     told = f"; exams of a lump are taken to differ by {100 * spread:.0f} %"

@@ -126,9 +126,7 @@ def figure_file(
     write_bytes(path, buffer.getvalue(), force=force)
 
 
-def finish(
-    axes: Axes, title: str, across: str, up: str, *, legend: bool = True, headroom: float = 0.0, **looks: Any
-) -> None:
+def finish(axes: Axes, title: str, across: str, up: str, *, headroom: float = 0.0, **looks: Any) -> None:
     """Title, labels, and a legend where something is named.
 
     `headroom`: space above the curves for the legend, as a share of their height; `looks`: of the legend.
@@ -141,5 +139,5 @@ def finish(
     axes.set_ylabel(up, fontsize=9)
     axes.tick_params(labelsize=8)
     axes.spines[["top", "right"]].set_visible(False)
-    if legend and axes.get_legend_handles_labels()[0]:
+    if axes.get_legend_handles_labels()[0]:
         axes.legend(**{"fontsize": 7.5, "frameon": False} | looks)

@@ -218,13 +218,8 @@ def _answer(found: Sequence[model_comparison.Agreement], beside: Sequence[model_
         ("maps", "map", model_comparison.PRINTED_MAPS),
     ):
         nearest = "" if beside is None else f"nearest head {_mean(beside, name):.1f}, "
-        told.append(f"{words} {_mean(found, name):.1f} % ({nearest}printed {_printed_mean(printed):.1f})")
+        told.append(f"{words} {_mean(found, name):.1f} % ({nearest}printed {np.mean([*printed.values()]):.1f})")
     return ", ".join(told)
-
-
-def _printed_mean(printed: Mapping[float, Sequence[float]]) -> float:
-    values = [value for row in printed.values() for value in row]
-    return sum(values) / len(values)
 
 
 def _others(found: Sequence[model_comparison.Agreement]) -> list[str]:
@@ -255,8 +250,8 @@ def _table(
         if printed is not None:
             cells = [f"{cell} ({value:.1f})" for cell, value in zip(cells, printed[depth], strict=True)]
         lines.append(f"{depth:>5g}" + "".join(f"{cell:>15}" for cell in cells))
-    mean = "mean " + " / ".join(f"{_mean(rows, name):.1f}" for rows in heads)
-    return [*lines, mean + ("" if printed is None else f" (of the printed cells {_printed_mean(printed):.1f})"), ""]
+    beside = "" if printed is None else f" (of the printed cells {np.mean([*printed.values()]):.1f})"
+    return [*lines, f"mean {' / '.join(f'{_mean(rows, name):.1f}' for rows in heads)}{beside}", ""]
 
 
 def tables_document(found: ByHead, phantoms: ByHead, *, seat: float) -> dict[str, object]:

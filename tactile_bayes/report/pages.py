@@ -105,7 +105,7 @@ class PageFiles(Record):
 Printer = Callable[[str], bytes]
 BROWSERS: Final = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
 PATIENCE_S: Final = 120
-# What a browser writes of the time, and what stands there instead, of the same length.
+# What a browser writes of the time: noughts stand there instead, as many, for places in a PDF are counted in bytes.
 _TIMES: Final = re.compile(rb"/(CreationDate|ModDate) ?\(D:[0-9+Z'-]*\)")
 
 
@@ -147,13 +147,7 @@ def _by_browser(browser: str, text: str) -> bytes:
         if not target.exists():
             last = (done.stderr.strip().splitlines() or ["it said nothing"])[-1][:200]
             raise UsageError(f"{browser} did not print the page ({last}); print it from your browser")
-        return _TIMES.sub(_timeless, target.read_bytes())
-
-
-def _timeless(found: re.Match[bytes]) -> bytes:
-    """The same entry with a fixed time, as long as it was: places in a PDF are counted in bytes."""
-    start, time = found[0].split(b"(D:")
-    return start + b"(D:" + re.sub(rb"[0-9]", b"0", time)
+        return _TIMES.sub(lambda found: re.sub(rb"[0-9]", b"0", found[0]), target.read_bytes())
 
 
 def _by_weasyprint(text: str) -> bytes:

@@ -73,11 +73,6 @@ def differences_figure(report: TrialReport, trial: Trial) -> bytes:
     return _svg([partial(_draw_differences, one, methods[one.name]) for one in found], alike=True)
 
 
-def calibration_figure(prediction: Prediction, found: Calibration) -> bytes:
-    """Draw integral transforms as a histogram and a distribution function with its band, and coverage by level."""
-    return _svg([partial(_draw_pit, found), partial(_draw_ecdf, found, prediction), partial(_draw_coverage, found)])
-
-
 def _svg(panels: Sequence[Callable[[Axes], None]], *, alike: bool = False) -> bytes:
     """Draw panels side by side as SVG, independent of the user's matplotlib settings; `alike`: all with one range."""
     with plain_matplotlib() as library:
@@ -257,11 +252,15 @@ def _masses(trial: Trial) -> tuple[list[str], list[list[str]]]:
 
 
 def _calibrations(report: TrialReport, trial: Trial) -> Iterator[tuple[str, Calibration, str]]:
-    """Name, figures and picture of each modality that states its uncertainty."""
+    """Name, figures and picture of each modality that states its uncertainty.
+
+    The picture: integral transforms as a histogram and a distribution function with its band, and coverage by level.
+    """
     for name, one in report.modalities.items():
         found, prediction = one.calibration, prediction_of(trial, name)
         if found is not None and prediction is not None:
-            yield name, found, _base64(calibration_figure(prediction, found))
+            panels = [partial(_draw_pit, found), partial(_draw_ecdf, found, prediction), partial(_draw_coverage, found)]
+            yield name, found, _base64(_svg(panels))
 
 
 def _cells(figures: Figures, wanted: Mapping[str, tuple[str, str]]) -> list[str]:

@@ -115,7 +115,9 @@ def calibration(prediction: Prediction, *, confidence: float) -> Calibration:
     ordered = np.sort(pit)
     steps = np.arange(len(pit) + 1) / len(pit)
     distance = float(max(np.max(steps[1:] - ordered), np.max(ordered - steps[:-1])))
-    scale, ends = _scale(z, masses, confidence=confidence)
+    mean, tail = float(np.mean(z**2)), 0.5 - 0.5 * confidence  # chi-squared, one degree of freedom per mass
+    low, high = (math.sqrt(masses * mean / float(chdtri(masses, p))) for p in (tail, 1 - tail))
+    scale, ends = math.sqrt(mean), (low, high)
     shift = 100 * math.expm1(float(np.median(prediction.found_log - prediction.median_log)))
     levels = []
     for level in LEVELS:
@@ -195,14 +197,6 @@ def prediction_of(trial: Trial, modality: str) -> Prediction | None:
     return Prediction(
         medians, np.sqrt(sds**2 + np.log1p(caliper**2)), np.log(found), np.array([masses[key] for key, _ in kept])
     )
-
-
-def _scale(z: FloatArray, masses: int, *, confidence: float) -> tuple[float, Ends]:
-    """Root mean square of z, and its chi-squared interval with one degree of freedom per mass."""
-    mean = float(np.mean(z**2))
-    tail = 0.5 - 0.5 * confidence
-    low, high = masses * mean / float(chdtri(masses, tail)), masses * mean / float(chdtri(masses, 1 - tail))
-    return math.sqrt(mean), (math.sqrt(low), math.sqrt(high))
 
 
 def _advice(scale: float, ends: Ends, masses: int, refuted: bool) -> str:
