@@ -250,8 +250,8 @@ def _table(
         if printed is not None:
             cells = [f"{cell} ({value:.1f})" for cell, value in zip(cells, printed[depth], strict=True)]
         lines.append(f"{depth:>5g}" + "".join(f"{cell:>15}" for cell in cells))
-    beside = "" if printed is None else f" (of the printed cells {np.mean([*printed.values()]):.1f})"
-    return [*lines, f"mean {' / '.join(f'{_mean(rows, name):.1f}' for rows in heads)}{beside}", ""]
+    print_mean = "" if printed is None else f" (of the printed cells {np.mean([*printed.values()]):.1f})"
+    return [*lines, f"mean {' / '.join(f'{_mean(rows, name):.1f}' for rows in heads)}{print_mean}", ""]
 
 
 def tables_document(found: ByHead, phantoms: ByHead, *, seat: float) -> dict[str, object]:
