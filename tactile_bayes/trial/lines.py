@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
+from bisect import bisect_left, bisect_right
 from collections.abc import Callable
 
 import numpy as np
-import numpy.typing as npt
 from scipy.special import ndtri, stdtrit
 
 from tactile_bayes.declarations import Record
@@ -75,8 +75,7 @@ def kendall_sign(x: FloatArray, y: FloatArray) -> int:
     if len(x) <= MOST_LISTED:
         first, second = np.triu_indices(len(x), 1)
         return int(np.sign(np.sum(np.sign(x[second] - x[first]) * np.sign(y[second] - y[first]))))
-    order = np.lexsort((y, x))
-    discordant = _inversions(x[order], y[order], ties=False)
+    discordant = _inversions(x, y, ties=False)
     tied = _pairs_of_equals(x[:, None]) + _pairs_of_equals(y[:, None])
     both = _pairs_of_equals(np.stack([x, y], axis=1))
     concordant = len(x) * (len(x) - 1) // 2 - tied + both - discordant
@@ -105,26 +104,12 @@ def _pairs_of_equals(rows: FloatArray) -> int:
 
 def _inversions(x: FloatArray, z: FloatArray, *, ties: bool) -> int:
     """Number of pairs of ascending x whose z descends; with `ties`, also pairs of equal z, or of equal x and z."""
-    order = np.lexsort((z, x))
-    ordered = z[order]
-    index = np.arange(len(z))
-    by_value = np.lexsort((-index if ties else index, ordered))
-    rank = np.empty(len(z), dtype=np.int64)
-    rank[by_value] = index
-    return _inversions_of_permutation(rank)
-
-
-def _inversions_of_permutation(rank: npt.NDArray[np.int64]) -> int:
-    """Number of inversions, counted bit by bit: within equal higher bits, every 1 before a 0."""
-    total = 0
-    for bit in reversed(range(max(1, int(len(rank) - 1).bit_length()))):
-        group, one = rank >> (bit + 1), (rank >> bit) & 1
-        ones_before = np.concatenate([[0], np.cumsum(one)])[:-1]
-        start = np.concatenate([[True], group[1:] != group[:-1]])
-        base = np.maximum.accumulate(np.where(start, ones_before, 0))
-        total += int(np.sum((ones_before - base)[one == 0]))
-        rank = rank[np.argsort(rank >> bit, kind="stable")]
-    return total
+    place_of, seen, number = bisect_left if ties else bisect_right, list[float](), 0
+    for value in z[np.lexsort((z, x))].tolist():
+        place = place_of(seen, value)
+        number += len(seen) - place
+        seen.insert(place, value)
+    return number
 
 
 # --- Passing and Bablok's line: the shifted median of the slopes of all pairs of masses.
