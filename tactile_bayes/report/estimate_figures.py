@@ -109,8 +109,9 @@ def draw_size(
     """
     leads = leading_size(size)
     rows = [("largest", "max_size_mm", _MAX_COLOUR, "-"), ("smallest", "min_size_mm", _MIN_COLOUR, "--")]
-    drawn = {which: getattr(leads, which).ravel() for _, which, _, _ in rows}
-    alike, more = float(np.mean(np.isclose(*drawn.values()))), ""
+    both = [getattr(leads, which).ravel() for _, which, _, _ in rows]
+    alike, more = float(np.mean(np.isclose(*both))), ""
+    drawn = {which: draws[np.isfinite(draws)] for (_, which, _, _), draws in zip(rows, both, strict=True)}
     if alike >= _ROUND:
         rows, more = rows[:1], f"\n(the smallest is the same in {100 * alike:.0f} % of the draws)"
     bars = [(words, leads.summarise(which, probability=probability), colour, "") for words, which, colour, _ in rows]
@@ -120,11 +121,15 @@ def draw_size(
     with figure_file(path, size_in=(7.0, 3.2 + 0.4 * len(bars)), force=force, findings=findings) as figure:
         axes = figure.subplots()
         for words, which, colour, dash in rows:
-            _draw_density(axes, words, drawn[which], colour=colour, dash=dash, more=more)
+            (sizes, density), median = _density(drawn[which]), float(np.median(drawn[which]))
+            looks: dict[str, Any] = {"color": colour, "linestyle": dash}
+            axes.plot(sizes, density, linewidth=1.8, label=f"{words} size, median {median:.1f} mm{more}", **looks)
+            axes.fill_between(sizes, density, color=colour, alpha=0.15, linewidth=0)
+            axes.vlines(median, 0.0, float(np.interp(median, sizes, density)), linewidth=1.2, **looks)
         for row, (words, q, colour, supposes) in enumerate(bars):
             _draw_interval(axes, q, size=words, row=row, colour=colour, supposes=supposes)
         # nearly all draws and all intervals, without a heavy tail's outermost draws
-        ends = [float(end) for one in drawn.values() for end in np.quantile(one[np.isfinite(one)], _SHOWN)]
+        ends = [float(end) for one in drawn.values() for end in np.quantile(one, _SHOWN)]
         ends += [end for _, q, _, _ in bars for end in (q.low, q.high)]
         margin = 0.05 * (max(ends) - min(ends)) or 1.0
         axes.set_xlim(max(0.0, min(ends) - margin) if min(ends) >= 0 else min(ends) - margin, max(ends) + margin)
@@ -133,9 +138,8 @@ def draw_size(
     return figure
 
 
-def _density(draws_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _density(draws: FloatArray) -> tuple[FloatArray, FloatArray]:
     """400 sizes in mm and their smoothed density per mm: a histogram convolved with a Gaussian, mirrored at 0."""
-    draws = draws_mm[np.isfinite(draws_mm)]
     if len(draws) < 2:
         raise BadDataError(f"{len(draws)} finite draws cannot be drawn as a density", way_out="give two or more")
     spread = min(float(draws.std()), float(np.subtract(*np.quantile(draws, [0.75, 0.25]))) / 1.349 or np.inf)
@@ -149,15 +153,6 @@ def _density(draws_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
     if draws.min() >= 0:
         kernel += np.exp(-0.5 * (np.add.outer(middle, middle) / width) ** 2)
     return middle, kernel @ weights / (width * np.sqrt(2 * np.pi))
-
-
-def _draw_density(axes: Axes, size: str, draws_mm: FloatArray, *, colour: str, dash: str, more: str) -> None:
-    sizes, density = _density(draws_mm)
-    median = float(np.median(draws_mm[np.isfinite(draws_mm)]))
-    label = f"{size} size, median {median:.1f} mm{more}"
-    axes.plot(sizes, density, color=colour, linestyle=dash, linewidth=1.8, label=label)
-    axes.fill_between(sizes, density, color=colour, alpha=0.15, linewidth=0)
-    axes.vlines(median, 0.0, float(np.interp(median, sizes, density)), color=colour, linestyle=dash, linewidth=1.2)
 
 
 def _draw_interval(axes: Axes, q: Quantity, *, size: str, row: int, colour: str, supposes: str) -> None:

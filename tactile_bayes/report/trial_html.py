@@ -30,7 +30,7 @@ from tactile_bayes.report.trial import (
     shown,
 )
 from tactile_bayes.trial.calibration import BINS, Calibration, Prediction, prediction_of
-from tactile_bayes.trial.figures import Ends, Figures
+from tactile_bayes.trial.figures import Figures
 from tactile_bayes.trial.method_comparison import MethodComparison
 from tactile_bayes.trial.next_mass import NextOfModality
 from tactile_bayes.trial.planning import PlanReport
@@ -231,7 +231,6 @@ def trial_html(report: TrialReport, trial: Trial, *, text: str, growth: Sequence
         number=number,
         of_variances=_of_variances,
         middles=_middles,
-        with_ends=_with,
         dumps=json.dumps,
     )
 
@@ -276,11 +275,7 @@ def _of_variances(report: ModalityReport) -> list[str]:
 
 
 def _middles(one: NextOfModality, names: Iterable[str]) -> list[str]:
-    return [_with(middle.median, (middle.low, middle.high)) for middle in (getattr(one, name) for name in names)]
-
-
-def _with(value: float, ends: Ends) -> str:
-    return f"{value:.3g} [{ends[0]:.3g}, {ends[1]:.3g}]"
+    return [getattr(one, name).shown(".3g") for name in names]
 
 
 def _base64(png: bytes) -> str:

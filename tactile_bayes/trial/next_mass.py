@@ -53,6 +53,10 @@ class Middle(Record):
     low: float
     high: float
 
+    def shown(self, spec: str) -> str:
+        """The median with its interval in brackets."""
+        return f"{self.median:{spec}} [{self.low:{spec}}, {self.high:{spec}}]"
+
 
 class NextOfModality(Record):
     """Posterior of one modality's errors."""
@@ -101,10 +105,10 @@ class NextMass(Record):
         """Text lines of the report."""
         lines = ["Bayesian errors-in-variables model, beside the table above and not instead of it:"]
         for name, one in self.modalities.items():
-            error, found = _shown(one.mape_percent, ".1f"), _shown(one.mape_detected_percent, ".1f")
+            error, found = one.mape_percent.shown(".1f"), one.mape_detected_percent.shown(".1f")
             lines.append(
                 f"{name}: next mass: expected error {error} %, if it is found {found} %; "
-                f"bias {_shown(one.bias_percent, '+.1f')} %, slope of ln size {_shown(one.log_slope, '.2f')}"
+                f"bias {one.bias_percent.shown('+.1f')} %, slope of ln size {one.log_slope.shown('.2f')}"
             )
         lines += [f"probability that {pair}: {p:.3f}" for pair, p in self.probability_less_error.items()]
         return [*lines, *(f"{name}: no model: {reason}" for name, reason in self.left_out.items())]
@@ -291,7 +295,3 @@ def expected_error_percent(model: LogModel, theta: FloatArray, misses: FloatArra
 def _total_variance(log_sd: FloatArray) -> FloatArray:
     """Variance of ln size, clipped against overflow where the prior excludes it anyway."""
     return np.asarray(np.exp(2 * np.clip(log_sd, -14, 5)))
-
-
-def _shown(one: Middle, spec: str) -> str:
-    return f"{one.median:{spec}} [{one.low:{spec}}, {one.high:{spec}}]"

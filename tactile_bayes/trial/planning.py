@@ -254,12 +254,8 @@ def first_guess(case: PlanCase, aim: Aim, target: float) -> int:
 
     For power :math:`((z_{1-\alpha/2} + z_\text{power}) / \delta)^2` with :math:`\delta` the mean of the differences of
     percent errors over their SD; for the interval of a mean error, whose ends lie :math:`z` standard errors of its
-    logarithm away, :math:`(2 z\,\text{cv} / \ln \text{factor})^2`.
-
-    Raises
-    ------
-    UndefinedError
-        When the tactile errors are not the smaller ones.
+    logarithm away, :math:`(2 z\,\text{cv} / \ln \text{factor})^2`. Undefined where the
+    tactile errors are not the smaller ones.
     """
     rng, n = np.random.default_rng(case.seed), _GUESSED_WITH
     shared = rng.normal(case.tactile_bias, case.mass_sd, n)

@@ -93,7 +93,7 @@ def _keeping(draw, kept: list):
 def axes(monkeypatch):
     """The figure that was written last, for looking at what is on it."""
     kept = []
-    for module, name in ((sizes, "_draw_density"), (maps, "_draw_values")):
+    for module, name in ((sizes, "_draw_interval"), (maps, "_draw_values")):
         monkeypatch.setattr(module, name, _keeping(getattr(module, name), kept))
     return kept
 
